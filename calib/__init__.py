@@ -1,0 +1,1 @@
+"""The calibration type, its file formats, and the calibration of cameras."""

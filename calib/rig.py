@@ -1,0 +1,47 @@
+"""`Rig`: the one calibration type of the project. Files of every dialect become this and are written from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry.cameras import Camera
+from stereo_sfm.types import F64
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """A camera with one or two eyes.
+
+    `left_T_right` takes points of the right eye into the left one: its translation is the position of the right eye
+    seen from the left, (+baseline, 0, 0) for an ideal pair. `right` is None for a monocular camera. An RGB-D camera has
+    `right` equal to `left` with a virtual baseline, and its images carry `depth`.
+    """
+
+    left: Camera
+    right: Camera | None = None
+    left_T_right: F64 = field(default_factory=lambda: np.eye(4))  # (4, 4)
+    body_T_left: F64 = field(default_factory=lambda: np.eye(4))  # (4, 4)
+    depth: bool = False  # RGB-D: the right eye is virtual, u_right = u_left - fx * baseline / depth
+    name: str = ""
+    serial: str = ""
+
+    def __post_init__(self) -> None:
+        for transform in (self.left_T_right, self.body_T_left):
+            if transform.shape != (4, 4) or not np.allclose(
+                transform[:3, :3] @ transform[:3, :3].T, np.eye(3), atol=1e-4
+            ):
+                raise StereoSfmError("calibration holds a transform that is not rigid: check the extrinsics")
+            transform.flags.writeable = False
+
+    @property
+    def stereo(self) -> bool:
+        """Two eyes (or one with depth)."""
+        return self.right is not None
+
+    @property
+    def baseline(self) -> float:
+        """Metres between the eyes; 0 for one eye."""
+        return float(np.linalg.norm(self.left_T_right[:3, 3])) if self.stereo else 0.0

@@ -1,0 +1,1 @@
+"""The simulated store and its cameras."""

@@ -1,0 +1,80 @@
+"""The source protocol and the table of sources."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol, Self
+from urllib.parse import parse_qsl
+
+from calib.rig import Rig
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.types import StereoImage, Trajectory
+
+
+class Source(Protocol):
+    """What every driver is."""
+
+    name: str  # for people: "sim:loop", "euroc:mh01"
+    rig: Rig  # known when the source is open, before the first frame
+    ground_truth: Trajectory | None  # world_T_cam0 where the source has it
+    frame_count: int | None  # None when unknown (live)
+    live: bool  # frames come whether or not somebody takes them
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None: ...
+
+    def __iter__(self) -> Iterator[StereoImage]: ...
+
+
+# name -> (module, factory). A factory takes what follows the colon and keyword options, and returns a Source.
+TABLE: dict[str, tuple[str, str]] = {
+    "sim": ("drivers.sim.source", "open_sim"),
+    "kitti": ("drivers.kitti", "open_kitti"),
+    "euroc": ("drivers.euroc", "open_euroc"),
+    "tum_vi": ("drivers.euroc", "open_tum_vi"),
+    "tum_rgbd": ("drivers.tum_rgbd", "open_tum_rgbd"),
+    "images": ("drivers.images", "open_images"),
+    "kapture": ("drivers.kapture", "open_kapture"),
+    "mcap": ("drivers.mcap", "open_mcap"),
+    "t265": ("drivers.t265.source", "open_t265"),
+    "oak": ("drivers.oak", "open_oak"),
+}
+
+
+def _factory(name: str) -> Callable[..., Source]:
+    module, attribute = TABLE[name]
+    return getattr(importlib.import_module(module), attribute)
+
+
+def open_source(spec: str | Path, **options: Any) -> Source:
+    """Open a source by name.
+
+    Args:
+        spec: `sim:loop?camera=pinhole&seed=3`, `t265`, `oak`, a folder (its kind is recognised), an .mcap file, or
+            `kind:path` to say the kind.
+        **options: passed to the driver; options in the spec's query come as strings.
+
+    Raises:
+        StereoSfmError: unknown name, missing folder, unrecognised folder, or whatever the driver finds wrong.
+    """
+    text = str(spec)
+    kind, colon, rest = text.partition(":")
+    if kind in TABLE and (colon or text == kind):
+        rest, _, query = rest.partition("?")
+        return _factory(kind)(rest, **{**dict(parse_qsl(query, keep_blank_values=True)), **options})
+    path = Path(text).expanduser()
+    if not path.exists():
+        looks_like_path = "/" in text or "." in text
+        what = f"no such file or folder: {text}" if looks_like_path else f"unknown source '{text}'"
+        raise StereoSfmError(f"{what} (sources: {', '.join(TABLE)}, a dataset folder, or an .mcap file)")
+    if path.is_file():
+        return _factory("mcap")(str(path), **options)
+    from drivers.recognise import recognise_folder
+
+    return _factory(recognise_folder(path))(str(path), **options)

@@ -1,0 +1,1 @@
+"""The Intel RealSense T265 over USB, without the vendor SDK."""

@@ -1,0 +1,71 @@
+"""The `stereo-sfm` command: a table of subcommands, each in its own file under `commands/`, imported when called."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from collections.abc import Sequence
+
+from stereo_sfm import __version__
+from stereo_sfm.errors import StereoSfmError
+
+# subcommand -> what `--help` says; the code is in stereo_sfm/commands/<name with _ for ->.py
+COMMANDS: dict[str, str] = {
+    "run": "turn a source into a trajectory and a map",
+    "record": "write a source to an MCAP file",
+    "info": "what a recording or dataset folder holds, and what is wrong with it",
+    "convert": "dataset folder to MCAP",
+    "rectify": "write rectified pictures with epipolar lines to look at",
+    "eval": "compare a trajectory with ground truth",
+    "config": "show the resolved configuration",
+}
+
+
+def _build_parser(chosen: str | None) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="stereo-sfm",
+        description="Visual structure-from-motion and SLAM for stereo cameras in retail stores.",
+    )
+    parser.add_argument("--version", action="store_true", help="versions of this package and what it runs on")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
+    for name, text in COMMANDS.items():
+        sub = commands.add_parser(name, help=text, description=text)
+        if name == chosen:
+            importlib.import_module(f"stereo_sfm.commands.{name.replace('-', '_')}").add_arguments(sub)
+    return parser
+
+
+def _print_versions() -> None:
+    from importlib.metadata import version
+
+    print(f"stereo-sfm {__version__}")
+    for package in ("numpy", "opencv-python-headless", "gtsam", "mcap", "numba", "rerun-sdk", "depthai"):
+        print(f"{package} {version(package)}")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point. Exit codes: 0 ok, 1 internal error, 2 bad input, 3 check failed, 4 tracking failed, 130 interrupted."""
+    args = list(sys.argv[1:] if argv is None else argv)
+    chosen = next((a for a in args if a in COMMANDS), None)
+    parser = _build_parser(chosen)
+    options = parser.parse_args(args)
+    if options.version:
+        _print_versions()
+        return 0
+    if options.command is None:
+        parser.print_help()
+        return 0
+    command = importlib.import_module(f"stereo_sfm.commands.{options.command.replace('-', '_')}")
+    try:
+        return command.run(options)
+    except StereoSfmError as error:
+        print(f"stereo-sfm {options.command}: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Metrics and reports against ground truth."""

@@ -1,0 +1,1 @@
+"""What leaves the project: trajectories, COLMAP, PLY, g2o, floor plans."""

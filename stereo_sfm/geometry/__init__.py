@@ -1,0 +1,1 @@
+"""Camera models, rigid transforms, triangulation and robust estimation: pure functions of arrays."""

@@ -1,0 +1,153 @@
+"""Camera models: `project(points) -> pixels` and `unproject(pixels) -> unit bearings`, vectorised over (..., 3).
+
+Pinhole with radial-tangential or rational distortion as in OpenCV, Kannala-Brandt with four coefficients (PAMI 28,
+2006, equation 6; the same as cv2.fisheye), and the epipolar-aligned wide projection that rectification produces. NaN
+outside the range where a model is monotonic.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from stereo_sfm.geometry import kernels
+from stereo_sfm.types import F64, Bool
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """One eye: image size in pixels, focal lengths and principal point in pixels, distortion coefficients."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, ...] = ()
+    params: F64 = field(init=False, repr=False)  # (16,) as geometry.kernels wants it
+
+    model: ClassVar[str] = ""
+    model_id: ClassVar[int] = -1
+    max_coefficients: ClassVar[int] = 0
+
+    def __post_init__(self) -> None:
+        if len(self.distortion) > self.max_coefficients:
+            raise ValueError(f"{self.model} takes at most {self.max_coefficients} distortion coefficients")
+        p = np.zeros(kernels.PARAMS)
+        p[:4] = self.fx, self.fy, self.cx, self.cy
+        p[4 : 4 + len(self.distortion)] = self.distortion
+        p[kernels.LIMIT] = self._limit(p)
+        p.flags.writeable = False
+        object.__setattr__(self, "distortion", tuple(float(d) for d in self.distortion))
+        object.__setattr__(self, "params", p)
+
+    def _limit(self, params: F64) -> float:
+        return 0.0
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) px."""
+        return self.width, self.height
+
+    @property
+    def matrix(self) -> F64:
+        """(3, 3) K."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
+
+    def project(self, points: F64) -> F64:
+        """Points (..., 3) in this camera -> (..., 2) px; NaN where the camera cannot see by its model."""
+        points = np.asarray(points, float)
+        flat = np.ascontiguousarray(points.reshape(-1, 3))
+        return kernels.project_many(self.model_id, self.params, flat).reshape(*points.shape[:-1], 2)
+
+    def project_jacobian(self, points: F64) -> tuple[F64, F64]:
+        """As `project`, with the derivative (..., 2, 3) of the pixel by the point."""
+        points = np.asarray(points, float)
+        flat = np.ascontiguousarray(points.reshape(-1, 3))
+        uv, jac = kernels.project_many_jacobian(self.model_id, self.params, flat)
+        return uv.reshape(*points.shape[:-1], 2), jac.reshape(*points.shape[:-1], 2, 3)
+
+    def unproject(self, uv: F64) -> F64:
+        """Pixels (..., 2) -> unit bearings (..., 3); NaN where the model is not invertible."""
+        uv = np.asarray(uv, float)
+        flat = np.ascontiguousarray(uv.reshape(-1, 2))
+        return kernels.unproject_many(self.model_id, self.params, flat).reshape(*uv.shape[:-1], 3)
+
+    def inside(self, uv: F64, border: float = 0.0) -> Bool:
+        """(..., 2) px -> whether the pixel lies in the image, `border` px from the edge; False for NaN."""
+        u, v = uv[..., 0], uv[..., 1]
+        return (
+            (u >= border) & (v >= border) & (u <= self.width - 1 - border) & (v <= self.height - 1 - border)
+        )
+
+    def bearing_grid(self) -> F64:
+        """(H, W, 3) unit bearing of every pixel, NaN where there is none."""
+        u, v = np.meshgrid(np.arange(self.width, dtype=float), np.arange(self.height, dtype=float))
+        return self.unproject(np.stack([u, v], -1))
+
+    def valid_mask(self, max_angle: float = np.pi) -> Bool:
+        """(H, W): pixels with a bearing at most `max_angle` radians from the optical axis."""
+        z = self.bearing_grid()[..., 2]
+        return np.nan_to_num(z, nan=-2.0) >= np.cos(max_angle)
+
+
+@dataclass(frozen=True, eq=False)
+class Pinhole(Camera):
+    """Ideal pinhole."""
+
+    model: ClassVar[str] = "pinhole"
+    model_id: ClassVar[int] = kernels.PINHOLE
+
+
+@dataclass(frozen=True, eq=False)
+class RadTan(Camera):
+    """Pinhole with OpenCV's distortion: k1 k2 p1 p2 [k3 [k4 k5 k6]] (radial-tangential or rational)."""
+
+    model: ClassVar[str] = "radtan"
+    model_id: ClassVar[int] = kernels.RADTAN
+    max_coefficients: ClassVar[int] = 8
+
+    def _limit(self, params: F64) -> float:
+        """Largest squared normalised radius up to which the radial part grows, 0 if it always does (to 20)."""
+        r = np.linspace(0, 20, 40001)[1:]
+        r2 = r * r
+        k1, k2, _, _, k3, k4, k5, k6 = params[4:12]
+        distorted = r * (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        falling = np.flatnonzero(np.diff(distorted, prepend=0.0) <= 0)
+        return float(r2[max(falling[0] - 1, 0)]) if len(falling) else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class KannalaBrandt(Camera):
+    """Fisheye: radius = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)."""
+
+    model: ClassVar[str] = "kannala_brandt"
+    model_id: ClassVar[int] = kernels.KANNALA_BRANDT
+    max_coefficients: ClassVar[int] = 4
+
+    def _limit(self, params: F64) -> float:
+        """Largest angle from the axis up to which the radius grows."""
+        theta = np.linspace(0, np.pi, 20001)
+        t2 = theta * theta
+        k1, k2, k3, k4 = params[4:8]
+        slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+        falling = np.flatnonzero(slope <= 1e-6)
+        return float(theta[max(falling[0] - 1, 0)]) if len(falling) else float(np.pi)
+
+
+@dataclass(frozen=True, eq=False)
+class Epipolar(Camera):
+    """Wide rectified projection: u = fx * longitude + cx along the baseline, v = fy * angle of the epipolar plane + cy.
+
+    With both eyes rotated so that the baseline is their x axis, a row of one image and the same row of the other are
+    the two halves of one epipolar plane, at any field of view below 180 degrees.
+    """
+
+    model: ClassVar[str] = "epipolar"
+    model_id: ClassVar[int] = kernels.EPIPOLAR
+
+
+MODELS: dict[str, type[Camera]] = {c.model: c for c in (Pinhole, RadTan, KannalaBrandt, Epipolar)}

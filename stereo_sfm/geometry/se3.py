@@ -1,0 +1,183 @@
+"""Rigid transforms as (..., 4, 4) arrays: exponential, logarithm, inverse, interpolation, alignment.
+
+A tangent vector is xi = (rho, phi): translation part first, rotation vector second, both (..., 3).
+Formulas: Barfoot, State Estimation for Robotics (2017), chapter 7; Umeyama, PAMI 13 (1991), equations 40-43.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stereo_sfm.types import F64
+
+_SMALL = 1e-8
+
+
+def skew(v: F64) -> F64:
+    """(..., 3) -> (..., 3, 3) with skew(v) @ w = v x w."""
+    v = np.asarray(v, float)
+    out = np.zeros((*v.shape[:-1], 3, 3))
+    out[..., 0, 1], out[..., 0, 2] = -v[..., 2], v[..., 1]
+    out[..., 1, 0], out[..., 1, 2] = v[..., 2], -v[..., 0]
+    out[..., 2, 0], out[..., 2, 1] = -v[..., 1], v[..., 0]
+    return out
+
+
+def so3_exp(phi: F64) -> F64:
+    """Rotation vector (..., 3) -> rotation matrix (..., 3, 3), Rodrigues."""
+    phi = np.asarray(phi, float)
+    angle = np.linalg.norm(phi, axis=-1)[..., None, None]
+    k = skew(phi)
+    small = angle < _SMALL
+    safe = np.where(small, 1.0, angle)
+    a = np.where(small, 1.0 - angle**2 / 6, np.sin(safe) / safe)
+    b = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
+    return np.eye(3) + a * k + b * (k @ k)
+
+
+def so3_log(rotation: F64) -> F64:
+    """Rotation matrix (..., 3, 3) -> rotation vector (..., 3), angle in [0, pi]."""
+    q = quaternion_from_rotation(rotation)
+    xyz, w = q[..., :3], q[..., 3]
+    norm = np.linalg.norm(xyz, axis=-1)
+    angle = 2 * np.arctan2(norm, w)
+    factor = np.where(
+        norm < _SMALL, 2.0 / np.where(np.abs(w) < 0.5, 1.0, w), angle / np.where(norm == 0, 1.0, norm)
+    )
+    return xyz * factor[..., None]
+
+
+def _left_jacobian(phi: F64) -> F64:
+    angle = np.linalg.norm(phi, axis=-1)[..., None, None]
+    k = skew(phi)
+    small = angle < 1e-5
+    safe = np.where(small, 1.0, angle)
+    b = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
+    c = np.where(small, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
+    return np.eye(3) + b * k + c * (k @ k)
+
+
+def exp(xi: F64) -> F64:
+    """Tangent (..., 6) = (rho, phi) -> transform (..., 4, 4)."""
+    xi = np.asarray(xi, float)
+    out = np.zeros((*xi.shape[:-1], 4, 4))
+    out[..., :3, :3] = so3_exp(xi[..., 3:])
+    out[..., :3, 3] = (_left_jacobian(xi[..., 3:]) @ xi[..., :3, None])[..., 0]
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def log(a_T_b: F64) -> F64:
+    """Transform (..., 4, 4) -> tangent (..., 6) = (rho, phi)."""
+    phi = so3_log(a_T_b[..., :3, :3])
+    rho = np.linalg.solve(_left_jacobian(phi), a_T_b[..., :3, 3, None])[..., 0]
+    return np.concatenate([rho, phi], axis=-1)
+
+
+def inverse(a_T_b: F64) -> F64:
+    """(..., 4, 4) -> b_T_a."""
+    rotation = np.swapaxes(a_T_b[..., :3, :3], -1, -2)
+    out = np.zeros_like(a_T_b, dtype=float)
+    out[..., :3, :3] = rotation
+    out[..., :3, 3] = -(rotation @ a_T_b[..., :3, 3, None])[..., 0]
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def adjoint(a_T_b: F64) -> F64:
+    """(..., 4, 4) -> (..., 6, 6) with T exp(xi) = exp(adjoint(T) xi) T."""
+    rotation = a_T_b[..., :3, :3]
+    out = np.zeros((*a_T_b.shape[:-2], 6, 6))
+    out[..., :3, :3] = rotation
+    out[..., 3:, 3:] = rotation
+    out[..., :3, 3:] = skew(a_T_b[..., :3, 3]) @ rotation
+    return out
+
+
+def transform(a_T_b: F64, points_b: F64) -> F64:
+    """Points (..., N, 3) of frame b -> frame a."""
+    return points_b @ np.swapaxes(a_T_b[..., :3, :3], -1, -2) + a_T_b[..., None, :3, 3]
+
+
+def from_rotation_translation(rotation: F64, translation: F64) -> F64:
+    """(..., 3, 3), (..., 3) -> (..., 4, 4)."""
+    rotation, translation = np.asarray(rotation, float), np.asarray(translation, float)
+    out = np.zeros((*np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1]), 4, 4))
+    out[..., :3, :3] = rotation
+    out[..., :3, 3] = translation
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def quaternion_from_rotation(rotation: F64) -> F64:
+    """(..., 3, 3) -> unit quaternion (..., 4) as x y z w, w >= 0. Largest-component branch, stable everywhere."""
+    r = np.asarray(rotation, float)
+    d0, d1, d2 = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
+    # Rows of the symmetric 4x4 matrix whose dominant eigenvector is the quaternion (Shepperd's method).
+    four_q_sq = np.stack([1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2, 1 + d0 + d1 + d2], -1)
+    xy, xz, yz = r[..., 1, 0] + r[..., 0, 1], r[..., 0, 2] + r[..., 2, 0], r[..., 2, 1] + r[..., 1, 2]
+    wx, wy, wz = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
+    rows = np.stack(
+        [
+            np.stack([four_q_sq[..., 0], xy, xz, wx], -1),
+            np.stack([xy, four_q_sq[..., 1], yz, wy], -1),
+            np.stack([xz, yz, four_q_sq[..., 2], wz], -1),
+            np.stack([wx, wy, wz, four_q_sq[..., 3]], -1),
+        ],
+        axis=-2,
+    )
+    best = np.argmax(four_q_sq, axis=-1)
+    q = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., 3:] < 0, -q, q)
+
+
+def rotation_from_quaternion(xyzw: F64) -> F64:
+    """Quaternion (..., 4) as x y z w (any norm > 0) -> (..., 3, 3)."""
+    q = np.asarray(xyzw, float)
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    xyz, w = q[..., :3], q[..., 3]
+    k = skew(xyz)
+    return np.eye(3) + 2 * (w[..., None, None] * k + k @ k)
+
+
+def orthonormalize(a_T_b: F64) -> F64:
+    """Nearest transform with an exact rotation (SVD), against the drift of long products."""
+    u, _, vt = np.linalg.svd(a_T_b[..., :3, :3])
+    det = np.linalg.det(u @ vt)
+    u[..., :, 2] *= det[..., None]
+    return from_rotation_translation(u @ vt, a_T_b[..., :3, 3])
+
+
+def interpolate(a_T_b0: F64, a_T_b1: F64, fraction: F64 | float) -> F64:
+    """Geodesic between two transforms at `fraction` in [0, 1] (may be an array of leading shape)."""
+    xi = log(inverse(a_T_b0) @ a_T_b1)
+    return a_T_b0 @ exp(np.asarray(fraction)[..., None] * xi)
+
+
+def umeyama(source: F64, target: F64, with_scale: bool = False) -> tuple[F64, float]:
+    """Least-squares similarity: target ~ scale * R @ source + t (Umeyama 1991, equations 40-43).
+
+    Args:
+        source: (N, 3). target: (N, 3).
+        with_scale: estimate the scale, else it is 1.
+
+    Returns:
+        (4, 4) [R t] without the scale, and the scale.
+
+    Raises:
+        ValueError: fewer than three points, or points without extent in two directions (the rotation is not unique).
+    """
+    if len(source) < 3:
+        raise ValueError("alignment needs at least three points")
+    mean_s, mean_t = source.mean(0), target.mean(0)
+    cov = (target - mean_t).T @ (source - mean_s) / len(source)
+    u, d, vt = np.linalg.svd(cov)
+    if d[1] <= 1e-12 * max(d[0], 1e-300):
+        raise ValueError("alignment of collinear points is not unique")
+    sign = np.ones(3)
+    if np.linalg.det(u) * np.linalg.det(vt) < 0:
+        sign[2] = -1
+    rotation = (u * sign) @ vt
+    scale = float((d * sign).sum() / ((source - mean_s) ** 2).sum(1).mean()) if with_scale else 1.0
+    return from_rotation_translation(rotation, mean_t - scale * rotation @ mean_s), scale

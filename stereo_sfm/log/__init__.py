@@ -1,0 +1,1 @@
+"""Everything that happened, as MCAP: topics, codec, writer, reader, diff."""

@@ -1,0 +1,1 @@
+"""From keyframes to loops: vocabulary, database, verification, correction."""

@@ -1,0 +1,1 @@
+"""From keyframes to a map: association, bundle adjustment, culling."""

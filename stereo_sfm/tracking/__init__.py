@@ -1,0 +1,1 @@
+"""From images to frames: features, flow, matching, pose, keyframes."""

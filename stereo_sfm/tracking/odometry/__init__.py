@@ -1,0 +1,1 @@
+"""One odometry estimator per file; `TABLE` names them."""

@@ -1,0 +1,213 @@
+"""Everything that flows between the stages: frozen dataclasses of numpy arrays, read-only after construction.
+
+Frames and units: ``a_T_b`` is (4, 4) float64 with ``p_a = a_T_b @ p_b``; metres, radians, integer nanoseconds of the
+sensor's clock. Frame names: ``map`` (may jump) -> ``odom`` (continuous) -> ``cam`` (left optical: x right, y down,
+z forward). Pixel (0, 0) is the centre of the top-left pixel.
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+F32 = NDArray[np.float32]
+I64 = NDArray[np.int64]
+I32 = NDArray[np.int32]
+U8 = NDArray[np.uint8]
+Bool = NDArray[np.bool_]
+
+
+def _freeze(obj: Any) -> None:
+    for f in fields(obj):
+        value = getattr(obj, f.name)
+        if isinstance(value, np.ndarray):
+            value.flags.writeable = False
+
+
+class Message:
+    """Base of everything that flows: arrays become read-only when the message is made."""
+
+    def __post_init__(self) -> None:
+        _freeze(self)
+
+
+class TrackState(enum.IntEnum):
+    """What the tracker knows about a frame's pose."""
+
+    INITIALIZING = 0  # no pose yet (monocular start, first black frames)
+    OK = 1  # pose from enough inliers
+    RECOVERED = 2  # first good pose after LOST frames, in the same odometry frame
+    LOST = 3  # pose predicted only; `Frame.reason` says why
+    RESTARTED = 4  # tracking began again as a new submap at the predicted pose
+
+
+@dataclass(frozen=True, eq=False)
+class ImuSamples(Message):
+    """Inertial samples since the previous frame, in the IMU's own axes."""
+
+    stamp_ns: I64  # (N,)
+    gyro: F64  # (N, 3) rad/s, NaN rows where only the accelerometer was sampled
+    accel: F64  # (N, 3) m/s^2, NaN rows where only the gyroscope was sampled
+
+
+@dataclass(frozen=True, eq=False)
+class WheelSamples(Message):
+    """Wheel odometry since the previous frame, body axes (x forward, y left)."""
+
+    stamp_ns: I64  # (N,)
+    linear: F64  # (N, 3) m/s
+    angular: F64  # (N, 3) rad/s
+
+
+@dataclass(frozen=True, eq=False)
+class StereoImage(Message):
+    """One synchronised pair (or a single image, or an image with depth), as a driver yields it."""
+
+    frame_id: int
+    stamp_ns: int  # sensor clock, mid-exposure, left eye
+    left: U8  # (H, W)
+    right: U8 | None = None  # (H, W); None for monocular and RGB-D sources
+    depth: F32 | None = None  # (H, W) metres along the left optical axis, NaN where unknown (RGB-D sources)
+    right_stamp_ns: int = 0  # 0: same as left
+    exposure_us: float = float("nan")
+    gain: float = float("nan")
+    dropped_before: int = 0  # frames the sensor or the driver lost just before this one
+    imu: ImuSamples | None = None
+    wheel: WheelSamples | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Observations(Message):
+    """Points seen in one frame, one row each."""
+
+    point_ids: I64  # (N,)
+    uv_left: F64  # (N, 2) px
+    uv_right: F64  # (N, 2) px, NaN where the right eye does not see it
+    age: I32  # (N,) frames since the track began
+    inlier: Bool  # (N,) used in the pose
+
+    @staticmethod
+    def empty() -> Observations:
+        return Observations(
+            np.zeros(0, np.int64),
+            np.zeros((0, 2)),
+            np.zeros((0, 2)),
+            np.zeros(0, np.int32),
+            np.zeros(0, bool),
+        )
+
+    def __len__(self) -> int:
+        return len(self.point_ids)
+
+
+@dataclass(frozen=True, eq=False)
+class Frame(Message):
+    """The tracker's answer to one image."""
+
+    frame_id: int
+    stamp_ns: int
+    odom_T_cam: F64  # (4, 4) continuous odometry pose
+    covariance: F64  # (6, 6) of odom_T_cam @ exp(xi), xi = (rho, phi) in camera axes
+    state: TrackState
+    reason: str  # "" when OK, else why (a short stable word such as "too_few_points", "dark", "no_consensus")
+    observations: Observations
+    reference_kf_id: int  # -1 before the first keyframe
+    kf_T_cam: F64  # (4, 4) pose in the reference keyframe, for the final trajectory
+    map_version: int = 0  # last MapUpdate applied before this frame
+    is_keyframe: bool = False
+    stats: dict[str, float] = field(default_factory=dict[str, float])  # numbers worth plotting; no wall clock
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe(Message):
+    """A frame that enters the map, with what place recognition and mapping need."""
+
+    kf_id: int  # 0, 1, 2, ...
+    frame_id: int
+    stamp_ns: int
+    odom_T_cam: F64  # (4, 4) at creation
+    point_ids: I64  # (N,) tracks' ids: the same id is the same physical point in every keyframe of this run
+    uv_left: F64  # (N, 2) px
+    uv_right: F64  # (N, 2) px, NaN where unseen
+    points_cam: F64  # (N, 3) metres in this keyframe's camera, NaN where the depth is unknown
+    descriptors: U8  # (N, 32) binary (oriented BRIEF), zero rows where none could be computed
+    angles: F32  # (N,) radians, orientation of the descriptor's patch
+    submap_id: int = 0  # grows when tracking restarts after it was lost
+    covariance: F64 = field(
+        default_factory=lambda: np.eye(6)
+    )  # (6, 6) of the pose relative to the previous keyframe
+
+
+@dataclass(frozen=True, eq=False)
+class MapUpdate(Message):
+    """The mapper's answer to one keyframe (exactly one each, possibly 'nothing')."""
+
+    version: int
+    kf_id: int  # the keyframe it answers
+    kf_ids: I64  # (K,) keyframes whose pose changed
+    map_T_kf: F64  # (K, 4, 4) their new poses
+    point_ids: I64  # (P,) new or moved points, in track ids
+    points_map: F64  # (P, 3)
+    culled_point_ids: I64  # (C,)
+    fused_point_ids: I64  # (D, 2) old id -> id that replaces it
+    map_T_odom: F64  # (4, 4)
+
+
+@dataclass(frozen=True, eq=False)
+class LoopResult(Message):
+    """The loop closer's answer to one keyframe (exactly one each)."""
+
+    kf_id: int
+    candidate_kf_id: int  # -1: no loop
+    candidate_T_kf: F64  # (4, 4) identity when rejected
+    information: F64  # (6, 6) inverse covariance of candidate_T_kf @ exp(xi)
+    matches: I64  # (M, 2) point ids (candidate's, this keyframe's) that are one physical point
+    inliers: int
+    score: float
+    reason: str  # "" when accepted, else why the best candidate was rejected ("no_candidate", "too_few_inliers", ...)
+    rejected: tuple[tuple[int, float, str], ...] = ()  # every rejected candidate: (kf_id, score, reason)
+
+
+@dataclass(frozen=True)
+class Dropped:
+    """A frame that never reached a stage."""
+
+    frame_id: int
+    stamp_ns: int
+    where: str  # "sensor", "capture", "ring", "viewer"
+    why: str
+    count: int = 1
+
+
+@dataclass(frozen=True)
+class Applied:
+    """Which map update was applied just before which frame (the recorded schedule of a realtime run)."""
+
+    version: int
+    before_frame_id: int
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory(Message):
+    """Poses over time."""
+
+    stamp_ns: I64  # (N,) ascending
+    poses: F64  # (N, 4, 4) world_T_cam, or world_T_body where the name says so
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+    @property
+    def positions(self) -> F64:
+        """(N, 3) metres."""
+        return self.poses[:, :3, 3]
+
+    @property
+    def length(self) -> float:
+        """Path length in metres."""
+        return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())

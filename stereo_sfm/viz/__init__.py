@@ -1,0 +1,1 @@
+"""The live viewer, in its own process, and its null object."""

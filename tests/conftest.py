@@ -1,0 +1,25 @@
+"""Shared fixtures: one OpenCV thread, and where the real sequences are."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import cv2
+import pytest
+
+cv2.setNumThreads(1)
+
+
+def _data_root() -> Path | None:
+    candidates = [os.environ.get("STEREO_SFM_DATA"), Path(__file__).parents[2] / "shared" / "data"]
+    return next((Path(c) for c in candidates if c and Path(c).is_dir()), None)
+
+
+@pytest.fixture(scope="session")
+def data_root() -> Path:
+    """Folder of the real sequences; tests that need it are skipped where there is none."""
+    root = _data_root()
+    if root is None:
+        pytest.skip("no real sequences here: set STEREO_SFM_DATA")
+    return root
