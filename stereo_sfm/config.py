@@ -71,9 +71,7 @@ def from_dict(data: dict[str, Any]) -> Config:
 
     merged = _merge(dataclasses.asdict(Config()), data)
     try:
-        return dacite.from_dict(
-            Config, merged, dacite.Config(strict=True, type_hooks={float: _as_float}, cast=[tuple])
-        )
+        return dacite.from_dict(Config, merged, dacite.Config(strict=True, type_hooks={float: _as_float}, cast=[tuple]))
     except dacite.DaciteError as error:
         raise StereoSfmError(f"configuration: {error} (see 'stereo-sfm config dump' for every key)") from None
 

@@ -138,9 +138,7 @@ class Keyframe(Message):
     descriptors: U8  # (N, 32) binary (oriented BRIEF), zero rows where none could be computed
     angles: F32  # (N,) radians, orientation of the descriptor's patch
     submap_id: int = 0  # grows when tracking restarts after it was lost
-    covariance: F64 = field(
-        default_factory=lambda: np.eye(6)
-    )  # (6, 6) of the pose relative to the previous keyframe
+    covariance: F64 = field(default_factory=lambda: np.eye(6))  # (6, 6) of the pose relative to the previous keyframe
 
 
 @dataclass(frozen=True, eq=False)

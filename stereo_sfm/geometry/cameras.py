@@ -79,9 +79,7 @@ class Camera:
     def inside(self, uv: F64, border: float = 0.0) -> Bool:
         """(..., 2) px -> whether the pixel lies in the image, `border` px from the edge; False for NaN."""
         u, v = uv[..., 0], uv[..., 1]
-        return (
-            (u >= border) & (v >= border) & (u <= self.width - 1 - border) & (v <= self.height - 1 - border)
-        )
+        return (u >= border) & (v >= border) & (u <= self.width - 1 - border) & (v <= self.height - 1 - border)
 
     def bearing_grid(self) -> F64:
         """(H, W, 3) unit bearing of every pixel, NaN where there is none."""

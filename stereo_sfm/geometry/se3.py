@@ -41,9 +41,7 @@ def so3_log(rotation: F64) -> F64:
     xyz, w = q[..., :3], q[..., 3]
     norm = np.linalg.norm(xyz, axis=-1)
     angle = 2 * np.arctan2(norm, w)
-    factor = np.where(
-        norm < _SMALL, 2.0 / np.where(np.abs(w) < 0.5, 1.0, w), angle / np.where(norm == 0, 1.0, norm)
-    )
+    factor = np.where(norm < _SMALL, 2.0 / np.where(np.abs(w) < 0.5, 1.0, w), angle / np.where(norm == 0, 1.0, norm))
     return xyz * factor[..., None]
 
 
