@@ -1,0 +1,237 @@
+"""Relative pose of two calibrated views from point matches: eight-point, five-point, decomposition, refinement.
+
+Retail paper equations 1-5; sparse localization paper equations 21-43; Hartley and Zisserman, Multiple View Geometry
+(2nd ed.), sections 9.6 and 11.2. Bearings instead of pixels, hence the same code for pinhole and fisheye.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.five_point import five_point
+from stereo_sfm.geometry.procrustes import rotation_between
+from stereo_sfm.geometry.robust import Consensus, Degenerate, ransac
+from stereo_sfm.geometry.two_view import epipolar_residuals, ray_depths
+from stereo_sfm.types import F64, I64, Bool
+
+_W = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+@dataclass(frozen=True, eq=False)
+class RelativePose:
+    """p1 = rotation @ p0 + scale * direction, the scale unknown."""
+
+    rotation: F64  # (3, 3)
+    direction: F64  # (3,) unit; NaN-free also for pure rotation, where it means nothing
+    inliers: Bool  # (N,) of the epipolar geometry
+    in_front: Bool  # (N,) inliers that triangulate in front of both cameras
+    parallax: float  # radians, median over inliers of the angle between R b0 and b1
+    pure_rotation: bool  # a rotation alone explains the inliers: the direction is not determined
+
+
+def _conditioning(vectors: F64) -> F64:
+    """(3, 3) similarity of Hartley's normalization when all vectors look forward, else the identity."""
+    if vectors[..., 2].min() < 0.05:
+        return np.eye(3)
+    xy = vectors[..., :2] / vectors[..., 2:]
+    mean = xy.reshape(-1, 2).mean(0)
+    scale = np.sqrt(2.0) / max(float(np.sqrt(((xy - mean) ** 2).sum(-1)).mean()), 1e-12)
+    return np.array([[scale, 0, -scale * mean[0]], [0, scale, -scale * mean[1]], [0, 0, 1.0]])
+
+
+def _null_matrices(x0: F64, x1: F64) -> tuple[F64, F64]:
+    """Samples (B, K, 3) of homogeneous vectors -> (B, 3, 3) smallest right singular matrix, (B, 9) singular values."""
+    design = (x1[..., :, None] * x0[..., None, :]).reshape(*x0.shape[:-1], 9)
+    design = design / np.linalg.norm(design, axis=-1, keepdims=True).clip(1e-300)
+    _, values, vt = np.linalg.svd(design, full_matrices=True)
+    padded = np.zeros((len(design), 9))
+    padded[:, : values.shape[1]] = values
+    return vt[:, 8].reshape(-1, 3, 3), padded
+
+
+def eight_point(x0: F64, x1: F64) -> F64:
+    """Linear fundamental (homogeneous pixels) or essential (bearings) matrix: x1^T F x0 = 0, rank 2, |F| = 1.
+
+    Args:
+        x0, x1: (N, 3), N >= 8.
+
+    Raises:
+        Degenerate: "too_few_matches"; "degenerate_points" where the equations leave more than one solution (points on
+            a line or a plane, repeated points, no translation).
+    """
+    if len(x0) < 8:
+        raise Degenerate("too_few_matches", f"{len(x0)} where 8 are needed")
+    t0, t1 = _conditioning(x0), _conditioning(x1)
+    matrix, values = _null_matrices((x0 @ t0.T)[None], (x1 @ t1.T)[None])
+    if not values[0, 7] > 1e-7 * values[0, 0]:
+        raise Degenerate("degenerate_points", "the points satisfy more than one epipolar geometry")
+    fundamental = t1.T @ matrix[0] @ t0
+    u, s, vt = np.linalg.svd(fundamental)
+    fundamental = (u[:, :2] * s[:2]) @ vt[:2]
+    return fundamental / np.linalg.norm(fundamental)
+
+
+def nearest_essential(matrix: F64) -> F64:
+    """Closest matrix with singular values (1, 1, 0) / sqrt 2."""
+    u, _, vt = np.linalg.svd(matrix)
+    return (u[..., :, :2] @ vt[..., :2, :]) / np.sqrt(2.0)
+
+
+def decompose(essential: F64) -> tuple[F64, F64]:
+    """Four motions of an essential matrix (retail paper, equations 3-5).
+
+    Returns:
+        (4, 3, 3) rotations and (4, 3) unit translations.
+
+    Raises:
+        Degenerate: "not_essential" for a matrix of rank below two or with non-finite entries.
+    """
+    if not np.isfinite(essential).all():
+        raise Degenerate("not_essential", "non-finite entries")
+    u, s, vt = np.linalg.svd(essential)
+    if s[1] <= 1e-9 * max(s[0], 1e-300):
+        raise Degenerate("not_essential", "rank below two")
+    u = u * np.sign(np.linalg.det(u))
+    vt = vt * np.sign(np.linalg.det(vt))
+    first, second, direction = u @ _W @ vt, u @ _W.T @ vt, u[:, 2]
+    return np.stack([first, first, second, second]), np.stack([direction, -direction, direction, -direction])
+
+
+def choose_in_front(
+    rotations: F64, translations: F64, bearings0: F64, bearings1: F64, min_parallax: float = 0.0
+) -> tuple[int, Bool]:
+    """Which motion puts the most points in front of both cameras, and which points those are.
+
+    Raises:
+        Degenerate: "ambiguous_cheirality" when the runner-up has almost as many (more than 0.8 of them).
+    """
+    depth0, depth1 = ray_depths(bearings0, bearings1, rotations, translations)
+    rotated = bearings0 @ np.swapaxes(rotations, -1, -2)
+    seen = np.linalg.norm(np.cross(rotated, bearings1), axis=-1) > np.sin(min_parallax)
+    front = (depth0 > 0) & (depth1 > 0) & seen
+    counts = front.sum(axis=1)
+    best = int(np.argmax(counts))
+    runner_up = int(np.sort(counts)[-2])
+    if counts[best] == 0 or runner_up > 0.8 * counts[best]:
+        raise Degenerate("ambiguous_cheirality", f"{counts[best]} against {runner_up} points in front")
+    return best, front[best]
+
+
+def refine_motion(
+    rotation: F64, direction: F64, bearings0: F64, bearings1: F64, scale: float, iterations: int = 8
+) -> tuple[F64, F64]:
+    """Gauss-Newton on the spherical Sampson distance with Cauchy weights of width `scale` radians.
+
+    Five parameters: a rotation vector on the left of `rotation` and two on the sphere of directions.
+    """
+    for _ in range(iterations):
+        p = bearings0 @ rotation.T
+        error = (bearings1 * np.cross(direction, p)).sum(1)
+        plane1 = np.cross(direction, p)
+        plane0 = np.cross(direction, bearings1)
+        slope = np.sqrt(np.maximum((plane1**2).sum(1) + (plane0**2).sum(1) - 2 * error**2, 1e-20))
+        residual = error / slope
+        weight = 1.0 / (1.0 + (residual / scale) ** 2)
+        tangent = np.linalg.svd(direction[None])[2][1:]  # (2, 3) basis orthogonal to the direction
+        by_rotation = np.cross(p, np.cross(bearings1, direction)) / slope[:, None]
+        by_direction = (np.cross(p, bearings1) @ tangent.T) / slope[:, None]
+        jac = np.concatenate([by_rotation, by_direction], axis=1)
+        hessian = jac.T @ (weight[:, None] * jac)
+        step = -np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(5), jac.T @ (weight * residual))
+        rotation = se3.so3_exp(step[:3]) @ rotation
+        direction = direction + step[3:] @ tangent
+        direction = direction / np.linalg.norm(direction)
+        if np.abs(step).max() < 1e-10:
+            break
+    return rotation, direction
+
+
+def essential_ransac(
+    bearings0: F64,
+    bearings1: F64,
+    threshold: float,
+    rng: np.random.Generator,
+    *,
+    method: str = "five_point",
+    max_samples: int = 512,
+    min_ratio: float = 0.25,
+) -> Consensus:
+    """Essential matrix (3, 3) with the most support; `threshold` in radians, method "five_point" or "eight_point".
+
+    Raises:
+        Degenerate: as `ransac`.
+    """
+    size = 5 if method == "five_point" else 8
+
+    def solve(indices: I64) -> F64:
+        if method == "five_point":
+            return five_point(bearings0[indices], bearings1[indices])
+        matrices, values = _null_matrices(bearings0[indices], bearings1[indices])
+        return nearest_essential(matrices[values[:, 7] > 1e-7 * values[:, 0]])
+
+    return ransac(
+        len(bearings0),
+        size,
+        solve,
+        lambda matrices: epipolar_residuals(matrices, bearings0, bearings1),
+        threshold,
+        rng,
+        max_samples=max_samples,
+        min_inliers=12,
+        min_ratio=min_ratio,
+    )
+
+
+def relative_pose(
+    bearings0: F64,
+    bearings1: F64,
+    threshold: float,
+    rng: np.random.Generator,
+    *,
+    method: str = "five_point",
+    refine: bool = True,
+    max_samples: int = 512,
+    min_ratio: float = 0.25,
+) -> RelativePose:
+    """Rotation and direction of translation between two views, with the pure-rotation case recognised.
+
+    A rotation alone is fitted to the inliers; when it explains (almost) all of them, the essential matrix is arbitrary
+    and the decomposition may pick a twisted rotation, so the fitted rotation is returned with `pure_rotation` set.
+
+    Raises:
+        Degenerate: as `essential_ransac`, `decompose` and `choose_in_front`.
+    """
+    consensus = essential_ransac(
+        bearings0, bearings1, threshold, rng, method=method, max_samples=max_samples, min_ratio=min_ratio
+    )
+    chosen = consensus.inliers
+    b0, b1 = bearings0[chosen], bearings1[chosen]
+    still = rotation_between(b0, b1)
+    off = np.linalg.norm(np.cross(b0 @ still.T, b1), axis=1)
+    if np.mean(off < 2 * threshold) > 0.95:
+        return RelativePose(
+            still, np.array([0.0, 0.0, 1.0]), chosen, np.zeros_like(chosen), float(np.median(off)), True
+        )
+    essential = consensus.model
+    if method == "eight_point":
+        essential = nearest_essential(eight_point(b0, b1))
+    rotations, translations = decompose(essential)
+    best, front = choose_in_front(rotations, translations, b0, b1)
+    rotation, direction = rotations[best], translations[best]
+    if refine:
+        for _ in range(3):  # refine, then let the better motion say who agrees with it
+            rotation, direction = refine_motion(
+                rotation, direction, bearings0[chosen], bearings1[chosen], 0.5 * threshold
+            )
+            chosen = epipolar_residuals(se3.skew(direction) @ rotation, bearings0, bearings1) <= threshold
+        depth0, depth1 = ray_depths(bearings0, bearings1, rotation, direction)
+        in_front = chosen & (depth0 > 0) & (depth1 > 0)
+    else:
+        in_front = np.zeros_like(chosen)
+        in_front[np.flatnonzero(chosen)[front]] = True
+    p = bearings0[chosen] @ rotation.T
+    parallax = float(np.median(np.linalg.norm(np.cross(p, bearings1[chosen]), axis=1))) if chosen.any() else 0.0
+    return RelativePose(rotation, direction, chosen, in_front, parallax, False)
