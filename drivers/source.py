@@ -36,6 +36,7 @@ class Source(Protocol):
 TABLE: dict[str, tuple[str, str]] = {
     "sim": ("drivers.sim.source", "open_sim"),
     "kitti": ("drivers.kitti", "open_kitti"),
+    "kitti_raw": ("drivers.kitti_raw", "open_kitti_raw"),
     "euroc": ("drivers.euroc", "open_euroc"),
     "tum_vi": ("drivers.euroc", "open_tum_vi"),
     "tum_rgbd": ("drivers.tum_rgbd", "open_tum_rgbd"),

@@ -1,0 +1,105 @@
+"""EuRoC/ASL folders (`mav0/cam0/data.csv`, `sensor.yaml`) and TUM VI (the same layout with a Kalibr camchain).
+
+EuRoC: Burri et al., IJRR 2016; poses of `state_groundtruth_estimate0` are the body's (the IMU), cameras sit at `T_BS`.
+TUM VI: Schubert et al., IROS 2018; `mocap0` holds the IMU's poses, Kalibr's `T_cam_imu` is the inverse of `T_BS`, and
+sixteen-bit images carry the sensor's twelve bits in their upper part.
+"""
+
+from __future__ import annotations
+
+import csv
+import logging
+from pathlib import Path
+
+from calib.formats.euroc import read_euroc as read_rig
+from calib.formats.kalibr import read_kalibr
+from calib.rig import Rig
+from drivers.folder_source import FolderSource, Shot, folder_of, need, pair_by_stamp
+from drivers.ground_truth import moved, read_euroc
+from drivers.rig_option import RigOption, chosen_rig
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.types import Trajectory
+
+log = logging.getLogger("stereo_sfm")
+
+MAX_SKEW_NS = 3_000_000  # stamps of one synchronised pair differ by less
+TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
+Listing = list[tuple[int, Path]]
+
+
+def open_euroc(path: str, rig: RigOption = None) -> FolderSource:
+    """Open an ASL folder: the one that holds `mav0`, or `mav0` itself."""
+    mav = _mav_folder(folder_of("euroc", path))
+    return _open(f"euroc:{_label(mav)}", mav, chosen_rig(rig, lambda: read_rig(mav)))
+
+
+def open_tum_vi(path: str, rig: RigOption = None) -> FolderSource:
+    """Open a TUM VI folder: `mav0` beside `camchain.yaml` (or `dso/camchain.yaml`)."""
+    mav = _mav_folder(folder_of("tum_vi", path))
+    chains = [mav.parent / "camchain.yaml", mav.parent / "dso" / "camchain.yaml"]
+    chain = next((c for c in chains if c.is_file()), chains[0])
+    return _open(f"tum_vi:{_label(mav)}", mav, chosen_rig(rig, lambda: read_kalibr(chain)))
+
+
+def _label(mav: Path) -> str:
+    mav = mav.resolve()
+    return mav.parent.name if mav.name == "mav0" else mav.name
+
+
+def _mav_folder(folder: Path) -> Path:
+    for mav in (folder / "mav0", folder):
+        if (mav / "cam0").is_dir():
+            return mav
+    raise StereoSfmError(f"{folder} has no mav0/cam0 folder")
+
+
+def _open(name: str, mav: Path, rig: Rig) -> FolderSource:
+    left = _read_listing(mav / "cam0")
+    exposures = _read_exposures(mav / "cam0" / "times.txt")
+    right: list[Path | None] = [None] * len(left)
+    if rig.stereo:
+        left, right = _pairs(name, left, _read_listing(need(mav / "cam1", "second camera")))
+    shots = [
+        Shot(stamp, file, other, exposure_us=exposures.get(file.stem, float("nan")))
+        for (stamp, file), other in zip(left, right, strict=True)
+    ]
+    return FolderSource(name, rig, shots, _ground_truth(mav, rig))
+
+
+def _pairs(name: str, left: Listing, right: Listing) -> tuple[Listing, list[Path | None]]:
+    pairs = pair_by_stamp([s for s, _ in left], [s for s, _ in right], MAX_SKEW_NS)
+    if len(pairs) < max(len(left), len(right)):
+        log.warning("%s: %d left and %d right images, the %d pairs are used", name, len(left), len(right), len(pairs))
+    return [left[i] for i, _ in pairs], [right[j][1] for _, j in pairs]
+
+
+def _read_listing(camera: Path) -> Listing:
+    """(stamp_ns, file) of every line of data.csv."""
+    path = need(camera / "data.csv", "image list")
+    images: Listing = []
+    with path.open(newline="") as file:
+        for number, row in enumerate(csv.reader(file), 1):
+            if not row or row[0].lstrip().startswith("#"):
+                continue
+            try:
+                images.append((int(row[0]), camera / "data" / row[1].strip()))
+            except (ValueError, IndexError):
+                raise StereoSfmError(f"{path} line {number} is not 'stamp_ns,file'") from None
+    return images
+
+
+def _read_exposures(path: Path) -> dict[str, float]:
+    """TUM VI: file stem -> exposure time in microseconds."""
+    if not path.is_file():
+        return {}
+    rows = [line.split() for line in path.read_text().splitlines() if not line.startswith("#")]
+    try:
+        return {row[0]: float(row[2]) * 1e3 for row in rows if len(row) >= 3}
+    except ValueError as error:
+        raise StereoSfmError(f"{path}: {error}") from None
+
+
+def _ground_truth(mav: Path, rig: Rig) -> Trajectory | None:
+    """world_T_cam0 from the poses of the body."""
+    path = next((p for p in (mav / f / "data.csv" for f in TRUTH_FOLDERS) if p.is_file()), None)
+    return None if path is None else moved(read_euroc(path), rig.body_T_left)

@@ -1,0 +1,121 @@
+"""Readers of trajectory files: TUM, KITTI and EuRoC/ASL text. They hold reference poses and estimates alike."""
+
+from __future__ import annotations
+
+from decimal import Decimal
+from pathlib import Path
+
+import numpy as np
+
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
+from stereo_sfm.types import F64, I64, Trajectory
+
+# Where the quaternion's x y z w stand in a row after the stamp and the position.
+_XYZW = (0, 1, 2, 3)
+_WXYZ = (1, 2, 3, 0)
+
+
+def stamp_from_seconds(text: str) -> int:
+    """Decimal seconds as text -> integer nanoseconds, exact (a float64 keeps only about 200 ns of today's epoch).
+
+    Raises:
+        ValueError: not a number.
+    """
+    try:
+        return int(Decimal(text).scaleb(9).to_integral_value())
+    except ArithmeticError:
+        raise ValueError(f"'{text}' is not a time in seconds") from None
+
+
+def _rows(path: Path, least: int) -> list[list[str]]:
+    """Rows of a text table, commas or blanks between the fields, without comments and headings."""
+    try:
+        lines = path.read_text().splitlines()
+    except FileNotFoundError:
+        raise StereoSfmError(f"no trajectory at {path}") from None
+    except (UnicodeDecodeError, IsADirectoryError):
+        raise StereoSfmError(f"{path} is not a trajectory in text form") from None
+    rows: list[list[str]] = []
+    for number, line in enumerate(lines, 1):
+        fields = line.replace(",", " ").split()
+        if not fields or line.lstrip().startswith("#") or (number == 1 and fields[0][0].isalpha()):
+            continue
+        if len(fields) < least:
+            raise StereoSfmError(f"{path} line {number}: {len(fields)} fields where at least {least} are needed")
+        rows.append(fields)
+    if not rows:
+        raise StereoSfmError(f"{path} holds no poses")
+    return rows
+
+
+def _trajectory(path: Path, stamps: list[int], values: list[list[str]], order: tuple[int, ...]) -> Trajectory:
+    try:
+        table = np.array(values, float)
+    except ValueError as error:
+        raise StereoSfmError(f"{path}: {error}") from None
+    keep = np.isfinite(table).all(axis=1) & (np.linalg.norm(table[:, 3:], axis=1) > 0.5)
+    if not keep.any():
+        raise StereoSfmError(f"{path} holds no finite pose")
+    stamp_ns: I64 = np.array(stamps, np.int64)[keep]
+    table = table[keep]
+    ascending, first = np.unique(stamp_ns, return_index=True)
+    quaternion = table[first, 3:][:, list(order)]
+    poses = se3.from_rotation_translation(se3.rotation_from_quaternion(quaternion), table[first, :3])
+    return Trajectory(ascending, poses)
+
+
+def read_tum(path: Path) -> Trajectory:
+    """`t tx ty tz qx qy qz qw`, seconds and metres."""
+    rows = _rows(path, 8)
+    try:
+        stamps = [stamp_from_seconds(r[0]) for r in rows]
+    except ValueError as error:
+        raise StereoSfmError(f"{path}: {error}") from None
+    return _trajectory(path, stamps, [r[1:8] for r in rows], _XYZW)
+
+
+def read_euroc(path: Path) -> Trajectory:
+    """`t_ns, x, y, z, qw, qx, qy, qz, ...`: `state_groundtruth_estimate0`, `mocap0`, `vicon0` (the sensor's poses)."""
+    rows = _rows(path, 8)
+    try:
+        stamps = [int(r[0]) for r in rows]
+    except ValueError as error:
+        raise StereoSfmError(f"{path}: {error}") from None
+    return _trajectory(path, stamps, [r[1:8] for r in rows], _WXYZ)
+
+
+def read_kitti(path: Path, stamp_ns: I64 | None = None) -> Trajectory:
+    """Twelve numbers a line, the (3, 4) rows of world_T_cam0.
+
+    Args:
+        path: the file.
+        stamp_ns: (N,) stamps of the lines, as the format has none. Longer or shorter ones are cut to the common part;
+            without them line i is stamped i seconds.
+    """
+    rows = _rows(path, 12)
+    try:
+        matrices: F64 = np.array([r[:12] for r in rows], float).reshape(-1, 3, 4)
+    except ValueError as error:
+        raise StereoSfmError(f"{path}: {error}") from None
+    stamps = np.arange(len(rows), dtype=np.int64) * 10**9 if stamp_ns is None else np.asarray(stamp_ns, np.int64)
+    count = min(len(stamps), len(rows))
+    poses = se3.from_rotation_translation(matrices[:count, :, :3], matrices[:count, :, 3])
+    return Trajectory(stamps[:count], se3.orthonormalize(poses))
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """A trajectory of whichever of the three forms the file has.
+
+    Raises:
+        StereoSfmError: no such file, or not a trajectory.
+    """
+    first = _rows(path, 8)[0]
+    if len(first) == 12:
+        return read_kitti(path)
+    return read_euroc(path) if first[0].isdigit() and len(first[0]) >= 15 else read_tum(path)
+
+
+def moved(trajectory: Trajectory, a_T_b: F64) -> Trajectory:
+    """world_T_a -> world_T_b by the constant (4, 4) `a_T_b` between two points of one rigid body."""
+    return Trajectory(trajectory.stamp_ns.copy(), trajectory.poses @ a_T_b)

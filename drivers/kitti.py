@@ -1,0 +1,74 @@
+"""KITTI odometry: `sequences/NN` with calib.txt, times.txt, image_0 and image_1 (or the colour pair), `poses/NN.txt`.
+
+Layout and conventions: Geiger et al., CVPR 2012, and the odometry development kit. Poses are those of grey camera 0,
+which is the body of the rig here.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+
+from calib.formats.kitti import read_kitti as read_rig
+from drivers.folder_source import FolderSource, Shot, folder_of, list_images, need, pair_in_order
+from drivers.ground_truth import moved, read_kitti, stamp_from_seconds
+from drivers.rig_option import RigOption, chosen_rig
+from stereo_sfm.errors import StereoSfmError
+
+log = logging.getLogger("stereo_sfm")
+
+PERIOD_NS = 100_000_000  # 10 Hz, where times.txt is missing
+
+
+def open_kitti(path: str, sequence: str = "", rig: RigOption = None) -> FolderSource:
+    """Open one sequence.
+
+    Args:
+        path: the sequence's folder, or the data set's root.
+        sequence: which one below the root, where there are several ("00").
+        rig: a rig or rig file that replaces the data set's calibration.
+    """
+    folder = _sequence_folder(folder_of("kitti", path), sequence)
+    name = f"kitti:{folder.resolve().name}"
+    eyes = next((pair for pair in ((0, 1), (2, 3)) if (folder / f"image_{pair[0]}").is_dir()), None)
+    if eyes is None:
+        raise StereoSfmError(f"{folder} has neither image_0 nor image_2")
+    pairs = pair_in_order(name, *(list_images(folder / f"image_{i}") for i in eyes))
+    stamps = _read_times(folder / "times.txt", name, len(pairs))
+    shots = [Shot(stamp, left, right) for stamp, (left, right) in zip(stamps, pairs, strict=False)]
+    chosen = chosen_rig(rig, lambda: read_rig(need(folder / "calib.txt", "KITTI calibration"), eyes=eyes))
+    truth_file = folder.resolve().parent.parent / "poses" / f"{folder.resolve().name}.txt"
+    truth = None
+    if truth_file.is_file():
+        truth = moved(read_kitti(truth_file, np.array(stamps, np.int64)), chosen.body_T_left)
+    return FolderSource(name, chosen, shots, truth)
+
+
+def _sequence_folder(folder: Path, sequence: str) -> Path:
+    if any((folder / f"image_{i}").is_dir() for i in (0, 2)):
+        return folder
+    root = next((folder / p for p in ("sequences", "dataset/sequences") if (folder / p).is_dir()), folder)
+    if sequence:
+        return folder_of("kitti", str(root / sequence))
+    found = sorted(p.name for p in root.iterdir() if any((p / f"image_{i}").is_dir() for i in (0, 2)))
+    if len(found) == 1:
+        return root / found[0]
+    if not found:
+        raise StereoSfmError(f"{root} holds no KITTI sequence (a folder with image_0 and image_1)")
+    raise StereoSfmError(f"{folder} holds sequences {', '.join(found)}: say which, as in {root / found[0]}")
+
+
+def _read_times(path: Path, name: str, count: int) -> list[int]:
+    """At most `count` stamps in ns."""
+    if not path.is_file():
+        log.warning("%s: no times.txt, frames are stamped at 10 Hz", name)
+        return [i * PERIOD_NS for i in range(count)]
+    try:
+        stamps = [stamp_from_seconds(line) for line in path.read_text().split()]
+    except ValueError as error:
+        raise StereoSfmError(f"{path}: {error}") from None
+    if len(stamps) < count:
+        log.warning("%s: %d images but %d lines in times.txt, the common part is used", name, count, len(stamps))
+    return stamps[:count]

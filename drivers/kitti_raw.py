@@ -1,0 +1,129 @@
+"""KITTI raw data: `DATE_drive_NNNN_sync/image_00/data`, calibration files of the date, poses from `oxts` (GPS/IMU).
+
+Geiger et al., IJRR 2013. The oxts packets become poses as in the raw data's development kit: a Mercator projection
+scaled at the first latitude, and rotation Rz(yaw) Ry(pitch) Rx(roll).
+"""
+
+from __future__ import annotations
+
+import logging
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from calib.formats.kitti import read_kitti as read_rig
+from drivers.folder_source import FolderSource, Shot, folder_of, list_images, need, pair_in_order
+from drivers.ground_truth import moved
+from drivers.rig_option import RigOption, chosen_rig
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
+from stereo_sfm.types import F64, Trajectory
+
+log = logging.getLogger("stereo_sfm")
+
+EARTH_RADIUS = 6378137.0  # metres, as the development kit
+CALIBRATION = "calib_cam_to_cam.txt"
+
+
+def open_kitti_raw(path: str, drive: str = "", rig: RigOption = None) -> FolderSource:
+    """Open one drive (synchronised and rectified).
+
+    Args:
+        path: the drive's folder, or the date's folder that holds it.
+        drive: which one below the date, where there are several.
+        rig: a rig or rig file that replaces the data set's calibration.
+    """
+    folder = _drive_folder(folder_of("kitti_raw", path), drive)
+    name = f"kitti_raw:{folder.resolve().name}"
+    eyes = next((e for e in ((0, 1), (2, 3)) if (folder / f"image_0{e[0]}" / "data").is_dir()), None)
+    if eyes is None:
+        raise StereoSfmError(f"{folder} has neither image_00/data nor image_02/data")
+    date = next((p for p in (folder, folder.resolve().parent) if (p / CALIBRATION).is_file()), folder.resolve().parent)
+    own = chosen_rig(rig, lambda: read_rig(need(date / CALIBRATION, "KITTI raw calibration"), eyes=eyes))
+    pairs = pair_in_order(name, *(list_images(folder / f"image_0{i}" / "data") for i in eyes))
+    stamps = _read_times(need(folder / f"image_0{eyes[0]}" / "timestamps.txt", "time stamps"))
+    if len(stamps) != len(pairs):
+        log.warning("%s: %d images but %d time stamps, the common part is used", name, len(pairs), len(stamps))
+    shots = [Shot(stamp, left, right) for stamp, (left, right) in zip(stamps, pairs, strict=False)]
+    return FolderSource(name, own, shots, _ground_truth(folder, date, stamps, own.body_T_left))
+
+
+def _drive_folder(folder: Path, drive: str) -> Path:
+    if any((folder / f"image_0{i}").is_dir() for i in (0, 2)):
+        return folder
+    found = sorted(p for p in folder.glob("*_drive_*") if drive in p.name and p.is_dir())
+    if len(found) != 1:
+        names = ", ".join(p.name for p in found) or "none"
+        raise StereoSfmError(f"{folder} must hold one KITTI raw drive, found {names}: name its folder")
+    return found[0]
+
+
+def _read_times(path: Path) -> list[int]:
+    """Nanoseconds from lines such as 2011-09-26 13:02:25.964389445."""
+    stamps: list[int] = []
+    for line in path.read_text().splitlines():
+        if not line.strip():
+            continue
+        whole, _, fraction = line.strip().partition(".")
+        try:
+            seconds = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC).timestamp()
+            stamps.append(int(seconds) * 10**9 + int(fraction[:9].ljust(9, "0")))
+        except ValueError:
+            raise StereoSfmError(f"{path}: '{line.strip()}' is not a time stamp") from None
+    return stamps
+
+
+def _ground_truth(folder: Path, date: Path, stamps: list[int], cam0_T_left: F64) -> Trajectory | None:
+    """world_T_cam0 with the first IMU pose as the world, or None without oxts or its calibration."""
+    files = [date / "calib_imu_to_velo.txt", date / "calib_velo_to_cam.txt", date / CALIBRATION]
+    packets = sorted((folder / "oxts" / "data").glob("*.txt"))
+    if not packets or not all(f.is_file() for f in files):
+        return None
+    velo_T_imu, cam_T_velo = (_read_rigid(f) for f in files[:2])
+    rectified_T_cam = np.eye(4)
+    rectified_T_cam[:3, :3] = _read_entries(files[2])["R_rect_00"].reshape(3, 3)
+    imu_T_cam0 = se3.inverse(rectified_T_cam @ cam_T_velo @ velo_T_imu)
+    count = min(len(packets), len(stamps))
+    try:
+        world_T_imu = poses_from_oxts(np.array([p.read_text().split()[:6] for p in packets[:count]], float))
+    except ValueError as error:
+        raise StereoSfmError(f"{folder / 'oxts'}: {error}") from None
+    return moved(Trajectory(np.array(stamps[:count], np.int64), world_T_imu), imu_T_cam0 @ cam0_T_left)
+
+
+def poses_from_oxts(packets: F64) -> F64:
+    """(N, 6) latitude, longitude (degrees), altitude, roll, pitch, yaw -> (N, 4, 4) first_T_imu."""
+    latitude, longitude, altitude, roll, pitch, yaw = packets.T
+    scale = np.cos(np.radians(latitude[0]))
+    east = scale * EARTH_RADIUS * np.radians(longitude)
+    north = scale * EARTH_RADIUS * np.log(np.tan(np.pi / 4 + np.radians(latitude) / 2))
+    zero = np.zeros_like(roll)
+    rotation = (
+        se3.so3_exp(np.stack([zero, zero, yaw], 1))
+        @ se3.so3_exp(np.stack([zero, pitch, zero], 1))
+        @ se3.so3_exp(np.stack([roll, zero, zero], 1))
+    )
+    poses = se3.from_rotation_translation(rotation, np.stack([east, north, altitude], 1))
+    return se3.inverse(poses[0]) @ poses
+
+
+def _read_entries(path: Path) -> dict[str, F64]:
+    """`KEY: numbers` lines."""
+    entries: dict[str, F64] = {}
+    for line in path.read_text().splitlines():
+        key, _, values = line.partition(":")
+        try:
+            entries[key.strip()] = np.array(values.split(), float)
+        except ValueError:
+            continue  # dates
+    return entries
+
+
+def _read_rigid(path: Path) -> F64:
+    """`R: nine numbers`, `T: three numbers` -> (4, 4)."""
+    entries = _read_entries(path)
+    try:
+        return se3.from_rotation_translation(entries["R"].reshape(3, 3), entries["T"])
+    except (KeyError, ValueError):
+        raise StereoSfmError(f"{path} must hold R (nine numbers) and T (three)") from None

@@ -1,0 +1,86 @@
+"""TUM RGB-D folders: rgb.txt, depth.txt, groundtruth.txt (Sturm et al., IROS 2012).
+
+The depth images are registered to the colour images as the camera delivers them, lens distortion included: depth pixel
+(u, v) belongs to colour pixel (u, v). The rig's right eye is virtual: the same lens, `VIRTUAL_BASELINE` to the right.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+
+from calib.rig import Rig
+from drivers.folder_source import FolderSource, Shot, folder_of, need, pair_by_stamp
+from drivers.ground_truth import read_tum, stamp_from_seconds
+from drivers.rig_option import RigOption, chosen_rig
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry.cameras import RadTan
+
+log = logging.getLogger("stereo_sfm")
+
+DEPTH_SCALE = 5000.0  # stored units a metre
+MAX_SKEW_NS = 20_000_000  # colour and depth within 20 ms, as the benchmark's own tools
+VIRTUAL_BASELINE = 0.08  # metres, close to the structured-light baseline of the sensor
+
+# fx fy cx cy, k1 k2 p1 p2 k3 of the colour cameras, from the benchmark's calibration page
+INTRINSICS: dict[str, tuple[float, ...]] = {
+    "freiburg1": (517.306408, 516.469215, 318.643040, 255.313989, 0.262383, -0.953104, -0.005358, 0.002628, 1.163314),
+    "freiburg2": (520.908620, 521.007327, 325.141442, 249.701764, 0.231222, -0.784899, -0.003257, -0.000105, 0.917205),
+    "freiburg3": (535.433105, 539.212524, 320.106653, 247.632132, 0.0, 0.0, 0.0, 0.0, 0.0),
+}
+
+
+def open_tum_rgbd(path: str, rig: RigOption = None) -> FolderSource:
+    """Open a TUM RGB-D folder; its name says which of the three cameras took it, else a rig file must be given."""
+    folder = folder_of("tum_rgbd", path)
+    label = folder.resolve().name
+    colour = _read_listing(need(folder / "rgb.txt", "colour image list"))
+    depth = _read_listing(need(folder / "depth.txt", "depth image list"))
+    pairs = pair_by_stamp([s for s, _ in colour], [s for s, _ in depth], MAX_SKEW_NS)
+    if len(pairs) < len(colour):
+        log.warning(
+            "tum_rgbd:%s: %d of %d colour images have no depth image", label, len(colour) - len(pairs), len(colour)
+        )
+    shots = [Shot(colour[i][0], colour[i][1], depth=depth[j][1]) for i, j in pairs]
+    truth = folder / "groundtruth.txt"
+    return FolderSource(
+        f"tum_rgbd:{label}",
+        with_virtual_eye(chosen_rig(rig, lambda: _own_rig(folder, label))),
+        shots,
+        read_tum(truth) if truth.is_file() else None,
+        DEPTH_SCALE,
+    )
+
+
+def with_virtual_eye(rig: Rig) -> Rig:
+    """The rig of a colour camera with depth: a second, virtual eye with the same lens."""
+    if rig.depth and rig.stereo:
+        return rig
+    left_T_right = np.eye(4)
+    left_T_right[0, 3] = VIRTUAL_BASELINE
+    return Rig(rig.left, rig.left, left_T_right, rig.body_T_left.copy(), depth=True, name=rig.name, serial=rig.serial)
+
+
+def _own_rig(folder: Path, label: str) -> Rig:
+    for key, (fx, fy, cx, cy, *distortion) in INTRINSICS.items():
+        if key in label:
+            return Rig(RadTan(640, 480, fx, fy, cx, cy, tuple(distortion)), name=f"tum_rgbd {key}")
+    raise StereoSfmError(
+        f"{folder}: the folder's name does not say which camera took it ({', '.join(INTRINSICS)}): give --rig FILE"
+    )
+
+
+def _read_listing(path: Path) -> list[tuple[int, Path]]:
+    """(stamp_ns, file) of every line."""
+    images: list[tuple[int, Path]] = []
+    for number, line in enumerate(path.read_text().splitlines(), 1):
+        fields = line.split()
+        if not fields or fields[0].startswith("#"):
+            continue
+        try:
+            images.append((stamp_from_seconds(fields[0]), path.parent / fields[1]))
+        except (ValueError, IndexError):
+            raise StereoSfmError(f"{path} line {number} is not 'seconds file'") from None
+    return images
