@@ -21,6 +21,40 @@ class TrackerConfig:
 
 
 @dataclass(frozen=True)
+class FeaturesConfig:
+    """Descriptors and matching of the selectable trackers (tracking/features.py, tracking/matching.py)."""
+
+    kind: str = "sift"  # orb | sift | akaze
+    count: int = 0  # most keypoints of an image; 0: what OpenCV's own default is (ORB 500, the others no limit)
+    ratio: float = 0.8  # Lowe's: best distance below this share of the second best
+    mask_radius_px: float = 0.0  # look for keypoints only this near to the last keyframe's stereo points; 0: everywhere
+    stereo_check: str = "rig"  # epipolar check of left-right matches: rig (calibrated) | ransac (estimated, as the thesis)
+    epipolar_px: float = 1.5  # largest distance to the epipolar line, in pixels at the image centre
+    motion_window_deg: float = 0.0  # drop matches that moved by more than this angle between frames; 0: keep all
+
+
+@dataclass(frozen=True)
+class OdometryConfig:
+    """Which motion estimator, and its policy (tracking/odometry/). "flow" is the default tracker of tracking/tracker.py."""
+
+    method: str = "flow"  # flow | em-r | vp-r | r-um | um | eight-point | pnp
+    reference: str = "frame"  # motion is estimated from the previous "frame" or from the last "keyframe"
+    refine: bool = True  # least squares over all inliers after the minimal solver
+    weighted: bool = True  # weigh 3D points by their stereo uncertainty; False: plain means, as the papers
+    epipolar_px: float = 1.0  # inlier of an essential matrix, in pixels at the image centre
+    inlier_m: float = 0.05  # inlier of 3D-3D estimators at any depth, metres
+    inlier_sigmas: float = 3.0  # and on top this many standard deviations of the stereo depth; 0: a fixed threshold
+    max_samples: int = 512  # RANSAC hypotheses
+    min_inliers: int = 8
+    scale: str = "stereo"  # of translations without metric points: stereo | unit | ground-truth
+    unit_step_m: float = 1.0  # length of one step with scale "unit"
+    keyframe_ratio: float = 0.3  # new keyframe when fewer of the last keyframe's points are tracked
+    keyframe_frames: int = 30  # a keyframe represents at most this many frames
+    keyframe_min_frames: int = 0  # and at least this many
+    keyframe_min_inliers: int = 0  # new keyframe below this number of inliers; 0: the ratio decides
+
+
+@dataclass(frozen=True)
 class MapperConfig:
     """Local mapping (mapping/mapper.py)."""
 
@@ -48,6 +82,8 @@ class Config:
 
     seed: int = 0
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
+    features: FeaturesConfig = field(default_factory=FeaturesConfig)
+    odometry: OdometryConfig = field(default_factory=OdometryConfig)
     mapper: MapperConfig = field(default_factory=MapperConfig)
     loop: LoopConfig = field(default_factory=LoopConfig)
     pipeline: PipelineConfig = field(default_factory=PipelineConfig)
