@@ -46,7 +46,7 @@ def read_gray(path: Path) -> U8:
     if image is None:
         raise UnreadableImage(str(path))
     if image.dtype == np.uint16:
-        return (image >> 8).astype(np.uint8)
+        return np.right_shift(image, 8).astype(np.uint8)
     if image.dtype != np.uint8:
         raise UnreadableImage(f"{path} ({image.dtype} pixels)")
     return image.astype(np.uint8, copy=False)
@@ -177,7 +177,7 @@ def natural_key(path: Path) -> tuple[tuple[int, str], ...]:
 
 
 def pair_in_order(name: str, left: list[Path], right: list[Path]) -> list[tuple[Path, Path]]:
-    """Pair two lists by file name if the names agree, else by position; warns of what has no partner and leaves it out."""
+    """Pair two lists by file name if the names agree, else by position; leaves out, with a warning, the rest."""
     partner = {_without_prefix(p): p for p in right}
     common = [(p, partner[_without_prefix(p)]) for p in left if _without_prefix(p) in partner]
     if not common:

@@ -58,10 +58,12 @@ def find_pair(folder: Path) -> tuple[list[Path], list[Path]] | None:
     if not _has_images(folder):
         return None
     files = list_images(folder)
-    left, right = (
-        [p for p in files if p.stem.startswith(n) and p.stem[len(n) :].strip("_-").isdigit()] for n in PAIRS[0]
-    )
+    left, right = ([p for p in files if _is_numbered(p.stem, prefix)] for prefix in PAIRS[0])
     return (left, right) if left and right else None
+
+
+def _is_numbered(stem: str, prefix: str) -> bool:
+    return stem.startswith(prefix) and stem[len(prefix) :].strip("_-").isdigit()
 
 
 def _has_images(folder: Path) -> bool:

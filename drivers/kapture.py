@@ -70,7 +70,7 @@ def _camera(model: str, p: list[float]) -> Camera:
         fx, fy, cx, cy, *distortion = p[2:]
         return RadTan(width, height, fx, fy, cx, cy, tuple(distortion))
     if model == "PINHOLE":
-        return Pinhole(width, height, *p[2:6])
+        return Pinhole(width, height, p[2], p[3], p[4], p[5])
     if model == "SIMPLE_PINHOLE":
         return Pinhole(width, height, p[2], p[2], p[3], p[4])
     raise StereoSfmError(f"kapture camera model {model} is not supported (OPENCV_FISHEYE, OPENCV, PINHOLE are)")

@@ -14,9 +14,8 @@ def _is_kitti(folder: Path) -> bool:
 
 
 def _is_kitti_raw(folder: Path) -> bool:
-    return any((folder / f"image_0{i}" / "data").is_dir() for i in (0, 2)) or any(
-        folder.glob("*_drive_*/image_00/data")
-    )
+    drives = (folder, *sorted(folder.glob("*_drive_*")))
+    return any((drive / f"image_0{i}" / "data").is_dir() for drive in drives for i in (0, 2))
 
 
 def _is_tum_vi(folder: Path) -> bool:
