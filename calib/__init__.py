@@ -1,1 +1,8 @@
 """The calibration type, its file formats, and the calibration of cameras."""
+
+from __future__ import annotations
+
+from calib.formats import load_rig, save_rig
+from calib.rig import Rig
+
+__all__ = ["Rig", "load_rig", "save_rig"]

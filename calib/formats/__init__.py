@@ -1,0 +1,103 @@
+"""One file per dialect, one table of them: every calibration file becomes a `Rig` and is written from one."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from calib.rig import Rig
+from stereo_sfm.errors import StereoSfmError
+
+# name -> (module, reader, writer, whether it writes a folder). The readers take a path and give a Rig.
+FORMATS: dict[str, tuple[str, str, str, bool]] = {
+    "rig": ("native", "read_native", "write_native", False),
+    "kalibr": ("kalibr", "read_kalibr", "write_kalibr", False),
+    "ros": ("ros", "read_ros", "write_ros", True),
+    "opencv": ("opencv", "read_opencv", "write_opencv", False),
+    "euroc": ("euroc", "read_euroc", "write_euroc", True),
+    "kitti": ("kitti", "read_kitti", "write_kitti", False),
+    "basalt": ("basalt", "read_basalt", "write_basalt", False),
+    "colmap": ("colmap", "read_colmap", "write_colmap", True),
+    "foxglove": ("foxglove", "read_foxglove", "write_foxglove", False),
+    "kapture": ("kapture", "read_kapture", "write_kapture", True),
+}
+
+
+def load_rig(path: Path | str, format: str | None = None, **options: Any) -> Rig:
+    """Read a calibration of any dialect.
+
+    Args:
+        path: a file, or a folder for the dialects that keep one file an eye.
+        format: a name of `FORMATS`; None recognises it from the content.
+        **options: what the dialect's reader takes, such as `size=(width, height)` for OpenCV and KITTI.
+
+    Raises:
+        StereoSfmError: missing, malformed or unrecognised.
+    """
+    path = Path(path).expanduser()
+    if not path.exists():
+        raise StereoSfmError(f"no calibration at {path}")
+    return _function(format or recognise(path), 1)(path, **options)
+
+
+def save_rig(rig: Rig, path: Path | str, format: str | None = None) -> None:
+    """Write a calibration; without `format` a .json is Foxglove's, an .xml OpenCV's, everything else ours."""
+    path = Path(path).expanduser()
+    name = format or {".json": "foxglove", ".xml": "opencv"}.get(path.suffix, "rig")
+    write = _function(name, 2)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write(rig, path)
+    except OSError as error:
+        raise StereoSfmError(f"cannot write the calibration to {path}: {error.strerror}") from None
+
+
+def recognise(path: Path) -> str:
+    """The dialect of a file or folder, by what it holds.
+
+    Raises:
+        StereoSfmError: none fits, or the file cannot be read as text.
+    """
+    found = _recognise_folder(path) if path.is_dir() else _recognise_file(path)
+    if found is None:
+        raise StereoSfmError(f"cannot tell the calibration format of {path}: name it ({', '.join(FORMATS)})")
+    return found
+
+
+def _recognise_folder(path: Path) -> str | None:
+    marks = {
+        "euroc": ("mav0/cam0/sensor.yaml", "cam0/sensor.yaml"),
+        "kitti": ("calib.txt", "calib_cam_to_cam.txt"),
+        "colmap": ("cameras.txt",),
+        "kapture": ("sensors.txt", "sensors/sensors.txt"),
+        "ros": ("left.yaml", "cam0.yaml", "camera0.yaml", "fisheye1.yaml"),
+    }
+    return next((name for name, files in marks.items() if any((path / f).is_file() for f in files)), None)
+
+
+def _recognise_file(path: Path) -> str | None:
+    try:
+        text = path.read_text()
+    except (UnicodeDecodeError, OSError):
+        raise StereoSfmError(f"calibration {path} is not a text file") from None
+    if path.suffix == ".json":
+        marks = {"basalt": '"T_imu_cam"', "opencv": '"opencv-matrix"', "foxglove": '"K"'}
+    elif path.suffix == ".txt":
+        marks = {"kitti": "P0:", "kapture": "camera,"} | {"colmap": "" if path.name == "cameras.txt" else "CAMERA_ID"}
+        marks = {"kitti": "P_rect_"} | marks if "P_rect_" in text else marks
+    else:
+        marks = {
+            "opencv": "opencv-matrix" if "opencv-matrix" in text else "<opencv_storage>",
+            "rig": "stereo_sfm_rig:",
+            "ros": "camera_matrix:",
+            "kalibr": "cam0:",
+        }
+    return next((name for name, mark in marks.items() if mark in text), None)
+
+
+def _function(name: str, which: int) -> Callable[..., Any]:
+    if name not in FORMATS:
+        raise StereoSfmError(f"unknown calibration format '{name}' (known: {', '.join(FORMATS)})")
+    return getattr(importlib.import_module(f"calib.formats.{FORMATS[name][0]}"), str(FORMATS[name][which]))

@@ -1,0 +1,132 @@
+"""What the readers and writers of every dialect share: one-line errors, lens models by coefficients, matrices."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.cameras import Camera, Pinhole, RadTan
+from stereo_sfm.types import F64
+
+
+@contextmanager
+def reading(path: Path, dialect: str) -> Generator[None]:
+    """Turn whatever goes wrong while a calibration is read into one line that names the file and the reason."""
+    try:
+        yield
+    except StereoSfmError:
+        raise
+    except FileNotFoundError as error:
+        raise StereoSfmError(f"no {dialect} calibration: {error.filename or path} does not exist") from None
+    except KeyError as error:
+        raise StereoSfmError(f"{dialect} calibration {path}: key {error.args[0]!r} is missing") from None
+    except (ValueError, TypeError, IndexError, AttributeError, OSError) as error:
+        first_line = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise StereoSfmError(f"{dialect} calibration {path} is malformed: {first_line}") from None
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """A YAML mapping.
+
+    Raises:
+        ValueError: the text is not YAML, or not a mapping.
+    """
+    import yaml
+
+    try:
+        data = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        raise ValueError(f"not YAML{f' (line {mark.line + 1})' if mark else ''}") from None
+    if not isinstance(data, dict):
+        raise ValueError("expected keys and values")
+    return data
+
+
+def read_json(path: Path) -> Any:
+    """Any JSON value; malformed text raises ValueError."""
+    return json.loads(path.read_text())
+
+
+def write_yaml(path: Path, data: dict[str, Any]) -> None:
+    """Keys in the order given, lists on one line, floats with every digit."""
+    import yaml
+
+    path.write_text(yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=200))
+
+
+def numbers(values: Any, count: int | None = None) -> list[float]:
+    """A flat list of finite floats, of length `count` where it is given."""
+    flat = np.asarray(values, float).ravel()
+    if count is not None and len(flat) != count:
+        raise ValueError(f"expected {count} numbers, found {len(flat)}")
+    if not np.isfinite(flat).all():
+        raise ValueError("a number is not finite")
+    return [float(v) for v in flat]
+
+
+def rigid(values: Any) -> F64:
+    """16 (or 12) numbers row by row -> (4, 4) with the rotation made exact when it was rounded in the file."""
+    flat = np.array(numbers(values))
+    if len(flat) not in (12, 16):
+        raise ValueError(f"a transform needs 12 or 16 numbers, found {len(flat)}")
+    transform = np.eye(4)
+    transform[:3] = flat[:12].reshape(3, 4)
+    return exact_rotation(transform)
+
+
+def exact_rotation(transform: F64) -> F64:
+    """(4, 4) whose rotation is orthonormal to rounding; a matrix that is not nearly a rotation raises ValueError."""
+    rotation = transform[:3, :3]
+    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    if error > 1e-3 or np.linalg.det(rotation) < 0:
+        raise ValueError("a rotation matrix is not orthonormal")
+    return se3.orthonormalize(transform) if error > 1e-14 else transform
+
+
+def brown(
+    size: Sequence[int], focal: Sequence[float], centre: Sequence[float], coefficients: Sequence[float]
+) -> Camera:
+    """Pinhole with OpenCV's coefficients k1 k2 p1 p2 [k3 [k4 k5 k6 [s1..s4 [tx ty]]]]; all zero is an ideal pinhole."""
+    d = list(coefficients)
+    if any(d[8:]):
+        raise ValueError("thin-prism and tilt coefficients are not supported: calibrate with at most eight")
+    while d and d[-1] == 0:
+        d.pop()
+    args = int(size[0]), int(size[1]), float(focal[0]), float(focal[1]), float(centre[0]), float(centre[1])
+    return RadTan(*args, tuple(d[:8])) if d else Pinhole(*args)
+
+
+def padded(camera: Camera, count: int) -> list[float]:
+    """The camera's coefficients filled with zeros to `count`."""
+    return [*camera.distortion, *[0.0] * (count - len(camera.distortion))]
+
+
+def rows(matrix: F64) -> list[list[float]]:
+    """(R, C) as nested plain floats."""
+    return [[float(v) for v in row] for row in matrix]
+
+
+def stereo_only(right: Camera | None, dialect: str) -> Camera:
+    """The right eye, or an error for a dialect that only holds pairs."""
+    if right is None:
+        raise StereoSfmError(f"{dialect} holds stereo pairs: this rig has one eye")
+    return right
+
+
+def unsupported(camera: Camera, dialect: str) -> StereoSfmError:
+    """The error for a lens model that a dialect cannot express."""
+    return StereoSfmError(f"{dialect} has no lens model for '{camera.model}': rectify to pinhole first, or choose ours")
+
+
+def pose_dict(a_T_b: F64) -> dict[str, float]:
+    """Basalt's px py pz qx qy qz qw."""
+    quaternion = se3.quaternion_from_rotation(a_T_b[:3, :3])
+    return dict(zip(("px", "py", "pz", "qx", "qy", "qz", "qw"), map(float, [*a_T_b[:3, 3], *quaternion]), strict=True))

@@ -1,0 +1,49 @@
+"""Foxglove CameraCalibration messages as JSON: one message, or a list of two (left, right)."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from calib.formats.camera_info import CameraInfo, check_pair, info_from_rows, info_rows, infos_from_rig, rig_from_infos
+from calib.formats.common import read_json, reading
+from calib.rig import Rig
+
+
+def read_foxglove(path: Path | str) -> Rig:
+    """One rig from one file."""
+    path = Path(path)
+    with reading(path, "Foxglove"):
+        data = read_json(path)
+        messages = data if isinstance(data, list) else [data]
+        left, right = check_pair([_info(m) for m in messages], str(path))
+        return rig_from_infos(left, right, path.stem)
+
+
+def write_foxglove(rig: Rig, path: Path) -> None:
+    """A JSON list with one message an eye. The body's pose has no place there and is lost."""
+    messages = [
+        {
+            "timestamp": {"sec": 0, "nsec": 0},
+            "frame_id": frame,
+            "width": info.width,
+            "height": info.height,
+            "distortion_model": info.distortion_model,
+            **info_rows(info),
+        }
+        for frame, info in zip(("cam0", "cam1"), infos_from_rig(rig, "kannala_brandt"), strict=False)
+    ]
+    path.write_text(json.dumps(messages, indent=2) + "\n")
+
+
+def _info(data: dict[str, Any]) -> CameraInfo:
+    return info_from_rows(
+        data["width"],
+        data["height"],
+        data.get("distortion_model", ""),
+        data["K"],
+        data.get("D", []),
+        data.get("R"),
+        data.get("P"),
+    )

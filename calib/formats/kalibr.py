@@ -1,0 +1,75 @@
+"""Kalibr's camchain.yaml. `T_cn_cnm1` takes points of the previous camera into this one: cam1_T_cam0."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.formats.common import brown, numbers, padded, read_yaml, reading, rigid, rows, unsupported, write_yaml
+from calib.rig import Rig
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.cameras import Camera, KannalaBrandt
+
+
+def read_kalibr(path: Path | str, eyes: tuple[int, int] = (0, 1)) -> Rig:
+    """cam0 and cam1 (or the two neighbours of `eyes`); the body is the IMU when its pose is known."""
+    path = Path(path)
+    with reading(path, "Kalibr"):
+        data = read_yaml(path)
+        first = data[f"cam{eyes[0]}"]
+        left = _camera(first)
+        body_T_left = se3.inverse(rigid(first["T_cam_imu"])) if "T_cam_imu" in first else np.eye(4)
+        second = data.get(f"cam{eyes[1]}")
+        if second is None:
+            return Rig(left, body_T_left=body_T_left, name=path.stem)
+        if "T_cn_cnm1" in second:
+            left_T_right = se3.inverse(rigid(second["T_cn_cnm1"]))
+        elif "T_cam_imu" in first and "T_cam_imu" in second:
+            left_T_right = se3.inverse(body_T_left) @ se3.inverse(rigid(second["T_cam_imu"]))
+        else:
+            raise KeyError("T_cn_cnm1")
+        return Rig(left, _camera(second), left_T_right, body_T_left, name=path.stem)
+
+
+def write_kalibr(rig: Rig, path: Path) -> None:
+    """A camchain with one or two cameras, T_cam_imu being the body's pose."""
+    data = {"cam0": _plain(rig.left, se3.inverse(rig.body_T_left))}
+    if rig.right is not None:
+        right_T_left = se3.inverse(rig.left_T_right)
+        data["cam0"]["cam_overlaps"] = [1]
+        data["cam1"] = _plain(rig.right, right_T_left @ se3.inverse(rig.body_T_left))
+        data["cam1"] |= {"cam_overlaps": [0], "T_cn_cnm1": rows(right_T_left)}
+    write_yaml(path, data)
+
+
+def _camera(data: dict[str, Any]) -> Camera:
+    if data["camera_model"] != "pinhole":
+        raise StereoSfmError(f"Kalibr camera model '{data['camera_model']}' is not supported (pinhole is)")
+    size = numbers(data["resolution"], 2)
+    fx, fy, cx, cy = numbers(data["intrinsics"], 4)
+    model, coefficients = data["distortion_model"], numbers(data.get("distortion_coeffs", []))
+    if model == "equidistant":
+        return KannalaBrandt(int(size[0]), int(size[1]), fx, fy, cx, cy, tuple(numbers(coefficients, 4)))
+    if model in ("radtan", "none"):
+        return brown([int(v) for v in size], (fx, fy), (cx, cy), coefficients if model == "radtan" else ())
+    raise StereoSfmError(f"Kalibr distortion model '{model}' is not supported (radtan, equidistant and none are)")
+
+
+def _plain(camera: Camera, cam_T_imu: Any) -> dict[str, Any]:
+    kinds = {"kannala_brandt": ("equidistant", 4), "radtan": ("radtan", 4), "pinhole": ("none", 0)}
+    if camera.model not in kinds:
+        raise unsupported(camera, "Kalibr")
+    if camera.model == "radtan" and len(camera.distortion) > 4:
+        raise StereoSfmError("Kalibr's radtan has four coefficients: this camera has more, choose opencv, ros or rig")
+    name, count = kinds[camera.model]
+    return {
+        "T_cam_imu": rows(cam_T_imu),
+        "camera_model": "pinhole",
+        "intrinsics": [float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy)],
+        "distortion_model": name,
+        "distortion_coeffs": padded(camera, count),
+        "resolution": [camera.width, camera.height],
+    }

@@ -1,0 +1,65 @@
+"""Our own rig file: YAML, every number exact, every field of `Rig`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from calib.formats.common import numbers, read_yaml, reading, rigid, rows, write_yaml
+from calib.rig import Rig
+from stereo_sfm.geometry.cameras import MODELS, Camera
+
+KEY = "stereo_sfm_rig"
+
+
+def read_native(path: Path) -> Rig:
+    """`rig.yaml` as `write_native` makes it."""
+    with reading(path, "rig"):
+        data = read_yaml(path)
+        if data.get(KEY) != 1:
+            raise ValueError(f"{KEY} is {data.get(KEY)}, this version reads 1")
+        return Rig(
+            left=_camera(data["left"]),
+            right=_camera(data["right"]) if data.get("right") else None,
+            left_T_right=rigid(data["left_T_right"]),
+            body_T_left=rigid(data["body_T_left"]),
+            depth=bool(data.get("depth", False)),
+            name=str(data.get("name", "")),
+            serial=str(data.get("serial", "")),
+        )
+
+
+def write_native(rig: Rig, path: Path) -> None:
+    """Every field; `read_native` gives the same bits back."""
+    write_yaml(
+        path,
+        {
+            KEY: 1,
+            "name": rig.name,
+            "serial": rig.serial,
+            "depth": rig.depth,
+            "left": _plain(rig.left),
+            "right": _plain(rig.right) if rig.right else None,
+            "left_T_right": rows(rig.left_T_right),
+            "body_T_left": rows(rig.body_T_left),
+        },
+    )
+
+
+def _camera(data: dict[str, Any]) -> Camera:
+    model = MODELS.get(data["model"])
+    if model is None:
+        raise ValueError(f"unknown camera model '{data['model']}' (known: {', '.join(MODELS)})")
+    width, height = (int(v) for v in numbers(data["size"], 2))
+    (fx, fy), (cx, cy) = numbers(data["focal"], 2), numbers(data["centre"], 2)
+    return model(width, height, fx, fy, cx, cy, tuple(numbers(data["distortion"])))
+
+
+def _plain(camera: Camera) -> dict[str, Any]:
+    return {
+        "model": camera.model,
+        "size": [camera.width, camera.height],
+        "focal": [float(camera.fx), float(camera.fy)],
+        "centre": [float(camera.cx), float(camera.cy)],
+        "distortion": list(camera.distortion),
+    }

@@ -1,0 +1,122 @@
+"""OpenCV FileStorage (.yml, .xml, .json): M1 D1 M2 D2 R T as cv2.stereoCalibrate returns them, right_T_left = [R T]."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.formats.common import brown, exact_rotation, numbers, padded, reading, unsupported
+from calib.rig import Rig
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.cameras import Camera, KannalaBrandt
+from stereo_sfm.types import F64
+
+_NAMES = {  # ours -> what people write
+    "M1": ("M1", "K1", "cameraMatrix1", "camera_matrix_left", "cameraMatrixL", "camera_matrix", "cameraMatrix"),
+    "M2": ("M2", "K2", "cameraMatrix2", "camera_matrix_right", "cameraMatrixR"),
+    "D1": ("D1", "distCoeffs1", "dist_coeffs_left", "distCoeffsL", "distortion_coefficients", "distCoeffs"),
+    "D2": ("D2", "distCoeffs2", "dist_coeffs_right", "distCoeffsR"),
+    "R": ("R", "rotation"),
+    "T": ("T", "translation"),
+}
+
+
+def read_opencv(path: Path | str, size: tuple[int, int] | None = None) -> Rig:
+    """One file, or `intrinsics.yml` with `extrinsics.yml` beside it as OpenCV's stereo sample writes them.
+
+    Four coefficients with `distortion_model: fisheye` (or equidistant) are Kannala-Brandt, all others Brown's.
+    """
+    path = Path(path)
+    with reading(path, "OpenCV"):
+        data = _matrices(path)
+        extrinsics = path.parent / path.name.replace("intrinsics", "extrinsics")
+        if "R" not in data and extrinsics != path and extrinsics.is_file():
+            data |= {k: v for k, v in _matrices(extrinsics).items() if k in ("R", "T")}
+        if size is None and "size" not in data:
+            raise ValueError("it does not state the image size (image_width, image_height): give the size")
+        width, height = size or numbers(data["size"], 2)
+        fisheye = data.get("model") in ("fisheye", "equidistant", "kannala_brandt")
+        left = _camera(data["M1"], data.get("D1", []), (int(width), int(height)), fisheye)
+        if "M2" not in data:
+            return Rig(left, name=path.stem)
+        right = _camera(data["M2"], data.get("D2", []), (int(width), int(height)), fisheye)
+        right_T_left = np.eye(4)
+        right_T_left[:3, :3] = np.array(numbers(data["R"], 9)).reshape(3, 3)
+        right_T_left[:3, 3] = numbers(data.get("T", []), 3)
+        return Rig(left, right, se3.inverse(exact_rotation(right_T_left)), name=path.stem)
+
+
+def write_opencv(rig: Rig, path: Path) -> None:
+    """M1 D1 M2 D2 R T, the image size, the distortion model."""
+    import cv2
+
+    cameras = [rig.left] if rig.right is None else [rig.left, rig.right]
+    if len({_model(camera) for camera in cameras}) > 1:
+        raise unsupported(cameras[1], "OpenCV with two lens kinds")
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    if not storage.isOpened():
+        raise OSError(0, "not a writable file")
+    try:
+        storage.write("image_width", rig.left.width)
+        storage.write("image_height", rig.left.height)
+        storage.write("distortion_model", _model(rig.left))
+        for i, camera in enumerate(cameras, 1):
+            count = 4 if camera.model == "kannala_brandt" or len(camera.distortion) <= 4 else 8
+            storage.write(f"M{i}", camera.matrix)
+            storage.write(f"D{i}", np.array([padded(camera, count)]))
+        if rig.right is not None:
+            right_T_left = se3.inverse(rig.left_T_right)
+            storage.write("R", right_T_left[:3, :3])
+            storage.write("T", right_T_left[:3, 3:])
+    finally:
+        storage.release()
+
+
+def _model(camera: Camera) -> str:
+    if camera.model == "epipolar":
+        raise unsupported(camera, "OpenCV")
+    return "fisheye" if camera.model == "kannala_brandt" else "plumb_bob"
+
+
+def _matrices(path: Path) -> dict[str, Any]:
+    """Arrays under our names, `size` and `model` where the file has them."""
+    import cv2
+
+    if not path.is_file():
+        raise FileNotFoundError(2, "no such file", str(path))
+    try:
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    except cv2.error as error:
+        raise ValueError(str(error.err or "not a FileStorage")) from None
+    if not storage.isOpened() or not storage.root().isMap():
+        raise ValueError("not an OpenCV FileStorage")
+    data: dict[str, Any] = {}
+    for ours, names in _NAMES.items():
+        node = next((n for n in map(storage.getNode, names) if n.isMap()), None)
+        if node is not None:
+            data[ours] = np.asarray(node.mat(), float).ravel()
+    width, height = storage.getNode("image_width"), storage.getNode("image_height")
+    sizes = [storage.getNode(n) for n in ("image_size", "imageSize", "size")]
+    if not width.empty() and not height.empty():
+        data["size"] = [width.real(), height.real()]
+    else:
+        listed = next((n for n in sizes if n.isSeq() and n.size() == 2), None)
+        if listed is not None:
+            data["size"] = [listed.at(0).real(), listed.at(1).real()]
+    model = storage.getNode("distortion_model")
+    if model.isString():
+        data["model"] = model.string()
+    if "R" in data and len(data["R"]) == 3:
+        data["R"] = cv2.Rodrigues(np.asarray(data["R"]))[0].ravel()
+    storage.release()
+    return data
+
+
+def _camera(matrix: F64, coefficients: Any, size: tuple[int, int], fisheye: bool) -> Camera:
+    k = np.array(numbers(matrix, 9)).reshape(3, 3)
+    d = numbers(coefficients)
+    if fisheye:
+        return KannalaBrandt(*size, k[0, 0], k[1, 1], k[0, 2], k[1, 2], tuple(numbers(d, 4)))
+    return brown(size, (k[0, 0], k[1, 1]), (k[0, 2], k[1, 2]), d)

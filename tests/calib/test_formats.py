@@ -1,0 +1,276 @@
+"""Every dialect: round trips, conventions on known rigs, and one line for what is missing or malformed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib import Rig, load_rig, save_rig
+from calib.formats import FORMATS, recognise
+from calib.formats.euroc import read_euroc
+from calib.formats.kalibr import read_kalibr
+from calib.formats.kapture import read_kapture
+from calib.formats.kitti import read_kitti
+from calib.formats.opencv import read_opencv
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.cameras import Camera, Epipolar, KannalaBrandt, Pinhole, RadTan
+
+NEARLY = se3.exp(np.array([0.0639, 3e-4, -2e-4, 0.004, -0.011, 0.002]))  # left_T_right
+BODY = se3.exp(np.array([0.02, -0.04, 0.01, 1.2, -0.3, 0.9]))  # body_T_left
+FISHEYE = Rig(
+    KannalaBrandt(848, 800, 286.2216, 287.4801, 419.467, 386.9751, (-0.004348, 0.037126, -0.035539, 0.005773)),
+    KannalaBrandt(848, 800, 285.2292, 286.3337, 422.039, 397.016, (-0.005279, 0.038634, -0.036636, 0.006108)),
+    NEARLY,
+    BODY,
+    name="t265",
+    serial="845412110103",
+)
+RADTAN = Rig(
+    RadTan(752, 480, 458.654, 457.296, 367.215, 248.375, (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)),
+    RadTan(752, 480, 457.587, 456.134, 379.999, 255.238, (-0.28368365, 0.07451284, -0.00010473, -3.5559e-05)),
+    NEARLY,
+    BODY,
+)
+RATIONAL = Rig(
+    RadTan(1280, 800, 799.7, 799.1, 640.5, 402.2, (8.1, -3.2, 1e-4, -2e-4, 0.4, 8.4, -2.1, 0.2)),
+    RadTan(1280, 800, 801.2, 800.3, 631.5, 398.2, (7.9, -3.1, -1e-4, 2e-4, 0.3, 8.2, -2.0, 0.1)),
+    NEARLY,
+)
+IDEAL = Rig(
+    Pinhole(1241, 376, 718.856, 718.856, 607.1928, 185.2157),
+    Pinhole(1241, 376, 718.856, 718.856, 607.1928, 185.2157),
+    se3.from_rotation_translation(np.eye(3), np.array([0.537165718864418, 0, 0])),
+)
+RIGS = {"fisheye": FISHEYE, "radtan": RADTAN, "rational": RATIONAL, "ideal": IDEAL}
+FILES = {"rig": "rig.yaml", "kalibr": "camchain.yaml", "opencv": "stereo.yml", "kitti": "calib.txt"}
+NO_BODY = ("ros", "opencv", "kitti", "colmap", "foxglove")  # dialects that have no place for body_T_left
+CANNOT = {("kitti", r) for r in ("fisheye", "radtan", "rational")} | {("kalibr", "rational"), ("euroc", "rational")}
+
+
+def target(folder: Path, name: str) -> Path:
+    return folder / (FILES.get(name) or (name if FORMATS[name][3] else f"{name}.json"))
+
+
+def same_lens(a: Camera, b: Camera, tolerance: float) -> None:
+    assert a.model == b.model
+    assert a.size == b.size
+    np.testing.assert_allclose(a.params, b.params, rtol=tolerance, atol=tolerance)
+
+
+def same_rig(a: Rig, b: Rig, tolerance: float, body: bool) -> None:
+    same_lens(a.left, b.left, tolerance)
+    assert a.right is not None and b.right is not None
+    same_lens(a.right, b.right, tolerance)
+    np.testing.assert_allclose(b.left_T_right, a.left_T_right, rtol=0, atol=max(tolerance, 1e-15))
+    if body:
+        np.testing.assert_allclose(b.body_T_left, a.body_T_left, rtol=0, atol=max(tolerance, 1e-15))
+
+
+@pytest.mark.parametrize("rig_name", RIGS)
+@pytest.mark.parametrize("name", FORMATS)
+def test_round_trip(tmp_path: Path, name: str, rig_name: str) -> None:
+    rig, path = RIGS[rig_name], target(tmp_path, name)
+    if (name, rig_name) in CANNOT:
+        with pytest.raises(StereoSfmError):
+            save_rig(rig, path, name)
+        return
+    save_rig(rig, path, name)
+    assert recognise(path) == name
+    same_rig(rig, load_rig(path), 1e-12, body=name not in NO_BODY)
+
+
+def test_own_file_keeps_every_bit(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    for i in range(50):
+        params = rng.standard_normal(8) * 10.0 ** rng.integers(-9, 3, 8)
+        rig = Rig(
+            KannalaBrandt(848, 800, 286 + params[0], 286, 424, 400 + params[1], tuple(params[2:6] * 1e-3)),
+            Epipolar(900, 800, 300 + params[6], 300, 449.5, 399.5),
+            se3.exp(rng.standard_normal(6)),
+            se3.exp(rng.standard_normal(6)),
+            depth=bool(i % 2),
+            name="a: 'b'",
+            serial="0012",
+        )
+        save_rig(rig, tmp_path / "rig.yaml")
+        back = load_rig(tmp_path / "rig.yaml")
+        assert np.array_equal(back.left.params, rig.left.params) and np.array_equal(back.left_T_right, rig.left_T_right)
+        assert back.right is not None and back.right.model == "epipolar" and back.right.fx == rig.right.fx  # type: ignore[union-attr]
+        assert np.array_equal(back.body_T_left, rig.body_T_left)
+        assert (back.depth, back.name, back.serial) == (rig.depth, rig.name, rig.serial)
+
+
+@pytest.mark.parametrize("name", [n for n in FORMATS if n != "kitti"])
+def test_one_eye(tmp_path: Path, name: str) -> None:
+    rig = Rig(FISHEYE.left)
+    save_rig(rig, target(tmp_path, name), name)
+    back = load_rig(target(tmp_path, name), name)
+    assert back.right is None
+    same_lens(rig.left, back.left, 1e-12)
+
+
+def test_kalibr_chain_is_cam1_from_cam0(data_root: Path) -> None:
+    rig = read_kalibr(data_root / "tum_vi_room1" / "camchain.yaml")
+    assert rig.left_T_right[0, 3] == pytest.approx(0.10092, abs=1e-4)  # the right eye is on the right
+    assert rig.baseline == pytest.approx(0.10095, abs=1e-4)
+    assert isinstance(rig.left, KannalaBrandt) and rig.left.size == (1024, 1024)
+    # the chain and the two T_cam_imu of the same file agree
+    import yaml
+
+    chain = yaml.safe_load((data_root / "tum_vi_room1" / "camchain.yaml").read_text())
+    left_T_imu, right_T_imu = (np.array(chain[c]["T_cam_imu"]) for c in ("cam0", "cam1"))
+    np.testing.assert_allclose(rig.left_T_right, left_T_imu @ np.linalg.inv(right_T_imu), atol=1e-6)
+
+
+def test_euroc_sensors(data_root: Path) -> None:
+    rig = read_euroc(data_root / "euroc_mh01")
+    assert rig.baseline == pytest.approx(0.11007, abs=1e-4)
+    assert rig.left_T_right[0, 3] > 0.1
+    assert rig.body_T_left[0, 3] == pytest.approx(-0.0216401454975)
+    assert load_rig(data_root / "euroc_mh01").left.fx == 458.654
+
+
+def test_kitti_baseline_and_size(data_root: Path) -> None:
+    rig = read_kitti(data_root / "kitti" / "sequences" / "00")
+    assert rig.left.size == (1241, 376)
+    np.testing.assert_allclose(rig.left_T_right[:3, 3], [0.5371657, 0, 0], atol=1e-6)
+
+
+def test_kitti_raw_colour_pair(tmp_path: Path) -> None:
+    p2 = "721.5377 0 609.5593 44.85728 0 721.5377 172.854 0.2163791 0 0 1 0.002745884"
+    p3 = "721.5377 0 609.5593 -339.5242 0 721.5377 172.854 2.199936 0 0 1 0.002729905"
+    size = "S_rect_02: 1242 375\nS_rect_03: 1242 375\n"
+    text = f"calib_time: 09-Jan-2012 13:57:47\n{size}P_rect_02: {p2}\nP_rect_03: {p3}\n"
+    (tmp_path / "calib_cam_to_cam.txt").write_text(text)
+    rig = read_kitti(tmp_path, eyes=(2, 3))
+    assert rig.left.size == (1242, 375)
+    point = np.array([1.0, -2.0, 9.0, 1.0])  # in the reference camera
+    for camera, cam_T_ref, p in (
+        (rig.left, se3.inverse(rig.body_T_left), p2),
+        (rig.right, se3.inverse(rig.body_T_left @ rig.left_T_right), p3),
+    ):
+        h = np.array(p.split(), float).reshape(3, 4) @ point
+        assert camera is not None
+        np.testing.assert_allclose(camera.project((cam_T_ref @ point)[:3]), h[:2] / h[2], atol=1e-9)
+
+
+def test_kapture_of_the_t265(data_root: Path) -> None:
+    extrinsics = se3.from_rotation_translation(np.eye(3), np.array([0.064, 0, 0]))
+    path = data_root / "t265_office" / "kapture_sensors.txt"
+    rig = read_kapture(path, extrinsics)
+    assert rig.right is not None and rig.right.fx == 283.999 and rig.left.cx == 424.355
+    with pytest.raises(StereoSfmError, match="extrinsics are missing"):
+        read_kapture(path)
+
+
+def test_opencv_sample_without_size_or_extrinsics(data_root: Path) -> None:
+    path = data_root / "calib_chessboard_pinhole" / "intrinsics.yml"
+    with pytest.raises(StereoSfmError, match="image size"):
+        read_opencv(path)
+    with pytest.raises(StereoSfmError, match="'R' is missing"):
+        read_opencv(path, size=(640, 480))
+
+
+def test_opencv_pair_is_right_from_left(tmp_path: Path) -> None:
+    import cv2
+
+    save_rig(FISHEYE, tmp_path / "a.yml", "opencv")
+    storage = cv2.FileStorage(str(tmp_path / "a.yml"), cv2.FILE_STORAGE_READ)
+    rotation, translation = storage.getNode("R").mat(), storage.getNode("T").mat()
+    point_left = np.array([0.3, 0.2, 2.0])
+    point_right = rotation @ point_left + translation.ravel()
+    np.testing.assert_allclose(point_right, np.linalg.inv(NEARLY)[:3] @ [*point_left, 1.0], atol=1e-14)
+    assert translation[0, 0] < 0
+
+
+def test_ros_right_projection_has_minus_focal_times_baseline(tmp_path: Path) -> None:
+    import yaml
+
+    save_rig(IDEAL, tmp_path, "ros")
+    right = yaml.safe_load((tmp_path / "right.yaml").read_text())["projection_matrix"]["data"]
+    assert right[3] == pytest.approx(-386.1448, abs=1e-3)  # KITTI's own P1
+    assert right[2] == 607.1928
+
+
+def test_colmap_shifts_half_a_pixel_and_inverts_the_pose(tmp_path: Path) -> None:
+    save_rig(FISHEYE, tmp_path, "colmap")
+    cameras = (tmp_path / "cameras.txt").read_text().splitlines()
+    assert float(cameras[1].split()[6]) == pytest.approx(419.967)
+    assert float((tmp_path / "rigs.txt").read_text().splitlines()[-1].split()[11]) < -0.06  # tx of cam1_from_rig
+
+
+def test_colmap_reads_what_pycolmap_means(tmp_path: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    for rig in (FISHEYE, RADTAN, RATIONAL, IDEAL):
+        save_rig(rig, tmp_path, "colmap")
+        fields = (tmp_path / "cameras.txt").read_text().splitlines()[1].split()
+        theirs = pycolmap.Camera(
+            model=fields[1], width=int(fields[2]), height=int(fields[3]), params=[float(v) for v in fields[4:]]
+        )
+        point = np.array([0.3, -0.2, 1.0])
+        ours = rig.left.project(point) + 0.5
+        np.testing.assert_allclose(np.ravel(theirs.img_from_cam(point)), ours, atol=1e-9)
+
+
+def test_basalt_quaternion_is_camera_to_body(tmp_path: Path) -> None:
+    save_rig(FISHEYE, tmp_path / "b.json", "basalt")
+    value = json.loads((tmp_path / "b.json").read_text())["value0"]
+    assert value["intrinsics"][0]["camera_type"] == "kb4"
+    second = value["T_imu_cam"][1]
+    expected = (BODY @ NEARLY)[:3, 3]
+    np.testing.assert_allclose([second["px"], second["py"], second["pz"]], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("camchain.yaml", "cam0: {camera_model: pinhole}", "'resolution' is missing"),
+        ("camchain.yaml", "cam0: [1, 2\n", "not YAML"),
+        ("camchain.yaml", "cam0: {camera_model: omni, resolution: [1, 2]}", "'omni' is not supported"),
+        (
+            "left.yaml",
+            "camera_matrix: {data: [1, 2]}\nimage_width: 3\nimage_height: 4",
+            "'distortion_model' is missing",
+        ),
+        ("rig.yaml", "stereo_sfm_rig: 2", "this version reads 1"),
+        ("rig.yaml", "hello: 1", "cannot tell the calibration format"),
+        ("calib.txt", "P0: 1 2 3\nP1: 4", "expected 12 numbers"),
+        ("b.json", '{"T_imu_cam": 3}', "'value0' is missing"),
+        ("f.json", '[{"K": [0,0,0,0,0,0,0,0,0], "width": 1, "height": 1}]', "not calibrated"),
+        ("f.json", '{"K": [1,', "malformed"),
+        ("stereo.yml", "%YAML:1.0\nM1: !!opencv-matrix\n", "malformed"),
+    ],
+)
+def test_malformed_files_give_one_line(tmp_path: Path, name: str, content: str, says: str) -> None:
+    (tmp_path / name).write_text(content)
+    with pytest.raises(StereoSfmError, match=says) as caught:
+        load_rig(tmp_path / name)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_file_and_format(tmp_path: Path) -> None:
+    with pytest.raises(StereoSfmError, match="no calibration at"):
+        load_rig("/nonexistent/rig.yaml")
+    with pytest.raises(StereoSfmError, match="does not exist"):
+        read_euroc("/nonexistent")
+    with pytest.raises(StereoSfmError, match="unknown calibration format"):
+        save_rig(IDEAL, tmp_path / "x", "xyz")
+    for name in ("ros", "kalibr", "opencv", "basalt", "euroc"):
+        with pytest.raises(StereoSfmError):
+            save_rig(Rig(Epipolar(10, 10, 5, 5, 5, 5)), tmp_path / "never", name)
+
+
+def test_scaled_rotation_is_refused(tmp_path: Path) -> None:
+    save_rig(FISHEYE, tmp_path / "camchain.yaml", "kalibr")
+    text = (tmp_path / "camchain.yaml").read_text()
+    import yaml
+
+    data = yaml.safe_load(text)
+    data["cam1"]["T_cn_cnm1"][0][0] *= 1.1
+    (tmp_path / "camchain.yaml").write_text(yaml.safe_dump(data))
+    with pytest.raises(StereoSfmError, match="not orthonormal"):
+        load_rig(tmp_path / "camchain.yaml")
