@@ -1,0 +1,99 @@
+"""Part of a source: from a time on, for a time, every k-th frame, at most n."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from types import TracebackType
+from typing import Self
+
+from calib.rig import Rig
+from drivers.source import Source
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.types import StereoImage, Trajectory
+
+
+class SelectedFrames:
+    """A source that passes on some frames of another one. Frames left out on purpose do not count as dropped."""
+
+    def __init__(
+        self,
+        source: Source,
+        start_s: float = 0.0,
+        duration_s: float = float("inf"),
+        frame_skip: int = 1,
+        max_frames: int | None = None,
+    ) -> None:
+        """Args:
+        source: where the frames come from; it is entered and left with this one.
+        start_s: seconds after the first frame at which the part begins.
+        duration_s: seconds that the part lasts.
+        frame_skip: 1 passes every frame, 3 every third.
+        max_frames: how many frames are passed at most.
+        """
+        if frame_skip < 1 or start_s < 0 or duration_s <= 0 or (max_frames is not None and max_frames < 1):
+            raise StereoSfmError("a part of a source needs frame skip and frames of at least 1, and times above 0")
+        self.source = source
+        self.start_ns = round(start_s * 1e9)
+        self.end_ns = None if duration_s == float("inf") else self.start_ns + round(duration_s * 1e9)
+        self.frame_skip = frame_skip
+        self.max_frames = max_frames
+
+    @property
+    def name(self) -> str:
+        """The source's."""
+        return self.source.name
+
+    @property
+    def rig(self) -> Rig:
+        """The source's."""
+        return self.source.rig
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """The source's, whole."""
+        return self.source.ground_truth
+
+    @property
+    def live(self) -> bool:
+        """The source's."""
+        return self.source.live
+
+    @property
+    def frame_count(self) -> int | None:
+        """At most so many; None where the part depends on stamps that are not read yet."""
+        count = self.source.frame_count
+        if count is not None and (self.start_ns or self.end_ns is not None):
+            count = None
+        if count is not None:
+            count = -(-count // self.frame_skip)
+        return count if self.max_frames is None else min(self.max_frames, count or self.max_frames)
+
+    def __enter__(self) -> Self:
+        self.source.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.source.__exit__(kind, error, trace)
+
+    def __iter__(self) -> Iterator[StereoImage]:
+        passed, seen, dropped = 0, 0, 0
+        first_ns: int | None = None
+        for image in self.source:
+            first_ns = image.stamp_ns if first_ns is None else first_ns
+            since = image.stamp_ns - first_ns
+            if self.end_ns is not None and since >= self.end_ns:
+                return
+            if since < self.start_ns:
+                continue
+            dropped += image.dropped_before
+            seen += 1
+            if (seen - 1) % self.frame_skip:
+                continue
+            yield image if dropped == image.dropped_before else replace(image, dropped_before=dropped)
+            dropped = 0
+            passed += 1
+            if passed == self.max_frames:
+                return

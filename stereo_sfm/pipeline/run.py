@@ -1,0 +1,23 @@
+"""The one way into a run, whichever way its stages are wired."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from drivers.source import Source
+from stereo_sfm.config import Config
+from stereo_sfm.pipeline.sinks import Sink
+from stereo_sfm.types import Frame
+
+
+def run(source: Source, config: Config | None = None, sinks: Sequence[Sink] = ()) -> Iterator[Frame]:
+    """Run on an open source and yield a `Frame` for each image; it blocks, and the same input gives the same bits.
+
+    Args:
+        source: an open source, as `drivers.source.open_source` gives it.
+        config: what decides the result; the defaults when omitted.
+        sinks: each gets every message of the run.
+    """
+    from stereo_sfm.pipeline.inline import run_inline
+
+    return run_inline(source, config or Config(), sinks)
