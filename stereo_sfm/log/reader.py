@@ -1,0 +1,197 @@
+"""`LogReader`: messages of an MCAP file by topic and time, whether or not the file was closed."""
+
+from __future__ import annotations
+
+import io
+import logging
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Self
+
+from mcap.reader import SeekingReader
+from mcap.records import Attachment, Channel, Schema, Statistics
+from mcap.summary import Summary
+
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.log import repair
+
+log = logging.getLogger("stereo_sfm")
+
+
+@dataclass(frozen=True)
+class Record:
+    """One message as it lies in the file."""
+
+    topic: str
+    channel: Channel
+    schema: Schema | None
+    log_time: int
+    publish_time: int
+    sequence: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class TopicInfo:
+    """One channel of the file."""
+
+    topic: str
+    schema: str  # full name, "" for none
+    encoding: str
+    count: int
+
+
+class _Mended(io.RawIOBase):
+    """The whole records of a file followed by the index that it lacks, as one stream."""
+
+    def __init__(self, stream: IO[bytes], end: int, tail: bytes) -> None:
+        self._stream, self._end, self._tail, self._at = stream, end, tail, 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
+        base = {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._end + len(self._tail)}[whence]
+        self._at = base + offset
+        return self._at
+
+    def read(self, size: int = -1, /) -> bytes:
+        stop = self._end + len(self._tail) if size < 0 else self._at + size
+        data = b""
+        if self._at < self._end:
+            self._stream.seek(self._at)
+            data = self._stream.read(min(stop, self._end) - self._at)
+        if stop > self._end:
+            data += self._tail[max(self._at - self._end, 0) : stop - self._end]
+        self._at += len(data)
+        return data
+
+
+class LogReader:
+    """Opens a file, closed or cut off. `truncated` says what was found wrong, "" when nothing."""
+
+    def __init__(self, path: Path) -> None:
+        """Open and read the index.
+
+        Raises:
+            StereoSfmError: no such file, or not an MCAP file.
+        """
+        self.path = path
+        try:
+            self._stream: IO[bytes] = path.open("rb")
+        except OSError as error:
+            raise StereoSfmError(f"cannot read {path}: {error.strerror}") from None
+        self.truncated = ""
+        try:
+            repair.check_magic(self._stream, path)
+            self._reader, self.summary = self._open()
+        except BaseException:
+            self._stream.close()
+            raise
+
+    def _open(self) -> tuple[SeekingReader, Summary]:
+        try:
+            reader = SeekingReader(self._stream, validate_crcs=True)
+            summary = reader.get_summary()
+            if summary is not None and _complete(summary):
+                return reader, summary
+        except repair.DAMAGE:
+            pass
+        index = repair.build_index(self._stream)
+        if not index.closed:
+            self.truncated = f"truncated, {index.messages} messages recovered"
+        if index.bad_chunks:
+            self.truncated += f"{', ' if self.truncated else ''}{len(index.bad_chunks)} damaged chunks left out"
+        if self.truncated:
+            log.warning("%s: %s ('stereo-sfm recover' writes a mended copy)", self.path, self.truncated)
+        mended: Any = _Mended(self._stream, index.end, repair.tail(index))
+        reader = SeekingReader(mended, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None
+        return reader, summary
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._stream.close()
+
+    @property
+    def topics(self) -> list[TopicInfo]:
+        """Every channel that has messages, by name."""
+        counts = self._statistics.channel_message_counts
+        rows = [
+            TopicInfo(c.topic, self._schema_name(c), c.message_encoding, counts.get(c.id, 0))
+            for c in self.summary.channels.values()
+        ]
+        return sorted((row for row in rows if row.count), key=lambda row: row.topic)
+
+    @property
+    def time_range(self) -> tuple[int, int]:
+        """First and last log time in nanoseconds, (0, 0) for a file without messages."""
+        return self._statistics.message_start_time, self._statistics.message_end_time
+
+    def messages(
+        self, topics: Collection[str] | None = None, start: int | None = None, until: int | None = None
+    ) -> Iterator[Record]:
+        """Messages in the order of their log time, equal times in file order.
+
+        Args:
+            topics: names, None for all.
+            start: first log time, inclusive.
+            until: last log time, inclusive.
+
+        Raises:
+            StereoSfmError: a damaged chunk in a file that was closed.
+        """
+        found = self._reader.iter_messages(None if topics is None else list(topics), starting_at=start, ending_at=until)
+        try:
+            for schema, channel, m in found:
+                yield Record(channel.topic, channel, schema, m.log_time, m.publish_time, m.sequence, m.data)
+        except repair.DAMAGE as error:
+            raise StereoSfmError(
+                f"{self.path} is damaged ({error}): 'stereo-sfm recover' copies what is whole"
+            ) from None
+
+    def attachment(self, name: str) -> bytes | None:
+        """The content of an attached file, None where there is none."""
+        found: list[Attachment] = [a for a in self._reader.iter_attachments() if a.name == name]
+        return found[0].data if found else None
+
+    def metadata(self, name: str) -> dict[str, str]:
+        """All key-value pairs recorded under a name."""
+        out: dict[str, str] = {}
+        for record in self._reader.iter_metadata():
+            if record.name == name:
+                out.update(record.metadata)
+        return out
+
+    @property
+    def _statistics(self) -> Statistics:
+        assert self.summary.statistics is not None
+        return self.summary.statistics
+
+    def _schema_name(self, channel: Channel) -> str:
+        return self.summary.schemas[channel.schema_id].name if channel.schema_id else ""
+
+
+def _complete(summary: Summary) -> bool:
+    """Whether the index alone tells everything: other writers may leave parts of it out."""
+    statistics = summary.statistics
+    if statistics is None or any(c.schema_id and c.schema_id not in summary.schemas for c in summary.channels.values()):
+        return False
+    if statistics.chunk_count != len(summary.chunk_indexes) or statistics.channel_count != len(summary.channels):
+        return False
+    known = summary.channels.keys()
+    return all(chunk.message_index_offsets.keys() <= known for chunk in summary.chunk_indexes)

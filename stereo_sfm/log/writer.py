@@ -1,0 +1,186 @@
+"""`LogWriter`: the one writer of an MCAP file. Chunks of at most 1 MiB or 0.4 s, each handed to the system at once.
+
+So `kill -9` loses less than half a second, and a full disk leaves a file that is closed properly at the last chunk
+that fitted.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Callable
+from dataclasses import is_dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from mcap.well_known import MessageEncoding, SchemaEncoding
+from mcap.writer import CompressionType, Writer
+from mcap_protobuf.schema import build_file_descriptor_set
+
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.log import repair, schema
+from stereo_sfm.log.topics import BY_NAME
+
+log = logging.getLogger("stereo_sfm")
+
+CHUNK_BYTES = 1 << 20
+CHUNK_NS = 400_000_000
+
+
+class _File:
+    """An unbuffered file: what `write` has returned from survives the death of this process."""
+
+    def __init__(self, path: Path) -> None:
+        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+        self._position = 0
+
+    def write(self, data: bytes) -> int:
+        view = memoryview(data)
+        while view:
+            written = os.write(self._fd, view)
+            self._position += written
+            view = view[written:]
+        return len(data)
+
+    def tell(self) -> int:
+        return self._position
+
+    def flush(self) -> None:
+        """Nothing waits here."""
+
+    def close(self) -> None:
+        os.close(self._fd)
+
+
+class LogWriter:
+    """Writes messages in the order they come; topics are registered when first used."""
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        overwrite: bool = False,
+        compress: bool = True,
+        clock: Callable[[], int] = time.time_ns,
+    ) -> None:
+        """Create the file.
+
+        Args:
+            path: the .mcap file; its folder is made.
+            overwrite: replace an existing file.
+            compress: zstd on every chunk; pointless for raw images of a real camera when speed matters.
+            clock: wall clock in nanoseconds, for `publish_time` only.
+
+        Raises:
+            StereoSfmError: the file exists or cannot be created.
+        """
+        if path.exists() and not overwrite:
+            raise StereoSfmError(f"{path} exists: choose another name or use --overwrite")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = _File(path)
+        except OSError as error:
+            raise StereoSfmError(f"cannot write {path}: {error.strerror}") from None
+        self.path = path
+        self._clock = clock
+        compression = CompressionType.ZSTD if compress else CompressionType.NONE
+        self._mcap = Writer(self._file, chunk_size=4 * CHUNK_BYTES, compression=compression)  # pyright: ignore[reportArgumentType]
+        self._channels: dict[str, int] = {}
+        self._pending_bytes = 0
+        self._pending_since: tuple[int, int] = (0, 0)  # log and publish time of the oldest message not yet written
+        self._closed = False
+        self._guarded(lambda: self._mcap.start(library="stereo-sfm"))
+
+    @property
+    def bytes_written(self) -> int:
+        """Size of the file now."""
+        return self._file.tell()
+
+    def attach(self, name: str, data: str | bytes, media_type: str = "text/plain", log_time: int = 0) -> None:
+        """A whole file inside the file. It is on disk when this returns."""
+        raw = data.encode() if isinstance(data, str) else data
+        self._guarded(lambda: self._mcap.add_attachment(0, log_time, name, media_type, raw))
+
+    def metadata(self, name: str, values: dict[str, str]) -> None:
+        """Key-value pairs about the whole file. They are on disk when this returns."""
+        self._guarded(lambda: self._mcap.add_metadata(name, values))
+
+    def write(self, topic: str, message: Any, log_time: int, sequence: int = 0) -> None:
+        """Append one message.
+
+        Args:
+            topic: a name of `topics.TABLE`.
+            message: a protobuf message, or a dataclass that `schema` turns into one.
+            log_time: sensor stamp in nanoseconds.
+            sequence: frame id (stored modulo 2**32).
+
+        Raises:
+            StereoSfmError: the disk is full; the file is closed and readable.
+        """
+        if self._closed:
+            raise ValueError(f"{self.path} is closed")
+        data: bytes = schema.encode(message) if is_dataclass(message) else message.SerializeToString()
+        now = self._clock()
+        if self._pending_bytes and self._due(len(data), log_time, now):
+            self.flush()
+        if not self._pending_bytes:
+            self._pending_since = (log_time, now)
+        self._pending_bytes += len(data) + 31
+        channel = self._channels.get(topic) or self._register(topic, message)
+        self._guarded(lambda: self._mcap.add_message(channel, log_time, data, now, sequence & 0xFFFFFFFF))
+
+    def flush(self) -> None:
+        """Hand everything written so far to the system."""
+        self._pending_bytes = 0
+        self._guarded(self._mcap.flush)
+
+    def close(self) -> None:
+        """Write the index and close. Safe to call twice."""
+        if self._closed:
+            return
+        self._guarded(self._mcap.finish)
+        self._closed = True
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _due(self, size: int, log_time: int, now: int) -> bool:
+        since_log, since_publish = self._pending_since
+        return (
+            self._pending_bytes + size > CHUNK_BYTES
+            or log_time - since_log >= CHUNK_NS
+            or now - since_publish >= CHUNK_NS
+        )
+
+    def _register(self, topic: str, message: Any) -> int:
+        if is_dataclass(message):
+            name, data = schema.full_name(type(message)), schema.schema_data(type(message))
+        else:
+            name, data = message.DESCRIPTOR.full_name, build_file_descriptor_set(type(message)).SerializeToString()
+        row = BY_NAME.get(topic)
+        if row is None or name not in row.schema.split("|"):
+            raise ValueError(f"topic {topic} with schema {name} is not in the table of topics")
+        schema_id = self._mcap.register_schema(name, SchemaEncoding.Protobuf, data)
+        self._channels[topic] = self._mcap.register_channel(topic, MessageEncoding.Protobuf, schema_id)
+        return self._channels[topic]
+
+    def _guarded(self, action: Callable[[], Any]) -> None:
+        """Run a writing action; when the disk refuses, close the file at its last complete chunk."""
+        try:
+            action()
+        except OSError as error:
+            self._closed = True
+            self._file.close()
+            messages = repair.finish_in_place(self.path)
+            raise StereoSfmError(
+                f"recording stopped, {error.strerror or error}: {self.path} is closed and readable up to there "
+                f"({messages} messages, {self.path.stat().st_size / 1e6:.1f} MB)"
+            ) from None
