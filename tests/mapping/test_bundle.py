@@ -1,0 +1,203 @@
+"""Bundle adjustment against exact truth, against GTSAM, and against its own other paths."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from calib.rig import Rig
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry.cameras import Epipolar
+from stereo_sfm.mapping.bundle import Bundle, BundleConfig, bundle_adjust
+from tests import gtsam_oracle
+from tests.synthetic import Scene, disturb, fisheye_rig, make_scene, pinhole_rig
+
+TIGHT = BundleConfig(rounds=1, huber=0, tolerance=1e-12, iterations=50)
+
+
+def bundle_of(scene: Scene, pose_sigma: float = 0.01, point_sigma: float = 0.03) -> Bundle:
+    poses, points = disturb(scene, pose_sigma, point_sigma)
+    fixed = np.zeros(len(poses), bool)
+    fixed[0] = True
+    return Bundle(poses, fixed, points, scene.obs_kf, scene.obs_pt, scene.uv_left, scene.uv_right)
+
+
+def stereo_only_u(scene: Scene) -> Scene:
+    """The right row unseen, as GenericStereoFactor3D has it."""
+    right = scene.uv_right.copy()
+    right[:, 1] = np.nan
+    return dataclasses.replace(scene, uv_right=right)
+
+
+@pytest.fixture(params=["pinhole", "fisheye", "epipolar"])
+def rig(request: pytest.FixtureRequest) -> Rig:
+    if request.param == "epipolar":
+        cam = Epipolar(900, 600, 300.0, 300.0, 450.0, 300.0)
+        return dataclasses.replace(pinhole_rig(), left=cam, right=cam)
+    return pinhole_rig() if request.param == "pinhole" else fisheye_rig()
+
+
+def test_noise_free_scene_returns_to_truth(rig: Rig) -> None:
+    scene = make_scene(rig, 6, 300, noise_px=0.0)
+    result = bundle_adjust(rig, bundle_of(scene), TIGHT)
+    assert result.cost < 1e-12
+    np.testing.assert_allclose(result.world_T_kf, scene.world_T_kf, atol=1e-8)
+    seen = np.unique(scene.obs_pt)
+    np.testing.assert_allclose(result.points[seen], scene.points[seen], atol=1e-5)
+    assert result.converged
+
+
+@pytest.mark.parametrize("huber", [0.0, 1.345])
+def test_agrees_with_gtsam_on_rectified_stereo(huber: float) -> None:
+    rig = pinhole_rig()
+    scene = stereo_only_u(make_scene(rig, 5, 150, noise_px=0.7, outliers=0.03 if huber else 0.0))
+    bundle = bundle_of(scene)
+    graph = gtsam_oracle.stereo_graph(rig, bundle, huber)
+    expected = gtsam_oracle.optimize(graph, gtsam_oracle.start_values(bundle))
+    result = bundle_adjust(rig, bundle, dataclasses.replace(TIGHT, huber=huber, joint_loss=True))
+    assert result.cost == pytest.approx(graph.error(expected), rel=1e-3)
+    np.testing.assert_allclose(result.world_T_kf, gtsam_oracle.poses(expected, 5), atol=1e-4)
+
+
+@pytest.mark.parametrize("huber", [0.0, 1.345])
+def test_agrees_with_gtsam_on_fisheye(huber: float) -> None:
+    rig = fisheye_rig()
+    scene = make_scene(rig, 5, 120, noise_px=0.7)
+    cam = (scene.points[scene.obs_pt] - scene.world_T_kf[scene.obs_kf, :3, 3])[:, None] @ scene.world_T_kf[
+        scene.obs_kf, :3, :3
+    ]
+    front = cam[:, 0, 2] > 0.5  # GTSAM's fisheye divides by the depth
+    scene = dataclasses.replace(
+        scene,
+        obs_kf=scene.obs_kf[front],
+        obs_pt=scene.obs_pt[front],
+        uv_left=scene.uv_left[front],
+        uv_right=scene.uv_right[front],
+    )
+    bundle = bundle_of(scene)
+    graph = gtsam_oracle.fisheye_graph(rig, bundle, huber)
+    expected = gtsam_oracle.optimize(graph, gtsam_oracle.start_values(bundle))
+    result = bundle_adjust(rig, bundle, dataclasses.replace(TIGHT, huber=huber))
+    assert result.cost == pytest.approx(graph.error(expected), rel=1e-3)
+    np.testing.assert_allclose(result.world_T_kf, gtsam_oracle.poses(expected, 5), atol=1e-4)
+
+
+def test_sparse_and_dense_solvers_agree(rig: Rig) -> None:
+    bundle = bundle_of(make_scene(rig, 20, 400, noise_px=0.5))
+    dense = bundle_adjust(rig, bundle, dataclasses.replace(TIGHT, dense=True))
+    sparse = bundle_adjust(rig, bundle, dataclasses.replace(TIGHT, dense=False))
+    assert sparse.cost == pytest.approx(dense.cost, rel=1e-9)
+    np.testing.assert_allclose(sparse.world_T_kf, dense.world_T_kf, atol=1e-6)
+
+
+def test_outliers_are_found_and_do_no_harm(rig: Rig) -> None:
+    scene = make_scene(rig, 10, 600, noise_px=0.5, outliers=0.1)
+    clean = make_scene(rig, 10, 600, noise_px=0.5)
+    result = bundle_adjust(rig, bundle_of(scene), BundleConfig(rounds=3))
+    reference = bundle_adjust(rig, bundle_of(clean), BundleConfig(rounds=3))
+    counts = np.bincount(scene.obs_pt, minlength=len(scene.points))[scene.obs_pt]
+    wrong = scene.outlier & (counts >= 4)
+    right = ~scene.outlier & (counts >= 4)
+    assert result.inlier[wrong, 0].mean() < 0.05
+    assert result.inlier[right, 0].mean() > 0.97
+    error = np.linalg.norm(result.world_T_kf[:, :3, 3] - scene.world_T_kf[:, :3, 3], axis=1).max()
+    bound = np.linalg.norm(reference.world_T_kf[:, :3, 3] - scene.world_T_kf[:, :3, 3], axis=1).max()
+    assert error < 1.5 * bound + 1e-3
+
+
+def test_fixed_keyframes_stay_to_the_bit(rig: Rig) -> None:
+    bundle = bundle_of(make_scene(rig, 8, 200))
+    fixed = np.array([True, False, True, False, False, True, False, False])
+    result = bundle_adjust(rig, dataclasses.replace(bundle, fixed=fixed))
+    assert np.array_equal(result.world_T_kf[fixed], bundle.world_T_kf[fixed])
+    assert not np.allclose(result.world_T_kf[~fixed], bundle.world_T_kf[~fixed], atol=1e-6)
+    everything = bundle_adjust(rig, dataclasses.replace(bundle, fixed=np.ones(8, bool)))
+    assert np.array_equal(everything.world_T_kf, bundle.world_T_kf)
+    assert everything.cost < everything.initial_cost
+
+
+def test_poses_alone_leave_points_untouched(rig: Rig) -> None:
+    scene = make_scene(rig, 6, 300, noise_px=0.3)
+    bundle = dataclasses.replace(bundle_of(scene), points=scene.points)
+    result = bundle_adjust(rig, bundle, BundleConfig(move_points=False))
+    assert np.array_equal(result.points, scene.points)
+    np.testing.assert_allclose(result.world_T_kf, scene.world_T_kf, atol=5e-3)
+
+
+def test_order_of_observations_does_not_matter(rig: Rig) -> None:
+    bundle = bundle_of(make_scene(rig, 5, 150, outliers=0.05))
+    order = np.random.default_rng(3).permutation(len(bundle.obs_kf))
+    mixed = dataclasses.replace(
+        bundle,
+        **{name: getattr(bundle, name)[order] for name in ("obs_kf", "obs_pt", "uv_left", "uv_right")},
+    )
+    first, second = bundle_adjust(rig, bundle), bundle_adjust(rig, mixed)
+    np.testing.assert_allclose(first.points, second.points, atol=1e-6)
+    assert (first.inlier[order] == second.inlier).mean() > 0.999
+
+
+def test_same_input_same_bits(rig: Rig) -> None:
+    bundle = bundle_of(make_scene(rig, 8, 300, outliers=0.05))
+    for dense in (True, False):
+        config = BundleConfig(dense=dense)
+        first, second = bundle_adjust(rig, bundle, config), bundle_adjust(rig, bundle, config)
+        assert first.world_T_kf.tobytes() == second.world_T_kf.tobytes()
+        assert first.points.tobytes() == second.points.tobytes()
+
+
+def test_sigma_weighs_observations(rig: Rig) -> None:
+    scene = make_scene(rig, 6, 300, noise_px=0.2)
+    left = scene.uv_left.copy()
+    bad = scene.obs_kf % 2 == 1
+    left[bad] += np.random.default_rng(0).normal(0, 5, (int(bad.sum()), 2))
+    bundle = dataclasses.replace(bundle_of(scene), uv_left=left)
+    sigma = np.full((len(left), 2), 0.2)
+    sigma[bad, 0] = 5.0
+    config = dataclasses.replace(TIGHT, huber=0)
+    plain = bundle_adjust(rig, bundle, config)
+    weighed = bundle_adjust(rig, dataclasses.replace(bundle, sigma=sigma), config)
+
+    def error(poses: np.ndarray) -> float:
+        return float(np.linalg.norm(poses[:, :3, 3] - scene.world_T_kf[:, :3, 3]))
+
+    assert error(weighed.world_T_kf) < 0.5 * error(plain.world_T_kf)
+
+
+def test_undetermined_points_and_keyframes_stay(rig: Rig) -> None:
+    """A point on one ray and a keyframe that sees nothing are no reason to fail."""
+    scene = make_scene(rig, 5, 100)
+    bundle = bundle_of(scene)
+    keep = (bundle.obs_kf != 3) & (bundle.obs_pt != 7)
+    row = int(np.flatnonzero(scene.obs_kf == 0)[0])
+    bundle = dataclasses.replace(
+        bundle,
+        obs_kf=np.append(bundle.obs_kf[keep], 0),
+        obs_pt=np.append(bundle.obs_pt[keep], 7),
+        uv_left=np.vstack([bundle.uv_left[keep], scene.uv_left[row]]),
+        uv_right=np.vstack([bundle.uv_right[keep], [[np.nan, np.nan]]]),
+    )
+    result = bundle_adjust(rig, bundle)
+    assert np.isfinite(result.points).all()
+    np.testing.assert_allclose(result.world_T_kf[3], bundle.world_T_kf[3], atol=1e-12)
+    assert not result.inlier[-1, 1]
+
+
+def test_bad_tables_are_refused() -> None:
+    rig = pinhole_rig()
+    bundle = bundle_of(make_scene(rig, 3, 50))
+    with pytest.raises(StereoSfmError, match="different lengths"):
+        bundle_adjust(rig, dataclasses.replace(bundle, obs_kf=bundle.obs_kf[:-1]))
+    with pytest.raises(StereoSfmError, match="keyframe that is not there"):
+        bundle_adjust(rig, dataclasses.replace(bundle, obs_kf=bundle.obs_kf + 1))
+
+
+def test_empty_bundle_is_its_own_answer() -> None:
+    rig = pinhole_rig()
+    none = np.zeros(0, np.int64)
+    bundle = Bundle(
+        np.eye(4)[None], np.zeros(1, bool), np.zeros((2, 3)), none, none, np.zeros((0, 2)), np.zeros((0, 2))
+    )
+    result = bundle_adjust(rig, bundle)
+    assert result.cost == 0.0 and np.array_equal(result.points, bundle.points)
