@@ -71,7 +71,7 @@ def read_depth(path: Path, scale: float) -> F32:
 class FolderSource:
     """Frames from files, in stamp order. A frame with an unreadable file is dropped with a warning and counted."""
 
-    live = False
+    live: bool = False
 
     def __init__(
         self,
@@ -85,15 +85,11 @@ class FolderSource:
             raise StereoSfmError(f"{name}: no images")
         self.name = name
         self.rig = rig
-        self.ground_truth = ground_truth
+        self.ground_truth: Trajectory | None = ground_truth
         self.shots = sorted(shots, key=lambda shot: shot.stamp_ns)
         self.depth_scale = depth_scale
+        self.frame_count: int | None = len(self.shots)
         self._check_first()
-
-    @property
-    def frame_count(self) -> int | None:
-        """Frames that the folder lists."""
-        return len(self.shots)
 
     def __enter__(self) -> Self:
         return self

@@ -38,39 +38,26 @@ class SelectedFrames:
         self.end_ns = None if duration_s == float("inf") else self.start_ns + round(duration_s * 1e9)
         self.frame_skip = frame_skip
         self.max_frames = max_frames
+        self._adopt()
 
-    @property
-    def name(self) -> str:
-        """The source's."""
-        return self.source.name
+    def _adopt(self) -> None:
+        self.name: str = self.source.name
+        self.rig: Rig = self.source.rig
+        self.ground_truth: Trajectory | None = self.source.ground_truth
+        self.live: bool = self.source.live
+        self.frame_count: int | None = self._count()
 
-    @property
-    def rig(self) -> Rig:
-        """The source's."""
-        return self.source.rig
-
-    @property
-    def ground_truth(self) -> Trajectory | None:
-        """The source's, whole."""
-        return self.source.ground_truth
-
-    @property
-    def live(self) -> bool:
-        """The source's."""
-        return self.source.live
-
-    @property
-    def frame_count(self) -> int | None:
-        """At most so many; None where the part depends on stamps that are not read yet."""
+    def _count(self) -> int | None:
+        """At most so many frames; None where the part depends on stamps that are not read yet."""
         count = self.source.frame_count
-        if count is not None and (self.start_ns or self.end_ns is not None):
-            count = None
-        if count is not None:
-            count = -(-count // self.frame_skip)
-        return count if self.max_frames is None else min(self.max_frames, count or self.max_frames)
+        if count is None or self.start_ns or self.end_ns is not None:
+            return self.max_frames
+        count = -(-count // self.frame_skip)
+        return count if self.max_frames is None else min(self.max_frames, count)
 
     def __enter__(self) -> Self:
         self.source.__enter__()
+        self._adopt()
         return self
 
     def __exit__(
