@@ -1,0 +1,77 @@
+"""How a pixel moves with a camera's own parameters: what calibration needs beside `Camera.project_jacobian`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stereo_sfm.geometry.cameras import Camera
+from stereo_sfm.types import F64
+
+
+def parameter_vector(camera: Camera) -> F64:
+    """(4 + n,) fx fy cx cy and the n distortion coefficients the camera was made with."""
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])
+
+
+def with_parameters(camera: Camera, vector: F64) -> Camera:
+    """The same kind of camera with other parameters, in the order of `parameter_vector`."""
+    fx, fy, cx, cy, *distortion = (float(v) for v in vector)
+    return type(camera)(camera.width, camera.height, fx, fy, cx, cy, tuple(distortion))
+
+
+def parameter_jacobian(camera: Camera, points: F64) -> F64:
+    """Derivative of the pixel by fx fy cx cy and the distortion coefficients.
+
+    Args:
+        camera: of any model.
+        points: (N, 3) in the camera.
+
+    Returns:
+        (N, 2, 4 + n); rows of points the camera cannot see are not meaningful.
+    """
+    count = len(camera.distortion)
+    jac = np.zeros((len(points), 2, 4 + count))
+    distorted, by_coefficients = _distorted(camera, points)
+    jac[:, 0, 0], jac[:, 1, 1] = distorted[:, 0], distorted[:, 1]
+    jac[:, 0, 2] = jac[:, 1, 3] = 1.0
+    jac[:, :, 4:] = by_coefficients * np.array([camera.fx, camera.fy])[:, None]
+    return jac
+
+
+def _distorted(camera: Camera, points: F64) -> tuple[F64, F64]:
+    """(N, 2) pixel before focal length and centre, and its derivative (N, 2, n) by the coefficients."""
+    uv = camera.project(points)
+    distorted = (uv - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+    if camera.model == "kannala_brandt":
+        radius = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-300)
+        theta = np.arctan2(radius, points[:, 2])
+        powers = theta[:, None] ** np.arange(3, 3 + 2 * len(camera.distortion), 2)  # theta^3, theta^5, ...
+        direction = points[:, :2] / radius[:, None]
+        return distorted, direction[:, :, None] * powers[:, None, :]
+    if camera.model == "radtan":
+        return distorted, _brown(camera, points)
+    return distorted, np.zeros((len(points), 2, 0))
+
+
+def _brown(camera: Camera, points: F64) -> F64:
+    """(N, 2, n) of OpenCV's k1 k2 p1 p2 k3 k4 k5 k6."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, y = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
+    r2 = x * x + y * y
+    k1, k2, _, _, k3, k4, k5, k6 = camera.params[4:12]
+    denominator = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    gain = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / denominator
+    xy = np.stack([x, y], -1)
+    rising = (r2 / denominator)[:, None] * xy  # by k1; k2 and k3 follow with r2, r4
+    falling = -(gain * r2 / denominator)[:, None] * xy  # by k4
+    columns = [
+        rising,
+        rising * r2[:, None],
+        np.stack([2 * x * y, r2 + 2 * y * y], -1),
+        np.stack([r2 + 2 * x * x, 2 * x * y], -1),
+        rising * (r2 * r2)[:, None],
+        falling,
+        falling * r2[:, None],
+        falling * (r2 * r2)[:, None],
+    ]
+    return np.stack(columns[: len(camera.distortion)], -1)
