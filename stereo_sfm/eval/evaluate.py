@@ -1,0 +1,172 @@
+"""Everything that is said about one estimate and one reference, and how it is printed."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.eval import metrics
+from stereo_sfm.eval.align import Alignment, align
+from stereo_sfm.eval.associate import MAX_DIFFERENCE_NS, associate
+from stereo_sfm.eval.metrics import Drift, RetailErrors, Statistics
+from stereo_sfm.types import F64, Trajectory
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Errors of an estimate. Absolute errors are after `alignment`, all others do not depend on it."""
+
+    mode: str  # of eval.align.MODES
+    alignment: Alignment
+    length_m: float  # of the associated reference
+    frames: int  # associated
+    ape_m: Statistics  # absolute position error: its rmse is the ATE
+    ape_deg: Statistics
+    ate_percent: float  # of the path
+    ate_sim3_m: float  # the ATE with scale aligned as well; NaN where it is not defined
+    sim3_scale: float
+    rpe_m: Statistics  # per `rpe_delta`
+    rpe_deg: Statistics
+    rpe_delta: str
+    drift: Drift | None
+    retail: RetailErrors | None
+    estimate: Trajectory  # aligned, at the associated stamps
+    reference: Trajectory
+
+    def errors_m(self) -> F64:
+        """(frames,) absolute position error."""
+        return metrics.absolute_errors(self.estimate.poses, self.reference.poses)[0]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON; NaN becomes None."""
+        skip = {"estimate", "reference", "alignment"}
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in skip}
+        values["scale"] = self.alignment.scale
+        return {name: _plain(value) for name, value in values.items()}
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {k: _plain(v) for k, v in dataclasses.asdict(value).items()}
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    return list(value) if isinstance(value, tuple) else value
+
+
+def evaluate(
+    estimate: Trajectory,
+    reference: Trajectory,
+    mode: str = "se3",
+    delta: str = "1f",
+    interpolate: bool = True,
+    max_difference_ns: int = MAX_DIFFERENCE_NS,
+) -> Evaluation:
+    """Compare two trajectories of the same frame (world_T_cam0 with world_T_cam0).
+
+    Args:
+        estimate: what is judged. reference: the truth.
+        mode: the alignment, one of eval.align.MODES.
+        delta: what relative errors are taken over: `5f` frames or `1m` metres.
+        interpolate, max_difference_ns: see `associate`.
+
+    Raises:
+        StereoSfmError: nothing in common, or the alignment is not determined.
+    """
+    estimate, reference = associate(estimate, reference, interpolate, max_difference_ns)
+    alignment = align(estimate, reference, mode)
+    pairs = _pairs(reference.poses, delta)
+    rpe_m, rpe_rad = metrics.relative_errors(estimate.poses, reference.poses, pairs)
+    drift = metrics.kitti_drift(estimate.poses, reference.poses)
+    retail = metrics.retail_errors(estimate.poses, reference.poses)
+    sim3_ate, sim3_scale = _sim3(estimate, reference)
+    aligned = alignment.apply(estimate)
+    ape_m, ape_rad = metrics.absolute_errors(aligned.poses, reference.poses)
+    ape = Statistics.of(ape_m)
+    length = reference.length
+    return Evaluation(
+        mode=mode,
+        alignment=alignment,
+        length_m=length,
+        frames=len(estimate),
+        ape_m=ape,
+        ape_deg=Statistics.of(np.degrees(ape_rad)),
+        ate_percent=100 * ape.rmse / length if length > 0 else math.nan,
+        ate_sim3_m=sim3_ate,
+        sim3_scale=sim3_scale,
+        rpe_m=Statistics.of(rpe_m),
+        rpe_deg=Statistics.of(np.degrees(rpe_rad)),
+        rpe_delta=delta,
+        drift=drift,
+        retail=retail,
+        estimate=aligned,
+        reference=reference,
+    )
+
+
+def _sim3(estimate: Trajectory, reference: Trajectory) -> tuple[float, float]:
+    try:
+        similarity = align(estimate, reference, "sim3")
+    except StereoSfmError:
+        return math.nan, math.nan
+    errors = metrics.absolute_errors(similarity.apply(estimate).poses, reference.poses)[0]
+    return Statistics.of(errors).rmse, similarity.scale
+
+
+def _pairs(reference: F64, delta: str) -> metrics.I64:
+    number, unit = delta[:-1], delta[-1:]
+    try:
+        value = float(number)
+    except ValueError:
+        value = 0.0
+    if unit == "f" and value >= 1 and value == int(value):
+        return metrics.pairs_by_frames(len(reference), int(value))
+    if unit == "m" and value > 0:
+        return metrics.pairs_by_metres(reference, value)
+    raise StereoSfmError(f"--delta takes frames or metres, as in 1f or 0.5m, got '{delta}'")
+
+
+def table(result: Evaluation) -> list[tuple[str, str]]:
+    """What is said, line by line, as (name, value with unit)."""
+    ape, angle = result.ape_m, result.ape_deg
+    rows = [
+        ("compared", f"{result.frames} frames over {length(result.length_m)}, alignment {result.mode}"),
+        ("ATE", f"{length(ape.rmse)} rmse, {length(ape.max)} max ({result.ate_percent:.3f} % of the path)"),
+        ("ATE, Sim(3)", f"{length(result.ate_sim3_m)} rmse, scale {result.sim3_scale:.5f}"),
+        ("rotation", f"{angle.rmse:.3f} deg rmse, {angle.max:.3f} deg max"),
+        (f"RPE per {result.rpe_delta}", f"{length(result.rpe_m.rmse)} rmse, {result.rpe_deg.rmse:.4f} deg rmse"),
+    ]
+    if result.drift is not None:
+        low, high = result.drift.lengths_m[0], result.drift.lengths_m[-1]
+        note = "KITTI's lengths" if result.drift.standard else "shorter than KITTI's: the path is"
+        rows.append(
+            (
+                "drift",
+                f"{result.drift.translation_percent:.3f} %, {result.drift.rotation_deg_per_m:.5f} deg/m over "
+                f"{result.drift.segments} segments of {low:g} to {high:g} m ({note})",
+            )
+        )
+    if result.retail is not None:
+        e = result.retail
+        rows += [
+            (
+                "frame to frame (eq. 23, 24)",
+                f"{e.relative_rotation_rad_mean:.3e} ± {e.relative_rotation_rad_std:.1e} rad, "
+                f"{e.relative_translation_m2_mean:.3e} ± {e.relative_translation_m2_std:.1e} m²",
+            ),
+            ("last frame (eq. 23, 24)", f"{e.absolute_rotation_rad:.3e} rad, {e.absolute_translation_m2:.3e} m²"),
+        ]
+    return rows
+
+
+def length(metres: float) -> str:
+    """Metres for people: 4.6 mm, 27.1 mm, 0.449 m, 92.0 m."""
+    if not math.isfinite(metres):
+        return "not defined"
+    if abs(metres) < 0.1:
+        return f"{metres * 1e3:.2f} mm"
+    return f"{metres:.3f} m" if abs(metres) < 10 else f"{metres:.1f} m"

@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evo.tools import file_interface
+
+from drivers.ground_truth import read_euroc, read_kitti, read_trajectory, read_tum, stamp_from_seconds
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.export.trajectories import fill_missing, seconds, write_euroc, write_kitti, write_tum
+from stereo_sfm.geometry import se3
+from stereo_sfm.types import Trajectory
+
+
+@pytest.fixture
+def walk() -> Trajectory:
+    rng = np.random.default_rng(3)
+    stamps = 1_553_180_224_360_915_899 + np.arange(20, dtype=np.int64) * 33_333_337
+    return Trajectory(stamps, se3.exp(rng.normal(size=(20, 6))))
+
+
+def test_tum_keeps_every_nanosecond_and_evo_reads_it(walk: Trajectory, tmp_path: Path) -> None:
+    path = tmp_path / "t.tum"
+    write_tum(path, walk)
+    for read in (read_tum(path), read_trajectory(path)):
+        assert read.stamp_ns.tolist() == walk.stamp_ns.tolist()
+        assert read.poses == pytest.approx(walk.poses, abs=1e-8)
+    assert np.array(file_interface.read_tum_trajectory_file(path).poses_se3) == pytest.approx(walk.poses, abs=1e-8)
+
+
+def test_euroc_round_trip_and_evo(walk: Trajectory, tmp_path: Path) -> None:
+    path = tmp_path / "t.csv"
+    write_euroc(path, walk)
+    for read in (read_euroc(path), read_trajectory(path)):
+        assert read.stamp_ns.tolist() == walk.stamp_ns.tolist()
+        assert read.poses == pytest.approx(walk.poses, abs=1e-8)
+    assert np.array(file_interface.read_euroc_csv_trajectory(path).poses_se3) == pytest.approx(walk.poses, abs=1e-8)
+
+
+def test_kitti_is_relative_to_the_first_pose_and_evo_reads_it(walk: Trajectory, tmp_path: Path) -> None:
+    path = tmp_path / "t.txt"
+    write_kitti(path, walk.poses)
+    expected = se3.inverse(walk.poses[0]) @ walk.poses
+    assert read_kitti(path, walk.stamp_ns).poses == pytest.approx(expected, abs=1e-8)
+    assert read_trajectory(path).poses == pytest.approx(expected, abs=1e-8)
+    assert np.array(file_interface.read_kitti_poses_file(path).poses_se3) == pytest.approx(expected, abs=1e-8)
+
+
+def test_seconds_are_exact_both_ways() -> None:
+    for stamp in (0, 1, 1_553_180_224_360_915_899, 999_999_999, -1_500_000_000):
+        assert stamp_from_seconds(seconds(stamp)) == stamp
+    assert stamp_from_seconds("1.037359e-01") == 103_735_900
+    with pytest.raises(ValueError, match="not a time"):
+        stamp_from_seconds("yesterday")
+
+
+def test_missing_frames_are_filled_on_the_geodesic() -> None:
+    poses = se3.exp(np.outer([0, 1, 4, 5], [0.1, 0, 0.5, 0, 0.1, 0]))
+    filled = fill_missing(np.array([10, 11, 14, 15]), poses)
+    assert filled == pytest.approx(se3.exp(np.outer(np.arange(6), [0.1, 0, 0.5, 0, 0.1, 0])), abs=1e-12)
+    assert len(fill_missing(np.array([0, 3, 9]), poses[:3], step=3)) == 4
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "holds no poses"),
+        ("1 2 3\n", "line 1: 3 fields"),
+        ("1 0 0 0 0 0 0 one\n", "one"),
+        ("1 0 0 0 0 0 0 0\n", "no finite pose"),
+        ("now 0 0 0 0 0 0 1\nthen 0 0 0 0 0 0 1\n", "not a time"),
+    ],
+)
+def test_malformed_files_are_one_line(text: str, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "bad.tum"
+    path.write_text(text)
+    with pytest.raises(StereoSfmError, match=message) as error:
+        read_trajectory(path)
+    assert "\n" not in str(error.value)
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(StereoSfmError, match="no trajectory at"):
+        read_trajectory(tmp_path / "none.tum")
