@@ -1,0 +1,147 @@
+"""What a sensor does to a picture: motion blur, exposure, vignetting, noise, eight bits. Random by (seed, frame, eye)."""
+
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportMissingTypeArgument=false
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.sim.kernels import njit
+from drivers.sim.render import Eye, View
+from stereo_sfm.types import F32, F64, U8
+
+
+@dataclass(frozen=True)
+class Effects:
+    """A sensor's faults; all of them off is `CLEAN`."""
+
+    exposure_s: float = 0.004  # motion blur and StereoImage.exposure_us
+    gain: float = 1.0  # brightness of the whole picture
+    drift: float = 0.12  # relative swing of the exposure over time
+    vignetting: float = 0.35  # loss at the edge of the field
+    read_noise: float = 0.9  # standard deviation in grey levels, in the dark
+    shot_noise: float = 0.02  # variance in grey levels per grey level
+    black_level: float = 3.0
+    drop: float = 0.0  # fraction of frames that never arrive
+
+
+CLEAN = Effects(0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+class Sensor:
+    """One eye's lens and sensor: what depends on the pixel only."""
+
+    def __init__(self, eye: Eye, effects: Effects) -> None:
+        grid = eye.bearings
+        camera = eye.camera
+        corners = camera.unproject(np.array([[0, camera.cy], [camera.width - 1, camera.cy]]))
+        edge = np.nanmax(np.arccos(np.clip(corners[:, 2], -1, 1))) if np.isfinite(corners[:, 2]).any() else 1.6
+        angle = np.arccos(np.clip(np.nan_to_num(grid[..., 2], nan=-1.0), -1, 1))
+        fall = 1 - effects.vignetting * np.minimum(angle / edge, 1.2) ** 2
+        rim = np.clip((np.deg2rad(92.5) - angle) / np.deg2rad(6.0), 0, 1)
+        soft = rim * rim * (3 - 2 * rim) if effects.vignetting > 0 else 1.0
+        self.vignette = np.where(np.isfinite(grid[..., 2]), fall * soft, 0).astype(np.float32)  # (H, W)
+        self.effects = effects
+        self._jacobian: F32 | None = None  # (H, W, 2, 3) d pixel / d bearing
+        if effects.exposure_s > 0:
+            self._jacobian = np.nan_to_num(camera.project_jacobian(grid)[1]).astype(np.float32)
+
+    def expose(self, view: View, twist: F64, brightness: float, rng: np.random.Generator) -> U8:
+        """A picture as the sensor gives it.
+
+        Args:
+            twist: (6,) velocity of the eye in its own axes, metres and radians a second.
+            brightness: exposure relative to the clean picture.
+        """
+        effects = self.effects
+        image = view.image
+        if self._jacobian is not None:
+            blurred = np.empty_like(image)
+            _blur(image, view.depth, self._jacobian, twist * effects.exposure_s, blurred)
+            image = blurred
+        noisy = effects.read_noise > 0 or effects.shot_noise > 0
+        noise = rng.standard_normal(image.shape, np.float32) if noisy else np.zeros((1, 1), np.float32)
+        out = np.empty(image.shape, np.uint8)
+        _digitise(
+            image, self.vignette, noise, brightness, effects.read_noise**2, effects.shot_noise, effects.black_level, out
+        )
+        return out
+
+
+def brightness(effects: Effects, seconds: float, seed: int) -> float:
+    """Exposure over time: two slow swings, the same at the same time."""
+    phase = np.random.default_rng([seed, 91]).uniform(0, 2 * np.pi, 2)
+    swing = 0.7 * math.sin(2 * math.pi * seconds / 13.0 + phase[0]) + 0.3 * math.sin(
+        2 * math.pi * seconds / 4.1 + phase[1]
+    )
+    return effects.gain * (1 + effects.drift * swing)
+
+
+@njit
+def _blur(image, depth, jacobian, move, out):
+    """Average along each pixel's path while the shutter is open, symmetric about mid-exposure.
+
+    A point at depth t along bearing b moves by -(v + w x (t b)) in the eye; the pixel follows by J(b) times that / t.
+    """
+    h, w = image.shape
+    for y in range(h):
+        for x in range(w):
+            t = depth[y, x]
+            j = jacobian[y, x]
+            out[y, x] = image[y, x]
+            if not (t > 0):
+                continue
+            # J(b) annihilates b, and J(b) maps a change of the bearing to pixels: use the tangent part only.
+            v0, v1, v2 = move[0] / t, move[1] / t, move[2] / t
+            b = _bearing(j)
+            p0 = -(v0 + move[4] * b[2] - move[5] * b[1])
+            p1 = -(v1 + move[5] * b[0] - move[3] * b[2])
+            p2 = -(v2 + move[3] * b[1] - move[4] * b[0])
+            fu = j[0, 0] * p0 + j[0, 1] * p1 + j[0, 2] * p2
+            fv = j[1, 0] * p0 + j[1, 1] * p1 + j[1, 2] * p2
+            n = int(math.sqrt(fu * fu + fv * fv) * 1.5) + 1
+            if n < 2:
+                continue
+            n = min(n, 24)
+            total = 0.0
+            for k in range(n):
+                a = (k + 0.5) / n - 0.5
+                total += _at(image, x + a * fu, y + a * fv)
+            out[y, x] = total / n
+
+
+@njit
+def _bearing(j):
+    """Unit vector that both rows of a projection's derivative annihilate (up to the sign, forward half first)."""
+    a = j[0, 1] * j[1, 2] - j[0, 2] * j[1, 1]
+    b = j[0, 2] * j[1, 0] - j[0, 0] * j[1, 2]
+    c = j[0, 0] * j[1, 1] - j[0, 1] * j[1, 0]
+    n = math.sqrt(a * a + b * b + c * c) + 1e-30
+    return a / n, b / n, c / n
+
+
+@njit
+def _at(image, x, y):
+    h, w = image.shape
+    x, y = min(max(x, 0.0), w - 1.001), min(max(y, 0.0), h - 1.001)
+    x0, y0 = int(x), int(y)
+    a, b = x - x0, y - y0
+    top = image[y0, x0] * (1 - a) + image[y0, x0 + 1] * a
+    low = image[y0 + 1, x0] * (1 - a) + image[y0 + 1, x0 + 1] * a
+    return top * (1 - b) + low * b
+
+
+@njit
+def _digitise(image, vignette, noise, brightness, read, shot, black, out):
+    """Exposure, vignetting, noise, clipping and rounding to a byte."""
+    h, w = image.shape
+    noisy = noise.shape[0] == h
+    for y in range(h):
+        for x in range(w):
+            value = image[y, x] * vignette[y, x] * brightness
+            if noisy:
+                value += noise[y, x] * math.sqrt(read + shot * max(value, 0.0))
+            out[y, x] = int(min(max(value + black + 0.5, 0.0), 255.0))

@@ -1,0 +1,257 @@
+"""Compiled ray casting of the store: a room, groups of boxes, shelves whose slots hold products, people, pictures.
+
+A shelf block is an axis-aligned box seen from its front: u runs to the viewer's right, w goes into the shelf, z up. Its
+levels are open slots between boards; each slot is a row of facings, walked like a one-dimensional grid.
+
+A hit is (t, id); `id` packs index << 12 | part << 7 | kind << 4 | face, so that two pixels show the same flat piece of
+surface exactly when their ids agree. The tables that all kernels take are described in world.Tables.
+"""
+
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportPrivateUsage=false
+# pyright: reportConstantRedefinition=false, reportMissingTypeArgument=false
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numba
+
+SHELF, SOLID = 0, 1  # kinds of block
+BIN = 0.05  # metres of a level per lookup bin
+ROOM, BLOCK, FACING, PERSON, TARGET = 0, 1, 2, 3, 4  # kinds of hit
+RAIL, BOARD, BACK, END, UNDER, INNER_END = 0, 1, 2, 3, 4, 5  # faces of a shelf
+FRONT, SIDE, LID, UPPER = 0, 1, 2, 4  # faces of a product; the upper box adds 4
+FAR = 1e30
+
+njit: Any = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+
+@njit
+def pack(kind, index, part, face):
+    """One integer for a flat piece of surface."""
+    return (index << 12) | ((part & 31) << 7) | (kind << 4) | face
+
+
+@njit
+def inverse(d):
+    """1 / d, huge for 0."""
+    return 1.0 / d if d != 0 else FAR
+
+
+@njit
+def slab(lo0, lo1, lo2, hi0, hi1, hi2, o0, o1, o2, i0, i1, i2):
+    """Ray (origin, inverse direction) against a box -> (t_in, t_out, axis of entry)."""
+    a, b = (lo0 - o0) * i0, (hi0 - o0) * i0
+    t0, t1, axis = min(a, b), max(a, b), 0
+    a, b = (lo1 - o1) * i1, (hi1 - o1) * i1
+    near = min(a, b)
+    if near > t0:
+        t0, axis = near, 1
+    t1 = min(t1, max(a, b))
+    a, b = (lo2 - o2) * i2, (hi2 - o2) * i2
+    near = min(a, b)
+    if near > t0:
+        t0, axis = near, 2
+    t1 = min(t1, max(a, b))
+    return t0, t1, axis
+
+
+@njit
+def _product(facings, c, base, ou, ow, oz, iu, iw, iz, depth, limit):
+    """Nearest hit of the lower and the upper box of facing c -> (t, face), face -1 for none."""
+    best, face = limit, -1
+    u0, u1, low, high = facings[c, 2], facings[c, 3], facings[c, 5], facings[c, 7]
+    if low > base:
+        t0, t1, axis = slab(u0, facings[c, 4], base, u1, depth, low, ou, ow, oz, iu, iw, iz)
+        if t0 < t1 and 0 < t0 < best:
+            best, face = t0, SIDE if axis == 0 else (FRONT if axis == 1 else LID)
+    if high > low:
+        t0, t1, axis = slab(u0, facings[c, 6], low, u1, depth, high, ou, ow, oz, iu, iw, iz)
+        if t0 < t1 and 0 < t0 < best:
+            best, face = t0, UPPER + (SIDE if axis == 0 else (FRONT if axis == 1 else LID))
+    return best, face
+
+
+@njit
+def _slot(levels_i, facings, bins, k, base, ou, ow, oz, du, iu, iw, iz, t_in, t_out, depth):
+    """Walk the facings of level k from t_in to t_out -> (t, facing, face), facing -1 for none."""
+    first, last, offset = levels_i[k, 0], levels_i[k, 1], levels_i[k, 2]
+    if last <= first:
+        return t_out, -1, -1
+    u = ou + t_in * du
+    c = bins[offset + min(max(int(u / BIN), 0), levels_i[k, 4] - 1)]
+    while c < last - 1 and facings[c, 1] <= u:
+        c += 1
+    while c > first and facings[c, 0] > u:
+        c -= 1
+    while True:
+        t, face = _product(facings, c, base, ou, ow, oz, iu, iw, iz, depth, t_out)
+        if face >= 0:
+            return t, c, face
+        if du > 0:
+            if (facings[c, 1] - ou) * iu >= t_out or c + 1 >= last:
+                return t_out, -1, -1
+            c += 1
+        else:
+            if du == 0 or (facings[c, 0] - ou) * iu >= t_out or c <= first:
+                return t_out, -1, -1
+            c -= 1
+
+
+@njit
+def to_shelf(blocks, b, facing, x, y):
+    """Horizontal point of the world -> (u, w) of shelf block b."""
+    if facing == 0:  # its front looks to -y
+        return x - blocks[b, 0], y - blocks[b, 1]
+    if facing == 1:  # +y
+        return blocks[b, 3] - x, blocks[b, 4] - y
+    if facing == 2:  # -x
+        return blocks[b, 4] - y, x - blocks[b, 0]
+    return y - blocks[b, 1], blocks[b, 3] - x
+
+
+@njit
+def turn_to_shelf(facing, dx, dy):
+    """Horizontal direction of the world -> (u, w)."""
+    if facing == 0:
+        return dx, dy
+    if facing == 1:
+        return -dx, -dy
+    if facing == 2:
+        return -dy, dx
+    return dy, -dx
+
+
+@njit
+def _shelf(blocks, blocks_i, levels, levels_i, facings, bins, b, ox, oy, oz, dx, dy, dz, t_in, axis, limit):
+    """Inside of shelf block b, entered at t_in through `axis` -> (t, id), id -1 when the ray leaves it again."""
+    facing = blocks_i[b, 1]
+    ou, ow = to_shelf(blocks, b, facing, ox, oy)
+    du, dw = turn_to_shelf(facing, dx, dy)
+    iu, iw, iz = inverse(du), inverse(dw), inverse(dz)
+    wide, deep = blocks[b, 3] - blocks[b, 0], blocks[b, 4] - blocks[b, 1]
+    if facing >= 2:
+        wide, deep = deep, wide
+    if t_in > 0:
+        if axis == 2:
+            if dz > 0:
+                return t_in, pack(BLOCK, b, 0, UNDER)
+        elif (axis == 0) == (facing < 2):
+            return t_in, pack(BLOCK, b, 0, END)
+        elif dw < 0:
+            return t_in, pack(BLOCK, b, 0, BACK)
+    else:
+        t_in = 0.0
+    z = oz + t_in * dz
+    first, last = blocks_i[b, 2], blocks_i[b, 3]
+    k = first
+    while k < last - 1 and z >= levels[k + 1, 0]:
+        k += 1
+    if z < levels[k, 1] and axis != 2:
+        return t_in, pack(BLOCK, b, k - first, RAIL)
+    # How the ray leaves the slot: through an end, the back or the front, the boards or the open top.
+    t_out = ((wide if du > 0 else 0.0) - ou) * iu if du != 0 else FAR
+    face = INNER_END
+    t = ((deep if dw > 0 else 0.0) - ow) * iw if dw != 0 else FAR
+    if t < t_out:
+        t_out, face = t, (BACK if dw > 0 else -1)
+    t = ((levels[k, 2] if dz > 0 else levels[k, 1]) - oz) * iz if dz != 0 else FAR
+    if t < t_out:
+        t_out, face = t, (BOARD if dz < 0 else (-1 if levels_i[k, 3] else UNDER))
+    end = min(t_out, limit)
+    t, c, side = _slot(levels_i, facings, bins, k, levels[k, 1], ou, ow, oz, du, iu, iw, iz, t_in, end, deep)
+    if c >= 0:
+        part = 0
+        if side & 3 == SIDE or side & 3 == LID:
+            part = int((ow + t * dw) / facings[c, 9])
+        else:
+            part = int((oz + t * dz - levels[k, 1]) / facings[c, 8])
+        return t, pack(FACING, c, part, side)
+    if face < 0 or t_out >= limit:
+        return limit, -1
+    return t_out, pack(BLOCK, b, k - first, face)
+
+
+@njit
+def _person(persons_i, ellipsoids, q, ox, oy, oz, dx, dy, dz, limit):
+    """Nearest ellipsoid of person q -> (t, ellipsoid), -1 for none."""
+    best, which = limit, -1
+    for e in range(persons_i[q, 0], persons_i[q, 1]):
+        px, py, pz = ox - ellipsoids[e, 0], oy - ellipsoids[e, 1], oz - ellipsoids[e, 2]
+        a0 = ellipsoids[e, 3] * px + ellipsoids[e, 4] * py + ellipsoids[e, 5] * pz
+        a1 = ellipsoids[e, 6] * px + ellipsoids[e, 7] * py + ellipsoids[e, 8] * pz
+        a2 = ellipsoids[e, 9] * px + ellipsoids[e, 10] * py + ellipsoids[e, 11] * pz
+        b0 = ellipsoids[e, 3] * dx + ellipsoids[e, 4] * dy + ellipsoids[e, 5] * dz
+        b1 = ellipsoids[e, 6] * dx + ellipsoids[e, 7] * dy + ellipsoids[e, 8] * dz
+        b2 = ellipsoids[e, 9] * dx + ellipsoids[e, 10] * dy + ellipsoids[e, 11] * dz
+        qa = b0 * b0 + b1 * b1 + b2 * b2
+        qb = a0 * b0 + a1 * b1 + a2 * b2
+        qc = a0 * a0 + a1 * a1 + a2 * a2 - 1
+        root = qb * qb - qa * qc
+        if root > 0:
+            t = (-qb - math.sqrt(root)) / qa
+            if 0 < t < best:
+                best, which = t, e
+    return best, which
+
+
+@njit
+def trace(w, order, moving, ox, oy, oz, dx, dy, dz):
+    """Nearest surface along a ray -> (t, id)."""
+    room, groups, groups_i, blocks, blocks_i = w.room, w.groups, w.groups_i, w.blocks, w.blocks_i
+    ix, iy, iz = inverse(dx), inverse(dy), inverse(dz)
+    best = ((room[2] if dz > 0 else 0.0) - oz) * iz if dz != 0 else FAR
+    hit = pack(ROOM, 0, 0, 1 if dz > 0 else 0)
+    t = ((room[0] if dx > 0 else 0.0) - ox) * ix if dx != 0 else FAR
+    if t < best:
+        best, hit = t, pack(ROOM, 0, 0, 3 if dx > 0 else 2)
+    t = ((room[1] if dy > 0 else 0.0) - oy) * iy if dy != 0 else FAR
+    if t < best:
+        best, hit = t, pack(ROOM, 0, 0, 5 if dy > 0 else 4)
+    for n in range(order.shape[0]):
+        g = order[n]
+        t0, t1, axis = slab(
+            groups[g, 0], groups[g, 1], groups[g, 2], groups[g, 3], groups[g, 4], groups[g, 5], ox, oy, oz, ix, iy, iz
+        )
+        if t0 >= t1 or t1 <= 0 or t0 >= best:
+            continue
+        for b in range(groups_i[g, 0], groups_i[g, 1]):
+            t0, t1, axis = slab(
+                blocks[b, 0], blocks[b, 1], blocks[b, 2], blocks[b, 3], blocks[b, 4], blocks[b, 5],
+                ox, oy, oz, ix, iy, iz,
+            )  # fmt: skip
+            if t0 >= t1 or t1 <= 0 or t0 >= best:
+                continue
+            if blocks_i[b, 0] == SHELF:
+                t, found = _shelf(
+                    blocks, blocks_i, w.levels, w.levels_i, w.facings, w.bins, b,
+                    ox, oy, oz, dx, dy, dz, t0, axis, best,
+                )  # fmt: skip
+                if found >= 0:
+                    best, hit = t, found
+            elif t0 > 0:
+                face = axis * 2 + (1 if (dx if axis == 0 else (dy if axis == 1 else dz)) < 0 else 0)
+                best, hit = t0, pack(BLOCK, b, 0, face)
+    persons = moving.persons
+    for q in range(persons.shape[0]):
+        t0, t1, axis = slab(
+            persons[q, 0], persons[q, 1], persons[q, 2], persons[q, 3], persons[q, 4], persons[q, 5],
+            ox, oy, oz, ix, iy, iz,
+        )  # fmt: skip
+        if t0 < t1 and t1 > 0 and t0 < best:
+            t, e = _person(moving.persons_i, moving.ellipsoids, q, ox, oy, oz, dx, dy, dz, best)
+            if e >= 0:
+                best, hit = t, pack(PERSON, e, 0, 0)
+    targets = moving.targets
+    for k in range(targets.shape[0]):
+        px, py, pz = ox - targets[k, 9], oy - targets[k, 10], oz - targets[k, 11]
+        down = targets[k, 2] * dx + targets[k, 5] * dy + targets[k, 8] * dz
+        t = -(targets[k, 2] * px + targets[k, 5] * py + targets[k, 8] * pz) * inverse(down)
+        if 0 < t < best:
+            px, py, pz = px + t * dx, py + t * dy, pz + t * dz
+            s = targets[k, 0] * px + targets[k, 3] * py + targets[k, 6] * pz
+            v = targets[k, 1] * px + targets[k, 4] * py + targets[k, 7] * pz
+            if 0 <= s <= targets[k, 12] and 0 <= v <= targets[k, 13]:
+                best, hit = t, pack(TARGET, k, 0, 0)
+    return best, hit

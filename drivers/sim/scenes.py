@@ -1,0 +1,103 @@
+"""Named scenes: a store's plan, a route through it, who else is there, and what the sensor does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from drivers.sim.effects import Effects
+from drivers.sim.people import Person
+from drivers.sim.world import CLOTHES, Layout
+from drivers.sim.walks import Gait
+from stereo_sfm.types import F64
+
+Route = Callable[[Layout, int, bool], F64]  # (layout, walk number, returns) -> polyline (N, 2) metres
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything about a simulated recording that its name decides."""
+
+    layout: Layout
+    route: Route
+    length: float  # metres walked
+    effects: Effects = Effects()
+    gait: Gait = Gait()
+    people: int = 0
+
+
+def _ends(layout: Layout) -> tuple[float, float]:
+    """x of the middle of the two cross aisles, kept near the gondolas."""
+    return layout.margin - 1.3, layout.margin + layout.gondola_length + 1.3
+
+
+def _aisle(layout: Layout, walk: int, returns: bool) -> F64:
+    """Down one aisle; back up the same aisle when it returns."""
+    k = 1 + walk % (layout.gondolas - 1)
+    a, b = _ends(layout)
+    y = layout.aisle_y(k)
+    down = [(a, y), (b, y)]
+    back = [(b, y + 0.35), (a, y + 0.35)] if returns else []
+    return np.array(down + back)
+
+
+def _loop(layout: Layout, walk: int, returns: bool) -> F64:
+    """Round and round one gondola, begun in the middle of an aisle."""
+    k = walk % layout.gondolas if walk else 1
+    a, b = _ends(layout)
+    y0, y1 = layout.aisle_y(k), layout.aisle_y(k + 1)
+    x = a + (b - a) * (0.3 + 0.13 * (walk % 4))
+    lap = [(b, y0), (b, y1), (a, y1), (a, y0)]
+    if walk % 2:  # the other way round
+        lap = [(a, y0), (a, y1), (b, y1), (b, y0)]
+    return np.array([(x, y0), *(lap * (12 if returns else 1)), (x, y0)])
+
+
+def _serpentine(layout: Layout, walk: int, returns: bool) -> F64:
+    """Through every aisle in turn, alternately up and down; then back along the first when it returns."""
+    a, b = _ends(layout)
+    points: list[tuple[float, float]] = []
+    aisles = list(range(layout.gondolas + 1))
+    if walk % 2:
+        aisles.reverse()
+    for n, k in enumerate(aisles):
+        x0, x1 = (a, b) if n % 2 == 0 else (b, a)
+        points += [(x0, layout.aisle_y(k)), (x1, layout.aisle_y(k))]
+    if returns:
+        x = points[-1][0]
+        back = layout.aisle_y(aisles[0])
+        points += [(x, back), (a + b - x, back)] if x == a else [(x, layout.aisle_y(aisles[0])), (a, back), (b, back)]
+        points += [(points[-1][0], layout.aisle_y(aisles[1])), (a + b - points[-1][0], layout.aisle_y(aisles[1]))]
+    return np.array(points)
+
+
+_STORE = Layout()
+_DARK = Effects(exposure_s=0.009, gain=0.14, drift=0.2, read_noise=3.0, shot_noise=0.35, black_level=6.0)
+
+SCENES: dict[str, Scene] = {
+    "aisle": Scene(_STORE, _aisle, 14.0),
+    "loop": Scene(_STORE, _loop, 42.0),
+    "identical-aisles": Scene(Layout(gondolas=4, identical=True), _serpentine, 100.0),
+    "people": Scene(_STORE, _loop, 40.0, people=7),
+    "dark": Scene(_STORE, _loop, 40.0, _DARK),
+    "big": Scene(Layout(gondolas=9, gondola_length=18.0, products=420), _serpentine, 260.0),
+}
+
+
+def crowd(scene: Scene, count: int, rng: np.random.Generator) -> list[Person]:
+    """People who walk along the aisles and across their ends."""
+    layout, out = scene.layout, list[Person]()
+    a, b = _ends(layout)
+    for n in range(count):
+        if n % 3 == 2:
+            x = a - 0.3 if rng.random() < 0.5 else b + 0.3
+            start, end = (x, layout.aisle_y(0)), (x, layout.aisle_y(layout.gondolas))
+        else:
+            y = layout.aisle_y(1 + n % 2) + float(rng.choice([-0.55, 0.55]))
+            start, end = (a, y), (b, y + float(rng.uniform(-0.1, 0.1)))
+        shirt, trousers = rng.choice(CLOTHES - 1, 2, replace=False)
+        speed, phase = float(rng.uniform(0.5, 1.2)), float(rng.uniform(0, 20))
+        out.append(Person(start, end, speed, phase, float(rng.uniform(1.55, 1.9)), int(shirt), int(trousers)))
+    return out

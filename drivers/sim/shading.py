@@ -1,0 +1,305 @@
+"""Compiled shading: texture lookups through the ripmap, light of the lamps, shadow inside the shelves; image loops."""
+
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportPrivateUsage=false
+# pyright: reportConstantRedefinition=false, reportMissingTypeArgument=false
+
+from __future__ import annotations
+
+import math
+
+from drivers.sim.kernels import BACK, BLOCK, BOARD, END, FACING, FRONT, LID, PERSON, RAIL, ROOM, SIDE, SOLID, njit
+from drivers.sim.kernels import to_shelf, trace, turn_to_shelf
+
+
+@njit
+def _bilinear(data, base, lw, lh, i, j, s, t, wrap):
+    """Ripmap level (i, j) at (s, t) in [0, 1]; texel centres at (k + 0.5) / n."""
+    w, h = 1 << (lw - i), 1 << (lh - j)
+    stride = 2 << lw
+    x, y = s * w - 0.5, t * h - 0.5
+    x0, y0 = math.floor(x), math.floor(y)
+    fx, fy = x - x0, y - y0
+    xa, ya = int(x0), int(y0)
+    xb, yb = xa + 1, ya + 1
+    if wrap:
+        xa, xb, ya, yb = xa & (w - 1), xb & (w - 1), ya & (h - 1), yb & (h - 1)
+    else:
+        xa, xb = min(max(xa, 0), w - 1), min(max(xb, 0), w - 1)
+        ya, yb = min(max(ya, 0), h - 1), min(max(yb, 0), h - 1)
+    origin = base + ((2 << lh) - ((2 << lh) >> j)) * stride + (2 << lw) - ((2 << lw) >> i)
+    ra, rb = origin + ya * stride, origin + yb * stride
+    top = data[ra + xa] * (1 - fx) + data[ra + xb] * fx
+    low = data[rb + xa] * (1 - fx) + data[rb + xb] * fx
+    return top * (1 - fy) + low * fy
+
+
+@njit
+def sample(w, k, s, t, fs, ft):
+    """Texture k at (s, t), filtered over a footprint (fs, ft) in the same units; 0..255."""
+    data, table = w.texels, w.textures
+    base, lw, lh, wrap = table[k, 0], table[k, 1], table[k, 2], table[k, 3]
+    if wrap:
+        s -= math.floor(s)
+        t -= math.floor(t)
+    i, j = 0, 0
+    fs *= 1 << lw
+    ft *= 1 << lh
+    while fs >= 2 and i < lw:
+        fs *= 0.5
+        i += 1
+    while ft >= 2 and j < lh:
+        ft *= 0.5
+        j += 1
+    a = min(max(fs - 1, 0.0), 1.0) if i < lw else 0.0
+    b = min(max(ft - 1, 0.0), 1.0) if j < lh else 0.0
+    value = _bilinear(data, base, lw, lh, i, j, s, t, wrap)
+    if a > 0:
+        value += a * (_bilinear(data, base, lw, lh, i + 1, j, s, t, wrap) - value)
+    if b > 0:
+        other = _bilinear(data, base, lw, lh, i, j + 1, s, t, wrap)
+        if a > 0:
+            other += a * (_bilinear(data, base, lw, lh, i + 1, j + 1, s, t, wrap) - other)
+        value += b * (other - value)
+    return value
+
+
+@njit
+def _lamps(x, y):
+    """Light from the rows of lamps, a smooth periodic pattern about 1."""
+    a, b = x / 2.4, y / 2.4
+    a -= math.floor(a) + 0.5
+    b -= math.floor(b) + 0.5
+    return 1 + 0.7 * (1 / 12 - a * a) + 0.5 * (1 / 12 - b * b)
+
+
+@njit
+def _cave(w):
+    """Light that reaches depth w inside a shelf."""
+    return 1 / (1 + 14 * w * w)
+
+
+@njit
+def _flat(w, k, a, b, da, db, cos, size):
+    """Texture k over a plane: coordinates a, b in metres, ray slopes da, db along them, size = footprint across."""
+    wide, high = w.texture_sizes[k, 0], w.texture_sizes[k, 1]
+    ic2 = 1 / max(cos * cos, 1e-4)
+    fa, fb = size * math.sqrt(1 + da * da * ic2), size * math.sqrt(1 + db * db * ic2)
+    return sample(w, k, a / wide, b / high, fa / wide, fb / high)
+
+
+@njit
+def _room(w, face, x, y, z, dx, dy, dz, size):
+    if face == 0:
+        value = _flat(w, w.surfaces[0], x, y, dx, dy, dz, size)
+        wear = _flat(w, w.surfaces[1], x, y, dx, dy, dz, size)
+        return value * wear * (0.92 / 200) * _lamps(x, y)
+    if face == 1:
+        return _flat(w, w.surfaces[2], x, y, dx, dy, dz, size)
+    if face <= 3:
+        return _flat(w, w.surfaces[3], y, -z, dy, dz, dx, size) * (0.6 + 0.1 * z)
+    return _flat(w, w.surfaces[3], x, -z, dx, dz, dy, size) * (0.6 + 0.1 * z)
+
+
+@njit
+def _solid(w, b, face, x, y, z, dx, dy, dz, size):
+    k = w.blocks_i[b, 4 + face]
+    if face >= 4:
+        s, t, ds, dt, cos = x - w.blocks[b, 0], y - w.blocks[b, 1], dx, dy, dz
+        wide, high = w.blocks[b, 3] - w.blocks[b, 0], w.blocks[b, 4] - w.blocks[b, 1]
+        light = 0.95 if face == 5 else 0.4
+    else:
+        t, dt = w.blocks[b, 5] - z, dz
+        high = w.blocks[b, 5] - w.blocks[b, 2]
+        if face < 2:
+            s, ds, cos, wide = y - w.blocks[b, 1], dy, dx, w.blocks[b, 4] - w.blocks[b, 1]
+            if face == 0:
+                s = wide - s
+        else:
+            s, ds, cos, wide = x - w.blocks[b, 0], dx, dy, w.blocks[b, 3] - w.blocks[b, 0]
+            if face == 3:
+                s = wide - s
+        light = 0.68 + 0.1 * z
+    if w.texture_sizes[k, 0] > 0:
+        return _flat(w, k, s, t, ds, dt, cos, size) * light
+    ic2 = 1 / max(cos * cos, 1e-4)
+    fs, ft = size * math.sqrt(1 + ds * ds * ic2), size * math.sqrt(1 + dt * dt * ic2)
+    return sample(w, k, s / wide, t / high, fs / wide, ft / high) * light
+
+
+@njit
+def _shelf_part(w, b, face, x, y, z, dx, dy, dz, size):
+    facing = w.blocks_i[b, 1]
+    u, deep = to_shelf(w.blocks, b, facing, x, y)
+    du, dw = turn_to_shelf(facing, dx, dy)
+    k = w.blocks_i[b, 4 + face]
+    if face == RAIL:
+        return _flat(w, k, u + 0.37 * b + 3.1 * z, -z, du, dz, dw, size) * (0.7 + 0.12 * z)
+    if face == BOARD:
+        return _flat(w, k, u, deep, du, dw, dz, size) * _cave(deep) * 0.9
+    if face == BACK:
+        return _flat(w, k, u, z, du, dz, dw, size) * _cave(deep) * 0.9
+    if face == END:
+        return _flat(w, k, deep, z, dw, dz, du, size) * (0.6 + 0.1 * z)
+    return _flat(w, k, deep, z, dw, dz, du, size) * 0.4 * _cave(deep)
+
+
+@njit
+def _product(w, c, face, part, x, y, z, dx, dy, dz, size):
+    b, k = w.facings_i[c, 3], w.facings_i[c, 4]
+    facing = w.blocks_i[b, 1]
+    u, deep = to_shelf(w.blocks, b, facing, x, y)
+    du, dw = turn_to_shelf(facing, dx, dy)
+    base, roof = w.levels[k, 1], w.levels[k, 2]
+    u0, wide = w.facings[c, 2], w.facings[c, 3] - w.facings[c, 2]
+    unit_h, unit_d = w.facings[c, 8], w.facings[c, 9]
+    row = (z - base) / unit_h
+    row = 1 - (row - math.floor(row))
+    column = deep / unit_d
+    column -= math.floor(column)
+    under = roof - z
+    light = _cave(deep) * (1 - 0.5 / (1 + 300 * under * under) * min(1.0, 12 * deep)) * (0.78 + 0.12 * z)
+    side = face & 3
+    if side == FRONT:
+        k, s, t, ds, dt, cos, high = w.facings_i[c, 0], (u - u0) / wide, row, du, dz, dw, unit_h
+    elif side == SIDE:
+        k, s, t, ds, dt, cos, high = w.facings_i[c, 1], column, row, dw, dz, du, unit_h
+        wide = unit_d
+        light *= 0.6
+    else:
+        k, s, t, ds, dt, cos, high = w.facings_i[c, 2], (u - u0) / wide, column, du, dw, dz, unit_d
+    ic2 = 1 / max(cos * cos, 1e-4)
+    fs, ft = size * math.sqrt(1 + ds * ds * ic2), size * math.sqrt(1 + dt * dt * ic2)
+    return sample(w, k, s, t, fs / wide, ft / high) * light * _lamps(x, y)
+
+
+@njit
+def _person(w, moving, e, x, y, z, dx, dy, dz, size):
+    ell = moving.ellipsoids
+    px, py, pz = x - ell[e, 0], y - ell[e, 1], z - ell[e, 2]
+    a0 = ell[e, 3] * px + ell[e, 4] * py + ell[e, 5] * pz
+    a1 = ell[e, 6] * px + ell[e, 7] * py + ell[e, 8] * pz
+    a2 = ell[e, 9] * px + ell[e, 10] * py + ell[e, 11] * pz
+    # The normal is A^T a; its upward part decides the light.
+    nx = ell[e, 3] * a0 + ell[e, 6] * a1 + ell[e, 9] * a2
+    ny = ell[e, 4] * a0 + ell[e, 7] * a1 + ell[e, 10] * a2
+    nz = ell[e, 5] * a0 + ell[e, 8] * a1 + ell[e, 11] * a2
+    norm = math.sqrt(nx * nx + ny * ny + nz * nz)
+    cos = abs(nx * dx + ny * dy + nz * dz) / norm
+    angle = math.atan2(a1, a0) / (2 * math.pi)
+    k = moving.ellipsoids_i[e]
+    wide = w.texture_sizes[k, 0]
+    footprint = size / max(cos, 0.1) / wide
+    around = 2 * math.pi * ell[e, 12] / wide
+    return sample(w, k, angle * max(round(around), 1.0), a2 * ell[e, 13] / wide, footprint, footprint) * (
+        0.65 + 0.3 * nz / norm
+    )
+
+
+@njit
+def _target(w, moving, k, x, y, z, dx, dy, dz, size):
+    f = moving.targets
+    px, py, pz = x - f[k, 9], y - f[k, 10], z - f[k, 11]
+    s, v = f[k, 0] * px + f[k, 3] * py + f[k, 6] * pz, f[k, 1] * px + f[k, 4] * py + f[k, 7] * pz
+    ds, dv = f[k, 0] * dx + f[k, 3] * dy + f[k, 6] * dz, f[k, 1] * dx + f[k, 4] * dy + f[k, 7] * dz
+    down = f[k, 2] * dx + f[k, 5] * dy + f[k, 8] * dz
+    ic2 = 1 / max(down * down, 1e-4)
+    fs, ft = size * math.sqrt(1 + ds * ds * ic2) / f[k, 12], size * math.sqrt(1 + dv * dv * ic2) / f[k, 13]
+    return sample(w, moving.targets_i[k], s / f[k, 12], v / f[k, 13], fs, ft)
+
+
+@njit
+def shade(w, moving, t, hit, ox, oy, oz, dx, dy, dz, angle):
+    """Brightness (0..255, may exceed) of a hit seen along a ray, filtered over `angle` radians."""
+    x, y, z, size = ox + t * dx, oy + t * dy, oz + t * dz, t * angle
+    kind, face, part, index = (hit >> 4) & 7, hit & 15, (hit >> 7) & 31, hit >> 12
+    if kind == FACING:
+        return _product(w, index, face, part, x, y, z, dx, dy, dz, size)
+    if kind == ROOM:
+        return _room(w, face, x, y, z, dx, dy, dz, size)
+    if kind == BLOCK:
+        if w.blocks_i[index, 0] == SOLID:
+            return _solid(w, index, face, x, y, z, dx, dy, dz, size)
+        return _shelf_part(w, index, face, x, y, z, dx, dy, dz, size)
+    if kind == PERSON:
+        return _person(w, moving, index, x, y, z, dx, dy, dz, size)
+    return _target(w, moving, index, x, y, z, dx, dy, dz, size)
+
+
+@njit
+def cast(w, moving, order, world_T_eye, bearings, angles, image, depth, ids):
+    """One ray through every pixel's centre.
+
+    Args:
+        bearings: (H, W, 3) unit, NaN where the lens shows nothing. angles: (H, W) radians a pixel covers.
+        image, depth, ids: (H, W) written: brightness, distance along the ray in metres (NaN), surface.
+    """
+    r, ox, oy, oz = world_T_eye, world_T_eye[0, 3], world_T_eye[1, 3], world_T_eye[2, 3]
+    for v in range(bearings.shape[0]):
+        for u in range(bearings.shape[1]):
+            a, b, c = bearings[v, u, 0], bearings[v, u, 1], bearings[v, u, 2]
+            if not math.isfinite(c):
+                image[v, u], depth[v, u], ids[v, u] = 0.0, math.nan, -1
+                continue
+            dx = r[0, 0] * a + r[0, 1] * b + r[0, 2] * c
+            dy = r[1, 0] * a + r[1, 1] * b + r[1, 2] * c
+            dz = r[2, 0] * a + r[2, 1] * b + r[2, 2] * c
+            t, hit = trace(w, order, moving, ox, oy, oz, dx, dy, dz)
+            image[v, u] = shade(w, moving, t, hit, ox, oy, oz, dx, dy, dz, angles[v, u])
+            depth[v, u], ids[v, u] = t, hit
+    return 0
+
+
+@njit
+def _is_edge(image, ids, v, u, contrast):
+    """Whether another surface of another brightness touches this pixel."""
+    here, value = ids[v, u], image[v, u]
+    return (
+        (ids[v, u - 1] != here and abs(image[v, u - 1] - value) > contrast)
+        or (ids[v, u + 1] != here and abs(image[v, u + 1] - value) > contrast)
+        or (ids[v - 1, u] != here and abs(image[v - 1, u] - value) > contrast)
+        or (ids[v + 1, u] != here and abs(image[v + 1, u] - value) > contrast)
+    )
+
+
+@njit
+def smooth_edges(w, moving, order, world_T_eye, bearings, angles, image, ids, out, offsets, contrast, kind):
+    """Where surfaces meet, the mean over several rays a pixel; elsewhere the one ray's value.
+
+    Args:
+        offsets: (N, 2) px of the rays within a pixel. contrast: least step of brightness that matters.
+        kind: also every pixel that shows or touches this kind of surface (TARGET), -1 for none.
+        out: (H, W) written.
+    """
+    r, ox, oy, oz = world_T_eye, world_T_eye[0, 3], world_T_eye[1, 3], world_T_eye[2, 3]
+    h, wide, n = image.shape[0], image.shape[1], offsets.shape[0]
+    narrow = 1 / math.sqrt(n)
+    for v in range(h):
+        for u in range(wide):
+            out[v, u] = image[v, u]
+            if v == 0 or u == 0 or v == h - 1 or u == wide - 1 or ids[v, u] < 0:
+                continue
+            if kind >= 0:
+                near = False
+                for q in range(9):
+                    near = near or ((ids[v + q // 3 - 1, u + q % 3 - 1] >> 4) & 7) == kind
+                if not near:
+                    continue
+            elif not _is_edge(image, ids, v, u, contrast):
+                continue
+            total = 0.0
+            for q in range(n):
+                su, sv = 0.5 * offsets[q, 0], 0.5 * offsets[q, 1]
+                a = bearings[v, u, 0] + su * (bearings[v, u + 1, 0] - bearings[v, u - 1, 0])
+                b = bearings[v, u, 1] + su * (bearings[v, u + 1, 1] - bearings[v, u - 1, 1])
+                c = bearings[v, u, 2] + su * (bearings[v, u + 1, 2] - bearings[v, u - 1, 2])
+                a += sv * (bearings[v + 1, u, 0] - bearings[v - 1, u, 0])
+                b += sv * (bearings[v + 1, u, 1] - bearings[v - 1, u, 1])
+                c += sv * (bearings[v + 1, u, 2] - bearings[v - 1, u, 2])
+                dx = r[0, 0] * a + r[0, 1] * b + r[0, 2] * c
+                dy = r[1, 0] * a + r[1, 1] * b + r[1, 2] * c
+                dz = r[2, 0] * a + r[2, 1] * b + r[2, 2] * c
+                t, hit = trace(w, order, moving, ox, oy, oz, dx, dy, dz)
+                total += shade(w, moving, t, hit, ox, oy, oz, dx, dy, dz, narrow * angles[v, u])
+            if math.isfinite(total):
+                out[v, u] = total / n
+    return 0

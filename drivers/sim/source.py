@@ -1,0 +1,224 @@
+"""`sim:NAME?option=value&...`: the simulated store as a source of stereo frames with ground truth."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import time
+from collections.abc import Iterator
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from drivers.sim.effects import CLEAN, Effects, Sensor, brightness
+from drivers.sim.people import figures
+from drivers.sim.render import Renderer, View
+from drivers.sim.rigs import make_rig
+from drivers.sim.scenes import SCENES, Scene, crowd
+from drivers.sim.walks import Walk
+from drivers.sim.world import Layout, Tables, build_world
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
+from stereo_sfm.types import F64, StereoImage, Trajectory
+
+_EPOCH_NS = 1_000_000_000
+
+
+@dataclasses.dataclass(frozen=True)
+class SimOptions:
+    """What follows the question mark."""
+
+    camera: str = "fisheye"  # fisheye, pinhole, distorted
+    size: str = ""  # WIDTHxHEIGHT, scales the images
+    seed: int = 0  # products, sensor, people
+    walk: int = 0  # another walk through the same store
+    length: float = 0.0  # metres walked, 0: the scene's own
+    start: int = 0  # first frame
+    frames: int = 0  # at most so many frames, 0: all
+    rate: float = 30.0  # frames a second
+    exchange: float = 0.0  # fraction of product rows exchanged against the same store with 0
+    returns: bool = True  # whether a walk comes back to where it has been
+    people: int = -1  # how many, -1: the scene's own
+    speed: float = 0.0  # m/s, 0: the scene's own
+    vibration: float = 1.0
+    drop: float = 0.0  # fraction of frames lost
+    noise: float = 1.0  # scales the sensor's noise
+    blur: float = 1.0  # scales the exposure time
+    effects: bool = True  # off: clean pictures
+    realtime: bool = False  # frames come by the clock
+
+
+_SWITCH = {"1": True, "on": True, "true": True, "yes": True, "0": False, "off": False, "false": False, "no": False}
+
+
+def _read(name: str, kind: Any, value: Any) -> Any:
+    try:
+        if isinstance(kind, bool):
+            return value if isinstance(value, bool) else _SWITCH[str(value).lower()]
+        return type(kind)(value)
+    except (KeyError, ValueError):
+        raise StereoSfmError(f"sim: option {name}={value} is not {_WANTED[type(kind)]}") from None
+
+
+_WANTED = {bool: "on or off", int: "a whole number", float: "a number", str: "text"}
+_RANGES = {"length": (0, 10000), "start": (0, 10**7), "frames": (0, 10**7), "rate": (1, 1000), "exchange": (0, 1),
+           "drop": (0, 0.9), "noise": (0, 20), "blur": (0, 10), "speed": (0, 5), "vibration": (0, 10),
+           "people": (-1, 60), "seed": (0, 2**31), "walk": (0, 1000)}  # fmt: skip
+
+
+def read_options(options: dict[str, Any]) -> SimOptions:
+    """Check and convert.
+
+    Raises:
+        StereoSfmError: unknown option, or a value out of range.
+    """
+    known = {f.name: f.default for f in dataclasses.fields(SimOptions)}
+    values: dict[str, Any] = {}
+    for name, value in options.items():
+        if name not in known:
+            raise StereoSfmError(f"sim: unknown option '{name}' (options: {', '.join(known)})")
+        values[name] = _read(name, known[name], value)
+        low, high = _RANGES.get(name, (None, None))
+        if low is not None and high is not None and not low <= values[name] <= high:
+            raise StereoSfmError(f"sim: option {name}={value} must be between {low} and {high}")
+    return SimOptions(**values)
+
+
+def _size(text: str) -> tuple[int, int] | None:
+    if not text:
+        return None
+    width, _, height = text.partition("x")
+    if not (width.isdigit() and height.isdigit() and 32 <= int(width) <= 4096 and 32 <= int(height) <= 4096):
+        raise StereoSfmError(f"sim: option size={text} must be WIDTHxHEIGHT, such as 424x400")
+    return int(width), int(height)
+
+
+@functools.lru_cache(maxsize=2)
+def _world(layout: Layout, seed: int, exchange: float) -> Tables:
+    return build_world(layout, seed, exchange)
+
+
+def _effects(scene: Scene, options: SimOptions) -> Effects:
+    if not options.effects:
+        return dataclasses.replace(CLEAN, drop=options.drop)
+    e = scene.effects
+    return dataclasses.replace(
+        e,
+        drop=options.drop,
+        exposure_s=e.exposure_s * options.blur,
+        read_noise=e.read_noise * options.noise,
+        shot_noise=e.shot_noise * options.noise**2,
+    )
+
+
+class SimSource:
+    """A source (drivers.source.Source) whose every frame can also be rendered alone, to the same bits."""
+
+    def __init__(self, name: str, scene: Scene, options: SimOptions) -> None:
+        self.name = f"sim:{name}"
+        self.options = options
+        self.live = options.realtime
+        self.rig = make_rig(options.camera, _size(options.size))
+        self.world = _world(scene.layout, options.seed, options.exchange)
+        self.effects = _effects(scene, options)
+        gait = dataclasses.replace(
+            scene.gait, speed=options.speed or scene.gait.speed, vibration=scene.gait.vibration * options.vibration
+        )
+        route = scene.route(scene.layout, options.walk, options.returns)
+        rng = np.random.default_rng([options.seed, options.walk, 31])
+        self.walk = Walk(route, gait, rng, options.length or scene.length)
+        count = scene.people if options.people < 0 else options.people
+        self.people = crowd(scene, count, np.random.default_rng([options.seed, 47]))
+        self._choose_frames()
+        self._renderer: Renderer | None = None
+        self._sensors: list[Sensor] = []
+
+    def _choose_frames(self) -> None:
+        """Which frames arrive, and the truth at them."""
+        o = self.options
+        total = int(self.walk.duration * o.rate) + 1
+        if o.start >= total:
+            raise StereoSfmError(f"sim: start={o.start} is beyond the walk's {total} frames")
+        last = min(total, o.start + o.frames) if o.frames else total
+        ids = np.arange(o.start, last)
+        if self.effects.drop > 0:
+            lost = np.array([np.random.default_rng([o.seed, int(k), 61]).random() < self.effects.drop for k in ids])
+            lost[0] = False
+            ids = ids[~lost]
+        self.frame_ids = ids
+        self.frame_count: int | None = len(ids)
+        self.ground_truth: Trajectory | None = Trajectory(
+            np.array([self.stamp_ns(int(k)) for k in ids], np.int64), self.walk.poses(ids / o.rate)
+        )
+
+    def stamp_ns(self, frame_id: int) -> int:
+        """Mid-exposure, on the simulated sensor's clock."""
+        return _EPOCH_NS + round(frame_id * 1e9 / self.options.rate)
+
+    @property
+    def renderer(self) -> Renderer:
+        """Made when first needed: its rays take a while."""
+        if self._renderer is None:
+            self._renderer = Renderer(self.world, self.rig)
+            self._sensors = [Sensor(eye, self.effects) for eye in self._renderer.eyes]
+        return self._renderer
+
+    def pose(self, frame_id: int) -> F64:
+        """world_T_cam0 (4, 4) of a frame."""
+        return self.walk.poses(np.array([frame_id / self.options.rate]))[0]
+
+    def clean(self, frame_id: int) -> tuple[View, View]:
+        """Brightness, depth and surfaces of a frame without the sensor's faults."""
+        moving = figures(self.world, self.people, frame_id / self.options.rate)
+        return self.renderer.render(self.pose(frame_id), moving)
+
+    def frame(self, frame_id: int, dropped_before: int = 0) -> StereoImage:
+        """Render one frame."""
+        o, seconds = self.options, frame_id / self.options.rate
+        step = 1e-4
+        before, after = self.walk.poses(np.array([seconds - step, seconds + step]))
+        twist = se3.log(se3.inverse(before) @ after) / (2 * step)
+        twists = [twist, se3.adjoint(se3.inverse(self.rig.left_T_right)) @ twist]
+        level = brightness(self.effects, seconds, o.seed) if o.effects else 1.0
+        images = [
+            self._sensors[k].expose(view, twists[k], level, np.random.default_rng([o.seed, frame_id, k]))
+            for k, view in enumerate(self.clean(frame_id))
+        ]
+        return StereoImage(
+            frame_id,
+            self.stamp_ns(frame_id),
+            images[0],
+            images[1],
+            exposure_us=self.effects.exposure_s * 1e6,
+            gain=level,
+            dropped_before=dropped_before,
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._renderer, self._sensors = None, []
+
+    def __iter__(self) -> Iterator[StereoImage]:
+        began, previous = time.monotonic(), int(self.frame_ids[0]) - 1
+        for n, k in enumerate(self.frame_ids.tolist()):
+            if self.live:
+                time.sleep(max(0.0, began + n / self.options.rate - time.monotonic()))
+            yield self.frame(k, k - previous - 1)
+            previous = k
+
+
+def open_sim(rest: str = "", **options: Any) -> SimSource:
+    """Open `sim:rest`; see SimOptions for the options.
+
+    Raises:
+        StereoSfmError: unknown scene or option, or a bad value.
+    """
+    name = rest or "loop"
+    if name not in SCENES:
+        raise StereoSfmError(f"sim: unknown scene '{name}' (scenes: {', '.join(SCENES)})")
+    return SimSource(name, SCENES[name], read_options(options))

@@ -1,0 +1,95 @@
+"""Walks of a camera through a store: smooth in position and direction, with the sway and tremble of a pushed cart.
+
+A route is a polyline on the floor, walked at a varying speed and smoothed over time by a Gaussian, so that corners
+become curves; position and heading are then cubic splines of time (twice continuously differentiable), and a few sines
+with the frequencies of steps and wheels are added.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter1d
+
+from stereo_sfm.geometry import se3
+from stereo_sfm.types import F64
+
+_RATE = 120.0  # samples a second of the dense route
+
+
+@dataclass(frozen=True)
+class Gait:
+    """How the camera is carried."""
+
+    speed: float = 0.95  # m/s
+    height: float = 1.25  # metres above the floor
+    pitch_deg: float = -4.0  # below the horizon is negative
+    vibration: float = 1.0  # scale of sway and tremble
+    turn_seconds: float = 0.65  # Gaussian width that rounds the corners
+    stand_seconds: float = 1.0  # at rest before the walk
+
+
+class Walk:
+    """world_T_cam at any time from 0 to `duration` seconds."""
+
+    def __init__(self, route: F64, gait: Gait, rng: np.random.Generator, length: float) -> None:
+        """`route` (N, 2) metres is walked for `length` metres at most."""
+        self.gait = gait
+        t, arc = _progress(gait, rng, length, route)
+        self.duration = float(t[-1])
+        corners = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(route, axis=0), axis=1))])
+        sigma = gait.turn_seconds * _RATE
+        xy = np.stack([np.interp(arc, corners, route[:, i]) for i in (0, 1)], -1)
+        xy = gaussian_filter1d(xy, sigma, axis=0, mode="nearest")
+        heading = gaussian_filter1d(_heading(xy, route), 0.4 * sigma, mode="nearest")
+        self._path = CubicSpline(t, np.column_stack([xy, heading]))
+        self._sines = _sines(rng, gait.vibration)
+
+    def poses(self, seconds: F64) -> F64:
+        """Times (N,) -> world_T_cam (N, 4, 4): x right, y down, z forward."""
+        seconds = np.asarray(seconds, float)
+        x, y, heading = self._path(seconds).T
+        amplitude, frequency, phase = self._sines
+        shake = (amplitude * np.sin(2 * np.pi * frequency * seconds[:, None, None] + phase)).sum(-1)  # (N, 6)
+        world_T_walker = se3.from_rotation_translation(
+            se3.so3_exp(np.stack([0 * heading, 0 * heading, heading], -1)),
+            np.stack([x, y, np.full_like(x, self.gait.height)], -1),
+        )
+        pitch = np.deg2rad(self.gait.pitch_deg)
+        walker_R_cam = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]) @ se3.so3_exp(np.array([pitch, 0, 0]))
+        walker_T_cam = se3.from_rotation_translation(walker_R_cam, np.zeros(3))
+        return world_T_walker @ walker_T_cam @ se3.exp(shake)
+
+
+def _progress(gait: Gait, rng: np.random.Generator, length: float, route: F64) -> tuple[F64, F64]:
+    """Times (N,) and metres walked (N,): at rest, a soft start, a speed that wanders by a tenth."""
+    length = min(length, float(np.linalg.norm(np.diff(route, axis=0), axis=1).sum()))
+    t = np.arange(0, gait.stand_seconds + 1.4 * length / gait.speed + 3, 1 / _RATE)
+    start = np.clip((t - gait.stand_seconds) / 1.5, 0, 1)
+    phase = rng.uniform(0, 2 * np.pi, 2)
+    speed = gait.speed * (1 + 0.08 * np.sin(0.9 * t + phase[0]) + 0.05 * np.sin(2.3 * t + phase[1]))
+    speed *= start * start * (3 - 2 * start)
+    arc = np.concatenate([[0.0], np.cumsum(speed[:-1]) / _RATE])
+    n = int(np.searchsorted(arc, length)) + 1
+    return t[:n], arc[:n]
+
+
+def _heading(xy: F64, route: F64) -> F64:
+    """(N,) radians of the direction of travel, unwrapped; held where the walker stands."""
+    velocity = np.gradient(xy, axis=0) * _RATE
+    moving = np.linalg.norm(velocity, axis=1) > 0.02
+    first = np.arctan2(*(route[1] - route[0])[::-1])
+    angle = np.arctan2(velocity[:, 1], velocity[:, 0])
+    index = np.maximum.accumulate(np.where(moving, np.arange(len(xy)), -1))
+    return np.unwrap(np.where(index >= 0, angle[np.maximum(index, 0)], first))
+
+
+def _sines(rng: np.random.Generator, scale: float) -> tuple[F64, F64, F64]:
+    """Amplitudes, frequencies (Hz) and phases (6, K) of the shake's tangent (metres, radians; camera axes)."""
+    bands = ((0.9, 1.0), (1.8, 0.6), (3.1, 0.12), (6.7, 0.03))
+    size = np.array([0.012, 0.009, 0.006, np.deg2rad(0.35), np.deg2rad(0.5), np.deg2rad(0.45)])
+    amplitude = scale * size[:, None] * np.array([a for _, a in bands]) * rng.uniform(0.5, 1.0, (6, len(bands)))
+    frequency = np.array([f for f, _ in bands]) * rng.uniform(0.9, 1.1, (6, len(bands)))
+    return amplitude, frequency, rng.uniform(0, 2 * np.pi, (6, len(bands)))
