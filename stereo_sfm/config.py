@@ -17,7 +17,23 @@ class TrackerConfig:
     """The default tracker (tracking/tracker.py)."""
 
     max_features: int = 400  # points tracked at once
-    seed: int = 0
+    min_features: int = 15  # inliers below which a frame is lost
+    pyramid_levels: int = 4
+    min_contrast: float = 2.0  # grey levels of standard deviation; flatter windows are no points
+    min_ncc: float = 0.6  # of a window with the previous frame's
+    min_anchor_ncc: float = 0.75  # of a window with the point's first appearance, affinely deformed
+    max_angle_deg: float = 88.0  # from the optical axis; beyond it a fisheye image is not used
+    corner_quality: float = 0.03  # least corner response, as a share of the strong ones in the image
+    min_depth: float = 0.25  # metres, nearest stereo match searched
+    sigma_px: float = 0.3  # noise of one coordinate of an observation
+    depth_sigma_px: float = 0.6  # the same when the depth of a point is refined from frame to frame
+    max_error: float = 3.0  # sigmas; a worse observation is no inlier
+    max_epipolar_px: float = 1.0  # distance of a stereo match from its epipolar curve
+    max_window_disparity_px: float = 0.4  # a narrow and a wide window must agree on the disparity: no depth edge inside
+    keyframe_share: float = 0.75  # new keyframe when fewer of the last keyframe's points are still tracked
+    keyframe_max_frames: int = 30
+    keyframe_min_flow_share: float = 0.0  # unused below this median flow, as a share of the image width; 0: no limit
+    lost_frames: int = 15  # frames predicted by constant velocity before tracking restarts as a new submap
 
 
 @dataclass(frozen=True)
@@ -27,15 +43,16 @@ class FeaturesConfig:
     kind: str = "sift"  # orb | sift | akaze
     count: int = 0  # most keypoints of an image; 0: what OpenCV's own default is (ORB 500, the others no limit)
     ratio: float = 0.8  # Lowe's: best distance below this share of the second best
-    mask_radius_px: float = 0.0  # look for keypoints only this near to the last keyframe's stereo points; 0: everywhere
-    stereo_check: str = "rig"  # epipolar check of left-right matches: rig (calibrated) | ransac (estimated, as the thesis)
+    mask_radius_px: float = 0.0  # keypoints only this near to the last keyframe's stereo points; 0: everywhere
+    stereo_check: str = "rig"  # epipolar check of left-right matches: rig (calibrated) | ransac (estimated)
     epipolar_px: float = 1.5  # largest distance to the epipolar line, in pixels at the image centre
+    stereo_only: bool = True  # with two eyes, only points that both see (as the thesis)
     motion_window_deg: float = 0.0  # drop matches that moved by more than this angle between frames; 0: keep all
 
 
 @dataclass(frozen=True)
 class OdometryConfig:
-    """Which motion estimator, and its policy (tracking/odometry/). "flow" is the default tracker of tracking/tracker.py."""
+    """Which motion estimator, and its policy (tracking/odometry/); "flow" is the default tracker."""
 
     method: str = "flow"  # flow | em-r | vp-r | r-um | um | eight-point | pnp
     reference: str = "frame"  # motion is estimated from the previous "frame" or from the last "keyframe"
@@ -66,6 +83,31 @@ class LoopConfig:
     """Loop closing (loop/closer.py)."""
 
     enabled: bool = True
+    correction: str = "pose_graph"  # or "averaging": how the loop's error is spread over the keyframes
+    vocabulary: str = ""  # vocabulary file; empty: the one of the package
+    grow_every: int = 0  # keyframes between growths of the vocabulary in a new environment; 0: never
+    score_ratio: float = 0.9  # candidates score above this times the reference score of the connected keyframes
+    reference: str = "weakest"  # reference: their "weakest" score (finds more), or their "best" (the retail paper)
+    min_score: float = 0.02  # ... and above this
+    connected_points: int = 15  # shared points that make two keyframes connected
+    min_gap: int = 10  # keyframes between a keyframe and its candidate
+    max_candidates: int = 3  # places verified per keyframe
+    pause: int = 10  # keyframes after an accepted loop in which none is searched
+    min_match_fraction: float = 0.3  # of the keyframe's points that must match the candidate's
+    max_distance: int = 60  # bits between matching descriptors
+    match_ratio: float = 0.9  # nearest / second nearest descriptor
+    pixel_sigma: float = 1.0  # px, of a point found again from another side
+    disparity_sigma: float = 0.5  # px, of a stereo point's disparity
+    ransac_iterations: int = 400
+    min_inliers: int = 30
+    min_cells: int = 8  # of the 8 x 6 cells of the image that hold inliers
+    consistent: int = 2  # successive keyframes that must agree on a loop
+    consistent_window: int = 4  # ... within so many keyframes
+    gate_metres: float = 0.3  # a loop may contradict odometry by this much ...
+    gate_per_metre: float = 0.02  # ... plus this for every metre walked since
+    gate_degrees: float = 3.0
+    gate_degrees_per_metre: float = 0.3
+    seed: int = 0
 
 
 @dataclass(frozen=True)

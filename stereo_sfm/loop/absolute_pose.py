@@ -1,0 +1,166 @@
+"""Pose of one stereo camera relative to another from matched points, in both directions and both eyes.
+
+Frame a holds known points (a keyframe's, or the map's); frame b is the camera to find. Rows are matches. Where b has
+stereo points too, they are projected back into a. A point's range is uncertain along its ray: the error of a far point
+seen from another side is weighed by that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.rig import Rig
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.cameras import Camera
+from stereo_sfm.loop import p3p
+from stereo_sfm.types import F64, I64, Bool
+
+CHI2_2DOF_95 = 5.991
+
+
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """N matched points; NaN rows where something is unknown."""
+
+    points_a: F64  # (N, 3) metres in frame a, never NaN
+    sigmas_a: F64  # (N,) metres, uncertainty along the ray from a
+    uv_left_b: F64  # (N, 2) px, never NaN
+    uv_right_b: F64  # (N, 2) px
+    points_b: F64  # (N, 3) metres in frame b
+    sigmas_b: F64  # (N,)
+    uv_left_a: F64  # (N, 2) px
+    uv_right_a: F64  # (N, 2) px
+
+    def __len__(self) -> int:
+        return len(self.points_a)
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """A refined relative pose."""
+
+    b_T_a: F64  # (4, 4)
+    information: F64  # (6, 6) of exp(xi) @ b_T_a, equal to that of inverse(b_T_a) @ exp(xi)
+    inlier: Bool  # (N,) agrees in every direction that could be checked
+    rms: float  # normalised error of the inliers (1 = as noisy as assumed)
+
+
+def range_sigmas(points: F64, rig: Rig, disparity_sigma: float) -> F64:
+    """Range uncertainty (N,) in metres of stereo points (N, 3) in the left camera: range^2 sigma / (f b_perp)."""
+    distance = np.linalg.norm(points, axis=1)
+    direction = points / np.maximum(distance, 1e-9)[:, None]
+    offset = rig.left_T_right[:3, 3]
+    across = np.linalg.norm(np.cross(direction, offset), axis=1)
+    return distance**2 * disparity_sigma / (rig.left.fx * np.maximum(across, 1e-3 * rig.baseline + 1e-9))
+
+
+def ransac_pose(
+    matches: Matches, rig: Rig, rng: np.random.Generator, pixel_sigma: float, iterations: int = 400
+) -> F64 | None:
+    """b_T_a (4, 4) with the least truncated error, or None when no sample of three gives one."""
+    if len(matches) < 4:
+        return None
+    bearings = rig.left.unproject(matches.uv_left_b)
+    usable = np.flatnonzero(np.isfinite(bearings[:, 0]))
+    if len(usable) < 4:
+        return None
+    samples = usable[_distinct_triples(rng, len(usable), iterations)]
+    best, cost = p3p.ransac(
+        matches.points_a,
+        matches.sigmas_a,
+        bearings,
+        matches.uv_left_b,
+        matches.points_b,
+        matches.sigmas_b,
+        matches.uv_left_a,
+        rig.left.model_id,
+        rig.left.params,
+        pixel_sigma,
+        CHI2_2DOF_95,
+        samples,
+        0.9999,
+    )
+    return se3.orthonormalize(np.vstack([best, [0, 0, 0, 1]])) if np.isfinite(cost) else None
+
+
+def _distinct_triples(rng: np.random.Generator, n: int, count: int) -> I64:
+    """(count, 3) rows below n, distinct within a triple."""
+    a = rng.integers(0, n, count)
+    b = (a + rng.integers(1, n, count)) % n
+    c = rng.integers(0, n - 2, count)
+    low, high = np.minimum(a, b), np.maximum(a, b)
+    c = c + (c >= low)
+    c = c + (c >= high)
+    return np.stack([a, b, c], axis=1)
+
+
+def consistent(b_T_a: F64, matches: Matches, rig: Rig, pixel_sigma: float) -> Bool:
+    """(N,): the error is within the 95 % bound forwards, and backwards where b knows the point."""
+    ahead = _errors(b_T_a, matches.points_a, matches.sigmas_a, matches.uv_left_b, rig.left, pixel_sigma)
+    back = _errors(se3.inverse(b_T_a), matches.points_b, matches.sigmas_b, matches.uv_left_a, rig.left, pixel_sigma)
+    return (ahead < CHI2_2DOF_95) & ~(back >= CHI2_2DOF_95)
+
+
+def _errors(t: F64, points: F64, sigmas: F64, uv: F64, camera: Camera, pixel_sigma: float) -> F64:
+    return p3p.errors(np.ascontiguousarray(t[:3]), points, sigmas, uv, camera.model_id, camera.params, pixel_sigma)
+
+
+def refine_pose(b_T_a: F64, matches: Matches, rig: Rig, pixel_sigma: float, iterations: int = 10) -> Pose:
+    """Gauss-Newton on exp(xi) @ b_T_a over both eyes and both directions, with the inliers of every round."""
+    t = b_T_a
+    inlier = consistent(t, matches, rig, pixel_sigma)
+    hessian, rms = np.zeros((6, 6)), float("inf")
+    for _ in range(iterations):
+        hessian, gradient, rms = _normal_equations(t, matches, rig, pixel_sigma, inlier)
+        try:
+            step: F64 = -np.asarray(np.linalg.solve(hessian + 1e-9 * np.eye(6), gradient), np.float64)
+        except np.linalg.LinAlgError:
+            break
+        t = se3.exp(step) @ t
+        updated = consistent(t, matches, rig, pixel_sigma)
+        if np.abs(step).max() < 1e-8 and np.array_equal(updated, inlier):
+            break
+        inlier = updated
+    return Pose(se3.orthonormalize(t), hessian, inlier, rms)
+
+
+def _normal_equations(t: F64, m: Matches, rig: Rig, pixel_sigma: float, inlier: Bool) -> tuple[F64, F64, float]:
+    hessian, gradient, cost, count = np.zeros((6, 6)), np.zeros(6), 0.0, 0
+    back = se3.inverse(t)
+    eyes: list[tuple[Camera, F64]] = [(rig.left, np.eye(4))]
+    if rig.right is not None:
+        eyes.append((rig.right, se3.inverse(rig.left_T_right)))
+    for eye, (camera, eye_T_left) in enumerate(eyes):
+        for points, sigmas, uv, pose, forward in (
+            (m.points_a, m.sigmas_a, (m.uv_left_b, m.uv_right_b)[eye], t, True),
+            (m.points_b, m.sigmas_b, (m.uv_left_a, m.uv_right_a)[eye], back, False),
+        ):
+            rows = np.flatnonzero(inlier & np.isfinite(points[:, 0]) & np.isfinite(uv[:, 0]))
+            source = points[rows]
+            seen = se3.transform(eye_T_left @ pose, source)
+            projected, jac = camera.project_jacobian(seen)
+            ok = np.isfinite(projected[:, 0])
+            rows, source, projected, jac = rows[ok], source[ok], projected[ok], jac[ok]
+            moved = se3.transform(t, source) if forward else source  # in b, where xi acts
+            dmove = np.concatenate([np.broadcast_to(np.eye(3), (len(rows), 3, 3)), -se3.skew(moved)], axis=2)
+            rotation = eye_T_left[:3, :3] if forward else -(eye_T_left @ back)[:3, :3]
+            j = jac @ (rotation @ dmove)
+            weight, residual = _whiten(projected - uv[rows], jac, eye_T_left @ pose, source, sigmas[rows], pixel_sigma)
+            jw = np.swapaxes(j, 1, 2) @ weight
+            hessian += (jw @ j).sum(0)
+            gradient += (jw @ (projected - uv[rows])[..., None]).sum(0)[:, 0]
+            cost += float(residual.sum())
+            count += len(rows)
+    return hessian, gradient, float(np.sqrt(cost / max(2 * count, 1)))
+
+
+def _whiten(error: F64, jac: F64, pose: F64, source: F64, sigmas: F64, pixel_sigma: float) -> tuple[F64, F64]:
+    """Inverse covariances (N, 2, 2) with the range uncertainty, and squared normalised errors (N,)."""
+    ray = source / np.maximum(np.linalg.norm(source, axis=1), 1e-9)[:, None] * sigmas[:, None]
+    d = (jac @ (pose[:3, :3] @ ray[..., None]))[..., 0]
+    s2 = pixel_sigma**2
+    outer = d[:, :, None] * d[:, None, :]
+    weight = (np.eye(2) - outer / (s2 + (d * d).sum(1))[:, None, None]) / s2
+    return weight, np.einsum("ni,nij,nj->n", error, weight, error)

@@ -1,0 +1,191 @@
+"""Compiled kernels over 256-bit binary descriptors: Hamming distances, nearest neighbours, k-majority clustering.
+
+A descriptor is 32 bytes; inside the kernels it is four uint64, made by `as_words`. A row of zeros means that no
+descriptor could be computed and matches nothing.
+"""
+
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportMissingTypeArgument=false
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from stereo_sfm.types import F32, I32, I64, U8, Bool
+
+U64 = NDArray[np.uint64]
+BITS = 256
+njit: Any = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+
+def as_words(descriptors: U8) -> U64:
+    """(N, 32) uint8 -> (N, 4) uint64 with the same bits."""
+    return np.ascontiguousarray(descriptors, np.uint8).reshape(-1, 32).view(np.uint64)
+
+
+def present(descriptors: U8) -> Bool:
+    """(N, 32) -> (N,) False for the zero rows."""
+    return np.asarray(np.any(descriptors, axis=1), bool)
+
+
+@njit
+def _popcount(x):
+    x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
+    x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return np.int64((x * np.uint64(0x0101010101010101)) >> np.uint64(56))
+
+
+@njit
+def hamming(a, i, b, j):
+    """Number of bits in which row i of a and row j of b differ."""
+    return (
+        _popcount(a[i, 0] ^ b[j, 0])
+        + _popcount(a[i, 1] ^ b[j, 1])
+        + _popcount(a[i, 2] ^ b[j, 2])
+        + _popcount(a[i, 3] ^ b[j, 3])
+    )
+
+
+@njit
+def _two_nearest(a, b, group):
+    """For every row of a: nearest row of b, its distance, and the distance of the nearest row of another group.
+
+    `group` (len(b),) marks rows that show one physical point: they do not compete with each other. Ties go to the
+    lower index.
+    """
+    best = np.full(a.shape[0], -1, np.int32)
+    first = np.full(a.shape[0], BITS + 1, np.int32)
+    second = np.full(a.shape[0], BITS + 1, np.int32)
+    for i in range(a.shape[0]):
+        for j in range(b.shape[0]):
+            d = hamming(a, i, b, j)
+            if d < first[i]:
+                if best[i] >= 0 and group[best[i]] != group[j]:
+                    second[i] = first[i]
+                first[i] = d
+                best[i] = j
+            elif d < second[i] and group[j] != group[best[i]]:
+                second[i] = d
+    return best, first, second
+
+
+@njit
+def _majority(words, members, k, assignment):
+    """Bitwise majority of each of k clusters over rows `members` of words; empty clusters stay zero."""
+    votes = np.zeros((k, BITS), np.int32)
+    sizes = np.zeros(k, np.int32)
+    for n in range(members.shape[0]):
+        c = assignment[n]
+        sizes[c] += 1
+        for w in range(4):
+            x = words[members[n], w]
+            for b in range(64):
+                votes[c, w * 64 + b] += np.int32((x >> np.uint64(b)) & np.uint64(1))
+    centres = np.zeros((k, 4), np.uint64)
+    for c in range(k):
+        for w in range(4):
+            x = np.uint64(0)
+            for b in range(64):
+                if 2 * votes[c, w * 64 + b] > sizes[c]:
+                    x |= np.uint64(1) << np.uint64(b)
+            centres[c, w] = x
+    return centres, sizes
+
+
+@njit
+def _assign(words, members, centres):
+    """Nearest centre of each member and the distance to it; ties go to the lower centre."""
+    out = np.empty(members.shape[0], np.int32)
+    distance = np.empty(members.shape[0], np.int32)
+    for n in range(members.shape[0]):
+        low = BITS + 1
+        for c in range(centres.shape[0]):
+            d = hamming(words, members[n], centres, c)
+            if d < low:
+                low = d
+                out[n] = c
+        distance[n] = low
+    return out, distance
+
+
+@njit
+def descend(words, centroids, first_child, child_count):
+    """Leaf node reached by every descriptor, and its distance to that leaf's centroid."""
+    node = np.zeros(words.shape[0], np.int32)
+    distance = np.zeros(words.shape[0], np.int32)
+    for i in range(words.shape[0]):
+        at = 0
+        low = BITS + 1
+        while child_count[at] > 0:
+            low = BITS + 1
+            start = first_child[at]
+            for c in range(start, start + child_count[at]):
+                d = hamming(words, i, centroids, c)
+                if d < low:
+                    low = d
+                    at = c
+        node[i] = at
+        distance[i] = low
+    return node, distance
+
+
+def k_majority(words: U64, members: I32, k: int, rng: np.random.Generator, rounds: int = 10) -> tuple[U64, I32]:
+    """k-majority clustering (Grana et al., 2013: k-means with Hamming distance and bitwise majority).
+
+    Args:
+        words: (N, 4). members: (n,) rows to cluster.
+        k: clusters wanted; fewer come back when there are fewer distinct descriptors.
+
+    Returns:
+        (c, 4) centres and (n,) the centre of each member.
+    """
+    centres = words[members[[int(rng.integers(len(members)))]]]
+    _, distance = _assign(words, members, centres)
+    while len(centres) < k:  # k-means++ seeding: the next centre with probability proportional to squared distance
+        weight = distance.astype(float) ** 2
+        total = weight.sum()
+        if total == 0:
+            break
+        pick = int(np.searchsorted(np.cumsum(weight), rng.random() * total, side="right"))
+        new = words[members[[min(pick, len(members) - 1)]]]
+        centres = np.concatenate([centres, new])
+        distance = np.minimum(distance, _assign(words, members, new)[1])
+    assignment, _ = _assign(words, members, centres)
+    for _ in range(rounds):
+        centres, sizes = _majority(words, members, len(centres), assignment)
+        centres = centres[sizes > 0]
+        updated, _ = _assign(words, members, centres)
+        if np.array_equal(updated, assignment):
+            break
+        assignment = updated
+    used, assignment = np.unique(assignment, return_inverse=True)
+    return centres[used], assignment.astype(np.int32)
+
+
+def match_descriptors(
+    query: U8, train: U8, group: I64 | None = None, max_distance: int = 64, ratio: float = 1.0, mutual: bool = True
+) -> tuple[I32, I32, F32]:
+    """Pairs of nearest descriptors.
+
+    Args:
+        query: (N, 32). train: (M, 32).
+        group: (M,) rows of train with the same value are one physical point and do not compete in the ratio test.
+        max_distance: bits; ratio: nearest / nearest of another point must not exceed it (1: no test).
+        mutual: keep a pair only if the query row is also the nearest to the train row.
+
+    Returns:
+        Query rows, train rows, distances in bits: (K,) each, ascending in the query row.
+    """
+    q_rows, t_rows = np.flatnonzero(present(query)).astype(np.int32), np.flatnonzero(present(train)).astype(np.int32)
+    a, b = as_words(query[q_rows]), as_words(train[t_rows])
+    groups = np.arange(len(b)) if group is None else np.ascontiguousarray(group[t_rows])
+    best, first, second = _two_nearest(a, b, groups)
+    ok = (best >= 0) & (first <= max_distance) & (first <= ratio * second)
+    if mutual and len(b):
+        back, _, _ = _two_nearest(b, a, np.arange(len(a)))
+        ok &= back[best] == np.arange(len(a))
+    return q_rows[ok], t_rows[best[ok]], first[ok].astype(np.float32)

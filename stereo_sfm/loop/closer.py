@@ -1,0 +1,203 @@
+"""The loop closer: one keyframe in, exactly one answer out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.rig import Rig
+from stereo_sfm.config import LoopConfig
+from stereo_sfm.geometry import se3
+from stereo_sfm.loop import vocabulary as voc
+from stereo_sfm.loop.absolute_pose import range_sigmas
+from stereo_sfm.loop.cloud import gather
+from stereo_sfm.loop.database import PlaceDatabase
+from stereo_sfm.loop.graph import KeyframeGraph
+from stereo_sfm.loop.store import KeyframeStore
+from stereo_sfm.loop.verification import Verdict, View, rejection, verify, view_of, within
+from stereo_sfm.loop.vocabulary import Vocabulary
+from stereo_sfm.timing import NoSpans
+from stereo_sfm.types import F64, Keyframe, LoopResult
+
+CLOUD_KEYFRAMES = 4  # connected keyframes whose points are added to a candidate's own
+PLACE_RADIUS = 3  # candidates this many keyframes apart are one place: only the best of them is verified
+AGREE_METRES, AGREE_DEGREES = 0.15, 2.0  # how well two keyframes must agree on a loop
+
+
+@dataclass(frozen=True, eq=False)
+class _Hypothesis:
+    kf_id: int
+    candidate_kf_id: int
+    candidate_T_kf: F64
+
+
+class LoopCloser:
+    """Owner of the place database.
+
+    Appearance proposes (bag of words), geometry decides (`verify`), odometry must allow it (a loop may not contradict
+    the way walked by more than drift can explain), and successive keyframes must agree.
+    """
+
+    def __init__(
+        self, config: LoopConfig, rig: Rig, vocabulary: Vocabulary | None = None, spans: NoSpans | None = None
+    ) -> None:
+        if vocabulary is None:
+            from stereo_sfm.loop.vocabulary_file import configured_vocabulary
+
+            vocabulary = configured_vocabulary(config)
+        self._config, self._rig, self._spans = config, rig, spans or NoSpans()
+        self._vocabulary = vocabulary
+        self._database = PlaceDatabase(len(vocabulary))
+        self._store = KeyframeStore()
+        self._graph = KeyframeGraph()
+        self._pending: list[_Hypothesis] = []
+        self._last_loop = -(10**9)
+
+    @property
+    def vocabulary(self) -> Vocabulary:
+        """The vocabulary as it is now: it may have grown."""
+        return self._vocabulary
+
+    def step(self, keyframe: Keyframe) -> LoopResult:
+        """Look for the keyframe's place among the older ones, then remember it."""
+        self._graph.add(keyframe.kf_id, keyframe.odom_T_cam, keyframe.submap_id)
+        with self._spans.span("loop_words"):
+            bag = self._vocabulary.bag(keyframe.descriptors)
+        with self._spans.span("loop_query"):
+            candidates, why_none = self._candidates(keyframe, bag)
+        with self._spans.span("loop_verify"):
+            result = self._judge(keyframe, candidates, why_none)
+        self._database.add(keyframe.kf_id, bag)
+        self._store.add(keyframe)
+        self._grow(keyframe)
+        return result
+
+    def _candidates(self, keyframe: Keyframe, bag: voc.Bag) -> tuple[list[tuple[int, float]], str]:
+        """Places to verify as (keyframe, score), best first, and the reason when there are none."""
+        config = self._config
+        if not config.enabled:
+            return [], "disabled"
+        if keyframe.kf_id - self._last_loop <= config.pause:
+            return [], "paused"
+        connected = self._store.connected(keyframe.point_ids, config.connected_points)
+        scores = self._database.scores(bag)
+        order = {int(k): i for i, k in enumerate(self._database.kf_ids)}
+        pick = max if config.reference == "best" else min
+        reference = pick((scores[order[k]] for k in connected), default=0.0)
+        bound = max(config.score_ratio * reference, config.min_score)
+        excluded = self._near(keyframe.kf_id, connected)
+        good = [int(i) for i in np.flatnonzero(scores > bound) if int(self._database.kf_ids[i]) not in excluded]
+        good.sort(key=lambda i: (-scores[i], i))
+        places: list[tuple[int, float]] = []
+        for i in good:
+            kf_id = int(self._database.kf_ids[i])
+            if all(abs(kf_id - other) > PLACE_RADIUS for other, _ in places):
+                places.append((kf_id, float(scores[i])))
+            if len(places) == config.max_candidates:
+                break
+        return places, "no_candidate"
+
+    def _near(self, kf_id: int, connected: list[int]) -> set[int]:
+        """Keyframes that cannot be loops: connected to this one, or just before it."""
+        near = set(connected)
+        near.update(range(kf_id - self._config.min_gap, kf_id + 1))
+        return near
+
+    def _judge(self, keyframe: Keyframe, candidates: list[tuple[int, float]], why_none: str) -> LoopResult:
+        if not candidates:
+            return _no_loop(keyframe.kf_id, why_none, 0.0, ())
+        sigmas = range_sigmas(keyframe.points_cam, self._rig, self._config.disparity_sigma)
+        view = view_of(keyframe, sigmas)
+        rejected: list[tuple[int, float, str]] = []
+        for candidate, score in candidates:
+            verdict = self._verify(keyframe, view, candidate)
+            if not verdict.reason:
+                return self._accept(keyframe, candidate, score, verdict, tuple(rejected))
+            rejected.append((candidate, score, verdict.reason))
+        return _no_loop(keyframe.kf_id, rejected[0][2], rejected[0][1], tuple(rejected))
+
+    def _verify(self, keyframe: Keyframe, view: View, candidate: int) -> Verdict:
+        config = self._config
+        centre = self._store[candidate]
+        around = [self._store[k] for k in self._store.best_connected(candidate, CLOUD_KEYFRAMES)]
+        around = [k for k in around if k.submap_id == centre.submap_id]
+        cloud = gather(centre, around, self._rig, config.disparity_sigma)
+        rng = np.random.default_rng([config.seed, keyframe.kf_id, candidate])
+        verdict = verify(view, cloud, self._rig, config, rng)
+        if verdict.reason:
+            return verdict
+        candidate_T_kf = se3.inverse(verdict.b_T_a)
+        way = self._graph.way(candidate, keyframe.kf_id)
+        if way is None:
+            if verdict.inliers < 2 * config.min_inliers:
+                return rejection("too_few_inliers", verdict.inliers)
+        else:
+            metres = config.gate_metres + config.gate_per_metre * way.metres
+            degrees = config.gate_degrees + config.gate_degrees_per_metre * way.metres
+            if not within(se3.inverse(way.a_T_b) @ candidate_T_kf, metres, degrees):
+                return rejection("against_odometry", verdict.inliers)
+        if not self._agreed(_Hypothesis(keyframe.kf_id, candidate, candidate_T_kf)):
+            return rejection("not_confirmed_yet", verdict.inliers)
+        return verdict
+
+    def _agreed(self, new: _Hypothesis) -> bool:
+        """Whether enough earlier keyframes found the same loop; remembers the new one."""
+        config = self._config
+        self._pending = [h for h in self._pending if new.kf_id - h.kf_id < config.consistent_window]
+        votes = {new.kf_id} | {h.kf_id for h in self._pending if self._same_loop(h, new)}
+        self._pending.append(new)
+        return len(votes) >= config.consistent
+
+    def _same_loop(self, old: _Hypothesis, new: _Hypothesis) -> bool:
+        back = self._graph.way(old.candidate_kf_id, new.candidate_kf_id)
+        ahead = self._graph.way(new.kf_id, old.kf_id)
+        if back is None or ahead is None:
+            return False
+        implied = back.a_T_b @ new.candidate_T_kf @ ahead.a_T_b
+        return within(se3.inverse(old.candidate_T_kf) @ implied, AGREE_METRES, AGREE_DEGREES)
+
+    def _accept(
+        self,
+        keyframe: Keyframe,
+        candidate: int,
+        score: float,
+        verdict: Verdict,
+        rejected: tuple[tuple[int, float, str], ...],
+    ) -> LoopResult:
+        candidate_T_kf = se3.inverse(verdict.b_T_a)
+        self._graph.add_loop(candidate, keyframe.kf_id, candidate_T_kf)
+        self._store.merge(verdict.pairs)
+        self._last_loop = keyframe.kf_id
+        self._pending.clear()
+        return LoopResult(
+            kf_id=keyframe.kf_id,
+            candidate_kf_id=candidate,
+            candidate_T_kf=candidate_T_kf,
+            information=verdict.information,
+            matches=verdict.pairs,
+            inliers=verdict.inliers,
+            score=score,
+            reason="",
+            rejected=rejected,
+        )
+
+    def _grow(self, keyframe: Keyframe) -> None:
+        every = self._config.grow_every
+        if every and keyframe.kf_id % every == every - 1:
+            recent = [self._store[k].descriptors for k in self._store.ids[-every:]]
+            self._vocabulary = voc.grow(self._vocabulary, np.concatenate(recent))
+
+
+def _no_loop(kf_id: int, reason: str, score: float, rejected: tuple[tuple[int, float, str], ...]) -> LoopResult:
+    return LoopResult(
+        kf_id=kf_id,
+        candidate_kf_id=-1,
+        candidate_T_kf=np.eye(4),
+        information=np.zeros((6, 6)),
+        matches=np.zeros((0, 2), np.int64),
+        inliers=0,
+        score=score,
+        reason=reason,
+        rejected=rejected,
+    )

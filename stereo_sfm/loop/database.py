@@ -1,0 +1,128 @@
+"""Place database: an inverted index from words to keyframes, in arrays that grow by doubling.
+
+Postings of a word are a chain of blocks, so adding a keyframe never moves the others and a query touches only the
+postings of the words it asks for.
+"""
+
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportMissingTypeArgument=false
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+
+from stereo_sfm.loop.vocabulary import Bag
+from stereo_sfm.types import F32, F64, I32, I64
+
+BLOCK = 8
+njit: Any = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+
+@njit
+def _insert(words, weights, entry, head, fill, following, block_entry, block_weight, used):
+    """Append (entry, weight) to the chain of each word; newest block first. Returns the number of used blocks."""
+    for i in range(words.shape[0]):
+        w = words[i]
+        block = head[w]
+        if block < 0 or fill[block] == BLOCK:
+            following[used] = block
+            head[w] = used
+            block = used
+            used += 1
+        slot = fill[block]
+        block_entry[block, slot] = entry
+        block_weight[block, slot] = weights[i]
+        fill[block] = slot + 1
+    return used
+
+
+@njit
+def _accumulate(words, weights, head, fill, following, block_entry, block_weight, scores):
+    """Add the common minimum of every posting to its entry's score (words in ascending order: a fixed sum order)."""
+    for i in range(words.shape[0]):
+        block = head[words[i]]
+        while block >= 0:
+            for s in range(fill[block]):
+                scores[block_entry[block, s]] += min(weights[i], block_weight[block, s])
+            block = following[block]
+
+
+def _grown(array: Any, size: int, value: int = 0) -> Any:
+    """A copy with at least `size` rows, doubling."""
+    if len(array) >= size:
+        return array
+    out = np.full((max(size, 2 * len(array)), *array.shape[1:]), value, array.dtype)
+    out[: len(array)] = array
+    return out
+
+
+class PlaceDatabase:
+    """Keyframes by their bags of words."""
+
+    def __init__(self, word_count: int) -> None:
+        self._head: I32 = np.full(word_count, -1, np.int32)
+        self._fill: I32 = np.zeros(1024, np.int32)
+        self._following: I32 = np.full(1024, -1, np.int32)
+        self._entry: I32 = np.zeros((1024, BLOCK), np.int32)
+        self._weight: F32 = np.zeros((1024, BLOCK), np.float32)
+        self._used = 0
+        self._kf_ids: I64 = np.zeros(64, np.int64)
+        self._count = 0
+
+    def __len__(self) -> int:
+        """Number of keyframes."""
+        return self._count
+
+    @property
+    def kf_ids(self) -> I64:
+        """(K,) in order of insertion."""
+        return self._kf_ids[: self._count]
+
+    def add(self, kf_id: int, bag: Bag) -> None:
+        """Insert a keyframe; words beyond the known ones (a grown vocabulary) are added."""
+        if len(bag.words):
+            self._head = _grown(self._head, int(bag.words[-1]) + 1, -1)
+        need = self._used + len(bag.words)
+        self._fill = _grown(self._fill, need)
+        self._following = _grown(self._following, need, -1)
+        self._entry = _grown(self._entry, need)
+        self._weight = _grown(self._weight, need)
+        self._used = _insert(
+            bag.words,
+            bag.weights,
+            self._count,
+            self._head,
+            self._fill,
+            self._following,
+            self._entry,
+            self._weight,
+            self._used,
+        )
+        self._kf_ids = _grown(self._kf_ids, self._count + 1)
+        self._kf_ids[self._count] = kf_id
+        self._count += 1
+
+    def scores(self, bag: Bag) -> F64:
+        """(K,) L1 score of every keyframe in order of insertion (see `vocabulary.score`)."""
+        scores = np.zeros(self._count)
+        known = bag.words < len(self._head)
+        _accumulate(
+            bag.words[known],
+            bag.weights[known],
+            self._head,
+            self._fill,
+            self._following,
+            self._entry,
+            self._weight,
+            scores,
+        )
+        return scores
+
+    def query(self, bag: Bag, min_score: float, limit: int) -> tuple[I64, F64]:
+        """Keyframes that score above `min_score`, best first, ties to the older; at most `limit`."""
+        scores = self.scores(bag)
+        chosen = np.flatnonzero(scores > min_score)
+        order = chosen[np.lexsort((chosen, -scores[chosen]))][:limit]
+        return self.kf_ids[order], scores[order]

@@ -1,0 +1,72 @@
+"""What is known of the way between two keyframes: odometry along the walk, and accepted loops as short cuts."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from stereo_sfm.geometry import se3
+from stereo_sfm.types import F64
+
+
+@dataclass(frozen=True, eq=False)
+class Way:
+    """The shortest known way from keyframe a to keyframe b."""
+
+    a_T_b: F64  # (4, 4) composed along it
+    metres: float  # walked on it: the drift it may hold grows with this
+
+
+class KeyframeGraph:
+    """Keyframes in order of time; consecutive ones are linked by odometry unless tracking restarted between them."""
+
+    def __init__(self) -> None:
+        self._poses: dict[int, F64] = {}  # odom_T_cam
+        self._metres: dict[int, float] = {}  # walked since the start
+        self._chain: dict[int, int] = {}  # number of the unbroken piece of odometry
+        self._loops: list[tuple[int, int, F64]] = []  # a, b, a_T_b
+        self._last = -1
+
+    def add(self, kf_id: int, odom_T_cam: F64, chain: int) -> None:
+        """Append the newest keyframe of an unbroken piece of odometry called `chain`."""
+        step = np.linalg.norm(odom_T_cam[:3, 3] - self._poses[self._last][:3, 3]) if self._last >= 0 else 0.0
+        self._metres[kf_id] = self._metres.get(self._last, 0.0) + float(step)
+        self._poses[kf_id], self._chain[kf_id], self._last = odom_T_cam, chain, kf_id
+
+    def add_loop(self, a: int, b: int, a_T_b: F64) -> None:
+        """Link two keyframes whose relative pose was verified."""
+        self._loops.append((a, b, a_T_b))
+
+    def way(self, a: int, b: int) -> Way | None:
+        """The way with the fewest metres, or None where tracking broke and no loop joins the pieces (Dijkstra)."""
+        nodes = sorted({a, b, *(n for loop in self._loops for n in loop[:2])}, key=lambda n: (self._chain[n], n))
+        edges: dict[int, list[tuple[int, float, F64]]] = {n: [] for n in nodes}
+        for p, q in itertools.pairwise(nodes):
+            if self._chain[p] == self._chain[q]:
+                self._link(edges, p, q, se3.inverse(self._poses[p]) @ self._poses[q], self._metres[q] - self._metres[p])
+        for p, q, p_T_q in self._loops:
+            self._link(edges, p, q, p_T_q, 0.0)
+        heap: list[tuple[float, int]] = [(0.0, a)]
+        poses, done = {a: np.eye(4)}, set[int]()
+        lowest = {a: 0.0}
+        while heap:
+            metres, node = heapq.heappop(heap)
+            if node == b:
+                return Way(poses[b], metres)
+            if node in done:
+                continue
+            done.add(node)
+            for other, length, node_T_other in edges[node]:
+                if metres + length < lowest.get(other, np.inf):
+                    lowest[other] = metres + length
+                    poses[other] = poses[node] @ node_T_other
+                    heapq.heappush(heap, (metres + length, other))
+        return None
+
+    @staticmethod
+    def _link(edges: dict[int, list[tuple[int, float, F64]]], p: int, q: int, p_T_q: F64, length: float) -> None:
+        edges[p].append((q, length, p_T_q))
+        edges[q].append((p, length, se3.inverse(p_T_q)))

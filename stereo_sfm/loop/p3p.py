@@ -1,0 +1,268 @@
+"""Three-point absolute pose and its RANSAC, compiled, for bearings of any camera (Persson & Nordberg, Lambda Twist,
+ECCV 2018; our own derivation of its steps)."""
+
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportMissingTypeArgument=false
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numba
+import numpy as np
+
+from stereo_sfm.geometry.kernels import project_one
+
+njit: Any = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+
+@njit
+def _cubic_root(c3, c2, c1, c0):
+    """One real root of c3 x^3 + c2 x^2 + c1 x + c0, the one where the polynomial is steepest, polished by Newton."""
+    if abs(c3) < 1e-14 * (abs(c2) + abs(c1) + abs(c0)):
+        if abs(c2) < 1e-14 * (abs(c1) + abs(c0)):
+            return -c0 / c1
+        disc = max(c1 * c1 - 4 * c2 * c0, 0.0)
+        return (-c1 - math.copysign(math.sqrt(disc), c1)) / (2 * c2)
+    a, b, c = c2 / c3, c1 / c3, c0 / c3
+    q = (a * a - 3 * b) / 9
+    r = (2 * a * a * a - 9 * a * b + 27 * c) / 54
+    if r * r < q * q * q:
+        theta = math.acos(max(-1.0, min(1.0, r / math.sqrt(q * q * q))))
+        x = -2 * math.sqrt(q) * math.cos(theta / 3) - a / 3
+    else:
+        s = -math.copysign((abs(r) + math.sqrt(max(r * r - q * q * q, 0.0))) ** (1 / 3), r)
+        x = s + (q / s if s != 0 else 0.0) - a / 3
+    for _ in range(4):
+        slope = (3 * x + 2 * a) * x + b
+        if slope == 0:
+            break
+        x -= (((x + a) * x + b) * x + c) / slope
+    return x
+
+
+@njit
+def _eigenvector(m, value):
+    """Unit null vector of the symmetric 3x3 matrix m - value I: the largest cross product of two of its rows."""
+    n = m - value * np.eye(3)
+    best = np.zeros(3)
+    largest = -1.0
+    for i in range(3):
+        c = np.cross(n[i], n[(i + 1) % 3])
+        size = c[0] * c[0] + c[1] * c[1] + c[2] * c[2]
+        if size > largest:
+            largest = size
+            best = c
+    return best / math.sqrt(largest) if largest > 0 else best
+
+
+@njit
+def _det3(m):
+    return (
+        m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1])
+        - m[0, 1] * (m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0])
+        + m[0, 2] * (m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0])
+    )
+
+
+@njit
+def _adjugate_trace(a, b):
+    """trace(adj(a) b) for symmetric a."""
+    total = 0.0
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        total += (a[j, j] * a[k, k] - a[j, k] * a[k, j]) * b[i, i]
+        total += 2 * (a[i, k] * a[j, k] - a[i, j] * a[k, k]) * b[i, j]
+    return total
+
+
+@njit
+def _polish(lam, a12, a13, a23, b12, b13, b23):
+    """Newton steps on the three distance equations."""
+    for _ in range(3):
+        l1, l2, l3 = lam
+        r = np.array(
+            [
+                l1 * l1 + l2 * l2 - 2 * b12 * l1 * l2 - a12,
+                l1 * l1 + l3 * l3 - 2 * b13 * l1 * l3 - a13,
+                l2 * l2 + l3 * l3 - 2 * b23 * l2 * l3 - a23,
+            ]
+        )
+        j = np.array(
+            [
+                [2 * (l1 - b12 * l2), 2 * (l2 - b12 * l1), 0.0],
+                [2 * (l1 - b13 * l3), 0.0, 2 * (l3 - b13 * l1)],
+                [0.0, 2 * (l2 - b23 * l3), 2 * (l3 - b23 * l2)],
+            ]
+        )
+        det = _det3(j)
+        if abs(det) < 1e-18:
+            break
+        step = np.empty(3)
+        for c in range(3):
+            jc = j.copy()
+            jc[:, c] = r
+            step[c] = _det3(jc) / det
+        lam = lam - step
+    return lam
+
+
+@njit
+def p3p(points, bearings):
+    """(3, 3) points of frame a and (3, 3) unit bearings of frame b -> up to four b_T_a as (4, 3, 4), and how many."""
+    out = np.empty((4, 3, 4))
+    count = 0
+    x12, x13 = points[0] - points[1], points[0] - points[2]
+    x23 = points[1] - points[2]
+    a12, a13, a23 = (x12 * x12).sum(), (x13 * x13).sum(), (x23 * x23).sum()
+    b12, b13 = (bearings[0] * bearings[1]).sum(), (bearings[0] * bearings[2]).sum()
+    b23 = (bearings[1] * bearings[2]).sum()
+    normal = np.cross(x12, x13)
+    area = (normal * normal).sum()
+    if area < 1e-12 * a12 * a13 or min(a12, a13, a23) < 1e-12:
+        return out, 0
+    d1 = np.array([[a23, -a23 * b12, 0.0], [-a23 * b12, a23 - a12, a12 * b23], [0.0, a12 * b23, -a12]])
+    d2 = np.array([[a23, 0.0, -a23 * b13], [0.0, -a13, a13 * b23], [-a23 * b13, a13 * b23, a23 - a13]])
+    g = _cubic_root(_det3(d2), _adjugate_trace(d2, d1), _adjugate_trace(d1, d2), _det3(d1))
+    d0 = d1 + g * d2
+    trace = d0[0, 0] + d0[1, 1] + d0[2, 2]
+    minors = (
+        d0[0, 0] * d0[1, 1] - d0[0, 1] ** 2 + d0[0, 0] * d0[2, 2] - d0[0, 2] ** 2 + d0[1, 1] * d0[2, 2] - d0[1, 2] ** 2
+    )
+    disc = math.sqrt(max(trace * trace - 4 * minors, 0.0))
+    positive, negative = 0.5 * (trace + disc), 0.5 * (trace - disc)
+    if not (positive > 0 and negative <= 0):
+        return out, 0
+    e1, e2 = _eigenvector(d0, positive), _eigenvector(d0, negative)
+    s = math.sqrt(-negative / positive)
+    frame = np.empty((3, 3))
+    frame[:, 0], frame[:, 1], frame[:, 2] = x12, x13, normal
+    inverse = np.linalg.inv(frame)
+    for sign in (-1.0, 1.0):
+        n = e1 + sign * s * e2
+        if abs(n[0]) < 1e-12:
+            continue
+        w0, w1 = -n[1] / n[0], -n[2] / n[0]
+        qa = (w1 * w1 + 1 - 2 * b13 * w1) * a23 - a13
+        qb = 2 * w0 * (w1 - b13) * a23 + 2 * b23 * a13
+        qc = w0 * w0 * a23 - a13
+        quad = qb * qb - 4 * qa * qc
+        if quad < 0 or abs(qa) < 1e-14:
+            continue
+        for root in (-1.0, 1.0):
+            tau = (-qb + root * math.sqrt(quad)) / (2 * qa)
+            ratio = w0 + w1 * tau
+            size = 1 + tau * tau - 2 * b23 * tau
+            if tau <= 0 or ratio <= 0 or size <= 0:
+                continue
+            l2 = math.sqrt(a23 / size)
+            lam = _polish(np.array([ratio * l2, l2, tau * l2]), a12, a13, a23, b12, b13, b23)
+            if not (lam[0] > 0 and lam[1] > 0 and lam[2] > 0):
+                continue
+            y12 = lam[0] * bearings[0] - lam[1] * bearings[1]
+            y13 = lam[0] * bearings[0] - lam[2] * bearings[2]
+            target = np.empty((3, 3))
+            target[:, 0], target[:, 1], target[:, 2] = y12, y13, np.cross(y12, y13)
+            rotation = target @ inverse
+            out[count, :, :3] = rotation
+            out[count, :, 3] = lam[0] * bearings[0] - rotation @ points[0]
+            count += 1
+    return out, count
+
+
+@njit
+def squared_error(t, point, range_sigma, uv, model, params, pixel_sigma):
+    """Squared reprojection error over its variance: pixel noise and the point's own range uncertainty along its ray.
+
+    `t` (3, 4) takes the point into the camera. Infinite where the camera cannot see the point.
+    """
+    x = t[0, 0] * point[0] + t[0, 1] * point[1] + t[0, 2] * point[2] + t[0, 3]
+    y = t[1, 0] * point[0] + t[1, 1] * point[1] + t[1, 2] * point[2] + t[1, 3]
+    z = t[2, 0] * point[0] + t[2, 1] * point[1] + t[2, 2] * point[2] + t[2, 3]
+    u, v, j00, j01, j02, j10, j11, j12 = project_one(model, params, x, y, z)
+    ru, rv = u - uv[0], v - uv[1]
+    if not math.isfinite(ru):
+        return math.inf
+    length = math.sqrt(point[0] ** 2 + point[1] ** 2 + point[2] ** 2) + 1e-12
+    k = range_sigma / length
+    rx = (t[0, 0] * point[0] + t[0, 1] * point[1] + t[0, 2] * point[2]) * k
+    ry = (t[1, 0] * point[0] + t[1, 1] * point[1] + t[1, 2] * point[2]) * k
+    rz = (t[2, 0] * point[0] + t[2, 1] * point[1] + t[2, 2] * point[2]) * k
+    du = j00 * rx + j01 * ry + j02 * rz
+    dv = j10 * rx + j11 * ry + j12 * rz
+    s2 = pixel_sigma * pixel_sigma
+    along = ru * du + rv * dv
+    return (ru * ru + rv * rv - along * along / (s2 + du * du + dv * dv)) / s2
+
+
+@njit
+def errors(t, points, sigmas, uv, model, params, pixel_sigma):
+    """`squared_error` of every row; NaN where the row has no point or no observation."""
+    out = np.empty(points.shape[0])
+    for i in range(points.shape[0]):
+        if math.isfinite(points[i, 0]) and math.isfinite(uv[i, 0]):
+            out[i] = squared_error(t, points[i], sigmas[i], uv[i], model, params, pixel_sigma)
+        else:
+            out[i] = math.nan
+    return out
+
+
+@njit
+def inverse34(t):
+    """Inverse of a rigid (3, 4) transform."""
+    out = np.empty((3, 4))
+    for r in range(3):
+        for c in range(3):
+            out[r, c] = t[c, r]
+        out[r, 3] = -(t[0, r] * t[0, 3] + t[1, r] * t[1, 3] + t[2, r] * t[2, 3])
+    return out
+
+
+@njit
+def _cost(t, points, sigmas, uv_b, points_b, sigmas_b, uv_a, model, params, pixel_sigma, limit, worst):
+    """Truncated cost over both directions (MSAC); stops early once it is no better than `worst`."""
+    back = inverse34(t)
+    total = 0.0
+    for i in range(points.shape[0]):
+        total += min(squared_error(t, points[i], sigmas[i], uv_b[i], model, params, pixel_sigma), limit)
+        if math.isfinite(points_b[i, 0]) and math.isfinite(uv_a[i, 0]):
+            total += min(squared_error(back, points_b[i], sigmas_b[i], uv_a[i], model, params, pixel_sigma), limit)
+        if total >= worst:
+            return total
+    return total
+
+
+@njit
+def ransac(
+    points, sigmas, bearings, uv_b, points_b, sigmas_b, uv_a, model, params, pixel_sigma, limit, samples, confidence
+):
+    """Best b_T_a over the given samples (S, 3) of rows, stopping when `confidence` is reached.
+
+    Returns:
+        (3, 4) transform, its cost (infinite when there is none).
+    """
+    best = np.zeros((3, 4))
+    lowest = math.inf
+    needed = samples.shape[0]
+    for s in range(samples.shape[0]):
+        if s >= needed:
+            break
+        rows = samples[s]
+        solutions, count = p3p(points[rows], bearings[rows])
+        for k in range(count):
+            t = solutions[k]
+            cost = _cost(t, points, sigmas, uv_b, points_b, sigmas_b, uv_a, model, params, pixel_sigma, limit, lowest)
+            if cost < lowest:
+                lowest = cost
+                best = t.copy()
+                inside = 0
+                for i in range(points.shape[0]):
+                    e = squared_error(t, points[i], sigmas[i], uv_b[i], model, params, pixel_sigma)
+                    inside += 1 if e < limit else 0
+                w = inside / points.shape[0]
+                miss = 1 - w * w * w
+                if miss <= 0:
+                    needed = s + 1
+                elif miss < 1:
+                    needed = min(needed, max(20, int(math.log(1 - confidence) / math.log(miss)) + 1))
+    return best, lowest

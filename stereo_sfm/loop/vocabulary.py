@@ -1,0 +1,157 @@
+"""Vocabulary tree over binary descriptors: train, look up, grow (Galvez-Lopez & Tardos, T-RO 28, 2012).
+
+A word is a leaf. Word ids never change: growing splits leaves and appends new ids, so bags made before stay valid.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from stereo_sfm.loop import binary
+from stereo_sfm.types import F32, I32, U8
+
+MIN_DISTANCE_NEW_WORD = 40  # bits from its word above which a descriptor is new to the vocabulary
+
+
+@dataclass(frozen=True, eq=False)
+class Bag:
+    """A keyframe as weighted words; weights sum to one (L1)."""
+
+    words: I32  # (W,) ascending
+    weights: F32  # (W,) tf-idf
+
+
+@dataclass(frozen=True, eq=False)
+class Vocabulary:
+    """Tree in columns; node 0 is the root, the children of a node are consecutive."""
+
+    centroids: binary.U64  # (M, 4) k-majority centre of each node
+    first_child: I32  # (M,)
+    child_count: I32  # (M,) 0 at leaves
+    word: I32  # (M,) word id of a leaf, -1 inside the tree
+    idf: F32  # (W,) natural logarithm of (images / images with the word)
+    id: str = field(init=False)  # changes with any bit of the content
+
+    def __post_init__(self) -> None:
+        digest = hashlib.sha256()
+        for array in (self.centroids, self.first_child, self.child_count, self.word, self.idf):
+            array.flags.writeable = False
+            digest.update(np.ascontiguousarray(array).tobytes())
+        object.__setattr__(self, "id", digest.hexdigest()[:16])
+
+    def __len__(self) -> int:
+        """Number of words."""
+        return len(self.idf)
+
+    def look_up(self, descriptors: U8) -> tuple[I32, I32]:
+        """(N, 32) -> word ids (N,), -1 for zero rows, and the distance to the word's centre in bits."""
+        node, distance = binary.descend(
+            binary.as_words(descriptors), self.centroids, self.first_child, self.child_count
+        )
+        return np.where(binary.present(descriptors), self.word[node], -1).astype(np.int32), distance
+
+    def bag(self, descriptors: U8) -> Bag:
+        """Term frequency times inverse document frequency, scaled to sum one; empty when nothing is known."""
+        ids, _ = self.look_up(descriptors)
+        words, counts = np.unique(ids[ids >= 0], return_counts=True)
+        weights = counts * self.idf[words]
+        total = float(weights.sum())
+        keep = weights > 0
+        return Bag(words[keep].astype(np.int32), (weights[keep] / max(total, 1e-12)).astype(np.float32))
+
+
+def score(a: Bag, b: Bag) -> float:
+    """L1 score in [0, 1]: 1 - |a - b|_1 / 2, which for positive weights is the sum of the common minima."""
+    _, ia, ib = np.intersect1d(a.words, b.words, assume_unique=True, return_indices=True)
+    return float(np.minimum(a.weights[ia], b.weights[ib]).sum())
+
+
+def train(images: Sequence[U8], branching: int = 10, depth: int = 4, seed: int = 0) -> Vocabulary:
+    """Hierarchical k-majority clustering of all descriptors, then idf over the images.
+
+    Args:
+        images: one (N, 32) array of descriptors per image.
+        branching: children of a node; depth: levels, so at most branching ** depth words.
+    """
+    descriptors = np.concatenate(list(images))
+    words = binary.as_words(descriptors[binary.present(descriptors)])
+    if not len(words):
+        raise ValueError("no descriptors to train a vocabulary from")
+    rng = np.random.default_rng(seed)
+    centroids, first_child, child_count = [np.zeros((1, 4), np.uint64)], [0], [0]
+    level = [(0, np.arange(len(words), dtype=np.int32))]
+    total = 1
+    for _ in range(depth):
+        following: list[tuple[int, I32]] = []
+        for node, members in level:
+            if len(members) < 2:
+                continue
+            centres, assignment = binary.k_majority(words, members, branching, rng)
+            if len(centres) < 2:
+                continue
+            first_child[node], child_count[node] = total, len(centres)
+            centroids.append(centres)
+            first_child += [0] * len(centres)
+            child_count += [0] * len(centres)
+            following += [(total + c, members[assignment == c]) for c in range(len(centres))]
+            total += len(centres)
+        level = following
+    counts = np.array(child_count, np.int32)
+    leaves = np.flatnonzero(counts == 0)
+    word = np.full(total, -1, np.int32)
+    word[leaves] = np.arange(len(leaves), dtype=np.int32)
+    tree = Vocabulary(
+        np.concatenate(centroids), np.array(first_child, np.int32), counts, word, np.ones(len(leaves), np.float32)
+    )
+    return Vocabulary(tree.centroids, tree.first_child, tree.child_count, tree.word, _idf(tree, images))
+
+
+def _idf(tree: Vocabulary, images: Sequence[U8]) -> F32:
+    seen = np.zeros(len(tree), np.int64)
+    for descriptors in images:
+        ids, _ = tree.look_up(descriptors)
+        seen[np.unique(ids[ids >= 0])] += 1
+    return np.log(np.maximum(len(images), 2) / np.maximum(seen, 1)).astype(np.float32)
+
+
+def grow(
+    vocabulary: Vocabulary, descriptors: U8, branching: int = 10, min_distance: int = MIN_DISTANCE_NEW_WORD
+) -> Vocabulary:
+    """Split the leaves that new descriptors fall far from; the old centre stays as a child and keeps its word id.
+
+    Args:
+        descriptors: (N, 32) of a new environment, one view of each point is enough.
+        min_distance: bits from the nearest word above which a descriptor asks for a new word.
+
+    Returns:
+        The grown vocabulary (the same object when nothing was far). A new word gets its parent word's idf.
+    """
+    words = binary.as_words(descriptors)
+    node, distance = binary.descend(words, vocabulary.centroids, vocabulary.first_child, vocabulary.child_count)
+    far = np.flatnonzero(binary.present(descriptors) & (distance > min_distance)).astype(np.int32)
+    if not len(far):
+        return vocabulary
+    centroids, first_child = [vocabulary.centroids], vocabulary.first_child.copy()
+    child_count, word = vocabulary.child_count.copy(), vocabulary.word.copy()
+    new_word, new_idf, total, known = [], [], len(vocabulary.word), len(vocabulary)
+    for leaf in np.unique(node[far]):
+        members = far[node[far] == leaf]
+        centres, _ = binary.k_majority(words, members, branching - 1, np.random.default_rng(int(leaf)))
+        first_child[leaf], child_count[leaf] = total, 1 + len(centres)
+        centroids += [vocabulary.centroids[[leaf]], centres]
+        new_word += [int(word[leaf]), *range(known, known + len(centres))]
+        new_idf += [vocabulary.idf[word[leaf]]] * len(centres)
+        word[leaf] = -1
+        total, known = total + 1 + len(centres), known + len(centres)
+    extra = total - len(vocabulary.word)
+    return Vocabulary(
+        np.concatenate(centroids),
+        np.concatenate([first_child, np.zeros(extra, np.int32)]),
+        np.concatenate([child_count, np.zeros(extra, np.int32)]),
+        np.concatenate([word, np.array(new_word, np.int32)]),
+        np.concatenate([vocabulary.idf, np.array(new_idf, np.float32)]),
+    )

@@ -1,0 +1,141 @@
+"""The vocabulary tree: words of noisy views, files, growth; and the inverted index against the plain definition."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.loop import vocabulary as voc
+from stereo_sfm.loop.binary import match_descriptors
+from stereo_sfm.loop.database import PlaceDatabase
+from stereo_sfm.loop.vocabulary_file import default_vocabulary, load_vocabulary, save_vocabulary
+from stereo_sfm.types import U8
+
+LOOKS = np.random.default_rng(0).integers(0, 256, (2000, 32), dtype=np.uint8)
+
+
+def picture(rng: np.random.Generator, which: np.ndarray, flip: float = 0.05) -> U8:
+    """Noisy views of the looks `which`."""
+    return LOOKS[which] ^ np.packbits(rng.random((len(which), 256)) < flip, axis=1)
+
+
+@pytest.fixture(scope="module")
+def places() -> list[np.ndarray]:
+    rng = np.random.default_rng(1)
+    return [rng.choice(2000, 200, replace=False) for _ in range(60)]
+
+
+@pytest.fixture(scope="module")
+def vocabulary(places: list[np.ndarray]) -> voc.Vocabulary:
+    rng = np.random.default_rng(2)
+    return voc.train([picture(rng, p) for p in places], branching=8, depth=4)
+
+
+def test_another_view_of_a_place_scores_above_all_other_places(
+    vocabulary: voc.Vocabulary, places: list[np.ndarray]
+) -> None:
+    rng = np.random.default_rng(3)
+    database = PlaceDatabase(len(vocabulary))
+    for k, place in enumerate(places):
+        database.add(100 + k, vocabulary.bag(picture(rng, place)))
+    for k, place in enumerate(places):
+        found, scores = database.query(vocabulary.bag(picture(rng, place)), 0.0, 2)
+        assert found[0] == 100 + k
+        assert scores[0] > 1.5 * scores[1]
+
+
+def test_inverted_index_gives_the_scores_of_the_definition(
+    vocabulary: voc.Vocabulary, places: list[np.ndarray]
+) -> None:
+    rng = np.random.default_rng(4)
+    bags = [vocabulary.bag(picture(rng, p)) for p in places]
+    database = PlaceDatabase(len(vocabulary))
+    for k, bag in enumerate(bags):
+        database.add(k, bag)
+    query = vocabulary.bag(picture(rng, places[5]))
+    dense = np.zeros((2, len(vocabulary)))
+    for k, bag in enumerate(bags):
+        dense[:] = 0
+        dense[0, query.words], dense[1, bag.words] = query.weights, bag.weights
+        assert database.scores(query)[k] == pytest.approx(1 - 0.5 * np.abs(dense[0] - dense[1]).sum(), abs=1e-6)
+
+
+def test_training_twice_gives_the_same_bits(places: list[np.ndarray], vocabulary: voc.Vocabulary) -> None:
+    rng = np.random.default_rng(2)
+    again = voc.train([picture(rng, p) for p in places], branching=8, depth=4)
+    assert again.id == vocabulary.id
+    other = voc.train([picture(rng, p) for p in places], branching=8, depth=4, seed=1)
+    assert other.id != vocabulary.id
+
+
+def test_zero_rows_are_no_words(vocabulary: voc.Vocabulary) -> None:
+    ids, _ = vocabulary.look_up(np.zeros((3, 32), np.uint8))
+    assert (ids == -1).all()
+    bag = vocabulary.bag(np.zeros((3, 32), np.uint8))
+    assert len(bag.words) == 0 and len(bag.weights) == 0
+
+
+def test_growth_separates_what_the_old_words_could_not(vocabulary: voc.Vocabulary) -> None:
+    rng = np.random.default_rng(5)
+    looks = rng.integers(0, 256, (300, 32), dtype=np.uint8)
+    grown = voc.grow(vocabulary, looks)
+    assert len(grown) > len(vocabulary)
+
+    def repeated(v: voc.Vocabulary) -> float:
+        noisy = looks ^ np.packbits(rng.random((300, 256)) < 0.05, axis=1)
+        return float((v.look_up(looks)[0] == v.look_up(noisy)[0]).mean())
+
+    assert repeated(grown) > repeated(vocabulary) + 0.1
+    assert voc.grow(grown, looks[:0]) is grown
+
+
+def test_growth_keeps_the_old_words(vocabulary: voc.Vocabulary, places: list[np.ndarray]) -> None:
+    grown = voc.grow(vocabulary, np.random.default_rng(6).integers(0, 256, (50, 32), dtype=np.uint8))
+    old, _ = vocabulary.look_up(LOOKS)
+    new, _ = grown.look_up(LOOKS)
+    kept = new < len(vocabulary)
+    assert kept.mean() > 0.9
+    assert (old[kept] == new[kept]).all()
+
+
+def test_file_round_trip(tmp_path: Path, vocabulary: voc.Vocabulary) -> None:
+    save_vocabulary(vocabulary, tmp_path / "a.npz")
+    save_vocabulary(vocabulary, tmp_path / "b.npz")
+    assert load_vocabulary(tmp_path / "a.npz").id == vocabulary.id
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+def test_bad_files_get_one_line(tmp_path: Path, vocabulary: voc.Vocabulary) -> None:
+    path = tmp_path / "v.npz"
+    with pytest.raises(StereoSfmError, match="no vocabulary at"):
+        load_vocabulary(path)
+    path.write_bytes(b"nonsense")
+    with pytest.raises(StereoSfmError, match="not a vocabulary file or is damaged"):
+        load_vocabulary(path)
+    save_vocabulary(vocabulary, path)
+    path.write_bytes(path.read_bytes()[:-500])
+    with pytest.raises(StereoSfmError, match="damaged"):
+        load_vocabulary(path)
+    np.savez_compressed(path, version=np.array(99))
+    with pytest.raises(StereoSfmError, match="version 99"):
+        load_vocabulary(path)
+
+
+def test_matching_finds_the_right_partners_and_ratio_spares_views_of_one_point() -> None:
+    rng = np.random.default_rng(7)
+    which = np.arange(100)
+    query, train = picture(rng, which), picture(rng, np.repeat(which, 2))
+    q, t, _ = match_descriptors(query, train, np.repeat(which, 2), ratio=0.8)
+    assert len(q) > 95
+    assert (t // 2 == q).all()
+    assert len(match_descriptors(query, train, None, ratio=0.8)[0]) < 60  # each view is the other's rival
+
+
+def test_package_vocabulary_loads() -> None:
+    vocabulary = default_vocabulary()
+    assert len(vocabulary) > 1000
+    bag = vocabulary.bag(LOOKS)
+    assert float(bag.weights.sum()) == pytest.approx(1.0, abs=1e-5)
