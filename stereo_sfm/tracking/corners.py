@@ -1,0 +1,88 @@
+"""Corners spread over the image: the best Shi-Tomasi response of each place that has no point yet."""
+
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportMissingTypeArgument=false
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from stereo_sfm.geometry.kernels import njit
+from stereo_sfm.types import F64, U8, Bool
+
+
+@njit
+def _block(blocked, u, v, radius):
+    h, w = blocked.shape
+    for y in range(max(v - radius, 0), min(v + radius + 1, h)):
+        for x in range(max(u - radius, 0), min(u + radius + 1, w)):
+            if (x - u) ** 2 + (y - v) ** 2 <= radius * radius:
+                blocked[y, x] = True
+
+
+@njit
+def _cell_maxima(score, blocked, cell, floor):
+    """Best unblocked pixel of every cell: (M, 2) integer u v and (M,) score, in row order."""
+    h, w = score.shape
+    found = np.empty((((h + cell - 1) // cell) * ((w + cell - 1) // cell), 2), np.int64)
+    best = np.empty(len(found))
+    n = 0
+    for top in range(0, h, cell):
+        for left in range(0, w, cell):
+            s, bu, bv = floor, -1, -1
+            for y in range(top, min(top + cell, h)):
+                for x in range(left, min(left + cell, w)):
+                    if score[y, x] > s and not blocked[y, x]:
+                        s, bu, bv = score[y, x], x, y
+            if bu >= 0:
+                found[n, 0], found[n, 1], best[n] = bu, bv, s
+                n += 1
+    return found[:n], best[:n]
+
+
+@njit
+def _pick(found, order, blocked, radius, count):
+    """Indices of `found`, best first, that keep `radius` pixels apart."""
+    picked = np.empty(min(count, len(order)), np.int64)
+    n = 0
+    for k in order:
+        if n == len(picked):
+            break
+        u, v = found[k, 0], found[k, 1]
+        if not blocked[v, u]:
+            picked[n] = k
+            n += 1
+            _block(blocked, u, v, radius)
+    return picked[:n]
+
+
+@njit
+def _block_all(blocked, points, radius):
+    for k in range(len(points)):
+        _block(blocked, points[k, 0], points[k, 1], radius)
+
+
+def detect_corners(half_image: U8, mask: Bool, taken: F64, count: int, spacing: float, quality: float) -> F64:
+    """New corners where no point is yet.
+
+    Args:
+        half_image: (H/2, W/2) level 1 of the pyramid: corners of the finest pixels would be noise.
+        mask: (H/2, W/2) where corners may lie. taken: (N, 2) px of the full image, points that exist.
+        count: at most so many. spacing: least distance in px of the full image.
+        quality: least response, as a fraction of the 95th percentile of the cells' best.
+
+    Returns:
+        (M, 2) float64 px of the full image, strongest first.
+    """
+    score = cv2.cornerMinEigenVal(half_image, 5, ksize=3)
+    blocked = ~mask
+    radius = max(int(spacing / 2), 1)
+    inside = (np.rint(taken / 2)).astype(np.int64)
+    _block_all(blocked, inside, radius)
+    found, best = _cell_maxima(score, blocked, max(radius, 4), 1e-7)
+    if len(found) == 0:
+        return np.zeros((0, 2))
+    strong = best > quality * np.percentile(best, 95)
+    found, best = found[strong], best[strong]
+    order = np.argsort(-best, kind="stable")
+    return found[_pick(found, order, blocked, radius, count)] * 2.0

@@ -1,0 +1,43 @@
+"""A rig as the compiled kernels want it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.rig import Rig
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
+from stereo_sfm.types import F64
+
+
+@dataclass(frozen=True)
+class Eyes:
+    """Model ids and parameters of both eyes, and where they are."""
+
+    model_l: int
+    params_l: F64
+    model_r: int
+    params_r: F64
+    left_T_right: F64
+    right_T_left: F64
+
+    @property
+    def cams(self) -> tuple[int, F64, int, F64]:
+        """(model_l, params_l, model_r, params_r)."""
+        return self.model_l, self.params_l, self.model_r, self.params_r
+
+    @staticmethod
+    def of(rig: Rig) -> Eyes:
+        """Raises StereoSfmError for a rig with one eye."""
+        if rig.right is None:
+            raise StereoSfmError("the default tracker needs a stereo or RGB-D source (for one camera: --preset cpp-course)")
+        return Eyes(
+            rig.left.model_id,
+            rig.left.params,
+            rig.right.model_id,
+            rig.right.params,
+            np.ascontiguousarray(rig.left_T_right),
+            np.ascontiguousarray(se3.inverse(rig.left_T_right)),
+        )

@@ -1,0 +1,412 @@
+"""Optical flow of points: translation between images, affine against the patch where a point was first seen.
+
+Shi & Tomasi, Good Features to Track (CVPR 1994): translation follows a feature from frame to frame; the affine model
+against its first appearance removes the drift, and its dissimilarity tells when a window no longer shows one surface
+(an occlusion, or a depth discontinuity inside the window). Both are inverse compositional (Baker & Matthews, IJCV 56,
+2004). The brightness of a window is normalised by its mean and contrast, so that exposure jumps do not matter.
+
+Windows are SIZE x SIZE pixels around the point, stored flat with STRIDE samples a row; the extra columns make interpolation
+and central differences contiguous loops and have weight zero. Sums add halves to halves in a fixed order: compiled to
+vector instructions, yet the same bits on every run and every machine.
+"""
+
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportPrivateUsage=false
+# pyright: reportConstantRedefinition=false, reportMissingTypeArgument=false
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+
+from stereo_sfm.geometry.kernels import njit
+from stereo_sfm.types import U8
+
+SIZE = 16
+HALF = 7.5  # from the centre of a window to its first sample
+STRIDE = SIZE + 4
+FLAT_SIZE = SIZE * STRIDE
+WIDE_SIZE = (SIZE + 2) * STRIDE
+RAW_SIZE = (SIZE + 4) * STRIDE
+TRACKED, LEFT_IMAGE, FLAT, DIVERGED, UNLIKE = 0, 1, 2, 3, 4  # why a point was not followed
+
+Pyramid = tuple[U8, ...]
+
+
+def build_pyramid(image: U8, levels: int) -> Pyramid:
+    """Image (H, W) and its halvings, finest first; level k holds pixel u at u / 2**k."""
+    out = [np.ascontiguousarray(image)]
+    for _ in range(levels - 1):
+        out.append(cv2.pyrDown(out[-1]))
+    out[0] = out[0].view()
+    for level in out:  # one array type for the compiled kernels
+        level.flags.writeable = False
+    return tuple(out)
+
+
+def _window_weights() -> np.ndarray:
+    """Flat window of weights: a wide Gaussian, zero in the extra columns, sum 1."""
+    x = np.arange(SIZE) - HALF
+    g = np.exp(-0.5 * (x / 5.5) ** 2)
+    w = np.zeros((SIZE, STRIDE))
+    w[:, :SIZE] = np.outer(g, g)
+    return (w / w.sum()).astype(np.float32).ravel()
+
+
+def _window_coordinates() -> np.ndarray:
+    """(3, FLAT_SIZE): x, y and 1 of every sample."""
+    x = np.zeros((3, SIZE, STRIDE), np.float32)
+    x[0, :, :SIZE] = np.arange(SIZE) - HALF
+    x[1, :, :SIZE] = (np.arange(SIZE) - HALF)[:, None]
+    x[2] = 1
+    return x.reshape(3, FLAT_SIZE)
+
+
+WEIGHTS = _window_weights()
+COORDINATES = _window_coordinates()
+
+
+@njit
+def _inside(image, u, v, margin):
+    h, w = image.shape
+    return u >= margin and v >= margin and u < w - 1 - margin and v < h - 1 - margin
+
+
+@njit
+def _dot(a, b, tmp):
+    """Sum of a * b over a flat window."""
+    for m in range(FLAT_SIZE):
+        tmp[m] = a[m] * b[m]
+    for m in range(160):
+        tmp[m] += tmp[m + 160]
+    for m in range(80):
+        tmp[m] += tmp[m + 80]
+    for m in range(40):
+        tmp[m] += tmp[m + 40]
+    total = np.float32(0)
+    for m in range(40):
+        total += tmp[m]
+    return total
+
+
+@njit
+def _sample(image, u, v, raw, out):
+    """Bilinear window whose first sample is at (u, v); the caller has checked that it lies inside."""
+    iu, iv = int(math.floor(u)), int(math.floor(v))
+    fu, fv = u - iu, v - iv
+    w00, w01 = np.float32((1 - fu) * (1 - fv)), np.float32(fu * (1 - fv))
+    w10, w11 = np.float32((1 - fu) * fv), np.float32(fu * fv)
+    for i in range(SIZE + 1):
+        row = image[iv + i, iu : iu + SIZE + 1]
+        for j in range(SIZE + 1):
+            raw[i * STRIDE + j] = np.float32(row[j])
+    for m in range(FLAT_SIZE):
+        out[m] = w00 * raw[m] + w01 * raw[m + 1] + w10 * raw[m + STRIDE] + w11 * raw[m + STRIDE + 1]
+
+
+@njit
+def _sample_wide(image, u, v, raw, out):
+    """As `_sample`, with one sample more on each side: first sample at (u - 1, v - 1), SIZE + 2 rows."""
+    u, v = u - 1, v - 1
+    iu, iv = int(math.floor(u)), int(math.floor(v))
+    fu, fv = u - iu, v - iv
+    w00, w01 = np.float32((1 - fu) * (1 - fv)), np.float32(fu * (1 - fv))
+    w10, w11 = np.float32((1 - fu) * fv), np.float32(fu * fv)
+    for i in range(SIZE + 3):
+        row = image[iv + i, iu : iu + SIZE + 3]
+        for j in range(SIZE + 3):
+            raw[i * STRIDE + j] = np.float32(row[j])
+    for m in range(WIDE_SIZE):
+        out[m] = w00 * raw[m] + w01 * raw[m + 1] + w10 * raw[m + STRIDE] + w11 * raw[m + STRIDE + 1]
+
+
+@njit
+def _template(image, u, v, weights, raw, wide, tmp, patch, gx, gy):
+    """Patch around (u, v), centred, and its weighted, centred gradients by central differences.
+
+    Returns mean, contrast, and the 2x2 normal matrix (hxx, hxy, hyy). `gx`, `gy` are left multiplied by the weights:
+    their dot product with a window is the right-hand side, whatever the window's mean.
+    """
+    half = np.float32(0.5)
+    _sample_wide(image, u - HALF, v - HALF, raw, wide)
+    for m in range(FLAT_SIZE):
+        patch[m] = wide[m + STRIDE + 1]
+        gx[m] = half * (wide[m + STRIDE + 2] - wide[m + STRIDE])
+        gy[m] = half * (wide[m + 2 * STRIDE + 1] - wide[m + 1])
+    mean = _dot(patch, weights, tmp)
+    mx = _dot(gx, weights, tmp)
+    my = _dot(gy, weights, tmp)
+    for m in range(FLAT_SIZE):
+        patch[m] -= mean
+        raw[m] = (gx[m] - mx) * weights[m]
+    hxx = _dot(raw, gx, tmp)
+    hxy = _dot(raw, gy, tmp)
+    for m in range(FLAT_SIZE):
+        gx[m] = raw[m]
+        raw[m] = (gy[m] - my) * weights[m]
+    hyy = _dot(raw, gy, tmp)
+    for m in range(FLAT_SIZE):
+        gy[m] = raw[m]
+        raw[m] = patch[m] * weights[m]
+    contrast = math.sqrt(max(_dot(raw, patch, tmp), 1e-6))
+    return mean, contrast, hxx, hxy, hyy
+
+
+@njit
+def _compare(window, patch, weights, raw, tmp):
+    """Contrast of a window and its normalised correlation times contrast with a centred patch."""
+    mean = _dot(window, weights, tmp)
+    for m in range(FLAT_SIZE):
+        raw[m] = (window[m] - mean) * weights[m]
+    cross = _dot(raw, patch, tmp)
+    variance = _dot(raw, window, tmp)
+    return math.sqrt(max(variance, 1e-6)), cross
+
+
+@njit
+def track_translation(prev, cur, uv_prev, uv_cur, first_level, last_level, iterations, min_contrast, min_ncc, weights):
+    """Follow points from one pyramid into another.
+
+    Args:
+        prev, cur: pyramids (tuples of uint8 images). uv_prev: (N, 2) float64 px in prev[0]. uv_cur: (N, 2) float64 px,
+            the predicted positions; overwritten with the result.
+        first_level, last_level: coarsest level to start at, finest level to end at (0 is the image itself).
+        iterations: at most, per level. min_contrast: grey levels of standard deviation below which a window is flat.
+        min_ncc: least normalised correlation of the windows at the end. weights: WEIGHTS.
+
+    Returns:
+        status (N,) int8 (TRACKED, ...), ncc (N,) float32.
+    """
+    n = uv_prev.shape[0]
+    status = np.zeros(n, np.int8)
+    ncc = np.zeros(n, np.float32)
+    raw = np.zeros(RAW_SIZE, np.float32)
+    tmp = np.zeros(FLAT_SIZE, np.float32)
+    patch = np.zeros(FLAT_SIZE, np.float32)
+    gx = np.zeros(FLAT_SIZE, np.float32)
+    gy = np.zeros(FLAT_SIZE, np.float32)
+    wide = np.zeros(WIDE_SIZE + STRIDE, np.float32)
+    window = np.zeros(FLAT_SIZE, np.float32)
+    for k in range(n):
+        u, v = uv_cur[k, 0], uv_cur[k, 1]
+        state = LEFT_IMAGE
+        if not (math.isfinite(u) and math.isfinite(v)):
+            status[k] = LEFT_IMAGE
+            continue
+        for level in range(first_level, last_level - 1, -1):
+            scale = 1.0 / (1 << level)
+            image, target = prev[level], cur[level]
+            pu, pv = uv_prev[k, 0] * scale, uv_prev[k, 1] * scale
+            cu, cv = u * scale, v * scale
+            if not (_inside(image, pu, pv, HALF + 1.5) and _inside(target, cu, cv, HALF + 0.5)):
+                state = LEFT_IMAGE
+                continue
+            _, contrast, hxx, hxy, hyy = _template(image, pu, pv, weights, raw, wide, tmp, patch, gx, gy)
+            det = hxx * hyy - hxy * hxy
+            if contrast < min_contrast or det < 1e-3 * (hxx + hyy) * (hxx + hyy):
+                state = FLAT
+                continue
+            state = TRACKED
+            start_u, start_v = cu, cv
+            tx, ty = _dot(gx, patch, tmp), _dot(gy, patch, tmp)
+            gain = 1.0
+            for iteration in range(iterations):
+                if not _inside(target, cu, cv, HALF + 0.5):
+                    state = LEFT_IMAGE
+                    break
+                _sample(target, cu - HALF, cv - HALF, raw, window)
+                if iteration == 0 or iteration == 2:
+                    contrast_c, _ = _compare(window, patch, weights, raw, tmp)
+                    gain = min(max(contrast / contrast_c, 0.4), 2.5)
+                bx = gain * _dot(gx, window, tmp) - tx
+                by = gain * _dot(gy, window, tmp) - ty
+                du = (hyy * bx - hxy * by) / det
+                dv = (hxx * by - hxy * bx) / det
+                length = math.sqrt(du * du + dv * dv)
+                if length > 2.0:  # a linearisation is worth two pixels at most
+                    du, dv = du * 2.0 / length, dv * 2.0 / length
+                cu -= du
+                cv -= dv
+                if length < 0.01:
+                    break
+            if (cu - start_u) ** 2 + (cv - start_v) ** 2 > 100.0:
+                state = DIVERGED
+            if state == TRACKED and level == last_level:
+                if _inside(target, cu, cv, HALF + 0.5):
+                    _sample(target, cu - HALF, cv - HALF, raw, window)
+                    contrast_c, cross = _compare(window, patch, weights, raw, tmp)
+                    ncc[k] = cross / (contrast * contrast_c)
+                    if ncc[k] < min_ncc:
+                        state = UNLIKE
+                else:
+                    state = LEFT_IMAGE
+            if state != TRACKED:
+                break
+            u, v = cu / scale, cv / scale
+        status[k] = state
+        uv_cur[k, 0], uv_cur[k, 1] = u, v
+    return status, ncc
+
+
+@njit
+def make_patches(pyramid, uv, slots, weights, coordinates, patch, gradients, inverse_normal, contrast):
+    """Remember the appearance of points for `track_affine`.
+
+    Args:
+        pyramid: of the image where the points are first seen. uv: (N, 2) px. coordinates: COORDINATES.
+        slots: (N,) rows of the store that follows: patch (M, FLAT_SIZE), gradients (M, 2, FLAT_SIZE), inverse_normal
+            (M, 6, 6), contrast (M,); these rows are filled in.
+
+    Returns:
+        (N,) bool, False where the window leaves the image or has no texture.
+    """
+    n = uv.shape[0]
+    good = np.zeros(n, np.bool_)
+    raw = np.zeros(RAW_SIZE, np.float32)
+    wide = np.zeros(WIDE_SIZE + STRIDE, np.float32)
+    tmp = np.zeros(FLAT_SIZE, np.float32)
+    jac = np.zeros((6, FLAT_SIZE), np.float32)
+    normal = np.zeros((6, 6))
+    for row in range(n):
+        if not _inside(pyramid[0], uv[row, 0], uv[row, 1], HALF + 1.5):
+            continue
+        k = slots[row]
+        gx, gy = gradients[k, 0], gradients[k, 1]
+        result = _template(pyramid[0], uv[row, 0], uv[row, 1], weights, raw, wide, tmp, patch[k], gx, gy)
+        contrast[k] = result[1]
+        if contrast[k] < 1.0:
+            continue
+        # gx, gy are already weighted; a second factor for the normal matrix needs them unweighted.
+        for m in range(FLAT_SIZE):
+            jac[0, m] = gx[m] * coordinates[0, m]
+            jac[1, m] = gx[m] * coordinates[1, m]
+            jac[2, m] = gx[m]
+            jac[3, m] = gy[m] * coordinates[0, m]
+            jac[4, m] = gy[m] * coordinates[1, m]
+            jac[5, m] = gy[m]
+        for m in range(FLAT_SIZE):
+            raw[m] = np.float32(1.0) / max(weights[m], np.float32(1e-9)) if weights[m] > 0 else np.float32(0)
+        for a in range(6):
+            for m in range(FLAT_SIZE):
+                wide[m] = jac[a, m] * raw[m]
+            for b in range(a, 6):
+                normal[a, b] = _dot(jac[b], wide, tmp)
+                normal[b, a] = normal[a, b]
+        # The affine part is a small departure from what it was: damped by what one grey-level-noise step may do.
+        damping = 0.02 * (normal[2, 2] + normal[5, 5])
+        for a in (0, 1, 3, 4):
+            normal[a, a] += damping * HALF * HALF
+        if normal[2, 2] * normal[5, 5] - normal[2, 5] ** 2 < 1e-3 * (normal[2, 2] + normal[5, 5]) ** 2:
+            continue
+        inverse_normal[k] = np.linalg.inv(normal)
+        good[row] = True
+    return good
+
+
+@njit
+def _sample_affine(image, warp, cu, cv, out):
+    """Window at warp @ (x, y) + (cu, cv); False when it leaves the image."""
+    h, w = image.shape
+    reach_u = (abs(warp[0, 0]) + abs(warp[0, 1])) * HALF
+    reach_v = (abs(warp[1, 0]) + abs(warp[1, 1])) * HALF
+    if cu - reach_u < 0 or cv - reach_v < 0 or cu + reach_u >= w - 1.001 or cv + reach_v >= h - 1.001:
+        return False
+    a, b, c, d = np.float32(warp[0, 0]), np.float32(warp[0, 1]), np.float32(warp[1, 0]), np.float32(warp[1, 1])
+    iu0, iv0 = int(math.floor(cu)), int(math.floor(cv))
+    du, dv = np.float32(cu - iu0 + 64), np.float32(cv - iv0 + 64)  # positive, so that truncation is floor
+    for i in range(SIZE):
+        y = np.float32(i - HALF)
+        for j in range(SIZE):
+            x = np.float32(j - HALF)
+            u = a * x + b * y + du
+            v = c * x + d * y + dv
+            iu, iv = np.int32(u), np.int32(v)
+            fu, fv = u - np.float32(iu), v - np.float32(iv)
+            iu += iu0 - 64
+            iv += iv0 - 64
+            upper = np.float32(image[iv, iu]) + fu * (np.float32(image[iv, iu + 1]) - np.float32(image[iv, iu]))
+            lower = np.float32(image[iv + 1, iu]) + fu * (
+                np.float32(image[iv + 1, iu + 1]) - np.float32(image[iv + 1, iu])
+            )
+            out[i * STRIDE + j] = upper + fv * (lower - upper)
+    return True
+
+
+@njit
+def track_affine(
+    image, uv, warp, slots, wanted, patch, gradients, inverse_normal, contrast, iterations, weights, coordinates
+):
+    """Align the first appearance of points with an image.
+
+    Args:
+        image: (H, W) uint8. uv: (N, 2) px and warp: (N, 2, 2), the positions and affine deformations to start from;
+            overwritten. slots: (N,) rows of the points in the store (patch, gradients, inverse_normal, contrast) that
+            `make_patches` filled. wanted: (N,) bool, others are skipped.
+
+    Returns:
+        ncc (N,) float32 normalised correlation after alignment, 0 where the window left the image or did not converge.
+    """
+    n = uv.shape[0]
+    ncc = np.zeros(n, np.float32)
+    window = np.zeros(FLAT_SIZE, np.float32)
+    raw = np.zeros(RAW_SIZE, np.float32)
+    tmp = np.zeros(FLAT_SIZE, np.float32)
+    bx = np.zeros(FLAT_SIZE, np.float32)
+    b = np.zeros(6)
+    step = np.zeros(6)
+    for row in range(n):
+        if not wanted[row]:
+            continue
+        k = slots[row]
+        a00, a01, a10, a11 = warp[row, 0, 0], warp[row, 0, 1], warp[row, 1, 0], warp[row, 1, 1]
+        cu, cv = uv[row, 0], uv[row, 1]
+        w2 = np.empty((2, 2))
+        ok = True
+        for _ in range(iterations):
+            w2[0, 0], w2[0, 1], w2[1, 0], w2[1, 1] = a00, a01, a10, a11
+            if not _sample_affine(image, w2, cu, cv, window):
+                ok = False
+                break
+            contrast_c, cross = _compare(window, patch[k], weights, raw, tmp)
+            gain = np.float32(min(max(contrast[k] / contrast_c, 0.3), 3.0))
+            ncc[row] = cross / (contrast[k] * contrast_c)
+            mean = _dot(window, weights, tmp)
+            for m in range(FLAT_SIZE):
+                window[m] = gain * (window[m] - mean) - patch[k, m]
+            for axis in range(2):
+                for m in range(FLAT_SIZE):
+                    bx[m] = gradients[k, axis, m] * window[m]
+                b[3 * axis] = _dot(bx, coordinates[0], tmp)
+                b[3 * axis + 1] = _dot(bx, coordinates[1], tmp)
+                b[3 * axis + 2] = _dot(bx, coordinates[2], tmp)
+            for i in range(6):
+                s = 0.0
+                for j in range(6):
+                    s += inverse_normal[k, i, j] * b[j]
+                step[i] = s
+            length = math.sqrt(step[2] ** 2 + step[5] ** 2)
+            if length > 2.0 or abs(step[0]) + abs(step[1]) + abs(step[3]) + abs(step[4]) > 1.0:
+                ok = False
+                break
+            # warp <- warp o (I + step)^-1
+            d00, d01, d10, d11 = 1 + step[0], step[1], step[3], 1 + step[4]
+            det = d00 * d11 - d01 * d10
+            i00, i01, i10, i11 = d11 / det, -d01 / det, -d10 / det, d00 / det
+            tu, tv = -(i00 * step[2] + i01 * step[5]), -(i10 * step[2] + i11 * step[5])
+            cu += a00 * tu + a01 * tv
+            cv += a10 * tu + a11 * tv
+            a00, a01, a10, a11 = (
+                a00 * i00 + a01 * i10,
+                a00 * i01 + a01 * i11,
+                a10 * i00 + a11 * i10,
+                a10 * i01 + a11 * i11,
+            )
+            if length < 0.01:
+                break
+        if not ok:
+            ncc[row] = 0
+            continue
+        uv[row, 0], uv[row, 1] = cu, cv
+        warp[row, 0, 0], warp[row, 0, 1], warp[row, 1, 0], warp[row, 1, 1] = a00, a01, a10, a11
+    return ncc

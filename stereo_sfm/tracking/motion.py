@@ -1,0 +1,221 @@
+"""Motion-only optimisation: the pose of one stereo frame from points of the local map, with covariance.
+
+Each point is known along a ray from where it was first seen, P = origin + direction / rho, with a variance of rho. The
+pose is solved by iteratively re-weighted Gauss-Newton on the pixels of both images while rho is marginalised in closed
+form (the four residuals of a point share one unknown: a rank-one update, Sherman-Morrison), so that a point whose
+distance is uncertain still gives rotation at full weight. Robust weights are Cauchy, narrowed in steps
+(graduated non-convexity, Yang et al., RA-L 5, 2020, with a Cauchy kernel).
+"""
+
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportMissingTypeArgument=false
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stereo_sfm.geometry.kernels import njit, project_one
+
+
+@njit
+def _exp(xi):
+    """(6,) (rho, phi) -> (4, 4)."""
+    out = np.eye(4)
+    px, py, pz = xi[3], xi[4], xi[5]
+    angle2 = px * px + py * py + pz * pz
+    angle = math.sqrt(angle2)
+    if angle < 1e-6:
+        a, b, c = 1.0 - angle2 / 6, 0.5 - angle2 / 24, 1.0 / 6 - angle2 / 120
+    else:
+        a, b, c = math.sin(angle) / angle, (1 - math.cos(angle)) / angle2, (angle - math.sin(angle)) / (angle2 * angle)
+    k = np.array([[0.0, -pz, py], [pz, 0.0, -px], [-py, px, 0.0]])
+    k2 = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            for m in range(3):
+                k2[i, j] += k[i, m] * k[m, j]
+    for i in range(3):
+        for j in range(3):
+            out[i, j] += a * k[i, j] + b * k2[i, j]
+            unit = 1.0 if i == j else 0.0
+            out[i, 3] += (unit + b * k[i, j] + c * k2[i, j]) * xi[j]
+    return out
+
+
+@njit
+def point_residuals(pose, px, py, pz, dx, dy, dz, uv_l, uv_r, cams, right_T_left, res, jac, ray):
+    """Residuals of one point in both eyes.
+
+    Args:
+        pose: (4, 4) odom_T_cam. px..pz: the point and dx..dz: its derivative by rho, odometry frame. cams: models and
+            parameters (model_l, params_l, model_r, params_r).
+        res (4,), jac (4, 6), ray (4,): filled in; derivatives by odom_T_cam @ exp(xi) and by rho.
+
+    Returns:
+        0 when the left pixel cannot be predicted, 2 with the left eye only, 4 with both.
+    """
+    model_l, params_l, model_r, params_r = cams
+    qx, qy, qz = px - pose[0, 3], py - pose[1, 3], pz - pose[2, 3]
+    x = pose[0, 0] * qx + pose[1, 0] * qy + pose[2, 0] * qz
+    y = pose[0, 1] * qx + pose[1, 1] * qy + pose[2, 1] * qz
+    z = pose[0, 2] * qx + pose[1, 2] * qy + pose[2, 2] * qz
+    gx = pose[0, 0] * dx + pose[1, 0] * dy + pose[2, 0] * dz
+    gy = pose[0, 1] * dx + pose[1, 1] * dy + pose[2, 1] * dz
+    gz = pose[0, 2] * dx + pose[1, 2] * dy + pose[2, 2] * dz
+    a = project_one(model_l, params_l, x, y, z)
+    if math.isnan(a[0]):
+        return 0
+    rows = 2
+    res[0], res[1] = a[0] - uv_l[0], a[1] - uv_l[1]
+    for i in range(2):
+        ju, jv, jw = a[2 + 3 * i], a[3 + 3 * i], a[4 + 3 * i]
+        ray[i] = ju * gx + jv * gy + jw * gz
+        jac[i, 0], jac[i, 1], jac[i, 2] = -ju, -jv, -jw
+        jac[i, 3], jac[i, 4], jac[i, 5] = jv * z - jw * y, jw * x - ju * z, ju * y - jv * x
+    if not math.isnan(uv_r[0]):
+        t = right_T_left
+        rx = t[0, 0] * x + t[0, 1] * y + t[0, 2] * z + t[0, 3]
+        ry = t[1, 0] * x + t[1, 1] * y + t[1, 2] * z + t[1, 3]
+        rz = t[2, 0] * x + t[2, 1] * y + t[2, 2] * z + t[2, 3]
+        b = project_one(model_r, params_r, rx, ry, rz)
+        if not math.isnan(b[0]):
+            rows = 4
+            res[2], res[3] = b[0] - uv_r[0], b[1] - uv_r[1]
+            for i in range(2):
+                j0, j1, j2 = b[2 + 3 * i], b[3 + 3 * i], b[4 + 3 * i]
+                ju = j0 * t[0, 0] + j1 * t[1, 0] + j2 * t[2, 0]
+                jv = j0 * t[0, 1] + j1 * t[1, 1] + j2 * t[2, 1]
+                jw = j0 * t[0, 2] + j1 * t[1, 2] + j2 * t[2, 2]
+                ray[2 + i] = ju * gx + jv * gy + jw * gz
+                jac[2 + i, 0], jac[2 + i, 1], jac[2 + i, 2] = -ju, -jv, -jw
+                jac[2 + i, 3], jac[2 + i, 4], jac[2 + i, 5] = jv * z - jw * y, jw * x - ju * z, ju * y - jv * x
+    return rows
+
+
+@njit
+def optimise_pose(
+    pose, origin, direction, rho, variance, uv_l, uv_r, weight, cams, right_T_left, sigma, scales, prior, prior_pose
+):
+    """Pose of a frame.
+
+    Args:
+        pose: (4, 4) odom_T_cam to start from. origin, direction: (N, 3) odometry frame. rho, variance: (N,) 1/m.
+        uv_l, uv_r: (N, 2) px, NaN in uv_r where unseen. weight: (N,) multiplies the information of a point.
+        sigma: px, noise of one coordinate. scales: (S,) Cauchy scales in sigmas, one Gauss-Newton step each.
+        prior: (6, 6) information of prior_pose (zeros: none).
+
+    Returns:
+        pose (4, 4), covariance (6, 6) of pose @ exp(xi), error (N,) root of the whitened squared residual over the number
+        of rows (1 is as expected; inf when not visible).
+    """
+    n = len(rho)
+    pose = pose.copy()
+    res, jac, ray = np.zeros(4), np.zeros((4, 6)), np.zeros(4)
+    error = np.full(n, np.inf)
+    normal = np.zeros((6, 6))
+    rhs = np.zeros(6)
+    jr = np.zeros(6)
+    inv_s2 = 1.0 / (sigma * sigma)
+    for step_index in range(len(scales) + 1):
+        last = step_index == len(scales)
+        scale2 = scales[min(step_index, len(scales) - 1)] ** 2
+        normal[:] = prior
+        rhs[:] = 0
+        used = 0.0
+        for k in range(n):
+            ir = 1.0 / rho[k]
+            px = origin[k, 0] + direction[k, 0] * ir
+            py = origin[k, 1] + direction[k, 1] * ir
+            pz = origin[k, 2] + direction[k, 2] * ir
+            g = -ir * ir
+            rows = point_residuals(
+                pose, px, py, pz, direction[k, 0] * g, direction[k, 1] * g, direction[k, 2] * g,
+                uv_l[k], uv_r[k], cams, right_T_left, res, jac, ray,
+            )  # fmt: skip
+            if rows == 0:
+                error[k] = np.inf
+                continue
+            rr, gr, gg = 0.0, 0.0, 0.0
+            for i in range(rows):
+                rr += res[i] * res[i]
+                gr += ray[i] * res[i]
+                gg += ray[i] * ray[i]
+            c = variance[k] / (sigma * sigma + variance[k] * gg)
+            chi2 = max(rr - c * gr * gr, 0.0) * inv_s2
+            error[k] = math.sqrt(chi2 / rows)
+            w = weight[k] / (1.0 + chi2 / (rows * scale2))
+            wi = w * inv_s2
+            used += w
+            for i in range(6):
+                s = 0.0
+                for m in range(rows):
+                    s += jac[m, i] * ray[m]
+                jr[i] = s
+            for i in range(6):
+                s = 0.0
+                for m in range(rows):
+                    s += jac[m, i] * res[m]
+                rhs[i] += wi * (s - c * jr[i] * gr)
+                for j in range(i, 6):
+                    s = 0.0
+                    for m in range(rows):
+                        s += jac[m, i] * jac[m, j]
+                    normal[i, j] += wi * (s - c * jr[i] * jr[j])
+        for i in range(6):
+            for j in range(i):
+                normal[i, j] = normal[j, i]
+        if last or used < 3:
+            break
+        for i in range(6):
+            normal[i, i] += 1e-6 + 1e-9 * normal[i, i]
+        if prior[0, 0] > 0:  # pull towards prior_pose; first order is enough at the prior's width
+            delta = np.zeros(6)
+            for i in range(3):
+                for j in range(3):
+                    delta[i] += pose[j, i] * (pose[j, 3] - prior_pose[j, 3])
+            r = np.zeros((3, 3))
+            for i in range(3):
+                for j in range(3):
+                    for m in range(3):
+                        r[i, j] += prior_pose[m, i] * pose[m, j]
+            delta[3], delta[4], delta[5] = 0.5 * (r[2, 1] - r[1, 2]), 0.5 * (r[0, 2] - r[2, 0]), 0.5 * (r[1, 0] - r[0, 1])
+            for i in range(6):
+                for j in range(6):
+                    rhs[i] += prior[i, j] * delta[j]
+        xi = -np.linalg.solve(normal, rhs)
+        pose = pose @ _exp(xi)
+    covariance = np.linalg.inv(normal + 1e-9 * np.eye(6))
+    return pose, covariance, error
+
+
+@njit
+def refine_depth(
+    pose, origin, direction, rho, variance, uv_l, uv_r, inlier, cams, right_T_left, sigma, growth, floor
+):
+    """Update rho and its variance (in place) by one frame's observations, the pose given.
+
+    `sigma` is larger than the pixel noise: successive errors of one patch are alike, and the pose was fitted to the same
+    pixels. `growth` multiplies the variance before the update; `floor` is the least relative standard deviation.
+    """
+    res, jac, ray = np.zeros(4), np.zeros((4, 6)), np.zeros(4)
+    for k in range(len(rho)):
+        if not inlier[k]:
+            continue
+        ir = 1.0 / rho[k]
+        g = -ir * ir
+        rows = point_residuals(
+            pose, origin[k, 0] + direction[k, 0] * ir, origin[k, 1] + direction[k, 1] * ir,
+            origin[k, 2] + direction[k, 2] * ir, direction[k, 0] * g, direction[k, 1] * g, direction[k, 2] * g,
+            uv_l[k], uv_r[k], cams, right_T_left, res, jac, ray,
+        )  # fmt: skip
+        if rows == 0:
+            continue
+        gr, gg = 0.0, 0.0
+        for i in range(rows):
+            gr += ray[i] * res[i]
+            gg += ray[i] * ray[i]
+        var = variance[k] * growth
+        information = 1.0 / var + gg / (sigma * sigma)
+        rho[k] = max(rho[k] - gr / (sigma * sigma) / information, 1e-4)
+        variance[k] = max(1.0 / information, (floor * rho[k]) ** 2)

@@ -1,0 +1,336 @@
+"""The default tracker: flow of grid-spread points, stereo by bearings, motion-only optimisation over both images.
+
+Per frame: predict the pose (constant velocity), predict every point's pixel, follow it by translation, align it with its
+first appearance, find it in the right image, solve the pose robustly, refine the points' distances. At keyframes: new
+corners where points are missing, stereo matches for them, descriptors for the mapper and the loop closer.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from calib.rig import Rig
+from stereo_sfm.config import TrackerConfig
+from stereo_sfm.geometry import se3
+from stereo_sfm.timing import NoSpans
+from stereo_sfm.tracking import flow, motion
+from stereo_sfm.tracking.corners import detect_corners
+from stereo_sfm.tracking.descriptors import describe
+from stereo_sfm.tracking.eyes import Eyes
+from stereo_sfm.tracking.stereo import StereoMatcher
+from stereo_sfm.tracking.tracks import Patches, Tracks
+from stereo_sfm.types import F64, Bool, Frame, Keyframe, MapUpdate, Observations, StereoImage, TrackState
+
+COARSE_TO_FINE = np.array([20.0, 10.0, 6.0, 4.0, 3.0, 2.0, 2.0])  # Cauchy scales in sigmas
+FINE = np.array([4.0, 2.0, 2.0])
+
+
+class Tracker:
+    """One `step` per image. Frame poses are odom_T_cam; the odometry frame is the first camera."""
+
+    def __init__(self, config: TrackerConfig, rig: Rig, spans: NoSpans | None = None) -> None:
+        self._config = config
+        self._rig = rig
+        self._eyes = Eyes.of(rig)
+        self._spans = spans or NoSpans()
+        self._stereo = StereoMatcher(config, rig)
+        half = rig.left.valid_mask(math.radians(config.max_angle_deg))[::2, ::2]
+        border = 12
+        half[:border] = half[-border:] = False
+        half[:, :border] = half[:, -border:] = False
+        self._mask: Bool = half
+        area = 4.0 * half.sum()
+        self._spacing = 0.75 * math.sqrt(area / config.max_features)
+        self._patches = Patches(2 * config.max_features)
+        self._tracks = Tracks()
+        self._pyramid: flow.Pyramid | None = None
+        self._pose: F64 = np.eye(4)
+        self._velocity: F64 = np.zeros(6)  # tangent per second
+        self._stamp_ns = 0
+        self._state = TrackState.INITIALIZING
+        self._lost = 0
+        self._next_point_id = 0
+        self._next_kf_id = 0
+        self._submap_id = 0
+        self._kf_pose: F64 = np.eye(4)
+        self._kf_points: int = 0
+        self._kf_last_point_id = 0
+        self._frames_since_kf = 0
+        self._first_level = config.pyramid_levels - 1
+        self._map_version = 0
+        self._odom_T_map: F64 = np.eye(4)
+
+    def apply(self, update: MapUpdate) -> None:
+        """Take the mapper's better positions of points and of the reference keyframe."""
+        self._map_version = update.version
+        self._odom_T_map = se3.inverse(update.map_T_odom)
+        ids, rows = np.unique(update.fused_point_ids[:, 0], return_index=True)
+        if len(ids):
+            at = np.clip(np.searchsorted(ids, self._tracks.point_ids), 0, len(ids) - 1)
+            hit = ids[at] == self._tracks.point_ids
+            self._tracks.point_ids[hit] = update.fused_point_ids[rows[at[hit]], 1]
+            _, first = np.unique(self._tracks.point_ids, return_index=True)
+            self._tracks = self._tracks.keep(np.isin(np.arange(len(self._tracks)), first))
+        if len(update.culled_point_ids):
+            self._tracks = self._tracks.keep(~np.isin(self._tracks.point_ids, update.culled_point_ids))
+        order = np.argsort(update.point_ids, kind="stable")
+        ids = update.point_ids[order]
+        if len(ids) and len(self._tracks):
+            at = np.clip(np.searchsorted(ids, self._tracks.point_ids), 0, len(ids) - 1)
+            hit = ids[at] == self._tracks.point_ids
+            self._move_points(hit, se3.transform(self._odom_T_map, update.points_map[order[at[hit]]]))
+
+    def _move_points(self, rows: Bool, points: F64) -> None:
+        tracks = self._tracks
+        ray = points - tracks.origin[rows]
+        distance = np.maximum(np.linalg.norm(ray, axis=1), 1e-6)
+        tracks.direction[rows] = ray / distance[:, None]
+        tracks.rho[rows] = 1.0 / distance
+        tracks.mapped[rows] = True
+
+    def step(self, image: StereoImage) -> tuple[Frame, Keyframe | None]:
+        """The pose of one image, and a keyframe when this frame becomes one."""
+        with self._spans.span("pyramid"):
+            pyramid = flow.build_pyramid(image.left, self._config.pyramid_levels)
+            right = self._stereo.prepare(image)
+        stats: dict[str, float] = {}
+        if self._state == TrackState.INITIALIZING:
+            return self._initialize(image, pyramid, right, stats)
+        dt = (image.stamp_ns - self._stamp_ns) * 1e-9
+        predicted = self._pose @ se3.exp(self._velocity * dt)
+        with self._spans.span("flow"):
+            tracks, index = self._follow(pyramid, predicted)
+        with self._spans.span("stereo"):
+            uv_right = self._stereo.follow(pyramid, right, tracks.uv, tracks.points(), predicted)
+        with self._spans.span("pose"):
+            pose, covariance, error, reason = self._solve(tracks, uv_right, predicted, len(index))
+        if reason:
+            return self._lose(image, predicted, reason, stats)
+        inlier = error < self._config.max_error
+        tracks.uv_right = uv_right
+        tracks.misses = np.where(inlier, 0, tracks.misses + 1).astype(np.int32)
+        tracks.age = tracks.age + np.int32(1)
+        self._refine(tracks, pose, inlier)
+        stats.update(
+            tracked=float(len(tracks)),
+            inliers=float(inlier.sum()),
+            right=float(np.isfinite(uv_right[:, 0]).sum()),
+            error=float(np.median(error[inlier])) if inlier.any() else 0.0,
+        )
+        state = TrackState.OK if self._lost == 0 else TrackState.RECOVERED
+        if dt > 0:
+            self._velocity = se3.log(se3.inverse(self._pose) @ pose) / dt
+        self._accept(image, pyramid, pose, tracks.keep(tracks.misses < 3))
+        frame_inlier = inlier[tracks.misses < 3]
+        self._frames_since_kf += 1
+        keyframe = None
+        if self._wants_keyframe():
+            with self._spans.span("keyframe"):
+                keyframe = self._make_keyframe(image, pyramid, right, covariance)
+                frame_inlier = np.concatenate([frame_inlier, np.ones(len(self._tracks) - len(frame_inlier), bool)])
+        return self._frame(image, covariance, state, "", frame_inlier, keyframe, stats), keyframe
+
+    # -- stages ----------------------------------------------------------------------------------------------------
+
+    def _initialize(
+        self, image: StereoImage, pyramid: flow.Pyramid, right: object, stats: dict[str, float]
+    ) -> tuple[Frame, Keyframe | None]:
+        """First frame, or the first after a restart: points from stereo alone."""
+        self._tracks = Tracks()
+        self._accept(image, pyramid, self._pose, self._tracks)
+        keyframe = self._make_keyframe(image, pyramid, right, np.eye(6) * 1e-12)
+        if len(self._tracks) < 2 * self._config.min_features:
+            self._tracks = Tracks()
+            self._next_kf_id -= 1
+            self._state = TrackState.INITIALIZING
+            reason = "dark" if image.left.max() < 30 else "too_few_points"
+            state = TrackState.INITIALIZING if self._submap_id == 0 and self._next_kf_id == 0 else TrackState.LOST
+            return self._frame(image, np.eye(6), state, reason, np.zeros(0, bool), None, stats), None
+        state = TrackState.OK if self._submap_id == 0 else TrackState.RESTARTED
+        inlier = np.ones(len(self._tracks), bool)
+        stats.update(tracked=float(len(inlier)), inliers=float(len(inlier)), right=float(len(inlier)), error=0.0)
+        return self._frame(image, np.eye(6) * 1e-12, state, "", inlier, keyframe, stats), keyframe
+
+    def _follow(self, pyramid: flow.Pyramid, predicted: F64) -> tuple[Tracks, F64]:
+        """Tracks that are found in the new left image, moved there, and the predicted pixels of all."""
+        config, tracks = self._config, self._tracks
+        assert self._pyramid is not None
+        guess = self._rig.left.project(se3.transform(se3.inverse(predicted), tracks.points()))
+        guess = np.where(np.isfinite(guess), guess, tracks.uv)
+        uv = guess.copy()
+        status, _ = flow.track_translation(
+            self._pyramid, pyramid, tracks.uv, uv, self._first_level, 0, 10, config.min_contrast, config.min_ncc,
+            flow.WEIGHTS,
+        )  # fmt: skip
+        found = status == flow.TRACKED
+        moved = np.linalg.norm(uv - guess, axis=1)
+        self._last_miss = float(np.median(moved[found])) if found.any() else np.inf
+        warp = tracks.warp.copy()
+        slot = tracks.slot
+        ncc = flow.track_affine(
+            pyramid[0], uv, warp, slot, found, self._patches.patch, self._patches.gradients,
+            self._patches.inverse_normal, self._patches.contrast, 6, flow.WEIGHTS, flow.COORDINATES,
+        )  # fmt: skip
+        found &= ncc > config.min_anchor_ncc
+        found &= self._rig.left.inside(uv, 1.0)
+        out = tracks.keep(found)
+        out.uv, out.warp = uv[found], warp[found]
+        return out, guess
+
+    def _solve(self, tracks: Tracks, uv_right: F64, predicted: F64, before: int) -> tuple[F64, F64, F64, str]:
+        """Pose, covariance, whitened error of each track, and why not ('' when solved)."""
+        config = self._config
+        none = np.eye(4), np.eye(6), np.zeros(0)
+        if len(tracks) < config.min_features:
+            return *none, "too_few_points"
+        pose, covariance, error = self._optimise(tracks, uv_right, predicted, COARSE_TO_FINE)
+        share = float((error < config.max_error).mean())
+        if share < 0.5:
+            for start in (self._pose,):
+                other = self._optimise(tracks, uv_right, start, COARSE_TO_FINE)
+                if (other[2] < config.max_error).mean() > share:
+                    pose, covariance, error = other
+        inliers = int((error < config.max_error).sum())
+        if inliers < config.min_features:
+            return *none, "no_consensus"
+        return pose, covariance, error, ""
+
+    def _optimise(self, tracks: Tracks, uv_right: F64, start: F64, scales: F64) -> tuple[F64, F64, F64]:
+        return motion.optimise_pose(
+            start, tracks.origin, tracks.direction, tracks.rho, tracks.variance, tracks.uv, uv_right,
+            np.ones(len(tracks)), self._eyes.cams, self._eyes.right_T_left, self._config.sigma_px, scales,
+            np.zeros((6, 6)), start,
+        )  # fmt: skip
+
+    def _refine(self, tracks: Tracks, pose: F64, inlier: Bool) -> None:
+        motion.refine_depth(
+            pose, tracks.origin, tracks.direction, tracks.rho, tracks.variance, tracks.uv, tracks.uv_right,
+            inlier & ~tracks.mapped, self._eyes.cams, self._eyes.right_T_left, self._config.depth_sigma_px, 1.0, 1e-3,
+        )  # fmt: skip
+
+    def _accept(self, image: StereoImage, pyramid: flow.Pyramid, pose: F64, tracks: Tracks) -> None:
+        self._pose, self._stamp_ns, self._pyramid, self._tracks = pose, image.stamp_ns, pyramid, tracks
+        self._lost = 0
+        self._state = TrackState.OK
+        self._first_level = 1 if getattr(self, "_last_miss", np.inf) < 3.0 else self._config.pyramid_levels - 1
+        self._patches.keep_only(tracks.slot)
+
+    def _lose(
+        self, image: StereoImage, predicted: F64, reason: str, stats: dict[str, float]
+    ) -> tuple[Frame, Keyframe | None]:
+        """Keep the last good frame's tracks and predict; after a while begin a new submap."""
+        self._lost += 1
+        self._first_level = self._config.pyramid_levels - 1
+        if image.left.max() < 30:
+            reason = "dark"
+        if self._lost > self._config.lost_frames:
+            self._pose = predicted
+            self._submap_id += 1
+            self._velocity = np.zeros(6)
+            self._state = TrackState.INITIALIZING
+        frame_pose, self_pose = predicted, self._pose
+        self._pose = frame_pose
+        frame = self._frame(image, np.eye(6), TrackState.LOST, reason, np.zeros(0, bool), None, stats)
+        self._pose = self_pose
+        return frame, None
+
+    def _wants_keyframe(self) -> bool:
+        config = self._config
+        old = int((self._tracks.point_ids < self._kf_last_point_id).sum())
+        return self._frames_since_kf >= config.keyframe_max_frames or old < config.keyframe_share * self._kf_points
+
+    def _make_keyframe(self, image: StereoImage, pyramid: flow.Pyramid, right: object, covariance: F64) -> Keyframe:
+        self._add_points(pyramid, right)
+        tracks = self._tracks
+        points_cam = se3.transform(se3.inverse(self._pose), tracks.points())
+        descriptors, angles = describe(pyramid[0], tracks.uv)
+        keyframe = Keyframe(
+            kf_id=self._next_kf_id,
+            frame_id=image.frame_id,
+            stamp_ns=image.stamp_ns,
+            odom_T_cam=self._pose.copy(),
+            point_ids=tracks.point_ids.copy(),
+            uv_left=tracks.uv.copy(),
+            uv_right=tracks.uv_right.copy(),
+            points_cam=points_cam,
+            descriptors=descriptors,
+            angles=angles,
+            submap_id=self._submap_id,
+            covariance=covariance,
+        )
+        self._next_kf_id += 1
+        self._kf_pose = self._pose.copy()
+        self._kf_points = len(tracks)
+        self._kf_last_point_id = self._next_point_id
+        self._frames_since_kf = 0
+        return keyframe
+
+    def _add_points(self, pyramid: flow.Pyramid, right: object) -> None:
+        config = self._config
+        missing = config.max_features - len(self._tracks)
+        if missing <= 0:
+            return
+        corners = detect_corners(
+            pyramid[1], self._mask, self._tracks.uv, missing, self._spacing, config.corner_quality
+        )
+        match = self._stereo.match(pyramid, right, corners)
+        good = match.good
+        slots = self._patches.take(int(good.sum()))
+        good[np.flatnonzero(good)[len(slots) :]] = False
+        uv = match.uv_left[good]
+        textured = self._patches_make(pyramid, uv, slots)
+        n = int(textured.sum())
+        new = Tracks(
+            point_ids=self._next_point_id + np.arange(n, dtype=np.int64),
+            uv=uv[textured],
+            uv_right=match.uv_right[good][textured],
+            origin=np.tile(self._pose[:3, 3], (n, 1)),
+            direction=match.bearing[good][textured] @ self._pose[:3, :3].T,
+            rho=np.maximum(match.rho[good][textured], 1e-4),
+            variance=match.variance[good][textured],
+            age=np.zeros(n, np.int32),
+            misses=np.zeros(n, np.int32),
+            warp=np.tile(np.eye(2), (n, 1, 1)),
+            slot=slots[textured],
+            mapped=np.zeros(n, bool),
+        )
+        self._next_point_id += n
+        self._tracks = self._tracks.append(new)
+        self._patches.keep_only(self._tracks.slot)
+
+    def _patches_make(self, pyramid: flow.Pyramid, uv: F64, slots: F64) -> Bool:
+        store = self._patches
+        return flow.make_patches(
+            pyramid, uv, slots, flow.WEIGHTS, flow.COORDINATES, store.patch, store.gradients, store.inverse_normal,
+            store.contrast,
+        )  # fmt: skip
+
+    def _frame(
+        self,
+        image: StereoImage,
+        covariance: F64,
+        state: TrackState,
+        reason: str,
+        inlier: Bool,
+        keyframe: Keyframe | None,
+        stats: dict[str, float],
+    ) -> Frame:
+        tracks = self._tracks if len(inlier) == len(self._tracks) else Tracks()
+        return Frame(
+            frame_id=image.frame_id,
+            stamp_ns=image.stamp_ns,
+            odom_T_cam=self._pose.copy(),
+            covariance=covariance,
+            state=state,
+            reason=reason,
+            observations=Observations(
+                tracks.point_ids.copy(), tracks.uv.copy(), tracks.uv_right.copy(), tracks.age.copy(), inlier
+            ),
+            reference_kf_id=self._next_kf_id - 1,
+            kf_T_cam=se3.inverse(self._kf_pose) @ self._pose,
+            map_version=self._map_version,
+            is_keyframe=keyframe is not None,
+            stats=stats,
+        )
