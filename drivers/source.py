@@ -17,11 +17,30 @@ from stereo_sfm.types import StereoImage, Trajectory
 class Source(Protocol):
     """What every driver is."""
 
-    name: str  # for people: "sim:loop", "euroc:mh01"
-    rig: Rig  # known when the source is open, before the first frame
-    ground_truth: Trajectory | None  # world_T_cam0 where the source has it
-    frame_count: int | None  # None when unknown (live)
-    live: bool  # frames come whether or not somebody takes them
+    @property
+    def name(self) -> str:
+        """For people: "sim:loop", "euroc:mh01"."""
+        ...
+
+    @property
+    def rig(self) -> Rig:
+        """Known when the source is open, before the first frame."""
+        ...
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """world_T_cam0 where the source has it."""
+        ...
+
+    @property
+    def frame_count(self) -> int | None:
+        """None when unknown (live)."""
+        ...
+
+    @property
+    def live(self) -> bool:
+        """Frames come whether or not somebody takes them."""
+        ...
 
     def __enter__(self) -> Self: ...
 
