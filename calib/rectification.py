@@ -1,0 +1,97 @@
+"""Rectification of a rig: the new rig, and the pictures it would have taken."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.rig import Rig
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.cameras import Camera
+from stereo_sfm.geometry.rectify import epipolar_camera, pinhole_camera, remap_tables
+from stereo_sfm.geometry.stereo import rectifying_rotations
+from stereo_sfm.types import F64, U8, Bool
+
+PROJECTIONS = ("none", "pinhole", "epipolar")
+
+
+@dataclass(frozen=True, eq=False)
+class Eye:
+    """How one eye's images are turned into rectified ones."""
+
+    source: Camera
+    target: Camera
+    target_R_source: F64  # (3, 3)
+    table: NDArray[np.int16]  # (H, W, 2) of cv2.remap
+    fraction: NDArray[np.uint16]  # (H, W)
+    mask: Bool  # (H, W) pixels that have a source
+
+    def apply(self, image: U8) -> U8:
+        """(H, W) of the source -> (H, W) of the target, black where there is no source."""
+        import cv2
+
+        if image.shape[:2] != (self.source.height, self.source.width):
+            raise StereoSfmError(
+                f"image of {image.shape[1]}x{image.shape[0]} px, but the calibration is for"
+                f" {self.source.width}x{self.source.height}"
+            )
+        out: Any = cv2.remap(image, self.table, self.fraction, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+        return out
+
+    def to_source(self, uv: F64) -> F64:
+        """(..., 2) rectified px -> (..., 2) px of the original image."""
+        return self.source.project(self.target.unproject(uv) @ self.target_R_source)
+
+    def from_source(self, uv: F64) -> F64:
+        """(..., 2) px of the original image -> (..., 2) rectified px."""
+        return self.target.project(self.source.unproject(uv) @ self.target_R_source.T)
+
+
+@dataclass(frozen=True, eq=False)
+class Rectification:
+    """Both eyes turned and projected so that a point lies on one row of both images."""
+
+    rig: Rig  # equal cameras, baseline along +x
+    left: Eye
+    right: Eye
+    cam_T_rect: F64  # (4, 4) the rectified left eye in the original left eye: a rotation
+
+    def apply(self, left: U8, right: U8) -> tuple[U8, U8]:
+        """Both rectified images."""
+        return self.left.apply(left), self.right.apply(right)
+
+
+def rectify(
+    rig: Rig,
+    projection: str = "epipolar",
+    hfov_deg: float | None = None,
+    size: tuple[int, int] | None = None,
+) -> Rectification:
+    """Rectify a stereo rig.
+
+    Args:
+        rig: two eyes.
+        projection: "pinhole" or "epipolar" ("none" is no rectification and has no answer here).
+        hfov_deg: horizontal field of view; None keeps what the projection sensibly can.
+        size: (width, height) px of the rectified images; None keeps about the resolution of the images' centre.
+
+    Raises:
+        StereoSfmError: one eye, depth camera, unknown projection, or geometry that cannot be rectified.
+    """
+    if rig.right is None or rig.depth:
+        raise StereoSfmError("rectification needs two eyes: this source has one")
+    if projection not in ("pinhole", "epipolar"):
+        raise StereoSfmError(f"unknown projection '{projection}': choose pinhole or epipolar")
+    rect_R_left, rect_R_right = rectifying_rotations(rig.left_T_right)
+    choose = pinhole_camera if projection == "pinhole" else epipolar_camera
+    camera = choose(rig.left, rig.right, rect_R_left, rect_R_right, hfov_deg, size)
+    left = Eye(rig.left, camera, rect_R_left, *remap_tables(rig.left, camera, rect_R_left))
+    right = Eye(rig.right, camera, rect_R_right, *remap_tables(rig.right, camera, rect_R_right))
+    cam_T_rect = se3.from_rotation_translation(rect_R_left.T, np.zeros(3))
+    baseline = se3.from_rotation_translation(np.eye(3), np.array([rig.baseline, 0.0, 0.0]))
+    new = replace(rig, left=camera, right=camera, left_T_right=baseline, body_T_left=rig.body_T_left @ cam_T_rect)
+    return Rectification(new, left, right, cam_T_rect)
