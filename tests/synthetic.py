@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import KannalaBrandt, Pinhole
-from stereo_sfm.types import F64, I64, Bool, Keyframe
+from stereo_sfm.types import F64, I64, Bool
 
 
 def pinhole_rig(baseline: float = 0.1) -> Rig:
@@ -37,7 +37,6 @@ class Scene:
     uv_left: F64  # (M, 2)
     uv_right: F64  # (M, 2)
     outlier: Bool  # (M,)
-    extra: dict[str, F64] = field(default_factory=dict[str, F64])
 
 
 def walk(count: int, step: float = 0.25, yaw_per_step: float = 0.02) -> F64:

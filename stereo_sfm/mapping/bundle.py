@@ -117,7 +117,7 @@ class _Solver:
     def _solve_poses(self, state: _State, damping: float) -> F64 | None:
         h, b = self._pose_system(state, damping)
         if not self.config.move_points:
-            return np.linalg.solve(h, b[..., None])[..., 0]
+            return np.asarray(np.linalg.solve(h, b[..., None])[..., 0], float)
         if self.system is None:
             self.system = ReducedSystem(self.starts, self.obs_kf, self.free, self.config.dense)
         blocks = self.system.new_blocks(h)
@@ -174,7 +174,7 @@ class _Solver:
 def bundle_adjust(rig: Rig, bundle: Bundle, config: BundleConfig | None = None) -> BundleResult:
     """Poses and points that minimise the robust reprojection error.
 
-    Points that no remaining observation determines (none, or one ray only) stay where they are.
+    A point that no remaining observation sees stays where it is; one on a single ray moves onto it and binds no pose.
 
     Raises:
         StereoSfmError: arrays of different lengths, or indices out of range.

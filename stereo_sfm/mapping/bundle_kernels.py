@@ -194,7 +194,7 @@ def _row_times_skew(row, p0, p1, p2):
 
 @njit
 def _point_block(first, last, obs_kf, rot, lin, damping, hinv, b):
-    """(H_point + damping diag)^-1 into hinv (3, 3) and b_point into b (3,). False where the point is unobservable."""
+    """(H_point + damping diag)^-1 into hinv (3, 3) and b_point into b (3,). False where nothing sees it."""
     a_all, g_all, _, _ = lin
     h00 = h01 = h02 = h11 = h12 = h22 = 0.0
     b[:] = 0.0
@@ -218,16 +218,16 @@ def _point_block(first, last, obs_kf, rot, lin, damping, hinv, b):
         z2 = a[2] * r[2, 0] + a[4] * r[2, 1] + a[5] * r[2, 2]
         h22 += r[2, 0] * z0 + r[2, 1] * z1 + r[2, 2] * z2
     scale = (h00 + h11 + h22) / 3.0
-    det = h00 * (h11 * h22 - h12 * h12) + h01 * (h02 * h12 - h01 * h22) + h02 * (h01 * h12 - h02 * h11)
-    if not det > 1e-13 * scale * scale * scale:
-        return False
     h00 += damping * h00
     h11 += damping * h11
     h22 += damping * h22
     c00 = h11 * h22 - h12 * h12
     c01 = h02 * h12 - h01 * h22
     c02 = h01 * h12 - h02 * h11
-    inv = 1.0 / (h00 * c00 + h01 * c01 + h02 * c02)
+    det = h00 * c00 + h01 * c01 + h02 * c02
+    if not det > 1e-14 * scale * scale * scale:
+        return False
+    inv = 1.0 / det
     hinv[0, 0] = c00 * inv
     hinv[0, 1] = hinv[1, 0] = c01 * inv
     hinv[0, 2] = hinv[2, 0] = c02 * inv

@@ -1,7 +1,8 @@
-"""The reduced camera system of bundle adjustment: its block pattern, and its solution, dense or sparse.
+"""The reduced camera system of bundle adjustment: its block pattern, and its solution, dense or banded.
 
-Windows are solved by a dense Cholesky factorisation. The full map is solved by a sparse LU with a minimum-degree order
-of the symmetric pattern and no pivoting, which on a symmetric positive matrix does the work of a sparse Cholesky.
+Windows are solved by a dense Cholesky factorisation. The full map is reordered by reverse Cuthill-McKee, which gathers
+the keyframes that see the same points, loops included, into a band, and solved by LAPACK's band Cholesky; one step
+on 1,000 keyframes takes 0.6 s there, 3 to 4 s in scipy's sparse LU, and never more than the dense factorisation.
 """
 
 from __future__ import annotations
@@ -9,12 +10,13 @@ from __future__ import annotations
 import numpy as np
 import scipy.linalg
 import scipy.sparse
-import scipy.sparse.linalg
+import scipy.sparse.csgraph
+from numpy.typing import NDArray
 
 from stereo_sfm.mapping import bundle_kernels
 from stereo_sfm.types import F64, I64
 
-DENSE_KEYFRAMES = 120  # above, the sparse solver is faster (benchmarks/full_ba.py)
+DENSE_KEYFRAMES = 200  # above, the banded solver is faster (benchmarks/full_ba.py --solvers)
 
 
 class ReducedSystem:
@@ -28,55 +30,67 @@ class ReducedSystem:
             free: (K,) row of a keyframe in the system, -1 when it is fixed.
             dense: which solver; by default by size.
         """
-        self.size = int(free.max(initial=-1)) + 1
-        self.dense = self.size <= DENSE_KEYFRAMES if dense is None else dense
+        self.size = n = int(free.max(initial=-1)) + 1
+        self.dense = n <= DENSE_KEYFRAMES if dense is None else dense
         pairs, self.most = bundle_kernels.count_pairs(starts, obs_kf, free)
         keys = np.empty(pairs, np.int64)
         bundle_kernels.list_pairs(starts, obs_kf, free, keys)
-        n = self.size
         diagonal = np.arange(n, dtype=np.int64) * (n + 1)
         if self.dense:
-            self.slots = keys.astype(np.int32)
-            self._rows, self._cols = np.divmod(np.arange(n * n, dtype=np.int64), max(n, 1))
-            self._diagonal = diagonal
-        else:
-            unique, slots = np.unique(np.concatenate([diagonal, keys]), return_inverse=True)
-            self.slots = slots[n:].astype(np.int32)
-            self._rows, self._cols = np.divmod(unique, n)
-            self._diagonal = slots[:n]
+            self.count, self._slots, self._diagonal = n * n, keys.astype(np.int32), diagonal
+            return
+        unique, slots = np.unique(np.concatenate([diagonal, keys]), return_inverse=True)
+        self.count, self._slots, self._diagonal = len(unique), slots[n:].astype(np.int32), slots[:n]
+        self._set_band(*np.divmod(unique, n))
+
+    @property
+    def slots(self) -> NDArray[np.int32]:
+        """Block of every pair in the order of bundle_kernels.list_pairs."""
+        return self._slots
+
+    def _set_band(self, rows: I64, cols: I64) -> None:
+        """Reorder so that coupled keyframes are near each other; where every entry of a block lies in the band."""
+        n = self.size
+        ones = np.ones(len(rows), np.int8)
+        graph = scipy.sparse.csr_array((ones, (rows, cols)), shape=(n, n))
+        order = scipy.sparse.csgraph.reverse_cuthill_mckee(scipy.sparse.csr_array(graph + graph.T), True)
+        place = np.empty(n, np.int64)
+        place[order] = np.arange(n)
+        self._place = place
+        self._swap = place[rows] < place[cols]  # the block falls into the upper triangle: its transpose is stored
+        self._high, self._low = np.maximum(place[rows], place[cols]), np.minimum(place[rows], place[cols])
+        self._band = 6 * int((self._high - self._low).max(initial=0)) + 6
 
     def new_blocks(self, pose_blocks: F64) -> F64:
         """(B, 6, 6) zeros, with the (F, 6, 6) blocks of the poses on the diagonal."""
-        blocks = np.zeros((len(self._rows), 6, 6))
+        blocks = np.zeros((self.count, 6, 6))
         blocks[self._diagonal] = pose_blocks
         return blocks
 
     def solve(self, blocks: F64, b: F64) -> F64 | None:
         """(F, 6) step, or None where the matrix is not positive definite."""
-        return self._solve_dense(blocks, b) if self.dense else self._solve_sparse(blocks, b)
-
-    def _solve_dense(self, blocks: F64, b: F64) -> F64 | None:
-        n = self.size
-        matrix = blocks.reshape(n, n, 6, 6).transpose(0, 2, 1, 3).reshape(6 * n, 6 * n)
         try:
-            factor = scipy.linalg.cho_factor(matrix, lower=True, overwrite_a=True, check_finite=False)
+            return self._solve_dense(blocks, b) if self.dense else self._solve_banded(blocks, b)
         except scipy.linalg.LinAlgError:
             return None
+
+    def _solve_dense(self, blocks: F64, b: F64) -> F64:
+        n = self.size
+        matrix = blocks.reshape(n, n, 6, 6).transpose(0, 2, 1, 3).reshape(6 * n, 6 * n)
+        factor = scipy.linalg.cho_factor(matrix, lower=True, overwrite_a=True, check_finite=False)
         return scipy.linalg.cho_solve(factor, b.ravel(), check_finite=False).reshape(n, 6)
 
-    def _solve_sparse(self, blocks: F64, b: F64) -> F64 | None:
-        off = self._rows != self._cols
-        rows = np.concatenate([self._rows, self._cols[off]])
-        cols = np.concatenate([self._cols, self._rows[off]])
-        values = np.concatenate([blocks, blocks[off].transpose(0, 2, 1)])
-        order = np.lexsort((cols, rows))
-        indptr = np.searchsorted(rows[order], np.arange(self.size + 1))
-        shape = (6 * self.size, 6 * self.size)
-        matrix = scipy.sparse.bsr_array((values[order], cols[order], indptr), shape=shape).tocsc()
-        try:
-            factor = scipy.sparse.linalg.splu(
-                matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-            )
-        except RuntimeError:  # exactly singular
-            return None
-        return factor.solve(b.ravel()).reshape(self.size, 6)
+    def _solve_banded(self, blocks: F64, b: F64) -> F64:
+        n, place = self.size, self._place
+        band = np.zeros((6 * n, self._band))  # row j: the entries (j, j), (j + 1, j), ... of column j
+        for i in range(6):
+            for j in range(6):
+                value = np.where(self._swap, blocks[:, j, i], blocks[:, i, j])
+                offset = 6 * (self._high - self._low) + i - j
+                lower = offset >= 0
+                band[6 * self._low[lower] + j, offset[lower]] = value[lower]
+        factor = scipy.linalg.cholesky_banded(band.T, overwrite_ab=True, lower=True, check_finite=False)
+        right = np.empty((n, 6))
+        right[place] = b
+        step = scipy.linalg.cho_solve_banded((factor, True), right.ravel(), check_finite=False)
+        return step.reshape(n, 6)[place]
