@@ -43,17 +43,11 @@ class TopicInfo:
     count: int
 
 
-class _Mended(io.RawIOBase):
+class _Mended:
     """The whole records of a file followed by the index that it lacks, as one stream."""
 
     def __init__(self, stream: IO[bytes], end: int, tail: bytes) -> None:
         self._stream, self._end, self._tail, self._at = stream, end, tail, 0
-
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
 
     def seek(self, offset: int, whence: int = io.SEEK_SET, /) -> int:
         base = {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._end + len(self._tail)}[whence]
@@ -95,6 +89,7 @@ class LogReader:
             raise
 
     def _open(self) -> tuple[SeekingReader, Summary]:
+        self._stream.seek(0)
         try:
             reader = SeekingReader(self._stream, validate_crcs=True)
             summary = reader.get_summary()

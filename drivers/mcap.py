@@ -1,0 +1,266 @@
+"""MCAP files as a source: our own recordings to the bit; `drivers.mcap_foreign` reads what others wrote."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+
+from calib.rig import Rig
+from drivers.rig_option import RigOption, chosen_rig
+from drivers.source import Source
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.log import foxglove, images, schema, topics
+from stereo_sfm.log.image_log import RIG_FILE, ImageInfo, ImuSample, WheelSample, rig_from_text
+from stereo_sfm.log.reader import LogReader, Record
+from stereo_sfm.types import F32, U8, ImuSamples, StereoImage, Trajectory, WheelSamples
+
+log = logging.getLogger("stereo_sfm")
+
+_PARTS = (
+    topics.IMAGE_INFO,
+    topics.LEFT_IMAGE,
+    topics.RIGHT_IMAGE,
+    topics.DEPTH_IMAGE,
+    topics.IMU,
+    topics.WHEEL,
+)
+_MARGIN_NS = 1_000_000_000  # inertial samples may lie this far from the frame that carries them
+_WAITING = 8  # frames that may be begun before an incomplete one is given up
+
+
+def open_mcap(path: str, **options: Any) -> Source:
+    """Open a recording or a run.
+
+    Args:
+        path: the file.
+        **options: `rig`, a calibration (a file or a `Rig`) that replaces the one in the file; for files by others
+            also `left`, `right`, `depth`: the image topics, where the names do not tell.
+
+    Raises:
+        StereoSfmError: no file, not MCAP, no images, no calibration, or images that do not fit the calibration.
+    """
+    if not path:
+        raise StereoSfmError("which file? mcap:FILE.mcap")
+    reader = LogReader(Path(path).expanduser())
+    try:
+        if any(t.topic == topics.IMAGE_INFO and t.schema == "stereo_sfm.ImageInfo" for t in reader.topics):
+            return McapSource(reader, **options)
+        from drivers.mcap_foreign import ForeignMcapSource
+
+        return ForeignMcapSource(reader, **options)
+    except TypeError as error:
+        reader.close()
+        raise StereoSfmError(f"{path}: {str(error).rpartition('.')[2]}") from None
+    except BaseException:
+        reader.close()
+        raise
+
+
+def read_ground_truth(reader: LogReader, topic: str) -> Trajectory | None:
+    """Poses of a PoseInFrame topic in stamp order, None where there are none."""
+    stamps: list[int] = []
+    poses: list[Any] = []
+    for record in reader.messages([topic]):
+        message = PoseInFrame.FromString(record.data)
+        stamps.append(record.log_time)
+        poses.append(foxglove.matrix(message.pose.position, message.pose.orientation))
+    return Trajectory(np.array(stamps, np.int64), np.array(poses)) if stamps else None
+
+
+def decode_image(record: Record) -> U8:
+    """Pixels of a RawImage or CompressedImage record as (H, W) u8.
+
+    Raises:
+        ValueError: an encoding nobody knows, or damaged bytes.
+    """
+    if record.schema is not None and record.schema.name == "foxglove.RawImage":
+        m = RawImage.FromString(record.data)
+        return images.decode_raw(m.data, m.width, m.height, m.step, m.encoding)
+    return images.decode_file(CompressedImage.FromString(record.data).data)
+
+
+def decode_depth(record: Record) -> F32:
+    """Pixels of a depth RawImage record as (H, W) metres."""
+    m = RawImage.FromString(record.data)
+    return images.decode_depth(m.data, m.width, m.height, m.step, m.encoding)
+
+
+def check_size(path: Path, what: str, pixels: U8 | F32, size: tuple[int, int]) -> None:
+    """Raises StereoSfmError when an image does not fit its calibration."""
+    height, width = pixels.shape
+    if (width, height) != size:
+        raise StereoSfmError(
+            f"{path}: {what} images are {width}x{height} but the calibration is for {size[0]}x{size[1]}: "
+            "use the calibration of these images (--rig FILE)"
+        )
+
+
+@dataclass
+class _Parts:
+    """The messages of one frame as they come."""
+
+    info: ImageInfo | None = None
+    left: U8 | None = None
+    right: U8 | None = None
+    depth: F32 | None = None
+    imu: list[ImuSample] = field(default_factory=list[ImuSample])
+    wheel: list[WheelSample] = field(default_factory=list[WheelSample])
+
+    def whole(self) -> bool:
+        """Everything that `info` promises is there."""
+        i = self.info
+        return (
+            i is not None
+            and self.left is not None
+            and (self.right is not None or not i.has_right)
+            and (self.depth is not None or not i.has_depth)
+            and len(self.imu) >= i.imu_count
+            and len(self.wheel) >= i.wheel_count
+        )
+
+    def image(self) -> StereoImage:
+        assert self.info is not None and self.left is not None
+        i = self.info
+        imu = _imu(self.imu) if i.imu_count >= 0 else None
+        wheel = _wheel(self.wheel) if i.wheel_count >= 0 else None
+        return StereoImage(
+            i.frame_id,
+            i.stamp_ns,
+            self.left,
+            self.right,
+            self.depth,
+            right_stamp_ns=i.right_stamp_ns,
+            exposure_us=i.exposure_us,
+            gain=i.gain,
+            dropped_before=i.dropped_before,
+            imu=imu,
+            wheel=wheel,
+        )
+
+
+def _imu(samples: list[ImuSample]) -> ImuSamples:
+    gyro = [(s.gyro_x, s.gyro_y, s.gyro_z) for s in samples]
+    accel = [(s.accel_x, s.accel_y, s.accel_z) for s in samples]
+    stamps = np.array([s.stamp_ns for s in samples], np.int64)
+    return ImuSamples(stamps, np.array(gyro, float).reshape(-1, 3), np.array(accel, float).reshape(-1, 3))
+
+
+def _wheel(samples: list[WheelSample]) -> WheelSamples:
+    linear = [(s.linear_x, s.linear_y, s.linear_z) for s in samples]
+    angular = [(s.angular_x, s.angular_y, s.angular_z) for s in samples]
+    stamps = np.array([s.stamp_ns for s in samples], np.int64)
+    return WheelSamples(stamps, np.array(linear, float).reshape(-1, 3), np.array(angular, float).reshape(-1, 3))
+
+
+class McapSource:
+    """A recording or a run of ours: the images that the sensor gave (or the tracker saw), bit for bit."""
+
+    live = False
+
+    def __init__(self, reader: LogReader, rig: RigOption = None) -> None:
+        """Takes over the reader. `rig` replaces the recorded calibration."""
+        self.reader = reader
+        self.name = str(reader.path)
+        self.rig = chosen_rig(rig, self._recorded_rig)
+        self._decoders: dict[type[Any], Callable[[bytes], Any]] = {}
+
+    def _recorded_rig(self) -> Rig:
+        text = self.reader.attachment(RIG_FILE)
+        if text is None:
+            raise StereoSfmError(f"{self.name} holds no calibration: give one with --rig FILE")
+        return rig_from_text(text.decode())
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        """world_T_cam0, where the recorded source had it."""
+        return read_ground_truth(self.reader, topics.GROUND_TRUTH)
+
+    @property
+    def frame_count(self) -> int | None:
+        """Frames whose every image is in the file."""
+        counts = {t.topic: t.count for t in self.reader.topics}
+        eyes = (topics.LEFT_IMAGE, topics.RIGHT_IMAGE, topics.DEPTH_IMAGE)
+        return min(counts[t] for t in (topics.IMAGE_INFO, *eyes) if t in counts)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.reader.close()
+
+    def __iter__(self) -> Iterator[StereoImage]:
+        return self.frames()
+
+    def frames(self, start_ns: int | None = None, until_ns: int | None = None) -> Iterator[StereoImage]:
+        """Frames with stamps in [start_ns, until_ns], without reading what lies before.
+
+        Raises:
+            StereoSfmError: pixels that do not fit the calibration, or a damaged file.
+        """
+        first = None if start_ns is None else start_ns - _MARGIN_NS
+        last = None if until_ns is None else until_ns + _MARGIN_NS
+        for image in self._whole_frames(first, last):
+            if until_ns is not None and image.stamp_ns > until_ns:
+                return
+            if start_ns is None or image.stamp_ns >= start_ns:
+                self._check(image)
+                yield image
+
+    def _whole_frames(self, first_ns: int | None, last_ns: int | None) -> Iterator[StereoImage]:
+        pending: dict[int, _Parts] = {}
+        for record in self.reader.messages(_PARTS, first_ns, last_ns):
+            self._add(pending.setdefault(record.sequence, _Parts()), record)
+            yield from self._take(pending, _WAITING)
+        yield from self._take(pending, 0, at_edge=first_ns is not None or bool(self.reader.truncated))
+
+    def _take(self, pending: dict[int, _Parts], waiting: int, at_edge: bool = False) -> Iterator[StereoImage]:
+        """The whole frames in front; a frame that stays incomplete while `waiting` others came is left out."""
+        while pending:
+            sequence = next(iter(pending))
+            parts = pending[sequence]
+            if not parts.whole() and len(pending) <= waiting:
+                return
+            del pending[sequence]
+            if parts.whole():
+                yield parts.image()
+            elif not at_edge:
+                log.warning("%s: frame %d is incomplete and left out", self.name, sequence)
+
+    def _add(self, parts: _Parts, record: Record) -> None:
+        try:
+            if record.topic == topics.LEFT_IMAGE:
+                parts.left = decode_image(record)
+            elif record.topic == topics.RIGHT_IMAGE:
+                parts.right = decode_image(record)
+            elif record.topic == topics.DEPTH_IMAGE:
+                parts.depth = decode_depth(record)
+            elif record.topic == topics.IMAGE_INFO:
+                parts.info = self._decode(record, ImageInfo)
+            elif record.topic == topics.IMU:
+                parts.imu.append(self._decode(record, ImuSample))
+            else:
+                parts.wheel.append(self._decode(record, WheelSample))
+        except ValueError as error:
+            log.warning("%s: %s of frame %d: %s", self.name, record.topic, record.sequence, error)
+
+    def _decode(self, record: Record, cls: type[Any]) -> Any:
+        if cls not in self._decoders:
+            assert record.schema is not None
+            self._decoders[cls] = schema.decoder(cls, record.schema.data)
+        return self._decoders[cls](record.data)
+
+    def _check(self, image: StereoImage) -> None:
+        check_size(self.reader.path, "left", image.left, self.rig.left.size)
+        if image.right is not None and self.rig.right is not None:
+            check_size(self.reader.path, "right", image.right, self.rig.right.size)

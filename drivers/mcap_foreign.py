@@ -1,0 +1,242 @@
+"""MCAP files of other programs as a source: two image topics, their calibrations and what else can be used."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from calib.rig import Rig
+from drivers.mcap_messages import (
+    BAD_MESSAGE,
+    CAMERAS,
+    IMUS,
+    PICTURES,
+    POSES,
+    TRANSFORMS,
+    CameraInfo,
+    Picture,
+    Transform,
+    schema_name,
+)
+from drivers.mcap_rig import camera_of, chain, stereo_rig
+from drivers.mcap_topics import camera_topic, choose_topics, is_rectified
+from drivers.rig_option import RigOption, chosen_rig
+from drivers.tum_rgbd import with_virtual_eye
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.log.reader import LogReader, Record
+from stereo_sfm.types import ImuSamples, StereoImage, Trajectory
+
+log = logging.getLogger("stereo_sfm")
+
+_STATIC_NS = 10_000_000_000  # the fixed transforms must come within the first ten seconds
+_WAITING = 30  # images of one eye that wait for the other eye at most
+
+
+@dataclass
+class _Shot:
+    """One image of one eye, not decoded."""
+
+    stamp_ns: int
+    picture: Picture
+
+
+class ForeignMcapSource:
+    """Pairs the images of two topics by their stamps. Frames without a partner count as dropped."""
+
+    live = False
+
+    def __init__(
+        self, reader: LogReader, rig: RigOption = None, left: str = "", right: str = "", depth: str = ""
+    ) -> None:
+        """Takes over the reader.
+
+        Args:
+            reader: the open file.
+            rig: calibration that replaces or supplies the one in the file.
+            left: image topic of the left eye when the names do not tell. right, depth: likewise.
+        """
+        self.reader = reader
+        self.name = str(reader.path)
+        self.topics = choose_topics(reader, left, right, depth)
+        self.rig = chosen_rig(rig, self._recorded_rig)
+        if self.topics.depth:
+            self.rig = with_virtual_eye(self.rig)
+        self.ground_truth = self._read_truth()
+        counts = {t.topic: t.count for t in reader.topics}
+        self.frame_count: int | None = min(counts[t] for t in (self.topics.left, self._other()) if t)
+        self._tolerance_ns = self._period_ns() * 2 // 5
+        self._check_first()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.reader.close()
+
+    def __iter__(self) -> Iterator[StereoImage]:
+        return self.frames()
+
+    def frames(self, start_ns: int | None = None, until_ns: int | None = None) -> Iterator[StereoImage]:
+        """Frames logged in [start_ns, until_ns]; the first is number 0 whatever the start.
+
+        Raises:
+            StereoSfmError: images that do not fit the calibration.
+        """
+        dropped = 0
+        previous = None
+        for frame_id, (left, other) in enumerate(self._pairs(start_ns, until_ns)):
+            image = self._decode(frame_id, left, other, dropped) if other or not self._other() else None
+            dropped = 0 if image is not None else dropped + 1
+            if image is not None:
+                yield image
+                previous = image
+        if previous is None:
+            raise StereoSfmError(
+                f"{self.name}: no image could be used (left {self.topics.left}, other {self._other()})"
+            )
+
+    def _other(self) -> str:
+        return self.topics.right or self.topics.depth
+
+    def _decode(self, frame_id: int, left: _Shot, other: _Shot | None, dropped: int) -> StereoImage | None:
+        try:
+            pixels = left.picture.gray()
+            right = other.picture.gray() if other and self.topics.right else None
+            depth = other.picture.depth() if other and self.topics.depth else None
+        except BAD_MESSAGE as error:
+            log.warning("%s: image at %d ns is left out: %s", self.name, left.stamp_ns, error)
+            return None
+        self._check_size("left", pixels.shape, self.rig.left.size)
+        if right is not None and self.rig.right is not None:
+            self._check_size("right", right.shape, self.rig.right.size)
+        if depth is not None:
+            self._check_size("depth", depth.shape, self.rig.left.size)
+        right_stamp = other.stamp_ns if other and right is not None and other.stamp_ns != left.stamp_ns else 0
+        return StereoImage(
+            frame_id, left.stamp_ns, pixels, right, depth, right_stamp_ns=right_stamp, dropped_before=dropped
+        )
+
+    def _pairs(
+        self, start_ns: int | None, until_ns: int | None, imu: list[tuple[int, list[float]]]
+    ) -> Iterator[tuple[_Shot, _Shot | None]]:
+        """(left, right or depth) by stamp; a left image alone comes with None. Inertial samples are put into `imu`."""
+        names = [t for t in (self.topics.left, self._other()) if t]
+        lefts: deque[_Shot] = deque()
+        others: deque[_Shot] = deque()
+        for record in self.reader.messages([*names, self.topics.imu], start_ns, until_ns):
+            if record.topic == self.topics.imu:
+                imu.append(IMUS[schema_name(record)](record.data))
+                continue
+            shot = self._shot(record)
+            if shot is None:
+                continue
+            if len(names) == 1:
+                yield shot, None
+                continue
+            (lefts if record.topic == names[0] else others).append(shot)
+            while lefts and others:
+                skew = others[0].stamp_ns - lefts[0].stamp_ns
+                if skew < -self._tolerance_ns:
+                    others.popleft()
+                elif skew > self._tolerance_ns:
+                    yield lefts.popleft(), None
+                else:
+                    yield lefts.popleft(), others.popleft()
+            if len(lefts) > _WAITING:
+                yield lefts.popleft(), None
+            if len(others) > _WAITING:
+                others.popleft()
+
+    def _shot(self, record: Record) -> _Shot | None:
+        try:
+            picture = PICTURES[schema_name(record)](record.data)
+        except BAD_MESSAGE as error:
+            log.warning("%s: a message of %s cannot be read: %s", self.name, record.topic, error)
+            return None
+        return _Shot(picture.stamp_ns or record.log_time, picture)
+
+    def _recorded_rig(self) -> Rig:
+        names = tuple(camera_topic(t, self.topics.cameras) for t in (self.topics.left, self.topics.right) if t)
+        if not all(names):
+            raise StereoSfmError(f"{self.name} holds no calibration of its images: give one with --rig FILE")
+        infos = [self._camera_info(name) for name in names]
+        rectified = is_rectified(self.topics.left)
+        if len(infos) == 1:
+            return Rig(camera_of(infos[0], names[0], rectified), name=self.reader.path.stem)
+        if names[0] == names[1]:
+            raise StereoSfmError(f"{self.name} has one calibration, {names[0]}, for two eyes: give one with --rig FILE")
+        rig = stereo_rig(infos[0], infos[1], (names[0], names[1]), rectified, self._fixed_transforms())
+        return Rig(rig.left, rig.right, rig.left_T_right, name=self.reader.path.stem)
+
+    def _camera_info(self, topic: str) -> CameraInfo:
+        for record in self.reader.messages([topic]):
+            try:
+                return CAMERAS[schema_name(record)](record.data)
+            except BAD_MESSAGE as error:
+                raise StereoSfmError(f"{self.name}: calibration on {topic} cannot be read: {error}") from None
+        raise StereoSfmError(f"{self.name}: {topic} is empty")
+
+    def _fixed_transforms(self) -> list[Transform]:
+        out: list[Transform] = []
+        start, _ = self.reader.time_range
+        for record in self.reader.messages(self.topics.transforms, None, start + _STATIC_NS):
+            try:
+                out += TRANSFORMS[schema_name(record)](record.data)
+            except BAD_MESSAGE as error:
+                log.warning("%s: a transform on %s cannot be read: %s", self.name, record.topic, error)
+        return out
+
+    def _read_truth(self) -> Trajectory | None:
+        """Poses of the left camera where a transform tells how it sits on the tracked body, else of the body itself."""
+        rows: list[Transform] = []
+        for record in self.reader.messages([self.topics.truth] if self.topics.truth else []):
+            try:
+                pose = POSES[schema_name(record)](record.data)
+            except BAD_MESSAGE:
+                continue
+            rows.append(Transform(pose.stamp_ns or record.log_time, pose.parent, pose.child, pose.matrix))
+        if not rows:
+            return None
+        rows.sort(key=lambda row: row.stamp_ns)
+        body_T_cam = chain(self._fixed_transforms(), rows[0].child, self._left_frame()) if rows[0].child else None
+        poses = np.array([row.matrix for row in rows]) @ (np.eye(4) if body_T_cam is None else body_T_cam)
+        return Trajectory(np.array([row.stamp_ns for row in rows], np.int64), poses)
+
+    def _left_frame(self) -> str:
+        first = next((self._shot(r) for r in self.reader.messages([self.topics.left])), None)
+        return first.picture.frame if first else ""
+
+    def _period_ns(self) -> int:
+        stamps = [r.log_time for r in itertools.islice(self.reader.messages([self.topics.left]), 20)]
+        return int(np.median(np.diff(stamps))) if len(stamps) > 1 else 100_000_000
+
+    def _check_first(self) -> None:
+        """The images must fit the calibration, and that is said before the first frame."""
+        for left, other in self._pairs(None, None, []):
+            if other or not self._other():
+                self._decode(0, left, other, 0)
+                return
+
+    def _check_size(self, what: str, shape: tuple[int, ...], size: tuple[int, int]) -> None:
+        if (shape[1], shape[0]) != size:
+            raise StereoSfmError(
+                f"{self.name}: {what} images are {shape[1]}x{shape[0]} but the calibration is for {size[0]}x{size[1]}: "
+                "use the calibration of these images (--rig FILE)"
+            )
+
+
+def _take_imu(buffer: list[tuple[int, list[float]]], until_ns: int) -> ImuSamples:
+    """Remove the samples up to a stamp from the buffer."""
+    taken = [s for s in buffer if s[0] <= until_ns]
+    buffer[:] = [s for s in buffer if s[0] > until_ns]
+    values = np.array([v for _, v in taken], float).reshape(-1, 6)
+    return ImuSamples(np.array([t for t, _ in taken], np.int64), values[:, :3].copy(), values[:, 3:].copy())

@@ -1,0 +1,240 @@
+"""Messages of files that others wrote, made neutral: images, calibrations, transforms of Foxglove (protobuf) and ROS 2.
+
+CDR is the plain form of OMG's Common Data Representation: a four-byte header, then fields aligned to their own size
+counted from the end of that header; strings carry their length with the closing zero.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.message import DecodeError
+
+from stereo_sfm.geometry import se3
+from stereo_sfm.log import foxglove, images
+from stereo_sfm.log.reader import Record
+from stereo_sfm.types import F32, F64, U8
+
+# What damaged or unexpected message bytes raise.
+BAD_MESSAGE = (ValueError, DecodeError, struct.error, IndexError)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An image that is not decoded yet."""
+
+    stamp_ns: int  # 0 where the message has none
+    frame: str
+    compressed: bool
+    data: bytes
+    width: int = 0
+    height: int = 0
+    step: int = 0
+    encoding: str = ""
+    big_endian: bool = False
+
+    def gray(self) -> U8:
+        """(H, W) u8."""
+        if self.compressed:
+            return images.decode_file(self.data)
+        return images.decode_raw(self.data, self.width, self.height, self.step, self.encoding, self.big_endian)
+
+    def depth(self) -> F32:
+        """(H, W) metres, NaN where unknown."""
+        if self.compressed:
+            return images.decode_depth_file(self.data)
+        return images.decode_depth(self.data, self.width, self.height, self.step, self.encoding)
+
+
+@dataclass(frozen=True)
+class CameraInfo:
+    """One eye's calibration as ROS and Foxglove have it."""
+
+    frame: str
+    width: int
+    height: int
+    model: str
+    d: list[float]
+    k: F64  # (3, 3)
+    r: F64  # (3, 3) rotates camera points into the rectified frame
+    p: F64  # (3, 4) projection of rectified points; p[0, 3] = -fx * baseline in the right eye
+
+
+@dataclass(frozen=True)
+class Transform:
+    """parent_T_child, or a pose (4, 4) of something unnamed in `parent`."""
+
+    stamp_ns: int
+    parent: str
+    child: str
+    matrix: F64
+
+
+class _Cdr:
+    """Reads CDR fields one after the other."""
+
+    def __init__(self, data: bytes) -> None:
+        if len(data) < 4:
+            raise ValueError("a ROS 2 message without header")
+        self._data = memoryview(data)[4:]
+        self._order = "<" if data[1] & 1 else ">"
+        self._at = 0
+
+    def take(self, kind: str, count: int = 1) -> Any:
+        """One number of a struct letter, or a tuple when `count` is not 1."""
+        size = struct.calcsize(kind)
+        self._at += -self._at % size
+        values = struct.unpack_from(f"{self._order}{count}{kind}", self._data, self._at)
+        self._at += size * count
+        return values[0] if count == 1 else values
+
+    def blob(self) -> bytes:
+        """A sequence of bytes."""
+        length = self.take("I")
+        out = bytes(self._data[self._at : self._at + length])
+        if len(out) != length:
+            raise ValueError("a ROS 2 message is cut off")
+        self._at += length
+        return out
+
+    def text(self) -> str:
+        return self.blob().rstrip(b"\0").decode(errors="replace")
+
+    def header(self) -> tuple[int, str]:
+        """(stamp_ns, frame_id)."""
+        seconds, nanos = self.take("i"), self.take("I")
+        return seconds * 1_000_000_000 + nanos, self.text()
+
+    def pose(self) -> F64:
+        """Position and quaternion -> (4, 4)."""
+        v = np.array(self.take("d", 7))
+        rotation = se3.rotation_from_quaternion(v[3:]) if v[3:].any() else np.eye(3)
+        return se3.from_rotation_translation(rotation, v[:3])
+
+
+def _picture_foxglove_raw(data: bytes) -> Picture:
+    m = RawImage.FromString(data)
+    return Picture(foxglove.stamp_of(m), m.frame_id, False, m.data, m.width, m.height, m.step, m.encoding)
+
+
+def _picture_foxglove_compressed(data: bytes) -> Picture:
+    m = CompressedImage.FromString(data)
+    return Picture(foxglove.stamp_of(m), m.frame_id, True, m.data)
+
+
+def _picture_ros_raw(data: bytes) -> Picture:
+    cdr = _Cdr(data)
+    stamp_ns, frame = cdr.header()
+    height, width, encoding = cdr.take("I"), cdr.take("I"), cdr.text()
+    big, step = bool(cdr.take("B")), cdr.take("I")
+    return Picture(stamp_ns, frame, False, cdr.blob(), width, height, step, encoding, big)
+
+
+def _picture_ros_compressed(data: bytes) -> Picture:
+    cdr = _Cdr(data)
+    stamp_ns, frame = cdr.header()
+    encoding = cdr.text()
+    blob = cdr.blob()
+    if "compressedDepth" in encoding:  # the depth transport puts its own header before the PNG
+        blob = blob[blob.find(b"\x89PNG") :]
+    return Picture(stamp_ns, frame, True, blob)
+
+
+def _camera_foxglove(data: bytes) -> CameraInfo:
+    m = CameraCalibration.FromString(data)
+    return _camera(m.frame_id, m.width, m.height, m.distortion_model, list(m.D), list(m.K), list(m.R), list(m.P))
+
+
+def _camera_ros(data: bytes) -> CameraInfo:
+    cdr = _Cdr(data)
+    _, frame = cdr.header()
+    height, width, model = cdr.take("I"), cdr.take("I"), cdr.text()
+    d = [cdr.take("d") for _ in range(cdr.take("I"))]
+    return _camera(frame, width, height, model, d, cdr.take("d", 9), cdr.take("d", 9), cdr.take("d", 12))
+
+
+def _camera(frame: str, width: int, height: int, model: str, d: list[float], k: Any, r: Any, p: Any) -> CameraInfo:
+    rotation = np.reshape(r, (3, 3)) if np.any(r) else np.eye(3)
+    projection = np.reshape(p, (3, 4)) if np.any(p) else np.zeros((3, 4))
+    intrinsics = np.reshape(k, (3, 3)) if len(k) == 9 else np.zeros((3, 3))
+    return CameraInfo(frame, width, height, model, d, intrinsics, rotation, projection)
+
+
+def _transform(m: FrameTransform) -> Transform:
+    return Transform(
+        foxglove.stamp_of(m), m.parent_frame_id, m.child_frame_id, foxglove.matrix(m.translation, m.rotation)
+    )
+
+
+def _transforms_ros(data: bytes) -> list[Transform]:
+    cdr = _Cdr(data)
+    out: list[Transform] = []
+    for _ in range(cdr.take("I")):
+        stamp_ns, parent = cdr.header()
+        out.append(Transform(stamp_ns, parent, cdr.text(), cdr.pose()))
+    return out
+
+
+def _pose_foxglove(data: bytes) -> Transform:
+    m = PoseInFrame.FromString(data)
+    return Transform(foxglove.stamp_of(m), m.frame_id, "", foxglove.matrix(m.pose.position, m.pose.orientation))
+
+
+def _pose_ros(data: bytes) -> Transform:
+    cdr = _Cdr(data)
+    stamp_ns, parent = cdr.header()
+    return Transform(stamp_ns, parent, "", cdr.pose())
+
+
+def _odometry_ros(data: bytes) -> Transform:
+    cdr = _Cdr(data)
+    stamp_ns, parent = cdr.header()
+    return Transform(stamp_ns, parent, cdr.text(), cdr.pose())
+
+
+def _imu_ros(data: bytes) -> tuple[int, list[float]]:
+    cdr = _Cdr(data)
+    stamp_ns, _ = cdr.header()
+    cdr.take("d", 13)
+    gyro = cdr.take("d", 3)
+    cdr.take("d", 9)
+    return stamp_ns, [*gyro, *cdr.take("d", 3)]
+
+
+PICTURES: dict[str, Callable[[bytes], Picture]] = {
+    "foxglove.RawImage": _picture_foxglove_raw,
+    "foxglove.CompressedImage": _picture_foxglove_compressed,
+    "sensor_msgs/msg/Image": _picture_ros_raw,
+    "sensor_msgs/msg/CompressedImage": _picture_ros_compressed,
+}
+CAMERAS: dict[str, Callable[[bytes], CameraInfo]] = {
+    "foxglove.CameraCalibration": _camera_foxglove,
+    "sensor_msgs/msg/CameraInfo": _camera_ros,
+}
+TRANSFORMS: dict[str, Callable[[bytes], list[Transform]]] = {
+    "foxglove.FrameTransforms": lambda data: [_transform(t) for t in FrameTransforms.FromString(data).transforms],
+    "foxglove.FrameTransform": lambda data: [_transform(FrameTransform.FromString(data))],
+    "tf2_msgs/msg/TFMessage": _transforms_ros,
+}
+POSES: dict[str, Callable[[bytes], Transform]] = {
+    "foxglove.PoseInFrame": _pose_foxglove,
+    "geometry_msgs/msg/PoseStamped": _pose_ros,
+    "nav_msgs/msg/Odometry": _odometry_ros,
+}
+IMUS: dict[str, Callable[[bytes], tuple[int, list[float]]]] = {"sensor_msgs/msg/Imu": _imu_ros}
+ENCODINGS = ("protobuf", "cdr")
+
+
+def schema_name(record: Record) -> str:
+    """Full name of a record's schema, "" for none."""
+    return record.schema.name if record.schema is not None else ""

@@ -1,0 +1,133 @@
+"""Which topics of a foreign recording are the eyes, their calibrations and the ground truth: by schema and by name."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+
+from drivers.mcap_messages import CAMERAS, ENCODINGS, IMUS, PICTURES, POSES, TRANSFORMS
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.log.reader import LogReader, TopicInfo
+
+log = logging.getLogger("stereo_sfm")
+
+# What names of a left and a right eye contain, the most telling first.
+_SIDES = (
+    ("left", "right"),
+    ("cam0", "cam1"),
+    ("cam_0", "cam_1"),
+    ("camera0", "camera1"),
+    ("camera_0", "camera_1"),
+    ("fisheye1", "fisheye2"),
+    ("infra1", "infra2"),
+    ("rect0", "rect1"),
+    ("image0", "image1"),
+    ("image_0", "image_1"),
+    ("cam1", "cam2"),
+)
+_DEPTH = ("depth", "disparity")
+_TRUTH = ("ground_truth", "groundtruth", "mocap", "vicon")
+
+
+@dataclass(frozen=True)
+class ChosenTopics:
+    """Topic names; "" for what is not there."""
+
+    left: str
+    right: str
+    depth: str
+    truth: str
+    imu: str
+    cameras: tuple[str, ...]
+    transforms: tuple[str, ...]
+
+
+def choose_topics(reader: LogReader, left: str = "", right: str = "", depth: str = "") -> ChosenTopics:
+    """Find the eyes.
+
+    Args:
+        reader: the open file.
+        left: image topic the user named, "" to find it. right, depth: likewise.
+
+    Raises:
+        StereoSfmError: no images, an unknown topic, or more than two images whose names tell nothing.
+    """
+    rows = [t for t in reader.topics if t.encoding in ENCODINGS]
+    pictures = [t.topic for t in rows if t.schema in PICTURES]
+    if not pictures:
+        raise StereoSfmError(f"{reader.path} holds no images ({_content(reader.topics)})")
+    for name in (left, right, depth):
+        if name and name not in pictures:
+            raise StereoSfmError(f"{reader.path} has no image topic {name} (there are: {', '.join(pictures)})")
+    cameras = tuple(t.topic for t in rows if t.schema in CAMERAS)
+    eyes = [t for t in pictures if not _is_depth(t)]
+    if not left:
+        left, found = _pair(str(reader.path), eyes or pictures, cameras)
+        right = right or ("" if depth else found)
+    if not right and not depth:
+        depth = next((t for t in pictures if _is_depth(t) and t != left), "")
+    return ChosenTopics(
+        left,
+        right,
+        "" if right else depth,
+        next((t.topic for t in rows if t.schema in POSES and any(w in t.topic.lower() for w in _TRUTH)), ""),
+        next((t.topic for t in rows if t.schema in IMUS), ""),
+        cameras,
+        tuple(t.topic for t in rows if t.schema in TRANSFORMS),
+    )
+
+
+def camera_topic(image: str, cameras: tuple[str, ...]) -> str:
+    """The calibration beside an image topic: the one that shares the longest path with it, "" when none shares any."""
+    best = max(cameras, key=lambda c: _shared(image, c), default="")
+    return best if best and _shared(image, best) else ""
+
+
+def is_rectified(topic: str) -> bool:
+    """Whether an image topic holds rectified images, by its name."""
+    return "rect" in topic.lower() and "unrect" not in topic.lower()
+
+
+def _content(topics: list[TopicInfo]) -> str:
+    if not topics:
+        return "no messages at all"
+    video = next((t.topic for t in topics if "Video" in t.schema), "")
+    if video:
+        return f"{video} is video, which is not supported: convert it to images first"
+    return "its topics: " + ", ".join(f"{t.topic} {t.schema or t.encoding}" for t in topics[:12])
+
+
+def _is_depth(topic: str) -> bool:
+    return any(word in topic.lower() for word in _DEPTH)
+
+
+def _shared(a: str, b: str) -> int:
+    """Leading path parts that two topics share."""
+    count = 0
+    for x, y in zip(PurePosixPath(a).parts[1:], PurePosixPath(b).parts[1:], strict=False):
+        if x != y:
+            break
+        count += 1
+    return count
+
+
+def _pair(name: str, eyes: list[str], cameras: tuple[str, ...]) -> tuple[str, str]:
+    pairs = [
+        (topic, topic.replace(one, other))
+        for one, other in _SIDES
+        for topic in eyes
+        if one in topic and topic.replace(one, other) in eyes
+    ]
+    if pairs:
+        order = {pair: i for i, pair in reversed(list(enumerate(pairs)))}
+        return min(order, key=lambda p: (not camera_topic(p[0], cameras), is_rectified(p[0]), len(p[0]), order[p]))
+    if len(eyes) == 1:
+        return eyes[0], ""
+    if len(eyes) == 2:
+        log.warning("%s: taking %s as the left eye and %s as the right one", name, *sorted(eyes))
+        return sorted(eyes)[0], sorted(eyes)[1]
+    raise StereoSfmError(
+        f"{name} has {len(eyes)} image topics and their names do not tell left from right: "
+        f"say mcap:FILE?left=TOPIC&right=TOPIC ({', '.join(eyes)})"
+    )

@@ -1,0 +1,184 @@
+"""A source as messages: calibration, images, inertial and wheel samples, ground truth, drops."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from calib.rig import Rig
+from stereo_sfm.log import foxglove, topics
+from stereo_sfm.log.images import LoggedImage, depth_message, encode_pair, image_message
+from stereo_sfm.log.writer import LogWriter
+from stereo_sfm.types import ImuSamples, StereoImage, Trajectory, WheelSamples
+
+RIG_FILE = "calibration.yaml"
+SECOND_NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class ImageInfo:
+    """What belongs to an image besides its pixels; tells the reader which messages make the frame whole."""
+
+    frame_id: int
+    stamp_ns: int
+    right_stamp_ns: int
+    exposure_us: float
+    gain: float
+    dropped_before: int
+    has_right: bool
+    has_depth: bool
+    imu_count: int  # -1: the source has no inertial unit
+    wheel_count: int  # -1: no wheel odometry
+
+
+@dataclass(frozen=True)
+class ImuSample:
+    """One inertial sample in the unit's own axes, NaN for what was not sampled."""
+
+    stamp_ns: int
+    gyro_x: float  # rad/s
+    gyro_y: float
+    gyro_z: float
+    accel_x: float  # m/s^2
+    accel_y: float
+    accel_z: float
+
+
+@dataclass(frozen=True)
+class WheelSample:
+    """One wheel odometry sample, body axes."""
+
+    stamp_ns: int
+    linear_x: float  # m/s
+    linear_y: float
+    linear_z: float
+    angular_x: float  # rad/s
+    angular_y: float
+    angular_z: float
+
+
+def rig_to_text(rig: Rig) -> str:
+    """The rig as our YAML, every number exact."""
+    from calib.formats.native import write_native
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / RIG_FILE
+        write_native(rig, path)
+        return path.read_text()
+
+
+def rig_from_text(text: str) -> Rig:
+    """The inverse of `rig_to_text`."""
+    from calib.formats.native import read_native
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / RIG_FILE
+        path.write_text(text)
+        return read_native(path)
+
+
+class ImageLog:
+    """Writes one source's images and everything around them through a `LogWriter`."""
+
+    def __init__(
+        self, writer: LogWriter, rig: Rig, ground_truth: Trajectory | None = None, image_format: str = "png"
+    ) -> None:
+        self._writer = writer
+        self._rig = rig
+        self._truth = ground_truth
+        self._format = image_format
+        self._next_static_ns: int | None = None
+        writer.attach(RIG_FILE, rig_to_text(rig), "application/yaml")
+
+    def image(self, image: StereoImage | LoggedImage) -> None:
+        """Everything of one frame, pixels last.
+
+        Args:
+            image: a pair, or one that `encode_pair` has encoded already (so that a run can track on decoded JPEG).
+        """
+        logged = image if isinstance(image, LoggedImage) else encode_pair(image, self._format)
+        pair = logged.image
+        self._static(pair.stamp_ns)
+        self._ground_truth(pair.stamp_ns)
+        self._samples(pair)
+        self._info(pair)
+        self._pixels(logged)
+
+    def _info(self, pair: StereoImage) -> None:
+        info = ImageInfo(
+            pair.frame_id,
+            pair.stamp_ns,
+            pair.right_stamp_ns,
+            pair.exposure_us,
+            pair.gain,
+            pair.dropped_before,
+            pair.right is not None,
+            pair.depth is not None,
+            -1 if pair.imu is None else len(pair.imu.stamp_ns),
+            -1 if pair.wheel is None else len(pair.wheel.stamp_ns),
+        )
+        self._writer.write(topics.IMAGE_INFO, info, pair.stamp_ns, pair.frame_id)
+
+    def _pixels(self, logged: LoggedImage) -> None:
+        pair = logged.image
+        eyes = (
+            (topics.LEFT_IMAGE, "cam0", pair.left, logged.left),
+            (topics.RIGHT_IMAGE, "cam1", pair.right, logged.right),
+        )
+        for topic, frame, pixels, data in eyes:
+            if pixels is None or data is None:
+                continue
+            message = image_message(data, (pixels.shape[1], pixels.shape[0]), logged.format, frame)
+            self._writer.write(topic, foxglove.stamp(message, pair.stamp_ns), pair.stamp_ns, pair.frame_id)
+        if pair.depth is not None:
+            depth = foxglove.stamp(depth_message(pair.depth, "cam0"), pair.stamp_ns)
+            self._writer.write(topics.DEPTH_IMAGE, depth, pair.stamp_ns, pair.frame_id)
+
+    def _samples(self, pair: StereoImage) -> None:
+        if pair.imu is not None:
+            for stamp_ns, row in _rows(pair.imu):
+                self._writer.write(topics.IMU, ImuSample(stamp_ns, *row), stamp_ns, pair.frame_id)
+        if pair.wheel is not None:
+            for stamp_ns, row in _rows(pair.wheel):
+                self._writer.write(topics.WHEEL, WheelSample(stamp_ns, *row), stamp_ns, pair.frame_id)
+
+    def _static(self, stamp_ns: int) -> None:
+        """Calibration and the transforms inside the rig, at the start and every second: players that seek need them."""
+        if self._next_static_ns is not None and stamp_ns < self._next_static_ns:
+            return
+        self._next_static_ns = stamp_ns + SECOND_NS
+        rig = self._rig
+        rows = [("body", "cam0", rig.body_T_left)]
+        left = foxglove.calibration(rig.left, "cam0", stamp_ns)
+        self._writer.write(topics.LEFT_CALIBRATION, left, stamp_ns)
+        if rig.right is not None and not rig.depth:
+            tx = -rig.right.fx * rig.baseline if np.allclose(rig.left_T_right[:3, :3], np.eye(3), atol=1e-9) else 0.0
+            right = foxglove.calibration(rig.right, "cam1", stamp_ns, tx)
+            self._writer.write(topics.RIGHT_CALIBRATION, right, stamp_ns)
+            rows.append(("cam0", "cam1", rig.left_T_right))
+        self._writer.write(topics.TF, foxglove.transforms(stamp_ns, rows), stamp_ns)
+
+    def _ground_truth(self, stamp_ns: int) -> None:
+        """All poses from the first image on, in chunks of their own: a reader gets them without reading the images."""
+        if self._truth is None:
+            return
+        first = max(int(np.searchsorted(self._truth.stamp_ns, stamp_ns, side="right")) - 1, 0)
+        self._writer.flush()
+        for pose_stamp, world_T_cam in zip(
+            self._truth.stamp_ns[first:].tolist(), self._truth.poses[first:], strict=True
+        ):
+            self._writer.write(topics.GROUND_TRUTH, foxglove.pose_in_frame("map", pose_stamp, world_T_cam), pose_stamp)
+        self._writer.flush()
+        self._truth = None
+
+
+def _rows(samples: ImuSamples | WheelSamples) -> list[tuple[int, list[float]]]:
+    """(stamp, six numbers) per sample."""
+    if isinstance(samples, ImuSamples):
+        values = np.hstack([samples.gyro, samples.accel])
+    else:
+        values = np.hstack([samples.linear, samples.angular])
+    return list(zip(samples.stamp_ns.tolist(), values.tolist(), strict=True))
