@@ -1,0 +1,112 @@
+"""Pictures of a run, drawn without a display."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from stereo_sfm.eval.evaluate import Evaluation
+from stereo_sfm.eval.record import RunRecord
+from stereo_sfm.types import F64, TrackState, Trajectory
+
+AXES = ("x", "y", "z")
+SHOWN_STAGES = 6  # the longest ones
+
+
+def _save(figure: Figure, path: Path) -> None:
+    FigureCanvasAgg(figure)
+    figure.savefig(path, dpi=110)
+
+
+def _plane(positions: F64) -> tuple[int, int]:
+    """The two axes along which a path extends most, in the order they are drawn."""
+    extent = np.ptp(positions, axis=0)
+    a, b = sorted(np.argsort(-extent, kind="stable")[:2].tolist())
+    return a, b
+
+
+def plot_trajectory(path: Path, estimates: dict[str, Trajectory], reference: Trajectory | None) -> None:
+    """Paths in the plane of their greatest extent, metres, the start marked."""
+    figure = Figure(figsize=(7, 6), layout="constrained")
+    axes = figure.subplots()
+    shown = reference if reference is not None else next(iter(estimates.values()))
+    a, b = _plane(shown.positions)
+    if reference is not None:
+        axes.plot(*reference.positions[:, [a, b]].T, color="0.55", linewidth=2.5, label="ground truth")
+    for name, trajectory in estimates.items():
+        axes.plot(*trajectory.positions[:, [a, b]].T, linewidth=1.2, label=name)
+    axes.plot(*shown.positions[0, [a, b]], marker="o", color="black", linestyle="none", label="start")
+    axes.set(xlabel=f"{AXES[a]} [m]", ylabel=f"{AXES[b]} [m]", title="trajectory")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.grid(alpha=0.3)
+    axes.legend()
+    _save(figure, path)
+
+
+def plot_errors(path: Path, evaluations: dict[str, Evaluation]) -> None:
+    """Absolute position error and its parts along the axes over time."""
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    top, bottom = figure.subplots(2, sharex=True)
+    for name, result in evaluations.items():
+        seconds = (result.estimate.stamp_ns - result.estimate.stamp_ns[0]) / 1e9
+        error = 1e3 * (result.estimate.positions - result.reference.positions)
+        top.plot(seconds, np.linalg.norm(error, axis=1), label=f"{name}: rmse {1e3 * result.ape_m.rmse:.1f} mm")
+        for axis in range(3) if len(evaluations) == 1 else ():
+            bottom.plot(seconds, error[:, axis], label=AXES[axis], linewidth=1)
+        if len(evaluations) > 1:
+            bottom.plot(seconds, np.degrees(_angles(result)), label=name, linewidth=1)
+    top.set(ylabel="position error [mm]", title="error after alignment")
+    bottom.set(xlabel="time [s]", ylabel="error along axis [mm]" if len(evaluations) == 1 else "rotation error [deg]")
+    for axes in (top, bottom):
+        axes.grid(alpha=0.3)
+        axes.legend()
+    _save(figure, path)
+
+
+def _angles(result: Evaluation) -> F64:
+    from stereo_sfm.eval.metrics import absolute_errors
+
+    return absolute_errors(result.estimate.poses, result.reference.poses)[1]
+
+
+def plot_tracking(path: Path, record: RunRecord) -> None:
+    """Points used in each frame's pose, frames without a pose marked."""
+    figure = Figure(figsize=(8, 3), layout="constrained")
+    axes = figure.subplots()
+    seconds = _seconds(record)
+    axes.plot(seconds, [row.inliers for row in record.frames], linewidth=1, label="points in the pose")
+    lost = ~record.tracked()
+    if lost.any():
+        axes.plot(seconds[lost], np.zeros(int(lost.sum())), "x", color="tab:red", label="no pose")
+    again = np.array([row.state is TrackState.RESTARTED for row in record.frames], bool)
+    if again.any():
+        axes.plot(seconds[again], np.zeros(int(again.sum())), "^", color="tab:orange", label="restarted")
+    axes.set(xlabel="time [s]", ylabel="points", title="tracked points")
+    axes.set_ylim(bottom=0)
+    axes.grid(alpha=0.3)
+    axes.legend()
+    _save(figure, path)
+
+
+def plot_times(path: Path, record: RunRecord, stages: Sequence[str]) -> None:
+    """Milliseconds a frame for the longest stages."""
+    figure = Figure(figsize=(8, 3), layout="constrained")
+    axes = figure.subplots()
+    seconds = _seconds(record)[: len(record.times)]
+    for stage in stages[:SHOWN_STAGES]:
+        axes.plot(seconds, [ms.get(stage, np.nan) for ms in record.times], linewidth=1, label=stage)
+    everything = [value for ms in record.times for value in ms.values()]
+    axes.set(xlabel="time [s]", ylabel="ms", title="time per stage")
+    axes.set_ylim(0, 1.2 * float(np.percentile(everything, 99.5)) if everything else 1)
+    axes.grid(alpha=0.3)
+    axes.legend(loc="upper right")
+    _save(figure, path)
+
+
+def _seconds(record: RunRecord) -> F64:
+    stamps = np.array([row.stamp_ns for row in record.frames], np.int64)
+    return (stamps - stamps[0]) / 1e9

@@ -1,0 +1,217 @@
+"""What is kept of a run for its output folder: a few numbers a frame, keyframes, loops, times. A sink."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from stereo_sfm.export.trajectories import fill_missing
+from stereo_sfm.geometry import se3
+from stereo_sfm.pipeline.sinks import StageTimes
+from stereo_sfm.types import (
+    F64,
+    I64,
+    Bool,
+    Dropped,
+    Frame,
+    Keyframe,
+    LoopResult,
+    MapUpdate,
+    StereoImage,
+    TrackState,
+    Trajectory,
+)
+
+TRACKED = (TrackState.OK, TrackState.RECOVERED, TrackState.RESTARTED)
+
+
+@dataclass
+class FrameRow:
+    """One frame, without its observations."""
+
+    frame_id: int
+    stamp_ns: int
+    odom_T_cam: F64
+    state: TrackState
+    reason: str
+    inliers: int
+    reference_kf_id: int
+    kf_T_cam: F64
+
+
+@dataclass
+class KeyframeRow:
+    """One keyframe."""
+
+    frame_id: int
+    stamp_ns: int
+    odom_T_cam: F64
+    path_m: float  # odometry path up to here
+
+
+@dataclass(frozen=True)
+class LostInterval:
+    """Frames in a row without a pose of their own."""
+
+    first_frame_id: int
+    frames: int
+    seconds: float
+    reason: str
+
+
+@dataclass
+class RunRecord:
+    """Collects the messages of one run."""
+
+    frames: list[FrameRow] = field(default_factory=list[FrameRow])
+    keyframes: dict[int, KeyframeRow] = field(default_factory=dict[int, KeyframeRow])
+    times: list[dict[str, float]] = field(default_factory=list[dict[str, float]])
+    dropped: int = 0
+    map_T_kf: dict[int, F64] = field(default_factory=dict[int, F64])
+    map_points: set[int] = field(default_factory=set[int])
+    seen_points: set[int] = field(default_factory=set[int])
+    loops: list[LoopResult] = field(default_factory=list[LoopResult])
+    rejections: dict[str, int] = field(default_factory=dict[str, int])
+    _path_m: float = 0.0
+
+    def put(self, message: object) -> None:
+        """Take one message of the run; those of other kinds are not kept."""
+        if isinstance(message, StereoImage):
+            self.dropped += message.dropped_before
+        elif isinstance(message, Dropped):
+            self.dropped += message.count
+        elif isinstance(message, Frame):
+            self._put_frame(message)
+        elif isinstance(message, Keyframe):
+            self.keyframes[message.kf_id] = KeyframeRow(
+                message.frame_id, message.stamp_ns, message.odom_T_cam, self._path_m
+            )
+            self.seen_points.update(message.point_ids.tolist())
+        elif isinstance(message, MapUpdate):
+            self._put_update(message)
+        elif isinstance(message, LoopResult):
+            self._put_loop(message)
+        elif isinstance(message, StageTimes):
+            self.times.append(message.ms)
+
+    def _put_frame(self, frame: Frame) -> None:
+        if self.frames:
+            step = frame.odom_T_cam[:3, 3] - self.frames[-1].odom_T_cam[:3, 3]
+            self._path_m += float(np.linalg.norm(step))
+        self.frames.append(
+            FrameRow(
+                frame.frame_id,
+                frame.stamp_ns,
+                frame.odom_T_cam,
+                frame.state,
+                frame.reason,
+                int(frame.observations.inlier.sum()),
+                frame.reference_kf_id,
+                frame.kf_T_cam,
+            )
+        )
+
+    def _put_update(self, update: MapUpdate) -> None:
+        self.map_T_kf.update(zip(update.kf_ids.tolist(), update.map_T_kf, strict=True))
+        self.map_points.update(update.point_ids.tolist())
+        self.map_points.difference_update(update.culled_point_ids.tolist(), update.fused_point_ids[:, 0].tolist())
+
+    def _put_loop(self, loop: LoopResult) -> None:
+        if loop.candidate_kf_id >= 0 and not loop.reason:
+            self.loops.append(loop)
+        for _, _, reason in loop.rejected:
+            self.rejections[reason] = self.rejections.get(reason, 0) + 1
+
+    # -- what it comes to ------------------------------------------------------------------------------------------
+
+    def tracked(self) -> Bool:
+        """(frames,) whether the frame has a pose of its own."""
+        return np.array([row.state in TRACKED for row in self.frames], bool)
+
+    def odometry(self) -> Trajectory:
+        """odom_T_cam of the tracked frames."""
+        return self._trajectory([row.odom_T_cam for row in self.frames])
+
+    def mapped(self) -> Trajectory | None:
+        """map_T_cam of the tracked frames after the last map update; None without a map."""
+        if not self.map_T_kf:
+            return None
+        return self._trajectory([self._map_pose(row) for row in self.frames])
+
+    def _map_pose(self, row: FrameRow) -> F64:
+        reference = self.map_T_kf.get(row.reference_kf_id)
+        return row.odom_T_cam if reference is None else reference @ row.kf_T_cam
+
+    def _trajectory(self, poses: list[F64]) -> Trajectory:
+        keep = np.flatnonzero(self.tracked())
+        stamps = np.array([self.frames[i].stamp_ns for i in keep], np.int64)
+        return Trajectory(stamps, np.array([poses[i] for i in keep]).reshape(-1, 4, 4))
+
+    def keyframe_trajectory(self) -> Trajectory:
+        """Of the keyframes, in the map where there is one."""
+        rows = sorted(self.keyframes.items())
+        poses = [self.map_T_kf.get(kf_id, row.odom_T_cam) for kf_id, row in rows]
+        stamps = np.array([row.stamp_ns for _, row in rows], np.int64)
+        return Trajectory(stamps, np.array(poses).reshape(-1, 4, 4))
+
+    def pose_per_frame(self, poses: F64, step: int = 1) -> F64:
+        """One pose for each frame id of the run: what was lost lies between its neighbours.
+
+        Args:
+            poses: (tracked frames, 4, 4).
+            step: frame ids that follow each other.
+
+        Returns:
+            (M, 4, 4). Frames before the first pose take that one, those after the last take the last.
+        """
+        ids: I64 = np.array([row.frame_id for row in self.frames], np.int64)
+        known = ids[self.tracked()]
+        if not len(known):
+            return poses
+        filled = fill_missing(known, poses, step)
+        before, after = (known[0] - ids[0]) // step, (ids[-1] - known[-1]) // step
+        return np.concatenate([np.repeat(filled[:1], before, 0), filled, np.repeat(filled[-1:], after, 0)])
+
+    def lost_intervals(self) -> list[LostInterval]:
+        """Runs of frames without a pose after the first one that had one."""
+        intervals: list[LostInterval] = []
+        begin: int | None = None
+        last_good: int | None = None
+        for i, row in enumerate(self.frames):
+            if row.state in TRACKED:
+                if begin is not None:
+                    intervals.append(self._interval(begin, i))
+                begin, last_good = None, i
+            elif last_good is not None and begin is None:
+                begin = i
+        if begin is not None:
+            intervals.append(self._interval(begin, len(self.frames)))
+        return intervals
+
+    def _interval(self, begin: int, end: int) -> LostInterval:
+        upto = self.frames[min(end, len(self.frames) - 1)]
+        row = self.frames[begin]
+        return LostInterval(row.frame_id, end - begin, (upto.stamp_ns - row.stamp_ns) / 1e9, row.reason)
+
+    def closure_drifts(self) -> list[float]:
+        """At each accepted loop: how far odometry was off, as a share of the path between the two keyframes."""
+        drifts: list[float] = []
+        for loop in self.loops:
+            old, new = self.keyframes[loop.candidate_kf_id], self.keyframes[loop.kf_id]
+            odometry = se3.inverse(old.odom_T_cam) @ new.odom_T_cam
+            error = se3.inverse(loop.candidate_T_kf) @ odometry
+            drifts.append(float(np.linalg.norm(error[:3, 3])) / max(new.path_m - old.path_m, 1e-9))
+        return drifts
+
+    def fingerprint(self) -> str:
+        """Eight hex digits of the poses' bits: two runs with the same ones gave the same result."""
+        digest = hashlib.sha256()
+        for row in self.frames:
+            digest.update(row.stamp_ns.to_bytes(8, "little", signed=True))
+            digest.update(np.ascontiguousarray(row.odom_T_cam).tobytes())
+        mapped = self.mapped()
+        if mapped is not None:
+            digest.update(mapped.poses.tobytes())
+        return digest.hexdigest()[:8]

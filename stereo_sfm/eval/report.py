@@ -1,0 +1,109 @@
+"""report.md: a run for people, with pictures, verdicts, and what to do next."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from stereo_sfm.eval import plots
+from stereo_sfm.eval.evaluate import Evaluation, table
+from stereo_sfm.eval.record import RunRecord
+from stereo_sfm.eval.statistics import failure, summary, thousands
+from stereo_sfm.types import Trajectory
+
+ADVICE = {
+    "dark": "images were dark: more light, or a longer exposure",
+    "too_few_points": "too few points could be followed: look at the images (blur, bare walls, a covered lens)",
+    "no_consensus": "points disagreed about the motion: people or carts in view, or a wrong calibration (`info`)",
+}
+FEW_INLIERS = 60  # median points a frame below which the pose hangs on little
+BIG_SCALE_ERROR = 0.02  # Sim(3) scale off by more than this points at the baseline
+
+
+def write_report(
+    folder: Path,
+    source_name: str,
+    record: RunRecord,
+    stats: dict[str, Any],
+    estimates: dict[str, Trajectory],
+    reference: Trajectory | None,
+    evaluations: dict[str, Evaluation],
+) -> None:
+    """Write report.md and its pictures.
+
+    Args:
+        folder: the run's.
+        source_name: what was run on.
+        record, stats: of the run.
+        estimates: trajectories by name ("odometry", "map").
+        reference: ground truth in its own frame, or None.
+        evaluations: of the estimates, by the same names, where there is ground truth.
+    """
+    pictures = _draw(folder, record, stats, estimates, evaluations)
+    lines = [f"# {source_name}", "", *(f"* {line}" for line in summary(stats, evaluations)), "", "## Verdict", ""]
+    lines += [f"* {verdict}" for verdict in verdicts(stats, evaluations)]
+    for name, result in evaluations.items():
+        lines += ["", f"## {name.capitalize()} against ground truth", "", "| | |", "|---|---|"]
+        lines += [f"| {key} | {value} |" for key, value in table(result)]
+    if reference is None:
+        lines += ["", "The source has no ground truth: `stereo-sfm eval` compares the trajectory with one."]
+    lines += ["", "## Time per stage", "", "| stage | p50 | p95 | p99 | frames |", "|---|---|---|---|---|"]
+    for stage, ms in stats["ms"].items():
+        count = thousands(int(ms["frames"]))
+        lines.append(f"| {stage} | {ms['p50']:.2f} ms | {ms['p95']:.2f} ms | {ms['p99']:.2f} ms | {count} |")
+    lines += ["", *(f"![{name}]({name}.png)\n" for name in pictures)]
+    (folder / "report.md").write_text("\n".join(lines))
+
+
+def _draw(
+    folder: Path,
+    record: RunRecord,
+    stats: dict[str, Any],
+    estimates: dict[str, Trajectory],
+    evaluations: dict[str, Evaluation],
+) -> list[str]:
+    """Draw what there is to draw; the pictures' names."""
+    pictures: list[str] = []
+    aligned = {name: result.estimate for name, result in evaluations.items()}
+    shown = aligned or {name: t for name, t in estimates.items() if len(t)}
+    if shown:
+        truth = next(iter(evaluations.values())).reference if evaluations else None
+        plots.plot_trajectory(folder / "trajectory.png", shown, truth)
+        pictures.append("trajectory")
+    if evaluations:
+        plots.plot_errors(folder / "errors.png", evaluations)
+        pictures.append("errors")
+    if record.frames:
+        plots.plot_tracking(folder / "tracking.png", record)
+        plots.plot_times(folder / "times.png", record, list(stats["ms"]))
+        pictures += ["tracking", "times"]
+    return pictures
+
+
+def verdicts(stats: dict[str, Any], evaluations: dict[str, Evaluation]) -> list[str]:
+    """What is good, what is not, and what to do about it."""
+    out: list[str] = []
+    failed = failure(stats)
+    if failed:
+        out.append(f"**FAIL**: {failed}")
+    reasons = sorted({interval["reason"] for interval in stats["lost_intervals"]})
+    if reasons:
+        out += [f"**WARN**: lost ({reason}): {ADVICE.get(reason, 'see stats.json')}" for reason in reasons]
+    elif stats["tracked"]:
+        out.append("**PASS**: every frame after the first pose has one")
+    if stats["dropped"]:
+        share = 100 * stats["dropped"] / (stats["frames"] + stats["dropped"])
+        out.append(
+            f"**WARN**: {stats['dropped']} frames ({share:.1f} %) never arrived: check the cable, disk and files"
+        )
+    if stats["tracked"] and stats["inliers_median"] < FEW_INLIERS:
+        out.append(
+            f"**WARN**: only {stats['inliers_median']:.0f} points a frame: look at texture, exposure and calibration"
+        )
+    for name, result in evaluations.items():
+        if abs(result.sim3_scale - 1) > BIG_SCALE_ERROR:
+            out.append(
+                f"**WARN**: {name} is {100 * (1 / result.sim3_scale - 1):+.1f} % too long: "
+                "check the baseline and the calibration"
+            )
+    return out or ["nothing to say: no frames"]

@@ -1,0 +1,108 @@
+"""From the record of a run to the files of its folder."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.rig import Rig
+from stereo_sfm import config as configuration
+from stereo_sfm.config import Config
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.eval.evaluate import Evaluation, evaluate
+from stereo_sfm.eval.record import RunRecord
+from stereo_sfm.eval.report import write_report
+from stereo_sfm.eval.statistics import statistics
+from stereo_sfm.export.run_folder import write_json
+from stereo_sfm.export.trajectories import write_kitti, write_tum
+from stereo_sfm.geometry import se3
+from stereo_sfm.types import F64, Trajectory
+
+log = logging.getLogger("stereo_sfm")
+
+
+def in_frame(poses_cam: F64, frame: str, rig: Rig) -> F64:
+    """(N, 4, 4) world_T_cam0 -> the same, or for "body" world_T_body with the first body as the world."""
+    if frame == "cam0":
+        return poses_cam
+    body_T_cam = rig.body_T_left
+    return body_T_cam @ poses_cam @ se3.inverse(body_T_cam)
+
+
+def write_results(
+    folder: Path,
+    source_name: str,
+    rig: Rig,
+    config: Config,
+    record: RunRecord,
+    wall_s: float,
+    reference: Trajectory | None = None,
+    frame: str = "cam0",
+    step: int = 1,
+) -> tuple[dict[str, Any], dict[str, Evaluation]]:
+    """Write trajectories, configuration, calibration, numbers and report.
+
+    Args:
+        folder: exists.
+        source_name, rig, config: what was run.
+        record: what came out.
+        wall_s: seconds it took.
+        reference: ground truth (world_T_cam0), or None.
+        frame: "cam0" or "body", the frame whose poses the trajectory files hold. Errors are always those of cam0.
+        step: every `step`-th frame of the source was used.
+
+    Returns:
+        What stats.json holds, and the evaluations by trajectory name.
+    """
+    from calib import save_rig
+
+    estimates = {"odometry": record.odometry()}
+    mapped = record.mapped()
+    if mapped is not None:
+        estimates["map"] = mapped
+    for short, trajectory in zip(("odom", "map"), estimates.values(), strict=False):
+        _write_trajectory(folder, short, trajectory, record, rig, frame, step)
+    keyframes = record.keyframe_trajectory()
+    if len(keyframes):
+        _write_tum(folder / "keyframes.tum", keyframes, rig, frame)
+    (folder / "config.toml").write_text(configuration.dump(config))
+    save_rig(rig, folder / "rig.yaml")
+    evaluations = _evaluate(estimates, reference)
+    stats = {"source": source_name, "frame": frame, **statistics(record, wall_s, evaluations)}
+    write_json(folder / "stats.json", stats)
+    write_report(folder, source_name, record, stats, estimates, reference, evaluations)
+    return stats, evaluations
+
+
+def _evaluate(estimates: dict[str, Trajectory], reference: Trajectory | None) -> dict[str, Evaluation]:
+    """By name; a path too short to align is compared from its first pose."""
+    evaluations: dict[str, Evaluation] = {}
+    if reference is None:
+        return evaluations
+    for name, trajectory in estimates.items():
+        for mode in ("se3", "origin"):
+            try:
+                evaluations[name] = evaluate(trajectory, reference, mode)
+                break
+            except StereoSfmError as error:
+                if mode == "origin":
+                    log.warning("%s is not compared with ground truth: %s", name, error)
+    return evaluations
+
+
+def _write_trajectory(
+    folder: Path, name: str, trajectory: Trajectory, record: RunRecord, rig: Rig, frame: str, step: int
+) -> None:
+    if not len(trajectory):
+        return
+    _write_tum(folder / f"trajectory_{name}.tum", trajectory, rig, frame)
+    per_frame = record.pose_per_frame(trajectory.poses, step)
+    write_kitti(folder / f"trajectory_{name}.kitti", in_frame(per_frame, frame, rig))
+
+
+def _write_tum(path: Path, trajectory: Trajectory, rig: Rig, frame: str) -> None:
+    poses = np.ascontiguousarray(in_frame(trajectory.poses, frame, rig))
+    write_tum(path, Trajectory(trajectory.stamp_ns.copy(), poses), f"world_T_{frame}")

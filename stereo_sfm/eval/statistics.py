@@ -1,0 +1,127 @@
+"""The numbers of a run: stats.json, and the lines that a user pastes into a bug report."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from stereo_sfm.eval.evaluate import Evaluation, length
+from stereo_sfm.eval.record import RunRecord
+
+# Part of frames without a pose above which the run counts as failed.
+MAX_LOST_PERCENT = 20.0
+
+
+def percentiles(values: Sequence[float]) -> dict[str, float]:
+    """p50, p95 and p99."""
+    p50, p95, p99 = np.percentile(np.asarray(values, float), [50, 95, 99])
+    return {"p50": float(p50), "p95": float(p95), "p99": float(p99)}
+
+
+def stage_times(record: RunRecord) -> dict[str, dict[str, float]]:
+    """Milliseconds per stage over the frames that ran it, the longest first."""
+    values: dict[str, list[float]] = {}
+    for ms in record.times:
+        for stage, value in ms.items():
+            values.setdefault(stage, []).append(value)
+    order = sorted(values, key=lambda stage: -sum(values[stage]))
+    return {stage: {**percentiles(values[stage]), "frames": float(len(values[stage]))} for stage in order}
+
+
+def statistics(record: RunRecord, wall_s: float, evaluations: dict[str, Evaluation] | None = None) -> dict[str, Any]:
+    """Everything countable about a run, as plain values for JSON."""
+    tracked = int(record.tracked().sum())
+    frames = len(record.frames)
+    lost = record.lost_intervals()
+    drifts = record.closure_drifts()
+    states: dict[str, int] = {}
+    for row in record.frames:
+        states[row.state.name] = states.get(row.state.name, 0) + 1
+    inliers = [row.inliers for row in record.frames]
+    trajectory = record.mapped() or record.odometry()
+    return {
+        "frames": frames,
+        "tracked": tracked,
+        "dropped": record.dropped,
+        "states": states,
+        "lost_percent": 100.0 * (frames - tracked) / frames if frames else 0.0,
+        "lost_intervals": [dataclasses.asdict(interval) for interval in lost],
+        "keyframes": len(record.keyframes),
+        "points": len(record.map_points or record.seen_points),
+        "inliers_median": float(np.median(inliers)) if inliers else 0.0,
+        "path_m": trajectory.length if len(trajectory) > 1 else 0.0,
+        "duration_s": (record.frames[-1].stamp_ns - record.frames[0].stamp_ns) / 1e9 if frames else 0.0,
+        "loops_accepted": len(record.loops),
+        "loops_rejected": dict(sorted(record.rejections.items(), key=lambda item: (-item[1], item[0]))),
+        "closure_drift_percent_median": 100 * float(np.median(drifts)) if drifts else None,
+        "wall_s": wall_s,
+        "frames_per_s": frames / wall_s if wall_s > 0 else 0.0,
+        "ms": stage_times(record),
+        "fingerprint": record.fingerprint(),
+        "evaluation": {name: result.to_dict() for name, result in (evaluations or {}).items()},
+    }
+
+
+def failure(stats: dict[str, Any], max_lost_percent: float = MAX_LOST_PERCENT) -> str:
+    """Why the run counts as failed (exit code 4), or ''."""
+    if not stats["tracked"]:
+        return "tracking never initialised"
+    if stats["lost_percent"] > max_lost_percent:
+        return f"{stats['lost_percent']:.0f} % of the frames have no pose (limit {max_lost_percent:g} %)"
+    return ""
+
+
+def thousands(count: int) -> str:
+    """8930 -> '8 930'."""
+    return f"{count:,}".replace(",", " ")
+
+
+def summary(stats: dict[str, Any], evaluations: dict[str, Evaluation] | None = None) -> list[str]:
+    """The closing lines of a run."""
+    lost = stats["lost_intervals"]
+    total = stats["frames"] + stats["dropped"]
+    lines = [
+        f"tracked {thousands(stats['tracked'])}/{thousands(total)} frames ({stats['dropped']} dropped by capture), "
+        f"{_lost(lost)}, {stats['keyframes']} keyframes, {thousands(stats['points'])} points",
+    ]
+    if stats["loops_accepted"] or stats["loops_rejected"]:
+        lines.append(_loops(stats))
+    lines.append(_times(stats))
+    for name, result in (evaluations or {}).items():
+        lines.append(
+            f"{name} against ground truth: ATE {length(result.ape_m.rmse)} over {length(result.length_m)} "
+            f"({result.ate_percent:.3f} %, {result.mode.upper()} aligned), Sim(3) {length(result.ate_sim3_m)}, "
+            f"RPE {length(result.rpe_m.rmse)} {result.rpe_deg.rmse:.3f} deg a frame"
+        )
+    return lines
+
+
+def _lost(intervals: list[dict[str, Any]]) -> str:
+    if not intervals:
+        return "never lost"
+    worst = max(intervals, key=lambda interval: interval["seconds"])
+    noun = "interval" if len(intervals) == 1 else "intervals"
+    return f"{len(intervals)} lost {noun} (max {worst['seconds']:.1f} s, {worst['reason']})"
+
+
+def _loops(stats: dict[str, Any]) -> str:
+    reasons = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in stats["loops_rejected"].items())
+    rejected = sum(stats["loops_rejected"].values())
+    text = f"{stats['loops_accepted']} loops accepted / {rejected} candidates rejected" + (
+        f" ({reasons})" if reasons else ""
+    )
+    drift = stats["closure_drift_percent_median"]
+    return text if drift is None else f"{text} · drift at closures {drift:.2f} % (median)"
+
+
+def _times(stats: dict[str, Any]) -> str:
+    parts = [
+        f"{stage} p50 {ms['p50']:.1f} ms p95 {ms['p95']:.1f} ms"
+        for stage, ms in stats["ms"].items()
+        if stage in ("track", "map", "loop")
+    ]
+    rate = f"{stats['frames_per_s']:.1f} frames/s"
+    return " · ".join([*parts, rate, f"result {stats['fingerprint']}"])

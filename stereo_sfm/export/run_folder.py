@@ -1,0 +1,64 @@
+"""The output folder of a run: its name, its files, and the link to the latest one."""
+
+from __future__ import annotations
+
+import json
+import re
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+
+from stereo_sfm.errors import StereoSfmError
+
+TRAJECTORIES = ("trajectory_odom.tum", "trajectory_odom.kitti", "trajectory_map.tum", "trajectory_map.kitti")
+PICTURES = ("trajectory.png", "errors.png", "tracking.png", "times.png")
+FILES = (*TRAJECTORIES, "keyframes.tum", "config.toml", "rig.yaml", "stats.json", "report.md", *PICTURES)
+
+
+def default_folder(source_name: str, now: datetime) -> Path:
+    """runs/2026-08-21_101500_store12."""
+    slug = re.sub(r"[^A-Za-z0-9.-]+", "_", source_name).strip("_") or "run"
+    return Path("runs") / f"{now:%Y-%m-%d_%H%M%S}_{slug}"
+
+
+def prepare_folder(folder: Path, overwrite: bool) -> None:
+    """Make the folder of a new run.
+
+    With `overwrite` the files of an earlier run are removed, so that none of them is taken for this run's; whatever
+    else lies there stays.
+
+    Raises:
+        StereoSfmError: it exists and may not be overwritten, or cannot be made.
+    """
+    if folder.exists() and not overwrite:
+        raise StereoSfmError(f"{folder} exists: choose another -o, or say --overwrite")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in FILES:
+            (folder / name).unlink(missing_ok=True)
+    except OSError as error:
+        raise StereoSfmError(f"cannot make the output folder {folder}: {error.strerror}") from None
+
+
+def link_latest(folder: Path) -> None:
+    """Let `latest` beside the folder point to it, where the file system has links."""
+    link = folder.parent / "latest"
+    if link.exists() and not link.is_symlink():
+        return
+    try:
+        link.unlink(missing_ok=True)
+        link.symlink_to(folder.name, target_is_directory=True)
+    except OSError:
+        return
+
+
+def write_json(path: Path, data: object) -> None:
+    """Indented, floats as they are, numpy numbers as plain ones."""
+    path.write_text(json.dumps(data, indent=2, default=_plain) + "\n")
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"{type(value).__name__} has no JSON form")
