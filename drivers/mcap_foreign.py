@@ -92,17 +92,12 @@ class ForeignMcapSource:
             StereoSfmError: images that do not fit the calibration.
         """
         dropped = 0
-        previous = None
-        for frame_id, (left, other) in enumerate(self._pairs(start_ns, until_ns)):
+        imu: list[tuple[int, list[float]]] = []
+        for frame_id, (left, other) in enumerate(self._pairs(start_ns, until_ns, imu)):
             image = self._decode(frame_id, left, other, dropped) if other or not self._other() else None
             dropped = 0 if image is not None else dropped + 1
             if image is not None:
-                yield image
-                previous = image
-        if previous is None:
-            raise StereoSfmError(
-                f"{self.name}: no image could be used (left {self.topics.left}, other {self._other()})"
-            )
+                yield replace(image, imu=_take_imu(imu, left.stamp_ns)) if self.topics.imu else image
 
     def _other(self) -> str:
         return self.topics.right or self.topics.depth
