@@ -23,8 +23,8 @@ class TrackerConfig:
     min_ncc: float = 0.6  # of a window with the previous frame's
     min_anchor_ncc: float = 0.75  # of a window with the point's first appearance, affinely deformed
     max_angle_deg: float = 88.0  # from the optical axis; beyond it a fisheye image is not used
-    corner_quality: float = 0.03  # least corner response, as a share of the strong ones in the image
-    min_depth: float = 0.25  # metres, nearest stereo match searched
+    corner_quality: float = 0.005  # least corner response, as a share of the strong ones in the image
+    min_depth_baselines: float = 4.0  # nearest stereo match searched, in baselines
     sigma_px: float = 0.3  # noise of one coordinate of an observation
     depth_sigma_px: float = 0.6  # the same when the depth of a point is refined from frame to frame
     max_error: float = 3.0  # sigmas; a worse observation is no inlier

@@ -14,7 +14,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.five_point import five_point
 from stereo_sfm.geometry.procrustes import rotation_between
 from stereo_sfm.geometry.robust import Consensus, Degenerate, ransac
-from stereo_sfm.geometry.two_view import epipolar_residuals, ray_depths
+from stereo_sfm.geometry.two_view import epipolar_residuals, parallax_angles, ray_depths
 from stereo_sfm.types import F64, I64, Bool
 
 _W = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -195,11 +195,13 @@ def relative_pose(
     refine: bool = True,
     max_samples: int = 512,
     min_ratio: float = 0.25,
+    need_direction: bool = True,
 ) -> RelativePose:
     """Rotation and direction of translation between two views, with the pure-rotation case recognised.
 
     A rotation alone is fitted to the inliers; when it explains (almost) all of them, the essential matrix is arbitrary
     and the decomposition may pick a twisted rotation, so the fitted rotation is returned with `pure_rotation` set.
+    Without `need_direction`, points so far that the sign of their depth is open do not matter.
 
     Raises:
         Degenerate: as `essential_ransac`, `decompose` and `choose_in_front`.
@@ -210,7 +212,7 @@ def relative_pose(
     chosen = consensus.inliers
     b0, b1 = bearings0[chosen], bearings1[chosen]
     still = rotation_between(b0, b1)
-    off = np.linalg.norm(np.cross(b0 @ still.T, b1), axis=1)
+    off = parallax_angles(b0, b1, still)
     if np.mean(off < 2 * threshold) > 0.95:
         return RelativePose(
             still, np.array([0.0, 0.0, 1.0]), chosen, np.zeros_like(chosen), float(np.median(off)), True
@@ -219,7 +221,13 @@ def relative_pose(
     if method == "eight_point":
         essential = nearest_essential(eight_point(b0, b1))
     rotations, translations = decompose(essential)
-    best, front = choose_in_front(rotations, translations, b0, b1)
+    try:
+        best, front = choose_in_front(rotations, translations, b0, b1)
+    except Degenerate:
+        if need_direction:
+            raise
+        # The two rotations differ by half a turn about the translation: between frames the smaller one is the motion.
+        best, front = int(np.argmax(np.trace(rotations, axis1=1, axis2=2))), np.ones(len(b0), bool)
     rotation, direction = rotations[best], translations[best]
     if refine:
         for _ in range(3):  # refine, then let the better motion say who agrees with it
@@ -232,6 +240,6 @@ def relative_pose(
     else:
         in_front = np.zeros_like(chosen)
         in_front[np.flatnonzero(chosen)[front]] = True
-    p = bearings0[chosen] @ rotation.T
-    parallax = float(np.median(np.linalg.norm(np.cross(p, bearings1[chosen]), axis=1))) if chosen.any() else 0.0
+    angles = parallax_angles(bearings0[chosen], bearings1[chosen], rotation)
+    parallax = float(np.median(angles)) if chosen.any() else 0.0
     return RelativePose(rotation, direction, chosen, in_front, parallax, False)

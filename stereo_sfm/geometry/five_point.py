@@ -88,7 +88,7 @@ def five_point(bearings0: F64, bearings1: F64) -> F64:
     if not usable.any():
         return np.zeros((0, 3, 3))
     basis, equations = basis[usable], equations[usable]
-    reduced: F64 = np.linalg.solve(equations[:, :, :10], equations[:, :, 10:])
+    reduced = np.linalg.solve(equations[:, :, :10], equations[:, :, 10:]).astype(np.float64)
     finite = np.isfinite(reduced).all(axis=(1, 2)) & (np.abs(reduced).max(axis=(1, 2)) < 1e12)
     basis, reduced = basis[finite], reduced[finite]
     if len(basis) == 0:

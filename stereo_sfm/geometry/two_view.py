@@ -1,4 +1,4 @@
-"""Rays of two cameras: triangulation, cheirality, epipolar residuals. All on unit bearings (..., 3)."""
+"""Rays of two cameras: depths along them, parallax, epipolar residuals. All on unit bearings (..., 3)."""
 
 from __future__ import annotations
 
@@ -24,22 +24,10 @@ def ray_depths(bearings0: F64, bearings1: F64, rotation: F64, translation: F64) 
     return (ab * bt - at) / sin_sq, (bt - ab * at) / sin_sq
 
 
-def triangulate_rays(bearings0: F64, bearings1: F64, c1_T_c0: F64) -> tuple[F64, F64]:
-    """Midpoint triangulation.
-
-    Returns:
-        (N, 3) points in camera 0, NaN where the rays do not meet in front of both cameras, and (N,) parallax angle in
-        radians.
-    """
-    rotation, translation = c1_T_c0[:3, :3], c1_T_c0[:3, 3]
-    depth0, depth1 = ray_depths(bearings0, bearings1, rotation, translation)
-    c0_T_c1 = se3.inverse(c1_T_c0)
-    rays1 = bearings1 @ rotation
-    midpoint = 0.5 * (depth0[:, None] * bearings0 + depth1[:, None] * rays1 + c0_T_c1[:3, 3])
-    cross = np.linalg.norm(np.cross(bearings0, rays1), axis=1)
-    parallax = np.arctan2(cross, (bearings0 * rays1).sum(1))
-    midpoint[~((depth0 > 0) & (depth1 > 0) & (cross > 1e-9))] = np.nan
-    return midpoint, parallax
+def parallax_angles(bearings0: F64, bearings1: F64, rotation: F64) -> F64:
+    """(N,) radians between R b0 and b1: what a translation adds to a rotation."""
+    rotated = bearings0 @ rotation.T
+    return np.arctan2(np.linalg.norm(np.cross(rotated, bearings1), axis=1), (rotated * bearings1).sum(1))
 
 
 def epipolar_residuals(essential: F64, bearings0: F64, bearings1: F64) -> F64:

@@ -10,7 +10,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.essential import RelativePose, decompose, eight_point, refine_motion, relative_pose
 from stereo_sfm.geometry.five_point import five_point
 from stereo_sfm.geometry.robust import Degenerate, needed_samples, ransac, sample_indices
-from stereo_sfm.geometry.two_view import epipolar_residuals, essential_from_motion, triangulate_rays
+from stereo_sfm.geometry.two_view import epipolar_residuals, essential_from_motion, parallax_angles, ray_depths
 from stereo_sfm.types import F64
 
 PIXEL = 1.0 / 400.0  # radians per pixel of a typical camera
@@ -198,15 +198,16 @@ def test_decompose_refuses_rank_one_and_nan() -> None:
 
 
 @pytest.mark.parametrize("wide", [False, True])
-def test_triangulation_is_exact_and_rejects_points_behind(wide: bool) -> None:
+def test_ray_depths_are_the_distances_and_negative_behind(wide: bool) -> None:
     rng = np.random.default_rng(2)
     points = unit(rng.normal(size=(50, 3))) * 5 if wide else rng.uniform([-2, -2, 3], [2, 2, 8], (50, 3))
-    c1_T_c0 = se3.exp(np.array([-0.1, 0.02, 0.01, 0.05, -0.02, 0.01]))
-    b0, b1 = unit(points), unit(se3.transform(c1_T_c0, points))
-    estimate, parallax = triangulate_rays(b0, b1, c1_T_c0)
-    np.testing.assert_allclose(estimate, points, atol=1e-7)
-    assert (parallax > 0).all()
-    assert np.isnan(triangulate_rays(b0, -b1, c1_T_c0)[0]).all()
+    motion = se3.exp(np.array([-0.1, 0.02, 0.01, 0.05, -0.02, 0.01]))
+    moved = se3.transform(motion, points)
+    depth0, depth1 = ray_depths(unit(points), unit(moved), motion[:3, :3], motion[:3, 3])
+    np.testing.assert_allclose(depth0, np.linalg.norm(points, axis=1), atol=1e-7)
+    np.testing.assert_allclose(depth1, np.linalg.norm(moved, axis=1), atol=1e-7)
+    assert (ray_depths(unit(points), -unit(moved), motion[:3, :3], motion[:3, 3])[1] < 0).all()
+    assert (parallax_angles(unit(points), unit(moved), motion[:3, :3]) > 0).all()
 
 
 def test_sampling_is_distinct_and_repeatable() -> None:

@@ -1,0 +1,115 @@
+"""Keypoints and descriptors: ORB, SIFT and AKAZE behind one function, with the thesis's keypoint mask."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+
+from stereo_sfm.config import FeaturesConfig
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.types import F32, F64, U8, Bool, Message
+
+BRIEF_PATCH_PX = 31.0  # size that OpenCV's ORB gives its keypoints at full resolution
+
+
+@dataclass(frozen=True, eq=False)
+class Features(Message):
+    """Keypoints of one image, in the detector's order."""
+
+    uv: F64  # (N, 2) px
+    descriptors: U8 | F32  # (N, D): bits in bytes (ORB, AKAZE) or floats (SIFT)
+    angles: F32  # (N,) radians
+
+    def __len__(self) -> int:
+        return len(self.uv)
+
+    def rows(self, rows: Bool) -> Features:
+        """Only some rows."""
+        return Features(self.uv[rows], self.descriptors[rows], self.angles[rows])
+
+
+@dataclass(frozen=True)
+class FeatureKind:
+    """One row of the table: how to make the detector, and how its descriptors are compared."""
+
+    create: Callable[[int], Any]  # most keypoints (0: OpenCV's default) -> cv2.Feature2D
+    norm: int  # cv2.NORM_*
+    width: int  # descriptor length
+
+    def empty(self) -> U8 | F32:
+        """(0, width) descriptors."""
+        binary = self.norm == cv2.NORM_HAMMING
+        return np.zeros((0, self.width), np.uint8) if binary else np.zeros((0, self.width), np.float32)
+
+
+def _orb(count: int) -> Any:
+    return cv2.ORB.create(count or 500)
+
+
+def _sift(count: int) -> Any:
+    return cv2.SIFT.create(count)
+
+
+def _akaze(count: int) -> Any:
+    return cv2.AKAZE.create(max_points=count or -1)
+
+
+# The thesis compares all of them by l2; binary descriptors are compared by Hamming distance here, as they are meant to.
+TABLE: dict[str, FeatureKind] = {
+    "orb": FeatureKind(_orb, cv2.NORM_HAMMING, 32),
+    "sift": FeatureKind(_sift, cv2.NORM_L2, 128),
+    "akaze": FeatureKind(_akaze, cv2.NORM_HAMMING, 61),
+}
+
+
+def feature_kind(name: str) -> FeatureKind:
+    """Row of the table.
+
+    Raises:
+        StereoSfmError: unknown name.
+    """
+    if name not in TABLE:
+        raise StereoSfmError(f"unknown features '{name}': choose one of {', '.join(TABLE)}")
+    return TABLE[name]
+
+
+class Extractor:
+    """Detects and describes; one object per tracker."""
+
+    def __init__(self, config: FeaturesConfig) -> None:
+        self._kind = feature_kind(config.kind)
+        self._detector = self._kind.create(config.count)
+
+    def extract(self, image: U8, mask: U8 | None = None) -> Features:
+        """Image (H, W), mask (H, W) non-zero where to look -> features, one per position and orientation."""
+        keypoints, descriptors = self._detector.detectAndCompute(image, mask)
+        if not keypoints:
+            return Features(np.zeros((0, 2)), self._kind.empty(), np.zeros(0, np.float32))
+        uv = np.array([k.pt for k in keypoints], np.float64)
+        angles = np.radians(np.array([k.angle for k in keypoints], np.float32)).astype(np.float32)
+        return Features(uv, descriptors, angles)
+
+
+def circle_mask(shape: tuple[int, int], centres: F64, radius_px: float) -> U8:
+    """(H, W) mask that is 255 within `radius_px` of any of the (N, 2) centres (thesis, section IV-A2)."""
+    mask = np.zeros(shape, np.uint8)
+    for u, v in np.rint(centres).astype(int):
+        cv2.circle(mask, (int(u), int(v)), round(radius_px), 255, -1)
+    return mask
+
+
+def describe_binary(image: U8, uv: F64, angles: F32) -> U8:
+    """(N, 32) oriented BRIEF at given points, zero rows where the patch leaves the image (for place recognition)."""
+    out = np.zeros((len(uv), 32), np.uint8)
+    keypoints = [
+        cv2.KeyPoint(float(u), float(v), BRIEF_PATCH_PX, float(np.degrees(a)), 1.0, 0, i)
+        for i, ((u, v), a) in enumerate(zip(uv, angles, strict=True))
+    ]
+    kept, descriptors = cv2.ORB.create(max(len(uv), 1)).compute(image, keypoints)
+    if len(kept):
+        out[[k.class_id for k in kept]] = descriptors
+    return out

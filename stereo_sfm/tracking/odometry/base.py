@@ -1,0 +1,73 @@
+"""What a motion estimator gets and gives. One estimator per file; the table of names is in `table.py`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from stereo_sfm.config import OdometryConfig
+from stereo_sfm.types import F64, U8, Bool, Message
+
+
+@dataclass(frozen=True, eq=False)
+class FramePair(Message):
+    """Matches between a reference view ("last") and the current one ("now"), left eye, one row each."""
+
+    bearings_last: F64  # (N, 3) unit
+    bearings_now: F64  # (N, 3) unit
+    points_last: F64  # (N, 3) metres in the last camera, NaN where the depth is unknown
+    points_now: F64  # (N, 3) metres in the current camera, NaN where the depth is unknown
+    sigmas_last: F64  # (N,) metres, standard deviation of the stereo depth
+    sigmas_now: F64  # (N,)
+    pixel_rad: float  # angle of one pixel at the image centre
+    image_last: U8  # (H, W)
+    image_now: U8  # (H, W)
+    frame_id_last: int
+    frame_id_now: int
+
+    @property
+    def both(self) -> Bool:
+        """(N,) rows with a 3D point on both sides."""
+        return np.isfinite(self.points_last[:, 2]) & np.isfinite(self.points_now[:, 2])
+
+    @property
+    def sigmas(self) -> F64:
+        """(N,) metres: joint standard deviation of the difference of both 3D points."""
+        return np.hypot(self.sigmas_last, self.sigmas_now)
+
+
+@dataclass(frozen=True, eq=False)
+class Motion(Message):
+    """p_now = rotation @ p_last + translation."""
+
+    rotation: F64  # (3, 3)
+    translation: F64  # (3,) metres; a unit direction where `metric` is False
+    inliers: Bool  # (N,) rows of the pair that agree
+    metric: bool = True
+    stats: dict[str, float] = field(default_factory=dict[str, float])
+
+
+class Estimator(Protocol):
+    """One file of this folder each."""
+
+    def estimate(self, pair: FramePair, rng: np.random.Generator) -> Motion:
+        """Motion between the two frames.
+
+        Raises:
+            Degenerate: the data do not determine it; the reason is a short stable word.
+        """
+        ...
+
+
+def thresholds(config: OdometryConfig, sigmas: F64) -> F64:
+    """(N,) metres: the fixed inlier bound of equation 11 widened by the uncertainty of each stereo point."""
+    return config.inlier_m + config.inlier_sigmas * sigmas
+
+
+def weights(config: OdometryConfig, sigmas: F64) -> F64 | None:
+    """(N,) inverse variances with the fixed bound as floor, or None for the papers' plain means."""
+    if not config.weighted:
+        return None
+    return 1.0 / (sigmas**2 + (0.1 * config.inlier_m) ** 2)

@@ -1,0 +1,32 @@
+"""The one table of motion estimators: name -> (module, class). Modules are imported when chosen."""
+
+from __future__ import annotations
+
+import importlib
+
+from stereo_sfm.config import OdometryConfig
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.tracking.odometry.base import Estimator
+
+_PACKAGE = "stereo_sfm.tracking.odometry"
+
+TABLE: dict[str, tuple[str, str]] = {
+    "em-r": ("em_r", "EmR"),  # retail paper: essential matrix, then 1-point translation
+    "vp-r": ("vp_r", "VpR"),  # retail paper: vanishing points, then 1-point translation
+    "r-um": ("r_um", "RUm"),  # retail paper: 3-point RANSAC and Umeyama
+    "um": ("um", "Um"),  # retail paper: Umeyama
+    "eight-point": ("eight_point", "EightPoint"),  # sparse localization paper
+    "pnp": ("pnp", "Pnp"),  # C++ course system
+}
+
+
+def make_estimator(config: OdometryConfig) -> Estimator:
+    """The estimator that `config.method` names.
+
+    Raises:
+        StereoSfmError: unknown name.
+    """
+    if config.method not in TABLE:
+        raise StereoSfmError(f"unknown odometry '{config.method}': choose one of flow, {', '.join(TABLE)}")
+    module, name = TABLE[config.method]
+    return getattr(importlib.import_module(f"{_PACKAGE}.{module}"), name)(config)
