@@ -1,0 +1,52 @@
+"""Tables of growing columns: one array per column, appended in amortised constant time."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+Spec = dict[str, tuple[DTypeLike, tuple[int, ...], Any]]
+
+
+class Columns:
+    """Rows in arrays. A subclass names its columns in SPEC, (dtype, shape of one value, value of a new row).
+
+    Reading `table.name` gives a view (rows, ...) of the column that may be written to; it is valid until rows are
+    appended.
+    """
+
+    SPEC: ClassVar[Spec] = {}
+
+    def __init__(self, capacity: int = 64) -> None:
+        self._count = 0
+        self._data = {name: np.empty((capacity, *shape), dtype) for name, (dtype, shape, _) in self.SPEC.items()}
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getattr__(self, name: str) -> Any:
+        data = self.__dict__.get("_data", {})
+        if name not in data:
+            raise AttributeError(name)
+        return data[name][: self._count]
+
+    def append(self, count: int, **values: Any) -> slice:
+        """New rows at the end; columns that are not given take their default. Returns the rows."""
+        first, last = self._count, self._count + count
+        for name, data in self._data.items():
+            if last > len(data):
+                grown = np.empty((max(last, 2 * len(data)), *data.shape[1:]), data.dtype)
+                grown[:first] = data[:first]
+                self._data[name] = data = grown
+            data[first:last] = values.pop(name) if name in values else self.SPEC[name][2]
+        if values:
+            raise TypeError(f"no such columns: {', '.join(values)}")
+        self._count = last
+        return slice(first, last)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the arrays, spare rows included."""
+        return sum(data.nbytes for data in self._data.values())

@@ -1,0 +1,397 @@
+"""The map: columns for keyframes and points and one observation table. Owned by the mapper alone.
+
+A row is forever: a culled keyframe or point keeps its row and loses `alive`, ids are never used again. A fused point
+keeps its id as another name of the point that replaced it. The observations of a keyframe are one run of rows; those of
+a point a linked list through the table, so that inserting a keyframe costs what it sees and not what the map holds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.mapping import map_kernels
+from stereo_sfm.mapping.columns import Columns, Spec
+from stereo_sfm.mapping.covisibility import Covisibility
+from stereo_sfm.types import F32, F64, I32, I64, U8, Bool, Keyframe
+
+
+class KeyframeTable(Columns):
+    """One row a keyframe."""
+
+    kf_id: I64
+    frame_id: I64
+    stamp_ns: I64
+    submap_id: I64
+    map_T_kf: F64  # (K, 4, 4)
+    odom_T_kf: F64  # (K, 4, 4) as the tracker made it
+    covariance: F64  # (K, 6, 6) of the pose relative to the previous keyframe
+    previous: I64  # row of the keyframe before it in the same submap, -1: none
+    obs_first: I64  # first row of its observations
+    obs_count: I64  # observations made, of which some may have been removed since
+    alive: Bool
+
+    SPEC: ClassVar[Spec] = {
+        "kf_id": (np.int64, (), -1),
+        "frame_id": (np.int64, (), -1),
+        "stamp_ns": (np.int64, (), 0),
+        "submap_id": (np.int64, (), 0),
+        "map_T_kf": (np.float64, (4, 4), np.eye(4)),
+        "odom_T_kf": (np.float64, (4, 4), np.eye(4)),
+        "covariance": (np.float64, (6, 6), np.eye(6)),
+        "previous": (np.int64, (), -1),
+        "obs_first": (np.int64, (), 0),
+        "obs_count": (np.int64, (), 0),
+        "alive": (np.bool_, (), True),
+    }
+
+
+class PointTable(Columns):
+    """One row a physical point."""
+
+    pt_id: I64
+    xyz: F64  # (P, 3) map frame, NaN until it is triangulated
+    anchor: I32  # keyframe row that carries the point when keyframes are corrected
+    head: I32  # newest observation, -1: none
+    obs_count: I32
+    seen: I32  # keyframes that saw it
+    expected: I32  # keyframes in whose view it lay
+    last_seen: I32  # newest keyframe row that saw it
+    descriptor_obs: I32  # observation whose descriptor stands for the point, -1: none has one
+    fused_into: I32  # row of the point that replaced it, -1: none
+    alive: Bool
+
+    SPEC: ClassVar[Spec] = {
+        "pt_id": (np.int64, (), -1),
+        "xyz": (np.float64, (3,), np.nan),
+        "anchor": (np.int32, (), -1),
+        "head": (np.int32, (), -1),
+        "obs_count": (np.int32, (), 0),
+        "seen": (np.int32, (), 0),
+        "expected": (np.int32, (), 0),
+        "last_seen": (np.int32, (), -1),
+        "descriptor_obs": (np.int32, (), -1),
+        "fused_into": (np.int32, (), -1),
+        "alive": (np.bool_, (), True),
+    }
+
+
+class ObservationTable(Columns):
+    """One row an observation: which keyframe saw which point where."""
+
+    kf: I32  # keyframe row
+    pt: I32  # point row, -1 when the observation was removed
+    uv_left: F32  # (M, 2) px
+    uv_right: F32  # (M, 2) px, NaN where unseen
+    descriptor: U8  # (M, 32), zero where there is none
+    angle: F32  # (M,) radians
+    following: I32  # next older observation of the same point, -1: last
+
+    SPEC: ClassVar[Spec] = {
+        "kf": (np.int32, (), -1),
+        "pt": (np.int32, (), -1),
+        "uv_left": (np.float32, (2,), np.nan),
+        "uv_right": (np.float32, (2,), np.nan),
+        "descriptor": (np.uint8, (32,), 0),
+        "angle": (np.float32, (), 0),
+        "following": (np.int32, (), -1),
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class MapDelta:
+    """What changed since the last delta, as copies."""
+
+    kf_rows: I64  # (K,) new or moved keyframes, ascending
+    map_T_kf: F64  # (K, 4, 4)
+    pt_rows: I64  # (P,) new or moved living points, ascending
+    xyz: F64  # (P, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class MapSnapshot:
+    """The living part of a map as copies: keyframes and points in order of their ids, observations by keyframe."""
+
+    kf_ids: I64  # (K,)
+    frame_ids: I64  # (K,)
+    stamp_ns: I64  # (K,)
+    submap_ids: I64  # (K,)
+    map_T_kf: F64  # (K, 4, 4)
+    odom_T_kf: F64  # (K, 4, 4)
+    pt_ids: I64  # (P,)
+    points: F64  # (P, 3)
+    anchors: I64  # (P,) index into kf_ids
+    seen: I64  # (P,)
+    expected: I64  # (P,)
+    obs_kf: I64  # (M,) index into kf_ids
+    obs_pt: I64  # (M,) index into pt_ids
+    uv_left: F64  # (M, 2) px
+    uv_right: F64  # (M, 2) px
+    descriptors: U8  # (M, 32)
+    angles: F32  # (M,)
+
+
+class Map:
+    """Keyframes, points, observations, covisibility."""
+
+    def __init__(self) -> None:
+        self.keyframes = KeyframeTable()
+        self.points = PointTable(1024)
+        self.observations = ObservationTable(4096)
+        self.covisibility = Covisibility()
+        self._kf_rows: dict[int, int] = {}
+        self._pt_rows = np.full(1024, -1, np.int32)  # by id
+        self._changed_kf: set[int] = set()
+        self._changed_pt: list[I64] = []
+
+    # -- looking up --------------------------------------------------------------------------------------------------
+
+    def kf_row(self, kf_id: int) -> int:
+        """Row of a keyframe.
+
+        Raises:
+            StereoSfmError: the map has no such keyframe.
+        """
+        row = self._kf_rows.get(kf_id)
+        if row is None:
+            raise StereoSfmError(f"the map has no keyframe {kf_id}")
+        return row
+
+    def point_rows(self, pt_ids: I64) -> I64:
+        """(N,) row of each point id, through fusions; -1 where the id is unknown. Culled points keep their rows."""
+        known = (pt_ids >= 0) & (pt_ids < len(self._pt_rows))
+        rows = np.where(known, self._pt_rows[np.where(known, pt_ids, 0)], -1).astype(np.int64)
+        map_kernels.follow(rows, self.points.fused_into)
+        return rows
+
+    def living_points(self) -> I64:
+        """Rows of points that have a position and are not culled."""
+        return np.flatnonzero(self.points.alive & np.isfinite(self.points.xyz[:, 0]))
+
+    def living_keyframes(self) -> I64:
+        """Rows of keyframes that are not culled."""
+        return np.flatnonzero(self.keyframes.alive)
+
+    def observations_of_keyframe(self, row: int) -> I64:
+        """Rows of the observations a keyframe has."""
+        first = int(self.keyframes.obs_first[row])
+        rows = np.arange(first, first + int(self.keyframes.obs_count[row]))
+        return rows[self.observations.pt[rows] >= 0]
+
+    def observations_of_points(self, rows: I64) -> I64:
+        """Rows of all observations of some points, ascending."""
+        rows = np.ascontiguousarray(rows, np.int64)
+        head, following = self.points.head, self.observations.following
+        out = np.empty(map_kernels.count_listed(rows, head, following), np.int64)
+        map_kernels.list_observations(rows, head, following, out)
+        return np.sort(out)
+
+    def descriptors_of(self, rows: I64) -> U8:
+        """(N, 32) descriptor of each point, zero where it has none."""
+        obs = self.points.descriptor_obs[rows]
+        return np.where((obs >= 0)[:, None], self.observations.descriptor[np.maximum(obs, 0)], 0).astype(np.uint8)
+
+    # -- growing -----------------------------------------------------------------------------------------------------
+
+    def add_keyframe(self, keyframe: Keyframe, map_T_kf: F64) -> int:
+        """A keyframe without observations yet. Returns its row.
+
+        Raises:
+            StereoSfmError: its id was used before.
+        """
+        if keyframe.kf_id in self._kf_rows:
+            raise StereoSfmError(f"keyframe {keyframe.kf_id} is in the map already: ids are never used twice")
+        row = len(self.keyframes)
+        same = row > 0 and int(self.keyframes.submap_id[row - 1]) == keyframe.submap_id
+        self.keyframes.append(
+            1,
+            kf_id=keyframe.kf_id,
+            frame_id=keyframe.frame_id,
+            stamp_ns=keyframe.stamp_ns,
+            submap_id=keyframe.submap_id,
+            map_T_kf=map_T_kf,
+            odom_T_kf=keyframe.odom_T_cam,
+            covariance=keyframe.covariance,
+            previous=row - 1 if same else -1,
+            obs_first=len(self.observations),
+        )
+        self._kf_rows[keyframe.kf_id] = row
+        self.covisibility.grow(row + 1)
+        self._changed_kf.add(row)
+        return row
+
+    def add_points(self, pt_ids: I64, xyz: F64, anchor: int) -> I64:
+        """New points; ids that are known already are refused. Returns their rows."""
+        if len(pt_ids) and (self.point_rows(pt_ids) >= 0).any():
+            raise StereoSfmError("a point id is in the map already: ids are never used twice")
+        rows = np.arange(len(self.points), len(self.points) + len(pt_ids))
+        self.points.append(len(pt_ids), pt_id=pt_ids, xyz=xyz, anchor=anchor, last_seen=anchor)
+        highest = int(pt_ids.max(initial=-1))
+        if highest >= len(self._pt_rows):
+            grown = np.full(max(highest + 1, 2 * len(self._pt_rows)), -1, np.int32)
+            grown[: len(self._pt_rows)] = self._pt_rows
+            self._pt_rows = grown
+        self._pt_rows[pt_ids] = rows
+        self._changed_pt.append(rows)
+        return rows
+
+    def observe(self, kf: int, pt_rows: I64, uv_left: F64, uv_right: F64, descriptors: U8, angles: F32) -> I64:
+        """Observations of the newest keyframe, one a point. Returns their rows."""
+        if kf != len(self.keyframes) - 1:
+            raise StereoSfmError("observations are added to the newest keyframe only")
+        earlier = self.observations_of_points(pt_rows)
+        self.covisibility.add(self.observations.kf[earlier].astype(np.int64), np.full(len(earlier), kf))
+        rows = self.observations.append(
+            len(pt_rows), kf=kf, pt=pt_rows, uv_left=uv_left, uv_right=uv_right, descriptor=descriptors, angle=angles
+        )
+        map_kernels.link(rows.start, self.points.head, self.observations.following, self.observations.pt)
+        self.keyframes.obs_count[kf] += len(pt_rows)
+        self.points.obs_count[pt_rows] += 1
+        self.points.seen[pt_rows] += 1
+        self.points.last_seen[pt_rows] = kf
+        made = np.arange(rows.start, rows.stop)
+        described = descriptors.any(axis=1)
+        self.points.descriptor_obs[pt_rows[described]] = made[described]
+        return made
+
+    # -- changing ----------------------------------------------------------------------------------------------------
+
+    def move_keyframes(self, rows: I64, map_T_kf: F64) -> None:
+        """New poses; points stay (see `carry_points`)."""
+        self.keyframes.map_T_kf[rows] = map_T_kf
+        self._changed_kf.update(rows.tolist())
+
+    def move_points(self, rows: I64, xyz: F64) -> None:
+        """New positions in the map frame."""
+        self.points.xyz[rows] = xyz
+        self._changed_pt.append(np.asarray(rows, np.int64))
+
+    def carry_points(self, before: F64, after: F64) -> None:
+        """Points follow their anchors after a correction.
+
+        Args:
+            before, after: (K, 4, 4) map_T_kf of every keyframe row before and after it.
+        """
+        rows = self.living_points()
+        anchor = self.points.anchor[rows]
+        local = np.einsum("nji,nj->ni", before[anchor, :3, :3], self.points.xyz[rows] - before[anchor, :3, 3])
+        self.move_points(rows, np.einsum("nij,nj->ni", after[anchor, :3, :3], local) + after[anchor, :3, 3])
+
+    def remove_observations(self, rows: I64) -> None:
+        """Forget observations; their points stay, even without any."""
+        rows = np.unique(np.asarray(rows, np.int64))
+        table = self.observations
+        rows = rows[table.pt[rows] >= 0]
+        if not len(rows):
+            return
+        points = table.pt[rows].astype(np.int64)
+        pairs = np.empty((2, int(self.points.obs_count[points].sum())), np.int64)
+        count = map_kernels.unlink(rows, self.points.head, table.following, table.pt, table.kf, pairs)
+        self.covisibility.add(pairs[0, :count], pairs[1, :count], -1)
+        np.subtract.at(self.points.obs_count, points, 1)
+        self._renew_descriptors(np.unique(points))
+
+    def _renew_descriptors(self, points: I64) -> None:
+        """Points whose standing observation is gone take the newest that has a descriptor."""
+        obs = self.points.descriptor_obs[points]
+        lost = points[(obs >= 0) & (self.observations.pt[np.maximum(obs, 0)] != points)]
+        for point in lost.tolist():
+            rows = self.observations_of_points(np.array([point]))
+            described = rows[self.observations.descriptor[rows].any(axis=1)]
+            self.points.descriptor_obs[point] = described[-1] if len(described) else -1
+
+    def cull_points(self, rows: I64) -> None:
+        """Points that go, with all their observations."""
+        rows = rows[self.points.alive[rows]]
+        self.remove_observations(self.observations_of_points(rows))
+        self.points.alive[rows] = False
+
+    def cull_keyframe(self, row: int) -> None:
+        """A keyframe that goes; points anchored to it pass to the oldest keyframe that still sees them."""
+        rows = self.observations_of_keyframe(row)
+        points = self.observations.pt[rows].astype(np.int64)
+        self.remove_observations(rows)
+        self.keyframes.alive[row] = False
+        self.covisibility.drop(row)
+        self.keyframes.previous[self.keyframes.previous == row] = self.keyframes.previous[row]
+        for point in points[self.points.anchor[points] == row].tolist():
+            seen = self.observations.kf[self.observations_of_points(np.array([point]))]
+            if len(seen):
+                self.points.anchor[point] = seen.min()
+
+    def fuse(self, old: int, new: int) -> None:
+        """The points of two rows are one: `new` takes over the observations and the names of `old`.
+
+        Where one keyframe saw both, the observation of `new` stays.
+        """
+        mine = set(self.observations.kf[self.observations_of_points(np.array([new]))].tolist())
+        moving = self.observations_of_points(np.array([old]))
+        double = np.isin(self.observations.kf[moving], sorted(mine))
+        self.remove_observations(moving[double])
+        moving = moving[~double]
+        kept = self.observations.kf[self.observations_of_points(np.array([new]))].astype(np.int64)
+        for obs in moving.tolist():
+            kf = int(self.observations.kf[obs])
+            self.covisibility.add(kept, np.full(len(kept), kf))
+            self.observations.pt[obs] = new
+            self.observations.following[obs] = self.points.head[new]
+            self.points.head[new] = obs
+        points = self.points
+        points.obs_count[new] += len(moving)
+        points.seen[new] += points.seen[old]
+        points.expected[new] += points.expected[old]
+        points.last_seen[new] = max(points.last_seen[new], points.last_seen[old])
+        if points.descriptor_obs[new] < 0:
+            points.descriptor_obs[new] = points.descriptor_obs[old]
+        points.head[old], points.obs_count[old], points.alive[old], points.fused_into[old] = -1, 0, False, new
+        self._changed_pt.append(np.array([new]))
+
+    # -- copies ------------------------------------------------------------------------------------------------------
+
+    def take_delta(self) -> MapDelta:
+        """What changed since the last call."""
+        kf = np.array(sorted(self._changed_kf), np.int64)
+        kf = kf[self.keyframes.alive[kf]]
+        pt = np.unique(np.concatenate([np.zeros(0, np.int64), *self._changed_pt]))
+        pt = pt[self.points.alive[pt] & np.isfinite(self.points.xyz[pt, 0])]
+        self._changed_kf.clear()
+        self._changed_pt.clear()
+        return MapDelta(kf, self.keyframes.map_T_kf[kf], pt, self.points.xyz[pt])
+
+    def snapshot(self) -> MapSnapshot:
+        """Everything that lives."""
+        kfs, pts, table = self.living_keyframes(), self.living_points(), self.observations
+        kf_index = np.full(len(self.keyframes), -1, np.int64)
+        kf_index[kfs] = np.arange(len(kfs))
+        pt_index = np.full(len(self.points) + 1, -1, np.int64)
+        pt_index[pts] = np.arange(len(pts))
+        obs = np.flatnonzero((table.pt >= 0) & (kf_index[table.kf] >= 0) & (pt_index[table.pt] >= 0))
+        k, p = self.keyframes, self.points
+        return MapSnapshot(
+            kf_ids=k.kf_id[kfs],
+            frame_ids=k.frame_id[kfs],
+            stamp_ns=k.stamp_ns[kfs],
+            submap_ids=k.submap_id[kfs],
+            map_T_kf=k.map_T_kf[kfs],
+            odom_T_kf=k.odom_T_kf[kfs],
+            pt_ids=p.pt_id[pts],
+            points=p.xyz[pts],
+            anchors=kf_index[p.anchor[pts]],
+            seen=p.seen[pts].astype(np.int64),
+            expected=p.expected[pts].astype(np.int64),
+            obs_kf=kf_index[table.kf[obs]],
+            obs_pt=pt_index[table.pt[obs]],
+            uv_left=table.uv_left[obs].astype(np.float64),
+            uv_right=table.uv_right[obs].astype(np.float64),
+            descriptors=table.descriptor[obs],
+            angles=table.angle[obs],
+        )
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all columns."""
+        tables = (self.keyframes, self.points, self.observations)
+        return sum(table.nbytes for table in tables) + self._pt_rows.nbytes

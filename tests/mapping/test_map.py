@@ -1,0 +1,168 @@
+"""The map's bookkeeping against plain sets that are recomputed from its observation table."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
+from stereo_sfm.mapping.map import Map
+from stereo_sfm.types import I64, Keyframe
+
+
+def keyframe(kf_id: int, point_ids: I64, submap: int = 0) -> Keyframe:
+    n = len(point_ids)
+    rng = np.random.default_rng(kf_id)
+    return Keyframe(
+        kf_id=kf_id,
+        frame_id=10 * kf_id,
+        stamp_ns=kf_id * 10**9,
+        odom_T_cam=se3.exp(np.array([0.1 * kf_id, 0, 0, 0, 0, 0.01 * kf_id])),
+        point_ids=np.asarray(point_ids, np.int64),
+        uv_left=rng.uniform(0, 600, (n, 2)),
+        uv_right=rng.uniform(0, 600, (n, 2)),
+        points_cam=rng.uniform(1, 3, (n, 3)),
+        descriptors=rng.integers(0, 256, (n, 32), dtype=np.uint8),
+        angles=np.zeros(n, np.float32),
+        submap_id=submap,
+    )
+
+
+def insert(m: Map, kf: Keyframe) -> int:
+    """A keyframe with all its points."""
+    row = m.add_keyframe(kf, np.asarray(kf.odom_T_cam))
+    known = m.point_rows(kf.point_ids) >= 0
+    m.add_points(kf.point_ids[~known], se3.transform(kf.odom_T_cam, kf.points_cam[~known]), row)
+    rows = m.point_rows(kf.point_ids)
+    m.observe(row, rows, kf.uv_left, kf.uv_right, kf.descriptors, kf.angles)
+    return row
+
+
+def check(m: Map) -> None:
+    """Lists, counts and covisibility say what the observation table says."""
+    table = m.observations
+    live = np.flatnonzero(table.pt >= 0)
+    for p in range(len(m.points)):
+        mine = live[table.pt[live] == p]
+        assert np.array_equal(m.observations_of_points(np.array([p])), mine)
+        assert m.points.obs_count[p] == len(mine)
+        standing = int(m.points.descriptor_obs[p])
+        if m.points.alive[p] and len(mine):
+            assert standing in mine
+    size = len(m.keyframes)
+    expected = np.zeros((size, size), int)
+    for p in range(len(m.points)):
+        seen = table.kf[live[table.pt[live] == p]]
+        assert len(set(seen.tolist())) == len(seen)
+        for a in seen:
+            for b in seen:
+                expected[a, b] += a != b
+    assert np.array_equal(m.covisibility.matrix().toarray(), expected)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_random_edits_keep_every_index_true(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    m = Map()
+    next_kf = 0
+    for _ in range(25):
+        choice = rng.integers(0, 6)
+        if choice < 3 or next_kf < 2:
+            start = next_kf * 4
+            ids = m.points.pt_id[np.unique(m.point_rows(rng.integers(0, max(start, 1), 6)))] if next_kf else np.zeros(0)
+            ids = ids[m.points.alive[m.point_rows(ids.astype(np.int64))]] if len(ids) else ids
+            insert(m, keyframe(next_kf, np.unique(np.concatenate([ids, start + np.arange(4)]).astype(np.int64))))
+            next_kf += 1
+        elif choice == 3:
+            m.cull_points(rng.integers(0, len(m.points), 2))
+        elif choice == 4:
+            alive = np.flatnonzero(m.points.alive)
+            if len(alive) > 2:
+                old, new = rng.choice(alive, 2, replace=False)
+                m.fuse(int(old), int(new))
+                assert m.point_rows(m.points.pt_id[[old]])[0] == new
+        else:
+            row = int(rng.integers(0, len(m.keyframes)))
+            if m.keyframes.alive[row]:
+                m.cull_keyframe(row)
+    check(m)
+
+
+def test_ids_are_never_used_twice() -> None:
+    m = Map()
+    insert(m, keyframe(0, np.arange(5)))
+    m.cull_points(np.array([2]))
+    with pytest.raises(StereoSfmError, match="never used twice"):
+        m.add_points(np.array([2]), np.zeros((1, 3)), 0)
+    with pytest.raises(StereoSfmError, match="keyframe 0 is in the map already"):
+        m.add_keyframe(keyframe(0, np.arange(2)), np.eye(4))
+    with pytest.raises(StereoSfmError, match="no keyframe 9"):
+        m.kf_row(9)
+
+
+def test_fused_names_follow_chains() -> None:
+    m = Map()
+    insert(m, keyframe(0, np.array([0, 1])))
+    insert(m, keyframe(1, np.array([2, 3])))
+    m.fuse(0, 2)
+    m.fuse(2, 1)
+    assert m.point_rows(np.array([0, 1, 2, 3, 77, -1])).tolist() == [1, 1, 1, 3, -1, -1]
+
+
+def test_points_follow_their_anchors() -> None:
+    m = Map()
+    insert(m, keyframe(0, np.arange(4)))
+    insert(m, keyframe(1, np.arange(2, 8)))
+    before = m.keyframes.map_T_kf.copy()
+    local = [
+        se3.transform(se3.inverse(before[a]), x[None])[0] for a, x in zip(m.points.anchor, m.points.xyz, strict=True)
+    ]
+    after = before.copy()
+    after[1] = se3.exp(np.array([1.0, -2, 0.5, 0.3, 0.2, -0.1])) @ before[1]
+    m.move_keyframes(np.array([1]), after[[1]])
+    m.carry_points(before, after)
+    again = [
+        se3.transform(se3.inverse(after[a]), x[None])[0] for a, x in zip(m.points.anchor, m.points.xyz, strict=True)
+    ]
+    np.testing.assert_allclose(again, local, atol=1e-12)
+
+
+def test_deltas_tell_what_changed_once() -> None:
+    m = Map()
+    insert(m, keyframe(0, np.arange(4)))
+    delta = m.take_delta()
+    assert delta.kf_rows.tolist() == [0] and delta.pt_rows.tolist() == [0, 1, 2, 3]
+    assert len(m.take_delta().kf_rows) == 0
+    m.move_points(np.array([1, 3]), np.ones((2, 3)))
+    m.cull_points(np.array([3]))
+    delta = m.take_delta()
+    assert delta.pt_rows.tolist() == [1] and len(delta.kf_rows) == 0
+    delta.xyz[:] = 7  # a copy: the map does not notice
+    assert m.points.xyz[1, 0] == 1
+
+
+def test_culled_keyframe_leaves_the_chain_and_its_points_find_another_anchor() -> None:
+    m = Map()
+    for k in range(3):
+        insert(m, keyframe(k, np.array([0, 10 + k])))
+    m.cull_keyframe(0)
+    assert m.keyframes.previous.tolist() == [-1, -1, 1]
+    assert int(m.points.anchor[m.point_rows(np.array([0]))[0]]) == 1
+    snap = m.snapshot()
+    assert snap.kf_ids.tolist() == [1, 2]
+    assert (snap.obs_kf < 2).all() and (snap.anchors[np.isin(snap.pt_ids, [0, 11, 12])] >= 0).all()
+
+
+def test_neighbours_come_in_order() -> None:
+    m = Map()
+    insert(m, keyframe(0, np.arange(0, 5)))
+    insert(m, keyframe(1, np.arange(0, 9)))
+    insert(m, keyframe(2, np.arange(4, 9)))
+    insert(m, keyframe(3, np.array([0, 5, 8])))
+    rows, counts = m.covisibility.neighbours(1)
+    assert rows.tolist() == [0, 2, 3] and counts.tolist() == [5, 5, 3]
+    assert m.covisibility.neighbours(3, at_least=2)[0].tolist() == [1, 2]
