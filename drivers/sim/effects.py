@@ -35,7 +35,7 @@ class Sensor:
     """One eye's lens and sensor: what depends on the pixel only."""
 
     def __init__(self, eye: Eye, effects: Effects) -> None:
-        grid = eye.bearings
+        grid = eye.grid
         camera = eye.camera
         corners = camera.unproject(np.array([[0, camera.cy], [camera.width - 1, camera.cy]]))
         edge = np.nanmax(np.arccos(np.clip(corners[:, 2], -1, 1))) if np.isfinite(corners[:, 2]).any() else 1.6

@@ -5,16 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from calib.rig import Rig
-from drivers.sim.shading import cast, smooth_edges
+from drivers.sim.kernels import TARGET
+from drivers.sim.shading import cast, find_edges
 from drivers.sim.world import Tables
 from stereo_sfm.geometry.cameras import Camera
-from stereo_sfm.types import F32, F64, I64
+from stereo_sfm.types import F32, F64, I32, I64
 
 EDGE_RAYS = np.array([[-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 0.125]])  # rotated grid, px
 EDGE_CONTRAST = 4.0  # least step of brightness (of 255) worth several rays
+_STEPS = (np.arange(6) - 2.5) / 6
+TARGET_RAYS = np.stack(np.meshgrid(_STEPS, _STEPS), -1).reshape(-1, 2)  # flat pictures are for sub-pixel measurement
+CHUNK = 400_000  # rays at a time
 
 
 class Moving(NamedTuple):
@@ -43,8 +48,8 @@ class View:
     """One eye's picture."""
 
     image: F32  # (H, W) brightness, 0..255 before exposure, 0 where the lens shows nothing
-    depth: F32  # (H, W) metres along the pixel's ray, NaN where the lens shows nothing
-    ids: I64  # (H, W) surface of the pixel's centre, -1 where the lens shows nothing
+    depth: F32  # (H, W) metres along the ray of the pixel's centre, NaN where the lens shows nothing
+    ids: I32  # (H, W) surface of the pixel's centre, -1 where the lens shows nothing
 
 
 class Eye:
@@ -53,11 +58,20 @@ class Eye:
     def __init__(self, camera: Camera, max_angle_deg: float = 93.0) -> None:
         self.camera = camera
         grid = camera.bearing_grid()
-        beyond = np.nan_to_num(grid[..., 2], nan=-2.0) < np.cos(np.deg2rad(max_angle_deg))
-        grid[beyond] = np.nan
-        self.bearings = np.ascontiguousarray(grid)
-        du, dv = (np.linalg.norm(np.gradient(np.nan_to_num(grid), axis=a), axis=-1) for a in (1, 0))
-        self.angles = np.sqrt(du * dv).astype(np.float32)  # (H, W) radians a pixel covers
+        grid[np.nan_to_num(grid[..., 2], nan=-2.0) < np.cos(np.deg2rad(max_angle_deg))] = np.nan
+        self.grid = grid  # (H, W, 3) unit bearings, NaN where the lens shows nothing
+        self.du, self.dv = np.gradient(grid, axis=1), np.gradient(grid, axis=0)  # (H, W, 3) per pixel
+        angles = np.sqrt(np.linalg.norm(self.du, axis=-1) * np.linalg.norm(self.dv, axis=-1))
+        self.valid = np.flatnonzero(np.isfinite(grid[..., 2]))  # (N,) flat indices of pixels with a ray
+        self.bearings = grid.reshape(-1, 3)[self.valid]  # (N, 3)
+        self.angles = np.nan_to_num(angles, nan=1.0 / camera.fx).ravel()  # (H * W,) radians a pixel covers
+        self.inner = np.isfinite(self.du).all(-1) & np.isfinite(self.dv).all(-1)  # (H, W) has rays all around
+
+    def spread(self, pixels: I64, offsets: F64) -> tuple[F64, F64]:
+        """Rays at `offsets` (K, 2) px inside flat `pixels` (M,) -> bearings (M * K, 3), angles (M * K,)."""
+        centre, du, dv = (a.reshape(-1, 3)[pixels, None] for a in (self.grid, self.du, self.dv))
+        rays = centre + offsets[:, :1] * du + offsets[:, 1:] * dv
+        return rays.reshape(-1, 3), np.repeat(self.angles[pixels] / np.sqrt(len(offsets)), len(offsets))
 
 
 class Renderer:
@@ -74,27 +88,31 @@ class Renderer:
 
     def view(self, eye: int, world_T_eye: F64, moving: Moving = NOTHING) -> View:
         """One eye at its own pose (4, 4)."""
-        rays, shape = self.eyes[eye], self.eyes[eye].bearings.shape[:2]
-        pose = np.ascontiguousarray(world_T_eye, float)
-        image, depth, ids = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.int64)
-        smooth = np.zeros(shape, np.float32)
-        order = self._order(pose[:3, 3])
-        cast(self.world, moving, order, pose, rays.bearings, rays.angles, image, depth, ids)
-        smooth_edges(
-            self.world,
-            moving,
-            order,
-            pose,
-            rays.bearings,
-            rays.angles,
-            image,
-            ids,
-            smooth,
-            EDGE_RAYS,
-            EDGE_CONTRAST,
-            -1,
-        )
-        return View(smooth, depth, ids)
+        rays, shape = self.eyes[eye], self.eyes[eye].grid.shape[:2]
+        values, depths, hits = self.cast(world_T_eye, moving, rays.bearings, rays.angles[rays.valid])
+        image, depth = np.zeros(shape, np.float32), np.full(shape, np.nan, np.float32)
+        ids = np.full(shape, -1, np.int32)
+        image.flat[rays.valid], depth.flat[rays.valid], ids.flat[rays.valid] = values, depths, hits
+        found = np.empty(ids.size, np.int64)
+        edges = found[: find_edges(image, ids, EDGE_CONTRAST, found)]
+        self._refine(rays, world_T_eye, moving, edges[rays.inner.flat[edges]], EDGE_RAYS, image)
+        if len(moving.targets):
+            near = cv2.dilate((ids >> 4 & 7 == TARGET).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+            self._refine(rays, world_T_eye, moving, np.flatnonzero(near & rays.inner), TARGET_RAYS, image)
+        return View(image, depth, ids)
+
+    def cast(self, world_T_eye: F64, moving: Moving, bearings: F64, angles: F64) -> tuple[F32, F32, I32]:
+        """Rays (N, 3) of an eye, each standing for `angles` (N,) radians -> brightness, metres, surface (N,)."""
+        n, pose = len(bearings), np.ascontiguousarray(world_T_eye, float)
+        values, depths, ids = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.int32)
+        cast(self.world, moving, self._order(pose[:3, 3]), pose, bearings, angles, values, depths, ids)
+        return values, depths, ids
+
+    def _refine(self, rays: Eye, world_T_eye: F64, moving: Moving, pixels: I64, offsets: F64, image: F32) -> None:
+        """Replace pixels of `image` by the mean over several rays each."""
+        for part in np.array_split(pixels, len(pixels) * len(offsets) // CHUNK + 1):
+            values = self.cast(world_T_eye, moving, *rays.spread(part, offsets))[0]
+            image.flat[part] = values.reshape(-1, len(offsets)).mean(1)
 
     def _order(self, origin: F64) -> I64:
         """Groups by distance, nearest first."""

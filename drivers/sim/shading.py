@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import math
 
-from drivers.sim.kernels import BACK, BLOCK, BOARD, END, FACING, FRONT, LID, PERSON, RAIL, ROOM, SIDE, SOLID, njit
-from drivers.sim.kernels import to_shelf, trace, turn_to_shelf
+from drivers.sim import kernels
+from drivers.sim.kernels import BACK, BLOCK, BOARD, END, FACING, FRONT, PERSON, RAIL, ROOM, SIDE, SOLID, njit, to_shelf
 
 
 @njit
@@ -130,7 +130,7 @@ def _solid(w, b, face, x, y, z, dx, dy, dz, size):
 def _shelf_part(w, b, face, x, y, z, dx, dy, dz, size):
     facing = w.blocks_i[b, 1]
     u, deep = to_shelf(w.blocks, b, facing, x, y)
-    du, dw = turn_to_shelf(facing, dx, dy)
+    du, dw = kernels.turn_to_shelf(facing, dx, dy)
     k = w.blocks_i[b, 4 + face]
     if face == RAIL:
         return _flat(w, k, u + 0.37 * b + 3.1 * z, -z, du, dz, dw, size) * (0.7 + 0.12 * z)
@@ -148,7 +148,7 @@ def _product(w, c, face, part, x, y, z, dx, dy, dz, size):
     b, k = w.facings_i[c, 3], w.facings_i[c, 4]
     facing = w.blocks_i[b, 1]
     u, deep = to_shelf(w.blocks, b, facing, x, y)
-    du, dw = turn_to_shelf(facing, dx, dy)
+    du, dw = kernels.turn_to_shelf(facing, dx, dy)
     base, roof = w.levels[k, 1], w.levels[k, 2]
     u0, wide = w.facings[c, 2], w.facings[c, 3] - w.facings[c, 2]
     unit_h, unit_d = w.facings[c, 8], w.facings[c, 9]
@@ -226,80 +226,38 @@ def shade(w, moving, t, hit, ox, oy, oz, dx, dy, dz, angle):
 
 
 @njit
-def cast(w, moving, order, world_T_eye, bearings, angles, image, depth, ids):
-    """One ray through every pixel's centre.
+def cast(w, moving, order, world_T_eye, bearings, angles, values, depths, ids):
+    """One ray each: what it shows.
 
     Args:
-        bearings: (H, W, 3) unit, NaN where the lens shows nothing. angles: (H, W) radians a pixel covers.
-        image, depth, ids: (H, W) written: brightness, distance along the ray in metres (NaN), surface.
+        order: groups, nearest first. world_T_eye: (4, 4). bearings: (N, 3) in the eye.
+        angles: (N,) radians that the ray stands for.
+        values, depths, ids: (N,) written: brightness, distance along the ray in metres, surface.
     """
     r, ox, oy, oz = world_T_eye, world_T_eye[0, 3], world_T_eye[1, 3], world_T_eye[2, 3]
-    for v in range(bearings.shape[0]):
-        for u in range(bearings.shape[1]):
-            a, b, c = bearings[v, u, 0], bearings[v, u, 1], bearings[v, u, 2]
-            if not math.isfinite(c):
-                image[v, u], depth[v, u], ids[v, u] = 0.0, math.nan, -1
-                continue
-            dx = r[0, 0] * a + r[0, 1] * b + r[0, 2] * c
-            dy = r[1, 0] * a + r[1, 1] * b + r[1, 2] * c
-            dz = r[2, 0] * a + r[2, 1] * b + r[2, 2] * c
-            t, hit = trace(w, order, moving, ox, oy, oz, dx, dy, dz)
-            image[v, u] = shade(w, moving, t, hit, ox, oy, oz, dx, dy, dz, angles[v, u])
-            depth[v, u], ids[v, u] = t, hit
-    return 0
+    for i in range(bearings.shape[0]):
+        a, b, c = bearings[i, 0], bearings[i, 1], bearings[i, 2]
+        dx = r[0, 0] * a + r[0, 1] * b + r[0, 2] * c
+        dy = r[1, 0] * a + r[1, 1] * b + r[1, 2] * c
+        dz = r[2, 0] * a + r[2, 1] * b + r[2, 2] * c
+        t, hit = kernels.trace(w, order, moving, ox, oy, oz, dx, dy, dz)
+        values[i] = shade(w, moving, t, hit, ox, oy, oz, dx, dy, dz, angles[i])
+        depths[i], ids[i] = t, hit
 
 
 @njit
-def _is_edge(image, ids, v, u, contrast):
-    """Whether another surface of another brightness touches this pixel."""
-    here, value = ids[v, u], image[v, u]
-    return (
-        (ids[v, u - 1] != here and abs(image[v, u - 1] - value) > contrast)
-        or (ids[v, u + 1] != here and abs(image[v, u + 1] - value) > contrast)
-        or (ids[v - 1, u] != here and abs(image[v - 1, u] - value) > contrast)
-        or (ids[v + 1, u] != here and abs(image[v + 1, u] - value) > contrast)
-    )
-
-
-@njit
-def smooth_edges(w, moving, order, world_T_eye, bearings, angles, image, ids, out, offsets, contrast, kind):
-    """Where surfaces meet, the mean over several rays a pixel; elsewhere the one ray's value.
-
-    Args:
-        offsets: (N, 2) px of the rays within a pixel. contrast: least step of brightness that matters.
-        kind: also every pixel that shows or touches this kind of surface (TARGET), -1 for none.
-        out: (H, W) written.
-    """
-    r, ox, oy, oz = world_T_eye, world_T_eye[0, 3], world_T_eye[1, 3], world_T_eye[2, 3]
-    h, wide, n = image.shape[0], image.shape[1], offsets.shape[0]
-    narrow = 1 / math.sqrt(n)
-    for v in range(h):
-        for u in range(wide):
-            out[v, u] = image[v, u]
-            if v == 0 or u == 0 or v == h - 1 or u == wide - 1 or ids[v, u] < 0:
-                continue
-            if kind >= 0:
-                near = False
-                for q in range(9):
-                    near = near or ((ids[v + q // 3 - 1, u + q % 3 - 1] >> 4) & 7) == kind
-                if not near:
-                    continue
-            elif not _is_edge(image, ids, v, u, contrast):
-                continue
-            total = 0.0
-            for q in range(n):
-                su, sv = 0.5 * offsets[q, 0], 0.5 * offsets[q, 1]
-                a = bearings[v, u, 0] + su * (bearings[v, u + 1, 0] - bearings[v, u - 1, 0])
-                b = bearings[v, u, 1] + su * (bearings[v, u + 1, 1] - bearings[v, u - 1, 1])
-                c = bearings[v, u, 2] + su * (bearings[v, u + 1, 2] - bearings[v, u - 1, 2])
-                a += sv * (bearings[v + 1, u, 0] - bearings[v - 1, u, 0])
-                b += sv * (bearings[v + 1, u, 1] - bearings[v - 1, u, 1])
-                c += sv * (bearings[v + 1, u, 2] - bearings[v - 1, u, 2])
-                dx = r[0, 0] * a + r[0, 1] * b + r[0, 2] * c
-                dy = r[1, 0] * a + r[1, 1] * b + r[1, 2] * c
-                dz = r[2, 0] * a + r[2, 1] * b + r[2, 2] * c
-                t, hit = trace(w, order, moving, ox, oy, oz, dx, dy, dz)
-                total += shade(w, moving, t, hit, ox, oy, oz, dx, dy, dz, narrow * angles[v, u])
-            if math.isfinite(total):
-                out[v, u] = total / n
-    return 0
+def find_edges(image, ids, contrast, out):
+    """Flat indices (H * W) of pixels at which another surface, brighter or darker by `contrast`, begins -> count."""
+    h, wide, n = image.shape[0], image.shape[1], 0
+    for v in range(1, h - 1):
+        for u in range(1, wide - 1):
+            here, value = ids[v, u], image[v, u]
+            if here >= 0 and (
+                (ids[v, u - 1] != here and abs(image[v, u - 1] - value) > contrast)
+                or (ids[v, u + 1] != here and abs(image[v, u + 1] - value) > contrast)
+                or (ids[v - 1, u] != here and abs(image[v - 1, u] - value) > contrast)
+                or (ids[v + 1, u] != here and abs(image[v + 1, u] - value) > contrast)
+            ):
+                out[n] = v * wide + u
+                n += 1
+    return n
