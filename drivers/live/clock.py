@@ -1,0 +1,72 @@
+"""The camera's clock beside this computer's, and one time line over restarts of the camera. Pure."""
+
+from __future__ import annotations
+
+GOOD_HALF_TRIP_NS = 250_000  # librealsense accepts a reading whose half round trip is shorter
+
+
+class ClockMap:
+    """host = camera + offset, from readings of the camera's clock between two looks at ours."""
+
+    def __init__(self) -> None:
+        self._offset_ns: int | None = None
+        self.uncertainty_ns = 0
+
+    def add(self, host_before_ns: int, camera_ns: int, host_after_ns: int) -> bool:
+        """Take a reading; the first is always kept, later ones when their round trip was short.
+
+        Returns:
+            Whether it was good enough to stop trying.
+        """
+        half = (host_after_ns - host_before_ns) // 2
+        good = half < GOOD_HALF_TRIP_NS
+        if good or self._offset_ns is None or half < self.uncertainty_ns:
+            self._offset_ns, self.uncertainty_ns = host_before_ns + half - camera_ns, half
+        return good
+
+    @property
+    def known(self) -> bool:
+        """Whether there was any reading."""
+        return self._offset_ns is not None
+
+    def to_host(self, camera_ns: int) -> int:
+        """Camera clock -> this computer's monotonic clock."""
+        return camera_ns + (self._offset_ns or 0)
+
+    def to_camera(self, host_ns: int) -> int:
+        """This computer's monotonic clock -> camera clock."""
+        return host_ns - (self._offset_ns or 0)
+
+
+class TimeLine:
+    """Stamps of the first segment's camera clock, continued when the camera restarts with another one.
+
+    Inside a segment differences of stamps are differences of the camera's clock exactly. Between segments they are
+    as good as two clock readings.
+    """
+
+    def __init__(self) -> None:
+        self._first_offset: int | None = None
+        self._shift = 0
+        self._last = -1
+
+    def begin_segment(self, clock: ClockMap) -> None:
+        """The camera has (re)started and `clock` maps its new clock."""
+        offset = clock.to_host(0)
+        if self._first_offset is None:
+            self._first_offset = offset
+        self._shift = offset - self._first_offset
+
+    def stamp(self, camera_ns: int) -> int:
+        """Camera clock of this segment -> the one time line."""
+        return camera_ns + self._shift
+
+    def frame_stamp(self, camera_ns: int) -> int:
+        """As `stamp`, and never before the last frame's, whatever the clock readings say."""
+        self._last = max(self.stamp(camera_ns), self._last + 1)
+        return self._last
+
+    @property
+    def last(self) -> int:
+        """Stamp of the last frame, -1 before any."""
+        return self._last

@@ -1,0 +1,92 @@
+"""From the boot state to the running camera: send the firmware, wait until it is back on another bus."""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+import time
+from collections.abc import Generator
+from pathlib import Path
+from typing import IO, Any
+
+from drivers.live.errors import BootFailed, Busy
+from drivers.t265 import messages as m
+from drivers.t265.firmware import Firmware
+from drivers.t265.link import Timing, dispose
+from drivers.t265.usb_device import UsbDevice, attached, device_error, is_boot, place
+
+
+def boot(device: UsbDevice, firmware: Firmware, backend: Any, timing: Timing) -> UsbDevice:
+    """Send the firmware to one camera and return it as it comes back.
+
+    The bus and address change, so the camera is recognised as a running one that was not there before, at the same
+    chain of ports when there is a choice.
+
+    Raises:
+        NoPermission, Busy, BootFailed.
+    """
+    if not is_boot(device):
+        raise ValueError("only a T265 in its boot state takes firmware")
+    with _one_booter(timing):
+        before = {place(d) for d in attached(backend) if not is_boot(d)}
+        _send(device, firmware, timing)
+        return _wait(device, before, backend, timing)
+
+
+def _send(device: UsbDevice, firmware: Firmware, timing: Timing) -> None:
+    import usb.core
+    import usb.util
+
+    try:
+        usb.util.claim_interface(device, 0)
+        sent = device.write(m.BOOT_OUT, firmware.data, timing.boot_ms)
+        if sent != len(firmware.data):
+            raise BootFailed(f"T265 took {sent} of {len(firmware.data)} bytes of firmware: replug it and try again")
+    except usb.core.USBTimeoutError:
+        raise BootFailed("T265 does not take its firmware: replug it, directly into the computer") from None
+    except (usb.core.USBError, ValueError, LookupError) as error:
+        raise device_error(error, f"cannot boot the T265 on {place(device)}") from None
+    finally:
+        dispose(device)
+
+
+def _wait(device: UsbDevice, before: set[str], backend: Any, timing: Timing) -> UsbDevice:
+    deadline = time.monotonic() + timing.boot_s
+    while time.monotonic() < deadline:
+        time.sleep(timing.boot_poll_s)
+        new = [d for d in attached(backend) if not is_boot(d) and place(d) not in before]
+        same_port = [d for d in new if d.port_numbers == device.port_numbers]
+        if new:
+            time.sleep(timing.settle_s)
+            return (same_port or new)[0]
+    raise BootFailed(f"T265 took its firmware but did not come back within {timing.boot_s:.0f} s: replug it")
+
+
+@contextlib.contextmanager
+def _one_booter(timing: Timing) -> Generator[None]:
+    """Two programs that boot cameras at once make both fail: a lock between processes."""
+    path = Path(tempfile.gettempdir()) / "stereo-sfm-t265-boot.lock"
+    try:
+        file = path.open("a")
+    except OSError:  # another user's lock file: boot without
+        yield
+        return
+    with file:
+        deadline = time.monotonic() + timing.boot_s
+        while not _try_lock(file):
+            if time.monotonic() > deadline:
+                raise Busy("another program is booting a T265: wait for it, or remove " + str(path))
+            time.sleep(timing.boot_poll_s)
+        yield
+
+
+def _try_lock(file: IO[str]) -> bool:
+    try:
+        import fcntl
+    except ImportError:  # Windows has no such lock
+        return True
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True

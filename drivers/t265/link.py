@@ -1,0 +1,147 @@
+"""The opened camera: commands, endpoint reads, reset. The only place from which commands leave."""
+
+from __future__ import annotations
+
+import array
+import struct
+import threading
+from dataclasses import dataclass
+from typing import Any
+
+from drivers.live.errors import DeviceError, DeviceFault, DeviceLost
+from drivers.t265 import messages as m
+from drivers.t265 import protocol
+from drivers.t265.usb_device import UsbDevice, device_error, place
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How long to wait for what."""
+
+    command_ms: int = 3000
+    read_ms: int = 300  # one blocking read of an image or event endpoint
+    stall_s: float = 0.5  # no image for so long: the camera has stopped
+    busy_tries: int = 5
+    busy_wait_s: float = 1.0
+    boot_ms: int = 10_000  # sending the firmware
+    boot_s: float = 10.0  # until the camera is back
+    boot_poll_s: float = 0.1
+    settle_s: float = 0.3  # after it is back, before the first command
+    reconnect_s: float = 20.0  # looking for a lost camera
+    clock_s: float = 0.5  # between clock readings
+
+
+class Link:
+    """Interface 0 of one T265 that runs.
+
+    Args:
+        device: from `usb_device.attached`.
+        timing: timeouts.
+
+    Raises:
+        NoPermission, Busy, DeviceLost, DeviceFault.
+    """
+
+    def __init__(self, device: UsbDevice, timing: Timing) -> None:
+        self.device, self._timing = device, timing
+        self._lock = threading.Lock()
+        self.what = f"T265 on {place(device)}"
+        try:
+            self._open()
+        except DeviceError:
+            self.close()
+            raise
+
+    def _open(self) -> None:
+        import usb.core
+        import usb.util
+
+        try:
+            try:
+                configuration = self.device.get_active_configuration()
+            except usb.core.USBError as error:
+                if error.errno is not None:
+                    raise
+                self.device.set_configuration()  # macOS leaves it unconfigured
+                configuration = self.device.get_active_configuration()
+            endpoints = {e.bEndpointAddress for e in configuration[(0, 0)].endpoints()}
+            missing = {m.COMMAND_OUT, m.COMMAND_IN, m.VIDEO_IN, m.EVENT_IN} - endpoints
+            if missing:
+                raise DeviceFault(f"{self.what} has no endpoint {min(missing):#04x}: not a T265 this driver knows")
+            usb.util.claim_interface(self.device, 0)
+        except usb.core.USBError as error:
+            raise device_error(error, f"cannot open the {self.what}") from None
+        except (LookupError, ValueError, TypeError, AttributeError, NotImplementedError) as error:
+            raise DeviceFault(f"{self.what} describes itself in a way that makes no sense ({error})") from None
+
+    def command(self, request: bytes) -> tuple[int, protocol.Buffer]:
+        """Send one request and wait for its answer.
+
+        Returns:
+            Status and payload.
+
+        Raises:
+            ValueError: the request is not one that this driver may send (a bug, never the camera's doing).
+            ProtocolError, DeviceLost, DeviceError.
+        """
+        import usb.core
+
+        length, message = struct.unpack_from("<IH", request)
+        if message not in m.SENDABLE or length != len(request):
+            raise ValueError(f"refusing to send message {message:#06x} to a T265: not on the list of safe ones")
+        buffer = array.array("B", bytes(m.COMMAND_BUFFER))
+        with self._lock:
+            try:
+                self.device.write(m.COMMAND_OUT, request, self._timing.command_ms)
+                for last in (False, False, True):
+                    got = self.device.read(m.COMMAND_IN, buffer, self._timing.command_ms)
+                    try:
+                        return protocol.response_payload(memoryview(buffer)[:got].tobytes(), message)
+                    except protocol.ProtocolError:  # perhaps the late answer to a command that timed out
+                        if last:
+                            raise
+            except usb.core.USBTimeoutError:
+                raise DeviceLost(f"{self.what} does not answer message {message:#06x}") from None
+            except (usb.core.USBError, ValueError, LookupError) as error:
+                raise device_error(error, f"{self.what}") from None
+        raise AssertionError("unreachable")
+
+    def read(self, endpoint: int, buffer: array.array[int], timeout_ms: int) -> int:
+        """One transfer from an IN endpoint; 0 when nothing came in time.
+
+        Raises:
+            DeviceLost, DeviceError.
+        """
+        import usb.core
+
+        try:
+            return self.device.read(endpoint, buffer, timeout_ms)
+        except usb.core.USBTimeoutError:
+            return 0
+        except (usb.core.USBError, ValueError, LookupError) as error:
+            raise device_error(error, self.what) from None
+
+    def reset(self) -> None:
+        """Vendor request that drops the camera to its boot state. It often dies in the middle of the answer."""
+        import usb.core
+
+        with self._lock:
+            try:
+                self.device.ctrl_transfer(0x40, 0x10, 0, 0, 0, self._timing.command_ms)
+            except (usb.core.USBError, ValueError, LookupError):
+                return
+
+    def close(self) -> None:
+        """Give the interface back. Readers must have ended."""
+        dispose(self.device)
+
+
+def dispose(device: UsbDevice | Any) -> None:
+    """Release what pyusb holds; a camera that is gone cannot be released, and that is fine."""
+    import contextlib
+
+    import usb.core
+    import usb.util
+
+    with contextlib.suppress(usb.core.USBError, ValueError, LookupError):
+        usb.util.dispose_resources(device)

@@ -1,0 +1,74 @@
+"""`t265:simulated`: the whole driver on a simulated camera, firmware and all.
+
+Options besides those of a real camera: `images` (a source such as sim:loop, or 'room'), `frames` (how many are made
+before the start and then played forwards and backwards), `faults` (names of simulated.faults.PRESETS), `paced` (0: as
+fast as the host reads), `seed`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import replace
+
+import numpy as np
+
+from drivers.live.options import Options
+from drivers.t265.acquire import Access
+from drivers.t265.camera import Settings
+from drivers.t265.firmware import SIZE, Firmware, verified
+from drivers.t265.link import Timing
+from drivers.t265.simulated.bus import SimulatedBus
+from drivers.t265.simulated.camera import SimulatedCamera
+from drivers.t265.simulated.content import room_content, source_content
+from drivers.t265.simulated.faults import preset
+from drivers.t265.source import T265Source
+from stereo_sfm.types import F64, I64, Trajectory
+
+# The simulated camera is quick to boot and to forgive.
+FAST = Timing(busy_wait_s=0.05, boot_s=3.0, boot_poll_s=0.02, settle_s=0.02, reconnect_s=5.0)
+
+
+def simulated_firmware() -> bytes:
+    """A file of the right size that only the simulated camera accepts."""
+    return b"MA2x" + bytes(SIZE - 4)
+
+
+def checked_firmware() -> Firmware:
+    """The simulated firmware through the same check as a real one."""
+    data = simulated_firmware()
+    return verified(data, frozenset({hashlib.sha1(data).hexdigest()}))
+
+
+class SimulatedT265Source(T265Source):
+    """As the real one, and it knows the truth afterwards."""
+
+    def __init__(self, camera: SimulatedCamera, access: Access, settings: Settings, queue: int, at_start: bool) -> None:
+        self.camera = camera
+        super().__init__(access, settings, queue, at_start, name="t265:simulated")
+
+    def truth(self, stamps: I64) -> F64:
+        """world_T_cam (N, 4, 4) at (N,) stamps of the images of the present segment."""
+        seconds = np.array([self.camera.frame_of(int(s) - self._time.stamp(0)) for s in stamps])
+        return self.camera.content.pose(seconds)
+
+    def trajectory(self, stamps: I64) -> Trajectory:
+        """The truth as a trajectory."""
+        return Trajectory(np.array(stamps, np.int64), self.truth(stamps))
+
+
+def open_simulated(
+    opts: Options, settings: Settings, queue: int, at_start: bool, allow_slow: bool, reconnect_s: float
+) -> SimulatedT265Source:
+    """Called by `open_t265`."""
+    frames = int(opts.number("frames", 60, 1, 3000))
+    images = opts.text("images", "room")
+    faults = preset(opts.text("faults", "none"))
+    paced = opts.flag("paced", True)
+    seed = int(opts.number("seed", 0, 0, 2**31))
+    opts.finish()
+    content = room_content(frames, seed) if images == "room" else source_content(images, frames)
+    camera = SimulatedCamera(content, faults, paced)
+    access = Access(
+        SimulatedBus([camera]), "", checked_firmware, allow_slow, replace(FAST, reconnect_s=min(reconnect_s, 5.0))
+    )
+    return SimulatedT265Source(camera, access, settings, queue, at_start)

@@ -1,0 +1,170 @@
+"""One segment of streaming: a reader thread per endpoint, and one that reads the camera's clock."""
+
+from __future__ import annotations
+
+import array
+import contextlib
+import logging
+import threading
+import time
+from collections.abc import Callable
+
+from drivers.live.buffers import Handoff, MotionBuffer
+from drivers.live.clock import ClockMap
+from drivers.live.counters import Counters
+from drivers.live.errors import DeviceError
+from drivers.live.pairing import LEFT, RIGHT, Eye, Pair, Pairer
+from drivers.t265 import messages as m
+from drivers.t265 import protocol
+from drivers.t265.camera import T265
+from drivers.t265.link import Timing
+from drivers.t265.messages import Sensor, Status
+
+logger = logging.getLogger("stereo_sfm")
+
+_CLOCK_TRIES = 3
+_TEMPERATURE_S = 10.0
+_STOP_S = 0.5  # waiting for the camera to say that it has stopped
+_MAX_STALE = 16  # transfers of an earlier session that may still lie in an endpoint
+
+
+class Stream:
+    """From `start` to `stop`. Pairs come out of `pairs`, inertial samples out of `motion` (camera clock).
+
+    Args:
+        camera: configured and stopped.
+        counters: shared with the source.
+        timing: waits.
+        queue_frames: pairs that wait for the consumer before the oldest is thrown away.
+    """
+
+    def __init__(self, camera: T265, counters: Counters, timing: Timing, queue_frames: int) -> None:
+        self._camera, self._counters, self._timing = camera, counters, timing
+        self.pairs: Handoff[Pair] = Handoff(queue_frames)
+        self.motion = MotionBuffer()
+        self.clock = ClockMap()
+        self._stopping = threading.Event()
+        self._stopped = (threading.Event(), threading.Event())  # the camera said so: video, events
+        self._pairer: Pairer | None = None
+        self._threads: list[threading.Thread] = []
+
+    def start(self) -> None:
+        """Clock, readers, START, in this order.
+
+        Raises:
+            DeviceError: nothing runs then.
+        """
+        self._drain()
+        self._read_clock()
+        self._pairer = Pairer(self._counters, m.PERIOD_NS, now_ns=self._camera.time_ns())
+        for name, work in (("video", self._read_video), ("events", self._read_events), ("clock", self._keep_clock)):
+            thread = threading.Thread(target=self._guard, args=(work,), name=f"t265-{name}", daemon=True)
+            self._threads.append(thread)
+            thread.start()
+        try:
+            self._camera.start()
+        except DeviceError:
+            self._join()
+            raise
+        self._counters.add("segments")
+
+    def stop(self, camera_alive: bool = True) -> None:
+        """End streaming and the threads. A camera that is alive is told, and given a moment to say goodbye."""
+        if camera_alive:
+            with contextlib.suppress(DeviceError):
+                self._camera.stop()
+                for said in self._stopped:
+                    said.wait(_STOP_S)
+        self._join()
+
+    def _join(self) -> None:
+        self._stopping.set()
+        for thread in self._threads:
+            thread.join()
+
+    def _guard(self, work: Callable[[], None]) -> None:
+        """No thread dies unseen: its error is the consumer's."""
+        try:
+            work()
+        except BaseException as error:
+            self.pairs.fail(error)
+
+    def _drain(self) -> None:
+        """Throw away what an earlier session left in the endpoints."""
+        buffer = array.array("B", bytes(m.VIDEO_BUFFER))
+        for endpoint in (m.VIDEO_IN, m.EVENT_IN):
+            for _ in range(_MAX_STALE):
+                if self._camera.link.read(endpoint, buffer, 10) == 0:
+                    break
+
+    def _read_video(self) -> None:
+        buffer = array.array("B", bytes(m.VIDEO_BUFFER))
+        while not self._stopping.is_set():
+            size = self._camera.link.read(m.VIDEO_IN, buffer, self._timing.read_ms)
+            if size and self._take_video(memoryview(buffer)[:size]):
+                buffer = array.array("B", bytes(m.VIDEO_BUFFER))  # the image keeps the old one
+
+    def _take_video(self, data: memoryview) -> bool:
+        """Whether the transfer was an image."""
+        try:
+            message = protocol.decode_video_endpoint(data)
+        except protocol.ProtocolError as error:
+            self._counters.add("malformed" if len(data) == m.VIDEO_BYTES else "half_frames")
+            logger.debug("T265: %s", error)
+            return False
+        if isinstance(message, protocol.StatusEvent):
+            self._take_status(message, self._stopped[0])
+            return False
+        side = LEFT if message.sensor == Sensor.LEFT else RIGHT
+        eye = Eye(message.stamp_ns, message.frame_id, message.pixels, float(message.exposure_us), message.gain)
+        pair = self._pairer.push(side, eye) if self._pairer else None
+        if pair is not None:
+            self.pairs.put(pair, weight=1 + pair.dropped_before)
+        return True
+
+    def _read_events(self) -> None:
+        buffer = array.array("B", bytes(m.EVENT_BUFFER))
+        while not self._stopping.is_set():
+            size = self._camera.link.read(m.EVENT_IN, buffer, self._timing.read_ms)
+            if not size:
+                continue
+            events, damaged = protocol.decode_events(memoryview(buffer)[:size])
+            if damaged:
+                self._counters.add("malformed", damaged)
+            for event in events:
+                if isinstance(event, protocol.MotionSample):
+                    self.motion.add(event.stamp_ns, event.sensor == Sensor.GYRO, event.xyz)
+                else:
+                    self._take_status(event, self._stopped[1])
+
+    def _take_status(self, event: protocol.StatusEvent, stopped: threading.Event) -> None:
+        """DEVICE_STOPPED matters while stopping only: a stale one can come right after a start."""
+        if event.status == Status.DEVICE_STOPPED:
+            stopped.set()
+        elif event.status != Status.SUCCESS:
+            self._counters.add("camera_errors")
+            logger.warning("T265 reports %s", m.status_name(event.status))
+
+    def _keep_clock(self) -> None:
+        next_temperature = 0.0
+        while not self._stopping.wait(self._timing.clock_s):
+            with contextlib.suppress(DeviceError):  # the readers notice a lost camera
+                self._read_clock()
+                if time.monotonic() >= next_temperature:
+                    next_temperature = time.monotonic() + _TEMPERATURE_S
+                    self._read_temperature()
+
+    def _read_clock(self) -> None:
+        for _ in range(_CLOCK_TRIES):
+            before = time.monotonic_ns()
+            camera_ns = self._camera.time_ns()
+            if self.clock.add(before, camera_ns, time.monotonic_ns()):
+                break
+        self._counters["clock_uncertainty_us"] = self.clock.uncertainty_ns / 1e3
+
+    def _read_temperature(self) -> None:
+        for probe in self._camera.temperatures():
+            if probe.index == 0:
+                self._counters["temperature_c"] = probe.celsius
+                if probe.threshold > 0 and probe.celsius > probe.threshold:
+                    logger.warning("T265 is hot: %.0f of %.0f degrees Celsius", probe.celsius, probe.threshold)
