@@ -310,7 +310,8 @@ def _sample_affine(image, warp, cu, cv, out):
     h, w = image.shape
     reach_u = (abs(warp[0, 0]) + abs(warp[0, 1])) * HALF
     reach_v = (abs(warp[1, 0]) + abs(warp[1, 1])) * HALF
-    if cu - reach_u < 0 or cv - reach_v < 0 or cu + reach_u >= w - 1.001 or cv + reach_v >= h - 1.001:
+    inside = cu - reach_u >= 0 and cv - reach_v >= 0 and cu + reach_u < w - 1.001 and cv + reach_v < h - 1.001
+    if not (inside and reach_u < 60 and reach_v < 60):  # also when anything is NaN
         return False
     a, b, c, d = np.float32(warp[0, 0]), np.float32(warp[0, 1]), np.float32(warp[1, 0]), np.float32(warp[1, 1])
     iu0, iv0 = int(math.floor(cu)), int(math.floor(cv))

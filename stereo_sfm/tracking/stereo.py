@@ -38,7 +38,8 @@ class StereoMatcher:
         self._config = config
         self._rig = rig
         self._eyes = Eyes.of(rig)
-        reach = np.linalg.norm(rig.left_T_right[:3, 3]) * rig.left.fx / config.min_depth
+        self._min_depth = config.min_depth_baselines * rig.baseline
+        reach = rig.left.fx / config.min_depth_baselines
         self._candidates = int(np.clip(reach / 2**SEARCH_LEVEL * 1.2, 16, 160))
         narrow = np.sqrt(np.maximum(flow.WEIGHTS, 0)) ** 5  # the same Gaussian, about 0.63 times as wide
         self._narrow = (narrow / narrow.sum()).astype(np.float32)
@@ -70,7 +71,7 @@ class StereoMatcher:
         if isinstance(right, tuple):
             coarse, _ = search_epipolar(
                 left[SEARCH_LEVEL], right[SEARCH_LEVEL], uv, 2.0**SEARCH_LEVEL, *self._eyes.cams,
-                self._eyes.right_T_left, config.min_depth, self._candidates, 25.0, 1.2,
+                self._eyes.right_T_left, self._min_depth, self._candidates, 25.0, 1.2,
             )  # fmt: skip
             uv_right = self._refine(left, right, uv, coarse, 1)
             back = uv.copy()
@@ -87,7 +88,7 @@ class StereoMatcher:
         )
         with np.errstate(invalid="ignore"):
             good &= (epipolar < config.max_epipolar_px) & (rho > -CLOSE * np.sqrt(variance))
-            good &= rho < 1.0 / (0.5 * config.min_depth)
+            good &= rho < 1.0 / (0.5 * self._min_depth)
         return StereoMatch(uv, uv_right, bearing, rho, variance, good)
 
     def _refine(self, left: flow.Pyramid, right: flow.Pyramid, uv: F64, guess: F64, level: int) -> F64:

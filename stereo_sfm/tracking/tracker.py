@@ -8,6 +8,7 @@ corners where points are missing, stereo matches for them, descriptors for the m
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,15 +17,40 @@ from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.tracking import flow, motion
+from stereo_sfm.tracking.coarse_rotation import CoarseRotation
 from stereo_sfm.tracking.corners import detect_corners
 from stereo_sfm.tracking.descriptors import describe
 from stereo_sfm.tracking.eyes import Eyes
 from stereo_sfm.tracking.stereo import StereoMatcher
 from stereo_sfm.tracking.tracks import Patches, Tracks
-from stereo_sfm.types import F64, Bool, Frame, Keyframe, MapUpdate, Observations, StereoImage, TrackState
+from stereo_sfm.types import F32, F64, Bool, Frame, Keyframe, MapUpdate, Observations, StereoImage, TrackState
 
-COARSE_TO_FINE = np.array([20.0, 10.0, 6.0, 4.0, 3.0, 2.0, 2.0])  # Cauchy scales in sigmas
-FINE = np.array([4.0, 2.0, 2.0])
+CAUCHY_SCALES = np.array([20.0, 10.0, 6.0, 4.0, 3.0, 2.0, 2.0])  # in sigmas, one Gauss-Newton step each
+
+
+@dataclass
+class PoseSolution:
+    """What motion-only optimisation found."""
+
+    pose: F64  # (4, 4) odom_T_cam
+    covariance: F64  # (6, 6)
+    error: F64  # (N,) whitened
+    max_error: float
+    reason: str = ""  # why there is no pose
+
+    @property
+    def inlier(self) -> Bool:
+        """(N,)"""
+        return self.error < self.max_error
+
+    @property
+    def inliers(self) -> int:
+        """How many points agree with the pose."""
+        return int(self.inlier.sum())
+
+    def good(self, config: TrackerConfig, before: int) -> bool:
+        """Whether most of the points that were followed agree."""
+        return not self.reason and self.inliers > max(2 * config.min_features, 0.4 * before)
 
 
 class Tracker:
@@ -59,6 +85,9 @@ class Tracker:
         self._kf_last_point_id = 0
         self._frames_since_kf = 0
         self._first_level = config.pyramid_levels - 1
+        self._miss_px = math.inf  # median distance of points from where they were predicted
+        self._noise = 1.0  # observed noise over config.sigma_px
+        self._coarse_rotation = CoarseRotation(rig.left, config.pyramid_levels)
         self._map_version = 0
         self._odom_T_map: F64 = np.eye(4)
 
@@ -100,15 +129,16 @@ class Tracker:
             return self._initialize(image, pyramid, right, stats)
         dt = (image.stamp_ns - self._stamp_ns) * 1e-9
         predicted = self._pose @ se3.exp(self._velocity * dt)
-        with self._spans.span("flow"):
-            tracks, index = self._follow(pyramid, predicted)
-        with self._spans.span("stereo"):
-            uv_right = self._stereo.follow(pyramid, right, tracks.uv, tracks.points(), predicted)
-        with self._spans.span("pose"):
-            pose, covariance, error, reason = self._solve(tracks, uv_right, predicted, len(index))
-        if reason:
-            return self._lose(image, predicted, reason, stats)
-        inlier = error < self._config.max_error
+        tracks, uv_right, solution = self._track(pyramid, right, predicted)
+        if not solution.good(self._config, len(self._tracks)):
+            turned = self._turn(pyramid, predicted)
+            again = self._track(pyramid, right, turned)
+            if again[2].inliers > solution.inliers:
+                tracks, uv_right, solution = again
+        if solution.reason:
+            return self._lose(image, predicted, solution.reason, stats)
+        pose, covariance, error, inlier = solution.pose, solution.covariance, solution.error, solution.inlier
+        self._noise = float(np.clip(0.9 * self._noise + 0.1 * np.median(error[inlier]) / 0.8, 1.0, 4.0))
         tracks.uv_right = uv_right
         tracks.misses = np.where(inlier, 0, tracks.misses + 1).astype(np.int32)
         tracks.age = tracks.age + np.int32(1)
@@ -135,7 +165,7 @@ class Tracker:
     # -- stages ----------------------------------------------------------------------------------------------------
 
     def _initialize(
-        self, image: StereoImage, pyramid: flow.Pyramid, right: object, stats: dict[str, float]
+        self, image: StereoImage, pyramid: flow.Pyramid, right: flow.Pyramid | F32, stats: dict[str, float]
     ) -> tuple[Frame, Keyframe | None]:
         """First frame, or the first after a restart: points from stereo alone."""
         self._tracks = Tracks()
@@ -153,8 +183,27 @@ class Tracker:
         stats.update(tracked=float(len(inlier)), inliers=float(len(inlier)), right=float(len(inlier)), error=0.0)
         return self._frame(image, np.eye(6) * 1e-12, state, "", inlier, keyframe, stats), keyframe
 
-    def _follow(self, pyramid: flow.Pyramid, predicted: F64) -> tuple[Tracks, F64]:
-        """Tracks that are found in the new left image, moved there, and the predicted pixels of all."""
+    def _track(
+        self, pyramid: flow.Pyramid, right: flow.Pyramid | F32, predicted: F64
+    ) -> tuple[Tracks, F64, PoseSolution]:
+        """Follow all points from a predicted pose and solve for the pose."""
+        with self._spans.span("flow"):
+            tracks = self._follow(pyramid, predicted)
+        with self._spans.span("stereo"):
+            uv_right = self._stereo.follow(pyramid, right, tracks.uv, tracks.points(), predicted)
+        with self._spans.span("pose"):
+            return tracks, uv_right, self._solve(tracks, uv_right, predicted)
+
+    def _turn(self, pyramid: flow.Pyramid, predicted: F64) -> F64:
+        """The predicted pose with the rotation that aligns the whole images."""
+        assert self._pyramid is not None
+        cur_R_prev = predicted[:3, :3].T @ self._pose[:3, :3]
+        cur_R_prev = self._coarse_rotation.align(self._pyramid, pyramid, cur_R_prev)
+        self._first_level = self._config.pyramid_levels - 1
+        return se3.from_rotation_translation(self._pose[:3, :3] @ cur_R_prev.T, predicted[:3, 3])
+
+    def _follow(self, pyramid: flow.Pyramid, predicted: F64) -> Tracks:
+        """Tracks that are found in the new left image, moved there."""
         config, tracks = self._config, self._tracks
         assert self._pyramid is not None
         guess = self._rig.left.project(se3.transform(se3.inverse(predicted), tracks.points()))
@@ -165,44 +214,36 @@ class Tracker:
             flow.WEIGHTS,
         )  # fmt: skip
         found = status == flow.TRACKED
-        moved = np.linalg.norm(uv - guess, axis=1)
-        self._last_miss = float(np.median(moved[found])) if found.any() else np.inf
+        self._miss_px = float(np.median(np.linalg.norm(uv - guess, axis=1)[found])) if found.any() else np.inf
         warp = tracks.warp.copy()
-        slot = tracks.slot
         ncc = flow.track_affine(
-            pyramid[0], uv, warp, slot, found, self._patches.patch, self._patches.gradients,
+            pyramid[0], uv, warp, tracks.slot, found, self._patches.patch, self._patches.gradients,
             self._patches.inverse_normal, self._patches.contrast, 6, flow.WEIGHTS, flow.COORDINATES,
         )  # fmt: skip
-        found &= ncc > config.min_anchor_ncc
-        found &= self._rig.left.inside(uv, 1.0)
+        found &= (ncc > config.min_anchor_ncc) & self._rig.left.inside(uv, 1.0)
         out = tracks.keep(found)
         out.uv, out.warp = uv[found], warp[found]
-        return out, guess
+        return out
 
-    def _solve(self, tracks: Tracks, uv_right: F64, predicted: F64, before: int) -> tuple[F64, F64, F64, str]:
-        """Pose, covariance, whitened error of each track, and why not ('' when solved)."""
+    def _solve(self, tracks: Tracks, uv_right: F64, predicted: F64) -> PoseSolution:
+        """Pose from the prediction; from the previous pose when the prediction finds no consensus."""
         config = self._config
-        none = np.eye(4), np.eye(6), np.zeros(0)
         if len(tracks) < config.min_features:
-            return *none, "too_few_points"
-        pose, covariance, error = self._optimise(tracks, uv_right, predicted, COARSE_TO_FINE)
-        share = float((error < config.max_error).mean())
-        if share < 0.5:
-            for start in (self._pose,):
-                other = self._optimise(tracks, uv_right, start, COARSE_TO_FINE)
-                if (other[2] < config.max_error).mean() > share:
-                    pose, covariance, error = other
-        inliers = int((error < config.max_error).sum())
-        if inliers < config.min_features:
-            return *none, "no_consensus"
-        return pose, covariance, error, ""
+            return PoseSolution(np.eye(4), np.eye(6), np.full(len(tracks), np.inf), 0.0, "too_few_points")
+        best = self._optimise(tracks, uv_right, predicted)
+        if best.inliers < 0.5 * len(tracks):
+            best = max(best, self._optimise(tracks, uv_right, self._pose), key=lambda s: s.inliers)
+        if best.inliers < config.min_features:
+            best.reason = "no_consensus"
+        return best
 
-    def _optimise(self, tracks: Tracks, uv_right: F64, start: F64, scales: F64) -> tuple[F64, F64, F64]:
-        return motion.optimise_pose(
+    def _optimise(self, tracks: Tracks, uv_right: F64, start: F64) -> PoseSolution:
+        pose, covariance, error = motion.optimise_pose(
             start, tracks.origin, tracks.direction, tracks.rho, tracks.variance, tracks.uv, uv_right,
-            np.ones(len(tracks)), self._eyes.cams, self._eyes.right_T_left, self._config.sigma_px, scales,
-            np.zeros((6, 6)), start,
+            np.ones(len(tracks)), self._eyes.cams, self._eyes.right_T_left, self._config.sigma_px * self._noise,
+            CAUCHY_SCALES, np.zeros((6, 6)), start,
         )  # fmt: skip
+        return PoseSolution(pose, covariance, error, self._config.max_error)
 
     def _refine(self, tracks: Tracks, pose: F64, inlier: Bool) -> None:
         motion.refine_depth(
@@ -214,7 +255,7 @@ class Tracker:
         self._pose, self._stamp_ns, self._pyramid, self._tracks = pose, image.stamp_ns, pyramid, tracks
         self._lost = 0
         self._state = TrackState.OK
-        self._first_level = 1 if getattr(self, "_last_miss", np.inf) < 3.0 else self._config.pyramid_levels - 1
+        self._first_level = 1 if self._miss_px < 3.0 else self._config.pyramid_levels - 1
         self._patches.keep_only(tracks.slot)
 
     def _lose(
@@ -241,7 +282,7 @@ class Tracker:
         old = int((self._tracks.point_ids < self._kf_last_point_id).sum())
         return self._frames_since_kf >= config.keyframe_max_frames or old < config.keyframe_share * self._kf_points
 
-    def _make_keyframe(self, image: StereoImage, pyramid: flow.Pyramid, right: object, covariance: F64) -> Keyframe:
+    def _make_keyframe(self, image: StereoImage, pyramid: flow.Pyramid, right: flow.Pyramid | F32, covariance: F64) -> Keyframe:
         self._add_points(pyramid, right)
         tracks = self._tracks
         points_cam = se3.transform(se3.inverse(self._pose), tracks.points())
@@ -267,7 +308,7 @@ class Tracker:
         self._frames_since_kf = 0
         return keyframe
 
-    def _add_points(self, pyramid: flow.Pyramid, right: object) -> None:
+    def _add_points(self, pyramid: flow.Pyramid, right: flow.Pyramid | F32) -> None:
         config = self._config
         missing = config.max_features - len(self._tracks)
         if missing <= 0:
