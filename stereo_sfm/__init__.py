@@ -1,5 +1,81 @@
-"""Visual structure-from-motion and SLAM for stereo cameras in retail stores."""
+"""Visual structure-from-motion and SLAM for stereo cameras in retail stores.
+
+    import stereo_sfm as s
+
+    with s.open_source("recordings/demo.mcap") as source:
+        for frame in s.run(source, s.Config()):
+            print(frame.stamp_ns, frame.state.name, frame.odom_T_cam[:3, 3])
+
+Names are imported when they are first used, so that `import stereo_sfm` is instant.
+"""
 
 from __future__ import annotations
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from calib.formats import load_rig, save_rig
+    from calib.rig import Rig
+    from drivers.ground_truth import read_trajectory
+    from drivers.source import open_source
+    from stereo_sfm.config import Config
+    from stereo_sfm.config import load as load_config
+    from stereo_sfm.demo import demo_recording
+    from stereo_sfm.errors import StereoSfmError
+    from stereo_sfm.eval.evaluate import evaluate
+    from stereo_sfm.pipeline.run import run
+    from stereo_sfm.types import Frame, StereoImage, TrackState, Trajectory
+
+__all__ = [
+    "Config",
+    "Frame",
+    "Rig",
+    "StereoImage",
+    "StereoSfmError",
+    "TrackState",
+    "Trajectory",
+    "__version__",
+    "demo_recording",
+    "evaluate",
+    "load_config",
+    "load_rig",
+    "open_source",
+    "read_trajectory",
+    "run",
+    "save_rig",
+]
+
 __version__ = "0.1.0"
+
+# name -> (module, attribute)
+_LAZY: dict[str, tuple[str, str]] = {
+    "Config": ("stereo_sfm.config", "Config"),
+    "Frame": ("stereo_sfm.types", "Frame"),
+    "Rig": ("calib.rig", "Rig"),
+    "StereoImage": ("stereo_sfm.types", "StereoImage"),
+    "StereoSfmError": ("stereo_sfm.errors", "StereoSfmError"),
+    "TrackState": ("stereo_sfm.types", "TrackState"),
+    "Trajectory": ("stereo_sfm.types", "Trajectory"),
+    "demo_recording": ("stereo_sfm.demo", "demo_recording"),
+    "evaluate": ("stereo_sfm.eval.evaluate", "evaluate"),
+    "load_config": ("stereo_sfm.config", "load"),
+    "load_rig": ("calib.formats", "load_rig"),
+    "open_source": ("drivers.source", "open_source"),
+    "read_trajectory": ("drivers.ground_truth", "read_trajectory"),
+    "run": ("stereo_sfm.pipeline.run", "run"),
+    "save_rig": ("calib.formats", "save_rig"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LAZY:
+        raise AttributeError(f"module 'stereo_sfm' has no attribute '{name}'")
+    module, attribute = _LAZY[name]
+    value = getattr(importlib.import_module(module), attribute)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_LAZY})

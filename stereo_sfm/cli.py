@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import logging
+import os
 import sys
 from collections.abc import Sequence
 
@@ -44,8 +46,26 @@ def _print_versions() -> None:
         print(f"{package} {version(package)}")
 
 
+class _Standard(logging.Handler):
+    """One line on standard error a message, wherever standard error points at that time."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print(f"{record.levelname.lower()}: {record.getMessage()}", file=sys.stderr)
+
+
+def _start_logging(options: argparse.Namespace) -> None:
+    log = logging.getLogger("stereo_sfm")
+    log.handlers = [_Standard()]
+    log.propagate = False
+    verbose, quiet = getattr(options, "verbose", False), getattr(options, "quiet", False)
+    log.setLevel(logging.INFO if verbose else logging.ERROR if quiet else logging.WARNING)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point. Exit codes: 0 ok, 1 internal error, 2 bad input, 3 check failed, 4 tracking failed, 130 interrupted."""
+    """Entry point.
+
+    Exit codes: 0 ok, 1 internal error, 2 bad input, 3 check failed, 4 tracking failed, 130 interrupted.
+    """
     args = list(sys.argv[1:] if argv is None else argv)
     chosen = next((a for a in args if a in COMMANDS), None)
     parser = _build_parser(chosen)
@@ -56,12 +76,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     if options.command is None:
         parser.print_help()
         return 0
+    _start_logging(options)
     command = importlib.import_module(f"stereo_sfm.commands.{options.command.replace('-', '_')}")
     try:
         return command.run(options)
     except StereoSfmError as error:
         print(f"stereo-sfm {options.command}: {error}", file=sys.stderr)
         return error.exit_code
+    except BrokenPipeError:
+        # The reader of our output went away (`| head`): nothing is wrong, and nothing more can be said.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130

@@ -98,12 +98,12 @@ def plot_times(path: Path, record: RunRecord, stages: Sequence[str]) -> None:
     axes = figure.subplots()
     seconds = _seconds(record)[: len(record.times)]
     for stage in stages[:SHOWN_STAGES]:
-        axes.plot(seconds, [ms.get(stage, np.nan) for ms in record.times], linewidth=1, label=stage)
+        axes.plot(seconds, [ms.get(stage, np.nan) for ms in record.times], ".-", markersize=2, linewidth=1, label=stage)
     everything = [value for ms in record.times for value in ms.values()]
     axes.set(xlabel="time [s]", ylabel="ms", title="time per stage")
     axes.set_ylim(0, 1.2 * float(np.percentile(everything, 99.5)) if everything else 1)
     axes.grid(alpha=0.3)
-    axes.legend(loc="upper right")
+    axes.legend(loc="center left", bbox_to_anchor=(1, 0.5))
     _save(figure, path)
 
 
