@@ -197,7 +197,7 @@ def _person(persons_i, ellipsoids, q, ox, oy, oz, dx, dy, dz, limit):
 
 
 @njit
-def trace(w, order, moving, ox, oy, oz, dx, dy, dz):
+def trace(w, order, gaps, moving, ox, oy, oz, dx, dy, dz):
     """Nearest surface along a ray -> (t, id)."""
     room, groups, groups_i, blocks, blocks_i = w.room, w.groups, w.groups_i, w.blocks, w.blocks_i
     ix, iy, iz = inverse(dx), inverse(dy), inverse(dz)
@@ -211,6 +211,8 @@ def trace(w, order, moving, ox, oy, oz, dx, dy, dz):
         best, hit = t, pack(ROOM, 0, 0, 5 if dy > 0 else 4)
     for n in range(order.shape[0]):
         g = order[n]
+        if gaps[n] >= best:
+            break
         t0, t1, axis = slab(
             groups[g, 0], groups[g, 1], groups[g, 2], groups[g, 3], groups[g, 4], groups[g, 5], ox, oy, oz, ix, iy, iz
         )

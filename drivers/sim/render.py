@@ -17,9 +17,9 @@ from stereo_sfm.types import F32, F64, I32, I64
 
 EDGE_RAYS = np.array([[-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 0.125]])  # rotated grid, px
 EDGE_CONTRAST = 4.0  # least step of brightness (of 255) worth several rays
+_CENTRE = np.zeros((1, 2))
 _STEPS = (np.arange(6) - 2.5) / 6
 TARGET_RAYS = np.stack(np.meshgrid(_STEPS, _STEPS), -1).reshape(-1, 2)  # flat pictures are for sub-pixel measurement
-CHUNK = 400_000  # rays at a time
 
 
 class Moving(NamedTuple):
@@ -62,16 +62,9 @@ class Eye:
         self.grid = grid  # (H, W, 3) unit bearings, NaN where the lens shows nothing
         self.du, self.dv = np.gradient(grid, axis=1), np.gradient(grid, axis=0)  # (H, W, 3) per pixel
         angles = np.sqrt(np.linalg.norm(self.du, axis=-1) * np.linalg.norm(self.dv, axis=-1))
-        self.valid = np.flatnonzero(np.isfinite(grid[..., 2]))  # (N,) flat indices of pixels with a ray
-        self.bearings = grid.reshape(-1, 3)[self.valid]  # (N, 3)
-        self.angles = np.nan_to_num(angles, nan=1.0 / camera.fx).ravel()  # (H * W,) radians a pixel covers
+        self.angles = np.nan_to_num(angles, nan=1.0 / camera.fx)  # (H, W) radians a pixel covers
         self.inner = np.isfinite(self.du).all(-1) & np.isfinite(self.dv).all(-1)  # (H, W) has rays all around
-
-    def spread(self, pixels: I64, offsets: F64) -> tuple[F64, F64]:
-        """Rays at `offsets` (K, 2) px inside flat `pixels` (M,) -> bearings (M * K, 3), angles (M * K,)."""
-        centre, du, dv = (a.reshape(-1, 3)[pixels, None] for a in (self.grid, self.du, self.dv))
-        rays = centre + offsets[:, :1] * du + offsets[:, 1:] * dv
-        return rays.reshape(-1, 3), np.repeat(self.angles[pixels] / np.sqrt(len(offsets)), len(offsets))
+        self.valid = np.flatnonzero(np.isfinite(grid[..., 2]))  # (N,) flat indices of pixels with a ray
 
 
 class Renderer:
@@ -89,33 +82,23 @@ class Renderer:
     def view(self, eye: int, world_T_eye: F64, moving: Moving = NOTHING) -> View:
         """One eye at its own pose (4, 4)."""
         rays, shape = self.eyes[eye], self.eyes[eye].grid.shape[:2]
-        values, depths, hits = self.cast(world_T_eye, moving, rays.bearings, rays.angles[rays.valid])
-        image, depth = np.zeros(shape, np.float32), np.full(shape, np.nan, np.float32)
-        ids = np.full(shape, -1, np.int32)
-        image.flat[rays.valid], depth.flat[rays.valid], ids.flat[rays.valid] = values, depths, hits
-        found = np.empty(ids.size, np.int64)
-        edges = found[: find_edges(image, ids, EDGE_CONTRAST, found)]
-        self._refine(rays, world_T_eye, moving, edges[rays.inner.flat[edges]], EDGE_RAYS, image)
+        view = View(np.zeros(shape, np.float32), np.full(shape, np.nan, np.float32), np.full(shape, -1, np.int32))
+        self._cast(rays, world_T_eye, moving, rays.valid, _CENTRE, view)
+        found = np.empty(view.ids.size, np.int64)
+        edges = found[: find_edges(view.image, view.ids, rays.inner, EDGE_CONTRAST, found)]
+        self._cast(rays, world_T_eye, moving, edges, EDGE_RAYS, view)
         if len(moving.targets):
-            near = cv2.dilate((ids >> 4 & 7 == TARGET).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-            self._refine(rays, world_T_eye, moving, np.flatnonzero(near & rays.inner), TARGET_RAYS, image)
-        return View(image, depth, ids)
+            shown = ((view.ids >> 4) & 7 == TARGET) & (view.ids >= 0)
+            near = cv2.dilate(shown.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+            self._cast(rays, world_T_eye, moving, np.flatnonzero(near & rays.inner), TARGET_RAYS, view)
+        return view
 
-    def cast(self, world_T_eye: F64, moving: Moving, bearings: F64, angles: F64) -> tuple[F32, F32, I32]:
-        """Rays (N, 3) of an eye, each standing for `angles` (N,) radians -> brightness, metres, surface (N,)."""
-        n, pose = len(bearings), np.ascontiguousarray(world_T_eye, float)
-        values, depths, ids = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(n, np.int32)
-        cast(self.world, moving, self._order(pose[:3, 3]), pose, bearings, angles, values, depths, ids)
-        return values, depths, ids
-
-    def _refine(self, rays: Eye, world_T_eye: F64, moving: Moving, pixels: I64, offsets: F64, image: F32) -> None:
-        """Replace pixels of `image` by the mean over several rays each."""
-        for part in np.array_split(pixels, len(pixels) * len(offsets) // CHUNK + 1):
-            values = self.cast(world_T_eye, moving, *rays.spread(part, offsets))[0]
-            image.flat[part] = values.reshape(-1, len(offsets)).mean(1)
-
-    def _order(self, origin: F64) -> I64:
-        """Groups by distance, nearest first."""
-        lo, hi = self.world.groups[:, :3], self.world.groups[:, 3:]
-        gap = np.maximum(np.maximum(lo - origin, origin - hi), 0)
-        return np.argsort((gap**2).sum(1), kind="stable").astype(np.int64)
+    def _cast(self, rays: Eye, world_T_eye: F64, moving: Moving, pixels: I64, offsets: F64, view: View) -> None:
+        """Write flat `pixels` of the view, each the mean over rays at `offsets` (K, 2) px."""
+        pose = np.ascontiguousarray(world_T_eye, float)
+        lo, hi, origin = self.world.groups[:, :3], self.world.groups[:, 3:], pose[:3, 3]
+        gaps = np.linalg.norm(np.maximum(np.maximum(lo - origin, origin - hi), 0), axis=1)
+        order = np.argsort(gaps, kind="stable").astype(np.int64)
+        flat = [a.reshape(-1, 3) for a in (rays.grid, rays.du, rays.dv)]
+        out = [a.reshape(-1) for a in (view.image, view.depth, view.ids)]
+        cast(self.world, moving, order, gaps[order], pose, pixels, offsets, *flat, rays.angles.ravel(), *out)

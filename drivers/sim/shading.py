@@ -164,6 +164,8 @@ def _product(w, c, face, part, x, y, z, dx, dy, dz, size):
     elif side == SIDE:
         k, s, t, ds, dt, cos, high = w.facings_i[c, 1], column, row, dw, dz, du, unit_h
         wide = unit_d
+        if du > 0:
+            s = 1 - s
         light *= 0.6
     else:
         k, s, t, ds, dt, cos, high = w.facings_i[c, 2], (u - u0) / wide, column, du, dw, dz, unit_d
@@ -226,33 +228,46 @@ def shade(w, moving, t, hit, ox, oy, oz, dx, dy, dz, angle):
 
 
 @njit
-def cast(w, moving, order, world_T_eye, bearings, angles, values, depths, ids):
-    """One ray each: what it shows.
+def cast(w, moving, order, gaps, world_T_eye, pixels, offsets, grid, du, dv, angles, image, depth, ids):
+    """What some pixels show, each the mean over one ray per offset.
 
     Args:
-        order: groups, nearest first. world_T_eye: (4, 4). bearings: (N, 3) in the eye.
-        angles: (N,) radians that the ray stands for.
-        values, depths, ids: (N,) written: brightness, distance along the ray in metres, surface.
+        order, gaps: groups, nearest first, and their distances in metres. world_T_eye: (4, 4).
+        pixels: (M,) flat indices. offsets: (K, 2) px inside a pixel; one row for its centre alone.
+        grid, du, dv: (H * W, 3) bearings and their change per pixel. angles: (H * W,) radians a pixel covers.
+        image, depth, ids: (H * W,) written: brightness; and with one offset distance along the ray (m), surface.
     """
     r, ox, oy, oz = world_T_eye, world_T_eye[0, 3], world_T_eye[1, 3], world_T_eye[2, 3]
-    for i in range(bearings.shape[0]):
-        a, b, c = bearings[i, 0], bearings[i, 1], bearings[i, 2]
-        dx = r[0, 0] * a + r[0, 1] * b + r[0, 2] * c
-        dy = r[1, 0] * a + r[1, 1] * b + r[1, 2] * c
-        dz = r[2, 0] * a + r[2, 1] * b + r[2, 2] * c
-        t, hit = kernels.trace(w, order, moving, ox, oy, oz, dx, dy, dz)
-        values[i] = shade(w, moving, t, hit, ox, oy, oz, dx, dy, dz, angles[i])
-        depths[i], ids[i] = t, hit
+    rays = offsets.shape[0]
+    narrow = 1 / math.sqrt(rays)
+    for i in range(pixels.shape[0]):
+        p = pixels[i]
+        total, t, hit = 0.0, 0.0, 0
+        for q in range(rays):
+            a, b, c = grid[p, 0], grid[p, 1], grid[p, 2]
+            if rays > 1:
+                x, y = offsets[q, 0], offsets[q, 1]
+                a += x * du[p, 0] + y * dv[p, 0]
+                b += x * du[p, 1] + y * dv[p, 1]
+                c += x * du[p, 2] + y * dv[p, 2]
+            dx = r[0, 0] * a + r[0, 1] * b + r[0, 2] * c
+            dy = r[1, 0] * a + r[1, 1] * b + r[1, 2] * c
+            dz = r[2, 0] * a + r[2, 1] * b + r[2, 2] * c
+            t, hit = kernels.trace(w, order, gaps, moving, ox, oy, oz, dx, dy, dz)
+            total += shade(w, moving, t, hit, ox, oy, oz, dx, dy, dz, angles[p] * narrow)
+        image[p] = total / rays
+        if rays == 1:
+            depth[p], ids[p] = t, hit
 
 
 @njit
-def find_edges(image, ids, contrast, out):
-    """Flat indices (H * W) of pixels at which another surface, brighter or darker by `contrast`, begins -> count."""
+def find_edges(image, ids, inner, contrast, out):
+    """Flat indices of `inner` pixels at which another surface, brighter or darker by `contrast`, begins -> count."""
     h, wide, n = image.shape[0], image.shape[1], 0
     for v in range(1, h - 1):
         for u in range(1, wide - 1):
             here, value = ids[v, u], image[v, u]
-            if here >= 0 and (
+            if inner[v, u] and (
                 (ids[v, u - 1] != here and abs(image[v, u - 1] - value) > contrast)
                 or (ids[v, u + 1] != here and abs(image[v, u + 1] - value) > contrast)
                 or (ids[v - 1, u] != here and abs(image[v - 1, u] - value) > contrast)
