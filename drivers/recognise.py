@@ -8,9 +8,10 @@ from stereo_sfm.errors import StereoSfmError
 
 
 def _is_kitti(folder: Path) -> bool:
-    return any((folder / p).is_dir() for p in ("sequences", "dataset/sequences")) or (
-        (folder / "calib.txt").is_file() and any((folder / f"image_{i}").is_dir() for i in (0, 2))
-    )
+    if any((folder / p).is_dir() for p in ("sequences", "dataset/sequences")):
+        return True
+    sequences = (folder, *sorted(folder.glob("[0-9][0-9]")))
+    return any((s / "calib.txt").is_file() and (s / f"image_{i}").is_dir() for s in sequences for i in (0, 2))
 
 
 def _is_kitti_raw(folder: Path) -> bool:

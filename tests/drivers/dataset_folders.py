@@ -1,0 +1,96 @@
+"""Small data sets on disk for the tests of the drivers: a textured pair of images and what each layout needs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from stereo_sfm.types import U8
+
+WIDTH, HEIGHT = 64, 48
+FRAMES = 4
+PERIOD_NS = 50_000_000
+START_NS = 1_403_636_579_763_555_584
+
+
+def picture(frame: int, eye: int) -> U8:
+    """(HEIGHT, WIDTH) noise, different for each frame and eye."""
+    rng = np.random.default_rng([frame, eye])
+    return rng.integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8)
+
+
+def write_images(folder: Path, eye: int, names: list[str]) -> None:
+    """One picture for each name."""
+    folder.mkdir(parents=True)
+    for i, name in enumerate(names):
+        cv2.imwrite(str(folder / name), picture(i, eye))
+
+
+def make_kitti(root: Path, frames: int = FRAMES) -> Path:
+    """Data set root with sequence 00; the camera moves 1 m forward a frame."""
+    sequence = root / "sequences" / "00"
+    for eye in (0, 1):
+        write_images(sequence / f"image_{eye}", eye, [f"{i:06d}.png" for i in range(frames)])
+    (sequence / "calib.txt").write_text("P0: 50 0 32 0 0 50 24 0 0 0 1 0\nP1: 50 0 32 -25 0 50 24 0 0 0 1 0\n")
+    (sequence / "times.txt").write_text("".join(f"{i * 0.1:.6e}\n" for i in range(frames)))
+    (root / "poses").mkdir()
+    (root / "poses" / "00.txt").write_text("".join(f"1 0 0 0 0 1 0 0 0 0 1 {i}\n" for i in range(frames)))
+    return root
+
+
+def make_euroc(root: Path, frames: int = FRAMES) -> Path:
+    """EuRoC folder whose body is 1 m above the camera and looks the other way."""
+    stamps = [START_NS + i * PERIOD_NS for i in range(frames)]
+    for eye in (0, 1):
+        camera = root / "mav0" / f"cam{eye}"
+        write_images(camera / "data", eye, [f"{s}.png" for s in stamps])
+        (camera / "data.csv").write_text("#timestamp [ns],filename\n" + "".join(f"{s},{s}.png\n" for s in stamps))
+        (camera / "sensor.yaml").write_text(
+            f"T_BS: {{cols: 4, rows: 4, data: [-1, 0, 0, {-0.1 * eye}, 0, 1, 0, -1, 0, 0, -1, 0, 0, 0, 0, 1]}}\n"
+            f"resolution: [{WIDTH}, {HEIGHT}]\ncamera_model: pinhole\nintrinsics: [50, 50, 32, 24]\n"
+            "distortion_model: radial-tangential\ndistortion_coefficients: [-0.1, 0.01, 0, 0]\n"
+        )
+    truth = root / "mav0" / "state_groundtruth_estimate0"
+    truth.mkdir()
+    rows = [f"{s},{i},2,3,1,0,0,0,9,9,9" for i, s in enumerate(stamps)]
+    (truth / "data.csv").write_text("#timestamp, p_RS_R_x [m], ...\n" + "\n".join(rows) + "\n")
+    return root
+
+
+RIG = f"""stereo_sfm_rig: 1
+depth: false
+left: {{model: pinhole, size: [{WIDTH}, {HEIGHT}], focal: [50, 50], centre: [32, 24], distortion: []}}
+right: {{model: pinhole, size: [{WIDTH}, {HEIGHT}], focal: [50, 50], centre: [32, 24], distortion: []}}
+left_T_right: [[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+body_T_left: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+"""
+
+
+def make_images(root: Path, names: list[str] | None = None) -> Path:
+    """left/ and right/ with rig.yaml."""
+    names = names or [f"{i}.png" for i in range(12)]
+    for eye, side in enumerate(("left", "right")):
+        write_images(root / side, eye, names)
+    (root / "rig.yaml").write_text(RIG)
+    return root
+
+
+def make_tum_rgbd(root: Path) -> Path:
+    """rgbd_dataset_freiburg1_*: two frames at 640x480, the second depth image too late for its colour image."""
+    folder = root / "rgbd_dataset_freiburg1_test"
+    for name in ("rgb", "depth"):
+        (folder / name).mkdir(parents=True)
+    colour = np.zeros((480, 640, 3), np.uint8)
+    colour[:] = 10, 20, 200
+    depth = np.full((480, 640), 7500, np.uint16)
+    depth[0, 0] = 0
+    for i in range(3):
+        cv2.imwrite(str(folder / "rgb" / f"{i}.png"), colour)
+        cv2.imwrite(str(folder / "depth" / f"{i}.png"), depth)
+    (folder / "rgb.txt").write_text("# c\n" + "".join(f"{100 + i / 10:.6f} rgb/{i}.png\n" for i in range(3)))
+    shifts = (0.004, 0.05, -0.003)
+    (folder / "depth.txt").write_text("".join(f"{100 + i / 10 + s:.6f} depth/{i}.png\n" for i, s in enumerate(shifts)))
+    (folder / "groundtruth.txt").write_text("# t\n100.0 0 0 0 0 0 0 1\n100.3 0 0 1 0 0 0 1\n")
+    return folder

@@ -1,0 +1,219 @@
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from drivers.folder_source import pair_by_stamp
+from drivers.recognise import recognise_folder
+from drivers.select import SelectedFrames
+from drivers.source import open_source
+from stereo_sfm.errors import StereoSfmError
+from tests.drivers.dataset_folders import (
+    FRAMES,
+    PERIOD_NS,
+    START_NS,
+    make_euroc,
+    make_images,
+    make_kitti,
+    make_tum_rgbd,
+    picture,
+)
+
+
+def test_kitti_root_and_sequence_folder_are_one_source(tmp_path: Path) -> None:
+    root = make_kitti(tmp_path)
+    for spec in (root, root / "sequences", root / "sequences" / "00", f"kitti:{root}?sequence=00"):
+        with open_source(spec) as source:
+            images = list(source)
+            assert source.name == "kitti:00"
+            assert source.frame_count == len(images) == FRAMES
+            assert [i.stamp_ns for i in images] == [0, 10**8, 2 * 10**8, 3 * 10**8]
+            assert np.array_equal(images[2].left, picture(2, 0))
+            assert images[2].right is not None and np.array_equal(images[2].right, picture(2, 1))
+            assert source.rig.left_T_right[0, 3] == pytest.approx(0.5)
+            assert source.ground_truth is not None
+            assert source.ground_truth.positions[:, 2].tolist() == [0, 1, 2, 3]
+
+
+def test_several_kitti_sequences_must_be_chosen_from(tmp_path: Path) -> None:
+    root = make_kitti(tmp_path)
+    (root / "sequences" / "07" / "image_0").mkdir(parents=True)
+    with pytest.raises(StereoSfmError, match="00, 07: say which"):
+        open_source(root)
+
+
+def test_kitti_colour_pair_is_moved_to_its_own_left_camera(tmp_path: Path) -> None:
+    root = make_kitti(tmp_path)
+    sequence = root / "sequences" / "00"
+    for old, new in ((0, 2), (1, 3)):
+        (sequence / f"image_{old}").rename(sequence / f"image_{new}")
+    (sequence / "calib.txt").write_text("P2: 50 0 32 -3 0 50 24 0 0 0 1 0\nP3: 50 0 32 -28 0 50 24 0 0 0 1 0\n")
+    with open_source(root) as source:
+        assert source.rig.baseline == pytest.approx(0.5)
+        assert source.ground_truth is not None
+        assert source.ground_truth.positions[0] == pytest.approx([0.06, 0, 0])
+
+
+def test_euroc_ground_truth_is_the_left_cameras(tmp_path: Path) -> None:
+    with open_source(make_euroc(tmp_path / "euroc")) as source:
+        assert source.name == "euroc:euroc"
+        images = list(source)
+        assert [i.stamp_ns for i in images] == [START_NS + i * PERIOD_NS for i in range(FRAMES)]
+        assert source.rig.left_T_right[:3, 3] == pytest.approx([0.1, 0, 0])
+        truth = source.ground_truth
+        assert truth is not None
+        # The body looks along +z without rotation, so the camera at T_BS is 1 m below it and looks along -z.
+        assert truth.poses[2][:3, :3] == pytest.approx(np.diag([-1, 1, -1]))
+        assert truth.positions[2] == pytest.approx([2, 1, 3])
+
+
+def test_euroc_pairs_by_stamp_when_one_eye_lacks_frames(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    root = make_euroc(tmp_path)
+    listing = root / "mav0" / "cam1" / "data.csv"
+    lines = listing.read_text().splitlines()
+    listing.write_text("\n".join([lines[0], *lines[2:]]) + "\n")
+    with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(root) as source:
+        images = list(source)
+    assert [i.stamp_ns for i in images] == [START_NS + i * PERIOD_NS for i in (1, 2, 3)]
+    assert images[0].right is not None and np.array_equal(images[0].right, picture(1, 1))
+    assert "4 left and 3 right images, the 3 pairs are used" in caplog.text
+
+
+def test_sixteen_bit_images_keep_their_upper_eight_bits(tmp_path: Path) -> None:
+    root = make_euroc(tmp_path)
+    for path in (root / "mav0" / "cam0" / "data").glob("*.png"):
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        cv2.imwrite(str(path), (image.astype(np.uint16) << 8) + 240)
+    with open_source(root) as source:
+        assert np.array_equal(next(iter(source)).left, picture(0, 0))
+
+
+def test_tum_rgbd_has_depth_in_metres_and_a_virtual_eye(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(make_tum_rgbd(tmp_path)) as source:
+        images = list(source)
+        assert [i.stamp_ns for i in images] == [100 * 10**9, 100_200_000_000]
+        depth = images[0].depth
+        assert depth is not None and depth.dtype == np.float32
+        assert np.isnan(depth[0, 0]) and depth[5, 5] == pytest.approx(1.5)
+        assert images[0].right is None
+        assert source.rig.depth and source.rig.baseline == pytest.approx(0.08)
+        assert source.rig.left.model == "radtan" and source.rig.left.fx == pytest.approx(517.306408)
+        assert source.ground_truth is not None and source.ground_truth.positions[-1].tolist() == [0, 0, 1]
+    assert "1 of 3 colour images have no depth image" in caplog.text
+
+
+def test_tum_rgbd_of_an_unknown_camera_needs_a_rig(tmp_path: Path) -> None:
+    folder = make_tum_rgbd(tmp_path).rename(tmp_path / "my_kinect")
+    with pytest.raises(StereoSfmError, match="--rig FILE"):
+        open_source(folder)
+
+
+def test_image_folders_in_natural_order_with_a_rig_file(tmp_path: Path) -> None:
+    with open_source(make_images(tmp_path), fps="20") as source:
+        images = list(source)
+        assert np.array_equal(images[10].left, picture(10, 0))  # 10.png after 9.png, not after 1.png
+        assert images[10].stamp_ns == 500_000_000
+        assert source.rig.baseline == pytest.approx(0.1)
+
+
+def test_image_files_named_by_time(tmp_path: Path) -> None:
+    names = [f"{START_NS + i * PERIOD_NS}.png" for i in range(3)]
+    with open_source(make_images(tmp_path, names)) as source:
+        assert [i.stamp_ns for i in source] == [START_NS + i * PERIOD_NS for i in range(3)]
+
+
+def test_image_times_file(tmp_path: Path) -> None:
+    make_images(tmp_path, ["a.png", "b.png"])
+    (tmp_path / "times.txt").write_text("1305031102.175304\n1305031102.211214\n")
+    with open_source(tmp_path) as source:
+        assert [i.stamp_ns for i in source] == [1305031102175304000, 1305031102211214000]
+
+
+def test_left_and_right_files_in_one_folder(tmp_path: Path) -> None:
+    make_images(tmp_path, [f"{i:02d}.png" for i in (1, 2, 4)])
+    for side in ("left", "right"):
+        for path in (tmp_path / side).iterdir():
+            path.rename(tmp_path / f"{side}{path.name}")
+        (tmp_path / side).rmdir()
+    (tmp_path / "right02.png").unlink()
+    with open_source(tmp_path) as source:
+        images = list(source)
+    assert len(images) == 2
+    assert np.array_equal(images[1].left, picture(2, 0))
+    assert images[1].right is not None and np.array_equal(images[1].right, picture(2, 1))
+
+
+def test_a_folder_of_something_else(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("milk\n")
+    with pytest.raises(StereoSfmError, match="no dataset that is known") as error:
+        recognise_folder(tmp_path)
+    assert "\n" not in str(error.value)
+
+
+def test_unreadable_images_are_dropped_and_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    root = make_kitti(tmp_path, frames=6)
+    sequence = root / "sequences" / "00"
+    (sequence / "image_0" / "000002.png").write_bytes(b"not a picture")
+    (sequence / "image_1" / "000003.png").write_bytes(b"")
+    with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(root) as source:
+        images = list(source)
+    assert [(i.frame_id, i.dropped_before) for i in images] == [(0, 0), (1, 0), (4, 2), (5, 0)]
+    assert len([r for r in caplog.records if "cannot read" in r.getMessage()]) == 2
+
+
+def test_only_unreadable_images_are_an_error(tmp_path: Path) -> None:
+    root = make_kitti(tmp_path)
+    for path in (root / "sequences" / "00" / "image_1").iterdir():
+        path.write_bytes(b"x")
+    with open_source(root) as source, pytest.raises(StereoSfmError, match="none of the 4 images"):
+        list(source)
+
+
+def test_a_size_that_contradicts_the_calibration_is_said_before_the_first_frame(tmp_path: Path) -> None:
+    root = make_images(tmp_path)
+    rig = root / "rig.yaml"
+    rig.write_text(rig.read_text().replace("[64, 48]", "[640, 480]"))
+    with pytest.raises(StereoSfmError, match="is 64x48 but the calibration is for 640x480"):
+        open_source(root)
+
+
+def test_another_rig_keeps_the_body_of_the_data_set(tmp_path: Path) -> None:
+    root = make_euroc(tmp_path / "euroc")
+    other = make_images(tmp_path / "other") / "rig.yaml"
+    with open_source(root, rig=other) as source:
+        assert source.rig.left.model == "pinhole"
+        assert source.ground_truth is not None and source.ground_truth.positions[2] == pytest.approx([2, 1, 3])
+
+
+def test_part_of_a_source(tmp_path: Path) -> None:
+    root = make_images(tmp_path)
+    (root / "left" / "4.png").write_bytes(b"x")
+
+    def part(**options: float) -> list[tuple[int, int]]:
+        with SelectedFrames(open_source(root, fps=10), **options) as source:
+            return [(i.frame_id, i.dropped_before) for i in source]
+
+    assert part(start_s=0.2, duration_s=0.5) == [(2, 0), (3, 0), (5, 1), (6, 0)]
+    assert part(frame_skip=3) == [(0, 0), (3, 0), (7, 1), (10, 0)]
+    assert part(max_frames=2) == [(0, 0), (1, 0)]
+    with pytest.raises(StereoSfmError, match="at least 1"):
+        part(frame_skip=0)
+
+
+def test_part_of_a_source_knows_how_many_frames_it_has(tmp_path: Path) -> None:
+    source = open_source(make_images(tmp_path))
+    assert SelectedFrames(source, frame_skip=5).frame_count == 3
+    assert SelectedFrames(source, max_frames=5).frame_count == 5
+    assert SelectedFrames(source, start_s=1).frame_count is None
+
+
+def test_pairs_take_the_smallest_difference_first() -> None:
+    # 10 is nearest to 11, so 7 must take the next one within reach, or nothing.
+    assert pair_by_stamp([7, 10], [11, 4], 5) == [(0, 1), (1, 0)]
+    assert pair_by_stamp([7, 10], [11], 5) == [(1, 0)]
+    assert pair_by_stamp([], [1], 5) == []
