@@ -37,16 +37,17 @@ class LoggedImage:
     format: str
 
 
-def encode_pair(image: StereoImage, image_format: str) -> LoggedImage:
+def encode_pair(image: StereoImage, image_format: str, decode: bool = True) -> LoggedImage:
     """Encode both eyes; for JPEG the pixels of `LoggedImage.image` are the decoded ones.
 
     Args:
         image: the pair.
         image_format: one of `FORMATS`.
+        decode: False saves the decoding of JPEG where nobody looks at the pixels again.
     """
     left = encode_pixels(image.left, image_format)
     right = None if image.right is None else encode_pixels(image.right, image_format)
-    if image_format == "jpeg":
+    if image_format == "jpeg" and decode:
         image = replace(image, left=decode_file(left), right=None if right is None else decode_file(right))
     return LoggedImage(image, left, right, image_format)
 

@@ -10,12 +10,15 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Self
 
+import numpy as np
+from mcap.data_stream import ReadDataStream
 from mcap.reader import SeekingReader
-from mcap.records import Attachment, Channel, Schema, Statistics
+from mcap.records import Attachment, Channel, MessageIndex, Schema, Statistics
 from mcap.summary import Summary
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log import repair
+from stereo_sfm.types import I64
 
 log = logging.getLogger("stereo_sfm")
 
@@ -89,6 +92,7 @@ class LogReader:
             raise
 
     def _open(self) -> tuple[SeekingReader, Summary]:
+        self._bytes: Any = self._stream  # what the reader sees: the file, or the file with the index it lacks
         self._stream.seek(0)
         try:
             reader = SeekingReader(self._stream, validate_crcs=True)
@@ -104,8 +108,8 @@ class LogReader:
             self.truncated += f"{', ' if self.truncated else ''}{len(index.bad_chunks)} damaged chunks left out"
         if self.truncated:
             log.warning("%s: %s ('stereo-sfm recover' writes a mended copy)", self.path, self.truncated)
-        mended: Any = _Mended(self._stream, index.end, repair.tail(index))
-        reader = SeekingReader(mended, validate_crcs=True)
+        self._bytes = _Mended(self._stream, index.end, repair.tail(index))
+        reader = SeekingReader(self._bytes, validate_crcs=True)
         summary = reader.get_summary()
         assert summary is not None
         return reader, summary
@@ -158,6 +162,19 @@ class LogReader:
             raise StereoSfmError(
                 f"{self.path} is damaged ({error}): 'stereo-sfm recover' copies what is whole"
             ) from None
+
+    def stamps(self, topic: str) -> I64:
+        """Log times of a topic in ascending order, from the index alone where the file has one."""
+        ids = {c.id for c in self.summary.channels.values() if c.topic == topic}
+        chunks = self.summary.chunk_indexes
+        if not chunks or any(not c.message_index_offsets for c in chunks):
+            return np.array([r.log_time for r in self.messages([topic])], np.int64)
+        out: list[int] = []
+        for chunk in chunks:
+            for channel_id in sorted(ids & chunk.message_index_offsets.keys()):
+                self._bytes.seek(chunk.message_index_offsets[channel_id] + repair.PREFIX)
+                out += [t for t, _ in MessageIndex.read(ReadDataStream(self._bytes)).records]
+        return np.sort(np.array(out, np.int64))
 
     def attachment(self, name: str) -> bytes | None:
         """The content of an attached file, None where there is none."""

@@ -38,7 +38,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from stereo_sfm.errors import StereoSfmError
 
-_PREFIX = 9  # opcode and length
+PREFIX = 9  # opcode and length
 _LAST_OPCODE = 0x0F
 # What broken bytes raise inside the library's parsers.
 DAMAGE = (McapError, ValueError, struct.error, EOFError, KeyError, MemoryError, OverflowError)
@@ -116,13 +116,13 @@ def spans(stream: IO[bytes], start: int = len(MCAP0_MAGIC)) -> Iterator[Span]:
     """Whole records from `start` on, until the bytes stop making sense."""
     size = stream.seek(0, 2)
     offset = start
-    while offset + _PREFIX <= size:
+    while offset + PREFIX <= size:
         stream.seek(offset)
-        opcode, length = struct.unpack("<BQ", stream.read(_PREFIX))
-        end = offset + _PREFIX + length
+        opcode, length = struct.unpack("<BQ", stream.read(PREFIX))
+        end = offset + PREFIX + length
         if end > size or not (1 <= opcode <= _LAST_OPCODE or opcode >= 0x80):
             return
-        yield Span(opcode, offset, _PREFIX + length)
+        yield Span(opcode, offset, PREFIX + length)
         offset = end
 
 
@@ -133,8 +133,8 @@ def read_span(stream: IO[bytes], span: Span) -> bytes:
 
 
 def _content(stream: IO[bytes], span: Span) -> ReadDataStream:
-    stream.seek(span.offset + _PREFIX)
-    return ReadDataStream(BytesIO(stream.read(span.length - _PREFIX)))
+    stream.seek(span.offset + PREFIX)
+    return ReadDataStream(BytesIO(stream.read(span.length - PREFIX)))
 
 
 def build_index(stream: IO[bytes]) -> Index:
@@ -199,7 +199,7 @@ def _add_record(index: Index, stream: IO[bytes], span: Span) -> None:
         channel = Channel.read(_content(stream, span))
         index.channels[channel.id] = channel
     elif span.opcode == Opcode.MESSAGE:
-        message = Message.read(_content(stream, span), span.length - _PREFIX)
+        message = Message.read(_content(stream, span), span.length - PREFIX)
         index.loose.append((message.channel_id, message.log_time))
     elif span.opcode == Opcode.MESSAGE_INDEX:
         _add_message_index(index, MessageIndex.read(_content(stream, span)), span)

@@ -1,0 +1,73 @@
+"""Where a file comes from: versions, source, configuration, as metadata and attachments."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from importlib.metadata import PackageNotFoundError, version
+
+from stereo_sfm import __version__
+from stereo_sfm.config import Config, dump
+from stereo_sfm.log.topics import SCHEMA_VERSION
+from stereo_sfm.log.writer import LogWriter
+
+METADATA = "stereo_sfm"
+CONFIG_FILE = "config.toml"
+VERSIONS_FILE = "versions.txt"
+_PACKAGES = (
+    "numpy",
+    "scipy",
+    "numba",
+    "opencv-python-headless",
+    "gtsam",
+    "mcap",
+    "protobuf",
+    "foxglove-schemas-protobuf",
+    "zstandard",
+    "depthai",
+)
+
+
+def write_provenance(
+    writer: LogWriter, *, source: str, serial: str, mode: str, image_format: str, config: Config | None = None
+) -> None:
+    """Record where everything in the file comes from.
+
+    Args:
+        writer: the open file.
+        source: the source's name for people.
+        serial: serial number of the device, "" for none.
+        mode: how the file came about: "record", "inline", "lockstep", "realtime".
+        image_format: one of `images.FORMATS`.
+        config: what decided the results of a run.
+    """
+    values = {
+        "version": __version__,
+        "schema_version": SCHEMA_VERSION,
+        "source": source,
+        "device_serial": serial,
+        "mode": mode,
+        "image_format": image_format,
+    }
+    if config is not None:
+        text = dump(config)
+        values |= {"seed": str(config.seed), "config_sha256": config_hash(text)}
+        writer.attach(CONFIG_FILE, text, "application/toml")
+    writer.metadata(METADATA, values)
+    writer.attach(VERSIONS_FILE, versions())
+
+
+def config_hash(text: str) -> str:
+    """Twelve digits that tell two configurations apart."""
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def versions() -> str:
+    """One line per package that results depend on."""
+    lines = [f"stereo-sfm {__version__}", f"python {platform.python_version()}", f"machine {platform.machine()}"]
+    for package in _PACKAGES:
+        try:
+            lines.append(f"{package} {version(package)}")
+        except PackageNotFoundError:
+            lines.append(f"{package} missing")
+    return "\n".join(lines) + "\n"

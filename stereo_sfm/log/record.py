@@ -1,0 +1,63 @@
+"""Write a source to a file, nothing else: what `stereo-sfm record` and `convert` do."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+from pathlib import Path
+
+from drivers.source import Source
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.log.image_log import ImageLog
+from stereo_sfm.log.images import FORMATS, encode_pair
+from stereo_sfm.log.provenance import write_provenance
+from stereo_sfm.log.writer import LogWriter
+
+
+@dataclass(frozen=True)
+class Progress:
+    """State of a recording after one more frame."""
+
+    frames: int
+    dropped: int
+    seconds: float  # of sensor time
+    bytes_written: int
+
+
+def record(
+    source: Source,
+    path: Path,
+    image_format: str = "png",
+    *,
+    overwrite: bool = False,
+    mode: str = "record",
+    clock: Callable[[], int] = time.time_ns,
+) -> Generator[Progress, None, None]:
+    """Write every frame of an open source; yields after each. Stop iterating (or close the iterator) to stop.
+
+    Args:
+        source: entered by the caller.
+        path: the .mcap file.
+        image_format: "png" (lossless), "raw" or "jpeg" (lossy).
+        overwrite: replace an existing file.
+        mode: goes into the metadata.
+        clock: wall clock in nanoseconds, for `publish_time`.
+
+    Raises:
+        StereoSfmError: the file cannot be written, the disk is full, the source fails, or it gave no frame.
+    """
+    if image_format not in FORMATS:
+        raise StereoSfmError(f"unknown image format '{image_format}' (known: {', '.join(FORMATS)})")
+    with LogWriter(path, overwrite=overwrite, compress=image_format != "raw", clock=clock) as writer:
+        write_provenance(writer, source=source.name, serial=source.rig.serial, mode=mode, image_format=image_format)
+        images = ImageLog(writer, source.rig, source.ground_truth, image_format)
+        frames, dropped, first_ns = 0, 0, None
+        for image in source:
+            images.image(encode_pair(image, image_format, decode=False))
+            first_ns = image.stamp_ns if first_ns is None else first_ns
+            frames += 1
+            dropped += image.dropped_before
+            yield Progress(frames, dropped, (image.stamp_ns - first_ns) / 1e9, writer.bytes_written)
+    if not frames:
+        raise StereoSfmError(f"{source.name} gave no image: {path} holds only its calibration")
