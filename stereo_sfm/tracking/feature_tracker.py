@@ -53,7 +53,7 @@ class FeatureTracker:
         self._spans = spans or NoSpans()
         self._views = ViewMaker(config.features, rig)
         self._norm = feature_kind(config.features.kind).norm
-        self._estimator = make_estimator(config.odometry)
+        self._estimator = make_estimator(config.odometry, rig.left)
         self._scale = StepScale(config.odometry, ground_truth)
         self._pixel = pixel_angle(rig)
         self._ids = PointIds()

@@ -6,6 +6,7 @@ import importlib
 
 from stereo_sfm.config import OdometryConfig
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.tracking.odometry.base import Estimator
 
 _PACKAGE = "stereo_sfm.tracking.odometry"
@@ -20,8 +21,8 @@ TABLE: dict[str, tuple[str, str]] = {
 }
 
 
-def make_estimator(config: OdometryConfig) -> Estimator:
-    """The estimator that `config.method` names.
+def make_estimator(config: OdometryConfig, camera: Camera) -> Estimator:
+    """The estimator that `config.method` names, for images of `camera`.
 
     Raises:
         StereoSfmError: unknown name.
@@ -29,4 +30,5 @@ def make_estimator(config: OdometryConfig) -> Estimator:
     if config.method not in TABLE:
         raise StereoSfmError(f"unknown odometry '{config.method}': choose one of flow, {', '.join(TABLE)}")
     module, name = TABLE[config.method]
-    return getattr(importlib.import_module(f"{_PACKAGE}.{module}"), name)(config)
+    factory = getattr(importlib.import_module(f"{_PACKAGE}.{module}"), name)
+    return factory(config, camera) if config.method == "vp-r" else factory(config)
