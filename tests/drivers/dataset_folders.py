@@ -94,3 +94,42 @@ def make_tum_rgbd(root: Path) -> Path:
     (folder / "depth.txt").write_text("".join(f"{100 + i / 10 + s:.6f} depth/{i}.png\n" for i, s in enumerate(shifts)))
     (folder / "groundtruth.txt").write_text("# t\n100.0 0 0 0 0 0 0 1\n100.3 0 0 1 0 0 0 1\n")
     return folder
+
+
+def make_kapture(root: Path) -> Path:
+    """Full kapture layout: the right eye 0.2 m to the right, both 1 m in front of the rig's origin."""
+    sensors = root / "sensors"
+    sensors.mkdir(parents=True)
+    camera = f"camera, PINHOLE, {WIDTH}, {HEIGHT}, 50, 50, 32, 24"
+    (sensors / "sensors.txt").write_text(f"# kapture format: 1.1\na, , {camera}\nb, , {camera}\n")
+    (sensors / "rigs.txt").write_text("# r\nrig, a, 1, 0, 0, 0, 0, 0, -1\nrig, b, 1, 0, 0, 0, -0.2, 0, -1\n")
+    lines = ["# timestamp, device_id, image_path"]
+    for eye, name in enumerate("ab"):
+        write_images(sensors / "records_data" / name, eye, [f"{i}.png" for i in range(FRAMES)])
+        lines += [f"{START_NS + i * PERIOD_NS}, {name}, {name}/{i}.png" for i in range(FRAMES)]
+    (sensors / "records_camera.txt").write_text("\n".join(lines) + "\n")
+    return root
+
+
+def make_kitti_raw(root: Path) -> Path:
+    """A date with one drive that goes 1 m east a frame, heading east."""
+    drive = root / "2011_09_26_drive_0001_sync"
+    for eye in (0, 1):
+        write_images(drive / f"image_0{eye}" / "data", eye, [f"{i:010d}.png" for i in range(FRAMES)])
+        (drive / f"image_0{eye}" / "timestamps.txt").write_text(
+            "".join(f"2011-09-26 13:02:25.{i}00000001\n" for i in range(FRAMES))
+        )
+    (root / "calib_cam_to_cam.txt").write_text(
+        "calib_time: 09-Jan-2012 13:57:47\n"
+        f"S_rect_00: {WIDTH} {HEIGHT}\nR_rect_00: 1 0 0 0 1 0 0 0 1\nP_rect_00: 50 0 32 0 0 50 24 0 0 0 1 0\n"
+        f"S_rect_01: {WIDTH} {HEIGHT}\nP_rect_01: 50 0 32 -25 0 50 24 0 0 0 1 0\n"
+    )
+    (root / "calib_imu_to_velo.txt").write_text("calib_time: x\nR: 1 0 0 0 1 0 0 0 1\nT: 0 0 0\n")
+    # The camera looks along the IMU's x axis: x right is -y, y down is -z.
+    (root / "calib_velo_to_cam.txt").write_text("R: 0 -1 0 0 0 -1 1 0 0\nT: 0 0 0\n")
+    oxts = drive / "oxts" / "data"
+    oxts.mkdir(parents=True)
+    metre = 180 / np.pi / 6378137.0 / np.cos(np.radians(49.0))
+    for i in range(FRAMES):
+        (oxts / f"{i:010d}.txt").write_text(f"49.0 {8.4 + i * metre:.12f} 100 0 0 0 " + "0 " * 24 + "\n")
+    return root

@@ -18,7 +18,9 @@ from tests.drivers.dataset_folders import (
     START_NS,
     make_euroc,
     make_images,
+    make_kapture,
     make_kitti,
+    make_kitti_raw,
     make_tum_rgbd,
     picture,
 )
@@ -56,6 +58,37 @@ def test_kitti_colour_pair_is_moved_to_its_own_left_camera(tmp_path: Path) -> No
         assert source.rig.baseline == pytest.approx(0.5)
         assert source.ground_truth is not None
         assert source.ground_truth.positions[0] == pytest.approx([0.06, 0, 0])
+
+
+def test_kitti_raw_drive_with_poses_from_gps(tmp_path: Path) -> None:
+    root = make_kitti_raw(tmp_path)
+    for spec in (root, root / "2011_09_26_drive_0001_sync"):
+        with open_source(spec) as source:
+            images = list(source)
+            assert source.name == "kitti_raw:2011_09_26_drive_0001_sync"
+            assert np.diff([i.stamp_ns for i in images]).tolist() == [10**8] * 3
+            assert images[0].stamp_ns == 1317042145 * 10**9 + 1
+            assert source.rig.left_T_right[0, 3] == pytest.approx(0.5)
+            truth = source.ground_truth
+            assert truth is not None
+            # World: the first IMU's, x forward. The camera looks along it.
+            assert truth.positions == pytest.approx(np.outer(range(4), [1, 0, 0]), abs=1e-4)
+            assert truth.poses[0][:3, 2] == pytest.approx([1, 0, 0])
+
+
+def test_kapture_records(tmp_path: Path) -> None:
+    with open_source(make_kapture(tmp_path)) as source:
+        images = list(source)
+        assert [i.stamp_ns for i in images] == [START_NS + i * PERIOD_NS for i in range(FRAMES)]
+        assert images[3].right is not None and np.array_equal(images[3].right, picture(3, 1))
+        assert source.rig.left_T_right[:3, 3] == pytest.approx([0.2, 0, 0])
+        assert source.rig.body_T_left[:3, 3] == pytest.approx([0, 0, 1])
+
+
+def test_kapture_without_extrinsics_needs_a_rig_unless_it_is_a_t265(tmp_path: Path) -> None:
+    (make_kapture(tmp_path) / "sensors" / "rigs.txt").unlink()
+    with pytest.raises(StereoSfmError, match="--rig FILE"):
+        open_source(tmp_path)
 
 
 def test_euroc_ground_truth_is_the_left_cameras(tmp_path: Path) -> None:
