@@ -43,7 +43,8 @@ class Stream:
         self.pairs: Handoff[Pair] = Handoff(queue_frames)
         self.motion = MotionBuffer()
         self.clock = ClockMap()
-        self._stopping = threading.Event()
+        self._goodbye = threading.Event()  # STOP was sent: DEVICE_STOPPED ends a reader
+        self._stopping = threading.Event()  # readers end now
         self._stopped = (threading.Event(), threading.Event())  # the camera said so: video, events
         self._pairer: Pairer | None = None
         self._threads: list[threading.Thread] = []
@@ -71,6 +72,9 @@ class Stream:
     def stop(self, camera_alive: bool = True) -> None:
         """End streaming and the threads. A camera that is alive is told, and given a moment to say goodbye."""
         if camera_alive:
+            for said in self._stopped:
+                said.clear()
+            self._goodbye.set()
             with contextlib.suppress(DeviceError):
                 self._camera.stop()
                 for said in self._stopped:
@@ -89,6 +93,9 @@ class Stream:
         except BaseException as error:
             self.pairs.fail(error)
 
+    def _ended(self, stopped: threading.Event) -> bool:
+        return self._stopping.is_set() or (self._goodbye.is_set() and stopped.is_set())
+
     def _drain(self) -> None:
         """Throw away what an earlier session left in the endpoints."""
         buffer = array.array("B", bytes(m.VIDEO_BUFFER))
@@ -99,7 +106,7 @@ class Stream:
 
     def _read_video(self) -> None:
         buffer = array.array("B", bytes(m.VIDEO_BUFFER))
-        while not self._stopping.is_set():
+        while not self._ended(self._stopped[0]):
             size = self._camera.link.read(m.VIDEO_IN, buffer, self._timing.read_ms)
             if size and self._take_video(memoryview(buffer)[:size]):
                 buffer = array.array("B", bytes(m.VIDEO_BUFFER))  # the image keeps the old one
@@ -124,7 +131,7 @@ class Stream:
 
     def _read_events(self) -> None:
         buffer = array.array("B", bytes(m.EVENT_BUFFER))
-        while not self._stopping.is_set():
+        while not self._ended(self._stopped[1]):
             size = self._camera.link.read(m.EVENT_IN, buffer, self._timing.read_ms)
             if not size:
                 continue

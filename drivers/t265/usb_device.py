@@ -55,18 +55,20 @@ def attached(backend: Any) -> list[UsbDevice]:
 
     wanted = {m.BOOT_ID, *m.RUN_IDS}
     try:
-        found = usb.core.find(
-            find_all=True, backend=backend, custom_match=lambda d: (d.idVendor, d.idProduct) in wanted
-        )
+        found = usb.core.find(find_all=True, backend=backend, custom_match=lambda d: _id(d) in wanted)
         devices = cast(list[UsbDevice], list(found or ()))
     except usb.core.USBError as error:
         raise device_error(error, "cannot look for cameras") from None
     return sorted(devices, key=lambda d: (d.bus or 0, d.address or 0))
 
 
+def _id(device: Any) -> tuple[int, int]:
+    return device.idVendor, device.idProduct
+
+
 def is_boot(device: UsbDevice) -> bool:
     """Whether the camera waits for its firmware."""
-    return (device.idVendor, device.idProduct) == m.BOOT_ID
+    return _id(device) == m.BOOT_ID
 
 
 def place(device: UsbDevice) -> str:

@@ -67,7 +67,7 @@ class SimulatedBus(usb.backend.IBackend):
             bLength=18, bDescriptorType=1, bcdUSB=0x0300 if dev.booted else 0x0200, bDeviceClass=0, bDeviceSubClass=0,
             bDeviceProtocol=0, bMaxPacketSize0=9 if dev.booted else 64, idVendor=vendor, idProduct=product,
             bcdDevice=0xFFFF if dev.booted else 1, iManufacturer=0, iProduct=0, iSerialNumber=0, bNumConfigurations=1,
-            address=dev.generation % 127 + 1, bus=2 if dev.booted else 1, port_number=dev.port,
+            address=(16 * dev.port + dev.generation) % 128, bus=2 if dev.booted else 1, port_number=dev.port,
             port_numbers=(dev.port,), speed=dev.camera.faults.speed if dev.booted else 3, extra_descriptors=[],
         )  # fmt: skip
 

@@ -79,7 +79,7 @@ def video_transfer(sensor: int, stamp: int, counter: int, pixels: U8) -> Transfe
     size = m.VIDEO_HEADER + pixels.size
     sample = struct.pack("<IHBBQQI", size, Id.SAMPLE, sensor, 0, stamp, stamp + 9_000_000, counter)
     header = sample + struct.pack("<IIfI", 8, 5000, 1.0, pixels.size)
-    return [header, memoryview(np.ascontiguousarray(pixels)).cast("B")] if pixels.size else [header]
+    return [header, np.ascontiguousarray(pixels).data.cast("B")] if pixels.size else [header]
 
 
 def motion_sample(sensor: int, stamp: int, counter: int, xyz: F64) -> bytes:
