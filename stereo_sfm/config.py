@@ -69,6 +69,10 @@ class OdometryConfig:
     keyframe_frames: int = 30  # a keyframe represents at most this many frames
     keyframe_min_frames: int = 0  # and at least this many
     keyframe_min_inliers: int = 0  # new keyframe below this number of inliers; 0: the ratio decides
+    keyframe_rescue_inliers: int = 0  # below this number at once, whatever the other rules say
+    monocular: bool = False  # use the left eye alone, whatever the source has (pnp)
+    init_share: float = 0.9  # monocular start: matches that must fit the essential matrix (C++ course system)
+    init_parallax_deg: float = 1.0  # monocular start: least median parallax
 
 
 @dataclass(frozen=True)
@@ -76,6 +80,25 @@ class MapperConfig:
     """Local mapping (mapping/mapper.py)."""
 
     enabled: bool = True
+    window_keyframes: int = 12  # keyframes that local bundle adjustment moves, the new one included; 0: all connected
+    connected_points: int = 15  # shared points that make two keyframes neighbours
+    sigma_px: float = 0.4  # noise of one coordinate of a tracked point
+    huber: float = 2.0  # sigmas
+    rounds: int = 2  # of bundle adjustment, outliers are judged between them
+    iterations: int = 5  # of a round
+    association: str = "map"  # "tracks": identity only; "map": also by descriptors; "previous": the retail paper's rule
+    match_radius_px: float = 10.0  # around the predicted pixel, in both eyes
+    match_distance: int = 50  # differing bits of 256
+    match_ratio: float = 0.85  # best / second best
+    match_sigma_px: float = 1.0  # noise of one coordinate of a point found again by its descriptor
+    match_min: int = 12  # fewer agreeing matches are not believed
+    near_keyframes: int = 10  # keyframes standing close by whose points are searched too
+    near_depths: float = 0.3  # how close, in median depths of the new keyframe
+    min_observations: int = 2  # keyframes below which a point that is no longer tracked is culled
+    max_error: float = 3.0  # sigmas; a point whose observations are on average worse is culled
+    min_parallax_deg: float = 0.1  # rays, both eyes included, that never were further apart make a point too uncertain
+    redundant_share: float = 0.9  # a keyframe goes when so many of its points are seen by three others; above 1: never
+    full_ba_lag_keyframes: int = 5  # the answer of the full bundle adjustment is applied so many keyframes later
 
 
 @dataclass(frozen=True)
@@ -84,6 +107,7 @@ class LoopConfig:
 
     enabled: bool = True
     correction: str = "pose_graph"  # or "averaging": how the loop's error is spread over the keyframes
+    robust: str = "gnc"  # how the pose graph takes loops: "gnc", "switchable" or "none"
     vocabulary: str = ""  # vocabulary file; empty: the one of the package
     grow_every: int = 0  # keyframes between growths of the vocabulary in a new environment; 0: never
     score_ratio: float = 0.9  # candidates score above this times the reference score of the connected keyframes
@@ -158,12 +182,12 @@ def _as_float(value: Any) -> Any:
     return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
-def load(path: Path | None = None, overrides: Iterable[str] = ()) -> Config:
-    """Defaults, then a TOML file, then `key.subkey=value` overrides whose values are read as TOML (else as text)."""
-    data: dict[str, Any] = {}
+def load(path: Path | None = None, overrides: Iterable[str] = (), base: dict[str, Any] | None = None) -> Config:
+    """Defaults, `base`, a TOML file, then `key.subkey=value` overrides, values read as TOML (else as text)."""
+    data: dict[str, Any] = base or {}
     if path is not None:
         try:
-            data = tomllib.loads(path.read_text())
+            data = _merge(data, tomllib.loads(path.read_text()))
         except FileNotFoundError:
             raise StereoSfmError(f"no configuration file at {path}") from None
         except tomllib.TOMLDecodeError as error:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.presets import PRESETS, preset
 
 if TYPE_CHECKING:
     from drivers.source import Source
@@ -53,6 +54,11 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="one value, as tracker.max_features=600"
     )
+    parser.add_argument("--preset", default="default", metavar="NAME", help=f"one of {', '.join(PRESETS)}")
+    parser.add_argument("--features", metavar="NAME", help="descriptors of --odometry: orb, sift, akaze")
+    parser.add_argument(
+        "--odometry", metavar="NAME", help="motion estimator: flow (default), em-r, vp-r, r-um, um, eight-point, pnp"
+    )
     parser.add_argument("--seed", type=int, help="of everything random (same as --set seed=N)")
 
 
@@ -60,8 +66,13 @@ def load_config(args: argparse.Namespace) -> Config:
     """The configuration that the options ask for."""
     from stereo_sfm import config
 
-    overrides = list(args.set) + ([f"seed={args.seed}"] if args.seed is not None else [])
-    return config.load(args.config, overrides)
+    overrides = [f"odometry.method={args.odometry}"] if args.odometry is not None else []
+    overrides += [f"features.kind={args.features}"] if args.features is not None else []
+    overrides += list(args.set) + ([f"seed={args.seed}"] if args.seed is not None else [])
+    chosen = config.load(args.config, overrides, preset(args.preset))
+    if args.features is not None and chosen.odometry.method == "flow":
+        raise StereoSfmError("--features needs an estimator that uses descriptors: add --odometry em-r (or another)")
+    return chosen
 
 
 def open_chosen(args: argparse.Namespace) -> Source:

@@ -48,7 +48,7 @@ class _Face:
 class LineDetector:
     """LSD (von Gioi et al., PAMI 32, 2010) on the image or on its cube faces."""
 
-    def __init__(self, camera: Camera, min_length_px: float = 25.0, max_lines: int = 400) -> None:
+    def __init__(self, camera: Camera, min_length_px: float = 15.0, max_lines: int = 600) -> None:
         """Args:
         camera: the eye whose images will come.
         min_length_px: shorter segments are dropped. max_lines: the longest are kept.

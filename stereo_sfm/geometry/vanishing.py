@@ -19,6 +19,7 @@ from stereo_sfm.types import F64, I64, Bool, Message
 
 _LATITUDES, _LONGITUDES = 90, 360  # one degree cells: phi in [0, 90), lambda in [0, 360)
 _PAIR_SAMPLES = 150  # two-line samples for the first vanishing point
+_VOTERS = 250  # longest segments that vote on the grid (all of them refine)
 _SPLITS = 90  # positions of the second on the great circle of the first; the other 270 repeat these
 
 
@@ -54,7 +55,8 @@ def polar_grid(lines: LineSegments) -> F64:
 
     The vote is length times length times sin(2 angle between the planes), as the paper's, smoothed by 3 x 3 cells.
     """
-    i, j = np.triu_indices(len(lines), 1)
+    voters = np.argsort(-lines.angles, kind="stable")[:_VOTERS]
+    i, j = (voters[k] for k in np.triu_indices(len(voters), 1))
     meet = np.cross(lines.normals[i], lines.normals[j])
     sine = np.linalg.norm(meet, axis=1)
     good = sine > 1e-4

@@ -42,7 +42,7 @@ def make_tracker(
         raise StereoSfmError(
             f"odometry {method} needs two eyes or depth, this camera has one eye: use eight-point or pnp"
         )
-    if not rig.stereo and method == "pnp":
+    if method == "pnp" and (config.odometry.monocular or not rig.stereo):
         from stereo_sfm.tracking.monocular import MonocularTracker
 
         return MonocularTracker(config, rig, spans)

@@ -65,6 +65,7 @@ class FeatureTracker:
         self._keyframe: View | None = None
         self._kf_id = -1
         self._odom_T_kf = np.eye(4)
+        self._odom_T_kfs: dict[int, F64] = {}  # keyframes whose answer is still to come
         self._kf_covariance = np.zeros((6, 6))
         self._frames_since_kf = 0
         self._lost = 0
@@ -75,6 +76,7 @@ class FeatureTracker:
         """Take over fused ids and, for motions from a keyframe, the map's positions of its points."""
         self._map_version = update.version
         self._ids.fuse(update.fused_point_ids)
+        self._correct(update)
         if self._last is not None:
             self._last = replace(self._last, ids=self._ids.current(self._last.ids))
         if self._keyframe is None:
@@ -85,6 +87,19 @@ class FeatureTracker:
         if self._odometry.reference == "keyframe" and len(own):
             kf_T_map = se3.inverse(update.map_T_kf[own[0]])
             self._keyframe = replace(self._keyframe, points=_moved(self._keyframe.points, ids, update, kf_T_map))
+
+    def _correct(self, update: MapUpdate) -> None:
+        """Move on from where the map puts the newest keyframe that both know (the mapper expects its answer used)."""
+        known = [k for k in update.kf_ids.tolist() if k in self._odom_T_kfs]
+        if not known:
+            return
+        newest = max(known)
+        odom_T_map = se3.inverse(update.map_T_odom)
+        row = int(np.flatnonzero(update.kf_ids == newest)[0])
+        moved = odom_T_map @ update.map_T_kf[row] @ se3.inverse(self._odom_T_kfs[newest])
+        self._odom_T_kfs = {k: moved @ pose for k, pose in self._odom_T_kfs.items() if k >= newest}
+        self._odom_T_cam, self._odom_T_last = moved @ self._odom_T_cam, moved @ self._odom_T_last
+        self._odom_T_kf = moved @ self._odom_T_kf
 
     def step(self, image: StereoImage) -> tuple[Frame, Keyframe | None]:
         """Track one image."""
@@ -210,6 +225,7 @@ class FeatureTracker:
         self._kf_id += 1
         self._keyframe = view
         self._odom_T_kf = self._odom_T_cam
+        self._odom_T_kfs[self._kf_id] = self._odom_T_cam
         self._frames_since_kf = 0
         covariance, self._kf_covariance = self._kf_covariance, np.zeros((6, 6))
         angles = view.features.angles
