@@ -13,6 +13,7 @@ from typing import ClassVar
 import numpy as np
 
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
 from stereo_sfm.mapping import map_kernels
 from stereo_sfm.mapping.columns import Columns, Spec
 from stereo_sfm.mapping.covisibility import Covisibility
@@ -32,6 +33,8 @@ class KeyframeTable(Columns):
     previous: I64  # row of the keyframe before it in the same submap, -1: none
     obs_first: I64  # first row of its observations
     obs_count: I64  # observations made, of which some may have been removed since
+    carrier: I64  # of a culled keyframe: the row of the one it moves with, -1 while it lives
+    carrier_T_kf: F64  # (K, 4, 4)
     alive: Bool
 
     SPEC: ClassVar[Spec] = {
@@ -45,6 +48,8 @@ class KeyframeTable(Columns):
         "previous": (np.int64, (), -1),
         "obs_first": (np.int64, (), 0),
         "obs_count": (np.int64, (), 0),
+        "carrier": (np.int64, (), -1),
+        "carrier_T_kf": (np.float64, (4, 4), np.eye(4)),
         "alive": (np.bool_, (), True),
     }
 
@@ -61,6 +66,7 @@ class PointTable(Columns):
     expected: I32  # keyframes in whose view it lay
     last_seen: I32  # newest keyframe row that saw it
     descriptor_obs: I32  # observation whose descriptor stands for the point, -1: none has one
+    sigma: F32  # px, noise of its next observation
     fused_into: I32  # row of the point that replaced it, -1: none
     alive: Bool
 
@@ -74,6 +80,7 @@ class PointTable(Columns):
         "expected": (np.int32, (), 0),
         "last_seen": (np.int32, (), -1),
         "descriptor_obs": (np.int32, (), -1),
+        "sigma": (np.float32, (), 1.0),
         "fused_into": (np.int32, (), -1),
         "alive": (np.bool_, (), True),
     }
@@ -86,6 +93,7 @@ class ObservationTable(Columns):
     pt: I32  # point row, -1 when the observation was removed
     uv_left: F32  # (M, 2) px
     uv_right: F32  # (M, 2) px, NaN where unseen
+    sigma: F32  # (M,) px, noise of one coordinate
     descriptor: U8  # (M, 32), zero where there is none
     angle: F32  # (M,) radians
     following: I32  # next older observation of the same point, -1: last
@@ -95,6 +103,7 @@ class ObservationTable(Columns):
         "pt": (np.int32, (), -1),
         "uv_left": (np.float32, (2,), np.nan),
         "uv_right": (np.float32, (2,), np.nan),
+        "sigma": (np.float32, (), 1.0),
         "descriptor": (np.uint8, (32,), 0),
         "angle": (np.float32, (), 0),
         "following": (np.int32, (), -1),
@@ -105,7 +114,7 @@ class ObservationTable(Columns):
 class MapDelta:
     """What changed since the last delta, as copies."""
 
-    kf_rows: I64  # (K,) new or moved keyframes, ascending
+    kf_rows: I64  # (K,) new or moved keyframes, culled ones too, ascending
     map_T_kf: F64  # (K, 4, 4)
     pt_rows: I64  # (P,) new or moved living points, ascending
     xyz: F64  # (P, 3)
@@ -144,6 +153,7 @@ class Map:
         self.covisibility = Covisibility()
         self._kf_rows: dict[int, int] = {}
         self._pt_rows = np.full(1024, -1, np.int32)  # by id
+        self._carried: dict[int, list[int]] = {}
         self._changed_kf: set[int] = set()
         self._changed_pt: list[I64] = []
 
@@ -223,12 +233,12 @@ class Map:
         self._changed_kf.add(row)
         return row
 
-    def add_points(self, pt_ids: I64, xyz: F64, anchor: int) -> I64:
+    def add_points(self, pt_ids: I64, xyz: F64, anchor: int, sigma: float = 1.0) -> I64:
         """New points; ids that are known already are refused. Returns their rows."""
         if len(pt_ids) and (self.point_rows(pt_ids) >= 0).any():
             raise StereoSfmError("a point id is in the map already: ids are never used twice")
         rows = np.arange(len(self.points), len(self.points) + len(pt_ids))
-        self.points.append(len(pt_ids), pt_id=pt_ids, xyz=xyz, anchor=anchor, last_seen=anchor)
+        self.points.append(len(pt_ids), pt_id=pt_ids, xyz=xyz, anchor=anchor, last_seen=anchor, sigma=sigma)
         highest = int(pt_ids.max(initial=-1))
         if highest >= len(self._pt_rows):
             grown = np.full(max(highest + 1, 2 * len(self._pt_rows)), -1, np.int32)
@@ -245,7 +255,14 @@ class Map:
         earlier = self.observations_of_points(pt_rows)
         self.covisibility.add(self.observations.kf[earlier].astype(np.int64), np.full(len(earlier), kf))
         rows = self.observations.append(
-            len(pt_rows), kf=kf, pt=pt_rows, uv_left=uv_left, uv_right=uv_right, descriptor=descriptors, angle=angles
+            len(pt_rows),
+            kf=kf,
+            pt=pt_rows,
+            uv_left=uv_left,
+            uv_right=uv_right,
+            sigma=self.points.sigma[pt_rows],
+            descriptor=descriptors,
+            angle=angles,
         )
         map_kernels.link(rows.start, self.points.head, self.observations.following, self.observations.pt)
         self.keyframes.obs_count[kf] += len(pt_rows)
@@ -260,9 +277,14 @@ class Map:
     # -- changing ----------------------------------------------------------------------------------------------------
 
     def move_keyframes(self, rows: I64, map_T_kf: F64) -> None:
-        """New poses; points stay (see `carry_points`)."""
+        """New poses; culled keyframes follow their carriers, points stay (see `carry_points`)."""
         self.keyframes.map_T_kf[rows] = map_T_kf
         self._changed_kf.update(rows.tolist())
+        carried = [c for row in rows.tolist() for c in self._carried.get(row, ())]
+        if carried:
+            pose = self.keyframes.map_T_kf
+            pose[carried] = pose[self.keyframes.carrier[carried]] @ self.keyframes.carrier_T_kf[carried]
+            self._changed_kf.update(carried)
 
     def move_points(self, rows: I64, xyz: F64) -> None:
         """New positions in the map frame."""
@@ -310,7 +332,12 @@ class Map:
         self.points.alive[rows] = False
 
     def cull_keyframe(self, row: int) -> None:
-        """A keyframe that goes; points anchored to it pass to the oldest keyframe that still sees them."""
+        """A keyframe that goes.
+
+        Its points pass to the oldest keyframe that still sees them; its pose stays known, tied to the living keyframe
+        that shared most points with it (else to the one before it).
+        """
+        self._carry(row)
         rows = self.observations_of_keyframe(row)
         points = self.observations.pt[rows].astype(np.int64)
         self.remove_observations(rows)
@@ -321,6 +348,15 @@ class Map:
             seen = self.observations.kf[self.observations_of_points(np.array([point]))]
             if len(seen):
                 self.points.anchor[point] = seen.min()
+
+    def _carry(self, row: int) -> None:
+        others, _ = self.covisibility.neighbours(row)
+        carrier = int(others[0]) if len(others) else max(int(self.keyframes.previous[row]), 0)
+        going = [row, *self._carried.pop(row, ())]
+        pose = self.keyframes.map_T_kf
+        self.keyframes.carrier[going] = carrier
+        self.keyframes.carrier_T_kf[going] = se3.inverse(pose[carrier]) @ pose[going]
+        self._carried.setdefault(carrier, []).extend(going)
 
     def fuse(self, old: int, new: int) -> None:
         """The points of two rows are one: `new` takes over the observations and the names of `old`.
@@ -354,7 +390,6 @@ class Map:
     def take_delta(self) -> MapDelta:
         """What changed since the last call."""
         kf = np.array(sorted(self._changed_kf), np.int64)
-        kf = kf[self.keyframes.alive[kf]]
         pt = np.unique(np.concatenate([np.zeros(0, np.int64), *self._changed_pt]))
         pt = pt[self.points.alive[pt] & np.isfinite(self.points.xyz[pt, 0])]
         self._changed_kf.clear()

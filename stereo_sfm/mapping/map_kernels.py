@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from stereo_sfm.geometry.kernels import njit
 
 
@@ -76,3 +78,62 @@ def follow(rows, fused_into):
         while r >= 0 and fused_into[r] >= 0:
             r = fused_into[r]
         rows[i] = r
+
+
+@njit
+def _bits(x):
+    """Set bits of a 64-bit word."""
+    x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
+    x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return np.int64((x * np.uint64(0x0101010101010101)) >> np.uint64(56))
+
+
+@njit
+def _distance(a, b):
+    return _bits(a[0] ^ b[0]) + _bits(a[1] ^ b[1]) + _bits(a[2] ^ b[2]) + _bits(a[3] ^ b[3])
+
+
+@njit
+def match_near(uv, uv_right, words, predicted, predicted_right, candidate_words, radius, limit, ratio):
+    """Best candidate of each row, or -1: within `radius` px in both eyes, at most `limit` bits, mutual, distinct.
+
+    Args:
+        uv, uv_right: (N, 2) px observed, the right one NaN where unseen. words: (N, 4) uint64 descriptors, 0: none.
+        predicted, predicted_right, candidate_words: the same of (C,) candidates.
+        ratio: the best distance must be below `ratio` times the second best.
+    """
+    n, c = uv.shape[0], predicted.shape[0]
+    best = np.full(n, -1)
+    best_bits = np.full(n, 257)
+    second_bits = np.full(n, 257)
+    owner = np.full(c, -1)
+    owner_bits = np.full(c, 257)
+    for i in range(n):
+        if words[i, 0] == 0 and words[i, 1] == 0:
+            continue
+        for j in range(c):
+            du, dv = uv[i, 0] - predicted[j, 0], uv[i, 1] - predicted[j, 1]
+            if not du * du + dv * dv <= radius * radius:
+                continue
+            if candidate_words[j, 0] == 0 and candidate_words[j, 1] == 0:
+                continue
+            ru, rv = uv_right[i, 0] - predicted_right[j, 0], uv_right[i, 1] - predicted_right[j, 1]
+            if ru * ru + rv * rv > radius * radius:  # False where either is NaN
+                continue
+            bits = _distance(words[i], candidate_words[j])
+            if bits < best_bits[i]:
+                second_bits[i] = best_bits[i]
+                best_bits[i], best[i] = bits, j
+            elif bits < second_bits[i]:
+                second_bits[i] = bits
+        if best[i] >= 0 and (best_bits[i] > limit or best_bits[i] >= ratio * second_bits[i]):
+            best[i] = -1
+        j = best[i]
+        if j >= 0 and best_bits[i] < owner_bits[j]:
+            if owner[j] >= 0:
+                best[owner[j]] = -1
+            owner[j], owner_bits[j] = i, best_bits[i]
+        elif j >= 0:
+            best[i] = -1
+    return best

@@ -1,0 +1,103 @@
+"""Projection-guided matching: which points of the map a keyframe sees again although no track connects them.
+
+Candidates are points of keyframes that share points with this one, of their neighbours, and of keyframes that stood
+close by. A match must lie near its prediction in both eyes, look alike, and be each other's best; together the matches
+must agree with one pose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.rig import Rig
+from stereo_sfm.config import MapperConfig
+from stereo_sfm.geometry import se3
+from stereo_sfm.mapping import map_kernels
+from stereo_sfm.mapping.bundle import Bundle, BundleConfig, bundle_adjust
+from stereo_sfm.mapping.map import Map
+from stereo_sfm.types import F64, I64, U8, Bool
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """What a keyframe sees, one row each."""
+
+    uv_left: F64  # (N, 2) px
+    uv_right: F64  # (N, 2) px, NaN where unseen
+    descriptors: U8  # (N, 32)
+
+
+def local_keyframes(map_: Map, seen_points: I64, map_T_kf: F64, reach: float, config: MapperConfig) -> I64:
+    """Rows of keyframes whose points may be in view.
+
+    Args:
+        seen_points: rows of points that the new keyframe is known to see.
+        reach: metres; keyframes that stood closer and looked less than 60 degrees elsewhere count as neighbours.
+    """
+    obs = map_.observations_of_points(seen_points)
+    rows, counts = np.unique(map_.observations.kf[obs], return_counts=True)
+    first = rows[np.lexsort((rows, -counts))][: config.window_keyframes].astype(np.int64)
+    second = [map_.covisibility.neighbours(int(k), config.connected_points)[0][:5] for k in first]
+    keyframes = map_.keyframes
+    apart = np.linalg.norm(keyframes.map_T_kf[:, :3, 3] - map_T_kf[:3, 3], axis=1)
+    cosine = keyframes.map_T_kf[:, :3, 2] @ map_T_kf[:3, 2]
+    near = np.flatnonzero(keyframes.alive & (apart < reach) & (cosine > 0.5))
+    near = near[np.argsort(apart[near], kind="stable")][: config.near_keyframes]
+    return np.unique(np.concatenate([first, *second, near]).astype(np.int64))
+
+
+def points_in_view(map_: Map, rig: Rig, keyframes: I64, map_T_kf: F64) -> tuple[I64, F64, F64]:
+    """Points of some keyframes that this pose should see from a like angle: rows, left and right pixels or NaN."""
+    seen = [map_.observations.pt[map_.observations_of_keyframe(int(k))] for k in keyframes]
+    rows = np.unique(np.concatenate([np.zeros(0, np.int32), *seen])).astype(np.int64)
+    rows = rows[map_.points.alive[rows] & np.isfinite(map_.points.xyz[rows, 0])]
+    xyz = map_.points.xyz[rows]
+    local = se3.transform(se3.inverse(map_T_kf), xyz)
+    uv_left = rig.left.project(local)
+    then = xyz - map_.keyframes.map_T_kf[map_.points.anchor[rows], :3, 3]
+    now = xyz - map_T_kf[:3, 3]
+    far_then, far_now = np.linalg.norm(then, axis=1), np.linalg.norm(now, axis=1)
+    alike = (then * now).sum(1) > 0.8 * far_then * far_now
+    alike &= (far_now < 2.0 * far_then) & (far_then < 2.0 * far_now)
+    visible = rig.left.inside(uv_left, 2.0) & alike
+    uv_right = np.full_like(uv_left, np.nan)
+    if rig.right is not None:
+        uv_right = rig.right.project(se3.transform(se3.inverse(rig.left_T_right), local))
+    return rows[visible], uv_left[visible], uv_right[visible]
+
+
+def match(
+    sightings: Sightings, predicted_left: F64, predicted_right: F64, descriptors: U8, config: MapperConfig
+) -> tuple[I64, I64]:
+    """Mutually best (sighting, candidate) pairs within the search radius and the descriptor distance."""
+    pairs = map_kernels.match_near(
+        sightings.uv_left, sightings.uv_right, _words(sightings.descriptors),
+        predicted_left, predicted_right, _words(descriptors),
+        config.match_radius_px, config.match_distance, config.match_ratio,
+    )  # fmt: skip
+    found = np.flatnonzero(pairs >= 0)
+    return found, pairs[found]
+
+
+def _words(descriptors: U8) -> np.ndarray[tuple[int, int], np.dtype[np.uint64]]:
+    return np.ascontiguousarray(descriptors).view(np.uint64).reshape(-1, 4)
+
+
+def agreeing(rig: Rig, map_T_kf: F64, xyz: F64, uv_left: F64, uv_right: F64, config: MapperConfig) -> tuple[Bool, F64]:
+    """Which matches (N,) agree with one pose near the given one, and that pose; none where too few do."""
+    count = len(xyz)
+    nothing = np.zeros(count, bool), map_T_kf
+    if count < config.match_min:
+        return nothing
+    rows = np.arange(count)
+    bundle = Bundle(
+        map_T_kf[None], np.zeros(1, bool), xyz, np.zeros(count, np.int64), rows, uv_left, uv_right,
+        np.full((count, 2), config.match_sigma_px),
+    )  # fmt: skip
+    result = bundle_adjust(rig, bundle, BundleConfig(rounds=3, huber=1.5, move_points=False))
+    good = result.inlier[:, 0] & (result.inlier[:, 1] | ~np.isfinite(uv_right[:, 0]))
+    if good.sum() < max(config.match_min, 0.5 * count):
+        return nothing
+    return good, result.world_T_kf[0]

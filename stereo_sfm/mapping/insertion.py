@@ -1,0 +1,138 @@
+"""How a keyframe enters the map: which of its points are known, where it stands, what is new."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.rig import Rig
+from stereo_sfm.config import MapperConfig
+from stereo_sfm.geometry import se3
+from stereo_sfm.mapping import association
+from stereo_sfm.mapping.bundle import Bundle, BundleConfig, bundle_adjust
+from stereo_sfm.mapping.map import Map
+from stereo_sfm.types import F64, I64, Bool, Keyframe
+
+MIN_POSE_POINTS = 10  # known points from which a keyframe's pose is solved before it enters the map
+
+
+@dataclass(frozen=True, eq=False)
+class Insertion:
+    """What came of it."""
+
+    row: int  # of the keyframe
+    fused: list[tuple[int, int]]  # point rows (gone, the one that replaced it)
+
+
+def insert_keyframe(map_: Map, rig: Rig, keyframe: Keyframe, guess: F64, config: MapperConfig) -> Insertion:
+    """A keyframe with its points.
+
+    Args:
+        guess: (4, 4) map_T_kf as odometry has it.
+    """
+    rows, usable = _identify(map_, keyframe, config)
+    pose = _solve_pose(map_, rig, keyframe, rows, usable & (rows >= 0), guess, config)
+    row = map_.add_keyframe(keyframe, pose)
+    matches = np.zeros((0, 2), np.int64)
+    if config.association == "map":
+        matches = _find_again(map_, rig, keyframe, rows, usable, pose, config)
+    new = np.flatnonzero(usable & (rows < 0))
+    xyz = se3.transform(pose, np.asarray(keyframe.points_cam)[new])
+    rows[new] = map_.add_points(np.asarray(keyframe.point_ids)[new], xyz, row, config.sigma_px)
+    fused = [pair for i, known in matches.tolist() if (pair := fuse_points(map_, int(rows[i]), known, config))]
+    rows = map_.point_rows(np.asarray(keyframe.point_ids))
+    keep = _first_of_each(np.where(usable, rows, -1))
+    map_.observe(
+        row,
+        rows[keep],
+        np.asarray(keyframe.uv_left)[keep],
+        np.asarray(keyframe.uv_right)[keep],
+        np.asarray(keyframe.descriptors)[keep],
+        np.asarray(keyframe.angles)[keep],
+    )
+    return Insertion(row, fused)
+
+
+def _identify(map_: Map, keyframe: Keyframe, config: MapperConfig) -> tuple[I64, Bool]:
+    """(N,) point row of each track, -1 when new, and (N,) which may be used: not those whose point was culled."""
+    rows = map_.point_rows(np.asarray(keyframe.point_ids))
+    usable = (rows < 0) | map_.points.alive[np.maximum(rows, 0)] if len(map_.points) else np.ones(len(rows), bool)
+    usable &= np.isfinite(keyframe.uv_left).all(axis=1)
+    if config.association == "previous" and len(map_.keyframes):
+        before = map_.observations.pt[map_.observations_of_keyframe(len(map_.keyframes) - 1)]
+        usable &= (rows < 0) | np.isin(rows, before)
+    return rows, usable
+
+
+def _solve_pose(
+    map_: Map, rig: Rig, keyframe: Keyframe, rows: I64, known: Bool, guess: F64, config: MapperConfig
+) -> F64:
+    """(4, 4) map_T_kf from the points that are known, where they are enough; else the guess."""
+    known = known.copy()
+    known[known] = np.isfinite(map_.points.xyz[rows[known], 0])
+    count = int(known.sum())
+    if count < MIN_POSE_POINTS:
+        return guess
+    bundle = Bundle(
+        guess[None],
+        np.zeros(1, bool),
+        map_.points.xyz[rows[known]],
+        np.zeros(count, np.int64),
+        np.arange(count),
+        np.asarray(keyframe.uv_left)[known],
+        np.asarray(keyframe.uv_right)[known],
+        np.repeat(map_.points.sigma[rows[known]].astype(float)[:, None], 2, 1),
+    )
+    result = bundle_adjust(rig, bundle, BundleConfig(rounds=3, huber=config.huber, move_points=False))
+    return result.world_T_kf[0] if result.inlier[:, 0].sum() >= max(MIN_POSE_POINTS, count // 2) else guess
+
+
+def _find_again(
+    map_: Map, rig: Rig, keyframe: Keyframe, rows: I64, usable: Bool, pose: F64, config: MapperConfig
+) -> I64:
+    """(M, 2) pairs (row of the keyframe, point row) that look alike where the point should be."""
+    tracked = rows[usable & (rows >= 0)]
+    depth = np.linalg.norm(keyframe.points_cam, axis=1)
+    reach = config.near_depths * float(np.nanmedian(depth)) if np.isfinite(depth).any() else 0.0
+    around = association.local_keyframes(map_, tracked, pose, reach, config)
+    points, uv_left, uv_right = association.points_in_view(map_, rig, around, pose)
+    map_.points.expected[np.union1d(points, tracked)] += 1
+    other = ~np.isin(points, tracked)
+    points, uv_left, uv_right = points[other], uv_left[other], uv_right[other]
+    sightings = association.Sightings(
+        np.asarray(keyframe.uv_left),
+        np.asarray(keyframe.uv_right),
+        np.where(usable[:, None], keyframe.descriptors, 0).astype(np.uint8),
+    )
+    mine, found = association.match(sightings, uv_left, uv_right, map_.descriptors_of(points), config)
+    good, _ = association.agreeing(
+        rig, pose, map_.points.xyz[points[found]], sightings.uv_left[mine], sightings.uv_right[mine], config
+    )
+    return np.stack([mine[good], points[found[good]]], 1)
+
+
+def fuse_points(map_: Map, first: int, second: int, config: MapperConfig) -> tuple[int, int] | None:
+    """Make two points one, the older survives; refused where one keyframe saw both. Returns (gone, stays) or None.
+
+    The two were seen by different tracks, whose places on the surface agree less well than those of one track: what the
+    younger one saw, and whatever the point is seen by from now on, counts less.
+    """
+    gone, stays = max(first, second), min(first, second)
+    if gone == stays or not (map_.points.alive[gone] and map_.points.alive[stays]):
+        return None
+    moving = map_.observations_of_points(np.array([gone]))
+    there = map_.observations_of_points(np.array([stays]))
+    table = map_.observations
+    if np.intersect1d(table.kf[moving], table.kf[there]).size:
+        return None
+    table.sigma[moving] = config.match_sigma_px
+    map_.points.sigma[stays] = config.match_sigma_px
+    map_.fuse(gone, stays)
+    return gone, stays
+
+
+def _first_of_each(rows: I64) -> I64:
+    """Indices of the first occurrence of every row that is not negative, ascending."""
+    values, first = np.unique(rows, return_index=True)
+    return np.sort(first[values >= 0])

@@ -1,0 +1,142 @@
+"""The mapper: one keyframe (and perhaps a loop) in, exactly one `MapUpdate` out. It alone owns the map.
+
+What the frames mean. Keyframes and points live in the map frame, the tracker's frames in the odometry frame, and
+map_T_odom joins them. It is the identity until a loop is corrected and changes then only: by what the newest keyframe
+moved, so that the newest points keep their places in the odometry frame and the odometry pose does not jump.
+
+What bounds the drift. Local bundle adjustment moves keyframes and points in the map frame. The update carries the moved
+points; the tracker takes them through the inverse of map_T_odom and solves the next frames against them. So the
+odometry frame's origin stays, and the pose goes where the adjusted map says. A point found again by its descriptor is
+fused with the older one: the tracker's track takes over the older point's name and place, and with it the older, less
+drifted part of the map. Where the robot stays, the same old points hold it.
+
+After a loop, full bundle adjustment runs beside the mapping. It is a job of arrays (`pending_job`) whose answer
+(`finish_job`) is applied a fixed number of keyframes later, wherever it was computed; if nobody brought it by then, the
+mapper computes it itself. Keyframes made meanwhile move with the one before them.
+
+The retail paper's mapping (section IV-B) is configuration: association = "previous" (a point is known when the previous
+keyframe saw it, else it is new), window_keyframes = 0 (all connected keyframes move), redundant_share = 2 (no keyframe
+is culled).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.rig import Rig
+from stereo_sfm.config import MapperConfig
+from stereo_sfm.mapping import culling, window
+from stereo_sfm.mapping.bundle import BundleConfig, BundleResult, bundle_adjust
+from stereo_sfm.mapping.insertion import insert_keyframe
+from stereo_sfm.mapping.map import Map
+from stereo_sfm.timing import NoSpans
+from stereo_sfm.types import F64, I32, I64, Keyframe, LoopResult, MapUpdate
+
+RECENT = 3  # newest keyframes: whose points are judged, and which are never redundant
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """Work that may be done elsewhere: `run_job`."""
+
+    rig: Rig
+    config: BundleConfig
+    window: window.Window
+    newest: int  # keyframe row that was the newest when the job was made
+
+
+def run_job(job: Job) -> BundleResult:
+    """The full bundle adjustment of a job."""
+    return bundle_adjust(job.rig, job.window.bundle, job.config)
+
+
+class Mapper:
+    """Owner of the map."""
+
+    def __init__(self, config: MapperConfig, rig: Rig, spans: NoSpans | None = None) -> None:
+        self._config, self._rig, self._spans = config, rig, spans or NoSpans()
+        self.map = Map()
+        self._map_T_odom: F64 = np.eye(4)
+        self._version = 0
+        self._culled: list[I64] = []
+        self._fused: list[tuple[int, int]] = []  # rows (gone, stays)
+        self._lately: list[I32] = []  # point rows that the newest keyframes saw, outliers too
+        self._loop_rows: set[int] = set()
+        self._job: Job | None = None
+        self._job_due = -1
+        self._answer: BundleResult | None = None
+
+    # -- messages ----------------------------------------------------------------------------------------------------
+
+    def step(self, keyframe: Keyframe, loop: LoopResult | None = None) -> MapUpdate:
+        """Put a keyframe into the map and improve the map around it.
+
+        Args:
+            keyframe: the newest. loop: the loop closer's answer to an earlier keyframe, or none.
+        """
+        self._version += 1
+        if not self._config.enabled:
+            return self._without_mapping(keyframe)
+        with self._spans.span("associate"):
+            row = self._insert(keyframe)
+        with self._spans.span("local_ba"):
+            self._adjust(row)
+        with self._spans.span("cull"):
+            self._cull(row)
+        return self._update(keyframe.kf_id)
+
+    def _without_mapping(self, keyframe: Keyframe) -> MapUpdate:
+        none = np.zeros(0, np.int64)
+        return MapUpdate(
+            self._version, keyframe.kf_id, np.array([keyframe.kf_id]), np.array([keyframe.odom_T_cam]), none,
+            np.zeros((0, 3)), none, np.zeros((0, 2), np.int64), np.eye(4),
+        )  # fmt: skip
+
+    def _update(self, kf_id: int) -> MapUpdate:
+        delta = self.map.take_delta()
+        culled = np.unique(np.concatenate([np.zeros(0, np.int64), *self._culled]))
+        fused = self.map.points.pt_id[np.array(self._fused, np.int64).reshape(-1, 2)]
+        self._culled, self._fused = [], []
+        return MapUpdate(
+            version=self._version,
+            kf_id=kf_id,
+            kf_ids=self.map.keyframes.kf_id[delta.kf_rows],
+            map_T_kf=delta.map_T_kf,
+            point_ids=self.map.points.pt_id[delta.pt_rows],
+            points_map=delta.xyz,
+            culled_point_ids=self.map.points.pt_id[culled],
+            fused_point_ids=fused,
+            map_T_odom=self._map_T_odom.copy(),
+        )
+
+    # -- stages ------------------------------------------------------------------------------------------------------
+
+    def _insert(self, keyframe: Keyframe) -> int:
+        guess = self._map_T_odom @ keyframe.odom_T_cam
+        insertion = insert_keyframe(self.map, self._rig, keyframe, guess, self._config)
+        self._fused += insertion.fused
+        return insertion.row
+
+    def _adjust(self, row: int) -> None:
+        if row == 0:
+            return
+        part = window.covisible_window(self.map, row, self._config)
+        result = bundle_adjust(self._rig, part.bundle, window.bundle_config(self._config))
+        window.write_back(self.map, part, result)
+
+    def _cull(self, row: int) -> None:
+        recent = np.arange(max(0, row - RECENT), row + 1)
+        seen = [self.map.observations.pt[self.map.observations_of_keyframe(int(k))] for k in recent]
+        rows = np.unique(np.concatenate([*self._lately, *seen])).astype(np.int64)
+        self._lately = [*self._lately[-RECENT:], seen[-1]]
+        weak = culling.weak_points(self.map, self._rig, rows, row, self._config)
+        self.map.cull_points(weak)
+        self._culled.append(weak)
+        protected = np.zeros(len(self.map.keyframes), bool)
+        protected[[0, *sorted(self._loop_rows)]] = True
+        protected[-RECENT:] = True
+        redundant = culling.redundant_keyframe(self.map, row, protected, self._config)
+        if redundant >= 0:
+            self.map.cull_keyframe(redundant)
