@@ -11,56 +11,48 @@ from calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.absolute_pose import range_sigmas
 from stereo_sfm.loop.binary import present
-from stereo_sfm.types import F64, I64, U8, Keyframe
+from stereo_sfm.types import F64, I32, I64, U8, Keyframe
 
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """M described points in the frame of a centre keyframe; a physical point may have several rows (views)."""
+    """M described points in the frame of a centre camera; a physical point may have several rows (views)."""
 
     ids: I64  # (M,) point ids
     points: F64  # (M, 3) metres in the centre's camera
     sigmas: F64  # (M,) metres along the ray
     descriptors: U8  # (M, 32)
-    uv_left: F64  # (M, 2) px in the centre's image, NaN for points of the other keyframes
+    uv_left: F64  # (M, 2) px in the image of the row's own keyframe
     uv_right: F64  # (M, 2)
+    view: I64  # (M,) which keyframe that is: row of centre_T_kf
+    centre_T_kf: F64  # (V, 4, 4); row 0 is the centre
 
     def __len__(self) -> int:
         return len(self.ids)
 
-
-def keyframe_cloud(keyframe: Keyframe, rig: Rig, disparity_sigma: float) -> Cloud:
-    """A keyframe's own points that have depth and a descriptor."""
-    rows = np.flatnonzero(np.isfinite(keyframe.points_cam[:, 2]) & present(keyframe.descriptors))
-    points = np.ascontiguousarray(keyframe.points_cam[rows])
-    return Cloud(
-        keyframe.point_ids[rows],
-        points,
-        range_sigmas(points, rig, disparity_sigma),
-        keyframe.descriptors[rows],
-        keyframe.uv_left[rows],
-        keyframe.uv_right[rows],
-    )
+    def seen_by_centre(self, rows: I32) -> tuple[F64, F64]:
+        """Left and right pixels (N, 2) of these rows in the centre's image, NaN for views of other keyframes."""
+        own = (self.view[rows] == 0)[:, None]
+        return np.where(own, self.uv_left[rows], np.nan), np.where(own, self.uv_right[rows], np.nan)
 
 
 def gather(centre: Keyframe, others: Sequence[Keyframe], rig: Rig, disparity_sigma: float) -> Cloud:
-    """The centre's points, then those of `others` (near in time), moved into its camera by odometry."""
-    clouds = [keyframe_cloud(centre, rig, disparity_sigma)]
-    for other in others:
-        cloud = keyframe_cloud(other, rig, disparity_sigma)
-        unseen = np.full((len(cloud), 2), np.nan)
-        moved = se3.transform(se3.inverse(centre.odom_T_cam) @ other.odom_T_cam, cloud.points)
-        clouds.append(Cloud(cloud.ids, moved, cloud.sigmas, cloud.descriptors, unseen, unseen))
-    return concatenate(clouds)
+    """The centre's points, then those of `others` (near in time), moved into its camera by odometry.
 
-
-def concatenate(clouds: Sequence[Cloud]) -> Cloud:
-    """Rows of all, in order."""
+    Only points with depth and a descriptor are taken.
+    """
+    keyframes = [centre, *others]
+    centre_T_kf = np.stack([se3.inverse(centre.odom_T_cam) @ k.odom_T_cam for k in keyframes])
+    rows = [np.flatnonzero(np.isfinite(k.points_cam[:, 2]) & present(k.descriptors)) for k in keyframes]
+    taken = list(zip(keyframes, rows, strict=True))
+    points = [k.points_cam[r] for k, r in taken]
     return Cloud(
-        np.concatenate([c.ids for c in clouds]),
-        np.concatenate([c.points for c in clouds]),
-        np.concatenate([c.sigmas for c in clouds]),
-        np.concatenate([c.descriptors for c in clouds]),
-        np.concatenate([c.uv_left for c in clouds]),
-        np.concatenate([c.uv_right for c in clouds]),
+        np.concatenate([k.point_ids[r] for k, r in taken]),
+        np.concatenate([se3.transform(t, p) for t, p in zip(centre_T_kf, points, strict=True)]),
+        range_sigmas(np.concatenate(points), rig, disparity_sigma),
+        np.concatenate([k.descriptors[r] for k, r in taken]),
+        np.concatenate([k.uv_left[r] for k, r in taken]),
+        np.concatenate([k.uv_right[r] for k, r in taken]),
+        np.repeat(np.arange(len(taken)), [len(r) for r in rows]),
+        centre_T_kf,
     )

@@ -20,6 +20,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.loop import binary
 from stereo_sfm.loop.absolute_pose import Matches, Pose, ransac_pose, refine_pose
 from stereo_sfm.loop.cloud import Cloud
+from stereo_sfm.mapping.bundle import Bundle, bundle_adjust
 from stereo_sfm.types import F64, I32, I64, Keyframe
 
 GUIDED_RADIUS_PX = 10.0
@@ -91,8 +92,9 @@ def verify(view: View, cloud: Cloud, rig: Rig, config: LoopConfig, rng: np.rando
     uv = view.uv_left[rows_b[pose.inlier]]
     if occupied_cells(uv, rig.left.size) < config.min_cells:
         return rejection("not_spread", inliers)
-    pairs = np.stack([cloud.ids[rows_a[pose.inlier]], view.ids[rows_b[pose.inlier]]], axis=1)
-    return Verdict("", pose.b_T_a, pose.information, pairs, inliers, uv)
+    rows_a, rows_b = rows_a[pose.inlier], rows_b[pose.inlier]
+    b_T_a = refine_with_points(pose.b_T_a, view, cloud, rows_b, rows_a, rig, config)
+    return Verdict("", b_T_a, pose.information, np.stack([cloud.ids[rows_a], view.ids[rows_b]], axis=1), inliers, uv)
 
 
 def _place(
@@ -103,7 +105,34 @@ def _place(
     return None if start is None else refine_pose(start, matches, rig, config.pixel_sigma)
 
 
+def refine_with_points(
+    b_T_a: F64, view: View, cloud: Cloud, rows_b: I32, rows_a: I32, rig: Rig, config: LoopConfig
+) -> F64:
+    """b_T_a from a bundle over all views of the matched points, the candidate's side held fast.
+
+    The retail paper finds the loop's pose this way (section IV-C3). Moving the points with it removes the bias that
+    noisy stereo depth has on a pose from fixed points.
+    """
+    ids = np.unique(cloud.ids[rows_a])
+    views = np.flatnonzero(np.isin(cloud.ids, ids))
+    first = views[np.unique(cloud.ids[views], return_index=True)[1]]
+    obs_pt = np.searchsorted(ids, np.concatenate([cloud.ids[views], cloud.ids[rows_a]]))
+    camera = len(cloud.centre_T_kf)
+    bundle = Bundle(
+        world_T_kf=np.concatenate([cloud.centre_T_kf, se3.inverse(b_T_a)[None]]),
+        fixed=np.arange(camera + 1) < camera,
+        points=cloud.points[first],
+        obs_kf=np.concatenate([cloud.view[views], np.full(len(rows_b), camera)]),
+        obs_pt=obs_pt,
+        uv_left=np.concatenate([cloud.uv_left[views], view.uv_left[rows_b]]),
+        uv_right=np.concatenate([cloud.uv_right[views], view.uv_right[rows_b]]),
+        sigma=np.full((len(obs_pt), 2), config.disparity_sigma),
+    )
+    return se3.inverse(bundle_adjust(rig, bundle).world_T_kf[-1])
+
+
 def _pair(view: View, cloud: Cloud, rows_b: I32, rows_a: I32) -> Matches:
+    left_a, right_a = cloud.seen_by_centre(rows_a)
     return Matches(
         cloud.points[rows_a],
         cloud.sigmas[rows_a],
@@ -111,8 +140,8 @@ def _pair(view: View, cloud: Cloud, rows_b: I32, rows_a: I32) -> Matches:
         view.uv_right[rows_b],
         view.points[rows_b],
         view.sigmas[rows_b],
-        cloud.uv_left[rows_a],
-        cloud.uv_right[rows_a],
+        left_a,
+        right_a,
     )
 
 

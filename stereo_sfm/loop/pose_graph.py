@@ -1,0 +1,132 @@
+"""Keyframe optimisation as a pose graph (the retail paper's equation 22), robust against false loops.
+
+The paper minimises |K_i - i_T_j K_j| over all edges with Levenberg-Marquardt; here an edge's error is the logarithm
+of the same difference, weighed by how well the edge is known, and loops must earn their weight: graduated
+non-convexity (Yang et al., RA-L 5, 2020) keeps the edges of the walk and drops loops that contradict them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
+from stereo_sfm.types import F64, I64, Bool
+
+ROBUST = ("gnc", "switchable", "none")
+CHI2_6DOF_99 = 16.81
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """Relative poses between keyframes, by their row."""
+
+    i: I64  # (E,)
+    j: I64  # (E,)
+    i_T_j: F64  # (E, 4, 4)
+    sigmas: F64  # (E, 2) metres, radians
+    loop: Bool  # (E,) may be false
+
+    def __len__(self) -> int:
+        return len(self.i)
+
+
+@dataclass(frozen=True, eq=False)
+class PoseGraphResult:
+    """Refined poses, and how much each edge counts in the end."""
+
+    poses: F64  # (K, 4, 4)
+    weights: F64  # (E,) 1 for edges of the walk, in [0, 1] for loops
+    initial_error: float
+    error: float
+    extra: dict[str, float] = field(default_factory=dict[str, float])
+
+
+def join(edges: list[Edges]) -> Edges:
+    """All edges, in order."""
+    return Edges(
+        np.concatenate([e.i for e in edges]),
+        np.concatenate([e.j for e in edges]),
+        np.concatenate([e.i_T_j for e in edges]),
+        np.concatenate([e.sigmas for e in edges]),
+        np.concatenate([e.loop for e in edges]),
+    )
+
+
+def edges_of_poses(poses: F64, i: I64, j: I64, metres_per_metre: float, radians_per_metre: float) -> Edges:
+    """Edges that hold what the poses (K, 4, 4) say now; uncertainty grows with the distance between the two."""
+    relative = se3.inverse(poses[i]) @ poses[j]
+    length = np.linalg.norm(relative[:, :3, 3], axis=1)
+    turn = np.linalg.norm(se3.log(relative)[:, 3:], axis=1) if len(i) else np.zeros(0)
+    sigmas = np.stack(
+        [0.001 + metres_per_metre * length, 0.0002 + radians_per_metre * length + 0.002 * turn],
+        axis=1,
+    )
+    return Edges(i, j, relative, sigmas, np.zeros(len(i), bool))
+
+
+def optimise(poses: F64, edges: Edges, fixed: I64, robust: str = "gnc") -> PoseGraphResult:
+    """Poses (K, 4, 4) that agree best with the edges; the rows `fixed` stay.
+
+    Args:
+        robust: "gnc" (loops are kept or dropped), "switchable" (dynamic covariance scaling, Agarwal et al., ICRA
+            2013: the closed form of switchable constraints), or "none" (least squares, as the paper).
+    """
+    if robust not in ROBUST:
+        raise StereoSfmError(f"loop.robust is '{robust}': choose one of {', '.join(ROBUST)}")
+    import gtsam
+
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    used = np.unique(np.concatenate([edges.i, edges.j, fixed]))
+    for row in used.tolist():
+        values.insert(row, gtsam.Pose3(se3.orthonormalize(poses[row])))
+    for e in range(len(edges)):
+        metres, radians = edges.sigmas[e]
+        noise: Any = gtsam.noiseModel.Diagonal.Sigmas(np.array([radians] * 3 + [metres] * 3))
+        if edges.loop[e] and robust == "switchable":
+            noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.DCS.Create(CHI2_6DOF_99), noise)
+        measured = gtsam.Pose3(se3.orthonormalize(edges.i_T_j[e]))
+        graph.add(gtsam.BetweenFactorPose3(int(edges.i[e]), int(edges.j[e]), measured, noise))
+    tight = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
+    for row in fixed.tolist():
+        graph.add(gtsam.PriorFactorPose3(row, values.atPose3(row), tight))
+    result, weights = _solve(gtsam, graph, values, edges, robust)
+    out = poses.copy()
+    for row in used.tolist():
+        out[row] = result.atPose3(row).matrix()
+    return PoseGraphResult(out, weights, float(graph.error(values)), float(graph.error(result)))
+
+
+def _solve(gtsam: Any, graph: Any, values: Any, edges: Edges, robust: str) -> tuple[Any, F64]:
+    weights = np.ones(len(edges))
+    loops = np.flatnonzero(edges.loop)
+    params = gtsam.LevenbergMarquardtParams()
+    if robust != "gnc" or not len(loops):
+        result = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+        if robust == "switchable":
+            weights[loops] = [_switch(2 * _plain_error(gtsam, edges, e, result)) for e in loops.tolist()]
+        return result, weights
+    gnc = gtsam.GncLMParams(params)
+    gnc.setLossType(gtsam.GncLossType.TLS)
+    gnc.setKnownInliers([k for k in range(graph.size()) if k >= len(edges) or not edges.loop[k]])
+    optimizer = gtsam.GncLMOptimizer(graph, values, gnc)
+    optimizer.setInlierCostThresholdsAtProbability(0.999)
+    result = optimizer.optimize()
+    weights[loops] = np.asarray(optimizer.getWeights())[loops]
+    return result, weights
+
+
+def _plain_error(gtsam: Any, edges: Edges, e: int, values: Any) -> float:
+    """Half the squared normalised error of an edge, without its robust loss."""
+    metres, radians = edges.sigmas[e]
+    noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([radians] * 3 + [metres] * 3))
+    measured = gtsam.Pose3(se3.orthonormalize(edges.i_T_j[e]))
+    return float(gtsam.BetweenFactorPose3(int(edges.i[e]), int(edges.j[e]), measured, noise).error(values))
+
+
+def _switch(chi2: float) -> float:
+    """Weight that dynamic covariance scaling gives to a squared error."""
+    return min(1.0, 2 * CHI2_6DOF_99 / (CHI2_6DOF_99 + chi2)) ** 2

@@ -1,0 +1,18 @@
+"""A single stereo image as a keyframe: the same corners, stereo matches and descriptors that tracking makes."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from calib.rig import Rig
+from stereo_sfm.config import TrackerConfig
+from stereo_sfm.tracking.tracker import Tracker
+from stereo_sfm.types import Keyframe, StereoImage
+
+
+def still_keyframe(
+    image: StereoImage, rig: Rig, max_features: int = 800, config: TrackerConfig | None = None
+) -> Keyframe | None:
+    """What a tracker that starts at this image makes of it (pose identity); None where it sees too little."""
+    config = dataclasses.replace(config or TrackerConfig(), max_features=max_features)
+    return Tracker(config, rig).step(image)[1]
