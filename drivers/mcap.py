@@ -11,17 +11,24 @@ from typing import Any, Self
 
 import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
 from calib.rig import Rig
 from drivers.rig_option import RigOption, chosen_rig
 from drivers.source import Source
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.log import foxglove, images, schema, topics
-from stereo_sfm.log.image_log import RIG_FILE, ImageInfo, ImuSample, WheelSample, rig_from_text
+from stereo_sfm.log import images, schema, topics
+from stereo_sfm.log.image_log import (
+    RIG_FILE,
+    TRUTH_FILE,
+    ImageInfo,
+    ImuSample,
+    WheelSample,
+    rig_from_text,
+    truth_from_bytes,
+)
 from stereo_sfm.log.reader import LogReader, Record
-from stereo_sfm.types import F32, U8, ImuSamples, StereoImage, Trajectory, WheelSamples
+from stereo_sfm.types import F32, U8, ImuSamples, StereoImage, WheelSamples
 
 log = logging.getLogger("stereo_sfm")
 
@@ -63,17 +70,6 @@ def open_mcap(path: str, **options: Any) -> Source:
     except BaseException:
         reader.close()
         raise
-
-
-def read_ground_truth(reader: LogReader, topic: str) -> Trajectory | None:
-    """Poses of a PoseInFrame topic in stamp order, None where there are none."""
-    stamps: list[int] = []
-    poses: list[Any] = []
-    for record in reader.messages([topic]):
-        message = PoseInFrame.FromString(record.data)
-        stamps.append(record.log_time)
-        poses.append(foxglove.matrix(message.pose.position, message.pose.orientation))
-    return Trajectory(np.array(stamps, np.int64), np.array(poses)) if stamps else None
 
 
 def decode_image(record: Record) -> U8:
@@ -171,6 +167,8 @@ class McapSource:
         self.reader = reader
         self.name = str(reader.path)
         self.rig = chosen_rig(rig, self._recorded_rig)
+        truth = reader.attachment(TRUTH_FILE)
+        self.ground_truth = truth_from_bytes(truth) if truth is not None else None  # world_T_cam0
         self._decoders: dict[type[Any], Callable[[bytes], Any]] = {}
 
     def _recorded_rig(self) -> Rig:
@@ -178,11 +176,6 @@ class McapSource:
         if text is None:
             raise StereoSfmError(f"{self.name} holds no calibration: give one with --rig FILE")
         return rig_from_text(text.decode())
-
-    @property
-    def ground_truth(self) -> Trajectory | None:
-        """world_T_cam0, where the recorded source had it."""
-        return read_ground_truth(self.reader, topics.GROUND_TRUTH)
 
     @property
     def frame_count(self) -> int | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from stereo_sfm.log.writer import LogWriter
 from stereo_sfm.types import ImuSamples, StereoImage, Trajectory, WheelSamples
 
 RIG_FILE = "calibration.yaml"
+TRUTH_FILE = "ground_truth.npz"
 SECOND_NS = 1_000_000_000
 
 
@@ -80,6 +82,19 @@ def rig_from_text(text: str) -> Rig:
         return read_native(path)
 
 
+def truth_to_bytes(trajectory: Trajectory) -> bytes:
+    """Stamps and poses as npz, every bit: the topic holds quaternions, which are rounded."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, stamp_ns=trajectory.stamp_ns, poses=trajectory.poses)
+    return buffer.getvalue()
+
+
+def truth_from_bytes(data: bytes) -> Trajectory:
+    """The inverse of `truth_to_bytes`."""
+    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+        return Trajectory(arrays["stamp_ns"], arrays["poses"])
+
+
 class ImageLog:
     """Writes one source's images and everything around them through a `LogWriter`."""
 
@@ -92,20 +107,30 @@ class ImageLog:
         self._format = image_format
         self._next_static_ns: int | None = None
         writer.attach(RIG_FILE, rig_to_text(rig), "application/yaml")
+        if ground_truth is not None:
+            writer.attach(TRUTH_FILE, truth_to_bytes(ground_truth), "application/zip")
 
     def image(self, image: StereoImage | LoggedImage) -> None:
         """Everything of one frame, pixels last.
 
         Args:
-            image: a pair, or one that `encode_pair` has encoded already (so that a run can track on decoded JPEG).
+            image: a pair, or one that `encode_pair` has encoded already.
+
+        Raises:
+            ValueError: a bare pair for a JPEG log: whoever tracks must see the decoded pixels, so encode first.
         """
-        logged = image if isinstance(image, LoggedImage) else encode_pair(image, self._format)
-        pair = logged.image
+        pair = image.image if isinstance(image, LoggedImage) else image
         self._static(pair.stamp_ns)
         self._ground_truth(pair.stamp_ns)
+        if self._format == "none":
+            return
+        if isinstance(image, StereoImage):
+            if self._format == "jpeg":
+                raise ValueError("JPEG is lossy: log and track what encode_pair(image, 'jpeg') gives")
+            image = encode_pair(image, self._format)
         self._samples(pair)
         self._info(pair)
-        self._pixels(logged)
+        self._pixels(image)
 
     def _info(self, pair: StereoImage) -> None:
         info = ImageInfo(

@@ -36,6 +36,7 @@ POINTS = "/map/points"
 TRAJECTORY = "/map/trajectory"
 SCENE = "/map/scene"
 HEALTH = "/health"
+STAGE_TIMES = "/stage_times"
 LOG = "/log"
 
 
@@ -77,6 +78,7 @@ TABLE: tuple[Topic, ...] = (
     Topic(TRAJECTORY, "foxglove.PosesInFrame", "all keyframes, at most every second and at the end"),
     Topic(SCENE, "foxglove.SceneUpdate", "loop and covisibility edges, with the trajectory"),
     Topic(HEALTH, "stereo_sfm.Health", "every second and stage: rate, queue, latency (wall clock)", compare=False),
+    Topic(STAGE_TIMES, "stereo_sfm.StageTimes", "every frame: milliseconds in each stage (wall clock)", compare=False),
     Topic(LOG, "foxglove.Log", "text for people", compare=False),
 )
 

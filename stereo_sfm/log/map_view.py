@@ -1,0 +1,67 @@
+"""The map as the log shows it: keyframe poses, points and edges, put together from the messages of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from stereo_sfm.types import F64, I64, Keyframe, LoopResult, MapUpdate
+
+COVISIBLE_KEYFRAMES = 20  # how far back edges are looked for
+COVISIBLE_POINTS = 30  # shared points that make an edge
+
+
+class MapView:
+    """Follows the mapper's updates. Points are columns sorted by id."""
+
+    def __init__(self) -> None:
+        self.point_ids: I64 = np.zeros(0, np.int64)
+        self.points: F64 = np.zeros((0, 3))
+        self._poses: dict[int, F64] = {}  # kf_id -> map_T_kf
+        self._recent: list[Keyframe] = []
+        self._covisible: list[tuple[int, int]] = []
+        self._loops: list[tuple[int, int]] = []
+
+    def keyframe(self, keyframe: Keyframe, map_T_odom: F64) -> None:
+        """A new keyframe, at its odometry pose until the mapper moves it."""
+        self._poses[keyframe.kf_id] = map_T_odom @ keyframe.odom_T_cam
+        for other in self._recent:
+            if np.isin(keyframe.point_ids, other.point_ids, assume_unique=True).sum() >= COVISIBLE_POINTS:
+                self._covisible.append((other.kf_id, keyframe.kf_id))
+        self._recent = [*self._recent[1 - COVISIBLE_KEYFRAMES :], keyframe]
+
+    def loop(self, result: LoopResult) -> None:
+        """An answer of the loop closer."""
+        if result.candidate_kf_id >= 0 and not result.reason:
+            self._loops.append((result.candidate_kf_id, result.kf_id))
+
+    def update(self, update: MapUpdate) -> None:
+        """The mapper's new poses and points."""
+        for kf_id, pose in zip(update.kf_ids.tolist(), update.map_T_kf, strict=True):
+            self._poses[kf_id] = pose
+        gone = np.concatenate([update.culled_point_ids, update.fused_point_ids[:, 0], update.point_ids])
+        keep = ~np.isin(self.point_ids, gone)
+        ids = np.concatenate([self.point_ids[keep], update.point_ids])
+        points = np.concatenate([self.points[keep], update.points_map])
+        order = np.argsort(ids, kind="stable")
+        self.point_ids, self.points = ids[order], points[order]
+
+    @property
+    def trajectory(self) -> F64:
+        """(K, 4, 4) map_T_kf in the order of their ids."""
+        return np.array([self._poses[k] for k in sorted(self._poses)]).reshape(-1, 4, 4)
+
+    @property
+    def covisibility_lines(self) -> F64:
+        """(2E, 3) ends of the edges between keyframes that see the same points."""
+        return self._lines(self._covisible)
+
+    @property
+    def loop_lines(self) -> F64:
+        """(2E, 3) ends of the accepted loops."""
+        return self._lines(self._loops)
+
+    def _lines(self, edges: Iterable[tuple[int, int]]) -> F64:
+        known = [(i, j) for i, j in edges if i in self._poses and j in self._poses]
+        return np.array([self._poses[k][:3, 3] for edge in known for k in edge]).reshape(-1, 3)

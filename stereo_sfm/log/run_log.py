@@ -1,0 +1,361 @@
+"""`RunLog`: everything a run says, as topics. A sink of the pipeline; `NoRunLog` is its null twin."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+
+from calib.rig import Rig
+from stereo_sfm.config import Config
+from stereo_sfm.geometry import se3
+from stereo_sfm.log import foxglove, topics
+from stereo_sfm.log.image_log import ImageLog
+from stereo_sfm.log.images import LoggedImage
+from stereo_sfm.log.map_view import MapView
+from stereo_sfm.log.provenance import write_provenance
+from stereo_sfm.log.writer import LogWriter
+from stereo_sfm.pipeline.sinks import StageTimes
+from stereo_sfm.types import (
+    F32,
+    F64,
+    I32,
+    Applied,
+    Dropped,
+    Frame,
+    Keyframe,
+    LoopResult,
+    MapUpdate,
+    StereoImage,
+    Trajectory,
+)
+
+TRAJECTORY_NS = 1_000_000_000  # the keyframe trajectory and the edges at most so often
+POINTS_NS = 5_000_000_000  # the whole map at most so often
+OLD_TRACK = 30  # frames after which a track's colour no longer changes
+NAN = float("nan")
+
+
+@dataclass(frozen=True)
+class TrackStats:
+    """Flat numbers of one frame, so that every player can plot them; NaN where the tracker does not know."""
+
+    frame_id: int
+    state: int
+    keyframe: bool
+    map_version: int
+    observations: int
+    inlier_observations: int
+    stereo_observations: int
+    position_sigma: float  # metres
+    rotation_sigma: float  # radians
+    tracked: float = NAN
+    inliers: float = NAN
+    right: float = NAN
+    error: float = NAN
+    features: float = NAN
+    matches: float = NAN
+    parallax_deg: float = NAN
+    pure_rotation: float = NAN
+    line_share: float = NAN
+    vp_sigma_deg: float = NAN
+    other: dict[str, float] = field(default_factory=dict[str, float])
+
+
+@dataclass(frozen=True)
+class Health:
+    """How one stage keeps up; wall clock, never compared."""
+
+    stage: str
+    frame_id: int
+    rate: float  # per second
+    queue: int  # messages waiting
+    p50_ms: float
+    p95_ms: float
+    p99_ms: float
+    dropped: int
+
+
+_NAMED = {f.name for f in fields(TrackStats)} - {"other"}
+
+
+def track_stats(frame: Frame) -> TrackStats:
+    """The numbers of a frame; what has no field of its own goes to `other`."""
+    obs = frame.observations
+    named = {k: v for k, v in frame.stats.items() if k in _NAMED}
+    sigma = np.sqrt(np.maximum(np.diag(frame.covariance), 0.0))
+    return TrackStats(
+        frame_id=frame.frame_id,
+        state=int(frame.state),
+        keyframe=frame.is_keyframe,
+        map_version=frame.map_version,
+        observations=len(obs),
+        inlier_observations=int(obs.inlier.sum()),
+        stereo_observations=int(np.isfinite(obs.uv_right[:, 0]).sum()),
+        position_sigma=float(np.linalg.norm(sigma[:3])),
+        rotation_sigma=float(np.linalg.norm(sigma[3:])),
+        other={k: v for k, v in frame.stats.items() if k not in _NAMED},
+        **named,
+    )
+
+
+class NoRunLog:
+    """Null object: writes nothing."""
+
+    def put(self, message: object) -> None:
+        """Any message of a run."""
+
+    def image(self, image: StereoImage | LoggedImage) -> None:
+        """What the tracker sees."""
+
+    def frame(self, frame: Frame) -> None:
+        """The tracker's answer."""
+
+    def keyframe(self, keyframe: Keyframe) -> None:
+        """A frame that enters the map."""
+
+    def map_update(self, update: MapUpdate) -> None:
+        """The mapper's answer."""
+
+    def loop(self, result: LoopResult) -> None:
+        """The loop closer's answer."""
+
+    def applied(self, applied: Applied) -> None:
+        """Which update came before which frame."""
+
+    def dropped(self, dropped: Dropped) -> None:
+        """A frame that is missing."""
+
+    def health(self, health: Health) -> None:
+        """How a stage keeps up."""
+
+    def stage_times(self, times: StageTimes) -> None:
+        """Wall-clock milliseconds of a frame."""
+
+    def text(self, level: str, message: str) -> None:
+        """A line for people."""
+
+    def close(self) -> None:
+        """Write what is left and close the file."""
+
+
+class RunLog(NoRunLog):
+    """Writes a run.
+
+    The messages of the stages may arrive interleaved in any way, as from several processes; each stage's own must come
+    in order. What is put together from several stages (map pose, points, edges) waits until everything it needs has
+    come, so that the content of every topic is the same however the stages were scheduled.
+    """
+
+    def __init__(
+        self,
+        writer: LogWriter,
+        rig: Rig,
+        config: Config,
+        *,
+        source: str,
+        mode: str,
+        image_format: str = "png",
+        ground_truth: Trajectory | None = None,
+    ) -> None:
+        """Begin a log.
+
+        Args:
+            writer: the open file; `close` closes it.
+            rig: calibration that the run uses.
+            config: what decides its results.
+            source: the source's name.
+            mode: "inline", "lockstep" or "realtime".
+            image_format: "png", "raw", "jpeg" (only with images from `encode_pair`), or "none" for no images.
+            ground_truth: world_T_cam0 where the source has it.
+        """
+        self._writer = writer
+        self._left_T_body = se3.inverse(rig.body_T_left)
+        self._body_adjoint = se3.adjoint(rig.body_T_left)
+        self._loops = config.loop.enabled
+        write_provenance(writer, source=source, serial=rig.serial, mode=mode, image_format=image_format, config=config)
+        self._images = ImageLog(writer, rig, ground_truth, image_format)
+        self._map = MapView()
+        self._map_T_odom: dict[int, F64] = {0: np.eye(4)}  # by map version
+        self._version = 0
+        self._frames: deque[Frame] = deque()  # wait for the map version they used
+        self._answers: tuple[deque[MapUpdate], deque[LoopResult]] = (deque(), deque())  # wait for their keyframe
+        self._updates: deque[MapUpdate] = deque()  # wait for their keyframe and its loop result, to be shown
+        self._keyframes: dict[int, Keyframe] = {}
+        self._stamps: dict[int, tuple[int, int]] = {}  # kf_id -> stamp and frame id
+        self._results: dict[int, LoopResult] = {}
+        self._next_trajectory_ns: int | None = None
+        self._next_points_ns: int | None = None
+        self._last: tuple[int, int] = (0, 0)  # stamp and frame id of the newest keyframe shown
+        self._now_ns = 0
+        self._closed = False
+
+    def put(self, message: object) -> None:
+        """Any message of a run, by its type."""
+        for kind, action in self._actions:
+            if isinstance(message, kind):
+                action(self, message)
+                return
+        raise TypeError(f"no topic for {type(message).__name__}")
+
+    def image(self, image: StereoImage | LoggedImage) -> None:
+        pair = image.image if isinstance(image, LoggedImage) else image
+        self._now_ns = pair.stamp_ns
+        self._images.image(image)
+
+    def frame(self, frame: Frame) -> None:
+        write, stamp, sequence = self._writer.write, frame.stamp_ns, frame.frame_id
+        write(topics.FRAME, frame, stamp, sequence)
+        write(topics.STATS, track_stats(frame), stamp, sequence)
+        obs = frame.observations
+        dots = foxglove.point_annotations(stamp, obs.uv_left, _age_colors(obs.age, obs.inlier))
+        write(topics.FEATURES, dots, stamp, sequence)
+        odom_T_body = frame.odom_T_cam @ self._left_T_body
+        write(topics.ODOM_POSE, foxglove.pose_in_frame("odom", stamp, odom_T_body), stamp, sequence)
+        covariance = self._odometry_covariance(frame.covariance, odom_T_body)
+        write(topics.ODOMETRY, foxglove.odometry(stamp, odom_T_body, covariance), stamp, sequence)
+        self._frames.append(frame)
+        self._release_frames()
+
+    def keyframe(self, keyframe: Keyframe) -> None:
+        self._writer.write(topics.KEYFRAME, keyframe, keyframe.stamp_ns, keyframe.frame_id)
+        self._keyframes[keyframe.kf_id] = keyframe
+        self._stamps[keyframe.kf_id] = (keyframe.stamp_ns, keyframe.frame_id)
+        self._release_answers()
+        self._release_updates()
+
+    def map_update(self, update: MapUpdate) -> None:
+        self._answers[0].append(update)
+        self._release_answers()
+        self._updates.append(update)
+        self._map_T_odom[update.version] = update.map_T_odom
+        self._version = update.version
+        self._release_updates()
+        self._release_frames()
+
+    def loop(self, result: LoopResult) -> None:
+        self._answers[1].append(result)
+        self._release_answers()
+        self._results[result.kf_id] = result
+        self._release_updates()
+
+    def applied(self, applied: Applied) -> None:
+        self._writer.write(topics.APPLIED, applied, self._now_ns, applied.before_frame_id)
+
+    def dropped(self, dropped: Dropped) -> None:
+        self._writer.write(topics.DROPPED, dropped, dropped.stamp_ns, dropped.frame_id)
+
+    def health(self, health: Health) -> None:
+        self._writer.write(topics.HEALTH, health, self._now_ns, health.frame_id)
+
+    def stage_times(self, times: StageTimes) -> None:
+        self._writer.write(topics.STAGE_TIMES, times, self._now_ns, times.frame_id)
+
+    def text(self, level: str, message: str) -> None:
+        self._writer.write(topics.LOG, foxglove.text(self._now_ns, level, message), self._now_ns)
+
+    def close(self) -> None:
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            self._release_answers(everything=True)
+            self._release_updates(everything=True)
+            self._release_frames(everything=True)
+            self._show_trajectory()
+            self._show_points()
+        finally:
+            self._writer.close()
+
+    def _release_frames(self, everything: bool = False) -> None:
+        while self._frames and (everything or self._frames[0].map_version <= self._version):
+            self._show_frame(self._frames.popleft())
+
+    def _show_frame(self, frame: Frame) -> None:
+        older = [v for v in self._map_T_odom if v <= frame.map_version]
+        map_T_odom = self._map_T_odom[max(older)]
+        for version in sorted(older)[:-1]:
+            del self._map_T_odom[version]
+        odom_T_body = frame.odom_T_cam @ self._left_T_body
+        stamp, sequence = frame.stamp_ns, frame.frame_id
+        pose = foxglove.pose_in_frame("map", stamp, map_T_odom @ odom_T_body)
+        self._writer.write(topics.MAP_POSE, pose, stamp, sequence)
+        rows = (("map", "odom", map_T_odom), ("odom", "body", odom_T_body))
+        self._writer.write(topics.TF, foxglove.transforms(stamp, rows), stamp, sequence)
+
+    def _release_answers(self, everything: bool = False) -> None:
+        """Write what the mapper and the loop closer said, stamped as the keyframe that it answers."""
+        for topic, queue in zip((topics.MAP_UPDATE, topics.LOOP), self._answers, strict=True):
+            while queue and (everything or queue[0].kf_id in self._stamps):
+                answer = queue.popleft()
+                self._writer.write(topic, answer, *self._stamps.get(answer.kf_id, self._last))
+
+    def _release_updates(self, everything: bool = False) -> None:
+        while self._updates:
+            kf_id = self._updates[0].kf_id
+            ready = kf_id in self._keyframes and (not self._loops or kf_id in self._results)
+            if not ready and not everything:
+                return
+            self._show_update(self._updates.popleft())
+
+    def _show_update(self, update: MapUpdate) -> None:
+        keyframe, result = self._keyframes.pop(update.kf_id, None), self._results.pop(update.kf_id, None)
+        if keyframe is not None:
+            self._last = (keyframe.stamp_ns, keyframe.frame_id)
+            self._map.keyframe(keyframe, update.map_T_odom)
+        if result is not None:
+            self._map.loop(result)
+        self._map.update(update)
+        stamp = self._last[0]
+        if self._next_trajectory_ns is None or stamp >= self._next_trajectory_ns:
+            self._next_trajectory_ns = stamp + TRAJECTORY_NS
+            self._show_trajectory()
+        if self._next_points_ns is None or stamp >= self._next_points_ns:
+            self._next_points_ns = stamp + POINTS_NS
+            self._show_points()
+
+    def _show_trajectory(self) -> None:
+        poses = self._map.trajectory
+        if not len(poses):
+            return
+        stamp, sequence = self._last
+        self._writer.write(topics.TRAJECTORY, foxglove.poses_in_frame("map", stamp, poses), stamp, sequence)
+        lines = [
+            ("covisibility", foxglove.line_list(self._map.covisibility_lines, (0.4, 0.6, 1.0, 0.4), 1.0)),
+            ("loops", foxglove.line_list(self._map.loop_lines, (1.0, 0.3, 0.2, 1.0), 3.0)),
+        ]
+        self._writer.write(topics.SCENE, foxglove.scene("map", stamp, lines), stamp, sequence)
+
+    def _show_points(self) -> None:
+        if not len(self._map.points):
+            return
+        stamp, sequence = self._last
+        cloud = foxglove.point_cloud("map", stamp, self._map.points, self._map.point_ids)
+        self._writer.write(topics.POINTS, cloud, stamp, sequence)
+
+    def _odometry_covariance(self, covariance: F64, odom_T_body: F64) -> F64:
+        """From xi in camera axes to the body's position and rotation in the axes of `odom`, as Odometry has it."""
+        turn = np.kron(np.eye(2), odom_T_body[:3, :3]) @ self._body_adjoint
+        return turn @ covariance @ turn.T
+
+    _actions: tuple[tuple[Any, Any], ...] = (
+        ((StereoImage, LoggedImage), image),
+        (Frame, frame),
+        (Keyframe, keyframe),
+        (MapUpdate, map_update),
+        (LoopResult, loop),
+        (Applied, applied),
+        (Dropped, dropped),
+        (Health, health),
+        (StageTimes, stage_times),
+    )
+
+
+def _age_colors(age: I32, inlier: Any) -> F32:
+    """(N, 4) from blue (new) over green to red (old); grey where the pose does not use the point."""
+    t = np.clip(age / OLD_TRACK, 0.0, 1.0)
+    colors = np.stack([t, 1.0 - np.abs(2.0 * t - 1.0), 1.0 - t, np.ones_like(t)], 1).astype(np.float32)
+    colors[~inlier] = (0.6, 0.6, 0.6, 0.6)
+    return colors
