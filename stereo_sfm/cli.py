@@ -18,6 +18,8 @@ COMMANDS: dict[str, str] = {
     "record": "write a source to an MCAP file",
     "info": "what a recording or dataset folder holds, and what is wrong with it",
     "convert": "dataset folder to MCAP",
+    "recover": "mended copy of a recording that was cut off",
+    "diff": "whether two logs hold the same, and where they part",
     "rectify": "write rectified pictures with epipolar lines to look at",
     "eval": "compare a trajectory with ground truth",
     "config": "show the resolved configuration",
