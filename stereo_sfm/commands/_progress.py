@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import sys
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
-from stereo_sfm.types import Frame
+if TYPE_CHECKING:
+    from stereo_sfm.types import Frame
 
 
 class NoProgress:

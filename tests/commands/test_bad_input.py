@@ -1,0 +1,206 @@
+"""Bad input through the command line: exit code 2 and one line on standard error, or a warning and the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import pytest
+
+from stereo_sfm.cli import main
+from tests.drivers.dataset_folders import make_euroc, make_images, make_kitti, make_tum_rgbd
+
+Outcome = tuple[int, str, str]
+Run = Callable[..., Outcome]
+
+
+@pytest.fixture
+def cli(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Runs the command line in an empty folder: exit code, standard output, standard error."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*args: object) -> Outcome:
+        try:
+            code = main([str(a) for a in args])
+        except SystemExit as stop:  # argparse
+            code = int(stop.code or 0)
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return run
+
+
+def assert_one_line(outcome: Outcome, *words: str) -> None:
+    code, _, err = outcome
+    assert code == 2, err
+    assert len(err.strip().splitlines()) == 1, err
+    assert err.startswith("stereo-sfm ")
+    for word in words:
+        assert word in err
+
+
+def test_missing_folder(cli: Run) -> None:
+    assert_one_line(cli("run", "data/nowhere"), "no such file or folder: data/nowhere")
+    assert_one_line(cli("run", "euroc:nowhere"), "no folder nowhere")
+    assert not Path("runs").exists()
+
+
+def test_unknown_source_name(cli: Run) -> None:
+    assert_one_line(cli("run", "t256"), "unknown source 't256'", "t265", "sim", "mcap")
+
+
+def test_folder_of_something_else(cli: Run, tmp_path: Path) -> None:
+    (tmp_path / "holiday").mkdir()
+    assert_one_line(cli("run", "holiday"), "no dataset that is known here", "KITTI", "EuRoC")
+
+
+@pytest.mark.parametrize("make", [make_kitti, make_euroc, make_images])
+def test_missing_calibration(cli: Run, tmp_path: Path, make: Callable[[Path], Path]) -> None:
+    root = make(tmp_path / "data")
+    for name in ("calib.txt", "sensor.yaml", "rig.yaml"):
+        for path in root.rglob(name):
+            path.unlink()
+    assert_one_line(cli("run", f"{'kitti:' if make is make_kitti else ''}{root}"), "calib")
+
+
+@pytest.mark.parametrize(
+    ("make", "name", "text"),
+    [
+        (make_kitti, "calib.txt", "P0: 50 0 32\nP1: 50 0 32\n"),
+        (make_kitti, "calib.txt", "P0: what is this\n"),
+        (make_euroc, "sensor.yaml", "T_BS: [1, 2\n"),
+        (make_euroc, "sensor.yaml", "resolution: [64, 48]\nintrinsics: [50, 50, 32, 24]\n"),
+        (make_images, "rig.yaml", "stereo_sfm_rig: 1\nleft: {model: pinhole}\n"),
+        (make_images, "rig.yaml", "stereo_sfm_rig: 99\n"),
+        (make_images, "rig.yaml", "\x00\x01\x02"),
+    ],
+)
+def test_malformed_calibration(cli: Run, tmp_path: Path, make: Callable[[Path], Path], name: str, text: str) -> None:
+    root = make(tmp_path / "data")
+    path = next(iter(sorted(root.rglob(name))))
+    path.write_text(text)
+    assert_one_line(cli("run", root), path.name)
+
+
+def test_calibration_with_a_transform_that_is_not_rigid(cli: Run, tmp_path: Path) -> None:
+    root = make_images(tmp_path / "data")
+    rig = root / "rig.yaml"
+    rig.write_text(rig.read_text().replace("[[1, 0, 0, 0.1]", "[[3, 0, 0, 0.1]"))
+    assert_one_line(cli("run", root))
+
+
+def test_rig_file_that_is_not_there(cli: Run, tmp_path: Path) -> None:
+    assert_one_line(cli("run", make_images(tmp_path / "data"), "--rig", "other.yaml"), "other.yaml")
+
+
+def test_unequal_image_counts_are_a_warning(cli: Run, tmp_path: Path) -> None:
+    root = make_kitti(tmp_path / "data", frames=5)
+    (root / "sequences" / "00" / "image_1" / "000004.png").unlink()
+    _, out, err = cli("run", root, "-o", "out", "--max-lost", 101)
+    assert "warning: kitti:00: 5 left and 4 right images, the 4 pairs are used" in err
+    assert "/4 frames" in out
+    assert "Traceback" not in err
+
+
+def test_unreadable_image_is_a_warning_and_a_dropped_frame(cli: Run, tmp_path: Path) -> None:
+    root = make_kitti(tmp_path / "data", frames=5)
+    (root / "sequences" / "00" / "image_0" / "000002.png").write_bytes(b"GIF89a")
+    _, out, err = cli("run", root, "-o", "out", "--max-lost", 101)
+    assert "warning: kitti:00: cannot read" in err and "000002.png, frame 2 is dropped" in err
+    assert "/5 frames (1 dropped by capture)" in out
+
+
+def test_no_readable_image_at_all(cli: Run, tmp_path: Path) -> None:
+    root = make_images(tmp_path / "data")
+    for path in (root / "left").iterdir():
+        path.write_bytes(b"x")
+    code, _, err = cli("run", root)
+    assert code == 2 and err.splitlines()[-1].startswith("stereo-sfm run: images:data: none of the 12 images")
+
+
+def test_image_size_that_contradicts_the_calibration(cli: Run, tmp_path: Path) -> None:
+    root = make_euroc(tmp_path / "data")
+    for path in root.rglob("sensor.yaml"):
+        path.write_text(path.read_text().replace("[64, 48]", "[752, 480]"))
+    assert_one_line(cli("run", root), "is 64x48 but the calibration is for 752x480")
+
+
+def test_one_image_of_another_size_ends_the_run_with_what_was_tracked(cli: Run, tmp_path: Path) -> None:
+    root = make_kitti(tmp_path / "data", frames=5)
+    cv2.imwrite(
+        str(root / "sequences" / "00" / "image_0" / "000003.png"), cv2.imread(str(root / "nothing")) or _small()
+    )
+    code, out, err = cli("run", root, "-o", "out")
+    assert code == 2 and "000003.png is 10x10 but the calibration is for 64x48" in err
+    assert "/3 frames" in out and Path("out/report.md").is_file()
+
+
+def _small() -> cv2.typing.MatLike:
+    import numpy as np
+
+    return np.zeros((10, 10), np.uint8)
+
+
+def test_depth_images_of_another_size(cli: Run, tmp_path: Path) -> None:
+    folder = make_tum_rgbd(tmp_path)
+    cv2.imwrite(str(folder / "depth" / "0.png"), _small().astype("uint16"))
+    (folder / "depth.txt").write_text("100.0 depth/0.png\n100.1 depth/1.png\n100.2 depth/2.png\n")
+    assert_one_line(cli("run", folder), "0.png is 10x10 but the calibration is for 640x480")
+
+
+def test_output_folder_that_exists(cli: Run, tmp_path: Path) -> None:
+    root = make_images(tmp_path / "data")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "thesis.tex").write_text("years of work")
+    assert_one_line(cli("run", root, "-o", "out"), "out exists", "--overwrite")
+    assert cli("run", root, "-o", "out", "--overwrite", "--max-lost", 101)[0] in (0, 4)
+    assert (tmp_path / "out" / "thesis.tex").read_text() == "years of work"
+
+
+def test_file_that_is_no_mcap(cli: Run, tmp_path: Path) -> None:
+    (tmp_path / "run.mcap").write_text("hello")
+    assert_one_line(cli("run", "run.mcap"), "run.mcap")
+
+
+@pytest.mark.parametrize(
+    ("args", "word"),
+    [
+        (("--set", "tracker.max_featurs=3"), "max_featurs"),
+        (("--set", "tracker.max_features=many"), "max_features"),
+        (("--set", "tracker"), "key=value"),
+        (("-c", "none.toml"), "none.toml"),
+        (("--frame-skip", "0"), "at least 1"),
+        (("--max-frames", "0"), "at least 1"),
+        (("--start", "-1"), "above 0"),
+    ],
+)
+def test_options_that_mean_nothing(cli: Run, tmp_path: Path, args: tuple[str, ...], word: str) -> None:
+    assert_one_line(cli("run", make_images(tmp_path / "data"), *args), word)
+
+
+def test_configuration_that_is_not_toml(cli: Run, tmp_path: Path) -> None:
+    (tmp_path / "bad.toml").write_text("[tracker\n")
+    assert_one_line(cli("run", make_images(tmp_path / "data"), "-c", "bad.toml"), "bad.toml")
+
+
+@pytest.mark.parametrize(
+    ("args", "word"),
+    [
+        (("none.tum", "--ref", "ref.tum"), "no trajectory at none.tum"),
+        (("est.tum", "--ref", "none.tum"), "none.tum"),
+        (("late.tum", "--ref", "ref.tum"), "no stamps in common"),
+        (("bad.tum", "--ref", "ref.tum"), "bad.tum line 1"),
+        (("folder", "--ref", "ref.tum"), "no run's folder"),
+        (("est.tum", "--ref", "data"), "has no ground truth"),
+        (("est.tum", "--ref", "ref.tum", "--delta", "x"), "--delta"),
+    ],
+)
+def test_eval_of_bad_files(cli: Run, tmp_path: Path, args: tuple[str, ...], word: str) -> None:
+    (tmp_path / "folder").mkdir()
+    make_images(tmp_path / "data")
+    for name, start in (("est", 0), ("ref", 0), ("late", 1000)):
+        lines = [f"{start + i / 10} {i} {i * i} 0 0 0 0 1" for i in range(9)]
+        (tmp_path / f"{name}.tum").write_text("\n".join(lines))
+    (tmp_path / "bad.tum").write_text("1 2 3")
+    assert_one_line(cli("eval", *args), word)

@@ -1,0 +1,134 @@
+from __future__ import annotations
+
+import json
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import stereo_sfm
+from drivers.ground_truth import read_kitti, read_tum
+from stereo_sfm.cli import main
+from stereo_sfm.geometry import se3
+from tests.drivers.dataset_folders import make_images
+
+
+@pytest.fixture(scope="module")
+def euroc_run(data_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run over 30 frames of EuRoC MH01."""
+    folder = tmp_path_factory.mktemp("runs") / "mh01"
+    assert main(["run", str(data_root / "euroc_mh01"), "-o", str(folder), "--max-frames", "30", "-q"]) == 0
+    return folder
+
+
+def test_output_folder(euroc_run: Path) -> None:
+    stats = json.loads((euroc_run / "stats.json").read_text())
+    assert stats["tracked"] == stats["frames"] == 30
+    assert stats["lost_intervals"] == [] and stats["keyframes"] >= 1
+    assert stats["evaluation"]["odometry"]["ape_m"]["rmse"] < 0.01
+    assert stats["ms"]["track"]["p50"] > 0
+    report = (euroc_run / "report.md").read_text()
+    assert "ATE" in report and "**PASS**" in report
+    for name in ("trajectory.png", "errors.png", "tracking.png", "times.png"):
+        assert (euroc_run / name).read_bytes().startswith(b"\x89PNG") and f"({name})" in report
+    assert stereo_sfm.load_rig(euroc_run / "rig.yaml").baseline == pytest.approx(0.1101, abs=1e-4)
+    assert (euroc_run.parent / "latest").resolve() == euroc_run.resolve()
+
+
+def test_trajectory_files_agree(euroc_run: Path) -> None:
+    tum = read_tum(euroc_run / "trajectory_odom.tum")
+    assert len(tum) == 30
+    assert tum.poses[0] == pytest.approx(np.eye(4))
+    kitti = read_kitti(euroc_run / "trajectory_odom.kitti", tum.stamp_ns)
+    assert kitti.poses == pytest.approx(tum.poses, abs=1e-7)
+    keyframes = read_tum(euroc_run / "keyframes.tum")
+    assert set(keyframes.stamp_ns.tolist()) <= set(tum.stamp_ns.tolist())
+
+
+def test_saved_configuration_runs_again(euroc_run: Path) -> None:
+    assert stereo_sfm.load_config(euroc_run / "config.toml") == stereo_sfm.Config()
+
+
+def test_same_input_same_bits(euroc_run: Path, data_root: Path, tmp_path: Path) -> None:
+    assert main(["run", str(data_root / "euroc_mh01"), "-o", str(tmp_path / "b"), "--max-frames", "30", "-q"]) == 0
+    first, second = (json.loads((f / "stats.json").read_text())["fingerprint"] for f in (euroc_run, tmp_path / "b"))
+    assert first == second
+
+
+def test_trajectory_of_the_body(euroc_run: Path, data_root: Path, tmp_path: Path) -> None:
+    args = ["run", str(data_root / "euroc_mh01"), "-o", str(tmp_path / "b"), "--max-frames", "30", "-q"]
+    assert main([*args, "--frame", "body"]) == 0
+    body = read_tum(tmp_path / "b" / "trajectory_odom.tum")
+    camera = read_tum(euroc_run / "trajectory_odom.tum")
+    body_T_cam = stereo_sfm.load_rig(euroc_run / "rig.yaml").body_T_left
+    assert body.poses == pytest.approx(body_T_cam @ camera.poses @ se3.inverse(body_T_cam), abs=1e-7)
+    assert "world_T_body" in (tmp_path / "b" / "trajectory_odom.tum").read_text()
+
+
+def test_eval_prints_the_runs_errors(
+    euroc_run: Path, data_root: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    stats = json.loads((euroc_run / "stats.json").read_text())
+    reference = str(data_root / "euroc_mh01")
+    assert main(["eval", str(euroc_run), "--ref", reference, "--json", "--plot", str(tmp_path)]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed["ape_m"]["rmse"] == pytest.approx(stats["evaluation"]["odometry"]["ape_m"]["rmse"], rel=1e-4)
+    assert {p.name for p in tmp_path.iterdir()} == {"trajectory.png", "errors.png"}
+    assert main(["eval", str(euroc_run), "--ref", reference, "--align", "none"]) == 0
+    assert "alignment none" in capsys.readouterr().out
+
+
+def test_eval_checks(euroc_run: Path, data_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    args = ["eval", str(euroc_run / "trajectory_odom.tum"), "--ref", str(data_root / "euroc_mh01")]
+    assert main([*args, "--max-ape", "0.02"]) == 0
+    assert main([*args, "--max-ape", "1e-6"]) == 3
+    assert "is above 1e-06 m" in capsys.readouterr().err
+
+
+def test_noise_is_not_tracked_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = make_images(tmp_path / "noise")
+    assert main(["run", str(root), "-o", str(tmp_path / "out")]) == 4
+    assert "never initialised" in capsys.readouterr().err
+    assert "**FAIL**" in (tmp_path / "out" / "report.md").read_text()
+
+
+def test_ctrl_c_writes_what_was_tracked(
+    data_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from stereo_sfm.pipeline import run as module
+
+    original = module.run
+
+    def interrupted(*args: object, **kwargs: object) -> object:
+        for i, frame in enumerate(original(*args, **kwargs)):  # pyright: ignore[reportArgumentType]
+            if i == 5:
+                raise KeyboardInterrupt
+            yield frame
+
+    monkeypatch.setattr(module, "run", interrupted)
+    assert main(["run", str(data_root / "euroc_mh01"), "-o", str(tmp_path / "out")]) == 130
+    assert len(read_tum(tmp_path / "out" / "trajectory_odom.tum")) in (5, 6)
+    assert "tracked" in capsys.readouterr().out
+
+
+def test_config_dump_is_read_back(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["config", "dump", "--set", "tracker.max_features=321", "--seed", "7"]) == 0
+    text = capsys.readouterr().out
+    assert tomllib.loads(text)["tracker"]["max_features"] == 321
+    (tmp_path / "c.toml").write_text(text)
+    config = stereo_sfm.load_config(tmp_path / "c.toml")
+    assert config.tracker.max_features == 321 and config.seed == 7
+
+
+def test_python_api_of_the_readme(data_root: Path) -> None:
+    import stereo_sfm as s
+
+    stamps: list[int] = []
+    with s.open_source(data_root / "euroc_mh01") as source:
+        for frame in s.run(source, s.Config()):
+            stamps.append(frame.stamp_ns)
+            assert frame.state is s.TrackState.OK
+            if len(stamps) == 3:
+                break
+    assert stamps == sorted(stamps) and len(stamps) == 3

@@ -1,0 +1,51 @@
+"""`import stereo_sfm` and `--help` are instant, because heavy libraries are imported where they are used."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+
+import pytest
+
+HEAVY = ("numpy", "cv2", "numba", "scipy", "gtsam", "rerun", "mcap", "matplotlib", "rich", "depthai", "google.protobuf")
+LIMIT_S = 0.5
+
+
+def fresh(code: str) -> str:
+    """What a fresh interpreter prints."""
+    return subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True).stdout
+
+
+@pytest.mark.parametrize(
+    "code",
+    ["import stereo_sfm", "import stereo_sfm.cli as c\ntry: c.main(['--help'])\nexcept SystemExit: pass"],
+)
+def test_fast_and_without_heavy_imports(code: str) -> None:
+    seconds = 1e9
+    for _ in range(3):  # the machine may be busy: the best of three counts
+        start = time.perf_counter()
+        loaded = fresh(code + f"\nimport sys\nprint('loaded', *[m for m in {HEAVY} if m in sys.modules])")
+        seconds = min(seconds, time.perf_counter() - start)
+        assert loaded.strip().splitlines()[-1] == "loaded"
+        if seconds < LIMIT_S:
+            break
+    assert seconds < LIMIT_S
+
+
+@pytest.mark.parametrize("command", ["run", "eval", "config"])
+def test_help_of_commands_needs_nothing_heavy(command: str) -> None:
+    code = (
+        f"import sys, stereo_sfm.cli as c\ntry: c.main(['{command}', '--help'])\nexcept SystemExit: pass\n"
+        f"print('loaded', *[m for m in {HEAVY} if m in sys.modules])"
+    )
+    assert fresh(code).strip().splitlines()[-1] == "loaded"
+
+
+def test_every_public_name_can_be_had() -> None:
+    import stereo_sfm
+
+    assert all(getattr(stereo_sfm, name) is not None for name in stereo_sfm.__all__)
+    assert set(stereo_sfm.__all__) <= set(dir(stereo_sfm))
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = stereo_sfm.nothing
