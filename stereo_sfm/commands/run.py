@@ -128,12 +128,15 @@ def run(args: argparse.Namespace) -> int:
 def _track(source: Source, config: Config, record: RunRecord, quiet: bool) -> tuple[bool, StereoSfmError | None]:
     """Run to the end, to Ctrl-C, or to an error of the source; what was tracked until then stays in the record."""
     from stereo_sfm.commands._progress import progress
+    from stereo_sfm.commands._stop import StopRequest
     from stereo_sfm.pipeline.run import run as run_source
 
-    with progress(source.name, source.frame_count, quiet) as bar:
+    with progress(source.name, source.frame_count, quiet) as bar, StopRequest() as stop:
         try:
             for frame in run_source(source, config, [record]):
                 bar.show(frame)
+                if stop.asked:
+                    return True, None
         except KeyboardInterrupt:
             return True, None
         except StereoSfmError as error:

@@ -14,6 +14,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, I64
 
 KITTI_LENGTHS = tuple(100.0 * i for i in range(1, 9))  # metres
+SHORTEST_PATH = 0.5  # metres; below it drift over a distance says nothing
 KITTI_STEP = 10  # a segment starts at every tenth frame
 
 
@@ -106,7 +107,7 @@ def kitti_drift(estimate: F64, reference: F64) -> Drift | None:
     on that path, not with the benchmark's numbers.
     """
     length = float(path_lengths(reference)[-1])
-    if length <= 1e-3:
+    if length < SHORTEST_PATH:
         return None
     lengths = KITTI_LENGTHS
     if length < KITTI_LENGTHS[0]:

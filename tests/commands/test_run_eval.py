@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import tomllib
 from pathlib import Path
 
@@ -10,7 +12,9 @@ import pytest
 import stereo_sfm
 from drivers.ground_truth import read_kitti, read_tum
 from stereo_sfm.cli import main
+from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.geometry import se3
+from stereo_sfm.types import Frame
 from tests.drivers.dataset_folders import make_images
 
 
@@ -93,23 +97,24 @@ def test_noise_is_not_tracked_and_says_so(tmp_path: Path, capsys: pytest.Capture
     assert "**FAIL**" in (tmp_path / "out" / "report.md").read_text()
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_writes_what_was_tracked(
-    data_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    number: int, data_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from stereo_sfm.pipeline import run as module
+    seen: list[int] = []
 
-    original = module.run
+    def put(self: RunRecord, message: object) -> None:
+        original(self, message)
+        if isinstance(message, Frame):
+            seen.append(message.frame_id)
+            if len(seen) == 5:
+                os.kill(os.getpid(), number)
 
-    def interrupted(*args: object, **kwargs: object) -> object:
-        for i, frame in enumerate(original(*args, **kwargs)):  # pyright: ignore[reportArgumentType]
-            if i == 5:
-                raise KeyboardInterrupt
-            yield frame
-
-    monkeypatch.setattr(module, "run", interrupted)
+    original = RunRecord.put
+    monkeypatch.setattr(RunRecord, "put", put)
     assert main(["run", str(data_root / "euroc_mh01"), "-o", str(tmp_path / "out")]) == 130
-    assert len(read_tum(tmp_path / "out" / "trajectory_odom.tum")) in (5, 6)
-    assert "tracked" in capsys.readouterr().out
+    assert len(read_tum(tmp_path / "out" / "trajectory_odom.tum")) == len(seen) == 5
+    assert "tracked 5/5 frames" in capsys.readouterr().out
 
 
 def test_config_dump_is_read_back(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -1,0 +1,97 @@
+"""Errors of the default system on every sequence, beside those of other systems.
+
+    python benchmarks/accuracy.py [--odometry] [--max-frames N] [SEQUENCE ...]
+
+Real sequences are looked for in STEREO_SFM_DATA; `sim:` scenes are rendered. ATE is the RMSE after alignment.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from _sequences import PEERS, one_thread, sequences
+
+one_thread()
+
+import cv2
+
+from drivers.select import SelectedFrames
+from drivers.source import open_source
+from stereo_sfm import config as configuration
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.eval.evaluate import Evaluation, evaluate, length
+from stereo_sfm.eval.record import RunRecord
+from stereo_sfm.pipeline.run import run
+
+HEADING = (
+    "| sequence | frames | lost | path | trajectory | ATE SE(3) | % | ATE Sim(3) | drift | deg/m | points |",
+    "|---|---|---|---|---|---|---|---|---|---|---|",
+)
+ODOMETRY_ONLY = ("mapper.enabled=false", "loop.enabled=false")
+
+
+def rows_of(name: str, spec: str, config: configuration.Config, max_frames: int | None) -> list[str]:
+    """Run on one sequence; a table row for each trajectory of it."""
+    record = RunRecord()
+    cv2.setRNGSeed(0)
+    with SelectedFrames(open_source(spec), max_frames=max_frames) as source:
+        for _ in run(source, config, [record]):
+            pass
+        reference = source.ground_truth
+    lost = len(record.frames) - int(record.tracked().sum())
+    inliers = sorted(row.inliers for row in record.frames)[len(record.frames) // 2]
+    rows: list[str] = []
+    mapped = record.mapped()
+    for kind, trajectory in (("odometry", record.odometry()), ("map", mapped)):
+        if trajectory is None:
+            continue
+        start = f"| {name} | {len(record.frames)} | {lost} "
+        try:
+            result = None if reference is None else evaluate(trajectory, reference)
+        except StereoSfmError:
+            result = None
+        cells = "| – | – | – | – | – | – " if result is None else ""
+        rows.append(start + (f"| – | {kind} {cells}" if result is None else _errors(kind, result)) + f"| {inliers} |")
+    return rows + peer_rows(name, max_frames)
+
+
+def _errors(kind: str, result: Evaluation) -> str:
+    drift = result.drift
+    over = (
+        "–"
+        if drift is None
+        else f"{drift.translation_percent:.2f} % ({drift.lengths_m[0]:g}–{drift.lengths_m[-1]:g} m)"
+    )
+    turn = "–" if drift is None else f"{drift.rotation_deg_per_m:.4f}"
+    return (
+        f"| {length(result.length_m)} | {kind} | {length(result.ape_m.rmse)} | {result.ate_percent:.3f} "
+        f"| {length(result.ate_sim3_m)} | {over} | {turn} "
+    )
+
+
+def peer_rows(name: str, max_frames: int | None) -> list[str]:
+    """What other systems reach on the whole of the same sequence."""
+    if max_frames is not None:
+        return []
+    return [
+        f"| {name} | | | | {system} | {length(se3)} | | {length(sim3)} | | | |"
+        for system, (se3, sim3) in PEERS.get(name, {}).items()
+    ]
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("sequence", nargs="*", help="folder names of the data root, or sources")
+    parser.add_argument("--odometry", action="store_true", help="without mapping and loop closing")
+    parser.add_argument("--max-frames", type=int)
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    args = parser.parse_args()
+    config = configuration.load(None, [*(ODOMETRY_ONLY if args.odometry else ()), *args.set])
+    print("\n".join(HEADING))
+    for name, spec in sequences(args.sequence):
+        print("\n".join(rows_of(name, spec, config, args.max_frames)), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,88 @@
+"""The tracking step beside `cv2.ORB_create(1000).detectAndCompute` on both images of the same frame, one thread.
+
+    python benchmarks/speed.py [--frames N] [SOURCE ...]
+
+Both are timed frame by frame in one run, so that a busy machine slows both. Reading and rendering images is not timed,
+nor are the first frames, in which code is compiled. RGB-D frames have one image: it counts twice.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+from _sequences import one_thread, sequences
+
+one_thread()
+
+import cv2
+import numpy as np
+
+from drivers.source import open_source
+from stereo_sfm.config import Config
+from stereo_sfm.timing import NoSpans
+from stereo_sfm.tracking.factory import make_tracker
+from stereo_sfm.types import StereoImage
+
+WARM_UP = 10  # frames
+SMALL = 20  # sequences with fewer frames say nothing about speed
+HEADING = (
+    "| sequence | image | frames | tracking step p50 | p95 | ORB on both images p50 | ratio of medians | points p50 |",
+    "|---|---|---|---|---|---|---|---|",
+)
+
+
+def orb_ms(orb: cv2.ORB, image: StereoImage) -> float:
+    """Milliseconds for both images."""
+    other = image.left if image.right is None else image.right
+    start = time.perf_counter()
+    orb.detectAndCompute(image.left, None)
+    orb.detectAndCompute(other, None)
+    return (time.perf_counter() - start) * 1e3
+
+
+def measure(name: str, spec: str, frames: int) -> str | None:
+    """One table row; None for a sequence that is too short."""
+    orb = cv2.ORB_create(1000)  # pyright: ignore[reportAttributeAccessIssue]
+    step: list[float] = []
+    extraction: list[float] = []
+    points: list[int] = []
+    with open_source(spec) as source:
+        if source.frame_count is not None and source.frame_count < SMALL:
+            return None
+        tracker = make_tracker(Config(), source.rig, NoSpans(), source.ground_truth)
+        for i, image in enumerate(source):
+            start = time.perf_counter()
+            frame, _ = tracker.step(image)
+            spent = (time.perf_counter() - start) * 1e3
+            other = orb_ms(orb, image)
+            if i >= WARM_UP:
+                step.append(spent)
+                extraction.append(other)
+                points.append(len(frame.observations))
+            if len(step) == frames:
+                break
+        width, height = source.rig.left.size
+    p50, p95 = np.percentile(step, [50, 95])
+    base = float(np.median(extraction))
+    return (
+        f"| {name} | {width}×{height} | {len(step)} | {p50:.1f} ms | {p95:.1f} ms | {base:.1f} ms "
+        f"| {p50 / base:.2f} | {int(np.median(points))} |"
+    )
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("source", nargs="*", help="folder names of the data root, or sources")
+    parser.add_argument("--frames", type=int, default=150)
+    args = parser.parse_args()
+    print("\n".join(HEADING))
+    for name, spec in sequences(args.source):
+        row = measure(name, spec, args.frames)
+        if row is not None:
+            print(row, flush=True)
+
+
+if __name__ == "__main__":
+    main()
