@@ -113,11 +113,7 @@ def _find_again(
 
 
 def fuse_points(map_: Map, first: int, second: int, config: MapperConfig) -> tuple[int, int] | None:
-    """Make two points one, the older survives; refused where one keyframe saw both. Returns (gone, stays) or None.
-
-    The two were seen by different tracks, whose places on the surface agree less well than those of one track: what the
-    younger one saw, and whatever the point is seen by from now on, counts less.
-    """
+    """Make two points one, the older survives; refused where one keyframe saw both. Returns (gone, stays) or None."""
     gone, stays = max(first, second), min(first, second)
     if gone == stays or not (map_.points.alive[gone] and map_.points.alive[stays]):
         return None
@@ -126,9 +122,7 @@ def fuse_points(map_: Map, first: int, second: int, config: MapperConfig) -> tup
     table = map_.observations
     if np.intersect1d(table.kf[moving], table.kf[there]).size:
         return None
-    table.sigma[moving] = config.match_sigma_px
-    map_.points.sigma[stays] = config.match_sigma_px
-    map_.fuse(gone, stays)
+    map_.fuse(gone, stays, config.match_sigma_px)
     return gone, stays
 
 

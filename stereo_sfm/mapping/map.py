@@ -358,10 +358,12 @@ class Map:
         self.keyframes.carrier_T_kf[going] = se3.inverse(pose[carrier]) @ pose[going]
         self._carried.setdefault(carrier, []).extend(going)
 
-    def fuse(self, old: int, new: int) -> None:
+    def fuse(self, old: int, new: int, sigma: float = 1.0) -> None:
         """The points of two rows are one: `new` takes over the observations and the names of `old`.
 
-        Where one keyframe saw both, the observation of `new` stays.
+        Where one keyframe saw both, the observation of `new` stays. Two tracks agree less well than one about where on
+        the surface a point is: what `old` was seen by, and what the point is seen by from now on, counts with `sigma`
+        pixels.
         """
         mine = set(self.observations.kf[self.observations_of_points(np.array([new]))].tolist())
         moving = self.observations_of_points(np.array([old]))
@@ -373,9 +375,11 @@ class Map:
             kf = int(self.observations.kf[obs])
             self.covisibility.add(kept, np.full(len(kept), kf))
             self.observations.pt[obs] = new
+            self.observations.sigma[obs] = sigma
             self.observations.following[obs] = self.points.head[new]
             self.points.head[new] = obs
         points = self.points
+        points.sigma[new] = sigma
         points.obs_count[new] += len(moving)
         points.seen[new] += points.seen[old]
         points.expected[new] += points.expected[old]

@@ -21,12 +21,15 @@ is culled).
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 
 from calib.rig import Rig
-from stereo_sfm.config import MapperConfig
+from stereo_sfm.config import LoopConfig, MapperConfig
+from stereo_sfm.geometry import se3
+from stereo_sfm.loop.correction import apply_loop
 from stereo_sfm.mapping import culling, window
 from stereo_sfm.mapping.bundle import BundleConfig, BundleResult, bundle_adjust
 from stereo_sfm.mapping.insertion import insert_keyframe
@@ -55,17 +58,22 @@ def run_job(job: Job) -> BundleResult:
 class Mapper:
     """Owner of the map."""
 
-    def __init__(self, config: MapperConfig, rig: Rig, spans: NoSpans | None = None) -> None:
+    def __init__(
+        self, config: MapperConfig, rig: Rig, spans: NoSpans | None = None, loop_config: LoopConfig | None = None
+    ) -> None:
+        """Empty map; `loop_config` says how an accepted loop is spread over the keyframes."""
         self._config, self._rig, self._spans = config, rig, spans or NoSpans()
+        self._loop_config = loop_config or LoopConfig()
         self.map = Map()
         self._map_T_odom: F64 = np.eye(4)
         self._version = 0
         self._culled: list[I64] = []
         self._fused: list[tuple[int, int]] = []  # rows (gone, stays)
         self._lately: list[I32] = []  # point rows that the newest keyframes saw, outliers too
-        self._loop_rows: set[int] = set()
+        self._loops: list[LoopResult] = []
         self._job: Job | None = None
         self._job_due = -1
+        self._job_taken = False
         self._answer: BundleResult | None = None
 
     # -- messages ----------------------------------------------------------------------------------------------------
@@ -79,6 +87,12 @@ class Mapper:
         self._version += 1
         if not self._config.enabled:
             return self._without_mapping(keyframe)
+        if self._job is not None and len(self.map.keyframes) >= self._job_due:
+            with self._spans.span("full_ba"):
+                self._apply_job()
+        if loop is not None and loop.candidate_kf_id >= 0:
+            with self._spans.span("close_loop"):
+                self._close(loop)
         with self._spans.span("associate"):
             row = self._insert(keyframe)
         with self._spans.span("local_ba"):
@@ -111,6 +125,69 @@ class Mapper:
             map_T_odom=self._map_T_odom.copy(),
         )
 
+    # -- loops -------------------------------------------------------------------------------------------------------
+
+    def _close(self, loop: LoopResult) -> None:
+        """Correct the map for a loop that the pose graph believes, and order a full bundle adjustment."""
+        loop = self._between_living(loop)
+        before = self.map.keyframes.map_T_kf[-1].copy()
+        correction = apply_loop(self.map, loop, self._loops, self._loop_config)
+        if not correction.applied:
+            return
+        self._loops.append(loop)
+        self._fused += correction.fused
+        self._follow_newest(before)
+        part = window.whole_map(self.map, self._config)
+        self._job = Job(self._rig, window.bundle_config(self._config), part, len(self.map.keyframes) - 1)
+        self._job_taken, self._answer = False, None
+        self._job_due = len(self.map.keyframes) + self._config.full_ba_lag_keyframes
+
+    def _between_living(self, loop: LoopResult) -> LoopResult:
+        """The same loop between the living keyframes that carry its two ends, where one was culled meanwhile."""
+        keyframes = self.map.keyframes
+        rows = [self.map.kf_row(loop.candidate_kf_id), self.map.kf_row(loop.kf_id)]
+        ends = [row if keyframes.alive[row] else int(keyframes.carrier[row]) for row in rows]
+        if ends == rows:
+            return loop
+        offset = [np.eye(4) if e == r else keyframes.carrier_T_kf[r] for e, r in zip(ends, rows, strict=True)]
+        return dataclasses.replace(
+            loop,
+            candidate_kf_id=int(keyframes.kf_id[ends[0]]),
+            kf_id=int(keyframes.kf_id[ends[1]]),
+            candidate_T_kf=offset[0] @ loop.candidate_T_kf @ se3.inverse(offset[1]),
+        )
+
+    def _follow_newest(self, before: F64) -> None:
+        """The odometry frame goes with the newest keyframe, whose map_T_kf was `before`."""
+        moved = self.map.keyframes.map_T_kf[-1] @ se3.inverse(before)
+        self._map_T_odom = se3.orthonormalize(moved @ self._map_T_odom)
+
+    def pending_job(self) -> Job | None:
+        """The full bundle adjustment that nobody has taken yet, once."""
+        if self._job is None or self._job_taken:
+            return None
+        self._job_taken = True
+        return self._job
+
+    def finish_job(self, result: BundleResult) -> None:
+        """Bring the answer of the job taken last. It counts when it is due, not before."""
+        self._answer = result
+
+    def _apply_job(self) -> None:
+        assert self._job is not None
+        job, result = self._job, self._answer or run_job(self._job)
+        self._job, self._answer = None, None
+        after = self.map.keyframes.map_T_kf.copy()
+        newest = after[job.newest].copy()
+        after[job.window.kf_rows] = result.world_T_kf
+        later = np.arange(job.newest + 1, len(after))
+        after[later] = after[job.newest] @ se3.inverse(newest) @ after[later]
+        before = self.map.keyframes.map_T_kf.copy()
+        self.map.move_keyframes(np.arange(len(after)), after)
+        self.map.carry_points(before, self.map.keyframes.map_T_kf)
+        window.write_back(self.map, job.window, result)
+        self._follow_newest(before[-1])
+
     # -- stages ------------------------------------------------------------------------------------------------------
 
     def _insert(self, keyframe: Keyframe) -> int:
@@ -135,7 +212,8 @@ class Mapper:
         self.map.cull_points(weak)
         self._culled.append(weak)
         protected = np.zeros(len(self.map.keyframes), bool)
-        protected[[0, *sorted(self._loop_rows)]] = True
+        ends = [self.map.kf_row(k) for x in self._loops for k in (x.candidate_kf_id, x.kf_id)]
+        protected[[0, *ends]] = True
         protected[-RECENT:] = True
         redundant = culling.redundant_keyframe(self.map, row, protected, self._config)
         if redundant >= 0:

@@ -8,9 +8,8 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
-from calib.rig import Rig
 from stereo_sfm.config import MapperConfig
-from stereo_sfm.mapping.bundle import Bundle, BundleConfig, BundleResult, bundle_adjust
+from stereo_sfm.mapping.bundle import Bundle, BundleConfig, BundleResult
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.types import I64, Bool
 
@@ -89,19 +88,14 @@ def _floating(fixed: Bool, obs_kf: I64, obs_pt: I64, points: int) -> I64:
     return floating[oldest]
 
 
-def adjust(map_: Map, rig: Rig, window: Window, config: MapperConfig) -> None:
-    """Bundle adjustment of a window, written back to the map."""
-    write_back(map_, window, bundle_adjust(rig, window.bundle, bundle_config(config)))
-
-
-def write_back(map_: Map, window: Window, result: BundleResult) -> None:
-    """New poses and points; eyes that disagree lose their observation."""
-    moved = np.flatnonzero(~window.bundle.fixed)
-    map_.move_keyframes(window.kf_rows[moved], result.world_T_kf[moved])
-    sane = np.isfinite(result.points).all(axis=1)
-    map_.move_points(window.pt_rows[sane], result.points[sane])
-    table, obs = map_.observations, window.obs_rows
-    wrong_left = ~result.inlier[:, 0] & np.isfinite(window.bundle.uv_left[:, 0])
-    wrong_right = ~result.inlier[:, 1] & np.isfinite(window.bundle.uv_right[:, 0])
+def write_back(map_: Map, part: Window, result: BundleResult) -> None:
+    """New poses and points of what still lives; eyes that disagree lose their observation."""
+    moved = np.flatnonzero(~part.bundle.fixed & map_.keyframes.alive[part.kf_rows])
+    map_.move_keyframes(part.kf_rows[moved], result.world_T_kf[moved])
+    sane = np.isfinite(result.points).all(axis=1) & map_.points.alive[part.pt_rows]
+    map_.move_points(part.pt_rows[sane], result.points[sane])
+    table, obs = map_.observations, part.obs_rows
+    wrong_left = ~result.inlier[:, 0] & np.isfinite(part.bundle.uv_left[:, 0])
+    wrong_right = ~result.inlier[:, 1] & np.isfinite(part.bundle.uv_right[:, 0])
     table.uv_right[obs[wrong_right & ~wrong_left]] = np.nan
     map_.remove_observations(obs[wrong_left])
