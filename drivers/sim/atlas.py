@@ -5,6 +5,8 @@ Larson and Shah 1990) filters each axis by its own footprint, so that nothing al
 Level (i, j) of a (h, w) picture lies in a (2h, 2w) block at column 2w - (2w >> i), row 2h - (2h >> j).
 """
 
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false
+
 from __future__ import annotations
 
 from dataclasses import dataclass, field
@@ -12,30 +14,56 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from stereo_sfm.types import F64, I64, U8
+from drivers.sim.kernels import njit
+from stereo_sfm.types import F32, F64, I64, U8
+
+
+@njit
+def _fill_ripmap(block, out):
+    """Complete `block` (2h, 2w) float, whose first quarter is the picture, by pair means; round into `out`."""
+    h, w = block.shape[0] // 2, block.shape[1] // 2
+    x0, n = w, w // 2
+    while n >= 1:  # halve along the rows
+        before = x0 - 2 * n
+        for y in range(h):
+            for x in range(n):
+                block[y, x0 + x] = 0.5 * (block[y, before + 2 * x] + block[y, before + 2 * x + 1])
+        x0 += n
+        n //= 2
+    y0, n = h, h // 2
+    while n >= 1:  # halve every column of that
+        before = y0 - 2 * n
+        for y in range(n):
+            for x in range(2 * w):
+                block[y0 + y, x] = 0.5 * (block[before + 2 * y, x] + block[before + 2 * y + 1, x])
+        y0 += n
+        n //= 2
+    for y in range(2 * h):
+        for x in range(2 * w):
+            out[y, x] = np.uint8(block[y, x] + 0.5)
+
+
+def _ripmap(image: U8) -> U8:
+    """(h, w) powers of two -> (2h, 2w)."""
+    h, w = image.shape
+    block = np.zeros((2 * h, 2 * w), np.float32)
+    block[:h, :w] = image
+    out = np.empty((2 * h, 2 * w), np.uint8)
+    _fill_ripmap(block, out)
+    return out
 
 
 def _power_of_two(n: int) -> int:
     return 1 << max(2, int(np.ceil(np.log2(max(n, 4)) - 0.25)))
 
 
-def _ripmap(image: U8) -> U8:
-    """(h, w) powers of two -> (2h, 2w)."""
-    h, w = image.shape
-    out = np.zeros((2 * h, 2 * w), np.uint8)
-    row = image.astype(np.float32)
-    j = 0
-    while True:
-        level, i, y0 = row, 0, 2 * h - (2 * h >> j)
-        while True:
-            x0 = 2 * w - (2 * w >> i)
-            out[y0 : y0 + level.shape[0], x0 : x0 + level.shape[1]] = np.rint(level)
-            if level.shape[1] == 1:
-                break
-            level, i = 0.5 * (level[:, ::2] + level[:, 1::2]), i + 1
-        if row.shape[0] == 1:
-            return out
-        row, j = 0.5 * (row[::2] + row[1::2]), j + 1
+def _resize(image: U8, w: int, h: int) -> U8:
+    """Each axis by the filter that suits it: means when it shrinks, linear when it grows."""
+    wide: F32 = image.astype(np.float32)
+    for size, shrinks in (((w, image.shape[0]), w < image.shape[1]), ((w, h), h < image.shape[0])):
+        how = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+        wide = np.asarray(cv2.resize(wide, size, interpolation=how), np.float32)
+    return np.clip(np.rint(wide), 0, 255).astype(np.uint8)
 
 
 @dataclass
@@ -60,7 +88,7 @@ class Atlas:
         """
         h, w = _power_of_two(image.shape[0]), _power_of_two(image.shape[1])
         if image.shape != (h, w):
-            image = np.asarray(cv2.resize(image, (w, h), interpolation=cv2.INTER_AREA), np.uint8)
+            image = _resize(image, w, h)
         self.blocks.append(_ripmap(image).ravel())
         self.table.append((self.used, w.bit_length() - 1, h.bit_length() - 1, int(wrap)))
         self.sizes.append(size)
@@ -69,4 +97,5 @@ class Atlas:
 
     def pack(self) -> tuple[U8, I64, F64]:
         """Bytes (N,), table (T, 4) of offset, log2 width, log2 height, wraps; sizes (T, 2) metres."""
-        return np.concatenate(self.blocks), np.array(self.table, np.int64), np.array(self.sizes, float)
+        texels = np.concatenate(self.blocks) if self.blocks else np.zeros(0, np.uint8)
+        return texels, np.array(self.table, np.int64).reshape(-1, 4), np.array(self.sizes, float).reshape(-1, 2)

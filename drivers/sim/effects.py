@@ -1,4 +1,4 @@
-"""What a sensor does to a picture: motion blur, exposure, vignetting, noise, eight bits. Random by (seed, frame, eye)."""
+"""What a sensor does to a picture: motion blur, exposure, vignetting, noise, eight bits; random by seed, frame, eye."""
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportMissingTypeArgument=false
 
@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from drivers.sim.kernels import njit
@@ -19,7 +20,8 @@ class Effects:
     """A sensor's faults; all of them off is `CLEAN`."""
 
     exposure_s: float = 0.004  # motion blur and StereoImage.exposure_us
-    gain: float = 1.0  # brightness of the whole picture
+    lens_blur_px: float = 0.45  # standard deviation of the lens's point spread
+    gain: float = 1.2  # brightness of the whole picture
     drift: float = 0.12  # relative swing of the exposure over time
     vignetting: float = 0.35  # loss at the edge of the field
     read_noise: float = 0.9  # standard deviation in grey levels, in the dark
@@ -28,7 +30,7 @@ class Effects:
     drop: float = 0.0  # fraction of frames that never arrive
 
 
-CLEAN = Effects(0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+CLEAN = Effects(0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class Sensor:
@@ -49,12 +51,12 @@ class Sensor:
         if effects.exposure_s > 0:
             self._jacobian = np.nan_to_num(camera.project_jacobian(grid)[1]).astype(np.float32)
 
-    def expose(self, view: View, twist: F64, brightness: float, rng: np.random.Generator) -> U8:
+    def expose(self, view: View, twist: F64, brightness: float, key: int) -> U8:
         """A picture as the sensor gives it.
 
         Args:
             twist: (6,) velocity of the eye in its own axes, metres and radians a second.
-            brightness: exposure relative to the clean picture.
+            brightness: exposure relative to the clean picture. key: of the noise, one for each frame and eye.
         """
         effects = self.effects
         image = view.image
@@ -62,12 +64,11 @@ class Sensor:
             blurred = np.empty_like(image)
             _blur(image, view.depth, self._jacobian, twist * effects.exposure_s, blurred)
             image = blurred
-        noisy = effects.read_noise > 0 or effects.shot_noise > 0
-        noise = rng.standard_normal(image.shape, np.float32) if noisy else np.zeros((1, 1), np.float32)
+        if effects.lens_blur_px > 0:
+            image = np.asarray(cv2.GaussianBlur(image, (5, 5), effects.lens_blur_px), np.float32)
         out = np.empty(image.shape, np.uint8)
-        _digitise(
-            image, self.vignette, noise, brightness, effects.read_noise**2, effects.shot_noise, effects.black_level, out
-        )
+        read, shot = effects.read_noise**2, effects.shot_noise
+        _digitise(image, self.vignette, np.uint64(key), brightness, read, shot, effects.black_level, out)
         return out
 
 
@@ -135,13 +136,24 @@ def _at(image, x, y):
 
 
 @njit
-def _digitise(image, vignette, noise, brightness, read, shot, black, out):
+def _normal(key, index):
+    """About standard normal: the centred sum of four 16-bit uniforms out of a hash (splitmix64; Steele et al. 2014)."""
+    z = key + np.uint64(index + 1) * np.uint64(0x9E3779B97F4A7C15)
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    z = z ^ (z >> np.uint64(31))
+    low = np.uint64(0xFFFF)
+    total = (z & low) + ((z >> np.uint64(16)) & low) + ((z >> np.uint64(32)) & low) + (z >> np.uint64(48))
+    return (np.float64(np.int64(total)) - 131070.0) * (1.7320508075688772 / 65536.0)
+
+
+@njit
+def _digitise(image, vignette, key, brightness, read, shot, black, out):
     """Exposure, vignetting, noise, clipping and rounding to a byte."""
     h, w = image.shape
-    noisy = noise.shape[0] == h
     for y in range(h):
         for x in range(w):
             value = image[y, x] * vignette[y, x] * brightness
-            if noisy:
-                value += noise[y, x] * math.sqrt(read + shot * max(value, 0.0))
+            if read > 0 or shot > 0:
+                value += _normal(key, y * w + x) * math.sqrt(read + shot * max(value, 0.0))
             out[y, x] = int(min(max(value + black + 0.5, 0.0), 255.0))

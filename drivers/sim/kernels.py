@@ -24,7 +24,9 @@ RAIL, BOARD, BACK, END, UNDER, INNER_END = 0, 1, 2, 3, 4, 5  # faces of a shelf
 FRONT, SIDE, LID, UPPER = 0, 1, 2, 4  # faces of a product; the upper box adds 4
 FAR = 1e30
 
-njit: Any = numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=False, forceinline=True)
+# Inlined by force and without reference counts: passing the world's many arrays through calls costs five times as much.
+_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False, "forceinline": True}
+njit: Any = numba.njit(**_OPTIONS)
 
 
 @njit

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers.sim.render import NOTHING, Moving
-from drivers.sim.world import CLOTHES, Tables
+from drivers.sim.world import SKIN, Tables
 from stereo_sfm.types import F64
 
 
@@ -22,6 +22,7 @@ class Person:
     height: float
     shirt: int  # index of a cloth
     trousers: int
+    hair: int  # and shoes
 
 
 def _pose(person: Person, seconds: float) -> tuple[F64, float, float]:
@@ -39,9 +40,12 @@ def _pose(person: Person, seconds: float) -> tuple[F64, float, float]:
 def _limbs(person: Person, step: float) -> list[tuple[F64, F64, float, int]]:
     """Ellipsoids in the person's axes (x ahead, z up): centre, half sizes, lean (radians about y), cloth."""
     h, swing = person.height, 0.45 * np.sin(step)
-    skin = CLOTHES - 1
+    skin = SKIN
     out = [
-        (np.array([0.0, 0.0, 0.93 * h]), np.array([0.1, 0.085, 0.125]), 0.0, skin),
+        (np.array([0.012, 0.0, 0.925 * h]), np.array([0.095, 0.08, 0.12]), 0.0, skin),
+        (np.array([-0.012, 0.0, 0.955 * h]), np.array([0.1, 0.088, 0.09]), -0.35, person.hair),
+        (np.array([0.0, 0.0, 0.85 * h]), np.array([0.05, 0.055, 0.09]), 0.0, skin),
+        (np.array([0.0, 0.0, 0.79 * h]), np.array([0.09, 0.225, 0.075]), 0.0, person.shirt),
         (np.array([0.0, 0.0, 0.68 * h]), np.array([0.13, 0.21, 0.33]), 0.04, person.shirt),
         (np.array([0.0, 0.0, 0.5 * h]), np.array([0.125, 0.185, 0.16]), 0.0, person.trousers),
     ]
@@ -53,10 +57,13 @@ def _limbs(person: Person, step: float) -> list[tuple[F64, F64, float, int]]:
         foot = knee + 0.235 * h * np.array([np.sin(bend), 0, -np.cos(bend)])
         out.append((0.5 * (hip + knee), np.array([0.085, 0.085, 0.15 * h]), -lean, person.trousers))
         out.append((0.5 * (knee + foot), np.array([0.06, 0.06, 0.145 * h]), -bend, person.trousers))
+        toe = foot + np.array([0.06, 0.0, 0.03])
+        out.append((toe, np.array([0.135, 0.048, 0.045]), 0.0, person.hair))
         shoulder = np.array([0.0, side * 0.235, 0.8 * h])
         arm = -0.8 * lean
         hand = shoulder + 0.33 * h * np.array([np.sin(arm), 0, -np.cos(arm)])
         out.append((0.5 * (shoulder + hand), np.array([0.055, 0.055, 0.19 * h]), -arm, person.shirt))
+        out.append((hand, np.array([0.045, 0.03, 0.085]), -arm, skin))
     return out
 
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from drivers.sim.effects import Effects
 from drivers.sim.people import Person
-from drivers.sim.world import CLOTHES, Layout
 from drivers.sim.walks import Gait
+from drivers.sim.world import CLOTHES, HAIR, Layout
 from stereo_sfm.types import F64
 
 Route = Callable[[Layout, int, bool], F64]  # (layout, walk number, returns) -> polyline (N, 2) metres
@@ -23,8 +23,8 @@ class Scene:
     layout: Layout
     route: Route
     length: float  # metres walked
-    effects: Effects = Effects()
-    gait: Gait = Gait()
+    effects: Effects = field(default_factory=Effects)
+    gait: Gait = field(default_factory=Gait)
     people: int = 0
 
 
@@ -97,7 +97,8 @@ def crowd(scene: Scene, count: int, rng: np.random.Generator) -> list[Person]:
         else:
             y = layout.aisle_y(1 + n % 2) + float(rng.choice([-0.55, 0.55]))
             start, end = (a, y), (b, y + float(rng.uniform(-0.1, 0.1)))
-        shirt, trousers = rng.choice(CLOTHES - 1, 2, replace=False)
+        shirt, trousers = rng.choice(CLOTHES, 2, replace=False)
+        hair = HAIR + int(rng.integers(2))
         speed, phase = float(rng.uniform(0.5, 1.2)), float(rng.uniform(0, 20))
-        out.append(Person(start, end, speed, phase, float(rng.uniform(1.55, 1.9)), int(shirt), int(trousers)))
+        out.append(Person(start, end, speed, phase, float(rng.uniform(1.55, 1.9)), int(shirt), int(trousers), hair))
     return out

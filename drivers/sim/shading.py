@@ -127,11 +127,13 @@ def _solid(w, b, face, x, y, z, dx, dy, dz, size):
 
 
 @njit
-def _shelf_part(w, b, face, x, y, z, dx, dy, dz, size):
+def _shelf_part(w, b, part, face, x, y, z, dx, dy, dz, size):
     facing = w.blocks_i[b, 1]
     u, deep = to_shelf(w.blocks, b, facing, x, y)
     du, dw = kernels.turn_to_shelf(facing, dx, dy)
     k = w.blocks_i[b, 4 + face]
+    if face == RAIL and w.levels[w.blocks_i[b, 2] + part, 1] - w.levels[w.blocks_i[b, 2] + part, 0] > 0.06:
+        return _flat(w, w.blocks_i[b, 4 + END], u, z, du, dz, dw, size) * 0.45  # kick plate
     if face == RAIL:
         return _flat(w, k, u + 0.37 * b + 3.1 * z, -z, du, dz, dw, size) * (0.7 + 0.12 * z)
     if face == BOARD:
@@ -206,7 +208,7 @@ def _target(w, moving, k, x, y, z, dx, dy, dz, size):
     down = f[k, 2] * dx + f[k, 5] * dy + f[k, 8] * dz
     ic2 = 1 / max(down * down, 1e-4)
     fs, ft = size * math.sqrt(1 + ds * ds * ic2) / f[k, 12], size * math.sqrt(1 + dv * dv * ic2) / f[k, 13]
-    return sample(w, moving.targets_i[k], s / f[k, 12], v / f[k, 13], fs, ft)
+    return 0.8 * sample(w, moving.targets_i[k], s / f[k, 12], v / f[k, 13], fs, ft)
 
 
 @njit
@@ -221,7 +223,7 @@ def shade(w, moving, t, hit, ox, oy, oz, dx, dy, dz, angle):
     if kind == BLOCK:
         if w.blocks_i[index, 0] == SOLID:
             return _solid(w, index, face, x, y, z, dx, dy, dz, size)
-        return _shelf_part(w, index, face, x, y, z, dx, dy, dz, size)
+        return _shelf_part(w, index, part, face, x, y, z, dx, dy, dz, size)
     if kind == PERSON:
         return _person(w, moving, index, x, y, z, dx, dy, dz, size)
     return _target(w, moving, index, x, y, z, dx, dy, dz, size)

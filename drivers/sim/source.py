@@ -112,6 +112,11 @@ def _effects(scene: Scene, options: SimOptions) -> Effects:
     )
 
 
+def _noise_key(seed: int, frame_id: int, eye: int) -> int:
+    """64 bits that differ for every picture."""
+    return int(np.random.SeedSequence([seed, frame_id, eye]).generate_state(1, np.uint64)[0])
+
+
 class SimSource:
     """A source (drivers.source.Source) whose every frame can also be rendered alone, to the same bits."""
 
@@ -170,30 +175,33 @@ class SimSource:
 
     def clean(self, frame_id: int) -> tuple[View, View]:
         """Brightness, depth and surfaces of a frame without the sensor's faults."""
-        moving = figures(self.world, self.people, frame_id / self.options.rate)
-        return self.renderer.render(self.pose(frame_id), moving)
+        return self.view(self.pose(frame_id), frame_id / self.options.rate)
+
+    def view(self, world_T_cam: F64, seconds: float = 0.0) -> tuple[View, View]:
+        """Brightness, depth and surfaces from any pose (4, 4), people as they are at `seconds`."""
+        return self.renderer.render(world_T_cam, figures(self.world, self.people, seconds))
+
+    def picture(self, world_T_cam: F64, frame_id: int = 0, twist: F64 | None = None) -> StereoImage:
+        """What the sensor gives at any pose (4, 4), moving by `twist` (6,) a second in camera axes, as that frame."""
+        o, seconds = self.options, frame_id / self.options.rate
+        twist = np.zeros(6) if twist is None else twist
+        twists = [twist, se3.adjoint(se3.inverse(self.rig.left_T_right)) @ twist]
+        level = brightness(self.effects, seconds, o.seed)
+        views = self.view(world_T_cam, seconds)
+        left, right = (
+            sensor.expose(view, twists[k], level, _noise_key(o.seed, frame_id, k))
+            for k, (sensor, view) in enumerate(zip(self._sensors, views, strict=True))
+        )
+        exposure_us = self.effects.exposure_s * 1e6
+        return StereoImage(frame_id, self.stamp_ns(frame_id), left, right, exposure_us=exposure_us, gain=level)
 
     def frame(self, frame_id: int, dropped_before: int = 0) -> StereoImage:
-        """Render one frame."""
-        o, seconds = self.options, frame_id / self.options.rate
-        step = 1e-4
+        """Render one frame of the walk."""
+        seconds, step = frame_id / self.options.rate, 1e-4
         before, after = self.walk.poses(np.array([seconds - step, seconds + step]))
         twist = se3.log(se3.inverse(before) @ after) / (2 * step)
-        twists = [twist, se3.adjoint(se3.inverse(self.rig.left_T_right)) @ twist]
-        level = brightness(self.effects, seconds, o.seed) if o.effects else 1.0
-        images = [
-            self._sensors[k].expose(view, twists[k], level, np.random.default_rng([o.seed, frame_id, k]))
-            for k, view in enumerate(self.clean(frame_id))
-        ]
-        return StereoImage(
-            frame_id,
-            self.stamp_ns(frame_id),
-            images[0],
-            images[1],
-            exposure_us=self.effects.exposure_s * 1e6,
-            gain=level,
-            dropped_before=dropped_before,
-        )
+        image = self.picture(self.pose(frame_id), frame_id, twist)
+        return dataclasses.replace(image, dropped_before=dropped_before)
 
     def __enter__(self) -> Self:
         return self

@@ -141,7 +141,7 @@ def side_label(rng: np.random.Generator, front: U8, h: int, w: int) -> U8:
 
 def top_label(rng: np.random.Generator, front: U8, h: int, w: int) -> U8:
     """The lid, (h, w): flaps and tape."""
-    image = np.full((h, w), float(np.mean(front)), np.float32) + 18 * (cloud(rng, (h, w), 3, 4) - 0.5)
+    image = (float(np.mean(front)) + 18 * (cloud(rng, (h, w), 3, 4) - 0.5)).astype(np.float32)
     image[h // 2 - 1 : h // 2 + 1] *= 0.5
     if rng.random() < 0.5:
         image[int(h * 0.42) : int(h * 0.58)] += 30
@@ -298,3 +298,8 @@ def cloth(rng: np.random.Generator, size: int = 128) -> U8:
     if rng.random() < 0.5:
         image[:, (np.arange(size) // (step // 2)) % 2 == 0] -= contrast
     return _finish(image.astype(np.float32))
+
+
+def plain(rng: np.random.Generator, grey: float, size: int = 64) -> U8:
+    """Hair, skin: one grey, faintly uneven; periodic."""
+    return _finish((grey + 16 * (cloud(rng, (size, size), 3, 4) - 0.5)).astype(np.float32))

@@ -12,7 +12,7 @@ from drivers.sim.atlas import Atlas
 from drivers.sim.kernels import BIN, SHELF, SOLID
 from stereo_sfm.types import F64, I64, U8
 
-CLOTHES = 8  # textures that people wear, the last one is skin
+CLOTHES, HAIR, SKIN = 8, 8, 10  # of the textures that people wear: patterned cloths, then two of hair, then skin
 FACING_MINUS_Y, FACING_PLUS_Y, FACING_MINUS_X, FACING_PLUS_X = 0, 1, 2, 3
 
 
@@ -34,7 +34,7 @@ class Tables(NamedTuple):
     texels: U8  # (M,)
     textures: I64  # (T, 4) offset, log2 width, log2 height, wraps
     texture_sizes: F64  # (T, 2) metres, (0, 0) for pictures that stretch
-    surfaces: I64  # (4 + CLOTHES,) textures of floor, floor wear, ceiling, walls, then people's clothes
+    surfaces: I64  # (4 + SKIN + 1,) textures of floor, floor wear, ceiling, walls, then people's clothes, hair, skin
 
 
 @dataclass(frozen=True)
@@ -346,13 +346,18 @@ def build_world(layout: Layout | None = None, seed: int = 0, exchange: float = 0
         atlas.add(textures.wall(rng), (1.2, 3.6), wrap=True),
     ]
     surfaces += [atlas.add(textures.cloth(rng), (0.25, 0.25), wrap=True) for _ in range(CLOTHES)]
-    return _tables(b, layout.room, surfaces)
+    surfaces += [atlas.add(textures.plain(rng, grey), (0.25, 0.25), wrap=True) for grey in (35.0, 75.0, 165.0)]
+    return make_tables(atlas, layout.room, surfaces, b)
 
 
-def _tables(b: _Builder, room: tuple[float, float, float], surfaces: list[int]) -> Tables:
-    texels, table, sizes = b.atlas.pack()
+def make_tables(
+    atlas: Atlas, room: tuple[float, float, float], surfaces: list[int], parts: _Builder | None = None
+) -> Tables:
+    """Pack what was collected."""
+    b = parts or _Builder()
+    texels, table, sizes = atlas.pack()
     return Tables(
-        np.array(room),
+        np.array(room, float),
         np.array(b.groups, float).reshape(-1, 6),
         np.array(b.groups_i, np.int64).reshape(-1, 2),
         np.array(b.blocks, float).reshape(-1, 6),
