@@ -20,14 +20,12 @@ class Timing:
 
     command_ms: int = 3000
     read_ms: int = 300  # one blocking read of an image or event endpoint
-    stall_s: float = 0.5  # no image for so long: the camera has stopped
     busy_tries: int = 5
     busy_wait_s: float = 1.0
     boot_ms: int = 10_000  # sending the firmware
     boot_s: float = 10.0  # until the camera is back
     boot_poll_s: float = 0.1
     settle_s: float = 0.3  # after it is back, before the first command
-    reconnect_s: float = 20.0  # looking for a lost camera
     clock_s: float = 0.5  # between clock readings
 
 

@@ -67,7 +67,6 @@ class Stream:
         except DeviceError:
             self._join()
             raise
-        self._counters.add("segments")
 
     def stop(self, camera_alive: bool = True) -> None:
         """End streaming and the threads. A camera that is alive is told, and given a moment to say goodbye."""

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from drivers.live.source import Patience
 from drivers.sim.rigs import fisheye
 from drivers.t265.acquire import Access
 from drivers.t265.camera import Settings
@@ -43,11 +44,11 @@ def open_camera(
     """The driver on a camera with these faults."""
     camera = SimulatedCamera(content or noise_content(), faults, paced)
     camera.booted = booted
-    settings = options.pop("settings", Settings())
-    queue = options.pop("queue", 30)
-    timing = replace(FAST, **{"reconnect_s": 1.0, **options.pop("timing", {})})
+    timing = replace(FAST, **options.pop("timing", {}))
+    patience = Patience(**{"reconnect_s": 1.0, **options.pop("patience", {})})
+    settings, queue = options.pop("settings", Settings()), options.pop("queue", 30)
     access = Access(SimulatedBus([camera]), firmware=checked_firmware, timing=timing, **options)
-    return SimulatedT265Source(camera, access, settings, queue, False)
+    return SimulatedT265Source(camera, access, settings, patience, queue)
 
 
 def take(source: SimulatedT265Source, count: int) -> list[StereoImage]:

@@ -348,6 +348,6 @@ class SimulatedCamera:
             for i, (stamp, sensor) in enumerate(due)
         )
 
-    def frame_of(self, camera_ns: int) -> float:
+    def seconds_of(self, camera_ns: int) -> float:
         """Seconds in the content's time of a stamp of the camera's present clock (for the truth)."""
         return (camera_ns + self._boot_ns - self._first_ns - m.PERIOD_NS) * 1e-9

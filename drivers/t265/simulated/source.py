@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from drivers.live.options import Options
+from drivers.live.source import Patience
 from drivers.t265.acquire import Access
 from drivers.t265.camera import Settings
 from drivers.t265.firmware import SIZE, Firmware, verified
@@ -22,10 +23,10 @@ from drivers.t265.simulated.camera import SimulatedCamera
 from drivers.t265.simulated.content import room_content, source_content
 from drivers.t265.simulated.faults import preset
 from drivers.t265.source import T265Source
-from stereo_sfm.types import F64, I64, Trajectory
+from stereo_sfm.types import I64, Trajectory
 
 # The simulated camera is quick to boot and to forgive.
-FAST = Timing(busy_wait_s=0.05, boot_s=3.0, boot_poll_s=0.02, settle_s=0.02, reconnect_s=5.0)
+FAST = Timing(busy_wait_s=0.05, boot_s=3.0, boot_poll_s=0.02, settle_s=0.02)
 
 
 def simulated_firmware() -> bytes:
@@ -42,22 +43,21 @@ def checked_firmware() -> Firmware:
 class SimulatedT265Source(T265Source):
     """As the real one, and it knows the truth afterwards."""
 
-    def __init__(self, camera: SimulatedCamera, access: Access, settings: Settings, queue: int, at_start: bool) -> None:
+    def __init__(
+        self, camera: SimulatedCamera, access: Access, settings: Settings, patience: Patience, queue: int = 30
+    ) -> None:
         self.camera = camera
-        super().__init__(access, settings, queue, at_start, name="t265:simulated")
+        super().__init__(access, settings, patience, queue, name="t265:simulated")
 
-    def truth(self, stamps: I64) -> F64:
-        """world_T_cam (N, 4, 4) at (N,) stamps of the images of the present segment."""
-        seconds = np.array([self.camera.frame_of(int(s) - self._time.stamp(0)) for s in stamps])
-        return self.camera.content.pose(seconds)
-
-    def trajectory(self, stamps: I64) -> Trajectory:
-        """The truth as a trajectory."""
-        return Trajectory(np.array(stamps, np.int64), self.truth(stamps))
+    def truth(self, stamps: I64) -> Trajectory:
+        """True poses at (N,) stamps of images that came."""
+        stamps = np.array(stamps, np.int64)
+        seconds = np.array([self.camera.seconds_of(int(s) - self._time.stamp(0)) for s in stamps])
+        return Trajectory(stamps, self.camera.content.pose(seconds))
 
 
 def open_simulated(
-    opts: Options, settings: Settings, queue: int, at_start: bool, allow_slow: bool, reconnect_s: float
+    opts: Options, settings: Settings, patience: Patience, queue: int, allow_slow: bool
 ) -> SimulatedT265Source:
     """Called by `open_t265`."""
     frames = int(opts.number("frames", 60, 1, 3000))
@@ -68,7 +68,5 @@ def open_simulated(
     opts.finish()
     content = room_content(frames, seed) if images == "room" else source_content(images, frames)
     camera = SimulatedCamera(content, faults, paced)
-    access = Access(
-        SimulatedBus([camera]), "", checked_firmware, allow_slow, replace(FAST, reconnect_s=min(reconnect_s, 5.0))
-    )
-    return SimulatedT265Source(camera, access, settings, queue, at_start)
+    access = Access(SimulatedBus([camera]), "", checked_firmware, allow_slow, FAST)
+    return SimulatedT265Source(camera, access, settings, replace(patience, reconnect_s=5.0), queue)

@@ -1,0 +1,87 @@
+"""The factory calibration of an OAK as this project's rig. depthai speaks centimetres and p_dst = T p_src."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from calib.rig import Rig
+from drivers.live.errors import DeviceFault
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.cameras import Camera, KannalaBrandt, RadTan
+from stereo_sfm.types import F64
+
+_MAX_TILT_DEG = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class OakCalibration:
+    """Eyes, and where the IMU sits if the board knows it."""
+
+    rig: Rig
+    left_T_imu: F64 | None  # (4, 4)
+
+
+def read_calibration(dai: Any, handler: Any, size: tuple[int, int], name: str, serial: str) -> OakCalibration:
+    """Calibration at an image size.
+
+    Args:
+        dai: the library. handler: its CalibrationHandler.
+        size: (width, height) of the images, px; intrinsics are scaled and cropped to it.
+        name, serial: for the rig.
+
+    Raises:
+        DeviceFault: not calibrated, an unknown lens model, or extrinsics that are none.
+    """
+    left, right = dai.CameraBoardSocket.CAM_B, dai.CameraBoardSocket.CAM_C
+    try:
+        eyes = [_eye(dai, handler, socket, size) for socket in (left, right)]
+        left_T_right = _metres(handler.getCameraExtrinsics(right, left, False, dai.LengthUnit.CENTIMETER))
+    except RuntimeError as error:
+        raise DeviceFault(f"OAK {serial} is not calibrated ({str(error).splitlines()[0]})") from None
+    _check(left_T_right, serial)
+    rig = Rig(eyes[0], eyes[1], left_T_right, name=name, serial=serial)
+    return OakCalibration(rig, _imu(dai, handler, left))
+
+
+def _eye(dai: Any, handler: Any, socket: Any, size: tuple[int, int]) -> Camera:
+    k = np.array(handler.getCameraIntrinsics(socket, *size), float)
+    fx, fy, cx, cy = (float(v) for v in (k[0, 0], k[1, 1], k[0, 2], k[1, 2]))
+    if not (fx > 0 and fy > 0 and 0 < cx < size[0] and 0 < cy < size[1]):
+        raise DeviceFault(f"OAK's factory calibration makes no sense: focal length {fx} {fy}, centre {cx} {cy}")
+    model = handler.getDistortionModel(socket)
+    coefficients = [float(c) for c in handler.getDistortionCoefficients(socket)]
+    if model == dai.CameraModel.Fisheye:
+        return KannalaBrandt(*size, fx, fy, cx, cy, tuple(coefficients[:4]))
+    if model != dai.CameraModel.Perspective:
+        raise DeviceFault(f"OAK's lens model {model} is not known here: calibrate it with 'stereo-sfm calibrate'")
+    if any(coefficients[8:]):
+        raise DeviceFault("OAK's calibration has thin-prism or tilt terms, which are not known here: calibrate it")
+    return RadTan(*size, fx, fy, cx, cy, tuple(coefficients[:8]))
+
+
+def _metres(transform_cm: Any) -> F64:
+    transform = np.array(transform_cm, float)
+    transform[:3, 3] /= 100
+    return se3.orthonormalize(transform)
+
+
+def _check(left_T_right: F64, serial: str) -> None:
+    baseline, tilt = left_T_right[:3, 3], float(np.degrees(np.linalg.norm(se3.so3_log(left_T_right[:3, :3]))))
+    if not (0.01 <= baseline[0] <= 1.0 and np.linalg.norm(baseline[1:]) < 0.2 * baseline[0]) or tilt > _MAX_TILT_DEG:
+        raise DeviceFault(
+            f"OAK {serial}: factory extrinsics make no sense: right eye at {np.round(baseline * 1e3, 1)} mm, "
+            f"{tilt:.1f} degrees from parallel"
+        )
+
+
+def _imu(dai: Any, handler: Any, left: Any) -> F64 | None:
+    """(4, 4) left_T_imu; many boards do not know it."""
+    try:
+        transform = _metres(handler.getImuToCameraExtrinsics(left, False, dai.LengthUnit.CENTIMETER))
+    except (RuntimeError, IndexError):
+        return None
+    return transform if math.isfinite(float(transform.sum())) else None

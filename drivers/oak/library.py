@@ -1,0 +1,118 @@
+"""depthai, imported late and without its telemetry; which cameras it sees; what its errors mean."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from dataclasses import dataclass
+from typing import Any
+
+from drivers.live.errors import Busy, DeviceError, DeviceFault, DeviceLost, NoPermission, NotFound
+
+# Read by depthai when it is imported. Since 3.7 it reports every import and pipeline to its maker unless told not to,
+# and it posts the camera's crash dumps. What the user has set stays.
+ENVIRONMENT = {
+    "DEPTHAI_TELEMETRY": "0",
+    "DEPTHAI_CRASHDUMP": "0",
+    "DEPTHAI_DISABLE_CRASHDUMP_COLLECTION": "1",
+    "DEPTHAI_DISABLE_STARTUP_NOTIFICATIONS": "1",
+    "DEPTHAI_INSTALL_SIGNAL_HANDLER": "0",
+    "DEPTHAI_LEVEL": "off",  # it logs to standard output
+    "DEPTHAI_SEARCH_TIMEOUT": "2000",
+    "DEPTHAI_RECONNECT_TIMEOUT": "0",  # a lost camera is our business: it becomes a new segment
+}
+
+# Lower case pieces of depthai's messages -> what they mean. The first that fits counts.
+_MEANINGS: tuple[tuple[str, type[DeviceError], str], ...] = (
+    ("no available devices", NotFound, "no OAK attached: plug it into a USB 3 port"),
+    ("cannot find any device", NotFound, "no such OAK attached ('stereo-sfm devices' lists those that are)"),
+    ("insufficient_permissions", NoPermission, "no permission: install the udev rule that 'stereo-sfm udev' prints"),
+    ("insufficient permissions", NoPermission, "no permission: install the udev rule that 'stereo-sfm udev' prints"),
+    ("already_in_use", Busy, "another program uses the OAK: close it"),
+    ("already in use", Busy, "another program uses the OAK: close it"),
+    ("x_link_error", DeviceLost, "the OAK is gone (unplugged, or its firmware crashed)"),
+    ("couldn't read data from stream", DeviceLost, "the OAK is gone (unplugged, or its firmware crashed)"),
+    ("closed", DeviceLost, "the OAK is gone (unplugged, or its firmware crashed)"),
+    ("disconnected", DeviceLost, "the OAK is gone (unplugged, or its firmware crashed)"),
+)
+
+
+def load() -> Any:
+    """depthai.
+
+    Raises:
+        DeviceFault: it is not installed.
+    """
+    for name, value in ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
+    try:
+        return importlib.import_module("depthai")
+    except ImportError as error:
+        raise DeviceFault(
+            f"depthai 3 is needed for an OAK and cannot be imported ({error}): pip install depthai"
+        ) from None
+
+
+def device_error(error: Exception) -> DeviceError:
+    """An exception of depthai as one of ours."""
+    if isinstance(error, DeviceError):
+        return error
+    text = str(error).lower()
+    for piece, kind, line in _MEANINGS:
+        if piece in text:
+            return kind(line)
+    return DeviceFault(f"OAK: {str(error).splitlines()[0] if str(error) else type(error).__name__}")
+
+
+@dataclass(frozen=True)
+class Found:
+    """A camera that depthai sees, not opened."""
+
+    device_id: str
+    name: str  # USB path or address in the network
+    state: str
+    protocol: str
+    status: str
+    info: Any  # depthai.DeviceInfo
+
+
+def find(dai: Any) -> list[Found]:
+    """All attached, in half a second, without booting any."""
+    try:
+        infos = dai.Device.getAllAvailableDevices()
+    except RuntimeError as error:
+        raise device_error(error) from None
+    found = [
+        Found(
+            info.deviceId,
+            info.name,
+            _last(info.state),
+            _last(info.protocol).replace("X_LINK_", "").lower(),
+            _last(info.status),
+            info,
+        )
+        for info in infos
+    ]
+    return sorted(found, key=lambda f: f.device_id)
+
+
+def _last(value: object) -> str:
+    return str(value).rpartition(".")[2]
+
+
+def choose(found: list[Found], wanted: str) -> Found:
+    """The camera with this id or name, or the only one.
+
+    Raises:
+        NotFound, DeviceFault.
+    """
+    if not found:
+        raise NotFound("no OAK attached: plug it into a USB 3 port (or give its address, oak:192.168.1.44)")
+    if wanted:
+        for one in found:
+            if wanted in (one.device_id, one.name):
+                return one
+        raise NotFound(f"no OAK '{wanted}' attached (attached: {', '.join(f.device_id for f in found)})")
+    if len(found) > 1:
+        raise DeviceFault(f"{len(found)} OAKs are attached: name one, oak:ID ('stereo-sfm devices' lists them)")
+    return found[0]

@@ -1,0 +1,184 @@
+"""The OAK as a source: `oak`, `oak:ID?size=640x400&fps=30`; options: see `open_oak`."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from dataclasses import dataclass
+from typing import Any
+
+from drivers.live.errors import DeviceFault, TooSlowLink
+from drivers.live.options import Options
+from drivers.live.source import LiveSource, Patience
+from drivers.oak.calibration import read_calibration
+from drivers.oak.library import choose, device_error, find, load
+from drivers.oak.stream import OakStream
+from drivers.rig_option import chosen_rig
+
+logger = logging.getLogger("stereo_sfm")
+
+_USB2_BYTES_PER_S = 30e6  # what a high-speed link carries in practice
+_IMU_RATE_HZ = 200
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What the user chooses."""
+
+    size: tuple[int, int] = (640, 400)
+    rate_hz: float = 30.0
+    exposure_us: int | None = None  # None: automatic
+    iso: int = 400  # with manual exposure
+    anti_flicker: str = "MAINS_50_HZ"  # with automatic exposure
+    max_exposure_us: int | None = None  # with automatic exposure
+    imu: bool = True
+    allow_slow: bool = False
+    queue_frames: int = 30
+
+
+class OakSource(LiveSource):
+    """Live stereo images of one OAK (left CAM_B, right CAM_C), not rectified, with the factory calibration.
+
+    Args:
+        wanted: id or address, empty for the only one.
+        settings: what to stream.
+        patience: waits.
+        name: of the source.
+    """
+
+    def __init__(self, wanted: str, settings: Settings, patience: Patience, name: str = "oak") -> None:
+        super().__init__(name, "OAK", round(1e9 / settings.rate_hz), patience)
+        self._settings, self._dai = settings, load()
+        self._wanted = choose(find(self._dai), wanted).device_id or wanted
+        self._device: Any = None
+        try:
+            self._open()
+            handler = self._device.getCalibration()
+            product = str(self._device.getProductName() or self._device.getDeviceName())
+            found = read_calibration(self._dai, handler, settings.size, product, self._wanted)
+        except RuntimeError as error:
+            self.close()
+            raise device_error(error) from None
+        except BaseException:
+            self.close()
+            raise
+        self.rig, self.left_T_imu = found.rig, found.left_T_imu
+
+    def _open(self) -> None:
+        self._device = self._dai.Device(choose(find(self._dai), self._wanted).info)
+        self._check_link()
+
+    def _check_link(self) -> None:
+        s, speed = self._settings, self._device.getUsbSpeed()
+        needed = 2 * s.size[0] * s.size[1] * s.rate_hz
+        slow = speed in (self._dai.UsbSpeed.LOW, self._dai.UsbSpeed.FULL, self._dai.UsbSpeed.HIGH)
+        if slow and needed > _USB2_BYTES_PER_S and not s.allow_slow:
+            raise TooSlowLink(
+                f"the OAK is on a USB 2 link, which cannot carry {needed / 1e6:.0f} MB/s of images: use a USB 3 port "
+                "and cable, a smaller size or rate (oak?size=640x400&fps=20), or allow losses with allow_slow=1"
+            )
+
+    def _start(self) -> OakStream:
+        try:
+            if self._device is None:
+                self._open()
+            return self._stream()
+        except RuntimeError as error:
+            raise device_error(error) from None
+
+    def _stream(self) -> OakStream:
+        dai, s = self._dai, self._settings
+        pipeline = dai.Pipeline(self._device)
+        queues = [self._eye(pipeline, socket) for socket in (dai.CameraBoardSocket.CAM_B, dai.CameraBoardSocket.CAM_C)]
+        imu = self._imu(pipeline) if s.imu and self._device.getConnectedIMU() else None
+        with contextlib.suppress(RuntimeError):  # cameras without a projector say that they have none
+            self._device.setIrLaserDotProjectorIntensity(0.0)
+            self._device.setIrFloodLightIntensity(0.0)
+        pipeline.start()
+        stream = OakStream(
+            dai, *queues, imu, s.size, self.counters, self._period_ns, s.queue_frames, lambda: _stop(pipeline)
+        )
+        stream.start()
+        return stream
+
+    def _eye(self, pipeline: Any, socket: Any) -> Any:
+        dai, s = self._dai, self._settings
+        camera = pipeline.create(dai.node.Camera).build(socket, sensorFps=s.rate_hz)
+        set_exposure(dai, camera.initialControl, s)
+        output = camera.requestOutput(s.size, type=dai.ImgFrame.Type.GRAY8, fps=s.rate_hz, enableUndistortion=False)
+        return output.createOutputQueue(maxSize=8, blocking=False)
+
+    def _imu(self, pipeline: Any) -> Any:
+        dai = self._dai
+        imu = pipeline.create(dai.node.IMU)
+        imu.enableIMUSensor([dai.IMUSensor.ACCELEROMETER_RAW, dai.IMUSensor.GYROSCOPE_RAW], _IMU_RATE_HZ)
+        imu.setBatchReportThreshold(5)
+        imu.setMaxBatchReports(20)
+        return imu.out.createOutputQueue(maxSize=50, blocking=False)
+
+    def _release(self) -> None:
+        device, self._device = self._device, None
+        if device is not None:
+            with contextlib.suppress(RuntimeError):
+                device.close()
+
+
+def set_exposure(dai: Any, control: Any, settings: Settings) -> None:
+    """Manual or automatic exposure, written into a CameraControl."""
+    if settings.exposure_us is not None:
+        control.setManualExposure(settings.exposure_us, settings.iso)
+        return
+    control.setAutoExposureEnable()
+    control.setAntiBandingMode(getattr(dai.CameraControl.AntiBandingMode, settings.anti_flicker))
+    if settings.max_exposure_us is not None:
+        control.setAutoExposureLimit(settings.max_exposure_us)
+
+
+def _stop(pipeline: Any) -> None:
+    with contextlib.suppress(RuntimeError):
+        pipeline.stop()
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    if not (width.isdigit() and height.isdigit() and 64 <= int(width) <= 4096 and 64 <= int(height) <= 4096):
+        raise DeviceFault(f"oak: option size={text}: it must be WIDTHxHEIGHT, such as 640x400 or 1280x800")
+    return int(width), int(height)
+
+
+def open_oak(rest: str = "", **options: Any) -> OakSource:
+    """Open an OAK.
+
+    Args:
+        rest: id or network address, empty for the only one attached.
+        **options: `size` (640x400), `fps` (30), `exposure` ('auto' or microseconds), `iso` (with manual exposure),
+            `max_exposure` ('auto' or microseconds, with automatic exposure), `anti_flicker` (50, 60, auto, off),
+            `imu` (1, 0), `allow_slow` (1: accept USB 2), `queue` (pairs that may wait), `reconnect` (seconds to wait
+            for a lost camera), `rig` (calibration instead of the factory's).
+
+    Raises:
+        StereoSfmError: bad option; DeviceError: no camera, no permission, ...
+    """
+    opts = Options("oak", options)
+    flicker = {"50": "MAINS_50_HZ", "60": "MAINS_60_HZ", "auto": "AUTO", "off": "OFF"}
+    settings = Settings(
+        size=_size(opts.text("size", "640x400")),
+        rate_hz=opts.number("fps", 30, 1, 120),
+        exposure_us=opts.microseconds("exposure", 20, 33_000),
+        iso=int(opts.number("iso", 400, 100, 1600)),
+        anti_flicker=opts.choice("anti_flicker", "50", flicker),
+        max_exposure_us=opts.microseconds("max_exposure", 20, 33_000),
+        imu=opts.flag("imu", True),
+        allow_slow=opts.flag("allow_slow", False),
+        queue_frames=int(opts.number("queue", 30, 1, 100_000)),
+    )
+    patience = Patience(first_image_s=5.0, reconnect_s=opts.number("reconnect", 20, 0, 86_400))
+    rig = opts.anything("rig", None)
+    opts.finish()
+    source = OakSource(rest, settings, patience, f"oak:{rest}" if rest else "oak")
+    try:
+        source.rig = chosen_rig(rig, lambda: source.rig)
+    except BaseException:
+        source.close()
+        raise
+    return source

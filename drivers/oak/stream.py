@@ -1,0 +1,136 @@
+"""One segment of an OAK: threads that only drain depthai's queues, since an exception inside its nodes kills Python."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from datetime import timedelta
+from typing import Any
+
+import numpy as np
+
+from drivers.live.buffers import Handoff, MotionBuffer
+from drivers.live.clock import ClockMap
+from drivers.live.counters import Counters
+from drivers.live.errors import DeviceLost
+from drivers.live.pairing import LEFT, RIGHT, Eye, Pair, Pairer
+from drivers.oak.library import device_error
+
+_WAIT = timedelta(milliseconds=200)
+_MAX_EXPOSURE_US = 1_000_000
+_ISO_PER_GAIN = 100.0
+
+
+class OakStream:
+    """Pairs come out of `pairs`, inertial samples out of `motion` (camera clock).
+
+    Args:
+        dai: the library.
+        left, right: queues of ImgFrame (GRAY8). imu: queue of IMUData, or None.
+        size: (width, height) that every image must have, px.
+        counters: shared with the source.
+        period_ns: nominal time between frames.
+        queue_frames: pairs that wait for the consumer before the oldest is thrown away.
+        end: called once, when streaming ends.
+    """
+
+    def __init__(
+        self,
+        dai: Any,
+        left: Any,
+        right: Any,
+        imu: Any | None,
+        size: tuple[int, int],
+        counters: Counters,
+        period_ns: int,
+        queue_frames: int,
+        end: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._dai, self._size, self._counters, self._end = dai, size, counters, end
+        self.pairs: Handoff[Pair] = Handoff(queue_frames)
+        self.motion = MotionBuffer()
+        self.clock = ClockMap()
+        self._pairer = Pairer(counters, period_ns)
+        self._lock = threading.Lock()  # one pairer, two queues
+        self._stopping = threading.Event()
+        self._last_motion = {True: -1, False: -1}
+        work: list[tuple[str, Any, Callable[[Any], None]]] = [
+            ("left", left, lambda frame: self._take_image(LEFT, frame)),
+            ("right", right, lambda frame: self._take_image(RIGHT, frame)),
+        ]
+        if imu is not None:
+            work.append(("imu", imu, self._take_motion))
+        self._threads = [
+            threading.Thread(target=self._drain, args=(queue, take), name=f"oak-{name}", daemon=True)
+            for name, queue, take in work
+        ]
+
+    def start(self) -> None:
+        for thread in self._threads:
+            thread.start()
+
+    def stop(self, camera_alive: bool = True) -> None:
+        self._stopping.set()
+        self._end()
+        for thread in self._threads:
+            thread.join()
+
+    def _drain(self, queue: Any, take: Callable[[Any], None]) -> None:
+        """No thread dies unseen: its error is the consumer's."""
+        try:
+            while not self._stopping.is_set():
+                message = queue.get(_WAIT)
+                if message is not None:
+                    take(message)
+        except self._dai.MessageQueue.QueueException:
+            self.pairs.fail(DeviceLost("the OAK is gone (unplugged, or its firmware crashed)"))
+        except RuntimeError as error:
+            self.pairs.fail(device_error(error))
+        except BaseException as error:
+            self.pairs.fail(error)
+
+    def _take_image(self, side: int, frame: Any) -> None:
+        eye = self._eye(frame)
+        if eye is None:
+            self._counters.add("malformed")
+            return
+        with self._lock:
+            if side == LEFT and not self.clock.known:
+                self._map_clock(frame)
+            pair = self._pairer.push(side, eye)
+        if pair is not None:
+            self.pairs.put(pair, weight=1 + pair.dropped_before)
+
+    def _eye(self, frame: Any) -> Eye | None:
+        """An image at mid-exposure on the camera's clock; None when it is no image of the asked size."""
+        pixels = np.array(frame.getFrame())
+        if pixels.dtype != np.uint8 or pixels.shape != (self._size[1], self._size[0]):
+            return None
+        exposure_us = frame.getExposureTime() / timedelta(microseconds=1)
+        if not 0 <= exposure_us <= _MAX_EXPOSURE_US:
+            return None
+        stamp = _nanoseconds(frame.getTimestampDevice(self._dai.CameraExposureOffset.MIDDLE))
+        gain = frame.getSensitivity() / _ISO_PER_GAIN
+        return Eye(stamp, frame.getSequenceNum(), pixels, exposure_us, gain)
+
+    def _map_clock(self, frame: Any) -> None:
+        """depthai maps its stamps to this computer's clock itself; the first image tells how."""
+        middle = self._dai.CameraExposureOffset.MIDDLE
+        host, camera = _nanoseconds(frame.getTimestamp(middle)), _nanoseconds(frame.getTimestampDevice(middle))
+        # dai.Clock is the monotonic clock on Linux; the difference makes it ours everywhere
+        shift = time.monotonic_ns() - _nanoseconds(self._dai.Clock.now())
+        self.clock.add(host + shift, camera, host + shift)
+
+    def _take_motion(self, message: Any) -> None:
+        for packet in message.packets:
+            for is_gyro, report in ((False, packet.acceleroMeter), (True, packet.gyroscope)):
+                stamp = _nanoseconds(report.getTimestampDevice())
+                if stamp > self._last_motion[is_gyro]:  # a packet repeats the slower sensor's last reading
+                    self._last_motion[is_gyro] = stamp
+                    self.motion.add(stamp, is_gyro, (report.x, report.y, report.z))
+
+
+def _nanoseconds(time: timedelta) -> int:
+    """timedelta holds microseconds."""
+    return (time.days * 86_400 + time.seconds) * 1_000_000_000 + time.microseconds * 1000
