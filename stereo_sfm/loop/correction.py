@@ -32,7 +32,7 @@ class Correction:
 
     applied: bool  # False: the pose graph did not believe the loop, nothing moved
     moved_m: float  # largest move of a keyframe
-    fused: int  # points that became one with another
+    fused: list[tuple[int, int]]  # point rows (gone, stays)
 
 
 def apply_loop(map_: Map, loop: LoopResult, earlier: Sequence[LoopResult], config: LoopConfig) -> Correction:
@@ -47,14 +47,14 @@ def apply_loop(map_: Map, loop: LoopResult, earlier: Sequence[LoopResult], confi
     """
     a, b = map_.kf_row(loop.candidate_kf_id), map_.kf_row(loop.kf_id)
     if not (map_.keyframes.alive[a] and map_.keyframes.alive[b]):
-        return Correction(False, 0.0, 0)
+        return Correction(False, 0.0, [])
     before = map_.keyframes.map_T_kf.copy()
     if config.correction == "averaging":
         after = _averaged(before, a, b, before[a] @ loop.candidate_T_kf)
     elif config.correction == "pose_graph":
         optimised = _optimised(map_, before, loop, earlier, config)
         if optimised is None:
-            return Correction(False, 0.0, 0)
+            return Correction(False, 0.0, [])
         after = optimised
     else:
         raise StereoSfmError(f"loop.correction is '{config.correction}': choose pose_graph or averaging")
@@ -65,14 +65,18 @@ def apply_loop(map_: Map, loop: LoopResult, earlier: Sequence[LoopResult], confi
     return Correction(True, moved, fuse_pairs(map_, loop.matches))
 
 
-def fuse_pairs(map_: Map, pairs: I64) -> int:
-    """Make one point of each pair of ids (M, 2) that are two living points; the first of a pair stays."""
-    fused = 0
+def fuse_pairs(map_: Map, pairs: I64) -> list[tuple[int, int]]:
+    """Make one point of each pair of ids (M, 2) that are two living points; the first of a pair stays.
+
+    Returns:
+        Rows (gone, stays).
+    """
+    fused: list[tuple[int, int]] = []
     for keep, drop in pairs.tolist():
         new, old = map_.point_rows(np.array([keep, drop]))
         if new >= 0 and old >= 0 and new != old and map_.points.alive[new] and map_.points.alive[old]:
             map_.fuse(int(old), int(new))
-            fused += 1
+            fused.append((int(old), int(new)))
     return fused
 
 

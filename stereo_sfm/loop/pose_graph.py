@@ -7,7 +7,7 @@ non-convexity (Yang et al., RA-L 5, 2020) keeps the edges of the walk and drops 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -42,7 +42,6 @@ class PoseGraphResult:
     weights: F64  # (E,) 1 for edges of the walk, in [0, 1] for loops
     initial_error: float
     error: float
-    extra: dict[str, float] = field(default_factory=dict[str, float])
 
 
 def join(edges: list[Edges]) -> Edges:
@@ -79,52 +78,54 @@ def optimise(poses: F64, edges: Edges, fixed: I64, robust: str = "gnc") -> PoseG
         raise StereoSfmError(f"loop.robust is '{robust}': choose one of {', '.join(ROBUST)}")
     import gtsam
 
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    values = gtsam.Values()
     used = np.unique(np.concatenate([edges.i, edges.j, fixed]))
     for row in used.tolist():
         values.insert(row, gtsam.Pose3(se3.orthonormalize(poses[row])))
+    plain = _graph(gtsam, edges, fixed, values, robust=False)
+    if robust == "gnc" and edges.loop.any():
+        result, weights = _graduated(gtsam, plain, values, edges)
+    else:
+        result, weights = _levenberg(gtsam, plain, values), np.ones(len(edges))
+        if robust == "switchable" and edges.loop.any():  # from the least-squares answer, where no true loop is far off
+            result = _levenberg(gtsam, _graph(gtsam, edges, fixed, values, robust=True), result)
+            loops = np.flatnonzero(edges.loop)
+            weights[loops] = [_switch(2 * plain.at(int(e)).error(result)) for e in loops]
+    out = poses.copy()
+    for row in used.tolist():
+        out[row] = result.atPose3(row).matrix()
+    return PoseGraphResult(out, weights, float(plain.error(values)), float(plain.error(result)))
+
+
+def _graph(gtsam: Any, edges: Edges, fixed: I64, values: Any, robust: bool) -> Any:
+    """Factors in the order of the edges, then one prior for each fixed row."""
+    graph = gtsam.NonlinearFactorGraph()
     for e in range(len(edges)):
         metres, radians = edges.sigmas[e]
         noise: Any = gtsam.noiseModel.Diagonal.Sigmas(np.array([radians] * 3 + [metres] * 3))
-        if edges.loop[e] and robust == "switchable":
+        if edges.loop[e] and robust:
             noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.DCS.Create(CHI2_6DOF_99), noise)
         measured = gtsam.Pose3(se3.orthonormalize(edges.i_T_j[e]))
         graph.add(gtsam.BetweenFactorPose3(int(edges.i[e]), int(edges.j[e]), measured, noise))
     tight = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
     for row in fixed.tolist():
         graph.add(gtsam.PriorFactorPose3(row, values.atPose3(row), tight))
-    result, weights = _solve(gtsam, graph, values, edges, robust)
-    out = poses.copy()
-    for row in used.tolist():
-        out[row] = result.atPose3(row).matrix()
-    return PoseGraphResult(out, weights, float(graph.error(values)), float(graph.error(result)))
+    return graph
 
 
-def _solve(gtsam: Any, graph: Any, values: Any, edges: Edges, robust: str) -> tuple[Any, F64]:
-    weights = np.ones(len(edges))
-    loops = np.flatnonzero(edges.loop)
-    params = gtsam.LevenbergMarquardtParams()
-    if robust != "gnc" or not len(loops):
-        result = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
-        if robust == "switchable":
-            weights[loops] = [_switch(2 * _plain_error(gtsam, edges, e, result)) for e in loops.tolist()]
-        return result, weights
-    gnc = gtsam.GncLMParams(params)
-    gnc.setLossType(gtsam.GncLossType.TLS)
-    gnc.setKnownInliers([k for k in range(graph.size()) if k >= len(edges) or not edges.loop[k]])
-    optimizer = gtsam.GncLMOptimizer(graph, values, gnc)
+def _levenberg(gtsam: Any, graph: Any, values: Any) -> Any:
+    return gtsam.LevenbergMarquardtOptimizer(graph, values, gtsam.LevenbergMarquardtParams()).optimize()
+
+
+def _graduated(gtsam: Any, graph: Any, values: Any, edges: Edges) -> tuple[Any, F64]:
+    """Graduated non-convexity with a truncated loss; edges of the walk are known to be true."""
+    params = gtsam.GncLMParams(gtsam.LevenbergMarquardtParams())
+    params.setLossType(gtsam.GncLossType.TLS)
+    params.setKnownInliers([k for k in range(graph.size()) if k >= len(edges) or not edges.loop[k]])
+    optimizer = gtsam.GncLMOptimizer(graph, values, params)
     optimizer.setInlierCostThresholdsAtProbability(0.999)
     result = optimizer.optimize()
-    weights[loops] = np.asarray(optimizer.getWeights())[loops]
-    return result, weights
-
-
-def _plain_error(gtsam: Any, edges: Edges, e: int, values: Any) -> float:
-    """Half the squared normalised error of an edge, without its robust loss."""
-    metres, radians = edges.sigmas[e]
-    noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([radians] * 3 + [metres] * 3))
-    measured = gtsam.Pose3(se3.orthonormalize(edges.i_T_j[e]))
-    return float(gtsam.BetweenFactorPose3(int(edges.i[e]), int(edges.j[e]), measured, noise).error(values))
+    return result, np.where(edges.loop, np.asarray(optimizer.getWeights())[: len(edges)], 1.0)
 
 
 def _switch(chi2: float) -> float:
