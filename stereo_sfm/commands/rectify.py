@@ -1,0 +1,101 @@
+"""`stereo-sfm rectify`: rectified pairs with epipolar lines that a person can check, the rig, and the row error."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from drivers.source import Source
+    from stereo_sfm.types import StereoImage
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command."""
+    parser.add_argument("source", help="a folder, an .mcap file, sim:..., t265 or oak")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="folder for the pictures and rig.yaml")
+    parser.add_argument("--projection", choices=("epipolar", "pinhole"), default="epipolar")
+    parser.add_argument("--hfov", type=float, default=None, metavar="DEG", help="horizontal field of view")
+    parser.add_argument("--size", default=None, metavar="WxH", help="size of the rectified images")
+    parser.add_argument("--rig", type=Path, default=None, help="calibration to use instead of the source's own")
+    parser.add_argument("--frames", type=int, default=5, help="pairs to write, spread over the source (default 5)")
+    parser.add_argument("--plain", action="store_true", help="write left and right images without lines instead")
+    parser.add_argument("--overwrite", action="store_true", help="write into a folder that is not empty")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write the pictures, print the row error."""
+    import cv2
+    import numpy as np
+
+    from calib import load_rig, save_rig
+    from calib.matches import match_pair
+    from calib.pictures import side_by_side
+    from calib.rectification import rectify
+    from drivers.source import open_source
+
+    if args.output.exists() and any(args.output.iterdir()) and not args.overwrite:
+        raise _error(f"{args.output} is not empty: choose another folder or give --overwrite")
+    errors: list[np.ndarray] = []
+    with open_source(args.source) as source:
+        rig = source.rig if args.rig is None else load_rig(args.rig)
+        rectification = rectify(rig, args.projection, args.hfov, parse_size(args.size))
+        args.output.mkdir(parents=True, exist_ok=True)
+        save_rig(rectification.rig, args.output / "rig.yaml")
+        for image in spread(source, args.frames):
+            if image.right is None:
+                raise _error(f"frame {image.frame_id} has no right image")
+            left, right = rectification.apply(image.left, image.right)
+            matches = match_pair(rectification, left, right)
+            errors.append(matches.row_error)
+            stem = args.output / f"pair_{image.frame_id:06d}"
+            if args.plain:
+                cv2.imwrite(f"{stem}_left.png", left)
+                cv2.imwrite(f"{stem}_right.png", right)
+            else:
+                cv2.imwrite(f"{stem}.png", side_by_side(left, right, matches))
+    camera = rectification.rig.left
+    fov = 2 * np.arctan(0.5 * camera.width / camera.fx) if args.projection == "pinhole" else camera.width / camera.fx
+    print(f"{len(errors)} pairs in {args.output}, {args.projection} {camera.width}x{camera.height} px,", end=" ")
+    print(f"{np.rad2deg(fov):.0f} degrees wide")
+    row = np.concatenate(errors) if errors else np.zeros(0)
+    if len(row) < 20:
+        print(f"only {len(row)} matches: too few to measure the row error")
+        return 0
+    size = np.abs(row)
+    print(f"row error of {len(row)} matches: median {np.median(row):+.2f} px,", end=" ")
+    print(f"of its size {np.median(size):.2f}, 95 % below {np.quantile(size, 0.95):.2f} px")
+    return 0
+
+
+def parse_size(text: str | None) -> tuple[int, int] | None:
+    """`640x480` -> (640, 480)."""
+    if text is None:
+        return None
+    width, cross, height = text.lower().partition("x")
+    if not cross or not width.isdigit() or not height.isdigit() or min(int(width), int(height)) < 16:
+        raise _error(f"a size is WIDTHxHEIGHT in pixels, got '{text}'")
+    return int(width), int(height)
+
+
+def spread(source: Source, count: int) -> Iterator[StereoImage]:
+    """About `count` frames evenly over the source, the first of a live one."""
+    step = 1
+    if source.frame_count is not None and not source.live:
+        step = max(1, source.frame_count // max(count, 1))
+    given = 0
+    for i, image in enumerate(source):
+        if i % step == 0:
+            given += 1
+            yield image
+        if given >= count:
+            return
+
+
+def _error(text: str) -> Exception:
+    from stereo_sfm.errors import StereoSfmError
+
+    return StereoSfmError(text)
