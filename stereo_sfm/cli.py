@@ -21,6 +21,9 @@ COMMANDS: dict[str, str] = {
     "recover": "mended copy of a recording that was cut off",
     "diff": "whether two logs hold the same, and where they part",
     "rectify": "write rectified pictures with epipolar lines to look at",
+    "calibrate": "calibrate a stereo rig from pictures of a target",
+    "check-calib": "judge a rig's calibration from any recording, without a target",
+    "convert-calib": "calibration files between Kalibr, ROS, OpenCV, Basalt, COLMAP, Foxglove, EuRoC, KITTI and ours",
     "eval": "compare a trajectory with ground truth",
     "config": "show the resolved configuration",
 }
