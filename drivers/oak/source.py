@@ -89,14 +89,14 @@ class OakSource(LiveSource):
     def _stream(self) -> OakStream:
         dai, s = self._dai, self._settings
         pipeline = dai.Pipeline(self._device)
-        queues = [self._eye(pipeline, socket) for socket in (dai.CameraBoardSocket.CAM_B, dai.CameraBoardSocket.CAM_C)]
+        left, right = (self._eye(pipeline, getattr(dai.CameraBoardSocket, name)) for name in ("CAM_B", "CAM_C"))
         imu = self._imu(pipeline) if s.imu and self._device.getConnectedIMU() else None
         with contextlib.suppress(RuntimeError):  # cameras without a projector say that they have none
             self._device.setIrLaserDotProjectorIntensity(0.0)
             self._device.setIrFloodLightIntensity(0.0)
         pipeline.start()
         stream = OakStream(
-            dai, *queues, imu, s.size, self.counters, self._period_ns, s.queue_frames, lambda: _stop(pipeline)
+            dai, left, right, imu, s.size, self.counters, self._period_ns, s.queue_frames, lambda: _stop(pipeline)
         )
         stream.start()
         return stream

@@ -120,21 +120,6 @@ def test_a_clean_stream_loses_nothing() -> None:
 
 _NAMES = ["left", "right", "both", "swapped", "skew", "too-skewed", "empty", "half", "eight-bytes"]
 _NAMES += ["split", "garbage", "counters", "busy", "stale"]
-    "left",
-    "right",
-    "both",
-    "swapped",
-    "skew",
-    "too-skewed",
-    "empty",
-    "half",
-    "eight-bytes",
-    "split",
-    "garbage",
-    "counters",
-    "busy",
-    "stale",
-]
 
 
 @pytest.mark.parametrize(
