@@ -25,6 +25,9 @@ COMMANDS: dict[str, str] = {
     "check-calib": "judge a rig's calibration from any recording, without a target",
     "convert-calib": "calibration files between Kalibr, ROS, OpenCV, Basalt, COLMAP, Foxglove, EuRoC, KITTI and ours",
     "eval": "compare a trajectory with ground truth",
+    "devices": "which cameras are attached",
+    "t265": "firmware and reset of a T265",
+    "udev": "rules that let everybody use the cameras (Linux)",
     "config": "show the resolved configuration",
 }
 
