@@ -72,6 +72,7 @@ class OdometryConfig:
     keyframe_rescue_inliers: int = 0  # below this number at once, whatever the other rules say
     monocular: bool = False  # use the left eye alone, whatever the source has (pnp)
     init_share: float = 0.9  # monocular start: matches that must fit the essential matrix (C++ course system)
+    init_epipolar_px: float = 2.0  # monocular start: what counts as fitting
     init_parallax_deg: float = 1.0  # monocular start: least median parallax
 
 
@@ -131,6 +132,10 @@ class LoopConfig:
     gate_per_metre: float = 0.02  # ... plus this for every metre walked since
     gate_degrees: float = 3.0
     gate_degrees_per_metre: float = 0.3
+    relocalize_candidates: int = 8  # places of a saved map that are verified
+    relocalize_keyframes: int = 6  # keyframes whose points make up a place
+    relocalize_inliers: int = 25  # points that must agree with the pose found in a saved map
+    relocalize_cells: int = 6  # ... in so many of the image's 8 x 6 cells
     seed: int = 0
 
 

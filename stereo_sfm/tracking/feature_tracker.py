@@ -17,11 +17,12 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.motion_only import bearing_errors, pose_covariance
 from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.timing import NoSpans
-from stereo_sfm.tracking.features import circle_mask, describe_binary, feature_kind
+from stereo_sfm.tracking.features import circle_mask, feature_kind
 from stereo_sfm.tracking.identity import PointIds
 from stereo_sfm.tracking.matching import epipolar_inliers, match_features
 from stereo_sfm.tracking.odometry.base import FramePair, Motion
 from stereo_sfm.tracking.odometry.table import make_estimator
+from stereo_sfm.tracking.outgoing import keyframe_of, observations_of
 from stereo_sfm.tracking.scale import StepScale
 from stereo_sfm.tracking.view import View, ViewMaker, pixel_angle
 from stereo_sfm.types import (
@@ -31,7 +32,6 @@ from stereo_sfm.types import (
     Frame,
     Keyframe,
     MapUpdate,
-    Observations,
     StereoImage,
     TrackState,
     Trajectory,
@@ -228,21 +228,7 @@ class FeatureTracker:
         self._odom_T_kfs[self._kf_id] = self._odom_T_cam
         self._frames_since_kf = 0
         covariance, self._kf_covariance = self._kf_covariance, np.zeros((6, 6))
-        angles = view.features.angles
-        return Keyframe(
-            kf_id=self._kf_id,
-            frame_id=image.frame_id,
-            stamp_ns=image.stamp_ns,
-            odom_T_cam=self._odom_T_cam.copy(),
-            point_ids=view.ids.copy(),
-            uv_left=view.features.uv.copy(),
-            uv_right=view.uv_right.copy(),
-            points_cam=view.points.copy(),
-            descriptors=describe_binary(image.left, view.features.uv, angles),
-            angles=angles.copy(),
-            submap_id=self._submap,
-            covariance=covariance + 1e-12 * np.eye(6),
-        )
+        return keyframe_of(view, image.stamp_ns, self._kf_id, self._odom_T_cam, self._submap, covariance)
 
     def _remember(self, image: StereoImage, view: View) -> None:
         self._last, self._odom_T_last, self._last_stamp = view, self._odom_T_cam, image.stamp_ns
@@ -257,10 +243,6 @@ class FeatureTracker:
         is_keyframe: bool,
         covariance: F64 | None = None,
     ) -> Frame:
-        rows = view.ids >= 0
-        observations = Observations(
-            view.ids[rows], view.features.uv[rows], view.uv_right[rows], view.ages[rows], view.ages[rows] > 0
-        )
         stats = {"features": float(len(view)), "inliers": 0.0 if motion is None else float(motion.inliers.sum())}
         if motion is not None:
             stats |= {"matches": float(len(motion.inliers)), **motion.stats}
@@ -271,7 +253,7 @@ class FeatureTracker:
             covariance=np.eye(6) if covariance is None else covariance,
             state=state,
             reason=reason,
-            observations=observations,
+            observations=observations_of(view),
             reference_kf_id=self._kf_id,
             kf_T_cam=se3.inverse(self._odom_T_kf) @ self._odom_T_cam,
             map_version=self._map_version,

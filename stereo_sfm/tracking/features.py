@@ -13,8 +13,6 @@ from stereo_sfm.config import FeaturesConfig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import F32, F64, U8, Bool, Message
 
-BRIEF_PATCH_PX = 31.0  # size that OpenCV's ORB gives its keypoints at full resolution
-
 
 @dataclass(frozen=True, eq=False)
 class Features(Message):
@@ -100,16 +98,3 @@ def circle_mask(shape: tuple[int, int], centres: F64, radius_px: float) -> U8:
     for u, v in np.rint(centres).astype(int):
         cv2.circle(mask, (int(u), int(v)), round(radius_px), 255, -1)
     return mask
-
-
-def describe_binary(image: U8, uv: F64, angles: F32) -> U8:
-    """(N, 32) oriented BRIEF at given points, zero rows where the patch leaves the image (for place recognition)."""
-    out = np.zeros((len(uv), 32), np.uint8)
-    keypoints = [
-        cv2.KeyPoint(float(u), float(v), BRIEF_PATCH_PX, float(np.degrees(a)), 1.0, 0, i)
-        for i, ((u, v), a) in enumerate(zip(uv, angles, strict=True))
-    ]
-    kept, descriptors = cv2.ORB.create(max(len(uv), 1)).compute(image, keypoints)
-    if len(kept):
-        out[[k.class_id for k in kept]] = descriptors
-    return out

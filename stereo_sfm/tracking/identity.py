@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from stereo_sfm.tracking.view import View
-from stereo_sfm.types import I64
+from stereo_sfm.types import I64, Bool
 
 
 class PointIds:
@@ -49,10 +49,10 @@ class PointIds:
         ages[rows[fresh, 1]] = reference.ages[rows[fresh, 0]] + 1
         return replace(view, ids=ids, ages=ages)
 
-    def give_new(self, view: View) -> View:
-        """The view with a new id wherever there is none."""
+    def give_new(self, view: View, only: Bool | None = None) -> View:
+        """The view with a new id wherever there is none (and `only` allows it)."""
         ids = view.ids.copy()
-        new = np.flatnonzero(ids < 0)
+        new = np.flatnonzero((ids < 0) if only is None else (ids < 0) & only)
         ids[new] = self._next + np.arange(len(new))
         self._next += len(new)
         return replace(view, ids=ids)
