@@ -37,6 +37,9 @@ _MEANINGS: tuple[tuple[str, type[DeviceError], str], ...] = (
 )
 
 
+NO_OAK = "no OAK attached: plug it into a USB 3 port (one in the network needs its address, oak:192.168.1.44)"
+
+
 def load() -> Any:
     """depthai.
 
@@ -76,8 +79,28 @@ class Found:
     info: Any  # depthai.DeviceInfo
 
 
+# USB product ids of vendor 03e7: unbooted, booted, bootloader, flash-booted. 2150 is a T265 and not here on purpose.
+_USB_VENDOR, _USB_PRODUCTS = 0x03E7, (0x2485, 0xF63B, 0xF63C, 0xF63D)
+
+
+def on_usb() -> bool:
+    """Whether an OAK is on the USB bus: a look of milliseconds, before depthai takes its second."""
+    import usb.core
+
+    from drivers.t265.usb_device import default_backend
+
+    try:
+        found = usb.core.find(
+            backend=default_backend(),
+            custom_match=lambda d: d.idVendor == _USB_VENDOR and d.idProduct in _USB_PRODUCTS,
+        )
+    except (usb.core.USBError, NotFound):
+        return False
+    return found is not None
+
+
 def find(dai: Any) -> list[Found]:
-    """All attached, in half a second, without booting any."""
+    """All attached to USB or the network, in half a second, without booting any."""
     try:
         infos = dai.Device.getAllAvailableDevices()
     except RuntimeError as error:
@@ -107,7 +130,7 @@ def choose(found: list[Found], wanted: str) -> Found:
         NotFound, DeviceFault.
     """
     if not found:
-        raise NotFound("no OAK attached: plug it into a USB 3 port (or give its address, oak:192.168.1.44)")
+        raise NotFound(NO_OAK)
     if wanted:
         for one in found:
             if wanted in (one.device_id, one.name):

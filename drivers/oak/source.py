@@ -7,11 +7,11 @@ import logging
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.live.errors import DeviceFault, TooSlowLink
+from drivers.live.errors import DeviceFault, NotFound, TooSlowLink
 from drivers.live.options import Options
 from drivers.live.source import LiveSource, Patience
 from drivers.oak.calibration import read_calibration
-from drivers.oak.library import choose, device_error, find, load
+from drivers.oak.library import NO_OAK, choose, device_error, find, load, on_usb
 from drivers.oak.stream import OakStream
 from drivers.rig_option import chosen_rig
 
@@ -48,6 +48,8 @@ class OakSource(LiveSource):
 
     def __init__(self, wanted: str, settings: Settings, patience: Patience, name: str = "oak") -> None:
         super().__init__(name, "OAK", round(1e9 / settings.rate_hz), patience)
+        if not wanted and not on_usb():
+            raise NotFound(NO_OAK)
         self._settings, self._dai = settings, load()
         self._wanted = choose(find(self._dai), wanted).device_id or wanted
         self._device: Any = None

@@ -1,0 +1,68 @@
+"""`stereo-sfm t265`: the firmware a T265 needs, and resetting one."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from stereo_sfm.errors import StereoSfmError
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of this command."""
+    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+    firmware = actions.add_parser(
+        "firmware", help="get or check the firmware file (Intel's; it cannot be shipped here)"
+    )
+    kinds = firmware.add_subparsers(dest="kind", metavar="ACTION", required=True)
+    extract = kinds.add_parser("extract", help="take it out of a librealsense library or pyrealsense2 wheel you have")
+    extract.add_argument("file", type=Path, help="librealsense2.so, a pyrealsense2 .so, .pyd or .whl, or the .mvcmd")
+    extract.add_argument("-o", "--output", type=Path, help="where to put it (default: where the driver looks)")
+    extract.add_argument("--overwrite", action="store_true", help="replace an existing file")
+    kinds.add_parser("check", help="is the file there, and is it the right one")
+    reset = actions.add_parser("reset", help="restart a camera that hangs")
+    reset.add_argument("--serial", default="", help="of the camera (default: the only one)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Dispatch."""
+    if args.action == "reset":
+        return _reset(args.serial)
+    return _extract(args) if args.kind == "extract" else _check()
+
+
+def _extract(args: argparse.Namespace) -> int:
+    from drivers.t265 import firmware
+
+    target: Path = args.output or firmware.default_path()
+    if target.exists() and not args.overwrite:
+        raise StereoSfmError(f"{target} exists: add --overwrite to replace it")
+    found = firmware.extract(args.file)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(found.data)
+    except OSError as error:
+        raise StereoSfmError(f"cannot write {target}: {error}") from None
+    print(f"T265 firmware {firmware.VERSION}, {len(found.data)} bytes, SHA-1 {firmware.SHA1}: written to {target}")
+    return 0
+
+
+def _check() -> int:
+    from drivers.t265 import firmware
+
+    path = firmware.find()
+    firmware.load()
+    print(f"T265 firmware {firmware.VERSION} at {path}: SHA-1 is right")
+    return 0
+
+
+def _reset(serial: str) -> int:
+    from drivers.live.counters import Counters
+    from drivers.t265.acquire import Access, acquire
+    from drivers.t265.usb_device import default_backend
+
+    camera = acquire(Access(default_backend(), serial, allow_slow=True), Counters())
+    camera.link.reset()
+    camera.link.close()
+    print(f"T265 {camera.info.serial} is back in its boot state; the next run or record boots it")
+    return 0
