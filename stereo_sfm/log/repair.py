@@ -18,6 +18,7 @@ from typing import IO
 from mcap.data_stream import ReadDataStream, RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
+from mcap.reader import SeekingReader
 from mcap.records import (
     Attachment,
     AttachmentIndex,
@@ -140,6 +141,7 @@ def _content(stream: IO[bytes], span: Span) -> ReadDataStream:
 def build_index(stream: IO[bytes]) -> Index:
     """Read every record of the data section. Chunks whose checksum is wrong are listed in `bad_chunks` and left out."""
     index = Index(end=len(MCAP0_MAGIC))
+    index.schemas, index.channels = _listed_at_the_end(stream)
     for span in spans(stream):
         if span.opcode in (Opcode.DATA_END, Opcode.FOOTER):
             index.closed = _ends_well(stream)
@@ -184,6 +186,16 @@ def _mend_last_message_index(index: Index, stream: IO[bytes]) -> None:
     index.lost_message_index = builder.end()
 
 
+def _listed_at_the_end(stream: IO[bytes]) -> tuple[dict[int, Schema], dict[int, Channel]]:
+    """Schemas and channels of the summary section, if there is one: the chunk that first held them may be damaged."""
+    try:
+        stream.seek(0)
+        summary = SeekingReader(stream).get_summary()
+    except (*DAMAGE, OSError, StopIteration):
+        return {}, {}
+    return (dict(summary.schemas), dict(summary.channels)) if summary is not None else ({}, {})
+
+
 def _ends_well(stream: IO[bytes]) -> bool:
     stream.seek(-len(MCAP0_MAGIC), 2)
     return stream.read() == MCAP0_MAGIC
@@ -220,6 +232,8 @@ def _add_chunk(index: Index, chunk: Chunk, span: Span) -> None:
         elif isinstance(record, Channel):
             index.channels[record.id] = record
         elif isinstance(record, Message):
+            if record.channel_id not in index.channels:
+                raise ValueError(f"channel {record.channel_id} is not declared")
             counts[record.channel_id] = counts.get(record.channel_id, 0) + 1
     index.chunk_counts.append(counts)
     index.chunks.append(
@@ -284,8 +298,9 @@ def finish_in_place(path: Path) -> int:
     Returns:
         The number of messages in the finished file.
     """
-    with path.open("r+b", buffering=0) as stream:
+    with path.open("rb") as stream:
         index = build_index(stream)
+    with path.open("r+b", buffering=0) as stream:
         while True:
             stream.truncate(index.end)
             stream.seek(index.end)
@@ -305,6 +320,14 @@ def _write_all(write: Callable[[bytes], int | None], data: bytes) -> None:
         view = view[write(view) or 0 :]  # pyright: ignore[reportArgumentType]
 
 
+def _declarations(index: Index) -> bytes:
+    """Schema and channel records, to stand in for those of a chunk that is left out; repeating them is allowed."""
+    builder = RecordBuilder()
+    for record in (*index.schemas.values(), *index.channels.values()):
+        record.write(builder)
+    return builder.end()
+
+
 def recover(source: Path, target: Path) -> Index:
     """Copy what is whole and append the index.
 
@@ -321,6 +344,8 @@ def recover(source: Path, target: Path) -> Index:
             for span in spans(stream):
                 if span.offset >= found.end:
                     break
+                if span.offset in bad and not skipping:
+                    out.write(_declarations(found))
                 skipping = span.offset in bad or (skipping and span.opcode == Opcode.MESSAGE_INDEX)
                 if not skipping:
                     out.write(read_span(stream, span))

@@ -168,6 +168,7 @@ class LogWriter:
         row = BY_NAME.get(topic)
         if row is None or name not in row.schema.split("|"):
             raise ValueError(f"topic {topic} with schema {name} is not in the table of topics")
+        self._pending_bytes += len(name) + len(data) + len(topic) + 64  # both records go into the chunk
         schema_id = self._mcap.register_schema(name, SchemaEncoding.Protobuf, data)
         self._channels[topic] = self._mcap.register_channel(topic, MessageEncoding.Protobuf, schema_id)
         return self._channels[topic]

@@ -1,0 +1,133 @@
+"""Dataclasses cross the protobuf form with every bit, and other protobuf readers see the same numbers."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.records import Schema
+from mcap_protobuf.decoder import DecoderFactory
+
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.log import schema
+from stereo_sfm.log.image_log import ImageInfo, ImuSample
+from stereo_sfm.log.run_log import Health, TrackStats
+from stereo_sfm.types import (
+    Applied,
+    Dropped,
+    Frame,
+    Keyframe,
+    LoopResult,
+    MapUpdate,
+    Observations,
+    TrackState,
+)
+
+
+def _observations(n: int, rng: np.random.Generator) -> Observations:
+    right = rng.normal(size=(n, 2))
+    right[::2] = np.nan
+    age = rng.integers(0, 99, n).astype(np.int32)
+    return Observations(rng.integers(0, 2**60, n), rng.normal(size=(n, 2)), right, age, rng.random(n) < 0.5)
+
+
+def _messages(n: int, seed: int) -> list[object]:
+    rng = np.random.default_rng(seed)
+    frame = Frame(
+        2**31 + 5, 10**18 + 7, rng.normal(size=(4, 4)), rng.normal(size=(6, 6)), TrackState.RECOVERED, "näher",
+        _observations(n, rng), -1, rng.normal(size=(4, 4)), 3, True, {"z": 0.1, "a": float("inf")},
+    )  # fmt: skip
+    keyframe = Keyframe(
+        n, 7, -5, rng.normal(size=(4, 4)), rng.integers(0, 9**9, n), rng.normal(size=(n, 2)), rng.normal(size=(n, 2)),
+        rng.normal(size=(n, 3)), rng.integers(0, 256, (n, 32), np.uint8), rng.random(n).astype(np.float32), 2,
+    )  # fmt: skip
+    update = MapUpdate(
+        1, 2, rng.integers(0, 9, n), rng.normal(size=(n, 4, 4)), rng.integers(0, 9, n), rng.normal(size=(n, 3)),
+        rng.integers(0, 9, n), rng.integers(0, 9, (n, 2)), rng.normal(size=(4, 4)),
+    )  # fmt: skip
+    loop = LoopResult(
+        4, -1, np.eye(4), rng.normal(size=(6, 6)), rng.integers(0, 9, (n, 2)), 0, 0.25, "too_few_inliers",
+        tuple((i, 0.5 * i, f"r{i}") for i in range(n)),
+    )  # fmt: skip
+    return [frame, keyframe, update, loop, Dropped(3, 4, "ring", "full", 2), Applied(5, 6)]
+
+
+def _assert_equal(a: object, b: object) -> None:
+    for f in dataclasses.fields(a):  # pyright: ignore[reportArgumentType]
+        x, y = getattr(a, f.name), getattr(b, f.name)
+        if isinstance(x, np.ndarray):
+            assert (x.dtype, x.shape) == (y.dtype, y.shape), f.name
+            assert x.tobytes() == y.tobytes(), f.name
+        elif dataclasses.is_dataclass(x):
+            _assert_equal(x, y)
+        else:
+            assert x == y and type(x) is type(y), f.name
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 12), st.integers(0, 2**32 - 1))
+def test_every_message_of_a_run_comes_back_with_every_bit(n: int, seed: int) -> None:
+    for message in _messages(n, seed):
+        decode = schema.decoder(type(message), schema.schema_data(type(message)))
+        _assert_equal(message, decode(schema.encode(message)))
+
+
+def test_arrays_of_rows_have_their_shape_in_the_table() -> None:
+    """A field of a new shape in `types` must be added to SHAPES, or it would come back flat."""
+    for message in _messages(3, 0):
+        for f in schema.fields_of(type(message)):
+            value = getattr(message, f.name)
+            if isinstance(value, np.ndarray) and value.ndim > 1:
+                assert np.zeros(value.shape).reshape(schema.SHAPES[f.name]).shape == value.shape, f.name
+
+
+def test_other_readers_of_the_schema_see_the_same_numbers() -> None:
+    frame = next(m for m in _messages(5, 1) if isinstance(m, Frame))
+    record = Schema(1, schema.schema_data(Frame), "protobuf", "stereo_sfm.Frame")
+    decode = DecoderFactory().decoder_for("protobuf", record)
+    assert decode is not None
+    seen = decode(schema.encode(frame))
+    assert list(seen.odom_T_cam) == frame.odom_T_cam.ravel().tolist()
+    assert list(seen.observations.point_ids) == frame.observations.point_ids.tolist()
+    assert list(seen.observations.inlier) == frame.observations.inlier.tolist()
+    assert list(seen.observations.age) == frame.observations.age.tolist()
+    assert (seen.frame_id, seen.state, seen.reason) == (frame.frame_id, 3 - 1, "näher")
+    assert dict(zip(seen.stats_names, seen.stats_values, strict=True)) == frame.stats
+
+
+def test_flat_messages_round_trip() -> None:
+    nan = float("nan")
+    stats = TrackStats(1, 2, True, 3, 4, 5, 6, 0.5, 0.25, inliers=7.0, other={"x": 1.0})
+    for message in (ImageInfo(1, 2, 3, 4.5, nan, 0, True, False, -1, 0), ImuSample(1, 2.0, 3.0, nan, 4.0, 5.0, 6.0),
+                    stats, Health("track", 1, 30.0, 2, 1.0, 2.0, 3.0, 0)):  # fmt: skip
+        decode = schema.decoder(type(message), schema.schema_data(type(message)))
+        assert repr(decode(schema.encode(message))) == repr(message)  # repr: NaN equals itself
+
+
+def test_a_log_of_an_older_version_takes_the_defaults_of_new_fields() -> None:
+    @dataclasses.dataclass
+    class Dropped:  # as it may have been before `why` and `count` existed
+        frame_id: int
+        stamp_ns: int
+        where: str
+        why: str
+
+    data, old = schema.encode(Dropped(1, 2, "ring", "full")), schema.schema_data(Dropped)
+    from stereo_sfm.types import Dropped as Today
+
+    assert schema.decoder(Today, old)(data) == Today(1, 2, "ring", "full", 1)
+
+
+def test_a_log_without_a_needed_field_is_named() -> None:
+    @dataclasses.dataclass
+    class Applied:
+        version: int
+
+    data, old = schema.encode(Applied(1)), schema.schema_data(Applied)
+    from stereo_sfm.types import Applied as Today
+
+    with pytest.raises(StereoSfmError, match="before_frame_id"):
+        schema.decoder(Today, old)(data)
