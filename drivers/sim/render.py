@@ -17,6 +17,7 @@ from stereo_sfm.types import F32, F64, I32, I64
 
 EDGE_RAYS = np.array([[-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 0.125]])  # rotated grid, px
 EDGE_CONTRAST = 4.0  # least step of brightness (of 255) worth several rays
+BREADTH = 1.3  # width of the texture filter in pixels: above 1 nothing crawls when the camera moves
 _CENTRE = np.zeros((1, 2))
 _STEPS = (np.arange(6) - 2.5) / 6
 TARGET_RAYS = np.stack(np.meshgrid(_STEPS, _STEPS), -1).reshape(-1, 2)  # flat pictures are for sub-pixel measurement
@@ -62,7 +63,7 @@ class Eye:
         self.grid = grid  # (H, W, 3) unit bearings, NaN where the lens shows nothing
         self.du, self.dv = np.gradient(grid, axis=1), np.gradient(grid, axis=0)  # (H, W, 3) per pixel
         angles = np.sqrt(np.linalg.norm(self.du, axis=-1) * np.linalg.norm(self.dv, axis=-1))
-        self.angles = np.nan_to_num(angles, nan=1.0 / camera.fx)  # (H, W) radians a pixel covers
+        self.angles = BREADTH * np.nan_to_num(angles, nan=1.0 / camera.fx)  # (H, W) radians that a pixel gathers
         self.inner = np.isfinite(self.du).all(-1) & np.isfinite(self.dv).all(-1)  # (H, W) has rays all around
         self.valid = np.flatnonzero(np.isfinite(grid[..., 2]))  # (N,) flat indices of pixels with a ray
 

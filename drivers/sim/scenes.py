@@ -9,8 +9,9 @@ import numpy as np
 
 from drivers.sim.effects import Effects
 from drivers.sim.people import Person
-from drivers.sim.walks import Gait
+from drivers.sim.walks import FORWARD, Gait
 from drivers.sim.world import CLOTHES, HAIR, Layout
+from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64
 
 Route = Callable[[Layout, int, bool], F64]  # (layout, walk number, returns) -> polyline (N, 2) metres
@@ -22,7 +23,7 @@ class Scene:
 
     layout: Layout
     route: Route
-    length: float  # metres walked
+    length: float  # metres walked, if the route is as long
     effects: Effects = field(default_factory=Effects)
     gait: Gait = field(default_factory=Gait)
     people: int = 0
@@ -56,20 +57,17 @@ def _loop(layout: Layout, walk: int, returns: bool) -> F64:
 
 
 def _serpentine(layout: Layout, walk: int, returns: bool) -> F64:
-    """Through every aisle in turn, alternately up and down; then back along the first when it returns."""
+    """Up and down every inner aisle in turn; then over to the first two again when it returns."""
     a, b = _ends(layout)
-    points: list[tuple[float, float]] = []
-    aisles = list(range(layout.gondolas + 1))
+    aisles = list(range(1, layout.gondolas))
     if walk % 2:
         aisles.reverse()
-    for n, k in enumerate(aisles):
-        x0, x1 = (a, b) if n % 2 == 0 else (b, a)
-        points += [(x0, layout.aisle_y(k)), (x1, layout.aisle_y(k))]
-    if returns:
-        x = points[-1][0]
-        back = layout.aisle_y(aisles[0])
-        points += [(x, back), (a + b - x, back)] if x == a else [(x, layout.aisle_y(aisles[0])), (a, back), (b, back)]
-        points += [(points[-1][0], layout.aisle_y(aisles[1])), (a + b - points[-1][0], layout.aisle_y(aisles[1]))]
+    points: list[tuple[float, float]] = []
+    x = a
+    for k in aisles + (aisles[:2] if returns else []):
+        points.append((x, layout.aisle_y(k)))
+        x = a + b - x
+        points.append((x, layout.aisle_y(k)))
     return np.array(points)
 
 
@@ -79,11 +77,23 @@ _DARK = Effects(exposure_s=0.009, gain=0.14, drift=0.2, read_noise=3.0, shot_noi
 SCENES: dict[str, Scene] = {
     "aisle": Scene(_STORE, _aisle, 14.0),
     "loop": Scene(_STORE, _loop, 42.0),
-    "identical-aisles": Scene(Layout(gondolas=4, identical=True), _serpentine, 100.0),
-    "people": Scene(_STORE, _loop, 40.0, people=7),
-    "dark": Scene(_STORE, _loop, 40.0, _DARK),
-    "big": Scene(Layout(gondolas=9, gondola_length=18.0, products=420), _serpentine, 260.0),
+    "identical-aisles": Scene(Layout(gondolas=5, gondola_length=8.0, identical=True), _serpentine, 1000.0),
+    "people": Scene(_STORE, _loop, 42.0, people=7),
+    "dark": Scene(_STORE, _loop, 42.0, _DARK),
+    "big": Scene(Layout(gondolas=9, gondola_length=18.0, products=420), _serpentine, 1000.0),
 }
+
+
+def random_poses(layout: Layout, count: int, rng: np.random.Generator) -> F64:
+    """(count, 4, 4) world_T_cam somewhere in the aisles, looking anywhere about the horizon."""
+    a, b = _ends(layout)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    for pose in poses:
+        k = int(rng.integers(layout.gondolas + 1))
+        pose[:3, 3] = rng.uniform(a, b), layout.aisle_y(k) + rng.uniform(-0.4, 0.4), rng.uniform(1.0, 1.6)
+        pose[:3, :3] = se3.so3_exp(np.array([0, 0, rng.uniform(-np.pi, np.pi)])) @ FORWARD
+        pose[:3, :3] = pose[:3, :3] @ se3.so3_exp(rng.normal(0, 0.08, 3))
+    return poses
 
 
 def crowd(scene: Scene, count: int, rng: np.random.Generator) -> list[Person]:

@@ -16,6 +16,7 @@ from scipy.ndimage import gaussian_filter1d
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64
 
+FORWARD = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])  # world_R_cam of a camera that looks along x, upright
 _RATE = 120.0  # samples a second of the dense route
 
 
@@ -58,7 +59,7 @@ class Walk:
             np.stack([x, y, np.full_like(x, self.gait.height)], -1),
         )
         pitch = np.deg2rad(self.gait.pitch_deg)
-        walker_R_cam = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]) @ se3.so3_exp(np.array([pitch, 0, 0]))
+        walker_R_cam = FORWARD @ se3.so3_exp(np.array([pitch, 0, 0]))
         walker_T_cam = se3.from_rotation_translation(walker_R_cam, np.zeros(3))
         return world_T_walker @ walker_T_cam @ se3.exp(shake)
 

@@ -26,9 +26,8 @@ class Tables(NamedTuple):
     blocks_i: I64  # (B, 10) kind, facing, first and last + 1 level, six textures
     levels: F64  # (L, 3) z of the board's bottom, the floor products stand on, the top of the slot
     levels_i: I64  # (L, 5) first and last + 1 facing, offset into bins, open above, number of bins
-    facings: (
-        F64  # (F, 10) cell u0 u1, box u0 u1, lower front w, lower top z, upper front w, upper top z, unit h, unit d
-    )
+    # (F, 10) cell u0 u1, box u0 u1, lower box's front w and top z, upper box's front w and top z, unit height and depth
+    facings: F64
     facings_i: I64  # (F, 5) textures front, side, top; block; level
     bins: I64  # (N,) first facing whose cell reaches into a bin of BIN metres
     texels: U8  # (M,)
