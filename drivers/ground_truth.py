@@ -104,12 +104,13 @@ def read_kitti(path: Path, stamp_ns: I64 | None = None) -> Trajectory:
     return Trajectory(stamps[:count], se3.orthonormalize(poses))
 
 
-def read_trajectory(path: Path) -> Trajectory:
+def read_trajectory(path: Path | str) -> Trajectory:
     """A trajectory of whichever of the three forms the file has.
 
     Raises:
         StereoSfmError: no such file, or not a trajectory.
     """
+    path = Path(path).expanduser()
     first = _rows(path, 8)[0]
     if len(first) == 12:
         return read_kitti(path)
