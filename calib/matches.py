@@ -42,7 +42,7 @@ def match_pair(
     search_rows: int = 14,
     max_disparity: float = 0.2,
 ) -> Matches:
-    """Match a rectified pair.
+    """Match a rectified pair (always the same matches for the same images).
 
     Args:
         rectification: that made the images; its masks keep patches away from the black border.
@@ -51,8 +51,6 @@ def match_pair(
         search_rows: rows above and below to search: how wrong the calibration may be.
         max_disparity: columns to search, as a fraction of the width.
     """
-    import cv2
-
     usable = _shrunk(rectification.left.mask, PATCH + 2)
     corners = spread_corners(left, usable, max_matches)
     guess = np.full_like(corners, np.nan)
@@ -64,9 +62,9 @@ def match_pair(
     start, guess = corners[found].astype(np.float32), guess[found].astype(np.float32)
     if not len(start):
         return Matches(np.zeros((0, 2)), np.zeros((0, 2)))
-    a, b = _flattened(left), _flattened(right)
-    end, good = _lucas_kanade(a, b, start, guess)
-    back, good_back = _lucas_kanade(b, a, end, start)
+    a, b = flattened(left), flattened(right)
+    end, good = lucas_kanade(a, b, start, guess)
+    back, good_back = lucas_kanade(b, a, end, start)
     inside = right_usable[
         np.clip(np.round(end[:, 1]).astype(int), 0, left.shape[0] - 1),
         np.clip(np.round(end[:, 0]).astype(int), 0, left.shape[1] - 1),
@@ -74,7 +72,6 @@ def match_pair(
     returned = np.linalg.norm(back - start, axis=1) < 0.15
     near = np.linalg.norm(end - guess, axis=1) < 2.5
     kept = good & good_back & inside & returned & near
-    cv2.setRNGSeed(0)
     return Matches(start[kept].astype(float), end[kept].astype(float))
 
 
@@ -124,7 +121,7 @@ def _search(left: U8, right: U8, u: int, v: int, reach: int, rows: int) -> tuple
     return float(u0 + x + PATCH), float(v0 + y + PATCH)
 
 
-def _flattened(image: U8) -> U8:
+def flattened(image: U8) -> U8:
     """The image less its local mean over its local contrast, so that the eyes' exposures do not matter."""
     import cv2
 
@@ -134,7 +131,19 @@ def _flattened(image: U8) -> U8:
     return np.clip(128 + 48 * (picture - mean) / (spread + 4), 0, 255).astype(np.uint8)
 
 
-def _lucas_kanade(a: U8, b: U8, start: Any, guess: Any) -> tuple[Any, Bool]:
+def pyramid_flow(a: U8, b: U8, start: Any) -> tuple[Any, Bool]:
+    """Lucas-Kanade over a pyramid from image a to the next one b: (N, 2) float32 px and whether it came back."""
+    import cv2
+
+    options: Any = {"winSize": WINDOW, "maxLevel": 4, "minEigThreshold": 1e-3}
+    end, status, _ = cv2.calcOpticalFlowPyrLK(a, b, start, start.copy(), **options)
+    back, status_back, _ = cv2.calcOpticalFlowPyrLK(b, a, end, end.copy(), **options)
+    returned = np.linalg.norm(back - start, axis=1) < 0.5
+    return end, (status.ravel() > 0) & (status_back.ravel() > 0) & returned
+
+
+def lucas_kanade(a: U8, b: U8, start: Any, guess: Any) -> tuple[Any, Bool]:
+    """Sub-pixel refinement at full size from `guess` (N, 2) float32 px in image b, and whether it converged."""
     import cv2
 
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 40, 1e-3)
