@@ -125,6 +125,7 @@ class LoopConfig:
     disparity_sigma: float = 0.5  # px, of a stereo point's disparity
     ransac_iterations: int = 400
     min_inliers: int = 30
+    min_inlier_share: float = 0.2  # ... and of the keyframe's described points
     min_cells: int = 8  # of the 8 x 6 cells of the image that hold inliers
     consistent: int = 2  # successive keyframes that must agree on a loop
     consistent_window: int = 4  # ... within so many keyframes
@@ -135,6 +136,7 @@ class LoopConfig:
     relocalize_candidates: int = 8  # places of a saved map that are verified
     relocalize_keyframes: int = 6  # keyframes whose points make up a place
     relocalize_inliers: int = 25  # points that must agree with the pose found in a saved map
+    relocalize_share: float = 0.27  # ... and so large a share of the camera's described points
     relocalize_cells: int = 6  # ... in so many of the image's 8 x 6 cells
     seed: int = 0
 

@@ -23,7 +23,7 @@ from stereo_sfm.loop.cloud import Cloud
 from stereo_sfm.mapping.bundle import Bundle, bundle_adjust
 from stereo_sfm.types import F64, I32, I64, Keyframe
 
-GUIDED_RADIUS_PX = 10.0
+GUIDED_RADII_PX = 12.0, 6.0  # one round each
 GRID = (8, 6)  # columns, rows
 njit: Any = numba.njit(cache=True, nogil=True, error_model="numpy")
 
@@ -50,7 +50,6 @@ class Verdict:
     information: F64  # (6, 6)
     pairs: I64  # (M, 2) point ids: candidate's, camera's
     inliers: int
-    uv: F64  # (M, 2) px of the inliers in the camera
 
 
 def view_of(keyframe: Keyframe, sigmas: F64) -> View:
@@ -69,11 +68,17 @@ def view_of(keyframe: Keyframe, sigmas: F64) -> View:
 
 def rejection(reason: str, inliers: int = 0) -> Verdict:
     """A verdict against."""
-    return Verdict(reason, np.eye(4), np.zeros((6, 6)), np.zeros((0, 2), np.int64), inliers, np.zeros((0, 2)))
+    return Verdict(reason, np.eye(4), np.zeros((6, 6)), np.zeros((0, 2), np.int64), inliers)
 
 
-def verify(view: View, cloud: Cloud, rig: Rig, config: LoopConfig, rng: np.random.Generator) -> Verdict:
-    """Match, place, match again along the projection, and judge. See the reasons below for what is asked for."""
+def verify(
+    view: View, cloud: Cloud, rig: Rig, config: LoopConfig, rng: np.random.Generator, move_points: bool = True
+) -> Verdict:
+    """Match, place, match again along the projection, and judge. See the reasons below for what is asked for.
+
+    Args:
+        move_points: finish with a bundle that moves the points too (stereo points are noisy, those of a map are not).
+    """
     rows_b, rows_a, _ = binary.match_descriptors(
         view.descriptors, cloud.descriptors, cloud.ids, config.max_distance, config.match_ratio
     )
@@ -84,17 +89,31 @@ def verify(view: View, cloud: Cloud, rig: Rig, config: LoopConfig, rng: np.rando
         return rejection("no_pose")
     if pose.inlier.sum() < config.min_inliers // 2:
         return rejection("too_few_inliers", int(pose.inlier.sum()))
-    rows_b, rows_a = match_guided(pose.b_T_a, view, cloud, rig, config.max_distance)
-    pose = refine_pose(pose.b_T_a, _pair(view, cloud, rows_b, rows_a), rig, config.pixel_sigma)
+    return verify_near(pose.b_T_a, view, cloud, rig, config, move_points)
+
+
+def verify_near(
+    b_T_a: F64, view: View, cloud: Cloud, rig: Rig, config: LoopConfig, move_points: bool = False
+) -> Verdict:
+    """The second half of `verify`: from a pose that is nearly right."""
+    pose: Pose | None = None
+    rows_b = rows_a = np.zeros(0, np.int32)
+    for radius in GUIDED_RADII_PX:
+        rows_b, rows_a = match_guided(b_T_a, view, cloud, rig, config.max_distance, radius)
+        if len(rows_b) < 4:
+            return rejection("too_few_inliers", len(rows_b))
+        pose = refine_pose(b_T_a, _pair(view, cloud, rows_b, rows_a), rig, config.pixel_sigma)
+        b_T_a = pose.b_T_a
+    assert pose is not None
     inliers = int(pose.inlier.sum())
-    if inliers < config.min_inliers:
+    if inliers < max(config.min_inliers, config.min_inlier_share * len(view.ids)):
         return rejection("too_few_inliers", inliers)
-    uv = view.uv_left[rows_b[pose.inlier]]
-    if occupied_cells(uv, rig.left.size) < config.min_cells:
-        return rejection("not_spread", inliers)
     rows_a, rows_b = rows_a[pose.inlier], rows_b[pose.inlier]
-    b_T_a = refine_with_points(pose.b_T_a, view, cloud, rows_b, rows_a, rig, config)
-    return Verdict("", b_T_a, pose.information, np.stack([cloud.ids[rows_a], view.ids[rows_b]], axis=1), inliers, uv)
+    if occupied_cells(view.uv_left[rows_b], rig.left.size) < config.min_cells:
+        return rejection("not_spread", inliers)
+    if move_points:
+        b_T_a = refine_with_points(b_T_a, view, cloud, rows_b, rows_a, rig, config)
+    return Verdict("", b_T_a, pose.information, np.stack([cloud.ids[rows_a], view.ids[rows_b]], axis=1), inliers)
 
 
 def _place(
@@ -145,9 +164,7 @@ def _pair(view: View, cloud: Cloud, rows_b: I32, rows_a: I32) -> Matches:
     )
 
 
-def match_guided(
-    b_T_a: F64, view: View, cloud: Cloud, rig: Rig, max_distance: int, radius: float = GUIDED_RADIUS_PX
-) -> tuple[I32, I32]:
+def match_guided(b_T_a: F64, view: View, cloud: Cloud, rig: Rig, max_distance: int, radius: float) -> tuple[I32, I32]:
     """Pairs (rows of view, rows of cloud) whose descriptors agree within `radius` px of the projection, one to one."""
     uv = rig.left.project(se3.transform(b_T_a, cloud.points))
     best = _nearest_within(view.uv_left, view.words, uv, binary.as_words(cloud.descriptors), radius, max_distance)

@@ -1,0 +1,78 @@
+"""`stereo-sfm vocabulary`: train a vocabulary, or say what one holds."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from stereo_sfm.types import U8
+
+# What the package's vocabulary was trained on: `stereo-sfm vocabulary train -o FILE` makes it again.
+DEFAULT_SOURCES = tuple(f"sim:{scene}?people=0&seed={seed}" for seed in (101, 102) for scene in ("loop", "big"))
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of this command."""
+    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+    train = actions.add_parser("train", help="cluster the descriptors of some sources into words")
+    train.add_argument(
+        "sources", nargs="*", default=list(DEFAULT_SOURCES), metavar="SOURCE", help="default: the package's own"
+    )
+    train.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="vocabulary file (.npz)")
+    train.add_argument(
+        "--images", type=int, default=80, metavar="N", help="images of each source, evenly spread"
+    )
+    train.add_argument("--branching", type=int, default=10, help="children of a node of the tree")
+    train.add_argument("--depth", type=int, default=4, help="levels of the tree")
+    train.add_argument("--seed", type=int, default=0, help="of the clustering")
+    info = actions.add_parser("info", help="what a vocabulary holds")
+    info.add_argument("file", nargs="?", type=Path, help="default: the one of the package")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Train or describe."""
+    from stereo_sfm.loop.vocabulary_file import default_vocabulary, load_vocabulary
+
+    if args.action == "train":
+        _train(args)
+        return 0
+    vocabulary = load_vocabulary(args.file) if args.file else default_vocabulary()
+    print(f"{len(vocabulary)} words in {len(vocabulary.word)} nodes, id {vocabulary.id}")
+    return 0
+
+
+def _train(args: argparse.Namespace) -> None:
+    from stereo_sfm.errors import StereoSfmError
+    from stereo_sfm.loop.vocabulary import train
+    from stereo_sfm.loop.vocabulary_file import save_vocabulary
+
+    images = [d for source in args.sources for d in _descriptors(source, args.images)]
+    if not images:
+        raise StereoSfmError("the sources hold no image with enough texture to train from")
+    vocabulary = train(images, args.branching, args.depth, args.seed)
+    save_vocabulary(vocabulary, args.output)
+    count = sum(len(d) for d in images)
+    print(
+        f"{len(vocabulary)} words from {count} descriptors of {len(images)} images, id {vocabulary.id}: {args.output}"
+    )
+
+
+def _descriptors(spec: str, wanted: int) -> Iterator[U8]:
+    """(N, 32) of images that lie evenly over a source."""
+    from drivers.sim.source import SimSource
+    from drivers.source import open_source
+    from stereo_sfm.loop.still import still_keyframe
+
+    with open_source(spec) as source:
+        every = max((source.frame_count or wanted) // wanted, 1)
+        if isinstance(source, SimSource):  # the simulator renders any frame alone
+            images = (source.frame(int(k)) for k in source.frame_ids[::every])
+        else:
+            images = (image for n, image in enumerate(source) if n % every == 0)
+        for image in images:
+            keyframe = still_keyframe(image, source.rig)
+            if keyframe is not None:
+                yield keyframe.descriptors

@@ -1,0 +1,223 @@
+"""A saved map: a versioned folder of `map.json`, `rig.yaml` and three npz files; it holds no image.
+
+The same map gives the same bytes. What is wrong with a folder is said in one line.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.formats.native import read_native, write_native
+from calib.rig import Rig
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.mapping.map import Map, MapSnapshot
+from stereo_sfm.types import I64, Keyframe
+
+VERSION = 1
+KIND = "stereo_sfm_map"
+_FILES: dict[str, tuple[str, ...]] = {
+    "keyframes": ("kf_ids", "frame_ids", "stamp_ns", "submap_ids", "map_T_kf", "odom_T_kf", "sessions"),
+    "points": ("pt_ids", "points", "anchors", "seen", "expected"),
+    "observations": ("obs_kf", "obs_pt", "uv_left", "uv_right", "descriptors", "angles"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class SavedMap:
+    """A map at rest, and what is needed to use it again."""
+
+    snapshot: MapSnapshot
+    rig: Rig
+    vocabulary_id: str
+    sessions: I64  # (K,) in which walk a keyframe was made: 0, 1, ...
+
+    def __len__(self) -> int:
+        """Number of keyframes."""
+        return len(self.snapshot.kf_ids)
+
+
+def save_map(saved: SavedMap, folder: Path) -> None:
+    """Write a map folder; what else lies in it stays.
+
+    Raises:
+        StereoSfmError: the map is empty.
+    """
+    if not len(saved) or not len(saved.snapshot.points):
+        raise StereoSfmError("the map is empty: nothing to save")
+    folder.mkdir(parents=True, exist_ok=True)
+    sums: dict[str, str] = {}
+    for name, columns in _FILES.items():
+        path = folder / f"{name}.npz"
+        np.savez_compressed(path, **{c: _column(saved, c) for c in columns})
+        sums[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+    write_native(saved.rig, folder / "rig.yaml")
+    s = saved.snapshot
+    head = {
+        "kind": KIND,
+        "version": VERSION,
+        "keyframes": len(s.kf_ids),
+        "points": len(s.pt_ids),
+        "observations": len(s.obs_kf),
+        "sessions": int(saved.sessions.max()) + 1,
+        "vocabulary": saved.vocabulary_id,
+        "sha256": sums,
+    }
+    (folder / "map.json").write_text(json.dumps(head, indent=1) + "\n")
+
+
+def _column(saved: SavedMap, name: str) -> Any:
+    """Pixels as float32: that is how the map holds them."""
+    value = saved.sessions if name == "sessions" else getattr(saved.snapshot, name)
+    return value.astype(np.float32) if name in ("uv_left", "uv_right") else value
+
+
+def load_map(folder: Path, rig: Rig | None = None) -> SavedMap:
+    """Read a map folder.
+
+    Args:
+        rig: the camera the map shall be used with, checked against the map's own.
+
+    Raises:
+        StereoSfmError: no map, another version, damaged, empty, or made with another camera.
+    """
+    head = _head(folder)
+    columns: dict[str, Any] = {}
+    try:
+        for name, wanted in _FILES.items():
+            raw = (folder / f"{name}.npz").read_bytes()
+            if hashlib.sha256(raw).hexdigest() != head["sha256"][name]:
+                raise ValueError(name)
+            with np.load(folder / f"{name}.npz", allow_pickle=False) as data:
+                columns.update({c: data[c] for c in wanted})
+        own = read_native(folder / "rig.yaml")
+    except (OSError, KeyError, ValueError, EOFError, TypeError, zipfile.BadZipFile, StereoSfmError):
+        raise StereoSfmError(f"the map {folder} is damaged: a file is missing or was changed; save it again") from None
+    sessions = columns.pop("sessions")
+    for name in ("uv_left", "uv_right"):
+        columns[name] = columns[name].astype(np.float64)
+    snapshot = MapSnapshot(**columns)
+    if not len(snapshot.kf_ids) or not len(snapshot.points):
+        raise StereoSfmError(f"the map {folder} is empty: it holds no keyframes or no points")
+    if rig is not None and not same_rig(own, rig):
+        raise StereoSfmError(
+            f"the map {folder} was made with another camera ({_describe(own)}) than this one ({_describe(rig)})"
+        )
+    return SavedMap(snapshot, own, str(head["vocabulary"]), sessions)
+
+
+def _head(folder: Path) -> dict[str, Any]:
+    path = folder / "map.json"
+    if not path.is_file():
+        raise StereoSfmError(f"no map at {folder}: there is no map.json (make one with 'run ... --map-out')")
+    try:
+        head = json.loads(path.read_text())
+        version = head["version"] if head["kind"] == KIND else None
+    except (ValueError, KeyError, TypeError, OSError):
+        raise StereoSfmError(f"the map {folder} is damaged: map.json cannot be read; save it again") from None
+    if version != VERSION:
+        raise StereoSfmError(f"the map {folder} is version {version}, this program reads version {VERSION}")
+    return head
+
+
+def same_rig(a: Rig, b: Rig) -> bool:
+    """Whether two rigs see the same way: models, sizes, parameters and the eyes' relative pose."""
+    if a.depth != b.depth or not np.allclose(a.left_T_right, b.left_T_right, atol=1e-6):
+        return False
+    for x, y in ((a.left, b.left), (a.right, b.right)):
+        if (x is None) != (y is None):
+            return False
+        if (
+            x is not None
+            and y is not None
+            and (x.model != y.model or x.size != y.size or not np.allclose(x.params, y.params, rtol=1e-6, atol=1e-9))
+        ):
+            return False
+    return True
+
+
+def _describe(rig: Rig) -> str:
+    return f"{rig.left.model} {rig.left.width}x{rig.left.height} f={rig.left.fx:.1f} b={1000 * rig.baseline:.0f} mm"
+
+
+def restore_map(snapshot: MapSnapshot) -> Map:
+    """A `Map` that can grow further, with the same ids."""
+    map_ = Map()
+    map_.add_points(snapshot.pt_ids, snapshot.points, 0)
+    map_.points.anchor[:] = snapshot.anchors
+    bounds = np.searchsorted(snapshot.obs_kf, np.arange(len(snapshot.kf_ids) + 1))
+    for k, keyframe in enumerate(keyframes_of(snapshot)):
+        row = map_.add_keyframe(keyframe, snapshot.map_T_kf[k])
+        part = slice(bounds[k], bounds[k + 1])
+        map_.observe(
+            row,
+            snapshot.obs_pt[part],
+            snapshot.uv_left[part],
+            snapshot.uv_right[part],
+            snapshot.descriptors[part],
+            snapshot.angles[part],
+        )
+    map_.keyframes.odom_T_kf[:] = snapshot.odom_T_kf
+    map_.points.seen[:] = snapshot.seen
+    map_.points.expected[:] = snapshot.expected
+    return map_
+
+
+def keyframes_of(snapshot: MapSnapshot) -> list[Keyframe]:
+    """The map's keyframes as a tracker would send them, with map poses for odometry and map points for stereo ones."""
+    out: list[Keyframe] = []
+    bounds = np.searchsorted(snapshot.obs_kf, np.arange(len(snapshot.kf_ids) + 1))
+    for k, kf_id in enumerate(snapshot.kf_ids.tolist()):
+        part = slice(bounds[k], bounds[k + 1])
+        rows, pose = snapshot.obs_pt[part], snapshot.map_T_kf[k]
+        out.append(
+            Keyframe(
+                kf_id=kf_id,
+                frame_id=int(snapshot.frame_ids[k]),
+                stamp_ns=int(snapshot.stamp_ns[k]),
+                odom_T_cam=pose.copy(),
+                point_ids=snapshot.pt_ids[rows],
+                uv_left=snapshot.uv_left[part].copy(),
+                uv_right=snapshot.uv_right[part].copy(),
+                points_cam=(snapshot.points[rows] - pose[:3, 3]) @ pose[:3, :3],
+                descriptors=snapshot.descriptors[part].copy(),
+                angles=snapshot.angles[part].copy(),
+                submap_id=int(snapshot.submap_ids[k]),
+            )
+        )
+    return out
+
+
+def joined(maps: list[SavedMap]) -> SavedMap:
+    """All maps in one, side by side: ids, submaps and sessions of the later ones are raised above the earlier's.
+
+    Raises:
+        StereoSfmError: they were made with different cameras or vocabularies.
+    """
+    first = maps[0]
+    parts: dict[str, list[Any]] = {f.name: [] for f in dataclasses.fields(MapSnapshot)}
+    sessions: list[Any] = []
+    raised = {"kf_ids": 0, "pt_ids": 0, "submap_ids": 0, "anchors": 0, "obs_kf": 0, "obs_pt": 0}
+    next_session = 0
+    for saved in maps:
+        if not same_rig(saved.rig, first.rig):
+            raise StereoSfmError("maps of different cameras cannot be merged")
+        s = saved.snapshot
+        for name, values in parts.items():
+            values.append(getattr(s, name) + raised.get(name, 0))
+        sessions.append(saved.sessions + next_session)
+        next_session += int(saved.sessions.max()) + 1
+        for name in ("kf_ids", "pt_ids", "submap_ids"):
+            raised[name] += int(getattr(s, name).max()) + 1
+        raised["anchors"] += len(s.kf_ids)
+        raised["obs_kf"] += len(s.kf_ids)
+        raised["obs_pt"] += len(s.pt_ids)
+    snapshot = MapSnapshot(**{name: np.concatenate(values) for name, values in parts.items()})
+    return SavedMap(snapshot, first.rig, first.vocabulary_id, np.concatenate(sessions))

@@ -1,0 +1,69 @@
+"""Localize only: in place of a mapper, a stage that holds a finished map and places the odometry frame in it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib.rig import Rig
+from stereo_sfm.config import LoopConfig
+from stereo_sfm.geometry import se3
+from stereo_sfm.loop.relocalize import Location, Relocalizer
+from stereo_sfm.loop.verification import within
+from stereo_sfm.loop.vocabulary import Vocabulary
+from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.types import F64, Keyframe, LoopResult, MapUpdate
+
+LOST_AFTER = 5  # keyframes without an answer near the prediction before the whole map is searched
+
+
+class Localizer:
+    """One keyframe in, one `MapUpdate` out that moves nothing but `map_T_odom`.
+
+    The first answer needs no guess. Later keyframes are looked for around the prediction; after some failures, or when
+    tracking restarted as another submap, the whole map is searched again. `found` is False until the first answer.
+    """
+
+    def __init__(self, snapshot: MapSnapshot, rig: Rig, vocabulary: Vocabulary, config: LoopConfig) -> None:
+        self._relocalizer = Relocalizer(snapshot, rig, vocabulary, config)
+        self._config = config
+        self._map_T_odom: F64 = np.eye(4)
+        self._version = 0
+        self._submap = -1
+        self._failures = 0
+        self.found = False
+        self.last = None
+
+    last: Location | None  # what was said about the newest keyframe
+
+    def step(self, keyframe: Keyframe, loop: LoopResult | None = None) -> MapUpdate:
+        """Place a keyframe in the map; `loop` is taken for the mapper's signature and not used."""
+        self._version += 1
+        if keyframe.submap_id != self._submap:
+            self._submap, self._failures = keyframe.submap_id, LOST_AFTER
+        self.last = self._locate(keyframe)
+        if self.last.found:
+            self._map_T_odom = se3.orthonormalize(self.last.map_T_cam @ se3.inverse(keyframe.odom_T_cam))
+            self.found, self._failures = True, 0
+        else:
+            self._failures += 1
+        return MapUpdate(
+            version=self._version,
+            kf_id=keyframe.kf_id,
+            kf_ids=np.array([keyframe.kf_id], np.int64),
+            map_T_kf=(self._map_T_odom @ keyframe.odom_T_cam)[None],
+            point_ids=np.zeros(0, np.int64),
+            points_map=np.zeros((0, 3)),
+            culled_point_ids=np.zeros(0, np.int64),
+            fused_point_ids=np.zeros((0, 2), np.int64),
+            map_T_odom=self._map_T_odom.copy(),
+        )
+
+    def _locate(self, keyframe: Keyframe) -> Location:
+        if self.found and self._failures < LOST_AFTER:
+            guess = self._map_T_odom @ keyframe.odom_T_cam
+            near = self._relocalizer.locate_near(keyframe, guess)
+            if not near.found or within(
+                se3.inverse(guess) @ near.map_T_cam, self._config.gate_metres, self._config.gate_degrees
+            ):
+                return near
+        return self._relocalizer.locate(keyframe)

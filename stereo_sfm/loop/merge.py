@@ -1,0 +1,148 @@
+"""Several walks of one store become one map: loops between them, one pose graph, full bundle adjustment."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stereo_sfm.config import LoopConfig
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.export.saved_map import SavedMap, joined, keyframes_of, restore_map
+from stereo_sfm.loop.closer import LoopCloser
+from stereo_sfm.loop.correction import apply_loop
+from stereo_sfm.loop.vocabulary import Vocabulary
+from stereo_sfm.mapping.bundle import Bundle, BundleConfig, bundle_adjust
+from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.types import I64, Bool, LoopResult
+
+log = logging.getLogger("stereo_sfm")
+MERGE_PAUSE = 2  # keyframes between two loops of a merge: every link between the walks helps
+
+
+@dataclass(frozen=True, eq=False)
+class Merge:
+    """The common map and how it came about."""
+
+    saved: SavedMap
+    loops: list[LoopResult]  # applied, in ids of the common map
+    fused: int  # points that became one with another
+
+
+def merge(maps: Sequence[SavedMap], vocabulary: Vocabulary, config: LoopConfig) -> Merge:
+    """One map of all; the first keeps its frame.
+
+    Raises:
+        StereoSfmError: other cameras, or a map that no loop joins to the rest.
+    """
+    side_by_side = joined(list(maps))
+    map_ = restore_map(side_by_side.snapshot)
+    closer = LoopCloser(dataclasses.replace(config, pause=MERGE_PAUSE), side_by_side.rig, vocabulary)
+    loops: list[LoopResult] = []
+    fused = 0
+    for keyframe in keyframes_of(side_by_side.snapshot):
+        result = closer.step(keyframe)
+        if result.candidate_kf_id >= 0:
+            done = apply_loop(map_, result, loops, config)
+            if done.applied:
+                loops.append(result)
+                fused += len(done.fused)
+    _check_joined(side_by_side, loops, len(maps))
+    snapshot = full_adjustment(map_.snapshot(), side_by_side)
+    session = dict(zip(side_by_side.snapshot.kf_ids.tolist(), side_by_side.sessions.tolist(), strict=True))
+    sessions = np.array([session[k] for k in snapshot.kf_ids.tolist()], np.int64)
+    return Merge(dataclasses.replace(side_by_side, snapshot=snapshot, sessions=sessions), loops, fused)
+
+
+def _check_joined(saved: SavedMap, loops: list[LoopResult], count: int) -> None:
+    """Every walk must hang together with the first one."""
+    owner = dict(zip(saved.snapshot.kf_ids.tolist(), saved.snapshot.submap_ids.tolist(), strict=True))
+    group = {submap: submap for submap in owner.values()}
+    for loop in loops:
+        a, b = group[owner[loop.candidate_kf_id]], group[owner[loop.kf_id]]
+        group = {s: min(a, b) if g in (a, b) else g for s, g in group.items()}
+    apart = len(set(group.values()))
+    if apart > 1:
+        raise StereoSfmError(f"the {count} maps stay in {apart} pieces: no loop joins them (are they of one store?)")
+
+
+def full_adjustment(snapshot: MapSnapshot, saved: SavedMap) -> MapSnapshot:
+    """Bundle adjustment of everything, the first keyframe held fast."""
+    result = bundle_adjust(
+        saved.rig,
+        Bundle(
+            world_T_kf=snapshot.map_T_kf,
+            fixed=np.arange(len(snapshot.kf_ids)) == 0,
+            points=snapshot.points,
+            obs_kf=snapshot.obs_kf,
+            obs_pt=snapshot.obs_pt,
+            uv_left=snapshot.uv_left,
+            uv_right=snapshot.uv_right,
+        ),
+        BundleConfig(),
+    )
+    log.info("full bundle adjustment: cost %.1f to %.1f", result.initial_cost, result.cost)
+    return dataclasses.replace(snapshot, map_T_kf=result.world_T_kf, points=result.points)
+
+
+def prune(saved: SavedMap, min_views: int = 0, min_seen_share: float = 0.0, unseen_sessions: int = 0) -> SavedMap:
+    """Leave out points that are no longer there, then keyframes without points.
+
+    Args:
+        min_views: points seen by fewer keyframes go.
+        min_seen_share: points that were seen in less than this share of the keyframes in whose view they lay go.
+        unseen_sessions: points that no keyframe of the newest so many walks saw go.
+
+    Raises:
+        StereoSfmError: nothing would be left.
+    """
+    s = saved.snapshot
+    views = np.bincount(s.obs_pt, minlength=len(s.pt_ids))
+    keep = views >= min_views
+    if min_seen_share > 0:
+        keep &= s.seen >= min_seen_share * np.maximum(s.expected, 1)
+    if unseen_sessions > 0:
+        newest = np.full(len(s.pt_ids), -1)
+        np.maximum.at(newest, s.obs_pt, saved.sessions[s.obs_kf])
+        keep &= newest > saved.sessions.max() - unseen_sessions
+    obs = keep[s.obs_pt]
+    keyframes = np.bincount(s.obs_kf[obs], minlength=len(s.kf_ids)) > 0
+    if not keep.any() or not keyframes.any():
+        raise StereoSfmError("pruning so much would leave an empty map: ask for less")
+    return dataclasses.replace(saved, snapshot=_subset(s, keyframes, keep, obs), sessions=saved.sessions[keyframes])
+
+
+def _subset(s: MapSnapshot, keyframes: Bool, points: Bool, obs: Bool) -> MapSnapshot:
+    """The rows that are kept (boolean masks); points of a keyframe that goes are carried by one that sees them."""
+    kf_row, pt_row = np.cumsum(keyframes) - 1, np.cumsum(points) - 1
+    obs_kf, obs_pt = kf_row[s.obs_kf[obs]], pt_row[s.obs_pt[obs]]
+    anchors = np.where(keyframes[s.anchors[points]], kf_row[s.anchors[points]], _first_seer(obs_kf, obs_pt, points))
+    return MapSnapshot(
+        kf_ids=s.kf_ids[keyframes],
+        frame_ids=s.frame_ids[keyframes],
+        stamp_ns=s.stamp_ns[keyframes],
+        submap_ids=s.submap_ids[keyframes],
+        map_T_kf=s.map_T_kf[keyframes],
+        odom_T_kf=s.odom_T_kf[keyframes],
+        pt_ids=s.pt_ids[points],
+        points=s.points[points],
+        anchors=anchors,
+        seen=s.seen[points],
+        expected=s.expected[points],
+        obs_kf=obs_kf,
+        obs_pt=obs_pt,
+        uv_left=s.uv_left[obs],
+        uv_right=s.uv_right[obs],
+        descriptors=s.descriptors[obs],
+        angles=s.angles[obs],
+    )
+
+
+def _first_seer(obs_kf: I64, obs_pt: I64, points: Bool) -> I64:
+    """(P,) oldest keyframe that sees each kept point, 0 where none does."""
+    first = np.full(int(points.sum()), np.iinfo(np.int64).max)
+    np.minimum.at(first, obs_pt, obs_kf)
+    return np.where(first == np.iinfo(np.int64).max, 0, first)

@@ -1,0 +1,151 @@
+"""Where is this camera in a saved map? Retrieval by words, pose from bearings, verification; no guess needed."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse
+
+from calib.rig import Rig
+from stereo_sfm.config import LoopConfig
+from stereo_sfm.geometry import se3
+from stereo_sfm.loop import binary
+from stereo_sfm.loop.absolute_pose import range_sigmas
+from stereo_sfm.loop.cloud import Cloud
+from stereo_sfm.loop.database import PlaceDatabase
+from stereo_sfm.loop.verification import Verdict, verify, verify_near, view_of, within
+from stereo_sfm.loop.vocabulary import Vocabulary
+from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.types import F64, I64, Keyframe
+
+SAME_METRES, SAME_DEGREES = 0.2, 5.0  # two answers closer than this are one
+RIVAL = 0.75  # another place with this share of the inliers makes the answer ambiguous
+SURE = 3.0  # times the inliers asked for: no need to look at more candidates
+MIN_RANGE_SIGMA = 0.003  # metres
+
+
+@dataclass(frozen=True, eq=False)
+class Location:
+    """The answer; `reason` is empty when the camera was found."""
+
+    reason: str  # "", "no_candidate", "ambiguous", or why the best candidate failed
+    map_T_cam: F64  # (4, 4)
+    information: F64  # (6, 6) of map_T_cam @ exp(xi)
+    kf_id: int  # the map's keyframe that showed the place, -1: none
+    inliers: int
+    pairs: I64  # (M, 2) the map's point ids, the camera's
+
+    @property
+    def found(self) -> bool:
+        """Whether the pose may be used."""
+        return not self.reason
+
+
+def _nowhere(reason: str, inliers: int = 0) -> Location:
+    return Location(reason, np.eye(4), np.zeros((6, 6)), -1, inliers, np.zeros((0, 2), np.int64))
+
+
+class Relocalizer:
+    """A map ready to be asked. Its answers depend on the map, the configuration and the view only."""
+
+    def __init__(self, snapshot: MapSnapshot, rig: Rig, vocabulary: Vocabulary, config: LoopConfig) -> None:
+        self._map, self._rig, self._vocabulary = snapshot, rig, vocabulary
+        self._config = dataclasses.replace(
+            config,
+            min_match_fraction=0.0,
+            min_inliers=config.relocalize_inliers,
+            min_inlier_share=config.relocalize_share,
+            min_cells=config.relocalize_cells,
+        )
+        self._bounds: list[int] = np.searchsorted(snapshot.obs_kf, np.arange(len(snapshot.kf_ids) + 1)).tolist()
+        shape = (len(snapshot.kf_ids), len(snapshot.pt_ids))
+        ones = np.ones(len(snapshot.obs_kf), np.int32)
+        self._sees = scipy.sparse.csr_array((ones, (snapshot.obs_kf, snapshot.obs_pt)), shape=shape)
+        self._views = np.maximum(np.bincount(snapshot.obs_pt, minlength=shape[1]), 1)
+        self._database = PlaceDatabase(len(vocabulary))
+        for k in range(shape[0]):
+            part = slice(self._bounds[k], self._bounds[k + 1])
+            self._database.add(k, vocabulary.bag(snapshot.descriptors[part]))
+
+    def locate(self, keyframe: Keyframe) -> Location:
+        """Find the camera of a keyframe (its pose is ignored) in the map."""
+        bag = self._vocabulary.bag(keyframe.descriptors)
+        rows, _ = self._database.query(bag, 0.0, 20 * self._config.relocalize_candidates)
+        view = view_of(keyframe, range_sigmas(keyframe.points_cam, self._rig, self._config.disparity_sigma))
+        found: list[Location] = []
+        reasons: list[str] = []
+        for row in self._places(rows):
+            rng = np.random.default_rng([self._config.seed, row])
+            verdict = verify(view, self.cloud(row), self._rig, self._config, rng, move_points=False)
+            reasons.append(verdict.reason)
+            if not verdict.reason:
+                found.append(self._location(row, verdict))
+                if verdict.inliers >= SURE * self._config.min_inliers:
+                    break
+        return self._choose(found, reasons)
+
+    def locate_near(self, keyframe: Keyframe, guess: F64) -> Location:
+        """Find the camera near a predicted map_T_cam (4, 4): as `locate`, but only around the guess."""
+        view = view_of(keyframe, range_sigmas(keyframe.points_cam, self._rig, self._config.disparity_sigma))
+        row = self._nearest(guess)
+        start = se3.inverse(guess) @ self._map.map_T_kf[row]
+        verdict = verify_near(start, view, self.cloud(row), self._rig, self._config)
+        return _nowhere(verdict.reason, verdict.inliers) if verdict.reason else self._location(row, verdict)
+
+    def cloud(self, row: int) -> Cloud:
+        """The map around a keyframe row, in its camera: all views of the points that it and its neighbours see."""
+        s = self._map
+        shared = (self._sees @ self._sees[[row]].T).toarray()[:, 0]
+        shared[row] = shared.max() + 1
+        order = np.lexsort((np.arange(len(shared)), -shared))[: self._config.relocalize_keyframes]
+        order = order[shared[order] > 0]
+        parts = [np.arange(self._bounds[k], self._bounds[k + 1]) for k in order.tolist()]
+        rows = np.concatenate(parts)
+        view = np.repeat(np.arange(len(order)), [len(part) for part in parts])
+        described = binary.present(s.descriptors[rows])
+        rows, view = rows[described], view[described]
+        pts = s.obs_pt[rows]
+        points = se3.transform(se3.inverse(s.map_T_kf[row]), s.points[pts])
+        sigmas = range_sigmas(points, self._rig, self._config.disparity_sigma) / np.sqrt(self._views[pts])
+        return Cloud(
+            s.pt_ids[pts],
+            np.ascontiguousarray(points),
+            np.maximum(sigmas, MIN_RANGE_SIGMA),
+            s.descriptors[rows],
+            s.uv_left[rows],
+            s.uv_right[rows],
+            view,
+            se3.inverse(s.map_T_kf[row]) @ s.map_T_kf[order],
+        )
+
+    def _places(self, rows: I64) -> list[int]:
+        """The best rows that are not all of one place (share few points with the ones before)."""
+        chosen: list[int] = []
+        for row in rows.tolist():
+            if all(abs(row - other) > 2 for other in chosen):
+                chosen.append(row)
+            if len(chosen) == self._config.relocalize_candidates:
+                break
+        return chosen
+
+    def _nearest(self, guess: F64) -> int:
+        relative = se3.inverse(self._map.map_T_kf) @ guess
+        turn = np.arccos(np.clip((np.trace(relative[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1))
+        return int(np.argmin(np.linalg.norm(relative[:, :3, 3], axis=1) + turn))
+
+    def _location(self, row: int, verdict: Verdict) -> Location:
+        map_T_cam = self._map.map_T_kf[row] @ se3.inverse(verdict.b_T_a)
+        kf_id = int(self._map.kf_ids[row])
+        return Location("", map_T_cam, verdict.information, kf_id, verdict.inliers, verdict.pairs)
+
+    def _choose(self, found: list[Location], reasons: list[str]) -> Location:
+        if not found:
+            return _nowhere(reasons[0] if reasons else "no_candidate")
+        best = max(found, key=lambda x: x.inliers)
+        for other in found:
+            apart = not within(se3.inverse(best.map_T_cam) @ other.map_T_cam, SAME_METRES, SAME_DEGREES)
+            if apart and other.inliers > RIVAL * best.inliers:
+                return _nowhere("ambiguous", best.inliers)
+        return best
