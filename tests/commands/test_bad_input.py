@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -156,6 +157,23 @@ def test_output_folder_that_exists(cli: Run, tmp_path: Path) -> None:
     assert_one_line(cli("run", root, "-o", "out"), "out exists", "--overwrite")
     assert cli("run", root, "-o", "out", "--overwrite", "--max-lost", 101)[0] in (0, 4)
     assert (tmp_path / "out" / "thesis.tex").read_text() == "years of work"
+
+
+def test_truncated_mcap_is_a_warning_and_the_rest(cli: Run, tmp_path: Path) -> None:
+    root = make_images(tmp_path / "data", [f"{i:03d}.png" for i in range(200)])
+    assert cli("convert", root, "-o", "whole.mcap", "--image-format", "raw", "-q")[0] == 0
+    whole = Path("whole.mcap").read_bytes()
+    Path("cut.mcap").write_bytes(whole[: len(whole) * 2 // 3])
+    code, out, err = cli("run", "cut.mcap", "-o", "out", "--max-lost", 101)
+    assert code in (0, 4) and "Traceback" not in err
+    assert "truncated" in err
+    found = re.search(r"/(\d+) frames", out)
+    assert found is not None and 50 < int(found[1]) < 200
+
+
+def test_empty_mcap(cli: Run, tmp_path: Path) -> None:
+    Path("empty.mcap").write_bytes(b"")
+    assert_one_line(cli("run", "empty.mcap"), "empty.mcap")
 
 
 def test_file_that_is_no_mcap(cli: Run, tmp_path: Path) -> None:
