@@ -19,6 +19,7 @@ from stereo_sfm.types import F32, U8, StereoImage, Trajectory
 
 log = logging.getLogger("stereo_sfm")
 
+SHOWN_WARNINGS = 5  # of unreadable images, one by one; then only their number
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
 
 
@@ -100,18 +101,21 @@ class FolderSource:
         return None
 
     def __iter__(self) -> Iterator[StereoImage]:
-        dropped = 0
-        read = 0
+        dropped, read, unreadable = 0, 0, 0
         for frame_id, shot in enumerate(self.shots):
             try:
                 image = self._read(frame_id, shot, dropped)
             except UnreadableImage as error:
-                log.warning("%s: cannot read %s, frame %d is dropped", self.name, error, frame_id)
                 dropped += 1
+                unreadable += 1
+                if unreadable <= SHOWN_WARNINGS:
+                    log.warning("%s: cannot read %s, frame %d is dropped", self.name, error, frame_id)
                 continue
             dropped = 0
             read += 1
             yield image
+        if unreadable > SHOWN_WARNINGS:
+            log.warning("%s: %d frames could not be read", self.name, unreadable)
         if not read:
             raise StereoSfmError(f"{self.name}: none of the {len(self.shots)} images can be read")
 

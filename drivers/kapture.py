@@ -48,7 +48,11 @@ def _read_rig(folder: Path) -> Rig:
     cameras = list(read_kapture_cameras(sensors).values())
     if len(cameras) < 2 or any(c.size != T265_SIZE or c.model != "kannala_brandt" for c in cameras[:2]):
         raise StereoSfmError(f"{folder} does not say where two cameras sit (rigs.txt): give --rig FILE")
-    log.warning("%s: no extrinsics, the T265's nominal %g m between parallel eyes are used", folder, T265_BASELINE)
+    log.warning(
+        "%s: no extrinsics, parallel eyes at the T265's nominal %g m are used (another calibration: --rig FILE)",
+        folder,
+        T265_BASELINE,
+    )
     left_T_right = np.eye(4)
     left_T_right[0, 3] = T265_BASELINE
     return read_kapture(sensors, left_T_right)

@@ -199,6 +199,16 @@ def test_unreadable_images_are_dropped_and_counted(tmp_path: Path, caplog: pytes
     assert len([r for r in caplog.records if "cannot read" in r.getMessage()]) == 2
 
 
+def test_many_unreadable_images_do_not_flood_the_terminal(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    root = make_images(tmp_path)
+    for i in range(1, 12):
+        (root / "left" / f"{i}.png").unlink()
+        (root / "left" / f"{i}.png").write_bytes(b"x")
+    with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(root) as source:
+        assert len(list(source)) == 1
+    assert len(caplog.records) == 6 and "11 frames could not be read" in caplog.text
+
+
 def test_only_unreadable_images_are_an_error(tmp_path: Path) -> None:
     root = make_kitti(tmp_path)
     for path in (root / "sequences" / "00" / "image_1").iterdir():
