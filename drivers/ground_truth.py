@@ -104,6 +104,11 @@ def read_kitti(path: Path, stamp_ns: I64 | None = None) -> Trajectory:
     return Trajectory(stamps[:count], se3.orthonormalize(poses))
 
 
+def has_stamps(path: Path | str) -> bool:
+    """Whether the lines of a trajectory file say their time: KITTI's do not."""
+    return len(_rows(Path(path).expanduser(), 8)[0]) != 12
+
+
 def read_trajectory(path: Path | str) -> Trajectory:
     """A trajectory of whichever of the three forms the file has.
 
@@ -111,9 +116,9 @@ def read_trajectory(path: Path | str) -> Trajectory:
         StereoSfmError: no such file, or not a trajectory.
     """
     path = Path(path).expanduser()
-    first = _rows(path, 8)[0]
-    if len(first) == 12:
+    if not has_stamps(path):
         return read_kitti(path)
+    first = _rows(path, 8)[0]
     return read_euroc(path) if first[0].isdigit() and len(first[0]) >= 15 else read_tum(path)
 
 

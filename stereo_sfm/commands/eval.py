@@ -37,9 +37,10 @@ def run(args: argparse.Namespace) -> int:
     from stereo_sfm.eval.associate import MAX_DIFFERENCE_NS
     from stereo_sfm.eval.evaluate import evaluate, table
 
+    reference = load_reference(args.ref)
     result = evaluate(
-        load_estimate(args.estimate, args.which),
-        load_reference(args.ref),
+        load_estimate(args.estimate, args.which, reference),
+        reference,
         args.align,
         args.delta,
         interpolate=args.t_max_diff is None,
@@ -59,10 +60,17 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def load_estimate(path: Path, which: str | None) -> Trajectory:
-    """The trajectory of a run's folder or of a file."""
-    from drivers.ground_truth import read_trajectory
+def load_estimate(path: Path, which: str | None, reference: Trajectory) -> Trajectory:
+    """The trajectory of a run's folder or of a file; one without stamps takes those of the reference, line by line."""
+    from drivers.ground_truth import has_stamps, read_kitti, read_trajectory
 
+    if not path.is_dir() and not has_stamps(path):
+        lines = len(read_trajectory(path))
+        if lines != len(reference):
+            raise StereoSfmError(
+                f"{path} has no stamps and {lines} lines, the reference {len(reference)} poses: compare the TUM form"
+            )
+        return read_kitti(path, reference.stamp_ns)
     if not path.is_dir():
         return read_trajectory(path)
     names = [f"trajectory_{which}.tum"] if which in ("odom", "map") else ["trajectory_map.tum", "trajectory_odom.tum"]

@@ -83,6 +83,17 @@ def test_eval_prints_the_runs_errors(
     assert "alignment none" in capsys.readouterr().out
 
 
+def test_eval_of_a_file_without_stamps(data_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    poses = data_root / "kitti" / "poses" / "00.txt"
+    for reference in (poses, data_root / "kitti"):
+        assert main(["eval", str(poses), "--ref", str(reference), "--max-ape", "1e-6"]) == 0
+        assert "120 frames over 92.0 m" in capsys.readouterr().out
+    short = tmp_path / "short.txt"
+    short.write_text("\n".join(poses.read_text().splitlines()[:50]))
+    assert main(["eval", str(short), "--ref", str(poses)]) == 2
+    assert "no stamps and 50 lines, the reference 120 poses" in capsys.readouterr().err
+
+
 def test_eval_checks(euroc_run: Path, data_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     args = ["eval", str(euroc_run / "trajectory_odom.tum"), "--ref", str(data_root / "euroc_mh01")]
     assert main([*args, "--max-ape", "0.02"]) == 0
