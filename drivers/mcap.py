@@ -28,7 +28,7 @@ from stereo_sfm.log.image_log import (
     truth_from_bytes,
 )
 from stereo_sfm.log.reader import LogReader, Record
-from stereo_sfm.types import F32, U8, ImuSamples, StereoImage, WheelSamples
+from stereo_sfm.types import F32, I64, U8, ImuSamples, StereoImage, WheelSamples
 
 log = logging.getLogger("stereo_sfm")
 
@@ -194,6 +194,10 @@ class McapSource:
 
     def __iter__(self) -> Iterator[StereoImage]:
         return self.frames()
+
+    def stamps(self) -> tuple[I64, float]:
+        """Stamps of all frames, without reading pixels, and NaN for the skew, which `image_info` holds."""
+        return self.reader.stamps(topics.LEFT_IMAGE), float("nan")
 
     def frames(self, start_ns: int | None = None, until_ns: int | None = None) -> Iterator[StereoImage]:
         """Frames with stamps in [start_ns, until_ns], without reading what lies before.

@@ -31,7 +31,7 @@ from drivers.rig_option import RigOption, chosen_rig
 from drivers.tum_rgbd import with_virtual_eye
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log.reader import LogReader, Record
-from stereo_sfm.types import ImuSamples, StereoImage, Trajectory
+from stereo_sfm.types import I64, ImuSamples, StereoImage, Trajectory
 
 log = logging.getLogger("stereo_sfm")
 
@@ -85,6 +85,18 @@ class ForeignMcapSource:
     def __iter__(self) -> Iterator[StereoImage]:
         return self.frames()
 
+    def stamps(self) -> tuple[I64, float]:
+        """Stamps of all usable pairs, without decoding pixels, and the largest skew between the eyes in ms."""
+        pairs = [(a.stamp_ns, b.stamp_ns if b else a.stamp_ns) for a, b in self._pairs(None, None, []) if self._used(b)]
+        table = np.array(pairs, np.int64).reshape(-1, 2)
+        skew = (
+            float(np.abs(table[:, 1] - table[:, 0]).max()) / 1e6 if len(table) and self.topics.right else float("nan")
+        )
+        return table[:, 0].copy(), skew
+
+    def _used(self, other: _Shot | None) -> bool:
+        return other is not None or not self._other()
+
     def frames(self, start_ns: int | None = None, until_ns: int | None = None) -> Iterator[StereoImage]:
         """Frames logged in [start_ns, until_ns]; the first is number 0 whatever the start.
 
@@ -94,7 +106,7 @@ class ForeignMcapSource:
         dropped = 0
         imu: list[tuple[int, list[float]]] = []
         for frame_id, (left, other) in enumerate(self._pairs(start_ns, until_ns, imu)):
-            image = self._decode(frame_id, left, other, dropped) if other or not self._other() else None
+            image = self._decode(frame_id, left, other, dropped) if self._used(other) else None
             dropped = 0 if image is not None else dropped + 1
             if image is not None:
                 yield replace(image, imu=_take_imu(imu, left.stamp_ns)) if self.topics.imu else image
@@ -217,7 +229,7 @@ class ForeignMcapSource:
     def _check_first(self) -> None:
         """The images must fit the calibration, and that is said before the first frame."""
         for left, other in self._pairs(None, None, []):
-            if other or not self._other():
+            if self._used(other):
                 self._decode(0, left, other, 0)
                 return
 

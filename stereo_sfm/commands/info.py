@@ -1,0 +1,64 @@
+"""`stereo-sfm info`: what a recording or dataset folder holds, and what is wrong with it."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stereo_sfm.errors import StereoSfmError
+
+if TYPE_CHECKING:
+    from stereo_sfm.log.describe import Description, Rate
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of this command."""
+    parser.add_argument("path", type=Path, help="an .mcap file or a dataset folder")
+    parser.add_argument("--json", action="store_true", help="for machines")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Describe and return 0; problems are printed, they are no error of this command."""
+    from stereo_sfm.log.describe import describe_file, describe_folder
+
+    path: Path = args.path.expanduser()
+    if not path.exists():
+        raise StereoSfmError(f"no such file or folder: {path}")
+    found = describe_folder(path) if path.is_dir() else describe_file(path)
+    print(found.as_json() if args.json else "\n".join(_lines(found)))
+    return 0
+
+
+def _lines(found: Description) -> list[str]:
+    lines = [f"{found.path}: {found.seconds:.2f} s"]
+    if found.kind == "mcap":
+        rate = f", {found.bytes / found.seconds / 1e6:.1f} MB/s" if found.seconds > 0 else ""
+        lines[0] += f", {found.bytes / 1e6:.1f} MB{rate}, {found.messages} messages, "
+        lines[0] += found.truncated or "closed properly"
+    lines += [f"  {key:<14} {value}" for key, value in found.metadata.items() if value]
+    if found.config_sha256 and "config_sha256" not in found.metadata:
+        lines.append(f"  {'config_sha256':<14} {found.config_sha256}")
+    if found.images is not None:
+        lines.append(f"images: {_rate(found.images)}, {found.dropped} counted as dropped" + _skew(found))
+    if found.ground_truth:
+        lines.append(f"ground truth: {found.ground_truth} poses")
+    lines += [f"calibration: {line}" for line in found.calibration]
+    if found.rows:
+        width = max(len(topic) for topic, _, _ in found.rows)
+        wide = max(len(schema) for _, schema, _ in found.rows)
+        lines += [f"  {topic:<{width}}  {schema:<{wide}}  {_rate(rate)}" for topic, schema, rate in found.rows]
+    lines += [f"problem: {problem}" for problem in found.problems]
+    return lines if found.problems else [*lines, "no problems found"]
+
+
+def _skew(found: Description) -> str:
+    return "" if math.isnan(found.skew_ms) else f", eyes at most {found.skew_ms:.3f} ms apart"
+
+
+def _rate(rate: Rate) -> str:
+    if math.isnan(rate.hz):
+        return f"{rate.count}"
+    gaps = f", {rate.gaps} gaps up to {rate.longest_gap_s:.3f} s" if rate.gaps else ""
+    return f"{rate.count} at {rate.hz:.2f} Hz, jitter {rate.jitter_ms:.2f} ms{gaps}"

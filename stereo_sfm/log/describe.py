@@ -1,0 +1,202 @@
+"""What a recording or a dataset folder holds and what is wrong with it: rates, jitter, gaps, skew, calibration."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from calib.rig import Rig
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry.cameras import Camera
+from stereo_sfm.log import schema, topics
+from stereo_sfm.log.image_log import ImageInfo
+from stereo_sfm.log.provenance import CONFIG_FILE, METADATA, config_hash
+from stereo_sfm.log.reader import LogReader
+from stereo_sfm.types import I64
+
+if TYPE_CHECKING:
+    from drivers.source import Source
+
+GAP = 1.5  # periods without a frame that count as a gap
+MAX_SKEW_MS = 1.0  # between the eyes, above which tracking suffers
+MAX_JITTER = 0.2  # of the period
+
+
+@dataclass(frozen=True)
+class Rate:
+    """How regularly something comes. Milliseconds; NaN with fewer than three stamps."""
+
+    count: int
+    hz: float
+    jitter_ms: float  # 95 % of the intervals are within this of the median
+    gaps: int
+    longest_gap_s: float
+    missing: int  # frames that would fill the gaps
+    backwards: int  # stamps not later than the one before
+
+
+@dataclass
+class Description:
+    """Everything `info` prints."""
+
+    path: str
+    kind: str
+    seconds: float = 0.0
+    bytes: int = 0
+    messages: int = 0
+    truncated: str = ""
+    metadata: dict[str, str] = field(default_factory=dict[str, str])
+    config_sha256: str = ""
+    rows: list[tuple[str, str, Rate]] = field(default_factory=list[tuple[str, str, Rate]])  # topic, schema, rate
+    images: Rate | None = None
+    dropped: int = 0
+    skew_ms: float = float("nan")  # largest difference between the eyes' stamps
+    calibration: list[str] = field(default_factory=list[str])
+    ground_truth: int = 0
+    problems: list[str] = field(default_factory=list[str])
+
+    def as_json(self) -> str:
+        """For machines; NaN becomes null."""
+        text = json.dumps(asdict(self), default=str)
+        return json.dumps(json.loads(text, parse_constant=lambda _: None), indent=2)
+
+
+def rate_of(stamps: I64) -> Rate:
+    """Regularity of ascending stamps in nanoseconds."""
+    nan = float("nan")
+    steps = np.diff(stamps)
+    forward = steps[steps > 0]
+    if len(forward) < 2:
+        return Rate(len(stamps), nan, nan, 0, 0.0, 0, int((steps <= 0).sum()))
+    period = float(np.median(forward))
+    wide = forward[forward > GAP * period]
+    jitter = float(np.percentile(np.abs(forward[forward <= GAP * period] - period), 95))
+    missing = int(np.maximum(np.round(wide / period) - 1, 1).sum())
+    longest = float(wide.max()) / 1e9 if len(wide) else 0.0
+    return Rate(len(stamps), 1e9 / period, jitter / 1e6, len(wide), longest, missing, int((steps <= 0).sum()))
+
+
+def describe_file(path: Path) -> Description:
+    """An MCAP file, ours or not.
+
+    Raises:
+        StereoSfmError: no such file, or not MCAP.
+    """
+    with LogReader(path) as reader:
+        first, last = reader.time_range
+        out = Description(
+            str(path), "mcap", (last - first) / 1e9, path.stat().st_size, truncated=reader.truncated,
+            metadata=reader.metadata(METADATA),
+        )  # fmt: skip
+        config = reader.attachment(CONFIG_FILE)
+        out.config_sha256 = config_hash(config.decode()) if config is not None else ""
+        for topic in reader.topics:
+            out.rows.append((topic.topic, topic.schema or topic.encoding, rate_of(reader.stamps(topic.topic))))
+            out.messages += topic.count
+        _describe_infos(out, reader)
+    if out.truncated:
+        out.problems.append(f"{out.truncated}: 'stereo-sfm recover' writes a mended copy")
+    _describe_source(out, path)
+    return out
+
+
+def describe_folder(path: Path) -> Description:
+    """A dataset folder of any kind that the drivers know.
+
+    Raises:
+        StereoSfmError: nothing known lies there.
+    """
+    out = Description(str(path), "folder")
+    _describe_source(out, path)
+    return out
+
+
+def _describe_infos(out: Description, reader: LogReader) -> None:
+    """Skew and drops as our own recordings hold them."""
+    decode = None
+    skews = [0]
+    for record in reader.messages([topics.IMAGE_INFO]):
+        assert record.schema is not None
+        decode = decode or schema.decoder(ImageInfo, record.schema.data)
+        info: ImageInfo = decode(record.data)
+        out.dropped += info.dropped_before
+        if info.has_right and info.right_stamp_ns:
+            skews.append(abs(info.right_stamp_ns - info.stamp_ns))
+    if decode is not None:
+        out.skew_ms = max(skews) / 1e6
+
+
+def _describe_source(out: Description, path: Path) -> None:
+    from drivers.source import open_source
+
+    try:
+        source = open_source(path)
+    except StereoSfmError as error:
+        if out.kind == "folder":
+            raise
+        out.problems.append(str(error))
+        return
+    with source:
+        out.calibration = rig_lines(source.rig)
+        out.ground_truth = 0 if source.ground_truth is None else len(source.ground_truth)
+        stamps, skew = _image_stamps(source)
+        out.images = rate_of(stamps)
+        if np.isnan(out.skew_ms):
+            out.skew_ms = skew
+        if out.kind == "folder":
+            out.metadata["source"] = source.name
+            out.seconds = float(stamps[-1] - stamps[0]) / 1e9 if len(stamps) else 0.0
+    out.problems += _problems(out)
+
+
+def _image_stamps(source: Source) -> tuple[I64, float]:
+    """Stamps of the left images and the largest skew in ms, without decoding pixels where the source allows."""
+    listed: Any = getattr(source, "stamps", None)
+    if callable(listed):
+        return listed()  # pyright: ignore[reportReturnType]
+    shots: Any = getattr(source, "shots", None)
+    if shots is not None:
+        return np.array([shot.stamp_ns for shot in shots], np.int64), float("nan")
+    return np.array([image.stamp_ns for image in source], np.int64), float("nan")
+
+
+def _problems(out: Description) -> list[str]:
+    found: list[str] = []
+    rate = out.images
+    if rate is None or not rate.count:
+        return [*found, "no image can be used"]
+    if rate.backwards:
+        found.append(f"{rate.backwards} image stamps are not later than the one before")
+    if rate.gaps:
+        found.append(
+            f"{rate.gaps} gaps between images (longest {rate.longest_gap_s:.3f} s, about {rate.missing} frames missing)"
+        )
+    if rate.jitter_ms > MAX_JITTER * 1e3 / rate.hz:
+        found.append(f"image stamps jitter by {rate.jitter_ms:.1f} ms: are they the sensor's?")
+    if out.skew_ms > MAX_SKEW_MS:
+        found.append(f"the eyes are up to {out.skew_ms:.2f} ms apart: a moving camera sees two different scenes")
+    return found
+
+
+def rig_lines(rig: Rig) -> list[str]:
+    """The calibration for people, one line per eye and one for the pair."""
+    lines = [f"left  {_camera_line(rig.left)}"]
+    if rig.depth:
+        return [*lines, f"depth image, virtual baseline {rig.baseline * 1e3:.1f} mm"]
+    if rig.right is None:
+        return [*lines, "one eye"]
+    angle = np.degrees(np.arccos(np.clip((np.trace(rig.left_T_right[:3, :3]) - 1) / 2, -1, 1)))
+    pair = f"baseline {rig.baseline * 1e3:.2f} mm, eyes turned by {angle:.2f} deg"
+    return [*lines, f"right {_camera_line(rig.right)}", pair]
+
+
+def _camera_line(camera: Camera) -> str:
+    distortion = ", ".join(f"{d:.5g}" for d in camera.distortion)
+    return (
+        f"{camera.model} {camera.width}x{camera.height} fx {camera.fx:.2f} fy {camera.fy:.2f} "
+        f"cx {camera.cx:.2f} cy {camera.cy:.2f}" + (f" distortion {distortion}" if distortion else "")
+    )

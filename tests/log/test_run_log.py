@@ -1,0 +1,300 @@
+"""The run log: what it holds, that the order of arrival does not change it, and that other programs read it."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
+from foxglove_schemas_protobuf.Odometry_pb2 import Odometry
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+
+from stereo_sfm.config import Config
+from stereo_sfm.geometry import se3
+from stereo_sfm.log import foxglove, schema, topics
+from stereo_sfm.log.diff import diff
+from stereo_sfm.log.map_view import MapView
+from stereo_sfm.log.reader import LogReader
+from stereo_sfm.log.run_log import Health, NoRunLog, RunLog, TrackStats, track_stats
+from stereo_sfm.log.writer import LogWriter
+from stereo_sfm.pipeline.sinks import StageTimes
+from stereo_sfm.types import (
+    F64,
+    Applied,
+    Dropped,
+    Frame,
+    Keyframe,
+    LoopResult,
+    MapUpdate,
+    Observations,
+    TrackState,
+)
+from tests.log.recordings import PERIOD_NS, START_NS, fisheye_rig, stereo_images, walk_truth
+
+FRAMES = 60
+KEYFRAME_EVERY = 6
+LAG = 3  # frames after which an update is applied
+
+
+def _map_T_odom(version: int) -> F64:
+    return se3.exp(np.array([0.01 * version, 0.0, 0.0, 0.0, 0.002 * version, 0.0]))
+
+
+def _odom_T_cam(frame_id: int) -> F64:
+    return se3.exp(np.array([0.0, 0.0, 0.05 * frame_id, 0.0, 0.01 * frame_id, 0.0]))
+
+
+def _frame(i: int) -> Frame:
+    rng = np.random.default_rng(i)
+    n = 40
+    obs = Observations(
+        np.arange(n) + 10 * (i // KEYFRAME_EVERY),
+        rng.uniform(0, 80, (n, 2)),
+        np.where(rng.random((n, 1)) < 0.5, rng.uniform(0, 80, (n, 2)), np.nan),
+        np.full(n, i % 40, np.int32),
+        rng.random(n) < 0.8,
+    )
+    version = 0 if i < LAG else (i - LAG) // KEYFRAME_EVERY + 1
+    stats = {"inliers": 30.0, "something_new": 1.5}
+    return Frame(
+        i, START_NS + i * PERIOD_NS, _odom_T_cam(i), np.eye(6) * 1e-4, TrackState.OK, "", obs, i // KEYFRAME_EVERY,
+        np.eye(4), version, i % KEYFRAME_EVERY == 0, stats,
+    )  # fmt: skip
+
+
+def _keyframe(k: int) -> Keyframe:
+    frame, rng = _frame(k * KEYFRAME_EVERY), np.random.default_rng(k)
+    n = len(frame.observations)
+    return Keyframe(
+        k, frame.frame_id, frame.stamp_ns, frame.odom_T_cam.copy(), frame.observations.point_ids,
+        frame.observations.uv_left, frame.observations.uv_right, rng.normal(size=(n, 3)),
+        rng.integers(0, 256, (n, 32), np.uint8), rng.random(n).astype(np.float32),
+    )  # fmt: skip
+
+
+def _answers(k: int) -> tuple[MapUpdate, LoopResult]:
+    keyframe = _keyframe(k)
+    map_T_odom = _map_T_odom(k + 1)
+    update = MapUpdate(
+        k + 1, k, np.array([k]), (map_T_odom @ keyframe.odom_T_cam)[None], keyframe.point_ids.copy(),
+        np.random.default_rng(k + 99).normal(size=(len(keyframe.point_ids), 3)), np.array([10 * k]),
+        np.zeros((0, 2), np.int64), map_T_odom,
+    )  # fmt: skip
+    accepted = k in (5, 8)
+    loop = LoopResult(
+        k, k - 4 if accepted else -1, np.eye(4), np.eye(6), np.zeros((0, 2), np.int64), 50 * accepted, 0.4,
+        "" if accepted else "no_candidate", ((1, 0.5, "too_few_inliers"),),
+    )  # fmt: skip
+    return update, loop
+
+
+def _streams() -> list[list[object]]:
+    """What capture, tracker, mapper and loop closer say, each in its own order."""
+    tracker: list[object] = []
+    for i in range(FRAMES):
+        tracker.append(_frame(i))
+        if i % KEYFRAME_EVERY == 0:
+            tracker.append(_keyframe(i // KEYFRAME_EVERY))
+    answers = [_answers(k) for k in range(FRAMES // KEYFRAME_EVERY)]
+    return [tracker, [u for u, _ in answers], [r for _, r in answers]]
+
+
+def _write(path: Path, order: np.random.Generator | None) -> None:
+    """Without `order` each stream after the other's cause; with it, at random."""
+    log = RunLog(LogWriter(path, clock=lambda: 0), fisheye_rig(), Config(), source="test", mode="inline",
+                 ground_truth=walk_truth(30, np.random.default_rng(0)))  # fmt: skip
+    log.image(stereo_images(1, np.random.default_rng(0))[0])
+    streams = [list(reversed(s)) for s in _streams()]
+    while any(streams):
+        alive = [s for s in streams if s]
+        log.put(alive[0 if order is None else order.integers(len(alive))].pop())
+    log.put(Applied(1, 3))
+    log.put(Dropped(9, START_NS, "ring", "full", 2))
+    log.put(Health("track", 5, 30.0, 1, 1.0, 2.0, 3.0, 0))
+    log.put(StageTimes(5, {"track": 3.5}))
+    log.text("WARNING", "dark")
+    log.close()
+    log.close()
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("run") / "run.mcap"
+    _write(path, None)
+    return path
+
+
+def _all(path: Path, topic: str, kind: type) -> list:
+    with LogReader(path) as reader:
+        if hasattr(kind, "FromString"):
+            return [kind.FromString(r.data) for r in reader.messages([topic])]
+        return [schema.decoder(kind, r.schema.data)(r.data) for r in reader.messages([topic]) if r.schema]
+
+
+def test_every_topic_of_the_table_that_a_run_has_is_there(run: Path) -> None:
+    with LogReader(run) as reader:
+        present = {t.topic: t.schema for t in reader.topics}
+        assert set(present) == {t.name for t in topics.TABLE} - {topics.DEPTH_IMAGE, topics.WHEEL}
+        assert all(name in topics.BY_NAME[t].schema.split("|") for t, name in present.items())
+        assert b"[tracker]" in (reader.attachment("config.toml") or b"")
+        assert len(reader.metadata("stereo_sfm")["config_sha256"]) == 12
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_order_of_arrival_changes_nothing(run: Path, tmp_path: Path, seed: int) -> None:
+    _write(tmp_path / "b.mcap", np.random.default_rng(seed))
+    with LogReader(run) as a, LogReader(tmp_path / "b.mcap") as b:
+        assert [str(d) for d in diff(a, b)] == []
+
+
+def test_poses_follow_the_map_version_that_the_frame_used(run: Path) -> None:
+    rig = fisheye_rig()
+    poses = _all(run, topics.MAP_POSE, PoseInFrame)
+    assert len(poses) == FRAMES
+    for i, message in enumerate(poses):
+        frame = _frame(i)
+        version = frame.map_version
+        wanted = (_map_T_odom(version) if version else np.eye(4)) @ frame.odom_T_cam @ se3.inverse(rig.body_T_left)
+        np.testing.assert_allclose(foxglove.matrix(message.pose.position, message.pose.orientation), wanted, atol=1e-12)
+        assert foxglove.stamp_of(message) == frame.stamp_ns
+
+
+def test_transforms_make_one_tree_from_map_to_the_right_eye(run: Path) -> None:
+    rig = fisheye_rig()
+    rows = {
+        (t.parent_frame_id, t.child_frame_id): foxglove.matrix(t.translation, t.rotation)
+        for message in _all(run, topics.TF, FrameTransforms)
+        for t in message.transforms
+    }
+    assert set(rows) == {("map", "odom"), ("odom", "body"), ("body", "cam0"), ("cam0", "cam1")}
+    np.testing.assert_allclose(rows["odom", "body"] @ rows["body", "cam0"], _odom_T_cam(FRAMES - 1), atol=1e-12)
+    np.testing.assert_allclose(rows["cam0", "cam1"], rig.left_T_right, atol=1e-12)
+
+
+def test_covariance_turns_into_the_axes_of_odom() -> None:
+    """Against sampled poses: positions of the body spread as the published covariance says."""
+    rig, frame = fisheye_rig(), _frame(17)
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(6, 6)) * 1e-4
+    covariance = root @ root.T
+    xi = rng.normal(size=(50_000, 6)) @ root.T
+    bodies = frame.odom_T_cam @ se3.exp(xi) @ se3.inverse(rig.body_T_left)
+    mean = frame.odom_T_cam @ se3.inverse(rig.body_T_left)
+    turns = se3.so3_log(bodies[:, :3, :3] @ mean[:3, :3].T)
+    sampled = np.cov(np.hstack([bodies[:, :3, 3] - mean[:3, 3], turns]).T)
+    from dataclasses import replace
+    from tempfile import TemporaryDirectory
+
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "a.mcap"
+        log = RunLog(LogWriter(path), rig, Config(), source="t", mode="inline", image_format="none")
+        log.frame(replace(frame, covariance=covariance, map_version=0))
+        log.close()
+        (message,) = _all(path, topics.ODOMETRY, Odometry)
+    published = np.reshape(message.pose_covariance, (6, 6))
+    np.testing.assert_allclose(published, sampled, atol=0.05 * np.abs(published).max())
+
+
+def test_points_trajectory_and_edges_are_the_map_at_the_end(run: Path) -> None:
+    view = MapView()
+    for k in range(FRAMES // KEYFRAME_EVERY):
+        update, loop = _answers(k)
+        view.keyframe(_keyframe(k), update.map_T_odom)
+        view.loop(loop)
+        view.update(update)
+    cloud = _all(run, topics.POINTS, PointCloud)[-1]
+    rows = np.frombuffer(cloud.data, np.dtype([("xyz", "<f4", 3), ("id", "<u4")]))
+    expected: dict[int, np.ndarray] = {}
+    for k in range(FRAMES // KEYFRAME_EVERY):
+        update, _ = _answers(k)
+        for point_id in update.culled_point_ids.tolist():
+            expected.pop(point_id, None)
+        expected.update(zip(update.point_ids.tolist(), update.points_map, strict=True))
+    assert rows["id"].tolist() == sorted(expected)
+    np.testing.assert_array_equal(rows["xyz"], np.float32([expected[i] for i in sorted(expected)]))
+    poses = _all(run, topics.TRAJECTORY, PosesInFrame)[-1].poses
+    positions = [[p.position.x, p.position.y, p.position.z] for p in poses]
+    np.testing.assert_array_equal(positions, view.trajectory[:, :3, 3])
+    scene = _all(run, topics.SCENE, SceneUpdate)[-1]
+    lines = {e.id: [[p.x, p.y, p.z] for p in e.lines[0].points] for e in scene.entities}
+    np.testing.assert_array_equal(lines["loops"], view.loop_lines)
+    assert len(lines["loops"]) == 4  # two loops
+    np.testing.assert_array_equal(lines["loops"][0], view.trajectory[1, :3, 3])
+    assert len(lines["covisibility"]) == 2 * 9  # each keyframe shares 30 of 40 points with the one before
+
+
+def test_features_are_where_the_tracker_saw_them(run: Path) -> None:
+    messages = _all(run, topics.FEATURES, ImageAnnotations)
+    for i in (0, 31):
+        (dots,) = messages[i].points
+        np.testing.assert_array_equal([[p.x, p.y] for p in dots.points], _frame(i).observations.uv_left)
+        assert len(dots.outline_colors) == len(dots.points)
+    young, old = (
+        messages[i].points[0].outline_colors[int(np.flatnonzero(_frame(i).observations.inlier)[0])] for i in (0, 39)
+    )
+    assert (young.b, young.r) == (1.0, 0.0) and (old.b, old.r) == (0.0, 1.0)
+
+
+def test_messages_of_the_stages_come_back_whole(run: Path) -> None:
+    for topic, kind, wanted in (
+        (topics.FRAME, Frame, [_frame(i) for i in range(FRAMES)]),
+        (topics.KEYFRAME, Keyframe, [_keyframe(k) for k in range(10)]),
+        (topics.MAP_UPDATE, MapUpdate, [_answers(k)[0] for k in range(10)]),
+        (topics.LOOP, LoopResult, [_answers(k)[1] for k in range(10)]),
+    ):
+        back = _all(run, topic, kind)
+        assert [schema.encode(m) for m in back] == [schema.encode(m) for m in wanted]
+    assert _all(run, topics.APPLIED, Applied) == [Applied(1, 3)]
+    assert _all(run, topics.DROPPED, Dropped) == [Dropped(9, START_NS, "ring", "full", 2)]
+    assert _all(run, topics.STAGE_TIMES, StageTimes) == [StageTimes(5, {"track": 3.5})]
+
+
+def test_stats_are_flat_and_keep_what_they_do_not_know(run: Path) -> None:
+    stats: TrackStats = _all(run, topics.STATS, TrackStats)[7]
+    assert repr(stats) == repr(track_stats(_frame(7)))
+    assert (stats.inliers, stats.other) == (30.0, {"something_new": 1.5})
+    assert np.isnan(stats.tracked) and stats.observations == 40
+
+
+def test_a_run_without_loops_or_mapping_waits_for_nothing(tmp_path: Path) -> None:
+    from stereo_sfm.config import from_dict
+
+    config = from_dict({"loop": {"enabled": False}})
+    log = RunLog(LogWriter(tmp_path / "a.mcap"), fisheye_rig(), config, source="t", mode="inline", image_format="none")
+    for k in range(3):
+        log.put(_keyframe(k))
+        log.put(_answers(k)[0])
+    log._writer.flush()
+    with LogReader(tmp_path / "a.mcap") as reader:
+        assert len(reader.stamps(topics.TRAJECTORY)) == 1 and len(reader.stamps(topics.MAP_UPDATE)) == 3
+    log.close()
+
+
+def test_an_unknown_message_is_an_error_and_the_null_log_takes_everything(tmp_path: Path) -> None:
+    log = RunLog(LogWriter(tmp_path / "a.mcap"), fisheye_rig(), Config(), source="t", mode="inline")
+    with pytest.raises(TypeError, match="no topic for str"):
+        log.put("x")
+    log.close()
+    null = NoRunLog()
+    null.put("x")
+    null.frame(_frame(0))
+    null.close()
+    methods = {n for n in dir(RunLog) if not n.startswith("_")}
+    assert methods == {n for n in dir(NoRunLog) if not n.startswith("_")}
+
+
+def test_rerun_reads_every_channel(run: Path) -> None:
+    rerun = shutil.which("rerun") or str(Path(__import__("sys").executable).parent / "rerun")
+    done = subprocess.run([rerun, "mcap", "check", str(run)], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stdout + done.stderr
+    rows = [line.split() for line in done.stdout.splitlines() if " /" in line and not line.startswith("/")]
+    with LogReader(run) as reader:
+        assert {row[3] for row in rows} == {t.topic for t in reader.topics}
+    assert {row[0] for row in rows} == {"ok"}
