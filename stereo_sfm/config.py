@@ -21,18 +21,17 @@ class TrackerConfig:
     pyramid_levels: int = 4
     min_contrast: float = 2.0  # grey levels of standard deviation; flatter windows are no points
     min_ncc: float = 0.6  # of a window with the previous frame's
-    min_anchor_ncc: float = 0.75  # of a window with the point's first appearance, affinely deformed
+    min_anchor_ncc: float = 0.85  # of a window with the point's first appearance, affinely deformed
     max_angle_deg: float = 88.0  # from the optical axis; beyond it a fisheye image is not used
     corner_quality: float = 0.005  # least corner response, as a share of the strong ones in the image
     min_depth_baselines: float = 4.0  # nearest stereo match searched, in baselines
-    sigma_px: float = 0.3  # noise of one coordinate of an observation
-    depth_sigma_px: float = 0.6  # the same when the depth of a point is refined from frame to frame
+    sigma_px: float = 0.3  # noise of one coordinate of an observation, to start with: it follows the residuals
+    depth_sigma_px: float = 3.0  # the same when a point's depth is refined from frame to frame: errors repeat
     max_error: float = 3.0  # sigmas; a worse observation is no inlier
     max_epipolar_px: float = 1.0  # distance of a stereo match from its epipolar curve
-    max_window_disparity_px: float = 0.4  # a narrow and a wide window must agree on the disparity: no depth edge inside
+    max_window_disparity_px: float = 0.2  # a narrow and a wide window must agree on the disparity: no depth edge inside
     keyframe_share: float = 0.75  # new keyframe when fewer of the last keyframe's points are still tracked
     keyframe_max_frames: int = 30
-    keyframe_min_flow_share: float = 0.0  # unused below this median flow, as a share of the image width; 0: no limit
     lost_frames: int = 15  # frames predicted by constant velocity before tracking restarts as a new submap
 
 

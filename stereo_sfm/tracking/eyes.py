@@ -32,7 +32,9 @@ class Eyes:
     def of(rig: Rig) -> Eyes:
         """Raises StereoSfmError for a rig with one eye."""
         if rig.right is None:
-            raise StereoSfmError("the default tracker needs a stereo or RGB-D source (for one camera: --preset cpp-course)")
+            raise StereoSfmError(
+                "the default tracker needs a stereo or RGB-D source (for one camera: --preset cpp-course)"
+            )
         return Eyes(
             rig.left.model_id,
             rig.left.params,

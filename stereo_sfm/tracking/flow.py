@@ -5,9 +5,9 @@ against its first appearance removes the drift, and its dissimilarity tells when
 (an occlusion, or a depth discontinuity inside the window). Both are inverse compositional (Baker & Matthews, IJCV 56,
 2004). The brightness of a window is normalised by its mean and contrast, so that exposure jumps do not matter.
 
-Windows are SIZE x SIZE pixels around the point, stored flat with STRIDE samples a row; the extra columns make interpolation
-and central differences contiguous loops and have weight zero. Sums add halves to halves in a fixed order: compiled to
-vector instructions, yet the same bits on every run and every machine.
+Windows are SIZE x SIZE pixels around the point, stored flat with STRIDE samples a row; the extra columns make
+interpolation and central differences contiguous loops and have weight zero. Sums add halves to halves in a fixed order:
+compiled to vector instructions, yet the same bits on every run and every machine.
 """
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportPrivateUsage=false
@@ -29,6 +29,7 @@ STRIDE = SIZE + 4
 FLAT_SIZE = SIZE * STRIDE
 WIDE_SIZE = (SIZE + 2) * STRIDE
 RAW_SIZE = (SIZE + 4) * STRIDE
+ONE = np.uint64(1)
 TRACKED, LEFT_IMAGE, FLAT, DIVERGED, UNLIKE = 0, 1, 2, 3, 4  # why a point was not followed
 
 Pyramid = tuple[U8, ...]
@@ -48,7 +49,7 @@ def build_pyramid(image: U8, levels: int) -> Pyramid:
 def _window_weights() -> np.ndarray:
     """Flat window of weights: a wide Gaussian, zero in the extra columns, sum 1."""
     x = np.arange(SIZE) - HALF
-    g = np.exp(-0.5 * (x / 5.5) ** 2)
+    g = np.exp(-0.5 * (x / 3.5) ** 2)
     w = np.zeros((SIZE, STRIDE))
     w[:, :SIZE] = np.outer(g, g)
     return (w / w.sum()).astype(np.float32).ravel()
@@ -316,20 +317,23 @@ def _sample_affine(image, warp, cu, cv, out):
     a, b, c, d = np.float32(warp[0, 0]), np.float32(warp[0, 1]), np.float32(warp[1, 0]), np.float32(warp[1, 1])
     iu0, iv0 = int(math.floor(cu)), int(math.floor(cv))
     du, dv = np.float32(cu - iu0 + 64), np.float32(cv - iv0 + 64)  # positive, so that truncation is floor
+    flat = image.reshape(-1)
+    start = (iv0 - 64) * w + iu0 - 64
     for i in range(SIZE):
         y = np.float32(i - HALF)
+        row_u, row_v = b * y + du, d * y + dv
         for j in range(SIZE):
             x = np.float32(j - HALF)
-            u = a * x + b * y + du
-            v = c * x + d * y + dv
+            u = a * x + row_u
+            v = c * x + row_v
             iu, iv = np.int32(u), np.int32(v)
             fu, fv = u - np.float32(iu), v - np.float32(iv)
-            iu += iu0 - 64
-            iv += iv0 - 64
-            upper = np.float32(image[iv, iu]) + fu * (np.float32(image[iv, iu + 1]) - np.float32(image[iv, iu]))
-            lower = np.float32(image[iv + 1, iu]) + fu * (
-                np.float32(image[iv + 1, iu + 1]) - np.float32(image[iv + 1, iu])
-            )
+            at = np.uint64(start + iv * w + iu)  # unsigned: no check for negative indices
+            i00, i01 = np.float32(flat[at]), np.float32(flat[at + ONE])
+            at = np.uint64(start + iv * w + iu + w)
+            i10, i11 = np.float32(flat[at]), np.float32(flat[at + ONE])
+            upper = i00 + fu * (i01 - i00)
+            lower = i10 + fu * (i11 - i10)
             out[i * STRIDE + j] = upper + fv * (lower - upper)
     return True
 
@@ -403,7 +407,7 @@ def track_affine(
                 a10 * i00 + a11 * i10,
                 a10 * i01 + a11 * i11,
             )
-            if length < 0.01:
+            if length < 0.03:
                 break
         if not ok:
             ncc[row] = 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 
@@ -30,7 +31,7 @@ class LocalPoints:
         points = se3.transform(odom_T_cam, view.points[rows])
         self.points = np.concatenate([self.points[stays], points])[-self.limit :]
         both = np.concatenate([self.descriptors[stays], view.features.descriptors[rows]])[-self.limit :]
-        self.descriptors = np.asarray(both, view.features.descriptors.dtype)
+        self.descriptors = cast("U8 | F32", both)
 
     def apply(self, update: MapUpdate, ids: PointIds) -> None:
         """Positions from the map; points that it culled or fused away go."""

@@ -106,8 +106,8 @@ def optimise_pose(
         prior: (6, 6) information of prior_pose (zeros: none).
 
     Returns:
-        pose (4, 4), covariance (6, 6) of pose @ exp(xi), error (N,) root of the whitened squared residual over the number
-        of rows (1 is as expected; inf when not visible).
+        pose (4, 4), covariance (6, 6) of pose @ exp(xi), error (N,) root of the whitened squared residual over
+        the number of rows (1 is as expected; inf when not visible).
     """
     n = len(rho)
     pose = pose.copy()
@@ -179,7 +179,11 @@ def optimise_pose(
                 for j in range(3):
                     for m in range(3):
                         r[i, j] += prior_pose[m, i] * pose[m, j]
-            delta[3], delta[4], delta[5] = 0.5 * (r[2, 1] - r[1, 2]), 0.5 * (r[0, 2] - r[2, 0]), 0.5 * (r[1, 0] - r[0, 1])
+            delta[3], delta[4], delta[5] = (
+                0.5 * (r[2, 1] - r[1, 2]),
+                0.5 * (r[0, 2] - r[2, 0]),
+                0.5 * (r[1, 0] - r[0, 1]),
+            )
             for i in range(6):
                 for j in range(6):
                     rhs[i] += prior[i, j] * delta[j]
@@ -190,13 +194,11 @@ def optimise_pose(
 
 
 @njit
-def refine_depth(
-    pose, origin, direction, rho, variance, uv_l, uv_r, inlier, cams, right_T_left, sigma, growth, floor
-):
+def refine_depth(pose, origin, direction, rho, variance, uv_l, uv_r, inlier, cams, right_T_left, sigma, growth, floor):
     """Update rho and its variance (in place) by one frame's observations, the pose given.
 
-    `sigma` is larger than the pixel noise: successive errors of one patch are alike, and the pose was fitted to the same
-    pixels. `growth` multiplies the variance before the update; `floor` is the least relative standard deviation.
+    `sigma` is larger than the pixel noise: successive errors of one patch are alike, and the pose was fitted to the
+    same pixels. `growth` multiplies the variance before the update; `floor` is the least relative standard deviation.
     """
     res, jac, ray = np.zeros(4), np.zeros((4, 6)), np.zeros(4)
     for k in range(len(rho)):

@@ -52,9 +52,7 @@ class StereoMatcher:
         assert image.right is not None
         return flow.build_pyramid(image.right, 2)
 
-    def follow(
-        self, left: flow.Pyramid, right: flow.Pyramid | F32, uv: F64, points: F64, predicted: F64
-    ) -> F64:
+    def follow(self, left: flow.Pyramid, right: flow.Pyramid | F32, uv: F64, points: F64, predicted: F64) -> F64:
         """Right pixels (N, 2) of tracked points (N, 3) whose left pixels are `uv`, NaN where not found."""
         if not isinstance(right, tuple):
             return self._from_depth(right, uv)[0]
@@ -110,7 +108,6 @@ class StereoMatcher:
 
     def _from_depth(self, depth: F32, uv: F64) -> tuple[F64, Bool]:
         """Virtual right pixels from a depth image, NaN where it has a hole or an edge."""
-        h, w = depth.shape
         inside = self._rig.left.inside(uv, 2.0)
         u = np.where(inside, np.rint(uv[:, 0]), 2).astype(np.int64)
         v = np.where(inside, np.rint(uv[:, 1]), 2).astype(np.int64)

@@ -1,8 +1,8 @@
 """The default tracker: flow of grid-spread points, stereo by bearings, motion-only optimisation over both images.
 
-Per frame: predict the pose (constant velocity), predict every point's pixel, follow it by translation, align it with its
-first appearance, find it in the right image, solve the pose robustly, refine the points' distances. At keyframes: new
-corners where points are missing, stereo matches for them, descriptors for the mapper and the loop closer.
+Per frame: predict the pose (constant velocity), predict every point's pixel, follow it by translation, align it with
+its first appearance, find it in the right image, solve the pose robustly, refine the points' distances. At keyframes:
+new corners where points are missing, stereo matches for them, descriptors for the mapper and the loop closer.
 """
 
 from __future__ import annotations
@@ -138,7 +138,8 @@ class Tracker:
         if solution.reason:
             return self._lose(image, predicted, solution.reason, stats)
         pose, covariance, error, inlier = solution.pose, solution.covariance, solution.error, solution.inlier
-        self._noise = float(np.clip(0.9 * self._noise + 0.1 * np.median(error[inlier]) / 0.8, 1.0, 4.0))
+        self._noise *= float(0.9 + 0.1 * np.median(error[inlier]) / 0.8)  # 0.8: median of unit noise in four rows
+        self._noise = min(max(self._noise, 0.3), 4.0)
         tracks.uv_right = uv_right
         tracks.misses = np.where(inlier, 0, tracks.misses + 1).astype(np.int32)
         tracks.age = tracks.age + np.int32(1)
@@ -282,7 +283,9 @@ class Tracker:
         old = int((self._tracks.point_ids < self._kf_last_point_id).sum())
         return self._frames_since_kf >= config.keyframe_max_frames or old < config.keyframe_share * self._kf_points
 
-    def _make_keyframe(self, image: StereoImage, pyramid: flow.Pyramid, right: flow.Pyramid | F32, covariance: F64) -> Keyframe:
+    def _make_keyframe(
+        self, image: StereoImage, pyramid: flow.Pyramid, right: flow.Pyramid | F32, covariance: F64
+    ) -> Keyframe:
         self._add_points(pyramid, right)
         tracks = self._tracks
         points_cam = se3.transform(se3.inverse(self._pose), tracks.points())
@@ -313,9 +316,7 @@ class Tracker:
         missing = config.max_features - len(self._tracks)
         if missing <= 0:
             return
-        corners = detect_corners(
-            pyramid[1], self._mask, self._tracks.uv, missing, self._spacing, config.corner_quality
-        )
+        corners = detect_corners(pyramid[1], self._mask, self._tracks.uv, missing, self._spacing, config.corner_quality)
         match = self._stereo.match(pyramid, right, corners)
         good = match.good
         slots = self._patches.take(int(good.sum()))
