@@ -1,0 +1,407 @@
+"""MCAP files that others wrote: topics, calibrations and extrinsics are found, and bad files are one line."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from mcap.writer import Writer
+from mcap_protobuf.writer import Writer as ProtobufWriter
+
+from calib.rig import Rig
+from drivers import open_source
+from drivers.mcap_topics import choose_topics
+from stereo_sfm.cli import main
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.cameras import Camera, KannalaBrandt, Pinhole, RadTan
+from stereo_sfm.log import foxglove
+from stereo_sfm.log.reader import LogReader
+from stereo_sfm.types import U8
+from tests.log.recordings import ArraySource, fisheye_rig, stereo_images, write_recording
+
+PERIOD_NS = 50_000_000
+W, H = 64, 48
+RADTAN = RadTan(W, H, 50.0, 51.0, 31.0, 23.0, (-0.2, 0.05, 0.001, -0.002))
+LEFT_T_RIGHT = se3.exp(np.array([0.12, 0.001, -0.002, 0.01, 0.02, -0.015]))
+
+
+def _pixels(i: int, eye: int) -> U8:
+    return np.random.default_rng(2 * i + eye).integers(0, 256, (H, W), np.uint8)
+
+
+def _raw(i: int, eye: int, frame: str) -> RawImage:
+    return RawImage(frame_id=frame, width=W, height=H, encoding="mono8", step=W, data=_pixels(i, eye).tobytes())
+
+
+def _write(
+    path: Path,
+    names: Sequence[str] = ("/stereo/left/image_raw", "/stereo/right/image_raw"),
+    calibrations: Sequence[str] = ("/stereo/left/camera_info", "/stereo/right/camera_info"),
+    frames: Sequence[str] = ("left_optical", "right_optical"),
+    cameras: Sequence[Camera] = (RADTAN, RADTAN),
+    image: Callable[[int, int, str], Any] = _raw,
+    transforms: Sequence[tuple[str, str, Any]] = (("left_optical", "right_optical", LEFT_T_RIGHT),),
+    edit: Callable[[int, CameraCalibration], None] = lambda eye, message: None,
+    count: int = 6,
+    skew_ns: int = 0,
+    skip: Sequence[tuple[int, int]] = (),
+    extra: Callable[[ProtobufWriter], None] = lambda writer: None,
+) -> Path:
+    """A stereo recording as somebody else may write it."""
+    with path.open("wb") as stream, ProtobufWriter(stream) as writer:
+        for eye, topic in enumerate(calibrations):
+            message = foxglove.calibration(cameras[eye], frames[eye], 10**9)
+            edit(eye, message)
+            writer.write_message(topic, message, 10**9, 10**9)
+        if transforms:
+            writer.write_message("/tf", foxglove.transforms(10**9, transforms), 10**9, 10**9)
+        for i in range(count):
+            for eye, topic in enumerate(names):
+                if (i, eye) in skip:
+                    continue
+                stamp = 10**9 + i * PERIOD_NS + eye * skew_ns
+                message = foxglove.stamp(image(i, eye, frames[eye]), stamp)
+                writer.write_message(topic, message, stamp + 7_000_000, stamp)  # logged later than taken
+        extra(writer)
+    return path
+
+
+def test_foxglove_file_with_transforms(tmp_path: Path) -> None:
+    path = _write(tmp_path / "a.mcap", skew_ns=300_000)
+    with open_source(path) as source:
+        assert isinstance(source.rig.left, RadTan)
+        assert source.rig.left.distortion == RADTAN.distortion  # the zero that pads it is gone
+        np.testing.assert_allclose(source.rig.left_T_right, LEFT_T_RIGHT, atol=1e-12)
+        images = list(source)
+    assert [image.frame_id for image in images] == list(range(6)) and source.frame_count == 6
+    for i, image in enumerate(images):
+        assert image.stamp_ns == 10**9 + i * PERIOD_NS
+        assert image.right_stamp_ns == image.stamp_ns + 300_000
+        assert image.right is not None
+        np.testing.assert_array_equal(image.left, _pixels(i, 0))
+        np.testing.assert_array_equal(image.right, _pixels(i, 1))
+
+
+def test_a_chain_of_transforms_through_the_body(tmp_path: Path) -> None:
+    body_T_left = se3.exp(np.array([0.5, 0.1, 0.2, 1.0, -1.2, 0.7]))
+    rows = (
+        ("map", "body", se3.exp(np.ones(6))),
+        ("body", "left_optical", body_T_left),
+        ("body", "right_mount", body_T_left @ LEFT_T_RIGHT @ se3.exp(-np.ones(6))),
+        ("right_mount", "right_optical", se3.exp(np.ones(6))),
+    )
+    with open_source(_write(tmp_path / "a.mcap", transforms=rows)) as source:
+        np.testing.assert_allclose(source.rig.left_T_right, LEFT_T_RIGHT, atol=1e-12)
+
+
+def test_baseline_from_the_projection_matrices(tmp_path: Path) -> None:
+    """Against OpenCV: a pair that stereoRectify rectified, described as ROS and Foxglove do, gives the pair back."""
+    right_T_left = se3.inverse(LEFT_T_RIGHT)
+    k, d = RADTAN.matrix, np.array(RADTAN.distortion)
+    out = cv2.stereoRectify(
+        k, d, k, d, (W, H), right_T_left[:3, :3], right_T_left[:3, 3], flags=cv2.CALIB_ZERO_DISPARITY
+    )
+
+    def edit(eye: int, message: CameraCalibration) -> None:
+        message.R[:] = out[eye].ravel()
+        message.P[:] = out[2 + eye].ravel()
+
+    with open_source(_write(tmp_path / "a.mcap", transforms=(), edit=edit)) as source:
+        np.testing.assert_allclose(source.rig.left_T_right, LEFT_T_RIGHT, atol=1e-9)
+    names = ("/left/image_rect", "/right/image_rect")
+    infos = ("/left/camera_info", "/right/camera_info")
+    with open_source(_write(tmp_path / "b.mcap", names, infos, transforms=(), edit=edit)) as source:
+        rig = source.rig
+        assert type(rig.left) is Pinhole and rig.left.fx == out[2][0, 0] and rig.left.cx == out[2][0, 2]
+        np.testing.assert_allclose(rig.left_T_right[:3, :3], np.eye(3), atol=1e-12)
+        np.testing.assert_allclose(rig.baseline, np.linalg.norm(LEFT_T_RIGHT[:3, 3]), rtol=1e-9)
+        assert rig.left_T_right[0, 3] > 0
+
+
+@pytest.mark.parametrize(
+    ("names", "left", "right"),
+    [
+        (["/cam0/image", "/cam1/image"], "/cam0/image", "/cam1/image"),
+        (["/b/right/x", "/b/left/x", "/rgb/image"], "/b/left/x", "/b/right/x"),
+        (["/camera/infra1/image_rect_raw", "/camera/infra2/image_rect_raw"], *["/camera/infra%d/image_rect_raw"] * 2),
+        (["/camera/fisheye1/image_raw", "/camera/fisheye2/image_raw"], *["/camera/fisheye%d/image_raw"] * 2),
+        (["/left/rect", "/left/raw", "/right/raw", "/right/rect"], "/left/raw", "/right/raw"),
+        (["/image"], "/image", ""),
+        (["/a", "/b"], "/a", "/b"),
+    ],
+)  # fmt: skip
+def test_the_eyes_are_found_by_name(tmp_path: Path, names: list[str], left: str, right: str) -> None:
+    path = _write(
+        tmp_path / "a.mcap", names, [], ["f"] * len(names), transforms=(), image=lambda i, e, f: _raw(i, e, f), count=1
+    )
+    with LogReader(path) as reader:
+        chosen = choose_topics(reader)
+    assert (chosen.left, chosen.right) == (left % 1 if "%d" in left else left, right % 2 if "%d" in right else right)
+
+
+def test_three_nameless_images_ask_for_the_topics(tmp_path: Path) -> None:
+    path = _write(
+        tmp_path / "a.mcap", ["/x", "/y", "/z"], ["/y/info", "/z/info"], ["f", "left_optical", "right_optical"]
+    )
+    with pytest.raises(StereoSfmError, match="left=TOPIC&right=TOPIC"):
+        open_source(path)
+    rig = Rig(RADTAN, RADTAN, LEFT_T_RIGHT.copy())
+    with open_source(f"mcap:{path}?left=/y&right=/z", rig=rig) as source:
+        image = next(iter(source))
+        np.testing.assert_array_equal(image.left, _pixels(0, 1))
+    with pytest.raises(StereoSfmError, match="no image topic /w"):
+        open_source(f"mcap:{path}?left=/w&right=/z")
+    with pytest.raises(StereoSfmError, match="bogus"):
+        open_source(f"mcap:{path}?bogus=1")
+
+
+def test_missing_partners_count_as_dropped(tmp_path: Path) -> None:
+    path = _write(tmp_path / "a.mcap", count=8, skip=[(2, 1), (3, 1), (6, 0)])
+    with open_source(path) as source:
+        images = list(source)
+    assert [image.frame_id for image in images] == [0, 1, 4, 5, 6]
+    assert [image.dropped_before for image in images] == [0, 0, 2, 0, 0]
+    assert all(image.right is not None for image in images)
+
+
+def test_compressed_images_and_fisheye_lenses(tmp_path: Path) -> None:
+    lens = KannalaBrandt(W, H, 20.0, 20.5, 31.0, 23.0, (0.01, -0.02, 0.003, -0.0004))
+
+    def image(i: int, eye: int, frame: str) -> CompressedImage:
+        data = cv2.imencode(".png", _pixels(i, eye))[1].tobytes()
+        return CompressedImage(frame_id=frame, format="png", data=b"broken" if (i, eye) == (3, 0) else data)
+
+    path = _write(tmp_path / "a.mcap", cameras=(lens, lens), image=image)
+    with open_source(path) as source:
+        assert isinstance(source.rig.left, KannalaBrandt) and source.rig.left.distortion == lens.distortion
+        images = list(source)
+    assert [image.frame_id for image in images] == [0, 1, 2, 4, 5] and images[3].dropped_before == 1
+    np.testing.assert_array_equal(images[4].left, _pixels(5, 0))
+
+
+def test_depth_beside_an_image_makes_an_rgbd_source(tmp_path: Path) -> None:
+    def image(i: int, eye: int, frame: str) -> RawImage:
+        if not eye:
+            return _raw(i, 0, frame)
+        depth = np.full((H, W), 2000 + i, np.uint16)
+        depth[0] = 0
+        return RawImage(frame_id=frame, width=W, height=H, encoding="16UC1", step=2 * W, data=depth.tobytes())
+
+    path = _write(tmp_path / "a.mcap", ["/rgb/image", "/depth/image"], ["/rgb/info"], image=image, transforms=())
+    with open_source(path) as source:
+        assert source.rig.depth and source.rig.stereo
+        images = list(source)
+    assert images[3].depth is not None and images[3].right is None
+    assert np.isnan(images[3].depth[0]).all() and (images[3].depth[1:] == np.float32(2.003)).all()
+
+
+def test_ground_truth_by_its_name(tmp_path: Path) -> None:
+    poses = se3.exp(np.random.default_rng(0).normal(size=(4, 6)))
+
+    def extra(writer: ProtobufWriter) -> None:
+        for i in (2, 0, 1, 3):  # not in order
+            message: PoseInFrame = foxglove.pose_in_frame("world", 10**9 + i, poses[i])
+            writer.write_message("/vicon/ground_truth", message, 10**9 + i, 0)
+
+    with open_source(_write(tmp_path / "a.mcap", extra=extra)) as source:
+        assert source.ground_truth is not None
+        assert source.ground_truth.stamp_ns.tolist() == [10**9 + i for i in range(4)]
+        np.testing.assert_allclose(source.ground_truth.poses, poses, atol=1e-12)
+
+
+def test_ros_2_file(tmp_path: Path) -> None:
+    """Written with the rosbags library as the oracle of CDR."""
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    t = store.types
+    path = tmp_path / "ros.mcap"
+
+    def header(stamp: int, frame: str) -> Any:
+        seconds, nanos = divmod(stamp, 10**9)
+        return t["std_msgs/msg/Header"](t["builtin_interfaces/msg/Time"](seconds, nanos), frame)
+
+    def quaternion(q: Sequence[float]) -> Any:
+        return t["geometry_msgs/msg/Quaternion"](*map(float, q))
+
+    def vector(v: Sequence[float]) -> Any:
+        return t["geometry_msgs/msg/Vector3"](*map(float, v))
+
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2")
+        channels: dict[str, int] = {}
+
+        def put(topic: str, kind: str, message: Any, stamp: int) -> None:
+            if topic not in channels:
+                schema_id = writer.register_schema(kind, "ros2msg", store.generate_msgdef(kind)[0].encode())
+                channels[topic] = writer.register_channel(topic, "cdr", schema_id)
+            writer.add_message(channels[topic], stamp, bytes(store.serialize_cdr(message, kind)), stamp)
+
+        roi = t["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+        zeros, eye = np.zeros(9), np.eye(3).ravel()
+        for side in ("left", "right"):
+            info = t["sensor_msgs/msg/CameraInfo"](
+                header(10**9, f"{side}_frame"), H, W, "plumb_bob", np.array([*RADTAN.distortion, 0.0]),
+                RADTAN.matrix.ravel(), eye, np.zeros(12), 0, 0, roi,
+            )  # fmt: skip
+            put(f"/{side}/camera_info", "sensor_msgs/msg/CameraInfo", info, 10**9)
+        q = se3.quaternion_from_rotation(LEFT_T_RIGHT[:3, :3])
+        moved = t["geometry_msgs/msg/Transform"](vector(LEFT_T_RIGHT[:3, 3]), quaternion(q))
+        row = t["geometry_msgs/msg/TransformStamped"](header(10**9, "left_frame"), "right_frame", moved)
+        put("/tf_static", "tf2_msgs/msg/TFMessage", t["tf2_msgs/msg/TFMessage"]([row]), 10**9)
+        for i in range(5):
+            stamp = 10**9 + i * PERIOD_NS
+            for j in range(3):
+                at = stamp - (2 - j) * 10_000_000
+                imu = t["sensor_msgs/msg/Imu"](
+                    header(at, "imu"),
+                    quaternion((0, 0, 0, 1)),
+                    zeros,
+                    vector((i, j, 1)),
+                    zeros,
+                    vector((0, 9.8, j)),
+                    zeros,
+                )
+                put("/imu/data", "sensor_msgs/msg/Imu", imu, at)
+            image = t["sensor_msgs/msg/Image"](header(stamp, "left_frame"), H, W, "mono8", 0, W, _pixels(i, 0).ravel())
+            put("/left/image_raw", "sensor_msgs/msg/Image", image, stamp)
+            data = cv2.imencode(".png", _pixels(i, 1))[1].ravel()
+            packed = t["sensor_msgs/msg/CompressedImage"](header(stamp, "right_frame"), "png", data)
+            put("/right/image_raw", "sensor_msgs/msg/CompressedImage", packed, stamp)
+            point = t["geometry_msgs/msg/Point"](float(i), 2.0, 3.0)
+            pose = t["geometry_msgs/msg/Pose"](point, quaternion((0, 0, 0, 1)))
+            stamped = t["geometry_msgs/msg/PoseStamped"](header(stamp, "world"), pose)
+            put("/ground_truth/pose", "geometry_msgs/msg/PoseStamped", stamped, stamp)
+        writer.finish()
+
+    with open_source(path) as source:
+        np.testing.assert_allclose(source.rig.left.params[:8], RADTAN.params[:8])
+        np.testing.assert_allclose(source.rig.left_T_right, LEFT_T_RIGHT, atol=1e-12)
+        assert source.ground_truth is not None
+        np.testing.assert_array_equal(source.ground_truth.positions[:, 0], np.arange(5.0))
+        for i, image in enumerate(source):
+            assert image.right is not None and image.imu is not None
+            np.testing.assert_array_equal(image.left, _pixels(i, 0))
+            np.testing.assert_array_equal(image.right, _pixels(i, 1))
+            np.testing.assert_array_equal(image.imu.gyro, [[i, j, 1] for j in range(3)])
+            np.testing.assert_array_equal(image.imu.accel, [[0, 9.8, j] for j in range(3)])
+            assert image.imu.stamp_ns[-1] == image.stamp_ns
+
+
+def _error(path: Path | str, capsys: pytest.CaptureFixture[str]) -> str:
+    """What `info` or `record` says on standard error: one line, exit code 2."""
+    out = Path(str(path)).with_name("never.mcap")
+    assert main(["record", str(path), "-o", str(out)]) == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert not out.exists()
+    return lines[-1]
+
+
+def test_bad_files_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "no such file" in _error(tmp_path / "missing.mcap", capsys)
+    (tmp_path / "empty.mcap").write_bytes(b"")
+    assert "is empty" in _error(tmp_path / "empty.mcap", capsys)
+    (tmp_path / "text.mcap").write_text("hello")
+    assert "not an MCAP file" in _error(tmp_path / "text.mcap", capsys)
+    no_images = _write(tmp_path / "none.mcap", [])
+    assert "holds no images (its topics: " in _error(no_images, capsys)
+    nothing = _write(tmp_path / "nothing.mcap", [], [], transforms=())
+    assert "no messages at all" in _error(nothing, capsys)
+
+    def video(i: int, eye: int, frame: str) -> CompressedVideo:
+        return CompressedVideo(frame_id=frame, format="h264", data=b"x")
+
+    assert "is video, which is not supported" in _error(_write(tmp_path / "video.mcap", image=video), capsys)
+
+
+def test_bad_calibrations_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def uncalibrated(eye: int, message: CameraCalibration) -> None:
+        message.K[0] = 0.0
+
+    def strange(eye: int, message: CameraCalibration) -> None:
+        message.distortion_model = "fisheye62"
+
+    def small(eye: int, message: CameraCalibration) -> None:
+        message.width = 32
+
+    missing = _write(tmp_path / "a.mcap", calibrations=())
+    assert "holds no calibration of its images: give one with --rig FILE" in _error(missing, capsys)
+    assert "not calibrated" in _error(_write(tmp_path / "b.mcap", edit=uncalibrated), capsys)
+    assert "lens model 'fisheye62' is not supported" in _error(_write(tmp_path / "c.mcap", edit=strange), capsys)
+    assert "no transform from 'left_optical' to 'right_optical'" in _error(
+        _write(tmp_path / "d.mcap", transforms=()), capsys
+    )
+    assert "64x48 but the calibration is for 32x48" in _error(_write(tmp_path / "e.mcap", edit=small), capsys)
+
+
+def test_a_given_rig_stands_in_for_a_missing_calibration(tmp_path: Path) -> None:
+    from calib import save_rig
+
+    path = _write(tmp_path / "a.mcap", calibrations=(), transforms=())
+    save_rig(Rig(RADTAN, RADTAN, LEFT_T_RIGHT.copy()), tmp_path / "rig.yaml")
+    with open_source(path, rig=tmp_path / "rig.yaml") as source:
+        assert len(list(source)) == 6
+    assert main(["record", str(path), "--rig", str(tmp_path / "rig.yaml"), "-o", str(tmp_path / "b.mcap"), "-q"]) == 0
+    with open_source(tmp_path / "b.mcap") as source:
+        np.testing.assert_allclose(source.rig.left_T_right, LEFT_T_RIGHT, atol=1e-12)
+
+
+def test_our_own_file_with_a_rig_of_another_size(tmp_path: Path) -> None:
+    path = tmp_path / "own.mcap"
+    write_recording(path, ArraySource(fisheye_rig(), stereo_images(2, np.random.default_rng(0))))
+    with open_source(path, rig=fisheye_rig(32, 32)) as source, pytest.raises(StereoSfmError, match="96x80 but the cal"):
+        list(source)
+
+
+def test_a_cut_off_file_of_others_is_read_as_far_as_it_goes(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = _write(tmp_path / "a.mcap", count=400)
+    path.write_bytes(path.read_bytes()[:-20_000])
+    with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(path) as source:
+        images = list(source)
+    assert 100 < len(images) < 400 and "truncated" in caplog.text
+
+
+def test_info_speaks_of_gaps_skew_and_topics(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = _write(tmp_path / "a.mcap", count=40, skew_ns=3_000_000, skip=[(i, e) for i in (9, 10) for e in (0, 1)])
+    assert main(["info", str(path)]) == 0
+    text = capsys.readouterr().out
+    assert "images: 38 at 20.00 Hz, jitter 0.00 ms, 1 gaps up to 0.150 s" in text
+    assert "problem: 1 gaps between images (longest 0.150 s, about 2 frames missing)" in text
+    assert "problem: the eyes are up to 3.00 ms apart" in text
+    assert "/stereo/left/image_raw" in text and "foxglove.RawImage" in text and "radtan 64x48" in text
+    assert main(["info", str(path), "--json"]) == 0
+    import json
+
+    found = json.loads(capsys.readouterr().out)
+    assert found["images"]["missing"] == 2 and found["skew_ms"] == 3.0
+
+
+def test_info_of_our_own_file_and_of_a_cut_off_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "own.mcap"
+    write_recording(path, ArraySource(fisheye_rig(), stereo_images(40, np.random.default_rng(0))))
+    assert main(["info", str(path)]) == 0
+    text = capsys.readouterr().out
+    assert "40 at 30.00 Hz" in text and "1 counted as dropped, eyes at most 0.040 ms apart" in text
+    assert "closed properly" in text and "baseline 64.10 mm" in text
+    path.write_bytes(path.read_bytes()[:-1500])
+    assert main(["info", str(path)]) == 0
+    assert "problem: truncated, " in capsys.readouterr().out
+    assert main(["info", str(tmp_path / "x")]) == 2
+
+
+def test_info_of_a_dataset_folder(data_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", str(data_root / "euroc_mh01")]) == 0
+    text = capsys.readouterr().out
+    assert "images: 180 at 20.00 Hz" in text and "ground truth: 1830 poses" in text and "baseline 110.08 mm" in text
