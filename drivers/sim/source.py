@@ -125,7 +125,7 @@ class SimSource:
         self.options = options
         self.live = options.realtime
         self.rig = make_rig(options.camera, _size(options.size))
-        self.world = _world(scene.layout, options.seed, options.exchange)
+        self.layout = scene.layout
         self.effects = _effects(scene, options)
         gait = dataclasses.replace(
             scene.gait, speed=options.speed or scene.gait.speed, vibration=scene.gait.vibration * options.vibration
@@ -162,6 +162,11 @@ class SimSource:
         return _EPOCH_NS + round(frame_id * 1e9 / self.options.rate)
 
     @property
+    def world(self) -> Tables:
+        """The store, built when first needed."""
+        return _world(self.layout, self.options.seed, self.options.exchange)
+
+    @property
     def renderer(self) -> Renderer:
         """Made when first needed: its rays take a while."""
         if self._renderer is None:
@@ -187,7 +192,7 @@ class SimSource:
         twist = np.zeros(6) if twist is None else twist
         twists = [twist, se3.adjoint(se3.inverse(self.rig.left_T_right)) @ twist]
         level = brightness(self.effects, seconds, o.seed)
-        views = self.view(world_T_cam, seconds)
+        views = self.view(world_T_cam, seconds)  # before the sensors: it makes them
         left, right = (
             sensor.expose(view, twists[k], level, _noise_key(o.seed, frame_id, k))
             for k, (sensor, view) in enumerate(zip(self._sensors, views, strict=True))

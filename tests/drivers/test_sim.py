@@ -1,0 +1,147 @@
+"""The simulated store as a source: bits, truth, options."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from drivers.sim.scenes import SCENES, random_poses
+from drivers.sim.source import SimSource, open_sim, read_options
+from drivers.sim.world import Layout
+from drivers.source import open_source
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
+from stereo_sfm.types import StereoImage
+
+SMALL = Layout(gondolas=2, gondola_length=5.0, products=40)
+
+
+def small(name: str = "loop", **options: object) -> SimSource:
+    """A named scene in a store that is quick to build, small images."""
+    scene = dataclasses.replace(SCENES[name], layout=SMALL)
+    return SimSource(name, scene, read_options({"size": "212x200", **options}))
+
+
+def same(a: StereoImage, b: StereoImage) -> bool:
+    assert a.right is not None and b.right is not None
+    return bool((a.left == b.left).all() and (a.right == b.right).all()) and a.stamp_ns == b.stamp_ns
+
+
+def test_frames_alone_and_in_order_are_the_same_bits() -> None:
+    in_order = list(small("people", start=40, frames=3))
+    other = small("people")
+    for image in reversed(in_order):
+        assert same(image, other.frame(image.frame_id))
+    assert not same(in_order[0], in_order[1])
+
+
+def test_seed_walk_and_effects_change_the_pictures() -> None:
+    base = small().frame(100)
+    for options in ({"seed": 1}, {"walk": 1}, {"effects": "off"}, {"exchange": 0.5}, {"noise": 0.5}, {"blur": 9}):
+        assert (small(**options).frame(100).left != base.left).mean() > 0.02, options
+
+
+def test_named_scenes_open_by_the_source_table() -> None:
+    source = open_source("sim:aisle?camera=pinhole&size=160x100&length=2&seed=5")
+    with source:
+        image = next(iter(source))
+        assert source.name == "sim:aisle"
+        assert image.left.shape == (100, 160) == source.rig.left.size[::-1]
+        assert source.rig.baseline == pytest.approx(0.075)
+        assert source.ground_truth is not None and source.frame_count == len(source.ground_truth)
+        assert 1.5 < source.ground_truth.length < 2.3
+    assert image.left.std() > 10
+
+
+def test_truth_belongs_to_the_frames_that_arrive() -> None:
+    whole, holed = small(frames=60), small(frames=60, drop=0.3)
+    assert whole.ground_truth is not None and holed.ground_truth is not None
+    assert holed.frame_count is not None and 25 < holed.frame_count < 58
+    previous = -1
+    for n, k in enumerate(holed.frame_ids.tolist()):
+        assert (holed.ground_truth.poses[n] == whole.ground_truth.poses[k]).all()
+        assert holed.ground_truth.stamp_ns[n] == whole.ground_truth.stamp_ns[k] == holed.stamp_ns(k)
+        previous = k
+    assert previous > 0
+    images = [image for image, _ in zip(holed, range(4), strict=False)]
+    gaps = np.diff([-1, *(i.frame_id for i in images)]) - 1
+    assert [i.dropped_before for i in images] == gaps.tolist()
+    assert same(images[-1], dataclasses.replace(whole.frame(images[-1].frame_id)))
+
+
+@pytest.mark.parametrize("name", sorted(SCENES))
+@pytest.mark.parametrize("walk", [0, 1])
+def test_walks_are_smooth_and_keep_clear_of_the_shelves(name: str, walk: int) -> None:
+    scene = SCENES[name]
+    source_walk = small_walk(name, walk)
+    seconds = np.arange(0, source_walk.duration, 0.01)
+    poses = source_walk.poses(seconds)
+    twist = se3.log(se3.inverse(poses[:-1]) @ poses[1:]) / 0.01
+    assert np.linalg.norm(twist[:, :3], axis=1).max() < 1.35
+    assert np.rad2deg(np.linalg.norm(twist[:, 3:], axis=1)).max() < 90
+    jerk = np.diff(twist, n=2, axis=0) / 0.01**2
+    assert np.abs(jerk).max() < 120  # a corner of a polyline would be thousands
+    at = poses[:, :2, 3]
+    for k in range(scene.layout.gondolas):
+        y = scene.layout.gondola_y(k)
+        lo = np.array([scene.layout.margin, y - 0.56])
+        hi = np.array([scene.layout.margin + scene.layout.gondola_length, y + 0.56])
+        assert np.linalg.norm(np.maximum(np.maximum(lo - at, at - hi), 0), axis=1).min() > 0.6
+    assert np.abs(np.linalg.det(poses[:, :3, :3]) - 1).max() < 1e-9
+
+
+def small_walk(name: str, walk: int):
+    """The scene's own walk, without building its store."""
+    from drivers.sim.walks import Walk
+
+    scene = SCENES[name]
+    route = scene.route(scene.layout, walk, True)
+    return Walk(route, scene.gait, np.random.default_rng([0, walk, 31]), scene.length)
+
+
+def test_loop_comes_back_and_overlaps() -> None:
+    walk = small_walk("loop", 0)
+    poses = walk.poses(np.arange(0, walk.duration, 1 / 30))
+    at, ahead = poses[:, :2, 3], poses[:, :3, 2]
+    late = np.arange(len(at)) > 600
+    near = np.linalg.norm(at[late][:, None] - at[None, :200], axis=2) < 0.3
+    again = near & ((ahead[late][:, None] * ahead[None, :200]).sum(2) > 0.97)
+    assert again.any(1).sum() > 60  # two seconds and more in the tracks of the beginning
+
+
+def test_random_poses_are_inside_and_upright() -> None:
+    poses = random_poses(SMALL, 50, np.random.default_rng(1))
+    assert (poses[:, :3, 3] > 0).all() and (poses[:, :3, 3] < SMALL.room).all()
+    assert (poses[:, 2, 1] < -0.9).all()  # the camera's y points down
+    assert np.allclose(poses[:, :3, :3] @ np.swapaxes(poses[:, :3, :3], 1, 2), np.eye(3))
+
+
+@pytest.mark.parametrize(
+    ("spec", "text"),
+    [
+        ("sim:shop", "unknown scene"),
+        ("sim:loop?colour=1", "unknown option"),
+        ("sim:loop?camera=gopro", "unknown camera"),
+        ("sim:loop?seed=x", "whole number"),
+        ("sim:loop?rate=0", "between"),
+        ("sim:loop?size=big", "WIDTHxHEIGHT"),
+        ("sim:loop?effects=maybe", "on or off"),
+        ("sim:loop?exchange=nan", "between"),
+    ],
+)
+def test_bad_specs_are_one_line(spec: str, text: str) -> None:
+    with pytest.raises(StereoSfmError, match=text) as caught:
+        open_source(spec)
+    assert "\n" not in str(caught.value)
+
+
+def test_start_beyond_the_end() -> None:
+    with pytest.raises(StereoSfmError, match="beyond"):
+        small(start=10**6)
+
+
+def test_default_is_the_loop() -> None:
+    with pytest.raises(StereoSfmError, match="beyond"):
+        open_sim("", start=10**6)
