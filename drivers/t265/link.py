@@ -13,6 +13,9 @@ from drivers.t265 import messages as m
 from drivers.t265 import protocol
 from drivers.t265.usb_device import UsbDevice, device_error, place
 
+_BULK, _INTERRUPT = 2, 3
+_ENDPOINTS = {(m.COMMAND_OUT, _BULK), (m.COMMAND_IN, _BULK), (m.VIDEO_IN, _BULK), (m.EVENT_IN, _INTERRUPT)}
+
 
 @dataclass(frozen=True)
 class Timing:
@@ -62,10 +65,10 @@ class Link:
                     raise
                 self.device.set_configuration()  # macOS leaves it unconfigured
                 configuration = self.device.get_active_configuration()
-            endpoints = {e.bEndpointAddress for e in configuration[(0, 0)].endpoints()}
-            missing = {m.COMMAND_OUT, m.COMMAND_IN, m.VIDEO_IN, m.EVENT_IN} - endpoints
+            endpoints = {(e.bEndpointAddress, e.bmAttributes & 3) for e in configuration[(0, 0)].endpoints()}
+            missing = _ENDPOINTS - endpoints
             if missing:
-                raise DeviceFault(f"{self.what} has no endpoint {min(missing):#04x}: not a T265 this driver knows")
+                raise DeviceFault(f"{self.what} has no endpoint {min(missing)[0]:#04x}: not a T265 this driver knows")
             usb.util.claim_interface(self.device, 0)
         except usb.core.USBError as error:
             raise device_error(error, f"cannot open the {self.what}") from None
