@@ -1,0 +1,123 @@
+"""`stereo-sfm map`: what a saved map holds; merge, prune and export maps."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from stereo_sfm.export.saved_map import SavedMap
+    from stereo_sfm.loop.vocabulary import Vocabulary
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of this command."""
+    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+    info = actions.add_parser("info", help="what a map holds")
+    info.add_argument("map", type=Path, help="map folder")
+    merge = actions.add_parser("merge", help="several walks of one store become one map")
+    merge.add_argument("maps", type=Path, nargs="+", metavar="MAP", help="map folders; the first keeps its frame")
+    _output(merge)
+    merge.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="configuration, as in 'run'")
+    prune = actions.add_parser("prune", help="leave out points that are no longer there")
+    prune.add_argument("map", type=Path, help="map folder")
+    _output(prune)
+    prune.add_argument("--min-views", type=int, default=0, metavar="N", help="points seen by fewer keyframes go")
+    prune.add_argument(
+        "--min-seen-share", type=float, default=0.0, metavar="X", help="points seen in less of the views they lay in go"
+    )
+    prune.add_argument(
+        "--unseen-sessions", type=int, default=0, metavar="N", help="points that the newest N walks did not see go"
+    )
+    from stereo_sfm.commands import export
+
+    export.add_arguments(actions.add_parser("export", help="a map in the formats of other programs"))
+
+
+def _output(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the new map")
+    parser.add_argument("--overwrite", action="store_true", help="replace the map that lies there")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do what the action says."""
+    if args.action == "export":
+        from stereo_sfm.commands import export
+
+        return export.run(args)
+    return {"info": _info, "merge": _merge, "prune": _prune}[args.action](args)
+
+
+def _info(args: argparse.Namespace) -> int:
+    from stereo_sfm.export.saved_map import load_map
+
+    print("\n".join(describe(load_map(args.map))))
+    return 0
+
+
+def describe(saved: SavedMap) -> list[str]:
+    """What a map holds, for people."""
+    import numpy as np
+
+    s = saved.snapshot
+    views = np.bincount(s.obs_pt, minlength=len(s.pt_ids))
+    steps = np.linalg.norm(np.diff(s.map_T_kf[:, :3, 3], axis=0), axis=1)
+    extent = s.points.max(0) - s.points.min(0)
+    rig = saved.rig
+    return [
+        f"{len(s.kf_ids)} keyframes, {len(s.pt_ids)} points, {len(s.obs_kf)} observations"
+        f" ({views.mean():.1f} views a point)",
+        f"{int(saved.sessions.max()) + 1} walk(s), {len(np.unique(s.submap_ids))} submap(s),"
+        f" {float(steps[s.submap_ids[1:] == s.submap_ids[:-1]].sum()):.1f} m between keyframes",
+        f"points extend {extent[0]:.1f} x {extent[1]:.1f} x {extent[2]:.1f} m",
+        f"camera {rig.left.model} {rig.left.width}x{rig.left.height}, baseline {1000 * rig.baseline:.1f} mm",
+        f"vocabulary {saved.vocabulary_id}",
+    ]
+
+
+def _merge(args: argparse.Namespace) -> int:
+    from stereo_sfm import config as configuration
+    from stereo_sfm.errors import StereoSfmError
+    from stereo_sfm.export.merge import merge
+    from stereo_sfm.export.saved_map import load_map, save_map
+
+    if len(args.maps) < 2:
+        raise StereoSfmError("merge takes at least two maps")
+    _check_free(args)
+    config = configuration.load(None, args.set).loop
+    maps = [load_map(folder) for folder in args.maps]
+    result = merge(maps, _vocabulary(maps[0], config.vocabulary), config)
+    save_map(result.saved, args.output)
+    print(f"{len(maps)} maps joined by {len(result.loops)} loops, {result.fused} points seen by more than one walk")
+    print("\n".join(describe(result.saved)))
+    return 0
+
+
+def _vocabulary(saved: SavedMap, named: str) -> Vocabulary:
+    """The vocabulary to compare maps with: any will do, since maps keep their descriptors."""
+    from stereo_sfm.loop.vocabulary_file import default_vocabulary, load_vocabulary
+
+    return load_vocabulary(Path(named)) if named else default_vocabulary()
+
+
+def _prune(args: argparse.Namespace) -> int:
+    from stereo_sfm.export.merge import prune
+    from stereo_sfm.export.saved_map import load_map, save_map
+
+    _check_free(args)
+    saved = load_map(args.map)
+    pruned = prune(saved, args.min_views, args.min_seen_share, args.unseen_sessions)
+    save_map(pruned, args.output)
+    before, after = saved.snapshot, pruned.snapshot
+    print(
+        f"{len(before.pt_ids)} points became {len(after.pt_ids)}, {len(saved)} keyframes {len(pruned)}: {args.output}"
+    )
+    return 0
+
+
+def _check_free(args: argparse.Namespace) -> None:
+    from stereo_sfm.errors import StereoSfmError
+
+    if (args.output / "map.json").exists() and not args.overwrite:
+        raise StereoSfmError(f"{args.output} holds a map: choose another -o, or say --overwrite")

@@ -1,0 +1,100 @@
+"""COLMAP text model (3.12 and later: rigs and frames; the classic three files are complete for older readers).
+
+COLMAP's poses are cam_from_world, quaternions w first, and the centre of the top-left pixel is (0.5, 0.5).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from calib.formats.colmap import write_colmap
+from calib.rig import Rig
+from stereo_sfm.export.saved_map import SavedMap
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.cameras import Camera
+from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.types import F64
+
+HALF_PIXEL = 0.5
+GREY = "128 128 128"
+
+
+def image_name(frame_id: int, eye: str) -> str:
+    """Where COLMAP looks for the picture of a frame, below its image folder."""
+    return f"{eye}/{frame_id:06d}.png"
+
+
+def export_colmap(saved: SavedMap, folder: Path) -> None:
+    """cameras, rigs, frames, images and points3D as text."""
+    rig, s = _eyes(saved.rig), saved.snapshot
+    write_colmap(rig, folder)
+    eyes = [("left", rig.left, np.eye(4), s.uv_left)]
+    if rig.right is not None:
+        eyes.append(("right", rig.right, se3.inverse(rig.left_T_right), s.uv_right))
+    _write_frames(s, len(eyes), folder / "frames.txt")
+    tracks = _write_images(s, eyes, folder / "images.txt")
+    errors = _reprojection_errors(s, eyes)
+    _write_points(s, tracks, errors, folder / "points3D.txt")
+
+
+def _eyes(rig: Rig) -> Rig:
+    """A depth camera has one real eye."""
+    return Rig(rig.left, name=rig.name) if rig.depth else rig
+
+
+def _pose(cam_T_map: F64) -> str:
+    x, y, z, w = se3.quaternion_from_rotation(cam_T_map[:3, :3]).tolist()
+    return " ".join(repr(float(v)) for v in (w, x, y, z, *cam_T_map[:3, 3]))
+
+
+def _write_frames(s: MapSnapshot, eyes: int, path: Path) -> None:
+    lines = [
+        "# FRAME_ID, RIG_ID, RIG_FROM_WORLD[QW..TZ], NUM_DATA_IDS, DATA_IDS[] as (SENSOR_TYPE, SENSOR_ID, DATA_ID)"
+    ]
+    for k, pose in enumerate(se3.inverse(s.map_T_kf)):
+        data = " ".join(f"CAMERA {e + 1} {k * eyes + e + 1}" for e in range(eyes))
+        lines.append(f"{k + 1} 1 {_pose(pose)} {eyes} {data}")
+    path.write_text("\n".join(lines) + "\n")
+
+
+def _write_images(s: MapSnapshot, eyes: list[tuple[str, Camera, F64, F64]], path: Path) -> list[list[str]]:
+    """Write all images; returns for each point its track as 'IMAGE_ID INDEX' entries."""
+    lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
+    bounds = np.searchsorted(s.obs_kf, np.arange(len(s.kf_ids) + 1)).tolist()
+    tracks: list[list[str]] = [[] for _ in range(len(s.pt_ids))]
+    for k, left_T_map in enumerate(se3.inverse(s.map_T_kf)):
+        for e, (name, _, eye_T_left, uv) in enumerate(eyes):
+            image_id = k * len(eyes) + e + 1
+            rows = np.arange(bounds[k], bounds[k + 1])
+            rows = rows[np.isfinite(uv[rows, 0])]
+            lines.append(f"{image_id} {_pose(eye_T_left @ left_T_map)} {e + 1} {image_name(int(s.frame_ids[k]), name)}")
+            pixels, points = (uv[rows] + HALF_PIXEL).tolist(), s.obs_pt[rows].tolist()
+            lines.append(" ".join(f"{u!r} {v!r} {p + 1}" for (u, v), p in zip(pixels, points, strict=True)))
+            for n, point in enumerate(points):
+                tracks[point].append(f"{image_id} {n}")
+    path.write_text("\n".join(lines) + "\n")
+    return tracks
+
+
+def _reprojection_errors(s: MapSnapshot, eyes: list[tuple[str, Camera, F64, F64]]) -> F64:
+    """(P,) mean distance in px between where a point was seen and where it should be."""
+    total, count = np.zeros(len(s.pt_ids)), np.zeros(len(s.pt_ids))
+    kf_T_map = se3.inverse(s.map_T_kf)
+    for _, camera, eye_T_left, uv in eyes:
+        pose = eye_T_left @ kf_T_map[s.obs_kf]
+        seen = np.einsum("nij,nj->ni", pose[:, :3, :3], s.points[s.obs_pt]) + pose[:, :3, 3]
+        distance = np.linalg.norm(camera.project(seen) - uv, axis=1)
+        ok = np.isfinite(distance)
+        np.add.at(total, s.obs_pt[ok], distance[ok])
+        np.add.at(count, s.obs_pt[ok], 1)
+    return total / np.maximum(count, 1)
+
+
+def _write_points(s: MapSnapshot, tracks: list[list[str]], errors: F64, path: Path) -> None:
+    lines = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"]
+    for p, (xyz, error, track) in enumerate(zip(s.points.tolist(), errors.tolist(), tracks, strict=True)):
+        x, y, z = xyz
+        lines.append(f"{p + 1} {x!r} {y!r} {z!r} {GREY} {error!r} {' '.join(track)}")
+    path.write_text("\n".join(lines) + "\n")

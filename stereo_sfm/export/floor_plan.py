@@ -1,0 +1,188 @@
+"""A floor plan of the store: occupancy from points, free space along the rays to them, aligned to the aisles.
+
+Written as ROS's map_server reads it: a grey PNG (white free, black occupied, grey unknown) and a YAML beside it.
+"""
+
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportMissingTypeArgument=false
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.export.saved_map import SavedMap
+from stereo_sfm.geometry import se3
+from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.types import F64, I32, U8, Bool
+
+FREE, OCCUPIED, UNKNOWN = 254, 0, 205
+LOW, HIGH = 0.15, 1.9  # metres above the floor that a robot can bump into
+MAX_RANGE = 6.0  # metres; stereo points further away blur the plan
+MARGIN = 0.5  # metres around what was seen
+MIN_HITS = 3  # points that make a cell occupied
+njit: Any = numba.njit(cache=True, nogil=True, error_model="numpy")
+
+
+@dataclass(frozen=True, eq=False)
+class FloorPlan:
+    """Row 0 of `image` is the far end of y, as pictures are; cell (0, 0) of map_server is its last row."""
+
+    image: U8  # (H, W) FREE, OCCUPIED or UNKNOWN
+    resolution: float  # metres per pixel
+    origin: tuple[float, float]  # metres, lower left corner of the picture in the floor frame
+    map_T_floor: F64  # (4, 4) floor frame: x and y along the aisles and across, z up, z = 0 on the floor
+
+
+def make_floor_plan(s: MapSnapshot, resolution: float = 0.05) -> FloorPlan:
+    """Find the floor and the aisles' direction, then count hits and passing rays per cell.
+
+    Raises:
+        StereoSfmError: too few points.
+    """
+    if len(s.points) < 50:
+        raise StereoSfmError("the map holds too few points for a floor plan")
+    map_T_floor = find_floor(s)
+    points = se3.transform(se3.inverse(map_T_floor), s.points)
+    cameras = se3.transform(se3.inverse(map_T_floor), s.map_T_kf[:, :3, 3])
+    near = np.linalg.norm(points[s.obs_pt] - cameras[s.obs_kf], axis=1) < MAX_RANGE
+    rays_kf, rays_pt = s.obs_kf[near], s.obs_pt[near]
+    used = points[np.unique(rays_pt)]
+    solid = used[(used[:, 2] > LOW) & (used[:, 2] < HIGH)]
+    corners = np.concatenate([solid[:, :2], cameras[:, :2]])
+    low = np.floor((corners.min(0) - MARGIN) / resolution) * resolution
+    size = np.ceil((corners.max(0) + MARGIN - low) / resolution).astype(int)
+    passed = np.zeros((size[1], size[0]), np.int32)
+    _trace(np.ascontiguousarray(cameras[rays_kf]), np.ascontiguousarray(points[rays_pt]), low, resolution, passed)
+    hits = np.zeros_like(passed)
+    cell = ((solid[:, :2] - low) / resolution).astype(int)
+    np.add.at(hits, (cell[:, 1], cell[:, 0]), 1)
+    return FloorPlan(_paint(hits, passed), resolution, (float(low[0]), float(low[1])), map_T_floor)
+
+
+def _paint(hits: I32, passed: I32) -> U8:
+    import cv2
+
+    blurred = cv2.boxFilter(hits.astype(np.float32), -1, (3, 3), normalize=False)
+    rays = cv2.boxFilter(passed.astype(np.float32), -1, (3, 3))
+    occupied = (hits > 0) & (blurred >= MIN_HITS) & (blurred > 0.25 * rays)
+    image = np.full(hits.shape, UNKNOWN, np.uint8)
+    image[passed > 0] = FREE
+    image[occupied] = OCCUPIED
+    return np.ascontiguousarray(image[::-1])
+
+
+@njit
+def _trace(start, end, low, resolution, passed):
+    """Count each ray in the cells it crosses between floor and shelf height, up to one cell before its point."""
+    h, w = passed.shape
+    for k in range(start.shape[0]):
+        dx, dy, dz = end[k, 0] - start[k, 0], end[k, 1] - start[k, 1], end[k, 2] - start[k, 2]
+        length = math.sqrt(dx * dx + dy * dy)
+        steps = int(length / (0.5 * resolution)) - 4
+        last_x, last_y = -1, -1
+        for i in range(steps):
+            f = i * 0.5 * resolution / length
+            z = start[k, 2] + f * dz
+            if z < 0.02 or z > 1.9:
+                continue
+            x = int((start[k, 0] + f * dx - low[0]) / resolution)
+            y = int((start[k, 1] + f * dy - low[1]) / resolution)
+            if (x != last_x or y != last_y) and 0 <= x < w and 0 <= y < h:
+                passed[y, x] += 1
+                last_x, last_y = x, y
+
+
+def find_floor(s: MapSnapshot) -> F64:
+    """map_T_floor (4, 4): z up from the floor plane, x along the dominant horizontal direction of what stands on it."""
+    down = s.map_T_kf[:, :3, 1].mean(0)
+    if np.linalg.norm(down) < 0.3:
+        raise StereoSfmError("no floor plan: the cameras look in all directions, which way is down is not known")
+    down /= np.linalg.norm(down)
+    centre = s.map_T_kf[:, :3, 3].mean(0)
+    below = (s.points - centre) @ down
+    down, depth = _floor_plane(s.points - centre, below > 0.2, down)
+    across = np.cross(down, [1.0, 0, 0]) if abs(down[0]) < 0.9 else np.cross(down, [0, 0, 1.0])
+    x = across / np.linalg.norm(across)
+    axes = np.stack([x, np.cross(-down, x), -down], axis=1)
+    flat = (s.points - centre) @ axes[:, :2]
+    height = depth - (s.points - centre) @ down
+    yaw = aisle_direction(flat[(height > LOW) & (height < HIGH)])
+    c, n = math.cos(yaw), math.sin(yaw)
+    turned = axes @ np.array([[c, -n, 0], [n, c, 0], [0, 0, 1.0]])
+    return se3.from_rotation_translation(turned, centre + depth * down)
+
+
+def _floor_plane(points: F64, candidates: Bool, down: F64) -> tuple[F64, float]:
+    """Normal (pointing down) and depth below the origin of the lowest well-filled plane."""
+    depth = points[candidates] @ down
+    if len(depth) < 20:
+        return down, float(np.percentile(points @ down, 99)) if len(points) else 1.5
+    counts, edges = np.histogram(depth, np.arange(depth.min(), depth.max() + 0.1, 0.05))
+    smooth = np.convolve(counts, [1, 2, 1], "same")
+    full = np.flatnonzero(smooth > 0.4 * smooth.max())
+    level = float(edges[full[-1]] + 0.025)
+    near, normal = points[candidates][np.abs(depth - level) < 0.08], down
+    for _ in range(5):
+        mean = near.mean(0)
+        normal = np.linalg.svd(near - mean, full_matrices=False)[2][2]
+        normal *= np.sign(normal @ down)
+        if normal @ down < math.cos(math.radians(10)):
+            return down, level
+        distance = (points[candidates] - mean) @ normal
+        near = points[candidates][np.abs(distance) < 0.05]
+        if len(near) < 20:
+            return down, level
+    return normal, float(near.mean(0) @ normal)
+
+
+def aisle_direction(flat: F64) -> float:
+    """Angle in radians, within 45 degrees of 0, that makes the points (N, 2) fall on the fewest lines.
+
+    Shelf fronts along an axis give a histogram of few high bars: the angle with the largest sum of squared counts.
+    """
+    if len(flat) < 10:
+        return 0.0
+
+    def sharpness(angle: float) -> float:
+        c, n = math.cos(angle), math.sin(angle)
+        rotated = flat @ np.array([[c, -n], [n, c]])
+        total = 0.0
+        for axis in range(2):
+            values = rotated[:, axis]
+            counts = np.histogram(values, np.arange(values.min(), values.max() + 0.05, 0.05))[0].astype(float)
+            total += float((counts**2).sum())
+        return total
+
+    coarse = np.deg2rad(np.arange(-45, 45, 1.0))
+    best = coarse[int(np.argmax([sharpness(a) for a in coarse]))]
+    fine = best + np.deg2rad(np.arange(-1, 1.01, 0.1))
+    return float(fine[int(np.argmax([sharpness(a) for a in fine]))])
+
+
+def export_floor_plan(saved: SavedMap, path: Path, resolution: float = 0.05) -> FloorPlan:
+    """Write PATH.png and PATH.yaml; `path` may carry either ending."""
+    import cv2
+    import yaml
+
+    plan = make_floor_plan(saved.snapshot, resolution)
+    image = path.with_suffix(".png")
+    if not cv2.imwrite(str(image), plan.image):
+        raise StereoSfmError(f"cannot write {image}")
+    description = {
+        "image": image.name,
+        "resolution": plan.resolution,
+        "origin": [plan.origin[0], plan.origin[1], 0.0],
+        "negate": 0,
+        "occupied_thresh": 0.65,
+        "free_thresh": 0.196,
+        "mode": "trinary",
+        "map_T_floor": plan.map_T_floor.tolist(),
+    }
+    path.with_suffix(".yaml").write_text(yaml.safe_dump(description, sort_keys=False))
+    return plan

@@ -1,0 +1,147 @@
+"""Exports read back by the programs they are for: pycolmap, gtsam, and map_server's rules."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from stereo_sfm.cli import main
+from stereo_sfm.export.colmap import export_colmap
+from stereo_sfm.export.floor_plan import FREE, OCCUPIED, UNKNOWN, aisle_direction, make_floor_plan
+from stereo_sfm.export.g2o import export_g2o, graph_edges
+from stereo_sfm.export.ply import export_ply
+from stereo_sfm.export.saved_map import SavedMap, save_map
+from stereo_sfm.geometry import se3
+from tests.export.maps import small_map
+from tests.loop.store_walk import StoreWalk
+
+
+@pytest.fixture(scope="module")
+def walk_and_map() -> tuple[StoreWalk, SavedMap]:
+    return small_map()
+
+
+@pytest.fixture(scope="module")
+def saved(walk_and_map: tuple[StoreWalk, SavedMap]) -> SavedMap:
+    return walk_and_map[1]
+
+
+def test_colmap_reads_the_model_and_its_own_projection_meets_the_pixels(tmp_path: Path, saved: SavedMap) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    export_colmap(saved, tmp_path)
+    model = pycolmap.Reconstruction(str(tmp_path))
+    s = saved.snapshot
+    assert model.num_images() == 2 * len(s.kf_ids)
+    assert model.num_frames() == len(s.kf_ids)
+    assert model.num_points3D() == len(s.pt_ids)
+    image = model.images[2 * 4 + 2]  # the right eye of the fifth keyframe
+    assert image.name == f"right/{int(s.frame_ids[4]):06d}.png"
+    cam_T_map = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
+    expected = se3.inverse(s.map_T_kf[4] @ saved.rig.left_T_right)
+    assert np.allclose(cam_T_map, expected, atol=1e-9)
+    errors = []
+    for point2d in image.points2D:
+        xyz = model.points3D[point2d.point3D_id].xyz
+        errors.append(np.linalg.norm(image.project_point(xyz) - point2d.xy))
+    assert saved.rig.right is not None
+    ours = saved.rig.right.project(se3.transform(expected, s.points[s.obs_pt[s.obs_kf == 4]]))
+    seen = s.uv_right[s.obs_kf == 4]
+    ok = np.isfinite(seen[:, 0])
+    assert np.allclose(errors, np.linalg.norm(ours - seen, axis=1)[ok], atol=1e-4)  # the half pixel cancels: same error
+    track = model.points3D[1].track.elements
+    assert len(track) == (s.obs_pt == 0).sum() + np.isfinite(s.uv_right[s.obs_pt == 0, 0]).sum()
+
+
+def test_classic_colmap_files_are_complete(tmp_path: Path, saved: SavedMap) -> None:
+    """Readers that know neither rigs nor frames take poses from images.txt."""
+    export_colmap(saved, tmp_path)
+    lines = [x for x in (tmp_path / "images.txt").read_text().splitlines() if not x.startswith("#")]
+    assert len(lines) == 2 * 2 * len(saved)
+    w, x, y, z, *t = map(float, lines[0].split()[1:8])
+    cam_T_map = se3.from_rotation_translation(se3.rotation_from_quaternion(np.array([x, y, z, w])), np.array(t))
+    assert np.allclose(cam_T_map, se3.inverse(saved.snapshot.map_T_kf[0]), atol=1e-12)
+
+
+def test_g2o_is_read_by_gtsam(tmp_path: Path, saved: SavedMap) -> None:
+    gtsam = pytest.importorskip("gtsam")
+    path = tmp_path / "g.g2o"
+    export_g2o(saved, path)
+    graph, values = gtsam.readG2o(str(path), True)
+    s = saved.snapshot
+    assert values.size() == len(s.kf_ids)
+    edges = graph_edges(s)
+    assert graph.size() == len(edges)
+    for k, kf_id in enumerate(s.kf_ids.tolist()):
+        assert np.allclose(values.atPose3(kf_id).matrix(), s.map_T_kf[k], atol=1e-5)
+    assert graph.error(values) < 1e-3
+    assert np.allclose(graph.at(0).noiseModel().sigmas()[3:], edges.sigmas[0, 0], rtol=1e-3)
+
+
+def test_ply_holds_the_points(tmp_path: Path, saved: SavedMap) -> None:
+    path = tmp_path / "p.ply"
+    export_ply(saved, path)
+    raw = path.read_bytes()
+    end = raw.index(b"end_header\n") + len(b"end_header\n")
+    header = raw[:end].decode()
+    assert f"element vertex {len(saved.snapshot.points)}" in header
+    row = struct.Struct("<fffBBBff")
+    assert len(raw) - end == row.size * len(saved.snapshot.points)
+    x, y, z, *_, views, session = row.unpack_from(raw, end + 7 * row.size)
+    assert np.allclose([x, y, z], saved.snapshot.points[7], rtol=1e-6)
+    assert views == (saved.snapshot.obs_pt == 7).sum() and session == 0
+
+
+def test_floor_plan_of_one_aisle(walk_and_map: tuple[StoreWalk, SavedMap]) -> None:
+    walk, saved = walk_and_map
+    plan = make_floor_plan(saved.snapshot, 0.05)
+    floor_T_map = se3.inverse(plan.map_T_floor)
+    cameras = se3.transform(floor_T_map, saved.snapshot.map_T_kf[:, :3, 3])
+    column = ((cameras[:, 0] - plan.origin[0]) / 0.05).astype(int)
+    row = plan.image.shape[0] - 1 - ((cameras[:, 1] - plan.origin[1]) / 0.05).astype(int)
+    inside = walk.world_T_kf[:, 2, 3] > 1.0
+    assert (plan.image[row[inside], column[inside]] == FREE).mean() > 0.9  # where the robot went is free
+    assert set(np.unique(plan.image)) <= {FREE, OCCUPIED, UNKNOWN}
+    # Shelf fronts stand 0.9 to 1.2 m left and right of the path, along it.
+    rows, columns = np.nonzero(plan.image == OCCUPIED)
+    xy = (
+        np.stack([columns * 0.05 + plan.origin[0], (plan.image.shape[0] - 1 - rows) * 0.05 + plan.origin[1]], 1) + 0.025
+    )
+    along = cameras[inside][-1, :2] - cameras[inside][0, :2]
+    along /= np.linalg.norm(along)
+    aside = np.abs((xy - cameras[inside][0, :2]) @ np.array([-along[1], along[0]]))
+    assert len(xy) > 50
+    assert ((aside > 0.75) & (aside < 1.4)).mean() > 0.85
+    assert min(abs(along[0]), abs(along[1])) < np.sin(np.deg2rad(2))  # the plan lies along the aisle
+
+
+def test_aisle_direction_finds_the_angle() -> None:
+    rng = np.random.default_rng(0)
+    walls = np.concatenate([np.stack([rng.uniform(0, 10, 500), np.full(500, y)], 1) for y in (0.0, 2.0, 4.5)])
+    for degrees in (-30.0, -3.0, 0.0, 12.0, 40.0):
+        c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+        turned = walls @ np.array([[c, s], [-s, c]]) + rng.normal(0, 0.01, walls.shape)
+        assert np.rad2deg(aisle_direction(turned)) == pytest.approx(degrees, abs=0.5)
+
+
+def test_export_command(tmp_path: Path, saved: SavedMap, capsys: pytest.CaptureFixture[str]) -> None:
+    save_map(saved, tmp_path / "m")
+    folder = str(tmp_path / "m")
+    assert main(["export", folder, "--format", "floor-plan", "-o", str(tmp_path / "plan.png")]) == 0
+    description = yaml.safe_load((tmp_path / "plan.yaml").read_text())
+    picture = cv2.imread(str(tmp_path / description["image"]), cv2.IMREAD_GRAYSCALE)
+    assert picture is not None and description["resolution"] == 0.05 and len(description["origin"]) == 3
+    occupied = (255 - picture.astype(float)) / 255 > description["occupied_thresh"]
+    free = (255 - picture.astype(float)) / 255 < description["free_thresh"]
+    assert occupied.any() and free.any() and (~occupied & ~free).any()
+    for kind in ("colmap", "ply", "g2o", "tum", "kitti", "euroc"):
+        assert main(["map", "export", folder, "--format", kind]) == 0
+    assert main(["export", folder, "--format", "ply"]) == 2
+    assert "exists: choose another -o" in capsys.readouterr().err
+    assert main(["export", str(tmp_path), "--format", "ply"]) == 2
+    assert "holds no map" in capsys.readouterr().err
+    assert len((tmp_path / "m" / "export_map.tum").read_text().splitlines()) == len(saved) + 1
