@@ -26,8 +26,9 @@ class Covisibility:
         apart = first != second
         if not apart.any():
             return
-        pairs, counts = np.unique(np.stack([first[apart], second[apart]]), axis=1, return_counts=True)
-        for a, b, n in zip(*pairs.tolist(), (counts * change).tolist(), strict=True):
+        size = len(self._rows)
+        keys, counts = np.unique(first[apart] * size + second[apart], return_counts=True)
+        for a, b, n in zip((keys // size).tolist(), (keys % size).tolist(), (counts * change).tolist(), strict=True):
             for x, y in ((a, b), (b, a)):
                 total = self._rows[x].get(y, 0) + n
                 if total > 0:
