@@ -2,10 +2,10 @@
 
     python benchmarks/map_growth.py
 
-Every keyframe sees 400 points: 300 of the one before it, 100 new ones; every tenth also sees the 100 that were
-new 500 keyframes earlier, as in a loop. An insertion is what the mapper asks of the map: new points, observations, covisibility,
-neighbours, the delta. Medians and 99th percentiles of the 100 insertions before each size; the worst one holds the
-doubling of a column.
+Every keyframe sees 400 points: 300 of the one before it, 100 new ones; every tenth also sees the 100 that were new 500
+keyframes earlier, as in a loop. An insertion is what the mapper asks of the map: new points, observations,
+covisibility, neighbours, the delta. Medians and 99th percentiles of the 100 insertions before each size; the worst one
+holds the doubling of a column.
 """
 
 from __future__ import annotations
