@@ -1,11 +1,14 @@
 from __future__ import annotations
 
+import itertools
 import json
 import os
+import re
 import signal
 import tomllib
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -106,6 +109,34 @@ def test_noise_is_not_tracked_and_says_so(tmp_path: Path, capsys: pytest.Capture
     assert main(["run", str(root), "-o", str(tmp_path / "out")]) == 4
     assert "never initialised" in capsys.readouterr().err
     assert "**FAIL**" in (tmp_path / "out" / "report.md").read_text()
+
+
+def test_lost_frames_are_said_and_filled(data_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Twenty-four frames of which three are black and one is no image."""
+    folder = tmp_path / "dark"
+    with stereo_sfm.open_source(data_root / "euroc_mh01") as source:
+        stereo_sfm.save_rig(source.rig, folder / "rig.yaml")
+        for side in ("left", "right"):
+            (folder / side).mkdir()
+        for image in itertools.islice(source, 24):
+            black = image.frame_id in (10, 11, 12)
+            for side, pixels in (("left", image.left), ("right", image.right)):
+                assert pixels is not None
+                cv2.imwrite(str(folder / side / f"{image.stamp_ns}.png"), pixels * np.uint8(not black))
+    broken = sorted((folder / "right").iterdir())[17]
+    broken.write_bytes(b"x")
+    assert main(["run", str(folder), "-o", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().out
+    assert re.search(r"tracked 20/24 frames \(1 dropped by capture\), 1 lost interval \(max 0\.[12] s, dark\)", said)
+    stats = json.loads((tmp_path / "out" / "stats.json").read_text())
+    assert stats["states"]["LOST"] == 3 and stats["dropped"] == 1
+    assert stats["lost_intervals"][0]["first_frame_id"] == 10 and stats["lost_intervals"][0]["frames"] == 3
+    assert "more light" in (tmp_path / "out" / "report.md").read_text()
+    assert len(read_tum(tmp_path / "out" / "trajectory_odom.tum")) == 20
+    kitti = read_kitti(tmp_path / "out" / "trajectory_odom.kitti")
+    assert len(kitti) == 24
+    steps = np.linalg.norm(np.diff(kitti.positions, axis=0), axis=1)
+    assert steps.max() < 0.05  # the filled ones lie between their neighbours
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
