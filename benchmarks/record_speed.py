@@ -1,0 +1,153 @@
+"""How fast `record` writes each image format on one core, and how much; and what each PNG setting costs.
+
+    python benchmarks/record_speed.py [SOURCE ...] [--frames 150] [--encoders]
+
+The default source is the simulated T265 (2 x 848 x 800). Frames are held in memory, so that only the recording counts;
+the process is pinned to one core. "keeps up" means more than 30 frames a second.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import TracebackType
+from typing import Self
+
+import cv2
+import zstandard
+
+from drivers import Source, open_source
+from stereo_sfm.log.images import FORMATS, PNG_OPTIONS
+from stereo_sfm.log.record import record
+from stereo_sfm.types import U8, StereoImage
+
+RATE = 30.0
+PERIOD_NS = round(1e9 / RATE)
+
+
+class Repeated:
+    """Frames from memory, played over and over until there are `count`, at 30 Hz by their stamps."""
+
+    live = False
+    ground_truth = None
+
+    def __init__(self, source: Source, images: list[StereoImage], count: int) -> None:
+        self.name, self.rig, self.images = source.name, source.rig, images
+        self.frame_count: int | None = count
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        return None
+
+    def __iter__(self) -> Iterator[StereoImage]:
+        endless = itertools.cycle(self.images)
+        for i in range(self.frame_count or 0):
+            yield replace(next(endless), frame_id=i, stamp_ns=i * PERIOD_NS, dropped_before=0)
+
+
+def load(spec: str, distinct: int) -> tuple[Source, list[StereoImage]]:
+    """Up to `distinct` frames of a source."""
+    with open_source(spec) as source:
+        return source, list(itertools.islice(source, distinct))
+
+
+def measure_recording(source: Source, images: list[StereoImage], count: int, folder: Path) -> None:
+    """One line per image format."""
+    raw_bytes = sum(eye.nbytes for eye in (images[0].left, images[0].right) if eye is not None)
+    print(
+        f"{'format':8} {'ms/frame':>9} {'of it CPU':>9} {'frames/s':>9} {'MB/s at 30 Hz':>14} {'of raw':>7}  keeps up"
+    )
+    for image_format in FORMATS:
+        path = folder / f"{image_format}.mcap"
+        wall, cpu = time.perf_counter(), time.process_time()
+        for _ in record(Repeated(source, images, count), path, image_format):
+            pass
+        wall, cpu = (time.perf_counter() - wall) / count, (time.process_time() - cpu) / count
+        size = path.stat().st_size / count
+        print(
+            f"{image_format:8} {wall * 1e3:9.2f} {cpu * 1e3:9.2f} {1 / wall:9.1f} {size * RATE / 1e6:14.2f} "
+            f"{size / raw_bytes:7.3f}  {'yes' if 1 / wall > RATE else 'no'} ({cpu * RATE:.0%} of the core)"
+        )
+        wall = time.perf_counter()
+        with open_source(path) as back:
+            frames = sum(1 for _ in back)
+        assert frames == count
+        print(f"{'':8} {(time.perf_counter() - wall) / count * 1e3:9.2f} reading")
+        path.unlink()
+
+
+def encoders() -> dict[str, Callable[[U8], bytes]]:
+    """Ways to store an image that were considered."""
+
+    def png(*options: int) -> Callable[[U8], bytes]:
+        return lambda image: cv2.imencode(".png", image, options)[1].tobytes()
+
+    def jpeg(quality: int) -> Callable[[U8], bytes]:
+        return lambda image: cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, quality))[1].tobytes()
+
+    level1 = (cv2.IMWRITE_PNG_COMPRESSION, 1)
+    table: dict[str, Callable[[U8], bytes]] = {
+        "raw": lambda image: image.tobytes(),
+        "raw, zstd 1": lambda image: zstandard.compress(image.tobytes(), 1),
+        "raw, zstd 3": lambda image: zstandard.compress(image.tobytes(), 3),
+        "png, OpenCV's default": png(),
+        "png 1": png(*level1),
+        "png, ours": png(*PNG_OPTIONS),
+    }
+    for strategy in ("FILTERED", "HUFFMAN_ONLY", "RLE"):
+        for filters in ("SUB", "UP", "AVG", "PAETH"):
+            table[f"png 1 {strategy} {filters}"] = png(
+                *level1,
+                cv2.IMWRITE_PNG_STRATEGY,
+                getattr(cv2, f"IMWRITE_PNG_STRATEGY_{strategy}"),
+                cv2.IMWRITE_PNG_FILTER,
+                getattr(cv2, f"IMWRITE_PNG_FILTER_{filters}"),
+            )
+    return table | {f"jpeg {quality}": jpeg(quality) for quality in (80, 90, 95)}
+
+
+def measure_encoders(images: list[StereoImage], count: int) -> None:
+    """One line per way to store an image."""
+    eyes = [eye for image in images for eye in (image.left, image.right) if eye is not None][:count]
+    for name, encode in encoders().items():
+        encode(eyes[0])
+        begin = time.process_time()
+        size = sum(len(encode(eye)) for eye in eyes)
+        spent = (time.process_time() - begin) / len(eyes)
+        print(f"{name:28} {spent * 1e3:7.2f} ms an image  {size / sum(eye.nbytes for eye in eyes):.3f} of raw")
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sources", nargs="*", default=["sim:loop?frames=12"])
+    parser.add_argument("--frames", type=int, default=150, help="frames to record in each format")
+    parser.add_argument("--distinct", type=int, default=12, help="different frames held in memory")
+    parser.add_argument("--encoders", action="store_true", help="compare ways to store an image")
+    parser.add_argument("--folder", type=Path, help="where to write (default: a temporary folder)")
+    args = parser.parse_args()
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    cv2.setNumThreads(1)
+    for spec in args.sources:
+        source, images = load(spec, args.distinct)
+        height, width = images[0].left.shape
+        print(f"\n{spec}: {len(images)} different frames of {1 if images[0].right is None else 2} x {width}x{height}")
+        with TemporaryDirectory(dir=args.folder) as folder:
+            measure_recording(source, images, args.frames, Path(folder))
+        if args.encoders:
+            measure_encoders(images, 24)
+
+
+if __name__ == "__main__":
+    main()
