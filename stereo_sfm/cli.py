@@ -27,6 +27,7 @@ COMMANDS: dict[str, str] = {
     "map": "what a saved map holds; merge, prune and export maps",
     "export": "a run or a map in the formats of other programs",
     "vocabulary": "train the words of place recognition, or describe them",
+    "ablation": "features, estimators and modules of the papers side by side",
     "eval": "compare a trajectory with ground truth",
     "devices": "which cameras are attached",
     "t265": "firmware and reset of a T265",

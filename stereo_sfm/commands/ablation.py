@@ -1,0 +1,108 @@
+"""`stereo-sfm ablation`: features, estimators and modules of the papers on any sources, beside our default."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stereo_sfm.errors import StereoSfmError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from stereo_sfm.eval.ablation import Cell
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of this command."""
+    parser.add_argument("sources", nargs="+", metavar="SOURCE", help="dataset folders, recordings, sim:SCENE")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="tables, plots and cells")
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes at once")
+    parser.add_argument("--frames", type=int, default=0, metavar="N", help="at most so many frames of each source")
+    parser.add_argument("--features", metavar="A,B", help="of orb, sift, akaze (default: all)")
+    parser.add_argument(
+        "--odometry", metavar="A,B", help="of em-r, vp-r, r-um, um, eight-point, pnp (default: first 4)"
+    )
+    parser.add_argument("--stages", metavar="A,B", help="of tracking, mapping, averaging, pose_graph (default: all)")
+    parser.add_argument("--systems", metavar="A,B", help="presets to add (default: all; none: leave them out)")
+    parser.add_argument("--seed", type=int, default=0, help="of everything random")
+    parser.add_argument("--again", action="store_true", help="compute cells anew that are there already")
+    parser.add_argument("-q", "--quiet", action="store_true", help="no progress")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run what is missing, then write the report over everything asked for."""
+    from stereo_sfm.eval.ablation import load_answer
+    from stereo_sfm.eval.ablation_report import write_report
+
+    cells = _cells(args)
+    folder: Path = args.output
+    store = folder / "cells"
+    store.mkdir(parents=True, exist_ok=True)
+    missing = [cell for cell in cells if args.again or load_answer(store / cell.file_name) is None]
+    if missing:
+        _run_all(missing, store, args.jobs, args.quiet, len(cells))
+    answers = [answer for cell in cells if (answer := load_answer(store / cell.file_name)) is not None]
+    report = write_report(folder, answers)
+    if not args.quiet:
+        good = sum(answer["status"] == "ok" for answer in answers)
+        print(f"{good} of {len(cells)} cells with a result, {len(cells) - good} with a reason why not: {report}")
+    return 0
+
+
+def _cells(args: argparse.Namespace) -> list[Cell]:
+    from stereo_sfm.eval import ablation
+    from stereo_sfm.presets import PRESETS
+    from stereo_sfm.tracking.features import TABLE as FEATURES
+    from stereo_sfm.tracking.odometry.table import TABLE as METHODS
+
+    if args.jobs < 1 or args.frames < 0:
+        raise StereoSfmError("--jobs must be at least 1 and --frames at least 0")
+    return ablation.grid(
+        args.sources,
+        _chosen(args.features, ablation.FEATURES, FEATURES, "features"),
+        _chosen(args.odometry, ablation.ESTIMATORS, METHODS, "odometry"),
+        _chosen(args.stages, tuple(ablation.STAGES), ablation.STAGES, "stages"),
+        () if args.systems == "none" else _chosen(args.systems, ablation.SYSTEMS, PRESETS, "systems"),
+        args.frames,
+        args.seed,
+    )
+
+
+def _chosen(text: str | None, default: Sequence[str], known: Iterable[str], what: str) -> Sequence[str]:
+    if text is None:
+        return default
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    wrong = [name for name in names if name not in set(known)]
+    if wrong or not names:
+        raise StereoSfmError(f"--{what}: unknown '{', '.join(wrong) or text}' (there are: {', '.join(known)})")
+    return names
+
+
+def _run_all(cells: Sequence[Cell], store: Path, jobs: int, quiet: bool, total: int) -> None:
+    """Spread the cells over processes; each file is written by the process that computed it."""
+    import multiprocessing
+    from concurrent.futures import ProcessPoolExecutor, as_completed
+
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from stereo_sfm.eval.ablation_worker import compute, one_thread
+
+    console = Console(stderr=True, quiet=quiet)
+    spawn = multiprocessing.get_context("spawn")
+    with (
+        ProcessPoolExecutor(jobs, mp_context=spawn, initializer=one_thread) as pool,
+        Progress(console=console, transient=True) as progress,
+    ):
+        task = progress.add_task("cells", total=total, completed=total - len(cells))
+        waiting = {pool.submit(compute, cell, store / cell.file_name): cell for cell in cells}
+        try:
+            for done in as_completed(waiting):
+                cell = waiting[done]
+                console.print(f"{Path(cell.source).name} {cell.name}: {done.result()}")
+                progress.advance(task)
+        except KeyboardInterrupt:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise

@@ -1,0 +1,191 @@
+"""One cell of the papers' ablation: a source, a front end, an estimator and the modules behind it; run and judged.
+
+A cell is a pure function of its description, so its answer is kept as a JSON file and not computed twice.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import re
+import time
+import traceback
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stereo_sfm.config import Config, load
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.eval.evaluate import evaluate
+from stereo_sfm.eval.record import RunRecord
+from stereo_sfm.presets import preset
+from stereo_sfm.types import Trajectory
+
+FEATURES = ("sift", "akaze", "orb")
+ESTIMATORS = ("em-r", "vp-r", "r-um", "um")
+# what runs behind the tracker -> overrides
+STAGES: dict[str, dict[str, Any]] = {
+    "tracking": {"mapper": {"enabled": False}, "loop": {"enabled": False}},
+    "mapping": {"loop": {"enabled": False}},
+    "averaging": {"loop": {"correction": "averaging"}},
+    "pose_graph": {"loop": {"correction": "pose_graph"}},
+}
+SYSTEMS = ("default", "retail-thesis", "sparse-localization", "cpp-course")
+_MIN_TRACKED = 0.5  # below this share of frames with a pose, a cell has no result
+_SCHEMA = 1
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One run."""
+
+    source: str
+    system: str  # a preset's name; "grid" for a combination of features and estimator
+    features: str  # "" for what the system uses
+    method: str  # "" for what the system uses
+    stage: str  # of STAGES, or "" for what the system does
+    frames: int  # at most so many, 0: all
+    seed: int = 0
+
+    @property
+    def name(self) -> str:
+        """For people, without the source."""
+        if self.system != "grid":
+            return self.system + (f" {self.stage}" if self.stage else "")
+        return f"{self.features} {self.method} {self.stage}"
+
+    @property
+    def file_name(self) -> str:
+        """Unique, readable, and the same in every session."""
+        digest = hashlib.sha256(repr((_SCHEMA, dataclasses.astuple(self))).encode()).hexdigest()[:8]
+        words = re.sub(r"[^a-z0-9]+", "-", f"{Path(self.source).name} {self.name}".lower()).strip("-")
+        return f"{words}-{digest}.json"
+
+    def config(self) -> Config:
+        """The configuration of this run."""
+        overrides = [f"seed={self.seed}"]
+        if self.system == "grid":
+            overrides += [f"features.kind={self.features}", f"odometry.method={self.method}"]
+        stage = [
+            f"{section}.{key}={json.dumps(value)}"
+            for section, values in STAGES.get(self.stage, {}).items()
+            for key, value in values.items()
+        ]
+        return load(base=preset("default" if self.system == "grid" else self.system), overrides=overrides + stage)
+
+
+def grid(
+    sources: Sequence[str],
+    features: Sequence[str] = FEATURES,
+    methods: Sequence[str] = ESTIMATORS,
+    stages: Sequence[str] = tuple(STAGES),
+    systems: Sequence[str] = SYSTEMS,
+    frames: int = 0,
+    seed: int = 0,
+) -> list[Cell]:
+    """Every cell, the quick ones of each source first."""
+    cells: list[Cell] = []
+    for source in sources:
+        for system in systems:
+            own = stages if system == "default" else ("",)
+            cells += [Cell(source, system, "", "", stage, frames, seed) for stage in own]
+        cells += [
+            Cell(source, "grid", kind, method, stage, frames, seed)
+            for stage in stages
+            for method in methods
+            for kind in features
+        ]
+    return cells
+
+
+def run_cell(cell: Cell) -> dict[str, Any]:
+    """Run and judge; every failure becomes a stated reason.
+
+    Returns:
+        Plain values for JSON: `status` is "ok" or "none" with `reason`.
+    """
+    from drivers.select import SelectedFrames
+    from drivers.source import open_source
+    from stereo_sfm.pipeline.run import run
+
+    answer: dict[str, Any] = {"schema": _SCHEMA, "cell": dataclasses.asdict(cell), "status": "none", "reason": ""}
+    record = RunRecord()
+    begin = time.perf_counter()
+    try:
+        config = cell.config()
+        source = open_source(cell.source)
+        with SelectedFrames(source, max_frames=cell.frames or None) as chosen:
+            for _ in run(chosen, config, [record]):
+                pass
+            truth = chosen.ground_truth
+            answer["source_name"] = chosen.name
+        answer |= _describe(record, time.perf_counter() - begin)
+        answer |= _judge(record, config, truth)
+    except StereoSfmError as error:
+        answer["reason"] = str(error)
+    except Exception:  # a cell that breaks is a finding of the table, not the end of the grid
+        answer["reason"] = "internal error: " + traceback.format_exc().strip().splitlines()[-1]
+        answer["traceback"] = traceback.format_exc()
+    return answer
+
+
+def _describe(record: RunRecord, wall_s: float) -> dict[str, Any]:
+    tracked = record.tracked()
+    lost = Counter(row.reason for row, good in zip(record.frames, tracked, strict=True) if not good)
+    spent = [ms["track"] for ms in record.times if "track" in ms]
+    return {
+        "frames": len(tracked),
+        "tracked": int(tracked.sum()),
+        "lost": dict(sorted(lost.items())),
+        "keyframes": len(record.keyframes),
+        "map_points": len(record.map_points),
+        "loops": len(record.loops),
+        "rejected_loops": dict(sorted(record.rejections.items())),
+        "track_ms": float(np.median(spent)) if spent else None,
+        "frame_ms": 1e3 * wall_s / max(len(tracked), 1),
+    }
+
+
+def _judge(record: RunRecord, config: Config, truth: Trajectory | None) -> dict[str, Any]:
+    """Errors of the trajectory that the last module gives: the map's where there is one, else the odometry."""
+    estimate = record.mapped() if config.mapper.enabled else record.odometry()
+    tracked = record.tracked()
+    if tracked.mean() < _MIN_TRACKED if len(tracked) else True:
+        reasons = Counter(row.reason for row, good in zip(record.frames, tracked, strict=True) if not good)
+        most, count = reasons.most_common(1)[0] if reasons else ("no frames", 0)
+        return {"reason": f"{most} in {count} of {len(tracked)} frames"}
+    if estimate is None:
+        return {"reason": "no map update came from the mapper"}
+    if truth is None:
+        return {"reason": "the source has no ground truth"}
+    result = evaluate(estimate, truth)
+    shown = evaluate(estimate, truth, "sim3" if config.odometry.monocular else "origin")
+    return {
+        "status": "ok",
+        "monocular": config.odometry.monocular,
+        "metrics": result.to_dict(),
+        "mean_error_m": float(result.errors_m().mean()),
+        "path": np.round(shown.estimate.positions, 4).tolist(),
+        "true_path": np.round(shown.reference.positions, 4).tolist(),
+    }
+
+
+def load_answer(path: Path) -> dict[str, Any] | None:
+    """A finished cell's file, or None where there is none or it was cut off."""
+    try:
+        data = json.loads(path.read_text())
+    except (FileNotFoundError, json.JSONDecodeError):
+        return None
+    return data if data.get("schema") == _SCHEMA else None
+
+
+def save_answer(path: Path, answer: dict[str, Any]) -> None:
+    """Write whole or not at all, so that an interrupted grid can go on."""
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps(answer))
+    part.replace(path)

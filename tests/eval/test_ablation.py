@@ -1,0 +1,146 @@
+"""The ablation: its grid, a cell on a rendered store, what it does with failures, resuming, the written report."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stereo_sfm.cli import main
+from stereo_sfm.eval.ablation import Cell, grid, load_answer, run_cell, save_answer
+from stereo_sfm.eval.ablation_report import COLUMNS, findings, row_of, write_report
+
+SIM = "sim:aisle?camera=pinhole&size=320x200&frames=5"
+CELL = Cell(SIM, "grid", "orb", "pnp", "tracking", 0)
+
+
+def answer(kind: str, method: str, ate: float, stage: str = "tracking", system: str = "grid", ms: float = 50) -> Any:
+    """A made cell."""
+    cell = Cell("kitti:07", system, kind, method, stage, 0)
+    path = [[0.1 * i, 0.0, 0.2 * i] for i in range(5)]
+    retail = {
+        "relative_rotation_rad_mean": 0.01, "relative_rotation_rad_std": 0.02, "relative_translation_m2_mean": 0.1,
+        "relative_translation_m2_std": 0.1, "absolute_rotation_rad": 0.3, "absolute_translation_m2": 4.0,
+    }  # fmt: skip
+    return {
+        "schema": 1, "cell": vars(cell), "status": "ok", "reason": "", "frames": 5, "tracked": 4, "keyframes": 2,
+        "loops": 0, "track_ms": ms, "frame_ms": ms, "monocular": False, "mean_error_m": ate, "source_name": "kitti:07",
+        "metrics": {
+            "retail": retail, "rpe_m": {"mean": 0.05, "std": 0.06}, "drift": None, "ape_m": {"rmse": ate},
+            "ate_sim3_m": ate, "length_m": 12.0,
+        },
+        "path": path, "true_path": path,
+    }  # fmt: skip
+
+
+def test_the_grid_holds_every_combination_once() -> None:
+    cells = grid(["a", "b"], systems=())
+    assert len(cells) == 2 * 3 * 4 * 4 == len(set(cells))
+    assert len({cell.file_name for cell in cells}) == len(cells)
+    assert {cell.system for cell in grid(["a"])} == {
+        "grid", "default", "retail-thesis", "sparse-localization", "cpp-course",
+    }  # fmt: skip
+
+
+def test_file_names_change_with_everything_that_changes_the_result() -> None:
+    others = [
+        replace(CELL, frames=3), replace(CELL, seed=1), replace(CELL, stage="mapping"), replace(CELL, source="x"),
+    ]  # fmt: skip
+    assert len({cell.file_name for cell in [CELL, *others]}) == 5
+    assert CELL.file_name == replace(CELL).file_name
+
+
+def test_stages_are_configurations() -> None:
+    tracking, loops = CELL.config(), replace(CELL, stage="averaging").config()
+    assert not tracking.mapper.enabled and not tracking.loop.enabled
+    assert loops.mapper.enabled and loops.loop.enabled and loops.loop.correction == "averaging"
+    assert tracking.odometry.method == "pnp" and tracking.features.kind == "orb"
+    assert replace(CELL, system="cpp-course", stage="").config().odometry.monocular
+
+
+def test_a_cell_is_run_judged_and_kept(tmp_path: Path) -> None:
+    result = run_cell(CELL)
+    assert result["status"] == "ok", result["reason"]
+    assert result["frames"] == result["tracked"] == 5
+    assert result["metrics"]["ape_m"]["rmse"] < 0.05
+    row = row_of(result)
+    assert row["rel trans mean [m]"] < 0.05
+    save_answer(tmp_path / "x.json", result)
+    assert load_answer(tmp_path / "x.json") == json.loads(json.dumps(result))
+    (tmp_path / "x.json").write_text('{"schema": 1, "cel')
+    assert load_answer(tmp_path / "x.json") is None
+
+
+def test_failures_have_reasons() -> None:
+    missing = run_cell(replace(CELL, source="/no/such/folder"))
+    assert missing["status"] == "none" and "no such file" in missing["reason"]
+    blind = run_cell(replace(CELL, source=f"{SIM}&size=64x40"))
+    assert blind["status"] == "none" and "frames" in blind["reason"]
+
+
+def test_findings_follow_the_numbers() -> None:
+    made = [
+        answer("sift", "em-r", 1.0), answer("akaze", "em-r", 2.0), answer("orb", "em-r", 3.0),
+        answer("sift", "r-um", 2.0), answer("sift", "um", 5.0), answer("", "", 0.5, system="default", ms=10),
+    ]  # fmt: skip
+    text = "\n".join(findings(made))
+    assert "SIFT best and ORB worst with em-r: yes" in text
+    assert "EM-R best with sift: yes" in text
+    assert "RANSAC needed with sift: yes" in text
+    assert "more accurate than every cell: yes" in text and "faster than every cell: yes" in text
+    worse = [answer("sift", "em-r", 3.0), answer("orb", "em-r", 1.0), answer("", "", 2.0, system="default", ms=90)]
+    text = "\n".join(findings(worse))
+    assert "SIFT best and ORB worst with em-r: no" in text
+    assert "more accurate than every cell: no" in text and "faster than every cell: no" in text
+
+
+def test_the_report_has_tables_plots_csv_and_published_figures(tmp_path: Path) -> None:
+    made = [answer("sift", "em-r", 1.0), answer("sift", "em-r", 0.5, "mapping")]
+    refused = {"schema": 1, "cell": vars(Cell("kitti:07", "grid", "sift", "vp-r", "tracking", 0)), "status": "none",
+               "reason": "weak_structure in 5 of 5 frames", "frames": 5, "tracked": 0}  # fmt: skip
+    text = write_report(tmp_path, [*made, refused]).read_text()
+    assert "weak_structure in 5 of 5 frames" in text
+    assert "33.95" in text  # Table II of the thesis is on KITTI 07
+    assert "| 2 |" in text  # absolute translation: the root of equation 24's square
+    lines = (tmp_path / "ablation.csv").read_text().splitlines()
+    assert lines[0].split(",")[1:] == list(COLUMNS) and len(lines) == 4
+    assert (tmp_path / "01-tracking-sift.png").stat().st_size > 5000
+    assert (tmp_path / "01-stages-sift-em-r.png").stat().st_size > 5000
+
+
+def test_the_command_resumes_and_refuses_unknown_names(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    chosen = ["--features", "orb", "--odometry", "um", "--stages", "tracking", "--systems", "none"]
+    command = ["ablation", "kitti:07", "-o", str(tmp_path), *chosen]
+    cell = grid(["kitti:07"], ["orb"], ["um"], ["tracking"], ())[0]
+    (tmp_path / "cells").mkdir()
+    save_answer(tmp_path / "cells" / cell.file_name, answer("orb", "um", 0.25))
+
+    def never(*_: object) -> None:
+        raise AssertionError("a finished cell was computed again")
+
+    monkeypatch.setattr("stereo_sfm.commands.ablation._run_all", never)
+    assert main(command) == 0
+    assert "1 of 1 cells" in capsys.readouterr().out
+    assert "0.25" in (tmp_path / "ablation.md").read_text()
+    assert main([*command, "--features", "surf"]) == 2
+    assert "orb, sift, akaze" in capsys.readouterr().err
+
+
+def test_paths_are_in_the_frame_of_the_truth() -> None:
+    result = run_cell(CELL)
+    path, truth = np.array(result["path"]), np.array(result["true_path"])
+    np.testing.assert_allclose(path[0], truth[0], atol=1e-3)
+    assert np.linalg.norm(path - truth, axis=1).max() < 0.1
+
+
+@pytest.mark.slow
+def test_the_whole_command_in_two_processes(tmp_path: Path) -> None:
+    command = ["ablation", SIM, "-o", str(tmp_path), "--jobs", "2", "--features", "orb", "--systems", "none", "-q"]
+    assert main([*command, "--odometry", "em-r,r-um", "--stages", "tracking"]) == 0
+    assert len(list((tmp_path / "cells").glob("*.json"))) == 2
