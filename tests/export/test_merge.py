@@ -1,0 +1,128 @@
+"""Several walks of one store in one map, and what pruning leaves."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stereo_sfm.cli import main
+from stereo_sfm.config import LoopConfig
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.export.merge import merge, prune
+from stereo_sfm.export.saved_map import SavedMap, joined, load_map, save_map
+from stereo_sfm.geometry import se3
+from stereo_sfm.loop import vocabulary as voc
+from tests.export.maps import map_of_walk, same
+from tests.loop.store_walk import StoreWalk, make_walk
+from tests.synthetic import pinhole_rig
+
+
+@pytest.fixture(scope="module")
+def walks() -> list[StoreWalk]:
+    """Two walks through one store: the first two aisles, and later the first one again, with frames of their own."""
+    both = make_walk([0, 1, 0], seed=31)
+    second = next(
+        k for k in range(90, len(both.keyframes)) if both.world_T_kf[k, 2, 3] < 0 and both.world_T_kf[k, 0, 3] < 1
+    )
+    parts = [slice(0, second - 8), slice(second, None)]
+    return [dataclasses.replace(both, keyframes=both.keyframes[p], world_T_kf=both.world_T_kf[p]) for p in parts]
+
+
+@pytest.fixture(scope="module")
+def vocabulary(walks: list[StoreWalk]) -> voc.Vocabulary:
+    return voc.train([k.descriptors for k in walks[0].keyframes], depth=3)
+
+
+@pytest.fixture(scope="module")
+def maps(walks: list[StoreWalk]) -> list[SavedMap]:
+    return [map_of_walk(w) for w in walks]
+
+
+@pytest.fixture(scope="module")
+def merged(maps: list[SavedMap], vocabulary: voc.Vocabulary) -> SavedMap:
+    result = merge(maps, vocabulary, LoopConfig())
+    assert len(result.loops) >= 2
+    assert result.fused > 100
+    return result.saved
+
+
+def test_merged_map_has_both_walks_where_they_were(
+    walks: list[StoreWalk], maps: list[SavedMap], merged: SavedMap
+) -> None:
+    assert len(merged) == sum(map(len, maps))
+    truth = np.concatenate([w.world_T_kf for w in walks])
+    expected = se3.inverse(truth[0]) @ truth
+    error = np.linalg.norm(merged.snapshot.map_T_kf[:, :3, 3] - expected[:, :3, 3], axis=1)
+    aisle = np.abs(truth[:, 0, 3]) < 0.1
+    assert np.sqrt((error[aisle] ** 2).mean()) < 0.05
+    assert merged.sessions.tolist() == [0] * len(maps[0]) + [1] * len(maps[1])
+    shared = {int(p) for p in merged.snapshot.obs_pt[merged.sessions[merged.snapshot.obs_kf] == 0]}
+    shared &= {int(p) for p in merged.snapshot.obs_pt[merged.sessions[merged.snapshot.obs_kf] == 1]}
+    assert len(shared) > 100
+
+
+def test_maps_that_share_nothing_are_not_joined(maps: list[SavedMap], vocabulary: voc.Vocabulary) -> None:
+    stranger = map_of_walk(make_walk([0], seed=99))
+    with pytest.raises(StereoSfmError, match="2 pieces: no loop joins them"):
+        merge([maps[1], stranger], vocabulary, LoopConfig())
+
+
+def test_maps_of_different_cameras_are_not_joined(maps: list[SavedMap]) -> None:
+    with pytest.raises(StereoSfmError, match="different cameras"):
+        joined([maps[0], dataclasses.replace(maps[1], rig=pinhole_rig())])
+
+
+def test_side_by_side_keeps_every_row(maps: list[SavedMap]) -> None:
+    both = joined(maps).snapshot
+    first = len(maps[0].snapshot.obs_kf)
+    assert np.array_equal(both.obs_kf[first:] - len(maps[0]), maps[1].snapshot.obs_kf)
+    assert np.array_equal(
+        both.points[both.obs_pt[first:]], maps[1].snapshot.points[maps[1].snapshot.obs_pt], equal_nan=True
+    )
+    assert len(np.unique(both.kf_ids)) == len(both.kf_ids) and len(np.unique(both.pt_ids)) == len(both.pt_ids)
+
+
+def test_prune_by_sessions_forgets_what_the_newest_walk_did_not_see(merged: SavedMap) -> None:
+    pruned = prune(merged, unseen_sessions=1)
+    s = pruned.snapshot
+    assert 0 < len(s.pt_ids) < len(merged.snapshot.pt_ids)
+    newest = np.full(len(s.pt_ids), -1)
+    np.maximum.at(newest, s.obs_pt, pruned.sessions[s.obs_kf])
+    assert (newest == 1).all()
+    assert (np.bincount(s.obs_kf, minlength=len(pruned)) > 0).all()
+    assert (s.anchors >= 0).all() and (s.anchors < len(pruned)).all()
+
+
+def test_prune_of_nothing_changes_nothing(maps: list[SavedMap]) -> None:
+    seen = np.unique(maps[0].snapshot.obs_kf)
+    kept = prune(maps[0], min_views=0)
+    assert len(kept) == len(seen)  # keyframes that see no point go
+    assert np.array_equal(kept.snapshot.points, maps[0].snapshot.points)
+    assert np.array_equal(kept.snapshot.map_T_kf, maps[0].snapshot.map_T_kf[seen])
+    assert same(prune(kept, min_views=0).snapshot, kept.snapshot)
+    with pytest.raises(StereoSfmError, match="empty map"):
+        prune(maps[0], min_views=10_000)
+
+
+def test_commands(
+    tmp_path: Path, maps: list[SavedMap], vocabulary: voc.Vocabulary, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from stereo_sfm.loop.vocabulary_file import save_vocabulary
+
+    save_vocabulary(vocabulary, tmp_path / "v.npz")
+    for name, saved in zip("ab", maps, strict=True):
+        save_map(saved, tmp_path / name)
+    a, b, both = str(tmp_path / "a"), str(tmp_path / "b"), str(tmp_path / "both")
+    vocabulary_option = ["--set", f"loop.vocabulary={tmp_path / 'v.npz'}"]
+    assert main(["map", "merge", a, b, "-o", both, *vocabulary_option]) == 0
+    assert "2 maps joined by" in capsys.readouterr().out
+    assert len(load_map(Path(both))) == len(maps[0]) + len(maps[1])
+    assert main(["map", "merge", a, b, "-o", both]) == 2
+    assert "holds a map: choose another -o" in capsys.readouterr().err
+    assert main(["map", "merge", a, "-o", str(tmp_path / "c")]) == 2
+    assert "at least two maps" in capsys.readouterr().err
+    assert main(["map", "prune", both, "--min-views", "3", "-o", str(tmp_path / "d")]) == 0
+    assert len(load_map(tmp_path / "d").snapshot.pt_ids) < len(load_map(Path(both)).snapshot.pt_ids)

@@ -1,0 +1,119 @@
+"""Finding a camera in a saved map without a guess, refusing what is elsewhere, and following a walk inside a map."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from stereo_sfm.config import LoopConfig
+from stereo_sfm.geometry import se3
+from stereo_sfm.loop import vocabulary as voc
+from stereo_sfm.loop.localizer import Localizer
+from stereo_sfm.loop.relocalize import Relocalizer
+from stereo_sfm.types import F64, U8
+from tests.export.maps import map_of_walk
+from tests.loop.store_walk import StoreWalk, make_walk
+
+
+@pytest.fixture(scope="module")
+def walk() -> StoreWalk:
+    """Two aisles; the map is made of the first pass through both, the second pass through the first aisle asks."""
+    return make_walk([0, 1, 0], seed=21, max_points=700)
+
+
+@pytest.fixture(scope="module")
+def first_pass(walk: StoreWalk) -> int:
+    return next(
+        k for k in range(90, len(walk.keyframes)) if walk.world_T_kf[k, 2, 3] < 0 and walk.world_T_kf[k, 0, 3] < 1
+    )
+
+
+@pytest.fixture(scope="module")
+def vocabulary(walk: StoreWalk) -> voc.Vocabulary:
+    return voc.train([k.descriptors for k in walk.keyframes[:80]], depth=3)
+
+
+@pytest.fixture(scope="module")
+def relocalizer(walk: StoreWalk, first_pass: int, vocabulary: voc.Vocabulary) -> Relocalizer:
+    part = dataclasses.replace(walk, keyframes=walk.keyframes[:first_pass], world_T_kf=walk.world_T_kf[:first_pass])
+    return Relocalizer(map_of_walk(part).snapshot, walk.rig, vocabulary, LoopConfig())
+
+
+def true_pose(walk: StoreWalk, k: int) -> F64:
+    return se3.inverse(walk.world_T_kf[0]) @ walk.world_T_kf[k]
+
+
+def test_views_of_the_known_aisle_is_found(walk: StoreWalk, first_pass: int, relocalizer: Relocalizer) -> None:
+    errors = []
+    asked = range(first_pass + 8, len(walk.keyframes))
+    for k in asked:
+        location = relocalizer.locate(walk.keyframes[k])
+        if not location.found:
+            continue
+        error = se3.inverse(true_pose(walk, k)) @ location.map_T_cam
+        errors.append((np.linalg.norm(error[:3, 3]), np.rad2deg(np.linalg.norm(se3.log(error)[3:]))))
+        assert np.linalg.eigvalsh(location.information).min() > 0
+    assert len(errors) >= 0.9 * len(asked)
+    assert np.max(errors, axis=0)[0] < 0.05 and np.max(errors, axis=0)[1] < 1.0
+
+
+def test_a_strange_place_is_not_found(walk: StoreWalk, relocalizer: Relocalizer) -> None:
+    elsewhere = make_walk([0], seed=77)
+    for keyframe in elsewhere.keyframes[::4]:
+        location = relocalizer.locate(keyframe)
+        assert not location.found and location.reason
+
+
+def test_a_fifth_of_the_products_exchanged(walk: StoreWalk, first_pass: int, relocalizer: Relocalizer) -> None:
+    rng = np.random.default_rng(0)
+    found = 0
+    asked = range(first_pass + 8, len(walk.keyframes), 2)
+    for k in asked:
+        keyframe = walk.keyframes[k]
+        other = rng.random(len(keyframe.descriptors)) < 0.2
+        looks: U8 = rng.integers(0, 256, keyframe.descriptors.shape, dtype=np.uint8)
+        changed = dataclasses.replace(keyframe, descriptors=np.where(other[:, None], looks, keyframe.descriptors))
+        location = relocalizer.locate(changed)
+        if location.found:
+            found += 1
+            assert np.linalg.norm((se3.inverse(true_pose(walk, k)) @ location.map_T_cam)[:3, 3]) < 0.05
+    assert found >= 0.8 * len(asked)
+
+
+def test_a_view_without_points_has_a_reason(walk: StoreWalk, relocalizer: Relocalizer) -> None:
+    blind = dataclasses.replace(walk.keyframes[3], descriptors=np.zeros_like(walk.keyframes[3].descriptors))
+    location = relocalizer.locate(blind)
+    assert location.reason == "no_candidate"
+
+
+def test_localizer_places_the_odometry_frame_and_keeps_it(
+    walk: StoreWalk, first_pass: int, vocabulary: voc.Vocabulary
+) -> None:
+    part = dataclasses.replace(walk, keyframes=walk.keyframes[:first_pass], world_T_kf=walk.world_T_kf[:first_pass])
+    localizer = Localizer(map_of_walk(part).snapshot, walk.rig, vocabulary, LoopConfig())
+    start = first_pass + 8
+    odom = se3.inverse(walk.keyframes[start].odom_T_cam)
+    for n, k in enumerate(range(start, len(walk.keyframes))):
+        keyframe = dataclasses.replace(walk.keyframes[k], kf_id=n, odom_T_cam=odom @ walk.keyframes[k].odom_T_cam)
+        update = localizer.step(keyframe)
+        assert update.kf_id == n and update.version == n + 1 and len(update.point_ids) == 0
+        error = se3.inverse(true_pose(walk, k)) @ update.map_T_odom @ keyframe.odom_T_cam
+        assert localizer.found
+        assert np.linalg.norm(error[:3, 3]) < 0.08
+
+
+def test_localizer_before_it_is_found(walk: StoreWalk, vocabulary: voc.Vocabulary, first_pass: int) -> None:
+    part = dataclasses.replace(walk, keyframes=walk.keyframes[:first_pass], world_T_kf=walk.world_T_kf[:first_pass])
+    localizer = Localizer(map_of_walk(part).snapshot, walk.rig, vocabulary, LoopConfig())
+    update = localizer.step(make_walk([0], seed=77).keyframes[4])
+    assert not localizer.found
+    assert np.array_equal(update.map_T_odom, np.eye(4))
+    assert localizer.last is not None and localizer.last.reason
+
+
+def test_same_question_same_bits(walk: StoreWalk, first_pass: int, relocalizer: Relocalizer) -> None:
+    answers = [relocalizer.locate(walk.keyframes[first_pass + 10]) for _ in range(2)]
+    assert answers[0].map_T_cam.tobytes() == answers[1].map_T_cam.tobytes()
+    assert np.array_equal(answers[0].pairs, answers[1].pairs)
