@@ -76,6 +76,18 @@ class OdometryConfig:
 
 
 @dataclass(frozen=True)
+class ManhattanConfig:
+    """Rotation prior from the world's three directions (tracking/manhattan_prior.py)."""
+
+    enabled: bool = False
+    every: int = 3  # frames between measurements
+    settle_frames: int = 10  # measurements that must agree before the axes are believed
+    gate_deg: float = 3.0  # a measurement further from the prediction is refused
+    model_deg: float = 0.15  # how exactly the world follows three directions
+    drift_deg_per_frame: float = 0.02  # standard deviation of the tracker's rotation, grows with the root of the frames
+
+
+@dataclass(frozen=True)
 class MapperConfig:
     """Local mapping (mapping/mapper.py)."""
 
@@ -144,8 +156,11 @@ class LoopConfig:
 class PipelineConfig:
     """How the stages are wired (pipeline/)."""
 
-    update_lag_frames: int = 3  # a keyframe's MapUpdate is applied just before this many frames later
+    update_lag_frames: int = 5  # a keyframe's MapUpdate is applied just before this many frames later
     loop_lag_keyframes: int = 2  # a keyframe's LoopResult reaches the mapper this many keyframes later
+    ring_slots: int = 8  # image pairs in shared memory between capture and the stages
+    threads: int = 1  # of OpenCV and BLAS in each process
+    cpus: dict[str, tuple[int, ...]] = field(default_factory=dict[str, tuple[int, ...]])  # stage -> cores it may use
 
 
 @dataclass(frozen=True)
@@ -156,6 +171,7 @@ class Config:
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     features: FeaturesConfig = field(default_factory=FeaturesConfig)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
+    manhattan: ManhattanConfig = field(default_factory=ManhattanConfig)
     mapper: MapperConfig = field(default_factory=MapperConfig)
     loop: LoopConfig = field(default_factory=LoopConfig)
     pipeline: PipelineConfig = field(default_factory=PipelineConfig)

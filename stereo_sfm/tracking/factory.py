@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 from calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.timing import NoSpans
-from stereo_sfm.types import Frame, Keyframe, MapUpdate, StereoImage, Trajectory
+from stereo_sfm.tracking.protocol import AnyTracker
+from stereo_sfm.types import Trajectory
+
+__all__ = ["NEEDS_DEPTH", "AnyTracker", "make_tracker"]
 
 # methods that turn 3D points of the current frame into motion: they need a second eye or depth
 NEEDS_DEPTH = ("em-r", "vp-r", "r-um", "um")
-
-
-class AnyTracker(Protocol):
-    """What every tracker is: one image in, one frame and perhaps a keyframe out."""
-
-    def step(self, image: StereoImage) -> tuple[Frame, Keyframe | None]: ...
-
-    def apply(self, update: MapUpdate) -> None: ...
 
 
 def make_tracker(
@@ -33,6 +26,15 @@ def make_tracker(
     Raises:
         StereoSfmError: an unknown method, or one that this camera cannot serve.
     """
+    tracker = _tracker(config, rig, spans, ground_truth)
+    if not config.manhattan.enabled:
+        return tracker
+    from stereo_sfm.tracking.manhattan_prior import ManhattanTracker
+
+    return ManhattanTracker(tracker, config.manhattan, rig)
+
+
+def _tracker(config: Config, rig: Rig, spans: NoSpans | None, ground_truth: Trajectory | None) -> AnyTracker:
     method = config.odometry.method
     if method == "flow":
         from stereo_sfm.tracking.tracker import Tracker
