@@ -9,7 +9,7 @@ from drivers.live.counters import Counters
 from stereo_sfm.types import U8
 
 LEFT, RIGHT = 0, 1
-_MAX_WAITING = 8  # images of one eye that may wait for the other
+_MAX_WAITING = 30  # images of one eye that may wait for the other: a reader may be late by a second
 _RELOCK = 3  # so many images that contradict the past but not each other are the new truth
 _FIRST_STAMP_NS = 2_000_000_000  # the first image must be this close to the camera's own clock
 _MAX_GAP = 10_000  # frames; a larger step of a counter is damage, not loss

@@ -48,8 +48,8 @@ def read_calibration(dai: Any, handler: Any, size: tuple[int, int], name: str, s
 
 
 def _eye(dai: Any, handler: Any, socket: Any, size: tuple[int, int]) -> Camera:
-    k = np.array(handler.getCameraIntrinsics(socket, *size), float)
-    fx, fy, cx, cy = (float(v) for v in (k[0, 0], k[1, 1], k[0, 2], k[1, 2]))
+    matrix, width, height = handler.getDefaultIntrinsics(socket)
+    fx, fy, cx, cy = _scaled(np.array(matrix, float), (int(width), int(height)), size)
     if not (fx > 0 and fy > 0 and 0 < cx < size[0] and 0 < cy < size[1]):
         raise DeviceFault(f"OAK's factory calibration makes no sense: focal length {fx} {fy}, centre {cx} {cy}")
     model = handler.getDistortionModel(socket)
@@ -61,6 +61,19 @@ def _eye(dai: Any, handler: Any, socket: Any, size: tuple[int, int]) -> Camera:
     if any(coefficients[8:]):
         raise DeviceFault("OAK's calibration has thin-prism or tilt terms, which are not known here: calibrate it")
     return RadTan(*size, fx, fy, cx, cy, tuple(coefficients[:8]))
+
+
+def _scaled(matrix: F64, at: tuple[int, int], size: tuple[int, int]) -> tuple[float, float, float, float]:
+    """Focal lengths and centre after the camera has scaled its image to cover `size` and cut off the rest evenly.
+
+    depthai's own getCameraIntrinsics pads where the camera crops, and forgets that a pixel's centre moves by half a
+    pixel when four become one.
+    """
+    if at[0] <= 0 or at[1] <= 0:
+        raise DeviceFault("OAK's factory calibration does not say for which image size it is")
+    s = max(size[0] / at[0], size[1] / at[1])
+    cx, cy = ((matrix[k, 2] + 0.5) * s - 0.5 - (at[k] * s - size[k]) / 2 for k in (0, 1))
+    return float(matrix[0, 0] * s), float(matrix[1, 1] * s), float(cx), float(cy)
 
 
 def _metres(transform_cm: Any) -> F64:

@@ -107,7 +107,8 @@ class OakSource(LiveSource):
         dai, s = self._dai, self._settings
         camera = pipeline.create(dai.node.Camera).build(socket, sensorFps=s.rate_hz)
         set_exposure(dai, camera.initialControl, s)
-        output = camera.requestOutput(s.size, type=dai.ImgFrame.Type.GRAY8, fps=s.rate_hz, enableUndistortion=False)
+        raw = {"resizeMode": dai.ImgResizeMode.CROP, "enableUndistortion": False}
+        output = camera.requestOutput(s.size, type=dai.ImgFrame.Type.GRAY8, fps=s.rate_hz, **raw)
         return output.createOutputQueue(maxSize=8, blocking=False)
 
     def _imu(self, pipeline: Any) -> Any:

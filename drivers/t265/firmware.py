@@ -124,7 +124,7 @@ def _from_elf(data: bytes) -> tuple[str, bytes]:
         size = struct.unpack_from("<I", data, symbols["fw_target_size"])[0]
         version = ".".join(str(v) for v in struct.unpack_from("<4i", data, symbols["fw_target_version"]))
         start = symbols["fw_target_data"]
-    except (KeyError, struct.error):
+    except (LookupError, OverflowError, struct.error):
         return "", b""
     return version, data[start : start + size]
 

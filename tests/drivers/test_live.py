@@ -1,0 +1,145 @@
+"""What both live cameras share: pairing, clocks, hand-over."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from drivers.live.buffers import Handoff, MotionBuffer, WheelBuffer
+from drivers.live.clock import ClockMap, TimeLine
+from drivers.live.counters import COUNTERS, Counters
+from drivers.live.errors import DeviceLost
+from drivers.live.options import Options
+from drivers.live.pairing import LEFT, RIGHT, Eye, Pair, Pairer
+from stereo_sfm.errors import StereoSfmError
+
+PERIOD = 33_333_333
+PIXELS = np.zeros((1, 1), np.uint8)
+
+
+def eye(frame: int, shift_ns: int = 0, counter: int | None = None) -> Eye:
+    return Eye(1_000_000_000 + frame * PERIOD + shift_ns, frame if counter is None else counter, PIXELS, 1000, 1)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_any_losses_and_any_interleaving_are_accounted_for(data: st.DataObject) -> None:
+    """Images of each eye come in order; the eyes interleave within three frames; any of them may be lost."""
+    frames = 30
+    arrivals: list[tuple[float, int, int]] = []
+    alive: list[set[int]] = []
+    for side in (LEFT, RIGHT):
+        lost = data.draw(st.sets(st.integers(0, frames - 1), max_size=10))
+        late = data.draw(st.floats(0, 2.9))
+        alive.append(set(range(frames)) - lost)
+        arrivals += [(k + (late if side else 0), side, k) for k in sorted(alive[side])]
+    counters = Counters()
+    pairer = Pairer(counters, PERIOD)
+    pairs: list[Pair] = []
+    for _, side, frame in sorted(arrivals):
+        pair = pairer.push(side, eye(frame, shift_ns=300_000 * side))
+        if pair is not None:
+            pairs.append(pair)
+    expected = sorted(alive[LEFT] & alive[RIGHT])
+    assert [p.left.counter for p in pairs] == expected
+    assert [p.right.counter for p in pairs] == expected
+    assert [p.dropped_before for p in pairs[1:]] == [b - a - 1 for a, b in pairwise(expected)]
+
+
+def test_without_a_known_rate_losses_go_by_the_counter() -> None:
+    counters = Counters()
+    pairer = Pairer(counters, 0)
+    pairs = [p for k in (0, 1, 5) for side in (LEFT, RIGHT) if (p := pairer.push(side, eye(k * 3, counter=k)))]
+    assert [p.dropped_before for p in pairs] == [0, 0, 3]
+
+
+def test_a_one_eyed_camera_is_noticed() -> None:
+    counters = Counters()
+    pairer = Pairer(counters, PERIOD)
+    assert not any(pairer.push(LEFT, eye(k)) for k in range(40))
+    assert counters["unpaired"] == 10
+
+
+def test_stamps_from_before_the_start_are_refused() -> None:
+    pairer = Pairer(counters := Counters(), PERIOD, now_ns=60_000_000_000)
+    assert not any(pairer.push(side, eye(0)) for side in (LEFT, RIGHT))
+    assert counters["implausible"] == 2
+
+
+def test_clock_keeps_the_best_reading_until_there_is_a_good_one() -> None:
+    clock = ClockMap()
+    assert not clock.known
+    assert not clock.add(1_000_000, 500, 3_000_000)  # half a round trip of 1 ms
+    assert clock.to_host(500) == 2_000_000
+    assert not clock.add(1_000_000, 500, 5_000_000)  # worse: not taken
+    assert clock.to_host(500) == 2_000_000
+    assert clock.add(9_000_000, 500, 9_100_000)
+    assert clock.to_host(500) == 9_050_000
+    assert clock.to_camera(9_050_000) == 500
+    assert clock.uncertainty_ns == 50_000
+
+
+def test_one_time_line_over_two_segments() -> None:
+    line, first, second = TimeLine(), ClockMap(), ClockMap()
+    first.add(10_000, 0, 10_000)
+    line.begin_segment(first)
+    assert line.frame_stamp(700) == 700
+    second.add(50_000, 0, 50_000)  # the camera's clock began again 40 us later
+    line.begin_segment(second)
+    assert line.stamp(100) == 40_100
+    assert line.frame_stamp(-39_500) == 701  # never backwards
+    assert line.last == 701
+
+
+def test_handoff_throws_the_oldest_away_and_says_what_it_weighed() -> None:
+    queue: Handoff[str] = Handoff(2)
+    assert queue.get(0.001) is None
+    for name, weight in (("a", 1), ("b", 3), ("c", 1), ("d", 1)):
+        queue.put(name, weight)
+    assert queue.get(0) == ("c", 4)
+    queue.fail(DeviceLost("gone"))
+    queue.fail(DeviceLost("again"))
+    assert queue.get(0) == ("d", 0)
+    with pytest.raises(DeviceLost, match="gone"):
+        queue.get(0)
+
+
+def test_samples_wait_for_their_image() -> None:
+    motion, wheel = MotionBuffer(), WheelBuffer()
+    for stamp, is_gyro in ((30, True), (10, False), (20, True)):
+        motion.add(stamp, is_gyro, (stamp, 0, 0))
+    taken = motion.take(20)
+    assert taken is not None
+    assert taken.stamp_ns.tolist() == [10, 20]
+    np.testing.assert_array_equal(taken.accel[:, 0], [10, np.nan])
+    np.testing.assert_array_equal(taken.gyro[:, 0], [np.nan, 20])
+    assert motion.take(20) is None
+    wheel.add(5, (1, 0, 0), (0, 0, 2))
+    rolled = wheel.take(5)
+    assert rolled is not None and rolled.linear.tolist() == [[1, 0, 0]] and rolled.angular.tolist() == [[0, 0, 2]]
+    assert wheel.take(9) is None
+
+
+def test_counters_have_every_documented_name() -> None:
+    counters = Counters()
+    assert dict(counters) == dict.fromkeys(COUNTERS, 0)
+    counters.add("dropped", 2)
+    assert counters["dropped"] == 2
+    with pytest.raises(KeyError):
+        counters.add("colour")
+
+
+def test_options_say_what_is_wrong() -> None:
+    options = Options("cam", {"a": "7", "b": "yes", "c": "x", "e": "500"})
+    assert options.number("a", 1, 0, 10) == 7
+    assert options.flag("b", False)
+    assert options.microseconds("d", 1, 1000) is None
+    assert options.microseconds("e", 1, 1000) == 500
+    with pytest.raises(StereoSfmError, match="cam has no option 'c'"):
+        options.finish()
+    with pytest.raises(StereoSfmError, match="c=x: it must be one of p, q"):
+        Options("cam", {"c": "x"}).choice("c", "p", {"p": 1, "q": 2})
