@@ -27,6 +27,7 @@ from stereo_sfm.log.image_log import (
     rig_from_text,
     truth_from_bytes,
 )
+from stereo_sfm.log.provenance import METADATA
 from stereo_sfm.log.reader import LogReader, Record
 from stereo_sfm.types import F32, I64, U8, ImuSamples, StereoImage, WheelSamples
 
@@ -61,6 +62,9 @@ def open_mcap(path: str, **options: Any) -> Source:
     try:
         if any(t.topic == topics.IMAGE_INFO and t.schema == "stereo_sfm.ImageInfo" for t in reader.topics):
             return McapSource(reader, **options)
+        about = reader.metadata(METADATA)
+        if about.get("image_format") == "none":
+            raise StereoSfmError(f"{path} is a run without its images: they are in {about.get('source')}")
         from drivers.mcap_foreign import ForeignMcapSource
 
         return ForeignMcapSource(reader, **options)

@@ -87,6 +87,9 @@ class LogReader:
         try:
             repair.check_magic(self._stream, path)
             self._reader, self.summary = self._open()
+        except OSError as error:
+            self._stream.close()
+            raise StereoSfmError(f"cannot read {path}: {error.strerror}") from None
         except BaseException:
             self._stream.close()
             raise
@@ -99,7 +102,7 @@ class LogReader:
             summary = reader.get_summary()
             if summary is not None and _complete(summary):
                 return reader, summary
-        except repair.DAMAGE:
+        except (*repair.DAMAGE, OSError, StopIteration):  # OSError: the file is shorter than its footer
             pass
         index = repair.build_index(self._stream)
         if not index.closed:
