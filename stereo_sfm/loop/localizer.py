@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from calib.rig import Rig
@@ -57,6 +59,10 @@ class Localizer:
             fused_point_ids=np.zeros((0, 2), np.int64),
             map_T_odom=self._map_T_odom.copy(),
         )
+
+    def finish(self, loops: Sequence[LoopResult]) -> MapUpdate | None:
+        """Nothing is left behind."""
+        return None
 
     def _locate(self, keyframe: Keyframe) -> Location:
         if self.found and self._failures < LOST_AFTER:

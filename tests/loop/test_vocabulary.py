@@ -78,18 +78,22 @@ def test_zero_rows_are_no_words(vocabulary: voc.Vocabulary) -> None:
     assert len(bag.words) == 0 and len(bag.weights) == 0
 
 
-def test_growth_separates_what_the_old_words_could_not(vocabulary: voc.Vocabulary) -> None:
+def test_growth_tells_apart_what_the_old_words_took_for_one(vocabulary: voc.Vocabulary) -> None:
+    """In a new environment many different things fall into one word; afterwards other places score less."""
     rng = np.random.default_rng(5)
-    looks = rng.integers(0, 256, (300, 32), dtype=np.uint8)
+    looks = rng.integers(0, 256, (3000, 32), dtype=np.uint8)
     grown = voc.grow(vocabulary, looks)
     assert len(grown) > len(vocabulary)
-
-    def repeated(v: voc.Vocabulary) -> float:
-        noisy = looks ^ np.packbits(rng.random((300, 256)) < 0.05, axis=1)
-        return float((v.look_up(looks)[0] == v.look_up(noisy)[0]).mean())
-
-    assert repeated(grown) > repeated(vocabulary) + 0.1
     assert voc.grow(grown, looks[:0]) is grown
+
+    def contrast(v: voc.Vocabulary) -> float:
+        noisy = looks ^ np.packbits(rng.random((3000, 256)) < 0.02, axis=1)
+        bags = [v.bag(looks[k : k + 300]) for k in range(0, 3000, 300)]
+        again = [v.bag(noisy[k : k + 300]) for k in range(0, 3000, 300)]
+        table = np.array([[voc.score(a, b) for b in again] for a in bags])
+        return float(np.diag(table).mean() / table[~np.eye(10, dtype=bool)].mean())
+
+    assert contrast(grown) > 1.2 * contrast(vocabulary)
 
 
 def test_growth_keeps_the_old_words(vocabulary: voc.Vocabulary, places: list[np.ndarray]) -> None:
