@@ -10,10 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
+from calib.eye_rotation import align_eyes
 from calib.formats.kapture import read_kapture, read_kapture_cameras
 from calib.rig import Rig
 from drivers.folder_source import FolderSource, Shot, folder_of, list_images, need, pair_by_stamp
 from drivers.rig_option import RigOption, chosen_rig
+from drivers.select import SelectedFrames
 from stereo_sfm.errors import StereoSfmError
 
 log = logging.getLogger("stereo_sfm")
@@ -21,11 +23,16 @@ log = logging.getLogger("stereo_sfm")
 MAX_SKEW_NS = 3_000_000
 T265_BASELINE = 0.064  # metres, the nominal distance of a T265's eyes
 T265_SIZE = (848, 800)
+ALIGNED_PAIRS = 5  # images from which a missing rotation between the eyes is found
 Listing = list[tuple[int, Path]]
 
 
 def open_kapture(path: str, rig: RigOption = None) -> FolderSource:
-    """Open the first two cameras of a kapture folder."""
+    """Open the first two cameras of a kapture folder.
+
+    A T265 sample has no extrinsics: its eyes are taken to be at the nominal distance, and how the right one is turned
+    is found from the images.
+    """
     folder = folder_of("kapture", path)
     name = f"kapture:{folder.resolve().name}"
     left, right = _listings(folder)
@@ -33,7 +40,30 @@ def open_kapture(path: str, rig: RigOption = None) -> FolderSource:
     if len(pairs) < max(len(left), len(right)):
         log.warning("%s: %d left and %d right images, the %d pairs are used", name, len(left), len(right), len(pairs))
     shots = [Shot(left[i][0], left[i][1], right[j][1]) for i, j in pairs]
-    return FolderSource(name, chosen_rig(rig, lambda: _read_rig(folder)), shots)
+    guessed = not rig and not _sensors(folder).with_name("rigs.txt").is_file()
+    source = FolderSource(name, chosen_rig(rig, lambda: _read_rig(folder)), shots)
+    if guessed:
+        source.rig = _turned(name, source)
+    return source
+
+
+def _turned(name: str, source: FolderSource) -> Rig:
+    """The source's nominal rig with the right eye turned as its images show."""
+    step = max(len(source.shots) // ALIGNED_PAIRS, 1)
+    found = align_eyes(source.rig, SelectedFrames(source, frame_skip=step, max_frames=ALIGNED_PAIRS))
+    if found is None:
+        log.warning("%s: no extrinsics, parallel eyes at the nominal %g m are used", name, T265_BASELINE)
+        return source.rig
+    log.warning(
+        "%s: no extrinsics, the nominal %g m are used and the right eye is turned until %d matches fit to %.1f px "
+        "(parallel: %.1f px)",
+        name,
+        T265_BASELINE,
+        found.matches,
+        found.after_px,
+        found.before_px,
+    )
+    return found.rig
 
 
 def _sensors(folder: Path) -> Path:
@@ -48,11 +78,6 @@ def _read_rig(folder: Path) -> Rig:
     cameras = list(read_kapture_cameras(sensors).values())
     if len(cameras) < 2 or any(c.size != T265_SIZE or c.model != "kannala_brandt" for c in cameras[:2]):
         raise StereoSfmError(f"{folder} does not say where two cameras sit (rigs.txt): give --rig FILE")
-    log.warning(
-        "%s: no extrinsics, parallel eyes at the T265's nominal %g m are used (another calibration: --rig FILE)",
-        folder,
-        T265_BASELINE,
-    )
     left_T_right = np.eye(4)
     left_T_right[0, 3] = T265_BASELINE
     return read_kapture(sensors, left_T_right)

@@ -66,7 +66,7 @@ def test_matches_lie_in_the_epipolar_planes(folder: str, data_root: Path) -> Non
         angles = epipolar_angles(source, next(iter(source)))
         pixels = angles * source.rig.left.fx
         assert len(pixels) > 50
-        assert np.nanmedian(pixels) < (1.0 if folder != "t265_office" else 3.0)
+        assert np.nanmedian(pixels) < 1.0
 
 
 def test_ground_truth_of_euroc_explains_the_motion_in_the_image(data_root: Path) -> None:
