@@ -2,8 +2,9 @@
 
 Unknown are the rotation of the right eye (3), the direction of the baseline (2), the focal length of both eyes and of
 the right one alone (2), the time skew of the right eye (1), a smooth displacement of each image for the lens's own
-imperfection (7 each, held small by a prior), the motion of each window (6) and the points (bearing and inverse depth,
-so that points at infinity and beyond stay what they are). Points are eliminated by the Schur complement.
+imperfection (9 each, held small by a prior with a heavy tail), the motion of each window (6) and the points (bearing
+and inverse depth, so that points at infinity and beyond stay what they are). Points are eliminated by the Schur
+complement.
 """
 
 from __future__ import annotations
@@ -20,10 +21,10 @@ from stereo_sfm.geometry.stereo import rectifying_rotations
 from stereo_sfm.types import F64, Bool
 
 ROTATION, DIRECTION, FOCAL, FOCAL_RIGHT, SKEW = slice(0, 3), slice(3, 5), 5, 6, 7
-NUISANCE = 7
+NUISANCE = 9
 SHARED = 8 + 2 * NUISANCE
 # One standard deviation of what may be wrong before any image is seen: radians, radians, ratios, seconds, px.
-PRIOR = np.array([0.05] * 3 + [0.05] * 2 + [0.1, 0.1, 0.02] + [0.4] * (2 * NUISANCE))
+PRIOR = np.array([0.05] * 3 + [0.05] * 2 + [0.05, 0.05, 0.02] + [0.15] * (2 * NUISANCE))
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +33,7 @@ class Correction:
 
     vector: F64  # (SHARED,)
     covariance: F64  # (SHARED, SHARED)
+    loose_covariance: F64  # (SHARED, SHARED) as if the lens could be wrong by half a pixel in every term
     noise_px: float  # of one measured coordinate, robust
     points: int
     residual_px: float  # root mean square of the inliers after the fit
@@ -59,34 +61,47 @@ class _Problem:
     weight: F64  # (N, 4 F) of each row
 
 
-def estimate(rig: Rig, windows: list[Window], iterations: int = 12) -> Correction:
+def estimate(rig: Rig, windows: list[Window], iterations: int = 18) -> Correction:
     """Fit the correction of `rig` to the windows."""
     problems = [_problem(rig, w) for w in windows]
-    vector, hessian = np.zeros(SHARED), np.diag(1 / PRIOR**2)
-    sigma = 0.5
+    vector, hessian = np.zeros(SHARED), np.eye(SHARED)
+    sigma = 5.0
     for iteration in range(iterations):
         current = _moved(rig, vector)
-        hessian, gradient = np.diag(1 / PRIOR**2), vector / PRIOR**2
+        trust = _trust(vector)
+        hessian, gradient = np.diag(trust), vector * trust
         steps: list[tuple[_Problem, F64, F64, F64, F64]] = []
         sizes: list[F64] = []
         for problem in problems:
             residual, by_point, by_rest = _linearised(current, problem, vector)
-            sizes.append(np.abs(residual[np.isfinite(residual) & (problem.weight > 0)]))
-            problem.weight = _weights(residual, sigma, hard=iteration >= 4)
+            sizes.append(_point_noise(residual))
+            problem.weight = _weights(residual, sigma, hard=iteration >= 9)
             h, g, step = _reduced(problem, residual, by_point, by_rest, sigma)
             hessian, gradient = hessian + h, gradient + g
             steps.append((problem, *step))
-        delta: F64 = -np.linalg.solve(hessian, gradient)
+        delta = np.asarray(-np.linalg.solve(hessian, gradient), float)
         for problem, pose_gain, pose_gradient, point_gain, point_gradient in steps:
             _apply(problem, delta, pose_gain, pose_gradient, point_gain, point_gradient)
         vector = vector + delta
-        # A point's own unknowns take up 3 of its 4 or 8 rows: the median of what is left is scaled back for that.
-        share = np.sqrt(5 / 8) if any(len(p.left) > 1 for p in problems) else np.sqrt(1 / 4)
-        sigma = float(np.clip(1.4826 * np.median(np.concatenate(sizes)) / share, 0.05, 2.0))
-    covariance: F64 = np.linalg.inv(hessian)
+        sigma = float(np.clip(np.median(np.concatenate(sizes)), 0.1, 30.0))
+    covariance = np.asarray(np.linalg.inv(hessian), float)
+    loose = hessian.copy()
+    lens = np.arange(8, SHARED)
+    loose[lens, lens] += 1 / np.maximum(0.5, np.abs(vector[8:])) ** 2 - _trust(vector)[8:]
+    loose_covariance = np.asarray(np.linalg.inv(loose), float)
     kept = np.concatenate([(p.weight > 0).all(1) for p in problems])
     final = np.concatenate([_linearised(_moved(rig, vector), p, vector)[0][p.weight > 0] for p in problems])
-    return Correction(vector, covariance, sigma, int(kept.sum()), float(np.sqrt(np.mean(final**2))))
+    return Correction(vector, covariance, loose_covariance, sigma, int(kept.sum()), float(np.sqrt(np.mean(final**2))))
+
+
+def _trust(vector: F64) -> F64:
+    """(SHARED,) inverse variance of the prior; for the lens displacement that of a Cauchy prior at its present value.
+
+    A good lens needs no displacement and then what is seen is put down to the eyes' rotation; a bad one is believed.
+    """
+    trust = 1 / PRIOR**2
+    trust[8:] /= 1 + (vector[8:] / PRIOR[8:]) ** 2
+    return trust
 
 
 def _moved(rig: Rig, vector: F64) -> Rig:
@@ -148,15 +163,16 @@ def _first_pose(camera: Camera, uv: F64, bearing: F64, rho: F64) -> F64:
 
 
 def _displacement(camera: Camera, uv: F64) -> F64:
-    """(N, 2, 7) smooth displacements of up to about one pixel at the image's corner.
+    """(N, 2, 9) smooth displacements of about one pixel at the image's border.
 
-    Shift, radial, tangential, aspect, skew: the first orders of what a lens model can get wrong.
+    A shift, every second-order term and the first radial one: the first orders of what a lens model can get wrong.
     """
-    half = 0.5 * np.hypot(camera.width, camera.height)
-    x, y = (uv[:, 0] - 0.5 * camera.width) / half, (uv[:, 1] - 0.5 * camera.height) / half
-    r2, one, zero = x * x + y * y, np.ones_like(x), np.zeros_like(x)
-    u = [one, zero, x * r2, 2 * x * y, r2 + 2 * x * x, x, y]
-    v = [zero, one, y * r2, r2 + 2 * y * y, 2 * x * y, -y, x]
+    x, y = 2 * uv[:, 0] / camera.width - 1, 2 * uv[:, 1] / camera.height - 1
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    aspect = camera.height / camera.width
+    r2 = x * x + (aspect * y) ** 2
+    u = [one, zero, x * x, x * y, y * y, zero, zero, zero, x * r2]
+    v = [zero, one, zero, zero, zero, x * x, x * y, y * y, aspect * y * r2]
     return np.stack([np.stack(u, -1), np.stack(v, -1)], 1)
 
 
@@ -210,7 +226,20 @@ def _tangents(bearing: F64) -> F64:
     helper = np.where(np.abs(bearing[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     first = np.cross(bearing, helper)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, np.cross(bearing, first)], -1)
+    return np.asarray(np.stack([first, np.cross(bearing, first)], -1), float)
+
+
+def _point_noise(residual: F64) -> F64:
+    """(N,) each point's own estimate of the noise of a coordinate, scaled so that the median is unbiased.
+
+    A point's three unknowns leave one of four rows, or five of eight; the medians of chi with one and five degrees of
+    freedom are 0.674 and 0.933 of its root mean square.
+    """
+    rows = np.isfinite(residual).sum(1)
+    usable = rows >= 4
+    free = rows[usable] - 3
+    size = np.sqrt(np.nansum(residual[usable] ** 2, 1) / free)
+    return size / np.where(free == 1, 0.674, 0.933)
 
 
 def _weights(residual: F64, sigma: float, hard: bool) -> F64:

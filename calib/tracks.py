@@ -12,7 +12,7 @@ from calib.matches import Matches, flattened, lucas_kanade, match_pair, pyramid_
 from calib.rectification import Rectification
 from stereo_sfm.types import F64, U8, Bool, StereoImage
 
-MOVED = 0.08  # of the width: a window ends when its points moved so far
+MOVED = 0.05  # of the width: a window ends when its points moved so far
 LONGEST = 12  # frames of a window
 
 

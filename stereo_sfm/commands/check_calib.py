@@ -1,0 +1,90 @@
+"""`stereo-sfm check-calib`: is the calibration of this recording good? PASS and WARN exit with 0, FAIL with 3."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from calib.check import CheckReport
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command."""
+    parser.add_argument("source", help="a folder, an .mcap file, sim:..., t265 or oak")
+    parser.add_argument("--rig", type=Path, default=None, help="calibration to judge instead of the source's own")
+    parser.add_argument("--windows", type=int, default=10, help="short stretches of the recording to look at")
+    parser.add_argument("--max-frames", type=int, default=600, help="stop reading after so many frames")
+    parser.add_argument("--search", type=int, default=14, metavar="ROWS", help="rows to search above and below")
+    parser.add_argument("--correct", type=Path, default=None, metavar="FILE", help="write the corrected rig there")
+    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Collect, judge, print."""
+    import itertools
+    import json
+
+    from calib import load_rig, save_rig
+    from calib.check import check
+    from calib.rectification import rectify
+    from calib.tracks import LONGEST, collect
+    from drivers.source import open_source
+
+    with open_source(args.source) as source:
+        rig = source.rig if args.rig is None else load_rig(args.rig)
+        rectification = rectify(rig, "epipolar")
+        total = min(source.frame_count or args.max_frames, args.max_frames)
+        gap = 0 if source.live else max(0, total // max(args.windows, 1) - LONGEST)
+        images = itertools.islice(source, args.max_frames)
+        report = check(rig, rectification, collect(images, rectification, args.windows, gap, search_rows=args.search))
+    if args.correct is not None:
+        save_rig(report.correction.apply(rig), args.correct)
+    if args.json:
+        print(json.dumps(as_dict(report), indent=2))
+    else:
+        print(as_text(report, str(args.source)))
+    return 3 if report.verdict == "FAIL" else 0
+
+
+def as_text(report: CheckReport, name: str) -> str:
+    """What a person reads."""
+    import numpy as np
+
+    from calib.check import VERDICTS
+
+    lines = [f"{name}: {report.matches} stereo matches in {report.windows} stretches"]
+    lines += [f"  {VERDICTS[f.level]}  {f.name}: {f.text}" for f in report.findings]
+    lines.append("row error by image region (median, px; - where nothing was matched):")
+    for row in report.region_median:
+        lines.append("  " + "  ".join("     -" if np.isnan(v) else f"{v:+6.2f}" for v in row))
+    lines.append(f"verdict: {report.verdict}" + (_advice(report) if report.level else ""))
+    return "\n".join(lines)
+
+
+def _advice(report: CheckReport) -> str:
+    names = [f.name for f in report.findings if f.level == report.level]
+    what = " and ".join(names)
+    if report.verdict == "WARN":
+        return f" (usable; {what} could be better)"
+    return f" ({what}): calibrate again, or try 'check-calib --correct rig.yaml' and check that"
+
+
+def as_dict(report: CheckReport) -> dict[str, Any]:
+    """Plain values for `--json`."""
+    import numpy as np
+
+    from calib.check import VERDICTS
+
+    return {
+        "verdict": report.verdict,
+        "matches": report.matches,
+        "windows": report.windows,
+        "findings": [{"name": f.name, "verdict": VERDICTS[f.level], "text": f.text} for f in report.findings],
+        "region_median_px": [[None if np.isnan(v) else round(float(v), 3) for v in r] for r in report.region_median],
+        "region_count": report.region_count.tolist(),
+        "correction": [float(v) for v in report.correction.vector[:8]],
+        "correction_sigma": [float(v) for v in report.correction.sigma[:8]],
+        "noise_px": report.correction.noise_px,
+    }
