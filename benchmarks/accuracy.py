@@ -41,7 +41,7 @@ def rows_of(name: str, spec: str, config: configuration.Config, max_frames: int 
     lost = len(record.frames) - int(record.tracked().sum())
     inliers = sorted(row.inliers for row in record.frames)[len(record.frames) // 2]
     rows: list[str] = []
-    mapped = record.mapped()
+    mapped = record.mapped() if config.mapper.enabled or config.loop.enabled else None
     for kind, trajectory in (("odometry", record.odometry()), ("map", mapped)):
         if trajectory is None:
             continue

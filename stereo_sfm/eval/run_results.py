@@ -60,7 +60,7 @@ def write_results(
     from calib import save_rig
 
     estimates = {"odometry": record.odometry()}
-    mapped = record.mapped()
+    mapped = record.mapped() if config.mapper.enabled or config.loop.enabled else None
     if mapped is not None:
         estimates["map"] = mapped
     for short, trajectory in zip(("odom", "map"), estimates.values(), strict=False):
