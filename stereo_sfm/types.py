@@ -35,6 +35,11 @@ class Message:
     def __post_init__(self) -> None:
         _freeze(self)
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Arrays stay read-only on the way through a pipe: compiled kernels see the same types in every process."""
+        self.__dict__.update(state)
+        _freeze(self)
+
 
 class TrackState(enum.IntEnum):
     """What the tracker knows about a frame's pose."""
@@ -188,6 +193,7 @@ class Applied:
 
     version: int
     before_frame_id: int
+    stamp_ns: int = 0  # of that frame
 
 
 @dataclass(frozen=True, eq=False)

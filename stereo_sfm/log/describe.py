@@ -12,10 +12,10 @@ import numpy as np
 from calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry.cameras import Camera
-from stereo_sfm.log import schema, topics
-from stereo_sfm.log.image_log import ImageInfo
-from stereo_sfm.log.provenance import CONFIG_FILE, METADATA, config_hash
+from stereo_sfm.log import topics
+from stereo_sfm.log.provenance import CONFIG_FILE, METADATA, TOTALS, config_hash
 from stereo_sfm.log.reader import LogReader
+from stereo_sfm.log.recorded import messages
 from stereo_sfm.types import I64
 
 if TYPE_CHECKING:
@@ -50,6 +50,7 @@ class Description:
     messages: int = 0
     truncated: str = ""
     metadata: dict[str, str] = field(default_factory=dict[str, str])
+    totals: dict[str, str] = field(default_factory=dict[str, str])
     config_sha256: str = ""
     rows: list[tuple[str, str, Rate]] = field(default_factory=list[tuple[str, str, Rate]])  # topic, schema, rate
     images: Rate | None = None
@@ -116,17 +117,20 @@ def describe_folder(path: Path) -> Description:
 
 
 def _describe_infos(out: Description, reader: LogReader) -> None:
-    """Skew and drops as our own recordings hold them."""
-    decode = None
+    """Skew and drops as our own recordings hold them: counted at the end, else (not closed) in every message."""
+    out.totals = reader.metadata(TOTALS)
+    if out.totals:
+        out.dropped = int(out.totals["dropped"])
+        out.skew_ms = int(out.totals["max_skew_ns"]) / 1e6
+        return
     skews = [0]
-    for record in reader.messages([topics.IMAGE_INFO]):
-        assert record.schema is not None
-        decode = decode or schema.decoder(ImageInfo, record.schema.data)
-        info: ImageInfo = decode(record.data)
+    infos = 0
+    for _, info in messages(reader, [topics.IMAGE_INFO]):
+        infos += 1
         out.dropped += info.dropped_before
         if info.has_right and info.right_stamp_ns:
             skews.append(abs(info.right_stamp_ns - info.stamp_ns))
-    if decode is not None:
+    if infos:
         out.skew_ms = max(skews) / 1e6
 
 

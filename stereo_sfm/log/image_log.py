@@ -106,6 +106,7 @@ class ImageLog:
         self._truth = ground_truth
         self._format = image_format
         self._next_static_ns: int | None = None
+        self._totals = {"images": 0, "dropped": 0, "max_skew_ns": 0}
         writer.attach(RIG_FILE, rig_to_text(rig), "application/yaml")
         if ground_truth is not None:
             writer.attach(TRUTH_FILE, truth_to_bytes(ground_truth), "application/zip")
@@ -130,7 +131,19 @@ class ImageLog:
             image = encode_pair(image, self._format)
         self._samples(pair)
         self._info(pair)
+        self._count(pair)
         self._pixels(image)
+
+    @property
+    def totals(self) -> dict[str, str]:
+        """Counts for the metadata at the end of the file."""
+        return {name: str(value) for name, value in self._totals.items()}
+
+    def _count(self, pair: StereoImage) -> None:
+        skew = abs(pair.right_stamp_ns - pair.stamp_ns) if pair.right is not None and pair.right_stamp_ns else 0
+        self._totals["images"] += 1
+        self._totals["dropped"] += pair.dropped_before
+        self._totals["max_skew_ns"] = max(self._totals["max_skew_ns"], skew)
 
     def _info(self, pair: StereoImage) -> None:
         info = ImageInfo(

@@ -12,6 +12,7 @@ from stereo_sfm.log.topics import SCHEMA_VERSION
 from stereo_sfm.log.writer import LogWriter
 
 METADATA = "stereo_sfm"
+TOTALS = "totals"  # written at the end: what a reader would else have to count
 CONFIG_FILE = "config.toml"
 VERSIONS_FILE = "versions.txt"
 _PACKAGES = (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
+import struct
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,9 +12,8 @@ from types import TracebackType
 from typing import IO, Any, Self
 
 import numpy as np
-from mcap.data_stream import ReadDataStream
 from mcap.reader import SeekingReader
-from mcap.records import Attachment, Channel, MessageIndex, Schema, Statistics
+from mcap.records import Attachment, Channel, Schema, Statistics
 from mcap.summary import Summary
 
 from stereo_sfm.errors import StereoSfmError
@@ -84,6 +84,7 @@ class LogReader:
         except OSError as error:
             raise StereoSfmError(f"cannot read {path}: {error.strerror}") from None
         self.truncated = ""
+        self._times: dict[int, I64] | None = None
         try:
             repair.check_magic(self._stream, path)
             self._reader, self.summary = self._open()
@@ -168,16 +169,29 @@ class LogReader:
 
     def stamps(self, topic: str) -> I64:
         """Log times of a topic in ascending order, from the index alone where the file has one."""
-        ids = {c.id for c in self.summary.channels.values() if c.topic == topic}
         chunks = self.summary.chunk_indexes
         if not chunks or any(not c.message_index_offsets for c in chunks):
             return np.array([r.log_time for r in self.messages([topic])], np.int64)
-        out: list[int] = []
-        for chunk in chunks:
-            for channel_id in sorted(ids & chunk.message_index_offsets.keys()):
-                self._bytes.seek(chunk.message_index_offsets[channel_id] + repair.PREFIX)
-                out += [t for t, _ in MessageIndex.read(ReadDataStream(self._bytes)).records]
-        return np.sort(np.array(out, np.int64))
+        if self._times is None:
+            self._times = self._read_message_indexes()
+        ids = [c.id for c in self.summary.channels.values() if c.topic == topic]
+        return np.sort(np.concatenate([self._times.get(i, np.zeros(0, np.int64)) for i in ids] or [[]])).astype(
+            np.int64
+        )
+
+    def _read_message_indexes(self) -> dict[int, I64]:
+        """Log times per channel. Behind each chunk lies a record per channel: opcode, length, channel, size, pairs."""
+        found: dict[int, list[I64]] = {}
+        for chunk in self.summary.chunk_indexes:
+            self._bytes.seek(chunk.chunk_start_offset + chunk.chunk_length)
+            data = self._bytes.read(chunk.message_index_length)
+            at = 0
+            while at < len(data):
+                _, length, channel_id, size = struct.unpack_from("<BQHI", data, at)
+                pairs = np.frombuffer(data, "<u8", size // 8, at + struct.calcsize("<BQHI"))
+                found.setdefault(channel_id, []).append(pairs[::2].astype(np.int64))
+                at += repair.PREFIX + length
+        return {channel_id: np.concatenate(parts) for channel_id, parts in found.items()}
 
     def attachment(self, name: str) -> bytes | None:
         """The content of an attached file, None where there is none."""

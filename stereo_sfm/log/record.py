@@ -11,7 +11,7 @@ from drivers.source import Source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log.image_log import ImageLog
 from stereo_sfm.log.images import FORMATS, encode_pair
-from stereo_sfm.log.provenance import write_provenance
+from stereo_sfm.log.provenance import TOTALS, write_provenance
 from stereo_sfm.log.writer import LogWriter
 
 
@@ -53,11 +53,15 @@ def record(
         write_provenance(writer, source=source.name, serial=source.rig.serial, mode=mode, image_format=image_format)
         images = ImageLog(writer, source.rig, source.ground_truth, image_format)
         frames, dropped, first_ns = 0, 0, None
-        for image in source:
-            images.image(encode_pair(image, image_format, decode=False))
-            first_ns = image.stamp_ns if first_ns is None else first_ns
-            frames += 1
-            dropped += image.dropped_before
-            yield Progress(frames, dropped, (image.stamp_ns - first_ns) / 1e9, writer.bytes_written)
+        try:
+            for image in source:
+                images.image(encode_pair(image, image_format, decode=False))
+                first_ns = image.stamp_ns if first_ns is None else first_ns
+                frames += 1
+                dropped += image.dropped_before
+                yield Progress(frames, dropped, (image.stamp_ns - first_ns) / 1e9, writer.bytes_written)
+        finally:
+            if not writer.closed:
+                writer.metadata(TOTALS, images.totals)
     if not frames:
         raise StereoSfmError(f"{source.name} gave no image: {path} holds only its calibration")

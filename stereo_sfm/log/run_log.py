@@ -15,9 +15,9 @@ from stereo_sfm.log import foxglove, topics
 from stereo_sfm.log.image_log import ImageLog
 from stereo_sfm.log.images import LoggedImage
 from stereo_sfm.log.map_view import MapView
-from stereo_sfm.log.provenance import write_provenance
+from stereo_sfm.log.provenance import TOTALS, write_provenance
 from stereo_sfm.log.writer import LogWriter
-from stereo_sfm.pipeline.sinks import StageTimes
+from stereo_sfm.pipeline.sinks import Health, StageTimes
 from stereo_sfm.types import (
     F32,
     F64,
@@ -29,6 +29,7 @@ from stereo_sfm.types import (
     LoopResult,
     MapUpdate,
     StereoImage,
+    TrackState,
     Trajectory,
 )
 
@@ -62,20 +63,6 @@ class TrackStats:
     line_share: float = NAN
     vp_sigma_deg: float = NAN
     other: dict[str, float] = field(default_factory=dict[str, float])
-
-
-@dataclass(frozen=True)
-class Health:
-    """How one stage keeps up; wall clock, never compared."""
-
-    stage: str
-    frame_id: int
-    rate: float  # per second
-    queue: int  # messages waiting
-    p50_ms: float
-    p95_ms: float
-    p99_ms: float
-    dropped: int
 
 
 _NAMED = {f.name for f in fields(TrackStats)} - {"other"}
@@ -174,7 +161,7 @@ class RunLog(NoRunLog):
         self._writer = writer
         self._left_T_body = se3.inverse(rig.body_T_left)
         self._body_adjoint = se3.adjoint(rig.body_T_left)
-        self._loops = config.loop.enabled
+        self._loops = config.loop.enabled and config.mapper.enabled and rig.stereo  # whether results will come
         write_provenance(writer, source=source, serial=rig.serial, mode=mode, image_format=image_format, config=config)
         self._images = ImageLog(writer, rig, ground_truth, image_format)
         self._map = MapView()
@@ -190,6 +177,7 @@ class RunLog(NoRunLog):
         self._next_points_ns: int | None = None
         self._last: tuple[int, int] = (0, 0)  # stamp and frame id of the newest keyframe shown
         self._now_ns = 0
+        self._totals = dict.fromkeys(("frames", "lost", "keyframes", "loops accepted", "loop candidates rejected"), 0)
         self._closed = False
 
     def put(self, message: object) -> None:
@@ -206,6 +194,8 @@ class RunLog(NoRunLog):
         self._images.image(image)
 
     def frame(self, frame: Frame) -> None:
+        self._totals["frames"] += 1
+        self._totals["lost"] += frame.state == TrackState.LOST
         write, stamp, sequence = self._writer.write, frame.stamp_ns, frame.frame_id
         write(topics.FRAME, frame, stamp, sequence)
         write(topics.STATS, track_stats(frame), stamp, sequence)
@@ -220,6 +210,7 @@ class RunLog(NoRunLog):
         self._release_frames()
 
     def keyframe(self, keyframe: Keyframe) -> None:
+        self._totals["keyframes"] += 1
         self._writer.write(topics.KEYFRAME, keyframe, keyframe.stamp_ns, keyframe.frame_id)
         self._keyframes[keyframe.kf_id] = keyframe
         self._stamps[keyframe.kf_id] = (keyframe.stamp_ns, keyframe.frame_id)
@@ -236,13 +227,15 @@ class RunLog(NoRunLog):
         self._release_frames()
 
     def loop(self, result: LoopResult) -> None:
+        self._totals["loops accepted"] += result.candidate_kf_id >= 0
+        self._totals["loop candidates rejected"] += len(result.rejected)
         self._answers[1].append(result)
         self._release_answers()
         self._results[result.kf_id] = result
         self._release_updates()
 
     def applied(self, applied: Applied) -> None:
-        self._writer.write(topics.APPLIED, applied, self._now_ns, applied.before_frame_id)
+        self._writer.write(topics.APPLIED, applied, applied.stamp_ns, applied.before_frame_id)
 
     def dropped(self, dropped: Dropped) -> None:
         self._writer.write(topics.DROPPED, dropped, dropped.stamp_ns, dropped.frame_id)
@@ -266,6 +259,8 @@ class RunLog(NoRunLog):
             self._release_frames(everything=True)
             self._show_trajectory()
             self._show_points()
+            totals = {name: str(int(value)) for name, value in self._totals.items()}
+            self._writer.metadata(TOTALS, self._images.totals | totals)
         finally:
             self._writer.close()
 

@@ -90,7 +90,7 @@ class LogWriter:
         self._channels: dict[str, int] = {}
         self._pending_bytes = 0
         self._pending_since: tuple[int, int] = (0, 0)  # log and publish time of the oldest message not yet written
-        self._closed = False
+        self.closed = False  # also after a full disk
         self._guarded(lambda: self._mcap.start(library="stereo-sfm"))
 
     @property
@@ -119,7 +119,7 @@ class LogWriter:
         Raises:
             StereoSfmError: the disk is full; the file is closed and readable.
         """
-        if self._closed:
+        if self.closed:
             raise ValueError(f"{self.path} is closed")
         data: bytes = schema.encode(message) if is_dataclass(message) else message.SerializeToString()
         now = self._clock()
@@ -138,10 +138,10 @@ class LogWriter:
 
     def close(self) -> None:
         """Write the index and close. Safe to call twice."""
-        if self._closed:
+        if self.closed:
             return
         self._guarded(self._mcap.finish)
-        self._closed = True
+        self.closed = True
         self._file.close()
 
     def __enter__(self) -> Self:
@@ -178,7 +178,7 @@ class LogWriter:
         try:
             action()
         except OSError as error:
-            self._closed = True
+            self.closed = True
             self._file.close()
             messages = repair.finish_in_place(self.path)
             raise StereoSfmError(

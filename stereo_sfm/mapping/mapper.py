@@ -22,6 +22,7 @@ is culled).
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -87,7 +88,7 @@ class Mapper:
         self._version += 1
         if not self._config.enabled:
             return self._without_mapping(keyframe)
-        if self._job is not None and len(self.map.keyframes) >= self._job_due:
+        if self.job_due:
             with self._spans.span("full_ba"):
                 self._apply_job()
         if loop is not None and loop.candidate_kf_id >= 0:
@@ -100,6 +101,22 @@ class Mapper:
         with self._spans.span("cull"):
             self._cull(row)
         return self._update(keyframe.kf_id)
+
+    def finish(self, loops: Sequence[LoopResult]) -> MapUpdate | None:
+        """After the last keyframe: loops that no keyframe brought any more, and the work in the background.
+
+        Returns:
+            A last update, or None when there is nothing to say.
+        """
+        if not self._config.enabled or not len(self.map.keyframes):
+            return None
+        for loop in [*loops, None]:
+            if self._job is not None:
+                self._apply_job()
+            if loop is not None and loop.candidate_kf_id >= 0:
+                self._close(loop)
+        self._version += 1
+        return self._update(int(self.map.keyframes.kf_id[-1]))
 
     def _without_mapping(self, keyframe: Keyframe) -> MapUpdate:
         none = np.zeros(0, np.int64)
@@ -161,6 +178,11 @@ class Mapper:
         """The odometry frame goes with the newest keyframe, whose map_T_kf was `before`."""
         moved = self.map.keyframes.map_T_kf[-1] @ se3.inverse(before)
         self._map_T_odom = se3.orthonormalize(moved @ self._map_T_odom)
+
+    @property
+    def job_due(self) -> bool:
+        """Whether the next `step` applies the answer of the job in the background."""
+        return self._job is not None and len(self.map.keyframes) >= self._job_due
 
     def pending_job(self) -> Job | None:
         """The full bundle adjustment that nobody has taken yet, once."""

@@ -1,4 +1,4 @@
-"""The reference: every stage in this process, one frame at a time."""
+"""The reference: every stage in this process, one frame at a time. Other wirings give the same bits."""
 
 from __future__ import annotations
 
@@ -6,27 +6,82 @@ from collections.abc import Iterator, Sequence
 
 from drivers.source import Source
 from stereo_sfm.config import Config
+from stereo_sfm.pipeline.schedule import Lockstep, Schedule
 from stereo_sfm.pipeline.sinks import Sink, StageTimes
+from stereo_sfm.pipeline.stages import LocalMailbox, MapStage, TrackStage, make_closer, make_mapper
 from stereo_sfm.timing import Spans
 from stereo_sfm.tracking.factory import make_tracker
-from stereo_sfm.types import Frame
+from stereo_sfm.types import Frame, Keyframe, LoopResult, MapUpdate, StereoImage
 
 
-def run_inline(source: Source, config: Config, sinks: Sequence[Sink] = ()) -> Iterator[Frame]:
-    """Track every image of an open source and yield its frame; every message also goes to the sinks, in order."""
-    spans = Spans()
-    tracker = make_tracker(config, source.rig, spans, source.ground_truth)
+class InlineRun:
+    """All stages of one run; `step` takes one image through all of them."""
 
-    def publish(message: object) -> None:
-        for sink in sinks:
+    def __init__(self, source: Source, config: Config, sinks: Sequence[Sink], schedule: Schedule | None) -> None:
+        self._spans = Spans()
+        self._sinks = sinks
+        self._updates: LocalMailbox[MapUpdate] = LocalMailbox()
+        self._loops: LocalMailbox[LoopResult] = LocalMailbox()
+        tracker = make_tracker(config, source.rig, self._spans, source.ground_truth)
+        schedule = schedule or Lockstep(config.pipeline.update_lag_frames)
+        self._track = TrackStage(tracker, schedule, self._updates)
+        self._closer = make_closer(config, source.rig, self._spans)
+        lag = config.pipeline.loop_lag_keyframes
+        self.map_stage = MapStage(
+            make_mapper(config, source.rig, self._spans), lag, None if self._closer is None else self._loops
+        )
+
+    def step(self, image: StereoImage) -> Frame:
+        """Track one image; map and close loops when it becomes a keyframe."""
+        self._publish(image)
+        frame: Frame | None = None
+        keyframe: Keyframe | None = None
+        with self._spans.span("track"):
+            for message in self._track.step(image):
+                self._publish(message)
+                frame = message if isinstance(message, Frame) else frame
+                keyframe = message if isinstance(message, Keyframe) else keyframe
+        assert frame is not None
+        if keyframe is not None:
+            self._map(keyframe)
+        self._publish(StageTimes(frame.frame_id, self._spans.take()))
+        return frame
+
+    def _map(self, keyframe: Keyframe) -> None:
+        if self._closer is not None:
+            with self._spans.span("loop"):
+                result = self._closer.step(keyframe)
+            self._publish(result)
+            self._loops.append(result)
+        with self._spans.span("map"):
+            update = self.map_stage.step(keyframe)
+        self._publish(update)
+        self._updates.append(update)
+
+    def finish(self) -> None:
+        """What the last keyframes left behind."""
+        update = self.map_stage.finish()
+        if update is not None:
+            self._publish(update)
+
+    def _publish(self, message: object) -> None:
+        for sink in self._sinks:
             sink.put(message)
 
-    for image in source:
-        publish(image)
-        with spans.span("track"):
-            frame, keyframe = tracker.step(image)
-        publish(frame)
-        if keyframe is not None:
-            publish(keyframe)
-        publish(StageTimes(frame.frame_id, spans.take()))
-        yield frame
+
+def run_inline(
+    source: Source, config: Config, sinks: Sequence[Sink] = (), schedule: Schedule | None = None
+) -> Iterator[Frame]:
+    """Take every image of an open source through all stages and yield its frame.
+
+    Args:
+        source: an open source. config: what decides the result.
+        sinks: every message of the run goes to each, in order.
+        schedule: when updates reach the tracker; lockstep when omitted.
+    """
+    run = InlineRun(source, config, sinks, schedule)
+    try:
+        for image in source:
+            yield run.step(image)
+    finally:
+        run.finish()

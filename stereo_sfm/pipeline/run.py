@@ -11,7 +11,9 @@ from stereo_sfm.types import Frame
 
 
 def run(source: Source, config: Config | None = None, sinks: Sequence[Sink] = ()) -> Iterator[Frame]:
-    """Run on an open source and yield a `Frame` for each image; it blocks, and the same input gives the same bits.
+    """Run on an open source in this process and yield a `Frame` for each image; the same input gives the same bits.
+
+    `stereo_sfm.pipeline.processes.ProcessRun` does the same over processes.
 
     Args:
         source: an open source, as `drivers.source.open_source` gives it.

@@ -14,6 +14,20 @@ class StageTimes:
     ms: dict[str, float]
 
 
+@dataclass(frozen=True)
+class Health:
+    """How one stage keeps up; wall clock, never compared."""
+
+    stage: str
+    frame_id: int
+    rate: float  # per second
+    queue: int  # messages waiting
+    p50_ms: float
+    p95_ms: float
+    p99_ms: float
+    dropped: int
+
+
 class Sink(Protocol):
     """Takes every message of a run in order: StereoImage, Frame, Keyframe, MapUpdate, LoopResult, StageTimes, ..."""
 

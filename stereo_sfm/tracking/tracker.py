@@ -23,7 +23,7 @@ from stereo_sfm.tracking.descriptors import describe
 from stereo_sfm.tracking.eyes import Eyes
 from stereo_sfm.tracking.stereo import StereoMatcher
 from stereo_sfm.tracking.tracks import Patches, Tracks
-from stereo_sfm.types import F32, F64, Bool, Frame, Keyframe, MapUpdate, Observations, StereoImage, TrackState
+from stereo_sfm.types import F32, F64, I64, Bool, Frame, Keyframe, MapUpdate, Observations, StereoImage, TrackState
 
 CAUCHY_SCALES = np.array([20.0, 10.0, 6.0, 4.0, 3.0, 2.0, 2.0])  # in sigmas, one Gauss-Newton step each
 
@@ -342,7 +342,7 @@ class Tracker:
         self._tracks = self._tracks.append(new)
         self._patches.keep_only(self._tracks.slot)
 
-    def _patches_make(self, pyramid: flow.Pyramid, uv: F64, slots: F64) -> Bool:
+    def _patches_make(self, pyramid: flow.Pyramid, uv: F64, slots: I64) -> Bool:
         store = self._patches
         return flow.make_patches(
             pyramid, uv, slots, flow.WEIGHTS, flow.COORDINATES, store.patch, store.gradients, store.inverse_normal,

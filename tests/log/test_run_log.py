@@ -16,15 +16,18 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
+from drivers import open_source
 from stereo_sfm.config import Config
+from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.log import foxglove, schema, topics
 from stereo_sfm.log.diff import diff
 from stereo_sfm.log.map_view import MapView
 from stereo_sfm.log.reader import LogReader
-from stereo_sfm.log.run_log import Health, NoRunLog, RunLog, TrackStats, track_stats
+from stereo_sfm.log.recorded import messages, read_run
+from stereo_sfm.log.run_log import NoRunLog, RunLog, TrackStats, track_stats
 from stereo_sfm.log.writer import LogWriter
-from stereo_sfm.pipeline.sinks import StageTimes
+from stereo_sfm.pipeline.sinks import Health, StageTimes
 from stereo_sfm.types import (
     F64,
     Applied,
@@ -36,7 +39,15 @@ from stereo_sfm.types import (
     Observations,
     TrackState,
 )
-from tests.log.recordings import PERIOD_NS, START_NS, fisheye_rig, stereo_images, walk_truth
+from tests.log.recordings import (
+    PERIOD_NS,
+    START_NS,
+    ArraySource,
+    fisheye_rig,
+    stereo_images,
+    walk_truth,
+    write_recording,
+)
 
 FRAMES = 60
 KEYFRAME_EVERY = 6
@@ -275,6 +286,30 @@ def test_a_run_without_loops_or_mapping_waits_for_nothing(tmp_path: Path) -> Non
     with LogReader(tmp_path / "a.mcap") as reader:
         assert len(reader.stamps(topics.TRAJECTORY)) == 1 and len(reader.stamps(topics.MAP_UPDATE)) == 3
     log.close()
+
+
+def test_what_a_replay_needs_comes_back(run: Path) -> None:
+    with LogReader(run) as reader:
+        recorded = read_run(reader)
+        kinds = {type(message).__name__ for _, message in messages(reader)}
+    assert (recorded.source, recorded.mode, recorded.image_format) == ("test", "inline", "png")
+    assert recorded.config == Config()
+    assert recorded.applied == [Applied(1, 3)]
+    assert recorded.dropped == [Dropped(9, START_NS, "ring", "full", 2)]
+    assert {"Frame", "Keyframe", "TrackStats", "StageTimes", "CompressedImage", "PointCloud", "Log"} <= kinds
+
+
+def test_a_recording_is_no_run_and_a_run_without_images_says_where_they_are(tmp_path: Path) -> None:
+    source = ArraySource(fisheye_rig(), stereo_images(2, np.random.default_rng(0)))
+    write_recording(tmp_path / "recording.mcap", source)
+    with LogReader(tmp_path / "recording.mcap") as reader, pytest.raises(StereoSfmError, match="no log of a run"):
+        read_run(reader)
+    path = tmp_path / "lean.mcap"
+    log = RunLog(LogWriter(path), fisheye_rig(), Config(), source="a.mcap", mode="inline", image_format="none")
+    log.image(source.images[0])
+    log.close()
+    with pytest.raises(StereoSfmError, match=r"a run without its images: they are in a\.mcap"):
+        open_source(path)
 
 
 def test_an_unknown_message_is_an_error_and_the_null_log_takes_everything(tmp_path: Path) -> None:

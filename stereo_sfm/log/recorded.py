@@ -1,0 +1,106 @@
+"""Messages of a log as our own types again, and what a replay needs to know of a run."""
+
+from __future__ import annotations
+
+import importlib
+import tomllib
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from stereo_sfm.config import Config, from_dict
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.log import schema, topics
+from stereo_sfm.log.image_log import ImageInfo, ImuSample, WheelSample
+from stereo_sfm.log.provenance import CONFIG_FILE, METADATA
+from stereo_sfm.log.reader import LogReader, Record
+from stereo_sfm.log.run_log import TrackStats
+from stereo_sfm.pipeline.sinks import Health, StageTimes
+from stereo_sfm.types import Applied, Dropped, Frame, Keyframe, LoopResult, MapUpdate
+
+TYPES: dict[str, type[Any]] = {
+    schema.full_name(cls): cls
+    for cls in (
+        Frame,
+        Keyframe,
+        MapUpdate,
+        LoopResult,
+        Applied,
+        Dropped,
+        ImageInfo,
+        ImuSample,
+        WheelSample,
+        TrackStats,
+        Health,
+        StageTimes,
+    )
+}
+
+
+def messages(
+    reader: LogReader, names: Collection[str] | None = None, start: int | None = None, until: int | None = None
+) -> Iterator[tuple[Record, Any]]:
+    """Records with their decoded messages: our dataclasses, or Foxglove's protobuf messages.
+
+    Args:
+        reader: the open file.
+        names: topics, None for all. Messages of unknown schemas are left out.
+        start: first log time, inclusive. until: last log time, inclusive.
+    """
+    decoders: dict[str, Callable[[bytes], Any] | None] = {}
+    for record in reader.messages(names, start, until):
+        if record.schema is None or record.channel.message_encoding != "protobuf":
+            continue
+        name = record.schema.name
+        if name not in decoders:
+            decoders[name] = _decoder(name, record.schema.data)
+        decode = decoders[name]
+        if decode is not None:
+            yield record, decode(record.data)
+
+
+def _decoder(name: str, data: bytes) -> Callable[[bytes], Any] | None:
+    if name in TYPES:
+        return schema.decoder(TYPES[name], data)
+    package, _, kind = name.partition(".")
+    if package != "foxglove":
+        return None
+    try:
+        return getattr(importlib.import_module(f"foxglove_schemas_protobuf.{kind}_pb2"), kind).FromString
+    except (ImportError, AttributeError):
+        return None
+
+
+@dataclass(frozen=True)
+class RecordedRun:
+    """How a run came about."""
+
+    source: str
+    mode: str  # "inline", "lockstep", "realtime"
+    image_format: str  # "none" when the images are elsewhere
+    config: Config
+    applied: list[Applied]
+    dropped: list[Dropped]
+
+
+def read_run(reader: LogReader) -> RecordedRun:
+    """Configuration and schedule of a run.
+
+    Raises:
+        StereoSfmError: the file is a recording, not a run.
+    """
+    text = reader.attachment(CONFIG_FILE)
+    if text is None:
+        raise StereoSfmError(f"{reader.path} is no log of a run: it holds no configuration ('stereo-sfm run' takes it)")
+    about = reader.metadata(METADATA)
+    found: dict[str, list[Any]] = {topics.APPLIED: [], topics.DROPPED: []}
+    for record, message in messages(reader, tuple(found)):
+        found[record.topic].append(message)
+    return RecordedRun(
+        about.get("source", ""),
+        about.get("mode", ""),
+        about.get("image_format", ""),
+        from_dict(tomllib.loads(text.decode())),
+        found[topics.APPLIED],
+        found[topics.DROPPED],
+    )

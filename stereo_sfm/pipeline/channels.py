@@ -1,0 +1,90 @@
+"""One-way pipes between two processes: one writer, one reader, no lock that a killed process could take along."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Any, Generic, TypeVar
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class End:
+    """The stage has said everything."""
+
+    stage: str
+
+
+@dataclass(frozen=True)
+class Failed:
+    """The stage ended with an error."""
+
+    stage: str
+    message: str  # one line for an error of ours, else the traceback
+    ours: bool
+    exit_code: int
+
+
+class Lost(Exception):
+    """The process at the other end is gone."""
+
+
+class Outbox:
+    """Sends in a thread, so that two stages that write to each other never wait for one another's pipe.
+
+    At most `limit` messages wait; then `send` blocks, which is the back-pressure of the pipeline.
+    """
+
+    def __init__(self, connection: Connection, limit: int = 64) -> None:
+        self._connection = connection
+        self._queue: queue.Queue[Any] = queue.Queue(limit)
+        self._thread = threading.Thread(target=self._work, daemon=True)
+        self._thread.start()
+
+    def send(self, message: object) -> None:
+        """Give the message away."""
+        self._queue.put((message,))
+
+    def waiting(self) -> int:
+        """Messages not yet in the pipe."""
+        return self._queue.qsize()
+
+    def close(self) -> None:
+        """Send what waits, then close the pipe."""
+        self._queue.put(None)
+        self._thread.join()
+        self._connection.close()
+
+    def _work(self) -> None:
+        gone = False
+        while (item := self._queue.get()) is not None:
+            if not gone:
+                try:
+                    self._connection.send(item[0])
+                except OSError:
+                    gone = True  # the reader died: main ends the run; nobody waits for these messages
+
+
+class Inbox(Generic[T]):
+    """Receiving end; `take` blocks."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+
+    def take(self) -> T:
+        """The next message.
+
+        Raises:
+            Lost: the sender is gone.
+        """
+        try:
+            return self._connection.recv()
+        except (EOFError, OSError):
+            raise Lost from None
+
+    def ready(self) -> bool:
+        """Whether a message is there: only the realtime schedule asks."""
+        return self._connection.poll(0)

@@ -1,0 +1,110 @@
+"""Images between processes: a ring of slots in shared memory. Messages carry the slot, never the pixels.
+
+The capture stage owns the slots. A slot is free again when all its readers have given it back.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from multiprocessing import shared_memory
+
+import numpy as np
+
+from calib.rig import Rig
+from stereo_sfm.types import F32, U8, StereoImage
+
+_NO_PIXELS = np.zeros((0, 0), np.uint8)
+
+
+@dataclass(frozen=True)
+class ImageLayout:
+    """Where the images of a slot lie; shapes are (H, W)."""
+
+    left: tuple[int, int]
+    right: tuple[int, int] | None
+    depth: tuple[int, int] | None
+
+    @staticmethod
+    def of(rig: Rig) -> ImageLayout:
+        """What this rig's images need."""
+        left = (rig.left.height, rig.left.width)
+        eyes = rig.right is not None and not rig.depth
+        assert rig.right is not None or not eyes
+        right = (rig.right.height, rig.right.width) if eyes and rig.right is not None else None
+        return ImageLayout(left, right, left if rig.depth else None)
+
+    @property
+    def size(self) -> int:
+        """Bytes of one slot."""
+        return _area(self.left) + _area(self.right) + 4 * _area(self.depth)
+
+
+def _area(shape: tuple[int, int] | None) -> int:
+    return 0 if shape is None else shape[0] * shape[1]
+
+
+@dataclass(frozen=True, eq=False)
+class SlotImage:
+    """A StereoImage whose pixels lie in a slot, with the time it was taken from the driver (for latency)."""
+
+    slot: int
+    image: StereoImage  # without pixels
+    has_right: bool
+    has_depth: bool
+    captured_s: float  # monotonic clock
+    encoded: tuple[bytes, bytes | None] | None = None  # JPEG bytes whose decoded pixels the slot holds
+
+
+class ImageRing:
+    """Slots of image pairs in one block of shared memory."""
+
+    def __init__(self, layout: ImageLayout, slots: int, name: str | None = None) -> None:
+        """Make a new block, or attach to the one called `name`."""
+        self.layout, self.slots = layout, slots
+        self._owner = name is None
+        size = max(layout.size * slots, 1)
+        self._memory = shared_memory.SharedMemory(name, create=self._owner, size=size)
+
+    @property
+    def name(self) -> str:
+        """For other processes to attach."""
+        return self._memory.name
+
+    def _arrays(self, slot: int) -> tuple[U8, U8 | None, F32 | None]:
+        buffer, at = self._memory.buf, slot * self.layout.size
+        left = np.ndarray(self.layout.left, np.uint8, buffer, at)
+        at += _area(self.layout.left)
+        right = None if self.layout.right is None else np.ndarray(self.layout.right, np.uint8, buffer, at)
+        at += _area(self.layout.right)
+        depth = None if self.layout.depth is None else np.ndarray(self.layout.depth, np.dtype("<f4"), buffer, at)
+        return left, right, depth
+
+    def write(
+        self, slot: int, image: StereoImage, captured_s: float, encoded: tuple[bytes, bytes | None] | None = None
+    ) -> SlotImage:
+        """Put the pixels into a slot."""
+        left, right, depth = self._arrays(slot)
+        left[...] = image.left
+        if right is not None and image.right is not None:
+            right[...] = image.right
+        if depth is not None and image.depth is not None:
+            depth[...] = image.depth
+        bare = dataclasses.replace(image, left=_NO_PIXELS, right=None, depth=None)
+        return SlotImage(slot, bare, image.right is not None, image.depth is not None, captured_s, encoded)
+
+    def read(self, message: SlotImage) -> StereoImage:
+        """The image with pixels of its own: the slot may be given back at once."""
+        left, right, depth = self._arrays(message.slot)
+        return dataclasses.replace(
+            message.image,
+            left=left.copy(),
+            right=right.copy() if right is not None and message.has_right else None,
+            depth=depth.copy() if depth is not None and message.has_depth else None,
+        )
+
+    def close(self) -> None:
+        """Detach; the maker also frees the memory."""
+        self._memory.close()
+        if self._owner:
+            self._memory.unlink()

@@ -1,0 +1,299 @@
+"""The stages as processes. This is the hub: it starts them, passes their messages on, and ends the run in order.
+
+Who talks to whom: capture -> tracker (images by slot), tracker -> mapper and loop (keyframes), loop -> mapper (loop
+results), mapper -> tracker (updates), mapper <-> optimizer (full bundle adjustment); every stage -> main; main -> logger
+and viewer. Every arrow is a pipe of its own, so a killed process leaves no lock behind, and its death is an end of file
+to whoever listens to it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator, Sequence
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from types import TracebackType
+from typing import Any, Self
+
+from stereo_sfm.config import Config
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.pipeline import workers
+from stereo_sfm.pipeline.capture import SourceInfo
+from stereo_sfm.pipeline.channels import End, Failed, Outbox
+from stereo_sfm.pipeline.images import ImageLayout, ImageRing, SlotImage
+from stereo_sfm.pipeline.sinks import Sink
+from stereo_sfm.pipeline.workers import LogOptions, Setup
+from stereo_sfm.types import Applied, Frame
+
+GRACE_S = 1.2  # for the logger to close its file after another stage died
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+
+
+class StageDied(StereoSfmError):
+    """A process of the pipeline ended by an error that is not the user's, or was killed."""
+
+    exit_code = 1
+
+
+class ProcessRun:
+    """One run over processes. Use as a context manager; iterate for the frames."""
+
+    def __init__(
+        self,
+        opener: Callable[[], Any],
+        config: Config,
+        sinks: Sequence[Sink] = (),
+        *,
+        realtime: bool | None = None,
+        applied: Sequence[Applied] | None = None,
+        log: LogOptions | None = None,
+        delays: int | None = None,
+    ) -> None:
+        """Prepare a run.
+
+        Args:
+            opener: opens the source in the capture process; must survive pickling.
+            config: what decides the result.
+            sinks: get every message of the run but the images, in this process.
+            realtime: drop images and take updates as they come; None: as the source says (`live`).
+            applied: schedule of an earlier realtime run to follow.
+            log: write everything to an MCAP file.
+            delays: seed of random delays in every stage, for tests.
+        """
+        self._opener, self._config, self._sinks = opener, config, list(sinks)
+        self._realtime, self._applied, self._log, self._delays = realtime, applied, log, delays
+        self._context = multiprocessing.get_context("spawn")
+        self._processes: dict[str, BaseProcess] = {}
+        self._reports: dict[Connection, str] = {}
+        self._controls: dict[str, Connection] = {}
+        self._to_logger: Outbox | None = None
+        self._release: Outbox | None = None
+        self._ring: ImageRing | None = None
+        self._ended: set[str] = set()
+        self._stopping = False
+        self.info: SourceInfo
+
+    # -- life --------------------------------------------------------------------------------------------------------
+
+    def __enter__(self) -> Self:
+        try:
+            self._start()
+        except BaseException:
+            self._kill_all()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is not None and not issubclass(kind, StageDied):
+            self._abandon()
+        self._kill_all()
+
+    @property
+    def pids(self) -> dict[str, int]:
+        """Process ids by stage."""
+        return {name: p.pid for name, p in self._processes.items() if p.pid is not None}
+
+    def stop(self) -> None:
+        """Ask capture to end; everything in flight is finished and written."""
+        if not self._stopping:
+            self._stopping = True
+            with contextlib.suppress(OSError):
+                self._controls["capture"].send("stop")
+
+    def __iter__(self) -> Iterator[Frame]:
+        while self._reports:
+            for connection in wait(list(self._reports)):
+                assert isinstance(connection, Connection)
+                try:
+                    message = connection.recv()
+                except (EOFError, OSError):
+                    self._died(connection)
+                    continue
+                if isinstance(message, Failed):
+                    self._fail(message)
+                elif isinstance(message, End):
+                    self._end(connection, message.stage)
+                else:
+                    self._dispatch(message)
+                    if isinstance(message, Frame):
+                        yield message
+
+    # -- start -------------------------------------------------------------------------------------------------------
+
+    def _start(self) -> None:
+        for variable in THREAD_VARIABLES:
+            os.environ.setdefault(variable, str(self._config.pipeline.threads))
+        pipe = self._pipe
+        images, updates = pipe(), pipe()
+        to_mapper, to_loop, loops = pipe(), pipe(), pipe()
+        jobs, results = pipe(), pipe()
+        tracker_free, second_free = pipe(), pipe()
+        logged = pipe()
+        readers = [tracker_free[0], second_free[0]]
+        self._spawn("capture", workers.run_capture, self._opener, self._control("capture"), images[1], readers)
+        self._spawn(
+            "tracker", workers.run_tracker, self._control("tracker"), images[0], tracker_free[1], updates[0],
+            to_mapper[1], to_loop[1],
+        )  # fmt: skip
+        self._spawn(
+            "mapper", workers.run_mapper, self._control("mapper"), to_mapper[0], loops[0], updates[1], jobs[1],
+            results[0],
+        )  # fmt: skip
+        self._spawn("loop", workers.run_loop, self._control("loop"), to_loop[0], loops[1])
+        self._spawn("optimizer", workers.run_optimizer, self._control("optimizer"), jobs[0], results[1])
+        keep: list[Connection] = []
+        if self._log is not None:
+            self._spawn("logger", workers.run_logger, self._control("logger"), logged[0], second_free[1], self._log)
+            self._to_logger = Outbox(logged[1], 64)
+            keep = [logged[1]]
+        else:
+            self._release = Outbox(second_free[1], 64)
+            keep = [second_free[1]]
+        for ends in (images, updates, to_mapper, to_loop, loops, jobs, results, tracker_free, second_free, logged):
+            for end in ends:
+                if end not in keep:
+                    end.close()  # only the workers hold these: their death must be seen as an end of file
+        self._set_up(self._first_report())
+
+    def _set_up(self, info: SourceInfo) -> None:
+        self.info = info
+        realtime = info.live if self._realtime is None else self._realtime
+        self._ring = ImageRing(ImageLayout.of(info.rig), self._config.pipeline.ring_slots)
+        applied = None if self._applied is None else tuple(self._applied)
+        setup = Setup(
+            info.rig, self._config, info.ground_truth, info.name, self._ring.name, applied, realtime, self._delays
+        )
+        jpeg = self._log is not None and self._log.image_format == "jpeg"
+        for stage, control in self._controls.items():
+            control.send((setup, jpeg) if stage == "capture" else setup)
+
+    def _pipe(self) -> tuple[Connection, Connection]:
+        """(receiving end, sending end)."""
+        return self._context.Pipe(duplex=False)
+
+    def _control(self, stage: str) -> Connection:
+        receive, send = self._pipe()
+        self._controls[stage] = send
+        return receive
+
+    def _spawn(self, stage: str, body: Callable[..., None], *args: Any) -> None:
+        report, send = self._pipe()
+        process = self._context.Process(
+            target=workers.guarded, args=(stage, body, send, *args), name=f"stereo-sfm {stage}", daemon=True
+        )
+        process.start()
+        send.close()
+        if args and isinstance(args[0], Connection):
+            args[0].close()
+        self._processes[stage] = process
+        self._reports[report] = stage
+
+    def _first_report(self) -> SourceInfo:
+        """Capture's first word: what the source is, or why it cannot be opened."""
+        connection = next(c for c, stage in self._reports.items() if stage == "capture")
+        try:
+            message = connection.recv()
+        except (EOFError, OSError):
+            raise StageDied(f"capture {self._how_it_died('capture')} before the source was open") from None
+        if isinstance(message, Failed):
+            self._reports.pop(connection)
+            raise _error(message)
+        assert isinstance(message, SourceInfo)
+        return message
+
+    # -- messages ----------------------------------------------------------------------------------------------------
+
+    def _dispatch(self, message: object) -> None:
+        if not isinstance(message, SlotImage):
+            for sink in self._sinks:
+                sink.put(message)
+        if self._to_logger is not None:
+            self._to_logger.send(message)
+        elif isinstance(message, SlotImage) and self._release is not None:
+            self._release.send(message.slot)
+
+    def _end(self, connection: Connection, stage: str) -> None:
+        self._ended.add(stage)
+        self._reports.pop(connection, None)
+        connection.close()
+        others = {s for s in self._processes if s != "logger"}
+        if self._to_logger is not None and others <= self._ended and "logger" not in self._ended:
+            self._to_logger.send(End("main"))
+
+    # -- death -------------------------------------------------------------------------------------------------------
+
+    def _how_it_died(self, stage: str) -> str:
+        process = self._processes[stage]
+        process.join(0.5)
+        code = process.exitcode
+        if code is not None and code < 0:
+            return f"was killed by {signal.Signals(-code).name}"
+        return f"ended with exit code {code}"
+
+    def _died(self, connection: Connection) -> None:
+        """End of file without `End`: find the one that died first, close the log, raise."""
+        stage = self._reports.pop(connection)
+        self._processes[stage].join(0.5)
+        consequence = self._processes[stage].exitcode == workers.UPSTREAM_LOST
+        if consequence and any(s != "logger" for s in self._reports.values()):
+            return  # its neighbour is the cause, and will be found
+        message = f"the {stage} process {self._how_it_died(stage)}"
+        self._abandon()
+        raise StageDied(f"{message}; {self._what_remains(stage)}")
+
+    def _what_remains(self, stage: str) -> str:
+        if self._log is None:
+            return "the run has no log"
+        if stage == "logger":
+            return f"the log {self._log.path} is not closed, but readable (stereo-sfm recover writes a clean copy)"
+        return f"the log {self._log.path} is complete up to then"
+
+    def _fail(self, failed: Failed) -> None:
+        self._abandon()
+        raise _error(failed)
+
+    def _abandon(self) -> None:
+        """Kill every stage but the logger, which closes its file."""
+        for stage, process in self._processes.items():
+            if stage != "logger" and process.is_alive():
+                process.kill()
+        logger = self._processes.get("logger")
+        if logger is None or self._to_logger is None:
+            return
+        until = time.monotonic() + GRACE_S
+        if logger.is_alive():
+            self._to_logger.send(End("main"))
+        logger.join(max(until - time.monotonic(), 0.0))
+
+    def _kill_all(self) -> None:
+        for process in self._processes.values():
+            if process.is_alive() and not self._finished(process):
+                process.kill()
+            process.join()
+        for connection in (*self._reports, *self._controls.values()):
+            connection.close()
+        self._reports.clear()
+        if self._ring is not None:
+            self._ring.close()
+            self._ring = None
+
+    def _finished(self, process: BaseProcess) -> bool:
+        """Whether the process has said its last word and is only leaving."""
+        stage = next(s for s, p in self._processes.items() if p is process)
+        if stage in self._ended:
+            process.join(1.0)
+        return not process.is_alive()
+
+
+def _error(failed: Failed) -> StereoSfmError:
+    if not failed.ours:
+        return StageDied(f"the {failed.stage} process failed:\n{failed.message}")
+    error = StereoSfmError(failed.message)
+    error.exit_code = failed.exit_code
+    return error

@@ -1,0 +1,131 @@
+"""The stages as every wiring runs them: a `step` each, and where they wait for one another.
+
+A stage only makes blocking reads of messages that must come, so what it computes depends on the input alone. Inline a
+mailbox is a deque that is never empty when it is read; between processes it is the receiving end of a pipe.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from typing import Protocol, TypeVar
+
+from calib.rig import Rig
+from stereo_sfm.config import Config
+from stereo_sfm.pipeline.schedule import Schedule
+from stereo_sfm.timing import NoSpans
+from stereo_sfm.tracking.factory import AnyTracker
+from stereo_sfm.types import Applied, Frame, Keyframe, LoopResult, MapUpdate, StereoImage
+
+T_co = TypeVar("T_co", covariant=True)
+
+
+class Mailbox(Protocol[T_co]):
+    """Where a stage's awaited messages arrive, in order."""
+
+    def take(self) -> T_co:
+        """The next message; blocks until it is there."""
+        ...
+
+    def ready(self) -> bool:
+        """Whether `take` would return at once: only the realtime schedule asks."""
+        ...
+
+
+class LocalMailbox(deque[T_co]):  # type: ignore[type-var]
+    """A mailbox inside one process."""
+
+    def take(self) -> T_co:
+        return self.popleft()
+
+    def ready(self) -> bool:
+        return len(self) > 0
+
+
+class AnyMapper(Protocol):
+    """What answers keyframes with map updates: the mapper, or the localizer in a finished map."""
+
+    def step(self, keyframe: Keyframe, loop: LoopResult | None = None) -> MapUpdate: ...
+
+    def finish(self, loops: list[LoopResult]) -> MapUpdate | None: ...
+
+
+class AnyCloser(Protocol):
+    """What answers keyframes with loop results."""
+
+    def step(self, keyframe: Keyframe) -> LoopResult: ...
+
+
+class TrackStage:
+    """Images in; `Applied`, `Frame` and `Keyframe` messages out."""
+
+    def __init__(self, tracker: AnyTracker, schedule: Schedule, updates: Mailbox[MapUpdate]) -> None:
+        self._tracker, self._schedule, self._updates = tracker, schedule, updates
+        self._index = 0
+
+    def step(self, image: StereoImage) -> Iterator[Applied | Frame | Keyframe]:
+        """Apply the updates that are due, then track."""
+        for update in self._take(self._schedule.due(self._index, image.frame_id)):
+            self._tracker.apply(update)
+            yield Applied(update.version, image.frame_id, image.stamp_ns)
+        frame, keyframe = self._tracker.step(image)
+        if keyframe is not None:
+            self._schedule.keyframe(self._index)
+        self._index += 1
+        yield frame
+        if keyframe is not None:
+            yield keyframe
+
+    def _take(self, count: int | None) -> Iterator[MapUpdate]:
+        if count is None:
+            while self._updates.ready():
+                yield self._updates.take()
+        else:
+            for _ in range(count):
+                yield self._updates.take()
+
+
+class MapStage:
+    """Keyframes in, one `MapUpdate` each out; the loop result of a keyframe is taken `lag` keyframes later."""
+
+    def __init__(self, mapper: AnyMapper, lag: int, loops: Mailbox[LoopResult] | None) -> None:
+        self.mapper = mapper
+        self._lag, self._loops = max(lag, 0), loops
+        self._taken = self._count = 0
+
+    def step(self, keyframe: Keyframe) -> MapUpdate:
+        """Answer one keyframe."""
+        loop = None
+        if self._loops is not None and self._count >= self._lag:
+            loop = self._loops.take()
+            self._taken += 1
+        self._count += 1
+        return self.mapper.step(keyframe, loop)
+
+    def finish(self) -> MapUpdate | None:
+        """After the last keyframe: loops that were not taken yet, and what was going on in the background."""
+        if self._count == 0:
+            return None
+        loops = [self._loops.take() for _ in range(self._count - self._taken)] if self._loops is not None else []
+        return self.mapper.finish(loops)
+
+
+def make_mapper(config: Config, rig: Rig, spans: NoSpans | None = None) -> AnyMapper:
+    """The mapper; or, with `loop.localize_only`, a localizer in the map at `loop.map_in`."""
+    from stereo_sfm.mapping.mapper import Mapper
+
+    return Mapper(config.mapper, rig, spans, config.loop)
+
+
+def has_closer(config: Config, rig: Rig) -> bool:
+    """Whether a run closes loops: the configuration wants it and the camera knows depth."""
+    return config.loop.enabled and config.mapper.enabled and rig.stereo
+
+
+def make_closer(config: Config, rig: Rig, spans: NoSpans | None = None) -> AnyCloser | None:
+    """The loop closer, or None where there is none."""
+    if not has_closer(config, rig):
+        return None
+    from stereo_sfm.loop.closer import LoopCloser
+
+    return LoopCloser(config.loop, rig, spans=spans)

@@ -1,0 +1,311 @@
+"""What each process of the pipeline runs. A worker gets its pipes; its last word is End, or Failed."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from calib.rig import Rig
+from stereo_sfm.config import Config
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.pipeline.channels import End, Failed, Inbox, Lost, Outbox
+from stereo_sfm.pipeline.schedule import Lockstep, Realtime, Recorded, Schedule
+from stereo_sfm.types import Applied, Keyframe, LoopResult, MapUpdate, Trajectory
+
+STAGES = ("capture", "tracker", "mapper", "loop", "optimizer", "logger", "viewer")
+UPSTREAM_LOST = 70  # exit code of a worker whose neighbour died: not the cause
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """What every stage is told once the source is open."""
+
+    rig: Rig
+    config: Config
+    ground_truth: Trajectory | None
+    source_name: str
+    ring_name: str
+    applied: tuple[Applied, ...] | None  # a recorded schedule to follow
+    realtime: bool
+    delays: int | None  # seed of random delays in every stage (tests)
+
+
+def guarded(stage: str, body: Callable[..., None], report: Connection, *args: Any) -> None:
+    """Entry of every worker process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # main decides what Ctrl-C means
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    to_main = Outbox(report, 512)
+    try:
+        body(to_main, *args)
+        to_main.send(End(stage))
+        to_main.close()
+    except Lost:
+        sys.stdout.flush()
+        os._exit(UPSTREAM_LOST)
+    except StereoSfmError as error:
+        to_main.send(Failed(stage, str(error), True, error.exit_code))
+        to_main.close()
+        os._exit(error.exit_code)
+    except BaseException:
+        to_main.send(Failed(stage, traceback.format_exc(), False, 1))
+        to_main.close()
+        os._exit(1)
+
+
+def prepare(stage: str, setup: Setup) -> Callable[[], None]:
+    """Threads and cores of this process; returns what injects a random delay (tests) or nothing."""
+    import cv2
+
+    cv2.setNumThreads(setup.config.pipeline.threads)
+    cpus = setup.config.pipeline.cpus.get(stage)
+    if cpus and hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, cpus)
+    if setup.delays is None:
+        return lambda: None
+    import numpy as np
+
+    rng = np.random.default_rng([setup.delays, STAGES.index(stage)])
+    return lambda: time.sleep(float(rng.exponential(0.01)) if rng.random() < 0.3 else 0.0)
+
+
+def run_capture(
+    to_main: Outbox, opener: Callable[[], Any], control: Connection, tracker: Connection, readers: list[Connection]
+) -> None:
+    """Open the source, tell main about it, read it to the end."""
+    from stereo_sfm.pipeline.capture import CaptureStage, FreeSlots, SourceInfo, StopFlag
+    from stereo_sfm.pipeline.images import ImageLayout, ImageRing
+
+    with opener() as source:
+        to_main.send(SourceInfo(source.name, source.rig, source.ground_truth, source.frame_count, source.live))
+        jpeg: bool
+        setup, jpeg = Inbox[tuple[Setup, bool]](control).take()
+        delay = prepare("capture", setup)
+        slots = setup.config.pipeline.ring_slots
+        ring = ImageRing(ImageLayout.of(source.rig), slots, setup.ring_name)
+        to_tracker = Outbox(tracker)
+        stage = CaptureStage(
+            source, ring, FreeSlots(slots, readers), to_tracker, to_main, StopFlag(control), setup.realtime, jpeg
+        )
+        delay()
+        stage.run()
+        to_tracker.close()
+        ring.close()
+
+
+def _schedule(setup: Setup) -> Schedule:
+    if setup.applied is not None:
+        return Recorded(setup.applied)
+    return Realtime() if setup.realtime else Lockstep(setup.config.pipeline.update_lag_frames)
+
+
+def run_tracker(
+    to_main: Outbox,
+    control: Connection,
+    images: Connection,
+    release: Connection,
+    updates: Connection,
+    to_mapper: Connection,
+    to_loop: Connection,
+) -> None:
+    """Images to frames and keyframes."""
+    from stereo_sfm.pipeline.health import HealthMeter
+    from stereo_sfm.pipeline.images import ImageLayout, ImageRing, SlotImage
+    from stereo_sfm.pipeline.sinks import StageTimes
+    from stereo_sfm.pipeline.stages import TrackStage
+    from stereo_sfm.timing import Spans
+    from stereo_sfm.tracking.factory import make_tracker
+
+    setup = Inbox[Setup](control).take()
+    delay = prepare("tracker", setup)
+    spans = Spans()
+    ring = ImageRing(ImageLayout.of(setup.rig), setup.config.pipeline.ring_slots, setup.ring_name)
+    tracker = make_tracker(setup.config, setup.rig, spans, setup.ground_truth)
+    stage = TrackStage(tracker, _schedule(setup), Inbox[MapUpdate](updates))
+    inbox = Inbox[SlotImage | End](images)
+    free, keyframes = Outbox(release), (Outbox(to_mapper), Outbox(to_loop))
+    meter = HealthMeter("tracker")
+    frame_id = -1
+    while isinstance(message := inbox.take(), SlotImage):
+        image = ring.read(message)
+        free.send(message.slot)
+        delay()
+        begin = time.monotonic()
+        with spans.span("track"):
+            answers = list(stage.step(image))
+        for answer in answers:
+            to_main.send(answer)
+            if isinstance(answer, Keyframe):
+                for outbox in keyframes:
+                    outbox.send(answer)
+        now = time.monotonic()
+        frame_id = image.frame_id
+        to_main.send(StageTimes(frame_id, {**spans.take(), "latency": (now - message.captured_s) * 1e3}))
+        health = meter.add(frame_id, (now - begin) * 1e3, to_main.waiting())
+        if health is not None:
+            to_main.send(health)
+    health = meter.report(frame_id, 0)
+    if health is not None:
+        to_main.send(health)
+    for outbox in keyframes:
+        outbox.send(End("tracker"))
+        outbox.close()
+    ring.close()
+
+
+def run_mapper(
+    to_main: Outbox,
+    control: Connection,
+    keyframes: Connection,
+    loops: Connection,
+    updates: Connection,
+    jobs: Connection,
+    results: Connection,
+) -> None:
+    """Keyframes to map updates."""
+    from stereo_sfm.mapping.mapper import Mapper
+    from stereo_sfm.pipeline.health import HealthMeter
+    from stereo_sfm.pipeline.sinks import StageTimes
+    from stereo_sfm.pipeline.stages import MapStage, has_closer, make_mapper
+    from stereo_sfm.timing import Spans
+
+    setup = Inbox[Setup](control).take()
+    delay = prepare("mapper", setup)
+    spans = Spans()
+    mapper = make_mapper(setup.config, setup.rig, spans)
+    closing = has_closer(setup.config, setup.rig)
+    lag = setup.config.pipeline.loop_lag_keyframes
+    stage = MapStage(mapper, lag, Inbox[LoopResult](loops) if closing else None)
+    inbox = Inbox[Keyframe | End](keyframes)
+    to_tracker, to_optimizer = Outbox(updates), Outbox(jobs)
+    answers = Inbox[Any](results)
+    meter = HealthMeter("mapper")
+    frame_id, busy = -1, False
+    while isinstance(keyframe := inbox.take(), Keyframe):
+        delay()
+        begin = time.monotonic()
+        if isinstance(mapper, Mapper) and busy and mapper.job_due:
+            mapper.finish_job(answers.take())
+            busy = False
+        update = stage.step(keyframe)
+        to_main.send(update)
+        to_tracker.send(update)
+        if isinstance(mapper, Mapper) and (job := mapper.pending_job()) is not None:
+            if busy:
+                answers.take()  # a newer loop made this job's answer useless
+            to_optimizer.send(job)
+            busy = True
+        frame_id = keyframe.frame_id
+        ms = (time.monotonic() - begin) * 1e3
+        to_main.send(StageTimes(frame_id, {**spans.take(), "map": ms}))
+        health = meter.add(frame_id, ms, 0)
+        if health is not None:
+            to_main.send(health)
+    if isinstance(mapper, Mapper) and busy:
+        mapper.finish_job(answers.take())
+    last = stage.finish()
+    if last is not None:
+        to_main.send(last)
+    health = meter.report(frame_id, 0)
+    if health is not None:
+        to_main.send(health)
+    to_tracker.close()
+    to_optimizer.send(End("mapper"))
+    to_optimizer.close()
+
+
+def run_optimizer(to_main: Outbox, control: Connection, jobs: Connection, results: Connection) -> None:
+    """Full bundle adjustments, beside the mapper."""
+    from stereo_sfm.mapping.mapper import Job, run_job
+
+    setup = Inbox[Setup](control).take()
+    delay = prepare("optimizer", setup)
+    inbox, outbox = Inbox[Job | End](jobs), Outbox(results)
+    while isinstance(job := inbox.take(), Job):
+        delay()
+        outbox.send(run_job(job))
+    outbox.close()
+
+
+def run_loop(to_main: Outbox, control: Connection, keyframes: Connection, to_mapper: Connection) -> None:
+    """Keyframes to loop results."""
+    from stereo_sfm.pipeline.health import HealthMeter
+    from stereo_sfm.pipeline.sinks import StageTimes
+    from stereo_sfm.pipeline.stages import make_closer
+    from stereo_sfm.timing import Spans
+
+    setup = Inbox[Setup](control).take()
+    delay = prepare("loop", setup)
+    spans = Spans()
+    closer = make_closer(setup.config, setup.rig, spans)
+    inbox, outbox = Inbox[Keyframe | End](keyframes), Outbox(to_mapper)
+    meter = HealthMeter("loop")
+    frame_id = -1
+    while isinstance(keyframe := inbox.take(), Keyframe):
+        if closer is None:
+            continue
+        delay()
+        begin = time.monotonic()
+        result = closer.step(keyframe)
+        to_main.send(result)
+        outbox.send(result)
+        frame_id, ms = keyframe.frame_id, (time.monotonic() - begin) * 1e3
+        to_main.send(StageTimes(frame_id, {**spans.take(), "loop": ms}))
+        health = meter.add(frame_id, ms, 0)
+        if health is not None:
+            to_main.send(health)
+    health = meter.report(frame_id, 0)
+    if health is not None:
+        to_main.send(health)
+    outbox.close()
+
+
+@dataclass(frozen=True)
+class LogOptions:
+    """Where a run's log goes and what it holds."""
+
+    path: Path
+    image_format: str = "png"  # png | raw | jpeg | none
+
+
+def run_logger(
+    to_main: Outbox, control: Connection, messages: Connection, release: Connection, options: LogOptions
+) -> None:
+    """Everything main passes on, into the MCAP file. The file is closed whatever happens to the others."""
+    from stereo_sfm.log.images import LoggedImage
+    from stereo_sfm.log.run_log import RunLog
+    from stereo_sfm.log.writer import LogWriter
+    from stereo_sfm.pipeline.images import ImageLayout, ImageRing, SlotImage
+
+    setup = Inbox[Setup](control).take()
+    prepare("logger", setup)
+    ring = ImageRing(ImageLayout.of(setup.rig), setup.config.pipeline.ring_slots, setup.ring_name)
+    mode = "realtime" if setup.realtime else "lockstep"
+    log = RunLog(
+        LogWriter(options.path), setup.rig, setup.config, source=setup.source_name, mode=mode,
+        image_format=options.image_format, ground_truth=setup.ground_truth,
+    )  # fmt: skip
+    inbox, free = Inbox[Any](messages), Outbox(release)
+    try:
+        while not isinstance(message := inbox.take(), End):
+            if isinstance(message, SlotImage):
+                image = ring.read(message)
+                free.send(message.slot)
+                if message.encoded is not None:
+                    log.put(LoggedImage(image, *message.encoded, "jpeg"))
+                else:
+                    log.put(image)
+            else:
+                log.put(message)
+    except Lost:
+        pass  # main is gone: what has arrived is kept
+    finally:
+        log.close()
+        ring.close()
