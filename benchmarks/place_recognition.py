@@ -1,0 +1,178 @@
+"""Place recognition: query time against the number of keyframes, and precision and recall in identical aisles.
+
+The walks go through every aisle of a store whose aisles hold the same products in the same order, and come back
+through the first one. "Words alone" takes the best-scored place as the answer, as the bag of words would; "words and
+geometry" adds the verification; "all" is the loop closer with odometry and agreement of successive keyframes.
+
+    python benchmarks/place_recognition.py --seeds 10
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+import time
+from dataclasses import dataclass, field
+
+from _sequences import one_thread
+
+one_thread()
+
+import numpy as np
+from _sparse_walk import SparseWalk, walk_keyframes
+
+from stereo_sfm.config import LoopConfig
+from stereo_sfm.geometry import se3
+from stereo_sfm.loop.closer import LoopCloser
+from stereo_sfm.loop.database import PlaceDatabase
+from stereo_sfm.loop.vocabulary import Vocabulary
+from stereo_sfm.loop.vocabulary_file import default_vocabulary
+from stereo_sfm.types import LoopResult
+
+FALSE_METRES, FALSE_DEGREES = 0.5, 10.0  # an accepted loop further off is false
+NEAR_METRES, NEAR_DEGREES, GAP = 1.0, 25.0, 12  # a return: so near to an older keyframe that is so many keyframes old
+
+
+@dataclass
+class Count:
+    """Over all walks."""
+
+    accepted: int = 0
+    false: int = 0
+    walks_with_return: int = 0
+    walks_found: int = 0
+    worst_m: float = 0.0
+    errors: list[float] = field(default_factory=list[float])
+
+    def row(self, name: str) -> str:
+        """A line of the table."""
+        true = self.accepted - self.false
+        precision = f"{true / self.accepted:9.3f}" if self.accepted else "        -"
+        median = f"{1e3 * float(np.median(self.errors)):8.1f}" if self.errors else "       -"
+        return (
+            f"{name:22s} {self.accepted:8d}  {self.false:5d}  {precision}  {self.walks_found:5d} of"
+            f" {self.walks_with_return:2d}  {median}  {self.worst_m:8.3f}"
+        )
+
+
+def query_times(vocabulary: Vocabulary, sizes: tuple[int, ...] = (100, 1000, 10_000)) -> None:
+    """Milliseconds to look up a keyframe's words, to query the database, and to insert, at three sizes."""
+    rng = np.random.default_rng(0)
+    leaves = vocabulary.centroids[np.flatnonzero(vocabulary.child_count == 0)]
+    looks = np.ascontiguousarray(leaves).view(np.uint8).reshape(-1, 32)
+
+    def keyframe() -> np.ndarray:
+        noise = np.packbits(rng.random((400, 256)) < 0.08, axis=1)
+        return looks[rng.integers(0, len(looks), 400)] ^ noise
+
+    database = PlaceDatabase(len(vocabulary))
+    print("keyframes   words ms  query ms  insert ms   (400 points each, median of 30)")
+    for size in sizes:
+        while len(database) < size - 30:
+            database.add(len(database), vocabulary.bag(keyframe()))
+        times = np.zeros((30, 3))
+        for n in range(30):
+            descriptors = keyframe()
+            stamps = [time.perf_counter()]
+            bag = vocabulary.bag(descriptors)
+            stamps.append(time.perf_counter())
+            database.query(bag, 0.02, 20)
+            stamps.append(time.perf_counter())
+            database.add(len(database), bag)
+            stamps.append(time.perf_counter())
+            times[n] = 1e3 * np.diff(stamps)
+        print(f"{size:9d}   {'  '.join(f'{t:8.3f}' for t in np.median(times, axis=0))}")
+
+
+def returns(walk: SparseWalk) -> set[int]:
+    """Keyframes that see an older place again."""
+    out: set[int] = set()
+    for k in range(GAP, len(walk.world_T_kf)):
+        relative = se3.inverse(walk.world_T_kf[: k - GAP + 1]) @ walk.world_T_kf[k]
+        turned = np.rad2deg(np.linalg.norm(se3.log(relative)[:, 3:], axis=1))
+        if ((np.linalg.norm(relative[:, :3, 3], axis=1) < NEAR_METRES) & (turned < NEAR_DEGREES)).any():
+            out.add(k)
+    return out
+
+
+def judge(walk: SparseWalk, results: list[LoopResult], count: Count) -> None:
+    """Add one walk's accepted loops."""
+    again = returns(walk)
+    found = False
+    for r in results:
+        if r.candidate_kf_id < 0:
+            continue
+        true = se3.inverse(walk.world_T_kf[r.candidate_kf_id]) @ walk.world_T_kf[r.kf_id]
+        error = se3.inverse(true) @ r.candidate_T_kf
+        metres = float(np.linalg.norm(error[:3, 3]))
+        wrong = metres > FALSE_METRES or np.rad2deg(np.linalg.norm(se3.log(error)[3:])) > FALSE_DEGREES
+        count.accepted += 1
+        count.false += wrong
+        count.worst_m = max(count.worst_m, metres)
+        if not wrong:
+            count.errors.append(metres)
+            found |= r.kf_id in again
+    count.walks_with_return += bool(again)
+    count.walks_found += bool(again) and found
+
+
+def words_alone(walk: SparseWalk, vocabulary: Vocabulary, config: LoopConfig) -> list[LoopResult]:
+    """The best-scored old keyframe of every keyframe, taken to stand exactly there, where the words say so."""
+    everything = dataclasses.replace(
+        config, min_match_fraction=0.0, min_inliers=10**6, max_candidates=1, pause=0, enabled=True
+    )
+    closer = LoopCloser(everything, walk.rig, vocabulary)
+    out: list[LoopResult] = []
+    for keyframe in walk.keyframes:
+        result = closer.step(keyframe)
+        if result.rejected:
+            candidate, score, _ = result.rejected[0]
+            result = dataclasses.replace(result, candidate_kf_id=candidate, score=score, reason="")
+        out.append(result)
+    return out
+
+
+def identical_aisles(spec: str, seeds: int, vocabulary: Vocabulary) -> int:
+    """The table; returns the number of false loops of the whole closer."""
+    ways = {
+        "words and geometry": LoopConfig(gate_metres=1e3, gate_degrees=360.0, consistent=1),
+        "all": LoopConfig(),
+        "all, paper's score rule": LoopConfig(reference="best"),
+    }
+    counts = {name: Count() for name in ("words alone", *ways)}
+    reasons: dict[str, int] = {}
+    for seed in range(seeds):
+        begin = time.perf_counter()
+        walk = walk_keyframes(f"{spec}{'&' if '?' in spec else '?'}seed={seed}&walk={seed}")
+        judge(walk, words_alone(walk, vocabulary, LoopConfig()), counts["words alone"])
+        for name, config in ways.items():
+            closer = LoopCloser(config, walk.rig, vocabulary)
+            results = [closer.step(k) for k in walk.keyframes]
+            judge(walk, results, counts[name])
+            if name == "all":
+                for r in results:
+                    for _, _, reason in r.rejected:
+                        reasons[reason] = reasons.get(reason, 0) + 1
+        print(f"walk {seed}: {len(walk.keyframes)} keyframes, {time.perf_counter() - begin:.0f} s", flush=True)
+    print(f"\n{spec}, {seeds} walks")
+    print("                       accepted  false  precision  walks found  median mm  worst m")
+    for name, count in counts.items():
+        print(count.row(name))
+    print("rejected by the whole closer: " + ", ".join(f"{n} {r}" for r, n in sorted(reasons.items())))
+    return counts["all"].false
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("source", nargs="?", default="sim:identical-aisles")
+    parser.add_argument("--seeds", type=int, default=10)
+    args = parser.parse_args()
+    vocabulary = default_vocabulary()
+    query_times(vocabulary)
+    false = identical_aisles(args.source, args.seeds, vocabulary) if args.seeds else 0
+    return 3 if false else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
