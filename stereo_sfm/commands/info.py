@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from stereo_sfm.log.describe import Description, Rate
 
 
+_SHOWN = ("images", "dropped", "max_skew_ns")  # totals that the line about the images tells
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
     parser.add_argument("path", type=Path, help="an .mcap file or a dataset folder")
@@ -42,6 +45,9 @@ def _lines(found: Description) -> list[str]:
         lines.append(f"  {'config_sha256':<14} {found.config_sha256}")
     if found.images is not None:
         lines.append(f"images: {_rate(found.images)}, {found.dropped} counted as dropped" + _skew(found))
+    run = {name: value for name, value in found.totals.items() if name not in _SHOWN}
+    if run:
+        lines.append("run: " + ", ".join(f"{value} {name}" for name, value in run.items()))
     if found.ground_truth:
         lines.append(f"ground truth: {found.ground_truth} poses")
     lines += [f"calibration: {line}" for line in found.calibration]

@@ -250,7 +250,7 @@ class RunLog(NoRunLog):
         self._writer.write(topics.LOG, foxglove.text(self._now_ns, level, message), self._now_ns)
 
     def close(self) -> None:
-        if self._closed:
+        if self._closed or self._writer.closed:  # closed by itself when the disk was full
             return
         self._closed = True
         try:

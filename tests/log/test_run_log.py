@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import shutil
 import subprocess
 from pathlib import Path
@@ -310,6 +311,26 @@ def test_a_recording_is_no_run_and_a_run_without_images_says_where_they_are(tmp_
     log.close()
     with pytest.raises(StereoSfmError, match=r"a run without its images: they are in a\.mcap"):
         open_source(path)
+
+
+def _put_frames(log: RunLog, count: int) -> None:
+    for i in range(count):
+        log.put(_frame(i))
+
+
+def test_a_full_disk_during_a_run_is_one_error_and_a_readable_log(tmp_path: Path) -> None:
+    path = tmp_path / "full.mcap"
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, hard))
+    log = RunLog(LogWriter(path), fisheye_rig(), Config(), source="t", mode="inline", image_format="none")
+    try:
+        with pytest.raises(StereoSfmError, match="is closed and readable"):
+            _put_frames(log, 1000)
+        log.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    with LogReader(path) as reader:
+        assert reader.truncated == "" and len(reader.stamps(topics.FRAME)) > 10
 
 
 def test_an_unknown_message_is_an_error_and_the_null_log_takes_everything(tmp_path: Path) -> None:
