@@ -24,7 +24,7 @@ from stereo_sfm.loop.verification import match_guided, view_of
 from stereo_sfm.types import F64, I64, Keyframe
 
 STEP_METRES, STEP_DEGREES = 0.4, 15.0  # between keyframes
-DRIFT_PER_METRE, TURN_PER_METRE = 0.005, 0.001  # random part of a step, and radians of constant curl per metre
+DRIFT_PER_METRE, TURN_PER_METRE = 0.005, 0.0005  # random part of a step, and radians of constant curl per metre
 
 
 @dataclass(frozen=True, eq=False)

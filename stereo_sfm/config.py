@@ -141,7 +141,7 @@ class LoopConfig:
     consistent: int = 2  # successive keyframes that must agree on a loop
     consistent_window: int = 4  # ... within so many keyframes
     gate_metres: float = 0.3  # a loop may contradict odometry by this much ...
-    gate_per_metre: float = 0.02  # ... plus this for every metre walked since
+    gate_per_metre: float = 0.01  # ... plus this for every metre walked since
     gate_degrees: float = 3.0
     gate_degrees_per_metre: float = 0.3
     relocalize_candidates: int = 8  # places of a saved map that are verified

@@ -49,6 +49,7 @@ class LoopCloser:
         self._config, self._rig, self._spans = config, rig, spans or NoSpans()
         self._vocabulary = vocabulary
         self._database = PlaceDatabase(len(vocabulary))
+        self._row: dict[int, int] = {}  # of a keyframe in the database
         self._store = KeyframeStore()
         self._graph = KeyframeGraph()
         self._pending: list[_Hypothesis] = []
@@ -68,6 +69,7 @@ class LoopCloser:
             candidates, why_none = self._candidates(keyframe, bag)
         with self._spans.span("loop_verify"):
             result = self._judge(keyframe, candidates, why_none)
+        self._row[keyframe.kf_id] = len(self._database)
         self._database.add(keyframe.kf_id, bag)
         self._store.add(keyframe)
         self._grow(keyframe)
@@ -82,9 +84,8 @@ class LoopCloser:
             return [], "paused"
         connected = self._store.connected(keyframe.point_ids, config.connected_points)
         scores = self._database.scores(bag)
-        order = {int(k): i for i, k in enumerate(self._database.kf_ids)}
         pick = max if config.reference == "best" else min
-        reference = pick((scores[order[k]] for k in connected), default=0.0)
+        reference = pick((scores[self._row[k]] for k in connected), default=0.0)
         bound = max(config.score_ratio * reference, config.min_score)
         excluded = self._near(keyframe.kf_id, connected)
         good = [int(i) for i in np.flatnonzero(scores > bound) if int(self._database.kf_ids[i]) not in excluded]
