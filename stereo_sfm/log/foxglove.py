@@ -38,12 +38,21 @@ def stamp_of(message: Any) -> int:
     return message.timestamp.seconds * 1_000_000_000 + message.timestamp.nanos
 
 
+def poses(a_T_b: F64) -> list[Pose]:
+    """(N, 4, 4) -> positions and quaternions."""
+    quaternions = se3.quaternion_from_rotation(a_T_b[:, :3, :3]).tolist()
+    return [_pose(t, q) for t, q in zip(a_T_b[:, :3, 3].tolist(), quaternions, strict=True)]
+
+
 def pose(a_T_b: F64) -> Pose:
     """(4, 4) -> position and quaternion."""
+    return poses(a_T_b[None])[0]
+
+
+def _pose(position: list[float], quaternion: list[float]) -> Pose:
     out = Pose()
-    out.position.x, out.position.y, out.position.z = a_T_b[:3, 3]
-    q = se3.quaternion_from_rotation(a_T_b[:3, :3])
-    out.orientation.x, out.orientation.y, out.orientation.z, out.orientation.w = q
+    out.position.x, out.position.y, out.position.z = position
+    out.orientation.x, out.orientation.y, out.orientation.z, out.orientation.w = quaternion
     return out
 
 
@@ -54,31 +63,30 @@ def matrix(position: Any, orientation: Any) -> F64:
     return se3.from_rotation_translation(rotation, np.array([position.x, position.y, position.z]))
 
 
-def pose_in_frame(frame: str, stamp_ns: int, a_T_b: F64) -> PoseInFrame:
+def pose_in_frame(frame: str, stamp_ns: int, pose: Pose) -> PoseInFrame:
     """Pose of something in `frame`."""
-    return stamp(PoseInFrame(frame_id=frame, pose=pose(a_T_b)), stamp_ns)
+    return stamp(PoseInFrame(frame_id=frame, pose=pose), stamp_ns)
 
 
-def poses_in_frame(frame: str, stamp_ns: int, poses: F64) -> PosesInFrame:
+def poses_in_frame(frame: str, stamp_ns: int, a_T_b: F64) -> PosesInFrame:
     """(N, 4, 4) -> a trajectory."""
-    return stamp(PosesInFrame(frame_id=frame, poses=[pose(p) for p in poses]), stamp_ns)
+    return stamp(PosesInFrame(frame_id=frame, poses=poses(a_T_b)), stamp_ns)
 
 
-def transforms(stamp_ns: int, rows: Iterable[tuple[str, str, F64]]) -> FrameTransforms:
+def transforms(stamp_ns: int, rows: Iterable[tuple[str, str, Pose]]) -> FrameTransforms:
     """Rows of (parent, child, parent_T_child)."""
     out = FrameTransforms()
     for parent, child, parent_T_child in rows:
         t = stamp(out.transforms.add(parent_frame_id=parent, child_frame_id=child), stamp_ns)
-        p = pose(parent_T_child)
-        t.translation.CopyFrom(p.position)
-        t.rotation.CopyFrom(p.orientation)
+        t.translation.CopyFrom(parent_T_child.position)
+        t.rotation.CopyFrom(parent_T_child.orientation)
     return out
 
 
-def odometry(stamp_ns: int, odom_T_body: F64, covariance: F64) -> Odometry:
+def odometry(stamp_ns: int, odom_T_body: Pose, covariance: F64) -> Odometry:
     """Pose with its 6x6 covariance (x y z, then rotation about x y z), row by row."""
-    out = Odometry(frame_id="odom", body_frame_id="body", pose=pose(odom_T_body))
-    out.pose_covariance.extend(covariance.ravel())
+    out = Odometry(frame_id="odom", body_frame_id="body", pose=odom_T_body)
+    out.pose_covariance.extend(covariance.ravel().tolist())
     return stamp(out, stamp_ns)
 
 

@@ -189,14 +189,14 @@ class ImageLog:
             return
         self._next_static_ns = stamp_ns + SECOND_NS
         rig = self._rig
-        rows = [("body", "cam0", rig.body_T_left)]
+        rows = [("body", "cam0", foxglove.pose(rig.body_T_left))]
         left = foxglove.calibration(rig.left, "cam0", stamp_ns)
         self._writer.write(topics.LEFT_CALIBRATION, left, stamp_ns)
         if rig.right is not None and not rig.depth:
             tx = -rig.right.fx * rig.baseline if np.allclose(rig.left_T_right[:3, :3], np.eye(3), atol=1e-9) else 0.0
             right = foxglove.calibration(rig.right, "cam1", stamp_ns, tx)
             self._writer.write(topics.RIGHT_CALIBRATION, right, stamp_ns)
-            rows.append(("cam0", "cam1", rig.left_T_right))
+            rows.append(("cam0", "cam1", foxglove.pose(rig.left_T_right)))
         self._writer.write(topics.TF, foxglove.transforms(stamp_ns, rows), stamp_ns)
 
     def _ground_truth(self, stamp_ns: int) -> None:
@@ -205,9 +205,8 @@ class ImageLog:
             return
         first = max(int(np.searchsorted(self._truth.stamp_ns, stamp_ns, side="right")) - 1, 0)
         self._writer.flush()
-        for pose_stamp, world_T_cam in zip(
-            self._truth.stamp_ns[first:].tolist(), self._truth.poses[first:], strict=True
-        ):
+        poses = foxglove.poses(self._truth.poses[first:])
+        for pose_stamp, world_T_cam in zip(self._truth.stamp_ns[first:].tolist(), poses, strict=True):
             self._writer.write(topics.GROUND_TRUTH, foxglove.pose_in_frame("map", pose_stamp, world_T_cam), pose_stamp)
         self._writer.flush()
         self._truth = None

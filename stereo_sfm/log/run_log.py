@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
+from foxglove_schemas_protobuf.Pose_pb2 import Pose
 
 from calib.rig import Rig
 from stereo_sfm.config import Config
@@ -167,7 +168,7 @@ class RunLog(NoRunLog):
         self._map = MapView()
         self._map_T_odom: dict[int, F64] = {0: np.eye(4)}  # by map version
         self._version = 0
-        self._frames: deque[Frame] = deque()  # wait for the map version they used
+        self._frames: deque[tuple[Frame, Pose]] = deque()  # wait for the map version they used
         self._answers: tuple[deque[MapUpdate], deque[LoopResult]] = (deque(), deque())  # wait for their keyframe
         self._updates: deque[MapUpdate] = deque()  # wait for their keyframe and its loop result, to be shown
         self._keyframes: dict[int, Keyframe] = {}
@@ -203,10 +204,11 @@ class RunLog(NoRunLog):
         dots = foxglove.point_annotations(stamp, obs.uv_left, _age_colors(obs.age, obs.inlier))
         write(topics.FEATURES, dots, stamp, sequence)
         odom_T_body = frame.odom_T_cam @ self._left_T_body
-        write(topics.ODOM_POSE, foxglove.pose_in_frame("odom", stamp, odom_T_body), stamp, sequence)
+        pose = foxglove.pose(odom_T_body)
+        write(topics.ODOM_POSE, foxglove.pose_in_frame("odom", stamp, pose), stamp, sequence)
         covariance = self._odometry_covariance(frame.covariance, odom_T_body)
-        write(topics.ODOMETRY, foxglove.odometry(stamp, odom_T_body, covariance), stamp, sequence)
-        self._frames.append(frame)
+        write(topics.ODOMETRY, foxglove.odometry(stamp, pose, covariance), stamp, sequence)
+        self._frames.append((frame, pose))
         self._release_frames()
 
     def keyframe(self, keyframe: Keyframe) -> None:
@@ -265,19 +267,20 @@ class RunLog(NoRunLog):
             self._writer.close()
 
     def _release_frames(self, everything: bool = False) -> None:
-        while self._frames and (everything or self._frames[0].map_version <= self._version):
-            self._show_frame(self._frames.popleft())
+        while self._frames and (everything or self._frames[0][0].map_version <= self._version):
+            self._show_frame(*self._frames.popleft())
 
-    def _show_frame(self, frame: Frame) -> None:
-        older = [v for v in self._map_T_odom if v <= frame.map_version]
-        map_T_odom = self._map_T_odom[max(older)]
-        for version in sorted(older)[:-1]:
+    def _show_frame(self, frame: Frame, odom_pose: Pose) -> None:
+        """Where the body is in the map, by the version of the map that the frame used."""
+        older = sorted(v for v in self._map_T_odom if v <= frame.map_version)
+        for version in older[:-1]:
             del self._map_T_odom[version]
-        odom_T_body = frame.odom_T_cam @ self._left_T_body
+        map_T_odom = self._map_T_odom[older[-1]]
+        map_T_body = map_T_odom @ frame.odom_T_cam @ self._left_T_body
         stamp, sequence = frame.stamp_ns, frame.frame_id
-        pose = foxglove.pose_in_frame("map", stamp, map_T_odom @ odom_T_body)
-        self._writer.write(topics.MAP_POSE, pose, stamp, sequence)
-        rows = (("map", "odom", map_T_odom), ("odom", "body", odom_T_body))
+        map_pose, correction = foxglove.poses(np.stack([map_T_body, map_T_odom]))
+        self._writer.write(topics.MAP_POSE, foxglove.pose_in_frame("map", stamp, map_pose), stamp, sequence)
+        rows = (("map", "odom", correction), ("odom", "body", odom_pose))
         self._writer.write(topics.TF, foxglove.transforms(stamp, rows), stamp, sequence)
 
     def _release_answers(self, everything: bool = False) -> None:

@@ -65,7 +65,8 @@ def _write(
             edit(eye, message)
             writer.write_message(topic, message, 10**9, 10**9)
         if transforms:
-            writer.write_message("/tf", foxglove.transforms(10**9, transforms), 10**9, 10**9)
+            rows = [(parent, child, foxglove.pose(matrix)) for parent, child, matrix in transforms]
+            writer.write_message("/tf", foxglove.transforms(10**9, rows), 10**9, 10**9)
         for i in range(count):
             for eye, topic in enumerate(names):
                 if (i, eye) in skip:
@@ -211,7 +212,7 @@ def test_ground_truth_by_its_name(tmp_path: Path) -> None:
 
     def extra(writer: ProtobufWriter) -> None:
         for i in (2, 0, 1, 3):  # not in order
-            message: PoseInFrame = foxglove.pose_in_frame("world", 10**9 + i, poses[i])
+            message: PoseInFrame = foxglove.pose_in_frame("world", 10**9 + i, foxglove.pose(poses[i]))
             writer.write_message("/vicon/ground_truth", message, 10**9 + i, 0)
 
     with open_source(_write(tmp_path / "a.mcap", extra=extra)) as source:
