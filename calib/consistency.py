@@ -23,8 +23,9 @@ from stereo_sfm.types import F64, Bool
 ROTATION, DIRECTION, FOCAL, FOCAL_RIGHT, SKEW = slice(0, 3), slice(3, 5), 5, 6, 7
 NUISANCE = 9
 SHARED = 8 + 2 * NUISANCE
+CORRELATED = 2.0  # the matches' errors are not independent: their deviation counts so many times
 # One standard deviation of what may be wrong before any image is seen: radians, radians, ratios, seconds, px.
-PRIOR = np.array([0.05] * 3 + [0.05] * 2 + [0.05, 0.05, 0.02] + [0.15] * (2 * NUISANCE))
+PRIOR = np.array([0.05] * 3 + [0.05] * 2 + [0.05, 0.05, 0.02] + ([0.3] * 2 + [0.15] * (NUISANCE - 2)) * 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,12 +96,14 @@ def estimate(rig: Rig, windows: list[Window], iterations: int = 18) -> Correctio
 
 
 def _trust(vector: F64) -> F64:
-    """(SHARED,) inverse variance of the prior; for the lens displacement that of a Cauchy prior at its present value.
+    """(SHARED,) inverse variance of the prior; for the lens's second-order terms that of a Cauchy prior, at most 1 px.
 
     A good lens needs no displacement and then what is seen is put down to the eyes' rotation; a bad one is believed.
     """
     trust = 1 / PRIOR**2
-    trust[8:] /= 1 + (vector[8:] / PRIOR[8:]) ** 2
+    lens = np.arange(8, SHARED)
+    bent = lens[(lens - 8) % NUISANCE >= 2]
+    trust[bent] = np.maximum(trust[bent] / (1 + (vector[bent] / PRIOR[bent]) ** 2), 1.0)
     return trust
 
 
@@ -255,7 +258,7 @@ def _reduced(
     problem: _Problem, residual: F64, by_point: F64, by_rest: F64, sigma: float
 ) -> tuple[F64, F64, tuple[F64, F64, F64, F64]]:
     """Normal equations of the shared unknowns with the window's points and pose eliminated, and what undoes that."""
-    weight = problem.weight / sigma**2
+    weight = problem.weight / (CORRELATED * sigma) ** 2
     r = np.nan_to_num(residual)
     wp = by_point * weight[..., None]
     h_pp = np.swapaxes(wp, 1, 2) @ by_point + 1e-9 * np.eye(3)
