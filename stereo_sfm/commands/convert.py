@@ -16,9 +16,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Convert everything that the source holds."""
-    from stereo_sfm.commands.run import open_chosen
+    from stereo_sfm.commands.run import SourceChoice
 
-    with open_chosen(args) as source:
+    with SourceChoice.of(args)() as source:
         if source.live:
             raise StereoSfmError(f"{source.name} is a device: use 'stereo-sfm record {args.source}'")
         return write(source, args, "convert")

@@ -42,9 +42,9 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Record until the source ends, the duration is over, or Ctrl-C."""
-    from stereo_sfm.commands.run import open_chosen
+    from stereo_sfm.commands.run import SourceChoice
 
-    with open_chosen(args) as source:
+    with SourceChoice.of(args)() as source:
         return write(source, args, "record")
 
 

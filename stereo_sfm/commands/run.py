@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import time
-from datetime import datetime
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +17,9 @@ if TYPE_CHECKING:
     from drivers.source import Source
     from stereo_sfm.config import Config
     from stereo_sfm.eval.record import RunRecord
+    from stereo_sfm.pipeline.maps import MapFolders
+    from stereo_sfm.pipeline.session import Session
+    from stereo_sfm.types import Applied
 
 TRACKING_FAILED = 4
 INTERRUPTED = 130
@@ -31,6 +36,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--overwrite", action="store_true", help="replace the run that lies in the output folder")
     add_source_arguments(parser)
     add_config_arguments(parser)
+    add_wiring_arguments(parser)
+    parser.add_argument("--map-in", type=Path, metavar="DIR", help="saved map of this place, from --map-out")
+    parser.add_argument("--localize-only", action="store_true", help="find the camera in --map-in, change no map")
+    parser.add_argument("--map-out", type=Path, metavar="DIR", help="save the map (merged with --map-in, if given)")
     parser.add_argument("--frame", choices=("cam0", "body"), default="cam0", help="whose poses the trajectories hold")
     parser.add_argument(
         "--max-lost", type=float, default=20.0, metavar="PERCENT", help="exit with 4 when more frames have no pose"
@@ -62,6 +71,26 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, help="of everything random (same as --set seed=N)")
 
 
+def add_wiring_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options that say how the stages run, and what is logged and shown. They never change the result of lockstep."""
+    parser.add_argument("--inline", action="store_true", help="all stages in one process; the same bits")
+    parser.add_argument(
+        "--mode",
+        choices=("lockstep", "realtime"),
+        help="lockstep waits for every stage (files); realtime drops what comes too fast (devices); default by source",
+    )
+    parser.add_argument("--speed", type=float, metavar="X", help="play a recording as if live, X times as fast")
+    parser.add_argument(
+        "--log",
+        choices=("full", "lean", "none"),
+        help="run.mcap with images, without them, or none (default: full for devices, lean for recordings)",
+    )
+    parser.add_argument("--image-format", choices=("png", "raw", "jpeg"), default="png", help="images of --log full")
+    parser.add_argument(
+        "--viz", choices=("none", "spawn", "serve", "save"), default="none", help="show it in rerun; save: run.rrd"
+    )
+
+
 def load_config(args: argparse.Namespace) -> Config:
     """The configuration that the options ask for."""
     from stereo_sfm import config
@@ -75,40 +104,71 @@ def load_config(args: argparse.Namespace) -> Config:
     return chosen
 
 
-def open_chosen(args: argparse.Namespace) -> Source:
-    """The source that the options ask for, not yet entered."""
-    from drivers.select import SelectedFrames
-    from drivers.source import open_source
-    from stereo_sfm.demo import demo_recording
+@dataclass(frozen=True)
+class SourceChoice:
+    """The source that the options ask for; opened by calling it, in whichever process reads it."""
 
-    spec = args.source if args.source is not None else str(demo_recording())
-    source = open_source(spec, **({"rig": args.rig} if args.rig is not None else {}))
-    if (args.start, args.duration, args.frame_skip, args.max_frames) == (0.0, float("inf"), 1, None):
-        return source
-    return SelectedFrames(source, args.start, args.duration, args.frame_skip, args.max_frames)
+    spec: str
+    rig: Path | None = None
+    start: float = 0.0
+    duration: float = float("inf")
+    frame_skip: int = 1
+    max_frames: int | None = None
+    speed: float | None = None
+
+    @staticmethod
+    def of(args: argparse.Namespace) -> SourceChoice:
+        """From the options of this command."""
+        from stereo_sfm.demo import demo_recording
+
+        spec = args.source if args.source is not None else str(demo_recording())
+        return SourceChoice(spec, args.rig, args.start, args.duration, args.frame_skip, args.max_frames, args.speed)
+
+    def __call__(self) -> Source:
+        """The source, not yet entered."""
+        from drivers.paced import PacedSource
+        from drivers.select import SelectedFrames
+        from drivers.source import open_source
+
+        source = open_source(self.spec, **({"rig": self.rig} if self.rig is not None else {}))
+        if (self.start, self.duration, self.frame_skip, self.max_frames) != (0.0, float("inf"), 1, None):
+            source = SelectedFrames(source, self.start, self.duration, self.frame_skip, self.max_frames)
+        return source if self.speed is None else PacedSource(source, self.speed)
 
 
 def run(args: argparse.Namespace) -> int:
     """Run, write the output folder, print the closing summary."""
+    from stereo_sfm.pipeline.maps import MapFolders
+
+    folders = MapFolders(args.map_in, args.localize_only, args.map_out)
+    folders.check(args.overwrite)
+    return execute(args, SourceChoice.of(args), load_config(args), folders)
+
+
+def execute(
+    args: argparse.Namespace,
+    choice: SourceChoice,
+    config: Config,
+    folders: MapFolders,
+    applied: Sequence[Applied] | None = None,
+) -> int:
+    """One run with its output folder; `applied` is the schedule of an earlier realtime run to follow."""
     from stereo_sfm.eval.record import RunRecord
     from stereo_sfm.eval.run_results import write_results
     from stereo_sfm.eval.statistics import failure, summary
-    from stereo_sfm.export.run_folder import default_folder, link_latest, prepare_folder
+    from stereo_sfm.export.run_folder import link_latest
+    from stereo_sfm.pipeline.session import Session, Wiring
 
-    config = load_config(args)
-    if args.output is not None:
-        prepare_folder(args.output, args.overwrite)
-    with open_chosen(args) as source:
-        folder: Path = args.output or default_folder(source.name, datetime.now())
-        if args.output is None:
-            prepare_folder(folder, args.overwrite)
-        record = RunRecord()
+    record = RunRecord()
+    wiring = Wiring(args.inline, args.mode, args.log, args.image_format, args.viz)
+    with Session(choice, config, [record], wiring, folders, args.output, args.overwrite, applied) as session:
         begin = time.perf_counter()
-        interrupted, problem = _track(source, config, record, args.quiet)
+        interrupted, problem = _follow(session, record, args.quiet)
         wall_s = time.perf_counter() - begin
-        stats, evaluations = write_results(
-            folder, source.name, source.rig, config, record, wall_s, source.ground_truth, args.frame, args.frame_skip
-        )
+    folder, info = session.folder, session.info
+    stats, evaluations = write_results(
+        folder, info.name, info.rig, config, record, wall_s, info.ground_truth, args.frame, choice.frame_skip
+    )
     link_latest(folder)
     if not args.quiet:
         print("\n".join([*summary(stats, evaluations), f"written to {folder} (start with {folder / 'report.md'})"]))
@@ -118,29 +178,26 @@ def run(args: argparse.Namespace) -> int:
         return INTERRUPTED
     failed = failure(stats, args.max_lost)
     if failed:
-        import sys
-
-        print(f"stereo-sfm run: {failed}; {folder / 'report.md'} says why", file=sys.stderr)
+        print(f"stereo-sfm {args.command}: {failed}; {folder / 'report.md'} says why", file=sys.stderr)
         return TRACKING_FAILED
     return 0
 
 
-def _track(source: Source, config: Config, record: RunRecord, quiet: bool) -> tuple[bool, StereoSfmError | None]:
-    """Run to the end, to Ctrl-C, or to an error of the source; what was tracked until then stays in the record."""
+def _follow(session: Session, record: RunRecord, quiet: bool) -> tuple[bool, StereoSfmError | None]:
+    """To the end, to Ctrl-C, or to an error; what was tracked until then stays in the record."""
     from stereo_sfm.commands._progress import progress
     from stereo_sfm.commands._stop import StopRequest
-    from stereo_sfm.pipeline.run import run as run_source
 
-    with progress(source.name, source.frame_count, quiet) as bar, StopRequest() as stop:
+    with progress(session.info.name, session.info.frame_count, quiet) as bar, StopRequest() as stop:
         try:
-            for frame in run_source(source, config, [record]):
+            for frame in session:
                 bar.show(frame)
                 if stop.asked:
-                    return True, None
+                    session.stop()
         except KeyboardInterrupt:
             return True, None
         except StereoSfmError as error:
             if not record.frames:
                 raise
             return False, error
-    return False, None
+        return stop.asked, None

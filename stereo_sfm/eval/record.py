@@ -9,7 +9,7 @@ import numpy as np
 
 from stereo_sfm.export.trajectories import fill_missing
 from stereo_sfm.geometry import se3
-from stereo_sfm.pipeline.sinks import StageTimes
+from stereo_sfm.pipeline.sinks import Health, StageTimes
 from stereo_sfm.types import (
     F64,
     I64,
@@ -67,7 +67,8 @@ class RunRecord:
 
     frames: list[FrameRow] = field(default_factory=list[FrameRow])
     keyframes: dict[int, KeyframeRow] = field(default_factory=dict[int, KeyframeRow])
-    times: list[dict[str, float]] = field(default_factory=list[dict[str, float]])
+    stage_ms: dict[int, dict[str, float]] = field(default_factory=dict[int, dict[str, float]])  # by frame id
+    health: dict[str, list[Health]] = field(default_factory=dict[str, list[Health]])  # by stage
     dropped: int = 0
     map_T_kf: dict[int, F64] = field(default_factory=dict[int, F64])
     map_points: set[int] = field(default_factory=set[int])
@@ -94,7 +95,9 @@ class RunRecord:
         elif isinstance(message, LoopResult):
             self._put_loop(message)
         elif isinstance(message, StageTimes):
-            self.times.append(message.ms)
+            self.stage_ms.setdefault(message.frame_id, {}).update(message.ms)
+        elif isinstance(message, Health):
+            self.health.setdefault(message.stage, []).append(message)
 
     def _put_frame(self, frame: Frame) -> None:
         if self.frames:
@@ -123,6 +126,11 @@ class RunRecord:
             self.loops.append(loop)
         for _, _, reason in loop.rejected:
             self.rejections[reason] = self.rejections.get(reason, 0) + 1
+
+    @property
+    def times(self) -> list[dict[str, float]]:
+        """Milliseconds per stage of each frame."""
+        return [self.stage_ms.get(row.frame_id, {}) for row in self.frames]
 
     # -- what it comes to ------------------------------------------------------------------------------------------
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from stereo_sfm.eval.evaluate import Evaluation, length
 from stereo_sfm.eval.record import RunRecord
+from stereo_sfm.pipeline.sinks import Health
 
 # Part of frames without a pose above which the run counts as failed.
 MAX_LOST_PERCENT = 20.0
@@ -60,8 +61,22 @@ def statistics(record: RunRecord, wall_s: float, evaluations: dict[str, Evaluati
         "wall_s": wall_s,
         "frames_per_s": frames / wall_s if wall_s > 0 else 0.0,
         "ms": stage_times(record),
+        "health": {stage: _health(reports) for stage, reports in sorted(record.health.items())},
         "fingerprint": record.fingerprint(),
         "evaluation": {name: result.to_dict() for name, result in (evaluations or {}).items()},
+    }
+
+
+def _health(reports: Sequence[Health]) -> dict[str, float]:
+    """A stage's last word, and its worst."""
+    last = reports[-1]
+    return {
+        "rate": last.rate,
+        "p50_ms": last.p50_ms,
+        "p95_ms": last.p95_ms,
+        "p99_ms": max(r.p99_ms for r in reports),
+        "queue_max": float(max(r.queue for r in reports)),
+        "dropped": float(last.dropped),
     }
 
 

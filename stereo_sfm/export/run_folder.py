@@ -13,7 +13,7 @@ from stereo_sfm.errors import StereoSfmError
 
 TRAJECTORIES = ("trajectory_odom.tum", "trajectory_odom.kitti", "trajectory_map.tum", "trajectory_map.kitti")
 PICTURES = ("trajectory.png", "errors.png", "tracking.png", "times.png")
-FILES = (*TRAJECTORIES, "keyframes.tum", "config.toml", "rig.yaml", "stats.json", "report.md", *PICTURES)
+FILES = ("run.mcap", "run.rrd", *TRAJECTORIES, "keyframes.tum", "config.toml", "rig.yaml", "stats.json", "report.md", *PICTURES)
 
 
 def default_folder(source_name: str, now: datetime) -> Path:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
+from collections import deque
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any, Generic, TypeVar
@@ -66,6 +68,38 @@ class Outbox:
                     self._connection.send(item[0])
                 except OSError:
                     gone = True  # the reader died: main ends the run; nobody waits for these messages
+
+
+class DroppingOutbox:
+    """As `Outbox`, but `send` never blocks: when too much waits, the oldest goes (the viewer is slow or closed)."""
+
+    def __init__(self, connection: Connection, limit: int = 256) -> None:
+        self._connection = connection
+        self._waiting: deque[object] = deque(maxlen=limit)
+        self._more = threading.Semaphore(0)
+        self._closing = False
+        self._thread = threading.Thread(target=self._work, daemon=True)
+        self._thread.start()
+
+    def send(self, message: object) -> None:
+        """Give the message away, perhaps to nobody."""
+        self._waiting.append(message)
+        self._more.release()
+
+    def close(self) -> None:
+        """Send what waits, then close the pipe, without waiting for it."""
+        self._closing = True
+        self._more.release()
+
+    def _work(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                self._more.acquire()
+                if self._waiting:
+                    self._connection.send(self._waiting.popleft())
+                elif self._closing:
+                    break
+        self._connection.close()
 
 
 class Inbox(Generic[T]):

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 
 from drivers.source import Source
 from stereo_sfm.config import Config
+from stereo_sfm.pipeline.maps import MapFolders, make_mapper, save_result
 from stereo_sfm.pipeline.schedule import Lockstep, Schedule
 from stereo_sfm.pipeline.sinks import Sink, StageTimes
-from stereo_sfm.pipeline.stages import LocalMailbox, MapStage, TrackStage, make_closer, make_mapper
+from stereo_sfm.pipeline.stages import LocalMailbox, MapStage, TrackStage, make_closer
 from stereo_sfm.timing import Spans
 from stereo_sfm.tracking.factory import make_tracker
 from stereo_sfm.types import Frame, Keyframe, LoopResult, MapUpdate, StereoImage
@@ -17,7 +18,17 @@ from stereo_sfm.types import Frame, Keyframe, LoopResult, MapUpdate, StereoImage
 class InlineRun:
     """All stages of one run; `step` takes one image through all of them."""
 
-    def __init__(self, source: Source, config: Config, sinks: Sequence[Sink], schedule: Schedule | None) -> None:
+    def __init__(
+        self,
+        source: Source,
+        config: Config,
+        sinks: Sequence[Sink] = (),
+        schedule: Schedule | None = None,
+        folders: MapFolders | None = None,
+        jpeg: bool = False,
+    ) -> None:
+        self._config, self._rig, self._folders = config, source.rig, folders or MapFolders()
+        self._jpeg = jpeg
         self._spans = Spans()
         self._sinks = sinks
         self._updates: LocalMailbox[MapUpdate] = LocalMailbox()
@@ -28,12 +39,21 @@ class InlineRun:
         self._closer = make_closer(config, source.rig, self._spans)
         lag = config.pipeline.loop_lag_keyframes
         self.map_stage = MapStage(
-            make_mapper(config, source.rig, self._spans), lag, None if self._closer is None else self._loops
+            make_mapper(config, source.rig, self._spans, self._folders),
+            lag,
+            None if self._closer is None else self._loops,
         )
 
     def step(self, image: StereoImage) -> Frame:
         """Track one image; map and close loops when it becomes a keyframe."""
-        self._publish(image)
+        if self._jpeg:
+            from stereo_sfm.log.images import encode_pair
+
+            logged = encode_pair(image, "jpeg")
+            image = logged.image
+            self._publish(logged)
+        else:
+            self._publish(image)
         frame: Frame | None = None
         keyframe: Keyframe | None = None
         with self._spans.span("track"):
@@ -63,6 +83,7 @@ class InlineRun:
         update = self.map_stage.finish()
         if update is not None:
             self._publish(update)
+        save_result(self.map_stage.mapper, self._config, self._rig, self._folders)
 
     def _publish(self, message: object) -> None:
         for sink in self._sinks:
@@ -70,16 +91,23 @@ class InlineRun:
 
 
 def run_inline(
-    source: Source, config: Config, sinks: Sequence[Sink] = (), schedule: Schedule | None = None
-) -> Iterator[Frame]:
+    source: Source,
+    config: Config,
+    sinks: Sequence[Sink] = (),
+    schedule: Schedule | None = None,
+    folders: MapFolders | None = None,
+    jpeg: bool = False,
+) -> Generator[Frame, None, None]:
     """Take every image of an open source through all stages and yield its frame.
 
     Args:
         source: an open source. config: what decides the result.
         sinks: every message of the run goes to each, in order.
         schedule: when updates reach the tracker; lockstep when omitted.
+        folders: maps to start from and to leave behind.
+        jpeg: the sinks store images as JPEG, so the tracker sees what they will give back.
     """
-    run = InlineRun(source, config, sinks, schedule)
+    run = InlineRun(source, config, sinks, schedule, folders, jpeg)
     try:
         for image in source:
             yield run.step(image)

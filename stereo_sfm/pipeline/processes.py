@@ -1,14 +1,15 @@
 """The stages as processes. This is the hub: it starts them, passes their messages on, and ends the run in order.
 
 Who talks to whom: capture -> tracker (images by slot), tracker -> mapper and loop (keyframes), loop -> mapper (loop
-results), mapper -> tracker (updates), mapper <-> optimizer (full bundle adjustment); every stage -> main; main -> logger
-and viewer. Every arrow is a pipe of its own, so a killed process leaves no lock behind, and its death is an end of file
-to whoever listens to it.
+results), mapper -> tracker (updates), mapper <-> optimizer (full bundle adjustment), every stage -> main, main ->
+logger and viewer. Every arrow is a pipe of its own, so a killed process leaves no lock behind, and its death is an end
+of file to whoever listens to it.
 """
 
 from __future__ import annotations
 
 import contextlib
+import logging
 import multiprocessing
 import os
 import signal
@@ -23,12 +24,15 @@ from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.pipeline import workers
 from stereo_sfm.pipeline.capture import SourceInfo
-from stereo_sfm.pipeline.channels import End, Failed, Outbox
+from stereo_sfm.pipeline.channels import DroppingOutbox, End, Failed, Outbox
 from stereo_sfm.pipeline.images import ImageLayout, ImageRing, SlotImage
+from stereo_sfm.pipeline.maps import MapFolders
 from stereo_sfm.pipeline.sinks import Sink
-from stereo_sfm.pipeline.workers import LogOptions, Setup
+from stereo_sfm.pipeline.workers import LogOptions, Setup, ViewerOptions
 from stereo_sfm.types import Applied, Frame
 
+SINKS = ("logger", "viewer")
+PICTURE_NS = 100_000_000  # the viewer gets a picture at most so often
 GRACE_S = 1.2  # for the logger to close its file after another stage died
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
@@ -51,6 +55,8 @@ class ProcessRun:
         realtime: bool | None = None,
         applied: Sequence[Applied] | None = None,
         log: LogOptions | None = None,
+        folders: MapFolders | None = None,
+        viewer: ViewerOptions | None = None,
         delays: int | None = None,
     ) -> None:
         """Prepare a run.
@@ -62,16 +68,21 @@ class ProcessRun:
             realtime: drop images and take updates as they come; None: as the source says (`live`).
             applied: schedule of an earlier realtime run to follow.
             log: write everything to an MCAP file.
+            folders: maps to start from and to leave behind.
+            viewer: show the run while it goes on.
             delays: seed of random delays in every stage, for tests.
         """
         self._opener, self._config, self._sinks = opener, config, list(sinks)
         self._realtime, self._applied, self._log, self._delays = realtime, applied, log, delays
+        self._folders, self._viewer = folders or MapFolders(), viewer
         self._context = multiprocessing.get_context("spawn")
         self._processes: dict[str, BaseProcess] = {}
         self._reports: dict[Connection, str] = {}
         self._controls: dict[str, Connection] = {}
         self._to_logger: Outbox | None = None
         self._release: Outbox | None = None
+        self._to_viewer: DroppingOutbox | None = None
+        self._next_picture_ns = 0
         self._ring: ImageRing | None = None
         self._ended: set[str] = set()
         self._stopping = False
@@ -116,7 +127,7 @@ class ProcessRun:
                     self._died(connection)
                     continue
                 if isinstance(message, Failed):
-                    self._fail(message)
+                    self._fail(connection, message)
                 elif isinstance(message, End):
                     self._end(connection, message.stage)
                 else:
@@ -155,6 +166,11 @@ class ProcessRun:
         else:
             self._release = Outbox(second_free[1], 64)
             keep = [second_free[1]]
+        if self._viewer is not None:
+            shown = pipe()
+            self._spawn("viewer", workers.run_viewer, self._control("viewer"), shown[0], self._viewer)
+            shown[0].close()
+            self._to_viewer = DroppingOutbox(shown[1])
         for ends in (images, updates, to_mapper, to_loop, loops, jobs, results, tracker_free, second_free, logged):
             for end in ends:
                 if end not in keep:
@@ -167,8 +183,9 @@ class ProcessRun:
         self._ring = ImageRing(ImageLayout.of(info.rig), self._config.pipeline.ring_slots)
         applied = None if self._applied is None else tuple(self._applied)
         setup = Setup(
-            info.rig, self._config, info.ground_truth, info.name, self._ring.name, applied, realtime, self._delays
-        )
+            info.rig, self._config, info.ground_truth, info.name, self._ring.name, applied, realtime, self._folders,
+            self._delays,
+        )  # fmt: skip
         jpeg = self._log is not None and self._log.image_format == "jpeg"
         for stage, control in self._controls.items():
             control.send((setup, jpeg) if stage == "capture" else setup)
@@ -213,18 +230,32 @@ class ProcessRun:
         if not isinstance(message, SlotImage):
             for sink in self._sinks:
                 sink.put(message)
+        if self._to_viewer is not None:
+            self._show(message)
         if self._to_logger is not None:
             self._to_logger.send(message)
         elif isinstance(message, SlotImage) and self._release is not None:
             self._release.send(message.slot)
 
+    def _show(self, message: object) -> None:
+        """Pass on to the viewer what it can take; it never holds anybody up."""
+        assert self._to_viewer is not None and self._ring is not None
+        if not isinstance(message, SlotImage):
+            self._to_viewer.send(message)
+        elif message.image.stamp_ns >= self._next_picture_ns:
+            self._next_picture_ns = message.image.stamp_ns + PICTURE_NS
+            self._to_viewer.send(self._ring.read(message))
+
     def _end(self, connection: Connection, stage: str) -> None:
         self._ended.add(stage)
         self._reports.pop(connection, None)
         connection.close()
-        others = {s for s in self._processes if s != "logger"}
-        if self._to_logger is not None and others <= self._ended and "logger" not in self._ended:
-            self._to_logger.send(End("main"))
+        if {s for s in self._processes if s not in SINKS} <= self._ended and stage not in SINKS:
+            if self._to_logger is not None:
+                self._to_logger.send(End("main"))
+            if self._to_viewer is not None:
+                self._to_viewer.send(End("main"))
+                self._to_viewer.close()
 
     # -- death -------------------------------------------------------------------------------------------------------
 
@@ -239,9 +270,12 @@ class ProcessRun:
     def _died(self, connection: Connection) -> None:
         """End of file without `End`: find the one that died first, close the log, raise."""
         stage = self._reports.pop(connection)
+        if stage == "viewer":  # closed or crashed: the run does not care
+            self._ended.add(stage)
+            return
         self._processes[stage].join(0.5)
         consequence = self._processes[stage].exitcode == workers.UPSTREAM_LOST
-        if consequence and any(s != "logger" for s in self._reports.values()):
+        if consequence and any(s not in SINKS for s in self._reports.values()):
             return  # its neighbour is the cause, and will be found
         message = f"the {stage} process {self._how_it_died(stage)}"
         self._abandon()
@@ -254,7 +288,12 @@ class ProcessRun:
             return f"the log {self._log.path} is not closed, but readable (stereo-sfm recover writes a clean copy)"
         return f"the log {self._log.path} is complete up to then"
 
-    def _fail(self, failed: Failed) -> None:
+    def _fail(self, connection: Connection, failed: Failed) -> None:
+        if failed.stage == "viewer":
+            logging.getLogger("stereo_sfm").warning("the viewer stopped: %s", failed.message.strip().splitlines()[-1])
+            self._reports.pop(connection)
+            self._ended.add("viewer")
+            return
         self._abandon()
         raise _error(failed)
 

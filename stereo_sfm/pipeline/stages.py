@@ -110,13 +110,6 @@ class MapStage:
         return self.mapper.finish(loops)
 
 
-def make_mapper(config: Config, rig: Rig, spans: NoSpans | None = None) -> AnyMapper:
-    """The mapper; or, with `loop.localize_only`, a localizer in the map at `loop.map_in`."""
-    from stereo_sfm.mapping.mapper import Mapper
-
-    return Mapper(config.mapper, rig, spans, config.loop)
-
-
 def has_closer(config: Config, rig: Rig) -> bool:
     """Whether a run closes loops: the configuration wants it and the camera knows depth."""
     return config.loop.enabled and config.mapper.enabled and rig.stereo

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import sys
@@ -17,6 +18,7 @@ from calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.pipeline.channels import End, Failed, Inbox, Lost, Outbox
+from stereo_sfm.pipeline.maps import MapFolders, make_mapper, save_result
 from stereo_sfm.pipeline.schedule import Lockstep, Realtime, Recorded, Schedule
 from stereo_sfm.types import Applied, Keyframe, LoopResult, MapUpdate, Trajectory
 
@@ -35,6 +37,7 @@ class Setup:
     ring_name: str
     applied: tuple[Applied, ...] | None  # a recorded schedule to follow
     realtime: bool
+    folders: MapFolders
     delays: int | None  # seed of random delays in every stage (tests)
 
 
@@ -173,13 +176,13 @@ def run_mapper(
     from stereo_sfm.mapping.mapper import Mapper
     from stereo_sfm.pipeline.health import HealthMeter
     from stereo_sfm.pipeline.sinks import StageTimes
-    from stereo_sfm.pipeline.stages import MapStage, has_closer, make_mapper
+    from stereo_sfm.pipeline.stages import MapStage, has_closer
     from stereo_sfm.timing import Spans
 
     setup = Inbox[Setup](control).take()
     delay = prepare("mapper", setup)
     spans = Spans()
-    mapper = make_mapper(setup.config, setup.rig, spans)
+    mapper = make_mapper(setup.config, setup.rig, spans, setup.folders)
     closing = has_closer(setup.config, setup.rig)
     lag = setup.config.pipeline.loop_lag_keyframes
     stage = MapStage(mapper, lag, Inbox[LoopResult](loops) if closing else None)
@@ -213,6 +216,7 @@ def run_mapper(
     last = stage.finish()
     if last is not None:
         to_main.send(last)
+    save_result(mapper, setup.config, setup.rig, setup.folders)
     health = meter.report(frame_id, 0)
     if health is not None:
         to_main.send(health)
@@ -309,3 +313,25 @@ def run_logger(
     finally:
         log.close()
         ring.close()
+
+
+@dataclass(frozen=True)
+class ViewerOptions:
+    """How a run is shown."""
+
+    mode: str  # spawn | serve | save
+    path: Path | None = None  # of mode "save"
+
+
+def run_viewer(to_main: Outbox, control: Connection, messages: Connection, options: ViewerOptions) -> None:
+    """What main passes on, into rerun."""
+    from stereo_sfm.viz.sink import RerunSink
+
+    setup = Inbox[Setup](control).take()
+    prepare("viewer", setup)
+    sink = RerunSink(setup.rig, setup.source_name, options.mode, options.path, setup.ground_truth)
+    inbox = Inbox[Any](messages)
+    with contextlib.suppress(Lost):
+        while not isinstance(message := inbox.take(), End):
+            sink.put(message)
+    sink.close()

@@ -1,0 +1,67 @@
+"""Maps that a run starts from or leaves behind."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from calib.rig import Rig
+from stereo_sfm.config import Config
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.pipeline.stages import AnyMapper
+from stereo_sfm.timing import NoSpans
+
+
+@dataclass(frozen=True)
+class MapFolders:
+    """`localize_only`: place the odometry in the map at `map_in` and change nothing. Otherwise the walk's own map is
+    merged with the one at `map_in`, if any, when it is saved to `map_out`."""
+
+    map_in: Path | None = None
+    localize_only: bool = False
+    map_out: Path | None = None
+
+    def check(self, overwrite: bool = False) -> None:
+        """Raises StereoSfmError for what cannot work, before anything is computed."""
+        if self.localize_only and self.map_in is None:
+            raise StereoSfmError("--localize-only needs the map to localize in: add --map-in DIR")
+        if self.localize_only and self.map_out is not None:
+            raise StereoSfmError("--localize-only changes no map: leave --map-out away")
+        if self.map_in is not None and not (self.map_in / "map.json").exists():
+            raise StereoSfmError(f"no map at {self.map_in}: 'stereo-sfm run ... --map-out DIR' makes one")
+        if self.map_out is not None and self.map_out.exists() and not overwrite:
+            raise StereoSfmError(f"{self.map_out} exists: choose another --map-out, or say --overwrite")
+
+
+def make_mapper(config: Config, rig: Rig, spans: NoSpans, folders: MapFolders) -> AnyMapper:
+    """The mapper, or the localizer in a saved map."""
+    if folders.localize_only and folders.map_in is not None:
+        from stereo_sfm.export.saved_map import load_map
+        from stereo_sfm.loop.localizer import Localizer
+        from stereo_sfm.loop.vocabulary_file import configured_vocabulary
+
+        saved = load_map(folders.map_in, rig)
+        return Localizer(saved.snapshot, rig, configured_vocabulary(config.loop), config.loop)
+    from stereo_sfm.mapping.mapper import Mapper
+
+    return Mapper(config.mapper, rig, spans, config.loop)
+
+
+def save_result(mapper: AnyMapper, config: Config, rig: Rig, folders: MapFolders) -> None:
+    """Write the map of a finished run to `map_out`, merged with `map_in`."""
+    from stereo_sfm.mapping.mapper import Mapper
+
+    if folders.map_out is None or not isinstance(mapper, Mapper):
+        return
+    from stereo_sfm.export.merge import merge
+    from stereo_sfm.export.saved_map import SavedMap, load_map, save_map
+    from stereo_sfm.loop.vocabulary_file import configured_vocabulary
+
+    vocabulary = configured_vocabulary(config.loop)
+    snapshot = mapper.map.snapshot()
+    saved = SavedMap(snapshot, rig, vocabulary.id, np.zeros(len(snapshot.kf_ids), np.int64))
+    if folders.map_in is not None:
+        saved = merge([load_map(folders.map_in, rig), saved], vocabulary, config.loop).saved
+    save_map(saved, folders.map_out)

@@ -1,0 +1,155 @@
+"""One run as the command line makes it: the output folder, the wiring, the log and the viewer around the stages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from drivers.source import Source
+from stereo_sfm.config import Config
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.export.run_folder import default_folder, prepare_folder
+from stereo_sfm.pipeline.capture import SourceInfo
+from stereo_sfm.pipeline.inline import run_inline
+from stereo_sfm.pipeline.maps import MapFolders
+from stereo_sfm.pipeline.processes import ProcessRun
+from stereo_sfm.pipeline.schedule import Recorded
+from stereo_sfm.pipeline.sinks import Sink
+from stereo_sfm.pipeline.workers import LogOptions, ViewerOptions
+from stereo_sfm.types import Applied, Frame
+
+LIVE = ("t265", "oak")  # sources that are devices
+
+
+@dataclass(frozen=True)
+class Wiring:
+    """How the stages run, and what is logged and shown."""
+
+    inline: bool = False
+    mode: str | None = None  # lockstep | realtime; None: as the source says
+    log: str | None = None  # full | lean | none; None: full for devices, lean for recordings
+    image_format: str = "png"  # of a full log
+    viz: str = "none"  # none | spawn | serve | save
+
+
+class Session:
+    """Enter it, iterate for the frames; `info` and `folder` say what runs and where its files go."""
+
+    def __init__(
+        self,
+        opener: Callable[[], Source],
+        config: Config,
+        sinks: Sequence[Sink],
+        wiring: Wiring,
+        folders: MapFolders,
+        folder: Path | None = None,
+        overwrite: bool = False,
+        applied: Sequence[Applied] | None = None,
+    ) -> None:
+        if wiring.inline and wiring.mode == "realtime":
+            raise StereoSfmError("--mode realtime needs processes: leave --inline away")
+        self._opener, self._config, self._sinks, self._wiring = opener, config, list(sinks), wiring
+        self._folders, self._overwrite, self._applied = folders, overwrite, applied
+        self._stack = ExitStack()
+        self._stopped = False
+        self._frames: Iterator[Frame]
+        self._run: ProcessRun | None = None
+        self._folder = folder
+        self.info: SourceInfo
+
+    @property
+    def folder(self) -> Path:
+        """Where the files go; known once entered."""
+        assert self._folder is not None
+        return self._folder
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            if self._folder is not None:
+                prepare_folder(self._folder, self._overwrite)
+            self._frames = self._enter_inline(stack) if self._wiring.inline else self._enter_processes(stack)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.__exit__(kind, error, trace)
+
+    def __iter__(self) -> Iterator[Frame]:
+        for frame in self._frames:
+            yield frame
+            if self._stopped and self._run is None:
+                return
+
+    def stop(self) -> None:
+        """Finish what is in flight and end."""
+        self._stopped = True
+        if self._run is not None:
+            self._run.stop()
+
+    def _make_folder(self, name: str) -> Path:
+        if self._folder is None:
+            self._folder = default_folder(name, datetime.now())
+            prepare_folder(self._folder, self._overwrite)
+        return self._folder
+
+    def _log_options(self, live: bool, folder: Path) -> LogOptions | None:
+        kind = self._wiring.log or ("full" if live else "lean")
+        if kind == "none":
+            return None
+        return LogOptions(folder / "run.mcap", self._wiring.image_format if kind == "full" else "none")
+
+    # -- wirings -----------------------------------------------------------------------------------------------------
+
+    def _enter_inline(self, stack: ExitStack) -> Iterator[Frame]:
+        from stereo_sfm.log.run_log import RunLog
+        from stereo_sfm.log.writer import LogWriter
+
+        source = stack.enter_context(self._opener())
+        self.info = SourceInfo(source.name, source.rig, source.ground_truth, source.frame_count, source.live)
+        folder = self._make_folder(source.name)
+        options = self._log_options(source.live, folder)
+        sinks: list[Any] = list(self._sinks)
+        jpeg = options is not None and options.image_format == "jpeg"
+        if options is not None:
+            log = RunLog(
+                LogWriter(options.path), source.rig, self._config, source=source.name, mode="inline",
+                image_format=options.image_format, ground_truth=source.ground_truth,
+            )  # fmt: skip
+            stack.callback(log.close)
+            sinks.append(log)
+        if self._wiring.viz != "none":
+            from stereo_sfm.viz.sink import RerunSink
+
+            viewer = RerunSink(source.rig, source.name, self._wiring.viz, folder / "run.rrd", source.ground_truth)
+            stack.callback(viewer.close)
+            sinks.append(viewer)
+        schedule = None if self._applied is None else Recorded(self._applied)
+        frames = run_inline(source, self._config, sinks, schedule, self._folders, jpeg=jpeg)
+        stack.callback(frames.close)
+        return frames
+
+    def _enter_processes(self, stack: ExitStack) -> Iterator[Frame]:
+        live = str(getattr(self._opener, "spec", "")).split(":")[0] in LIVE
+        if self._folder is None:
+            self._make_folder(str(getattr(self._opener, "spec", "run")).rstrip("/").split("/")[-1])
+        viewer = None if self._wiring.viz == "none" else ViewerOptions(self._wiring.viz, self.folder / "run.rrd")
+        self._run = ProcessRun(
+            self._opener,
+            self._config,
+            self._sinks,
+            realtime=None if self._wiring.mode is None else self._wiring.mode == "realtime",
+            applied=self._applied,
+            log=self._log_options(live, self.folder),
+            folders=self._folders,
+            viewer=viewer,
+        )
+        stack.enter_context(self._run)
+        self.info = self._run.info
+        return iter(self._run)
