@@ -46,6 +46,7 @@ class FeaturesConfig:
     stereo_check: str = "rig"  # epipolar check of left-right matches: rig (calibrated) | ransac (estimated)
     epipolar_px: float = 1.5  # largest distance to the epipolar line, in pixels at the image centre
     stereo_only: bool = True  # with two eyes, only points that both see (as the thesis)
+    motion_check: bool = False  # fundamental RANSAC on matches between frames too, before the estimator's own
     motion_window_deg: float = 0.0  # drop matches that moved by more than this angle between frames; 0: keep all
 
 

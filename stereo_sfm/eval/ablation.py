@@ -61,8 +61,9 @@ class Cell:
 
     @property
     def file_name(self) -> str:
-        """Unique, readable, and the same in every session."""
-        digest = hashlib.sha256(repr((_SCHEMA, dataclasses.astuple(self))).encode()).hexdigest()[:8]
+        """Unique, readable, the same in every session, and another one when the configuration is another."""
+        settings = (_SCHEMA, dataclasses.astuple(self), dataclasses.asdict(self.config()))
+        digest = hashlib.sha256(repr(settings).encode()).hexdigest()[:8]
         words = re.sub(r"[^a-z0-9]+", "-", f"{Path(self.source).name} {self.name}".lower()).strip("-")
         return f"{words}-{digest}.json"
 

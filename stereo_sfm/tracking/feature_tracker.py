@@ -154,13 +154,15 @@ class FeatureTracker:
         return motion, self._ids.give_new(view)
 
     def _match(self, reference: View, view: View, rng: np.random.Generator) -> I64:
-        """(M, 2) rows of both views that agree with one epipolar geometry."""
+        """(M, 2) rows of both views; by configuration only those that agree with one epipolar geometry."""
         features = self._config.features
         rows = match_features(reference.features, view.features, self._norm, features.ratio)
         a, b = reference.bearings[rows[:, 0]], view.bearings[rows[:, 1]]
         if features.motion_window_deg > 0:
             near = (a * b).sum(1) > np.cos(np.radians(features.motion_window_deg))
             rows, a, b = rows[near], a[near], b[near]
+        if not features.motion_check:
+            return rows
         return rows[epipolar_inliers(a, b, 2 * features.epipolar_px * self._pixel, rng)]
 
     def _recover(self, view: View) -> View:
