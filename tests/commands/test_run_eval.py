@@ -49,6 +49,9 @@ def test_trajectory_files_agree(euroc_run: Path) -> None:
     assert tum.poses[0] == pytest.approx(np.eye(4))
     kitti = read_kitti(euroc_run / "trajectory_odom.kitti", tum.stamp_ns)
     assert kitti.poses == pytest.approx(tum.poses, abs=1e-7)
+    mapped = read_tum(euroc_run / "trajectory_map.tum")
+    assert mapped.stamp_ns.tolist() == tum.stamp_ns.tolist()
+    assert 0 < np.abs(mapped.positions - tum.positions).max() < 0.02
     keyframes = read_tum(euroc_run / "keyframes.tum")
     assert set(keyframes.stamp_ns.tolist()) <= set(tum.stamp_ns.tolist())
 
@@ -78,9 +81,11 @@ def test_eval_prints_the_runs_errors(
 ) -> None:
     stats = json.loads((euroc_run / "stats.json").read_text())
     reference = str(data_root / "euroc_mh01")
-    assert main(["eval", str(euroc_run), "--ref", reference, "--json", "--plot", str(tmp_path)]) == 0
-    printed = json.loads(capsys.readouterr().out)
-    assert printed["ape_m"]["rmse"] == pytest.approx(stats["evaluation"]["odometry"]["ape_m"]["rmse"], rel=1e-4)
+    for which, name in (("map", "map"), ("odom", "odometry")):
+        args = ["eval", str(euroc_run), "--ref", reference, "--json", "--which", which]
+        assert main([*args, "--plot", str(tmp_path)]) == 0
+        printed = json.loads(capsys.readouterr().out)
+        assert printed["ape_m"]["rmse"] == pytest.approx(stats["evaluation"][name]["ape_m"]["rmse"], rel=1e-4)
     assert {p.name for p in tmp_path.iterdir()} == {"trajectory.png", "errors.png"}
     assert main(["eval", str(euroc_run), "--ref", reference, "--align", "none"]) == 0
     assert "alignment none" in capsys.readouterr().out
