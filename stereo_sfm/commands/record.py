@@ -38,6 +38,7 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-q", "--quiet", action="store_true", help="no progress and no summary")
     add_source_arguments(parser)
     parser.add_argument("--frames", type=int, dest="max_frames", metavar="N", help="same as --max-frames")
+    parser.set_defaults(speed=None)  # recordings are copied as fast as they can be read
 
 
 def run(args: argparse.Namespace) -> int:
