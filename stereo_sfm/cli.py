@@ -15,6 +15,8 @@ from stereo_sfm.errors import StereoSfmError
 # subcommand -> what `--help` says; the code is in stereo_sfm/commands/<name with _ for ->.py
 COMMANDS: dict[str, str] = {
     "run": "turn a source into a trajectory and a map",
+    "replay": "execute a run again from its log, to the same bits",
+    "viz": "show a run or a recording in rerun",
     "record": "write a source to an MCAP file",
     "info": "what a recording or dataset folder holds, and what is wrong with it",
     "convert": "dataset folder to MCAP",

@@ -122,6 +122,8 @@ class SourceChoice:
         from stereo_sfm.demo import demo_recording
 
         spec = args.source if args.source is not None else str(demo_recording())
+        if Path(spec).exists():
+            spec = str(Path(spec).resolve())  # the log says where the images are: a replay may start elsewhere
         return SourceChoice(spec, args.rig, args.start, args.duration, args.frame_skip, args.max_frames, args.speed)
 
     def __call__(self) -> Source:

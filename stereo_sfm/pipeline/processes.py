@@ -183,9 +183,16 @@ class ProcessRun:
         self._ring = ImageRing(ImageLayout.of(info.rig), self._config.pipeline.ring_slots)
         applied = None if self._applied is None else tuple(self._applied)
         setup = Setup(
-            info.rig, self._config, info.ground_truth, info.name, self._ring.name, applied, realtime, self._folders,
-            self._delays,
-        )  # fmt: skip
+            rig=info.rig,
+            config=self._config,
+            ground_truth=info.ground_truth,
+            source_name=str(getattr(self._opener, "spec", info.name)),
+            ring_name=self._ring.name,
+            applied=applied,
+            realtime=realtime,
+            folders=self._folders,
+            delays=self._delays,
+        )
         jpeg = self._log is not None and self._log.image_format == "jpeg"
         for stage, control in self._controls.items():
             control.send((setup, jpeg) if stage == "capture" else setup)

@@ -63,6 +63,11 @@ class Session:
         self.info: SourceInfo
 
     @property
+    def _spec(self) -> str:
+        """What the source was opened by, '' when the opener does not say."""
+        return str(getattr(self._opener, "spec", ""))
+
+    @property
     def folder(self) -> Path:
         """Where the files go; known once entered."""
         assert self._folder is not None
@@ -119,7 +124,7 @@ class Session:
         jpeg = options is not None and options.image_format == "jpeg"
         if options is not None:
             log = RunLog(
-                LogWriter(options.path), source.rig, self._config, source=source.name, mode="inline",
+                LogWriter(options.path), source.rig, self._config, source=self._spec or source.name, mode="inline",
                 image_format=options.image_format, ground_truth=source.ground_truth,
             )  # fmt: skip
             stack.callback(log.close)
@@ -136,9 +141,8 @@ class Session:
         return frames
 
     def _enter_processes(self, stack: ExitStack) -> Iterator[Frame]:
-        live = str(getattr(self._opener, "spec", "")).split(":")[0] in LIVE
-        if self._folder is None:
-            self._make_folder(str(getattr(self._opener, "spec", "run")).rstrip("/").split("/")[-1])
+        live = self._spec.split(":")[0] in LIVE
+        self._make_folder(self._spec.rstrip("/").split("/")[-1] or "run")
         viewer = None if self._wiring.viz == "none" else ViewerOptions(self._wiring.viz, self.folder / "run.rrd")
         self._run = ProcessRun(
             self._opener,

@@ -1,0 +1,97 @@
+"""`stereo-sfm replay`: execute a run again from its log, to the same bits."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stereo_sfm.commands.run import SourceChoice, add_wiring_arguments, execute
+from stereo_sfm.errors import StereoSfmError
+
+if TYPE_CHECKING:
+    from drivers.source import Source
+    from stereo_sfm.config import Config
+    from stereo_sfm.types import Frame
+
+DIFFERENT = 3
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of this command."""
+    parser.add_argument("run", type=Path, help="run.mcap or the folder of a run")
+    parser.add_argument("--source", help="where the images are (default: in the log, else the run's own source)")
+    parser.add_argument("-o", "--output", type=Path, help="output folder (default: runs/DATE_replay)")
+    parser.add_argument("--overwrite", action="store_true", help="replace the run that lies in the output folder")
+    parser.add_argument(
+        "--schedule",
+        choices=("recorded", "lockstep"),
+        help="when map updates reach the tracker: as the run recorded it, or by the lockstep rule (default: as it ran)",
+    )
+    parser.add_argument("--until", type=float, metavar="S", help="stop after this many seconds")
+    parser.add_argument("--step", action="store_true", help="show every frame and wait for Enter")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change a value, to compare")
+    parser.add_argument("--check", action="store_true", help="compare with the run; exit with 3 when they differ")
+    add_wiring_arguments(parser)
+    parser.add_argument("--frame", choices=("cam0", "body"), default="cam0", help="whose poses the trajectories hold")
+    parser.add_argument("--max-lost", type=float, default=100.0, metavar="PERCENT", help=argparse.SUPPRESS)
+    parser.add_argument("-q", "--quiet", action="store_true", help="no progress and no summary")
+
+
+@dataclass(frozen=True)
+class ReplayChoice(SourceChoice):
+    """The frames that a run tracked."""
+
+    frame_ids: tuple[int, ...] = ()
+
+    def __call__(self) -> Source:
+        from drivers.replayed import ReplayedSource
+
+        return ReplayedSource(super().__call__(), self.frame_ids)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read what the run was, do it again, compare if asked."""
+    from stereo_sfm.log import recorded, topics
+    from stereo_sfm.log.reader import LogReader
+    from stereo_sfm.pipeline.maps import MapFolders
+
+    path: Path = args.run / "run.mcap" if args.run.is_dir() else args.run
+    if not path.exists():
+        raise StereoSfmError(f"no run at {path}: 'stereo-sfm run' writes run.mcap into its folder")
+    with LogReader(path) as reader:
+        before = recorded.read_run(reader)
+        frames: list[Frame] = [message for _, message in recorded.messages(reader, (topics.FRAME,))]
+    if not frames:
+        raise StereoSfmError(f"{path} holds no frames: nothing to replay")
+    follow = args.schedule == "recorded" or (args.schedule is None and before.mode == "realtime")
+    spec = args.source or (before.source if before.image_format == "none" else str(path))
+    frame_ids = tuple(f.frame_id for f in frames if _within(f, frames[0], args.until))
+    choice = ReplayChoice(spec, frame_ids=frame_ids)
+    args.mode = "lockstep" if args.mode is None else args.mode
+    args.log = args.log or "lean"
+    config = _changed(before.config, args.set)
+    code = execute(args, choice, config, MapFolders(), before.applied if follow else None)
+    return _compare(path, args) if args.check and code == 0 else code
+
+
+def _within(frame: Frame, first: Frame, until_s: float | None) -> bool:
+    return until_s is None or (frame.stamp_ns - first.stamp_ns) * 1e-9 <= until_s
+
+
+def _changed(config: Config, overrides: list[str]) -> Config:
+    from stereo_sfm.config import load
+
+    return load(None, overrides, dataclasses.asdict(config)) if overrides else config
+
+
+def _compare(path: Path, args: argparse.Namespace) -> int:
+    from stereo_sfm.log.diff import diff
+    from stereo_sfm.log.reader import LogReader
+
+    with LogReader(path) as a, LogReader(Path(args.output) / "run.mcap") as b:
+        differences = diff(a, b)
+    print("identical" if not differences else "\n".join(str(d) for d in differences))
+    return DIFFERENT if differences else 0

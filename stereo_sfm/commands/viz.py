@@ -1,0 +1,74 @@
+"""`stereo-sfm viz`: show a run, or any MCAP recording, in rerun."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stereo_sfm.errors import StereoSfmError
+
+if TYPE_CHECKING:
+    from stereo_sfm.log.reader import LogReader
+    from stereo_sfm.pipeline.sinks import Sink
+    from stereo_sfm.types import StereoImage
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of this command."""
+    parser.add_argument("file", type=Path, help="run.mcap, a run's folder, or any recording")
+    parser.add_argument("--source", help="where the images are, for a run whose log has none")
+    parser.add_argument("--serve", action="store_true", help="to browsers, instead of opening a window")
+    parser.add_argument("--save", type=Path, metavar="FILE.rrd", help="write a rerun file instead of showing it")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Feed a log to the viewer; with --serve stay until interrupted."""
+    path: Path = args.file / "run.mcap" if args.file.is_dir() else args.file
+    if not path.exists():
+        raise StereoSfmError(f"no recording at {path}")
+    from drivers.source import open_source
+    from stereo_sfm.log import topics
+    from stereo_sfm.log.image_log import RIG_FILE, TRUTH_FILE, rig_from_text, truth_from_bytes
+    from stereo_sfm.log.reader import LogReader
+    from stereo_sfm.viz.sink import RerunSink
+
+    mode = "save" if args.save else "serve" if args.serve else "spawn"
+    with LogReader(path) as reader:
+        names = {t.topic for t in reader.topics}
+        rig_text = reader.attachment(RIG_FILE)
+        has_images = args.source is not None or topics.LEFT_IMAGE in names or rig_text is None
+        if has_images:
+            with open_source(args.source or path) as source:
+                sink = RerunSink(source.rig, source.name, mode, args.save, source.ground_truth)
+                _play(reader, iter(source), sink)
+        else:
+            assert rig_text is not None
+            truth = reader.attachment(TRUTH_FILE)
+            ground_truth = None if truth is None else truth_from_bytes(truth)
+            sink = RerunSink(rig_from_text(rig_text.decode()), path.stem, mode, args.save, ground_truth)
+            _play(reader, iter(()), sink)
+        sink.close()
+    if mode == "serve":
+        print("serving; open the address above in a browser, Ctrl-C ends")
+        signal.pause()
+    return 0
+
+
+def _play(reader: LogReader, images: Iterator[StereoImage], sink: Sink) -> None:
+    """The answers in the order of the log, every image before the frame that was tracked in it."""
+    from stereo_sfm.log import recorded, topics
+    from stereo_sfm.types import Frame
+
+    shown = (topics.FRAME, topics.KEYFRAME, topics.MAP_UPDATE, topics.LOOP, topics.STAGE_TIMES)
+    last = -1
+    for _, message in recorded.messages(reader, shown):
+        if isinstance(message, Frame):
+            while last < message.frame_id and (image := next(images, None)) is not None:
+                sink.put(image)
+                last = image.frame_id
+        sink.put(message)
+    for image in images:
+        sink.put(image)
