@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from stereo_sfm.pipeline.maps import MapFolders
     from stereo_sfm.pipeline.session import Session
     from stereo_sfm.types import Applied
+    from stereo_sfm.viz.match_pictures import MatchPictures
 
 TRACKING_FAILED = 4
 INTERRUPTED = 130
@@ -43,6 +44,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frame", choices=("cam0", "body"), default="cam0", help="whose poses the trajectories hold")
     parser.add_argument(
         "--max-lost", type=float, default=20.0, metavar="PERCENT", help="exit with 4 when more frames have no pose"
+    )
+    parser.add_argument(
+        "--matches", type=int, metavar="K", help="every K frames a picture of the matches with the last keyframe"
     )
     parser.add_argument("-q", "--quiet", action="store_true", help="no progress and no summary")
     parser.add_argument("-v", "--verbose", action="store_true", help="say more on standard error")
@@ -161,9 +165,13 @@ def execute(
     from stereo_sfm.export.run_folder import link_latest
     from stereo_sfm.pipeline.session import Session, Wiring
 
-    record = RunRecord()
-    wiring = Wiring(args.inline, args.mode, args.log, args.image_format, args.viz)
-    with Session(choice, config, [record], wiring, folders, args.output, args.overwrite, applied) as session:
+    record, pictures = RunRecord(), _match_pictures(getattr(args, "matches", None))
+    sinks = [record] if pictures is None else [record, pictures]
+    # Images reach the sinks only where the stages share this process.
+    wiring = Wiring(args.inline or pictures is not None, args.mode, args.log, args.image_format, args.viz)
+    with Session(choice, config, sinks, wiring, folders, args.output, args.overwrite, applied) as session:
+        if pictures is not None:
+            pictures.folder = session.folder / "matches"
         begin = time.perf_counter()
         interrupted, problem = _follow(session, record, args.quiet)
         wall_s = time.perf_counter() - begin
@@ -183,6 +191,16 @@ def execute(
         print(f"stereo-sfm {args.command}: {failed}; {folder / 'report.md'} says why", file=sys.stderr)
         return TRACKING_FAILED
     return 0
+
+
+def _match_pictures(every: int | None) -> MatchPictures | None:
+    if every is None:
+        return None
+    if every < 1:
+        raise StereoSfmError("--matches takes a number of frames of at least 1")
+    from stereo_sfm.viz.match_pictures import MatchPictures
+
+    return MatchPictures(every)
 
 
 def _follow(session: Session, record: RunRecord, quiet: bool) -> tuple[bool, StereoSfmError | None]:

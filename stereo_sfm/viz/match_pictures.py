@@ -53,11 +53,11 @@ def common_rows(first: I64, second: I64) -> tuple[I64, I64]:
 class MatchPictures:
     """Writes `NNNNNN.png` for every k-th frame."""
 
-    def __init__(self, folder: Path, every: int = 1) -> None:
+    def __init__(self, every: int = 1, folder: Path | None = None) -> None:
         """Args:
-        folder: made when the first picture is written. every: frames between pictures.
+        every: frames between pictures. folder: made when the first picture is written; may be set later.
         """
-        self._folder = folder
+        self.folder = folder
         self._every = max(every, 1)
         self._images: dict[int, U8] = {}  # the current frame's, and the last keyframe's
         self._keyframe: Keyframe | None = None
@@ -76,7 +76,7 @@ class MatchPictures:
 
     def _draw(self, frame: Frame) -> None:
         keyframe = self._keyframe
-        if keyframe is None or keyframe.frame_id not in self._images or frame.frame_id not in self._images:
+        if keyframe is None or not {keyframe.frame_id, frame.frame_id} <= self._images.keys():
             return
         seen = frame.observations
         a, b = common_rows(keyframe.point_ids, seen.point_ids)
@@ -94,5 +94,6 @@ class MatchPictures:
             seen.uv_left[others],
             text,
         )
-        self._folder.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(self._folder / f"{frame.frame_id:06d}.png"), picture)
+        folder = self.folder or Path("matches")
+        folder.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(folder / f"{frame.frame_id:06d}.png"), picture)

@@ -42,7 +42,7 @@ def test_lines_join_the_matches() -> None:
 
 
 def test_a_picture_for_every_second_frame_after_a_keyframe(tmp_path: Path) -> None:
-    sink = MatchPictures(tmp_path / "matches", every=2)
+    sink = MatchPictures(2, tmp_path / "matches")
     for k in range(5):
         sink.put(StereoImage(k, 0, GREY))
         sink.put(frame(k, [1, 2, 3]))
