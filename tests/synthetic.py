@@ -9,7 +9,7 @@ import numpy as np
 from calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import KannalaBrandt, Pinhole
-from stereo_sfm.types import F64, I64, Bool
+from stereo_sfm.types import F64, I64, Bool, Keyframe
 
 
 def pinhole_rig(baseline: float = 0.1) -> Rig:
@@ -111,3 +111,100 @@ def disturb(scene: Scene, pose_sigma: float, point_sigma: float, seed: int = 1) 
     xi[:, 3:] *= 0.5
     xi[0] = 0
     return scene.world_T_kf @ se3.exp(xi), scene.points + rng.normal(0, point_sigma, scene.points.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class KeyframeStream:
+    """Keyframes as a tracker with drift would make them, and the truth behind them."""
+
+    rig: Rig
+    keyframes: list[Keyframe]
+    world_T_kf: F64  # (K, 4, 4)
+    points: F64  # (P, 3)
+    truth_of_id: I64  # (ids,) row of `points` behind each track id
+
+
+def keyframe_stream(
+    rig: Rig,
+    world_T_kf: F64,
+    points: int = 3000,
+    noise_px: float = 0.3,
+    outliers: float = 0.0,
+    drift: tuple[float, float] = (0.002, 0.0005),
+    track_length: int = 6,
+    per_keyframe: int = 150,
+    broken_at: int = -1,
+    seed: int = 0,
+) -> KeyframeStream:
+    """A walk seen through tracks that break.
+
+    A point that stays in view is tracked for at most `track_length` keyframes and comes back later under a new id with
+    the descriptor it had, a few bits changed; every new track sits up to half a pixel beside the point.
+
+    Args:
+        drift: metres and radians of random error from one keyframe to the next.
+        broken_at: a keyframe before which every track ends.
+    """
+    rng = np.random.default_rng(seed)
+    xyz = points_around(world_T_kf, points, rng)
+    looks = rng.integers(0, 256, (points, 32), dtype=np.uint8)
+    odometry, next_id = [world_T_kf[0]], 0
+    track: dict[int, tuple[int, int, F64]] = {}  # point -> id, age, offset px
+    rest: dict[int, int] = {}  # point -> keyframe until which no corner is found there again
+    truth_of_id: list[int] = []
+    keyframes: list[Keyframe] = []
+    for k, pose in enumerate(world_T_kf):
+        if k:
+            error = rng.normal(0, 1, 6) * np.repeat(drift, 3)
+            odometry.append(odometry[-1] @ se3.inverse(world_T_kf[k - 1]) @ pose @ se3.exp(error))
+        seen, left, right = see(rig, pose, xyz)
+        seen &= np.isfinite(right[:, 0])
+        ended = [p for p, t in track.items() if not seen[p] or t[1] >= track_length or k == broken_at]
+        for p in ended:
+            del track[p]
+            rest[p] = k - 1 if k == broken_at else k + 1
+        fresh = [p for p in np.flatnonzero(seen).tolist() if p not in track and rest.get(p, -1) < k]
+        for p in rng.permutation(fresh)[: max(per_keyframe - len(track), 0)].tolist():
+            age = 0 if k else int(rng.integers(track_length))  # so that tracks do not all end together
+            track[p] = (next_id, age, rng.uniform(-0.5, 0.5, 2))
+            truth_of_id.append(p)
+            next_id += 1
+        rows = np.array(sorted(track), np.int64)
+        ids = np.array([track[p][0] for p in rows.tolist()], np.int64)
+        offset = np.array([track[p][2] for p in rows.tolist()]).reshape(-1, 2)
+        track = {p: (i, age + 1, o) for p, (i, age, o) in track.items()}
+        uv_left = left[rows] + offset + rng.normal(0, noise_px, (len(rows), 2))
+        uv_right = right[rows] + offset + rng.normal(0, noise_px, (len(rows), 2))
+        wild = rng.random(len(rows)) < outliers
+        uv_left[wild] += rng.choice([-1.0, 1.0], (int(wild.sum()), 2)) * rng.uniform(5, 30, (int(wild.sum()), 2))
+        keyframes.append(
+            Keyframe(
+                kf_id=k,
+                frame_id=5 * k,
+                stamp_ns=k * 10**8,
+                odom_T_cam=odometry[-1],
+                point_ids=ids,
+                uv_left=uv_left,
+                uv_right=uv_right,
+                points_cam=_stereo_points(rig, uv_left, uv_right),
+                descriptors=looks[rows] ^ _few_bits(rng, len(rows)),
+                angles=np.zeros(len(rows), np.float32),
+            )
+        )
+    return KeyframeStream(rig, keyframes, world_T_kf, xyz, np.array(truth_of_id, np.int64))
+
+
+def _few_bits(rng: np.random.Generator, count: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+    """(N, 32) masks with about ten bits set."""
+    return np.packbits(rng.random((count, 256)) < 0.04, axis=1)
+
+
+def _stereo_points(rig: Rig, uv_left: F64, uv_right: F64) -> F64:
+    """(N, 3) midpoints of the two rays, left camera."""
+    assert rig.right is not None
+    a = rig.left.unproject(uv_left)
+    b = rig.right.unproject(uv_right) @ rig.left_T_right[:3, :3].T
+    t = rig.left_T_right[:3, 3]
+    ab, at, bt = (a * b).sum(1), a @ t, b @ t
+    along = (at - ab * bt) / np.maximum(1 - ab * ab, 1e-12)
+    return a * np.clip(along, 0.2, 50.0)[:, None]

@@ -35,9 +35,11 @@ from stereo_sfm.mapping import culling, window
 from stereo_sfm.mapping.bundle import BundleConfig, BundleResult, bundle_adjust
 from stereo_sfm.mapping.insertion import insert_keyframe
 from stereo_sfm.mapping.map import Map
+from stereo_sfm.mapping.triangulate import triangulate
 from stereo_sfm.timing import NoSpans
-from stereo_sfm.types import F64, I32, I64, Keyframe, LoopResult, MapUpdate
+from stereo_sfm.types import F64, I64, Bool, Keyframe, LoopResult, MapUpdate
 
+YOUNG = 4  # observations up to which a point is triangulated anew before it is adjusted
 RECENT = 3  # newest keyframes: whose points are judged, and which are never redundant
 
 
@@ -70,7 +72,7 @@ class Mapper:
         self._version = 0
         self._culled: list[I64] = []
         self._fused: list[tuple[int, int]] = []  # rows (gone, stays)
-        self._lately: list[I32] = []  # point rows that the newest keyframes saw, outliers too
+        self._adjusted: I64 = np.zeros(0, np.int64)  # point rows of the last window
         self._loops: list[LoopResult] = []
         self._job: Job | None = None
         self._job_due = -1
@@ -221,22 +223,35 @@ class Mapper:
     def _adjust(self, row: int) -> None:
         if row == 0:
             return
+        seen = self._seen_by(row)
+        count = self.map.points.obs_count[seen]
+        young = seen[(count > 1) & (count <= YOUNG)]
+        self.map.move_points(young, triangulate(self.map, self._rig, young))
         part = window.covisible_window(self.map, row, self._config)
+        self._adjusted = part.pt_rows
         result = bundle_adjust(self._rig, part.bundle, window.bundle_config(self._config))
         window.write_back(self.map, part, result)
 
     def _cull(self, row: int) -> None:
-        recent = np.arange(max(0, row - RECENT), row + 1)
-        seen = [self.map.observations.pt[self.map.observations_of_keyframe(int(k))] for k in recent]
-        rows = np.unique(np.concatenate([*self._lately, *seen])).astype(np.int64)
-        self._lately = [*self._lately[-RECENT:], seen[-1]]
+        recent = range(max(0, row - RECENT), row + 1)
+        seen = [self._seen_by(k) for k in recent]
+        redundant = culling.redundant_keyframe(self.map, row, self._protected(), self._config)
+        if redundant >= 0:
+            seen.append(self._seen_by(redundant))
+            self.map.cull_keyframe(redundant)
+        rows = np.unique(np.concatenate([self._adjusted, *seen]))
         weak = culling.weak_points(self.map, self._rig, rows, row, self._config)
         self.map.cull_points(weak)
         self._culled.append(weak)
-        protected = np.zeros(len(self.map.keyframes), bool)
+
+    def _seen_by(self, row: int) -> I64:
+        """Point rows that a keyframe sees."""
+        return self.map.observations.pt[self.map.observations_of_keyframe(row)].astype(np.int64)
+
+    def _protected(self) -> Bool:
+        """(K,) keyframes that stay: the first, the newest, those that loops join."""
         ends = [self.map.kf_row(k) for x in self._loops for k in (x.candidate_kf_id, x.kf_id)]
+        protected = np.zeros(len(self.map.keyframes), bool)
         protected[[0, *ends]] = True
         protected[-RECENT:] = True
-        redundant = culling.redundant_keyframe(self.map, row, protected, self._config)
-        if redundant >= 0:
-            self.map.cull_keyframe(redundant)
+        return protected

@@ -1,4 +1,7 @@
-"""Parts of the map as bundles: the covisible window around a keyframe, or everything."""
+"""Parts of the map as bundles: the covisible window around a keyframe, or everything.
+
+A point that only one keyframe sees binds nothing: it stays out of the bundle and goes where its keyframe goes.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +12,13 @@ import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
 from stereo_sfm.config import MapperConfig
+from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.bundle import Bundle, BundleConfig, BundleResult
 from stereo_sfm.mapping.map import Map
-from stereo_sfm.types import I64, Bool
+from stereo_sfm.types import F64, I64, Bool
 
 ALL_KEYFRAMES = 10**9
+TIE = 10  # shared points that hold one keyframe to another
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +58,7 @@ def _window(map_: Map, moving: I64, config: MapperConfig) -> Window:
     table, points = map_.observations, map_.points
     seen = np.concatenate([table.pt[map_.observations_of_keyframe(int(k))] for k in moving])
     pts = np.unique(seen).astype(np.int64)
-    pts = pts[points.alive[pts] & np.isfinite(points.xyz[pts, 0])]
+    pts = pts[points.alive[pts] & np.isfinite(points.xyz[pts, 0]) & (points.obs_count[pts] > 1)]
     obs = map_.observations_of_points(pts)
     around = np.setdiff1d(table.kf[obs], moving)
     moving = np.sort(moving)
@@ -63,7 +68,7 @@ def _window(map_: Map, moving: I64, config: MapperConfig) -> Window:
     kf_index = np.full(len(map_.keyframes), -1, np.int64)
     kf_index[kfs] = np.arange(len(kfs))
     obs_kf, obs_pt = kf_index[table.kf[obs]], np.searchsorted(pts, table.pt[obs])
-    fixed[_floating(fixed, obs_kf, obs_pt, len(pts))] = True
+    fixed[_floating(map_, kfs, fixed)] = True
     bundle = Bundle(
         map_.keyframes.map_T_kf[kfs],
         fixed,
@@ -77,20 +82,28 @@ def _window(map_: Map, moving: I64, config: MapperConfig) -> Window:
     return Window(bundle, kfs, len(moving), pts, obs)
 
 
-def _floating(fixed: Bool, obs_kf: I64, obs_pt: I64, points: int) -> I64:
-    """The oldest keyframe of every component that points do not connect to a fixed keyframe: it must not drift."""
-    count = len(fixed)
-    size = count + points
-    edges = scipy.sparse.csr_array((np.ones(len(obs_kf), np.int8), (obs_kf, count + obs_pt)), shape=(size, size))
-    label = connected_components(edges, directed=False)[1][:count]
+def _floating(map_: Map, kfs: I64, fixed: Bool) -> I64:
+    """The oldest keyframe (index) of every part that too few shared points tie to a fixed one: it must not drift."""
+    index = {row: i for i, row in enumerate(kfs.tolist())}
+    pairs = [
+        (i, index[other])
+        for row, i in index.items()
+        for other in map_.covisibility.neighbours(row, TIE)[0].tolist()
+        if other in index
+    ]
+    table = np.array(pairs, np.int64).reshape(-1, 2)
+    edges = scipy.sparse.csr_array((np.ones(len(table), np.int8), (table[:, 0], table[:, 1])), shape=(len(kfs),) * 2)
+    label = connected_components(edges, directed=False)[1]
     floating = np.flatnonzero(~np.isin(label, label[fixed]))
-    _, oldest = np.unique(label[floating], return_index=True)
-    return floating[oldest]
+    oldest = floating[np.lexsort((kfs[floating], label[floating]))]
+    _, first = np.unique(label[oldest], return_index=True)
+    return oldest[first]
 
 
 def write_back(map_: Map, part: Window, result: BundleResult) -> None:
     """New poses and points of what still lives; eyes that disagree lose their observation."""
     moved = np.flatnonzero(~part.bundle.fixed & map_.keyframes.alive[part.kf_rows])
+    _carry_single_points(map_, part.kf_rows[moved], result.world_T_kf[moved])
     map_.move_keyframes(part.kf_rows[moved], result.world_T_kf[moved])
     sane = np.isfinite(result.points).all(axis=1) & map_.points.alive[part.pt_rows]
     map_.move_points(part.pt_rows[sane], result.points[sane])
@@ -99,3 +112,13 @@ def write_back(map_: Map, part: Window, result: BundleResult) -> None:
     wrong_right = ~result.inlier[:, 1] & np.isfinite(part.bundle.uv_right[:, 0])
     table.uv_right[obs[wrong_right & ~wrong_left]] = np.nan
     map_.remove_observations(obs[wrong_left])
+
+
+def _carry_single_points(map_: Map, kf_rows: I64, after: F64) -> None:
+    """Points that only one of these keyframes sees go with it."""
+    table, points = map_.observations, map_.points
+    for row, pose in zip(kf_rows.tolist(), after, strict=True):
+        seen = table.pt[map_.observations_of_keyframe(row)].astype(np.int64)
+        seen = seen[(points.obs_count[seen] == 1) & np.isfinite(points.xyz[seen, 0])]
+        move = pose @ se3.inverse(map_.keyframes.map_T_kf[row])
+        map_.move_points(seen, se3.transform(move, points.xyz[seen]))

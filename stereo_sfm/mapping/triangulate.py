@@ -1,0 +1,151 @@
+"""Points from their observations, the keyframes given: what bundle adjustment needs to start near the minimum.
+
+A point's first depth comes from one pair of eyes and may be far off (a fisheye sees points along its own baseline). The
+first time that several keyframes see it, distances along its first ray are tried from near to far, and the best is
+refined by Levenberg-Marquardt with a Cauchy loss, each point with its own damping.
+"""
+
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from calib.rig import Rig
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.kernels import njit, project_one
+from stereo_sfm.mapping.map import Map
+from stereo_sfm.types import F64, I64
+
+TRIALS = 8  # distances tried
+NEAREST, FARTHEST = 4.0, 4000.0  # baselines (a rig with one eye: of 5 cm)
+STEPS = 8
+
+
+@njit
+def _accumulate(cam, params, p0, p1, p2, u_obs, v_obs, inv_sigma, m, h, b):
+    """Adds one eye's normal equations in the axes of m (3, 3) = world -> eye. Returns its Cauchy cost."""
+    u, v, j00, j01, j02, j10, j11, j12 = project_one(cam, params, p0, p1, p2)
+    if not (math.isfinite(u) and math.isfinite(v)):
+        return 10.0
+    ru, rv = (u - u_obs) * inv_sigma, (v - v_obs) * inv_sigma
+    if not math.isfinite(rv):  # only u was seen
+        rv, j10, j11, j12 = 0.0, 0.0, 0.0, 0.0
+    chi2 = ru * ru + rv * rv
+    w = inv_sigma / (1.0 + chi2 / 4.0)
+    for i in range(3):
+        gu = j00 * m[0, i] + j01 * m[1, i] + j02 * m[2, i]
+        gv = j10 * m[0, i] + j11 * m[1, i] + j12 * m[2, i]
+        b[i] -= w * (gu * ru + gv * rv)
+        for k in range(3):
+            hu = j00 * m[0, k] + j01 * m[1, k] + j02 * m[2, k]
+            hv = j10 * m[0, k] + j11 * m[1, k] + j12 * m[2, k]
+            h[i, k] += w * inv_sigma * (gu * hu + gv * hv)
+    return 2.0 * math.log1p(chi2 / 4.0)
+
+
+@njit
+def _cost(x, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, h, b):
+    left_model, left_params, right_model, right_params = cams
+    h[:] = 0.0
+    b[:] = 0.0
+    cost = 0.0
+    m = np.zeros((3, 3))
+    for o in range(first, last):
+        r, t = rot[obs_kf[o]], pos[obs_kf[o]]
+        d0, d1, d2 = x[0] - t[0], x[1] - t[1], x[2] - t[2]
+        p0 = r[0, 0] * d0 + r[1, 0] * d1 + r[2, 0] * d2
+        p1 = r[0, 1] * d0 + r[1, 1] * d1 + r[2, 1] * d2
+        p2 = r[0, 2] * d0 + r[1, 2] * d1 + r[2, 2] * d2
+        for i in range(3):
+            for k in range(3):
+                m[i, k] = r[k, i]
+        s = 1.0 / sigma[o]
+        cost += _accumulate(left_model, left_params, p0, p1, p2, uv_left[o, 0], uv_left[o, 1], s, m, h, b)
+        if math.isfinite(uv_right[o, 0]):
+            q0 = right_r[0, 0] * p0 + right_r[0, 1] * p1 + right_r[0, 2] * p2 + right_t[0]
+            q1 = right_r[1, 0] * p0 + right_r[1, 1] * p1 + right_r[1, 2] * p2 + right_t[1]
+            q2 = right_r[2, 0] * p0 + right_r[2, 1] * p1 + right_r[2, 2] * p2 + right_t[2]
+            for i in range(3):
+                for k in range(3):
+                    m[i, k] = right_r[i, 0] * r[k, 0] + right_r[i, 1] * r[k, 1] + right_r[i, 2] * r[k, 2]
+            cost += _accumulate(right_model, right_params, q0, q1, q2, uv_right[o, 0], uv_right[o, 1], s, m, h, b)
+    return cost
+
+
+@njit
+def refine_points(
+    points, rays, origins, trials, starts, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, steps
+):
+    """Improves points (P, 3) in place.
+
+    Args:
+        rays, origins: (P, 3) unit first ray and where it starts, world. trials: (T,) metres tried along it.
+        starts: (P + 1,) first observation of each point. rot, pos: world_T_kf. obs_kf, uv_left, uv_right, sigma:
+        (M, ...) sorted by point. cams, right_r, right_t: as in bundle_kernels.linearize.
+    """
+    h, b = np.zeros((3, 3)), np.zeros(3)
+    h2, b2 = np.zeros((3, 3)), np.zeros(3)
+    x, y, damped = np.zeros(3), np.zeros(3), np.zeros((3, 3))
+    for i in range(points.shape[0]):
+        first, last = starts[i], starts[i + 1]
+        lowest = math.inf
+        for k in range(trials.shape[0] + 1):
+            for j in range(3):
+                y[j] = points[i, j] if k == 0 else origins[i, j] + rays[i, j] * trials[k - 1]
+            if not math.isfinite(y[0]):
+                continue
+            cost = _cost(y, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, h, b)
+            if cost < lowest:
+                lowest = cost
+                x[:] = y
+        damping = 1e-3
+        cost = _cost(x, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, h, b)
+        for _ in range(steps):
+            damped[:] = h
+            for j in range(3):
+                damped[j, j] += damping * h[j, j] + 1e-12
+            y[:] = x + np.linalg.solve(damped, b)
+            new = _cost(y, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, h2, b2)
+            if new < cost:
+                done = cost - new < 1e-4 * cost
+                cost, damping = new, damping * 0.1
+                x[:] = y
+                h[:] = h2
+                b[:] = b2
+                if done:
+                    break
+            else:
+                damping *= 10.0
+        points[i] = x
+
+
+def triangulate(map_: Map, rig: Rig, rows: I64) -> F64:
+    """(N, 3) better positions of some points from all their observations; each must have at least one."""
+    table, keyframes = map_.observations, map_.keyframes
+    rows = np.asarray(rows, np.int64)
+    obs = map_.observations_of_points(rows)
+    order = np.argsort(rows, kind="stable")
+    index = order[np.searchsorted(rows[order], table.pt[obs])]
+    obs = obs[np.argsort(index, kind="stable")]
+    starts = np.searchsorted(np.sort(index), np.arange(len(rows) + 1))
+    oldest = obs[starts[:-1]]
+    pose = keyframes.map_T_kf[table.kf[oldest]]
+    bearing = rig.left.unproject(table.uv_left[oldest].astype(float))
+    rays = np.einsum("nij,nj->ni", pose[:, :3, :3], bearing)
+    base = rig.baseline if rig.stereo else 0.05
+    trials = 1.0 / np.linspace(1.0 / (NEAREST * base), 1.0 / (FARTHEST * base), TRIALS)
+    right = rig.right if rig.right is not None else rig.left
+    right_T_left = se3.inverse(rig.left_T_right)
+    kfs, kf_index = np.unique(table.kf[obs], return_inverse=True)
+    points = map_.points.xyz[rows]
+    refine_points(
+        *(points, np.ascontiguousarray(rays), np.ascontiguousarray(pose[:, :3, 3]), trials, starts),
+        *(np.ascontiguousarray(keyframes.map_T_kf[kfs, :3, :3]), np.ascontiguousarray(keyframes.map_T_kf[kfs, :3, 3])),
+        *(kf_index, table.uv_left[obs].astype(float), table.uv_right[obs].astype(float)),
+        *(table.sigma[obs].astype(float), (rig.left.model_id, rig.left.params, right.model_id, right.params)),
+        *(np.ascontiguousarray(right_T_left[:3, :3]), right_T_left[:3, 3].copy(), STEPS),
+    )
+    return points

@@ -1,0 +1,215 @@
+"""The mapper on synthetic walks: it must take drift out, find points again, keep its promises about frames and bits."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from calib.rig import Rig
+from stereo_sfm.config import MapperConfig
+from stereo_sfm.geometry import se3
+from stereo_sfm.mapping.mapper import Mapper, run_job
+from stereo_sfm.types import F64, LoopResult, MapUpdate
+from tests.synthetic import KeyframeStream, fisheye_rig, keyframe_stream, pinhole_rig, walk
+
+CONFIG = MapperConfig()
+
+
+def to_and_fro(count: int, reach: int = 10, step: float = 0.1) -> F64:
+    """(K, 4, 4) somebody who steps sideways along one shelf, again and again."""
+    x = np.abs((np.arange(count) + reach) % (2 * reach) - reach) * step
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, 0, 3] = x - x[0]
+    return poses
+
+
+def run(stream: KeyframeStream, config: MapperConfig = CONFIG) -> tuple[Mapper, list[MapUpdate]]:
+    mapper = Mapper(config, stream.rig)
+    return mapper, [mapper.step(k) for k in stream.keyframes]
+
+
+def error(poses: F64, truth: F64) -> float:
+    """RMSE of positions, metres, no alignment: both start at the first truth."""
+    return float(np.sqrt(((poses[:, :3, 3] - truth[:, :3, 3]) ** 2).sum(1).mean()))
+
+
+def odometry(stream: KeyframeStream) -> F64:
+    return np.array([k.odom_T_cam for k in stream.keyframes])
+
+
+@pytest.fixture(params=["pinhole", "fisheye"])
+def rig(request: pytest.FixtureRequest) -> Rig:
+    return pinhole_rig() if request.param == "pinhole" else fisheye_rig()
+
+
+def test_a_walk_loses_its_drift(rig: Rig) -> None:
+    stream = keyframe_stream(rig, walk(25), drift=(0.01, 0.003), outliers=0.03)
+    mapper, _ = run(stream)
+    assert error(mapper.map.keyframes.map_T_kf, stream.world_T_kf) < 0.25 * error(odometry(stream), stream.world_T_kf)
+
+
+def test_points_found_again_bound_the_drift(rig: Rig) -> None:
+    """In one place for long: tracks alone drift on, points found again hold."""
+    stream = keyframe_stream(rig, to_and_fro(40), points=900, track_length=4, drift=(0.004, 0.001))
+    with_matches, _ = run(stream)
+    without, _ = run(stream, dataclasses.replace(CONFIG, association="tracks"))
+    kept = error(with_matches.map.keyframes.map_T_kf, stream.world_T_kf)
+    lost = error(without.map.keyframes.map_T_kf, stream.world_T_kf)
+    assert kept < 0.6 * lost
+    assert len(with_matches.map.living_points()) < 0.5 * len(without.map.living_points())
+
+
+def test_fused_points_are_truly_one(rig: Rig) -> None:
+    stream = keyframe_stream(rig, to_and_fro(30), points=900, track_length=4)
+    _, updates = run(stream)
+    fused = np.concatenate([u.fused_point_ids for u in updates])
+    assert len(fused) > 100
+    truth = stream.truth_of_id[fused]
+    assert (truth[:, 0] == truth[:, 1]).mean() > 0.99
+
+
+def test_updates_alone_rebuild_the_map(rig: Rig) -> None:
+    """Whoever applies every update has the mapper's poses and points."""
+    stream = keyframe_stream(rig, to_and_fro(30), points=900, track_length=4, outliers=0.02)
+    mapper, updates = run(stream)
+    poses: dict[int, F64] = {}
+    points: dict[int, F64] = {}
+    for version, update in enumerate(updates, start=1):
+        assert update.version == version
+        poses.update(zip(update.kf_ids.tolist(), update.map_T_kf, strict=True))
+        points.update(zip(update.point_ids.tolist(), update.points_map, strict=True))
+        for gone in [*update.culled_point_ids.tolist(), *update.fused_point_ids[:, 0].tolist()]:
+            points.pop(gone, None)
+    m = mapper.map
+    np.testing.assert_array_equal([poses[int(k)] for k in m.keyframes.kf_id], m.keyframes.map_T_kf)
+    rows = m.living_points()
+    assert sorted(points) == sorted(m.points.pt_id[rows].tolist())
+    np.testing.assert_array_equal([points[int(i)] for i in m.points.pt_id[rows]], m.points.xyz[rows])
+
+
+def test_map_and_odometry_are_one_frame_before_a_loop(rig: Rig) -> None:
+    _, updates = run(keyframe_stream(rig, walk(8)))
+    assert all(np.array_equal(u.map_T_odom, np.eye(4)) for u in updates)
+
+
+def test_where_no_track_connects_odometry_holds(rig: Rig) -> None:
+    stream = keyframe_stream(rig, walk(12), broken_at=6)
+    mapper, _ = run(stream, dataclasses.replace(CONFIG, association="tracks"))
+    step = se3.inverse(mapper.map.keyframes.map_T_kf[5]) @ mapper.map.keyframes.map_T_kf[6]
+    expected = se3.inverse(stream.world_T_kf[5]) @ stream.world_T_kf[6]
+    assert np.linalg.norm(step[:3, 3] - expected[:3, 3]) < 0.02
+    rematched, _ = run(stream)
+    poses = rematched.map.keyframes.map_T_kf
+    assert error(poses, stream.world_T_kf) < error(mapper.map.keyframes.map_T_kf, stream.world_T_kf)
+
+
+def test_weak_points_go_and_tracked_ones_stay(rig: Rig) -> None:
+    stream = keyframe_stream(rig, walk(20), outliers=0.05)
+    mapper, updates = run(stream)
+    points = mapper.map.points
+    old = mapper.map.living_points()
+    old = old[points.last_seen[old] < len(stream.keyframes) - 1]
+    assert (points.obs_count[old] >= CONFIG.min_observations).all()
+    assert sum(len(u.culled_point_ids) for u in updates) > 0
+    truth = stream.points[stream.truth_of_id[points.pt_id[mapper.map.living_points()]]]
+    away = np.linalg.norm(points.xyz[mapper.map.living_points()] - truth, axis=1)
+    assert np.median(away) < 0.05
+
+
+def test_keyframes_of_one_place_are_thinned_out(rig: Rig) -> None:
+    stream = keyframe_stream(rig, to_and_fro(40, reach=4, step=0.05), points=600, track_length=8)
+    mapper, _ = run(stream)
+    alive = mapper.map.keyframes.alive
+    assert alive.sum() < 33 and alive[0] and alive[-1]
+    every, _ = run(stream, dataclasses.replace(CONFIG, redundant_share=2.0))
+    assert every.map.keyframes.alive.all()
+    assert error(mapper.map.keyframes.map_T_kf, stream.world_T_kf) < 0.02
+
+
+def test_retail_papers_rule_only_knows_the_previous_keyframe(rig: Rig) -> None:
+    stream = keyframe_stream(rig, walk(15))
+    paper = dataclasses.replace(CONFIG, association="previous", window_keyframes=0, redundant_share=2.0)
+    mapper, updates = run(stream, paper)
+    assert sum(len(u.fused_point_ids) for u in updates) == 0
+    obs = mapper.map.observations
+    for row in range(len(mapper.map.points)):
+        seen = np.sort(obs.kf[mapper.map.observations_of_points(np.array([row]))])
+        assert len(seen) == 0 or seen[-1] - seen[0] < 8
+    assert error(mapper.map.keyframes.map_T_kf, stream.world_T_kf) < error(odometry(stream), stream.world_T_kf)
+
+
+def test_same_keyframes_same_bits(rig: Rig) -> None:
+    stream = keyframe_stream(rig, to_and_fro(25), points=900, track_length=4, outliers=0.02)
+    for first, second in zip(run(stream)[1], run(stream)[1], strict=True):
+        for field in dataclasses.fields(MapUpdate):
+            a, b = getattr(first, field.name), getattr(second, field.name)
+            assert np.asarray(a).tobytes() == np.asarray(b).tobytes(), field.name
+
+
+def test_switched_off_it_repeats_odometry(rig: Rig) -> None:
+    stream = keyframe_stream(rig, walk(5))
+    mapper, updates = run(stream, dataclasses.replace(CONFIG, enabled=False))
+    assert len(mapper.map.keyframes) == 0
+    for keyframe, update in zip(stream.keyframes, updates, strict=True):
+        np.testing.assert_array_equal(update.map_T_kf[0], keyframe.odom_T_cam)
+        assert len(update.point_ids) == 0
+
+
+def ring(count: int) -> F64:
+    """(K, 4, 4) once round a circle and a little further."""
+    return walk(count, 0.25, 2 * np.pi / (count - 5))
+
+
+def true_loop(stream: KeyframeStream, kf: int, candidate: int) -> LoopResult:
+    """What a perfect loop closer would say."""
+    return LoopResult(
+        kf_id=kf,
+        candidate_kf_id=candidate,
+        candidate_T_kf=se3.inverse(stream.world_T_kf[candidate]) @ stream.world_T_kf[kf],
+        information=np.diag([1e4] * 3 + [1e5] * 3),
+        matches=np.zeros((0, 2), np.int64),
+        inliers=100,
+        score=1.0,
+        reason="",
+    )
+
+
+def walk_with_loop(stream: KeyframeStream, elsewhere: bool = False) -> tuple[Mapper, list[MapUpdate]]:
+    """One true loop two keyframes before the end; `elsewhere`: the job is run by somebody else."""
+    config = dataclasses.replace(CONFIG, full_ba_lag_keyframes=3, association="tracks")
+    mapper, updates = Mapper(config, stream.rig), []
+    last = len(stream.keyframes)
+    for keyframe in stream.keyframes:
+        loop = true_loop(stream, last - 8, 2) if keyframe.kf_id == last - 6 else None
+        updates.append(mapper.step(keyframe, loop))
+        job = mapper.pending_job()
+        if elsewhere and job is not None:
+            mapper.finish_job(run_job(job))
+    return mapper, updates
+
+
+def test_a_loop_moves_the_map_and_not_the_odometry() -> None:
+    stream = keyframe_stream(
+        pinhole_rig(), ring(40), points=3000, noise_px=1.0, drift=(0.02, 0.01), per_keyframe=40, track_length=3
+    )
+    mapper, updates = walk_with_loop(stream)
+    closing = next(i for i, u in enumerate(updates) if not np.array_equal(u.map_T_odom, np.eye(4)))
+    before, after = updates[closing - 1], updates[closing]
+    ends = [error(m.map.keyframes.map_T_kf[-8:], stream.world_T_kf[-8:]) for m in (run(stream)[0], mapper)]
+    assert ends[1] < 0.5 * ends[0]
+    # The newest keyframe before the loop stays where it was in the odometry frame.
+    newest = int(before.kf_id)
+    old = {int(k): p for u in updates[:closing] for k, p in zip(u.kf_ids, u.map_T_kf, strict=True)}[newest]
+    new = after.map_T_kf[int(np.flatnonzero(after.kf_ids == newest)[0])]
+    jump = se3.inverse(se3.inverse(after.map_T_odom) @ new) @ se3.inverse(before.map_T_odom) @ old
+    assert np.linalg.norm(se3.log(jump)) < 0.02
+    assert np.linalg.norm(new[:3, 3] - old[:3, 3]) > 0.01
+
+
+def test_full_adjustment_gives_the_same_bits_wherever_it_runs() -> None:
+    stream = keyframe_stream(pinhole_rig(), ring(30), drift=(0.01, 0.003), per_keyframe=80)
+    here, there = walk_with_loop(stream)[0].map, walk_with_loop(stream, elsewhere=True)[0].map
+    assert here.keyframes.map_T_kf.tobytes() == there.keyframes.map_T_kf.tobytes()
+    assert here.points.xyz.tobytes() == there.points.xyz.tobytes()
