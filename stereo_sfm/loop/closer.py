@@ -88,16 +88,18 @@ class LoopCloser:
         reference = pick((scores[self._row[k]] for k in connected), default=0.0)
         bound = max(config.score_ratio * reference, config.min_score)
         excluded = self._near(keyframe.kf_id, connected)
-        good = [int(i) for i in np.flatnonzero(scores > bound) if int(self._database.kf_ids[i]) not in excluded]
+        ids = self._database.kf_ids
+        good = [int(i) for i in np.flatnonzero(scores > bound) if int(ids[i]) not in excluded]
         good.sort(key=lambda i: (-scores[i], i))
-        places: list[tuple[int, float]] = []
+        places: list[int] = []
+        if config.proximity:
+            places += self._graph.nearby(keyframe.kf_id, excluded)
+        wanted = config.max_candidates + len(places)
         for i in good:
-            kf_id = int(self._database.kf_ids[i])
-            if all(abs(kf_id - other) > PLACE_RADIUS for other, _ in places):
-                places.append((kf_id, float(scores[i])))
-            if len(places) == config.max_candidates:
-                break
-        return places, "no_candidate"
+            kf_id = int(ids[i])
+            if len(places) < wanted and all(abs(kf_id - other) > PLACE_RADIUS for other in places):
+                places.append(kf_id)
+        return [(k, float(scores[self._row[k]])) for k in places], "no_candidate"
 
     def _near(self, kf_id: int, connected: list[int]) -> set[int]:
         """Keyframes that cannot be loops: connected to this one, or just before it."""
@@ -131,8 +133,8 @@ class LoopCloser:
         candidate_T_kf = se3.inverse(verdict.b_T_a)
         way = self._graph.way(candidate, keyframe.kf_id)
         if way is None:
-            if verdict.inliers < 2 * config.min_inliers:
-                return rejection("too_few_inliers", verdict.inliers)
+            if verdict.inliers < max(2 * config.min_inliers, config.relocalize_share * len(view.ids)):
+                return rejection("too_few_inliers", verdict.inliers)  # nothing but the pictures speaks for it
         else:
             metres = config.gate_metres + config.gate_per_metre * way.metres
             degrees = config.gate_degrees + config.gate_degrees_per_metre * way.metres

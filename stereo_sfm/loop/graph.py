@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import heapq
 import itertools
+from collections.abc import Container
 from dataclasses import dataclass
 
 import numpy as np
 
 from stereo_sfm.geometry import se3
-from stereo_sfm.types import F64
+from stereo_sfm.types import F64, I64
+
+NEAR_METRES, NEAR_RADIANS = 1.5, 0.7  # keyframes that should see the same things
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,12 +32,31 @@ class KeyframeGraph:
         self._chain: dict[int, int] = {}  # number of the unbroken piece of odometry
         self._loops: list[tuple[int, int, F64]] = []  # a, b, a_T_b
         self._last = -1
+        self._ids: I64 = np.zeros(64, np.int64)
+        self._stack: F64 = np.empty((64, 4, 4))  # odom_T_cam of _ids, for vectorised search
+        self._chains: I64 = np.zeros(64, np.int64)
+        self._count = 0
 
     def add(self, kf_id: int, odom_T_cam: F64, chain: int) -> None:
         """Append the newest keyframe of an unbroken piece of odometry called `chain`."""
         step = np.linalg.norm(odom_T_cam[:3, 3] - self._poses[self._last][:3, 3]) if self._last >= 0 else 0.0
         self._metres[kf_id] = self._metres.get(self._last, 0.0) + float(step)
         self._poses[kf_id], self._chain[kf_id], self._last = odom_T_cam, chain, kf_id
+        if self._count == len(self._ids):
+            self._ids, self._stack = np.tile(self._ids, 2), np.tile(self._stack, (2, 1, 1))
+            self._chains = np.tile(self._chains, 2)
+        self._ids[self._count], self._stack[self._count], self._chains[self._count] = kf_id, odom_T_cam, chain
+        self._count += 1
+
+    def nearby(self, kf_id: int, excluded: Container[int]) -> list[int]:
+        """The keyframe of the same piece of odometry that stood nearest and looked the same way, if near at all."""
+        part = slice(0, self._count)
+        relative = se3.inverse(self._stack[part]) @ self._poses[kf_id]
+        metres = np.linalg.norm(relative[:, :3, 3], axis=1)
+        cosine = (np.trace(relative[:, :3, :3], axis1=1, axis2=2) - 1) / 2
+        close = (metres < NEAR_METRES) & (cosine > np.cos(NEAR_RADIANS)) & (self._chains[part] == self._chain[kf_id])
+        rows = [r for r in np.flatnonzero(close).tolist() if int(self._ids[r]) not in excluded]
+        return [int(self._ids[min(rows, key=lambda r: (metres[r] + 1 - cosine[r], r))])] if rows else []
 
     def add_loop(self, a: int, b: int, a_T_b: F64) -> None:
         """Link two keyframes whose relative pose was verified."""
