@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import logging
 from collections import deque
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -11,6 +13,7 @@ from foxglove_schemas_protobuf.Pose_pb2 import Pose
 
 from calib.rig import Rig
 from stereo_sfm.config import Config
+from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.log import foxglove, topics
 from stereo_sfm.log.image_log import ImageLog
@@ -129,6 +132,18 @@ class NoRunLog:
         """Write what is left and close the file."""
 
 
+class _TextHandler(logging.Handler):
+    """Puts what the package says on its logger into the log as well."""
+
+    def __init__(self, log: RunLog) -> None:
+        super().__init__(logging.INFO)
+        self._log = log
+
+    def emit(self, record: logging.LogRecord) -> None:
+        with contextlib.suppress(StereoSfmError):  # a full disk is told by the next message of a stage
+            self._log.text(record.levelname, record.getMessage())
+
+
 class RunLog(NoRunLog):
     """Writes a run.
 
@@ -180,6 +195,8 @@ class RunLog(NoRunLog):
         self._now_ns = 0
         self._totals = dict.fromkeys(("frames", "lost", "keyframes", "loops accepted", "loop candidates rejected"), 0)
         self._closed = False
+        self._handler = _TextHandler(self)
+        logging.getLogger("stereo_sfm").addHandler(self._handler)
 
     def put(self, message: object) -> None:
         """Any message of a run, by its type."""
@@ -249,9 +266,12 @@ class RunLog(NoRunLog):
         self._writer.write(topics.STAGE_TIMES, times, self._now_ns, times.frame_id)
 
     def text(self, level: str, message: str) -> None:
+        if self._writer.closed:
+            return
         self._writer.write(topics.LOG, foxglove.text(self._now_ns, level, message), self._now_ns)
 
     def close(self) -> None:
+        logging.getLogger("stereo_sfm").removeHandler(self._handler)
         if self._closed or self._writer.closed:  # closed by itself when the disk was full
             return
         self._closed = True

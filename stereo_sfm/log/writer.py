@@ -91,6 +91,7 @@ class LogWriter:
         self._pending_bytes = 0
         self._pending_since: tuple[int, int] = (0, 0)  # log and publish time of the oldest message not yet written
         self.closed = False  # also after a full disk
+        self._failure: StereoSfmError | None = None
         self._guarded(lambda: self._mcap.start(library="stereo-sfm"))
 
     @property
@@ -120,7 +121,7 @@ class LogWriter:
             StereoSfmError: the disk is full; the file is closed and readable.
         """
         if self.closed:
-            raise ValueError(f"{self.path} is closed")
+            raise self._failure or ValueError(f"{self.path} is closed")
         data: bytes = schema.encode(message) if is_dataclass(message) else message.SerializeToString()
         now = self._clock()
         if self._pending_bytes and self._due(len(data), log_time, now):
@@ -181,7 +182,8 @@ class LogWriter:
             self.closed = True
             self._file.close()
             messages = repair.finish_in_place(self.path)
-            raise StereoSfmError(
+            self._failure = StereoSfmError(
                 f"recording stopped, {error.strerror or error}: {self.path} is closed and readable up to there "
                 f"({messages} messages, {self.path.stat().st_size / 1e6:.1f} MB)"
-            ) from None
+            )
+            raise self._failure from None

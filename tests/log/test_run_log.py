@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import resource
 import shutil
 import subprocess
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
+from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.Odometry_pb2 import Odometry
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
@@ -289,6 +291,18 @@ def test_a_run_without_loops_or_mapping_waits_for_nothing(tmp_path: Path) -> Non
     log.close()
 
 
+def test_what_the_package_says_is_in_the_log(tmp_path: Path) -> None:
+    log = RunLog(
+        LogWriter(tmp_path / "a.mcap"), fisheye_rig(), Config(), source="t", mode="inline", image_format="none"
+    )
+    log.put(stereo_images(1, np.random.default_rng(0))[0])
+    logging.getLogger("stereo_sfm").warning("only %d points", 3)
+    log.close()
+    logging.getLogger("stereo_sfm").warning("after the end")
+    (line,) = _all(tmp_path / "a.mcap", topics.LOG, Log)
+    assert (line.message, line.level, foxglove.stamp_of(line)) == ("only 3 points", 3, START_NS)
+
+
 def test_what_a_replay_needs_comes_back(run: Path) -> None:
     with LogReader(run) as reader:
         recorded = read_run(reader)
@@ -326,6 +340,9 @@ def test_a_full_disk_during_a_run_is_one_error_and_a_readable_log(tmp_path: Path
     try:
         with pytest.raises(StereoSfmError, match="is closed and readable"):
             _put_frames(log, 1000)
+        logging.getLogger("stereo_sfm").warning("nobody may fail because of this")
+        with pytest.raises(StereoSfmError, match="is closed and readable"):
+            log.put(_frame(1000))
         log.close()
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
