@@ -15,6 +15,10 @@ from drivers.t265.firmware import Firmware
 from drivers.t265.link import Timing, dispose
 from drivers.t265.usb_device import UsbDevice, attached, device_error, is_boot, place
 
+# Bytes of one transfer: whole packets, so that the camera sees one stream. One transfer of 9 MB needs more
+# memory in one piece than some kernels give (found on the virtual host controller of Linux 6.1).
+_CHUNK = 256 * 1024
+
 
 def boot(device: UsbDevice, firmware: Firmware, backend: Any, timing: Timing) -> UsbDevice:
     """Send the firmware to one camera and return it as it comes back.
@@ -39,9 +43,10 @@ def _send(device: UsbDevice, firmware: Firmware, timing: Timing) -> None:
 
     try:
         usb.util.claim_interface(device, 0)
-        sent = device.write(m.BOOT_OUT, firmware.data, timing.boot_ms)
-        if sent != len(firmware.data):
-            raise BootFailed(f"T265 took {sent} of {len(firmware.data)} bytes of firmware: replug it and try again")
+        for at in range(0, len(firmware.data), _CHUNK):
+            chunk = firmware.data[at : at + _CHUNK]
+            if device.write(m.BOOT_OUT, chunk, timing.boot_ms) != len(chunk):
+                raise BootFailed("T265 stopped taking its firmware half way: replug it and try again")
     except usb.core.USBTimeoutError:
         raise BootFailed("T265 does not take its firmware: replug it, directly into the computer") from None
     except (usb.core.USBError, ValueError, LookupError) as error:

@@ -51,15 +51,9 @@ NEVER_SEND = {
 }
 
 
-def shown(source: SimulatedT265Source, image: StereoImage) -> int:
-    """Which frame the camera showed, from the truth's clock."""
-    seconds = source.camera.seconds_of(image.stamp_ns - source._time.stamp(0))
-    return round(seconds * m.FRAME_RATE)
-
-
 def assert_honest(source: SimulatedT265Source, images: list[StereoImage]) -> None:
     """Every image is the one that its stamp says, and every missing one is counted where it is missing."""
-    frames = [shown(source, i) for i in images]
+    frames = [source.frame_shown(i.stamp_ns) for i in images]
     for image, frame in zip(images, frames, strict=True):
         left, right = source.camera.content.image(frame)
         assert image.right is not None
@@ -162,7 +156,7 @@ def test_every_lost_frame_is_counted(faults: Faults, counts: dict[str, int]) -> 
     with open_camera(replace(faults, stall_at=frames), paced=False, booted=True) as source:
         images = take(source, frames - counts["dropped"])
     assert_honest(source, images)
-    assert shown(source, images[-1]) == frames - 1
+    assert source.frame_shown(images[-1].stamp_ns) == frames - 1
     assert {k: source.counters[k] for k in counts} == counts
     assert source.counters["segments"] == 1
 
@@ -365,7 +359,7 @@ def test_only_two_functions_write_to_a_camera() -> None:
         if re.search(r"\.(write|bulk_write|intr_write|ctrl_transfer)\(", line)
     ]
     assert writers == [
-        ("boot.py", "sent = device.write(m.BOOT_OUT, firmware.data, timing.boot_ms)"),
+        ("boot.py", "if device.write(m.BOOT_OUT, chunk, timing.boot_ms) != len(chunk):"),
         ("link.py", "self.device.write(m.COMMAND_OUT, request, self._timing.command_ms)"),
         ("link.py", "self.device.ctrl_transfer(0x40, 0x10, 0, 0, 0, self._timing.command_ms)"),
     ]

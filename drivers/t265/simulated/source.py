@@ -14,6 +14,7 @@ import numpy as np
 
 from drivers.live.options import Options
 from drivers.live.source import Patience
+from drivers.t265 import messages as m
 from drivers.t265.acquire import Access
 from drivers.t265.camera import Settings
 from drivers.t265.firmware import SIZE, Firmware, verified
@@ -48,6 +49,10 @@ class SimulatedT265Source(T265Source):
     ) -> None:
         self.camera = camera
         super().__init__(access, settings, patience, queue, name="t265:simulated")
+
+    def frame_shown(self, stamp_ns: int) -> int:
+        """Which frame, counted since the camera first streamed, an image with this stamp shows."""
+        return round(self.camera.seconds_of(stamp_ns - self._time.stamp(0)) * m.FRAME_RATE)
 
     def truth(self, stamps: I64) -> Trajectory:
         """True poses at (N,) stamps of images that came."""
