@@ -124,7 +124,8 @@ class Session:
         jpeg = options is not None and options.image_format == "jpeg"
         if options is not None:
             log = RunLog(
-                LogWriter(options.path), source.rig, self._config, source=self._spec or source.name, mode="inline",
+                LogWriter(options.path, compress=options.image_format != "raw"), source.rig, self._config,
+                source=self._spec or source.name, mode="inline",
                 image_format=options.image_format, ground_truth=source.ground_truth,
             )  # fmt: skip
             stack.callback(log.close)

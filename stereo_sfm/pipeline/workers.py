@@ -293,8 +293,8 @@ def run_logger(
     ring = ImageRing(ImageLayout.of(setup.rig), setup.config.pipeline.ring_slots, setup.ring_name)
     mode = "realtime" if setup.realtime else "lockstep"
     log = RunLog(
-        LogWriter(options.path), setup.rig, setup.config, source=setup.source_name, mode=mode,
-        image_format=options.image_format, ground_truth=setup.ground_truth,
+        LogWriter(options.path, compress=options.image_format != "raw"), setup.rig, setup.config,
+        source=setup.source_name, mode=mode, image_format=options.image_format, ground_truth=setup.ground_truth,
     )  # fmt: skip
     inbox, free = Inbox[Any](messages), Outbox(release)
     try:
