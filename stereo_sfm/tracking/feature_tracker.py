@@ -14,15 +14,15 @@ import numpy as np
 from calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.geometry import se3
-from stereo_sfm.geometry.motion_only import bearing_errors, pose_covariance
+from stereo_sfm.geometry.motion_only import pose_covariance
 from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.timing import NoSpans
-from stereo_sfm.tracking.features import circle_mask, feature_kind
+from stereo_sfm.tracking.features import circle_mask
 from stereo_sfm.tracking.identity import PointIds
-from stereo_sfm.tracking.matching import epipolar_inliers, match_features
-from stereo_sfm.tracking.odometry.base import FramePair, Motion
+from stereo_sfm.tracking.odometry.base import Motion
 from stereo_sfm.tracking.odometry.table import make_estimator
 from stereo_sfm.tracking.outgoing import keyframe_of, observations_of
+from stereo_sfm.tracking.pairing import Pairing
 from stereo_sfm.tracking.scale import StepScale
 from stereo_sfm.tracking.view import View, ViewMaker, pixel_angle
 from stereo_sfm.types import (
@@ -38,7 +38,6 @@ from stereo_sfm.types import (
 )
 
 LOST_BEFORE_RESTART = 5  # frames without a motion after which tracking starts again from the predicted pose
-_RECOVER_PX = 4.0  # how near a keyframe's point must reproject to be taken for the same point
 
 
 class FeatureTracker:
@@ -52,10 +51,10 @@ class FeatureTracker:
         self._rig = rig
         self._spans = spans or NoSpans()
         self._views = ViewMaker(config.features, rig)
-        self._norm = feature_kind(config.features.kind).norm
         self._estimator = make_estimator(config.odometry, rig.left)
         self._scale = StepScale(config.odometry, ground_truth)
         self._pixel = pixel_angle(rig)
+        self._pairing = Pairing(config.features, self._pixel)
         self._ids = PointIds()
         self._odom_T_cam = np.eye(4)
         self._velocity = np.eye(4)  # last_T_now of the last good step
@@ -114,8 +113,10 @@ class FeatureTracker:
             return self._lose(image, view, outcome.reason)
         motion, view = outcome
         state = TrackState.RECOVERED if self._lost else TrackState.OK
+        last_T_now = se3.inverse(self._odom_T_last) @ self._odom_T_cam
+        self._velocity = se3.exp(se3.log(last_T_now) / (1 + self._lost))
         self._lost = 0
-        return self._finish(image, view, motion, state, "")
+        return self._finish(image, view, motion, state)
 
     def _mask(self, image: StereoImage) -> U8 | None:
         radius = self._config.features.mask_radius_px
@@ -138,8 +139,8 @@ class FeatureTracker:
         reference, odom_T_reference = self._last, self._odom_T_last
         if self._odometry.reference == "keyframe":
             reference, odom_T_reference = self._keyframe, self._odom_T_kf
-        rows = self._match(reference, view, rng)
-        pair = _pair(reference, view, rows, self._pixel)
+        rows = self._pairing.match(reference, view, rng)
+        pair = self._pairing.pair(reference, view, rows)
         try:
             motion = self._estimator.estimate(pair, rng)
             motion = self._scale.metric(motion, self._last_stamp, image.stamp_ns)
@@ -150,36 +151,9 @@ class FeatureTracker:
         agreed = rows[motion.inliers]
         view = self._ids.inherit(view, reference, agreed)
         if reference is not self._keyframe:
-            view = self._recover(view)
+            now_T_kf = se3.inverse(self._odom_T_cam) @ self._odom_T_kf
+            view = self._pairing.recover(self._keyframe, view, now_T_kf, self._ids)
         return motion, self._ids.give_new(view)
-
-    def _match(self, reference: View, view: View, rng: np.random.Generator) -> I64:
-        """(M, 2) rows of both views; by configuration only those that agree with one epipolar geometry."""
-        features = self._config.features
-        rows = match_features(reference.features, view.features, self._norm, features.ratio)
-        a, b = reference.bearings[rows[:, 0]], view.bearings[rows[:, 1]]
-        if features.motion_window_deg > 0:
-            near = (a * b).sum(1) > np.cos(np.radians(features.motion_window_deg))
-            rows, a, b = rows[near], a[near], b[near]
-        if not features.motion_check:
-            return rows
-        return rows[epipolar_inliers(a, b, 2 * features.epipolar_px * self._pixel, rng)]
-
-    def _recover(self, view: View) -> View:
-        """Ids for points of the last keyframe that were missed in between: descriptor and position agree."""
-        assert self._keyframe is not None
-        known = self._ids.current(self._keyframe.ids)
-        free_kf = ~np.isin(known, view.ids) & np.isfinite(self._keyframe.points[:, 2])
-        free_now = view.ids < 0
-        rows = match_features(
-            self._keyframe.features.rows(free_kf), view.features.rows(free_now), self._norm, self._config.features.ratio
-        )
-        rows = np.stack([np.flatnonzero(free_kf)[rows[:, 0]], np.flatnonzero(free_now)[rows[:, 1]]], axis=1)
-        if len(rows) == 0:
-            return view
-        now_T_kf = se3.inverse(self._odom_T_cam) @ self._odom_T_kf
-        errors = bearing_errors(now_T_kf, self._keyframe.points[rows[:, 0]], view.bearings[rows[:, 1]])
-        return self._ids.inherit(view, self._keyframe, rows[errors < _RECOVER_PX * self._pixel])
 
     def _lose(self, image: StereoImage, view: View, reason: str) -> tuple[Frame, Keyframe | None]:
         """No motion: keep moving as before; after several such frames start again there as a new submap."""
@@ -196,16 +170,14 @@ class FeatureTracker:
         return self._frame(image, view, None, TrackState.RESTARTED, reason, True), keyframe
 
     def _finish(
-        self, image: StereoImage, view: View, motion: Motion, state: TrackState, reason: str
+        self, image: StereoImage, view: View, motion: Motion, state: TrackState
     ) -> tuple[Frame, Keyframe | None]:
-        assert self._last is not None
-        self._velocity = se3.inverse(self._odom_T_last) @ self._odom_T_cam
         self._frames_since_kf += 1
         chosen = np.isfinite(view.points[:, 2]) & (view.ages > 0)
         covariance = pose_covariance(view.points[chosen], self._pixel)
         self._kf_covariance = covariance if self._odometry.reference == "keyframe" else self._kf_covariance + covariance
         wanted = self._wants_keyframe(view, int(motion.inliers.sum()))
-        frame = self._frame(image, view, motion, state, reason, wanted, covariance)
+        frame = self._frame(image, view, motion, state, "", wanted, covariance)
         keyframe = self._make_keyframe(image, view) if wanted else None
         self._remember(image, view)
         return (replace(frame, reference_kf_id=self._kf_id, kf_T_cam=np.eye(4)) if wanted else frame), keyframe
@@ -262,23 +234,6 @@ class FeatureTracker:
             is_keyframe=is_keyframe,
             stats=stats,
         )
-
-
-def _pair(reference: View, view: View, rows: I64, pixel: float) -> FramePair:
-    a, b = rows[:, 0], rows[:, 1]
-    return FramePair(
-        bearings_last=reference.bearings[a],
-        bearings_now=view.bearings[b],
-        points_last=reference.points[a],
-        points_now=view.points[b],
-        sigmas_last=reference.sigmas[a],
-        sigmas_now=view.sigmas[b],
-        pixel_rad=pixel,
-        image_last=reference.image,
-        image_now=view.image,
-        frame_id_last=reference.frame_id,
-        frame_id_now=view.frame_id,
-    )
 
 
 def _moved(points: F64, ids: I64, update: MapUpdate, kf_T_map: F64) -> F64:
