@@ -68,7 +68,16 @@ class Sensor:
             image = np.asarray(cv2.GaussianBlur(image, (5, 5), effects.lens_blur_px), np.float32)
         out = np.empty(image.shape, np.uint8)
         read, shot = effects.read_noise**2, effects.shot_noise
-        _digitise(image, self.vignette, np.uint64(key), brightness, read, shot, effects.black_level, out)
+        _digitise(
+            image,
+            self.vignette,
+            np.uint64(key),
+            brightness,
+            read,
+            shot,
+            effects.black_level,
+            out,
+        )
         return out
 
 
@@ -103,14 +112,17 @@ def _blur(image, depth, jacobian, move, out):
             p2 = -(v2 + move[3] * b[1] - move[4] * b[0])
             fu = j[0, 0] * p0 + j[0, 1] * p1 + j[0, 2] * p2
             fv = j[1, 0] * p0 + j[1, 1] * p1 + j[1, 2] * p2
-            n = int(math.sqrt(fu * fu + fv * fv) * 1.5) + 1
+            n = int(math.sqrt(fu * fu + fv * fv) * 1.34) + 1
             if n < 2:
                 continue
             n = min(n, 24)
             total = 0.0
+            reach = 0.5 * max(abs(fu), abs(fv)) + 1
+            if x < reach or y < reach or x > w - 1 - reach or y > h - 1 - reach:
+                continue
             for k in range(n):
                 a = (k + 0.5) / n - 0.5
-                total += _at(image, x + a * fu, y + a * fv)
+                total += _between(image, x + a * fu, y + a * fv)
             out[y, x] = total / n
 
 
@@ -125,9 +137,8 @@ def _bearing(j):
 
 
 @njit
-def _at(image, x, y):
-    h, w = image.shape
-    x, y = min(max(x, 0.0), w - 1.001), min(max(y, 0.0), h - 1.001)
+def _between(image, x, y):
+    """Bilinear value inside the image."""
     x0, y0 = int(x), int(y)
     a, b = x - x0, y - y0
     top = image[y0, x0] * (1 - a) + image[y0, x0 + 1] * a

@@ -25,23 +25,31 @@ FRONT, SIDE, LID, UPPER = 0, 1, 2, 4  # faces of a product; the upper box adds 4
 FAR = 1e30
 
 # Inlined by force and without reference counts: passing the world's many arrays through calls costs five times as much.
-_OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "_nrt": False, "forceinline": True}
+_OPTIONS: dict[str, Any] = {
+    "cache": True,
+    "nogil": True,
+    "error_model": "numpy",
+    "_nrt": False,
+    "forceinline": True,
+}
 njit: Any = numba.njit(**_OPTIONS)
+# For kernels that never see NaN: comparisons get shorter, no sum changes its order, so the bits stay the same anywhere.
+njit_finite: Any = numba.njit(**_OPTIONS, fastmath={"nnan", "nsz"})
 
 
-@njit
+@njit_finite
 def pack(kind, index, part, face):
     """One integer for a flat piece of surface."""
     return (index << 12) | ((part & 31) << 7) | (kind << 4) | face
 
 
-@njit
+@njit_finite
 def inverse(d):
     """1 / d, huge for 0."""
-    return 1.0 / d if d != 0 else FAR
+    return 1.0 / d if d != 0 else FAR  # with the sign of +0: a parallel ray misses or is inside a slab either way
 
 
-@njit
+@njit_finite
 def slab(lo0, lo1, lo2, hi0, hi1, hi2, o0, o1, o2, i0, i1, i2):
     """Ray (origin, inverse direction) against a box -> (t_in, t_out, axis of entry)."""
     a, b = (lo0 - o0) * i0, (hi0 - o0) * i0
@@ -59,7 +67,7 @@ def slab(lo0, lo1, lo2, hi0, hi1, hi2, o0, o1, o2, i0, i1, i2):
     return t0, t1, axis
 
 
-@njit
+@njit_finite
 def _product(facings, c, base, ou, ow, oz, iu, iw, iz, depth, limit):
     """Nearest hit of the lower and the upper box of facing c -> (t, face), face -1 for none."""
     best, face = limit, -1
@@ -71,11 +79,14 @@ def _product(facings, c, base, ou, ow, oz, iu, iw, iz, depth, limit):
     if high > low:
         t0, t1, axis = slab(u0, facings[c, 6], low, u1, depth, high, ou, ow, oz, iu, iw, iz)
         if t0 < t1 and 0 < t0 < best:
-            best, face = t0, UPPER + (SIDE if axis == 0 else (FRONT if axis == 1 else LID))
+            best, face = (
+                t0,
+                UPPER + (SIDE if axis == 0 else (FRONT if axis == 1 else LID)),
+            )
     return best, face
 
 
-@njit
+@njit_finite
 def _slot(levels_i, facings, bins, k, base, ou, ow, oz, du, iu, iw, iz, t_in, t_out, depth):
     """Walk the facings of level k from t_in to t_out -> (t, facing, face), facing -1 for none."""
     first, last, offset = levels_i[k, 0], levels_i[k, 1], levels_i[k, 2]
@@ -101,7 +112,7 @@ def _slot(levels_i, facings, bins, k, base, ou, ow, oz, du, iu, iw, iz, t_in, t_
             c -= 1
 
 
-@njit
+@njit_finite
 def to_shelf(blocks, b, facing, x, y):
     """Horizontal point of the world -> (u, w) of shelf block b."""
     if facing == 0:  # its front looks to -y
@@ -113,7 +124,7 @@ def to_shelf(blocks, b, facing, x, y):
     return y - blocks[b, 1], blocks[b, 3] - x
 
 
-@njit
+@njit_finite
 def turn_to_shelf(facing, dx, dy):
     """Horizontal direction of the world -> (u, w)."""
     if facing == 0:
@@ -125,13 +136,14 @@ def turn_to_shelf(facing, dx, dy):
     return dy, -dx
 
 
-@njit
-def _shelf(blocks, blocks_i, levels, levels_i, facings, bins, b, ox, oy, oz, dx, dy, dz, t_in, axis, limit):
+@njit_finite
+def _shelf(w, b, ox, oy, oz, dx, dy, dz, ix, iy, iz, t_in, axis, limit):
     """Inside of shelf block b, entered at t_in through `axis` -> (t, id), id -1 when the ray leaves it again."""
+    blocks, blocks_i, levels, levels_i = w.blocks, w.blocks_i, w.levels, w.levels_i
     facing = blocks_i[b, 1]
     ou, ow = to_shelf(blocks, b, facing, ox, oy)
     du, dw = turn_to_shelf(facing, dx, dy)
-    iu, iw, iz = inverse(du), inverse(dw), inverse(dz)
+    iu, iw = turn_to_shelf(facing, ix, iy)
     wide, deep = blocks[b, 3] - blocks[b, 0], blocks[b, 4] - blocks[b, 1]
     if facing >= 2:
         wide, deep = deep, wide
@@ -162,20 +174,36 @@ def _shelf(blocks, blocks_i, levels, levels_i, facings, bins, b, ox, oy, oz, dx,
     if t < t_out:
         t_out, face = t, (BOARD if dz < 0 else (-1 if levels_i[k, 3] else UNDER))
     end = min(t_out, limit)
-    t, c, side = _slot(levels_i, facings, bins, k, levels[k, 1], ou, ow, oz, du, iu, iw, iz, t_in, end, deep)
+    t, c, side = _slot(
+        levels_i,
+        w.facings,
+        w.bins,
+        k,
+        levels[k, 1],
+        ou,
+        ow,
+        oz,
+        du,
+        iu,
+        iw,
+        iz,
+        t_in,
+        end,
+        deep,
+    )
     if c >= 0:
         part = 0
         if side & 3 == SIDE or side & 3 == LID:
-            part = int((ow + t * dw) / facings[c, 9])
+            part = int((ow + t * dw) * w.facings[c, 9])
         else:
-            part = int((oz + t * dz - levels[k, 1]) / facings[c, 8])
+            part = int((oz + t * dz - levels[k, 1]) * w.facings[c, 8])
         return t, pack(FACING, c, part, side)
     if face < 0 or t_out >= limit:
         return limit, -1
     return t_out, pack(BLOCK, b, k - first, face)
 
 
-@njit
+@njit_finite
 def _person(persons_i, ellipsoids, q, ox, oy, oz, dx, dy, dz, limit):
     """Nearest ellipsoid of person q -> (t, ellipsoid), -1 for none."""
     best, which = limit, -1
@@ -198,10 +226,16 @@ def _person(persons_i, ellipsoids, q, ox, oy, oz, dx, dy, dz, limit):
     return best, which
 
 
-@njit
-def trace(w, order, gaps, moving, ox, oy, oz, dx, dy, dz):
+@njit_finite
+def trace(w, near, moving, ox, oy, oz, dx, dy, dz):
     """Nearest surface along a ray -> (t, id)."""
-    room, groups, groups_i, blocks, blocks_i = w.room, w.groups, w.groups_i, w.blocks, w.blocks_i
+    room, groups, groups_i, blocks, blocks_i = (
+        w.room,
+        w.groups,
+        w.groups_i,
+        w.blocks,
+        w.blocks_i,
+    )
     ix, iy, iz = inverse(dx), inverse(dy), inverse(dz)
     best = ((room[2] if dz > 0 else 0.0) - oz) * iz if dz != 0 else FAR
     hit = pack(ROOM, 0, 0, 1 if dz > 0 else 0)
@@ -211,16 +245,30 @@ def trace(w, order, gaps, moving, ox, oy, oz, dx, dy, dz):
     t = ((room[1] if dy > 0 else 0.0) - oy) * iy if dy != 0 else FAR
     if t < best:
         best, hit = t, pack(ROOM, 0, 0, 5 if dy > 0 else 4)
-    for n in range(order.shape[0]):
-        g = order[n]
-        if gaps[n] >= best:
+    for n in range(near.groups.shape[0]):
+        g = near.groups[n]
+        if near.group_gaps[n] >= best:
             break
         t0, t1, axis = slab(
-            groups[g, 0], groups[g, 1], groups[g, 2], groups[g, 3], groups[g, 4], groups[g, 5], ox, oy, oz, ix, iy, iz
+            groups[g, 0],
+            groups[g, 1],
+            groups[g, 2],
+            groups[g, 3],
+            groups[g, 4],
+            groups[g, 5],
+            ox,
+            oy,
+            oz,
+            ix,
+            iy,
+            iz,
         )
         if t0 >= t1 or t1 <= 0 or t0 >= best:
             continue
-        for b in range(groups_i[g, 0], groups_i[g, 1]):
+        for m in range(groups_i[g, 0], groups_i[g, 1]):
+            if near.block_gaps[m] >= best:
+                break
+            b = near.blocks[m]
             t0, t1, axis = slab(
                 blocks[b, 0], blocks[b, 1], blocks[b, 2], blocks[b, 3], blocks[b, 4], blocks[b, 5],
                 ox, oy, oz, ix, iy, iz,
@@ -228,10 +276,7 @@ def trace(w, order, gaps, moving, ox, oy, oz, dx, dy, dz):
             if t0 >= t1 or t1 <= 0 or t0 >= best:
                 continue
             if blocks_i[b, 0] == SHELF:
-                t, found = _shelf(
-                    blocks, blocks_i, w.levels, w.levels_i, w.facings, w.bins, b,
-                    ox, oy, oz, dx, dy, dz, t0, axis, best,
-                )  # fmt: skip
+                t, found = _shelf(w, b, ox, oy, oz, dx, dy, dz, ix, iy, iz, t0, axis, best)
                 if found >= 0:
                     best, hit = t, found
             elif t0 > 0:

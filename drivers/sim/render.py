@@ -15,8 +15,9 @@ from drivers.sim.world import Tables
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.types import F32, F64, I32, I64
 
-EDGE_RAYS = np.array([[-0.125, -0.375], [0.375, -0.125], [0.125, 0.375], [-0.375, 0.125]])  # rotated grid, px
-EDGE_CONTRAST = 4.0  # least step of brightness (of 255) worth several rays
+EDGE_RAYS = np.array([[-0.11, -0.37], [0.38, 0.09], [-0.27, 0.28]])  # px, about the centre's own ray
+EDGE_CONTRAST = 5.0  # least step of brightness (of 255) worth several rays
+SCRATCH = 1024  # rays traced before they are shaded
 BREADTH = 1.3  # width of the texture filter in pixels: above 1 nothing crawls when the camera moves
 _CENTRE = np.zeros((1, 2))
 _STEPS = (np.arange(6) - 2.5) / 6
@@ -61,11 +62,36 @@ class Eye:
         grid = camera.bearing_grid()
         grid[np.nan_to_num(grid[..., 2], nan=-2.0) < np.cos(np.deg2rad(max_angle_deg))] = np.nan
         self.grid = grid  # (H, W, 3) unit bearings, NaN where the lens shows nothing
-        self.du, self.dv = np.gradient(grid, axis=1), np.gradient(grid, axis=0)  # (H, W, 3) per pixel
+        self.du, self.dv = (
+            np.gradient(grid, axis=1),
+            np.gradient(grid, axis=0),
+        )  # (H, W, 3) per pixel
         angles = np.sqrt(np.linalg.norm(self.du, axis=-1) * np.linalg.norm(self.dv, axis=-1))
         self.angles = BREADTH * np.nan_to_num(angles, nan=1.0 / camera.fx)  # (H, W) radians that a pixel gathers
         self.inner = np.isfinite(self.du).all(-1) & np.isfinite(self.dv).all(-1)  # (H, W) has rays all around
         self.valid = np.flatnonzero(np.isfinite(grid[..., 2]))  # (N,) flat indices of pixels with a ray
+
+
+class Near(NamedTuple):
+    """Groups by distance from an eye, and within each group its blocks, nearest first; distances in metres."""
+
+    groups: I64  # (G,)
+    group_gaps: F64  # (G,)
+    blocks: I64  # (B,) the blocks of group g in the places of its own range
+    block_gaps: F64  # (B,)
+
+
+def _gaps(boxes: F64, origin: F64) -> F64:
+    """Distance from a point (3,) to boxes (N, 6)."""
+    return np.linalg.norm(np.maximum(np.maximum(boxes[:, :3] - origin, origin - boxes[:, 3:]), 0), axis=1)
+
+
+def _near(world: Tables, origin: F64) -> Near:
+    groups, blocks = _gaps(world.groups, origin), _gaps(world.blocks, origin)
+    order = np.argsort(groups, kind="stable")
+    member = np.repeat(np.arange(len(groups)), np.diff(world.groups_i, axis=1).ravel())
+    inside = np.lexsort((np.arange(len(blocks)), blocks, member))
+    return Near(order.astype(np.int64), groups[order], inside.astype(np.int64), blocks[inside])
 
 
 class Renderer:
@@ -74,6 +100,7 @@ class Renderer:
     def __init__(self, world: Tables, rig: Rig) -> None:
         self.world, self.rig = world, rig
         self.eyes = [Eye(c) for c in (rig.left, rig.right) if c is not None]
+        self._ts, self._hits = np.empty(SCRATCH), np.empty(SCRATCH, np.int64)
 
     def render(self, world_T_cam: F64, moving: Moving = NOTHING) -> tuple[View, View]:
         """Both eyes at a pose of the left eye (4, 4); the second is the first for a single camera."""
@@ -83,23 +110,55 @@ class Renderer:
     def view(self, eye: int, world_T_eye: F64, moving: Moving = NOTHING) -> View:
         """One eye at its own pose (4, 4)."""
         rays, shape = self.eyes[eye], self.eyes[eye].grid.shape[:2]
-        view = View(np.zeros(shape, np.float32), np.full(shape, np.nan, np.float32), np.full(shape, -1, np.int32))
-        self._cast(rays, world_T_eye, moving, rays.valid, _CENTRE, view)
+        view = View(
+            np.zeros(shape, np.float32),
+            np.full(shape, np.nan, np.float32),
+            np.full(shape, -1, np.int32),
+        )
+        self._cast(rays, world_T_eye, moving, rays.valid, _CENTRE, 0, view)
         found = np.empty(view.ids.size, np.int64)
         edges = found[: find_edges(view.image, view.ids, rays.inner, EDGE_CONTRAST, found)]
-        self._cast(rays, world_T_eye, moving, edges, EDGE_RAYS, view)
+        self._cast(rays, world_T_eye, moving, edges, EDGE_RAYS, 1, view)
         if len(moving.targets):
             shown = ((view.ids >> 4) & 7 == TARGET) & (view.ids >= 0)
             near = cv2.dilate(shown.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-            self._cast(rays, world_T_eye, moving, np.flatnonzero(near & rays.inner), TARGET_RAYS, view)
+            self._cast(
+                rays,
+                world_T_eye,
+                moving,
+                np.flatnonzero(near & rays.inner),
+                TARGET_RAYS,
+                0,
+                view,
+            )
         return view
 
-    def _cast(self, rays: Eye, world_T_eye: F64, moving: Moving, pixels: I64, offsets: F64, view: View) -> None:
-        """Write flat `pixels` of the view, each the mean over rays at `offsets` (K, 2) px."""
+    def _cast(
+        self,
+        rays: Eye,
+        world_T_eye: F64,
+        moving: Moving,
+        pixels: I64,
+        offsets: F64,
+        keep: int,
+        view: View,
+    ) -> None:
+        """Write flat `pixels` of the view: the mean over rays at `offsets` (K, 2) px and `keep` times the old value."""
         pose = np.ascontiguousarray(world_T_eye, float)
-        lo, hi, origin = self.world.groups[:, :3], self.world.groups[:, 3:], pose[:3, 3]
-        gaps = np.linalg.norm(np.maximum(np.maximum(lo - origin, origin - hi), 0), axis=1)
-        order = np.argsort(gaps, kind="stable").astype(np.int64)
+        near = _near(self.world, pose[:3, 3])
         flat = [a.reshape(-1, 3) for a in (rays.grid, rays.du, rays.dv)]
         out = [a.reshape(-1) for a in (view.image, view.depth, view.ids)]
-        cast(self.world, moving, order, gaps[order], pose, pixels, offsets, *flat, rays.angles.ravel(), *out)
+        cast(
+            self.world,
+            moving,
+            near,
+            pose,
+            pixels,
+            offsets,
+            float(keep),
+            *flat,
+            rays.angles.ravel(),
+            *out,
+            self._ts,
+            self._hits,
+        )

@@ -80,6 +80,7 @@ SCENES: dict[str, Scene] = {
     "identical-aisles": Scene(Layout(gondolas=5, gondola_length=8.0, identical=True), _serpentine, 1000.0),
     "people": Scene(_STORE, _loop, 42.0, people=7),
     "dark": Scene(_STORE, _loop, 42.0, _DARK),
+    "demo": Scene(Layout(gondolas=2, gondola_length=3.6, products=120), _loop, 21.0, gait=Gait(speed=1.05)),
     "big": Scene(Layout(gondolas=9, gondola_length=18.0, products=420), _serpentine, 1000.0),
 }
 

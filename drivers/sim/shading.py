@@ -8,10 +8,24 @@ from __future__ import annotations
 import math
 
 from drivers.sim import kernels
-from drivers.sim.kernels import BACK, BLOCK, BOARD, END, FACING, FRONT, PERSON, RAIL, ROOM, SIDE, SOLID, njit, to_shelf
+from drivers.sim.kernels import (
+    BACK,
+    BLOCK,
+    BOARD,
+    END,
+    FACING,
+    FRONT,
+    PERSON,
+    RAIL,
+    ROOM,
+    SIDE,
+    SOLID,
+    njit_finite,
+    to_shelf,
+)
 
 
-@njit
+@njit_finite
 def _bilinear(data, base, lw, lh, i, j, s, t, wrap):
     """Ripmap level (i, j) at (s, t) in [0, 1]; texel centres at (k + 0.5) / n."""
     w, h = 1 << (lw - i), 1 << (lh - j)
@@ -33,7 +47,7 @@ def _bilinear(data, base, lw, lh, i, j, s, t, wrap):
     return top * (1 - fy) + low * fy
 
 
-@njit
+@njit_finite
 def sample(w, k, s, t, fs, ft):
     """Texture k at (s, t), filtered over a footprint (fs, ft) in the same units; 0..255."""
     data, table = w.texels, w.textures
@@ -63,22 +77,22 @@ def sample(w, k, s, t, fs, ft):
     return value
 
 
-@njit
+@njit_finite
 def _lamps(x, y):
     """Light from the rows of lamps, a smooth periodic pattern about 1."""
-    a, b = x / 2.4, y / 2.4
+    a, b = x * (1 / 2.4), y * (1 / 2.4)
     a -= math.floor(a) + 0.5
     b -= math.floor(b) + 0.5
     return 1 + 0.7 * (1 / 12 - a * a) + 0.5 * (1 / 12 - b * b)
 
 
-@njit
+@njit_finite
 def _cave(w):
     """Light that reaches depth w inside a shelf."""
     return 1 / (1 + 14 * w * w)
 
 
-@njit
+@njit_finite
 def _flat(w, k, a, b, da, db, cos, size):
     """Texture k over a plane: coordinates a, b in metres, ray slopes da, db along them, size = footprint across."""
     wide, high = w.texture_sizes[k, 0], w.texture_sizes[k, 1]
@@ -87,7 +101,7 @@ def _flat(w, k, a, b, da, db, cos, size):
     return sample(w, k, a / wide, b / high, fa / wide, fb / high)
 
 
-@njit
+@njit_finite
 def _room(w, face, x, y, z, dx, dy, dz, size):
     if face == 0:
         value = _flat(w, w.surfaces[0], x, y, dx, dy, dz, size)
@@ -100,7 +114,7 @@ def _room(w, face, x, y, z, dx, dy, dz, size):
     return _flat(w, w.surfaces[3], x, -z, dx, dz, dy, size) * (0.6 + 0.1 * z)
 
 
-@njit
+@njit_finite
 def _solid(w, b, face, x, y, z, dx, dy, dz, size):
     k = w.blocks_i[b, 4 + face]
     if face >= 4:
@@ -111,11 +125,21 @@ def _solid(w, b, face, x, y, z, dx, dy, dz, size):
         t, dt = w.blocks[b, 5] - z, dz
         high = w.blocks[b, 5] - w.blocks[b, 2]
         if face < 2:
-            s, ds, cos, wide = y - w.blocks[b, 1], dy, dx, w.blocks[b, 4] - w.blocks[b, 1]
+            s, ds, cos, wide = (
+                y - w.blocks[b, 1],
+                dy,
+                dx,
+                w.blocks[b, 4] - w.blocks[b, 1],
+            )
             if face == 0:
                 s = wide - s
         else:
-            s, ds, cos, wide = x - w.blocks[b, 0], dx, dy, w.blocks[b, 3] - w.blocks[b, 0]
+            s, ds, cos, wide = (
+                x - w.blocks[b, 0],
+                dx,
+                dy,
+                w.blocks[b, 3] - w.blocks[b, 0],
+            )
             if face == 3:
                 s = wide - s
         light = 0.68 + 0.1 * z
@@ -126,7 +150,7 @@ def _solid(w, b, face, x, y, z, dx, dy, dz, size):
     return sample(w, k, s / wide, t / high, fs / wide, ft / high) * light
 
 
-@njit
+@njit_finite
 def _shelf_part(w, b, part, face, x, y, z, dx, dy, dz, size):
     facing = w.blocks_i[b, 1]
     u, deep = to_shelf(w.blocks, b, facing, x, y)
@@ -145,38 +169,64 @@ def _shelf_part(w, b, part, face, x, y, z, dx, dy, dz, size):
     return _flat(w, k, deep, z, dw, dz, du, size) * 0.4 * _cave(deep)
 
 
-@njit
+@njit_finite
 def _product(w, c, face, part, x, y, z, dx, dy, dz, size):
     b, k = w.facings_i[c, 3], w.facings_i[c, 4]
     facing = w.blocks_i[b, 1]
     u, deep = to_shelf(w.blocks, b, facing, x, y)
     du, dw = kernels.turn_to_shelf(facing, dx, dy)
     base, roof = w.levels[k, 1], w.levels[k, 2]
-    u0, wide = w.facings[c, 2], w.facings[c, 3] - w.facings[c, 2]
-    unit_h, unit_d = w.facings[c, 8], w.facings[c, 9]
-    row = (z - base) / unit_h
+    across = (u - w.facings[c, 2]) * w.facings[c, 10]
+    per_u, per_z, per_w = w.facings[c, 10], w.facings[c, 8], w.facings[c, 9]
+    row = (z - base) * per_z
     row = 1 - (row - math.floor(row))
-    column = deep / unit_d
+    column = deep * per_w
     column -= math.floor(column)
     under = roof - z
     light = _cave(deep) * (1 - 0.5 / (1 + 300 * under * under) * min(1.0, 12 * deep)) * (0.78 + 0.12 * z)
     side = face & 3
     if side == FRONT:
-        k, s, t, ds, dt, cos, high = w.facings_i[c, 0], (u - u0) / wide, row, du, dz, dw, unit_h
+        k, s, t, ds, dt, cos, per_s, per_t = (
+            w.facings_i[c, 0],
+            across,
+            row,
+            du,
+            dz,
+            dw,
+            per_u,
+            per_z,
+        )
     elif side == SIDE:
-        k, s, t, ds, dt, cos, high = w.facings_i[c, 1], column, row, dw, dz, du, unit_h
-        wide = unit_d
+        k, s, t, ds, dt, cos, per_s, per_t = (
+            w.facings_i[c, 1],
+            column,
+            row,
+            dw,
+            dz,
+            du,
+            per_w,
+            per_z,
+        )
         if du > 0:
             s = 1 - s
         light *= 0.6
     else:
-        k, s, t, ds, dt, cos, high = w.facings_i[c, 2], (u - u0) / wide, column, du, dw, dz, unit_d
+        k, s, t, ds, dt, cos, per_s, per_t = (
+            w.facings_i[c, 2],
+            across,
+            column,
+            du,
+            dw,
+            dz,
+            per_u,
+            per_w,
+        )
     ic2 = 1 / max(cos * cos, 1e-4)
     fs, ft = size * math.sqrt(1 + ds * ds * ic2), size * math.sqrt(1 + dt * dt * ic2)
-    return sample(w, k, s, t, fs / wide, ft / high) * light * _lamps(x, y)
+    return sample(w, k, s, t, fs * per_s, ft * per_t) * light * _lamps(x, y)
 
 
-@njit
+@njit_finite
 def _person(w, moving, e, x, y, z, dx, dy, dz, size):
     ell = moving.ellipsoids
     px, py, pz = x - ell[e, 0], y - ell[e, 1], z - ell[e, 2]
@@ -194,24 +244,38 @@ def _person(w, moving, e, x, y, z, dx, dy, dz, size):
     wide = w.texture_sizes[k, 0]
     footprint = size / max(cos, 0.1) / wide
     around = 2 * math.pi * ell[e, 12] / wide
-    return sample(w, k, angle * max(round(around), 1.0), a2 * ell[e, 13] / wide, footprint, footprint) * (
-        0.65 + 0.3 * nz / norm
-    )
+    return sample(
+        w,
+        k,
+        angle * max(round(around), 1.0),
+        a2 * ell[e, 13] / wide,
+        footprint,
+        footprint,
+    ) * (0.65 + 0.3 * nz / norm)
 
 
-@njit
+@njit_finite
 def _target(w, moving, k, x, y, z, dx, dy, dz, size):
     f = moving.targets
     px, py, pz = x - f[k, 9], y - f[k, 10], z - f[k, 11]
-    s, v = f[k, 0] * px + f[k, 3] * py + f[k, 6] * pz, f[k, 1] * px + f[k, 4] * py + f[k, 7] * pz
-    ds, dv = f[k, 0] * dx + f[k, 3] * dy + f[k, 6] * dz, f[k, 1] * dx + f[k, 4] * dy + f[k, 7] * dz
+    s, v = (
+        f[k, 0] * px + f[k, 3] * py + f[k, 6] * pz,
+        f[k, 1] * px + f[k, 4] * py + f[k, 7] * pz,
+    )
+    ds, dv = (
+        f[k, 0] * dx + f[k, 3] * dy + f[k, 6] * dz,
+        f[k, 1] * dx + f[k, 4] * dy + f[k, 7] * dz,
+    )
     down = f[k, 2] * dx + f[k, 5] * dy + f[k, 8] * dz
     ic2 = 1 / max(down * down, 1e-4)
-    fs, ft = size * math.sqrt(1 + ds * ds * ic2) / f[k, 12], size * math.sqrt(1 + dv * dv * ic2) / f[k, 13]
+    fs, ft = (
+        size * math.sqrt(1 + ds * ds * ic2) / f[k, 12],
+        size * math.sqrt(1 + dv * dv * ic2) / f[k, 13],
+    )
     return 0.8 * sample(w, moving.targets_i[k], s / f[k, 12], v / f[k, 13], fs, ft)
 
 
-@njit
+@njit_finite
 def shade(w, moving, t, hit, ox, oy, oz, dx, dy, dz, angle):
     """Brightness (0..255, may exceed) of a hit seen along a ray, filtered over `angle` radians."""
     x, y, z, size = ox + t * dx, oy + t * dy, oz + t * dz, t * angle
@@ -229,40 +293,84 @@ def shade(w, moving, t, hit, ox, oy, oz, dx, dy, dz, angle):
     return _target(w, moving, index, x, y, z, dx, dy, dz, size)
 
 
-@njit
-def cast(w, moving, order, gaps, world_T_eye, pixels, offsets, grid, du, dv, angles, image, depth, ids):
-    """What some pixels show, each the mean over one ray per offset.
+@njit_finite
+def _ray(r, grid, du, dv, p, x, y):
+    """Direction in the world of the ray (x, y) px from the centre of pixel p."""
+    a, b, c = grid[p, 0], grid[p, 1], grid[p, 2]
+    if x != 0 or y != 0:
+        a += x * du[p, 0] + y * dv[p, 0]
+        b += x * du[p, 1] + y * dv[p, 1]
+        c += x * du[p, 2] + y * dv[p, 2]
+    return (
+        r[0, 0] * a + r[0, 1] * b + r[0, 2] * c,
+        r[1, 0] * a + r[1, 1] * b + r[1, 2] * c,
+        r[2, 0] * a + r[2, 1] * b + r[2, 2] * c,
+    )
+
+
+@njit_finite
+def cast(
+    w,
+    moving,
+    near,
+    world_T_eye,
+    pixels,
+    offsets,
+    keep,
+    grid,
+    du,
+    dv,
+    angles,
+    image,
+    depth,
+    ids,
+    ts,
+    hits,
+):
+    """What some pixels show, each the mean over one ray per offset, and what was there counted `keep` times.
 
     Args:
-        order, gaps: groups, nearest first, and their distances in metres. world_T_eye: (4, 4).
+        near: groups and blocks by distance (render.Near). world_T_eye: (4, 4).
         pixels: (M,) flat indices. offsets: (K, 2) px inside a pixel; one row for its centre alone.
-        grid, du, dv: (H * W, 3) bearings and their change per pixel. angles: (H * W,) radians a pixel covers.
+        grid, du, dv: (H * W, 3) bearings and their change per pixel. angles: (H * W,) radians a pixel gathers.
         image, depth, ids: (H * W,) written: brightness; and with one offset distance along the ray (m), surface.
+        ts, hits: (N,) scratch; so many rays are traced, then shaded, which is faster than one by one.
     """
     r, ox, oy, oz = world_T_eye, world_T_eye[0, 3], world_T_eye[1, 3], world_T_eye[2, 3]
     rays = offsets.shape[0]
-    narrow = 1 / math.sqrt(rays)
-    for i in range(pixels.shape[0]):
-        p = pixels[i]
-        total, t, hit = 0.0, 0.0, 0
-        for q in range(rays):
-            a, b, c = grid[p, 0], grid[p, 1], grid[p, 2]
-            if rays > 1:
-                x, y = offsets[q, 0], offsets[q, 1]
-                a += x * du[p, 0] + y * dv[p, 0]
-                b += x * du[p, 1] + y * dv[p, 1]
-                c += x * du[p, 2] + y * dv[p, 2]
-            dx = r[0, 0] * a + r[0, 1] * b + r[0, 2] * c
-            dy = r[1, 0] * a + r[1, 1] * b + r[1, 2] * c
-            dz = r[2, 0] * a + r[2, 1] * b + r[2, 2] * c
-            t, hit = kernels.trace(w, order, gaps, moving, ox, oy, oz, dx, dy, dz)
-            total += shade(w, moving, t, hit, ox, oy, oz, dx, dy, dz, angles[p] * narrow)
-        image[p] = total / rays
-        if rays == 1:
-            depth[p], ids[p] = t, hit
+    block = ts.shape[0] // rays
+    narrow = 1 / math.sqrt(rays + keep)
+    for first in range(0, pixels.shape[0], block):
+        count = min(block, pixels.shape[0] - first)
+        for i in range(count * rays):
+            q = i % rays
+            dx, dy, dz = _ray(r, grid, du, dv, pixels[first + i // rays], offsets[q, 0], offsets[q, 1])
+            ts[i], hits[i] = kernels.trace(w, near, moving, ox, oy, oz, dx, dy, dz)
+        for i in range(count):
+            p = pixels[first + i]
+            total = 0.0
+            for q in range(rays):
+                k = i * rays + q
+                dx, dy, dz = _ray(r, grid, du, dv, p, offsets[q, 0], offsets[q, 1])
+                total += shade(
+                    w,
+                    moving,
+                    ts[k],
+                    hits[k],
+                    ox,
+                    oy,
+                    oz,
+                    dx,
+                    dy,
+                    dz,
+                    angles[p] * narrow,
+                )
+            image[p] = (total + keep * image[p]) / (rays + keep)
+            if rays == 1:
+                depth[p], ids[p] = ts[i], hits[i]
 
 
-@njit
+@njit_finite
 def find_edges(image, ids, inner, contrast, out):
     """Flat indices of `inner` pixels at which another surface, brighter or darker by `contrast`, begins -> count."""
     h, wide, n = image.shape[0], image.shape[1], 0

@@ -26,7 +26,7 @@ class Tables(NamedTuple):
     blocks_i: I64  # (B, 10) kind, facing, first and last + 1 level, six textures
     levels: F64  # (L, 3) z of the board's bottom, the floor products stand on, the top of the slot
     levels_i: I64  # (L, 5) first and last + 1 facing, offset into bins, open above, number of bins
-    # (F, 10) cell u0 u1, box u0 u1, lower box's front w and top z, upper box's front w and top z, unit height and depth
+    # (F, 11) cell u0 u1, box u0 u1, lower box's front w and top z, upper box's, 1 / unit height, 1 / depth, 1 / width
     facings: F64
     facings_i: I64  # (F, 5) textures front, side, top; block; level
     bins: I64  # (N,) first facing whose cell reaches into a bin of BIN metres
@@ -153,20 +153,9 @@ def _fill_level(
             up_front = min(front + p.deep * int(f[4] * 2) + 0.01 * f[5], deep - 0.03)
             low_top = floor + low * p.high
             up_top = low_top + upper * p.high
-            b.facings.append(
-                [
-                    u,
-                    u + p.wide + gap,
-                    u + 0.5 * gap,
-                    u + 0.5 * gap + p.wide,
-                    front,
-                    low_top,
-                    up_front,
-                    up_top,
-                    p.high,
-                    p.deep,
-                ]
-            )
+            u0 = u + 0.5 * gap
+            cell = [u, u + p.wide + gap, u0, u0 + p.wide]
+            b.facings.append([*cell, front, low_top, up_front, up_top, 1 / p.high, 1 / p.deep, 1 / p.wide])
             b.facings_i.append([shown.front, shown.side, shown.top, block, level])
             u += p.wide + gap
         else:
@@ -363,7 +352,7 @@ def make_tables(
         np.array(b.blocks_i, np.int64).reshape(-1, 10),
         np.array(b.levels, float).reshape(-1, 3),
         np.array(b.levels_i, np.int64).reshape(-1, 5),
-        np.array(b.facings, float).reshape(-1, 10),
+        np.array(b.facings, float).reshape(-1, 11),
         np.array(b.facings_i, np.int64).reshape(-1, 5),
         np.array(b.bins, np.int64),
         texels,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,7 +40,15 @@ def test_frames_alone_and_in_order_are_the_same_bits() -> None:
 
 def test_seed_walk_and_effects_change_the_pictures() -> None:
     base = small().frame(100)
-    for options in ({"seed": 1}, {"walk": 1}, {"effects": "off"}, {"exchange": 0.5}, {"noise": 0.5}, {"blur": 9}):
+    changes: list[dict[str, Any]] = [
+        {"seed": 1},
+        {"walk": 1},
+        {"effects": "off"},
+        {"exchange": 0.5},
+        {"noise": 0.5},
+        {"blur": 9},
+    ]
+    for options in changes:
         assert (small(**options).frame(100).left != base.left).mean() > 0.02, options
 
 

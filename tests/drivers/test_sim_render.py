@@ -90,17 +90,22 @@ def test_both_eyes_see_the_same_points(camera: str) -> None:
     same = right.ids[near[:, 1], near[:, 0]] == left.ids[ok]
     assert same.mean() > 0.8
     # On a plane the inverse distance along rays through neighbouring pixels is nearly linear: interpolate it.
-    maps = [np.ascontiguousarray(uv[..., i], np.float32) for i in (0, 1)]
-    inverse = cv2.remap(np.nan_to_num(1 / right.depth), *maps, cv2.INTER_LINEAR)
+    inverse = look_up(np.nan_to_num(1 / right.depth), uv)
     error = np.abs(inverse[ok] * np.linalg.norm(points[ok], axis=1) - 1)[same]
     assert np.median(error) < 1e-4
     # Brightness agrees too: lights, textures and filters do not depend on the eye.
-    warped = cv2.remap(right.image, *maps, cv2.INTER_LINEAR)
+    warped = look_up(right.image, uv)
     step = np.abs(warped - left.image)[ok][same]
     assert np.median(step) < 1.0
     # Mean shift between the eyes, by flow from the exact prediction, along and across the epipolar line.
     shift = _mean_shift(left.image, right.image, left.ids, uv)
     assert np.abs(shift).max() < 0.03
+
+
+def look_up(image: np.ndarray, uv: F64, how: int = cv2.INTER_LINEAR) -> np.ndarray:
+    """Image between its pixels, at uv (H, W, 2)."""
+    x, y = (np.ascontiguousarray(uv[..., i], np.float32) for i in (0, 1))
+    return cv2.remap(image.astype(np.float32), x, y, how)
 
 
 def _mean_shift(a: np.ndarray, b: np.ndarray, ids: np.ndarray, uv: F64) -> F64:
@@ -135,7 +140,7 @@ def test_textures_do_not_crawl() -> None:
     uv = r.rig.left.project(se3.transform(se3.inverse(after), hit_points(r, 0, one, POSE)))
     assert np.abs(_mean_shift(one.image, two.image, one.ids, uv)).max() < 0.02
     ok = r.rig.left.inside(uv, 2)
-    warped = cv2.remap(two.image, *(np.ascontiguousarray(uv[..., i], np.float32) for i in (0, 1)), cv2.INTER_CUBIC)
+    warped = look_up(two.image, uv, cv2.INTER_CUBIC)
     step = np.abs(warped - one.image)[ok]
     assert np.median(step) < 0.7
     assert np.percentile(step, 90) < 8
