@@ -197,7 +197,7 @@ class ImageLog:
             right = foxglove.calibration(rig.right, "cam1", stamp_ns, tx)
             self._writer.write(topics.RIGHT_CALIBRATION, right, stamp_ns)
             rows.append(("cam0", "cam1", foxglove.pose(rig.left_T_right)))
-        self._writer.write(topics.TF, foxglove.transforms(stamp_ns, rows), stamp_ns)
+        self._writer.write(topics.TF_STATIC, foxglove.transforms(stamp_ns, rows), stamp_ns)
 
     def _ground_truth(self, stamp_ns: int) -> None:
         """All poses from the first image on, in chunks of their own: a reader gets them without reading the images."""

@@ -23,6 +23,7 @@ GROUND_TRUTH = "/ground_truth"
 DROPPED = "/dropped"
 APPLIED = "/applied"
 TF = "/tf"
+TF_STATIC = "/tf_static"
 ODOMETRY = "/odom"
 ODOM_POSE = "/odom/pose"
 MAP_POSE = "/map/pose"
@@ -64,7 +65,8 @@ TABLE: tuple[Topic, ...] = (
     Topic(GROUND_TRUTH, "foxglove.PoseInFrame", "every pose of the source's ground truth"),
     Topic(DROPPED, "stereo_sfm.Dropped", "when frames are lost"),
     Topic(APPLIED, "stereo_sfm.Applied", "when a map update is applied"),
-    Topic(TF, "foxglove.FrameTransforms", "every frame, and the fixed ones every second"),
+    Topic(TF, "foxglove.FrameTransforms", "every frame: map to odom, odom to body"),
+    Topic(TF_STATIC, "foxglove.FrameTransforms", "at the start and every second: body to the eyes"),
     Topic(ODOMETRY, "foxglove.Odometry", "every frame, with covariance"),
     Topic(ODOM_POSE, "foxglove.PoseInFrame", "every frame, body in odom"),
     Topic(MAP_POSE, "foxglove.PoseInFrame", "every frame, body in map"),

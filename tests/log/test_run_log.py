@@ -18,6 +18,8 @@ from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
 
 from drivers import open_source
 from stereo_sfm.config import Config
@@ -166,6 +168,12 @@ def test_the_order_of_arrival_changes_nothing(run: Path, tmp_path: Path, seed: i
     _write(tmp_path / "b.mcap", np.random.default_rng(seed))
     with LogReader(run) as a, LogReader(tmp_path / "b.mcap") as b:
         assert [str(d) for d in diff(a, b)] == []
+    times: dict[int, int] = {}
+    with (tmp_path / "b.mcap").open("rb") as stream:  # in the order of the file
+        for record in StreamReader(stream).records:
+            if isinstance(record, Message):
+                assert record.log_time >= times.get(record.channel_id, 0)
+                times[record.channel_id] = record.log_time
 
 
 def test_poses_follow_the_map_version_that_the_frame_used(run: Path) -> None:
@@ -184,7 +192,8 @@ def test_transforms_make_one_tree_from_map_to_the_right_eye(run: Path) -> None:
     rig = fisheye_rig()
     rows = {
         (t.parent_frame_id, t.child_frame_id): foxglove.matrix(t.translation, t.rotation)
-        for message in _all(run, topics.TF, FrameTransforms)
+        for topic in (topics.TF, topics.TF_STATIC)
+        for message in _all(run, topic, FrameTransforms)
         for t in message.transforms
     }
     assert set(rows) == {("map", "odom"), ("odom", "body"), ("body", "cam0"), ("cam0", "cam1")}
