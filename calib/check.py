@@ -108,7 +108,8 @@ def regions(left: F64, error: F64, size: tuple[int, int]) -> tuple[F64, I64]:
     return median, count
 
 
-def _level(value: float, sigma: float, limit: Limit) -> int:
+def level_of(value: float, sigma: float, limit: Limit) -> int:
+    """0 pass, 1 warn, 2 fail."""
     if abs(value) < limit.deviations * sigma:
         return 0
     return 2 if abs(value) > limit.fail else 1 if abs(value) > limit.warn else 0
@@ -126,7 +127,7 @@ def _rows(error: F64, median: F64, count: I64) -> Finding:
         f"median {np.median(error):+.2f} px, of its size {np.median(np.abs(error)):.2f} px;"
         f" systematic part {systematic:.2f} px, worst region {worst:.2f} px"
     )
-    return Finding("row error", _level(systematic, 0.0, SYSTEMATIC_PX), text)
+    return Finding("row error", level_of(systematic, 0.0, SYSTEMATIC_PX), text)
 
 
 def _baseline(rig: Rig) -> Finding:
@@ -146,17 +147,17 @@ def _judged(correction: Correction) -> list[Finding]:
     vector, sigma = correction.vector, correction.sigma
     out: list[Finding] = []
     rotation, deviation = np.rad2deg(vector[ROTATION]), np.rad2deg(sigma[ROTATION])
-    level = max(_level(float(v), float(s), ROTATION_DEG) for v, s in zip(rotation, deviation, strict=True))
+    level = max(level_of(float(v), float(s), ROTATION_DEG) for v, s in zip(rotation, deviation, strict=True))
     out.append(
         Finding("rotation between the eyes", level, f"off by {_list(rotation)} +- {_list(deviation)} degrees (x y z)")
     )
     direction, deviation = np.rad2deg(vector[DIRECTION]), np.rad2deg(sigma[DIRECTION])
-    level = max(_level(float(v), float(s), DIRECTION_DEG) for v, s in zip(direction, deviation, strict=True))
+    level = max(level_of(float(v), float(s), DIRECTION_DEG) for v, s in zip(direction, deviation, strict=True))
     out.append(
         Finding("baseline direction", min(level, 1), f"off by {_list(direction)} +- {_list(deviation)} degrees (y z)")
     )
     ratio, deviation = 100 * vector[FOCAL_RIGHT], 100 * sigma[FOCAL_RIGHT]
-    level = _level(float(ratio), float(deviation), FOCAL_RIGHT_PERCENT)
+    level = level_of(float(ratio), float(deviation), FOCAL_RIGHT_PERCENT)
     out.append(Finding("focal length, right against left", level, f"off by {ratio:+.2f} +- {deviation:.2f} %"))
     # The focal length of both eyes shows only through the images' second order, which lenses have too.
     both, deviation = 100 * vector[FOCAL], 100 * float(np.sqrt(correction.loose_covariance[FOCAL, FOCAL]))
@@ -164,11 +165,11 @@ def _judged(correction: Correction) -> list[Finding]:
     seen = deviation < 0.5
     text += "" if seen else " (this motion does not show it)"
     out.append(
-        Finding("focal length, both eyes", _level(float(both), float(deviation), FOCAL_PERCENT) if seen else 0, text)
+        Finding("focal length, both eyes", level_of(float(both), float(deviation), FOCAL_PERCENT) if seen else 0, text)
     )
     skew, deviation = 1e3 * vector[SKEW], 1e3 * sigma[SKEW]
     text = f"{skew:+.2f} +- {deviation:.2f} ms" + ("" if deviation < 2 else " (this motion does not show it)")
-    out.append(Finding("time skew of the right eye", _level(float(skew), float(deviation), SKEW_MS), text))
+    out.append(Finding("time skew of the right eye", level_of(float(skew), float(deviation), SKEW_MS), text))
     return out
 
 

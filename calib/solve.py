@@ -304,7 +304,7 @@ def _stepped(state: _State, observed: Observed, eyes: int, step: F64) -> _State:
 
 
 def _minimise(state: _State, observed: Observed, eyes: int, iterations: int, free: int | None = None) -> float:
-    """Levenberg-Marquardt in place, returns the mean robust cost. `free` holds an eye's later parameters as they are."""
+    """Levenberg-Marquardt in place; returns the mean robust cost. `free` holds the later parameters as they are."""
     huber, damping = 2.0, 1e-3
     held = np.arange(free, _shared_count(state, eyes)) if free is not None else np.zeros(0, int)
     hessian, gradient, cost, _ = _normal(state, observed, eyes, huber)

@@ -104,7 +104,8 @@ def _checkerboard(target: Target, image: U8) -> Detection:
             return _empty()
         corners = np.asarray(corners, np.float32)
     uv = np.asarray(corners, float).reshape(-1, 2)
-    uv = refine(image, uv, float(np.median(np.linalg.norm(np.diff(uv.reshape(*size[::-1], 2), axis=1), axis=-1))))
+    spacing = np.linalg.norm(np.diff(uv.reshape(*size[::-1], 2), axis=1), axis=-1)
+    uv = refine(image, uv, 0.3 * float(np.median(spacing)))
     return Detection(np.arange(len(uv)), uv)
 
 
@@ -120,7 +121,8 @@ def _charuco(target: Target, image: U8) -> Detection:
     uv = np.asarray(corners, float).reshape(-1, 2)
     sides: Any = np.concatenate([np.linalg.norm(np.diff(np.asarray(c)[0], axis=0), axis=1) for c in marker_corners])
     return Detection(
-        np.asarray(ids).ravel().astype(np.int64), refine(image, uv, float(np.median(sides)) / target.ratio)
+        np.asarray(ids).ravel().astype(np.int64),
+        refine(image, uv, float(np.median(sides)) * 0.5 * (1 / target.ratio - 1)),
     )
 
 
@@ -158,7 +160,7 @@ def _aprilgrid(target: Target, image: U8) -> Detection:
             continue
         points = np.asarray(quad, float)[0]
         side = float(np.linalg.norm(np.diff(points, axis=0), axis=1).min())
-        refined = refine(image, points, side * target.ratio * 1.5)
+        refined = refine(image, points, 0.5 * side * target.ratio)
         if np.abs(refined - points).max() > max(2.5, 0.12 * side):
             continue
         # Kalibr: bottom left, bottom right, top right, top left. OpenCV: clockwise from Kalibr's second.
@@ -168,11 +170,11 @@ def _aprilgrid(target: Target, image: U8) -> Detection:
     return Detection(np.array(ids, np.int64), np.array(uv)) if len(ids) >= 8 else _empty()
 
 
-def refine(image: U8, uv: F64, spacing: float) -> F64:
-    """(K, 2) saddle points near the guesses, in windows that stay clear of the neighbours `spacing` px away."""
+def refine(image: U8, uv: F64, clear: float) -> F64:
+    """(K, 2) saddle points near the guesses, in windows that stay within the `clear` px around a corner."""
     import cv2
 
-    half = int(np.clip(spacing * 0.25, 2, 8))
+    half = int(np.clip(0.8 * clear, 2, 8))
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
     out = cv2.cornerSubPix(image, uv.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), criteria)
     return np.asarray(out, float).reshape(-1, 2)
