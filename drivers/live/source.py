@@ -21,6 +21,7 @@ from stereo_sfm.types import ImuSamples, StereoImage, Trajectory
 logger = logging.getLogger("stereo_sfm")
 
 _RETRY_S = 0.2
+_QUIET_S = 1.0  # between two lines about lost frames
 
 
 class Segment(Protocol):
@@ -78,6 +79,7 @@ class LiveSource(ABC):
         self._segment: Segment | None = None
         self._frame_id = 0
         self._segment_frames = 0
+        self._unsaid, self._quiet_until = 0, 0.0
 
     # ---- what a camera brings
 
@@ -185,8 +187,15 @@ class LiveSource(ABC):
         for name, amount in {**amounts, "wheel_samples": wheel}.items():
             self.counters.add(name, amount)
         if dropped:
+            self._warn_lost(dropped, lost_here)
+
+    def _warn_lost(self, dropped: int, lost_here: int) -> None:
+        """One line a second at most; what was not said yet goes into the next one."""
+        self._unsaid += dropped
+        if time.monotonic() >= self._quiet_until:
             why = " (this computer is too slow)" if lost_here else ""
-            logger.warning("%s: %d frame(s) lost before frame %d%s", self._title, dropped, self._frame_id, why)
+            logger.warning("%s: %d frame(s) lost before frame %d%s", self._title, self._unsaid, self._frame_id, why)
+            self._unsaid, self._quiet_until = 0, time.monotonic() + _QUIET_S
 
     # ---- life and death of segments
 
