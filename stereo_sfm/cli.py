@@ -17,6 +17,7 @@ COMMANDS: dict[str, str] = {
     "run": "turn a source into a trajectory and a map",
     "replay": "execute a run again from its log, to the same bits",
     "viz": "show a run or a recording in rerun",
+    "batch": "many recordings at once, on this machine or a cluster",
     "record": "write a source to an MCAP file",
     "info": "what a recording or dataset folder holds, and what is wrong with it",
     "convert": "dataset folder to MCAP",

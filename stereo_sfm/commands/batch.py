@@ -1,0 +1,67 @@
+"""`stereo-sfm batch`: run many recordings, on this machine or on a Ray cluster, and merge their maps."""
+
+from __future__ import annotations
+
+import argparse
+import glob
+import sys
+from pathlib import Path
+
+from stereo_sfm.errors import StereoSfmError
+
+SOME_FAILED = 3
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of this command."""
+    from stereo_sfm.commands.run import add_config_arguments
+
+    parser.add_argument("recordings", nargs="+", help="files, folders, sim:SCENE, or quoted patterns")
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, help="folder of all results; continued if it exists"
+    )
+    parser.add_argument("--address", help="of a Ray cluster (default: this machine)")
+    parser.add_argument("--no-merge", action="store_true", help="do not join the walks' maps into one")
+    add_config_arguments(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run all, write the table, merge the maps. A recording that fails stops none of the others."""
+    from stereo_sfm.commands.run import load_config
+    from stereo_sfm.pipeline import batch
+
+    config = load_config(args)
+    recordings = _expand(args.recordings)
+    args.output.mkdir(parents=True, exist_ok=True)
+    names = batch.names(recordings)
+    merging = not args.no_merge and config.mapper.enabled
+    folders = [args.output.resolve() / name for name in names]
+    tasks = [
+        batch.BatchTask(spec, str(folder), config, merging) for spec, folder in zip(recordings, folders, strict=True)
+    ]
+    results = {}
+    for task, result in batch.run_batch(tasks, args.address):
+        results[task.folder] = result
+        state = "ok" if result["ok"] else "failed"
+        again = ", from before" if result.get("resumed") else ""
+        print(f"{len(results)}/{len(tasks)} {Path(task.folder).name}: {state}{again}", file=sys.stderr)
+        rows = [batch.table_row(n, results[str(f)]) for n, f in zip(names, folders, strict=True) if str(f) in results]
+        batch.write_table(rows, args.output)
+    print((args.output / "results.md").read_text(), end="")
+    maps = [
+        folder / "map" for folder in folders if (folder / "map" / "map.json").exists() and results[str(folder)]["ok"]
+    ]
+    if merging and len(maps) > 1:
+        print(batch.merge_maps(maps, config, args.output / "map"))
+    return SOME_FAILED if any(not r["ok"] for r in results.values()) else 0
+
+
+def _expand(patterns: list[str]) -> list[str]:
+    """Patterns as the shell would expand them, everything else as it is; paths made absolute for other nodes."""
+    out: list[str] = []
+    for pattern in patterns:
+        found = sorted(glob.glob(pattern))
+        if not found and any(c in pattern for c in "*[") and not pattern.startswith("sim:"):
+            raise StereoSfmError(f"no recording matches {pattern}")
+        out += [str(Path(f).resolve()) for f in found] or [pattern]
+    return out

@@ -1,0 +1,200 @@
+"""Inline, processes and replay give the same bits; whoever is killed, the log stays and nobody is left behind."""
+
+from __future__ import annotations
+
+import functools
+import os
+import signal
+from collections.abc import Iterator, Sequence
+from multiprocessing import shared_memory
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+import psutil
+import pytest
+
+from calib.rig import Rig
+from stereo_sfm.config import Config, load
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry.cameras import Pinhole
+from stereo_sfm.log.diff import diff
+from stereo_sfm.log.reader import LogReader
+from stereo_sfm.log.recorded import read_run
+from stereo_sfm.log.run_log import RunLog
+from stereo_sfm.log.writer import LogWriter
+from stereo_sfm.pipeline.inline import run_inline
+from stereo_sfm.pipeline.processes import ProcessRun, StageDied
+from stereo_sfm.pipeline.schedule import Lockstep, Recorded, Schedule
+from stereo_sfm.pipeline.workers import LogOptions
+from stereo_sfm.types import Applied, Frame, StereoImage, Trajectory
+
+WIDTH, HEIGHT, BASELINE = 320, 240, 0.1
+
+
+class SlidingWall:
+    """A camera that slides along a textured wall, out and back: exact, quick, and it sees places again."""
+
+    name, live, ground_truth = "wall", False, None
+
+    def __init__(self, frames: int, fail_at: int = -1, slow_s: float = 0.0) -> None:
+        camera = Pinhole(WIDTH, HEIGHT, 200.0, 200.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+        left_T_right = np.eye(4)
+        left_T_right[0, 3] = BASELINE
+        self.rig = Rig(camera, camera, left_T_right)
+        self.frame_count: int | None = frames
+        self._fail_at, self._slow_s = fail_at, slow_s
+        rng = np.random.default_rng(4)
+        coarse = rng.uniform(20, 230, (HEIGHT // 4, 1200 // 4))
+        wall = np.kron(coarse, np.ones((4, 4)))
+        kernel = np.array([1, 4, 6, 4, 1]) / 16
+        for axis in (0, 1):
+            wall = np.apply_along_axis(lambda r: np.convolve(r, kernel, "same"), axis, wall)
+        self._wall = wall
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        return None
+
+    def __iter__(self) -> Iterator[StereoImage]:
+        import time
+
+        count = self.frame_count or 0
+        for k in range(count):
+            if k == self._fail_at:
+                raise RuntimeError("the driver broke")
+            time.sleep(self._slow_s)
+            x = 4 * min(k, count - k)
+            views = [self._wall[:, x + d : x + d + WIDTH].astype(np.uint8) for d in (10, 20)]
+            yield StereoImage(k, 1_000_000_000 + k * 33_333_333, *views)
+
+
+CONFIG = load(None, ["tracker.max_features=150", "pipeline.update_lag_frames=4"])
+
+
+def inline_log(path: Path, source: SlidingWall, config: Config = CONFIG, schedule: Schedule | None = None) -> None:
+    log = RunLog(LogWriter(path), source.rig, config, source="wall", mode="inline", image_format="none")
+    for _ in run_inline(source, config, [log], schedule):
+        pass
+    log.close()
+
+
+def process_log(path: Path, source: functools.partial[SlidingWall], **options: object) -> list[Frame]:
+    with ProcessRun(source, CONFIG, log=LogOptions(path, "none"), **options) as run:  # type: ignore[arg-type]
+        return list(run)
+
+
+def same(a: Path, b: Path) -> list[str]:
+    with LogReader(a) as left, LogReader(b) as right:
+        return [str(d) for d in diff(left, right)]
+
+
+@pytest.fixture(scope="module")
+def inline(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("inline") / "run.mcap"
+    inline_log(path, SlidingWall(80))
+    return path
+
+
+def test_processes_with_delays_give_the_bits_of_inline(inline: Path, tmp_path: Path) -> None:
+    frames = process_log(tmp_path / "run.mcap", functools.partial(SlidingWall, 80), delays=1)
+    assert len(frames) == 80
+    assert same(inline, tmp_path / "run.mcap") == []
+    with LogReader(inline) as reader:
+        assert len(read_run(reader).applied) >= 3  # the map reached the tracker
+
+
+def test_a_realtime_run_is_replayed_by_its_recorded_schedule(tmp_path: Path) -> None:
+    process_log(tmp_path / "live.mcap", functools.partial(SlidingWall, 60, slow_s=0.01), realtime=True, delays=2)
+    with LogReader(tmp_path / "live.mcap") as reader:
+        run = read_run(reader)
+        tracked = {r.sequence for r in reader.messages(["/frame"])}
+    assert len(tracked) + sum(d.count for d in run.dropped) == 60
+
+    class Tracked(SlidingWall):
+        def __iter__(self) -> Iterator[StereoImage]:
+            return (image for image in super().__iter__() if image.frame_id in tracked)
+
+    inline_log(tmp_path / "again.mcap", Tracked(60), schedule=Recorded(run.applied))
+    different = [d for d in same(tmp_path / "live.mcap", tmp_path / "again.mcap") if "/dropped" not in d]
+    assert different == []
+
+
+@pytest.mark.parametrize(
+    "stage", ["tracker", "logger", *(pytest.param(s, marks=pytest.mark.slow) for s in ("capture", "mapper", "loop"))]
+)
+def test_a_killed_stage_ends_the_run_and_leaves_a_log(stage: str, tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    run = ProcessRun(functools.partial(SlidingWall, 5000, slow_s=0.005), CONFIG, log=LogOptions(path, "none"))
+    with pytest.raises(StageDied, match=f"the {stage} process was killed by SIGKILL"), run:  # noqa: PT012
+        pids = run.pids
+        name = run._ring.name if run._ring is not None else ""
+        for k, _ in enumerate(run):
+            if k == 40:
+                os.kill(pids[stage], signal.SIGKILL)
+    assert not any(psutil.pid_exists(pid) for pid in pids.values())
+    with pytest.raises(FileNotFoundError):
+        shared_memory.SharedMemory(name)
+    with LogReader(path) as reader:
+        logged = sum(1 for _ in reader.messages(["/frame"]))
+    assert logged >= 40 - 15
+
+
+def test_an_error_in_a_stage_comes_back_with_its_traceback(tmp_path: Path) -> None:
+    with pytest.raises(StageDied, match="the driver broke"):
+        process_log(tmp_path / "run.mcap", functools.partial(SlidingWall, 50, fail_at=20))
+
+
+def test_a_source_that_cannot_be_opened_is_one_clear_line() -> None:
+    from drivers.source import open_source
+
+    with (
+        pytest.raises(StereoSfmError, match="unknown source 'nothing'"),
+        ProcessRun(functools.partial(open_source, "nothing"), CONFIG),
+    ):
+        pass
+
+
+def test_stop_finishes_what_is_in_flight(tmp_path: Path) -> None:
+    seen = 0
+    with ProcessRun(
+        functools.partial(SlidingWall, 5000, slow_s=0.005), CONFIG, log=LogOptions(tmp_path / "run.mcap", "none")
+    ) as run:
+        for seen, _ in enumerate(run, 1):
+            if seen == 30:
+                run.stop()
+    assert 30 <= seen < 200
+    with LogReader(tmp_path / "run.mcap") as reader:
+        assert sum(1 for _ in reader.messages(["/frame"])) == seen
+
+
+def dues(schedule: Schedule, keyframes: Sequence[int], count: int) -> list[int]:
+    out: list[int] = []
+    for k in range(count):
+        due = schedule.due(k, 10 + k)
+        out.extend([k] * (due or 0))
+        if k in keyframes:
+            schedule.keyframe(k)
+    return out
+
+
+def test_lockstep_applies_an_update_exactly_the_lag_later() -> None:
+    assert dues(Lockstep(3), (0, 4, 5), 10) == [3, 7, 8]
+
+
+def test_a_recorded_schedule_is_followed() -> None:
+    assert dues(Recorded([Applied(1, 12), Applied(2, 15), Applied(3, 15)]), (0, 1, 2), 10) == [2, 5, 5]
+
+
+def test_trajectory_of_the_wall_is_right() -> None:
+    frames = list(run_inline(SlidingWall(40), CONFIG))
+    x = np.array([f.odom_T_cam[0, 3] for f in frames])
+    depth = 200 * BASELINE / 10  # the eyes see the wall ten pixels apart
+    expected = 4 * np.minimum(np.arange(40), 40 - np.arange(40)) * depth / 200
+    assert np.abs(x - expected).max() < 0.002
+    assert isinstance(Trajectory(np.arange(40), np.array([f.odom_T_cam for f in frames])).length, float)
