@@ -47,7 +47,7 @@ def test_python_of_the_readme(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, d
     code = re.search(r"```python\n(.*?)```", TEXT, re.S)
     assert code is not None
     monkeypatch.chdir(tmp_path)
-    run_args = ["run", str(data_root / "euroc_mh01"), "--max-frames", "4", "-o", "runs/one", "-q"]
+    run_args = ["run", "--inline", str(data_root / "euroc_mh01"), "--max-frames", "4", "-o", "runs/one", "-q"]
     assert main(run_args) == 0
     monkeypatch.setattr(stereo_sfm, "demo_recording", lambda: data_root / "tum_vi_room1", raising=False)
     out = io.StringIO()

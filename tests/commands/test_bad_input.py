@@ -22,8 +22,11 @@ def cli(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.
     monkeypatch.chdir(tmp_path)
 
     def run(*args: object) -> Outcome:
+        words = [str(a) for a in args]
+        if words[0] == "run" and "--processes" not in words:
+            words.append("--inline")
         try:
-            code = main([str(a) for a in args])
+            code = main([w for w in words if w != "--processes"])
         except SystemExit as stop:  # argparse
             code = int(stop.code or 0)
         out, err = capsys.readouterr()
@@ -141,6 +144,13 @@ def _small() -> cv2.typing.MatLike:
     import numpy as np
 
     return np.zeros((10, 10), np.uint8)
+
+
+def test_errors_of_the_source_cross_processes_as_one_line(cli: Run, tmp_path: Path) -> None:
+    root = make_euroc(tmp_path / "data")
+    for path in root.rglob("sensor.yaml"):
+        path.write_text(path.read_text().replace("[64, 48]", "[752, 480]"))
+    assert_one_line(cli("run", root, "--processes"), "is 64x48 but the calibration is for 752x480")
 
 
 def test_depth_images_of_another_size(cli: Run, tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from tests.drivers.dataset_folders import make_images
 def euroc_run(data_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run over 30 frames of EuRoC MH01."""
     folder = tmp_path_factory.mktemp("runs") / "mh01"
-    assert main(["run", str(data_root / "euroc_mh01"), "-o", str(folder), "--max-frames", "30", "-q"]) == 0
+    assert main(["run", "--inline", str(data_root / "euroc_mh01"), "-o", str(folder), "--max-frames", "30", "-q"]) == 0
     return folder
 
 
@@ -60,14 +60,14 @@ def test_saved_configuration_runs_again(euroc_run: Path) -> None:
     assert stereo_sfm.load_config(euroc_run / "config.toml") == stereo_sfm.Config()
 
 
-def test_same_input_same_bits(euroc_run: Path, data_root: Path, tmp_path: Path) -> None:
+def test_processes_give_the_same_bits_as_inline(euroc_run: Path, data_root: Path, tmp_path: Path) -> None:
     assert main(["run", str(data_root / "euroc_mh01"), "-o", str(tmp_path / "b"), "--max-frames", "30", "-q"]) == 0
     first, second = (json.loads((f / "stats.json").read_text())["fingerprint"] for f in (euroc_run, tmp_path / "b"))
     assert first == second
 
 
 def test_trajectory_of_the_body(euroc_run: Path, data_root: Path, tmp_path: Path) -> None:
-    args = ["run", str(data_root / "euroc_mh01"), "-o", str(tmp_path / "b"), "--max-frames", "30", "-q"]
+    args = ["run", "--inline", str(data_root / "euroc_mh01"), "-o", str(tmp_path / "b"), "--max-frames", "30", "-q"]
     assert main([*args, "--frame", "body"]) == 0
     body = read_tum(tmp_path / "b" / "trajectory_odom.tum")
     camera = read_tum(euroc_run / "trajectory_odom.tum")
@@ -111,7 +111,7 @@ def test_eval_checks(euroc_run: Path, data_root: Path, capsys: pytest.CaptureFix
 
 def test_noise_is_not_tracked_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root = make_images(tmp_path / "noise")
-    assert main(["run", str(root), "-o", str(tmp_path / "out")]) == 4
+    assert main(["run", "--inline", str(root), "-o", str(tmp_path / "out")]) == 4
     assert "never initialised" in capsys.readouterr().err
     assert "**FAIL**" in (tmp_path / "out" / "report.md").read_text()
 
@@ -130,7 +130,7 @@ def test_lost_frames_are_said_and_filled(data_root: Path, tmp_path: Path, capsys
                 cv2.imwrite(str(folder / side / f"{image.stamp_ns}.png"), pixels * np.uint8(not black))
     broken = sorted((folder / "right").iterdir())[17]
     broken.write_bytes(b"x")
-    assert main(["run", str(folder), "-o", str(tmp_path / "out")]) == 0
+    assert main(["run", "--inline", str(folder), "-o", str(tmp_path / "out")]) == 0
     said = capsys.readouterr().out
     assert re.search(r"tracked 20/24 frames \(1 dropped by capture\), 1 lost interval \(max 0\.[12] s, dark\)", said)
     stats = json.loads((tmp_path / "out" / "stats.json").read_text())
@@ -159,7 +159,7 @@ def test_ctrl_c_writes_what_was_tracked(
 
     original = RunRecord.put
     monkeypatch.setattr(RunRecord, "put", put)
-    assert main(["run", str(data_root / "euroc_mh01"), "-o", str(tmp_path / "out")]) == 130
+    assert main(["run", "--inline", str(data_root / "euroc_mh01"), "-o", str(tmp_path / "out")]) == 130
     assert len(read_tum(tmp_path / "out" / "trajectory_odom.tum")) == len(seen) == 5
     assert "tracked 5/5 frames" in capsys.readouterr().out
 
