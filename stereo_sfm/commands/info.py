@@ -44,7 +44,8 @@ def _lines(found: Description) -> list[str]:
     if found.config_sha256 and "config_sha256" not in found.metadata:
         lines.append(f"  {'config_sha256':<14} {found.config_sha256}")
     if found.images is not None:
-        lines.append(f"images: {_rate(found.images)}, {found.dropped} counted as dropped" + _skew(found))
+        what = "frames, without their images" if found.metadata.get("image_format") == "none" else "images"
+        lines.append(f"{what}: {_rate(found.images)}, {found.dropped} counted as dropped" + _skew(found))
     run = {name: value for name, value in found.totals.items() if name not in _SHOWN}
     if run:
         lines.append("run: " + ", ".join(f"{value} {name}" for name, value in run.items()))

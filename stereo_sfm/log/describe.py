@@ -13,6 +13,7 @@ from calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.log import topics
+from stereo_sfm.log.image_log import RIG_FILE, rig_from_text
 from stereo_sfm.log.provenance import CONFIG_FILE, METADATA, TOTALS, config_hash
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.recorded import messages
@@ -99,9 +100,14 @@ def describe_file(path: Path) -> Description:
             out.rows.append((topic.topic, topic.schema or topic.encoding, rate_of(reader.stamps(topic.topic))))
             out.messages += topic.count
         _describe_infos(out, reader)
+        lean = out.metadata.get("image_format") == "none"
+        if lean:
+            out.calibration = rig_lines(rig_from_text((reader.attachment(RIG_FILE) or b"").decode()))
+            out.images = rate_of(reader.stamps(topics.FRAME))
     if out.truncated:
         out.problems.append(f"{out.truncated}: 'stereo-sfm recover' writes a mended copy")
-    _describe_source(out, path)
+    if not lean:
+        _describe_source(out, path)
     return out
 
 

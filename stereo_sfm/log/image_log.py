@@ -123,6 +123,7 @@ class ImageLog:
         pair = image.image if isinstance(image, LoggedImage) else image
         self._static(pair.stamp_ns)
         self._ground_truth(pair.stamp_ns)
+        self._count(pair)
         if self._format == "none":
             return
         if isinstance(image, StereoImage):
@@ -131,7 +132,6 @@ class ImageLog:
             image = encode_pair(image, self._format)
         self._samples(pair)
         self._info(pair)
-        self._count(pair)
         self._pixels(image)
 
     @property

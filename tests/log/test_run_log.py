@@ -22,6 +22,7 @@ from mcap.records import Message
 from mcap.stream_reader import StreamReader
 
 from drivers import open_source
+from stereo_sfm.cli import main
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
@@ -323,7 +324,9 @@ def test_what_a_replay_needs_comes_back(run: Path) -> None:
     assert {"Frame", "Keyframe", "TrackStats", "StageTimes", "CompressedImage", "PointCloud", "Log"} <= kinds
 
 
-def test_a_recording_is_no_run_and_a_run_without_images_says_where_they_are(tmp_path: Path) -> None:
+def test_a_recording_is_no_run_and_a_run_without_images_says_where_they_are(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     source = ArraySource(fisheye_rig(), stereo_images(2, np.random.default_rng(0)))
     write_recording(tmp_path / "recording.mcap", source)
     with LogReader(tmp_path / "recording.mcap") as reader, pytest.raises(StereoSfmError, match="no log of a run"):
@@ -334,6 +337,9 @@ def test_a_recording_is_no_run_and_a_run_without_images_says_where_they_are(tmp_
     log.close()
     with pytest.raises(StereoSfmError, match=r"a run without its images: they are in a\.mcap"):
         open_source(path)
+    assert main(["info", str(path)]) == 0
+    text = capsys.readouterr().out
+    assert "frames, without their images: 0" in text and "baseline 64.10 mm" in text and "no problems found" in text
 
 
 def _put_frames(log: RunLog, count: int) -> None:
