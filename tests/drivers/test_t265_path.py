@@ -42,11 +42,11 @@ class Taken:
 
 
 def path_error(content: Content, faults: Faults, count: int) -> tuple[float, float, int, list[TrackState]]:
-    """RMSE of the positions (m), length of the path (m), frames lost on the way, states of the tracker."""
+    """RMSE of the positions (m), length of the path (m), frames lost by fault, states of the tracker."""
     with open_camera(faults, content, booted=True) as source:
         images = take(source, count)
         truth = source.truth(np.array([i.stamp_ns for i in images]))
-        lost = int(source.counters["dropped"])
+        lost = int(source.counters["dropped"]) - source.camera.overruns
         rig = source.rig
     frames = list(run(Taken(rig, images)))
     estimate = np.array([f.odom_T_cam[:3, 3] for f in frames])
