@@ -95,8 +95,8 @@ class MapperConfig:
     enabled: bool = True
     window_keyframes: int = 12  # keyframes that local bundle adjustment moves, the new one included; 0: all connected
     connected_points: int = 15  # shared points that make two keyframes neighbours
-    sigma_px: float = 0.4  # noise of one coordinate of a tracked point
-    huber: float = 2.0  # sigmas
+    sigma_px: float = 0.3  # noise of one coordinate of a tracked point
+    huber: float = 1.0  # sigmas; narrow, for depths near edges err to one side and would bend the scale
     rounds: int = 2  # of bundle adjustment, outliers are judged between them
     iterations: int = 5  # of a round
     association: str = "map"  # "tracks": identity only; "map": also by descriptors; "previous": the retail paper's rule
