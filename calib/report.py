@@ -40,8 +40,9 @@ def write_report(
     """
     verdict = VERDICTS[quality.level]
     rows = "".join(
-        f'<tr><td class="{VERDICTS[f.level]}">{VERDICTS[f.level]}</td><td>{f.name}</td><td>{html.escape(f.text)}</td></tr>'
+        f'<tr><td class="{word}">{word}</td><td>{f.name}</td><td>{html.escape(f.text)}</td></tr>'
         for f in quality.findings
+        for word in (VERDICTS[f.level],)
     )
     parts = [
         f"<h1>Calibration of {html.escape(title)}: <span class='{verdict}'>{verdict}</span></h1><table>{rows}</table>",

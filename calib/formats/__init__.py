@@ -22,6 +22,7 @@ FORMATS: dict[str, tuple[str, str, str, bool]] = {
     "colmap": ("colmap", "read_colmap", "write_colmap", True),
     "foxglove": ("foxglove", "read_foxglove", "write_foxglove", False),
     "kapture": ("kapture", "read_kapture", "write_kapture", True),
+    "depthai": ("depthai", "read_depthai", "write_depthai", False),
 }
 
 
@@ -83,7 +84,7 @@ def _recognise_file(path: Path) -> str | None:
     except (UnicodeDecodeError, OSError):
         raise StereoSfmError(f"calibration {path} is not a text file") from None
     if path.suffix == ".json":
-        marks = {"basalt": '"T_imu_cam"', "opencv": '"opencv-matrix"', "foxglove": '"K"'}
+        marks = {"basalt": '"T_imu_cam"', "depthai": '"cameraData"', "opencv": '"opencv-matrix"', "foxglove": '"K"'}
     elif path.suffix == ".txt":
         marks = {"kitti": "P0:", "kapture": "camera,"} | {"colmap": "" if path.name == "cameras.txt" else "CAMERA_ID"}
         marks = {"kitti": "P_rect_"} | marks if "P_rect_" in text else marks

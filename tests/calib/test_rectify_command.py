@@ -17,7 +17,7 @@ from stereo_sfm.cli import main
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 
-SIM = "sim:aisle?length=1"
+SIM = "sim:aisle?frames=2"
 
 
 def test_rendered_fisheye_rows_agree_below_a_tenth_of_a_pixel() -> None:

@@ -1,0 +1,105 @@
+"""depthai's calibration JSON (the EEPROM's content): sockets, extrinsics as destination_from_source in centimetres."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.formats.common import brown, exact_rotation, numbers, padded, read_json, reading, stereo_only, unsupported
+from calib.rig import Rig
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.cameras import Camera, KannalaBrandt
+from stereo_sfm.types import F64
+
+_PERSPECTIVE, _FISHEYE = 0, 1
+_CENTIMETRE = 0.01
+
+
+def read_depthai(path: Path | str, left_socket: int | None = None, right_socket: int | None = None) -> Rig:
+    """The stereo pair that the file names, else sockets 1 and 2 (CAM_B left, CAM_C right)."""
+    path = Path(path)
+    with reading(path, "depthai"):
+        data = read_json(path)
+        cameras = {int(socket): camera for socket, camera in data["cameraData"]}
+        stereo = data.get("stereoRectificationData", {})
+        left = _socket(left_socket, stereo.get("leftCameraSocket", -1), 1)
+        right = _socket(right_socket, stereo.get("rightCameraSocket", -1), 2)
+        name, serial = str(data.get("boardName", "")), str(data.get("batchName", ""))
+        right_T_left = _chain(cameras, left, right)
+        return Rig(_camera(cameras[left]), _camera(cameras[right]), se3.inverse(right_T_left), name=name, serial=serial)
+
+
+def write_depthai(rig: Rig, path: Path) -> None:
+    """Sockets 1 and 2. The body's pose has no place there and is lost."""
+    right = stereo_only(rig.right, "depthai")
+    right_T_left = se3.inverse(rig.left_T_right)
+    data = {
+        "batchName": rig.serial,
+        "boardName": rig.name,
+        "version": 7,
+        "cameraData": [[1, _plain(rig.left, right_T_left, 2)], [2, _plain(right, np.eye(4), -1)]],
+        "stereoRectificationData": {"leftCameraSocket": 1, "rightCameraSocket": 2},
+    }
+    path.write_text(json.dumps(data, indent=2) + "\n")
+
+
+def _socket(asked: int | None, stated: int, usual: int) -> int:
+    return asked if asked is not None else stated if stated >= 0 else usual
+
+
+def _chain(cameras: dict[int, Any], start: int, end: int) -> F64:
+    """end_T_start by following each camera's extrinsics to the next, from either side; metres."""
+    towards: dict[int, tuple[int, F64]] = {}
+    for socket, camera in cameras.items():
+        extrinsics = camera["extrinsics"]
+        if int(extrinsics["toCameraSocket"]) >= 0:
+            step = np.eye(4)
+            step[:3, :3] = np.array(numbers(extrinsics["rotationMatrix"], 9)).reshape(3, 3)
+            step[:3, 3] = [_CENTIMETRE * float(extrinsics["translation"][k]) for k in "xyz"]
+            towards[socket] = int(extrinsics["toCameraSocket"]), exact_rotation(step)
+    return se3.inverse(_to_root(towards, end)) @ _to_root(towards, start)
+
+
+def _to_root(towards: dict[int, tuple[int, F64]], socket: int) -> F64:
+    """root_T_socket, the root being the camera that leads no further."""
+    out, seen = np.eye(4), {socket}
+    while socket in towards:
+        socket, step = towards[socket]
+        if socket in seen:
+            raise ValueError("the extrinsics go round in a circle")
+        seen.add(socket)
+        out = step @ out
+    return out
+
+
+def _camera(data: dict[str, Any]) -> Camera:
+    k = np.array(numbers(data["intrinsicMatrix"], 9)).reshape(3, 3)
+    width, height, kind = int(data["width"]), int(data["height"]), int(data.get("cameraType", _PERSPECTIVE))
+    coefficients = numbers(data["distortionCoeff"])
+    if kind == _FISHEYE:
+        return KannalaBrandt(width, height, k[0, 0], k[1, 1], k[0, 2], k[1, 2], tuple(coefficients[:4]))
+    if kind != _PERSPECTIVE:
+        raise ValueError(f"camera type {kind} is not supported (perspective and fisheye are)")
+    return brown((width, height), (k[0, 0], k[1, 1]), (k[0, 2], k[1, 2]), coefficients)
+
+
+def _plain(camera: Camera, next_T_this: F64, next_socket: int) -> dict[str, Any]:
+    if camera.model == "epipolar":
+        raise unsupported(camera, "depthai")
+    x, y, z = (float(v) / _CENTIMETRE for v in next_T_this[:3, 3])
+    return {
+        "cameraType": _FISHEYE if camera.model == "kannala_brandt" else _PERSPECTIVE,
+        "width": camera.width,
+        "height": camera.height,
+        "intrinsicMatrix": [[float(v) for v in row] for row in camera.matrix],
+        "distortionCoeff": padded(camera, 14),
+        "extrinsics": {
+            "rotationMatrix": [[float(v) for v in row] for row in next_T_this[:3, :3]],
+            "translation": {"x": x, "y": y, "z": z},
+            "specTranslation": {"x": x, "y": y, "z": z},
+            "toCameraSocket": next_socket,
+        },
+    }

@@ -1,0 +1,103 @@
+"""Pictures of a target from wherever they are: a folder of left and right images, or any source."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from calib.coverage import is_new
+from calib.targets import Detection, Target
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.types import U8, StereoImage
+
+_PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".tif", ".tiff")
+_SIDES = ((r"left", "right"), (r"cam0", "cam1"), (r"_0(?=\.)", "_1"), (r"_l(?=\.)", "_r"))
+
+
+def find_pairs(folder: Path) -> list[tuple[Path, Path]]:
+    """left*/right*, cam0/cam1 or *_0/*_1 pictures of a folder, in the order of the numbers in their names."""
+    files = {str(p.relative_to(folder)): p for p in folder.rglob("*") if p.suffix.lower() in _PICTURES}
+    for left, right in _SIDES:
+        pairs: list[tuple[Path, Path]] = []
+        for name, path in files.items():
+            other = re.sub(left, right, name)
+            if other != name and other in files and re.search(r"\d", name.replace("cam0", "")):
+                pairs.append((path, files[other]))
+        if pairs:
+            return sorted(pairs, key=lambda p: _natural(str(p[0])))
+    return []
+
+
+def _natural(name: str) -> list[int | str]:
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name)]
+
+
+def read_pairs(pairs: list[tuple[Path, Path]]) -> Iterator[tuple[U8, U8]]:
+    """Grey pictures.
+
+    Raises:
+        StereoSfmError: a file is not a picture, or the sizes differ.
+    """
+    import cv2
+
+    size: tuple[int, int] = (0, 0)
+    for paths in pairs:
+        images: list[U8] = []
+        for path in paths:
+            image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            if image is None:
+                raise StereoSfmError(f"cannot read the picture {path}")
+            found = (image.shape[1], image.shape[0])
+            size = found if size == (0, 0) else size
+            if found != size:
+                raise StereoSfmError(f"{path} is {found[0]}x{found[1]} px, the others {size[0]}x{size[1]}")
+            images.append(np.asarray(image, np.uint8))
+        yield images[0], images[1]
+
+
+def gather(
+    pairs: Iterator[tuple[U8, U8]],
+    target: Target,
+    limit: int,
+    every_view: bool,
+    tell: Callable[[int, list[Detection], list[Detection], tuple[int, int]], None],
+) -> tuple[list[Detection], list[Detection], list[tuple[U8, U8]], tuple[int, int]]:
+    """Detect the target and keep views that add something.
+
+    Args:
+        pairs: grey pictures of both eyes.
+        limit: views at most.
+        every_view: keep views that look like earlier ones too (pictures taken one by one).
+        tell: called after each kept view with its number, both eyes' detections so far and the image size.
+
+    Returns:
+        Detections of the left and right eye, the kept pictures, and (width, height) px.
+    """
+    left: list[Detection] = []
+    right: list[Detection] = []
+    kept: list[tuple[U8, U8]] = []
+    size = (0, 0)
+    for a, b in pairs:
+        size = (a.shape[1], a.shape[0])
+        da, db = target.detect(a), target.detect(b)
+        seen = da if len(da) else db
+        if not len(seen) or not (every_view or is_new(seen, left, size[0])):
+            continue
+        left.append(da)
+        right.append(db)
+        kept.append((a, b))
+        tell(len(left), left, right, size)
+        if len(left) >= limit:
+            break
+    return left, right, kept, size
+
+
+def stereo_pairs(images: Iterator[StereoImage]) -> Iterator[tuple[U8, U8]]:
+    """Both eyes' pictures of a source's frames."""
+    for image in images:
+        if image.right is None:
+            raise StereoSfmError("the source has one eye: a stereo calibration needs two")
+        yield image.left, image.right

@@ -1,0 +1,104 @@
+"""`stereo-sfm calibrate`: pictures of a target become a rig, a report and a verdict."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from calib.targets import Detection, Target
+    from stereo_sfm.types import U8
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command."""
+    parser.add_argument("source", help="a folder of left*/right* pictures, a recording, a live camera, any source")
+    parser.add_argument("--target", required=True, help="charuco, checkerboard, aprilgrid, or a target's YAML file")
+    parser.add_argument("--columns", type=int, help="inner corners (checkerboard), squares (charuco), tags (aprilgrid)")
+    parser.add_argument("--rows", type=int)
+    parser.add_argument("--square", type=float, metavar="M", help="metres: side of a square or of an AprilTag")
+    parser.add_argument("--ratio", type=float, default=None, help="marker / square (charuco), gap / tag (aprilgrid)")
+    parser.add_argument("--dictionary", default="DICT_4X4_50", help="charuco markers, OpenCV's name")
+    parser.add_argument(
+        "--model", choices=("pinhole", "rational", "kb4"), default="pinhole", help="lens (fisheye: kb4)"
+    )
+    parser.add_argument("-o", "--output", type=Path, required=True, help="rig file to write")
+    parser.add_argument("--format", default=None, help="its format (default: ours; see convert-calib)")
+    parser.add_argument("--report", type=Path, default=None, help="HTML report (default: beside the rig)")
+    parser.add_argument("--views", type=int, default=60, help="views at most")
+    parser.add_argument("--overwrite", action="store_true")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Gather, solve, judge, write."""
+    from calib import save_rig
+    from calib.check import VERDICTS
+    from calib.coverage import coverage
+    from calib.quality import judge
+    from calib.report import write_report
+    from calib.solve import align_pairs, calibrate
+    from stereo_sfm.errors import StereoSfmError
+
+    if args.output.exists() and not args.overwrite:
+        raise StereoSfmError(f"{args.output} exists: choose another file or give --overwrite")
+    target = make_target(args)
+    left, right, kept, size = collect(args.source, target, args.views)
+    if target.kind == "checkerboard":
+        right = align_pairs(left, right)
+    calibration = calibrate(left, right, target.points, size, args.model)
+    views = [coverage(left, size), coverage(right, size)]
+    quality = judge(calibration, min(views, key=lambda v: v.fraction))
+    save_rig(calibration.rig, args.output, args.format)
+    report = args.report or args.output.with_suffix(".html")
+    write_report(report, str(args.source), calibration, quality, views, kept[:: max(1, len(kept) // 3)][:3])
+    for finding in quality.findings:
+        print(f"  {VERDICTS[finding.level]}  {finding.name}: {finding.text}")
+    for eye, view in zip(("left", "right"), views, strict=True):
+        for advice in view.advice:
+            print(f"  {eye} eye: {advice}")
+    print(f"verdict: {VERDICTS[quality.level]}, rig {args.output}, report {report}")
+    return 3 if VERDICTS[quality.level] == "FAIL" else 0
+
+
+def make_target(args: argparse.Namespace) -> Target:
+    """The target of the options or of the file."""
+    from calib.targets import KINDS, Target, read_target
+    from stereo_sfm.errors import StereoSfmError
+
+    if args.target not in KINDS:
+        return read_target(Path(args.target))
+    if args.columns is None or args.rows is None or args.square is None:
+        raise StereoSfmError("a target needs --columns, --rows and --square (metres), or a YAML file as --target")
+    ratio = args.ratio if args.ratio is not None else 0.3 if args.target == "aprilgrid" else 0.75
+    return Target(args.target, args.columns, args.rows, args.square, ratio, args.dictionary)
+
+
+def collect(
+    source: str, target: Target, limit: int
+) -> tuple[list[Detection], list[Detection], list[tuple[U8, U8]], tuple[int, int]]:
+    """Detections of both eyes from a folder of pictures or from a source, telling what is still missing."""
+    from calib.coverage import coverage
+    from calib.views import find_pairs, gather, read_pairs, stereo_pairs
+    from drivers.source import open_source
+    from stereo_sfm.errors import StereoSfmError
+
+    def tell(number: int, left: list[Detection], right: list[Detection], size: tuple[int, int]) -> None:
+        advice = coverage(left, size).advice or coverage(right, size).advice
+        seen = f"{len(left[-1])} and {len(right[-1])} corners"
+        print(f"view {number}: {seen}; {advice[0] if advice else 'enough, more does no harm'}", file=sys.stderr)
+
+    folder = Path(source).expanduser()
+    pairs = find_pairs(folder) if folder.is_dir() and not (folder / "mav0").is_dir() else []
+    if pairs:
+        found = gather(read_pairs(pairs), target, limit, every_view=True, tell=tell)
+    else:
+        with open_source(source) as opened:
+            try:
+                found = gather(stereo_pairs(iter(opened)), target, limit, every_view=False, tell=tell)
+            except KeyboardInterrupt:
+                raise StereoSfmError("interrupted before the calibration was computed") from None
+    if not found[0]:
+        raise StereoSfmError(f"no {target.kind} of {target.columns} x {target.rows} in {source}: check its layout")
+    return found

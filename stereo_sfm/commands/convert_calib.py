@@ -1,0 +1,41 @@
+"""`stereo-sfm convert-calib IN OUT`: one calibration dialect to another."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+# Kept here so that `--help` needs no import; calib.formats.FORMATS is the table (a test compares them).
+NAMES = ("rig", "kalibr", "ros", "opencv", "euroc", "kitti", "basalt", "colmap", "foxglove", "kapture", "depthai")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the command."""
+    parser.add_argument("input", type=Path, help="calibration file, or folder of one file an eye")
+    parser.add_argument("output", type=Path, help="file, or folder for ros, euroc, colmap and kapture")
+    parser.add_argument("--from", dest="source", choices=NAMES, default=None, help="default: by the content")
+    parser.add_argument("--to", dest="target", choices=NAMES, default=None, help="default: by the ending, else ours")
+    parser.add_argument("--size", default=None, metavar="WxH", help="image size, for files that do not state it")
+    parser.add_argument("--overwrite", action="store_true", help="write over an existing file or into a folder")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read, write, say what it was."""
+    from calib import load_rig, save_rig
+    from calib.formats import recognise
+    from stereo_sfm.commands.rectify import parse_size
+    from stereo_sfm.errors import StereoSfmError
+
+    if not args.input.exists():
+        raise StereoSfmError(f"no calibration at {args.input}")
+    if args.output.exists() and not args.overwrite:
+        raise StereoSfmError(f"{args.output} exists: choose another name or give --overwrite")
+    source = args.source or recognise(args.input)
+    options = {} if args.size is None else {"size": parse_size(args.size)}
+    if options and source not in ("opencv", "kitti"):
+        raise StereoSfmError(f"--size is for opencv and kitti files: a {source} file states its own")
+    rig = load_rig(args.input, source, **options)
+    save_rig(rig, args.output, args.target)
+    eyes = rig.left.model if rig.right is None else f"{rig.left.model} pair, baseline {1000 * rig.baseline:.2f} mm"
+    print(f"{source}: {eyes}, {rig.left.width}x{rig.left.height} px -> {args.output}")
+    return 0
