@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import array
 import time
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ from drivers.t265.messages import AntiFlicker, Id, Sensor, Status
 
 MIN_EXPOSURE_US, MAX_EXPOSURE_US = 200, 16_000  # librealsense's limits; below 200 the camera refuses
 MIN_GAIN, MAX_GAIN = 1.0, 10.0
+_MAX_STALE = 16  # transfers of an earlier session that may still lie in an endpoint
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,15 @@ class T265:
         if not self.info.healthy:
             raise DeviceFault(f"{link.what} (serial {self.info.serial}) reports a hardware error: replug it")
         self.link.command(protocol.request(Id.STOP))  # a program that crashed may have left it streaming
+        self._drain()
+
+    def _drain(self) -> None:
+        """Take what an earlier session left in the endpoints: the camera stays busy until its last words are read."""
+        buffer = array.array("B", bytes(m.VIDEO_BUFFER))
+        for endpoint in (m.VIDEO_IN, m.EVENT_IN):
+            for _ in range(_MAX_STALE):
+                if self.link.read(endpoint, buffer, 10) == 0:
+                    break
 
     def _ask(self, request: bytes) -> protocol.Buffer:
         """Command with the answer's status checked; a busy camera is asked again."""

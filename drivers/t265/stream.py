@@ -25,7 +25,6 @@ logger = logging.getLogger("stereo_sfm")
 _CLOCK_TRIES = 3
 _TEMPERATURE_S = 10.0
 _STOP_S = 0.5  # waiting for the camera to say that it has stopped
-_MAX_STALE = 16  # transfers of an earlier session that may still lie in an endpoint
 
 
 class Stream:
@@ -55,7 +54,6 @@ class Stream:
         Raises:
             DeviceError: nothing runs then.
         """
-        self._drain()
         self._read_clock()
         self._pairer = Pairer(self._counters, m.PERIOD_NS, now_ns=self._camera.time_ns())
         for name, work in (("video", self._read_video), ("events", self._read_events), ("clock", self._keep_clock)):
@@ -94,14 +92,6 @@ class Stream:
 
     def _ended(self, stopped: threading.Event) -> bool:
         return self._stopping.is_set() or (self._goodbye.is_set() and stopped.is_set())
-
-    def _drain(self) -> None:
-        """Throw away what an earlier session left in the endpoints."""
-        buffer = array.array("B", bytes(m.VIDEO_BUFFER))
-        for endpoint in (m.VIDEO_IN, m.EVENT_IN):
-            for _ in range(_MAX_STALE):
-                if self._camera.link.read(endpoint, buffer, 10) == 0:
-                    break
 
     def _read_video(self) -> None:
         buffer = array.array("B", bytes(m.VIDEO_BUFFER))

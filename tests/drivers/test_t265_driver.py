@@ -374,3 +374,19 @@ def test_firmware_goes_to_unbooted_cameras_only() -> None:
     bus = SimulatedBus([camera])
     with pytest.raises(ValueError, match="boot state"):
         boot(attached(bus)[0], checked_firmware(), bus, FAST)
+
+
+def test_a_program_that_crashed_left_the_camera_streaming() -> None:
+    """The next one stops it, reads its last words, and streams."""
+    camera = SimulatedCamera(noise_content())
+    camera.booted = True
+    bus = SimulatedBus([camera])
+    access = Access(bus, firmware=checked_firmware, timing=FAST)
+    crashed = SimulatedT265Source(camera, access, Settings(), Patience())
+    take(crashed, 2)
+    assert crashed._segment is not None
+    crashed._segment.stop(camera_alive=False)  # threads end; nobody says STOP
+    bus._claimed.clear()  # the operating system takes the interface back
+    with SimulatedT265Source(camera, access, Settings(), Patience()) as source:
+        assert_honest(source, take(source, 3))
+        assert source.counters["busy_retries"] == 0

@@ -73,7 +73,7 @@ def exercise(seconds: float, faults: str, paced: bool) -> dict[str, Any]:
     while not attached(backend) and time.monotonic() < deadline:
         time.sleep(0.05)
     seen = [f"{d.idVendor:04x}:{d.idProduct:04x} speed {d.speed}" for d in attached(backend)]
-    access = Access(backend, firmware=checked_firmware, timing=Timing(settle_s=0.5))
+    access = Access(backend, firmware=checked_firmware, timing=Timing(settle_s=0.5, read_ms=2000))
     wrong = 0
     with SimulatedT265Source(camera, access, Settings(), Patience(stall_s=2.0), 60) as source:
         seen += [f"{d.idVendor:04x}:{d.idProduct:04x} speed {d.speed}" for d in attached(backend)]

@@ -81,12 +81,13 @@ class _Endpoint(threading.Thread):
         return memoryview(camera.read_events(_POLL_S, generation, m.EVENT_BUFFER) or b"")
 
     def _complete(self) -> None:
+        """Answer one request; a cancellation waits meanwhile, since the kernel takes no answer after its own."""
         with self.ready:
             if not self.waiting:
-                return  # cancelled meanwhile: the next request gets the data, as on a real bus
+                return  # cancelled before: the next request gets the data, as on a real bus
             urb = self.waiting.popleft()
-        piece, self._left = self._left[: urb.length], self._left[urb.length :]
-        self.session.answer(urb, 0, bytes(piece))
+            piece, self._left = self._left[: urb.length], self._left[urb.length :]
+            self.session.answer(urb, 0, bytes(piece))
 
 
 class _Session:
