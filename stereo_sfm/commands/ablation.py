@@ -33,14 +33,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run what is missing, then write the report over everything asked for."""
-    from stereo_sfm.eval.ablation import load_answer
+    from stereo_sfm.eval.ablation import finished, load_answer
     from stereo_sfm.eval.ablation_report import write_report
 
     cells = _cells(args)
     folder: Path = args.output
     store = folder / "cells"
     store.mkdir(parents=True, exist_ok=True)
-    missing = [cell for cell in cells if args.again or load_answer(store / cell.file_name) is None]
+    missing = [cell for cell in cells if args.again or not finished(load_answer(store / cell.file_name))]
     if missing:
         _run_all(missing, store, args.jobs, args.quiet, len(cells))
     answers = [answer for cell in cells if (answer := load_answer(store / cell.file_name)) is not None]

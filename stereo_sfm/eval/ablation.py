@@ -185,6 +185,11 @@ def load_answer(path: Path) -> dict[str, Any] | None:
     return data if data.get("schema") == _SCHEMA else None
 
 
+def finished(answer: dict[str, Any] | None) -> bool:
+    """Whether a cell need not be run again: it has a result or a refusal, and did not break."""
+    return answer is not None and "traceback" not in answer
+
+
 def save_answer(path: Path, answer: dict[str, Any]) -> None:
     """Write whole or not at all, so that an interrupted grid can go on."""
     part = path.with_suffix(".part")

@@ -11,12 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.epipolar_refine import refine_from_many, refine_motion
 from stereo_sfm.geometry.five_point import five_point
 from stereo_sfm.geometry.procrustes import rotation_between
 from stereo_sfm.geometry.robust import Consensus, Degenerate, ransac
 from stereo_sfm.geometry.two_view import epipolar_residuals, parallax_angles, ray_depths
 from stereo_sfm.types import F64, I64, Bool
 
+_MIN_GAIN = 9.0  # how much a translation must improve the fit of a rotation to be believed
 _W = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
@@ -120,35 +122,6 @@ def choose_in_front(
     return best, front[best]
 
 
-def refine_motion(
-    rotation: F64, direction: F64, bearings0: F64, bearings1: F64, scale: float, iterations: int = 8
-) -> tuple[F64, F64]:
-    """Gauss-Newton on the spherical Sampson distance with Cauchy weights of width `scale` radians.
-
-    Five parameters: a rotation vector on the left of `rotation` and two on the sphere of directions.
-    """
-    for _ in range(iterations):
-        p = bearings0 @ rotation.T
-        error = (bearings1 * np.cross(direction, p)).sum(1)
-        plane1 = np.cross(direction, p)
-        plane0 = np.cross(direction, bearings1)
-        slope = np.sqrt(np.maximum((plane1**2).sum(1) + (plane0**2).sum(1) - 2 * error**2, 1e-20))
-        residual = error / slope
-        weight = 1.0 / (1.0 + (residual / scale) ** 2)
-        tangent = np.linalg.svd(direction[None])[2][1:]  # (2, 3) basis orthogonal to the direction
-        by_rotation = np.cross(p, np.cross(bearings1, direction)) / slope[:, None]
-        by_direction = (np.cross(p, bearings1) @ tangent.T) / slope[:, None]
-        jac = np.concatenate([by_rotation, by_direction], axis=1)
-        hessian = jac.T @ (weight[:, None] * jac)
-        step = -np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(5), jac.T @ (weight * residual))
-        rotation = se3.so3_exp(step[:3]) @ rotation
-        direction = direction + step[3:] @ tangent
-        direction = direction / np.linalg.norm(direction)
-        if np.abs(step).max() < 1e-10:
-            break
-    return rotation, direction
-
-
 def essential_ransac(
     bearings0: F64,
     bearings1: F64,
@@ -185,6 +158,30 @@ def essential_ransac(
     )
 
 
+def _small_motion(bearings0: F64, bearings1: F64, chosen: Bool, still: F64, off: F64, threshold: float) -> RelativePose:
+    """The motion where a rotation alone (`still`) leaves every inlier within two thresholds.
+
+    Without translation the squared angles `off` (two directions, noise of both views) are about 6.1 times the squared
+    Sampson distances in the median; a translation is believed when it makes them more than 9 times as large, and when
+    at least two thirds of the points then lie in front.
+    """
+    b0, b1 = bearings0[chosen], bearings1[chosen]
+    direction = np.linalg.svd(np.cross(b0 @ still.T, b1), full_matrices=False)[2][-1]
+    rotation, direction = refine_from_many(still, direction, still, b0, b1, 0.5 * threshold)
+    residuals = epipolar_residuals((se3.skew(direction) @ rotation)[None], b0, b1)[0]
+    depth0, depth1 = ray_depths(b0, b1, rotation, direction)
+    if (depth0 + depth1 < 0).mean() > 0.5:
+        direction, depth0, depth1 = -direction, -depth0, -depth1
+    front = (depth0 > 0) & (depth1 > 0)
+    gain = float(np.median(off**2)) / max(float(np.median(residuals**2)), 1e-18)
+    in_front = np.zeros_like(chosen)
+    if gain < _MIN_GAIN or front.mean() < 2 / 3 or np.median(off) < 1e-9:
+        return RelativePose(still, np.array([0.0, 0.0, 1.0]), chosen, in_front, float(np.median(off)), True)
+    in_front[np.flatnonzero(chosen)[front]] = True
+    parallax = float(np.median(parallax_angles(b0, b1, rotation)))
+    return RelativePose(rotation, direction, chosen, in_front, parallax, False)
+
+
 def relative_pose(
     bearings0: F64,
     bearings1: F64,
@@ -214,9 +211,7 @@ def relative_pose(
     still = rotation_between(b0, b1)
     off = parallax_angles(b0, b1, still)
     if np.mean(off < 2 * threshold) > 0.95:
-        return RelativePose(
-            still, np.array([0.0, 0.0, 1.0]), chosen, np.zeros_like(chosen), float(np.median(off)), True
-        )
+        return _small_motion(bearings0, bearings1, chosen, still, off, threshold)
     essential = consensus.model
     if method == "eight_point":
         essential = nearest_essential(eight_point(b0, b1))
@@ -230,11 +225,15 @@ def relative_pose(
         best, front = int(np.argmax(np.trace(rotations, axis1=1, axis2=2))), np.ones(len(b0), bool)
     rotation, direction = rotations[best], translations[best]
     if refine:
-        for _ in range(3):  # refine, then let the better motion say who agrees with it
+        rotation, direction = refine_from_many(rotation, direction, still, b0, b1, 0.5 * threshold)
+        depth0, depth1 = ray_depths(b0, b1, rotation, direction)
+        if (depth0 + depth1 < 0).mean() > 0.5:
+            direction = -direction
+        for _ in range(2):  # let the better motion say who agrees with it
+            chosen = epipolar_residuals((se3.skew(direction) @ rotation)[None], bearings0, bearings1)[0] <= threshold
             rotation, direction = refine_motion(
                 rotation, direction, bearings0[chosen], bearings1[chosen], 0.5 * threshold
             )
-            chosen = epipolar_residuals(se3.skew(direction) @ rotation, bearings0, bearings1) <= threshold
         depth0, depth1 = ray_depths(bearings0, bearings1, rotation, direction)
         in_front = chosen & (depth0 > 0) & (depth1 > 0)
     else:

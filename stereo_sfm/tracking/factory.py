@@ -44,6 +44,10 @@ def _tracker(config: Config, rig: Rig, spans: NoSpans | None, ground_truth: Traj
         raise StereoSfmError(
             f"odometry {method} needs two eyes or depth, this camera has one eye: use eight-point or pnp"
         )
+    if not rig.stereo and method == "eight-point" and config.odometry.scale == "stereo":
+        raise StereoSfmError(
+            "one eye has no scale: choose --set odometry.scale=unit (steps of odometry.unit_step_m) or ground-truth"
+        )
     if method == "pnp" and (config.odometry.monocular or not rig.stereo):
         from stereo_sfm.tracking.monocular import MonocularTracker
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from stereo_sfm.cli import main
-from stereo_sfm.eval.ablation import Cell, grid, load_answer, run_cell, save_answer
+from stereo_sfm.eval.ablation import Cell, finished, grid, load_answer, run_cell, save_answer
 from stereo_sfm.eval.ablation_report import COLUMNS, findings, row_of, write_report
 
 SIM = "sim:aisle?camera=pinhole&size=320x200&frames=5"
@@ -73,6 +73,12 @@ def test_a_cell_is_run_judged_and_kept(tmp_path: Path) -> None:
     assert load_answer(tmp_path / "x.json") == json.loads(json.dumps(result))
     (tmp_path / "x.json").write_text('{"schema": 1, "cel')
     assert load_answer(tmp_path / "x.json") is None
+
+
+def test_broken_cells_are_run_again_refused_ones_are_not() -> None:
+    assert not finished(None)
+    assert not finished({"schema": 1, "status": "none", "reason": "internal error: x", "traceback": "..."})
+    assert finished({"schema": 1, "status": "none", "reason": "weak_structure in 5 of 5 frames"})
 
 
 def test_failures_have_reasons() -> None:

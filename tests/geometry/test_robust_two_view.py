@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from stereo_sfm.geometry import se3
-from stereo_sfm.geometry.essential import RelativePose, decompose, eight_point, refine_motion, relative_pose
+from stereo_sfm.geometry.epipolar_refine import refine_motion
+from stereo_sfm.geometry.essential import RelativePose, decompose, eight_point, relative_pose
 from stereo_sfm.geometry.five_point import five_point
 from stereo_sfm.geometry.robust import Degenerate, needed_samples, ransac, sample_indices
 from stereo_sfm.geometry.two_view import epipolar_residuals, essential_from_motion, parallax_angles, ray_depths
@@ -146,6 +147,26 @@ def test_pure_rotation_is_recognised_and_its_rotation_right() -> None:
     pose = relative_pose(b0, b1, 1.5 * PIXEL, np.random.default_rng(0))
     assert pose.pure_rotation
     assert angle_deg(pose.rotation, rotation) < 0.05
+
+
+@pytest.mark.parametrize("step", [0.0, 0.05, 0.1])
+def test_a_small_step_is_told_from_a_rotation(step: float) -> None:
+    """Points at 3 to 9 m, 0.3 px of noise: 50 mm are 3 px of parallax, of which a turn takes two thirds."""
+    found: list[bool] = []
+    turns: list[float] = []
+    directions: list[float] = []
+    for seed in range(6):
+        b0, _, rotation, translation = scene(seed, 200)
+        depth = np.random.default_rng(seed).uniform(3, 9, (200, 1))
+        b1 = unit(b0 * depth @ rotation.T + step * unit(translation))
+        rng = np.random.default_rng(seed)
+        pose = relative_pose(noisy(b0, rng, 0.3 * PIXEL), noisy(b1, rng, 0.3 * PIXEL), 1.5 * PIXEL, rng)
+        turns.append(angle_deg(pose.rotation, rotation))
+        directions.append(float(pose.direction @ unit(translation)))
+        found.append(not pose.pure_rotation)
+    assert np.median(turns) < 0.2
+    assert np.mean(found) <= 0.2 if step == 0 else np.mean(found) >= 0.5
+    assert step < 0.05 or np.median(directions) > np.cos(np.radians(25))
 
 
 @pytest.mark.parametrize("points", ["few", "identical", "collinear", "pure_rotation"])

@@ -143,6 +143,24 @@ def test_one_eye_is_refused_where_depth_is_needed() -> None:
     rig, _, _ = rendered()
     with pytest.raises(StereoSfmError, match="one eye"):
         make_tracker(config_for("em-r"), Rig(rig.left))
+    with pytest.raises(StereoSfmError, match=r"odometry\.scale=unit"):
+        make_tracker(config_for("eight-point"), Rig(rig.left))
+
+
+def test_one_eye_with_unit_steps_and_with_true_steps() -> None:
+    rig, images, poses = rendered()
+    stamps = np.array([image.stamp_ns for image in images], np.int64)
+    alone = [replace(image, right=None) for image in images]
+    for scale, step in (("unit", 0.3), ("ground-truth", None)):
+        tracker = make_tracker(
+            config_for("eight-point", scale=scale, unit_step_m=0.3), Rig(rig.left), None, Trajectory(stamps, poses)
+        )
+        frames = [tracker.step(image)[0] for image in alone]
+        walked = np.linalg.norm(np.diff([frame.odom_T_cam[:3, 3] for frame in frames], axis=0), axis=1)
+        true = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+        moved = walked > 0  # a pure rotation has no direction, so no step
+        assert moved.sum() >= 3
+        np.testing.assert_allclose(walked[moved], true[moved] if step is None else step, rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", list(PRESETS))

@@ -1,0 +1,58 @@
+"""Least squares on the epipolar geometry of two views, with the valleys of a narrow view in mind."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.two_view import epipolar_residuals
+from stereo_sfm.types import F64
+
+
+def refine_motion(
+    rotation: F64, direction: F64, bearings0: F64, bearings1: F64, scale: float, iterations: int = 8
+) -> tuple[F64, F64]:
+    """Gauss-Newton on the spherical Sampson distance with Cauchy weights of width `scale` radians.
+
+    Five parameters: a rotation vector on the left of `rotation` and two on the sphere of directions.
+    """
+    for _ in range(iterations):
+        p = bearings0 @ rotation.T
+        plane1, plane0 = np.cross(direction, p), np.cross(direction, bearings1)
+        error = (bearings1 * plane1).sum(1)
+        slope = np.sqrt(np.maximum((plane1**2).sum(1) + (plane0**2).sum(1) - 2 * error**2, 1e-20))
+        residual = error / slope
+        weight = 1.0 / (1.0 + (residual / scale) ** 2)
+        # The slope moves too; without its derivative the direction is drawn towards the middle of the view.
+        error_by_rotation, error_by_direction = np.cross(p, np.cross(bearings1, direction)), np.cross(p, bearings1)
+        half_by_rotation = np.cross(p, np.cross(plane1, direction)) - 2 * error[:, None] * error_by_rotation
+        half_by_direction = np.cross(p, plane1) + np.cross(bearings1, plane0) - 2 * error[:, None] * error_by_direction
+        by_rotation = (error_by_rotation - (residual / slope)[:, None] * half_by_rotation) / slope[:, None]
+        by_direction = (error_by_direction - (residual / slope)[:, None] * half_by_direction) / slope[:, None]
+        tangent = np.linalg.svd(direction[None])[2][1:]  # (2, 3) basis orthogonal to the direction
+        jac = np.concatenate([by_rotation, by_direction @ tangent.T], axis=1)
+        hessian = jac.T @ (weight[:, None] * jac)
+        step = -np.linalg.solve(hessian + 1e-9 * np.trace(hessian) * np.eye(5), jac.T @ (weight * residual))
+        rotation = se3.so3_exp(step[:3]) @ rotation
+        direction = direction + step[3:] @ tangent
+        direction = direction / np.linalg.norm(direction)
+        if np.abs(step).max() < 1e-10:
+            break
+    return rotation, direction
+
+
+def refine_from_many(
+    rotation: F64, direction: F64, still: F64, bearings0: F64, bearings1: F64, scale: float
+) -> tuple[F64, F64]:
+    """`refine_motion` from a solution and from steps along each axis with the rotation `still`; the best one.
+
+    In a narrow view a small step sideways looks like a turn, and the cost has a valley for each: one start is not
+    enough. The signs of the directions are free.
+    """
+    starts = [(rotation, direction), *((still, axis) for axis in np.eye(3))]
+    refined = [refine_motion(r, d, bearings0, bearings1, scale, iterations=12) for r, d in starts]
+    costs = [
+        np.log1p((epipolar_residuals((se3.skew(d) @ r)[None], bearings0, bearings1)[0] / scale) ** 2).sum()
+        for r, d in refined
+    ]
+    return refined[int(np.argmin(costs))]
