@@ -16,9 +16,10 @@ from drivers.sim.people import figures
 from drivers.sim.render import Renderer, View
 from drivers.sim.rigs import CAMERAS, make_rig
 from drivers.sim.scenes import SCENES, crowd
+from drivers.sim.tables import Tables
 from drivers.sim.targets import Target, empty_room, move, place
 from drivers.sim.walks import FORWARD
-from drivers.sim.world import Layout, Tables, build_world
+from drivers.sim.world import Layout, build_world
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, U8
 
@@ -74,6 +75,42 @@ def test_hits_lie_on_the_surfaces_they_name(camera: str) -> None:
         expected = plane + sign * world.facings[index, 4]
         mine = facing == side
         assert np.abs(points[front][mine][:, 1] - expected[mine]).max() < 1e-5
+
+
+def product_boxes(world: Tables) -> F64:
+    """(2 F, 6) lower and upper boxes of every facing in world axes, lo xyz, hi xyz; empty ones have hi below lo."""
+    out = np.empty((2, len(world.facings), 6))
+    for c, (f, (*_, b, k)) in enumerate(zip(world.facings, world.facings_i, strict=True)):
+        lo, hi, facing, base = world.blocks[b, :3], world.blocks[b, 3:], world.blocks_i[b, 1], world.levels[k, 1]
+        deep = (hi - lo)[1 if facing < 2 else 0]
+        for n, (front, bottom, top) in enumerate(((f[4], base, f[5]), (f[6], f[5], f[7]))):
+            u, w = np.array([f[2], f[3]]), np.array([front, deep])
+            x, y = ((lo[0] + u, lo[1] + w), (hi[0] - u, hi[1] - w), (lo[0] + w, hi[1] - u), (hi[0] - w, lo[1] + u))[
+                facing
+            ]
+            out[n, c] = min(x), min(y), bottom, max(x), max(y), top
+    return out.reshape(-1, 6)
+
+
+@pytest.mark.parametrize("fill", [1.0, 0.2])
+def test_walking_the_shelves_finds_what_testing_every_box_finds(fill: float) -> None:
+    world = store() if fill == 1 else build_world(dataclasses.replace(SMALL, fill=fill), seed=3)
+    assert fill == 1 or len(world.facings) < 0.4 * len(store().facings)
+    boxes = product_boxes(world)
+    boxes = boxes[boxes[:, 5] > boxes[:, 2]]
+    r = Renderer(world, make_rig("fisheye", (106, 100)))
+    for pose in (POSE, pose_at(2.2, SMALL.aisle_y(1), 2.5, 0.3)):
+        view = r.view(0, pose)
+        shown = np.flatnonzero(view.ids.ravel() >= 0)[::9]
+        rays = r.eyes[0].grid.reshape(-1, 3)[shown] @ pose[:3, :3].T
+        with np.errstate(divide="ignore"):
+            a, b = ((boxes[None, :, i : i + 3] - pose[:3, 3]) / rays[:, None] for i in (0, 3))
+        enter, leave = np.minimum(a, b).max(2), np.maximum(a, b).min(2)
+        nearest = np.where((enter < leave) & (enter > 0), enter, np.inf).min(1)
+        found, product = view.depth.ravel()[shown], kind_of(view).ravel()[shown] == FACING
+        assert product.mean() > (0.2 if fill == 1 else 0.02)
+        assert np.allclose(found[product], nearest[product], rtol=1e-6, atol=1e-6)
+        assert (found[~product] < nearest[~product] + 1e-5).all()
 
 
 @pytest.mark.parametrize("camera", sorted(CAMERAS))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from types import TracebackType
 from typing import Self
 
@@ -97,3 +98,18 @@ def test_simulated_store_through_usb() -> None:
     assert lost == 2
     assert set(states) == {TrackState.OK}
     assert error < 0.02 * length + 0.003
+
+
+def test_pictures_of_a_real_t265_come_through_unchanged(data_root: Path) -> None:
+    """Its factory calibration and its images, as the simulated camera's own."""
+    content = source_content(f"kapture:{data_root / 't265_office'}", 3)
+    with open_camera(content=content, booted=True) as source:
+        images = take(source, 3)
+    for ours, theirs in ((source.rig.left, content.rig.left), (source.rig.right, content.rig.right)):
+        assert ours is not None and theirs is not None
+        np.testing.assert_allclose(ours.params[:8], theirs.params[:8], rtol=1e-6)
+    assert source.rig.baseline == pytest.approx(content.rig.baseline, abs=1e-7)
+    for image in images:
+        left, right = content.image(source.frame_shown(image.stamp_ns))
+        assert image.right is not None
+        assert np.array_equal(image.left, left) and np.array_equal(image.right, right)

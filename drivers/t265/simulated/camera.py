@@ -53,6 +53,7 @@ class _Session:
     counter_extra: int = 0
     stopped_said: set[int] = field(default_factory=set[int])
     stopping: bool = False
+    leaving: bool = False  # unplugged after what is pending
 
 
 class SimulatedCamera:
@@ -264,6 +265,9 @@ class SimulatedCamera:
             return None
         if s.stopping:
             return self._say_stopped(s, m.VIDEO_IN)
+        if not s.pending and s.leaving:
+            self.unplug(self.faults.unplugged_s)
+            raise Gone
         if not s.pending and Sensor.LEFT in self._streams and not self.stalled:
             self._expose(s, now)
         return s.pending.popleft() if s.pending else None
@@ -291,9 +295,9 @@ class SimulatedCamera:
         self.sent_frames = index + 1
         f = self.faults
         if index >= f.unplug_at >= 0 and not self._unplug_done:
-            self._unplug_done = True
-            self.unplug(f.unplugged_s)
-            raise Gone
+            s.pending.append(video_transfer(Sensor.LEFT, self.clock_ns(stamp), counter, self.content.image(index)[0]))
+            self._unplug_done = s.leaving = True
+            return
         if index in f.counter_skips:
             s.counter_extra += 1
         self._send_pair(s, index, counter, self.clock_ns(stamp))
