@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import logging
 import struct
+import zlib
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ from types import TracebackType
 from typing import IO, Any, Self
 
 import numpy as np
+from mcap.data_stream import ReadDataStream
 from mcap.reader import SeekingReader
 from mcap.records import Attachment, Channel, Schema, Statistics
 from mcap.summary import Summary
@@ -97,17 +99,20 @@ class LogReader:
 
     def _open(self) -> tuple[SeekingReader, Summary]:
         self._bytes: Any = self._stream  # what the reader sees: the file, or the file with the index it lacks
+        index_is_whole = repair.summary_is_whole(self._stream)
         self._stream.seek(0)
         try:
             reader = SeekingReader(self._stream, validate_crcs=True)
             summary = reader.get_summary()
-            if summary is not None and _complete(summary):
+            if summary is not None and index_is_whole and _complete(summary):
                 return reader, summary
         except (*repair.DAMAGE, OSError, StopIteration):  # OSError: the file is shorter than its footer
             pass
         index = repair.build_index(self._stream)
         if not index.closed:
             self.truncated = f"truncated, {index.messages} messages recovered"
+        elif not index_is_whole:
+            self.truncated = f"its index is damaged, {index.messages} messages recovered"
         if index.bad_chunks:
             self.truncated += f"{', ' if self.truncated else ''}{len(index.bad_chunks)} damaged chunks left out"
         if self.truncated:
@@ -163,9 +168,11 @@ class LogReader:
             for schema, channel, m in found:
                 yield Record(channel.topic, channel, schema, m.log_time, m.publish_time, m.sequence, m.data)
         except repair.DAMAGE as error:
-            raise StereoSfmError(
-                f"{self.path} is damaged ({error}): 'stereo-sfm recover' copies what is whole"
-            ) from None
+            raise self._damaged(error) from None
+
+    def _damaged(self, error: BaseException) -> StereoSfmError:
+        said = str(error) or type(error).__name__
+        return StereoSfmError(f"{self.path} is damaged ({said}): 'stereo-sfm recover' copies what is whole")
 
     def stamps(self, topic: str) -> I64:
         """Log times of a topic in ascending order, from the index alone where the file has one."""
@@ -173,7 +180,10 @@ class LogReader:
         if not chunks or any(not c.message_index_offsets for c in chunks):
             return np.array([r.log_time for r in self.messages([topic])], np.int64)
         if self._times is None:
-            self._times = self._read_message_indexes()
+            try:
+                self._times = self._read_message_indexes()
+            except repair.DAMAGE as error:
+                raise self._damaged(error) from None
         ids = [c.id for c in self.summary.channels.values() if c.topic == topic]
         return np.sort(np.concatenate([self._times.get(i, np.zeros(0, np.int64)) for i in ids] or [[]])).astype(
             np.int64
@@ -194,16 +204,30 @@ class LogReader:
         return {channel_id: np.concatenate(parts) for channel_id, parts in found.items()}
 
     def attachment(self, name: str) -> bytes | None:
-        """The content of an attached file, None where there is none."""
-        found: list[Attachment] = [a for a in self._reader.iter_attachments() if a.name == name]
-        return found[0].data if found else None
+        """The content of an attached file; None where there is none, or, with a warning, where it is damaged."""
+        for entry in self.summary.attachment_indexes:
+            if entry.name != name:
+                continue
+            self._bytes.seek(entry.offset)
+            raw: bytes = self._bytes.read(entry.length)
+            try:
+                crc = struct.unpack("<I", raw[-4:])[0]
+                if crc and crc != zlib.crc32(raw[repair.PREFIX : -4]):
+                    raise ValueError("its checksum is wrong")
+                return Attachment.read(ReadDataStream(io.BytesIO(raw[repair.PREFIX :]))).data
+            except repair.DAMAGE as error:
+                log.warning("%s: the attached %s is damaged (%s) and left out", self.path, name, error)
+        return None
 
     def metadata(self, name: str) -> dict[str, str]:
         """All key-value pairs recorded under a name."""
         out: dict[str, str] = {}
-        for record in self._reader.iter_metadata():
-            if record.name == name:
-                out.update(record.metadata)
+        try:
+            for record in self._reader.iter_metadata():
+                if record.name == name:
+                    out.update(record.metadata)
+        except repair.DAMAGE as error:
+            log.warning("%s: metadata is damaged (%s) and left out", self.path, error)
         return out
 
     @property

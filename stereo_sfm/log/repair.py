@@ -36,13 +36,25 @@ from mcap.records import (
 )
 from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC
+from zstandard import ZstdError
 
 from stereo_sfm.errors import StereoSfmError
 
 PREFIX = 9  # opcode and length
+FOOTER_SIZE = PREFIX + 20
 _LAST_OPCODE = 0x0F
 # What broken bytes raise inside the library's parsers.
-DAMAGE = (McapError, ValueError, struct.error, EOFError, KeyError, MemoryError, OverflowError)
+DAMAGE = (
+    McapError,
+    ZstdError,
+    RuntimeError,  # lz4
+    ValueError,
+    struct.error,
+    EOFError,
+    KeyError,
+    MemoryError,
+    OverflowError,
+)
 
 
 @dataclass(frozen=True)
@@ -189,11 +201,31 @@ def _mend_last_message_index(index: Index, stream: IO[bytes]) -> None:
 def _listed_at_the_end(stream: IO[bytes]) -> tuple[dict[int, Schema], dict[int, Channel]]:
     """Schemas and channels of the summary section, if there is one: the chunk that first held them may be damaged."""
     try:
+        if not summary_is_whole(stream):
+            return {}, {}
         stream.seek(0)
         summary = SeekingReader(stream).get_summary()
     except (*DAMAGE, OSError, StopIteration):
         return {}, {}
     return (dict(summary.schemas), dict(summary.channels)) if summary is not None else ({}, {})
+
+
+def summary_is_whole(stream: IO[bytes]) -> bool:
+    """Whether the checksum of the summary section holds; True as well for a writer that made none.
+
+    The checksum covers the section and the footer up to itself.
+    """
+    size = stream.seek(0, 2)
+    footer_at = size - len(MCAP0_MAGIC) - FOOTER_SIZE
+    if footer_at < len(MCAP0_MAGIC):
+        return False
+    stream.seek(footer_at)
+    footer = stream.read(FOOTER_SIZE)
+    opcode, length, start, _, crc = struct.unpack("<BQQQI", footer)
+    if opcode != Opcode.FOOTER or length != FOOTER_SIZE - PREFIX or not 0 <= start <= footer_at:
+        return False
+    stream.seek(start)
+    return crc == 0 or start == 0 or zlib.crc32(footer[:-4], zlib.crc32(stream.read(footer_at - start))) == crc
 
 
 def _ends_well(stream: IO[bytes]) -> bool:

@@ -23,6 +23,7 @@ from stereo_sfm.cli import main
 from stereo_sfm.commands import record as record_command
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log import repair, topics
+from stereo_sfm.log.describe import describe_file
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.types import StereoImage
 from tests.log.recordings import (
@@ -281,3 +282,61 @@ def test_an_interrupted_recording_is_closed(
             assert reader.truncated == ""
         assert len(_read(path)) == 11
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(changes=st.lists(st.tuples(st.floats(-0.03, 1.0), st.integers(0, 255)), min_size=1, max_size=4))
+def test_changed_bytes_give_the_right_frames_or_one_line(
+    whole: Whole, tmp_path: Path, changes: list[tuple[float, int]]
+) -> None:
+    """Checksums cover the pixels, the index, the calibration and the truth: nothing wrong gets through unseen."""
+    path, images = whole
+    data = bytearray(path.read_bytes())
+    for where, value in changes:  # negative: near the end, where the index is
+        data[int(where * (len(data) - 1))] = value
+    bad, out = tmp_path / "bad.mcap", tmp_path / "out.mcap"
+    bad.write_bytes(data)
+    by_id = {image.frame_id: image for image in images}
+    for candidate in (bad, out):
+        said = _use(candidate, bad, out, by_id)
+        assert "\n" not in said
+        if said:
+            return
+
+
+def _use(path: Path, damaged: Path, mended: Path, by_id: dict[int, StereoImage]) -> str:
+    """Read, describe and recover; what is refused, or nothing."""
+    try:
+        for image in _read(path):
+            assert_same_image(by_id[image.frame_id], image)
+        describe_file(path)
+        repair.recover(damaged, mended)
+    except StereoSfmError as error:
+        return str(error)
+    return ""
+
+
+def test_a_damaged_attachment_is_left_out_and_the_rig_can_be_given(
+    whole: Whole, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path, images = whole
+    data = path.read_bytes()
+    at = data.index(b"kannala_brandt")
+    bad = tmp_path / "bad.mcap"
+    bad.write_bytes(data[:at] + b"K" + data[at + 1 :])
+    with caplog.at_level(logging.WARNING, "stereo_sfm"), pytest.raises(StereoSfmError, match="give one with --rig"):
+        _read(bad)
+    assert "calibration.yaml is damaged (its checksum is wrong)" in caplog.text
+    with open_source(bad, rig=fisheye_rig()) as source:
+        assert len(list(source)) == len(images)
+
+
+def test_a_damaged_index_is_made_again(whole: Whole, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path, images = whole
+    data = bytearray(path.read_bytes())
+    data[-400] ^= 1
+    bad = tmp_path / "bad.mcap"
+    bad.write_bytes(data)
+    with caplog.at_level(logging.WARNING, "stereo_sfm"):
+        assert len(_read(bad)) == len(images)
+    assert "its index is damaged" in caplog.text
