@@ -144,8 +144,11 @@ def _inner_rectangle(left: Camera, right: Camera, rect_R_left: F64, rect_R_right
     for camera, rotation in ((left, rect_R_left), (right, rect_R_right)):
         rays = camera.unproject(_lattice(camera)) @ rotation.T
         x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
-        x0, x1 = max(x0, x[:, 0].max()), min(x1, x[:, -1].min())
-        y0, y1 = max(y0, y[0].max()), min(y1, y[-1].min())
+        if any(np.isnan(edge).all() for edge in (x[:, 0], x[:, -1], y[0], y[-1])):
+            raise StereoSfmError("the lens model ends inside the image: give a field of view")
+        # Corners beyond the lens model's range lie further out than the edges that count here.
+        x0, x1 = max(x0, np.nanmax(x[:, 0])), min(x1, np.nanmin(x[:, -1]))
+        y0, y1 = max(y0, np.nanmax(y[0])), min(y1, np.nanmin(y[-1]))
     if not (x1 - x0 > 0.05 and y1 - y0 > 0.05):
         raise StereoSfmError("the eyes share no pinhole view: check the extrinsics, or give a field of view")
     return float(x0), float(x1), float(y0), float(y1)

@@ -119,6 +119,17 @@ def test_pinhole_default_has_no_black_border() -> None:
     assert rectification.left.mask.mean() > 0.999 and rectification.right.mask.mean() > 0.999
 
 
+def test_pinhole_default_copes_with_corners_beyond_the_lens_model() -> None:
+    folding = (-0.314, 0.136, 0.0002, -0.0007, -0.0331)
+    eye = RadTan(752, 480, 459.7, 458.7, 369.9, 248.2, folding)
+    assert np.isnan(eye.unproject(np.array([751.0, 479.0]))).any() or eye.params[12] > 0
+    narrow = replace(eye, fx=420.0, fy=420.0)
+    assert np.isnan(narrow.unproject(np.array([751.0, 479.0]))).any()
+    rectification = rectify(Rig(narrow, narrow, se3.exp(np.array([0.11, 0, 0, 0, 0, 0]))), "pinhole")
+    assert 300 < rectification.rig.left.fx < 500
+    assert rectification.left.mask.mean() > 0.99
+
+
 def test_a_rectified_pair_stays_as_it_is() -> None:
     rig = pinhole_rig()
     rectification = rectify(rig, "pinhole")
