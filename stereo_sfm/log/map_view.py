@@ -48,6 +48,11 @@ class MapView:
         self.point_ids, self.points = ids[order], points[order]
 
     @property
+    def keyframes(self) -> int:
+        """How many there are."""
+        return len(self._poses)
+
+    @property
     def trajectory(self) -> F64:
         """(K, 4, 4) map_T_kf in the order of their ids."""
         return np.array([self._poses[k] for k in sorted(self._poses)]).reshape(-1, 4, 4)

@@ -37,8 +37,12 @@ from stereo_sfm.types import (
     Trajectory,
 )
 
-TRAJECTORY_NS = 1_000_000_000  # the keyframe trajectory and the edges at most so often
-POINTS_NS = 5_000_000_000  # the whole map at most so often
+# The whole trajectory with its edges, and the whole map, at most so often; less often as they grow, so that they take
+# no more room a second in a long run.
+TRAJECTORY_NS = 1_000_000_000
+TRAJECTORY_SIZE = 200  # keyframes
+POINTS_NS = 5_000_000_000
+POINTS_SIZE = 50_000
 OLD_TRACK = 30  # frames after which a track's colour no longer changes
 NAN = float("nan")
 
@@ -328,10 +332,10 @@ class RunLog(NoRunLog):
         self._map.update(update)
         stamp = self._last[0]
         if self._next_trajectory_ns is None or stamp >= self._next_trajectory_ns:
-            self._next_trajectory_ns = stamp + TRAJECTORY_NS
+            self._next_trajectory_ns = stamp + _interval(TRAJECTORY_NS, self._map.keyframes, TRAJECTORY_SIZE)
             self._show_trajectory()
         if self._next_points_ns is None or stamp >= self._next_points_ns:
-            self._next_points_ns = stamp + POINTS_NS
+            self._next_points_ns = stamp + _interval(POINTS_NS, len(self._map.points), POINTS_SIZE)
             self._show_points()
 
     def _show_trajectory(self) -> None:
@@ -369,6 +373,11 @@ class RunLog(NoRunLog):
         (Health, health),
         (StageTimes, stage_times),
     )
+
+
+def _interval(shortest_ns: int, size: int, usual: int) -> int:
+    """Nanoseconds to the next time something is shown whole."""
+    return shortest_ns * max(size, usual) // usual
 
 
 def _age_colors(age: I32, inlier: Any) -> F32:

@@ -6,6 +6,7 @@ import logging
 import resource
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,7 @@ from mcap.stream_reader import StreamReader
 
 from drivers import open_source
 from stereo_sfm.cli import main
-from stereo_sfm.config import Config
+from stereo_sfm.config import Config, from_dict
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.log import foxglove, schema, topics
@@ -213,7 +214,6 @@ def test_covariance_turns_into_the_axes_of_odom() -> None:
     mean = frame.odom_T_cam @ se3.inverse(rig.body_T_left)
     turns = se3.so3_log(bodies[:, :3, :3] @ mean[:3, :3].T)
     sampled = np.cov(np.hstack([bodies[:, :3, 3] - mean[:3, 3], turns]).T)
-    from dataclasses import replace
     from tempfile import TemporaryDirectory
 
     with TemporaryDirectory() as folder:
@@ -254,6 +254,26 @@ def test_points_trajectory_and_edges_are_the_map_at_the_end(run: Path) -> None:
     assert len(lines["covisibility"]) == 2 * 9  # each keyframe shares 30 of 40 points with the one before
 
 
+def test_what_is_shown_whole_comes_less_often_as_it_grows(tmp_path: Path) -> None:
+    """A run of 1,000 keyframes, three a second: the trajectory takes no more room a second at the end."""
+    path, eye = tmp_path / "a.mcap", np.eye(4)
+    config = from_dict({"loop": {"enabled": False}})
+    log = RunLog(LogWriter(path), fisheye_rig(), config, source="t", mode="inline", image_format="none")
+    none, nothing = np.zeros(0, np.int64), np.zeros((0, 2))
+    for k in range(1000):
+        keyframe = replace(_keyframe(0), kf_id=k, stamp_ns=START_NS + k * 333_333_333, point_ids=none, uv_left=nothing)
+        log.put(keyframe)
+        pairs = nothing.astype(np.int64)
+        log.put(MapUpdate(k + 1, k, np.array([k]), eye[None].copy(), none, np.zeros((0, 3)), none, pairs, eye.copy()))
+    log.close()
+    shown = _all(path, topics.TRAJECTORY, PosesInFrame)
+    stamps = np.array([foxglove.stamp_of(m) for m in shown[:-1]])
+    sizes = np.array([len(m.poses) for m in shown[:-1]])
+    assert np.diff(stamps)[0] <= 1_100_000_000 and np.diff(stamps)[-1] > 4_000_000_000
+    rates = sizes[:-1] / (np.diff(stamps) / 1e9)
+    assert rates.max() < 250 and len(shown[-1].poses) == 1000
+
+
 def test_features_are_where_the_tracker_saw_them(run: Path) -> None:
     messages = _all(run, topics.FEATURES, ImageAnnotations)
     for i in (0, 31):
@@ -288,8 +308,6 @@ def test_stats_are_flat_and_keep_what_they_do_not_know(run: Path) -> None:
 
 
 def test_a_run_without_loops_or_mapping_waits_for_nothing(tmp_path: Path) -> None:
-    from stereo_sfm.config import from_dict
-
     config = from_dict({"loop": {"enabled": False}})
     log = RunLog(LogWriter(tmp_path / "a.mcap"), fisheye_rig(), config, source="t", mode="inline", image_format="none")
     for k in range(3):
