@@ -1,0 +1,165 @@
+"""The default tracker on real and simulated walks, and on what goes wrong in a store."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.rig import Rig
+from drivers.rectified import RectifiedSource
+from drivers.source import Source, open_source
+from stereo_sfm.config import load
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.eval.evaluate import evaluate
+from stereo_sfm.geometry import se3
+from stereo_sfm.tracking.tracker import Tracker
+from stereo_sfm.types import Frame, StereoImage, TrackState, Trajectory
+
+Change = Callable[[Iterator[StereoImage]], Iterator[StereoImage]]
+CONFIG = load().tracker
+
+
+def track(source: Source, count: int | None = None, change: Change | None = None) -> list[Frame]:
+    with source:
+        tracker = Tracker(CONFIG, source.rig)
+        images = islice(source, count)
+        return [tracker.step(image)[0] for image in (change(images) if change else images)]
+
+
+def ate_mm(frames: list[Frame], truth: Trajectory | None) -> float:
+    assert truth is not None
+    good = [f for f in frames if f.state in (TrackState.OK, TrackState.RECOVERED)]
+    estimate = Trajectory(np.array([f.stamp_ns for f in good]), np.array([f.odom_T_cam for f in good]))
+    return evaluate(estimate, truth).ape_m.rmse * 1e3
+
+
+def black(images: Iterator[StereoImage]) -> Iterator[StereoImage]:
+    """One fully black frame."""
+    for image in images:
+        dark = np.zeros_like(image.left)
+        yield dataclasses.replace(image, left=dark, right=dark.copy()) if image.frame_id == 30 else image
+
+
+def dropped(images: Iterator[StereoImage]) -> Iterator[StereoImage]:
+    """Five frames in a row are missing."""
+    return (image for image in images if not 30 <= image.frame_id < 35)
+
+
+def brighter(images: Iterator[StereoImage]) -> Iterator[StereoImage]:
+    """The exposure jumps up by half and back down to sixty percent."""
+    for image in images:
+        gain = 1.5 if 20 <= image.frame_id < 40 else 0.6 if image.frame_id >= 40 else 1.0
+        eyes = [np.clip(e.astype(float) * gain, 0, 255).astype(np.uint8) for e in (image.left, image.right)]
+        yield dataclasses.replace(image, left=eyes[0], right=eyes[1])
+
+
+@pytest.mark.parametrize("change", [None, black, dropped, brighter], ids=lambda c: c.__name__ if c else "as recorded")
+def test_euroc_and_what_goes_wrong(data_root: Path, change: Change | None) -> None:
+    source = open_source(data_root / "euroc_mh01")
+    frames = track(source, 70, change)
+    lost = [f for f in frames if f.state == TrackState.LOST]
+    assert len(lost) == (1 if change is black else 0)
+    assert all(f.reason == "dark" for f in lost)
+    assert ate_mm(frames, source.ground_truth) < 7.0
+    if change is black:
+        assert [f.state for f in frames if f.frame_id == 31] == [TrackState.RECOVERED]
+
+
+@pytest.mark.parametrize(
+    ("folder", "limit_percent"),
+    [("kitti", 0.4), ("rgbd_dataset_freiburg1_xyz", 1.2)],  # 2 cm of 1.79 m
+)
+def test_accuracy_of_odometry_alone(data_root: Path, folder: str, limit_percent: float) -> None:
+    source = open_source(data_root / folder)
+    frames = track(source)
+    assert all(f.state == TrackState.OK for f in frames)
+    assert source.ground_truth is not None
+    path = source.ground_truth.length if folder == "kitti" else 1.79
+    assert ate_mm(frames, source.ground_truth) / 1e3 / path * 100 < limit_percent
+
+
+@pytest.mark.parametrize("folder", ["tum_vi_room1", "t265_office"])
+def test_fisheyes_that_hardly_move(data_root: Path, folder: str) -> None:
+    source = open_source(data_root / folder)
+    with source:
+        tracker = Tracker(CONFIG, source.rig)
+        answers = [tracker.step(image) for image in source]
+    assert all(f.state == TrackState.OK for f, _ in answers)
+    assert np.abs(answers[-1][0].odom_T_cam[:3, 3]).max() < 0.1
+    keyframe = answers[0][1]
+    assert keyframe is not None
+    depth = np.linalg.norm(keyframe.points_cam, axis=1)
+    assert len(depth) > 40
+    assert 0.3 < np.percentile(depth, 5) < np.median(depth) < 8  # an office and a room
+
+
+@pytest.mark.parametrize("scene", ["sim:aisle?camera=fisheye&size=424x400", "sim:aisle?camera=pinhole"])
+def test_a_simulated_aisle(scene: str) -> None:
+    source = open_source(f"{scene}&frames=40")
+    frames = track(source)
+    assert all(f.state == TrackState.OK for f in frames)
+    assert ate_mm(frames, source.ground_truth) < 6.0
+
+
+def test_rectified_fisheye() -> None:
+    source = RectifiedSource(open_source("sim:aisle?camera=fisheye&size=424x400&frames=30"), "epipolar")
+    frames = track(source)
+    assert all(f.state == TrackState.OK for f in frames)
+    assert ate_mm(frames, source.ground_truth) < 6.0
+
+
+@pytest.mark.slow
+def test_people_crossing() -> None:
+    source = open_source("sim:people?frames=200")
+    frames = track(source)
+    assert all(f.state == TrackState.OK for f in frames)
+    assert ate_mm(frames, source.ground_truth) < 0.002 * 1e3 * 7
+
+
+def test_the_same_images_give_the_same_bits(data_root: Path) -> None:
+    a, b = (track(open_source(data_root / "euroc_mh01"), 25) for _ in range(2))
+    for x, y in zip(a, b, strict=True):
+        assert np.array_equal(x.odom_T_cam, y.odom_T_cam)
+        assert np.array_equal(x.observations.uv_right, y.observations.uv_right, equal_nan=True)
+
+
+def test_losing_track_for_long_begins_a_submap(data_root: Path) -> None:
+    def blind(images: Iterator[StereoImage]) -> Iterator[StereoImage]:
+        for image in images:
+            dark = np.zeros_like(image.left)
+            yield dataclasses.replace(image, left=dark, right=dark) if 10 <= image.frame_id < 35 else image
+
+    source = open_source(data_root / "euroc_mh01")
+    with source:
+        tracker = Tracker(CONFIG, source.rig)
+        answers = [tracker.step(image) for image in blind(islice(source, 45))]
+    states = [f.state for f, _ in answers]
+    assert states[35] == TrackState.RESTARTED
+    assert states[36:] == [TrackState.OK] * 9
+    assert next(k.submap_id for _, k in answers if k is not None and k.frame_id >= 35) >= 1
+    steps = np.linalg.norm(np.diff([f.odom_T_cam[:3, 3] for f, _ in answers], axis=0), axis=1)
+    assert steps.max() < 0.2  # the odometry pose never jumps
+
+
+def test_covariance_grows_where_little_is_seen(data_root: Path) -> None:
+    frames = track(open_source(data_root / "euroc_mh01"), 10)
+    assert all(np.linalg.eigvalsh(f.covariance).min() > 0 for f in frames[1:])
+
+
+def test_one_eye_is_refused_in_one_line() -> None:
+    from stereo_sfm.geometry.cameras import Pinhole
+
+    with pytest.raises(StereoSfmError, match="needs a stereo or RGB-D source"):
+        Tracker(CONFIG, Rig(Pinhole(640, 480, 400, 400, 320, 240)))
+
+
+def test_poses_are_rigid(data_root: Path) -> None:
+    for frame in track(open_source(data_root / "euroc_mh01"), 40):
+        rotation = frame.odom_T_cam[:3, :3]
+        assert np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-9
+        assert np.allclose(se3.inverse(frame.odom_T_cam) @ frame.odom_T_cam, np.eye(4))
