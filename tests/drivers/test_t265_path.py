@@ -88,7 +88,7 @@ def test_trajectory_continues_over_injected_faults(room: Content) -> None:
 
 @pytest.mark.slow
 def test_simulated_store_through_usb() -> None:
-    """45 frames of the store; the camera is unplugged in between and comes back as a new segment."""
+    """45 frames of the store, without and with faults."""
     content = source_content("sim:loop?frames=45", 45)
     error, length, lost, states = path_error(content, Faults(), 45)
     assert (lost, set(states)) == (0, {TrackState.OK})
