@@ -4,7 +4,7 @@ A shelf block is an axis-aligned box seen from its front: u runs to the viewer's
 levels are open slots between boards; each slot is a row of facings, walked like a one-dimensional grid.
 
 A hit is (t, id); `id` packs index << 12 | part << 7 | kind << 4 | face, so that two pixels show the same flat piece of
-surface exactly when their ids agree. The tables that all kernels take are described in world.Tables.
+surface exactly when their ids agree. The tables that all kernels take are described in tables.Tables.
 """
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportPrivateUsage=false

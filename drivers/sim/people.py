@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers.sim.render import NOTHING, Moving
-from drivers.sim.world import SKIN, Tables
+from drivers.sim.tables import Tables
+from drivers.sim.world import SKIN
 from stereo_sfm.types import F64
 
 

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 
 from calib.rig import Rig
+from drivers.sim.casting import cast, find_edges
 from drivers.sim.kernels import TARGET
-from drivers.sim.shading import cast, find_edges
-from drivers.sim.world import Tables
+from drivers.sim.tables import Tables
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.types import F32, F64, I32, I64
 

@@ -72,7 +72,7 @@ def _serpentine(layout: Layout, walk: int, returns: bool) -> F64:
 
 
 _STORE = Layout()
-_DARK = Effects(exposure_s=0.009, gain=0.14, drift=0.2, read_noise=3.0, shot_noise=0.35, black_level=6.0)
+_DARK = Effects(exposure_s=0.012, gain=0.3, drift=0.2, read_noise=3.5, shot_noise=0.3, black_level=6.0)
 
 SCENES: dict[str, Scene] = {
     "aisle": Scene(_STORE, _aisle, 14.0),
@@ -80,6 +80,7 @@ SCENES: dict[str, Scene] = {
     "identical-aisles": Scene(Layout(gondolas=5, gondola_length=8.0, identical=True), _serpentine, 1000.0),
     "people": Scene(_STORE, _loop, 42.0, people=7),
     "dark": Scene(_STORE, _loop, 42.0, _DARK),
+    "blank": Scene(Layout(fill=0.06), _loop, 42.0),
     "demo": Scene(Layout(gondolas=2, gondola_length=3.6, products=120), _loop, 21.0, gait=Gait(speed=1.05)),
     "big": Scene(Layout(gondolas=9, gondola_length=18.0, products=420), _serpentine, 1000.0),
 }

@@ -1,4 +1,4 @@
-"""Compiled shading: texture lookups through the ripmap, light of the lamps, shadow inside the shelves; image loops."""
+"""Compiled shading of a hit: which texture lies there, light of the lamps, shadow inside the shelves."""
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportPrivateUsage=false
 # pyright: reportConstantRedefinition=false, reportMissingTypeArgument=false
@@ -23,58 +23,7 @@ from drivers.sim.kernels import (
     njit_finite,
     to_shelf,
 )
-
-
-@njit_finite
-def _bilinear(data, base, lw, lh, i, j, s, t, wrap):
-    """Ripmap level (i, j) at (s, t) in [0, 1]; texel centres at (k + 0.5) / n."""
-    w, h = 1 << (lw - i), 1 << (lh - j)
-    stride = 2 << lw
-    x, y = s * w - 0.5, t * h - 0.5
-    x0, y0 = math.floor(x), math.floor(y)
-    fx, fy = x - x0, y - y0
-    xa, ya = int(x0), int(y0)
-    xb, yb = xa + 1, ya + 1
-    if wrap:
-        xa, xb, ya, yb = xa & (w - 1), xb & (w - 1), ya & (h - 1), yb & (h - 1)
-    else:
-        xa, xb = min(max(xa, 0), w - 1), min(max(xb, 0), w - 1)
-        ya, yb = min(max(ya, 0), h - 1), min(max(yb, 0), h - 1)
-    origin = base + ((2 << lh) - ((2 << lh) >> j)) * stride + (2 << lw) - ((2 << lw) >> i)
-    ra, rb = origin + ya * stride, origin + yb * stride
-    top = data[ra + xa] * (1 - fx) + data[ra + xb] * fx
-    low = data[rb + xa] * (1 - fx) + data[rb + xb] * fx
-    return top * (1 - fy) + low * fy
-
-
-@njit_finite
-def sample(w, k, s, t, fs, ft):
-    """Texture k at (s, t), filtered over a footprint (fs, ft) in the same units; 0..255."""
-    data, table = w.texels, w.textures
-    base, lw, lh, wrap = table[k, 0], table[k, 1], table[k, 2], table[k, 3]
-    if wrap:
-        s -= math.floor(s)
-        t -= math.floor(t)
-    i, j = 0, 0
-    fs *= 1 << lw
-    ft *= 1 << lh
-    while fs >= 2 and i < lw:
-        fs *= 0.5
-        i += 1
-    while ft >= 2 and j < lh:
-        ft *= 0.5
-        j += 1
-    a = min(max(fs - 1, 0.0), 1.0) if i < lw else 0.0
-    b = min(max(ft - 1, 0.0), 1.0) if j < lh else 0.0
-    value = _bilinear(data, base, lw, lh, i, j, s, t, wrap)
-    if a > 0:
-        value += a * (_bilinear(data, base, lw, lh, i + 1, j, s, t, wrap) - value)
-    if b > 0:
-        other = _bilinear(data, base, lw, lh, i, j + 1, s, t, wrap)
-        if a > 0:
-            other += a * (_bilinear(data, base, lw, lh, i + 1, j + 1, s, t, wrap) - other)
-        value += b * (other - value)
-    return value
+from drivers.sim.sampling import over_plane, sample
 
 
 @njit_finite
@@ -93,25 +42,16 @@ def _cave(w):
 
 
 @njit_finite
-def _flat(w, k, a, b, da, db, cos, size):
-    """Texture k over a plane: coordinates a, b in metres, ray slopes da, db along them, size = footprint across."""
-    wide, high = w.texture_sizes[k, 0], w.texture_sizes[k, 1]
-    ic2 = 1 / max(cos * cos, 1e-4)
-    fa, fb = size * math.sqrt(1 + da * da * ic2), size * math.sqrt(1 + db * db * ic2)
-    return sample(w, k, a / wide, b / high, fa / wide, fb / high)
-
-
-@njit_finite
 def _room(w, face, x, y, z, dx, dy, dz, size):
     if face == 0:
-        value = _flat(w, w.surfaces[0], x, y, dx, dy, dz, size)
-        wear = _flat(w, w.surfaces[1], x, y, dx, dy, dz, size)
+        value = over_plane(w, w.surfaces[0], x, y, dx, dy, dz, size)
+        wear = over_plane(w, w.surfaces[1], x, y, dx, dy, dz, size)
         return value * wear * (0.92 / 200) * _lamps(x, y)
     if face == 1:
-        return _flat(w, w.surfaces[2], x, y, dx, dy, dz, size)
+        return over_plane(w, w.surfaces[2], x, y, dx, dy, dz, size)
     if face <= 3:
-        return _flat(w, w.surfaces[3], y, -z, dy, dz, dx, size) * (0.6 + 0.1 * z)
-    return _flat(w, w.surfaces[3], x, -z, dx, dz, dy, size) * (0.6 + 0.1 * z)
+        return over_plane(w, w.surfaces[3], y, -z, dy, dz, dx, size) * (0.6 + 0.1 * z)
+    return over_plane(w, w.surfaces[3], x, -z, dx, dz, dy, size) * (0.6 + 0.1 * z)
 
 
 @njit_finite
@@ -144,7 +84,7 @@ def _solid(w, b, face, x, y, z, dx, dy, dz, size):
                 s = wide - s
         light = 0.68 + 0.1 * z
     if w.texture_sizes[k, 0] > 0:
-        return _flat(w, k, s, t, ds, dt, cos, size) * light
+        return over_plane(w, k, s, t, ds, dt, cos, size) * light
     ic2 = 1 / max(cos * cos, 1e-4)
     fs, ft = size * math.sqrt(1 + ds * ds * ic2), size * math.sqrt(1 + dt * dt * ic2)
     return sample(w, k, s / wide, t / high, fs / wide, ft / high) * light
@@ -157,16 +97,16 @@ def _shelf_part(w, b, part, face, x, y, z, dx, dy, dz, size):
     du, dw = kernels.turn_to_shelf(facing, dx, dy)
     k = w.blocks_i[b, 4 + face]
     if face == RAIL and w.levels[w.blocks_i[b, 2] + part, 1] - w.levels[w.blocks_i[b, 2] + part, 0] > 0.06:
-        return _flat(w, w.blocks_i[b, 4 + END], u, z, du, dz, dw, size) * 0.45  # kick plate
+        return over_plane(w, w.blocks_i[b, 4 + END], u, z, du, dz, dw, size) * 0.45  # kick plate
     if face == RAIL:
-        return _flat(w, k, u + 0.37 * b + 3.1 * z, -z, du, dz, dw, size) * (0.7 + 0.12 * z)
+        return over_plane(w, k, u + 0.37 * b + 3.1 * z, -z, du, dz, dw, size) * (0.7 + 0.12 * z)
     if face == BOARD:
-        return _flat(w, k, u, deep, du, dw, dz, size) * _cave(deep) * 0.9
+        return over_plane(w, k, u, deep, du, dw, dz, size) * _cave(deep) * 0.9
     if face == BACK:
-        return _flat(w, k, u, z, du, dz, dw, size) * _cave(deep) * 0.9
+        return over_plane(w, k, u, z, du, dz, dw, size) * _cave(deep) * 0.9
     if face == END:
-        return _flat(w, k, deep, z, dw, dz, du, size) * (0.6 + 0.1 * z)
-    return _flat(w, k, deep, z, dw, dz, du, size) * 0.4 * _cave(deep)
+        return over_plane(w, k, deep, z, dw, dz, du, size) * (0.6 + 0.1 * z)
+    return over_plane(w, k, deep, z, dw, dz, du, size) * 0.4 * _cave(deep)
 
 
 @njit_finite
@@ -291,98 +231,3 @@ def shade(w, moving, t, hit, ox, oy, oz, dx, dy, dz, angle):
     if kind == PERSON:
         return _person(w, moving, index, x, y, z, dx, dy, dz, size)
     return _target(w, moving, index, x, y, z, dx, dy, dz, size)
-
-
-@njit_finite
-def _ray(r, grid, du, dv, p, x, y):
-    """Direction in the world of the ray (x, y) px from the centre of pixel p."""
-    a, b, c = grid[p, 0], grid[p, 1], grid[p, 2]
-    if x != 0 or y != 0:
-        a += x * du[p, 0] + y * dv[p, 0]
-        b += x * du[p, 1] + y * dv[p, 1]
-        c += x * du[p, 2] + y * dv[p, 2]
-    return (
-        r[0, 0] * a + r[0, 1] * b + r[0, 2] * c,
-        r[1, 0] * a + r[1, 1] * b + r[1, 2] * c,
-        r[2, 0] * a + r[2, 1] * b + r[2, 2] * c,
-    )
-
-
-@njit_finite
-def cast(
-    w,
-    moving,
-    near,
-    world_T_eye,
-    pixels,
-    offsets,
-    keep,
-    grid,
-    du,
-    dv,
-    angles,
-    image,
-    depth,
-    ids,
-    ts,
-    hits,
-):
-    """What some pixels show, each the mean over one ray per offset, and what was there counted `keep` times.
-
-    Args:
-        near: groups and blocks by distance (render.Near). world_T_eye: (4, 4).
-        pixels: (M,) flat indices. offsets: (K, 2) px inside a pixel; one row for its centre alone.
-        grid, du, dv: (H * W, 3) bearings and their change per pixel. angles: (H * W,) radians a pixel gathers.
-        image, depth, ids: (H * W,) written: brightness; and with one offset distance along the ray (m), surface.
-        ts, hits: (N,) scratch; so many rays are traced, then shaded, which is faster than one by one.
-    """
-    r, ox, oy, oz = world_T_eye, world_T_eye[0, 3], world_T_eye[1, 3], world_T_eye[2, 3]
-    rays = offsets.shape[0]
-    block = ts.shape[0] // rays
-    narrow = 1 / math.sqrt(rays + keep)
-    for first in range(0, pixels.shape[0], block):
-        count = min(block, pixels.shape[0] - first)
-        for i in range(count * rays):
-            q = i % rays
-            dx, dy, dz = _ray(r, grid, du, dv, pixels[first + i // rays], offsets[q, 0], offsets[q, 1])
-            ts[i], hits[i] = kernels.trace(w, near, moving, ox, oy, oz, dx, dy, dz)
-        for i in range(count):
-            p = pixels[first + i]
-            total = 0.0
-            for q in range(rays):
-                k = i * rays + q
-                dx, dy, dz = _ray(r, grid, du, dv, p, offsets[q, 0], offsets[q, 1])
-                total += shade(
-                    w,
-                    moving,
-                    ts[k],
-                    hits[k],
-                    ox,
-                    oy,
-                    oz,
-                    dx,
-                    dy,
-                    dz,
-                    angles[p] * narrow,
-                )
-            image[p] = (total + keep * image[p]) / (rays + keep)
-            if rays == 1:
-                depth[p], ids[p] = ts[i], hits[i]
-
-
-@njit_finite
-def find_edges(image, ids, inner, contrast, out):
-    """Flat indices of `inner` pixels at which another surface, brighter or darker by `contrast`, begins -> count."""
-    h, wide, n = image.shape[0], image.shape[1], 0
-    for v in range(1, h - 1):
-        for u in range(1, wide - 1):
-            here, value = ids[v, u], image[v, u]
-            if inner[v, u] and (
-                (ids[v, u - 1] != here and abs(image[v, u - 1] - value) > contrast)
-                or (ids[v, u + 1] != here and abs(image[v, u + 1] - value) > contrast)
-                or (ids[v - 1, u] != here and abs(image[v - 1, u] - value) > contrast)
-                or (ids[v + 1, u] != here and abs(image[v + 1, u] - value) > contrast)
-            ):
-                out[n] = v * wide + u
-                n += 1
-    return n

@@ -16,8 +16,9 @@ from drivers.sim.people import figures
 from drivers.sim.render import Renderer, View
 from drivers.sim.rigs import make_rig
 from drivers.sim.scenes import SCENES, Scene, crowd
+from drivers.sim.tables import Tables
 from drivers.sim.walks import Walk
-from drivers.sim.world import Layout, Tables, build_world
+from drivers.sim.world import Layout, build_world
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, StereoImage, Trajectory

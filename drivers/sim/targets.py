@@ -9,7 +9,7 @@ import numpy as np
 from drivers.sim import textures
 from drivers.sim.atlas import Atlas
 from drivers.sim.render import NOTHING, Moving
-from drivers.sim.world import Tables, make_tables
+from drivers.sim.tables import Tables, make_tables
 from stereo_sfm.types import F64, U8
 
 
