@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
     spec = args.source or (before.source if before.image_format == "none" else str(path))
     frame_ids = tuple(f.frame_id for f in frames if _within(f, frames[0], args.until))
     choice = ReplayChoice(spec, frame_ids=frame_ids)
-    args.mode = "lockstep" if args.mode is None else args.mode
+    args.mode, args.realtime = args.mode or "lockstep", False
     args.log = args.log or "lean"
     config = _changed(before.config, args.set)
     code = execute(args, choice, config, MapFolders(), before.applied if follow else None)

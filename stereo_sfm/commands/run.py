@@ -83,6 +83,9 @@ def add_wiring_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("lockstep", "realtime"),
         help="lockstep waits for every stage (files); realtime drops what comes too fast (devices); default by source",
     )
+    parser.add_argument(
+        "--realtime", action="store_true", help="--mode realtime; recordings and sim: play at their own speed"
+    )
     parser.add_argument("--speed", type=float, metavar="X", help="play a recording as if live, X times as fast")
     parser.add_argument(
         "--log",
@@ -126,9 +129,10 @@ class SourceChoice:
         from stereo_sfm.demo import demo_recording
 
         spec = args.source if args.source is not None else str(demo_recording())
+        speed = args.speed or (1.0 if args.realtime and spec.split(":")[0] not in ("t265", "oak") else None)
         if Path(spec).exists():
             spec = str(Path(spec).resolve())  # the log says where the images are: a replay may start elsewhere
-        return SourceChoice(spec, args.rig, args.start, args.duration, args.frame_skip, args.max_frames, args.speed)
+        return SourceChoice(spec, args.rig, args.start, args.duration, args.frame_skip, args.max_frames, speed)
 
     def __call__(self) -> Source:
         """The source, not yet entered."""

@@ -198,3 +198,23 @@ def test_trajectory_of_the_wall_is_right() -> None:
     expected = 4 * np.minimum(np.arange(40), 40 - np.arange(40)) * depth / 200
     assert np.abs(x - expected).max() < 0.002
     assert isinstance(Trajectory(np.arange(40), np.array([f.odom_T_cam for f in frames])).length, float)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(20))
+def test_any_process_killed_at_any_time(seed: int, tmp_path: Path) -> None:
+    """At most half a second of frames is lost to the log, nobody is left behind."""
+    rng = np.random.default_rng(seed)
+    path, kill_at, seen = tmp_path / "run.mcap", int(rng.integers(5, 120)), 0
+    run = ProcessRun(functools.partial(SlidingWall, 5000, slow_s=0.005), CONFIG, log=LogOptions(path, "none"))
+    with pytest.raises(StageDied, match="was killed by SIGKILL") as died, run:  # noqa: PT012
+        pids = run.pids
+        stage = sorted(pids)[int(rng.integers(len(pids)))]
+        for seen, _ in enumerate(run, 1):
+            if seen == kill_at:
+                os.kill(pids[stage], signal.SIGKILL)
+    assert died.value.exit_code == 1
+    assert not any(psutil.pid_exists(pid) for pid in pids.values())
+    with LogReader(path) as reader:
+        logged = sum(1 for _ in reader.messages(["/frame"]))
+    assert logged >= seen - 15

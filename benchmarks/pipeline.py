@@ -1,0 +1,151 @@
+"""The whole pipeline on a recorded fisheye walk: frames a second, drops, latency, memory.
+
+    python -m benchmarks pipeline -- [--recording FILE.mcap] [--minutes 5]
+
+Without a recording, `sim:loop` (848x800, 30 Hz) is recorded first as raw images. The walk is played forwards and
+backwards, over and over, so that it can go on for minutes without a jump. First as fast as the stages can, then in real
+time at 30 Hz, with mapping, loops and logging on. Memory is the sum of the unique set sizes of all processes plus the
+shared image ring.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import functools
+import tempfile
+import time
+from collections.abc import Iterator
+from itertools import count
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+import psutil
+
+from drivers.paced import PacedSource
+from drivers.source import Source, open_source
+from stereo_sfm.config import Config
+from stereo_sfm.log.record import record
+from stereo_sfm.pipeline.processes import ProcessRun
+from stereo_sfm.pipeline.sinks import Health, StageTimes
+from stereo_sfm.pipeline.workers import LogOptions
+from stereo_sfm.types import Dropped, LoopResult, StereoImage
+
+PERIOD_NS = 33_333_333
+
+
+class PingPong:
+    """A recording held in memory, forwards and backwards, at 30 Hz."""
+
+    live, ground_truth = False, None
+
+    def __init__(self, path: str, frames: int) -> None:
+        self.name, self.frame_count = "ping-pong", frames
+        with open_source(path) as source:
+            self.rig = source.rig
+            self._images = list(source)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        return None
+
+    def __iter__(self) -> Iterator[StereoImage]:
+        n = len(self._images)
+        for k in count():
+            if k == self.frame_count:
+                return
+            at = k % (2 * n - 2)
+            image = self._images[at if at < n else 2 * n - 2 - at]
+            yield dataclasses.replace(image, frame_id=k, stamp_ns=1_000_000_000 + k * PERIOD_NS, dropped_before=0)
+
+
+def opened(path: str, frames: int, paced: bool) -> Source:
+    source = PingPong(path, frames)
+    return PacedSource(source) if paced else source
+
+
+class Numbers:
+    """What the stages say, as a sink."""
+
+    def __init__(self) -> None:
+        self.latency: list[float] = []
+        self.dropped = self.loops = 0
+        self.health: dict[str, Health] = {}
+
+    def put(self, message: object) -> None:
+        if isinstance(message, StageTimes) and "latency" in message.ms:
+            self.latency.append(message.ms["latency"])
+        elif isinstance(message, Dropped):
+            self.dropped += message.count
+        elif isinstance(message, LoopResult):
+            self.loops += message.candidate_kf_id >= 0
+        elif isinstance(message, Health):
+            self.health[message.stage] = message
+
+
+def memory_mb(run: ProcessRun) -> float:
+    """Unique set sizes of the stages but capture's recording in memory, which a camera would not have."""
+    total = psutil.Process().memory_full_info().uss
+    for stage, pid in run.pids.items():
+        if stage != "capture" and psutil.pid_exists(pid):
+            total += psutil.Process(pid).memory_full_info().uss
+    return total / 2**20
+
+
+def play(path: str, frames: int, paced: bool, folder: Path) -> None:
+    numbers, memory = Numbers(), list[tuple[float, float]]()
+    log = folder / f"{'realtime' if paced else 'fast'}.mcap"
+    with ProcessRun(
+        functools.partial(opened, path, frames, paced), Config(), [numbers], log=LogOptions(log, "raw")
+    ) as run:
+        begin = last = time.monotonic()
+        first = 0.0
+        done = 0
+        for done, _ in enumerate(run, 1):
+            now = time.monotonic()
+            first = first or now
+            if now - last > 5:
+                last = now
+                memory.append((now - begin, memory_mb(run)))
+        seconds = time.monotonic() - first
+    mode = "real time, 30 Hz" if paced else "as fast as it goes"
+    print(
+        f"{mode}: {done} of {frames} frames, {done / seconds:.1f} frames/s, {numbers.dropped} dropped, {numbers.loops} loops"
+    )
+    if paced:
+        p50, p95, p99 = np.percentile(numbers.latency[30:], (50, 95, 99))
+        print(f"  image to pose: p50 {p50:.1f} ms, p95 {p95:.1f} ms, p99 {p99:.1f} ms")
+    for stage, health in sorted(numbers.health.items()):
+        print(f"  {stage}: p50 {health.p50_ms:.1f} ms, p95 {health.p95_ms:.1f} ms, {health.rate:.1f} a second")
+    if memory:
+        print("  memory MiB: " + ", ".join(f"{s:.0f} s {mb:.0f}" for s, mb in memory[:: max(len(memory) // 10, 1)]))
+    print(f"  log {log.stat().st_size / 2**20 / max(seconds, 1e-9):.1f} MiB/s")
+    log.unlink()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--recording", help="raw MCAP recording of sim:loop")
+    parser.add_argument("--frames", type=int, default=600, help="of sim:loop to record when there is no recording")
+    parser.add_argument("--minutes", type=float, default=1.0)
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        path = args.recording or str(folder / "loop.mcap")
+        if args.recording is None:
+            with open_source(f"sim:loop?frames={args.frames}") as source:
+                for _ in record(source, Path(path), "raw"):
+                    pass
+        frames = round(args.minutes * 60 * 30)
+        for paced in (False, True):
+            play(path, frames, paced, folder)
+
+
+if __name__ == "__main__":
+    main()
