@@ -107,7 +107,8 @@ def play(path: str, frames: int, paced: bool, folder: Path) -> None:
         begin = last = time.monotonic()
         first = 0.0
         done = 0
-        for done, _ in enumerate(run, 1):
+        for _ in run:
+            done += 1
             now = time.monotonic()
             first = first or now
             if now - last > 5:
@@ -115,9 +116,8 @@ def play(path: str, frames: int, paced: bool, folder: Path) -> None:
                 memory.append((now - begin, memory_mb(run)))
         seconds = time.monotonic() - first
     mode = "real time, 30 Hz" if paced else "as fast as it goes"
-    print(
-        f"{mode}: {done} of {frames} frames, {done / seconds:.1f} frames/s, {numbers.dropped} dropped, {numbers.loops} loops"
-    )
+    print(f"{mode}: {done} of {frames} frames, {done / seconds:.1f} frames/s, {numbers.dropped} dropped")
+    print(f"  {numbers.loops} loops closed")
     if paced:
         p50, p95, p99 = np.percentile(numbers.latency[30:], (50, 95, 99))
         print(f"  image to pose: p50 {p50:.1f} ms, p95 {p95:.1f} ms, p99 {p99:.1f} ms")

@@ -129,7 +129,9 @@ class SourceChoice:
         from stereo_sfm.demo import demo_recording
 
         spec = args.source if args.source is not None else str(demo_recording())
-        speed = args.speed or (1.0 if args.realtime and spec.split(":")[0] not in ("t265", "oak") else None)
+        speed: float | None = getattr(args, "speed", None)
+        if speed is None and getattr(args, "realtime", False) and spec.split(":")[0] not in ("t265", "oak"):
+            speed = 1.0
         if Path(spec).exists():
             spec = str(Path(spec).resolve())  # the log says where the images are: a replay may start elsewhere
         return SourceChoice(spec, args.rig, args.start, args.duration, args.frame_skip, args.max_frames, speed)
@@ -172,7 +174,8 @@ def execute(
     record, pictures = RunRecord(), _match_pictures(getattr(args, "matches", None))
     sinks = [record] if pictures is None else [record, pictures]
     # Images reach the sinks only where the stages share this process.
-    wiring = Wiring(args.inline or pictures is not None, args.mode, args.log, args.image_format, args.viz)
+    mode = "realtime" if args.realtime else args.mode
+    wiring = Wiring(args.inline or pictures is not None, mode, args.log, args.image_format, args.viz)
     with Session(choice, config, sinks, wiring, folders, args.output, args.overwrite, applied) as session:
         if pictures is not None:
             pictures.folder = session.folder / "matches"
