@@ -125,7 +125,8 @@ def _lost(intervals: list[dict[str, Any]]) -> str:
 def _loops(stats: dict[str, Any]) -> str:
     reasons = ", ".join(f"{count} {reason.replace('_', ' ')}" for reason, count in stats["loops_rejected"].items())
     rejected = sum(stats["loops_rejected"].values())
-    text = f"{stats['loops_accepted']} loops accepted / {rejected} candidates rejected" + (
+    noun = "loop" if stats["loops_accepted"] == 1 else "loops"
+    text = f"{stats['loops_accepted']} {noun} accepted / {rejected} candidates rejected" + (
         f" ({reasons})" if reasons else ""
     )
     drift = stats["closure_drift_percent_median"]

@@ -18,7 +18,7 @@ FILES = ("run.mcap", "run.rrd", *TRAJECTORIES, "keyframes.tum", "config.toml", "
 
 def default_folder(source_name: str, now: datetime) -> Path:
     """runs/2026-08-21_101500_store12."""
-    slug = re.sub(r"[^A-Za-z0-9.-]+", "_", source_name).strip("_") or "run"
+    slug = re.sub(r"[^A-Za-z0-9.-]+", "_", source_name.removesuffix(".mcap")).strip("_") or "run"
     return Path("runs") / f"{now:%Y-%m-%d_%H%M%S}_{slug}"
 
 
