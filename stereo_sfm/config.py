@@ -95,8 +95,8 @@ class MapperConfig:
     enabled: bool = True
     window_keyframes: int = 12  # keyframes that local bundle adjustment moves, the new one included; 0: all connected
     connected_points: int = 15  # shared points that make two keyframes neighbours
-    sigma_px: float = 0.3  # noise of one coordinate of a tracked point
-    huber: float = 1.0  # sigmas; narrow, for depths near edges err to one side and would bend the scale
+    sigma_px: float = 0.4  # noise of one coordinate of a tracked point
+    huber: float = 0.75  # sigmas; narrow, for depths near edges err to one side and would bend the scale
     rounds: int = 2  # of bundle adjustment, outliers are judged between them
     iterations: int = 5  # of a round
     association: str = "map"  # "tracks": identity only; "map": also by descriptors; "previous": the retail paper's rule
@@ -142,14 +142,15 @@ class LoopConfig:
     min_cells: int = 8  # of the 8 x 6 cells of the image that hold inliers
     consistent: int = 2  # successive keyframes that must agree on a loop
     consistent_window: int = 4  # ... within so many keyframes
+    unknown_way_share: float = 0.2  # share of inliers asked for where tracking broke and odometry cannot speak for a loop
     gate_metres: float = 0.3  # a loop may contradict odometry by this much ...
     gate_per_metre: float = 0.01  # ... plus this for every metre walked since
     gate_degrees: float = 3.0
     gate_degrees_per_metre: float = 0.3
-    relocalize_candidates: int = 8  # places of a saved map that are verified
+    relocalize_candidates: int = 16  # places of a saved map that are verified
     relocalize_keyframes: int = 6  # keyframes whose points make up a place
-    relocalize_inliers: int = 25  # points that must agree with the pose found in a saved map
-    relocalize_share: float = 0.27  # ... and so large a share of the camera's described points
+    relocalize_inliers: int = 48  # points that must agree with the pose found in a saved map
+    relocalize_share: float = 0.08  # ... and so large a share of the camera's described points
     relocalize_cells: int = 6  # ... in so many of the image's 8 x 6 cells
     seed: int = 0
 
