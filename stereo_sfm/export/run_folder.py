@@ -13,7 +13,8 @@ from stereo_sfm.errors import StereoSfmError
 
 TRAJECTORIES = ("trajectory_odom.tum", "trajectory_odom.kitti", "trajectory_map.tum", "trajectory_map.kitti")
 PICTURES = ("trajectory.png", "errors.png", "tracking.png", "times.png")
-FILES = ("run.mcap", "run.rrd", *TRAJECTORIES, "keyframes.tum", "config.toml", "rig.yaml", "stats.json", "report.md", *PICTURES)
+NUMBERS = ("keyframes.tum", "config.toml", "rig.yaml", "stats.json", "report.md")
+FILES = ("run.mcap", "run.rrd", *TRAJECTORIES, *NUMBERS, *PICTURES)
 
 
 def default_folder(source_name: str, now: datetime) -> Path:
