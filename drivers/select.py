@@ -47,6 +47,11 @@ class SelectedFrames:
         self.live: bool = self.source.live
         self.frame_count: int | None = self._count()
 
+    @property
+    def counters(self) -> dict[str, float]:
+        """What a live source counts about itself (drivers.live.counters); empty for files."""
+        return getattr(self.source, "counters", {})
+
     def _count(self) -> int | None:
         """At most so many frames; None where the part depends on stamps that are not read yet."""
         count = self.source.frame_count

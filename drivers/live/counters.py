@@ -26,6 +26,16 @@ COUNTERS: dict[str, str] = {
     "clock_uncertainty_us": "half the round trip of the last accepted clock reading",
 }
 
+# Those that are not 0 only when something went wrong.
+TROUBLE = frozenset(COUNTERS) - {
+    "pairs",
+    "segments",
+    "imu_samples",
+    "wheel_samples",
+    "temperature_c",
+    "clock_uncertainty_us",
+}
+
 
 class Counters(dict[str, float]):
     """Counts that several threads add to. Reading is reading a dict."""

@@ -13,7 +13,7 @@ from typing import Protocol, Self
 from calib.rig import Rig
 from drivers.live.buffers import Handoff, MotionBuffer, WheelBuffer
 from drivers.live.clock import ClockMap, TimeLine
-from drivers.live.counters import Counters
+from drivers.live.counters import TROUBLE, Counters
 from drivers.live.errors import DeviceError, DeviceLost, FirmwareMissing
 from drivers.live.pairing import Pair, periods
 from stereo_sfm.types import ImuSamples, StereoImage, Trajectory
@@ -80,6 +80,7 @@ class LiveSource(ABC):
         self._frame_id = 0
         self._segment_frames = 0
         self._unsaid, self._quiet_until = 0, 0.0
+        self._summed_up = False
 
     # ---- what a camera brings
 
@@ -110,8 +111,14 @@ class LiveSource(ABC):
         self.close()
 
     def close(self) -> None:
-        """Stop streaming and give the camera back."""
+        """Stop streaming, give the camera back, and say in one line what was counted."""
         self._shut(camera_alive=True)
+        trouble = {k: v for k, v in self.counters.items() if v and k in TROUBLE}
+        if self._frame_id and not self._summed_up:
+            self._summed_up = True
+            said = ", ".join(f"{name} {count:.0f}" for name, count in trouble.items()) or "nothing lost"
+            level = logging.WARNING if trouble else logging.INFO
+            logger.log(level, "%s: %d stereo images, %s", self._title, self._frame_id, said)
 
     def push_wheel(
         self, linear: tuple[float, float, float], angular: tuple[float, float, float], host_ns: int | None = None

@@ -62,6 +62,7 @@ def record(
                 yield Progress(frames, dropped, (image.stamp_ns - first_ns) / 1e9, writer.bytes_written)
         finally:
             if not writer.closed:
-                writer.metadata(TOTALS, images.totals)
+                counted = {name: f"{value:g}" for name, value in getattr(source, "counters", {}).items() if value}
+                writer.metadata(TOTALS, counted | images.totals)
     if not frames:
         raise StereoSfmError(f"{source.name} gave no image: {path} holds only its calibration")
