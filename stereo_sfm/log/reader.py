@@ -19,7 +19,8 @@ from mcap.records import Attachment, Channel, Schema, Statistics
 from mcap.summary import Summary
 
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.log import repair
+from stereo_sfm.log import scan
+from stereo_sfm.log.index import tail
 from stereo_sfm.types import I64
 
 log = logging.getLogger("stereo_sfm")
@@ -88,7 +89,7 @@ class LogReader:
         self.truncated = ""
         self._times: dict[int, I64] | None = None
         try:
-            repair.check_magic(self._stream, path)
+            scan.check_magic(self._stream, path)
             self._reader, self.summary = self._open()
         except OSError as error:
             self._stream.close()
@@ -99,16 +100,16 @@ class LogReader:
 
     def _open(self) -> tuple[SeekingReader, Summary]:
         self._bytes: Any = self._stream  # what the reader sees: the file, or the file with the index it lacks
-        index_is_whole = repair.summary_is_whole(self._stream)
+        index_is_whole = scan.summary_is_whole(self._stream)
         self._stream.seek(0)
         try:
             reader = SeekingReader(self._stream, validate_crcs=True)
             summary = reader.get_summary()
             if summary is not None and index_is_whole and _complete(summary):
                 return reader, summary
-        except (*repair.DAMAGE, OSError, StopIteration):  # OSError: the file is shorter than its footer
+        except (*scan.DAMAGE, OSError, StopIteration):  # OSError: the file is shorter than its footer
             pass
-        index = repair.build_index(self._stream)
+        index = scan.build_index(self._stream)
         if not index.closed:
             self.truncated = f"truncated, {index.messages} messages recovered"
         elif not index_is_whole:
@@ -117,7 +118,7 @@ class LogReader:
             self.truncated += f"{', ' if self.truncated else ''}{len(index.bad_chunks)} damaged chunks left out"
         if self.truncated:
             log.warning("%s: %s ('stereo-sfm recover' writes a mended copy)", self.path, self.truncated)
-        self._bytes = _Mended(self._stream, index.end, repair.tail(index))
+        self._bytes = _Mended(self._stream, index.end, tail(index))
         reader = SeekingReader(self._bytes, validate_crcs=True)
         summary = reader.get_summary()
         assert summary is not None
@@ -167,7 +168,7 @@ class LogReader:
         try:
             for schema, channel, m in found:
                 yield Record(channel.topic, channel, schema, m.log_time, m.publish_time, m.sequence, m.data)
-        except repair.DAMAGE as error:
+        except scan.DAMAGE as error:
             raise self._damaged(error) from None
 
     def _damaged(self, error: BaseException) -> StereoSfmError:
@@ -182,7 +183,7 @@ class LogReader:
         if self._times is None:
             try:
                 self._times = self._read_message_indexes()
-            except repair.DAMAGE as error:
+            except scan.DAMAGE as error:
                 raise self._damaged(error) from None
         ids = [c.id for c in self.summary.channels.values() if c.topic == topic]
         return np.sort(np.concatenate([self._times.get(i, np.zeros(0, np.int64)) for i in ids] or [[]])).astype(
@@ -200,7 +201,7 @@ class LogReader:
                 _, length, channel_id, size = struct.unpack_from("<BQHI", data, at)
                 pairs = np.frombuffer(data, "<u8", size // 8, at + struct.calcsize("<BQHI"))
                 found.setdefault(channel_id, []).append(pairs[::2].astype(np.int64))
-                at += repair.PREFIX + length
+                at += scan.PREFIX + length
         return {channel_id: np.concatenate(parts) for channel_id, parts in found.items()}
 
     def attachment(self, name: str) -> bytes | None:
@@ -212,10 +213,10 @@ class LogReader:
             raw: bytes = self._bytes.read(entry.length)
             try:
                 crc = struct.unpack("<I", raw[-4:])[0]
-                if crc and crc != zlib.crc32(raw[repair.PREFIX : -4]):
+                if crc and crc != zlib.crc32(raw[scan.PREFIX : -4]):
                     raise ValueError("its checksum is wrong")
-                return Attachment.read(ReadDataStream(io.BytesIO(raw[repair.PREFIX :]))).data
-            except repair.DAMAGE as error:
+                return Attachment.read(ReadDataStream(io.BytesIO(raw[scan.PREFIX :]))).data
+            except scan.DAMAGE as error:
                 log.warning("%s: the attached %s is damaged (%s) and left out", self.path, name, error)
         return None
 
@@ -226,7 +227,7 @@ class LogReader:
             for record in self._reader.iter_metadata():
                 if record.name == name:
                     out.update(record.metadata)
-        except repair.DAMAGE as error:
+        except scan.DAMAGE as error:
             log.warning("%s: metadata is damaged (%s) and left out", self.path, error)
         return out
 

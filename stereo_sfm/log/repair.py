@@ -1,327 +1,21 @@
-"""Files that were not closed: find what is whole, and make the index (MCAP's summary section) that is missing.
+"""Mend files that were not closed.
 
 One mechanism, three uses: `recover` copies the whole records and appends the index, a full disk cuts the file back and
-appends it, and the reader puts it behind the file in memory. MCAP specification: mcap.dev/spec.
+appends it, and the reader (`log.reader`) puts it behind the file in memory.
 """
 
 from __future__ import annotations
 
-import struct
-import zlib
-from collections import Counter
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
-from io import BytesIO
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO
 
-from mcap.data_stream import ReadDataStream, RecordBuilder
-from mcap.exceptions import McapError
+from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.reader import SeekingReader
-from mcap.records import (
-    Attachment,
-    AttachmentIndex,
-    Channel,
-    Chunk,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Message,
-    MessageIndex,
-    Metadata,
-    MetadataIndex,
-    Schema,
-    Statistics,
-)
-from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC
-from zstandard import ZstdError
 
-from stereo_sfm.errors import StereoSfmError
-
-PREFIX = 9  # opcode and length
-FOOTER_SIZE = PREFIX + 20
-_LAST_OPCODE = 0x0F
-# What broken bytes raise inside the library's parsers.
-DAMAGE = (
-    McapError,
-    ZstdError,
-    RuntimeError,  # lz4
-    ValueError,
-    struct.error,
-    EOFError,
-    KeyError,
-    MemoryError,
-    OverflowError,
-)
-
-
-@dataclass(frozen=True)
-class Span:
-    """Where a record lies in the file."""
-
-    opcode: int
-    offset: int
-    length: int  # with opcode and length bytes
-
-    @property
-    def end(self) -> int:
-        return self.offset + self.length
-
-
-@dataclass
-class Index:
-    """What a summary section is made of."""
-
-    end: int  # of the last whole record of the data section
-    closed: bool = False  # the file has its end mark
-    schemas: dict[int, Schema] = field(default_factory=dict[int, Schema])
-    channels: dict[int, Channel] = field(default_factory=dict[int, Channel])
-    chunks: list[ChunkIndex] = field(default_factory=list[ChunkIndex])
-    chunk_counts: list[dict[int, int]] = field(default_factory=list[dict[int, int]])  # messages per channel, per chunk
-    attachments: list[AttachmentIndex] = field(default_factory=list[AttachmentIndex])
-    metadata: list[MetadataIndex] = field(default_factory=list[MetadataIndex])
-    loose: list[tuple[int, int]] = field(default_factory=list[tuple[int, int]])  # (channel, log time) outside chunks
-    bad_chunks: list[Span] = field(default_factory=list[Span])
-    lost_message_index: bytes = b""  # of the last chunk, when it was cut off; it belongs at `end`
-
-    @property
-    def counts(self) -> dict[int, int]:
-        """Messages per channel."""
-        total = Counter(channel for channel, _ in self.loose)
-        for counts in self.chunk_counts:
-            total.update(counts)
-        return dict(sorted(total.items()))
-
-    @property
-    def messages(self) -> int:
-        """Messages found."""
-        return sum(self.counts.values())
-
-    @property
-    def time_range(self) -> tuple[int, int]:
-        """First and last log time."""
-        times = [t for _, t in self.loose]
-        times += [t for c in self.chunks for t in (c.message_start_time, c.message_end_time)]
-        return (min(times), max(times)) if times else (0, 0)
-
-    def drop_last_chunk(self) -> None:
-        """Forget the last chunk and everything behind it."""
-        self.end = self.chunks.pop().chunk_start_offset
-        self.chunk_counts.pop()
-        self.attachments = [a for a in self.attachments if a.offset < self.end]
-        self.metadata = [m for m in self.metadata if m.offset < self.end]
-        self.lost_message_index = b""
-
-
-def check_magic(stream: IO[bytes], path: Path) -> None:
-    """Raises StereoSfmError when the file is no MCAP file."""
-    stream.seek(0)
-    start = stream.read(len(MCAP0_MAGIC))
-    if not start:
-        raise StereoSfmError(f"{path} is empty")
-    if start != MCAP0_MAGIC:
-        raise StereoSfmError(f"{path} is not an MCAP file")
-
-
-def spans(stream: IO[bytes], start: int = len(MCAP0_MAGIC)) -> Iterator[Span]:
-    """Whole records from `start` on, until the bytes stop making sense."""
-    size = stream.seek(0, 2)
-    offset = start
-    while offset + PREFIX <= size:
-        stream.seek(offset)
-        opcode, length = struct.unpack("<BQ", stream.read(PREFIX))
-        end = offset + PREFIX + length
-        if end > size or not (1 <= opcode <= _LAST_OPCODE or opcode >= 0x80):
-            return
-        yield Span(opcode, offset, PREFIX + length)
-        offset = end
-
-
-def read_span(stream: IO[bytes], span: Span) -> bytes:
-    """A record's bytes, with its prefix."""
-    stream.seek(span.offset)
-    return stream.read(span.length)
-
-
-def _content(stream: IO[bytes], span: Span) -> ReadDataStream:
-    stream.seek(span.offset + PREFIX)
-    return ReadDataStream(BytesIO(stream.read(span.length - PREFIX)))
-
-
-def build_index(stream: IO[bytes]) -> Index:
-    """Read every record of the data section. Chunks whose checksum is wrong are listed in `bad_chunks` and left out."""
-    index = Index(end=len(MCAP0_MAGIC))
-    index.schemas, index.channels = _listed_at_the_end(stream)
-    for span in spans(stream):
-        if span.opcode in (Opcode.DATA_END, Opcode.FOOTER):
-            index.closed = _ends_well(stream)
-            break
-        try:
-            _add_record(index, stream, span)
-        except DAMAGE:
-            if span.opcode != Opcode.CHUNK:
-                break
-            index.bad_chunks.append(span)
-        index.end = span.end
-    if not index.closed and index.chunks:
-        _mend_last_message_index(index, stream)
-    return index
-
-
-def _mend_last_message_index(index: Index, stream: IO[bytes]) -> None:
-    """The records that index the messages of the last chunk may be missing or cut off: make them again."""
-    chunk = index.chunks[-1]
-    if chunk.message_index_offsets.keys() == index.chunk_counts[-1].keys():
-        return
-    chunk_end = chunk.chunk_start_offset + chunk.chunk_length
-    if index.end != chunk_end + chunk.message_index_length:
-        return  # something else was written behind it
-    span = Span(Opcode.CHUNK, chunk.chunk_start_offset, chunk.chunk_length)
-    builder = RecordBuilder()
-    offset = 0
-    tables: dict[int, MessageIndex] = {}
-    for record in breakup_chunk(Chunk.read(_content(stream, span))):
-        if isinstance(record, Message):
-            table = tables.setdefault(record.channel_id, MessageIndex(channel_id=record.channel_id, records=[]))
-            table.records.append((record.log_time, offset))
-        single = RecordBuilder()
-        record.write(single)
-        offset += single.count
-    chunk.message_index_offsets.clear()
-    for channel_id, table in tables.items():
-        chunk.message_index_offsets[channel_id] = chunk_end + builder.count
-        table.write(builder)
-    chunk.message_index_length = builder.count
-    index.end = chunk_end
-    index.lost_message_index = builder.end()
-
-
-def _listed_at_the_end(stream: IO[bytes]) -> tuple[dict[int, Schema], dict[int, Channel]]:
-    """Schemas and channels of the summary section, if there is one: the chunk that first held them may be damaged."""
-    try:
-        if not summary_is_whole(stream):
-            return {}, {}
-        stream.seek(0)
-        summary = SeekingReader(stream).get_summary()
-    except (*DAMAGE, OSError, StopIteration):
-        return {}, {}
-    return (dict(summary.schemas), dict(summary.channels)) if summary is not None else ({}, {})
-
-
-def summary_is_whole(stream: IO[bytes]) -> bool:
-    """Whether the checksum of the summary section holds; True as well for a writer that made none.
-
-    The checksum covers the section and the footer up to itself.
-    """
-    size = stream.seek(0, 2)
-    footer_at = size - len(MCAP0_MAGIC) - FOOTER_SIZE
-    if footer_at < len(MCAP0_MAGIC):
-        return False
-    stream.seek(footer_at)
-    footer = stream.read(FOOTER_SIZE)
-    opcode, length, start, _, crc = struct.unpack("<BQQQI", footer)
-    if opcode != Opcode.FOOTER or length != FOOTER_SIZE - PREFIX or not 0 <= start <= footer_at:
-        return False
-    stream.seek(start)
-    return crc == 0 or start == 0 or zlib.crc32(footer[:-4], zlib.crc32(stream.read(footer_at - start))) == crc
-
-
-def _ends_well(stream: IO[bytes]) -> bool:
-    stream.seek(-len(MCAP0_MAGIC), 2)
-    return stream.read() == MCAP0_MAGIC
-
-
-def _add_record(index: Index, stream: IO[bytes], span: Span) -> None:
-    if span.opcode == Opcode.CHUNK:
-        _add_chunk(index, Chunk.read(_content(stream, span)), span)
-    elif span.opcode == Opcode.SCHEMA:
-        schema = Schema.read(_content(stream, span))
-        index.schemas[schema.id] = schema
-    elif span.opcode == Opcode.CHANNEL:
-        channel = Channel.read(_content(stream, span))
-        index.channels[channel.id] = channel
-    elif span.opcode == Opcode.MESSAGE:
-        message = Message.read(_content(stream, span), span.length - PREFIX)
-        index.loose.append((message.channel_id, message.log_time))
-    elif span.opcode == Opcode.MESSAGE_INDEX:
-        _add_message_index(index, MessageIndex.read(_content(stream, span)), span)
-    elif span.opcode == Opcode.ATTACHMENT:
-        a = Attachment.read(_content(stream, span))
-        index.attachments.append(
-            AttachmentIndex(span.offset, span.length, a.log_time, a.create_time, len(a.data), a.name, a.media_type)
-        )
-    elif span.opcode == Opcode.METADATA:
-        index.metadata.append(MetadataIndex(span.offset, span.length, Metadata.read(_content(stream, span)).name))
-
-
-def _add_chunk(index: Index, chunk: Chunk, span: Span) -> None:
-    counts: dict[int, int] = {}
-    for record in breakup_chunk(chunk, validate_crc=True):
-        if isinstance(record, Schema):
-            index.schemas[record.id] = record
-        elif isinstance(record, Channel):
-            index.channels[record.id] = record
-        elif isinstance(record, Message):
-            if record.channel_id not in index.channels:
-                raise ValueError(f"channel {record.channel_id} is not declared")
-            counts[record.channel_id] = counts.get(record.channel_id, 0) + 1
-    index.chunk_counts.append(counts)
-    index.chunks.append(
-        ChunkIndex(
-            chunk_length=span.length,
-            chunk_start_offset=span.offset,
-            compression=chunk.compression,
-            compressed_size=len(chunk.data),
-            message_end_time=chunk.message_end_time,
-            message_index_length=0,
-            message_index_offsets={},
-            message_start_time=chunk.message_start_time,
-            uncompressed_size=chunk.uncompressed_size,
-        )
-    )
-
-
-def _add_message_index(index: Index, record: MessageIndex, span: Span) -> None:
-    if index.chunks and record.channel_id in index.channels:
-        chunk = index.chunks[-1]
-        chunk.message_index_offsets[record.channel_id] = span.offset
-        chunk.message_index_length += span.length
-
-
-def tail(index: Index) -> bytes:
-    """What belongs at `index.end`: lost message index, DataEnd, summary section, footer and end mark."""
-    head = RecordBuilder()
-    head.write(index.lost_message_index)
-    DataEnd(0).write(head)
-    start = index.end + head.count
-    body = RecordBuilder()
-    for group in (index.schemas.values(), index.channels.values(), [_statistics(index)]):
-        for record in group:
-            record.write(body)
-    for group in (index.chunks, index.attachments, index.metadata):
-        for record in group:
-            record.write(body)
-    data = body.end()
-    crc = zlib.crc32(struct.pack("<BQQQ", Opcode.FOOTER, 20, start, 0), zlib.crc32(data))
-    foot = RecordBuilder()
-    Footer(summary_start=start, summary_offset_start=0, summary_crc=crc).write(foot)
-    return head.end() + data + foot.end() + MCAP0_MAGIC
-
-
-def _statistics(index: Index) -> Statistics:
-    return Statistics(
-        attachment_count=len(index.attachments),
-        channel_count=len(index.channels),
-        channel_message_counts=index.counts,
-        chunk_count=len(index.chunks),
-        message_count=index.messages,
-        message_end_time=index.time_range[1],
-        message_start_time=index.time_range[0],
-        metadata_count=len(index.metadata),
-        schema_count=len(index.schemas),
-    )
+from stereo_sfm.log.index import Index, Span, tail
+from stereo_sfm.log.scan import build_index, check_magic, spans
 
 
 def finish_in_place(path: Path) -> int:
@@ -380,6 +74,12 @@ def recover(source: Path, target: Path) -> Index:
                     out.write(_declarations(found))
                 skipping = span.offset in bad or (skipping and span.opcode == Opcode.MESSAGE_INDEX)
                 if not skipping:
-                    out.write(read_span(stream, span))
+                    out.write(_read_span(stream, span))
     finish_in_place(target)
     return found
+
+
+def _read_span(stream: IO[bytes], span: Span) -> bytes:
+    """A record's bytes, with its prefix."""
+    stream.seek(span.offset)
+    return stream.read(span.length)

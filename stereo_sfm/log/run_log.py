@@ -1,11 +1,10 @@
-"""`RunLog`: everything a run says, as topics. A sink of the pipeline; `NoRunLog` is its null twin."""
+"""`RunLog`: everything a run says, as topics. A sink of the pipeline."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
 from collections import deque
-from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from stereo_sfm.log.image_log import ImageLog
 from stereo_sfm.log.images import LoggedImage
 from stereo_sfm.log.map_view import MapView
 from stereo_sfm.log.provenance import TOTALS, write_provenance
+from stereo_sfm.log.track_stats import track_stats
 from stereo_sfm.log.writer import LogWriter
 from stereo_sfm.pipeline.sinks import Health, StageTimes
 from stereo_sfm.types import (
@@ -44,96 +44,6 @@ TRAJECTORY_SIZE = 200  # keyframes
 POINTS_NS = 5_000_000_000
 POINTS_SIZE = 50_000
 OLD_TRACK = 30  # frames after which a track's colour no longer changes
-NAN = float("nan")
-
-
-@dataclass(frozen=True)
-class TrackStats:
-    """Flat numbers of one frame, so that every player can plot them; NaN where the tracker does not know."""
-
-    frame_id: int
-    state: int
-    keyframe: bool
-    map_version: int
-    observations: int
-    inlier_observations: int
-    stereo_observations: int
-    position_sigma: float  # metres
-    rotation_sigma: float  # radians
-    tracked: float = NAN
-    inliers: float = NAN
-    right: float = NAN
-    error: float = NAN
-    features: float = NAN
-    matches: float = NAN
-    parallax_deg: float = NAN
-    pure_rotation: float = NAN
-    line_share: float = NAN
-    vp_sigma_deg: float = NAN
-    other: dict[str, float] = field(default_factory=dict[str, float])
-
-
-_NAMED = {f.name for f in fields(TrackStats)} - {"other"}
-
-
-def track_stats(frame: Frame) -> TrackStats:
-    """The numbers of a frame; what has no field of its own goes to `other`."""
-    obs = frame.observations
-    named = {k: v for k, v in frame.stats.items() if k in _NAMED}
-    sigma = np.sqrt(np.maximum(np.diag(frame.covariance), 0.0))
-    return TrackStats(
-        frame_id=frame.frame_id,
-        state=int(frame.state),
-        keyframe=frame.is_keyframe,
-        map_version=frame.map_version,
-        observations=len(obs),
-        inlier_observations=int(obs.inlier.sum()),
-        stereo_observations=int(np.isfinite(obs.uv_right[:, 0]).sum()),
-        position_sigma=float(np.linalg.norm(sigma[:3])),
-        rotation_sigma=float(np.linalg.norm(sigma[3:])),
-        other={k: v for k, v in frame.stats.items() if k not in _NAMED},
-        **named,
-    )
-
-
-class NoRunLog:
-    """Null object: writes nothing."""
-
-    def put(self, message: object) -> None:
-        """Any message of a run."""
-
-    def image(self, image: StereoImage | LoggedImage) -> None:
-        """What the tracker sees."""
-
-    def frame(self, frame: Frame) -> None:
-        """The tracker's answer."""
-
-    def keyframe(self, keyframe: Keyframe) -> None:
-        """A frame that enters the map."""
-
-    def map_update(self, update: MapUpdate) -> None:
-        """The mapper's answer."""
-
-    def loop(self, result: LoopResult) -> None:
-        """The loop closer's answer."""
-
-    def applied(self, applied: Applied) -> None:
-        """Which update came before which frame."""
-
-    def dropped(self, dropped: Dropped) -> None:
-        """A frame that is missing."""
-
-    def health(self, health: Health) -> None:
-        """How a stage keeps up."""
-
-    def stage_times(self, times: StageTimes) -> None:
-        """Wall-clock milliseconds of a frame."""
-
-    def text(self, level: str, message: str) -> None:
-        """A line for people."""
-
-    def close(self) -> None:
-        """Write what is left and close the file."""
 
 
 class _TextHandler(logging.Handler):
@@ -148,7 +58,7 @@ class _TextHandler(logging.Handler):
             self._log.text(record.levelname, record.getMessage())
 
 
-class RunLog(NoRunLog):
+class RunLog:
     """Writes a run.
 
     The messages of the stages may arrive interleaved in any way, as from several processes; each stage's own must come
@@ -211,11 +121,13 @@ class RunLog(NoRunLog):
         raise TypeError(f"no topic for {type(message).__name__}")
 
     def image(self, image: StereoImage | LoggedImage) -> None:
+        """What the tracker sees."""
         pair = image.image if isinstance(image, LoggedImage) else image
         self._now_ns = pair.stamp_ns
         self._images.image(image)
 
     def frame(self, frame: Frame) -> None:
+        """The tracker's answer."""
         self._totals["frames"] += 1
         self._totals["lost"] += frame.state == TrackState.LOST
         write, stamp, sequence = self._writer.write, frame.stamp_ns, frame.frame_id
@@ -233,6 +145,7 @@ class RunLog(NoRunLog):
         self._release_frames()
 
     def keyframe(self, keyframe: Keyframe) -> None:
+        """A frame that enters the map."""
         self._totals["keyframes"] += 1
         self._writer.write(topics.KEYFRAME, keyframe, keyframe.stamp_ns, keyframe.frame_id)
         self._keyframes[keyframe.kf_id] = keyframe
@@ -241,6 +154,7 @@ class RunLog(NoRunLog):
         self._release_updates()
 
     def map_update(self, update: MapUpdate) -> None:
+        """The mapper's answer."""
         self._answers[0].append(update)
         self._release_answers()
         self._updates.append(update)
@@ -250,6 +164,7 @@ class RunLog(NoRunLog):
         self._release_frames()
 
     def loop(self, result: LoopResult) -> None:
+        """The loop closer's answer."""
         self._totals["loops accepted"] += result.candidate_kf_id >= 0
         self._totals["loop candidates rejected"] += len(result.rejected)
         self._answers[1].append(result)
@@ -258,23 +173,29 @@ class RunLog(NoRunLog):
         self._release_updates()
 
     def applied(self, applied: Applied) -> None:
+        """Which update came before which frame."""
         self._writer.write(topics.APPLIED, applied, applied.stamp_ns, applied.before_frame_id)
 
     def dropped(self, dropped: Dropped) -> None:
+        """A frame that is missing."""
         self._writer.write(topics.DROPPED, dropped, dropped.stamp_ns, dropped.frame_id)
 
     def health(self, health: Health) -> None:
+        """How a stage keeps up."""
         self._writer.write(topics.HEALTH, health, self._now_ns, health.frame_id)
 
     def stage_times(self, times: StageTimes) -> None:
+        """Wall-clock milliseconds of a frame."""
         self._writer.write(topics.STAGE_TIMES, times, self._now_ns, times.frame_id)
 
     def text(self, level: str, message: str) -> None:
+        """A line for people."""
         if self._writer.closed:
             return
         self._writer.write(topics.LOG, foxglove.text(self._now_ns, level, message), self._now_ns)
 
     def close(self) -> None:
+        """Write what is left and close the file."""
         logging.getLogger("stereo_sfm").removeHandler(self._handler)
         if self._closed or self._writer.closed:  # closed by itself when the disk was full
             return
