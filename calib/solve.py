@@ -264,25 +264,26 @@ def _normal(state: _State, observed: Observed, eyes: int, huber: float) -> tuple
     right_R_left, offset = state.left_T_right[:3, :3].T, 0
     for eye, camera in enumerate(state.cameras):
         own = 4 + len(camera.distortion)
+        mine = np.flatnonzero(observed.eye == eye)
+        mine = mine[np.argsort(index[mine], kind="stable")]
+        p = in_left[mine]
+        q = p if eye == 0 else se3.transform(se3.inverse(state.left_T_right), p)
+        _, by_point = camera.project_jacobian(q)
+        by_left = by_point if eye == 0 else by_point @ right_R_left
+        by_shared, where = [parameter_jacobian(camera, q)], [np.arange(offset, offset + own)]
+        if eye == 1:  # left_T_right exp(xi): q moves by -(rho + phi x q)
+            by_shared.append(np.concatenate([-by_point, by_point @ se3.skew(q)], -1))
+            where.append(np.arange(shared - 6, shared))
+        by_pose = np.concatenate([by_left, -by_left @ se3.skew(p)], -1)  # exp(xi) left_T_target
+        jac = np.nan_to_num(np.concatenate([*by_shared, by_pose], -1))
+        weighted = jac * weight[mine, None, None]
+        ends = np.searchsorted(index[mine], np.arange(len(views) + 1))
         for k in range(len(views)):
-            rows = (observed.eye == eye) & (index == k)
-            if not rows.any():
-                continue
-            p = in_left[rows]
-            q = p if eye == 0 else se3.transform(se3.inverse(state.left_T_right), p)
-            _, by_point = camera.project_jacobian(q)
-            by_left = by_point if eye == 0 else by_point @ right_R_left
-            by_pose = np.concatenate([by_left, -by_left @ se3.skew(p)], -1)  # exp(xi) left_T_target
-            columns = [np.arange(offset, offset + own), np.arange(shared + 6 * k, shared + 6 * k + 6)]
-            blocks = [parameter_jacobian(camera, q), by_pose]
-            if eye == 1:  # left_T_right exp(xi): q moves by -(rho + phi x q)
-                columns.append(np.arange(shared - 6, shared))
-                blocks.append(np.concatenate([-by_point, by_point @ se3.skew(q)], -1))
-            jac = np.nan_to_num(np.concatenate(blocks, -1)).reshape(-1, sum(len(c) for c in columns))
-            where = np.concatenate(columns)
-            w = np.repeat(weight[rows], 2)
-            hessian[np.ix_(where, where)] += jac.T @ (jac * w[:, None])
-            gradient[where] -= jac.T @ (residual[rows].ravel() * w)
+            rows = slice(ends[k], ends[k + 1])
+            block, heavy = jac[rows].reshape(-1, jac.shape[2]), weighted[rows].reshape(-1, jac.shape[2])
+            columns = np.concatenate([*where, np.arange(shared + 6 * k, shared + 6 * k + 6)])
+            hessian[np.ix_(columns, columns)] += block.T @ heavy
+            gradient[columns] -= heavy.T @ residual[mine[rows]].ravel()
         offset += own
     free = max(2 * len(norm) - size, 1)
     return hessian, gradient, cost, float(np.sqrt((norm**2).sum() / free))

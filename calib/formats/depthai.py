@@ -16,6 +16,7 @@ from stereo_sfm.types import F64
 
 _PERSPECTIVE, _FISHEYE = 0, 1
 _CENTIMETRE = 0.01
+_NO_RECTIFICATION: dict[str, Any] = {"rectifiedRotationLeft": [], "rectifiedRotationRight": []}
 
 
 def read_depthai(path: Path | str, left_socket: int | None = None, right_socket: int | None = None) -> Rig:
@@ -41,7 +42,7 @@ def write_depthai(rig: Rig, path: Path) -> None:
         "boardName": rig.name,
         "version": 7,
         "cameraData": [[1, _plain(rig.left, right_T_left, 2)], [2, _plain(right, np.eye(4), -1)]],
-        "stereoRectificationData": {"leftCameraSocket": 1, "rightCameraSocket": 2},
+        "stereoRectificationData": {"leftCameraSocket": 1, "rightCameraSocket": 2} | _NO_RECTIFICATION,
     }
     path.write_text(json.dumps(data, indent=2) + "\n")
 
@@ -96,6 +97,8 @@ def _plain(camera: Camera, next_T_this: F64, next_socket: int) -> dict[str, Any]
         "height": camera.height,
         "intrinsicMatrix": [[float(v) for v in row] for row in camera.matrix],
         "distortionCoeff": padded(camera, 14),
+        "lensPosition": 0,
+        "specHfovDeg": float(np.rad2deg(2 * np.arctan(0.5 * camera.width / camera.fx))),
         "extrinsics": {
             "rotationMatrix": [[float(v) for v in row] for row in next_T_this[:3, :3]],
             "translation": {"x": x, "y": y, "z": z},
