@@ -89,7 +89,7 @@ def ask(saved: SavedMap, world_T_map: F64, source: SimSource, count: int, seed: 
     reasons: Counter[str] = Counter()
     for image, pose in questions(source, count, seed):
         begin = time.perf_counter()
-        keyframe = still_keyframe(image, saved.rig, max_features=400)
+        keyframe = still_keyframe(image, saved.rig)
         location = None if keyframe is None else relocalizer.locate(keyframe)
         times.append(1e3 * (time.perf_counter() - begin))
         if location is None or not location.found:

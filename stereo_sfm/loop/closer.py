@@ -133,7 +133,7 @@ class LoopCloser:
         candidate_T_kf = se3.inverse(verdict.b_T_a)
         way = self._graph.way(candidate, keyframe.kf_id)
         if way is None:
-            if verdict.inliers < max(2 * config.min_inliers, config.relocalize_share * len(view.ids)):
+            if verdict.inliers < max(2 * config.min_inliers, config.unknown_way_share * len(view.ids)):
                 return rejection("too_few_inliers", verdict.inliers)  # nothing but the pictures speaks for it
         else:
             metres = config.gate_metres + config.gate_per_metre * way.metres

@@ -16,7 +16,7 @@ import numpy as np
 from stereo_sfm.loop.vocabulary import Bag
 from stereo_sfm.types import F32, F64, I32, I64
 
-BLOCK = 16
+BLOCK = 64
 njit: Any = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 

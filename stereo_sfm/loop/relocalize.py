@@ -21,8 +21,8 @@ from stereo_sfm.mapping.map import MapSnapshot
 from stereo_sfm.types import F64, I64, Keyframe
 
 SAME_METRES, SAME_DEGREES = 0.2, 5.0  # two answers closer than this are one
-RIVAL = 0.75  # another place with this share of the inliers makes the answer ambiguous
-SURE = 3.0  # times the inliers asked for: no need to look at more candidates
+RIVAL = 0.7  # another place with this share of the inliers makes the answer ambiguous
+SURE = 2.0  # times the inliers asked for: no need to look at more candidates
 MIN_RANGE_SIGMA = 0.003  # metres
 
 
@@ -55,8 +55,8 @@ class Relocalizer:
         self._config = dataclasses.replace(
             config,
             min_match_fraction=0.0,
-            min_inliers=config.relocalize_inliers,
-            min_inlier_share=config.relocalize_share,
+            min_inliers=config.relocalize_inliers // 3,  # rivals are worth knowing
+            min_inlier_share=0.0,
             min_cells=config.relocalize_cells,
         )
         self._bounds: list[int] = np.searchsorted(snapshot.obs_kf, np.arange(len(snapshot.kf_ids) + 1)).tolist()
@@ -71,20 +71,19 @@ class Relocalizer:
 
     def locate(self, keyframe: Keyframe) -> Location:
         """Find the camera of a keyframe (its pose is ignored) in the map."""
-        bag = self._vocabulary.bag(keyframe.descriptors)
-        rows, _ = self._database.query(bag, 0.0, 20 * self._config.relocalize_candidates)
         view = view_of(keyframe, range_sigmas(keyframe.points_cam, self._rig, self._config.disparity_sigma))
         found: list[Location] = []
-        reasons: list[str] = []
-        for row in self._places(rows):
+        reason = "no_candidate"
+        for row in self._places(self._database.scores(self._vocabulary.bag(keyframe.descriptors))):
             rng = np.random.default_rng([self._config.seed, row])
             verdict = verify(view, self.cloud(row), self._rig, self._config, rng, move_points=False)
-            reasons.append(verdict.reason)
-            if not verdict.reason:
-                found.append(self._location(row, verdict))
-                if verdict.inliers >= SURE * self._config.min_inliers:
-                    break
-        return self._choose(found, reasons)
+            if verdict.reason:
+                reason = verdict.reason if reason == "no_candidate" else reason
+                continue
+            found.append(self._location(row, verdict))
+            if verdict.inliers >= SURE * self._config.relocalize_inliers:
+                break
+        return self._choose(found, len(view.ids)) if found else _nowhere(reason)
 
     def locate_near(self, keyframe: Keyframe, guess: F64) -> Location:
         """Find the camera near a predicted map_T_cam (4, 4): as `locate`, but only around the guess."""
@@ -92,7 +91,9 @@ class Relocalizer:
         row = self._nearest(guess)
         start = se3.inverse(guess) @ self._map.map_T_kf[row]
         verdict = verify_near(start, view, self.cloud(row), self._rig, self._config)
-        return _nowhere(verdict.reason, verdict.inliers) if verdict.reason else self._location(row, verdict)
+        if verdict.reason:
+            return _nowhere(verdict.reason, verdict.inliers)
+        return self._choose([self._location(row, verdict)], len(view.ids))
 
     def cloud(self, row: int) -> Cloud:
         """The map around a keyframe row, in its camera: all views of the points that it and its neighbours see."""
@@ -120,14 +121,16 @@ class Relocalizer:
             se3.inverse(s.map_T_kf[row]) @ s.map_T_kf[order],
         )
 
-    def _places(self, rows: I64) -> list[int]:
-        """The best rows that are not all of one place (share few points with the ones before)."""
+    def _places(self, scores: F64) -> list[int]:
+        """The best rows, each of another place: a place counts what it and its neighbours in time score together."""
+        padded = np.pad(scores, 1)
+        together = scores + padded[:-2] + padded[2:]
         chosen: list[int] = []
-        for row in rows.tolist():
+        for row in np.lexsort((np.arange(len(scores)), -together)).tolist():
+            if len(chosen) == self._config.relocalize_candidates or scores[row] <= 0:
+                break
             if all(abs(row - other) > 2 for other in chosen):
                 chosen.append(row)
-            if len(chosen) == self._config.relocalize_candidates:
-                break
         return chosen
 
     def _nearest(self, guess: F64) -> int:
@@ -140,10 +143,11 @@ class Relocalizer:
         kf_id = int(self._map.kf_ids[row])
         return Location("", map_T_cam, verdict.information, kf_id, verdict.inliers, verdict.pairs)
 
-    def _choose(self, found: list[Location], reasons: list[str]) -> Location:
-        if not found:
-            return _nowhere(reasons[0] if reasons else "no_candidate")
+    def _choose(self, found: list[Location], asked: int) -> Location:
+        """The answer with most points, if they are enough and no other place comes near it."""
         best = max(found, key=lambda x: x.inliers)
+        if best.inliers < max(self._config.relocalize_inliers, self._config.relocalize_share * asked):
+            return _nowhere("too_few_inliers", best.inliers)
         for other in found:
             apart = not within(se3.inverse(best.map_T_cam) @ other.map_T_cam, SAME_METRES, SAME_DEGREES)
             if apart and other.inliers > RIVAL * best.inliers:

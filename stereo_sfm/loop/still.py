@@ -11,7 +11,7 @@ from stereo_sfm.types import Keyframe, StereoImage
 
 
 def still_keyframe(
-    image: StereoImage, rig: Rig, max_features: int = 800, config: TrackerConfig | None = None
+    image: StereoImage, rig: Rig, max_features: int = 1000, config: TrackerConfig | None = None
 ) -> Keyframe | None:
     """What a tracker that starts at this image makes of it (pose identity); None where it sees too little."""
     config = dataclasses.replace(config or TrackerConfig(), max_features=max_features)
