@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 import time
 
 import numpy as np
@@ -26,10 +27,12 @@ def measure(seconds: float, images: str, faults: str, frames: int) -> dict[str, 
         assert isinstance(bus, SimulatedBus)
         stamps: list[int] = []
         late_ms: list[float] = []
+        first_dropped = 0
         wall, cpu, simulated = time.monotonic(), time.process_time(), bus.thread_ns
         for image in source:
             segment = source._segment
             assert segment is not None
+            first_dropped = image.dropped_before if not stamps else first_dropped
             stamps.append(image.stamp_ns)
             late_ms.append((time.monotonic_ns() - segment.clock.to_host(image.stamp_ns - source._time.stamp(0))) * 1e-6)
             if time.monotonic() - wall >= seconds or len(stamps) >= count:
@@ -37,10 +40,12 @@ def measure(seconds: float, images: str, faults: str, frames: int) -> dict[str, 
         wall, cpu = time.monotonic() - wall, time.process_time() - cpu
         simulated = (bus.thread_ns - simulated) * 1e-9
         c = source.counters
+        shown = source.frame_shown(stamps[-1]) - source.frame_shown(stamps[0]) + 1  # frames the camera made meanwhile
         return {
             "seconds": wall,
             "pairs": c["pairs"],
             "dropped": c["dropped"],
+            "lost_without_being_counted": shown - len(stamps) - (c["dropped"] - first_dropped),
             "camera_overruns": source.camera.overruns,
             "imu_samples": c["imu_samples"],
             "rate_hz": (len(stamps) - 1) / ((stamps[-1] - stamps[0]) * 1e-9),
@@ -54,17 +59,19 @@ def measure(seconds: float, images: str, faults: str, frames: int) -> dict[str, 
         }
 
 
-def main() -> None:
-    """Command line."""
+def main() -> int:
+    """Command line; 3 when a frame was lost without being counted."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=60)
     parser.add_argument("--images", default="room", help="room, or a source such as sim:loop")
     parser.add_argument("--faults", default="none", help="names of drivers.t265.simulated.faults.PRESETS")
     parser.add_argument("--frames", type=int, default=30, help="images made before the start")
     options = parser.parse_args()
-    for name, value in measure(options.seconds, options.images, options.faults, options.frames).items():
+    numbers = measure(options.seconds, options.images, options.faults, options.frames)
+    for name, value in numbers.items():
         print(f"{name:30} {value:10.2f}")
+    return 3 if numbers["lost_without_being_counted"] else 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -8,6 +8,7 @@ import time
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -391,3 +392,21 @@ def test_a_program_that_crashed_left_the_camera_streaming() -> None:
     with SimulatedT265Source(camera, access, Settings(), Patience()) as source:
         assert_honest(source, take(source, 3))
         assert source.counters["busy_retries"] == 0
+
+
+@pytest.mark.parametrize("product", [0x2485, 0xF63B, 0xF63C, 0xF63D, 0x2151])
+def test_other_movidius_devices_are_left_alone(product: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An OAK has the same vendor id: it must never get a T265's firmware."""
+    camera = SimulatedCamera(noise_content())
+    bus = SimulatedBus([camera])
+    original = bus.get_device_descriptor
+
+    def other(device: Any) -> Any:
+        described = original(device)
+        described.idProduct = product
+        return described
+
+    monkeypatch.setattr(bus, "get_device_descriptor", other)
+    with pytest.raises(NotFound, match="no T265 attached"):
+        open_t265(backend=bus)
+    assert camera.boot_bytes == b""
