@@ -46,9 +46,9 @@ def _lines(found: Description) -> list[str]:
     if found.images is not None:
         what = "frames, without their images" if found.metadata.get("image_format") == "none" else "images"
         lines.append(f"{what}: {_rate(found.images)}, {found.dropped} counted as dropped" + _skew(found))
-    run = {name: value for name, value in found.totals.items() if name not in _SHOWN}
-    if run:
-        lines.append("run: " + ", ".join(f"{value} {name}" for name, value in run.items()))
+    rest = {name: value for name, value in found.totals.items() if name not in _SHOWN}
+    if rest:
+        lines.append("totals: " + ", ".join(f"{value} {name}" for name, value in rest.items()))
     if found.ground_truth:
         lines.append(f"ground truth: {found.ground_truth} poses")
     lines += [f"calibration: {line}" for line in found.calibration]
