@@ -73,6 +73,7 @@ class Mapper:
         self._culled: list[I64] = []
         self._fused: list[tuple[int, int]] = []  # rows (gone, stays)
         self._adjusted: I64 = np.zeros(0, np.int64)  # point rows of the last window
+        self._thin: I64 = np.zeros(0, np.int64)  # point rows with too few observations that may still get more
         self._loops: list[LoopResult] = []
         self._job: Job | None = None
         self._job_due = -1
@@ -239,10 +240,12 @@ class Mapper:
         if redundant >= 0:
             seen.append(self._seen_by(redundant))
             self.map.cull_keyframe(redundant)
-        rows = np.unique(np.concatenate([self._adjusted, *seen]))
+        rows = np.unique(np.concatenate([self._adjusted, self._thin, *seen]))
         weak = culling.weak_points(self.map, self._rig, rows, row, self._config)
         self.map.cull_points(weak)
         self._culled.append(weak)
+        points = self.map.points
+        self._thin = rows[points.alive[rows] & (points.obs_count[rows] < self._config.min_observations)]
 
     def _seen_by(self, row: int) -> I64:
         """Point rows that a keyframe sees."""
