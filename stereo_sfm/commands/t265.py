@@ -11,9 +11,7 @@ from stereo_sfm.errors import StereoSfmError
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
-    firmware = actions.add_parser(
-        "firmware", help="get or check the firmware file (Intel's: not shipped here)"
-    )
+    firmware = actions.add_parser("firmware", help="get or check the firmware file (Intel's: not shipped here)")
     kinds = firmware.add_subparsers(dest="kind", metavar="ACTION", required=True)
     extract = kinds.add_parser("extract", help="take it out of a librealsense library or pyrealsense2 wheel you have")
     extract.add_argument("file", type=Path, help="librealsense2.so, a pyrealsense2 .so, .pyd or .whl, or the .mvcmd")
