@@ -33,6 +33,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.loop.relocalize import Relocalizer
 from stereo_sfm.loop.still import still_keyframe
 from stereo_sfm.loop.vocabulary_file import default_vocabulary
+from stereo_sfm.mapping.mapper import Mapper
 from stereo_sfm.types import F64, StereoImage
 
 ASIDE_METRES = np.array([0.2, 0.03, 0.2])  # to the side, up or down, ahead or back
@@ -51,7 +52,9 @@ def make_map(spec: str, stored: Path | None) -> SavedMap:
         for image in images(source, 0, stored):
             run.step(image)
         run.finish()
-        snapshot = run.map_stage.mapper.map.snapshot()
+        mapper = run.map_stage.mapper
+        assert isinstance(mapper, Mapper)
+        snapshot = mapper.map.snapshot()
         rig = source.rig
     return SavedMap(snapshot, rig, default_vocabulary().id, np.zeros(len(snapshot.kf_ids), np.int64))
 

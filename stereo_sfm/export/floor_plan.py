@@ -72,7 +72,7 @@ def _paint(hits: I32, passed: I32) -> U8:
     rays = cv2.boxFilter(passed.astype(np.float32), -1, (3, 3))
     occupied = (hits > 0) & (blurred >= MIN_HITS) & (blurred > 0.25 * rays)
     image = np.full(hits.shape, UNKNOWN, np.uint8)
-    image[passed > 0] = FREE
+    image[passed > 1] = FREE  # one ray alone may belong to a wrong point
     image[occupied] = OCCUPIED
     return np.ascontiguousarray(image[::-1])
 
