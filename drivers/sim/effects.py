@@ -47,9 +47,11 @@ class Sensor:
         soft = rim * rim * (3 - 2 * rim) if effects.vignetting > 0 else 1.0
         self.vignette = np.where(np.isfinite(grid[..., 2]), fall * soft, 0).astype(np.float32)  # (H, W)
         self.effects = effects
+        self._steepest = 0.0  # px per radian at most
         self._jacobian: F32 | None = None  # (H, W, 2, 3) d pixel / d bearing
         if effects.exposure_s > 0:
             self._jacobian = np.nan_to_num(camera.project_jacobian(grid)[1]).astype(np.float32)
+            self._steepest = float(np.linalg.norm(self._jacobian, axis=(2, 3)).max())
 
     def expose(self, view: View, twist: F64, brightness: float, key: int) -> U8:
         """A picture as the sensor gives it.
@@ -62,7 +64,7 @@ class Sensor:
         image = view.image
         if self._jacobian is not None:
             blurred = np.empty_like(image)
-            _blur(image, view.depth, self._jacobian, twist * effects.exposure_s, blurred)
+            _blur(image, view.depth, self._jacobian, self._steepest, twist * effects.exposure_s, blurred)
             image = blurred
         if effects.lens_blur_px > 0:
             image = np.asarray(cv2.GaussianBlur(image, (5, 5), effects.lens_blur_px), np.float32)
@@ -91,18 +93,20 @@ def brightness(effects: Effects, seconds: float, seed: int) -> float:
 
 
 @njit
-def _blur(image, depth, jacobian, move, out):
+def _blur(image, depth, jacobian, steepest, move, out):
     """Average along each pixel's path while the shutter is open, symmetric about mid-exposure.
 
     A point at depth t along bearing b moves by -(v + w x (t b)) in the eye; the pixel follows by J(b) times that / t.
     """
     h, w = image.shape
+    speed = math.sqrt(move[0] * move[0] + move[1] * move[1] + move[2] * move[2])
+    turning = math.sqrt(move[3] * move[3] + move[4] * move[4] + move[5] * move[5])
     for y in range(h):
         for x in range(w):
             t = depth[y, x]
             j = jacobian[y, x]
             out[y, x] = image[y, x]
-            if not (t > 0):
+            if not (t > 0 and steepest * (speed / t + turning) >= 0.74):
                 continue
             # J(b) annihilates b, and J(b) maps a change of the bearing to pixels: use the tangent part only.
             v0, v1, v2 = move[0] / t, move[1] / t, move[2] / t
