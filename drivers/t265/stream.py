@@ -15,7 +15,7 @@ from drivers.live.counters import Counters
 from drivers.live.errors import DeviceError
 from drivers.live.pairing import LEFT, RIGHT, Eye, Pair, Pairer
 from drivers.t265 import messages as m
-from drivers.t265 import protocol
+from drivers.t265 import protocol, samples
 from drivers.t265.camera import T265
 from drivers.t265.link import Timing
 from drivers.t265.messages import Sensor, Status
@@ -103,12 +103,12 @@ class Stream:
     def _take_video(self, data: memoryview) -> bool:
         """Whether the transfer was an image."""
         try:
-            message = protocol.decode_video_endpoint(data)
+            message = samples.decode_video_endpoint(data)
         except protocol.ProtocolError as error:
             self._counters.add("malformed" if len(data) == m.VIDEO_BYTES else "half_frames")
             logger.debug("T265: %s", error)
             return False
-        if isinstance(message, protocol.StatusEvent):
+        if isinstance(message, samples.StatusEvent):
             self._take_status(message, self._stopped[0])
             return False
         side = LEFT if message.sensor == Sensor.LEFT else RIGHT
@@ -124,16 +124,16 @@ class Stream:
             size = self._camera.link.read(m.EVENT_IN, buffer, self._timing.read_ms)
             if not size:
                 continue
-            events, damaged = protocol.decode_events(memoryview(buffer)[:size])
+            events, damaged = samples.decode_events(memoryview(buffer)[:size])
             if damaged:
                 self._counters.add("malformed", damaged)
             for event in events:
-                if isinstance(event, protocol.MotionSample):
+                if isinstance(event, samples.MotionSample):
                     self.motion.add(event.stamp_ns, event.sensor == Sensor.GYRO, event.xyz)
                 else:
                     self._take_status(event, self._stopped[1])
 
-    def _take_status(self, event: protocol.StatusEvent, stopped: threading.Event) -> None:
+    def _take_status(self, event: samples.StatusEvent, stopped: threading.Event) -> None:
         """DEVICE_STOPPED matters while stopping only: a stale one can come right after a start."""
         if event.status == Status.DEVICE_STOPPED:
             stopped.set()

@@ -16,6 +16,7 @@ from drivers.live.errors import DeviceError
 from drivers.live.pairing import LEFT, RIGHT, Eye, EyeLock, Pairer
 from drivers.t265 import messages as m
 from drivers.t265 import protocol as p
+from drivers.t265 import samples
 from drivers.t265.link import Link, Timing
 from drivers.t265.messages import Id, Sensor
 from drivers.t265.simulated.bus import SimulatedBus
@@ -93,10 +94,10 @@ def test_damaged_events() -> None:
     status = struct.pack("<IHH", 8, Id.STATUS, 0x0C)
     for _ in range(COUNT // 4):
         transfer = b"".join(damage(rng.choice([sample, status]), rng) for _ in range(rng.randrange(1, 5)))
-        events, damaged = p.decode_events(transfer)
+        events, damaged = samples.decode_events(transfer)
         assert damaged >= 0
         for event in events:
-            if isinstance(event, p.MotionSample):
+            if isinstance(event, samples.MotionSample):
                 assert event.sensor in (4, 5)
                 assert all(abs(v) <= 1000 for v in event.xyz)
 
@@ -125,13 +126,13 @@ def test_no_wrong_frame_among_damaged_transfers() -> None:
             header = damage(data, rng) if spoiled else data
             if len(header) != len(data):
                 with pytest.raises(p.ProtocolError):
-                    p.decode_video_endpoint(header)
+                    samples.decode_video_endpoint(header)
                 continue
             try:
-                sample = p.decode_video_endpoint(header + pixels)
+                sample = samples.decode_video_endpoint(header + pixels)
             except p.ProtocolError:
                 continue
-            assert isinstance(sample, p.VideoSample)
+            assert isinstance(sample, samples.VideoSample)
             eye = Eye(sample.stamp_ns, sample.frame_id, sample.pixels, sample.exposure_us, sample.gain)
             pair = pairer.push(LEFT if sample.sensor == Sensor.LEFT else RIGHT, eye)
             if pair is not None:

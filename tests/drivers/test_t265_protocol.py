@@ -9,6 +9,7 @@ import pytest
 
 from drivers.t265 import messages as m
 from drivers.t265 import protocol as p
+from drivers.t265 import samples
 from drivers.t265.messages import AntiFlicker, Id, Sensor
 
 FISHEYES = [p.StreamProfile(eye, 848, 800, m.PIXEL_FORMAT_Y8, 848, 30, to_host=True) for eye in (0x03, 0x23)]
@@ -111,8 +112,8 @@ def video(sensor: int = 3, stamp: int = 5, frame_id: int = 7, exposure: int = 80
 
 
 def test_video_frame() -> None:
-    sample = p.decode_video_endpoint(video())
-    assert isinstance(sample, p.VideoSample)
+    sample = samples.decode_video_endpoint(video())
+    assert isinstance(sample, samples.VideoSample)
     assert (sample.sensor, sample.stamp_ns, sample.frame_id, sample.exposure_us, sample.gain) == (3, 5, 7, 8000, 1.5)
     assert sample.pixels.shape == (800, 848)
     assert sample.pixels[0, :4].tolist() == [0, 1, 2, 3]
@@ -134,14 +135,14 @@ def test_video_frame_with_a_wrong_header_is_refused(offset: int, value: bytes) -
     frame = video()
     frame[offset : offset + len(value)] = value
     with pytest.raises(p.ProtocolError):
-        p.decode_video_endpoint(frame)
+        samples.decode_video_endpoint(frame)
 
 
 @pytest.mark.parametrize("size", [0, 1, 7, 9, 44, 196_608, 240_128, m.VIDEO_BYTES - 1, m.VIDEO_BYTES + 1])
 def test_half_a_frame_is_refused(size: int) -> None:
     data = (video() + b"\0")[:size]
     with pytest.raises(p.ProtocolError):
-        p.decode_video_endpoint(data)
+        samples.decode_video_endpoint(data)
 
 
 def motion(sensor: int = 4, stamp: int = 3, xyz: tuple[float, float, float] = (0.5, 1.0, -2.0)) -> bytes:
@@ -151,18 +152,18 @@ def motion(sensor: int = 4, stamp: int = 3, xyz: tuple[float, float, float] = (0
 def test_several_events_in_one_transfer() -> None:
     status = struct.pack("<IHH", 8, Id.STATUS, m.Status.DEVICE_STOPPED)
     pose = struct.pack("<IH", 104, Id.GET_POSE) + bytes(98)
-    events, damaged = p.decode_events(motion() + status + pose + motion(sensor=5))
+    events, damaged = samples.decode_events(motion() + status + pose + motion(sensor=5))
     assert damaged == 0
-    assert [type(e) for e in events] == [p.MotionSample, p.StatusEvent, p.MotionSample]
+    assert [type(e) for e in events] == [samples.MotionSample, samples.StatusEvent, samples.MotionSample]
     first = events[0]
-    assert isinstance(first, p.MotionSample)
+    assert isinstance(first, samples.MotionSample)
     assert (first.sensor, first.stamp_ns, first.celsius, first.xyz) == (4, 3, 31.5, (0.5, 1.0, -2.0))
 
 
 def test_damaged_events_are_counted() -> None:
-    assert p.decode_events(motion() + motion()[:40])[1] == 1
-    assert p.decode_events(motion(sensor=6) + motion())[1] == 1
-    assert len(p.decode_events(motion(sensor=6) + motion())[0]) == 1
-    assert p.decode_events(motion(xyz=(float("nan"), 0, 0)))[1] == 1
-    assert p.decode_events(b"\0" * 64) == ([], 1)
-    assert p.decode_events(b"") == ([], 0)
+    assert samples.decode_events(motion() + motion()[:40])[1] == 1
+    assert samples.decode_events(motion(sensor=6) + motion())[1] == 1
+    assert len(samples.decode_events(motion(sensor=6) + motion())[0]) == 1
+    assert samples.decode_events(motion(xyz=(float("nan"), 0, 0)))[1] == 1
+    assert samples.decode_events(b"\0" * 64) == ([], 1)
+    assert samples.decode_events(b"") == ([], 0)
