@@ -161,7 +161,7 @@ def test_command_on_a_few_real_pictures(data_root: Path, tmp_path: Path, capsys:
     assert "verdict: " in captured.out and "view 7:" in captured.err
     rig = load_rig(tmp_path / "rig.yaml")
     assert rig.baseline == pytest.approx(0.1100, abs=2e-3)  # EuRoC's own calibration: 0.11007
-    assert rig.left.fx == pytest.approx(458.65, rel=0.01)
+    assert rig.left.fx == pytest.approx(458.65, rel=0.02)
     page = (tmp_path / "rig.html").read_text()
     assert page.count("data:image/") >= 4 and "Epipolar error" in page
     assert main(["calibrate", folder, *options, "-o", str(tmp_path / "rig.yaml")]) == 2
