@@ -10,11 +10,19 @@ from stereo_sfm.types import F64
 
 
 def refine_motion(
-    rotation: F64, direction: F64, bearings0: F64, bearings1: F64, scale: float, iterations: int = 8
+    rotation: F64,
+    direction: F64,
+    bearings0: F64,
+    bearings1: F64,
+    scale: float,
+    iterations: int = 8,
+    slope_moves: bool = True,
 ) -> tuple[F64, F64]:
     """Gauss-Newton on the spherical Sampson distance with Cauchy weights of width `scale` radians.
 
-    Five parameters: a rotation vector on the left of `rotation` and two on the sphere of directions.
+    Five parameters: a rotation vector on the left of `rotation` and two on the sphere of directions. With `slope_moves`
+    it is the whole derivative of the distance, and ends in the nearest minimum. Without, the denominator is held in
+    each step: a biased answer, drawn towards the middle of the view, but one that crosses from valley to valley.
     """
     for _ in range(iterations):
         p = bearings0 @ rotation.T
@@ -23,12 +31,13 @@ def refine_motion(
         slope = np.sqrt(np.maximum((plane1**2).sum(1) + (plane0**2).sum(1) - 2 * error**2, 1e-20))
         residual = error / slope
         weight = 1.0 / (1.0 + (residual / scale) ** 2)
-        # The slope moves too; without its derivative the direction is drawn towards the middle of the view.
-        error_by_rotation, error_by_direction = np.cross(p, np.cross(bearings1, direction)), np.cross(p, bearings1)
-        half_by_rotation = np.cross(p, np.cross(plane1, direction)) - 2 * error[:, None] * error_by_rotation
-        half_by_direction = np.cross(p, plane1) + np.cross(bearings1, plane0) - 2 * error[:, None] * error_by_direction
-        by_rotation = (error_by_rotation - (residual / slope)[:, None] * half_by_rotation) / slope[:, None]
-        by_direction = (error_by_direction - (residual / slope)[:, None] * half_by_direction) / slope[:, None]
+        by_rotation, by_direction = np.cross(p, np.cross(bearings1, direction)), np.cross(p, bearings1)
+        if slope_moves:
+            half_rotation = np.cross(p, np.cross(plane1, direction)) - 2 * error[:, None] * by_rotation
+            half_direction = np.cross(p, plane1) + np.cross(bearings1, plane0) - 2 * error[:, None] * by_direction
+            by_rotation = by_rotation - (residual / slope)[:, None] * half_rotation
+            by_direction = by_direction - (residual / slope)[:, None] * half_direction
+        by_rotation, by_direction = by_rotation / slope[:, None], by_direction / slope[:, None]
         tangent = np.linalg.svd(direction[None])[2][1:]  # (2, 3) basis orthogonal to the direction
         jac = np.concatenate([by_rotation, by_direction @ tangent.T], axis=1)
         hessian = jac.T @ (weight[:, None] * jac)
@@ -47,12 +56,17 @@ def refine_from_many(
     """`refine_motion` from a solution and from steps along each axis with the rotation `still`; the best one.
 
     In a narrow view a small step sideways looks like a turn, and the cost has a valley for each: one start is not
-    enough. The signs of the directions are free.
+    enough. Give all matches (Cauchy weights bear the outliers), not those that one solution chose, or that one wins.
+    The signs of the directions are free.
     """
     starts = [(rotation, direction), *((still, axis) for axis in np.eye(3))]
+    starts += [
+        refine_motion(still, axis, bearings0, bearings1, scale, iterations=8, slope_moves=False) for axis in np.eye(3)
+    ]
     refined = [refine_motion(r, d, bearings0, bearings1, scale, iterations=12) for r, d in starts]
     costs = [
         np.log1p((epipolar_residuals((se3.skew(d) @ r)[None], bearings0, bearings1)[0] / scale) ** 2).sum()
         for r, d in refined
     ]
-    return refined[int(np.argmin(costs))]
+    best = int(np.argmin(costs))  # a plane has two exact answers: the first one stays unless another is clearly better
+    return refined[best] if costs[best] < 0.99 * costs[0] - 1e-9 * len(bearings0) else refined[0]

@@ -225,7 +225,8 @@ def relative_pose(
         best, front = int(np.argmax(np.trace(rotations, axis1=1, axis2=2))), np.ones(len(b0), bool)
     rotation, direction = rotations[best], translations[best]
     if refine:
-        rotation, direction = refine_from_many(rotation, direction, still, b0, b1, 0.5 * threshold)
+        # Over all matches: the inliers of the minimal solution would vote for its own valley.
+        rotation, direction = refine_from_many(rotation, direction, still, bearings0, bearings1, 0.5 * threshold)
         depth0, depth1 = ray_depths(b0, b1, rotation, direction)
         if (depth0 + depth1 < 0).mean() > 0.5:
             direction = -direction
