@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 
 
@@ -11,7 +11,7 @@ class NoSpans:
     """Null object: measures nothing."""
 
     @contextmanager
-    def span(self, name: str) -> Iterator[None]:
+    def span(self, name: str) -> Generator[None, None, None]:
         """Mark a stage called `name`."""
         yield
 
@@ -27,7 +27,7 @@ class Spans(NoSpans):
         self._ms: dict[str, float] = {}
 
     @contextmanager
-    def span(self, name: str) -> Iterator[None]:
+    def span(self, name: str) -> Generator[None, None, None]:
         start = time.perf_counter()
         try:
             yield

@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
     args.mode, args.realtime = args.mode or "lockstep", False
     args.log = args.log or "lean"
     config = _changed(before.config, args.set)
-    code = execute(args, choice, config, MapFolders(), before.applied if follow else None)
+    code = execute(args, choice, config, MapFolders(), before if follow else None)
     return _compare(path, args) if args.check and code == 0 else code
 
 

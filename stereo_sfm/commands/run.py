@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,9 +16,9 @@ if TYPE_CHECKING:
     from drivers.source import Source
     from stereo_sfm.config import Config
     from stereo_sfm.eval.record import RunRecord
+    from stereo_sfm.log.recorded import RecordedRun
     from stereo_sfm.pipeline.maps import MapFolders
     from stereo_sfm.pipeline.session import Session
-    from stereo_sfm.types import Applied
     from stereo_sfm.viz.match_pictures import MatchPictures
 
 TRACKING_FAILED = 4
@@ -162,9 +161,9 @@ def execute(
     choice: SourceChoice,
     config: Config,
     folders: MapFolders,
-    applied: Sequence[Applied] | None = None,
+    replayed: RecordedRun | None = None,
 ) -> int:
-    """One run with its output folder; `applied` is the schedule of an earlier realtime run to follow."""
+    """One run with its output folder; `replayed` is an earlier run whose schedule is followed."""
     from stereo_sfm.eval.record import RunRecord
     from stereo_sfm.eval.run_results import write_results
     from stereo_sfm.eval.statistics import failure, summary
@@ -176,7 +175,7 @@ def execute(
     # Images reach the sinks only where the stages share this process.
     mode = "realtime" if args.realtime else args.mode
     wiring = Wiring(args.inline or pictures is not None, mode, args.log, args.image_format, args.viz)
-    with Session(choice, config, sinks, wiring, folders, args.output, args.overwrite, applied) as session:
+    with Session(choice, config, sinks, wiring, folders, args.output, args.overwrite, replayed) as session:
         if pictures is not None:
             pictures.folder = session.folder / "matches"
         begin = time.perf_counter()

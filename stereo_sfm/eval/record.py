@@ -19,7 +19,6 @@ from stereo_sfm.types import (
     Keyframe,
     LoopResult,
     MapUpdate,
-    StereoImage,
     TrackState,
     Trajectory,
 )
@@ -79,9 +78,7 @@ class RunRecord:
 
     def put(self, message: object) -> None:
         """Take one message of the run; those of other kinds are not kept."""
-        if isinstance(message, StereoImage):
-            self.dropped += message.dropped_before
-        elif isinstance(message, Dropped):
+        if isinstance(message, Dropped):
             self.dropped += message.count
         elif isinstance(message, Frame):
             self._put_frame(message)

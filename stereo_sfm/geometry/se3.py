@@ -69,7 +69,7 @@ def log(a_T_b: F64) -> F64:
     """Transform (..., 4, 4) -> tangent (..., 6) = (rho, phi)."""
     phi = so3_log(a_T_b[..., :3, :3])
     rho = np.linalg.solve(_left_jacobian(phi), a_T_b[..., :3, 3, None])[..., 0]
-    return np.concatenate([rho, phi], axis=-1)
+    return np.concatenate([rho, phi], axis=-1).astype(np.float64, copy=False)
 
 
 def inverse(a_T_b: F64) -> F64:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 import time
 import traceback
@@ -113,11 +114,12 @@ def _run_on_ray(tasks: list[BatchTask], address: str | None) -> Iterator[tuple[B
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:
         import ray
+        from ray.exceptions import RayError
     except ImportError:
         raise StereoSfmError("batch needs Ray: pip install 'stereo-sfm[batch]'") from None
 
     if not ray.is_initialized():
-        ray.init(address=address, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+        ray.init(address=address, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
     remote = ray.remote(num_cpus=1, max_retries=RETRIES)(run_one)
     pending = {remote.remote(task): task for task in tasks}
     try:
@@ -127,7 +129,7 @@ def _run_on_ray(tasks: list[BatchTask], address: str | None) -> Iterator[tuple[B
                 task = pending.pop(reference)
                 try:
                     result = ray.get(reference)
-                except ray.exceptions.RayError as error:
+                except RayError as error:
                     result = {"recording": task.spec, "ok": False, "error": f"the task died: {error}".splitlines()[0]}
                 yield task, result
     finally:

@@ -15,6 +15,7 @@ from drivers.source import Source
 from stereo_sfm.pipeline.channels import End, Outbox
 from stereo_sfm.pipeline.health import HealthMeter
 from stereo_sfm.pipeline.images import ImageRing, SlotImage
+from stereo_sfm.pipeline.stages import sensor_drop
 from stereo_sfm.types import Dropped, StereoImage, Trajectory
 
 
@@ -70,8 +71,8 @@ class FreeSlots:
 class StopFlag:
     """Set when main says stop, or is gone: a thread waits for it."""
 
-    def __init__(self, control: Connection) -> None:
-        self.asked = False
+    def __init__(self, control: Connection, asked: bool = False) -> None:
+        self.asked = asked
         self._control = control
         threading.Thread(target=self._wait, daemon=True).start()
 
@@ -102,11 +103,9 @@ class CaptureStage:
             if self.stop.asked:
                 break
             begin = time.monotonic()
-            if image.dropped_before:
-                why = "lost by the sensor or the driver"
-                self.to_main.send(
-                    Dropped(image.frame_id - image.dropped_before, image.stamp_ns, "sensor", why, image.dropped_before)
-                )
+            drop = sensor_drop(image)
+            if drop is not None:
+                self.to_main.send(drop)
             slot = self.slots.take(block=not self.realtime)
             if slot is None:
                 meter.dropped += 1

@@ -9,7 +9,7 @@ from stereo_sfm.config import Config
 from stereo_sfm.pipeline.maps import MapFolders, make_mapper, save_result
 from stereo_sfm.pipeline.schedule import Lockstep, Schedule
 from stereo_sfm.pipeline.sinks import Sink, StageTimes
-from stereo_sfm.pipeline.stages import LocalMailbox, MapStage, TrackStage, make_closer
+from stereo_sfm.pipeline.stages import LocalMailbox, MapStage, TrackStage, make_closer, sensor_drop
 from stereo_sfm.timing import Spans
 from stereo_sfm.tracking.factory import make_tracker
 from stereo_sfm.types import Frame, Keyframe, LoopResult, MapUpdate, StereoImage
@@ -46,6 +46,9 @@ class InlineRun:
 
     def step(self, image: StereoImage) -> Frame:
         """Track one image; map and close loops when it becomes a keyframe."""
+        drop = sensor_drop(image)
+        if drop is not None:
+            self._publish(drop)
         if self._jpeg:
             from stereo_sfm.log.images import encode_pair
 

@@ -28,7 +28,7 @@ from stereo_sfm.pipeline.channels import DroppingOutbox, End, Failed, Outbox
 from stereo_sfm.pipeline.images import ImageLayout, ImageRing, SlotImage
 from stereo_sfm.pipeline.maps import MapFolders
 from stereo_sfm.pipeline.sinks import Sink
-from stereo_sfm.pipeline.workers import LogOptions, Setup, ViewerOptions
+from stereo_sfm.pipeline.workers import LogOptions, Ready, Setup, ViewerOptions
 from stereo_sfm.types import Applied, Frame
 
 SINKS = ("logger", "viewer")
@@ -85,6 +85,7 @@ class ProcessRun:
         self._next_picture_ns = 0
         self._ring: ImageRing | None = None
         self._ended: set[str] = set()
+        self._waiting = {"tracker", "mapper", "loop"}  # not ready yet
         self._stopping = False
         self.info: SourceInfo
 
@@ -130,6 +131,8 @@ class ProcessRun:
                     self._fail(connection, message)
                 elif isinstance(message, End):
                     self._end(connection, message.stage)
+                elif isinstance(message, Ready):
+                    self._begin(message.stage)
                 else:
                     self._dispatch(message)
                     if isinstance(message, Frame):
@@ -197,6 +200,13 @@ class ProcessRun:
         for stage, control in self._controls.items():
             control.send((setup, jpeg) if stage == "capture" else setup)
 
+    def _begin(self, stage: str) -> None:
+        """Capture goes when the last of the others is ready."""
+        self._waiting.discard(stage)
+        if not self._waiting:
+            with contextlib.suppress(OSError):
+                self._controls["capture"].send("go")
+
     def _pipe(self) -> tuple[Connection, Connection]:
         """(receiving end, sending end)."""
         return self._context.Pipe(duplex=False)
@@ -232,6 +242,10 @@ class ProcessRun:
         return message
 
     # -- messages ----------------------------------------------------------------------------------------------------
+
+    def publish(self, message: object) -> None:
+        """Put a message of the caller's into the run's log, viewer and sinks."""
+        self._dispatch(message)
 
     def _dispatch(self, message: object) -> None:
         if not isinstance(message, SlotImage):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from drivers.source import Source
 from stereo_sfm.config import Config
@@ -21,7 +21,10 @@ from stereo_sfm.pipeline.processes import ProcessRun
 from stereo_sfm.pipeline.schedule import Recorded
 from stereo_sfm.pipeline.sinks import Sink
 from stereo_sfm.pipeline.workers import LogOptions, ViewerOptions
-from stereo_sfm.types import Applied, Frame
+from stereo_sfm.types import Dropped, Frame
+
+if TYPE_CHECKING:
+    from stereo_sfm.log.recorded import RecordedRun
 
 LIVE = ("t265", "oak")  # sources that are devices
 
@@ -49,12 +52,12 @@ class Session:
         folders: MapFolders,
         folder: Path | None = None,
         overwrite: bool = False,
-        applied: Sequence[Applied] | None = None,
+        replayed: RecordedRun | None = None,
     ) -> None:
         if wiring.inline and wiring.mode == "realtime":
             raise StereoSfmError("--mode realtime needs processes: leave --inline away")
         self._opener, self._config, self._sinks, self._wiring = opener, config, list(sinks), wiring
-        self._folders, self._overwrite, self._applied = folders, overwrite, applied
+        self._folders, self._overwrite, self._replayed = folders, overwrite, replayed
         self._stack = ExitStack()
         self._stopped = False
         self._frames: Iterator[Frame]
@@ -110,6 +113,10 @@ class Session:
             return None
         return LogOptions(folder / "run.mcap", self._wiring.image_format if kind == "full" else "none")
 
+    def _ring_drops(self) -> list[Dropped]:
+        """Images that the run to be repeated dropped for want of time."""
+        return [] if self._replayed is None else [d for d in self._replayed.dropped if d.where == "ring"]
+
     # -- wirings -----------------------------------------------------------------------------------------------------
 
     def _enter_inline(self, stack: ExitStack) -> Iterator[Frame]:
@@ -136,7 +143,10 @@ class Session:
             viewer = RerunSink(source.rig, source.name, self._wiring.viz, folder / "run.rrd", source.ground_truth)
             stack.callback(viewer.close)
             sinks.append(viewer)
-        schedule = None if self._applied is None else Recorded(self._applied)
+        schedule = None if self._replayed is None else Recorded(self._replayed.applied)
+        for drop in self._ring_drops():
+            for sink in sinks:
+                sink.put(drop)
         frames = run_inline(source, self._config, sinks, schedule, self._folders, jpeg=jpeg)
         stack.callback(frames.close)
         return frames
@@ -150,11 +160,13 @@ class Session:
             self._config,
             self._sinks,
             realtime=None if self._wiring.mode is None else self._wiring.mode == "realtime",
-            applied=self._applied,
+            applied=None if self._replayed is None else self._replayed.applied,
             log=self._log_options(live, self.folder),
             folders=self._folders,
             viewer=viewer,
         )
         stack.enter_context(self._run)
         self.info = self._run.info
+        for drop in self._ring_drops():
+            self._run.publish(drop)
         return iter(self._run)

@@ -15,7 +15,7 @@ from stereo_sfm.config import Config
 from stereo_sfm.pipeline.schedule import Schedule
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.tracking.factory import AnyTracker
-from stereo_sfm.types import Applied, Frame, Keyframe, LoopResult, MapUpdate, StereoImage
+from stereo_sfm.types import Applied, Dropped, Frame, Keyframe, LoopResult, MapUpdate, StereoImage
 
 T_co = TypeVar("T_co", covariant=True)
 
@@ -40,6 +40,14 @@ class LocalMailbox(deque[T_co]):  # type: ignore[type-var]
 
     def ready(self) -> bool:
         return len(self) > 0
+
+
+def sensor_drop(image: StereoImage) -> Dropped | None:
+    """What the sensor or its driver lost just before an image."""
+    if not image.dropped_before:
+        return None
+    first = image.frame_id - image.dropped_before
+    return Dropped(first, image.stamp_ns, "sensor", "lost by the sensor or the driver", image.dropped_before)
 
 
 class AnyMapper(Protocol):

@@ -63,6 +63,22 @@ def guarded(stage: str, body: Callable[..., None], report: Connection, *args: An
         os._exit(1)
 
 
+@dataclass(frozen=True)
+class Ready:
+    """The stage has loaded what it needs; a live run begins when all are ready."""
+
+    stage: str
+
+
+def ready(stage: str, setup: Setup, to_main: Outbox) -> None:
+    """Load the stage's code if the run is live, and say so."""
+    if setup.realtime:
+        from stereo_sfm.pipeline.warm_up import warm_up_stage
+
+        warm_up_stage(stage, setup.config, setup.rig)
+    to_main.send(Ready(stage))
+
+
 def prepare(stage: str, setup: Setup) -> Callable[[], None]:
     """Threads and cores of this process; returns what injects a random delay (tests) or nothing."""
     import cv2
@@ -93,9 +109,17 @@ def run_capture(
         delay = prepare("capture", setup)
         slots = setup.config.pipeline.ring_slots
         ring = ImageRing(ImageLayout.of(source.rig), slots, setup.ring_name)
+        word = Inbox[str](control).take()  # main says go when every stage is ready, or stop
         to_tracker = Outbox(tracker)
         stage = CaptureStage(
-            source, ring, FreeSlots(slots, readers), to_tracker, to_main, StopFlag(control), setup.realtime, jpeg
+            source,
+            ring,
+            FreeSlots(slots, readers),
+            to_tracker,
+            to_main,
+            StopFlag(control, word == "stop"),
+            setup.realtime,
+            jpeg,
         )
         delay()
         stage.run()
@@ -134,6 +158,7 @@ def run_tracker(
     stage = TrackStage(tracker, _schedule(setup), Inbox[MapUpdate](updates))
     inbox = Inbox[SlotImage | End](images)
     free, keyframes = Outbox(release), (Outbox(to_mapper), Outbox(to_loop))
+    ready("tracker", setup, to_main)
     meter = HealthMeter("tracker")
     frame_id = -1
     while isinstance(message := inbox.take(), SlotImage):
@@ -189,6 +214,7 @@ def run_mapper(
     inbox = Inbox[Keyframe | End](keyframes)
     to_tracker, to_optimizer = Outbox(updates), Outbox(jobs)
     answers = Inbox[Any](results)
+    ready("mapper", setup, to_main)
     meter = HealthMeter("mapper")
     frame_id, busy = -1, False
     while isinstance(keyframe := inbox.take(), Keyframe):
@@ -250,6 +276,7 @@ def run_loop(to_main: Outbox, control: Connection, keyframes: Connection, to_map
     spans = Spans()
     closer = make_closer(setup.config, setup.rig, spans)
     inbox, outbox = Inbox[Keyframe | End](keyframes), Outbox(to_mapper)
+    ready("loop", setup, to_main)
     meter = HealthMeter("loop")
     frame_id = -1
     while isinstance(keyframe := inbox.take(), Keyframe):

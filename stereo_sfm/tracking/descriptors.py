@@ -43,7 +43,7 @@ def describe(image: U8, uv: F64) -> tuple[U8, F32]:
     if len(uv) == 0:
         return descriptors, np.zeros(0, np.float32)
     angles = _intensity_angles(image, np.ascontiguousarray(uv))
-    orb = cv2.ORB_create(nlevels=1, edgeThreshold=BORDER, patchSize=PATCH_SIZE)
+    orb = cv2.ORB.create(nlevels=1, edgeThreshold=BORDER, patchSize=PATCH_SIZE)
     keypoints = [
         cv2.KeyPoint(float(u), float(v), float(PATCH_SIZE), math.degrees(a) % 360.0, 1.0, 0, k)
         for k, ((u, v), a) in enumerate(zip(uv, angles, strict=True))

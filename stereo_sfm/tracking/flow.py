@@ -39,7 +39,7 @@ def build_pyramid(image: U8, levels: int) -> Pyramid:
     """Image (H, W) and its halvings, finest first; level k holds pixel u at u / 2**k."""
     out = [np.ascontiguousarray(image)]
     for _ in range(levels - 1):
-        out.append(cv2.pyrDown(out[-1]))
+        out.append(cv2.pyrDown(out[-1]).astype(np.uint8, copy=False))
     out[0] = out[0].view()
     for level in out:  # one array type for the compiled kernels
         level.flags.writeable = False
