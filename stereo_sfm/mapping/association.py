@@ -85,10 +85,10 @@ def _words(descriptors: U8) -> np.ndarray[tuple[int, int], np.dtype[np.uint64]]:
     return np.ascontiguousarray(descriptors).view(np.uint64).reshape(-1, 4)
 
 
-def agreeing(rig: Rig, map_T_kf: F64, xyz: F64, uv_left: F64, uv_right: F64, config: MapperConfig) -> tuple[Bool, F64]:
-    """Which matches (N,) agree with one pose near the given one, and that pose; none where too few do."""
+def agreeing(rig: Rig, map_T_kf: F64, xyz: F64, uv_left: F64, uv_right: F64, config: MapperConfig) -> Bool:
+    """Which matches (N,) agree with one pose near the given one; none where too few do."""
     count = len(xyz)
-    nothing = np.zeros(count, bool), map_T_kf
+    nothing = np.zeros(count, bool)
     if count < config.match_min:
         return nothing
     rows = np.arange(count)
@@ -100,4 +100,4 @@ def agreeing(rig: Rig, map_T_kf: F64, xyz: F64, uv_left: F64, uv_right: F64, con
     good = result.inlier[:, 0] & (result.inlier[:, 1] | ~np.isfinite(uv_right[:, 0]))
     if good.sum() < max(config.match_min, 0.5 * count):
         return nothing
-    return good, result.world_T_kf[0]
+    return good

@@ -106,7 +106,7 @@ def _find_again(
         np.where(usable[:, None], keyframe.descriptors, 0).astype(np.uint8),
     )
     mine, found = association.match(sightings, uv_left, uv_right, map_.descriptors_of(points), config)
-    good, _ = association.agreeing(
+    good = association.agreeing(
         rig, pose, map_.points.xyz[points[found]], sightings.uv_left[mine], sightings.uv_right[mine], config
     )
     return np.stack([mine[good], points[found[good]]], 1)
