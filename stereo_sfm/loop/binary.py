@@ -185,7 +185,8 @@ def match_descriptors(
     groups = np.arange(len(b)) if group is None else np.ascontiguousarray(group[t_rows])
     best, first, second = _two_nearest(a, b, groups)
     ok = (best >= 0) & (first <= max_distance) & (first <= ratio * second)
-    if mutual and len(b):
-        back, _, _ = _two_nearest(b, a, np.arange(len(a)))
-        ok &= back[best] == np.arange(len(a))
+    if mutual and ok.any():
+        asked, back_row = np.unique(best[ok], return_inverse=True)
+        back, _, _ = _two_nearest(b[asked], a, np.arange(len(a)))
+        ok[ok] = back[back_row] == np.flatnonzero(ok)
     return q_rows[ok], t_rows[best[ok]], first[ok].astype(np.float32)

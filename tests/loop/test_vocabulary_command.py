@@ -1,0 +1,31 @@
+"""`stereo-sfm vocabulary` on real images: anybody can train one again and gets the same bytes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from stereo_sfm.cli import main
+from stereo_sfm.loop.vocabulary_file import load_vocabulary
+
+
+def test_train_twice_and_describe(tmp_path: Path, data_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    paths = [tmp_path / "a.npz", tmp_path / "b.npz"]
+    for path in paths:
+        arguments = ["--images", "3", "--branching", "6", "--depth", "3", "-o", str(path)]
+        assert main(["vocabulary", "train", str(data_root / "t265_office"), *arguments]) == 0
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+    words = len(load_vocabulary(paths[0]))
+    assert 50 < words <= 6**3
+    out = capsys.readouterr().out
+    assert f"{words} words from" in out and "of 3 images" in out
+    assert main(["vocabulary", "info", str(paths[0])]) == 0
+    assert f"{words} words in" in capsys.readouterr().out
+
+
+def test_bad_input_has_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["vocabulary", "info", str(tmp_path / "none.npz")]) == 2
+    assert "no vocabulary at" in capsys.readouterr().err
+    assert main(["vocabulary", "train", str(tmp_path / "nowhere"), "-o", str(tmp_path / "v.npz")]) == 2
+    assert "no such file or folder" in capsys.readouterr().err
