@@ -91,7 +91,11 @@ def add_wiring_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("full", "lean", "none"),
         help="run.mcap with images, without them, or none (default: full for devices, lean for recordings)",
     )
-    parser.add_argument("--image-format", choices=("png", "raw", "jpeg"), default="png", help="images of --log full")
+    parser.add_argument(
+        "--image-format",
+        choices=("png", "raw", "jpeg"),
+        help="images of --log full (default: raw for devices, which leaves the time to track; else png)",
+    )
     parser.add_argument(
         "--viz", choices=("none", "spawn", "serve", "save"), default="none", help="show it in rerun; save: run.rrd"
     )

@@ -36,7 +36,7 @@ class Wiring:
     inline: bool = False
     mode: str | None = None  # lockstep | realtime; None: as the source says
     log: str | None = None  # full | lean | none; None: full for devices, lean for recordings
-    image_format: str = "png"  # of a full log
+    image_format: str | None = None  # of a full log; None: raw for devices, else png
     viz: str = "none"  # none | spawn | serve | save
 
 
@@ -111,7 +111,8 @@ class Session:
         kind = self._wiring.log or ("full" if live else "lean")
         if kind == "none":
             return None
-        return LogOptions(folder / "run.mcap", self._wiring.image_format if kind == "full" else "none")
+        pixels = self._wiring.image_format or ("raw" if live else "png")
+        return LogOptions(folder / "run.mcap", pixels if kind == "full" else "none")
 
     def _ring_drops(self) -> list[Dropped]:
         """Images that the run to be repeated dropped for want of time."""

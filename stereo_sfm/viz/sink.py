@@ -46,7 +46,8 @@ def blueprint(name: str) -> rrb.Blueprint:
 def age_colors(age: I32) -> U8:
     """(N,) frames -> (N, 3) RGB: blue for new tracks, over green, to red for old ones."""
     scaled = np.clip(age.astype(float) / OLD, 0, 1) * 255
-    return cv2.applyColorMap(scaled.astype(np.uint8)[:, None], cv2.COLORMAP_JET)[:, 0, ::-1].astype(np.uint8, copy=False)
+    bgr = cv2.applyColorMap(scaled.astype(np.uint8)[:, None], cv2.COLORMAP_JET)[:, 0]
+    return bgr[:, ::-1].astype(np.uint8, copy=False)
 
 
 class RerunSink:
