@@ -18,7 +18,7 @@ from calib.tracks import Window
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.stereo import rectifying_rotations
-from stereo_sfm.types import F64, Bool
+from stereo_sfm.types import F64
 
 ROTATION, DIRECTION, FOCAL, FOCAL_RIGHT, SKEW = slice(0, 3), slice(3, 5), 5, 6, 7
 NUISANCE = 9
@@ -293,8 +293,3 @@ def _apply(problem: _Problem, shared: F64, pose_gain: F64, pose_gradient: F64, g
     problem.rho = problem.rho + step[:, 2]
     if len(problem.left) > 1:
         problem.frame_T_first[1] = se3.exp(pose) @ problem.frame_T_first[1]
-
-
-def inlier_mask(correction: Correction, errors: F64) -> Bool:
-    """Rows within five deviations of the noise the fit found."""
-    return np.abs(errors) < 5 * correction.noise_px
