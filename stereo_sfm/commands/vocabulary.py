@@ -22,9 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "sources", nargs="*", default=list(DEFAULT_SOURCES), metavar="SOURCE", help="default: the package's own"
     )
     train.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="vocabulary file (.npz)")
-    train.add_argument(
-        "--images", type=int, default=80, metavar="N", help="images of each source, evenly spread"
-    )
+    train.add_argument("--images", type=int, default=80, metavar="N", help="images of each source, evenly spread")
     train.add_argument("--branching", type=int, default=10, help="children of a node of the tree")
     train.add_argument("--depth", type=int, default=4, help="levels of the tree")
     train.add_argument("--seed", type=int, default=0, help="of the clustering")
