@@ -65,17 +65,16 @@ def guarded(stage: str, body: Callable[..., None], report: Connection, *args: An
 
 @dataclass(frozen=True)
 class Ready:
-    """The stage has loaded what it needs; a live run begins when all are ready."""
+    """The stage has loaded what it needs; a run begins when all are ready."""
 
     stage: str
 
 
 def ready(stage: str, setup: Setup, to_main: Outbox) -> None:
-    """Load the stage's code if the run is live, and say so."""
-    if setup.realtime:
-        from stereo_sfm.pipeline.warm_up import warm_up_stage
+    """Load the stage's code, and say so."""
+    from stereo_sfm.pipeline.warm_up import warm_up_stage
 
-        warm_up_stage(stage, setup.config, setup.rig)
+    warm_up_stage(stage, setup.config, setup.rig)
     to_main.send(Ready(stage))
 
 
