@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
@@ -25,6 +26,12 @@ class NoProgress:
         """One frame is done."""
 
 
+def _first_state() -> str:
+    """What the bar says before the first frame."""
+    compiled = any((Path(__file__).parents[1] / "tracking" / "__pycache__").glob("flow.*.nbi"))
+    return "" if compiled else "first run on this machine: compiling, about half a minute"
+
+
 class TerminalProgress(NoProgress):
     """A bar on standard error."""
 
@@ -42,7 +49,7 @@ class TerminalProgress(NoProgress):
             console=Console(stderr=True),
             transient=True,
         )
-        self._task = self._progress.add_task(name, total=total, rate="-", state="")
+        self._task = self._progress.add_task(name, total=total, rate="-", state=_first_state())
 
     def __enter__(self) -> Self:
         self._progress.start()

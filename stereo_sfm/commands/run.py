@@ -174,8 +174,6 @@ def execute(
     from stereo_sfm.export.run_folder import link_latest
     from stereo_sfm.pipeline.session import Session, Wiring
 
-    if not args.quiet and not _compiled():
-        print("first run on this machine: compiling, about a minute; later runs begin at once", file=sys.stderr)
     record, pictures = RunRecord(), _match_pictures(getattr(args, "matches", None))
     sinks = [record] if pictures is None else [record, pictures]
     # Images reach the sinks only where the stages share this process.
@@ -213,11 +211,6 @@ def _match_pictures(every: int | None) -> MatchPictures | None:
     from stereo_sfm.viz.match_pictures import MatchPictures
 
     return MatchPictures(every)
-
-
-def _compiled() -> bool:
-    """Whether an earlier run left compiled kernels behind."""
-    return any((Path(__file__).parents[1] / "tracking" / "__pycache__").glob("flow.*.nbi"))
 
 
 def _follow(session: Session, record: RunRecord, quiet: bool) -> tuple[bool, StereoSfmError | None]:

@@ -6,14 +6,10 @@ ECCV 2018; our own derivation of its steps)."""
 from __future__ import annotations
 
 import math
-from typing import Any
 
-import numba
 import numpy as np
 
-from stereo_sfm.geometry.kernels import project_one
-
-njit: Any = numba.njit(cache=True, nogil=True, error_model="numpy")
+from stereo_sfm.geometry.kernels import njit, project_one
 
 
 @njit
@@ -42,27 +38,34 @@ def _cubic_root(c3, c2, c1, c0):
 
 
 @njit
+def _cross(a, b):
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@njit
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit
 def _eigenvector(m, value):
     """Unit null vector of the symmetric 3x3 matrix m - value I: the largest cross product of two of its rows."""
-    n = m - value * np.eye(3)
-    best = np.zeros(3)
-    largest = -1.0
+    n = m.copy()
     for i in range(3):
-        c = np.cross(n[i], n[(i + 1) % 3])
-        size = c[0] * c[0] + c[1] * c[1] + c[2] * c[2]
+        n[i, i] -= value
+    x, y, z, largest = 0.0, 0.0, 0.0, 0.0
+    for i in range(3):
+        cx, cy, cz = _cross(n[i], n[(i + 1) % 3])
+        size = cx * cx + cy * cy + cz * cz
         if size > largest:
-            largest = size
-            best = c
-    return best / math.sqrt(largest) if largest > 0 else best
+            x, y, z, largest = cx, cy, cz, size
+    scale = 1.0 / math.sqrt(largest) if largest > 0 else 0.0
+    return x * scale, y * scale, z * scale
 
 
 @njit
 def _det3(m):
-    return (
-        m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1])
-        - m[0, 1] * (m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0])
-        + m[0, 2] * (m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0])
-    )
+    return _dot(m[0], _cross(m[1], m[2]))
 
 
 @njit
@@ -77,54 +80,48 @@ def _adjugate_trace(a, b):
 
 
 @njit
-def _polish(lam, a12, a13, a23, b12, b13, b23):
+def _polish(l1, l2, l3, a12, a13, a23, b12, b13, b23):
     """Newton steps on the three distance equations."""
     for _ in range(3):
-        l1, l2, l3 = lam
-        r = np.array(
-            [
-                l1 * l1 + l2 * l2 - 2 * b12 * l1 * l2 - a12,
-                l1 * l1 + l3 * l3 - 2 * b13 * l1 * l3 - a13,
-                l2 * l2 + l3 * l3 - 2 * b23 * l2 * l3 - a23,
-            ]
-        )
-        j = np.array(
-            [
-                [2 * (l1 - b12 * l2), 2 * (l2 - b12 * l1), 0.0],
-                [2 * (l1 - b13 * l3), 0.0, 2 * (l3 - b13 * l1)],
-                [0.0, 2 * (l2 - b23 * l3), 2 * (l3 - b23 * l2)],
-            ]
-        )
-        det = _det3(j)
+        r1 = l1 * l1 + l2 * l2 - 2 * b12 * l1 * l2 - a12
+        r2 = l1 * l1 + l3 * l3 - 2 * b13 * l1 * l3 - a13
+        r3 = l2 * l2 + l3 * l3 - 2 * b23 * l2 * l3 - a23
+        # Columns of the Jacobian, and Cramer's rule.
+        c1 = (2 * (l1 - b12 * l2), 2 * (l1 - b13 * l3), 0.0)
+        c2 = (2 * (l2 - b12 * l1), 0.0, 2 * (l2 - b23 * l3))
+        c3 = (0.0, 2 * (l3 - b13 * l1), 2 * (l3 - b23 * l2))
+        r = (r1, r2, r3)
+        det = _dot(c1, _cross(c2, c3))
         if abs(det) < 1e-18:
             break
-        step = np.empty(3)
-        for c in range(3):
-            jc = j.copy()
-            jc[:, c] = r
-            step[c] = _det3(jc) / det
-        lam = lam - step
-    return lam
+        l1 -= _dot(r, _cross(c2, c3)) / det
+        l2 -= _dot(c1, _cross(r, c3)) / det
+        l3 -= _dot(c1, _cross(c2, r)) / det
+    return l1, l2, l3
 
 
 @njit
 def p3p(points, bearings):
     """(3, 3) points of frame a and (3, 3) unit bearings of frame b -> up to four b_T_a as (4, 3, 4), and how many."""
     out = np.empty((4, 3, 4))
+    y12, y13 = np.empty(3), np.empty(3)
     count = 0
     x12, x13 = points[0] - points[1], points[0] - points[2]
     x23 = points[1] - points[2]
-    a12, a13, a23 = (x12 * x12).sum(), (x13 * x13).sum(), (x23 * x23).sum()
-    b12, b13 = (bearings[0] * bearings[1]).sum(), (bearings[0] * bearings[2]).sum()
-    b23 = (bearings[1] * bearings[2]).sum()
-    normal = np.cross(x12, x13)
-    area = (normal * normal).sum()
+    a12, a13, a23 = _dot(x12, x12), _dot(x13, x13), _dot(x23, x23)
+    b12, b13 = _dot(bearings[0], bearings[1]), _dot(bearings[0], bearings[2])
+    b23 = _dot(bearings[1], bearings[2])
+    normal = _cross(x12, x13)
+    area = _dot(normal, normal)
     if area < 1e-12 * a12 * a13 or min(a12, a13, a23) < 1e-12:
         return out, 0
     d1 = np.array([[a23, -a23 * b12, 0.0], [-a23 * b12, a23 - a12, a12 * b23], [0.0, a12 * b23, -a12]])
     d2 = np.array([[a23, 0.0, -a23 * b13], [0.0, -a13, a13 * b23], [-a23 * b13, a13 * b23, a23 - a13]])
     g = _cubic_root(_det3(d2), _adjugate_trace(d2, d1), _adjugate_trace(d1, d2), _det3(d1))
-    d0 = d1 + g * d2
+    d0 = np.empty((3, 3))
+    for i in range(3):
+        for k in range(3):
+            d0[i, k] = d1[i, k] + g * d2[i, k]
     trace = d0[0, 0] + d0[1, 1] + d0[2, 2]
     minors = (
         d0[0, 0] * d0[1, 1] - d0[0, 1] ** 2 + d0[0, 0] * d0[2, 2] - d0[0, 2] ** 2 + d0[1, 1] * d0[2, 2] - d0[1, 2] ** 2
@@ -135,14 +132,13 @@ def p3p(points, bearings):
         return out, 0
     e1, e2 = _eigenvector(d0, positive), _eigenvector(d0, negative)
     s = math.sqrt(-negative / positive)
-    frame = np.empty((3, 3))
-    frame[:, 0], frame[:, 1], frame[:, 2] = x12, x13, normal
-    inverse = np.linalg.inv(frame)
+    # Rows of the inverse of the matrix with the columns x12, x13, normal, whose determinant is `area`.
+    dual12, dual13 = _cross(x13, normal), _cross(normal, x12)
     for sign in (-1.0, 1.0):
-        n = e1 + sign * s * e2
-        if abs(n[0]) < 1e-12:
+        n0 = e1[0] + sign * s * e2[0]
+        if abs(n0) < 1e-12:
             continue
-        w0, w1 = -n[1] / n[0], -n[2] / n[0]
+        w0, w1 = -(e1[1] + sign * s * e2[1]) / n0, -(e1[2] + sign * s * e2[2]) / n0
         qa = (w1 * w1 + 1 - 2 * b13 * w1) * a23 - a13
         qb = 2 * w0 * (w1 - b13) * a23 + 2 * b23 * a13
         qc = w0 * w0 * a23 - a13
@@ -156,16 +152,17 @@ def p3p(points, bearings):
             if tau <= 0 or ratio <= 0 or size <= 0:
                 continue
             l2 = math.sqrt(a23 / size)
-            lam = _polish(np.array([ratio * l2, l2, tau * l2]), a12, a13, a23, b12, b13, b23)
-            if not (lam[0] > 0 and lam[1] > 0 and lam[2] > 0):
+            m1, m2, m3 = _polish(ratio * l2, l2, tau * l2, a12, a13, a23, b12, b13, b23)
+            if not (m1 > 0 and m2 > 0 and m3 > 0):
                 continue
-            y12 = lam[0] * bearings[0] - lam[1] * bearings[1]
-            y13 = lam[0] * bearings[0] - lam[2] * bearings[2]
-            target = np.empty((3, 3))
-            target[:, 0], target[:, 1], target[:, 2] = y12, y13, np.cross(y12, y13)
-            rotation = target @ inverse
-            out[count, :, :3] = rotation
-            out[count, :, 3] = lam[0] * bearings[0] - rotation @ points[0]
+            for i in range(3):
+                y12[i] = m1 * bearings[0, i] - m2 * bearings[1, i]
+                y13[i] = m1 * bearings[0, i] - m3 * bearings[2, i]
+            up = _cross(y12, y13)
+            for i in range(3):
+                for k in range(3):
+                    out[count, i, k] = (y12[i] * dual12[k] + y13[i] * dual13[k] + up[i] * normal[k]) / area
+                out[count, i, 3] = m1 * bearings[0, i] - _dot(out[count, i], points[0])
             count += 1
     return out, count
 
@@ -242,13 +239,16 @@ def ransac(
         (3, 4) transform, its cost (infinite when there is none).
     """
     best = np.zeros((3, 4))
+    three, rays = np.empty((3, 3)), np.empty((3, 3))
     lowest = math.inf
     needed = samples.shape[0]
     for s in range(samples.shape[0]):
         if s >= needed:
             break
-        rows = samples[s]
-        solutions, count = p3p(points[rows], bearings[rows])
+        for i in range(3):
+            for c in range(3):
+                three[i, c], rays[i, c] = points[samples[s, i], c], bearings[samples[s, i], c]
+        solutions, count = p3p(three, rays)
         for k in range(count):
             t = solutions[k]
             cost = _cost(t, points, sigmas, uv_b, points_b, sigmas_b, uv_a, model, params, pixel_sigma, limit, lowest)

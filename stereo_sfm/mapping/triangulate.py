@@ -16,6 +16,7 @@ import numpy as np
 from calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.kernels import njit, project_one
+from stereo_sfm.geometry.small_matrix import solve_symmetric
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.types import F64, I64
 
@@ -76,6 +77,13 @@ def _cost(x, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, righ
 
 
 @njit
+def _copy(source, target):
+    """Element by element: a slice assignment would take seconds to compile for the text of its error message."""
+    for i in range(source.size):
+        target.flat[i] = source.flat[i]
+
+
+@njit
 def refine_points(
     points, rays, origins, trials, starts, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, steps
 ):
@@ -88,7 +96,7 @@ def refine_points(
     """
     h, b = np.zeros((3, 3)), np.zeros(3)
     h2, b2 = np.zeros((3, 3)), np.zeros(3)
-    x, y, damped = np.zeros(3), np.zeros(3), np.zeros((3, 3))
+    x, y, damped, factor = np.zeros(3), np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
     for i in range(points.shape[0]):
         first, last = starts[i], starts[i + 1]
         lowest = math.inf
@@ -100,26 +108,30 @@ def refine_points(
             cost = _cost(y, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, h, b)
             if cost < lowest:
                 lowest = cost
-                x[:] = y
+                _copy(y, x)
         damping = 1e-3
         cost = _cost(x, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, h, b)
         for _ in range(steps):
-            damped[:] = h
+            _copy(h, damped)
             for j in range(3):
                 damped[j, j] += damping * h[j, j] + 1e-12
-            y[:] = x + np.linalg.solve(damped, b)
+            if not solve_symmetric(damped, b, y, factor):
+                break
+            for j in range(3):
+                y[j] += x[j]
             new = _cost(y, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, h2, b2)
             if new < cost:
                 done = cost - new < 1e-4 * cost
                 cost, damping = new, damping * 0.1
-                x[:] = y
-                h[:] = h2
-                b[:] = b2
+                _copy(y, x)
+                _copy(h2, h)
+                _copy(b2, b)
                 if done:
                     break
             else:
                 damping *= 10.0
-        points[i] = x
+        for j in range(3):
+            points[i, j] = x[j]
 
 
 def triangulate(map_: Map, rig: Rig, rows: I64) -> F64:

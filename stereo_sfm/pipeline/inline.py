@@ -110,9 +110,13 @@ def run_inline(
         folders: maps to start from and to leave behind.
         jpeg: the sinks store images as JPEG, so the tracker sees what they will give back.
     """
+    import scipy.linalg  # noqa: F401  # its BLAS must be loaded to be limited
+    from threadpoolctl import threadpool_limits
+
     run = InlineRun(source, config, sinks, schedule, folders, jpeg)
-    try:
-        for image in source:
-            yield run.step(image)
-    finally:
-        run.finish()
+    with threadpool_limits(config.pipeline.threads):  # BLAS sums in another order with another number of threads
+        try:
+            for image in source:
+                yield run.step(image)
+        finally:
+            run.finish()

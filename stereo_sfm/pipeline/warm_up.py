@@ -10,35 +10,45 @@ import numpy as np
 from calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.pipeline.stages import make_closer
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.tracking.factory import make_tracker
-from stereo_sfm.types import F32, U8, Keyframe, StereoImage
+from stereo_sfm.types import F64, U8, Keyframe, StereoImage
 
-FRAMES, POINTS = 4, 300
+FRAMES, POINTS = 8, 300
+WALL = 2.0  # metres ahead
 
 
 def images(rig: Rig) -> list[StereoImage]:
-    """Noise that moves a little: enough for points, matches and keyframes in any camera."""
+    """Both eyes pass a wall of grey squares: enough for points, matches and keyframes in any camera."""
     rng = np.random.default_rng(0)
-    height, width = rig.left.height, rig.left.width
-    coarse = rng.integers(20, 230, (height // 8 + 2, width // 8 + 8))
-    wall = np.kron(coarse, np.ones((8, 8))).astype(np.uint8)
+    texture = np.kron(rng.integers(20, 230, (64, 64)), np.ones((8, 8))).astype(np.uint8)
     out: list[StereoImage] = []
     for k in range(FRAMES):
-        left = np.ascontiguousarray(wall[:height, 2 * k : 2 * k + width])
-        right: U8 | None = None
-        depth: F32 | None = None
-        if rig.right is not None and not rig.depth:
-            right = np.ascontiguousarray(wall[: rig.right.height, 2 * k + 4 : 2 * k + 4 + rig.right.width])
-        elif rig.depth:
-            depth = np.full((height, width), 2.0, np.float32)
+        world_T_left = se3.exp(np.array([0.03 * k, 0.0, 0.02 * k, 0.0, 0.002 * k, 0.0]))
+        left = _wall(rig.left, world_T_left, texture)
+        right, depth = None, None
+        if rig.depth:
+            depth = np.full(left.shape, WALL, np.float32)
+        elif rig.right is not None:
+            right = _wall(rig.right, world_T_left @ rig.left_T_right, texture)
         out.append(StereoImage(k, 1 + k * 33_000_000, left, right, depth))
     return out
 
 
+def _wall(camera: Camera, world_T_cam: F64, texture: U8) -> U8:
+    """Picture of the plane z = WALL, covered by `texture`, a centimetre a pixel."""
+    grid = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), -1).reshape(-1, 2)
+    ray = camera.unproject(grid.astype(float)) @ world_T_cam[:3, :3].T
+    with np.errstate(invalid="ignore", divide="ignore"):
+        place = world_T_cam[:3, 3] + ray * ((WALL - world_T_cam[2, 3]) / ray[:, 2:])
+        cell = np.where(ray[:, 2:] > 0.05, place[:, :2] * 100, 0).astype(np.int64) % len(texture)
+    return np.ascontiguousarray(texture[cell[:, 1], cell[:, 0]].reshape(camera.height, camera.width))
+
+
 def keyframes(rig: Rig) -> list[Keyframe]:
-    """Keyframes of a made scene that see the same points: what the mapper and the loop closer work on."""
+    """Keyframes of made points: what the mapper and the loop closer work on. Halfway all are seen anew: a loop."""
     rng = np.random.default_rng(0)
     uv = rng.uniform([40, 40], [rig.left.width - 40, rig.left.height - 40], (POINTS, 2))
     bearing = rig.left.unproject(uv)
@@ -47,25 +57,15 @@ def keyframes(rig: Rig) -> list[Keyframe]:
     descriptors = rng.integers(0, 256, (len(points), 32)).astype(np.uint8)
     out: list[Keyframe] = []
     for k in range(FRAMES):
-        odom_T_cam = se3.exp(np.array([0.05 * k, 0.0, 0.02 * k, 0.0, 0.005 * k, 0.0]))
+        odom_T_cam = se3.exp(np.array([0.02 * k, 0.0, 0.01 * k, 0.0, 0.002 * k, 0.0]))
         points_cam = se3.transform(se3.inverse(odom_T_cam), points)
         right = np.full((len(points), 2), np.nan)
         if rig.right is not None:
             right = rig.right.project(se3.transform(se3.inverse(rig.left_T_right), points_cam))
-        out.append(
-            Keyframe(
-                k,
-                k,
-                k * 100_000_000,
-                odom_T_cam,
-                np.arange(len(points)) + (k % 2) * 20,
-                rig.left.project(points_cam),
-                right,
-                points_cam,
-                descriptors,
-                np.zeros(len(points), np.float32),
-            )
-        )
+        ids = np.arange(len(points)) + (k % 2) * 20 + (k >= FRAMES // 2) * 10_000
+        size = np.zeros(len(points), np.float32)
+        uv_left = rig.left.project(points_cam)
+        out.append(Keyframe(k, k, k * 100_000_000, odom_T_cam, ids, uv_left, right, points_cam, descriptors, size))
     return out
 
 
@@ -81,6 +81,7 @@ def warm_up_stage(stage: str, config: Config, rig: Rig) -> None:
         mapper = Mapper(config.mapper, rig, NoSpans(), config.loop)
         for keyframe in keyframes(rig):
             mapper.step(keyframe)
+        mapper.finish([])
     elif stage == "loop":
         eager = dataclasses.replace(config.loop, min_gap=1, min_score=0.0, pause=0)
         closer = make_closer(dataclasses.replace(config, loop=eager), rig)

@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 
 from stereo_sfm.geometry.kernels import njit
+from stereo_sfm.geometry.small_matrix import invert_symmetric
 from stereo_sfm.types import U8
 
 SIZE = 16
@@ -268,7 +269,7 @@ def make_patches(pyramid, uv, slots, weights, coordinates, patch, gradients, inv
     wide = np.zeros(WIDE_SIZE + STRIDE, np.float32)
     tmp = np.zeros(FLAT_SIZE, np.float32)
     jac = np.zeros((6, FLAT_SIZE), np.float32)
-    normal = np.zeros((6, 6))
+    normal, factor = np.zeros((6, 6)), np.zeros((6, 6))
     for row in range(n):
         if not _inside(pyramid[0], uv[row, 0], uv[row, 1], HALF + 1.5):
             continue
@@ -300,8 +301,7 @@ def make_patches(pyramid, uv, slots, weights, coordinates, patch, gradients, inv
             normal[a, a] += damping * HALF * HALF
         if normal[2, 2] * normal[5, 5] - normal[2, 5] ** 2 < 1e-3 * (normal[2, 2] + normal[5, 5]) ** 2:
             continue
-        inverse_normal[k] = np.linalg.inv(normal)
-        good[row] = True
+        good[row] = invert_symmetric(normal, inverse_normal[k], factor)
     return good
 
 

@@ -16,6 +16,7 @@ import math
 import numpy as np
 
 from stereo_sfm.geometry.kernels import njit, project_one
+from stereo_sfm.geometry.small_matrix import invert_symmetric, solve_symmetric
 
 
 @njit
@@ -94,6 +95,17 @@ def point_residuals(pose, px, py, pz, dx, dy, dz, uv_l, uv_r, cams, right_T_left
 
 
 @njit
+def _compose(a, b):
+    """a @ b of two (4, 4) transforms."""
+    out = np.zeros((4, 4))
+    for i in range(4):
+        for j in range(4):
+            for m in range(4):
+                out[i, j] += a[i, m] * b[m, j]
+    return out
+
+
+@njit
 def optimise_pose(
     pose, origin, direction, rho, variance, uv_l, uv_r, weight, cams, right_T_left, sigma, scales, prior, prior_pose
 ):
@@ -113,15 +125,16 @@ def optimise_pose(
     pose = pose.copy()
     res, jac, ray = np.zeros(4), np.zeros((4, 6)), np.zeros(4)
     error = np.full(n, np.inf)
-    normal = np.zeros((6, 6))
-    rhs = np.zeros(6)
-    jr = np.zeros(6)
+    normal, factor = np.zeros((6, 6)), np.zeros((6, 6))
+    rhs, xi, jr = np.zeros(6), np.zeros(6), np.zeros(6)
     inv_s2 = 1.0 / (sigma * sigma)
     for step_index in range(len(scales) + 1):
         last = step_index == len(scales)
         scale2 = scales[min(step_index, len(scales) - 1)] ** 2
-        normal[:] = prior
-        rhs[:] = 0
+        for i in range(6):
+            rhs[i] = 0.0
+            for j in range(6):
+                normal[i, j] = prior[i, j]
         used = 0.0
         for k in range(n):
             ir = 1.0 / rho[k]
@@ -187,9 +200,15 @@ def optimise_pose(
             for i in range(6):
                 for j in range(6):
                     rhs[i] += prior[i, j] * delta[j]
-        xi = -np.linalg.solve(normal, rhs)
-        pose = pose @ _exp(xi)
-    covariance = np.linalg.inv(normal + 1e-9 * np.eye(6))
+        for i in range(6):
+            rhs[i] = -rhs[i]
+        if not solve_symmetric(normal, rhs, xi, factor):
+            break
+        pose = _compose(pose, _exp(xi))
+    for i in range(6):
+        normal[i, i] += 1e-9
+    covariance = np.full((6, 6), np.inf)
+    invert_symmetric(normal, covariance, factor)
     return pose, covariance, error
 
 

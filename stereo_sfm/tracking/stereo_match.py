@@ -115,7 +115,11 @@ def triangulate(uv_left, uv_right, model_l, params_l, model_r, params_r, left_T_
     rho = np.full(n, np.nan)
     variance = np.full(n, np.nan)
     epipolar = np.full(n, np.nan)
-    right_T_left = np.linalg.inv(left_T_right)
+    right_T_left = np.zeros((3, 4))
+    for i in range(3):
+        for j in range(3):
+            right_T_left[i, j] = left_T_right[j, i]
+            right_T_left[i, 3] -= left_T_right[j, i] * left_T_right[j, 3]
     for k in range(n):
         bx, by, bz = unproject_one(model_l, params_l, uv_left[k, 0], uv_left[k, 1])
         if math.isnan(bx) or math.isnan(uv_right[k, 0]):

@@ -109,6 +109,15 @@ def test_processes_with_delays_give_the_bits_of_inline(inline: Path, tmp_path: P
         assert len(read_run(reader).applied) >= 3  # the map reached the tracker
 
 
+def test_blas_has_the_configured_threads_inline_as_between_processes() -> None:
+    from threadpoolctl import threadpool_info
+
+    frames = run_inline(SlidingWall(3), CONFIG)
+    next(frames)
+    assert {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"} == {1}
+    frames.close()
+
+
 def test_a_realtime_run_is_replayed_by_its_recorded_schedule(tmp_path: Path) -> None:
     process_log(tmp_path / "live.mcap", functools.partial(SlidingWall, 60, slow_s=0.01), realtime=True, delays=2)
     with LogReader(tmp_path / "live.mcap") as reader:
