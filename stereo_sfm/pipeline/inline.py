@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Generator, Sequence
 
 from drivers.source import Source
@@ -110,9 +111,9 @@ def run_inline(
         folders: maps to start from and to leave behind.
         jpeg: the sinks store images as JPEG, so the tracker sees what they will give back.
     """
-    import scipy.linalg  # noqa: F401  # its BLAS must be loaded to be limited
     from threadpoolctl import threadpool_limits
 
+    importlib.import_module("scipy.linalg")  # its BLAS must be loaded to be limited
     run = InlineRun(source, config, sinks, schedule, folders, jpeg)
     with threadpool_limits(config.pipeline.threads):  # BLAS sums in another order with another number of threads
         try:

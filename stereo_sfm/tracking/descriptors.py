@@ -49,6 +49,6 @@ def describe(image: U8, uv: F64) -> tuple[U8, F32]:
         for k, ((u, v), a) in enumerate(zip(uv, angles, strict=True))
     ]
     kept, rows = orb.compute(image, keypoints)
-    if rows is not None:
+    if len(kept):
         descriptors[[kp.class_id for kp in kept]] = rows
     return descriptors, angles
