@@ -89,17 +89,17 @@ class Numbers:
             self.health[message.stage] = message
 
 
-def memory_mb(run: ProcessRun) -> float:
-    """Unique set sizes of the stages but capture's recording in memory, which a camera would not have."""
-    total = psutil.Process().memory_full_info().uss
+def memory_mb(run: ProcessRun) -> dict[str, float]:
+    """Unique set sizes of the stages but capture's, whose recording in memory a camera would not have."""
+    sizes = {"main": psutil.Process().memory_full_info().uss / 2**20}
     for stage, pid in run.pids.items():
         if stage != "capture" and psutil.pid_exists(pid):
-            total += psutil.Process(pid).memory_full_info().uss
-    return total / 2**20
+            sizes[stage] = psutil.Process(pid).memory_full_info().uss / 2**20
+    return sizes
 
 
 def play(path: str, frames: int, paced: bool, folder: Path) -> None:
-    numbers, memory = Numbers(), list[tuple[float, float]]()
+    numbers, memory = Numbers(), list[tuple[float, dict[str, float]]]()
     log = folder / f"{'realtime' if paced else 'fast'}.mcap"
     with ProcessRun(
         functools.partial(opened, path, frames, paced), Config(), [numbers], log=LogOptions(log, "raw")
@@ -123,8 +123,9 @@ def play(path: str, frames: int, paced: bool, folder: Path) -> None:
         print(f"  image to pose: p50 {p50:.1f} ms, p95 {p95:.1f} ms, p99 {p99:.1f} ms")
     for stage, health in sorted(numbers.health.items()):
         print(f"  {stage}: p50 {health.p50_ms:.1f} ms, p95 {health.p95_ms:.1f} ms, {health.rate:.1f} a second")
-    if memory:
-        print("  memory MiB: " + ", ".join(f"{s:.0f} s {mb:.0f}" for s, mb in memory[:: max(len(memory) // 10, 1)]))
+    for seconds_in, sizes in memory[:: max(len(memory) // 10, 1)]:
+        stages = ", ".join(f"{stage} {mb:.0f}" for stage, mb in sizes.items())
+        print(f"  memory after {seconds_in:.0f} s: {sum(sizes.values()):.0f} MiB ({stages})")
     print(f"  log {log.stat().st_size / 2**20 / max(seconds, 1e-9):.1f} MiB/s")
     log.unlink()
 
@@ -134,6 +135,7 @@ def main() -> None:
     parser.add_argument("--recording", help="raw MCAP recording of sim:loop")
     parser.add_argument("--frames", type=int, default=600, help="of sim:loop to record when there is no recording")
     parser.add_argument("--minutes", type=float, default=1.0)
+    parser.add_argument("--fast", action="store_true", help="only as fast as it goes, not in real time")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -143,7 +145,7 @@ def main() -> None:
                 for _ in record(source, Path(path), "raw"):
                     pass
         frames = round(args.minutes * 60 * 30)
-        for paced in (False, True):
+        for paced in (False, True) if not args.fast else (False,):
             play(path, frames, paced, folder)
 
 

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.consistency import DIRECTION, FOCAL, FOCAL_RIGHT, ROTATION, SKEW, Correction, estimate
+from calib.consistency import Correction, estimate
 from calib.rectification import Rectification
 from calib.rig import Rig
+from calib.scene_model import DIRECTION, FOCAL, FOCAL_RIGHT, ROTATION, SKEW
 from calib.tracks import Window
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import F64, I64

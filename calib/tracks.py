@@ -1,9 +1,9 @@
-"""Points seen by both eyes at two moments: what a calibration can be judged by without a target."""
+"""Points seen by both eyes at several moments: what a calibration can be judged by without a target."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,13 +12,14 @@ from calib.matches import Matches, flattened, lucas_kanade, match_pair, pyramid_
 from calib.rectification import Rectification
 from stereo_sfm.types import F64, U8, Bool, StereoImage
 
-MOVED = 0.05  # of the width: a window ends when its points moved so far
-LONGEST = 12  # frames of a window
+STEP = 0.04  # of the width: a moment is kept when the points moved so far since the last one
+MOMENTS = 6  # of a window
+LONGEST = 24  # frames of a window
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """The same N points in both eyes at one or two moments, in pixels of the original images, NaN where not seen."""
+    """The same N points in both eyes at F moments, in pixels of the original images, NaN where not seen."""
 
     left: F64  # (F, N, 2)
     right: F64  # (F, N, 2)
@@ -27,19 +28,29 @@ class Window:
 
 
 @dataclass(eq=False)
+class _Moment:
+    """Rectified positions (N, 2) px, NaN where lost, and the right eye's velocities in px/s."""
+
+    left: F64
+    right: F64
+    velocity: F64
+
+
+@dataclass(eq=False)
 class _Tracking:
     """A window while it grows: rectified positions, float32."""
 
     start: Matches
-    first: tuple[U8, U8]  # flattened images of the first moment
+    kept: tuple[U8, Any]  # flattened left image of the last kept moment, and the points there
     last: tuple[U8, U8]
     left: Any
     right: Any
     alive: Bool
     last_ns: int
-    age: int = 0
-    first_velocity: F64 = field(default_factory=lambda: np.zeros((0, 2)))
-    velocity: F64 = field(default_factory=lambda: np.zeros((0, 2)))
+    moments: list[_Moment]
+    velocity: F64
+    age: int = 0  # frames since the start
+    fresh: int = 0  # frames since the last kept moment
 
 
 def collect(
@@ -76,7 +87,9 @@ def collect(
                 current = _begin(matches, flattened(left), flattened(right), image.stamp_ns)
             continue
         _advance(current, flattened(left), flattened(right), image.stamp_ns)
-        if _finished(current, left.shape[1]):
+        if _moved(current) > STEP * left.shape[1]:
+            _keep(current)
+        if len(current.moments) == MOMENTS or current.age >= LONGEST or current.alive.mean() < 0.3:
             out.append(_close(current, rectification))
             current, wait = None, gap
             if len(out) >= windows:
@@ -88,51 +101,54 @@ def collect(
 
 def _begin(matches: Matches, left: U8, right: U8, stamp_ns: int) -> _Tracking:
     a, b = matches.left.astype(np.float32), matches.right.astype(np.float32)
-    return _Tracking(matches, (left, right), (left, right), a, b, np.ones(len(a), bool), stamp_ns)
+    unknown = np.full(a.shape, np.nan)
+    first = _Moment(matches.left, matches.right, unknown)
+    return _Tracking(matches, (left, a), (left, right), a, b, np.ones(len(a), bool), stamp_ns, [first], unknown)
 
 
 def _advance(state: _Tracking, left: U8, right: U8, stamp_ns: int) -> None:
     seconds = max((stamp_ns - state.last_ns) * 1e-9, 1e-6)
     new_left, good_left = pyramid_flow(state.last[0], left, state.left)
     new_right, good_right = pyramid_flow(state.last[1], right, state.right)
-    state.velocity = (new_right - state.right).astype(float) / seconds
-    if state.age == 0:
-        state.first_velocity = state.velocity
     state.alive &= good_left & good_right
+    state.velocity = np.where(state.alive[:, None], (new_right - state.right).astype(float) / seconds, np.nan)
+    if state.age == 0:
+        state.moments[0].velocity = state.velocity
     state.left, state.right, state.last = new_left, new_right, (left, right)
-    state.last_ns, state.age = stamp_ns, state.age + 1
+    state.last_ns, state.age, state.fresh = stamp_ns, state.age + 1, state.fresh + 1
 
 
-def _finished(state: _Tracking, width: int) -> bool:
-    if state.age >= LONGEST or state.alive.mean() < 0.5:
-        return True
-    moved = np.linalg.norm(state.left - state.start.left, axis=1)[state.alive]
-    return float(np.median(moved)) > MOVED * width
+def _moved(state: _Tracking) -> float:
+    """Median movement in px since the last kept moment."""
+    moved = np.linalg.norm(state.left - state.kept[1], axis=1)[state.alive]
+    return float(np.median(moved)) if len(moved) else 0.0
+
+
+def _keep(state: _Tracking) -> None:
+    """A moment: the left points refined against the last moment's, the right ones against the left."""
+    left, good = lucas_kanade(state.kept[0], state.last[0], state.kept[1], state.left)
+    right, good_right = lucas_kanade(*state.last, left, state.right)
+    state.alive &= good & (np.linalg.norm(left - state.left, axis=1) < 1.5)
+    good_right &= np.linalg.norm(right - state.right, axis=1) < 2.0
+    seen = state.alive & good_right
+    state.moments.append(
+        _Moment(np.where(state.alive[:, None], left, np.nan), np.where(seen[:, None], right, np.nan), state.velocity)
+    )
+    state.left = np.where(state.alive[:, None], left, state.left)
+    state.kept, state.fresh = (state.last[0], state.left), 0
 
 
 def _close(state: _Tracking, rectification: Rectification) -> Window:
-    """Refine the end against the start and between the eyes, and go back to the original images' pixels."""
-    count = len(state.start)
-    shape = (1 if state.age == 0 else 2, count, 2)
-    left, right, velocity = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan)
-    left[0] = rectification.left.to_source(state.start.left)
-    right[0] = rectification.right.to_source(state.start.right)
-    if state.age:
-        begin = state.start.left.astype(np.float32)
-        end_left, good = lucas_kanade(state.first[0], state.last[0], begin, state.left)
-        end_right, good_right = lucas_kanade(*state.last, end_left, state.right)
-        good &= good_right & state.alive
-        good &= np.linalg.norm(end_left - state.left, axis=1) < 1.5
-        good &= np.linalg.norm(end_right - state.right, axis=1) < 2.0
-        left[1, good] = rectification.left.to_source(end_left[good].astype(float))
-        right[1, good] = rectification.right.to_source(end_right[good].astype(float))
-        velocity[0] = _moved(rectification, state.start.right, state.first_velocity)
-        velocity[1] = _moved(rectification, end_right.astype(float), state.velocity)
-        velocity[:, ~state.alive] = np.nan
+    """Keep the end too, and go back to the original images' pixels."""
+    if state.fresh and len(state.moments) < MOMENTS:
+        _keep(state)
+    left = np.stack([rectification.left.to_source(m.left.astype(float)) for m in state.moments])
+    right = np.stack([rectification.right.to_source(m.right.astype(float)) for m in state.moments])
+    velocity = np.stack([_in_source(rectification, m.right.astype(float), m.velocity) for m in state.moments])
     return Window(left, right, velocity, state.start)
 
 
-def _moved(rectification: Rectification, uv: F64, velocity: F64) -> F64:
+def _in_source(rectification: Rectification, uv: F64, velocity: F64) -> F64:
     """Velocity in rectified px/s -> in px/s of the original right image."""
     step = 1e-3
     return (rectification.right.to_source(uv + step * velocity) - rectification.right.to_source(uv)) / step

@@ -111,6 +111,7 @@ class MapperConfig:
     max_error: float = 3.0  # sigmas; a point whose observations are on average worse is culled
     min_parallax_deg: float = 0.1  # rays, both eyes included, that never were further apart make a point too uncertain
     redundant_share: float = 0.9  # a keyframe goes when so many of its points are seen by three others; above 1: never
+    crowd_keyframes: int = 5  # keyframes with the same view that stay
     full_ba_lag_keyframes: int = 5  # the answer of the full bundle adjustment is applied so many keyframes later
 
 

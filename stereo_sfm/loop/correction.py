@@ -65,6 +65,18 @@ def apply_loop(map_: Map, loop: LoopResult, earlier: Sequence[LoopResult], confi
     return Correction(True, moved, fuse_pairs(map_, loop.matches))
 
 
+def loop_is_known(map_: Map, loop: LoopResult, connected_points: int) -> bool:
+    """Whether the map says already what a loop says: its two sides share points, and stand as the loop has them."""
+    a, b = map_.kf_row(loop.candidate_kf_id), map_.kf_row(loop.kf_id)
+    beside_a, beside_b = (map_.covisibility.neighbours(row, connected_points)[0] for row in (a, b))
+    if not len(np.intersect1d(np.append(beside_a, a), beside_b)):
+        return False
+    poses = map_.keyframes.map_T_kf
+    error = se3.log(se3.inverse(loop.candidate_T_kf) @ se3.inverse(poses[a]) @ poses[b])
+    metres, radians = loop_sigmas(loop.information)
+    return bool(np.linalg.norm(error[:3]) < metres and np.linalg.norm(error[3:]) < radians)
+
+
 def fuse_pairs(map_: Map, pairs: I64) -> list[tuple[int, int]]:
     """Make one point of each pair of ids (M, 2) that are two living points; the first of a pair stays.
 

@@ -10,6 +10,7 @@ from stereo_sfm.mapping.map import Map
 from stereo_sfm.types import F64, I64, Bool
 
 OTHERS = 3  # keyframes that must see a point before one more is redundant
+CROWD_DEPTHS, CROWD_DEG = 0.15, 15.0  # keyframes so near, in median depths, and so alike in direction see the same
 
 
 def weak_points(map_: Map, rig: Rig, rows: I64, newest: int, config: MapperConfig) -> I64:
@@ -55,7 +56,10 @@ def _quality(map_: Map, rig: Rig, rows: I64) -> tuple[F64, F64]:
 
 
 def redundant_keyframe(map_: Map, newest: int, protected: Bool, config: MapperConfig) -> int:
-    """A neighbour of the newest keyframe whose points are seen well enough without it, -1: none. Oldest first.
+    """A neighbour of the newest keyframe that the map can do without, -1: none.
+
+    One whose points are seen well enough by others, oldest first; else, where the robot passes again and again, the
+    one of a crowd whose points are seen best by others: a place keeps `crowd_keyframes` views, however often it is seen.
 
     Args:
         protected: (K,) keyframes that must stay (the first, those of loops, the newest ones).
@@ -63,10 +67,25 @@ def redundant_keyframe(map_: Map, newest: int, protected: Bool, config: MapperCo
     if config.redundant_share > 1:
         return -1
     neighbours, _ = map_.covisibility.neighbours(newest, config.connected_points)
-    for row in np.sort(neighbours):
-        if protected[row]:
-            continue
-        pts = map_.observations.pt[map_.observations_of_keyframe(int(row))]
-        if len(pts) and (map_.points.obs_count[pts] > OTHERS).mean() > config.redundant_share:
-            return int(row)
-    return -1
+    neighbours = np.sort(neighbours[~protected[neighbours]])
+    shares = np.array([_seen_by_others(map_, int(row)) for row in neighbours])
+    if (shares > config.redundant_share).any():
+        return int(neighbours[np.argmax(shares > config.redundant_share)])
+    crowd = np.flatnonzero(_same_view(map_, newest, neighbours))
+    return int(neighbours[crowd[np.argmax(shares[crowd])]]) if len(crowd) > config.crowd_keyframes else -1
+
+
+def _seen_by_others(map_: Map, row: int) -> float:
+    """Share of a keyframe's points that enough other keyframes see."""
+    pts = map_.observations.pt[map_.observations_of_keyframe(row)]
+    return float((map_.points.obs_count[pts] > OTHERS).mean()) if len(pts) else 0.0
+
+
+def _same_view(map_: Map, newest: int, rows: I64) -> Bool:
+    """(N,) which keyframes stand where the newest stands and look where it looks."""
+    poses = map_.keyframes.map_T_kf
+    pts = map_.observations.pt[map_.observations_of_keyframe(newest)]
+    depth = np.nanmedian(np.linalg.norm(map_.points.xyz[pts] - poses[newest, :3, 3], axis=1)) if len(pts) else 0.0
+    apart = np.linalg.norm(poses[rows, :3, 3] - poses[newest, :3, 3], axis=1)
+    cos = (np.einsum("nij,ij->n", poses[rows, :3, :3], poses[newest, :3, :3]) - 1) / 2
+    return (apart < CROWD_DEPTHS * depth) & (cos > np.cos(np.deg2rad(CROWD_DEG)))

@@ -10,7 +10,8 @@ odometry frame's origin stays, and the pose goes where the adjusted map says. A 
 fused with the older one: the tracker's track takes over the older point's name and place, and with it the older, less
 drifted part of the map. Where the robot stays, the same old points hold it.
 
-After a loop, full bundle adjustment runs beside the mapping. It is a job of arrays (`pending_job`) whose answer
+A loop that the map knows already (the place was found again before, its two sides share points) only fuses the points
+that it pairs: a robot that passes the same places all day must not pay for them again. After another loop, full bundle adjustment runs beside the mapping. It is a job of arrays (`pending_job`) whose answer
 (`finish_job`) is applied a fixed number of keyframes later, wherever it was computed; if nobody brought it by then, the
 mapper computes it itself. Keyframes made meanwhile move with the one before them.
 
@@ -30,7 +31,7 @@ import numpy as np
 from calib.rig import Rig
 from stereo_sfm.config import LoopConfig, MapperConfig
 from stereo_sfm.geometry import se3
-from stereo_sfm.loop.correction import apply_loop
+from stereo_sfm.loop.correction import apply_loop, fuse_pairs, loop_is_known
 from stereo_sfm.mapping import culling, window
 from stereo_sfm.mapping.bundle import BundleConfig, BundleResult, bundle_adjust
 from stereo_sfm.mapping.insertion import insert_keyframe
@@ -40,6 +41,7 @@ from stereo_sfm.timing import NoSpans
 from stereo_sfm.types import F64, I64, Bool, Keyframe, LoopResult, MapUpdate
 
 YOUNG = 4  # observations up to which a point is triangulated anew before it is adjusted
+GROWN = 1.1  # a loop that says nothing new leads to full bundle adjustment when the map has grown by so much
 RECENT = 3  # newest keyframes: whose points are judged, and which are never redundant
 
 
@@ -77,6 +79,7 @@ class Mapper:
         self._loops: list[LoopResult] = []
         self._job: Job | None = None
         self._job_due = -1
+        self._whole = 0  # living keyframes at the last full bundle adjustment
         self._job_taken = False
         self._answer: BundleResult | None = None
 
@@ -150,6 +153,11 @@ class Mapper:
     def _close(self, loop: LoopResult) -> None:
         """Correct the map for a loop that the pose graph believes, and order a full bundle adjustment."""
         loop = self._between_living(loop)
+        if loop_is_known(self.map, loop, self._config.connected_points):
+            self._fused += fuse_pairs(self.map, loop.matches)
+            if len(self.map.living_keyframes()) > GROWN * self._whole:
+                self._order_full_bundle()
+            return
         before = self.map.keyframes.map_T_kf[-1].copy()
         correction = apply_loop(self.map, loop, self._loops, self._loop_config)
         if not correction.applied:
@@ -157,10 +165,14 @@ class Mapper:
         self._loops.append(loop)
         self._fused += correction.fused
         self._follow_newest(before)
+        self._order_full_bundle()
+
+    def _order_full_bundle(self) -> None:
         part = window.whole_map(self.map, self._config)
         self._job = Job(self._rig, window.bundle_config(self._config), part, len(self.map.keyframes) - 1)
         self._job_taken, self._answer = False, None
         self._job_due = len(self.map.keyframes) + self._config.full_ba_lag_keyframes
+        self._whole = len(self.map.living_keyframes())
 
     def _between_living(self, loop: LoopResult) -> LoopResult:
         """The same loop between the living keyframes that carry its two ends, where one was culled meanwhile."""

@@ -2,52 +2,45 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
 import numpy as np
 import rerun as rr
-import rerun.blueprint as rrb
 
 from calib.rig import Rig
 from stereo_sfm.geometry import se3
-from stereo_sfm.log.map_view import MapView
-from stereo_sfm.pipeline.sinks import StageTimes
-from stereo_sfm.types import F64, I32, U8, Frame, Keyframe, LoopResult, MapUpdate, StereoImage, Trajectory
+from stereo_sfm.pipeline.sinks import Health, StageTimes
+from stereo_sfm.types import (
+    U8,
+    Dropped,
+    Frame,
+    Keyframe,
+    LoopResult,
+    MapUpdate,
+    StereoImage,
+    TrackState,
+    Trajectory,
+)
+from stereo_sfm.viz.blueprint import blueprint
+from stereo_sfm.viz.map_scene import MapScene
+from stereo_sfm.viz.shapes import age_colors, spread_colors, strips, turbo
 
 MEMORY_LIMIT = "1GB"  # of the viewer, which keeps its history
 JPEG_QUALITY = 80
-MAP_EVERY = 5  # updates between two pictures of the whole map
-OLD = 60  # frames after which a track's colour no longer changes
-ODOMETRY, MAPPED, TRUTH, LOOP = (255, 170, 0), (60, 160, 255), (120, 220, 120), (255, 60, 60)
-
-
-def blueprint(name: str) -> rrb.Blueprint:
-    """What a user sees first: the map, both eyes, and the numbers over time."""
-    return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Spatial3DView(origin="/map", name=name),
-            rrb.Vertical(
-                rrb.Spatial2DView(origin="/cam0", name="left: features by age (new blue, old red)"),
-                rrb.Spatial2DView(origin="/matches", name="last keyframe (left) and this frame (right)"),
-                rrb.TimeSeriesView(origin="/points", name="tracked points"),
-                rrb.TimeSeriesView(origin="/ms", name="milliseconds a stage"),
-                rrb.TextLogView(origin="/log", name="log"),
-                row_shares=[4, 3, 2, 2, 1],
-            ),
-            column_shares=[3, 2],
-        ),
-        rrb.TimePanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        rrb.BlueprintPanel(state="collapsed"),
-    )
-
-
-def age_colors(age: I32) -> U8:
-    """(N,) frames -> (N, 3) RGB: blue for new tracks, over green, to red for old ones."""
-    scaled = np.clip(age.astype(float) / OLD, 0, 1) * 255
-    bgr = cv2.applyColorMap(scaled.astype(np.uint8)[:, None], cv2.COLORMAP_JET)[:, 0]
-    return bgr[:, ::-1].astype(np.uint8, copy=False)
+MATCHES_DRAWN = 100  # more lines than that hide the picture: every k-th is drawn
+MATCHES_EVERY = 5  # pictures between two pictures of matches
+KEPT = 64  # images that wait for their frame: more than the stages have between them
+TRUTH = (95, 200, 110)
+SERIES: Mapping[str, tuple[int, int, int]] = {
+    "points/tracked": (90, 170, 255),
+    "points/inliers": (120, 220, 130),
+    "ms/track": (90, 170, 255),
+    "ms/map": (255, 170, 60),
+    "ms/loop": (235, 90, 90),
+    "ms/latency": (180, 180, 190),
+}
 
 
 class RerunSink:
@@ -62,6 +55,7 @@ class RerunSink:
             mode: "spawn" a viewer, "serve" it to browsers, or "save" to `path`.
             ground_truth: drawn aligned with the first pose.
         """
+        self._mode = mode
         self._rec = rr.RecordingStream("stereo_sfm", recording_id=None)
         if mode == "spawn":
             self._rec.spawn(memory_limit=MEMORY_LIMIT, default_blueprint=blueprint(name))
@@ -71,118 +65,134 @@ class RerunSink:
         else:
             assert path is not None
             self._rec.save(path, default_blueprint=blueprint(name))
-        self._rig, self._map = rig, MapView()
-        self._image: StereoImage | None = None
+        self._scene = MapScene(self._rec, rig)
+        self._images: dict[int, StereoImage] = {}  # that wait for their frame
+        self._pictures = 0
         self._keyframe: tuple[Keyframe, U8] | None = None
-        self._map_T_odom: F64 = np.eye(4)
-        self._odometry: list[F64] = []
-        self._updates = 0
-        self._rec.log("map", rr.ViewCoordinates.RDF, static=True)
+        self._first_ns: int | None = None
+        self._now: tuple[int, int] = (0, 0)  # frame id and stamp
+        self._dropped = 0
+        for entity, color in SERIES.items():
+            self._rec.log(entity, rr.SeriesLines(colors=[color], names=entity.split("/")[1]), static=True)
         if ground_truth is not None and len(ground_truth):
             world = se3.inverse(ground_truth.poses[0]) @ ground_truth.poses
-            self._rec.log("map/ground_truth", rr.LineStrips3D([world[:, :3, 3]], colors=[TRUTH]), static=True)
+            line = rr.LineStrips3D([world[:, :3, 3]], colors=[TRUTH], radii=rr.Radius.ui_points(0.8))
+            self._rec.log("map/ground_truth", line, static=True)
 
     def put(self, message: object) -> None:
         """Any message of a run; kinds that are not shown are passed over."""
         if isinstance(message, StereoImage):
-            self._put_image(message)
+            self._images[message.frame_id] = message
+            if len(self._images) > KEPT:
+                del self._images[min(self._images)]
         elif isinstance(message, Frame):
             self._put_frame(message)
         elif isinstance(message, Keyframe):
             self._put_keyframe(message)
         elif isinstance(message, MapUpdate):
-            self._put_update(message)
+            self._scene.update(message)
         elif isinstance(message, LoopResult):
             self._put_loop(message)
         elif isinstance(message, StageTimes):
             for stage, ms in sorted(message.ms.items()):
                 self._rec.log(f"ms/{stage}", rr.Scalars(ms))
+        elif isinstance(message, Health):
+            self._rec.log(f"rate/{message.stage}", rr.Scalars(message.rate))
+        elif isinstance(message, Dropped):
+            self._put_dropped(message)
 
     def close(self) -> None:
         """Everything is sent."""
-        self._show_map()
+        self._scene.show()
         self._rec.flush()
+        if self._mode == "save":
+            self._rec.disconnect()  # writes the end of the file; a server goes on serving
 
-    def _at(self, frame_id: int, stamp_ns: int) -> None:
-        self._rec.set_time("frame", sequence=frame_id)
-        self._rec.set_time("stamp", timestamp=np.datetime64(stamp_ns, "ns"))
+    def _text(self, level: str, text: str) -> None:
+        self._rec.log("log", rr.TextLog(text, level=level))
 
-    def _put_image(self, image: StereoImage) -> None:
-        self._image = image
-        self._at(image.frame_id, image.stamp_ns)
-        self._rec.log("cam0/image", _jpeg(image.left))
-        if image.right is not None:
-            self._rec.log("cam1/image", _jpeg(image.right))
+    # -- frames ------------------------------------------------------------------------------------------------------
 
     def _put_frame(self, frame: Frame) -> None:
-        self._at(frame.frame_id, frame.stamp_ns)
+        self._first_ns = frame.stamp_ns if self._first_ns is None else self._first_ns
+        self._now = (frame.frame_id, frame.stamp_ns)
+        self._rec.set_time("frame", sequence=frame.frame_id)
+        self._rec.set_time("seconds", duration=np.timedelta64(frame.stamp_ns - self._first_ns, "ns"))
         obs = frame.observations
-        self._rec.log("cam0/features", rr.Points2D(obs.uv_left, colors=age_colors(obs.age), radii=2.5))
-        if len(obs):
-            stereo = np.isfinite(obs.uv_right[:, 0])
-            ends = np.stack([obs.uv_left[stereo], obs.uv_right[stereo]], 1)
-            self._rec.log("cam0/disparity", rr.LineStrips2D(list(ends), colors=[(255, 255, 255, 60)], radii=0.5))
         self._rec.log("points/tracked", rr.Scalars(float(len(obs))))
         self._rec.log("points/inliers", rr.Scalars(float(obs.inlier.sum())))
         if frame.reason:
-            self._rec.log(
-                "log", rr.TextLog(f"frame {frame.frame_id}: {frame.state.name} ({frame.reason})", level="WARN")
-            )
-        pose = self._map_T_odom @ frame.odom_T_cam
-        self._odometry.append(frame.odom_T_cam[:3, 3])
-        self._rec.log("map/camera", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
-        focal = min(self._rig.left.fx, 0.5 * self._rig.left.width)
-        self._rec.log(
-            "map/camera/left",
-            rr.Pinhole(focal_length=focal, width=self._rig.left.width, height=self._rig.left.height,
-                       camera_xyz=rr.ViewCoordinates.RDF, image_plane_distance=0.4),
-        )  # fmt: skip
-        if frame.frame_id % 10 == 0:
-            self._rec.log("map/odometry", rr.LineStrips3D([np.array(self._odometry)], colors=[ODOMETRY], radii=0.01))
-            self._show_matches(frame)
+            level = "WARN" if frame.state != TrackState.OK else "INFO"
+            self._text(level, f"frame {frame.frame_id}: {frame.state.name} ({frame.reason})")
+        self._scene.frame(frame)
+        image = self._images.pop(frame.frame_id, None)
+        if image is not None:
+            self._show_eyes(frame, image)
+            if self._pictures % MATCHES_EVERY == 0:
+                self._show_matches(frame, image.left)
+            self._pictures += 1
+            if frame.is_keyframe:
+                self._images[frame.frame_id] = image  # until the keyframe itself comes
+        elif not self._pictures:
+            self._show_tracks(frame)
 
-    def _put_keyframe(self, keyframe: Keyframe) -> None:
-        self._map.keyframe(keyframe, self._map_T_odom)
-        if self._image is not None:
-            self._keyframe = (keyframe, self._image.left)
+    def _show_tracks(self, frame: Frame) -> None:
+        obs = frame.observations
+        dots = rr.Points2D(obs.uv_left, colors=age_colors(obs.age), radii=rr.Radius.ui_points(2.5))
+        self._rec.log("map/camera/left/features", dots)
 
-    def _show_matches(self, frame: Frame) -> None:
+    def _show_eyes(self, frame: Frame, image: StereoImage) -> None:
+        """Both images, tracks by age in the left one, lines by disparity in the right one."""
+        self._rec.log("map/camera/left/image", _jpeg(image.left))
+        self._show_tracks(frame)
+        obs = frame.observations
+        stereo = np.isfinite(obs.uv_right[:, 0])
+        if image.right is not None:
+            self._rec.log("right/image", _jpeg(image.right))
+        elif not stereo.any():
+            return
+        ends = np.stack([obs.uv_left[stereo], obs.uv_right[stereo]], 1)
+        length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+        colors = spread_colors(np.log(np.maximum(length, 0.1)))
+        self._rec.log("right/disparity", rr.LineStrips2D(strips(ends), colors=colors, radii=rr.Radius.ui_points(1.0)))
+        self._rec.log("right/points", rr.Points2D(ends[:, 1], colors=colors, radii=rr.Radius.ui_points(2.0)))
+
+    def _show_matches(self, frame: Frame, now: U8) -> None:
         """The points that the last keyframe and this frame share, side by side."""
-        if self._keyframe is None or self._image is None:
+        if self._keyframe is None:
             return
         keyframe, before = self._keyframe
         obs = frame.observations
         _, a, b = np.intersect1d(keyframe.point_ids, obs.point_ids, return_indices=True)
-        if not len(a):
+        if not len(a) or before.shape != now.shape:
             return
+        some = slice(None, None, -(-len(a) // MATCHES_DRAWN))
+        a, b = a[some], b[some]
         shift = np.array([before.shape[1], 0.0])
-        self._rec.log("matches/image", _jpeg(np.hstack([before, self._image.left])))
-        lines = np.stack([keyframe.uv_left[a], obs.uv_left[b] + shift], 1)
-        self._rec.log("matches/points", rr.LineStrips2D(list(lines), colors=age_colors(obs.age[b]), radii=0.7))
+        ends = np.stack([keyframe.uv_left[a], obs.uv_left[b] + shift], 1)
+        colors = turbo(ends[:, 0, 1], 0.0, float(before.shape[0]))  # by height, so that neighbours can be told apart
+        self._rec.log("matches/image", _jpeg(np.hstack([before, now])))
+        self._rec.log("matches/lines", rr.LineStrips2D(strips(ends), colors=colors, radii=rr.Radius.ui_points(0.6)))
 
-    def _put_update(self, update: MapUpdate) -> None:
-        self._map.update(update)
-        self._map_T_odom = update.map_T_odom
-        self._updates += 1
-        if self._updates % MAP_EVERY == 0:
-            self._show_map()
+    # -- the others --------------------------------------------------------------------------------------------------
 
-    def _show_map(self) -> None:
-        self._rec.log("map/points", rr.Points3D(self._map.points, radii=0.012, colors=[(200, 200, 210)]))
-        self._rec.log("map/trajectory", rr.LineStrips3D([self._map.trajectory[:, :3, 3]], colors=[MAPPED], radii=0.015))
-        covisible = self._map.covisibility_lines.reshape(-1, 2, 3)
-        self._rec.log("map/covisibility", rr.LineStrips3D(list(covisible), colors=[(90, 120, 160, 80)], radii=0.003))
-        loops = self._map.loop_lines.reshape(-1, 2, 3)
-        self._rec.log("map/loops", rr.LineStrips3D(list(loops), colors=[LOOP], radii=0.02))
+    def _put_keyframe(self, keyframe: Keyframe) -> None:
+        self._scene.keyframe(keyframe)
+        image = self._images.pop(keyframe.frame_id, None)
+        if image is not None:
+            self._keyframe = (keyframe, image.left)
 
     def _put_loop(self, result: LoopResult) -> None:
         if result.candidate_kf_id >= 0:
-            self._map.loop(result)
-            text = f"loop: keyframe {result.kf_id} is at keyframe {result.candidate_kf_id}, {result.inliers} inliers"
-            self._rec.log("log", rr.TextLog(text, level="INFO"))
+            self._scene.loop(result)
+            self._text("INFO", f"loop: keyframe {result.kf_id} sees keyframe {result.candidate_kf_id} again, "
+                               f"{result.inliers} inliers")  # fmt: skip
         elif result.rejected:
-            text = f"no loop at keyframe {result.kf_id}: {result.reason}"
-            self._rec.log("log", rr.TextLog(text, level="DEBUG"))
+            self._text("DEBUG", f"no loop at keyframe {result.kf_id}: {result.reason.replace('_', ' ')}")
+
+    def _put_dropped(self, dropped: Dropped) -> None:
+        self._dropped += dropped.count
+        self._rec.log("points/dropped", rr.Scalars(float(self._dropped)))
 
 
 def _jpeg(image: U8) -> rr.EncodedImage:
