@@ -32,6 +32,7 @@ def run(args: argparse.Namespace) -> int:
     from drivers.source import open_source
     from stereo_sfm.log import topics
     from stereo_sfm.log.image_log import RIG_FILE, TRUTH_FILE, rig_from_text, truth_from_bytes
+    from stereo_sfm.log.provenance import METADATA
     from stereo_sfm.log.reader import LogReader
     from stereo_sfm.viz.sink import RerunSink
 
@@ -39,16 +40,17 @@ def run(args: argparse.Namespace) -> int:
     with LogReader(path) as reader:
         names = {t.topic for t in reader.topics}
         rig_text = reader.attachment(RIG_FILE)
+        name = reader.metadata(METADATA).get("source") or path.stem
         has_images = args.source is not None or topics.LEFT_IMAGE in names or rig_text is None
         if has_images:
             with open_source(args.source or path) as source:
-                sink = RerunSink(source.rig, source.name, mode, args.save, source.ground_truth)
+                sink = RerunSink(source.rig, name, mode, args.save, source.ground_truth)
                 _play(reader, iter(source), sink)
         else:
             assert rig_text is not None
             truth = reader.attachment(TRUTH_FILE)
             ground_truth = None if truth is None else truth_from_bytes(truth)
-            sink = RerunSink(rig_from_text(rig_text.decode()), path.stem, mode, args.save, ground_truth)
+            sink = RerunSink(rig_from_text(rig_text.decode()), name, mode, args.save, ground_truth)
             _play(reader, iter(()), sink)
         sink.close()
     if mode == "serve":
@@ -62,7 +64,8 @@ def _play(reader: LogReader, images: Iterator[StereoImage], sink: Sink) -> None:
     from stereo_sfm.log import recorded, topics
     from stereo_sfm.types import Frame
 
-    shown = (topics.FRAME, topics.KEYFRAME, topics.MAP_UPDATE, topics.LOOP, topics.STAGE_TIMES)
+    shown = (topics.FRAME, topics.KEYFRAME, topics.MAP_UPDATE, topics.LOOP)
+    shown += (topics.STAGE_TIMES, topics.HEALTH, topics.DROPPED)
     last = -1
     for _, message in recorded.messages(reader, shown):
         if isinstance(message, Frame):
