@@ -39,6 +39,11 @@ class PacedSource:
     def live(self) -> bool:
         return True
 
+    @property
+    def counters(self) -> dict[str, float]:
+        """What a live source counts about itself (drivers.live.counters); empty for files."""
+        return getattr(self._source, "counters", {})
+
     def __enter__(self) -> Self:
         self._source.__enter__()
         return self

@@ -35,6 +35,11 @@ class RectifiedSource:
     def _turned(self, truth: Trajectory) -> Trajectory:
         return Trajectory(truth.stamp_ns.copy(), truth.poses @ self.rectification.cam_T_rect)
 
+    @property
+    def counters(self) -> dict[str, float]:
+        """What a live source counts about itself (drivers.live.counters); empty for files."""
+        return getattr(self._source, "counters", {})
+
     def __enter__(self) -> Self:
         self._source.__enter__()
         return self

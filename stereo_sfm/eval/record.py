@@ -9,7 +9,7 @@ import numpy as np
 
 from stereo_sfm.export.trajectories import fill_missing
 from stereo_sfm.geometry import se3
-from stereo_sfm.pipeline.sinks import Health, StageTimes
+from stereo_sfm.pipeline.sinks import Health, SourceCounters, StageTimes
 from stereo_sfm.types import (
     F64,
     I64,
@@ -69,6 +69,7 @@ class RunRecord:
     stage_ms: dict[int, dict[str, float]] = field(default_factory=dict[int, dict[str, float]])  # by frame id
     health: dict[str, list[Health]] = field(default_factory=dict[str, list[Health]])  # by stage
     dropped: int = 0
+    source_counts: dict[str, float] = field(default_factory=dict[str, float])  # of a live camera, at the end
     map_T_kf: dict[int, F64] = field(default_factory=dict[int, F64])
     map_points: set[int] = field(default_factory=set[int])
     seen_points: set[int] = field(default_factory=set[int])
@@ -95,6 +96,8 @@ class RunRecord:
             self.stage_ms.setdefault(message.frame_id, {}).update(message.ms)
         elif isinstance(message, Health):
             self.health.setdefault(message.stage, []).append(message)
+        elif isinstance(message, SourceCounters):
+            self.source_counts = message.counts
 
     def _put_frame(self, frame: Frame) -> None:
         if self.frames:

@@ -15,7 +15,7 @@ from stereo_sfm.log.image_log import ImageInfo, ImuSample, WheelSample
 from stereo_sfm.log.provenance import CONFIG_FILE, METADATA
 from stereo_sfm.log.reader import LogReader, Record
 from stereo_sfm.log.track_stats import TrackStats
-from stereo_sfm.pipeline.sinks import Health, StageTimes
+from stereo_sfm.pipeline.sinks import Health, SourceCounters, StageTimes
 from stereo_sfm.types import Applied, Dropped, Frame, Keyframe, LoopResult, MapUpdate
 
 TYPES: dict[str, type[Any]] = {
@@ -33,6 +33,7 @@ TYPES: dict[str, type[Any]] = {
         TrackStats,
         Health,
         StageTimes,
+        SourceCounters,
     )
 }
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import logging
 from collections import deque
 from typing import Any
 
@@ -12,7 +10,6 @@ from foxglove_schemas_protobuf.Pose_pb2 import Pose
 
 from calib.rig import Rig
 from stereo_sfm.config import Config
-from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.log import foxglove, topics
 from stereo_sfm.log.image_log import ImageLog
@@ -21,7 +18,7 @@ from stereo_sfm.log.map_view import MapView
 from stereo_sfm.log.provenance import TOTALS, write_provenance
 from stereo_sfm.log.track_stats import track_stats
 from stereo_sfm.log.writer import LogWriter
-from stereo_sfm.pipeline.sinks import Health, StageTimes
+from stereo_sfm.pipeline.sinks import Health, LogLine, SourceCounters, StageTimes
 from stereo_sfm.types import (
     F32,
     F64,
@@ -44,18 +41,6 @@ TRAJECTORY_SIZE = 200  # keyframes
 POINTS_NS = 5_000_000_000
 POINTS_SIZE = 50_000
 OLD_TRACK = 30  # frames after which a track's colour no longer changes
-
-
-class _TextHandler(logging.Handler):
-    """Puts what the package says on its logger into the log as well."""
-
-    def __init__(self, log: RunLog) -> None:
-        super().__init__(logging.INFO)
-        self._log = log
-
-    def emit(self, record: logging.LogRecord) -> None:
-        with contextlib.suppress(StereoSfmError):  # a full disk is told by the next message of a stage
-            self._log.text(record.levelname, record.getMessage())
 
 
 class RunLog:
@@ -109,8 +94,7 @@ class RunLog:
         self._now_ns = 0
         self._totals = dict.fromkeys(("frames", "lost", "keyframes", "loops accepted", "loop candidates rejected"), 0)
         self._closed = False
-        self._handler = _TextHandler(self)
-        logging.getLogger("stereo_sfm").addHandler(self._handler)
+        self._counts: dict[str, float] = {}  # of a live source
 
     def put(self, message: object) -> None:
         """Any message of a run, by its type."""
@@ -188,15 +172,19 @@ class RunLog:
         """Wall-clock milliseconds of a frame."""
         self._writer.write(topics.STAGE_TIMES, times, self._now_ns, times.frame_id)
 
-    def text(self, level: str, message: str) -> None:
+    def counters(self, counters: SourceCounters) -> None:
+        """What the camera counts about itself."""
+        self._counts = counters.counts
+        self._writer.write(topics.COUNTERS, counters, self._now_ns, counters.frame_id)
+
+    def line(self, line: LogLine) -> None:
         """A line for people."""
-        if self._writer.closed:
-            return
-        self._writer.write(topics.LOG, foxglove.text(self._now_ns, level, message), self._now_ns)
+        if not self._writer.closed:  # a full disk is told by the next message of a stage
+            text = foxglove.text(self._now_ns, line.level, line.text, line.stage)
+            self._writer.write(topics.LOG, text, self._now_ns)
 
     def close(self) -> None:
         """Write what is left and close the file."""
-        logging.getLogger("stereo_sfm").removeHandler(self._handler)
         if self._closed or self._writer.closed:  # closed by itself when the disk was full
             return
         self._closed = True
@@ -207,7 +195,8 @@ class RunLog:
             self._show_trajectory()
             self._show_points()
             totals = {name: str(int(value)) for name, value in self._totals.items()}
-            self._writer.metadata(TOTALS, self._images.totals | totals)
+            counted = {name: f"{value:g}" for name, value in self._counts.items() if value}
+            self._writer.metadata(TOTALS, counted | self._images.totals | totals)
         finally:
             self._writer.close()
 
@@ -293,6 +282,8 @@ class RunLog:
         (Dropped, dropped),
         (Health, health),
         (StageTimes, stage_times),
+        (SourceCounters, counters),
+        (LogLine, line),
     )
 
 

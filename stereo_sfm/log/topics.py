@@ -38,6 +38,7 @@ TRAJECTORY = "/map/trajectory"
 SCENE = "/map/scene"
 HEALTH = "/health"
 STAGE_TIMES = "/stage_times"
+COUNTERS = "/counters"
 LOG = "/log"
 
 
@@ -81,6 +82,7 @@ TABLE: tuple[Topic, ...] = (
     Topic(SCENE, "foxglove.SceneUpdate", "loop and covisibility edges, with the trajectory"),
     Topic(HEALTH, "stereo_sfm.Health", "every second and stage: rate, queue, latency (wall clock)", compare=False),
     Topic(STAGE_TIMES, "stereo_sfm.StageTimes", "every frame: milliseconds in each stage (wall clock)", compare=False),
+    Topic(COUNTERS, "stereo_sfm.SourceCounters", "every few seconds: what a live camera counts", compare=False),
     Topic(LOG, "foxglove.Log", "text for people", compare=False),
 )
 

@@ -15,7 +15,7 @@ from drivers.source import Source
 from stereo_sfm.pipeline.channels import End, Outbox
 from stereo_sfm.pipeline.health import HealthMeter
 from stereo_sfm.pipeline.images import ImageRing, SlotImage
-from stereo_sfm.pipeline.stages import sensor_drop
+from stereo_sfm.pipeline.stages import sensor_drop, source_counters
 from stereo_sfm.types import Dropped, StereoImage, Trajectory
 
 
@@ -94,11 +94,18 @@ class CaptureStage:
     stop: StopFlag
     realtime: bool
     jpeg: bool
+    _last: int = -1  # frame id
 
     def run(self) -> None:
         """Until the source ends or somebody asks to stop."""
+        try:
+            self._read()
+        finally:
+            self._count(self._last)  # above all when the source failed
+        self.to_tracker.send(End("capture"))
+
+    def _read(self) -> None:
         meter = HealthMeter("capture")
-        last = -1
         for image in self.source:
             if self.stop.asked:
                 break
@@ -114,14 +121,20 @@ class CaptureStage:
             message = self._put(slot, image, begin)
             self.to_tracker.send(message)
             self.to_main.send(message)
-            last = image.frame_id
-            health = meter.add(last, (time.monotonic() - begin) * 1e3, self.to_tracker.waiting())
+            self._last = image.frame_id
+            health = meter.add(self._last, (time.monotonic() - begin) * 1e3, self.to_tracker.waiting())
             if health is not None:
                 self.to_main.send(health)
-        health = meter.report(last, 0)
+                self._count(self._last)
+        health = meter.report(self._last, 0)
         if health is not None:
             self.to_main.send(health)
-        self.to_tracker.send(End("capture"))
+
+    def _count(self, frame_id: int) -> None:
+        """Tell what the source has counted until now."""
+        counters = source_counters(self.source, frame_id)
+        if counters is not None:
+            self.to_main.send(counters)
 
     def _put(self, slot: int, image: StereoImage, begin: float) -> SlotImage:
         if not self.jpeg:

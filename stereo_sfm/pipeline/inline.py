@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import importlib
+from collections import deque
 from collections.abc import Generator, Sequence
 
 from drivers.source import Source
 from stereo_sfm.config import Config
 from stereo_sfm.pipeline.maps import MapFolders, make_mapper, save_result
 from stereo_sfm.pipeline.schedule import Lockstep, Schedule
-from stereo_sfm.pipeline.sinks import Sink, StageTimes
-from stereo_sfm.pipeline.stages import LocalMailbox, MapStage, TrackStage, make_closer, sensor_drop
+from stereo_sfm.pipeline.sinks import LogLine, Sink, StageTimes
+from stereo_sfm.pipeline.stages import LocalMailbox, MapStage, TrackStage, make_closer, sensor_drop, source_counters
+from stereo_sfm.pipeline.text import Listener
 from stereo_sfm.timing import Spans
 from stereo_sfm.tracking.factory import make_tracker
 from stereo_sfm.types import Frame, Keyframe, LoopResult, MapUpdate, StereoImage
@@ -29,7 +31,8 @@ class InlineRun:
         jpeg: bool = False,
     ) -> None:
         self._config, self._rig, self._folders = config, source.rig, folders or MapFolders()
-        self._jpeg = jpeg
+        self._said: deque[LogLine] = deque()
+        self._jpeg, self._source, self._last = jpeg, source, -1
         self._spans = Spans()
         self._sinks = sinks
         self._updates: LocalMailbox[MapUpdate] = LocalMailbox()
@@ -47,49 +50,63 @@ class InlineRun:
 
     def step(self, image: StereoImage) -> Frame:
         """Track one image; map and close loops when it becomes a keyframe."""
+        self._last = image.frame_id
         drop = sensor_drop(image)
         if drop is not None:
-            self._publish(drop)
+            self.publish(drop)
         if self._jpeg:
             from stereo_sfm.log.images import encode_pair
 
             logged = encode_pair(image, "jpeg")
             image = logged.image
-            self._publish(logged)
+            self.publish(logged)
         else:
-            self._publish(image)
+            self.publish(image)
         frame: Frame | None = None
         keyframe: Keyframe | None = None
         with self._spans.span("track"):
             for message in self._track.step(image):
-                self._publish(message)
+                self.publish(message)
                 frame = message if isinstance(message, Frame) else frame
                 keyframe = message if isinstance(message, Keyframe) else keyframe
         assert frame is not None
         if keyframe is not None:
             self._map(keyframe)
-        self._publish(StageTimes(frame.frame_id, self._spans.take()))
+        self.publish(StageTimes(frame.frame_id, self._spans.take()))
         return frame
 
     def _map(self, keyframe: Keyframe) -> None:
         if self._closer is not None:
             with self._spans.span("loop"):
                 result = self._closer.step(keyframe)
-            self._publish(result)
+            self.publish(result)
             self._loops.append(result)
         with self._spans.span("map"):
             update = self.map_stage.step(keyframe)
-        self._publish(update)
+        self.publish(update)
         self._updates.append(update)
 
     def finish(self) -> None:
         """What the last keyframes left behind."""
         update = self.map_stage.finish()
         if update is not None:
-            self._publish(update)
+            self.publish(update)
+        counters = source_counters(self._source, self._last)
+        if counters is not None:
+            self.publish(counters)
         save_result(self.map_stage.mapper, self._config, self._rig, self._folders)
 
-    def _publish(self, message: object) -> None:
+    def hear(self, line: LogLine) -> None:
+        """From any thread; the sinks get it with the next frame."""
+        self._said.append(line)
+
+    def publish(self, message: object) -> None:
+        """To every sink, after what was said before."""
+        while self._said:
+            self._pass_on(self._said.popleft())
+        self._pass_on(message)
+
+    def _pass_on(self, message: object) -> None:
         for sink in self._sinks:
             sink.put(message)
 
@@ -115,7 +132,10 @@ def run_inline(
 
     importlib.import_module("scipy.linalg")  # its BLAS must be loaded to be limited
     run = InlineRun(source, config, sinks, schedule, folders, jpeg)
-    with threadpool_limits(config.pipeline.threads):  # BLAS sums in another order with another number of threads
+    with (
+        Listener("main", run.hear),
+        threadpool_limits(config.pipeline.threads),
+    ):  # BLAS sums in another order with another number of threads
         try:
             for image in source:
                 yield run.step(image)

@@ -27,7 +27,8 @@ from stereo_sfm.pipeline.capture import SourceInfo
 from stereo_sfm.pipeline.channels import DroppingOutbox, End, Failed, Outbox
 from stereo_sfm.pipeline.images import ImageLayout, ImageRing, SlotImage
 from stereo_sfm.pipeline.maps import MapFolders
-from stereo_sfm.pipeline.sinks import Sink
+from stereo_sfm.pipeline.sinks import LogLine, Sink
+from stereo_sfm.pipeline.text import Listener, say
 from stereo_sfm.pipeline.workers import LogOptions, Ready, Setup, ViewerOptions
 from stereo_sfm.types import Applied, Frame
 
@@ -87,15 +88,18 @@ class ProcessRun:
         self._ended: set[str] = set()
         self._waiting = {"tracker", "mapper", "loop"}  # not ready yet
         self._stopping = False
+        self._listener = Listener("main", self.publish)
         self.info: SourceInfo
 
     # -- life --------------------------------------------------------------------------------------------------------
 
     def __enter__(self) -> Self:
+        self._listener.__enter__()
         try:
             self._start()
         except BaseException:
             self._kill_all()
+            self._listener.__exit__(None, None, None)
             raise
         return self
 
@@ -105,6 +109,7 @@ class ProcessRun:
         if kind is not None and not issubclass(kind, StageDied):
             self._abandon()
         self._kill_all()
+        self._listener.__exit__(None, None, None)
 
     @property
     def pids(self) -> dict[str, int]:
@@ -134,6 +139,8 @@ class ProcessRun:
                 elif isinstance(message, Ready):
                     self._begin(message.stage)
                 else:
+                    if isinstance(message, LogLine):
+                        say(message)
                     self._dispatch(message)
                     if isinstance(message, Frame):
                         yield message

@@ -28,6 +28,23 @@ class Health:
     dropped: int
 
 
+@dataclass(frozen=True)
+class LogLine:
+    """A line for people, from the process of some stage."""
+
+    stage: str
+    level: str  # a name of `logging`
+    text: str
+
+
+@dataclass(frozen=True)
+class SourceCounters:
+    """What a live camera counts about itself (drivers.live.counters), up to a frame; never compared."""
+
+    frame_id: int
+    counts: dict[str, float]
+
+
 class Sink(Protocol):
     """Takes every message of a run in order: StereoImage, Frame, Keyframe, MapUpdate, LoopResult, StageTimes, ..."""
 

@@ -11,8 +11,10 @@ from collections.abc import Iterator
 from typing import Protocol, TypeVar
 
 from calib.rig import Rig
+from drivers.source import Source
 from stereo_sfm.config import Config
 from stereo_sfm.pipeline.schedule import Schedule
+from stereo_sfm.pipeline.sinks import SourceCounters
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.tracking.factory import AnyTracker
 from stereo_sfm.types import Applied, Dropped, Frame, Keyframe, LoopResult, MapUpdate, StereoImage
@@ -48,6 +50,12 @@ def sensor_drop(image: StereoImage) -> Dropped | None:
         return None
     first = image.frame_id - image.dropped_before
     return Dropped(first, image.stamp_ns, "sensor", "lost by the sensor or the driver", image.dropped_before)
+
+
+def source_counters(source: Source, frame_id: int) -> SourceCounters | None:
+    """What a live source has counted until now; None for files, which count nothing."""
+    counts: dict[str, float] | None = getattr(source, "counters", None)
+    return SourceCounters(frame_id, dict(counts)) if counts else None
 
 
 class AnyMapper(Protocol):

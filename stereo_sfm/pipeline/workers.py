@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import signal
 import sys
@@ -20,6 +21,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.pipeline.channels import End, Failed, Inbox, Lost, Outbox
 from stereo_sfm.pipeline.maps import MapFolders, make_mapper, save_result
 from stereo_sfm.pipeline.schedule import Lockstep, Realtime, Recorded, Schedule
+from stereo_sfm.pipeline.text import LOGGER, Listener
 from stereo_sfm.types import Applied, Keyframe, LoopResult, MapUpdate, Trajectory
 
 STAGES = ("capture", "tracker", "mapper", "loop", "optimizer", "logger", "viewer")
@@ -46,8 +48,10 @@ def guarded(stage: str, body: Callable[..., None], report: Connection, *args: An
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # main decides what Ctrl-C means
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     to_main = Outbox(report, 512)
+    logging.getLogger(LOGGER).setLevel(logging.INFO)  # main decides what is printed
     try:
-        body(to_main, *args)
+        with Listener(stage, to_main.send):
+            body(to_main, *args)
         to_main.send(End(stage))
         to_main.close()
     except Lost:

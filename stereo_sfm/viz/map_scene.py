@@ -52,7 +52,7 @@ class MapScene:
         focal = min(left.fx, 0.5 * left.width)  # a fisheye's pyramid shows its direction, not its field of view
         pinhole = rr.Pinhole(
             focal_length=focal, width=left.width, height=left.height, camera_xyz=rr.ViewCoordinates.RDF,
-            image_plane_distance=1.2 * size, color=CAMERA, line_width=rr.Radius.ui_points(1.0),
+            image_plane_distance=1.2 * size, color=CAMERA,
         )  # fmt: skip
         self._rec.log("map/camera/left", pinhole)
 

@@ -11,7 +11,7 @@ import rerun as rr
 
 from calib.rig import Rig
 from stereo_sfm.geometry import se3
-from stereo_sfm.pipeline.sinks import Health, StageTimes
+from stereo_sfm.pipeline.sinks import Health, LogLine, StageTimes
 from stereo_sfm.types import (
     U8,
     Dropped,
@@ -98,6 +98,8 @@ class RerunSink:
                 self._rec.log(f"ms/{stage}", rr.Scalars(ms))
         elif isinstance(message, Health):
             self._rec.log(f"rate/{message.stage}", rr.Scalars(message.rate))
+        elif isinstance(message, LogLine):
+            self._text(message.level.replace("WARNING", "WARN"), f"{message.stage}: {message.text}")
         elif isinstance(message, Dropped):
             self._put_dropped(message)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import resource
 import shutil
 import subprocess
@@ -35,7 +34,7 @@ from stereo_sfm.log.recorded import messages, read_run
 from stereo_sfm.log.run_log import RunLog
 from stereo_sfm.log.track_stats import TrackStats, track_stats
 from stereo_sfm.log.writer import LogWriter
-from stereo_sfm.pipeline.sinks import Health, StageTimes
+from stereo_sfm.pipeline.sinks import Health, LogLine, SourceCounters, StageTimes
 from stereo_sfm.types import (
     F64,
     Applied,
@@ -138,7 +137,8 @@ def _write(path: Path, order: np.random.Generator | None) -> None:
     log.put(Dropped(9, START_NS, "ring", "full", 2))
     log.put(Health("track", 5, 30.0, 1, 1.0, 2.0, 3.0, 0))
     log.put(StageTimes(5, {"track": 3.5}))
-    log.text("WARNING", "dark")
+    log.put(SourceCounters(5, {"pairs": 6.0, "stalls": 1.0}))
+    log.put(LogLine("tracker", "WARNING", "dark"))
     log.close()
     log.close()
 
@@ -299,6 +299,7 @@ def test_messages_of_the_stages_come_back_whole(run: Path) -> None:
     assert _all(run, topics.APPLIED, Applied) == [Applied(1, 3)]
     assert _all(run, topics.DROPPED, Dropped) == [Dropped(9, START_NS, "ring", "full", 2)]
     assert _all(run, topics.STAGE_TIMES, StageTimes) == [StageTimes(5, {"track": 3.5})]
+    assert _all(run, topics.COUNTERS, SourceCounters) == [SourceCounters(5, {"pairs": 6.0, "stalls": 1.0})]
 
 
 def test_stats_are_flat_and_keep_what_they_do_not_know(run: Path) -> None:
@@ -320,16 +321,17 @@ def test_a_run_without_loops_or_mapping_waits_for_nothing(tmp_path: Path) -> Non
     log.close()
 
 
-def test_what_the_package_says_is_in_the_log(tmp_path: Path) -> None:
+def test_what_a_stage_says_is_in_the_log(tmp_path: Path) -> None:
     log = RunLog(
         LogWriter(tmp_path / "a.mcap"), fisheye_rig(), Config(), source="t", mode="inline", image_format="none"
     )
     log.put(stereo_images(1, np.random.default_rng(0))[0])
-    logging.getLogger("stereo_sfm").warning("only %d points", 3)
+    log.put(LogLine("tracker", "WARNING", "only 3 points"))
     log.close()
-    logging.getLogger("stereo_sfm").warning("after the end")
+    log.put(LogLine("tracker", "WARNING", "after the end"))
     (line,) = _all(tmp_path / "a.mcap", topics.LOG, Log)
-    assert (line.message, line.level, foxglove.stamp_of(line)) == ("only 3 points", 3, START_NS)
+    assert (line.message, line.level, line.name) == ("only 3 points", 3, "tracker")
+    assert foxglove.stamp_of(line) == START_NS
 
 
 def test_what_a_replay_needs_comes_back(run: Path) -> None:
@@ -374,7 +376,7 @@ def test_a_full_disk_during_a_run_is_one_error_and_a_readable_log(tmp_path: Path
     try:
         with pytest.raises(StereoSfmError, match="is closed and readable"):
             _put_frames(log, 1000)
-        logging.getLogger("stereo_sfm").warning("nobody may fail because of this")
+        log.put(LogLine("main", "WARNING", "nobody may fail because of this"))
         with pytest.raises(StereoSfmError, match="is closed and readable"):
             log.put(_frame(1000))
         log.close()

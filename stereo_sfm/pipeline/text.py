@@ -1,0 +1,44 @@
+"""What the package says on its logger, from any process of a run, to the run's sinks: the log and the viewer."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from types import TracebackType
+from typing import Self
+
+from stereo_sfm.pipeline.sinks import LogLine
+
+LOGGER = "stereo_sfm"
+_PASSED_ON = "stereo_sfm_stage"  # attribute of records that came from another process
+
+
+class Listener(logging.Handler):
+    """While entered, passes every line of the package's logger on as a `LogLine`."""
+
+    def __init__(self, stage: str, put: Callable[[LogLine], None]) -> None:
+        """Args: stage, whose process this is; put, takes the lines, from whichever thread says them."""
+        super().__init__()
+        self._stage, self._put = stage, put
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if not hasattr(record, _PASSED_ON):
+            self._put(LogLine(self._stage, record.levelname, record.getMessage()))
+
+    def __enter__(self) -> Self:
+        logging.getLogger(LOGGER).addHandler(self)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        logging.getLogger(LOGGER).removeHandler(self)
+
+
+def say(line: LogLine) -> None:
+    """Say in this process what another one said, as loudly as this one is set to; listeners pass it over."""
+    logger = logging.getLogger(LOGGER)
+    level = logging.getLevelNamesMapping().get(line.level, logging.WARNING)
+    if logger.isEnabledFor(level):
+        record = logger.makeRecord(LOGGER, level, line.stage, 0, line.text, (), None, extra={_PASSED_ON: line.stage})
+        logger.handle(record)

@@ -1,0 +1,139 @@
+"""What stages say and what a camera counts reaches the log, the sinks and the viewer, inline and between processes."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import multiprocessing
+from collections.abc import Callable, Iterator
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from stereo_sfm.eval.record import RunRecord
+from stereo_sfm.eval.statistics import statistics, summary
+from stereo_sfm.log import topics
+from stereo_sfm.log.provenance import TOTALS
+from stereo_sfm.log.reader import LogReader
+from stereo_sfm.log.recorded import messages
+from stereo_sfm.log.run_log import RunLog
+from stereo_sfm.log.writer import LogWriter
+from stereo_sfm.pipeline import workers
+from stereo_sfm.pipeline.channels import End, Outbox
+from stereo_sfm.pipeline.inline import run_inline
+from stereo_sfm.pipeline.processes import ProcessRun
+from stereo_sfm.pipeline.sinks import LogLine, SourceCounters
+from stereo_sfm.pipeline.workers import LogOptions
+from stereo_sfm.types import StereoImage
+from tests.pipeline.test_pipeline import CONFIG, SlidingWall
+
+logger = logging.getLogger("stereo_sfm")
+
+
+class TroubledWall(SlidingWall):
+    """Warns and counts as a camera does."""
+
+    def __iter__(self) -> Iterator[StereoImage]:
+        self.counters = {"pairs": 0.0, "stalls": 0.0, "temperature_c": 41.5}
+        for image in super().__iter__():
+            self.counters["pairs"] += 1
+            if image.frame_id == 7:
+                self.counters["stalls"] += 1
+                logger.warning("wall sent no image for %d ms", 500)
+                logger.info("wall is back")
+            yield image
+
+
+class Kept:
+    """A sink that keeps what it gets."""
+
+    def __init__(self) -> None:
+        self.lines: list[LogLine] = []
+        self.counters: list[SourceCounters] = []
+
+    def put(self, message: object) -> None:
+        if isinstance(message, LogLine):
+            self.lines.append(message)
+        elif isinstance(message, SourceCounters):
+            self.counters.append(message)
+
+
+def between_processes(path: Path, sinks: list[Any]) -> None:
+    opener = functools.partial(TroubledWall, 12)
+    with ProcessRun(opener, CONFIG, sinks, log=LogOptions(path, "none")) as run:
+        assert len(list(run)) == 12
+
+
+def inline(path: Path, sinks: list[Any]) -> None:
+    source = TroubledWall(12)
+    log = RunLog(LogWriter(path), source.rig, CONFIG, source="wall", mode="inline", image_format="none")
+    assert len(list(run_inline(source, CONFIG, [*sinks, log]))) == 12
+    log.close()
+
+
+@pytest.mark.parametrize(("run", "stage"), [(between_processes, "capture"), (inline, "main")])
+def test_warnings_and_counters_reach_the_log_and_the_sinks(
+    run: Callable[[Path, list[Any]], None], stage: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    kept, record = Kept(), RunRecord()
+    run(tmp_path / "run.mcap", [kept, record])
+    counts = {"pairs": 12.0, "stalls": 1.0, "temperature_c": 41.5}
+    assert kept.lines[0] == LogLine(stage, "WARNING", "wall sent no image for 500 ms")
+    assert kept.counters[-1] == SourceCounters(11, counts)
+    with LogReader(tmp_path / "run.mcap") as reader:
+        texts = [(m.name, m.message) for _, m in messages(reader, [topics.LOG])]
+        logged = [m for _, m in messages(reader, [topics.COUNTERS])]
+        totals = reader.metadata(TOTALS)
+    assert texts == [(line.stage, line.text) for line in kept.lines]
+    assert texts.count((stage, "wall sent no image for 500 ms")) == 1
+    assert logged[-1].counts == counts
+    assert (totals["pairs"], totals["stalls"], totals["frames"]) == ("12", "1", "12")
+    said = [r for r in caplog.records if r.getMessage() == "wall sent no image for 500 ms"]
+    assert [r.levelname for r in said] == ["WARNING"]  # once on the screen too, wherever it was said
+
+    stats = statistics(record, 1.0)
+    assert stats["source"] == counts
+    assert "camera: 12 stereo images, stalls 1" in summary(stats)
+
+
+def test_a_quiet_main_still_logs_what_a_stage_informs_of(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    kept = Kept()
+    between_processes(tmp_path / "run.mcap", [kept])
+    assert LogLine("capture", "INFO", "wall is back") in kept.lines
+    assert "wall is back" not in caplog.text
+
+
+def _warn(to_main: Outbox) -> None:
+    logger.warning("%s is tired", "somebody")
+
+
+@pytest.mark.parametrize("stage", ["tracker", "mapper", "loop", "logger"])
+def test_every_worker_passes_on_what_it_says(stage: str) -> None:
+    context = multiprocessing.get_context("spawn")
+    receive, send = context.Pipe(duplex=False)
+    process = context.Process(target=workers.guarded, args=(stage, _warn, send))
+    process.start()
+    send.close()
+    said = _all(receive)
+    process.join()
+    assert said == [LogLine(stage, "WARNING", "somebody is tired"), End(stage)]
+
+
+def _all(receive: Connection) -> list[object]:
+    out: list[object] = []
+    try:
+        while True:
+            out.append(receive.recv())
+    except EOFError:
+        return out
+
+
+def test_files_count_nothing_and_the_summary_says_nothing_of_them() -> None:
+    record = RunRecord()
+    for _ in run_inline(SlidingWall(3), CONFIG, [record]):
+        pass
+    stats = statistics(record, 1.0)
+    assert stats["source"] == {}
+    assert not any(line.startswith("camera:") for line in summary(stats))
