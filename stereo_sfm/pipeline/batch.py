@@ -118,8 +118,10 @@ def _run_on_ray(tasks: list[BatchTask], address: str | None) -> Iterator[tuple[B
     except ImportError:
         raise StereoSfmError("batch needs Ray: pip install 'stereo-sfm[batch]'") from None
 
-    if not ray.is_initialized():
-        ray.init(address=address, include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
+    # "local" even where a cluster once ran: without it Ray waits for the last one it remembers.
+    ours = not ray.is_initialized()
+    if ours:
+        ray.init(address=address or "local", include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
     remote = ray.remote(num_cpus=1, max_retries=RETRIES)(run_one)
     pending = {remote.remote(task): task for task in tasks}
     try:
@@ -135,6 +137,8 @@ def _run_on_ray(tasks: list[BatchTask], address: str | None) -> Iterator[tuple[B
     finally:
         for reference in pending:
             ray.cancel(reference, force=True)
+        if ours:
+            ray.shutdown()
 
 
 COLUMNS = ("recording", "frames", "tracked %", "keyframes", "loops", "path m", "ATE mm", "frames/s", "result")

@@ -33,6 +33,23 @@ def test_a_result_of_another_configuration_is_not_taken(tmp_path: Path) -> None:
     assert batch.finished(other) is None
 
 
+def test_without_an_address_no_cluster_is_looked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ray remembers the last cluster of this machine, and waits for it for minutes when it is gone."""
+    ray = pytest.importorskip("ray")
+    asked: list[object] = []
+
+    def init(**options: object) -> None:
+        asked.append(options["address"])
+        raise ConnectionError
+
+    monkeypatch.setattr(ray, "init", init)
+    task = batch.BatchTask(SMALL.format(1), str(tmp_path / "a"), load(), False)
+    for address in (None, "10.0.0.1:6379"):
+        with pytest.raises(ConnectionError):
+            list(batch.run_batch([task], address))
+    assert asked == ["local", "10.0.0.1:6379"]
+
+
 @pytest.mark.slow
 def test_a_failed_recording_stops_no_other_and_the_rest_is_resumed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
