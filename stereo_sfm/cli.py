@@ -70,10 +70,11 @@ class _Standard(logging.Handler):
 
 def _start_logging(options: argparse.Namespace) -> None:
     log = logging.getLogger("stereo_sfm")
-    log.handlers = [_Standard()]
-    log.propagate = False
     verbose, quiet = getattr(options, "verbose", False), getattr(options, "quiet", False)
-    log.setLevel(logging.INFO if verbose else logging.ERROR if quiet else logging.WARNING)
+    screen = _Standard(logging.INFO if verbose else logging.ERROR if quiet else logging.WARNING)
+    log.handlers = [screen]
+    log.propagate = False
+    log.setLevel(logging.INFO)  # the log of a run holds what the screen leaves out
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -63,7 +63,7 @@ def statistics(record: RunRecord, wall_s: float, evaluations: dict[str, Evaluati
         "frames_per_s": frames / wall_s if wall_s > 0 else 0.0,
         "ms": stage_times(record),
         "health": {stage: _health(reports) for stage, reports in sorted(record.health.items())},
-        "source": record.source_counts,
+        "camera": record.source_counts,
         "fingerprint": record.fingerprint(),
         "evaluation": {name: result.to_dict() for name, result in (evaluations or {}).items()},
     }
@@ -106,8 +106,8 @@ def summary(stats: dict[str, Any], evaluations: dict[str, Evaluation] | None = N
     ]
     if stats["loops_accepted"] or stats["loops_rejected"]:
         lines.append(_loops(stats))
-    if stats["source"]:
-        lines.append(_source(stats["source"]))
+    if stats["camera"]:
+        lines.append(_camera(stats["camera"]))
     lines.append(_times(stats))
     for name, result in (evaluations or {}).items():
         lines.append(
@@ -126,7 +126,7 @@ def _lost(intervals: list[dict[str, Any]]) -> str:
     return f"{len(intervals)} lost {noun} (max {worst['seconds']:.1f} s, {worst['reason']})"
 
 
-def _source(counts: dict[str, float]) -> str:
+def _camera(counts: dict[str, float]) -> str:
     """What went wrong in a live camera, by its own counters."""
     trouble = [f"{name.replace('_', ' ')} {count:g}" for name, count in counts.items() if count and name in TROUBLE]
     return f"camera: {counts.get('pairs', 0):g} stereo images, {', '.join(trouble) or 'nothing lost'}"

@@ -32,6 +32,15 @@ from tests.pipeline.test_pipeline import CONFIG, SlidingWall
 logger = logging.getLogger("stereo_sfm")
 
 
+@pytest.fixture(autouse=True)
+def fresh_logger(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a library has it: the command line leaves its own settings behind."""
+    monkeypatch.setattr(logger, "propagate", True)
+    monkeypatch.setattr(logger, "handlers", [])
+    monkeypatch.setattr(logger, "level", logging.NOTSET)
+    logger.manager._clear_cache()  # type: ignore[attr-defined]
+
+
 class TroubledWall(SlidingWall):
     """Warns and counts as a camera does."""
 
@@ -94,7 +103,7 @@ def test_warnings_and_counters_reach_the_log_and_the_sinks(
     assert [r.levelname for r in said] == ["WARNING"]  # once on the screen too, wherever it was said
 
     stats = statistics(record, 1.0)
-    assert stats["source"] == counts
+    assert stats["camera"] == counts
     assert "camera: 12 stereo images, stalls 1" in summary(stats)
 
 
@@ -135,5 +144,5 @@ def test_files_count_nothing_and_the_summary_says_nothing_of_them() -> None:
     for _ in run_inline(SlidingWall(3), CONFIG, [record]):
         pass
     stats = statistics(record, 1.0)
-    assert stats["source"] == {}
+    assert stats["camera"] == {}
     assert not any(line.startswith("camera:") for line in summary(stats))
