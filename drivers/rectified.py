@@ -14,7 +14,7 @@ from stereo_sfm.types import StereoImage, Trajectory
 
 
 class RectifiedSource:
-    """Wraps an open source; `rig`, images and ground truth are those of the rectified pair."""
+    """Wraps a source and is entered with it; `rig`, images and ground truth are those of the rectified pair."""
 
     def __init__(
         self,
@@ -23,8 +23,13 @@ class RectifiedSource:
         hfov_deg: float | None = None,
         size: tuple[int, int] | None = None,
     ) -> None:
-        self._source = source
-        self.rectification = rectify(source.rig, projection, hfov_deg, size)
+        self._source, self._how = source, (projection, hfov_deg, size)
+        self._adopt()
+
+    def _adopt(self) -> None:
+        source = self._source
+        self._source_rig = source.rig
+        self.rectification = rectify(source.rig, *self._how)
         self.rig = self.rectification.rig
         self.name = source.name
         self.frame_count = source.frame_count
@@ -42,6 +47,8 @@ class RectifiedSource:
 
     def __enter__(self) -> Self:
         self._source.__enter__()
+        if self._source.rig is not self._source_rig:
+            self._adopt()  # a camera tells its calibration when it is open
         return self
 
     def __exit__(

@@ -18,7 +18,8 @@ def run(args: argparse.Namespace) -> int:
     """Convert everything that the source holds."""
     from stereo_sfm.commands.run import SourceChoice
 
-    with SourceChoice.of(args)() as source:
+    choice = SourceChoice.of(args)
+    with choice() as source:
         if source.live:
             raise StereoSfmError(f"{source.name} is a device: use 'stereo-sfm record {args.source}'")
-        return write(source, args, "convert")
+        return write(source, args, "convert", choice.opening)

@@ -12,6 +12,7 @@ from stereo_sfm.errors import StereoSfmError
 
 if TYPE_CHECKING:
     from drivers.source import Source
+    from stereo_sfm.log.provenance import Opening
     from stereo_sfm.log.record import Progress
 
 INTERRUPTED = 130
@@ -45,11 +46,12 @@ def run(args: argparse.Namespace) -> int:
     """Record until the source ends, the duration is over, or Ctrl-C."""
     from stereo_sfm.commands.run import SourceChoice
 
-    with SourceChoice.of(args)() as source:
-        return write(source, args, "record")
+    choice = SourceChoice.of(args)
+    with choice() as source:
+        return write(source, args, "record", choice.opening)
 
 
-def write(source: Source, args: argparse.Namespace, mode: str) -> int:
+def write(source: Source, args: argparse.Namespace, mode: str, opening: Opening) -> int:
     """Write an entered source and say what came of it."""
     from stereo_sfm.commands._stop import StopRequest
     from stereo_sfm.log.record import record
@@ -60,7 +62,7 @@ def write(source: Source, args: argparse.Namespace, mode: str) -> int:
     last: Progress | None = None
     show = _Line(source.frame_count, args.quiet)
     with StopRequest() as stop:
-        frames = record(source, path, args.image_format, overwrite=args.overwrite, mode=mode)
+        frames = record(source, path, args.image_format, overwrite=args.overwrite, mode=mode, opening=opening)
         for last in frames:
             show(last)
             if stop.asked:

@@ -13,14 +13,17 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.presets import PRESETS, preset
 
 if TYPE_CHECKING:
+    from calib.rig import Rig
     from drivers.source import Source
     from stereo_sfm.config import Config
     from stereo_sfm.eval.record import RunRecord
+    from stereo_sfm.log.provenance import Opening
     from stereo_sfm.log.recorded import RecordedRun
     from stereo_sfm.pipeline.maps import MapFolders
     from stereo_sfm.pipeline.session import Session
     from stereo_sfm.viz.match_pictures import MatchPictures
 
+RECTIFY = {"none": "none", "pinhole": "pinhole", "wide": "epipolar"}  # option -> projection of `rectify`
 TRACKING_FAILED = 4
 INTERRUPTED = 130
 
@@ -54,6 +57,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def add_source_arguments(parser: argparse.ArgumentParser) -> None:
     """Options that choose the calibration and a part of a source."""
     parser.add_argument("--rig", type=Path, metavar="FILE", help="calibration instead of the source's own")
+    parser.add_argument(
+        "--rectify",
+        choices=RECTIFY,
+        default="none",
+        help="turn the images into rectified ones first: pinhole (crops a fisheye), wide (keeps its view)",
+    )
     parser.add_argument("--start", type=float, default=0.0, metavar="S", help="seconds to leave out at the beginning")
     parser.add_argument("--duration", type=float, default=float("inf"), metavar="S", help="seconds to use")
     parser.add_argument("--frame-skip", type=int, default=1, metavar="K", help="use every K-th frame")
@@ -119,12 +128,13 @@ class SourceChoice:
     """The source that the options ask for; opened by calling it, in whichever process reads it."""
 
     spec: str
-    rig: Path | None = None
+    rig: Rig | None = None
     start: float = 0.0
     duration: float = float("inf")
     frame_skip: int = 1
     max_frames: int | None = None
     speed: float | None = None
+    rectify: str = "none"
 
     @staticmethod
     def of(args: argparse.Namespace) -> SourceChoice:
@@ -137,17 +147,32 @@ class SourceChoice:
             speed = 1.0
         if Path(spec).exists():
             spec = str(Path(spec).resolve())  # the log says where the images are: a replay may start elsewhere
-        return SourceChoice(spec, args.rig, args.start, args.duration, args.frame_skip, args.max_frames, speed)
+        rig = None
+        if args.rig is not None:
+            from calib import load_rig
+
+            rig = load_rig(args.rig)
+        part = (args.start, args.duration, args.frame_skip, args.max_frames)
+        return SourceChoice(spec, rig, *part, speed, args.rectify)
+
+    @property
+    def opening(self) -> Opening:
+        """What the log keeps of it besides the name."""
+        from stereo_sfm.log.provenance import Opening
+
+        return Opening(self.rectify, self.rig)
 
     def __call__(self) -> Source:
         """The source, not yet entered."""
         from drivers.paced import PacedSource
+        from drivers.rectified import rectified
         from drivers.select import SelectedFrames
         from drivers.source import open_source
 
         source = open_source(self.spec, **({"rig": self.rig} if self.rig is not None else {}))
         if (self.start, self.duration, self.frame_skip, self.max_frames) != (0.0, float("inf"), 1, None):
             source = SelectedFrames(source, self.start, self.duration, self.frame_skip, self.max_frames)
+        source = rectified(source, RECTIFY[self.rectify])
         return source if self.speed is None else PacedSource(source, self.speed)
 
 

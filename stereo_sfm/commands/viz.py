@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from stereo_sfm.errors import StereoSfmError
 
 if TYPE_CHECKING:
+    from drivers.source import Source
     from stereo_sfm.log.reader import LogReader
     from stereo_sfm.pipeline.sinks import Sink
     from stereo_sfm.types import StereoImage
@@ -29,7 +30,6 @@ def run(args: argparse.Namespace) -> int:
     path: Path = args.file / "run.mcap" if args.file.is_dir() else args.file
     if not path.exists():
         raise StereoSfmError(f"no recording at {path}")
-    from drivers.source import open_source
     from stereo_sfm.log import topics
     from stereo_sfm.log.image_log import RIG_FILE, TRUTH_FILE, rig_from_text, truth_from_bytes
     from stereo_sfm.log.provenance import METADATA
@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
         name = reader.metadata(METADATA).get("source") or path.stem
         has_images = args.source is not None or topics.LEFT_IMAGE in names or rig_text is None
         if has_images:
-            with open_source(args.source or path) as source:
+            with _images(reader, path, args.source) as source:
                 sink = RerunSink(source.rig, name, mode, args.save, source.ground_truth)
                 _play(reader, iter(source), sink)
         else:
@@ -57,6 +57,20 @@ def run(args: argparse.Namespace) -> int:
         print("serving; open the address above in a browser, Ctrl-C ends")
         signal.pause()
     return 0
+
+
+def _images(reader: LogReader, path: Path, spec: str | None) -> Source:
+    """Where the images come from: another source is opened as the run opened it."""
+    from drivers.rectified import rectified
+    from drivers.source import open_source
+    from stereo_sfm.commands.run import RECTIFY
+    from stereo_sfm.log.recorded import read_opening
+
+    if spec is None:
+        return open_source(path)
+    opening = read_opening(reader)
+    source = open_source(spec, **({"rig": opening.rig} if opening.rig is not None else {}))
+    return rectified(source, RECTIFY[opening.rectify])
 
 
 def _play(reader: LogReader, images: Iterator[StereoImage], sink: Sink) -> None:

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import platform
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 
+from calib.rig import Rig
 from stereo_sfm import __version__
 from stereo_sfm.config import Config, dump
+from stereo_sfm.log.image_log import rig_to_text
 from stereo_sfm.log.topics import SCHEMA_VERSION
 from stereo_sfm.log.writer import LogWriter
 
 METADATA = "stereo_sfm"
 TOTALS = "totals"  # written at the end: what a reader would else have to count
 CONFIG_FILE = "config.toml"
+SOURCE_RIG_FILE = "source_calibration.yaml"
 VERSIONS_FILE = "versions.txt"
 _PACKAGES = (
     "numpy",
@@ -29,8 +33,23 @@ _PACKAGES = (
 )
 
 
+@dataclass(frozen=True, eq=False)
+class Opening:
+    """How a source was opened, besides its name: what a replay from the same source must do again."""
+
+    rectify: str = "none"  # none | pinhole | wide
+    rig: Rig | None = None  # calibration that replaced the source's own, before rectification
+
+
 def write_provenance(
-    writer: LogWriter, *, source: str, serial: str, mode: str, image_format: str, config: Config | None = None
+    writer: LogWriter,
+    *,
+    source: str,
+    serial: str,
+    mode: str,
+    image_format: str,
+    config: Config | None = None,
+    opening: Opening | None = None,
 ) -> None:
     """Record where everything in the file comes from.
 
@@ -41,6 +60,7 @@ def write_provenance(
         mode: how the file came about: "record", "inline", "lockstep", "realtime".
         image_format: one of `images.FORMATS`.
         config: what decided the results of a run.
+        opening: how the source was opened.
     """
     values = {
         "version": __version__,
@@ -50,6 +70,10 @@ def write_provenance(
         "mode": mode,
         "image_format": image_format,
     }
+    if opening is not None and opening.rectify != "none":
+        values["rectify"] = opening.rectify
+    if opening is not None and opening.rig is not None:
+        writer.attach(SOURCE_RIG_FILE, rig_to_text(opening.rig), "application/yaml")
     if config is not None:
         text = dump(config)
         values |= {"seed": str(config.seed), "config_sha256": config_hash(text)}

@@ -11,7 +11,7 @@ from drivers.source import Source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log.image_log import ImageLog
 from stereo_sfm.log.images import FORMATS, encode_pair
-from stereo_sfm.log.provenance import TOTALS, write_provenance
+from stereo_sfm.log.provenance import TOTALS, Opening, write_provenance
 from stereo_sfm.log.writer import LogWriter
 
 
@@ -33,6 +33,7 @@ def record(
     overwrite: bool = False,
     mode: str = "record",
     clock: Callable[[], int] = time.time_ns,
+    opening: Opening | None = None,
 ) -> Generator[Progress, None, None]:
     """Write every frame of an open source; yields after each. Stop iterating (or close the iterator) to stop.
 
@@ -43,6 +44,7 @@ def record(
         overwrite: replace an existing file.
         mode: goes into the metadata.
         clock: wall clock in nanoseconds, for `publish_time`.
+        opening: how the source was opened.
 
     Raises:
         StereoSfmError: the file cannot be written, the disk is full, the source fails, or it gave no frame.
@@ -50,7 +52,9 @@ def record(
     if image_format not in FORMATS:
         raise StereoSfmError(f"unknown image format '{image_format}' (known: {', '.join(FORMATS)})")
     with LogWriter(path, overwrite=overwrite, compress=image_format != "raw", clock=clock) as writer:
-        write_provenance(writer, source=source.name, serial=source.rig.serial, mode=mode, image_format=image_format)
+        write_provenance(
+            writer, source=source.name, serial=source.rig.serial, mode=mode, image_format=image_format, opening=opening
+        )
         images = ImageLog(writer, source.rig, source.ground_truth, image_format)
         frames, dropped, first_ns = 0, 0, None
         try:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import importlib
 import tomllib
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from stereo_sfm.config import Config, from_dict
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log import schema, topics
-from stereo_sfm.log.image_log import ImageInfo, ImuSample, WheelSample
-from stereo_sfm.log.provenance import CONFIG_FILE, METADATA
+from stereo_sfm.log.image_log import ImageInfo, ImuSample, WheelSample, rig_from_text
+from stereo_sfm.log.provenance import CONFIG_FILE, METADATA, SOURCE_RIG_FILE, Opening
 from stereo_sfm.log.reader import LogReader, Record
 from stereo_sfm.log.track_stats import TrackStats
 from stereo_sfm.pipeline.sinks import Health, SourceCounters, StageTimes
@@ -82,6 +82,7 @@ class RecordedRun:
     config: Config
     applied: list[Applied]
     dropped: list[Dropped]
+    opening: Opening = field(default_factory=Opening)  # of the source
 
 
 def read_run(reader: LogReader) -> RecordedRun:
@@ -104,4 +105,12 @@ def read_run(reader: LogReader) -> RecordedRun:
         from_dict(tomllib.loads(text.decode())),
         found[topics.APPLIED],
         found[topics.DROPPED],
+        read_opening(reader),
     )
+
+
+def read_opening(reader: LogReader) -> Opening:
+    """How the source of a run was opened."""
+    rig = reader.attachment(SOURCE_RIG_FILE)
+    rectify = reader.metadata(METADATA).get("rectify", "none")
+    return Opening(rectify, None if rig is None else rig_from_text(rig.decode()))

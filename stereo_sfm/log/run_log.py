@@ -15,7 +15,7 @@ from stereo_sfm.log import foxglove, topics
 from stereo_sfm.log.image_log import ImageLog
 from stereo_sfm.log.images import LoggedImage
 from stereo_sfm.log.map_view import MapView
-from stereo_sfm.log.provenance import TOTALS, write_provenance
+from stereo_sfm.log.provenance import TOTALS, Opening, write_provenance
 from stereo_sfm.log.track_stats import track_stats
 from stereo_sfm.log.writer import LogWriter
 from stereo_sfm.pipeline.sinks import Health, LogLine, SourceCounters, StageTimes
@@ -61,6 +61,7 @@ class RunLog:
         mode: str,
         image_format: str = "png",
         ground_truth: Trajectory | None = None,
+        opening: Opening | None = None,
     ) -> None:
         """Begin a log.
 
@@ -72,12 +73,16 @@ class RunLog:
             mode: "inline", "lockstep" or "realtime".
             image_format: "png", "raw", "jpeg" (only with images from `encode_pair`), or "none" for no images.
             ground_truth: world_T_cam0 where the source has it.
+            opening: how the source was opened.
         """
         self._writer = writer
         self._left_T_body = se3.inverse(rig.body_T_left)
         self._body_adjoint = se3.adjoint(rig.body_T_left)
         self._loops = config.loop.enabled and config.mapper.enabled and rig.stereo  # whether results will come
-        write_provenance(writer, source=source, serial=rig.serial, mode=mode, image_format=image_format, config=config)
+        write_provenance(
+            writer, source=source, serial=rig.serial, mode=mode, image_format=image_format, config=config,
+            opening=opening,
+        )  # fmt: skip
         self._images = ImageLog(writer, rig, ground_truth, image_format)
         self._map = MapView()
         self._map_T_odom: dict[int, F64] = {0: np.eye(4)}  # by map version

@@ -22,6 +22,7 @@ from typing import Any, Self
 
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.log.provenance import Opening
 from stereo_sfm.pipeline import workers
 from stereo_sfm.pipeline.capture import SourceInfo
 from stereo_sfm.pipeline.channels import DroppingOutbox, End, Failed, Outbox
@@ -202,6 +203,7 @@ class ProcessRun:
             realtime=realtime,
             folders=self._folders,
             delays=self._delays,
+            opening=getattr(self._opener, "opening", Opening()),
         )
         jpeg = self._log is not None and self._log.image_format == "jpeg"
         for stage, control in self._controls.items():

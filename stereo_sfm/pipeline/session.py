@@ -135,6 +135,7 @@ class Session:
                 LogWriter(options.path, compress=options.image_format != "raw"), source.rig, self._config,
                 source=self._spec or source.name, mode="inline",
                 image_format=options.image_format, ground_truth=source.ground_truth,
+                opening=getattr(self._opener, "opening", None),
             )  # fmt: skip
             stack.callback(log.close)
             sinks.append(log)

@@ -10,7 +10,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from typing import Any
 from calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.log.provenance import Opening
 from stereo_sfm.pipeline.channels import End, Failed, Inbox, Lost, Outbox
 from stereo_sfm.pipeline.maps import MapFolders, make_mapper, save_result
 from stereo_sfm.pipeline.schedule import Lockstep, Realtime, Recorded, Schedule
@@ -41,6 +42,7 @@ class Setup:
     realtime: bool
     folders: MapFolders
     delays: int | None  # seed of random delays in every stage (tests)
+    opening: Opening = field(default_factory=Opening)  # of the source
 
 
 def guarded(stage: str, body: Callable[..., None], report: Connection, *args: Any) -> None:
@@ -325,6 +327,7 @@ def run_logger(
     log = RunLog(
         LogWriter(options.path, compress=options.image_format != "raw"), setup.rig, setup.config,
         source=setup.source_name, mode=mode, image_format=options.image_format, ground_truth=setup.ground_truth,
+        opening=setup.opening,
     )  # fmt: skip
     inbox, free = Inbox[Any](messages), Outbox(release)
     try:
