@@ -36,6 +36,7 @@ from stereo_sfm.types import Applied, Frame
 SINKS = ("logger", "viewer")
 PICTURE_NS = 100_000_000  # the viewer gets a picture at most so often
 GRACE_S = 1.2  # for the logger to close its file after another stage died
+VIEWER_GRACE_S = 10.0  # for the viewer to show what waits when the run is over
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
@@ -126,7 +127,10 @@ class ProcessRun:
 
     def __iter__(self) -> Iterator[Frame]:
         while self._reports:
-            for connection in wait(list(self._reports)):
+            ready = wait(list(self._reports), self._patience())
+            if not ready:
+                return  # only the viewer is left, and it hangs
+            for connection in ready:
                 assert isinstance(connection, Connection)
                 try:
                     message = connection.recv()
@@ -145,6 +149,10 @@ class ProcessRun:
                     self._dispatch(message)
                     if isinstance(message, Frame):
                         yield message
+
+    def _patience(self) -> float | None:
+        """Seconds to wait for the next message; without end while a stage or the logger is at work."""
+        return VIEWER_GRACE_S if set(self._reports.values()) == {"viewer"} else None
 
     # -- start -------------------------------------------------------------------------------------------------------
 
