@@ -3,14 +3,15 @@ adjustment would change, and a verdict with its reasons."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calib.amount import FOCAL_BOTH, FOCAL_RATIO, TURN
 from calib.consistency import Correction, estimate
 from calib.rectification import Rectification
 from calib.rig import Rig
-from calib.scene_model import DIRECTION, FOCAL, FOCAL_RIGHT, ROTATION, SKEW
+from calib.scene_model import DIRECTION, SKEW
 from calib.tracks import Window
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import F64, I64
@@ -26,6 +27,9 @@ class Finding:
     name: str
     level: int  # index into VERDICTS
     text: str
+    judged: bool = True  # False: the recording does not show it, which is no fault of the calibration
+    value: tuple[float, ...] = ()  # what should be added, in the text's unit
+    sigma: tuple[float, ...] = ()  # its standard deviation
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,12 +63,13 @@ class Limit:
     deviations: float
 
 
-SYSTEMATIC_PX = Limit(0.3, 0.75, 0.0)
-ROTATION_DEG = Limit(0.10, 0.16, 3.0)
-DIRECTION_DEG = Limit(1.0, 3.0, 4.0)
-FOCAL_PERCENT = Limit(0.6, 1.2, 3.0)
+SYSTEMATIC_PX = Limit(0.5, 0.75, 0.0)
+ROTATION_DEG = Limit(0.08, 0.11, 3.0)
+DIRECTION_DEG = Limit(1.5, 3.0, 4.0)
+FOCAL_PERCENT = Limit(1.0, 1.15, 2.5)
 FOCAL_RIGHT_PERCENT = Limit(0.4, 1.0, 4.0)
 SKEW_MS = Limit(0.5, 2.0, 5.0)
+UNKNOWN = "cannot be judged from this recording: move the camera"
 
 
 def check(rig: Rig, rectification: Rectification, windows: list[Window]) -> CheckReport:
@@ -73,21 +78,23 @@ def check(rig: Rig, rectification: Rectification, windows: list[Window]) -> Chec
     Raises:
         StereoSfmError: too few matches to say anything.
     """
-    left = np.concatenate([w.rows.left for w in windows]) if windows else np.zeros((0, 2))
-    if len(left) < 40:
+    total = sum(len(w.rows) for w in windows)
+    if total < 40:
         raise StereoSfmError(
-            f"only {len(left)} stereo matches in the whole source: too dark, too plain, swapped eyes, or a calibration"
+            f"only {total} stereo matches in the whole source: too dark, too plain, swapped eyes, or a calibration"
             " so wrong that nothing matches"
         )
-    error = np.concatenate([w.rows.row_error for w in windows])
-    median, count = regions(left, error, rectification.rig.left.size)
     correction = estimate(rig, windows)
+    good = np.concatenate(correction.explained)
+    left = np.concatenate([w.rows.left for w in windows])[good]
+    error = np.concatenate([w.rows.row_error for w in windows])[good]
+    median, count = regions(left, error, rectification.rig.left.size)
     findings = (
         _rows(error, median, count),
         _baseline(rig),
         *_judged(correction),
     )
-    return CheckReport(findings, len(left), len(windows), median, count, correction)
+    return CheckReport(findings, total, len(windows), median, count, correction)
 
 
 def regions(left: F64, error: F64, size: tuple[int, int]) -> tuple[F64, I64]:
@@ -145,34 +152,36 @@ def _baseline(rig: Rig) -> Finding:
 
 
 def _judged(correction: Correction) -> list[Finding]:
-    vector, sigma = correction.vector, correction.sigma
-    out: list[Finding] = []
-    rotation, deviation = np.rad2deg(vector[ROTATION]), np.rad2deg(sigma[ROTATION])
-    level = max(level_of(float(v), float(s), ROTATION_DEG) for v, s in zip(rotation, deviation, strict=True))
-    out.append(
-        Finding("rotation between the eyes", level, f"off by {_list(rotation)} +- {_list(deviation)} degrees (x y z)")
-    )
-    direction, deviation = np.rad2deg(vector[DIRECTION]), np.rad2deg(sigma[DIRECTION])
-    level = max(level_of(float(v), float(s), DIRECTION_DEG) for v, s in zip(direction, deviation, strict=True))
-    out.append(
-        Finding("baseline direction", min(level, 1), f"off by {_list(direction)} +- {_list(deviation)} degrees (y z)")
-    )
-    ratio, deviation = 100 * vector[FOCAL_RIGHT], 100 * sigma[FOCAL_RIGHT]
-    level = level_of(float(ratio), float(deviation), FOCAL_RIGHT_PERCENT)
-    out.append(Finding("focal length, right against left", level, f"off by {ratio:+.2f} +- {deviation:.2f} %"))
-    # The focal length of both eyes shows only through the images' second order, which lenses have too.
-    both, deviation = 100 * vector[FOCAL], 100 * float(np.sqrt(correction.loose_covariance[FOCAL, FOCAL]))
-    text = f"off by {both:+.2f} +- {deviation:.2f} %"
-    seen = deviation < 0.5
-    text += "" if seen else " (this motion does not show it)"
-    out.append(
-        Finding("focal length, both eyes", level_of(float(both), float(deviation), FOCAL_PERCENT) if seen else 0, text)
-    )
-    skew, deviation = 1e3 * vector[SKEW], 1e3 * sigma[SKEW]
-    text = f"{skew:+.2f} +- {deviation:.2f} ms" + ("" if deviation < 2 else " (this motion does not show it)")
-    out.append(Finding("time skew of the right eye", level_of(float(skew), float(deviation), SKEW_MS), text))
-    return out
+    amount, sigma = correction.amount, correction.amount_sigma
+    rotation = _measured(
+        "rotation between the eyes", np.rad2deg(amount[TURN]), np.rad2deg(sigma[TURN]), ROTATION_DEG,
+        "degrees (x y z)", float(np.rad2deg(sigma[TURN]).max()) < 0.045,
+    )  # fmt: skip
+    own = correction.sigma[DIRECTION]
+    direction = _measured(
+        "baseline direction", np.rad2deg(correction.vector[DIRECTION]), np.rad2deg(own), DIRECTION_DEG,
+        "degrees (y z)", bool((own < 0.019).all()),
+    )  # fmt: skip
+    ratio = _measured(
+        "focal length, right against left", 100 * amount[[FOCAL_RATIO]], 100 * sigma[[FOCAL_RATIO]],
+        FOCAL_RIGHT_PERCENT, "%", float(sigma[FOCAL_RATIO]) < 0.004,
+    )  # fmt: skip
+    both = _measured(
+        "focal length, both eyes", 100 * amount[[FOCAL_BOTH]], 100 * sigma[[FOCAL_BOTH]],
+        FOCAL_PERCENT, "%", correction.shows_focal,
+    )  # fmt: skip
+    skew = 1e3 * correction.vector[[SKEW]], 1e3 * correction.sigma[[SKEW]]
+    time = _measured("time skew of the right eye", *skew, SKEW_MS, "ms", float(skew[1][0]) < 1.0)
+    return [rotation, replace(direction, level=min(direction.level, 1)), ratio, both, time]
 
 
-def _list(values: F64) -> str:
-    return "(" + ", ".join(f"{v:+.3f}" if abs(v) < 1 else f"{v:+.2f}" for v in values) + ")"
+def _measured(name: str, value: F64, sigma: F64, limit: Limit, unit: str, judged: bool) -> Finding:
+    """A finding about what should be added to the calibration, with its standard deviation."""
+    level = max(level_of(float(v), float(s), limit) for v, s in zip(value, sigma, strict=True)) if judged else 0
+    text = f"off by {_list(value)} +- {_list(sigma, '')} {unit}" + ("" if judged else f" ({UNKNOWN})")
+    return Finding(name, level, text, judged, tuple(float(v) for v in value), tuple(float(s) for s in sigma))
+
+
+def _list(values: F64, sign: str = "+") -> str:
+    texts = [f"{v:{sign}.3f}" if abs(v) < 1 else f"{v:{sign}.2f}" for v in values]
+    return texts[0] if len(texts) == 1 else "(" + ", ".join(texts) + ")"

@@ -2,9 +2,13 @@
 
 Unknown are the rotation of the right eye (3), the direction of the baseline (2), the focal length of both eyes and of
 the right one alone (2), the time skew of the right eye (1), a smooth displacement of each image for the lens's own
-imperfection (9 each, held small by a prior with a heavy tail), the motion of each window (6 for each moment after the
-first) and the points (bearing and inverse depth, so that points at infinity and beyond stay what they are). Points and
-motions are eliminated by the Schur complement.
+imperfection (10 each, held small by a prior), the motion of each window (6 for each moment after the first) and the
+points (bearing and inverse depth, so that points at infinity and beyond stay what they are). Points and motions are
+eliminated by the Schur complement.
+
+A turn and a shift of the picture, or a focal length and a radial displacement, are hard to tell apart, and it does not
+matter which it is: what counts is where the pictures are wrong. So the answer is the turn and the magnification that
+the whole correction amounts to over the matches (`calib.amount`), which are known far better than their parts.
 """
 
 from __future__ import annotations
@@ -13,53 +17,149 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib.amount import FOCAL_BOTH, FOCAL_RATIO, TURN, amounts
 from calib.rig import Rig
-from calib.scene_model import NUISANCE, SHARED, Problem, linearised, make_problem, moved, tangents
+from calib.scene_model import (
+    FOCAL,
+    FOCAL_RIGHT,
+    NUISANCE,
+    ROTATION,
+    SHARED,
+    Problem,
+    in_both,
+    linearised,
+    make_problem,
+    moved,
+    tangents,
+)
 from calib.tracks import Window
 from stereo_sfm.geometry import se3
-from stereo_sfm.types import F64
+from stereo_sfm.types import F64, Bool
 
 CORRELATED = 2.0  # the matches' errors are not independent: their deviation counts so many times
-# One standard deviation of what may be wrong before any image is seen: radians, radians, ratios, seconds, px.
-PRIOR = np.array([0.05] * 3 + [0.05] * 2 + [0.05, 0.05, 0.02] + ([0.3] * 2 + [0.15] * (NUISANCE - 2)) * 2)
+# One standard deviation of what may be wrong before any image is seen: radians, radians, ratios, seconds.
+RIG_PRIOR = (0.05, 0.05, 0.05, 0.02, 0.02, 0.05, 0.05, 0.02)
+
+
+@dataclass(frozen=True)
+class Lens:
+    """How far the lenses may be from their model: one standard deviation in px at the image's border."""
+
+    shift: float
+    bend: float  # second order
+    radial: tuple[float, float]  # third and fifth order
+    heavy: bool  # a Cauchy prior (but not above 5 px): good lenses need nothing, bad ones are believed
+
+    def trust(self, vector: F64) -> F64:
+        """(SHARED,) inverse variances at the present estimate."""
+        one = (self.shift, self.shift, *[self.bend] * (NUISANCE - 4), *self.radial)
+        prior = np.array(RIG_PRIOR + one + one)
+        trust = 1 / prior**2
+        if self.heavy:
+            lens = np.arange(len(RIG_PRIOR), SHARED)
+            bent = lens[(lens - len(RIG_PRIOR)) % NUISANCE >= 2]
+            trust[bent] = np.maximum(trust[bent] / (1 + (vector[bent] / prior[bent]) ** 2), 0.04)
+        return trust
+
+
+ANY = Lens(0.3, 0.15, (5.0, 2.0), heavy=True)
+# The focal length of both eyes hides behind the radial order: two views of the lens, their difference is doubt.
+CUBIC = Lens(0.3, 0.15, (5.0, 1e-3), heavy=False)
+QUINTIC = Lens(0.3, 0.15, (5.0, 1.0), heavy=False)
 
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """What should be added to the calibration, with its covariance."""
+    """What should be added to the calibration, with standard deviations."""
 
     vector: F64  # (SHARED,)
     covariance: F64  # (SHARED, SHARED)
-    loose_covariance: F64  # (SHARED, SHARED) as if the lens could be wrong by half a pixel in every term
+    amount: F64  # (5,) turn of the right eye in radians, right focal length against left, both: see `calib.amount`
+    amount_sigma: F64  # (5,)
     noise_px: float  # of one measured coordinate, robust
     points: int
     residual_px: float  # root mean square of the inliers after the fit
+    travel: float  # how far the points of the liveliest window moved, as a fraction of the image's width
+    explained: tuple[Bool, ...]  # for each window (N,) the points whose first moment the corrected rig explains
 
     @property
     def sigma(self) -> F64:
         """(SHARED,) standard deviations."""
         return np.sqrt(np.diag(self.covariance))
 
+    @property
+    def shows_focal(self) -> bool:
+        """Whether there is enough motion to tell the focal length of both eyes from the lenses' imperfection."""
+        return self.travel > 0.04 and float(self.amount_sigma[FOCAL_BOTH]) < 0.007
+
     def apply(self, rig: Rig) -> Rig:
-        """The rig with the corrected extrinsics and focal lengths."""
-        return moved(rig, self.vector)
+        """The rig turned and magnified as the images ask for; the focal length of both only if the motion shows it."""
+        vector = self.vector.copy()
+        vector[ROTATION], vector[FOCAL_RIGHT] = self.amount[TURN], self.amount[FOCAL_RATIO]
+        vector[FOCAL] = self.amount[FOCAL_BOTH] if self.shows_focal else 0.0
+        return moved(rig, vector)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """One minimum."""
+
+    vector: F64
+    covariance: F64
+    sigma: float
 
 
 def estimate(rig: Rig, windows: list[Window], iterations: int = 18) -> Correction:
     """Fit the correction of `rig` to the windows."""
     problems = [make_problem(rig, w) for w in windows]
-    vector, hessian = np.zeros(SHARED), np.eye(SHARED)
-    sigma = 5.0
+    best = _fit(rig, problems, ANY, np.zeros(SHARED), 5.0, iterations)
+    final = [linearised(moved(rig, best.vector), p, best.vector)[0][p.weight > 0] for p in problems]
+    kept = sum(int((p.weight > 0).all(1).sum()) for p in problems)
+    explained = tuple(_explained(w, p) for w, p in zip(windows, problems, strict=True))
+    total = amounts(rig, windows)
+    amount, covariance = total @ best.vector, total @ best.covariance @ total.T
+    sigma = np.sqrt(np.diag(covariance))
+    amount[FOCAL_BOTH], sigma[FOCAL_BOTH] = _both(rig, problems, best, total[FOCAL_BOTH])
+    residual = float(np.sqrt(np.mean(np.concatenate(final) ** 2)))
+    travel = max(_travel(w) for w in windows) / rig.left.width
+    return Correction(
+        best.vector, best.covariance, amount, sigma, best.sigma, kept, residual, travel, explained
+    )  # fmt: skip
+
+
+def _explained(window: Window, problem: Problem) -> Bool:
+    out = in_both(window)
+    out[out] = (problem.weight[:, :4] > 0).all(1)
+    return out
+
+
+def _both(rig: Rig, problems: list[Problem], start: _Fit, total: F64) -> tuple[float, float]:
+    """The magnification of both eyes: mean of two views of the lens, half their difference added to its deviation."""
+    fits = [_fit(rig, problems, lens, start.vector, start.sigma, 8) for lens in (CUBIC, QUINTIC)]
+    values = [float(total @ f.vector) for f in fits]
+    deviation = max(float(np.sqrt(total @ f.covariance @ total)) for f in fits)
+    return 0.5 * sum(values), float(np.hypot(deviation, 0.5 * (values[0] - values[1])))
+
+
+def _travel(window: Window) -> float:
+    """Median over the points of the farthest they were from where they began, px of the left eye."""
+    far = np.linalg.norm(window.left - window.left[0], axis=2)
+    return float(np.median(np.nan_to_num(np.fmax.reduce(far, axis=0))))
+
+
+def _fit(rig: Rig, problems: list[Problem], lens: Lens, vector: F64, sigma: float, iterations: int) -> _Fit:
+    """Gauss-Newton with weights renewed each time; the problems' points and motions move along."""
+    hessian = np.eye(SHARED)
     for iteration in range(iterations):
         current = moved(rig, vector)
-        trust = _trust(vector)
+        trust = lens.trust(vector)
         hessian, gradient = np.diag(trust), vector * trust
         steps: list[tuple[Problem, _Solved]] = []
         sizes: list[F64] = []
         for problem in problems:
             residual, by_point, by_rest = linearised(current, problem, vector)
             sizes.append(_point_noise(residual))
-            problem.weight = _weights(residual, sigma, hard=iteration >= 9)
+            problem.weight = _weights(residual, sigma, hard=iteration >= iterations // 2)
             h, g, solved = _reduced(problem, residual, by_point, by_rest, sigma)
             hessian, gradient = hessian + h, gradient + g
             steps.append((problem, solved))
@@ -68,26 +168,7 @@ def estimate(rig: Rig, windows: list[Window], iterations: int = 18) -> Correctio
             _apply(problem, delta, solved)
         vector = vector + delta
         sigma = float(np.clip(np.median(np.concatenate(sizes)), 0.1, 30.0))
-    covariance = np.asarray(np.linalg.inv(hessian), float)
-    loose = hessian.copy()
-    lens = np.arange(8, SHARED)
-    loose[lens, lens] += 1 / np.maximum(0.5, np.abs(vector[8:])) ** 2 - _trust(vector)[8:]
-    loose_covariance = np.asarray(np.linalg.inv(loose), float)
-    kept = np.concatenate([(p.weight > 0).all(1) for p in problems])
-    final = np.concatenate([linearised(moved(rig, vector), p, vector)[0][p.weight > 0] for p in problems])
-    return Correction(vector, covariance, loose_covariance, sigma, int(kept.sum()), float(np.sqrt(np.mean(final**2))))
-
-
-def _trust(vector: F64) -> F64:
-    """(SHARED,) inverse variance of the prior; for the lens's second-order terms that of a Cauchy prior, at most 1 px.
-
-    A good lens needs no displacement and then what is seen is put down to the eyes' rotation; a bad one is believed.
-    """
-    trust = 1 / PRIOR**2
-    lens = np.arange(8, SHARED)
-    bent = lens[(lens - 8) % NUISANCE >= 2]
-    trust[bent] = np.maximum(trust[bent] / (1 + (vector[bent] / PRIOR[bent]) ** 2), 1.0)
-    return trust
+    return _Fit(vector, np.asarray(np.linalg.inv(hessian), float), sigma)
 
 
 def _point_noise(residual: F64) -> F64:
@@ -104,7 +185,7 @@ def _point_noise(residual: F64) -> F64:
 
 
 def _weights(residual: F64, sigma: float, hard: bool) -> F64:
-    """Cauchy weights by the worst row of a point at a moment; zero where missing and, when `hard`, for gross outliers."""
+    """Cauchy weights by the worst row of a point at a moment; zero for missing rows and, if `hard`, gross outliers."""
     count, rows = residual.shape
     size = np.abs(np.nan_to_num(residual)).reshape(count, rows // 4, 4).max(2)
     worst = np.repeat(size, 4, axis=1)

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from calib.matches import Matches, flattened, lucas_kanade, match_pair, pyramid_flow
+from calib.matches import Matches, flattened, match_pair, pyramid_flow
+from calib.patches import Patches, Warp, align, cut, smooth, unstretched
 from calib.rectification import Rectification
 from stereo_sfm.types import F64, U8, Bool, StereoImage
 
@@ -41,7 +42,8 @@ class _Tracking:
     """A window while it grows: rectified positions, float32."""
 
     start: Matches
-    kept: tuple[U8, Any]  # flattened left image of the last kept moment, and the points there
+    patches: Patches  # of the first left image
+    warps: tuple[Warp, Warp]  # to the left and the right eye of the last kept moment
     last: tuple[U8, U8]
     left: Any
     right: Any
@@ -73,6 +75,7 @@ def collect(
     """
     out: list[Window] = []
     current: _Tracking | None = None
+    pair: tuple[U8, U8] | None = None
     wait = 0
     for image in images:
         if image.right is None:
@@ -80,30 +83,40 @@ def collect(
         if current is None and wait > 0:
             wait -= 1
             continue
-        left, right = rectification.apply(image.left, image.right)
+        left, right = pair = rectification.apply(image.left, image.right)
         if current is None:
             matches = match_pair(rectification, left, right, max_matches, search_rows)
             if len(matches) >= 12:
-                current = _begin(matches, flattened(left), flattened(right), image.stamp_ns)
+                current = _begin(matches, left, right, image.stamp_ns)
             continue
         _advance(current, flattened(left), flattened(right), image.stamp_ns)
         if _moved(current) > STEP * left.shape[1]:
-            _keep(current)
+            _keep(current, left, right)
         if len(current.moments) == MOMENTS or current.age >= LONGEST or current.alive.mean() < 0.3:
-            out.append(_close(current, rectification))
+            out.append(_close(current, rectification, pair))
             current, wait = None, gap
             if len(out) >= windows:
                 return out
-    if current is not None:
-        out.append(_close(current, rectification))
+    if current is not None and pair is not None:
+        out.append(_close(current, rectification, pair))
     return out
 
 
+def corners_for(frames: int, windows: int) -> int:
+    """Corners of one window, more when a recording is too short for many windows."""
+    return int(np.clip(4800 / max(1.0, min(windows, frames / LONGEST)), 400, 1600))
+
+
 def _begin(matches: Matches, left: U8, right: U8, stamp_ns: int) -> _Tracking:
-    a, b = matches.left.astype(np.float32), matches.right.astype(np.float32)
+    """Patches of the left eye, found again in the right eye."""
+    patches = cut(smooth(left), matches.left)
+    here = unstretched(matches.left)
+    there, good = align(patches, smooth(right), unstretched(matches.right))
+    a, b = here.uv, there.uv
     unknown = np.full(a.shape, np.nan)
-    first = _Moment(matches.left, matches.right, unknown)
-    return _Tracking(matches, (left, a), (left, right), a, b, np.ones(len(a), bool), stamp_ns, [first], unknown)
+    first = _Moment(matches.left, np.where(good[:, None], b, np.nan).astype(float), unknown)
+    last = flattened(left), flattened(right)
+    return _Tracking(matches, patches, (here, there), last, a, b, good, stamp_ns, [first], unknown)
 
 
 def _advance(state: _Tracking, left: U8, right: U8, stamp_ns: int) -> None:
@@ -120,31 +133,29 @@ def _advance(state: _Tracking, left: U8, right: U8, stamp_ns: int) -> None:
 
 def _moved(state: _Tracking) -> float:
     """Median movement in px since the last kept moment."""
-    moved = np.linalg.norm(state.left - state.kept[1], axis=1)[state.alive]
+    moved = np.linalg.norm(state.left - state.warps[0].uv, axis=1)[state.alive]
     return float(np.median(moved)) if len(moved) else 0.0
 
 
-def _keep(state: _Tracking) -> None:
-    """A moment: the left points refined against the last moment's, the right ones against the left."""
-    left, good = lucas_kanade(state.kept[0], state.last[0], state.kept[1], state.left)
-    right, good_right = lucas_kanade(*state.last, left, state.right)
-    state.alive &= good & (np.linalg.norm(left - state.left, axis=1) < 1.5)
-    good_right &= np.linalg.norm(right - state.right, axis=1) < 2.0
-    seen = state.alive & good_right
-    state.moments.append(
-        _Moment(np.where(state.alive[:, None], left, np.nan), np.where(seen[:, None], right, np.nan), state.velocity)
-    )
-    state.left = np.where(state.alive[:, None], left, state.left)
-    state.kept, state.fresh = (state.last[0], state.left), 0
+def _keep(state: _Tracking, left: U8, right: U8) -> None:
+    """A moment: the first picture's patches found in both rectified images, from where the flow says they are."""
+    here, good = align(state.patches, smooth(left), Warp(state.left, state.warps[0].stretch))
+    there, good_right = align(state.patches, smooth(right), Warp(state.right, state.warps[1].stretch))
+    state.alive &= good & good_right
+    lost = ~state.alive[:, None]
+    a, b = np.where(lost, np.nan, here.uv), np.where(lost, np.nan, there.uv)
+    state.moments.append(_Moment(a.astype(float), b.astype(float), state.velocity))
+    state.left, state.right = np.where(lost, state.left, here.uv), np.where(lost, state.right, there.uv)
+    state.warps, state.fresh = (Warp(state.left, here.stretch), Warp(state.right, there.stretch)), 0
 
 
-def _close(state: _Tracking, rectification: Rectification) -> Window:
+def _close(state: _Tracking, rectification: Rectification, pair: tuple[U8, U8]) -> Window:
     """Keep the end too, and go back to the original images' pixels."""
     if state.fresh and len(state.moments) < MOMENTS:
-        _keep(state)
-    left = np.stack([rectification.left.to_source(m.left.astype(float)) for m in state.moments])
-    right = np.stack([rectification.right.to_source(m.right.astype(float)) for m in state.moments])
-    velocity = np.stack([_in_source(rectification, m.right.astype(float), m.velocity) for m in state.moments])
+        _keep(state, *pair)
+    left = np.stack([rectification.left.to_source(m.left) for m in state.moments])
+    right = np.stack([rectification.right.to_source(m.right) for m in state.moments])
+    velocity = np.stack([_in_source(rectification, m.right, m.velocity) for m in state.moments])
     return Window(left, right, velocity, state.start)
 
 

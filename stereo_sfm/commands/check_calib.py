@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from calib.check import CheckReport
+    from calib.check import CheckReport, Finding
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -29,7 +29,7 @@ def run(args: argparse.Namespace) -> int:
     from calib import load_rig, save_rig
     from calib.check import check
     from calib.rectification import rectify
-    from calib.tracks import LONGEST, collect
+    from calib.tracks import LONGEST, collect, corners_for
     from drivers.source import open_source
 
     with open_source(args.source) as source:
@@ -37,8 +37,9 @@ def run(args: argparse.Namespace) -> int:
         rectification = rectify(rig, "epipolar")
         total = min(source.frame_count or args.max_frames, args.max_frames)
         gap = 0 if source.live else max(0, total // max(args.windows, 1) - LONGEST)
+        corners = corners_for(total, args.windows)
         images = itertools.islice(source, args.max_frames)
-        report = check(rig, rectification, collect(images, rectification, args.windows, gap, search_rows=args.search))
+        report = check(rig, rectification, collect(images, rectification, args.windows, gap, corners, args.search))
     if args.correct is not None:
         save_rig(report.correction.apply(rig), args.correct)
     if args.json:
@@ -55,7 +56,7 @@ def as_text(report: CheckReport, name: str) -> str:
     from calib.check import VERDICTS
 
     lines = [f"{name}: {report.matches} stereo matches in {report.windows} stretches"]
-    lines += [f"  {VERDICTS[f.level]}  {f.name}: {f.text}" for f in report.findings]
+    lines += [f"  {VERDICTS[f.level] if f.judged else '  - '}  {f.name}: {f.text}" for f in report.findings]
     lines.append("row error by image region (median, px; - where nothing was matched):")
     for row in report.region_median:
         lines.append("  " + "  ".join("     -" if np.isnan(v) else f"{v:+6.2f}" for v in row))
@@ -75,16 +76,25 @@ def as_dict(report: CheckReport) -> dict[str, Any]:
     """Plain values for `--json`."""
     import numpy as np
 
-    from calib.check import VERDICTS
-
     return {
         "verdict": report.verdict,
         "matches": report.matches,
         "windows": report.windows,
-        "findings": [{"name": f.name, "verdict": VERDICTS[f.level], "text": f.text} for f in report.findings],
+        "findings": [_finding(f) for f in report.findings],
         "region_median_px": [[None if np.isnan(v) else round(float(v), 3) for v in r] for r in report.region_median],
         "region_count": report.region_count.tolist(),
-        "correction": [float(v) for v in report.correction.vector[:8]],
-        "correction_sigma": [float(v) for v in report.correction.sigma[:8]],
         "noise_px": report.correction.noise_px,
+    }
+
+
+def _finding(finding: Finding) -> dict[str, Any]:
+    from calib.check import VERDICTS
+
+    return {
+        "name": finding.name,
+        "judged": finding.judged,
+        "verdict": VERDICTS[finding.level] if finding.judged else None,
+        "text": finding.text,
+        "value": list(finding.value),
+        "sigma": list(finding.sigma),
     }

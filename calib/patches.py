@@ -1,0 +1,109 @@
+"""Sub-pixel alignment of small patches that may stretch, turn and change their brightness.
+
+The inverse compositional algorithm of Baker and Matthews (IJCV 56, 2004, section 3.2) for an affine warp with gain and
+offset. Every later picture is compared with the first one, so that errors do not add up along a track.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereo_sfm.types import F64, U8, Bool
+
+HALF = 8  # px: half the size of a patch
+F32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """What the points of one picture look like."""
+
+    offset: F32  # (P, 2) px from the centre
+    value: F32  # (N, P)
+    slope: F32  # (N, P, 8) of the value by place (2), stretch (4), gain and offset, times the window
+    inverse: F32  # (N, 8, 8) of the normal equations
+
+
+@dataclass(eq=False)
+class Warp:
+    """Where patches are in another picture: a pixel at offset x from the centre is found at uv + stretch @ x."""
+
+    uv: F32  # (N, 2)
+    stretch: F32  # (N, 2, 2)
+
+
+def smooth(image: U8) -> F32:
+    """The picture as it is compared."""
+    import cv2
+
+    return cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.8)
+
+
+def cut(picture: F32, uv: F64) -> Patches:
+    """Patches around (N, 2) px of a smoothed picture."""
+    import cv2
+
+    steps = np.arange(-HALF, HALF + 1, dtype=np.float32)
+    offset = np.stack([m.ravel() for m in np.meshgrid(steps, steps)], -1).astype(np.float32)
+    place = uv[:, None].astype(np.float32) + offset
+    across: Any = cv2.Sobel(picture, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
+    down: Any = cv2.Sobel(picture, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8)
+    value, gx, gy = (_sample(p, place) for p in (picture, across, down))
+    x, y = offset.T
+    centred = value - value.mean(1, keepdims=True)
+    slope = np.stack([gx, gy, gx * x, gx * y, gy * x, gy * y, centred, np.ones_like(gx)], -1)
+    window = np.exp(-(x * x + y * y) / (2 * (0.6 * HALF) ** 2))[:, None]
+    normal = np.swapaxes(slope * window, 1, 2) @ slope
+    diagonal = np.einsum("nii->ni", normal)
+    diagonal *= 1.0 + 1e-4
+    diagonal += 1e-2
+    return Patches(offset, value, slope * window, np.linalg.inv(normal).astype(np.float32))
+
+
+def align(patches: Patches, picture: F32, start: Warp, iterations: int = 8) -> tuple[Warp, Bool]:
+    """The patches' places in another smoothed picture, and (N,) whether each was found.
+
+    Args:
+        patches: of the first picture. picture: the other one.
+        start: guesses, within two pixels or so.
+    """
+    uv, stretch = start.uv.copy(), start.stretch.copy()
+    moved, seen = np.full(len(uv), np.inf, np.float32), patches.value
+    for _ in range(iterations):
+        seen = _sample(picture, uv[:, None] + patches.offset @ np.swapaxes(stretch, 1, 2))
+        error = seen - patches.value
+        step = (patches.inverse @ (np.swapaxes(patches.slope, 1, 2) @ error[..., None]))[..., 0]
+        change = np.eye(2, dtype=np.float32) + np.clip(step[:, 2:6], -0.3, 0.3).reshape(-1, 2, 2)
+        stretch = stretch @ np.linalg.inv(change)
+        shift = (stretch @ np.clip(step[:, :2], -2, 2)[..., None])[..., 0]
+        uv = uv - shift
+        moved = np.abs(shift).max(1)
+    size = np.linalg.det(stretch)
+    good = (moved < 0.02) & (size > 0.25) & (size < 4) & (_likeness(patches.value, seen) > 0.9)
+    good &= np.linalg.norm(uv - start.uv, axis=1) < 2.5
+    height, width = picture.shape
+    inside = (uv > HALF).all(1) & (uv[:, 0] < width - 1 - HALF) & (uv[:, 1] < height - 1 - HALF)
+    return Warp(uv, stretch), good & inside
+
+
+def unstretched(uv: F64) -> Warp:
+    """A guess that only knows the places."""
+    return Warp(uv.astype(np.float32), np.broadcast_to(np.eye(2, dtype=np.float32), (len(uv), 2, 2)).copy())
+
+
+def _sample(picture: F32, place: F32) -> F32:
+    """(N, P) values at (N, P, 2) px, bilinear; cv2.remap holds at most 32767 rows, so patches are rows."""
+    import cv2
+
+    place = np.ascontiguousarray(place, np.float32)
+    return np.asarray(cv2.remap(picture, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))  # pyright: ignore
+
+
+def _likeness(a: F32, b: F32) -> F32:
+    """(N,) normalised correlation."""
+    a, b = a - a.mean(1, keepdims=True), b - b.mean(1, keepdims=True)
+    return (a * b).sum(1) / np.maximum(np.sqrt((a * a).sum(1) * (b * b).sum(1)), 1e-6)

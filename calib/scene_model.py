@@ -1,0 +1,166 @@
+"""What a calibration predicts of points seen by both eyes at several moments, and the derivatives of that.
+
+The unknowns of the calibration and of the lenses are one vector, shared by all windows; see `calib.consistency`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.rig import Rig
+from calib.tracks import Window
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.cameras import Camera
+from stereo_sfm.geometry.stereo import rectifying_rotations
+from stereo_sfm.types import F64, Bool
+
+ROTATION, DIRECTION, FOCAL, FOCAL_RIGHT, SKEW = slice(0, 3), slice(3, 5), 5, 6, 7
+NUISANCE = 10  # terms of one eye's lens displacement
+SHARED = 8 + 2 * NUISANCE
+
+
+@dataclass(eq=False)
+class Problem:
+    """One window's measurements and its own unknowns."""
+
+    left: F64  # (F, N, 2)
+    right: F64
+    velocity: F64  # zero where unknown
+    bearing: F64  # (N, 3) unit, first left eye
+    rho: F64  # (N,) inverse distance
+    frame_T_first: F64  # (F, 4, 4) left eye's motion
+    weight: F64  # (N, 4 F) of each row
+
+
+def moved(rig: Rig, vector: F64) -> Rig:
+    """The rig with rotation, direction and focal lengths changed; skew and lens displacement are not part of a rig."""
+    assert rig.right is not None
+    rect_R_left, _ = rectifying_rotations(rig.left_T_right)
+    t = rig.left_T_right[:3, 3] + rig.baseline * (vector[DIRECTION] @ rect_R_left[1:])
+    transform = np.eye(4)
+    transform[:3, :3] = rig.left_T_right[:3, :3] @ se3.so3_exp(vector[ROTATION])
+    transform[:3, 3] = t * (rig.baseline / np.linalg.norm(t))
+    left = _focal(rig.left, float(np.exp(vector[FOCAL])))
+    right = _focal(rig.right, float(np.exp(vector[FOCAL] + vector[FOCAL_RIGHT])))
+    return replace(rig, left=left, right=right, left_T_right=transform)
+
+
+def _focal(camera: Camera, factor: float) -> Camera:
+    return replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
+
+
+def in_both(window: Window) -> Bool:
+    """(N,) the points that both eyes see at the first moment."""
+    return np.isfinite(window.left[0]).all(1) & np.isfinite(window.right[0]).all(1)
+
+
+def make_problem(rig: Rig, window: Window) -> Problem:
+    seen = in_both(window)
+    left, right = window.left[:, seen], window.right[:, seen]
+    velocity = np.nan_to_num(window.right_velocity[:, seen])
+    assert rig.right is not None
+    bearing = rig.left.unproject(left[0])
+    # (b - rho t) seen from the right eye is parallel to its bearing r: r x R'b = rho r x R't, least squares in rho.
+    in_right = rig.right.unproject(right[0])
+    rotation, t = rig.left_T_right[:3, :3], rig.left_T_right[:3, 3]
+    a, c = np.cross(in_right, bearing @ rotation), np.cross(in_right, t @ rotation)
+    rho = (a * c).sum(1) / np.maximum((c * c).sum(1), 1e-12)
+    frames = np.broadcast_to(np.eye(4), (len(left), 4, 4)).copy()
+    problem = Problem(left, right, velocity, bearing, rho, frames, np.ones((len(bearing), 4 * len(left))))
+    for f in range(1, len(left)):
+        frames[f] = _first_pose(rig.left, left[f], bearing, rho, frames[f - 1])
+    return problem
+
+
+def _first_pose(camera: Camera, uv: F64, bearing: F64, rho: F64, pose: F64) -> F64:
+    """frame_T_first (4, 4) by robust Gauss-Newton on the left eye with the points held, from `pose`."""
+    seen = np.isfinite(uv[:, 0]) & (np.abs(rho) < 1e3)
+    uv, bearing, rho = uv[seen], bearing[seen], rho[seen]
+    for _ in range(20):
+        p = bearing @ pose[:3, :3].T + rho[:, None] * pose[:3, 3]
+        predicted, jac = camera.project_jacobian(p)
+        residual = uv - predicted
+        good = np.isfinite(residual).all(1)
+        if good.sum() < 6:
+            return pose
+        j = np.concatenate([jac * rho[:, None, None], -jac @ se3.skew(p)], -1)[good]
+        r = residual[good]
+        size = np.linalg.norm(r, axis=1)
+        scale = max(float(np.median(size)), 0.3)
+        w = (1 / (1 + (size / scale) ** 2))[:, None]
+        h = np.einsum("nij,nik,ni->jk", j, j, np.broadcast_to(w, r.shape)) + 1e-6 * np.eye(6)
+        step = np.linalg.solve(h, np.einsum("nij,ni->j", j, r * w))
+        pose = se3.exp(step) @ pose
+    return pose
+
+
+def displacement(camera: Camera, uv: F64) -> F64:
+    """(N, 2, NUISANCE) smooth displacements of about one pixel at the image's border.
+
+    A shift, every second-order term and the first two radial ones: the first orders of what a lens model can get wrong.
+    """
+    x, y = 2 * uv[:, 0] / camera.width - 1, 2 * uv[:, 1] / camera.height - 1
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    aspect = camera.height / camera.width
+    r2 = x * x + (aspect * y) ** 2
+    u = [one, zero, x * x, x * y, y * y, zero, zero, zero, x * r2, x * r2 * r2]
+    v = [zero, one, zero, zero, zero, x * x, x * y, y * y, aspect * y * r2, aspect * y * r2 * r2]
+    return np.stack([np.stack(u, -1), np.stack(v, -1)], 1)
+
+
+def linearised(rig: Rig, problem: Problem, vector: F64) -> tuple[F64, F64, F64]:
+    """Residuals (N, 4 F), derivatives of the prediction by the point (N, 4 F, 3) and by the rest (N, 4 F, R).
+
+    The rest is the shared vector and the poses of all moments but the first, R = SHARED + 6 (F - 1).
+    """
+    assert rig.right is not None
+    count, frames = len(problem.bearing), len(problem.left)
+    residual = np.full((count, 4 * frames), np.nan)
+    by_point = np.zeros((count, 4 * frames, 3))
+    by_rest = np.zeros((count, 4 * frames, SHARED + 6 * (frames - 1)))
+    rotation, t = rig.left_T_right[:3, :3], rig.left_T_right[:3, 3]
+    rect_R_left, _ = rectifying_rotations(rig.left_T_right)
+    by_direction = -rig.baseline * (rotation.T @ rect_R_left[1:].T)  # (3, 2) of rho-scaled right coordinates
+    tangent = tangents(problem.bearing)
+    rho = problem.rho[:, None]
+    for f in range(frames):
+        move = problem.frame_T_first[f]
+        p = problem.bearing @ move[:3, :3].T + rho * move[:3, 3]
+        q = (p - rho * t) @ rotation
+        p_point = np.concatenate([move[:3, :3] @ tangent, np.broadcast_to(move[:3, 3, None], (count, 3, 1))], -1)
+        q_point = rotation.T @ np.concatenate([p_point[..., :2], p_point[..., 2:] - t[:, None]], -1)
+        p_pose = np.concatenate([rho[..., None] * np.eye(3), -se3.skew(p)], -1)
+        for eye, camera, points, point_d in ((0, rig.left, p, p_point), (1, rig.right, q, q_point)):
+            rows = slice(4 * f + 2 * eye, 4 * f + 2 * eye + 2)
+            seen = problem.right[f] if eye else problem.left[f]
+            uv, jac = camera.project_jacobian(points)
+            shape = displacement(camera, np.nan_to_num(seen))
+            own = slice(8 + eye * NUISANCE, 8 + (eye + 1) * NUISANCE)
+            predicted = uv + shape @ vector[own]
+            by_point[:, rows] = jac @ point_d
+            rest = by_rest[:, rows]
+            rest[..., own] = shape
+            rest[..., FOCAL] = uv - [camera.cx, camera.cy]
+            pose = slice(SHARED + 6 * (f - 1), SHARED + 6 * f)
+            if eye:
+                predicted = predicted + vector[SKEW] * problem.velocity[f]
+                rest[..., FOCAL_RIGHT] = rest[..., FOCAL]
+                rest[..., SKEW] = problem.velocity[f]
+                rest[..., ROTATION] = jac @ se3.skew(q)
+                rest[..., DIRECTION] = (jac @ by_direction) * rho[..., None]
+            if f:
+                rest[..., pose] = jac @ (rotation.T @ p_pose if eye else p_pose)
+            residual[:, rows] = seen - predicted
+    missing = ~np.isfinite(residual) | ~np.isfinite(by_point).all(2) | ~np.isfinite(by_rest).all(2)
+    by_point[missing], by_rest[missing], residual[missing] = 0.0, 0.0, np.nan
+    return residual, by_point, by_rest
+
+
+def tangents(bearing: F64) -> F64:
+    """(N, 3, 2) two directions across each bearing."""
+    helper = np.where(np.abs(bearing[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    first = np.cross(bearing, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.asarray(np.stack([first, np.cross(bearing, first)], -1), float)
