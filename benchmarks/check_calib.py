@@ -5,7 +5,8 @@ python benchmarks/check_calib.py kitti sim:loop         these
 python benchmarks/check_calib.py --faults pitch+ both-  some faults (the true rig is always judged)
 
 Each cell reads the verdict, and what check-calib says should be added, +- its standard deviation: degrees about the
-axis of the turn, or per cent of focal length. Every cell rectifies, matches and judges anew with the faulty rig.
+axis of the turn, or per cent of focal length; for the true rig the turn about x, y, z, the right focal length against
+the left, and both, in brackets where the recording does not show it. Every cell rectifies, matches and judges anew with the faulty rig.
 """
 
 from __future__ import annotations
@@ -99,12 +100,22 @@ def cell(report: CheckReport, fault: Fault) -> tuple[str, bool]:
     """What the table says, and whether it is as it should be (a fault that cannot be judged is said to be so)."""
     if not fault.finding:
         worst = [f.name for f in report.findings if f.level == report.level] if report.level else []
-        return report.verdict + "".join(f" ({w})" for w in worst), report.verdict == "PASS"
+        return report.verdict + "".join(f" ({w})" for w in worst) + _all(report), report.verdict == "PASS"
     found = next(f for f in report.findings if f.name == fault.finding)
     number = f"{found.value[fault.index]:+.2f}±{found.sigma[fault.index]:.2f}"
     if not found.judged and report.verdict != "FAIL":
         return f"not judged {number}", True
     return f"{report.verdict} {number}", report.verdict == "FAIL"
+
+
+def _all(report: CheckReport) -> str:
+    """What is said of an unchanged rig: the turn, the focal lengths' ratio, both focal lengths."""
+    names = ("rotation between the eyes", "focal length, right against left", "focal length, both eyes")
+    parts: list[str] = []
+    for f in (f for name in names for f in report.findings if f.name == name):
+        numbers = ", ".join(f"{v:+.2f}±{s:.2f}" for v, s in zip(f.value, f.sigma, strict=True))
+        parts.append(numbers if f.judged else f"[{numbers}]")
+    return "  " + "; ".join(parts)
 
 
 def main() -> int:

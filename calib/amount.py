@@ -53,4 +53,4 @@ def _turn_and_scale(camera: Camera, bearing: F64) -> tuple[F64, F64]:
 
 def _fitted(by: F64, shapes: F64) -> F64:
     """(4, K) least-squares turn and magnification of K displacement fields (N, 2, K)."""
-    return np.linalg.lstsq(by.reshape(-1, 4), shapes.reshape(-1, shapes.shape[2]), rcond=None)[0]
+    return np.asarray(np.linalg.lstsq(by.reshape(-1, 4), shapes.reshape(-1, shapes.shape[2]), rcond=None)[0], float)

@@ -66,7 +66,7 @@ class Limit:
 SYSTEMATIC_PX = Limit(0.5, 0.75, 0.0)
 ROTATION_DEG = Limit(0.08, 0.11, 3.0)
 DIRECTION_DEG = Limit(1.5, 3.0, 4.0)
-FOCAL_PERCENT = Limit(1.0, 1.15, 2.5)
+FOCAL_PERCENT = Limit(1.0, 1.0, 2.5)
 FOCAL_RIGHT_PERCENT = Limit(0.4, 1.0, 4.0)
 SKEW_MS = Limit(0.5, 2.0, 5.0)
 UNKNOWN = "cannot be judged from this recording: move the camera"
@@ -155,7 +155,7 @@ def _judged(correction: Correction) -> list[Finding]:
     amount, sigma = correction.amount, correction.amount_sigma
     rotation = _measured(
         "rotation between the eyes", np.rad2deg(amount[TURN]), np.rad2deg(sigma[TURN]), ROTATION_DEG,
-        "degrees (x y z)", float(np.rad2deg(sigma[TURN]).max()) < 0.045,
+        "degrees (x y z)", float(np.rad2deg(sigma[TURN]).max()) < 0.06,
     )  # fmt: skip
     own = correction.sigma[DIRECTION]
     direction = _measured(

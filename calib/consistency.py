@@ -219,10 +219,12 @@ def _reduced(problem: Problem, residual: F64, by_point: F64, by_rest: F64, sigma
     h = flat.T @ (flat * weights[:, None]) - np.tensordot(h_pr, point_gain, ((0, 1), (0, 1)))
     g = -(flat * weights[:, None]).T @ r.reshape(-1) - np.tensordot(h_pr, point_gradient, ((0, 1), (0, 1)))
     own = h[SHARED:, SHARED:] + 1e-6 * np.eye(len(h) - SHARED)
-    pose_gain, pose_gradient = np.linalg.solve(own, h[SHARED:, :SHARED]), np.linalg.solve(own, g[SHARED:])
+    pose_gain = np.asarray(np.linalg.solve(own, h[SHARED:, :SHARED]), float)
+    pose_gradient = np.asarray(np.linalg.solve(own, g[SHARED:]), float)
     solved = _Solved(pose_gain, pose_gradient, point_gain, point_gradient)
     across = h[:SHARED, SHARED:]
-    return h[:SHARED, :SHARED] - across @ pose_gain, g[:SHARED] - across @ pose_gradient, solved
+    reduced = np.asarray(h[:SHARED, :SHARED] - across @ pose_gain, float)
+    return reduced, np.asarray(g[:SHARED] - across @ pose_gradient, float), solved
 
 
 def _apply(problem: Problem, shared: F64, solved: _Solved) -> None:

@@ -45,17 +45,17 @@ def match_pair(
     """Match a rectified pair (always the same matches for the same images).
 
     Args:
-        rectification: that made the images; its masks keep patches away from the black border.
+        rectification: that made the images; patches stay away from the black border and the outermost rays.
         left: (H, W) rectified. right: (H, W) rectified.
         max_matches: corners to try.
         search_rows: rows above and below to search: how wrong the calibration may be.
         max_disparity: columns to search, as a fraction of the width.
     """
-    usable = _shrunk(rectification.left.mask, PATCH + 2)
+    usable = _shrunk(rectification.left.trusted, PATCH + 2)
     corners = spread_corners(left, usable, max_matches)
     guess = np.full_like(corners, np.nan)
     reach = round(max_disparity * left.shape[1])
-    right_usable = _shrunk(rectification.right.mask, PATCH + 2)
+    right_usable = _shrunk(rectification.right.trusted, PATCH + 2)
     for i, (u, v) in enumerate(np.round(corners).astype(int)):
         guess[i] = _search(left, right, int(u), int(v), reach, search_rows)
     found = np.isfinite(guess[:, 0])

@@ -40,7 +40,7 @@ def smooth(image: U8) -> F32:
     """The picture as it is compared."""
     import cv2
 
-    return cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.8)
+    return np.asarray(cv2.GaussianBlur(image.astype(np.float32), (0, 0), 0.8), np.float32)
 
 
 def cut(picture: F32, uv: F64) -> Patches:
@@ -71,16 +71,17 @@ def align(patches: Patches, picture: F32, start: Warp, iterations: int = 8) -> t
         patches: of the first picture. picture: the other one.
         start: guesses, within two pixels or so.
     """
-    uv, stretch = start.uv.copy(), start.stretch.copy()
+    uv, stretch = start.uv, start.stretch
     moved, seen = np.full(len(uv), np.inf, np.float32), patches.value
     for _ in range(iterations):
-        seen = _sample(picture, uv[:, None] + patches.offset @ np.swapaxes(stretch, 1, 2))
+        place = uv[:, None] + patches.offset @ np.swapaxes(stretch, 1, 2)
+        seen = _sample(picture, np.asarray(place, np.float32))
         error = seen - patches.value
         step = (patches.inverse @ (np.swapaxes(patches.slope, 1, 2) @ error[..., None]))[..., 0]
         change = np.eye(2, dtype=np.float32) + np.clip(step[:, 2:6], -0.3, 0.3).reshape(-1, 2, 2)
-        stretch = stretch @ np.linalg.inv(change)
+        stretch = np.asarray(stretch @ np.linalg.inv(change), np.float32)
         shift = (stretch @ np.clip(step[:, :2], -2, 2)[..., None])[..., 0]
-        uv = uv - shift
+        uv = np.asarray(uv - shift, np.float32)
         moved = np.abs(shift).max(1)
     size = np.linalg.det(stretch)
     good = (moved < 0.02) & (size > 0.25) & (size < 4) & (_likeness(patches.value, seen) > 0.9)
@@ -96,11 +97,12 @@ def unstretched(uv: F64) -> Warp:
 
 
 def _sample(picture: F32, place: F32) -> F32:
-    """(N, P) values at (N, P, 2) px, bilinear; cv2.remap holds at most 32767 rows, so patches are rows."""
+    """(N, P) values at (N, P, 2) px, bilinear."""
     import cv2
 
-    place = np.ascontiguousarray(place, np.float32)
-    return np.asarray(cv2.remap(picture, place, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))  # pyright: ignore
+    nothing: Any = None
+    options: Any = {"interpolation": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_REPLICATE}
+    return np.asarray(cv2.remap(picture, np.ascontiguousarray(place), nothing, **options), np.float32)
 
 
 def _likeness(a: F32, b: F32) -> F32:

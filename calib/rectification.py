@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from stereo_sfm.geometry.stereo import rectifying_rotations
 from stereo_sfm.types import F64, U8, Bool
 
 PROJECTIONS = ("none", "pinhole", "epipolar")
+TRUSTED = np.deg2rad(75.0)  # from the axis: targets reach no further, and lens models beyond are guesses
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +47,12 @@ class Eye:
     def to_source(self, uv: F64) -> F64:
         """(..., 2) rectified px -> (..., 2) px of the original image."""
         return self.source.project(self.target.unproject(uv) @ self.target_R_source)
+
+    @cached_property
+    def trusted(self) -> Bool:
+        """(H, W) pixels of the mask whose ray is so near the lens's axis that a calibration can be held to it."""
+        axis = self.target_R_source[:, 2]
+        return self.mask & (np.nan_to_num(self.target.bearing_grid() @ axis, nan=-1.0) >= np.cos(TRUSTED))
 
     def from_source(self, uv: F64) -> F64:
         """(..., 2) px of the original image -> (..., 2) rectified px."""
