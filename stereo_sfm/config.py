@@ -112,7 +112,10 @@ class MapperConfig:
     min_parallax_deg: float = 0.1  # rays, both eyes included, that never were further apart make a point too uncertain
     redundant_share: float = 0.9  # a keyframe goes when so many of its points are seen by three others; above 1: never
     crowd_keyframes: int = 5  # keyframes with the same view that stay
-    full_ba_lag_keyframes: int = 5  # the answer of the full bundle adjustment is applied so many keyframes later
+    full_ba_growth: float = 1.15  # full bundle adjustment also when the map has grown by this factor since the last
+    full_ba_lag_keyframes: int = (
+        5  # its answer is applied so many keyframes later (large maps: a tenth of the keyframes)
+    )
 
 
 @dataclass(frozen=True)

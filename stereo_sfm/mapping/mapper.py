@@ -1,8 +1,8 @@
 """The mapper: one keyframe (and perhaps a loop) in, exactly one `MapUpdate` out. It alone owns the map.
 
 What the frames mean. Keyframes and points live in the map frame, the tracker's frames in the odometry frame, and
-map_T_odom joins them. It is the identity until a loop is corrected and changes then only: by what the newest keyframe
-moved, so that the newest points keep their places in the odometry frame and the odometry pose does not jump.
+map_T_odom joins them. It is the identity until a loop is corrected or the whole map adjusted, and changes then only:
+by what the newest keyframe moved, so that the newest points keep their places in the odometry frame and the odometry pose does not jump.
 
 What bounds the drift. Local bundle adjustment moves keyframes and points in the map frame. The update carries the moved
 points; the tracker takes them through the inverse of map_T_odom and solves the next frames against them. So the
@@ -11,9 +11,12 @@ fused with the older one: the tracker's track takes over the older point's name 
 drifted part of the map. Where the robot stays, the same old points hold it.
 
 A loop that the map knows already (the place was found again before, its two sides share points) only fuses the points
-that it pairs: a robot that passes the same places all day must not pay for them again. After another loop, full bundle adjustment runs beside the mapping. It is a job of arrays (`pending_job`) whose answer
-(`finish_job`) is applied a fixed number of keyframes later, wherever it was computed; if nobody brought it by then, the
-mapper computes it itself. Keyframes made meanwhile move with the one before them.
+that it pairs: a robot that passes the same places all day must not pay for them again.
+
+Local windows pass a small error of scale on from one to the next, which only all keyframes together see. So full
+bundle adjustment runs beside the mapping after a loop, and whenever the map has grown by a share. It is a job of arrays
+(`pending_job`) whose answer (`finish_job`) is applied a fixed number of keyframes later, wherever it was computed; if
+nobody brought it by then, the mapper computes it itself. Keyframes made meanwhile move with the one before them.
 
 The retail paper's mapping (section IV-B) is configuration: association = "previous" (a point is known when the previous
 keyframe saw it, else it is new), window_keyframes = 0 (all connected keyframes move), redundant_share = 2 (no keyframe
@@ -41,7 +44,9 @@ from stereo_sfm.timing import NoSpans
 from stereo_sfm.types import F64, I64, Bool, Keyframe, LoopResult, MapUpdate
 
 YOUNG = 4  # observations up to which a point is triangulated anew before it is adjusted
-GROWN = 1.1  # a loop that says nothing new leads to full bundle adjustment when the map has grown by so much
+FIRST_WHOLE = 8  # keyframes beyond which full bundle adjustments begin
+GROWN_CLOSED = 1.1  # a loop that says nothing new leads to full bundle adjustment when the map has grown by so much
+LAG_SHARE = 0.1  # of the living keyframes: a large bundle gets more time before its answer is due
 RECENT = 3  # newest keyframes: whose points are judged, and which are never redundant
 
 
@@ -79,7 +84,7 @@ class Mapper:
         self._loops: list[LoopResult] = []
         self._job: Job | None = None
         self._job_due = -1
-        self._whole = 0  # living keyframes at the last full bundle adjustment
+        self._whole = FIRST_WHOLE  # living keyframes at the last full bundle adjustment
         self._job_taken = False
         self._answer: BundleResult | None = None
 
@@ -106,6 +111,7 @@ class Mapper:
             self._adjust(row)
         with self._spans.span("cull"):
             self._cull(row)
+        self._bundle_when_grown(self._config.full_ba_growth)
         return self._update(keyframe.kf_id)
 
     def finish(self, loops: Sequence[LoopResult]) -> MapUpdate | None:
@@ -155,8 +161,7 @@ class Mapper:
         loop = self._between_living(loop)
         if loop_is_known(self.map, loop, self._config.connected_points):
             self._fused += fuse_pairs(self.map, loop.matches)
-            if len(self.map.living_keyframes()) > GROWN * self._whole:
-                self._order_full_bundle()
+            self._bundle_when_grown(GROWN_CLOSED)
             return
         before = self.map.keyframes.map_T_kf[-1].copy()
         correction = apply_loop(self.map, loop, self._loops, self._loop_config)
@@ -167,11 +172,17 @@ class Mapper:
         self._follow_newest(before)
         self._order_full_bundle()
 
+    def _bundle_when_grown(self, factor: float) -> None:
+        """Order a full bundle adjustment once the map has grown by a factor since the last."""
+        if self._job is None and len(self.map.living_keyframes()) >= factor * self._whole:
+            self._order_full_bundle()
+
     def _order_full_bundle(self) -> None:
         part = window.whole_map(self.map, self._config)
         self._job = Job(self._rig, window.bundle_config(self._config), part, len(self.map.keyframes) - 1)
         self._job_taken, self._answer = False, None
-        self._job_due = len(self.map.keyframes) + self._config.full_ba_lag_keyframes
+        lag = max(self._config.full_ba_lag_keyframes, round(LAG_SHARE * len(self.map.living_keyframes())))
+        self._job_due = len(self.map.keyframes) + lag
         self._whole = len(self.map.living_keyframes())
 
     def _between_living(self, loop: LoopResult) -> LoopResult:

@@ -10,6 +10,7 @@ import pytest
 from calib.rig import Rig
 from stereo_sfm.config import MapperConfig
 from stereo_sfm.geometry import se3
+from stereo_sfm.loop.correction import loop_is_known
 from stereo_sfm.mapping.mapper import Mapper, run_job
 from stereo_sfm.types import F64, LoopResult, MapUpdate
 from tests.synthetic import KeyframeStream, fisheye_rig, keyframe_stream, pinhole_rig, walk
@@ -185,7 +186,7 @@ def true_loop(stream: KeyframeStream, kf: int, candidate: int) -> LoopResult:
 
 def walk_with_loop(stream: KeyframeStream, elsewhere: bool = False) -> tuple[Mapper, list[MapUpdate]]:
     """One true loop two keyframes before the end; `elsewhere`: the job is run by somebody else."""
-    config = dataclasses.replace(CONFIG, full_ba_lag_keyframes=3, association="tracks")
+    config = dataclasses.replace(CONFIG, full_ba_lag_keyframes=3, full_ba_growth=np.inf, association="tracks")
     mapper, updates = Mapper(config, stream.rig), []
     last = len(stream.keyframes)
     for keyframe in stream.keyframes:
@@ -222,3 +223,26 @@ def test_full_adjustment_gives_the_same_bits_wherever_it_runs() -> None:
     here, there = walk_with_loop(stream)[0].map, walk_with_loop(stream, elsewhere=True)[0].map
     assert here.keyframes.map_T_kf.tobytes() == there.keyframes.map_T_kf.tobytes()
     assert here.points.xyz.tobytes() == there.points.xyz.tobytes()
+
+
+def test_a_loop_that_the_map_knows_only_fuses(monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = keyframe_stream(pinhole_rig(), ring(40), points=800, per_keyframe=100, track_length=3)
+    mapper, _ = walk_with_loop(stream)
+    mapper.finish([])
+    again = true_loop(stream, len(stream.keyframes) - 8, 2)
+    assert loop_is_known(mapper.map, again, CONFIG.connected_points)
+    monkeypatch.setattr("stereo_sfm.mapping.mapper.apply_loop", lambda *_: pytest.fail("the pose graph ran"))
+    assert mapper.finish([again]) is not None
+    wrong = dataclasses.replace(again, candidate_T_kf=again.candidate_T_kf @ se3.exp(np.array([0.1, 0, 0, 0, 0, 0])))
+    assert not loop_is_known(mapper.map, wrong, CONFIG.connected_points)
+
+
+def test_a_place_keeps_a_bounded_number_of_keyframes() -> None:
+    """To and fro along the same wall: new tracks every time, so no keyframe is redundant by its points."""
+    once = walk(12, 0.1, 0.0)
+    stream = keyframe_stream(pinhole_rig(), np.concatenate([once, once[::-1]] * 6), points=600, track_length=4)
+    bounded, _ = run(stream, dataclasses.replace(CONFIG, redundant_share=0.999))
+    every, _ = run(stream, dataclasses.replace(CONFIG, redundant_share=2.0))
+    assert len(every.map.living_keyframes()) == len(stream.keyframes)
+    assert len(bounded.map.living_keyframes()) < 0.6 * len(stream.keyframes)
+    assert error(bounded.map.keyframes.map_T_kf, stream.world_T_kf) < 0.006
