@@ -114,7 +114,7 @@ class MapperConfig:
     crowd_keyframes: int = 5  # keyframes with the same view that stay
     full_ba_growth: float = 1.15  # full bundle adjustment also when the map has grown by this factor since the last
     full_ba_lag_keyframes: int = (
-        5  # its answer is applied so many keyframes later (large maps: a tenth of the keyframes)
+        5  # keyframes until its answer is applied (large maps: a tenth of theirs)
     )
 
 

@@ -59,7 +59,7 @@ def redundant_keyframe(map_: Map, newest: int, protected: Bool, config: MapperCo
     """A neighbour of the newest keyframe that the map can do without, -1: none.
 
     One whose points are seen well enough by others, oldest first; else, where the robot passes again and again, the
-    one of a crowd whose points are seen best by others: a place keeps `crowd_keyframes` views, however often it is seen.
+    one of a crowd whose points are seen best by others: a place keeps `crowd_keyframes` views however often it is seen.
 
     Args:
         protected: (K,) keyframes that must stay (the first, those of loops, the newest ones).

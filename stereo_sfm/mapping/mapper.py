@@ -1,8 +1,9 @@
 """The mapper: one keyframe (and perhaps a loop) in, exactly one `MapUpdate` out. It alone owns the map.
 
 What the frames mean. Keyframes and points live in the map frame, the tracker's frames in the odometry frame, and
-map_T_odom joins them. It is the identity until a loop is corrected or the whole map adjusted, and changes then only:
-by what the newest keyframe moved, so that the newest points keep their places in the odometry frame and the odometry pose does not jump.
+map_T_odom joins them. It is the identity until a loop is corrected or the whole map adjusted, and changes then only: by
+what the newest keyframe moved, so that the newest points keep their places in the odometry frame and the odometry pose
+does not jump.
 
 What bounds the drift. Local bundle adjustment moves keyframes and points in the map frame. The update carries the moved
 points; the tracker takes them through the inverse of map_T_odom and solves the next frames against them. So the
