@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
         return write(source, args, "record", choice.opening)
 
 
-def write(source: Source, args: argparse.Namespace, mode: str, opening: Opening) -> int:
+def write(source: Source, args: argparse.Namespace, mode: str, opening: Opening | None = None) -> int:
     """Write an entered source and say what came of it."""
     from stereo_sfm.commands._stop import StopRequest
     from stereo_sfm.log.record import record

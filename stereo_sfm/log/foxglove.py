@@ -106,17 +106,24 @@ def calibration(camera: Camera, frame: str, stamp_ns: int, projection_tx: float 
     return stamp(out, stamp_ns)
 
 
-def point_cloud(frame: str, stamp_ns: int, points: F64, ids: I64) -> PointCloud:
-    """(N, 3) metres and (N,) ids."""
-    layout = np.dtype([("xyz", "<f4", 3), ("id", "<u4")])
+def point_cloud(
+    frame: str, stamp_ns: int, points: F64, ids: I64, color: tuple[int, int, int, int] | None = None
+) -> PointCloud:
+    """(N, 3) metres and (N,) ids; color, of all of them, 0 to 255."""
+    layout = np.dtype([("xyz", "<f4", 3), ("id", "<u4"), *([("rgba", "u1", 4)] if color is not None else [])])
     rows = np.empty(len(points), layout)
     rows["xyz"], rows["id"] = points, ids & 0xFFFFFFFF
+    if color is not None:
+        rows["rgba"] = color
     out = PointCloud(frame_id=frame, point_stride=layout.itemsize, data=rows.tobytes())
     out.pose.orientation.w = 1.0
     out.fields.extend(
         PackedElementField(name=n, offset=4 * i, type=PackedElementField.FLOAT32) for i, n in enumerate("xyz")
     )
     out.fields.append(PackedElementField(name="id", offset=12, type=PackedElementField.UINT32))
+    if color is not None:
+        channels = enumerate(("red", "green", "blue", "alpha"))
+        out.fields.extend(PackedElementField(name=n, offset=16 + i, type=PackedElementField.UINT8) for i, n in channels)
     return stamp(out, stamp_ns)
 
 

@@ -53,6 +53,11 @@ class MapView:
         return len(self._poses)
 
     @property
+    def keyframe_ids(self) -> I64:
+        """(K,) ascending."""
+        return np.array(sorted(self._poses), np.int64)
+
+    @property
     def trajectory(self) -> F64:
         """(K, 4, 4) map_T_kf in the order of their ids."""
         return np.array([self._poses[k] for k in sorted(self._poses)]).reshape(-1, 4, 4)

@@ -40,6 +40,7 @@ TRAJECTORY_NS = 1_000_000_000
 TRAJECTORY_SIZE = 200  # keyframes
 POINTS_NS = 5_000_000_000
 POINTS_SIZE = 50_000
+PATH_COLOR = (70, 150, 255, 255)
 OLD_TRACK = 30  # frames after which a track's colour no longer changes
 
 
@@ -259,6 +260,8 @@ class RunLog:
             return
         stamp, sequence = self._last
         self._writer.write(topics.TRAJECTORY, foxglove.poses_in_frame("map", stamp, poses), stamp, sequence)
+        path = foxglove.point_cloud("map", stamp, poses[:, :3, 3], self._map.keyframe_ids, PATH_COLOR)
+        self._writer.write(topics.PATH, path, stamp, sequence)
         lines = [
             ("covisibility", foxglove.line_list(self._map.covisibility_lines, (0.4, 0.6, 1.0, 0.4), 1.0)),
             ("loops", foxglove.line_list(self._map.loop_lines, (1.0, 0.3, 0.2, 1.0), 3.0)),

@@ -35,6 +35,7 @@ MAP_UPDATE = "/map/update"
 LOOP = "/loop"
 POINTS = "/map/points"
 TRAJECTORY = "/map/trajectory"
+PATH = "/map/path"
 SCENE = "/map/scene"
 HEALTH = "/health"
 STAGE_TIMES = "/stage_times"
@@ -79,6 +80,7 @@ TABLE: tuple[Topic, ...] = (
     Topic(LOOP, "stereo_sfm.LoopResult", "every keyframe: the loop closer's answer, with reasons"),
     Topic(POINTS, "foxglove.PointCloud", "the whole map, at most every few seconds and at the end"),
     Topic(TRAJECTORY, "foxglove.PosesInFrame", "all keyframes, at most every second and at the end"),
+    Topic(PATH, "foxglove.PointCloud", "the trajectory's positions, for players that draw no poses (rerun)"),
     Topic(SCENE, "foxglove.SceneUpdate", "loop and covisibility edges, with the trajectory"),
     Topic(HEALTH, "stereo_sfm.Health", "every second and stage: rate, queue, latency (wall clock)", compare=False),
     Topic(STAGE_TIMES, "stereo_sfm.StageTimes", "every frame: milliseconds in each stage (wall clock)", compare=False),

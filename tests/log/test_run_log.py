@@ -334,6 +334,16 @@ def test_what_a_stage_says_is_in_the_log(tmp_path: Path) -> None:
     assert foxglove.stamp_of(line) == START_NS
 
 
+def test_the_path_is_where_the_keyframes_are(run: Path) -> None:
+    (cloud,) = _all(run, topics.PATH, PointCloud)[-1:]
+    (poses,) = _all(run, topics.TRAJECTORY, PosesInFrame)[-1:]
+    names = [f.name for f in cloud.fields]
+    assert names == ["x", "y", "z", "id", "red", "green", "blue", "alpha"] and cloud.point_stride == 20
+    rows = np.frombuffer(cloud.data, np.dtype([("xyz", "<f4", 3), ("id", "<u4"), ("rgba", "u1", 4)]))
+    assert rows["xyz"] == pytest.approx(np.array([[p.position.x, p.position.y, p.position.z] for p in poses.poses]))
+    assert rows["rgba"].tolist() == [[70, 150, 255, 255]] * len(poses.poses)
+
+
 def test_what_a_replay_needs_comes_back(run: Path) -> None:
     with LogReader(run) as reader:
         recorded = read_run(reader)
