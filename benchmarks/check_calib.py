@@ -6,7 +6,8 @@ python benchmarks/check_calib.py --faults pitch+ both-  some faults (the true ri
 
 Each cell reads the verdict, and what check-calib says should be added, +- its standard deviation: degrees about the
 axis of the turn, or per cent of focal length; for the true rig the turn about x, y, z, the right focal length against
-the left, and both, in brackets where the recording does not show it. Every cell rectifies, matches and judges anew with the faulty rig.
+the left, and both, in brackets where the recording does not show it. Every cell rectifies, matches and judges anew
+with the faulty rig.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from calib.rig import Rig
 from calib.scene_model import DIRECTION, SKEW
 from calib.tracks import Window
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.types import F64, I64
+from stereo_sfm.types import F64, I64, Bool
 
 GRID = (4, 5)  # rows and columns of regions
 VERDICTS = ("PASS", "WARN", "FAIL")
@@ -27,9 +27,14 @@ class Finding:
     name: str
     level: int  # index into VERDICTS
     text: str
-    judged: bool = True  # False: the recording does not show it, which is no fault of the calibration
+    judged: bool = True  # False: the recording does not show all of it, which is no fault of the calibration
     value: tuple[float, ...] = ()  # what should be added, in the text's unit
     sigma: tuple[float, ...] = ()  # its standard deviation
+
+    @property
+    def verdict(self) -> str:
+        """PASS, WARN, FAIL, or nothing when it is not judged."""
+        return VERDICTS[self.level] if self.judged or self.level else ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +69,7 @@ class Limit:
 
 
 SYSTEMATIC_PX = Limit(0.5, 0.75, 0.0)
-ROTATION_DEG = Limit(0.08, 0.11, 3.0)
+ROTATION_DEG = Limit(0.08, 0.11, 2.5)
 DIRECTION_DEG = Limit(1.5, 3.0, 4.0)
 FOCAL_PERCENT = Limit(1.0, 1.0, 2.5)
 FOCAL_RIGHT_PERCENT = Limit(0.4, 1.0, 4.0)
@@ -153,33 +158,33 @@ def _baseline(rig: Rig) -> Finding:
 
 def _judged(correction: Correction) -> list[Finding]:
     amount, sigma = correction.amount, correction.amount_sigma
-    rotation = _measured(
-        "rotation between the eyes", np.rad2deg(amount[TURN]), np.rad2deg(sigma[TURN]), ROTATION_DEG,
-        "degrees (x y z)", float(np.rad2deg(sigma[TURN]).max()) < 0.06,
-    )  # fmt: skip
-    own = correction.sigma[DIRECTION]
-    direction = _measured(
-        "baseline direction", np.rad2deg(correction.vector[DIRECTION]), np.rad2deg(own), DIRECTION_DEG,
-        "degrees (y z)", bool((own < 0.019).all()),
-    )  # fmt: skip
-    ratio = _measured(
-        "focal length, right against left", 100 * amount[[FOCAL_RATIO]], 100 * sigma[[FOCAL_RATIO]],
-        FOCAL_RIGHT_PERCENT, "%", float(sigma[FOCAL_RATIO]) < 0.004,
-    )  # fmt: skip
-    both = _measured(
-        "focal length, both eyes", 100 * amount[[FOCAL_BOTH]], 100 * sigma[[FOCAL_BOTH]],
-        FOCAL_PERCENT, "%", correction.shows_focal,
-    )  # fmt: skip
+    turn = np.rad2deg(amount[TURN]), np.rad2deg(sigma[TURN])
+    rotation = _measured("rotation between the eyes", *turn, ROTATION_DEG, "degrees", turn[1] < 0.06, "xyz")
+    along = np.rad2deg(correction.vector[DIRECTION]), np.rad2deg(correction.sigma[DIRECTION])
+    direction = _measured("baseline direction", *along, DIRECTION_DEG, "degrees", along[1] < 1.1, "yz")
+    ratio = 100 * amount[[FOCAL_RATIO]], 100 * sigma[[FOCAL_RATIO]]
+    right = _measured("focal length, right against left", *ratio, FOCAL_RIGHT_PERCENT, "%", ratio[1] < 0.4)
+    both = 100 * amount[[FOCAL_BOTH]], 100 * sigma[[FOCAL_BOTH]]
+    shown = np.array([correction.shows_focal])
+    common = _measured("focal length, both eyes", *both, FOCAL_PERCENT, "%", shown)
     skew = 1e3 * correction.vector[[SKEW]], 1e3 * correction.sigma[[SKEW]]
-    time = _measured("time skew of the right eye", *skew, SKEW_MS, "ms", float(skew[1][0]) < 1.0)
-    return [rotation, replace(direction, level=min(direction.level, 1)), ratio, both, time]
+    time = _measured("time skew of the right eye", *skew, SKEW_MS, "ms", skew[1] < 1.0)
+    return [rotation, replace(direction, level=min(direction.level, 1)), right, common, time]
 
 
-def _measured(name: str, value: F64, sigma: F64, limit: Limit, unit: str, judged: bool) -> Finding:
-    """A finding about what should be added to the calibration, with its standard deviation."""
-    level = max(level_of(float(v), float(s), limit) for v, s in zip(value, sigma, strict=True)) if judged else 0
-    text = f"off by {_list(value)} +- {_list(sigma, '')} {unit}" + ("" if judged else f" ({UNKNOWN})")
-    return Finding(name, level, text, judged, tuple(float(v) for v in value), tuple(float(s) for s in sigma))
+def _measured(name: str, value: F64, sigma: F64, limit: Limit, unit: str, known: Bool, axes: str = "") -> Finding:
+    """A finding about what should be added to the calibration, with its standard deviation.
+
+    Args:
+        value: (K,) in `unit`. sigma: (K,). known: (K,) whether the recording shows it. axes: K letters.
+    """
+    levels = [level_of(float(v), float(s), limit) for v, s in zip(value[known], sigma[known], strict=True)]
+    text = f"off by {_list(value)} +- {_list(sigma, '')} {unit}" + (f" ({' '.join(axes)})" if axes else "")
+    if not known.all():
+        which = " and ".join(a for a, k in zip(axes, known, strict=True) if not k) + " " if axes else ""
+        text += f" ({which}{UNKNOWN})"
+    values, deviations = tuple(float(v) for v in value), tuple(float(s) for s in sigma)
+    return Finding(name, max(levels, default=0), text, bool(known.all()), values, deviations)
 
 
 def _list(values: F64, sign: str = "+") -> str:

@@ -53,10 +53,8 @@ def as_text(report: CheckReport, name: str) -> str:
     """What a person reads."""
     import numpy as np
 
-    from calib.check import VERDICTS
-
     lines = [f"{name}: {report.matches} stereo matches in {report.windows} stretches"]
-    lines += [f"  {VERDICTS[f.level] if f.judged else '  - '}  {f.name}: {f.text}" for f in report.findings]
+    lines += [f"  {f.verdict or '  - '}  {f.name}: {f.text}" for f in report.findings]
     lines.append("row error by image region (median, px; - where nothing was matched):")
     for row in report.region_median:
         lines.append("  " + "  ".join("     -" if np.isnan(v) else f"{v:+6.2f}" for v in row))
@@ -88,12 +86,10 @@ def as_dict(report: CheckReport) -> dict[str, Any]:
 
 
 def _finding(finding: Finding) -> dict[str, Any]:
-    from calib.check import VERDICTS
-
     return {
         "name": finding.name,
         "judged": finding.judged,
-        "verdict": VERDICTS[finding.level] if finding.judged else None,
+        "verdict": finding.verdict or None,
         "text": finding.text,
         "value": list(finding.value),
         "sigma": list(finding.sigma),
