@@ -126,8 +126,8 @@ def flattened(image: U8) -> U8:
     import cv2
 
     picture = image.astype(np.float32)
-    mean: Any = cv2.GaussianBlur(picture, (0, 0), 8)
-    spread: Any = np.sqrt(np.maximum(cv2.GaussianBlur(picture * picture, (0, 0), 8) - mean * mean, 0))
+    mean: Any = cv2.blur(picture, (27, 27))
+    spread: Any = np.sqrt(np.maximum(cv2.blur(picture * picture, (27, 27)) - mean * mean, 0))
     return np.clip(128 + 48 * (picture - mean) / (spread + 4), 0, 255).astype(np.uint8)
 
 
