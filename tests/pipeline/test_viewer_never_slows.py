@@ -41,7 +41,7 @@ def slow_viewer(to_main: Outbox, control: Connection, messages: Connection, opti
     os._exit(0)  # and is closed by its user
 
 
-@pytest.mark.parametrize("body", [hanging_viewer, slow_viewer])
+@pytest.mark.parametrize("body", [hanging_viewer, pytest.param(slow_viewer, marks=pytest.mark.slow)])
 def test_the_run_is_whole_whatever_the_viewer_does(
     body: object, inline: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -55,6 +55,7 @@ def test_the_run_is_whole_whatever_the_viewer_does(
     assert not any(psutil.pid_exists(pid) for pid in pids.values())
 
 
+@pytest.mark.slow
 def test_a_killed_viewer_is_not_missed(inline: Path, tmp_path: Path) -> None:
     log, viewer = LogOptions(tmp_path / "run.mcap", "none"), ViewerOptions("save", tmp_path / "run.rrd")
     seen = 0
