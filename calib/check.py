@@ -12,7 +12,7 @@ from calib.consistency import Correction, estimate
 from calib.rectification import Rectification
 from calib.rig import Rig
 from calib.scene_model import DIRECTION, SKEW
-from calib.tracks import Window
+from calib.tracks import LEAST, Window
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import F64, I64, Bool
 
@@ -91,6 +91,7 @@ def check(rig: Rig, rectification: Rectification, windows: list[Window]) -> Chec
         )
     correction = estimate(rig, windows)
     good = np.concatenate(correction.explained)
+    good = good if good.sum() >= LEAST else np.ones(total, bool)
     left = np.concatenate([w.rows.left for w in windows])[good]
     error = np.concatenate([w.rows.row_error for w in windows])[good]
     median, count = regions(left, error, rectification.rig.left.size)

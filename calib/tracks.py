@@ -16,6 +16,7 @@ from stereo_sfm.types import F64, U8, Bool, StereoImage
 STEP = 0.04  # of the width: a moment is kept when the points moved so far since the last one
 MOMENTS = 6  # of a window
 LONGEST = 24  # frames of a window
+LEAST = 12  # points of a window
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,8 +87,9 @@ def collect(
         left, right = pair = rectification.apply(image.left, image.right)
         if current is None:
             matches = match_pair(rectification, left, right, max_matches, search_rows)
-            if len(matches) >= 12:
-                current = _begin(matches, left, right, image.stamp_ns)
+            current = _begin(matches, left, right, image.stamp_ns) if len(matches) >= LEAST else None
+            if current is not None and current.alive.sum() < LEAST:
+                current = None
             continue
         _advance(current, flattened(left), flattened(right), image.stamp_ns)
         if _moved(current) > STEP * left.shape[1]:
