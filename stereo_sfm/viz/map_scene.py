@@ -29,6 +29,7 @@ class MapScene:
         self._updates = 0
         self._size = 0.0  # of the drawn camera, metres
         self._rec.log("map", rr.ViewCoordinates.RDF, static=True)
+        self._show_camera(0.0)
 
     def frame(self, frame: Frame) -> None:
         """Where the camera is now."""

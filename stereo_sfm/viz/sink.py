@@ -70,7 +70,7 @@ class RerunSink:
         self._pictures = 0
         self._keyframe: tuple[Keyframe, U8] | None = None
         self._first_ns: int | None = None
-        self._now: tuple[int, int] = (0, 0)  # frame id and stamp
+        self._last_frame = -1
         self._dropped = 0
         for entity, color in SERIES.items():
             self._rec.log(entity, rr.SeriesLines(colors=[color], names=entity.split("/")[1]), static=True)
@@ -84,7 +84,7 @@ class RerunSink:
         if isinstance(message, StereoImage):
             self._images[message.frame_id] = message
             if len(self._images) > KEPT:
-                del self._images[min(self._images)]
+                self._show_alone(self._images.pop(min(self._images)))
         elif isinstance(message, Frame):
             self._put_frame(message)
         elif isinstance(message, Keyframe):
@@ -105,6 +105,8 @@ class RerunSink:
 
     def close(self) -> None:
         """Everything is sent."""
+        for frame_id in sorted(self._images):
+            self._show_alone(self._images[frame_id])
         self._scene.show()
         self._rec.flush()
         if self._mode == "save":
@@ -115,11 +117,23 @@ class RerunSink:
 
     # -- frames ------------------------------------------------------------------------------------------------------
 
+    def _at(self, frame_id: int, stamp_ns: int) -> None:
+        self._first_ns = stamp_ns if self._first_ns is None else self._first_ns
+        self._rec.set_time("frame", sequence=frame_id)
+        self._rec.set_time("seconds", duration=np.timedelta64(stamp_ns - self._first_ns, "ns"))
+
+    def _show_alone(self, image: StereoImage) -> None:
+        """An image that nobody tracked, as in a recording without a run."""
+        if image.frame_id <= self._last_frame:  # a keyframe whose message was dropped, or a late picture
+            return
+        self._at(image.frame_id, image.stamp_ns)
+        self._rec.log("map/camera/left/image", _jpeg(image.left))
+        if image.right is not None:
+            self._rec.log("right/image", _jpeg(image.right))
+
     def _put_frame(self, frame: Frame) -> None:
-        self._first_ns = frame.stamp_ns if self._first_ns is None else self._first_ns
-        self._now = (frame.frame_id, frame.stamp_ns)
-        self._rec.set_time("frame", sequence=frame.frame_id)
-        self._rec.set_time("seconds", duration=np.timedelta64(frame.stamp_ns - self._first_ns, "ns"))
+        self._at(frame.frame_id, frame.stamp_ns)
+        self._last_frame = frame.frame_id
         obs = frame.observations
         self._rec.log("points/tracked", rr.Scalars(float(len(obs))))
         self._rec.log("points/inliers", rr.Scalars(float(obs.inlier.sum())))

@@ -108,6 +108,17 @@ def test_matches_join_a_keyframe_with_a_later_frame(shown: Recording) -> None:
     assert lines[:, 0, 0].max() < width <= lines[:, 1, 0].min()
 
 
+def test_a_recording_without_a_run_shows_its_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sink.rr, "RecordingStream", Recording)
+    source = SlidingWall(70)
+    viewer = sink.RerunSink(source.rig, "wall", "save", Path("unused.rrd"))
+    for image in source:
+        viewer.put(image)
+    viewer.close()
+    recording: Any = viewer._rec
+    assert len(recording.of("map/camera/left/image")) == len(recording.of("right/image")) == 70
+
+
 def test_a_saved_recording_is_valid(tmp_path: Path) -> None:
     source = SlidingWall(5)
     viewer = sink.RerunSink(source.rig, "some/where/wall.mcap", "save", tmp_path / "run.rrd")
