@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
             _play(reader, iter(()), sink)
         sink.close()
     if mode == "serve":
-        print("serving; open the address above in a browser, Ctrl-C ends")
+        print("everything is sent; Ctrl-C ends")
         signal.pause()
     return 0
 

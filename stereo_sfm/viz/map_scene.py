@@ -29,7 +29,6 @@ class MapScene:
         self._updates = 0
         self._size = 0.0  # of the drawn camera, metres
         self._rec.log("map", rr.ViewCoordinates.RDF, static=True)
-        self._show_camera(0.0)
 
     def frame(self, frame: Frame) -> None:
         """Where the camera is now."""
@@ -40,10 +39,10 @@ class MapScene:
             return
         self._next_line = len(self._odometry) + LINE_EVERY * max(len(self._odometry), USUAL_FRAMES) // USUAL_FRAMES
         line = np.array(self._odometry)
-        self._show_camera(float(np.linalg.norm(np.ptp(line, axis=0))))
+        self.show_camera(float(np.linalg.norm(np.ptp(line, axis=0))))
         self._rec.log("map/odometry", _lines(line[None], ODOMETRY, 1.0))
 
-    def _show_camera(self, extent: float) -> None:
+    def show_camera(self, extent: float) -> None:
         """The pyramid of the camera, larger when the walk has grown."""
         size = max(0.15, CAMERA_SIZE * extent)
         if 0.8 < size / max(self._size, 1e-9) < 1.25:

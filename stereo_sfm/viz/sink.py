@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from pathlib import Path
+from urllib.parse import quote
 
 import cv2
 import numpy as np
@@ -28,6 +30,7 @@ from stereo_sfm.viz.map_scene import MapScene
 from stereo_sfm.viz.shapes import age_colors, spread_colors, strips, turbo
 
 MEMORY_LIMIT = "1GB"  # of the viewer, which keeps its history
+WEB_PORT = 9090
 JPEG_QUALITY = 80
 MATCHES_DRAWN = 100  # more lines than that hide the picture: every k-th is drawn
 MATCHES_EVERY = 5  # pictures between two pictures of matches
@@ -61,7 +64,8 @@ class RerunSink:
             self._rec.spawn(memory_limit=MEMORY_LIMIT, default_blueprint=blueprint(name))
         elif mode == "serve":
             uri = self._rec.serve_grpc(default_blueprint=blueprint(name), server_memory_limit=MEMORY_LIMIT)
-            rr.serve_web_viewer(open_browser=False, connect_to=uri)
+            rr.serve_web_viewer(web_port=WEB_PORT, open_browser=False, connect_to=uri)
+            print(f"viewer: http://localhost:{WEB_PORT}/?url={quote(uri, safe='')}", file=sys.stderr, flush=True)
         else:
             assert path is not None
             self._rec.save(path, default_blueprint=blueprint(name))
@@ -127,6 +131,7 @@ class RerunSink:
         if image.frame_id <= self._last_frame:  # a keyframe whose message was dropped, or a late picture
             return
         self._at(image.frame_id, image.stamp_ns)
+        self._scene.show_camera(0.0)
         self._rec.log("map/camera/left/image", _jpeg(image.left))
         if image.right is not None:
             self._rec.log("right/image", _jpeg(image.right))
