@@ -52,7 +52,10 @@ def main() -> int:
             recording = Path(args.source)
         loops = Loops()
         with open_source(recording) as source:
-            log = RunLog(LogWriter(inline), source.rig, config, source="x", mode="inline", image_format="none")
+            log = RunLog(
+                LogWriter(inline), source.rig, config, source="x", mode="inline", image_format="none",
+                ground_truth=source.ground_truth,
+            )  # fmt: skip
             frames = sum(1 for _ in run_inline(source, config, [log, loops]))
             log.close()
         print(f"inline: {frames} frames, {loops.count} loops closed", flush=True)
