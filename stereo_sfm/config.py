@@ -113,9 +113,7 @@ class MapperConfig:
     redundant_share: float = 0.9  # a keyframe goes when so many of its points are seen by three others; above 1: never
     crowd_keyframes: int = 5  # keyframes with the same view that stay
     full_ba_growth: float = 1.15  # full bundle adjustment also when the map has grown by this factor since the last
-    full_ba_lag_keyframes: int = (
-        5  # keyframes until its answer is applied (large maps: a tenth of theirs)
-    )
+    full_ba_lag_keyframes: int = 5  # keyframes until its answer is applied (large maps: a tenth of theirs)
 
 
 @dataclass(frozen=True)
@@ -153,7 +151,7 @@ class LoopConfig:
     gate_degrees_per_metre: float = 0.3
     relocalize_candidates: int = 16  # places of a saved map that are verified
     relocalize_keyframes: int = 6  # keyframes whose points make up a place
-    relocalize_inliers: int = 48  # points that must agree with the pose found in a saved map
+    relocalize_inliers: int = 56  # points that must agree with the pose found in a saved map
     relocalize_share: float = 0.08  # ... and so large a share of the camera's described points
     relocalize_cells: int = 6  # ... in so many of the image's 8 x 6 cells
     seed: int = 0

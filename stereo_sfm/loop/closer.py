@@ -22,6 +22,7 @@ from stereo_sfm.types import F64, Keyframe, LoopResult
 
 CLOUD_KEYFRAMES = 4  # connected keyframes whose points are added to a candidate's own
 PLACE_RADIUS = 3  # candidates this many keyframes apart are one place: only the best of them is verified
+FRESH, CROWD = 30, 5  # newest keyframes, which are all kept; keyframes of one view beyond which one is forgotten
 AGREE_METRES, AGREE_DEGREES = 0.15, 2.0  # how well two keyframes must agree on a loop
 
 
@@ -54,11 +55,17 @@ class LoopCloser:
         self._graph = KeyframeGraph()
         self._pending: list[_Hypothesis] = []
         self._last_loop = -(10**9)
+        self._forgotten: set[int] = set()
 
     @property
     def vocabulary(self) -> Vocabulary:
         """The vocabulary as it is now: it may have grown."""
         return self._vocabulary
+
+    @property
+    def remembered(self) -> int:
+        """Number of keyframes that may be found again."""
+        return len(self._store)
 
     def step(self, keyframe: Keyframe) -> LoopResult:
         """Look for the keyframe's place among the older ones, then remember it."""
@@ -72,8 +79,19 @@ class LoopCloser:
         self._row[keyframe.kf_id] = len(self._database)
         self._database.add(keyframe.kf_id, bag)
         self._store.add(keyframe)
+        self._forget(keyframe.kf_id)
         self._grow(keyframe)
         return result
+
+    def _forget(self, newest: int) -> None:
+        """Of a view that was seen many times keep the first and the last few: a day in one store fits into memory."""
+        settled = newest - FRESH
+        if settled not in self._row or settled in self._forgotten:
+            return
+        crowd = [k for k in self._graph.same_view(settled) if k <= settled and k not in self._forgotten]
+        if len(crowd) > CROWD:
+            self._forgotten.add(crowd[1])
+            self._store.remove(crowd[1])
 
     def _candidates(self, keyframe: Keyframe, bag: voc.Bag) -> tuple[list[tuple[int, float]], str]:
         """Places to verify as (keyframe, score), best first, and the reason when there are none."""
@@ -105,7 +123,7 @@ class LoopCloser:
         """Keyframes that cannot be loops: connected to this one, or just before it."""
         near = set(connected)
         near.update(range(kf_id - self._config.min_gap, kf_id + 1))
-        return near
+        return near | self._forgotten
 
     def _judge(self, keyframe: Keyframe, candidates: list[tuple[int, float]], why_none: str) -> LoopResult:
         if not candidates:

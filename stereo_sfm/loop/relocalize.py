@@ -21,7 +21,7 @@ from stereo_sfm.mapping.map import MapSnapshot
 from stereo_sfm.types import F64, I64, Keyframe
 
 SAME_METRES, SAME_DEGREES = 0.2, 5.0  # two answers closer than this are one
-RIVAL = 0.7  # another place with this share of the inliers makes the answer ambiguous
+RIVAL = 0.85  # another place with this share of the inliers makes the answer ambiguous
 SURE = 2.0  # times the inliers asked for: no need to look at more candidates
 MIN_RANGE_SIGMA = 0.003  # metres
 

@@ -34,6 +34,17 @@ class KeyframeStore:
         for point_id in keyframe.point_ids.tolist():
             self._seen_by.setdefault(self._root(point_id), []).append(keyframe.kf_id)
 
+    def remove(self, kf_id: int) -> None:
+        """Forget a keyframe."""
+        self.ids.remove(kf_id)
+        for point_id in self._keyframes.pop(kf_id).point_ids.tolist():
+            root = self._root(point_id)
+            left = [k for k in self._seen_by.get(root, ()) if k != kf_id]
+            if left:
+                self._seen_by[root] = left
+            else:
+                self._seen_by.pop(root, None)
+
     def merge(self, pairs: I64) -> None:
         """(M, 2) point ids: the second is the same physical point as the first."""
         for old, new in pairs.tolist():

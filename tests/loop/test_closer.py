@@ -97,3 +97,17 @@ def test_vocabulary_grows_online(vocabulary: voc.Vocabulary) -> None:
     results = [closer.step(k) for k in walk.keyframes]
     assert len(closer.vocabulary) > len(vocabulary)
     assert any(r.candidate_kf_id >= 0 and error_of(walk, r) < 0.05 for r in results)
+
+
+def test_a_view_seen_every_lap_is_remembered_a_few_times_and_still_closes(vocabulary: voc.Vocabulary) -> None:
+    walk = make_walk([0, 1] * 7, seed=3)
+    closer = LoopCloser(LoopConfig(), walk.rig, vocabulary)
+    results, remembered = [], list[int]()
+    for keyframe in walk.keyframes:
+        results.append(closer.step(keyframe))
+        remembered.append(closer.remembered)
+    lap = len(walk.keyframes) // 7
+    assert remembered[lap] == lap + 1  # nothing is forgotten on the first lap
+    assert remembered[-1] - remembered[-1 - lap] < 0.3 * lap  # hardly anything is added on the last
+    assert any(r.candidate_kf_id >= 0 for r in results[-lap:])
+    assert all(error_of(walk, r) < 0.1 for r in results if r.candidate_kf_id >= 0)
