@@ -102,7 +102,7 @@ def test_vocabulary_grows_online(vocabulary: voc.Vocabulary) -> None:
 def test_a_view_seen_every_lap_is_remembered_a_few_times_and_still_closes(vocabulary: voc.Vocabulary) -> None:
     walk = make_walk([0, 1] * 7, seed=3)
     closer = LoopCloser(LoopConfig(), walk.rig, vocabulary)
-    results, remembered = [], list[int]()
+    results, remembered = list[LoopResult](), list[int]()
     for keyframe in walk.keyframes:
         results.append(closer.step(keyframe))
         remembered.append(closer.remembered)
