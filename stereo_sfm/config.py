@@ -29,7 +29,7 @@ class TrackerConfig:
     depth_sigma_px: float = 3.0  # the same when a point's depth is refined from frame to frame: errors repeat
     max_error: float = 3.0  # sigmas; a worse observation is no inlier
     max_epipolar_px: float = 1.0  # distance of a stereo match from its epipolar curve
-    max_window_disparity_px: float = 0.2  # a narrow and a wide window must agree on the disparity: no depth edge inside
+    max_window_disparity_px: float = 0.15  # a narrow and a wide window must agree on the disparity: no depth edge in it
     keyframe_share: float = 0.75  # new keyframe when fewer of the last keyframe's points are still tracked
     keyframe_max_frames: int = 30
     lost_frames: int = 15  # frames predicted by constant velocity before tracking restarts as a new submap

@@ -10,14 +10,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import numba
 import numpy as np
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.saved_map import SavedMap
 from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.mapping.map import MapSnapshot
 from stereo_sfm.types import F64, I32, U8, Bool
 
@@ -26,7 +25,6 @@ LOW, HIGH = 0.15, 1.9  # metres above the floor that a robot can bump into
 MAX_RANGE = 6.0  # metres; stereo points further away blur the plan
 MARGIN = 0.5  # metres around what was seen
 MIN_HITS = 3  # points that make a cell occupied
-njit: Any = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @dataclass(frozen=True, eq=False)

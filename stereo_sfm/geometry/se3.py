@@ -147,6 +147,12 @@ def orthonormalize(a_T_b: F64) -> F64:
     return from_rotation_translation(u @ vt, a_T_b[..., :3, 3])
 
 
+def extent(a_T_b: F64) -> tuple[F64, F64]:
+    """How far apart two frames are: (...) metres between their origins and (...) radians between their axes."""
+    trace = np.trace(a_T_b[..., :3, :3], axis1=-2, axis2=-1)
+    return np.linalg.norm(a_T_b[..., :3, 3], axis=-1), np.arccos(np.clip((trace - 1) / 2, -1, 1))
+
+
 def interpolate(a_T_b0: F64, a_T_b1: F64, fraction: F64 | float) -> F64:
     """Geodesic between two transforms at `fraction` in [0, 1] (may be an array of leading shape)."""
     xi = log(inverse(a_T_b0) @ a_T_b1)

@@ -11,6 +11,7 @@ import numpy as np
 
 from calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.log import topics
 from stereo_sfm.log.image_log import RIG_FILE, rig_from_text
@@ -199,7 +200,7 @@ def rig_lines(rig: Rig) -> list[str]:
         return [*lines, f"depth image, virtual baseline {rig.baseline * 1e3:.1f} mm"]
     if rig.right is None:
         return [*lines, "one eye"]
-    angle = np.degrees(np.arccos(np.clip((np.trace(rig.left_T_right[:3, :3]) - 1) / 2, -1, 1)))
+    angle = np.degrees(se3.extent(rig.left_T_right)[1])
     pair = f"baseline {rig.baseline * 1e3:.2f} mm, eyes turned by {angle:.2f} deg"
     return [*lines, f"right {_camera_line(rig.right)}", pair]
 

@@ -8,17 +8,14 @@ descriptor could be computed and matches nothing.
 
 from __future__ import annotations
 
-from typing import Any
-
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.types import F32, I32, I64, U8, Bool
 
 U64 = NDArray[np.uint64]
 BITS = 256
-njit: Any = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 def as_words(descriptors: U8) -> U64:

@@ -10,14 +10,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 
+from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.loop.vocabulary import Bag
 from stereo_sfm.types import F32, F64, I32, I64
 
 BLOCK = 64
-njit: Any = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @njit

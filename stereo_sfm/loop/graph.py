@@ -37,6 +37,7 @@ class KeyframeGraph:
         self._stack: F64 = np.empty((64, 4, 4))  # odom_T_cam of _ids, for vectorised search
         self._anchored: F64 = np.empty((64, 4, 4))  # the same, taken back at each loop to where its older end stood
         self._chains: I64 = np.zeros(64, np.int64)
+        self._frames: I64 = np.zeros(64, np.int64)  # the chain whose coordinates _anchored is in
         self._count = 0
 
     def add(self, kf_id: int, odom_T_cam: F64, chain: int) -> None:
@@ -46,37 +47,37 @@ class KeyframeGraph:
         self._poses[kf_id], self._chain[kf_id], self._last = odom_T_cam, chain, kf_id
         if self._count == len(self._ids):
             self._ids, self._stack = np.tile(self._ids, 2), np.tile(self._stack, (2, 1, 1))
-            self._chains, self._anchored = np.tile(self._chains, 2), np.tile(self._anchored, (2, 1, 1))
+            self._chains, self._frames = np.tile(self._chains, 2), np.tile(self._frames, 2)
+            self._anchored = np.tile(self._anchored, (2, 1, 1))
         self._ids[self._count], self._stack[self._count], self._chains[self._count] = kf_id, odom_T_cam, chain
-        self._anchored[self._count] = odom_T_cam
+        self._anchored[self._count], self._frames[self._count] = odom_T_cam, chain
         if self._count and self._chains[self._count - 1] == chain:
             moved = se3.inverse(self._stack[self._count - 1]) @ odom_T_cam
             self._anchored[self._count] = self._anchored[self._count - 1] @ moved
+            self._frames[self._count] = self._frames[self._count - 1]
         self._count += 1
 
     def same_view(self, kf_id: int) -> list[int]:
         """Keyframes, this one among them, that stood where it stood and looked where it looked, oldest first."""
         part = slice(0, self._count)
-        here = self._anchored[int(np.searchsorted(self._ids[part], kf_id))]
-        metres = np.linalg.norm(self._anchored[part, :3, 3] - here[:3, 3], axis=1)
-        cosine = (np.einsum("nij,ij->n", self._anchored[part, :3, :3], here[:3, :3]) - 1) / 2
-        return self._ids[part][(metres < SAME_METRES) & (cosine > np.cos(SAME_RADIANS))].tolist()
+        row = int(np.searchsorted(self._ids[part], kf_id))
+        metres, radians = se3.extent(se3.inverse(self._anchored[part]) @ self._anchored[row])
+        same = (metres < SAME_METRES) & (radians < SAME_RADIANS) & (self._frames[part] == self._frames[row])
+        return self._ids[part][same].tolist()
 
     def nearby(self, kf_id: int, excluded: Container[int]) -> list[int]:
         """The keyframe of the same piece of odometry that stood nearest and looked the same way, if near at all."""
         part = slice(0, self._count)
-        relative = se3.inverse(self._stack[part]) @ self._poses[kf_id]
-        metres = np.linalg.norm(relative[:, :3, 3], axis=1)
-        cosine = (np.trace(relative[:, :3, :3], axis1=1, axis2=2) - 1) / 2
-        close = (metres < NEAR_METRES) & (cosine > np.cos(NEAR_RADIANS)) & (self._chains[part] == self._chain[kf_id])
+        metres, radians = se3.extent(se3.inverse(self._stack[part]) @ self._poses[kf_id])
+        close = (metres < NEAR_METRES) & (radians < NEAR_RADIANS) & (self._chains[part] == self._chain[kf_id])
         rows = [r for r in np.flatnonzero(close).tolist() if int(self._ids[r]) not in excluded]
-        return [int(self._ids[min(rows, key=lambda r: (metres[r] + 1 - cosine[r], r))])] if rows else []
+        return [int(self._ids[min(rows, key=lambda r: (metres[r] + 1 - np.cos(radians[r]), r))])] if rows else []
 
     def add_loop(self, a: int, b: int, a_T_b: F64) -> None:
         """Link two keyframes whose relative pose was verified."""
         self._loops.append((a, b, a_T_b))
         row_a, row_b = np.searchsorted(self._ids[: self._count], (a, b)).tolist()
-        self._anchored[row_b] = self._anchored[row_a] @ a_T_b
+        self._anchored[row_b], self._frames[row_b] = self._anchored[row_a] @ a_T_b, self._frames[row_a]
 
     def way(self, a: int, b: int) -> Way | None:
         """The way with the fewest metres, or None where tracking broke and no loop joins the pieces (Dijkstra)."""

@@ -134,9 +134,8 @@ class Relocalizer:
         return chosen
 
     def _nearest(self, guess: F64) -> int:
-        relative = se3.inverse(self._map.map_T_kf) @ guess
-        turn = np.arccos(np.clip((np.trace(relative[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1))
-        return int(np.argmin(np.linalg.norm(relative[:, :3, 3], axis=1) + turn))
+        metres, radians = se3.extent(se3.inverse(self._map.map_T_kf) @ guess)
+        return int(np.argmin(metres + radians))
 
     def _location(self, row: int, verdict: Verdict) -> Location:
         map_T_cam = self._map.map_T_kf[row] @ se3.inverse(verdict.b_T_a)

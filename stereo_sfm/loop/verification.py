@@ -11,12 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import numba
 import numpy as np
 
 from calib.rig import Rig
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.loop import binary
 from stereo_sfm.loop.absolute_pose import Matches, Pose, ransac_pose, refine_pose
 from stereo_sfm.loop.cloud import Cloud
@@ -25,7 +25,6 @@ from stereo_sfm.types import F64, I32, I64, Keyframe
 
 GUIDED_RADII_PX = 12.0, 6.0  # one round each
 GRID = (8, 6)  # columns, rows
-njit: Any = numba.njit(cache=True, nogil=True, error_model="numpy")
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,5 +207,5 @@ def occupied_cells(uv: F64, size: tuple[int, int]) -> int:
 
 def within(error: F64, metres: float, degrees: float) -> bool:
     """Whether a transform (4, 4) moves by at most so much."""
-    xi = se3.log(error)
-    return bool(np.linalg.norm(error[:3, 3]) <= metres and np.rad2deg(np.linalg.norm(xi[3:])) <= degrees)
+    moved, turned = se3.extent(error)
+    return bool(moved <= metres and np.rad2deg(turned) <= degrees)

@@ -6,6 +6,7 @@ import numpy as np
 
 from calib.rig import Rig
 from stereo_sfm.config import MapperConfig
+from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.types import F64, I64, Bool
 
@@ -86,6 +87,5 @@ def _same_view(map_: Map, newest: int, rows: I64) -> Bool:
     poses = map_.keyframes.map_T_kf
     pts = map_.observations.pt[map_.observations_of_keyframe(newest)]
     depth = np.nanmedian(np.linalg.norm(map_.points.xyz[pts] - poses[newest, :3, 3], axis=1)) if len(pts) else 0.0
-    apart = np.linalg.norm(poses[rows, :3, 3] - poses[newest, :3, 3], axis=1)
-    cos = (np.einsum("nij,ij->n", poses[rows, :3, :3], poses[newest, :3, :3]) - 1) / 2
-    return (apart < CROWD_DEPTHS * depth) & (cos > np.cos(np.deg2rad(CROWD_DEG)))
+    metres, radians = se3.extent(se3.inverse(poses[rows]) @ poses[newest])
+    return (metres < CROWD_DEPTHS * depth) & (radians < np.deg2rad(CROWD_DEG))

@@ -111,3 +111,10 @@ def test_umeyama_never_reflects_and_refuses_lines() -> None:
         se3.umeyama(line, line)
     with pytest.raises(ValueError, match="three points"):
         se3.umeyama(line[:2], line[:2])
+
+
+def test_extent_is_metres_and_radians() -> None:
+    xi = np.array([[3.0, 0, 4.0, 0, 0, 0], [0, 0, 0, 0.3, 0, 0.4], [0, 0, 0, 0, np.pi, 0]])
+    metres, radians = se3.extent(se3.exp(xi))
+    np.testing.assert_allclose(metres, [5.0, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(radians, [0.0, 0.5, np.pi], atol=1e-7)

@@ -1,0 +1,87 @@
+"""What the loop closer knows of the way between keyframes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stereo_sfm.geometry import se3
+from stereo_sfm.loop.graph import KeyframeGraph
+from stereo_sfm.types import F64
+
+
+def at(x: float, turn: float = 0.0) -> F64:
+    """A camera x metres along the aisle, turned by so many radians."""
+    return se3.exp(np.array([x, 0, 0, 0, 0, 0])) @ se3.exp(np.array([0, 0, 0, 0, turn, 0]))
+
+
+def test_a_way_without_loops_is_the_odometry_and_its_length() -> None:
+    graph = KeyframeGraph()
+    for k, x in enumerate((0.0, 1.0, 2.5)):
+        graph.add(k, at(x), 0)
+    way = graph.way(0, 2)
+    assert way is not None and way.metres == pytest.approx(2.5)
+    np.testing.assert_allclose(way.a_T_b, at(2.5), atol=1e-12)
+
+
+def test_a_loop_is_a_short_cut() -> None:
+    graph = KeyframeGraph()
+    for k in range(20):
+        graph.add(k, at(float(k)), 0)
+    graph.add_loop(0, 19, at(0.1))
+    way = graph.way(1, 19)
+    assert way is not None and way.metres == pytest.approx(1.0)
+    np.testing.assert_allclose(way.a_T_b, at(-0.9), atol=1e-12)
+
+
+def test_where_tracking_broke_no_way_is_known_until_a_loop_joins_the_pieces() -> None:
+    graph = KeyframeGraph()
+    graph.add(0, at(0.0), 0)
+    graph.add(1, at(5.0), 1)
+    assert graph.way(0, 1) is None
+    graph.add_loop(0, 1, at(0.2))
+    assert graph.way(0, 1) is not None
+
+
+def test_the_nearest_keyframe_that_looks_the_same_way_is_found() -> None:
+    graph = KeyframeGraph()
+    for k, pose in enumerate((at(0.0), at(1.0), at(1.2, 2.0), at(9.0), at(1.1))):
+        graph.add(k, pose, 0)
+    assert graph.nearby(4, {4}) == [1]
+    assert graph.nearby(4, {0, 1, 4}) == []  # 2 is near but looks away, 3 is far
+
+
+def test_the_same_view_is_the_same_place_and_direction() -> None:
+    graph = KeyframeGraph()
+    for k, pose in enumerate((at(0.0), at(0.2), at(0.1, 1.0), at(4.0))):
+        graph.add(k, pose, 0)
+    assert graph.same_view(0) == [0, 1]
+
+
+def test_the_same_view_is_found_in_spite_of_drift_once_a_loop_is_known() -> None:
+    graph = KeyframeGraph()
+    graph.add(0, at(0.0), 0)
+    graph.add(1, at(30.0), 0)
+    graph.add(2, at(0.5), 0)  # it stands where 0 stood: odometry has drifted by half a metre
+    assert graph.same_view(0) == [0]
+    graph.add_loop(0, 2, at(0.0))
+    graph.add(3, at(0.6), 0)
+    assert graph.same_view(0) == [0, 2, 3]
+
+
+def test_poses_of_unrelated_pieces_of_odometry_are_not_compared() -> None:
+    graph = KeyframeGraph()
+    graph.add(0, at(0.0), 0)
+    graph.add(1, at(0.0), 1)  # tracking broke: the numbers are the same, the place is not known
+    assert graph.same_view(1) == [1]
+    assert graph.nearby(1, {1}) == []
+    graph.add_loop(0, 1, at(0.1))
+    graph.add(2, at(0.05), 1)
+    assert graph.same_view(0) == [0, 1, 2]
+
+
+def test_it_grows_beyond_its_first_size() -> None:
+    graph = KeyframeGraph()
+    for k in range(200):
+        graph.add(k, at(k % 10 * 1.0), 0)
+    assert graph.same_view(150) == list(range(0, 200, 10))
