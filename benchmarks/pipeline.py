@@ -11,19 +11,15 @@ shared image ring.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import functools
 import tempfile
 import time
-from collections.abc import Iterator
-from itertools import count
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 import psutil
 
+from drivers.memory import MemorySource
 from drivers.paced import PacedSource
 from drivers.source import Source, open_source
 from stereo_sfm.config import Config
@@ -31,42 +27,13 @@ from stereo_sfm.log.record import record
 from stereo_sfm.pipeline.processes import ProcessRun
 from stereo_sfm.pipeline.sinks import Health, StageTimes
 from stereo_sfm.pipeline.workers import LogOptions
-from stereo_sfm.types import Dropped, LoopResult, StereoImage
-
-PERIOD_NS = 33_333_333
-
-
-class PingPong:
-    """A recording held in memory, forwards and backwards, at 30 Hz."""
-
-    live, ground_truth = False, None
-
-    def __init__(self, path: str, frames: int) -> None:
-        self.name, self.frame_count = "ping-pong", frames
-        with open_source(path) as source:
-            self.rig = source.rig
-            self._images = list(source)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        return None
-
-    def __iter__(self) -> Iterator[StereoImage]:
-        n = len(self._images)
-        for k in count():
-            if k == self.frame_count:
-                return
-            at = k % (2 * n - 2)
-            image = self._images[at if at < n else 2 * n - 2 - at]
-            yield dataclasses.replace(image, frame_id=k, stamp_ns=1_000_000_000 + k * PERIOD_NS, dropped_before=0)
+from stereo_sfm.types import Dropped, LoopResult
 
 
 def opened(path: str, frames: int, paced: bool) -> Source:
-    source = PingPong(path, frames)
+    """A recording held in memory, forwards and backwards, at 30 Hz."""
+    with open_source(path) as recording:
+        source = MemorySource(recording.rig, list(recording), count=frames, there_and_back=True)
     return PacedSource(source) if paced else source
 
 

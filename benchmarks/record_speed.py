@@ -13,47 +13,20 @@ import argparse
 import itertools
 import os
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from types import TracebackType
-from typing import Self
 
 import cv2
 import zstandard
 
 from drivers import Source, open_source
+from drivers.memory import MemorySource
 from stereo_sfm.log.images import FORMATS, PNG_OPTIONS
 from stereo_sfm.log.record import record
 from stereo_sfm.types import U8, StereoImage
 
 RATE = 30.0
-PERIOD_NS = round(1e9 / RATE)
-
-
-class Repeated:
-    """Frames from memory, played over and over until there are `count`, at 30 Hz by their stamps."""
-
-    live = False
-    ground_truth = None
-
-    def __init__(self, source: Source, images: list[StereoImage], count: int) -> None:
-        self.name, self.rig, self.images = source.name, source.rig, images
-        self.frame_count: int | None = count
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        return None
-
-    def __iter__(self) -> Iterator[StereoImage]:
-        endless = itertools.cycle(self.images)
-        for i in range(self.frame_count or 0):
-            yield replace(next(endless), frame_id=i, stamp_ns=i * PERIOD_NS, dropped_before=0)
 
 
 def load(spec: str, distinct: int) -> tuple[Source, list[StereoImage]]:
@@ -70,7 +43,7 @@ def measure_recording(source: Source, images: list[StereoImage], count: int, fol
     for image_format in FORMATS:
         path = folder / f"{image_format}.mcap"
         wall, cpu = time.perf_counter(), time.process_time()
-        for _ in record(Repeated(source, images, count), path, image_format):
+        for _ in record(MemorySource(source.rig, images, name=source.name, count=count), path, image_format):
             pass
         wall, cpu = (time.perf_counter() - wall) / count, (time.process_time() - cpu) / count
         size = path.stat().st_size / count

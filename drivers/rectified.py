@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from types import TracebackType
 from typing import Self
 
 from calib.rectification import PROJECTIONS, rectify
+from calib.rig import Rig
 from drivers.source import Source
+from drivers.wrapped import WrappedSource
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import StereoImage, Trajectory
 
 
-class RectifiedSource:
+class RectifiedSource(WrappedSource):
     """Wraps a source and is entered with it; `rig`, images and ground truth are those of the rectified pair."""
 
     def __init__(
@@ -23,41 +24,33 @@ class RectifiedSource:
         hfov_deg: float | None = None,
         size: tuple[int, int] | None = None,
     ) -> None:
-        self._source, self._how = source, (projection, hfov_deg, size)
+        super().__init__(source)
+        self._how = (projection, hfov_deg, size)
         self._adopt()
 
     def _adopt(self) -> None:
-        source = self._source
-        self._source_rig = source.rig
-        self.rectification = rectify(source.rig, *self._how)
-        self.rig = self.rectification.rig
-        self.name = source.name
-        self.frame_count = source.frame_count
-        self.live = source.live
-        truth = source.ground_truth
-        self.ground_truth = None if truth is None else self._turned(truth)
-
-    def _turned(self, truth: Trajectory) -> Trajectory:
-        return Trajectory(truth.stamp_ns.copy(), truth.poses @ self.rectification.cam_T_rect)
+        self._source_rig = self.source.rig
+        self.rectification = rectify(self._source_rig, *self._how)
 
     @property
-    def counters(self) -> dict[str, float]:
-        """What a live source counts about itself (drivers.live.counters); empty for files."""
-        return getattr(self._source, "counters", {})
+    def rig(self) -> Rig:
+        return self.rectification.rig
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        truth = self.source.ground_truth
+        if truth is None:
+            return None
+        return Trajectory(truth.stamp_ns.copy(), truth.poses @ self.rectification.cam_T_rect)
 
     def __enter__(self) -> Self:
-        self._source.__enter__()
-        if self._source.rig is not self._source_rig:
+        super().__enter__()
+        if self.source.rig is not self._source_rig:
             self._adopt()  # a camera tells its calibration when it is open
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._source.__exit__(kind, error, trace)
-
     def __iter__(self) -> Iterator[StereoImage]:
-        for image in self._source:
+        for image in self.source:
             if image.right is None:
                 raise StereoSfmError(f"frame {image.frame_id} of {self.name} has no right image to rectify")
             left, right = self.rectification.apply(image.left, image.right)

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from types import TracebackType
-from typing import Self
 
-from calib.rig import Rig
 from drivers.source import Source
+from drivers.wrapped import WrappedSource
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.types import StereoImage, Trajectory
+from stereo_sfm.types import StereoImage
 
 
-class SelectedFrames:
+class SelectedFrames(WrappedSource):
     """A source that passes on some frames of another one. Frames left out on purpose do not count as dropped."""
 
     def __init__(
@@ -33,42 +31,20 @@ class SelectedFrames:
         """
         if frame_skip < 1 or start_s < 0 or duration_s <= 0 or (max_frames is not None and max_frames < 1):
             raise StereoSfmError("a part of a source needs frame skip and frames of at least 1, and times above 0")
-        self.source = source
+        super().__init__(source)
         self.start_ns = round(start_s * 1e9)
         self.end_ns = None if duration_s == float("inf") else self.start_ns + round(duration_s * 1e9)
         self.frame_skip = frame_skip
         self.max_frames = max_frames
-        self._adopt()
-
-    def _adopt(self) -> None:
-        self.name: str = self.source.name
-        self.rig: Rig = self.source.rig
-        self.ground_truth: Trajectory | None = self.source.ground_truth
-        self.live: bool = self.source.live
-        self.frame_count: int | None = self._count()
 
     @property
-    def counters(self) -> dict[str, float]:
-        """What a live source counts about itself (drivers.live.counters); empty for files."""
-        return getattr(self.source, "counters", {})
-
-    def _count(self) -> int | None:
+    def frame_count(self) -> int | None:
         """At most so many frames; None where the part depends on stamps that are not read yet."""
         count = self.source.frame_count
         if count is None or self.start_ns or self.end_ns is not None:
             return self.max_frames
         count = -(-count // self.frame_skip)
         return count if self.max_frames is None else min(self.max_frames, count)
-
-    def __enter__(self) -> Self:
-        self.source.__enter__()
-        self._adopt()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.source.__exit__(kind, error, trace)
 
     def __iter__(self) -> Iterator[StereoImage]:
         passed, seen, dropped = 0, 0, 0

@@ -21,6 +21,7 @@ from mcap_protobuf.writer import Writer as ProtobufWriter
 from calib.rig import Rig
 from drivers import open_source
 from drivers.mcap_topics import choose_topics
+from drivers.memory import MemorySource
 from stereo_sfm.cli import main
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
@@ -28,7 +29,7 @@ from stereo_sfm.geometry.cameras import Camera, KannalaBrandt, Pinhole, RadTan
 from stereo_sfm.log import foxglove
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.types import U8
-from tests.log.recordings import ArraySource, fisheye_rig, stereo_images, write_recording
+from tests.log.recordings import fisheye_rig, stereo_images, write_recording
 
 PERIOD_NS = 50_000_000
 W, H = 64, 48
@@ -361,7 +362,7 @@ def test_a_given_rig_stands_in_for_a_missing_calibration(tmp_path: Path) -> None
 
 def test_our_own_file_with_a_rig_of_another_size(tmp_path: Path) -> None:
     path = tmp_path / "own.mcap"
-    write_recording(path, ArraySource(fisheye_rig(), stereo_images(2, np.random.default_rng(0))))
+    write_recording(path, MemorySource(fisheye_rig(), stereo_images(2, np.random.default_rng(0))))
     with open_source(path, rig=fisheye_rig(32, 32)) as source, pytest.raises(StereoSfmError, match="96x80 but the cal"):
         list(source)
 
@@ -391,7 +392,7 @@ def test_info_speaks_of_gaps_skew_and_topics(tmp_path: Path, capsys: pytest.Capt
 
 def test_info_of_our_own_file_and_of_a_cut_off_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "own.mcap"
-    write_recording(path, ArraySource(fisheye_rig(), stereo_images(40, np.random.default_rng(0))))
+    write_recording(path, MemorySource(fisheye_rig(), stereo_images(40, np.random.default_rng(0))))
     assert main(["info", str(path)]) == 0
     text = capsys.readouterr().out
     assert "40 at 30.00 Hz" in text and "1 counted as dropped, eyes at most 0.040 ms apart" in text

@@ -2,44 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 import pytest
 
-from calib.rig import Rig
+from drivers.memory import MemorySource
 from drivers.t265.simulated.content import Content, room_content, source_content
 from drivers.t265.simulated.faults import Faults
 from stereo_sfm.geometry import se3
 from stereo_sfm.pipeline.run import run
-from stereo_sfm.types import StereoImage, TrackState, Trajectory
+from stereo_sfm.types import TrackState
 from tests.drivers.t265_rig import open_camera, take
-
-
-class Taken:
-    """Images that have been taken, as a source: tracking at its own pace."""
-
-    name = "taken"
-    live = False
-    ground_truth: Trajectory | None = None
-
-    def __init__(self, rig: Rig, images: list[StereoImage]) -> None:
-        self.rig, self._images = rig, images
-        self.frame_count: int | None = len(images)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        return
-
-    def __iter__(self) -> Iterator[StereoImage]:
-        return iter(self._images)
 
 
 def path_error(content: Content, faults: Faults, count: int) -> tuple[float, float, int, list[TrackState]]:
@@ -49,7 +23,7 @@ def path_error(content: Content, faults: Faults, count: int) -> tuple[float, flo
         truth = source.truth(np.array([i.stamp_ns for i in images]))
         lost = int(source.counters["dropped"]) - source.camera.overruns
         rig = source.rig
-    frames = list(run(Taken(rig, images)))
+    frames = list(run(MemorySource(rig, images)))
     estimate = np.array([f.odom_T_cam[:3, 3] for f in frames])
     true = (se3.inverse(truth.poses[0]) @ truth.poses)[:, :3, 3]
     rmse = float(np.sqrt(((estimate - true) ** 2).sum(1).mean()))

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import cv2
 import numpy as np
 
 from calib.rig import Rig
+from drivers.memory import MemorySource
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import KannalaBrandt, Pinhole
 from stereo_sfm.log.record import record
@@ -27,30 +25,6 @@ def fisheye_rig(width: int = 96, height: int = 80) -> Rig:
     right = KannalaBrandt(width, height, 31.5 / 3, 31.4 / 3, 48.3, 39.7, (-0.0102, 0.0411, -0.0299, 0.0059))
     left_T_right = se3.exp(np.array([0.0641, 0.0002, -0.0001, 0.002, -0.003, 0.001]))
     return Rig(left, right, left_T_right, se3.exp(np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6])), name="test", serial="42")
-
-
-class ArraySource:
-    """A source of given images."""
-
-    live = False
-
-    def __init__(self, rig: Rig, images: list[StereoImage], ground_truth: Trajectory | None = None) -> None:
-        self.name = "arrays"
-        self.rig = rig
-        self.images = images
-        self.ground_truth = ground_truth
-        self.frame_count: int | None = len(images)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        return None
-
-    def __iter__(self) -> Iterator[StereoImage]:
-        return iter(self.images)
 
 
 def stereo_images(count: int, rng: np.random.Generator, size: tuple[int, int] = (96, 80)) -> list[StereoImage]:
@@ -102,7 +76,7 @@ def walk_truth(count: int, rng: np.random.Generator) -> Trajectory:
     return Trajectory(stamps.astype(np.int64), se3.exp(rng.normal(size=(count, 6))))
 
 
-def write_recording(path: Path, source: ArraySource, image_format: str = "png") -> None:
+def write_recording(path: Path, source: MemorySource, image_format: str = "png") -> None:
     """Record everything, with a wall clock that is always the same."""
     ticks = iter(range(EPOCH_NS, EPOCH_NS + 10**12, 1000))
     for _ in record(source, path, image_format, clock=lambda: next(ticks)):

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from drivers.memory import MemorySource
 from stereo_sfm.cli import main
 from stereo_sfm.config import Config
 from stereo_sfm.log import topics
@@ -16,7 +17,7 @@ from stereo_sfm.log.diff import Difference, diff
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.writer import LogWriter
 from stereo_sfm.types import Frame, Observations, StereoImage, TrackState
-from tests.log.recordings import ArraySource, fisheye_rig, stereo_images, walk_truth, write_recording
+from tests.log.recordings import fisheye_rig, stereo_images, walk_truth, write_recording
 
 
 def _frames(count: int) -> list[Frame]:
@@ -102,23 +103,23 @@ def test_lossless_formats_are_the_same_images(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     images, truth = stereo_images(6, rng), walk_truth(20, rng)
     for name in ("png", "raw"):
-        write_recording(tmp_path / f"{name}.mcap", ArraySource(fisheye_rig(), images, truth), name)
+        write_recording(tmp_path / f"{name}.mcap", MemorySource(fisheye_rig(), images, truth), name)
     assert _diff(tmp_path / "png.mcap", tmp_path / "raw.mcap") == []
     assert main(["convert", str(tmp_path / "raw.mcap"), "-o", str(tmp_path / "again.mcap"), "-q"]) == 0
     assert _diff(tmp_path / "again.mcap", tmp_path / "raw.mcap") == []
     left = images[2].left.copy()
     left[5, 9] ^= 1
     other: list[StereoImage] = [*images[:2], replace(images[2], left=left), *images[3:]]
-    write_recording(tmp_path / "other.mcap", ArraySource(fisheye_rig(), other, truth))
+    write_recording(tmp_path / "other.mcap", MemorySource(fisheye_rig(), other, truth))
     (found,) = _diff(tmp_path / "raw.mcap", tmp_path / "other.mcap")
     assert (found.topic, found.frame_id, found.field) == ("/cam0/image", 2, "pixel (9, 5)")
 
 
 def test_another_calibration_and_a_missing_topic_come_first(tmp_path: Path) -> None:
     images = stereo_images(3, np.random.default_rng(2))
-    write_recording(tmp_path / "a.mcap", ArraySource(fisheye_rig(), images))
+    write_recording(tmp_path / "a.mcap", MemorySource(fisheye_rig(), images))
     still = [replace(image, imu=None) for image in images]
-    write_recording(tmp_path / "b.mcap", ArraySource(replace(fisheye_rig(), name="other"), still))
+    write_recording(tmp_path / "b.mcap", MemorySource(replace(fisheye_rig(), name="other"), still))
     found = _diff(tmp_path / "a.mcap", tmp_path / "b.mcap")
     assert [(d.topic, d.field) for d in found[:3]] == [
         ("/imu", "messages"),

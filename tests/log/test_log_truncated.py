@@ -29,7 +29,7 @@ from stereo_sfm.types import StereoImage
 from tests.log.recordings import (
     PERIOD_NS,
     START_NS,
-    ArraySource,
+    MemorySource,
     assert_same_image,
     fisheye_rig,
     stereo_images,
@@ -51,7 +51,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
     rng = np.random.default_rng(0)
     images = stereo_images(40, rng)
     path = tmp_path_factory.mktemp("whole") / "whole.mcap"
-    write_recording(path, ArraySource(fisheye_rig(), images, walk_truth(30, rng)))
+    write_recording(path, MemorySource(fisheye_rig(), images, walk_truth(30, rng)))
     return Whole((path, images))
 
 
@@ -177,9 +177,10 @@ from pathlib import Path
 sys.path.insert(0, {root!r})
 import numpy as np
 from stereo_sfm.log.record import record
-from tests.log.recordings import ArraySource, fisheye_rig, stereo_images
+from drivers.memory import MemorySource
+from tests.log.recordings import fisheye_rig, stereo_images
 
-class Slow(ArraySource):
+class Slow(MemorySource):
     live = True
     def __iter__(self):
         begin = time.monotonic()
@@ -220,7 +221,7 @@ def test_a_full_disk_stops_with_one_line_and_leaves_a_closed_file(tmp_path: Path
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
     try:
         with pytest.raises(StereoSfmError, match=r"recording stopped, File too large: .* is closed and readable"):
-            write_recording(path, ArraySource(fisheye_rig(), images))
+            write_recording(path, MemorySource(fisheye_rig(), images))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert path.stat().st_size <= limit
@@ -254,7 +255,7 @@ def test_no_room_for_the_index_gives_up_chunks_for_it(tmp_path: Path, whole: Who
         assert len(reader.summary.chunk_indexes) == len(chunks) - 2
 
 
-class _Interrupted(ArraySource):
+class _Interrupted(MemorySource):
     """Sends a signal to this process when it is asked for the tenth frame."""
 
     number = signal.SIGINT

@@ -49,7 +49,7 @@ from stereo_sfm.types import (
 from tests.log.recordings import (
     PERIOD_NS,
     START_NS,
-    ArraySource,
+    MemorySource,
     fisheye_rig,
     stereo_images,
     walk_truth,
@@ -358,7 +358,7 @@ def test_what_a_replay_needs_comes_back(run: Path) -> None:
 def test_a_recording_is_no_run_and_a_run_without_images_says_where_they_are(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    source = ArraySource(fisheye_rig(), stereo_images(2, np.random.default_rng(0)))
+    source = MemorySource(fisheye_rig(), stereo_images(2, np.random.default_rng(0)))
     write_recording(tmp_path / "recording.mcap", source)
     with LogReader(tmp_path / "recording.mcap") as reader, pytest.raises(StereoSfmError, match="no log of a run"):
         read_run(reader)

@@ -18,7 +18,7 @@ from stereo_sfm.log.writer import CHUNK_BYTES, CHUNK_NS, LogWriter
 from tests.log.recordings import (
     PERIOD_NS,
     START_NS,
-    ArraySource,
+    MemorySource,
     assert_same_image,
     depth_images,
     fisheye_rig,
@@ -42,7 +42,7 @@ def test_a_lossless_recording_gives_back_every_bit(tmp_path: Path, image_format:
     rng = np.random.default_rng(1)
     images, truth = stereo_images(12, rng), walk_truth(60, rng)
     path = tmp_path / "a.mcap"
-    write_recording(path, ArraySource(fisheye_rig(), images, truth), image_format)
+    write_recording(path, MemorySource(fisheye_rig(), images, truth), image_format)
     with open_source(path) as source:
         back = list(source)
         again = list(source)
@@ -58,7 +58,7 @@ def test_a_lossless_recording_gives_back_every_bit(tmp_path: Path, image_format:
 
 def test_depth_images_give_back_every_bit(tmp_path: Path) -> None:
     rig, images = depth_images(4, np.random.default_rng(2))
-    write_recording(tmp_path / "d.mcap", ArraySource(rig, images))
+    write_recording(tmp_path / "d.mcap", MemorySource(rig, images))
     with open_source(tmp_path / "d.mcap") as source:
         _assert_same_rig(rig, source.rig)
         for one, other in zip(images, source, strict=True):
@@ -70,7 +70,7 @@ def test_monocular_images_come_back_without_a_right_eye(tmp_path: Path) -> None:
     from dataclasses import replace
 
     mono = [replace(image, depth=None) for image in images]
-    write_recording(tmp_path / "m.mcap", ArraySource(Rig(rig.left), mono))
+    write_recording(tmp_path / "m.mcap", MemorySource(Rig(rig.left), mono))
     with open_source(tmp_path / "m.mcap") as source:
         assert not source.rig.stereo
         for one, other in zip(mono, source, strict=True):
@@ -79,7 +79,7 @@ def test_monocular_images_come_back_without_a_right_eye(tmp_path: Path) -> None:
 
 def test_two_recordings_of_the_same_source_are_the_same_file(tmp_path: Path) -> None:
     for name in ("a.mcap", "b.mcap"):
-        write_recording(tmp_path / name, ArraySource(fisheye_rig(), stereo_images(5, np.random.default_rng(4))))
+        write_recording(tmp_path / name, MemorySource(fisheye_rig(), stereo_images(5, np.random.default_rng(4))))
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
 
 
@@ -87,7 +87,7 @@ def test_chunks_stay_small_in_bytes_and_time(tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     images = stereo_images(30, rng, (640, 480))
     rig = fisheye_rig(640, 480)
-    write_recording(tmp_path / "a.mcap", ArraySource(rig, images), "raw")
+    write_recording(tmp_path / "a.mcap", MemorySource(rig, images), "raw")
     with (tmp_path / "a.mcap").open("rb") as stream:
         summary = make_reader(stream).get_summary()
     assert summary is not None and len(summary.chunk_indexes) >= 18
@@ -111,14 +111,14 @@ def test_a_chunk_also_ends_by_the_wall_clock(tmp_path: Path) -> None:
 
 def test_times_and_sequence_are_what_they_should_be(tmp_path: Path) -> None:
     images = stereo_images(4, np.random.default_rng(6))
-    write_recording(tmp_path / "a.mcap", ArraySource(fisheye_rig(), images))
+    write_recording(tmp_path / "a.mcap", MemorySource(fisheye_rig(), images))
     with LogReader(tmp_path / "a.mcap") as reader:
         records = list(reader.messages([topics.LEFT_IMAGE]))
         assert [r.log_time for r in records] == [image.stamp_ns for image in images]
         assert [r.sequence for r in records] == [image.frame_id for image in images]
         assert all(r.publish_time > 1_600_000_000_000_000_000 for r in records)
         assert reader.stamps(topics.LEFT_IMAGE).tolist() == [image.stamp_ns for image in images]
-        assert reader.metadata("stereo_sfm")["source"] == "arrays"
+        assert reader.metadata("stereo_sfm")["source"] == "memory"
         assert b"numpy" in (reader.attachment("versions.txt") or b"")
         assert reader.truncated == ""
 
@@ -132,7 +132,7 @@ def test_every_topic_written_is_in_the_table() -> None:
 
 def test_a_part_by_time_has_its_samples(tmp_path: Path) -> None:
     images = stereo_images(40, np.random.default_rng(7))
-    write_recording(tmp_path / "a.mcap", ArraySource(fisheye_rig(), images))
+    write_recording(tmp_path / "a.mcap", MemorySource(fisheye_rig(), images))
     start, until = START_NS + 10 * PERIOD_NS, START_NS + 20 * PERIOD_NS
     with open_source(tmp_path / "a.mcap") as source:
         assert isinstance(source, McapSource)

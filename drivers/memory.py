@@ -1,0 +1,56 @@
+"""Images held in memory as a source: for tests, benchmarks, and programs that have their images already."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from types import TracebackType
+from typing import Self
+
+from calib.rig import Rig
+from stereo_sfm.types import StereoImage, Trajectory
+
+PERIOD_NS = 33_333_333  # of a repeated walk: 30 Hz
+
+
+class MemorySource:
+    """Gives the images as they are, or, with `count`, a longer walk made of them."""
+
+    live = False
+
+    def __init__(
+        self,
+        rig: Rig,
+        images: Sequence[StereoImage],
+        ground_truth: Trajectory | None = None,
+        name: str = "memory",
+        count: int | None = None,
+        there_and_back: bool = False,
+    ) -> None:
+        """Args:
+        rig, images, ground_truth, name: what the source gives.
+        count: images of a longer walk, numbered and stamped anew at 30 Hz; None plays the images once, unchanged.
+        there_and_back: the longer walk turns round at the ends, so that it goes on without a jump.
+        """
+        self.rig, self.images, self.ground_truth, self.name = rig, images, ground_truth, name
+        self.frame_count: int | None = len(images) if count is None else count
+        self._count, self._there_and_back = count, there_and_back
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        return None
+
+    def __iter__(self) -> Iterator[StereoImage]:
+        if self._count is None:
+            yield from self.images
+            return
+        n = len(self.images)
+        period = max(2 * n - 2, 1) if self._there_and_back else n
+        for k in range(self._count):
+            at = k % period
+            image = self.images[at if at < n else period - at]
+            yield replace(image, frame_id=k, stamp_ns=1_000_000_000 + k * PERIOD_NS, dropped_before=0)

@@ -1,0 +1,55 @@
+"""What sources that stand in front of another source have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from types import TracebackType
+from typing import Self
+
+from calib.rig import Rig
+from drivers.source import Source
+from stereo_sfm.types import StereoImage, Trajectory
+
+
+class WrappedSource:
+    """Another source, entered and left with this one; a subclass says what is different."""
+
+    def __init__(self, source: Source) -> None:
+        self.source = source
+
+    @property
+    def name(self) -> str:
+        return self.source.name
+
+    @property
+    def rig(self) -> Rig:
+        return self.source.rig
+
+    @property
+    def ground_truth(self) -> Trajectory | None:
+        return self.source.ground_truth
+
+    @property
+    def frame_count(self) -> int | None:
+        return self.source.frame_count
+
+    @property
+    def live(self) -> bool:
+        return self.source.live
+
+    @property
+    def counters(self) -> dict[str, float]:
+        """What a live source counts about itself (drivers.live.counters); empty for files."""
+        return getattr(self.source, "counters", {})
+
+    def __enter__(self) -> Self:
+        self.source.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.source.__exit__(kind, error, trace)
+
+    def __iter__(self) -> Iterator[StereoImage]:
+        return iter(self.source)
