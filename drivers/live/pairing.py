@@ -98,6 +98,7 @@ class Pairer:
         self._counters, self._period_ns, self._tolerance_ns = counters, period_ns, tolerance_ns
         self._locks = (EyeLock(period_ns, now_ns), EyeLock(period_ns, now_ns))
         self._waiting: tuple[deque[Eye], deque[Eye]] = (deque(), deque())
+        self._alone: tuple[deque[int], deque[int]] = (deque(maxlen=_MAX_WAITING), deque(maxlen=_MAX_WAITING))
         self._last: Pair | None = None
         self._offset = 0  # left counter minus right counter
 
@@ -108,7 +109,7 @@ class Pairer:
             return None
         others = self._waiting[1 - side]
         while others and others[0].stamp_ns <= eye.stamp_ns - self._tolerance_ns:
-            self._give_up(1 - side, others.popleft(), eye)
+            self._give_up(1 - side, others.popleft())
         if not others or others[0].stamp_ns - eye.stamp_ns >= self._tolerance_ns:
             self._waiting[side].append(eye)
             if len(self._waiting[side]) > _MAX_WAITING:
@@ -120,11 +121,13 @@ class Pairer:
         left, right = (eye, other) if side == LEFT else (other, eye)
         return self._emit(left, right)
 
-    def _give_up(self, side: int, eye: Eye, arrived: Eye | None = None) -> None:
-        """`eye` stays alone; `arrived` is the image of the other side that showed it."""
+    def _give_up(self, side: int, eye: Eye) -> None:
+        """`eye` stays alone. Where the other eye's image of that number stays alone too, the two came too far apart."""
+        number = self._number(side, eye)
         self._counters.add("unpaired")
-        if arrived is not None and self._number(side, eye) == self._number(1 - side, arrived):
+        if number in self._alone[1 - side]:
             self._counters.add("skewed")
+        self._alone[side].append(number)
 
     def _number(self, side: int, eye: Eye) -> int:
         """The counter both eyes agree on."""
