@@ -1,4 +1,4 @@
-"""`LogWriter`: the one writer of an MCAP file. Chunks of at most 1 MiB or 0.4 s, each handed to the system at once.
+"""`LogWriter`: the one writer of an MCAP file. Chunks of at most 4 MiB or 0.4 s, each handed to the system at once.
 
 So `kill -9` loses less than half a second, and a full disk leaves a file that is closed properly at the last chunk
 that fitted.
@@ -25,7 +25,7 @@ from stereo_sfm.log.topics import BY_NAME
 
 log = logging.getLogger("stereo_sfm")
 
-CHUNK_BYTES = 1 << 20
+CHUNK_BYTES = 4 << 20  # the index of the chunks stays in memory until the end
 CHUNK_NS = 400_000_000
 
 
@@ -86,7 +86,7 @@ class LogWriter:
         self.path = path
         self._clock = clock
         compression = CompressionType.ZSTD if compress else CompressionType.NONE
-        self._mcap = Writer(self._file, chunk_size=4 * CHUNK_BYTES, compression=compression)  # pyright: ignore[reportArgumentType]
+        self._mcap = Writer(self._file, chunk_size=2 * CHUNK_BYTES, compression=compression)  # pyright: ignore[reportArgumentType]
         self._channels: dict[str, int] = {}
         self._pending_bytes = 0
         self._pending_since: tuple[int, int] = (0, 0)  # log and publish time of the oldest message not yet written

@@ -1,8 +1,10 @@
 """The map: columns for keyframes and points and one observation table. Owned by the mapper alone.
 
-A row is forever: a culled keyframe or point keeps its row and loses `alive`, ids are never used again. A fused point
-keeps its id as another name of the point that replaced it. The observations of a keyframe are one run of rows; those of
-a point a linked list through the table, so that inserting a keyframe costs what it sees and not what the map holds.
+Ids are never used again: a culled keyframe or point keeps its row and loses `alive`, a fused point keeps its id as
+another name of the point that replaced it. Keyframe rows are forever; point and observation rows are until `compact`
+takes back those of what is gone, so that a day in the same aisles fits into memory. The observations of a keyframe are
+one run of rows; those of a point a linked list through the table, so that inserting a keyframe costs what it sees and
+not what the map holds.
 """
 
 from __future__ import annotations
@@ -171,7 +173,7 @@ class Map:
         return row
 
     def point_rows(self, pt_ids: I64) -> I64:
-        """(N,) row of each point id, through fusions; -1 where the id is unknown. Culled points keep their rows."""
+        """(N,) row of each point id, through fusions; -1 where the id is unknown. A culled point's is not alive."""
         known = (pt_ids >= 0) & (pt_ids < len(self._pt_rows))
         rows = np.where(known, self._pt_rows[np.where(known, pt_ids, 0)], -1).astype(np.int64)
         map_kernels.follow(rows, self.points.fused_into)
@@ -388,6 +390,49 @@ class Map:
             points.descriptor_obs[new] = points.descriptor_obs[old]
         points.head[old], points.obs_count[old], points.alive[old], points.fused_into[old] = -1, 0, False, new
         self._changed_pt.append(np.array([new]))
+
+    # -- memory ------------------------------------------------------------------------------------------------------
+
+    @property
+    def mostly_gone(self) -> bool:
+        """Whether less than half of the rows of points or observations still stand for something."""
+        living = self.points.alive
+        seen = int(self.points.obs_count[living].sum())
+        return len(living) > max(2 * int(living.sum()), 1024) or len(self.observations) > max(2 * seen, 4096)
+
+    def compact(self) -> I64:
+        """Take back the rows of points and observations that are gone; the order of the others stays.
+
+        The ids of culled points, which must stay known, share one row from then on.
+
+        Returns:
+            (P,) the row that each point row has become.
+        """
+        points, table = self.points, self.observations
+        now = np.arange(len(points))
+        map_kernels.follow(now, points.fused_into)
+        dead = ~points.alive[now]
+        if dead.any():
+            now[dead] = np.flatnonzero(~points.alive & (points.fused_into < 0))[0]
+        kept = np.unique(now)
+        pt_row = np.searchsorted(kept, now)
+        obs = np.flatnonzero(table.pt >= 0)
+        obs_row = np.append(np.searchsorted(obs, np.arange(len(table))), -1)  # the last one stands for -1: none
+        keyframes = self.keyframes
+        ends = np.searchsorted(obs, keyframes.obs_first + keyframes.obs_count)
+        keyframes.obs_first[:] = np.searchsorted(obs, keyframes.obs_first)
+        keyframes.obs_count[:] = ends - keyframes.obs_first
+        table.keep(obs)
+        table.pt[:] = pt_row[table.pt]
+        table.following[:] = obs_row[table.following]
+        points.keep(kept)
+        points.fused_into[:] = -1
+        points.head[:] = np.where(points.alive, obs_row[points.head], -1)
+        points.descriptor_obs[:] = np.where(points.alive, obs_row[points.descriptor_obs], -1)
+        known = self._pt_rows >= 0
+        self._pt_rows[known] = pt_row[self._pt_rows[known]]
+        self._changed_pt = [pt_row[rows] for rows in self._changed_pt]
+        return pt_row
 
     # -- copies ------------------------------------------------------------------------------------------------------
 

@@ -113,7 +113,10 @@ class Mapper:
         with self._spans.span("cull"):
             self._cull(row)
         self._bundle_when_grown(self._config.full_ba_growth)
-        return self._update(keyframe.kf_id)
+        update = self._update(keyframe.kf_id)
+        if self._job is None and self.map.mostly_gone:
+            self._thin = np.unique(self.map.compact()[self._thin])
+        return update
 
     def finish(self, loops: Sequence[LoopResult]) -> MapUpdate | None:
         """After the last keyframe: loops that no keyframe brought any more, and the work in the background.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +11,7 @@ from hypothesis import strategies as st
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
-from stereo_sfm.mapping.map import Map
+from stereo_sfm.mapping.map import Map, MapSnapshot
 from stereo_sfm.types import I64, Keyframe
 
 
@@ -63,33 +65,78 @@ def check(m: Map) -> None:
     assert np.array_equal(m.covisibility.matrix().toarray(), expected)
 
 
+def edit(m: Map, rng: np.random.Generator) -> None:
+    """Something that a mapper does to a map, any number of times in any order."""
+    choice = rng.integers(0, 6)
+    next_kf = len(m.keyframes)
+    if choice < 3 or next_kf < 2:
+        start = next_kf * 4
+        rows = m.point_rows(rng.integers(0, max(start, 1), 6))
+        known = np.unique(m.points.pt_id[rows[rows >= 0]]) if next_kf else np.zeros(0, np.int64)
+        known = known[m.points.alive[m.point_rows(known)]] if len(known) else known
+        insert(m, keyframe(next_kf, np.unique(np.concatenate([known, start + np.arange(4)]))))
+    elif choice == 3:
+        m.cull_points(m.point_rows(rng.integers(0, 4 * next_kf, 2)))
+    elif choice == 4:
+        alive = m.points.pt_id[m.points.alive]
+        if len(alive) > 2:
+            old, new = m.point_rows(rng.choice(alive, 2, replace=False)).tolist()
+            name = m.points.pt_id[[old]]
+            m.fuse(old, new)
+            assert m.point_rows(name)[0] == new
+    else:
+        row = int(rng.integers(0, next_kf))
+        if m.keyframes.alive[row]:
+            m.cull_keyframe(row)
+
+
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 10**6))
 def test_random_edits_keep_every_index_true(seed: int) -> None:
     rng = np.random.default_rng(seed)
     m = Map()
-    next_kf = 0
     for _ in range(25):
-        choice = rng.integers(0, 6)
-        if choice < 3 or next_kf < 2:
-            start = next_kf * 4
-            ids = m.points.pt_id[np.unique(m.point_rows(rng.integers(0, max(start, 1), 6)))] if next_kf else np.zeros(0)
-            ids = ids[m.points.alive[m.point_rows(ids.astype(np.int64))]] if len(ids) else ids
-            insert(m, keyframe(next_kf, np.unique(np.concatenate([ids, start + np.arange(4)]).astype(np.int64))))
-            next_kf += 1
-        elif choice == 3:
-            m.cull_points(rng.integers(0, len(m.points), 2))
-        elif choice == 4:
-            alive = np.flatnonzero(m.points.alive)
-            if len(alive) > 2:
-                old, new = rng.choice(alive, 2, replace=False)
-                m.fuse(int(old), int(new))
-                assert m.point_rows(m.points.pt_id[[old]])[0] == new
-        else:
-            row = int(rng.integers(0, len(m.keyframes)))
-            if m.keyframes.alive[row]:
-                m.cull_keyframe(row)
+        edit(m, rng)
     check(m)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_a_compacted_map_is_the_same_map(seed: int) -> None:
+    """The same edits, once with rows taken back now and then: same snapshots, same names, same lists."""
+    a, b = Map(), Map()
+    for step in range(40):
+        for m in (a, b):
+            edit(m, np.random.default_rng([seed, step]))
+        if step % 7 == 6:
+            rows = np.arange(len(b.points))
+            names, living = b.points.pt_id.copy(), b.points.alive.copy()
+            now = b.compact()
+            assert np.array_equal(b.points.pt_id[now[rows[living]]], names[living])
+            assert (~b.points.alive).sum() <= 1
+            assert (b.observations.pt >= 0).all()
+    check(b)
+    for field in dataclasses.fields(MapSnapshot):
+        assert np.array_equal(getattr(a.snapshot(), field.name), getattr(b.snapshot(), field.name)), field.name
+    ids = np.arange(4 * len(a.keyframes) + 3)
+    rows_a, rows_b = a.point_rows(ids), b.point_rows(ids)
+    assert np.array_equal(rows_a >= 0, rows_b >= 0)
+    known = rows_a >= 0
+    assert np.array_equal(a.points.alive[rows_a[known]], b.points.alive[rows_b[known]])
+    living = known & a.points.alive[rows_a]
+    assert np.array_equal(a.points.pt_id[rows_a[living]], b.points.pt_id[rows_b[living]])
+
+
+def test_rows_are_taken_back_when_most_are_gone() -> None:
+    m = Map()
+    for k in range(40):
+        insert(m, keyframe(k, np.arange(200 * k, 200 * k + 200)))
+        m.cull_points(m.point_rows(np.arange(200 * k, 200 * k + 150)))
+    assert m.mostly_gone
+    before = m.nbytes
+    m.compact()
+    assert not m.mostly_gone
+    assert m.nbytes < before / 2
 
 
 def test_ids_are_never_used_twice() -> None:
