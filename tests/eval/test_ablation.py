@@ -97,11 +97,11 @@ def test_findings_follow_the_numbers() -> None:
     assert "SIFT best and ORB worst with em-r: yes" in text
     assert "EM-R best with sift: yes" in text
     assert "RANSAC needed with sift: yes" in text
-    assert "more accurate than every cell: yes" in text and "faster than every cell: yes" in text
+    assert "more accurate than every cell, ATE: yes" in text and "faster than every cell: yes" in text
     worse = [answer("sift", "em-r", 3.0), answer("orb", "em-r", 1.0), answer("", "", 2.0, system="default", ms=90)]
     text = "\n".join(findings(worse))
     assert "SIFT best and ORB worst with em-r: no" in text
-    assert "more accurate than every cell: no" in text and "faster than every cell: no" in text
+    assert "more accurate than every cell, ATE: no" in text and "faster than every cell: no" in text
 
 
 def test_the_report_has_tables_plots_csv_and_published_figures(tmp_path: Path) -> None:
