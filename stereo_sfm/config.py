@@ -81,11 +81,11 @@ class ManhattanConfig:
     """Rotation prior from the world's three directions (tracking/manhattan_prior.py)."""
 
     enabled: bool = False
-    every: int = 3  # frames between measurements
+    every: int = 15  # frames between measurements: finding the lines costs several frames of tracking
     settle_frames: int = 10  # measurements that must agree before the axes are believed
     gate_deg: float = 3.0  # a measurement further from the prediction is refused
     model_deg: float = 0.15  # how exactly the world follows three directions
-    drift_deg_per_frame: float = 0.02  # standard deviation of the tracker's rotation, grows with the root of the frames
+    drift_deg_per_frame: float = 0.01  # standard deviation of the tracker's rotation, grows with the root of the frames
 
 
 @dataclass(frozen=True)
