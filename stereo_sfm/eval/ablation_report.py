@@ -82,6 +82,41 @@ def markdown_table(answers: Sequence[Answer]) -> str:
     return "\n".join(lines)
 
 
+def overview(answers: Sequence[Answer]) -> str:
+    """The errors of one source at a glance: ATE in metres and the tracker's milliseconds, a column for each feature."""
+    grid = {_place(a): a for a in answers if a["cell"]["system"] == "grid"}
+    kinds = list(dict.fromkeys(kind for _, _, kind in grid))
+    rows = list(dict.fromkeys((method, stage) for method, stage, _ in grid))
+    lines = [
+        "| odometry | stage | " + " | ".join(kinds or ["result"]) + " |",
+        "|---|---|" + "---|" * max(len(kinds), 1),
+    ]
+    for method, stage in rows:
+        cells = [_brief(grid.get((method, stage, kind))) for kind in kinds]
+        lines.append(f"| {method} | {stage} | " + " | ".join(cells) + " |")
+    for answer in answers:
+        if answer["cell"]["system"] != "grid":
+            system, stage = answer["cell"]["system"], answer["cell"]["stage"]
+            lines.append(f"| **{system}** | {stage} | {_brief(answer)} |" + " |" * (len(kinds) - 1))
+    return "\n".join(lines)
+
+
+def _place(answer: Answer) -> tuple[str, str, str]:
+    cell = answer["cell"]
+    return cell["method"], cell["stage"], cell["features"]
+
+
+def _brief(answer: Answer | None) -> str:
+    if answer is None:
+        return "-"
+    if answer["status"] != "ok":
+        return answer["reason"]
+    metrics, ms = answer["metrics"], answer["track_ms"] or 0.0
+    sim3 = f"{metrics['ate_sim3_m']:.3g} m"
+    error = f"({sim3})" if answer["monocular"] else f"{metrics['ape_m']['rmse']:.3g} m ({sim3})"
+    return f"{error}, {ms:.0f} ms"
+
+
 def write_csv(path: Path, answers: Sequence[Answer]) -> None:
     """Every cell of every source."""
     with path.open("w", newline="") as file:
@@ -216,7 +251,8 @@ def write_report(folder: Path, answers: Sequence[Answer]) -> Path:
         "alignment, `mean error` the mean distance of the same poses (the sparse localization paper's equation 44, "
         "read as the mean over the frames of the distance under its root). "
         "Drift as KITTI's, over segments that fit the path. `track` is the tracker's median; `frame` the whole run, "
-        "with reading, compiling and mapping, per frame.",
+        "with reading, compiling and mapping, per frame. The first table of a source gives the ATE, after Sim(3) in "
+        "brackets, and the tracker's median.",
         "",
     ]
     for number, source in enumerate(dict.fromkeys(a["cell"]["source"] for a in answers)):
@@ -225,12 +261,13 @@ def write_report(folder: Path, answers: Sequence[Answer]) -> Path:
         length = next((a["metrics"]["length_m"] for a in own if a["status"] == "ok"), None)
         frames = max((a.get("frames", 0) for a in own), default=0)
         lines += [f"## {name}", "", f"{frames} frames" + (f", {length:.2f} m" if length else ""), ""]
+        lines += [overview(own), ""]
+        checked = findings(own)
+        if checked:
+            lines += ["Findings, checked:", "", *[f"- {line}" for line in checked], ""]
         lines += [markdown_table(own), ""]
         published = [row for row in PUBLISHED if row[0] in name or row[0] in source]
         lines += [f"- published: {system}: {what} {value}" for _, system, what, value in published]
-        checked = findings(own)
-        if checked:
-            lines += ["", "Findings, checked:", "", *[f"- {line}" for line in checked]]
         slug = f"{number + 1:02d}"
         lines += ["", *[f"![{plot}]({plot})" for plot in write_plots(folder, slug, own)], ""]
     path = folder / "ablation.md"

@@ -12,7 +12,7 @@ import pytest
 
 from stereo_sfm.cli import main
 from stereo_sfm.eval.ablation import Cell, finished, grid, load_answer, run_cell, save_answer
-from stereo_sfm.eval.ablation_report import COLUMNS, findings, row_of, write_report
+from stereo_sfm.eval.ablation_report import COLUMNS, findings, overview, row_of, write_report
 
 SIM = "sim:aisle?camera=pinhole&size=320x200&frames=5"
 CELL = Cell(SIM, "grid", "orb", "pnp", "tracking", 0)
@@ -150,3 +150,14 @@ def test_the_whole_command_in_two_processes(tmp_path: Path) -> None:
     command = ["ablation", SIM, "-o", str(tmp_path), "--jobs", "2", "--features", "orb", "--systems", "none", "-q"]
     assert main([*command, "--odometry", "em-r,r-um", "--stages", "tracking"]) == 0
     assert len(list((tmp_path / "cells").glob("*.json"))) == 2
+
+
+def test_the_overview_has_a_column_for_each_feature_and_a_line_for_each_system() -> None:
+    refused = {**answer("orb", "em-r", 9.0), "status": "none", "reason": "weak_structure in 5 of 5 frames"}
+    made = [answer("sift", "em-r", 1.25), refused, answer("sift", "um", 2.0), answer("", "", 0.5, system="default")]
+    lines = overview(made).splitlines()
+    assert lines[0] == "| odometry | stage | sift | orb |"
+    assert lines[2] == "| em-r | tracking | 1.25 m (1.25 m), 50 ms | weak_structure in 5 of 5 frames |"
+    assert lines[3] == "| um | tracking | 2 m (2 m), 50 ms | - |"
+    assert lines[4] == "| **default** | tracking | 0.5 m (0.5 m), 50 ms | |"
+    assert len({line.count("|") for line in lines}) == 1
