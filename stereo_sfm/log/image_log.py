@@ -8,8 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from foxglove_schemas_protobuf.Pose_pb2 import Pose
 
 from calib.rig import Rig
+from stereo_sfm.geometry import se3
 from stereo_sfm.log import foxglove, topics
 from stereo_sfm.log.images import LoggedImage, depth_message, encode_pair, image_message
 from stereo_sfm.log.writer import LogWriter
@@ -18,6 +20,8 @@ from stereo_sfm.types import ImuSamples, StereoImage, Trajectory, WheelSamples
 RIG_FILE = "calibration.yaml"
 TRUTH_FILE = "ground_truth.npz"
 SECOND_NS = 1_000_000_000
+# Players hold z for up: a frame above the map that stands as the first image does (x forward, y left, z up).
+LEVEL_T_MAP = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True)
@@ -99,10 +103,27 @@ class ImageLog:
     """Writes one source's images and everything around them through a `LogWriter`."""
 
     def __init__(
-        self, writer: LogWriter, rig: Rig, ground_truth: Trajectory | None = None, image_format: str = "png"
+        self,
+        writer: LogWriter,
+        rig: Rig,
+        ground_truth: Trajectory | None = None,
+        image_format: str = "png",
+        *,
+        mapped: bool = False,
     ) -> None:
+        """Begin a log.
+
+        Args:
+            writer: the open file.
+            rig: calibration of the images.
+            ground_truth: truth_T_cam0 where the source has it.
+            image_format: one of `images.FORMATS`, or "none" for no images.
+            mapped: the file gets a map, which begins at the first image: say how it stands and where the truth lies.
+        """
         self._writer = writer
         self._rig = rig
+        self._mapped = mapped
+        self._map_rows: list[tuple[str, str, Pose]] | None = None
         self._truth = ground_truth
         self._format = image_format
         self._next_static_ns: int | None = None
@@ -189,7 +210,7 @@ class ImageLog:
             return
         self._next_static_ns = stamp_ns + SECOND_NS
         rig = self._rig
-        rows = [("body", "cam0", foxglove.pose(rig.body_T_left))]
+        rows = [*self._above_body(stamp_ns), ("body", "cam0", foxglove.pose(rig.body_T_left))]
         left = foxglove.calibration(rig.left, "cam0", stamp_ns)
         self._writer.write(topics.LEFT_CALIBRATION, left, stamp_ns)
         if rig.right is not None and not rig.depth:
@@ -199,15 +220,29 @@ class ImageLog:
             rows.append(("cam0", "cam1", foxglove.pose(rig.left_T_right)))
         self._writer.write(topics.TF_STATIC, foxglove.transforms(stamp_ns, rows), stamp_ns)
 
+    def _above_body(self, stamp_ns: int) -> list[tuple[str, str, Pose]]:
+        """How the map stands, and the truth in the map: they share the first image's pose."""
+        if self._map_rows is None:
+            self._map_rows = [("level", "map", foxglove.pose(LEVEL_T_MAP))] if self._mapped else []
+            if self._mapped and self._truth is not None and len(self._truth):
+                map_T_truth = se3.inverse(self._truth.poses[self._first_truth(self._truth, stamp_ns)])
+                self._map_rows.append(("map", "truth", foxglove.pose(map_T_truth)))
+        return self._map_rows
+
+    @staticmethod
+    def _first_truth(truth: Trajectory, stamp_ns: int) -> int:
+        return max(int(np.searchsorted(truth.stamp_ns, stamp_ns, side="right")) - 1, 0)
+
     def _ground_truth(self, stamp_ns: int) -> None:
         """All poses from the first image on, in chunks of their own: a reader gets them without reading the images."""
         if self._truth is None:
             return
-        first = max(int(np.searchsorted(self._truth.stamp_ns, stamp_ns, side="right")) - 1, 0)
+        first = self._first_truth(self._truth, stamp_ns)
         self._writer.flush()
         poses = foxglove.poses(self._truth.poses[first:])
-        for pose_stamp, world_T_cam in zip(self._truth.stamp_ns[first:].tolist(), poses, strict=True):
-            self._writer.write(topics.GROUND_TRUTH, foxglove.pose_in_frame("map", pose_stamp, world_T_cam), pose_stamp)
+        for pose_stamp, truth_T_cam in zip(self._truth.stamp_ns[first:].tolist(), poses, strict=True):
+            message = foxglove.pose_in_frame("truth", pose_stamp, truth_T_cam)
+            self._writer.write(topics.GROUND_TRUTH, message, pose_stamp)
         self._writer.flush()
         self._truth = None
 

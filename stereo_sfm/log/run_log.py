@@ -84,7 +84,7 @@ class RunLog:
             writer, source=source, serial=rig.serial, mode=mode, image_format=image_format, config=config,
             opening=opening,
         )  # fmt: skip
-        self._images = ImageLog(writer, rig, ground_truth, image_format)
+        self._images = ImageLog(writer, rig, ground_truth, image_format, mapped=True)
         self._map = MapView()
         self._map_T_odom: dict[int, F64] = {0: np.eye(4)}  # by map version
         self._version = 0

@@ -191,7 +191,7 @@ def test_poses_follow_the_map_version_that_the_frame_used(run: Path) -> None:
         assert foxglove.stamp_of(message) == frame.stamp_ns
 
 
-def test_transforms_make_one_tree_from_map_to_the_right_eye(run: Path) -> None:
+def test_transforms_make_one_tree_from_level_to_the_right_eye(run: Path) -> None:
     rig = fisheye_rig()
     rows = {
         (t.parent_frame_id, t.child_frame_id): foxglove.matrix(t.translation, t.rotation)
@@ -199,9 +199,15 @@ def test_transforms_make_one_tree_from_map_to_the_right_eye(run: Path) -> None:
         for message in _all(run, topic, FrameTransforms)
         for t in message.transforms
     }
-    assert set(rows) == {("map", "odom"), ("odom", "body"), ("body", "cam0"), ("cam0", "cam1")}
+    above = {("level", "map"), ("map", "truth"), ("map", "odom")}
+    assert set(rows) == above | {("odom", "body"), ("body", "cam0"), ("cam0", "cam1")}
     np.testing.assert_allclose(rows["odom", "body"] @ rows["body", "cam0"], _odom_T_cam(FRAMES - 1), atol=1e-12)
     np.testing.assert_allclose(rows["cam0", "cam1"], rig.left_T_right, atol=1e-12)
+    np.testing.assert_array_equal(rows["level", "map"][:3, :3] @ [0, -1, 0], [0, 0, 1])  # up in the image is z
+    first = _all(run, topics.GROUND_TRUTH, PoseInFrame)[0]
+    assert first.frame_id == "truth"
+    truth_T_cam = foxglove.matrix(first.pose.position, first.pose.orientation)
+    np.testing.assert_allclose(rows["map", "truth"] @ truth_T_cam, np.eye(4), atol=1e-12)
 
 
 def test_covariance_turns_into_the_axes_of_odom() -> None:
