@@ -131,6 +131,10 @@ def _ate(answer: Answer | None) -> float:
     return float(answer["metrics"]["ape_m"]["rmse"]) if answer is not None and answer["status"] == "ok" else math.inf
 
 
+def _metres(error: float) -> str:
+    return f"{error:.3g} m" if math.isfinite(error) else "no result"
+
+
 def _ate_sim3(answer: Answer) -> float:
     """Metres, of a cell that has a result: the shape of the path without its scale."""
     return float(answer["metrics"]["ate_sim3_m"])
@@ -163,20 +167,20 @@ def findings(answers: Sequence[Answer]) -> list[str]:
         if len(scores) > 1 and min(scores.values()) < math.inf:
             order = sorted(scores, key=lambda kind: scores[kind])
             agreed = order[0] == "sift" and order[-1] == "orb"
-            text = ", ".join(f"{kind} {scores[kind]:.3g} m" for kind in order)
+            text = ", ".join(f"{kind} {_metres(scores[kind])}" for kind in order)
             lines.append(f"SIFT best and ORB worst with {method}: {'yes' if agreed else 'no'} ({text})")
     for kind in kinds:
         scores = {method: _ate(cells.get((kind, method))) for method in methods}
         if len(scores) > 1 and min(scores.values()) < math.inf:
             order = sorted(scores, key=lambda method: scores[method])
-            text = ", ".join(f"{method} {scores[method]:.3g} m" for method in order)
+            text = ", ".join(f"{method} {_metres(scores[method])}" for method in order)
             lines.append(f"EM-R best with {kind}: {'yes' if order[0] == 'em-r' else 'no'} ({text})")
         robust, plain = cells.get((kind, "r-um")), cells.get((kind, "um"))
         if robust is not None and plain is not None:
             agreed = _ate(robust) < _ate(plain)
             lines.append(
                 f"RANSAC needed with {kind}: {'yes' if agreed else 'no'} "
-                f"(R-Um {_ate(robust):.3g} m, Um {_ate(plain):.3g} m; "
+                f"(R-Um {_metres(_ate(robust))}, Um {_metres(_ate(plain))}; "
                 f"rotation {_turn(robust):.2g} and {_turn(plain):.2g} rad a frame)"
             )
     return lines + _against_default(answers)
