@@ -31,7 +31,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="when map updates reach the tracker: as the run recorded it, or by the lockstep rule (default: as it ran)",
     )
     parser.add_argument("--until", type=float, metavar="S", help="stop after this many seconds")
-    parser.add_argument("--step", action="store_true", help="show every frame and wait for Enter")
+    parser.add_argument("--step", action="store_true", help="show every frame and wait for Enter (in one process)")
+    parser.add_argument("--seek", type=float, default=0.0, metavar="S", help="with --step: go to this second first")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change a value, to compare")
     parser.add_argument("--check", action="store_true", help="compare with the run; exit with 3 when they differ")
     add_wiring_arguments(parser)
@@ -58,6 +59,8 @@ def run(args: argparse.Namespace) -> int:
     from stereo_sfm.log.reader import LogReader
     from stereo_sfm.pipeline.maps import MapFolders
 
+    if args.seek and not args.step:
+        raise StereoSfmError("--seek goes with --step: every frame must be executed to reach a later one")
     path: Path = args.run / "run.mcap" if args.run.is_dir() else args.run
     if not path.exists():
         raise StereoSfmError(f"no run at {path}: 'stereo-sfm run' writes run.mcap into its folder")

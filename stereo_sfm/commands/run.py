@@ -15,6 +15,7 @@ from stereo_sfm.presets import PRESETS, preset
 if TYPE_CHECKING:
     from calib.rig import Rig
     from drivers.source import Source
+    from stereo_sfm.commands._step import Stepper
     from stereo_sfm.config import Config
     from stereo_sfm.eval.record import RunRecord
     from stereo_sfm.log.provenance import Opening
@@ -203,12 +204,14 @@ def execute(
     sinks = [record] if pictures is None else [record, pictures]
     # Images reach the sinks only where the stages share this process.
     mode = "realtime" if args.realtime else args.mode
-    wiring = Wiring(args.inline or pictures is not None, mode, args.log, args.image_format, args.viz)
+    stepper = _stepper(args)
+    inline = args.inline or pictures is not None or stepper is not None  # the next frame waits for the user
+    wiring = Wiring(inline, mode, args.log, args.image_format, args.viz)
     with Session(choice, config, sinks, wiring, folders, args.output, args.overwrite, replayed) as session:
         if pictures is not None:
             pictures.folder = session.folder / "matches"
         begin = time.perf_counter()
-        interrupted, problem = _follow(session, record, args.quiet)
+        interrupted, problem = _follow(session, record, args.quiet or stepper is not None, stepper)
         wall_s = time.perf_counter() - begin
     folder, info = session.folder, session.info
     stats, evaluations = write_results(
@@ -238,7 +241,17 @@ def _match_pictures(every: int | None) -> MatchPictures | None:
     return MatchPictures(every)
 
 
-def _follow(session: Session, record: RunRecord, quiet: bool) -> tuple[bool, StereoSfmError | None]:
+def _stepper(args: argparse.Namespace) -> Stepper | None:
+    if not getattr(args, "step", False):
+        return None
+    from stereo_sfm.commands._step import Stepper
+
+    return Stepper(args.seek)
+
+
+def _follow(
+    session: Session, record: RunRecord, quiet: bool, stepper: Stepper | None = None
+) -> tuple[bool, StereoSfmError | None]:
     """To the end, to Ctrl-C, or to an error; what was tracked until then stays in the record."""
     from stereo_sfm.commands._progress import progress
     from stereo_sfm.commands._stop import StopRequest
@@ -247,7 +260,7 @@ def _follow(session: Session, record: RunRecord, quiet: bool) -> tuple[bool, Ste
         try:
             for frame in session:
                 bar.show(frame)
-                if stop.asked:
+                if stop.asked or (stepper is not None and not stepper.go_on(frame)):
                     session.stop()
         except KeyboardInterrupt:
             return True, None

@@ -1,0 +1,65 @@
+"""`replay --step` and `--seek`: one frame at a time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from stereo_sfm.cli import main
+
+SPEC = "sim:aisle?camera=pinhole&size=320x200&rate=10&frames=8"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("step") / "run"
+    options = ["--inline", "-q", "--max-lost", "100", "--set", "tracker.max_features=100"]
+    assert main(["run", SPEC, "-o", str(folder), *options]) == 0
+    return folder
+
+
+def step(run: Path, out: Path, typed: list[str], monkeypatch: pytest.MonkeyPatch, *options: str) -> int:
+    """Replay with a user who types these lines and then closes the input."""
+
+    def answer(prompt: str) -> str:
+        if not typed:
+            raise EOFError
+        return typed.pop(0)
+
+    monkeypatch.setattr("builtins.input", answer)
+    return main(["replay", str(run), "-o", str(out), "--step", "-q", *options])
+
+
+def shown(text: str) -> list[int]:
+    return [int(line.split()[1]) for line in text.splitlines() if line.startswith("frame ")]
+
+
+def test_every_frame_is_shown_and_the_result_is_the_same(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert step(run, tmp_path / "a", [""] * 8, monkeypatch, "--check") == 0
+    out = capsys.readouterr().out
+    assert shown(out) == list(range(8))
+    assert "OK, " in out and "identical" in out
+
+
+def test_seek_goes_to_a_time_first(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert step(run, tmp_path / "b", [""] * 8, monkeypatch, "--seek", "0.45") == 0
+    assert shown(capsys.readouterr().out) == [5, 6, 7]
+
+
+@pytest.mark.parametrize("typed", [["", "q"], [""]])
+def test_the_user_may_stop(
+    typed: list[str], run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    step(run, tmp_path / "c", list(typed), monkeypatch)
+    assert shown(capsys.readouterr().out) == [0, 1]
+    assert len((tmp_path / "c" / "trajectory_odom.tum").read_text().splitlines()) < 8
+
+
+def test_seek_alone_says_what_it_needs(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", str(run), "--seek", "2"]) == 2
+    assert "--seek goes with --step" in capsys.readouterr().err
