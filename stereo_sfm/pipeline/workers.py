@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import logging
 import os
 import signal
@@ -256,6 +257,12 @@ def run_mapper(
     to_optimizer.close()
 
 
+def release_memory() -> None:
+    """Give what was freed back to the system, where the C library can do that (glibc)."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL("libc.so.6").malloc_trim(0)
+
+
 def run_optimizer(to_main: Outbox, control: Connection, jobs: Connection, results: Connection) -> None:
     """Full bundle adjustments, beside the mapper."""
     from stereo_sfm.mapping.mapper import Job, run_job
@@ -266,6 +273,8 @@ def run_optimizer(to_main: Outbox, control: Connection, jobs: Connection, result
     while isinstance(job := inbox.take(), Job):
         delay()
         outbox.send(run_job(job))
+        del job
+        release_memory()
     outbox.close()
 
 
