@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from stereo_sfm.types import Frame
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from stereo_sfm.types import Frame
 
 
 class Stepper:
