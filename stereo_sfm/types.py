@@ -152,13 +152,16 @@ class MapUpdate(Message):
 
     version: int
     kf_id: int  # the keyframe it answers
-    kf_ids: I64  # (K,) keyframes whose pose changed
+    kf_ids: I64  # (K,) living keyframes that are new or moved
     map_T_kf: F64  # (K, 4, 4) their new poses
     point_ids: I64  # (P,) new or moved points, in track ids
     points_map: F64  # (P, 3)
     culled_point_ids: I64  # (C,)
     fused_point_ids: I64  # (D, 2) old id -> id that replaces it
     map_T_odom: F64  # (4, 4)
+    culled_kf_ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))  # (R,) keyframes that the map gave up
+    carrier_kf_ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))  # (R,) what each moves with from now on
+    carrier_T_kf: F64 = field(default_factory=lambda: np.zeros((0, 4, 4)))  # (R, 4, 4) its place there
 
 
 @dataclass(frozen=True, eq=False)

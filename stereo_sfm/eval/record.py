@@ -9,6 +9,7 @@ import numpy as np
 
 from stereo_sfm.export.trajectories import fill_missing
 from stereo_sfm.geometry import se3
+from stereo_sfm.mapping.keyframe_poses import KeyframePoses
 from stereo_sfm.pipeline.sinks import Health, SourceCounters, StageTimes
 from stereo_sfm.types import (
     F64,
@@ -70,7 +71,7 @@ class RunRecord:
     health: dict[str, list[Health]] = field(default_factory=dict[str, list[Health]])  # by stage
     dropped: int = 0
     source_counts: dict[str, float] = field(default_factory=dict[str, float])  # of a live camera, at the end
-    map_T_kf: dict[int, F64] = field(default_factory=dict[int, F64])
+    map_T_kf: KeyframePoses = field(default_factory=KeyframePoses)
     map_points: set[int] = field(default_factory=set[int])
     seen_points: set[int] = field(default_factory=set[int])
     loops: list[LoopResult] = field(default_factory=list[LoopResult])
@@ -117,7 +118,7 @@ class RunRecord:
         )
 
     def _put_update(self, update: MapUpdate) -> None:
-        self.map_T_kf.update(zip(update.kf_ids.tolist(), update.map_T_kf, strict=True))
+        self.map_T_kf.update(update)
         self.map_points.update(update.point_ids.tolist())
         self.map_points.difference_update(update.culled_point_ids.tolist(), update.fused_point_ids[:, 0].tolist())
 
@@ -146,11 +147,10 @@ class RunRecord:
         """map_T_cam of the tracked frames after the last map update; None without a map."""
         if not self.map_T_kf:
             return None
-        return self._trajectory([self._map_pose(row) for row in self.frames])
-
-    def _map_pose(self, row: FrameRow) -> F64:
-        reference = self.map_T_kf.get(row.reference_kf_id)
-        return row.odom_T_cam if reference is None else reference @ row.kf_T_cam
+        known = self.map_T_kf.all()
+        return self._trajectory(
+            [known[f.reference_kf_id] @ f.kf_T_cam if f.reference_kf_id in known else f.odom_T_cam for f in self.frames]
+        )
 
     def _trajectory(self, poses: list[F64]) -> Trajectory:
         keep = np.flatnonzero(self.tracked())
@@ -159,8 +159,8 @@ class RunRecord:
 
     def keyframe_trajectory(self) -> Trajectory:
         """Of the keyframes, in the map where there is one."""
-        rows = sorted(self.keyframes.items())
-        poses = [self.map_T_kf.get(kf_id, row.odom_T_cam) for kf_id, row in rows]
+        rows, known = sorted(self.keyframes.items()), self.map_T_kf.all()
+        poses = [known.get(kf_id, row.odom_T_cam) for kf_id, row in rows]
         stamps = np.array([row.stamp_ns for _, row in rows], np.int64)
         return Trajectory(stamps, np.array(poses).reshape(-1, 4, 4))
 

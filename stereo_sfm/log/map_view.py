@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from stereo_sfm.mapping.keyframe_poses import KeyframePoses
 from stereo_sfm.types import F64, I64, Keyframe, LoopResult, MapUpdate
 
 COVISIBLE_KEYFRAMES = 20  # how far back edges are looked for
@@ -18,14 +19,14 @@ class MapView:
     def __init__(self) -> None:
         self.point_ids: I64 = np.zeros(0, np.int64)
         self.points: F64 = np.zeros((0, 3))
-        self._poses: dict[int, F64] = {}  # kf_id -> map_T_kf
+        self._poses = KeyframePoses()
         self._recent: list[Keyframe] = []
         self._covisible: list[tuple[int, int]] = []
         self._loops: list[tuple[int, int]] = []
 
     def keyframe(self, keyframe: Keyframe, map_T_odom: F64) -> None:
         """A new keyframe, at its odometry pose until the mapper moves it."""
-        self._poses[keyframe.kf_id] = map_T_odom @ keyframe.odom_T_cam
+        self._poses.add(keyframe.kf_id, map_T_odom @ keyframe.odom_T_cam)
         for other in self._recent:
             if np.isin(keyframe.point_ids, other.point_ids, assume_unique=True).sum() >= COVISIBLE_POINTS:
                 self._covisible.append((other.kf_id, keyframe.kf_id))
@@ -38,8 +39,7 @@ class MapView:
 
     def update(self, update: MapUpdate) -> None:
         """The mapper's new poses and points."""
-        for kf_id, pose in zip(update.kf_ids.tolist(), update.map_T_kf, strict=True):
-            self._poses[kf_id] = pose
+        self._poses.update(update)
         gone = np.concatenate([update.culled_point_ids, update.fused_point_ids[:, 0], update.point_ids])
         keep = ~np.isin(self.point_ids, gone)
         ids = np.concatenate([self.point_ids[keep], update.point_ids])
@@ -53,18 +53,15 @@ class MapView:
         return len(self._poses)
 
     @property
-    def keyframe_ids(self) -> I64:
-        """(K,) ascending."""
-        return np.array(sorted(self._poses), np.int64)
-
-    @property
-    def trajectory(self) -> F64:
-        """(K, 4, 4) map_T_kf in the order of their ids."""
-        return np.array([self._poses[k] for k in sorted(self._poses)]).reshape(-1, 4, 4)
+    def trajectory(self) -> tuple[I64, F64]:
+        """(K,) ids, ascending, and (K, 4, 4) map_T_kf of all keyframes."""
+        poses = self._poses.all()
+        return np.array(list(poses), np.int64), np.array(list(poses.values())).reshape(-1, 4, 4)
 
     @property
     def covisibility_lines(self) -> F64:
-        """(2E, 3) ends of the edges between keyframes that see the same points."""
+        """(2E, 3) ends of the edges between living keyframes that see the same points."""
+        self._covisible = [(i, j) for i, j in self._covisible if self._poses.lives(i) and self._poses.lives(j)]
         return self._lines(self._covisible)
 
     @property
@@ -73,5 +70,6 @@ class MapView:
         return self._lines(self._loops)
 
     def _lines(self, edges: Iterable[tuple[int, int]]) -> F64:
-        known = [(i, j) for i, j in edges if i in self._poses and j in self._poses]
-        return np.array([self._poses[k][:3, 3] for edge in known for k in edge]).reshape(-1, 3)
+        poses = self._poses.all()
+        known = [(i, j) for i, j in edges if i in poses and j in poses]
+        return np.array([poses[k][:3, 3] for edge in known for k in edge]).reshape(-1, 3)

@@ -255,12 +255,12 @@ class RunLog:
             self._show_points()
 
     def _show_trajectory(self) -> None:
-        poses = self._map.trajectory
+        kf_ids, poses = self._map.trajectory
         if not len(poses):
             return
         stamp, sequence = self._last
         self._writer.write(topics.TRAJECTORY, foxglove.poses_in_frame("map", stamp, poses), stamp, sequence)
-        path = foxglove.point_cloud("map", stamp, poses[:, :3, 3], self._map.keyframe_ids, PATH_COLOR)
+        path = foxglove.point_cloud("map", stamp, poses[:, :3, 3], kf_ids, PATH_COLOR)
         self._writer.write(topics.PATH, path, stamp, sequence)
         lines = [
             ("covisibility", foxglove.line_list(self._map.covisibility_lines, (0.4, 0.6, 1.0, 0.4), 1.0)),

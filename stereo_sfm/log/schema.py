@@ -56,6 +56,7 @@ SHAPES: dict[str, tuple[int, ...]] = {
     "points_map": (-1, 3),
     "descriptors": (-1, 32),
     "map_T_kf": (-1, 4, 4),
+    "carrier_T_kf": (-1, 4, 4),
     "fused_point_ids": (-1, 2),
     "matches": (-1, 2),
 }

@@ -48,7 +48,7 @@ def apply_loop(map_: Map, loop: LoopResult, earlier: Sequence[LoopResult], confi
     a, b = map_.kf_row(loop.candidate_kf_id), map_.kf_row(loop.kf_id)
     if not (map_.keyframes.alive[a] and map_.keyframes.alive[b]):
         return Correction(False, 0.0, [])
-    before = map_.keyframes.map_T_kf.copy()
+    before = map_.keyframe_poses()
     if config.correction == "averaging":
         after = _averaged(before, a, b, before[a] @ loop.candidate_T_kf)
     elif config.correction == "pose_graph":

@@ -25,8 +25,10 @@ from stereo_sfm.types import F32, F64, I64, U8, Keyframe
 class MapDelta:
     """What changed since the last delta, as copies."""
 
-    kf_rows: I64  # (K,) new or moved keyframes, culled ones too, ascending
+    kf_rows: I64  # (K,) new or moved living keyframes, ascending
     map_T_kf: F64  # (K, 4, 4)
+    culled_kf: I64  # (R, 2) rows: a culled keyframe, the keyframe that carries it
+    carrier_T_kf: F64  # (R, 4, 4) its place there
     pt_rows: I64  # (P,) new or moved living points, ascending
     xyz: F64  # (P, 3)
 
@@ -64,8 +66,9 @@ class Map:
         self.covisibility = Covisibility()
         self._kf_rows: dict[int, int] = {}
         self._pt_rows = np.full(1024, -1, np.int32)  # by id
-        self._carried: dict[int, list[int]] = {}
         self._changed_kf: set[int] = set()
+        self._culled_kf: list[tuple[int, int]] = []
+        self._culled_offset: list[F64] = []
         self._changed_pt: list[I64] = []
 
     # -- looking up --------------------------------------------------------------------------------------------------
@@ -188,14 +191,16 @@ class Map:
     # -- changing ----------------------------------------------------------------------------------------------------
 
     def move_keyframes(self, rows: I64, map_T_kf: F64) -> None:
-        """New poses; culled keyframes follow their carriers, points stay (see `carry_points`)."""
+        """New poses; points stay (see `carry_points`)."""
         self.keyframes.map_T_kf[rows] = map_T_kf
         self._changed_kf.update(rows.tolist())
-        carried = [c for row in rows.tolist() for c in self._carried.get(row, ())]
-        if carried:
-            pose = self.keyframes.map_T_kf
-            pose[carried] = pose[self.keyframes.carrier[carried]] @ self.keyframes.carrier_T_kf[carried]
-            self._changed_kf.update(carried)
+
+    def keyframe_poses(self) -> F64:
+        """(K, 4, 4) map_T_kf of every row; culled keyframes are where their carriers have taken them."""
+        poses = self.keyframes.map_T_kf.copy()
+        gone = np.flatnonzero(~self.keyframes.alive)
+        poses[gone] = poses[self.keyframes.carrier[gone]] @ self.keyframes.carrier_T_kf[gone]
+        return poses
 
     def move_points(self, rows: I64, xyz: F64) -> None:
         """New positions in the map frame."""
@@ -206,10 +211,11 @@ class Map:
         """Points follow their anchors after a correction.
 
         Args:
-            before, after: (K, 4, 4) map_T_kf of every keyframe row before and after it.
+            before, after: (K, 4, 4) map_T_kf before and after it by row, right for the living keyframes.
         """
         rows = self.living_points()
         anchor = self.points.anchor[rows]
+        anchor = np.where(self.keyframes.alive[anchor], anchor, self.keyframes.carrier[anchor])
         local = np.einsum("nji,nj->ni", before[anchor, :3, :3], self.points.xyz[rows] - before[anchor, :3, 3])
         self.move_points(rows, np.einsum("nij,nj->ni", after[anchor, :3, :3], local) + after[anchor, :3, 3])
 
@@ -245,10 +251,12 @@ class Map:
     def cull_keyframe(self, row: int) -> None:
         """A keyframe that goes.
 
-        Its points pass to the oldest keyframe that still sees them; its pose stays known, tied to the living keyframe
+        Its points pass to the oldest keyframe that still sees them; its place stays known, tied to the living keyframe
         that shared most points with it (else to the one before it).
         """
-        self._carry(row)
+        carrier = self._carry(row)
+        self._culled_kf.append((row, carrier))
+        self._culled_offset.append(self.keyframes.carrier_T_kf[row].copy())
         rows = self.observations_of_keyframe(row)
         points = self.observations.pt[rows].astype(np.int64)
         self.remove_observations(rows)
@@ -260,14 +268,17 @@ class Map:
             if len(seen):
                 self.points.anchor[point] = seen.min()
 
-    def _carry(self, row: int) -> None:
+    def _carry(self, row: int) -> int:
+        """Tie a keyframe, and those that it carries, to another. Returns that one's row."""
         others, _ = self.covisibility.neighbours(row)
         carrier = int(others[0]) if len(others) else max(int(self.keyframes.previous[row]), 0)
-        going = [row, *self._carried.pop(row, ())]
-        pose = self.keyframes.map_T_kf
-        self.keyframes.carrier[going] = carrier
-        self.keyframes.carrier_T_kf[going] = se3.inverse(pose[carrier]) @ pose[going]
-        self._carried.setdefault(carrier, []).extend(going)
+        table = self.keyframes
+        carrier_T_row = se3.inverse(table.map_T_kf[carrier]) @ table.map_T_kf[row]
+        carried = np.flatnonzero(table.carrier == row)
+        table.carrier_T_kf[carried] = carrier_T_row @ table.carrier_T_kf[carried]
+        table.carrier_T_kf[row] = carrier_T_row
+        table.carrier[carried], table.carrier[row] = carrier, carrier
+        return carrier
 
     def fuse(self, old: int, new: int, sigma: float = 1.0) -> None:
         """The points of two rows are one: `new` takes over the observations and the names of `old`.
@@ -348,11 +359,15 @@ class Map:
     def take_delta(self) -> MapDelta:
         """What changed since the last call."""
         kf = np.array(sorted(self._changed_kf), np.int64)
+        kf = kf[self.keyframes.alive[kf]]
+        culled = np.array(self._culled_kf, np.int64).reshape(-1, 2), np.array(self._culled_offset).reshape(-1, 4, 4)
         pt = np.unique(np.concatenate([np.zeros(0, np.int64), *self._changed_pt]))
         pt = pt[self.points.alive[pt] & np.isfinite(self.points.xyz[pt, 0])]
         self._changed_kf.clear()
         self._changed_pt.clear()
-        return MapDelta(kf, self.keyframes.map_T_kf[kf], pt, self.points.xyz[pt])
+        self._culled_kf.clear()
+        self._culled_offset.clear()
+        return MapDelta(kf, self.keyframes.map_T_kf[kf], *culled, pt, self.points.xyz[pt])
 
     def snapshot(self) -> MapSnapshot:
         """Everything that lives."""

@@ -156,6 +156,9 @@ class Mapper:
             culled_point_ids=self.map.points.pt_id[culled],
             fused_point_ids=fused,
             map_T_odom=self._map_T_odom.copy(),
+            culled_kf_ids=self.map.keyframes.kf_id[delta.culled_kf[:, 0]],
+            carrier_kf_ids=self.map.keyframes.kf_id[delta.culled_kf[:, 1]],
+            carrier_T_kf=delta.carrier_T_kf,
         )
 
     # -- loops -------------------------------------------------------------------------------------------------------

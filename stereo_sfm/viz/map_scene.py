@@ -76,7 +76,7 @@ class MapScene:
 
     def show(self) -> None:
         """The whole map."""
-        points, poses = self._map.points, self._map.trajectory
+        points, (_, poses) = self._map.points, self._map.trajectory
         # Colour is height: y points down where the first camera was upright.
         cloud = rr.Points3D(points, radii=rr.Radius.ui_points(1.3), colors=spread_colors(-points[:, 1]))
         self._rec.log("map/points", cloud)

@@ -252,12 +252,12 @@ def test_points_trajectory_and_edges_are_the_map_at_the_end(run: Path) -> None:
     np.testing.assert_array_equal(rows["xyz"], np.float32([expected[i] for i in sorted(expected)]))
     poses = _all(run, topics.TRAJECTORY, PosesInFrame)[-1].poses
     positions = [[p.position.x, p.position.y, p.position.z] for p in poses]
-    np.testing.assert_array_equal(positions, view.trajectory[:, :3, 3])
+    np.testing.assert_array_equal(positions, view.trajectory[1][:, :3, 3])
     scene = _all(run, topics.SCENE, SceneUpdate)[-1]
     lines = {e.id: [[p.x, p.y, p.z] for p in e.lines[0].points] for e in scene.entities}
     np.testing.assert_array_equal(lines["loops"], view.loop_lines)
     assert len(lines["loops"]) == 4  # two loops
-    np.testing.assert_array_equal(lines["loops"][0], view.trajectory[1, :3, 3])
+    np.testing.assert_array_equal(lines["loops"][0], view.trajectory[1][1, :3, 3])
     assert len(lines["covisibility"]) == 2 * 9  # each keyframe shares 30 of 40 points with the one before
 
 

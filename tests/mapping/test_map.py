@@ -204,6 +204,25 @@ def test_culled_keyframe_leaves_the_chain_and_its_points_find_another_anchor() -
     assert (snap.obs_kf < 2).all() and (snap.anchors[np.isin(snap.pt_ids, [0, 11, 12])] >= 0).all()
 
 
+def test_culled_keyframes_move_with_what_carries_them_and_are_told_once() -> None:
+    m = Map()
+    for k in range(4):
+        insert(m, keyframe(k, np.array([0, 10 + k])))
+    poses = m.keyframes.map_T_kf.copy()
+    m.cull_keyframe(1)  # carried by 0, which shares point 0, then with 0 by the next
+    m.cull_keyframe(0)
+    delta = m.take_delta()
+    assert delta.culled_kf[:, 0].tolist() == [1, 0] and delta.kf_rows.tolist() == [2, 3]
+    carrier = int(m.keyframes.carrier[0])
+    assert m.keyframes.carrier[1] == carrier and m.keyframes.alive[carrier]
+    np.testing.assert_allclose(m.keyframe_poses(), poses, atol=1e-12)
+    move = se3.exp(np.array([1.0, -2, 0.5, 0.3, 0.2, -0.1]))
+    m.move_keyframes(np.array([carrier]), (move @ poses[carrier])[None])
+    np.testing.assert_allclose(m.keyframe_poses()[:2], move @ poses[:2], atol=1e-12)
+    delta = m.take_delta()
+    assert delta.kf_rows.tolist() == [carrier] and len(delta.culled_kf) == 0  # what is carried costs nothing
+
+
 def test_neighbours_come_in_order() -> None:
     m = Map()
     insert(m, keyframe(0, np.arange(0, 5)))

@@ -11,6 +11,7 @@ from calib.rig import Rig
 from stereo_sfm.config import MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.correction import loop_is_known
+from stereo_sfm.mapping.keyframe_poses import KeyframePoses
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.mapping.mapper import Mapper, run_job
 from stereo_sfm.types import F64, LoopResult, MapUpdate
@@ -81,16 +82,19 @@ def test_updates_alone_rebuild_the_map() -> None:
     """Whoever applies every update has the mapper's poses and points."""
     stream = place(20)
     mapper, updates = run(stream)
-    poses: dict[int, F64] = {}
+    poses = KeyframePoses()
     points: dict[int, F64] = {}
     for version, update in enumerate(updates, start=1):
         assert update.version == version
-        poses.update(zip(update.kf_ids.tolist(), update.map_T_kf, strict=True))
+        poses.update(update)
         points.update(zip(update.point_ids.tolist(), update.points_map, strict=True))
         for gone in [*update.culled_point_ids.tolist(), *update.fused_point_ids[:, 0].tolist()]:
             points.pop(gone, None)
     m = mapper.map
-    np.testing.assert_array_equal([poses[int(k)] for k in m.keyframes.kf_id], m.keyframes.map_T_kf)
+    assert (~m.keyframes.alive).any() and list(poses.all()) == m.keyframes.kf_id.tolist()
+    np.testing.assert_allclose(list(poses.all().values()), m.keyframe_poses(), rtol=0, atol=1e-12)
+    rows = m.living_keyframes()
+    np.testing.assert_array_equal([poses.all()[int(k)] for k in m.keyframes.kf_id[rows]], m.keyframes.map_T_kf[rows])
     rows = m.living_points()
     assert sorted(points) == sorted(m.points.pt_id[rows].tolist())
     np.testing.assert_array_equal([points[int(i)] for i in m.points.pt_id[rows]], m.points.xyz[rows])

@@ -1,0 +1,46 @@
+"""The keyframes' poses as the mapper's updates tell them, for whoever follows a run from outside the mapper."""
+
+from __future__ import annotations
+
+from stereo_sfm.types import F64, MapUpdate
+
+
+class KeyframePoses:
+    """map_T_kf of every keyframe that there was. A culled keyframe moves with the one that carries it."""
+
+    def __init__(self) -> None:
+        self._poses: dict[int, F64] = {}  # of living keyframes: map_T_kf
+        self._carried: dict[int, tuple[int, F64]] = {}  # of culled ones: carrier's id, carrier_T_kf
+
+    def __len__(self) -> int:
+        return len(self._poses) + len(self._carried)
+
+    def lives(self, kf_id: int) -> bool:
+        """Whether the keyframe is known and not culled."""
+        return kf_id in self._poses
+
+    def add(self, kf_id: int, map_T_kf: F64) -> None:
+        """A keyframe that no update has told of yet."""
+        self._poses[kf_id] = map_T_kf
+
+    def update(self, update: MapUpdate) -> None:
+        """Take the poses of one update."""
+        self._poses.update(zip(update.kf_ids.tolist(), update.map_T_kf, strict=True))
+        culled, carriers = update.culled_kf_ids.tolist(), update.carrier_kf_ids.tolist()
+        for kf_id, carrier, carrier_T_kf in zip(culled, carriers, update.carrier_T_kf, strict=True):
+            self._poses.pop(kf_id, None)
+            self._carried[kf_id] = carrier, carrier_T_kf
+
+    def all(self) -> dict[int, F64]:
+        """map_T_kf (4, 4) by id, ascending. What is carried by a keyframe that no update told of is left out."""
+        out = dict(self._poses)
+        for kf_id in self._carried:
+            way, at = list[int](), kf_id
+            while at not in out and at in self._carried:
+                way.append(at)
+                at = self._carried[at][0]
+            if at in out:
+                for k in reversed(way):
+                    carrier, carrier_T_kf = self._carried[k]
+                    out[k] = out[carrier] @ carrier_T_kf
+        return dict(sorted(out.items()))
