@@ -6,12 +6,13 @@ and the odometry pose does not.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import connected_components, dijkstra
 
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.errors import StereoSfmError
@@ -23,6 +24,7 @@ from stereo_sfm.types import F64, I64, LoopResult
 
 STRONG = 30  # shared points that make an edge of the pose graph beside those of the walk
 ODOMETRY = 0.004, 0.0006  # metres and radians per metre that an edge of the walk may be wrong by
+DRIFT = 0.003, 0.0003  # metres and radians per metre that a walk as a whole may drift by: scale and heading
 LOOP_SIGMAS = 0.01, 0.003  # metres, radians: at least this uncertain
 
 
@@ -102,7 +104,7 @@ def _optimised(
     map_: Map, before: F64, loop: LoopResult, earlier: Sequence[LoopResult], config: LoopConfig
 ) -> F64 | None:
     a, b = map_.kf_row(loop.candidate_kf_id), map_.kf_row(loop.kf_id)
-    walk = walk_edges(map_, before)
+    walk = _loosened(walk_edges(map_, before), before, a, b)
     closed = loop_edges(map_, [*earlier, loop])
     piece = _pieces(len(before), walk, closed, len(closed) - 1)
     start = before
@@ -131,6 +133,23 @@ def walk_edges(map_: Map, poses: F64) -> Edges:
                 pairs.add((min(row, other), max(row, other)))
     table = np.array(sorted(pairs), np.int64).reshape(-1, 2)
     return edges_of_poses(poses, table[:, 0], table[:, 1], *ODOMETRY)
+
+
+def _loosened(walk: Edges, poses: F64, a: int, b: int) -> Edges:
+    """The edges of the walk as uncertain as drift from row a to row b makes them.
+
+    A wrong scale or a turning heading is alike in all edges. Their errors add up along the way instead of averaging
+    out, and edges beside each other know nothing that one alone does not. The sum of the variances of the edges of
+    DRIFT along the way is (DRIFT * way)^2.
+    """
+    length = np.linalg.norm(poses[walk.j, :3, 3] - poses[walk.i, :3, 3], axis=1)
+    graph = scipy.sparse.coo_array((length + 1e-9, (walk.i, walk.j)), shape=(len(poses), len(poses))).tocsr()
+    way = float(dijkstra(graph, directed=False, indices=a)[b])
+    if not np.isfinite(way):
+        return walk
+    beside = len(walk) / max(len(np.unique(walk.j)), 1)
+    drift = np.square(DRIFT) * (length * way)[:, None]
+    return dataclasses.replace(walk, sigmas=np.sqrt(beside * (walk.sigmas**2 + drift)))
 
 
 def loop_edges(map_: Map, loops: Sequence[LoopResult]) -> Edges:

@@ -12,7 +12,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.correction import apply_loop
 from stereo_sfm.mapping.map import Map
-from stereo_sfm.types import F64, LoopResult
+from stereo_sfm.types import F64, Keyframe, LoopResult
 from tests.loop.store_walk import StoreWalk, make_walk
 
 
@@ -80,6 +80,54 @@ def test_loop_takes_the_drift_away_and_carries_the_points(walk: StoreWalk) -> No
     assert len(done.fused) == len(loop.matches) > 20
     assert len(map_.living_points()) == alive - len(done.fused)
     assert map_.covisibility.neighbours(b)[0].tolist().count(a) == 1  # the two sides now share points
+
+
+def turning_walk(degrees_per_100m: float, side_m: float = 30.0, step_m: float = 0.5) -> tuple[Map, F64]:
+    """A map of keyframes around a square back to its beginning, whose heading drifts, and the truth of its poses."""
+    truth, drifted = [np.eye(4)], [np.eye(4)]
+    per_side = round(side_m / step_m)
+    for k in range(4 * per_side):
+        turn = np.pi / 2 if (k + 1) % per_side == 0 else 0.0
+        ahead = se3.exp(np.array([0, 0, step_m, 0, 0, 0]))
+        truth.append(truth[-1] @ ahead @ se3.exp(np.array([0, 0, 0, 0, turn, 0])))
+        turn += np.radians(degrees_per_100m) / 100 * step_m
+        drifted.append(drifted[-1] @ ahead @ se3.exp(np.array([0, 0, 0, 0, turn, 0])))
+    map_ = Map()
+    for k, pose in enumerate(drifted):
+        ids = np.arange(20 * k, 20 * k + 100)  # 80 points shared with the keyframe before, 40 with the third
+        seen = Keyframe(
+            k, k, k, pose, ids, np.ones((100, 2)), np.ones((100, 2)), np.ones((100, 3)),
+            np.ones((100, 32), np.uint8), np.zeros(100, np.float32), 0, np.eye(6),
+        )  # fmt: skip
+        row = map_.add_keyframe(seen, pose)
+        new = map_.point_rows(ids) < 0
+        map_.add_points(ids[new], se3.transform(pose, np.ones((new.sum(), 3))), row)
+        map_.observe(row, map_.point_rows(ids), seen.uv_left, seen.uv_right, seen.descriptors, seen.angles)
+    return map_, np.array(truth)
+
+
+@pytest.mark.parametrize("degrees_per_100m", [0.5, 2.0, 5.0])
+def test_a_walk_whose_heading_drifts_evenly_closes(degrees_per_100m: float) -> None:
+    """Such errors add up: after 120 m the ends are 0.2 to 2.2 m apart, and the true loop is believed."""
+    map_, truth = turning_walk(degrees_per_100m)
+    last = len(truth) - 1
+    before = trajectory_error(map_, truth)
+    loop = LoopResult(
+        last, 0, se3.inverse(truth[0]) @ truth[last], np.eye(6) * 1e6, np.zeros((0, 2), np.int64), 50, 0.3, ""
+    )
+    assert apply_loop(map_, loop, [], LoopConfig()).applied
+    assert trajectory_error(map_, truth) < 0.2 * before
+
+
+def test_a_loop_that_no_drift_explains_is_refused() -> None:
+    """The next aisle looks the same: 1.5 m aside after 40 m."""
+    map_, truth = turning_walk(0.5, side_m=10.0)
+    last = len(truth) - 1
+    poses = map_.keyframes.map_T_kf.copy()
+    aside = se3.inverse(truth[0]) @ truth[last] @ se3.exp(np.array([1.5, 0, 0, 0, 0, 0]))
+    loop = LoopResult(last, 0, aside, np.eye(6) * 1e6, np.zeros((0, 2), np.int64), 50, 0.3, "")
+    assert not apply_loop(map_, loop, [], LoopConfig()).applied
+    assert np.array_equal(map_.keyframes.map_T_kf, poses)
 
 
 def test_false_loop_changes_nothing(walk: StoreWalk) -> None:
