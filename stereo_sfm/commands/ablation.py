@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import signal
+import sys
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from stereo_sfm.eval.ablation import Cell
+
+INTERRUPTED = 130
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,10 +47,15 @@ def run(args: argparse.Namespace) -> int:
     store = folder / "cells"
     store.mkdir(parents=True, exist_ok=True)
     missing = [cell for cell in cells if args.again or not finished(load_answer(store / cell.file_name))]
-    if missing:
-        _run_all(missing, store, args.jobs, args.quiet, len(cells))
+    whole = not missing or _run_all(missing, store, args.jobs, args.quiet, len(cells))
     answers = [answer for cell in cells if (answer := load_answer(store / cell.file_name)) is not None]
     report = write_report(folder, answers)
+    if not whole:
+        print(
+            f"interrupted with {len(answers)} of {len(cells)} cells; the same command goes on: {report}",
+            file=sys.stderr,
+        )
+        return INTERRUPTED
     if not args.quiet:
         good = sum(answer["status"] == "ok" for answer in answers)
         print(f"{good} of {len(cells)} cells with a result, {len(cells) - good} with a reason why not: {report}")
@@ -80,29 +91,66 @@ def _chosen(text: str | None, default: Sequence[str], known: Iterable[str], what
     return names
 
 
-def _run_all(cells: Sequence[Cell], store: Path, jobs: int, quiet: bool, total: int) -> None:
-    """Spread the cells over processes; each file is written by the process that computed it."""
+def _run_all(cells: Sequence[Cell], store: Path, jobs: int, quiet: bool, total: int) -> bool:
+    """Spread the cells over processes; each file is written by the process that computed it.
+
+    After Ctrl-C the cells that run are finished, and no other is begun.
+
+    Returns:
+        Whether it came to the end.
+    """
     import multiprocessing
-    from concurrent.futures import ProcessPoolExecutor, as_completed
+    from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+    from concurrent.futures.process import BrokenProcessPool
 
     from rich.console import Console
     from rich.progress import Progress
 
+    from stereo_sfm.commands._stop import StopRequest
     from stereo_sfm.eval.ablation_worker import compute, one_thread
 
     console = Console(stderr=True, quiet=quiet)
     spawn = multiprocessing.get_context("spawn")
+    left, running = list(reversed(cells)), dict[Future[str], str]()
     with (
         ProcessPoolExecutor(jobs, mp_context=spawn, initializer=one_thread) as pool,
         Progress(console=console, transient=True) as progress,
+        StopRequest() as stop,
     ):
         task = progress.add_task("cells", total=total, completed=total - len(cells))
-        waiting = {pool.submit(compute, cell, store / cell.file_name): cell for cell in cells}
         try:
-            for done in as_completed(waiting):
-                cell = waiting[done]
-                console.print(f"{Path(cell.source).name} {cell.name}: {done.result()}")
-                progress.advance(task)
+            while True:
+                while (
+                    left and len(running) < jobs and not stop.asked
+                ):  # what waits in the pool could not be called back
+                    cell = left.pop()
+                    with _ignored_by_children():
+                        running[pool.submit(compute, cell, store / cell.file_name)] = (
+                            f"{Path(cell.source).name} {cell.name}"
+                        )
+                if not running:
+                    return not left
+                for done in wait(running, return_when=FIRST_COMPLETED).done:
+                    console.print(f"{running.pop(done)}: {done.result()}")
+                    progress.advance(task)
+        except BrokenProcessPool:
+            if stop.asked:
+                return False
+            raise StereoSfmError(
+                "a process died while it computed a cell (too little memory? try fewer --jobs); "
+                "what is finished is kept, the same command goes on from there"
+            ) from None
         except KeyboardInterrupt:
-            pool.shutdown(wait=False, cancel_futures=True)
+            for child in multiprocessing.active_children():
+                child.terminate()
             raise
+
+
+@contextmanager
+def _ignored_by_children() -> Generator[None]:
+    """Processes started inside never see Ctrl-C, from their first moment on: this one decides what it means."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

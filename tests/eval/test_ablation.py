@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import signal
+from concurrent.futures import Executor, Future
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -161,3 +163,30 @@ def test_the_overview_has_a_column_for_each_feature_and_a_line_for_each_system()
     assert lines[3] == "| um | tracking | 2 m (2 m), 50 ms | - |"
     assert lines[4] == "| **default** | tracking | 0.5 m (0.5 m), 50 ms | |"
     assert len({line.count("|") for line in lines}) == 1
+
+
+def test_ctrl_c_finishes_the_running_cell_and_begins_no_other(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun: list[Any] = []
+
+    class OneThread(Executor):
+        """Computes at once, while somebody presses Ctrl-C."""
+
+        def __init__(self, *_: object, **__: object) -> None: ...
+
+        def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+            begun.append(args[0])
+            assert signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())  # a process begun now never sees it
+            signal.raise_signal(signal.SIGINT)
+            save_answer(args[1], answer("orb", "um", 0.25))
+            done: Future[Any] = Future()
+            done.set_result("ATE 0.25 m")
+            return done
+
+    monkeypatch.setattr("concurrent.futures.ProcessPoolExecutor", OneThread)
+    chosen = ["--features", "orb", "--odometry", "em-r,r-um", "--stages", "tracking", "--systems", "none", "-q"]
+    assert main(["ablation", SIM, "-o", str(tmp_path), *chosen]) == 130
+    assert len(begun) == 1 and len(list((tmp_path / "cells").iterdir())) == 1
+    assert "interrupted with 1 of 2 cells; the same command goes on" in capsys.readouterr().err
+    assert (tmp_path / "ablation.md").exists()
