@@ -18,6 +18,15 @@ if TYPE_CHECKING:
     from stereo_sfm.eval.ablation import Cell
 
 INTERRUPTED = 130
+# configuration that tells the cells apart -> the option that chooses it
+DECIDED = {
+    "seed": "--seed",
+    "features.kind": "--features",
+    "odometry.method": "--odometry",
+    "mapper.enabled": "--stages",
+    "loop.enabled": "--stages",
+    "loop.correction": "--stages",
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -32,6 +41,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--stages", metavar="A,B", help="of tracking, mapping, averaging, pose_graph (default: all)")
     parser.add_argument("--systems", metavar="A,B", help="presets to add (default: all; none: leave them out)")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="one value in every cell, as odometry.refine=false",
+    )
     parser.add_argument("--seed", type=int, default=0, help="of everything random")
     parser.add_argument("--again", action="store_true", help="compute cells anew that are there already")
     parser.add_argument("-q", "--quiet", action="store_true", help="no progress")
@@ -45,8 +61,9 @@ def run(args: argparse.Namespace) -> int:
     cells = _cells(args)
     folder: Path = args.output
     store = folder / "cells"
-    store.mkdir(parents=True, exist_ok=True)
     missing = [cell for cell in cells if args.again or not finished(load_answer(store / cell.file_name))]
+    _check_sources(missing)
+    store.mkdir(parents=True, exist_ok=True)
     whole = not missing or _run_all(missing, store, args.jobs, args.quiet, len(cells))
     answers = [answer for cell in cells if (answer := load_answer(store / cell.file_name)) is not None]
     report = write_report(folder, answers)
@@ -70,15 +87,37 @@ def _cells(args: argparse.Namespace) -> list[Cell]:
 
     if args.jobs < 1 or args.frames < 0:
         raise StereoSfmError("--jobs must be at least 1 and --frames at least 0")
+    for setting in args.set:
+        key = setting.partition("=")[0].strip()
+        if key in DECIDED:
+            raise StereoSfmError(f"--set {key}: the cells differ in it, choose them with {DECIDED[key]}")
     return ablation.grid(
-        args.sources,
+        _different(args.sources),
         _chosen(args.features, ablation.FEATURES, FEATURES, "features"),
         _chosen(args.odometry, ablation.ESTIMATORS, METHODS, "odometry"),
         _chosen(args.stages, tuple(ablation.STAGES), ablation.STAGES, "stages"),
         () if args.systems == "none" else _chosen(args.systems, ablation.SYSTEMS, PRESETS, "systems"),
         args.frames,
         args.seed,
+        args.set,
     )
+
+
+def _different(sources: Sequence[str]) -> list[str]:
+    """Each source once, as it was first written."""
+    found: dict[str, str] = {}
+    for source in sources:
+        found.setdefault(str(Path(source).resolve()) if Path(source).exists() else source, source)
+    return list(found.values())
+
+
+def _check_sources(cells: Sequence[Cell]) -> None:
+    """Raises StereoSfmError for a source that cannot be opened, before anything is computed."""
+    from drivers.source import open_source
+
+    for source in dict.fromkeys(cell.source for cell in cells):
+        with open_source(source):
+            pass
 
 
 def _chosen(text: str | None, default: Sequence[str], known: Iterable[str], what: str) -> Sequence[str]:

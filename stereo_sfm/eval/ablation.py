@@ -51,6 +51,7 @@ class Cell:
     stage: str  # of STAGES, or "" for what the system does
     frames: int  # at most so many, 0: all
     seed: int = 0
+    settings: tuple[str, ...] = ()  # SECTION.KEY=VALUE, over what the system and the others say
 
     @property
     def name(self) -> str:
@@ -62,8 +63,10 @@ class Cell:
     @property
     def file_name(self) -> str:
         """Unique, readable, the same in every session, and another one when the configuration is another."""
-        settings = (_SCHEMA, dataclasses.astuple(self), dataclasses.asdict(self.config()))
-        digest = hashlib.sha256(repr(settings).encode()).hexdigest()[:8]
+        *others, settings = dataclasses.astuple(self)
+        own = (*others, settings) if settings else tuple(others)
+        described = (_SCHEMA, own, dataclasses.asdict(self.config()))
+        digest = hashlib.sha256(repr(described).encode()).hexdigest()[:8]
         words = re.sub(r"[^a-z0-9]+", "-", f"{Path(self.source).name} {self.name}".lower()).strip("-")
         return f"{words}-{digest}.json"
 
@@ -77,7 +80,8 @@ class Cell:
             for section, values in STAGES.get(self.stage, {}).items()
             for key, value in values.items()
         ]
-        return load(base=preset("default" if self.system == "grid" else self.system), overrides=overrides + stage)
+        base = preset("default" if self.system == "grid" else self.system)
+        return load(base=base, overrides=[*self.settings, *overrides, *stage])
 
 
 def grid(
@@ -88,27 +92,29 @@ def grid(
     systems: Sequence[str] = SYSTEMS,
     frames: int = 0,
     seed: int = 0,
+    settings: Sequence[str] = (),
 ) -> list[Cell]:
-    """Every cell, the quick ones of each source first."""
+    """Every cell once, whatever is named twice; the quick ones of each source first."""
+    given = tuple(dict.fromkeys(settings))
     cells: list[Cell] = []
     for source in sources:
         for system in systems:
             own = stages if system == "default" else ("",)
-            cells += [Cell(source, system, "", "", stage, frames, seed) for stage in own]
+            cells += [Cell(source, system, "", "", stage, frames, seed, given) for stage in own]
         cells += [
-            Cell(source, "grid", kind, method, stage, frames, seed)
+            Cell(source, "grid", kind, method, stage, frames, seed, given)
             for stage in stages
             for method in methods
             for kind in features
         ]
-    return cells
+    return list(dict.fromkeys(cells))
 
 
 def run_cell(cell: Cell) -> dict[str, Any]:
     """Run and judge; every failure becomes a stated reason.
 
     Returns:
-        Plain values for JSON: `status` is "ok" or "none" with `reason`.
+        Plain values for JSON: `status` is "ok" or "none" with `reason`; `opened` once the source was found good.
     """
     from drivers.select import SelectedFrames
     from drivers.source import open_source
@@ -121,6 +127,7 @@ def run_cell(cell: Cell) -> dict[str, Any]:
         config = cell.config()
         source = open_source(cell.source)
         with SelectedFrames(source, max_frames=cell.frames or None) as chosen:
+            answer["opened"] = True
             for _ in run(chosen, config, [record]):
                 pass
             truth = chosen.ground_truth
@@ -186,8 +193,11 @@ def load_answer(path: Path) -> dict[str, Any] | None:
 
 
 def finished(answer: dict[str, Any] | None) -> bool:
-    """Whether a cell need not be run again: it has a result or a refusal, and did not break."""
-    return answer is not None and "traceback" not in answer
+    """Whether a cell need not be run again: it has a result or a refusal.
+
+    One that broke, or whose source could not be opened, is no answer (neither is a refusal that does not tell which).
+    """
+    return answer is not None and "traceback" not in answer and ("frames" in answer or "opened" in answer)
 
 
 def save_answer(path: Path, answer: dict[str, Any]) -> None:

@@ -120,10 +120,16 @@ def _brief(answer: Answer | None) -> str:
 def write_csv(path: Path, answers: Sequence[Answer]) -> None:
     """Every cell of every source."""
     with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, ["source", *COLUMNS], restval="")
+        writer = csv.DictWriter(file, ["source", *COLUMNS, "set"], restval="")
         writer.writeheader()
         for answer in answers:
-            writer.writerow({"source": answer["cell"]["source"], **row_of(answer)})
+            settings = " ".join(_settings(answer))
+            writer.writerow({"source": answer["cell"]["source"], **row_of(answer), "set": settings})
+
+
+def _settings(answer: Answer) -> tuple[str, ...]:
+    """What `--set` changed in a cell."""
+    return tuple(answer["cell"].get("settings", ()))
 
 
 def _ate(answer: Answer | None) -> float:
@@ -259,6 +265,9 @@ def write_report(folder: Path, answers: Sequence[Answer]) -> Path:
         "brackets, and the tracker's median.",
         "",
     ]
+    for settings in dict.fromkeys(map(_settings, answers)):
+        if settings:
+            lines += ["Set in every cell: " + ", ".join(f"`{setting}`" for setting in settings) + ".", ""]
     for number, source in enumerate(dict.fromkeys(a["cell"]["source"] for a in answers)):
         own = [a for a in answers if a["cell"]["source"] == source]
         name = next((a["source_name"] for a in own if "source_name" in a), source)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import signal
 from concurrent.futures import Executor, Future
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -80,7 +81,10 @@ def test_a_cell_is_run_judged_and_kept(tmp_path: Path) -> None:
 def test_broken_cells_are_run_again_refused_ones_are_not() -> None:
     assert not finished(None)
     assert not finished({"schema": 1, "status": "none", "reason": "internal error: x", "traceback": "..."})
-    assert finished({"schema": 1, "status": "none", "reason": "weak_structure in 5 of 5 frames"})
+    assert finished({"schema": 1, "status": "none", "reason": "weak_structure in 5 of 5 frames", "frames": 5})
+    assert finished(run_cell(replace(CELL, features="surf")))  # refused whenever it is asked
+    assert not finished(run_cell(replace(CELL, source="/no/such/folder")))  # perhaps it is not mounted now
+    assert not finished({"schema": 1, "status": "none", "reason": "no such file or folder: /data"})
 
 
 def test_failures_have_reasons() -> None:
@@ -115,7 +119,7 @@ def test_the_report_has_tables_plots_csv_and_published_figures(tmp_path: Path) -
     assert "33.95" in text  # Table II of the thesis is on KITTI 07
     assert "| 2 |" in text  # absolute translation: the root of equation 24's square
     lines = (tmp_path / "ablation.csv").read_text().splitlines()
-    assert lines[0].split(",")[1:] == list(COLUMNS) and len(lines) == 4
+    assert lines[0].split(",") == ["source", *COLUMNS, "set"] and len(lines) == 4
     assert (tmp_path / "01-tracking-sift.png").stat().st_size > 5000
     assert (tmp_path / "01-stages-sift-em-r.png").stat().st_size > 5000
 
@@ -190,3 +194,42 @@ def test_ctrl_c_finishes_the_running_cell_and_begins_no_other(
     assert len(begun) == 1 and len(list((tmp_path / "cells").iterdir())) == 1
     assert "interrupted with 1 of 2 cells; the same command goes on" in capsys.readouterr().err
     assert (tmp_path / "ablation.md").exists()
+
+
+def test_what_is_named_twice_is_one_cell() -> None:
+    assert grid(["a", "a"], ["orb", "orb"], ["um", "um"], ["tracking"] * 2, ["default"] * 2) == grid(
+        ["a"], ["orb"], ["um"], ["tracking"], ["default"]
+    )
+
+
+def test_settings_are_part_of_a_cell_and_leave_the_names_of_others_alone(tmp_path: Path) -> None:
+    plain = replace(CELL, settings=("odometry.refine=false", "odometry.inlier_sigmas=0"))
+    assert not plain.config().odometry.refine and plain.config().odometry.inlier_sigmas == 0.0
+    assert plain.config().odometry.method == "pnp"
+    same = replace(CELL, settings=("odometry.refine=true",))  # as without, but said
+    assert len({CELL.file_name, plain.file_name, same.file_name}) == 3
+    described = (1, (SIM, "grid", "orb", "pnp", "tracking", 0, 0), asdict(CELL.config()))
+    assert hashlib.sha256(repr(described).encode()).hexdigest()[:8] in CELL.file_name  # as before there were settings
+    made = answer("orb", "um", 0.25)
+    made["cell"] = {**made["cell"], "settings": ["odometry.refine=false"]}
+    assert "Set in every cell: `odometry.refine=false`." in write_report(tmp_path, [made]).read_text()
+    assert (tmp_path / "ablation.csv").read_text().splitlines()[1].endswith(",odometry.refine=false")
+    assert "Set in every cell" not in write_report(tmp_path, [answer("orb", "um", 0.25)]).read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["/no/such/folder"], "no such file or folder: /no/such/folder"),
+        ([SIM, "euroc:nowhere"], "no folder nowhere"),
+        ([SIM, "--set", "odometry.refin=false"], "refin"),
+        ([SIM, "--set", "odometry.method=um"], "choose them with --odometry"),
+    ],
+)
+def test_mistakes_are_told_before_any_cell_runs(
+    words: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["ablation", *words, "-o", str(tmp_path / "out"), "--features", "orb", "--systems", "none"]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1 and said in lines[0]
+    assert not (tmp_path / "out").exists()
