@@ -27,6 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--images", metavar="SOURCE", help="with colmap: write the keyframes' pictures of this source too"
     )
+    parser.add_argument("--walk", type=int, metavar="N", help="of a merged map: which walk --images shows (0, 1, ...)")
     parser.add_argument("--resolution", type=float, default=0.05, metavar="M", help="of the floor plan, metres a pixel")
 
 
@@ -38,6 +39,10 @@ def run(args: argparse.Namespace) -> int:
         raise StereoSfmError(f"{args.source} is not the folder of a run or a map")
     if args.resolution <= 0:
         raise StereoSfmError("--resolution must be above 0 metres")
+    if args.images and args.format != "colmap":
+        raise StereoSfmError("--images goes with --format colmap")
+    if args.walk is not None and not args.images:
+        raise StereoSfmError("--walk goes with --images")
     output = args.output or args.source / _default_name(args)
     if output.exists() and not args.overwrite:
         raise StereoSfmError(f"{output} exists: choose another -o, or say --overwrite")
@@ -58,21 +63,18 @@ def _default_name(args: argparse.Namespace) -> str:
 
 
 def _write_map(args: argparse.Namespace, output: Path) -> None:
-    from stereo_sfm.export.colmap import export_colmap
     from stereo_sfm.export.floor_plan import export_floor_plan
     from stereo_sfm.export.g2o import export_g2o
     from stereo_sfm.export.ply import export_ply
 
     saved = _load(args.source)
     writers: dict[str, Callable[[SavedMap, Path], object]] = {
-        "colmap": export_colmap,
+        "colmap": lambda s, path: _write_colmap(s, path, args),
         "ply": export_ply,
         "g2o": export_g2o,
         "floor-plan": lambda s, path: export_floor_plan(s, path, args.resolution),
     }
     writers[args.format](saved, output)
-    if args.images and args.format == "colmap":
-        _write_images(saved, args.images, output)
 
 
 def _load(folder: Path) -> SavedMap:
@@ -86,29 +88,31 @@ def _load(folder: Path) -> SavedMap:
     raise StereoSfmError(f"{folder} holds no map (make one with 'run ... --map-out DIR')")
 
 
-def _write_images(saved: SavedMap, spec: str, folder: Path) -> None:
-    """PNG pictures of the keyframes under folder/images, named as the model names them."""
-    import cv2
-
+def _shown_walk(saved: SavedMap, args: argparse.Namespace) -> int:
+    """The walk whose pictures --images holds."""
     from drivers.source import open_source
-    from stereo_sfm.errors import StereoSfmError
-    from stereo_sfm.export.colmap import image_name
+    from stereo_sfm.export.pictures import check_walk, walk_of_recording
 
-    wanted = set(saved.snapshot.frame_ids.tolist())
-    with open_source(spec) as source:
-        for image in source:
-            if image.frame_id not in wanted:
-                continue
-            wanted.discard(image.frame_id)
-            for eye, pixels in (("left", image.left), ("right", image.right)):
-                if pixels is not None:
-                    path = folder / "images" / image_name(image.frame_id, eye)
-                    path.parent.mkdir(parents=True, exist_ok=True)
-                    cv2.imwrite(str(path), pixels)
-            if not wanted:
-                break
-    if wanted:
-        raise StereoSfmError(f"{spec} lacks {len(wanted)} of the map's keyframes: is it the recording of this map?")
+    check_walk(saved, args.walk)
+    if args.walk is not None:
+        return args.walk
+    if len(saved.walks) == 1:
+        return saved.walks[0]
+    with open_source(args.images) as source:
+        return walk_of_recording(saved, source, args.images)
+
+
+def _write_colmap(saved: SavedMap, output: Path, args: argparse.Namespace) -> None:
+    """The model, and the keyframes' pictures beside it where they are asked for."""
+    from drivers.source import open_source
+    from stereo_sfm.export.colmap import export_colmap
+    from stereo_sfm.export.pictures import write_pictures
+
+    walk = _shown_walk(saved, args) if args.images else 0
+    export_colmap(saved, output)
+    if args.images:
+        with open_source(args.images) as source:
+            write_pictures(saved, source, walk, output, args.images)
 
 
 def _write_trajectory(args: argparse.Namespace, output: Path) -> None:

@@ -21,9 +21,15 @@ HALF_PIXEL = 0.5
 GREY = "128 128 128"
 
 
-def image_name(frame_id: int, eye: str) -> str:
-    """Where COLMAP looks for the picture of a frame, below its image folder."""
-    return f"{eye}/{frame_id:06d}.png"
+def image_name(frame_id: int, eye: str, walk: int | None = None) -> str:
+    """Where COLMAP looks for the picture of a frame, below its image folder; `walk` in maps of several walks only."""
+    return f"{eye}/{frame_id:06d}.png" if walk is None else f"{eye}/walk{walk}/{frame_id:06d}.png"
+
+
+def image_names(saved: SavedMap, eye: str) -> list[str]:
+    """The name of every keyframe's picture; frame ids begin anew in every walk, names do not."""
+    walks: list[int | None] = [None] * len(saved) if len(saved.walks) == 1 else saved.sessions.tolist()
+    return [image_name(k, eye, walk) for k, walk in zip(saved.snapshot.frame_ids.tolist(), walks, strict=True)]
 
 
 def export_colmap(saved: SavedMap, folder: Path) -> None:
@@ -34,7 +40,8 @@ def export_colmap(saved: SavedMap, folder: Path) -> None:
     if rig.right is not None:
         eyes.append(("right", rig.right, se3.inverse(rig.left_T_right), s.uv_right))
     _write_frames(s, len(eyes), folder / "frames.txt")
-    tracks = _write_images(s, eyes, folder / "images.txt")
+    names = [image_names(saved, eye) for eye, *_ in eyes]
+    tracks = _write_images(s, eyes, names, folder / "images.txt")
     errors = _reprojection_errors(s, eyes)
     _write_points(s, tracks, errors, folder / "points3D.txt")
 
@@ -59,17 +66,19 @@ def _write_frames(s: MapSnapshot, eyes: int, path: Path) -> None:
     path.write_text("\n".join(lines) + "\n")
 
 
-def _write_images(s: MapSnapshot, eyes: list[tuple[str, Camera, F64, F64]], path: Path) -> list[list[str]]:
+def _write_images(
+    s: MapSnapshot, eyes: list[tuple[str, Camera, F64, F64]], names: list[list[str]], path: Path
+) -> list[list[str]]:
     """Write all images; returns for each point its track as 'IMAGE_ID INDEX' entries."""
     lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
     bounds = np.searchsorted(s.obs_kf, np.arange(len(s.kf_ids) + 1)).tolist()
     tracks: list[list[str]] = [[] for _ in range(len(s.pt_ids))]
     for k, left_T_map in enumerate(se3.inverse(s.map_T_kf)):
-        for e, (name, _, eye_T_left, uv) in enumerate(eyes):
+        for e, (_, _, eye_T_left, uv) in enumerate(eyes):
             image_id = k * len(eyes) + e + 1
             rows = np.arange(bounds[k], bounds[k + 1])
             rows = rows[np.isfinite(uv[rows, 0])]
-            lines.append(f"{image_id} {_pose(eye_T_left @ left_T_map)} {e + 1} {image_name(int(s.frame_ids[k]), name)}")
+            lines.append(f"{image_id} {_pose(eye_T_left @ left_T_map)} {e + 1} {names[e][k]}")
             pixels, points = (uv[rows] + HALF_PIXEL).tolist(), s.obs_pt[rows].tolist()
             lines.append(" ".join(f"{u!r} {v!r} {p + 1}" for (u, v), p in zip(pixels, points, strict=True)))
             for n, point in enumerate(points):

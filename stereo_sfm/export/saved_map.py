@@ -43,6 +43,11 @@ class SavedMap:
         """Number of keyframes."""
         return len(self.snapshot.kf_ids)
 
+    @property
+    def walks(self) -> list[int]:
+        """The walks that still have keyframes, ascending."""
+        return np.unique(self.sessions).tolist()
+
 
 def save_map(saved: SavedMap, folder: Path) -> None:
     """Write a map folder; what else lies in it stays.

@@ -1,0 +1,83 @@
+"""Pictures of a map's keyframes: each walk's own, from its own recording."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.export.colmap import export_colmap
+from stereo_sfm.export.pictures import check_walk, walk_of_recording, write_pictures
+from stereo_sfm.export.saved_map import SavedMap, joined
+from stereo_sfm.types import StereoImage
+from tests.export.maps import small_map
+
+LATER_NS = 10**12
+
+
+@pytest.fixture(scope="module")
+def saved() -> SavedMap:
+    return small_map()[1]
+
+
+def later(saved: SavedMap, by_ns: int = LATER_NS) -> SavedMap:
+    """The same walk on another day: frame ids begin anew, the clock does not."""
+    return dataclasses.replace(
+        saved, snapshot=dataclasses.replace(saved.snapshot, stamp_ns=saved.snapshot.stamp_ns + by_ns)
+    )
+
+
+def recording(saved: SavedMap, grey: int) -> list[StereoImage]:
+    """One picture of one grey for every keyframe."""
+    s = saved.snapshot
+    picture = np.full((4, 6), grey, np.uint8)
+    return [
+        StereoImage(stamp_ns=t, frame_id=k, left=picture, right=picture)
+        for t, k in zip(s.stamp_ns.tolist(), s.frame_ids.tolist(), strict=True)
+    ]
+
+
+def names_in(folder: Path) -> list[str]:
+    lines = [x for x in (folder / "images.txt").read_text().splitlines() if not x.startswith("#")]
+    return [line.split()[9] for line in lines[::2]]
+
+
+def test_every_picture_of_a_merged_map_has_a_name_of_its_own(tmp_path: Path, saved: SavedMap) -> None:
+    both = joined([saved, later(saved)])
+    export_colmap(both, tmp_path)
+    names = names_in(tmp_path)
+    assert len(set(names)) == len(names) == 4 * len(saved)
+    first = int(saved.snapshot.frame_ids[0])
+    assert names[0] == f"left/walk0/{first:06d}.png" and f"right/walk1/{first:06d}.png" in names
+    pycolmap = pytest.importorskip("pycolmap")
+    assert pycolmap.Reconstruction(str(tmp_path)).num_images() == len(names)
+
+
+def test_each_recording_gives_the_pictures_of_its_own_walk(tmp_path: Path, saved: SavedMap) -> None:
+    both = joined([saved, later(saved)])
+    export_colmap(both, tmp_path)
+    for walk, one in enumerate((saved, later(saved))):
+        pictures = recording(one, 50 + 100 * walk)
+        assert walk_of_recording(both, pictures, "day") == walk
+        write_pictures(both, pictures, walk, tmp_path)
+        assert sum(1 for _ in (tmp_path / "images").rglob("*.png")) == 2 * len(saved) * (walk + 1)
+    for name in names_in(tmp_path):
+        picture = cv2.imread(str(tmp_path / "images" / name), cv2.IMREAD_GRAYSCALE)
+        assert picture is not None and int(picture[0, 0]) == (150 if "walk1" in name else 50)
+
+
+def test_a_recording_that_cannot_be_told_is_refused(tmp_path: Path, saved: SavedMap) -> None:
+    pictures = recording(saved, 50)
+    with pytest.raises(StereoSfmError, match="any of the walks 0, 1 of the map by its times: say --walk N"):
+        walk_of_recording(joined([saved, saved]), pictures, "day")
+    with pytest.raises(StereoSfmError, match="day lacks keyframes of every walk"):
+        walk_of_recording(joined([saved, later(saved)]), pictures[1:], "day")
+    with pytest.raises(StereoSfmError, match="no walk 2"):
+        check_walk(joined([saved, saved]), 2)
+    with pytest.raises(StereoSfmError, match=f"another day lacks {len(saved)} of the map's keyframes"):
+        write_pictures(later(saved), pictures, 0, tmp_path, "another day")
+    assert not list(tmp_path.iterdir())
