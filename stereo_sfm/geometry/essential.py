@@ -13,7 +13,7 @@ import numpy as np
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.epipolar_refine import refine_from_many, refine_motion
 from stereo_sfm.geometry.five_point import five_point
-from stereo_sfm.geometry.procrustes import rotation_between
+from stereo_sfm.geometry.procrustes import refuse_line, rotation_between, rotation_ransac
 from stereo_sfm.geometry.robust import Consensus, Degenerate, ransac
 from stereo_sfm.geometry.two_view import epipolar_residuals, parallax_angles, ray_depths
 from stereo_sfm.types import F64, I64, Bool
@@ -182,6 +182,21 @@ def _small_motion(bearings0: F64, bearings1: F64, chosen: Bool, still: F64, off:
     return RelativePose(rotation, direction, chosen, in_front, parallax, False)
 
 
+def _rotation_alone(
+    bearings0: F64, bearings1: F64, threshold: float, rng: np.random.Generator, refusal: Degenerate
+) -> RelativePose:
+    """The rotation that explains the matches where no essential matrix does: without any noise none is determined."""
+    try:
+        chosen = rotation_ransac(bearings0, bearings1, 2 * threshold, rng).inliers
+        refuse_line(bearings0[chosen], 2 * threshold)
+    except Degenerate:
+        raise refusal from None
+    still = rotation_between(bearings0[chosen], bearings1[chosen])
+    off = parallax_angles(bearings0[chosen], bearings1[chosen], still)
+    none = np.zeros_like(chosen)
+    return RelativePose(still, np.array([0.0, 0.0, 1.0]), chosen, none, float(np.median(off)), True)
+
+
 def relative_pose(
     bearings0: F64,
     bearings1: F64,
@@ -201,13 +216,17 @@ def relative_pose(
     Without `need_direction`, points so far that the sign of their depth is open do not matter.
 
     Raises:
-        Degenerate: as `essential_ransac`, `decompose` and `choose_in_front`.
+        Degenerate: as `essential_ransac`, `decompose` and `choose_in_front`; "collinear" as `refuse_line`.
     """
-    consensus = essential_ransac(
-        bearings0, bearings1, threshold, rng, method=method, max_samples=max_samples, min_ratio=min_ratio
-    )
+    try:
+        consensus = essential_ransac(
+            bearings0, bearings1, threshold, rng, method=method, max_samples=max_samples, min_ratio=min_ratio
+        )
+    except Degenerate as refusal:
+        return _rotation_alone(bearings0, bearings1, threshold, rng, refusal)
     chosen = consensus.inliers
     b0, b1 = bearings0[chosen], bearings1[chosen]
+    refuse_line(b0, 2 * threshold)
     still = rotation_between(b0, b1)
     off = parallax_angles(b0, b1, still)
     if np.mean(off < 2 * threshold) > 0.95:

@@ -34,6 +34,39 @@ def rotation_between(bearings0: F64, bearings1: F64, weights: F64 | None = None)
     return _proper(u, vt)
 
 
+def rotation_ransac(
+    bearings0: F64, bearings1: F64, threshold: float, rng: np.random.Generator, max_samples: int = 128
+) -> Consensus:
+    """2-point RANSAC for b1 ~ R b0; `threshold` in radians. Model (3, 3).
+
+    Raises:
+        Degenerate: as `ransac`; half of the bearings must agree.
+    """
+
+    def solve(indices: I64) -> F64:
+        u, s, vt = np.linalg.svd(np.swapaxes(bearings1[indices], 1, 2) @ bearings0[indices])
+        return _proper(u, vt)[s[:, 1] > 1e-6 * s[:, 0]]
+
+    def residuals(models: F64) -> F64:
+        return np.linalg.norm(bearings1 - bearings0 @ np.swapaxes(models, 1, 2), axis=-1)
+
+    return ransac(len(bearings0), 2, solve, residuals, threshold, rng, max_samples=max_samples, min_ratio=0.5)
+
+
+def refuse_line(bearings: F64, threshold: float) -> None:
+    """Points on one line of the image (a great circle) do not determine a motion.
+
+    Args:
+        bearings: (N, 3). threshold: radians, root mean square distance from the great circle that counts as none.
+
+    Raises:
+        Degenerate: "collinear".
+    """
+    off = np.linalg.svd(bearings, compute_uv=False)[2] / np.sqrt(len(bearings)) if len(bearings) > 2 else 0.0
+    if not off > threshold:
+        raise Degenerate("collinear", "all points lie on one line of the image")
+
+
 def rigid_batch(source: F64, target: F64) -> F64:
     """Samples (B, K, 3), K >= 3 -> (B, 4, 4) with target ~ T source; NaN rows where the points are collinear."""
     mean_s, mean_t = source.mean(1, keepdims=True), target.mean(1, keepdims=True)

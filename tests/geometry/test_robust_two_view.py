@@ -202,13 +202,12 @@ def pose_or_refusal(b0: F64, b1: F64, method: str) -> RelativePose | str:
 
 
 @pytest.mark.parametrize("method", ["five_point", "eight_point"])
-def test_identical_and_collinear_points_end_in_a_refusal_or_finite_numbers(method: str) -> None:
+def test_identical_and_collinear_points_are_refused(method: str) -> None:
     b0, b1, rotation, _ = scene(10, 40)
     same = np.repeat(b0[:1], 40, 0), np.repeat(b1[:1], 40, 0)
     line = np.linspace(0, 1, 40)[:, None] * np.array([1.0, 0.5, 1.0]) + np.array([0.0, 0, 4])
     for pair in (same, (unit(line), unit(line @ rotation.T + np.array([0.3, 0, 0.1])))):
-        answer = pose_or_refusal(*pair, method)
-        assert isinstance(answer, str) or (np.isfinite(answer.rotation).all() and np.isfinite(answer.direction).all())
+        assert pose_or_refusal(*pair, method) in ("collinear", "no_consensus")
 
 
 def test_decompose_refuses_rank_one_and_nan() -> None:

@@ -8,7 +8,11 @@ from typing import Protocol
 import numpy as np
 
 from stereo_sfm.config import OdometryConfig
+from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.types import F64, U8, Bool, Message
+
+SHIFTS = 8  # random pairings that `refuse_chance` compares with ...
+BETTER_THAN_CHANCE = 3.0  # ... and how many times nearer a motion must bring the points
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +68,29 @@ class Estimator(Protocol):
 def thresholds(config: OdometryConfig, sigmas: F64) -> F64:
     """(N,) metres: the fixed inlier bound of equation 11 widened by the uncertainty of each stereo point."""
     return config.inlier_m + config.inlier_sigmas * sigmas
+
+
+def refuse_chance(moved: F64, bearings_now: F64) -> None:
+    """A motion must put the points nearer to where they are seen than to where other points are seen.
+
+    Stereo points are so uncertain along their rays that any motion "agrees" with many of them: counting inliers cannot
+    refuse matches that are all wrong. The angles can, compared with those of the same points in shifted pairs.
+
+    Args:
+        moved: (N, 3) points where the motion takes them. bearings_now: (N, 3) where they are seen.
+
+    Raises:
+        Degenerate: "no_consensus".
+    """
+    ray = moved / np.maximum(np.linalg.norm(moved, axis=1, keepdims=True), 1e-12)
+    count = len(ray)
+
+    def off(shift: int) -> float:
+        return float(np.median(np.linalg.norm(np.roll(bearings_now, shift, axis=0) - ray, axis=1)))
+
+    chance = float(np.mean([off(shift) for shift in np.arange(1, SHIFTS + 1) * count // (SHIFTS + 1)]))
+    if not off(0) < chance / BETTER_THAN_CHANCE:
+        raise Degenerate("no_consensus", f"points are {off(0):.3f} rad off, {chance:.3f} when paired at random")
 
 
 def weights(config: OdometryConfig, sigmas: F64) -> F64 | None:

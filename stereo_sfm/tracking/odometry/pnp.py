@@ -14,6 +14,7 @@ import numpy as np
 from stereo_sfm.config import OdometryConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.motion_only import bearing_errors, refine_pose
+from stereo_sfm.geometry.procrustes import refuse_line
 from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.tracking.odometry.base import FramePair, Motion
 from stereo_sfm.types import F64, Bool
@@ -70,6 +71,7 @@ def pnp_pose(
         inliers = bearing_errors(cam_T_ref, points, bearings) < 2 * threshold
     if inliers.sum() < config.min_inliers:
         raise Degenerate("no_consensus", f"{int(inliers.sum())} of {len(points)} agree")
+    refuse_line(bearings[inliers], 2 * threshold)
     return cam_T_ref, inliers
 
 

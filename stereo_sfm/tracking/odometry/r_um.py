@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from stereo_sfm.config import OdometryConfig
-from stereo_sfm.geometry.procrustes import rigid, rigid_ransac
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.procrustes import refuse_line, rigid, rigid_ransac
 from stereo_sfm.geometry.robust import Degenerate
-from stereo_sfm.tracking.odometry.base import FramePair, Motion, thresholds, weights
+from stereo_sfm.tracking.odometry.base import FramePair, Motion, refuse_chance, thresholds, weights
 
 
 class RUm:
@@ -25,8 +26,10 @@ class RUm:
         source, target, sigmas = pair.points_last[rows], pair.points_now[rows], pair.sigmas[rows]
         consensus = rigid_ransac(source, target, thresholds(config, sigmas), rng, config.max_samples)
         chosen = consensus.inliers
+        refuse_line(pair.bearings_last[rows[chosen]], 2 * config.epipolar_px * pair.pixel_rad)
         weight = weights(config, sigmas[chosen])
         now_T_last = rigid(source[chosen], target[chosen], weight)
+        refuse_chance(se3.transform(now_T_last, source[chosen]), pair.bearings_now[rows[chosen]])
         inliers = np.zeros(len(pair.bearings_now), bool)
         inliers[rows[chosen]] = True
         return Motion(now_T_last[:3, :3], now_T_last[:3, 3], inliers)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from stereo_sfm.config import OdometryConfig
-from stereo_sfm.geometry.procrustes import rigid
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.procrustes import refuse_line, rigid
 from stereo_sfm.geometry.robust import Degenerate
-from stereo_sfm.tracking.odometry.base import FramePair, Motion, weights
+from stereo_sfm.tracking.odometry.base import FramePair, Motion, refuse_chance, weights
 
 
 class Um:
@@ -21,6 +22,8 @@ class Um:
         rows = pair.both
         if rows.sum() < self._config.min_inliers:
             raise Degenerate("too_few_points", f"{int(rows.sum())} matches have depth on both sides")
-        weight = weights(self._config, pair.sigmas[rows])
-        now_T_last = rigid(pair.points_last[rows], pair.points_now[rows], weight)
+        refuse_line(pair.bearings_last[rows], 2 * self._config.epipolar_px * pair.pixel_rad)
+        source, target = pair.points_last[rows], pair.points_now[rows]
+        now_T_last = rigid(source, target, weights(self._config, pair.sigmas[rows]))
+        refuse_chance(se3.transform(now_T_last, source), pair.bearings_now[rows])
         return Motion(now_T_last[:3, :3], now_T_last[:3, 3], rows)
