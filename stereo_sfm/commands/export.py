@@ -25,8 +25,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--which", choices=("odom", "map", "keyframes"), default="map", help="trajectory of a run (default: map)"
     )
     parser.add_argument(
-        "--images", metavar="SOURCE", help="with colmap: write the keyframes' pictures of this source too"
+        "--images",
+        metavar="SOURCE",
+        help="with colmap: write the keyframes' pictures of this source too (rectified where the map is)",
     )
+    parser.add_argument("--rig", type=Path, metavar="FILE", help="calibration of --images instead of its own")
     parser.add_argument("--walk", type=int, metavar="N", help="of a merged map: which walk --images shows (0, 1, ...)")
     parser.add_argument("--resolution", type=float, default=0.05, metavar="M", help="of the floor plan, metres a pixel")
 
@@ -88,31 +91,22 @@ def _load(folder: Path) -> SavedMap:
     raise StereoSfmError(f"{folder} holds no map (make one with 'run ... --map-out DIR')")
 
 
-def _shown_walk(saved: SavedMap, args: argparse.Namespace) -> int:
-    """The walk whose pictures --images holds."""
-    from drivers.source import open_source
-    from stereo_sfm.export.pictures import check_walk, walk_of_recording
-
-    check_walk(saved, args.walk)
-    if args.walk is not None:
-        return args.walk
-    if len(saved.walks) == 1:
-        return saved.walks[0]
-    with open_source(args.images) as source:
-        return walk_of_recording(saved, source, args.images)
-
-
 def _write_colmap(saved: SavedMap, output: Path, args: argparse.Namespace) -> None:
     """The model, and the keyframes' pictures beside it where they are asked for."""
-    from drivers.source import open_source
     from stereo_sfm.export.colmap import export_colmap
-    from stereo_sfm.export.pictures import write_pictures
 
-    walk = _shown_walk(saved, args) if args.images else 0
-    export_colmap(saved, output)
-    if args.images:
-        with open_source(args.images) as source:
-            write_pictures(saved, source, walk, output, args.images)
+    if not args.images:
+        export_colmap(saved, output)
+        return
+    from calib import load_rig
+    from stereo_sfm.export.pictures import check_walk, open_pictures, walk_of_recording, write_pictures
+
+    check_walk(saved, args.walk)
+    source = open_pictures(args.images, saved.rig, load_rig(args.rig) if args.rig is not None else None)
+    with source:
+        walk = args.walk if args.walk is not None else walk_of_recording(saved, source, args.images)
+        export_colmap(saved, output)
+        write_pictures(saved, source, walk, output, args.images)
 
 
 def _write_trajectory(args: argparse.Namespace, output: Path) -> None:

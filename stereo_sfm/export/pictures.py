@@ -5,12 +5,41 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
+from calib.rectification import PROJECTIONS
+from calib.rig import Rig
+from drivers.rectified import rectified
+from drivers.source import Source, open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.colmap import image_names
-from stereo_sfm.export.saved_map import SavedMap
+from stereo_sfm.export.saved_map import SavedMap, describe_rig, same_rig
 from stereo_sfm.types import U8, StereoImage
 
 Key = tuple[int, int]  # frame id, stamp in ns
+
+
+def open_pictures(spec: str, map_rig: Rig, own_rig: Rig | None = None) -> Source:
+    """A recording, not yet entered, as the map's camera saw it: as it is, or rectified as the run had it.
+
+    Args:
+        spec: the recording.
+        map_rig: the map's camera.
+        own_rig: calibration instead of the recording's own.
+
+    Raises:
+        StereoSfmError: it was not taken with this camera.
+    """
+    source = open_source(spec, **({} if own_rig is None else {"rig": own_rig}))
+    for how in PROJECTIONS:
+        try:
+            seen = rectified(source, how)
+        except StereoSfmError:  # one eye, or two that cannot be rectified this way
+            continue
+        if same_rig(seen.rig, map_rig):
+            return seen
+    raise StereoSfmError(
+        f"the camera of {spec} ({describe_rig(source.rig)}) is not the map's ({describe_rig(map_rig)}), rectified or"
+        " not: give the recording of this map, and --rig where the run had one"
+    )
 
 
 def check_walk(saved: SavedMap, walk: int | None) -> None:
@@ -25,6 +54,8 @@ def walk_of_recording(saved: SavedMap, recording: Iterable[StereoImage], name: s
     Raises:
         StereoSfmError: no walk of the map is in it, or more than one could be.
     """
+    if len(saved.walks) == 1:
+        return saved.walks[0]
     frames = {(image.frame_id, image.stamp_ns) for image in recording}
     fits = [walk for walk in saved.walks if frames.issuperset(_names(saved, walk, "left"))]
     if not fits:

@@ -113,7 +113,7 @@ def load_map(folder: Path, rig: Rig | None = None) -> SavedMap:
         raise StereoSfmError(f"the map {folder} is empty: it holds no keyframes or no points")
     if rig is not None and not same_rig(own, rig):
         raise StereoSfmError(
-            f"the map {folder} was made with another camera ({_describe(own)}) than this one ({_describe(rig)})"
+            f"the map {folder} was made with another camera ({describe_rig(own)}) than this one ({describe_rig(rig)})"
         )
     return SavedMap(snapshot, own, str(head["vocabulary"]), sessions)
 
@@ -148,7 +148,8 @@ def same_rig(a: Rig, b: Rig) -> bool:
     return True
 
 
-def _describe(rig: Rig) -> str:
+def describe_rig(rig: Rig) -> str:
+    """A camera in a few words."""
     return f"{rig.left.model} {rig.left.width}x{rig.left.height} f={rig.left.fx:.1f} b={1000 * rig.baseline:.0f} mm"
 
 

@@ -9,14 +9,19 @@ import cv2
 import numpy as np
 import pytest
 
+from calib import save_rig
+from drivers.rectified import RectifiedSource, rectified
+from drivers.source import open_source
+from stereo_sfm.cli import main
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.colmap import export_colmap
-from stereo_sfm.export.pictures import check_walk, walk_of_recording, write_pictures
-from stereo_sfm.export.saved_map import SavedMap, joined
+from stereo_sfm.export.pictures import check_walk, open_pictures, walk_of_recording, write_pictures
+from stereo_sfm.export.saved_map import SavedMap, joined, save_map
 from stereo_sfm.types import StereoImage
 from tests.export.maps import small_map
 
 LATER_NS = 10**12
+SPEC = "sim:aisle?size=150x140&rate=15&seed=1&frames=4"
 
 
 @pytest.fixture(scope="module")
@@ -81,3 +86,42 @@ def test_a_recording_that_cannot_be_told_is_refused(tmp_path: Path, saved: Saved
     with pytest.raises(StereoSfmError, match=f"another day lacks {len(saved)} of the map's keyframes"):
         write_pictures(later(saved), pictures, 0, tmp_path, "another day")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("how", "option"), [("none", "none"), ("pinhole", "pinhole"), ("epipolar", "wide")])
+def test_pictures_are_those_that_the_maps_camera_saw(how: str, option: str) -> None:
+    rig = rectified(open_source(SPEC), how).rig
+    source = open_pictures(SPEC, rig)
+    assert isinstance(source, RectifiedSource) == (option != "none")
+    assert np.array_equal(source.rig.left.params, rig.left.params)
+
+
+def test_pictures_of_another_camera_are_refused(saved: SavedMap) -> None:
+    with pytest.raises(StereoSfmError, match=r"150x140 .*is not the map's \(kannala_brandt 848x800"):
+        open_pictures(SPEC, saved.rig)
+
+
+def test_export_of_a_rectified_run_writes_rectified_pictures(
+    tmp_path: Path, saved: SavedMap, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen = rectified(open_source(SPEC), "pinhole")
+    with seen:
+        frames = list(seen)
+    s = saved.snapshot
+    ids, stamps = np.full(len(saved), frames[0].frame_id), np.full(len(saved), frames[0].stamp_ns)
+    ids[-1], stamps[-1] = frames[2].frame_id, frames[2].stamp_ns
+    rectified_map = dataclasses.replace(
+        saved, rig=seen.rig, snapshot=dataclasses.replace(s, frame_ids=ids, stamp_ns=stamps)
+    )
+    save_map(rectified_map, tmp_path / "m")
+    export = ["export", str(tmp_path / "m"), "--format", "colmap", "-o", str(tmp_path / "c"), "--images", SPEC]
+    assert main(export) == 0
+    picture = cv2.imread(str(tmp_path / f"c/images/right/{frames[2].frame_id:06d}.png"), cv2.IMREAD_GRAYSCALE)
+    right = frames[2].right
+    assert picture is not None and right is not None and np.array_equal(picture, right)
+    assert "PINHOLE" in (tmp_path / "c" / "cameras.txt").read_text()
+    save_rig(saved.rig, tmp_path / "other.yaml")
+    assert main([*export, "--rig", str(tmp_path / "other.yaml"), "--overwrite"]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+    assert main(["export", str(tmp_path / "m"), "--format", "ply", "--images", SPEC]) == 2
+    assert "--images goes with --format colmap" in capsys.readouterr().err
