@@ -9,8 +9,8 @@ from stereo_sfm.errors import StereoSfmError
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
     # Retail Store Visual Structure-from-Motion: SIFT in the mask of stereo-matched points, brute force with Lowe's
-    # ratio and fundamental RANSAC, EM-R, keyframes at < 30 % or 30 frames, co-visible window, loops at 30 % matches. The
-    # bound of equation 11 stays as wide as the stereo depth is uncertain: fixed, far points would never agree.
+    # ratio and fundamental RANSAC, EM-R, keyframes at < 30 % or 30 frames, co-visible window, loops at 30 % matches.
+    # The bound of equation 11 stays as wide as the stereo depth is uncertain: fixed, far points would never agree.
     "retail-thesis": {
         "features": {"kind": "sift", "mask_radius_px": 40.0, "stereo_check": "ransac"},
         "odometry": {"method": "em-r", "refine": False, "weighted": False},
@@ -32,8 +32,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "loop": {"enabled": False},
     },
     # Visual SLAM of the C++ course: one eye, ORB, essential matrix at the start, PnP against the last keyframe and
-    # motion-only bundle adjustment, keyframes after more than 19 frames with fewer than 80 inliers; below 60 at once, or
-    # tracking would end before the 19 frames do.
+    # motion-only bundle adjustment, keyframes after more than 19 frames with fewer than 80 inliers; below 60 at once,
+    # or tracking would end before the 19 frames do.
     "cpp-course": {
         "features": {"kind": "orb", "count": 2000, "stereo_only": False},
         "odometry": {

@@ -52,7 +52,7 @@ def apply_loop(map_: Map, loop: LoopResult, earlier: Sequence[LoopResult], confi
         return Correction(False, 0.0, [])
     before = map_.keyframe_poses()
     if config.correction == "averaging":
-        after = _averaged(before, a, b, before[a] @ loop.candidate_T_kf)
+        after = _averaged(map_, before, loop, earlier)
     elif config.correction == "pose_graph":
         optimised = _optimised(map_, before, loop, earlier, config)
         if optimised is None:
@@ -94,10 +94,34 @@ def fuse_pairs(map_: Map, pairs: I64) -> list[tuple[int, int]]:
     return fused
 
 
-def _averaged(poses: F64, a: int, b: int, corrected: F64) -> F64:
+def _averaged(map_: Map, before: F64, loop: LoopResult, earlier: Sequence[LoopResult]) -> F64:
+    """The error spread over the walk that led to the loop. Pieces that the loop joins move as rigid bodies only.
+
+    Between two walks (submaps) that hang together already, the younger one's way from its first keyframe takes it.
+    """
+    a, b = map_.kf_row(loop.candidate_kf_id), map_.kf_row(loop.kf_id)
+    walk, closed = walk_edges(map_, before), loop_edges(map_, [*earlier, loop])
+    piece = _pieces(len(before), walk, closed, len(closed) - 1)
+    if piece[a] != piece[b]:
+        return _brought_together(before, loop, a, b, piece)
     if a > b:
         raise StereoSfmError("transformation averaging needs a loop back to an older keyframe")
-    return average_correction(poses, a, b, corrected)
+    after, submap = before.copy(), map_.keyframes.submap_id
+    rows = np.flatnonzero((submap == submap[b]) & map_.keyframes.alive)
+    first = int(np.searchsorted(rows, a)) if submap[a] == submap[b] else 0
+    after[rows] = average_correction(
+        before[rows], first, int(np.searchsorted(rows, b)), before[a] @ loop.candidate_T_kf
+    )
+    return after
+
+
+def _brought_together(before: F64, loop: LoopResult, a: int, b: int, piece: I64) -> F64:
+    """The younger of two pieces moved to where the loop has it."""
+    after = before.copy()
+    move = before[a] @ loop.candidate_T_kf @ se3.inverse(before[b])
+    rows = piece == piece[b] if piece[b] > piece[a] else piece == piece[a]
+    after[rows] = (move if piece[b] > piece[a] else se3.inverse(move)) @ before[rows]
+    return after
 
 
 def _optimised(
@@ -109,10 +133,7 @@ def _optimised(
     piece = _pieces(len(before), walk, closed, len(closed) - 1)
     start = before
     if piece[a] != piece[b]:  # a submap that this loop joins to the rest: bring it there as a rigid body first
-        start = before.copy()
-        rows = piece == piece[b] if piece[b] > piece[a] else piece == piece[a]
-        move = before[a] @ loop.candidate_T_kf @ se3.inverse(before[b])
-        start[rows] = (move if piece[b] > piece[a] else se3.inverse(move)) @ before[rows]
+        start = _brought_together(before, loop, a, b, piece)
     fixed = _first_of_each_piece(len(before), join([walk, closed]))
     result = optimise(start, join([walk, closed]), fixed, config.robust)
     if result.weights[-1] < 0.5:

@@ -158,7 +158,8 @@ def test_unknown_correction_is_refused(walk: StoreWalk) -> None:
         )
 
 
-def test_a_submap_is_brought_to_the_rest_by_the_loop(walk: StoreWalk) -> None:
+@pytest.mark.parametrize("correction", ["pose_graph", "averaging"])
+def test_a_submap_is_brought_to_the_rest_by_the_loop(walk: StoreWalk, correction: str) -> None:
     """Tracking restarted somewhere: the second piece begins at an odometry pose that means nothing."""
     a, b = ends(walk)
     half = len(walk.keyframes) // 2
@@ -173,7 +174,8 @@ def test_a_submap_is_brought_to_the_rest_by_the_loop(walk: StoreWalk) -> None:
         pieces[k] = dataclasses.replace(pieces[k], point_ids=ids)
     lost.physical.update({i + 10**6: p for i, p in walk.physical.items()})
     map_ = raw_map(lost)
-    assert apply_loop(map_, true_loop(lost, a, b), [], LoopConfig()).applied
+    config = dataclasses.replace(LoopConfig(), correction=correction)
+    assert apply_loop(map_, true_loop(lost, a, b), [], config).applied
     assert trajectory_error(map_, walk.world_T_kf) < 0.3
 
 
