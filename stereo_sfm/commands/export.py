@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,7 +30,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="with colmap: write the keyframes' pictures of this source too (rectified where the map is)",
     )
     parser.add_argument("--rig", type=Path, metavar="FILE", help="calibration of --images instead of its own")
-    parser.add_argument("--walk", type=int, metavar="N", help="of a merged map: which walk --images shows (0, 1, ...)")
+    parser.add_argument(
+        "--walk", type=int, metavar="N", help="of a merged map: this trajectory alone; with --images: what it shows"
+    )
     parser.add_argument("--resolution", type=float, default=0.05, metavar="M", help="of the floor plan, metres a pixel")
 
 
@@ -44,17 +46,11 @@ def run(args: argparse.Namespace) -> int:
         raise StereoSfmError("--resolution must be above 0 metres")
     if args.images and args.format != "colmap":
         raise StereoSfmError("--images goes with --format colmap")
-    if args.walk is not None and not args.images:
-        raise StereoSfmError("--walk goes with --images")
-    output = args.output or args.source / _default_name(args)
-    if output.exists() and not args.overwrite:
-        raise StereoSfmError(f"{output} exists: choose another -o, or say --overwrite")
-    output.parent.mkdir(parents=True, exist_ok=True)
-    if args.format in TRAJECTORY_FORMATS:
-        _write_trajectory(args, output)
-    else:
-        _write_map(args, output)
-    print(f"written to {output}")
+    if args.walk is not None and not args.images and args.format not in TRAJECTORY_FORMATS:
+        raise StereoSfmError("--walk goes with --images and with trajectories")
+    write = _write_trajectories if args.format in TRAJECTORY_FORMATS else _write_map
+    paths = write(args, args.output or args.source / _default_name(args))
+    print(f"written to {', '.join(map(str, paths))}")
     return 0
 
 
@@ -65,12 +61,14 @@ def _default_name(args: argparse.Namespace) -> str:
     return f"export_{args.which}.{ending}"
 
 
-def _write_map(args: argparse.Namespace, output: Path) -> None:
+def _write_map(args: argparse.Namespace, output: Path) -> list[Path]:
     from stereo_sfm.export.floor_plan import export_floor_plan
     from stereo_sfm.export.g2o import export_g2o
     from stereo_sfm.export.ply import export_ply
 
+    _check_free(args, [output])
     saved = _load(args.source)
+    output.parent.mkdir(parents=True, exist_ok=True)
     writers: dict[str, Callable[[SavedMap, Path], object]] = {
         "colmap": lambda s, path: _write_colmap(s, path, args),
         "ply": export_ply,
@@ -78,6 +76,7 @@ def _write_map(args: argparse.Namespace, output: Path) -> None:
         "floor-plan": lambda s, path: export_floor_plan(s, path, args.resolution),
     }
     writers[args.format](saved, output)
+    return [output]
 
 
 def _load(folder: Path) -> SavedMap:
@@ -109,29 +108,50 @@ def _write_colmap(saved: SavedMap, output: Path, args: argparse.Namespace) -> No
         write_pictures(saved, source, walk, output, args.images)
 
 
-def _write_trajectory(args: argparse.Namespace, output: Path) -> None:
+def _write_trajectories(args: argparse.Namespace, output: Path) -> list[Path]:
+    """One file, or one for each walk of a merged map."""
     from stereo_sfm.export import trajectories
 
-    trajectory = _trajectory(args.source, args.which)
-    if args.format == "tum":
-        trajectories.write_tum(output, trajectory)
-    elif args.format == "euroc":
-        trajectories.write_euroc(output, trajectory)
-    else:
-        trajectories.write_kitti(output, trajectory.poses)
+    found = _trajectories(args)
+    paths = [output if len(found) == 1 else _of_walk(output, walk) for walk in found]
+    _check_free(args, paths)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    for path, trajectory in zip(paths, found.values(), strict=True):
+        if args.format == "tum":
+            trajectories.write_tum(path, trajectory)
+        elif args.format == "euroc":
+            trajectories.write_euroc(path, trajectory)
+        else:
+            trajectories.write_kitti(path, trajectory.poses)
+    return paths
 
 
-def _trajectory(folder: Path, which: str) -> Trajectory:
-    """A run's trajectory, or a map's keyframes."""
+def _of_walk(path: Path, walk: int) -> Path:
+    """map.tum -> map_walk1.tum."""
+    ending = path.suffix if path.suffix in (".tum", ".kitti", ".csv", ".txt") else ""
+    return path.with_name(f"{path.name.removesuffix(ending)}_walk{walk}{ending}")
+
+
+def _trajectories(args: argparse.Namespace) -> dict[int, Trajectory]:
+    """A run's trajectory, or a map's keyframes, walk by walk."""
     from drivers.ground_truth import read_trajectory
     from stereo_sfm.errors import StereoSfmError
-    from stereo_sfm.types import Trajectory
+    from stereo_sfm.export.pictures import check_walk
+    from stereo_sfm.export.saved_map import walk_trajectory
 
-    path = folder / {"odom": "trajectory_odom.tum", "map": "trajectory_map.tum", "keyframes": "keyframes.tum"}[which]
-    if path.is_file():
-        return read_trajectory(path)
-    if (folder / "map.json").is_file():
-        s = _load(folder).snapshot
-        order = s.stamp_ns.argsort(kind="stable")
-        return Trajectory(s.stamp_ns[order], s.map_T_kf[order])
-    raise StereoSfmError(f"{folder} holds no {path.name}")
+    name = {"odom": "trajectory_odom.tum", "map": "trajectory_map.tum", "keyframes": "keyframes.tum"}[args.which]
+    if (args.source / name).is_file():
+        return {0: read_trajectory(args.source / name)}
+    if not (args.source / "map.json").is_file():
+        raise StereoSfmError(f"{args.source} holds no {name}")
+    saved = _load(args.source)
+    check_walk(saved, args.walk)
+    return {k: walk_trajectory(saved, k) for k in saved.walks if args.walk in (None, k)}
+
+
+def _check_free(args: argparse.Namespace, paths: Sequence[Path]) -> None:
+    from stereo_sfm.errors import StereoSfmError
+
+    there = [path for path in paths if path.exists()]
+    if there and not args.overwrite:
+        raise StereoSfmError(f"{there[0]} exists: choose another -o, or say --overwrite")

@@ -19,7 +19,7 @@ from calib.formats.native import read_native, write_native
 from calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.mapping.map import Map, MapSnapshot
-from stereo_sfm.types import I64, Keyframe
+from stereo_sfm.types import I64, Keyframe, Trajectory
 
 VERSION = 1
 KIND = "stereo_sfm_map"
@@ -199,6 +199,20 @@ def keyframes_of(snapshot: MapSnapshot) -> list[Keyframe]:
             )
         )
     return out
+
+
+def walk_trajectory(saved: SavedMap, walk: int) -> Trajectory:
+    """The keyframes of one walk in the order of time.
+
+    Raises:
+        StereoSfmError: two of them have one time.
+    """
+    rows = np.flatnonzero(saved.sessions == walk)
+    rows = rows[saved.snapshot.stamp_ns[rows].argsort(kind="stable")]
+    stamp_ns = saved.snapshot.stamp_ns[rows]
+    if (np.diff(stamp_ns) <= 0).any():
+        raise StereoSfmError(f"walk {walk} of the map holds two keyframes of one time: it is no single walk")
+    return Trajectory(stamp_ns, saved.snapshot.map_T_kf[rows])
 
 
 def joined(maps: list[SavedMap]) -> SavedMap:

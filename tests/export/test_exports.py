@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import struct
 from pathlib import Path
 
@@ -11,11 +12,12 @@ import pytest
 import yaml
 
 from stereo_sfm.cli import main
+from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.colmap import export_colmap
 from stereo_sfm.export.floor_plan import FREE, OCCUPIED, UNKNOWN, aisle_direction, make_floor_plan
 from stereo_sfm.export.g2o import export_g2o, graph_edges
 from stereo_sfm.export.ply import export_ply
-from stereo_sfm.export.saved_map import SavedMap, save_map
+from stereo_sfm.export.saved_map import SavedMap, joined, save_map, walk_trajectory
 from stereo_sfm.geometry import se3
 from tests.export.maps import small_map
 from tests.loop.store_walk import StoreWalk
@@ -145,3 +147,34 @@ def test_export_command(tmp_path: Path, saved: SavedMap, capsys: pytest.CaptureF
     assert main(["export", str(tmp_path), "--format", "ply"]) == 2
     assert "holds no map" in capsys.readouterr().err
     assert len((tmp_path / "m" / "export_map.tum").read_text().splitlines()) == len(saved) + 1
+
+
+@pytest.mark.parametrize(("kind", "ending"), [("tum", "tum"), ("kitti", "kitti"), ("euroc", "csv")])
+def test_trajectories_of_a_merged_map_are_a_file_for_each_walk(
+    tmp_path: Path, saved: SavedMap, kind: str, ending: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    both = joined([saved, saved])
+    save_map(both, tmp_path / "m")
+    export = ["export", str(tmp_path / "m"), "--format", kind]
+    assert main(export) == 0
+    names = [f"export_map_walk{k}.{ending}" for k in (0, 1)]
+    told = capsys.readouterr().out
+    assert all(name in told for name in names)
+    for name in names:
+        lines = [x for x in (tmp_path / "m" / name).read_text().splitlines() if not x.startswith("#")]
+        assert len(lines) == len(saved)
+        if kind != "kitti":
+            stamps = [float(line.replace(",", " ").split()[0]) for line in lines]
+            assert (np.diff(stamps) > 0).all()
+    assert main([*export, "--walk", "1", "-o", str(tmp_path / "one.txt")]) == 0
+    assert (tmp_path / "one.txt").read_bytes() == (tmp_path / "m" / names[1]).read_bytes()
+    assert main(export) == 2
+    assert f"{names[0]} exists: choose another -o" in capsys.readouterr().err
+    assert main([*export, "--walk", "2", "-o", str(tmp_path / "two.txt")]) == 2
+    assert "the map holds no walk 2 (it holds 0, 1)" in capsys.readouterr().err
+
+
+def test_a_walk_with_two_keyframes_of_one_time_is_no_trajectory(saved: SavedMap) -> None:
+    twice = dataclasses.replace(joined([saved, saved]), sessions=np.zeros(2 * len(saved), np.int64))
+    with pytest.raises(StereoSfmError, match="walk 0 of the map holds two keyframes of one time"):
+        walk_trajectory(twice, 0)
