@@ -112,15 +112,15 @@ def _write_trajectories(args: argparse.Namespace, output: Path) -> list[Path]:
     """One file, or one for each walk of a merged map."""
     from stereo_sfm.export import trajectories
 
-    found = _trajectories(args)
+    found, what = _trajectories(args)
     paths = [output if len(found) == 1 else _of_walk(output, walk) for walk in found]
     _check_free(args, paths)
     output.parent.mkdir(parents=True, exist_ok=True)
     for path, trajectory in zip(paths, found.values(), strict=True):
         if args.format == "tum":
-            trajectories.write_tum(path, trajectory)
+            trajectories.write_tum(path, trajectory, what)
         elif args.format == "euroc":
-            trajectories.write_euroc(path, trajectory)
+            trajectories.write_euroc(path, trajectory, what)
         else:
             trajectories.write_kitti(path, trajectory.poses)
     return paths
@@ -132,21 +132,24 @@ def _of_walk(path: Path, walk: int) -> Path:
     return path.with_name(f"{path.name.removesuffix(ending)}_walk{walk}{ending}")
 
 
-def _trajectories(args: argparse.Namespace) -> dict[int, Trajectory]:
-    """A run's trajectory, or a map's keyframes, walk by walk."""
+def _trajectories(args: argparse.Namespace) -> tuple[dict[int, Trajectory], str]:
+    """A run's trajectory, or a map's keyframes, walk by walk; and which poses they are."""
     from drivers.ground_truth import read_trajectory
     from stereo_sfm.errors import StereoSfmError
     from stereo_sfm.export.pictures import check_walk
     from stereo_sfm.export.saved_map import walk_trajectory
+    from stereo_sfm.export.trajectories import named_pose
 
     name = {"odom": "trajectory_odom.tum", "map": "trajectory_map.tum", "keyframes": "keyframes.tum"}[args.which]
     if (args.source / name).is_file():
-        return {0: read_trajectory(args.source / name)}
+        if args.walk is not None:
+            raise StereoSfmError("--walk goes with maps: a run is one walk")
+        return {0: read_trajectory(args.source / name)}, named_pose(args.source / name)
     if not (args.source / "map.json").is_file():
         raise StereoSfmError(f"{args.source} holds no {name}")
     saved = _load(args.source)
     check_walk(saved, args.walk)
-    return {k: walk_trajectory(saved, k) for k in saved.walks if args.walk in (None, k)}
+    return {k: walk_trajectory(saved, k) for k in saved.walks if args.walk in (None, k)}, "world_T_cam0"
 
 
 def _check_free(args: argparse.Namespace, paths: Sequence[Path]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,16 @@ def write_tum(path: Path, trajectory: Trajectory, what: str = "world_T_cam0") ->
     for stamp, t, q in zip(trajectory.stamp_ns, trajectory.positions, quaternions, strict=True):
         lines.append(seconds(int(stamp)) + "".join(f" {v:.9f}" for v in (*t, *q)))
     path.write_text("\n".join(lines) + "\n")
+
+
+def named_pose(path: Path) -> str:
+    """What the heading of a file by `write_tum` says its poses are: "world_T_body"; without one they are the camera's.
+
+    A file that somebody else wrote may have any heading, or none.
+    """
+    with path.open() as stream:
+        found = re.match(r"#\s*(world_T_\w+):", stream.readline())
+    return found[1] if found else "world_T_cam0"
 
 
 def write_kitti(path: Path, poses: F64) -> None:

@@ -18,6 +18,7 @@ from stereo_sfm.export.floor_plan import FREE, OCCUPIED, UNKNOWN, aisle_directio
 from stereo_sfm.export.g2o import export_g2o, graph_edges
 from stereo_sfm.export.ply import export_ply
 from stereo_sfm.export.saved_map import SavedMap, joined, save_map, walk_trajectory
+from stereo_sfm.export.trajectories import named_pose, write_tum
 from stereo_sfm.geometry import se3
 from tests.export.maps import small_map
 from tests.loop.store_walk import StoreWalk
@@ -178,3 +179,19 @@ def test_a_walk_with_two_keyframes_of_one_time_is_no_trajectory(saved: SavedMap)
     twice = dataclasses.replace(joined([saved, saved]), sessions=np.zeros(2 * len(saved), np.int64))
     with pytest.raises(StereoSfmError, match="walk 0 of the map holds two keyframes of one time"):
         walk_trajectory(twice, 0)
+
+
+@pytest.mark.parametrize("what", ["world_T_body", "world_T_cam0"])
+def test_exported_poses_of_a_run_keep_their_name(tmp_path: Path, saved: SavedMap, what: str) -> None:
+    """`run --frame body` writes poses of the body: no export may call them the camera's."""
+    trajectory = walk_trajectory(saved, 0)
+    write_tum(tmp_path / "trajectory_map.tum", trajectory, what)
+    for kind in ("tum", "euroc"):
+        assert main(["export", str(tmp_path), "--format", kind, "-o", str(tmp_path / kind)]) == 0
+        assert what in (tmp_path / kind).read_text().splitlines()[0]
+    assert (tmp_path / "tum").read_bytes() == (tmp_path / "trajectory_map.tum").read_bytes()
+
+
+def test_a_trajectory_without_a_heading_is_the_cameras(tmp_path: Path) -> None:
+    (tmp_path / "t.tum").write_text("1.0 0 0 0 0 0 0 1\n")
+    assert named_pose(tmp_path / "t.tum") == "world_T_cam0"
