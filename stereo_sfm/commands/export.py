@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
 
     if not args.source.is_dir():
         raise StereoSfmError(f"{args.source} is not the folder of a run or a map")
-    if args.resolution <= 0:
+    if not 0 < args.resolution < float("inf"):
         raise StereoSfmError("--resolution must be above 0 metres")
     if args.images and args.format != "colmap":
         raise StereoSfmError("--images goes with --format colmap")
@@ -62,11 +62,12 @@ def _default_name(args: argparse.Namespace) -> str:
 
 
 def _write_map(args: argparse.Namespace, output: Path) -> list[Path]:
-    from stereo_sfm.export.floor_plan import export_floor_plan
+    from stereo_sfm.export.floor_plan import export_floor_plan, plan_files
     from stereo_sfm.export.g2o import export_g2o
     from stereo_sfm.export.ply import export_ply
 
-    _check_free(args, [output])
+    paths = [*plan_files(output)] if args.format == "floor-plan" else [output]
+    _check_free(args, paths)
     saved = _load(args.source)
     output.parent.mkdir(parents=True, exist_ok=True)
     writers: dict[str, Callable[[SavedMap, Path], object]] = {
@@ -76,7 +77,7 @@ def _write_map(args: argparse.Namespace, output: Path) -> list[Path]:
         "floor-plan": lambda s, path: export_floor_plan(s, path, args.resolution),
     }
     writers[args.format](saved, output)
-    return [output]
+    return paths
 
 
 def _load(folder: Path) -> SavedMap:

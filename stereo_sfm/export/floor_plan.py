@@ -25,6 +25,7 @@ LOW, HIGH = 0.15, 1.9  # metres above the floor that a robot can bump into
 MAX_RANGE = 6.0  # metres; stereo points further away blur the plan
 MARGIN = 0.5  # metres around what was seen
 MIN_HITS = 3  # points that make a cell occupied
+MAX_CELLS = 10**8  # 500 m x 500 m at 5 cm
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +42,10 @@ def make_floor_plan(s: MapSnapshot, resolution: float = 0.05) -> FloorPlan:
     """Find the floor and the aisles' direction, then count hits and passing rays per cell.
 
     Raises:
-        StereoSfmError: too few points.
+        StereoSfmError: too few points, or cells of no size or too small a one.
     """
+    if not (math.isfinite(resolution) and resolution > 0):
+        raise StereoSfmError(f"the resolution of a floor plan must be above 0 metres, not {resolution}")
     if len(s.points) < 50:
         raise StereoSfmError("the map holds too few points for a floor plan")
     map_T_floor = find_floor(s)
@@ -54,7 +57,12 @@ def make_floor_plan(s: MapSnapshot, resolution: float = 0.05) -> FloorPlan:
     solid = used[(used[:, 2] > LOW) & (used[:, 2] < HIGH)]
     corners = np.concatenate([solid[:, :2], cameras[:, :2]])
     low = np.floor((corners.min(0) - MARGIN) / resolution) * resolution
-    size = np.ceil((corners.max(0) + MARGIN - low) / resolution).astype(int)
+    cells = np.ceil((corners.max(0) + MARGIN - low) / resolution)
+    if not cells.prod() <= MAX_CELLS:
+        raise StereoSfmError(
+            f"a floor plan with {resolution:g} m a pixel would be {cells[0]:.3g} x {cells[1]:.3g} pixels"
+        )
+    size = cells.astype(int)
     passed = np.zeros((size[1], size[0]), np.int32)
     _trace(np.ascontiguousarray(cameras[rays_kf]), np.ascontiguousarray(points[rays_pt]), low, resolution, passed)
     hits = np.zeros_like(passed)
@@ -163,13 +171,19 @@ def aisle_direction(flat: F64) -> float:
     return float(fine[int(np.argmax([sharpness(a) for a in fine]))])
 
 
+def plan_files(path: Path) -> tuple[Path, Path]:
+    """PATH.png and PATH.yaml; `path` may carry either ending, any other dot in it is part of the name."""
+    name = path.name.removesuffix(".png").removesuffix(".yaml")
+    return path.with_name(f"{name}.png"), path.with_name(f"{name}.yaml")
+
+
 def export_floor_plan(saved: SavedMap, path: Path, resolution: float = 0.05) -> FloorPlan:
-    """Write PATH.png and PATH.yaml; `path` may carry either ending."""
+    """Write the two `plan_files` of a path."""
     import cv2
     import yaml
 
     plan = make_floor_plan(saved.snapshot, resolution)
-    image = path.with_suffix(".png")
+    image, about = plan_files(path)
     if not cv2.imwrite(str(image), plan.image):
         raise StereoSfmError(f"cannot write {image}")
     description = {
@@ -182,5 +196,5 @@ def export_floor_plan(saved: SavedMap, path: Path, resolution: float = 0.05) -> 
         "mode": "trinary",
         "map_T_floor": plan.map_T_floor.tolist(),
     }
-    path.with_suffix(".yaml").write_text(yaml.safe_dump(description, sort_keys=False))
+    about.write_text(yaml.safe_dump(description, sort_keys=False))
     return plan

@@ -195,3 +195,36 @@ def test_exported_poses_of_a_run_keep_their_name(tmp_path: Path, saved: SavedMap
 def test_a_trajectory_without_a_heading_is_the_cameras(tmp_path: Path) -> None:
     (tmp_path / "t.tum").write_text("1.0 0 0 0 0 0 0 1\n")
     assert named_pose(tmp_path / "t.tum") == "world_T_cam0"
+
+
+def test_floor_plan_is_written_where_it_says_and_over_nothing(
+    tmp_path: Path, saved: SavedMap, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_map(saved, tmp_path / "m")
+    export = ["export", str(tmp_path / "m"), "--format", "floor-plan", "-o", str(tmp_path / "plans" / "plan_0.05m")]
+    assert main(export) == 0
+    files = [tmp_path / "plans" / f"plan_0.05m.{ending}" for ending in ("png", "yaml")]
+    assert capsys.readouterr().out == f"written to {files[0]}, {files[1]}\n"
+    assert sorted((tmp_path / "plans").iterdir()) == files
+    assert yaml.safe_load(files[1].read_text())["image"] == "plan_0.05m.png"
+    for path in files:  # either of the two is somebody's work
+        other = next(f for f in files if f != path)
+        other.unlink()
+        before = path.read_bytes()
+        assert main(export) == 2
+        assert f"{path} exists: choose another -o" in capsys.readouterr().err
+        assert path.read_bytes() == before and not other.exists()
+        assert main([*export, "--overwrite"]) == 0
+        capsys.readouterr()
+
+
+@pytest.mark.parametrize("metres", ["nan", "0", "-0.1", "inf", "1e-7"])
+def test_floor_plan_of_no_sensible_resolution(
+    tmp_path: Path, saved: SavedMap, metres: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_map(saved, tmp_path / "m")
+    assert main(["export", str(tmp_path / "m"), "--format", "floor-plan", f"--resolution={metres}"]) == 2
+    error = capsys.readouterr().err
+    assert len(error.splitlines()) == 1 and ("above 0 metres" in error or "pixels" in error)
+    with pytest.raises(StereoSfmError):
+        make_floor_plan(saved.snapshot, float(metres))
