@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 from drivers.source import Source
 from drivers.wrapped import WrappedSource
+from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import StereoImage
 
 
@@ -14,7 +15,13 @@ class PacedSource(WrappedSource):
     """Passes on another source's frames no earlier than their stamps say, counted from the first one."""
 
     def __init__(self, source: Source, speed: float = 1.0) -> None:
-        """Args: source, entered and left with this one; speed, 2 plays twice as fast."""
+        """Args: source, entered and left with this one; speed, 2 plays twice as fast.
+
+        Raises:
+            StereoSfmError: a speed that is not above 0.
+        """
+        if not speed > 0:
+            raise StereoSfmError(f"a speed must be above 0 (1: as it was recorded), got {speed:g}")
         super().__init__(source)
         self._speed = speed
 

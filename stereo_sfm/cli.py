@@ -10,7 +10,7 @@ import sys
 from collections.abc import Sequence
 
 from stereo_sfm import __version__
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import StereoSfmError, from_os_error
 
 # subcommand -> what `--help` says; the code is in stereo_sfm/commands/<name with _ for ->.py
 COMMANDS: dict[str, str] = {
@@ -103,6 +103,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         # The reader of our output went away (`| head`): nothing is wrong, and nothing more can be said.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:
+        said = from_os_error(error)
+        if said is None:
+            raise
+        print(f"stereo-sfm {options.command}: {said}", file=sys.stderr)
+        return said.exit_code
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130

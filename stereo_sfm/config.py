@@ -217,6 +217,10 @@ def load(path: Path | None = None, overrides: Iterable[str] = (), base: dict[str
             data = _merge(data, tomllib.loads(path.read_text()))
         except FileNotFoundError:
             raise StereoSfmError(f"no configuration file at {path}") from None
+        except OSError as error:
+            raise StereoSfmError(f"cannot read the configuration {path}: {error.strerror}") from None
+        except UnicodeDecodeError:
+            raise StereoSfmError(f"configuration {path}: it is no text (expected TOML)") from None
         except tomllib.TOMLDecodeError as error:
             raise StereoSfmError(f"configuration {path}: {error}") from None
     for override in overrides:

@@ -1,5 +1,11 @@
 """The one error root of the project."""
 
+from __future__ import annotations
+
+import errno
+
+_OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)
+
 
 class StereoSfmError(Exception):
     """Something the user can mend: bad input, calibration, configuration or device.
@@ -9,3 +15,12 @@ class StereoSfmError(Exception):
     """
 
     exit_code = 2
+
+
+def from_os_error(error: OSError) -> StereoSfmError | None:
+    """What the system says of a file as one line; None for what is no fault of a file (a pipe between processes)."""
+    if error.filename is None:
+        return StereoSfmError(f"{error.strerror}") if error.errno in _OF_THE_DISK else None
+    if isinstance(error, FileExistsError):
+        return StereoSfmError(f"{error.filename}: a file of that name is there already")
+    return StereoSfmError(f"{error.filename}: {error.strerror}")

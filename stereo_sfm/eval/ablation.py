@@ -187,7 +187,7 @@ def load_answer(path: Path) -> dict[str, Any] | None:
     """A finished cell's file, or None where there is none or it was cut off."""
     try:
         data = json.loads(path.read_text())
-    except (FileNotFoundError, json.JSONDecodeError):
+    except (FileNotFoundError, NotADirectoryError, json.JSONDecodeError):
         return None
     return data if data.get("schema") == _SCHEMA else None
 

@@ -40,4 +40,5 @@ def export_g2o(saved: SavedMap, path: Path) -> None:
         noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([radians] * 3 + [metres] * 3))
         measured = gtsam.Pose3(se3.orthonormalize(pose))
         graph.add(gtsam.BetweenFactorPose3(int(s.kf_ids[i]), int(s.kf_ids[j]), measured, noise))
+    path.open("ab").close()  # raises OSError where GTSAM would write nothing and say nothing
     gtsam.writeG2o(graph, values, str(path))

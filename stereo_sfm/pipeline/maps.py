@@ -34,6 +34,10 @@ class MapFolders:
         if self.map_out is not None and self.map_out.exists() and not overwrite:
             raise StereoSfmError(f"{self.map_out} exists: choose another --map-out, or say --overwrite")
 
+        if self.map_out is not None:
+            above = next(folder for folder in self.map_out.absolute().parents if folder.exists())
+            if not above.is_dir():
+                raise StereoSfmError(f"cannot make --map-out {self.map_out}: {above} is no folder")
 
 def make_mapper(config: Config, rig: Rig, spans: NoSpans, folders: MapFolders) -> AnyMapper:
     """The mapper, or the localizer in a saved map."""

@@ -18,7 +18,7 @@ from typing import Any
 
 from calib.rig import Rig
 from stereo_sfm.config import Config
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import StereoSfmError, from_os_error
 from stereo_sfm.log.provenance import Opening
 from stereo_sfm.pipeline.channels import End, Failed, Inbox, Lost, Outbox
 from stereo_sfm.pipeline.maps import MapFolders, make_mapper, save_result
@@ -64,10 +64,14 @@ def guarded(stage: str, body: Callable[..., None], report: Connection, *args: An
         to_main.send(Failed(stage, str(error), True, error.exit_code))
         to_main.close()
         os._exit(error.exit_code)
-    except BaseException:
-        to_main.send(Failed(stage, traceback.format_exc(), False, 1))
+    except BaseException as error:
+        said = from_os_error(error) if isinstance(error, OSError) else None
+        failed = (
+            Failed(stage, str(said), True, said.exit_code) if said else Failed(stage, traceback.format_exc(), False, 1)
+        )
+        to_main.send(failed)
         to_main.close()
-        os._exit(1)
+        os._exit(failed.exit_code)
 
 
 @dataclass(frozen=True)

@@ -68,6 +68,7 @@ class RerunSink:
             print(f"viewer: http://localhost:{WEB_PORT}/?url={quote(uri, safe='')}", file=sys.stderr, flush=True)
         else:
             assert path is not None
+            path.open("ab").close()  # rerun's own error for a file that cannot be written is no OSError
             self._rec.save(path, default_blueprint=blueprint(name))
         self._scene = MapScene(self._rec, rig)
         self._images: dict[int, StereoImage] = {}  # that wait for their frame

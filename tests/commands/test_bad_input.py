@@ -232,3 +232,46 @@ def test_eval_of_bad_files(cli: Run, tmp_path: Path, args: tuple[str, ...], word
         (tmp_path / f"{name}.tum").write_text("\n".join(lines))
     (tmp_path / "bad.tum").write_text("1 2 3")
     assert_one_line(cli("eval", *args), word)
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        ("run", "data", "-c", "folder"),
+        ("config", "dump", "-c", "folder"),
+        ("config", "dump", "-c", "noise.toml"),
+        ("ablation", "data", "-o", "file", "--features", "orb", "--systems", "none"),
+        ("eval", "folder", "--ref", "folder/trajectory_map.tum", "--plot", "file"),
+        ("export", "folder", "--format", "tum", "-o", "file/x"),
+        ("rectify", "data", "-o", "file"),
+        ("batch", "data", "-o", "file"),
+        ("viz", "data.mcap", "--save", "file/x.rrd"),
+        ("viz", "data.mcap", "--save", "folder"),
+        ("run", "data", "--map-out", "file/x"),
+    ],
+)
+def test_files_that_cannot_be_read_or_written(cli: Run, tmp_path: Path, args: tuple[str, ...]) -> None:
+    make_images(tmp_path / "data")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").write_text("years of work")
+    (tmp_path / "noise.toml").write_bytes(bytes(range(256)))
+    lines = [f"{i / 10} {i} {i * i} 0 0 0 0 1" for i in range(9)]
+    (tmp_path / "folder" / "trajectory_map.tum").write_text("\n".join(lines))
+    if args[0] == "viz":
+        assert cli("convert", "data", "-o", "data.mcap", "-q")[0] == 0
+    assert_one_line(cli(*args), next(name for name in ("noise.toml", "file", "folder") if name in " ".join(args[2:])))
+    assert (tmp_path / "file").read_text() == "years of work"
+
+
+def test_errors_that_are_not_of_a_file_keep_their_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(_: object) -> int:
+        raise ConnectionResetError(104, "Connection reset by peer")
+
+    monkeypatch.setattr("stereo_sfm.commands.config.run", broken)
+    with pytest.raises(ConnectionResetError):
+        main(["config", "dump"])
+
+
+@pytest.mark.parametrize("speed", ["0", "-1", "nan"])
+def test_a_speed_that_means_nothing(cli: Run, tmp_path: Path, speed: str) -> None:
+    assert_one_line(cli("run", make_images(tmp_path / "data"), "--speed", speed, "--processes"), "speed", "above 0")
