@@ -6,8 +6,7 @@ The same map gives the same bytes. What is wrong with a folder is said in one li
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import json
+import io
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,11 +17,11 @@ import numpy as np
 from calib.formats.native import read_native, write_native
 from calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.export.map_header import check_counts, checksum, damaged, read_header, write_header
+from stereo_sfm.export.replace_folder import replaced_folder
 from stereo_sfm.mapping.map import Map, MapSnapshot
 from stereo_sfm.types import I64, Keyframe, Trajectory
 
-VERSION = 1
-KIND = "stereo_sfm_map"
 _FILES: dict[str, tuple[str, ...]] = {
     "keyframes": ("kf_ids", "frame_ids", "stamp_ns", "submap_ids", "map_T_kf", "odom_T_kf", "sessions"),
     "points": ("pt_ids", "points", "anchors", "seen", "expected"),
@@ -50,32 +49,29 @@ class SavedMap:
 
 
 def save_map(saved: SavedMap, folder: Path) -> None:
-    """Write a map folder; what else lies in it stays.
+    """Write a map folder, whole or not at all; what else lies in it stays.
 
     Raises:
         StereoSfmError: the map is empty.
     """
     if not len(saved) or not len(saved.snapshot.points):
         raise StereoSfmError("the map is empty: nothing to save")
-    folder.mkdir(parents=True, exist_ok=True)
-    sums: dict[str, str] = {}
-    for name, columns in _FILES.items():
-        path = folder / f"{name}.npz"
-        np.savez_compressed(path, **{c: _column(saved, c) for c in columns})
-        sums[name] = hashlib.sha256(path.read_bytes()).hexdigest()
-    write_native(saved.rig, folder / "rig.yaml")
+    with replaced_folder(folder, frozenset({"map.json", "rig.yaml", *(f"{name}.npz" for name in _FILES)})) as draft:
+        sums: dict[str, str] = {}
+        for name, columns in _FILES.items():
+            path = draft / f"{name}.npz"
+            np.savez_compressed(path, **{c: _column(saved, c) for c in columns})
+            sums[name] = checksum(path.read_bytes())
+        write_native(saved.rig, draft / "rig.yaml")
+        sums["rig"] = checksum((draft / "rig.yaml").read_bytes())
+        write_header(draft, _counts(saved), saved.vocabulary_id, sums)
+
+
+def _counts(saved: SavedMap) -> dict[str, int]:
+    """What map.json says of the size of the map."""
     s = saved.snapshot
-    head = {
-        "kind": KIND,
-        "version": VERSION,
-        "keyframes": len(s.kf_ids),
-        "points": len(s.pt_ids),
-        "observations": len(s.obs_kf),
-        "sessions": int(saved.sessions.max()) + 1,
-        "vocabulary": saved.vocabulary_id,
-        "sha256": sums,
-    }
-    (folder / "map.json").write_text(json.dumps(head, indent=1) + "\n")
+    sessions = int(saved.sessions.max(initial=-1)) + 1
+    return {"keyframes": len(s.kf_ids), "points": len(s.pt_ids), "observations": len(s.obs_kf), "sessions": sessions}
 
 
 def _column(saved: SavedMap, name: str) -> Any:
@@ -93,18 +89,21 @@ def load_map(folder: Path, rig: Rig | None = None) -> SavedMap:
     Raises:
         StereoSfmError: no map, another version, damaged, empty, or made with another camera.
     """
-    head = _head(folder)
+    head = read_header(folder, tuple(_FILES))
+    sums = head["sha256"]
     columns: dict[str, Any] = {}
     try:
         for name, wanted in _FILES.items():
             raw = (folder / f"{name}.npz").read_bytes()
-            if hashlib.sha256(raw).hexdigest() != head["sha256"][name]:
+            if checksum(raw) != sums[name]:
                 raise ValueError(name)
-            with np.load(folder / f"{name}.npz", allow_pickle=False) as data:
+            with np.load(io.BytesIO(raw), allow_pickle=False) as data:
                 columns.update({c: data[c] for c in wanted})
+        if "rig" in sums and checksum((folder / "rig.yaml").read_bytes()) != sums["rig"]:  # the first maps have none
+            raise ValueError("rig")
         own = read_native(folder / "rig.yaml")
     except (OSError, KeyError, ValueError, EOFError, TypeError, zipfile.BadZipFile, StereoSfmError):
-        raise StereoSfmError(f"the map {folder} is damaged: a file is missing or was changed; save it again") from None
+        raise damaged(folder, "a file is missing or was changed") from None
     sessions = columns.pop("sessions")
     for name in ("uv_left", "uv_right"):
         columns[name] = columns[name].astype(np.float64)
@@ -115,21 +114,9 @@ def load_map(folder: Path, rig: Rig | None = None) -> SavedMap:
         raise StereoSfmError(
             f"the map {folder} was made with another camera ({describe_rig(own)}) than this one ({describe_rig(rig)})"
         )
-    return SavedMap(snapshot, own, str(head["vocabulary"]), sessions)
-
-
-def _head(folder: Path) -> dict[str, Any]:
-    path = folder / "map.json"
-    if not path.is_file():
-        raise StereoSfmError(f"no map at {folder}: there is no map.json (make one with 'run ... --map-out')")
-    try:
-        head = json.loads(path.read_text())
-        version = head["version"] if head["kind"] == KIND else None
-    except (ValueError, KeyError, TypeError, OSError):
-        raise StereoSfmError(f"the map {folder} is damaged: map.json cannot be read; save it again") from None
-    if version != VERSION:
-        raise StereoSfmError(f"the map {folder} is version {version}, this program reads version {VERSION}")
-    return head
+    saved = SavedMap(snapshot, own, head["vocabulary"], sessions)
+    check_counts(folder, head, _counts(saved))
+    return saved
 
 
 def same_rig(a: Rig, b: Rig) -> bool:

@@ -93,6 +93,79 @@ def test_damaged_files_are_noticed(tmp_path: Path, saved: SavedMap, name: str, h
         load_map(tmp_path / "m")
 
 
+def test_an_edited_focal_length_is_noticed(tmp_path: Path, saved: SavedMap) -> None:
+    save_map(saved, tmp_path / "m")
+    path = tmp_path / "m" / "rig.yaml"
+    focal = f"{saved.rig.left.fx!r}"
+    assert focal in path.read_text()
+    path.write_text(path.read_text().replace(focal, f"{saved.rig.left.fx + 1!r}"))
+    with pytest.raises(StereoSfmError, match="damaged: a file is missing or was changed"):
+        load_map(tmp_path / "m")
+
+
+def test_maps_from_before_the_rig_had_a_checksum_are_read(tmp_path: Path, saved: SavedMap) -> None:
+    save_map(saved, tmp_path / "m")
+    sums = json.loads((tmp_path / "m" / "map.json").read_text())["sha256"]
+    spoil(tmp_path / "m", sha256={name: sums[name] for name in ("keyframes", "points", "observations")})
+    assert same(load_map(tmp_path / "m").snapshot, saved.snapshot)
+
+
+@pytest.mark.parametrize("value", [None, 1.5, -1, 3, [], True])
+@pytest.mark.parametrize("field", ["keyframes", "points", "observations", "sessions", "vocabulary", "sha256"])
+def test_each_field_of_map_json_is_checked(tmp_path: Path, saved: SavedMap, field: str, value: object) -> None:
+    save_map(saved, tmp_path / "m")
+    spoil(tmp_path / "m", **{field: value})
+    with pytest.raises(StereoSfmError, match=r"damaged: map\.json (has no|lacks|says)"):
+        load_map(tmp_path / "m")
+    head = json.loads((tmp_path / "m" / "map.json").read_text())
+    del head[field]
+    (tmp_path / "m" / "map.json").write_text(json.dumps(head))
+    with pytest.raises(StereoSfmError, match=r"damaged: map\.json (has no|lacks)"):
+        load_map(tmp_path / "m")
+
+
+@pytest.mark.parametrize("beside", [[], ["notes.txt"]])
+def test_a_save_that_fails_leaves_the_map_that_was_there(
+    tmp_path: Path, saved: SavedMap, monkeypatch: pytest.MonkeyPatch, beside: list[str]
+) -> None:
+    folder = tmp_path / "m"
+    save_map(saved, folder)
+    for name in beside:
+        (folder / name).write_text("mine")
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    other = dataclasses.replace(saved, vocabulary_id="new")
+    with monkeypatch.context() as patch:
+        patch.setattr("stereo_sfm.export.saved_map.write_native", full)
+        with pytest.raises(OSError, match="No space"):
+            save_map(other, folder)
+        with pytest.raises(OSError, match="No space"):
+            save_map(other, tmp_path / "fresh")
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    assert list(tmp_path.iterdir()) == [folder]
+    save_map(other, folder)
+    assert load_map(folder).vocabulary_id == "new"
+    assert list(tmp_path.iterdir()) == [folder]
+    assert {path.name for path in folder.iterdir()} == before.keys()
+
+
+def test_a_map_is_saved_into_the_folder_one_stands_in(
+    tmp_path: Path, saved: SavedMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for _ in range(2):
+        save_map(saved, Path())
+        assert len(load_map(Path())) == len(saved)
+        assert tmp_path.samefile(Path.cwd())
+    (tmp_path.parent / "link").symlink_to(tmp_path)
+    monkeypatch.chdir(tmp_path.parent)
+    save_map(saved, tmp_path.parent / "link")
+    assert (tmp_path.parent / "link").is_symlink()
+
+
 def test_empty_map_is_not_saved(tmp_path: Path, saved: SavedMap) -> None:
     s = saved.snapshot
     nothing = dataclasses.replace(s, points=s.points[:0], pt_ids=s.pt_ids[:0])

@@ -1,0 +1,68 @@
+"""`map.json`: what a saved map says about itself, checked field by field."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+from stereo_sfm.errors import StereoSfmError
+
+VERSION = 1
+KIND = "stereo_sfm_map"
+COUNTS = ("keyframes", "points", "observations", "sessions")
+
+
+def damaged(folder: Path, what: str) -> StereoSfmError:
+    """The error of a map folder that is not as it was saved."""
+    return StereoSfmError(f"the map {folder} is damaged: {what}; save it again")
+
+
+def checksum(raw: bytes) -> str:
+    """As it stands in map.json."""
+    return hashlib.sha256(raw).hexdigest()
+
+
+def write_header(folder: Path, counts: dict[str, int], vocabulary_id: str, sums: dict[str, str]) -> None:
+    """Write map.json with the numbers of rows by name and the checksums of the files by name."""
+    head = {"kind": KIND, "version": VERSION, **counts, "vocabulary": vocabulary_id, "sha256": sums}
+    (folder / "map.json").write_text(json.dumps(head, indent=1) + "\n")
+
+
+def read_header(folder: Path, files: tuple[str, ...]) -> dict[str, Any]:
+    """The fields of map.json.
+
+    Args:
+        folder: of the map.
+        files: names that must have a checksum.
+
+    Raises:
+        StereoSfmError: no map, another version, or a field that is missing or no sense.
+    """
+    path = folder / "map.json"
+    if not path.is_file():
+        raise StereoSfmError(f"no map at {folder}: there is no map.json (make one with 'run ... --map-out')")
+    try:
+        head = json.loads(path.read_text())
+        version = head["version"] if head["kind"] == KIND else None
+    except (ValueError, KeyError, TypeError, OSError):
+        raise damaged(folder, "map.json cannot be read") from None
+    if version != VERSION:
+        raise StereoSfmError(f"the map {folder} is version {version}, this program reads version {VERSION}")
+    for name in COUNTS:
+        if type(head.get(name)) is not int or head[name] < 0:
+            raise damaged(folder, f"map.json has no number '{name}'")
+    if not isinstance(head.get("vocabulary"), str):
+        raise damaged(folder, "map.json has no text 'vocabulary'")
+    sums = head.get("sha256")
+    if not isinstance(sums, dict) or not all(isinstance(sums.get(name), str) for name in files):
+        raise damaged(folder, "map.json lacks checksums")
+    return head
+
+
+def check_counts(folder: Path, head: dict[str, Any], counts: dict[str, int]) -> None:
+    """Raises StereoSfmError where map.json and the files tell other numbers."""
+    for name in COUNTS:
+        if head[name] != counts[name]:
+            raise damaged(folder, f"map.json says {head[name]} {name}, the files hold {counts[name]}")

@@ -1,0 +1,61 @@
+"""A folder of files that is there whole or not at all: written beside its place, then renamed into it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def replaced_folder(folder: Path, names: frozenset[str]) -> Generator[Path]:
+    """An empty folder to write into; at the end of the block it takes the place of `folder`.
+
+    Until then what lies in `folder` is untouched, and it stays so when the block raises or the process is killed
+    (between the two renames at the end it is called .NAME.old). A
+    folder that holds other files than `names`, or cannot be renamed (a mount, the working directory), stays as it is
+    and gets the new files one after the other.
+    """
+    folder = folder.resolve()
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    keep = folder.exists() and (_cannot_move(folder) or any(path.name not in names for path in folder.iterdir()))
+    draft = folder / ".partial" if keep else folder.with_name(f".{folder.name}.partial")
+    _remove(draft)  # of a process that was killed
+    draft.mkdir()
+    try:
+        yield draft
+        if keep:
+            for path in sorted(draft.iterdir()):
+                path.replace(folder / path.name)
+        else:
+            _swap(draft, folder)
+    finally:
+        _remove(draft)
+
+
+def _cannot_move(folder: Path) -> bool:
+    here = Path.cwd()
+    return folder.is_mount() or folder == here or folder in here.parents
+
+
+def _swap(draft: Path, folder: Path) -> None:
+    if not folder.exists():
+        draft.rename(folder)
+        return
+    shutil.copymode(folder, draft)
+    old = folder.with_name(f".{folder.name}.old")
+    _remove(old)
+    folder.rename(old)
+    try:
+        draft.rename(folder)
+    except OSError:
+        old.rename(folder)
+        raise
+    _remove(old)
+
+
+def _remove(folder: Path) -> None:
+    if os.path.lexists(folder):
+        shutil.rmtree(folder)
