@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_source_arguments(parser)
     add_config_arguments(parser)
     add_wiring_arguments(parser)
-    parser.add_argument("--map-in", type=Path, metavar="DIR", help="saved map of this place, from --map-out")
+    parser.add_argument("--map-in", type=Path, metavar="DIR", help="go on with a saved map of this place")
     parser.add_argument("--localize-only", action="store_true", help="find the camera in --map-in, change no map")
     parser.add_argument("--map-out", type=Path, metavar="DIR", help="save the map (merged with --map-in, if given)")
     parser.add_argument("--frame", choices=("cam0", "body"), default="cam0", help="whose poses the trajectories hold")

@@ -144,16 +144,22 @@ class RunRecord:
         return self._trajectory([row.odom_T_cam for row in self.frames])
 
     def mapped(self) -> Trajectory | None:
-        """map_T_cam of the tracked frames after the last map update; None without a map."""
-        if not self.map_T_kf:
+        """map_T_cam after the last map update of the frames that have a place in the map; None without any."""
+        if not len(self.map_T_kf):
             return None
         known = self.map_T_kf.all()
-        return self._trajectory(
-            [known[f.reference_kf_id] @ f.kf_T_cam if f.reference_kf_id in known else f.odom_T_cam for f in self.frames]
-        )
+        poses = [
+            known[f.reference_kf_id] @ f.kf_T_cam if f.reference_kf_id in known else np.eye(4) for f in self.frames
+        ]
+        return self._trajectory(poses, self.placed())
 
-    def _trajectory(self, poses: list[F64]) -> Trajectory:
-        keep = np.flatnonzero(self.tracked())
+    def placed(self) -> Bool:
+        """(frames,) whether the frame has a place in the map; all tracked ones unless a saved map did not know them."""
+        known = self.map_T_kf.all()
+        return self.tracked() & np.array([f.reference_kf_id in known for f in self.frames], bool)
+
+    def _trajectory(self, poses: list[F64], kept: Bool | None = None) -> Trajectory:
+        keep = np.flatnonzero(self.tracked() if kept is None else kept)
         stamps = np.array([self.frames[i].stamp_ns for i in keep], np.int64)
         return Trajectory(stamps, np.array([poses[i] for i in keep]).reshape(-1, 4, 4))
 
@@ -164,18 +170,18 @@ class RunRecord:
         stamps = np.array([row.stamp_ns for _, row in rows], np.int64)
         return Trajectory(stamps, np.array(poses).reshape(-1, 4, 4))
 
-    def pose_per_frame(self, poses: F64, step: int = 1) -> F64:
+    def pose_per_frame(self, poses: F64, kept: Bool, step: int = 1) -> F64:
         """One pose for each frame id of the run: what was lost lies between its neighbours.
 
         Args:
-            poses: (tracked frames, 4, 4).
+            poses: (M, 4, 4) of the frames that `kept` (frames,) marks.
             step: frame ids that follow each other.
 
         Returns:
             (M, 4, 4). Frames before the first pose take that one, those after the last take the last.
         """
         ids: I64 = np.array([row.frame_id for row in self.frames], np.int64)
-        known = ids[self.tracked()]
+        known = ids[kept]
         if not len(known):
             return poses
         filled = fill_missing(known, poses, step)

@@ -99,7 +99,8 @@ def _write_trajectory(
     if not len(trajectory):
         return
     _write_tum(folder / f"trajectory_{name}.tum", trajectory, rig, frame)
-    per_frame = record.pose_per_frame(trajectory.poses, step)
+    kept = record.tracked() if name == "odom" else record.placed()
+    per_frame = record.pose_per_frame(trajectory.poses, kept, step)
     write_kitti(folder / f"trajectory_{name}.kitti", in_frame(per_frame, frame, rig))
 
 

@@ -47,6 +47,7 @@ def statistics(record: RunRecord, wall_s: float, evaluations: dict[str, Evaluati
     return {
         "frames": frames,
         "tracked": tracked,
+        "unplaced": tracked - int(record.placed().sum()),  # a saved map did not know them
         "dropped": record.dropped,
         "states": states,
         "lost_percent": 100.0 * (frames - tracked) / frames if frames else 0.0,
@@ -88,6 +89,8 @@ def failure(stats: dict[str, Any], max_lost_percent: float = MAX_LOST_PERCENT) -
         return "tracking never initialised"
     if stats["lost_percent"] > max_lost_percent:
         return f"{stats['lost_percent']:.0f} % of the frames have no pose (limit {max_lost_percent:g} %)"
+    if stats["unplaced"] == stats["tracked"]:
+        return "the camera was never found in the map"
     return ""
 
 
@@ -104,6 +107,8 @@ def summary(stats: dict[str, Any], evaluations: dict[str, Evaluation] | None = N
         f"tracked {thousands(stats['tracked'])}/{thousands(total)} frames ({stats['dropped']} dropped by capture), "
         f"{_lost(lost)}, {stats['keyframes']} keyframes, {thousands(stats['points'])} points",
     ]
+    if stats["unplaced"]:
+        lines.append(f"{thousands(stats['unplaced'])} of the tracked frames were not found in the map")
     if stats["loops_accepted"] or stats["loops_rejected"]:
         lines.append(_loops(stats))
     if stats["camera"]:

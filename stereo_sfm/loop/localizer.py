@@ -23,6 +23,7 @@ class Localizer:
 
     The first answer needs no guess. Later keyframes are looked for around the prediction; after some failures, or when
     tracking restarted as another submap, the whole map is searched again. `found` is False until the first answer.
+    Keyframes from before the first answer of their submap get their places with it, by odometry.
     """
 
     def __init__(self, snapshot: MapSnapshot, rig: Rig, vocabulary: Vocabulary, config: LoopConfig) -> None:
@@ -32,6 +33,7 @@ class Localizer:
         self._version = 0
         self._submap = -1
         self._failures = 0
+        self._waiting: list[Keyframe] | None = []  # of this submap, not placed yet; None: it is placed
         self.found = False
         self.last = None
 
@@ -41,18 +43,19 @@ class Localizer:
         """Place a keyframe in the map; `loop` is taken for the mapper's signature and not used."""
         self._version += 1
         if keyframe.submap_id != self._submap:
-            self._submap, self._failures = keyframe.submap_id, LOST_AFTER
+            self._submap, self._failures, self._waiting = keyframe.submap_id, LOST_AFTER, []
         self.last = self._locate(keyframe)
         if self.last.found:
             self._map_T_odom = se3.orthonormalize(self.last.map_T_cam @ se3.inverse(keyframe.odom_T_cam))
             self.found, self._failures = True, 0
         else:
             self._failures += 1
+        placed = self._placed(keyframe)
         return MapUpdate(
             version=self._version,
             kf_id=keyframe.kf_id,
-            kf_ids=np.array([keyframe.kf_id], np.int64),
-            map_T_kf=(self._map_T_odom @ keyframe.odom_T_cam)[None],
+            kf_ids=np.array([k.kf_id for k in placed], np.int64),
+            map_T_kf=np.array([self._map_T_odom @ k.odom_T_cam for k in placed]).reshape(-1, 4, 4),
             point_ids=np.zeros(0, np.int64),
             points_map=np.zeros((0, 3)),
             culled_point_ids=np.zeros(0, np.int64),
@@ -63,6 +66,15 @@ class Localizer:
     def finish(self, loops: Sequence[LoopResult]) -> MapUpdate | None:
         """Nothing is left behind."""
         return None
+
+    def _placed(self, keyframe: Keyframe) -> list[Keyframe]:
+        """The keyframes whose places are known with this one."""
+        if self._waiting is None:
+            return [keyframe]
+        waiting = [*self._waiting, keyframe]
+        found = self.last is not None and self.last.found
+        self._waiting = None if found else waiting
+        return waiting if found else []
 
     def _locate(self, keyframe: Keyframe) -> Location:
         if self.found and self._failures < LOST_AFTER:

@@ -16,8 +16,9 @@ from stereo_sfm.timing import NoSpans
 
 @dataclass(frozen=True)
 class MapFolders:
-    """`localize_only`: place the odometry in the map at `map_in` and change nothing. Otherwise the walk's own map is
-    merged with the one at `map_in`, if any, when it is saved to `map_out`."""
+    """`localize_only`: place the odometry in the map at `map_in` and change nothing. Otherwise the walk is mapped as
+    always, placed in the map at `map_in`, if any, once it is found there, and merged with it when it is saved to
+    `map_out`."""
 
     map_in: Path | None = None
     localize_only: bool = False
@@ -33,24 +34,28 @@ class MapFolders:
             raise StereoSfmError(f"no map at {self.map_in}: 'stereo-sfm run ... --map-out DIR' makes one")
         if self.map_out is not None and self.map_out.exists() and not overwrite:
             raise StereoSfmError(f"{self.map_out} exists: choose another --map-out, or say --overwrite")
-
         if self.map_out is not None:
             above = next(folder for folder in self.map_out.absolute().parents if folder.exists())
             if not above.is_dir():
                 raise StereoSfmError(f"cannot make --map-out {self.map_out}: {above} is no folder")
 
+
 def make_mapper(config: Config, rig: Rig, spans: NoSpans, folders: MapFolders) -> AnyMapper:
     """The mapper, or the localizer in a saved map."""
-    if folders.localize_only and folders.map_in is not None:
-        from stereo_sfm.export.saved_map import load_map
-        from stereo_sfm.loop.localizer import Localizer
-        from stereo_sfm.loop.vocabulary_file import configured_vocabulary
-
-        saved = load_map(folders.map_in, rig)
-        return Localizer(saved.snapshot, rig, configured_vocabulary(config.loop), config.loop)
+    if not folders.localize_only and not config.mapper.enabled and (folders.map_in or folders.map_out):
+        raise StereoSfmError("there is no map without the mapper: leave mapper.enabled=true, or --map-in and --map-out")
     from stereo_sfm.mapping.mapper import Mapper
 
-    return Mapper(config.mapper, rig, spans, config.loop)
+    if folders.map_in is None:
+        return Mapper(config.mapper, rig, spans, config.loop)
+    from stereo_sfm.export.saved_map import load_map
+    from stereo_sfm.loop.extension import Extension
+    from stereo_sfm.loop.localizer import Localizer
+    from stereo_sfm.loop.vocabulary_file import configured_vocabulary
+
+    saved = load_map(folders.map_in, rig)
+    localizer = Localizer(saved.snapshot, rig, configured_vocabulary(config.loop), config.loop)
+    return localizer if folders.localize_only else Extension(config.mapper, rig, spans, config.loop, localizer)
 
 
 def save_result(mapper: AnyMapper, config: Config, rig: Rig, folders: MapFolders) -> None:
@@ -67,5 +72,11 @@ def save_result(mapper: AnyMapper, config: Config, rig: Rig, folders: MapFolders
     snapshot = mapper.map.snapshot()
     saved = SavedMap(snapshot, rig, vocabulary.id, np.zeros(len(snapshot.kf_ids), np.int64))
     if folders.map_in is not None:
-        saved = merge([load_map(folders.map_in, rig), saved], vocabulary, config.loop).saved
+        try:
+            saved = merge([load_map(folders.map_in, rig), saved], vocabulary, config.loop).saved
+        except StereoSfmError as error:
+            save_map(saved, folders.map_out)
+            raise StereoSfmError(
+                f"not merged with {folders.map_in}: {error}; {folders.map_out} is this walk alone"
+            ) from None
     save_map(saved, folders.map_out)

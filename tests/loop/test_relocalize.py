@@ -7,11 +7,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from stereo_sfm.config import LoopConfig
+from stereo_sfm.config import LoopConfig, MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
+from stereo_sfm.loop.extension import Extension
 from stereo_sfm.loop.localizer import Localizer
 from stereo_sfm.loop.relocalize import Relocalizer
+from stereo_sfm.mapping.keyframe_poses import KeyframePoses
 from stereo_sfm.types import F64, U8
 from tests.export.maps import map_of_walk
 from tests.loop.store_walk import StoreWalk, make_walk
@@ -109,7 +111,7 @@ def test_localizer_before_it_is_found(walk: StoreWalk, vocabulary: voc.Vocabular
     localizer = Localizer(map_of_walk(part).snapshot, walk.rig, vocabulary, LoopConfig())
     update = localizer.step(make_walk([0], seed=77).keyframes[4])
     assert not localizer.found
-    assert np.array_equal(update.map_T_odom, np.eye(4))
+    assert np.array_equal(update.map_T_odom, np.eye(4)) and len(update.kf_ids) == 0  # no place is claimed
     assert localizer.last is not None and localizer.last.reason
 
 
@@ -117,3 +119,45 @@ def test_same_question_same_bits(walk: StoreWalk, first_pass: int, relocalizer: 
     answers = [relocalizer.locate(walk.keyframes[first_pass + 10]) for _ in range(2)]
     assert answers[0].map_T_cam.tobytes() == answers[1].map_T_cam.tobytes()
     assert np.array_equal(answers[0].pairs, answers[1].pairs)
+
+
+def test_what_came_before_the_first_answer_is_placed_with_it(
+    walk: StoreWalk, first_pass: int, vocabulary: voc.Vocabulary
+) -> None:
+    part = dataclasses.replace(walk, keyframes=walk.keyframes[:first_pass], world_T_kf=walk.world_T_kf[:first_pass])
+    localizer = Localizer(map_of_walk(part).snapshot, walk.rig, vocabulary, LoopConfig())
+    rows = range(first_pass + 5, first_pass + 9)
+    keyframes = [dataclasses.replace(walk.keyframes[k], kf_id=n) for n, k in enumerate(rows)]
+    blind = [dataclasses.replace(k, descriptors=np.zeros_like(k.descriptors)) for k in keyframes[:2]]
+    assert [len(localizer.step(k).kf_ids) for k in blind] == [0, 0]
+    update = localizer.step(keyframes[2])
+    assert update.kf_ids.tolist() == [0, 1, 2]
+    for k, pose in zip(rows, update.map_T_kf, strict=False):
+        assert np.linalg.norm((se3.inverse(true_pose(walk, k)) @ pose)[:3, 3]) < 0.1
+    assert localizer.step(keyframes[3]).kf_ids.tolist() == [3]
+
+
+def test_a_walk_goes_on_in_the_frame_of_the_saved_map(
+    walk: StoreWalk, first_pass: int, vocabulary: voc.Vocabulary
+) -> None:
+    part = dataclasses.replace(walk, keyframes=walk.keyframes[:first_pass], world_T_kf=walk.world_T_kf[:first_pass])
+    localizer = Localizer(map_of_walk(part).snapshot, walk.rig, vocabulary, LoopConfig())
+    extension = Extension(MapperConfig(), walk.rig, None, LoopConfig(), localizer)
+    rows = range(first_pass + 5, first_pass + 15)
+    odom = se3.inverse(walk.keyframes[rows[0]].odom_T_cam)
+    keyframes = [
+        dataclasses.replace(walk.keyframes[k], kf_id=n, odom_T_cam=odom @ walk.keyframes[k].odom_T_cam)
+        for n, k in enumerate(rows)
+    ]
+    blind = [dataclasses.replace(k, descriptors=np.zeros_like(k.descriptors)) for k in keyframes[:2]]
+    poses = KeyframePoses()
+    for keyframe in blind:
+        assert np.array_equal(extension.step(keyframe).map_T_odom, np.eye(4)) and not localizer.found
+    updates = [extension.step(keyframe) for keyframe in keyframes[2:]]
+    for update in updates:
+        poses.update(update)
+    last = updates[-1].map_T_odom
+    assert localizer.found and np.abs(last - np.eye(4)).max() > 0.1
+    for k, pose in zip(rows, poses.all().values(), strict=True):  # those from before it was found too
+        assert np.linalg.norm((se3.inverse(true_pose(walk, k)) @ pose)[:3, 3]) < 0.1
+    assert np.linalg.norm((se3.inverse(poses.all()[9]) @ last @ keyframes[9].odom_T_cam)[:3, 3]) < 0.05
