@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -79,7 +80,7 @@ def describe(saved: SavedMap) -> list[str]:
 def _merge(args: argparse.Namespace) -> int:
     from stereo_sfm import config as configuration
     from stereo_sfm.errors import StereoSfmError
-    from stereo_sfm.export.merge import merge
+    from stereo_sfm.export.merge import merge, share_a_walk
     from stereo_sfm.export.saved_map import load_map, save_map
 
     if len(args.maps) < 2:
@@ -87,6 +88,9 @@ def _merge(args: argparse.Namespace) -> int:
     _check_free(args)
     config = configuration.load(None, args.set).loop
     maps = [load_map(folder) for folder in args.maps]
+    for (name_a, a), (name_b, b) in combinations(zip(args.maps, maps, strict=True), 2):
+        if share_a_walk(a, b):
+            raise StereoSfmError(f"{name_a} and {name_b} hold the same walk: merge takes maps of different walks")
     result = merge(maps, _vocabulary(maps[0], config.vocabulary), config)
     save_map(result.saved, args.output)
     print(f"{len(maps)} maps joined by {len(result.loops)} loops, {result.fused} points seen by more than one walk")

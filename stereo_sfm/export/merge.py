@@ -20,6 +20,7 @@ from stereo_sfm.mapping.map import MapSnapshot
 from stereo_sfm.types import I64, Bool, LoopResult
 
 log = logging.getLogger("stereo_sfm")
+SAME_SHARE = 0.5  # of the pixels at common times: pictures taken twice have hardly any in common
 MERGE_PAUSE = 2  # keyframes between two loops of a merge: every link between the walks helps
 
 
@@ -55,6 +56,30 @@ def merge(maps: Sequence[SavedMap], vocabulary: Vocabulary, config: LoopConfig) 
     session = dict(zip(side_by_side.snapshot.kf_ids.tolist(), side_by_side.sessions.tolist(), strict=True))
     sessions = np.array([session[k] for k in snapshot.kf_ids.tolist()], np.int64)
     return Merge(dataclasses.replace(side_by_side, snapshot=snapshot, sessions=sessions), loops, fused)
+
+
+def share_a_walk(a: SavedMap, b: SavedMap) -> bool:
+    """Whether a walk of one map is one of the other: the same pixels were seen at the same times.
+
+    Times alone tell nothing, they begin at zero in many recordings.
+    """
+    return any(_same_walk(_sightings(a, m), _sightings(b, n)) for m in a.walks for n in b.walks)
+
+
+def _sightings(saved: SavedMap, walk: int) -> dict[int, set[tuple[float, float]]]:
+    """The pixels (as files hold them) of what the left eye saw in a walk, by the time of the keyframe."""
+    s = saved.snapshot
+    rows = np.flatnonzero((saved.sessions == walk)[s.obs_kf])
+    out: dict[int, set[tuple[float, float]]] = {}
+    for stamp, (u, v) in zip(s.stamp_ns[s.obs_kf[rows]].tolist(), s.uv_left[rows].astype(np.float32), strict=True):
+        out.setdefault(stamp, set()).add((float(u), float(v)))
+    return out
+
+
+def _same_walk(a: dict[int, set[tuple[float, float]]], b: dict[int, set[tuple[float, float]]]) -> bool:
+    times = a.keys() & b.keys()
+    same = sum(len(a[t] & b[t]) for t in times)
+    return same > SAME_SHARE * sum(min(len(a[t]), len(b[t])) for t in times)
 
 
 def _check_joined(saved: SavedMap, loops: list[LoopResult], count: int) -> None:

@@ -11,7 +11,7 @@ import pytest
 from stereo_sfm.cli import main
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.export.merge import merge, prune
+from stereo_sfm.export.merge import merge, prune, share_a_walk
 from stereo_sfm.export.saved_map import SavedMap, joined, load_map, save_map
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
@@ -75,6 +75,20 @@ def test_maps_of_different_cameras_are_not_joined(maps: list[SavedMap]) -> None:
         joined([maps[0], dataclasses.replace(maps[1], rig=pinhole_rig())])
 
 
+def test_a_walk_is_known_again(maps: list[SavedMap], merged: SavedMap) -> None:
+    for saved in maps:
+        assert share_a_walk(saved, saved)
+        assert share_a_walk(merged, saved)
+    part = np.arange(len(maps[0])) < 20
+    s = maps[0].snapshot
+    snapshot = dataclasses.replace(s, **{f: getattr(s, f)[part[s.obs_kf]] for f in ("obs_kf", "obs_pt", "uv_left")})
+    assert share_a_walk(dataclasses.replace(maps[0], snapshot=snapshot), maps[0])
+    assert not share_a_walk(maps[0], maps[1])
+    again = map_of_walk(make_walk([0, 1], seed=31, noise_px=0.3))  # the same times, pictures of their own
+    assert set(again.snapshot.stamp_ns.tolist()) & set(s.stamp_ns.tolist())
+    assert not share_a_walk(maps[0], again)
+
+
 def test_side_by_side_keeps_every_row(maps: list[SavedMap]) -> None:
     both = joined(maps).snapshot
     first = len(maps[0].snapshot.obs_kf)
@@ -124,5 +138,10 @@ def test_commands(
     assert "holds a map: choose another -o" in capsys.readouterr().err
     assert main(["map", "merge", a, "-o", str(tmp_path / "c")]) == 2
     assert "at least two maps" in capsys.readouterr().err
+    for pair in ([a, a], [both, b]):
+        assert main(["map", "merge", *pair, "-o", str(tmp_path / "c")]) == 2
+        error = capsys.readouterr().err
+        assert f"{pair[0]} and {pair[1]} hold the same walk" in error and len(error.splitlines()) == 1
+    assert not (tmp_path / "c").exists()
     assert main(["map", "prune", both, "--min-views", "3", "-o", str(tmp_path / "d")]) == 0
     assert len(load_map(tmp_path / "d").snapshot.pt_ids) < len(load_map(Path(both)).snapshot.pt_ids)
