@@ -42,11 +42,25 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _check_ranges(args: argparse.Namespace) -> None:
+    from stereo_sfm.errors import StereoSfmError
+
+    for option, value, least in (
+        ("--images", args.images, 1),
+        ("--branching", args.branching, 2),
+        ("--depth", args.depth, 1),
+        ("--seed", args.seed, 0),
+    ):
+        if value < least:
+            raise StereoSfmError(f"{option} must be at least {least}, not {value}")
+
+
 def _train(args: argparse.Namespace) -> None:
     from stereo_sfm.errors import StereoSfmError
     from stereo_sfm.loop.vocabulary import train
     from stereo_sfm.loop.vocabulary_file import save_vocabulary
 
+    _check_ranges(args)
     images = [d for source in args.sources for d in _descriptors(source, args.images)]
     if not images:
         raise StereoSfmError("the sources hold no image with enough texture to train from")

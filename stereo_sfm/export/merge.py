@@ -122,8 +122,12 @@ def prune(saved: SavedMap, min_views: int = 0, min_seen_share: float = 0.0, unse
         unseen_sessions: points that no keyframe of the newest so many walks saw go.
 
     Raises:
-        StereoSfmError: nothing would be left.
+        StereoSfmError: nothing would be left, or an argument out of its range.
     """
+    if min_views < 0 or unseen_sessions < 0:
+        raise StereoSfmError("--min-views and --unseen-sessions must be at least 0")
+    if not 0 <= min_seen_share <= 1:
+        raise StereoSfmError(f"--min-seen-share must be between 0 and 1, not {min_seen_share}")
     s = saved.snapshot
     views = np.bincount(s.obs_pt, minlength=len(s.pt_ids))
     keep = views >= min_views

@@ -145,3 +145,17 @@ def test_commands(
     assert not (tmp_path / "c").exists()
     assert main(["map", "prune", both, "--min-views", "3", "-o", str(tmp_path / "d")]) == 0
     assert len(load_map(tmp_path / "d").snapshot.pt_ids) < len(load_map(Path(both)).snapshot.pt_ids)
+
+
+@pytest.mark.parametrize(
+    "option",
+    ["--min-views=-3", "--unseen-sessions=-1", "--min-seen-share=nan", "--min-seen-share=-0.1", "--min-seen-share=1.5"],
+)
+def test_prune_refuses_numbers_out_of_range(
+    tmp_path: Path, maps: list[SavedMap], option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_map(maps[1], tmp_path / "m")
+    assert main(["map", "prune", str(tmp_path / "m"), option, "-o", str(tmp_path / "p")]) == 2
+    error = capsys.readouterr().err
+    assert option.split("=")[0] in error and len(error.splitlines()) == 1
+    assert not (tmp_path / "p").exists()

@@ -29,3 +29,14 @@ def test_bad_input_has_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert "no vocabulary at" in capsys.readouterr().err
     assert main(["vocabulary", "train", str(tmp_path / "nowhere"), "-o", str(tmp_path / "v.npz")]) == 2
     assert "no such file or folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("option", "least"), [("--images", 1), ("--branching", 2), ("--depth", 1), ("--seed", 0)])
+@pytest.mark.parametrize("below", [1, 2])
+def test_numbers_out_of_range_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str, least: int, below: int
+) -> None:
+    train = ["vocabulary", "train", "sim:aisle", "-o", str(tmp_path / "v.npz"), f"{option}={least - below}"]
+    assert main(train) == 2
+    assert capsys.readouterr().err == f"stereo-sfm vocabulary: {option} must be at least {least}, not {least - below}\n"
+    assert not list(tmp_path.iterdir())
