@@ -24,22 +24,27 @@ def default_folder(source_name: str, now: datetime) -> Path:
 
 
 def prepare_folder(folder: Path, overwrite: bool) -> None:
-    """Make the folder of a new run.
+    """Make the folder of a new run; an empty one will do.
 
     With `overwrite` the files of an earlier run are removed, so that none of them is taken for this run's; whatever
     else lies there stays.
 
     Raises:
-        StereoSfmError: it exists and may not be overwritten, or cannot be made.
+        StereoSfmError: it holds something that may not be overwritten, or cannot be made.
     """
-    if folder.exists() and not overwrite:
-        raise StereoSfmError(f"{folder} exists: choose another -o, or say --overwrite")
     try:
+        if folder.exists() and not overwrite and not (folder.is_dir() and not any(folder.iterdir())):
+            raise StereoSfmError(f"{folder} exists: choose another -o, or say --overwrite")
         folder.mkdir(parents=True, exist_ok=True)
-        for name in FILES:
-            (folder / name).unlink(missing_ok=True)
+        discard_files(folder)
     except OSError as error:
         raise StereoSfmError(f"cannot make the output folder {folder}: {error.strerror}") from None
+
+
+def discard_files(folder: Path) -> None:
+    """Remove the files of a run; whatever else lies there stays."""
+    for name in FILES:
+        (folder / name).unlink(missing_ok=True)
 
 
 def link_latest(folder: Path) -> None:

@@ -61,6 +61,7 @@ class ProcessRun:
         folders: MapFolders | None = None,
         viewer: ViewerOptions | None = None,
         delays: int | None = None,
+        opened: Callable[[], None] | None = None,
     ) -> None:
         """Prepare a run.
 
@@ -74,10 +75,12 @@ class ProcessRun:
             folders: maps to start from and to leave behind.
             viewer: show the run while it goes on.
             delays: seed of random delays in every stage, for tests.
+            opened: called when the source is open, before anything is written.
         """
         self._opener, self._config, self._sinks = opener, config, list(sinks)
         self._realtime, self._applied, self._log, self._delays = realtime, applied, log, delays
         self._folders, self._viewer = folders or MapFolders(), viewer
+        self._opened = opened
         self._context = multiprocessing.get_context("spawn")
         self._processes: dict[str, BaseProcess] = {}
         self._reports: dict[Connection, str] = {}
@@ -194,7 +197,10 @@ class ProcessRun:
             for end in ends:
                 if end not in keep:
                     end.close()  # only the workers hold these: their death must be seen as an end of file
-        self._set_up(self._first_report())
+        info = self._first_report()
+        if self._opened is not None:
+            self._opened()
+        self._set_up(info)
 
     def _set_up(self, info: SourceInfo) -> None:
         self.info = info

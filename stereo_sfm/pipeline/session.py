@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Self
 from drivers.source import Source
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.export.run_folder import default_folder, prepare_folder
+from stereo_sfm.export.run_folder import default_folder, discard_files, prepare_folder
 from stereo_sfm.pipeline.capture import SourceInfo
 from stereo_sfm.pipeline.inline import run_inline
 from stereo_sfm.pipeline.maps import MapFolders
@@ -63,6 +63,8 @@ class Session:
         self._frames: Iterator[Frame]
         self._run: ProcessRun | None = None
         self._folder = folder
+        self._made = self._prepared = False  # the folder: by this run, and for this run
+        self._began = False  # a frame has come
         self.info: SourceInfo
 
     @property
@@ -77,20 +79,34 @@ class Session:
         return self._folder
 
     def __enter__(self) -> Self:
-        with ExitStack() as stack:
-            if self._folder is not None:
-                prepare_folder(self._folder, self._overwrite)
-            self._frames = self._enter_inline(stack) if self._wiring.inline else self._enter_processes(stack)
-            self._stack = stack.pop_all()
+        try:
+            with ExitStack() as stack:
+                self._frames = self._enter_inline(stack) if self._wiring.inline else self._enter_processes(stack)
+                self._stack = stack.pop_all()
+        except StereoSfmError as error:
+            self._clean_up(error)
+            raise
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._stack.__exit__(kind, error, trace)
+        self._clean_up(error)
+
+    def _clean_up(self, error: BaseException | None) -> None:
+        """A mistake that ended the run before its first frame leaves nothing behind that is in the way of the next."""
+        if self._folder is None or not self._prepared or self._began:
+            return
+        if isinstance(error, StereoSfmError) and error.exit_code == StereoSfmError.exit_code:
+            discard_files(self._folder)
+            if self._made:
+                with suppress(OSError):  # somebody else put something there
+                    self._folder.rmdir()
 
     def __iter__(self) -> Iterator[Frame]:
         for frame in self._frames:
+            self._began = True
             yield frame
             if self._stopped and self._run is None:
                 return
@@ -101,11 +117,16 @@ class Session:
         if self._run is not None:
             self._run.stop()
 
-    def _make_folder(self, name: str) -> Path:
+    def _name_folder(self, source_name: str) -> Path:
         if self._folder is None:
-            self._folder = default_folder(name, datetime.now())
-            prepare_folder(self._folder, self._overwrite)
+            self._folder = default_folder(source_name, datetime.now())
         return self._folder
+
+    def _prepare(self) -> None:
+        """Make the folder, once the source is open: what is wrong with the source is told first, and leaves none."""
+        self._made = not self.folder.exists()
+        prepare_folder(self.folder, self._overwrite)
+        self._prepared = True
 
     def _log_options(self, live: bool, folder: Path) -> LogOptions | None:
         kind = self._wiring.log or ("full" if live else "lean")
@@ -126,7 +147,8 @@ class Session:
 
         source = stack.enter_context(self._opener())
         self.info = SourceInfo(source.name, source.rig, source.ground_truth, source.frame_count, source.live)
-        folder = self._make_folder(source.name)
+        folder = self._name_folder(source.name)
+        self._prepare()
         options = self._log_options(source.live, folder)
         sinks: list[Any] = list(self._sinks)
         jpeg = options is not None and options.image_format == "jpeg"
@@ -155,7 +177,7 @@ class Session:
 
     def _enter_processes(self, stack: ExitStack) -> Iterator[Frame]:
         live = self._spec.split(":")[0] in LIVE
-        self._make_folder(self._spec.rstrip("/").split("/")[-1] or "run")
+        self._name_folder(self._spec.rstrip("/").split("/")[-1] or "run")
         viewer = None if self._wiring.viz == "none" else ViewerOptions(self._wiring.viz, self.folder / "run.rrd")
         self._run = ProcessRun(
             self._opener,
@@ -166,6 +188,7 @@ class Session:
             log=self._log_options(live, self.folder),
             folders=self._folders,
             viewer=viewer,
+            opened=self._prepare,
         )
         stack.enter_context(self._run)
         self.info = self._run.info

@@ -275,3 +275,25 @@ def test_errors_that_are_not_of_a_file_keep_their_traceback(monkeypatch: pytest.
 @pytest.mark.parametrize("speed", ["0", "-1", "nan"])
 def test_a_speed_that_means_nothing(cli: Run, tmp_path: Path, speed: str) -> None:
     assert_one_line(cli("run", make_images(tmp_path / "data"), "--speed", speed, "--processes"), "speed", "above 0")
+
+
+@pytest.mark.parametrize("wiring", [(), ("--processes",)])
+def test_a_mistake_leaves_no_output_folder(cli: Run, tmp_path: Path, wiring: tuple[str, ...]) -> None:
+    root = make_images(tmp_path / "data", ["0.png", "1.png", "2.png"])
+    (tmp_path / "nothing").mkdir()
+    assert_one_line(cli("run", "nothing", "-o", "r/x", *wiring), "no dataset that is known here")
+    assert_one_line(cli("run", root, "-o", "r/x", "--features", "surf", "--odometry", "um", *wiring), "surf")
+    assert not (tmp_path / "r" / "x").exists()
+    (tmp_path / "used").mkdir()
+    (tmp_path / "used" / "thesis.tex").write_text("years of work")
+    assert_one_line(cli("run", "nothing", "-o", "used", *wiring), "no dataset that is known here")
+    assert_one_line(cli("run", root, "-o", "used", *wiring), "used exists", "--overwrite")
+
+
+def test_an_empty_output_folder_will_do(cli: Run, tmp_path: Path) -> None:
+    root = make_images(tmp_path / "data", ["0.png", "1.png", "2.png"])
+    (tmp_path / "empty").mkdir()
+    assert_one_line(cli("run", root, "-o", "empty", "--features", "surf", "--odometry", "um"), "surf")
+    assert not any((tmp_path / "empty").iterdir())
+    assert cli("run", root, "-o", "empty", "--max-lost", 101)[0] in (0, 4)
+    assert (tmp_path / "empty" / "report.md").is_file()
