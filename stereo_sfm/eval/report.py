@@ -101,7 +101,7 @@ def verdicts(stats: dict[str, Any], evaluations: dict[str, Evaluation]) -> list[
             f"**WARN**: only {stats['inliers_median']:.0f} points a frame: look at texture, exposure and calibration"
         )
     for name, result in evaluations.items():
-        if abs(result.sim3_scale - 1) > BIG_SCALE_ERROR:
+        if result.mode != "sim3" and abs(result.sim3_scale - 1) > BIG_SCALE_ERROR:
             out.append(
                 f"**WARN**: {name} is {100 * (1 / result.sim3_scale - 1):+.1f} % too long: "
                 "check the baseline and the calibration"

@@ -70,20 +70,25 @@ def write_results(
         _write_tum(folder / "keyframes.tum", keyframes, rig, frame)
     (folder / "config.toml").write_text(configuration.dump(config))
     save_rig(rig, folder / "rig.yaml")
-    evaluations = _evaluate(estimates, reference)
+    evaluations = _evaluate(estimates, reference, "sim3" if scale_free(config, rig) else "se3")
     stats = {"source": source_name, "frame": frame, **statistics(record, wall_s, evaluations)}
     write_json(folder / "stats.json", stats)
     write_report(folder, source_name, record, stats, estimates, reference, evaluations)
     return stats, evaluations
 
 
-def _evaluate(estimates: dict[str, Trajectory], reference: Trajectory | None) -> dict[str, Evaluation]:
-    """By name; a path too short to align is compared from its first pose."""
+def scale_free(config: Config, rig: Rig) -> bool:
+    """Whether the lengths of a run are in no unit: one eye, and no other source of scale."""
+    return config.odometry.monocular or (not rig.stereo and config.odometry.scale == "unit")
+
+
+def _evaluate(estimates: dict[str, Trajectory], reference: Trajectory | None, best: str) -> dict[str, Evaluation]:
+    """By name, aligned as `best` says; a path too short to align is compared from its first pose."""
     evaluations: dict[str, Evaluation] = {}
     if reference is None:
         return evaluations
     for name, trajectory in estimates.items():
-        for mode in ("se3", "origin"):
+        for mode in (best, "origin"):
             try:
                 evaluations[name] = evaluate(trajectory, reference, mode)
                 break

@@ -115,12 +115,18 @@ def summary(stats: dict[str, Any], evaluations: dict[str, Evaluation] | None = N
         lines.append(_camera(stats["camera"]))
     lines.append(_times(stats))
     for name, result in (evaluations or {}).items():
-        lines.append(
-            f"{name} against ground truth: ATE {length(result.ape_m.rmse)} over {length(result.length_m)} "
-            f"({result.ate_percent:.3f} %, {result.mode.upper()} aligned), Sim(3) {length(result.ate_sim3_m)}, "
-            f"RPE {length(result.rpe_m.rmse)} {result.rpe_deg.rmse:.3f} deg a frame"
-        )
+        lines.append(_against_truth(name, result))
     return lines
+
+
+def _against_truth(name: str, result: Evaluation) -> str:
+    ate = f"{name} against ground truth: ATE {length(result.ape_m.rmse)} over {length(result.length_m)}"
+    if result.mode == "sim3":
+        return f"{ate} (Sim(3) aligned: one eye has no scale), rotation {result.rpe_deg.rmse:.3f} deg a frame"
+    return (
+        f"{ate} ({result.ate_percent:.3f} %, {result.mode.upper()} aligned), Sim(3) {length(result.ate_sim3_m)}, "
+        f"RPE {length(result.rpe_m.rmse)} {result.rpe_deg.rmse:.3f} deg a frame"
+    )
 
 
 def _lost(intervals: list[dict[str, Any]]) -> str:

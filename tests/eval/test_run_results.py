@@ -1,0 +1,79 @@
+"""What a run's numbers claim: scale only where there is one, a place in the map only where one was found."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.rig import Rig
+from stereo_sfm.config import Config
+from stereo_sfm.eval.record import RunRecord
+from stereo_sfm.eval.run_results import scale_free, write_results
+from stereo_sfm.eval.statistics import failure, summary
+from stereo_sfm.geometry import se3
+from stereo_sfm.types import F64, Frame, MapUpdate, Observations, TrackState, Trajectory
+from tests.synthetic import pinhole_rig
+
+COUNT = 30
+
+
+def walk() -> F64:
+    steps: F64 = np.arange(float(COUNT))[:, None] * np.array([0.0, 0, 0.1, 0, 0.02, 0])
+    return se3.exp(steps)
+
+
+def record_of(poses: F64, placed_from: int) -> RunRecord:
+    """A keyframe every ten frames; those before frame `placed_from` got no place in the map."""
+    record = RunRecord()
+    none = np.zeros(0, np.int64)
+    seen = Observations(none, np.zeros((0, 2)), np.zeros((0, 2)), none.astype(np.int32), np.zeros(0, bool))
+    for k, pose in enumerate(poses):
+        reference = 10 * (k // 10)
+        kf_T_cam = se3.inverse(poses[reference]) @ pose
+        record.put(Frame(k, k * 10**8, pose, np.eye(6), TrackState.OK, "", seen, reference, kf_T_cam))
+        if k == reference and k >= placed_from:
+            record.put(
+                MapUpdate(k, k, np.array([k]), pose[None], none, np.zeros((0, 3)), none, none.reshape(-1, 2), np.eye(4))
+            )
+    return record
+
+
+def results(tmp_path: Path, record: RunRecord, rig: Rig, config: Config) -> tuple[dict[str, Any], list[str], str]:
+    truth = walk()
+    truth[:, :3, 3] *= 3.0
+    stats, evaluations = write_results(
+        tmp_path, "test", rig, config, record, 1.0, Trajectory(np.arange(COUNT) * 10**8, truth)
+    )
+    return stats, summary(stats, evaluations), (tmp_path / "report.md").read_text()
+
+
+def test_one_eye_is_judged_after_its_scale(tmp_path: Path) -> None:
+    config = Config(odometry=dataclasses.replace(Config().odometry, method="pnp", monocular=True))
+    assert scale_free(config, pinhole_rig())
+    _, lines, report = results(tmp_path, record_of(walk(), 0), pinhole_rig(), config)
+    assert any("one eye has no scale" in line for line in lines) and "baseline" not in report
+    assert not any("SE3" in line for line in lines)
+
+
+def test_a_wrong_scale_of_two_eyes_is_said(tmp_path: Path) -> None:
+    assert not scale_free(Config(), pinhole_rig())
+    _, lines, report = results(tmp_path, record_of(walk(), 0), pinhole_rig(), Config())
+    assert any("SE3 aligned" in line for line in lines) and "check the baseline" in report
+
+
+def test_frames_without_a_place_in_the_map_are_left_out(tmp_path: Path) -> None:
+    record = record_of(walk(), 10)
+    mapped = record.mapped()
+    assert mapped is not None and len(mapped) == COUNT - 10 and len(record.odometry()) == COUNT
+    stats, lines, _ = results(tmp_path, record, pinhole_rig(), Config())
+    assert stats["unplaced"] == 10 and failure(stats) == ""
+    assert any("10 of the tracked frames were not found in the map" in line for line in lines)
+
+
+def test_never_found_in_the_map_is_a_failure(tmp_path: Path) -> None:
+    stats, _, _ = results(tmp_path, record_of(walk(), COUNT), pinhole_rig(), Config())
+    assert "never found" in failure(stats)
+    assert not (tmp_path / "trajectory_map.tum").exists() and (tmp_path / "trajectory_odom.tum").exists()
