@@ -12,23 +12,33 @@ from typing import Any
 from stereo_sfm.errors import StereoSfmError
 
 
+def one_of(*words: str) -> Any:
+    """A field that takes one of these words, the first by default."""
+    return field(default=words[0], metadata={"words": words})
+
+
+def above_zero(default: float) -> Any:
+    """A field that must be above 0; all other numbers must be at least 0."""
+    return field(default=default, metadata={"above_zero": True})
+
+
 @dataclass(frozen=True)
 class TrackerConfig:
     """The default tracker (tracking/tracker.py)."""
 
-    max_features: int = 400  # points tracked at once
+    max_features: int = above_zero(400)  # points tracked at once
     min_features: int = 15  # inliers below which a frame is lost
-    pyramid_levels: int = 4
+    pyramid_levels: int = above_zero(4)
     min_contrast: float = 2.0  # grey levels of standard deviation; flatter windows are no points
     min_ncc: float = 0.6  # of a window with the previous frame's
     min_anchor_ncc: float = 0.85  # of a window with the point's first appearance, affinely deformed
     max_angle_deg: float = 88.0  # from the optical axis; beyond it a fisheye image is not used
     corner_quality: float = 0.005  # least corner response, as a share of the strong ones in the image
-    min_depth_baselines: float = 4.0  # nearest stereo match searched, in baselines
-    sigma_px: float = 0.3  # noise of one coordinate of an observation, to start with: it follows the residuals
-    depth_sigma_px: float = 3.0  # the same when a point's depth is refined from frame to frame: errors repeat
-    max_error: float = 3.0  # sigmas; a worse observation is no inlier
-    max_epipolar_px: float = 1.0  # distance of a stereo match from its epipolar curve
+    min_depth_baselines: float = above_zero(4.0)  # nearest stereo match searched, in baselines
+    sigma_px: float = above_zero(0.3)  # noise of one coordinate of an observation, to start with: follows the residuals
+    depth_sigma_px: float = above_zero(3.0)  # the same when a depth is refined from frame to frame: errors repeat
+    max_error: float = above_zero(3.0)  # sigmas; a worse observation is no inlier
+    max_epipolar_px: float = above_zero(1.0)  # distance of a stereo match from its epipolar curve
     max_window_disparity_px: float = 0.15  # a narrow and a wide window must agree on the disparity: no depth edge in it
     keyframe_share: float = 0.75  # new keyframe when fewer of the last keyframe's points are still tracked
     keyframe_max_frames: int = 30
@@ -41,10 +51,10 @@ class FeaturesConfig:
 
     kind: str = "sift"  # orb | sift | akaze
     count: int = 0  # most keypoints of an image; 0: what OpenCV's own default is (ORB 500, the others no limit)
-    ratio: float = 0.8  # Lowe's: best distance below this share of the second best
+    ratio: float = above_zero(0.8)  # Lowe's: best distance below this share of the second best
     mask_radius_px: float = 0.0  # keypoints only this near to the last keyframe's stereo points; 0: everywhere
-    stereo_check: str = "rig"  # epipolar check of left-right matches: rig (calibrated) | ransac (estimated)
-    epipolar_px: float = 1.5  # largest distance to the epipolar line, in pixels at the image centre
+    stereo_check: str = one_of("rig", "ransac")  # epipolar check of left-right matches: calibrated | estimated
+    epipolar_px: float = above_zero(1.5)  # largest distance to the epipolar line, in pixels at the image centre
     stereo_only: bool = True  # with two eyes, only points that both see (as the thesis)
     motion_check: bool = False  # fundamental RANSAC on matches between frames too, before the estimator's own
     motion_window_deg: float = 0.0  # drop matches that moved by more than this angle between frames; 0: keep all
@@ -55,16 +65,16 @@ class OdometryConfig:
     """Which motion estimator, and its policy (tracking/odometry/); "flow" is the default tracker."""
 
     method: str = "flow"  # flow | em-r | vp-r | r-um | um | eight-point | pnp
-    reference: str = "frame"  # motion is estimated from the previous "frame" or from the last "keyframe"
+    reference: str = one_of("frame", "keyframe")  # motion is estimated from the previous frame or the last keyframe
     refine: bool = True  # least squares over all inliers after the minimal solver
     weighted: bool = True  # weigh 3D points by their stereo uncertainty; False: plain means, as the papers
-    epipolar_px: float = 1.0  # inlier of an essential matrix, in pixels at the image centre
+    epipolar_px: float = above_zero(1.0)  # inlier of an essential matrix, in pixels at the image centre
     inlier_m: float = 0.05  # inlier of 3D-3D estimators at any depth, metres
     inlier_sigmas: float = 3.0  # and on top this many standard deviations of the stereo depth; 0: a fixed threshold
-    max_samples: int = 512  # RANSAC hypotheses
-    min_inliers: int = 8
-    scale: str = "stereo"  # of translations without metric points: stereo | unit | ground-truth
-    unit_step_m: float = 1.0  # length of one step with scale "unit"
+    max_samples: int = above_zero(512)  # RANSAC hypotheses
+    min_inliers: int = above_zero(8)
+    scale: str = one_of("stereo", "unit", "ground-truth")  # of translations without metric points
+    unit_step_m: float = above_zero(1.0)  # length of one step with scale "unit"
     keyframe_ratio: float = 0.3  # new keyframe when fewer of the last keyframe's points are tracked
     keyframe_frames: int = 30  # a keyframe represents at most this many frames
     keyframe_min_frames: int = 0  # and at least this many
@@ -81,10 +91,10 @@ class ManhattanConfig:
     """Rotation prior from the world's three directions (tracking/manhattan_prior.py)."""
 
     enabled: bool = False
-    every: int = 15  # frames between measurements: finding the lines costs several frames of tracking
+    every: int = above_zero(15)  # frames between measurements: finding the lines costs several frames of tracking
     settle_frames: int = 10  # measurements that must agree before the axes are believed
     gate_deg: float = 3.0  # a measurement further from the prediction is refused
-    model_deg: float = 0.15  # how exactly the world follows three directions
+    model_deg: float = above_zero(0.15)  # how exactly the world follows three directions
     drift_deg_per_frame: float = 0.01  # standard deviation of the tracker's rotation, grows with the root of the frames
 
 
@@ -95,15 +105,16 @@ class MapperConfig:
     enabled: bool = True
     window_keyframes: int = 12  # keyframes that local bundle adjustment moves, the new one included; 0: all connected
     connected_points: int = 15  # shared points that make two keyframes neighbours
-    sigma_px: float = 0.4  # noise of one coordinate of a tracked point
+    sigma_px: float = above_zero(0.4)  # noise of one coordinate of a tracked point
     huber: float = 0.75  # sigmas; narrow, for depths near edges err to one side and would bend the scale
     rounds: int = 2  # of bundle adjustment, outliers are judged between them
     iterations: int = 5  # of a round
-    association: str = "map"  # "tracks": identity only; "map": also by descriptors; "previous": the retail paper's rule
+    # "tracks": identity only; "map": also by descriptors; "previous": the retail paper's rule
+    association: str = one_of("map", "tracks", "previous")
     match_radius_px: float = 10.0  # around the predicted pixel, in both eyes
     match_distance: int = 50  # differing bits of 256
     match_ratio: float = 0.85  # best / second best
-    match_sigma_px: float = 1.0  # noise of one coordinate of a point found again by its descriptor
+    match_sigma_px: float = above_zero(1.0)  # noise of one coordinate of a point found again by its descriptor
     match_min: int = 12  # fewer agreeing matches are not believed
     near_keyframes: int = 10  # keyframes standing close by whose points are searched too
     near_depths: float = 0.3  # how close, in median depths of the new keyframe
@@ -121,12 +132,12 @@ class LoopConfig:
     """Loop closing (loop/closer.py)."""
 
     enabled: bool = True
-    correction: str = "pose_graph"  # or "averaging": how the loop's error is spread over the keyframes
-    robust: str = "gnc"  # how the pose graph takes loops: "gnc", "switchable" or "none"
+    correction: str = one_of("pose_graph", "averaging")  # how the loop's error is spread over the keyframes
+    robust: str = one_of("gnc", "switchable", "none")  # how the pose graph takes loops
     vocabulary: str = ""  # vocabulary file; empty: the one of the package
     grow_every: int = 0  # keyframes between growths of the vocabulary in a new environment; 0: never
     score_ratio: float = 0.9  # candidates score above this times the reference score of the connected keyframes
-    reference: str = "weakest"  # reference: their "weakest" score (finds more), or their "best" (the retail paper)
+    reference: str = one_of("weakest", "best")  # reference: their weakest score (finds more) or best (retail paper)
     min_score: float = 0.02  # ... and above this
     connected_points: int = 15  # shared points that make two keyframes connected
     min_gap: int = 10  # keyframes between a keyframe and its candidate
@@ -136,10 +147,10 @@ class LoopConfig:
     min_match_fraction: float = 0.15  # of the keyframe's points that must match the candidate's (paper: 0.3)
     max_distance: int = 60  # bits between matching descriptors
     match_ratio: float = 0.9  # nearest / second nearest descriptor
-    pixel_sigma: float = 1.0  # px, of a point found again from another side
-    disparity_sigma: float = 0.5  # px, of a stereo point's disparity
-    ransac_iterations: int = 400
-    min_inliers: int = 30
+    pixel_sigma: float = above_zero(1.0)  # px, of a point found again from another side
+    disparity_sigma: float = above_zero(0.5)  # px, of a stereo point's disparity
+    ransac_iterations: int = above_zero(400)
+    min_inliers: int = above_zero(30)
     min_inlier_share: float = 0.1  # ... and of the keyframe's described points
     min_cells: int = 8  # of the 8 x 6 cells of the image that hold inliers
     consistent: int = 2  # successive keyframes that must agree on a loop
@@ -163,8 +174,8 @@ class PipelineConfig:
 
     update_lag_frames: int = 5  # a keyframe's MapUpdate is applied just before this many frames later
     loop_lag_keyframes: int = 2  # a keyframe's LoopResult reaches the mapper this many keyframes later
-    ring_slots: int = 8  # image pairs in shared memory between capture and the stages
-    threads: int = 1  # of OpenCV and BLAS in each process
+    ring_slots: int = above_zero(8)  # image pairs in shared memory between capture and the stages
+    threads: int = above_zero(1)  # of OpenCV and BLAS in each process
     cpus: dict[str, tuple[int, ...]] = field(default_factory=dict[str, tuple[int, ...]])  # stage -> cores it may use
 
 
@@ -194,15 +205,33 @@ def from_dict(data: dict[str, Any]) -> Config:
     """Nested plain values over the defaults.
 
     Raises:
-        StereoSfmError: an unknown key or a value of the wrong type.
+        StereoSfmError: an unknown key, a value of the wrong type, or one that its field does not take.
     """
     import dacite
 
     merged = _merge(dataclasses.asdict(Config()), data)
+    rules = dacite.Config(strict=True, type_hooks={float: _as_float}, cast=[tuple])
     try:
-        return dacite.from_dict(Config, merged, dacite.Config(strict=True, type_hooks={float: _as_float}, cast=[tuple]))
+        config = dacite.from_dict(Config, merged, rules)
     except dacite.DaciteError as error:
         raise StereoSfmError(f"configuration: {error} (see 'stereo-sfm config dump' for every key)") from None
+    _check(config)
+    return config
+
+
+def _check(section: Any, place: str = "") -> None:
+    """Raises StereoSfmError for a word or a number that a field does not take."""
+    for f in dataclasses.fields(section):
+        name, value = place + f.name, getattr(section, f.name)
+        words: tuple[str, ...] = f.metadata.get("words", ())
+        if dataclasses.is_dataclass(value):
+            _check(value, f"{name}.")
+        elif words and value not in words:
+            raise StereoSfmError(f"configuration: {name} is '{value}': choose one of {', '.join(words)}")
+        elif f.metadata.get("above_zero") and not value > 0:
+            raise StereoSfmError(f"configuration: {name} is {value:g}: it must be above 0")
+        elif isinstance(value, int | float) and not value >= 0:
+            raise StereoSfmError(f"configuration: {name} is {value:g}: it must be at least 0")
 
 
 def _as_float(value: Any) -> Any:
