@@ -47,13 +47,13 @@ class SelectedFrames(WrappedSource):
         return count if self.max_frames is None else min(self.max_frames, count)
 
     def __iter__(self) -> Iterator[StereoImage]:
-        passed, seen, dropped = 0, 0, 0
+        passed, seen, dropped, since = 0, 0, 0, 0
         first_ns: int | None = None
         for image in self.source:
             first_ns = image.stamp_ns if first_ns is None else first_ns
             since = image.stamp_ns - first_ns
             if self.end_ns is not None and since >= self.end_ns:
-                return
+                break
             if since < self.start_ns:
                 continue
             dropped += image.dropped_before
@@ -65,3 +65,9 @@ class SelectedFrames(WrappedSource):
             passed += 1
             if passed == self.max_frames:
                 return
+        if first_ns is not None and not seen:
+            until = "" if self.end_ns is None else f" until {self.end_ns * 1e-9:g} s"
+            raise StereoSfmError(
+                f"nothing is left of {self.name}: no frame from {self.start_ns * 1e-9:g} s on{until}, "
+                f"the last one read is at {since * 1e-9:.2f} s"
+            )

@@ -37,6 +37,8 @@ def run(args: argparse.Namespace) -> int:
     from calib.rectification import rectify
     from drivers.source import open_source
 
+    if args.frames < 1:
+        raise _error("--frames must be at least 1")
     if args.output.exists() and any(args.output.iterdir()) and not args.overwrite:
         raise _error(f"{args.output} is not empty: choose another folder or give --overwrite")
     errors: list[np.ndarray] = []

@@ -61,6 +61,8 @@ def run(args: argparse.Namespace) -> int:
 
     if args.seek and not args.step:
         raise StereoSfmError("--seek goes with --step: every frame must be executed to reach a later one")
+    if args.until is not None and not args.until >= 0:
+        raise StereoSfmError(f"--until takes seconds after the first frame, got {args.until:g}")
     path: Path = args.run / "run.mcap" if args.run.is_dir() else args.run
     if not path.exists():
         raise StereoSfmError(f"no run at {path}: 'stereo-sfm run' writes run.mcap into its folder")

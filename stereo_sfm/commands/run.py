@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import sys
 import time
 from dataclasses import dataclass
@@ -121,6 +122,10 @@ def load_config(args: argparse.Namespace) -> Config:
     chosen = config.load(args.config, overrides, preset(args.preset))
     if args.features is not None and chosen.odometry.method == "flow":
         raise StereoSfmError("--features needs an estimator that uses descriptors: add --odometry em-r (or another)")
+    if chosen.odometry.scale != "stereo" and chosen.odometry.method == "flow":
+        logging.getLogger("stereo_sfm").warning(
+            "odometry.scale does nothing with the default tracker, whose steps have a length: it is for --odometry"
+        )
     return chosen
 
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import logging
+from collections.abc import Generator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,6 +25,8 @@ from stereo_sfm.types import I64
 
 if TYPE_CHECKING:
     from drivers.source import Source
+
+log = logging.getLogger("stereo_sfm")
 
 GAP = 1.5  # periods without a frame that count as a gap
 MAX_SKEW_MS = 1.0  # between the eyes, above which tracking suffers
@@ -89,6 +94,11 @@ def describe_file(path: Path) -> Description:
     Raises:
         StereoSfmError: no such file, or not MCAP.
     """
+    with _said_once():
+        return _describe_file(path)
+
+
+def _describe_file(path: Path) -> Description:
     with LogReader(path) as reader:
         first, last = reader.time_range
         out = Description(
@@ -105,11 +115,31 @@ def describe_file(path: Path) -> Description:
         if lean:
             out.calibration = rig_lines(rig_from_text((reader.attachment(RIG_FILE) or b"").decode()))
             out.images = rate_of(reader.stamps(topics.FRAME))
+    if lean and (out.images is None or not out.images.count):
+        out.problems.append("it holds no frames")
     if out.truncated:
         out.problems.append(f"{out.truncated}: 'stereo-sfm recover' writes a mended copy")
     if not lean:
         _describe_source(out, path)
     return out
+
+
+@contextmanager
+def _said_once() -> Generator[None]:
+    """The file is opened as a log and as a source: what both find is one warning."""
+    said = set[str]()
+
+    def new(record: logging.LogRecord) -> bool:
+        text = record.getMessage()
+        before = len(said)
+        said.add(text)
+        return len(said) > before
+
+    log.addFilter(new)
+    try:
+        yield
+    finally:
+        log.removeFilter(new)
 
 
 def describe_folder(path: Path) -> Description:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
@@ -25,6 +26,8 @@ from stereo_sfm.types import Dropped, Frame
 
 if TYPE_CHECKING:
     from stereo_sfm.log.recorded import RecordedRun
+
+log = logging.getLogger("stereo_sfm")
 
 LIVE = ("t265", "oak")  # sources that are devices
 
@@ -130,6 +133,8 @@ class Session:
 
     def _log_options(self, live: bool, folder: Path) -> LogOptions | None:
         kind = self._wiring.log or ("full" if live else "lean")
+        if kind != "full" and self._wiring.image_format is not None:
+            log.warning("--image-format does nothing: only --log full keeps images, this run has --log %s", kind)
         if kind == "none":
             return None
         pixels = self._wiring.image_format or ("raw" if live else "png")

@@ -201,6 +201,7 @@ def test_file_that_is_no_mcap(cli: Run, tmp_path: Path) -> None:
         (("--frame-skip", "0"), "at least 1"),
         (("--max-frames", "0"), "at least 1"),
         (("--start", "-1"), "above 0"),
+        (("--start", "1000"), "nothing is left"),
     ],
 )
 def test_options_that_mean_nothing(cli: Run, tmp_path: Path, args: tuple[str, ...], word: str) -> None:
@@ -297,3 +298,32 @@ def test_an_empty_output_folder_will_do(cli: Run, tmp_path: Path) -> None:
     assert not any((tmp_path / "empty").iterdir())
     assert cli("run", root, "-o", "empty", "--max-lost", 101)[0] in (0, 4)
     assert (tmp_path / "empty" / "report.md").is_file()
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (("--image-format", "jpeg", "--log", "none"), "--image-format does nothing"),
+        (("--image-format", "jpeg"), "--image-format does nothing"),
+        (("--set", "odometry.scale=ground-truth"), "odometry.scale does nothing"),
+    ],
+)
+def test_options_without_effect_are_a_warning(cli: Run, tmp_path: Path, args: tuple[str, ...], said: str) -> None:
+    root = make_images(tmp_path / "data", ["0.png", "1.png"])
+    _, _, err = cli("run", root, "-o", "out", "--max-lost", 101, *args)
+    assert len([line for line in err.splitlines() if line.startswith("warning: ") and said in line]) == 1
+    assert "does nothing" not in cli("run", root, "-o", "other", "--log", "full", "--image-format", "png")[2]
+
+
+def test_rectify_of_no_frames(cli: Run, tmp_path: Path) -> None:
+    assert_one_line(cli("rectify", make_images(tmp_path / "data"), "-o", "out", "--frames", 0), "--frames")
+    assert not Path("out").exists()
+
+
+def test_info_warns_once_of_a_truncated_file(cli: Run, tmp_path: Path) -> None:
+    assert cli("convert", make_images(tmp_path / "data"), "-o", "whole.mcap", "-q")[0] == 0
+    Path("cut.mcap").write_bytes(Path("whole.mcap").read_bytes()[:-1000])
+    code, out, err = cli("info", "cut.mcap")
+    assert code == 0 and "problem: truncated" in out
+    assert len(err.splitlines()) == 1 and "truncated" in err
+    assert len(cli("info", "cut.mcap")[2].splitlines()) == 1  # and each time it is asked

@@ -63,3 +63,8 @@ def test_the_user_may_stop(
 def test_seek_alone_says_what_it_needs(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", str(run), "--seek", "2"]) == 2
     assert "--seek goes with --step" in capsys.readouterr().err
+
+
+def test_a_time_before_the_first_frame_is_refused(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", str(run), "--until", "-1"]) == 2
+    assert "--until takes seconds after the first frame, got -1" in capsys.readouterr().err

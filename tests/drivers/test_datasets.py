@@ -246,6 +246,10 @@ def test_part_of_a_source(tmp_path: Path) -> None:
     assert part(max_frames=2) == [(0, 0), (1, 0)]
     with pytest.raises(StereoSfmError, match="at least 1"):
         part(frame_skip=0)
+    with pytest.raises(StereoSfmError, match=r"nothing is left .* from 1000 s on, the last one read is at 1\.10 s"):
+        part(start_s=1000)
+    with pytest.raises(StereoSfmError, match=r"from 0\.32 s on until 0\.33 s"):
+        part(start_s=0.32, duration_s=0.01)
 
 
 def test_part_of_a_source_knows_how_many_frames_it_has(tmp_path: Path) -> None:
