@@ -86,12 +86,12 @@ def _merge(args: argparse.Namespace) -> int:
     if len(args.maps) < 2:
         raise StereoSfmError("merge takes at least two maps")
     _check_free(args)
-    config = configuration.load(None, args.set).loop
+    config = configuration.load(None, args.set)
     maps = [load_map(folder) for folder in args.maps]
     for (name_a, a), (name_b, b) in combinations(zip(args.maps, maps, strict=True), 2):
         if share_a_walk(a, b):
             raise StereoSfmError(f"{name_a} and {name_b} hold the same walk: merge takes maps of different walks")
-    result = merge(maps, _vocabulary(maps[0], config.vocabulary), config)
+    result = merge(maps, _vocabulary(maps[0], config.loop.vocabulary), config.loop, config.mapper)
     save_map(result.saved, args.output)
     print(f"{len(maps)} maps joined by {len(result.loops)} loops, {result.fused} points seen by more than one walk")
     print("\n".join(describe(result.saved)))

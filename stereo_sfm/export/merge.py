@@ -9,16 +9,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stereo_sfm.config import LoopConfig
+from calib.rig import Rig
+from stereo_sfm.config import LoopConfig, MapperConfig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.saved_map import SavedMap, joined, keyframes_of, restore_map
 from stereo_sfm.loop.closer import LoopCloser
 from stereo_sfm.loop.correction import apply_loop
 from stereo_sfm.loop.vocabulary import Vocabulary
-from stereo_sfm.mapping.bundle import Bundle, BundleConfig, bundle_adjust
-from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.mapping import window
+from stereo_sfm.mapping.bundle import bundle_adjust
+from stereo_sfm.mapping.map import Map, MapSnapshot
 from stereo_sfm.types import I64, Bool, LoopResult
 
+_MAPPER = MapperConfig()
 log = logging.getLogger("stereo_sfm")
 SAME_SHARE = 0.5  # of the pixels at common times: pictures taken twice have hardly any in common
 MERGE_PAUSE = 2  # keyframes between two loops of a merge: every link between the walks helps
@@ -33,14 +36,23 @@ class Merge:
     fused: int  # points that became one with another
 
 
-def merge(maps: Sequence[SavedMap], vocabulary: Vocabulary, config: LoopConfig) -> Merge:
+def merge(
+    maps: Sequence[SavedMap], vocabulary: Vocabulary, config: LoopConfig, mapper: MapperConfig = _MAPPER
+) -> Merge:
     """One map of all; the first keeps its frame.
+
+    Args:
+        maps: two or more.
+        vocabulary: of the search for loops. Maps keep their descriptors, so it need not be the one they were made with.
+        config: of the loops.
+        mapper: of the bundle adjustment at the end.
 
     Raises:
         StereoSfmError: other cameras, or a map that no loop joins to the rest.
     """
     side_by_side = joined(list(maps))
     map_ = restore_map(side_by_side.snapshot)
+    map_.points.sigma[:] = map_.observations.sigma[:] = mapper.sigma_px  # what is fused from now on counts less
     closer = LoopCloser(dataclasses.replace(config, pause=MERGE_PAUSE), side_by_side.rig, vocabulary)
     loops: list[LoopResult] = []
     fused = 0
@@ -52,10 +64,11 @@ def merge(maps: Sequence[SavedMap], vocabulary: Vocabulary, config: LoopConfig) 
                 loops.append(result)
                 fused += len(done.fused)
     _check_joined(side_by_side, loops, len(maps))
-    snapshot = full_adjustment(map_.snapshot(), side_by_side)
+    full_adjustment(map_, side_by_side.rig, mapper)
+    snapshot = map_.snapshot()
     session = dict(zip(side_by_side.snapshot.kf_ids.tolist(), side_by_side.sessions.tolist(), strict=True))
     sessions = np.array([session[k] for k in snapshot.kf_ids.tolist()], np.int64)
-    return Merge(dataclasses.replace(side_by_side, snapshot=snapshot, sessions=sessions), loops, fused)
+    return Merge(SavedMap(snapshot, side_by_side.rig, vocabulary.id, sessions), loops, fused)
 
 
 def share_a_walk(a: SavedMap, b: SavedMap) -> bool:
@@ -94,23 +107,16 @@ def _check_joined(saved: SavedMap, loops: list[LoopResult], count: int) -> None:
         raise StereoSfmError(f"the {count} maps stay in {apart} pieces: no loop joins them (are they of one store?)")
 
 
-def full_adjustment(snapshot: MapSnapshot, saved: SavedMap) -> MapSnapshot:
-    """Bundle adjustment of everything, the first keyframe held fast."""
-    result = bundle_adjust(
-        saved.rig,
-        Bundle(
-            world_T_kf=snapshot.map_T_kf,
-            fixed=np.arange(len(snapshot.kf_ids)) == 0,
-            points=snapshot.points,
-            obs_kf=snapshot.obs_kf,
-            obs_pt=snapshot.obs_pt,
-            uv_left=snapshot.uv_left,
-            uv_right=snapshot.uv_right,
-        ),
-        BundleConfig(),
-    )
+def full_adjustment(map_: Map, rig: Rig, config: MapperConfig) -> None:
+    """Bundle adjustment of everything as the mapper does it, the first keyframe held fast.
+
+    Observations that disagree afterwards go, and with them the points that too few keyframes still see.
+    """
+    part = window.whole_map(map_, config)
+    result = bundle_adjust(rig, part.bundle, window.bundle_config(config))
+    window.write_back(map_, part, result)
+    map_.cull_points(part.pt_rows[map_.points.obs_count[part.pt_rows] < config.min_observations])
     log.info("full bundle adjustment: cost %.1f to %.1f", result.initial_cost, result.cost)
-    return dataclasses.replace(snapshot, map_T_kf=result.world_T_kf, points=result.points)
 
 
 def prune(saved: SavedMap, min_views: int = 0, min_seen_share: float = 0.0, unseen_sessions: int = 0) -> SavedMap:

@@ -206,7 +206,7 @@ def joined(maps: list[SavedMap]) -> SavedMap:
     """All maps in one, side by side: ids, submaps and sessions of the later ones are raised above the earlier's.
 
     Raises:
-        StereoSfmError: they were made with different cameras or vocabularies.
+        StereoSfmError: they were made with different cameras.
     """
     first = maps[0]
     parts: dict[str, list[Any]] = {f.name: [] for f in dataclasses.fields(MapSnapshot)}

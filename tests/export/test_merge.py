@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from stereo_sfm.cli import main
-from stereo_sfm.config import LoopConfig
+from stereo_sfm.config import LoopConfig, MapperConfig
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.export.merge import merge, prune, share_a_walk
-from stereo_sfm.export.saved_map import SavedMap, joined, load_map, save_map
+from stereo_sfm.export.merge import full_adjustment, merge, prune, share_a_walk
+from stereo_sfm.export.saved_map import SavedMap, joined, load_map, restore_map, save_map
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
 from tests.export.maps import map_of_walk, same
@@ -62,6 +62,33 @@ def test_merged_map_has_both_walks_where_they_were(
     shared = {int(p) for p in merged.snapshot.obs_pt[merged.sessions[merged.snapshot.obs_kf] == 0]}
     shared &= {int(p) for p in merged.snapshot.obs_pt[merged.sessions[merged.snapshot.obs_kf] == 1]}
     assert len(shared) > 100
+
+
+def test_merged_map_names_the_vocabulary_it_was_compared_with(merged: SavedMap, vocabulary: voc.Vocabulary) -> None:
+    assert merged.vocabulary_id == vocabulary.id
+
+
+def test_wrong_observations_leave_the_map_in_the_full_adjustment(walks: list[StoreWalk], maps: list[SavedMap]) -> None:
+    s = maps[1].snapshot
+    views = np.bincount(s.obs_pt, minlength=len(s.pt_ids))
+    many, two = np.flatnonzero(views[s.obs_pt] > 4)[::400], np.flatnonzero(views[s.obs_pt] == 2)[::400]
+    wrong = np.concatenate([many[:5], two[:3]])
+    uv_left = s.uv_left.copy()
+    uv_left[wrong] += [12.0, -9.0]
+    map_ = restore_map(dataclasses.replace(s, uv_left=uv_left))
+    map_.points.sigma[:] = map_.observations.sigma[:] = MapperConfig().sigma_px
+    full_adjustment(map_, maps[1].rig, MapperConfig())
+    after = map_.snapshot()
+    seen = set(zip(after.kf_ids[after.obs_kf].tolist(), after.pt_ids[after.obs_pt].tolist(), strict=True))
+    for row in wrong:
+        assert (int(s.kf_ids[s.obs_kf[row]]), int(s.pt_ids[s.obs_pt[row]])) not in seen
+    kept = np.isin(s.pt_ids, after.pt_ids)
+    assert kept[s.obs_pt[many]].all() and not kept[s.obs_pt[two]][:3].any()
+    still = np.bincount(after.obs_pt, minlength=len(after.pt_ids))[np.searchsorted(after.pt_ids, s.pt_ids[kept])]
+    assert (still[views[kept] >= 2] >= 2).all()
+    truth = se3.inverse(walks[1].world_T_kf[0]) @ walks[1].world_T_kf
+    error = np.linalg.norm(after.map_T_kf[:, :3, 3] - truth[:, :3, 3], axis=1)
+    assert np.sqrt((error**2).mean()) < 0.02
 
 
 def test_maps_that_share_nothing_are_not_joined(maps: list[SavedMap], vocabulary: voc.Vocabulary) -> None:
