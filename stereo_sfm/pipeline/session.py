@@ -66,7 +66,8 @@ class Session:
         self._frames: Iterator[Frame]
         self._run: ProcessRun | None = None
         self._folder = folder
-        self._made = self._prepared = False  # the folder: by this run, and for this run
+        self._made: list[Path] = []  # folders, from the inside out
+        self._prepared = False  # the folder is this run's
         self._began = False  # a frame has come
         self.info: SourceInfo
 
@@ -103,9 +104,9 @@ class Session:
             return
         if isinstance(error, StereoSfmError) and error.exit_code == StereoSfmError.exit_code:
             discard_files(self._folder)
-            if self._made:
-                with suppress(OSError):  # somebody else put something there
-                    self._folder.rmdir()
+            with suppress(OSError):  # somebody else put something there
+                for folder in self._made:
+                    folder.rmdir()
 
     def __iter__(self) -> Iterator[Frame]:
         for frame in self._frames:
@@ -127,7 +128,7 @@ class Session:
 
     def _prepare(self) -> None:
         """Make the folder, once the source is open: what is wrong with the source is told first, and leaves none."""
-        self._made = not self.folder.exists()
+        self._made = [place for place in (self.folder, *self.folder.parents) if not place.exists()]
         prepare_folder(self.folder, self._overwrite)
         self._prepared = True
 

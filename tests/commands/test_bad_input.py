@@ -284,7 +284,7 @@ def test_a_mistake_leaves_no_output_folder(cli: Run, tmp_path: Path, wiring: tup
     (tmp_path / "nothing").mkdir()
     assert_one_line(cli("run", "nothing", "-o", "r/x", *wiring), "no dataset that is known here")
     assert_one_line(cli("run", root, "-o", "r/x", "--features", "surf", "--odometry", "um", *wiring), "surf")
-    assert not (tmp_path / "r" / "x").exists()
+    assert not (tmp_path / "r").exists()
     (tmp_path / "used").mkdir()
     (tmp_path / "used" / "thesis.tex").write_text("years of work")
     assert_one_line(cli("run", "nothing", "-o", "used", *wiring), "no dataset that is known here")
