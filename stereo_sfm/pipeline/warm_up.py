@@ -50,7 +50,8 @@ def _wall(camera: Camera, world_T_cam: F64, texture: U8) -> U8:
 def keyframes(rig: Rig) -> list[Keyframe]:
     """Keyframes of made points: what the mapper and the loop closer work on. Halfway all are seen anew: a loop."""
     rng = np.random.default_rng(0)
-    uv = rng.uniform([40, 40], [rig.left.width - 40, rig.left.height - 40], (POINTS, 2))
+    margin = min(40.0, rig.left.width / 4, rig.left.height / 4)
+    uv = rng.uniform([margin, margin], [rig.left.width - margin, rig.left.height - margin], (POINTS, 2))
     bearing = rig.left.unproject(uv)
     bearing = bearing[np.nan_to_num(bearing[:, 2]) > 0.3]
     points = bearing * rng.uniform(1, 6, (len(bearing), 1))

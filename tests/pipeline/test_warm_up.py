@@ -6,7 +6,12 @@ import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
+
+from calib.rig import Rig
+from stereo_sfm.geometry.cameras import Pinhole
+from stereo_sfm.pipeline.warm_up import keyframes
 
 CHILD = """
 import sys
@@ -38,3 +43,9 @@ def test_nothing_is_compiled_after_the_warm_up() -> None:
     child = subprocess.run([sys.executable, "-c", CHILD], capture_output=True, text=True, env=dict(os.environ))
     assert child.returncode == 0, child.stderr
     assert child.stdout.split() == []
+
+
+def test_images_of_any_size_have_a_warm_up() -> None:
+    eye = Pinhole(64, 48, 50.0, 50.0, 32.0, 24.0)
+    made = keyframes(Rig(eye, eye, np.eye(4) + 0.1 * np.eye(4, k=3)))
+    assert made and all(len(keyframe.point_ids) for keyframe in made)
