@@ -14,6 +14,8 @@ from stereo_sfm.errors import StereoSfmError
 if TYPE_CHECKING:
     from drivers.source import Source
     from stereo_sfm.config import Config
+    from stereo_sfm.log.provenance import Opening
+    from stereo_sfm.pipeline.maps import MapFolders
     from stereo_sfm.types import Frame
 
 DIFFERENT = 3
@@ -57,7 +59,6 @@ def run(args: argparse.Namespace) -> int:
     """Read what the run was, do it again, compare if asked."""
     from stereo_sfm.log import recorded, topics
     from stereo_sfm.log.reader import LogReader
-    from stereo_sfm.pipeline.maps import MapFolders
 
     if args.seek and not args.step:
         raise StereoSfmError("--seek goes with --step: every frame must be executed to reach a later one")
@@ -76,12 +77,27 @@ def run(args: argparse.Namespace) -> int:
     spec = str(path) if logged else args.source or before.source
     rig, rectify = (None, "none") if logged else (before.opening.rig, before.opening.rectify)
     frame_ids = tuple(f.frame_id for f in frames if _within(f, frames[0], args.until))
-    choice = ReplayChoice(spec, rig, rectify=rectify, frame_ids=frame_ids)
+    folders = map_folders(before.opening)
+    choice = ReplayChoice(
+        spec, rig, rectify=rectify, map_in=folders.map_in, localize_only=folders.localize_only, frame_ids=frame_ids
+    )
     args.mode, args.realtime = args.mode or "lockstep", False
     args.log = args.log or "lean"
     config = _changed(before.config, args.set)
-    code = execute(args, choice, config, MapFolders(), before if follow else None)
+    code = execute(args, choice, config, folders, before if follow else None)
     return _compare(path, args) if args.check and code == 0 else code
+
+
+def map_folders(opening: Opening) -> MapFolders:
+    """The saved map that the run began with, as it was then."""
+    from stereo_sfm.pipeline.maps import MapFolders, map_sha256
+
+    if not opening.map_in:
+        return MapFolders()
+    folder = Path(opening.map_in)
+    if not (folder / "map.json").exists() or map_sha256(folder) != opening.map_sha256:
+        raise StereoSfmError(f"the run began with the map at {folder}, which is gone or another now: put it back")
+    return MapFolders(folder, opening.localize_only)
 
 
 def _within(frame: Frame, first: Frame, until_s: float | None) -> bool:

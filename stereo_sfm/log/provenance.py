@@ -35,10 +35,13 @@ _PACKAGES = (
 
 @dataclass(frozen=True, eq=False)
 class Opening:
-    """How a source was opened, besides its name: what a replay from the same source must do again."""
+    """How a run began, besides the source's name: what a replay must do again."""
 
     rectify: str = "none"  # none | pinhole | wide
     rig: Rig | None = None  # calibration that replaced the source's own, before rectification
+    map_in: str = ""  # folder of the saved map that the run started from
+    map_sha256: str = ""  # of its map.json, which holds the checksums of the rest
+    localize_only: bool = False
 
 
 def write_provenance(
@@ -60,7 +63,7 @@ def write_provenance(
         mode: how the file came about: "record", "inline", "lockstep", "realtime".
         image_format: one of `images.FORMATS`.
         config: what decided the results of a run.
-        opening: how the source was opened.
+        opening: how the run began.
     """
     values = {
         "version": __version__,
@@ -72,6 +75,9 @@ def write_provenance(
     }
     if opening is not None and opening.rectify != "none":
         values["rectify"] = opening.rectify
+    if opening is not None and opening.map_in:
+        values |= {"map_in": opening.map_in, "map_sha256": opening.map_sha256}
+        values["localize_only"] = str(opening.localize_only).lower()
     if opening is not None and opening.rig is not None:
         writer.attach(SOURCE_RIG_FILE, rig_to_text(opening.rig), "application/yaml")
     if config is not None:

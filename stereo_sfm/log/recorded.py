@@ -112,5 +112,11 @@ def read_run(reader: LogReader) -> RecordedRun:
 def read_opening(reader: LogReader) -> Opening:
     """How the source of a run was opened."""
     rig = reader.attachment(SOURCE_RIG_FILE)
-    rectify = reader.metadata(METADATA).get("rectify", "none")
-    return Opening(rectify, None if rig is None else rig_from_text(rig.decode()))
+    about = reader.metadata(METADATA)
+    return Opening(
+        about.get("rectify", "none"),
+        None if rig is None else rig_from_text(rig.decode()),
+        about.get("map_in", ""),
+        about.get("map_sha256", ""),
+        about.get("localize_only") == "true",
+    )

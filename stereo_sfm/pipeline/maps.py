@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,6 +39,11 @@ class MapFolders:
             above = next(folder for folder in self.map_out.absolute().parents if folder.exists())
             if not above.is_dir():
                 raise StereoSfmError(f"cannot make --map-out {self.map_out}: {above} is no folder")
+
+
+def map_sha256(folder: Path) -> str:
+    """What tells a saved map from any other: its map.json holds the checksums of all its files."""
+    return hashlib.sha256((folder / "map.json").read_bytes()).hexdigest()
 
 
 def make_mapper(config: Config, rig: Rig, spans: NoSpans, folders: MapFolders) -> AnyMapper:
