@@ -107,7 +107,7 @@ def _averaged(map_: Map, before: F64, loop: LoopResult, earlier: Sequence[LoopRe
     if a > b:
         raise StereoSfmError("transformation averaging needs a loop back to an older keyframe")
     after, submap = before.copy(), map_.keyframes.submap_id
-    rows = np.flatnonzero((submap == submap[b]) & map_.keyframes.alive)
+    rows = np.flatnonzero(submap == submap[b])
     first = int(np.searchsorted(rows, a)) if submap[a] == submap[b] else 0
     after[rows] = average_correction(
         before[rows], first, int(np.searchsorted(rows, b)), before[a] @ loop.candidate_T_kf
