@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import heapq
-import itertools
 from collections.abc import Container
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse
+from scipy.sparse.csgraph import dijkstra
 
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, I64
 
 NEAR_METRES, NEAR_RADIANS = 1.5, 0.7  # keyframes that should see the same things
 SAME_METRES, SAME_RADIANS = 0.3, 0.25  # keyframes that show the same view
+HOP_METRES = 1e-6  # added to each edge of a way: of equal ways the one with fewer edges
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +30,6 @@ class KeyframeGraph:
 
     def __init__(self) -> None:
         self._poses: dict[int, F64] = {}  # odom_T_cam
-        self._metres: dict[int, float] = {}  # walked since the start
         self._chain: dict[int, int] = {}  # number of the unbroken piece of odometry
         self._loops: list[tuple[int, int, F64]] = []  # a, b, a_T_b
         self._last = -1
@@ -37,20 +37,21 @@ class KeyframeGraph:
         self._stack: F64 = np.empty((64, 4, 4))  # odom_T_cam of _ids, for vectorised search
         self._anchored: F64 = np.empty((64, 4, 4))  # the same, taken back at each loop to where its older end stood
         self._chains: I64 = np.zeros(64, np.int64)
+        self._walked: F64 = np.zeros(64)  # metres since the start
         self._frames: I64 = np.zeros(64, np.int64)  # the chain whose coordinates _anchored is in
         self._count = 0
 
     def add(self, kf_id: int, odom_T_cam: F64, chain: int) -> None:
         """Append the newest keyframe of an unbroken piece of odometry called `chain`."""
         step = np.linalg.norm(odom_T_cam[:3, 3] - self._poses[self._last][:3, 3]) if self._last >= 0 else 0.0
-        self._metres[kf_id] = self._metres.get(self._last, 0.0) + float(step)
         self._poses[kf_id], self._chain[kf_id], self._last = odom_T_cam, chain, kf_id
         if self._count == len(self._ids):
             self._ids, self._stack = np.tile(self._ids, 2), np.tile(self._stack, (2, 1, 1))
             self._chains, self._frames = np.tile(self._chains, 2), np.tile(self._frames, 2)
-            self._anchored = np.tile(self._anchored, (2, 1, 1))
+            self._anchored, self._walked = np.tile(self._anchored, (2, 1, 1)), np.tile(self._walked, 2)
         self._ids[self._count], self._stack[self._count], self._chains[self._count] = kf_id, odom_T_cam, chain
         self._anchored[self._count], self._frames[self._count] = odom_T_cam, chain
+        self._walked[self._count] = (self._walked[self._count - 1] if self._count else 0.0) + float(step)
         if self._count and self._chains[self._count - 1] == chain:
             moved = se3.inverse(self._stack[self._count - 1]) @ odom_T_cam
             self._anchored[self._count] = self._anchored[self._count - 1] @ moved
@@ -81,31 +82,52 @@ class KeyframeGraph:
 
     def way(self, a: int, b: int) -> Way | None:
         """The way with the fewest metres, or None where tracking broke and no loop joins the pieces (Dijkstra)."""
-        nodes = sorted({a, b, *(n for loop in self._loops for n in loop[:2])}, key=lambda n: (self._chain[n], n))
-        edges: dict[int, list[tuple[int, float, F64]]] = {n: [] for n in nodes}
-        for p, q in itertools.pairwise(nodes):
-            if self._chain[p] == self._chain[q]:
-                self._link(edges, p, q, se3.inverse(self._poses[p]) @ self._poses[q], self._metres[q] - self._metres[p])
-        for p, q, p_T_q in self._loops:
-            self._link(edges, p, q, p_T_q, 0.0)
-        heap: list[tuple[float, int]] = [(0.0, a)]
-        poses, done = {a: np.eye(4)}, set[int]()
-        lowest = {a: 0.0}
-        while heap:
-            metres, node = heapq.heappop(heap)
-            if node == b:
-                return Way(poses[b], metres)
-            if node in done:
-                continue
-            done.add(node)
-            for other, length, node_T_other in edges[node]:
-                if metres + length < lowest.get(other, np.inf):
-                    lowest[other] = metres + length
-                    poses[other] = poses[node] @ node_T_other
-                    heapq.heappush(heap, (metres + length, other))
-        return None
+        loops = np.array([loop[:2] for loop in self._loops], np.int64).reshape(-1, 2)
+        rows = np.unique(np.searchsorted(self._ids[: self._count], np.append(loops.ravel(), (a, b))))
+        nodes = self._ids[rows]
+        linked = np.flatnonzero(self._chains[rows[:-1]] == self._chains[rows[1:]])
+        ends = np.concatenate([np.stack([linked, linked + 1], 1), np.searchsorted(nodes, loops)])
+        metres = np.zeros(len(ends))
+        metres[: len(linked)] = self._walked[rows[linked + 1]] - self._walked[rows[linked]]
+        best = _shortest_of_each_pair(ends, metres)
+        start, goal = np.searchsorted(nodes, (a, b)).tolist()
+        path = _shortest_path(len(nodes), ends[best], metres[best], start, goal)
+        if path is None:
+            return None
+        a_T_b, total = np.eye(4), 0.0
+        for edge, forward in path:
+            k = int(best[edge])
+            p, q = nodes[ends[k]].tolist()
+            p_T_q = (
+                self._loops[k - len(linked)][2] if k >= len(linked) else se3.inverse(self._poses[p]) @ self._poses[q]
+            )
+            a_T_b = a_T_b @ (p_T_q if forward else se3.inverse(p_T_q))
+            total += float(metres[k])
+        return Way(a_T_b, total)
 
-    @staticmethod
-    def _link(edges: dict[int, list[tuple[int, float, F64]]], p: int, q: int, p_T_q: F64, length: float) -> None:
-        edges[p].append((q, length, p_T_q))
-        edges[q].append((p, length, se3.inverse(p_T_q)))
+
+def _shortest_of_each_pair(ends: I64, metres: F64) -> I64:
+    """Rows of the edges (E, 2) that no other edge between the same nodes undercuts; the first of equals."""
+    low, high = ends.min(1), ends.max(1)
+    order = np.lexsort((np.arange(len(ends)), metres, high, low))
+    new = np.ones(len(order), bool)
+    new[1:] = (low[order][1:] != low[order][:-1]) | (high[order][1:] != high[order][:-1])
+    return order[new & (low[order] != high[order])].astype(np.int64)
+
+
+def _shortest_path(count: int, ends: I64, metres: F64, start: int, goal: int) -> list[tuple[int, bool]] | None:
+    """Edges from start to goal, each with whether it is walked from its first end to its second."""
+    if start == goal:
+        return []
+    graph = scipy.sparse.coo_array((metres + HOP_METRES, (ends[:, 0], ends[:, 1])), shape=(count, count)).tocsr()
+    distance, before = dijkstra(graph, directed=False, indices=start, return_predecessors=True)
+    if not np.isfinite(distance[goal]):
+        return None
+    edge_of = {(min(i, j), max(i, j)): k for k, (i, j) in enumerate(ends.tolist())}
+    path: list[tuple[int, bool]] = []
+    while goal != start:
+        last = int(before[goal])
+        edge = edge_of[min(last, goal), max(last, goal)]
+        path.append((edge, int(ends[edge, 0]) == last))
+        goal = last
+    return path[::-1]
