@@ -184,7 +184,7 @@ def merge_maps(folders: Sequence[Path], config: Config, out: Path) -> str:
     joined, alone = [folders[0].parent.name], list[str]()
     for folder in folders[1:]:
         try:
-            common = merge([common, load_map(folder)], vocabulary, config.loop).saved
+            common = merge([common, load_map(folder)], vocabulary, config.loop, config.mapper).saved
             joined.append(folder.parent.name)
         except StereoSfmError as error:
             alone.append(f"{folder.parent.name} ({error})")

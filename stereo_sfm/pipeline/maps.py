@@ -79,7 +79,7 @@ def save_result(mapper: AnyMapper, config: Config, rig: Rig, folders: MapFolders
     saved = SavedMap(snapshot, rig, vocabulary.id, np.zeros(len(snapshot.kf_ids), np.int64))
     if folders.map_in is not None:
         try:
-            saved = merge([load_map(folders.map_in, rig), saved], vocabulary, config.loop).saved
+            saved = merge([load_map(folders.map_in, rig), saved], vocabulary, config.loop, config.mapper).saved
         except StereoSfmError as error:
             save_map(saved, folders.map_out)
             raise StereoSfmError(
