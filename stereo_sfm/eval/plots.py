@@ -103,7 +103,8 @@ def plot_times(path: Path, record: RunRecord, stages: Sequence[str]) -> None:
     axes.set(xlabel="time [s]", ylabel="ms", title="time per stage")
     axes.set_ylim(0, 1.2 * float(np.percentile(everything, 99.5)) if everything else 1)
     axes.grid(alpha=0.3)
-    axes.legend(loc="center left", bbox_to_anchor=(1, 0.5))
+    if stages:
+        axes.legend(loc="center left", bbox_to_anchor=(1, 0.5))
     _save(figure, path)
 
 

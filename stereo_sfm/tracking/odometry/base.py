@@ -88,7 +88,7 @@ def refuse_chance(moved: F64, bearings_now: F64) -> None:
     def off(shift: int) -> float:
         return float(np.median(np.linalg.norm(np.roll(bearings_now, shift, axis=0) - ray, axis=1)))
 
-    chance = float(np.mean([off(shift) for shift in np.arange(1, SHIFTS + 1) * count // (SHIFTS + 1)]))
+    chance = float(np.mean([off(shift) for shift in (np.arange(1, SHIFTS + 1) * count // (SHIFTS + 1)).tolist()]))
     if not off(0) < chance / BETTER_THAN_CHANCE:
         raise Degenerate("no_consensus", f"points are {off(0):.3f} rad off, {chance:.3f} when paired at random")
 
