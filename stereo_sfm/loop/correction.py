@@ -24,6 +24,7 @@ from stereo_sfm.types import F64, I64, LoopResult
 
 STRONG = 30  # shared points that make an edge of the pose graph beside those of the walk
 ODOMETRY = 0.004, 0.0006  # metres and radians per metre that an edge of the walk may be wrong by
+RELAXED = 6.0  # squared sigmas that a loop may keep
 DRIFT = 0.003, 0.0003  # metres and radians per metre that a walk as a whole may drift by: scale and heading
 LOOP_SIGMAS = 0.01, 0.003  # metres, radians: at least this uncertain
 
@@ -127,8 +128,13 @@ def _brought_together(before: F64, loop: LoopResult, a: int, b: int, piece: I64)
 def _optimised(
     map_: Map, before: F64, loop: LoopResult, earlier: Sequence[LoopResult], config: LoopConfig
 ) -> F64 | None:
+    """Poses that agree with the walk and the loops, or None where they contradict each other.
+
+    The walk counts as exact as a good tracker makes it; where the loop then stays strained, as much drift is allowed as
+    may add up along the way.
+    """
     a, b = map_.kf_row(loop.candidate_kf_id), map_.kf_row(loop.kf_id)
-    walk = _loosened(walk_edges(map_, before), before, a, b)
+    walk = walk_edges(map_, before)
     closed = loop_edges(map_, [*earlier, loop])
     piece = _pieces(len(before), walk, closed, len(closed) - 1)
     start = before
@@ -136,9 +142,15 @@ def _optimised(
         start = _brought_together(before, loop, a, b, piece)
     fixed = _first_of_each_piece(len(before), join([walk, closed]))
     result = optimise(start, join([walk, closed]), fixed, config.robust)
-    if result.weights[-1] < 0.5:
-        return None
-    return result.poses
+    if result.weights[-1] < 0.5 or _strain(result.poses, closed) > RELAXED:
+        result = optimise(start, join([_loosened(walk, before, a, b), closed]), fixed, config.robust)
+    return result.poses if result.weights[-1] >= 0.5 else None
+
+
+def _strain(poses: F64, closed: Edges) -> float:
+    """Squared error in sigmas that the last loop keeps; 6 is what noise alone leaves."""
+    error = se3.log(se3.inverse(closed.i_T_j[-1]) @ se3.inverse(poses[closed.i[-1]]) @ poses[closed.j[-1]])
+    return float((error**2 / np.repeat(closed.sigmas[-1], 3) ** 2).sum())
 
 
 def walk_edges(map_: Map, poses: F64) -> Edges:

@@ -116,7 +116,7 @@ def test_a_walk_whose_heading_drifts_evenly_closes(degrees_per_100m: float) -> N
         last, 0, se3.inverse(truth[0]) @ truth[last], np.eye(6) * 1e6, np.zeros((0, 2), np.int64), 50, 0.3, ""
     )
     assert apply_loop(map_, loop, [], LoopConfig()).applied
-    assert trajectory_error(map_, truth) < 0.2 * before
+    assert trajectory_error(map_, truth) < 0.4 * before
 
 
 def test_a_loop_that_no_drift_explains_is_refused() -> None:
