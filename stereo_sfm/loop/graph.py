@@ -58,6 +58,10 @@ class KeyframeGraph:
             self._frames[self._count] = self._frames[self._count - 1]
         self._count += 1
 
+    def unbroken(self, a: int, b: int) -> bool:
+        """Whether odometry leads from one keyframe to the other."""
+        return a in self._chain and self._chain[a] == self._chain[b]
+
     def same_view(self, kf_id: int) -> list[int]:
         """Keyframes, this one among them, that stood where it stood and looked where it looked, oldest first."""
         part = slice(0, self._count)

@@ -111,3 +111,19 @@ def test_a_view_seen_every_lap_is_remembered_a_few_times_and_still_closes(vocabu
     assert remembered[-1] - remembered[-1 - lap] < 0.3 * lap  # hardly anything is added on the last
     assert any(r.candidate_kf_id >= 0 for r in results[-lap:])
     assert all(error_of(walk, r) < 0.1 for r in results if r.candidate_kf_id >= 0)
+
+
+def test_tracking_that_began_anew_finds_the_place_it_just_left(vocabulary: voc.Vocabulary) -> None:
+    """Dark for a moment: the new submap joins the old one at once, not when the robot comes round again."""
+    walk = make_walk([0], seed=3)
+    break_at = 20
+    astray = se3.exp(np.array([5.0, 1, -8, 0.2, 1.0, 0]))
+    keyframes = [
+        k
+        if i < break_at
+        else dataclasses.replace(k, submap_id=1, odom_T_cam=astray @ k.odom_T_cam, point_ids=k.point_ids + 10**6)
+        for i, k in enumerate(walk.keyframes[: break_at + 8])
+    ]
+    loops = [r for r in close(dataclasses.replace(walk, keyframes=keyframes), vocabulary) if r.candidate_kf_id >= 0]
+    assert loops and loops[0].candidate_kf_id < break_at <= loops[0].kf_id < break_at + 5
+    assert all(error_of(walk, loop) < 0.05 for loop in loops)
