@@ -78,9 +78,7 @@ def run(args: argparse.Namespace) -> int:
     rig, rectify = (None, "none") if logged else (before.opening.rig, before.opening.rectify)
     frame_ids = tuple(f.frame_id for f in frames if _within(f, frames[0], args.until))
     folders = map_folders(before.opening)
-    choice = ReplayChoice(
-        spec, rig, rectify=rectify, map_in=folders.map_in, localize_only=folders.localize_only, frame_ids=frame_ids
-    )
+    choice = ReplayChoice(spec, rig, rectify=rectify, frame_ids=frame_ids)
     args.mode, args.realtime = args.mode or "lockstep", False
     args.log = args.log or "lean"
     config = _changed(before.config, args.set)

@@ -141,8 +141,6 @@ class SourceChoice:
     max_frames: int | None = None
     speed: float | None = None
     rectify: str = "none"
-    map_in: Path | None = None
-    localize_only: bool = False
 
     @staticmethod
     def of(args: argparse.Namespace) -> SourceChoice:
@@ -161,18 +159,14 @@ class SourceChoice:
 
             rig = load_rig(args.rig)
         part = (args.start, args.duration, args.frame_skip, args.max_frames)
-        known = getattr(args, "map_in", None), getattr(args, "localize_only", False)
-        return SourceChoice(spec, rig, *part, speed, args.rectify, *known)
+        return SourceChoice(spec, rig, *part, speed, args.rectify)
 
     @property
     def opening(self) -> Opening:
         """What the log keeps of it besides the name."""
         from stereo_sfm.log.provenance import Opening
-        from stereo_sfm.pipeline.maps import map_sha256
 
-        if self.map_in is None:
-            return Opening(self.rectify, self.rig)
-        return Opening(self.rectify, self.rig, str(self.map_in.resolve()), map_sha256(self.map_in), self.localize_only)
+        return Opening(self.rectify, self.rig)
 
     def __call__(self) -> Source:
         """The source, not yet entered."""

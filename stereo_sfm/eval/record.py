@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -141,27 +142,24 @@ class RunRecord:
 
     def odometry(self) -> Trajectory:
         """odom_T_cam of the tracked frames."""
-        return self._trajectory([row.odom_T_cam for row in self.frames])
+        return self._trajectory(self.tracked(), lambda row: row.odom_T_cam)
 
     def mapped(self) -> Trajectory | None:
         """map_T_cam after the last map update of the frames that have a place in the map; None without any."""
         if not len(self.map_T_kf):
             return None
         known = self.map_T_kf.all()
-        poses = [
-            known[f.reference_kf_id] @ f.kf_T_cam if f.reference_kf_id in known else np.eye(4) for f in self.frames
-        ]
-        return self._trajectory(poses, self.placed())
+        return self._trajectory(self.placed(), lambda row: known[row.reference_kf_id] @ row.kf_T_cam)
 
     def placed(self) -> Bool:
         """(frames,) whether the frame has a place in the map; all tracked ones unless a saved map did not know them."""
         known = self.map_T_kf.all()
         return self.tracked() & np.array([f.reference_kf_id in known for f in self.frames], bool)
 
-    def _trajectory(self, poses: list[F64], kept: Bool | None = None) -> Trajectory:
-        keep = np.flatnonzero(self.tracked() if kept is None else kept)
-        stamps = np.array([self.frames[i].stamp_ns for i in keep], np.int64)
-        return Trajectory(stamps, np.array([poses[i] for i in keep]).reshape(-1, 4, 4))
+    def _trajectory(self, kept: Bool, pose_of: Callable[[FrameRow], F64]) -> Trajectory:
+        rows = [self.frames[i] for i in np.flatnonzero(kept)]
+        stamps = np.array([row.stamp_ns for row in rows], np.int64)
+        return Trajectory(stamps, np.array([pose_of(row) for row in rows]).reshape(-1, 4, 4))
 
     def keyframe_trajectory(self) -> Trajectory:
         """Of the keyframes, in the map where there is one."""

@@ -11,6 +11,7 @@ class KeyframePoses:
     def __init__(self) -> None:
         self._poses: dict[int, F64] = {}  # of living keyframes: map_T_kf
         self._carried: dict[int, tuple[int, F64]] = {}  # of culled ones: carrier's id, carrier_T_kf
+        self._all: dict[int, F64] | None = None  # what `all` gave last, until something changes
 
     def __len__(self) -> int:
         return len(self._poses) + len(self._carried)
@@ -21,10 +22,11 @@ class KeyframePoses:
 
     def add(self, kf_id: int, map_T_kf: F64) -> None:
         """A keyframe that no update has told of yet."""
-        self._poses[kf_id] = map_T_kf
+        self._poses[kf_id], self._all = map_T_kf, None
 
     def update(self, update: MapUpdate) -> None:
         """Take the poses of one update."""
+        self._all = None
         self._poses.update(zip(update.kf_ids.tolist(), update.map_T_kf, strict=True))
         culled, carriers = update.culled_kf_ids.tolist(), update.carrier_kf_ids.tolist()
         for kf_id, carrier, carrier_T_kf in zip(culled, carriers, update.carrier_T_kf, strict=True):
@@ -33,6 +35,11 @@ class KeyframePoses:
 
     def all(self) -> dict[int, F64]:
         """map_T_kf (4, 4) by id, ascending. What is carried by a keyframe that no update told of is left out."""
+        if self._all is None:
+            self._all = self._put_together()
+        return self._all
+
+    def _put_together(self) -> dict[int, F64]:
         out = dict(self._poses)
         for kf_id in self._carried:
             way, at = list[int](), kf_id

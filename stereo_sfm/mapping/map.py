@@ -67,8 +67,7 @@ class Map:
         self._kf_rows: dict[int, int] = {}
         self._pt_rows = np.full(1024, -1, np.int32)  # by id
         self._changed_kf: set[int] = set()
-        self._culled_kf: list[tuple[int, int]] = []
-        self._culled_offset: list[F64] = []
+        self._culled_kf: list[int] = []
         self._changed_pt: list[I64] = []
 
     # -- looking up --------------------------------------------------------------------------------------------------
@@ -254,9 +253,8 @@ class Map:
         Its points pass to the oldest keyframe that still sees them; its place stays known, tied to the living keyframe
         that shared most points with it (else to the one before it).
         """
-        carrier = self._carry(row)
-        self._culled_kf.append((row, carrier))
-        self._culled_offset.append(self.keyframes.carrier_T_kf[row].copy())
+        self._carry(row)
+        self._culled_kf.append(row)
         rows = self.observations_of_keyframe(row)
         points = self.observations.pt[rows].astype(np.int64)
         self.remove_observations(rows)
@@ -268,8 +266,8 @@ class Map:
             if len(seen):
                 self.points.anchor[point] = seen.min()
 
-    def _carry(self, row: int) -> int:
-        """Tie a keyframe, and those that it carries, to another. Returns that one's row."""
+    def _carry(self, row: int) -> None:
+        """Tie a keyframe, and those that it carries, to another."""
         others, _ = self.covisibility.neighbours(row)
         carrier = int(others[0]) if len(others) else max(int(self.keyframes.previous[row]), 0)
         table = self.keyframes
@@ -278,7 +276,6 @@ class Map:
         table.carrier_T_kf[carried] = carrier_T_row @ table.carrier_T_kf[carried]
         table.carrier_T_kf[row] = carrier_T_row
         table.carrier[carried], table.carrier[row] = carrier, carrier
-        return carrier
 
     def fuse(self, old: int, new: int, sigma: float = 1.0) -> None:
         """The points of two rows are one: `new` takes over the observations and the names of `old`.
@@ -360,13 +357,13 @@ class Map:
         """What changed since the last call."""
         kf = np.array(sorted(self._changed_kf), np.int64)
         kf = kf[self.keyframes.alive[kf]]
-        culled = np.array(self._culled_kf, np.int64).reshape(-1, 2), np.array(self._culled_offset).reshape(-1, 4, 4)
+        gone = np.array(self._culled_kf, np.int64)
+        culled = np.stack([gone, self.keyframes.carrier[gone]], 1), self.keyframes.carrier_T_kf[gone]
         pt = np.unique(np.concatenate([np.zeros(0, np.int64), *self._changed_pt]))
         pt = pt[self.points.alive[pt] & np.isfinite(self.points.xyz[pt, 0])]
         self._changed_kf.clear()
         self._changed_pt.clear()
         self._culled_kf.clear()
-        self._culled_offset.clear()
         return MapDelta(kf, self.keyframes.map_T_kf[kf], *culled, pt, self.points.xyz[pt])
 
     def snapshot(self) -> MapSnapshot:

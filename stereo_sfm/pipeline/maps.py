@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,8 @@ import numpy as np
 from calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.export.map_header import checksum
+from stereo_sfm.log.provenance import Opening
 from stereo_sfm.pipeline.stages import AnyMapper
 from stereo_sfm.timing import NoSpans
 
@@ -40,10 +41,17 @@ class MapFolders:
             if not above.is_dir():
                 raise StereoSfmError(f"cannot make --map-out {self.map_out}: {above} is no folder")
 
+    def recorded(self, opening: Opening) -> Opening:
+        """How a run began, with the map that it began with."""
+        if self.map_in is None:
+            return opening
+        place, sha256 = str(self.map_in.resolve()), map_sha256(self.map_in)
+        return replace(opening, map_in=place, map_sha256=sha256, localize_only=self.localize_only)
+
 
 def map_sha256(folder: Path) -> str:
     """What tells a saved map from any other: its map.json holds the checksums of all its files."""
-    return hashlib.sha256((folder / "map.json").read_bytes()).hexdigest()
+    return checksum((folder / "map.json").read_bytes())
 
 
 def make_mapper(config: Config, rig: Rig, spans: NoSpans, folders: MapFolders) -> AnyMapper:

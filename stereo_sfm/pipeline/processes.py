@@ -217,7 +217,7 @@ class ProcessRun:
             realtime=realtime,
             folders=self._folders,
             delays=self._delays,
-            opening=getattr(self._opener, "opening", Opening()),
+            opening=self._folders.recorded(getattr(self._opener, "opening", Opening())),
         )
         jpeg = self._log is not None and self._log.image_format == "jpeg"
         for stage, control in self._controls.items():

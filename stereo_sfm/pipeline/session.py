@@ -15,6 +15,7 @@ from drivers.source import Source
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.run_folder import default_folder, discard_files, prepare_folder
+from stereo_sfm.log.provenance import Opening
 from stereo_sfm.pipeline.capture import SourceInfo
 from stereo_sfm.pipeline.inline import run_inline
 from stereo_sfm.pipeline.maps import MapFolders
@@ -163,7 +164,7 @@ class Session:
                 LogWriter(options.path, compress=options.image_format != "raw"), source.rig, self._config,
                 source=self._spec or source.name, mode="inline",
                 image_format=options.image_format, ground_truth=source.ground_truth,
-                opening=getattr(self._opener, "opening", None),
+                opening=self._folders.recorded(getattr(self._opener, "opening", Opening())),
             )  # fmt: skip
             stack.callback(log.close)
             sinks.append(log)
