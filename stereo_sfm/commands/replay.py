@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
     parser.add_argument("run", type=Path, help="run.mcap or the folder of a run")
     parser.add_argument("--source", help="where the images are (default: in the log, else the run's own source)")
-    parser.add_argument("-o", "--output", type=Path, help="output folder (default: runs/DATE_replay)")
+    parser.add_argument("-o", "--output", type=Path, help="output folder (default: runs/DATE_NAME)")
     parser.add_argument("--overwrite", action="store_true", help="replace the run that lies in the output folder")
     parser.add_argument(
         "--schedule",
@@ -62,6 +62,8 @@ def run(args: argparse.Namespace) -> int:
 
     if args.seek and not args.step:
         raise StereoSfmError("--seek goes with --step: every frame must be executed to reach a later one")
+    if args.check and args.log == "none":
+        raise StereoSfmError("--check compares the logs of both runs: it needs --log lean or full")
     if args.until is not None and not args.until >= 0:
         raise StereoSfmError(f"--until takes seconds after the first frame, got {args.until:g}")
     path: Path = args.run / "run.mcap" if args.run.is_dir() else args.run
@@ -82,8 +84,8 @@ def run(args: argparse.Namespace) -> int:
     args.mode, args.realtime = args.mode or "lockstep", False
     args.log = args.log or "lean"
     config = _changed(before.config, args.set)
-    code = execute(args, choice, config, folders, before if follow else None)
-    return _compare(path, args) if args.check and code == 0 else code
+    code, folder = execute(args, choice, config, folders, before if follow else None)
+    return _compare(path, folder / "run.mcap") if args.check and code == 0 else code
 
 
 def map_folders(opening: Opening) -> MapFolders:
@@ -108,13 +110,13 @@ def _changed(config: Config, overrides: list[str]) -> Config:
     return load(None, overrides, dataclasses.asdict(config)) if overrides else config
 
 
-def _compare(path: Path, args: argparse.Namespace) -> int:
+def _compare(run: Path, replay: Path) -> int:
     from stereo_sfm.log import topics
     from stereo_sfm.log.diff import diff
     from stereo_sfm.log.reader import LogReader
 
     images = (topics.IMAGE_INFO, topics.LEFT_IMAGE, topics.RIGHT_IMAGE, topics.DEPTH_IMAGE, topics.IMU, topics.WHEEL)
-    with LogReader(path) as a, LogReader(Path(args.output) / "run.mcap") as b:
+    with LogReader(run) as a, LogReader(replay) as b:
         not_logged = set(images) - {t.topic for t in b.topics}  # what the replay read, without --log full
         differences = [d for d in diff(a, b) if d.topic not in not_logged]
     print("identical" if not differences else "\n".join(str(d) for d in differences))

@@ -188,7 +188,7 @@ def run(args: argparse.Namespace) -> int:
 
     folders = MapFolders(args.map_in, args.localize_only, args.map_out)
     folders.check(args.overwrite)
-    return execute(args, SourceChoice.of(args), load_config(args), folders)
+    return execute(args, SourceChoice.of(args), load_config(args), folders)[0]
 
 
 def execute(
@@ -197,8 +197,8 @@ def execute(
     config: Config,
     folders: MapFolders,
     replayed: RecordedRun | None = None,
-) -> int:
-    """One run with its output folder; `replayed` is an earlier run whose schedule is followed."""
+) -> tuple[int, Path]:
+    """One run: its exit code and its output folder. `replayed` is an earlier run whose schedule is followed."""
     from stereo_sfm.eval.record import RunRecord
     from stereo_sfm.eval.run_results import write_results
     from stereo_sfm.eval.statistics import failure, summary
@@ -228,12 +228,12 @@ def execute(
     if problem is not None:
         raise problem
     if interrupted:
-        return INTERRUPTED
+        return INTERRUPTED, folder
     failed = failure(stats, args.max_lost)
     if failed:
         print(f"stereo-sfm {args.command}: {failed}; {folder / 'report.md'} says why", file=sys.stderr)
-        return TRACKING_FAILED
-    return 0
+        return TRACKING_FAILED, folder
+    return 0, folder
 
 
 def _match_pictures(every: int | None) -> MatchPictures | None:

@@ -1,4 +1,4 @@
-"""`replay --step` and `--seek`: one frame at a time."""
+"""`replay --check`; `--step` and `--seek`: one frame at a time."""
 
 from __future__ import annotations
 
@@ -68,3 +68,14 @@ def test_seek_alone_says_what_it_needs(run: Path, capsys: pytest.CaptureFixture[
 def test_a_time_before_the_first_frame_is_refused(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", str(run), "--until", "-1"]) == 2
     assert "--until takes seconds after the first frame, got -1" in capsys.readouterr().err
+
+
+def test_check_needs_no_output_folder(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["replay", str(run), "--check", "--inline", "-q"]) == 0
+    assert capsys.readouterr().out == "identical\n"
+    assert (tmp_path / "runs" / "latest" / "run.mcap").exists()
+    assert main(["replay", str(run), "--check", "--log", "none", "-q"]) == 2
+    assert "--check compares the logs" in capsys.readouterr().err
