@@ -156,6 +156,7 @@ class LoopConfig:
     consistent: int = 2  # successive keyframes that must agree on a loop
     consistent_window: int = 4  # ... within so many keyframes
     unknown_way_share: float = 0.2  # share of inliers where tracking broke and odometry cannot speak for a loop
+    gap_metres: float = 1.4  # ... unless the robot cannot be further off than this from where it is expected
     gate_metres: float = 0.3  # a loop may contradict odometry by this much ...
     gate_per_metre: float = 0.01  # ... plus this for every metre walked since
     gate_degrees: float = 3.0

@@ -46,6 +46,7 @@ class SimOptions:
     drop: float = 0.0  # fraction of frames lost
     noise: float = 1.0  # scales the sensor's noise
     blur: float = 1.0  # scales the exposure time
+    dark: str = ""  # FROM-TO in seconds: when the lights are out
     effects: bool = True  # off: clean pictures
     realtime: bool = False  # frames come by the clock
 
@@ -95,6 +96,20 @@ def _size(text: str) -> tuple[int, int] | None:
     return int(width), int(height)
 
 
+def _interval(text: str) -> tuple[float, float]:
+    """Seconds from and to of FROM-TO; an empty one for no text."""
+    if not text:
+        return 0.0, 0.0
+    begin, _, end = text.partition("-")
+    try:
+        low, high = float(begin), float(end)
+    except ValueError:
+        low, high = 0.0, 0.0
+    if not 0 <= low < high:
+        raise StereoSfmError(f"sim: option dark={text} must be FROM-TO in seconds, such as 10-11.5")
+    return low, high
+
+
 @functools.lru_cache(maxsize=2)
 def _world(layout: Layout, seed: int, exchange: float) -> Tables:
     return build_world(layout, seed, exchange)
@@ -128,6 +143,7 @@ class SimSource:
         self.rig = make_rig(options.camera, _size(options.size))
         self.layout = scene.layout
         self.effects = _effects(scene, options)
+        self._dark = _interval(options.dark)
         gait = dataclasses.replace(
             scene.gait, speed=options.speed or scene.gait.speed, vibration=scene.gait.vibration * options.vibration
         )
@@ -192,7 +208,8 @@ class SimSource:
         o, seconds = self.options, frame_id / self.options.rate
         twist = np.zeros(6) if twist is None else twist
         twists = [twist, se3.adjoint(se3.inverse(self.rig.left_T_right)) @ twist]
-        level = brightness(self.effects, seconds, o.seed)
+        dark = self._dark[0] <= seconds < self._dark[1]
+        level = 0.0 if dark else brightness(self.effects, seconds, o.seed)
         views = self.view(world_T_cam, seconds)  # before the sensors: it makes them
         left, right = (
             sensor.expose(view, twists[k], level, _noise_key(o.seed, frame_id, k))

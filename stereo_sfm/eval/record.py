@@ -7,6 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy.sparse
+from scipy.sparse.csgraph import connected_components
 
 from stereo_sfm.export.trajectories import fill_missing
 from stereo_sfm.geometry import se3
@@ -50,6 +52,7 @@ class KeyframeRow:
     stamp_ns: int
     odom_T_cam: F64
     path_m: float  # odometry path up to here
+    submap_id: int  # of the unbroken piece of odometry
 
 
 @dataclass(frozen=True)
@@ -66,6 +69,7 @@ class LostInterval:
 class RunRecord:
     """Collects the messages of one run."""
 
+    localize_only: bool = False  # a saved map places every piece of odometry
     frames: list[FrameRow] = field(default_factory=list[FrameRow])
     keyframes: dict[int, KeyframeRow] = field(default_factory=dict[int, KeyframeRow])
     stage_ms: dict[int, dict[str, float]] = field(default_factory=dict[int, dict[str, float]])  # by frame id
@@ -87,7 +91,7 @@ class RunRecord:
             self._put_frame(message)
         elif isinstance(message, Keyframe):
             self.keyframes[message.kf_id] = KeyframeRow(
-                message.frame_id, message.stamp_ns, message.odom_T_cam, self._path_m
+                message.frame_id, message.stamp_ns, message.odom_T_cam, self._path_m, message.submap_id
             )
             self.seen_points.update(message.point_ids.tolist())
         elif isinstance(message, MapUpdate):
@@ -207,11 +211,26 @@ class RunRecord:
         row = self.frames[begin]
         return LostInterval(row.frame_id, end - begin, (upto.stamp_ns - row.stamp_ns) / 1e9, row.reason)
 
+    def pieces(self) -> int:
+        """How many pieces the walk is in: tracking restarted after it was lost, and no loop joins what is before and
+        after. Where one piece lies beside the other is only predicted.
+        """
+        submaps = sorted({row.submap_id for row in self.keyframes.values()})
+        if self.localize_only or len(submaps) < 2:
+            return min(len(submaps), 1)
+        at = {submap: k for k, submap in enumerate(submaps)}
+        joined = [tuple(at[self.keyframes[k].submap_id] for k in (x.candidate_kf_id, x.kf_id)) for x in self.loops]
+        i, j = np.array(joined, np.int64).reshape(-1, 2).T
+        graph = scipy.sparse.coo_array((np.ones(len(i)), (i, j)), shape=(len(at), len(at)))
+        return int(connected_components(graph, directed=False)[0])
+
     def closure_drifts(self) -> list[float]:
-        """At each accepted loop: how far odometry was off, as a share of the path between the two keyframes."""
+        """At each loop within a piece of odometry: how far that was off, as a share of the path between its ends."""
         drifts: list[float] = []
         for loop in self.loops:
             old, new = self.keyframes[loop.candidate_kf_id], self.keyframes[loop.kf_id]
+            if old.submap_id != new.submap_id:
+                continue
             odometry = se3.inverse(old.odom_T_cam) @ new.odom_T_cam
             error = se3.inverse(loop.candidate_T_kf) @ odometry
             drifts.append(float(np.linalg.norm(error[:3, 3])) / max(new.path_m - old.path_m, 1e-9))

@@ -91,6 +91,11 @@ def verdicts(stats: dict[str, Any], evaluations: dict[str, Evaluation]) -> list[
         out += [f"**WARN**: lost ({reason}): {ADVICE.get(reason, 'see stats.json')}" for reason in reasons]
     elif stats["tracked"]:
         out.append("**PASS**: every frame after the first pose has one")
+    if stats["pieces"] > 1:
+        out.append(
+            f"**WARN**: the walk is in {stats['pieces']} pieces: tracking began again, and no place of one piece was "
+            "recognised in another; drive through a place again that was seen before tracking was lost"
+        )
     if stats["dropped"]:
         share = 100 * stats["dropped"] / (stats["frames"] + stats["dropped"])
         out.append(

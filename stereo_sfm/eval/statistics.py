@@ -52,6 +52,7 @@ def statistics(record: RunRecord, wall_s: float, evaluations: dict[str, Evaluati
         "states": states,
         "lost_percent": 100.0 * (frames - tracked) / frames if frames else 0.0,
         "lost_intervals": [dataclasses.asdict(interval) for interval in lost],
+        "pieces": record.pieces(),
         "keyframes": len(record.keyframes),
         "points": len(record.map_points or record.seen_points),
         "inliers_median": float(np.median(inliers)) if inliers else 0.0,
@@ -109,6 +110,8 @@ def summary(stats: dict[str, Any], evaluations: dict[str, Evaluation] | None = N
     ]
     if stats["unplaced"]:
         lines.append(f"{thousands(stats['unplaced'])} of the tracked frames were not found in the map")
+    if stats["pieces"] > 1:
+        lines.append(f"{stats['pieces']} pieces that no loop joins: how they lie to each other is only predicted")
     if stats["loops_accepted"] or stats["loops_rejected"]:
         lines.append(_loops(stats))
     if stats["camera"]:

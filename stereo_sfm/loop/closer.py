@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,8 @@ from stereo_sfm.types import F64, Keyframe, LoopResult
 CLOUD_KEYFRAMES = 4  # connected keyframes whose points are added to a candidate's own
 PLACE_RADIUS = 3  # candidates this many keyframes apart are one place: only the best of them is verified
 FRESH, CROWD = 30, 5  # newest keyframes, which are all kept; keyframes of one view beyond which one is forgotten
+DRIFT_PER_METRE = 0.003  # of the odometry on both sides of a gap
+RIVAL = 0.5  # share of a loop's inliers with which another place makes it ambiguous, where odometry cannot decide
 AGREE_METRES, AGREE_DEGREES = 0.15, 2.0  # how well two keyframes must agree on a loop
 
 
@@ -31,6 +34,8 @@ class _Hypothesis:
     kf_id: int
     candidate_kf_id: int
     candidate_T_kf: F64
+    inliers: int
+    against: str = ""  # what speaks against it
 
 
 class LoopCloser:
@@ -69,7 +74,7 @@ class LoopCloser:
 
     def step(self, keyframe: Keyframe) -> LoopResult:
         """Look for the keyframe's place among the older ones, then remember it."""
-        self._graph.add(keyframe.kf_id, keyframe.odom_T_cam, keyframe.submap_id)
+        self._graph.add(keyframe.kf_id, keyframe.odom_T_cam, keyframe.submap_id, keyframe.stamp_ns)
         with self._spans.span("loop_words"):
             bag = self._vocabulary.bag(keyframe.descriptors)
         with self._spans.span("loop_query"):
@@ -147,33 +152,44 @@ class LoopCloser:
         verdict = verify(view, cloud, self._rig, config, rng)
         if verdict.reason:
             return verdict
-        candidate_T_kf = se3.inverse(verdict.b_T_a)
-        way = self._graph.way(candidate, keyframe.kf_id)
-        if way is None:
-            if verdict.inliers < max(2 * config.min_inliers, config.unknown_way_share * len(view.ids)):
-                return rejection("too_few_inliers", verdict.inliers)  # nothing but the pictures speaks for it
-        else:
-            metres = config.gate_metres + config.gate_per_metre * way.metres
-            degrees = config.gate_degrees + config.gate_degrees_per_metre * way.metres
-            if not within(se3.inverse(way.a_T_b) @ candidate_T_kf, metres, degrees):
-                return rejection("against_odometry", verdict.inliers)
-        if not self._agreed(_Hypothesis(keyframe.kf_id, candidate, candidate_T_kf)):
-            return rejection("not_confirmed_yet", verdict.inliers)
+        loop = _Hypothesis(keyframe.kf_id, candidate, se3.inverse(verdict.b_T_a), verdict.inliers)
+        self._pending = [h for h in self._pending if loop.kf_id - h.kf_id < config.consistent_window]
+        loop = dataclasses.replace(loop, against=self._against(loop, len(view.ids)))
+        self._pending.append(loop)
+        if loop.against or not self._agreed(loop):
+            return rejection(loop.against or "not_confirmed_yet", verdict.inliers)
         return verdict
 
-    def _agreed(self, new: _Hypothesis) -> bool:
-        """Whether enough earlier keyframes found the same loop; remembers the new one."""
+    def _against(self, loop: _Hypothesis, seen: int) -> str:
+        """What speaks against a verified loop, '' for nothing; `seen` points are described in the keyframe."""
         config = self._config
-        self._pending = [h for h in self._pending if new.kf_id - h.kf_id < config.consistent_window]
-        votes = {new.kf_id} | {h.kf_id for h in self._pending if self._same_loop(h, new)}
-        self._pending.append(new)
-        return len(votes) >= config.consistent
+        way = self._graph.way(loop.candidate_kf_id, loop.kf_id)
+        if way is not None:
+            metres = config.gate_metres + config.gate_per_metre * way.metres
+            degrees = config.gate_degrees + config.gate_degrees_per_metre * way.metres
+            return "" if within(se3.inverse(way.a_T_b) @ loop.candidate_T_kf, metres, degrees) else "against_odometry"
+        jump = self._graph.jump(loop.candidate_kf_id, loop.kf_id, loop.candidate_T_kf)
+        if jump is not None:
+            if jump.off > jump.radius + DRIFT_PER_METRE * jump.walked:
+                return "out_of_reach"
+            if jump.radius < config.gap_metres:
+                return ""
+        if loop.inliers < max(2 * config.min_inliers, config.unknown_way_share * seen):
+            return "too_few_inliers"  # nothing but the pictures speaks for it
+        rivals = [h for h in self._pending if h.inliers > RIVAL * loop.inliers and self._same_loop(h, loop) is False]
+        return "ambiguous" if rivals else ""
 
-    def _same_loop(self, old: _Hypothesis, new: _Hypothesis) -> bool:
+    def _agreed(self, new: _Hypothesis) -> bool:
+        """Whether enough earlier keyframes found the same loop."""
+        votes = {h.kf_id for h in self._pending if not h.against and (h is new or self._same_loop(h, new))}
+        return len(votes) >= self._config.consistent
+
+    def _same_loop(self, old: _Hypothesis, new: _Hypothesis) -> bool | None:
+        """Whether two loops say the same; None where no way leads from one to the other."""
         back = self._graph.way(old.candidate_kf_id, new.candidate_kf_id)
         ahead = self._graph.way(new.kf_id, old.kf_id)
         if back is None or ahead is None:
-            return False
+            return None
         implied = back.a_T_b @ new.candidate_T_kf @ ahead.a_T_b
         return within(se3.inverse(old.candidate_T_kf) @ implied, AGREE_METRES, AGREE_DEGREES)
 

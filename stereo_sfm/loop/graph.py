@@ -14,6 +14,7 @@ from stereo_sfm.types import F64, I64
 
 NEAR_METRES, NEAR_RADIANS = 1.5, 0.7  # keyframes that should see the same things
 SAME_METRES, SAME_RADIANS = 0.3, 0.25  # keyframes that show the same view
+GAP_METRES, GAP_SHARE, SLOW = 0.3, 0.75, 0.5  # reach without tracking: metres, share of the way, least metres a second
 HOP_METRES = 1e-6  # added to each edge of a way: of equal ways the one with fewer edges
 
 
@@ -23,6 +24,15 @@ class Way:
 
     a_T_b: F64  # (4, 4) composed along it
     metres: float  # walked on it: the drift it may hold grows with this
+
+
+@dataclass(frozen=True, eq=False)
+class Jump:
+    """What a loop says of the motion while tracking was lost, beside what the robot's speed before says."""
+
+    off: float  # metres between where the loop puts the camera after the gap and where it is expected
+    radius: float  # metres by which a robot that stops, turns or hurries can be off
+    walked: float  # metres of odometry between the gap and the loop's two ends
 
 
 class KeyframeGraph:
@@ -38,10 +48,12 @@ class KeyframeGraph:
         self._anchored: F64 = np.empty((64, 4, 4))  # the same, taken back at each loop to where its older end stood
         self._chains: I64 = np.zeros(64, np.int64)
         self._walked: F64 = np.zeros(64)  # metres since the start
+        self._stamps: I64 = np.zeros(64, np.int64)
+        self._joined: dict[int, int] = {}  # number of the chains' group that loops hold together
         self._frames: I64 = np.zeros(64, np.int64)  # the chain whose coordinates _anchored is in
         self._count = 0
 
-    def add(self, kf_id: int, odom_T_cam: F64, chain: int) -> None:
+    def add(self, kf_id: int, odom_T_cam: F64, chain: int, stamp_ns: int = 0) -> None:
         """Append the newest keyframe of an unbroken piece of odometry called `chain`."""
         step = np.linalg.norm(odom_T_cam[:3, 3] - self._poses[self._last][:3, 3]) if self._last >= 0 else 0.0
         self._poses[kf_id], self._chain[kf_id], self._last = odom_T_cam, chain, kf_id
@@ -49,6 +61,9 @@ class KeyframeGraph:
             self._ids, self._stack = np.tile(self._ids, 2), np.tile(self._stack, (2, 1, 1))
             self._chains, self._frames = np.tile(self._chains, 2), np.tile(self._frames, 2)
             self._anchored, self._walked = np.tile(self._anchored, (2, 1, 1)), np.tile(self._walked, 2)
+            self._stamps = np.tile(self._stamps, 2)
+        self._stamps[self._count] = stamp_ns
+        self._joined.setdefault(chain, chain)
         self._ids[self._count], self._stack[self._count], self._chains[self._count] = kf_id, odom_T_cam, chain
         self._anchored[self._count], self._frames[self._count] = odom_T_cam, chain
         self._walked[self._count] = (self._walked[self._count - 1] if self._count else 0.0) + float(step)
@@ -83,6 +98,43 @@ class KeyframeGraph:
         self._loops.append((a, b, a_T_b))
         row_a, row_b = np.searchsorted(self._ids[: self._count], (a, b)).tolist()
         self._anchored[row_b], self._frames[row_b] = self._anchored[row_a] @ a_T_b, self._frames[row_a]
+        keep, gone = self._joined[self._chain[a]], self._joined[self._chain[b]]
+        self._joined = {chain: keep if group == gone else group for chain, group in self._joined.items()}
+
+    def jump(self, a: int, b: int, a_T_b: F64) -> Jump | None:
+        """What a loop between two pieces of the walk says of the shortest gap between them; None where none is known.
+
+        In the dark a robot goes on as before, stops, turns or goes half as fast again: all this is in a ball around the
+        middle of the way that its speed makes likely.
+        """
+        group = np.array([self._joined[chain] for chain in self._chains[: self._count].tolist()])
+        ours = {self._joined[self._chain[a]], self._joined[self._chain[b]]}
+        gaps = [
+            (int(self._stamps[k + 1] - self._stamps[k]), k)
+            for k in np.flatnonzero(group[1:] != group[:-1]).tolist()
+            if {group[k], group[k + 1]} == ours
+        ]
+        gaps = [(ns, k) for ns, k in gaps if ns > 0 and self._velocity(k) is not None]
+        if not gaps:
+            return None
+        ns, k = min(gaps)
+        velocity = self._velocity(k)
+        assert velocity is not None
+        if self._joined[self._chain[a]] != group[k]:
+            a, b, a_T_b = b, a, se3.inverse(a_T_b)
+        before, after = self.way(int(self._ids[k]), a), self.way(b, int(self._ids[k + 1]))
+        assert before is not None and after is not None
+        moved = before.a_T_b @ a_T_b @ after.a_T_b
+        off = float(np.linalg.norm(moved[:3, 3] - 0.5e-9 * ns * velocity))
+        radius = GAP_METRES + GAP_SHARE * 1e-9 * ns * max(float(np.linalg.norm(velocity)), SLOW)
+        return Jump(off, radius, before.metres + after.metres)
+
+    def _velocity(self, row: int) -> F64 | None:
+        """(3,) metres a second before a keyframe, in its camera; None for the first of a piece."""
+        if row == 0 or self._chains[row - 1] != self._chains[row] or self._stamps[row] <= self._stamps[row - 1]:
+            return None
+        step = se3.inverse(self._stack[row]) @ self._stack[row - 1]
+        return -step[:3, 3] / (1e-9 * float(self._stamps[row] - self._stamps[row - 1]))
 
     def way(self, a: int, b: int) -> Way | None:
         """The way with the fewest metres, or None where tracking broke and no loop joins the pieces (Dijkstra)."""

@@ -140,6 +140,8 @@ def test_random_poses_are_inside_and_upright() -> None:
         ("sim:loop?size=big", "WIDTHxHEIGHT"),
         ("sim:loop?effects=maybe", "on or off"),
         ("sim:loop?exchange=nan", "between"),
+        ("sim:loop?dark=5", "FROM-TO"),
+        ("sim:loop?dark=5-nan", "FROM-TO"),
     ],
 )
 def test_bad_specs_are_one_line(spec: str, text: str) -> None:
@@ -177,3 +179,10 @@ def test_bundled_recording_is_what_its_command_renders() -> None:
             assert image.right is not None and rendered.right is not None
             for a, b in ((image.left, rendered.left), (image.right, rendered.right)):
                 assert np.abs(a.astype(float) - b).mean() < 3.0
+
+
+def test_the_lights_go_out_for_a_while() -> None:
+    source = small("loop", dark="0.1-0.2", rate=30)
+    levels = [float(source.frame(k).left.mean()) for k in range(8)]
+    assert all((level < 10) == (3 <= k < 6) for k, level in enumerate(levels))
+    assert source.frame(0).left.max() > 100 and source.frame(4).left.max() < 30

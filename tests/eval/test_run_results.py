@@ -10,11 +10,11 @@ import numpy as np
 
 from calib.rig import Rig
 from stereo_sfm.config import Config
-from stereo_sfm.eval.record import RunRecord
+from stereo_sfm.eval.record import KeyframeRow, RunRecord
 from stereo_sfm.eval.run_results import scale_free, write_results
 from stereo_sfm.eval.statistics import failure, summary
 from stereo_sfm.geometry import se3
-from stereo_sfm.types import F64, Frame, MapUpdate, Observations, TrackState, Trajectory
+from stereo_sfm.types import F64, Frame, Keyframe, LoopResult, MapUpdate, Observations, TrackState, Trajectory
 from tests.synthetic import pinhole_rig
 
 COUNT = 30
@@ -77,3 +77,28 @@ def test_never_found_in_the_map_is_a_failure(tmp_path: Path) -> None:
     stats, _, _ = results(tmp_path, record_of(walk(), COUNT), pinhole_rig(), Config())
     assert "never found" in failure(stats)
     assert not (tmp_path / "trajectory_map.tum").exists() and (tmp_path / "trajectory_odom.tum").exists()
+
+
+def test_pieces_that_no_loop_joins_are_said(tmp_path: Path) -> None:
+    record, none = record_of(walk(), 0), np.zeros(0, np.int64)
+    nothing = np.zeros((0, 2))
+    for kf_id, submap in ((0, 0), (10, 1), (20, 1)):
+        keyframe = Keyframe(
+            kf_id, kf_id, kf_id * 10**8, walk()[kf_id], none, nothing, nothing, np.zeros((0, 3)),
+            np.zeros((0, 32), np.uint8), np.zeros(0, np.float32), submap_id=submap,
+        )  # fmt: skip
+        record.put(keyframe)
+    assert record.pieces() == 2
+    _, lines, report = results(tmp_path, record, pinhole_rig(), Config())
+    assert any("2 pieces that no loop joins" in line for line in lines) and "the walk is in 2 pieces" in report
+    loop = LoopResult(20, 0, np.eye(4), np.eye(6), none.reshape(-1, 2), 50, 0.1, "", ())
+    record.put(loop)
+    assert record.pieces() == 1
+    assert record.closure_drifts() == []  # what lay between the pieces was not odometry
+    assert not any("pieces" in line for line in results(tmp_path, record, pinhole_rig(), Config())[1])
+
+
+def test_a_saved_map_holds_the_pieces_together() -> None:
+    record = RunRecord(localize_only=True)
+    record.keyframes = {k: KeyframeRow(k, k, np.eye(4), 0.0, submap_id=k) for k in range(3)}
+    assert record.pieces() == 1

@@ -127,3 +127,19 @@ def test_tracking_that_began_anew_finds_the_place_it_just_left(vocabulary: voc.V
     loops = [r for r in close(dataclasses.replace(walk, keyframes=keyframes), vocabulary) if r.candidate_kf_id >= 0]
     assert loops and loops[0].candidate_kf_id < break_at <= loops[0].kf_id < break_at + 5
     assert all(error_of(walk, loop) < 0.05 for loop in loops)
+
+
+def test_tracking_that_began_anew_in_a_twin_aisle_does_not_join_the_first(vocabulary: voc.Vocabulary) -> None:
+    """Dark between two identical aisles: the robot cannot have driven back so fast as the pictures say."""
+    walk = make_walk([0, 1], identical=True, seed=0)
+    turned = next(i for i, pose in enumerate(walk.world_T_kf) if pose[0, 3] > 1.0)
+    rest = walk.keyframes[turned + 2 :]
+    begin = se3.inverse(rest[0].odom_T_cam)
+    keyframes = walk.keyframes[:turned] + [
+        dataclasses.replace(k, submap_id=1, odom_T_cam=begin @ k.odom_T_cam, point_ids=k.point_ids + 10**6)
+        for k in rest
+    ]
+    results = close(dataclasses.replace(walk, keyframes=keyframes), vocabulary)
+    across = [r for r in results if r.candidate_kf_id >= 0 and r.candidate_kf_id < turned < r.kf_id]
+    assert all(error_of(walk, r) < 0.1 for r in across)
+    assert any(reason == "out_of_reach" for r in results for _, _, reason in r.rejected)

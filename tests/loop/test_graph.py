@@ -85,3 +85,43 @@ def test_it_grows_beyond_its_first_size() -> None:
     for k in range(200):
         graph.add(k, at(k % 10 * 1.0), 0)
     assert graph.same_view(150) == list(range(0, 200, 10))
+
+
+def broken(seconds: float) -> KeyframeGraph:
+    """A metre a second along x for five seconds, then so many seconds without tracking; keyframe 6 begins anew."""
+    graph = KeyframeGraph()
+    for k in range(6):
+        graph.add(k, at(float(k)), 0, k * 10**9)
+    graph.add(6, np.eye(4), 1, round((5 + seconds) * 1e9))
+    return graph
+
+
+@pytest.mark.parametrize(("moved", "possible"), [(0.0, True), (1.0, True), (1.5, True), (-1.4, False), (3.4, False)])
+def test_how_far_a_robot_gets_without_tracking(moved: float, possible: bool) -> None:
+    jump = broken(1.0).jump(3, 6, at(2.0 + moved))
+    assert jump is not None
+    assert jump.off == pytest.approx(abs(moved - 0.5)) and jump.walked == pytest.approx(2.0)
+    assert (jump.off < jump.radius) == possible
+
+
+def test_the_gap_is_the_same_from_its_other_side() -> None:
+    graph = broken(1.0)
+    there, back = graph.jump(3, 6, at(2.7)), graph.jump(6, 3, at(-2.7))
+    assert there is not None and back is not None
+    assert (there.off, there.radius, there.walked) == pytest.approx((back.off, back.radius, back.walked))
+
+
+def test_nothing_is_known_of_a_gap_without_time_or_speed() -> None:
+    assert broken(-3.0).jump(3, 6, at(2.0)) is None  # another clock
+    graph = KeyframeGraph()
+    graph.add(0, at(0.0), 0, 0)
+    graph.add(1, at(0.0), 1, 10**9)
+    assert graph.jump(0, 1, at(0.5)) is None
+
+
+def test_pieces_joined_through_a_third_share_its_gaps() -> None:
+    graph = broken(1.0)
+    graph.add(7, at(0.0), 2, 9 * 10**9)
+    graph.add_loop(6, 7, at(0.5))
+    jump = graph.jump(5, 7, at(1.5))
+    assert jump is not None and jump.off == pytest.approx(0.5)
