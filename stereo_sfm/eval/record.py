@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+import itertools
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -146,24 +146,44 @@ class RunRecord:
 
     def odometry(self) -> Trajectory:
         """odom_T_cam of the tracked frames."""
-        return self._trajectory(self.tracked(), lambda row: row.odom_T_cam)
+        rows = [self.frames[i] for i in np.flatnonzero(self.tracked())]
+        stamps = np.array([row.stamp_ns for row in rows], np.int64)
+        return Trajectory(stamps, np.array([row.odom_T_cam for row in rows]).reshape(-1, 4, 4))
 
     def mapped(self) -> Trajectory | None:
-        """map_T_cam after the last map update of the frames that have a place in the map; None without any."""
+        """map_T_cam after the last map update of the frames that have a place in the map; None without any.
+
+        A frame stands where its reference keyframe says, and the nearer the next keyframe comes the more where that
+        says: the map moved both since the frame was tracked, and not alike.
+        """
         if not len(self.map_T_kf):
             return None
+        known, following = self.map_T_kf.all(), self._following()
+        rows = [self.frames[i] for i in np.flatnonzero(self.placed())]
+        stamps = np.array([row.stamp_ns for row in rows], np.int64)
+        poses = np.array([known[row.reference_kf_id] @ row.kf_T_cam for row in rows]).reshape(-1, 4, 4)
+        between = [k for k, row in enumerate(rows) if row.reference_kf_id in following]
+        if between:
+            begin = [self.keyframes[rows[k].reference_kf_id].stamp_ns for k in between]
+            ends = [following[rows[k].reference_kf_id] for k in between]
+            end = np.array([self.keyframes[kf_id].stamp_ns for kf_id in ends])
+            odom_T_end = np.array([self.keyframes[kf_id].odom_T_cam for kf_id in ends])
+            end_T_cam = se3.inverse(odom_T_end) @ np.array([rows[k].odom_T_cam for k in between])
+            share = np.clip((stamps[between] - begin) / (end - begin), 0.0, 1.0)
+            there = np.array([known[kf_id] for kf_id in ends]) @ end_T_cam
+            poses[between] = se3.interpolate(poses[between], there, share)
+        return Trajectory(stamps, poses)
+
+    def _following(self) -> dict[int, int]:
+        """The next keyframe of the same piece of odometry, by id, of those that the map knows."""
         known = self.map_T_kf.all()
-        return self._trajectory(self.placed(), lambda row: known[row.reference_kf_id] @ row.kf_T_cam)
+        pairs = itertools.pairwise(k for k in sorted(self.keyframes) if k in known)
+        return {a: b for a, b in pairs if self.keyframes[a].submap_id == self.keyframes[b].submap_id}
 
     def placed(self) -> Bool:
         """(frames,) whether the frame has a place in the map; all tracked ones unless a saved map did not know them."""
         known = self.map_T_kf.all()
         return self.tracked() & np.array([f.reference_kf_id in known for f in self.frames], bool)
-
-    def _trajectory(self, kept: Bool, pose_of: Callable[[FrameRow], F64]) -> Trajectory:
-        rows = [self.frames[i] for i in np.flatnonzero(kept)]
-        stamps = np.array([row.stamp_ns for row in rows], np.int64)
-        return Trajectory(stamps, np.array([pose_of(row) for row in rows]).reshape(-1, 4, 4))
 
     def keyframe_trajectory(self) -> Trajectory:
         """Of the keyframes, in the map where there is one."""

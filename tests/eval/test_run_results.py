@@ -102,3 +102,23 @@ def test_a_saved_map_holds_the_pieces_together() -> None:
     record = RunRecord(localize_only=True)
     record.keyframes = {k: KeyframeRow(k, k, np.eye(4), 0.0, submap_id=k) for k in range(3)}
     assert record.pieces() == 1
+
+
+def test_frames_go_over_from_one_keyframes_place_to_the_next(tmp_path: Path) -> None:
+    """The map moved the second keyframe by 9 cm after the frames between were tracked: each takes its share."""
+    record, none = record_of(walk(), 0), np.zeros(0, np.int64)
+    record.keyframes = {k: KeyframeRow(k, k * 10**8, walk()[k], 0.0, submap_id=0) for k in (0, 10, 20)}
+    aside = np.eye(4)
+    aside[0, 3] = 0.09
+    record.put(
+        MapUpdate(
+            40, 20, np.array([10]), (aside @ walk()[10])[None], none, np.zeros((0, 3)), none, none.reshape(-1, 2),
+            np.eye(4),
+        )
+    )  # fmt: skip
+    mapped = record.mapped()
+    assert mapped is not None
+    off = mapped.poses[:, 0, 3] - walk()[:, 0, 3]
+    np.testing.assert_allclose(off[:11], 0.009 * np.arange(11), atol=1e-6)
+    np.testing.assert_allclose(off[10:21], 0.009 * np.arange(10, -1, -1), atol=1e-6)
+    np.testing.assert_allclose(off[21:], 0.0, atol=1e-12)
