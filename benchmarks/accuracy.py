@@ -33,7 +33,7 @@ ODOMETRY_ONLY = ("mapper.enabled=false", "loop.enabled=false")
 
 def rows_of(name: str, spec: str, config: configuration.Config, max_frames: int | None) -> list[str]:
     """Run on one sequence; a table row for each trajectory of it."""
-    record = RunRecord()
+    record = RunRecord.of(config)
     cv2.setRNGSeed(0)
     with SelectedFrames(open_source(spec), max_frames=max_frames) as source:
         for _ in run(source, config, [record]):

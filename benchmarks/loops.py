@@ -64,7 +64,7 @@ def measure(spec: str, frames: int, stored: Path | None, only: str) -> None:
         truth = source.ground_truth
         assert truth is not None
         configs = configurations(only)
-        records = {name: RunRecord() for name in configs}
+        records = {name: RunRecord.of(config) for name, config in configs.items()}
         runs = {name: InlineRun(source, config, [records[name]], None) for name, config in configs.items()}
         begin = time.perf_counter()
         for image in images(source, frames, stored):

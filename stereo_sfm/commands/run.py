@@ -205,7 +205,7 @@ def execute(
     from stereo_sfm.export.run_folder import link_latest
     from stereo_sfm.pipeline.session import Session, Wiring
 
-    record, pictures = RunRecord(folders.localize_only), _match_pictures(getattr(args, "matches", None))
+    record, pictures = RunRecord.of(config, folders.localize_only), _match_pictures(getattr(args, "matches", None))
     sinks = [record] if pictures is None else [record, pictures]
     # Images reach the sinks only where the stages share this process.
     mode = "realtime" if args.realtime else args.mode

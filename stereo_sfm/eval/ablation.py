@@ -125,6 +125,7 @@ def run_cell(cell: Cell) -> dict[str, Any]:
     begin = time.perf_counter()
     try:
         config = cell.config()
+        record = RunRecord.of(config)
         source = open_source(cell.source)
         with SelectedFrames(source, max_frames=cell.frames or None) as chosen:
             answer["opened"] = True

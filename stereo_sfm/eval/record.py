@@ -10,6 +10,7 @@ import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
+from stereo_sfm.config import Config
 from stereo_sfm.export.trajectories import fill_missing
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.keyframe_poses import KeyframePoses
@@ -70,6 +71,7 @@ class RunRecord:
     """Collects the messages of one run."""
 
     localize_only: bool = False  # a saved map places every piece of odometry
+    followed: bool = True  # points are followed from frame to frame: errors grow slowly from keyframe to keyframe
     frames: list[FrameRow] = field(default_factory=list[FrameRow])
     keyframes: dict[int, KeyframeRow] = field(default_factory=dict[int, KeyframeRow])
     stage_ms: dict[int, dict[str, float]] = field(default_factory=dict[int, dict[str, float]])  # by frame id
@@ -82,6 +84,11 @@ class RunRecord:
     loops: list[LoopResult] = field(default_factory=list[LoopResult])
     rejections: dict[str, int] = field(default_factory=dict[str, int])
     _path_m: float = 0.0
+
+    @staticmethod
+    def of(config: Config, localize_only: bool = False) -> RunRecord:
+        """For a run with this configuration."""
+        return RunRecord(localize_only, followed=config.odometry.method == "flow")
 
     def put(self, message: object) -> None:
         """Take one message of the run; those of other kinds are not kept."""
@@ -153,12 +160,13 @@ class RunRecord:
     def mapped(self) -> Trajectory | None:
         """map_T_cam after the last map update of the frames that have a place in the map; None without any.
 
-        A frame stands where its reference keyframe says, and the nearer the next keyframe comes the more where that
-        says: the map moved both since the frame was tracked, and not alike.
+        A frame stands where its reference keyframe says. Where points are followed from frame to frame, the next
+        keyframe has its say too, the more the nearer it comes: the map moved both since the frame was tracked, and not
+        alike.
         """
         if not len(self.map_T_kf):
             return None
-        known, following = self.map_T_kf.all(), self._following()
+        known, following = self.map_T_kf.all(), self._following() if self.followed else dict[int, int]()
         rows = [self.frames[i] for i in np.flatnonzero(self.placed())]
         stamps = np.array([row.stamp_ns for row in rows], np.int64)
         poses = np.array([known[row.reference_kf_id] @ row.kf_T_cam for row in rows]).reshape(-1, 4, 4)

@@ -46,7 +46,7 @@ def run_one(task: BatchTask) -> dict[str, Any]:
     from stereo_sfm.pipeline.session import Session, Wiring
 
     cv2.setNumThreads(1)
-    folder, begin, record = Path(task.folder), time.perf_counter(), RunRecord()
+    folder, begin, record = Path(task.folder), time.perf_counter(), RunRecord.of(task.config)
     result: dict[str, Any] = {"recording": task.spec, "config": dump(task.config), "node": os.uname().nodename}
     try:
         prepare_folder(folder, overwrite=True)

@@ -122,3 +122,16 @@ def test_frames_go_over_from_one_keyframes_place_to_the_next(tmp_path: Path) -> 
     np.testing.assert_allclose(off[:11], 0.009 * np.arange(11), atol=1e-6)
     np.testing.assert_allclose(off[10:21], 0.009 * np.arange(10, -1, -1), atol=1e-6)
     np.testing.assert_allclose(off[21:], 0.0, atol=1e-12)
+
+
+def test_frames_located_by_a_keyframe_each_stay_with_it() -> None:
+    """An estimator that refers each frame to the last keyframe knows nothing of its place to the next one."""
+    pnp = dataclasses.replace(Config().odometry, method="pnp")
+    record = RunRecord.of(Config(odometry=pnp))
+    record.frames = [row for row in record_of(walk(), 0).frames if row.reference_kf_id == 0]
+    record.keyframes = {k: KeyframeRow(k, k * 10**8, walk()[k], 0.0, submap_id=0) for k in (0, 10)}
+    record.map_T_kf.add(0, walk()[0])
+    record.map_T_kf.add(10, np.eye(4))
+    mapped = record.mapped()
+    assert mapped is not None
+    np.testing.assert_array_equal(mapped.poses, walk()[:10])
