@@ -7,6 +7,8 @@ import sys
 from types import FrameType, TracebackType
 from typing import Any, Self
 
+INTERRUPTED = 130  # exit code, as shells give it for Ctrl-C
+
 
 class StopRequest:
     """While entered, the first SIGINT or SIGTERM only sets `asked`; the loop ends at its next round."""

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from stereo_sfm.commands._stop import INTERRUPTED, StopRequest
 from stereo_sfm.errors import StereoSfmError
 
 if TYPE_CHECKING:
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
 
     from stereo_sfm.eval.ablation import Cell
 
-INTERRUPTED = 130
 # configuration that tells the cells apart -> the option that chooses it
 DECIDED = {
     "seed": "--seed",
@@ -145,7 +145,6 @@ def _run_all(cells: Sequence[Cell], store: Path, jobs: int, quiet: bool, total: 
     from rich.console import Console
     from rich.progress import Progress
 
-    from stereo_sfm.commands._stop import StopRequest
     from stereo_sfm.eval.ablation_worker import compute, one_thread
 
     console = Console(stderr=True, quiet=quiet)
@@ -159,14 +158,12 @@ def _run_all(cells: Sequence[Cell], store: Path, jobs: int, quiet: bool, total: 
         task = progress.add_task("cells", total=total, completed=total - len(cells))
         try:
             while True:
-                while (
-                    left and len(running) < jobs and not stop.asked
-                ):  # what waits in the pool could not be called back
+                # Not all at once: what waits in the pool could not be called back.
+                while left and len(running) < jobs and not stop.asked:
                     cell = left.pop()
                     with _ignored_by_children():
-                        running[pool.submit(compute, cell, store / cell.file_name)] = (
-                            f"{Path(cell.source).name} {cell.name}"
-                        )
+                        job = pool.submit(compute, cell, store / cell.file_name)
+                    running[job] = f"{Path(cell.source).name} {cell.name}"
                 if not running:
                     return not left
                 for done in wait(running, return_when=FIRST_COMPLETED).done:

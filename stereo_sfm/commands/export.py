@@ -148,6 +148,8 @@ def _trajectories(args: argparse.Namespace) -> tuple[dict[int, Trajectory], str]
         return {0: read_trajectory(args.source / name)}, named_pose(args.source / name)
     if not (args.source / "map.json").is_file():
         raise StereoSfmError(f"{args.source} holds no {name}")
+    if args.which == "odom":
+        raise StereoSfmError(f"{args.source} is a map: it holds keyframes, not the odometry of a run")
     saved = _load(args.source)
     check_walk(saved, args.walk)
     return {k: walk_trajectory(saved, k) for k in saved.walks if args.walk in (None, k)}, "world_T_cam0"

@@ -8,14 +8,13 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from stereo_sfm.commands._stop import INTERRUPTED, StopRequest
 from stereo_sfm.errors import StereoSfmError
 
 if TYPE_CHECKING:
     from drivers.source import Source
     from stereo_sfm.log.provenance import Opening
     from stereo_sfm.log.record import Progress
-
-INTERRUPTED = 130
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,7 +52,6 @@ def run(args: argparse.Namespace) -> int:
 
 def write(source: Source, args: argparse.Namespace, mode: str, opening: Opening | None = None) -> int:
     """Write an entered source and say what came of it."""
-    from stereo_sfm.commands._stop import StopRequest
     from stereo_sfm.log.record import record
 
     path: Path = args.output

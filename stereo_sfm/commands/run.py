@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from stereo_sfm.commands._stop import INTERRUPTED, StopRequest
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.presets import PRESETS, preset
 
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
 
 RECTIFY = {"none": "none", "pinhole": "pinhole", "wide": "epipolar"}  # option -> projection of `rectify`
 TRACKING_FAILED = 4
-INTERRUPTED = 130
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -259,7 +259,6 @@ def _follow(
 ) -> tuple[bool, StereoSfmError | None]:
     """To the end, to Ctrl-C, or to an error; what was tracked until then stays in the record."""
     from stereo_sfm.commands._progress import progress
-    from stereo_sfm.commands._stop import StopRequest
 
     with progress(session.info.name, session.info.frame_count, quiet) as bar, StopRequest() as stop:
         try:

@@ -33,7 +33,8 @@ def prepare_folder(folder: Path, overwrite: bool) -> None:
         StereoSfmError: it holds something that may not be overwritten, or cannot be made.
     """
     try:
-        if folder.exists() and not overwrite and not (folder.is_dir() and not any(folder.iterdir())):
+        free = not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
+        if not (free or overwrite):
             raise StereoSfmError(f"{folder} exists: choose another -o, or say --overwrite")
         folder.mkdir(parents=True, exist_ok=True)
         discard_files(folder)

@@ -51,12 +51,12 @@ def record(
     """
     if image_format not in FORMATS:
         raise StereoSfmError(f"unknown image format '{image_format}' (known: {', '.join(FORMATS)})")
+    frames, dropped, first_ns = 0, 0, None
     with LogWriter(path, overwrite=overwrite, compress=image_format != "raw", clock=clock) as writer:
         write_provenance(
             writer, source=source.name, serial=source.rig.serial, mode=mode, image_format=image_format, opening=opening
         )
         images = ImageLog(writer, source.rig, source.ground_truth, image_format)
-        frames, dropped, first_ns = 0, 0, None
         try:
             for image in source:
                 images.image(encode_pair(image, image_format, decode=False))
@@ -68,5 +68,8 @@ def record(
             if not writer.closed:
                 counted = {name: f"{value:g}" for name, value in getattr(source, "counters", {}).items() if value}
                 writer.metadata(TOTALS, counted | images.totals)
+            if not frames:
+                writer.close()
+                path.unlink()  # nothing but a calibration
     if not frames:
-        raise StereoSfmError(f"{source.name} gave no image: {path} holds only its calibration")
+        raise StereoSfmError(f"{source.name} gave no image: nothing was recorded")

@@ -327,3 +327,15 @@ def test_info_warns_once_of_a_truncated_file(cli: Run, tmp_path: Path) -> None:
     assert code == 0 and "problem: truncated" in out
     assert len(err.splitlines()) == 1 and "truncated" in err
     assert len(cli("info", "cut.mcap")[2].splitlines()) == 1  # and each time it is asked
+
+
+def test_a_recording_of_nothing_leaves_no_file(cli: Run) -> None:
+    source = "sim:aisle?camera=pinhole&size=64x48&frames=2"
+    assert_one_line(cli("record", source, "-o", "a.mcap", "--start", "1000"), "nothing is left")
+    assert not Path("a.mcap").exists()
+
+
+def test_a_map_has_no_odometry(cli: Run, tmp_path: Path) -> None:
+    (tmp_path / "map").mkdir()
+    (tmp_path / "map" / "map.json").write_text("{}")
+    assert_one_line(cli("export", "map", "--format", "tum", "--which", "odom"), "not the odometry")
