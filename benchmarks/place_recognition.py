@@ -4,7 +4,11 @@ The walks go through every aisle of a store whose aisles hold the same products 
 through the first one. "Words alone" takes the best-scored place as the answer, as the bag of words would; "words and
 geometry" adds the verification; "all" is the loop closer with odometry and agreement of successive keyframes.
 
+`--cut` takes the walks of any scene apart instead: tracking is lost at five places of each and begins anew four
+keyframes later, with odometry that knows nothing of what was before; counted is the first loop that joins the pieces.
+
     python benchmarks/place_recognition.py --seeds 10
+    python benchmarks/place_recognition.py --cut --seeds 6 "sim:loop?size=424x400"
 """
 
 from __future__ import annotations
@@ -34,6 +38,7 @@ from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.loop.vocabulary_file import default_vocabulary
 from stereo_sfm.types import LoopResult
 
+CUTS, LEFT_OUT = (0.08, 0.15, 0.25, 0.5, 0.75), 3  # where tracking is lost, and keyframes that it loses
 FALSE_METRES, FALSE_DEGREES = 0.5, 10.0  # an accepted loop further off is false
 NEAR_METRES, NEAR_DEGREES, GAP = 1.0, 25.0, 12  # a return: so near to an older keyframe that is so many keyframes old
 
@@ -167,6 +172,31 @@ def identical_aisles(spec: str, seeds: int, vocabulary: Vocabulary, cache: Path 
     return counts["all"].false
 
 
+def cut_walks(spec: str, seeds: int, vocabulary: Vocabulary, cache: Path | None) -> None:
+    """One line: how many walks that tracking lost half-way were joined, rightly or wrongly."""
+    answers: Counter[str] = Counter()
+    for seed in range(seeds):
+        walk = _walk(f"{spec}{'&' if '?' in spec else '?'}seed={seed}&walk={seed}", cache)
+        answers.update(_joined(walk, round(share * len(walk.keyframes)), vocabulary) for share in CUTS)
+    gap = f"{LEFT_OUT} keyframes left out"
+    print(f"{spec}, cut in two, {gap}: " + ", ".join(f"{answers[k]} {k}" for k in ("right", "wrong", "never")))
+
+
+def _joined(walk: SparseWalk, cut: int, vocabulary: Vocabulary) -> str:
+    """How the pieces before keyframe `cut` and after the gap are joined: "right", "wrong" or "never"."""
+    closer = LoopCloser(LoopConfig(), walk.rig, vocabulary)
+    rest = walk.keyframes[cut + LEFT_OUT :]
+    begin = se3.inverse(rest[0].odom_T_cam)
+    anew = [dataclasses.replace(k, submap_id=1, odom_T_cam=begin @ k.odom_T_cam) for k in rest]
+    for keyframe in [*walk.keyframes[:cut], *anew]:
+        loop = closer.step(keyframe)
+        if 0 <= loop.candidate_kf_id < cut <= loop.kf_id:
+            count = Count()
+            judge(walk, [loop], count)
+            return "wrong" if count.false else "right"
+    return "never"
+
+
 def _walk(spec: str, cache: Path | None) -> SparseWalk:
     """Rendered, or as it was stored by an earlier run."""
     path = cache / f"{hashlib.sha256(spec.encode()).hexdigest()[:12]}.pkl" if cache else None
@@ -184,8 +214,12 @@ def main() -> int:
     parser.add_argument("source", nargs="?", default="sim:identical-aisles")
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--cache", type=Path, help="folder that keeps rendered walks for the next run")
+    parser.add_argument("--cut", action="store_true", help="walks in which tracking is lost once")
     args = parser.parse_args()
     vocabulary = default_vocabulary()
+    if args.cut:
+        cut_walks(args.source, args.seeds, vocabulary, args.cache)
+        return 0
     query_times(vocabulary)
     false = identical_aisles(args.source, args.seeds, vocabulary, args.cache) if args.seeds else 0
     return 3 if false else 0
