@@ -54,10 +54,12 @@ def merge(
     map_ = restore_map(side_by_side.snapshot)
     map_.points.sigma[:] = map_.observations.sigma[:] = mapper.sigma_px  # what is fused from now on counts less
     closer = LoopCloser(dataclasses.replace(config, pause=MERGE_PAUSE), side_by_side.rig, vocabulary)
+    walks, stamps = side_by_side.sessions, side_by_side.snapshot.stamp_ns
+    begins = {k: int(stamps[walks == k].min()) for k in side_by_side.walks}  # clocks of walks have nothing in common
     loops: list[LoopResult] = []
     fused = 0
-    for keyframe in keyframes_of(side_by_side.snapshot):
-        result = closer.step(keyframe)
+    for keyframe, walk in zip(keyframes_of(side_by_side.snapshot), walks.tolist(), strict=True):
+        result = closer.step(dataclasses.replace(keyframe, stamp_ns=keyframe.stamp_ns - begins[walk]))
         if result.candidate_kf_id >= 0:
             done = apply_loop(map_, result, loops, config)
             if done.applied:

@@ -9,7 +9,7 @@ import numpy as np
 from calib.rig import Rig
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
-from stereo_sfm.loop.relocalize import Location, Relocalizer
+from stereo_sfm.loop.relocalize import SURE, Location, Relocalizer, nowhere
 from stereo_sfm.loop.verification import within
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.mapping.map import MapSnapshot
@@ -21,8 +21,9 @@ LOST_AFTER = 5  # keyframes without an answer near the prediction before the who
 class Localizer:
     """One keyframe in, one `MapUpdate` out that moves nothing but `map_T_odom`.
 
-    The first answer needs no guess. Later keyframes are looked for around the prediction; after some failures, or when
-    tracking restarted as another submap, the whole map is searched again. `found` is False until the first answer.
+    The first answer needs no guess; where it rests on few points, a second keyframe must say the same. Later keyframes
+    are looked for around the prediction; after some failures, or when tracking restarted as another submap, the whole
+    map is searched again. `found` is False until the first answer.
     Keyframes from before the first answer of their submap get their places with it, by odometry.
     """
 
@@ -33,6 +34,7 @@ class Localizer:
         self._version = 0
         self._submap = -1
         self._failures = 0
+        self._unsure: F64 | None = None  # map_T_odom by the newest keyframe, if it rests on few points
         self._waiting: list[Keyframe] | None = []  # of this submap, not placed yet; None: it is placed
         self.found = False
         self.last = None
@@ -44,6 +46,7 @@ class Localizer:
         self._version += 1
         if keyframe.submap_id != self._submap:
             self._submap, self._failures, self._waiting = keyframe.submap_id, LOST_AFTER, []
+            self._unsure = None
         self.last = self._locate(keyframe)
         if self.last.found:
             self._map_T_odom = se3.orthonormalize(self.last.map_T_cam @ se3.inverse(keyframe.odom_T_cam))
@@ -80,8 +83,16 @@ class Localizer:
         if self.found and self._failures < LOST_AFTER:
             guess = self._map_T_odom @ keyframe.odom_T_cam
             near = self._relocalizer.locate_near(keyframe, guess)
-            if not near.found or within(
-                se3.inverse(guess) @ near.map_T_cam, self._config.gate_metres, self._config.gate_degrees
-            ):
+            if not near.found or self._within_gate(guess, near):
                 return near
-        return self._relocalizer.locate(keyframe)
+        place = self._relocalizer.locate(keyframe)
+        before, self._unsure = self._unsure, None
+        if not place.found or place.inliers >= SURE * self._config.relocalize_inliers:
+            return place
+        if before is not None and self._within_gate(before @ keyframe.odom_T_cam, place):
+            return place
+        self._unsure = se3.orthonormalize(place.map_T_cam @ se3.inverse(keyframe.odom_T_cam))
+        return nowhere("not_confirmed_yet", place.inliers)
+
+    def _within_gate(self, guess: F64, place: Location) -> bool:
+        return within(se3.inverse(guess) @ place.map_T_cam, self._config.gate_metres, self._config.gate_degrees)

@@ -43,7 +43,7 @@ class Location:
         return not self.reason
 
 
-def _nowhere(reason: str, inliers: int = 0) -> Location:
+def nowhere(reason: str, inliers: int = 0) -> Location:
     return Location(reason, np.eye(4), np.zeros((6, 6)), -1, inliers, np.zeros((0, 2), np.int64))
 
 
@@ -83,7 +83,7 @@ class Relocalizer:
             found.append(self._location(row, verdict))
             if verdict.inliers >= SURE * self._config.relocalize_inliers:
                 break
-        return self._choose(found, len(view.ids)) if found else _nowhere(reason)
+        return self._choose(found, len(view.ids)) if found else nowhere(reason)
 
     def locate_near(self, keyframe: Keyframe, guess: F64) -> Location:
         """Find the camera near a predicted map_T_cam (4, 4): as `locate`, but only around the guess."""
@@ -92,7 +92,7 @@ class Relocalizer:
         start = se3.inverse(guess) @ self._map.map_T_kf[row]
         verdict = verify_near(start, view, self.cloud(row), self._rig, self._config)
         if verdict.reason:
-            return _nowhere(verdict.reason, verdict.inliers)
+            return nowhere(verdict.reason, verdict.inliers)
         return self._choose([self._location(row, verdict)], len(view.ids))
 
     def cloud(self, row: int) -> Cloud:
@@ -146,9 +146,9 @@ class Relocalizer:
         """The answer with most points, if they are enough and no other place comes near it."""
         best = max(found, key=lambda x: x.inliers)
         if best.inliers < max(self._config.relocalize_inliers, self._config.relocalize_share * asked):
-            return _nowhere("too_few_inliers", best.inliers)
+            return nowhere("too_few_inliers", best.inliers)
         for other in found:
             apart = not within(se3.inverse(best.map_T_cam) @ other.map_T_cam, SAME_METRES, SAME_DEGREES)
             if apart and other.inliers > RIVAL * best.inliers:
-                return _nowhere("ambiguous", best.inliers)
+                return nowhere("ambiguous", best.inliers)
         return best

@@ -137,6 +137,24 @@ def test_what_came_before_the_first_answer_is_placed_with_it(
     assert localizer.step(keyframes[3]).kf_ids.tolist() == [3]
 
 
+@pytest.mark.parametrize("astray", [False, True])
+def test_an_answer_of_few_points_needs_a_second_one(
+    walk: StoreWalk, first_pass: int, vocabulary: voc.Vocabulary, astray: bool
+) -> None:
+    part = dataclasses.replace(walk, keyframes=walk.keyframes[:first_pass], world_T_kf=walk.world_T_kf[:first_pass])
+    saved, config = map_of_walk(part).snapshot, LoopConfig()
+    first, second = (dataclasses.replace(walk.keyframes[first_pass + k], kf_id=n) for n, k in enumerate((6, 7)))
+    seen = Relocalizer(saved, walk.rig, vocabulary, config).locate(first).inliers
+    if astray:  # odometry says that the robot drove two metres between them
+        second = dataclasses.replace(second, odom_T_cam=se3.exp(np.array([2.0, 0, 0, 0, 0, 0])) @ second.odom_T_cam)
+    hardly_enough = dataclasses.replace(config, relocalize_inliers=round(0.8 * seen))
+    localizer = Localizer(saved, walk.rig, vocabulary, hardly_enough)
+    assert len(localizer.step(first).kf_ids) == 0 and not localizer.found
+    assert localizer.last is not None and localizer.last.reason == "not_confirmed_yet"
+    assert localizer.step(second).kf_ids.tolist() == ([] if astray else [0, 1])
+    assert localizer.found != astray
+
+
 def test_a_walk_goes_on_in_the_frame_of_the_saved_map(
     walk: StoreWalk, first_pass: int, vocabulary: voc.Vocabulary
 ) -> None:
