@@ -15,6 +15,7 @@ from _sequences import PEERS, one_thread, sequences
 one_thread()
 
 import cv2
+import numpy as np
 
 from drivers.select import SelectedFrames
 from drivers.source import open_source
@@ -40,7 +41,7 @@ def rows_of(name: str, spec: str, config: configuration.Config, max_frames: int 
             pass
         reference = source.ground_truth
     lost = len(record.frames) - int(record.tracked().sum())
-    inliers = sorted(row.inliers for row in record.frames)[len(record.frames) // 2]
+    inliers = int(np.median(record.frames.inliers))
     rows: list[str] = []
     mapped = record.mapped() if config.mapper.enabled or config.loop.enabled else None
     for kind, trajectory in (("odometry", record.odometry()), ("map", mapped)):

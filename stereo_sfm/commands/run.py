@@ -269,7 +269,7 @@ def _follow(
         except KeyboardInterrupt:
             return True, None
         except StereoSfmError as error:
-            if not record.frames:
+            if not len(record.frames):
                 raise
             return False, error
         return stop.asked, None

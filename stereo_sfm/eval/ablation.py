@@ -145,8 +145,8 @@ def run_cell(cell: Cell) -> dict[str, Any]:
 
 def _describe(record: RunRecord, wall_s: float) -> dict[str, Any]:
     tracked = record.tracked()
-    lost = Counter(row.reason for row, good in zip(record.frames, tracked, strict=True) if not good)
-    spent = [ms["track"] for ms in record.times if "track" in ms]
+    lost = Counter(record.frames.reasons_of(~tracked))
+    track_ms = record.times().get("track", np.zeros(0))
     return {
         "frames": len(tracked),
         "tracked": int(tracked.sum()),
@@ -155,7 +155,7 @@ def _describe(record: RunRecord, wall_s: float) -> dict[str, Any]:
         "map_points": len(record.map_points),
         "loops": len(record.loops),
         "rejected_loops": dict(sorted(record.rejections.items())),
-        "track_ms": float(np.median(spent)) if spent else None,
+        "track_ms": float(np.nanmedian(track_ms)) if len(track_ms) else None,
         "frame_ms": 1e3 * wall_s / max(len(tracked), 1),
     }
 
@@ -165,7 +165,7 @@ def _judge(record: RunRecord, config: Config, truth: Trajectory | None) -> dict[
     estimate = record.mapped() if config.mapper.enabled else record.odometry()
     tracked = record.tracked()
     if tracked.mean() < _MIN_TRACKED if len(tracked) else True:
-        reasons = Counter(row.reason for row, good in zip(record.frames, tracked, strict=True) if not good)
+        reasons = Counter(record.frames.reasons_of(~tracked))
         most, count = reasons.most_common(1)[0] if reasons else ("no frames", 0)
         return {"reason": f"{most} in {count} of {len(tracked)} frames"}
     if estimate is None:

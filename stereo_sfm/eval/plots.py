@@ -78,11 +78,11 @@ def plot_tracking(path: Path, record: RunRecord) -> None:
     figure = Figure(figsize=(8, 3), layout="constrained")
     axes = figure.subplots()
     seconds = _seconds(record)
-    axes.plot(seconds, [row.inliers for row in record.frames], linewidth=1, label="points in the pose")
+    axes.plot(seconds, record.frames.inliers, linewidth=1, label="points in the pose")
     lost = ~record.tracked()
     if lost.any():
         axes.plot(seconds[lost], np.zeros(int(lost.sum())), "x", color="tab:red", label="no pose")
-    again = np.array([row.state is TrackState.RESTARTED for row in record.frames], bool)
+    again = record.frames.state == TrackState.RESTARTED
     if again.any():
         axes.plot(seconds[again], np.zeros(int(again.sum())), "^", color="tab:orange", label="restarted")
     axes.set(xlabel="time [s]", ylabel="points", title="tracked points")
@@ -96,12 +96,12 @@ def plot_times(path: Path, record: RunRecord, stages: Sequence[str]) -> None:
     """Milliseconds a frame for the longest stages."""
     figure = Figure(figsize=(8, 3), layout="constrained")
     axes = figure.subplots()
-    seconds = _seconds(record)[: len(record.times)]
+    seconds, times = _seconds(record), record.times()
     for stage in stages[:SHOWN_STAGES]:
-        axes.plot(seconds, [ms.get(stage, np.nan) for ms in record.times], ".-", markersize=2, linewidth=1, label=stage)
-    everything = [value for ms in record.times for value in ms.values()]
+        axes.plot(seconds, times[stage], ".-", markersize=2, linewidth=1, label=stage)
+    everything = np.concatenate([np.zeros(0), *(ms[np.isfinite(ms)] for ms in times.values())])
     axes.set(xlabel="time [s]", ylabel="ms", title="time per stage")
-    axes.set_ylim(0, 1.2 * float(np.percentile(everything, 99.5)) if everything else 1)
+    axes.set_ylim(0, 1.2 * float(np.percentile(everything, 99.5)) if len(everything) else 1)
     axes.grid(alpha=0.3)
     if stages:
         axes.legend(loc="center left", bbox_to_anchor=(1, 0.5))
@@ -109,5 +109,5 @@ def plot_times(path: Path, record: RunRecord, stages: Sequence[str]) -> None:
 
 
 def _seconds(record: RunRecord) -> F64:
-    stamps = np.array([row.stamp_ns for row in record.frames], np.int64)
+    stamps = record.frames.stamp_ns
     return (stamps - stamps[0]) / 1e9

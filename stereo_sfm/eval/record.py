@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import itertools
 from dataclasses import dataclass, field
@@ -11,6 +12,7 @@ import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
 from stereo_sfm.config import Config
+from stereo_sfm.eval.frame_table import FrameTable, TimeTable
 from stereo_sfm.export.trajectories import fill_missing
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.keyframe_poses import KeyframePoses
@@ -24,25 +26,8 @@ from stereo_sfm.types import (
     Keyframe,
     LoopResult,
     MapUpdate,
-    TrackState,
     Trajectory,
 )
-
-TRACKED = (TrackState.OK, TrackState.RECOVERED, TrackState.RESTARTED)
-
-
-@dataclass
-class FrameRow:
-    """One frame, without its observations."""
-
-    frame_id: int
-    stamp_ns: int
-    odom_T_cam: F64
-    state: TrackState
-    reason: str
-    inliers: int
-    reference_kf_id: int
-    kf_T_cam: F64
 
 
 @dataclass
@@ -72,15 +57,17 @@ class RunRecord:
 
     localize_only: bool = False  # a saved map places every piece of odometry
     followed: bool = True  # points are followed from frame to frame: errors grow slowly from keyframe to keyframe
-    frames: list[FrameRow] = field(default_factory=list[FrameRow])
+    frames: FrameTable = field(default_factory=FrameTable)
     keyframes: dict[int, KeyframeRow] = field(default_factory=dict[int, KeyframeRow])
-    stage_ms: dict[int, dict[str, float]] = field(default_factory=dict[int, dict[str, float]])  # by frame id
-    health: dict[str, list[Health]] = field(default_factory=dict[str, list[Health]])  # by stage
+    stage_ms: TimeTable = field(default_factory=TimeTable)
+    health: dict[str, Health] = field(
+        default_factory=dict[str, Health]
+    )  # by stage: the last word, but the worst p99 and queue
     dropped: int = 0
     source_counts: dict[str, float] = field(default_factory=dict[str, float])  # of a live camera, at the end
     map_T_kf: KeyframePoses = field(default_factory=KeyframePoses)
     map_points: set[int] = field(default_factory=set[int])
-    seen_points: set[int] = field(default_factory=set[int])
+    seen_points: Bool = field(default_factory=lambda: np.zeros(1024, bool))  # by id: whether a keyframe had it
     loops: list[LoopResult] = field(default_factory=list[LoopResult])
     rejections: dict[str, int] = field(default_factory=dict[str, int])
     _path_m: float = 0.0
@@ -100,34 +87,35 @@ class RunRecord:
             self.keyframes[message.kf_id] = KeyframeRow(
                 message.frame_id, message.stamp_ns, message.odom_T_cam, self._path_m, message.submap_id
             )
-            self.seen_points.update(message.point_ids.tolist())
+            self._see(message.point_ids)
         elif isinstance(message, MapUpdate):
             self._put_update(message)
         elif isinstance(message, LoopResult):
             self._put_loop(message)
         elif isinstance(message, StageTimes):
-            self.stage_ms.setdefault(message.frame_id, {}).update(message.ms)
+            self.stage_ms.add(message.frame_id, message.ms)
         elif isinstance(message, Health):
-            self.health.setdefault(message.stage, []).append(message)
+            self._put_health(message)
         elif isinstance(message, SourceCounters):
             self.source_counts = message.counts
 
     def _put_frame(self, frame: Frame) -> None:
-        if self.frames:
-            step = frame.odom_T_cam[:3, 3] - self.frames[-1].odom_T_cam[:3, 3]
+        if len(self.frames):
+            step = frame.odom_T_cam[:3, 3] - self.frames.odom_T_cam[-1, :3, 3]
             self._path_m += float(np.linalg.norm(step))
-        self.frames.append(
-            FrameRow(
-                frame.frame_id,
-                frame.stamp_ns,
-                frame.odom_T_cam,
-                frame.state,
-                frame.reason,
-                int(frame.observations.inlier.sum()),
-                frame.reference_kf_id,
-                frame.kf_T_cam,
-            )
-        )
+        self.frames.add(frame)
+
+    def _see(self, point_ids: I64) -> None:
+        last = int(point_ids.max(initial=0))
+        if last >= len(self.seen_points):
+            more = np.zeros(max(last + 1, 2 * len(self.seen_points)) - len(self.seen_points), bool)
+            self.seen_points = np.concatenate([self.seen_points, more])
+        self.seen_points[point_ids] = True
+
+    def _put_health(self, health: Health) -> None:
+        before = self.health.get(health.stage, health)
+        p99, queue = max(before.p99_ms, health.p99_ms), max(before.queue, health.queue)
+        self.health[health.stage] = dataclasses.replace(health, p99_ms=p99, queue=queue)
 
     def _put_update(self, update: MapUpdate) -> None:
         self.map_T_kf.update(update)
@@ -140,22 +128,20 @@ class RunRecord:
         for _, _, reason in loop.rejected:
             self.rejections[reason] = self.rejections.get(reason, 0) + 1
 
-    @property
-    def times(self) -> list[dict[str, float]]:
-        """Milliseconds per stage of each frame."""
-        return [self.stage_ms.get(row.frame_id, {}) for row in self.frames]
+    def times(self) -> dict[str, F64]:
+        """(frames,) milliseconds by stage, NaN where a stage did not run."""
+        return self.stage_ms.of_frames(self.frames.frame_id)
 
     # -- what it comes to ------------------------------------------------------------------------------------------
 
     def tracked(self) -> Bool:
         """(frames,) whether the frame has a pose of its own."""
-        return np.array([row.state in TRACKED for row in self.frames], bool)
+        return self.frames.tracked
 
     def odometry(self) -> Trajectory:
         """odom_T_cam of the tracked frames."""
-        rows = [self.frames[i] for i in np.flatnonzero(self.tracked())]
-        stamps = np.array([row.stamp_ns for row in rows], np.int64)
-        return Trajectory(stamps, np.array([row.odom_T_cam for row in rows]).reshape(-1, 4, 4))
+        tracked = self.tracked()
+        return Trajectory(self.frames.stamp_ns[tracked], self.frames.odom_T_cam[tracked])
 
     def mapped(self) -> Trajectory | None:
         """map_T_cam after the last map update of the frames that have a place in the map; None without any.
@@ -167,16 +153,17 @@ class RunRecord:
         if not len(self.map_T_kf):
             return None
         known, following = self.map_T_kf.all(), self._following() if self.followed else dict[int, int]()
-        rows = [self.frames[i] for i in np.flatnonzero(self.placed())]
-        stamps = np.array([row.stamp_ns for row in rows], np.int64)
-        poses = np.array([known[row.reference_kf_id] @ row.kf_T_cam for row in rows]).reshape(-1, 4, 4)
-        between = [k for k, row in enumerate(rows) if row.reference_kf_id in following]
+        rows = np.flatnonzero(self.placed())
+        reference = self.frames.reference_kf_id[rows].tolist()
+        stamps = self.frames.stamp_ns[rows]
+        poses = np.array([known[kf_id] for kf_id in reference]).reshape(-1, 4, 4) @ self.frames.kf_T_cam[rows]
+        between = [k for k, kf_id in enumerate(reference) if kf_id in following]
         if between:
-            begin = [self.keyframes[rows[k].reference_kf_id].stamp_ns for k in between]
-            ends = [following[rows[k].reference_kf_id] for k in between]
+            begin = [self.keyframes[reference[k]].stamp_ns for k in between]
+            ends = [following[reference[k]] for k in between]
             end = np.array([self.keyframes[kf_id].stamp_ns for kf_id in ends])
             odom_T_end = np.array([self.keyframes[kf_id].odom_T_cam for kf_id in ends])
-            end_T_cam = se3.inverse(odom_T_end) @ np.array([rows[k].odom_T_cam for k in between])
+            end_T_cam = se3.inverse(odom_T_end) @ self.frames.odom_T_cam[rows[between]]
             share = np.clip((stamps[between] - begin) / (end - begin), 0.0, 1.0)
             there = np.array([known[kf_id] for kf_id in ends]) @ end_T_cam
             poses[between] = se3.interpolate(poses[between], there, share)
@@ -190,8 +177,8 @@ class RunRecord:
 
     def placed(self) -> Bool:
         """(frames,) whether the frame has a place in the map; all tracked ones unless a saved map did not know them."""
-        known = self.map_T_kf.all()
-        return self.tracked() & np.array([f.reference_kf_id in known for f in self.frames], bool)
+        known = np.array([*self.map_T_kf.all()], np.int64)
+        return self.tracked() & np.isin(self.frames.reference_kf_id, known)
 
     def keyframe_trajectory(self) -> Trajectory:
         """Of the keyframes, in the map where there is one."""
@@ -210,7 +197,7 @@ class RunRecord:
         Returns:
             (M, 4, 4). Frames before the first pose take that one, those after the last take the last.
         """
-        ids: I64 = np.array([row.frame_id for row in self.frames], np.int64)
+        ids = self.frames.frame_id
         known = ids[kept]
         if not len(known):
             return poses
@@ -220,24 +207,22 @@ class RunRecord:
 
     def lost_intervals(self) -> list[LostInterval]:
         """Runs of frames without a pose after the first one that had one."""
-        intervals: list[LostInterval] = []
-        begin: int | None = None
-        last_good: int | None = None
-        for i, row in enumerate(self.frames):
-            if row.state in TRACKED:
-                if begin is not None:
-                    intervals.append(self._interval(begin, i))
-                begin, last_good = None, i
-            elif last_good is not None and begin is None:
-                begin = i
-        if begin is not None:
-            intervals.append(self._interval(begin, len(self.frames)))
-        return intervals
+        tracked = self.tracked()
+        if not tracked.any():
+            return []
+        lost = ~tracked
+        lost[: int(np.argmax(tracked))] = False
+        edges = np.diff(np.concatenate([[0], lost.astype(np.int8), [0]]))
+        return [
+            self._interval(begin, end)
+            for begin, end in zip(np.flatnonzero(edges > 0).tolist(), np.flatnonzero(edges < 0).tolist(), strict=True)
+        ]
 
     def _interval(self, begin: int, end: int) -> LostInterval:
-        upto = self.frames[min(end, len(self.frames) - 1)]
-        row = self.frames[begin]
-        return LostInterval(row.frame_id, end - begin, (upto.stamp_ns - row.stamp_ns) / 1e9, row.reason)
+        stamps = self.frames.stamp_ns
+        seconds = float(stamps[min(end, len(stamps) - 1)] - stamps[begin]) / 1e9
+        reason = self.frames.reasons_of(np.array([begin]))[0]
+        return LostInterval(int(self.frames.frame_id[begin]), end - begin, seconds, reason)
 
     def pieces(self) -> int:
         """How many pieces the walk is in: tracking restarted after it was lost, and no loop joins what is before and
@@ -267,9 +252,9 @@ class RunRecord:
     def fingerprint(self) -> str:
         """Eight hex digits of the poses' bits: two runs with the same ones gave the same result."""
         digest = hashlib.sha256()
-        for row in self.frames:
-            digest.update(row.stamp_ns.to_bytes(8, "little", signed=True))
-            digest.update(np.ascontiguousarray(row.odom_T_cam).tobytes())
+        for stamp_ns, odom_T_cam in zip(self.frames.stamp_ns, self.frames.odom_T_cam, strict=True):
+            digest.update(stamp_ns.tobytes())
+            digest.update(odom_T_cam.tobytes())
         mapped = self.mapped()
         if mapped is not None:
             digest.update(mapped.poses.tobytes())

@@ -73,7 +73,7 @@ def _draw(
     if evaluations:
         plots.plot_errors(folder / "errors.png", evaluations)
         pictures.append("errors")
-    if record.frames:
+    if len(record.frames):
         plots.plot_tracking(folder / "tracking.png", record)
         plots.plot_times(folder / "times.png", record, list(stats["ms"]))
         pictures += ["tracking", "times"]

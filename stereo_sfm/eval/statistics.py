@@ -12,12 +12,13 @@ from drivers.live.counters import TROUBLE
 from stereo_sfm.eval.evaluate import Evaluation, length
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.pipeline.sinks import Health
+from stereo_sfm.types import F64, TrackState
 
 # Part of frames without a pose above which the run counts as failed.
 MAX_LOST_PERCENT = 20.0
 
 
-def percentiles(values: Sequence[float]) -> dict[str, float]:
+def percentiles(values: Sequence[float] | F64) -> dict[str, float]:
     """p50, p95 and p99."""
     p50, p95, p99 = np.percentile(np.asarray(values, float), [50, 95, 99])
     return {"p50": float(p50), "p95": float(p95), "p99": float(p99)}
@@ -25,12 +26,10 @@ def percentiles(values: Sequence[float]) -> dict[str, float]:
 
 def stage_times(record: RunRecord) -> dict[str, dict[str, float]]:
     """Milliseconds per stage over the frames that ran it, the longest first."""
-    values: dict[str, list[float]] = {}
-    for ms in record.times:
-        for stage, value in ms.items():
-            values.setdefault(stage, []).append(value)
-    order = sorted(values, key=lambda stage: -sum(values[stage]))
-    return {stage: {**percentiles(values[stage]), "frames": float(len(values[stage]))} for stage in order}
+    ran = {stage: ms[np.isfinite(ms)] for stage, ms in record.times().items()}
+    ran = {stage: ms for stage, ms in ran.items() if len(ms)}
+    order = sorted(ran, key=lambda stage: -float(ran[stage].sum()))
+    return {stage: {**percentiles(ran[stage]), "frames": float(len(ran[stage]))} for stage in order}
 
 
 def statistics(record: RunRecord, wall_s: float, evaluations: dict[str, Evaluation] | None = None) -> dict[str, Any]:
@@ -39,48 +38,44 @@ def statistics(record: RunRecord, wall_s: float, evaluations: dict[str, Evaluati
     frames = len(record.frames)
     lost = record.lost_intervals()
     drifts = record.closure_drifts()
-    states: dict[str, int] = {}
-    for row in record.frames:
-        states[row.state.name] = states.get(row.state.name, 0) + 1
-    inliers = [row.inliers for row in record.frames]
+    states, counts = np.unique(record.frames.state, return_counts=True)
+    stamps = record.frames.stamp_ns
     trajectory = record.mapped() or record.odometry()
     return {
         "frames": frames,
         "tracked": tracked,
         "unplaced": tracked - int(record.placed().sum()),  # a saved map did not know them
         "dropped": record.dropped,
-        "states": states,
+        "states": {TrackState(k).name: n for k, n in zip(states.tolist(), counts.tolist(), strict=True)},
         "lost_percent": 100.0 * (frames - tracked) / frames if frames else 0.0,
         "lost_intervals": [dataclasses.asdict(interval) for interval in lost],
         "pieces": record.pieces(),
         "keyframes": len(record.keyframes),
-        "points": len(record.map_points or record.seen_points),
-        "inliers_median": float(np.median(inliers)) if inliers else 0.0,
+        "points": len(record.map_points) or int(record.seen_points.sum()),
+        "inliers_median": float(np.median(record.frames.inliers)) if frames else 0.0,
         "path_m": trajectory.length if len(trajectory) > 1 else 0.0,
-        "duration_s": (record.frames[-1].stamp_ns - record.frames[0].stamp_ns) / 1e9 if frames else 0.0,
+        "duration_s": float(stamps[-1] - stamps[0]) / 1e9 if frames else 0.0,
         "loops_accepted": len(record.loops),
         "loops_rejected": dict(sorted(record.rejections.items(), key=lambda item: (-item[1], item[0]))),
         "closure_drift_percent_median": 100 * float(np.median(drifts)) if drifts else None,
         "wall_s": wall_s,
         "frames_per_s": frames / wall_s if wall_s > 0 else 0.0,
         "ms": stage_times(record),
-        "health": {stage: _health(reports) for stage, reports in sorted(record.health.items())},
+        "health": {stage: _health(report) for stage, report in sorted(record.health.items())},
         "camera": record.source_counts,
         "fingerprint": record.fingerprint(),
         "evaluation": {name: result.to_dict() for name, result in (evaluations or {}).items()},
     }
 
 
-def _health(reports: Sequence[Health]) -> dict[str, float]:
-    """A stage's last word, and its worst."""
-    last = reports[-1]
+def _health(report: Health) -> dict[str, float]:
     return {
-        "rate": last.rate,
-        "p50_ms": last.p50_ms,
-        "p95_ms": last.p95_ms,
-        "p99_ms": max(r.p99_ms for r in reports),
-        "queue_max": float(max(r.queue for r in reports)),
-        "dropped": float(last.dropped),
+        "rate": report.rate,
+        "p50_ms": report.p50_ms,
+        "p95_ms": report.p95_ms,
+        "p99_ms": report.p99_ms,
+        "queue_max": float(report.queue),
+        "dropped": float(report.dropped),
     }
 
 
