@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,6 +13,7 @@ from stereo_sfm.errors import StereoSfmError
 
 if TYPE_CHECKING:
     from stereo_sfm.eval.evaluate import Evaluation
+    from stereo_sfm.log.provenance import Opening
     from stereo_sfm.types import Trajectory
 
 CHECK_FAILED = 3
@@ -37,15 +39,18 @@ def run(args: argparse.Namespace) -> int:
     from stereo_sfm.eval.associate import MAX_DIFFERENCE_NS
     from stereo_sfm.eval.evaluate import evaluate, table
 
-    reference = load_reference(args.ref)
+    _check_ranges(args)
     result = evaluate(
-        load_estimate(args.estimate, args.which, reference),
-        reference,
+        *load(args.estimate, args.which, args.ref),
         args.align,
         args.delta,
         interpolate=args.t_max_diff is None,
         max_difference_ns=MAX_DIFFERENCE_NS if args.t_max_diff is None else round(args.t_max_diff * 1e9),
     )
+    if result.frames > 1 and not result.rpe_m.count:
+        raise StereoSfmError(
+            f"--delta {args.delta} is longer than what is compared: {result.frames} poses, {result.length_m:.3g} m"
+        )
     if args.plot is not None:
         _plot(args.plot, args.estimate.stem, result)
     if args.json:
@@ -60,39 +65,99 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def load_estimate(path: Path, which: str | None, reference: Trajectory) -> Trajectory:
-    """The trajectory of a run's folder or of a file; one without stamps takes those of the reference, line by line."""
-    from drivers.ground_truth import has_stamps, read_kitti, read_trajectory
+def _check_ranges(args: argparse.Namespace) -> None:
+    for option, value in (("--t-max-diff", args.t_max_diff), ("--max-ape", args.max_ape)):
+        if value is not None and not 0 <= value < float("inf"):
+            raise StereoSfmError(f"{option} must be a number of at least 0, not {value:g}")
 
-    if not path.is_dir() and not has_stamps(path):
-        lines = len(read_trajectory(path))
-        if lines != len(reference):
-            raise StereoSfmError(
-                f"{path} has no stamps and {lines} lines, the reference {len(reference)} poses: compare the TUM form"
-            )
-        return read_kitti(path, reference.stamp_ns)
+
+def load(path: Path, which: str | None, spec: str) -> tuple[Trajectory, Trajectory]:
+    """Estimate and reference: with the stamps of the other where one has none, and poses of the same frame."""
+    file = estimate_file(path, which)
+    reference, truth_file = load_reference(spec, _opening(file.parent))
+    estimate = _with_stamps(file, reference)
+    if truth_file is not None:
+        reference = _with_stamps(truth_file, estimate)
+    frame, truth_frame = _pose_frame(file), "cam0" if truth_file is None else _pose_frame(truth_file)
+    if (frame, truth_frame) == ("body", "cam0"):
+        estimate = _in_cam0(estimate, file)
+    elif (frame, truth_frame) == ("cam0", "body") and truth_file is not None:
+        reference = _in_cam0(reference, truth_file)
+    return estimate, reference
+
+
+def estimate_file(path: Path, which: str | None) -> Path:
+    """The trajectory of a run's folder, or the file itself."""
     if not path.is_dir():
-        return read_trajectory(path)
+        return path
     names = [f"trajectory_{which}.tum"] if which in ("odom", "map") else ["trajectory_map.tum", "trajectory_odom.tum"]
     names = ["keyframes.tum"] if which == "keyframes" else names
     found = next((path / name for name in names if (path / name).is_file()), None)
     if found is None:
         raise StereoSfmError(f"{path} is no run's folder: it has no {' or '.join(names)}")
-    return read_trajectory(found)
+    return found
 
 
-def load_reference(spec: str) -> Trajectory:
-    """The ground truth of a file or of a source."""
+def load_reference(spec: str, opening: Opening) -> tuple[Trajectory, Path | None]:
+    """The ground truth of a file, and that file; or of a source, seen as the run saw its own."""
     from drivers.ground_truth import read_trajectory
+    from drivers.rectified import rectified
     from drivers.source import open_source
+    from stereo_sfm.commands.run import RECTIFY
 
     path = Path(spec).expanduser()
     if path.is_file() and path.suffix != ".mcap":
+        return read_trajectory(path), path
+    source = open_source(spec, **({"rig": opening.rig} if opening.rig is not None else {}))
+    with rectified(source, RECTIFY[opening.rectify]) as opened:
+        if opened.ground_truth is None:
+            raise StereoSfmError(f"{opened.name} has no ground truth")
+        return opened.ground_truth, None
+
+
+def _opening(folder: Path) -> Opening:
+    """How the run of a folder saw its source; as it is where the folder has no log."""
+    from stereo_sfm.log.provenance import Opening
+    from stereo_sfm.log.reader import LogReader
+    from stereo_sfm.log.recorded import read_opening
+
+    if not (folder / "run.mcap").is_file():
+        return Opening()
+    with LogReader(folder / "run.mcap") as reader:
+        return read_opening(reader)
+
+
+def _with_stamps(path: Path, other: Trajectory) -> Trajectory:
+    """The trajectory of a file; one without stamps takes those of the other, line by line."""
+    from drivers.ground_truth import has_stamps, read_kitti, read_trajectory
+
+    if has_stamps(path):
         return read_trajectory(path)
-    with open_source(spec) as source:
-        if source.ground_truth is None:
-            raise StereoSfmError(f"{source.name} has no ground truth")
-        return source.ground_truth
+    lines = len(read_trajectory(path))
+    if lines != len(other):
+        raise StereoSfmError(
+            f"{path} has no stamps and {lines} lines, what it is compared with {len(other)} poses: take the TUM form"
+        )
+    return read_kitti(path, other.stamp_ns)
+
+
+def _pose_frame(path: Path) -> str:
+    """Whose poses the heading of a file names: "cam0", "body", or "" where it says nothing."""
+    with path.open() as stream:
+        found = re.search(r"world_T_(cam0|body)", stream.readline())
+    return found[1] if found else ""
+
+
+def _in_cam0(bodies: Trajectory, path: Path) -> Trajectory:
+    """world_T_body -> world_T_cam0, each with its first pose as the world, by the calibration beside the file."""
+    from calib import load_rig
+    from stereo_sfm.geometry import se3
+    from stereo_sfm.types import Trajectory
+
+    if not (path.parent / "rig.yaml").is_file():
+        raise StereoSfmError(f"{path} holds poses of the body, and no rig.yaml beside it leads to cam0")
+    body_T_cam = load_rig(path.parent / "rig.yaml").body_T_left
+    return Trajectory(bodies.stamp_ns.copy(), se3.inverse(body_T_cam) @ bodies.poses @ body_T_cam)
 
 
 def _plot(folder: Path, name: str, result: Evaluation) -> None:

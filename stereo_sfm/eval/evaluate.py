@@ -138,7 +138,7 @@ def table(result: Evaluation) -> list[tuple[str, str]]:
         ("ATE", f"{length(ape.rmse)} rmse, {length(ape.max)} max ({result.ate_percent:.3f} % of the path)"),
         ("ATE, Sim(3)", f"{length(result.ate_sim3_m)} rmse, scale {result.sim3_scale:.5f}"),
         ("rotation", f"{angle.rmse:.3f} deg rmse, {angle.max:.3f} deg max"),
-        (f"RPE per {result.rpe_delta}", f"{length(result.rpe_m.rmse)} rmse, {result.rpe_deg.rmse:.4f} deg rmse"),
+        (f"RPE per {result.rpe_delta}", _relative(result)),
     ]
     if result.drift is not None:
         low, high = result.drift.lengths_m[0], result.drift.lengths_m[-1]
@@ -161,6 +161,12 @@ def table(result: Evaluation) -> list[tuple[str, str]]:
             ("last frame (eq. 23, 24)", f"{e.absolute_rotation_rad:.3e} rad, {e.absolute_translation_m2:.3e} m²"),
         ]
     return rows
+
+
+def _relative(result: Evaluation) -> str:
+    if not result.rpe_m.count:
+        return length(math.nan)
+    return f"{length(result.rpe_m.rmse)} rmse, {result.rpe_deg.rmse:.4f} deg rmse"
 
 
 def length(metres: float) -> str:

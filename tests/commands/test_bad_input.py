@@ -223,6 +223,9 @@ def test_configuration_that_is_not_toml(cli: Run, tmp_path: Path) -> None:
         (("folder", "--ref", "ref.tum"), "no run's folder"),
         (("est.tum", "--ref", "data"), "has no ground truth"),
         (("est.tum", "--ref", "ref.tum", "--delta", "x"), "--delta"),
+        (("est.tum", "--ref", "ref.tum", "--delta", "1000f"), "--delta 1000f is longer"),
+        (("est.tum", "--ref", "ref.tum", "--t-max-diff", "-1"), "--t-max-diff must be"),
+        (("est.tum", "--ref", "ref.tum", "--max-ape", "nan"), "--max-ape must be"),
     ],
 )
 def test_eval_of_bad_files(cli: Run, tmp_path: Path, args: tuple[str, ...], word: str) -> None:

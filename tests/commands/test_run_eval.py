@@ -16,6 +16,7 @@ import stereo_sfm
 from drivers.ground_truth import read_kitti, read_tum
 from stereo_sfm.cli import main
 from stereo_sfm.eval.record import RunRecord
+from stereo_sfm.export.trajectories import write_tum
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import Frame
 from tests.drivers.dataset_folders import make_images
@@ -76,6 +77,37 @@ def test_trajectory_of_the_body(euroc_run: Path, data_root: Path, tmp_path: Path
     assert "world_T_body" in (tmp_path / "b" / "trajectory_odom.tum").read_text()
 
 
+def ate(*args: object, capsys: pytest.CaptureFixture[str]) -> float:
+    """What `eval` says."""
+    assert main(["eval", *map(str, args), "--json"]) == 0
+    return json.loads(capsys.readouterr().out)["ape_m"]["rmse"]
+
+
+@pytest.mark.parametrize("options", [("--frame", "body"), ("--rectify", "pinhole"), ("--rectify", "wide")])
+def test_eval_agrees_with_the_report_of_any_frame(
+    data_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[str, ...]
+) -> None:
+    source, folder = data_root / "euroc_mh01", tmp_path / "a"
+    assert main(["run", "--inline", str(source), "-o", str(folder), "--max-frames", "30", "-q", *options]) == 0
+    reported = json.loads((folder / "stats.json").read_text())["evaluation"]["map"]["ape_m"]["rmse"]
+    assert ate(folder, "--ref", source, capsys=capsys) == pytest.approx(reported, rel=1e-4)
+
+
+def test_eval_of_body_poses(
+    euroc_run: Path, data_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They are compared with the camera's only through the calibration beside them."""
+    source, folder = data_root / "euroc_mh01", tmp_path / "b"
+    assert main(["run", "--inline", str(source), "-o", str(folder), "--max-frames", "30", "-q", "--frame", "body"]) == 0
+    camera, body = euroc_run / "trajectory_map.tum", folder / "trajectory_map.tum"
+    assert ate(camera, "--ref", body, capsys=capsys) < 1e-6
+    assert ate(body, "--ref", camera, capsys=capsys) < 1e-6
+    assert ate(body, "--ref", body, capsys=capsys) < 1e-6
+    (folder / "rig.yaml").unlink()
+    assert main(["eval", str(body), "--ref", str(source)]) == 2
+    assert "poses of the body, and no rig.yaml" in capsys.readouterr().err
+
+
 def test_eval_prints_the_runs_errors(
     euroc_run: Path, data_root: Path, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -99,7 +131,12 @@ def test_eval_of_a_file_without_stamps(data_root: Path, tmp_path: Path, capsys: 
     short = tmp_path / "short.txt"
     short.write_text("\n".join(poses.read_text().splitlines()[:50]))
     assert main(["eval", str(short), "--ref", str(poses)]) == 2
-    assert "no stamps and 50 lines, the reference 120 poses" in capsys.readouterr().err
+    assert "no stamps and 50 lines, what it is compared with 120 poses" in capsys.readouterr().err
+    stamped = tmp_path / "stamped.tum"
+    write_tum(stamped, read_kitti(poses, np.arange(120, dtype=np.int64) * 10**8))
+    assert main(["eval", str(stamped), "--ref", str(short)]) == 2
+    assert "short.txt has no stamps and 50 lines" in capsys.readouterr().err
+    assert ate(stamped, "--ref", poses, capsys=capsys) < 1e-6
 
 
 def test_eval_checks(euroc_run: Path, data_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
