@@ -123,5 +123,8 @@ def _prune(args: argparse.Namespace) -> int:
 def _check_free(args: argparse.Namespace) -> None:
     from stereo_sfm.errors import StereoSfmError
 
-    if (args.output / "map.json").exists() and not args.overwrite:
-        raise StereoSfmError(f"{args.output} holds a map: choose another -o, or say --overwrite")
+    if (args.output / "map.json").exists():
+        if not args.overwrite:
+            raise StereoSfmError(f"{args.output} holds a map: choose another -o, or say --overwrite")
+    elif args.output.exists() and not (args.output.is_dir() and not any(args.output.iterdir())):
+        raise StereoSfmError(f"{args.output} exists and is no map: choose another -o")

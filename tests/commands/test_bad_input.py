@@ -342,3 +342,25 @@ def test_a_map_has_no_odometry(cli: Run, tmp_path: Path) -> None:
     (tmp_path / "map").mkdir()
     (tmp_path / "map" / "map.json").write_text("{}")
     assert_one_line(cli("export", "map", "--format", "tum", "--which", "odom"), "not the odometry")
+
+
+def test_overwriting_a_run_leaves_nothing_of_it(cli: Run, tmp_path: Path) -> None:
+    folder = tmp_path / "a"
+    (folder / "matches").mkdir(parents=True)
+    old = [folder / "export_map.tum", folder / "matches" / "000003.png", folder / "trajectory_map.kitti"]
+    for path in [*old, folder / "mine.txt"]:
+        path.write_text("")
+    source = "sim:aisle?camera=pinhole&size=64x48&frames=2"
+    cli("run", source, "-o", "a", "--overwrite", "-q", "--set", "mapper.enabled=false")
+    assert (folder / "report.md").exists() and (folder / "mine.txt").exists()
+    assert not any(path.exists() for path in old)
+    assert not (tmp_path / "latest").exists()  # only the runs in `runs` have a latest one
+
+
+@pytest.mark.parametrize("command", [("merge", "a", "b"), ("prune", "a")])
+def test_a_map_is_not_written_over_something_else(cli: Run, tmp_path: Path, command: tuple[str, ...]) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "rig.yaml").write_text("years of work")
+    assert_one_line(cli("map", *command, "-o", "run", "--overwrite"), "run exists and is no map")
+    assert_one_line(cli("map", *command, "-o", "run/rig.yaml"), "exists and is no map")
+    assert (tmp_path / "run" / "rig.yaml").read_text() == "years of work"
