@@ -23,6 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--source", help="where the images are, for a run whose log has none")
     parser.add_argument("--serve", action="store_true", help="to browsers, instead of opening a window")
     parser.add_argument("--save", type=Path, metavar="FILE.rrd", help="write a rerun file instead of showing it")
+    parser.add_argument("--overwrite", action="store_true", help="replace the file of --save")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -30,6 +31,8 @@ def run(args: argparse.Namespace) -> int:
     path: Path = args.file / "run.mcap" if args.file.is_dir() else args.file
     if not path.exists():
         raise StereoSfmError(f"no recording at {path}")
+    if args.save is not None and args.save.is_file() and not args.overwrite:
+        raise StereoSfmError(f"{args.save} exists: choose another name or give --overwrite")
     from stereo_sfm.log import topics
     from stereo_sfm.log.image_log import RIG_FILE, TRUTH_FILE, rig_from_text, truth_from_bytes
     from stereo_sfm.log.provenance import METADATA

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import socket
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,6 +14,7 @@ import numpy as np
 import rerun as rr
 
 from calib.rig import Rig
+from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.pipeline.sinks import Health, LogLine, StageTimes
 from stereo_sfm.types import (
@@ -30,7 +33,7 @@ from stereo_sfm.viz.map_scene import MapScene
 from stereo_sfm.viz.shapes import age_colors, spread_colors, strips, turbo
 
 MEMORY_LIMIT = "1GB"  # of the viewer, which keeps its history
-WEB_PORT = 9090
+WEB_PORT, GRPC_PORT = 9090, 9876
 JPEG_QUALITY = 80
 MATCHES_DRAWN = 100  # more lines than that hide the picture: every k-th is drawn
 MATCHES_EVERY = 5  # pictures between two pictures of matches
@@ -61,9 +64,12 @@ class RerunSink:
         self._mode = mode
         self._rec = rr.RecordingStream("stereo_sfm", recording_id=None)
         if mode == "spawn":
-            self._rec.spawn(memory_limit=MEMORY_LIMIT, default_blueprint=blueprint(name))
+            _spawn(self._rec, name)
         elif mode == "serve":
-            uri = self._rec.serve_grpc(default_blueprint=blueprint(name), server_memory_limit=MEMORY_LIMIT)
+            _check_free(GRPC_PORT, WEB_PORT)  # rerun itself goes on without the port
+            uri = self._rec.serve_grpc(
+                grpc_port=GRPC_PORT, default_blueprint=blueprint(name), server_memory_limit=MEMORY_LIMIT
+            )
             rr.serve_web_viewer(web_port=WEB_PORT, open_browser=False, connect_to=uri)
             print(f"viewer: http://localhost:{WEB_PORT}/?url={quote(uri, safe='')}", file=sys.stderr, flush=True)
         else:
@@ -215,6 +221,27 @@ class RerunSink:
     def _put_dropped(self, dropped: Dropped) -> None:
         self._dropped += dropped.count
         self._rec.log("points/dropped", rr.Scalars(float(self._dropped)))
+
+
+def _spawn(recording: rr.RecordingStream, name: str) -> None:
+    """Open the viewer that was installed with this interpreter, which need not be in the PATH; else the PATH's."""
+    viewer = shutil.which("rerun", path=Path(sys.executable).parent)
+    try:
+        rr.spawn(
+            memory_limit=MEMORY_LIMIT, executable_path=viewer, default_blueprint=blueprint(name), recording=recording
+        )
+    except RuntimeError as error:
+        raise StereoSfmError(f"cannot open the viewer: {str(error).splitlines()[0]}") from None
+
+
+def _check_free(*ports: int) -> None:
+    for port in ports:
+        with socket.socket() as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind(("", port))
+            except OSError:
+                raise StereoSfmError(f"port {port} is taken: is another viewer open?") from None
 
 
 def _jpeg(image: U8) -> rr.EncodedImage:
