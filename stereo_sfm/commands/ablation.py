@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
-from collections.abc import Generator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -146,6 +143,7 @@ def _run_all(cells: Sequence[Cell], store: Path, jobs: int, quiet: bool, total: 
     from rich.progress import Progress
 
     from stereo_sfm.eval.ablation_worker import compute, one_thread
+    from stereo_sfm.pipeline.interrupts import ignored_by_children
 
     console = Console(stderr=True, quiet=quiet)
     spawn = multiprocessing.get_context("spawn")
@@ -161,7 +159,7 @@ def _run_all(cells: Sequence[Cell], store: Path, jobs: int, quiet: bool, total: 
                 # Not all at once: what waits in the pool could not be called back.
                 while left and len(running) < jobs and not stop.asked:
                     cell = left.pop()
-                    with _ignored_by_children():
+                    with ignored_by_children():
                         job = pool.submit(compute, cell, store / cell.file_name)
                     running[job] = f"{Path(cell.source).name} {cell.name}"
                 if not running:
@@ -180,13 +178,3 @@ def _run_all(cells: Sequence[Cell], store: Path, jobs: int, quiet: bool, total: 
             for child in multiprocessing.active_children():
                 child.terminate()
             raise
-
-
-@contextmanager
-def _ignored_by_children() -> Generator[None]:
-    """Processes started inside never see Ctrl-C, from their first moment on: this one decides what it means."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)

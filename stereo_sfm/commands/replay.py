@@ -64,6 +64,10 @@ def run(args: argparse.Namespace) -> int:
         raise StereoSfmError("--seek goes with --step: every frame must be executed to reach a later one")
     if args.check and args.log == "none":
         raise StereoSfmError("--check compares the logs of both runs: it needs --log lean or full")
+    if args.check and args.until is not None:
+        raise StereoSfmError("--check compares whole runs: leave --until away")
+    if args.realtime or args.speed is not None:
+        raise StereoSfmError("a replay takes its time from the run: --realtime and --speed go with 'run'")
     if args.until is not None and not args.until >= 0:
         raise StereoSfmError(f"--until takes seconds after the first frame, got {args.until:g}")
     path: Path = args.run / "run.mcap" if args.run.is_dir() else args.run

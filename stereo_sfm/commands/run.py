@@ -86,7 +86,10 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_wiring_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options that say how the stages run, and what is logged and shown. They never change the result of lockstep."""
+    """Options that say how the stages run, and what is logged and shown.
+
+    They never change the result of lockstep, but for JPEG images: the tracker sees what the log holds.
+    """
     parser.add_argument("--inline", action="store_true", help="all stages in one process; the same bits")
     parser.add_argument(
         "--mode",

@@ -37,7 +37,11 @@ class Merge:
 
 
 def merge(
-    maps: Sequence[SavedMap], vocabulary: Vocabulary, config: LoopConfig, mapper: MapperConfig = _MAPPER
+    maps: Sequence[SavedMap],
+    vocabulary: Vocabulary,
+    config: LoopConfig,
+    mapper: MapperConfig = _MAPPER,
+    place: LoopResult | None = None,
 ) -> Merge:
     """One map of all; the first keeps its frame.
 
@@ -46,6 +50,7 @@ def merge(
         vocabulary: of the search for loops. Maps keep their descriptors, so it need not be the one they were made with.
         config: of the loops.
         mapper: of the bundle adjustment at the end.
+        place: a loop from the first map to the second that is known already, in the ids of each.
 
     Raises:
         StereoSfmError: other cameras, or a map that no loop joins to the rest.
@@ -58,6 +63,13 @@ def merge(
     begins = {k: int(stamps[walks == k].min()) for k in side_by_side.walks}  # clocks of walks have nothing in common
     loops: list[LoopResult] = []
     fused = 0
+    if place is not None:
+        kf_ids, pt_ids = (int(ids.max()) + 1 for ids in (maps[0].snapshot.kf_ids, maps[0].snapshot.pt_ids))
+        known = dataclasses.replace(place, kf_id=place.kf_id + kf_ids, matches=place.matches + np.array([0, pt_ids]))
+        done = apply_loop(map_, known, [], config)
+        if done.applied:
+            loops.append(known)
+            fused += len(done.fused)
     for keyframe, walk in zip(keyframes_of(side_by_side.snapshot), walks.tolist(), strict=True):
         result = closer.step(dataclasses.replace(keyframe, stamp_ns=keyframe.stamp_ns - begins[walk]))
         if result.candidate_kf_id >= 0:
@@ -65,7 +77,7 @@ def merge(
             if done.applied:
                 loops.append(result)
                 fused += len(done.fused)
-    _check_joined(side_by_side, loops, len(maps))
+    _check_joined(maps, loops)
     full_adjustment(map_, side_by_side.rig, mapper)
     snapshot = map_.snapshot()
     session = dict(zip(side_by_side.snapshot.kf_ids.tolist(), side_by_side.sessions.tolist(), strict=True))
@@ -97,16 +109,18 @@ def _same_walk(a: dict[int, set[tuple[float, float]]], b: dict[int, set[tuple[fl
     return same > SAME_SHARE * sum(min(len(a[t]), len(b[t])) for t in times)
 
 
-def _check_joined(saved: SavedMap, loops: list[LoopResult], count: int) -> None:
-    """Every walk must hang together with the first one."""
-    owner = dict(zip(saved.snapshot.kf_ids.tolist(), saved.snapshot.submap_ids.tolist(), strict=True))
-    group = {submap: submap for submap in owner.values()}
+def _check_joined(maps: Sequence[SavedMap], loops: list[LoopResult]) -> None:
+    """Every map must hang together with the first one."""
+    ends = np.cumsum([int(saved.snapshot.kf_ids.max()) + 1 for saved in maps])  # of the raised keyframe ids
+    group = np.arange(len(maps))
     for loop in loops:
-        a, b = group[owner[loop.candidate_kf_id]], group[owner[loop.kf_id]]
-        group = {s: min(a, b) if g in (a, b) else g for s, g in group.items()}
-    apart = len(set(group.values()))
+        a, b = group[np.searchsorted(ends, [loop.candidate_kf_id, loop.kf_id], side="right")]
+        group[group == max(a, b)] = min(a, b)
+    apart = len(np.unique(group))
     if apart > 1:
-        raise StereoSfmError(f"the {count} maps stay in {apart} pieces: no loop joins them (are they of one store?)")
+        raise StereoSfmError(
+            f"the {len(maps)} maps stay in {apart} pieces: no loop joins them (are they of one store?)"
+        )
 
 
 def full_adjustment(map_: Map, rig: Rig, config: MapperConfig) -> None:

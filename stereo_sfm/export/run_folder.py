@@ -44,14 +44,15 @@ def prepare_folder(folder: Path, overwrite: bool) -> None:
 
 def discard_files(folder: Path) -> None:
     """Remove the files of a run; whatever else lies there stays."""
-    for name in FILES:
-        (folder / name).unlink(missing_ok=True)
+    made_later = [*folder.glob("export_*"), *folder.glob("matches/*.png")]
+    for path in [*(folder / name for name in FILES), *(path for path in made_later if path.is_file())]:
+        path.unlink(missing_ok=True)
 
 
 def link_latest(folder: Path) -> None:
-    """Let `latest` beside the folder point to it, where the file system has links."""
+    """Let `runs/latest` point to a folder in `runs`, where the file system has links."""
     link = folder.parent / "latest"
-    if link.exists() and not link.is_symlink():
+    if folder.parent.name != "runs" or (link.exists() and not link.is_symlink()):
         return
     try:
         link.unlink(missing_ok=True)

@@ -5,10 +5,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
+import numpy as np
+
 from calib.rig import Rig
 from stereo_sfm.config import LoopConfig, MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.localizer import Localizer
+from stereo_sfm.loop.relocalize import Location
+from stereo_sfm.mapping.map import MapSnapshot
 from stereo_sfm.mapping.mapper import Mapper
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.types import F64, Keyframe, LoopResult, MapUpdate
@@ -28,6 +32,7 @@ class Extension(Mapper):
         super().__init__(config, rig, spans, loop_config)
         self._localizer = localizer
         self._saved_T_walk: F64 | None = None
+        self._found: tuple[int, Location] | None = None  # the keyframe that was found first, and where
 
     def step(self, keyframe: Keyframe, loop: LoopResult | None = None) -> MapUpdate:
         """As the mapper's, in the saved map's frame where that is known."""
@@ -37,6 +42,8 @@ class Extension(Mapper):
         place = self._localizer.step(keyframe)
         if not self._localizer.found:
             return update
+        assert self._localizer.last is not None
+        self._found = keyframe.kf_id, self._localizer.last
         self._saved_T_walk = se3.orthonormalize(place.map_T_odom @ se3.inverse(update.map_T_odom))
         return self._in_saved_map(self._with_everything(update), self._saved_T_walk)
 
@@ -46,6 +53,30 @@ class Extension(Mapper):
         if update is None or self._saved_T_walk is None:
             return update
         return self._in_saved_map(update, self._saved_T_walk)
+
+    def place(self, saved: MapSnapshot) -> LoopResult | None:
+        """The first place found, as a loop from a keyframe of the saved map to a living one of the walk; None: none.
+
+        The ids are each map's own.
+        """
+        if self._found is None:
+            return None
+        kf_id, where = self._found
+        table, row = self.map.keyframes, self.map.kf_row(kf_id)
+        alive = bool(table.alive[row])
+        living = kf_id if alive else int(table.kf_id[table.carrier[row]])
+        kf_T_living = np.eye(4) if alive else se3.inverse(table.carrier_T_kf[row])
+        candidate = saved.map_T_kf[int(np.searchsorted(saved.kf_ids, where.kf_id))]
+        return LoopResult(
+            kf_id=living,
+            candidate_kf_id=where.kf_id,
+            candidate_T_kf=se3.inverse(candidate) @ where.map_T_cam @ kf_T_living,
+            information=where.information,
+            matches=where.pairs,
+            inliers=where.inliers,
+            score=0.0,
+            reason="",
+        )
 
     def _with_everything(self, update: MapUpdate) -> MapUpdate:
         keyframes, points = self.map.living_keyframes(), self.map.living_points()

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,8 +15,13 @@ from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.map_header import checksum
 from stereo_sfm.log.provenance import Opening
+from stereo_sfm.loop.vocabulary_file import configured_vocabulary
 from stereo_sfm.pipeline.stages import AnyMapper
 from stereo_sfm.timing import NoSpans
+
+if TYPE_CHECKING:
+    from stereo_sfm.export.saved_map import SavedMap
+    from stereo_sfm.loop.vocabulary import Vocabulary
 
 
 @dataclass(frozen=True)
@@ -38,8 +46,9 @@ class MapFolders:
             raise StereoSfmError(f"{self.map_out} exists: choose another --map-out, or say --overwrite")
         if self.map_out is not None:
             above = next(folder for folder in self.map_out.absolute().parents if folder.exists())
-            if not above.is_dir():
-                raise StereoSfmError(f"cannot make --map-out {self.map_out}: {above} is no folder")
+            if not above.is_dir() or not os.access(above, os.W_OK):
+                why = "may not be written to" if above.is_dir() else "is no folder"
+                raise StereoSfmError(f"cannot make --map-out {self.map_out}: {above} {why}")
 
     def recorded(self, opening: Opening) -> Opening:
         """How a run began, with the map that it began with."""
@@ -65,7 +74,6 @@ def make_mapper(config: Config, rig: Rig, spans: NoSpans, folders: MapFolders) -
     from stereo_sfm.export.saved_map import load_map
     from stereo_sfm.loop.extension import Extension
     from stereo_sfm.loop.localizer import Localizer
-    from stereo_sfm.loop.vocabulary_file import configured_vocabulary
 
     saved = load_map(folders.map_in, rig)
     localizer = Localizer(saved.snapshot, rig, configured_vocabulary(config.loop), config.loop)
@@ -73,24 +81,50 @@ def make_mapper(config: Config, rig: Rig, spans: NoSpans, folders: MapFolders) -
 
 
 def save_result(mapper: AnyMapper, config: Config, rig: Rig, folders: MapFolders) -> None:
-    """Write the map of a finished run to `map_out`, merged with `map_in`."""
+    """Write the map of a finished run to `map_out`, merged with `map_in`.
+
+    Raises:
+        StereoSfmError: it cannot be merged, and the walk's own map was written instead (beside `map_out` where that is
+            the map it should have been merged with); or the disk does not take it.
+    """
     from stereo_sfm.mapping.mapper import Mapper
 
     if folders.map_out is None or not isinstance(mapper, Mapper):
         return
-    from stereo_sfm.export.merge import merge
-    from stereo_sfm.export.saved_map import SavedMap, load_map, save_map
-    from stereo_sfm.loop.vocabulary_file import configured_vocabulary
+    from stereo_sfm.export.saved_map import SavedMap, save_map
 
-    vocabulary = configured_vocabulary(config.loop)
     snapshot = mapper.map.snapshot()
-    saved = SavedMap(snapshot, rig, vocabulary.id, np.zeros(len(snapshot.kf_ids), np.int64))
+    vocabulary = configured_vocabulary(config.loop)
+    saved, out, failure = (
+        SavedMap(snapshot, rig, vocabulary.id, np.zeros(len(snapshot.kf_ids), np.int64)),
+        folders.map_out,
+        "",
+    )
     if folders.map_in is not None:
         try:
-            saved = merge([load_map(folders.map_in, rig), saved], vocabulary, config.loop, config.mapper).saved
+            saved = _merged(mapper, saved, folders.map_in, vocabulary, config)
         except StereoSfmError as error:
-            save_map(saved, folders.map_out)
-            raise StereoSfmError(
-                f"not merged with {folders.map_in}: {error}; {folders.map_out} is this walk alone"
-            ) from None
-    save_map(saved, folders.map_out)
+            out = _beside(out) if out.resolve() == folders.map_in.resolve() else out
+            failure = f"not merged with {folders.map_in}: {error}; {out} is this walk alone"
+    try:
+        save_map(saved, out)
+    except OSError as error:
+        raise StereoSfmError(f"the map cannot be written to {out}: {error.strerror}") from None
+    if failure:
+        raise StereoSfmError(failure)
+
+
+def _merged(mapper: AnyMapper, walk: SavedMap, map_in: Path, vocabulary: Vocabulary, config: Config) -> SavedMap:
+    from stereo_sfm.export.merge import merge
+    from stereo_sfm.export.saved_map import load_map
+    from stereo_sfm.loop.extension import Extension
+
+    before = load_map(map_in, walk.rig)
+    place = mapper.place(before.snapshot) if isinstance(mapper, Extension) else None
+    return merge([before, walk], vocabulary, config.loop, config.mapper, place).saved
+
+
+def _beside(folder: Path) -> Path:
+    """A free name next to a folder."""
+    names = (folder.with_name(f"{folder.name}_walk{k}") for k in itertools.count(1))
+    return next(name for name in names if not name.exists())

@@ -27,6 +27,7 @@ from stereo_sfm.pipeline import workers
 from stereo_sfm.pipeline.capture import SourceInfo
 from stereo_sfm.pipeline.channels import DroppingOutbox, End, Failed, Outbox
 from stereo_sfm.pipeline.images import ImageLayout, ImageRing, SlotImage
+from stereo_sfm.pipeline.interrupts import ignored_by_children
 from stereo_sfm.pipeline.maps import MapFolders
 from stereo_sfm.pipeline.sinks import LogLine, Sink
 from stereo_sfm.pipeline.text import Listener, say
@@ -91,6 +92,7 @@ class ProcessRun:
         self._next_picture_ns = 0
         self._ring: ImageRing | None = None
         self._ended: set[str] = set()
+        self._said_early: list[LogLine] = []  # while the source was opened
         self._waiting = {"tracker", "mapper", "loop"}  # not ready yet
         self._stopping = False
         self._listener = Listener("main", self.publish)
@@ -201,6 +203,8 @@ class ProcessRun:
         if self._opened is not None:
             self._opened()
         self._set_up(info)
+        for line in self._said_early:
+            self._dispatch(line)
 
     def _set_up(self, info: SourceInfo) -> None:
         self.info = info
@@ -244,7 +248,8 @@ class ProcessRun:
         process = self._context.Process(
             target=workers.guarded, args=(stage, body, send, *args), name=f"stereo-sfm {stage}", daemon=True
         )
-        process.start()
+        with ignored_by_children():
+            process.start()
         send.close()
         if args and isinstance(args[0], Connection):
             args[0].close()
@@ -254,15 +259,19 @@ class ProcessRun:
     def _first_report(self) -> SourceInfo:
         """Capture's first word: what the source is, or why it cannot be opened."""
         connection = next(c for c, stage in self._reports.items() if stage == "capture")
-        try:
-            message = connection.recv()
-        except (EOFError, OSError):
-            raise StageDied(f"capture {self._how_it_died('capture')} before the source was open") from None
-        if isinstance(message, Failed):
-            self._reports.pop(connection)
-            raise _error(message)
-        assert isinstance(message, SourceInfo)
-        return message
+        while True:
+            try:
+                message = connection.recv()
+            except (EOFError, OSError):
+                raise StageDied(f"capture {self._how_it_died('capture')} before the source was open") from None
+            if isinstance(message, Failed):
+                self._reports.pop(connection)
+                raise _error(message)
+            if isinstance(message, SourceInfo):
+                return message
+            assert isinstance(message, LogLine)
+            say(message)
+            self._said_early.append(message)
 
     # -- messages ----------------------------------------------------------------------------------------------------
 

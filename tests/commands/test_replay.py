@@ -79,3 +79,12 @@ def test_check_needs_no_output_folder(
     assert (tmp_path / "runs" / "latest" / "run.mcap").exists()
     assert main(["replay", str(run), "--check", "--log", "none", "-q"]) == 2
     assert "--check compares the logs" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("options", [("--realtime",), ("--speed", "2"), ("--check", "--until", "1")])
+def test_options_that_a_replay_has_no_use_for(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[str, ...]
+) -> None:
+    assert main(["replay", str(run), "-o", str(tmp_path / "c"), *options]) == 2
+    assert options[-2 if options[-1].isdigit() else -1] in capsys.readouterr().err
+    assert not (tmp_path / "c").exists()

@@ -9,12 +9,15 @@ import numpy as np
 import pytest
 
 from stereo_sfm.cli import main
-from stereo_sfm.config import LoopConfig, MapperConfig
+from stereo_sfm.config import Config, LoopConfig, MapperConfig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.merge import full_adjustment, merge, prune, share_a_walk
 from stereo_sfm.export.saved_map import SavedMap, joined, load_map, restore_map, save_map
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
+from stereo_sfm.mapping.mapper import Mapper
+from stereo_sfm.pipeline.maps import MapFolders, save_result
+from stereo_sfm.types import LoopResult
 from tests.export.maps import map_of_walk, same
 from tests.loop.store_walk import StoreWalk, make_walk
 from tests.synthetic import pinhole_rig
@@ -186,3 +189,58 @@ def test_prune_refuses_numbers_out_of_range(
     error = capsys.readouterr().err
     assert option.split("=")[0] in error and len(error.splitlines()) == 1
     assert not (tmp_path / "p").exists()
+
+
+def test_a_known_place_joins_what_the_search_does_not(
+    walks: list[StoreWalk], maps: list[SavedMap], vocabulary: voc.Vocabulary
+) -> None:
+    blind = LoopConfig(min_inliers=10**6)
+    with pytest.raises(StereoSfmError, match="stay in 2 pieces"):
+        merge(maps, vocabulary, blind)
+    here = 5
+    distance = np.linalg.norm(walks[0].world_T_kf[:, :3, 3] - walks[1].world_T_kf[here, :3, 3], axis=1)
+    there = int(np.argmin(distance))
+    physical = {walks[0].physical[p]: p for p in maps[0].snapshot.pt_ids.tolist()}
+    seen = [p for p in maps[1].snapshot.pt_ids.tolist() if walks[1].physical[p] in physical]
+    place = LoopResult(
+        kf_id=int(maps[1].snapshot.kf_ids[here]),
+        candidate_kf_id=int(maps[0].snapshot.kf_ids[there]),
+        candidate_T_kf=se3.inverse(walks[0].world_T_kf[there]) @ walks[1].world_T_kf[here],
+        information=np.eye(6) * 1e4,
+        matches=np.array([[physical[walks[1].physical[p]], p] for p in seen[:100]]),
+        inliers=100,
+        score=0.0,
+        reason="",
+    )
+    result = merge(maps, vocabulary, blind, place=place)
+    assert len(result.loops) == 1 and result.fused == 100
+    error = np.linalg.norm(
+        result.saved.snapshot.map_T_kf[len(maps[0]) :, :3, 3]
+        - (se3.inverse(walks[0].world_T_kf[0]) @ walks[1].world_T_kf)[:, :3, 3],
+        axis=1,
+    )
+    assert np.median(error) < 0.1
+
+
+def test_a_merged_map_is_one_piece(merged: SavedMap, maps: list[SavedMap], vocabulary: voc.Vocabulary) -> None:
+    """What joined its walks is not in the file: with a third map they still count as one."""
+    with pytest.raises(StereoSfmError, match="the 2 maps stay in 2 pieces"):
+        merge([merged, maps[1]], vocabulary, LoopConfig(min_inliers=10**6))
+
+
+@pytest.mark.parametrize("in_place", [True, False])
+def test_a_merge_that_fails_costs_no_map(
+    tmp_path: Path, walks: list[StoreWalk], maps: list[SavedMap], in_place: bool
+) -> None:
+    save_map(maps[0], tmp_path / "store")
+    mapper = Mapper(MapperConfig(), walks[1].rig)
+    for k, keyframe in enumerate(walks[1].keyframes[:5]):
+        mapper.step(dataclasses.replace(keyframe, kf_id=k))
+    out = tmp_path / ("store" if in_place else "other")
+    config = Config(loop=LoopConfig(min_inliers=10**6))
+    with pytest.raises(StereoSfmError, match="is this walk alone"):
+        save_result(mapper, config, walks[1].rig, MapFolders(tmp_path / "store", map_out=out))
+    assert len(load_map(tmp_path / "store", walks[0].rig)) == len(maps[0])
+    assert len(load_map(tmp_path / "store_walk1" if in_place else out, walks[0].rig)) == len(
+        mapper.map.living_keyframes()
+    )

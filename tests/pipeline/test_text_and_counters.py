@@ -8,7 +8,7 @@ import multiprocessing
 from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import pytest
 
@@ -53,6 +53,14 @@ class TroubledWall(SlidingWall):
                 logger.warning("wall sent no image for %d ms", 500)
                 logger.info("wall is back")
             yield image
+
+
+class TalkativeWall(SlidingWall):
+    """Says something while it is opened, as a camera that boots does."""
+
+    def __enter__(self) -> Self:
+        logger.info("the wall boots")
+        return super().__enter__()
 
 
 class Kept:
@@ -108,6 +116,17 @@ def test_warnings_and_counters_reach_the_log_and_the_sinks(
     stats = statistics(record, 1.0)
     assert stats["camera"] == counts
     assert "camera: 12 stereo images, stalls 1" in summary(stats)
+
+
+def test_what_a_source_says_while_it_opens_is_kept(tmp_path: Path) -> None:
+    kept = Kept()
+    with ProcessRun(
+        functools.partial(TalkativeWall, 5), CONFIG, [kept], log=LogOptions(tmp_path / "run.mcap", "none")
+    ) as run:
+        assert len(list(run)) == 5
+    assert kept.lines[0] == LogLine("capture", "INFO", "the wall boots")
+    with LogReader(tmp_path / "run.mcap") as reader:
+        assert "the wall boots" in [m.message for _, m in messages(reader, [topics.LOG])]
 
 
 def _warn(to_main: Outbox) -> None:
