@@ -83,11 +83,13 @@ def scale_free(config: Config, rig: Rig) -> bool:
 
 
 def _evaluate(estimates: dict[str, Trajectory], reference: Trajectory | None, best: str) -> dict[str, Evaluation]:
-    """By name, aligned as `best` says; a path too short to align is compared from its first pose."""
+    """By name, aligned as `best` says; a path too short to align is compared from its first pose, one pose is not."""
     evaluations: dict[str, Evaluation] = {}
     if reference is None:
         return evaluations
     for name, trajectory in estimates.items():
+        if len(trajectory) < 2:
+            continue
         for mode in (best, "origin"):
             try:
                 evaluations[name] = evaluate(trajectory, reference, mode)

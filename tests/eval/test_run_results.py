@@ -136,3 +136,9 @@ def test_frames_located_by_a_keyframe_each_stay_with_it() -> None:
     mapped = record.mapped()
     assert mapped is not None
     np.testing.assert_array_equal(mapped.poses, walk()[:10])
+
+
+def test_one_pose_is_compared_with_nothing(tmp_path: Path) -> None:
+    record = record_of(walk()[:1], 0)
+    _, lines, report = results(tmp_path, record, pinhole_rig(), Config())
+    assert not any("ground truth" in line or "nan" in line for line in lines) and "nan" not in report
