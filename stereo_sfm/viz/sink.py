@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 import socket
 import sys
@@ -32,12 +33,14 @@ from stereo_sfm.viz.blueprint import blueprint
 from stereo_sfm.viz.map_scene import MapScene
 from stereo_sfm.viz.shapes import age_colors, spread_colors, strips, turbo
 
+log = logging.getLogger("stereo_sfm")
 MEMORY_LIMIT = "1GB"  # of the viewer, which keeps its history
 WEB_PORT, GRPC_PORT = 9090, 9876
 JPEG_QUALITY = 80
 MATCHES_DRAWN = 100  # more lines than that hide the picture: every k-th is drawn
 MATCHES_EVERY = 5  # pictures between two pictures of matches
 KEPT = 64  # images that wait for their frame: more than the stages have between them
+GRACE_S = 5.0  # that a viewer has to take what is left
 TRUTH = (95, 200, 110)
 SERIES: Mapping[str, tuple[int, int, int]] = {
     "points/tracked": (90, 170, 255),
@@ -119,7 +122,10 @@ class RerunSink:
         for frame_id in sorted(self._images):
             self._show_alone(self._images[frame_id])
         self._scene.show()
-        self._rec.flush()
+        try:
+            self._rec.flush(timeout_sec=GRACE_S if self._mode == "spawn" else 1e38)
+        except RuntimeError as error:
+            log.warning("the viewer does not answer, what it shows is not complete: %s", str(error).splitlines()[0])
         if self._mode == "save":
             self._rec.disconnect()  # writes the end of the file; a server goes on serving
 

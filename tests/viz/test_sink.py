@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import socket
 import subprocess
 import sys
@@ -42,7 +43,7 @@ class Recording:
 
     def save(self, *_: Any, **__: Any) -> None: ...
     def set_time(self, *_: Any, **__: Any) -> None: ...
-    def flush(self) -> None: ...
+    def flush(self, **__: Any) -> None: ...
     def disconnect(self) -> None: ...
 
 
@@ -189,3 +190,17 @@ def test_colors_run_from_blue_to_red() -> None:
     low, high = spread_colors(np.array([0.0, 100.0])).astype(int)
     assert low[2] > low[0] and high[0] > high[2]
     assert spread_colors(np.zeros(0)).shape == (0, 3)
+
+
+def test_a_viewer_that_does_not_answer_is_a_warning(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def gone(self: Recording, timeout_sec: float) -> None:
+        raise RuntimeError("deadline expired\nmore")
+
+    monkeypatch.setattr(Recording, "flush", gone)
+    monkeypatch.setattr(rr, "RecordingStream", Recording)
+    monkeypatch.setattr(logging.getLogger("stereo_sfm"), "propagate", True)
+    viewer = sink.RerunSink(SlidingWall(1).rig, "wall", "save", tmp_path / "run.rrd")
+    viewer.close()
+    assert "the viewer does not answer" in caplog.text and "more" not in caplog.text
