@@ -83,7 +83,7 @@ def _recognise_file(path: Path) -> str | None:
         text = path.read_text()
     except (UnicodeDecodeError, OSError):
         raise StereoSfmError(f"calibration {path} is not a text file") from None
-    if path.suffix == ".json":
+    if path.suffix == ".json" or text.lstrip().startswith(("{", "[")):
         marks = {"basalt": '"T_imu_cam"', "depthai": '"cameraData"', "opencv": '"opencv-matrix"', "foxglove": '"K"'}
     elif path.suffix == ".txt":
         marks = {"kitti": "P0:", "kapture": "camera,"} | {"colmap": "" if path.name == "cameras.txt" else "CAMERA_ID"}
@@ -94,6 +94,7 @@ def _recognise_file(path: Path) -> str | None:
             "rig": "stereo_sfm_rig:",
             "ros": "camera_matrix:",
             "kalibr": "cam0:",
+            "kitti": "P0:",
         }
     return next((name for name, mark in marks.items() if mark in text), None)
 

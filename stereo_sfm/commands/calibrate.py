@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from stereo_sfm.commands.convert_calib import NAMES
 
 if TYPE_CHECKING:
     from calib.targets import Detection, Target
@@ -25,10 +28,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--model", choices=("pinhole", "rational", "kb4"), default="pinhole", help="lens (fisheye: kb4)"
     )
     parser.add_argument("-o", "--output", type=Path, required=True, help="rig file to write")
-    parser.add_argument("--format", default=None, help="its format (default: ours; see convert-calib)")
+    parser.add_argument("--format", choices=NAMES, default=None, help="its format (default: ours; see convert-calib)")
     parser.add_argument("--report", type=Path, default=None, help="HTML report (default: beside the rig)")
     parser.add_argument("--views", type=int, default=60, help="views at most")
-    parser.add_argument("--overwrite", action="store_true")
+    parser.add_argument("--overwrite", action="store_true", help="replace the rig and the report that are there")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -39,10 +42,9 @@ def run(args: argparse.Namespace) -> int:
     from calib.quality import judge
     from calib.report import write_report
     from calib.solve import align_pairs, calibrate
-    from stereo_sfm.errors import StereoSfmError
 
-    if args.output.exists() and not args.overwrite:
-        raise StereoSfmError(f"{args.output} exists: choose another file or give --overwrite")
+    report: Path = args.report or args.output.with_suffix(".html")
+    _check_files(args.output, report, args.overwrite)
     target = make_target(args)
     left, right, kept, size = collect(args.source, target, args.views)
     if target.kind == "checkerboard":
@@ -51,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
     views = [coverage(left, size), coverage(right, size)]
     quality = judge(calibration, min(views, key=lambda v: v.fraction))
     save_rig(calibration.rig, args.output, args.format)
-    report = args.report or args.output.with_suffix(".html")
+    report.parent.mkdir(parents=True, exist_ok=True)
     write_report(report, str(args.source), calibration, quality, views, kept[:: max(1, len(kept) // 3)][:3])
     for finding in quality.findings:
         print(f"  {VERDICTS[finding.level]}  {finding.name}: {finding.text}")
@@ -60,6 +62,22 @@ def run(args: argparse.Namespace) -> int:
             print(f"  {eye} eye: {advice}")
     print(f"verdict: {VERDICTS[quality.level]}, rig {args.output}, report {report}")
     return 3 if VERDICTS[quality.level] == "FAIL" else 0
+
+
+def _check_files(rig: Path, report: Path, overwrite: bool) -> None:
+    """Before the pictures are searched: both can be written, and nothing is lost by it."""
+    from stereo_sfm.errors import StereoSfmError
+
+    if rig.resolve() == report.resolve():
+        raise StereoSfmError(f"the report would replace the rig {rig}: name another --report")
+    for path in (rig, report):
+        if path.exists() and not overwrite:
+            raise StereoSfmError(f"{path} exists: choose another file or give --overwrite")
+        folder = next(p for p in path.absolute().parents if p.exists())
+        if not folder.is_dir() or not os.access(folder, os.W_OK):
+            raise StereoSfmError(f"cannot write {path}: {folder} is no folder that can be written to")
+    if report.is_dir():
+        raise StereoSfmError(f"cannot write the report {report}: it is a folder")
 
 
 def make_target(args: argparse.Namespace) -> Target:

@@ -18,6 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--max-frames", type=int, default=600, help="stop reading after so many frames")
     parser.add_argument("--search", type=int, default=14, metavar="ROWS", help="rows to search above and below")
     parser.add_argument("--correct", type=Path, default=None, metavar="FILE", help="write the corrected rig there")
+    parser.add_argument("--overwrite", action="store_true", help="replace the file of --correct")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
@@ -32,11 +33,12 @@ def run(args: argparse.Namespace) -> int:
     from calib.tracks import LONGEST, collect, corners_for
     from drivers.source import open_source
 
+    _check(args)
     with open_source(args.source) as source:
         rig = source.rig if args.rig is None else load_rig(args.rig)
         rectification = rectify(rig, "epipolar")
         total = min(source.frame_count or args.max_frames, args.max_frames)
-        gap = 0 if source.live else max(0, total // max(args.windows, 1) - LONGEST)
+        gap = 0 if source.live else max(0, total // args.windows - LONGEST)
         corners = corners_for(total, args.windows)
         images = itertools.islice(source, args.max_frames)
         report = check(rig, rectification, collect(images, rectification, args.windows, gap, corners, args.search))
@@ -47,6 +49,16 @@ def run(args: argparse.Namespace) -> int:
     else:
         print(as_text(report, str(args.source)))
     return 3 if report.verdict == "FAIL" else 0
+
+
+def _check(args: argparse.Namespace) -> None:
+    from stereo_sfm.errors import StereoSfmError
+
+    for option, value in (("--windows", args.windows), ("--max-frames", args.max_frames), ("--search", args.search)):
+        if value < 1:
+            raise StereoSfmError(f"{option} must be at least 1, not {value}")
+    if args.correct is not None and args.correct.exists() and not args.overwrite:
+        raise StereoSfmError(f"{args.correct} exists: choose another name or give --overwrite")
 
 
 def as_text(report: CheckReport, name: str) -> str:

@@ -45,12 +45,13 @@ def run(args: argparse.Namespace) -> int:
     with open_source(args.source) as source:
         rig = source.rig if args.rig is None else load_rig(args.rig)
         rectification = rectify(rig, args.projection, args.hfov, parse_size(args.size))
-        args.output.mkdir(parents=True, exist_ok=True)
-        save_rig(rectification.rig, args.output / "rig.yaml")
         for image in spread(source, args.frames):
             if image.right is None:
                 raise _error(f"frame {image.frame_id} has no right image")
             left, right = rectification.apply(image.left, image.right)
+            if not errors:  # only now: the first pair has shown that the calibration is for these images
+                args.output.mkdir(parents=True, exist_ok=True)
+                save_rig(rectification.rig, args.output / "rig.yaml")
             matches = match_pair(rectification, left, right)
             errors.append(matches.row_error)
             stem = args.output / f"pair_{image.frame_id:06d}"
@@ -59,11 +60,13 @@ def run(args: argparse.Namespace) -> int:
                 cv2.imwrite(f"{stem}_right.png", right)
             else:
                 cv2.imwrite(f"{stem}.png", side_by_side(left, right, matches))
+    if not errors:
+        raise _error(f"{args.source} gave no images")
     camera = rectification.rig.left
     fov = 2 * np.arctan(0.5 * camera.width / camera.fx) if args.projection == "pinhole" else camera.width / camera.fx
     print(f"{len(errors)} pairs in {args.output}, {args.projection} {camera.width}x{camera.height} px,", end=" ")
     print(f"{np.rad2deg(fov):.0f} degrees wide")
-    row = np.concatenate(errors) if errors else np.zeros(0)
+    row = np.concatenate(errors)
     if len(row) < 20:
         print(f"only {len(row)} matches: too few to measure the row error")
         return 0

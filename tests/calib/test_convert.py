@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from calib import Rig, load_rig, save_rig
-from calib.formats import FORMATS
+from calib.formats import FORMATS, recognise
+from calib.rectification import rectify
 from stereo_sfm.cli import main
 from stereo_sfm.commands.convert_calib import NAMES
 from stereo_sfm.geometry import se3
@@ -34,6 +35,13 @@ def test_there_and_back(tmp_path: Path, name: str, capsys: pytest.CaptureFixture
     np.testing.assert_allclose(back.left_T_right, rig.left_T_right, atol=1e-12)
     np.testing.assert_allclose(back.left.params, rig.left.params, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(back.right.params, rig.right.params, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", [n for n, (*_, folder) in FORMATS.items() if not folder])
+def test_a_file_is_known_by_its_content(tmp_path: Path, name: str) -> None:
+    rig = rectify(fisheye_rig(), "pinhole").rig if name == "kitti" else fisheye_rig()
+    save_rig(rig, tmp_path / "calibration", name)
+    assert recognise(tmp_path / "calibration") == name
 
 
 def test_depthai_reads_our_file_in_centimetres(tmp_path: Path) -> None:
