@@ -46,6 +46,8 @@ def run(args: argparse.Namespace) -> int:
         raise StereoSfmError("--resolution must be above 0 metres")
     if args.images and args.format != "colmap":
         raise StereoSfmError("--images goes with --format colmap")
+    if args.rig is not None and not args.images:
+        raise StereoSfmError("--rig goes with --images")
     if args.walk is not None and not args.images and args.format not in TRAJECTORY_FORMATS:
         raise StereoSfmError("--walk goes with --images and with trajectories")
     write = _write_trajectories if args.format in TRAJECTORY_FORMATS else _write_map

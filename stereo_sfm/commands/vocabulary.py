@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,7 @@ if TYPE_CHECKING:
 
 # What the package's vocabulary was trained on: `stereo-sfm vocabulary train -o FILE` makes it again.
 DEFAULT_SOURCES = tuple(f"sim:{scene}?people=0&seed={seed}" for seed in (101, 102) for scene in ("loop", "big"))
+IMAGES = 80  # of each source, about
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,7 +24,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "sources", nargs="*", default=list(DEFAULT_SOURCES), metavar="SOURCE", help="default: the package's own"
     )
     train.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="vocabulary file (.npz)")
-    train.add_argument("--images", type=int, default=80, metavar="N", help="images of each source, evenly spread")
+    train.add_argument("--overwrite", action="store_true", help="replace an existing file")
+    train.add_argument(
+        "--images", type=int, metavar="N", help="images of each source, evenly spread (default: about 80)"
+    )
     train.add_argument("--branching", type=int, default=10, help="children of a node of the tree")
     train.add_argument("--depth", type=int, default=4, help="levels of the tree")
     train.add_argument("--seed", type=int, default=0, help="of the clustering")
@@ -42,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _check_ranges(args: argparse.Namespace) -> None:
+def _check(args: argparse.Namespace) -> None:
     from stereo_sfm.errors import StereoSfmError
 
     for option, value, least in (
@@ -51,8 +56,10 @@ def _check_ranges(args: argparse.Namespace) -> None:
         ("--depth", args.depth, 1),
         ("--seed", args.seed, 0),
     ):
-        if value < least:
+        if value is not None and value < least:
             raise StereoSfmError(f"{option} must be at least {least}, not {value}")
+    if args.output.exists() and not args.overwrite:
+        raise StereoSfmError(f"{args.output} exists: choose another name or give --overwrite")
 
 
 def _train(args: argparse.Namespace) -> None:
@@ -60,7 +67,7 @@ def _train(args: argparse.Namespace) -> None:
     from stereo_sfm.loop.vocabulary import train
     from stereo_sfm.loop.vocabulary_file import save_vocabulary
 
-    _check_ranges(args)
+    _check(args)
     images = [d for source in args.sources for d in _descriptors(source, args.images)]
     if not images:
         raise StereoSfmError("the sources hold no image with enough texture to train from")
@@ -72,18 +79,27 @@ def _train(args: argparse.Namespace) -> None:
     )
 
 
-def _descriptors(spec: str, wanted: int) -> Iterator[U8]:
-    """(N, 32) of images that lie evenly over a source."""
+def spread(count: int, wanted: int | None) -> Sequence[int]:
+    """Which of `count` images to take; None is what the package's vocabulary was trained with."""
+    if wanted is None:
+        return range(0, count, max(count // IMAGES, 1))
+    return [k * count // min(wanted, count) for k in range(min(wanted, count))]
+
+
+def _descriptors(spec: str, wanted: int | None) -> Iterator[U8]:
+    """(N, 32) of images that lie evenly over a source; of the first ones where nobody knows how many it has."""
     from drivers.sim.source import SimSource
     from drivers.source import open_source
     from stereo_sfm.loop.still import still_keyframe
 
     with open_source(spec) as source:
-        every = max((source.frame_count or wanted) // wanted, 1)
+        chosen = spread(source.frame_count or wanted or IMAGES, wanted)
         if isinstance(source, SimSource):  # the simulator renders any frame alone
-            images = (source.frame(int(k)) for k in source.frame_ids[::every])
+            images = (source.frame(int(k)) for k in source.frame_ids[chosen])
         else:
-            images = (image for n, image in enumerate(source) if n % every == 0)
+            wanted_ones = set(chosen)
+            first = islice(source, max(chosen, default=-1) + 1)
+            images = (image for n, image in enumerate(first) if n in wanted_ones)
         for image in images:
             keyframe = still_keyframe(image, source.rig)
             if keyframe is not None:

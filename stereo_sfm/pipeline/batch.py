@@ -9,6 +9,7 @@ import time
 import traceback
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,15 @@ class BatchTask:
 def names(recordings: Sequence[str]) -> list[str]:
     """A folder name for each recording, unique and in order."""
     stems = [Path(r).stem or r for r in recordings]
-    return [s if stems.count(s) == 1 else f"{s}_{stems[:k].count(s) + 1}" for k, s in enumerate(stems)]
+    taken = {s for s in stems if stems.count(s) == 1}
+    out: list[str] = []
+    for stem in stems:
+        name = stem
+        if stems.count(stem) > 1:
+            name = next(f"{stem}_{k}" for k in count(1) if f"{stem}_{k}" not in taken)
+            taken.add(name)
+        out.append(name)
+    return out
 
 
 def run_one(task: BatchTask) -> dict[str, Any]:

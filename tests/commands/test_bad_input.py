@@ -9,11 +9,16 @@ from pathlib import Path
 import cv2
 import pytest
 
+from calib import save_rig
 from stereo_sfm.cli import main
+from stereo_sfm.pipeline.batch import names
 from tests.drivers.dataset_folders import make_euroc, make_images, make_kitti, make_tum_rgbd
+from tests.synthetic import fisheye_rig
 
 Outcome = tuple[int, str, str]
 Run = Callable[..., Outcome]
+
+TARGET = ("--target", "checkerboard", "--columns", "9", "--rows", "6", "--square", "0.02")
 
 
 @pytest.fixture
@@ -364,3 +369,85 @@ def test_a_map_is_not_written_over_something_else(cli: Run, tmp_path: Path, comm
     assert_one_line(cli("map", *command, "-o", "run", "--overwrite"), "run exists and is no map")
     assert_one_line(cli("map", *command, "-o", "run/rig.yaml"), "exists and is no map")
     assert (tmp_path / "run" / "rig.yaml").read_text() == "years of work"
+
+
+@pytest.mark.parametrize("option", ["--max-frames", "--search", "--windows"])
+@pytest.mark.parametrize("value", [0, -3])
+def test_check_calib_of_nothing(cli: Run, option: str, value: int) -> None:
+    assert_one_line(cli("check-calib", "sim:aisle?frames=3", option, value), f"{option} must be at least 1")
+
+
+@pytest.mark.parametrize("frames", [1, 2])
+def test_check_calib_of_hardly_anything(cli: Run, frames: int) -> None:
+    assert cli("check-calib", "sim:aisle?frames=3&size=300x280", "--max-frames", frames)[0] in (0, 3)
+
+
+@pytest.mark.parametrize("address", ["nonsense", "10.0.0.1:6379"])
+def test_batch_without_its_cluster(cli: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, address: str) -> None:
+    ray = pytest.importorskip("ray")
+
+    def init(**_: object) -> None:
+        raise ConnectionError("Failed to connect to Ray cluster\nCheck that")
+
+    if address != "nonsense":
+        monkeypatch.setattr(ray, "init", init)
+    data = make_images(tmp_path / "data")
+    assert_one_line(cli("batch", data, "-o", "out", "--address", address), f"no Ray cluster at {address}")
+
+
+def test_names_of_a_batch_are_unique() -> None:
+    assert names(["d1/a.mcap", "d2/a.mcap", "a_1.mcap"]) == ["a_2", "a_3", "a_1"]
+
+
+def test_export_takes_a_rig_only_for_pictures(cli: Run, tmp_path: Path) -> None:
+    (tmp_path / "map").mkdir()
+    assert_one_line(cli("export", "map", "--format", "colmap", "--rig", "rig.yaml"), "--rig goes with --images")
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        ("vocabulary", "train", "data", "-o", "file"),
+        ("check-calib", "data", "--correct", "file"),
+        ("viz", "data.mcap", "--save", "file"),
+        ("calibrate", "data", *TARGET, "-o", "file"),
+        ("calibrate", "data", *TARGET, "-o", "rig.yaml", "--report", "file"),
+    ],
+)
+def test_files_are_replaced_only_when_asked(cli: Run, tmp_path: Path, args: tuple[str, ...]) -> None:
+    make_images(tmp_path / "data")
+    (tmp_path / "file").write_text("years of work")
+    (tmp_path / "data.mcap").write_text("")
+    assert_one_line(cli(*args), "file exists", "--overwrite")
+    assert (tmp_path / "file").read_text() == "years of work"
+
+
+@pytest.mark.parametrize(
+    ("args", "word"),
+    [
+        (("-o", "cal3.html"), "would replace the rig"),
+        (("-o", "rig.yaml", "--report", "file/x.html"), "cannot write file/x.html"),
+        (("-o", "file/rig.yaml"), "cannot write file/rig.yaml"),
+        (("-o", "rig.yaml", "--report", "data", "--overwrite"), "it is a folder"),
+    ],
+)
+def test_calibrate_knows_before_it_searches_where_it_cannot_write(
+    cli: Run, tmp_path: Path, args: tuple[str, ...], word: str
+) -> None:
+    make_images(tmp_path / "data")
+    (tmp_path / "file").write_text("years of work")
+    assert_one_line(cli("calibrate", "data", *TARGET, *args), word)
+
+
+def test_calibrate_into_an_unknown_format(cli: Run, tmp_path: Path) -> None:
+    code, _, err = cli("calibrate", make_images(tmp_path / "data"), *TARGET, "-o", "rig.yaml", "--format", "nope")
+    assert code == 2 and "invalid choice: 'nope'" in err
+
+
+def test_rectify_with_a_wrong_calibration_replaces_nothing(cli: Run, tmp_path: Path) -> None:
+    make_images(tmp_path / "data")
+    save_rig(fisheye_rig(), tmp_path / "wrong.yaml")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "rig.yaml").write_text("years of work")
+    assert_one_line(cli("rectify", "data", "-o", "out", "--overwrite", "--rig", "wrong.yaml"))
+    assert (tmp_path / "out" / "rig.yaml").read_text() == "years of work"

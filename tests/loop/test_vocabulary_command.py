@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from stereo_sfm.cli import main
+from stereo_sfm.commands.vocabulary import spread
 from stereo_sfm.loop.vocabulary_file import load_vocabulary
 
 
@@ -40,3 +41,10 @@ def test_numbers_out_of_range_are_refused(
     assert main(train) == 2
     assert capsys.readouterr().err == f"stereo-sfm vocabulary: {option} must be at least {least}, not {least - below}\n"
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("count", "wanted"), [(99, 50), (7, 3), (3, 7), (5, 5), (0, 4), (10, 1)])
+def test_as_many_images_as_asked_for(count: int, wanted: int) -> None:
+    chosen = spread(count, wanted)
+    assert len(set(chosen)) == min(wanted, count)
+    assert set(chosen) <= set(range(count))
