@@ -89,8 +89,12 @@ class Correction:
 
     @property
     def shows_focal(self) -> bool:
-        """Whether there is enough motion to tell the focal length of both eyes from the lenses' imperfection."""
-        return self.travel > 0.04 and float(self.amount_sigma[FOCAL_BOTH]) < 0.007
+        """Whether there is enough motion to tell the focal length of both eyes from the lenses' imperfection.
+
+        One window does not show it: its matches err together, which their deviation does not say.
+        """
+        several = len(self.explained) > 1
+        return several and self.travel > 0.04 and float(self.amount_sigma[FOCAL_BOTH]) < 0.007
 
     def apply(self, rig: Rig) -> Rig:
         """The rig turned and magnified as the images ask for; the focal length of both only if the motion shows it."""

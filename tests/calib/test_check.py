@@ -118,6 +118,12 @@ def test_a_still_camera_does_not_show_the_focal_length_of_both_eyes() -> None:
     assert finding(check(one, rectify(one), still), "focal length, right against left").level == 2
 
 
+def test_one_window_does_not_show_the_focal_length_of_both_eyes() -> None:
+    rig = magnified(RIGS["pinhole"], 0.98, 0.98)
+    both = [finding(check(rig, rectify(rig), SEEN["pinhole"][:n]), "focal length, both eyes") for n in (1, 2)]
+    assert [(f.judged, f.level) for f in both] == [(False, 0), (True, 2)]
+
+
 def finding(report: CheckReport, name: str) -> Finding:
     return next(f for f in report.findings if f.name == name)
 
