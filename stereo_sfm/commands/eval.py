@@ -142,10 +142,13 @@ def _with_stamps(path: Path, other: Trajectory) -> Trajectory:
 
 
 def _pose_frame(path: Path) -> str:
-    """Whose poses the heading of a file names: "cam0", "body", or "" where it says nothing."""
+    """Whose poses a file holds, "cam0" or "body", by its heading or else by its run; "" where nothing says it."""
     with path.open() as stream:
         found = re.search(r"world_T_(cam0|body)", stream.readline())
-    return found[1] if found else ""
+    if found:
+        return found[1]
+    stats = path.parent / "stats.json"
+    return json.loads(stats.read_text()).get("frame", "") if path.suffix == ".kitti" and stats.is_file() else ""
 
 
 def _in_cam0(bodies: Trajectory, path: Path) -> Trajectory:

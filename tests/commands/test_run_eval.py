@@ -103,6 +103,7 @@ def test_eval_of_body_poses(
     assert ate(camera, "--ref", body, capsys=capsys) < 1e-6
     assert ate(body, "--ref", camera, capsys=capsys) < 1e-6
     assert ate(body, "--ref", body, capsys=capsys) < 1e-6
+    assert ate(body.with_suffix(".kitti"), "--ref", camera, capsys=capsys) < 1e-6  # has no heading
     (folder / "rig.yaml").unlink()
     assert main(["eval", str(body), "--ref", str(source)]) == 2
     assert "poses of the body, and no rig.yaml" in capsys.readouterr().err
