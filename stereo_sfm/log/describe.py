@@ -100,15 +100,17 @@ def describe_file(path: Path) -> Description:
 
 def _describe_file(path: Path) -> Description:
     with LogReader(path) as reader:
-        first, last = reader.time_range
+        stamps = {topic.topic: reader.stamps(topic.topic) for topic in reader.topics}
+        ends = [(int(x[0]), int(x[-1])) for name, x in stamps.items() if name != topics.GROUND_TRUTH and len(x)]
+        seconds = (max(last for _, last in ends) - min(first for first, _ in ends)) / 1e9 if ends else 0.0
         out = Description(
-            str(path), "mcap", (last - first) / 1e9, path.stat().st_size, truncated=reader.truncated,
+            str(path), "mcap", seconds, path.stat().st_size, truncated=reader.truncated,
             metadata=reader.metadata(METADATA),
         )  # fmt: skip
         config = reader.attachment(CONFIG_FILE)
         out.config_sha256 = config_hash(config.decode()) if config is not None else ""
         for topic in reader.topics:
-            out.rows.append((topic.topic, topic.schema or topic.encoding, rate_of(reader.stamps(topic.topic))))
+            out.rows.append((topic.topic, topic.schema or topic.encoding, rate_of(stamps[topic.topic])))
             out.messages += topic.count
         _describe_infos(out, reader)
         lean = out.metadata.get("image_format") == "none"

@@ -25,7 +25,7 @@ from tests.drivers.dataset_folders import make_images
 @pytest.fixture(scope="module")
 def euroc_run(data_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run over 30 frames of EuRoC MH01."""
-    folder = tmp_path_factory.mktemp("runs") / "mh01"
+    folder = tmp_path_factory.mktemp("euroc") / "runs" / "mh01"
     assert main(["run", "--inline", str(data_root / "euroc_mh01"), "-o", str(folder), "--max-frames", "30", "-q"]) == 0
     return folder
 
@@ -222,3 +222,14 @@ def test_python_api_of_the_readme(data_root: Path) -> None:
             if len(stamps) == 3:
                 break
     assert stamps == sorted(stamps) and len(stamps) == 3
+
+
+def test_a_part_of_a_source_lasts_as_long_as_its_images(
+    data_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The truth in the file goes on to the source's end."""
+    path = str(tmp_path / "part.mcap")
+    assert main(["convert", str(data_root / "kitti"), "-o", path, "--max-frames", "3", "-q"]) == 0
+    capsys.readouterr()
+    assert main(["info", path]) == 0
+    assert f"{path}: 0.21 s" in capsys.readouterr().out
