@@ -16,6 +16,8 @@ from stereo_sfm.eval.associate import MAX_DIFFERENCE_NS, associate
 from stereo_sfm.eval.metrics import Drift, RetailErrors, Statistics
 from stereo_sfm.types import F64, Trajectory
 
+STRAIGHT = 0.02  # extent of a path aside, as a share of its extent along, below which it counts as a line
+
 
 @dataclass(frozen=True)
 class Evaluation:
@@ -130,6 +132,13 @@ def _pairs(reference: F64, delta: str) -> metrics.I64:
     raise StereoSfmError(f"--delta takes frames or metres, as in 1f or 0.5m, got '{delta}'")
 
 
+def _leaning(result: Evaluation) -> str:
+    """Said where positions hardly say how the paths lie to each other about their own direction."""
+    spread = np.linalg.svd(result.reference.positions - result.reference.positions.mean(0), compute_uv=False)
+    straight = result.mode != "origin" and spread[1] < STRAIGHT * spread[0]
+    return " (the path is nearly straight: the alignment leaves the turn about it open)" if straight else ""
+
+
 def table(result: Evaluation) -> list[tuple[str, str]]:
     """What is said, line by line, as (name, value with unit)."""
     ape, angle = result.ape_m, result.ape_deg
@@ -137,7 +146,7 @@ def table(result: Evaluation) -> list[tuple[str, str]]:
         ("compared", f"{result.frames} frames over {length(result.length_m)}, alignment {result.mode}"),
         ("ATE", f"{length(ape.rmse)} rmse, {length(ape.max)} max ({result.ate_percent:.3f} % of the path)"),
         ("ATE, Sim(3)", f"{length(result.ate_sim3_m)} rmse, scale {result.sim3_scale:.5f}"),
-        ("rotation", f"{angle.rmse:.3f} deg rmse, {angle.max:.3f} deg max"),
+        ("rotation", f"{angle.rmse:.3f} deg rmse, {angle.max:.3f} deg max{_leaning(result)}"),
         (f"RPE per {result.rpe_delta}", _relative(result)),
     ]
     if result.drift is not None:

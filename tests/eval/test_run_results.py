@@ -10,6 +10,7 @@ import numpy as np
 
 from calib.rig import Rig
 from stereo_sfm.config import Config
+from stereo_sfm.eval.evaluate import evaluate, table
 from stereo_sfm.eval.record import KeyframeRow, RunRecord
 from stereo_sfm.eval.run_results import scale_free, write_results
 from stereo_sfm.eval.statistics import failure, summary
@@ -142,3 +143,13 @@ def test_one_pose_is_compared_with_nothing(tmp_path: Path) -> None:
     record = record_of(walk()[:1], 0)
     _, lines, report = results(tmp_path, record, pinhole_rig(), Config())
     assert not any("ground truth" in line or "nan" in line for line in lines) and "nan" not in report
+
+
+def test_a_straight_path_says_that_its_rotation_is_open(tmp_path: Path) -> None:
+    truth = np.tile(np.eye(4), (COUNT, 1, 1))
+    truth[:, 2, 3] = np.arange(COUNT) * 0.1
+    truth[:, 0, 3] = 1e-4 * np.sin(np.arange(COUNT))
+    straight, curved = (Trajectory(np.arange(COUNT) * 10**8, poses) for poses in (truth, walk()))
+    for path, said in ((straight, True), (curved, False)):
+        rows = dict(table(evaluate(path, path)))
+        assert ("nearly straight" in rows["rotation"]) == said
