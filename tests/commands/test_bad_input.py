@@ -382,15 +382,22 @@ def test_check_calib_of_hardly_anything(cli: Run, frames: int) -> None:
     assert cli("check-calib", "sim:aisle?frames=3&size=300x280", "--max-frames", frames)[0] in (0, 3)
 
 
-@pytest.mark.parametrize("address", ["nonsense", "10.0.0.1:6379"])
-def test_batch_without_its_cluster(cli: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, address: str) -> None:
+@pytest.mark.parametrize(
+    ("address", "error"),
+    [
+        ("nonsense", ValueError("Malformed address: nonsense")),
+        ("10.0.0.1:6379", ConnectionError("Failed to connect to Ray cluster\nCheck that")),
+    ],
+)
+def test_batch_without_its_cluster(
+    cli: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, address: str, error: Exception
+) -> None:
     ray = pytest.importorskip("ray")
 
     def init(**_: object) -> None:
-        raise ConnectionError("Failed to connect to Ray cluster\nCheck that")
+        raise error
 
-    if address != "nonsense":
-        monkeypatch.setattr(ray, "init", init)
+    monkeypatch.setattr(ray, "init", init)
     data = make_images(tmp_path / "data")
     assert_one_line(cli("batch", data, "-o", "out", "--address", address), f"no Ray cluster at {address}")
 
