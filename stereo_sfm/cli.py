@@ -10,6 +10,7 @@ import sys
 from collections.abc import Sequence
 
 from stereo_sfm import __version__
+from stereo_sfm.commands._stop import INTERRUPTED
 from stereo_sfm.errors import StereoSfmError, from_os_error
 
 # subcommand -> what `--help` says; the code is in stereo_sfm/commands/<name with _ for ->.py
@@ -111,7 +112,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return said.exit_code
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
-        return 130
+        return INTERRUPTED
 
 
 if __name__ == "__main__":

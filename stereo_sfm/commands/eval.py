@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -143,10 +142,11 @@ def _with_stamps(path: Path, other: Trajectory) -> Trajectory:
 
 def _pose_frame(path: Path) -> str:
     """Whose poses a file holds, "cam0" or "body", by its heading or else by its run; "" where nothing says it."""
-    with path.open() as stream:
-        found = re.search(r"world_T_(cam0|body)", stream.readline())
-    if found:
-        return found[1]
+    from stereo_sfm.export.trajectories import named_pose
+
+    named = named_pose(path, "").removeprefix("world_T_")
+    if named:
+        return named
     stats = path.parent / "stats.json"
     return json.loads(stats.read_text()).get("frame", "") if path.suffix == ".kitti" and stats.is_file() else ""
 

@@ -122,9 +122,10 @@ def _prune(args: argparse.Namespace) -> int:
 
 def _check_free(args: argparse.Namespace) -> None:
     from stereo_sfm.errors import StereoSfmError
+    from stereo_sfm.export.run_folder import is_free
 
     if (args.output / "map.json").exists():
         if not args.overwrite:
             raise StereoSfmError(f"{args.output} holds a map: choose another -o, or say --overwrite")
-    elif args.output.exists() and not (args.output.is_dir() and not any(args.output.iterdir())):
+    elif not is_free(args.output):
         raise StereoSfmError(f"{args.output} exists and is no map: choose another -o")

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stereo_sfm.commands._stop import INTERRUPTED, StopRequest
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import StereoSfmError, from_os_error
 from stereo_sfm.presets import PRESETS, preset
 
 if TYPE_CHECKING:
@@ -271,8 +271,9 @@ def _follow(
                     session.stop()
         except KeyboardInterrupt:
             return True, None
-        except StereoSfmError as error:
-            if not len(record.frames):
+        except (StereoSfmError, OSError) as error:
+            said = from_os_error(error) if isinstance(error, OSError) else error
+            if said is None or not len(record.frames):
                 raise
-            return False, error
+            return False, said
         return stop.asked, None

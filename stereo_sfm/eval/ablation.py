@@ -23,6 +23,7 @@ from stereo_sfm.config import Config, load
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.eval.evaluate import evaluate
 from stereo_sfm.eval.record import RunRecord
+from stereo_sfm.eval.statistics import stage_times
 from stereo_sfm.presets import preset
 from stereo_sfm.types import Trajectory
 
@@ -146,7 +147,6 @@ def run_cell(cell: Cell) -> dict[str, Any]:
 def _describe(record: RunRecord, wall_s: float) -> dict[str, Any]:
     tracked = record.tracked()
     lost = Counter(record.frames.reasons_of(~tracked))
-    track_ms = record.times().get("track", np.zeros(0))
     return {
         "frames": len(tracked),
         "tracked": int(tracked.sum()),
@@ -155,7 +155,7 @@ def _describe(record: RunRecord, wall_s: float) -> dict[str, Any]:
         "map_points": len(record.map_points),
         "loops": len(record.loops),
         "rejected_loops": dict(sorted(record.rejections.items())),
-        "track_ms": float(np.nanmedian(track_ms)) if len(track_ms) else None,
+        "track_ms": stage_times(record).get("track", {}).get("p50"),
         "frame_ms": 1e3 * wall_s / max(len(tracked), 1),
     }
 

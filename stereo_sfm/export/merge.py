@@ -64,8 +64,10 @@ def merge(
     loops: list[LoopResult] = []
     fused = 0
     if place is not None:
-        kf_ids, pt_ids = (int(ids.max()) + 1 for ids in (maps[0].snapshot.kf_ids, maps[0].snapshot.pt_ids))
-        known = dataclasses.replace(place, kf_id=place.kf_id + kf_ids, matches=place.matches + np.array([0, pt_ids]))
+        raised = np.array([0, _ends(maps, "pt_ids")[0]])
+        known = dataclasses.replace(
+            place, kf_id=place.kf_id + int(_ends(maps, "kf_ids")[0]), matches=place.matches + raised
+        )
         done = apply_loop(map_, known, [], config)
         if done.applied:
             loops.append(known)
@@ -109,9 +111,14 @@ def _same_walk(a: dict[int, set[tuple[float, float]]], b: dict[int, set[tuple[fl
     return same > SAME_SHARE * sum(min(len(a[t]), len(b[t])) for t in times)
 
 
+def _ends(maps: Sequence[SavedMap], ids: str) -> I64:
+    """(maps,) above which the ids of the next map begin when `joined` has raised them."""
+    return np.cumsum([int(getattr(saved.snapshot, ids).max()) + 1 for saved in maps])
+
+
 def _check_joined(maps: Sequence[SavedMap], loops: list[LoopResult]) -> None:
     """Every map must hang together with the first one."""
-    ends = np.cumsum([int(saved.snapshot.kf_ids.max()) + 1 for saved in maps])  # of the raised keyframe ids
+    ends = _ends(maps, "kf_ids")
     group = np.arange(len(maps))
     for loop in loops:
         a, b = group[np.searchsorted(ends, [loop.candidate_kf_id, loop.kf_id], side="right")]

@@ -14,9 +14,8 @@ def replaced_folder(folder: Path, names: frozenset[str]) -> Generator[Path]:
     """An empty folder to write into; at the end of the block it takes the place of `folder`.
 
     Until then what lies in `folder` is untouched, and it stays so when the block raises or the process is killed
-    (between the two renames at the end it is called .NAME.old). A
-    folder that holds other files than `names`, or cannot be renamed (a mount, the working directory), stays as it is
-    and gets the new files one after the other.
+    (between the two renames at the end it is called .NAME.old). A folder that holds other files than `names`, or cannot
+    be renamed (a mount, the working directory), stays as it is and gets the new files one after the other.
     """
     folder = folder.resolve()
     folder.parent.mkdir(parents=True, exist_ok=True)

@@ -23,6 +23,11 @@ def default_folder(source_name: str, now: datetime) -> Path:
     return Path("runs") / f"{now:%Y-%m-%d_%H%M%S}_{slug}"
 
 
+def is_free(folder: Path) -> bool:
+    """Whether nothing is there, or an empty folder."""
+    return not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
+
+
 def prepare_folder(folder: Path, overwrite: bool) -> None:
     """Make the folder of a new run; an empty one will do.
 
@@ -33,8 +38,7 @@ def prepare_folder(folder: Path, overwrite: bool) -> None:
         StereoSfmError: it holds something that may not be overwritten, or cannot be made.
     """
     try:
-        free = not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
-        if not (free or overwrite):
+        if not (overwrite or is_free(folder)):
             raise StereoSfmError(f"{folder} exists: choose another -o, or say --overwrite")
         folder.mkdir(parents=True, exist_ok=True)
         discard_files(folder)

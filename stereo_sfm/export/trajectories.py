@@ -27,14 +27,14 @@ def write_tum(path: Path, trajectory: Trajectory, what: str = "world_T_cam0") ->
     path.write_text("\n".join(lines) + "\n")
 
 
-def named_pose(path: Path) -> str:
-    """What the heading of a file by `write_tum` says its poses are: "world_T_body"; without one they are the camera's.
+def named_pose(path: Path, otherwise: str = "world_T_cam0") -> str:
+    """What the heading of a trajectory file says its poses are, "world_T_cam0" or "world_T_body".
 
-    A file that somebody else wrote may have any heading, or none.
+    A file that somebody else wrote may have any heading, or none: then `otherwise`.
     """
     with path.open() as stream:
-        found = re.match(r"#\s*(world_T_\w+):", stream.readline())
-    return found[1] if found else "world_T_cam0"
+        found = re.match(r"#.*\b(world_T_(?:cam0|body))\b", stream.readline())
+    return found[1] if found else otherwise
 
 
 def write_kitti(path: Path, poses: F64) -> None:

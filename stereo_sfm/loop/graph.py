@@ -110,16 +110,15 @@ class KeyframeGraph:
         group = np.array([self._joined[chain] for chain in self._chains[: self._count].tolist()])
         ours = {self._joined[self._chain[a]], self._joined[self._chain[b]]}
         gaps = [
-            (int(self._stamps[k + 1] - self._stamps[k]), k)
+            (int(self._stamps[k + 1] - self._stamps[k]), k, velocity)
             for k in np.flatnonzero(group[1:] != group[:-1]).tolist()
             if {group[k], group[k + 1]} == ours
+            and self._stamps[k + 1] > self._stamps[k]
+            and (velocity := self._velocity(k)) is not None
         ]
-        gaps = [(ns, k) for ns, k in gaps if ns > 0 and self._velocity(k) is not None]
         if not gaps:
             return None
-        ns, k = min(gaps)
-        velocity = self._velocity(k)
-        assert velocity is not None
+        ns, k, velocity = min(gaps, key=lambda gap: gap[:2])
         if self._joined[self._chain[a]] != group[k]:
             a, b, a_T_b = b, a, se3.inverse(a_T_b)
         before, after = self.way(int(self._ids[k]), a), self.way(b, int(self._ids[k + 1]))

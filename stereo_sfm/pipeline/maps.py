@@ -50,8 +50,9 @@ class MapFolders:
                 why = "may not be written to" if above.is_dir() else "is no folder"
                 raise StereoSfmError(f"cannot make --map-out {self.map_out}: {above} {why}")
 
-    def recorded(self, opening: Opening) -> Opening:
-        """How a run began, with the map that it began with."""
+    def opening(self, opener: object) -> Opening:
+        """How a run begins: as its opener says, if it says anything, with the map that it begins with."""
+        opening: Opening = getattr(opener, "opening", Opening())
         if self.map_in is None:
             return opening
         place, sha256 = str(self.map_in.resolve()), map_sha256(self.map_in)
@@ -85,7 +86,8 @@ def save_result(mapper: AnyMapper, config: Config, rig: Rig, folders: MapFolders
 
     Raises:
         StereoSfmError: it cannot be merged, and the walk's own map was written instead (beside `map_out` where that is
-            the map it should have been merged with); or the disk does not take it.
+            the map it should have been merged with).
+        OSError: the disk does not take it.
     """
     from stereo_sfm.mapping.mapper import Mapper
 
@@ -106,10 +108,7 @@ def save_result(mapper: AnyMapper, config: Config, rig: Rig, folders: MapFolders
         except StereoSfmError as error:
             out = _beside(out) if out.resolve() == folders.map_in.resolve() else out
             failure = f"not merged with {folders.map_in}: {error}; {out} is this walk alone"
-    try:
-        save_map(saved, out)
-    except OSError as error:
-        raise StereoSfmError(f"the map cannot be written to {out}: {error.strerror}") from None
+    save_map(saved, out)
     if failure:
         raise StereoSfmError(failure)
 

@@ -22,7 +22,6 @@ from typing import Any, Self
 
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.log.provenance import Opening
 from stereo_sfm.pipeline import workers
 from stereo_sfm.pipeline.capture import SourceInfo
 from stereo_sfm.pipeline.channels import DroppingOutbox, End, Failed, Outbox
@@ -221,7 +220,7 @@ class ProcessRun:
             realtime=realtime,
             folders=self._folders,
             delays=self._delays,
-            opening=self._folders.recorded(getattr(self._opener, "opening", Opening())),
+            opening=self._folders.opening(self._opener),
         )
         jpeg = self._log is not None and self._log.image_format == "jpeg"
         for stage, control in self._controls.items():

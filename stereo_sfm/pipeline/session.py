@@ -15,7 +15,6 @@ from drivers.source import Source
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.run_folder import default_folder, discard_files, prepare_folder
-from stereo_sfm.log.provenance import Opening
 from stereo_sfm.pipeline.capture import SourceInfo
 from stereo_sfm.pipeline.inline import run_inline
 from stereo_sfm.pipeline.maps import MapFolders
@@ -164,7 +163,7 @@ class Session:
                 LogWriter(options.path, compress=options.image_format != "raw"), source.rig, self._config,
                 source=self._spec or source.name, mode="inline",
                 image_format=options.image_format, ground_truth=source.ground_truth,
-                opening=self._folders.recorded(getattr(self._opener, "opening", Opening())),
+                opening=self._folders.opening(self._opener),
             )  # fmt: skip
             stack.callback(log.close)
             sinks.append(log)
