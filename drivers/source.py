@@ -10,6 +10,7 @@ from typing import Any, Protocol, Self
 from urllib.parse import parse_qsl
 
 from calib.rig import Rig
+from drivers.rig_option import RigOption
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import StereoImage, Trajectory
 
@@ -72,17 +73,20 @@ def _factory(name: str) -> Callable[..., Source]:
     return getattr(importlib.import_module(module), attribute)
 
 
-def open_source(spec: str | Path, **options: Any) -> Source:
+def open_source(spec: str | Path, rig: RigOption = None, **options: Any) -> Source:
     """Open a source by name.
 
     Args:
         spec: `sim:loop?camera=pinhole&seed=3`, `t265`, `oak`, a folder (its kind is recognised), an .mcap file, or
             `kind:path` to say the kind.
+        rig: calibration instead of the source's own, or a file of one.
         **options: passed to the driver; options in the spec's query come as strings.
 
     Raises:
         StereoSfmError: unknown name, missing folder, unrecognised folder, or whatever the driver finds wrong.
     """
+    if rig is not None:
+        options["rig"] = rig
     text = str(spec)
     kind, colon, rest = text.partition(":")
     if kind in TABLE and (colon or text == kind):

@@ -107,7 +107,7 @@ def load_reference(spec: str, opening: Opening) -> tuple[Trajectory, Path | None
     path = Path(spec).expanduser()
     if path.is_file() and path.suffix != ".mcap":
         return read_trajectory(path), path
-    source = open_source(spec, **({"rig": opening.rig} if opening.rig is not None else {}))
+    source = open_source(spec, opening.rig)
     with rectified(source, RECTIFY[opening.rectify]) as opened:
         if opened.ground_truth is None:
             raise StereoSfmError(f"{opened.name} has no ground truth")

@@ -178,7 +178,7 @@ class SourceChoice:
         from drivers.select import SelectedFrames
         from drivers.source import open_source
 
-        source = open_source(self.spec, **({"rig": self.rig} if self.rig is not None else {}))
+        source = open_source(self.spec, self.rig)
         if (self.start, self.duration, self.frame_skip, self.max_frames) != (0.0, float("inf"), 1, None):
             source = SelectedFrames(source, self.start, self.duration, self.frame_skip, self.max_frames)
         source = rectified(source, RECTIFY[self.rectify])

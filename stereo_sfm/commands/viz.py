@@ -72,7 +72,7 @@ def _images(reader: LogReader, path: Path, spec: str | None) -> Source:
     if spec is None:
         return open_source(path)
     opening = read_opening(reader)
-    source = open_source(spec, **({"rig": opening.rig} if opening.rig is not None else {}))
+    source = open_source(spec, opening.rig)
     return rectified(source, RECTIFY[opening.rectify])
 
 

@@ -28,7 +28,7 @@ def open_pictures(spec: str, map_rig: Rig, own_rig: Rig | None = None) -> Source
     Raises:
         StereoSfmError: it was not taken with this camera.
     """
-    source = open_source(spec, **({} if own_rig is None else {"rig": own_rig}))
+    source = open_source(spec, own_rig)
     for how in PROJECTIONS:
         try:
             seen = rectified(source, how)
