@@ -142,6 +142,7 @@ class LoopConfig:
     connected_points: int = 15  # shared points that make two keyframes connected
     min_gap: int = 10  # keyframes between a keyframe and its candidate
     max_candidates: int = 3  # places verified per keyframe
+    corners: int = 400  # a keyframe is known by: points followed by flow are seldom detected again (0: known by those)
     proximity: bool = True  # verify also the old keyframe that should be nearest by odometry
     pause: int = 10  # keyframes after an accepted loop in which none is searched
     min_match_fraction: float = 0.15  # of the keyframe's points that must match the candidate's (paper: 0.3)
@@ -151,12 +152,11 @@ class LoopConfig:
     disparity_sigma: float = above_zero(0.5)  # px, of a stereo point's disparity
     ransac_iterations: int = above_zero(400)
     min_inliers: int = above_zero(30)
-    min_inlier_share: float = 0.1  # ... and of the keyframe's described points
+    min_inlier_share: float = 0.15  # ... and of the keyframe's corners
     min_cells: int = 8  # of the 8 x 6 cells of the image that hold inliers
     consistent: int = 2  # successive keyframes that must agree on a loop
     consistent_window: int = 4  # ... within so many keyframes
-    unknown_way_share: float = 0.2  # share of inliers where tracking broke and odometry cannot speak for a loop
-    gap_metres: float = 1.4  # ... unless the robot cannot be further off than this from where it is expected
+    unknown_way_share: float = 0.3  # share of inliers where tracking broke and odometry cannot speak for a loop
     gate_metres: float = 0.3  # a loop may contradict odometry by this much ...
     gate_per_metre: float = 0.01  # ... plus this for every metre walked since
     gate_degrees: float = 3.0
@@ -164,7 +164,7 @@ class LoopConfig:
     relocalize_candidates: int = 16  # places of a saved map that are verified
     relocalize_keyframes: int = 6  # keyframes whose points make up a place
     relocalize_inliers: int = 56  # points that must agree with the pose found in a saved map
-    relocalize_share: float = 0.08  # ... and so large a share of the camera's described points
+    relocalize_share: float = 0.25  # ... and so large a share of the camera's corners (near a guess: min_inlier_share)
     relocalize_cells: int = 6  # ... in so many of the image's 8 x 6 cells
     seed: int = 0
 

@@ -129,6 +129,29 @@ class Frame(Message):
 
 
 @dataclass(frozen=True, eq=False)
+class Corners(Message):
+    """Corners that a detector finds again when it sees the place again: what place recognition knows a keyframe by."""
+
+    uv_left: F32  # (N, 2) px
+    uv_right: F32  # (N, 2) px
+    points_cam: F32  # (N, 3) metres in the keyframe's camera
+    descriptors: U8  # (N, 32) binary (oriented BRIEF)
+
+    @staticmethod
+    def none() -> Corners:
+        uv, xyz = np.zeros((0, 2), np.float32), np.zeros((0, 3), np.float32)
+        return Corners(uv, uv.copy(), xyz, np.zeros((0, 32), np.uint8))
+
+    def __len__(self) -> int:
+        return len(self.uv_left)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all columns."""
+        return self.uv_left.nbytes + self.uv_right.nbytes + self.points_cam.nbytes + self.descriptors.nbytes
+
+
+@dataclass(frozen=True, eq=False)
 class Keyframe(Message):
     """A frame that enters the map, with what place recognition and mapping need."""
 
@@ -144,6 +167,7 @@ class Keyframe(Message):
     angles: F32  # (N,) radians, orientation of the descriptor's patch
     submap_id: int = 0  # grows when tracking restarts after it was lost
     covariance: F64 = field(default_factory=lambda: np.eye(6))  # (6, 6) of the pose relative to the previous keyframe
+    corners: Corners = field(default_factory=Corners.none)  # none: the points themselves would be detected again
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +13,6 @@ if TYPE_CHECKING:
 
 # What the package's vocabulary was trained on: `stereo-sfm vocabulary train -o FILE` makes it again.
 DEFAULT_SOURCES = tuple(f"sim:{scene}?people=0&seed={seed}" for seed in (101, 102) for scene in ("loop", "big"))
-IMAGES = 80  # of each source, about
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -26,7 +25,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     train.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="vocabulary file (.npz)")
     train.add_argument("--overwrite", action="store_true", help="replace an existing file")
     train.add_argument(
-        "--images", type=int, metavar="N", help="images of each source, evenly spread (default: about 80)"
+        "--images",
+        type=int,
+        default=80,
+        metavar="N",
+        help="images of each source, evenly spread (default: %(default)s)",
     )
     train.add_argument("--branching", type=int, default=10, help="children of a node of the tree")
     train.add_argument("--depth", type=int, default=4, help="levels of the tree")
@@ -56,7 +59,7 @@ def _check(args: argparse.Namespace) -> None:
         ("--depth", args.depth, 1),
         ("--seed", args.seed, 0),
     ):
-        if value is not None and value < least:
+        if value < least:
             raise StereoSfmError(f"{option} must be at least {least}, not {value}")
     if args.output.exists() and not args.overwrite:
         raise StereoSfmError(f"{args.output} exists: choose another name or give --overwrite")
@@ -79,21 +82,20 @@ def _train(args: argparse.Namespace) -> None:
     )
 
 
-def spread(count: int, wanted: int | None) -> Sequence[int]:
-    """Which of `count` images to take; None is what the package's vocabulary was trained with."""
-    if wanted is None:
-        return range(0, count, max(count // IMAGES, 1))
+def spread(count: int, wanted: int) -> list[int]:
+    """Which of `count` images to take."""
     return [k * count // min(wanted, count) for k in range(min(wanted, count))]
 
 
-def _descriptors(spec: str, wanted: int | None) -> Iterator[U8]:
+def _descriptors(spec: str, wanted: int) -> Iterator[U8]:
     """(N, 32) of images that lie evenly over a source; of the first ones where nobody knows how many it has."""
     from drivers.sim.source import SimSource
     from drivers.source import open_source
     from stereo_sfm.loop.still import still_keyframe
+    from stereo_sfm.loop.view import known_by
 
     with open_source(spec) as source:
-        chosen = spread(source.frame_count or wanted or IMAGES, wanted)
+        chosen = spread(source.frame_count or wanted, wanted)
         if isinstance(source, SimSource):  # the simulator renders any frame alone
             images = (source.frame(int(k)) for k in source.frame_ids[chosen])
         else:
@@ -103,4 +105,4 @@ def _descriptors(spec: str, wanted: int | None) -> Iterator[U8]:
         for image in images:
             keyframe = still_keyframe(image, source.rig)
             if keyframe is not None:
-                yield keyframe.descriptors
+                yield known_by(keyframe)

@@ -9,7 +9,7 @@ from typing import Any
 
 from stereo_sfm.errors import StereoSfmError
 
-VERSION = 1
+VERSION = 2  # 1 had no corners
 KIND = "stereo_sfm_map"
 COUNTS = ("keyframes", "points", "observations", "sessions")
 

@@ -12,7 +12,7 @@ import numpy as np
 from calib.rig import Rig
 from stereo_sfm.config import LoopConfig, MapperConfig
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.export.saved_map import SavedMap, joined, keyframes_of, restore_map
+from stereo_sfm.export.saved_map import SavedMap, joined, restore_map
 from stereo_sfm.loop.closer import LoopCloser
 from stereo_sfm.loop.correction import apply_loop
 from stereo_sfm.loop.vocabulary import Vocabulary
@@ -72,7 +72,7 @@ def merge(
         if done.applied:
             loops.append(known)
             fused += len(done.fused)
-    for keyframe, walk in zip(keyframes_of(side_by_side.snapshot), walks.tolist(), strict=True):
+    for keyframe, walk in zip(side_by_side.snapshot.keyframes(), walks.tolist(), strict=True):
         result = closer.step(dataclasses.replace(keyframe, stamp_ns=keyframe.stamp_ns - begins[walk]))
         if result.candidate_kf_id >= 0:
             done = apply_loop(map_, result, loops, config)
@@ -177,6 +177,7 @@ def _subset(s: MapSnapshot, keyframes: Bool, points: Bool, obs: Bool) -> MapSnap
     """The rows that are kept (boolean masks); points of a keyframe that goes are carried by one that sees them."""
     kf_row, pt_row = np.cumsum(keyframes) - 1, np.cumsum(points) - 1
     obs_kf, obs_pt = kf_row[s.obs_kf[obs]], pt_row[s.obs_pt[obs]]
+    corners = keyframes[s.corner_kf]
     anchors = np.where(keyframes[s.anchors[points]], kf_row[s.anchors[points]], _first_seer(obs_kf, obs_pt, points))
     return MapSnapshot(
         kf_ids=s.kf_ids[keyframes],
@@ -196,6 +197,11 @@ def _subset(s: MapSnapshot, keyframes: Bool, points: Bool, obs: Bool) -> MapSnap
         uv_right=s.uv_right[obs],
         descriptors=s.descriptors[obs],
         angles=s.angles[obs],
+        corner_kf=kf_row[s.corner_kf[corners]],
+        corner_uv_left=s.corner_uv_left[corners],
+        corner_uv_right=s.corner_uv_right[corners],
+        corner_points=s.corner_points[corners],
+        corner_descriptors=s.corner_descriptors[corners],
     )
 
 

@@ -1,4 +1,4 @@
-"""A saved map: a versioned folder of `map.json`, `rig.yaml` and three npz files; it holds no image.
+"""A saved map: a versioned folder of `map.json`, `rig.yaml` and four npz files; it holds no image.
 
 The same map gives the same bytes. What is wrong with a folder is said in one line.
 """
@@ -20,12 +20,13 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.map_header import check_counts, checksum, damaged, read_header, write_header
 from stereo_sfm.export.replace_folder import replaced_folder
 from stereo_sfm.mapping.map import Map, MapSnapshot
-from stereo_sfm.types import I64, Keyframe, Trajectory
+from stereo_sfm.types import I64, Trajectory
 
 _FILES: dict[str, tuple[str, ...]] = {
     "keyframes": ("kf_ids", "frame_ids", "stamp_ns", "submap_ids", "map_T_kf", "odom_T_kf", "sessions"),
     "points": ("pt_ids", "points", "anchors", "seen", "expected"),
     "observations": ("obs_kf", "obs_pt", "uv_left", "uv_right", "descriptors", "angles"),
+    "corners": ("corner_kf", "corner_uv_left", "corner_uv_right", "corner_points", "corner_descriptors"),
 }
 
 
@@ -89,7 +90,7 @@ def load_map(folder: Path, rig: Rig | None = None) -> SavedMap:
     Raises:
         StereoSfmError: no map, another version, damaged, empty, or made with another camera.
     """
-    head = read_header(folder, tuple(_FILES))
+    head = read_header(folder, (*_FILES, "rig"))
     sums = head["sha256"]
     columns: dict[str, Any] = {}
     try:
@@ -99,7 +100,7 @@ def load_map(folder: Path, rig: Rig | None = None) -> SavedMap:
                 raise ValueError(name)
             with np.load(io.BytesIO(raw), allow_pickle=False) as data:
                 columns.update({c: data[c] for c in wanted})
-        if "rig" in sums and checksum((folder / "rig.yaml").read_bytes()) != sums["rig"]:  # the first maps have none
+        if checksum((folder / "rig.yaml").read_bytes()) != sums["rig"]:
             raise ValueError("rig")
         own = read_native(folder / "rig.yaml")
     except (OSError, KeyError, ValueError, EOFError, TypeError, zipfile.BadZipFile, StereoSfmError):
@@ -146,7 +147,7 @@ def restore_map(snapshot: MapSnapshot) -> Map:
     map_.add_points(snapshot.pt_ids, snapshot.points, 0)
     map_.points.anchor[:] = snapshot.anchors
     bounds = np.searchsorted(snapshot.obs_kf, np.arange(len(snapshot.kf_ids) + 1))
-    for k, keyframe in enumerate(keyframes_of(snapshot)):
+    for k, keyframe in enumerate(snapshot.keyframes()):
         row = map_.add_keyframe(keyframe, snapshot.map_T_kf[k])
         part = slice(bounds[k], bounds[k + 1])
         map_.observe(
@@ -161,31 +162,6 @@ def restore_map(snapshot: MapSnapshot) -> Map:
     map_.points.seen[:] = snapshot.seen
     map_.points.expected[:] = snapshot.expected
     return map_
-
-
-def keyframes_of(snapshot: MapSnapshot) -> list[Keyframe]:
-    """The map's keyframes as a tracker would send them, with map poses for odometry and map points for stereo ones."""
-    out: list[Keyframe] = []
-    bounds = np.searchsorted(snapshot.obs_kf, np.arange(len(snapshot.kf_ids) + 1))
-    for k, kf_id in enumerate(snapshot.kf_ids.tolist()):
-        part = slice(bounds[k], bounds[k + 1])
-        rows, pose = snapshot.obs_pt[part], snapshot.map_T_kf[k]
-        out.append(
-            Keyframe(
-                kf_id=kf_id,
-                frame_id=int(snapshot.frame_ids[k]),
-                stamp_ns=int(snapshot.stamp_ns[k]),
-                odom_T_cam=pose.copy(),
-                point_ids=snapshot.pt_ids[rows],
-                uv_left=snapshot.uv_left[part].copy(),
-                uv_right=snapshot.uv_right[part].copy(),
-                points_cam=(snapshot.points[rows] - pose[:3, 3]) @ pose[:3, :3],
-                descriptors=snapshot.descriptors[part].copy(),
-                angles=snapshot.angles[part].copy(),
-                submap_id=int(snapshot.submap_ids[k]),
-            )
-        )
-    return out
 
 
 def walk_trajectory(saved: SavedMap, walk: int) -> Trajectory:
@@ -211,7 +187,7 @@ def joined(maps: list[SavedMap]) -> SavedMap:
     first = maps[0]
     parts: dict[str, list[Any]] = {f.name: [] for f in dataclasses.fields(MapSnapshot)}
     sessions: list[Any] = []
-    raised = {"kf_ids": 0, "pt_ids": 0, "submap_ids": 0, "anchors": 0, "obs_kf": 0, "obs_pt": 0}
+    raised = {"kf_ids": 0, "pt_ids": 0, "submap_ids": 0, "anchors": 0, "obs_kf": 0, "obs_pt": 0, "corner_kf": 0}
     next_session = 0
     for saved in maps:
         if not same_rig(saved.rig, first.rig):
@@ -223,8 +199,8 @@ def joined(maps: list[SavedMap]) -> SavedMap:
         next_session += int(saved.sessions.max()) + 1
         for name in ("kf_ids", "pt_ids", "submap_ids"):
             raised[name] += int(getattr(s, name).max()) + 1
-        raised["anchors"] += len(s.kf_ids)
-        raised["obs_kf"] += len(s.kf_ids)
+        for name in ("anchors", "obs_kf", "corner_kf"):
+            raised[name] += len(s.kf_ids)
         raised["obs_pt"] += len(s.pt_ids)
     snapshot = MapSnapshot(**{name: np.concatenate(values) for name, values in parts.items()})
     return SavedMap(snapshot, first.rig, first.vocabulary_id, np.concatenate(sessions))

@@ -120,7 +120,7 @@ def refine_pose(b_T_a: F64, matches: Matches, rig: Rig, pixel_sigma: float, iter
             break
         t = se3.exp(step) @ t
         updated = consistent(t, matches, rig, pixel_sigma)
-        if np.abs(step).max() < 1e-8 and np.array_equal(updated, inlier):
+        if np.abs(step).max() < 1e-6 and np.array_equal(updated, inlier):
             break
         inlier = updated
     return Pose(se3.orthonormalize(t), hessian, inlier, rms)

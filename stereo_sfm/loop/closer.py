@@ -11,12 +11,12 @@ from calib.rig import Rig
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
-from stereo_sfm.loop.absolute_pose import range_sigmas
 from stereo_sfm.loop.cloud import gather
 from stereo_sfm.loop.database import PlaceDatabase
 from stereo_sfm.loop.graph import KeyframeGraph
 from stereo_sfm.loop.store import KeyframeStore
-from stereo_sfm.loop.verification import Verdict, View, rejection, verify, view_of, within
+from stereo_sfm.loop.verification import Verdict, verify, within
+from stereo_sfm.loop.view import View, known_by, view_of
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.types import F64, Keyframe, LoopResult
@@ -76,7 +76,7 @@ class LoopCloser:
         """Look for the keyframe's place among the older ones, then remember it."""
         self._graph.add(keyframe.kf_id, keyframe.odom_T_cam, keyframe.submap_id, keyframe.stamp_ns)
         with self._spans.span("loop_words"):
-            bag = self._vocabulary.bag(keyframe.descriptors)
+            bag = self._vocabulary.bag(known_by(keyframe))
         with self._spans.span("loop_query"):
             candidates, why_none = self._candidates(keyframe, bag)
         with self._spans.span("loop_verify"):
@@ -132,15 +132,20 @@ class LoopCloser:
     def _judge(self, keyframe: Keyframe, candidates: list[tuple[int, float]], why_none: str) -> LoopResult:
         if not candidates:
             return _no_loop(keyframe.kf_id, why_none, 0.0, ())
-        sigmas = range_sigmas(keyframe.points_cam, self._rig, self._config.disparity_sigma)
-        view = view_of(keyframe, sigmas)
-        rejected: list[tuple[int, float, str]] = []
-        for candidate, score in candidates:
-            verdict = self._verify(keyframe, view, candidate)
-            if not verdict.reason:
-                return self._accept(keyframe, candidate, score, verdict, tuple(rejected))
-            rejected.append((candidate, score, verdict.reason))
-        return _no_loop(keyframe.kf_id, rejected[0][2], rejected[0][1], tuple(rejected))
+        view = view_of(keyframe, self._rig, self._config.disparity_sigma)
+        verdicts = [self._verify(keyframe, view, candidate) for candidate, _ in candidates]
+        reasons = [verdict.reason for verdict in verdicts]
+        verified = sorted((k for k, reason in enumerate(reasons) if not reason), key=lambda k: -verdicts[k].inliers)
+        accepted = -1
+        for k in verified:
+            reasons[k] = self._doubt(keyframe, candidates[k][0], verdicts[k], view, verdicts[verified[0]].inliers)
+            if not reasons[k]:
+                accepted = k
+                break
+        rejected = tuple((*candidate, why) for candidate, why in zip(candidates, reasons, strict=True) if why)
+        if accepted >= 0:
+            return self._accept(keyframe, *candidates[accepted], verdicts[accepted], rejected)
+        return _no_loop(keyframe.kf_id, reasons[0], candidates[0][1], rejected)
 
     def _verify(self, keyframe: Keyframe, view: View, candidate: int) -> Verdict:
         config = self._config
@@ -149,19 +154,19 @@ class LoopCloser:
         around = [k for k in around if k.submap_id == centre.submap_id]
         cloud = gather(centre, around, self._rig, config.disparity_sigma)
         rng = np.random.default_rng([config.seed, keyframe.kf_id, candidate])
-        verdict = verify(view, cloud, self._rig, config, rng)
-        if verdict.reason:
-            return verdict
+        return verify(view, cloud, self._rig, config, rng)
+
+    def _doubt(self, keyframe: Keyframe, candidate: int, verdict: Verdict, view: View, most: int) -> str:
+        """Why a verified candidate is no loop yet, '' if it is one; `most`: inliers of the best candidate."""
         loop = _Hypothesis(keyframe.kf_id, candidate, se3.inverse(verdict.b_T_a), verdict.inliers)
-        self._pending = [h for h in self._pending if loop.kf_id - h.kf_id < config.consistent_window]
-        loop = dataclasses.replace(loop, against=self._against(loop, len(view.ids)))
+        self._pending = [h for h in self._pending if loop.kf_id - h.kf_id < self._config.consistent_window]
+        against = "better_elsewhere" if loop.inliers < RIVAL * most else self._against(loop, view.corners)
+        loop = dataclasses.replace(loop, against=against)
         self._pending.append(loop)
-        if loop.against or not self._agreed(loop):
-            return rejection(loop.against or "not_confirmed_yet", verdict.inliers)
-        return verdict
+        return against or ("" if self._agreed(loop) else "not_confirmed_yet")
 
     def _against(self, loop: _Hypothesis, seen: int) -> str:
-        """What speaks against a verified loop, '' for nothing; `seen` points are described in the keyframe."""
+        """What speaks against a verified loop, '' for nothing; the keyframe has `seen` corners."""
         config = self._config
         way = self._graph.way(loop.candidate_kf_id, loop.kf_id)
         if way is not None:
@@ -169,11 +174,8 @@ class LoopCloser:
             degrees = config.gate_degrees + config.gate_degrees_per_metre * way.metres
             return "" if within(se3.inverse(way.a_T_b) @ loop.candidate_T_kf, metres, degrees) else "against_odometry"
         jump = self._graph.jump(loop.candidate_kf_id, loop.kf_id, loop.candidate_T_kf)
-        if jump is not None:
-            if jump.off > jump.radius + DRIFT_PER_METRE * jump.walked:
-                return "out_of_reach"
-            if jump.radius < config.gap_metres:
-                return ""
+        if jump is not None and jump.off > jump.radius + DRIFT_PER_METRE * jump.walked:
+            return "out_of_reach"
         if loop.inliers < max(2 * config.min_inliers, config.unknown_way_share * seen):
             return "too_few_inliers"  # nothing but the pictures speaks for it
         rivals = [h for h in self._pending if h.inliers > RIVAL * loop.inliers and self._same_loop(h, loop) is False]
@@ -221,7 +223,7 @@ class LoopCloser:
     def _grow(self, keyframe: Keyframe) -> None:
         every = self._config.grow_every
         if every and keyframe.kf_id % every == every - 1:
-            recent = [self._store[k].descriptors for k in self._store.ids[-every:]]
+            recent = [known_by(self._store[k]) for k in self._store.ids[-every:]]
             self._vocabulary = voc.grow(self._vocabulary, np.concatenate(recent))
 
 

@@ -1,58 +1,131 @@
 """Points around a keyframe, its own and those of connected keyframes: what a camera is matched to."""
 
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false
+
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
 from calib.rig import Rig
 from stereo_sfm.geometry import se3
-from stereo_sfm.loop.absolute_pose import range_sigmas
-from stereo_sfm.loop.binary import present
-from stereo_sfm.types import F64, I32, I64, U8, Keyframe
+from stereo_sfm.geometry.kernels import njit
+from stereo_sfm.loop import binary
+from stereo_sfm.loop.view import View, view_of
+from stereo_sfm.types import F64, I64, U8, Bool, Keyframe
+
+SAME_CORNER_PX, SAME_CORNER_BITS = 4.0, 50  # corners of two keyframes that are so near and so alike are one
 
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
     """M described points in the frame of a centre camera; a physical point may have several rows (views)."""
 
-    ids: I64  # (M,) point ids
+    ids: I64  # (M,) point ids; negative for corners that are no points
     points: F64  # (M, 3) metres in the centre's camera
     sigmas: F64  # (M,) metres along the ray
     descriptors: U8  # (M, 32)
+    words: binary.U64  # (M, 4) the same
     uv_left: F64  # (M, 2) px in the image of the row's own keyframe
     uv_right: F64  # (M, 2)
+    corner: Bool  # (M,) a detector finds it again
     view: I64  # (M,) which keyframe that is: row of centre_T_kf
     centre_T_kf: F64  # (V, 4, 4); row 0 is the centre
 
     def __len__(self) -> int:
         return len(self.ids)
 
-    def seen_by_centre(self, rows: I32) -> tuple[F64, F64]:
+    def seen_by_centre(self, rows: I64) -> tuple[F64, F64]:
         """Left and right pixels (N, 2) of these rows in the centre's image, NaN for views of other keyframes."""
         own = (self.view[rows] == 0)[:, None]
         return np.where(own, self.uv_left[rows], np.nan), np.where(own, self.uv_right[rows], np.nan)
 
 
 def gather(centre: Keyframe, others: Sequence[Keyframe], rig: Rig, disparity_sigma: float) -> Cloud:
-    """The centre's points, then those of `others` (near in time), moved into its camera by odometry.
+    """What the centre shows, then what `others` (near in time) show, moved into its camera by odometry.
 
-    Only points with depth and a descriptor are taken.
+    Only rows with depth are taken. Corners that keyframes show at one place and that look alike share an id.
     """
     keyframes = [centre, *others]
     centre_T_kf = np.stack([se3.inverse(centre.odom_T_cam) @ k.odom_T_cam for k in keyframes])
-    rows = [np.flatnonzero(np.isfinite(k.points_cam[:, 2]) & present(k.descriptors)) for k in keyframes]
-    taken = list(zip(keyframes, rows, strict=True))
-    points = [k.points_cam[r] for k, r in taken]
-    return Cloud(
-        np.concatenate([k.point_ids[r] for k, r in taken]),
-        np.concatenate([se3.transform(t, p) for t, p in zip(centre_T_kf, points, strict=True)]),
-        range_sigmas(np.concatenate(points), rig, disparity_sigma),
-        np.concatenate([k.descriptors[r] for k, r in taken]),
-        np.concatenate([k.uv_left[r] for k, r in taken]),
-        np.concatenate([k.uv_right[r] for k, r in taken]),
-        np.repeat(np.arange(len(taken)), [len(r) for r in rows]),
-        centre_T_kf,
-    )
+    parts: list[Cloud] = []
+    for k, keyframe in enumerate(keyframes):
+        view = view_of(keyframe, rig, disparity_sigma)
+        ids = view.ids.copy()
+        nameless = np.flatnonzero(ids < 0)
+        ids[nameless] = -1 - nameless - k * 10**6
+        if k and len(nameless):
+            so_far = _joined(parts, centre_T_kf)
+            rows, at = match_guided(se3.inverse(centre_T_kf[k]), view, so_far, rig, SAME_CORNER_BITS, SAME_CORNER_PX)
+            same = (ids[rows] < 0) & (so_far.ids[at] < 0)
+            ids[rows[same]] = so_far.ids[at[same]]
+        deep = np.isfinite(view.points[:, 2])
+        parts.append(
+            Cloud(
+                ids[deep],
+                se3.transform(centre_T_kf[k], view.points[deep]),
+                view.sigmas[deep],
+                view.descriptors[deep],
+                view.words[deep],
+                view.uv_left[deep],
+                view.uv_right[deep],
+                view.corner[deep],
+                np.full(int(deep.sum()), k),
+                centre_T_kf,
+            )
+        )
+    return _joined(parts, centre_T_kf)
+
+
+def _joined(parts: list[Cloud], centre_T_kf: F64) -> Cloud:
+    columns: dict[str, Any] = {f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Cloud)[:-1]}
+    return Cloud(**columns, centre_T_kf=centre_T_kf)
+
+
+def match_guided(b_T_a: F64, view: View, cloud: Cloud, rig: Rig, max_distance: int, radius: float) -> tuple[I64, I64]:
+    """Pairs (rows of view, rows of cloud) whose descriptors agree within `radius` px of the projection, one to one.
+
+    Corners are paired with corners, other points with other points.
+    """
+    uv = rig.left.project(se3.transform(b_T_a, cloud.points))
+    best = _nearest_within(view.uv_left, view.words, view.corner, uv, cloud.words, cloud.corner, radius, max_distance)
+    rows_b = np.flatnonzero(best >= 0)
+    return rows_b, best[rows_b].astype(np.int64)
+
+
+@njit
+def _nearest_within(uv_b, words_b, kind_b, uv_a, words_a, kind_a, radius, max_distance):
+    """For every row of b the row of a of its kind with the nearest descriptor within the radius, if that is mutual.
+
+    Ties go to the lower row.
+    """
+    n, m = uv_b.shape[0], uv_a.shape[0]
+    best = np.full(n, -1, np.int32)
+    low = np.full(n, max_distance + 1, np.int32)
+    best_a = np.full(m, -1, np.int32)
+    low_a = np.full(m, max_distance + 1, np.int32)
+    order = np.argsort(uv_b[:, 0])
+    columns = uv_b[order, 0]
+    for j in range(m):
+        if not np.isfinite(uv_a[j, 0]):
+            continue
+        for at in range(np.searchsorted(columns, uv_a[j, 0] - radius), n):
+            if columns[at] > uv_a[j, 0] + radius:
+                break
+            i = order[at]
+            if abs(uv_b[i, 1] - uv_a[j, 1]) > radius or kind_b[i] != kind_a[j]:
+                continue
+            d = binary.hamming(words_b, i, words_a, j)
+            if d < low[i]:
+                low[i] = d
+                best[i] = j
+            if d < low_a[j] or (d == low_a[j] and i < best_a[j]):
+                low_a[j] = d
+                best_a[j] = i
+    for i in range(n):
+        if best[i] >= 0 and best_a[best[i]] != i:
+            best[i] = -1
+    return best

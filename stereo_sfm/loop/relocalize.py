@@ -11,11 +11,10 @@ import scipy.sparse
 from calib.rig import Rig
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
-from stereo_sfm.loop import binary
-from stereo_sfm.loop.absolute_pose import range_sigmas
-from stereo_sfm.loop.cloud import Cloud
+from stereo_sfm.loop.cloud import Cloud, gather
 from stereo_sfm.loop.database import PlaceDatabase
-from stereo_sfm.loop.verification import Verdict, verify, verify_near, view_of, within
+from stereo_sfm.loop.verification import Verdict, verify, verify_near, within
+from stereo_sfm.loop.view import known_by, view_of
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.mapping.map import MapSnapshot
 from stereo_sfm.types import F64, I64, Keyframe
@@ -52,6 +51,8 @@ class Relocalizer:
 
     def __init__(self, snapshot: MapSnapshot, rig: Rig, vocabulary: Vocabulary, config: LoopConfig) -> None:
         self._map, self._rig, self._vocabulary = snapshot, rig, vocabulary
+        self._keyframes = snapshot.keyframes()
+        self._near_share = config.min_inlier_share
         self._config = dataclasses.replace(
             config,
             min_match_fraction=0.0,
@@ -59,22 +60,20 @@ class Relocalizer:
             min_inlier_share=0.0,
             min_cells=config.relocalize_cells,
         )
-        self._bounds: list[int] = np.searchsorted(snapshot.obs_kf, np.arange(len(snapshot.kf_ids) + 1)).tolist()
         shape = (len(snapshot.kf_ids), len(snapshot.pt_ids))
         ones = np.ones(len(snapshot.obs_kf), np.int32)
         self._sees = scipy.sparse.csr_array((ones, (snapshot.obs_kf, snapshot.obs_pt)), shape=shape)
         self._views = np.maximum(np.bincount(snapshot.obs_pt, minlength=shape[1]), 1)
         self._database = PlaceDatabase(len(vocabulary))
-        for k in range(shape[0]):
-            part = slice(self._bounds[k], self._bounds[k + 1])
-            self._database.add(k, vocabulary.bag(snapshot.descriptors[part]))
+        for k, keyframe in enumerate(self._keyframes):
+            self._database.add(k, vocabulary.bag(known_by(keyframe)))
 
     def locate(self, keyframe: Keyframe) -> Location:
         """Find the camera of a keyframe (its pose is ignored) in the map."""
-        view = view_of(keyframe, range_sigmas(keyframe.points_cam, self._rig, self._config.disparity_sigma))
+        view = view_of(keyframe, self._rig, self._config.disparity_sigma)
         found: list[Location] = []
         reason = "no_candidate"
-        for row in self._places(self._database.scores(self._vocabulary.bag(keyframe.descriptors))):
+        for row in self._places(self._database.scores(self._vocabulary.bag(known_by(keyframe)))):
             rng = np.random.default_rng([self._config.seed, row])
             verdict = verify(view, self.cloud(row), self._rig, self._config, rng, move_points=False)
             if verdict.reason:
@@ -83,43 +82,31 @@ class Relocalizer:
             found.append(self._location(row, verdict))
             if verdict.inliers >= SURE * self._config.relocalize_inliers:
                 break
-        return self._choose(found, len(view.ids)) if found else nowhere(reason)
+        return self._choose(found, self._config.relocalize_share * view.corners) if found else nowhere(reason)
 
     def locate_near(self, keyframe: Keyframe, guess: F64) -> Location:
         """Find the camera near a predicted map_T_cam (4, 4): as `locate`, but only around the guess."""
-        view = view_of(keyframe, range_sigmas(keyframe.points_cam, self._rig, self._config.disparity_sigma))
+        view = view_of(keyframe, self._rig, self._config.disparity_sigma)
         row = self._nearest(guess)
         start = se3.inverse(guess) @ self._map.map_T_kf[row]
         verdict = verify_near(start, view, self.cloud(row), self._rig, self._config)
         if verdict.reason:
             return nowhere(verdict.reason, verdict.inliers)
-        return self._choose([self._location(row, verdict)], len(view.ids))
+        return self._choose([self._location(row, verdict)], self._near_share * view.corners)
 
     def cloud(self, row: int) -> Cloud:
-        """The map around a keyframe row, in its camera: all views of the points that it and its neighbours see."""
-        s = self._map
+        """The map around a keyframe row, in its camera: what it and its neighbours show."""
         shared = (self._sees @ self._sees[[row]].T).toarray()[:, 0]
         shared[row] = shared.max() + 1
         order = np.lexsort((np.arange(len(shared)), -shared))[: self._config.relocalize_keyframes]
         order = order[shared[order] > 0]
-        parts = [np.arange(self._bounds[k], self._bounds[k + 1]) for k in order.tolist()]
-        rows = np.concatenate(parts)
-        view = np.repeat(np.arange(len(order)), [len(part) for part in parts])
-        described = binary.present(s.descriptors[rows])
-        rows, view = rows[described], view[described]
-        pts = s.obs_pt[rows]
-        points = se3.transform(se3.inverse(s.map_T_kf[row]), s.points[pts])
-        sigmas = range_sigmas(points, self._rig, self._config.disparity_sigma) / np.sqrt(self._views[pts])
-        return Cloud(
-            s.pt_ids[pts],
-            np.ascontiguousarray(points),
-            np.maximum(sigmas, MIN_RANGE_SIGMA),
-            s.descriptors[rows],
-            s.uv_left[rows],
-            s.uv_right[rows],
-            view,
-            se3.inverse(s.map_T_kf[row]) @ s.map_T_kf[order],
-        )
+        centre, *others = (self._keyframes[k] for k in order.tolist())
+        cloud = gather(centre, others, self._rig, self._config.disparity_sigma)
+        mapped = cloud.ids >= 0
+        at = np.searchsorted(self._map.pt_ids, cloud.ids[mapped])
+        sigmas = cloud.sigmas.copy()
+        sigmas[mapped] = np.maximum(sigmas[mapped] / np.sqrt(self._views[at]), MIN_RANGE_SIGMA)
+        return dataclasses.replace(cloud, sigmas=sigmas)
 
     def _places(self, scores: F64) -> list[int]:
         """The best rows, each of another place: a place counts what it and its neighbours in time score together."""
@@ -142,10 +129,10 @@ class Relocalizer:
         kf_id = int(self._map.kf_ids[row])
         return Location("", map_T_cam, verdict.information, kf_id, verdict.inliers, verdict.pairs)
 
-    def _choose(self, found: list[Location], asked: int) -> Location:
+    def _choose(self, found: list[Location], wanted: float) -> Location:
         """The answer with most points, if they are enough and no other place comes near it."""
         best = max(found, key=lambda x: x.inliers)
-        if best.inliers < max(self._config.relocalize_inliers, self._config.relocalize_share * asked):
+        if best.inliers < max(self._config.relocalize_inliers, wanted):
             return nowhere("too_few_inliers", best.inliers)
         for other in found:
             apart = not within(se3.inverse(best.map_T_cam) @ other.map_T_cam, SAME_METRES, SAME_DEGREES)

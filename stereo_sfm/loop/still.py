@@ -5,14 +5,15 @@ from __future__ import annotations
 import dataclasses
 
 from calib.rig import Rig
-from stereo_sfm.config import TrackerConfig
+from stereo_sfm.config import Config
 from stereo_sfm.tracking.tracker import Tracker
 from stereo_sfm.types import Keyframe, StereoImage
 
 
 def still_keyframe(
-    image: StereoImage, rig: Rig, max_features: int = 1000, config: TrackerConfig | None = None
+    image: StereoImage, rig: Rig, max_features: int = 1000, config: Config | None = None
 ) -> Keyframe | None:
     """What a tracker that starts at this image makes of it (pose identity); None where it sees too little."""
-    config = dataclasses.replace(config or TrackerConfig(), max_features=max_features)
-    return Tracker(config, rig).step(image)[1]
+    config = config or Config()
+    tracker = dataclasses.replace(config.tracker, max_features=max_features)
+    return Tracker(tracker, rig, place_corners=config.loop.corners).step(image)[1]

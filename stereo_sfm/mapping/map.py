@@ -18,7 +18,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.mapping import map_kernels
 from stereo_sfm.mapping.covisibility import Covisibility
 from stereo_sfm.mapping.tables import KeyframeTable, ObservationTable, PointTable
-from stereo_sfm.types import F32, F64, I64, U8, Keyframe
+from stereo_sfm.types import F32, F64, I64, U8, Corners, Keyframe
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +54,42 @@ class MapSnapshot:
     uv_right: F64  # (M, 2) px
     descriptors: U8  # (M, 32)
     angles: F32  # (M,)
+    corner_kf: I64  # (C,) index into kf_ids, ascending: what keyframes are recognised by, see `Keyframe.corners`
+    corner_uv_left: F32  # (C, 2) px
+    corner_uv_right: F32  # (C, 2) px
+    corner_points: F32  # (C, 3) metres in the keyframe's camera
+    corner_descriptors: U8  # (C, 32)
+
+    def keyframes(self) -> list[Keyframe]:
+        """As a tracker would send them, with map poses for odometry and map points for stereo ones."""
+        rows = np.arange(len(self.kf_ids) + 1)
+        seen, corners = np.searchsorted(self.obs_kf, rows), np.searchsorted(self.corner_kf, rows)
+        return [
+            self._keyframe(k, slice(seen[k], seen[k + 1]), slice(corners[k], corners[k + 1]))
+            for k in rows[:-1].tolist()
+        ]
+
+    def _keyframe(self, k: int, seen: slice, corners: slice) -> Keyframe:
+        points, pose = self.obs_pt[seen], self.map_T_kf[k]
+        return Keyframe(
+            kf_id=int(self.kf_ids[k]),
+            frame_id=int(self.frame_ids[k]),
+            stamp_ns=int(self.stamp_ns[k]),
+            odom_T_cam=pose.copy(),
+            point_ids=self.pt_ids[points],
+            uv_left=self.uv_left[seen].copy(),
+            uv_right=self.uv_right[seen].copy(),
+            points_cam=(self.points[points] - pose[:3, 3]) @ pose[:3, :3],
+            descriptors=self.descriptors[seen].copy(),
+            angles=self.angles[seen].copy(),
+            submap_id=int(self.submap_ids[k]),
+            corners=Corners(
+                self.corner_uv_left[corners].copy(),
+                self.corner_uv_right[corners].copy(),
+                self.corner_points[corners].copy(),
+                self.corner_descriptors[corners].copy(),
+            ),
+        )
 
 
 class Map:
@@ -64,6 +100,7 @@ class Map:
         self.points = PointTable(1024)
         self.observations = ObservationTable(4096)
         self.covisibility = Covisibility()
+        self.corners: dict[int, Corners] = {}  # of living keyframes, by row
         self._kf_rows: dict[int, int] = {}
         self._pt_rows = np.full(1024, -1, np.int32)  # by id
         self._changed_kf: set[int] = set()
@@ -142,6 +179,7 @@ class Map:
             obs_first=len(self.observations),
         )
         self._kf_rows[keyframe.kf_id] = row
+        self.corners[row] = keyframe.corners
         self.covisibility.grow(row + 1)
         self._changed_kf.add(row)
         return row
@@ -259,6 +297,7 @@ class Map:
         points = self.observations.pt[rows].astype(np.int64)
         self.remove_observations(rows)
         self.keyframes.alive[row] = False
+        del self.corners[row]
         self.covisibility.drop(row)
         self.keyframes.previous[self.keyframes.previous == row] = self.keyframes.previous[row]
         for point in points[self.points.anchor[points] == row].tolist():
@@ -375,6 +414,7 @@ class Map:
         pt_index[pts] = np.arange(len(pts))
         obs = np.flatnonzero((table.pt >= 0) & (kf_index[table.kf] >= 0) & (pt_index[table.pt] >= 0))
         k, p = self.keyframes, self.points
+        corners, none = [self.corners[row] for row in kfs.tolist()], Corners.none()
         return MapSnapshot(
             kf_ids=k.kf_id[kfs],
             frame_ids=k.frame_id[kfs],
@@ -393,10 +433,16 @@ class Map:
             uv_right=table.uv_right[obs].astype(np.float64),
             descriptors=table.descriptor[obs],
             angles=table.angle[obs],
+            corner_kf=np.repeat(np.arange(len(kfs)), [len(c) for c in corners]),
+            corner_uv_left=np.concatenate([none.uv_left, *(c.uv_left for c in corners)]),
+            corner_uv_right=np.concatenate([none.uv_right, *(c.uv_right for c in corners)]),
+            corner_points=np.concatenate([none.points_cam, *(c.points_cam for c in corners)]),
+            corner_descriptors=np.concatenate([none.descriptors, *(c.descriptors for c in corners)]),
         )
 
     @property
     def nbytes(self) -> int:
         """Bytes of all columns."""
         tables = (self.keyframes, self.points, self.observations)
-        return sum(table.nbytes for table in tables) + self._pt_rows.nbytes
+        corners = sum(c.nbytes for c in self.corners.values())
+        return sum(table.nbytes for table in tables) + self._pt_rows.nbytes + corners

@@ -39,7 +39,8 @@ def _tracker(config: Config, rig: Rig, spans: NoSpans | None, ground_truth: Traj
     if method == "flow":
         from stereo_sfm.tracking.tracker import Tracker
 
-        return Tracker(config.tracker, rig, spans or NoSpans())
+        recognised = config.mapper.enabled or config.loop.enabled
+        return Tracker(config.tracker, rig, spans, config.loop.corners if recognised else 0)
     if not rig.stereo and method in NEEDS_DEPTH:
         raise StereoSfmError(
             f"odometry {method} needs two eyes or depth, this camera has one eye: use eight-point or pnp"

@@ -67,11 +67,7 @@ class StereoMatcher:
         config = self._config
         uv = np.ascontiguousarray(uv)
         if isinstance(right, tuple):
-            coarse, _ = search_epipolar(
-                left[SEARCH_LEVEL], right[SEARCH_LEVEL], uv, 2.0**SEARCH_LEVEL, *self._eyes.cams,
-                self._eyes.right_T_left, self._min_depth, self._candidates, 25.0, 1.2,
-            )  # fmt: skip
-            uv_right = self._refine(left, right, uv, coarse, 1)
+            uv_right = self._refine(left, right, uv, self._search(left, right, uv), 1)
             back = uv.copy()
             status, _ = flow.track_translation(
                 right, left, np.nan_to_num(uv_right, nan=-1e3), back, 0, 0, 10, config.min_contrast, config.min_ncc,
@@ -81,11 +77,35 @@ class StereoMatcher:
             good &= self._one_surface(left, right, uv, uv_right)
         else:
             uv_right, good = self._from_depth(right, uv)
+        return self._triangulated(uv, uv_right, good, config.max_epipolar_px, -CLOSE)
+
+    def match_coarse(self, left: flow.Pyramid, right: flow.Pyramid | F32, uv: F64) -> StereoMatch:
+        """As `match`, in half the time: good to half a pixel, and with no look at depth edges."""
+        uv = np.ascontiguousarray(uv)
+        if not isinstance(right, tuple):
+            return self.match(left, right, uv)
+        uv_right = self._search(left, right, uv)
+        status, _ = flow.track_translation(
+            left, right, uv, uv_right, SEARCH_LEVEL, SEARCH_LEVEL, 10, self._config.min_contrast, self._config.min_ncc,
+            flow.WEIGHTS,
+        )  # fmt: skip
+        return self._triangulated(uv, uv_right, status == flow.TRACKED, 2 * self._config.max_epipolar_px, 0.0)
+
+    def _search(self, left: flow.Pyramid, right: flow.Pyramid, uv: F64) -> F64:
+        """Right pixels (N, 2) to the pixel of the search level, NaN where nothing is alike."""
+        found, _ = search_epipolar(
+            left[SEARCH_LEVEL], right[SEARCH_LEVEL], uv, 2.0**SEARCH_LEVEL, *self._eyes.cams,
+            self._eyes.right_T_left, self._min_depth, self._candidates, 25.0, 1.2,
+        )  # fmt: skip
+        return found
+
+    def _triangulated(self, uv: F64, uv_right: F64, good: Bool, max_epipolar_px: float, least: float) -> StereoMatch:
+        """`least`: inverse distance in its sigmas; a far point may come out behind the camera by noise."""
         bearing, rho, variance, epipolar = triangulate(
-            uv, uv_right, *self._eyes.cams, self._eyes.left_T_right, config.sigma_px
+            uv, uv_right, *self._eyes.cams, self._eyes.left_T_right, self._config.sigma_px
         )
         with np.errstate(invalid="ignore"):
-            good &= (epipolar < config.max_epipolar_px) & (rho > -CLOSE * np.sqrt(variance))
+            good &= (epipolar < max_epipolar_px) & (rho > least * np.sqrt(variance))
             good &= rho < 1.0 / (0.5 * self._min_depth)
         return StereoMatch(uv, uv_right, bearing, rho, variance, good)
 

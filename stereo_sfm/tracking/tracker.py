@@ -2,7 +2,8 @@
 
 Per frame: predict the pose (constant velocity), predict every point's pixel, follow it by translation, align it with
 its first appearance, find it in the right image, solve the pose robustly, refine the points' distances. At keyframes:
-new corners where points are missing, stereo matches for them, descriptors for the mapper and the loop closer.
+new corners where points are missing, stereo matches for them, descriptors for the mapper; corners of the whole image
+for the loop closer.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from stereo_sfm.tracking.coarse_rotation import CoarseRotation
 from stereo_sfm.tracking.corners import detect_corners
 from stereo_sfm.tracking.descriptors import describe
 from stereo_sfm.tracking.eyes import Eyes
+from stereo_sfm.tracking.place_corners import PlaceCorners
 from stereo_sfm.tracking.stereo import StereoMatcher
 from stereo_sfm.tracking.tracks import Patches, Tracks
 from stereo_sfm.types import F32, F64, I64, Bool, Frame, Keyframe, MapUpdate, Observations, StereoImage, TrackState
@@ -56,7 +58,8 @@ class PoseSolution:
 class Tracker:
     """One `step` per image. Frame poses are odom_T_cam; the odometry frame is the first camera."""
 
-    def __init__(self, config: TrackerConfig, rig: Rig, spans: NoSpans | None = None) -> None:
+    def __init__(self, config: TrackerConfig, rig: Rig, spans: NoSpans | None = None, place_corners: int = 0) -> None:
+        """`place_corners`: at most so many at each keyframe, for place recognition."""
         self._config = config
         self._rig = rig
         self._eyes = Eyes.of(rig)
@@ -67,6 +70,7 @@ class Tracker:
         half[:border] = half[-border:] = False
         half[:, :border] = half[:, -border:] = False
         self._mask: Bool = half
+        self._place_corners = PlaceCorners(place_corners, half, self._stereo)
         area = 4.0 * half.sum()
         self._spacing = 0.75 * math.sqrt(area / config.max_features)
         self._patches = Patches(2 * config.max_features)
@@ -303,6 +307,7 @@ class Tracker:
             angles=angles,
             submap_id=self._submap_id,
             covariance=covariance,
+            corners=self._place_corners.find(pyramid, right),
         )
         self._next_kf_id += 1
         self._kf_pose = self._pose.copy()

@@ -1,5 +1,6 @@
 """Keyframes of a walk around shelves with exact truth: descriptors that flip some bits from view to view, new point
-ids whenever a point comes back after it was out of sight, odometry that drifts, and aisles that may be copies."""
+ids whenever a point comes back after it was out of sight, corners of which a half is found again, odometry that drifts,
+and aisles that may be copies."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ import numpy as np
 
 from calib.rig import Rig
 from stereo_sfm.geometry import se3
-from stereo_sfm.types import F64, I64, U8, Keyframe
+from stereo_sfm.types import F32, F64, I64, U8, Corners, Keyframe
 from tests.synthetic import fisheye_rig, see
 
 SHELF_Z = 10.0  # metres along an aisle
@@ -25,11 +26,14 @@ class StoreWalk:
     physical: dict[int, int]  # point id -> index of the physical point
 
 
-def shelf_points(aisles: int, identical: bool, rng: np.random.Generator, per_aisle: int = 1200) -> tuple[F64, U8]:
-    """(P, 3) points on both sides of parallel aisles 3 m apart, and (P, 32) what each looks like."""
+def shelf_points(aisles: int, alike: float, rng: np.random.Generator, per_aisle: int = 1200) -> tuple[F64, U8]:
+    """(P, 3) points on both sides of parallel aisles 3 m apart, and (P, 32) what each looks like.
+
+    `alike`: share of the points of the other aisles that are copies of those in the first; 0: all else is new too.
+    """
     points, looks = [], []
     for aisle in range(aisles):
-        if aisle == 0 or not identical:
+        if aisle == 0 or not alike:
             local = np.stack(
                 [
                     np.where(rng.random(per_aisle) < 0.5, -1.0, 1.0) * rng.uniform(0.9, 1.2, per_aisle),
@@ -40,7 +44,10 @@ def shelf_points(aisles: int, identical: bool, rng: np.random.Generator, per_ais
             )
             look = rng.integers(0, 256, (per_aisle, 32), dtype=np.uint8)
         points.append(local + np.array([3.0 * aisle, 0, 0]))
-        looks.append(look)
+        looks.append(look.copy())
+        if aisle and 0 < alike < 1:
+            other = rng.random(per_aisle) >= alike
+            looks[-1][other] = rng.integers(0, 256, (int(other.sum()), 32), dtype=np.uint8)
     return np.concatenate(points), np.concatenate(looks)
 
 
@@ -75,16 +82,18 @@ def drift(world_T_kf: F64, rng: np.random.Generator, per_metre: float, turn_per_
 
 def make_walk(
     aisles: list[int],
-    identical: bool = False,
+    alike: float = 0.0,
     seed: int = 0,
     flip: float = 0.06,
     noise_px: float = 0.4,
     max_points: int = 300,
+    max_corners: int = 300,
 ) -> StoreWalk:
-    """Keyframes of a walk through the aisles, in this order."""
-    rng = np.random.default_rng(seed)
+    """Keyframes of a walk through the aisles, in this order; without corners they are known by their points."""
+    rng, corner_rng = np.random.default_rng(seed), np.random.default_rng([seed, 1])
     rig = fisheye_rig()
-    points, looks = shelf_points(max(aisles) + 1, identical, rng)
+    points, looks = shelf_points(max(aisles) + 1, alike, rng)
+    strength = corner_rng.random(len(points))
     world_T_kf = aisle_walk(aisles)
     odom = drift(world_T_kf, rng, 0.004, 0.0006)
     tracks: dict[int, int] = {}  # physical point -> its id while it stays in sight
@@ -97,7 +106,10 @@ def make_walk(
         physical.update(zip(range(len(physical), len(physical) + len(new)), new, strict=True))
         tracks = kept | dict(zip(new, range(len(physical) - len(new), len(physical)), strict=True))
         ids = [tracks[p] for p in rows.tolist()]
-        keyframes.append(_keyframe(k, rig, pose, odom[k], points[rows], looks[rows], ids, rng, flip, noise_px))
+        seen = _seen(rig, pose, points[rows], looks[rows], rng, flip, noise_px)
+        strongest = _strongest(rig, pose, points, strength, corner_rng, max_corners)
+        corners = _seen(rig, pose, points[strongest], looks[strongest], corner_rng, flip, noise_px)
+        keyframes.append(_keyframe(k, odom[k], ids, seen, corners))
     return StoreWalk(rig, keyframes, world_T_kf, physical)
 
 
@@ -109,25 +121,41 @@ def _visible(rig: Rig, pose: F64, points: F64, tracks: dict[int, int], rng: np.r
     return np.sort(rows[np.argsort(order, kind="stable")][:most])
 
 
-def _keyframe(
-    k: int, rig: Rig, pose: F64, odom: F64, points: F64, looks: U8, ids: list[int], rng: np.random.Generator,
-    flip: float, noise_px: float,
-) -> Keyframe:  # fmt: skip
+def _strongest(rig: Rig, pose: F64, points: F64, strength: F64, rng: np.random.Generator, most: int) -> I64:
+    """Rows in sight that a detector prefers: much the same ones from view to view."""
+    seen, _, right = see(rig, pose, points, max_depth=5.0)
+    rows = np.flatnonzero(seen & np.isfinite(right[:, 0]))
+    return rows[np.argsort(-strength[rows] - rng.normal(0, 0.3, len(rows)), kind="stable")][:most]
+
+
+def _seen(
+    rig: Rig, pose: F64, points: F64, looks: U8, rng: np.random.Generator, flip: float, noise_px: float
+) -> Corners:
+    """How points look from there."""
     _, left, right = see(rig, pose, points)
     left, right = left + rng.normal(0, noise_px, left.shape), right + rng.normal(0, noise_px, right.shape)
     cam = se3.transform(se3.inverse(pose), points)
     distance = np.linalg.norm(cam, axis=1, keepdims=True)
     cam *= 1 + rng.normal(0, noise_px, (len(cam), 1)) * distance / (rig.left.fx * rig.baseline)
     flips = np.packbits(rng.random((len(looks), 256)) < flip, axis=1)
+    return Corners(_float32(left), _float32(right), _float32(cam), looks ^ flips)
+
+
+def _float32(values: F64) -> F32:
+    return values.astype(np.float32)
+
+
+def _keyframe(k: int, odom: F64, ids: list[int], seen: Corners, corners: Corners) -> Keyframe:
     return Keyframe(
         kf_id=k,
         frame_id=5 * k,
         stamp_ns=k * 10**8,
         odom_T_cam=odom,
         point_ids=np.array(ids, np.int64),
-        uv_left=left,
-        uv_right=right,
-        points_cam=cam,
-        descriptors=looks ^ flips,
-        angles=np.zeros(len(looks), np.float32),
+        uv_left=seen.uv_left.astype(np.float64),
+        uv_right=seen.uv_right.astype(np.float64),
+        points_cam=seen.points_cam.astype(np.float64),
+        descriptors=seen.descriptors,
+        angles=np.zeros(len(ids), np.float32),
+        corners=corners,
     )

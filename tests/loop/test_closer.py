@@ -30,15 +30,16 @@ def error_of(walk: StoreWalk, loop: LoopResult) -> float:
     return float(np.linalg.norm((se3.inverse(truth) @ loop.candidate_T_kf)[:3, 3]))
 
 
-def test_a_walk_that_returns_is_closed_and_its_points_are_paired(vocabulary: voc.Vocabulary) -> None:
-    walk = make_walk([0, 1, 0], seed=3)
+@pytest.mark.parametrize("corners", [0, 300])
+def test_a_walk_that_returns_is_closed_and_its_points_are_paired(vocabulary: voc.Vocabulary, corners: int) -> None:
+    walk = make_walk([0, 1, 0], seed=3, max_corners=corners)
     results = close(walk, vocabulary)
     assert [r.kf_id for r in results] == [k.kf_id for k in walk.keyframes]  # exactly one answer each
     loops = [r for r in results if r.candidate_kf_id >= 0]
     second_visit = next(i for i, p in enumerate(walk.world_T_kf) if i > 90 and abs(p[0, 3]) < 0.1 and p[2, 2] > 0.9)
     assert any(r.kf_id >= second_visit for r in loops)
     for loop in loops:
-        assert error_of(walk, loop) < 0.05
+        assert error_of(walk, loop) < 0.1
         assert loop.inliers >= LoopConfig().min_inliers
         right = [walk.physical[a] == walk.physical[b] for a, b in loop.matches.tolist()]
         assert np.mean(right) > 0.95
@@ -54,7 +55,7 @@ def test_every_rejection_has_a_reason(vocabulary: voc.Vocabulary) -> None:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_identical_aisles_are_not_taken_for_each_other(vocabulary: voc.Vocabulary, seed: int) -> None:
-    walk = make_walk([0, 1, 0], identical=True, seed=seed)
+    walk = make_walk([0, 1, 0], alike=1.0, seed=seed)
     loops = [r for r in close(walk, vocabulary) if r.candidate_kf_id >= 0]
     assert all(error_of(walk, loop) < 0.1 for loop in loops)
     assert any(walk.world_T_kf[r.kf_id][2, 2] > 0.9 and r.kf_id > 90 for r in loops)
@@ -62,10 +63,21 @@ def test_identical_aisles_are_not_taken_for_each_other(vocabulary: voc.Vocabular
 
 def test_without_the_odometry_gate_identical_aisles_deceive(vocabulary: voc.Vocabulary) -> None:
     """The gate is what saves the test above: appearance and geometry alone accept the twin aisle."""
-    walk = make_walk([0, 1], identical=True, seed=0)
+    walk = make_walk([0, 4], alike=1.0, seed=0)  # so far apart that neither is seen from the other
     blind = dataclasses.replace(LoopConfig(), gate_metres=100.0, gate_degrees=360.0)
     loops = [r for r in close(walk, vocabulary, blind) if r.candidate_kf_id >= 0]
     assert any(error_of(walk, loop) > 1.0 for loop in loops)
+
+
+def test_of_two_places_that_look_alike_the_one_that_shows_more_is_taken(vocabulary: voc.Vocabulary) -> None:
+    """Half of the products stand in both aisles, and odometry allows everything."""
+    walk = make_walk([0, 4, 0], alike=0.5, seed=0)
+    blind = dataclasses.replace(LoopConfig(), gate_metres=100.0, gate_degrees=360.0)
+    again = next(i for i, p in enumerate(walk.world_T_kf) if i > 90 and abs(p[0, 3]) < 0.1 and p[2, 2] > 0.9)
+    results = close(walk, vocabulary, blind)[again + 4 :]
+    loops = [r for r in results if r.candidate_kf_id >= 0]
+    assert loops and all(error_of(walk, r) < 0.1 for r in loops)
+    assert any(reason == "better_elsewhere" for r in results for _, _, reason in r.rejected)
 
 
 def test_pause_after_a_loop(vocabulary: voc.Vocabulary) -> None:
@@ -131,7 +143,7 @@ def test_tracking_that_began_anew_finds_the_place_it_just_left(vocabulary: voc.V
 
 def test_tracking_that_began_anew_in_a_twin_aisle_does_not_join_the_first(vocabulary: voc.Vocabulary) -> None:
     """Dark between two identical aisles: the robot cannot have driven back so fast as the pictures say."""
-    walk = make_walk([0, 1], identical=True, seed=0)
+    walk = make_walk([0, 1], alike=1.0, seed=0)
     turned = next(i for i, pose in enumerate(walk.world_T_kf) if pose[0, 3] > 1.0)
     rest = walk.keyframes[turned + 2 :]
     begin = se3.inverse(rest[0].odom_T_cam)

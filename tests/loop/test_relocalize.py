@@ -14,7 +14,7 @@ from stereo_sfm.loop.extension import Extension
 from stereo_sfm.loop.localizer import Localizer
 from stereo_sfm.loop.relocalize import Relocalizer
 from stereo_sfm.mapping.keyframe_poses import KeyframePoses
-from stereo_sfm.types import F64, U8
+from stereo_sfm.types import F64, U8, Corners
 from tests.export.maps import map_of_walk
 from tests.loop.store_walk import StoreWalk, make_walk
 
@@ -68,15 +68,19 @@ def test_a_strange_place_is_not_found(walk: StoreWalk, relocalizer: Relocalizer)
         assert not location.found and location.reason
 
 
+def _exchanged(descriptors: U8, rng: np.random.Generator) -> U8:
+    looks: U8 = rng.integers(0, 256, descriptors.shape, dtype=np.uint8)
+    return np.where(rng.random((len(descriptors), 1)) < 0.2, looks, descriptors)
+
+
 def test_a_fifth_of_the_products_exchanged(walk: StoreWalk, first_pass: int, relocalizer: Relocalizer) -> None:
     rng = np.random.default_rng(0)
     found = 0
     asked = range(first_pass + 8, len(walk.keyframes), 4)
     for k in asked:
         keyframe = walk.keyframes[k]
-        other = rng.random(len(keyframe.descriptors)) < 0.2
-        looks: U8 = rng.integers(0, 256, keyframe.descriptors.shape, dtype=np.uint8)
-        changed = dataclasses.replace(keyframe, descriptors=np.where(other[:, None], looks, keyframe.descriptors))
+        corners = dataclasses.replace(keyframe.corners, descriptors=_exchanged(keyframe.corners.descriptors, rng))
+        changed = dataclasses.replace(keyframe, descriptors=_exchanged(keyframe.descriptors, rng), corners=corners)
         location = relocalizer.locate(changed)
         if location.found:
             found += 1
@@ -85,7 +89,9 @@ def test_a_fifth_of_the_products_exchanged(walk: StoreWalk, first_pass: int, rel
 
 
 def test_a_view_without_points_has_a_reason(walk: StoreWalk, relocalizer: Relocalizer) -> None:
-    blind = dataclasses.replace(walk.keyframes[3], descriptors=np.zeros_like(walk.keyframes[3].descriptors))
+    blind = dataclasses.replace(
+        walk.keyframes[3], descriptors=np.zeros_like(walk.keyframes[3].descriptors), corners=Corners.none()
+    )
     location = relocalizer.locate(blind)
     assert location.reason == "no_candidate"
 
@@ -128,7 +134,9 @@ def test_what_came_before_the_first_answer_is_placed_with_it(
     localizer = Localizer(map_of_walk(part).snapshot, walk.rig, vocabulary, LoopConfig())
     rows = range(first_pass + 5, first_pass + 9)
     keyframes = [dataclasses.replace(walk.keyframes[k], kf_id=n) for n, k in enumerate(rows)]
-    blind = [dataclasses.replace(k, descriptors=np.zeros_like(k.descriptors)) for k in keyframes[:2]]
+    blind = [
+        dataclasses.replace(k, descriptors=np.zeros_like(k.descriptors), corners=Corners.none()) for k in keyframes[:2]
+    ]
     assert [len(localizer.step(k).kf_ids) for k in blind] == [0, 0]
     update = localizer.step(keyframes[2])
     assert update.kf_ids.tolist() == [0, 1, 2]
@@ -167,7 +175,9 @@ def test_a_walk_goes_on_in_the_frame_of_the_saved_map(
         dataclasses.replace(walk.keyframes[k], kf_id=n, odom_T_cam=odom @ walk.keyframes[k].odom_T_cam)
         for n, k in enumerate(rows)
     ]
-    blind = [dataclasses.replace(k, descriptors=np.zeros_like(k.descriptors)) for k in keyframes[:2]]
+    blind = [
+        dataclasses.replace(k, descriptors=np.zeros_like(k.descriptors), corners=Corners.none()) for k in keyframes[:2]
+    ]
     poses = KeyframePoses()
     for keyframe in blind:
         assert np.array_equal(extension.step(keyframe).map_T_odom, np.eye(4)) and not localizer.found

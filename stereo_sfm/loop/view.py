@@ -1,0 +1,58 @@
+"""What one keyframe shows to place recognition: the corners that it is known by, and its points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.rig import Rig
+from stereo_sfm.loop import binary
+from stereo_sfm.loop.absolute_pose import range_sigmas
+from stereo_sfm.types import F64, I64, U8, Bool, Keyframe
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """N described pixels; corners decide whether a place is the same, points are what two sides of a loop share."""
+
+    ids: I64  # (N,) point ids; corners that are no points have -1
+    uv_left: F64  # (N, 2) px
+    uv_right: F64  # (N, 2) px, NaN where unseen
+    points: F64  # (N, 3) metres in this camera, NaN where the depth is unknown
+    sigmas: F64  # (N,) metres along the ray
+    descriptors: U8  # (N, 32), none of them zero
+    words: binary.U64  # (N, 4) the same
+    corner: Bool  # (N,) a detector finds it again
+
+    @property
+    def corners(self) -> int:
+        """How many rows are corners."""
+        return int(self.corner.sum())
+
+
+def view_of(keyframe: Keyframe, rig: Rig, disparity_sigma: float) -> View:
+    """Corners of a keyframe, then its points; without corners of their own, its points are the corners."""
+    c = keyframe.corners
+    uv_left = np.concatenate([c.uv_left, keyframe.uv_left]).astype(np.float64)
+    uv_right = np.concatenate([c.uv_right, keyframe.uv_right]).astype(np.float64)
+    points = np.concatenate([c.points_cam, keyframe.points_cam]).astype(np.float64)
+    descriptors = np.concatenate([c.descriptors, keyframe.descriptors])
+    ids = np.concatenate([np.full(len(c), -1, np.int64), keyframe.point_ids])
+    corner = np.arange(len(ids)) < (len(c) or len(ids))
+    rows = binary.present(descriptors)
+    return View(
+        ids[rows],
+        uv_left[rows],
+        uv_right[rows],
+        points[rows],
+        range_sigmas(points[rows], rig, disparity_sigma),
+        descriptors[rows],
+        binary.as_words(descriptors[rows]),
+        corner[rows],
+    )
+
+
+def known_by(keyframe: Keyframe) -> U8:
+    """(N, 32) descriptors of its corners, or of its points where it has none."""
+    return keyframe.corners.descriptors if len(keyframe.corners) else keyframe.descriptors

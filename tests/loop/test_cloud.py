@@ -1,0 +1,71 @@
+"""What is matched to what: corners and points of keyframes, and which rows are one physical thing."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from stereo_sfm.geometry import se3
+from stereo_sfm.loop.cloud import gather, match_guided
+from stereo_sfm.loop.view import known_by, view_of
+from stereo_sfm.types import Corners
+from tests.loop.store_walk import StoreWalk, make_walk
+
+SIGMA = 0.5  # px
+
+
+@pytest.fixture(scope="module")
+def walk() -> StoreWalk:
+    return make_walk([0], seed=4)
+
+
+def test_corners_come_first_and_are_no_points(walk: StoreWalk) -> None:
+    keyframe = walk.keyframes[5]
+    view, n = view_of(keyframe, walk.rig, SIGMA), len(keyframe.corners)
+    assert view.corners == n == 300
+    assert (view.ids[:n] == -1).all() and np.array_equal(view.ids[n:], keyframe.point_ids)
+    assert view.corner[:n].all() and not view.corner[n:].any()
+    assert np.array_equal(known_by(keyframe), view.descriptors[:n])
+
+
+def test_a_keyframe_without_corners_is_known_by_its_points(walk: StoreWalk) -> None:
+    keyframe = dataclasses.replace(walk.keyframes[5], corners=Corners.none())
+    view = view_of(keyframe, walk.rig, SIGMA)
+    assert view.corner.all() and np.array_equal(view.ids, keyframe.point_ids)
+    assert np.array_equal(known_by(keyframe), keyframe.descriptors)
+
+
+def test_points_without_a_descriptor_are_left_out(walk: StoreWalk) -> None:
+    keyframe = walk.keyframes[5]
+    some = keyframe.descriptors.copy()
+    some[::2] = 0
+    view = view_of(dataclasses.replace(keyframe, descriptors=some), walk.rig, SIGMA)
+    assert np.array_equal(view.ids[300:], keyframe.point_ids[1::2])
+
+
+def test_corners_of_neighbours_at_one_place_share_an_id(walk: StoreWalk) -> None:
+    a, b = walk.keyframes[5], walk.keyframes[6]
+    cloud = gather(a, [b], walk.rig, SIGMA)
+    first, second = (cloud.ids[cloud.corner & (cloud.view == k)] for k in range(2))
+    assert len(np.unique(first)) == len(first) and len(np.unique(second)) == len(second)
+    shared = np.intersect1d(first, second)
+    assert len(shared) > 80
+    points = [cloud.points[cloud.corner & (cloud.view == k)][np.isin(i, shared)] for k, i in enumerate((first, second))]
+    order = [np.argsort(i[np.isin(i, shared)]) for i in (first, second)]
+    apart = np.linalg.norm(points[0][order[0]] - points[1][order[1]], axis=1)
+    assert np.median(apart) < 0.15  # stereo depth is that uncertain
+    assert (cloud.ids[~cloud.corner] >= 0).all() and (cloud.ids[cloud.corner] < 0).all()
+
+
+def test_only_like_is_paired_with_like(walk: StoreWalk) -> None:
+    a, b = walk.keyframes[5], walk.keyframes[6]
+    cloud, view = gather(a, [], walk.rig, SIGMA), view_of(b, walk.rig, SIGMA)
+    b_T_a = se3.inverse(walk.world_T_kf[6]) @ walk.world_T_kf[5]
+    rows_b, rows_a = match_guided(b_T_a, view, cloud, walk.rig, 60, 4.0)
+    assert np.array_equal(view.corner[rows_b], cloud.corner[rows_a])
+    assert len(np.unique(rows_b)) == len(rows_b) and len(np.unique(rows_a)) == len(rows_a)
+    points = ~view.corner[rows_b]
+    assert points.sum() > 100 and (~points).sum() > 80
+    assert np.mean(view.ids[rows_b[points]] == cloud.ids[rows_a[points]]) > 0.95

@@ -1,0 +1,99 @@
+"""Corners for place recognition: found again from another place, with depth, and none of the tracker's business."""
+
+from __future__ import annotations
+
+import dataclasses
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from calib.rig import Rig
+from drivers.sim.source import SimSource
+from drivers.source import open_source
+from stereo_sfm.config import load
+from stereo_sfm.geometry import se3
+from stereo_sfm.loop.still import still_keyframe
+from stereo_sfm.loop.verification import occupied_cells
+from stereo_sfm.tracking.factory import make_tracker
+from stereo_sfm.types import F32, F64, U8, Corners, Keyframe, StereoImage
+
+SOURCE = "sim:loop?size=424x400&rate=10"
+
+
+@pytest.fixture(scope="module")
+def walk() -> SimSource:
+    source = open_source(SOURCE)
+    assert isinstance(source, SimSource)
+    return source
+
+
+def keyframe_at(walk: SimSource, row: int) -> tuple[Keyframe, F64]:
+    assert walk.ground_truth is not None
+    keyframe = still_keyframe(walk.frame(int(walk.frame_ids[row])), walk.rig)
+    assert keyframe is not None
+    return keyframe, walk.ground_truth.poses[row]
+
+
+def share_found_again(rig: Rig, b_T_a: F64, a: Corners, uv_b: F32, descriptors_b: U8) -> float:
+    """Of those in the view of b: something within 3 px of their place there that looks alike."""
+    uv = rig.left.project(se3.transform(b_T_a, a.points_cam.astype(np.float64)))
+    width, height = rig.left.size
+    with np.errstate(invalid="ignore"):
+        inside = np.flatnonzero((uv > 30).all(1) & (uv[:, 0] < width - 30) & (uv[:, 1] < height - 30))
+    found = 0
+    for k in inside:
+        near = np.abs(uv_b - uv[k]).max(axis=1) < 3
+        bits = np.unpackbits(descriptors_b[near] ^ a.descriptors[k], axis=1).sum(axis=1)
+        found += bool((bits <= 60).any())
+    return found / len(inside)
+
+
+@pytest.mark.parametrize("rows", [(40, 42), (100, 103), (200, 198)])
+def test_corners_are_found_again_a_step_further(walk: SimSource, rows: tuple[int, int]) -> None:
+    (a, world_T_a), (b, world_T_b) = (keyframe_at(walk, row) for row in rows)
+    b_T_a = se3.inverse(world_T_b) @ world_T_a
+    assert 0.1 < se3.extent(b_T_a)[0] < 0.5
+    assert min(len(a.corners), len(b.corners)) > 250
+    assert share_found_again(walk.rig, b_T_a, a.corners, b.corners.uv_left, b.corners.descriptors) > 0.4
+
+
+def test_corners_lie_all_over_the_image_and_have_depth(walk: SimSource) -> None:
+    corners = keyframe_at(walk, 40)[0].corners
+    assert occupied_cells(corners.uv_left.astype(np.float64), walk.rig.left.size) > 20
+    assert np.isfinite(corners.points_cam).all() and np.isfinite(corners.uv_right).all()
+    assert walk.rig.right is not None
+    right = walk.rig.right.project(se3.transform(se3.inverse(walk.rig.left_T_right), corners.points_cam))
+    assert np.percentile(np.linalg.norm(right - corners.uv_right, axis=1), 90) < 1.0
+
+
+def run(*overrides: str) -> list[Keyframe]:
+    with open_source(SOURCE) as source:
+        tracker = make_tracker(load(overrides=overrides), source.rig)
+        return [k for image in islice(source, 25) if (k := tracker.step(image)[1]) is not None]
+
+
+def test_corners_change_nothing_for_the_tracker() -> None:
+    with_corners, without = run(), run("loop.corners=0")
+    assert len(with_corners) >= 3 and all(len(k.corners) > 200 for k in with_corners)
+    for a, b in zip(with_corners, without, strict=True):
+        assert not len(b.corners)
+        for name in ("odom_T_cam", "point_ids", "uv_left", "uv_right", "points_cam", "descriptors"):
+            assert np.array_equal(getattr(a, name), getattr(b, name), equal_nan=True)
+
+
+def test_odometry_alone_needs_none() -> None:
+    assert not any(len(k.corners) for k in run("mapper.enabled=false", "loop.enabled=false"))
+
+
+def test_a_black_image_has_none(walk: SimSource) -> None:
+    image = walk.frame(int(walk.frame_ids[0]))
+    dark = np.zeros_like(image.left)
+    assert still_keyframe(dataclasses.replace(image, left=dark, right=dark.copy()), walk.rig) is None
+
+
+def test_an_eye_that_sees_nothing_leaves_none(walk: SimSource) -> None:
+    image = walk.frame(int(walk.frame_ids[40]))
+    covered = StereoImage(0, 0, image.left, np.full_like(image.left, 90))
+    keyframe = still_keyframe(covered, walk.rig)
+    assert keyframe is None or len(keyframe.corners) < 10
