@@ -89,11 +89,15 @@ def read_run(reader: LogReader) -> RecordedRun:
     """Configuration and schedule of a run.
 
     Raises:
-        StereoSfmError: the file is a recording, not a run.
+        StereoSfmError: the file is a recording, not a run; or a run of a version with other settings.
     """
     text = reader.attachment(CONFIG_FILE)
     if text is None:
         raise StereoSfmError(f"{reader.path} is no log of a run: it holds no configuration ('stereo-sfm run' takes it)")
+    try:
+        config = from_dict(tomllib.loads(text.decode()))
+    except StereoSfmError as error:
+        raise StereoSfmError(f"{reader.path} was written by another version of this program: {error}") from None
     about = reader.metadata(METADATA)
     found: dict[str, list[Any]] = {topics.APPLIED: [], topics.DROPPED: []}
     for record, message in messages(reader, tuple(found)):
@@ -102,7 +106,7 @@ def read_run(reader: LogReader) -> RecordedRun:
         about.get("source", ""),
         about.get("mode", ""),
         about.get("image_format", ""),
-        from_dict(tomllib.loads(text.decode())),
+        config,
         found[topics.APPLIED],
         found[topics.DROPPED],
         read_opening(reader),

@@ -18,6 +18,7 @@ from stereo_sfm.loop.view import View, view_of
 from stereo_sfm.types import F64, I64, U8, Bool, Keyframe
 
 SAME_CORNER_PX, SAME_CORNER_BITS = 4.0, 50  # corners of two keyframes that are so near and so alike are one
+CORNERS = 10**6  # more than a keyframe has
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +29,6 @@ class Cloud:
     points: F64  # (M, 3) metres in the centre's camera
     sigmas: F64  # (M,) metres along the ray
     descriptors: U8  # (M, 32)
-    words: binary.U64  # (M, 4) the same
     uv_left: F64  # (M, 2) px in the image of the row's own keyframe
     uv_right: F64  # (M, 2)
     corner: Bool  # (M,) a detector finds it again
@@ -56,7 +56,7 @@ def gather(centre: Keyframe, others: Sequence[Keyframe], rig: Rig, disparity_sig
         view = view_of(keyframe, rig, disparity_sigma)
         ids = view.ids.copy()
         nameless = np.flatnonzero(ids < 0)
-        ids[nameless] = -1 - nameless - k * 10**6
+        ids[nameless] = -1 - k * CORNERS - nameless
         if k and len(nameless):
             so_far = _joined(parts, centre_T_kf)
             rows, at = match_guided(se3.inverse(centre_T_kf[k]), view, so_far, rig, SAME_CORNER_BITS, SAME_CORNER_PX)
@@ -69,7 +69,6 @@ def gather(centre: Keyframe, others: Sequence[Keyframe], rig: Rig, disparity_sig
                 se3.transform(centre_T_kf[k], view.points[deep]),
                 view.sigmas[deep],
                 view.descriptors[deep],
-                view.words[deep],
                 view.uv_left[deep],
                 view.uv_right[deep],
                 view.corner[deep],
@@ -91,7 +90,8 @@ def match_guided(b_T_a: F64, view: View, cloud: Cloud, rig: Rig, max_distance: i
     Corners are paired with corners, other points with other points.
     """
     uv = rig.left.project(se3.transform(b_T_a, cloud.points))
-    best = _nearest_within(view.uv_left, view.words, view.corner, uv, cloud.words, cloud.corner, radius, max_distance)
+    words_b, words_a = binary.as_words(view.descriptors), binary.as_words(cloud.descriptors)
+    best = _nearest_within(view.uv_left, words_b, view.corner, uv, words_a, cloud.corner, radius, max_distance)
     rows_b = np.flatnonzero(best >= 0)
     return rows_b, best[rows_b].astype(np.int64)
 

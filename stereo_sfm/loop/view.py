@@ -22,7 +22,6 @@ class View:
     points: F64  # (N, 3) metres in this camera, NaN where the depth is unknown
     sigmas: F64  # (N,) metres along the ray
     descriptors: U8  # (N, 32), none of them zero
-    words: binary.U64  # (N, 4) the same
     corner: Bool  # (N,) a detector finds it again
 
     @property
@@ -48,7 +47,6 @@ def view_of(keyframe: Keyframe, rig: Rig, disparity_sigma: float) -> View:
         points[rows],
         range_sigmas(points[rows], rig, disparity_sigma),
         descriptors[rows],
-        binary.as_words(descriptors[rows]),
         corner[rows],
     )
 

@@ -361,6 +361,14 @@ def test_what_a_replay_needs_comes_back(run: Path) -> None:
     assert {"Frame", "Keyframe", "TrackStats", "StageTimes", "CompressedImage", "PointCloud", "Log"} <= kinds
 
 
+def test_a_run_of_a_version_with_other_settings_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("stereo_sfm.log.provenance.dump", lambda config: "[loop]\nan_old_setting = 1\n")
+    path = tmp_path / "old.mcap"
+    RunLog(LogWriter(path), fisheye_rig(), Config(), source="t", mode="inline", image_format="none").close()
+    with LogReader(path) as reader, pytest.raises(StereoSfmError, match=r"written by another version.*an_old_setting"):
+        read_run(reader)
+
+
 def test_a_recording_is_no_run_and_a_run_without_images_says_where_they_are(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
