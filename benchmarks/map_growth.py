@@ -3,9 +3,9 @@
     python benchmarks/map_growth.py
 
 Every keyframe sees 400 points: 300 of the one before it, 100 new ones; every tenth also sees the 100 that were new 500
-keyframes earlier, as in a loop. An insertion is what the mapper asks of the map: new points, observations,
-covisibility, neighbours, the delta. Medians and 99th percentiles of the 100 insertions before each size; the worst one
-holds the doubling of a column.
+keyframes earlier, as in a loop; each brings 400 corners to be recognised by. An insertion is what the mapper asks of the
+map: new points, observations, covisibility, neighbours, the delta. Medians and 99th percentiles of the 100 insertions
+before each size; the worst one holds the doubling of a column.
 """
 
 from __future__ import annotations
@@ -25,10 +25,11 @@ import numpy as np
 import psutil
 
 from stereo_sfm.mapping.map import Map
-from stereo_sfm.types import I64, Keyframe
+from stereo_sfm.types import I64, Corners, Keyframe
 
 SIZES = (100, 1_000, 10_000)
 TRACKED, NEW, BACK = 300, 100, 500
+CORNERS = 400
 
 
 def keyframe(kf_id: int, point_ids: I64, rng: np.random.Generator) -> Keyframe:
@@ -45,6 +46,12 @@ def keyframe(kf_id: int, point_ids: I64, rng: np.random.Generator) -> Keyframe:
         points_cam=rng.uniform(1, 5, (n, 3)),
         descriptors=rng.integers(0, 256, (n, 32), dtype=np.uint8),
         angles=np.zeros(n, np.float32),
+        corners=Corners(
+            rng.uniform(0, 800, (CORNERS, 2)).astype(np.float32),
+            rng.uniform(0, 800, (CORNERS, 2)).astype(np.float32),
+            rng.uniform(1, 5, (CORNERS, 3)).astype(np.float32),
+            rng.integers(0, 256, (CORNERS, 32), dtype=np.uint8),
+        ),
     )
 
 
