@@ -3,7 +3,7 @@
     python benchmarks/map_growth.py
 
 Every keyframe sees 400 points: 300 of the one before it, 100 new ones; every tenth also sees the 100 that were new 500
-keyframes earlier, as in a loop; each brings 400 corners to be recognised by. An insertion is what the mapper asks of the
+keyframes earlier, as in a loop; each brings 400 corners to be known by. An insertion is what the mapper asks of the
 map: new points, observations, covisibility, neighbours, the delta. Medians and 99th percentiles of the 100 insertions
 before each size; the worst one holds the doubling of a column.
 """
