@@ -142,10 +142,10 @@ class LoopConfig:
     connected_points: int = 15  # shared points that make two keyframes connected
     min_gap: int = 10  # keyframes between a keyframe and its candidate
     max_candidates: int = 3  # places verified per keyframe
-    corners: int = 400  # a keyframe is known by: points followed by flow are seldom detected again (0: known by those)
+    corners: int = 400  # made at a keyframe to recognise it by; 0: its points, which are seldom detected again
     proximity: bool = True  # verify also the old keyframe that should be nearest by odometry
     pause: int = 10  # keyframes after an accepted loop in which none is searched
-    min_match_fraction: float = 0.15  # of the keyframe's points that must match the candidate's (paper: 0.3)
+    min_match_fraction: float = 0.15  # of the keyframe's corners that must match the candidate's (paper: 0.3)
     max_distance: int = 60  # bits between matching descriptors
     match_ratio: float = 0.9  # nearest / second nearest descriptor
     pixel_sigma: float = above_zero(1.0)  # px, of a point found again from another side
@@ -163,7 +163,7 @@ class LoopConfig:
     gate_degrees_per_metre: float = 0.3
     relocalize_candidates: int = 16  # places of a saved map that are verified
     relocalize_keyframes: int = 6  # keyframes whose points make up a place
-    relocalize_inliers: int = 56  # points that must agree with the pose found in a saved map
+    relocalize_inliers: int = 56  # corners that must agree with the pose found in a saved map
     relocalize_share: float = 0.25  # ... and so large a share of the camera's corners (near a guess: min_inlier_share)
     relocalize_cells: int = 6  # ... in so many of the image's 8 x 6 cells
     seed: int = 0

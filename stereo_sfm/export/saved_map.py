@@ -146,18 +146,9 @@ def restore_map(snapshot: MapSnapshot) -> Map:
     map_ = Map()
     map_.add_points(snapshot.pt_ids, snapshot.points, 0)
     map_.points.anchor[:] = snapshot.anchors
-    bounds = np.searchsorted(snapshot.obs_kf, np.arange(len(snapshot.kf_ids) + 1))
-    for k, keyframe in enumerate(snapshot.keyframes()):
-        row = map_.add_keyframe(keyframe, snapshot.map_T_kf[k])
-        part = slice(bounds[k], bounds[k + 1])
-        map_.observe(
-            row,
-            snapshot.obs_pt[part],
-            snapshot.uv_left[part],
-            snapshot.uv_right[part],
-            snapshot.descriptors[part],
-            snapshot.angles[part],
-        )
+    for k, map_T_kf in zip(snapshot.keyframes(), snapshot.map_T_kf, strict=True):
+        row = map_.add_keyframe(k, map_T_kf)
+        map_.observe(row, map_.point_rows(k.point_ids), k.uv_left, k.uv_right, k.descriptors, k.angles)
     map_.keyframes.odom_T_kf[:] = snapshot.odom_T_kf
     map_.points.seen[:] = snapshot.seen
     map_.points.expected[:] = snapshot.expected

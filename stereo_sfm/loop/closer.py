@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +25,7 @@ PLACE_RADIUS = 3  # candidates this many keyframes apart are one place: only the
 FRESH, CROWD = 30, 5  # newest keyframes, which are all kept; keyframes of one view beyond which one is forgotten
 DRIFT_PER_METRE = 0.003  # of the odometry on both sides of a gap
 RIVAL = 0.5  # share of a loop's inliers with which another place makes it ambiguous, where odometry cannot decide
+REFUTED = "against_odometry", "out_of_reach"  # what cannot be, however much it looks so
 AGREE_METRES, AGREE_DEGREES = 0.15, 2.0  # how well two keyframes must agree on a loop
 
 
@@ -35,7 +35,8 @@ class _Hypothesis:
     candidate_kf_id: int
     candidate_T_kf: F64
     inliers: int
-    against: str = ""  # what speaks against it
+    against: str  # what odometry has to say against it
+    on_its_own: bool  # no odometry leads from one end to the other: nothing but the pictures speaks for it
 
 
 class LoopCloser:
@@ -135,10 +136,17 @@ class LoopCloser:
         view = view_of(keyframe, self._rig, self._config.disparity_sigma)
         verdicts = [self._verify(keyframe, view, candidate) for candidate, _ in candidates]
         reasons = [verdict.reason for verdict in verdicts]
-        verified = sorted((k for k, reason in enumerate(reasons) if not reason), key=lambda k: -verdicts[k].inliers)
+        loops = {
+            k: self._hypothesis(keyframe.kf_id, candidates[k][0], verdict)
+            for k, verdict in enumerate(verdicts)
+            if not verdict.reason
+        }
+        most = max((loop.inliers for loop in loops.values() if not loop.against), default=0)
+        self._pending = [h for h in self._pending if keyframe.kf_id - h.kf_id < self._config.consistent_window]
+        self._pending += [h for h in loops.values() if h.against or h.inliers >= RIVAL * most]
         accepted = -1
-        for k in verified:
-            reasons[k] = self._doubt(keyframe, candidates[k][0], verdicts[k], view, verdicts[verified[0]].inliers)
+        for k in sorted(loops, key=lambda k: -loops[k].inliers):
+            reasons[k] = loops[k].against or self._doubt(loops[k], most)
             if not reasons[k]:
                 accepted = k
                 break
@@ -156,30 +164,30 @@ class LoopCloser:
         rng = np.random.default_rng([config.seed, keyframe.kf_id, candidate])
         return verify(view, cloud, self._rig, config, rng)
 
-    def _doubt(self, keyframe: Keyframe, candidate: int, verdict: Verdict, view: View, most: int) -> str:
-        """Why a verified candidate is no loop yet, '' if it is one; `most`: inliers of the best candidate."""
-        loop = _Hypothesis(keyframe.kf_id, candidate, se3.inverse(verdict.b_T_a), verdict.inliers)
-        self._pending = [h for h in self._pending if loop.kf_id - h.kf_id < self._config.consistent_window]
-        against = "better_elsewhere" if loop.inliers < RIVAL * most else self._against(loop, view.corners)
-        loop = dataclasses.replace(loop, against=against)
-        self._pending.append(loop)
-        return against or ("" if self._agreed(loop) else "not_confirmed_yet")
-
-    def _against(self, loop: _Hypothesis, seen: int) -> str:
-        """What speaks against a verified loop, '' for nothing; the keyframe has `seen` corners."""
-        config = self._config
-        way = self._graph.way(loop.candidate_kf_id, loop.kf_id)
+    def _hypothesis(self, kf_id: int, candidate: int, verdict: Verdict) -> _Hypothesis:
+        """A verified candidate, and what is known of the way to it."""
+        config, candidate_T_kf = self._config, se3.inverse(verdict.b_T_a)
+        way = self._graph.way(candidate, kf_id)
         if way is not None:
             metres = config.gate_metres + config.gate_per_metre * way.metres
             degrees = config.gate_degrees + config.gate_degrees_per_metre * way.metres
-            return "" if within(se3.inverse(way.a_T_b) @ loop.candidate_T_kf, metres, degrees) else "against_odometry"
-        jump = self._graph.jump(loop.candidate_kf_id, loop.kf_id, loop.candidate_T_kf)
-        if jump is not None and jump.off > jump.radius + DRIFT_PER_METRE * jump.walked:
-            return "out_of_reach"
-        if loop.inliers < max(2 * config.min_inliers, config.unknown_way_share * seen):
-            return "too_few_inliers"  # nothing but the pictures speaks for it
-        rivals = [h for h in self._pending if h.inliers > RIVAL * loop.inliers and self._same_loop(h, loop) is False]
-        return "ambiguous" if rivals else ""
+            near = within(se3.inverse(way.a_T_b) @ candidate_T_kf, metres, degrees)
+            against = "" if near else "against_odometry"
+        else:
+            jump = self._graph.jump(candidate, kf_id, candidate_T_kf)
+            reached = jump is None or jump.off <= jump.radius + DRIFT_PER_METRE * jump.walked
+            enough = verdict.inliers >= 2 * config.min_inliers and verdict.share >= config.unknown_way_share
+            against = "out_of_reach" if not reached else "" if enough else "too_few_inliers"
+        return _Hypothesis(kf_id, candidate, candidate_T_kf, verdict.inliers, against, way is None)
+
+    def _doubt(self, loop: _Hypothesis, most: int) -> str:
+        """Why a loop that odometry allows is none yet, '' if it is one; `most`: inliers of the best such candidate."""
+        if loop.inliers < RIVAL * most:
+            return "better_elsewhere"
+        rivals = [h for h in self._pending if h.against not in REFUTED and h.inliers > RIVAL * loop.inliers]
+        if loop.on_its_own and any(self._same_loop(h, loop) is False for h in rivals):
+            return "ambiguous"
+        return "" if self._agreed(loop) else "not_confirmed_yet"
 
     def _agreed(self, new: _Hypothesis) -> bool:
         """Whether enough earlier keyframes found the same loop."""

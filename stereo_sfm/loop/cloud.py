@@ -27,11 +27,11 @@ class Cloud:
 
     ids: I64  # (M,) point ids; negative for corners that are no points
     points: F64  # (M, 3) metres in the centre's camera
-    sigmas: F64  # (M,) metres along the ray
+    sigmas: F64  # (M,) metres along the ray of the row's own keyframe
     descriptors: U8  # (M, 32)
     uv_left: F64  # (M, 2) px in the image of the row's own keyframe
     uv_right: F64  # (M, 2)
-    corner: Bool  # (M,) a detector finds it again
+    corner: Bool  # (M,) of `Keyframe.corners`; False: a point
     view: I64  # (M,) which keyframe that is: row of centre_T_kf
     centre_T_kf: F64  # (V, 4, 4); row 0 is the centre
 
@@ -60,8 +60,9 @@ def gather(centre: Keyframe, others: Sequence[Keyframe], rig: Rig, disparity_sig
         if k and len(nameless):
             so_far = _joined(parts, centre_T_kf)
             rows, at = match_guided(se3.inverse(centre_T_kf[k]), view, so_far, rig, SAME_CORNER_BITS, SAME_CORNER_PX)
-            same = (ids[rows] < 0) & (so_far.ids[at] < 0)
-            ids[rows[same]] = so_far.ids[at[same]]
+            corner = view.corner[rows]
+            known, first = np.unique(so_far.ids[at[corner]], return_index=True)
+            ids[rows[corner][first]] = known
         deep = np.isfinite(view.points[:, 2])
         parts.append(
             Cloud(
@@ -80,7 +81,8 @@ def gather(centre: Keyframe, others: Sequence[Keyframe], rig: Rig, disparity_sig
 
 
 def _joined(parts: list[Cloud], centre_T_kf: F64) -> Cloud:
-    columns: dict[str, Any] = {f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Cloud)[:-1]}
+    names = [f.name for f in fields(Cloud) if f.name != "centre_T_kf"]
+    columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
     return Cloud(**columns, centre_T_kf=centre_T_kf)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from calib.rig import Rig
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
-from stereo_sfm.loop.relocalize import SURE, Location, Relocalizer, nowhere
+from stereo_sfm.loop.relocalize import Location, Relocalizer, nowhere
 from stereo_sfm.loop.verification import within
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.mapping.map import MapSnapshot
@@ -21,7 +21,7 @@ LOST_AFTER = 5  # keyframes without an answer near the prediction before the who
 class Localizer:
     """One keyframe in, one `MapUpdate` out that moves nothing but `map_T_odom`.
 
-    The first answer needs no guess; where it rests on few points, a second keyframe must say the same. Later keyframes
+    The first answer needs no guess; where it rests on few corners, a second keyframe must say the same. Later keyframes
     are looked for around the prediction; after some failures, or when tracking restarted as another submap, the whole
     map is searched again. `found` is False until the first answer.
     Keyframes from before the first answer of their submap get their places with it, by odometry.
@@ -34,8 +34,8 @@ class Localizer:
         self._version = 0
         self._submap = -1
         self._failures = 0
-        self._unsure: F64 | None = None  # map_T_odom by the newest keyframe, if it rests on few points
-        self._waiting: list[Keyframe] | None = []  # of this submap, not placed yet; None: it is placed
+        self._unsure: F64 | None = None  # map_T_odom by the newest keyframe, if it rests on few corners
+        self._waiting: list[tuple[int, F64]] | None = []  # keyframes of this submap without a place; None: it has one
         self.found = False
         self.last = None
 
@@ -57,8 +57,8 @@ class Localizer:
         return MapUpdate(
             version=self._version,
             kf_id=keyframe.kf_id,
-            kf_ids=np.array([k.kf_id for k in placed], np.int64),
-            map_T_kf=np.array([self._map_T_odom @ k.odom_T_cam for k in placed]).reshape(-1, 4, 4),
+            kf_ids=np.array([kf_id for kf_id, _ in placed], np.int64),
+            map_T_kf=np.array([self._map_T_odom @ odom_T_cam for _, odom_T_cam in placed]).reshape(-1, 4, 4),
             point_ids=np.zeros(0, np.int64),
             points_map=np.zeros((0, 3)),
             culled_point_ids=np.zeros(0, np.int64),
@@ -70,11 +70,12 @@ class Localizer:
         """Nothing is left behind."""
         return None
 
-    def _placed(self, keyframe: Keyframe) -> list[Keyframe]:
-        """The keyframes whose places are known with this one."""
+    def _placed(self, keyframe: Keyframe) -> list[tuple[int, F64]]:
+        """The keyframes (id, odom_T_cam) whose places are known with this one."""
+        newest = keyframe.kf_id, keyframe.odom_T_cam
         if self._waiting is None:
-            return [keyframe]
-        waiting = [*self._waiting, keyframe]
+            return [newest]
+        waiting = [*self._waiting, newest]
         found = self.last is not None and self.last.found
         self._waiting = None if found else waiting
         return waiting if found else []
@@ -87,7 +88,7 @@ class Localizer:
                 return near
         place = self._relocalizer.locate(keyframe)
         before, self._unsure = self._unsure, None
-        if not place.found or place.inliers >= SURE * self._config.relocalize_inliers:
+        if not place.found or place.sure:
             return place
         if before is not None and self._within_gate(before @ keyframe.odom_T_cam, place):
             return place

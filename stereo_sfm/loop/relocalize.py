@@ -21,7 +21,7 @@ from stereo_sfm.types import F64, I64, Keyframe
 
 SAME_METRES, SAME_DEGREES = 0.2, 5.0  # two answers closer than this are one
 RIVAL = 0.85  # another place with this share of the inliers makes the answer ambiguous
-SURE = 2.0  # times the inliers asked for: no need to look at more candidates
+SURE = 2.0  # times the inliers asked for: no need to look at more candidates, or for a second opinion
 MIN_RANGE_SIGMA = 0.003  # metres
 
 
@@ -35,6 +35,7 @@ class Location:
     kf_id: int  # the map's keyframe that showed the place, -1: none
     inliers: int
     pairs: I64  # (M, 2) the map's point ids, the camera's
+    sure: bool = False  # the inliers are more than enough
 
     @property
     def found(self) -> bool:
@@ -79,10 +80,10 @@ class Relocalizer:
             if verdict.reason:
                 reason = verdict.reason if reason == "no_candidate" else reason
                 continue
-            found.append(self._location(row, verdict))
-            if verdict.inliers >= SURE * self._config.relocalize_inliers:
+            found.append(self._location(row, verdict, self._config.relocalize_share))
+            if found[-1].sure:
                 break
-        return self._choose(found, self._config.relocalize_share * view.corners) if found else nowhere(reason)
+        return self._choose(found) if found else nowhere(reason)
 
     def locate_near(self, keyframe: Keyframe, guess: F64) -> Location:
         """Find the camera near a predicted map_T_cam (4, 4): as `locate`, but only around the guess."""
@@ -92,7 +93,7 @@ class Relocalizer:
         verdict = verify_near(start, view, self.cloud(row), self._rig, self._config)
         if verdict.reason:
             return nowhere(verdict.reason, verdict.inliers)
-        return self._choose([self._location(row, verdict)], self._near_share * view.corners)
+        return self._choose([self._location(row, verdict, self._near_share)])
 
     def cloud(self, row: int) -> Cloud:
         """The map around a keyframe row, in its camera: what it and its neighbours show."""
@@ -124,16 +125,19 @@ class Relocalizer:
         metres, radians = se3.extent(se3.inverse(self._map.map_T_kf) @ guess)
         return int(np.argmin(metres + radians))
 
-    def _location(self, row: int, verdict: Verdict) -> Location:
+    def _location(self, row: int, verdict: Verdict, share: float) -> Location:
+        """The place that a verdict stands for, if this share of the camera's corners is asked for."""
         map_T_cam = self._map.map_T_kf[row] @ se3.inverse(verdict.b_T_a)
         kf_id = int(self._map.kf_ids[row])
-        return Location("", map_T_cam, verdict.information, kf_id, verdict.inliers, verdict.pairs)
+        enough = min(verdict.inliers / self._config.relocalize_inliers, verdict.share / share)
+        reason = "" if enough >= 1 else "too_few_inliers"
+        return Location(reason, map_T_cam, verdict.information, kf_id, verdict.inliers, verdict.pairs, enough >= SURE)
 
-    def _choose(self, found: list[Location], wanted: float) -> Location:
-        """The answer with most points, if they are enough and no other place comes near it."""
+    def _choose(self, found: list[Location]) -> Location:
+        """The answer with most inliers, if they are enough and no other place comes near it."""
         best = max(found, key=lambda x: x.inliers)
-        if best.inliers < max(self._config.relocalize_inliers, wanted):
-            return nowhere("too_few_inliers", best.inliers)
+        if best.reason:
+            return nowhere(best.reason, best.inliers)
         for other in found:
             apart = not within(se3.inverse(best.map_T_cam) @ other.map_T_cam, SAME_METRES, SAME_DEGREES)
             if apart and other.inliers > RIVAL * best.inliers:

@@ -18,7 +18,7 @@ from stereo_sfm.loop.absolute_pose import Matches, Pose, consistent, ransac_pose
 from stereo_sfm.loop.cloud import Cloud, match_guided
 from stereo_sfm.loop.view import View
 from stereo_sfm.mapping.bundle import Bundle, bundle_adjust
-from stereo_sfm.types import F64, I64
+from stereo_sfm.types import F64, I64, Bool
 
 GUIDED = (12.0, 4), (6.0, 10)  # rounds: radius of the search in px, most iterations
 RANSAC_SHARE = 0.4  # of the corners that must agree in the end, for the pose of three of them
@@ -33,12 +33,20 @@ class Verdict:
     b_T_a: F64  # (4, 4) from the candidate's frame into the camera's
     information: F64  # (6, 6)
     pairs: I64  # (M, 2) point ids: candidate's, camera's; corners that are no points are left out
-    inliers: int  # corners that agree
+    inliers: int  # corners that agree (points, where one side has no corners)
+    share: float  # of the camera's corners that these are
 
 
 def rejection(reason: str, inliers: int = 0) -> Verdict:
     """A verdict against."""
-    return Verdict(reason, np.eye(4), np.zeros((6, 6)), np.zeros((0, 2), np.int64), inliers)
+    return Verdict(reason, np.eye(4), np.zeros((6, 6)), np.zeros((0, 2), np.int64), inliers, 0.0)
+
+
+def compared(view: View, cloud: Cloud) -> tuple[Bool, Bool]:
+    """Rows of both that tell whether the place is the same: corners, or points where one side has no corners."""
+    if view.corner.any() and cloud.corner.any():
+        return view.corner, cloud.corner
+    return ~view.corner, ~cloud.corner
 
 
 def verify(
@@ -47,9 +55,9 @@ def verify(
     """Match, place, match again along the projection, and judge. See the reasons below for what is asked for.
 
     Args:
-        move_points: finish with a bundle that moves the points too (stereo points are noisy, those of a map are not).
+        move_points: finish with a bundle that moves the points too (those of stereo are noisy, those of a map less so).
     """
-    corners_b, corners_a = np.flatnonzero(view.corner), np.flatnonzero(cloud.corner)
+    corners_b, corners_a = (np.flatnonzero(rows) for rows in compared(view, cloud))
     at_b, at_a, _ = binary.match_descriptors(
         view.descriptors[corners_b],
         cloud.descriptors[corners_a],
@@ -65,7 +73,7 @@ def verify(
     if start is None:
         return rejection("no_pose")
     agree = int(consistent(start, matches, rig, config.pixel_sigma).sum())
-    if agree < RANSAC_SHARE * _wanted(view, config):
+    if agree < RANSAC_SHARE * max(config.min_inliers, config.min_inlier_share * len(corners_b)):
         return rejection("too_few_inliers", agree)
     pose = refine_pose(start, matches, rig, config.pixel_sigma, GUIDED[0][1])
     return verify_near(pose.b_T_a, view, cloud, rig, config, move_points)
@@ -85,21 +93,17 @@ def verify_near(
         b_T_a = pose.b_T_a
     assert pose is not None
     rows_a, rows_b = rows_a[pose.inlier], rows_b[pose.inlier]
-    corners = rows_b[view.corner[rows_b]]
-    inliers = len(corners)
-    if inliers < _wanted(view, config):
+    corner, _ = compared(view, cloud)
+    corners = rows_b[corner[rows_b]]
+    inliers, share = len(corners), len(corners) / max(int(corner.sum()), 1)
+    if inliers < config.min_inliers or share < config.min_inlier_share:
         return rejection("too_few_inliers", inliers)
     if occupied_cells(view.uv_left[corners], rig.left.size) < config.min_cells:
         return rejection("not_spread", inliers)
     if move_points:
         b_T_a = refine_with_points(b_T_a, view, cloud, rows_b, rows_a, rig, config)
     pairs = np.stack([cloud.ids[rows_a], view.ids[rows_b]], axis=1)
-    return Verdict("", b_T_a, pose.information, pairs[(pairs >= 0).all(axis=1)], inliers)
-
-
-def _wanted(view: View, config: LoopConfig) -> float:
-    """So many corners must agree with a pose."""
-    return max(config.min_inliers, config.min_inlier_share * view.corners)
+    return Verdict("", b_T_a, pose.information, pairs[(pairs >= 0).all(axis=1)], inliers, share)
 
 
 def refine_with_points(

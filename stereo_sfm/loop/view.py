@@ -14,7 +14,7 @@ from stereo_sfm.types import F64, I64, U8, Bool, Keyframe
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """N described pixels; corners decide whether a place is the same, points are what two sides of a loop share."""
+    """N described pixels: corners tell whether a place is the same, points are what two sides of a loop share."""
 
     ids: I64  # (N,) point ids; corners that are no points have -1
     uv_left: F64  # (N, 2) px
@@ -22,23 +22,18 @@ class View:
     points: F64  # (N, 3) metres in this camera, NaN where the depth is unknown
     sigmas: F64  # (N,) metres along the ray
     descriptors: U8  # (N, 32), none of them zero
-    corner: Bool  # (N,) a detector finds it again
-
-    @property
-    def corners(self) -> int:
-        """How many rows are corners."""
-        return int(self.corner.sum())
+    corner: Bool  # (N,) of `Keyframe.corners`; False: a point
 
 
 def view_of(keyframe: Keyframe, rig: Rig, disparity_sigma: float) -> View:
-    """Corners of a keyframe, then its points; without corners of their own, its points are the corners."""
+    """Corners of a keyframe, then its points."""
     c = keyframe.corners
-    uv_left = np.concatenate([c.uv_left, keyframe.uv_left]).astype(np.float64)
-    uv_right = np.concatenate([c.uv_right, keyframe.uv_right]).astype(np.float64)
-    points = np.concatenate([c.points_cam, keyframe.points_cam]).astype(np.float64)
+    uv_left = np.concatenate([c.uv_left, keyframe.uv_left], dtype=np.float64)
+    uv_right = np.concatenate([c.uv_right, keyframe.uv_right], dtype=np.float64)
+    points = np.concatenate([c.points_cam, keyframe.points_cam], dtype=np.float64)
     descriptors = np.concatenate([c.descriptors, keyframe.descriptors])
     ids = np.concatenate([np.full(len(c), -1, np.int64), keyframe.point_ids])
-    corner = np.arange(len(ids)) < (len(c) or len(ids))
+    corner = np.arange(len(ids)) < len(c)
     rows = binary.present(descriptors)
     return View(
         ids[rows],

@@ -77,17 +77,17 @@ class MapSnapshot:
             stamp_ns=int(self.stamp_ns[k]),
             odom_T_cam=pose.copy(),
             point_ids=self.pt_ids[points],
-            uv_left=self.uv_left[seen].copy(),
-            uv_right=self.uv_right[seen].copy(),
+            uv_left=self.uv_left[seen],
+            uv_right=self.uv_right[seen],
             points_cam=(self.points[points] - pose[:3, 3]) @ pose[:3, :3],
-            descriptors=self.descriptors[seen].copy(),
-            angles=self.angles[seen].copy(),
+            descriptors=self.descriptors[seen],
+            angles=self.angles[seen],
             submap_id=int(self.submap_ids[k]),
             corners=Corners(
-                self.corner_uv_left[corners].copy(),
-                self.corner_uv_right[corners].copy(),
-                self.corner_points[corners].copy(),
-                self.corner_descriptors[corners].copy(),
+                self.corner_uv_left[corners],
+                self.corner_uv_right[corners],
+                self.corner_points[corners],
+                self.corner_descriptors[corners],
             ),
         )
 
@@ -408,6 +408,7 @@ class Map:
     def snapshot(self) -> MapSnapshot:
         """Everything that lives."""
         kfs, pts, table = self.living_keyframes(), self.living_points(), self.observations
+        pts = pts[np.argsort(self.points.pt_id[pts])]
         kf_index = np.full(len(self.keyframes), -1, np.int64)
         kf_index[kfs] = np.arange(len(kfs))
         pt_index = np.full(len(self.points) + 1, -1, np.int64)

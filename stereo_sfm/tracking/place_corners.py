@@ -1,7 +1,8 @@
 """What a keyframe is recognised by: ORB corners of the whole image, tracked or not, with their stereo depth.
 
 The points that flow follows were corners where they were first seen. Where they are now, a detector finds others, and
-when the place is seen again a third choice: a fifth of them come back. So place recognition has corners of its own.
+when the place is seen again a third choice: one in eight comes back. So place recognition has corners of its own. One
+spot may be a corner on several levels: that is what makes it known again from nearer or farther away.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ class PlaceCorners:
     """Oriented FAST with rotated BRIEF (Rublee et al., ORB, ICCV 2011) on level 1 of the pyramid.
 
     Args:
-        count: at most so many, the strongest; 0: none.
+        count: so many, the strongest of each level (more where equals end the list); 0: none.
         mask: (H/2, W/2) where they may lie.
     """
 

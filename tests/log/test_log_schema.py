@@ -18,6 +18,7 @@ from stereo_sfm.log.track_stats import TrackStats
 from stereo_sfm.pipeline.sinks import Health
 from stereo_sfm.types import (
     Applied,
+    Corners,
     Dropped,
     Frame,
     Keyframe,
@@ -44,6 +45,10 @@ def _messages(n: int, seed: int) -> list[object]:
     keyframe = Keyframe(
         n, 7, -5, rng.normal(size=(4, 4)), rng.integers(0, 9**9, n), rng.normal(size=(n, 2)), rng.normal(size=(n, 2)),
         rng.normal(size=(n, 3)), rng.integers(0, 256, (n, 32), np.uint8), rng.random(n).astype(np.float32), 2,
+        corners=Corners(
+            rng.random((n, 2), np.float32), rng.random((n, 2), np.float32), rng.random((n, 3), np.float32),
+            rng.integers(0, 256, (n, 32), np.uint8),
+        ),
     )  # fmt: skip
     update = MapUpdate(
         1, 2, rng.integers(0, 9, n), rng.normal(size=(n, 4, 4)), rng.integers(0, 9, n), rng.normal(size=(n, 3)),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
 from stereo_sfm.loop.closer import LoopCloser
-from stereo_sfm.types import LoopResult
+from stereo_sfm.loop.verification import Verdict, rejection
+from stereo_sfm.loop.view import View
+from stereo_sfm.types import F64, Keyframe, LoopResult
 from tests.loop.store_walk import StoreWalk, make_walk
 
 
@@ -78,6 +81,58 @@ def test_of_two_places_that_look_alike_the_one_that_shows_more_is_taken(vocabula
     loops = [r for r in results if r.candidate_kf_id >= 0]
     assert loops and all(error_of(walk, r) < 0.1 for r in loops)
     assert any(reason == "better_elsewhere" for r in results for _, _, reason in r.rejected)
+
+
+def scripted(walk: StoreWalk, answers: dict[tuple[int, int], tuple[int, F64]]) -> Callable[..., Verdict]:
+    """In place of `LoopCloser._verify`: (keyframe, candidate) -> inliers, and the error of the relative pose."""
+
+    def answer(_: LoopCloser, keyframe: Keyframe, __: View, candidate: int) -> Verdict:
+        if (keyframe.kf_id, candidate) not in answers:
+            return rejection("too_few_matches")
+        inliers, error = answers[keyframe.kf_id, candidate]
+        truth = se3.inverse(walk.world_T_kf[candidate]) @ walk.world_T_kf[keyframe.kf_id]
+        nothing = np.zeros((0, 2), np.int64)
+        return Verdict("", se3.inverse(truth @ error), np.eye(6), nothing, inliers, inliers / 300)
+
+    return answer
+
+
+def answers_of(
+    walk: StoreWalk, vocabulary: voc.Vocabulary, monkeypatch: pytest.MonkeyPatch, script: dict[tuple[int, int], int],
+    wrong: set[int], keyframes: list[Keyframe] | None = None,
+) -> list[LoopResult]:  # fmt: skip
+    """Results where these candidates are verified with so many inliers, those in `wrong` five metres off."""
+    off = se3.exp(np.array([0, 0, 5.0, 0, 0, 0]))
+    answers = {key: (inliers, off if key[1] in wrong else np.eye(4)) for key, inliers in script.items()}
+    monkeypatch.setattr(LoopCloser, "_verify", scripted(walk, answers))
+    monkeypatch.setattr(
+        LoopCloser,
+        "_candidates",
+        lambda self, keyframe, bag: ([(c, 0.5) for k, c in script if k == keyframe.kf_id], "no_candidate"),
+    )
+    return close(walk if keyframes is None else dataclasses.replace(walk, keyframes=keyframes), vocabulary)
+
+
+def test_a_twin_that_odometry_refutes_does_not_stand_against_the_true_place(
+    vocabulary: voc.Vocabulary, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    walk = make_walk([0], seed=3)
+    script = {(k, c): n for k in (28, 29) for c, n in ((k - 25, 60), (10, 130))}
+    results = answers_of(walk, vocabulary, monkeypatch, script, wrong={10})
+    assert results[28].rejected == ((3, 0.5, "not_confirmed_yet"), (10, 0.5, "against_odometry"))
+    assert results[29].candidate_kf_id == 4 and results[29].rejected == ((10, 0.5, "against_odometry"),)
+
+
+def test_two_places_in_one_image_are_ambiguous_where_no_way_decides(
+    vocabulary: voc.Vocabulary, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    walk = make_walk([0], seed=3)
+    anew = [dataclasses.replace(k, submap_id=int(k.kf_id >= 20), stamp_ns=0) for k in walk.keyframes]
+    one, other = {(25, 5): 200, (26, 6): 210}, {(26, 12): 205}
+    alone = answers_of(walk, vocabulary, monkeypatch, one, set(), anew)
+    assert alone[25].reason == "not_confirmed_yet" and alone[26].candidate_kf_id == 6
+    both = answers_of(walk, vocabulary, monkeypatch, one | other, {12}, anew)
+    assert both[26].candidate_kf_id == -1 and [why for _, _, why in both[26].rejected] == ["ambiguous"] * 2
 
 
 def test_pause_after_a_loop(vocabulary: voc.Vocabulary) -> None:

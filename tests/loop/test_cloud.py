@@ -7,10 +7,12 @@ import dataclasses
 import numpy as np
 import pytest
 
+from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.cloud import gather, match_guided
+from stereo_sfm.loop.verification import compared, verify
 from stereo_sfm.loop.view import known_by, view_of
-from stereo_sfm.types import Corners
+from stereo_sfm.types import Corners, Keyframe
 from tests.loop.store_walk import StoreWalk, make_walk
 
 SIGMA = 0.5  # px
@@ -24,7 +26,7 @@ def walk() -> StoreWalk:
 def test_corners_come_first_and_are_no_points(walk: StoreWalk) -> None:
     keyframe = walk.keyframes[5]
     view, n = view_of(keyframe, walk.rig, SIGMA), len(keyframe.corners)
-    assert view.corners == n == 300
+    assert view.corner.sum() == n == 300
     assert (view.ids[:n] == -1).all() and np.array_equal(view.ids[n:], keyframe.point_ids)
     assert view.corner[:n].all() and not view.corner[n:].any()
     assert np.array_equal(known_by(keyframe), view.descriptors[:n])
@@ -33,8 +35,25 @@ def test_corners_come_first_and_are_no_points(walk: StoreWalk) -> None:
 def test_a_keyframe_without_corners_is_known_by_its_points(walk: StoreWalk) -> None:
     keyframe = dataclasses.replace(walk.keyframes[5], corners=Corners.none())
     view = view_of(keyframe, walk.rig, SIGMA)
-    assert view.corner.all() and np.array_equal(view.ids, keyframe.point_ids)
+    assert not view.corner.any() and np.array_equal(view.ids, keyframe.point_ids)
     assert np.array_equal(known_by(keyframe), keyframe.descriptors)
+    cloud = gather(keyframe, [], walk.rig, SIGMA)
+    assert all(rows.all() for rows in compared(view, cloud))
+
+
+@pytest.mark.parametrize("without", ["view", "cloud"])
+def test_points_are_compared_where_one_side_has_no_corners(walk: StoreWalk, without: str) -> None:
+    """A map of a descriptor tracker, asked by the default one, and the other way round."""
+    a, b = walk.keyframes[5], walk.keyframes[6]
+    if without == "view":
+        b = dataclasses.replace(b, corners=Corners.none())
+    else:
+        a = dataclasses.replace(a, corners=Corners.none())
+    cloud, view = gather(a, [], walk.rig, SIGMA), view_of(b, walk.rig, SIGMA)
+    verdict = verify(view, cloud, walk.rig, LoopConfig(), np.random.default_rng(0))
+    assert not verdict.reason and verdict.inliers > 100
+    error = verdict.b_T_a @ se3.inverse(walk.world_T_kf[5]) @ walk.world_T_kf[6]
+    assert se3.extent(error)[0] < 0.05
 
 
 def test_points_without_a_descriptor_are_left_out(walk: StoreWalk) -> None:
@@ -46,17 +65,30 @@ def test_points_without_a_descriptor_are_left_out(walk: StoreWalk) -> None:
 
 
 def test_corners_of_neighbours_at_one_place_share_an_id(walk: StoreWalk) -> None:
-    a, b = walk.keyframes[5], walk.keyframes[6]
-    cloud = gather(a, [b], walk.rig, SIGMA)
-    first, second = (cloud.ids[cloud.corner & (cloud.view == k)] for k in range(2))
-    assert len(np.unique(first)) == len(first) and len(np.unique(second)) == len(second)
-    shared = np.intersect1d(first, second)
-    assert len(shared) > 80
-    points = [cloud.points[cloud.corner & (cloud.view == k)][np.isin(i, shared)] for k, i in enumerate((first, second))]
-    order = [np.argsort(i[np.isin(i, shared)]) for i in (first, second)]
-    apart = np.linalg.norm(points[0][order[0]] - points[1][order[1]], axis=1)
-    assert np.median(apart) < 0.15  # stereo depth is that uncertain
+    cloud = gather(walk.keyframes[5], [walk.keyframes[k] for k in (6, 4, 7)], walk.rig, SIGMA)
+    views = [cloud.ids[cloud.corner & (cloud.view == k)] for k in range(4)]
+    assert all(len(np.unique(ids)) == len(ids) == 300 for ids in views)
+    for k, ids in enumerate(views[1:], 1):
+        shared, at_0, at_k = np.intersect1d(views[0], ids, return_indices=True)
+        assert len(shared) > 80
+        points_0, points_k = (cloud.points[cloud.corner & (cloud.view == n)] for n in (0, k))
+        apart = np.linalg.norm(points_0[at_0] - points_k[at_k], axis=1)
+        assert np.median(apart) < 0.15  # stereo depth is that uncertain
     assert (cloud.ids[~cloud.corner] >= 0).all() and (cloud.ids[cloud.corner] < 0).all()
+
+
+def test_two_corners_of_one_keyframe_never_share_an_id(walk: StoreWalk) -> None:
+    """Each keyframe shows the same corner twice, as detectors of several scales do."""
+
+    def doubled(k: int) -> Keyframe:
+        c = walk.keyframes[k].corners
+        twice = (np.repeat(column, 2, axis=0) for column in (c.uv_left, c.uv_right, c.points_cam, c.descriptors))
+        return dataclasses.replace(walk.keyframes[k], corners=Corners(*twice))
+
+    cloud = gather(doubled(5), [doubled(k) for k in (6, 4, 7, 3)], walk.rig, SIGMA)
+    for k in range(5):
+        ids = cloud.ids[cloud.corner & (cloud.view == k)]
+        assert len(np.unique(ids)) == len(ids) == 600
 
 
 def test_only_like_is_paired_with_like(walk: StoreWalk) -> None:

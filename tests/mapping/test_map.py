@@ -43,6 +43,18 @@ def insert(m: Map, kf: Keyframe) -> int:
     return row
 
 
+def test_points_of_a_snapshot_are_in_order_of_their_ids() -> None:
+    """Trackers may number the points of a keyframe in any order."""
+    m = Map()
+    insert(m, keyframe(0, np.array([7, 3, 9])))
+    insert(m, keyframe(1, np.array([9, 1, 7])))
+    s = m.snapshot()
+    assert s.pt_ids.tolist() == [1, 3, 7, 9]
+    for k, ids in enumerate(([7, 3, 9], [9, 1, 7])):
+        assert s.pt_ids[s.obs_pt[s.obs_kf == k]].tolist() == ids
+    assert np.array_equal(s.points, m.points.xyz[m.point_rows(s.pt_ids)])
+
+
 def check(m: Map) -> None:
     """Lists, counts and covisibility say what the observation table says."""
     table = m.observations
