@@ -68,6 +68,8 @@ def make_mapper(config: Config, rig: Rig, spans: NoSpans, folders: MapFolders) -
     """The mapper, or the localizer in a saved map."""
     if not folders.localize_only and not config.mapper.enabled and (folders.map_in or folders.map_out):
         raise StereoSfmError("there is no map without the mapper: leave mapper.enabled=true, or --map-in and --map-out")
+    if folders.localize_only and not config.mapper.enabled and not config.loop.enabled:
+        raise StereoSfmError("--localize-only recognises places: leave loop.enabled=true")
     from stereo_sfm.mapping.mapper import Mapper
 
     if folders.map_in is None:

@@ -1,0 +1,101 @@
+"""`run --map-out`, then `--map-in` when a fifth of the products are others: placed in the map, or mapped and joined."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.ground_truth import read_tum
+from drivers.source import open_source
+from stereo_sfm.cli import main
+from stereo_sfm.eval.associate import poses_at
+from stereo_sfm.export.saved_map import SavedMap, load_map
+from stereo_sfm.geometry import se3
+from stereo_sfm.types import F64
+
+FIRST = "sim:loop?size=424x400&rate=10"
+SECOND = f"{FIRST}&exchange=0.2"
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The map of the first five seconds."""
+    folder = tmp_path_factory.mktemp("maps")
+    run = ["run", FIRST, "--duration", "5", "--inline", "-q", "-o", str(folder / "run"), "--log", "none"]
+    assert main([*run, "--map-out", str(folder / "store")]) == 0
+    return folder / "store"
+
+
+def world_T_map(spec: str = FIRST) -> F64:
+    """A map begins at its first image."""
+    with open_source(spec) as source:
+        assert source.ground_truth is not None
+        return source.ground_truth.poses[0]
+
+
+def errors_in_the_map(run: Path) -> F64:
+    """(N,) metres between the map trajectory of the second walk and the truth in the first walk's frame."""
+    with open_source(SECOND) as source:
+        assert source.ground_truth is not None
+        estimate = read_tum(run / "trajectory_map.tum")
+        truth, rows = poses_at(source.ground_truth, estimate.stamp_ns)
+        truth = se3.inverse(world_T_map()) @ truth
+        return np.linalg.norm(estimate.poses[rows, :3, 3] - truth[:, :3, 3], axis=1)
+
+
+def second_walk(tmp_path: Path, store: Path, *options: str) -> int:
+    given = [
+        "--map-in",
+        str(store),
+        "--start",
+        "2",
+        "--duration",
+        "3",
+        "--inline",
+        "-q",
+        "--log",
+        "none",
+        "-o",
+        str(tmp_path / "run"),
+    ]
+    return main(["run", SECOND, *given, *options])
+
+
+def test_the_map_holds_what_it_is_recognised_by(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    saved = load_map(store)
+    assert len(np.unique(saved.snapshot.corner_kf)) == len(saved) >= 10
+    assert main(["map", "info", str(store)]) == 0
+    assert f"{len(saved.snapshot.corner_kf)} corners of {len(saved)} keyframes" in capsys.readouterr().out
+
+
+def test_another_walk_is_placed_in_the_map(tmp_path: Path, store: Path) -> None:
+    assert second_walk(tmp_path, store, "--localize-only") == 0
+    errors = errors_in_the_map(tmp_path / "run")
+    assert len(errors) >= 30 and np.median(errors) < 0.03 and errors.max() < 0.1
+
+
+def test_another_walk_is_joined_with_the_map(tmp_path: Path, store: Path) -> None:
+    assert second_walk(tmp_path, store, "--map-out", str(tmp_path / "both")) == 0
+    both: SavedMap = load_map(tmp_path / "both")
+    assert both.walks == [0, 1]
+    assert len(both) > len(load_map(store))
+    seen_by = [np.unique(both.snapshot.obs_pt[both.sessions[both.snapshot.obs_kf] == walk]) for walk in both.walks]
+    assert len(np.intersect1d(*seen_by)) > 50
+    assert np.median(errors_in_the_map(tmp_path / "run")) < 0.03
+
+
+def test_a_tracker_whose_keyframes_have_no_corners_says_where_it_is_or_that_it_does_not_know(
+    tmp_path: Path, store: Path
+) -> None:
+    code = second_walk(tmp_path, store, "--localize-only", "--odometry", "r-um", "--features", "orb")
+    assert code in (0, 4)
+    if code == 0:
+        assert np.median(errors_in_the_map(tmp_path / "run")) < 0.1
+
+
+def test_without_recognition_there_is_no_place(tmp_path: Path, store: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    off = ["--set", "mapper.enabled=false", "--set", "loop.enabled=false"]
+    assert second_walk(tmp_path, store, "--localize-only", *off) == 2
+    assert "leave loop.enabled=true" in capsys.readouterr().err
