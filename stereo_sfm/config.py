@@ -142,7 +142,7 @@ class LoopConfig:
     connected_points: int = 15  # shared points that make two keyframes connected
     min_gap: int = 10  # keyframes between a keyframe and its candidate
     max_candidates: int = 3  # places verified per keyframe
-    corners: int = 400  # made at a keyframe to recognise it by; 0: its points, which are seldom detected again
+    corners: int = above_zero(400)  # made at a keyframe to recognise it by: tracked points are seldom detected again
     proximity: bool = True  # verify also the old keyframe that should be nearest by odometry
     pause: int = 10  # keyframes after an accepted loop in which none is searched
     min_match_fraction: float = 0.15  # of the keyframe's corners that must match the candidate's (paper: 0.3)

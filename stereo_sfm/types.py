@@ -167,7 +167,7 @@ class Keyframe(Message):
     angles: F32  # (N,) radians, orientation of the descriptor's patch
     submap_id: int = 0  # grows when tracking restarts after it was lost
     covariance: F64 = field(default_factory=lambda: np.eye(6))  # (6, 6) of the pose relative to the previous keyframe
-    corners: Corners = field(default_factory=Corners.none)  # what it is recognised by; none: by its points
+    corners: Corners = field(default_factory=Corners.none)  # what it is recognised by; none: nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,7 +197,7 @@ class LoopResult(Message):
     candidate_T_kf: F64  # (4, 4) identity when rejected
     information: F64  # (6, 6) inverse covariance of candidate_T_kf @ exp(xi)
     matches: I64  # (M, 2) point ids (candidate's, this keyframe's) that are one physical point
-    inliers: int  # corners that agree, of the keyframe's (points, where there are no corners)
+    inliers: int  # corners of the keyframe that agree
     score: float
     reason: str  # "" when accepted, else why the best candidate was rejected ("no_candidate", "too_few_inliers", ...)
     rejected: tuple[tuple[int, float, str], ...] = ()  # every rejected candidate: (kf_id, score, reason)

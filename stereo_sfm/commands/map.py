@@ -69,9 +69,7 @@ def describe(saved: SavedMap) -> list[str]:
     return [
         f"{len(s.kf_ids)} keyframes, {len(s.pt_ids)} points, {len(s.obs_kf)} observations"
         f" ({views.mean():.1f} views a point)",
-        f"recognised by {len(s.corner_kf)} corners of {len(np.unique(s.corner_kf))} keyframes"
-        if len(s.corner_kf)
-        else "recognised by its points: no keyframe has corners",
+        f"recognised by {len(s.corner_kf)} corners of {len(np.unique(s.corner_kf))} keyframes",
         f"{int(saved.sessions.max()) + 1} walk(s), {len(np.unique(s.submap_ids))} submap(s),"
         f" {float(steps[s.submap_ids[1:] == s.submap_ids[:-1]].sum()):.1f} m between keyframes",
         f"points extend {extent[0]:.1f} x {extent[1]:.1f} x {extent[2]:.1f} m",

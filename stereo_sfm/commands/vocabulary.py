@@ -92,7 +92,6 @@ def _descriptors(spec: str, wanted: int) -> Iterator[U8]:
     from drivers.sim.source import SimSource
     from drivers.source import open_source
     from stereo_sfm.loop.still import still_keyframe
-    from stereo_sfm.loop.view import known_by
 
     with open_source(spec) as source:
         chosen = spread(source.frame_count or wanted, wanted)
@@ -105,4 +104,4 @@ def _descriptors(spec: str, wanted: int) -> Iterator[U8]:
         for image in images:
             keyframe = still_keyframe(image, source.rig)
             if keyframe is not None:
-                yield known_by(keyframe)
+                yield keyframe.corners.descriptors

@@ -15,7 +15,7 @@ from stereo_sfm.loop.database import PlaceDatabase
 from stereo_sfm.loop.graph import KeyframeGraph
 from stereo_sfm.loop.store import KeyframeStore
 from stereo_sfm.loop.verification import Verdict, verify, within
-from stereo_sfm.loop.view import View, known_by, view_of
+from stereo_sfm.loop.view import View, view_of
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.types import F64, Keyframe, LoopResult
@@ -77,7 +77,7 @@ class LoopCloser:
         """Look for the keyframe's place among the older ones, then remember it."""
         self._graph.add(keyframe.kf_id, keyframe.odom_T_cam, keyframe.submap_id, keyframe.stamp_ns)
         with self._spans.span("loop_words"):
-            bag = self._vocabulary.bag(known_by(keyframe))
+            bag = self._vocabulary.bag(keyframe.corners.descriptors)
         with self._spans.span("loop_query"):
             candidates, why_none = self._candidates(keyframe, bag)
         with self._spans.span("loop_verify"):
@@ -231,7 +231,7 @@ class LoopCloser:
     def _grow(self, keyframe: Keyframe) -> None:
         every = self._config.grow_every
         if every and keyframe.kf_id % every == every - 1:
-            recent = [known_by(self._store[k]) for k in self._store.ids[-every:]]
+            recent = [self._store[k].corners.descriptors for k in self._store.ids[-every:]]
             self._vocabulary = voc.grow(self._vocabulary, np.concatenate(recent))
 
 

@@ -14,7 +14,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.loop.cloud import Cloud, gather
 from stereo_sfm.loop.database import PlaceDatabase
 from stereo_sfm.loop.verification import Verdict, verify, verify_near, within
-from stereo_sfm.loop.view import known_by, view_of
+from stereo_sfm.loop.view import view_of
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.mapping.map import MapSnapshot
 from stereo_sfm.types import F64, I64, Keyframe
@@ -67,14 +67,14 @@ class Relocalizer:
         self._views = np.maximum(np.bincount(snapshot.obs_pt, minlength=shape[1]), 1)
         self._database = PlaceDatabase(len(vocabulary))
         for k, keyframe in enumerate(self._keyframes):
-            self._database.add(k, vocabulary.bag(known_by(keyframe)))
+            self._database.add(k, vocabulary.bag(keyframe.corners.descriptors))
 
     def locate(self, keyframe: Keyframe) -> Location:
         """Find the camera of a keyframe (its pose is ignored) in the map."""
         view = view_of(keyframe, self._rig, self._config.disparity_sigma)
         found: list[Location] = []
         reason = "no_candidate"
-        for row in self._places(self._database.scores(self._vocabulary.bag(known_by(keyframe)))):
+        for row in self._places(self._database.scores(self._vocabulary.bag(keyframe.corners.descriptors))):
             rng = np.random.default_rng([self._config.seed, row])
             verdict = verify(view, self.cloud(row), self._rig, self._config, rng, move_points=False)
             if verdict.reason:

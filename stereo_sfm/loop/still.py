@@ -6,7 +6,7 @@ import dataclasses
 
 from calib.rig import Rig
 from stereo_sfm.config import Config
-from stereo_sfm.tracking.tracker import Tracker
+from stereo_sfm.tracking.factory import make_tracker
 from stereo_sfm.types import Keyframe, StereoImage
 
 
@@ -15,5 +15,5 @@ def still_keyframe(
 ) -> Keyframe | None:
     """What a tracker that starts at this image makes of it (pose identity); None where it sees too little."""
     config = config or Config()
-    tracker = dataclasses.replace(config.tracker, max_features=max_features)
-    return Tracker(tracker, rig, place_corners=config.loop.corners).step(image)[1]
+    config = dataclasses.replace(config, tracker=dataclasses.replace(config.tracker, max_features=max_features))
+    return make_tracker(config, rig).step(image)[1]

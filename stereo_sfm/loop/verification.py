@@ -18,7 +18,7 @@ from stereo_sfm.loop.absolute_pose import Matches, Pose, consistent, ransac_pose
 from stereo_sfm.loop.cloud import Cloud, match_guided
 from stereo_sfm.loop.view import View
 from stereo_sfm.mapping.bundle import Bundle, bundle_adjust
-from stereo_sfm.types import F64, I64, Bool
+from stereo_sfm.types import F64, I64
 
 GUIDED = (12.0, 4), (6.0, 10)  # rounds: radius of the search in px, most iterations
 RANSAC_SHARE = 0.4  # of the corners that must agree in the end, for the pose of three of them
@@ -33,20 +33,13 @@ class Verdict:
     b_T_a: F64  # (4, 4) from the candidate's frame into the camera's
     information: F64  # (6, 6)
     pairs: I64  # (M, 2) point ids: candidate's, camera's; corners that are no points are left out
-    inliers: int  # corners that agree (points, where one side has no corners)
+    inliers: int  # corners that agree
     share: float  # of the camera's corners that these are
 
 
 def rejection(reason: str, inliers: int = 0) -> Verdict:
     """A verdict against."""
     return Verdict(reason, np.eye(4), np.zeros((6, 6)), np.zeros((0, 2), np.int64), inliers, 0.0)
-
-
-def compared(view: View, cloud: Cloud) -> tuple[Bool, Bool]:
-    """Rows of both that tell whether the place is the same: corners, or points where one side has no corners."""
-    if view.corner.any() and cloud.corner.any():
-        return view.corner, cloud.corner
-    return ~view.corner, ~cloud.corner
 
 
 def verify(
@@ -57,7 +50,7 @@ def verify(
     Args:
         move_points: finish with a bundle that moves the points too (those of stereo are noisy, those of a map less so).
     """
-    corners_b, corners_a = (np.flatnonzero(rows) for rows in compared(view, cloud))
+    corners_b, corners_a = np.flatnonzero(view.corner), np.flatnonzero(cloud.corner)
     at_b, at_a, _ = binary.match_descriptors(
         view.descriptors[corners_b],
         cloud.descriptors[corners_a],
@@ -93,9 +86,8 @@ def verify_near(
         b_T_a = pose.b_T_a
     assert pose is not None
     rows_a, rows_b = rows_a[pose.inlier], rows_b[pose.inlier]
-    corner, _ = compared(view, cloud)
-    corners = rows_b[corner[rows_b]]
-    inliers, share = len(corners), len(corners) / max(int(corner.sum()), 1)
+    corners = rows_b[view.corner[rows_b]]
+    inliers, share = len(corners), len(corners) / max(int(view.corner.sum()), 1)
     if inliers < config.min_inliers or share < config.min_inlier_share:
         return rejection("too_few_inliers", inliers)
     if occupied_cells(view.uv_left[corners], rig.left.size) < config.min_cells:

@@ -44,8 +44,3 @@ def view_of(keyframe: Keyframe, rig: Rig, disparity_sigma: float) -> View:
         descriptors[rows],
         corner[rows],
     )
-
-
-def known_by(keyframe: Keyframe) -> U8:
-    """(N, 32) descriptors of its corners, or of its points where it has none."""
-    return keyframe.corners.descriptors if len(keyframe.corners) else keyframe.descriptors

@@ -4,11 +4,16 @@
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 
+from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.types import F64, U8, Bool
+
+BORDER = 12  # of the half image, where no corners are looked for
 
 
 @njit
@@ -60,6 +65,14 @@ def _pick(found, order, blocked, radius, count):
 def _block_all(blocked, points, radius):
     for k in range(len(points)):
         _block(blocked, points[k, 0], points[k, 1], radius)
+
+
+def corner_mask(camera: Camera, max_angle_deg: float) -> Bool:
+    """(H/2, W/2) where corners may lie: what looks into the world, not too far from the axis or near to the border."""
+    half = camera.valid_mask(math.radians(max_angle_deg))[::2, ::2]
+    half[:BORDER] = half[-BORDER:] = False
+    half[:, :BORDER] = half[:, -BORDER:] = False
+    return half
 
 
 def detect_corners(half_image: U8, mask: Bool, taken: F64, count: int, spacing: float, quality: float) -> F64:

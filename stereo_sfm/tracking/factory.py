@@ -37,10 +37,10 @@ def make_tracker(
 def _tracker(config: Config, rig: Rig, spans: NoSpans | None, ground_truth: Trajectory | None) -> AnyTracker:
     method = config.odometry.method
     if method == "flow":
+        from stereo_sfm.tracking.place_corners import PlaceCorners
         from stereo_sfm.tracking.tracker import Tracker
 
-        recognised = config.mapper.enabled or config.loop.enabled
-        return Tracker(config.tracker, rig, spans, config.loop.corners if recognised else 0)
+        return Tracker(config.tracker, rig, spans, PlaceCorners(config, rig))
     if not rig.stereo and method in NEEDS_DEPTH:
         raise StereoSfmError(
             f"odometry {method} needs two eyes or depth, this camera has one eye: use eight-point or pnp"

@@ -23,6 +23,7 @@ from stereo_sfm.tracking.odometry.base import Motion
 from stereo_sfm.tracking.odometry.table import make_estimator
 from stereo_sfm.tracking.outgoing import keyframe_of, observations_of
 from stereo_sfm.tracking.pairing import Pairing
+from stereo_sfm.tracking.place_corners import PlaceCorners
 from stereo_sfm.tracking.scale import StepScale
 from stereo_sfm.tracking.view import View, ViewMaker, pixel_angle
 from stereo_sfm.types import (
@@ -51,6 +52,7 @@ class FeatureTracker:
         self._rig = rig
         self._spans = spans or NoSpans()
         self._views = ViewMaker(config.features, rig)
+        self._place_corners = PlaceCorners(config, rig)
         self._estimator = make_estimator(config.odometry, rig.left)
         self._scale = StepScale(config.odometry, ground_truth)
         self._pixel = pixel_angle(rig)
@@ -202,7 +204,8 @@ class FeatureTracker:
         self._odom_T_kfs[self._kf_id] = self._odom_T_cam
         self._frames_since_kf = 0
         covariance, self._kf_covariance = self._kf_covariance, np.zeros((6, 6))
-        return keyframe_of(view, image.stamp_ns, self._kf_id, self._odom_T_cam, self._submap, covariance)
+        keyframe = keyframe_of(view, image.stamp_ns, self._kf_id, self._odom_T_cam, self._submap, covariance)
+        return replace(keyframe, corners=self._place_corners.find(image))
 
     def _remember(self, image: StereoImage, view: View) -> None:
         self._last, self._odom_T_last, self._last_stamp = view, self._odom_T_cam, image.stamp_ns

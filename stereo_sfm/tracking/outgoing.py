@@ -18,7 +18,7 @@ def observations_of(view: View) -> Observations:
 
 
 def keyframe_of(view: View, stamp_ns: int, kf_id: int, odom_T_cam: F64, submap_id: int, covariance: F64) -> Keyframe:
-    """A keyframe with binary descriptors, whatever the tracker matches by; it is recognised by its points."""
+    """A keyframe with binary descriptors, whatever the tracker matches by, and no corners to recognise it by."""
     rows = view.ids >= 0
     uv = view.features.uv[rows]
     descriptors, angles = describe(view.image, uv)

@@ -10,30 +10,37 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from stereo_sfm.tracking.flow import Pyramid
+from calib.rig import Rig
+from stereo_sfm.config import Config
+from stereo_sfm.tracking.corners import corner_mask
+from stereo_sfm.tracking.flow import Pyramid, build_pyramid
 from stereo_sfm.tracking.stereo import StereoMatcher
-from stereo_sfm.types import F32, Bool, Corners
+from stereo_sfm.types import F32, Corners, StereoImage
 
 LEVELS, SCALE = 4, 1.2  # of ORB in the half image: more levels cost more than they find again
 FAST_THRESHOLD = 10  # grey levels
 
 
 class PlaceCorners:
-    """Oriented FAST with rotated BRIEF (Rublee et al., ORB, ICCV 2011) on level 1 of the pyramid.
+    """Oriented FAST with rotated BRIEF (Rublee et al., ORB, ICCV 2011) on level 1 of the pyramid."""
 
-    Args:
-        count: so many, the strongest of each level (more where equals end the list); 0: none.
-        mask: (H/2, W/2) where they may lie.
-    """
+    def __init__(self, config: Config, rig: Rig) -> None:
+        """A run that recognises no places, or a camera without depth, has none."""
+        wanted = rig.stereo and (config.mapper.enabled or config.loop.enabled)
+        self._levels = config.tracker.pyramid_levels
+        self._stereo = StereoMatcher(config.tracker, rig) if wanted else None
+        self._mask = corner_mask(rig.left, config.tracker.max_angle_deg).astype(np.uint8)
+        self._orb = cv2.ORB.create(config.loop.corners, SCALE, LEVELS, edgeThreshold=15, fastThreshold=FAST_THRESHOLD)
 
-    def __init__(self, count: int, mask: Bool, stereo: StereoMatcher) -> None:
-        self._count, self._stereo = count, stereo
-        self._mask = mask.astype(np.uint8)
-        self._orb = cv2.ORB.create(count, SCALE, LEVELS, edgeThreshold=15, fastThreshold=FAST_THRESHOLD)
+    def find(self, image: StereoImage) -> Corners:
+        """About as many as the configuration says, the strongest of each level, of those that both eyes see."""
+        if self._stereo is None:
+            return Corners.none()
+        return self.find_in(build_pyramid(image.left, self._levels), self._stereo.prepare(image))
 
-    def find(self, left: Pyramid, right: Pyramid | F32) -> Corners:
-        """Those that both eyes see."""
-        if not self._count:
+    def find_in(self, left: Pyramid, right: Pyramid | F32) -> Corners:
+        """As `find`, of a left image's pyramid and what `StereoMatcher.prepare` makes of the second eye."""
+        if self._stereo is None:
             return Corners.none()
         keypoints, descriptors = self._orb.detectAndCompute(left[1], self._mask)
         if not len(keypoints):

@@ -19,13 +19,25 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.tracking import flow, motion
 from stereo_sfm.tracking.coarse_rotation import CoarseRotation
-from stereo_sfm.tracking.corners import detect_corners
+from stereo_sfm.tracking.corners import corner_mask, detect_corners
 from stereo_sfm.tracking.descriptors import describe
 from stereo_sfm.tracking.eyes import Eyes
 from stereo_sfm.tracking.place_corners import PlaceCorners
 from stereo_sfm.tracking.stereo import StereoMatcher
 from stereo_sfm.tracking.tracks import Patches, Tracks
-from stereo_sfm.types import F32, F64, I64, Bool, Frame, Keyframe, MapUpdate, Observations, StereoImage, TrackState
+from stereo_sfm.types import (
+    F32,
+    F64,
+    I64,
+    Bool,
+    Corners,
+    Frame,
+    Keyframe,
+    MapUpdate,
+    Observations,
+    StereoImage,
+    TrackState,
+)
 
 CAUCHY_SCALES = np.array([20.0, 10.0, 6.0, 4.0, 3.0, 2.0, 2.0])  # in sigmas, one Gauss-Newton step each
 
@@ -58,20 +70,18 @@ class PoseSolution:
 class Tracker:
     """One `step` per image. Frame poses are odom_T_cam; the odometry frame is the first camera."""
 
-    def __init__(self, config: TrackerConfig, rig: Rig, spans: NoSpans | None = None, place_corners: int = 0) -> None:
-        """`place_corners`: at most so many at each keyframe, for place recognition."""
+    def __init__(
+        self, config: TrackerConfig, rig: Rig, spans: NoSpans | None = None, place_corners: PlaceCorners | None = None
+    ) -> None:
+        """`place_corners`: what keyframes are recognised by; None: by nothing."""
         self._config = config
         self._rig = rig
         self._eyes = Eyes.of(rig)
         self._spans = spans or NoSpans()
         self._stereo = StereoMatcher(config, rig)
-        half = rig.left.valid_mask(math.radians(config.max_angle_deg))[::2, ::2]
-        border = 12
-        half[:border] = half[-border:] = False
-        half[:, :border] = half[:, -border:] = False
-        self._mask: Bool = half
-        self._place_corners = PlaceCorners(place_corners, half, self._stereo)
-        area = 4.0 * half.sum()
+        self._mask = corner_mask(rig.left, config.max_angle_deg)
+        self._place_corners = place_corners
+        area = 4.0 * self._mask.sum()
         self._spacing = 0.75 * math.sqrt(area / config.max_features)
         self._patches = Patches(2 * config.max_features)
         self._tracks = Tracks()
@@ -307,7 +317,7 @@ class Tracker:
             angles=angles,
             submap_id=self._submap_id,
             covariance=covariance,
-            corners=self._place_corners.find(pyramid, right),
+            corners=Corners.none() if self._place_corners is None else self._place_corners.find_in(pyramid, right),
         )
         self._next_kf_id += 1
         self._kf_pose = self._pose.copy()

@@ -14,6 +14,7 @@ from stereo_sfm.types import F32, F64, I64, U8, Corners, Keyframe
 from tests.synthetic import fisheye_rig, see
 
 SHELF_Z = 10.0  # metres along an aisle
+CORNERS = 300  # of a keyframe
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,9 +88,8 @@ def make_walk(
     flip: float = 0.06,
     noise_px: float = 0.4,
     max_points: int = 300,
-    max_corners: int = 300,
 ) -> StoreWalk:
-    """Keyframes of a walk through the aisles, in this order; without corners they are known by their points."""
+    """Keyframes of a walk through the aisles, in this order."""
     rng, corner_rng = np.random.default_rng(seed), np.random.default_rng([seed, 1])
     rig = fisheye_rig()
     points, looks = shelf_points(max(aisles) + 1, alike, rng)
@@ -107,7 +107,7 @@ def make_walk(
         tracks = kept | dict(zip(new, range(len(physical) - len(new), len(physical)), strict=True))
         ids = [tracks[p] for p in rows.tolist()]
         seen = _seen(rig, pose, points[rows], looks[rows], rng, flip, noise_px)
-        strongest = _strongest(rig, pose, points, strength, corner_rng, max_corners)
+        strongest = _strongest(rig, pose, points, strength, corner_rng)
         corners = _seen(rig, pose, points[strongest], looks[strongest], corner_rng, flip, noise_px)
         keyframes.append(_keyframe(k, odom[k], ids, seen, corners))
     return StoreWalk(rig, keyframes, world_T_kf, physical)
@@ -121,11 +121,11 @@ def _visible(rig: Rig, pose: F64, points: F64, tracks: dict[int, int], rng: np.r
     return np.sort(rows[np.argsort(order, kind="stable")][:most])
 
 
-def _strongest(rig: Rig, pose: F64, points: F64, strength: F64, rng: np.random.Generator, most: int) -> I64:
+def _strongest(rig: Rig, pose: F64, points: F64, strength: F64, rng: np.random.Generator) -> I64:
     """Rows in sight that a detector prefers: much the same ones from view to view."""
     seen, _, right = see(rig, pose, points, max_depth=5.0)
     rows = np.flatnonzero(seen & np.isfinite(right[:, 0]))
-    return rows[np.argsort(-strength[rows] - rng.normal(0, 0.3, len(rows)), kind="stable")][:most]
+    return rows[np.argsort(-strength[rows] - rng.normal(0, 0.3, len(rows)), kind="stable")][:CORNERS]
 
 
 def _seen(

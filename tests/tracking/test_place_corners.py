@@ -73,8 +73,8 @@ def run(*overrides: str) -> list[Keyframe]:
         return [k for image in islice(source, 25) if (k := tracker.step(image)[1]) is not None]
 
 
-def test_corners_change_nothing_for_the_tracker() -> None:
-    with_corners, without = run(), run("loop.corners=0")
+def test_corners_change_nothing_for_the_tracker_and_odometry_alone_has_none() -> None:
+    with_corners, without = run(), run("mapper.enabled=false", "loop.enabled=false")
     assert len(with_corners) >= 3 and all(len(k.corners) > 200 for k in with_corners)
     for a, b in zip(with_corners, without, strict=True):
         assert not len(b.corners)
@@ -82,8 +82,10 @@ def test_corners_change_nothing_for_the_tracker() -> None:
             assert np.array_equal(getattr(a, name), getattr(b, name), equal_nan=True)
 
 
-def test_odometry_alone_needs_none() -> None:
-    assert not any(len(k.corners) for k in run("mapper.enabled=false", "loop.enabled=false"))
+def test_they_are_the_image_s_whatever_tracks_in_it() -> None:
+    by_flow, by_descriptors = run()[0], run("odometry.method=r-um", "features.kind=orb")[0]
+    for a, b in zip(dataclasses.astuple(by_flow.corners), dataclasses.astuple(by_descriptors.corners), strict=True):
+        assert len(a) > 200 and np.array_equal(a, b)
 
 
 def test_a_black_image_has_none(walk: SimSource) -> None:
