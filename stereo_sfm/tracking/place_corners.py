@@ -26,10 +26,11 @@ class PlaceCorners:
 
     def __init__(self, config: Config, rig: Rig) -> None:
         """A run that recognises no places, or a camera without depth, has none."""
-        wanted = rig.stereo and (config.mapper.enabled or config.loop.enabled)
         self._levels = config.tracker.pyramid_levels
-        self._stereo = StereoMatcher(config.tracker, rig) if wanted else None
-        self._mask = corner_mask(rig.left, config.tracker.max_angle_deg).astype(np.uint8)
+        self._stereo: StereoMatcher | None = None
+        if rig.stereo and (config.mapper.enabled or config.loop.enabled):
+            self._stereo = StereoMatcher(config.tracker, rig)
+            self._mask = corner_mask(rig.left, config.tracker.max_angle_deg).astype(np.uint8)
         self._orb = cv2.ORB.create(config.loop.corners, SCALE, LEVELS, edgeThreshold=15, fastThreshold=FAST_THRESHOLD)
 
     def find(self, image: StereoImage) -> Corners:
