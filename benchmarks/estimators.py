@@ -9,6 +9,7 @@ images is not timed, nor are the first frames, in which code is compiled. A rati
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import time
 
 from _sequences import one_thread, sequences
@@ -36,14 +37,24 @@ def step_ms(tracker: AnyTracker, image: StereoImage) -> float:
     return (time.perf_counter() - start) * 1e3
 
 
+def _ours(theirs: Config) -> Config:
+    """The default tracker, with what mapping and loops ask of it where theirs has that too."""
+    config = Config()
+    mapper = dataclasses.replace(config.mapper, enabled=theirs.mapper.enabled)
+    return dataclasses.replace(
+        config, mapper=mapper, loop=dataclasses.replace(config.loop, enabled=theirs.loop.enabled)
+    )
+
+
 def measure(name: str, spec: str, frames: int) -> None:
     """Print the table of one sequence."""
     with open_source(spec) as source:
         images = [image for image, _ in zip(source, range(frames + WARM_UP), strict=False)]
         print(f"\n{name}, {len(images) - WARM_UP} frames: milliseconds (median), ours / theirs: medians, means")
         for cell in grid([spec], FEATURES, stages=["tracking"], systems=["retail-thesis", "cpp-course"]):
-            theirs = make_tracker(cell.config(), source.rig, NoSpans(), source.ground_truth)
-            ours = make_tracker(Config(), source.rig, NoSpans(), source.ground_truth)
+            config = cell.config()
+            theirs = make_tracker(config, source.rig, NoSpans(), source.ground_truth)
+            ours = make_tracker(_ours(config), source.rig, NoSpans(), source.ground_truth)
             times = np.array([(step_ms(theirs, image), step_ms(ours, image)) for image in images])[WARM_UP:]
             (a, b), (mean_a, mean_b) = np.median(times, axis=0), times.mean(0)
             print(f"  {cell.name:24s} {a:7.1f}  ours {b:5.1f}  ratio {b / a:.2f}  {mean_b / mean_a:.2f}", flush=True)
