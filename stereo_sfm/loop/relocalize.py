@@ -129,9 +129,12 @@ class Relocalizer:
         """The place that a verdict stands for, if this share of the camera's corners is asked for."""
         map_T_cam = self._map.map_T_kf[row] @ se3.inverse(verdict.b_T_a)
         kf_id = int(self._map.kf_ids[row])
-        enough = min(verdict.inliers / self._config.relocalize_inliers, verdict.share / share)
-        reason = "" if enough >= 1 else "too_few_inliers"
-        return Location(reason, map_T_cam, verdict.information, kf_id, verdict.inliers, verdict.pairs, enough >= SURE)
+        enough, sure = (
+            verdict.inliers >= times * self._config.relocalize_inliers and verdict.share >= times * share
+            for times in (1.0, SURE)
+        )
+        reason = "" if enough else "too_few_inliers"
+        return Location(reason, map_T_cam, verdict.information, kf_id, verdict.inliers, verdict.pairs, sure)
 
     def _choose(self, found: list[Location]) -> Location:
         """The answer with most inliers, if they are enough and no other place comes near it."""

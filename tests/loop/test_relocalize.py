@@ -88,6 +88,15 @@ def test_a_fifth_of_the_products_exchanged(walk: StoreWalk, first_pass: int, rel
     assert found >= 0.8 * len(asked)
 
 
+def test_no_share_may_be_asked_for(walk: StoreWalk, first_pass: int, vocabulary: voc.Vocabulary) -> None:
+    part = dataclasses.replace(walk, keyframes=walk.keyframes[:first_pass], world_T_kf=walk.world_T_kf[:first_pass])
+    config = dataclasses.replace(LoopConfig(), relocalize_share=0.0, min_inlier_share=0.0)
+    lenient = Relocalizer(map_of_walk(part).snapshot, walk.rig, vocabulary, config)
+    keyframe = walk.keyframes[first_pass + 8]
+    place = lenient.locate(keyframe)
+    assert place.found and lenient.locate_near(keyframe, place.map_T_cam).found
+
+
 def test_a_view_without_points_has_a_reason(walk: StoreWalk, relocalizer: Relocalizer) -> None:
     blind = dataclasses.replace(
         walk.keyframes[3], descriptors=np.zeros_like(walk.keyframes[3].descriptors), corners=Corners.none()
