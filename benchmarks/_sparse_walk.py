@@ -90,5 +90,5 @@ def _continue_ids(ids: I64, kf_T_previous: F64, previous: Keyframe, still: Keyfr
     """Give the points that the previous keyframe saw their ids."""
     cloud, view = gather(previous, [], rig, 0.3), view_of(still, rig, 0.3)
     rows_b, rows_a = match_guided(kf_T_previous, view, cloud, rig, 50, radius=4.0)
-    points = (view.ids[rows_b] >= 0) & (cloud.ids[rows_a] >= 0)
+    points = ~view.corner[rows_b]
     ids[np.searchsorted(still.point_ids, view.ids[rows_b[points]])] = cloud.ids[rows_a[points]]

@@ -81,14 +81,14 @@ class Camera:
         u, v = uv[..., 0], uv[..., 1]
         return (u >= border) & (v >= border) & (u <= self.width - 1 - border) & (v <= self.height - 1 - border)
 
-    def bearing_grid(self) -> F64:
-        """(H, W, 3) unit bearing of every pixel, NaN where there is none."""
-        u, v = np.meshgrid(np.arange(self.width, dtype=float), np.arange(self.height, dtype=float))
+    def bearing_grid(self, step: int = 1) -> F64:
+        """(H, W, 3) unit bearing of every `step`-th pixel in both directions, NaN where there is none."""
+        u, v = np.meshgrid(np.arange(0, self.width, step, dtype=float), np.arange(0, self.height, step, dtype=float))
         return self.unproject(np.stack([u, v], -1))
 
-    def valid_mask(self, max_angle: float = np.pi) -> Bool:
-        """(H, W): pixels with a bearing at most `max_angle` radians from the optical axis."""
-        z = self.bearing_grid()[..., 2]
+    def valid_mask(self, max_angle: float = np.pi, step: int = 1) -> Bool:
+        """(H, W): every `step`-th pixel, whether its bearing is at most `max_angle` radians from the optical axis."""
+        z = self.bearing_grid(step)[..., 2]
         return np.nan_to_num(z, nan=-2.0) >= np.cos(max_angle)
 
 

@@ -69,7 +69,7 @@ def _block_all(blocked, points, radius):
 
 def corner_mask(camera: Camera, max_angle_deg: float) -> Bool:
     """(H/2, W/2) where corners may lie: what looks into the world, not too far from the axis or near to the border."""
-    half = camera.valid_mask(math.radians(max_angle_deg))[::2, ::2]
+    half = camera.valid_mask(math.radians(max_angle_deg), step=2)
     half[:BORDER] = half[-BORDER:] = False
     half[:, :BORDER] = half[:, -BORDER:] = False
     return half

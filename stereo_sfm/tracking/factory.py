@@ -40,7 +40,7 @@ def _tracker(config: Config, rig: Rig, spans: NoSpans | None, ground_truth: Traj
         from stereo_sfm.tracking.place_corners import PlaceCorners
         from stereo_sfm.tracking.tracker import Tracker
 
-        return Tracker(config.tracker, rig, spans, PlaceCorners(config, rig))
+        return Tracker(config.tracker, rig, spans, PlaceCorners.wanted(config, rig))
     if not rig.stereo and method in NEEDS_DEPTH:
         raise StereoSfmError(
             f"odometry {method} needs two eyes or depth, this camera has one eye: use eight-point or pnp"

@@ -52,7 +52,7 @@ class FeatureTracker:
         self._rig = rig
         self._spans = spans or NoSpans()
         self._views = ViewMaker(config.features, rig)
-        self._place_corners = PlaceCorners(config, rig)
+        self._place_corners = PlaceCorners.wanted(config, rig)
         self._estimator = make_estimator(config.odometry, rig.left)
         self._scale = StepScale(config.odometry, ground_truth)
         self._pixel = pixel_angle(rig)
@@ -205,6 +205,8 @@ class FeatureTracker:
         self._frames_since_kf = 0
         covariance, self._kf_covariance = self._kf_covariance, np.zeros((6, 6))
         keyframe = keyframe_of(view, image.stamp_ns, self._kf_id, self._odom_T_cam, self._submap, covariance)
+        if self._place_corners is None:
+            return keyframe
         return replace(keyframe, corners=self._place_corners.find(image))
 
     def _remember(self, image: StereoImage, view: View) -> None:

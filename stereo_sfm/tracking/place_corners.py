@@ -25,24 +25,23 @@ class PlaceCorners:
     """Oriented FAST with rotated BRIEF (Rublee et al., ORB, ICCV 2011) on level 1 of the pyramid."""
 
     def __init__(self, config: Config, rig: Rig) -> None:
-        """A run that recognises no places, or a camera without depth, has none."""
         self._levels = config.tracker.pyramid_levels
-        self._stereo: StereoMatcher | None = None
-        if rig.stereo and (config.mapper.enabled or config.loop.enabled):
-            self._stereo = StereoMatcher(config.tracker, rig)
-            self._mask = corner_mask(rig.left, config.tracker.max_angle_deg).astype(np.uint8)
+        self._stereo = StereoMatcher(config.tracker, rig)
+        self._mask = corner_mask(rig.left, config.tracker.max_angle_deg).astype(np.uint8)
         self._orb = cv2.ORB.create(config.loop.corners, SCALE, LEVELS, edgeThreshold=15, fastThreshold=FAST_THRESHOLD)
+
+    @staticmethod
+    def wanted(config: Config, rig: Rig) -> PlaceCorners | None:
+        """None for a run that recognises no places, or a camera without depth."""
+        recognised = config.mapper.enabled or config.loop.enabled
+        return PlaceCorners(config, rig) if rig.stereo and recognised else None
 
     def find(self, image: StereoImage) -> Corners:
         """About as many as the configuration says, the strongest of each level, of those that both eyes see."""
-        if self._stereo is None:
-            return Corners.none()
         return self.find_in(build_pyramid(image.left, self._levels), self._stereo.prepare(image))
 
     def find_in(self, left: Pyramid, right: Pyramid | F32) -> Corners:
         """As `find`, of a left image's pyramid and what `StereoMatcher.prepare` makes of the second eye."""
-        if self._stereo is None:
-            return Corners.none()
         keypoints, descriptors = self._orb.detectAndCompute(left[1], self._mask)
         if not len(keypoints):
             return Corners.none()
