@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stereo_sfm.commands.run import SourceChoice, add_wiring_arguments, execute
+from stereo_sfm.commands.run import SourceChoice, add_talk_arguments, add_wiring_arguments, execute
 from stereo_sfm.errors import StereoSfmError
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_wiring_arguments(parser)
     parser.add_argument("--frame", choices=("cam0", "body"), default="cam0", help="whose poses the trajectories hold")
     parser.add_argument("--max-lost", type=float, default=100.0, metavar="PERCENT", help=argparse.SUPPRESS)
-    parser.add_argument("-q", "--quiet", action="store_true", help="no progress and no summary")
+    add_talk_arguments(parser)
 
 
 @dataclass(frozen=True)

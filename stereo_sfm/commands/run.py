@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from stereo_sfm.log.recorded import RecordedRun
     from stereo_sfm.pipeline.maps import MapFolders
     from stereo_sfm.pipeline.session import Session
+    from stereo_sfm.pipeline.sinks import Sink
     from stereo_sfm.viz.match_pictures import MatchPictures
 
 RECTIFY = {"none": "none", "pinhole": "pinhole", "wide": "epipolar"}  # option -> projection of `rectify`
@@ -52,8 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--matches", type=int, metavar="K", help="every K frames a picture of the matches with the last keyframe"
     )
-    parser.add_argument("-q", "--quiet", action="store_true", help="no progress and no summary")
-    parser.add_argument("-v", "--verbose", action="store_true", help="say more on standard error")
+    add_talk_arguments(parser)
 
 
 def add_source_arguments(parser: argparse.ArgumentParser) -> None:
@@ -112,6 +112,14 @@ def add_wiring_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--viz", choices=("none", "spawn", "serve", "save"), default="none", help="show it in rerun; save: run.rrd"
+    )
+
+
+def add_talk_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options that say how much is told."""
+    parser.add_argument("-q", "--quiet", action="store_true", help="no progress and no summary")
+    parser.add_argument(
+        "-v", "--verbose", action="store_true", help="say what happens: lost, found again, loops, jumps of the map"
     )
 
 
@@ -206,10 +214,13 @@ def execute(
     from stereo_sfm.eval.run_results import write_results
     from stereo_sfm.eval.statistics import failure, summary
     from stereo_sfm.export.run_folder import link_latest
+    from stereo_sfm.pipeline.events import EventLines
     from stereo_sfm.pipeline.session import Session, Wiring
 
     record, pictures = RunRecord.of(config, folders.localize_only), _match_pictures(getattr(args, "matches", None))
-    sinks = [record] if pictures is None else [record, pictures]
+    sinks: list[Sink] = [record] if pictures is None else [record, pictures]
+    if args.verbose:
+        sinks.append(EventLines())
     # Images reach the sinks only where the stages share this process.
     mode = "realtime" if args.realtime else args.mode
     stepper = _stepper(args)

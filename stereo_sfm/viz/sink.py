@@ -17,6 +17,7 @@ import rerun as rr
 from calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
+from stereo_sfm.pipeline.events import Events
 from stereo_sfm.pipeline.sinks import Health, LogLine, StageTimes
 from stereo_sfm.types import (
     U8,
@@ -26,7 +27,6 @@ from stereo_sfm.types import (
     LoopResult,
     MapUpdate,
     StereoImage,
-    TrackState,
     Trajectory,
 )
 from stereo_sfm.viz.blueprint import blueprint
@@ -80,6 +80,7 @@ class RerunSink:
             path.open("ab").close()  # rerun's own error for a file that cannot be written is no OSError
             self._rec.save(path, default_blueprint=blueprint(name))
         self._scene = MapScene(self._rec, rig)
+        self._events = Events()
         self._images: dict[int, StereoImage] = {}  # that wait for their frame
         self._pictures = 0
         self._keyframe: tuple[Keyframe, U8] | None = None
@@ -106,16 +107,19 @@ class RerunSink:
         elif isinstance(message, MapUpdate):
             self._scene.update(message)
         elif isinstance(message, LoopResult):
-            self._put_loop(message)
+            self._scene.loop(message)
         elif isinstance(message, StageTimes):
             for stage, ms in sorted(message.ms.items()):
                 self._rec.log(f"ms/{stage}", rr.Scalars(ms))
         elif isinstance(message, Health):
             self._rec.log(f"rate/{message.stage}", rr.Scalars(message.rate))
         elif isinstance(message, LogLine):
-            self._text(message.level.replace("WARNING", "WARN"), f"{message.stage}: {message.text}")
+            self._text(message)
         elif isinstance(message, Dropped):
             self._put_dropped(message)
+        event = self._events.of(message)
+        if event is not None:
+            self._text(event)
 
     def close(self) -> None:
         """Everything is sent."""
@@ -129,8 +133,8 @@ class RerunSink:
         if self._mode == "save":
             self._rec.disconnect()  # writes the end of the file; a server goes on serving
 
-    def _text(self, level: str, text: str) -> None:
-        self._rec.log("log", rr.TextLog(text, level=level))
+    def _text(self, line: LogLine) -> None:
+        self._rec.log("log", rr.TextLog(f"{line.stage}: {line.text}", level=line.level.replace("WARNING", "WARN")))
 
     # -- frames ------------------------------------------------------------------------------------------------------
 
@@ -155,9 +159,6 @@ class RerunSink:
         obs = frame.observations
         self._rec.log("points/tracked", rr.Scalars(float(len(obs))))
         self._rec.log("points/inliers", rr.Scalars(float(obs.inlier.sum())))
-        if frame.reason:
-            level = "WARN" if frame.state != TrackState.OK else "INFO"
-            self._text(level, f"frame {frame.frame_id}: {frame.state.name} ({frame.reason})")
         self._scene.frame(frame)
         image = self._images.pop(frame.frame_id, None)
         if image is not None:
@@ -215,14 +216,6 @@ class RerunSink:
         image = self._images.pop(keyframe.frame_id, None)
         if image is not None:
             self._keyframe = (keyframe, image.left)
-
-    def _put_loop(self, result: LoopResult) -> None:
-        if result.candidate_kf_id >= 0:
-            self._scene.loop(result)
-            self._text("INFO", f"loop: keyframe {result.kf_id} sees keyframe {result.candidate_kf_id} again, "
-                               f"{result.inliers} inliers")  # fmt: skip
-        elif result.rejected:
-            self._text("DEBUG", f"no loop at keyframe {result.kf_id}: {result.reason.replace('_', ' ')}")
 
     def _put_dropped(self, dropped: Dropped) -> None:
         self._dropped += dropped.count
