@@ -8,7 +8,6 @@ import time
 from collections import deque
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
-from typing import Protocol
 
 from calib.rig import Rig
 from drivers.source import Source
@@ -17,12 +16,6 @@ from stereo_sfm.pipeline.health import HealthMeter
 from stereo_sfm.pipeline.images import ImageRing, SlotImage
 from stereo_sfm.pipeline.stages import sensor_drop, source_counters
 from stereo_sfm.types import Dropped, StereoImage, Trajectory
-
-
-class Opener(Protocol):
-    """Opens the source in the process that owns it; must survive pickling."""
-
-    def __call__(self) -> Source: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +95,8 @@ class CaptureStage:
             self._read()
         finally:
             self._count(self._last)  # above all when the source failed
-        self.to_tracker.send(End("capture"))
+            self.to_tracker.send(End("capture"))  # what was read until then is finished
+            self.to_tracker.close()
 
     def _read(self) -> None:
         meter = HealthMeter("capture")

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-import importlib
+import logging
 from collections import deque
 from collections.abc import Generator, Sequence
 
 from drivers.source import Source
 from stereo_sfm.config import Config
+from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.pipeline.maps import MapFolders, make_mapper, save_result
 from stereo_sfm.pipeline.schedule import Lockstep, Schedule
 from stereo_sfm.pipeline.sinks import LogLine, Sink, StageTimes
 from stereo_sfm.pipeline.stages import LocalMailbox, MapStage, TrackStage, make_closer, sensor_drop, source_counters
 from stereo_sfm.pipeline.text import Listener
+from stereo_sfm.pipeline.threads import limited_threads
 from stereo_sfm.timing import Spans
 from stereo_sfm.tracking.factory import make_tracker
 from stereo_sfm.types import Frame, Keyframe, LoopResult, MapUpdate, StereoImage
+
+log = logging.getLogger("stereo_sfm")
 
 
 class InlineRun:
@@ -128,16 +132,28 @@ def run_inline(
         folders: maps to start from and to leave behind.
         jpeg: the sinks store images as JPEG, so the tracker sees what they will give back.
     """
-    from threadpoolctl import threadpool_limits
-
-    importlib.import_module("scipy.linalg")  # its BLAS must be loaded to be limited
     run = InlineRun(source, config, sinks, schedule, folders, jpeg)
-    with (
-        Listener("main", run.hear),
-        threadpool_limits(config.pipeline.threads),
-    ):  # BLAS sums in another order with another number of threads
+    with Listener("main", run.hear), limited_threads(config.pipeline.threads):
+        images, failure = iter(source), None
+        while failure is None:
+            try:
+                image = next(images)
+            except StopIteration:
+                break
+            except Exception as error:  # of the source: what it gave until then is kept
+                failure = error
+                break
+            frame = run.step(image)
+            try:
+                yield frame
+            except GeneratorExit:  # nobody wants more
+                run.finish()
+                raise
         try:
-            for image in source:
-                yield run.step(image)
-        finally:
             run.finish()
+        except StereoSfmError as error:
+            if failure is None:
+                raise
+            log.warning("%s", error)
+        if failure is not None:
+            raise failure

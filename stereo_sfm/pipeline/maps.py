@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import logging
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +23,9 @@ from stereo_sfm.timing import NoSpans
 if TYPE_CHECKING:
     from stereo_sfm.export.saved_map import SavedMap
     from stereo_sfm.loop.vocabulary import Vocabulary
+
+
+log = logging.getLogger("stereo_sfm")
 
 
 @dataclass(frozen=True)
@@ -98,6 +102,9 @@ def save_result(mapper: AnyMapper, config: Config, rig: Rig, folders: MapFolders
     from stereo_sfm.export.saved_map import SavedMap, save_map
 
     snapshot = mapper.map.snapshot()
+    if not len(snapshot.kf_ids) or not len(snapshot.points):
+        log.warning("nothing was mapped: no map is written to %s", folders.map_out)
+        return
     vocabulary = configured_vocabulary(config.loop)
     saved, out, failure = (
         SavedMap(snapshot, rig, vocabulary.id, np.zeros(len(snapshot.kf_ids), np.int64)),

@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import multiprocessing
-import os
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -30,6 +29,7 @@ from stereo_sfm.pipeline.interrupts import ignored_by_children
 from stereo_sfm.pipeline.maps import MapFolders
 from stereo_sfm.pipeline.sinks import LogLine, Sink
 from stereo_sfm.pipeline.text import Listener, say
+from stereo_sfm.pipeline.threads import thread_environment
 from stereo_sfm.pipeline.workers import LogOptions, Ready, Setup, ViewerOptions
 from stereo_sfm.types import Applied, Frame
 
@@ -37,7 +37,6 @@ SINKS = ("logger", "viewer")
 PICTURE_NS = 100_000_000  # the viewer gets a picture at most so often
 GRACE_S = 1.2  # for the logger to close its file after another stage died
 VIEWER_GRACE_S = 10.0  # for the viewer to show what waits when the run is over
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
 class StageDied(StereoSfmError):
@@ -94,6 +93,7 @@ class ProcessRun:
         self._said_early: list[LogLine] = []  # while the source was opened
         self._waiting = {"tracker", "mapper", "loop"}  # not ready yet
         self._stopping = False
+        self._failure: StereoSfmError | None = None  # of the source: told when all that it gave is finished
         self._listener = Listener("main", self.publish)
         self.info: SourceInfo
 
@@ -133,7 +133,7 @@ class ProcessRun:
         while self._reports:
             ready = wait(list(self._reports), self._patience())
             if not ready:
-                return  # only the viewer is left, and it hangs
+                break  # only the viewer is left, and it hangs
             for connection in ready:
                 assert isinstance(connection, Connection)
                 try:
@@ -153,6 +153,8 @@ class ProcessRun:
                     self._dispatch(message)
                     if isinstance(message, Frame):
                         yield message
+        if self._failure is not None:
+            raise self._failure
 
     def _patience(self) -> float | None:
         """Seconds to wait for the next message; without end while a stage or the logger is at work."""
@@ -161,8 +163,6 @@ class ProcessRun:
     # -- start -------------------------------------------------------------------------------------------------------
 
     def _start(self) -> None:
-        for variable in THREAD_VARIABLES:
-            os.environ.setdefault(variable, str(self._config.pipeline.threads))
         pipe = self._pipe
         images, updates = pipe(), pipe()
         to_mapper, to_loop, loops = pipe(), pipe(), pipe()
@@ -247,7 +247,7 @@ class ProcessRun:
         process = self._context.Process(
             target=workers.guarded, args=(stage, body, send, *args), name=f"stereo-sfm {stage}", daemon=True
         )
-        with ignored_by_children():
+        with ignored_by_children(), thread_environment(self._config.pipeline.threads):
             process.start()
         send.close()
         if args and isinstance(args[0], Connection):
@@ -325,6 +325,10 @@ class ProcessRun:
         if stage == "viewer":  # closed or crashed: the run does not care
             self._ended.add(stage)
             return
+        if stage == "capture" and not self._waiting:
+            self._failure = StageDied(f"the capture process {self._how_it_died(stage)}; {self._what_remains(stage)}")
+            self._end(connection, stage)
+            return
         self._processes[stage].join(0.5)
         consequence = self._processes[stage].exitcode == workers.UPSTREAM_LOST
         if consequence and any(s not in SINKS for s in self._reports.values()):
@@ -346,7 +350,14 @@ class ProcessRun:
             self._reports.pop(connection)
             self._ended.add("viewer")
             return
+        if failed.stage == "capture" and not self._waiting:
+            self._failure = _error(failed)
+            self._end(connection, failed.stage)
+            return
         self._abandon()
+        if self._failure is not None:
+            logging.getLogger("stereo_sfm").warning("%s", failed.message)
+            raise self._failure
         raise _error(failed)
 
     def _abandon(self) -> None:

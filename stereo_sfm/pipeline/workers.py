@@ -93,7 +93,7 @@ def prepare(stage: str, setup: Setup) -> Callable[[], None]:
     """Threads and cores of this process; returns what injects a random delay (tests) or nothing."""
     import cv2
 
-    cv2.setNumThreads(setup.config.pipeline.threads)
+    cv2.setNumThreads(setup.config.pipeline.threads)  # of BLAS: as the environment says
     cpus = setup.config.pipeline.cpus.get(stage)
     if cpus and hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, cpus)
@@ -133,7 +133,6 @@ def run_capture(
         )
         delay()
         stage.run()
-        to_tracker.close()
         ring.close()
 
 
@@ -141,6 +140,14 @@ def _schedule(setup: Setup) -> Schedule:
     if setup.applied is not None:
         return Recorded(setup.applied)
     return Realtime() if setup.realtime else Lockstep(setup.config.pipeline.update_lag_frames)
+
+
+def _next_image(inbox: Inbox[Any]) -> Any:
+    """A capture process that was killed has said everything: what it read until then is finished."""
+    try:
+        return inbox.take()
+    except Lost:
+        return End("capture")
 
 
 def run_tracker(
@@ -171,7 +178,7 @@ def run_tracker(
     ready("tracker", setup, to_main)
     meter = HealthMeter("tracker")
     frame_id = -1
-    while isinstance(message := inbox.take(), SlotImage):
+    while isinstance(message := _next_image(inbox), SlotImage):
         image = ring.read(message)
         free.send(message.slot)
         delay()

@@ -86,31 +86,32 @@ class ManhattanTracker:
         self._config = config
         self._compass = ManhattanCompass(rig.left)
         self._filter = RotationFilter(config)
-        self._inner_pose, self._pose = np.eye(4), np.eye(4)  # odom_T_cam of the last frame: the tracker's, and ours
-        self._kf_pose = np.eye(4)
+        self._outer_T_inner = np.eye(4)  # corrected odometry frame from the tracker's, now and at the last keyframe
+        self._outer_T_inner_kf = np.eye(4)
 
     def apply(self, update: MapUpdate) -> None:
         """The map lives in the corrected odometry frame; the tracker gets it in its own."""
-        outer_T_inner = self._pose @ se3.inverse(self._inner_pose)
-        self._inner.apply(replace(update, map_T_odom=update.map_T_odom @ outer_T_inner))
+        self._inner.apply(replace(update, map_T_odom=update.map_T_odom @ self._outer_T_inner))
 
     def step(self, image: StereoImage) -> tuple[Frame, Keyframe | None]:
         """Track one image and correct its rotation."""
         frame, keyframe = self._inner.step(image)
-        pose = self._pose @ se3.inverse(self._inner_pose) @ frame.odom_T_cam
+        pose = self._outer_T_inner @ frame.odom_T_cam
         self._filter.predict()
         stats = dict(frame.stats)
         good = frame.state in (TrackState.OK, TrackState.RECOVERED)
         if good and image.frame_id % self._config.every == 0:
             try:
                 found = self._compass.measure(image.left, image.frame_id, self._filter.expected(pose[:3, :3]))
-                pose[:3, :3] = self._filter.correct(pose[:3, :3], found)
+                turned = self._filter.correct(pose[:3, :3], found)
+                pose = se3.orthonormalize(se3.from_rotation_translation(turned, pose[:3, 3]))
+                self._outer_T_inner = se3.orthonormalize(pose @ se3.inverse(frame.odom_T_cam))
                 stats["line_share"] = found.share
             except Degenerate:
                 stats["line_share"] = 0.0
-        self._pose, self._inner_pose = se3.orthonormalize(pose), frame.odom_T_cam
-        if keyframe is not None:
-            self._kf_pose = self._pose
-            keyframe = replace(keyframe, odom_T_cam=self._pose.copy())
-        kf_T_cam = se3.inverse(self._kf_pose) @ self._pose
-        return replace(frame, odom_T_cam=self._pose.copy(), kf_T_cam=kf_T_cam, stats=stats), keyframe
+        if keyframe is not None:  # of this image, or of an earlier one that a monocular start began with
+            self._outer_T_inner_kf = self._outer_T_inner
+            keyframe = replace(keyframe, odom_T_cam=self._outer_T_inner @ keyframe.odom_T_cam)
+        inner_T_kf = frame.odom_T_cam @ se3.inverse(frame.kf_T_cam)  # where the tracker has it now
+        kf_T_cam = se3.inverse(self._outer_T_inner_kf @ inner_T_kf) @ pose
+        return replace(frame, odom_T_cam=pose, kf_T_cam=kf_T_cam, stats=stats), keyframe

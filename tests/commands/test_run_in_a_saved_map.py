@@ -95,3 +95,14 @@ def test_without_recognition_there_is_no_place(tmp_path: Path, store: Path, caps
     off = ["--set", "mapper.enabled=false", "--set", "loop.enabled=false"]
     assert second_walk(tmp_path, store, "--localize-only", *off) == 2
     assert "leave loop.enabled=true" in capsys.readouterr().err
+
+
+def test_a_dark_recording_has_no_map_and_says_that_tracking_never_began(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--duration", "1", "--inline", "-o", str(tmp_path / "run"), "--map-out", str(tmp_path / "map")]
+    assert main(["run", "sim:aisle?size=212x200&rate=10&dark=0-20", *options]) == 4
+    said = capsys.readouterr().err
+    assert "nothing was mapped" in said
+    assert "tracking never initialised" in said
+    assert not (tmp_path / "map").exists()

@@ -18,6 +18,7 @@ import pytest
 from calib.rig import Rig
 from stereo_sfm.config import Config, load
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.export.saved_map import load_map
 from stereo_sfm.geometry.cameras import Pinhole
 from stereo_sfm.log.diff import diff
 from stereo_sfm.log.reader import LogReader
@@ -25,8 +26,10 @@ from stereo_sfm.log.recorded import read_run
 from stereo_sfm.log.run_log import RunLog
 from stereo_sfm.log.writer import LogWriter
 from stereo_sfm.pipeline.inline import run_inline
+from stereo_sfm.pipeline.maps import MapFolders
 from stereo_sfm.pipeline.processes import ProcessRun, StageDied
 from stereo_sfm.pipeline.schedule import Lockstep, Recorded, Schedule
+from stereo_sfm.pipeline.threads import VARIABLES, thread_environment
 from stereo_sfm.pipeline.workers import LogOptions
 from stereo_sfm.types import Applied, Frame, StereoImage, Trajectory
 
@@ -157,6 +160,53 @@ def test_a_killed_stage_ends_the_run_and_leaves_a_log(stage: str, tmp_path: Path
 def test_an_error_in_a_stage_comes_back_with_its_traceback(tmp_path: Path) -> None:
     with pytest.raises(StageDied, match="the driver broke"):
         process_log(tmp_path / "run.mcap", functools.partial(SlidingWall, 50, fail_at=20))
+    with LogReader(tmp_path / "run.mcap") as reader:
+        assert sum(1 for _ in reader.messages(["/frame"])) == 20
+
+
+def wired(in_processes: bool, source: functools.partial[SlidingWall], folders: MapFolders) -> Iterator[Frame]:
+    if not in_processes:
+        yield from run_inline(source(), CONFIG, folders=folders)
+        return
+    with ProcessRun(source, CONFIG, folders=folders) as run:
+        yield from run
+
+
+@pytest.mark.parametrize("in_processes", [False, True])
+def test_what_a_source_gave_before_it_failed_is_mapped(in_processes: bool, tmp_path: Path) -> None:
+    frames: list[Frame] = []
+    source, folders = functools.partial(SlidingWall, 80, fail_at=60), MapFolders(map_out=tmp_path / "map")
+    with pytest.raises((RuntimeError, StageDied), match="the driver broke"):
+        frames.extend(wired(in_processes, source, folders))
+    assert [f.frame_id for f in frames] == list(range(60))
+    assert len(load_map(tmp_path / "map").snapshot.kf_ids) >= 3
+
+
+@pytest.mark.parametrize("in_processes", [False, True])
+def test_the_error_of_the_source_is_told_though_there_is_no_map_to_save(in_processes: bool, tmp_path: Path) -> None:
+    source, folders = functools.partial(SlidingWall, 80, fail_at=0), MapFolders(map_out=tmp_path / "map")
+    with pytest.raises((RuntimeError, StageDied), match="the driver broke"):
+        list(wired(in_processes, source, folders))
+    assert not (tmp_path / "map").exists()
+
+
+def test_a_capture_process_that_is_killed_costs_nothing_that_it_read(tmp_path: Path) -> None:
+    source, folders = functools.partial(SlidingWall, 5000, slow_s=0.005), MapFolders(map_out=tmp_path / "map")
+    with pytest.raises(StageDied, match="the capture process was killed by SIGKILL"):  # noqa: PT012, SIM117
+        with ProcessRun(source, CONFIG, folders=folders) as run:
+            for k, _ in enumerate(run):
+                if k == 60:
+                    os.kill(run.pids["capture"], signal.SIGKILL)
+    assert len(load_map(tmp_path / "map").snapshot.kf_ids) >= 3
+
+
+def test_the_users_number_of_threads_does_not_reach_the_stages(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OPENBLAS_NUM_THREADS", "8")
+    monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
+    with thread_environment(1):
+        assert {os.environ[variable] for variable in VARIABLES} == {"1"}
+    assert os.environ["OPENBLAS_NUM_THREADS"] == "8"
+    assert "MKL_NUM_THREADS" not in os.environ
 
 
 def test_a_source_that_cannot_be_opened_is_one_clear_line() -> None:

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-import numpy as np
+from itertools import islice
 
-from stereo_sfm.config import ManhattanConfig
+import numpy as np
+import pytest
+
+from drivers.source import open_source
+from stereo_sfm.config import ManhattanConfig, load
+from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.vanishing import Manhattan
+from stereo_sfm.pipeline.inline import InlineRun
+from stereo_sfm.presets import preset
 from stereo_sfm.tracking.manhattan_prior import ManhattanTracker, RotationFilter
-from stereo_sfm.types import F64, Frame, Keyframe, MapUpdate, Observations, StereoImage, TrackState
+from stereo_sfm.types import F64, Frame, Keyframe, MapUpdate, Observations, StereoImage, TrackState, Trajectory
 from tests.synthetic import pinhole_rig
 
 CONFIG = ManhattanConfig(every=1, settle_frames=5, drift_deg_per_frame=0.02)
@@ -95,7 +102,7 @@ def test_updates_reach_the_tracker_in_its_own_frame() -> None:
     np.testing.assert_allclose(frame.odom_T_cam, poses[2], atol=1e-9)  # nothing seen, nothing changed
     # Turn the corrected pose away from the tracker's: a map point must land at the same place before the camera.
     correction = se3.exp(np.array([0.2, 0, 0, 0, 0.1, 0]))
-    tracker._pose = correction @ tracker._pose
+    tracker._outer_T_inner = correction
     none = np.zeros(0, np.int64)
     map_T_odom = se3.exp(np.array([1.0, 2, 3, 0.1, 0.2, 0.3]))
     update = MapUpdate(
@@ -104,6 +111,31 @@ def test_updates_reach_the_tracker_in_its_own_frame() -> None:
     tracker.apply(update)
     assert inner.update is not None
     point = np.array([[0.3, -0.2, 4.0]])
-    outer = se3.transform(se3.inverse(tracker._pose) @ se3.inverse(map_T_odom), point)
+    outer = se3.transform(se3.inverse(correction @ poses[2]) @ se3.inverse(map_T_odom), point)
     seen = se3.transform(se3.inverse(poses[2]) @ se3.inverse(inner.update.map_T_odom), point)
     np.testing.assert_allclose(seen, outer, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "camera", "options"),
+    [
+        ("default", "fisheye", []),
+        ("default", "fisheye", ["odometry.method=em-r", "features.kind=orb"]),
+        ("cpp-course", "pinhole", []),
+    ],
+)
+def test_a_compass_that_never_measures_changes_nothing(name: str, camera: str, options: list[str]) -> None:
+    paths: list[Trajectory] = []
+    for enabled in ("false", "true"):
+        overrides = [*options, f"manhattan.enabled={enabled}", "manhattan.every=1000000", "loop.enabled=false"]
+        config = load(None, overrides, preset(name))
+        record = RunRecord.of(config)
+        with open_source(f"sim:aisle?camera={camera}&size=424x400&rate=10") as source:
+            run = InlineRun(source, config, [record], None)
+            for image in islice(source, 1, 40):  # frame 0 is measured: it is a multiple of every number
+                run.step(image)
+            run.finish()
+        paths.append(record.mapped())
+    assert len(paths[0]) > 15
+    np.testing.assert_array_equal(paths[1].stamp_ns, paths[0].stamp_ns)
+    np.testing.assert_allclose(paths[1].poses, paths[0].poses, atol=1e-6)
