@@ -80,7 +80,7 @@ def measure(spec: str, frames: int, stored: Path | None, only: str) -> None:
             assert trajectory is not None
             e = evaluate(trajectory, truth)
             end = _end_error(trajectory.poses, np.array([by_stamp[s] for s in trajectory.stamp_ns.tolist()]))
-            rejected = ", ".join(f"{n} {reason}" for reason, n in sorted(record.rejections.items())) or "-"
+            rejected = ", ".join(f"{n} {reason}" for reason, n in sorted(record.rejected.items())) or "-"
             print(
                 f"{name:11s} {1e3 * e.ape_m.rmse:6.1f}  {e.ate_percent:9.3f}  {1e3 * e.ate_sim3_m:9.1f}"
                 f"  {1e3 * end:6.1f}  {len(record.keyframes):9d}  {len(record.loops):5d}  {rejected}"
@@ -107,7 +107,7 @@ def _print_loops(name: str, record: RunRecord, by_stamp: dict[int, F64]) -> None
             f" {1e3 * np.linalg.norm(error[:3, 3]):.1f} mm off"
         )
     if record.loops:
-        print(f"{name}: {len(record.loops)} accepted, {Counter(record.rejections).total()} candidates rejected")
+        print(f"{name}: {len(record.loops)} accepted, {Counter(record.rejected).total()} candidates rejected")
 
 
 def main() -> int:

@@ -68,6 +68,14 @@ TABLE: dict[str, tuple[str, str]] = {
 }
 
 
+DEVICES = ("t265", "oak")  # kinds that are live cameras
+
+
+def is_device(spec: str) -> bool:
+    """Whether a source's name stands for a live camera."""
+    return spec.partition(":")[0] in DEVICES
+
+
 def _factory(name: str) -> Callable[..., Source]:
     module, attribute = TABLE[name]
     return getattr(importlib.import_module(module), attribute)

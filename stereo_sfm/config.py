@@ -22,13 +22,18 @@ def above_zero(default: float) -> Any:
     return field(default=default, metadata={"above_zero": True})
 
 
+def at_least(least: int, default: int) -> Any:
+    """A field that takes no smaller number."""
+    return field(default=default, metadata={"least": least})
+
+
 @dataclass(frozen=True)
 class TrackerConfig:
     """The default tracker (tracking/tracker.py)."""
 
     max_features: int = above_zero(400)  # points tracked at once
-    min_features: int = 15  # inliers below which a frame is lost
-    pyramid_levels: int = above_zero(4)
+    min_features: int = at_least(3, 15)  # inliers below which a frame is lost
+    pyramid_levels: int = at_least(2, 4)
     min_contrast: float = 2.0  # grey levels of standard deviation; flatter windows are no points
     min_ncc: float = 0.6  # of a window with the previous frame's
     min_anchor_ncc: float = 0.85  # of a window with the point's first appearance, affinely deformed
@@ -126,6 +131,11 @@ class MapperConfig:
     full_ba_growth: float = 1.15  # full bundle adjustment also when the map has grown by this factor since the last
     full_ba_lag_keyframes: int = 5  # keyframes until its answer is applied (large maps: a tenth of theirs)
 
+    @property
+    def most_keyframes(self) -> int | None:
+        """`window_keyframes` as the end of a slice: None takes all."""
+        return self.window_keyframes if self.window_keyframes > 0 else None
+
 
 @dataclass(frozen=True)
 class LoopConfig:
@@ -166,14 +176,17 @@ class LoopConfig:
     relocalize_inliers: int = 56  # corners that must agree with the pose found in a saved map
     relocalize_share: float = 0.25  # ... and so large a share of the camera's corners (near a guess: min_inlier_share)
     relocalize_cells: int = 6  # ... in so many of the image's 8 x 6 cells
-    seed: int = 0
+    seed: int = 0  # of the samples of verification
+
+
+STAGES = ("capture", "tracker", "mapper", "loop", "optimizer", "logger", "viewer")  # processes of a run
 
 
 @dataclass(frozen=True)
 class PipelineConfig:
     """How the stages are wired (pipeline/)."""
 
-    update_lag_frames: int = 5  # a keyframe's MapUpdate is applied just before this many frames later
+    update_lag_frames: int = at_least(1, 5)  # a keyframe's MapUpdate is applied just before this many frames later
     loop_lag_keyframes: int = 2  # a keyframe's LoopResult reaches the mapper this many keyframes later
     ring_slots: int = above_zero(8)  # image pairs in shared memory between capture and the stages
     threads: int = above_zero(1)  # of OpenCV and BLAS in each process
@@ -184,7 +197,7 @@ class PipelineConfig:
 class Config:
     """Everything that decides what a run computes. The resolved tree is saved with every run."""
 
-    seed: int = 0
+    seed: int = 0  # of the estimators of --odometry
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     features: FeaturesConfig = field(default_factory=FeaturesConfig)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
@@ -192,6 +205,10 @@ class Config:
     mapper: MapperConfig = field(default_factory=MapperConfig)
     loop: LoopConfig = field(default_factory=LoopConfig)
     pipeline: PipelineConfig = field(default_factory=PipelineConfig)
+
+    def closes_loops(self, depth: bool, localize_only: bool) -> bool:
+        """Whether a run looks for loops: it maps, and its camera knows depth (two eyes, or a depth image)."""
+        return self.loop.enabled and self.mapper.enabled and depth and not localize_only
 
 
 def _merge(base: dict[str, Any], extra: dict[str, Any]) -> dict[str, Any]:
@@ -217,6 +234,9 @@ def from_dict(data: dict[str, Any]) -> Config:
     except dacite.DaciteError as error:
         raise StereoSfmError(f"configuration: {error} (see 'stereo-sfm config dump' for every key)") from None
     _check(config)
+    unknown = sorted(set(config.pipeline.cpus) - set(STAGES))
+    if unknown:
+        raise StereoSfmError(f"configuration: pipeline.cpus names '{unknown[0]}': the stages are {', '.join(STAGES)}")
     return config
 
 
@@ -229,6 +249,8 @@ def _check(section: Any, place: str = "") -> None:
             _check(value, f"{name}.")
         elif words and value not in words:
             raise StereoSfmError(f"configuration: {name} is '{value}': choose one of {', '.join(words)}")
+        elif "least" in f.metadata and value < f.metadata["least"]:
+            raise StereoSfmError(f"configuration: {name} is {value}: it must be at least {f.metadata['least']}")
         elif f.metadata.get("above_zero") and not value > 0:
             raise StereoSfmError(f"configuration: {name} is {value:g}: it must be above 0")
         elif isinstance(value, int | float) and not value >= 0:

@@ -186,6 +186,9 @@ class MapUpdate(Message):
     culled_kf_ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))  # (R,) keyframes that the map gave up
     carrier_kf_ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))  # (R,) what each moves with from now on
     carrier_T_kf: F64 = field(default_factory=lambda: np.zeros((0, 4, 4)))  # (R, 4, 4) its place there
+    refused_kf_ids: I64 = field(
+        default_factory=lambda: np.zeros(0, np.int64)
+    )  # (L,) whose accepted loop the map refused
 
 
 @dataclass(frozen=True, eq=False)

@@ -48,6 +48,11 @@ class ReplayChoice(SourceChoice):
     """The frames that a run tracked."""
 
     frame_ids: tuple[int, ...] = ()
+    recorded_skip: int = 1  # of the run: its frame ids say which frames
+
+    @property
+    def numbering(self) -> int:
+        return self.recorded_skip
 
     def __call__(self) -> Source:
         from drivers.replayed import ReplayedSource
@@ -84,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
     rig, rectify = (None, "none") if logged else (before.opening.rig, before.opening.rectify)
     frame_ids = tuple(f.frame_id for f in frames if _within(f, frames[0], args.until))
     folders = map_folders(before.opening)
-    choice = ReplayChoice(spec, rig, rectify=rectify, frame_ids=frame_ids)
+    choice = ReplayChoice(spec, rig, rectify=rectify, frame_ids=frame_ids, recorded_skip=before.opening.frame_skip)
     args.mode, args.realtime = args.mode or "lockstep", False
     args.log = args.log or "lean"
     config = _changed(before.config, args.set)

@@ -82,7 +82,7 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--odometry", metavar="NAME", help="motion estimator: flow (default), em-r, vp-r, r-um, um, eight-point, pnp"
     )
-    parser.add_argument("--seed", type=int, help="of everything random (same as --set seed=N)")
+    parser.add_argument("--seed", type=int, help="of everything random (seed and loop.seed of the configuration)")
 
 
 def add_wiring_arguments(parser: argparse.ArgumentParser) -> None:
@@ -129,7 +129,7 @@ def load_config(args: argparse.Namespace) -> Config:
 
     overrides = [f"odometry.method={args.odometry}"] if args.odometry is not None else []
     overrides += [f"features.kind={args.features}"] if args.features is not None else []
-    overrides += list(args.set) + ([f"seed={args.seed}"] if args.seed is not None else [])
+    overrides += list(args.set) + ([f"seed={args.seed}", f"loop.seed={args.seed}"] if args.seed is not None else [])
     chosen = config.load(args.config, overrides, preset(args.preset))
     if args.features is not None and chosen.odometry.method == "flow":
         raise StereoSfmError("--features needs an estimator that uses descriptors: add --odometry em-r (or another)")
@@ -156,11 +156,12 @@ class SourceChoice:
     @staticmethod
     def of(args: argparse.Namespace) -> SourceChoice:
         """From the options of this command."""
+        from drivers.source import is_device
         from stereo_sfm.demo import demo_recording
 
         spec = args.source if args.source is not None else str(demo_recording())
         speed: float | None = getattr(args, "speed", None)
-        if speed is None and getattr(args, "realtime", False) and spec.split(":")[0] not in ("t265", "oak"):
+        if speed is None and getattr(args, "realtime", False) and not is_device(spec):
             speed = 1.0
         if Path(spec).exists():
             spec = str(Path(spec).resolve())  # the log says where the images are: a replay may start elsewhere
@@ -173,11 +174,16 @@ class SourceChoice:
         return SourceChoice(spec, rig, *part, speed, args.rectify)
 
     @property
+    def numbering(self) -> int:
+        """Frames of the source from one to the next."""
+        return self.frame_skip
+
+    @property
     def opening(self) -> Opening:
         """What the log keeps of it besides the name."""
         from stereo_sfm.log.provenance import Opening
 
-        return Opening(self.rectify, self.rig)
+        return Opening(self.rectify, self.rig, frame_skip=self.numbering)
 
     def __call__(self) -> Source:
         """The source, not yet entered."""
@@ -234,7 +240,16 @@ def execute(
         wall_s = time.perf_counter() - begin
     folder, info = session.folder, session.info
     stats, evaluations = write_results(
-        folder, info.name, info.rig, config, record, wall_s, info.ground_truth, args.frame, choice.frame_skip
+        folder,
+        info.name,
+        info.rig,
+        config,
+        record,
+        wall_s,
+        info.ground_truth,
+        args.frame,
+        choice.numbering,
+        args.max_lost,
     )
     link_latest(folder)
     if not args.quiet:
@@ -243,7 +258,7 @@ def execute(
         raise problem
     if interrupted:
         return INTERRUPTED, folder
-    failed = failure(stats, args.max_lost)
+    failed = failure(stats)
     if failed:
         print(f"stereo-sfm {args.command}: {failed}; {folder / 'report.md'} says why", file=sys.stderr)
         return TRACKING_FAILED, folder

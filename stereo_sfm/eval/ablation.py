@@ -73,7 +73,7 @@ class Cell:
 
     def config(self) -> Config:
         """The configuration of this run."""
-        overrides = [f"seed={self.seed}"]
+        overrides = [f"seed={self.seed}", f"loop.seed={self.seed}"]
         if self.system == "grid":
             overrides += [f"features.kind={self.features}", f"odometry.method={self.method}"]
         stage = [
@@ -154,7 +154,7 @@ def _describe(record: RunRecord, wall_s: float) -> dict[str, Any]:
         "keyframes": len(record.keyframes),
         "map_points": len(record.map_points),
         "loops": len(record.loops),
-        "rejected_loops": dict(sorted(record.rejections.items())),
+        "rejected_loops": dict(sorted(record.rejected.items())),
         "track_ms": stage_times(record).get("track", {}).get("p50"),
         "frame_ms": 1e3 * wall_s / max(len(tracked), 1),
     }

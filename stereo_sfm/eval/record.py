@@ -68,7 +68,8 @@ class RunRecord:
     map_T_kf: KeyframePoses = field(default_factory=KeyframePoses)
     map_points: set[int] = field(default_factory=set[int])
     seen_points: Bool = field(default_factory=lambda: np.zeros(1024, bool))  # by id: whether a keyframe had it
-    loops: list[LoopResult] = field(default_factory=list[LoopResult])
+    closed: list[LoopResult] = field(default_factory=list[LoopResult])  # as the loop closer said
+    refused_kf_ids: set[int] = field(default_factory=set[int])  # of loops that the mapper did not believe
     rejections: dict[str, int] = field(default_factory=dict[str, int])
     _path_m: float = 0.0
 
@@ -119,14 +120,26 @@ class RunRecord:
 
     def _put_update(self, update: MapUpdate) -> None:
         self.map_T_kf.update(update)
+        self.refused_kf_ids.update(update.refused_kf_ids.tolist())
         self.map_points.update(update.point_ids.tolist())
         self.map_points.difference_update(update.culled_point_ids.tolist(), update.fused_point_ids[:, 0].tolist())
 
     def _put_loop(self, loop: LoopResult) -> None:
         if loop.candidate_kf_id >= 0 and not loop.reason:
-            self.loops.append(loop)
+            self.closed.append(loop)
         for _, _, reason in loop.rejected:
             self.rejections[reason] = self.rejections.get(reason, 0) + 1
+
+    @property
+    def loops(self) -> list[LoopResult]:
+        """Accepted loops that the map holds."""
+        return [x for x in self.closed if x.kf_id not in self.refused_kf_ids]
+
+    @property
+    def rejected(self) -> dict[str, int]:
+        """How many candidates were rejected, by reason."""
+        refused = {"against_the_map": len(self.refused_kf_ids)} if self.refused_kf_ids else {}
+        return self.rejections | refused
 
     def times(self) -> dict[str, F64]:
         """(frames,) milliseconds by stage, NaN where a stage did not run."""

@@ -15,7 +15,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.eval.evaluate import Evaluation, evaluate
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.eval.report import write_report
-from stereo_sfm.eval.statistics import statistics
+from stereo_sfm.eval.statistics import MAX_LOST_PERCENT, statistics
 from stereo_sfm.export.run_folder import write_json
 from stereo_sfm.export.trajectories import write_kitti, write_tum
 from stereo_sfm.geometry import se3
@@ -42,6 +42,7 @@ def write_results(
     reference: Trajectory | None = None,
     frame: str = "cam0",
     step: int = 1,
+    max_lost_percent: float = MAX_LOST_PERCENT,
 ) -> tuple[dict[str, Any], dict[str, Evaluation]]:
     """Write trajectories, configuration, calibration, numbers and report.
 
@@ -53,6 +54,7 @@ def write_results(
         reference: ground truth (world_T_cam0), or None.
         frame: "cam0" or "body", the frame whose poses the trajectory files hold. Errors are always those of cam0.
         step: every `step`-th frame of the source was used.
+        max_lost_percent: frames without a pose above which the run counts as failed.
 
     Returns:
         What stats.json holds, and the evaluations by trajectory name.
@@ -72,6 +74,7 @@ def write_results(
     save_rig(rig, folder / "rig.yaml")
     evaluations = _evaluate(estimates, reference, "sim3" if scale_free(config, rig) else "se3")
     stats = {"source": source_name, "frame": frame, **statistics(record, wall_s, evaluations)}
+    stats["max_lost_percent"] = max_lost_percent
     write_json(folder / "stats.json", stats)
     write_report(folder, source_name, record, stats, estimates, reference, evaluations)
     return stats, evaluations

@@ -56,7 +56,7 @@ def statistics(record: RunRecord, wall_s: float, evaluations: dict[str, Evaluati
         "path_m": trajectory.length if len(trajectory) > 1 else 0.0,
         "duration_s": float(stamps[-1] - stamps[0]) / 1e9 if frames else 0.0,
         "loops_accepted": len(record.loops),
-        "loops_rejected": dict(sorted(record.rejections.items(), key=lambda item: (-item[1], item[0]))),
+        "loops_rejected": dict(sorted(record.rejected.items(), key=lambda item: (-item[1], item[0]))),
         "closure_drift_percent_median": 100 * float(np.median(drifts)) if drifts else None,
         "wall_s": wall_s,
         "frames_per_s": frames / wall_s if wall_s > 0 else 0.0,
@@ -79,12 +79,12 @@ def _health(report: Health) -> dict[str, float]:
     }
 
 
-def failure(stats: dict[str, Any], max_lost_percent: float = MAX_LOST_PERCENT) -> str:
+def failure(stats: dict[str, Any]) -> str:
     """Why the run counts as failed (exit code 4), or ''."""
     if not stats["tracked"]:
         return "tracking never initialised"
-    if stats["lost_percent"] > max_lost_percent:
-        return f"{stats['lost_percent']:.0f} % of the frames have no pose (limit {max_lost_percent:g} %)"
+    if stats["lost_percent"] > stats["max_lost_percent"]:
+        return f"{stats['lost_percent']:.0f} % of the frames have no pose (limit {stats['max_lost_percent']:g} %)"
     if stats["unplaced"] == stats["tracked"]:
         return "the camera was never found in the map"
     return ""

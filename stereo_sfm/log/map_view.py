@@ -23,6 +23,7 @@ class MapView:
         self._recent: list[Keyframe] = []
         self._covisible: list[tuple[int, int]] = []
         self._loops: list[tuple[int, int]] = []
+        self._refused: set[int] = set()  # kf_ids whose loops the mapper did not believe
 
     def keyframe(self, keyframe: Keyframe, map_T_odom: F64) -> None:
         """A new keyframe, at its odometry pose until the mapper moves it."""
@@ -40,6 +41,7 @@ class MapView:
     def update(self, update: MapUpdate) -> None:
         """The mapper's new poses and points."""
         self._poses.update(update)
+        self._refused.update(update.refused_kf_ids.tolist())
         gone = np.concatenate([update.culled_point_ids, update.fused_point_ids[:, 0], update.point_ids])
         keep = ~np.isin(self.point_ids, gone)
         ids = np.concatenate([self.point_ids[keep], update.point_ids])
@@ -67,7 +69,7 @@ class MapView:
     @property
     def loop_lines(self) -> F64:
         """(2E, 3) ends of the accepted loops."""
-        return self._lines(self._loops)
+        return self._lines((i, j) for i, j in self._loops if j not in self._refused)
 
     def _lines(self, edges: Iterable[tuple[int, int]]) -> F64:
         poses = self._poses.all()

@@ -42,6 +42,7 @@ class Opening:
     map_in: str = ""  # folder of the saved map that the run started from
     map_sha256: str = ""  # of its map.json, which holds the checksums of the rest
     localize_only: bool = False
+    frame_skip: int = 1  # every K-th frame of the source
 
 
 def write_provenance(
@@ -75,6 +76,8 @@ def write_provenance(
     }
     if opening is not None and opening.rectify != "none":
         values["rectify"] = opening.rectify
+    if opening is not None and opening.frame_skip != 1:
+        values["frame_skip"] = str(opening.frame_skip)
     if opening is not None and opening.map_in:
         values |= {"map_in": opening.map_in, "map_sha256": opening.map_sha256}
         values["localize_only"] = str(opening.localize_only).lower()

@@ -123,4 +123,5 @@ def read_opening(reader: LogReader) -> Opening:
         about.get("map_in", ""),
         about.get("map_sha256", ""),
         about.get("localize_only") == "true",
+        int(about.get("frame_skip", "1")),
     )

@@ -79,7 +79,8 @@ class RunLog:
         self._writer = writer
         self._left_T_body = se3.inverse(rig.body_T_left)
         self._body_adjoint = se3.adjoint(rig.body_T_left)
-        self._loops = config.loop.enabled and config.mapper.enabled and rig.stereo  # whether results will come
+        localize_only = opening is not None and opening.localize_only
+        self._loops = config.closes_loops(rig.stereo, localize_only)  # whether results will come
         write_provenance(
             writer, source=source, serial=rig.serial, mode=mode, image_format=image_format, config=config,
             opening=opening,
@@ -147,6 +148,8 @@ class RunLog:
         """The mapper's answer."""
         self._answers[0].append(update)
         self._release_answers()
+        self._totals["loops accepted"] -= len(update.refused_kf_ids)
+        self._totals["loop candidates rejected"] += len(update.refused_kf_ids)
         self._updates.append(update)
         self._map_T_odom[update.version] = update.map_T_odom
         self._version = update.version

@@ -38,12 +38,15 @@ class Correction:
     fused: list[tuple[int, int]]  # point rows (gone, stays)
 
 
-def apply_loop(map_: Map, loop: LoopResult, earlier: Sequence[LoopResult], config: LoopConfig) -> Correction:
+def apply_loop(
+    map_: Map, loop: LoopResult, earlier: Sequence[LoopResult], config: LoopConfig, match_sigma_px: float = 1.0
+) -> Correction:
     """Correct the map for an accepted loop.
 
     Args:
         map_: changed in place.
         earlier: loops applied before, which must keep holding.
+        match_sigma_px: noise of one coordinate of a point that was fused.
 
     Returns:
         `applied` False when the loop contradicts the rest of the graph; the map is then as it was.
@@ -65,7 +68,7 @@ def apply_loop(map_: Map, loop: LoopResult, earlier: Sequence[LoopResult], confi
     moved = float(np.linalg.norm(after[rows, :3, 3] - before[rows, :3, 3], axis=1).max())
     map_.move_keyframes(rows, after[rows])
     map_.carry_points(before, after)
-    return Correction(True, moved, fuse_pairs(map_, loop.matches))
+    return Correction(True, moved, fuse_pairs(map_, loop.matches, match_sigma_px))
 
 
 def loop_is_known(map_: Map, loop: LoopResult, connected_points: int) -> bool:
@@ -80,7 +83,7 @@ def loop_is_known(map_: Map, loop: LoopResult, connected_points: int) -> bool:
     return bool(np.linalg.norm(error[:3]) < metres and np.linalg.norm(error[3:]) < radians)
 
 
-def fuse_pairs(map_: Map, pairs: I64) -> list[tuple[int, int]]:
+def fuse_pairs(map_: Map, pairs: I64, match_sigma_px: float) -> list[tuple[int, int]]:
     """Make one point of each pair of ids (M, 2) that are two living points; the first of a pair stays.
 
     Returns:
@@ -90,7 +93,7 @@ def fuse_pairs(map_: Map, pairs: I64) -> list[tuple[int, int]]:
     for keep, drop in pairs.tolist():
         new, old = map_.point_rows(np.array([keep, drop]))
         if new >= 0 and old >= 0 and new != old and map_.points.alive[new] and map_.points.alive[old]:
-            map_.fuse(int(old), int(new))
+            map_.fuse(int(old), int(new), match_sigma_px)
             fused.append((int(old), int(new)))
     return fused
 

@@ -37,9 +37,7 @@ class Localizer:
         self._unsure: F64 | None = None  # map_T_odom by the newest keyframe, if it rests on few corners
         self._waiting: list[tuple[int, F64]] | None = []  # keyframes of this submap without a place; None: it has one
         self.found = False
-        self.last = None
-
-    last: Location | None  # what was said about the newest keyframe
+        self.last: Location | None = None  # what was said about the newest keyframe
 
     def step(self, keyframe: Keyframe, loop: LoopResult | None = None) -> MapUpdate:
         """Place a keyframe in the map; `loop` is taken for the mapper's signature and not used."""

@@ -38,7 +38,7 @@ def local_keyframes(map_: Map, seen_points: I64, map_T_kf: F64, reach: float, co
     """
     obs = map_.observations_of_points(seen_points)
     rows, counts = np.unique(map_.observations.kf[obs], return_counts=True)
-    first = rows[np.lexsort((rows, -counts))][: config.window_keyframes].astype(np.int64)
+    first = rows[np.lexsort((rows, -counts))][: config.most_keyframes].astype(np.int64)
     second = [map_.covisibility.neighbours(int(k), config.connected_points)[0][:5] for k in first]
     keyframes = map_.keyframes
     apart = np.linalg.norm(keyframes.map_T_kf[:, :3, 3] - map_T_kf[:3, 3], axis=1)

@@ -83,6 +83,7 @@ class Mapper:
         self._adjusted: I64 = np.zeros(0, np.int64)  # point rows of the last window
         self._thin: I64 = np.zeros(0, np.int64)  # point rows with too few observations that may still get more
         self._loops: list[LoopResult] = []
+        self._refused: list[int] = []  # kf_ids whose loops contradict the rest of the map
         self._job: Job | None = None
         self._job_due = -1
         self._whole = FIRST_WHOLE  # living keyframes at the last full bundle adjustment
@@ -145,7 +146,8 @@ class Mapper:
         delta = self.map.take_delta()
         culled = np.unique(np.concatenate([np.zeros(0, np.int64), *self._culled]))
         fused = self.map.points.pt_id[np.array(self._fused, np.int64).reshape(-1, 2)]
-        self._culled, self._fused = [], []
+        refused = np.array(self._refused, np.int64)
+        self._culled, self._fused, self._refused = [], [], []
         return MapUpdate(
             version=self._version,
             kf_id=kf_id,
@@ -159,20 +161,22 @@ class Mapper:
             culled_kf_ids=self.map.keyframes.kf_id[delta.culled_kf[:, 0]],
             carrier_kf_ids=self.map.keyframes.kf_id[delta.culled_kf[:, 1]],
             carrier_T_kf=delta.carrier_T_kf,
+            refused_kf_ids=refused,
         )
 
     # -- loops -------------------------------------------------------------------------------------------------------
 
     def _close(self, loop: LoopResult) -> None:
         """Correct the map for a loop that the pose graph believes, and order a full bundle adjustment."""
-        loop = self._between_living(loop)
-        if loop_is_known(self.map, loop, self._config.connected_points):
-            self._fused += fuse_pairs(self.map, loop.matches)
+        told, loop = loop, self._between_living(loop)
+        if loop.candidate_kf_id == loop.kf_id or loop_is_known(self.map, loop, self._config.connected_points):
+            self._fused += fuse_pairs(self.map, loop.matches, self._config.match_sigma_px)
             self._bundle_when_grown(GROWN_CLOSED)
             return
         before = self.map.keyframes.map_T_kf[-1].copy()
-        correction = apply_loop(self.map, loop, self._loops, self._loop_config)
+        correction = apply_loop(self.map, loop, self._loops, self._loop_config, self._config.match_sigma_px)
         if not correction.applied:
+            self._refused.append(told.kf_id)
             return
         self._loops.append(loop)
         self._fused += correction.fused
@@ -200,11 +204,12 @@ class Mapper:
         if ends == rows:
             return loop
         offset = [np.eye(4) if e == r else keyframes.carrier_T_kf[r] for e, r in zip(ends, rows, strict=True)]
+        ids, candidate_T_kf = keyframes.kf_id[ends].tolist(), offset[0] @ loop.candidate_T_kf @ se3.inverse(offset[1])
+        matches = loop.matches
+        if ids[0] > ids[1]:  # the candidate's carrier is the younger of the two: a loop looks back
+            ids, candidate_T_kf, matches = ids[::-1], se3.inverse(candidate_T_kf), matches[:, ::-1]
         return dataclasses.replace(
-            loop,
-            candidate_kf_id=int(keyframes.kf_id[ends[0]]),
-            kf_id=int(keyframes.kf_id[ends[1]]),
-            candidate_T_kf=offset[0] @ loop.candidate_T_kf @ se3.inverse(offset[1]),
+            loop, candidate_kf_id=ids[0], kf_id=ids[1], candidate_T_kf=candidate_T_kf, matches=matches
         )
 
     def _follow_newest(self, before: F64) -> None:

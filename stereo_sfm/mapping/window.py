@@ -17,7 +17,6 @@ from stereo_sfm.mapping.bundle import Bundle, BundleConfig, BundleResult
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.types import F64, I64, Bool
 
-ALL_KEYFRAMES = 10**9
 TIE = 10  # shared points that hold one keyframe to another
 
 
@@ -45,8 +44,7 @@ def covisible_window(map_: Map, row: int, config: MapperConfig) -> Window:
     others, _ = map_.covisibility.neighbours(row, config.connected_points)
     if not len(others):
         others, _ = map_.covisibility.neighbours(row)
-    limit = config.window_keyframes - 1 if config.window_keyframes > 0 else ALL_KEYFRAMES
-    return _window(map_, np.concatenate([[row], others[:limit]]).astype(np.int64), config)
+    return _window(map_, np.concatenate([[row], others])[: config.most_keyframes].astype(np.int64), config)
 
 
 def whole_map(map_: Map, config: MapperConfig) -> Window:

@@ -66,6 +66,9 @@ class Events:
         return LogLine("loop", "DEBUG", f"no loop at keyframe {result.kf_id}, {refused}")
 
     def _map_update(self, update: MapUpdate) -> LogLine | None:
+        if len(update.refused_kf_ids):
+            ids = ", ".join(str(k) for k in update.refused_kf_ids.tolist())
+            return LogLine("mapper", "WARNING", f"the loop of keyframe {ids} contradicts the rest of the map: left out")
         moved = se3.log(se3.inverse(self._map_T_odom) @ update.map_T_odom)
         metres, radians = float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:]))
         if metres < JUMP[0] and radians < JUMP[1]:

@@ -44,7 +44,7 @@ class InlineRun:
         tracker = make_tracker(config, source.rig, self._spans, source.ground_truth)
         schedule = schedule or Lockstep(config.pipeline.update_lag_frames)
         self._track = TrackStage(tracker, schedule, self._updates)
-        self._closer = make_closer(config, source.rig, self._spans)
+        self._closer = make_closer(config, source.rig, self._spans, self._folders.localize_only)
         lag = config.pipeline.loop_lag_keyframes
         self.map_stage = MapStage(
             make_mapper(config, source.rig, self._spans, self._folders),

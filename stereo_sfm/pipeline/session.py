@@ -11,7 +11,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-from drivers.source import Source
+from drivers.source import Source, is_device
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.run_folder import default_folder, discard_files, prepare_folder
@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from stereo_sfm.log.recorded import RecordedRun
 
 log = logging.getLogger("stereo_sfm")
-
-LIVE = ("t265", "oak")  # sources that are devices
 
 
 @dataclass(frozen=True)
@@ -121,9 +119,11 @@ class Session:
         if self._run is not None:
             self._run.stop()
 
-    def _name_folder(self, source_name: str) -> Path:
+    def _name_folder(self, otherwise: str) -> Path:
+        """By what the source was opened by, else by the given name."""
         if self._folder is None:
-            self._folder = default_folder(source_name, datetime.now())
+            name = self._spec.rstrip("/").split("/")[-1] or otherwise
+            self._folder = default_folder(name, datetime.now())
         return self._folder
 
     def _prepare(self) -> None:
@@ -155,7 +155,7 @@ class Session:
         self.info = SourceInfo(source.name, source.rig, source.ground_truth, source.frame_count, source.live)
         folder = self._name_folder(source.name)
         self._prepare()
-        options = self._log_options(source.live, folder)
+        options = self._log_options(is_device(self._spec), folder)
         sinks: list[Any] = list(self._sinks)
         jpeg = options is not None and options.image_format == "jpeg"
         if options is not None:
@@ -182,8 +182,7 @@ class Session:
         return frames
 
     def _enter_processes(self, stack: ExitStack) -> Iterator[Frame]:
-        live = self._spec.split(":")[0] in LIVE
-        self._name_folder(self._spec.rstrip("/").split("/")[-1] or "run")
+        self._name_folder("run")
         viewer = None if self._wiring.viz == "none" else ViewerOptions(self._wiring.viz, self.folder / "run.rrd")
         self._run = ProcessRun(
             self._opener,
@@ -191,7 +190,7 @@ class Session:
             self._sinks,
             realtime=None if self._wiring.mode is None else self._wiring.mode == "realtime",
             applied=None if self._replayed is None else self._replayed.applied,
-            log=self._log_options(live, self.folder),
+            log=self._log_options(is_device(self._spec), self.folder),
             folders=self._folders,
             viewer=viewer,
             opened=self._prepare,

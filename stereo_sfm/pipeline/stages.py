@@ -126,14 +126,11 @@ class MapStage:
         return self.mapper.finish(loops)
 
 
-def has_closer(config: Config, rig: Rig) -> bool:
-    """Whether a run closes loops: the configuration wants it and the camera knows depth."""
-    return config.loop.enabled and config.mapper.enabled and rig.stereo
-
-
-def make_closer(config: Config, rig: Rig, spans: NoSpans | None = None) -> AnyCloser | None:
+def make_closer(
+    config: Config, rig: Rig, spans: NoSpans | None = None, localize_only: bool = False
+) -> AnyCloser | None:
     """The loop closer, or None where there is none."""
-    if not has_closer(config, rig):
+    if not config.closes_loops(rig.stereo, localize_only):
         return None
     from stereo_sfm.loop.closer import LoopCloser
 

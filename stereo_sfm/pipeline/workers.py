@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.rig import Rig
-from stereo_sfm.config import Config
+from stereo_sfm.config import STAGES, Config
 from stereo_sfm.errors import StereoSfmError, from_os_error
 from stereo_sfm.log.provenance import Opening
 from stereo_sfm.pipeline.channels import End, Failed, Inbox, Lost, Outbox
@@ -26,7 +26,6 @@ from stereo_sfm.pipeline.schedule import Lockstep, Realtime, Recorded, Schedule
 from stereo_sfm.pipeline.text import LOGGER, Listener
 from stereo_sfm.types import Applied, Keyframe, LoopResult, MapUpdate, Trajectory
 
-STAGES = ("capture", "tracker", "mapper", "loop", "optimizer", "logger", "viewer")
 UPSTREAM_LOST = 70  # exit code of a worker whose neighbour died: not the cause
 
 
@@ -96,7 +95,10 @@ def prepare(stage: str, setup: Setup) -> Callable[[], None]:
     cv2.setNumThreads(setup.config.pipeline.threads)  # of BLAS: as the environment says
     cpus = setup.config.pipeline.cpus.get(stage)
     if cpus and hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, cpus)
+        try:
+            os.sched_setaffinity(0, cpus)
+        except OSError:
+            raise StereoSfmError(f"configuration: pipeline.cpus.{stage} is {list(cpus)}: no such core here") from None
     if setup.delays is None:
         return lambda: None
     import numpy as np
@@ -218,14 +220,14 @@ def run_mapper(
     from stereo_sfm.mapping.mapper import Mapper
     from stereo_sfm.pipeline.health import HealthMeter
     from stereo_sfm.pipeline.sinks import StageTimes
-    from stereo_sfm.pipeline.stages import MapStage, has_closer
+    from stereo_sfm.pipeline.stages import MapStage
     from stereo_sfm.timing import Spans
 
     setup = Inbox[Setup](control).take()
     delay = prepare("mapper", setup)
     spans = Spans()
     mapper = make_mapper(setup.config, setup.rig, spans, setup.folders)
-    closing = has_closer(setup.config, setup.rig)
+    closing = setup.config.closes_loops(setup.rig.stereo, setup.folders.localize_only)
     lag = setup.config.pipeline.loop_lag_keyframes
     stage = MapStage(mapper, lag, Inbox[LoopResult](loops) if closing else None)
     inbox = Inbox[Keyframe | End](keyframes)
@@ -299,7 +301,7 @@ def run_loop(to_main: Outbox, control: Connection, keyframes: Connection, to_map
     setup = Inbox[Setup](control).take()
     delay = prepare("loop", setup)
     spans = Spans()
-    closer = make_closer(setup.config, setup.rig, spans)
+    closer = make_closer(setup.config, setup.rig, spans, setup.folders.localize_only)
     inbox, outbox = Inbox[Keyframe | End](keyframes), Outbox(to_mapper)
     ready("loop", setup, to_main)
     meter = HealthMeter("loop")

@@ -96,7 +96,6 @@ class Tracker:
         self._submap_id = 0
         self._kf_pose: F64 = np.eye(4)
         self._kf_points: int = 0
-        self._kf_last_point_id = 0
         self._frames_since_kf = 0
         self._first_level = config.pyramid_levels - 1
         self._miss_px = math.inf  # median distance of points from where they were predicted
@@ -173,6 +172,7 @@ class Tracker:
         keyframe = None
         if self._wants_keyframe():
             with self._spans.span("keyframe"):
+                self._add_points(pyramid, right)
                 keyframe = self._make_keyframe(image, pyramid, right, covariance)
                 frame_inlier = np.concatenate([frame_inlier, np.ones(len(self._tracks) - len(frame_inlier), bool)])
         return self._frame(image, covariance, state, "", frame_inlier, keyframe, stats), keyframe
@@ -185,14 +185,14 @@ class Tracker:
         """First frame, or the first after a restart: points from stereo alone."""
         self._tracks = Tracks()
         self._accept(image, pyramid, self._pose, self._tracks)
-        keyframe = self._make_keyframe(image, pyramid, right, np.eye(6) * 1e-12)
+        self._add_points(pyramid, right)
         if len(self._tracks) < 2 * self._config.min_features:
             self._tracks = Tracks()
-            self._next_kf_id -= 1
             self._state = TrackState.INITIALIZING
             reason = "dark" if image.left.max() < 30 else "too_few_points"
             state = TrackState.INITIALIZING if self._submap_id == 0 and self._next_kf_id == 0 else TrackState.LOST
             return self._frame(image, np.eye(6), state, reason, np.zeros(0, bool), None, stats), None
+        keyframe = self._make_keyframe(image, pyramid, right, np.eye(6) * 1e-12)
         state = TrackState.OK if self._submap_id == 0 else TrackState.RESTARTED
         inlier = np.ones(len(self._tracks), bool)
         stats.update(tracked=float(len(inlier)), inliers=float(len(inlier)), right=float(len(inlier)), error=0.0)
@@ -294,13 +294,12 @@ class Tracker:
 
     def _wants_keyframe(self) -> bool:
         config = self._config
-        old = int((self._tracks.point_ids < self._kf_last_point_id).sum())
-        return self._frames_since_kf >= config.keyframe_max_frames or old < config.keyframe_share * self._kf_points
+        left = len(self._tracks)  # new points come with keyframes only
+        return self._frames_since_kf >= config.keyframe_max_frames or left < config.keyframe_share * self._kf_points
 
     def _make_keyframe(
         self, image: StereoImage, pyramid: flow.Pyramid, right: flow.Pyramid | F32, covariance: F64
     ) -> Keyframe:
-        self._add_points(pyramid, right)
         tracks = self._tracks
         points_cam = se3.transform(se3.inverse(self._pose), tracks.points())
         descriptors, angles = describe(pyramid[0], tracks.uv)
@@ -322,7 +321,6 @@ class Tracker:
         self._next_kf_id += 1
         self._kf_pose = self._pose.copy()
         self._kf_points = len(tracks)
-        self._kf_last_point_id = self._next_point_id
         self._frames_since_kf = 0
         return keyframe
 
