@@ -172,7 +172,7 @@ class LoopConfig:
     gate_degrees: float = 3.0
     gate_degrees_per_metre: float = 0.3
     relocalize_candidates: int = 16  # places of a saved map that are verified
-    relocalize_keyframes: int = 6  # keyframes whose points make up a place
+    relocalize_keyframes: int = above_zero(6)  # keyframes whose points make up a place
     relocalize_inliers: int = 56  # corners that must agree with the pose found in a saved map
     relocalize_share: float = 0.25  # ... and so large a share of the camera's corners (near a guess: min_inlier_share)
     relocalize_cells: int = 6  # ... in so many of the image's 8 x 6 cells

@@ -31,6 +31,10 @@ from stereo_sfm.tracking.scale import SCALES
         ("manhattan.every=0", "manhattan.every is 0: it must be above 0"),
         ("loop.gate_metres=-0.1", "loop.gate_metres is -0.1: it must be at least 0"),
         ("tracker.sigma_px=nan", "tracker.sigma_px is nan"),
+        ("tracker.pyramid_levels=1", "tracker.pyramid_levels is 1: it must be at least 2"),
+        ("tracker.min_features=0", "tracker.min_features is 0: it must be at least 3"),
+        ("loop.relocalize_keyframes=0", "loop.relocalize_keyframes is 0: it must be above 0"),
+        ("pipeline.cpus.nobody=[0]", "pipeline.cpus names 'nobody': the stages are capture,"),
     ],
 )
 def test_what_a_field_does_not_take_is_refused(override: str, said: str) -> None:

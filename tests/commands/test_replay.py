@@ -88,3 +88,11 @@ def test_options_that_a_replay_has_no_use_for(
     assert main(["replay", str(run), "-o", str(tmp_path / "c"), *options]) == 2
     assert options[-2 if options[-1].isdigit() else -1] in capsys.readouterr().err
     assert not (tmp_path / "c").exists()
+
+
+def test_a_replay_numbers_the_frames_as_the_run_did(tmp_path: Path) -> None:
+    options = ["--frame-skip", "3", "--inline", "-q", "--max-lost", "100"]
+    assert main(["run", SPEC, "-o", str(tmp_path / "run"), *options]) == 0
+    assert main(["replay", str(tmp_path / "run"), "-o", str(tmp_path / "again"), "--check", "--inline", "-q"]) == 0
+    for name in ("trajectory_odom.kitti", "trajectory_odom.tum"):
+        assert (tmp_path / "again" / name).read_text() == (tmp_path / "run" / name).read_text()

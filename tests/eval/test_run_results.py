@@ -153,3 +153,31 @@ def test_a_straight_path_says_that_its_rotation_is_open(tmp_path: Path) -> None:
     for path, said in ((straight, True), (curved, False)):
         rows = dict(table(evaluate(path, path)))
         assert ("nearly straight" in rows["rotation"]) == said
+
+
+def test_a_loop_that_the_map_refused_is_no_accepted_one(tmp_path: Path) -> None:
+    record = record_of(walk(), 0)
+    none = np.zeros(0, np.int64)
+    pairs = none.reshape(-1, 2)
+    for kf_id in (10, 20):
+        record.put(Keyframe(kf_id, kf_id, kf_id * 10**8, np.eye(4), none, *(np.zeros((0, n)) for n in (2, 2, 3)),
+                            np.zeros((0, 32), np.uint8), np.zeros(0, np.float32)))  # fmt: skip
+        record.put(LoopResult(kf_id, 0, np.eye(4), np.eye(6), pairs, 50, 1.0, ""))
+    place = np.eye(4)[None]
+    update = MapUpdate(9, 20, np.array([20]), place, none, np.zeros((0, 3)), none, pairs, np.eye(4),
+                       refused_kf_ids=np.array([10]))  # fmt: skip
+    record.put(update)
+    assert [loop.kf_id for loop in record.loops] == [20]
+    assert record.rejected == {"against_the_map": 1}
+
+
+def test_the_report_and_the_exit_code_know_the_same_limit(tmp_path: Path) -> None:
+    record = record_of(walk(), 0)
+    for k in range(COUNT, COUNT + 10):  # a quarter is lost
+        record.put(
+            Frame(k, k * 10**8, np.eye(4), np.eye(6), TrackState.LOST, "dark", Observations.empty(), 0, np.eye(4))
+        )
+    for limit, wrong in ((20.0, True), (30.0, False)):
+        stats, _ = write_results(tmp_path, "test", pinhole_rig(), Config(), record, 1.0, max_lost_percent=limit)
+        assert bool(failure(stats)) == wrong
+        assert ("FAIL" in (tmp_path / "report.md").read_text()) == wrong

@@ -254,6 +254,25 @@ def test_a_loop_that_the_map_knows_only_fuses(monkeypatch: pytest.MonkeyPatch) -
     assert not loop_is_known(mapper.map, wrong, CONFIG.connected_points)
 
 
+def test_a_loop_that_contradicts_the_map_is_refused_and_told() -> None:
+    stream = keyframe_stream(pinhole_rig(), ring(40), points=800, per_keyframe=100, track_length=3)
+    mapper, _ = walk_with_loop(stream)
+    mapper.finish([])
+    before = mapper.map.keyframes.map_T_kf.copy()
+    loop = true_loop(stream, len(stream.keyframes) - 8, 2)
+    false = dataclasses.replace(loop, candidate_T_kf=loop.candidate_T_kf @ se3.exp(np.array([2.0, 0, 0, 0, 0, 0])))
+    update = mapper.finish([false])
+    assert update is not None and update.refused_kf_ids.tolist() == [false.kf_id]
+    assert np.array_equal(mapper.map.keyframes.map_T_kf, before)
+    assert mapper.finish([]).refused_kf_ids.tolist() == []  # type: ignore[union-attr]
+
+
+def test_no_limit_of_the_window_takes_all_keyframes() -> None:
+    stream = keyframe_stream(pinhole_rig(), ring(12), points=400, per_keyframe=100, track_length=3)
+    all_, many = (run(stream, dataclasses.replace(CONFIG, window_keyframes=n))[0].map for n in (0, 1000))
+    assert all_.keyframes.map_T_kf.tobytes() == many.keyframes.map_T_kf.tobytes()
+
+
 def test_a_place_keeps_a_bounded_number_of_keyframes() -> None:
     """To and fro along the same wall: new tracks every time, so no keyframe is redundant by its points."""
     once = walk(12, 0.1, 0.0)
