@@ -61,7 +61,7 @@ def write_report(
             *_rectified(calibration, pairs),
         ]
     page = f"<!doctype html><meta charset='utf-8'><title>{html.escape(title)}</title><style>{_STYLE}</style>"
-    path.write_text(page + "\n".join(parts) + "\n")
+    path.write_text(page + "\n".join(parts) + "\n", encoding="utf-8")
 
 
 def _advice(views: list[Coverage]) -> str:

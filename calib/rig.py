@@ -10,6 +10,9 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.types import F64
 
+BASELINES = 1e-4, 100.0  # metres that the eyes can be apart
+MOST_PIXELS = 10**8
+
 
 @dataclass(frozen=True, eq=False)
 class Rig:
@@ -35,6 +38,15 @@ class Rig:
             ):
                 raise StereoSfmError("calibration holds a transform that is not rigid: check the extrinsics")
             transform.flags.writeable = False
+            if not np.isfinite(transform).all():
+                raise StereoSfmError("calibration holds a transform that is not finite: check the extrinsics")
+        for eye, camera in (("left", self.left), ("right", self.right)):
+            if camera is not None:
+                _check_camera(eye, camera)
+        if self.right is not None and not BASELINES[0] <= self.baseline <= BASELINES[1]:
+            raise StereoSfmError(
+                f"calibration has a baseline of {self.baseline:g} m: the distance between the eyes in metres is meant"
+            )
 
     @property
     def stereo(self) -> bool:
@@ -45,3 +57,17 @@ class Rig:
     def baseline(self) -> float:
         """Metres between the eyes; 0 for one eye."""
         return float(np.linalg.norm(self.left_T_right[:3, 3])) if self.stereo else 0.0
+
+
+def _check_camera(eye: str, camera: Camera) -> None:
+    """Raises StereoSfmError for numbers that no camera has."""
+    numbers = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
+    wrong = [f"{name} {value:g}" for name, value in numbers.items() if not np.isfinite(value)]
+    wrong += [f"distortion {value:g}" for value in camera.distortion if not np.isfinite(value)]
+    wrong += [f"{name} {numbers[name]:g}" for name in ("fx", "fy") if numbers[name] <= 0]
+    wrong += [f"cx {camera.cx:g}"] if abs(camera.cx) > 2 * camera.width else []
+    wrong += [f"cy {camera.cy:g}"] if abs(camera.cy) > 2 * camera.height else []
+    if min(camera.width, camera.height) < 1 or camera.width * camera.height > MOST_PIXELS:
+        wrong.append(f"size {camera.width}x{camera.height}")
+    if wrong:
+        raise StereoSfmError(f"calibration of the {eye} eye cannot be: {', '.join(wrong)}")

@@ -92,7 +92,7 @@ def _read_exposures(path: Path) -> dict[str, float]:
     """TUM VI: file stem -> exposure time in microseconds."""
     if not path.is_file():
         return {}
-    rows = [line.split() for line in path.read_text().splitlines() if not line.startswith("#")]
+    rows = [line.split() for line in path.read_text("utf-8-sig").splitlines() if not line.startswith("#")]
     try:
         return {row[0]: float(row[2]) * 1e3 for row in rows if len(row) >= 3}
     except ValueError as error:

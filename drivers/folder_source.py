@@ -187,6 +187,20 @@ def pair_in_order(name: str, left: list[Path], right: list[Path]) -> list[tuple[
     return common
 
 
+def stamps_of(name: str, images: list[Path], stamp_ns: list[int]) -> dict[Path, int]:
+    """The stamps of numbered images that lie beside a list of stamps, one a line, as KITTI has them.
+
+    Images and lines go together in order where there are as many, by the images' numbers where some are missing.
+    """
+    numbers = [int(p.stem) if p.stem.isdigit() else len(stamp_ns) for p in images]
+    if len(images) == len(stamp_ns) or max(numbers) >= len(stamp_ns):
+        if len(images) != len(stamp_ns):
+            log.warning("%s: %d images but %d stamps, the common part is used", name, len(images), len(stamp_ns))
+        return dict(zip(images, stamp_ns, strict=False))
+    log.warning("%s: %d of %d images are missing", name, len(stamp_ns) - len(images), len(stamp_ns))
+    return {image: stamp_ns[number] for image, number in zip(images, numbers, strict=True)}
+
+
 def _without_prefix(path: Path) -> str:
     """left_0012 -> 0012, so that both eyes' files have one name."""
     return path.stem.lstrip(string.ascii_letters + "_-") or path.stem

@@ -23,15 +23,18 @@ def stamp_from_seconds(text: str) -> int:
         ValueError: not a number.
     """
     try:
-        return int(Decimal(text).scaleb(9).to_integral_value())
-    except ArithmeticError:
+        stamp_ns = int(Decimal(text).scaleb(9).to_integral_value())
+    except (ArithmeticError, ValueError):
         raise ValueError(f"'{text}' is not a time in seconds") from None
+    if abs(stamp_ns) >= 2**62:
+        raise ValueError(f"'{text}' is too large for a time in seconds")
+    return stamp_ns
 
 
 def _rows(path: Path, least: int) -> list[list[str]]:
     """Rows of a text table, commas or blanks between the fields, without comments and headings."""
     try:
-        lines = path.read_text().splitlines()
+        lines = path.read_text("utf-8-sig").splitlines()
     except FileNotFoundError:
         raise StereoSfmError(f"no trajectory at {path}") from None
     except (UnicodeDecodeError, IsADirectoryError):
@@ -98,6 +101,8 @@ def read_kitti(path: Path, stamp_ns: I64 | None = None) -> Trajectory:
         matrices: F64 = np.array([r[:12] for r in rows], float).reshape(-1, 3, 4)
     except ValueError as error:
         raise StereoSfmError(f"{path}: {error}") from None
+    if not np.isfinite(matrices).all():
+        raise StereoSfmError(f"{path}: pose {int(np.flatnonzero(~np.isfinite(matrices).all((1, 2)))[0])} is not finite")
     stamps = np.arange(len(rows), dtype=np.int64) * 10**9 if stamp_ns is None else np.asarray(stamp_ns, np.int64)
     count = min(len(stamps), len(rows))
     poses = se3.from_rotation_translation(matrices[:count, :, :3], matrices[:count, :, 3])

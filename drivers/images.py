@@ -84,7 +84,7 @@ def _stamps(folder: Path, files: list[Path], fps: float | str) -> list[int]:
     """Strictly ascending nanoseconds, one for each file."""
     times = folder / "times.txt"
     if times.is_file():
-        stamps = [stamp_from_text(line) for line in times.read_text().split()]
+        stamps = [stamp_from_text(line) for line in times.read_text("utf-8-sig").split()]
         if len(stamps) < len(files) or None in stamps:
             raise StereoSfmError(f"{times} must hold one time in seconds for each of the {len(files)} frames")
         return [s for s in stamps if s is not None][: len(files)]

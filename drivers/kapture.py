@@ -92,7 +92,7 @@ def _listings(folder: Path) -> tuple[Listing, Listing]:
     eyes: dict[str, Listing] = {i: [] for i in list(read_kapture_cameras(_sensors(folder)))[:2]}
     if len(eyes) < 2:
         raise StereoSfmError(f"{folder} has one camera, two are needed")
-    for line in records.read_text().splitlines():
+    for line in records.read_text("utf-8-sig").splitlines():
         fields = [f.strip() for f in line.split(",")]
         if len(fields) == 3 and fields[1] in eyes:
             eyes[fields[1]].append((_stamp(fields[0]), folder / "sensors" / "records_data" / fields[2]))

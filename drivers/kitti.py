@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.formats.kitti import read_kitti as read_rig
-from drivers.folder_source import FolderSource, Shot, folder_of, list_images, need, pair_in_order
+from drivers.folder_source import FolderSource, Shot, folder_of, list_images, need, pair_in_order, stamps_of
 from drivers.ground_truth import moved, read_kitti, stamp_from_seconds
 from drivers.rig_option import RigOption, chosen_rig
 from stereo_sfm.errors import StereoSfmError
@@ -35,9 +35,11 @@ def open_kitti(path: str, sequence: str = "", rig: RigOption = None) -> FolderSo
     eyes = next((pair for pair in ((0, 1), (2, 3)) if (folder / f"image_{pair[0]}").is_dir()), None)
     if eyes is None:
         raise StereoSfmError(f"{folder} has neither image_0 nor image_2")
-    pairs = pair_in_order(name, *(list_images(folder / f"image_{i}") for i in eyes))
-    stamps = _read_times(folder / "times.txt", name, len(pairs))
-    shots = [Shot(stamp, left, right) for stamp, (left, right) in zip(stamps, pairs, strict=False)]
+    lefts, rights = (list_images(folder / f"image_{i}") for i in eyes)
+    stamps = _read_times(folder / "times.txt", name, len(lefts))
+    stamp_of = stamps_of(name, lefts, stamps)
+    pairs = pair_in_order(name, lefts, rights)
+    shots = [Shot(stamp_of[left], left, right) for left, right in pairs if left in stamp_of]
     chosen = chosen_rig(rig, lambda: read_rig(need(folder / "calib.txt", "KITTI calibration"), eyes=eyes))
     truth_file = folder.resolve().parent.parent / "poses" / f"{folder.resolve().name}.txt"
     truth = None
@@ -61,14 +63,11 @@ def _sequence_folder(folder: Path, sequence: str) -> Path:
 
 
 def _read_times(path: Path, name: str, count: int) -> list[int]:
-    """At most `count` stamps in ns."""
+    """Stamps in ns, one a line; `count` of them where there is no file."""
     if not path.is_file():
         log.warning("%s: no times.txt, frames are stamped at 10 Hz", name)
         return [i * PERIOD_NS for i in range(count)]
     try:
-        stamps = [stamp_from_seconds(line) for line in path.read_text().split()]
+        return [stamp_from_seconds(line) for line in path.read_text("utf-8-sig").split()]
     except ValueError as error:
         raise StereoSfmError(f"{path}: {error}") from None
-    if len(stamps) < count:
-        log.warning("%s: %d images but %d lines in times.txt, the common part is used", name, count, len(stamps))
-    return stamps[:count]

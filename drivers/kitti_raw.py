@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.formats.kitti import read_kitti as read_rig
-from drivers.folder_source import FolderSource, Shot, folder_of, list_images, need, pair_in_order
+from drivers.folder_source import FolderSource, Shot, folder_of, list_images, need, pair_in_order, stamps_of
 from drivers.ground_truth import moved
 from drivers.rig_option import RigOption, chosen_rig
 from stereo_sfm.errors import StereoSfmError
@@ -41,11 +41,11 @@ def open_kitti_raw(path: str, drive: str = "", rig: RigOption = None) -> FolderS
         raise StereoSfmError(f"{folder} has neither image_00/data nor image_02/data")
     date = next((p for p in (folder, folder.resolve().parent) if (p / CALIBRATION).is_file()), folder.resolve().parent)
     own = chosen_rig(rig, lambda: read_rig(need(date / CALIBRATION, "KITTI raw calibration"), eyes=eyes))
-    pairs = pair_in_order(name, *(list_images(folder / f"image_0{i}" / "data") for i in eyes))
+    lefts, rights = (list_images(folder / f"image_0{i}" / "data") for i in eyes)
     stamps = _read_times(need(folder / f"image_0{eyes[0]}" / "timestamps.txt", "time stamps"))
-    if len(stamps) != len(pairs):
-        log.warning("%s: %d images but %d time stamps, the common part is used", name, len(pairs), len(stamps))
-    shots = [Shot(stamp, left, right) for stamp, (left, right) in zip(stamps, pairs, strict=False)]
+    stamp_of = stamps_of(name, lefts, stamps)
+    pairs = pair_in_order(name, lefts, rights)
+    shots = [Shot(stamp_of[left], left, right) for left, right in pairs if left in stamp_of]
     return FolderSource(name, own, shots, _ground_truth(folder, date, stamps, own.body_T_left))
 
 
@@ -62,7 +62,7 @@ def _drive_folder(folder: Path, drive: str) -> Path:
 def _read_times(path: Path) -> list[int]:
     """Nanoseconds from lines such as 2011-09-26 13:02:25.964389445."""
     stamps: list[int] = []
-    for line in path.read_text().splitlines():
+    for line in path.read_text("utf-8-sig").splitlines():
         if not line.strip():
             continue
         whole, _, fraction = line.strip().partition(".")
@@ -86,7 +86,7 @@ def _ground_truth(folder: Path, date: Path, stamps: list[int], cam0_T_left: F64)
     imu_T_cam0 = se3.inverse(rectified_T_cam @ cam_T_velo @ velo_T_imu)
     count = min(len(packets), len(stamps))
     try:
-        world_T_imu = poses_from_oxts(np.array([p.read_text().split()[:6] for p in packets[:count]], float))
+        world_T_imu = poses_from_oxts(np.array([p.read_text("utf-8-sig").split()[:6] for p in packets[:count]], float))
     except ValueError as error:
         raise StereoSfmError(f"{folder / 'oxts'}: {error}") from None
     return moved(Trajectory(np.array(stamps[:count], np.int64), world_T_imu), imu_T_cam0 @ cam0_T_left)
@@ -111,7 +111,7 @@ def poses_from_oxts(packets: F64) -> F64:
 def _read_entries(path: Path) -> dict[str, F64]:
     """`KEY: numbers` lines."""
     entries: dict[str, F64] = {}
-    for line in path.read_text().splitlines():
+    for line in path.read_text("utf-8-sig").splitlines():
         key, _, values = line.partition(":")
         try:
             entries[key.strip()] = np.array(values.split(), float)

@@ -14,6 +14,7 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
 from calib.rig import Rig
+from drivers.folder_source import SHOWN_WARNINGS
 from drivers.rig_option import RigOption, chosen_rig
 from drivers.source import Source
 from stereo_sfm.errors import StereoSfmError
@@ -171,9 +172,18 @@ class McapSource:
         self.reader = reader
         self.name = str(reader.path)
         self.rig = chosen_rig(rig, self._recorded_rig)
+        self._check_eyes()
         truth = reader.attachment(TRUTH_FILE)
         self.ground_truth = truth_from_bytes(truth) if truth is not None else None  # world_T_cam0
+        self._incomplete = 0  # frames of the last reading
         self._decoders: dict[type[Any], Callable[[bytes], Any]] = {}
+
+    def _check_eyes(self) -> None:
+        """Raises StereoSfmError when the calibration has an eye that the recording has not."""
+        recorded = {t.topic for t in self.reader.topics if t.count}
+        what, topic = ("depth", topics.DEPTH_IMAGE) if self.rig.depth else ("right", topics.RIGHT_IMAGE)
+        if topics.LEFT_IMAGE in recorded and self.rig.stereo and topic not in recorded:
+            raise StereoSfmError(f"{self.name} holds no {what} images, but its calibration (or --rig) has them")
 
     def _recorded_rig(self) -> Rig:
         text = self.reader.attachment(RIG_FILE)
@@ -220,10 +230,13 @@ class McapSource:
 
     def _whole_frames(self, first_ns: int | None, last_ns: int | None) -> Iterator[StereoImage]:
         pending: dict[int, _Parts] = {}
+        self._incomplete = 0
         for record in self.reader.messages(_PARTS, first_ns, last_ns):
             self._add(pending.setdefault(record.sequence, _Parts()), record)
             yield from self._take(pending, _WAITING)
         yield from self._take(pending, 0, at_edge=first_ns is not None or bool(self.reader.truncated))
+        if self._incomplete > SHOWN_WARNINGS:
+            log.warning("%s: %d frames were incomplete and left out", self.name, self._incomplete)
 
     def _take(self, pending: dict[int, _Parts], waiting: int, at_edge: bool = False) -> Iterator[StereoImage]:
         """The whole frames in front; a frame that stays incomplete while `waiting` others came is left out."""
@@ -236,6 +249,9 @@ class McapSource:
             if parts.whole():
                 yield parts.image()
             elif not at_edge:
+                self._incomplete += 1
+                if self._incomplete > SHOWN_WARNINGS:
+                    continue
                 log.warning("%s: frame %d is incomplete and left out", self.name, sequence)
 
     def _add(self, parts: _Parts, record: Record) -> None:

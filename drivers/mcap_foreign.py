@@ -36,6 +36,7 @@ from stereo_sfm.types import I64, ImuSamples, StereoImage, Trajectory
 log = logging.getLogger("stereo_sfm")
 
 _STATIC_NS = 10_000_000_000  # the fixed transforms must come within the first ten seconds
+_STEP_BACK_NS = 200_000_000  # messages of several threads may be out of order by less
 _WAITING = 30  # images of one eye that wait for the other eye at most
 
 
@@ -73,6 +74,13 @@ class ForeignMcapSource:
         self.frame_count: int | None = min(counts[t] for t in (self.topics.left, self._other()) if t)
         self._tolerance_ns = self._period_ns() * 2 // 5
         self._check_first()
+        back_ns = reader.step_back_ns(self.topics.left)
+        if back_ns > _STEP_BACK_NS:
+            log.warning(
+                "%s: the clock goes back by %.1f s in it: images from before and after are mixed by their stamps",
+                self.name,
+                back_ns / 1e9,
+            )
 
     def __enter__(self) -> Self:
         return self

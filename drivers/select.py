@@ -10,6 +10,8 @@ from drivers.wrapped import WrappedSource
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import StereoImage
 
+LONGEST_S = 1e9  # seconds that any source can last
+
 
 class SelectedFrames(WrappedSource):
     """A source that passes on some frames of another one. Frames left out on purpose do not count as dropped."""
@@ -29,11 +31,13 @@ class SelectedFrames(WrappedSource):
         frame_skip: 1 passes every frame, 3 every third.
         max_frames: how many frames are passed at most.
         """
-        if frame_skip < 1 or start_s < 0 or duration_s <= 0 or (max_frames is not None and max_frames < 1):
+        if frame_skip < 1 or not start_s >= 0 or not duration_s > 0 or (max_frames is not None and max_frames < 1):
             raise StereoSfmError("a part of a source needs frame skip and frames of at least 1, and times above 0")
+        if start_s > LONGEST_S:
+            raise StereoSfmError(f"a part of a source cannot begin {start_s:g} s after the first frame")
         super().__init__(source)
         self.start_ns = round(start_s * 1e9)
-        self.end_ns = None if duration_s == float("inf") else self.start_ns + round(duration_s * 1e9)
+        self.end_ns = None if duration_s > LONGEST_S else self.start_ns + round(duration_s * 1e9)
         self.frame_skip = frame_skip
         self.max_frames = max_frames
 

@@ -75,7 +75,7 @@ def _own_rig(folder: Path, label: str) -> Rig:
 def _read_listing(path: Path) -> list[tuple[int, Path]]:
     """(stamp_ns, file) of every line."""
     images: list[tuple[int, Path]] = []
-    for number, line in enumerate(path.read_text().splitlines(), 1):
+    for number, line in enumerate(path.read_text("utf-8-sig").splitlines(), 1):
         fields = line.split()
         if not fields or fields[0].startswith("#"):
             continue

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import io
 import logging
 import os
 import sys
@@ -78,30 +79,55 @@ def _start_logging(options: argparse.Namespace) -> None:
     log.setLevel(logging.INFO)  # the log of a run holds what the screen leaves out
 
 
+def _mend_standard_streams() -> None:
+    """Closed ones lead nowhere; a character that the terminal does not know becomes another."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # takes the lowest free number
+            setattr(sys, name, open(number, "r" if number == 0 else "w"))  # noqa: SIM115
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+
+
+def _nobody_reads() -> bool:
+    """Whether the reader of our output went away (`| head`): nothing is wrong, and nothing more can be said."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        return True
+    return False
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point.
 
     Exit codes: 0 ok, 1 internal error, 2 bad input, 3 check failed, 4 tracking failed, 130 interrupted.
     """
+    if argv is None:
+        _mend_standard_streams()
     args = list(sys.argv[1:] if argv is None else argv)
     chosen = next((a for a in args if a in COMMANDS), None)
     parser = _build_parser(chosen)
     options = parser.parse_args(args)
-    if options.version:
-        _print_versions()
-        return 0
-    if options.command is None:
-        parser.print_help()
-        return 0
     _start_logging(options)
-    command = importlib.import_module(f"stereo_sfm.commands.{options.command.replace('-', '_')}")
     try:
+        if options.version:
+            _print_versions()
+            return 0
+        if options.command is None:
+            parser.print_help()
+            return 0
+        command = importlib.import_module(f"stereo_sfm.commands.{options.command.replace('-', '_')}")
         return command.run(options)
     except StereoSfmError as error:
         print(f"stereo-sfm {options.command}: {error}", file=sys.stderr)
         return error.exit_code
     except BrokenPipeError:
-        # The reader of our output went away (`| head`): nothing is wrong, and nothing more can be said.
+        if not _nobody_reads():
+            raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:

@@ -11,6 +11,8 @@ from typing import Any
 
 from stereo_sfm.errors import StereoSfmError
 
+MOST = 10**9  # that any whole number of the configuration may be
+
 
 def one_of(*words: str) -> Any:
     """A field that takes one of these words, the first by default."""
@@ -22,18 +24,18 @@ def above_zero(default: float) -> Any:
     return field(default=default, metadata={"above_zero": True})
 
 
-def at_least(least: int, default: int) -> Any:
-    """A field that takes no smaller number."""
-    return field(default=default, metadata={"least": least})
+def within(least: int, most: int, default: int) -> Any:
+    """A field that takes whole numbers from `least` to `most`."""
+    return field(default=default, metadata={"range": (least, most)})
 
 
 @dataclass(frozen=True)
 class TrackerConfig:
     """The default tracker (tracking/tracker.py)."""
 
-    max_features: int = above_zero(400)  # points tracked at once
-    min_features: int = at_least(3, 15)  # inliers below which a frame is lost
-    pyramid_levels: int = at_least(2, 4)
+    max_features: int = within(1, 20_000, 400)  # points tracked at once
+    min_features: int = within(3, 10_000, 15)  # inliers below which a frame is lost
+    pyramid_levels: int = within(2, 10, 4)
     min_contrast: float = 2.0  # grey levels of standard deviation; flatter windows are no points
     min_ncc: float = 0.6  # of a window with the previous frame's
     min_anchor_ncc: float = 0.85  # of a window with the point's first appearance, affinely deformed
@@ -152,7 +154,7 @@ class LoopConfig:
     connected_points: int = 15  # shared points that make two keyframes connected
     min_gap: int = 10  # keyframes between a keyframe and its candidate
     max_candidates: int = 3  # places verified per keyframe
-    corners: int = above_zero(400)  # made at a keyframe to recognise it by: tracked points are seldom detected again
+    corners: int = within(1, 20_000, 400)  # a keyframe is recognised by: tracked points are seldom detected again
     proximity: bool = True  # verify also the old keyframe that should be nearest by odometry
     pause: int = 10  # keyframes after an accepted loop in which none is searched
     min_match_fraction: float = 0.15  # of the keyframe's corners that must match the candidate's (paper: 0.3)
@@ -186,7 +188,9 @@ STAGES = ("capture", "tracker", "mapper", "loop", "optimizer", "logger", "viewer
 class PipelineConfig:
     """How the stages are wired (pipeline/)."""
 
-    update_lag_frames: int = at_least(1, 5)  # a keyframe's MapUpdate is applied just before this many frames later
+    update_lag_frames: int = within(
+        1, 10_000, 5
+    )  # a keyframe's MapUpdate is applied just before this many frames later
     loop_lag_keyframes: int = 2  # a keyframe's LoopResult reaches the mapper this many keyframes later
     ring_slots: int = above_zero(8)  # image pairs in shared memory between capture and the stages
     threads: int = above_zero(1)  # of OpenCV and BLAS in each process
@@ -249,8 +253,11 @@ def _check(section: Any, place: str = "") -> None:
             _check(value, f"{name}.")
         elif words and value not in words:
             raise StereoSfmError(f"configuration: {name} is '{value}': choose one of {', '.join(words)}")
-        elif "least" in f.metadata and value < f.metadata["least"]:
-            raise StereoSfmError(f"configuration: {name} is {value}: it must be at least {f.metadata['least']}")
+        elif "range" in f.metadata and not f.metadata["range"][0] <= value <= f.metadata["range"][1]:
+            least, most = f.metadata["range"]
+            raise StereoSfmError(f"configuration: {name} is {value}: it must be from {least} to {most}")
+        elif isinstance(value, int) and value > MOST:
+            raise StereoSfmError(f"configuration: {name} is {value}: it is too large")
         elif f.metadata.get("above_zero") and not value > 0:
             raise StereoSfmError(f"configuration: {name} is {value:g}: it must be above 0")
         elif isinstance(value, int | float) and not value >= 0:
@@ -266,7 +273,7 @@ def load(path: Path | None = None, overrides: Iterable[str] = (), base: dict[str
     data: dict[str, Any] = base or {}
     if path is not None:
         try:
-            data = _merge(data, tomllib.loads(path.read_text()))
+            data = _merge(data, tomllib.loads(path.read_text("utf-8-sig")))
         except FileNotFoundError:
             raise StereoSfmError(f"no configuration file at {path}") from None
         except OSError as error:

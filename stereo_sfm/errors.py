@@ -20,7 +20,8 @@ class StereoSfmError(Exception):
 def from_os_error(error: OSError) -> StereoSfmError | None:
     """What the system says of a file as one line; None for what is no fault of a file (a pipe between processes)."""
     if error.filename is None:
-        return StereoSfmError(f"{error.strerror}") if error.errno in _OF_THE_DISK else None
+        kept = "what was written until then is kept"
+        return StereoSfmError(f"cannot write: {error.strerror}; {kept}") if error.errno in _OF_THE_DISK else None
     if isinstance(error, FileExistsError):
         return StereoSfmError(f"{error.filename}: a file of that name is there already")
     return StereoSfmError(f"{error.filename}: {error.strerror}")

@@ -31,9 +31,11 @@ from stereo_sfm.tracking.scale import SCALES
         ("manhattan.every=0", "manhattan.every is 0: it must be above 0"),
         ("loop.gate_metres=-0.1", "loop.gate_metres is -0.1: it must be at least 0"),
         ("tracker.sigma_px=nan", "tracker.sigma_px is nan"),
-        ("tracker.pyramid_levels=1", "tracker.pyramid_levels is 1: it must be at least 2"),
-        ("tracker.min_features=0", "tracker.min_features is 0: it must be at least 3"),
+        ("tracker.pyramid_levels=1", "tracker.pyramid_levels is 1: it must be from 2 to 10"),
+        ("tracker.min_features=0", "tracker.min_features is 0: it must be from 3 to"),
         ("loop.relocalize_keyframes=0", "loop.relocalize_keyframes is 0: it must be above 0"),
+        ("tracker.max_features=1000000000", "tracker.max_features is 1000000000: it must be from 1 to 20000"),
+        ("loop.min_gap=99999999999999999999", "loop.min_gap is 99999999999999999999: it is too large"),
         ("pipeline.cpus.nobody=[0]", "pipeline.cpus names 'nobody': the stages are capture,"),
     ],
 )

@@ -80,7 +80,7 @@ def _recognise_folder(path: Path) -> str | None:
 
 def _recognise_file(path: Path) -> str | None:
     try:
-        text = path.read_text()
+        text = path.read_text("utf-8-sig")
     except (UnicodeDecodeError, OSError):
         raise StereoSfmError(f"calibration {path} is not a text file") from None
     if path.suffix == ".json" or text.lstrip().startswith(("{", "[")):

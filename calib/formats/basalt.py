@@ -41,7 +41,7 @@ def write_basalt(rig: Rig, path: Path) -> None:
         "cam_time_offset_ns": 0,
         "vignette": [],
     }
-    path.write_text(json.dumps({"value0": value}, indent=2) + "\n")
+    path.write_text(json.dumps({"value0": value}, indent=2) + "\n", encoding="utf-8")
 
 
 def _pose(data: dict[str, float]) -> F64:

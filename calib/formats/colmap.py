@@ -81,7 +81,7 @@ def write_colmap(rig: Rig, folder: Path) -> None:
     for i, camera in enumerate([rig.left] if rig.right is None else [rig.left, rig.right], 1):
         model, params = colmap_params(camera)
         lines.append(f"{i} {model} {camera.width} {camera.height} " + " ".join(map(repr, params)))
-    (folder / "cameras.txt").write_text("\n".join(lines) + "\n")
+    (folder / "cameras.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
     entry = "1 1 CAMERA 1"
     if rig.right is not None:
         right_T_left = se3.inverse(rig.left_T_right)
@@ -89,11 +89,13 @@ def write_colmap(rig: Rig, folder: Path) -> None:
         pose = " ".join(repr(float(v)) for v in (w, x, y, z, *right_T_left[:3, 3]))
         entry = f"1 2 CAMERA 1 CAMERA 2 1 {pose}"
     header = "# RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID, SENSORS[] as (TYPE, ID, HAS_POSE, [QW..TZ])"
-    (folder / "rigs.txt").write_text(f"{header}\n{entry}\n")
+    (folder / "rigs.txt").write_text(f"{header}\n{entry}\n", encoding="utf-8")
 
 
 def _lines(path: Path) -> list[list[str]]:
-    return [line.split() for line in path.read_text().splitlines() if line.strip() and not line.startswith("#")]
+    return [
+        line.split() for line in path.read_text("utf-8-sig").splitlines() if line.strip() and not line.startswith("#")
+    ]
 
 
 def _rig(path: Path) -> tuple[int, int, F64]:

@@ -41,7 +41,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     import yaml
 
     try:
-        data = yaml.safe_load(path.read_text())
+        data = yaml.safe_load(path.read_text("utf-8-sig"))
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         raise ValueError(f"not YAML{f' (line {mark.line + 1})' if mark else ''}") from None
@@ -52,14 +52,14 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 def read_json(path: Path) -> Any:
     """Any JSON value; malformed text raises ValueError."""
-    return json.loads(path.read_text())
+    return json.loads(path.read_text("utf-8-sig"))
 
 
 def write_yaml(path: Path, data: dict[str, Any]) -> None:
     """Keys in the order given, lists on one line, floats with every digit."""
     import yaml
 
-    path.write_text(yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=200))
+    path.write_text(yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=200), encoding="utf-8")
 
 
 def numbers(values: Any, count: int | None = None) -> list[float]:

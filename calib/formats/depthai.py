@@ -44,7 +44,7 @@ def write_depthai(rig: Rig, path: Path) -> None:
         "cameraData": [[1, _plain(rig.left, right_T_left, 2)], [2, _plain(right, np.eye(4), -1)]],
         "stereoRectificationData": {"leftCameraSocket": 1, "rightCameraSocket": 2} | _NO_RECTIFICATION,
     }
-    path.write_text(json.dumps(data, indent=2) + "\n")
+    path.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
 
 
 def _socket(asked: int | None, stated: int, usual: int) -> int:

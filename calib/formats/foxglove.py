@@ -34,7 +34,7 @@ def write_foxglove(rig: Rig, path: Path) -> None:
         }
         for frame, info in zip(("cam0", "cam1"), infos_from_rig(rig, "kannala_brandt"), strict=False)
     ]
-    path.write_text(json.dumps(messages, indent=2) + "\n")
+    path.write_text(json.dumps(messages, indent=2) + "\n", encoding="utf-8")
 
 
 def _info(data: dict[str, Any]) -> CameraInfo:

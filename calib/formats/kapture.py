@@ -75,12 +75,12 @@ def write_kapture(rig: Rig, folder: Path) -> None:
         x, y, z, w = se3.quaternion_from_rotation(cam_T_body[:3, :3])
         pose = ", ".join(repr(float(v)) for v in (w, x, y, z, *cam_T_body[:3, 3]))
         rigs.append(f"rig, {name}, {pose}")
-    (folder / "sensors.txt").write_text("\n".join(sensors) + "\n")
-    (folder / "rigs.txt").write_text("\n".join(rigs) + "\n")
+    (folder / "sensors.txt").write_text("\n".join(sensors) + "\n", encoding="utf-8")
+    (folder / "rigs.txt").write_text("\n".join(rigs) + "\n", encoding="utf-8")
 
 
 def _lines(path: Path) -> list[list[str]]:
-    text = path.read_text().splitlines()
+    text = path.read_text("utf-8-sig").splitlines()
     return [[f.strip() for f in line.split(",")] for line in text if line.strip() and not line.startswith("#")]
 
 

@@ -54,12 +54,12 @@ def write_kitti(rig: Rig, path: Path) -> None:
         projection = camera.matrix @ np.column_stack([np.eye(3), offset])
         lines.append(f"P{i}: " + " ".join(f"{v:.17g}" for v in projection.ravel()))
         lines.append(f"S_rect_{i:02d}: {camera.width} {camera.height}")
-    path.write_text("\n".join(lines) + "\n")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _entries(path: Path) -> dict[str, list[float]]:
     out: dict[str, list[float]] = {}
-    for line in path.read_text().splitlines():
+    for line in path.read_text("utf-8-sig").splitlines():
         key, colon, values = line.partition(":")
         if colon:
             try:

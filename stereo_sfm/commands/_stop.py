@@ -1,25 +1,31 @@
-"""Ctrl-C and SIGTERM: the first asks to finish cleanly, the second interrupts."""
+"""Ctrl-C, SIGTERM and a closed terminal: the first asks to finish cleanly, the second interrupts."""
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import sys
+from collections.abc import Callable
 from types import FrameType, TracebackType
 from typing import Any, Self
+
+from stereo_sfm.pipeline.interrupts import STOP_SIGNALS
 
 INTERRUPTED = 130  # exit code, as shells give it for Ctrl-C
 
 
 class StopRequest:
-    """While entered, the first SIGINT or SIGTERM only sets `asked`; the loop ends at its next round."""
+    """While entered, the first of the signals only sets `asked` and calls `then`; the loop ends at its next round."""
 
     def __init__(self) -> None:
         self.asked = False
+        self.then: Callable[[], None] | None = None  # called in the handler: must be short
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> Self:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            self._previous[number] = signal.signal(number, self._handle)
+        for number in STOP_SIGNALS:
+            if (number, signal.getsignal(number)) != (signal.SIGHUP, signal.SIG_IGN):  # which is what nohup does
+                self._previous[number] = signal.signal(number, self._handle)
         return self
 
     def __exit__(
@@ -32,4 +38,7 @@ class StopRequest:
         if self.asked:
             raise KeyboardInterrupt
         self.asked = True
-        print("\nfinishing (once more to abort)", file=sys.stderr)
+        with contextlib.suppress(OSError):  # the terminal may be gone
+            print("\nfinishing (once more to abort)", file=sys.stderr)
+        if self.then is not None:
+            self.then()

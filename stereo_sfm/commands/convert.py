@@ -19,6 +19,7 @@ def run(args: argparse.Namespace) -> int:
     from stereo_sfm.commands.run import SourceChoice
 
     choice = SourceChoice.of(args)
+    choice.refuse_to_overwrite(args.output)
     with choice() as source:
         if source.live:
             raise StereoSfmError(f"{source.name} is a device: use 'stereo-sfm record {args.source}'")

@@ -148,7 +148,9 @@ def _pose_frame(path: Path) -> str:
     if named:
         return named
     stats = path.parent / "stats.json"
-    return json.loads(stats.read_text()).get("frame", "") if path.suffix == ".kitti" and stats.is_file() else ""
+    return (
+        json.loads(stats.read_text("utf-8-sig")).get("frame", "") if path.suffix == ".kitti" and stats.is_file() else ""
+    )
 
 
 def _in_cam0(bodies: Trajectory, path: Path) -> Trajectory:

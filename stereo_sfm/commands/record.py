@@ -46,6 +46,7 @@ def run(args: argparse.Namespace) -> int:
     from stereo_sfm.commands.run import SourceChoice
 
     choice = SourceChoice.of(args)
+    choice.refuse_to_overwrite(args.output)
     with choice() as source:
         return write(source, args, "record", choice.opening)
 

@@ -76,6 +76,8 @@ def run(args: argparse.Namespace) -> int:
     if args.until is not None and not args.until >= 0:
         raise StereoSfmError(f"--until takes seconds after the first frame, got {args.until:g}")
     path: Path = args.run / "run.mcap" if args.run.is_dir() else args.run
+    if args.output is not None and args.output.resolve() == path.resolve().parent:
+        raise StereoSfmError(f"{args.output} holds the run that is to be replayed: choose another -o")
     if not path.exists():
         raise StereoSfmError(f"no run at {path}: 'stereo-sfm run' writes run.mcap into its folder")
     with LogReader(path) as reader:

@@ -173,6 +173,17 @@ class SourceChoice:
         part = (args.start, args.duration, args.frame_skip, args.max_frames)
         return SourceChoice(spec, rig, *part, speed, args.rectify)
 
+    def refuse_to_overwrite(self, output: Path | None) -> None:
+        """Raises StereoSfmError when the source is the file that is to be written, or lies in the folder."""
+        from drivers.source import TABLE
+
+        kind, colon, rest = self.spec.partition(":")
+        source = Path(rest.partition("?")[0] if colon and kind in TABLE else self.spec)
+        if output is None or not source.exists() or not output.exists():
+            return
+        if output.resolve() in (source.resolve(), *source.resolve().parents):
+            raise StereoSfmError(f"{output} is what is read, or holds it: choose another -o")
+
     @property
     def numbering(self) -> int:
         """Frames of the source from one to the next."""
@@ -223,6 +234,7 @@ def execute(
     from stereo_sfm.pipeline.events import EventLines
     from stereo_sfm.pipeline.session import Session, Wiring
 
+    choice.refuse_to_overwrite(args.output)
     record, pictures = RunRecord.of(config, folders.localize_only), _match_pictures(getattr(args, "matches", None))
     sinks: list[Sink] = [record] if pictures is None else [record, pictures]
     if args.verbose:
@@ -232,26 +244,23 @@ def execute(
     stepper = _stepper(args)
     inline = args.inline or pictures is not None or stepper is not None  # the next frame waits for the user
     wiring = Wiring(inline, mode, args.log, args.image_format, args.viz)
-    with Session(choice, config, sinks, wiring, folders, args.output, args.overwrite, replayed) as session:
-        if pictures is not None:
-            pictures.folder = session.folder / "matches"
-        begin = time.perf_counter()
-        interrupted, problem = _follow(session, record, args.quiet or stepper is not None, stepper)
-        wall_s = time.perf_counter() - begin
-    folder, info = session.folder, session.info
-    stats, evaluations = write_results(
-        folder,
-        info.name,
-        info.rig,
-        config,
-        record,
-        wall_s,
-        info.ground_truth,
-        args.frame,
-        choice.numbering,
-        args.max_lost,
-    )
-    link_latest(folder)
+    with StopRequest() as stop:
+        with Session(choice, config, sinks, wiring, folders, args.output, args.overwrite, replayed) as session:
+            stop.then = session.stop
+            if stop.asked:  # while it was opened
+                session.stop()
+            if pictures is not None:
+                pictures.folder = session.folder / "matches"
+            begin = time.perf_counter()
+            interrupted, problem = _follow(session, record, stop, args.quiet or stepper is not None, stepper)
+            wall_s = time.perf_counter() - begin
+        stop.then = None
+        folder, info = session.folder, session.info
+        stats, evaluations = write_results(
+            folder, info.name, info.rig, config, record, wall_s, info.ground_truth, args.frame, choice.numbering,
+            args.max_lost,
+        )  # fmt: skip
+        link_latest(folder)
     if not args.quiet:
         print("\n".join([*summary(stats, evaluations), f"written to {folder} (start with {folder / 'report.md'})"]))
     if problem is not None:
@@ -284,16 +293,16 @@ def _stepper(args: argparse.Namespace) -> Stepper | None:
 
 
 def _follow(
-    session: Session, record: RunRecord, quiet: bool, stepper: Stepper | None = None
+    session: Session, record: RunRecord, stop: StopRequest, quiet: bool, stepper: Stepper | None
 ) -> tuple[bool, StereoSfmError | None]:
     """To the end, to Ctrl-C, or to an error; what was tracked until then stays in the record."""
     from stereo_sfm.commands._progress import progress
 
-    with progress(session.info.name, session.info.frame_count, quiet) as bar, StopRequest() as stop:
+    with progress(session.info.name, session.info.frame_count, quiet) as bar:
         try:
             for frame in session:
                 bar.show(frame)
-                if stop.asked or (stepper is not None and not stepper.go_on(frame)):
+                if stepper is not None and not stepper.go_on(frame):
                     session.stop()
         except KeyboardInterrupt:
             return True, None

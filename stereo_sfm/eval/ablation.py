@@ -187,7 +187,7 @@ def _judge(record: RunRecord, config: Config, truth: Trajectory | None) -> dict[
 def load_answer(path: Path) -> dict[str, Any] | None:
     """A finished cell's file, or None where there is none or it was cut off."""
     try:
-        data = json.loads(path.read_text())
+        data = json.loads(path.read_text("utf-8-sig"))
     except (FileNotFoundError, NotADirectoryError, json.JSONDecodeError):
         return None
     return data if data.get("schema") == _SCHEMA else None
@@ -204,5 +204,5 @@ def finished(answer: dict[str, Any] | None) -> bool:
 def save_answer(path: Path, answer: dict[str, Any]) -> None:
     """Write whole or not at all, so that an interrupted grid can go on."""
     part = path.with_suffix(".part")
-    part.write_text(json.dumps(answer))
+    part.write_text(json.dumps(answer), encoding="utf-8")
     part.replace(path)

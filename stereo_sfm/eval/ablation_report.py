@@ -119,7 +119,7 @@ def _brief(answer: Answer | None) -> str:
 
 def write_csv(path: Path, answers: Sequence[Answer]) -> None:
     """Every cell of every source."""
-    with path.open("w", newline="") as file:
+    with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, ["source", *COLUMNS, "set"], restval="")
         writer.writeheader()
         for answer in answers:
@@ -284,5 +284,5 @@ def write_report(folder: Path, answers: Sequence[Answer]) -> Path:
         slug = f"{number + 1:02d}"
         lines += ["", *[f"![{plot}]({plot})" for plot in write_plots(folder, slug, own)], ""]
     path = folder / "ablation.md"
-    path.write_text("\n".join(lines))
+    path.write_text("\n".join(lines), encoding="utf-8")
     return path

@@ -52,7 +52,7 @@ def write_report(
         count = thousands(int(ms["frames"]))
         lines.append(f"| {stage} | {ms['p50']:.2f} ms | {ms['p95']:.2f} ms | {ms['p99']:.2f} ms | {count} |")
     lines += ["", *(f"![{name}]({name}.png)\n" for name in pictures)]
-    (folder / "report.md").write_text("\n".join(lines))
+    (folder / "report.md").write_text("\n".join(lines), encoding="utf-8")
 
 
 def _draw(

@@ -70,7 +70,7 @@ def write_results(
     keyframes = record.keyframe_trajectory()
     if len(keyframes):
         _write_tum(folder / "keyframes.tum", keyframes, rig, frame)
-    (folder / "config.toml").write_text(configuration.dump(config))
+    (folder / "config.toml").write_text(configuration.dump(config), encoding="utf-8")
     save_rig(rig, folder / "rig.yaml")
     evaluations = _evaluate(estimates, reference, "sim3" if scale_free(config, rig) else "se3")
     stats = {"source": source_name, "frame": frame, **statistics(record, wall_s, evaluations)}

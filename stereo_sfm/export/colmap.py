@@ -63,7 +63,7 @@ def _write_frames(s: MapSnapshot, eyes: int, path: Path) -> None:
     for k, pose in enumerate(se3.inverse(s.map_T_kf)):
         data = " ".join(f"CAMERA {e + 1} {k * eyes + e + 1}" for e in range(eyes))
         lines.append(f"{k + 1} 1 {_pose(pose)} {eyes} {data}")
-    path.write_text("\n".join(lines) + "\n")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _write_images(
@@ -83,7 +83,7 @@ def _write_images(
             lines.append(" ".join(f"{u!r} {v!r} {p + 1}" for (u, v), p in zip(pixels, points, strict=True)))
             for n, point in enumerate(points):
                 tracks[point].append(f"{image_id} {n}")
-    path.write_text("\n".join(lines) + "\n")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return tracks
 
 
@@ -106,4 +106,4 @@ def _write_points(s: MapSnapshot, tracks: list[list[str]], errors: F64, path: Pa
     for p, (xyz, error, track) in enumerate(zip(s.points.tolist(), errors.tolist(), tracks, strict=True)):
         x, y, z = xyz
         lines.append(f"{p + 1} {x!r} {y!r} {z!r} {GREY} {error!r} {' '.join(track)}")
-    path.write_text("\n".join(lines) + "\n")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -196,5 +196,5 @@ def export_floor_plan(saved: SavedMap, path: Path, resolution: float = 0.05) -> 
         "mode": "trinary",
         "map_T_floor": plan.map_T_floor.tolist(),
     }
-    about.write_text(yaml.safe_dump(description, sort_keys=False))
+    about.write_text(yaml.safe_dump(description, sort_keys=False), encoding="utf-8")
     return plan

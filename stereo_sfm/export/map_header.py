@@ -27,7 +27,7 @@ def checksum(raw: bytes) -> str:
 def write_header(folder: Path, counts: dict[str, int], vocabulary_id: str, sums: dict[str, str]) -> None:
     """Write map.json with the numbers of rows by name and the checksums of the files by name."""
     head = {"kind": KIND, "version": VERSION, **counts, "vocabulary": vocabulary_id, "sha256": sums}
-    (folder / "map.json").write_text(json.dumps(head, indent=1) + "\n")
+    (folder / "map.json").write_text(json.dumps(head, indent=1) + "\n", encoding="utf-8")
 
 
 def read_header(folder: Path, files: tuple[str, ...]) -> dict[str, Any]:
@@ -44,7 +44,7 @@ def read_header(folder: Path, files: tuple[str, ...]) -> dict[str, Any]:
     if not path.is_file():
         raise StereoSfmError(f"no map at {folder}: there is no map.json (make one with 'run ... --map-out')")
     try:
-        head = json.loads(path.read_text())
+        head = json.loads(path.read_text("utf-8-sig"))
         version = head["version"] if head["kind"] == KIND else None
     except (ValueError, KeyError, TypeError, OSError):
         raise damaged(folder, "map.json cannot be read") from None

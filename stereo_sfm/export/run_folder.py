@@ -67,7 +67,7 @@ def link_latest(folder: Path) -> None:
 
 def write_json(path: Path, data: object) -> None:
     """Indented, floats as they are, numpy numbers as plain ones."""
-    path.write_text(json.dumps(data, indent=2, default=_plain) + "\n")
+    path.write_text(json.dumps(data, indent=2, default=_plain) + "\n", encoding="utf-8")
 
 
 def _plain(value: object) -> object:

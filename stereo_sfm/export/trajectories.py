@@ -24,7 +24,7 @@ def write_tum(path: Path, trajectory: Trajectory, what: str = "world_T_cam0") ->
     quaternions = se3.quaternion_from_rotation(trajectory.poses[:, :3, :3])
     for stamp, t, q in zip(trajectory.stamp_ns, trajectory.positions, quaternions, strict=True):
         lines.append(seconds(int(stamp)) + "".join(f" {v:.9f}" for v in (*t, *q)))
-    path.write_text("\n".join(lines) + "\n")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def named_pose(path: Path, otherwise: str = "world_T_cam0") -> str:
@@ -41,7 +41,7 @@ def write_kitti(path: Path, poses: F64) -> None:
     """Twelve numbers a line for each of (N, 4, 4), relative to the first."""
     relative = se3.inverse(poses[0]) @ poses if len(poses) else poses
     rows = relative[:, :3, :].reshape(-1, 12)
-    path.write_text("".join(" ".join(f"{v:.9e}" for v in row) + "\n" for row in rows))
+    path.write_text("".join(" ".join(f"{v:.9e}" for v in row) + "\n" for row in rows), encoding="utf-8")
 
 
 def write_euroc(path: Path, trajectory: Trajectory, what: str = "world_T_cam0") -> None:
@@ -50,7 +50,7 @@ def write_euroc(path: Path, trajectory: Trajectory, what: str = "world_T_cam0") 
     quaternions = se3.quaternion_from_rotation(trajectory.poses[:, :3, :3])[:, [3, 0, 1, 2]]
     for stamp, t, q in zip(trajectory.stamp_ns, trajectory.positions, quaternions, strict=True):
         lines.append(f"{int(stamp)}" + "".join(f",{v:.9f}" for v in (*t, *q)))
-    path.write_text("\n".join(lines) + "\n")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def fill_missing(frame_ids: I64, poses: F64, step: int = 1) -> F64:

@@ -20,13 +20,10 @@ def rectifying_rotations(left_T_right: F64) -> tuple[F64, F64]:
         (3, 3) rect_R_left and (3, 3) rect_R_right.
 
     Raises:
-        StereoSfmError: no baseline, eyes swapped, or a baseline along the viewing direction.
+        StereoSfmError: eyes swapped, or a baseline along the viewing direction.
     """
     baseline = left_T_right[:3, 3]
-    length = float(np.linalg.norm(baseline))
-    if length < 1e-9:
-        raise StereoSfmError("the calibration has no baseline: both eyes are at one place")
-    x = baseline / length
+    x = baseline / np.linalg.norm(baseline)
     forward = left_T_right[:3, 2] + np.array([0.0, 0.0, 1.0])
     if abs(x @ forward) > 0.9 * np.linalg.norm(forward) or np.linalg.norm(forward) < 0.2:
         raise StereoSfmError("the eyes look along their baseline or apart: such a pair cannot be rectified")

@@ -113,6 +113,7 @@ def _describe_file(path: Path) -> Description:
             out.rows.append((topic.topic, topic.schema or topic.encoding, rate_of(stamps[topic.topic])))
             out.messages += topic.count
         _describe_infos(out, reader)
+        _compare_eyes(out, {topic.topic: topic.count for topic in reader.topics})
         lean = out.metadata.get("image_format") == "none"
         if lean:
             out.calibration = rig_lines(rig_from_text((reader.attachment(RIG_FILE) or b"").decode()))
@@ -171,6 +172,16 @@ def _describe_infos(out: Description, reader: LogReader) -> None:
             skews.append(abs(info.right_stamp_ns - info.stamp_ns))
     if infos:
         out.skew_ms = max(skews) / 1e6
+
+
+def _compare_eyes(out: Description, counts: dict[str, int]) -> None:
+    """Our own recordings say of every frame which images it has."""
+    frames = counts.get(topics.IMAGE_INFO, 0)
+    for topic in (topics.LEFT_IMAGE, topics.RIGHT_IMAGE, topics.DEPTH_IMAGE):
+        if 0 < counts.get(topic, frames) < frames:
+            out.problems.append(
+                f"{frames - counts[topic]} of {frames} images of {topic} are missing: those frames are left out"
+            )
 
 
 def _describe_source(out: Description, path: Path) -> None:

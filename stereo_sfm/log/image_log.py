@@ -73,7 +73,7 @@ def rig_to_text(rig: Rig) -> str:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / RIG_FILE
         write_native(rig, path)
-        return path.read_text()
+        return path.read_text("utf-8-sig")
 
 
 def rig_from_text(text: str) -> Rig:
@@ -82,7 +82,7 @@ def rig_from_text(text: str) -> Rig:
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / RIG_FILE
-        path.write_text(text)
+        path.write_text(text, encoding="utf-8")
         return read_native(path)
 
 

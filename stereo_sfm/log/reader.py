@@ -82,6 +82,8 @@ class LogReader:
             StereoSfmError: no such file, or not an MCAP file.
         """
         self.path = path
+        if path.exists() and not path.is_file():
+            raise StereoSfmError(f"cannot read {path}: it is no file")
         try:
             self._stream: IO[bytes] = path.open("rb")
         except OSError as error:
@@ -189,6 +191,16 @@ class LogReader:
         return np.sort(np.concatenate([self._times.get(i, np.zeros(0, np.int64)) for i in ids] or [[]])).astype(
             np.int64
         )
+
+    def step_back_ns(self, topic: str) -> int:
+        """How far the log time of a topic's messages goes back at most from one to the next in the file."""
+        chunks = self.summary.chunk_indexes
+        if not chunks or any(not c.message_index_offsets for c in chunks):
+            return 0
+        self.stamps(topic)
+        ids = [c.id for c in self.summary.channels.values() if c.topic == topic]
+        steps = [np.diff(self._times[i]) for i in ids if self._times is not None and i in self._times]
+        return max((int(-step.min(initial=0)) for step in steps), default=0)
 
     def _read_message_indexes(self) -> dict[int, I64]:
         """Log times per channel. Behind each chunk lies a record per channel: opcode, length, channel, size, pairs."""

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from google.protobuf.message import DecodeError
 
 from stereo_sfm.errors import StereoSfmError
 
@@ -248,6 +249,8 @@ def decoder(cls: type[Any], schema: bytes) -> Callable[[bytes], Any]:
     def decode(data: bytes) -> Any:
         try:
             return _read(message_class.FromString(data), cls)
+        except DecodeError:
+            raise ValueError(f"a damaged {cls.__name__} message") from None
         except TypeError as error:
             raise StereoSfmError(f"{cls.__name__} in this log was written by another version: {error}") from None
 

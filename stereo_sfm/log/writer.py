@@ -118,10 +118,14 @@ class LogWriter:
             sequence: frame id (stored modulo 2**32).
 
         Raises:
-            StereoSfmError: the disk is full; the file is closed and readable.
+            StereoSfmError: the disk is full; the file is closed and readable. A stamp that MCAP cannot hold.
         """
         if self.closed:
             raise self._failure or ValueError(f"{self.path} is closed")
+        if not 0 <= log_time < 2**63:
+            raise StereoSfmError(
+                f"a stamp of {log_time / 1e9:g} s cannot be logged: MCAP has none below 0 or after 2262"
+            )
         data: bytes = schema.encode(message) if is_dataclass(message) else message.SerializeToString()
         now = self._clock()
         if self._pending_bytes and self._due(len(data), log_time, now):

@@ -74,7 +74,7 @@ def run_one(task: BatchTask) -> dict[str, Any]:
         result |= {"ok": False, "error": traceback.format_exc()}
     folder.mkdir(parents=True, exist_ok=True)
     temporary = folder / f"{RESULT}.part"
-    temporary.write_text(json.dumps(result, indent=2, default=str))
+    temporary.write_text(json.dumps(result, indent=2, default=str), encoding="utf-8")
     temporary.replace(folder / RESULT)
     return result
 
@@ -93,7 +93,7 @@ def finished(task: BatchTask) -> dict[str, Any] | None:
     """The result of an earlier batch with the same recording and configuration, if it went well."""
     path = Path(task.folder) / RESULT
     try:
-        result = json.loads(path.read_text())
+        result = json.loads(path.read_text("utf-8-sig"))
     except (OSError, ValueError):
         return None
     same = result.get("ok") and result.get("recording") == task.spec and result.get("config") == dump(task.config)
@@ -177,8 +177,8 @@ def write_table(rows: Sequence[Sequence[str]], folder: Path) -> None:
     import csv
 
     lines = [f"| {' | '.join(r)} |" for r in (COLUMNS, ["---"] * len(COLUMNS), *rows)]
-    (folder / "results.md").write_text("\n".join(lines) + "\n")
-    with (folder / "results.csv").open("w", newline="") as stream:
+    (folder / "results.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    with (folder / "results.csv").open("w", newline="", encoding="utf-8") as stream:
         csv.writer(stream).writerows([COLUMNS, *rows])
 
 

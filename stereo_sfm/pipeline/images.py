@@ -6,14 +6,18 @@ The capture stage owns the slots. A slot is free again when all its readers have
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from dataclasses import dataclass
 from multiprocessing import shared_memory
+from pathlib import Path
 
 import numpy as np
 
 from calib.rig import Rig
+from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import F32, U8, StereoImage
 
+SHARED = Path("/dev/shm")  # where Linux keeps shared memory
 _NO_PIXELS = np.zeros((0, 0), np.uint8)
 
 
@@ -64,6 +68,11 @@ class ImageRing:
         self.layout, self.slots = layout, slots
         self._owner = name is None
         size = max(layout.size * slots, 1)
+        if self._owner and SHARED.is_dir() and shutil.disk_usage(SHARED).free < size:
+            raise StereoSfmError(
+                f"{SHARED} is too small for {slots} images ({size / 1e6:.0f} MB): make it larger (docker: --shm-size), "
+                "take --set pipeline.ring_slots=2, or --inline"
+            )
         self._memory = shared_memory.SharedMemory(name, create=self._owner, size=size)
 
     @property

@@ -140,7 +140,7 @@ def run_inline(
                 image = next(images)
             except StopIteration:
                 break
-            except Exception as error:  # of the source: what it gave until then is kept
+            except (Exception, KeyboardInterrupt) as error:  # what the source gave until then is kept
                 failure = error
                 break
             frame = run.step(image)

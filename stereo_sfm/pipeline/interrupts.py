@@ -1,4 +1,4 @@
-"""Ctrl-C reaches every process of the terminal; the main one decides what it means."""
+"""Ctrl-C reaches every process of the terminal, SIGTERM often the whole group; the main one decides what they mean."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import signal
 from collections.abc import Generator
 from contextlib import contextmanager
 
+STOP_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+
 
 @contextmanager
 def ignored_by_children() -> Generator[None]:
     """Processes started inside never see Ctrl-C, from their first moment on."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     try:
         yield
     finally:

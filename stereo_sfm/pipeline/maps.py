@@ -48,6 +48,8 @@ class MapFolders:
             raise StereoSfmError(f"no map at {self.map_in}: 'stereo-sfm run ... --map-out DIR' makes one")
         if self.map_out is not None and self.map_out.exists() and not overwrite:
             raise StereoSfmError(f"{self.map_out} exists: choose another --map-out, or say --overwrite")
+        if self.map_out is not None and self.map_out.exists() and not self.map_out.is_dir():
+            raise StereoSfmError(f"{self.map_out} is a file: --map-out takes a folder")
         if self.map_out is not None:
             above = next(folder for folder in self.map_out.absolute().parents if folder.exists())
             if not above.is_dir() or not os.access(above, os.W_OK):

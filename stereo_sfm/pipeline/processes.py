@@ -36,6 +36,7 @@ from stereo_sfm.types import Applied, Frame
 SINKS = ("logger", "viewer")
 PICTURE_NS = 100_000_000  # the viewer gets a picture at most so often
 GRACE_S = 1.2  # for the logger to close its file after another stage died
+STOP_GRACE_S = 3.0  # without any message, for capture to see that it shall stop
 VIEWER_GRACE_S = 10.0  # for the viewer to show what waits when the run is over
 
 
@@ -93,6 +94,7 @@ class ProcessRun:
         self._said_early: list[LogLine] = []  # while the source was opened
         self._waiting = {"tracker", "mapper", "loop"}  # not ready yet
         self._stopping = False
+        self._woken, self._wake = self._pipe()  # `stop` may be called while the next message is awaited
         self._failure: StereoSfmError | None = None  # of the source: told when all that it gave is finished
         self._listener = Listener("main", self.publish)
         self.info: SourceInfo
@@ -128,16 +130,21 @@ class ProcessRun:
             self._stopping = True
             with contextlib.suppress(OSError):
                 self._controls["capture"].send("stop")
+            self._wake.send("stop")
 
     def __iter__(self) -> Iterator[Frame]:
         while self._reports:
-            ready = wait(list(self._reports), self._patience())
-            if not ready:
+            ready = wait([*self._reports, self._woken], self._patience())
+            if not ready and "capture" not in self._reports.values():
                 break  # only the viewer is left, and it hangs
+            if not ready:  # asked to stop, it waits for an image that does not come
+                self._processes["capture"].kill()
             for connection in ready:
                 assert isinstance(connection, Connection)
                 try:
                     message = connection.recv()
+                    if connection is self._woken:
+                        continue
                 except (EOFError, OSError):
                     self._died(connection)
                     continue
@@ -158,7 +165,10 @@ class ProcessRun:
 
     def _patience(self) -> float | None:
         """Seconds to wait for the next message; without end while a stage or the logger is at work."""
-        return VIEWER_GRACE_S if set(self._reports.values()) == {"viewer"} else None
+        waiting = set(self._reports.values())
+        if self._stopping and "capture" in waiting:
+            return STOP_GRACE_S
+        return VIEWER_GRACE_S if waiting == {"viewer"} else None
 
     # -- start -------------------------------------------------------------------------------------------------------
 
@@ -224,7 +234,8 @@ class ProcessRun:
         )
         jpeg = self._log is not None and self._log.image_format == "jpeg"
         for stage, control in self._controls.items():
-            control.send((setup, jpeg) if stage == "capture" else setup)
+            with contextlib.suppress(OSError):  # it died: its report tells
+                control.send((setup, jpeg) if stage == "capture" else setup)
 
     def _begin(self, stage: str) -> None:
         """Capture goes when the last of the others is ready."""
@@ -325,6 +336,9 @@ class ProcessRun:
         if stage == "viewer":  # closed or crashed: the run does not care
             self._ended.add(stage)
             return
+        if stage == "capture" and self._stopping:
+            self._end(connection, stage)
+            return
         if stage == "capture" and not self._waiting:
             self._failure = StageDied(f"the capture process {self._how_it_died(stage)}; {self._what_remains(stage)}")
             self._end(connection, stage)
@@ -340,6 +354,8 @@ class ProcessRun:
     def _what_remains(self, stage: str) -> str:
         if self._log is None:
             return "the run has no log"
+        if stage == "logger" and not self._log.path.exists():
+            return "there is no log"
         if stage == "logger":
             return f"the log {self._log.path} is not closed, but readable (stereo-sfm recover writes a clean copy)"
         return f"the log {self._log.path} is complete up to then"
@@ -378,7 +394,7 @@ class ProcessRun:
             if process.is_alive() and not self._finished(process):
                 process.kill()
             process.join()
-        for connection in (*self._reports, *self._controls.values()):
+        for connection in (*self._reports, *self._controls.values(), self._woken, self._wake):
             connection.close()
         self._reports.clear()
         if self._ring is not None:

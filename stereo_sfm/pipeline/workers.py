@@ -21,6 +21,7 @@ from stereo_sfm.config import STAGES, Config
 from stereo_sfm.errors import StereoSfmError, from_os_error
 from stereo_sfm.log.provenance import Opening
 from stereo_sfm.pipeline.channels import End, Failed, Inbox, Lost, Outbox
+from stereo_sfm.pipeline.interrupts import STOP_SIGNALS
 from stereo_sfm.pipeline.maps import MapFolders, make_mapper, save_result
 from stereo_sfm.pipeline.schedule import Lockstep, Realtime, Recorded, Schedule
 from stereo_sfm.pipeline.text import LOGGER, Listener
@@ -47,8 +48,8 @@ class Setup:
 
 def guarded(stage: str, body: Callable[..., None], report: Connection, *args: Any) -> None:
     """Entry of every worker process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # main decides what Ctrl-C means
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    for number in STOP_SIGNALS:
+        signal.signal(number, signal.SIG_IGN)  # main decides what Ctrl-C means
     to_main = Outbox(report, 512)
     logging.getLogger(LOGGER).setLevel(logging.INFO)  # main decides what is printed
     try:

@@ -458,3 +458,39 @@ def test_rectify_with_a_wrong_calibration_replaces_nothing(cli: Run, tmp_path: P
     (tmp_path / "out" / "rig.yaml").write_text("years of work")
     assert_one_line(cli("rectify", "data", "-o", "out", "--overwrite", "--rig", "wrong.yaml"))
     assert (tmp_path / "out" / "rig.yaml").read_text() == "years of work"
+
+
+def test_nothing_is_written_over_what_is_read(cli: Run, tmp_path: Path) -> None:
+    assert cli("record", "sim:aisle?size=212x200&rate=10", "--max-frames", "3", "-o", "a.mcap", "-q")[0] == 0
+    before = (tmp_path / "a.mcap").read_bytes()
+    Path("b.mcap").symlink_to("a.mcap")
+    for command in ("record", "convert"):
+        for output in ("a.mcap", "b.mcap"):
+            assert_one_line(cli(command, "a.mcap", "-o", output, "--overwrite"), "is what is read", "another -o")
+    assert cli("run", "a.mcap", "-o", "r", "-q", "--log", "full", "--max-lost", "100")[0] in (0, 4)
+    logged = (tmp_path / "r" / "run.mcap").read_bytes()
+    assert_one_line(cli("run", "mcap:r/run.mcap", "-o", "r", "--overwrite"), "is what is read, or holds it")
+    assert_one_line(cli("replay", "r", "-o", "r", "--overwrite"), "holds the run that is to be replayed")
+    assert (tmp_path / "a.mcap").read_bytes() == before
+    assert (tmp_path / "r" / "run.mcap").read_bytes() == logged
+
+
+def test_a_file_in_the_place_of_the_map_is_told_before_anything_is_computed(cli: Run) -> None:
+    Path("m").write_text("x")
+    assert_one_line(cli("run", "sim:aisle", "--map-out", "m", "--overwrite"), "m is a file: --map-out takes a folder")
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("P1: 50 0 32 0 0 50 24 0 0 0 1 0", "baseline of 0 m"),
+        ("P1: 50 0 32 -25e12 0 50 24 0 0 0 1 0", "distance between the eyes in metres"),
+        ("P1: -50 0 32 -25 0 50 24 0 0 0 1 0", "fx -50"),
+        ("P1: 50 0 1e9 -25 0 50 24 0 0 0 1 0", "cx 1e+09"),
+        ("P1: 50 0 nan -25 0 50 24 0 0 0 1 0", "calib"),
+    ],
+)
+def test_a_calibration_that_cannot_be(cli: Run, tmp_path: Path, line: str, said: str) -> None:
+    root = make_kitti(tmp_path / "k")
+    (root / "sequences" / "00" / "calib.txt").write_text(f"P0: 50 0 32 0 0 50 24 0 0 0 1 0\n{line}\n")
+    assert_one_line(cli("run", root), said)

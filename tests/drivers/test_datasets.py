@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from pathlib import Path
 
 import cv2
@@ -264,3 +265,46 @@ def test_pairs_take_the_smallest_difference_first() -> None:
     assert pair_by_stamp([7, 10], [11, 4], 5) == [(0, 1), (1, 0)]
     assert pair_by_stamp([7, 10], [11], 5) == [(1, 0)]
     assert pair_by_stamp([], [1], 5) == []
+
+
+@pytest.mark.parametrize("eye", [0, 1])
+def test_a_missing_kitti_image_leaves_the_stamps_of_the_others(
+    eye: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    root = make_kitti(tmp_path, frames=6)
+    (root / "sequences" / "00" / f"image_{eye}" / "000002.png").unlink()
+    with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(root) as source:
+        stamps = [image.stamp_ns for image in source]
+        truth = source.ground_truth
+    assert stamps == [k * 100_000_000 for k in (0, 1, 3, 4, 5)]
+    assert truth is not None and len(truth) == 6
+    assert "5 pairs are used" in caplog.text
+
+
+def test_ground_truth_that_is_not_finite_is_refused(tmp_path: Path) -> None:
+    root = make_kitti(tmp_path)
+    (root / "poses" / "00.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 nan 0 1 0 0 0 0 1 0\n")
+    with pytest.raises(StereoSfmError, match="pose 1 is not finite"):
+        open_source(root)
+
+
+@pytest.mark.parametrize(("text", "said"), [("nan", "not a time"), ("1e99", "too large"), ("x", "not a time")])
+def test_times_that_are_none_are_refused(text: str, said: str, tmp_path: Path) -> None:
+    root = make_kitti(tmp_path)
+    (root / "sequences" / "00" / "times.txt").write_text(f"0\n{text}\n0.2\n0.3\n")
+    with pytest.raises(StereoSfmError, match=said):
+        open_source(root)
+
+
+def test_files_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+    root = make_kitti(tmp_path)
+    times = root / "sequences" / "00" / "times.txt"
+    times.write_text("\ufeff" + times.read_text(), encoding="utf-8")
+    with open_source(root) as source:
+        assert len(list(source)) == 4
+
+
+@pytest.mark.parametrize(("start", "duration"), [(math.nan, 1.0), (math.inf, 1.0), (1e300, 1.0), (0.0, math.nan)])
+def test_a_part_that_cannot_be_is_refused(start: float, duration: float, tmp_path: Path) -> None:
+    with open_source(make_kitti(tmp_path)) as source, pytest.raises(StereoSfmError, match="a part of a source"):
+        SelectedFrames(source, start, duration)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from stereo_sfm.cli import main
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, KannalaBrandt, Pinhole, RadTan
-from stereo_sfm.log import foxglove
+from stereo_sfm.log import foxglove, topics
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.types import U8
 from tests.log.recordings import fisheye_rig, stereo_images, write_recording
@@ -407,3 +408,78 @@ def test_info_of_a_dataset_folder(data_root: Path, capsys: pytest.CaptureFixture
     assert main(["info", str(data_root / "euroc_mh01")]) == 0
     text = capsys.readouterr().out
     assert "images: 180 at 20.00 Hz" in text and "ground truth: 1830 poses" in text and "baseline 110.08 mm" in text
+
+
+def test_our_own_file_without_the_right_eye_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    images = stereo_images(40, np.random.default_rng(0))
+    whole, without, some = (tmp_path / name for name in ("whole.mcap", "without.mcap", "some.mcap"))
+    write_recording(whole, MemorySource(fisheye_rig(), images))
+    for path, kept in ((without, -1), (some, 30)):
+        _copy_without_right_images(whole, path, kept)
+    with pytest.raises(StereoSfmError, match="no right images, but its calibration"):
+        open_source(without)
+    with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(some) as source:
+        assert len(list(source)) == 30
+    assert caplog.text.count("is incomplete and left out") == 5
+    assert "10 frames were incomplete" in caplog.text
+
+
+def test_info_counts_the_images_that_are_missing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    whole, some = tmp_path / "whole.mcap", tmp_path / "some.mcap"
+    write_recording(whole, MemorySource(fisheye_rig(), stereo_images(40, np.random.default_rng(0))))
+    _copy_without_right_images(whole, some, 30)
+    assert main(["info", str(some)]) == 0
+    assert "problem: 10 of 40 images of /cam1/image are missing" in capsys.readouterr().out
+
+
+def _copy_without_right_images(source: Path, path: Path, kept: int) -> None:
+    """The same file, as if the right eye had failed after some images."""
+    from mcap.reader import make_reader
+    from mcap.writer import Writer
+
+    with source.open("rb") as stream, path.open("wb") as out:
+        reader, writer = make_reader(stream), Writer(out)
+        writer.start()
+        schemas: dict[int, int] = {}
+        channels: dict[int, int] = {}
+        for schema, channel, message in reader.iter_messages():
+            if channel.topic == topics.RIGHT_IMAGE and message.sequence >= kept + 1:
+                continue
+            if schema is not None and schema.id not in schemas:
+                schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+            if channel.id not in channels:
+                kind = schemas[schema.id] if schema is not None else 0
+                channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, kind)
+            writer.add_message(
+                channels[channel.id], message.log_time, message.data, message.publish_time, message.sequence
+            )
+        for attachment in reader.iter_attachments():
+            writer.add_attachment(
+                attachment.create_time, attachment.log_time, attachment.name, attachment.media_type, attachment.data
+            )
+        for entry in reader.iter_metadata():
+            writer.add_metadata(entry.name, entry.metadata)
+        writer.finish()
+
+
+def test_a_clock_that_goes_back_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    def again(writer: ProtobufWriter) -> None:
+        for i in range(3):
+            for eye, topic in enumerate(("/stereo/left/image_raw", "/stereo/right/image_raw")):
+                stamp = 10**9 + i * PERIOD_NS + PERIOD_NS // 2
+                writer.write_message(topic, foxglove.stamp(_raw(i, eye, "x"), stamp), stamp, stamp)
+
+    path = _write(tmp_path / "a.mcap", count=10, extra=again)
+    with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(path):
+        pass
+    assert "the clock goes back by 0.4 s" in caplog.text
+    caplog.clear()
+    with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(_write(tmp_path / "b.mcap", count=10)):
+        pass
+    assert "clock" not in caplog.text
+
+
+def test_a_pipe_is_no_recording(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.mcap")
+    with pytest.raises(StereoSfmError, match="it is no file"):
+        LogReader(tmp_path / "a.mcap")

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import functools
 import os
+import shutil
 import signal
+import threading
 from collections.abc import Iterator, Sequence
 from multiprocessing import shared_memory
 from pathlib import Path
@@ -25,6 +27,7 @@ from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.recorded import read_run
 from stereo_sfm.log.run_log import RunLog
 from stereo_sfm.log.writer import LogWriter
+from stereo_sfm.pipeline.images import ImageLayout, ImageRing
 from stereo_sfm.pipeline.inline import run_inline
 from stereo_sfm.pipeline.maps import MapFolders
 from stereo_sfm.pipeline.processes import ProcessRun, StageDied
@@ -198,6 +201,49 @@ def test_a_capture_process_that_is_killed_costs_nothing_that_it_read(tmp_path: P
                 if k == 60:
                     os.kill(run.pids["capture"], signal.SIGKILL)
     assert len(load_map(tmp_path / "map").snapshot.kf_ids) >= 3
+
+
+class StalledWall(SlidingWall):
+    """A camera that gives no more images."""
+
+    def __iter__(self) -> Iterator[StereoImage]:
+        import time
+
+        for image in super().__iter__():
+            if image.frame_id == 20:
+                time.sleep(1000)
+            yield image
+
+
+def test_a_stop_is_heard_though_no_image_comes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("stereo_sfm.pipeline.processes.STOP_GRACE_S", 0.5)
+    folders = MapFolders(map_out=tmp_path / "map")
+    with ProcessRun(functools.partial(StalledWall, 50), CONFIG, folders=folders) as run:
+        frames: list[Frame] = []
+        for frame in run:
+            frames.append(frame)
+            if len(frames) == 20:
+                threading.Timer(0.5, run.stop).start()  # as a signal does: while the next message is awaited
+    assert len(frames) == 20
+    assert len(load_map(tmp_path / "map")) >= 1
+
+
+def test_a_stage_that_dies_before_it_is_set_up_is_named(tmp_path: Path) -> None:
+    run = ProcessRun(functools.partial(SlidingWall, 50), CONFIG, log=LogOptions(tmp_path / "run.mcap", "none"))
+
+    def kill() -> None:
+        os.kill(run.pids["tracker"], signal.SIGKILL)
+        run._processes["tracker"].join()
+
+    run._opened = kill
+    with pytest.raises(StageDied, match="the tracker process was killed by SIGKILL"), run:
+        list(run)
+
+
+def test_too_little_shared_memory_is_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("stereo_sfm.pipeline.images.shutil.disk_usage", lambda _: shutil._ntuple_diskusage(1, 1, 1000))
+    with pytest.raises(StereoSfmError, match="too small for 8 images"):
+        ImageRing(ImageLayout((240, 320), (240, 320), None), 8)
 
 
 def test_the_users_number_of_threads_does_not_reach_the_stages(monkeypatch: pytest.MonkeyPatch) -> None:
