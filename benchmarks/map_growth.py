@@ -45,7 +45,6 @@ def keyframe(kf_id: int, point_ids: I64, rng: np.random.Generator) -> Keyframe:
         uv_right=rng.uniform(0, 800, (n, 2)),
         points_cam=rng.uniform(1, 5, (n, 3)),
         descriptors=rng.integers(0, 256, (n, 32), dtype=np.uint8),
-        angles=np.zeros(n, np.float32),
         corners=Corners(
             rng.uniform(0, 800, (CORNERS, 2)).astype(np.float32),
             rng.uniform(0, 800, (CORNERS, 2)).astype(np.float32),
@@ -60,7 +59,7 @@ def insert(map_: Map, kf: Keyframe) -> None:
     row = map_.add_keyframe(kf, kf.odom_T_cam)
     new = map_.point_rows(kf.point_ids) < 0
     map_.add_points(kf.point_ids[new], kf.points_cam[new], row)
-    map_.observe(row, map_.point_rows(kf.point_ids), kf.uv_left, kf.uv_right, kf.descriptors, kf.angles)
+    map_.observe(row, map_.point_rows(kf.point_ids), kf.uv_left, kf.uv_right, kf.descriptors)
     neighbours, _ = map_.covisibility.neighbours(row, 15)
     if len(neighbours):
         map_.observations_of_points(map_.observations.pt[map_.observations_of_keyframe(int(neighbours[0]))])

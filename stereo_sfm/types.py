@@ -164,9 +164,7 @@ class Keyframe(Message):
     uv_right: F64  # (N, 2) px, NaN where unseen
     points_cam: F64  # (N, 3) metres in this keyframe's camera, NaN where the depth is unknown
     descriptors: U8  # (N, 32) binary (oriented BRIEF), zero rows where none could be computed
-    angles: F32  # (N,) radians, orientation of the descriptor's patch
     submap_id: int = 0  # grows when tracking restarts after it was lost
-    covariance: F64 = field(default_factory=lambda: np.eye(6))  # (6, 6) of the pose relative to the previous keyframe
     corners: Corners = field(default_factory=Corners.none)  # what it is recognised by; none: nothing
 
 

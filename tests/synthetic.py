@@ -188,7 +188,6 @@ def keyframe_stream(
                 uv_right=uv_right,
                 points_cam=_stereo_points(rig, uv_left, uv_right),
                 descriptors=looks[rows] ^ _few_bits(rng, len(rows)),
-                angles=np.zeros(len(rows), np.float32),
             )
         )
     return KeyframeStream(rig, keyframes, world_T_kf, xyz, np.array(truth_of_id, np.int64))

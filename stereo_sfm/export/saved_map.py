@@ -23,9 +23,9 @@ from stereo_sfm.mapping.map import Map, MapSnapshot
 from stereo_sfm.types import I64, Trajectory
 
 _FILES: dict[str, tuple[str, ...]] = {
-    "keyframes": ("kf_ids", "frame_ids", "stamp_ns", "submap_ids", "map_T_kf", "odom_T_kf", "sessions"),
+    "keyframes": ("kf_ids", "frame_ids", "stamp_ns", "submap_ids", "map_T_kf", "sessions"),
     "points": ("pt_ids", "points", "anchors", "seen", "expected"),
-    "observations": ("obs_kf", "obs_pt", "uv_left", "uv_right", "descriptors", "angles"),
+    "observations": ("obs_kf", "obs_pt", "uv_left", "uv_right", "descriptors"),
     "corners": ("corner_kf", "corner_uv_left", "corner_uv_right", "corner_points", "corner_descriptors"),
 }
 
@@ -148,8 +148,7 @@ def restore_map(snapshot: MapSnapshot) -> Map:
     map_.points.anchor[:] = snapshot.anchors
     for k, map_T_kf in zip(snapshot.keyframes(), snapshot.map_T_kf, strict=True):
         row = map_.add_keyframe(k, map_T_kf)
-        map_.observe(row, map_.point_rows(k.point_ids), k.uv_left, k.uv_right, k.descriptors, k.angles)
-    map_.keyframes.odom_T_kf[:] = snapshot.odom_T_kf
+        map_.observe(row, map_.point_rows(k.point_ids), k.uv_left, k.uv_right, k.descriptors)
     map_.points.seen[:] = snapshot.seen
     map_.points.expected[:] = snapshot.expected
     return map_

@@ -49,7 +49,6 @@ def insert_keyframe(map_: Map, rig: Rig, keyframe: Keyframe, guess: F64, config:
         np.asarray(keyframe.uv_left)[keep],
         np.asarray(keyframe.uv_right)[keep],
         np.asarray(keyframe.descriptors)[keep],
-        np.asarray(keyframe.angles)[keep],
     )
     return Insertion(row, fused)
 

@@ -42,7 +42,6 @@ class MapSnapshot:
     stamp_ns: I64  # (K,)
     submap_ids: I64  # (K,)
     map_T_kf: F64  # (K, 4, 4)
-    odom_T_kf: F64  # (K, 4, 4)
     pt_ids: I64  # (P,)
     points: F64  # (P, 3)
     anchors: I64  # (P,) index into kf_ids
@@ -53,7 +52,6 @@ class MapSnapshot:
     uv_left: F64  # (M, 2) px
     uv_right: F64  # (M, 2) px
     descriptors: U8  # (M, 32)
-    angles: F32  # (M,)
     corner_kf: I64  # (C,) index into kf_ids, ascending: what keyframes are recognised by, see `Keyframe.corners`
     corner_uv_left: F32  # (C, 2) px
     corner_uv_right: F32  # (C, 2) px
@@ -81,7 +79,6 @@ class MapSnapshot:
             uv_right=self.uv_right[seen],
             points_cam=(self.points[points] - pose[:3, 3]) @ pose[:3, :3],
             descriptors=self.descriptors[seen],
-            angles=self.angles[seen],
             submap_id=int(self.submap_ids[k]),
             corners=Corners(
                 self.corner_uv_left[corners],
@@ -173,8 +170,6 @@ class Map:
             stamp_ns=keyframe.stamp_ns,
             submap_id=keyframe.submap_id,
             map_T_kf=map_T_kf,
-            odom_T_kf=keyframe.odom_T_cam,
-            covariance=keyframe.covariance,
             previous=row - 1 if same else -1,
             obs_first=len(self.observations),
         )
@@ -199,7 +194,7 @@ class Map:
         self._changed_pt.append(rows)
         return rows
 
-    def observe(self, kf: int, pt_rows: I64, uv_left: F64, uv_right: F64, descriptors: U8, angles: F32) -> I64:
+    def observe(self, kf: int, pt_rows: I64, uv_left: F64, uv_right: F64, descriptors: U8) -> I64:
         """Observations of the newest keyframe, one a point. Returns their rows."""
         if kf != len(self.keyframes) - 1:
             raise StereoSfmError("observations are added to the newest keyframe only")
@@ -213,7 +208,6 @@ class Map:
             uv_right=uv_right,
             sigma=self.points.sigma[pt_rows],
             descriptor=descriptors,
-            angle=angles,
         )
         map_kernels.link(rows.start, self.points.head, self.observations.following, self.observations.pt)
         self.keyframes.obs_count[kf] += len(pt_rows)
@@ -422,7 +416,6 @@ class Map:
             stamp_ns=k.stamp_ns[kfs],
             submap_ids=k.submap_id[kfs],
             map_T_kf=k.map_T_kf[kfs],
-            odom_T_kf=k.odom_T_kf[kfs],
             pt_ids=p.pt_id[pts],
             points=p.xyz[pts],
             anchors=kf_index[p.anchor[pts]],
@@ -433,7 +426,6 @@ class Map:
             uv_left=table.uv_left[obs].astype(np.float64),
             uv_right=table.uv_right[obs].astype(np.float64),
             descriptors=table.descriptor[obs],
-            angles=table.angle[obs],
             corner_kf=np.repeat(np.arange(len(kfs)), [len(c) for c in corners]),
             corner_uv_left=np.concatenate([none.uv_left, *(c.uv_left for c in corners)]),
             corner_uv_right=np.concatenate([none.uv_right, *(c.uv_right for c in corners)]),

@@ -18,8 +18,6 @@ class KeyframeTable(Columns):
     stamp_ns: I64
     submap_id: I64
     map_T_kf: F64  # (K, 4, 4)
-    odom_T_kf: F64  # (K, 4, 4) as the tracker made it
-    covariance: F64  # (K, 6, 6) of the pose relative to the previous keyframe
     previous: I64  # row of the keyframe before it in the same submap, -1: none
     obs_first: I64  # first row of its observations
     obs_count: I64  # observations made, of which some may have been removed since
@@ -33,8 +31,6 @@ class KeyframeTable(Columns):
         "stamp_ns": (np.int64, (), 0),
         "submap_id": (np.int64, (), 0),
         "map_T_kf": (np.float64, (4, 4), np.eye(4)),
-        "odom_T_kf": (np.float64, (4, 4), np.eye(4)),
-        "covariance": (np.float64, (6, 6), np.eye(6)),
         "previous": (np.int64, (), -1),
         "obs_first": (np.int64, (), 0),
         "obs_count": (np.int64, (), 0),
@@ -85,7 +81,6 @@ class ObservationTable(Columns):
     uv_right: F32  # (M, 2) px, NaN where unseen
     sigma: F32  # (M,) px, noise of one coordinate
     descriptor: U8  # (M, 32), zero where there is none
-    angle: F32  # (M,) radians
     following: I32  # next older observation of the same point, -1: last
 
     SPEC: ClassVar[Spec] = {
@@ -95,6 +90,5 @@ class ObservationTable(Columns):
         "uv_right": (np.float32, (2,), np.nan),
         "sigma": (np.float32, (), 1.0),
         "descriptor": (np.uint8, (32,), 0),
-        "angle": (np.float32, (), 0),
         "following": (np.int32, (), -1),
     }

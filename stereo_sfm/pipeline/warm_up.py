@@ -64,9 +64,8 @@ def keyframes(rig: Rig) -> list[Keyframe]:
         if rig.right is not None:
             right = rig.right.project(se3.transform(se3.inverse(rig.left_T_right), points_cam))
         ids = np.arange(len(points)) + (k % 2) * 20 + (k >= FRAMES // 2) * 10_000
-        size = np.zeros(len(points), np.float32)
         uv_left = rig.left.project(points_cam)
-        out.append(Keyframe(k, k, k * 100_000_000, odom_T_cam, ids, uv_left, right, points_cam, descriptors, size))
+        out.append(Keyframe(k, k, k * 100_000_000, odom_T_cam, ids, uv_left, right, points_cam, descriptors))
     return out
 
 

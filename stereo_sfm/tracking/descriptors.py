@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from stereo_sfm.geometry.kernels import njit
-from stereo_sfm.types import F32, F64, U8
+from stereo_sfm.types import F64, U8
 
 PATCH_SIZE = 31
 RADIUS = 15
@@ -37,11 +37,11 @@ def _intensity_angles(image, uv):
     return out
 
 
-def describe(image: U8, uv: F64) -> tuple[U8, F32]:
-    """(N, 32) uint8 descriptors and (N,) angles in radians of points (N, 2) px; zero rows too near to the border."""
+def describe(image: U8, uv: F64) -> U8:
+    """(N, 32) descriptors of points (N, 2) px; zero rows too near to the border."""
     descriptors = np.zeros((len(uv), 32), np.uint8)
     if len(uv) == 0:
-        return descriptors, np.zeros(0, np.float32)
+        return descriptors
     angles = _intensity_angles(image, np.ascontiguousarray(uv))
     orb = cv2.ORB.create(nlevels=1, edgeThreshold=BORDER, patchSize=PATCH_SIZE)
     keypoints = [
@@ -51,4 +51,4 @@ def describe(image: U8, uv: F64) -> tuple[U8, F32]:
     kept, rows = orb.compute(image, keypoints)
     if len(kept):
         descriptors[[kp.class_id for kp in kept]] = rows
-    return descriptors, angles
+    return descriptors

@@ -67,7 +67,6 @@ class FeatureTracker:
         self._kf_id = -1
         self._odom_T_kf = np.eye(4)
         self._odom_T_kfs: dict[int, F64] = {}  # keyframes whose answer is still to come
-        self._kf_covariance = np.zeros((6, 6))
         self._frames_since_kf = 0
         self._lost = 0
         self._submap = 0
@@ -177,7 +176,6 @@ class FeatureTracker:
         self._frames_since_kf += 1
         chosen = np.isfinite(view.points[:, 2]) & (view.ages > 0)
         covariance = pose_covariance(view.points[chosen], self._pixel)
-        self._kf_covariance = covariance if self._odometry.reference == "keyframe" else self._kf_covariance + covariance
         wanted = self._wants_keyframe(view, int(motion.inliers.sum()))
         frame = self._frame(image, view, motion, state, "", wanted, covariance)
         keyframe = self._make_keyframe(image, view) if wanted else None
@@ -203,8 +201,7 @@ class FeatureTracker:
         self._odom_T_kf = self._odom_T_cam
         self._odom_T_kfs[self._kf_id] = self._odom_T_cam
         self._frames_since_kf = 0
-        covariance, self._kf_covariance = self._kf_covariance, np.zeros((6, 6))
-        keyframe = keyframe_of(view, image.stamp_ns, self._kf_id, self._odom_T_cam, self._submap, covariance)
+        keyframe = keyframe_of(view, image.stamp_ns, self._kf_id, self._odom_T_cam, self._submap)
         if self._place_corners is None:
             return keyframe
         return replace(keyframe, corners=self._place_corners.find(image))

@@ -20,14 +20,13 @@ class Features(Message):
 
     uv: F64  # (N, 2) px
     descriptors: U8 | F32  # (N, D): bits in bytes (ORB, AKAZE) or floats (SIFT)
-    angles: F32  # (N,) radians
 
     def __len__(self) -> int:
         return len(self.uv)
 
     def rows(self, rows: Bool) -> Features:
         """Only some rows."""
-        return Features(self.uv[rows], self.descriptors[rows], self.angles[rows])
+        return Features(self.uv[rows], self.descriptors[rows])
 
 
 @dataclass(frozen=True)
@@ -86,10 +85,9 @@ class Extractor:
         """Image (H, W), mask (H, W) non-zero where to look -> features, one per position and orientation."""
         keypoints, descriptors = self._detector.detectAndCompute(image, mask)
         if not keypoints:
-            return Features(np.zeros((0, 2)), self._kind.empty(), np.zeros(0, np.float32))
+            return Features(np.zeros((0, 2)), self._kind.empty())
         uv = np.array([k.pt for k in keypoints], np.float64)
-        angles = np.radians(np.array([k.angle for k in keypoints], np.float32)).astype(np.float32)
-        return Features(uv, descriptors, angles)
+        return Features(uv, descriptors)
 
 
 def circle_mask(shape: tuple[int, int], centres: F64, radius_px: float) -> U8:

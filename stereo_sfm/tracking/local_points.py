@@ -54,7 +54,7 @@ class LocalPoints:
 
     def features(self, rows: I64) -> Features:
         """Some rows as features for matching; their pixels mean nothing."""
-        return Features(np.zeros((len(rows), 2)), self.descriptors[rows], np.zeros(len(rows), np.float32))
+        return Features(np.zeros((len(rows), 2)), self.descriptors[rows])
 
 
 def row_of(ids: I64, wanted: I64) -> I64:

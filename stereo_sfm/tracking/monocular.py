@@ -149,7 +149,7 @@ class MonocularTracker:
         keyframe = None
         if wanted:
             seen = self._new_keyframe_view(seen, rows, rng)
-            keyframe = self._enter(seen, image.stamp_ns, self._odom_T_cam, covariance)
+            keyframe = self._enter(seen, image.stamp_ns, self._odom_T_cam)
         return self._frame(image, seen, int(inliers.sum()), state, "", wanted, covariance), keyframe
 
     def _check(self, pose: F64, points: F64) -> None:
@@ -228,14 +228,13 @@ class MonocularTracker:
 
     # -- messages --------------------------------------------------------------------------------------------------
 
-    def _enter(self, view: View, stamp_ns: int, odom_T_cam: F64, covariance: F64 | None = None) -> Keyframe:
+    def _enter(self, view: View, stamp_ns: int, odom_T_cam: F64) -> Keyframe:
         self._kf_id += 1
         self._local.add(view, odom_T_cam)
         self._keyframe, self._odom_T_kf = view, odom_T_cam
         self._odom_T_kfs[self._kf_id] = odom_T_cam
         self._frames_since_kf = 0
-        noise = np.eye(6) if covariance is None else covariance
-        return keyframe_of(view, stamp_ns, self._kf_id, odom_T_cam, self._submap, noise)
+        return keyframe_of(view, stamp_ns, self._kf_id, odom_T_cam, self._submap)
 
     def _frame(
         self, image: StereoImage, view: View, inliers: int, state: TrackState, reason: str, is_kf: bool, covariance: F64

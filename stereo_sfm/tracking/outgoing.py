@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from stereo_sfm.tracking.descriptors import describe
 from stereo_sfm.tracking.view import View
 from stereo_sfm.types import F64, Keyframe, Observations
@@ -17,11 +15,10 @@ def observations_of(view: View) -> Observations:
     )
 
 
-def keyframe_of(view: View, stamp_ns: int, kf_id: int, odom_T_cam: F64, submap_id: int, covariance: F64) -> Keyframe:
+def keyframe_of(view: View, stamp_ns: int, kf_id: int, odom_T_cam: F64, submap_id: int) -> Keyframe:
     """A keyframe with binary descriptors, whatever the tracker matches by, and no corners to recognise it by."""
     rows = view.ids >= 0
     uv = view.features.uv[rows]
-    descriptors, angles = describe(view.image, uv)
     return Keyframe(
         kf_id=kf_id,
         frame_id=view.frame_id,
@@ -31,8 +28,6 @@ def keyframe_of(view: View, stamp_ns: int, kf_id: int, odom_T_cam: F64, submap_i
         uv_left=uv,
         uv_right=view.uv_right[rows],
         points_cam=view.points[rows],
-        descriptors=descriptors,
-        angles=angles,
+        descriptors=describe(view.image, uv),
         submap_id=submap_id,
-        covariance=covariance + 1e-12 * np.eye(6),
     )

@@ -173,7 +173,7 @@ class Tracker:
         if self._wants_keyframe():
             with self._spans.span("keyframe"):
                 self._add_points(pyramid, right)
-                keyframe = self._make_keyframe(image, pyramid, right, covariance)
+                keyframe = self._make_keyframe(image, pyramid, right)
                 frame_inlier = np.concatenate([frame_inlier, np.ones(len(self._tracks) - len(frame_inlier), bool)])
         return self._frame(image, covariance, state, "", frame_inlier, keyframe, stats), keyframe
 
@@ -192,7 +192,7 @@ class Tracker:
             reason = "dark" if image.left.max() < 30 else "too_few_points"
             state = TrackState.INITIALIZING if self._submap_id == 0 and self._next_kf_id == 0 else TrackState.LOST
             return self._frame(image, np.eye(6), state, reason, np.zeros(0, bool), None, stats), None
-        keyframe = self._make_keyframe(image, pyramid, right, np.eye(6) * 1e-12)
+        keyframe = self._make_keyframe(image, pyramid, right)
         state = TrackState.OK if self._submap_id == 0 else TrackState.RESTARTED
         inlier = np.ones(len(self._tracks), bool)
         stats.update(tracked=float(len(inlier)), inliers=float(len(inlier)), right=float(len(inlier)), error=0.0)
@@ -297,12 +297,9 @@ class Tracker:
         left = len(self._tracks)  # new points come with keyframes only
         return self._frames_since_kf >= config.keyframe_max_frames or left < config.keyframe_share * self._kf_points
 
-    def _make_keyframe(
-        self, image: StereoImage, pyramid: flow.Pyramid, right: flow.Pyramid | F32, covariance: F64
-    ) -> Keyframe:
+    def _make_keyframe(self, image: StereoImage, pyramid: flow.Pyramid, right: flow.Pyramid | F32) -> Keyframe:
         tracks = self._tracks
         points_cam = se3.transform(se3.inverse(self._pose), tracks.points())
-        descriptors, angles = describe(pyramid[0], tracks.uv)
         keyframe = Keyframe(
             kf_id=self._next_kf_id,
             frame_id=image.frame_id,
@@ -312,10 +309,8 @@ class Tracker:
             uv_left=tracks.uv.copy(),
             uv_right=tracks.uv_right.copy(),
             points_cam=points_cam,
-            descriptors=descriptors,
-            angles=angles,
+            descriptors=describe(pyramid[0], tracks.uv),
             submap_id=self._submap_id,
-            covariance=covariance,
             corners=Corners.none() if self._place_corners is None else self._place_corners.find_in(pyramid, right),
         )
         self._next_kf_id += 1

@@ -67,7 +67,7 @@ def test_points_seen_are_counted_once() -> None:
         record.put(
             Keyframe(
                 kf_id, kf_id, kf_id, np.eye(4), points, empty, empty, np.zeros((len(ids), 3)),
-                np.zeros((len(ids), 32), np.uint8), np.zeros(len(ids), np.float32),
+                np.zeros((len(ids), 32), np.uint8),
             )
         )  # fmt: skip
     assert record.seen_points.sum() == 4

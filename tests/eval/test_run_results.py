@@ -86,7 +86,7 @@ def test_pieces_that_no_loop_joins_are_said(tmp_path: Path) -> None:
     for kf_id, submap in ((0, 0), (10, 1), (20, 1)):
         keyframe = Keyframe(
             kf_id, kf_id, kf_id * 10**8, walk()[kf_id], none, nothing, nothing, np.zeros((0, 3)),
-            np.zeros((0, 32), np.uint8), np.zeros(0, np.float32), submap_id=submap,
+            np.zeros((0, 32), np.uint8), submap_id=submap,
         )  # fmt: skip
         record.put(keyframe)
     assert record.pieces() == 2
@@ -161,7 +161,7 @@ def test_a_loop_that_the_map_refused_is_no_accepted_one(tmp_path: Path) -> None:
     pairs = none.reshape(-1, 2)
     for kf_id in (10, 20):
         record.put(Keyframe(kf_id, kf_id, kf_id * 10**8, np.eye(4), none, *(np.zeros((0, n)) for n in (2, 2, 3)),
-                            np.zeros((0, 32), np.uint8), np.zeros(0, np.float32)))  # fmt: skip
+                            np.zeros((0, 32), np.uint8)))  # fmt: skip
         record.put(LoopResult(kf_id, 0, np.eye(4), np.eye(6), pairs, 50, 1.0, ""))
     place = np.eye(4)[None]
     update = MapUpdate(9, 20, np.array([20]), place, none, np.zeros((0, 3)), none, pairs, np.eye(4),

@@ -20,7 +20,7 @@ def map_of_walk(walk: StoreWalk, vocabulary_id: str = "") -> SavedMap:
         row = map_.add_keyframe(k, pose)
         new = map_.point_rows(k.point_ids) < 0
         map_.add_points(k.point_ids[new], se3.transform(pose, k.points_cam[new]), row)
-        map_.observe(row, map_.point_rows(k.point_ids), k.uv_left, k.uv_right, k.descriptors, k.angles)
+        map_.observe(row, map_.point_rows(k.point_ids), k.uv_left, k.uv_right, k.descriptors)
     snapshot = map_.snapshot()
     return SavedMap(snapshot, walk.rig, vocabulary_id, np.zeros(len(snapshot.kf_ids), np.int64))
 

@@ -40,7 +40,7 @@ def test_restored_map_is_the_same_map_and_can_grow(saved: SavedMap) -> None:
     assert len(shared) > 3
     new = dataclasses.replace(saved.snapshot.keyframes()[-1], kf_id=10_000)
     row = map_.add_keyframe(new, np.eye(4))
-    map_.observe(row, map_.point_rows(new.point_ids), new.uv_left, new.uv_right, new.descriptors, new.angles)
+    map_.observe(row, map_.point_rows(new.point_ids), new.uv_left, new.uv_right, new.descriptors)
     assert map_.covisibility.neighbours(row)[0][0] == row - 1
 
 

@@ -44,7 +44,7 @@ def _messages(n: int, seed: int) -> list[object]:
     )  # fmt: skip
     keyframe = Keyframe(
         n, 7, -5, rng.normal(size=(4, 4)), rng.integers(0, 9**9, n), rng.normal(size=(n, 2)), rng.normal(size=(n, 2)),
-        rng.normal(size=(n, 3)), rng.integers(0, 256, (n, 32), np.uint8), rng.random(n).astype(np.float32), 2,
+        rng.normal(size=(n, 3)), rng.integers(0, 256, (n, 32), np.uint8), 2,
         corners=Corners(
             rng.random((n, 2), np.float32), rng.random((n, 2), np.float32), rng.random((n, 3), np.float32),
             rng.integers(0, 256, (n, 32), np.uint8),

@@ -93,7 +93,7 @@ def _keyframe(k: int) -> Keyframe:
     return Keyframe(
         k, frame.frame_id, frame.stamp_ns, frame.odom_T_cam.copy(), frame.observations.point_ids,
         frame.observations.uv_left, frame.observations.uv_right, rng.normal(size=(n, 3)),
-        rng.integers(0, 256, (n, 32), np.uint8), rng.random(n).astype(np.float32),
+        rng.integers(0, 256, (n, 32), np.uint8),
     )  # fmt: skip
 
 

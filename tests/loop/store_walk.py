@@ -156,6 +156,5 @@ def _keyframe(k: int, odom: F64, ids: list[int], seen: Corners, corners: Corners
         uv_right=seen.uv_right.astype(np.float64),
         points_cam=seen.points_cam.astype(np.float64),
         descriptors=seen.descriptors,
-        angles=np.zeros(len(ids), np.float32),
         corners=corners,
     )

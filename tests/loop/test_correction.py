@@ -29,7 +29,7 @@ def raw_map(walk: StoreWalk) -> Map:
         new = map_.point_rows(k.point_ids) < 0
         map_.add_points(k.point_ids[new], se3.transform(k.odom_T_cam, k.points_cam[new]), row)
         rows = map_.point_rows(k.point_ids)
-        map_.observe(row, rows, k.uv_left, k.uv_right, k.descriptors, k.angles)
+        map_.observe(row, rows, k.uv_left, k.uv_right, k.descriptors)
     return map_
 
 
@@ -97,12 +97,12 @@ def turning_walk(degrees_per_100m: float, side_m: float = 30.0, step_m: float = 
         ids = np.arange(20 * k, 20 * k + 100)  # 80 points shared with the keyframe before, 40 with the third
         seen = Keyframe(
             k, k, k, pose, ids, np.ones((100, 2)), np.ones((100, 2)), np.ones((100, 3)),
-            np.ones((100, 32), np.uint8), np.zeros(100, np.float32), 0, np.eye(6),
+            np.ones((100, 32), np.uint8),
         )  # fmt: skip
         row = map_.add_keyframe(seen, pose)
         new = map_.point_rows(ids) < 0
         map_.add_points(ids[new], se3.transform(pose, np.ones((new.sum(), 3))), row)
-        map_.observe(row, map_.point_rows(ids), seen.uv_left, seen.uv_right, seen.descriptors, seen.angles)
+        map_.observe(row, map_.point_rows(ids), seen.uv_left, seen.uv_right, seen.descriptors)
     return map_, np.array(truth)
 
 

@@ -28,7 +28,6 @@ def keyframe(kf_id: int, point_ids: I64, submap: int = 0) -> Keyframe:
         uv_right=rng.uniform(0, 600, (n, 2)),
         points_cam=rng.uniform(1, 3, (n, 3)),
         descriptors=rng.integers(0, 256, (n, 32), dtype=np.uint8),
-        angles=np.zeros(n, np.float32),
         submap_id=submap,
     )
 
@@ -39,7 +38,7 @@ def insert(m: Map, kf: Keyframe) -> int:
     known = m.point_rows(kf.point_ids) >= 0
     m.add_points(kf.point_ids[~known], se3.transform(kf.odom_T_cam, kf.points_cam[~known]), row)
     rows = m.point_rows(kf.point_ids)
-    m.observe(row, rows, kf.uv_left, kf.uv_right, kf.descriptors, kf.angles)
+    m.observe(row, rows, kf.uv_left, kf.uv_right, kf.descriptors)
     return row
 
 

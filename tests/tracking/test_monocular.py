@@ -136,7 +136,7 @@ def test_motion_only_adjustment_is_exact_and_refuses_what_it_cannot() -> None:
 
 def some_view(ids: list[int], points: F64) -> View:
     n = len(ids)
-    features = Features(np.zeros((n, 2)), np.full((n, 32), 7, np.uint8), np.zeros(n, np.float32))
+    features = Features(np.zeros((n, 2)), np.full((n, 32), 7, np.uint8))
     return View(
         0, np.zeros((4, 4), np.uint8), features, unit(points), np.full((n, 2), np.nan), points, np.ones(n),
         np.array(ids, np.int64), np.zeros(n, np.int32),

@@ -24,7 +24,7 @@ def keyframe(frame_id: int, ids: list[int]) -> Keyframe:
     n = len(ids)
     return Keyframe(
         0, frame_id, 0, np.eye(4), np.array(ids, np.int64), uv, uv * np.nan, np.full((n, 3), np.nan),
-        np.zeros((n, 32), np.uint8), np.zeros(n, np.float32),
+        np.zeros((n, 32), np.uint8),
     )  # fmt: skip
 
 
