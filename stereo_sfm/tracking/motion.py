@@ -106,101 +106,93 @@ def _compose(a, b):
 
 
 @njit
-def optimise_pose(
-    pose, origin, direction, rho, variance, uv_l, uv_r, weight, cams, right_T_left, sigma, scales, prior, prior_pose
+def _normal_equations(
+    pose, origin, direction, rho, variance, uv_l, uv_r, cams, right_T_left, sigma, scale, normal, rhs, error
 ):
+    """Sums over all points, each with its distance marginalised; a robust weight by a Cauchy kernel of `scale` sigmas.
+
+    Args:
+        normal (6, 6), rhs (6,), error (N,): overwritten; see `optimise_pose`.
+
+    Returns:
+        The sum of the weights.
+    """
+    res, jac, ray, jr = np.zeros(4), np.zeros((4, 6)), np.zeros(4), np.zeros(6)
+    inv_s2 = 1.0 / (sigma * sigma)
+    used = 0.0
+    normal[:] = 0.0
+    rhs[:] = 0.0
+    for k in range(len(rho)):
+        ir = 1.0 / rho[k]
+        px = origin[k, 0] + direction[k, 0] * ir
+        py = origin[k, 1] + direction[k, 1] * ir
+        pz = origin[k, 2] + direction[k, 2] * ir
+        g = -ir * ir
+        rows = point_residuals(
+            pose, px, py, pz, direction[k, 0] * g, direction[k, 1] * g, direction[k, 2] * g,
+            uv_l[k], uv_r[k], cams, right_T_left, res, jac, ray,
+        )  # fmt: skip
+        if rows == 0:
+            error[k] = np.inf
+            continue
+        rr, gr, gg = 0.0, 0.0, 0.0
+        for i in range(rows):
+            rr += res[i] * res[i]
+            gr += ray[i] * res[i]
+            gg += ray[i] * ray[i]
+        c = variance[k] / (sigma * sigma + variance[k] * gg)
+        chi2 = max(rr - c * gr * gr, 0.0) * inv_s2
+        error[k] = math.sqrt(chi2 / rows)
+        w = 1.0 / (1.0 + chi2 / (rows * scale * scale))
+        wi = w * inv_s2
+        used += w
+        for i in range(6):
+            s = 0.0
+            for m in range(rows):
+                s += jac[m, i] * ray[m]
+            jr[i] = s
+        for i in range(6):
+            s = 0.0
+            for m in range(rows):
+                s += jac[m, i] * res[m]
+            rhs[i] += wi * (s - c * jr[i] * gr)
+            for j in range(i, 6):
+                s = 0.0
+                for m in range(rows):
+                    s += jac[m, i] * jac[m, j]
+                normal[i, j] += wi * (s - c * jr[i] * jr[j])
+    for i in range(6):
+        for j in range(i):
+            normal[i, j] = normal[j, i]
+    return used
+
+
+@njit
+def optimise_pose(pose, origin, direction, rho, variance, uv_l, uv_r, cams, right_T_left, sigma, scales):
     """Pose of a frame.
 
     Args:
         pose: (4, 4) odom_T_cam to start from. origin, direction: (N, 3) odometry frame. rho, variance: (N,) 1/m.
-        uv_l, uv_r: (N, 2) px, NaN in uv_r where unseen. weight: (N,) multiplies the information of a point.
+        uv_l, uv_r: (N, 2) px, NaN in uv_r where unseen.
         sigma: px, noise of one coordinate. scales: (S,) Cauchy scales in sigmas, one Gauss-Newton step each.
-        prior: (6, 6) information of prior_pose (zeros: none).
 
     Returns:
         pose (4, 4), covariance (6, 6) of pose @ exp(xi), error (N,) root of the whitened squared residual over
         the number of rows (1 is as expected; inf when not visible).
     """
-    n = len(rho)
     pose = pose.copy()
-    res, jac, ray = np.zeros(4), np.zeros((4, 6)), np.zeros(4)
-    error = np.full(n, np.inf)
+    error = np.full(len(rho), np.inf)
     normal, factor = np.zeros((6, 6)), np.zeros((6, 6))
-    rhs, xi, jr = np.zeros(6), np.zeros(6), np.zeros(6)
-    inv_s2 = 1.0 / (sigma * sigma)
-    for step_index in range(len(scales) + 1):
-        last = step_index == len(scales)
-        scale2 = scales[min(step_index, len(scales) - 1)] ** 2
-        for i in range(6):
-            rhs[i] = 0.0
-            for j in range(6):
-                normal[i, j] = prior[i, j]
-        used = 0.0
-        for k in range(n):
-            ir = 1.0 / rho[k]
-            px = origin[k, 0] + direction[k, 0] * ir
-            py = origin[k, 1] + direction[k, 1] * ir
-            pz = origin[k, 2] + direction[k, 2] * ir
-            g = -ir * ir
-            rows = point_residuals(
-                pose, px, py, pz, direction[k, 0] * g, direction[k, 1] * g, direction[k, 2] * g,
-                uv_l[k], uv_r[k], cams, right_T_left, res, jac, ray,
-            )  # fmt: skip
-            if rows == 0:
-                error[k] = np.inf
-                continue
-            rr, gr, gg = 0.0, 0.0, 0.0
-            for i in range(rows):
-                rr += res[i] * res[i]
-                gr += ray[i] * res[i]
-                gg += ray[i] * ray[i]
-            c = variance[k] / (sigma * sigma + variance[k] * gg)
-            chi2 = max(rr - c * gr * gr, 0.0) * inv_s2
-            error[k] = math.sqrt(chi2 / rows)
-            w = weight[k] / (1.0 + chi2 / (rows * scale2))
-            wi = w * inv_s2
-            used += w
-            for i in range(6):
-                s = 0.0
-                for m in range(rows):
-                    s += jac[m, i] * ray[m]
-                jr[i] = s
-            for i in range(6):
-                s = 0.0
-                for m in range(rows):
-                    s += jac[m, i] * res[m]
-                rhs[i] += wi * (s - c * jr[i] * gr)
-                for j in range(i, 6):
-                    s = 0.0
-                    for m in range(rows):
-                        s += jac[m, i] * jac[m, j]
-                    normal[i, j] += wi * (s - c * jr[i] * jr[j])
-        for i in range(6):
-            for j in range(i):
-                normal[i, j] = normal[j, i]
-        if last or used < 3:
+    rhs, xi = np.zeros(6), np.zeros(6)
+    for step in range(len(scales) + 1):  # after the last step once more, for errors and covariance
+        scale = scales[min(step, len(scales) - 1)]
+        used = _normal_equations(
+            pose, origin, direction, rho, variance, uv_l, uv_r, cams, right_T_left, sigma, scale, normal, rhs, error
+        )
+        if step == len(scales) or used < 3:
             break
         for i in range(6):
             normal[i, i] += 1e-6 + 1e-9 * normal[i, i]
-        if prior[0, 0] > 0:  # pull towards prior_pose; first order is enough at the prior's width
-            delta = np.zeros(6)
-            for i in range(3):
-                for j in range(3):
-                    delta[i] += pose[j, i] * (pose[j, 3] - prior_pose[j, 3])
-            r = np.zeros((3, 3))
-            for i in range(3):
-                for j in range(3):
-                    for m in range(3):
-                        r[i, j] += prior_pose[m, i] * pose[m, j]
-            delta[3], delta[4], delta[5] = (
-                0.5 * (r[2, 1] - r[1, 2]),
-                0.5 * (r[0, 2] - r[2, 0]),
-                0.5 * (r[1, 0] - r[0, 1]),
-            )
-            for i in range(6):
-                for j in range(6):
-                    rhs[i] += prior[i, j] * delta[j]
-        for i in range(6):
             rhs[i] = -rhs[i]
         if not solve_symmetric(normal, rhs, xi, factor):
             break
@@ -213,11 +205,11 @@ def optimise_pose(
 
 
 @njit
-def refine_depth(pose, origin, direction, rho, variance, uv_l, uv_r, inlier, cams, right_T_left, sigma, growth, floor):
+def refine_depth(pose, origin, direction, rho, variance, uv_l, uv_r, inlier, cams, right_T_left, sigma, floor):
     """Update rho and its variance (in place) by one frame's observations, the pose given.
 
     `sigma` is larger than the pixel noise: successive errors of one patch are alike, and the pose was fitted to the
-    same pixels. `growth` multiplies the variance before the update; `floor` is the least relative standard deviation.
+    same pixels. `floor` is the least relative standard deviation.
     """
     res, jac, ray = np.zeros(4), np.zeros((4, 6)), np.zeros(4)
     for k in range(len(rho)):
@@ -236,7 +228,6 @@ def refine_depth(pose, origin, direction, rho, variance, uv_l, uv_r, inlier, cam
         for i in range(rows):
             gr += ray[i] * res[i]
             gg += ray[i] * ray[i]
-        var = variance[k] * growth
-        information = 1.0 / var + gg / (sigma * sigma)
+        information = 1.0 / variance[k] + gg / (sigma * sigma)
         rho[k] = max(rho[k] - gr / (sigma * sigma) / information, 1e-4)
         variance[k] = max(1.0 / information, (floor * rho[k]) ** 2)

@@ -255,15 +255,14 @@ class Tracker:
     def _optimise(self, tracks: Tracks, uv_right: F64, start: F64) -> PoseSolution:
         pose, covariance, error = motion.optimise_pose(
             start, tracks.origin, tracks.direction, tracks.rho, tracks.variance, tracks.uv, uv_right,
-            np.ones(len(tracks)), self._eyes.cams, self._eyes.right_T_left, self._config.sigma_px * self._noise,
-            CAUCHY_SCALES, np.zeros((6, 6)), start,
+            self._eyes.cams, self._eyes.right_T_left, self._config.sigma_px * self._noise, CAUCHY_SCALES,
         )  # fmt: skip
         return PoseSolution(pose, covariance, error, self._config.max_error)
 
     def _refine(self, tracks: Tracks, pose: F64, inlier: Bool) -> None:
         motion.refine_depth(
             pose, tracks.origin, tracks.direction, tracks.rho, tracks.variance, tracks.uv, tracks.uv_right,
-            inlier & ~tracks.mapped, self._eyes.cams, self._eyes.right_T_left, self._config.depth_sigma_px, 1.0, 1e-3,
+            inlier & ~tracks.mapped, self._eyes.cams, self._eyes.right_T_left, self._config.depth_sigma_px, 1e-3,
         )  # fmt: skip
 
     def _accept(self, image: StereoImage, pyramid: flow.Pyramid, pose: F64, tracks: Tracks) -> None:

@@ -45,7 +45,7 @@ def solve(camera: Camera, points: F64, uv: F64, uv_right: F64, variance: float =
     n = len(points)
     return motion.optimise_pose(
         np.eye(4), np.zeros((n, 3)), points / distance[:, None], 1 / distance, np.full(n, variance), uv, uv_right,
-        np.ones(n), eyes.cams, eyes.right_T_left, 0.5, SCALES, np.zeros((6, 6)), np.eye(4),
+        eyes.cams, eyes.right_T_left, 0.5, SCALES,
     )  # fmt: skip
 
 
