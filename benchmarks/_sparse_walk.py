@@ -18,8 +18,8 @@ from drivers.sim.source import SimSource
 from drivers.source import open_source
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.cloud import gather, match_guided
+from stereo_sfm.loop.place_view import place_view_of
 from stereo_sfm.loop.still import still_keyframe
-from stereo_sfm.loop.view import view_of
 from stereo_sfm.types import F64, I64, Keyframe
 
 STEP_METRES, STEP_DEGREES = 0.4, 15.0  # between keyframes
@@ -88,7 +88,7 @@ def _described(source: SimSource, frame_ids: I64, world_T_kf: F64, odom: F64) ->
 
 def _continue_ids(ids: I64, kf_T_previous: F64, previous: Keyframe, still: Keyframe, rig: Rig) -> None:
     """Give the points that the previous keyframe saw their ids."""
-    cloud, view = gather(previous, [], rig, 0.3), view_of(still, rig, 0.3)
+    cloud, view = gather(previous, [], rig, 0.3), place_view_of(still, rig, 0.3)
     rows_b, rows_a = match_guided(kf_T_previous, view, cloud, rig, 50, radius=4.0)
     points = ~view.corner[rows_b]
     ids[np.searchsorted(still.point_ids, view.ids[rows_b[points]])] = cloud.ids[rows_a[points]]

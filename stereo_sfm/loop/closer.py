@@ -13,9 +13,9 @@ from stereo_sfm.loop import vocabulary as voc
 from stereo_sfm.loop.cloud import gather
 from stereo_sfm.loop.database import PlaceDatabase
 from stereo_sfm.loop.graph import KeyframeGraph
+from stereo_sfm.loop.place_view import PlaceView, place_view_of
 from stereo_sfm.loop.store import KeyframeStore
 from stereo_sfm.loop.verification import Verdict, verify, within
-from stereo_sfm.loop.view import View, view_of
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.types import F64, Keyframe, LoopResult
@@ -133,7 +133,7 @@ class LoopCloser:
     def _judge(self, keyframe: Keyframe, candidates: list[tuple[int, float]], why_none: str) -> LoopResult:
         if not candidates:
             return _no_loop(keyframe.kf_id, why_none, 0.0, ())
-        view = view_of(keyframe, self._rig, self._config.disparity_sigma)
+        view = place_view_of(keyframe, self._rig, self._config.disparity_sigma)
         verdicts = [self._verify(keyframe, view, candidate) for candidate, _ in candidates]
         reasons = [verdict.reason for verdict in verdicts]
         loops = {
@@ -155,7 +155,7 @@ class LoopCloser:
             return self._accept(keyframe, *candidates[accepted], verdicts[accepted], rejected)
         return _no_loop(keyframe.kf_id, reasons[0], candidates[0][1], rejected)
 
-    def _verify(self, keyframe: Keyframe, view: View, candidate: int) -> Verdict:
+    def _verify(self, keyframe: Keyframe, view: PlaceView, candidate: int) -> Verdict:
         config = self._config
         centre = self._store[candidate]
         around = [self._store[k] for k in self._store.best_connected(candidate, CLOUD_KEYFRAMES)]

@@ -14,7 +14,7 @@ from calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.loop import binary
-from stereo_sfm.loop.view import View, view_of
+from stereo_sfm.loop.place_view import PlaceView, place_view_of
 from stereo_sfm.types import F64, I64, U8, Bool, Keyframe
 
 SAME_CORNER_PX, SAME_CORNER_BITS = 4.0, 50  # corners of two keyframes that are so near and so alike are one
@@ -53,7 +53,7 @@ def gather(centre: Keyframe, others: Sequence[Keyframe], rig: Rig, disparity_sig
     centre_T_kf = np.stack([se3.inverse(centre.odom_T_cam) @ k.odom_T_cam for k in keyframes])
     parts: list[Cloud] = []
     for k, keyframe in enumerate(keyframes):
-        view = view_of(keyframe, rig, disparity_sigma)
+        view = place_view_of(keyframe, rig, disparity_sigma)
         ids = view.ids.copy()
         nameless = np.flatnonzero(ids < 0)
         ids[nameless] = -1 - k * CORNERS - nameless
@@ -86,7 +86,9 @@ def _joined(parts: list[Cloud], centre_T_kf: F64) -> Cloud:
     return Cloud(**columns, centre_T_kf=centre_T_kf)
 
 
-def match_guided(b_T_a: F64, view: View, cloud: Cloud, rig: Rig, max_distance: int, radius: float) -> tuple[I64, I64]:
+def match_guided(
+    b_T_a: F64, view: PlaceView, cloud: Cloud, rig: Rig, max_distance: int, radius: float
+) -> tuple[I64, I64]:
     """Pairs (rows of view, rows of cloud) whose descriptors agree within `radius` px of the projection, one to one.
 
     Corners are paired with corners, other points with other points.

@@ -34,7 +34,6 @@ class Correction:
     """What was done."""
 
     applied: bool  # False: the pose graph did not believe the loop, nothing moved
-    moved_m: float  # largest move of a keyframe
     fused: list[tuple[int, int]]  # point rows (gone, stays)
 
 
@@ -53,22 +52,21 @@ def apply_loop(
     """
     a, b = map_.kf_row(loop.candidate_kf_id), map_.kf_row(loop.kf_id)
     if not (map_.keyframes.alive[a] and map_.keyframes.alive[b]):
-        return Correction(False, 0.0, [])
+        return Correction(False, [])
     before = map_.keyframe_poses()
     if config.correction == "averaging":
         after = _averaged(map_, before, loop, earlier)
     elif config.correction == "pose_graph":
         optimised = _optimised(map_, before, loop, earlier, config)
         if optimised is None:
-            return Correction(False, 0.0, [])
+            return Correction(False, [])
         after = optimised
     else:
         raise StereoSfmError(f"loop.correction is '{config.correction}': choose pose_graph or averaging")
     rows = map_.living_keyframes()
-    moved = float(np.linalg.norm(after[rows, :3, 3] - before[rows, :3, 3], axis=1).max())
     map_.move_keyframes(rows, after[rows])
     map_.carry_points(before, after)
-    return Correction(True, moved, fuse_pairs(map_, loop.matches, match_sigma_px))
+    return Correction(True, fuse_pairs(map_, loop.matches, match_sigma_px))
 
 
 def loop_is_known(map_: Map, loop: LoopResult, connected_points: int) -> bool:

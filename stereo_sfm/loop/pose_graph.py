@@ -40,7 +40,6 @@ class PoseGraphResult:
 
     poses: F64  # (K, 4, 4)
     weights: F64  # (E,) 1 for edges of the walk, in [0, 1] for loops
-    initial_error: float
     error: float
 
 
@@ -94,7 +93,7 @@ def optimise(poses: F64, edges: Edges, fixed: I64, robust: str = "gnc") -> PoseG
     out = poses.copy()
     for row in used.tolist():
         out[row] = result.atPose3(row).matrix()
-    return PoseGraphResult(out, weights, float(plain.error(values)), float(plain.error(result)))
+    return PoseGraphResult(out, weights, float(plain.error(result)))
 
 
 def _graph(gtsam: Any, edges: Edges, fixed: I64, values: Any, robust: bool) -> Any:

@@ -13,8 +13,8 @@ from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.cloud import Cloud, gather
 from stereo_sfm.loop.database import PlaceDatabase
+from stereo_sfm.loop.place_view import place_view_of
 from stereo_sfm.loop.verification import Verdict, verify, verify_near, within
-from stereo_sfm.loop.view import view_of
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.mapping.map import MapSnapshot
 from stereo_sfm.types import F64, I64, Keyframe
@@ -71,7 +71,7 @@ class Relocalizer:
 
     def locate(self, keyframe: Keyframe) -> Location:
         """Find the camera of a keyframe (its pose is ignored) in the map."""
-        view = view_of(keyframe, self._rig, self._config.disparity_sigma)
+        view = place_view_of(keyframe, self._rig, self._config.disparity_sigma)
         found: list[Location] = []
         reason = "no_candidate"
         for row in self._places(self._database.scores(self._vocabulary.bag(keyframe.corners.descriptors))):
@@ -87,7 +87,7 @@ class Relocalizer:
 
     def locate_near(self, keyframe: Keyframe, guess: F64) -> Location:
         """Find the camera near a predicted map_T_cam (4, 4): as `locate`, but only around the guess."""
-        view = view_of(keyframe, self._rig, self._config.disparity_sigma)
+        view = place_view_of(keyframe, self._rig, self._config.disparity_sigma)
         row = self._nearest(guess)
         start = se3.inverse(guess) @ self._map.map_T_kf[row]
         verdict = verify_near(start, view, self.cloud(row), self._rig, self._config)

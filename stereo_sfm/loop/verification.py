@@ -16,7 +16,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.loop import binary
 from stereo_sfm.loop.absolute_pose import Matches, Pose, consistent, ransac_pose, refine_pose
 from stereo_sfm.loop.cloud import Cloud, match_guided
-from stereo_sfm.loop.view import View
+from stereo_sfm.loop.place_view import PlaceView
 from stereo_sfm.mapping.bundle import Bundle, bundle_adjust
 from stereo_sfm.types import F64, I64
 
@@ -43,7 +43,7 @@ def rejection(reason: str, inliers: int = 0) -> Verdict:
 
 
 def verify(
-    view: View, cloud: Cloud, rig: Rig, config: LoopConfig, rng: np.random.Generator, move_points: bool = True
+    view: PlaceView, cloud: Cloud, rig: Rig, config: LoopConfig, rng: np.random.Generator, move_points: bool = True
 ) -> Verdict:
     """Match, place, match again along the projection, and judge. See the reasons below for what is asked for.
 
@@ -73,7 +73,7 @@ def verify(
 
 
 def verify_near(
-    b_T_a: F64, view: View, cloud: Cloud, rig: Rig, config: LoopConfig, move_points: bool = False
+    b_T_a: F64, view: PlaceView, cloud: Cloud, rig: Rig, config: LoopConfig, move_points: bool = False
 ) -> Verdict:
     """The second half of `verify`: from a pose that is nearly right."""
     pose: Pose | None = None
@@ -99,7 +99,7 @@ def verify_near(
 
 
 def refine_with_points(
-    b_T_a: F64, view: View, cloud: Cloud, rows_b: I64, rows_a: I64, rig: Rig, config: LoopConfig
+    b_T_a: F64, view: PlaceView, cloud: Cloud, rows_b: I64, rows_a: I64, rig: Rig, config: LoopConfig
 ) -> F64:
     """b_T_a from a bundle over all views of the matched points, the candidate's side held fast.
 
@@ -124,7 +124,7 @@ def refine_with_points(
     return se3.inverse(bundle_adjust(rig, bundle).world_T_kf[-1])
 
 
-def _pair(view: View, cloud: Cloud, rows_b: I64, rows_a: I64) -> Matches:
+def _pair(view: PlaceView, cloud: Cloud, rows_b: I64, rows_a: I64) -> Matches:
     left_a, right_a = cloud.seen_by_centre(rows_a)
     return Matches(
         cloud.points[rows_a],

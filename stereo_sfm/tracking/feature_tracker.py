@@ -17,6 +17,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.motion_only import pose_covariance
 from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.timing import NoSpans
+from stereo_sfm.tracking.feature_view import FeatureView, ViewMaker, pixel_angle
 from stereo_sfm.tracking.features import circle_mask
 from stereo_sfm.tracking.identity import PointIds
 from stereo_sfm.tracking.odometry.base import Motion
@@ -25,7 +26,6 @@ from stereo_sfm.tracking.outgoing import keyframe_of, observations_of
 from stereo_sfm.tracking.pairing import Pairing
 from stereo_sfm.tracking.place_corners import PlaceCorners
 from stereo_sfm.tracking.scale import StepScale
-from stereo_sfm.tracking.view import View, ViewMaker, pixel_angle
 from stereo_sfm.types import (
     F64,
     I64,
@@ -60,10 +60,10 @@ class FeatureTracker:
         self._ids = PointIds()
         self._odom_T_cam = np.eye(4)
         self._velocity = np.eye(4)  # last_T_now of the last good step
-        self._last: View | None = None
+        self._last: FeatureView | None = None
         self._odom_T_last = np.eye(4)
         self._last_stamp = 0
-        self._keyframe: View | None = None
+        self._keyframe: FeatureView | None = None
         self._kf_id = -1
         self._odom_T_kf = np.eye(4)
         self._odom_T_kfs: dict[int, F64] = {}  # keyframes whose answer is still to come
@@ -125,7 +125,7 @@ class FeatureTracker:
             return None
         return circle_mask(image.left.shape, self._keyframe.features.uv, radius)
 
-    def _begin(self, image: StereoImage, view: View) -> tuple[Frame, Keyframe | None]:
+    def _begin(self, image: StereoImage, view: FeatureView) -> tuple[Frame, Keyframe | None]:
         if len(view) < self._odometry.min_inliers:
             frame = self._frame(image, view, None, TrackState.INITIALIZING, "too_few_points", False)
             return frame, None
@@ -134,7 +134,9 @@ class FeatureTracker:
         self._remember(image, view)
         return self._frame(image, view, None, TrackState.OK, "", True), keyframe
 
-    def _move(self, image: StereoImage, view: View, rng: np.random.Generator) -> tuple[Motion, View] | Degenerate:
+    def _move(
+        self, image: StereoImage, view: FeatureView, rng: np.random.Generator
+    ) -> tuple[Motion, FeatureView] | Degenerate:
         """Motion from the reference, with the view's ids filled in, or why there is none."""
         assert self._last is not None and self._keyframe is not None
         reference, odom_T_reference = self._last, self._odom_T_last
@@ -156,7 +158,7 @@ class FeatureTracker:
             view = self._pairing.recover(self._keyframe, view, now_T_kf, self._ids)
         return motion, self._ids.give_new(view)
 
-    def _lose(self, image: StereoImage, view: View, reason: str) -> tuple[Frame, Keyframe | None]:
+    def _lose(self, image: StereoImage, view: FeatureView, reason: str) -> tuple[Frame, Keyframe | None]:
         """No motion: keep moving as before; after several such frames start again there as a new submap."""
         self._lost += 1
         self._odom_T_cam = self._odom_T_cam @ self._velocity
@@ -171,7 +173,7 @@ class FeatureTracker:
         return self._frame(image, view, None, TrackState.RESTARTED, reason, True), keyframe
 
     def _finish(
-        self, image: StereoImage, view: View, motion: Motion, state: TrackState
+        self, image: StereoImage, view: FeatureView, motion: Motion, state: TrackState
     ) -> tuple[Frame, Keyframe | None]:
         self._frames_since_kf += 1
         chosen = np.isfinite(view.points[:, 2]) & (view.ages > 0)
@@ -182,7 +184,7 @@ class FeatureTracker:
         self._remember(image, view)
         return (replace(frame, reference_kf_id=self._kf_id, kf_T_cam=np.eye(4)) if wanted else frame), keyframe
 
-    def _wants_keyframe(self, view: View, inliers: int) -> bool:
+    def _wants_keyframe(self, view: FeatureView, inliers: int) -> bool:
         """Fewer than 30 % of the keyframe's points tracked, or 30 frames since (retail paper, IV-A4)."""
         assert self._keyframe is not None
         o = self._odometry
@@ -195,7 +197,7 @@ class FeatureTracker:
         tracked = np.isin(self._ids.current(self._keyframe.ids), view.ids).mean()
         return bool(tracked < o.keyframe_ratio)
 
-    def _make_keyframe(self, image: StereoImage, view: View) -> Keyframe:
+    def _make_keyframe(self, image: StereoImage, view: FeatureView) -> Keyframe:
         self._kf_id += 1
         self._keyframe = view
         self._odom_T_kf = self._odom_T_cam
@@ -206,13 +208,13 @@ class FeatureTracker:
             return keyframe
         return replace(keyframe, corners=self._place_corners.find(image))
 
-    def _remember(self, image: StereoImage, view: View) -> None:
+    def _remember(self, image: StereoImage, view: FeatureView) -> None:
         self._last, self._odom_T_last, self._last_stamp = view, self._odom_T_cam, image.stamp_ns
 
     def _frame(
         self,
         image: StereoImage,
-        view: View,
+        view: FeatureView,
         motion: Motion | None,
         state: TrackState,
         reason: str,

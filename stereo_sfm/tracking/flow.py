@@ -31,7 +31,7 @@ FLAT_SIZE = SIZE * STRIDE
 WIDE_SIZE = (SIZE + 2) * STRIDE
 RAW_SIZE = (SIZE + 4) * STRIDE
 ONE = np.uint64(1)
-TRACKED, LEFT_IMAGE, FLAT, DIVERGED, UNLIKE = 0, 1, 2, 3, 4  # why a point was not followed
+TRACKED, OUTSIDE, FLAT, DIVERGED, UNLIKE = 0, 1, 2, 3, 4  # why a point was not followed
 
 Pyramid = tuple[U8, ...]
 
@@ -192,9 +192,9 @@ def track_translation(prev, cur, uv_prev, uv_cur, first_level, last_level, itera
     window = np.zeros(FLAT_SIZE, np.float32)
     for k in range(n):
         u, v = uv_cur[k, 0], uv_cur[k, 1]
-        state = LEFT_IMAGE
+        state = OUTSIDE
         if not (math.isfinite(u) and math.isfinite(v)):
-            status[k] = LEFT_IMAGE
+            status[k] = OUTSIDE
             continue
         for level in range(first_level, last_level - 1, -1):
             scale = 1.0 / (1 << level)
@@ -202,7 +202,7 @@ def track_translation(prev, cur, uv_prev, uv_cur, first_level, last_level, itera
             pu, pv = uv_prev[k, 0] * scale, uv_prev[k, 1] * scale
             cu, cv = u * scale, v * scale
             if not (_inside(image, pu, pv, HALF + 1.5) and _inside(target, cu, cv, HALF + 0.5)):
-                state = LEFT_IMAGE
+                state = OUTSIDE
                 continue
             _, contrast, hxx, hxy, hyy = _template(image, pu, pv, weights, raw, wide, tmp, patch, gx, gy)
             det = hxx * hyy - hxy * hxy
@@ -215,7 +215,7 @@ def track_translation(prev, cur, uv_prev, uv_cur, first_level, last_level, itera
             gain = 1.0
             for iteration in range(iterations):
                 if not _inside(target, cu, cv, HALF + 0.5):
-                    state = LEFT_IMAGE
+                    state = OUTSIDE
                     break
                 _sample(target, cu - HALF, cv - HALF, raw, window)
                 if iteration == 0 or iteration == 2:
@@ -242,7 +242,7 @@ def track_translation(prev, cur, uv_prev, uv_cur, first_level, last_level, itera
                     if ncc[k] < min_ncc:
                         state = UNLIKE
                 else:
-                    state = LEFT_IMAGE
+                    state = OUTSIDE
             if state != TRACKED:
                 break
             u, v = cu / scale, cv / scale

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from stereo_sfm.tracking.view import View
+from stereo_sfm.tracking.feature_view import FeatureView
 from stereo_sfm.types import I64, Bool
 
 
@@ -37,7 +37,7 @@ class PointIds:
             point = replaced
         return point
 
-    def inherit(self, view: View, reference: View, rows: I64) -> View:
+    def inherit(self, view: FeatureView, reference: FeatureView, rows: I64) -> FeatureView:
         """The view with ids of the reference for matched rows (M, 2) = (reference, view); an id is given only once."""
         ids, ages = view.ids.copy(), view.ages.copy()
         given = self.current(reference.ids[rows[:, 0]])
@@ -49,7 +49,7 @@ class PointIds:
         ages[rows[fresh, 1]] = reference.ages[rows[fresh, 0]] + 1
         return replace(view, ids=ids, ages=ages)
 
-    def give_new(self, view: View, only: Bool | None = None) -> View:
+    def give_new(self, view: FeatureView, only: Bool | None = None) -> FeatureView:
         """The view with a new id wherever there is none (and `only` allows it)."""
         ids = view.ids.copy()
         new = np.flatnonzero((ids < 0) if only is None else (ids < 0) & only)

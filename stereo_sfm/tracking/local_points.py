@@ -8,9 +8,9 @@ from typing import cast
 import numpy as np
 
 from stereo_sfm.geometry import se3
+from stereo_sfm.tracking.feature_view import FeatureView
 from stereo_sfm.tracking.features import Features
 from stereo_sfm.tracking.identity import PointIds
-from stereo_sfm.tracking.view import View
 from stereo_sfm.types import F32, F64, I64, U8, MapUpdate
 
 
@@ -23,7 +23,7 @@ class LocalPoints:
     descriptors: U8 | F32  # (N, D)
     limit: int = 4000
 
-    def add(self, view: View, odom_T_cam: F64) -> None:
+    def add(self, view: FeatureView, odom_T_cam: F64) -> None:
         """Take a keyframe's points; what is known already gets its newest descriptor and position."""
         rows = np.isfinite(view.points[:, 2]) & (view.ids >= 0)
         stays = ~np.isin(self.ids, view.ids[rows])

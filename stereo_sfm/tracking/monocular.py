@@ -18,6 +18,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.motion_only import bearing_errors, pose_covariance
 from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.timing import NoSpans
+from stereo_sfm.tracking.feature_view import FeatureView, ViewMaker, pixel_angle
 from stereo_sfm.tracking.features import feature_kind
 from stereo_sfm.tracking.identity import PointIds
 from stereo_sfm.tracking.local_points import LocalPoints
@@ -25,7 +26,6 @@ from stereo_sfm.tracking.matching import epipolar_inliers, match_features
 from stereo_sfm.tracking.mono_start import MIN_MATCHES, good_points, start_from
 from stereo_sfm.tracking.odometry.pnp import pnp_pose
 from stereo_sfm.tracking.outgoing import keyframe_of, observations_of
-from stereo_sfm.tracking.view import View, ViewMaker, pixel_angle
 from stereo_sfm.types import F64, I64, Bool, Frame, Keyframe, MapUpdate, StereoImage, TrackState
 
 _FIRST_VIEW_LASTS = 60  # frames that a first view waits for its partner
@@ -47,9 +47,9 @@ class MonocularTracker:
         self._pixel = pixel_angle(rig)
         self._ids = PointIds()
         self._local = LocalPoints(np.zeros(0, np.int64), np.zeros((0, 3)), self._kind.empty())
-        self._first: View | None = None
+        self._first: FeatureView | None = None
         self._first_stamp, self._first_age = 0, 0
-        self._keyframe: View | None = None
+        self._keyframe: FeatureView | None = None
         self._kf_id, self._submap = -1, 0
         self._odom_T_cam = np.eye(4)
         self._odom_T_kf = np.eye(4)
@@ -74,7 +74,7 @@ class MonocularTracker:
         if self._keyframe is not None:
             self._keyframe = self._with_positions(self._keyframe, self._odom_T_kf)
 
-    def _with_positions(self, view: View, odom_T_cam: F64) -> View:
+    def _with_positions(self, view: FeatureView, odom_T_cam: F64) -> FeatureView:
         """The view with its points where the local map has them; points that left the map are unknown again."""
         ids = self._ids.current(view.ids)
         points = se3.transform(se3.inverse(odom_T_cam), self._local.positions(ids))
@@ -92,7 +92,7 @@ class MonocularTracker:
 
     # -- start -----------------------------------------------------------------------------------------------------
 
-    def _start(self, image: StereoImage, view: View, rng: np.random.Generator) -> tuple[Frame, Keyframe | None]:
+    def _start(self, image: StereoImage, view: FeatureView, rng: np.random.Generator) -> tuple[Frame, Keyframe | None]:
         self._first_age += 1
         if self._first is None or self._first_age > _FIRST_VIEW_LASTS:
             return self._wait(image, view, "first_view", new_first=True)
@@ -118,7 +118,7 @@ class MonocularTracker:
         state = TrackState.OK if self._submap == 0 else TrackState.RESTARTED
         return self._frame(image, self._keyframe, len(rows), state, "", True, np.eye(6)), keyframe
 
-    def _wait(self, image: StereoImage, view: View, reason: str, new_first: bool) -> tuple[Frame, None]:
+    def _wait(self, image: StereoImage, view: FeatureView, reason: str, new_first: bool) -> tuple[Frame, None]:
         if new_first:
             self._first, self._first_stamp, self._first_age = view, image.stamp_ns, 0
         state = TrackState.INITIALIZING if self._submap == 0 else TrackState.LOST
@@ -126,7 +126,7 @@ class MonocularTracker:
 
     # -- tracking --------------------------------------------------------------------------------------------------
 
-    def _track(self, image: StereoImage, view: View, rng: np.random.Generator) -> tuple[Frame, Keyframe | None]:
+    def _track(self, image: StereoImage, view: FeatureView, rng: np.random.Generator) -> tuple[Frame, Keyframe | None]:
         assert self._keyframe is not None
         rows = match_features(self._keyframe.features, view.features, self._kind.norm, self._config.features.ratio)
         known = rows[np.isfinite(self._keyframe.points[rows[:, 0], 2])]
@@ -171,7 +171,7 @@ class MonocularTracker:
             return True
         return self._frames_since_kf > o.keyframe_min_frames and inliers < o.keyframe_min_inliers
 
-    def _new_keyframe_view(self, view: View, rows: I64, rng: np.random.Generator) -> View:
+    def _new_keyframe_view(self, view: FeatureView, rows: I64, rng: np.random.Generator) -> FeatureView:
         """Known points found again, then new ones from the matches with the last keyframe that have none yet."""
         view = self._find_again(view)
         assert self._keyframe is not None
@@ -192,7 +192,7 @@ class MonocularTracker:
         view = replace(view, points=positions)
         return self._ids.give_new(view, only=np.isfinite(positions[:, 2]) & (view.ids < 0))
 
-    def _find_again(self, view: View) -> View:
+    def _find_again(self, view: FeatureView) -> FeatureView:
         """Ids for points of earlier keyframes that reproject to a feature of the view with a similar descriptor."""
         free = np.flatnonzero(view.ids < 0)
         absent = np.flatnonzero(~np.isin(self._local.ids, view.ids))
@@ -213,7 +213,7 @@ class MonocularTracker:
         ages[row[near]] = 1
         return replace(view, ids=ids, ages=ages)
 
-    def _lose(self, image: StereoImage, view: View, reason: str) -> tuple[Frame, None]:
+    def _lose(self, image: StereoImage, view: FeatureView, reason: str) -> tuple[Frame, None]:
         """Stay where the motion was going and look for the keyframe again; after a while begin a new map."""
         self._lost += 1
         if self._lost <= 3:
@@ -228,7 +228,7 @@ class MonocularTracker:
 
     # -- messages --------------------------------------------------------------------------------------------------
 
-    def _enter(self, view: View, stamp_ns: int, odom_T_cam: F64) -> Keyframe:
+    def _enter(self, view: FeatureView, stamp_ns: int, odom_T_cam: F64) -> Keyframe:
         self._kf_id += 1
         self._local.add(view, odom_T_cam)
         self._keyframe, self._odom_T_kf = view, odom_T_cam
@@ -237,7 +237,14 @@ class MonocularTracker:
         return keyframe_of(view, stamp_ns, self._kf_id, odom_T_cam, self._submap)
 
     def _frame(
-        self, image: StereoImage, view: View, inliers: int, state: TrackState, reason: str, is_kf: bool, covariance: F64
+        self,
+        image: StereoImage,
+        view: FeatureView,
+        inliers: int,
+        state: TrackState,
+        reason: str,
+        is_keyframe: bool,
+        covariance: F64,
     ) -> Frame:
         return Frame(
             frame_id=image.frame_id,
@@ -250,7 +257,7 @@ class MonocularTracker:
             reference_kf_id=self._kf_id,
             kf_T_cam=se3.inverse(self._odom_T_kfs.get(self._kf_id, np.eye(4))) @ self._odom_T_cam,
             map_version=self._map_version,
-            is_keyframe=is_kf,
+            is_keyframe=is_keyframe,
             stats={"features": float(len(view)), "inliers": float(inliers)},
         )
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from stereo_sfm.tracking.descriptors import describe
-from stereo_sfm.tracking.view import View
+from stereo_sfm.tracking.feature_view import FeatureView
 from stereo_sfm.types import F64, Keyframe, Observations
 
 
-def observations_of(view: View) -> Observations:
+def observations_of(view: FeatureView) -> Observations:
     """Rows with an id; those that were seen before are the inliers of the pose."""
     rows = view.ids >= 0
     return Observations(
@@ -15,7 +15,7 @@ def observations_of(view: View) -> Observations:
     )
 
 
-def keyframe_of(view: View, stamp_ns: int, kf_id: int, odom_T_cam: F64, submap_id: int) -> Keyframe:
+def keyframe_of(view: FeatureView, stamp_ns: int, kf_id: int, odom_T_cam: F64, submap_id: int) -> Keyframe:
     """A keyframe with binary descriptors, whatever the tracker matches by, and no corners to recognise it by."""
     rows = view.ids >= 0
     uv = view.features.uv[rows]

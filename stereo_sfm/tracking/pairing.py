@@ -6,11 +6,11 @@ import numpy as np
 
 from stereo_sfm.config import FeaturesConfig
 from stereo_sfm.geometry.motion_only import bearing_errors
+from stereo_sfm.tracking.feature_view import FeatureView
 from stereo_sfm.tracking.features import feature_kind
 from stereo_sfm.tracking.identity import PointIds
 from stereo_sfm.tracking.matching import epipolar_inliers, match_features
 from stereo_sfm.tracking.odometry.base import FramePair
-from stereo_sfm.tracking.view import View
 from stereo_sfm.types import F64, I64
 
 _RECOVER_PX = 4.0  # how near a keyframe's point must reproject to be taken for the same point
@@ -25,7 +25,7 @@ class Pairing:
         self._norm = feature_kind(config.kind).norm
         self._pixel = pixel_rad
 
-    def match(self, reference: View, view: View, rng: np.random.Generator) -> I64:
+    def match(self, reference: FeatureView, view: FeatureView, rng: np.random.Generator) -> I64:
         """(M, 2) rows of both views; by configuration only those that agree with one epipolar geometry."""
         config = self._config
         rows = match_features(reference.features, view.features, self._norm, config.ratio)
@@ -37,7 +37,7 @@ class Pairing:
             return rows
         return rows[epipolar_inliers(a, b, 2 * config.epipolar_px * self._pixel, rng)]
 
-    def pair(self, reference: View, view: View, rows: I64) -> FramePair:
+    def pair(self, reference: FeatureView, view: FeatureView, rows: I64) -> FramePair:
         """Matched rows (M, 2) as the estimators want them."""
         a, b = rows[:, 0], rows[:, 1]
         return FramePair(
@@ -54,7 +54,7 @@ class Pairing:
             frame_id_now=view.frame_id,
         )
 
-    def recover(self, keyframe: View, view: View, now_T_kf: F64, ids: PointIds) -> View:
+    def recover(self, keyframe: FeatureView, view: FeatureView, now_T_kf: F64, ids: PointIds) -> FeatureView:
         """Ids for points of the last keyframe that were missed in between: descriptor and position agree.
 
         Args:

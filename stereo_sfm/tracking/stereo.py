@@ -93,11 +93,10 @@ class StereoMatcher:
 
     def _search(self, left: flow.Pyramid, right: flow.Pyramid, uv: F64) -> F64:
         """Right pixels (N, 2) to the pixel of the search level, NaN where nothing is alike."""
-        found, _ = search_epipolar(
+        return search_epipolar(
             left[SEARCH_LEVEL], right[SEARCH_LEVEL], uv, 2.0**SEARCH_LEVEL, *self._eyes.cams,
             self._eyes.right_T_left, self._min_depth, self._candidates, 25.0, 1.2,
         )  # fmt: skip
-        return found
 
     def _triangulated(self, uv: F64, uv_right: F64, good: Bool, max_epipolar_px: float, least: float) -> StereoMatch:
         """`least`: inverse distance in its sigmas; a far point may come out behind the camera by noise."""

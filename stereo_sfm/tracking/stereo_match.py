@@ -29,11 +29,10 @@ def search_epipolar(
             the best, must be at least this much larger.
 
     Returns:
-        (N, 2) px of the full right image, NaN without a clear best; (N,) inverse distance.
+        (N, 2) px of the full right image, NaN without a clear best.
     """
     n = uv.shape[0]
     out = np.full((n, 2), np.nan)
-    inverse = np.full(n, np.nan)
     h, w = left.shape
     hr, wr = right.shape
     cost = np.empty(candidates)
@@ -98,8 +97,7 @@ def search_epipolar(
             continue
         out[k, 0] = bu + uv[k, 0] - iu * scale
         out[k, 1] = bv + uv[k, 1] - iv * scale
-        inverse[k] = best_index / (candidates - 1.0) / min_depth
-    return out, inverse
+    return out
 
 
 @njit

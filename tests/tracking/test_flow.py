@@ -92,7 +92,7 @@ def test_nan_and_outside_are_refused() -> None:
     uv = np.array([[100.0, 100.0], [1.0, 1.0], [150.0, 90.0]])
     guess = np.array([[np.nan, 100.0], [1.0, 1.0], [5000.0, -70.0]])
     status, _ = flow.track_translation(pyramid, pyramid, uv, guess, 2, 0, 10, 2.0, 0.6, flow.WEIGHTS)
-    assert (status == flow.LEFT_IMAGE).all()
+    assert (status == flow.OUTSIDE).all()
 
 
 def test_corners_keep_their_distance_and_the_mask() -> None:

@@ -13,11 +13,11 @@ from stereo_sfm.geometry.homography import PLANAR_RATIO, homographies, homograph
 from stereo_sfm.geometry.motion_only import refine_pose
 from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.geometry.two_view import essential_from_motion
+from stereo_sfm.tracking.feature_view import FeatureView
 from stereo_sfm.tracking.features import Features
 from stereo_sfm.tracking.identity import PointIds
 from stereo_sfm.tracking.local_points import LocalPoints, row_of
 from stereo_sfm.tracking.mono_start import TwoViewStart, good_points, start_from
-from stereo_sfm.tracking.view import View
 from stereo_sfm.types import F64, MapUpdate
 from tests.tracking.synthetic_views import PIXEL, unit
 
@@ -134,10 +134,10 @@ def test_motion_only_adjustment_is_exact_and_refuses_what_it_cannot() -> None:
         refine_pose(np.repeat(points[:1], 9, 0), np.repeat(bearings[:1], 9, 0), near, PIXEL)
 
 
-def some_view(ids: list[int], points: F64) -> View:
+def some_view(ids: list[int], points: F64) -> FeatureView:
     n = len(ids)
     features = Features(np.zeros((n, 2)), np.full((n, 32), 7, np.uint8))
-    return View(
+    return FeatureView(
         0, np.zeros((4, 4), np.uint8), features, unit(points), np.full((n, 2), np.nan), points, np.ones(n),
         np.array(ids, np.int64), np.zeros(n, np.int32),
     )  # fmt: skip

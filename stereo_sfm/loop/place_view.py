@@ -13,7 +13,7 @@ from stereo_sfm.types import F64, I64, U8, Bool, Keyframe
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class PlaceView:
     """N described pixels: corners tell whether a place is the same, points are what two sides of a loop share."""
 
     ids: I64  # (N,) point ids; corners that are no points have -1
@@ -25,7 +25,7 @@ class View:
     corner: Bool  # (N,) of `Keyframe.corners`; False: a point
 
 
-def view_of(keyframe: Keyframe, rig: Rig, disparity_sigma: float) -> View:
+def place_view_of(keyframe: Keyframe, rig: Rig, disparity_sigma: float) -> PlaceView:
     """Corners of a keyframe, then its points."""
     c = keyframe.corners
     uv_left = np.concatenate([c.uv_left, keyframe.uv_left], dtype=np.float64)
@@ -35,7 +35,7 @@ def view_of(keyframe: Keyframe, rig: Rig, disparity_sigma: float) -> View:
     ids = np.concatenate([np.full(len(c), -1, np.int64), keyframe.point_ids])
     corner = np.arange(len(ids)) < len(c)
     rows = binary.present(descriptors)
-    return View(
+    return PlaceView(
         ids[rows],
         uv_left[rows],
         uv_right[rows],

@@ -19,7 +19,7 @@ MIN_DISPARITY_PX = 0.5  # below, the depth is treated as unknown
 
 
 @dataclass(frozen=True, eq=False)
-class View(Message):
+class FeatureView(Message):
     """Features of one frame, one row each, in the left eye."""
 
     frame_id: int
@@ -71,7 +71,7 @@ class ViewMaker:
         right_T_left = se3.inverse(rig.left_T_right)
         self._essential = essential_from_motion(right_T_left[:3, :3], right_T_left[:3, 3]) if rig.stereo else None
 
-    def make(self, image: StereoImage, mask: U8 | None, rng: np.random.Generator) -> View:
+    def make(self, image: StereoImage, mask: U8 | None, rng: np.random.Generator) -> FeatureView:
         """Features of the left eye; with stereo only those that the other eye confirms (retail paper, IV-A3)."""
         features = self._left.extract(image.left, mask)
         bearings = self._rig.left.unproject(features.uv)
@@ -87,7 +87,7 @@ class ViewMaker:
             features, bearings, points, right = features.rows(known), bearings[known], points[known], right[known]
         sigmas = range_sigmas(points, self._rig) if self._rig.stereo else np.full(len(features), np.nan)
         ids, ages = np.full(len(features), -1, np.int64), np.zeros(len(features), np.int32)
-        return View(image.frame_id, image.left, features, bearings, right, points, sigmas, ids, ages)
+        return FeatureView(image.frame_id, image.left, features, bearings, right, points, sigmas, ids, ages)
 
     def _stereo(self, right_image: U8, features: Features, bearings: F64, rng: np.random.Generator) -> tuple[F64, F64]:
         """(N, 3) points and (N, 2) right pixels, NaN where unmatched."""
