@@ -7,8 +7,14 @@ from pathlib import Path
 
 import cv2
 import pytest
+from hypothesis import settings
 
 cv2.setNumThreads(1)
+
+# The same examples in every run; HYPOTHESIS_PROFILE=search looks for new ones.
+settings.register_profile("same", derandomize=True)
+settings.register_profile("search", derandomize=False, max_examples=500)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 
 
 def _data_root() -> Path | None:

@@ -158,13 +158,16 @@ def unproject_one(model, p, u, v):
 
 @njit
 def _kb_theta(p, d):
-    """Solve theta * (1 + k1 theta^2 + ...) = d on [0, limit] by Newton steps kept inside a shrinking bracket."""
+    """Solve theta * (1 + k1 theta^2 + ...) = d on [0, limit] by Newton steps kept inside a shrinking bracket.
+
+    A step that is not at most half as long as the one before goes to the middle: near the limit Newton may cycle.
+    """
     lo, hi = 0.0, p[12]
     h2 = hi * hi
     if d > hi * (1 + h2 * (p[4] + h2 * (p[5] + h2 * (p[6] + h2 * p[7])))):
         return math.nan
-    theta = min(d, hi)
-    for _ in range(60):
+    theta, before = min(d, hi), hi
+    for _ in range(100):
         t2 = theta * theta
         f = theta * (1 + t2 * (p[4] + t2 * (p[5] + t2 * (p[6] + t2 * p[7])))) - d
         if f > 0:
@@ -173,9 +176,10 @@ def _kb_theta(p, d):
             lo = theta
         df = 1 + t2 * (3 * p[4] + t2 * (5 * p[5] + t2 * (7 * p[6] + t2 * 9 * p[7])))
         new = theta - f / df if df > 1e-12 else 0.5 * (lo + hi)
-        if not (lo <= new <= hi):
+        if not (lo <= new <= hi) or abs(new - theta) > max(0.5 * before, 1e-12):
             new = 0.5 * (lo + hi)
-        if abs(new - theta) < 1e-15:
+        before = abs(new - theta)
+        if before < 1e-15:
             return new
         theta = new
     return theta
