@@ -82,12 +82,10 @@ def _size(path: Path, entries: dict[str, list[float]], index: int) -> tuple[int,
         width, height = numbers(stated, 2)
         return int(width), int(height)
     folders = (path.parent / f"image_{index}", path.parent / f"image_{index:02d}" / "data")
-    picture = next((p for f in folders if f.is_dir() for p in sorted(f.glob("*.png"))), None)
-    if picture is None:
-        raise ValueError("it does not state the image size and no image lies beside it: give the size")
     import cv2
 
-    image = cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE)
+    pictures = (p for f in folders if f.is_dir() for p in sorted(f.glob("*.png"))[:20])
+    image = next((i for p in pictures if (i := cv2.imread(str(p), cv2.IMREAD_GRAYSCALE)) is not None), None)
     if image is None:
-        raise ValueError(f"cannot read {picture} to learn the image size")
+        raise ValueError("it does not state the image size and no image that can be read lies beside it")
     return image.shape[1], image.shape[0]

@@ -135,7 +135,7 @@ def _pairs(reference: F64, delta: str) -> metrics.I64:
 def _leaning(result: Evaluation) -> str:
     """Said where positions hardly say how the paths lie to each other about their own direction."""
     spread = np.linalg.svd(result.reference.positions - result.reference.positions.mean(0), compute_uv=False)
-    straight = result.mode != "origin" and spread[1] < STRAIGHT * spread[0]
+    straight = result.mode != "origin" and len(spread) > 1 and spread[1] < STRAIGHT * spread[0]
     return " (the path is nearly straight: the alignment leaves the turn about it open)" if straight else ""
 
 

@@ -14,7 +14,7 @@ from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.pipeline.stages import make_closer
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.tracking.factory import make_tracker
-from stereo_sfm.types import F64, U8, Keyframe, StereoImage
+from stereo_sfm.types import F64, U8, Corners, Keyframe, StereoImage
 
 FRAMES, POINTS = 8, 300
 WALL = 2.0  # metres ahead
@@ -65,7 +65,10 @@ def keyframes(rig: Rig) -> list[Keyframe]:
             right = rig.right.project(se3.transform(se3.inverse(rig.left_T_right), points_cam))
         ids = np.arange(len(points)) + (k % 2) * 20 + (k >= FRAMES // 2) * 10_000
         uv_left = rig.left.project(points_cam)
-        out.append(Keyframe(k, k, k * 100_000_000, odom_T_cam, ids, uv_left, right, points_cam, descriptors))
+        small = [a.astype(np.float32) for a in (uv_left, right, points_cam)]
+        corners = Corners(small[0], small[1], small[2], descriptors)
+        stamp_ns = k * 100_000_000
+        out.append(Keyframe(k, k, stamp_ns, odom_T_cam, ids, uv_left, right, points_cam, descriptors, corners=corners))
     return out
 
 

@@ -7,7 +7,6 @@ import subprocess
 import sys
 
 import numpy as np
-import pytest
 
 from calib.rig import Rig
 from stereo_sfm.geometry.cameras import Pinhole
@@ -38,7 +37,6 @@ print(*sorted(set(late)))
 """
 
 
-@pytest.mark.slow
 def test_nothing_is_compiled_after_the_warm_up() -> None:
     child = subprocess.run([sys.executable, "-c", CHILD], capture_output=True, text=True, env=dict(os.environ))
     assert child.returncode == 0, child.stderr
