@@ -128,9 +128,9 @@ class ProcessRun:
         """Ask capture to end; everything in flight is finished and written."""
         if not self._stopping:
             self._stopping = True
-            with contextlib.suppress(OSError):
-                self._controls["capture"].send("stop")
-            self._wake.send("stop")
+            for connection in (self._controls["capture"], self._wake):
+                with contextlib.suppress(OSError):  # capture is gone, or the whole run
+                    connection.send("stop")
 
     def __iter__(self) -> Iterator[Frame]:
         while self._reports:

@@ -228,6 +228,12 @@ def test_a_stop_is_heard_though_no_image_comes(monkeypatch: pytest.MonkeyPatch, 
     assert len(load_map(tmp_path / "map")) >= 1
 
 
+def test_a_stop_that_comes_too_late_is_no_error() -> None:
+    with ProcessRun(functools.partial(SlidingWall, 5), CONFIG) as run:
+        assert len(list(run)) == 5
+    run.stop()
+
+
 def test_a_stage_that_dies_before_it_is_set_up_is_named(tmp_path: Path) -> None:
     run = ProcessRun(functools.partial(SlidingWall, 50), CONFIG, log=LogOptions(tmp_path / "run.mcap", "none"))
 
