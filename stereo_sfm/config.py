@@ -188,9 +188,7 @@ STAGES = ("capture", "tracker", "mapper", "loop", "optimizer", "logger", "viewer
 class PipelineConfig:
     """How the stages are wired (pipeline/)."""
 
-    update_lag_frames: int = within(
-        1, 10_000, 5
-    )  # a keyframe's MapUpdate is applied just before this many frames later
+    update_lag_frames: int = within(1, 10_000, 5)  # a keyframe's MapUpdate is applied before this many frames later
     loop_lag_keyframes: int = 2  # a keyframe's LoopResult reaches the mapper this many keyframes later
     ring_slots: int = above_zero(8)  # image pairs in shared memory between capture and the stages
     threads: int = above_zero(1)  # of OpenCV and BLAS in each process

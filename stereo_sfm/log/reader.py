@@ -179,28 +179,27 @@ class LogReader:
 
     def stamps(self, topic: str) -> I64:
         """Log times of a topic in ascending order, from the index alone where the file has one."""
+        indexed = self._indexed_times(topic)
+        if indexed is None:
+            return np.array([r.log_time for r in self.messages([topic])], np.int64)
+        return np.sort(np.concatenate([np.zeros(0, np.int64), *indexed]))
+
+    def step_back_ns(self, topic: str) -> int:
+        """How far the log time goes back at most from one message of a topic to the next; 0 without an index."""
+        return max((int(-np.diff(times).min(initial=0)) for times in self._indexed_times(topic) or []), default=0)
+
+    def _indexed_times(self, topic: str) -> list[I64] | None:
+        """Log times of each channel of a topic in file order, None where the file has no index of its messages."""
         chunks = self.summary.chunk_indexes
         if not chunks or any(not c.message_index_offsets for c in chunks):
-            return np.array([r.log_time for r in self.messages([topic])], np.int64)
+            return None
         if self._times is None:
             try:
                 self._times = self._read_message_indexes()
             except scan.DAMAGE as error:
                 raise self._damaged(error) from None
         ids = [c.id for c in self.summary.channels.values() if c.topic == topic]
-        return np.sort(np.concatenate([self._times.get(i, np.zeros(0, np.int64)) for i in ids] or [[]])).astype(
-            np.int64
-        )
-
-    def step_back_ns(self, topic: str) -> int:
-        """How far the log time of a topic's messages goes back at most from one to the next in the file."""
-        chunks = self.summary.chunk_indexes
-        if not chunks or any(not c.message_index_offsets for c in chunks):
-            return 0
-        self.stamps(topic)
-        ids = [c.id for c in self.summary.channels.values() if c.topic == topic]
-        steps = [np.diff(self._times[i]) for i in ids if self._times is not None and i in self._times]
-        return max((int(-step.min(initial=0)) for step in steps), default=0)
+        return [self._times[i] for i in ids if i in self._times]
 
     def _read_message_indexes(self) -> dict[int, I64]:
         """Log times per channel. Behind each chunk lies a record per channel: opcode, length, channel, size, pairs."""

@@ -135,7 +135,7 @@ def run_inline(
     run = InlineRun(source, config, sinks, schedule, folders, jpeg)
     with Listener("main", run.hear), limited_threads(config.pipeline.threads):
         images, failure = iter(source), None
-        while failure is None:
+        while True:
             try:
                 image = next(images)
             except StopIteration:

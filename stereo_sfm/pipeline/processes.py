@@ -336,11 +336,10 @@ class ProcessRun:
         if stage == "viewer":  # closed or crashed: the run does not care
             self._ended.add(stage)
             return
-        if stage == "capture" and self._stopping:
-            self._end(connection, stage)
-            return
-        if stage == "capture" and not self._waiting:
-            self._failure = StageDied(f"the capture process {self._how_it_died(stage)}; {self._what_remains(stage)}")
+        if stage == "capture" and (self._stopping or not self._waiting):
+            if not self._stopping:
+                died = self._how_it_died(stage)
+                self._failure = StageDied(f"the {stage} process {died}; {self._what_remains(stage)}")
             self._end(connection, stage)
             return
         self._processes[stage].join(0.5)
