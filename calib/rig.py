@@ -12,6 +12,7 @@ from stereo_sfm.types import F64
 
 BASELINES = 1e-4, 100.0  # metres that the eyes can be apart
 MOST_PIXELS = 10**8
+MOST_READOUT_S = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +31,7 @@ class Rig:
     depth: bool = False  # RGB-D: the right eye is virtual, u_right = u_left - fx * baseline / depth
     name: str = ""
     serial: str = ""
+    readout_s: float = 0.0  # rolling shutter: seconds from the first row's exposure to the last's; 0: all at once
 
     def __post_init__(self) -> None:
         for transform in (self.left_T_right, self.body_T_left):
@@ -43,6 +45,11 @@ class Rig:
         for eye, camera in (("left", self.left), ("right", self.right)):
             if camera is not None:
                 _check_camera(eye, camera)
+        if not 0 <= self.readout_s <= MOST_READOUT_S:
+            raise StereoSfmError(
+                f"calibration has a readout of {self.readout_s:g} s: seconds from the first row to the last are meant, "
+                "0 for a global shutter"
+            )
         if self.right is not None and not BASELINES[0] <= self.baseline <= BASELINES[1]:
             raise StereoSfmError(
                 f"calibration has a baseline of {self.baseline:g} m: the distance between the eyes in metres is meant"

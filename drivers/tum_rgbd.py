@@ -7,6 +7,7 @@ The depth images are registered to the colour images as the camera delivers them
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ log = logging.getLogger("stereo_sfm")
 
 DEPTH_SCALE = 5000.0  # stored units a metre
 MAX_SKEW_NS = 20_000_000  # colour and depth within 20 ms, as the benchmark's own tools
+READOUT_S = 0.028  # of these cameras' rolling shutter, as Kerl et al. (ICCV 2015) model it
 VIRTUAL_BASELINE = 0.08  # metres, close to the structured-light baseline of the sensor
 
 # fx fy cx cy, k1 k2 p1 p2 k3 of the colour cameras, from the benchmark's calibration page
@@ -60,13 +62,13 @@ def with_virtual_eye(rig: Rig) -> Rig:
         return rig
     left_T_right = np.eye(4)
     left_T_right[0, 3] = VIRTUAL_BASELINE
-    return Rig(rig.left, rig.left, left_T_right, rig.body_T_left.copy(), depth=True, name=rig.name, serial=rig.serial)
+    return replace(rig, right=rig.left, left_T_right=left_T_right, body_T_left=rig.body_T_left.copy(), depth=True)
 
 
 def _own_rig(folder: Path, label: str) -> Rig:
     for key, (fx, fy, cx, cy, *distortion) in INTRINSICS.items():
         if key in label:
-            return Rig(RadTan(640, 480, fx, fy, cx, cy, tuple(distortion)), name=f"tum_rgbd {key}")
+            return Rig(RadTan(640, 480, fx, fy, cx, cy, tuple(distortion)), name=f"tum_rgbd {key}", readout_s=READOUT_S)
     raise StereoSfmError(
         f"{folder}: the folder's name does not say which camera took it ({', '.join(INTRINSICS)}): give --rig FILE"
     )

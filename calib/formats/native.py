@@ -26,6 +26,7 @@ def read_native(path: Path) -> Rig:
             depth=bool(data.get("depth", False)),
             name=str(data.get("name", "")),
             serial=str(data.get("serial", "")),
+            readout_s=float(data.get("readout_s", 0.0)),
         )
 
 
@@ -38,6 +39,7 @@ def write_native(rig: Rig, path: Path) -> None:
             "name": rig.name,
             "serial": rig.serial,
             "depth": rig.depth,
+            "readout_s": float(rig.readout_s),
             "left": _plain(rig.left),
             "right": _plain(rig.right) if rig.right else None,
             "left_T_right": rows(rig.left_T_right),

@@ -86,8 +86,9 @@ def _gaps(boxes: F64, origin: F64) -> F64:
     return np.linalg.norm(np.maximum(np.maximum(boxes[:, :3] - origin, origin - boxes[:, 3:]), 0), axis=1)
 
 
-def _near(world: Tables, origin: F64) -> Near:
-    groups, blocks = _gaps(world.groups, origin), _gaps(world.blocks, origin)
+def _near(world: Tables, origin: F64, reach: float) -> Near:
+    """`reach`: metres that an eye moves about the origin while its rows are read."""
+    groups, blocks = (np.maximum(_gaps(boxes, origin) - reach, 0) for boxes in (world.groups, world.blocks))
     order = np.argsort(groups, kind="stable")
     member = np.repeat(np.arange(len(groups)), np.diff(world.groups_i, axis=1).ravel())
     inside = np.lexsort((np.arange(len(blocks)), blocks, member))
@@ -103,12 +104,15 @@ class Renderer:
         self._ts, self._hits = np.empty(SCRATCH), np.empty(SCRATCH, np.int64)
 
     def render(self, world_T_cam: F64, moving: Moving = NOTHING) -> tuple[View, View]:
-        """Both eyes at a pose of the left eye (4, 4); the second is the first for a single camera."""
+        """Both eyes at a pose of the left eye; the second is the first for a single camera.
+
+        `world_T_cam`: (4, 4), or with a rolling shutter one for each row (H, 4, 4).
+        """
         left = self.view(0, world_T_cam, moving)
         return left, self.view(1, world_T_cam @ self.rig.left_T_right, moving) if len(self.eyes) > 1 else left
 
     def view(self, eye: int, world_T_eye: F64, moving: Moving = NOTHING) -> View:
-        """One eye at its own pose (4, 4)."""
+        """One eye at its own pose (4, 4), or poses of its rows (H, 4, 4)."""
         rays, shape = self.eyes[eye], self.eyes[eye].grid.shape[:2]
         view = View(
             np.zeros(shape, np.float32),
@@ -144,21 +148,26 @@ class Renderer:
         view: View,
     ) -> None:
         """Write flat `pixels` of the view: the mean over rays at `offsets` (K, 2) px and `keep` times the old value."""
-        pose = np.ascontiguousarray(world_T_eye, float)
-        near = _near(self.world, pose[:3, 3])
+        poses = np.ascontiguousarray(world_T_eye, float).reshape(-1, 4, 4)  # one, or one for each row
+        origins = poses[:, :3, 3]
+        middle = origins[len(origins) // 2]
+        near = _near(self.world, middle, float(np.linalg.norm(origins - middle, axis=1).max()))
         flat = [a.reshape(-1, 3) for a in (rays.grid, rays.du, rays.dv)]
         out = [a.reshape(-1) for a in (view.image, view.depth, view.ids)]
-        cast(
-            self.world,
-            moving,
-            near,
-            pose,
-            pixels,
-            offsets,
-            float(keep),
-            *flat,
-            rays.angles.ravel(),
-            *out,
-            self._ts,
-            self._hits,
-        )
+        height, width = view.image.shape
+        rows = np.searchsorted(pixels, width * np.arange(height + 1)) if len(poses) > 1 else (0, len(pixels))
+        for pose, first, last in zip(poses, rows[:-1], rows[1:], strict=True):
+            cast(
+                self.world,
+                moving,
+                near,
+                pose,
+                pixels[first:last],
+                offsets,
+                float(keep),
+                *flat,
+                rays.angles.ravel(),
+                *out,
+                self._ts,
+                self._hits,
+            )

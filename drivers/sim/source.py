@@ -46,6 +46,7 @@ class SimOptions:
     drop: float = 0.0  # fraction of frames lost
     noise: float = 1.0  # scales the sensor's noise
     blur: float = 1.0  # scales the exposure time
+    readout: float = 0.0  # seconds from the first row's exposure to the last's: a rolling shutter
     dark: str = ""  # FROM-TO in seconds: when the lights are out
     effects: bool = True  # off: clean pictures
     realtime: bool = False  # frames come by the clock
@@ -65,7 +66,8 @@ def _read(name: str, kind: Any, value: Any) -> Any:
 
 _WANTED = {bool: "on or off", int: "a whole number", float: "a number", str: "text"}
 _RANGES = {"length": (0, 10000), "start": (0, 10**7), "frames": (0, 10**7), "rate": (1, 1000), "exchange": (0, 1),
-           "drop": (0, 0.9), "noise": (0, 20), "blur": (0, 10), "speed": (0, 5), "vibration": (0, 10),
+           "drop": (0, 0.9), "noise": (0, 20), "blur": (0, 10), "readout": (0, 0.1),
+           "speed": (0, 5), "vibration": (0, 10),
            "people": (-1, 60), "seed": (0, 2**31), "walk": (0, 1000)}  # fmt: skip
 
 
@@ -140,7 +142,7 @@ class SimSource:
         self.name = f"sim:{name}"
         self.options = options
         self.live = options.realtime
-        self.rig = make_rig(options.camera, _size(options.size))
+        self.rig = dataclasses.replace(make_rig(options.camera, _size(options.size)), readout_s=options.readout)
         self.layout = scene.layout
         self.effects = _effects(scene, options)
         self._dark = _interval(options.dark)
@@ -195,16 +197,26 @@ class SimSource:
         """world_T_cam0 (4, 4) of a frame."""
         return self.walk.poses(np.array([frame_id / self.options.rate]))[0]
 
+    def row_poses(self, frame_id: int) -> F64:
+        """world_T_cam0 of the rows of a frame: (H, 4, 4), or (4, 4) where all are exposed at once."""
+        if self.options.readout == 0:
+            return self.pose(frame_id)
+        seconds = self.options.readout * np.linspace(-0.5, 0.5, self.rig.left.height)
+        return self.walk.poses(frame_id / self.options.rate + seconds)
+
     def clean(self, frame_id: int) -> tuple[View, View]:
         """Brightness, depth and surfaces of a frame without the sensor's faults."""
-        return self.view(self.pose(frame_id), frame_id / self.options.rate)
+        return self.view(self.row_poses(frame_id), frame_id / self.options.rate)
 
     def view(self, world_T_cam: F64, seconds: float = 0.0) -> tuple[View, View]:
-        """Brightness, depth and surfaces from any pose (4, 4), people as they are at `seconds`."""
+        """Brightness, depth and surfaces from a pose (4, 4) or poses of rows (H, 4, 4), people as at `seconds`."""
         return self.renderer.render(world_T_cam, figures(self.world, self.people, seconds))
 
     def picture(self, world_T_cam: F64, frame_id: int = 0, twist: F64 | None = None) -> StereoImage:
-        """What the sensor gives at any pose (4, 4), moving by `twist` (6,) a second in camera axes, as that frame."""
+        """What the sensor gives at any pose, moving by `twist` (6,) a second in camera axes, as that frame.
+
+        `world_T_cam`: (4, 4), or (H, 4, 4) of the rows.
+        """
         o, seconds = self.options, frame_id / self.options.rate
         twist = np.zeros(6) if twist is None else twist
         twists = [twist, se3.adjoint(se3.inverse(self.rig.left_T_right)) @ twist]
@@ -223,7 +235,7 @@ class SimSource:
         seconds, step = frame_id / self.options.rate, 1e-4
         before, after = self.walk.poses(np.array([seconds - step, seconds + step]))
         twist = se3.log(se3.inverse(before) @ after) / (2 * step)
-        image = self.picture(self.pose(frame_id), frame_id, twist)
+        image = self.picture(self.row_poses(frame_id), frame_id, twist)
         return dataclasses.replace(image, dropped_before=dropped_before)
 
     def __enter__(self) -> Self:

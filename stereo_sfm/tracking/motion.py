@@ -5,6 +5,11 @@ pose is solved by iteratively re-weighted Gauss-Newton on the pixels of both ima
 form (the four residuals of a point share one unknown: a rank-one update, Sherman-Morrison), so that a point whose
 distance is uncertain still gives rotation at full weight. Robust weights are Cauchy, narrowed in steps
 (graduated non-convexity, Yang et al., RA-L 5, 2020, with a Cauchy kernel).
+
+Where rows are exposed one after the other (a rolling shutter), each point is seen from where the camera was at the time
+of its row: pose @ exp(seconds * velocity). The velocity is solved with the pose (Ait-Aider et al., Simultaneous object
+pose and velocity computation using a single view from a rolling shutter camera, ECCV 2006), held by the mean since the
+last frame.
 """
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportMissingTypeArgument=false
@@ -107,18 +112,22 @@ def _compose(a, b):
 
 @njit
 def _normal_equations(
-    pose, origin, direction, rho, variance, uv_l, uv_r, cams, right_T_left, sigma, scale, normal, rhs, error
-):
+    pose, velocity, row_s, origin, direction, rho, variance, uv_l, uv_r, cams, right_T_left, sigma, scale, normal, rhs,
+    error,
+):  # fmt: skip
     """Sums over all points, each with its distance marginalised; a robust weight by a Cauchy kernel of `scale` sigmas.
 
     Args:
-        normal (6, 6), rhs (6,), error (N,): overwritten; see `optimise_pose`.
+        normal (n, n), rhs (n,), error (N,): overwritten; see `optimise_pose`. n is 6, with a rolling shutter 12.
 
     Returns:
         The sum of the weights.
     """
     res, jac, ray, jr = np.zeros(4), np.zeros((4, 6)), np.zeros(4), np.zeros(6)
+    gradient, block = np.zeros(6), np.zeros((6, 6))  # of one point
+    rolling = len(row_s) > 0
     inv_s2 = 1.0 / (sigma * sigma)
+    seen_from = pose
     used = 0.0
     normal[:] = 0.0
     rhs[:] = 0.0
@@ -128,8 +137,10 @@ def _normal_equations(
         py = origin[k, 1] + direction[k, 1] * ir
         pz = origin[k, 2] + direction[k, 2] * ir
         g = -ir * ir
+        if rolling:
+            seen_from = _compose(pose, _exp(velocity * row_s[k]))
         rows = point_residuals(
-            pose, px, py, pz, direction[k, 0] * g, direction[k, 1] * g, direction[k, 2] * g,
+            seen_from, px, py, pz, direction[k, 0] * g, direction[k, 1] * g, direction[k, 2] * g,
             uv_l[k], uv_r[k], cams, right_T_left, res, jac, ray,
         )  # fmt: skip
         if rows == 0:
@@ -155,70 +166,112 @@ def _normal_equations(
             s = 0.0
             for m in range(rows):
                 s += jac[m, i] * res[m]
-            rhs[i] += wi * (s - c * jr[i] * gr)
+            gradient[i] = wi * (s - c * jr[i] * gr)
+            rhs[i] += gradient[i]
             for j in range(i, 6):
                 s = 0.0
                 for m in range(rows):
                     s += jac[m, i] * jac[m, j]
-                normal[i, j] += wi * (s - c * jr[i] * jr[j])
+                block[i, j] = wi * (s - c * jr[i] * jr[j])
+                normal[i, j] += block[i, j]
+        if rolling:  # a row's pose follows the velocity by the row's seconds
+            for i in range(6):
+                rhs[6 + i] += row_s[k] * gradient[i]
+                for j in range(i, 6):
+                    normal[i, 6 + j] += row_s[k] * block[i, j]
+                    normal[6 + i, 6 + j] += row_s[k] * row_s[k] * block[i, j]
     for i in range(6):
         for j in range(i):
             normal[i, j] = normal[j, i]
+            if rolling:
+                normal[i, 6 + j] = normal[j, 6 + i]
+                normal[6 + i, 6 + j] = normal[6 + j, 6 + i]
+    if rolling:
+        for i in range(6):
+            for j in range(6):
+                normal[6 + i, j] = normal[j, 6 + i]
     return used
 
 
 @njit
-def optimise_pose(pose, origin, direction, rho, variance, uv_l, uv_r, cams, right_T_left, sigma, scales):
+def optimise_pose(
+    pose, moved, seconds, velocity_sigma, row_s, origin, direction, rho, variance, uv_l, uv_r, cams, right_T_left,
+    sigma, scales,
+):  # fmt: skip
     """Pose of a frame.
 
     Args:
-        pose: (4, 4) odom_T_cam to start from. origin, direction: (N, 3) odometry frame. rho, variance: (N,) 1/m.
+        pose: (4, 4) odom_T_cam to start from.
+        moved: (6,) tangent from the last frame's pose to that one, `seconds` before. velocity_sigma: (6,) by how much
+            the velocity at this frame differs from the mean since the last. These are for rolling shutters only.
+        row_s: (N,) seconds from the pose's time to that of the row of each point; empty for a global shutter.
+        origin, direction: (N, 3) odometry frame. rho, variance: (N,) 1/m.
         uv_l, uv_r: (N, 2) px, NaN in uv_r where unseen.
         sigma: px, noise of one coordinate. scales: (S,) Cauchy scales in sigmas, one Gauss-Newton step each.
 
     Returns:
-        pose (4, 4), covariance (6, 6) of pose @ exp(xi), error (N,) root of the whitened squared residual over
-        the number of rows (1 is as expected; inf when not visible).
+        pose (4, 4), velocity (6,) a second, covariance (6, 6) of pose @ exp(xi), error (N,) root of the whitened
+        squared residual over the number of rows (1 is as expected; inf when not visible).
     """
-    pose = pose.copy()
+    pose, moved, velocity = pose.copy(), moved.copy(), moved / max(seconds, 1e-6)
     error = np.full(len(rho), np.inf)
-    normal, factor = np.zeros((6, 6)), np.zeros((6, 6))
-    rhs, xi = np.zeros(6), np.zeros(6)
+    n = 12 if len(row_s) > 0 else 6
+    normal, factor = np.zeros((n, n)), np.zeros((n, n))
+    rhs, xi = np.zeros(n), np.zeros(n)
     for step in range(len(scales) + 1):  # after the last step once more, for errors and covariance
         scale = scales[min(step, len(scales) - 1)]
         used = _normal_equations(
-            pose, origin, direction, rho, variance, uv_l, uv_r, cams, right_T_left, sigma, scale, normal, rhs, error
-        )
+            pose, velocity, row_s, origin, direction, rho, variance, uv_l, uv_r, cams, right_T_left, sigma, scale,
+            normal, rhs, error,
+        )  # fmt: skip
+        for i in range(n - 6):  # the velocity is the mean motion since the last frame, or nearly
+            information = 1.0 / (velocity_sigma[i] * velocity_sigma[i])
+            rate = 1.0 / max(seconds, 1e-6)
+            difference = velocity[i] - moved[i] * rate
+            normal[i, i] += information * rate * rate
+            normal[i, 6 + i] -= information * rate
+            normal[6 + i, i] -= information * rate
+            normal[6 + i, 6 + i] += information
+            rhs[i] -= information * rate * difference
+            rhs[6 + i] += information * difference
         if step == len(scales) or used < 3:
             break
-        for i in range(6):
+        for i in range(n):
             normal[i, i] += 1e-6 + 1e-9 * normal[i, i]
             rhs[i] = -rhs[i]
         if not solve_symmetric(normal, rhs, xi, factor):
             break
-        pose = _compose(pose, _exp(xi))
-    for i in range(6):
+        pose = _compose(pose, _exp(xi[:6]))
+        for i in range(n - 6):
+            moved[i] += xi[i]
+            velocity[i] += xi[6 + i]
+    for i in range(n):
         normal[i, i] += 1e-9
-    covariance = np.full((6, 6), np.inf)
-    invert_symmetric(normal, covariance, factor)
-    return pose, covariance, error
+    inverse = np.full((n, n), np.inf)
+    invert_symmetric(normal, inverse, factor)
+    return pose, velocity, inverse[:6, :6].copy(), error
 
 
 @njit
-def refine_depth(pose, origin, direction, rho, variance, uv_l, uv_r, inlier, cams, right_T_left, sigma, floor):
-    """Update rho and its variance (in place) by one frame's observations, the pose given.
+def refine_depth(
+    pose, velocity, row_s, origin, direction, rho, variance, uv_l, uv_r, inlier, cams, right_T_left, sigma, floor
+):
+    """Update rho and its variance (in place) by one frame's observations, pose and velocity given.
 
     `sigma` is larger than the pixel noise: successive errors of one patch are alike, and the pose was fitted to the
     same pixels. `floor` is the least relative standard deviation.
     """
     res, jac, ray = np.zeros(4), np.zeros((4, 6)), np.zeros(4)
+    seen_from = pose
     for k in range(len(rho)):
         if not inlier[k]:
             continue
         ir = 1.0 / rho[k]
         g = -ir * ir
+        if len(row_s) > 0:
+            seen_from = _compose(pose, _exp(velocity * row_s[k]))
         rows = point_residuals(
-            pose, origin[k, 0] + direction[k, 0] * ir, origin[k, 1] + direction[k, 1] * ir,
+            seen_from, origin[k, 0] + direction[k, 0] * ir, origin[k, 1] + direction[k, 1] * ir,
             origin[k, 2] + direction[k, 2] * ir, direction[k, 0] * g, direction[k, 1] * g, direction[k, 2] * g,
             uv_l[k], uv_r[k], cams, right_T_left, res, jac, ray,
         )  # fmt: skip

@@ -9,7 +9,7 @@ for the loop closer.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from stereo_sfm.tracking.corners import corner_mask, detect_corners
 from stereo_sfm.tracking.descriptors import describe
 from stereo_sfm.tracking.eyes import Eyes
 from stereo_sfm.tracking.place_corners import PlaceCorners
+from stereo_sfm.tracking.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.stereo import StereoMatcher
 from stereo_sfm.tracking.tracks import Patches, Tracks
 from stereo_sfm.types import (
@@ -42,11 +43,21 @@ from stereo_sfm.types import (
 CAUCHY_SCALES = np.array([20.0, 10.0, 6.0, 4.0, 3.0, 2.0, 2.0])  # in sigmas, one Gauss-Newton step each
 
 
+@dataclass(frozen=True)
+class Motion:
+    """How the camera is expected to have moved since the last frame."""
+
+    pose: F64  # (4, 4) odom_T_cam
+    velocity: F64  # (6,) tangent a second
+    seconds: float
+
+
 @dataclass
 class PoseSolution:
     """What motion-only optimisation found."""
 
     pose: F64  # (4, 4) odom_T_cam
+    velocity: F64  # (6,) tangent a second while the rows were read; as expected for a global shutter
     covariance: F64  # (6, 6)
     error: F64  # (N,) whitened
     max_error: float
@@ -79,6 +90,7 @@ class Tracker:
         self._eyes = Eyes.of(rig)
         self._spans = spans or NoSpans()
         self._stereo = StereoMatcher(config, rig)
+        self._shutter = RollingShutter(rig)
         self._mask = corner_mask(rig.left, config.max_angle_deg)
         self._place_corners = place_corners
         area = 4.0 * self._mask.sum()
@@ -142,10 +154,10 @@ class Tracker:
             return self._initialize(image, pyramid, right, stats)
         dt = (image.stamp_ns - self._stamp_ns) * 1e-9
         predicted = self._pose @ se3.exp(self._velocity * dt)
-        tracks, uv_right, solution = self._track(pyramid, right, predicted)
+        expected = Motion(predicted, self._velocity, dt)
+        tracks, uv_right, solution = self._track(pyramid, right, expected)
         if not solution.good(self._config, len(self._tracks)):
-            turned = self._turn(pyramid, predicted)
-            again = self._track(pyramid, right, turned)
+            again = self._track(pyramid, right, self._turn(pyramid, expected))
             if again[2].inliers > solution.inliers:
                 tracks, uv_right, solution = again
         if solution.reason:
@@ -156,7 +168,7 @@ class Tracker:
         tracks.uv_right = uv_right
         tracks.misses = np.where(inlier, 0, tracks.misses + 1).astype(np.int32)
         tracks.age = tracks.age + np.int32(1)
-        self._refine(tracks, pose, inlier)
+        self._refine(tracks, solution)
         stats.update(
             tracked=float(len(tracks)),
             inliers=float(inlier.sum()),
@@ -164,8 +176,9 @@ class Tracker:
             error=float(np.median(error[inlier])) if inlier.any() else 0.0,
         )
         state = TrackState.OK if self._lost == 0 else TrackState.RECOVERED
-        if dt > 0:
-            self._velocity = se3.log(se3.inverse(self._pose) @ pose) / dt
+        mean = self._velocity_to(pose, dt)
+        self._shutter.moved(mean, dt)
+        self._velocity = solution.velocity if self._shutter.active else mean
         self._accept(image, pyramid, pose, tracks.keep(tracks.misses < 3))
         frame_inlier = inlier[tracks.misses < 3]
         self._frames_since_kf += 1
@@ -199,29 +212,34 @@ class Tracker:
         return self._frame(image, np.eye(6) * 1e-12, state, "", inlier, keyframe, stats), keyframe
 
     def _track(
-        self, pyramid: flow.Pyramid, right: flow.Pyramid | F32, predicted: F64
+        self, pyramid: flow.Pyramid, right: flow.Pyramid | F32, expected: Motion
     ) -> tuple[Tracks, F64, PoseSolution]:
-        """Follow all points from a predicted pose and solve for the pose."""
+        """Follow all points from where they are expected and solve for the pose."""
         with self._spans.span("flow"):
-            tracks = self._follow(pyramid, predicted)
+            tracks = self._follow(pyramid, expected)
         with self._spans.span("stereo"):
-            uv_right = self._stereo.follow(pyramid, right, tracks.uv, tracks.points(), predicted)
+            uv_right = self._stereo.follow(pyramid, right, tracks.uv, tracks.points(), expected.pose)
         with self._spans.span("pose"):
-            return tracks, uv_right, self._solve(tracks, uv_right, predicted)
+            return tracks, uv_right, self._solve(tracks, uv_right, expected)
 
-    def _turn(self, pyramid: flow.Pyramid, predicted: F64) -> F64:
-        """The predicted pose with the rotation that aligns the whole images."""
+    def _turn(self, pyramid: flow.Pyramid, expected: Motion) -> Motion:
+        """The expected motion with the rotation that aligns the whole images."""
         assert self._pyramid is not None
-        cur_R_prev = predicted[:3, :3].T @ self._pose[:3, :3]
+        cur_R_prev = expected.pose[:3, :3].T @ self._pose[:3, :3]
         cur_R_prev = self._coarse_rotation.align(self._pyramid, pyramid, cur_R_prev)
         self._first_level = self._config.pyramid_levels - 1
-        return se3.from_rotation_translation(self._pose[:3, :3] @ cur_R_prev.T, predicted[:3, 3])
+        turned = se3.from_rotation_translation(self._pose[:3, :3] @ cur_R_prev.T, expected.pose[:3, 3])
+        return Motion(turned, self._velocity_to(turned, expected.seconds), expected.seconds)
 
-    def _follow(self, pyramid: flow.Pyramid, predicted: F64) -> Tracks:
+    def _velocity_to(self, pose: F64, seconds: float) -> F64:
+        """(6,) tangent a second from the last pose to this one."""
+        return se3.log(se3.inverse(self._pose) @ pose) / seconds if seconds > 0 else self._velocity
+
+    def _follow(self, pyramid: flow.Pyramid, expected: Motion) -> Tracks:
         """Tracks that are found in the new left image, moved there."""
         config, tracks = self._config, self._tracks
         assert self._pyramid is not None
-        guess = self._rig.left.project(se3.transform(se3.inverse(predicted), tracks.points()))
+        guess = self._shutter.project(expected.pose, expected.velocity, tracks.points(), tracks.uv)
         guess = np.where(np.isfinite(guess), guess, tracks.uv)
         uv = guess.copy()
         status, _ = flow.track_translation(
@@ -240,29 +258,35 @@ class Tracker:
         out.uv, out.warp = uv[found], warp[found]
         return out
 
-    def _solve(self, tracks: Tracks, uv_right: F64, predicted: F64) -> PoseSolution:
-        """Pose from the prediction; from the previous pose when the prediction finds no consensus."""
+    def _solve(self, tracks: Tracks, uv_right: F64, expected: Motion) -> PoseSolution:
+        """Pose from where it is expected; from the previous pose when that finds no consensus."""
         config = self._config
         if len(tracks) < config.min_features:
-            return PoseSolution(np.eye(4), np.eye(6), np.full(len(tracks), np.inf), 0.0, "too_few_points")
-        best = self._optimise(tracks, uv_right, predicted)
+            far = np.full(len(tracks), np.inf)
+            return PoseSolution(np.eye(4), np.zeros(6), np.eye(6), far, 0.0, "too_few_points")
+        best = self._optimise(tracks, uv_right, expected)
         if best.inliers < 0.5 * len(tracks):
-            best = max(best, self._optimise(tracks, uv_right, self._pose), key=lambda s: s.inliers)
+            still = replace(expected, pose=self._pose)
+            best = max(best, self._optimise(tracks, uv_right, still), key=lambda s: s.inliers)
         if best.inliers < config.min_features:
             best.reason = "no_consensus"
         return best
 
-    def _optimise(self, tracks: Tracks, uv_right: F64, start: F64) -> PoseSolution:
-        pose, covariance, error = motion.optimise_pose(
-            start, tracks.origin, tracks.direction, tracks.rho, tracks.variance, tracks.uv, uv_right,
-            self._eyes.cams, self._eyes.right_T_left, self._config.sigma_px * self._noise, CAUCHY_SCALES,
+    def _optimise(self, tracks: Tracks, uv_right: F64, expected: Motion) -> PoseSolution:
+        pose, velocity, covariance, error = motion.optimise_pose(
+            expected.pose, se3.log(se3.inverse(self._pose) @ expected.pose), expected.seconds,
+            self._shutter.velocity_sigma(),
+            self._shutter.row_seconds(tracks.uv), tracks.origin, tracks.direction, tracks.rho, tracks.variance,
+            tracks.uv, uv_right, self._eyes.cams, self._eyes.right_T_left, self._config.sigma_px * self._noise,
+            CAUCHY_SCALES,
         )  # fmt: skip
-        return PoseSolution(pose, covariance, error, self._config.max_error)
+        return PoseSolution(pose, velocity, covariance, error, self._config.max_error)
 
-    def _refine(self, tracks: Tracks, pose: F64, inlier: Bool) -> None:
+    def _refine(self, tracks: Tracks, solution: PoseSolution) -> None:
         motion.refine_depth(
-            pose, tracks.origin, tracks.direction, tracks.rho, tracks.variance, tracks.uv, tracks.uv_right,
-            inlier & ~tracks.mapped, self._eyes.cams, self._eyes.right_T_left, self._config.depth_sigma_px, 1e-3,
+            solution.pose, solution.velocity, self._shutter.row_seconds(tracks.uv), tracks.origin, tracks.direction,
+            tracks.rho, tracks.variance, tracks.uv, tracks.uv_right, solution.inlier & ~tracks.mapped, self._eyes.cams,
+            self._eyes.right_T_left, self._config.depth_sigma_px, 1e-3,
         )  # fmt: skip
 
     def _accept(self, image: StereoImage, pyramid: flow.Pyramid, pose: F64, tracks: Tracks) -> None:
@@ -299,18 +323,20 @@ class Tracker:
     def _make_keyframe(self, image: StereoImage, pyramid: flow.Pyramid, right: flow.Pyramid | F32) -> Keyframe:
         tracks = self._tracks
         points_cam = se3.transform(se3.inverse(self._pose), tracks.points())
+        corners = Corners.none() if self._place_corners is None else self._place_corners.find_in(pyramid, right)
+        uv_left, uv_right = self._shutter.at_stamp(tracks.uv, tracks.uv_right, points_cam, self._velocity)
         keyframe = Keyframe(
             kf_id=self._next_kf_id,
             frame_id=image.frame_id,
             stamp_ns=image.stamp_ns,
             odom_T_cam=self._pose.copy(),
             point_ids=tracks.point_ids.copy(),
-            uv_left=tracks.uv.copy(),
-            uv_right=tracks.uv_right.copy(),
+            uv_left=uv_left.copy(),
+            uv_right=uv_right.copy(),
             points_cam=points_cam,
             descriptors=describe(pyramid[0], tracks.uv),
             submap_id=self._submap_id,
-            corners=Corners.none() if self._place_corners is None else self._place_corners.find_in(pyramid, right),
+            corners=self._shutter.corners_at_stamp(corners, self._velocity),
         )
         self._next_kf_id += 1
         self._kf_pose = self._pose.copy()
@@ -331,12 +357,13 @@ class Tracker:
         uv = match.uv_left[good]
         textured = self._patches_make(pyramid, uv, slots)
         n = int(textured.sum())
+        origin, direction = self._shutter.rays(self._pose, self._velocity, uv[textured], match.bearing[good][textured])
         new = Tracks(
             point_ids=self._next_point_id + np.arange(n, dtype=np.int64),
             uv=uv[textured],
             uv_right=match.uv_right[good][textured],
-            origin=np.tile(self._pose[:3, 3], (n, 1)),
-            direction=match.bearing[good][textured] @ self._pose[:3, :3].T,
+            origin=origin,
+            direction=direction,
             rho=np.maximum(match.rho[good][textured], 1e-4),
             variance=match.variance[good][textured],
             age=np.zeros(n, np.int32),

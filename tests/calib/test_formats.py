@@ -95,6 +95,7 @@ def test_own_file_keeps_every_bit(tmp_path: Path) -> None:
             depth=bool(i % 2),
             name="a: 'b'",
             serial="0012",
+            readout_s=0.001 * abs(params[7]) / (1 + abs(params[7])),
         )
         save_rig(rig, tmp_path / "rig.yaml")
         back = load_rig(tmp_path / "rig.yaml")
@@ -102,6 +103,12 @@ def test_own_file_keeps_every_bit(tmp_path: Path) -> None:
         assert back.right is not None and back.right.model == "epipolar" and back.right.fx == rig.right.fx  # type: ignore[union-attr]
         assert np.array_equal(back.body_T_left, rig.body_T_left)
         assert (back.depth, back.name, back.serial) == (rig.depth, rig.name, rig.serial)
+        assert back.readout_s == rig.readout_s
+
+
+def test_a_readout_in_milliseconds_is_told() -> None:
+    with pytest.raises(StereoSfmError, match="readout of 28 s: seconds"):
+        Rig(FISHEYE.left, readout_s=28.0)
 
 
 @pytest.mark.parametrize("name", [n for n in FORMATS if n not in ("kitti", "depthai")])

@@ -137,6 +137,7 @@ def test_tum_rgbd_has_depth_in_metres_and_a_virtual_eye(tmp_path: Path, caplog: 
         assert images[0].right is None
         assert source.rig.depth and source.rig.baseline == pytest.approx(0.08)
         assert source.rig.left.model == "radtan" and source.rig.left.fx == pytest.approx(517.306408)
+        assert source.rig.readout_s == pytest.approx(0.028)  # a rolling shutter
         assert source.ground_truth is not None and source.ground_truth.positions[-1].tolist() == [0, 0, 1]
     assert "1 of 3 colour images have no depth image" in caplog.text
 

@@ -56,6 +56,20 @@ def kind_of(view: View) -> np.ndarray:
     return np.where(view.ids >= 0, (view.ids >> 4) & 7, -1)
 
 
+def test_rows_of_a_rolling_shutter_see_what_their_own_pose_sees() -> None:
+    r = renderer("pinhole")
+    height = r.rig.left.height
+    poses = np.array(
+        [POSE @ se3.exp(np.array([0.02, 0.01, 0.03, 0.0, 0.05, 0.02]) * s) for s in np.linspace(-1, 1, height)]
+    )
+    rolling = r.render(poses)
+    for row in (0, 57, 100, height - 1):
+        still = r.render(poses[row])
+        for eye in (0, 1):
+            assert np.array_equal(rolling[eye].depth[row], still[eye].depth[row], equal_nan=True)
+            assert np.array_equal(rolling[eye].ids[row], still[eye].ids[row])
+
+
 @pytest.mark.parametrize("camera", sorted(CAMERAS))
 def test_hits_lie_on_the_surfaces_they_name(camera: str) -> None:
     r, world = renderer(camera), store()

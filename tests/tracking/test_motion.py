@@ -43,10 +43,11 @@ def solve(camera: Camera, points: F64, uv: F64, uv_right: F64, variance: float =
     eyes = Eyes.of(rig(camera))
     distance = np.linalg.norm(points, axis=1)
     n = len(points)
-    return motion.optimise_pose(
-        np.eye(4), np.zeros((n, 3)), points / distance[:, None], 1 / distance, np.full(n, variance), uv, uv_right,
-        eyes.cams, eyes.right_T_left, 0.5, SCALES,
+    pose, _, covariance, error = motion.optimise_pose(
+        np.eye(4), np.zeros(6), 0.1, np.ones(6), np.zeros(0), np.zeros((n, 3)), points / distance[:, None],
+        1 / distance, np.full(n, variance), uv, uv_right, eyes.cams, eyes.right_T_left, 0.5, SCALES,
     )  # fmt: skip
+    return pose, covariance, error
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: c.model)
