@@ -19,12 +19,16 @@ from stereo_sfm.tracking.flow import Pyramid
 from stereo_sfm.types import F64
 
 ITERATIONS = 12
+STEP = 0.1  # pixels of the level below which a step ends its iterations
 
 
 @njit
-def _normal_equations(prev, cur, bearings, model, params, scale, rotation, offset):
-    """(3, 3) and (3,) of the brightness differences by a left rotation increment, mean difference, count."""
-    h, w = prev.shape
+def _normal_equations(prev, cur, bearings, stride, model, params, scale, rotation, offset):
+    """(3, 3) and (3,) of the brightness differences by a left rotation increment, mean difference, count.
+
+    `bearings`: (h, w, 3) of every `stride`-th pixel of a level of the previous image.
+    """
+    h, w = bearings.shape[:2]
     hc, wc = cur.shape
     normal = np.zeros((3, 3))
     rhs = np.zeros(3)
@@ -51,8 +55,9 @@ def _normal_equations(prev, cur, bearings, model, params, scale, rotation, offse
             value = (1 - fv) * ((1 - fu) * i00 + fu * i01) + fv * ((1 - fu) * i10 + fu * i11)
             gu = ((1 - fv) * (i01 - i00) + fv * (i11 - i10)) / scale
             gv = ((1 - fu) * (i10 - i00) + fu * (i11 - i01)) / scale
-            e = value - prev[v, u] - offset
-            total += value - prev[v, u]
+            difference = value - prev[v * stride, u * stride]
+            e = difference - offset
+            total += difference
             count += 1
             d0 = gu * p[2] + gv * p[5]
             d1 = gu * p[3] + gv * p[6]
@@ -73,29 +78,25 @@ class CoarseRotation:
 
     def __init__(self, camera: Camera, levels: int) -> None:
         self._camera = camera
-        self._levels = (levels - 1, levels - 2)
-        self._bearings = {level: self._grid(level) for level in self._levels}
-
-    def _grid(self, level: int) -> F64:
-        scale = 2**level
-        width, height = (self._camera.width + scale - 1) // scale, (self._camera.height + scale - 1) // scale
-        u, v = np.meshgrid(np.arange(width) * float(scale), np.arange(height) * float(scale))
-        return self._camera.unproject(np.stack([u, v], -1))
+        spacing = 2 ** (levels - 1)  # of the pixels of the previous image that are used, on both levels
+        u, v = np.arange(0, camera.width, spacing), np.arange(0, camera.height, spacing)
+        self._bearings = camera.unproject(np.stack(np.meshgrid(u, v), -1).astype(np.float64))
+        self._strides = {levels - 1: 1, levels - 2: 2}
 
     def align(self, prev: Pyramid, cur: Pyramid, cur_R_prev: F64) -> F64:
         """Improve the rotation (3, 3) that takes bearings of `prev` into `cur`."""
         rotation = np.ascontiguousarray(cur_R_prev)
-        for level in self._levels:
+        for level, stride in self._strides.items():
             offset = 0.0
             for _ in range(ITERATIONS):
                 normal, rhs, offset, count = _normal_equations(
-                    prev[level], cur[level], self._bearings[level], self._camera.model_id, self._camera.params,
+                    prev[level], cur[level], self._bearings, stride, self._camera.model_id, self._camera.params,
                     float(2**level), rotation, offset,
                 )  # fmt: skip
                 if count < 100 or np.linalg.matrix_rank(normal) < 3:
                     return np.ascontiguousarray(cur_R_prev)
                 step = -np.linalg.solve(normal, rhs)
                 rotation = np.ascontiguousarray(se3.so3_exp(step) @ rotation)
-                if np.linalg.norm(step) < 1e-4:
+                if np.linalg.norm(step) < STEP * 2**level / self._camera.fx:
                     break
         return rotation

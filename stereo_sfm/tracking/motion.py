@@ -25,28 +25,34 @@ from stereo_sfm.geometry.small_matrix import invert_symmetric, solve_symmetric
 
 
 @njit
-def _exp(xi):
-    """(6,) (rho, phi) -> (4, 4)."""
-    out = np.eye(4)
-    px, py, pz = xi[3], xi[4], xi[5]
-    angle2 = px * px + py * py + pz * pz
+def exp_into(xi, seconds, out):
+    """exp(seconds * xi) of a tangent (6,) = (rho, phi) a second, into `out` (4, 4)."""
+    rx, ry, rz = xi[0] * seconds, xi[1] * seconds, xi[2] * seconds
+    px, py, pz = xi[3] * seconds, xi[4] * seconds, xi[5] * seconds
+    xx, yy, zz = px * px, py * py, pz * pz
+    angle2 = xx + yy + zz
     angle = math.sqrt(angle2)
     if angle < 1e-6:
         a, b, c = 1.0 - angle2 / 6, 0.5 - angle2 / 24, 1.0 / 6 - angle2 / 120
     else:
         a, b, c = math.sin(angle) / angle, (1 - math.cos(angle)) / angle2, (angle - math.sin(angle)) / (angle2 * angle)
-    k = np.array([[0.0, -pz, py], [pz, 0.0, -px], [-py, px, 0.0]])
-    k2 = np.zeros((3, 3))
+    out[0, 0], out[0, 1], out[0, 2] = 1.0 - b * (yy + zz), b * px * py - a * pz, b * px * pz + a * py
+    out[1, 0], out[1, 1], out[1, 2] = b * px * py + a * pz, 1.0 - b * (xx + zz), b * py * pz - a * px
+    out[2, 0], out[2, 1], out[2, 2] = b * px * pz - a * py, b * py * pz + a * px, 1.0 - b * (xx + yy)
+    kx, ky, kz = py * rz - pz * ry, pz * rx - px * rz, px * ry - py * rx  # phi x rho
+    out[0, 3] = rx + b * kx + c * (py * kz - pz * ky)
+    out[1, 3] = ry + b * ky + c * (pz * kx - px * kz)
+    out[2, 3] = rz + b * kz + c * (px * ky - py * kx)
+    out[3, 0], out[3, 1], out[3, 2], out[3, 3] = 0.0, 0.0, 0.0, 1.0
+
+
+@njit
+def _compose_into(a, b, out):
+    """a @ b of two (4, 4) transforms, into `out`."""
     for i in range(3):
-        for j in range(3):
-            for m in range(3):
-                k2[i, j] += k[i, m] * k[m, j]
-    for i in range(3):
-        for j in range(3):
-            out[i, j] += a * k[i, j] + b * k2[i, j]
-            unit = 1.0 if i == j else 0.0
-            out[i, 3] += (unit + b * k[i, j] + c * k2[i, j]) * xi[j]
-    return out
+        for j in range(4):
+            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j] + (a[i, 3] if j == 3 else 0.0)
+    out[3, 0], out[3, 1], out[3, 2], out[3, 3] = 0.0, 0.0, 0.0, 1.0
 
 
 @njit
@@ -100,17 +106,6 @@ def point_residuals(pose, px, py, pz, dx, dy, dz, uv_l, uv_r, cams, right_T_left
 
 
 @njit
-def _compose(a, b):
-    """a @ b of two (4, 4) transforms."""
-    out = np.zeros((4, 4))
-    for i in range(4):
-        for j in range(4):
-            for m in range(4):
-                out[i, j] += a[i, m] * b[m, j]
-    return out
-
-
-@njit
 def _normal_equations(
     pose, velocity, row_s, origin, direction, rho, variance, uv_l, uv_r, cams, right_T_left, sigma, scale, normal, rhs,
     error,
@@ -126,8 +121,8 @@ def _normal_equations(
     res, jac, ray, jr = np.zeros(4), np.zeros((4, 6)), np.zeros(4), np.zeros(6)
     gradient, block = np.zeros(6), np.zeros((6, 6))  # of one point
     rolling = len(row_s) > 0
+    row, step = pose.copy(), np.zeros((4, 4))  # the pose at the point's row
     inv_s2 = 1.0 / (sigma * sigma)
-    seen_from = pose
     used = 0.0
     normal[:] = 0.0
     rhs[:] = 0.0
@@ -138,9 +133,10 @@ def _normal_equations(
         pz = origin[k, 2] + direction[k, 2] * ir
         g = -ir * ir
         if rolling:
-            seen_from = _compose(pose, _exp(velocity * row_s[k]))
+            exp_into(velocity, row_s[k], step)
+            _compose_into(pose, step, row)
         rows = point_residuals(
-            seen_from, px, py, pz, direction[k, 0] * g, direction[k, 1] * g, direction[k, 2] * g,
+            row, px, py, pz, direction[k, 0] * g, direction[k, 1] * g, direction[k, 2] * g,
             uv_l[k], uv_r[k], cams, right_T_left, res, jac, ray,
         )  # fmt: skip
         if rows == 0:
@@ -213,11 +209,12 @@ def optimise_pose(
         pose (4, 4), velocity (6,) a second, covariance (6, 6) of pose @ exp(xi), error (N,) root of the whitened
         squared residual over the number of rows (1 is as expected; inf when not visible).
     """
-    pose, moved, velocity = pose.copy(), moved.copy(), moved / max(seconds, 1e-6)
+    rate = 1.0 / seconds if seconds > 0 else 0.0
+    pose, moved, velocity = pose.copy(), moved.copy(), moved * rate
     error = np.full(len(rho), np.inf)
     n = 12 if len(row_s) > 0 else 6
     normal, factor = np.zeros((n, n)), np.zeros((n, n))
-    rhs, xi = np.zeros(n), np.zeros(n)
+    rhs, xi, move = np.zeros(n), np.zeros(n), np.zeros((4, 4))
     for step in range(len(scales) + 1):  # after the last step once more, for errors and covariance
         scale = scales[min(step, len(scales) - 1)]
         used = _normal_equations(
@@ -226,7 +223,6 @@ def optimise_pose(
         )  # fmt: skip
         for i in range(n - 6):  # the velocity is the mean motion since the last frame, or nearly
             information = 1.0 / (velocity_sigma[i] * velocity_sigma[i])
-            rate = 1.0 / max(seconds, 1e-6)
             difference = velocity[i] - moved[i] * rate
             normal[i, i] += information * rate * rate
             normal[i, 6 + i] -= information * rate
@@ -241,7 +237,8 @@ def optimise_pose(
             rhs[i] = -rhs[i]
         if not solve_symmetric(normal, rhs, xi, factor):
             break
-        pose = _compose(pose, _exp(xi[:6]))
+        exp_into(xi, 1.0, move)
+        _compose_into(pose.copy(), move, pose)
         for i in range(n - 6):
             moved[i] += xi[i]
             velocity[i] += xi[6 + i]
@@ -262,16 +259,17 @@ def refine_depth(
     same pixels. `floor` is the least relative standard deviation.
     """
     res, jac, ray = np.zeros(4), np.zeros((4, 6)), np.zeros(4)
-    seen_from = pose
+    row, step = pose.copy(), np.zeros((4, 4))  # the pose at the point's row
     for k in range(len(rho)):
         if not inlier[k]:
             continue
         ir = 1.0 / rho[k]
         g = -ir * ir
         if len(row_s) > 0:
-            seen_from = _compose(pose, _exp(velocity * row_s[k]))
+            exp_into(velocity, row_s[k], step)
+            _compose_into(pose, step, row)
         rows = point_residuals(
-            seen_from, origin[k, 0] + direction[k, 0] * ir, origin[k, 1] + direction[k, 1] * ir,
+            row, origin[k, 0] + direction[k, 0] * ir, origin[k, 1] + direction[k, 1] * ir,
             origin[k, 2] + direction[k, 2] * ir, direction[k, 0] * g, direction[k, 1] * g, direction[k, 2] * g,
             uv_l[k], uv_r[k], cams, right_T_left, res, jac, ray,
         )  # fmt: skip

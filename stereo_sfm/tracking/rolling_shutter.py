@@ -7,6 +7,8 @@ shrink along it unnoticed (Albl et al., Degeneracies in rolling shutter SfM, ECC
 velocity since the last frame, the more tightly the steadier the camera has moved of late.
 """
 
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportMissingTypeArgument=false
+
 from __future__ import annotations
 
 import math
@@ -16,6 +18,8 @@ import numpy as np
 
 from calib.rig import Rig
 from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.kernels import njit
+from stereo_sfm.tracking.motion import exp_into
 from stereo_sfm.types import F64, Corners
 
 MEMORY_S = 1.0  # over which unsteadiness is averaged
@@ -51,16 +55,13 @@ class RollingShutter:
             return np.zeros(0)
         return (uv[:, 1] / (self._rig.left.height - 1) - 0.5) * self._rig.readout_s
 
-    def _cam_T_row(self, velocity: F64, uv: F64) -> F64:
-        """(N, 4, 4) from where the camera was when it saw pixels (N, 2) to where it was at the stamp."""
-        return se3.exp(self.row_seconds(uv)[:, None] * velocity)
-
     def rays(self, odom_T_cam: F64, velocity: F64, uv: F64, bearing: F64) -> tuple[F64, F64]:
         """Origins (N, 3) and directions (N, 3) in the odometry frame of what pixels (N, 2) see, bearings (N, 3)."""
         if not self.active:
             return np.tile(odom_T_cam[:3, 3], (len(uv), 1)), bearing @ odom_T_cam[:3, :3].T
-        poses = odom_T_cam @ self._cam_T_row(velocity, uv)
-        return poses[:, :3, 3].copy(), _each(poses, bearing) - poses[:, :3, 3]
+        seconds = self.row_seconds(uv)
+        origin, tip = (_by_rows(p, velocity, seconds) for p in (np.zeros_like(bearing), bearing))
+        return se3.transform(odom_T_cam, origin), (tip - origin) @ odom_T_cam[:3, :3].T
 
     def project(self, odom_T_cam: F64, velocity: F64, points: F64, uv: F64) -> F64:
         """Pixels (N, 2) where the left eye sees points (N, 3) of the odometry frame, NaN where it does not.
@@ -73,7 +74,7 @@ class RollingShutter:
         if self.active:
             for _ in range(2):  # the row decides when a point is seen, and that on which row
                 rows = np.where(np.isfinite(seen), seen, uv)
-                seen = camera.project(_each(se3.inverse(self._cam_T_row(velocity, rows)), points_cam))
+                seen = camera.project(_by_rows(points_cam, velocity, -self.row_seconds(rows)))
         return seen
 
     def at_stamp(self, uv_left: F64, uv_right: F64, points_cam: F64, velocity: F64) -> tuple[F64, F64]:
@@ -85,7 +86,7 @@ class RollingShutter:
         """
         if not self.active:
             return uv_left, uv_right
-        before = _each(se3.inverse(self._cam_T_row(velocity, uv_left)), points_cam)
+        before = _by_rows(points_cam, velocity, -self.row_seconds(uv_left))
         return self._moved(uv_left, uv_right, before, points_cam)
 
     def corners_at_stamp(self, corners: Corners, velocity: F64) -> Corners:
@@ -94,7 +95,7 @@ class RollingShutter:
             return corners
         before = corners.points_cam.astype(np.float64)
         uv_left, uv_right = corners.uv_left.astype(np.float64), corners.uv_right.astype(np.float64)
-        after = _each(self._cam_T_row(velocity, uv_left), before)
+        after = _by_rows(before, velocity, self.row_seconds(uv_left))
         columns = (*self._moved(uv_left, uv_right, before, after), after)
         left, right, points = (column.astype(np.float32) for column in columns)
         return replace(corners, uv_left=left, uv_right=right, points_cam=points)
@@ -111,6 +112,12 @@ class RollingShutter:
         return uv_left + shifts[0], uv_right + shifts[1]
 
 
-def _each(a_T_b: F64, points_b: F64) -> F64:
-    """Points (N, 3), each by its own transform (N, 4, 4)."""
-    return np.einsum("nij,nj->ni", a_T_b[:, :3, :3], points_b) + a_T_b[:, :3, 3]
+@njit
+def _by_rows(points, velocity, seconds):
+    """Points (N, 3), each moved by exp(its seconds (N,) * velocity (6,))."""
+    out, move = np.empty_like(points), np.zeros((4, 4))
+    for k in range(len(points)):
+        exp_into(velocity, seconds[k], move)
+        for i in range(3):
+            out[k, i] = move[i, 0] * points[k, 0] + move[i, 1] * points[k, 1] + move[i, 2] * points[k, 2] + move[i, 3]
+    return out

@@ -134,9 +134,9 @@ class StereoMatcher:
         with np.errstate(invalid="ignore"):
             smooth = np.ptp(around, axis=0) < DEPTH_STEP * around[4]
         good = inside & smooth & (around[4] > 0)
-        bearing = self._rig.left.unproject(uv)
-        points = bearing / bearing[:, 2:] * np.where(good, around.mean(0), np.nan)[:, None]
+        bearing = self._rig.left.unproject(uv[good])
+        points = bearing / bearing[:, 2:] * around.mean(0)[good, None]
         assert self._rig.right is not None
-        uv_right = self._rig.right.project(se3.transform(self._eyes.right_T_left, points))
-        good &= np.isfinite(uv_right[:, 0])
-        return uv_right, good
+        uv_right = np.full(uv.shape, np.nan)
+        uv_right[good] = self._rig.right.project(se3.transform(self._eyes.right_T_left, points))
+        return uv_right, np.isfinite(uv_right[:, 0])

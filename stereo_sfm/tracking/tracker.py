@@ -9,7 +9,7 @@ for the loop closer.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -48,8 +48,13 @@ class Motion:
     """How the camera is expected to have moved since the last frame."""
 
     pose: F64  # (4, 4) odom_T_cam
-    velocity: F64  # (6,) tangent a second
-    seconds: float
+    moved: F64  # (6,) tangent from the last frame's pose to this one
+    seconds: float  # since the last frame
+
+    @property
+    def velocity(self) -> F64:
+        """(6,) tangent a second."""
+        return self.moved / self.seconds if self.seconds > 0 else np.zeros(6)
 
 
 @dataclass
@@ -153,8 +158,9 @@ class Tracker:
         if self._state == TrackState.INITIALIZING:
             return self._initialize(image, pyramid, right, stats)
         dt = (image.stamp_ns - self._stamp_ns) * 1e-9
-        predicted = self._pose @ se3.exp(self._velocity * dt)
-        expected = Motion(predicted, self._velocity, dt)
+        moved = self._velocity * dt
+        predicted = self._pose @ se3.exp(moved)
+        expected = Motion(predicted, moved, dt)
         tracks, uv_right, solution = self._track(pyramid, right, expected)
         if not solution.good(self._config, len(self._tracks)):
             again = self._track(pyramid, right, self._turn(pyramid, expected))
@@ -176,9 +182,10 @@ class Tracker:
             error=float(np.median(error[inlier])) if inlier.any() else 0.0,
         )
         state = TrackState.OK if self._lost == 0 else TrackState.RECOVERED
-        mean = self._velocity_to(pose, dt)
-        self._shutter.moved(mean, dt)
-        self._velocity = solution.velocity if self._shutter.active else mean
+        if dt > 0:
+            mean = self._moved_to(pose) / dt
+            self._shutter.moved(mean, dt)
+            self._velocity = solution.velocity if self._shutter.active else mean
         self._accept(image, pyramid, pose, tracks.keep(tracks.misses < 3))
         frame_inlier = inlier[tracks.misses < 3]
         self._frames_since_kf += 1
@@ -229,11 +236,11 @@ class Tracker:
         cur_R_prev = self._coarse_rotation.align(self._pyramid, pyramid, cur_R_prev)
         self._first_level = self._config.pyramid_levels - 1
         turned = se3.from_rotation_translation(self._pose[:3, :3] @ cur_R_prev.T, expected.pose[:3, 3])
-        return Motion(turned, self._velocity_to(turned, expected.seconds), expected.seconds)
+        return Motion(turned, self._moved_to(turned), expected.seconds)
 
-    def _velocity_to(self, pose: F64, seconds: float) -> F64:
-        """(6,) tangent a second from the last pose to this one."""
-        return se3.log(se3.inverse(self._pose) @ pose) / seconds if seconds > 0 else self._velocity
+    def _moved_to(self, pose: F64) -> F64:
+        """(6,) tangent from the last pose to this one."""
+        return se3.log(se3.inverse(self._pose) @ pose)
 
     def _follow(self, pyramid: flow.Pyramid, expected: Motion) -> Tracks:
         """Tracks that are found in the new left image, moved there."""
@@ -266,7 +273,7 @@ class Tracker:
             return PoseSolution(np.eye(4), np.zeros(6), np.eye(6), far, 0.0, "too_few_points")
         best = self._optimise(tracks, uv_right, expected)
         if best.inliers < 0.5 * len(tracks):
-            still = replace(expected, pose=self._pose)
+            still = Motion(self._pose, np.zeros(6), expected.seconds)
             best = max(best, self._optimise(tracks, uv_right, still), key=lambda s: s.inliers)
         if best.inliers < config.min_features:
             best.reason = "no_consensus"
@@ -274,8 +281,7 @@ class Tracker:
 
     def _optimise(self, tracks: Tracks, uv_right: F64, expected: Motion) -> PoseSolution:
         pose, velocity, covariance, error = motion.optimise_pose(
-            expected.pose, se3.log(se3.inverse(self._pose) @ expected.pose), expected.seconds,
-            self._shutter.velocity_sigma(),
+            expected.pose, expected.moved, expected.seconds, self._shutter.velocity_sigma(),
             self._shutter.row_seconds(tracks.uv), tracks.origin, tracks.direction, tracks.rho, tracks.variance,
             tracks.uv, uv_right, self._eyes.cams, self._eyes.right_T_left, self._config.sigma_px * self._noise,
             CAUCHY_SCALES,
