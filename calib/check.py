@@ -75,6 +75,7 @@ FOCAL_PERCENT = Limit(1.0, 1.0, 2.5)
 FOCAL_RIGHT_PERCENT = Limit(0.4, 1.0, 4.0)
 SKEW_MS = Limit(0.5, 2.0, 5.0)
 UNKNOWN = "cannot be judged from this recording: move the camera"
+ROLLING = "cannot be judged with a rolling shutter"
 
 
 def check(rig: Rig, rectification: Rectification, windows: list[Window]) -> CheckReport:
@@ -98,7 +99,7 @@ def check(rig: Rig, rectification: Rectification, windows: list[Window]) -> Chec
     findings = (
         _rows(error, median, count),
         _baseline(rig),
-        *_judged(correction),
+        *_judged(correction, rolling=rig.readout_s > 0),
     )
     return CheckReport(findings, total, len(windows), median, count, correction)
 
@@ -157,7 +158,8 @@ def _baseline(rig: Rig) -> Finding:
     )
 
 
-def _judged(correction: Correction) -> list[Finding]:
+def _judged(correction: Correction, rolling: bool) -> list[Finding]:
+    """`rolling`: rows are exposed one after the other, which tracks of a moving camera do not tell from its lens."""
     amount, sigma = correction.amount, correction.amount_sigma
     turn = np.rad2deg(amount[TURN]), np.rad2deg(sigma[TURN])
     rotation = _measured("rotation between the eyes", *turn, ROTATION_DEG, "degrees", turn[1] < 0.06, "xyz")
@@ -166,24 +168,27 @@ def _judged(correction: Correction) -> list[Finding]:
     ratio = 100 * amount[[FOCAL_RATIO]], 100 * sigma[[FOCAL_RATIO]]
     right = _measured("focal length, right against left", *ratio, FOCAL_RIGHT_PERCENT, "%", ratio[1] < 0.4)
     both = 100 * amount[[FOCAL_BOTH]], 100 * sigma[[FOCAL_BOTH]]
-    shown = np.array([correction.shows_focal])
-    common = _measured("focal length, both eyes", *both, FOCAL_PERCENT, "%", shown)
+    shown, why = np.array([correction.shows_focal and not rolling]), ROLLING if rolling else UNKNOWN
+    common = _measured("focal length, both eyes", *both, FOCAL_PERCENT, "%", shown, why=why)
     skew = 1e3 * correction.vector[[SKEW]], 1e3 * correction.sigma[[SKEW]]
     time = _measured("time skew of the right eye", *skew, SKEW_MS, "ms", skew[1] < 1.0)
     return [rotation, replace(direction, level=min(direction.level, 1)), right, common, time]
 
 
-def _measured(name: str, value: F64, sigma: F64, limit: Limit, unit: str, known: Bool, axes: str = "") -> Finding:
+def _measured(
+    name: str, value: F64, sigma: F64, limit: Limit, unit: str, known: Bool, axes: str = "", why: str = UNKNOWN
+) -> Finding:
     """A finding about what should be added to the calibration, with its standard deviation.
 
     Args:
         value: (K,) in `unit`. sigma: (K,). known: (K,) whether the recording shows it. axes: K letters.
+        why: it does not.
     """
     levels = [level_of(float(v), float(s), limit) for v, s in zip(value[known], sigma[known], strict=True)]
     text = f"off by {_list(value)} +- {_list(sigma, '')} {unit}" + (f" ({' '.join(axes)})" if axes else "")
     if not known.all():
         which = " and ".join(a for a, k in zip(axes, known, strict=True) if not k) + " " if axes else ""
-        text += f" ({which}{UNKNOWN})"
+        text += f" ({which}{why})"
     values, deviations = tuple(float(v) for v in value), tuple(float(s) for s in sigma)
     return Finding(name, max(levels, default=0), text, bool(known.all()), values, deviations)
 

@@ -7,7 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
     from calib.check import CheckReport, Finding
+    from stereo_sfm.tracking.readout import ReadoutErrors, ReadoutSearch
+    from stereo_sfm.types import StereoImage
+
+SHUTTER_FRAMES = 200  # looked at for a rolling shutter
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -26,12 +32,15 @@ def run(args: argparse.Namespace) -> int:
     """Collect, judge, print."""
     import itertools
     import json
+    from dataclasses import replace
 
     from calib import load_rig, save_rig
     from calib.check import check
     from calib.rectification import rectify
     from calib.tracks import LONGEST, collect, corners_for
     from drivers.source import open_source
+    from stereo_sfm.config import Config
+    from stereo_sfm.tracking.readout import ReadoutSearch
 
     _check(args)
     with open_source(args.source) as source:
@@ -40,8 +49,12 @@ def run(args: argparse.Namespace) -> int:
         total = min(source.frame_count or args.max_frames, args.max_frames)
         gap = 0 if source.live else max(0, total // args.windows - LONGEST)
         corners = corners_for(total, args.windows)
-        images = itertools.islice(source, args.max_frames)
-        report = check(rig, rectification, collect(images, rectification, args.windows, gap, corners, args.search))
+        shutter = ReadoutSearch(Config().tracker, rig)
+        images = _searched(itertools.islice(source, args.max_frames), shutter)
+        windows = collect(images, rectification, args.windows, gap, corners, args.search)
+        readout = shutter.errors()
+        report = check(replace(rig, readout_s=readout.best_s), rectification, windows)
+        report = replace(report, findings=(*report.findings, _shutter(readout)))
     if args.correct is not None:
         save_rig(report.correction.apply(rig), args.correct)
     if args.json:
@@ -49,6 +62,32 @@ def run(args: argparse.Namespace) -> int:
     else:
         print(as_text(report, str(args.source)))
     return 3 if report.verdict == "FAIL" else 0
+
+
+def _searched(images: Iterable[StereoImage], shutter: ReadoutSearch) -> Iterator[StereoImage]:
+    """The images, the first of them tracked on the way."""
+    for number, image in enumerate(images):
+        if number < SHUTTER_FRAMES:
+            shutter.add(image)
+        yield image
+
+
+def _shutter(errors: ReadoutErrors) -> Finding:
+    import numpy as np
+
+    from calib.check import UNKNOWN, Finding
+
+    own_s, best_s = float(errors.readout_s[0]), errors.best_s
+    known = f"rows read within {own_s * 1e3:g} ms" if own_s else "all rows at once"
+    if np.isnan(errors.gain):
+        return Finding("shutter", 0, f"{known}; {UNKNOWN}", judged=False)
+    if best_s == own_s:
+        return Finding("shutter", 0, f"{known}; points are off by {errors.error_px[0]:.2f} px (median)")
+    better = f"{known}, but points fit {100 * errors.gain:.0f} % better"
+    if best_s == 0:
+        return Finding("shutter", 1, f"{better} without: is readout_s in rig.yaml right?")
+    how = f"if rows are read within {best_s * 1e3:g} ms or more: set readout_s in rig.yaml, a data sheet tells it"
+    return Finding("shutter", 1, f"{better} {how}")
 
 
 def _check(args: argparse.Namespace) -> None:

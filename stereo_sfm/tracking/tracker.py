@@ -120,6 +120,7 @@ class Tracker:
         self._coarse_rotation = CoarseRotation(rig.left, config.pyramid_levels)
         self._map_version = 0
         self._odom_T_map: F64 = np.eye(4)
+        self.residual_px = math.nan  # median reprojection error of the last frame, NaN where it has no pose
 
     def apply(self, update: MapUpdate) -> None:
         """Take the mapper's better positions of points and of the reference keyframe."""
@@ -155,6 +156,7 @@ class Tracker:
             pyramid = flow.build_pyramid(image.left, self._config.pyramid_levels)
             right = self._stereo.prepare(image)
         stats: dict[str, float] = {}
+        self.residual_px = math.nan
         if self._state == TrackState.INITIALIZING:
             return self._initialize(image, pyramid, right, stats)
         dt = (image.stamp_ns - self._stamp_ns) * 1e-9
@@ -169,6 +171,7 @@ class Tracker:
         if solution.reason:
             return self._lose(image, predicted, solution.reason, stats)
         pose, covariance, error, inlier = solution.pose, solution.covariance, solution.error, solution.inlier
+        self.residual_px = float(np.median(error[np.isfinite(error)])) * self._noise * self._config.sigma_px
         self._noise *= float(0.9 + 0.1 * np.median(error[inlier]) / 0.8)  # 0.8: median of unit noise in four rows
         self._noise = min(max(self._noise, 0.3), 4.0)
         tracks.uv_right = uv_right
