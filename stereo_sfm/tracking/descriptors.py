@@ -14,6 +14,7 @@ from stereo_sfm.types import F64, U8
 
 PATCH_SIZE = 31
 RADIUS = 15
+HALF_WIDTHS = np.sqrt(RADIUS**2 - np.arange(-RADIUS, RADIUS + 1) ** 2).astype(np.int64)  # of the disc's rows
 BORDER = 19  # of the image, where no descriptor is computed
 
 
@@ -28,11 +29,12 @@ def _intensity_angles(image, uv):
             continue
         m10, m01 = 0, 0
         for dy in range(-RADIUS, RADIUS + 1):
-            for dx in range(-RADIUS, RADIUS + 1):
-                if dx * dx + dy * dy <= RADIUS * RADIUS:
-                    value = int(image[v + dy, u + dx])
-                    m10 += dx * value
-                    m01 += dy * value
+            half, total = HALF_WIDTHS[dy + RADIUS], 0
+            for dx in range(-half, half + 1):
+                value = int(image[v + dy, u + dx])
+                m10 += dx * value
+                total += value
+            m01 += dy * total
         out[k] = math.atan2(m01, m10)
     return out
 
@@ -42,13 +44,13 @@ def describe(image: U8, uv: F64) -> U8:
     descriptors = np.zeros((len(uv), 32), np.uint8)
     if len(uv) == 0:
         return descriptors
-    angles = _intensity_angles(image, np.ascontiguousarray(uv))
+    angles = np.degrees(_intensity_angles(image, np.ascontiguousarray(uv))) % 360.0
     orb = cv2.ORB.create(nlevels=1, edgeThreshold=BORDER, patchSize=PATCH_SIZE)
-    keypoints = [
-        cv2.KeyPoint(float(u), float(v), float(PATCH_SIZE), math.degrees(a) % 360.0, 1.0, 0, k)
-        for k, ((u, v), a) in enumerate(zip(uv, angles, strict=True))
-    ]
+    points = uv.astype(np.float32)
+    keypoints = cv2.KeyPoint.convert(points, PATCH_SIZE)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    for row, (keypoint, angle) in enumerate(zip(keypoints, angles.tolist(), strict=True)):
+        keypoint.angle, keypoint.class_id = angle, row
     kept, rows = orb.compute(image, keypoints)
     if len(kept):
-        descriptors[[kp.class_id for kp in kept]] = rows
+        descriptors[[keypoint.class_id for keypoint in kept]] = rows
     return descriptors
