@@ -78,8 +78,10 @@ UNKNOWN = "cannot be judged from this recording: move the camera"
 ROLLING = "cannot be judged with a rolling shutter"
 
 
-def check(rig: Rig, rectification: Rectification, windows: list[Window]) -> CheckReport:
+def check(rig: Rig, rectification: Rectification, windows: list[Window], rolling: bool = False) -> CheckReport:
     """Judge `rig` by windows collected through its rectification.
+
+    `rolling`: rows are exposed one after the other; what only motion shows is not judged then.
 
     Raises:
         StereoSfmError: too few matches to say anything.
@@ -90,7 +92,7 @@ def check(rig: Rig, rectification: Rectification, windows: list[Window]) -> Chec
             f"only {total} stereo matches in the whole source: too dark, too plain, swapped eyes, or a calibration"
             " so wrong that nothing matches"
         )
-    correction = estimate(rig, windows)
+    correction = replace(estimate(rig, windows), rolling=rolling)
     good = np.concatenate(correction.explained)
     good = good if good.sum() >= LEAST else np.ones(total, bool)
     left = np.concatenate([w.rows.left for w in windows])[good]
@@ -99,7 +101,7 @@ def check(rig: Rig, rectification: Rectification, windows: list[Window]) -> Chec
     findings = (
         _rows(error, median, count),
         _baseline(rig),
-        *_judged(correction, rolling=rig.readout_s > 0),
+        *_judged(correction),
     )
     return CheckReport(findings, total, len(windows), median, count, correction)
 
@@ -158,17 +160,18 @@ def _baseline(rig: Rig) -> Finding:
     )
 
 
-def _judged(correction: Correction, rolling: bool) -> list[Finding]:
-    """`rolling`: rows are exposed one after the other, which tracks of a moving camera do not tell from its lens."""
-    amount, sigma = correction.amount, correction.amount_sigma
+def _judged(correction: Correction) -> list[Finding]:
+    amount, sigma, still = correction.amount, correction.amount_sigma, not correction.rolling
+    why = UNKNOWN if still else ROLLING
     turn = np.rad2deg(amount[TURN]), np.rad2deg(sigma[TURN])
-    rotation = _measured("rotation between the eyes", *turn, ROTATION_DEG, "degrees", turn[1] < 0.06, "xyz")
+    shown = (turn[1] < 0.06) & np.array([True, still, True])
+    rotation = _measured("rotation between the eyes", *turn, ROTATION_DEG, "degrees", shown, "xyz", why)
     along = np.rad2deg(correction.vector[DIRECTION]), np.rad2deg(correction.sigma[DIRECTION])
-    direction = _measured("baseline direction", *along, DIRECTION_DEG, "degrees", along[1] < 1.1, "yz")
+    direction = _measured("baseline direction", *along, DIRECTION_DEG, "degrees", (along[1] < 1.1) & still, "yz", why)
     ratio = 100 * amount[[FOCAL_RATIO]], 100 * sigma[[FOCAL_RATIO]]
     right = _measured("focal length, right against left", *ratio, FOCAL_RIGHT_PERCENT, "%", ratio[1] < 0.4)
     both = 100 * amount[[FOCAL_BOTH]], 100 * sigma[[FOCAL_BOTH]]
-    shown, why = np.array([correction.shows_focal and not rolling]), ROLLING if rolling else UNKNOWN
+    shown = np.array([correction.shows_focal])
     common = _measured("focal length, both eyes", *both, FOCAL_PERCENT, "%", shown, why=why)
     skew = 1e3 * correction.vector[[SKEW]], 1e3 * correction.sigma[[SKEW]]
     time = _measured("time skew of the right eye", *skew, SKEW_MS, "ms", skew[1] < 1.0)

@@ -20,6 +20,7 @@ import numpy as np
 from calib.amount import FOCAL_BOTH, FOCAL_RATIO, TURN, amounts
 from calib.rig import Rig
 from calib.scene_model import (
+    DIRECTION,
     FOCAL,
     FOCAL_RIGHT,
     NUISANCE,
@@ -81,6 +82,7 @@ class Correction:
     residual_px: float  # root mean square of the inliers after the fit
     travel: float  # how far the points of the liveliest window moved, as a fraction of the image's width
     explained: tuple[Bool, ...]  # for each window (N,) the points whose first moment the corrected rig explains
+    rolling: bool = False  # rows are exposed one after the other: what moves bends as if the lens did
 
     @property
     def sigma(self) -> F64:
@@ -93,13 +95,18 @@ class Correction:
 
         One window does not show it: its matches err together, which their deviation does not say.
         """
-        several = len(self.explained) > 1
+        several = len(self.explained) > 1 and not self.rolling
         return several and self.travel > 0.04 and float(self.amount_sigma[FOCAL_BOTH]) < 0.007
 
     def apply(self, rig: Rig) -> Rig:
-        """The rig turned and magnified as the images ask for; the focal length of both only if the motion shows it."""
+        """The rig turned and magnified as the images ask for; the focal length of both only if the motion shows it.
+
+        With a rolling shutter only what rows tell without motion: the turns about x and z and the right focal length.
+        """
         vector = self.vector.copy()
         vector[ROTATION], vector[FOCAL_RIGHT] = self.amount[TURN], self.amount[FOCAL_RATIO]
+        if self.rolling:
+            vector[ROTATION.start + 1], vector[DIRECTION] = 0.0, 0.0
         vector[FOCAL] = self.amount[FOCAL_BOTH] if self.shows_focal else 0.0
         return moved(rig, vector)
 

@@ -101,5 +101,20 @@ def rectify(
     right = Eye(rig.right, camera, rect_R_right, *remap_tables(rig.right, camera, rect_R_right))
     cam_T_rect = se3.from_rotation_translation(rect_R_left.T, np.zeros(3))
     baseline = se3.from_rotation_translation(np.eye(3), np.array([rig.baseline, 0.0, 0.0]))
-    new = replace(rig, left=camera, right=camera, left_T_right=baseline, body_T_left=rig.body_T_left @ cam_T_rect)
+    new = replace(
+        rig,
+        left=camera,
+        right=camera,
+        left_T_right=baseline,
+        body_T_left=rig.body_T_left @ cam_T_rect,
+        readout_s=rig.readout_s * _rows_read(rig.left, camera, rect_R_left),
+    )
     return Rectification(new, left, right, cam_T_rect)
+
+
+def _rows_read(original: Camera, camera: Camera, rect_R_left: F64) -> float:
+    """What part of the original's rows the rectified image shows, along its middle column."""
+    column = np.array([[camera.cx, 0.0], [camera.cx, camera.height - 1.0]])
+    rows = original.project(camera.unproject(column) @ rect_R_left)[:, 1]
+    part = (rows[1] - rows[0]) / (original.height - 1)
+    return float(np.clip(part, 0.0, 1.0)) if np.isfinite(part) else 1.0

@@ -17,20 +17,30 @@ RigOption = str | Path | Rig | None
 def chosen_rig(option: RigOption, own: Callable[[], Rig]) -> Rig:
     """The rig given by the user, as a `Rig` or a file of any dialect that `calib` reads, else the data set's own.
 
-    A given rig that does not know its body keeps the data set's, so that ground truth of the body stays usable.
+    A given rig that does not know its body keeps the data set's, so that ground truth of the body stays usable; so does
+    one of a dialect that cannot state a readout.
     """
     if option is None or option == "":
         return own()
-    given = option if isinstance(option, Rig) else _load(Path(option))
-    if not np.array_equal(given.body_T_left, np.eye(4)):
+    given, stated = (option, True) if isinstance(option, Rig) else _load(Path(option))
+    bodiless = np.array_equal(given.body_T_left, np.eye(4))
+    if not bodiless and stated:
         return given
     try:
-        return replace(given, body_T_left=own().body_T_left)
+        known = own()
     except StereoSfmError:
         return given
+    return replace(
+        given,
+        body_T_left=known.body_T_left if bodiless else given.body_T_left,
+        readout_s=given.readout_s if stated else known.readout_s,
+    )
 
 
-def _load(path: Path) -> Rig:
+def _load(path: Path) -> tuple[Rig, bool]:
+    """The rig of a file, and whether files of its kind state a readout."""
     from calib import load_rig
+    from calib.formats import recognise
 
-    return load_rig(path)
+    rig = load_rig(path)
+    return rig, recognise(path.expanduser()) == "rig"

@@ -160,8 +160,8 @@ class Keyframe(Message):
     stamp_ns: int
     odom_T_cam: F64  # (4, 4) at creation
     point_ids: I64  # (N,) tracks' ids: the same id is the same physical point in every keyframe of this run
-    uv_left: F64  # (N, 2) px
-    uv_right: F64  # (N, 2) px, NaN where unseen
+    uv_left: F64  # (N, 2) px; with a rolling shutter where they would be if all rows were exposed at the stamp
+    uv_right: F64  # (N, 2) px, NaN where unseen; the same
     points_cam: F64  # (N, 3) metres in this keyframe's camera, NaN where the depth is unknown
     descriptors: U8  # (N, 32) binary (oriented BRIEF), zero rows where none could be computed
     submap_id: int = 0  # grows when tracking restarts after it was lost

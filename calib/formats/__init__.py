@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import importlib
+import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
+
+log = logging.getLogger("stereo_sfm")
 
 # name -> (module, reader, writer, whether it writes a folder). The readers take a path and give a Rig.
 FORMATS: dict[str, tuple[str, str, str, bool]] = {
@@ -48,6 +51,8 @@ def save_rig(rig: Rig, path: Path | str, format: str | None = None) -> None:
     path = Path(path).expanduser()
     name = format or {".json": "foxglove", ".xml": "opencv"}.get(path.suffix, "rig")
     write = _function(name, 2)
+    if rig.readout_s and name != "rig":
+        log.warning("%s has no place for the readout of a rolling shutter (%g s): it is lost", name, rig.readout_s)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write(rig, path)

@@ -26,7 +26,7 @@ def read_native(path: Path) -> Rig:
             depth=bool(data.get("depth", False)),
             name=str(data.get("name", "")),
             serial=str(data.get("serial", "")),
-            readout_s=float(data.get("readout_s", 0.0)),
+            readout_s=float(data.get("readout_s") or 0.0),
         )
 
 

@@ -36,6 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Gather, solve, judge, write."""
+    from dataclasses import replace
+
     from calib import save_rig
     from calib.check import VERDICTS
     from calib.coverage import coverage
@@ -46,13 +48,13 @@ def run(args: argparse.Namespace) -> int:
     report: Path = args.report or args.output.with_suffix(".html")
     _check_files(args.output, report, args.overwrite)
     target = make_target(args)
-    left, right, kept, size = collect(args.source, target, args.views)
+    left, right, kept, size, readout_s = collect(args.source, target, args.views)
     if target.kind == "checkerboard":
         right = align_pairs(left, right)
     calibration = calibrate(left, right, target.points, size, args.model)
     views = [coverage(left, size), coverage(right, size)]
     quality = judge(calibration, min(views, key=lambda v: v.fraction))
-    save_rig(calibration.rig, args.output, args.format)
+    save_rig(replace(calibration.rig, readout_s=readout_s), args.output, args.format)
     report.parent.mkdir(parents=True, exist_ok=True)
     write_report(report, str(args.source), calibration, quality, views, kept[:: max(1, len(kept) // 3)][:3])
     for finding in quality.findings:
@@ -95,8 +97,11 @@ def make_target(args: argparse.Namespace) -> Target:
 
 def collect(
     source: str, target: Target, limit: int
-) -> tuple[list[Detection], list[Detection], list[tuple[U8, U8]], tuple[int, int]]:
-    """Detections of both eyes from a folder of pictures or from a source, telling what is still missing."""
+) -> tuple[list[Detection], list[Detection], list[tuple[U8, U8]], tuple[int, int], float]:
+    """Detections of both eyes from a folder of pictures or from a source, telling what is still missing.
+
+    The last value is the readout that the source's own calibration states: pictures of a target do not show it.
+    """
     from calib.coverage import coverage
     from calib.views import find_pairs, gather, read_pairs, stereo_pairs
     from drivers.source import open_source
@@ -108,6 +113,7 @@ def collect(
         print(f"view {number}: {seen}; {advice[0] if advice else 'enough, more does no harm'}", file=sys.stderr)
 
     folder = Path(source).expanduser()
+    readout_s = 0.0
     pairs = find_pairs(folder) if folder.is_dir() and not (folder / "mav0").is_dir() else []
     if pairs:
         found = gather(read_pairs(pairs), target, limit, every_view=True, tell=tell)
@@ -117,6 +123,7 @@ def collect(
                 found = gather(stereo_pairs(iter(opened)), target, limit, every_view=False, tell=tell)
             except KeyboardInterrupt:
                 raise StereoSfmError("interrupted before the calibration was computed") from None
+            readout_s = opened.rig.readout_s
     if not found[0]:
         raise StereoSfmError(f"no {target.kind} of {target.columns} x {target.rows} in {source}: check its layout")
-    return found
+    return *found, readout_s

@@ -53,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
         images = _searched(itertools.islice(source, args.max_frames), shutter)
         windows = collect(images, rectification, args.windows, gap, corners, args.search)
         readout = shutter.errors()
-        report = check(replace(rig, readout_s=readout.best_s), rectification, windows)
+        report = check(rig, rectification, windows, rolling=readout.best_s > 0)
         report = replace(report, findings=(*report.findings, _shutter(readout)))
     if args.correct is not None:
         save_rig(report.correction.apply(rig), args.correct)
@@ -67,26 +67,24 @@ def run(args: argparse.Namespace) -> int:
 def _searched(images: Iterable[StereoImage], shutter: ReadoutSearch) -> Iterator[StereoImage]:
     """The images, the first of them tracked on the way."""
     for number, image in enumerate(images):
-        if number < SHUTTER_FRAMES:
+        if number < SHUTTER_FRAMES and image.right is not None:
             shutter.add(image)
         yield image
 
 
 def _shutter(errors: ReadoutErrors) -> Finding:
-    import numpy as np
-
     from calib.check import UNKNOWN, Finding
 
-    own_s, best_s = float(errors.readout_s[0]), errors.best_s
-    known = f"rows read within {own_s * 1e3:g} ms" if own_s else "all rows at once"
-    if np.isnan(errors.gain):
+    own_ms, best_ms = 1e3 * float(errors.readout_s[0]), 1e3 * errors.best_s
+    known = f"rows read within {own_ms:g} ms" if own_ms else "all rows at once"
+    if not errors.shown:
         return Finding("shutter", 0, f"{known}; {UNKNOWN}", judged=False)
-    if best_s == own_s:
+    if best_ms == own_ms:
         return Finding("shutter", 0, f"{known}; points are off by {errors.error_px[0]:.2f} px (median)")
     better = f"{known}, but points fit {100 * errors.gain:.0f} % better"
-    if best_s == 0:
-        return Finding("shutter", 1, f"{better} without: is readout_s in rig.yaml right?")
-    how = f"if rows are read within {best_s * 1e3:g} ms or more: set readout_s in rig.yaml, a data sheet tells it"
+    if best_ms < own_ms:
+        return Finding("shutter", 1, f"{better} within {best_ms:g} ms: is readout_s in rig.yaml right?")
+    how = f"if rows are read within {best_ms:g} ms or more: set readout_s in rig.yaml, a data sheet tells it"
     return Finding("shutter", 1, f"{better} {how}")
 
 

@@ -1,5 +1,6 @@
 """COLMAP text model (3.12 and later: rigs and frames; the classic three files are complete for older readers).
 
+With a rolling shutter observations are where a global shutter would have seen them: some pixels beside the pictures.
 COLMAP's poses are cam_from_world, quaternions w first, and the centre of the top-left pixel is (0.5, 0.5).
 """
 

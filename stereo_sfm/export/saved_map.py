@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import logging
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,8 @@ from stereo_sfm.export.map_header import check_counts, checksum, damaged, read_h
 from stereo_sfm.export.replace_folder import replaced_folder
 from stereo_sfm.mapping.map import Map, MapSnapshot
 from stereo_sfm.types import I64, Trajectory
+
+log = logging.getLogger("stereo_sfm")
 
 _FILES: dict[str, tuple[str, ...]] = {
     "keyframes": ("kf_ids", "frame_ids", "stamp_ns", "submap_ids", "map_T_kf", "sessions"),
@@ -115,13 +118,21 @@ def load_map(folder: Path, rig: Rig | None = None) -> SavedMap:
         raise StereoSfmError(
             f"the map {folder} was made with another camera ({describe_rig(own)}) than this one ({describe_rig(rig)})"
         )
+    if rig is not None and abs(own.readout_s - rig.readout_s) > 1e-3:
+        log.warning(
+            "the map %s was made with %s, this camera has %s: is readout_s in rig.yaml right?",
+            folder, describe_shutter(own), describe_shutter(rig),
+        )  # fmt: skip
     saved = SavedMap(snapshot, own, head["vocabulary"], sessions)
     check_counts(folder, head, _counts(saved))
     return saved
 
 
 def same_rig(a: Rig, b: Rig) -> bool:
-    """Whether two rigs see the same way: models, sizes, parameters and the eyes' relative pose."""
+    """Whether two rigs see the same way: models, sizes, parameters and the eyes' relative pose.
+
+    Readouts may differ: a map's pixels are those at the stamps.
+    """
     if a.depth != b.depth or not np.allclose(a.left_T_right, b.left_T_right, atol=1e-6):
         return False
     for x, y in ((a.left, b.left), (a.right, b.right)):
@@ -139,6 +150,11 @@ def same_rig(a: Rig, b: Rig) -> bool:
 def describe_rig(rig: Rig) -> str:
     """A camera in a few words."""
     return f"{rig.left.model} {rig.left.width}x{rig.left.height} f={rig.left.fx:.1f} b={1000 * rig.baseline:.0f} mm"
+
+
+def describe_shutter(rig: Rig) -> str:
+    """When its rows are exposed, in a few words."""
+    return f"rows read within {1000 * rig.readout_s:g} ms" if rig.readout_s else "all rows exposed at once"
 
 
 def restore_map(snapshot: MapSnapshot) -> Map:

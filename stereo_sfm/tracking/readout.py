@@ -33,6 +33,11 @@ class ReadoutErrors:
         return float(self.readout_s[self.error_px <= enough].min())
 
     @property
+    def shown(self) -> bool:
+        """Whether the recording tells readouts apart: a camera that hardly moves fits them all."""
+        return float(np.ptp(self.error_px)) > LEAST_GAIN * float(self.error_px.min())
+
+    @property
     def gain(self) -> float:
         """By what part the error is smaller with the best one than with the rig's own; NaN when it is not known."""
         return float(1 - self.error_px.min() / self.error_px[0])

@@ -25,6 +25,7 @@ from stereo_sfm.types import F64, Corners
 MEMORY_S = 1.0  # over which unsteadiness is averaged
 UNSTEADY = 0.1  # m/s and rad/s between the means of successive frames, until it is known
 LEAST_SIGMA = 0.005  # m/s and rad/s
+LEAST_S = 1e-3  # between frames that say how steady the motion is
 
 
 class RollingShutter:
@@ -37,8 +38,10 @@ class RollingShutter:
         self._unsteady = np.full(2, UNSTEADY**2)  # variance of its changes along one axis: linear, angular
         self.active = rig.readout_s > 0
 
-    def moved(self, mean: F64, seconds: float) -> None:
+    def learn(self, mean: F64, seconds: float) -> None:
         """Learn how steady the motion is from the mean velocity (6,) since the last frame, `seconds` before."""
+        if seconds < LEAST_S:  # such a mean is noise
+            return
         if self._mean is not None:
             share = 1 - math.exp(-seconds / MEMORY_S)
             change = ((mean - self._mean) ** 2).reshape(2, 3).mean(1)
@@ -87,7 +90,7 @@ class RollingShutter:
         if not self.active:
             return uv_left, uv_right
         before = _by_rows(points_cam, velocity, -self.row_seconds(uv_left))
-        return self._moved(uv_left, uv_right, before, points_cam)
+        return self._shifted(uv_left, uv_right, before, points_cam)
 
     def corners_at_stamp(self, corners: Corners, velocity: F64) -> Corners:
         """Corners, whose points are where their rows saw them, as a global shutter would have seen them."""
@@ -96,11 +99,11 @@ class RollingShutter:
         before = corners.points_cam.astype(np.float64)
         uv_left, uv_right = corners.uv_left.astype(np.float64), corners.uv_right.astype(np.float64)
         after = _by_rows(before, velocity, self.row_seconds(uv_left))
-        columns = (*self._moved(uv_left, uv_right, before, after), after)
+        columns = (*self._shifted(uv_left, uv_right, before, after), after)
         left, right, points = (column.astype(np.float32) for column in columns)
         return replace(corners, uv_left=left, uv_right=right, points_cam=points)
 
-    def _moved(self, uv_left: F64, uv_right: F64, before: F64, after: F64) -> tuple[F64, F64]:
+    def _shifted(self, uv_left: F64, uv_right: F64, before: F64, after: F64) -> tuple[F64, F64]:
         """Pixels of both eyes after points (N, 3) metres in the left camera have moved."""
         shifts: list[F64] = []
         for camera, eye_T_left in ((self._rig.left, np.eye(4)), (self._rig.right, self._right_T_left)):

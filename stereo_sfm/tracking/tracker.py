@@ -187,7 +187,7 @@ class Tracker:
         state = TrackState.OK if self._lost == 0 else TrackState.RECOVERED
         if dt > 0:
             mean = self._moved_to(pose) / dt
-            self._shutter.moved(mean, dt)
+            self._shutter.learn(mean, dt)
             self._velocity = solution.velocity if self._shutter.active else mean
         self._accept(image, pyramid, pose, tracks.keep(tracks.misses < 3))
         frame_inlier = inlier[tracks.misses < 3]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -104,6 +105,16 @@ def test_own_file_keeps_every_bit(tmp_path: Path) -> None:
         assert np.array_equal(back.body_T_left, rig.body_T_left)
         assert (back.depth, back.name, back.serial) == (rig.depth, rig.name, rig.serial)
         assert back.readout_s == rig.readout_s
+
+
+def test_a_readout_that_a_dialect_cannot_state(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    rig = replace(RADTAN, readout_s=0.02)
+    save_rig(rig, tmp_path / "rig.yaml")
+    assert not caplog.records
+    save_rig(rig, tmp_path / "camchain.yaml", "kalibr")
+    assert "kalibr has no place for the readout" in caplog.text
+    (tmp_path / "rig.yaml").write_text((tmp_path / "rig.yaml").read_text().replace("readout_s: 0.02", "readout_s:"))
+    assert load_rig(tmp_path / "rig.yaml").readout_s == 0.0
 
 
 def test_a_readout_in_milliseconds_is_told() -> None:

@@ -2,12 +2,14 @@ from __future__ import annotations
 
 import logging
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from calib import save_rig
 from drivers.folder_source import pair_by_stamp
 from drivers.recognise import recognise_folder
 from drivers.select import SelectedFrames
@@ -140,6 +142,16 @@ def test_tum_rgbd_has_depth_in_metres_and_a_virtual_eye(tmp_path: Path, caplog: 
         assert source.rig.readout_s == pytest.approx(0.028)  # a rolling shutter
         assert source.ground_truth is not None and source.ground_truth.positions[-1].tolist() == [0, 0, 1]
     assert "1 of 3 colour images have no depth image" in caplog.text
+
+
+def test_a_rig_that_cannot_state_a_readout_keeps_the_data_sets(tmp_path: Path) -> None:
+    folder = make_tum_rgbd(tmp_path)
+    with open_source(folder) as source:
+        own = source.rig
+    save_rig(replace(own, right=None, depth=False), tmp_path / "camera.yml", "opencv")
+    save_rig(replace(own, readout_s=0.0), tmp_path / "rig.yaml")
+    assert open_source(folder, rig=tmp_path / "camera.yml").rig.readout_s == own.readout_s
+    assert open_source(folder, rig=tmp_path / "rig.yaml").rig.readout_s == 0.0
 
 
 def test_tum_rgbd_of_an_unknown_camera_needs_a_rig(tmp_path: Path) -> None:

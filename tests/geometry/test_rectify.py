@@ -209,3 +209,15 @@ def test_pinhole_of_different_eyes_shares_one_camera() -> None:
     rectification = make(rig, "pinhole", None)
     a, b = both_eyes(rectification, points_before(rig))
     assert np.abs(a[:, 1] - b[:, 1]).max() < 1e-9
+
+
+def test_a_rectified_image_that_shows_fewer_rows_was_read_in_less_time() -> None:
+    fisheye = replace(fisheye_rig(), readout_s=0.03)
+    cropped = rectify(fisheye, "pinhole", 90.0).rig
+    rows = fisheye.left.project(
+        cropped.left.unproject(np.array([[cropped.left.cx, 0.0], [cropped.left.cx, cropped.left.height - 1.0]]))
+    )
+    part = (rows[1, 1] - rows[0, 1]) / (fisheye.left.height - 1)
+    assert 0.3 < part < 0.9
+    assert cropped.readout_s == pytest.approx(0.03 * part, rel=0.02)
+    assert rectify(fisheye_rig(), "pinhole", 90.0).rig.readout_s == 0.0

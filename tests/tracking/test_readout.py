@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from calib import load_rig, save_rig
+from drivers.sim.source import SimSource
 from drivers.source import open_source
 from stereo_sfm.cli import main
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.tracking.readout import LEAST_FRAMES, ReadoutErrors, ReadoutSearch
+from stereo_sfm.types import StereoImage
 
 WALK = "sim:aisle?camera=pinhole&size=320x200&start=60&frames=40&vibration=4"
 
@@ -40,8 +44,39 @@ def test_too_few_frames_say_nothing() -> None:
     assert found.best_s == 0.0
 
 
-def test_check_calib_tells(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["check-calib", f"{WALK}&readout=0.025"]) in (0, 3)
+def test_a_camera_that_glides_fits_every_readout() -> None:
+    assert not search(f"{WALK}&vibration=0&readout=0.025", 0.0).shown
+    assert search(f"{WALK}&readout=0.025", 0.0).shown
+
+
+def test_check_calib_tells(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    source = f"{WALK}&readout=0.025"
+    assert main(["check-calib", source, "--correct", str(tmp_path / "corrected.yaml")]) in (0, 3)
     told = capsys.readouterr().out
     assert "shutter: rows read within 25 ms; points are off by" in told
     assert "cannot be judged with a rolling shutter" in told
+    with open_source(source) as opened:
+        rig = opened.rig
+    corrected = load_rig(tmp_path / "corrected.yaml")
+    assert corrected.left.fx == rig.left.fx  # of what cannot be judged nothing is changed
+    assert corrected.left_T_right[1, 3] == pytest.approx(rig.left_T_right[1, 3], abs=1e-12)
+    save_rig(dataclasses.replace(rig, readout_s=0.0), tmp_path / "silent.yaml")
+    assert main(["check-calib", source, "--rig", str(tmp_path / "silent.yaml")]) == 0
+    told = capsys.readouterr().out
+    assert "WARN  shutter: all rows at once, but points fit" in told
+    assert "set readout_s in rig.yaml" in told
+    assert "cannot be judged with a rolling shutter" in told
+    save_rig(dataclasses.replace(rig, readout_s=0.1), tmp_path / "long.yaml")
+    assert main(["check-calib", source, "--rig", str(tmp_path / "long.yaml")]) == 0
+    assert "is readout_s in rig.yaml right?" in capsys.readouterr().out
+
+
+def test_check_calib_of_a_pair_that_misses_right_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    frame = SimSource.frame
+
+    def without(self: SimSource, frame_id: int, dropped_before: int = 0) -> StereoImage:
+        image = frame(self, frame_id, dropped_before)
+        return dataclasses.replace(image, right=None) if frame_id % 15 == 0 else image
+
+    monkeypatch.setattr(SimSource, "frame", without)
+    assert main(["check-calib", WALK]) in (0, 3)

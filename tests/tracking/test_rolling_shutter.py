@@ -15,6 +15,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import KannalaBrandt, Pinhole
 from stereo_sfm.tracking import motion
 from stereo_sfm.tracking.eyes import Eyes
+from stereo_sfm.tracking.place_corners import PlaceCorners
 from stereo_sfm.tracking.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.tracker import Tracker
 from stereo_sfm.types import F64, Corners, StereoImage, Trajectory
@@ -128,11 +129,19 @@ def test_a_global_shutter_changes_nothing() -> None:
 def test_the_velocity_is_held_as_tightly_as_the_motion_is_steady() -> None:
     steady, shaken = RollingShutter(rig(CAMERAS[0])), RollingShutter(rig(CAMERAS[0]))
     for k in range(200):
-        steady.moved(VELOCITY, 1 / 30)
-        shaken.moved(VELOCITY * (1.3 if k % 2 else 0.7), 1 / 30)
+        steady.learn(VELOCITY, 1 / 30)
+        shaken.learn(VELOCITY * (1.3 if k % 2 else 0.7), 1 / 30)
     assert steady.velocity_sigma().max() < 0.007
     change = np.sqrt((0.6 * VELOCITY).reshape(2, 3) ** 2 @ np.ones(3) / 3)
     assert shaken.velocity_sigma()[[0, 3]] == pytest.approx(0.5 * change + 0.005, rel=0.05)
+
+
+def test_nearly_equal_stamps_do_not_unsettle() -> None:
+    shutter = RollingShutter(rig(CAMERAS[0]))
+    shutter.learn(VELOCITY, 1 / 30)
+    before = shutter.velocity_sigma()
+    shutter.learn(1e4 * VELOCITY, 1e-7)
+    assert np.array_equal(shutter.velocity_sigma(), before)
 
 
 def ate_mm(rig: Rig, images: list[StereoImage], truth: Trajectory) -> float:
@@ -152,3 +161,26 @@ def test_a_rendered_walk_with_a_rolling_shutter() -> None:
     print(f"{known:.2f} mm, without the times of the rows {unknown:.2f} mm")
     assert known < 5.0
     assert known < unknown / 2.5
+
+
+def test_keyframes_of_a_rendered_walk_are_as_if_seen_at_once() -> None:
+    """What the map gets: pixels where the points are at the stamp, of tracked and new points and of corners."""
+    spec = "sim:aisle?camera=pinhole&size=320x200&rate=10&start=20&frames=40&vibration=4&readout=0.05"
+    with open_source(spec) as source:
+        rig, corners = source.rig, PlaceCorners(load(), source.rig)
+        tracker = Tracker(load().tracker, rig, place_corners=corners)
+        off, moved = [], []
+        for image in source:
+            _, keyframe = tracker.step(image)
+            if keyframe is None or keyframe.kf_id == 0:  # at the first the velocity is not known
+                continue
+            left = rig.left.project(keyframe.points_cam)
+            right_T_left = se3.inverse(rig.left_T_right)
+            assert rig.right is not None
+            right = rig.right.project(se3.transform(right_T_left, keyframe.points_cam))
+            off += [np.hypot(*(keyframe.uv_left - left).T), np.hypot(*(keyframe.uv_right - right).T)]
+            seen = corners.find(image)
+            moved.append(np.hypot(*(keyframe.corners.uv_left - seen.uv_left).T))
+    assert len(moved) > 3
+    assert np.nanpercentile(np.concatenate(off), 90) < 0.5
+    assert np.percentile(np.concatenate(moved), 90) > 1.0
