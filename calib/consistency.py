@@ -95,8 +95,8 @@ class Correction:
 
         One window does not show it: its matches err together, which their deviation does not say.
         """
-        several = len(self.explained) > 1 and not self.rolling
-        return several and self.travel > 0.04 and float(self.amount_sigma[FOCAL_BOTH]) < 0.007
+        several = len(self.explained) > 1
+        return not self.rolling and several and self.travel > 0.04 and float(self.amount_sigma[FOCAL_BOTH]) < 0.007
 
     def apply(self, rig: Rig) -> Rig:
         """The rig turned and magnified as the images ask for; the focal length of both only if the motion shows it.

@@ -65,6 +65,15 @@ class Rig:
         """Metres between the eyes; 0 for one eye."""
         return float(np.linalg.norm(self.left_T_right[:3, 3])) if self.stereo else 0.0
 
+    @property
+    def shutter(self) -> str:
+        """When its rows are exposed, for people."""
+        return f"rows read within {1e3 * self.readout_s:g} ms" if self.readout_s else "all rows at once"
+
+    def row_seconds(self, rows: F64) -> F64:
+        """Seconds from an image's stamp, which is the middle row's, to the exposure of other rows (pixels from 0)."""
+        return (rows / (self.left.height - 1) - 0.5) * self.readout_s
+
 
 def _check_camera(eye: str, camera: Camera) -> None:
     """Raises StereoSfmError for numbers that no camera has."""

@@ -42,5 +42,6 @@ def _load(path: Path) -> tuple[Rig, bool]:
     from calib import load_rig
     from calib.formats import recognise
 
-    rig = load_rig(path)
-    return rig, recognise(path.expanduser()) == "rig"
+    path = path.expanduser()
+    kind = recognise(path) if path.exists() else None
+    return load_rig(path, kind), kind == "rig"

@@ -62,7 +62,7 @@ def with_virtual_eye(rig: Rig) -> Rig:
         return rig
     left_T_right = np.eye(4)
     left_T_right[0, 3] = VIRTUAL_BASELINE
-    return replace(rig, right=rig.left, left_T_right=left_T_right, body_T_left=rig.body_T_left.copy(), depth=True)
+    return replace(rig, right=rig.left, left_T_right=left_T_right, depth=True)
 
 
 def _own_rig(folder: Path, label: str) -> Rig:

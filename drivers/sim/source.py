@@ -201,7 +201,7 @@ class SimSource:
         """world_T_cam0 of the rows of a frame: (H, 4, 4), or (4, 4) where all are exposed at once."""
         if self.options.readout == 0:
             return self.pose(frame_id)
-        seconds = self.options.readout * np.linspace(-0.5, 0.5, self.rig.left.height)
+        seconds = self.rig.row_seconds(np.arange(float(self.rig.left.height)))
         return self.walk.poses(frame_id / self.options.rate + seconds)
 
     def clean(self, frame_id: int) -> tuple[View, View]:

@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
         windows = collect(images, rectification, args.windows, gap, corners, args.search)
         readout = shutter.errors()
         report = check(rig, rectification, windows, rolling=readout.best_s > 0)
-        report = replace(report, findings=(*report.findings, _shutter(readout)))
+        report = replace(report, findings=(*report.findings, _shutter(rig.shutter, readout)))
     if args.correct is not None:
         save_rig(report.correction.apply(rig), args.correct)
     if args.json:
@@ -72,11 +72,10 @@ def _searched(images: Iterable[StereoImage], shutter: ReadoutSearch) -> Iterator
         yield image
 
 
-def _shutter(errors: ReadoutErrors) -> Finding:
+def _shutter(known: str, errors: ReadoutErrors) -> Finding:
     from calib.check import UNKNOWN, Finding
 
     own_ms, best_ms = 1e3 * float(errors.readout_s[0]), 1e3 * errors.best_s
-    known = f"rows read within {own_ms:g} ms" if own_ms else "all rows at once"
     if not errors.shown:
         return Finding("shutter", 0, f"{known}; {UNKNOWN}", judged=False)
     if best_ms == own_ms:

@@ -121,7 +121,7 @@ def load_map(folder: Path, rig: Rig | None = None) -> SavedMap:
     if rig is not None and abs(own.readout_s - rig.readout_s) > 1e-3:
         log.warning(
             "the map %s was made with %s, this camera has %s: is readout_s in rig.yaml right?",
-            folder, describe_shutter(own), describe_shutter(rig),
+            folder, own.shutter, rig.shutter,
         )  # fmt: skip
     saved = SavedMap(snapshot, own, head["vocabulary"], sessions)
     check_counts(folder, head, _counts(saved))
@@ -150,11 +150,6 @@ def same_rig(a: Rig, b: Rig) -> bool:
 def describe_rig(rig: Rig) -> str:
     """A camera in a few words."""
     return f"{rig.left.model} {rig.left.width}x{rig.left.height} f={rig.left.fx:.1f} b={1000 * rig.baseline:.0f} mm"
-
-
-def describe_shutter(rig: Rig) -> str:
-    """When its rows are exposed, in a few words."""
-    return f"rows read within {1000 * rig.readout_s:g} ms" if rig.readout_s else "all rows exposed at once"
 
 
 def restore_map(snapshot: MapSnapshot) -> Map:

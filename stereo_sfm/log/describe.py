@@ -240,7 +240,7 @@ def rig_lines(rig: Rig) -> list[str]:
     """The calibration for people, one line per eye and one for the pair."""
     lines = [f"left  {_camera_line(rig.left)}"]
     if rig.readout_s:
-        lines.append(f"rolling shutter, {rig.readout_s * 1e3:.1f} ms from the first row to the last")
+        lines.append(f"rolling shutter, {rig.shutter}")
     if rig.depth:
         return [*lines, f"depth image, virtual baseline {rig.baseline * 1e3:.1f} mm"]
     if rig.right is None:

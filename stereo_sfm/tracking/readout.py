@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -56,7 +57,8 @@ class ReadoutSearch:
         """Track one more image."""
         for tracker in self._trackers:
             tracker.step(image)
-        self._errors.append([tracker.residual_px for tracker in self._trackers])
+        solutions = [tracker.solution for tracker in self._trackers]
+        self._errors.append([math.nan if s is None else s.residual_px for s in solutions])
 
     def errors(self) -> ReadoutErrors:
         """What was found until now."""

@@ -19,7 +19,7 @@ import numpy as np
 from calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.kernels import njit
-from stereo_sfm.tracking.motion import exp_into
+from stereo_sfm.geometry.se3_kernels import exp_into
 from stereo_sfm.types import F64, Corners
 
 MEMORY_S = 1.0  # over which unsteadiness is averaged
@@ -40,7 +40,7 @@ class RollingShutter:
 
     def learn(self, mean: F64, seconds: float) -> None:
         """Learn how steady the motion is from the mean velocity (6,) since the last frame, `seconds` before."""
-        if seconds < LEAST_S:  # such a mean is noise
+        if not self.active or seconds < LEAST_S:  # such a mean is noise
             return
         if self._mean is not None:
             share = 1 - math.exp(-seconds / MEMORY_S)
@@ -56,7 +56,7 @@ class RollingShutter:
         """(N,) seconds from the stamp to the exposure of the rows of pixels (N, 2); (0,) with a global shutter."""
         if not self.active:
             return np.zeros(0)
-        return (uv[:, 1] / (self._rig.left.height - 1) - 0.5) * self._rig.readout_s
+        return self._rig.row_seconds(uv[:, 1])
 
     def rays(self, odom_T_cam: F64, velocity: F64, uv: F64, bearing: F64) -> tuple[F64, F64]:
         """Origins (N, 3) and directions (N, 3) in the odometry frame of what pixels (N, 2) see, bearings (N, 3)."""

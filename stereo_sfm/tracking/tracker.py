@@ -65,6 +65,7 @@ class PoseSolution:
     velocity: F64  # (6,) tangent a second while the rows were read; as expected for a global shutter
     covariance: F64  # (6, 6)
     error: F64  # (N,) whitened
+    sigma_px: float  # what it is whitened by
     max_error: float
     reason: str = ""  # why there is no pose
 
@@ -77,6 +78,11 @@ class PoseSolution:
     def inliers(self) -> int:
         """How many points agree with the pose."""
         return int(self.inlier.sum())
+
+    @property
+    def residual_px(self) -> float:
+        """Median over the points; NaN without a pose."""
+        return math.nan if self.reason else self.sigma_px * float(np.median(self.error[np.isfinite(self.error)]))
 
     def good(self, config: TrackerConfig, before: int) -> bool:
         """Whether most of the points that were followed agree."""
@@ -120,7 +126,7 @@ class Tracker:
         self._coarse_rotation = CoarseRotation(rig.left, config.pyramid_levels)
         self._map_version = 0
         self._odom_T_map: F64 = np.eye(4)
-        self.residual_px = math.nan  # median reprojection error of the last frame, NaN where it has no pose
+        self.solution: PoseSolution | None = None  # of the last image; None where points were only begun
 
     def apply(self, update: MapUpdate) -> None:
         """Take the mapper's better positions of points and of the reference keyframe."""
@@ -156,7 +162,7 @@ class Tracker:
             pyramid = flow.build_pyramid(image.left, self._config.pyramid_levels)
             right = self._stereo.prepare(image)
         stats: dict[str, float] = {}
-        self.residual_px = math.nan
+        self.solution = None
         if self._state == TrackState.INITIALIZING:
             return self._initialize(image, pyramid, right, stats)
         dt = (image.stamp_ns - self._stamp_ns) * 1e-9
@@ -168,10 +174,10 @@ class Tracker:
             again = self._track(pyramid, right, self._turn(pyramid, expected))
             if again[2].inliers > solution.inliers:
                 tracks, uv_right, solution = again
+        self.solution = solution
         if solution.reason:
             return self._lose(image, predicted, solution.reason, stats)
         pose, covariance, error, inlier = solution.pose, solution.covariance, solution.error, solution.inlier
-        self.residual_px = float(np.median(error[np.isfinite(error)])) * self._noise * self._config.sigma_px
         self._noise *= float(0.9 + 0.1 * np.median(error[inlier]) / 0.8)  # 0.8: median of unit noise in four rows
         self._noise = min(max(self._noise, 0.3), 4.0)
         tracks.uv_right = uv_right
@@ -273,7 +279,7 @@ class Tracker:
         config = self._config
         if len(tracks) < config.min_features:
             far = np.full(len(tracks), np.inf)
-            return PoseSolution(np.eye(4), np.zeros(6), np.eye(6), far, 0.0, "too_few_points")
+            return PoseSolution(np.eye(4), np.zeros(6), np.eye(6), far, 0.0, 0.0, "too_few_points")
         best = self._optimise(tracks, uv_right, expected)
         if best.inliers < 0.5 * len(tracks):
             still = Motion(self._pose, np.zeros(6), expected.seconds)
@@ -283,13 +289,13 @@ class Tracker:
         return best
 
     def _optimise(self, tracks: Tracks, uv_right: F64, expected: Motion) -> PoseSolution:
+        sigma_px = self._config.sigma_px * self._noise
         pose, velocity, covariance, error = motion.optimise_pose(
             expected.pose, expected.moved, expected.seconds, self._shutter.velocity_sigma(),
             self._shutter.row_seconds(tracks.uv), tracks.origin, tracks.direction, tracks.rho, tracks.variance,
-            tracks.uv, uv_right, self._eyes.cams, self._eyes.right_T_left, self._config.sigma_px * self._noise,
-            CAUCHY_SCALES,
+            tracks.uv, uv_right, self._eyes.cams, self._eyes.right_T_left, sigma_px, CAUCHY_SCALES,
         )  # fmt: skip
-        return PoseSolution(pose, velocity, covariance, error, self._config.max_error)
+        return PoseSolution(pose, velocity, covariance, error, sigma_px, self._config.max_error)
 
     def _refine(self, tracks: Tracks, solution: PoseSolution) -> None:
         motion.refine_depth(
