@@ -14,7 +14,7 @@ from stereo_sfm.types import F64, U8
 
 PATCH_SIZE = 31
 RADIUS = 15
-HALF_WIDTHS = np.sqrt(RADIUS**2 - np.arange(-RADIUS, RADIUS + 1) ** 2).astype(np.int64)  # of the disc's rows
+HALF_WIDTHS = np.sqrt(RADIUS**2 - np.arange(-RADIUS, RADIUS + 1) ** 2).astype(np.int32)  # of the disc's rows
 BORDER = 19  # of the image, where no descriptor is computed
 
 
@@ -27,14 +27,16 @@ def _intensity_angles(image, uv):
         u, v = int(round(uv[k, 0])), int(round(uv[k, 1]))
         if u < RADIUS or v < RADIUS or u >= w - RADIUS or v >= h - RADIUS:
             continue
-        m10, m01 = 0, 0
+        m10, m01 = np.int32(0), np.int32(0)
         for dy in range(-RADIUS, RADIUS + 1):
-            half, total = HALF_WIDTHS[dy + RADIUS], 0
-            for dx in range(-half, half + 1):
-                value = int(image[v + dy, u + dx])
-                m10 += dx * value
-                total += value
-            m01 += dy * total
+            half = HALF_WIDTHS[dy + RADIUS]
+            row = image[v + dy, u - half : u + half + 1]
+            total, moment = np.int32(0), np.int32(0)
+            for x in range(2 * half + 1):
+                total += np.int32(row[x])
+                moment += np.int32(x) * np.int32(row[x])
+            m10 += moment - half * total
+            m01 += np.int32(dy) * total
         out[k] = math.atan2(m01, m10)
     return out
 
@@ -42,15 +44,16 @@ def _intensity_angles(image, uv):
 def describe(image: U8, uv: F64) -> U8:
     """(N, 32) descriptors of points (N, 2) px; zero rows too near to the border."""
     descriptors = np.zeros((len(uv), 32), np.uint8)
-    if len(uv) == 0:
+    pixel = np.rint(uv.astype(np.float32))  # as OpenCV rounds where it drops points at the border
+    inside = np.flatnonzero(((pixel >= BORDER) & (pixel < np.array(image.shape[::-1]) - BORDER)).all(1))
+    if len(inside) == 0:
         return descriptors
-    angles = np.degrees(_intensity_angles(image, np.ascontiguousarray(uv))) % 360.0
+    kept = np.ascontiguousarray(uv[inside])
     orb = cv2.ORB.create(nlevels=1, edgeThreshold=BORDER, patchSize=PATCH_SIZE)
-    points = uv.astype(np.float32)
-    keypoints = cv2.KeyPoint.convert(points, PATCH_SIZE)  # pyright: ignore[reportArgumentType, reportCallIssue]
-    for row, (keypoint, angle) in enumerate(zip(keypoints, angles.tolist(), strict=True)):
-        keypoint.angle, keypoint.class_id = angle, row
-    kept, rows = orb.compute(image, keypoints)
-    if len(kept):
-        descriptors[[keypoint.class_id for keypoint in kept]] = rows
+    keypoints = cv2.KeyPoint.convert(kept.astype(np.float32), PATCH_SIZE)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    for keypoint, angle in zip(keypoints, (np.degrees(_intensity_angles(image, kept)) % 360.0).tolist(), strict=True):
+        keypoint.angle = angle
+    computed, rows = orb.compute(image, keypoints)
+    assert len(computed) == len(inside)
+    descriptors[inside] = rows
     return descriptors

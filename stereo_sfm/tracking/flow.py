@@ -30,7 +30,8 @@ STRIDE = SIZE + 4
 FLAT_SIZE = SIZE * STRIDE
 WIDE_SIZE = (SIZE + 2) * STRIDE
 RAW_SIZE = (SIZE + 4) * STRIDE
-ONE = np.uint64(1)
+FINE, COARSE = 0.01, 0.1  # px, last step of a translation: in the image itself, and where a finer level follows
+MAX_REACH = 60.0  # px from the centre of a warped window
 TRACKED, OUTSIDE, FLAT, DIVERGED, UNLIKE = 0, 1, 2, 3, 4  # why a point was not followed
 
 Pyramid = tuple[U8, ...]
@@ -78,18 +79,15 @@ def _inside(image, u, v, margin):
 @njit
 def _dot(a, b, tmp):
     """Sum of a * b over a flat window."""
-    for m in range(FLAT_SIZE):
-        tmp[m] = a[m] * b[m]
-    for m in range(160):
-        tmp[m] += tmp[m + 160]
-    for m in range(80):
-        tmp[m] += tmp[m + 80]
-    for m in range(40):
-        tmp[m] += tmp[m + 40]
-    total = np.float32(0)
-    for m in range(40):
-        total += tmp[m]
-    return total
+    for m in range(32):
+        even = (a[m] * b[m] + a[m + 64] * b[m + 64]) + (a[m + 128] * b[m + 128] + a[m + 192] * b[m + 192])
+        odd = (a[m + 32] * b[m + 32] + a[m + 96] * b[m + 96]) + (a[m + 160] * b[m + 160] + a[m + 224] * b[m + 224])
+        tmp[m] = (even + odd) + (a[m + 256] * b[m + 256] + a[m + 288] * b[m + 288])
+    for m in range(16):
+        tmp[m] += tmp[m + 16]
+    for m in range(8):
+        tmp[m] += tmp[m + 8]
+    return ((tmp[0] + tmp[4]) + (tmp[2] + tmp[6])) + ((tmp[1] + tmp[5]) + (tmp[3] + tmp[7]))
 
 
 @njit
@@ -157,13 +155,13 @@ def _template(image, u, v, weights, raw, wide, tmp, patch, gx, gy):
 
 @njit
 def _compare(window, patch, weights, raw, tmp):
-    """Contrast of a window and its normalised correlation times contrast with a centred patch."""
+    """Mean and contrast of a window, and its normalised correlation times contrast with a centred patch."""
     mean = _dot(window, weights, tmp)
     for m in range(FLAT_SIZE):
         raw[m] = (window[m] - mean) * weights[m]
     cross = _dot(raw, patch, tmp)
     variance = _dot(raw, window, tmp)
-    return math.sqrt(max(variance, 1e-6)), cross
+    return mean, math.sqrt(max(variance, 1e-6)), cross
 
 
 @njit
@@ -219,7 +217,7 @@ def track_translation(prev, cur, uv_prev, uv_cur, first_level, last_level, itera
                     break
                 _sample(target, cu - HALF, cv - HALF, raw, window)
                 if iteration == 0 or iteration == 2:
-                    contrast_c, _ = _compare(window, patch, weights, raw, tmp)
+                    _, contrast_c, _ = _compare(window, patch, weights, raw, tmp)
                     gain = min(max(contrast / contrast_c, 0.4), 2.5)
                 bx = gain * _dot(gx, window, tmp) - tx
                 by = gain * _dot(gy, window, tmp) - ty
@@ -230,14 +228,14 @@ def track_translation(prev, cur, uv_prev, uv_cur, first_level, last_level, itera
                     du, dv = du * 2.0 / length, dv * 2.0 / length
                 cu -= du
                 cv -= dv
-                if length < 0.01:
+                if length < (FINE if level == 0 else COARSE):
                     break
             if (cu - start_u) ** 2 + (cv - start_v) ** 2 > 100.0:
                 state = DIVERGED
             if state == TRACKED and level == last_level:
                 if _inside(target, cu, cv, HALF + 0.5):
                     _sample(target, cu - HALF, cv - HALF, raw, window)
-                    contrast_c, cross = _compare(window, patch, weights, raw, tmp)
+                    _, contrast_c, cross = _compare(window, patch, weights, raw, tmp)
                     ncc[k] = cross / (contrast * contrast_c)
                     if ncc[k] < min_ncc:
                         state = UNLIKE
@@ -306,35 +304,56 @@ def make_patches(pyramid, uv, slots, weights, coordinates, patch, gradients, inv
 
 
 @njit
-def _sample_affine(image, warp, cu, cv, out):
-    """Window at warp @ (x, y) + (cu, cv); False when it leaves the image."""
+def _sample_affine(image, warp, cu, cv, scratch, out):
+    """Window at warp @ (x, y) + (cu, cv); False when it leaves the image.
+
+    In three loops of one kind each, which is what makes them fast: where the samples lie, what lies there (each pixel
+    with its right, lower and lower right neighbour in one word), and the interpolation.
+    """
     h, w = image.shape
     reach_u = (abs(warp[0, 0]) + abs(warp[0, 1])) * HALF
     reach_v = (abs(warp[1, 0]) + abs(warp[1, 1])) * HALF
     inside = cu - reach_u >= 0 and cv - reach_v >= 0 and cu + reach_u < w - 1.001 and cv + reach_v < h - 1.001
-    if not (inside and reach_u < 60 and reach_v < 60):  # also when anything is NaN
+    if not (inside and reach_u < MAX_REACH and reach_v < MAX_REACH):  # also when anything is NaN
         return False
+    words, index, offset, quads = scratch
+    left, top = max(int(cu - reach_u - 0.01), 0), max(int(cv - reach_v - 0.01), 0)
+    columns = min(int(cu + reach_u + 0.01), w - 2) - left + 1
+    rows = min(int(cv + reach_v + 0.01), h - 2) - top + 1
+    for i in range(rows):
+        upper, lower = image[top + i, left : left + columns + 1], image[top + i + 1, left : left + columns + 1]
+        row = words[i * columns : (i + 1) * columns]
+        for j in range(columns):
+            row[j] = (
+                np.uint32(upper[j])
+                | np.uint32(upper[j + 1]) << np.uint32(8)
+                | np.uint32(lower[j]) << np.uint32(16)
+                | np.uint32(lower[j + 1]) << np.uint32(24)
+            )
     a, b, c, d = np.float32(warp[0, 0]), np.float32(warp[0, 1]), np.float32(warp[1, 0]), np.float32(warp[1, 1])
-    iu0, iv0 = int(math.floor(cu)), int(math.floor(cv))
-    du, dv = np.float32(cu - iu0 + 64), np.float32(cv - iv0 + 64)  # positive, so that truncation is floor
-    flat = image.reshape(-1)
-    start = (iv0 - 64) * w + iu0 - 64
+    du, dv = np.float32(cu - left), np.float32(cv - top)
+    stride = np.int32(columns)
     for i in range(SIZE):
         y = np.float32(i - HALF)
         row_u, row_v = b * y + du, d * y + dv
         for j in range(SIZE):
-            x = np.float32(j - HALF)
-            u = a * x + row_u
-            v = c * x + row_v
+            x = np.float32(j) - np.float32(HALF)
+            u, v = a * x + row_u, c * x + row_v
             iu, iv = np.int32(u), np.int32(v)
-            fu, fv = u - np.float32(iu), v - np.float32(iv)
-            at = np.uint64(start + iv * w + iu)  # unsigned: no check for negative indices
-            i00, i01 = np.float32(flat[at]), np.float32(flat[at + ONE])
-            at = np.uint64(start + iv * w + iu + w)
-            i10, i11 = np.float32(flat[at]), np.float32(flat[at + ONE])
-            upper = i00 + fu * (i01 - i00)
-            lower = i10 + fu * (i11 - i10)
-            out[i * STRIDE + j] = upper + fv * (lower - upper)
+            index[i * SIZE + j] = iv * stride + iu
+            offset[0, i * SIZE + j], offset[1, i * SIZE + j] = u - np.float32(iu), v - np.float32(iv)
+    for m in range(SIZE * SIZE):
+        quads[m] = words[np.uint32(index[m])]  # unsigned: no check for negative indices
+    byte = np.uint32(255)
+    for i in range(SIZE):
+        for j in range(SIZE):
+            m = i * SIZE + j
+            quad, fu, fv = quads[m], offset[0, m], offset[1, m]
+            i00, i01 = np.float32(np.int32(quad & byte)), np.float32(np.int32(quad >> np.uint32(8) & byte))
+            i10, i11 = np.float32(np.int32(quad >> np.uint32(16) & byte)), np.float32(np.int32(quad >> np.uint32(24)))
+            upper_value = i00 + fu * (i01 - i00)
+            lower_value = i10 + fu * (i11 - i10)
+            out[i * STRIDE + j] = upper_value + fv * (lower_value - upper_value)
     return True
 
 
@@ -360,6 +379,12 @@ def track_affine(
     bx = np.zeros(FLAT_SIZE, np.float32)
     b = np.zeros(6)
     step = np.zeros(6)
+    scratch = (
+        np.zeros(int(2 * MAX_REACH + 3) ** 2, np.uint32),
+        np.zeros(SIZE * SIZE, np.int32),
+        np.zeros((2, SIZE * SIZE), np.float32),
+        np.zeros(SIZE * SIZE, np.uint32),
+    )
     for row in range(n):
         if not wanted[row]:
             continue
@@ -370,13 +395,12 @@ def track_affine(
         ok = True
         for _ in range(iterations):
             w2[0, 0], w2[0, 1], w2[1, 0], w2[1, 1] = a00, a01, a10, a11
-            if not _sample_affine(image, w2, cu, cv, window):
+            if not _sample_affine(image, w2, cu, cv, scratch, window):
                 ok = False
                 break
-            contrast_c, cross = _compare(window, patch[k], weights, raw, tmp)
+            mean, contrast_c, cross = _compare(window, patch[k], weights, raw, tmp)
             gain = np.float32(min(max(contrast[k] / contrast_c, 0.3), 3.0))
             ncc[row] = cross / (contrast[k] * contrast_c)
-            mean = _dot(window, weights, tmp)
             for m in range(FLAT_SIZE):
                 window[m] = gain * (window[m] - mean) - patch[k, m]
             for axis in range(2):

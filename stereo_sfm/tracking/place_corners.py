@@ -19,6 +19,7 @@ from stereo_sfm.types import F32, Corners, StereoImage
 
 LEVELS, SCALE = 4, 1.2  # of ORB in the half image: more levels cost more than they find again
 FAST_THRESHOLD = 10  # grey levels
+BORDER = 15  # px of each level, where no corners are looked for
 
 
 class PlaceCorners:
@@ -27,8 +28,12 @@ class PlaceCorners:
     def __init__(self, config: Config, rig: Rig) -> None:
         self._levels = config.tracker.pyramid_levels
         self._stereo = StereoMatcher(config.tracker, rig)
-        self._mask = corner_mask(rig.left, config.tracker.max_angle_deg).astype(np.uint8)
-        self._orb = cv2.ORB.create(config.loop.corners, SCALE, LEVELS, edgeThreshold=15, fastThreshold=FAST_THRESHOLD)
+        mask = corner_mask(rig.left, config.tracker.max_angle_deg)
+        everywhere = mask[BORDER:-BORDER, BORDER:-BORDER].all()
+        self._mask = None if everywhere else mask.astype(np.uint8)  # a mask that masks nothing takes time
+        self._orb = cv2.ORB.create(
+            config.loop.corners, SCALE, LEVELS, edgeThreshold=BORDER, fastThreshold=FAST_THRESHOLD
+        )
 
     @staticmethod
     def wanted(config: Config, rig: Rig) -> PlaceCorners | None:
@@ -45,7 +50,7 @@ class PlaceCorners:
         keypoints, descriptors = self._orb.detectAndCompute(left[1], self._mask)
         if not len(keypoints):
             return Corners.none()
-        uv = 2.0 * np.array([k.pt for k in keypoints], np.float64)
+        uv = 2.0 * np.asarray(cv2.KeyPoint.convert(keypoints), np.float64)
         match = self._stereo.match_coarse(left, right, uv)
         return Corners(
             uv[match.good].astype(np.float32),

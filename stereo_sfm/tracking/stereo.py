@@ -11,7 +11,7 @@ from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.tracking import flow
 from stereo_sfm.tracking.eyes import Eyes
-from stereo_sfm.tracking.stereo_match import search_epipolar, triangulate
+from stereo_sfm.tracking.stereo_match import patch_sums, search_epipolar, triangulate
 from stereo_sfm.types import F32, F64, Bool, StereoImage
 
 SEARCH_LEVEL = 1
@@ -94,8 +94,8 @@ class StereoMatcher:
     def _search(self, left: flow.Pyramid, right: flow.Pyramid, uv: F64) -> F64:
         """Right pixels (N, 2) to the pixel of the search level, NaN where nothing is alike."""
         return search_epipolar(
-            left[SEARCH_LEVEL], right[SEARCH_LEVEL], uv, 2.0**SEARCH_LEVEL, *self._eyes.cams,
-            self._eyes.right_T_left, self._min_depth, self._candidates, 25.0, 1.2,
+            left[SEARCH_LEVEL], right[SEARCH_LEVEL], patch_sums(right[SEARCH_LEVEL]), uv, 2.0**SEARCH_LEVEL,
+            *self._eyes.cams, self._eyes.right_T_left, self._min_depth, self._candidates, 25.0, 1.2,
         )  # fmt: skip
 
     def _triangulated(self, uv: F64, uv_right: F64, good: Bool, max_epipolar_px: float, least: float) -> StereoMatch:

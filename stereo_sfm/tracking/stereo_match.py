@@ -7,23 +7,43 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 
 from stereo_sfm.geometry.kernels import njit, project_one, unproject_one
+from stereo_sfm.types import I32, U8
 
 PATCH = 4  # half size of the search patch, in pixels of the search level
+SIZE = 2 * PATCH + 1
+AREA = SIZE * SIZE
+
+
+def patch_sums(image: U8) -> I32:
+    """(H, W) sum of the search patch around each pixel."""
+    return cv2.boxFilter(image, cv2.CV_32S, (SIZE, SIZE), normalize=False).astype(np.int32, copy=False)
+
+
+@njit
+def _cut(image, u, v, patch):
+    """Write the patch around a pixel into a flat array."""
+    for y in range(SIZE):
+        row = image[v - PATCH + y, u - PATCH : u + PATCH + 1]
+        for x in range(SIZE):
+            patch[y * SIZE + x] = row[x]
 
 
 @njit
 def search_epipolar(
-    left, right, uv, scale, model_l, params_l, model_r, params_r, right_T_left, min_depth, candidates, max_cost, ratio
-):
+    left, right, right_sums, uv, scale, model_l, params_l, model_r, params_r, right_T_left, min_depth, candidates,
+    max_cost, ratio,
+):  # fmt: skip
     """Coarse position in the right image of points of the left one.
 
     Mean-free absolute differences of patches along the epipolar curve, sampled evenly in inverse distance.
 
     Args:
         left, right: (H, W) uint8, one pyramid level whose pixels are `scale` pixels of the full image.
+        right_sums: (H, W) int32, the sum of the patch around each pixel of `right` (`patch_sums`).
         uv: (N, 2) px of the full left image. right_T_left: (4, 4). min_depth: metres, nearest distance searched.
         candidates: how many inverse distances. max_cost: grey levels a pixel. ratio: the second best cost, away from
             the best, must be at least this much larger.
@@ -37,8 +57,8 @@ def search_epipolar(
     hr, wr = right.shape
     cost = np.empty(candidates)
     where = np.empty((candidates, 2))
-    size = 2 * PATCH + 1
-    template = np.empty((size, size), np.float32)
+    template = np.empty(AREA, np.int32)
+    patch = np.empty(AREA, np.int32)
     for k in range(n):
         iu, iv = int(round(uv[k, 0] / scale)), int(round(uv[k, 1] / scale))
         if iu < PATCH or iv < PATCH or iu >= w - PATCH or iv >= h - PATCH:
@@ -47,12 +67,10 @@ def search_epipolar(
         bx, by, bz = unproject_one(model_l, params_l, iu * scale, iv * scale)
         if math.isnan(bx):
             continue
-        mean = np.float32(0)
-        for y in range(size):
-            for x in range(size):
-                template[y, x] = np.float32(left[iv + y - PATCH, iu + x - PATCH])
-                mean += template[y, x]
-        mean /= size * size
+        _cut(left, iu, iv, template)
+        total = np.int32(0)
+        for m in range(AREA):
+            total += template[m]
         best, best_index = 1e9, -1
         last_u, last_v = -10000, -10000
         for c in range(candidates):
@@ -72,16 +90,12 @@ def search_epipolar(
                 cost[c] = cost[c - 1]
                 continue
             last_u, last_v = ru, rv
-            mean_r = np.float32(0)
-            for y in range(size):
-                for x in range(size):
-                    mean_r += np.float32(right[rv + y - PATCH, ru + x - PATCH])
-            shift = mean_r / (size * size) - mean
-            s = np.float32(0)
-            for y in range(size):
-                for x in range(size):
-                    s += abs(np.float32(right[rv + y - PATCH, ru + x - PATCH]) - template[y, x] - shift)
-            cost[c] = s / (size * size)
+            _cut(right, ru, rv, patch)
+            brighter = np.int32(right_sums[rv, ru] - total)
+            difference = np.int32(0)  # AREA times too large, so that it is a whole number: those are summed at once
+            for m in range(AREA):
+                difference += abs(np.int32(AREA) * (patch[m] - template[m]) - brighter)
+            cost[c] = difference / (AREA * AREA)
             if cost[c] < best:
                 best, best_index = cost[c], c
         if best_index < 0 or best > max_cost:

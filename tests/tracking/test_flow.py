@@ -67,6 +67,37 @@ def test_affine_alignment_finds_the_deformation() -> None:
     assert np.abs(np.median(deformation[found], 0) - matrix[:, :2]).max() < 0.01
 
 
+def test_a_warped_window_is_the_bilinear_interpolation_up_to_the_border() -> None:
+    image = np.random.default_rng(0).integers(0, 256, (90, 120)).astype(np.uint8)
+    rng = np.random.default_rng(1)
+    n = 4000
+    centre = rng.uniform([-5, -5], [125, 95], (n, 2))
+    warps = np.eye(2) + rng.normal(0, 0.3, (n, 2, 2))
+    offset = flow.COORDINATES.reshape(3, flow.SIZE, flow.STRIDE)[:2, :, : flow.SIZE].reshape(2, -1)
+    u, v = np.moveaxis(warps @ offset + centre[:, :, None], 1, 0)
+    reach = flow.HALF * np.abs(warps).sum(2)  # of the corners of the window, and no further
+    inside = ((centre - reach >= 0) & (centre + reach < [120 - 1.001, 90 - 1.001])).all(1)
+    assert 0.2 < inside.mean() < 0.8
+    windows = rng.normal(size=u.shape)
+    for row in np.flatnonzero(inside):
+        iu, iv = np.floor(u[row]).astype(int), np.floor(v[row]).astype(int)
+        fu, fv = u[row] - iu, v[row] - iv
+        four = [image[iv + dv, iu + du].astype(float) for dv in (0, 1) for du in (0, 1)]
+        windows[row] = (1 - fv) * ((1 - fu) * four[0] + fu * four[1]) + fv * ((1 - fu) * four[2] + fu * four[3])
+    weights = flow.WEIGHTS.reshape(flow.SIZE, flow.STRIDE)[:, : flow.SIZE].ravel().astype(float)
+    windows -= (windows @ weights)[:, None]
+    patch = np.zeros((n, flow.SIZE, flow.STRIDE), np.float32)
+    patch[:, :, : flow.SIZE] = windows.reshape(n, flow.SIZE, flow.SIZE)
+    contrast = np.sqrt(windows**2 @ weights)
+    still = np.zeros((n, 2, flow.FLAT_SIZE), np.float32), np.zeros((n, 6, 6))  # no gradients: a step of zero
+    ncc = flow.track_affine(
+        flow.build_pyramid(image, 1)[0], centre.copy(), warps.copy(), np.arange(n), np.ones(n, bool),
+        patch.reshape(n, -1), *still, contrast, 1, flow.WEIGHTS, flow.COORDINATES,
+    )  # fmt: skip
+    assert (ncc[~inside] == 0).all()
+    assert ncc[inside].min() > 0.9999
+
+
 def test_an_unlike_window_is_refused() -> None:
     image, other = texture(3), texture(4)
     uv = grid(image)
