@@ -19,15 +19,8 @@ from drivers.rig_option import RigOption, chosen_rig
 from drivers.source import Source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log import images, schema, topics
-from stereo_sfm.log.image_log import (
-    RIG_FILE,
-    TRUTH_FILE,
-    ImageInfo,
-    ImuSample,
-    WheelSample,
-    rig_from_text,
-    truth_from_bytes,
-)
+from stereo_sfm.log.attached import attached_rig, attached_truth
+from stereo_sfm.log.image_log import ImageInfo, ImuSample, WheelSample
 from stereo_sfm.log.provenance import METADATA
 from stereo_sfm.log.reader import LogReader, Record
 from stereo_sfm.types import F32, I64, U8, ImuSamples, StereoImage, WheelSamples
@@ -173,8 +166,7 @@ class McapSource:
         self.name = str(reader.path)
         self.rig = chosen_rig(rig, self._recorded_rig)
         self._check_eyes()
-        truth = reader.attachment(TRUTH_FILE)
-        self.ground_truth = truth_from_bytes(truth) if truth is not None else None  # world_T_cam0
+        self.ground_truth = attached_truth(reader)  # world_T_cam0
         self._incomplete = 0  # frames of the last reading
         self._decoders: dict[type[Any], Callable[[bytes], Any]] = {}
 
@@ -186,10 +178,10 @@ class McapSource:
             raise StereoSfmError(f"{self.name} holds no {what} images, but its calibration (or --rig) has them")
 
     def _recorded_rig(self) -> Rig:
-        text = self.reader.attachment(RIG_FILE)
-        if text is None:
+        rig = attached_rig(self.reader)
+        if rig is None:
             raise StereoSfmError(f"{self.name} holds no calibration: give one with --rig FILE")
-        return rig_from_text(text.decode())
+        return rig
 
     @property
     def frame_count(self) -> int | None:

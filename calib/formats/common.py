@@ -17,7 +17,7 @@ from stereo_sfm.types import F64
 
 
 @contextmanager
-def reading(path: Path, dialect: str) -> Generator[None]:
+def reading(path: Path | str, dialect: str) -> Generator[None]:
     """Turn whatever goes wrong while a calibration is read into one line that names the file and the reason."""
     try:
         yield
@@ -33,7 +33,12 @@ def reading(path: Path, dialect: str) -> Generator[None]:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """A YAML mapping.
+    """`yaml_mapping` of a file."""
+    return yaml_mapping(path.read_text("utf-8-sig"))
+
+
+def yaml_mapping(text: str) -> dict[str, Any]:
+    """Keys and values of a YAML text.
 
     Raises:
         ValueError: the text is not YAML, or not a mapping.
@@ -41,7 +46,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     import yaml
 
     try:
-        data = yaml.safe_load(path.read_text("utf-8-sig"))
+        data = yaml.safe_load(text)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         raise ValueError(f"not YAML{f' (line {mark.line + 1})' if mark else ''}") from None
@@ -56,10 +61,15 @@ def read_json(path: Path) -> Any:
 
 
 def write_yaml(path: Path, data: dict[str, Any]) -> None:
+    """`yaml_text` as a file."""
+    path.write_text(yaml_text(data), encoding="utf-8")
+
+
+def yaml_text(data: dict[str, Any]) -> str:
     """Keys in the order given, lists on one line, floats with every digit."""
     import yaml
 
-    path.write_text(yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=200), encoding="utf-8")
+    return yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=200)
 
 
 def numbers(values: Any, count: int | None = None) -> list[float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from calib.formats.common import numbers, read_yaml, reading, rigid, rows, write_yaml
+from calib.formats.common import numbers, reading, rigid, rows, yaml_mapping, yaml_text
 from calib.rig import Rig
 from stereo_sfm.geometry.cameras import MODELS, Camera
 
@@ -15,7 +15,14 @@ KEY = "stereo_sfm_rig"
 def read_native(path: Path) -> Rig:
     """`rig.yaml` as `write_native` makes it."""
     with reading(path, "rig"):
-        data = read_yaml(path)
+        text = path.read_text("utf-8-sig")
+    return rig_from_text(text, path)
+
+
+def rig_from_text(text: str, where: Path | str) -> Rig:
+    """The inverse of `rig_to_text`; `where` the text comes from is named when it is malformed."""
+    with reading(where, "rig"):
+        data = yaml_mapping(text)
         if data.get(KEY) != 1:
             raise ValueError(f"{KEY} is {data.get(KEY)}, this version reads 1")
         return Rig(
@@ -32,8 +39,12 @@ def read_native(path: Path) -> Rig:
 
 def write_native(rig: Rig, path: Path) -> None:
     """Every field; `read_native` gives the same bits back."""
-    write_yaml(
-        path,
+    path.write_text(rig_to_text(rig), encoding="utf-8")
+
+
+def rig_to_text(rig: Rig) -> str:
+    """The rig as YAML, every number exact."""
+    return yaml_text(
         {
             KEY: 1,
             "name": rig.name,

@@ -34,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
     if args.save is not None and args.save.is_file() and not args.overwrite:
         raise StereoSfmError(f"{args.save} exists: choose another name or give --overwrite")
     from stereo_sfm.log import topics
-    from stereo_sfm.log.image_log import RIG_FILE, TRUTH_FILE, rig_from_text, truth_from_bytes
+    from stereo_sfm.log.attached import attached_rig, attached_truth
     from stereo_sfm.log.provenance import METADATA
     from stereo_sfm.log.reader import LogReader
     from stereo_sfm.viz.sink import RerunSink
@@ -42,18 +42,16 @@ def run(args: argparse.Namespace) -> int:
     mode = "save" if args.save else "serve" if args.serve else "spawn"
     with LogReader(path) as reader:
         names = {t.topic for t in reader.topics}
-        rig_text = reader.attachment(RIG_FILE)
+        rig = attached_rig(reader)
         name = reader.metadata(METADATA).get("source") or path.stem
-        has_images = args.source is not None or topics.LEFT_IMAGE in names or rig_text is None
+        has_images = args.source is not None or topics.LEFT_IMAGE in names or rig is None
         if has_images:
             with _images(reader, path, args.source) as source:
                 sink = RerunSink(source.rig, name, mode, args.save, source.ground_truth)
                 _play(reader, iter(source), sink)
         else:
-            assert rig_text is not None
-            truth = reader.attachment(TRUTH_FILE)
-            ground_truth = None if truth is None else truth_from_bytes(truth)
-            sink = RerunSink(rig_from_text(rig_text.decode()), name, mode, args.save, ground_truth)
+            assert rig is not None
+            sink = RerunSink(rig, name, mode, args.save, attached_truth(reader))
             _play(reader, iter(()), sink)
         sink.close()
     if mode == "serve":

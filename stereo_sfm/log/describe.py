@@ -17,7 +17,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.log import topics
-from stereo_sfm.log.image_log import RIG_FILE, rig_from_text
+from stereo_sfm.log.attached import attached_rig
 from stereo_sfm.log.provenance import CONFIG_FILE, METADATA, TOTALS, config_hash
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.recorded import messages
@@ -116,7 +116,11 @@ def _describe_file(path: Path) -> Description:
         _compare_eyes(out, {topic.topic: topic.count for topic in reader.topics})
         lean = out.metadata.get("image_format") == "none"
         if lean:
-            out.calibration = rig_lines(rig_from_text((reader.attachment(RIG_FILE) or b"").decode()))
+            rig = attached_rig(reader)
+            if rig is None:
+                out.problems.append("its calibration is damaged")
+            else:
+                out.calibration = rig_lines(rig)
             out.images = rate_of(reader.stamps(topics.FRAME))
     if lean and (out.images is None or not out.images.count):
         out.problems.append("it holds no frames")

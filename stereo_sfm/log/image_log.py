@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import io
-import tempfile
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from foxglove_schemas_protobuf.Pose_pb2 import Pose
 
+from calib.formats.native import rig_to_text
 from calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.log import foxglove, topics
@@ -66,37 +65,11 @@ class WheelSample:
     angular_z: float
 
 
-def rig_to_text(rig: Rig) -> str:
-    """The rig as our YAML, every number exact."""
-    from calib.formats.native import write_native
-
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / RIG_FILE
-        write_native(rig, path)
-        return path.read_text("utf-8-sig")
-
-
-def rig_from_text(text: str) -> Rig:
-    """The inverse of `rig_to_text`."""
-    from calib.formats.native import read_native
-
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / RIG_FILE
-        path.write_text(text, encoding="utf-8")
-        return read_native(path)
-
-
 def truth_to_bytes(trajectory: Trajectory) -> bytes:
     """Stamps and poses as npz, every bit: the topic holds quaternions, which are rounded."""
     buffer = io.BytesIO()
     np.savez_compressed(buffer, stamp_ns=trajectory.stamp_ns, poses=trajectory.poses)
     return buffer.getvalue()
-
-
-def truth_from_bytes(data: bytes) -> Trajectory:
-    """The inverse of `truth_to_bytes`."""
-    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-        return Trajectory(arrays["stamp_ns"], arrays["poses"])
 
 
 class ImageLog:

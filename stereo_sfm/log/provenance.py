@@ -7,10 +7,10 @@ import platform
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 
+from calib.formats.native import rig_to_text
 from calib.rig import Rig
 from stereo_sfm import __version__
 from stereo_sfm.config import Config, dump
-from stereo_sfm.log.image_log import rig_to_text
 from stereo_sfm.log.topics import SCHEMA_VERSION
 from stereo_sfm.log.writer import LogWriter
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import importlib
-import tomllib
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from stereo_sfm.config import Config, from_dict
+from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log import schema, topics
-from stereo_sfm.log.image_log import ImageInfo, ImuSample, WheelSample, rig_from_text
-from stereo_sfm.log.provenance import CONFIG_FILE, METADATA, SOURCE_RIG_FILE, Opening
+from stereo_sfm.log.attached import attached_config, attached_rig
+from stereo_sfm.log.image_log import ImageInfo, ImuSample, WheelSample
+from stereo_sfm.log.provenance import METADATA, SOURCE_RIG_FILE, Opening
 from stereo_sfm.log.reader import LogReader, Record
 from stereo_sfm.log.track_stats import TrackStats
 from stereo_sfm.pipeline.sinks import Health, SourceCounters, StageTimes
@@ -91,13 +91,9 @@ def read_run(reader: LogReader) -> RecordedRun:
     Raises:
         StereoSfmError: the file is a recording, not a run; or a run of a version with other settings.
     """
-    text = reader.attachment(CONFIG_FILE)
-    if text is None:
+    config = attached_config(reader)
+    if config is None:
         raise StereoSfmError(f"{reader.path} is no log of a run: it holds no configuration ('stereo-sfm run' takes it)")
-    try:
-        config = from_dict(tomllib.loads(text.decode()))
-    except StereoSfmError as error:
-        raise StereoSfmError(f"{reader.path} was written by another version of this program: {error}") from None
     about = reader.metadata(METADATA)
     found: dict[str, list[Any]] = {topics.APPLIED: [], topics.DROPPED: []}
     for record, message in messages(reader, tuple(found)):
@@ -115,11 +111,10 @@ def read_run(reader: LogReader) -> RecordedRun:
 
 def read_opening(reader: LogReader) -> Opening:
     """How the source of a run was opened."""
-    rig = reader.attachment(SOURCE_RIG_FILE)
     about = reader.metadata(METADATA)
     return Opening(
         about.get("rectify", "none"),
-        None if rig is None else rig_from_text(rig.decode()),
+        attached_rig(reader, SOURCE_RIG_FILE),
         about.get("map_in", ""),
         about.get("map_sha256", ""),
         about.get("localize_only") == "true",
