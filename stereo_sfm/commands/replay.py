@@ -125,10 +125,17 @@ def _compare(run: Path, replay: Path) -> int:
     from stereo_sfm.log import topics
     from stereo_sfm.log.diff import diff
     from stereo_sfm.log.reader import LogReader
+    from stereo_sfm.log.recorded import ended_early
 
     images = (topics.IMAGE_INFO, topics.LEFT_IMAGE, topics.RIGHT_IMAGE, topics.DEPTH_IMAGE, topics.IMU, topics.WHEEL)
     with LogReader(run) as a, LogReader(replay) as b:
         not_logged = set(images) - {t.topic for t in b.topics}  # what the replay read, without --log full
         differences = [d for d in diff(a, b) if d.topic not in not_logged]
-    print("identical" if not differences else "\n".join(str(d) for d in differences))
+        same = "identical"
+        if ended_early(a):  # the replay ends with the last logged frame: its mapper finishes where the run's went on
+            end = max((record.sequence for record in a.messages((topics.KEYFRAME,))), default=0)
+            known = {t.topic for t in a.topics}
+            differences = [d for d in differences if (0 <= d.frame_id < end or (d.frame_id < 0 and d.topic in known))]
+            same = f"identical before frame {end}, the last keyframe of a run that was killed"
+    print("\n".join(str(d) for d in differences) or same)
     return DIFFERENT if differences else 0

@@ -18,7 +18,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.log import topics
 from stereo_sfm.log.attached import attached_rig
-from stereo_sfm.log.provenance import CONFIG_FILE, METADATA, TOTALS, config_hash
+from stereo_sfm.log.provenance import CONFIG_FILE, ENDED_EARLY, METADATA, TOTALS, config_hash
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.recorded import messages
 from stereo_sfm.types import I64
@@ -124,6 +124,8 @@ def _describe_file(path: Path) -> Description:
             out.images = rate_of(reader.stamps(topics.FRAME))
     if lean and (out.images is None or not out.images.count):
         out.problems.append("it holds no frames")
+    if ENDED_EARLY.items() <= out.metadata.items():
+        out.problems.append("the run was killed: what its stages would have said last is missing")
     if out.truncated:
         out.problems.append(f"{out.truncated}: 'stereo-sfm recover' writes a mended copy")
     if not lean:

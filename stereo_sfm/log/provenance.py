@@ -16,6 +16,7 @@ from stereo_sfm.log.writer import LogWriter
 
 METADATA = "stereo_sfm"
 TOTALS = "totals"  # written at the end: what a reader would else have to count
+ENDED_EARLY = {"ended": "early"}  # in the metadata of a run that was killed
 CONFIG_FILE = "config.toml"
 SOURCE_RIG_FILE = "source_calibration.yaml"
 VERSIONS_FILE = "versions.txt"

@@ -12,7 +12,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log import schema, topics
 from stereo_sfm.log.attached import attached_config, attached_rig
 from stereo_sfm.log.image_log import ImageInfo, ImuSample, WheelSample
-from stereo_sfm.log.provenance import METADATA, SOURCE_RIG_FILE, Opening
+from stereo_sfm.log.provenance import ENDED_EARLY, METADATA, SOURCE_RIG_FILE, Opening
 from stereo_sfm.log.reader import LogReader, Record
 from stereo_sfm.log.track_stats import TrackStats
 from stereo_sfm.pipeline.sinks import Health, SourceCounters, StageTimes
@@ -107,6 +107,11 @@ def read_run(reader: LogReader) -> RecordedRun:
         found[topics.DROPPED],
         read_opening(reader),
     )
+
+
+def ended_early(reader: LogReader) -> bool:
+    """Whether the log lacks what the run would have said last: the run was killed, or the file was cut off."""
+    return bool(reader.truncated) or ENDED_EARLY.items() <= reader.metadata(METADATA).items()
 
 
 def read_opening(reader: LogReader) -> Opening:

@@ -15,7 +15,7 @@ from stereo_sfm.log import foxglove, topics
 from stereo_sfm.log.image_log import ImageLog
 from stereo_sfm.log.images import LoggedImage
 from stereo_sfm.log.map_view import MapView
-from stereo_sfm.log.provenance import TOTALS, Opening, write_provenance
+from stereo_sfm.log.provenance import ENDED_EARLY, METADATA, TOTALS, Opening, write_provenance
 from stereo_sfm.log.track_stats import track_stats
 from stereo_sfm.log.writer import LogWriter
 from stereo_sfm.pipeline.sinks import Health, LogLine, SourceCounters, StageTimes
@@ -192,8 +192,8 @@ class RunLog:
             text = foxglove.text(self._now_ns, line.level, line.text, line.stage)
             self._writer.write(topics.LOG, text, self._now_ns)
 
-    def close(self) -> None:
-        """Write what is left and close the file."""
+    def close(self, *, early: bool = False) -> None:
+        """Write what is left and close the file. `early`: a stage was killed, its last words are missing."""
         if self._closed or self._writer.closed:  # closed by itself when the disk was full
             return
         self._closed = True
@@ -206,6 +206,8 @@ class RunLog:
             totals = {name: str(int(value)) for name, value in self._totals.items()}
             counted = {name: f"{value:g}" for name, value in self._counts.items() if value}
             self._writer.metadata(TOTALS, counted | self._images.totals | totals)
+            if early:
+                self._writer.metadata(METADATA, ENDED_EARLY)
         finally:
             self._writer.close()
 

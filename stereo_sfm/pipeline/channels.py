@@ -18,6 +18,7 @@ class End:
     """The stage has said everything."""
 
     stage: str
+    early: bool = False  # another stage died: what it would still have said is missing
 
 
 @dataclass(frozen=True)

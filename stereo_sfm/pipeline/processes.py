@@ -385,7 +385,7 @@ class ProcessRun:
             return
         until = time.monotonic() + GRACE_S
         if logger.is_alive():
-            self._to_logger.send(End("main"))
+            self._to_logger.send(End("main", early=True))
         logger.join(max(until - time.monotonic(), 0.0))
 
     def _kill_all(self) -> None:

@@ -353,6 +353,7 @@ def run_logger(
         opening=setup.opening,
     )  # fmt: skip
     inbox, free = Inbox[Any](messages), Outbox(release)
+    early = True
     try:
         while not isinstance(message := inbox.take(), End):
             if isinstance(message, SlotImage):
@@ -364,10 +365,11 @@ def run_logger(
                     log.put(image)
             else:
                 log.put(message)
+        early = message.early
     except Lost:
         pass  # main is gone: what has arrived is kept
     finally:
-        log.close()
+        log.close(early=early)
         ring.close()
 
 

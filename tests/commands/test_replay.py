@@ -81,6 +81,26 @@ def test_check_needs_no_output_folder(
     assert "--check compares the logs" in capsys.readouterr().err
 
 
+def test_the_log_of_a_killed_run_is_compared_as_far_as_it_goes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = tmp_path / "whole"
+    spec = "sim:loop?size=212x200&rate=10&frames=60"
+    assert main(["run", spec, "-o", str(whole), "--inline", "-q"]) == 0
+    data = (whole / "run.mcap").read_bytes()
+    for name, kept in (("one", 0.5), ("other", 0.8)):
+        killed = tmp_path / name
+        killed.mkdir()
+        (killed / "run.mcap").write_bytes(data[: int(kept * len(data))])
+        capsys.readouterr()
+        assert main(["replay", str(killed), "-o", str(tmp_path / f"{name}2"), "--check", "--inline", "-q"]) == 0
+        said = capsys.readouterr().out.splitlines()[-1]
+        assert said.startswith("identical before frame ") and "killed" in said
+        assert int(said.split()[3].rstrip(",")) > 60 * kept - 25
+    assert main(["replay", str(killed), "-o", str(tmp_path / "different"), "--check", "--inline", "-q",
+                 "--set", "tracker.max_features=150"]) == 3  # fmt: skip
+
+
 @pytest.mark.parametrize("options", [("--realtime",), ("--speed", "2"), ("--check", "--until", "1")])
 def test_options_that_a_replay_has_no_use_for(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[str, ...]

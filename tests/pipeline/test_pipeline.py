@@ -24,7 +24,7 @@ from stereo_sfm.export.saved_map import load_map
 from stereo_sfm.geometry.cameras import Pinhole
 from stereo_sfm.log.diff import diff
 from stereo_sfm.log.reader import LogReader
-from stereo_sfm.log.recorded import read_run
+from stereo_sfm.log.recorded import ended_early, read_run
 from stereo_sfm.log.run_log import RunLog
 from stereo_sfm.log.writer import LogWriter
 from stereo_sfm.pipeline.images import ImageLayout, ImageRing
@@ -157,6 +157,7 @@ def test_a_killed_stage_ends_the_run_and_leaves_a_log(stage: str, tmp_path: Path
         shared_memory.SharedMemory(name)
     with LogReader(path) as reader:
         logged = sum(1 for _ in reader.messages(["/frame"]))
+        assert ended_early(reader) == (stage != "capture")  # what capture had read is tracked and mapped to the end
     assert logged >= 40 - 15
 
 
@@ -165,6 +166,7 @@ def test_an_error_in_a_stage_comes_back_with_its_traceback(tmp_path: Path) -> No
         process_log(tmp_path / "run.mcap", functools.partial(SlidingWall, 50, fail_at=20))
     with LogReader(tmp_path / "run.mcap") as reader:
         assert sum(1 for _ in reader.messages(["/frame"])) == 20
+        assert not ended_early(reader)
 
 
 def wired(in_processes: bool, source: functools.partial[SlidingWall], folders: MapFolders) -> Iterator[Frame]:
