@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import errno
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
 
-_OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO, errno.EFBIG)
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_OF_THE_DISK = (*_FULL, errno.EROFS, errno.EIO)
 
 
 class StereoSfmError(Exception):
@@ -19,9 +23,22 @@ class StereoSfmError(Exception):
 
 def from_os_error(error: OSError) -> StereoSfmError | None:
     """What the system says of a file as one line; None for what is no fault of a file (a pipe between processes)."""
+    kept = "what was written until then is kept"
     if error.filename is None:
-        kept = "what was written until then is kept"
         return StereoSfmError(f"cannot write: {error.strerror}; {kept}") if error.errno in _OF_THE_DISK else None
+    if error.errno in _FULL:
+        return StereoSfmError(f"cannot write to {error.filename}: {error.strerror}; {kept}")
     if isinstance(error, FileExistsError):
         return StereoSfmError(f"{error.filename}: a file of that name is there already")
     return StereoSfmError(f"{error.filename}: {error.strerror}")
+
+
+@contextmanager
+def writing_to(folder: Path) -> Generator[None]:
+    """Let a disk error name the folder: the system names files that it cannot open, not those that it cannot fill."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None:
+            error.filename = str(folder)
+        raise

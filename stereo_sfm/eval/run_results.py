@@ -11,7 +11,7 @@ import numpy as np
 from calib.rig import Rig
 from stereo_sfm import config as configuration
 from stereo_sfm.config import Config
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import StereoSfmError, writing_to
 from stereo_sfm.eval.evaluate import Evaluation, evaluate
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.eval.report import write_report
@@ -65,18 +65,19 @@ def write_results(
     mapped = record.mapped() if config.mapper.enabled or config.loop.enabled else None
     if mapped is not None:
         estimates["map"] = mapped
-    for short, trajectory in zip(("odom", "map"), estimates.values(), strict=False):
-        _write_trajectory(folder, short, trajectory, record, rig, frame, step)
-    keyframes = record.keyframe_trajectory()
-    if len(keyframes):
-        _write_tum(folder / "keyframes.tum", keyframes, rig, frame)
-    (folder / "config.toml").write_text(configuration.dump(config), encoding="utf-8")
-    save_rig(rig, folder / "rig.yaml")
-    evaluations = _evaluate(estimates, reference, "sim3" if scale_free(config, rig) else "se3")
-    stats = {"source": source_name, "frame": frame, **statistics(record, wall_s, evaluations)}
-    stats["max_lost_percent"] = max_lost_percent
-    write_json(folder / "stats.json", stats)
-    write_report(folder, source_name, record, stats, estimates, reference, evaluations)
+    with writing_to(folder):
+        for short, trajectory in zip(("odom", "map"), estimates.values(), strict=False):
+            _write_trajectory(folder, short, trajectory, record, rig, frame, step)
+        keyframes = record.keyframe_trajectory()
+        if len(keyframes):
+            _write_tum(folder / "keyframes.tum", keyframes, rig, frame)
+        (folder / "config.toml").write_text(configuration.dump(config), encoding="utf-8")
+        save_rig(rig, folder / "rig.yaml")
+        evaluations = _evaluate(estimates, reference, "sim3" if scale_free(config, rig) else "se3")
+        stats = {"source": source_name, "frame": frame, **statistics(record, wall_s, evaluations)}
+        stats["max_lost_percent"] = max_lost_percent
+        write_json(folder / "stats.json", stats)
+        write_report(folder, source_name, record, stats, estimates, reference, evaluations)
     return stats, evaluations
 
 

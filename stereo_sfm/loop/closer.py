@@ -127,7 +127,7 @@ class LoopCloser:
 
     def _near(self, kf_id: int, connected: list[int]) -> set[int]:
         """Keyframes that cannot be loops: connected to this one, or just before it in the same piece of odometry."""
-        before = range(kf_id - self._config.min_gap, kf_id + 1)
+        before = range(max(kf_id - self._config.min_gap, 0), kf_id + 1)
         return {*connected, *(k for k in before if self._graph.unbroken(k, kf_id)), *self._forgotten}
 
     def _judge(self, keyframe: Keyframe, candidates: list[tuple[int, float]], why_none: str) -> LoopResult:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from calib.rig import Rig
 from stereo_sfm.config import Config
+from stereo_sfm.errors import from_os_error
 from stereo_sfm.eval.evaluate import evaluate, table
 from stereo_sfm.eval.record import KeyframeRow, RunRecord
 from stereo_sfm.eval.run_results import scale_free, write_results
@@ -181,3 +184,14 @@ def test_the_report_and_the_exit_code_know_the_same_limit(tmp_path: Path) -> Non
         stats, _ = write_results(tmp_path, "test", pinhole_rig(), Config(), record, 1.0, max_lost_percent=limit)
         assert bool(failure(stats)) == wrong
         assert ("FAIL" in (tmp_path / "report.md").read_text()) == wrong
+
+
+def test_a_disk_that_is_full_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")  # as from a file that is open already
+
+    monkeypatch.setattr("stereo_sfm.eval.run_results.write_report", full)
+    with pytest.raises(OSError, match="No space") as caught:
+        write_results(tmp_path, "test", pinhole_rig(), Config(), record_of(walk(), 0), 1.0)
+    assert str(from_os_error(caught.value)).startswith(f"cannot write to {tmp_path}: No space left")
+    assert (tmp_path / "trajectory_odom.tum").exists()
