@@ -66,6 +66,20 @@ class Rig:
         return float(np.linalg.norm(self.left_T_right[:3, 3])) if self.stereo else 0.0
 
     @property
+    def pixel_angle(self) -> float:
+        """Radians per pixel at the centre of the left image."""
+        return 1.0 / (0.5 * (self.left.fx + self.left.fy))
+
+    def range_sigmas(self, points: F64, disparity_sigma: float) -> F64:
+        """Standard deviation (N,) in metres of the ranges of stereo points (N, 3) in the left camera.
+
+        range^2 * angle of `disparity_sigma` pixels / baseline across the ray; NaN where a point is.
+        """
+        distance = np.linalg.norm(points, axis=1)
+        across = np.linalg.norm(np.cross(points, self.left_T_right[:3, 3]), axis=1) / np.maximum(distance, 1e-9)
+        return distance**2 * disparity_sigma * self.pixel_angle / np.maximum(across, 1e-3 * self.baseline + 1e-12)
+
+    @property
     def shutter(self) -> str:
         """When its rows are exposed, for people."""
         return f"rows read within {1e3 * self.readout_s:g} ms" if self.readout_s else "all rows at once"

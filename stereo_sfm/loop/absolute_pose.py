@@ -47,15 +47,6 @@ class Pose:
     rms: float  # normalised error of the inliers (1 = as noisy as assumed)
 
 
-def range_sigmas(points: F64, rig: Rig, disparity_sigma: float) -> F64:
-    """Range uncertainty (N,) in metres of stereo points (N, 3) in the left camera: range^2 sigma / (f b_perp)."""
-    distance = np.linalg.norm(points, axis=1)
-    direction = points / np.maximum(distance, 1e-9)[:, None]
-    offset = rig.left_T_right[:3, 3]
-    across = np.linalg.norm(np.cross(direction, offset), axis=1)
-    return distance**2 * disparity_sigma / (rig.left.fx * np.maximum(across, 1e-3 * rig.baseline + 1e-9))
-
-
 def ransac_pose(
     matches: Matches, rig: Rig, rng: np.random.Generator, pixel_sigma: float, iterations: int = 400
 ) -> F64 | None:

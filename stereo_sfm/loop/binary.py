@@ -1,7 +1,6 @@
-"""Compiled kernels over 256-bit binary descriptors: Hamming distances, nearest neighbours, k-majority clustering.
+"""Compiled kernels over 256-bit binary descriptors: nearest neighbours, k-majority clustering.
 
-A descriptor is 32 bytes; inside the kernels it is four uint64, made by `as_words`. A row of zeros means that no
-descriptor could be computed and matches nothing.
+A row of zeros means that no descriptor could be computed and matches nothing.
 """
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportMissingTypeArgument=false
@@ -9,42 +8,15 @@ descriptor could be computed and matches nothing.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from stereo_sfm.geometry.hamming import BITS, U64, as_words, hamming
 from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.types import F32, I32, I64, U8, Bool
-
-U64 = NDArray[np.uint64]
-BITS = 256
-
-
-def as_words(descriptors: U8) -> U64:
-    """(N, 32) uint8 -> (N, 4) uint64 with the same bits."""
-    return np.ascontiguousarray(descriptors, np.uint8).reshape(-1, 32).view(np.uint64)
 
 
 def present(descriptors: U8) -> Bool:
     """(N, 32) -> (N,) False for the zero rows."""
     return np.asarray(np.any(descriptors, axis=1), bool)
-
-
-@njit
-def _popcount(x):
-    x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
-    x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
-    x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-    return np.int64((x * np.uint64(0x0101010101010101)) >> np.uint64(56))
-
-
-@njit
-def hamming(a, i, b, j):
-    """Number of bits in which row i of a and row j of b differ."""
-    return (
-        _popcount(a[i, 0] ^ b[j, 0])
-        + _popcount(a[i, 1] ^ b[j, 1])
-        + _popcount(a[i, 2] ^ b[j, 2])
-        + _popcount(a[i, 3] ^ b[j, 3])
-    )
 
 
 @njit

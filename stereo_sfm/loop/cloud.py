@@ -12,8 +12,8 @@ import numpy as np
 
 from calib.rig import Rig
 from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.hamming import as_words, hamming
 from stereo_sfm.geometry.kernels import njit
-from stereo_sfm.loop import binary
 from stereo_sfm.loop.place_view import PlaceView, place_view_of
 from stereo_sfm.types import F64, I64, U8, Bool, Keyframe
 
@@ -94,7 +94,7 @@ def match_guided(
     Corners are paired with corners, other points with other points.
     """
     uv = rig.left.project(se3.transform(b_T_a, cloud.points))
-    words_b, words_a = binary.as_words(view.descriptors), binary.as_words(cloud.descriptors)
+    words_b, words_a = as_words(view.descriptors), as_words(cloud.descriptors)
     best = _nearest_within(view.uv_left, words_b, view.corner, uv, words_a, cloud.corner, radius, max_distance)
     rows_b = np.flatnonzero(best >= 0)
     return rows_b, best[rows_b].astype(np.int64)
@@ -122,7 +122,7 @@ def _nearest_within(uv_b, words_b, kind_b, uv_a, words_a, kind_a, radius, max_di
             i = order[at]
             if abs(uv_b[i, 1] - uv_a[j, 1]) > radius or kind_b[i] != kind_a[j]:
                 continue
-            d = binary.hamming(words_b, i, words_a, j)
+            d = hamming(words_b, i, words_a, j)
             if d < low[i]:
                 low[i] = d
                 best[i] = j

@@ -8,7 +8,6 @@ import numpy as np
 
 from calib.rig import Rig
 from stereo_sfm.loop import binary
-from stereo_sfm.loop.absolute_pose import range_sigmas
 from stereo_sfm.types import F64, I64, U8, Bool, Keyframe
 
 
@@ -40,7 +39,7 @@ def place_view_of(keyframe: Keyframe, rig: Rig, disparity_sigma: float) -> Place
         uv_left[rows],
         uv_right[rows],
         points[rows],
-        range_sigmas(points[rows], rig, disparity_sigma),
+        rig.range_sigmas(points[rows], disparity_sigma),
         descriptors[rows],
         corner[rows],
     )

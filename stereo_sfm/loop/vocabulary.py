@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from stereo_sfm.geometry.hamming import U64, as_words
 from stereo_sfm.loop import binary
 from stereo_sfm.types import F32, I32, U8
 
@@ -29,7 +30,7 @@ class Bag:
 class Vocabulary:
     """Tree in columns; node 0 is the root, the children of a node are consecutive."""
 
-    centroids: binary.U64  # (M, 4) k-majority centre of each node
+    centroids: U64  # (M, 4) k-majority centre of each node
     first_child: I32  # (M,)
     child_count: I32  # (M,) 0 at leaves
     word: I32  # (M,) word id of a leaf, -1 inside the tree
@@ -49,9 +50,7 @@ class Vocabulary:
 
     def look_up(self, descriptors: U8) -> tuple[I32, I32]:
         """(N, 32) -> word ids (N,), -1 for zero rows, and the distance to the word's centre in bits."""
-        node, distance = binary.descend(
-            binary.as_words(descriptors), self.centroids, self.first_child, self.child_count
-        )
+        node, distance = binary.descend(as_words(descriptors), self.centroids, self.first_child, self.child_count)
         return np.where(binary.present(descriptors), self.word[node], -1).astype(np.int32), distance
 
     def bag(self, descriptors: U8) -> Bag:
@@ -78,7 +77,7 @@ def train(images: Sequence[U8], branching: int = 10, depth: int = 4, seed: int =
         branching: children of a node; depth: levels, so at most branching ** depth words.
     """
     descriptors = np.concatenate(list(images))
-    words = binary.as_words(descriptors[binary.present(descriptors)])
+    words = as_words(descriptors[binary.present(descriptors)])
     if not len(words):
         raise ValueError("no descriptors to train a vocabulary from")
     rng = np.random.default_rng(seed)
@@ -130,7 +129,7 @@ def grow(
     Returns:
         The grown vocabulary (the same object when nothing was far). A new word gets its parent word's idf.
     """
-    words = binary.as_words(descriptors)
+    words = as_words(descriptors)
     node, distance = binary.descend(words, vocabulary.centroids, vocabulary.first_child, vocabulary.child_count)
     far = np.flatnonzero(binary.present(descriptors) & (distance > min_distance)).astype(np.int32)
     if not len(far):

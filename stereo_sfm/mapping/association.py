@@ -14,6 +14,7 @@ import numpy as np
 from calib.rig import Rig
 from stereo_sfm.config import MapperConfig
 from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.hamming import as_words
 from stereo_sfm.mapping import map_kernels
 from stereo_sfm.mapping.bundle import Bundle, BundleConfig, bundle_adjust
 from stereo_sfm.mapping.map import Map
@@ -73,16 +74,12 @@ def match(
 ) -> tuple[I64, I64]:
     """Mutually best (sighting, candidate) pairs within the search radius and the descriptor distance."""
     pairs = map_kernels.match_near(
-        sightings.uv_left, sightings.uv_right, _words(sightings.descriptors),
-        predicted_left, predicted_right, _words(descriptors),
+        sightings.uv_left, sightings.uv_right, as_words(sightings.descriptors),
+        predicted_left, predicted_right, as_words(descriptors),
         config.match_radius_px, config.match_distance, config.match_ratio,
     )  # fmt: skip
     found = np.flatnonzero(pairs >= 0)
     return found, pairs[found]
-
-
-def _words(descriptors: U8) -> np.ndarray[tuple[int, int], np.dtype[np.uint64]]:
-    return np.ascontiguousarray(descriptors).view(np.uint64).reshape(-1, 4)
 
 
 def agreeing(rig: Rig, map_T_kf: F64, xyz: F64, uv_left: F64, uv_right: F64, config: MapperConfig) -> Bool:

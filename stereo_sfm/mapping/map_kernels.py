@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from stereo_sfm.geometry.hamming import BITS, hamming
 from stereo_sfm.geometry.kernels import njit
 
 
@@ -81,20 +82,6 @@ def follow(rows, fused_into):
 
 
 @njit
-def _bits(x):
-    """Set bits of a 64-bit word."""
-    x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
-    x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))
-    x = (x + (x >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-    return np.int64((x * np.uint64(0x0101010101010101)) >> np.uint64(56))
-
-
-@njit
-def _distance(a, b):
-    return _bits(a[0] ^ b[0]) + _bits(a[1] ^ b[1]) + _bits(a[2] ^ b[2]) + _bits(a[3] ^ b[3])
-
-
-@njit
 def match_near(uv, uv_right, words, predicted, predicted_right, candidate_words, radius, limit, ratio):
     """Best candidate of each row, or -1: within `radius` px in both eyes, at most `limit` bits, mutual, distinct.
 
@@ -105,10 +92,10 @@ def match_near(uv, uv_right, words, predicted, predicted_right, candidate_words,
     """
     n, c = uv.shape[0], predicted.shape[0]
     best = np.full(n, -1)
-    best_bits = np.full(n, 257)
-    second_bits = np.full(n, 257)
+    best_bits = np.full(n, BITS + 1)
+    second_bits = np.full(n, BITS + 1)
     owner = np.full(c, -1)
-    owner_bits = np.full(c, 257)
+    owner_bits = np.full(c, BITS + 1)
     for i in range(n):
         if words[i, 0] == 0 and words[i, 1] == 0:
             continue
@@ -121,7 +108,7 @@ def match_near(uv, uv_right, words, predicted, predicted_right, candidate_words,
             ru, rv = uv_right[i, 0] - predicted_right[j, 0], uv_right[i, 1] - predicted_right[j, 1]
             if ru * ru + rv * rv > radius * radius:  # False where either is NaN
                 continue
-            bits = _distance(words[i], candidate_words[j])
+            bits = hamming(words, i, candidate_words, j)
             if bits < best_bits[i]:
                 second_bits[i] = best_bits[i]
                 best_bits[i], best[i] = bits, j

@@ -17,7 +17,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.motion_only import pose_covariance
 from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.timing import NoSpans
-from stereo_sfm.tracking.feature_view import FeatureView, ViewMaker, pixel_angle
+from stereo_sfm.tracking.feature_view import FeatureView, ViewMaker
 from stereo_sfm.tracking.features import circle_mask
 from stereo_sfm.tracking.identity import PointIds
 from stereo_sfm.tracking.odometry.base import Motion
@@ -55,7 +55,7 @@ class FeatureTracker:
         self._place_corners = PlaceCorners.wanted(config, rig)
         self._estimator = make_estimator(config.odometry, rig.left)
         self._scale = StepScale(config.odometry, ground_truth)
-        self._pixel = pixel_angle(rig)
+        self._pixel = rig.pixel_angle
         self._pairing = Pairing(config.features, self._pixel)
         self._ids = PointIds()
         self._odom_T_cam = np.eye(4)

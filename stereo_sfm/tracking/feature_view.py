@@ -36,18 +36,6 @@ class FeatureView(Message):
         return len(self.bearings)
 
 
-def pixel_angle(rig: Rig) -> float:
-    """Radians per pixel at the centre of the left image."""
-    return 1.0 / (0.5 * (rig.left.fx + rig.left.fy))
-
-
-def range_sigmas(points: F64, rig: Rig, sigma_px: float = 1.0) -> F64:
-    """(N,) metres: range^2 * angle of `sigma_px` / baseline across the ray; NaN where the point is unknown."""
-    distance = np.linalg.norm(points, axis=1)
-    across = np.linalg.norm(np.cross(points, rig.left_T_right[:3, 3]), axis=1) / np.maximum(distance, 1e-9)
-    return distance**2 * sigma_px * pixel_angle(rig) / np.maximum(across, 1e-3 * rig.baseline + 1e-12)
-
-
 def _depth_points(image: StereoImage, uv: F64, bearings: F64, rig: Rig) -> tuple[F64, F64]:
     """Points and virtual right observations from a depth image: u_right = u_left - fx * baseline / depth."""
     assert image.depth is not None
@@ -67,7 +55,7 @@ class ViewMaker:
         self._rig = rig
         self._left = Extractor(config)
         self._norm = feature_kind(config.kind).norm
-        self._threshold = config.epipolar_px * pixel_angle(rig)
+        self._threshold = config.epipolar_px * rig.pixel_angle
         right_T_left = se3.inverse(rig.left_T_right)
         self._essential = essential_from_motion(right_T_left[:3, :3], right_T_left[:3, 3]) if rig.stereo else None
 
@@ -85,7 +73,7 @@ class ViewMaker:
         if self._rig.stereo and self._config.stereo_only:
             known = np.isfinite(points[:, 2])
             features, bearings, points, right = features.rows(known), bearings[known], points[known], right[known]
-        sigmas = range_sigmas(points, self._rig) if self._rig.stereo else np.full(len(features), np.nan)
+        sigmas = self._rig.range_sigmas(points, 1.0) if self._rig.stereo else np.full(len(features), np.nan)
         ids, ages = np.full(len(features), -1, np.int64), np.zeros(len(features), np.int32)
         return FeatureView(image.frame_id, image.left, features, bearings, right, points, sigmas, ids, ages)
 
@@ -102,7 +90,7 @@ class ViewMaker:
         a, b = bearings[matches[:, 0]], other_bearings[matches[:, 1]]
         found = triangulate(a, b, self._rig.left_T_right)
         turned = b @ self._rig.left_T_right[:3, :3].T
-        enough = np.linalg.norm(np.cross(a, turned), axis=1) > MIN_DISPARITY_PX * pixel_angle(self._rig)
+        enough = np.linalg.norm(np.cross(a, turned), axis=1) > MIN_DISPARITY_PX * self._rig.pixel_angle
         keep = enough & np.isfinite(found[:, 2])
         points[matches[keep, 0]] = found[keep]
         uv_right[matches[keep, 0]] = other.uv[matches[keep, 1]]

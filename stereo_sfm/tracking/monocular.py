@@ -18,7 +18,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.motion_only import bearing_errors, pose_covariance
 from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.timing import NoSpans
-from stereo_sfm.tracking.feature_view import FeatureView, ViewMaker, pixel_angle
+from stereo_sfm.tracking.feature_view import FeatureView, ViewMaker
 from stereo_sfm.tracking.features import feature_kind
 from stereo_sfm.tracking.identity import PointIds
 from stereo_sfm.tracking.local_points import LocalPoints
@@ -44,7 +44,7 @@ class MonocularTracker:
         self._spans = spans or NoSpans()
         self._views = ViewMaker(config.features, Rig(rig.left))
         self._kind = feature_kind(config.features.kind)
-        self._pixel = pixel_angle(rig)
+        self._pixel = rig.pixel_angle
         self._ids = PointIds()
         self._local = LocalPoints(np.zeros(0, np.int64), np.zeros((0, 3)), self._kind.empty())
         self._first: FeatureView | None = None

@@ -36,7 +36,7 @@ def scene(rig: Rig, count: int, outliers: float, rng: np.random.Generator) -> tu
     points_b = se3.transform(b_T_a, points_a)
     left_a, right_a = (uv + rng.normal(0, 0.5, uv.shape) for uv in see(rig, np.eye(4), points_a)[1:])
     left_b, right_b = (uv + rng.normal(0, 0.5, uv.shape) for uv in see(rig, se3.inverse(b_T_a), points_a)[1:])
-    sigma_a, sigma_b = ap.range_sigmas(points_a, rig, 0.5), ap.range_sigmas(points_b, rig, 0.5)
+    sigma_a, sigma_b = rig.range_sigmas(points_a, 0.5), rig.range_sigmas(points_b, 0.5)
     noisy_a = points_a * (1 + rng.normal(size=count) * sigma_a / np.linalg.norm(points_a, axis=1))[:, None]
     noisy_b = points_b * (1 + rng.normal(size=count) * sigma_b / np.linalg.norm(points_b, axis=1))[:, None]
     wrong = rng.random(count) < outliers
