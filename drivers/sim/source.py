@@ -143,6 +143,7 @@ class SimSource:
         self.options = options
         self.live = options.realtime
         self.rig = dataclasses.replace(make_rig(options.camera, _size(options.size)), readout_s=options.readout)
+        self._camera = self.rig  # as it is, whatever calibration is used instead
         self.layout = scene.layout
         self.effects = _effects(scene, options)
         self._dark = _interval(options.dark)
@@ -189,7 +190,7 @@ class SimSource:
     def renderer(self) -> Renderer:
         """Made when first needed: its rays take a while."""
         if self._renderer is None:
-            self._renderer = Renderer(self.world, self.rig)
+            self._renderer = Renderer(self.world, self._camera)
             self._sensors = [Sensor(eye, self.effects) for eye in self._renderer.eyes]
         return self._renderer
 
@@ -201,7 +202,7 @@ class SimSource:
         """world_T_cam0 of the rows of a frame: (H, 4, 4), or (4, 4) where all are exposed at once."""
         if self.options.readout == 0:
             return self.pose(frame_id)
-        seconds = self.rig.row_seconds(np.arange(float(self.rig.left.height)))
+        seconds = self._camera.row_seconds(np.arange(float(self._camera.left.height)))
         return self.walk.poses(frame_id / self.options.rate + seconds)
 
     def clean(self, frame_id: int) -> tuple[View, View]:
@@ -219,7 +220,7 @@ class SimSource:
         """
         o, seconds = self.options, frame_id / self.options.rate
         twist = np.zeros(6) if twist is None else twist
-        twists = [twist, se3.adjoint(se3.inverse(self.rig.left_T_right)) @ twist]
+        twists = [twist, se3.adjoint(se3.inverse(self._camera.left_T_right)) @ twist]
         dark = self._dark[0] <= seconds < self._dark[1]
         level = 0.0 if dark else brightness(self.effects, seconds, o.seed)
         views = self.view(world_T_cam, seconds)  # before the sensors: it makes them

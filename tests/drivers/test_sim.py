@@ -54,6 +54,15 @@ def test_seed_walk_and_effects_change_the_pictures() -> None:
         assert (small(**options).frame(100).left != base.left).mean() > 0.02, options
 
 
+def test_another_calibration_does_not_change_the_pictures() -> None:
+    """`--rig` says what tracking believes, not what the camera is."""
+    spec = {"camera": "pinhole", "vibration": 3.0, "readout": 0.05}
+    source, believed = small(**spec), small(**spec)
+    believed.rig = dataclasses.replace(small().rig, readout_s=0.0)
+    assert same(source.frame(7), believed.frame(7))
+    assert not same(source.frame(7), small(**{**spec, "readout": 0.0}).frame(7))
+
+
 def test_named_scenes_open_by_the_source_table() -> None:
     source = open_source("sim:aisle?camera=pinhole&size=160x100&length=2&seed=5")
     with source:
