@@ -11,7 +11,7 @@ from stereo_sfm.geometry.cameras import KannalaBrandt
 from stereo_sfm.tracking import flow
 from stereo_sfm.tracking.coarse_rotation import CoarseRotation
 from stereo_sfm.tracking.corners import detect_corners
-from stereo_sfm.types import F64, U8
+from stereo_sfm.types import F64, U8, Bool
 
 
 def texture(seed: int, height: int = 240, width: int = 320) -> U8:
@@ -47,24 +47,42 @@ def test_translation_is_found_to_a_twentieth_of_a_pixel(shift: tuple[float, floa
     assert np.median(ncc[found]) > 0.98
 
 
-def test_affine_alignment_finds_the_deformation() -> None:
-    image, matrix = texture(2), np.array([[1.04, 0.05, -4.0], [-0.03, 0.97, 3.0]])
-    seen = warp(image, matrix)
-    uv = grid(image)
+def aligned(image: U8, seen: U8, uv: F64, start: F64) -> tuple[F64, F64, Bool]:
+    """First appearances at `uv` of one image found in another: pixels, deformations, and which were found."""
     n, slots = len(uv), np.arange(len(uv))[::-1].copy()
     patch, gradients = np.zeros((n, flow.FLAT_SIZE), np.float32), np.zeros((n, 2, flow.FLAT_SIZE), np.float32)
     inverse, contrast = np.zeros((n, 6, 6)), np.zeros(n)
     store = (patch, gradients, inverse, contrast)
     good = flow.make_patches(flow.build_pyramid(image, 1), uv, slots, flow.WEIGHTS, flow.COORDINATES, *store)
+    out, deformation = start.copy(), np.tile(np.eye(2), (n, 1, 1))
+    pixels = flow.build_pyramid(seen, 1)[0]
+    ncc = flow.track_affine(pixels, out, deformation, slots, good, *store, 15, flow.WEIGHTS, flow.COORDINATES)
+    return out, deformation, good & (ncc > 0.95)
+
+
+def test_affine_alignment_finds_the_deformation() -> None:
+    image, matrix = texture(2), np.array([[1.04, 0.05, -4.0], [-0.03, 0.97, 3.0]])
+    uv = grid(image)
     truth = uv @ matrix[:, :2].T + matrix[:, 2]
     start = truth + np.random.default_rng(0).normal(size=truth.shape) * 0.5
-    deformation = np.tile(np.eye(2), (n, 1, 1))
-    pixels = flow.build_pyramid(seen, 1)[0]
-    ncc = flow.track_affine(pixels, start, deformation, slots, good, *store, 15, flow.WEIGHTS, flow.COORDINATES)
-    found = good & (ncc > 0.95)
+    out, deformation, found = aligned(image, warp(image, matrix), uv, start)
     assert found.mean() > 0.8  # the rest lies where the border was reflected
-    assert np.median(np.linalg.norm(start - truth, axis=1)[found]) < 0.05
+    assert np.median(np.linalg.norm(out - truth, axis=1)[found]) < 0.05
     assert np.abs(np.median(deformation[found], 0) - matrix[:, :2]).max() < 0.01
+
+
+def test_affine_alignment_forgets_where_it_began() -> None:
+    """What is left of the start is left of the motion too, when all points begin short of it."""
+    image, matrix = texture(2), np.array([[1.02, 0.01, -2.4], [-0.01, 1.02, -1.8]])
+    uv = grid(image)
+    truth = uv @ matrix[:, :2].T + matrix[:, 2]
+    seen = warp(image, matrix)
+    off = np.array([0.2, 0.1])
+    short, _, found = aligned(image, seen, uv, truth + off)
+    far, _, found_far = aligned(image, seen, uv, truth - off)
+    both = found & found_far
+    assert both.mean() > 0.8
+    assert np.abs(np.median((short - far)[both], axis=0)).max() < 0.001
 
 
 def test_a_warped_window_is_the_bilinear_interpolation_up_to_the_border() -> None:
