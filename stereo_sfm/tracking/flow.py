@@ -30,7 +30,7 @@ STRIDE = SIZE + 4
 FLAT_SIZE = SIZE * STRIDE
 WIDE_SIZE = (SIZE + 2) * STRIDE
 RAW_SIZE = (SIZE + 4) * STRIDE
-FINE, COARSE = 0.01, 0.1  # px, last step of an alignment: in the image itself, and where a finer level follows
+FINE, COARSE = 0.01, 0.1  # px, last step of a translation: in the image itself, and where a finer level follows
 MAX_REACH = 60.0  # px from the centre of a warped window
 TRACKED, OUTSIDE, FLAT, DIVERGED, UNLIKE = 0, 1, 2, 3, 4  # why a point was not followed
 
@@ -431,7 +431,7 @@ def track_affine(
                 a10 * i00 + a11 * i10,
                 a10 * i01 + a11 * i11,
             )
-            if length < FINE:
+            if length < 0.03:
                 break
         if not ok:
             ncc[row] = 0

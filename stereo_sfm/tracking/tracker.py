@@ -258,8 +258,8 @@ class Tracker:
         guess = self._shutter.project(expected.pose, expected.velocity, tracks.points(), tracks.uv)
         guess = np.where(np.isfinite(guess), guess, tracks.uv)
         uv = guess.copy()
-        status, _ = flow.track_translation(  # not in the image itself: there the first appearance is aligned
-            self._pyramid, pyramid, tracks.uv, uv, self._first_level, 1, 10, config.min_contrast, config.min_ncc,
+        status, _ = flow.track_translation(
+            self._pyramid, pyramid, tracks.uv, uv, self._first_level, 0, 10, config.min_contrast, config.min_ncc,
             flow.WEIGHTS,
         )  # fmt: skip
         found = status == flow.TRACKED

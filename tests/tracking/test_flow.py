@@ -82,7 +82,7 @@ def test_affine_alignment_forgets_where_it_began() -> None:
     far, _, found_far = aligned(image, seen, uv, truth - off)
     both = found & found_far
     assert both.mean() > 0.8
-    assert np.abs(np.median((short - far)[both], axis=0)).max() < 0.001
+    assert np.abs(np.median((short - far)[both], axis=0)).max() < 0.003
 
 
 def test_a_warped_window_is_the_bilinear_interpolation_up_to_the_border() -> None:
