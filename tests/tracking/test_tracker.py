@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from calib.rig import Rig
+from drivers.memory import MemorySource
 from drivers.rectified import RectifiedSource
 from drivers.source import Source, open_source
 from stereo_sfm.config import load
@@ -163,3 +164,15 @@ def test_poses_are_rigid(data_root: Path) -> None:
         rotation = frame.odom_T_cam[:3, :3]
         assert np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-9
         assert np.allclose(se3.inverse(frame.odom_T_cam) @ frame.odom_T_cam, np.eye(4))
+
+
+def test_backwards_points_are_kept_as_long_as_forwards() -> None:
+    """There and back twice: a tracker that loses points where the view widens makes keyframes instead."""
+    with open_source("sim:aisle?size=212x200&frames=150") as source:
+        images, rig = list(source), source.rig
+    tracker = Tracker(load().tracker, rig)
+    steps = [tracker.step(image) for image in MemorySource(rig, images, count=600, there_and_back=True)]
+    keyframes = np.array([keyframe is not None for _, keyframe in steps]).reshape(4, 150).sum(1)
+    back_at_start = steps[298][0].odom_T_cam[:3, 3] - steps[0][0].odom_T_cam[:3, 3]
+    assert keyframes[1] + keyframes[3] < 1.5 * (keyframes[0] + keyframes[2])
+    assert np.linalg.norm(back_at_start) < 0.02
