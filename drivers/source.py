@@ -6,13 +6,15 @@ import importlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import TYPE_CHECKING, Any, Protocol, Self
 from urllib.parse import parse_qsl
 
-from calib.rig import Rig
-from drivers.rig_option import RigOption
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.types import StereoImage, Trajectory
+
+if TYPE_CHECKING:
+    from calib.rig import Rig
+    from drivers.rig_option import RigOption
+    from stereo_sfm.types import StereoImage, Trajectory
 
 
 class Source(Protocol):
@@ -74,6 +76,12 @@ DEVICES = ("t265", "oak")  # kinds that are live cameras
 def is_device(spec: str) -> bool:
     """Whether a source's name stands for a live camera."""
     return spec.partition(":")[0] in DEVICES
+
+
+def path_of(spec: str) -> Path:
+    """The file or folder that a source's text names, if it names one."""
+    kind, colon, rest = spec.partition(":")
+    return Path(rest.partition("?")[0] if colon and kind in TABLE else spec).expanduser()
 
 
 def _factory(name: str) -> Callable[..., Source]:

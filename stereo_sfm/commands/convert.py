@@ -16,9 +16,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Convert everything that the source holds."""
-    from stereo_sfm.commands.run import SourceChoice
+    from stereo_sfm.commands.run import source_choice
 
-    choice = SourceChoice.of(args)
+    choice = source_choice(args)
     choice.refuse_to_overwrite(args.output)
     with choice() as source:
         if source.live:

@@ -99,16 +99,13 @@ def estimate_file(path: Path, which: str | None) -> Path:
 
 def load_reference(spec: str, opening: Opening) -> tuple[Trajectory, Path | None]:
     """The ground truth of a file, and that file; or of a source, seen as the run saw its own."""
+    from drivers.choice import SourceChoice
     from drivers.ground_truth import read_trajectory
-    from drivers.rectified import rectified
-    from drivers.source import open_source
-    from stereo_sfm.commands.run import RECTIFY
 
     path = Path(spec).expanduser()
     if path.is_file() and path.suffix != ".mcap":
         return read_trajectory(path), path
-    source = open_source(spec, opening.rig)
-    with rectified(source, RECTIFY[opening.rectify]) as opened:
+    with SourceChoice(spec, opening.rig, rectify=opening.rectify)() as opened:
         if opened.ground_truth is None:
             raise StereoSfmError(f"{opened.name} has no ground truth")
         return opened.ground_truth, None

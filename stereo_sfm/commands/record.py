@@ -38,14 +38,13 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-q", "--quiet", action="store_true", help="no progress and no summary")
     add_source_arguments(parser)
     parser.add_argument("--frames", type=int, dest="max_frames", metavar="N", help="same as --max-frames")
-    parser.set_defaults(speed=None)  # recordings are copied as fast as they can be read
 
 
 def run(args: argparse.Namespace) -> int:
     """Record until the source ends, the duration is over, or Ctrl-C."""
-    from stereo_sfm.commands.run import SourceChoice
+    from stereo_sfm.commands.run import source_choice
 
-    choice = SourceChoice.of(args)
+    choice = source_choice(args)
     choice.refuse_to_overwrite(args.output)
     with choice() as source:
         return write(source, args, "record", choice.opening)

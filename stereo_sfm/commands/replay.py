@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stereo_sfm.commands.run import SourceChoice, add_talk_arguments, add_wiring_arguments, execute
+from stereo_sfm.commands.run import add_talk_arguments, add_wiring_arguments, execute
 from stereo_sfm.errors import StereoSfmError
 
 if TYPE_CHECKING:
-    from drivers.source import Source
     from stereo_sfm.config import Config
     from stereo_sfm.log.provenance import Opening
     from stereo_sfm.pipeline.maps import MapFolders
@@ -43,25 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_talk_arguments(parser)
 
 
-@dataclass(frozen=True)
-class ReplayChoice(SourceChoice):
-    """The frames that a run tracked."""
-
-    frame_ids: tuple[int, ...] = ()
-    recorded_skip: int = 1  # of the run: its frame ids say which frames
-
-    @property
-    def numbering(self) -> int:
-        return self.recorded_skip
-
-    def __call__(self) -> Source:
-        from drivers.replayed import ReplayedSource
-
-        return ReplayedSource(super().__call__(), self.frame_ids)
-
-
 def run(args: argparse.Namespace) -> int:
     """Read what the run was, do it again, compare if asked."""
+    from drivers.choice import ReplayChoice
     from stereo_sfm.log import recorded, topics
     from stereo_sfm.log.reader import LogReader
 

@@ -6,7 +6,6 @@ import argparse
 import logging
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,19 +14,16 @@ from stereo_sfm.errors import StereoSfmError, from_os_error
 from stereo_sfm.presets import PRESETS, preset
 
 if TYPE_CHECKING:
-    from calib.rig import Rig
-    from drivers.source import Source
+    from drivers.choice import SourceChoice
     from stereo_sfm.commands._step import Stepper
     from stereo_sfm.config import Config
     from stereo_sfm.eval.record import RunRecord
-    from stereo_sfm.log.provenance import Opening
     from stereo_sfm.log.recorded import RecordedRun
     from stereo_sfm.pipeline.maps import MapFolders
     from stereo_sfm.pipeline.session import Session
     from stereo_sfm.pipeline.sinks import Sink
     from stereo_sfm.viz.match_pictures import MatchPictures
 
-RECTIFY = {"none": "none", "pinhole": "pinhole", "wide": "epipolar"}  # option -> projection of `rectify`
 TRACKING_FAILED = 4
 
 
@@ -58,6 +54,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def add_source_arguments(parser: argparse.ArgumentParser) -> None:
     """Options that choose the calibration and a part of a source."""
+    from drivers.choice import RECTIFY
+
     parser.add_argument("--rig", type=Path, metavar="FILE", help="calibration instead of the source's own")
     parser.add_argument(
         "--rectify",
@@ -140,74 +138,18 @@ def load_config(args: argparse.Namespace) -> Config:
     return chosen
 
 
-@dataclass(frozen=True)
-class SourceChoice:
-    """The source that the options ask for; opened by calling it, in whichever process reads it."""
+def source_choice(args: argparse.Namespace, realtime: bool = False, speed: float | None = None) -> SourceChoice:
+    """The source that the options of `add_source_arguments` ask for; `realtime`: recordings at their own speed."""
+    from drivers.choice import SourceChoice
+    from drivers.selection import Selection
+    from drivers.source import is_device
+    from stereo_sfm.demo import demo_recording
 
-    spec: str
-    rig: Rig | None = None
-    start: float = 0.0
-    duration: float = float("inf")
-    frame_skip: int = 1
-    max_frames: int | None = None
-    speed: float | None = None
-    rectify: str = "none"
-
-    @staticmethod
-    def of(args: argparse.Namespace) -> SourceChoice:
-        """From the options of this command."""
-        from drivers.source import is_device
-        from stereo_sfm.demo import demo_recording
-
-        spec = args.source if args.source is not None else str(demo_recording())
-        speed: float | None = getattr(args, "speed", None)
-        if speed is None and getattr(args, "realtime", False) and not is_device(spec):
-            speed = 1.0
-        if Path(spec).exists():
-            spec = str(Path(spec).resolve())  # the log says where the images are: a replay may start elsewhere
-        rig = None
-        if args.rig is not None:
-            from calib import load_rig
-
-            rig = load_rig(args.rig)
-        part = (args.start, args.duration, args.frame_skip, args.max_frames)
-        return SourceChoice(spec, rig, *part, speed, args.rectify)
-
-    def refuse_to_overwrite(self, output: Path | None) -> None:
-        """Raises StereoSfmError when the source is the file that is to be written, or lies in the folder."""
-        from drivers.source import TABLE
-
-        kind, colon, rest = self.spec.partition(":")
-        source = Path(rest.partition("?")[0] if colon and kind in TABLE else self.spec)
-        if output is None or not source.exists() or not output.exists():
-            return
-        if output.resolve() in (source.resolve(), *source.resolve().parents):
-            raise StereoSfmError(f"{output} is what is read, or holds it: choose another -o")
-
-    @property
-    def numbering(self) -> int:
-        """Frames of the source from one to the next."""
-        return self.frame_skip
-
-    @property
-    def opening(self) -> Opening:
-        """What the log keeps of it besides the name."""
-        from stereo_sfm.log.provenance import Opening
-
-        return Opening(self.rectify, self.rig, frame_skip=self.numbering)
-
-    def __call__(self) -> Source:
-        """The source, not yet entered."""
-        from drivers.paced import PacedSource
-        from drivers.rectified import rectified
-        from drivers.select import SelectedFrames
-        from drivers.source import open_source
-
-        source = open_source(self.spec, self.rig)
-        if (self.start, self.duration, self.frame_skip, self.max_frames) != (0.0, float("inf"), 1, None):
-            source = SelectedFrames(source, self.start, self.duration, self.frame_skip, self.max_frames)
-        source = rectified(source, RECTIFY[self.rectify])
-        return source if self.speed is None else PacedSource(source, self.speed)
+    spec = args.source if args.source is not None else str(demo_recording())
+    if speed is None and realtime and not is_device(spec):
+        speed = 1.0
+    part = Selection(args.start, args.duration, args.frame_skip, args.max_frames)
+    return SourceChoice.of(spec, args.rig, part, args.rectify, speed)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -216,7 +158,7 @@ def run(args: argparse.Namespace) -> int:
 
     folders = MapFolders(args.map_in, args.localize_only, args.map_out)
     folders.check(args.overwrite)
-    return execute(args, SourceChoice.of(args), load_config(args), folders)[0]
+    return execute(args, source_choice(args, args.realtime, args.speed), load_config(args), folders)[0]
 
 
 def execute(

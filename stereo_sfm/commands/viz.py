@@ -62,16 +62,13 @@ def run(args: argparse.Namespace) -> int:
 
 def _images(reader: LogReader, path: Path, spec: str | None) -> Source:
     """Where the images come from: another source is opened as the run opened it."""
-    from drivers.rectified import rectified
-    from drivers.source import open_source
-    from stereo_sfm.commands.run import RECTIFY
+    from drivers.choice import SourceChoice
     from stereo_sfm.log.recorded import read_opening
 
     if spec is None:
-        return open_source(path)
+        return SourceChoice(str(path))()
     opening = read_opening(reader)
-    source = open_source(spec, opening.rig)
-    return rectified(source, RECTIFY[opening.rectify])
+    return SourceChoice(spec, opening.rig, rectify=opening.rectify)()
 
 
 def _play(reader: LogReader, images: Iterator[StereoImage], sink: Sink) -> None:

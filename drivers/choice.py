@@ -1,0 +1,133 @@
+"""Which source a command reads, and which part of it seen how: chosen here, opened in whichever process reads it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from drivers.selection import EVERYTHING, Selection
+from drivers.source import is_device, open_source, path_of
+from stereo_sfm.errors import StereoSfmError
+
+if TYPE_CHECKING:
+    from calib.rig import Rig
+    from drivers.rig_option import RigOption
+    from drivers.source import Source
+    from stereo_sfm.log.provenance import Opening
+
+# how a user says it -> projection of `calib.rectification`
+RECTIFY = {"none": "none", "pinhole": "pinhole", "wide": "epipolar"}
+
+
+@dataclass(frozen=True)
+class SourceChoice:
+    """A source by its text, with what replaces its calibration and which of its frames are passed on.
+
+    Calling it gives the source, not yet entered. It can be pickled: it holds no open file and no camera.
+
+    Attributes:
+        spec: what `open_source` takes. Files and folders are absolute in it: a log says where its images are.
+        rig: calibration instead of the source's own.
+        options: of the driver, as keyword arguments of `open_source`; those in `spec` come as text.
+        selection: the part of the source.
+        rectify: a key of RECTIFY: none, pinhole (crops a fisheye), wide (keeps its view).
+        speed: frames come no earlier than their stamps say, so many times as fast; None: as fast as they are read.
+    """
+
+    spec: str
+    rig: Rig | None = None
+    options: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    selection: Selection = EVERYTHING
+    rectify: str = "none"
+    speed: float | None = None
+
+    @staticmethod
+    def of(
+        source: str | Path,
+        rig: RigOption = None,
+        selection: Selection | None = None,
+        rectify: str = "none",
+        speed: float | None = None,
+        **options: Any,
+    ) -> SourceChoice:
+        """As a user says it: paths may be relative, and the calibration may be a file.
+
+        Raises:
+            StereoSfmError: a calibration that cannot be read, or an unknown way to rectify.
+        """
+        if rectify not in RECTIFY:
+            raise StereoSfmError(f"unknown rectification '{rectify}' (choose {', '.join(RECTIFY)})")
+        spec = str(source)
+        if Path(spec).exists():
+            spec = str(Path(spec).resolve())
+        return SourceChoice(spec, _loaded(rig), options, selection or EVERYTHING, rectify, speed)
+
+    @property
+    def device(self) -> bool:
+        """Whether it is a camera: what it gave is gone unless it is logged."""
+        return is_device(self.spec)
+
+    @property
+    def numbering(self) -> int:
+        """Frames of the source from one that is passed on to the next."""
+        return self.selection.frame_skip
+
+    @property
+    def opening(self) -> Opening:
+        """What a log keeps of it besides its name."""
+        from stereo_sfm.log.provenance import Opening
+
+        return Opening(self.rectify, self.rig, frame_skip=self.numbering)
+
+    def refuse_to_overwrite(self, output: Path | None) -> None:
+        """Raises StereoSfmError when the source is the file that is to be written, or lies in the folder."""
+        source = path_of(self.spec)
+        if output is None or not source.exists() or not output.exists():
+            return
+        if output.resolve() in (source.resolve(), *source.resolve().parents):
+            raise StereoSfmError(f"{output} is what is read, or holds it: choose another -o")
+
+    def __call__(self) -> Source:
+        """The source, not yet entered."""
+        from drivers.paced import PacedSource
+        from drivers.rectified import rectified
+        from drivers.select import SelectedFrames
+
+        source = open_source(self.spec, self.rig, **self.options)
+        if self.selection != EVERYTHING:
+            source = SelectedFrames(source, **vars(self.selection))
+        source = rectified(source, RECTIFY[self.rectify])
+        return source if self.speed is None else PacedSource(source, self.speed)
+
+
+def _loaded(rig: RigOption) -> Rig | None:
+    """A calibration as it is, or from a file of any dialect."""
+    if not isinstance(rig, str | Path):
+        return rig
+    from calib import load_rig
+
+    return load_rig(rig)
+
+
+@dataclass(frozen=True)
+class ReplayChoice(SourceChoice):
+    """The frames that an earlier run tracked.
+
+    Attributes:
+        frame_ids: of those frames.
+        recorded_skip: of the run: frames of its source from one to the next.
+    """
+
+    frame_ids: tuple[int, ...] = ()
+    recorded_skip: int = 1
+
+    @property
+    def numbering(self) -> int:
+        return self.recorded_skip
+
+    def __call__(self) -> Source:
+        from drivers.replayed import ReplayedSource
+
+        return ReplayedSource(super().__call__(), self.frame_ids)

@@ -1,0 +1,67 @@
+"""What a command reads, as data: chosen in one process, opened in another."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib import save_rig
+from drivers import open_source
+from drivers.choice import ReplayChoice, SourceChoice
+from drivers.selection import Selection
+from stereo_sfm.errors import StereoSfmError
+
+SPEC = "sim:aisle?size=212x200&frames=8&effects=0"
+
+
+def test_a_choice_opens_the_same_source_wherever_it_is_opened() -> None:
+    choice = SourceChoice.of(SPEC, None, Selection(frame_skip=3, max_frames=2))
+    for one in (choice, pickle.loads(pickle.dumps(choice))):
+        with one() as source:
+            assert [image.frame_id for image in source] == [0, 3]
+    assert choice.numbering == choice.opening.frame_skip == 3
+    assert not choice.device
+
+
+def test_options_may_be_text_or_keywords() -> None:
+    with SourceChoice.of("sim:aisle", size="212x200", frames=2, effects=False)() as a, open_source(SPEC) as b:
+        assert a.rig.left.size == b.rig.left.size
+        np.testing.assert_array_equal(next(iter(a)).left, next(iter(b)).left)
+
+
+def test_a_choice_reads_the_calibration_and_makes_paths_absolute(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with open_source(SPEC) as source:
+        rig = replace(source.rig, name="other")
+    save_rig(rig, tmp_path / "rig.yaml")
+    monkeypatch.chdir(tmp_path)
+    choice = SourceChoice.of("rig.yaml", "rig.yaml")
+    assert choice.spec == str(tmp_path / "rig.yaml")
+    assert choice.rig is not None and choice.rig.name == choice.opening.rig.name == "other"  # type: ignore[union-attr]
+
+
+def test_a_choice_rectifies_and_replays() -> None:
+    choice = ReplayChoice(SPEC, rectify="wide", frame_ids=(1, 4, 5), recorded_skip=2)
+    with choice() as source:
+        assert source.rig.left.model != "kannala_brandt"
+        assert [image.frame_id for image in source] == [1, 4, 5]
+    assert choice.opening.rectify == "wide" and choice.opening.frame_skip == 2
+
+
+def test_what_is_read_is_not_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "left").mkdir()
+    choice = SourceChoice.of(f"images:{tmp_path}?fps=10")
+    choice.refuse_to_overwrite(None)
+    choice.refuse_to_overwrite(tmp_path / "new")
+    with pytest.raises(StereoSfmError, match="choose another -o"):
+        choice.refuse_to_overwrite(tmp_path)
+
+
+def test_an_unknown_way_to_rectify_is_told() -> None:
+    with pytest.raises(StereoSfmError, match="unknown rectification 'widest'"):
+        SourceChoice.of(SPEC, rectify="widest")
