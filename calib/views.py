@@ -6,8 +6,6 @@ import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import numpy as np
-
 from calib.coverage import is_new
 from calib.targets import Detection, Target
 from stereo_sfm.errors import StereoSfmError
@@ -41,20 +39,21 @@ def read_pairs(pairs: list[tuple[Path, Path]]) -> Iterator[tuple[U8, U8]]:
     Raises:
         StereoSfmError: a file is not a picture, or the sizes differ.
     """
-    import cv2
+    from stereo_sfm.pixels import decode_gray, eight_bits
 
     size: tuple[int, int] = (0, 0)
     for paths in pairs:
         images: list[U8] = []
         for path in paths:
-            image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-            if image is None:
-                raise StereoSfmError(f"cannot read the picture {path}")
+            try:
+                image = eight_bits(decode_gray(path.read_bytes()))
+            except (OSError, ValueError):
+                raise StereoSfmError(f"cannot read the picture {path}") from None
             found = (image.shape[1], image.shape[0])
             size = found if size == (0, 0) else size
             if found != size:
                 raise StereoSfmError(f"{path} is {found[0]}x{found[1]} px, the others {size[0]}x{size[1]}")
-            images.append(np.asarray(image, np.uint8))
+            images.append(image)
         yield images[0], images[1]
 
 

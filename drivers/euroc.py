@@ -8,23 +8,20 @@ sixteen-bit images carry the sensor's twelve bits in their upper part.
 from __future__ import annotations
 
 import csv
-import logging
+from dataclasses import replace
 from pathlib import Path
 
 from calib.formats.euroc import read_euroc as read_rig
 from calib.formats.kalibr import read_kalibr
 from calib.rig import Rig
-from drivers.folder_source import FolderSource, Shot, folder_of, need, pair_by_stamp
+from drivers.folder_source import FolderSource, Shot, folder_of, need
 from drivers.ground_truth import moved, read_euroc
+from drivers.image_lists import Listing, pair_listings
 from drivers.rig_option import RigOption, chosen_rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import Trajectory
 
-log = logging.getLogger("stereo_sfm")
-
-MAX_SKEW_NS = 3_000_000  # stamps of one synchronised pair differ by less
 TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
-Listing = list[tuple[int, Path]]
 
 
 def open_euroc(path: str, rig: RigOption = None) -> FolderSource:
@@ -56,21 +53,12 @@ def _mav_folder(folder: Path) -> Path:
 def _open(name: str, mav: Path, rig: Rig) -> FolderSource:
     left = _read_listing(mav / "cam0")
     exposures = _read_exposures(mav / "cam0" / "times.txt")
-    right: list[Path | None] = [None] * len(left)
+    shots = [Shot(stamp, file, exposure_us=exposures.get(file.stem, float("nan"))) for stamp, file in left]
     if rig.stereo:
-        left, right = _pairs(name, left, _read_listing(need(mav / "cam1", "second camera")))
-    shots = [
-        Shot(stamp, file, other, exposure_us=exposures.get(file.stem, float("nan")))
-        for (stamp, file), other in zip(left, right, strict=True)
-    ]
+        right = _read_listing(need(mav / "cam1", "second camera"))
+        pairs = pair_listings(name, left, right)
+        shots = [replace(shots[i], right=right[j][1], right_stamp_ns=right[j][0]) for i, j in pairs]
     return FolderSource(name, rig, shots, _ground_truth(mav, rig))
-
-
-def _pairs(name: str, left: Listing, right: Listing) -> tuple[Listing, list[Path | None]]:
-    pairs = pair_by_stamp([s for s, _ in left], [s for s, _ in right], MAX_SKEW_NS)
-    if len(pairs) < max(len(left), len(right)):
-        log.warning("%s: %d left and %d right images, the %d pairs are used", name, len(left), len(right), len(pairs))
-    return [left[i] for i, _ in pairs], [right[j][1] for _, j in pairs]
 
 
 def _read_listing(camera: Path) -> Listing:

@@ -1,7 +1,7 @@
 """Two folders of images (or one with left*/right* files) with a rig file: the form anybody can bring.
 
-Stamps come from file names that are nanoseconds or seconds, else from times.txt (a line of seconds a frame), else from
-the frame rate given.
+Stamps come from times.txt (a line of seconds a frame), else from file names that are nanoseconds or seconds, else from
+the frame rate given and the numbers in the file names.
 """
 
 from __future__ import annotations
@@ -9,12 +9,20 @@ from __future__ import annotations
 from pathlib import Path
 
 from calib.rig import Rig
-from drivers.folder_source import IMAGE_SUFFIXES, FolderSource, Shot, folder_of, list_images, pair_in_order
-from drivers.ground_truth import read_trajectory, stamp_from_seconds
+from drivers.folder_source import FolderSource, Shot, folder_of
+from drivers.ground_truth import read_trajectory
+from drivers.image_lists import (
+    IMAGE_SUFFIXES,
+    frame_numbers,
+    lines_of,
+    list_images,
+    pair_files,
+    stamp_from_text,
+    stamp_of,
+)
 from drivers.rig_option import RigOption, chosen_rig
 from stereo_sfm.errors import StereoSfmError
 
-EARLIEST_NS = 10**17  # file names that are times are after 1973; smaller numbers count frames
 # folder names of the two eyes; the first two are also file name prefixes in one folder
 PAIRS = (("left", "right"), ("cam0", "cam1"), ("image_0", "image_1"), ("image_2", "image_3"), ("infra1", "infra2"))
 RIG_NAMES = ("rig", "calibration", "calib", "camchain", "stereo", "intrinsics")
@@ -37,9 +45,13 @@ def open_images(path: str, rig: RigOption = None, fps: float | str = 30.0) -> Fo
         raise StereoSfmError(
             f"{folder} holds no image pair (left/ and right/, cam0/ and cam1/, or left*, right* files)"
         )
-    pairs = pair_in_order(name, *found)
-    stamps = _stamps(folder, [left for left, _ in pairs], fps)
-    shots = [Shot(stamp, left, right) for stamp, (left, right) in zip(stamps, pairs, strict=True)]
+    stamps = _stamps(name, folder, found[0], fps)
+    pairs = pair_files(name, *found)
+    shots = [
+        Shot(stamps[left], left, right, right_stamp_ns=_right_stamp(stamps[left], left, right))
+        for left, right in pairs
+        if left in stamps
+    ]
     truth = next((folder / n for n in TRUTH_NAMES if (folder / n).is_file()), None)
     return FolderSource(
         name,
@@ -80,29 +92,26 @@ def _own_rig(folder: Path) -> Rig:
     return load_rig(path)
 
 
-def _stamps(folder: Path, files: list[Path], fps: float | str) -> list[int]:
-    """Strictly ascending nanoseconds, one for each file."""
+def _stamps(name: str, folder: Path, files: list[Path], fps: float | str) -> dict[Path, int]:
+    """Nanoseconds of the left images."""
     times = folder / "times.txt"
     if times.is_file():
         stamps = [stamp_from_text(line) for line in times.read_text("utf-8-sig").split()]
-        if len(stamps) < len(files) or None in stamps:
+        if None in stamps:
             raise StereoSfmError(f"{times} must hold one time in seconds for each of the {len(files)} frames")
-        return [s for s in stamps if s is not None][: len(files)]
-    named = [stamp_from_text(p.stem) for p in files]
-    if all(s is not None and s > EARLIEST_NS for s in named):
-        return [s for s in named if s is not None]
+        lines = lines_of(name, files, len(stamps), times.name)
+        return {file: stamps[line] or 0 for file, line in lines.items()}
+    named = {p: stamp_of(p) for p in files}
+    if None not in named.values():
+        return {p: s or 0 for p, s in named.items()}
     try:
         period = 1e9 / float(fps)
     except (ValueError, ZeroDivisionError):
         raise StereoSfmError(f"fps must be a number above 0, got '{fps}'") from None
-    return [round(i * period) for i in range(len(files))]
+    return {p: round(i * period) for p, i in zip(files, frame_numbers(files), strict=True)}
 
 
-def stamp_from_text(text: str) -> int | None:
-    """Nanoseconds from '1403636579763555584' or '1305031102.175304'; None if it is neither."""
-    if text.isdigit() and len(text) >= 15:
-        return int(text)
-    try:
-        return stamp_from_seconds(text)
-    except ValueError:
-        return None
+def _right_stamp(stamp_ns: int, left: Path, right: Path) -> int:
+    """The right image's stamp where both names are times, 0 where they do not tell it."""
+    named = stamp_of(left), stamp_of(right)
+    return 0 if named[0] is None or named[1] is None else stamp_ns + named[1] - named[0]

@@ -13,18 +13,17 @@ import numpy as np
 from calib.eye_rotation import align_eyes
 from calib.formats.kapture import read_kapture, read_kapture_cameras
 from calib.rig import Rig
-from drivers.folder_source import FolderSource, Shot, folder_of, list_images, need, pair_by_stamp
+from drivers.folder_source import FolderSource, Shot, folder_of, need
+from drivers.image_lists import Listing, list_images, pair_listings
 from drivers.rig_option import RigOption, chosen_rig
 from drivers.select import SelectedFrames
 from stereo_sfm.errors import StereoSfmError
 
 log = logging.getLogger("stereo_sfm")
 
-MAX_SKEW_NS = 3_000_000
 T265_BASELINE = 0.064  # metres, the nominal distance of a T265's eyes
 T265_SIZE = (848, 800)
 ALIGNED_PAIRS = 5  # images from which a missing rotation between the eyes is found
-Listing = list[tuple[int, Path]]
 
 
 def open_kapture(path: str, rig: RigOption = None) -> FolderSource:
@@ -36,10 +35,8 @@ def open_kapture(path: str, rig: RigOption = None) -> FolderSource:
     folder = folder_of("kapture", path)
     name = f"kapture:{folder.resolve().name}"
     left, right = _listings(folder)
-    pairs = pair_by_stamp([s for s, _ in left], [s for s, _ in right], MAX_SKEW_NS)
-    if len(pairs) < max(len(left), len(right)):
-        log.warning("%s: %d left and %d right images, the %d pairs are used", name, len(left), len(right), len(pairs))
-    shots = [Shot(left[i][0], left[i][1], right[j][1]) for i, j in pairs]
+    pairs = pair_listings(name, left, right)
+    shots = [Shot(left[i][0], left[i][1], right[j][1], right_stamp_ns=right[j][0]) for i, j in pairs]
     guessed = not rig and not _sensors(folder).with_name("rigs.txt").is_file()
     source = FolderSource(name, chosen_rig(rig, lambda: _read_rig(folder)), shots)
     if guessed:

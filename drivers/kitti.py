@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from calib.formats.kitti import read_kitti as read_rig
-from drivers.folder_source import FolderSource, Shot, folder_of, list_images, need, pair_in_order, stamps_of
+from drivers.folder_source import FolderSource, Shot, folder_of, need
 from drivers.ground_truth import moved, read_kitti, stamp_from_seconds
+from drivers.image_lists import lines_of, list_images, pair_files
 from drivers.rig_option import RigOption, chosen_rig
 from stereo_sfm.errors import StereoSfmError
 
@@ -37,9 +38,8 @@ def open_kitti(path: str, sequence: str = "", rig: RigOption = None) -> FolderSo
         raise StereoSfmError(f"{folder} has neither image_0 nor image_2")
     lefts, rights = (list_images(folder / f"image_{i}") for i in eyes)
     stamps = _read_times(folder / "times.txt", name, len(lefts))
-    stamp_of = stamps_of(name, lefts, stamps)
-    pairs = pair_in_order(name, lefts, rights)
-    shots = [Shot(stamp_of[left], left, right) for left, right in pairs if left in stamp_of]
+    line = lines_of(name, lefts, len(stamps), "times.txt", first=0)
+    shots = [Shot(stamps[line[left]], left, right) for left, right in pair_files(name, lefts, rights) if left in line]
     chosen = chosen_rig(rig, lambda: read_rig(need(folder / "calib.txt", "KITTI calibration"), eyes=eyes))
     truth_file = folder.resolve().parent.parent / "poses" / f"{folder.resolve().name}.txt"
     truth = None

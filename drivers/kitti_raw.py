@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from calib.formats.kitti import read_kitti as read_rig
-from drivers.folder_source import FolderSource, Shot, folder_of, list_images, need, pair_in_order, stamps_of
+from drivers.folder_source import FolderSource, Shot, folder_of, need
 from drivers.ground_truth import moved
+from drivers.image_lists import lines_of, list_images, pair_files
 from drivers.rig_option import RigOption, chosen_rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
@@ -42,10 +43,15 @@ def open_kitti_raw(path: str, drive: str = "", rig: RigOption = None) -> FolderS
     date = next((p for p in (folder, folder.resolve().parent) if (p / CALIBRATION).is_file()), folder.resolve().parent)
     own = chosen_rig(rig, lambda: read_rig(need(date / CALIBRATION, "KITTI raw calibration"), eyes=eyes))
     lefts, rights = (list_images(folder / f"image_0{i}" / "data") for i in eyes)
-    stamps = _read_times(need(folder / f"image_0{eyes[0]}" / "timestamps.txt", "time stamps"))
-    stamp_of = stamps_of(name, lefts, stamps)
-    pairs = pair_in_order(name, lefts, rights)
-    shots = [Shot(stamp_of[left], left, right) for left, right in pairs if left in stamp_of]
+    files = [folder / f"image_0{i}" / "timestamps.txt" for i in eyes]
+    stamps = _read_times(need(files[0], "time stamps"))
+    others = _read_times(files[1]) if files[1].is_file() else []
+    line = lines_of(name, lefts, len(stamps), "timestamps.txt", first=0)
+    shots = [
+        Shot(stamps[line[left]], left, right, right_stamp_ns=others[line[left]] if len(others) == len(stamps) else 0)
+        for left, right in pair_files(name, lefts, rights)
+        if left in line
+    ]
     return FolderSource(name, own, shots, _ground_truth(folder, date, stamps, own.body_T_left))
 
 

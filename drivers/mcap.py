@@ -23,6 +23,7 @@ from stereo_sfm.log.attached import attached_rig, attached_truth
 from stereo_sfm.log.image_log import ImageInfo, ImuSample, WheelSample
 from stereo_sfm.log.provenance import METADATA
 from stereo_sfm.log.reader import LogReader, Record
+from stereo_sfm.pixels import eight_bits
 from stereo_sfm.types import F32, I64, U8, ImuSamples, StereoImage, WheelSamples
 
 log = logging.getLogger("stereo_sfm")
@@ -78,7 +79,7 @@ def decode_image(record: Record) -> U8:
     """
     if record.schema is not None and record.schema.name == "foxglove.RawImage":
         m = RawImage.FromString(record.data)
-        return images.decode_raw(m.data, m.width, m.height, m.step, m.encoding)
+        return eight_bits(images.decode_raw(m.data, m.width, m.height, m.step, m.encoding))
     return images.decode_file(CompressedImage.FromString(record.data).data)
 
 

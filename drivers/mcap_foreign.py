@@ -6,13 +6,15 @@ import itertools
 import logging
 from collections import deque
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
 from calib.rig import Rig
+from drivers.folder_source import SAMPLED
 from drivers.mcap_messages import (
     BAD_MESSAGE,
     CAMERAS,
@@ -31,6 +33,7 @@ from drivers.rig_option import RigOption, chosen_rig
 from drivers.tum_rgbd import with_virtual_eye
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log.reader import LogReader, Record
+from stereo_sfm.pixels import eight_bits, sensor_bits
 from stereo_sfm.types import I64, ImuSamples, StereoImage, Trajectory
 
 log = logging.getLogger("stereo_sfm")
@@ -73,6 +76,7 @@ class ForeignMcapSource:
         counts = {t.topic: t.count for t in reader.topics}
         self.frame_count: int | None = min(counts[t] for t in (self.topics.left, self._other()) if t)
         self._tolerance_ns = self._period_ns() * 2 // 5
+        self._bits = self._sensor_bits()
         self._check_first()
         back_ns = reader.step_back_ns(self.topics.left)
         if back_ns > _STEP_BACK_NS:
@@ -124,8 +128,8 @@ class ForeignMcapSource:
 
     def _decode(self, frame_id: int, left: _Shot, other: _Shot | None, dropped: int) -> StereoImage | None:
         try:
-            pixels = left.picture.gray()
-            right = other.picture.gray() if other and self.topics.right else None
+            pixels = eight_bits(left.picture.gray(), self._bits)
+            right = eight_bits(other.picture.gray(), self._bits) if other and self.topics.right else None
             depth = other.picture.depth() if other and self.topics.depth else None
         except BAD_MESSAGE as error:
             log.warning("%s: image at %d ns is left out: %s", self.name, left.stamp_ns, error)
@@ -233,6 +237,26 @@ class ForeignMcapSource:
     def _period_ns(self) -> int:
         stamps = [r.log_time for r in itertools.islice(self.reader.messages([self.topics.left]), 20)]
         return int(np.median(np.diff(stamps))) if len(stamps) > 1 else 100_000_000
+
+    def _sensor_bits(self) -> int:
+        """Of sixteen-bit images: decided once, so that brightness does not jump between frames."""
+        if not any(image.dtype == np.uint16 for image in self._sample(1)):
+            return 16
+        bits = sensor_bits(image for image in self._sample(SAMPLED) if image.dtype == np.uint16)
+        if bits < 16:
+            log.warning("%s: its sixteen-bit images use %d bits, these are scaled to eight", self.name, bits)
+        return bits
+
+    def _sample(self, count: int) -> Iterator[Any]:
+        """Readable images of both eyes from so many times, spread evenly."""
+        first, last = self.reader.time_range
+        for topic in filter(None, (self.topics.left, self.topics.right)):
+            for k in range(count):
+                at = self.reader.messages([topic], first + k * (last - first) // max(count, 1))
+                shot = next((shot for record in at if (shot := self._shot(record)) is not None), None)
+                with suppress(*BAD_MESSAGE):
+                    if shot is not None:
+                        yield shot.picture.gray()
 
     def _check_first(self) -> None:
         """The images must fit the calibration, and that is said before the first frame."""

@@ -23,7 +23,8 @@ from google.protobuf.message import DecodeError
 from stereo_sfm.geometry import se3
 from stereo_sfm.log import foxglove, images
 from stereo_sfm.log.reader import Record
-from stereo_sfm.types import F32, F64, U8
+from stereo_sfm.pixels import decode_gray
+from stereo_sfm.types import F32, F64, U8, U16
 
 # What damaged or unexpected message bytes raise.
 BAD_MESSAGE = (ValueError, DecodeError, struct.error, IndexError)
@@ -43,10 +44,10 @@ class Picture:
     encoding: str = ""
     big_endian: bool = False
 
-    def gray(self) -> U8:
-        """(H, W) u8."""
+    def gray(self) -> U8 | U16:
+        """(H, W) with the depth of the message."""
         if self.compressed:
-            return images.decode_file(self.data)
+            return decode_gray(self.data)
         return images.decode_raw(self.data, self.width, self.height, self.step, self.encoding, self.big_endian)
 
     def depth(self) -> F32:

@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from calib.rig import Rig
-from drivers.folder_source import FolderSource, Shot, folder_of, need, pair_by_stamp
+from drivers.folder_source import FolderSource, Shot, folder_of, need
 from drivers.ground_truth import read_tum, stamp_from_seconds
+from drivers.image_lists import pair_by_stamp
 from drivers.rig_option import RigOption, chosen_rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry.cameras import RadTan

@@ -12,7 +12,14 @@ PACKAGES = ("stereo_sfm", "drivers", "calib")
 
 # Each room may import from its own level and from lower ones.
 LEVELS: tuple[tuple[str, ...], ...] = (
-    ("stereo_sfm.errors", "stereo_sfm.types", "stereo_sfm.timing", "stereo_sfm.config", "stereo_sfm.pipeline.sinks"),
+    (
+        "stereo_sfm.errors",
+        "stereo_sfm.types",
+        "stereo_sfm.pixels",
+        "stereo_sfm.timing",
+        "stereo_sfm.config",
+        "stereo_sfm.pipeline.sinks",
+    ),
     ("stereo_sfm.geometry",),
     ("calib",),
     # The log is a file format as well, which one of the drivers reads.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -82,10 +83,9 @@ def _size(path: Path, entries: dict[str, list[float]], index: int) -> tuple[int,
         width, height = numbers(stated, 2)
         return int(width), int(height)
     folders = (path.parent / f"image_{index}", path.parent / f"image_{index:02d}" / "data")
-    import cv2
+    from stereo_sfm.pixels import declared_size
 
-    pictures = (p for f in folders if f.is_dir() for p in sorted(f.glob("*.png"))[:20])
-    image = next((i for p in pictures if (i := cv2.imread(str(p), cv2.IMREAD_GRAYSCALE)) is not None), None)
-    if image is None:
-        raise ValueError("it does not state the image size and no image that can be read lies beside it")
-    return image.shape[1], image.shape[0]
+    for picture in (p for f in folders if f.is_dir() for p in sorted(f.glob("*.png"))[:20]):
+        with suppress(ValueError, OSError):
+            return declared_size(picture.read_bytes())
+    raise ValueError("it does not state the image size and no image that can be read lies beside it")

@@ -218,9 +218,6 @@ def _image_stamps(source: Source) -> tuple[I64, float]:
     listed: Any = getattr(source, "stamps", None)
     if callable(listed):
         return listed()  # pyright: ignore[reportReturnType]
-    shots: Any = getattr(source, "shots", None)
-    if shots is not None:
-        return np.array([shot.stamp_ns for shot in shots], np.int64), float("nan")
     return np.array([image.stamp_ns for image in source], np.int64), float("nan")
 
 

@@ -11,7 +11,8 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.types import F32, U8, StereoImage
+from stereo_sfm.pixels import MOST_PIXELS, decode, decode_gray, eight_bits
+from stereo_sfm.types import F32, U8, U16, StereoImage
 
 FORMATS = ("png", "raw", "jpeg")
 # Average filter and run-length matching: of 26 settings the smallest file per millisecond on real T265 and EuRoC
@@ -69,19 +70,9 @@ def decode_file(data: bytes) -> U8:
     """Bytes of a PNG, JPEG or any file OpenCV reads -> (H, W) u8; deeper pixels keep their upper eight bits.
 
     Raises:
-        ValueError: not an image.
+        ValueError: not an image, or too large.
     """
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE) if data else None
-    if image is None:
-        raise ValueError("a compressed image cannot be decoded")
-    return to_eight_bits(image)
-
-
-def to_eight_bits(image: np.ndarray[Any, Any]) -> U8:
-    """u8 unchanged; u16 keeps its upper eight bits."""
-    if image.dtype == np.uint16:
-        return (image >> 8).astype(np.uint8)
-    return image.astype(np.uint8, copy=False)
+    return eight_bits(decode_gray(data))
 
 
 def image_message(data: bytes, size: tuple[int, int], image_format: str, frame: str) -> RawImage | CompressedImage:
@@ -118,11 +109,11 @@ _ENCODINGS: dict[str, tuple[int, int, int | None]] = {
 }
 
 
-def decode_raw(data: bytes, width: int, height: int, step: int, encoding: str, big_endian: bool = False) -> U8:
-    """Pixels of a RawImage in any common encoding -> (H, W) u8 grey.
+def decode_raw(data: bytes, width: int, height: int, step: int, encoding: str, big_endian: bool = False) -> U8 | U16:
+    """Pixels of a RawImage in any common encoding -> (H, W) grey with the encoding's depth of eight or sixteen bits.
 
     Raises:
-        ValueError: unknown encoding, or too few bytes.
+        ValueError: unknown encoding, impossible size, or too few bytes.
     """
     layout = _ENCODINGS.get(encoding.lower())
     if layout is None:
@@ -130,13 +121,15 @@ def decode_raw(data: bytes, width: int, height: int, step: int, encoding: str, b
     depth, channels, conversion = layout
     row = width * channels * depth
     step = step or row
+    if width * height > MOST_PIXELS:
+        raise ValueError(f"an image of {width}x{height} has more than {MOST_PIXELS} pixels")
     if step < row or len(data) < step * (height - 1) + row:
         raise ValueError(f"an image of {width}x{height} {encoding} has only {len(data)} bytes")
     rows = np.frombuffer(data[: step * height].ljust(step * height, b"\0"), np.uint8).reshape(height, step)[:, :row]
     dtype = np.dtype(f"{'>' if big_endian else '<'}u{depth}")
     pixels = np.ascontiguousarray(rows).view(dtype).reshape(height, width, channels)
     if conversion is None:
-        return to_eight_bits(pixels[..., 0].astype(dtype.newbyteorder("=")))
+        return pixels[..., 0].astype(dtype.newbyteorder("="))
     return cv2.cvtColor(pixels if channels > 1 else pixels[..., 0], conversion).astype(np.uint8, copy=False)
 
 
@@ -164,8 +157,11 @@ def decode_depth_file(data: bytes) -> F32:
     Raises:
         ValueError: not a depth image.
     """
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
-    if image is None or image.dtype != np.uint16 or image.ndim != 2:
+    try:
+        image = decode(data, cv2.IMREAD_UNCHANGED)
+    except ValueError as error:
+        raise ValueError(f"a compressed depth image is not a sixteen-bit PNG: {error}") from None
+    if image.dtype != np.uint16 or image.ndim != 2:
         raise ValueError("a compressed depth image is not a sixteen-bit PNG")
     return _metres(image)
 

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,14 +11,17 @@ import numpy as np
 import pytest
 
 from calib import save_rig
-from drivers.folder_source import pair_by_stamp
+from drivers.image_lists import pair_by_stamp
 from drivers.recognise import recognise_folder
 from drivers.select import SelectedFrames
 from drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.log.describe import describe_folder
+from stereo_sfm.pixels import eight_bits
 from tests.drivers.dataset_folders import (
     FRAMES,
     PERIOD_NS,
+    RIG,
     START_NS,
     make_euroc,
     make_images,
@@ -129,6 +133,30 @@ def test_sixteen_bit_images_keep_their_upper_eight_bits(tmp_path: Path) -> None:
         assert np.array_equal(next(iter(source)).left, picture(0, 0))
 
 
+@pytest.mark.parametrize(("bits", "shift"), [(12, 4), (10, 2), (14, 6), (8, 0)])
+def test_sixteen_bit_images_are_scaled_by_the_range_that_they_use(
+    bits: int, shift: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    root = make_images(tmp_path)
+    for path in root.glob("*/*.png"):
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        cv2.imwrite(str(path), (image.astype(np.uint16) << shift) + (1 << shift) // 2)
+    dark = root / "left" / "0.png"  # the first image alone does not show the range
+    cv2.imwrite(str(dark), np.full((48, 64), 3, np.uint16))
+    with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(root) as source:
+        images = list(source)
+    assert np.array_equal(images[1].left, picture(1, 0))
+    assert images[0].right is not None and np.array_equal(images[0].right, picture(0, 1))
+    assert f"its sixteen-bit images use {bits} bits" in caplog.text
+    assert len(caplog.records) == 1
+
+
+def test_pixels_above_the_range_of_the_sample_are_white() -> None:
+    image = np.array([[0, 1023, 1024, 65535]], np.uint16)
+    assert eight_bits(image, 10).tolist() == [[0, 255, 255, 255]]
+
+
 def test_tum_rgbd_has_depth_in_metres_and_a_virtual_eye(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(make_tum_rgbd(tmp_path)) as source:
         images = list(source)
@@ -193,6 +221,86 @@ def test_left_and_right_files_in_one_folder(tmp_path: Path) -> None:
     assert len(images) == 2
     assert np.array_equal(images[1].left, picture(2, 0))
     assert images[1].right is not None and np.array_equal(images[1].right, picture(2, 1))
+
+
+def skewed_stereo(root: Path, skew_ns: int, missing: int | None = None) -> Path:
+    """Ten pairs 25 ms apart in time, their names the stamps; one right image may be missing."""
+    for eye, side in enumerate(("left", "right")):
+        (root / side).mkdir()
+        for i in range(10):
+            if side == "left" or i != missing:
+                name = f"{START_NS + i * 25_000_000 + eye * skew_ns}.png"
+                cv2.imwrite(str(root / side / name), picture(i, eye))
+    (root / "rig.yaml").write_text(RIG)
+    return root
+
+
+def test_images_named_by_time_are_paired_by_time(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(skewed_stereo(tmp_path, 1_500_000, 4)) as source:
+        images = list(source)
+    kept = [i for i in range(10) if i != 4]
+    assert [i.stamp_ns for i in images] == [START_NS + i * 25_000_000 for i in kept]
+    assert all(i.right_stamp_ns - i.stamp_ns == 1_500_000 for i in images)
+    for image, number in zip(images, kept, strict=True):
+        assert image.right is not None and np.array_equal(image.right, picture(number, 1))
+    assert "10 left and 9 right images, the 9 pairs are used" in caplog.text
+    assert describe_folder(tmp_path).skew_ms == pytest.approx(1.5)
+
+
+@pytest.mark.parametrize("folder", [make_euroc, None], ids=["euroc", "images"])
+def test_eyes_that_are_never_exposed_together_are_refused_with_their_skew(
+    folder: Callable[[Path], Path] | None, tmp_path: Path
+) -> None:
+    if folder is None:
+        skewed_stereo(tmp_path, 12_000_000)
+    else:
+        listing = folder(tmp_path) / "mav0" / "cam1" / "data.csv"
+        rows = [line.split(",") for line in listing.read_text().splitlines()[1:]]
+        listing.write_text("".join(f"{int(stamp) + 12_000_000},{name}\n" for stamp, name in rows))
+    with pytest.raises(StereoSfmError, match="left and right images are 12 ms apart"):
+        open_source(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("left", "right"), [("left{:02d}", "right{:02d}"), ("{:02d}_cam0", "{:02d}_cam1"), ("im-{}-L2", "im-{}-R1")]
+)
+def test_numbered_images_are_paired_by_number_and_keep_their_times(left: str, right: str, tmp_path: Path) -> None:
+    make_images(tmp_path)
+    for side, name in (("left", left), ("right", right)):
+        for i in range(12):
+            (tmp_path / side / f"{i}.png").rename(tmp_path / side / f"{name.format(i)}.png")
+    (tmp_path / "right" / f"{right.format(5)}.png").unlink()
+    with open_source(tmp_path, fps=10) as source:
+        images = list(source)
+    kept = [i for i in range(12) if i != 5]
+    assert [i.stamp_ns for i in images] == [i * 10**8 for i in kept]
+    for image, number in zip(images, kept, strict=True):
+        assert image.right is not None and np.array_equal(image.right, picture(number, 1))
+    assert math.isnan(describe_folder(tmp_path).skew_ms)  # nobody knows it
+
+
+def test_names_that_do_not_tell_the_pairs_are_refused(tmp_path: Path) -> None:
+    make_images(tmp_path, ["a.png", "b.png", "c.png"])
+    for name in "abc":
+        (tmp_path / "right" / f"{name}.png").rename(tmp_path / "right" / f"r{name}.png")
+    with pytest.raises(StereoSfmError, match=r"which left image \(a.png, ...\) belongs to which right one \(ra.png"):
+        open_source(tmp_path)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_times_belong_to_images_by_number_where_one_is_missing(first: int, tmp_path: Path) -> None:
+    make_images(tmp_path, [f"{i + first}.png" for i in range(6)])
+    (tmp_path / "left" / f"{3}.png").unlink()
+    (tmp_path / "times.txt").write_text("".join(f"{i / 10}\n" for i in range(6)))
+    with open_source(tmp_path) as source:
+        assert [i.stamp_ns for i in source] == [k * 10**8 for k in range(6) if k != 3 - first]
+
+
+def test_times_that_fit_no_image_are_refused(tmp_path: Path) -> None:
+    make_images(tmp_path, [f"{i}.png" for i in (3, 4, 5)])
+    (tmp_path / "times.txt").write_text("0\n1\n2\n3\n")
+    with pytest.raises(StereoSfmError, match=r"3 images but 4 lines in times.txt, and the numbers"):
+        open_source(tmp_path)
 
 
 def test_a_folder_of_something_else(tmp_path: Path) -> None:

@@ -193,6 +193,25 @@ def test_compressed_images_and_fisheye_lenses(tmp_path: Path) -> None:
     np.testing.assert_array_equal(images[4].left, _pixels(5, 0))
 
 
+@pytest.mark.parametrize("compressed", [False, True])
+def test_twelve_of_sixteen_bits_become_eight(
+    compressed: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def deep(i: int, eye: int, frame: str) -> Any:
+        pixels = _pixels(i, eye).astype(np.uint16) * 16 + 5
+        if compressed:
+            return CompressedImage(frame_id=frame, format="png", data=cv2.imencode(".png", pixels)[1].tobytes())
+        return RawImage(frame_id=frame, width=W, height=H, encoding="mono16", step=2 * W, data=pixels.tobytes())
+
+    with open_source(_write(tmp_path / "a.mcap", image=deep)) as source:
+        images = list(source)
+    for i, image in enumerate(images):
+        np.testing.assert_array_equal(image.left, _pixels(i, 0))
+        assert image.right is not None
+        np.testing.assert_array_equal(image.right, _pixels(i, 1))
+    assert "its sixteen-bit images use 12 bits" in caplog.text
+
+
 def test_depth_beside_an_image_makes_an_rgbd_source(tmp_path: Path) -> None:
     def image(i: int, eye: int, frame: str) -> RawImage:
         if not eye:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from pathlib import Path
 
 import cv2
@@ -88,8 +89,8 @@ def test_encodings_of_other_programs() -> None:
             np.testing.assert_array_equal(images.decode_raw(data, 8, 6, step, encoding), gray, err_msg=encoding)
     deep = rng.integers(0, 2**16, (6, 8), np.uint16)
     little, big = deep.astype("<u2").tobytes(), deep.astype(">u2").tobytes()
-    np.testing.assert_array_equal(images.decode_raw(little, 8, 6, 16, "mono16"), deep >> 8)
-    np.testing.assert_array_equal(images.decode_raw(big, 8, 6, 16, "16UC1", big_endian=True), deep >> 8)
+    np.testing.assert_array_equal(images.decode_raw(little, 8, 6, 16, "mono16"), deep)
+    np.testing.assert_array_equal(images.decode_raw(big, 8, 6, 16, "16UC1", big_endian=True), deep)
     yuv = np.stack([gray, np.full_like(gray, 128)], -1)
     np.testing.assert_array_equal(images.decode_raw(yuv.tobytes(), 8, 6, 16, "yuyv"), gray)
     np.testing.assert_array_equal(images.decode_raw(yuv[..., ::-1].tobytes(), 8, 6, 16, "uyvy"), gray)
@@ -102,6 +103,23 @@ def test_bayer_patterns_start_at_the_right_colour() -> None:
         mosaic[row::2, column::2] = 200
         gray = images.decode_raw(mosaic.tobytes(), 12, 12, 12, f"bayer_{pattern}8")
         np.testing.assert_allclose(gray[4:-4, 4:-4], 0.299 * 200, atol=1.5)
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_files_that_declare_too_many_pixels_are_never_decoded(suffix: str) -> None:
+    """The header is changed, so a decoder that believed it would need gigabytes; the error shows it was read first."""
+    small = cv2.imencode(suffix, np.zeros((8, 8), np.uint8))[1].tobytes()
+    if suffix == ".png":
+        large = small[:16] + (60_000).to_bytes(4) * 2 + small[24:29]
+        large += zlib.crc32(large[12:29]).to_bytes(4) + small[33:]
+    else:
+        at = small.index(b"\xff\xc0")
+        large = small[: at + 5] + (60_000).to_bytes(2) * 2 + small[at + 9 :]
+    for decode in (images.decode_file, images.decode_depth_file):
+        with pytest.raises(ValueError, match="more than 100000000 pixels"):
+            decode(large)
+    with pytest.raises(ValueError, match="more than 100000000 pixels"):
+        images.decode_raw(b"", 60_000, 60_000, 60_000, "mono8")
 
 
 def test_depth_encodings() -> None:

@@ -1,0 +1,197 @@
+"""Lists of image files: their order, their stamps, and which left image belongs to which right one.
+
+Images are paired by what their names say: by stamps where the names are times, by numbers otherwise. A position in a
+list says nothing once an image is missing, so lists whose names do not tell are refused.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from drivers.ground_truth import stamp_from_seconds
+from stereo_sfm.errors import StereoSfmError
+
+log = logging.getLogger("stereo_sfm")
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
+EARLIEST_NS = 10**17  # file names that are times are after 1973; smaller numbers count frames
+MAX_SKEW_NS = 3_000_000  # stamps of one synchronised pair differ by less
+Listing = list[tuple[int, Path]]  # (stamp_ns, file) of one camera
+
+
+def list_images(folder: Path) -> list[Path]:
+    """The image files of a folder in the order of their numbers (image2 before image10)."""
+    if not folder.is_dir():
+        raise StereoSfmError(f"no image folder {folder}")
+    files = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES]
+    if not files:
+        raise StereoSfmError(f"no images in {folder}")
+    return sorted(files, key=natural_key)
+
+
+def natural_key(path: Path) -> tuple[tuple[int, str], ...]:
+    """Sort key that compares runs of digits as numbers."""
+    parts = [p for p in re.split(r"([0-9]+)", path.stem) if p]
+    return (*((int(p), "") if p[0] in "0123456789" else (-1, p) for p in parts), (-1, path.name))
+
+
+def numbers_of(images: list[Path]) -> list[int] | None:
+    """The frame numbers in files' names: the last digits that no two files share (left_12 and 12_cam0 -> 12).
+
+    None where the names have no such digits.
+    """
+    digits = [[int(d) for d in re.findall(r"[0-9]+", p.stem)] for p in images]
+    for place in range(1, min(map(len, digits), default=0) + 1):
+        numbers = [d[-place] for d in digits]
+        if len(set(numbers)) == len(numbers):
+            return numbers
+    return None
+
+
+def stamp_of(path: Path) -> int | None:
+    """Nanoseconds that a file's name tells (left_1403636579763555584, 1305031102.175304); None where it is no time."""
+    found = re.fullmatch(r"[^0-9]*([0-9]+(?:\.[0-9]+)?)[^0-9]*", path.stem)
+    stamp_ns = stamp_from_text(found[1]) if found else None
+    return stamp_ns if stamp_ns is not None and stamp_ns > EARLIEST_NS else None
+
+
+def stamp_from_text(text: str) -> int | None:
+    """Nanoseconds from '1403636579763555584' or '1305031102.175304'; None if it is neither."""
+    if text.isdecimal() and 15 <= len(text) <= 19:
+        return int(text)
+    try:
+        return stamp_from_seconds(text)
+    except ValueError:
+        return None
+
+
+def pair_files(name: str, left: list[Path], right: list[Path]) -> list[tuple[Path, Path]]:
+    """Left and right images of the same moment, by the stamps or else by the numbers in their names.
+
+    Images without a partner are left out with a warning.
+
+    Raises:
+        StereoSfmError: the names do not tell which images belong together.
+    """
+    if all(stamp_of(p) is not None for p in (*left, *right)):
+        a, b = ([(stamp_of(p) or 0, p) for p in files] for files in (left, right))
+        return [(left[i], right[j]) for i, j in pair_listings(name, a, b)]
+    pairs = _by_key([p.stem for p in left], [p.stem for p in right]) or _by_key(numbers_of(left), numbers_of(right))
+    if pairs is None and len(left) == len(right) == 1:
+        pairs = [(0, 0)]
+    if pairs is None:
+        raise StereoSfmError(
+            f"{name}: the names of the images do not tell which left image ({left[0].name}, ...) belongs to which "
+            f"right one ({right[0].name}, ...): name both of a pair by the same number or by their times"
+        )
+    _tell_unpaired(name, len(left), len(right), len(pairs))
+    return [(left[i], right[j]) for i, j in pairs]
+
+
+def _by_key(left: Sequence[object] | None, right: Sequence[object] | None) -> list[tuple[int, int]] | None:
+    """Indices of equal keys; None where keys are missing, repeated, or not shared."""
+    if left is None or right is None:
+        return None
+    place = {key: j for j, key in enumerate(right)}
+    if len(place) < len(right) or len(set(left)) < len(left):
+        return None
+    return [(i, place[key]) for i, key in enumerate(left) if key in place] or None
+
+
+def pair_listings(name: str, left: Listing, right: Listing) -> list[tuple[int, int]]:
+    """Indices (i, j) of the images of two cameras that were exposed together, by their stamps.
+
+    Raises:
+        StereoSfmError: no two are; the message says how far apart they are.
+    """
+    stamps = [s for s, _ in left], [s for s, _ in right]
+    pairs = pair_by_stamp(*stamps, MAX_SKEW_NS)
+    if not pairs and left and right:
+        apart_ms = _median_distance(*stamps) / 1e6
+        raise StereoSfmError(
+            f"{name}: left and right images are {apart_ms:.6g} ms apart by their stamps, and only images within "
+            f"{MAX_SKEW_NS / 1e6:g} ms are one pair: both cameras must be triggered together and have one clock"
+        )
+    _tell_unpaired(name, len(left), len(right), len(pairs))
+    return pairs
+
+
+def _median_distance(left: Sequence[int], right: Sequence[int]) -> float:
+    """Median over the left stamps of how far the nearest right one is, nanoseconds."""
+    a, b = np.asarray(left, np.int64), np.sort(np.asarray(right, np.int64))
+    after = np.clip(np.searchsorted(b, a), 0, len(b) - 1)
+    return float(np.median(np.minimum(np.abs(b[after] - a), np.abs(b[np.maximum(after - 1, 0)] - a))))
+
+
+def _tell_unpaired(name: str, left: int, right: int, pairs: int) -> None:
+    if pairs < max(left, right):
+        log.warning("%s: %d left and %d right images, the %d pairs are used", name, left, right, pairs)
+
+
+def lines_of(name: str, images: list[Path], lines: int, what: str, first: int | None = None) -> dict[Path, int]:
+    """Which line of a list of `lines` stamps belongs to which image; images behind the last line are left out.
+
+    Images and lines go together in order where there are as many, else by the images' numbers.
+
+    Args:
+        name: of the source, for messages.
+        images: files in order.
+        lines: of the list.
+        what: the list's name, for messages.
+        first: number of the first line's image; None finds out whether it is 0 or 1.
+
+    Raises:
+        StereoSfmError: the numbers do not say which line is whose.
+    """
+    if len(images) == lines:
+        return {image: line for line, image in enumerate(images)}
+    numbers = numbers_of(images)
+    if numbers is not None and first is None:
+        first = 0 if min(numbers) == 0 else 1 if max(numbers) == lines else None
+    if numbers is None or first is None or min(numbers) < first:
+        raise StereoSfmError(
+            f"{name}: {len(images)} images but {lines} lines in {what}, and the numbers in the images' names do not "
+            "say which line is whose"
+        )
+    places = {image: n - first for image, n in zip(images, numbers, strict=True) if n - first < lines}
+    log.warning("%s: %d images and %d lines in %s, %d belong together", name, len(images), lines, what, len(places))
+    return places
+
+
+def frame_numbers(images: list[Path]) -> list[int]:
+    """Places 0, 1, ... of images in time by their numbers, whose common step is one frame; by order without numbers."""
+    numbers = numbers_of(images)
+    if numbers is None or sorted(numbers) != numbers:
+        return list(range(len(images)))
+    step = math.gcd(*(n - numbers[0] for n in numbers)) or 1
+    return [(n - numbers[0]) // step for n in numbers]
+
+
+def pair_by_stamp(a: Sequence[int], b: Sequence[int], max_difference_ns: int) -> list[tuple[int, int]]:
+    """Indices (i, j) of the pairs whose stamps differ least; each entry is used once, smallest differences first."""
+    if not a or not b:
+        return []
+    stamps_a, stamps_b = np.asarray(a, np.int64), np.asarray(b, np.int64)
+    order = np.argsort(stamps_b, kind="stable")
+    right_of = np.searchsorted(stamps_b[order], stamps_a)
+    candidates: list[tuple[int, int, int]] = []
+    for i, position in enumerate(right_of):
+        for j in {max(position - 1, 0), min(position, len(order) - 1)}:
+            difference = abs(int(stamps_a[i]) - int(stamps_b[order[j]]))
+            if difference <= max_difference_ns:
+                candidates.append((difference, i, int(order[j])))
+    pairs: list[tuple[int, int]] = []
+    used_a: set[int] = set()
+    used_b: set[int] = set()
+    for _, i, j in sorted(candidates):
+        if i not in used_a and j not in used_b:
+            used_a.add(i)
+            used_b.add(j)
+            pairs.append((i, j))
+    return sorted(pairs)

@@ -1,0 +1,91 @@
+"""Grey pixels from the bytes of image files, and from sixteen bits to eight.
+
+A file is decoded only after its header has said how large the picture is: a few kilobytes of PNG or JPEG can stand for
+gigabytes of pixels.
+"""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Iterable
+from typing import Any
+
+import cv2
+import numpy as np
+
+from stereo_sfm.types import U8, U16
+
+MOST_PIXELS = 10**8  # of one image; above what any camera of a rig has
+LEFT_ALIGNED = 0xF  # bits that are always zero when a sensor of at most twelve bits fills the upper part of sixteen
+
+
+def declared_size(data: bytes) -> tuple[int, int]:
+    """(width, height) that the header of an image file declares; no pixel is decoded.
+
+    Raises:
+        ValueError: no image file, or larger than `MOST_PIXELS`.
+    """
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(io.BytesIO(data)) as image:
+                width, height = image.size
+    except Image.DecompressionBombError:
+        raise ValueError(f"a compressed image has more than {MOST_PIXELS} pixels") from None
+    except (OSError, ValueError, SyntaxError, ArithmeticError, LookupError, TypeError, MemoryError):
+        raise ValueError("a compressed image cannot be decoded") from None
+    if width * height > MOST_PIXELS:
+        raise ValueError(f"a compressed image of {width}x{height} has more than {MOST_PIXELS} pixels")
+    return width, height
+
+
+def decode(data: bytes, flags: int) -> np.ndarray[Any, Any]:
+    """The pixels of an image file as OpenCV's `flags` want them.
+
+    Raises:
+        ValueError: no image file, damaged, or too large.
+    """
+    declared_size(data)
+    try:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except (cv2.error, MemoryError):
+        image = None
+    if image is None:
+        raise ValueError("a compressed image cannot be decoded")
+    return image
+
+
+def decode_gray(data: bytes) -> U8 | U16:
+    """Bytes of any image file that OpenCV reads -> (H, W) grey with the file's depth of eight or sixteen bits.
+
+    Raises:
+        ValueError: no image file, damaged, too large, or of another depth.
+    """
+    image = decode(data, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE)
+    if image.dtype not in (np.uint8, np.uint16):
+        raise ValueError(f"a compressed image has {image.dtype} pixels")
+    return image
+
+
+def sensor_bits(images: Iterable[U16]) -> int:
+    """How many of sixteen bits a sensor uses (8, 10, 12, 14 or 16), from some of its images.
+
+    Values whose lowest bits are always zero fill the upper part of the sixteen (TUM VI: twelve bits), so that full
+    white is 65,535; others begin at the lowest bit, and the largest one tells.
+    """
+    used = 0
+    for image in images:
+        used |= int(np.bitwise_or.reduce(image, axis=None))
+    if not used & LEFT_ALIGNED:
+        return 16
+    return max(8, used.bit_length() + used.bit_length() % 2)
+
+
+def eight_bits(image: U8 | U16, bits: int = 16) -> U8:
+    """(H, W) u8 unchanged; u16 keeps the upper eight of the `bits` that its sensor uses, what is above is white."""
+    if image.dtype == np.uint16:
+        return np.minimum(np.right_shift(image, bits - 8), 255).astype(np.uint8)
+    return image.astype(np.uint8, copy=False)
