@@ -19,7 +19,7 @@ from drivers.source import open_source
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.cloud import gather, match_guided
 from stereo_sfm.loop.place_view import place_view_of
-from stereo_sfm.loop.still import still_keyframe
+from stereo_sfm.maps.single_image import still_keyframe
 from stereo_sfm.types import F64, I64, Keyframe
 
 STEP_METRES, STEP_DEGREES = 0.4, 15.0  # between keyframes

@@ -23,10 +23,10 @@ from drivers.memory import MemorySource
 from drivers.paced import PacedSource
 from drivers.source import Source, open_source
 from stereo_sfm.config import Config
-from stereo_sfm.log.record import record
+from stereo_sfm.messages import Health, StageTimes
 from stereo_sfm.pipeline.processes import ProcessRun
-from stereo_sfm.pipeline.sinks import Health, StageTimes
 from stereo_sfm.pipeline.workers import LogOptions
+from stereo_sfm.recording.record import record
 from stereo_sfm.types import Dropped, LoopResult
 
 

@@ -23,7 +23,7 @@ import zstandard
 from drivers import Source, open_source
 from drivers.memory import MemorySource
 from stereo_sfm.log.images import FORMATS, PNG_OPTIONS
-from stereo_sfm.log.record import record
+from stereo_sfm.recording.record import record
 from stereo_sfm.types import U8, StereoImage
 
 RATE = 30.0

@@ -28,12 +28,12 @@ from drivers.sim.effects import Sensor
 from drivers.sim.source import SimSource
 from drivers.source import open_source
 from stereo_sfm.config import Config
-from stereo_sfm.export.saved_map import SavedMap, load_map, save_map
 from stereo_sfm.geometry import se3
-from stereo_sfm.loop.relocalize import Relocalizer
-from stereo_sfm.loop.still import still_keyframe
 from stereo_sfm.loop.vocabulary_file import default_vocabulary
 from stereo_sfm.mapping.mapper import Mapper
+from stereo_sfm.maps.relocalization import Relocalizer
+from stereo_sfm.maps.saved_map import SavedMap, load_map, save_map
+from stereo_sfm.maps.single_image import still_keyframe
 from stereo_sfm.types import F64, StereoImage
 
 ASIDE_METRES = np.array([0.2, 0.03, 0.2])  # to the side, up or down, ahead or back

@@ -43,7 +43,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as name:
         recording, inline = Path(name) / "recording.mcap", Path(name) / "inline.mcap"
         if not Path(args.source).exists():
-            from stereo_sfm.log.record import record
+            from stereo_sfm.recording.record import record
 
             with open_source(args.source) as source:
                 for _ in record(source, recording, "raw"):

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from stereo_sfm.demo import demo_recording
     from stereo_sfm.errors import StereoSfmError
     from stereo_sfm.eval.evaluate import evaluate
-    from stereo_sfm.export.saved_map import load_map
+    from stereo_sfm.maps.saved_map import load_map
     from stereo_sfm.pipeline.run import run
     from stereo_sfm.types import Frame, StereoImage, TrackState, Trajectory
 
@@ -62,7 +62,7 @@ _LAZY: dict[str, tuple[str, str]] = {
     "demo_recording": ("stereo_sfm.demo", "demo_recording"),
     "evaluate": ("stereo_sfm.eval.evaluate", "evaluate"),
     "load_config": ("stereo_sfm.config", "load"),
-    "load_map": ("stereo_sfm.export.saved_map", "load_map"),
+    "load_map": ("stereo_sfm.maps.saved_map", "load_map"),
     "load_rig": ("calib.formats", "load_rig"),
     "open_source": ("drivers.source", "open_source"),
     "read_trajectory": ("drivers.ground_truth", "read_trajectory"),

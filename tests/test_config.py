@@ -10,9 +10,9 @@ import pytest
 
 from stereo_sfm.config import Config, dump, from_dict, load
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.loop.pose_graph import ROBUST
+from stereo_sfm.mapping.pose_graph import ROBUST
 from stereo_sfm.presets import PRESETS
-from stereo_sfm.tracking.scale import SCALES
+from stereo_sfm.tracking.features.step_scale import SCALES
 
 
 @pytest.mark.parametrize(

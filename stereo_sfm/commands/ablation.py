@@ -79,8 +79,8 @@ def run(args: argparse.Namespace) -> int:
 def _cells(args: argparse.Namespace) -> list[Cell]:
     from stereo_sfm.eval import ablation
     from stereo_sfm.presets import PRESETS
-    from stereo_sfm.tracking.features import TABLE as FEATURES
-    from stereo_sfm.tracking.odometry.table import TABLE as METHODS
+    from stereo_sfm.tracking.features.extraction import TABLE as FEATURES
+    from stereo_sfm.tracking.features.odometry.table import TABLE as METHODS
 
     if args.jobs < 1 or args.frames < 0:
         raise StereoSfmError("--jobs must be at least 1 and --frames at least 0")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from stereo_sfm.errors import StereoSfmError
 
 if TYPE_CHECKING:
-    from stereo_sfm.pipeline.batch import BatchTask
+    from stereo_sfm.eval.batch import BatchTask
 
 SOME_FAILED = 3
 
@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run all, write the table, merge the maps. A recording that fails stops none of the others."""
     from stereo_sfm.commands.run import load_config
-    from stereo_sfm.pipeline import batch
+    from stereo_sfm.eval import batch
 
     config = load_config(args)
     recordings = _expand(args.recordings)
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _results(tasks: Sequence[BatchTask], address: str | None) -> Iterator[tuple[BatchTask, dict[str, Any]]]:
-    from stereo_sfm.pipeline.batch import run_batch
+    from stereo_sfm.eval.batch import run_batch
 
     try:
         yield from run_batch(tasks, address)

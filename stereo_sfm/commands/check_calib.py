@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from calib.check import CheckReport, Finding
-    from stereo_sfm.tracking.readout import ReadoutErrors, ReadoutSearch
+    from stereo_sfm.tracking.flow.readout import ReadoutErrors, ReadoutSearch
     from stereo_sfm.types import StereoImage
 
 SHUTTER_FRAMES = 200  # looked at for a rolling shutter
@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     from calib.tracks import LONGEST, collect, corners_for
     from drivers.source import open_source
     from stereo_sfm.config import Config
-    from stereo_sfm.tracking.readout import ReadoutSearch
+    from stereo_sfm.tracking.flow.readout import ReadoutSearch
 
     _check(args)
     with open_source(args.source) as source:

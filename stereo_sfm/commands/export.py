@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from stereo_sfm.export.saved_map import SavedMap
+    from stereo_sfm.maps.saved_map import SavedMap
     from stereo_sfm.types import Trajectory
 
 MAP_FORMATS = {"colmap": "model", "ply": "points.ply", "g2o": "pose_graph.g2o", "floor-plan": "floor_plan.png"}
@@ -85,7 +85,7 @@ def _write_map(args: argparse.Namespace, output: Path) -> list[Path]:
 def _load(folder: Path) -> SavedMap:
     """The map of a map folder, or the one inside a run's folder."""
     from stereo_sfm.errors import StereoSfmError
-    from stereo_sfm.export.saved_map import load_map
+    from stereo_sfm.maps.saved_map import load_map
 
     for place in (folder, folder / "map"):
         if (place / "map.json").is_file():
@@ -140,8 +140,8 @@ def _trajectories(args: argparse.Namespace) -> tuple[dict[int, Trajectory], str]
     from drivers.ground_truth import read_trajectory
     from stereo_sfm.errors import StereoSfmError
     from stereo_sfm.export.pictures import check_walk
-    from stereo_sfm.export.saved_map import walk_trajectory
     from stereo_sfm.export.trajectories import named_pose
+    from stereo_sfm.maps.saved_map import walk_trajectory
 
     name = {"odom": "trajectory_odom.tum", "map": "trajectory_map.tum", "keyframes": "keyframes.tum"}[args.which]
     if (args.source / name).is_file():

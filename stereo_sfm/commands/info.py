@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from stereo_sfm.errors import StereoSfmError
 
 if TYPE_CHECKING:
-    from stereo_sfm.log.describe import Description, Rate
+    from stereo_sfm.recording.describe import Description, Rate
 
 
 _SHOWN = ("images", "dropped", "max_skew_ns")  # totals that the line about the images tells
@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Describe and return 0; problems are printed, they are no error of this command."""
-    from stereo_sfm.log.describe import describe_file, describe_folder
+    from stereo_sfm.recording.describe import describe_file, describe_folder
 
     path: Path = args.path.expanduser()
     if not path.exists():

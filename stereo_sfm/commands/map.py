@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from stereo_sfm.export.saved_map import SavedMap
     from stereo_sfm.loop.vocabulary import Vocabulary
+    from stereo_sfm.maps.saved_map import SavedMap
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _info(args: argparse.Namespace) -> int:
-    from stereo_sfm.export.saved_map import load_map
+    from stereo_sfm.maps.saved_map import load_map
 
     print("\n".join(describe(load_map(args.map))))
     return 0
@@ -81,8 +81,8 @@ def describe(saved: SavedMap) -> list[str]:
 def _merge(args: argparse.Namespace) -> int:
     from stereo_sfm import config as configuration
     from stereo_sfm.errors import StereoSfmError
-    from stereo_sfm.export.merge import merge, share_a_walk
-    from stereo_sfm.export.saved_map import load_map, save_map
+    from stereo_sfm.maps.merge import merge, share_a_walk
+    from stereo_sfm.maps.saved_map import load_map, save_map
 
     if len(args.maps) < 2:
         raise StereoSfmError("merge takes at least two maps")
@@ -107,8 +107,8 @@ def _vocabulary(saved: SavedMap, named: str) -> Vocabulary:
 
 
 def _prune(args: argparse.Namespace) -> int:
-    from stereo_sfm.export.merge import prune
-    from stereo_sfm.export.saved_map import load_map, save_map
+    from stereo_sfm.maps.merge import prune
+    from stereo_sfm.maps.saved_map import load_map, save_map
 
     _check_free(args)
     saved = load_map(args.map)

@@ -14,7 +14,7 @@ from stereo_sfm.errors import StereoSfmError
 if TYPE_CHECKING:
     from drivers.source import Source
     from stereo_sfm.log.provenance import Opening
-    from stereo_sfm.log.record import Progress
+    from stereo_sfm.recording.record import Progress
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
 
 def write(source: Source, args: argparse.Namespace, mode: str, opening: Opening | None = None) -> int:
     """Write an entered source and say what came of it."""
-    from stereo_sfm.log.record import record
+    from stereo_sfm.recording.record import record
 
     path: Path = args.output
     if path.suffix != ".mcap":

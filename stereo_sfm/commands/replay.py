@@ -13,7 +13,7 @@ from stereo_sfm.errors import StereoSfmError
 if TYPE_CHECKING:
     from stereo_sfm.config import Config
     from stereo_sfm.log.provenance import Opening
-    from stereo_sfm.pipeline.maps import MapFolders
+    from stereo_sfm.maps.folders import MapFolders
     from stereo_sfm.types import Frame
 
 DIFFERENT = 3
@@ -83,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
 
 def map_folders(opening: Opening) -> MapFolders:
     """The saved map that the run began with, as it was then."""
-    from stereo_sfm.pipeline.maps import MapFolders, map_sha256
+    from stereo_sfm.maps.folders import MapFolders, map_sha256
 
     if not opening.map_in:
         return MapFolders()

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from stereo_sfm.config import Config
     from stereo_sfm.eval.record import RunRecord
     from stereo_sfm.log.recorded import RecordedRun
-    from stereo_sfm.pipeline.maps import MapFolders
+    from stereo_sfm.maps.folders import MapFolders
+    from stereo_sfm.messages import Sink
     from stereo_sfm.pipeline.session import Session
-    from stereo_sfm.pipeline.sinks import Sink
     from stereo_sfm.viz.match_pictures import MatchPictures
 
 TRACKING_FAILED = 4
@@ -154,7 +154,7 @@ def source_choice(args: argparse.Namespace, realtime: bool = False, speed: float
 
 def run(args: argparse.Namespace) -> int:
     """Run, write the output folder, print the closing summary."""
-    from stereo_sfm.pipeline.maps import MapFolders
+    from stereo_sfm.maps.folders import MapFolders
 
     folders = MapFolders(args.map_in, args.localize_only, args.map_out)
     folders.check(args.overwrite)
@@ -173,7 +173,7 @@ def execute(
     from stereo_sfm.eval.run_results import write_results
     from stereo_sfm.eval.statistics import failure, summary
     from stereo_sfm.export.run_folder import link_latest
-    from stereo_sfm.pipeline.events import EventLines
+    from stereo_sfm.log.events import EventLines
     from stereo_sfm.pipeline.session import Session, Wiring
 
     choice.refuse_to_overwrite(args.output)

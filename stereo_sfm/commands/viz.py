@@ -13,7 +13,7 @@ from stereo_sfm.errors import StereoSfmError
 if TYPE_CHECKING:
     from drivers.source import Source
     from stereo_sfm.log.reader import LogReader
-    from stereo_sfm.pipeline.sinks import Sink
+    from stereo_sfm.messages import Sink
     from stereo_sfm.types import StereoImage
 
 

@@ -91,7 +91,7 @@ def _descriptors(spec: str, wanted: int) -> Iterator[U8]:
     """(N, 32) of images that lie evenly over a source; of the first ones where nobody knows how many it has."""
     from drivers.sim.source import SimSource
     from drivers.source import open_source
-    from stereo_sfm.loop.still import still_keyframe
+    from stereo_sfm.maps.single_image import still_keyframe
 
     with open_source(spec) as source:
         chosen = spread(source.frame_count or wanted, wanted)

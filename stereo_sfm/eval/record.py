@@ -16,7 +16,7 @@ from stereo_sfm.eval.frame_table import FrameTable, TimeTable
 from stereo_sfm.export.trajectories import fill_missing
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.keyframe_poses import KeyframePoses
-from stereo_sfm.pipeline.sinks import Health, SourceCounters, StageTimes
+from stereo_sfm.messages import Health, SourceCounters, StageTimes
 from stereo_sfm.types import (
     F64,
     I64,

@@ -11,7 +11,7 @@ import numpy as np
 from drivers.live.counters import TROUBLE
 from stereo_sfm.eval.evaluate import Evaluation, length
 from stereo_sfm.eval.record import RunRecord
-from stereo_sfm.pipeline.sinks import Health
+from stereo_sfm.messages import Health
 from stereo_sfm.types import F64, TrackState
 
 # Part of frames without a pose above which the run counts as failed.

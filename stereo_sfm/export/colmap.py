@@ -12,10 +12,10 @@ import numpy as np
 
 from calib.formats.colmap import write_colmap
 from calib.rig import Rig
-from stereo_sfm.export.saved_map import SavedMap
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.maps.saved_map import SavedMap
 from stereo_sfm.types import F64
 
 HALF_PIXEL = 0.5

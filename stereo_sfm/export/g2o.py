@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import scipy.sparse
 
-from stereo_sfm.export.saved_map import SavedMap
 from stereo_sfm.geometry import se3
-from stereo_sfm.loop.correction import ODOMETRY, STRONG
-from stereo_sfm.loop.pose_graph import Edges, edges_of_poses
+from stereo_sfm.mapping.correction import ODOMETRY, STRONG
 from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.mapping.pose_graph import Edges, edges_of_poses
+from stereo_sfm.maps.saved_map import SavedMap
 
 
 def graph_edges(s: MapSnapshot) -> Edges:

@@ -11,7 +11,7 @@ from drivers.rectified import rectified
 from drivers.source import Source, open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.colmap import image_names
-from stereo_sfm.export.saved_map import SavedMap, describe_rig, same_rig
+from stereo_sfm.maps.saved_map import SavedMap, describe_rig, same_rig
 from stereo_sfm.types import U8, StereoImage
 
 Key = tuple[int, int]  # frame id, stamp in ns

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stereo_sfm.export.saved_map import SavedMap
+from stereo_sfm.maps.saved_map import SavedMap
 from stereo_sfm.types import F64, U8
 
 

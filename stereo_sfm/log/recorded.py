@@ -15,7 +15,7 @@ from stereo_sfm.log.image_log import ImageInfo, ImuSample, WheelSample
 from stereo_sfm.log.provenance import ENDED_EARLY, METADATA, SOURCE_RIG_FILE, Opening
 from stereo_sfm.log.reader import LogReader, Record
 from stereo_sfm.log.track_stats import TrackStats
-from stereo_sfm.pipeline.sinks import Health, SourceCounters, StageTimes
+from stereo_sfm.messages import Health, SourceCounters, StageTimes
 from stereo_sfm.types import Applied, Dropped, Frame, Keyframe, LoopResult, MapUpdate
 
 TYPES: dict[str, type[Any]] = {

@@ -18,7 +18,7 @@ from stereo_sfm.log.map_view import MapView
 from stereo_sfm.log.provenance import ENDED_EARLY, METADATA, TOTALS, Opening, write_provenance
 from stereo_sfm.log.track_stats import track_stats
 from stereo_sfm.log.writer import LogWriter
-from stereo_sfm.pipeline.sinks import Health, LogLine, SourceCounters, StageTimes
+from stereo_sfm.messages import Health, LogLine, SourceCounters, StageTimes
 from stereo_sfm.types import (
     F32,
     F64,

@@ -13,8 +13,8 @@ from stereo_sfm.loop import vocabulary as voc
 from stereo_sfm.loop.cloud import gather
 from stereo_sfm.loop.database import PlaceDatabase
 from stereo_sfm.loop.graph import KeyframeGraph
+from stereo_sfm.loop.keyframe_store import KeyframeStore
 from stereo_sfm.loop.place_view import PlaceView, place_view_of
-from stereo_sfm.loop.store import KeyframeStore
 from stereo_sfm.loop.verification import Verdict, verify, within
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.timing import NoSpans

@@ -35,9 +35,9 @@ import numpy as np
 from calib.rig import Rig
 from stereo_sfm.config import LoopConfig, MapperConfig
 from stereo_sfm.geometry import se3
-from stereo_sfm.loop.correction import apply_loop, fuse_pairs, loop_is_known
 from stereo_sfm.mapping import culling, window
 from stereo_sfm.mapping.bundle import BundleConfig, BundleResult, bundle_adjust
+from stereo_sfm.mapping.correction import apply_loop, fuse_pairs, loop_is_known
 from stereo_sfm.mapping.insertion import insert_keyframe
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.mapping.triangulate import triangulate

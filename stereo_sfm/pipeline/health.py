@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 
-from stereo_sfm.pipeline.sinks import Health
+from stereo_sfm.messages import Health
 
 WINDOW = 90  # steps between two reports, and what they look back on
 

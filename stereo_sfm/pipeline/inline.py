@@ -9,9 +9,9 @@ from collections.abc import Generator, Sequence
 from drivers.source import Source
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.pipeline.maps import MapFolders, make_mapper, save_result
+from stereo_sfm.maps.folders import MapFolders, make_mapper, save_result
+from stereo_sfm.messages import LogLine, Sink, StageTimes
 from stereo_sfm.pipeline.schedule import Lockstep, Schedule
-from stereo_sfm.pipeline.sinks import LogLine, Sink, StageTimes
 from stereo_sfm.pipeline.stages import LocalMailbox, MapStage, TrackStage, make_closer, sensor_drop, source_counters
 from stereo_sfm.pipeline.text import Listener
 from stereo_sfm.pipeline.threads import limited_threads

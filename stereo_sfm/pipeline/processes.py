@@ -21,13 +21,13 @@ from typing import Any, Self
 
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.maps.folders import MapFolders
+from stereo_sfm.messages import LogLine, Sink
 from stereo_sfm.pipeline import workers
 from stereo_sfm.pipeline.capture import SourceInfo
 from stereo_sfm.pipeline.channels import DroppingOutbox, End, Failed, Outbox
 from stereo_sfm.pipeline.images import ImageLayout, ImageRing, SlotImage
 from stereo_sfm.pipeline.interrupts import ignored_by_children
-from stereo_sfm.pipeline.maps import MapFolders
-from stereo_sfm.pipeline.sinks import LogLine, Sink
 from stereo_sfm.pipeline.text import Listener, say
 from stereo_sfm.pipeline.threads import thread_environment
 from stereo_sfm.pipeline.workers import LogOptions, Ready, Setup, ViewerOptions

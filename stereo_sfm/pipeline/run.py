@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from drivers.source import Source
 from stereo_sfm.config import Config
-from stereo_sfm.pipeline.sinks import Sink
+from stereo_sfm.messages import Sink
 from stereo_sfm.types import Frame
 
 

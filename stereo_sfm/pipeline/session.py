@@ -15,12 +15,12 @@ from drivers.source import Source, is_device
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.run_folder import default_folder, discard_files, prepare_folder
+from stereo_sfm.maps.folders import MapFolders
+from stereo_sfm.messages import Sink
 from stereo_sfm.pipeline.capture import SourceInfo
 from stereo_sfm.pipeline.inline import run_inline
-from stereo_sfm.pipeline.maps import MapFolders
 from stereo_sfm.pipeline.processes import ProcessRun
 from stereo_sfm.pipeline.schedule import Recorded
-from stereo_sfm.pipeline.sinks import Sink
 from stereo_sfm.pipeline.workers import LogOptions, ViewerOptions
 from stereo_sfm.types import Dropped, Frame
 

@@ -13,8 +13,9 @@ from typing import Protocol, TypeVar
 from calib.rig import Rig
 from drivers.source import Source
 from stereo_sfm.config import Config
+from stereo_sfm.mapping.protocol import AnyMapper
+from stereo_sfm.messages import SourceCounters
 from stereo_sfm.pipeline.schedule import Schedule
-from stereo_sfm.pipeline.sinks import SourceCounters
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.tracking.factory import AnyTracker
 from stereo_sfm.types import Applied, Dropped, Frame, Keyframe, LoopResult, MapUpdate, StereoImage
@@ -56,14 +57,6 @@ def source_counters(source: Source, frame_id: int) -> SourceCounters | None:
     """What a live source has counted until now; None for files, which count nothing."""
     counts: dict[str, float] | None = getattr(source, "counters", None)
     return SourceCounters(frame_id, dict(counts)) if counts else None
-
-
-class AnyMapper(Protocol):
-    """What answers keyframes with map updates: the mapper, or the localizer in a finished map."""
-
-    def step(self, keyframe: Keyframe, loop: LoopResult | None = None) -> MapUpdate: ...
-
-    def finish(self, loops: list[LoopResult]) -> MapUpdate | None: ...
 
 
 class AnyCloser(Protocol):

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
-from stereo_sfm.pipeline.sinks import LogLine
+from stereo_sfm.messages import LogLine
 
 LOGGER = "stereo_sfm"
 _PASSED_ON = "stereo_sfm_stage"  # attribute of records that came from another process

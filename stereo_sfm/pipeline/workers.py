@@ -20,9 +20,9 @@ from calib.rig import Rig
 from stereo_sfm.config import STAGES, Config
 from stereo_sfm.errors import StereoSfmError, from_os_error
 from stereo_sfm.log.provenance import Opening
+from stereo_sfm.maps.folders import MapFolders, make_mapper, save_result
 from stereo_sfm.pipeline.channels import End, Failed, Inbox, Lost, Outbox
 from stereo_sfm.pipeline.interrupts import STOP_SIGNALS
-from stereo_sfm.pipeline.maps import MapFolders, make_mapper, save_result
 from stereo_sfm.pipeline.schedule import Lockstep, Realtime, Recorded, Schedule
 from stereo_sfm.pipeline.text import LOGGER, Listener
 from stereo_sfm.types import Applied, Keyframe, LoopResult, MapUpdate, Trajectory
@@ -163,9 +163,9 @@ def run_tracker(
     to_loop: Connection,
 ) -> None:
     """Images to frames and keyframes."""
+    from stereo_sfm.messages import StageTimes
     from stereo_sfm.pipeline.health import HealthMeter
     from stereo_sfm.pipeline.images import ImageLayout, ImageRing, SlotImage
-    from stereo_sfm.pipeline.sinks import StageTimes
     from stereo_sfm.pipeline.stages import TrackStage
     from stereo_sfm.timing import Spans
     from stereo_sfm.tracking.factory import make_tracker
@@ -219,8 +219,8 @@ def run_mapper(
 ) -> None:
     """Keyframes to map updates."""
     from stereo_sfm.mapping.mapper import Mapper
+    from stereo_sfm.messages import StageTimes
     from stereo_sfm.pipeline.health import HealthMeter
-    from stereo_sfm.pipeline.sinks import StageTimes
     from stereo_sfm.pipeline.stages import MapStage
     from stereo_sfm.timing import Spans
 
@@ -294,8 +294,8 @@ def run_optimizer(to_main: Outbox, control: Connection, jobs: Connection, result
 
 def run_loop(to_main: Outbox, control: Connection, keyframes: Connection, to_mapper: Connection) -> None:
     """Keyframes to loop results."""
+    from stereo_sfm.messages import StageTimes
     from stereo_sfm.pipeline.health import HealthMeter
-    from stereo_sfm.pipeline.sinks import StageTimes
     from stereo_sfm.pipeline.stages import make_closer
     from stereo_sfm.timing import Spans
 

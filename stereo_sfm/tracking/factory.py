@@ -37,8 +37,8 @@ def make_tracker(
 def _tracker(config: Config, rig: Rig, spans: NoSpans | None, ground_truth: Trajectory | None) -> AnyTracker:
     method = config.odometry.method
     if method == "flow":
-        from stereo_sfm.tracking.place_corners import PlaceCorners
-        from stereo_sfm.tracking.tracker import Tracker
+        from stereo_sfm.tracking.flow.place_corners import PlaceCorners
+        from stereo_sfm.tracking.flow.tracker import Tracker
 
         return Tracker(config.tracker, rig, spans, PlaceCorners.wanted(config, rig))
     if not rig.stereo and method in NEEDS_DEPTH:
@@ -50,9 +50,9 @@ def _tracker(config: Config, rig: Rig, spans: NoSpans | None, ground_truth: Traj
             "one eye has no scale: choose --set odometry.scale=unit (steps of odometry.unit_step_m) or ground-truth"
         )
     if method == "pnp" and (config.odometry.monocular or not rig.stereo):
-        from stereo_sfm.tracking.monocular import MonocularTracker
+        from stereo_sfm.tracking.features.monocular import MonocularTracker
 
         return MonocularTracker(config, rig, spans)
-    from stereo_sfm.tracking.feature_tracker import FeatureTracker
+    from stereo_sfm.tracking.features.feature_tracker import FeatureTracker
 
     return FeatureTracker(config, rig, spans, ground_truth)

@@ -17,8 +17,8 @@ import rerun as rr
 from calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
-from stereo_sfm.pipeline.events import Events
-from stereo_sfm.pipeline.sinks import Health, LogLine, StageTimes
+from stereo_sfm.log.events import Events
+from stereo_sfm.messages import Health, LogLine, StageTimes
 from stereo_sfm.types import (
     U8,
     Dropped,

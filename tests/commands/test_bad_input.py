@@ -11,7 +11,7 @@ import pytest
 
 from calib import save_rig
 from stereo_sfm.cli import main
-from stereo_sfm.pipeline.batch import names
+from stereo_sfm.eval.batch import names
 from tests.drivers.dataset_folders import make_euroc, make_images, make_kitti, make_tum_rgbd
 from tests.synthetic import fisheye_rig
 

@@ -12,7 +12,7 @@ from stereo_sfm.log.provenance import Opening, write_provenance
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.recorded import read_opening
 from stereo_sfm.log.writer import LogWriter
-from stereo_sfm.pipeline.maps import MapFolders, map_sha256
+from stereo_sfm.maps.folders import MapFolders, map_sha256
 
 
 def logged(tmp_path: Path, opening: Opening) -> Opening:

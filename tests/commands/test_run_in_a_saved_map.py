@@ -11,8 +11,8 @@ from drivers.ground_truth import read_tum
 from drivers.source import open_source
 from stereo_sfm.cli import main
 from stereo_sfm.eval.associate import poses_at
-from stereo_sfm.export.saved_map import SavedMap, load_map
 from stereo_sfm.geometry import se3
+from stereo_sfm.maps.saved_map import SavedMap, load_map
 from stereo_sfm.types import F64
 
 FIRST = "sim:loop?size=424x400&rate=10"

@@ -6,7 +6,7 @@ import numpy as np
 
 from stereo_sfm.eval.frame_table import FrameTable, TimeTable
 from stereo_sfm.eval.record import LostInterval, RunRecord
-from stereo_sfm.pipeline.sinks import Health
+from stereo_sfm.messages import Health
 from stereo_sfm.types import Frame, Keyframe, Observations, TrackState
 
 NONE = np.zeros(0, np.int64)

@@ -17,11 +17,11 @@ from stereo_sfm.export.colmap import export_colmap
 from stereo_sfm.export.floor_plan import FREE, OCCUPIED, UNKNOWN, aisle_direction, make_floor_plan
 from stereo_sfm.export.g2o import export_g2o, graph_edges
 from stereo_sfm.export.ply import export_ply
-from stereo_sfm.export.saved_map import SavedMap, joined, save_map, walk_trajectory
 from stereo_sfm.export.trajectories import named_pose, write_tum
 from stereo_sfm.geometry import se3
-from tests.export.maps import small_map
+from stereo_sfm.maps.saved_map import SavedMap, joined, save_map, walk_trajectory
 from tests.loop.store_walk import StoreWalk
+from tests.maps.maps import small_map
 
 
 @pytest.fixture(scope="module")

@@ -16,9 +16,9 @@ from stereo_sfm.cli import main
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.colmap import export_colmap
 from stereo_sfm.export.pictures import check_walk, open_pictures, walk_of_recording, write_pictures
-from stereo_sfm.export.saved_map import SavedMap, joined, save_map
+from stereo_sfm.maps.saved_map import SavedMap, joined, save_map
 from stereo_sfm.types import StereoImage
-from tests.export.maps import small_map
+from tests.maps.maps import small_map
 
 LATER_NS = 10**12
 SPEC = "sim:aisle?size=150x140&rate=15&seed=1&frames=4"

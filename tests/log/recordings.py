@@ -11,7 +11,7 @@ from calib.rig import Rig
 from drivers.memory import MemorySource
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import KannalaBrandt, Pinhole
-from stereo_sfm.log.record import record
+from stereo_sfm.recording.record import record
 from stereo_sfm.types import ImuSamples, StereoImage, Trajectory, WheelSamples
 
 PERIOD_NS = 33_333_333

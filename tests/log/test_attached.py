@@ -12,12 +12,12 @@ from calib.formats.native import rig_to_text
 from stereo_sfm.config import Config, dump
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log.attached import attached_config, attached_rig, attached_truth
-from stereo_sfm.log.describe import describe_file
 from stereo_sfm.log.image_log import RIG_FILE, TRUTH_FILE, truth_to_bytes
 from stereo_sfm.log.provenance import CONFIG_FILE
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.recorded import read_run
 from stereo_sfm.log.writer import LogWriter
+from stereo_sfm.recording.describe import describe_file
 from stereo_sfm.types import Trajectory
 from tests.synthetic import fisheye_rig, walk
 

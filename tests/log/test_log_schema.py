@@ -15,7 +15,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log import schema
 from stereo_sfm.log.image_log import ImageInfo, ImuSample
 from stereo_sfm.log.track_stats import TrackStats
-from stereo_sfm.pipeline.sinks import Health
+from stereo_sfm.messages import Health
 from stereo_sfm.types import (
     Applied,
     Corners,

@@ -23,8 +23,8 @@ from stereo_sfm.cli import main
 from stereo_sfm.commands import record as record_command
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log import repair, topics
-from stereo_sfm.log.describe import describe_file
 from stereo_sfm.log.reader import LogReader
+from stereo_sfm.recording.describe import describe_file
 from stereo_sfm.types import StereoImage
 from tests.log.recordings import (
     PERIOD_NS,
@@ -176,7 +176,7 @@ import sys, time
 from pathlib import Path
 sys.path.insert(0, {root!r})
 import numpy as np
-from stereo_sfm.log.record import record
+from stereo_sfm.recording.record import record
 from drivers.memory import MemorySource
 from tests.log.recordings import fisheye_rig, stereo_images
 

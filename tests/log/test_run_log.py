@@ -34,7 +34,7 @@ from stereo_sfm.log.recorded import messages, read_run
 from stereo_sfm.log.run_log import RunLog
 from stereo_sfm.log.track_stats import TrackStats, track_stats
 from stereo_sfm.log.writer import LogWriter
-from stereo_sfm.pipeline.sinks import Health, LogLine, SourceCounters, StageTimes
+from stereo_sfm.messages import Health, LogLine, SourceCounters, StageTimes
 from stereo_sfm.types import (
     F64,
     Applied,

@@ -10,7 +10,7 @@ import pytest
 from calib.rig import Rig
 from stereo_sfm.config import MapperConfig
 from stereo_sfm.geometry import se3
-from stereo_sfm.loop.correction import loop_is_known
+from stereo_sfm.mapping.correction import loop_is_known
 from stereo_sfm.mapping.keyframe_poses import KeyframePoses
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.mapping.mapper import Mapper, run_job

@@ -20,16 +20,16 @@ import pytest
 from calib.rig import Rig
 from stereo_sfm.config import Config, load
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.export.saved_map import load_map
 from stereo_sfm.geometry.cameras import Pinhole
 from stereo_sfm.log.diff import diff
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.recorded import ended_early, read_run
 from stereo_sfm.log.run_log import RunLog
 from stereo_sfm.log.writer import LogWriter
+from stereo_sfm.maps.folders import MapFolders
+from stereo_sfm.maps.saved_map import load_map
 from stereo_sfm.pipeline.images import ImageLayout, ImageRing
 from stereo_sfm.pipeline.inline import run_inline
-from stereo_sfm.pipeline.maps import MapFolders
 from stereo_sfm.pipeline.processes import ProcessRun, StageDied
 from stereo_sfm.pipeline.schedule import Lockstep, Recorded, Schedule
 from stereo_sfm.pipeline.threads import VARIABLES, thread_environment

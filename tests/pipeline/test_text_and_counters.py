@@ -20,11 +20,11 @@ from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.recorded import messages
 from stereo_sfm.log.run_log import RunLog
 from stereo_sfm.log.writer import LogWriter
+from stereo_sfm.messages import LogLine, SourceCounters
 from stereo_sfm.pipeline import workers
 from stereo_sfm.pipeline.channels import End, Outbox
 from stereo_sfm.pipeline.inline import run_inline
 from stereo_sfm.pipeline.processes import ProcessRun
-from stereo_sfm.pipeline.sinks import LogLine, SourceCounters
 from stereo_sfm.pipeline.workers import LogOptions
 from stereo_sfm.types import StereoImage
 from tests.pipeline.test_pipeline import CONFIG, SlidingWall

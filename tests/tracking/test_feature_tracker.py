@@ -18,7 +18,7 @@ from stereo_sfm.eval.evaluate import evaluate
 from stereo_sfm.geometry import se3
 from stereo_sfm.presets import PRESETS, preset
 from stereo_sfm.tracking.factory import make_tracker
-from stereo_sfm.tracking.feature_tracker import LOST_BEFORE_RESTART, FeatureTracker
+from stereo_sfm.tracking.features.feature_tracker import LOST_BEFORE_RESTART, FeatureTracker
 from stereo_sfm.types import F64, Frame, Keyframe, MapUpdate, StereoImage, TrackState, Trajectory
 
 SPEC = "sim:aisle?camera=pinhole&frames=7&size=480x300"

@@ -13,11 +13,11 @@ from stereo_sfm.geometry.homography import PLANAR_RATIO, homographies, homograph
 from stereo_sfm.geometry.motion_only import refine_pose
 from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.geometry.two_view import essential_from_motion
-from stereo_sfm.tracking.feature_view import FeatureView
-from stereo_sfm.tracking.features import Features
-from stereo_sfm.tracking.identity import PointIds
-from stereo_sfm.tracking.local_points import LocalPoints, row_of
-from stereo_sfm.tracking.mono_start import TwoViewStart, good_points, start_from
+from stereo_sfm.tracking.features.extraction import Features
+from stereo_sfm.tracking.features.feature_view import FeatureView
+from stereo_sfm.tracking.features.local_points import LocalPoints, row_of
+from stereo_sfm.tracking.features.monocular_start import TwoViewStart, good_points, start_from
+from stereo_sfm.tracking.features.point_ids import PointIds
 from stereo_sfm.types import F64, MapUpdate
 from tests.tracking.synthetic_views import PIXEL, unit
 

@@ -12,9 +12,9 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Pinhole
 from stereo_sfm.geometry.robust import Degenerate
-from stereo_sfm.tracking.odometry.base import FramePair, Motion
-from stereo_sfm.tracking.odometry.table import TABLE, make_estimator
-from stereo_sfm.tracking.scale import StepScale
+from stereo_sfm.tracking.features.odometry.base import FramePair, Motion
+from stereo_sfm.tracking.features.odometry.table import TABLE, make_estimator
+from stereo_sfm.tracking.features.step_scale import StepScale
 from stereo_sfm.types import F64, Trajectory
 from tests.tracking.synthetic_views import PIXEL, frame_pair, unit
 

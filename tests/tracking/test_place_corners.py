@@ -13,8 +13,8 @@ from drivers.sim.source import SimSource
 from drivers.source import open_source
 from stereo_sfm.config import load
 from stereo_sfm.geometry import se3
-from stereo_sfm.loop.still import still_keyframe
 from stereo_sfm.loop.verification import occupied_cells
+from stereo_sfm.maps.single_image import still_keyframe
 from stereo_sfm.tracking.factory import make_tracker
 from stereo_sfm.types import F32, F64, U8, Corners, Keyframe, StereoImage
 

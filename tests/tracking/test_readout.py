@@ -13,7 +13,7 @@ from drivers.sim.source import SimSource
 from drivers.source import open_source
 from stereo_sfm.cli import main
 from stereo_sfm.config import TrackerConfig
-from stereo_sfm.tracking.readout import LEAST_FRAMES, ReadoutErrors, ReadoutSearch
+from stereo_sfm.tracking.flow.readout import LEAST_FRAMES, ReadoutErrors, ReadoutSearch
 from stereo_sfm.types import StereoImage
 
 WALK = "sim:aisle?camera=pinhole&size=320x200&start=60&frames=40&vibration=4"

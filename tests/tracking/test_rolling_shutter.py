@@ -13,11 +13,11 @@ from stereo_sfm.config import load
 from stereo_sfm.eval.evaluate import evaluate
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import KannalaBrandt, Pinhole
-from stereo_sfm.tracking import motion
-from stereo_sfm.tracking.eyes import Eyes
-from stereo_sfm.tracking.place_corners import PlaceCorners
-from stereo_sfm.tracking.rolling_shutter import RollingShutter
-from stereo_sfm.tracking.tracker import Tracker
+from stereo_sfm.tracking.flow import pose_solver
+from stereo_sfm.tracking.flow.place_corners import PlaceCorners
+from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
+from stereo_sfm.tracking.flow.stereo_cameras import Eyes
+from stereo_sfm.tracking.flow.tracker import Tracker
 from stereo_sfm.types import F64, Corners, StereoImage, Trajectory
 
 LEFT_T_RIGHT = se3.exp(np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0]))
@@ -61,7 +61,7 @@ def solve(shutter: RollingShutter, points: F64, uv: F64, uv_right: F64, start: F
     camera = CAMERAS[0]
     distance, n = np.linalg.norm(points, axis=1), len(points)
     eyes = Eyes.of(rig(camera))
-    pose, velocity, _, _ = motion.optimise_pose(
+    pose, velocity, _, _ = pose_solver.optimise_pose(
         start, 0.9 * VELOCITY * 0.1, 0.1, np.full(6, sigma), shutter.row_seconds(uv), np.zeros((n, 3)),
         points / distance[:, None], 1 / distance, np.full(n, 1e-12), uv, uv_right, eyes.cams, eyes.right_T_left, 0.1,
         SCALES,

@@ -9,8 +9,8 @@ import pytest
 from calib.rig import Rig
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
-from stereo_sfm.tracking import flow
-from stereo_sfm.tracking.stereo import StereoMatch, StereoMatcher
+from stereo_sfm.tracking.flow import klt
+from stereo_sfm.tracking.flow.stereo import StereoMatch, StereoMatcher
 from stereo_sfm.types import F32, F64, U8
 from tests.synthetic import fisheye_rig, pinhole_rig
 
@@ -46,7 +46,7 @@ def see_plane(rig: Rig, depth: float, pattern: F32, gain: float, offset: float) 
 def matches(rig: Rig, images: tuple[U8, U8], coarse: bool) -> tuple[F64, StereoMatch]:
     """Corners around the image centre and what is found of them."""
     matcher = StereoMatcher(TrackerConfig(), rig)
-    left, right = (flow.build_pyramid(image, 4) for image in images)
+    left, right = (klt.build_pyramid(image, 4) for image in images)
     width, height = rig.left.size
     u, v = np.meshgrid(np.arange(0.3 * width, 0.7 * width, 11.3), np.arange(0.3 * height, 0.7 * height, 11.7))
     uv = np.stack([u.ravel(), v.ravel()], 1)

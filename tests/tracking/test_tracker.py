@@ -18,7 +18,7 @@ from stereo_sfm.config import load
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.eval.evaluate import evaluate
 from stereo_sfm.geometry import se3
-from stereo_sfm.tracking.tracker import Tracker
+from stereo_sfm.tracking.flow.tracker import Tracker
 from stereo_sfm.types import Frame, StereoImage, TrackState, Trajectory
 
 Change = Callable[[Iterator[StereoImage]], Iterator[StereoImage]]

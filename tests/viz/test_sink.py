@@ -17,8 +17,8 @@ import rerun as rr
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
+from stereo_sfm.messages import Health
 from stereo_sfm.pipeline.inline import run_inline
-from stereo_sfm.pipeline.sinks import Health
 from stereo_sfm.types import Dropped, LoopResult, Trajectory
 from stereo_sfm.viz import sink
 from stereo_sfm.viz.shapes import age_colors, spread_colors, strips, wire_cameras

@@ -1,0 +1,202 @@
+"""Many recordings as Ray tasks: each its own inline run in its own folder, resumable, one table of results."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import time
+import traceback
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from stereo_sfm.config import Config, dump
+from stereo_sfm.errors import StereoSfmError
+
+RESULT = "result.json"
+RETRIES = 3  # of a task whose node died
+
+
+@dataclass(frozen=True)
+class BatchTask:
+    """One recording."""
+
+    spec: str
+    folder: str
+    config: Config
+    map_out: bool
+
+
+def names(recordings: Sequence[str]) -> list[str]:
+    """A folder name for each recording, unique and in order."""
+    stems = [Path(r).stem or r for r in recordings]
+    taken = {s for s in stems if stems.count(s) == 1}
+    out: list[str] = []
+    for stem in stems:
+        name = stem
+        if stems.count(stem) > 1:
+            name = next(f"{stem}_{k}" for k in count(1) if f"{stem}_{k}" not in taken)
+            taken.add(name)
+        out.append(name)
+    return out
+
+
+def run_one(task: BatchTask) -> dict[str, Any]:
+    """Run one recording to the end; what goes wrong becomes part of the result."""
+    import cv2
+
+    from stereo_sfm.eval.record import RunRecord
+    from stereo_sfm.eval.run_results import write_results
+    from stereo_sfm.export.run_folder import prepare_folder
+    from stereo_sfm.maps.folders import MapFolders
+    from stereo_sfm.pipeline.session import Session, Wiring
+
+    cv2.setNumThreads(1)
+    folder, begin, record = Path(task.folder), time.perf_counter(), RunRecord.of(task.config)
+    result: dict[str, Any] = {"recording": task.spec, "config": dump(task.config), "node": os.uname().nodename}
+    try:
+        prepare_folder(folder, overwrite=True)
+        folders = MapFolders(map_out=folder / "map" if task.map_out else None)
+        opener = _Opener(task.spec)
+        with Session(opener, task.config, [record], Wiring(inline=True), folders, folder, True) as session:
+            for _ in session:
+                pass
+        info = session.info
+        wall_s = time.perf_counter() - begin
+        stats, _ = write_results(folder, info.name, info.rig, task.config, record, wall_s, info.ground_truth)
+        result |= {"ok": True, "stats": stats}
+    except StereoSfmError as error:
+        result |= {"ok": False, "error": str(error)}
+    except Exception:
+        result |= {"ok": False, "error": traceback.format_exc()}
+    folder.mkdir(parents=True, exist_ok=True)
+    temporary = folder / f"{RESULT}.part"
+    temporary.write_text(json.dumps(result, indent=2, default=str), encoding="utf-8")
+    temporary.replace(folder / RESULT)
+    return result
+
+
+@dataclass(frozen=True)
+class _Opener:
+    spec: str
+
+    def __call__(self) -> Any:
+        from drivers.source import open_source
+
+        return open_source(self.spec)
+
+
+def finished(task: BatchTask) -> dict[str, Any] | None:
+    """The result of an earlier batch with the same recording and configuration, if it went well."""
+    path = Path(task.folder) / RESULT
+    try:
+        result = json.loads(path.read_text("utf-8-sig"))
+    except (OSError, ValueError):
+        return None
+    same = result.get("ok") and result.get("recording") == task.spec and result.get("config") == dump(task.config)
+    has_map = not task.map_out or (Path(task.folder) / "map" / "map.json").exists()
+    return result if same and has_map else None
+
+
+def run_batch(tasks: Sequence[BatchTask], address: str | None = None) -> Iterator[tuple[BatchTask, dict[str, Any]]]:
+    """Run what is not finished yet, on this machine or on a cluster; yields in the order of completion.
+
+    Args:
+        tasks: what to run; the folders must be reachable from every node.
+        address: of a Ray cluster, None for this machine.
+    """
+    waiting: list[BatchTask] = []
+    for task in tasks:
+        done = finished(task)
+        if done is None:
+            waiting.append(task)
+        else:
+            yield task, {**done, "resumed": True}
+    if waiting:
+        yield from _run_on_ray(waiting, address)
+
+
+def _run_on_ray(tasks: list[BatchTask], address: str | None) -> Iterator[tuple[BatchTask, dict[str, Any]]]:
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    try:
+        import ray
+        from ray.exceptions import RayError
+    except ImportError:
+        raise StereoSfmError("batch needs Ray: pip install 'stereo-sfm[batch]'") from None
+
+    # "local" even where a cluster once ran: without it Ray waits for the last one it remembers.
+    ours = not ray.is_initialized()
+    if ours:
+        ray.init(address=address or "local", include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
+    remote = ray.remote(num_cpus=1, max_retries=RETRIES)(run_one)
+    pending = {remote.remote(task): task for task in tasks}
+    try:
+        while pending:
+            ready, _ = ray.wait(list(pending), num_returns=1)
+            for reference in ready:
+                task = pending.pop(reference)
+                try:
+                    result = ray.get(reference)
+                except RayError as error:
+                    result = {"recording": task.spec, "ok": False, "error": f"the task died: {error}".splitlines()[0]}
+                yield task, result
+    finally:
+        for reference in pending:
+            ray.cancel(reference, force=True)
+        if ours:
+            ray.shutdown()
+
+
+COLUMNS = ("recording", "frames", "tracked %", "keyframes", "loops", "path m", "ATE mm", "frames/s", "result")
+
+
+def table_row(name: str, result: dict[str, Any]) -> list[str]:
+    """One line of the table of results."""
+    if not result["ok"]:
+        return [name, *["-"] * (len(COLUMNS) - 2), f"failed: {result['error'].strip().splitlines()[-1]}"]
+    stats = result["stats"]
+    ate = stats["evaluation"].get("map", stats["evaluation"].get("odometry"))
+    return [
+        name,
+        str(stats["frames"]),
+        f"{100 - stats['lost_percent']:.1f}",
+        str(stats["keyframes"]),
+        str(stats["loops_accepted"]),
+        f"{stats['path_m']:.1f}",
+        "-" if ate is None else f"{ate['ape_m']['rmse'] * 1e3:.1f}",
+        f"{stats['frames_per_s']:.1f}",
+        str(stats["fingerprint"]),
+    ]
+
+
+def write_table(rows: Sequence[Sequence[str]], folder: Path) -> None:
+    """results.md and results.csv."""
+    import csv
+
+    lines = [f"| {' | '.join(r)} |" for r in (COLUMNS, ["---"] * len(COLUMNS), *rows)]
+    (folder / "results.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    with (folder / "results.csv").open("w", newline="", encoding="utf-8") as stream:
+        csv.writer(stream).writerows([COLUMNS, *rows])
+
+
+def merge_maps(folders: Sequence[Path], config: Config, out: Path) -> str:
+    """One map of all walks that loops can join; a line that says what became of them."""
+    from stereo_sfm.loop.vocabulary_file import configured_vocabulary
+    from stereo_sfm.maps.merge import merge
+    from stereo_sfm.maps.saved_map import load_map, save_map
+
+    vocabulary = configured_vocabulary(config.loop)
+    common = load_map(folders[0])
+    joined, alone = [folders[0].parent.name], list[str]()
+    for folder in folders[1:]:
+        try:
+            common = merge([common, load_map(folder)], vocabulary, config.loop, config.mapper).saved
+            joined.append(folder.parent.name)
+        except StereoSfmError as error:
+            alone.append(f"{folder.parent.name} ({error})")
+    save_map(common, out)
+    text = f"one map of {', '.join(joined)}: {len(common)} keyframes, {out}"
+    return text + (f"; not joined: {'; '.join(alone)}" if alone else "")

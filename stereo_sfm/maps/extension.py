@@ -1,0 +1,98 @@
+"""Go on with a saved map: the walk is mapped as always, and placed in the saved map as soon as it is found there."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+
+from calib.rig import Rig
+from stereo_sfm.config import LoopConfig, MapperConfig
+from stereo_sfm.geometry import se3
+from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.mapping.mapper import Mapper
+from stereo_sfm.maps.localizer import Localizer
+from stereo_sfm.maps.relocalization import Location
+from stereo_sfm.timing import NoSpans
+from stereo_sfm.types import F64, Keyframe, LoopResult, MapUpdate
+
+
+class Extension(Mapper):
+    """A mapper whose updates are in the frame of a saved map once a keyframe was found there.
+
+    Until then they are in the walk's own map frame, which begins at its first keyframe; the update that tells of the
+    first place found holds every keyframe and point again, moved. The walk's own map (`map`) keeps its own frame:
+    `export.merge` joins the two when the run is saved.
+    """
+
+    def __init__(
+        self, config: MapperConfig, rig: Rig, spans: NoSpans | None, loop_config: LoopConfig, localizer: Localizer
+    ) -> None:
+        super().__init__(config, rig, spans, loop_config)
+        self._localizer = localizer
+        self._saved_T_walk: F64 | None = None
+        self._found: tuple[int, Location] | None = None  # the keyframe that was found first, and where
+
+    def step(self, keyframe: Keyframe, loop: LoopResult | None = None) -> MapUpdate:
+        """As the mapper's, in the saved map's frame where that is known."""
+        update = super().step(keyframe, loop)
+        if self._saved_T_walk is not None:
+            return self._in_saved_map(update, self._saved_T_walk)
+        place = self._localizer.step(keyframe)
+        if not self._localizer.found:
+            return update
+        assert self._localizer.last is not None
+        self._found = keyframe.kf_id, self._localizer.last
+        self._saved_T_walk = se3.orthonormalize(place.map_T_odom @ se3.inverse(update.map_T_odom))
+        return self._in_saved_map(self._with_everything(update), self._saved_T_walk)
+
+    def finish(self, loops: Sequence[LoopResult]) -> MapUpdate | None:
+        """As the mapper's."""
+        update = super().finish(loops)
+        if update is None or self._saved_T_walk is None:
+            return update
+        return self._in_saved_map(update, self._saved_T_walk)
+
+    def place(self, saved: MapSnapshot) -> LoopResult | None:
+        """The first place found, as a loop from a keyframe of the saved map to a living one of the walk; None: none.
+
+        The ids are each map's own.
+        """
+        if self._found is None:
+            return None
+        kf_id, where = self._found
+        table, row = self.map.keyframes, self.map.kf_row(kf_id)
+        alive = bool(table.alive[row])
+        living = kf_id if alive else int(table.kf_id[table.carrier[row]])
+        kf_T_living = np.eye(4) if alive else se3.inverse(table.carrier_T_kf[row])
+        candidate = saved.map_T_kf[int(np.searchsorted(saved.kf_ids, where.kf_id))]
+        return LoopResult(
+            kf_id=living,
+            candidate_kf_id=where.kf_id,
+            candidate_T_kf=se3.inverse(candidate) @ where.map_T_cam @ kf_T_living,
+            information=where.information,
+            matches=where.pairs,
+            inliers=where.inliers,
+            score=0.0,
+            reason="",
+        )
+
+    def _with_everything(self, update: MapUpdate) -> MapUpdate:
+        keyframes, points = self.map.living_keyframes(), self.map.living_points()
+        return dataclasses.replace(
+            update,
+            kf_ids=self.map.keyframes.kf_id[keyframes],
+            map_T_kf=self.map.keyframes.map_T_kf[keyframes],
+            point_ids=self.map.points.pt_id[points],
+            points_map=self.map.points.xyz[points],
+        )
+
+    @staticmethod
+    def _in_saved_map(update: MapUpdate, saved_T_walk: F64) -> MapUpdate:
+        return dataclasses.replace(
+            update,
+            map_T_kf=saved_T_walk @ update.map_T_kf,
+            points_map=se3.transform(saved_T_walk, update.points_map),
+            map_T_odom=saved_T_walk @ update.map_T_odom,
+        )

@@ -1,0 +1,140 @@
+"""Maps that a run starts from or leaves behind."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from calib.rig import Rig
+from stereo_sfm.config import Config
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.log.provenance import Opening
+from stereo_sfm.loop.vocabulary_file import configured_vocabulary
+from stereo_sfm.mapping.protocol import AnyMapper
+from stereo_sfm.maps.header import checksum
+from stereo_sfm.timing import NoSpans
+
+if TYPE_CHECKING:
+    from stereo_sfm.loop.vocabulary import Vocabulary
+    from stereo_sfm.maps.saved_map import SavedMap
+
+
+log = logging.getLogger("stereo_sfm")
+
+
+@dataclass(frozen=True)
+class MapFolders:
+    """`localize_only`: place the odometry in the map at `map_in` and change nothing. Otherwise the walk is mapped as
+    always, placed in the map at `map_in`, if any, once it is found there, and merged with it when it is saved to
+    `map_out`."""
+
+    map_in: Path | None = None
+    localize_only: bool = False
+    map_out: Path | None = None
+
+    def check(self, overwrite: bool = False) -> None:
+        """Raises StereoSfmError for what cannot work, before anything is computed."""
+        if self.localize_only and self.map_in is None:
+            raise StereoSfmError("--localize-only needs the map to localize in: add --map-in DIR")
+        if self.localize_only and self.map_out is not None:
+            raise StereoSfmError("--localize-only changes no map: leave --map-out away")
+        if self.map_in is not None and not (self.map_in / "map.json").exists():
+            raise StereoSfmError(f"no map at {self.map_in}: 'stereo-sfm run ... --map-out DIR' makes one")
+        if self.map_out is not None and self.map_out.exists() and not overwrite:
+            raise StereoSfmError(f"{self.map_out} exists: choose another --map-out, or say --overwrite")
+        if self.map_out is not None and self.map_out.exists() and not self.map_out.is_dir():
+            raise StereoSfmError(f"{self.map_out} is a file: --map-out takes a folder")
+        if self.map_out is not None:
+            above = next(folder for folder in self.map_out.absolute().parents if folder.exists())
+            if not above.is_dir() or not os.access(above, os.W_OK):
+                why = "may not be written to" if above.is_dir() else "is no folder"
+                raise StereoSfmError(f"cannot make --map-out {self.map_out}: {above} {why}")
+
+    def opening(self, opener: object) -> Opening:
+        """How a run begins: as its opener says, if it says anything, with the map that it begins with."""
+        opening: Opening = getattr(opener, "opening", Opening())
+        if self.map_in is None:
+            return opening
+        place, sha256 = str(self.map_in.resolve()), map_sha256(self.map_in)
+        return replace(opening, map_in=place, map_sha256=sha256, localize_only=self.localize_only)
+
+
+def map_sha256(folder: Path) -> str:
+    """What tells a saved map from any other: its map.json holds the checksums of all its files."""
+    return checksum((folder / "map.json").read_bytes())
+
+
+def make_mapper(config: Config, rig: Rig, spans: NoSpans, folders: MapFolders) -> AnyMapper:
+    """The mapper, or the localizer in a saved map."""
+    if not folders.localize_only and not config.mapper.enabled and (folders.map_in or folders.map_out):
+        raise StereoSfmError("there is no map without the mapper: leave mapper.enabled=true, or --map-in and --map-out")
+    if folders.localize_only and not config.mapper.enabled and not config.loop.enabled:
+        raise StereoSfmError("--localize-only recognises places: leave loop.enabled=true")
+    from stereo_sfm.mapping.mapper import Mapper
+
+    if folders.map_in is None:
+        return Mapper(config.mapper, rig, spans, config.loop)
+    from stereo_sfm.maps.extension import Extension
+    from stereo_sfm.maps.localizer import Localizer
+    from stereo_sfm.maps.saved_map import load_map
+
+    saved = load_map(folders.map_in, rig)
+    localizer = Localizer(saved.snapshot, rig, configured_vocabulary(config.loop), config.loop)
+    return localizer if folders.localize_only else Extension(config.mapper, rig, spans, config.loop, localizer)
+
+
+def save_result(mapper: AnyMapper, config: Config, rig: Rig, folders: MapFolders) -> None:
+    """Write the map of a finished run to `map_out`, merged with `map_in`.
+
+    Raises:
+        StereoSfmError: it cannot be merged, and the walk's own map was written instead (beside `map_out` where that is
+            the map it should have been merged with).
+        OSError: the disk does not take it.
+    """
+    from stereo_sfm.mapping.mapper import Mapper
+
+    if folders.map_out is None or not isinstance(mapper, Mapper):
+        return
+    from stereo_sfm.maps.saved_map import SavedMap, save_map
+
+    snapshot = mapper.map.snapshot()
+    if not len(snapshot.kf_ids) or not len(snapshot.points):
+        log.warning("nothing was mapped: no map is written to %s", folders.map_out)
+        return
+    vocabulary = configured_vocabulary(config.loop)
+    saved, out, failure = (
+        SavedMap(snapshot, rig, vocabulary.id, np.zeros(len(snapshot.kf_ids), np.int64)),
+        folders.map_out,
+        "",
+    )
+    if folders.map_in is not None:
+        try:
+            saved = _merged(mapper, saved, folders.map_in, vocabulary, config)
+        except StereoSfmError as error:
+            out = _beside(out) if out.resolve() == folders.map_in.resolve() else out
+            failure = f"not merged with {folders.map_in}: {error}; {out} is this walk alone"
+    save_map(saved, out)
+    if failure:
+        raise StereoSfmError(failure)
+
+
+def _merged(mapper: AnyMapper, walk: SavedMap, map_in: Path, vocabulary: Vocabulary, config: Config) -> SavedMap:
+    from stereo_sfm.maps.extension import Extension
+    from stereo_sfm.maps.merge import merge
+    from stereo_sfm.maps.saved_map import load_map
+
+    before = load_map(map_in, walk.rig)
+    place = mapper.place(before.snapshot) if isinstance(mapper, Extension) else None
+    return merge([before, walk], vocabulary, config.loop, config.mapper, place).saved
+
+
+def _beside(folder: Path) -> Path:
+    """A free name next to a folder."""
+    names = (folder.with_name(f"{folder.name}_walk{k}") for k in itertools.count(1))
+    return next(name for name in names if not name.exists())

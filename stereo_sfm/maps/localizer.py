@@ -1,0 +1,97 @@
+"""Localize only: in place of a mapper, a stage that holds a finished map and places the odometry frame in it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from calib.rig import Rig
+from stereo_sfm.config import LoopConfig
+from stereo_sfm.geometry import se3
+from stereo_sfm.loop.verification import within
+from stereo_sfm.loop.vocabulary import Vocabulary
+from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.maps.relocalization import Location, Relocalizer, nowhere
+from stereo_sfm.types import F64, Keyframe, LoopResult, MapUpdate
+
+LOST_AFTER = 5  # keyframes without an answer near the prediction before the whole map is searched
+
+
+class Localizer:
+    """One keyframe in, one `MapUpdate` out that moves nothing but `map_T_odom`.
+
+    The first answer needs no guess; where it rests on few corners, a second keyframe must say the same. Later keyframes
+    are looked for around the prediction; after some failures, or when tracking restarted as another submap, the whole
+    map is searched again. `found` is False until the first answer.
+    Keyframes from before the first answer of their submap get their places with it, by odometry.
+    """
+
+    def __init__(self, snapshot: MapSnapshot, rig: Rig, vocabulary: Vocabulary, config: LoopConfig) -> None:
+        self._relocalizer = Relocalizer(snapshot, rig, vocabulary, config)
+        self._config = config
+        self._map_T_odom: F64 = np.eye(4)
+        self._version = 0
+        self._submap = -1
+        self._failures = 0
+        self._unsure: F64 | None = None  # map_T_odom by the newest keyframe, if it rests on few corners
+        self._waiting: list[tuple[int, F64]] | None = []  # keyframes of this submap without a place; None: it has one
+        self.found = False
+        self.last: Location | None = None  # what was said about the newest keyframe
+
+    def step(self, keyframe: Keyframe, loop: LoopResult | None = None) -> MapUpdate:
+        """Place a keyframe in the map; `loop` is taken for the mapper's signature and not used."""
+        self._version += 1
+        if keyframe.submap_id != self._submap:
+            self._submap, self._failures, self._waiting = keyframe.submap_id, LOST_AFTER, []
+            self._unsure = None
+        self.last = self._locate(keyframe)
+        if self.last.found:
+            self._map_T_odom = se3.orthonormalize(self.last.map_T_cam @ se3.inverse(keyframe.odom_T_cam))
+            self.found, self._failures = True, 0
+        else:
+            self._failures += 1
+        placed = self._placed(keyframe)
+        return MapUpdate(
+            version=self._version,
+            kf_id=keyframe.kf_id,
+            kf_ids=np.array([kf_id for kf_id, _ in placed], np.int64),
+            map_T_kf=np.array([self._map_T_odom @ odom_T_cam for _, odom_T_cam in placed]).reshape(-1, 4, 4),
+            point_ids=np.zeros(0, np.int64),
+            points_map=np.zeros((0, 3)),
+            culled_point_ids=np.zeros(0, np.int64),
+            fused_point_ids=np.zeros((0, 2), np.int64),
+            map_T_odom=self._map_T_odom.copy(),
+        )
+
+    def finish(self, loops: Sequence[LoopResult]) -> MapUpdate | None:
+        """Nothing is left behind."""
+        return None
+
+    def _placed(self, keyframe: Keyframe) -> list[tuple[int, F64]]:
+        """The keyframes (id, odom_T_cam) whose places are known with this one."""
+        newest = keyframe.kf_id, keyframe.odom_T_cam
+        if self._waiting is None:
+            return [newest]
+        waiting = [*self._waiting, newest]
+        found = self.last is not None and self.last.found
+        self._waiting = None if found else waiting
+        return waiting if found else []
+
+    def _locate(self, keyframe: Keyframe) -> Location:
+        if self.found and self._failures < LOST_AFTER:
+            guess = self._map_T_odom @ keyframe.odom_T_cam
+            near = self._relocalizer.locate_near(keyframe, guess)
+            if not near.found or self._within_gate(guess, near):
+                return near
+        place = self._relocalizer.locate(keyframe)
+        before, self._unsure = self._unsure, None
+        if not place.found or place.sure:
+            return place
+        if before is not None and self._within_gate(before @ keyframe.odom_T_cam, place):
+            return place
+        self._unsure = se3.orthonormalize(place.map_T_cam @ se3.inverse(keyframe.odom_T_cam))
+        return nowhere("not_confirmed_yet", place.inliers)
+
+    def _within_gate(self, guess: F64, place: Location) -> bool:
+        return within(se3.inverse(guess) @ place.map_T_cam, self._config.gate_metres, self._config.gate_degrees)

@@ -1,0 +1,207 @@
+"""A saved map: a versioned folder of `map.json`, `rig.yaml` and four npz files; it holds no image.
+
+The same map gives the same bytes. What is wrong with a folder is said in one line.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import logging
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.formats.native import read_native, write_native
+from calib.rig import Rig
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.mapping.map import Map, MapSnapshot
+from stereo_sfm.maps.header import check_counts, checksum, damaged, read_header, write_header
+from stereo_sfm.maps.replace_folder import replaced_folder
+from stereo_sfm.types import I64, Trajectory
+
+log = logging.getLogger("stereo_sfm")
+
+_FILES: dict[str, tuple[str, ...]] = {
+    "keyframes": ("kf_ids", "frame_ids", "stamp_ns", "submap_ids", "map_T_kf", "sessions"),
+    "points": ("pt_ids", "points", "anchors", "seen", "expected"),
+    "observations": ("obs_kf", "obs_pt", "uv_left", "uv_right", "descriptors"),
+    "corners": ("corner_kf", "corner_uv_left", "corner_uv_right", "corner_points", "corner_descriptors"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class SavedMap:
+    """A map at rest, and what is needed to use it again."""
+
+    snapshot: MapSnapshot
+    rig: Rig
+    vocabulary_id: str
+    sessions: I64  # (K,) in which walk a keyframe was made: 0, 1, ...
+
+    def __len__(self) -> int:
+        """Number of keyframes."""
+        return len(self.snapshot.kf_ids)
+
+    @property
+    def walks(self) -> list[int]:
+        """The walks that still have keyframes, ascending."""
+        return np.unique(self.sessions).tolist()
+
+
+def save_map(saved: SavedMap, folder: Path) -> None:
+    """Write a map folder, whole or not at all; what else lies in it stays.
+
+    Raises:
+        StereoSfmError: the map is empty.
+    """
+    if not len(saved) or not len(saved.snapshot.points):
+        raise StereoSfmError("the map is empty: nothing to save")
+    with replaced_folder(folder, frozenset({"map.json", "rig.yaml", *(f"{name}.npz" for name in _FILES)})) as draft:
+        sums: dict[str, str] = {}
+        for name, columns in _FILES.items():
+            path = draft / f"{name}.npz"
+            np.savez_compressed(path, **{c: _column(saved, c) for c in columns})
+            sums[name] = checksum(path.read_bytes())
+        write_native(saved.rig, draft / "rig.yaml")
+        sums["rig"] = checksum((draft / "rig.yaml").read_bytes())
+        write_header(draft, _counts(saved), saved.vocabulary_id, sums)
+
+
+def _counts(saved: SavedMap) -> dict[str, int]:
+    """What map.json says of the size of the map."""
+    s = saved.snapshot
+    sessions = int(saved.sessions.max(initial=-1)) + 1
+    return {"keyframes": len(s.kf_ids), "points": len(s.pt_ids), "observations": len(s.obs_kf), "sessions": sessions}
+
+
+def _column(saved: SavedMap, name: str) -> Any:
+    """Pixels as float32: that is how the map holds them."""
+    value = saved.sessions if name == "sessions" else getattr(saved.snapshot, name)
+    return value.astype(np.float32) if name in ("uv_left", "uv_right") else value
+
+
+def load_map(folder: Path, rig: Rig | None = None) -> SavedMap:
+    """Read a map folder.
+
+    Args:
+        rig: the camera the map shall be used with, checked against the map's own.
+
+    Raises:
+        StereoSfmError: no map, another version, damaged, empty, or made with another camera.
+    """
+    head = read_header(folder, (*_FILES, "rig"))
+    sums = head["sha256"]
+    columns: dict[str, Any] = {}
+    try:
+        for name, wanted in _FILES.items():
+            raw = (folder / f"{name}.npz").read_bytes()
+            if checksum(raw) != sums[name]:
+                raise ValueError(name)
+            with np.load(io.BytesIO(raw), allow_pickle=False) as data:
+                columns.update({c: data[c] for c in wanted})
+        if checksum((folder / "rig.yaml").read_bytes()) != sums["rig"]:
+            raise ValueError("rig")
+        own = read_native(folder / "rig.yaml")
+    except (OSError, KeyError, ValueError, EOFError, TypeError, zipfile.BadZipFile, StereoSfmError):
+        raise damaged(folder, "a file is missing or was changed") from None
+    sessions = columns.pop("sessions")
+    for name in ("uv_left", "uv_right"):
+        columns[name] = columns[name].astype(np.float64)
+    snapshot = MapSnapshot(**columns)
+    if not len(snapshot.kf_ids) or not len(snapshot.points):
+        raise StereoSfmError(f"the map {folder} is empty: it holds no keyframes or no points")
+    if rig is not None and not same_rig(own, rig):
+        raise StereoSfmError(
+            f"the map {folder} was made with another camera ({describe_rig(own)}) than this one ({describe_rig(rig)})"
+        )
+    if rig is not None and abs(own.readout_s - rig.readout_s) > 1e-3:
+        log.warning(
+            "the map %s was made with %s, this camera has %s: is readout_s in rig.yaml right?",
+            folder, own.shutter, rig.shutter,
+        )  # fmt: skip
+    saved = SavedMap(snapshot, own, head["vocabulary"], sessions)
+    check_counts(folder, head, _counts(saved))
+    return saved
+
+
+def same_rig(a: Rig, b: Rig) -> bool:
+    """Whether two rigs see the same way: models, sizes, parameters and the eyes' relative pose.
+
+    Readouts may differ: a map's pixels are those at the stamps.
+    """
+    if a.depth != b.depth or not np.allclose(a.left_T_right, b.left_T_right, atol=1e-6):
+        return False
+    for x, y in ((a.left, b.left), (a.right, b.right)):
+        if (x is None) != (y is None):
+            return False
+        if (
+            x is not None
+            and y is not None
+            and (x.model != y.model or x.size != y.size or not np.allclose(x.params, y.params, rtol=1e-6, atol=1e-9))
+        ):
+            return False
+    return True
+
+
+def describe_rig(rig: Rig) -> str:
+    """A camera in a few words."""
+    return f"{rig.left.model} {rig.left.width}x{rig.left.height} f={rig.left.fx:.1f} b={1000 * rig.baseline:.0f} mm"
+
+
+def restore_map(snapshot: MapSnapshot) -> Map:
+    """A `Map` that can grow further, with the same ids."""
+    map_ = Map()
+    map_.add_points(snapshot.pt_ids, snapshot.points, 0)
+    map_.points.anchor[:] = snapshot.anchors
+    for k, map_T_kf in zip(snapshot.keyframes(), snapshot.map_T_kf, strict=True):
+        row = map_.add_keyframe(k, map_T_kf)
+        map_.observe(row, map_.point_rows(k.point_ids), k.uv_left, k.uv_right, k.descriptors)
+    map_.points.seen[:] = snapshot.seen
+    map_.points.expected[:] = snapshot.expected
+    return map_
+
+
+def walk_trajectory(saved: SavedMap, walk: int) -> Trajectory:
+    """The keyframes of one walk in the order of time.
+
+    Raises:
+        StereoSfmError: two of them have one time.
+    """
+    rows = np.flatnonzero(saved.sessions == walk)
+    rows = rows[saved.snapshot.stamp_ns[rows].argsort(kind="stable")]
+    stamp_ns = saved.snapshot.stamp_ns[rows]
+    if (np.diff(stamp_ns) <= 0).any():
+        raise StereoSfmError(f"walk {walk} of the map holds two keyframes of one time: it is no single walk")
+    return Trajectory(stamp_ns, saved.snapshot.map_T_kf[rows])
+
+
+def joined(maps: list[SavedMap]) -> SavedMap:
+    """All maps in one, side by side: ids, submaps and sessions of the later ones are raised above the earlier's.
+
+    Raises:
+        StereoSfmError: they were made with different cameras.
+    """
+    first = maps[0]
+    parts: dict[str, list[Any]] = {f.name: [] for f in dataclasses.fields(MapSnapshot)}
+    sessions: list[Any] = []
+    raised = {"kf_ids": 0, "pt_ids": 0, "submap_ids": 0, "anchors": 0, "obs_kf": 0, "obs_pt": 0, "corner_kf": 0}
+    next_session = 0
+    for saved in maps:
+        if not same_rig(saved.rig, first.rig):
+            raise StereoSfmError("maps of different cameras cannot be merged")
+        s = saved.snapshot
+        for name, values in parts.items():
+            values.append(getattr(s, name) + raised.get(name, 0))
+        sessions.append(saved.sessions + next_session)
+        next_session += int(saved.sessions.max()) + 1
+        for name in ("kf_ids", "pt_ids", "submap_ids"):
+            raised[name] += int(getattr(s, name).max()) + 1
+        for name in ("anchors", "obs_kf", "corner_kf"):
+            raised[name] += len(s.kf_ids)
+        raised["obs_pt"] += len(s.pt_ids)
+    snapshot = MapSnapshot(**{name: np.concatenate(values) for name, values in parts.items()})
+    return SavedMap(snapshot, first.rig, first.vocabulary_id, np.concatenate(sessions))

@@ -1,0 +1,1 @@
+"""Writing any source to a recording, and describing one."""

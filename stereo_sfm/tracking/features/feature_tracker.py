@@ -1,0 +1,253 @@
+"""Tracking by descriptors, frame by frame, around any motion estimator: the papers' front end (retail paper, IV-A).
+
+Features of the current frame are matched with those of the reference (the last good frame, or the last keyframe), an
+estimator of `odometry/` turns the matches into a motion, and motions accumulate to the odometry pose (equation 19).
+Points keep their ids through matches, so the mapper, the loop closer and the evaluation are those of the default.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from calib.rig import Rig
+from stereo_sfm.config import Config
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.motion_only import pose_covariance
+from stereo_sfm.geometry.robust import Degenerate
+from stereo_sfm.timing import NoSpans
+from stereo_sfm.tracking.features.extraction import circle_mask
+from stereo_sfm.tracking.features.feature_view import FeatureView, ViewMaker
+from stereo_sfm.tracking.features.odometry.base import Motion
+from stereo_sfm.tracking.features.odometry.table import make_estimator
+from stereo_sfm.tracking.features.outgoing import keyframe_of, observations_of
+from stereo_sfm.tracking.features.pairing import Pairing
+from stereo_sfm.tracking.features.point_ids import PointIds
+from stereo_sfm.tracking.features.step_scale import StepScale
+from stereo_sfm.tracking.flow.place_corners import PlaceCorners
+from stereo_sfm.types import (
+    F64,
+    I64,
+    U8,
+    Frame,
+    Keyframe,
+    MapUpdate,
+    StereoImage,
+    TrackState,
+    Trajectory,
+)
+
+LOST_BEFORE_RESTART = 5  # frames without a motion after which tracking starts again from the predicted pose
+
+
+class FeatureTracker:
+    """One per run; `step` every image in order, `apply` every map update when the schedule says so."""
+
+    def __init__(
+        self, config: Config, rig: Rig, spans: NoSpans | None = None, ground_truth: Trajectory | None = None
+    ) -> None:
+        self._config = config
+        self._odometry = config.odometry
+        self._rig = rig
+        self._spans = spans or NoSpans()
+        self._views = ViewMaker(config.features, rig)
+        self._place_corners = PlaceCorners.wanted(config, rig)
+        self._estimator = make_estimator(config.odometry, rig.left)
+        self._scale = StepScale(config.odometry, ground_truth)
+        self._pixel = rig.pixel_angle
+        self._pairing = Pairing(config.features, self._pixel)
+        self._ids = PointIds()
+        self._odom_T_cam = np.eye(4)
+        self._velocity = np.eye(4)  # last_T_now of the last good step
+        self._last: FeatureView | None = None
+        self._odom_T_last = np.eye(4)
+        self._last_stamp = 0
+        self._keyframe: FeatureView | None = None
+        self._kf_id = -1
+        self._odom_T_kf = np.eye(4)
+        self._odom_T_kfs: dict[int, F64] = {}  # keyframes whose answer is still to come
+        self._frames_since_kf = 0
+        self._lost = 0
+        self._submap = 0
+        self._map_version = 0
+
+    def apply(self, update: MapUpdate) -> None:
+        """Take over fused ids and, for motions from a keyframe, the map's positions of its points."""
+        self._map_version = update.version
+        self._ids.fuse(update.fused_point_ids)
+        self._correct(update)
+        if self._last is not None:
+            self._last = replace(self._last, ids=self._ids.current(self._last.ids))
+        if self._keyframe is None:
+            return
+        ids = self._ids.current(self._keyframe.ids)
+        self._keyframe = replace(self._keyframe, ids=ids)
+        own = np.flatnonzero(update.kf_ids == self._kf_id)
+        if self._odometry.reference == "keyframe" and len(own):
+            kf_T_map = se3.inverse(update.map_T_kf[own[0]])
+            self._keyframe = replace(self._keyframe, points=_moved(self._keyframe.points, ids, update, kf_T_map))
+
+    def _correct(self, update: MapUpdate) -> None:
+        """Move on from where the map puts the newest keyframe that both know (the mapper expects its answer used)."""
+        known = [k for k in update.kf_ids.tolist() if k in self._odom_T_kfs]
+        if not known:
+            return
+        newest = max(known)
+        odom_T_map = se3.inverse(update.map_T_odom)
+        row = int(np.flatnonzero(update.kf_ids == newest)[0])
+        moved = odom_T_map @ update.map_T_kf[row] @ se3.inverse(self._odom_T_kfs[newest])
+        self._odom_T_kfs = {k: moved @ pose for k, pose in self._odom_T_kfs.items() if k >= newest}
+        self._odom_T_cam, self._odom_T_last = moved @ self._odom_T_cam, moved @ self._odom_T_last
+        self._odom_T_kf = moved @ self._odom_T_kf
+
+    def step(self, image: StereoImage) -> tuple[Frame, Keyframe | None]:
+        """Track one image."""
+        rng = np.random.default_rng((self._config.seed, image.frame_id))
+        with self._spans.span("features"):
+            view = self._views.make(image, self._mask(image), rng)
+        if self._last is None:
+            return self._begin(image, view)
+        with self._spans.span("motion"):
+            outcome = self._move(image, view, rng)
+        if isinstance(outcome, Degenerate):
+            return self._lose(image, view, outcome.reason)
+        motion, view = outcome
+        state = TrackState.RECOVERED if self._lost else TrackState.OK
+        last_T_now = se3.inverse(self._odom_T_last) @ self._odom_T_cam
+        self._velocity = se3.exp(se3.log(last_T_now) / (1 + self._lost))
+        self._lost = 0
+        return self._finish(image, view, motion, state)
+
+    def _mask(self, image: StereoImage) -> U8 | None:
+        radius = self._config.features.mask_radius_px
+        if radius <= 0 or self._keyframe is None or len(self._keyframe) == 0:
+            return None
+        return circle_mask(image.left.shape, self._keyframe.features.uv, radius)
+
+    def _begin(self, image: StereoImage, view: FeatureView) -> tuple[Frame, Keyframe | None]:
+        if len(view) < self._odometry.min_inliers:
+            frame = self._frame(image, view, None, TrackState.INITIALIZING, "too_few_points", False)
+            return frame, None
+        view = self._ids.give_new(view)
+        keyframe = self._make_keyframe(image, view)
+        self._remember(image, view)
+        return self._frame(image, view, None, TrackState.OK, "", True), keyframe
+
+    def _move(
+        self, image: StereoImage, view: FeatureView, rng: np.random.Generator
+    ) -> tuple[Motion, FeatureView] | Degenerate:
+        """Motion from the reference, with the view's ids filled in, or why there is none."""
+        assert self._last is not None and self._keyframe is not None
+        reference, odom_T_reference = self._last, self._odom_T_last
+        if self._odometry.reference == "keyframe":
+            reference, odom_T_reference = self._keyframe, self._odom_T_kf
+        rows = self._pairing.match(reference, view, rng)
+        pair = self._pairing.pair(reference, view, rows)
+        try:
+            motion = self._estimator.estimate(pair, rng)
+            motion = self._scale.metric(motion, self._last_stamp, image.stamp_ns)
+        except Degenerate as refusal:
+            return refusal
+        reference_T_now = se3.inverse(se3.from_rotation_translation(motion.rotation, motion.translation))
+        self._odom_T_cam = se3.orthonormalize(odom_T_reference @ reference_T_now)
+        agreed = rows[motion.inliers]
+        view = self._ids.inherit(view, reference, agreed)
+        if reference is not self._keyframe:
+            now_T_kf = se3.inverse(self._odom_T_cam) @ self._odom_T_kf
+            view = self._pairing.recover(self._keyframe, view, now_T_kf, self._ids)
+        return motion, self._ids.give_new(view)
+
+    def _lose(self, image: StereoImage, view: FeatureView, reason: str) -> tuple[Frame, Keyframe | None]:
+        """No motion: keep moving as before; after several such frames start again there as a new submap."""
+        self._lost += 1
+        self._odom_T_cam = self._odom_T_cam @ self._velocity
+        if self._lost < LOST_BEFORE_RESTART or len(view) < self._odometry.min_inliers:
+            return self._frame(image, view, None, TrackState.LOST, reason, False), None
+        self._lost = 0
+        self._submap += 1
+        self._velocity = np.eye(4)
+        view = self._ids.give_new(view)
+        keyframe = self._make_keyframe(image, view)
+        self._remember(image, view)
+        return self._frame(image, view, None, TrackState.RESTARTED, reason, True), keyframe
+
+    def _finish(
+        self, image: StereoImage, view: FeatureView, motion: Motion, state: TrackState
+    ) -> tuple[Frame, Keyframe | None]:
+        self._frames_since_kf += 1
+        chosen = np.isfinite(view.points[:, 2]) & (view.ages > 0)
+        covariance = pose_covariance(view.points[chosen], self._pixel)
+        wanted = self._wants_keyframe(view, int(motion.inliers.sum()))
+        frame = self._frame(image, view, motion, state, "", wanted, covariance)
+        keyframe = self._make_keyframe(image, view) if wanted else None
+        self._remember(image, view)
+        return (replace(frame, reference_kf_id=self._kf_id, kf_T_cam=np.eye(4)) if wanted else frame), keyframe
+
+    def _wants_keyframe(self, view: FeatureView, inliers: int) -> bool:
+        """Fewer than 30 % of the keyframe's points tracked, or 30 frames since (retail paper, IV-A4)."""
+        assert self._keyframe is not None
+        o = self._odometry
+        if self._frames_since_kf <= o.keyframe_min_frames:
+            return False
+        if o.keyframe_frames and self._frames_since_kf >= o.keyframe_frames:
+            return True
+        if o.keyframe_min_inliers and inliers < o.keyframe_min_inliers:
+            return True
+        tracked = np.isin(self._ids.current(self._keyframe.ids), view.ids).mean()
+        return bool(tracked < o.keyframe_ratio)
+
+    def _make_keyframe(self, image: StereoImage, view: FeatureView) -> Keyframe:
+        self._kf_id += 1
+        self._keyframe = view
+        self._odom_T_kf = self._odom_T_cam
+        self._odom_T_kfs[self._kf_id] = self._odom_T_cam
+        self._frames_since_kf = 0
+        keyframe = keyframe_of(view, image.stamp_ns, self._kf_id, self._odom_T_cam, self._submap)
+        if self._place_corners is None:
+            return keyframe
+        return replace(keyframe, corners=self._place_corners.find(image))
+
+    def _remember(self, image: StereoImage, view: FeatureView) -> None:
+        self._last, self._odom_T_last, self._last_stamp = view, self._odom_T_cam, image.stamp_ns
+
+    def _frame(
+        self,
+        image: StereoImage,
+        view: FeatureView,
+        motion: Motion | None,
+        state: TrackState,
+        reason: str,
+        is_keyframe: bool,
+        covariance: F64 | None = None,
+    ) -> Frame:
+        stats = {"features": float(len(view)), "inliers": 0.0 if motion is None else float(motion.inliers.sum())}
+        if motion is not None:
+            stats |= {"matches": float(len(motion.inliers)), **motion.stats}
+        return Frame(
+            frame_id=image.frame_id,
+            stamp_ns=image.stamp_ns,
+            odom_T_cam=self._odom_T_cam.copy(),
+            covariance=np.eye(6) if covariance is None else covariance,
+            state=state,
+            reason=reason,
+            observations=observations_of(view),
+            reference_kf_id=self._kf_id,
+            kf_T_cam=se3.inverse(self._odom_T_kf) @ self._odom_T_cam,
+            map_version=self._map_version,
+            is_keyframe=is_keyframe,
+            stats=stats,
+        )
+
+
+def _moved(points: F64, ids: I64, update: MapUpdate, kf_T_map: F64) -> F64:
+    """(N, 3) points of a keyframe with the map's positions where the update has them."""
+    if len(update.point_ids) == 0:
+        return points
+    order = np.argsort(update.point_ids, kind="stable")
+    slot = np.searchsorted(update.point_ids[order], ids).clip(0, len(order) - 1)
+    row = order[slot]
+    hit = update.point_ids[row] == ids
+    out = points.copy()
+    out[hit] = se3.transform(kf_T_map, update.points_map[row[hit]])
+    return out

@@ -1,0 +1,1 @@
+"""The default tracker: points followed by optical flow, matched in the second camera, solved for the pose."""

@@ -1,0 +1,102 @@
+"""Rotation between two images by aligning their smallest pyramid levels, for motion faster than flow can follow.
+
+A small blurred image, as in Klein & Murray, Improving the Agility of Keyframe-Based SLAM (ECCV 2008), section 3.4, here
+for any camera model: every pixel is a bearing, turned and projected; brightness differences give the rotation.
+"""
+
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportMissingTypeArgument=false
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.cameras import Camera
+from stereo_sfm.geometry.kernels import njit, project_one
+from stereo_sfm.tracking.flow.klt import Pyramid
+from stereo_sfm.types import F64
+
+ITERATIONS = 12
+STEP = 0.1  # pixels of the level below which a step ends its iterations
+
+
+@njit
+def _normal_equations(prev, cur, bearings, stride, model, params, scale, rotation, offset):
+    """(3, 3) and (3,) of the brightness differences by a left rotation increment, mean difference, count.
+
+    `bearings`: (h, w, 3) of every `stride`-th pixel of a level of the previous image.
+    """
+    h, w = bearings.shape[:2]
+    hc, wc = cur.shape
+    normal = np.zeros((3, 3))
+    rhs = np.zeros(3)
+    total, count = 0.0, 0
+    jac = np.zeros(3)
+    for v in range(h):
+        for u in range(w):
+            if math.isnan(bearings[v, u, 0]):
+                continue
+            b = bearings[v, u]
+            x = rotation[0, 0] * b[0] + rotation[0, 1] * b[1] + rotation[0, 2] * b[2]
+            y = rotation[1, 0] * b[0] + rotation[1, 1] * b[1] + rotation[1, 2] * b[2]
+            z = rotation[2, 0] * b[0] + rotation[2, 1] * b[1] + rotation[2, 2] * b[2]
+            p = project_one(model, params, x, y, z)
+            if math.isnan(p[0]):
+                continue
+            cu, cv = p[0] / scale, p[1] / scale
+            if cu < 1 or cv < 1 or cu >= wc - 2 or cv >= hc - 2:
+                continue
+            iu, iv = int(cu), int(cv)
+            fu, fv = cu - iu, cv - iv
+            i00, i01 = float(cur[iv, iu]), float(cur[iv, iu + 1])
+            i10, i11 = float(cur[iv + 1, iu]), float(cur[iv + 1, iu + 1])
+            value = (1 - fv) * ((1 - fu) * i00 + fu * i01) + fv * ((1 - fu) * i10 + fu * i11)
+            gu = ((1 - fv) * (i01 - i00) + fv * (i11 - i10)) / scale
+            gv = ((1 - fu) * (i10 - i00) + fu * (i11 - i01)) / scale
+            difference = value - prev[v * stride, u * stride]
+            e = difference - offset
+            total += difference
+            count += 1
+            d0 = gu * p[2] + gv * p[5]
+            d1 = gu * p[3] + gv * p[6]
+            d2 = gu * p[4] + gv * p[7]
+            jac[0] = y * d2 - z * d1
+            jac[1] = z * d0 - x * d2
+            jac[2] = x * d1 - y * d0
+            weight = 1.0 / max(1.0, abs(e) / 10.0)
+            for i in range(3):
+                rhs[i] += weight * jac[i] * e
+                for j in range(3):
+                    normal[i, j] += weight * jac[i] * jac[j]
+    return normal, rhs, total / max(count, 1), count
+
+
+class CoarseRotation:
+    """Rotation of the camera between two pyramids."""
+
+    def __init__(self, camera: Camera, levels: int) -> None:
+        self._camera = camera
+        spacing = 2 ** (levels - 1)  # of the pixels of the previous image that are used, on both levels
+        u, v = np.arange(0, camera.width, spacing), np.arange(0, camera.height, spacing)
+        self._bearings = camera.unproject(np.stack(np.meshgrid(u, v), -1).astype(np.float64))
+        self._strides = {levels - 1: 1, levels - 2: 2}
+
+    def align(self, prev: Pyramid, cur: Pyramid, cur_R_prev: F64) -> F64:
+        """Improve the rotation (3, 3) that takes bearings of `prev` into `cur`."""
+        rotation = np.ascontiguousarray(cur_R_prev)
+        for level, stride in self._strides.items():
+            offset = 0.0
+            for _ in range(ITERATIONS):
+                normal, rhs, offset, count = _normal_equations(
+                    prev[level], cur[level], self._bearings, stride, self._camera.model_id, self._camera.params,
+                    float(2**level), rotation, offset,
+                )  # fmt: skip
+                if count < 100 or np.linalg.matrix_rank(normal) < 3:
+                    return np.ascontiguousarray(cur_R_prev)
+                step = -np.linalg.solve(normal, rhs)
+                rotation = np.ascontiguousarray(se3.so3_exp(step) @ rotation)
+                if np.linalg.norm(step) < STEP * 2**level / self._camera.fx:
+                    break
+        return rotation

@@ -1,0 +1,60 @@
+"""What a keyframe is recognised by: ORB corners of the whole image, tracked or not, with their stereo depth.
+
+The points that flow follows were corners where they were first seen. Where they are now, a detector finds others, and
+when the place is seen again a third choice: one in eight comes back. So place recognition has corners of its own. One
+spot may be a corner on several levels: that is what makes it known again from nearer or farther away.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from calib.rig import Rig
+from stereo_sfm.config import Config
+from stereo_sfm.tracking.flow.corners import corner_mask
+from stereo_sfm.tracking.flow.klt import Pyramid, build_pyramid
+from stereo_sfm.tracking.flow.stereo import StereoMatcher
+from stereo_sfm.types import F32, Corners, StereoImage
+
+LEVELS, SCALE = 4, 1.2  # of ORB in the half image: more levels cost more than they find again
+FAST_THRESHOLD = 10  # grey levels
+BORDER = 15  # px of each level, where no corners are looked for
+
+
+class PlaceCorners:
+    """Oriented FAST with rotated BRIEF (Rublee et al., ORB, ICCV 2011) on level 1 of the pyramid."""
+
+    def __init__(self, config: Config, rig: Rig) -> None:
+        self._levels = config.tracker.pyramid_levels
+        self._stereo = StereoMatcher(config.tracker, rig)
+        mask = corner_mask(rig.left, config.tracker.max_angle_deg)
+        everywhere = mask[BORDER:-BORDER, BORDER:-BORDER].all()
+        self._mask = None if everywhere else mask.astype(np.uint8)  # a mask that masks nothing takes time
+        self._orb = cv2.ORB.create(
+            config.loop.corners, SCALE, LEVELS, edgeThreshold=BORDER, fastThreshold=FAST_THRESHOLD
+        )
+
+    @staticmethod
+    def wanted(config: Config, rig: Rig) -> PlaceCorners | None:
+        """None for a run that recognises no places, or a camera without depth."""
+        recognised = config.mapper.enabled or config.loop.enabled
+        return PlaceCorners(config, rig) if rig.stereo and recognised else None
+
+    def find(self, image: StereoImage) -> Corners:
+        """About as many as the configuration says, the strongest of each level, of those that both eyes see."""
+        return self.find_in(build_pyramid(image.left, self._levels), self._stereo.prepare(image))
+
+    def find_in(self, left: Pyramid, right: Pyramid | F32) -> Corners:
+        """As `find`, of a left image's pyramid and what `StereoMatcher.prepare` makes of the second eye."""
+        keypoints, descriptors = self._orb.detectAndCompute(left[1], self._mask)
+        if not len(keypoints):
+            return Corners.none()
+        uv = 2.0 * np.asarray(cv2.KeyPoint.convert(keypoints), np.float64)
+        match = self._stereo.match_coarse(left, right, uv)
+        return Corners(
+            uv[match.good].astype(np.float32),
+            match.uv_right[match.good].astype(np.float32),
+            (match.bearing[match.good] / match.rho[match.good, None]).astype(np.float32),
+            np.asarray(descriptors, np.uint8)[match.good],
+        )

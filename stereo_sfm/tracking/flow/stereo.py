@@ -1,0 +1,142 @@
+"""The second observation of a point: the right image, or depth turned into a virtual right image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.rig import Rig
+from stereo_sfm.config import TrackerConfig
+from stereo_sfm.geometry import se3
+from stereo_sfm.tracking.flow import klt
+from stereo_sfm.tracking.flow.stereo_cameras import Eyes
+from stereo_sfm.tracking.flow.stereo_match import patch_sums, search_epipolar, triangulate
+from stereo_sfm.types import F32, F64, Bool, StereoImage
+
+SEARCH_LEVEL = 1
+DEPTH_STEP = 0.04  # relative depth difference around a pixel that counts as an edge
+CLOSE = 4.0  # sigmas
+
+
+@dataclass
+class StereoMatch:
+    """New points seen by both eyes; arrays of equal length, rows are usable where `good`."""
+
+    uv_left: F64  # (N, 2) px
+    uv_right: F64  # (N, 2) px
+    bearing: F64  # (N, 3) unit, left camera
+    rho: F64  # (N,) 1/m along the bearing
+    variance: F64  # (N,)
+    good: Bool  # (N,)
+
+
+class StereoMatcher:
+    """Finds points of the left image in the right one, whatever the camera model."""
+
+    def __init__(self, config: TrackerConfig, rig: Rig) -> None:
+        self._config = config
+        self._rig = rig
+        self._eyes = Eyes.of(rig)
+        self._min_depth = config.min_depth_baselines * rig.baseline
+        reach = rig.left.fx / config.min_depth_baselines
+        self._candidates = int(np.clip(reach / 2**SEARCH_LEVEL * 1.2, 16, 160))
+        narrow = np.sqrt(np.maximum(klt.WEIGHTS, 0)) ** 5  # the same Gaussian, about 0.63 times as wide
+        self._narrow = (narrow / narrow.sum()).astype(np.float32)
+
+    def prepare(self, image: StereoImage) -> klt.Pyramid | F32:
+        """What `follow` and `match` need of the second eye: a pyramid, or the depth image."""
+        if self._rig.depth:
+            assert image.depth is not None
+            return image.depth
+        assert image.right is not None
+        return klt.build_pyramid(image.right, 2)
+
+    def follow(self, left: klt.Pyramid, right: klt.Pyramid | F32, uv: F64, points: F64, predicted: F64) -> F64:
+        """Right pixels (N, 2) of tracked points (N, 3) whose left pixels are `uv`, NaN where not found."""
+        if not isinstance(right, tuple):
+            return self._from_depth(right, uv)[0]
+        points_cam = se3.transform(se3.inverse(predicted), points)
+        guess_left = self._rig.left.project(points_cam)
+        assert self._rig.right is not None
+        guess = self._rig.right.project(se3.transform(self._eyes.right_T_left, points_cam)) + uv - guess_left
+        return self._refine(left, right, uv, guess, 0)
+
+    def match(self, left: klt.Pyramid, right: klt.Pyramid | F32, uv: F64) -> StereoMatch:
+        """Stereo matches of new corners (N, 2) px."""
+        config = self._config
+        uv = np.ascontiguousarray(uv)
+        if isinstance(right, tuple):
+            uv_right = self._refine(left, right, uv, self._search(left, right, uv), 1)
+            back = uv.copy()
+            status, _ = klt.track_translation(
+                right, left, np.nan_to_num(uv_right, nan=-1e3), back, 0, 0, 10, config.min_contrast, config.min_ncc,
+                klt.WEIGHTS,
+            )  # fmt: skip
+            good = (status == klt.TRACKED) & (np.linalg.norm(back - uv, axis=1) < 0.5)
+            good &= self._one_surface(left, right, uv, uv_right)
+        else:
+            uv_right, good = self._from_depth(right, uv)
+        return self._triangulated(uv, uv_right, good, config.max_epipolar_px, -CLOSE)
+
+    def match_coarse(self, left: klt.Pyramid, right: klt.Pyramid | F32, uv: F64) -> StereoMatch:
+        """As `match`, in half the time: good to half a pixel, and with no look at depth edges."""
+        uv = np.ascontiguousarray(uv)
+        if not isinstance(right, tuple):
+            return self.match(left, right, uv)
+        uv_right = self._search(left, right, uv)
+        status, _ = klt.track_translation(
+            left, right, uv, uv_right, SEARCH_LEVEL, SEARCH_LEVEL, 10, self._config.min_contrast, self._config.min_ncc,
+            klt.WEIGHTS,
+        )  # fmt: skip
+        return self._triangulated(uv, uv_right, status == klt.TRACKED, 2 * self._config.max_epipolar_px, 0.0)
+
+    def _search(self, left: klt.Pyramid, right: klt.Pyramid, uv: F64) -> F64:
+        """Right pixels (N, 2) to the pixel of the search level, NaN where nothing is alike."""
+        return search_epipolar(
+            left[SEARCH_LEVEL], right[SEARCH_LEVEL], patch_sums(right[SEARCH_LEVEL]), uv, 2.0**SEARCH_LEVEL,
+            *self._eyes.cams, self._eyes.right_T_left, self._min_depth, self._candidates, 25.0, 1.2,
+        )  # fmt: skip
+
+    def _triangulated(self, uv: F64, uv_right: F64, good: Bool, max_epipolar_px: float, least: float) -> StereoMatch:
+        """`least`: inverse distance in its sigmas; a far point may come out behind the camera by noise."""
+        bearing, rho, variance, epipolar = triangulate(
+            uv, uv_right, *self._eyes.cams, self._eyes.left_T_right, self._config.sigma_px
+        )
+        with np.errstate(invalid="ignore"):
+            good &= (epipolar < max_epipolar_px) & (rho > least * np.sqrt(variance))
+            good &= rho < 1.0 / (0.5 * self._min_depth)
+        return StereoMatch(uv, uv_right, bearing, rho, variance, good)
+
+    def _refine(self, left: klt.Pyramid, right: klt.Pyramid, uv: F64, guess: F64, level: int) -> F64:
+        out = np.ascontiguousarray(guess)
+        status, _ = klt.track_translation(
+            left, right, np.ascontiguousarray(uv), out, level, 0, 10, self._config.min_contrast, self._config.min_ncc,
+            klt.WEIGHTS,
+        )  # fmt: skip
+        out[status != klt.TRACKED] = np.nan
+        return out
+
+    def _one_surface(self, left: klt.Pyramid, right: klt.Pyramid, uv: F64, uv_right: F64) -> Bool:
+        """Whether a narrower window finds the same disparity: it does not where a depth edge crosses the window."""
+        narrow = np.nan_to_num(uv_right, nan=-1e3)
+        status, _ = klt.track_translation(left, right, uv, narrow, 0, 0, 10, 0.5, 0.3, self._narrow)
+        with np.errstate(invalid="ignore"):
+            near = np.linalg.norm(narrow - uv_right, axis=1) < self._config.max_window_disparity_px
+        return (status == klt.TRACKED) & near
+
+    def _from_depth(self, depth: F32, uv: F64) -> tuple[F64, Bool]:
+        """Virtual right pixels from a depth image, NaN where it has a hole or an edge."""
+        inside = self._rig.left.inside(uv, 2.0)
+        u = np.where(inside, np.rint(uv[:, 0]), 2).astype(np.int64)
+        v = np.where(inside, np.rint(uv[:, 1]), 2).astype(np.int64)
+        around = np.stack([depth[v + dy, u + dx] for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
+        with np.errstate(invalid="ignore"):
+            smooth = np.ptp(around, axis=0) < DEPTH_STEP * around[4]
+        good = inside & smooth & (around[4] > 0)
+        bearing = self._rig.left.unproject(uv[good])
+        points = bearing / bearing[:, 2:] * around.mean(0)[good, None]
+        assert self._rig.right is not None
+        uv_right = np.full(uv.shape, np.nan)
+        uv_right[good] = self._rig.right.project(se3.transform(self._eyes.right_T_left, points))
+        return uv_right, np.isfinite(uv_right[:, 0])

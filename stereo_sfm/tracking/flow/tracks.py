@@ -1,0 +1,65 @@
+"""The points a tracker follows: one row each, with the patch of their first appearance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+
+from stereo_sfm.tracking.flow import klt
+from stereo_sfm.types import F32, F64, I32, I64, Bool
+
+
+@dataclass
+class Tracks:
+    """Columns of N points. A point is P = origin + direction / rho in the odometry frame."""
+
+    point_ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
+    uv: F64 = field(default_factory=lambda: np.zeros((0, 2)))  # (N, 2) px in the last tracked frame
+    uv_right: F64 = field(default_factory=lambda: np.zeros((0, 2)))  # (N, 2) px, NaN where unseen
+    origin: F64 = field(default_factory=lambda: np.zeros((0, 3)))
+    direction: F64 = field(default_factory=lambda: np.zeros((0, 3)))
+    rho: F64 = field(default_factory=lambda: np.zeros(0))  # 1/m
+    variance: F64 = field(default_factory=lambda: np.zeros(0))  # of rho
+    age: I32 = field(default_factory=lambda: np.zeros(0, np.int32))  # frames tracked
+    misses: I32 = field(default_factory=lambda: np.zeros(0, np.int32))  # successive frames as an outlier
+    warp: F64 = field(default_factory=lambda: np.zeros((0, 2, 2)))  # deformation since the first appearance
+    slot: I64 = field(default_factory=lambda: np.zeros(0, np.int64))  # row in the `Patches`
+    mapped: Bool = field(default_factory=lambda: np.zeros(0, bool))  # position given by the map
+
+    def __len__(self) -> int:
+        return len(self.point_ids)
+
+    def points(self) -> F64:
+        """(N, 3) metres, odometry frame."""
+        return self.origin + self.direction / self.rho[:, None]
+
+    def keep(self, mask: Bool) -> Tracks:
+        """The rows where `mask` is True."""
+        return Tracks(**{f.name: getattr(self, f.name)[mask] for f in fields(self)})
+
+    def append(self, other: Tracks) -> Tracks:
+        """These rows, then the other's."""
+        return Tracks(**{f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)})
+
+
+class Patches:
+    """First appearances of points, in slots that are used again."""
+
+    def __init__(self, capacity: int) -> None:
+        self.patch: F32 = np.zeros((capacity, klt.FLAT_SIZE), np.float32)
+        self.gradients: F32 = np.zeros((capacity, 2, klt.FLAT_SIZE), np.float32)
+        self.inverse_normal: F64 = np.zeros((capacity, 6, 6))
+        self.contrast: F64 = np.zeros(capacity)
+        self._free = np.ones(capacity, bool)
+
+    def take(self, count: int) -> I64:
+        """Free slots, lowest first."""
+        slots = np.flatnonzero(self._free)[:count]
+        self._free[slots] = False
+        return slots
+
+    def keep_only(self, slots: I64) -> None:
+        """Everything else is free again."""
+        self._free[:] = True
+        self._free[slots] = False

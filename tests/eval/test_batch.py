@@ -1,0 +1,88 @@
+"""Many recordings: one table, failures stay alone, finished work is not done again, a dying node costs nothing."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+
+from stereo_sfm.cli import main
+from stereo_sfm.config import load
+from stereo_sfm.eval import batch
+
+SMALL = "sim:aisle?size=212x200&frames=12&rate=15&seed={}"
+
+
+def rows(folder: Path) -> list[dict[str, str]]:
+    with (folder / "results.csv").open() as stream:
+        return list(csv.DictReader(stream))
+
+
+def test_names_are_unique() -> None:
+    assert batch.names(["a/x.mcap", "b/x.mcap", "y.mcap"]) == ["x_1", "x_2", "y"]
+
+
+def test_a_result_of_another_configuration_is_not_taken(tmp_path: Path) -> None:
+    task = batch.BatchTask(SMALL.format(1), str(tmp_path / "a"), load(), False)
+    assert batch.finished(task) is None
+    result = batch.run_one(task)
+    assert result["ok"], result
+    assert batch.finished(task) is not None
+    other = batch.BatchTask(task.spec, task.folder, load(None, ["seed=5"]), False)
+    assert batch.finished(other) is None
+
+
+def test_without_an_address_no_cluster_is_looked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ray remembers the last cluster of this machine, and waits for it for minutes when it is gone."""
+    ray = pytest.importorskip("ray")
+    asked: list[object] = []
+
+    def init(**options: object) -> None:
+        asked.append(options["address"])
+        raise ConnectionError
+
+    monkeypatch.setattr(ray, "init", init)
+    task = batch.BatchTask(SMALL.format(1), str(tmp_path / "a"), load(), False)
+    for address in (None, "10.0.0.1:6379"):
+        with pytest.raises(ConnectionError):
+            list(batch.run_batch([task], address))
+    assert asked == ["local", "10.0.0.1:6379"]
+
+
+@pytest.mark.slow
+def test_a_failed_recording_stops_no_other_and_the_rest_is_resumed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes(b"nothing")
+    args = ["batch", SMALL.format(1), str(broken), SMALL.format(2), "-o", str(tmp_path / "out"), "--no-merge"]
+    assert main(args) == 3
+    states = ["failed" in row["result"] for row in rows(tmp_path / "out")]
+    assert states == [False, True, False]
+    capsys.readouterr()
+    assert main(args) == 3
+    assert capsys.readouterr().err.count("from before") == 2
+
+
+@pytest.mark.slow
+def test_two_nodes_one_killed_on_the_way(tmp_path: Path) -> None:
+    ray = pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    node = cluster.add_node(num_cpus=1)
+    ray.init(address=cluster.address, log_to_driver=False)
+    try:
+        spec = "sim:aisle?size=212x200&frames=40&rate=15&seed={}"
+        tasks = [batch.BatchTask(spec.format(k), str(tmp_path / str(k)), load(), False) for k in range(4)]
+        results = {}
+        for task, result in batch.run_batch(tasks, cluster.address):
+            results[task.spec] = result
+            if len(results) == 1:
+                cluster.remove_node(node, allow_graceful=False)
+        assert len(results) == 4
+        assert all(r["ok"] for r in results.values())
+    finally:
+        ray.shutdown()
+        cluster.shutdown()

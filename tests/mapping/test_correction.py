@@ -1,0 +1,188 @@
+"""A loop applied to a real map of a synthetic walk: poses, points, fusion, and a false loop that changes nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from stereo_sfm.config import LoopConfig
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
+from stereo_sfm.mapping.correction import apply_loop
+from stereo_sfm.mapping.map import Map
+from stereo_sfm.types import F64, Keyframe, LoopResult
+from tests.loop.store_walk import StoreWalk, make_walk
+
+
+@pytest.fixture(scope="module")
+def walk() -> StoreWalk:
+    return make_walk([0, 0], seed=11)
+
+
+def raw_map(walk: StoreWalk) -> Map:
+    """Keyframes where odometry says, points where their first keyframe saw them."""
+    map_ = Map()
+    for k in walk.keyframes:
+        row = map_.add_keyframe(k, k.odom_T_cam)
+        new = map_.point_rows(k.point_ids) < 0
+        map_.add_points(k.point_ids[new], se3.transform(k.odom_T_cam, k.points_cam[new]), row)
+        rows = map_.point_rows(k.point_ids)
+        map_.observe(row, rows, k.uv_left, k.uv_right, k.descriptors)
+    return map_
+
+
+def true_loop(walk: StoreWalk, a: int, b: int) -> LoopResult:
+    """The loop between two keyframes as truth has it, with the points that both saw."""
+    seen = {walk.physical[i]: i for i in walk.keyframes[a].point_ids.tolist()}
+    pairs = [(seen[walk.physical[i]], i) for i in walk.keyframes[b].point_ids.tolist() if walk.physical[i] in seen]
+    return LoopResult(
+        kf_id=b,
+        candidate_kf_id=a,
+        candidate_T_kf=se3.inverse(walk.world_T_kf[a]) @ walk.world_T_kf[b],
+        information=np.eye(6) * 1e6,
+        matches=np.array(pairs, np.int64).reshape(-1, 2),
+        inliers=len(pairs),
+        score=0.3,
+        reason="",
+    )
+
+
+def ends(walk: StoreWalk) -> tuple[int, int]:
+    """The last keyframe, and the nearest to it of the first visit."""
+    b = len(walk.keyframes) - 1
+    distance = np.linalg.norm(walk.world_T_kf[:30, :3, 3] - walk.world_T_kf[b, :3, 3], axis=1)
+    return int(distance.argmin()), b
+
+
+def trajectory_error(map_: Map, truth: F64) -> float:
+    moved = se3.transform(se3.inverse(truth[0]) @ truth, np.zeros((len(truth), 1, 3)))[:, 0]
+    here = se3.inverse(map_.keyframes.map_T_kf[0]) @ map_.keyframes.map_T_kf
+    return float(np.sqrt(((here[:, :3, 3] - moved) ** 2).sum(1).mean()))
+
+
+def test_loop_takes_the_drift_away_and_carries_the_points(walk: StoreWalk) -> None:
+    map_ = raw_map(walk)
+    a, b = ends(walk)
+    before = trajectory_error(map_, walk.world_T_kf)
+    alive = len(map_.living_points())
+    local = se3.transform(se3.inverse(map_.keyframes.map_T_kf[b]), map_.points.xyz[map_.points.anchor == b])
+    loop = true_loop(walk, a, b)
+    done = apply_loop(map_, loop, [], LoopConfig())
+    assert done.applied
+    assert trajectory_error(map_, walk.world_T_kf) < 0.7 * before
+    relative = se3.inverse(map_.keyframes.map_T_kf[a]) @ map_.keyframes.map_T_kf[b]
+    assert np.linalg.norm((se3.inverse(loop.candidate_T_kf) @ relative)[:3, 3]) < 0.02
+    assert np.allclose(
+        se3.transform(se3.inverse(map_.keyframes.map_T_kf[b]), map_.points.xyz[map_.points.anchor == b]), local
+    )
+    assert len(done.fused) == len(loop.matches) > 20
+    assert len(map_.living_points()) == alive - len(done.fused)
+    assert map_.covisibility.neighbours(b)[0].tolist().count(a) == 1  # the two sides now share points
+
+
+def turning_walk(degrees_per_100m: float, side_m: float = 30.0, step_m: float = 0.5) -> tuple[Map, F64]:
+    """A map of keyframes around a square back to its beginning, whose heading drifts, and the truth of its poses."""
+    truth, drifted = [np.eye(4)], [np.eye(4)]
+    per_side = round(side_m / step_m)
+    for k in range(4 * per_side):
+        turn = np.pi / 2 if (k + 1) % per_side == 0 else 0.0
+        ahead = se3.exp(np.array([0, 0, step_m, 0, 0, 0]))
+        truth.append(truth[-1] @ ahead @ se3.exp(np.array([0, 0, 0, 0, turn, 0])))
+        turn += np.radians(degrees_per_100m) / 100 * step_m
+        drifted.append(drifted[-1] @ ahead @ se3.exp(np.array([0, 0, 0, 0, turn, 0])))
+    map_ = Map()
+    for k, pose in enumerate(drifted):
+        ids = np.arange(20 * k, 20 * k + 100)  # 80 points shared with the keyframe before, 40 with the third
+        seen = Keyframe(
+            k, k, k, pose, ids, np.ones((100, 2)), np.ones((100, 2)), np.ones((100, 3)),
+            np.ones((100, 32), np.uint8),
+        )  # fmt: skip
+        row = map_.add_keyframe(seen, pose)
+        new = map_.point_rows(ids) < 0
+        map_.add_points(ids[new], se3.transform(pose, np.ones((new.sum(), 3))), row)
+        map_.observe(row, map_.point_rows(ids), seen.uv_left, seen.uv_right, seen.descriptors)
+    return map_, np.array(truth)
+
+
+@pytest.mark.parametrize("degrees_per_100m", [0.5, 2.0, 5.0])
+def test_a_walk_whose_heading_drifts_evenly_closes(degrees_per_100m: float) -> None:
+    """Such errors add up: after 120 m the ends are 0.2 to 2.2 m apart, and the true loop is believed."""
+    map_, truth = turning_walk(degrees_per_100m)
+    last = len(truth) - 1
+    before = trajectory_error(map_, truth)
+    loop = LoopResult(
+        last, 0, se3.inverse(truth[0]) @ truth[last], np.eye(6) * 1e6, np.zeros((0, 2), np.int64), 50, 0.3, ""
+    )
+    assert apply_loop(map_, loop, [], LoopConfig()).applied
+    assert trajectory_error(map_, truth) < 0.4 * before
+
+
+def test_a_loop_that_no_drift_explains_is_refused() -> None:
+    """The next aisle looks the same: 1.5 m aside after 40 m."""
+    map_, truth = turning_walk(0.5, side_m=10.0)
+    last = len(truth) - 1
+    poses = map_.keyframes.map_T_kf.copy()
+    aside = se3.inverse(truth[0]) @ truth[last] @ se3.exp(np.array([1.5, 0, 0, 0, 0, 0]))
+    loop = LoopResult(last, 0, aside, np.eye(6) * 1e6, np.zeros((0, 2), np.int64), 50, 0.3, "")
+    assert not apply_loop(map_, loop, [], LoopConfig()).applied
+    assert np.array_equal(map_.keyframes.map_T_kf, poses)
+
+
+def test_false_loop_changes_nothing(walk: StoreWalk) -> None:
+    map_ = raw_map(walk)
+    a, b = ends(walk)
+    apply_loop(map_, true_loop(walk, a, b), [], LoopConfig())
+    poses, points = map_.keyframes.map_T_kf.copy(), map_.points.xyz.copy()
+    false = dataclasses.replace(true_loop(walk, a, b - 5), candidate_T_kf=se3.exp(np.array([1.5, 0, 1.0, 0, 0.3, 0])))
+    done = apply_loop(map_, false, [true_loop(walk, a, b)], LoopConfig())
+    assert not done.applied
+    assert np.array_equal(map_.keyframes.map_T_kf, poses)
+    assert np.array_equal(map_.points.xyz, points, equal_nan=True)
+
+
+def test_averaging_meets_the_loop_exactly(walk: StoreWalk) -> None:
+    map_ = raw_map(walk)
+    a, b = ends(walk)
+    loop = true_loop(walk, a, b)
+    assert apply_loop(map_, loop, [], dataclasses.replace(LoopConfig(), correction="averaging")).applied
+    relative = se3.inverse(map_.keyframes.map_T_kf[a]) @ map_.keyframes.map_T_kf[b]
+    assert np.allclose(relative, loop.candidate_T_kf, atol=1e-9)
+
+
+def test_unknown_correction_is_refused(walk: StoreWalk) -> None:
+    with pytest.raises(StereoSfmError, match=r"loop\.correction"):
+        apply_loop(
+            raw_map(walk), true_loop(walk, *ends(walk)), [], dataclasses.replace(LoopConfig(), correction="magic")
+        )
+
+
+@pytest.mark.parametrize("correction", ["pose_graph", "averaging"])
+def test_a_submap_is_brought_to_the_rest_by_the_loop(walk: StoreWalk, correction: str) -> None:
+    """Tracking restarted somewhere: the second piece begins at an odometry pose that means nothing."""
+    a, b = ends(walk)
+    half = len(walk.keyframes) // 2
+    astray = se3.exp(np.array([5.0, 1, -8, 0.2, 1.0, 0]))
+    pieces = [
+        k if i < half else dataclasses.replace(k, submap_id=1, odom_T_cam=astray @ k.odom_T_cam)
+        for i, k in enumerate(walk.keyframes)
+    ]
+    lost = dataclasses.replace(walk, keyframes=pieces)
+    for k in range(half, len(pieces)):  # no track survives the break
+        ids = pieces[k].point_ids + 10**6
+        pieces[k] = dataclasses.replace(pieces[k], point_ids=ids)
+    lost.physical.update({i + 10**6: p for i, p in walk.physical.items()})
+    map_ = raw_map(lost)
+    config = dataclasses.replace(LoopConfig(), correction=correction)
+    assert apply_loop(map_, true_loop(lost, a, b), [], config).applied
+    assert trajectory_error(map_, walk.world_T_kf) < 0.3
+
+
+def test_same_map_same_bits(walk: StoreWalk) -> None:
+    def bits() -> bytes:
+        map_ = raw_map(walk)
+        apply_loop(map_, true_loop(walk, *ends(walk)), [], LoopConfig())
+        return map_.keyframes.map_T_kf.tobytes() + map_.points.xyz.tobytes()
+
+    assert bits() == bits()

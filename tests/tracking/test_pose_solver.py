@@ -1,0 +1,116 @@
+"""Motion-only optimisation and stereo triangulation on exact scenes, in every camera model."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib.rig import Rig
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.cameras import Camera, Epipolar, KannalaBrandt, Pinhole, RadTan
+from stereo_sfm.tracking.flow import pose_solver
+from stereo_sfm.tracking.flow.stereo_cameras import Eyes
+from stereo_sfm.tracking.flow.stereo_match import triangulate
+from stereo_sfm.types import F64
+
+CAMERAS = [
+    Pinhole(640, 480, 400, 401, 320, 240),
+    RadTan(752, 480, 458.6, 457.3, 367.2, 248.4, (-0.2834, 0.0739, 0.00019, 1.76e-5)),
+    KannalaBrandt(848, 800, 286.2, 287.5, 419.5, 387.0, (-0.004348, 0.037126, -0.035539, 0.005773)),
+    Epipolar(900, 800, 290, 290, 450, 400),
+]
+SCALES = np.array([20.0, 10.0, 5.0, 3.0, 2.0, 2.0, 2.0, 2.0])
+
+
+def rig(camera: Camera) -> Rig:
+    return Rig(camera, camera, se3.exp(np.array([0.1, 0.002, -0.001, 0.01, -0.02, 0.005])))
+
+
+def scene(camera: Camera, count: int, seed: int) -> tuple[F64, F64, F64, F64]:
+    """True pose, points in the odometry frame, exact pixels in both eyes."""
+    rng = np.random.default_rng(seed)
+    pose = se3.exp(rng.normal(size=6) * [0.1, 0.1, 0.1, 0.05, 0.05, 0.05])
+    uv = rng.uniform([60, 60], [camera.width - 60, camera.height - 60], (count, 2))
+    bearing = camera.unproject(uv)
+    keep = bearing[:, 2] > 0.2
+    points_cam = bearing[keep] * rng.uniform(1, 8, (int(keep.sum()), 1))
+    eyes = Eyes.of(rig(camera))
+    uv_right = camera.project(se3.transform(eyes.right_T_left, points_cam))
+    return pose, se3.transform(pose, points_cam), uv[keep], uv_right
+
+
+def solve(camera: Camera, points: F64, uv: F64, uv_right: F64, variance: float = 1e-10) -> tuple[F64, F64, F64]:
+    eyes = Eyes.of(rig(camera))
+    distance = np.linalg.norm(points, axis=1)
+    n = len(points)
+    pose, _, covariance, error = pose_solver.optimise_pose(
+        np.eye(4), np.zeros(6), 0.1, np.ones(6), np.zeros(0), np.zeros((n, 3)), points / distance[:, None],
+        1 / distance, np.full(n, variance), uv, uv_right, eyes.cams, eyes.right_T_left, 0.5, SCALES,
+    )  # fmt: skip
+    return pose, covariance, error
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: c.model)
+def test_exact_pixels_give_the_exact_pose(camera: Camera) -> None:
+    pose, points, uv, uv_right = scene(camera, 120, 0)
+    found, covariance, error = solve(camera, points, uv, uv_right)
+    assert np.abs(found - pose).max() < 1e-8
+    assert error.max() < 1e-6
+    assert np.linalg.eigvalsh(covariance).min() > 0
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: c.model)
+def test_forty_percent_outliers_do_not_matter(camera: Camera) -> None:
+    rng = np.random.default_rng(3)
+    pose, points, uv, uv_right = scene(camera, 300, 1)
+    bad = rng.random(len(uv)) < 0.4
+    uv[bad] += rng.uniform(-40, 40, (int(bad.sum()), 2))
+    found, _, error = solve(camera, points, uv, uv_right)
+    assert np.abs(found - pose).max() < 2e-3
+    assert (error[~bad] < 3).mean() > 0.98
+
+
+def test_left_eye_alone_is_enough() -> None:
+    pose, points, uv, uv_right = scene(CAMERAS[2], 120, 2)
+    found, _, _ = solve(CAMERAS[2], points, uv, np.full_like(uv_right, np.nan))
+    assert np.abs(found - pose).max() < 1e-7
+
+
+def test_covariance_is_what_noise_does() -> None:
+    """Squared Mahalanobis length of the error has mean six when pixels and distances are as noisy as stated."""
+    rng = np.random.default_rng(5)
+    pose, points, uv, uv_right = scene(CAMERAS[0], 150, 4)
+    lengths = []
+    for _ in range(60):
+        noisy = uv + rng.normal(size=uv.shape) * 0.5, uv_right + rng.normal(size=uv.shape) * 0.5
+        found, covariance, _ = solve(CAMERAS[0], points, *noisy)
+        xi = se3.log(se3.inverse(pose) @ found)
+        lengths.append(xi @ np.linalg.solve(covariance, xi))
+    assert 4.0 < np.mean(lengths) < 9.0
+
+
+def test_uncertain_distance_does_not_bias_the_pose() -> None:
+    """Points whose distance is wrong by its stated variance: the marginalised solution stays near the truth."""
+    rng = np.random.default_rng(6)
+    pose, points, uv, uv_right = scene(CAMERAS[2], 300, 5)
+    distance = np.linalg.norm(points, axis=1)
+    rho = np.maximum(1 / distance + rng.normal(size=len(points)) * 0.05, 0.01)
+    wrong = points * (1 / rho / distance)[:, None]
+    naive, _, _ = solve(CAMERAS[2], wrong, uv, uv_right)
+    aware, _, _ = solve(CAMERAS[2], wrong, uv, uv_right, 0.05**2)
+    error = [np.linalg.norm(p[:3, 3] - pose[:3, 3]) for p in (naive, aware)]
+    assert error[1] < 0.01
+    assert error[1] < error[0]
+
+
+@pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: c.model)
+def test_triangulation_of_exact_pairs(camera: Camera) -> None:
+    pose, points, uv, uv_right = scene(camera, 100, 7)
+    eyes = Eyes.of(rig(camera))
+    bearing, rho, variance, epipolar = triangulate(uv, uv_right, *eyes.cams, eyes.left_T_right, 0.5)
+    truth = se3.transform(se3.inverse(pose), points)
+    good = np.isfinite(rho)
+    assert good.mean() > 0.95
+    assert np.abs((bearing / rho[:, None] - truth)[good]).max() < 1e-6
+    assert epipolar[good].max() < 1e-6
+    assert (variance[good] > 0).all()
