@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 
 import pytest
 
@@ -24,15 +23,10 @@ def fresh(code: str) -> str:
     ["import stereo_sfm", "import stereo_sfm.cli as c\ntry: c.main(['--help'])\nexcept SystemExit: pass"],
 )
 def test_fast_and_without_heavy_imports(code: str) -> None:
-    seconds = 1e9
-    for _ in range(3):  # the machine may be busy: the best of three counts
-        start = time.perf_counter()
-        loaded = fresh(code + f"\nimport sys\nprint('loaded', *[m for m in {HEAVY} if m in sys.modules])")
-        seconds = min(seconds, time.perf_counter() - start)
-        assert loaded.strip().splitlines()[-1] == "loaded"
-        if seconds < LIMIT_S:
-            break
-    assert seconds < LIMIT_S
+    loaded = fresh(f"{code}\nimport sys, time\nprint(time.process_time(), *[m for m in {HEAVY} if m in sys.modules])")
+    seconds, *heavy = loaded.strip().splitlines()[-1].split()
+    assert not heavy
+    assert float(seconds) < LIMIT_S  # of the processor: on a busy machine the clock on the wall says nothing
 
 
 def test_help_of_every_command_needs_nothing_heavy() -> None:
