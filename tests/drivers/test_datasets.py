@@ -16,8 +16,8 @@ from drivers.recognise import recognise_folder
 from drivers.select import SelectedFrames
 from drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.log.describe import describe_folder
 from stereo_sfm.pixels import eight_bits
+from stereo_sfm.recording.describe import describe_folder
 from tests.drivers.dataset_folders import (
     FRAMES,
     PERIOD_NS,
