@@ -1,15 +1,43 @@
-"""Customers: figures of ellipsoids in patterned clothes that walk to and fro, legs and arms swinging."""
+"""Who and what moves through the store: things made of ellipsoids, and customers in patterned clothes."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
 from drivers.sim.render import NOTHING, Moving
 from drivers.sim.tables import Tables
-from drivers.sim.world import SKIN
+from drivers.sim.world import CLOTHES, HAIR, SKIN
 from stereo_sfm.types import F64
+
+Part = tuple[F64, F64, float, int]  # an ellipsoid: centre (3,), half sizes (3,), lean (radians about y), cloth
+
+
+@dataclass(frozen=True, eq=False)
+class Thing:
+    """Ellipsoids that move together."""
+
+    parts: list[Part]  # in axes of their own
+    turn: F64  # (3, 3) from these axes to the world's
+    at: F64  # (3,) metres, where their origin is
+
+
+@dataclass(frozen=True)
+class Looks:
+    """What a person looks like."""
+
+    height: float
+    shirt: int  # index of a cloth
+    trousers: int
+    hair: int  # and shoes
+
+    @staticmethod
+    def random(rng: np.random.Generator) -> Looks:
+        """Two different cloths, one of two colours of hair, any height of a grown-up."""
+        shirt, trousers = rng.choice(CLOTHES, 2, replace=False)
+        return Looks(float(rng.uniform(1.55, 1.9)), int(shirt), int(trousers), HAIR + int(rng.integers(2)))
 
 
 @dataclass(frozen=True)
@@ -20,10 +48,7 @@ class Person:
     end: tuple[float, float]
     speed: float
     phase: float  # metres already walked at time 0
-    height: float
-    shirt: int  # index of a cloth
-    trousers: int
-    hair: int  # and shoes
+    looks: Looks
 
 
 def _pose(person: Person, seconds: float) -> tuple[F64, float, float]:
@@ -38,11 +63,11 @@ def _pose(person: Person, seconds: float) -> tuple[F64, float, float]:
     return a + s * (b - a), float(np.arctan2(way[1], way[0])), walked / 0.75 * np.pi
 
 
-def _limbs(person: Person, step: float) -> list[tuple[F64, F64, float, int]]:
-    """Ellipsoids in the person's axes (x ahead, z up): centre, half sizes, lean (radians about y), cloth."""
+def _limbs(person: Looks, step: float) -> list[Part]:
+    """Ellipsoids in the person's axes (x ahead, z up), legs and arms swinging with the phase of the step."""
     h, swing = person.height, 0.45 * np.sin(step)
     skin = SKIN
-    out = [
+    out: list[Part] = [
         (np.array([0.012, 0.0, 0.925 * h]), np.array([0.095, 0.08, 0.12]), 0.0, skin),
         (np.array([-0.012, 0.0, 0.955 * h]), np.array([0.1, 0.088, 0.09]), -0.35, person.hair),
         (np.array([0.0, 0.0, 0.85 * h]), np.array([0.05, 0.055, 0.09]), 0.0, skin),
@@ -68,23 +93,32 @@ def _limbs(person: Person, step: float) -> list[tuple[F64, F64, float, int]]:
     return out
 
 
-def figures(world: Tables, people: list[Person], seconds: float) -> Moving:
+def standing(looks: Looks, at: F64, heading: float, step: float) -> Thing:
+    """A person at a place on the floor (2,), facing `heading` (radians), in the middle of a step."""
+    c, s = np.cos(heading), np.sin(heading)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+    return Thing(_limbs(looks, step), turn, np.array([at[0], at[1], 0]))
+
+
+def crowd_at(people: Iterable[Person], seconds: float) -> list[Thing]:
     """Everybody as they are at a time."""
-    if not people:
+    return [standing(person.looks, *_pose(person, seconds)) for person in people]
+
+
+def moving(world: Tables, things: list[Thing]) -> Moving:
+    """Things as the renderer takes them."""
+    if not things:
         return NOTHING
     boxes: list[F64] = []
     ranges: list[list[int]] = []
     rows: list[F64] = []
     cloths: list[int] = []
-    for person in people:
-        at, heading, step = _pose(person, seconds)
-        c, s = np.cos(heading), np.sin(heading)
-        turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+    for thing in things:
         lo, hi, first = np.full(3, np.inf), np.full(3, -np.inf), len(rows)
-        for centre, half, lean, cloth in _limbs(person, step):
+        for centre, half, lean, cloth in thing.parts:
             cl, sl = np.cos(lean), np.sin(lean)
-            axes = turn @ np.array([[cl, 0, sl], [0, 1.0, 0], [-sl, 0, cl]])
-            middle = turn @ centre + [at[0], at[1], 0]
+            axes = thing.turn @ np.array([[cl, 0, sl], [0, 1.0, 0], [-sl, 0, cl]])
+            middle = thing.turn @ centre + thing.at
             extent = np.sqrt(((axes * half) ** 2).sum(1))
             lo, hi = np.minimum(lo, middle - extent), np.maximum(hi, middle + extent)
             rows.append(np.concatenate([middle, (axes / half).T.ravel(), [0.5 * (half[0] + half[1]), half[2]]]))

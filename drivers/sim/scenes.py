@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from drivers.sim.effects import Effects
-from drivers.sim.people import Person
+from drivers.sim.people import Looks, Person
 from drivers.sim.walks import FORWARD, Gait
 from drivers.sim.world import CLOTHES, HAIR, Layout
 from stereo_sfm.geometry import se3
@@ -112,5 +112,6 @@ def crowd(scene: Scene, count: int, rng: np.random.Generator) -> list[Person]:
         shirt, trousers = rng.choice(CLOTHES, 2, replace=False)
         hair = HAIR + int(rng.integers(2))
         speed, phase = float(rng.uniform(0.5, 1.2)), float(rng.uniform(0, 20))
-        out.append(Person(start, end, speed, phase, float(rng.uniform(1.55, 1.9)), int(shirt), int(trousers), hair))
+        looks = Looks(float(rng.uniform(1.55, 1.9)), int(shirt), int(trousers), hair)
+        out.append(Person(start, end, speed, phase, looks))
     return out

@@ -12,7 +12,9 @@ from typing import Any, Self
 import numpy as np
 
 from drivers.sim.effects import CLEAN, Effects, Sensor, brightness
-from drivers.sim.people import figures
+from drivers.sim.encounters import plan, present
+from drivers.sim.kernels import PERSON
+from drivers.sim.people import crowd_at, moving
 from drivers.sim.render import Renderer, View
 from drivers.sim.rigs import make_rig
 from drivers.sim.scenes import SCENES, Scene, crowd
@@ -41,6 +43,7 @@ class SimOptions:
     exchange: float = 0.0  # fraction of product rows exchanged against the same store with 0
     returns: bool = True  # whether a walk comes back to where it has been
     people: int = -1  # how many, -1: the scene's own
+    encounters: str = ""  # what people do to the robot, by turns: approach, stop, cover, lens, cart, beside, group; all
     speed: float = 0.0  # m/s, 0: the scene's own
     vibration: float = 1.0
     drop: float = 0.0  # fraction of frames lost
@@ -155,8 +158,10 @@ class SimSource:
         self.walk = Walk(route, gait, rng, options.length or scene.length)
         count = scene.people if options.people < 0 else options.people
         self.people = crowd(scene, count, np.random.default_rng([options.seed, 47]))
+        self.encounters = plan(options.encounters, self.walk, np.random.default_rng([options.seed, options.walk, 71]))
         self._choose_frames()
         self._renderer: Renderer | None = None
+        self._glimpse: Renderer | None = None  # small, for `moving_share`
         self._sensors: list[Sensor] = []
 
     def _choose_frames(self) -> None:
@@ -211,7 +216,20 @@ class SimSource:
 
     def view(self, world_T_cam: F64, seconds: float = 0.0) -> tuple[View, View]:
         """Brightness, depth and surfaces from a pose (4, 4) or poses of rows (H, 4, 4), people as at `seconds`."""
-        return self.renderer.render(world_T_cam, figures(self.world, self.people, seconds))
+        things = crowd_at(self.people, seconds) + present(self.encounters, seconds)
+        return self.renderer.render(world_T_cam, moving(self.world, things))
+
+    def moving_share(self, frame_id: int) -> F64:
+        """Truth: the share of each eye's view (2,) that people and their things take in a frame."""
+        if self._glimpse is None:
+            size = (round(self._camera.left.width / 8), round(self._camera.left.height / 8))
+            self._glimpse = Renderer(self.world, make_rig(self.options.camera, size))
+        seconds = frame_id / self.options.rate
+        things = crowd_at(self.people, seconds) + present(self.encounters, seconds)
+        if not things:
+            return np.zeros(2)
+        views = self._glimpse.render(self.pose(frame_id), moving(self.world, things))
+        return np.array([((view.ids >> 4) & 7 == PERSON)[view.ids >= 0].mean() for view in views])
 
     def picture(self, world_T_cam: F64, frame_id: int = 0, twist: F64 | None = None) -> StereoImage:
         """What the sensor gives at any pose, moving by `twist` (6,) a second in camera axes, as that frame.

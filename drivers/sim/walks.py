@@ -46,14 +46,37 @@ class Walk:
         xy = gaussian_filter1d(xy, sigma, axis=0, mode="nearest")
         heading = gaussian_filter1d(_heading(xy, route), 0.4 * sigma, mode="nearest")
         self._path = CubicSpline(t, np.column_stack([xy, heading]))
+        self._times, self._arc = t, arc
         self._sines = _sines(rng, gait.vibration)
+
+    def walked(self, seconds: float) -> float:
+        """Metres of the route behind the walker."""
+        return float(np.interp(seconds, self._times, self._arc))
+
+    def when(self, metres: float) -> float:
+        """Seconds until so much of the route is behind the walker; the end of the walk where it is not so long."""
+        return float(np.interp(metres, self._arc, self._times))
+
+    def place(self, metres: float, aside: float = 0.0) -> tuple[F64, float]:
+        """Position (2,) and heading after so many metres of the route, `aside` metres to the left of it.
+
+        Before its beginning and beyond its end the route goes straight on.
+        """
+        x, y, heading = self._path(self.when(metres)).tolist()
+        ahead, left = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
+        beyond = metres - float(np.clip(metres, 0.0, self._arc[-1]))
+        return np.array([x, y]) + beyond * ahead + aside * left, heading
 
     def poses(self, seconds: F64) -> F64:
         """Times (N,) -> world_T_cam (N, 4, 4): x right, y down, z forward."""
         seconds = np.asarray(seconds, float)
-        x, y, heading = self._path(seconds).T
         amplitude, frequency, phase = self._sines
         shake = (amplitude * np.sin(2 * np.pi * frequency * seconds[:, None, None] + phase)).sum(-1)  # (N, 6)
+        return self.steady(seconds) @ se3.exp(shake)
+
+    def steady(self, seconds: F64) -> F64:
+        """`poses` without sway and tremble."""
+        x, y, heading = self._path(seconds).T
         world_T_walker = se3.from_rotation_translation(
             se3.so3_exp(np.stack([0 * heading, 0 * heading, heading], -1)),
             np.stack([x, y, np.full_like(x, self.gait.height)], -1),
@@ -61,7 +84,7 @@ class Walk:
         pitch = np.deg2rad(self.gait.pitch_deg)
         walker_R_cam = FORWARD @ se3.so3_exp(np.array([pitch, 0, 0]))
         walker_T_cam = se3.from_rotation_translation(walker_R_cam, np.zeros(3))
-        return world_T_walker @ walker_T_cam @ se3.exp(shake)
+        return world_T_walker @ walker_T_cam
 
 
 def _progress(gait: Gait, rng: np.random.Generator, length: float, route: F64) -> tuple[F64, F64]:

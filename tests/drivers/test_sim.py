@@ -195,3 +195,43 @@ def test_the_lights_go_out_for_a_while() -> None:
     levels = [float(source.frame(k).left.mean()) for k in range(8)]
     assert all((level < 10) == (3 <= k < 6) for k, level in enumerate(levels))
     assert source.frame(0).left.max() > 100 and source.frame(4).left.max() < 30
+
+
+ENCOUNTER_SHARES = {  # kind: least and most share of the fuller eye's view at the fullest moment
+    "approach": (0.2, 1.0), "stop": (0.1, 1.0), "cover": (0.85, 1.0), "lens": (0.7, 1.0), "cart": (0.08, 0.8),
+    "beside": (0.05, 0.7), "group": (0.2, 0.8),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ENCOUNTER_SHARES)
+def test_encounters_fill_the_view_and_leave_it_free_again(kind: str) -> None:
+    least, most = ENCOUNTER_SHARES[kind]
+    source = small("loop", encounters=kind, speed=0.8, rate=15, seed=4)
+    encounter = source.encounters[0]
+    frames = np.arange(np.ceil(encounter.begin * 15), encounter.end * 15, max(1.0, (encounter.end - encounter.begin)))
+    shares = np.array([source.moving_share(int(k)) for k in frames])
+    assert least < shares.max() <= most
+    assert source.moving_share(int(encounter.begin * 15) - 2).max() == 0
+    assert source.moving_share(int(np.ceil(encounter.end * 15)) + 2).max() == 0
+    assert all(a.end < b.begin for a, b in itertools.pairwise(source.encounters))
+
+
+def test_encounters_come_by_turns_and_from_the_seed() -> None:
+    one, same_seed, other = (small("loop", encounters="cart,cover", seed=seed) for seed in (1, 1, 2))
+    assert [e.kind for e in one.encounters[:4]] == ["cart", "cover", "cart", "cover"]
+    assert [e.end for e in one.encounters] == [e.end for e in same_seed.encounters]
+    assert [e.end for e in one.encounters] != [e.end for e in other.encounters]
+    assert same(one.frame(200), same_seed.frame(200))
+    assert {e.kind for e in small("loop", encounters="all", length=1000.0).encounters} == set(ENCOUNTER_SHARES)
+    with pytest.raises(StereoSfmError, match="no encounter 'dance'"):
+        small("loop", encounters="cart,dance")
+
+
+def test_who_walks_beside_keeps_the_distance() -> None:
+    source = small("loop", encounters="beside", speed=0.8, length=30.0)
+    encounter = source.encounters[0]
+    gaps = [
+        float(np.linalg.norm(encounter.at(t)[0].at[:2] - source.walk.poses(np.array([t]))[0, :2, 3]))
+        for t in np.arange(encounter.begin + 3, encounter.end - 3, 0.5)
+    ]
+    assert 0.5 < min(gaps) and max(gaps) < 2.2

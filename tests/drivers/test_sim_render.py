@@ -12,7 +12,7 @@ import pytest
 from calib.rig import Rig
 from drivers.sim.effects import CLEAN, Effects, Sensor
 from drivers.sim.kernels import BLOCK, FACING, FRONT, PERSON, ROOM, TARGET
-from drivers.sim.people import figures
+from drivers.sim.people import crowd_at, moving
 from drivers.sim.render import Renderer, View
 from drivers.sim.rigs import CAMERAS, make_rig
 from drivers.sim.scenes import SCENES, crowd
@@ -292,10 +292,10 @@ def test_clean_sensor_only_rounds_and_blur_follows_the_motion() -> None:
 def test_people_walk_and_the_store_stands() -> None:
     people = crowd(dataclasses.replace(SCENES["people"], layout=SMALL), 6, np.random.default_rng(0))
     world = store()
-    moved = [figures(world, people, t) for t in (0.0, 1.0)]
+    moved = [moving(world, crowd_at(people, t)) for t in (0.0, 1.0)]
     shift = np.linalg.norm(moved[1].persons[:, :2] - moved[0].persons[:, :2], axis=1)
     assert (shift > 0.2).all() and (shift < 1.6).all()
-    alone = figures(world, people[:1], 0.0)
+    alone = moving(world, crowd_at(people[:1], 0.0))
     at = alone.persons[0]
     eye = pose_at(0.5 * (at[0] + at[3]) - 2.0, 0.5 * (at[1] + at[4]), 0.0)
     r = renderer("pinhole")
