@@ -17,6 +17,7 @@ ROOMS: tuple[str, ...] = (
     "stereo_sfm.types",
     "stereo_sfm.pixels",
     "stereo_sfm.messages",
+    "stereo_sfm.kernel_cache",
     "stereo_sfm.geometry",
     "calib",
     "stereo_sfm.config",

@@ -15,7 +15,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba
+from stereo_sfm.kernel_cache import jit
 
 SHELF, SOLID = 0, 1  # kinds of block
 BIN = 0.05  # metres of a level per lookup bin
@@ -26,15 +26,14 @@ FAR = 1e30
 
 # Inlined by force and without reference counts: passing the world's many arrays through calls costs five times as much.
 _OPTIONS: dict[str, Any] = {
-    "cache": True,
     "nogil": True,
     "error_model": "numpy",
     "_nrt": False,
     "forceinline": True,
 }
-njit: Any = numba.njit(**_OPTIONS)
+njit: Any = jit(**_OPTIONS)
 # For kernels that never see NaN: comparisons get shorter, no sum changes its order, so the bits stay the same anywhere.
-njit_finite: Any = numba.njit(**_OPTIONS, fastmath={"nnan", "nsz"})
+njit_finite: Any = jit(**_OPTIONS, fastmath={"nnan", "nsz"})
 
 
 @njit_finite

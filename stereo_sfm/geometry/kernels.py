@@ -14,14 +14,15 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba
 import numpy as np
+
+from stereo_sfm.kernel_cache import jit
 
 PINHOLE, RADTAN, KANNALA_BRANDT, EPIPOLAR = 0, 1, 2, 3
 PARAMS = 16
 LIMIT = 12
 
-njit: Any = numba.njit(cache=True, nogil=True, error_model="numpy")
+njit: Any = jit(nogil=True, error_model="numpy")
 
 
 @njit

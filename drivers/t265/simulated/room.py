@@ -7,18 +7,18 @@ The simulated store (`sim:`) is the better scene and takes seconds a frame; this
 from __future__ import annotations
 
 import cv2
-import numba
 import numpy as np
 
 from calib.rig import Rig
 from stereo_sfm.geometry import se3
+from stereo_sfm.kernel_cache import jit
 from stereo_sfm.types import F32, F64, U8
 
 _HALF_SIZE_M = np.array([5.0, 1.6, 4.0])  # x right, y down, z forward
 _TEXTURE_PX_PER_M = 64.0
 
 
-@numba.njit(cache=True, fastmath=False)
+@jit(fastmath=False)
 def _trace(bearings: F32, rotation: F64, origin: F64, half: F64, texture: U8, scale: float, out: U8) -> None:
     """Brightness of the inside of a box along every ray; 0 where a pixel has no ray.
 

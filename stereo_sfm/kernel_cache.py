@@ -1,0 +1,123 @@
+"""Where compiled kernels are kept between runs, and what there is to say while they are compiled.
+
+numba keeps them beside the source files. Where those may not be written to (an installation of another user, a
+read-only file system) they go to the user's cache, else to a folder of temporary files, and what was compiled at the
+installation (`stereo-sfm compile`) is taken along.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import stat
+import tempfile
+import time
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numba
+from numba.core import event
+from numba.core.caching import UserProvidedCacheLocator
+
+VARIABLE = "NUMBA_CACHE_DIR"
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("stereo_sfm", "drivers", "calib")
+COMPILING = "numba:compile"
+
+
+def usable(folder: Path) -> bool:
+    """Whether files can be made in a folder; it is made if need be."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError:
+        return False
+    return True
+
+
+def private(folder: Path) -> bool:
+    """Whether a folder is ours alone: what lies in it is executed."""
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        found = folder.lstat()
+    except OSError:
+        return False
+    return stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022 and usable(folder)
+
+
+def choose_folder(root: Path = ROOT) -> Path | None:
+    """A folder for compiled kernels where neither the user's choice nor the source tree will do, else None."""
+    chosen = os.environ.get(VARIABLE)
+    if (chosen and usable(Path(chosen))) or usable(root / "stereo_sfm" / "geometry" / "__pycache__"):
+        return None
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "stereo-sfm"
+    if usable(cache):
+        return cache
+    shared = Path(tempfile.gettempdir()) / f"stereo-sfm-{os.getuid()}"
+    return shared if private(shared) else Path(tempfile.mkdtemp(prefix="stereo-sfm-"))
+
+
+def take_along(root: Path, folder: Path) -> None:
+    """Copy what was compiled beside the source files to where numba looks for it in another folder."""
+    for source in (p for package in PACKAGES for p in sorted((root / package).rglob("__pycache__"))):
+        target = folder / UserProvidedCacheLocator.get_suitable_cache_subpath(str(source.parent / "module.py"))
+        for path in (p for p in sorted(source.glob("*.nb[ic]")) if not (target / p.name).exists()):
+            target.mkdir(parents=True, exist_ok=True)
+            part = target / f"{path.name}.{os.getpid()}"
+            shutil.copyfile(path, part)
+            part.replace(target / path.name)
+
+
+def _prepare() -> bool:
+    """Whether there is a place to keep kernels in; other processes of the run find the same one."""
+    try:
+        folder = choose_folder()
+        if folder is not None:
+            take_along(ROOT, folder)
+            numba.config.CACHE_DIR = os.environ[VARIABLE] = str(folder)  # pyright: ignore[reportAttributeAccessIssue]
+    except OSError:
+        return False
+    return True
+
+
+_KEPT = _prepare()
+
+
+def jit(**options: Any) -> Any:
+    """`numba.njit` with the options, its results kept where there is a place for them."""
+    return numba.njit(cache=_KEPT, **options)
+
+
+class Compilation(event.Listener):
+    """What is compiled while it listens: how many kernels, and the seconds that took."""
+
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        self.kernels, self.seconds = 0, 0.0
+        self._tell, self._since, self._depth = tell, 0.0, 0
+
+    def on_start(self, event: event.Event) -> None:
+        """A kernel, perhaps for another one that calls it."""
+        if not self._depth:
+            self._since = time.perf_counter()
+        self._depth += 1
+        self.kernels += 1
+        self._tell(event.data["dispatcher"].py_func.__name__.strip("_"))
+
+    def on_end(self, event: event.Event) -> None:
+        """It is compiled."""
+        self._depth -= 1
+        if not self._depth:
+            self.seconds += time.perf_counter() - self._since
+
+
+@contextmanager
+def listening(tell: Callable[[str], None]) -> Generator[Compilation]:
+    """Tell the name of every kernel that has to be compiled inside; those that are only loaded are not told."""
+    listener = Compilation(tell)
+    event.register(COMPILING, listener)
+    try:
+        yield listener
+    finally:
+        event.unregister(COMPILING, listener)
