@@ -5,8 +5,12 @@ The capture stage owns the slots. A slot is free again when all its readers have
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-import shutil
+import fcntl
+import os
+import secrets
+import time
 from dataclasses import dataclass
 from multiprocessing import shared_memory
 from pathlib import Path
@@ -18,6 +22,8 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import F32, U8, StereoImage
 
 SHARED = Path("/dev/shm")  # where Linux keeps shared memory
+PREFIX = "stereo_sfm_ring_"
+YOUNG_S = 2.0  # a ring this young may not be locked by its owner yet
 _NO_PIXELS = np.zeros((0, 0), np.uint8)
 
 
@@ -67,13 +73,28 @@ class ImageRing:
         """Make a new block, or attach to the one called `name`."""
         self.layout, self.slots = layout, slots
         self._owner = name is None
-        size = max(layout.size * slots, 1)
-        if self._owner and SHARED.is_dir() and shutil.disk_usage(SHARED).free < size:
+        self._memory = self._make() if name is None else shared_memory.SharedMemory(name)
+
+    def _make(self) -> shared_memory.SharedMemory:
+        """A block that is ours for as long as this process lives, and all of it there: nobody else can fill its place.
+
+        Raises:
+            StereoSfmError: there is not so much shared memory.
+        """
+        remove_abandoned()
+        size = max(self.layout.size * self.slots, 1)
+        try:
+            memory = shared_memory.SharedMemory(PREFIX + secrets.token_hex(8), create=True, size=size)
+            descriptor: int = memory._fd  # pyright: ignore[reportAttributeAccessIssue]
+            with contextlib.suppress(OSError):  # where shared memory has no locks nobody looks for them
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _allocate(memory, descriptor, size)
+        except OSError as error:
             raise StereoSfmError(
-                f"{SHARED} is too small for {slots} images ({size / 1e6:.0f} MB): make it larger (docker: --shm-size), "
-                "take --set pipeline.ring_slots=2, or --inline"
-            )
-        self._memory = shared_memory.SharedMemory(name, create=self._owner, size=size)
+                f"{SHARED} has no room for {self.slots} images ({size / 1e6:.0f} MB): {error.strerror}; make it larger "
+                "(docker: --shm-size), take --set pipeline.ring_slots=2, or --inline"
+            ) from None
+        return memory
 
     @property
     def name(self) -> str:
@@ -117,3 +138,29 @@ class ImageRing:
         self._memory.close()
         if self._owner:
             self._memory.unlink()
+
+
+def _allocate(memory: shared_memory.SharedMemory, descriptor: int, size: int) -> None:
+    """Have the pages now: a file system that fills up later would end the run by SIGBUS."""
+    if not hasattr(os, "posix_fallocate"):
+        return
+    try:
+        os.posix_fallocate(descriptor, 0, size)
+    except OSError:
+        memory.close()
+        memory.unlink()
+        raise
+
+
+def remove_abandoned(folder: Path = SHARED, young_s: float = YOUNG_S) -> None:
+    """Remove the rings of runs that were killed with all their processes: nobody holds their lock any more."""
+    for path in sorted(folder.glob(f"{PREFIX}*")):
+        with contextlib.suppress(OSError):  # of another user, or in use
+            if time.time() - path.stat().st_mtime < young_s:
+                continue
+            descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                path.unlink()
+            finally:
+                os.close(descriptor)

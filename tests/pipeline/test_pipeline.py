@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import os
-import shutil
 import signal
 import threading
 from collections.abc import Iterator, Sequence
@@ -28,7 +27,6 @@ from stereo_sfm.log.run_log import RunLog
 from stereo_sfm.log.writer import LogWriter
 from stereo_sfm.maps.folders import MapFolders
 from stereo_sfm.maps.saved_map import load_map
-from stereo_sfm.pipeline.images import ImageLayout, ImageRing
 from stereo_sfm.pipeline.inline import run_inline
 from stereo_sfm.pipeline.processes import ProcessRun, StageDied
 from stereo_sfm.pipeline.schedule import Lockstep, Recorded, Schedule
@@ -246,12 +244,6 @@ def test_a_stage_that_dies_before_it_is_set_up_is_named(tmp_path: Path) -> None:
     run._opened = kill
     with pytest.raises(StageDied, match="the tracker process was killed by SIGKILL"), run:
         list(run)
-
-
-def test_too_little_shared_memory_is_one_clear_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stereo_sfm.pipeline.images.shutil.disk_usage", lambda _: shutil._ntuple_diskusage(1, 1, 1000))
-    with pytest.raises(StereoSfmError, match="too small for 8 images"):
-        ImageRing(ImageLayout((240, 320), (240, 320), None), 8)
 
 
 def test_the_users_number_of_threads_does_not_reach_the_stages(monkeypatch: pytest.MonkeyPatch) -> None:
