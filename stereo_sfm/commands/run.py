@@ -111,6 +111,17 @@ def add_wiring_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--viz", choices=("none", "spawn", "serve", "save"), default="none", help="show it in rerun; save: run.rrd"
     )
+    add_viewer_address(parser)
+
+
+def add_viewer_address(parser: argparse.ArgumentParser) -> None:
+    """Option that opens a viewer to other computers."""
+    parser.add_argument(
+        "--viz-address",
+        default="127.0.0.1",
+        metavar="ADDRESS",
+        help="what a served viewer listens on (default: this computer only; 0.0.0.0 lets everybody look and write)",
+    )
 
 
 def add_talk_arguments(parser: argparse.ArgumentParser) -> None:
@@ -185,7 +196,7 @@ def execute(
     mode = "realtime" if args.realtime else args.mode
     stepper = _stepper(args)
     inline = args.inline or pictures is not None or stepper is not None  # the next frame waits for the user
-    wiring = Wiring(inline, mode, args.log, args.image_format, args.viz)
+    wiring = Wiring(inline, mode, args.log, args.image_format, args.viz, args.viz_address)
     with StopRequest() as stop:
         with Session(choice, config, sinks, wiring, folders, args.output, args.overwrite, replayed) as session:
             stop.then = session.stop

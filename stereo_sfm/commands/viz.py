@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from stereo_sfm.commands.run import add_viewer_address
 from stereo_sfm.errors import StereoSfmError
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("file", type=Path, help="run.mcap, a run's folder, or any recording")
     parser.add_argument("--source", help="where the images are, for a run whose log has none")
     parser.add_argument("--serve", action="store_true", help="to browsers, instead of opening a window")
+    add_viewer_address(parser)
     parser.add_argument("--save", type=Path, metavar="FILE.rrd", help="write a rerun file instead of showing it")
     parser.add_argument("--overwrite", action="store_true", help="replace the file of --save")
 
@@ -47,11 +49,11 @@ def run(args: argparse.Namespace) -> int:
         has_images = args.source is not None or topics.LEFT_IMAGE in names or rig is None
         if has_images:
             with _images(reader, path, args.source) as source:
-                sink = RerunSink(source.rig, name, mode, args.save, source.ground_truth)
+                sink = RerunSink(source.rig, name, mode, args.save, source.ground_truth, args.viz_address)
                 _play(reader, iter(source), sink)
         else:
             assert rig is not None
-            sink = RerunSink(rig, name, mode, args.save, attached_truth(reader))
+            sink = RerunSink(rig, name, mode, args.save, attached_truth(reader), args.viz_address)
             _play(reader, iter(()), sink)
         sink.close()
     if mode == "serve":

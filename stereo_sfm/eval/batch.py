@@ -18,6 +18,8 @@ from stereo_sfm.errors import StereoSfmError
 
 RESULT = "result.json"
 RETRIES = 3  # of a task whose node died
+# Ray's own switch for one computer alone, the default where firewalls ask: every port of it on the loopback address.
+LOOPBACK_ONLY = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 
 
 @dataclass(frozen=True)
@@ -121,6 +123,8 @@ def run_batch(tasks: Sequence[BatchTask], address: str | None = None) -> Iterato
 
 def _run_on_ray(tasks: list[BatchTask], address: str | None) -> Iterator[tuple[BatchTask, dict[str, Any]]]:
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    if address is None:
+        os.environ[LOOPBACK_ONLY] = "0"
     try:
         import ray
         from ray.exceptions import RayError

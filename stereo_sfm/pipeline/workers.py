@@ -26,6 +26,7 @@ from stereo_sfm.pipeline.interrupts import STOP_SIGNALS
 from stereo_sfm.pipeline.schedule import Lockstep, Realtime, Recorded, Schedule
 from stereo_sfm.pipeline.text import LOGGER, Listener
 from stereo_sfm.types import Applied, Keyframe, LoopResult, MapUpdate, Trajectory
+from stereo_sfm.viz.server import LOOPBACK
 
 UPSTREAM_LOST = 70  # exit code of a worker whose neighbour died: not the cause
 
@@ -379,6 +380,7 @@ class ViewerOptions:
 
     mode: str  # spawn | serve | save
     path: Path | None = None  # of mode "save"
+    address: str = LOOPBACK  # of mode "serve"
 
 
 def run_viewer(to_main: Outbox, control: Connection, messages: Connection, options: ViewerOptions) -> None:
@@ -387,7 +389,7 @@ def run_viewer(to_main: Outbox, control: Connection, messages: Connection, optio
 
     setup = Inbox[Setup](control).take()
     prepare("viewer", setup)
-    sink = RerunSink(setup.rig, setup.source_name, options.mode, options.path, setup.ground_truth)
+    sink = RerunSink(setup.rig, setup.source_name, options.mode, options.path, setup.ground_truth, options.address)
     inbox = Inbox[Any](messages)
     with contextlib.suppress(Lost):
         while not isinstance(message := inbox.take(), End):

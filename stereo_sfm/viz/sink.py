@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import logging
-import shutil
-import socket
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from urllib.parse import quote
 
 import cv2
 import numpy as np
 import rerun as rr
 
 from calib.rig import Rig
-from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.log.events import Events
 from stereo_sfm.messages import Health, LogLine, StageTimes
@@ -31,11 +27,10 @@ from stereo_sfm.types import (
 )
 from stereo_sfm.viz.blueprint import blueprint
 from stereo_sfm.viz.map_scene import MapScene
+from stereo_sfm.viz.server import LOOPBACK, open_window, serve
 from stereo_sfm.viz.shapes import age_colors, spread_colors, strips, turbo
 
 log = logging.getLogger("stereo_sfm")
-MEMORY_LIMIT = "1GB"  # of the viewer, which keeps its history
-WEB_PORT, GRPC_PORT = 9090, 9876
 JPEG_QUALITY = 80
 MATCHES_DRAWN = 100  # more lines than that hide the picture: every k-th is drawn
 MATCHES_EVERY = 5  # pictures between two pictures of matches
@@ -56,25 +51,29 @@ class RerunSink:
     """Shows the messages of a run as they come."""
 
     def __init__(
-        self, rig: Rig, name: str, mode: str, path: Path | None = None, ground_truth: Trajectory | None = None
+        self,
+        rig: Rig,
+        name: str,
+        mode: str,
+        path: Path | None = None,
+        ground_truth: Trajectory | None = None,
+        address: str = LOOPBACK,
     ) -> None:
         """Open a viewer.
 
         Args:
             mode: "spawn" a viewer, "serve" it to browsers, or "save" to `path`.
             ground_truth: drawn aligned with the first pose.
+            address: to listen on with "serve".
         """
         self._mode = mode
         self._rec = rr.RecordingStream("stereo_sfm", recording_id=None)
-        if mode == "spawn":
-            _spawn(self._rec, name)
-        elif mode == "serve":
-            _check_free(GRPC_PORT, WEB_PORT)  # rerun itself goes on without the port
-            uri = self._rec.serve_grpc(
-                grpc_port=GRPC_PORT, default_blueprint=blueprint(name), server_memory_limit=MEMORY_LIMIT
-            )
-            rr.serve_web_viewer(web_port=WEB_PORT, open_browser=False, connect_to=uri)
-            print(f"viewer: http://localhost:{WEB_PORT}/?url={quote(uri, safe='')}", file=sys.stderr, flush=True)
+        if mode == "serve":
+            destination, said = serve(address)
+            self._rec.connect_grpc(destination, default_blueprint=blueprint(name))
+            print(said, file=sys.stderr, flush=True)
+        elif mode == "spawn":
+            self._rec.connect_grpc(open_window(), default_blueprint=blueprint(name))
         else:
             assert path is not None
             path.open("ab").close()  # rerun's own error for a file that cannot be written is no OSError
@@ -127,11 +126,11 @@ class RerunSink:
             self._show_alone(self._images[frame_id])
         self._scene.show()
         try:
-            self._rec.flush(timeout_sec=GRACE_S if self._mode == "spawn" else 1e38)
+            self._rec.flush(timeout_sec=1e38 if self._mode == "save" else GRACE_S)
         except RuntimeError as error:
             log.warning("the viewer does not answer, what it shows is not complete: %s", str(error).splitlines()[0])
         if self._mode == "save":
-            self._rec.disconnect()  # writes the end of the file; a server goes on serving
+            self._rec.disconnect()  # writes the end of the file
 
     def _text(self, line: LogLine) -> None:
         self._rec.log("log", rr.TextLog(f"{line.stage}: {line.text}", level=line.level.replace("WARNING", "WARN")))
@@ -220,27 +219,6 @@ class RerunSink:
     def _put_dropped(self, dropped: Dropped) -> None:
         self._dropped += dropped.count
         self._rec.log("points/dropped", rr.Scalars(float(self._dropped)))
-
-
-def _spawn(recording: rr.RecordingStream, name: str) -> None:
-    """Open the viewer that was installed with this interpreter, which need not be in the PATH; else the PATH's."""
-    viewer = shutil.which("rerun", path=Path(sys.executable).parent)
-    try:
-        rr.spawn(
-            memory_limit=MEMORY_LIMIT, executable_path=viewer, default_blueprint=blueprint(name), recording=recording
-        )
-    except RuntimeError as error:
-        raise StereoSfmError(f"cannot open the viewer: {str(error).splitlines()[0]}") from None
-
-
-def _check_free(*ports: int) -> None:
-    for port in ports:
-        with socket.socket() as probe:
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                probe.bind(("", port))
-            except OSError:
-                raise StereoSfmError(f"port {port} is taken: is another viewer open?") from None
 
 
 def _jpeg(image: U8) -> rr.EncodedImage:

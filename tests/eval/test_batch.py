@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -48,6 +50,30 @@ def test_without_an_address_no_cluster_is_looked_for(tmp_path: Path, monkeypatch
         with pytest.raises(ConnectionError):
             list(batch.run_batch([task], address))
     assert asked == ["local", "10.0.0.1:6379"]
+
+
+LISTENING = """
+import sys
+import psutil
+from stereo_sfm.eval import batch
+
+def look(task):
+    ours = [psutil.Process(), *psutil.Process().children(recursive=True)]
+    print(*{c.laddr.ip for p in ours for c in p.net_connections() if c.status == psutil.CONN_LISTEN})
+    sys.exit()
+
+batch.BatchTask.__reduce__ = look  # called when a task is given to Ray, all of which runs then
+list(batch.run_batch([batch.BatchTask("sim:nothing", "/nowhere", batch.Config(), False)]))
+"""
+
+
+@pytest.mark.slow
+def test_a_batch_on_this_machine_listens_on_loopback_alone() -> None:
+    pytest.importorskip("ray")
+    child = subprocess.run([sys.executable, "-c", LISTENING], capture_output=True, text=True)
+    assert child.returncode == 0, child.stderr
+    addresses = set(child.stdout.split())
+    assert addresses and addresses <= {"127.0.0.1", "::ffff:127.0.0.1", "::1"}
 
 
 @pytest.mark.slow

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import socket
 import subprocess
 import sys
 from collections import Counter
@@ -15,7 +14,6 @@ import numpy as np
 import pytest
 import rerun as rr
 
-from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.messages import Health
 from stereo_sfm.pipeline.inline import run_inline
@@ -131,40 +129,6 @@ def test_a_saved_recording_is_valid(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "rerun", "rrd", "verify", str(tmp_path / "run.rrd")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert "verified without error" in done.stdout + done.stderr
-
-
-@pytest.mark.parametrize("path", ["/usr/bin:/bin", ""])
-def test_the_viewer_of_this_interpreter_is_found(monkeypatch: pytest.MonkeyPatch, path: str) -> None:
-    asked: list[Any] = []
-    monkeypatch.setenv("PATH", path)
-    monkeypatch.setattr(sink.rr, "RecordingStream", Recording)
-    monkeypatch.setattr(sink.rr, "spawn", lambda **options: asked.append(options["executable_path"]))
-    sink.RerunSink(SlidingWall(1).rig, "wall", "spawn")
-    assert asked == [str(Path(sys.executable).with_name("rerun"))]
-
-
-def test_no_viewer_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    def spawn(**_: Any) -> None:
-        raise RuntimeError("Failed to find Rerun Viewer executable in PATH.\n\n  You can install it")
-
-    monkeypatch.setattr(sink.rr, "spawn", spawn)
-    with pytest.raises(StereoSfmError, match=r"^cannot open the viewer: .* in PATH\.$"):
-        sink.RerunSink(SlidingWall(1).rig, "wall", "spawn")
-
-
-@pytest.mark.parametrize("name", ["WEB_PORT", "GRPC_PORT"])
-def test_a_port_that_is_taken_is_said(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    with socket.socket() as taken, socket.socket() as free:
-        for probe in (taken, free):
-            probe.bind(("", 0))
-        taken.listen()
-        port, other = (s.getsockname()[1] for s in (taken, free))
-        free.close()
-        monkeypatch.setattr(sink, "WEB_PORT", other)
-        monkeypatch.setattr(sink, "GRPC_PORT", other)
-        monkeypatch.setattr(sink, name, port)
-        with pytest.raises(StereoSfmError, match=f"port {port} is taken"):
-            sink.RerunSink(SlidingWall(1).rig, "wall", "serve")
 
 
 def test_strips_are_what_rerun_makes_of_a_list_of_lines() -> None:
