@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
+import os
 import re
+import weakref
 from datetime import datetime
 from pathlib import Path
 
@@ -28,20 +31,42 @@ def is_free(folder: Path) -> bool:
     return not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
 
 
-def prepare_folder(folder: Path, overwrite: bool) -> None:
-    """Make the folder of a new run; an empty one will do.
+class FolderLock:
+    """Says that a folder is a run's, as long as this object lives; nothing is written, a killed run leaves nothing."""
+
+    def __init__(self, folder: Path) -> None:
+        """Lock an existing folder.
+
+        Raises:
+            StereoSfmError: another run has it.
+        """
+        descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
+        self.release = weakref.finalize(self, os.close, descriptor)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self.release()
+            raise StereoSfmError(f"a run is writing to {folder}: choose another -o, or wait for its end") from None
+        except OSError:  # a network folder without locks
+            return
+
+
+def prepare_folder(folder: Path, overwrite: bool) -> FolderLock:
+    """Make the folder of a new run; an empty one will do. It is the run's as long as the lock lives.
 
     With `overwrite` the files of an earlier run are removed, so that none of them is taken for this run's; whatever
     else lies there stays.
 
     Raises:
-        StereoSfmError: it holds something that may not be overwritten, or cannot be made.
+        StereoSfmError: it holds something that may not be overwritten, another run has it, or it cannot be made.
     """
     try:
         if not (overwrite or is_free(folder)):
             raise StereoSfmError(f"{folder} exists: choose another -o, or say --overwrite")
         folder.mkdir(parents=True, exist_ok=True)
+        lock = FolderLock(folder)
         discard_files(folder)
+        return lock
     except OSError as error:
         raise StereoSfmError(f"cannot make the output folder {folder}: {error.strerror}") from None
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Self
 from drivers.source import Source, is_device
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.export.run_folder import default_folder, discard_files, prepare_folder
+from stereo_sfm.export.run_folder import FolderLock, default_folder, discard_files, prepare_folder
 from stereo_sfm.maps.folders import MapFolders
 from stereo_sfm.messages import Sink
 from stereo_sfm.pipeline.capture import SourceInfo
@@ -23,6 +23,7 @@ from stereo_sfm.pipeline.processes import ProcessRun
 from stereo_sfm.pipeline.schedule import Recorded
 from stereo_sfm.pipeline.workers import LogOptions, ViewerOptions
 from stereo_sfm.types import Dropped, Frame
+from stereo_sfm.viz.server import LOOPBACK
 
 if TYPE_CHECKING:
     from stereo_sfm.log.recorded import RecordedRun
@@ -39,6 +40,7 @@ class Wiring:
     log: str | None = None  # full | lean | none; None: full for devices, lean for recordings
     image_format: str | None = None  # of a full log; None: raw for devices, else png
     viz: str = "none"  # none | spawn | serve | save
+    viz_address: str = LOOPBACK  # that "serve" listens on
 
 
 class Session:
@@ -65,7 +67,7 @@ class Session:
         self._run: ProcessRun | None = None
         self._folder = folder
         self._made: list[Path] = []  # folders, from the inside out
-        self._prepared = False  # the folder is this run's
+        self._lock: FolderLock | None = None  # on the folder, until its last file is written
         self._began = False  # a frame has come
         self.info: SourceInfo
 
@@ -98,13 +100,14 @@ class Session:
 
     def _clean_up(self, error: BaseException | None) -> None:
         """A mistake that ended the run before its first frame leaves nothing behind that is in the way of the next."""
-        if self._folder is None or not self._prepared or self._began:
+        if self._folder is None or self._lock is None or error is None:
             return
-        if isinstance(error, StereoSfmError) and error.exit_code == StereoSfmError.exit_code:
+        if not self._began and isinstance(error, StereoSfmError) and error.exit_code == StereoSfmError.exit_code:
             discard_files(self._folder)
             with suppress(OSError):  # somebody else put something there
                 for folder in self._made:
                     folder.rmdir()
+        self._lock.release()
 
     def __iter__(self) -> Iterator[Frame]:
         for frame in self._frames:
@@ -129,8 +132,7 @@ class Session:
     def _prepare(self) -> None:
         """Make the folder, once the source is open: what is wrong with the source is told first, and leaves none."""
         self._made = [place for place in (self.folder, *self.folder.parents) if not place.exists()]
-        prepare_folder(self.folder, self._overwrite)
-        self._prepared = True
+        self._lock = prepare_folder(self.folder, self._overwrite)
 
     def _log_options(self, live: bool, folder: Path) -> LogOptions | None:
         kind = self._wiring.log or ("full" if live else "lean")
@@ -170,7 +172,10 @@ class Session:
         if self._wiring.viz != "none":
             from stereo_sfm.viz.sink import RerunSink
 
-            viewer = RerunSink(source.rig, source.name, self._wiring.viz, folder / "run.rrd", source.ground_truth)
+            viewer = RerunSink(
+                source.rig, source.name, self._wiring.viz, folder / "run.rrd", source.ground_truth,
+                self._wiring.viz_address,
+            )  # fmt: skip
             stack.callback(viewer.close)
             sinks.append(viewer)
         schedule = None if self._replayed is None else Recorded(self._replayed.applied)
@@ -183,7 +188,9 @@ class Session:
 
     def _enter_processes(self, stack: ExitStack) -> Iterator[Frame]:
         self._name_folder("run")
-        viewer = None if self._wiring.viz == "none" else ViewerOptions(self._wiring.viz, self.folder / "run.rrd")
+        viewer = None
+        if self._wiring.viz != "none":
+            viewer = ViewerOptions(self._wiring.viz, self.folder / "run.rrd", self._wiring.viz_address)
         self._run = ProcessRun(
             self._opener,
             self._config,
