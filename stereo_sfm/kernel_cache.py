@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core import event
+from numba.core import config, event
 from numba.core.caching import UserProvidedCacheLocator
 
 VARIABLE = "NUMBA_CACHE_DIR"
@@ -76,7 +76,7 @@ def _prepare() -> bool:
         folder = choose_folder()
         if folder is not None:
             take_along(ROOT, folder)
-            numba.config.CACHE_DIR = os.environ[VARIABLE] = str(folder)  # pyright: ignore[reportAttributeAccessIssue]
+            config.CACHE_DIR = os.environ[VARIABLE] = str(folder)  # pyright: ignore[reportAttributeAccessIssue]
     except OSError:
         return False
     return True
@@ -97,7 +97,7 @@ class Compilation(event.Listener):
         self.kernels, self.seconds = 0, 0.0
         self._tell, self._since, self._depth = tell, 0.0, 0
 
-    def on_start(self, event: event.Event) -> None:
+    def on_start(self, event: Any) -> None:
         """A kernel, perhaps for another one that calls it."""
         if not self._depth:
             self._since = time.perf_counter()
@@ -105,7 +105,7 @@ class Compilation(event.Listener):
         self.kernels += 1
         self._tell(event.data["dispatcher"].py_func.__name__.strip("_"))
 
-    def on_end(self, event: event.Event) -> None:
+    def on_end(self, event: Any) -> None:
         """It is compiled."""
         self._depth -= 1
         if not self._depth:

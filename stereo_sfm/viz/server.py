@@ -16,6 +16,7 @@ import socket
 import subprocess
 import time
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 from stereo_sfm.errors import StereoSfmError
@@ -65,7 +66,7 @@ def open_window() -> str:
     return _proxy(LOOPBACK)
 
 
-_SILENT = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+_SILENT: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
 
 
 def _executable() -> str:
@@ -85,7 +86,7 @@ def _end_with_parent() -> None:
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
-def _wait_for(process: subprocess.Popen[bytes], address: str, *ports: int) -> None:
+def _wait_for(process: subprocess.Popen[Any], address: str, *ports: int) -> None:
     until = time.monotonic() + START_S
     while not all(_answers(address, port) for port in ports):
         if process.poll() is not None:
