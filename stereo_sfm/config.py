@@ -49,7 +49,7 @@ class TrackerConfig:
     max_window_disparity_px: float = 0.15  # a narrow and a wide window must agree on the disparity: no depth edge in it
     keyframe_share: float = 0.75  # new keyframe when fewer of the last keyframe's points are still tracked
     keyframe_max_frames: int = 30
-    lost_frames: int = 15  # frames predicted by constant velocity before tracking restarts as a new submap
+    lost_frames: int = 15  # frames without a pose after which a new submap begins, whichever the tracker
 
 
 @dataclass(frozen=True)

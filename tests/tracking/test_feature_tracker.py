@@ -18,7 +18,7 @@ from stereo_sfm.eval.evaluate import evaluate
 from stereo_sfm.geometry import se3
 from stereo_sfm.presets import PRESETS, preset
 from stereo_sfm.tracking.factory import make_tracker
-from stereo_sfm.tracking.features.feature_tracker import LOST_BEFORE_RESTART, FeatureTracker
+from stereo_sfm.tracking.features.feature_tracker import FeatureTracker
 from stereo_sfm.types import F64, Frame, Keyframe, MapUpdate, StereoImage, TrackState, Trajectory
 
 SPEC = "sim:aisle?camera=pinhole&frames=7&size=480x300"
@@ -108,7 +108,7 @@ def test_a_dark_gap_is_lost_and_recovered() -> None:
 def test_after_long_darkness_a_new_submap_begins() -> None:
     _, images, _ = rendered()
     dark = replace(images[0], left=np.zeros_like(images[0].left), right=np.zeros_like(images[0].left))
-    sequence = (images[0], images[1], *[dark] * LOST_BEFORE_RESTART, images[-1])
+    sequence = (images[0], images[1], *[dark] * (Config().tracker.lost_frames + 1), images[-1])
     answers = list(track(config_for("pnp"), sequence))
     frame, keyframe = answers[-1]
     assert frame.state in (TrackState.RESTARTED, TrackState.RECOVERED)

@@ -9,7 +9,7 @@ from calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, Epipolar, KannalaBrandt, Pinhole, RadTan
 from stereo_sfm.tracking.flow import pose_solver
-from stereo_sfm.tracking.flow.stereo_cameras import Eyes
+from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.tracking.flow.stereo_match import triangulate
 from stereo_sfm.types import F64
 
@@ -27,25 +27,25 @@ def rig(camera: Camera) -> Rig:
 
 
 def scene(camera: Camera, count: int, seed: int) -> tuple[F64, F64, F64, F64]:
-    """True pose, points in the odometry frame, exact pixels in both eyes."""
+    """True pose, points in the odometry frame, exact pixels in both cameras."""
     rng = np.random.default_rng(seed)
     pose = se3.exp(rng.normal(size=6) * [0.1, 0.1, 0.1, 0.05, 0.05, 0.05])
     uv = rng.uniform([60, 60], [camera.width - 60, camera.height - 60], (count, 2))
     bearing = camera.unproject(uv)
     keep = bearing[:, 2] > 0.2
     points_cam = bearing[keep] * rng.uniform(1, 8, (int(keep.sum()), 1))
-    eyes = Eyes.of(rig(camera))
-    uv_right = camera.project(se3.transform(eyes.right_T_left, points_cam))
+    cameras = StereoCameras.of(rig(camera))
+    uv_right = camera.project(se3.transform(cameras.right_T_left, points_cam))
     return pose, se3.transform(pose, points_cam), uv[keep], uv_right
 
 
 def solve(camera: Camera, points: F64, uv: F64, uv_right: F64, variance: float = 1e-10) -> tuple[F64, F64, F64]:
-    eyes = Eyes.of(rig(camera))
+    cameras = StereoCameras.of(rig(camera))
     distance = np.linalg.norm(points, axis=1)
     n = len(points)
     pose, _, covariance, error = pose_solver.optimise_pose(
         np.eye(4), np.zeros(6), 0.1, np.ones(6), np.zeros(0), np.zeros((n, 3)), points / distance[:, None],
-        1 / distance, np.full(n, variance), uv, uv_right, eyes.cams, eyes.right_T_left, 0.5, SCALES,
+        1 / distance, np.full(n, variance), uv, uv_right, cameras.cams, cameras.right_T_left, 0.5, SCALES,
     )  # fmt: skip
     return pose, covariance, error
 
@@ -106,8 +106,8 @@ def test_uncertain_distance_does_not_bias_the_pose() -> None:
 @pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: c.model)
 def test_triangulation_of_exact_pairs(camera: Camera) -> None:
     pose, points, uv, uv_right = scene(camera, 100, 7)
-    eyes = Eyes.of(rig(camera))
-    bearing, rho, variance, epipolar = triangulate(uv, uv_right, *eyes.cams, eyes.left_T_right, 0.5)
+    cameras = StereoCameras.of(rig(camera))
+    bearing, rho, variance, epipolar = triangulate(uv, uv_right, *cameras.cams, cameras.left_T_right, 0.5)
     truth = se3.transform(se3.inverse(pose), points)
     good = np.isfinite(rho)
     assert good.mean() > 0.95

@@ -16,7 +16,7 @@ from stereo_sfm.geometry.cameras import KannalaBrandt, Pinhole
 from stereo_sfm.tracking.flow import pose_solver
 from stereo_sfm.tracking.flow.place_corners import PlaceCorners
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
-from stereo_sfm.tracking.flow.stereo_cameras import Eyes
+from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.tracking.flow.tracker import Tracker
 from stereo_sfm.types import F64, Corners, StereoImage, Trajectory
 
@@ -34,7 +34,7 @@ def rig(camera: Pinhole | KannalaBrandt, readout_s: float = 0.03) -> Rig:
 
 
 def scene(camera: Pinhole | KannalaBrandt, seed: int) -> tuple[F64, F64, F64, F64]:
-    """Pose at the stamp, points in the odometry frame, the pixels of both eyes as the rows see them.
+    """Pose at the stamp, points in the odometry frame, the pixels of both cameras as the rows see them.
 
     Each row is put where the pixel of its own pose lies, by iteration to the last bit.
     """
@@ -43,7 +43,7 @@ def scene(camera: Pinhole | KannalaBrandt, seed: int) -> tuple[F64, F64, F64, F6
     uv = rng.uniform([80, 80], [camera.width - 80, camera.height - 80], (200, 2))
     points_cam = camera.unproject(uv) * rng.uniform(1, 8, (200, 1))
     points = se3.transform(pose, points_cam)
-    eyes: list[F64] = []
+    cameras: list[F64] = []
     for cam_T_eye in (np.eye(4), LEFT_T_RIGHT):
         seen = uv.copy()
         for _ in range(30):
@@ -52,25 +52,25 @@ def scene(camera: Pinhole | KannalaBrandt, seed: int) -> tuple[F64, F64, F64, F6
             seen = np.array(
                 [camera.project(se3.transform(se3.inverse(t), p[None]))[0] for t, p in zip(poses, points, strict=True)]
             )
-        eyes.append(seen)
-    return pose, points, eyes[0], eyes[1]
+        cameras.append(seen)
+    return pose, points, cameras[0], cameras[1]
 
 
 def solve(shutter: RollingShutter, points: F64, uv: F64, uv_right: F64, start: F64, sigma: float) -> tuple[F64, F64]:
     """Pose and velocity, the last frame 0.1 s before and a tenth slower than it is while the rows are read."""
     camera = CAMERAS[0]
     distance, n = np.linalg.norm(points, axis=1), len(points)
-    eyes = Eyes.of(rig(camera))
+    cameras = StereoCameras.of(rig(camera))
     pose, velocity, _, _ = pose_solver.optimise_pose(
         start, 0.9 * VELOCITY * 0.1, 0.1, np.full(6, sigma), shutter.row_seconds(uv), np.zeros((n, 3)),
-        points / distance[:, None], 1 / distance, np.full(n, 1e-12), uv, uv_right, eyes.cams, eyes.right_T_left, 0.1,
-        SCALES,
+        points / distance[:, None], 1 / distance, np.full(n, 1e-12), uv, uv_right, cameras.cams,
+        cameras.right_T_left, 0.1, SCALES,
     )  # fmt: skip
     return pose, velocity
 
 
 def test_pose_and_velocity_of_exact_rows() -> None:
-    """Both eyes of an ideal pair have a point on one row, so nothing is approximated."""
+    """Both cameras of an ideal pair have a point on one row, so nothing is approximated."""
     pose, points, uv, uv_right = scene(CAMERAS[0], 0)
     found, velocity = solve(RollingShutter(rig(CAMERAS[0])), points, uv, uv_right, pose, 10.0)
     assert np.abs(found - pose).max() < 1e-5

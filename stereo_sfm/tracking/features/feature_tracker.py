@@ -19,6 +19,7 @@ from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.tracking.features.extraction import circle_mask
 from stereo_sfm.tracking.features.feature_view import FeatureView, ViewMaker
+from stereo_sfm.tracking.features.map_correction import KeyframePoses
 from stereo_sfm.tracking.features.odometry.base import Motion
 from stereo_sfm.tracking.features.odometry.table import make_estimator
 from stereo_sfm.tracking.features.outgoing import keyframe_of, observations_of
@@ -37,8 +38,6 @@ from stereo_sfm.types import (
     TrackState,
     Trajectory,
 )
-
-LOST_BEFORE_RESTART = 5  # frames without a motion after which tracking starts again from the predicted pose
 
 
 class FeatureTracker:
@@ -66,7 +65,7 @@ class FeatureTracker:
         self._keyframe: FeatureView | None = None
         self._kf_id = -1
         self._odom_T_kf = np.eye(4)
-        self._odom_T_kfs: dict[int, F64] = {}  # keyframes whose answer is still to come
+        self._kf_poses = KeyframePoses()
         self._frames_since_kf = 0
         self._lost = 0
         self._submap = 0
@@ -76,7 +75,10 @@ class FeatureTracker:
         """Take over fused ids and, for motions from a keyframe, the map's positions of its points."""
         self._map_version = update.version
         self._ids.fuse(update.fused_point_ids)
-        self._correct(update)
+        moved = self._kf_poses.correct(update)
+        if moved is not None:
+            self._odom_T_cam, self._odom_T_last = moved @ self._odom_T_cam, moved @ self._odom_T_last
+            self._odom_T_kf = moved @ self._odom_T_kf
         if self._last is not None:
             self._last = replace(self._last, ids=self._ids.current(self._last.ids))
         if self._keyframe is None:
@@ -87,19 +89,6 @@ class FeatureTracker:
         if self._odometry.reference == "keyframe" and len(own):
             kf_T_map = se3.inverse(update.map_T_kf[own[0]])
             self._keyframe = replace(self._keyframe, points=_moved(self._keyframe.points, ids, update, kf_T_map))
-
-    def _correct(self, update: MapUpdate) -> None:
-        """Move on from where the map puts the newest keyframe that both know (the mapper expects its answer used)."""
-        known = [k for k in update.kf_ids.tolist() if k in self._odom_T_kfs]
-        if not known:
-            return
-        newest = max(known)
-        odom_T_map = se3.inverse(update.map_T_odom)
-        row = int(np.flatnonzero(update.kf_ids == newest)[0])
-        moved = odom_T_map @ update.map_T_kf[row] @ se3.inverse(self._odom_T_kfs[newest])
-        self._odom_T_kfs = {k: moved @ pose for k, pose in self._odom_T_kfs.items() if k >= newest}
-        self._odom_T_cam, self._odom_T_last = moved @ self._odom_T_cam, moved @ self._odom_T_last
-        self._odom_T_kf = moved @ self._odom_T_kf
 
     def step(self, image: StereoImage) -> tuple[Frame, Keyframe | None]:
         """Track one image."""
@@ -162,7 +151,7 @@ class FeatureTracker:
         """No motion: keep moving as before; after several such frames start again there as a new submap."""
         self._lost += 1
         self._odom_T_cam = self._odom_T_cam @ self._velocity
-        if self._lost < LOST_BEFORE_RESTART or len(view) < self._odometry.min_inliers:
+        if self._lost <= self._config.tracker.lost_frames or len(view) < self._odometry.min_inliers:
             return self._frame(image, view, None, TrackState.LOST, reason, False), None
         self._lost = 0
         self._submap += 1
@@ -201,7 +190,7 @@ class FeatureTracker:
         self._kf_id += 1
         self._keyframe = view
         self._odom_T_kf = self._odom_T_cam
-        self._odom_T_kfs[self._kf_id] = self._odom_T_cam
+        self._kf_poses.add(self._kf_id, self._odom_T_cam)
         self._frames_since_kf = 0
         keyframe = keyframe_of(view, image.stamp_ns, self._kf_id, self._odom_T_cam, self._submap)
         if self._place_corners is None:

@@ -11,6 +11,7 @@ from stereo_sfm.config import FeaturesConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.stereo import triangulate
 from stereo_sfm.geometry.two_view import epipolar_residuals, essential_from_motion
+from stereo_sfm.tracking.depth_image import points_from_depth
 from stereo_sfm.tracking.features.extraction import Extractor, Features, feature_kind
 from stereo_sfm.tracking.features.matching import epipolar_inliers, match_features
 from stereo_sfm.types import F64, I32, I64, U8, Bool, Message, StereoImage
@@ -36,17 +37,6 @@ class FeatureView(Message):
         return len(self.bearings)
 
 
-def _depth_points(image: StereoImage, uv: F64, bearings: F64, rig: Rig) -> tuple[F64, F64]:
-    """Points and virtual right observations from a depth image: u_right = u_left - fx * baseline / depth."""
-    assert image.depth is not None
-    column, row = np.rint(uv).astype(int).T
-    height, width = image.depth.shape
-    depth = image.depth[row.clip(0, height - 1), column.clip(0, width - 1)].astype(float)
-    depth[~(depth > 0)] = np.nan
-    right = np.stack([uv[:, 0] - rig.left.fx * rig.baseline / depth, np.where(depth > 0, uv[:, 1], np.nan)], axis=1)
-    return bearings * (depth / bearings[:, 2])[:, None], right
-
-
 class ViewMaker:
     """Extraction, stereo matching and triangulation."""
 
@@ -67,7 +57,7 @@ class ViewMaker:
         features, bearings = features.rows(seen), bearings[seen]
         points, right = np.full((len(features), 3), np.nan), np.full((len(features), 2), np.nan)
         if image.depth is not None:
-            points, right = _depth_points(image, features.uv, bearings, self._rig)
+            points, right = points_from_depth(self._rig, image.depth, features.uv)
         elif image.right is not None and self._rig.right is not None:
             points, right = self._stereo(image.right, features, bearings, rng)
         if self._rig.stereo and self._config.stereo_only:

@@ -21,6 +21,7 @@ from stereo_sfm.timing import NoSpans
 from stereo_sfm.tracking.features.extraction import feature_kind
 from stereo_sfm.tracking.features.feature_view import FeatureView, ViewMaker
 from stereo_sfm.tracking.features.local_points import LocalPoints
+from stereo_sfm.tracking.features.map_correction import KeyframePoses
 from stereo_sfm.tracking.features.matching import epipolar_inliers, match_features
 from stereo_sfm.tracking.features.monocular_start import MIN_MATCHES, good_points, start_from
 from stereo_sfm.tracking.features.odometry.pnp import pnp_pose
@@ -29,7 +30,6 @@ from stereo_sfm.tracking.features.point_ids import PointIds
 from stereo_sfm.types import F64, I64, Bool, Frame, Keyframe, MapUpdate, StereoImage, TrackState
 
 _FIRST_VIEW_LASTS = 60  # frames that a first view waits for its partner
-_LOST_BEFORE_RESTART = 30  # frames without a pose after which a new map is begun
 _MAX_STEP = 0.5  # of the median distance of the points: a larger step between frames is no motion but an error
 _MAX_TURN = np.radians(30.0)
 _REPROJECT_PX = 3.0
@@ -53,7 +53,7 @@ class MonocularTracker:
         self._kf_id, self._submap = -1, 0
         self._odom_T_cam = np.eye(4)
         self._odom_T_kf = np.eye(4)
-        self._odom_T_kfs: dict[int, F64] = {}  # keyframes whose answer is still to come
+        self._kf_poses = KeyframePoses()
         self._velocity = np.eye(4)
         self._frames_since_kf = self._lost = self._map_version = 0
         self._force_keyframe = False
@@ -63,13 +63,8 @@ class MonocularTracker:
         self._map_version = update.version
         self._ids.fuse(update.fused_point_ids)
         self._local.apply(update, self._ids)
-        known = [k for k in update.kf_ids.tolist() if k in self._odom_T_kfs]
-        if known:
-            newest = max(known)
-            row = int(np.flatnonzero(update.kf_ids == newest)[0])
-            after = se3.inverse(update.map_T_odom) @ update.map_T_kf[row]
-            moved = after @ se3.inverse(self._odom_T_kfs[newest])
-            self._odom_T_kfs = {k: moved @ pose for k, pose in self._odom_T_kfs.items() if k >= newest}
+        moved = self._kf_poses.correct(update)
+        if moved is not None:
             self._odom_T_cam, self._odom_T_kf = moved @ self._odom_T_cam, moved @ self._odom_T_kf
         if self._keyframe is not None:
             self._keyframe = self._with_positions(self._keyframe, self._odom_T_kf)
@@ -218,7 +213,7 @@ class MonocularTracker:
         self._lost += 1
         if self._lost <= 3:
             self._odom_T_cam = self._odom_T_cam @ self._velocity
-        if self._lost >= _LOST_BEFORE_RESTART:
+        if self._lost > self._config.tracker.lost_frames:
             self._submap += 1
             self._lost = 0
             self._keyframe = None
@@ -232,7 +227,7 @@ class MonocularTracker:
         self._kf_id += 1
         self._local.add(view, odom_T_cam)
         self._keyframe, self._odom_T_kf = view, odom_T_cam
-        self._odom_T_kfs[self._kf_id] = odom_T_cam
+        self._kf_poses.add(self._kf_id, odom_T_cam)
         self._frames_since_kf = 0
         return keyframe_of(view, stamp_ns, self._kf_id, odom_T_cam, self._submap)
 
@@ -255,7 +250,7 @@ class MonocularTracker:
             reason=reason,
             observations=observations_of(view),
             reference_kf_id=self._kf_id,
-            kf_T_cam=se3.inverse(self._odom_T_kfs.get(self._kf_id, np.eye(4))) @ self._odom_T_cam,
+            kf_T_cam=se3.inverse(self._kf_poses.pose(self._kf_id)) @ self._odom_T_cam,
             map_version=self._map_version,
             is_keyframe=is_keyframe,
             stats={"features": float(len(view)), "inliers": float(inliers)},

@@ -9,13 +9,13 @@ import numpy as np
 from calib.rig import Rig
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
+from stereo_sfm.tracking.depth_image import points_from_depth
 from stereo_sfm.tracking.flow import klt
-from stereo_sfm.tracking.flow.stereo_cameras import Eyes
+from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.tracking.flow.stereo_match import patch_sums, search_epipolar, triangulate
 from stereo_sfm.types import F32, F64, Bool, StereoImage
 
 SEARCH_LEVEL = 1
-DEPTH_STEP = 0.04  # relative depth difference around a pixel that counts as an edge
 CLOSE = 4.0  # sigmas
 
 
@@ -37,7 +37,7 @@ class StereoMatcher:
     def __init__(self, config: TrackerConfig, rig: Rig) -> None:
         self._config = config
         self._rig = rig
-        self._eyes = Eyes.of(rig)
+        self._cameras = StereoCameras.of(rig)
         self._min_depth = config.min_depth_baselines * rig.baseline
         reach = rig.left.fx / config.min_depth_baselines
         self._candidates = int(np.clip(reach / 2**SEARCH_LEVEL * 1.2, 16, 160))
@@ -59,7 +59,7 @@ class StereoMatcher:
         points_cam = se3.transform(se3.inverse(predicted), points)
         guess_left = self._rig.left.project(points_cam)
         assert self._rig.right is not None
-        guess = self._rig.right.project(se3.transform(self._eyes.right_T_left, points_cam)) + uv - guess_left
+        guess = self._rig.right.project(se3.transform(self._cameras.right_T_left, points_cam)) + uv - guess_left
         return self._refine(left, right, uv, guess, 0)
 
     def match(self, left: klt.Pyramid, right: klt.Pyramid | F32, uv: F64) -> StereoMatch:
@@ -95,13 +95,13 @@ class StereoMatcher:
         """Right pixels (N, 2) to the pixel of the search level, NaN where nothing is alike."""
         return search_epipolar(
             left[SEARCH_LEVEL], right[SEARCH_LEVEL], patch_sums(right[SEARCH_LEVEL]), uv, 2.0**SEARCH_LEVEL,
-            *self._eyes.cams, self._eyes.right_T_left, self._min_depth, self._candidates, 25.0, 1.2,
+            *self._cameras.cams, self._cameras.right_T_left, self._min_depth, self._candidates, 25.0, 1.2,
         )  # fmt: skip
 
     def _triangulated(self, uv: F64, uv_right: F64, good: Bool, max_epipolar_px: float, least: float) -> StereoMatch:
         """`least`: inverse distance in its sigmas; a far point may come out behind the camera by noise."""
         bearing, rho, variance, epipolar = triangulate(
-            uv, uv_right, *self._eyes.cams, self._eyes.left_T_right, self._config.sigma_px
+            uv, uv_right, *self._cameras.cams, self._cameras.left_T_right, self._config.sigma_px
         )
         with np.errstate(invalid="ignore"):
             good &= (epipolar < max_epipolar_px) & (rho > least * np.sqrt(variance))
@@ -127,16 +127,5 @@ class StereoMatcher:
 
     def _from_depth(self, depth: F32, uv: F64) -> tuple[F64, Bool]:
         """Virtual right pixels from a depth image, NaN where it has a hole or an edge."""
-        inside = self._rig.left.inside(uv, 2.0)
-        u = np.where(inside, np.rint(uv[:, 0]), 2).astype(np.int64)
-        v = np.where(inside, np.rint(uv[:, 1]), 2).astype(np.int64)
-        around = np.stack([depth[v + dy, u + dx] for dy in (-1, 0, 1) for dx in (-1, 0, 1)])
-        with np.errstate(invalid="ignore"):
-            smooth = np.ptp(around, axis=0) < DEPTH_STEP * around[4]
-        good = inside & smooth & (around[4] > 0)
-        bearing = self._rig.left.unproject(uv[good])
-        points = bearing / bearing[:, 2:] * around.mean(0)[good, None]
-        assert self._rig.right is not None
-        uv_right = np.full(uv.shape, np.nan)
-        uv_right[good] = self._rig.right.project(se3.transform(self._eyes.right_T_left, points))
+        uv_right = points_from_depth(self._rig, depth, uv)[1]
         return uv_right, np.isfinite(uv_right[:, 0])

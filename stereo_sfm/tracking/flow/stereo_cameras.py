@@ -13,8 +13,8 @@ from stereo_sfm.types import F64
 
 
 @dataclass(frozen=True)
-class Eyes:
-    """Model ids and parameters of both eyes, and where they are."""
+class StereoCameras:
+    """Model ids and parameters of both cameras, and where they are."""
 
     model_l: int
     params_l: F64
@@ -29,13 +29,13 @@ class Eyes:
         return self.model_l, self.params_l, self.model_r, self.params_r
 
     @staticmethod
-    def of(rig: Rig) -> Eyes:
-        """Raises StereoSfmError for a rig with one eye."""
+    def of(rig: Rig) -> StereoCameras:
+        """Raises StereoSfmError for a rig with one camera."""
         if rig.right is None:
             raise StereoSfmError(
                 "the default tracker needs a stereo or RGB-D source (for one camera: --preset cpp-course)"
             )
-        return Eyes(
+        return StereoCameras(
             rig.left.model_id,
             rig.left.params,
             rig.right.model_id,

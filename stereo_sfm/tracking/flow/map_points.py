@@ -1,0 +1,54 @@
+"""What the mapper knows better about the points that are followed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stereo_sfm.geometry import se3
+from stereo_sfm.tracking.flow.tracks import Tracks
+from stereo_sfm.types import F64, I64, Bool, MapUpdate
+
+NEAREST_M = 1e-6
+
+
+def take_update(tracks: Tracks, update: MapUpdate) -> Tracks:
+    """The tracks with fused points under one id, without culled ones, and placed where the map places them."""
+    tracks = _without_culled(_fused(tracks, update.fused_point_ids), update.culled_point_ids)
+    rows, found = _rows_of(update.point_ids, tracks.point_ids)
+    if len(found):
+        _place(tracks, rows, se3.transform(se3.inverse(update.map_T_odom), update.points_map[found]))
+    return tracks
+
+
+def _fused(tracks: Tracks, pairs: I64) -> Tracks:
+    """Ids replaced by those that live on, (D, 2) old and new; each id once, the older track stays."""
+    old, first = np.unique(pairs[:, 0], return_index=True)
+    if not len(old):
+        return tracks
+    rows, found = _rows_of(old, tracks.point_ids)
+    tracks.point_ids[rows] = pairs[first[found], 1]
+    _, once = np.unique(tracks.point_ids, return_index=True)
+    return tracks.keep(np.isin(np.arange(len(tracks)), once))
+
+
+def _without_culled(tracks: Tracks, culled: I64) -> Tracks:
+    return tracks.keep(~np.isin(tracks.point_ids, culled)) if len(culled) else tracks
+
+
+def _rows_of(ids: I64, wanted: I64) -> tuple[Bool, I64]:
+    """Which of the wanted ids (N,) are in `ids`, as a mask (N,), and where each of those is."""
+    if not len(ids) or not len(wanted):
+        return np.zeros(len(wanted), bool), np.zeros(0, np.int64)
+    order = np.argsort(ids, kind="stable")
+    at = order[np.clip(np.searchsorted(ids[order], wanted), 0, len(ids) - 1)]
+    hit = ids[at] == wanted
+    return hit, at[hit]
+
+
+def _place(tracks: Tracks, rows: Bool, points: F64) -> None:
+    """Put some tracks at points (M, 3) of the odometry frame, along new rays from where they were first seen."""
+    ray = points - tracks.origin[rows]
+    distance = np.maximum(np.linalg.norm(ray, axis=1), NEAREST_M)
+    tracks.direction[rows] = ray / distance[:, None]
+    tracks.rho[rows] = 1.0 / distance
+    tracks.mapped[rows] = True

@@ -1,0 +1,64 @@
+"""New points where some are missing: corners of the left image that the second camera sees as well."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from calib.rig import Rig
+from stereo_sfm.config import TrackerConfig
+from stereo_sfm.tracking.flow.corners import corner_mask, detect_corners
+from stereo_sfm.tracking.flow.follower import Follower
+from stereo_sfm.tracking.flow.pyramids import StereoPyramids
+from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
+from stereo_sfm.tracking.flow.stereo import StereoMatcher
+from stereo_sfm.tracking.flow.tracks import Tracks
+from stereo_sfm.types import F64
+
+LEAST_RHO = 1e-4  # 1/m
+
+
+class NewPoints:
+    """Finds them, spread over the image; point ids are never used again."""
+
+    def __init__(
+        self, config: TrackerConfig, rig: Rig, stereo: StereoMatcher, follower: Follower, shutter: RollingShutter
+    ) -> None:
+        self._config, self._stereo, self._follower, self._shutter = config, stereo, follower, shutter
+        self._mask = corner_mask(rig.left, config.max_angle_deg)
+        area = 4.0 * self._mask.sum()
+        self._spacing = 0.75 * math.sqrt(area / config.max_features)
+        self._next_point_id = 0
+
+    def add(self, tracks: Tracks, images: StereoPyramids, pose: F64, velocity: F64) -> Tracks:
+        """The tracks with new ones behind them, up to max_features; pose (4, 4) and velocity (6,) of the image."""
+        config = self._config
+        missing = config.max_features - len(tracks)
+        if missing <= 0:
+            return tracks
+        corners = detect_corners(images.left[1], self._mask, tracks.uv, missing, self._spacing, config.corner_quality)
+        match = self._stereo.match(images.left, images.right, corners)
+        good = np.flatnonzero(match.good)
+        rows, slots = self._follower.begin(images.left, match.uv_left[good])
+        new, n = good[rows], len(rows)
+        origin, direction = self._shutter.rays(pose, velocity, match.uv_left[new], match.bearing[new])
+        tracks = tracks.append(
+            Tracks(
+                point_ids=self._next_point_id + np.arange(n, dtype=np.int64),
+                uv=match.uv_left[new],
+                uv_right=match.uv_right[new],
+                origin=origin,
+                direction=direction,
+                rho=np.maximum(match.rho[new], LEAST_RHO),
+                variance=match.variance[new],
+                age=np.zeros(n, np.int32),
+                misses=np.zeros(n, np.int32),
+                warp=np.tile(np.eye(2), (n, 1, 1)),
+                slot=slots,
+                mapped=np.zeros(n, bool),
+            )
+        )
+        self._next_point_id += n
+        self._follower.keep_only(tracks)
+        return tracks
