@@ -1,7 +1,8 @@
 """What people do to a robot: come at it, stop before it, cover its lenses, push a cart past, walk along with it.
 
-An encounter is a function of time: where people and their things are, given where the robot's walk is. Places are metres
-along the robot's route (ahead of it) and aside (to its left), so that an encounter follows the aisle round a corner.
+An encounter is a function of time: where people and their things are, given where the robot's walk is. Places are
+metres along the robot's route (ahead of it) and aside (to its left), so that an encounter follows the aisle round a
+corner.
 Everything random is drawn when the encounter is planned.
 """
 
@@ -79,7 +80,7 @@ def _person(walk: Walk, looks: Looks, metres: float, aside: float, towards: bool
 
 
 def _approach(walk: Walk, begin: float, rng: np.random.Generator) -> Encounter:
-    """Straight at the robot up to a hand's breadth or half a metre, there for up to a second, then aside and past it."""
+    """Straight at the robot, up to a hand's breadth or half a metre, there for up to a second, then past it."""
     looks, speed = Looks.random(rng), float(rng.uniform(0.8, 1.3))
     middle, side = float(rng.uniform(-0.12, 0.12)), float(rng.choice([-1, 1])) * float(rng.uniform(0.36, 0.45))
     gap, hesitation = float(rng.uniform(0.24, 0.6)), float(rng.uniform(0.0, 1.0))
