@@ -143,7 +143,7 @@ def words_alone(walk: SparseWalk, vocabulary: Vocabulary, config: LoopConfig) ->
 
 
 WAYS = {
-    "words and geometry": LoopConfig(gate_metres=1e3, gate_degrees=360.0, consistent=1, proximity=False),
+    "words and geometry": LoopConfig(gate_m=1e3, gate_deg=360.0, consistent=1, proximity=False),
     "all": LoopConfig(),
     "all, paper's rules": LoopConfig(reference="best", min_match_fraction=0.3, proximity=False),
 }

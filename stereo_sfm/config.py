@@ -1,8 +1,12 @@
-"""One tree of frozen dataclasses whose defaults work; load, merge, dump. Unknown keys are errors."""
+"""One tree of frozen dataclasses whose defaults work; load, merge, dump. Unknown keys are errors.
+
+Each setting stands with its default, the values that it takes, and one sentence (`stereo_sfm.settings`).
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import logging
 import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -10,128 +14,161 @@ from pathlib import Path
 from typing import Any
 
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.settings import check, check_names, explained, number, path, switch, word
 
-MOST = 10**9  # that any whole number of the configuration may be
+MOST_CORES = 1024  # of a machine
 
-
-def one_of(*words: str) -> Any:
-    """A field that takes one of these words, the first by default."""
-    return field(default=words[0], metadata={"words": words})
-
-
-def above_zero(default: float) -> Any:
-    """A field that must be above 0; all other numbers must be at least 0."""
-    return field(default=default, metadata={"above_zero": True})
-
-
-def within(least: int, most: int, default: int) -> Any:
-    """A field that takes whole numbers from `least` to `most`."""
-    return field(default=default, metadata={"range": (least, most)})
+# Names of earlier versions, in files and in the logs of old runs -> the name of today.
+RENAMED = {
+    "tracker.max_error": "tracker.max_error_sigmas",
+    "manhattan.model_deg": "manhattan.model_sigma_deg",
+    "manhattan.drift_deg_per_frame": "manhattan.drift_sigma_deg_per_frame",
+    "mapper.huber": "mapper.huber_sigmas",
+    "mapper.max_error": "mapper.max_error_sigmas",
+    "mapper.match_distance": "mapper.match_distance_bits",
+    "loop.max_distance": "loop.max_distance_bits",
+    "loop.pixel_sigma": "loop.sigma_px",
+    "loop.disparity_sigma": "loop.disparity_sigma_px",
+    "loop.unknown_way_share": "loop.min_inlier_share_after_gap",
+    "loop.gate_metres": "loop.gate_m",
+    "loop.gate_per_metre": "loop.gate_m_per_m",
+    "loop.gate_degrees": "loop.gate_deg",
+    "loop.gate_degrees_per_metre": "loop.gate_deg_per_m",
+}
 
 
 @dataclass(frozen=True)
 class TrackerConfig:
-    """The default tracker (tracking/tracker.py)."""
+    """The default tracker (tracking/flow/)."""
 
-    max_features: int = within(1, 20_000, 400)  # points tracked at once
-    min_features: int = within(3, 10_000, 15)  # inliers below which a frame is lost
-    pyramid_levels: int = within(2, 10, 4)
-    min_contrast: float = 2.0  # grey levels of standard deviation; flatter windows are no points
-    min_ncc: float = 0.6  # of a window with the previous frame's
-    min_anchor_ncc: float = 0.85  # of a window with the point's first appearance, affinely deformed
-    max_angle_deg: float = 88.0  # from the optical axis; beyond it a fisheye image is not used
-    corner_quality: float = 0.005  # least corner response, as a share of the strong ones in the image
-    min_depth_baselines: float = above_zero(4.0)  # nearest stereo match searched, in baselines
-    sigma_px: float = above_zero(0.3)  # noise of one coordinate of an observation, to start with: follows the residuals
-    depth_sigma_px: float = above_zero(3.0)  # the same when a depth is refined from frame to frame: errors repeat
-    max_error: float = above_zero(3.0)  # sigmas; a worse observation is no inlier
-    max_epipolar_px: float = above_zero(1.0)  # distance of a stereo match from its epipolar curve
-    max_window_disparity_px: float = 0.15  # a narrow and a wide window must agree on the disparity: no depth edge in it
-    keyframe_share: float = 0.75  # new keyframe when fewer of the last keyframe's points are still tracked
-    keyframe_max_frames: int = 30
-    lost_frames: int = 15  # frames without a pose after which a new submap begins, whichever the tracker
+    max_features: int = number(400, 1, 20_000, "Points followed at once")
+    min_features: int = number(15, 3, 10_000, "Inliers below which a frame is lost")
+    pyramid_levels: int = number(4, 2, 10, "Levels of the image pyramid, each half as large")
+    min_contrast: float = number(2.0, 0, 255, "Grey levels of standard deviation below which a window is no point")
+    min_ncc: float = number(0.6, -1, 1, "Correlation of a window with the previous frame's below which it is dropped")
+    min_anchor_ncc: float = number(0.85, -1, 1, "The same with the point's first appearance, affinely deformed")
+    max_angle_deg: float = number(88.0, 1, 180, "Angle from the optical axis beyond which an image is not used")
+    corner_quality: float = number(0.005, 0, 1, "Least corner response, as a share of the strong ones in the image")
+    min_depth_baselines: float = number(4.0, 0.1, 1000, "Nearest stereo match that is searched, in baselines")
+    sigma_px: float = number(0.3, 0.001, 100, "Noise of one coordinate of an observation at the start of a run")
+    depth_sigma_px: float = number(
+        3.0, 0.001, 1000, "Noise of an observation that refines a depth: its errors repeat from frame to frame"
+    )
+    max_error_sigmas: float = number(3.0, 0.1, 1000, "Residual above which an observation is no inlier")
+    max_epipolar_px: float = number(1.0, 0.01, 100, "Distance of a stereo match from its epipolar curve")
+    max_window_disparity_px: float = number(
+        0.15, 0, 100, "Difference of the disparities of a narrow and a wide window: more is an edge in depth"
+    )
+    keyframe_share: float = number(0.75, 0, 1, "New keyframe when a smaller share of the last one's points is left")
+    keyframe_max_frames: int = number(30, 1, 100_000, "Frames that a keyframe represents at most")
+    lost_frames: int = number(
+        15, 0, 100_000, "Frames without a pose after which a new submap begins, whichever the tracker"
+    )
 
 
 @dataclass(frozen=True)
 class FeaturesConfig:
-    """Descriptors and matching of the selectable trackers (tracking/features.py, tracking/matching.py)."""
+    """Descriptors and matching of the selectable trackers (tracking/features/)."""
 
-    kind: str = "sift"  # orb | sift | akaze
-    count: int = 0  # most keypoints of an image; 0: what OpenCV's own default is (ORB 500, the others no limit)
-    ratio: float = above_zero(0.8)  # Lowe's: best distance below this share of the second best
-    mask_radius_px: float = 0.0  # keypoints only this near to the last keyframe's stereo points; 0: everywhere
-    stereo_check: str = one_of("rig", "ransac")  # epipolar check of left-right matches: calibrated | estimated
-    epipolar_px: float = above_zero(1.5)  # largest distance to the epipolar line, in pixels at the image centre
-    stereo_only: bool = True  # with two eyes, only points that both see (as the thesis)
-    motion_check: bool = False  # fundamental RANSAC on matches between frames too, before the estimator's own
-    motion_window_deg: float = 0.0  # drop matches that moved by more than this angle between frames; 0: keep all
+    kind: str = word("sift", ("orb", "sift", "akaze"), "Detector and descriptor")
+    count: int = number(0, 0, 100_000, "Most keypoints of an image; 0: OpenCV's own default (ORB 500, others no limit)")
+    ratio: float = number(0.8, 0.01, 1, "Lowe's ratio: best distance below this share of the second best")
+    mask_radius_px: float = number(
+        0.0, 0, 100_000, "Keypoints only this near to the last keyframe's stereo points; 0: everywhere"
+    )
+    stereo_check: str = word("rig", ("rig", "ransac"), "Epipolar check of left-right matches: calibrated or estimated")
+    epipolar_px: float = number(1.5, 0.01, 1000, "Largest distance to the epipolar line, in pixels at the image centre")
+    stereo_only: bool = switch(True, "With two cameras, only points that both see (as the thesis)")
+    motion_check: bool = switch(False, "Fundamental RANSAC on matches between frames before the estimator's own")
+    motion_window_deg: float = number(
+        0.0, 0, 360, "Matches that moved by more than this angle between frames are dropped; 0: none"
+    )
 
 
 @dataclass(frozen=True)
 class OdometryConfig:
-    """Which motion estimator, and its policy (tracking/odometry/); "flow" is the default tracker."""
+    """Which motion estimator, and its policy (tracking/features/odometry/); "flow" is the default tracker."""
 
-    method: str = "flow"  # flow | em-r | vp-r | r-um | um | eight-point | pnp
-    reference: str = one_of("frame", "keyframe")  # motion is estimated from the previous frame or the last keyframe
-    refine: bool = True  # least squares over all inliers after the minimal solver
-    weighted: bool = True  # weigh 3D points by their stereo uncertainty; False: plain means, as the papers
-    epipolar_px: float = above_zero(1.0)  # inlier of an essential matrix, in pixels at the image centre
-    inlier_m: float = 0.05  # inlier of 3D-3D estimators at any depth, metres
-    inlier_sigmas: float = 3.0  # and on top this many standard deviations of the stereo depth; 0: a fixed threshold
-    max_samples: int = above_zero(512)  # RANSAC hypotheses
-    min_inliers: int = above_zero(8)
-    scale: str = one_of("stereo", "unit", "ground-truth")  # of translations without metric points
-    unit_step_m: float = above_zero(1.0)  # length of one step with scale "unit"
-    keyframe_ratio: float = 0.3  # new keyframe when fewer of the last keyframe's points are tracked
-    keyframe_frames: int = 30  # a keyframe represents at most this many frames
-    keyframe_min_frames: int = 0  # and at least this many
-    keyframe_min_inliers: int = 0  # new keyframe below this number of inliers; 0: the ratio decides
-    keyframe_rescue_inliers: int = 0  # below this number at once, whatever the other rules say
-    monocular: bool = False  # use the left eye alone, whatever the source has (pnp)
-    init_share: float = 0.9  # monocular start: matches that must fit the essential matrix (C++ course system)
-    init_epipolar_px: float = 2.0  # monocular start: what counts as fitting
-    init_parallax_deg: float = 1.0  # monocular start: least median parallax
+    method: str = word("flow", ("flow", "em-r", "vp-r", "r-um", "um", "eight-point", "pnp"), "Motion estimator")
+    reference: str = word(
+        "frame", ("frame", "keyframe"), "Motion is estimated from the previous frame or the last keyframe"
+    )
+    refine: bool = switch(True, "Least squares over all inliers after the minimal solver")
+    weighted: bool = switch(True, "Weigh 3D points by their stereo uncertainty; false: plain means, as the papers")
+    epipolar_px: float = number(1.0, 0.01, 1000, "Inlier of an essential matrix, in pixels at the image centre")
+    inlier_m: float = number(0.05, 0, 1000, "Inlier of 3D-3D estimators at any depth")
+    inlier_sigmas: float = number(
+        3.0, 0, 1000, "Standard deviations of the stereo depth added to inlier_m; 0: a fixed threshold"
+    )
+    max_samples: int = number(512, 1, 1_000_000, "RANSAC hypotheses")
+    min_inliers: int = number(8, 1, 100_000, "Inliers below which a frame is lost")
+    scale: str = word("stereo", ("stereo", "unit", "ground-truth"), "Scale of translations without metric points")
+    unit_step_m: float = number(1.0, 1e-9, 1e6, 'Length of one step with scale "unit"')
+    keyframe_ratio: float = number(0.3, 0, 1, "New keyframe when a smaller share of the last one's points is tracked")
+    keyframe_frames: int = number(30, 0, 100_000, "Frames that a keyframe represents at most; 0: no limit")
+    keyframe_min_frames: int = number(0, 0, 100_000, "Frames that a keyframe represents at least")
+    keyframe_min_inliers: int = number(0, 0, 100_000, "New keyframe below this many inliers; 0: the ratio decides")
+    keyframe_rescue_inliers: int = number(0, 0, 100_000, "New keyframe at once below this many inliers")
+    monocular: bool = switch(False, "Use the left camera alone, whatever the source has (pnp)")
+    init_share: float = number(0.9, 0, 1, "Monocular start: share of the matches that must fit the essential matrix")
+    init_epipolar_px: float = number(2.0, 0.01, 1000, "Monocular start: what counts as fitting")
+    init_parallax_deg: float = number(1.0, 0, 90, "Monocular start: least median parallax")
 
 
 @dataclass(frozen=True)
 class ManhattanConfig:
-    """Rotation prior from the world's three directions (tracking/manhattan_prior.py)."""
+    """Rotation prior from the world's three directions (tracking/flow/)."""
 
-    enabled: bool = False
-    every: int = above_zero(15)  # frames between measurements: finding the lines costs several frames of tracking
-    settle_frames: int = 10  # measurements that must agree before the axes are believed
-    gate_deg: float = 3.0  # a measurement further from the prediction is refused
-    model_deg: float = above_zero(0.15)  # how exactly the world follows three directions
-    drift_deg_per_frame: float = 0.01  # standard deviation of the tracker's rotation, grows with the root of the frames
+    enabled: bool = switch(False, "Correct the odometry's rotation by the building's three directions")
+    every: int = number(
+        15, 1, 10_000_000, "Frames from one measurement to the next; one costs several frames of tracking"
+    )
+    settle_frames: int = number(10, 1, 100_000, "Measurements that must agree before the axes are believed")
+    gate_deg: float = number(3.0, 0, 180, "Distance from the prediction above which a measurement is refused")
+    model_sigma_deg: float = number(0.15, 1e-6, 90, "How exactly the world follows three directions")
+    drift_sigma_deg_per_frame: float = number(
+        0.01, 0, 90, "The tracker's rotation error in one frame; it grows with the root of the frames"
+    )
 
 
 @dataclass(frozen=True)
 class MapperConfig:
     """Local mapping (mapping/mapper.py)."""
 
-    enabled: bool = True
-    window_keyframes: int = 12  # keyframes that local bundle adjustment moves, the new one included; 0: all connected
-    connected_points: int = 15  # shared points that make two keyframes neighbours
-    sigma_px: float = above_zero(0.4)  # noise of one coordinate of a tracked point
-    huber: float = 0.75  # sigmas; narrow, for depths near edges err to one side and would bend the scale
-    rounds: int = 2  # of bundle adjustment, outliers are judged between them
-    iterations: int = 5  # of a round
-    # "tracks": identity only; "map": also by descriptors; "previous": the retail paper's rule
-    association: str = one_of("map", "tracks", "previous")
-    match_radius_px: float = 10.0  # around the predicted pixel, in both eyes
-    match_distance: int = 50  # differing bits of 256
-    match_ratio: float = 0.85  # best / second best
-    match_sigma_px: float = above_zero(1.0)  # noise of one coordinate of a point found again by its descriptor
-    match_min: int = 12  # fewer agreeing matches are not believed
-    near_keyframes: int = 10  # keyframes standing close by whose points are searched too
-    near_depths: float = 0.3  # how close, in median depths of the new keyframe
-    min_observations: int = 2  # keyframes below which a point that is no longer tracked is culled
-    max_error: float = 3.0  # sigmas; a point whose observations are on average worse is culled
-    min_parallax_deg: float = 0.1  # rays, both eyes included, that never were further apart make a point too uncertain
-    redundant_share: float = 0.9  # a keyframe goes when so many of its points are seen by three others; above 1: never
-    crowd_keyframes: int = 5  # keyframes with the same view that stay
-    full_ba_growth: float = 1.15  # full bundle adjustment also when the map has grown by this factor since the last
-    full_ba_lag_keyframes: int = 5  # keyframes until its answer is applied (large maps: a tenth of theirs)
+    enabled: bool = switch(True, "Keep a map and adjust it; false: odometry alone")
+    window_keyframes: int = number(
+        12, 0, 10_000, "Keyframes that local bundle adjustment moves, the new one included; 0: all connected ones"
+    )
+    connected_points: int = number(15, 1, 100_000, "Shared points that make two keyframes neighbours")
+    sigma_px: float = number(0.4, 0.001, 100, "Noise of one coordinate of a tracked point")
+    huber_sigmas: float = number(
+        0.75, 0, 1000, "Residual where the loss becomes linear; narrow, as depths near edges err to one side"
+    )
+    rounds: int = number(2, 1, 100, "Rounds of bundle adjustment, outliers are judged between them")
+    iterations: int = number(5, 1, 1000, "Iterations of a round")
+    association: str = word(
+        "map",
+        ("map", "tracks", "previous"),
+        "Points are joined by tracks only, also by descriptors in the map, or with the previous keyframe",
+    )
+    match_radius_px: float = number(10.0, 0, 10_000, "Search radius around the predicted pixel, in both images")
+    match_distance_bits: int = number(50, 0, 256, "Largest distance of descriptors")
+    match_ratio: float = number(0.85, 0.01, 1, "Best distance below this share of the second best")
+    match_sigma_px: float = number(1.0, 0.001, 100, "Noise of one coordinate of a point found again by its descriptor")
+    match_min: int = number(12, 0, 100_000, "Agreeing matches below which none is believed")
+    near_keyframes: int = number(10, 0, 10_000, "Keyframes standing close by whose points are searched too")
+    near_depths: float = number(0.3, 0, 1000, "How close these stand, in median depths of the new keyframe")
+    min_observations: int = number(2, 0, 10_000, "Keyframes below which a point that is no longer tracked is culled")
+    max_error_sigmas: float = number(3.0, 0, 1000, "Mean error of a point's observations above which it is culled")
+    min_parallax_deg: float = number(0.1, 0, 90, "Largest angle between a point's rays below which it is too uncertain")
+    redundant_share: float = number(
+        0.9, 0, 10, "A keyframe goes when this share of its points is seen by three others; above 1: never"
+    )
+    crowd_keyframes: int = number(5, 1, 10_000, "Keyframes with the same view that stay")
+    full_ba_growth: float = number(1.15, 1, 1e6, "Full bundle adjustment when the map has grown by this factor")
+    full_ba_lag_keyframes: int = number(
+        5, 1, 10_000, "Keyframes until its answer is applied (in large maps a tenth of their keyframes)"
+    )
 
     @property
     def most_keyframes(self) -> int | None:
@@ -141,44 +178,54 @@ class MapperConfig:
 
 @dataclass(frozen=True)
 class LoopConfig:
-    """Loop closing (loop/closer.py)."""
+    """Loop closing (loop/closer.py), and finding the camera in a saved map."""
 
-    enabled: bool = True
-    correction: str = one_of("pose_graph", "averaging")  # how the loop's error is spread over the keyframes
-    robust: str = one_of("gnc", "switchable", "none")  # how the pose graph takes loops
-    vocabulary: str = ""  # vocabulary file; empty: the one of the package
-    grow_every: int = 0  # keyframes between growths of the vocabulary in a new environment; 0: never
-    score_ratio: float = 0.9  # candidates score above this times the reference score of the connected keyframes
-    reference: str = one_of("weakest", "best")  # reference: their weakest score (finds more) or best (retail paper)
-    min_score: float = 0.02  # ... and above this
-    connected_points: int = 15  # shared points that make two keyframes connected
-    min_gap: int = 10  # keyframes between a keyframe and its candidate
-    max_candidates: int = 3  # places verified per keyframe
-    corners: int = within(1, 20_000, 400)  # a keyframe is recognised by: tracked points are seldom detected again
-    proximity: bool = True  # verify also the old keyframe that should be nearest by odometry
-    pause: int = 10  # keyframes after an accepted loop in which none is searched
-    min_match_fraction: float = 0.15  # of the keyframe's corners that must match the candidate's (paper: 0.3)
-    max_distance: int = 60  # bits between matching descriptors
-    match_ratio: float = 0.9  # nearest / second nearest descriptor
-    pixel_sigma: float = above_zero(1.0)  # px, of a point found again from another side
-    disparity_sigma: float = above_zero(0.5)  # px, of a stereo point's disparity
-    ransac_iterations: int = above_zero(400)
-    min_inliers: int = above_zero(30)
-    min_inlier_share: float = 0.15  # ... and of the keyframe's corners
-    min_cells: int = 8  # of the 8 x 6 cells of the image that hold inliers
-    consistent: int = 2  # successive keyframes that must agree on a loop
-    consistent_window: int = 4  # ... within so many keyframes
-    unknown_way_share: float = 0.3  # share of inliers where tracking broke and odometry cannot speak for a loop
-    gate_metres: float = 0.3  # a loop may contradict odometry by this much ...
-    gate_per_metre: float = 0.01  # ... plus this for every metre walked since
-    gate_degrees: float = 3.0
-    gate_degrees_per_metre: float = 0.3
-    relocalize_candidates: int = 16  # places of a saved map that are verified
-    relocalize_keyframes: int = above_zero(6)  # keyframes whose points make up a place
-    relocalize_inliers: int = 56  # corners that must agree with the pose found in a saved map
-    relocalize_share: float = 0.25  # ... and so large a share of the camera's corners (near a guess: min_inlier_share)
-    relocalize_cells: int = 6  # ... in so many of the image's 8 x 6 cells
-    seed: int = 0  # of the samples of verification
+    enabled: bool = switch(True, "Look for loops")
+    correction: str = word(
+        "pose_graph", ("pose_graph", "averaging"), "How the loop's error is spread over the keyframes"
+    )
+    robust: str = word("gnc", ("gnc", "switchable", "none"), "How the pose graph withstands a false loop")
+    vocabulary: str = path("Vocabulary file; empty: the one of the package")
+    grow_every: int = number(0, 0, 1_000_000, "Keyframes between growths of the vocabulary in a new place; 0: never")
+    score_ratio: float = number(0.9, 0, 10, "Candidates score above this share of the connected keyframes' score")
+    reference: str = word(
+        "weakest", ("weakest", "best"), "Which of the connected keyframes' scores (weakest finds more; paper: best)"
+    )
+    min_score: float = number(0.02, 0, 1, "Score below which no candidate is considered")
+    connected_points: int = number(15, 1, 100_000, "Shared points that make two keyframes connected")
+    min_gap: int = number(10, 0, 1_000_000, "Keyframes between a keyframe and its candidate")
+    max_candidates: int = number(3, 1, 1000, "Places verified for a keyframe")
+    corners: int = number(
+        400, 1, 20_000, "Corners by which a keyframe is recognised: tracked points are seldom detected again"
+    )
+    proximity: bool = switch(True, "Verify also the old keyframe that should be nearest by odometry")
+    pause: int = number(10, 0, 1_000_000, "Keyframes after an accepted loop in which none is searched")
+    min_match_fraction: float = number(0.15, 0, 1, "Share of the keyframe's corners that must match (paper: 0.3)")
+    max_distance_bits: int = number(60, 0, 256, "Largest distance of matching descriptors")
+    match_ratio: float = number(0.9, 0.01, 1, "Nearest distance below this share of the second nearest")
+    sigma_px: float = number(1.0, 0.001, 100, "Noise of a point found again from another side")
+    disparity_sigma_px: float = number(0.5, 0.001, 100, "Noise of a stereo point's disparity")
+    ransac_iterations: int = number(400, 1, 1_000_000, "Hypotheses of the verification")
+    min_inliers: int = number(30, 1, 1_000_000, "Inliers below which a loop is refused")
+    min_inlier_share: float = number(0.15, 0, 1, "The same as a share of the keyframe's corners")
+    min_cells: int = number(8, 0, 48, "Of the image's 8 x 6 cells, those that must hold inliers")
+    consistent: int = number(2, 1, 1000, "Successive keyframes that must agree on a loop")
+    consistent_window: int = number(4, 1, 1000, "Keyframes within which they must agree")
+    min_inlier_share_after_gap: float = number(
+        0.3, 0, 1, "Share of inliers where tracking broke in between, so that odometry cannot speak for the loop"
+    )
+    gate_m: float = number(0.3, 0, 1e6, "Distance by which a loop may contradict odometry")
+    gate_m_per_m: float = number(0.01, 0, 1e3, "What is added for every metre travelled since")
+    gate_deg: float = number(3.0, 0, 360, "Angle by which a loop may contradict odometry")
+    gate_deg_per_m: float = number(0.3, 0, 360, "What is added for every metre travelled since")
+    relocalize_candidates: int = number(16, 1, 10_000, "Places of a saved map that are verified")
+    relocalize_keyframes: int = number(6, 1, 1000, "Keyframes whose points make up a place")
+    relocalize_inliers: int = number(56, 1, 100_000, "Corners that must agree with the pose found in a saved map")
+    relocalize_share: float = number(
+        0.25, 0, 1, "The same as a share of the camera's corners (near a guess: min_inlier_share)"
+    )
+    relocalize_cells: int = number(6, 0, 48, "Of the image's 8 x 6 cells, those that must hold them")
+    seed: int = number(0, 0, 10**9, "Of the samples of verification")
 
 
 STAGES = ("capture", "tracker", "mapper", "loop", "optimizer", "logger", "viewer")  # processes of a run
@@ -188,18 +235,21 @@ STAGES = ("capture", "tracker", "mapper", "loop", "optimizer", "logger", "viewer
 class PipelineConfig:
     """How the stages are wired (pipeline/)."""
 
-    update_lag_frames: int = within(1, 10_000, 5)  # a keyframe's MapUpdate is applied before this many frames later
-    loop_lag_keyframes: int = 2  # a keyframe's LoopResult reaches the mapper this many keyframes later
-    ring_slots: int = above_zero(8)  # image pairs in shared memory between capture and the stages
-    threads: int = above_zero(1)  # of OpenCV and BLAS in each process
-    cpus: dict[str, tuple[int, ...]] = field(default_factory=dict[str, tuple[int, ...]])  # stage -> cores it may use
+    update_lag_frames: int = number(5, 1, 10_000, "Frames after a keyframe before which its map update is applied")
+    loop_lag_keyframes: int = number(2, 0, 10_000, "Keyframes after which a keyframe's loop reaches the mapper")
+    ring_slots: int = number(8, 1, 1024, "Image pairs in shared memory between capture and the stages")
+    threads: int = number(1, 1, 256, "Threads of OpenCV and BLAS in each process")
+    cpus: dict[str, tuple[int, ...]] = field(
+        default_factory=dict[str, tuple[int, ...]],
+        metadata={"text": f"Cores that a stage may use, as tracker = [0, 1]; stages: {', '.join(STAGES)}"},
+    )
 
 
 @dataclass(frozen=True)
 class Config:
     """Everything that decides what a run computes. The resolved tree is saved with every run."""
 
-    seed: int = 0  # of the estimators of --odometry
+    seed: int = number(0, 0, 10**9, "Of the estimators of --odometry")
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     features: FeaturesConfig = field(default_factory=FeaturesConfig)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
@@ -209,7 +259,7 @@ class Config:
     pipeline: PipelineConfig = field(default_factory=PipelineConfig)
 
     def closes_loops(self, depth: bool, localize_only: bool) -> bool:
-        """Whether a run looks for loops: it maps, and its camera knows depth (two eyes, or a depth image)."""
+        """Whether a run looks for loops: it maps, and its camera knows depth (two cameras, or a depth image)."""
         return self.loop.enabled and self.mapper.enabled and depth and not localize_only
 
 
@@ -221,45 +271,57 @@ def _merge(base: dict[str, Any], extra: dict[str, Any]) -> dict[str, Any]:
     return out
 
 
+def renamed(data: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
+    """Nested values under the names of today, and the old names that were met."""
+    out, met = dict(data), list[str]()
+    for old, new in RENAMED.items():
+        (section, old_key), new_key = old.split("."), new.split(".")[1]
+        inside = out.get(section)
+        if isinstance(inside, dict) and old_key in inside:
+            moved: dict[str, Any] = dict(inside)  # pyright: ignore[reportUnknownArgumentType]
+            moved.setdefault(new_key, moved[old_key])
+            del moved[old_key]
+            out[section] = moved
+            met.append(old)
+    return out, met
+
+
+def _of_today(data: dict[str, Any]) -> dict[str, Any]:
+    """One layer of values under the names of today; says so where a name is an old one."""
+    out, met = renamed(data)
+    for old in met:
+        logging.getLogger("stereo_sfm").warning("configuration: %s is called %s now", old, RENAMED[old])
+    return out
+
+
 def from_dict(data: dict[str, Any]) -> Config:
-    """Nested plain values over the defaults.
+    """Nested plain values over the defaults; names of earlier versions are taken in silence.
 
     Raises:
-        StereoSfmError: an unknown key, a value of the wrong type, or one that its field does not take.
+        StereoSfmError: an unknown key, a value of the wrong type, or one that its setting does not take.
     """
     import dacite
 
+    data, _ = renamed(data)
+    check_names(Config(), data)
     merged = _merge(dataclasses.asdict(Config()), data)
     rules = dacite.Config(strict=True, type_hooks={float: _as_float}, cast=[tuple])
     try:
         config = dacite.from_dict(Config, merged, rules)
     except dacite.DaciteError as error:
         raise StereoSfmError(f"configuration: {error} (see 'stereo-sfm config dump' for every key)") from None
-    _check(config)
-    unknown = sorted(set(config.pipeline.cpus) - set(STAGES))
-    if unknown:
-        raise StereoSfmError(f"configuration: pipeline.cpus names '{unknown[0]}': the stages are {', '.join(STAGES)}")
+    check(config)
+    _check_cores(config.pipeline.cpus)
     return config
 
 
-def _check(section: Any, place: str = "") -> None:
-    """Raises StereoSfmError for a word or a number that a field does not take."""
-    for f in dataclasses.fields(section):
-        name, value = place + f.name, getattr(section, f.name)
-        words: tuple[str, ...] = f.metadata.get("words", ())
-        if dataclasses.is_dataclass(value):
-            _check(value, f"{name}.")
-        elif words and value not in words:
-            raise StereoSfmError(f"configuration: {name} is '{value}': choose one of {', '.join(words)}")
-        elif "range" in f.metadata and not f.metadata["range"][0] <= value <= f.metadata["range"][1]:
-            least, most = f.metadata["range"]
-            raise StereoSfmError(f"configuration: {name} is {value}: it must be from {least} to {most}")
-        elif isinstance(value, int) and value > MOST:
-            raise StereoSfmError(f"configuration: {name} is {value}: it is too large")
-        elif f.metadata.get("above_zero") and not value > 0:
-            raise StereoSfmError(f"configuration: {name} is {value:g}: it must be above 0")
-        elif isinstance(value, int | float) and not value >= 0:
-            raise StereoSfmError(f"configuration: {name} is {value:g}: it must be at least 0")
+def _check_cores(cpus: dict[str, tuple[int, ...]]) -> None:
+    unknown = sorted(set(cpus) - set(STAGES))
+    if unknown:
+        raise StereoSfmError(f"configuration: pipeline.cpus names '{unknown[0]}': the stages are {', '.join(STAGES)}")
+    wrong = [core for cores in cpus.values() for core in cores if not 0 <= core < MOST_CORES]
+    if wrong:
+        raise StereoSfmError(f"configuration: pipeline.cpus names core {wrong[0]}: cores are 0 to {MOST_CORES - 1}")
 
 
 def _as_float(value: Any) -> Any:
@@ -268,31 +330,38 @@ def _as_float(value: Any) -> Any:
 
 def load(path: Path | None = None, overrides: Iterable[str] = (), base: dict[str, Any] | None = None) -> Config:
     """Defaults, `base`, a TOML file, then `key.subkey=value` overrides, values read as TOML (else as text)."""
-    data: dict[str, Any] = base or {}
+    data: dict[str, Any] = _of_today(base or {})
     if path is not None:
-        try:
-            data = _merge(data, tomllib.loads(path.read_text("utf-8-sig")))
-        except FileNotFoundError:
-            raise StereoSfmError(f"no configuration file at {path}") from None
-        except OSError as error:
-            raise StereoSfmError(f"cannot read the configuration {path}: {error.strerror}") from None
-        except UnicodeDecodeError:
-            raise StereoSfmError(f"configuration {path}: it is no text (expected TOML)") from None
-        except tomllib.TOMLDecodeError as error:
-            raise StereoSfmError(f"configuration {path}: {error}") from None
+        data = _merge(data, _of_today(_read(path)))
     for override in overrides:
-        key, equals, value = override.partition("=")
-        if not equals:
-            raise StereoSfmError(f"--set takes key=value, got '{override}'")
-        try:
-            tree = tomllib.loads(f"{key} = {value}")
-        except tomllib.TOMLDecodeError:
-            try:
-                tree = tomllib.loads(f"{key} = {value!r}")
-            except tomllib.TOMLDecodeError:
-                raise StereoSfmError(f"--set cannot read '{override}'") from None
-        data = _merge(data, tree)
+        data = _merge(data, _of_today(_parsed(override)))
     return from_dict(data)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text("utf-8-sig"))
+    except FileNotFoundError:
+        raise StereoSfmError(f"no configuration file at {path}") from None
+    except OSError as error:
+        raise StereoSfmError(f"cannot read the configuration {path}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise StereoSfmError(f"configuration {path}: it is no text (expected TOML)") from None
+    except tomllib.TOMLDecodeError as error:
+        raise StereoSfmError(f"configuration {path}: {error}") from None
+
+
+def _parsed(override: str) -> dict[str, Any]:
+    """`key.subkey=value` as nested values."""
+    key, equals, value = override.partition("=")
+    if not equals:
+        raise StereoSfmError(f"--set takes key=value, got '{override}'")
+    for text in (value, repr(value)):
+        try:
+            return tomllib.loads(f"{key} = {text}")
+        except tomllib.TOMLDecodeError:
+            continue
+    raise StereoSfmError(f"--set cannot read '{override}'")
 
 
 def dump(config: Config) -> str:
@@ -300,3 +369,8 @@ def dump(config: Config) -> str:
     import tomli_w
 
     return tomli_w.dumps(dataclasses.asdict(config))
+
+
+def explain(config: Config) -> str:
+    """The same with a sentence above every setting."""
+    return explained(config)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Generator
+from collections.abc import Generator, Iterable
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -31,6 +31,14 @@ def from_os_error(error: OSError) -> StereoSfmError | None:
     if isinstance(error, FileExistsError):
         return StereoSfmError(f"{error.filename}: a file of that name is there already")
     return StereoSfmError(f"{error.filename}: {error.strerror}")
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """ ", did you mean NAME?" for a misspelt word of a list; "" where none is near."""
+    from difflib import get_close_matches
+
+    near = get_close_matches(word.lower(), known, 1)
+    return f", did you mean {near[0]}?" if near else ""
 
 
 @contextmanager

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import StereoSfmError, did_you_mean
 
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
@@ -58,5 +58,7 @@ def preset(name: str) -> dict[str, Any]:
         StereoSfmError: unknown name.
     """
     if name not in PRESETS:
-        raise StereoSfmError(f"unknown preset '{name}': choose one of {', '.join(PRESETS)}")
+        raise StereoSfmError(
+            f"unknown preset '{name}'{did_you_mean(name, PRESETS)}: choose one of {', '.join(PRESETS)}"
+        )
     return PRESETS[name]

@@ -20,6 +20,7 @@ ROOMS: tuple[str, ...] = (
     "stereo_sfm.kernel_cache",
     "stereo_sfm.geometry",
     "calib",
+    "stereo_sfm.settings",
     "stereo_sfm.config",
     "stereo_sfm.presets",
     "stereo_sfm.tracking",

@@ -3,71 +3,129 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 import tomllib
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from stereo_sfm.config import Config, dump, from_dict, load
+from stereo_sfm.config import RENAMED, Config, dump, explain, from_dict, load
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.mapping.pose_graph import ROBUST
 from stereo_sfm.presets import PRESETS
+from stereo_sfm.settings import walk
+from stereo_sfm.tracking.features.extraction import TABLE as FEATURES
+from stereo_sfm.tracking.features.odometry.table import TABLE as METHODS
 from stereo_sfm.tracking.features.step_scale import SCALES
 
 
 @pytest.mark.parametrize(
     ("override", "said"),
     [
-        ("loop.correction=foo", "loop.correction is 'foo': choose one of pose_graph, averaging"),
-        ("loop.robust=foo", "choose one of gnc, switchable, none"),
-        ("loop.reference=foo", "choose one of weakest, best"),
-        ("mapper.association=foo", "choose one of map, tracks, previous"),
-        ("features.stereo_check=foo", "choose one of rig, ransac"),
-        ("odometry.reference=foo", "choose one of frame, keyframe"),
-        ("odometry.scale=foo", "choose one of stereo, unit, ground-truth"),
-        ("seed=-1", "seed is -1: it must be at least 0"),
-        ("features.ratio=-1", "features.ratio is -1: it must be above 0"),
-        ("odometry.min_inliers=-5", "odometry.min_inliers is -5: it must be above 0"),
-        ("manhattan.every=0", "manhattan.every is 0: it must be above 0"),
-        ("loop.gate_metres=-0.1", "loop.gate_metres is -0.1: it must be at least 0"),
+        ("loop.correction=pose_grap", "is 'pose_grap', did you mean pose_graph?: choose one of pose_graph, averaging"),
+        ("loop.robust=foo", "loop.robust is 'foo': choose one of gnc, switchable, none"),
+        ("odometry.method=emr", "odometry.method is 'emr', did you mean em-r?: choose one of flow, em-r"),
+        ("features.kind=SIFT", "features.kind is 'SIFT', did you mean sift?: choose one of orb, sift, akaze"),
+        ("seed=-1", "seed is -1: it must be from 0 to"),
+        ("features.ratio=-1", "features.ratio is -1: it must be from 0.01 to 1"),
+        ("odometry.min_inliers=-5", "odometry.min_inliers is -5: it must be from 1 to"),
+        ("manhattan.every=0", "manhattan.every is 0: it must be from 1 to"),
+        ("loop.gate_m=-0.1", "loop.gate_m is -0.1: it must be from 0 to"),
         ("tracker.sigma_px=nan", "tracker.sigma_px is nan"),
+        ("tracker.sigma_px=inf", "tracker.sigma_px is inf"),
         ("tracker.pyramid_levels=1", "tracker.pyramid_levels is 1: it must be from 2 to 10"),
-        ("tracker.min_features=0", "tracker.min_features is 0: it must be from 3 to"),
-        ("loop.relocalize_keyframes=0", "loop.relocalize_keyframes is 0: it must be above 0"),
         ("tracker.max_features=1000000000", "tracker.max_features is 1000000000: it must be from 1 to 20000"),
-        ("loop.min_gap=99999999999999999999", "loop.min_gap is 99999999999999999999: it is too large"),
+        ("loop.min_gap=99999999999999999999", "loop.min_gap is 99999999999999999999: it must be from 0 to"),
+        ("pipeline.threads=1000000", "pipeline.threads is 1000000: it must be from 1 to 256"),
+        ("pipeline.ring_slots=1000000", "pipeline.ring_slots is 1000000: it must be from 1 to 1024"),
         ("pipeline.cpus.nobody=[0]", "pipeline.cpus names 'nobody': the stages are capture,"),
+        ("pipeline.cpus.tracker=[100000]", "pipeline.cpus names core 100000"),
+        ("tracker.max_featurs=3", "there is no tracker.max_featurs, did you mean max_features?"),
+        ("treker.max_features=3", "there is no treker, did you mean tracker?"),
+        ("tracker=3", "tracker is a section of settings, as tracker.max_features"),
+        ("tracker.max_features=many", "tracker.max_features"),
     ],
 )
-def test_what_a_field_does_not_take_is_refused(override: str, said: str) -> None:
+def test_what_a_setting_does_not_take_is_refused(override: str, said: str) -> None:
     with pytest.raises(StereoSfmError) as error:
         load(overrides=[override])
     assert said in str(error.value) and "\n" not in str(error.value)
 
 
-def fields_with(key: str) -> list[tuple[str, str, Any]]:
-    """Section, field and what its metadata says under a key."""
-    sections = [f for f in dataclasses.fields(Config) if dataclasses.is_dataclass(getattr(Config(), f.name))]
-    return [
-        (s.name, f.name, f.metadata[key])
-        for s in sections
-        for f in dataclasses.fields(getattr(Config(), s.name))
-        if key in f.metadata
-    ]
+SETTINGS = [*walk(Config())]
+
+
+@pytest.mark.parametrize(("name", "field", "value"), SETTINGS, ids=[name for name, _, _ in SETTINGS])
+def test_every_setting_has_a_sentence_and_every_number_two_bounds(
+    name: str, field: dataclasses.Field[Any], value: Any
+) -> None:
+    text = field.metadata["text"]
+    assert text[0].isupper() and not text.endswith(".") and "\n" not in text
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        least, most = field.metadata["range"]
+        assert least <= value <= most and np.isfinite([least, most]).all()
+    elif isinstance(value, str) and name != "loop.vocabulary":
+        assert value in field.metadata["words"]
+
+
+@pytest.mark.parametrize("name", [name for name, _, _ in SETTINGS])
+def test_one_rule_for_names(name: str) -> None:
+    """Units as suffixes, spelled one way."""
+    words = name.split(".")[-1].split("_")
+    assert not set(words) & {"metres", "metre", "degrees", "degree", "seconds", "pixels", "pixel"}
+    if "sigma" in words:  # a standard deviation says its unit
+        assert words[words.index("sigma") + 1] in ("px", "m", "s", "deg")
+
+
+def words_of() -> dict[str, tuple[str, ...]]:
+    """Setting -> the words that it takes."""
+    return {name: field.metadata["words"] for name, field, _ in SETTINGS if "words" in field.metadata}
 
 
 def test_every_declared_word_is_taken() -> None:
-    declared = fields_with("words")
-    assert len(declared) == 7
-    for section, name, words in declared:
+    assert len(words_of()) == 9
+    for name, words in words_of().items():
+        section, key = name.split(".")
         for word in words:
-            assert getattr(getattr(load(overrides=[f"{section}.{name}={word}"]), section), name) == word
+            assert getattr(getattr(load(overrides=[f"{name}={word}"]), section), key) == word
 
 
 def test_the_words_are_those_of_the_code_that_reads_them() -> None:
-    words = {f"{section}.{name}": set(words) for section, name, words in fields_with("words")}
+    words = {name: set(words) for name, words in words_of().items()}
     assert words["loop.robust"] == set(ROBUST)
     assert words["odometry.scale"] == set(SCALES)
+    assert words["odometry.method"] == {"flow", *METHODS}
+    assert words["features.kind"] == set(FEATURES)
+
+
+def test_names_of_earlier_versions_are_taken(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
+    """From a file with a line that says the new name; from the log of a run without one."""
+    logging.getLogger("stereo_sfm").propagate = True
+    (tmp_path / "old.toml").write_text("[loop]\npixel_sigma = 2.5\ngate_metres = 0.7\n")
+    config = load(tmp_path / "old.toml", ["tracker.max_error=4"])
+    assert (config.loop.sigma_px, config.loop.gate_m, config.tracker.max_error_sigmas) == (2.5, 0.7, 4.0)
+    assert [record.getMessage() for record in caplog.records] == [
+        "configuration: loop.pixel_sigma is called loop.sigma_px now",
+        "configuration: loop.gate_metres is called loop.gate_m now",
+        "configuration: tracker.max_error is called tracker.max_error_sigmas now",
+    ]
+    caplog.clear()
+    assert from_dict({"loop": {"gate_degrees": 5.0}}).loop.gate_deg == 5.0 and not caplog.records
+
+
+def test_every_earlier_name_leads_to_a_setting() -> None:
+    names = {name for name, _, _ in SETTINGS}
+    assert set(RENAMED.values()) <= names and not set(RENAMED) & names
+
+
+def test_an_explained_configuration_says_every_sentence_and_is_read_back() -> None:
+    config = load(overrides=["tracker.max_features=321", "pipeline.cpus.tracker=[0, 1]", "odometry.method=um"])
+    text = explain(config)
+    assert from_dict(tomllib.loads(text)) == config and from_dict(tomllib.loads(explain(Config()))) == Config()
+    assert "# Points followed at once (from 1 to 20000).\nmax_features = 321\n" in text
+    assert all(f"# {field.metadata['text']}" in text for _, field, _ in SETTINGS)
 
 
 @pytest.mark.parametrize("name", PRESETS)

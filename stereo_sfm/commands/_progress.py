@@ -1,4 +1,4 @@
-"""Progress on a terminal: frames, rate and tracking state. Nothing where there is no terminal."""
+"""Progress on a terminal, the same for every command: done, rate, time left, a state. Nothing where there is none."""
 
 from __future__ import annotations
 
@@ -22,20 +22,14 @@ class NoProgress:
     ) -> None:
         return None
 
-    def show(self, frame: Frame) -> None:
-        """One frame is done."""
-
-
-def _first_state() -> str:
-    """What the bar says before the first frame."""
-    compiled = any((Path(__file__).parents[1] / "tracking" / "__pycache__").glob("flow.*.nbi"))
-    return "" if compiled else "first run on this machine: compiling, about half a minute"
+    def step(self, state: str, line: str = "") -> None:
+        """One more is done; `line` is printed above the bar and stays."""
 
 
 class TerminalProgress(NoProgress):
     """A bar on standard error."""
 
-    def __init__(self, name: str, total: int | None) -> None:
+    def __init__(self, name: str, total: int | None, unit: str = "frames", done: int = 0, state: str = "") -> None:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -43,13 +37,13 @@ class TerminalProgress(NoProgress):
             TextColumn("{task.description}"),
             BarColumn(),
             MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]:>6} frames/s"),
+            TextColumn("{task.fields[rate]:>6} " + f"{unit}/s"),
             TimeRemainingColumn(compact=True),
             TextColumn("{task.fields[state]}"),
             console=Console(stderr=True),
             transient=True,
         )
-        self._task = self._progress.add_task(name, total=total, rate="-", state=_first_state())
+        self._task = self._progress.add_task(name, total=total, completed=done, rate="-", state=state)
 
     def __enter__(self) -> Self:
         self._progress.start()
@@ -60,16 +54,42 @@ class TerminalProgress(NoProgress):
     ) -> None:
         self._progress.stop()
 
-    def show(self, frame: Frame) -> None:
-        """One frame is done."""
+    def step(self, state: str, line: str = "") -> None:
         speed = self._progress.tasks[0].speed
-        state = frame.state.name if not frame.reason else f"{frame.state.name} ({frame.reason})"
-        points = int(frame.observations.inlier.sum())
-        self._progress.update(
-            self._task, advance=1, rate=f"{speed:.1f}" if speed else "-", state=f"{state} · {points} points"
-        )
+        self._progress.update(self._task, advance=1, rate=f"{speed:.1f}" if speed else "-", state=state)
+        if line:
+            self._progress.console.print(line, markup=False, highlight=False)
 
 
-def progress(name: str, total: int | None, quiet: bool) -> NoProgress:
-    """A bar if standard error is a terminal and nobody asked for quiet."""
-    return NoProgress() if quiet or not sys.stderr.isatty() else TerminalProgress(name, total)
+class LinesOnly(NoProgress):
+    """Where there is no terminal: the lines that stay."""
+
+    def step(self, state: str, line: str = "") -> None:
+        if line:
+            print(line, file=sys.stderr)
+
+
+def progress(
+    name: str, total: int | None, quiet: bool, unit: str = "frames", done: int = 0, state: str = ""
+) -> NoProgress:
+    """A bar if standard error is a terminal and nobody asked for quiet.
+
+    Args:
+        name: of what is done. total: how many there are, None where nobody knows. done: of them before it begins.
+        quiet: nothing at all. unit: what is counted. state: what stands beside the bar until the first step.
+    """
+    if quiet:
+        return NoProgress()
+    return TerminalProgress(name, total, unit, done, state) if sys.stderr.isatty() else LinesOnly()
+
+
+def first_state() -> str:
+    """What the bar of a run says before the first frame."""
+    compiled = any((Path(__file__).parents[1] / "tracking").glob("**/__pycache__/*.nbi"))
+    return "" if compiled else "first run on this machine: compiling the numerical kernels"
+
+
+def frame_state(frame: Frame) -> str:
+    """What the bar of a run says of a frame."""
+    state = frame.state.name if not frame.reason else f"{frame.state.name} ({frame.reason})"
+    return f"{state} · {int(frame.observations.inlier.sum())} points"

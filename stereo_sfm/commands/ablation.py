@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import argparse
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from stereo_sfm.commands._options import typed
+from stereo_sfm.commands._progress import progress
 from stereo_sfm.commands._stop import INTERRUPTED, StopRequest
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import StereoSfmError, did_you_mean
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -50,18 +53,40 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-q", "--quiet", action="store_true", help="no progress")
 
 
+@dataclass(frozen=True)
+class AblationOptions:
+    """Options of this command, as the parser names them."""
+
+    sources: list[str]
+    output: Path
+    jobs: int
+    frames: int
+    features: str | None
+    odometry: str | None
+    stages: str | None
+    systems: str | None
+    set: list[str]
+    seed: int
+    again: bool
+    quiet: bool
+
+
 def run(args: argparse.Namespace) -> int:
     """Run what is missing, then write the report over everything asked for."""
+    return ablation(typed(AblationOptions, args))
+
+
+def ablation(options: AblationOptions) -> int:
+    """The exit code."""
     from stereo_sfm.eval.ablation import finished, load_answer
     from stereo_sfm.eval.ablation_report import write_report
 
-    cells = _cells(args)
-    folder: Path = args.output
-    store = folder / "cells"
-    missing = [cell for cell in cells if args.again or not finished(load_answer(store / cell.file_name))]
+    cells = _cells(options)
+    folder, store = options.output, options.output / "cells"
+    missing = [cell for cell in cells if options.again or not finished(load_answer(store / cell.file_name))]
     _check_sources(missing)
     store.mkdir(parents=True, exist_ok=True)
-    whole = not missing or _run_all(missing, store, args.jobs, args.quiet, len(cells))
+    whole = not missing or _run_all(missing, store, options.jobs, options.quiet, len(cells))
     answers = [answer for cell in cells if (answer := load_answer(store / cell.file_name)) is not None]
     report = write_report(folder, answers)
     if not whole:
@@ -70,33 +95,33 @@ def run(args: argparse.Namespace) -> int:
             file=sys.stderr,
         )
         return INTERRUPTED
-    if not args.quiet:
+    if not options.quiet:
         good = sum(answer["status"] == "ok" for answer in answers)
         print(f"{good} of {len(cells)} cells with a result, {len(cells) - good} with a reason why not: {report}")
     return 0
 
 
-def _cells(args: argparse.Namespace) -> list[Cell]:
+def _cells(options: AblationOptions) -> list[Cell]:
     from stereo_sfm.eval import ablation
     from stereo_sfm.presets import PRESETS
     from stereo_sfm.tracking.features.extraction import TABLE as FEATURES
     from stereo_sfm.tracking.features.odometry.table import TABLE as METHODS
 
-    if args.jobs < 1 or args.frames < 0:
+    if options.jobs < 1 or options.frames < 0:
         raise StereoSfmError("--jobs must be at least 1 and --frames at least 0")
-    for setting in args.set:
+    for setting in options.set:
         key = setting.partition("=")[0].strip()
         if key in DECIDED:
             raise StereoSfmError(f"--set {key}: the cells differ in it, choose them with {DECIDED[key]}")
     return ablation.grid(
-        _different(args.sources),
-        _chosen(args.features, ablation.FEATURES, FEATURES, "features"),
-        _chosen(args.odometry, ablation.ESTIMATORS, METHODS, "odometry"),
-        _chosen(args.stages, tuple(ablation.STAGES), ablation.STAGES, "stages"),
-        () if args.systems == "none" else _chosen(args.systems, ablation.SYSTEMS, PRESETS, "systems"),
-        args.frames,
-        args.seed,
-        args.set,
+        _different(options.sources),
+        _chosen(options.features, ablation.FEATURES, FEATURES, "features"),
+        _chosen(options.odometry, ablation.ESTIMATORS, METHODS, "odometry"),
+        _chosen(options.stages, tuple(ablation.STAGES), ablation.STAGES, "stages"),
+        () if options.systems == "none" else _chosen(options.systems, ablation.SYSTEMS, PRESETS, "systems"),
+        options.frames,
+        options.seed,
+        options.set,
     )
 
 
@@ -109,12 +134,17 @@ def _different(sources: Sequence[str]) -> list[str]:
 
 
 def _check_sources(cells: Sequence[Cell]) -> None:
-    """Raises StereoSfmError for a source that cannot be opened, before anything is computed."""
+    """Before anything is computed: every source can be opened and knows the truth that the cells are judged by.
+
+    Raises:
+        StereoSfmError: one does not.
+    """
     from drivers.source import open_source
 
-    for source in dict.fromkeys(cell.source for cell in cells):
-        with open_source(source):
-            pass
+    for spec in dict.fromkeys(cell.source for cell in cells):
+        with open_source(spec) as source:
+            if source.ground_truth is None:
+                raise StereoSfmError(f"{source.name} has no ground truth: there is nothing to judge the cells by")
 
 
 def _chosen(text: str | None, default: Sequence[str], known: Iterable[str], what: str) -> Sequence[str]:
@@ -123,7 +153,8 @@ def _chosen(text: str | None, default: Sequence[str], known: Iterable[str], what
     names = [name.strip() for name in text.split(",") if name.strip()]
     wrong = [name for name in names if name not in set(known)]
     if wrong or not names:
-        raise StereoSfmError(f"--{what}: unknown '{', '.join(wrong) or text}' (there are: {', '.join(known)})")
+        near = did_you_mean(wrong[0], known) if wrong else ""
+        raise StereoSfmError(f"--{what}: unknown '{', '.join(wrong) or text}'{near} (there are: {', '.join(known)})")
     return names
 
 
@@ -139,21 +170,16 @@ def _run_all(cells: Sequence[Cell], store: Path, jobs: int, quiet: bool, total: 
     from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
     from concurrent.futures.process import BrokenProcessPool
 
-    from rich.console import Console
-    from rich.progress import Progress
-
     from stereo_sfm.eval.ablation_worker import compute, one_thread
     from stereo_sfm.pipeline.interrupts import ignored_by_children
 
-    console = Console(stderr=True, quiet=quiet)
     spawn = multiprocessing.get_context("spawn")
     left, running = list(reversed(cells)), dict[Future[str], str]()
     with (
         ProcessPoolExecutor(jobs, mp_context=spawn, initializer=one_thread) as pool,
-        Progress(console=console, transient=True) as progress,
+        progress("ablation", total, quiet, "cells", total - len(cells)) as bar,
         StopRequest() as stop,
     ):
-        task = progress.add_task("cells", total=total, completed=total - len(cells))
         try:
             while True:
                 # Not all at once: what waits in the pool could not be called back.
@@ -165,8 +191,8 @@ def _run_all(cells: Sequence[Cell], store: Path, jobs: int, quiet: bool, total: 
                 if not running:
                     return not left
                 for done in wait(running, return_when=FIRST_COMPLETED).done:
-                    console.print(f"{running.pop(done)}: {done.result()}")
-                    progress.advance(task)
+                    name = running.pop(done)
+                    bar.step(name, f"{name}: {done.result()}")
         except BrokenProcessPool:
             if stop.asked:
                 return False

@@ -19,7 +19,7 @@ SOME_FAILED = 3
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
-    from stereo_sfm.commands.run import add_config_arguments
+    from stereo_sfm.commands._options import add_config_arguments
 
     parser.add_argument("recordings", nargs="+", help="files, folders, sim:SCENE, or quoted patterns")
     parser.add_argument(
@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run all, write the table, merge the maps. A recording that fails stops none of the others."""
-    from stereo_sfm.commands.run import load_config
+    from stereo_sfm.commands._options import load_config
     from stereo_sfm.eval import batch
 
     config = load_config(args)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from stereo_sfm.commands.run import add_config_arguments, load_config
+from stereo_sfm.commands._options import add_config_arguments, load_config
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -16,8 +16,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print every key with its value, as TOML that `run -c` reads."""
+    """Print every setting with its value and what it means, as TOML that `run -c` reads."""
     from stereo_sfm import config
 
-    print(config.dump(load_config(args)), end="")
+    print(config.explain(load_config(args)), end="")
     return 0

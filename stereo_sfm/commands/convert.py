@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from stereo_sfm.commands.record import add_output_arguments, write
+from stereo_sfm.commands._options import source_choice, typed
+from stereo_sfm.commands.record import RecordOptions, add_output_arguments, write
 from stereo_sfm.errors import StereoSfmError
 
 
@@ -16,11 +17,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Convert everything that the source holds."""
-    from stereo_sfm.commands.run import source_choice
-
-    choice = source_choice(args)
-    choice.refuse_to_overwrite(args.output)
+    options, choice = typed(RecordOptions, args), source_choice(args)
+    choice.refuse_to_overwrite(options.output)
     with choice() as source:
         if source.live:
-            raise StereoSfmError(f"{source.name} is a device: use 'stereo-sfm record {args.source}'")
-        return write(source, args, "convert", choice.opening)
+            raise StereoSfmError(f"{source.name} is a device: use 'stereo-sfm record {choice.spec}'")
+        return write(source, options, "convert", choice.opening)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import sys
-import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from stereo_sfm.commands._options import add_source_arguments, source_choice, typed
+from stereo_sfm.commands._progress import progress
 from stereo_sfm.commands._stop import INTERRUPTED, StopRequest
 from stereo_sfm.errors import StereoSfmError
 
@@ -25,8 +26,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def add_output_arguments(parser: argparse.ArgumentParser) -> None:
     """Options that `record` and `convert` share."""
-    from stereo_sfm.commands.run import add_source_arguments
-
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.mcap", help="file to write")
     parser.add_argument(
         "--image-format",
@@ -40,61 +39,43 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frames", type=int, dest="max_frames", metavar="N", help="same as --max-frames")
 
 
+@dataclass(frozen=True)
+class RecordOptions:
+    """What `record` and `convert` write, as the parser names it."""
+
+    output: Path
+    image_format: str
+    overwrite: bool
+    quiet: bool
+
+
 def run(args: argparse.Namespace) -> int:
     """Record until the source ends, the duration is over, or Ctrl-C."""
-    from stereo_sfm.commands.run import source_choice
-
-    choice = source_choice(args)
-    choice.refuse_to_overwrite(args.output)
+    options, choice = typed(RecordOptions, args), source_choice(args)
+    choice.refuse_to_overwrite(options.output)
     with choice() as source:
-        return write(source, args, "record", choice.opening)
+        return write(source, options, "record", choice.opening)
 
 
-def write(source: Source, args: argparse.Namespace, mode: str, opening: Opening | None = None) -> int:
+def write(source: Source, options: RecordOptions, mode: str, opening: Opening | None = None) -> int:
     """Write an entered source and say what came of it."""
     from stereo_sfm.recording.record import record
 
-    path: Path = args.output
+    path = options.output
     if path.suffix != ".mcap":
         raise StereoSfmError(f"{path} does not end in .mcap: recordings are MCAP files")
     last: Progress | None = None
-    show = _Line(source.frame_count, args.quiet)
-    with StopRequest() as stop:
-        frames = record(source, path, args.image_format, overwrite=args.overwrite, mode=mode, opening=opening)
+    with StopRequest() as stop, progress(source.name, source.frame_count, options.quiet) as bar:
+        frames = record(source, path, options.image_format, overwrite=options.overwrite, mode=mode, opening=opening)
         for last in frames:
-            show(last)
+            bar.step(f"{last.seconds:.1f} s · {last.dropped} dropped · {last.bytes_written / 1e6:.1f} MB")
             if stop.asked:
                 break
         frames.close()
-    show.end()
-    if last is not None and not args.quiet:
+    if last is not None and not options.quiet:
         size = path.stat().st_size
         print(
             f"{path}: {last.frames} frames, {last.seconds:.1f} s, {last.dropped} dropped, {size / 1e6:.1f} MB "
-            f"({size / max(last.seconds, 1e-9) / 1e6:.1f} MB/s as {args.image_format})"
+            f"({size / max(last.seconds, 1e-9) / 1e6:.1f} MB/s as {options.image_format})"
         )
     return INTERRUPTED if stop.asked and not source.live else 0
-
-
-class _Line:
-    """One line on a terminal that is rewritten twice a second."""
-
-    def __init__(self, total: int | None, quiet: bool) -> None:
-        self._on = sys.stderr.isatty() and not quiet
-        self._of = f"/{total}" if total else ""
-        self._next = 0.0
-        self._begin = time.perf_counter()
-
-    def __call__(self, state: Progress) -> None:
-        now = time.perf_counter()
-        if not self._on or now < self._next:
-            return
-        self._next = now + 0.5
-        rate = state.frames / max(now - self._begin, 1e-9)
-        text = f"{state.frames}{self._of} frames  {state.seconds:.1f} s  {rate:.1f} frames/s  {state.dropped} dropped"
-        print(f"\r{text}  {state.bytes_written / 1e6:.1f} MB ", end="", file=sys.stderr, flush=True)
-
-    def end(self) -> None:
-        """Leave the line."""
-        if self._on:
-            print(file=sys.stderr)

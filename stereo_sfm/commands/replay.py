@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stereo_sfm.commands.run import add_talk_arguments, add_wiring_arguments, execute
+from stereo_sfm.commands._options import add_talk_arguments, add_wiring_arguments, typed, wiring_of
 from stereo_sfm.errors import StereoSfmError
 
 if TYPE_CHECKING:
+    from stereo_sfm.commands._execute import RunOptions
     from stereo_sfm.config import Config
     from stereo_sfm.log.provenance import Opening
     from stereo_sfm.maps.folders import MapFolders
+    from stereo_sfm.pipeline.session import Wiring
     from stereo_sfm.types import Frame
 
 DIFFERENT = 3
@@ -41,44 +44,100 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_talk_arguments(parser)
 
 
+@dataclass(frozen=True)
+class ReplayOptions:
+    """Options of this command, as the parser names them."""
+
+    run: Path
+    source: str | None
+    output: Path | None
+    overwrite: bool
+    schedule: str | None
+    until: float | None
+    step: bool
+    seek: float
+    set: list[str]
+    check: bool
+    frame: str
+    max_lost: float
+    quiet: bool
+    verbose: bool
+
+    @property
+    def log_file(self) -> Path:
+        """Of the run."""
+        return self.run / "run.mcap" if self.run.is_dir() else self.run
+
+
 def run(args: argparse.Namespace) -> int:
     """Read what the run was, do it again, compare if asked."""
+    if args.realtime or args.speed is not None:
+        raise StereoSfmError("a replay takes its time from the run: --realtime and --speed go with 'run'")
+    wiring = wiring_of(args)
+    if args.check and wiring.log == "none":
+        raise StereoSfmError("--check compares the logs of both runs: it needs --log lean or full")
+    wiring = dataclasses.replace(wiring, mode=wiring.mode or "lockstep", log=wiring.log or "lean")
+    return replay(typed(ReplayOptions, args), wiring)
+
+
+def replay(options: ReplayOptions, wiring: Wiring) -> int:
+    """The exit code."""
+    from stereo_sfm.commands._execute import execute
+
+    _check(options)
+    chosen = _run_again(options, wiring)
+    code, folder = execute(chosen)
+    return _compare(options.log_file, folder / "run.mcap") if options.check and code == 0 else code
+
+
+def _check(options: ReplayOptions) -> None:
+    """Raises StereoSfmError for options that do not go together, and for a run that is not there."""
+    path = options.log_file
+    if options.seek and not options.step:
+        raise StereoSfmError("--seek goes with --step: every frame must be executed to reach a later one")
+    if options.check and options.until is not None:
+        raise StereoSfmError("--check compares whole runs: omit --until")
+    if options.until is not None and not options.until >= 0:
+        raise StereoSfmError(f"--until takes seconds after the first frame, got {options.until:g}")
+    if options.output is not None and options.output.resolve() == path.resolve().parent:
+        raise StereoSfmError(f"{options.output} holds the run that is to be replayed: choose another -o")
+    if not path.exists():
+        raise StereoSfmError(f"no run at {path}: 'stereo-sfm run' writes run.mcap into its folder")
+
+
+def _run_again(options: ReplayOptions, wiring: Wiring) -> RunOptions:
+    """The run of a log as options."""
     from drivers.choice import ReplayChoice
+    from stereo_sfm.commands._execute import RunOptions
     from stereo_sfm.log import recorded, topics
     from stereo_sfm.log.reader import LogReader
 
-    if args.seek and not args.step:
-        raise StereoSfmError("--seek goes with --step: every frame must be executed to reach a later one")
-    if args.check and args.log == "none":
-        raise StereoSfmError("--check compares the logs of both runs: it needs --log lean or full")
-    if args.check and args.until is not None:
-        raise StereoSfmError("--check compares whole runs: leave --until away")
-    if args.realtime or args.speed is not None:
-        raise StereoSfmError("a replay takes its time from the run: --realtime and --speed go with 'run'")
-    if args.until is not None and not args.until >= 0:
-        raise StereoSfmError(f"--until takes seconds after the first frame, got {args.until:g}")
-    path: Path = args.run / "run.mcap" if args.run.is_dir() else args.run
-    if args.output is not None and args.output.resolve() == path.resolve().parent:
-        raise StereoSfmError(f"{args.output} holds the run that is to be replayed: choose another -o")
-    if not path.exists():
-        raise StereoSfmError(f"no run at {path}: 'stereo-sfm run' writes run.mcap into its folder")
+    path = options.log_file
     with LogReader(path) as reader:
         before = recorded.read_run(reader)
         frames: list[Frame] = [message for _, message in recorded.messages(reader, (topics.FRAME,))]
     if not frames:
         raise StereoSfmError(f"{path} holds no frames: nothing to replay")
-    follow = args.schedule == "recorded" or (args.schedule is None and before.mode == "realtime")
-    logged = args.source is None and before.image_format != "none"  # the images that the tracker saw
-    spec = str(path) if logged else args.source or before.source
+    follow = options.schedule == "recorded" or (options.schedule is None and before.mode == "realtime")
+    logged = options.source is None and before.image_format != "none"  # the images that the tracker saw
+    spec = str(path) if logged else options.source or before.source
     rig, rectify = (None, "none") if logged else (before.opening.rig, before.opening.rectify)
-    frame_ids = tuple(f.frame_id for f in frames if _within(f, frames[0], args.until))
-    folders = map_folders(before.opening)
-    choice = ReplayChoice(spec, rig, rectify=rectify, frame_ids=frame_ids, recorded_skip=before.opening.frame_skip)
-    args.mode, args.realtime = args.mode or "lockstep", False
-    args.log = args.log or "lean"
-    config = _changed(before.config, args.set)
-    code, folder = execute(args, choice, config, folders, before if follow else None)
-    return _compare(path, folder / "run.mcap") if args.check and code == 0 else code
+    frame_ids = tuple(f.frame_id for f in frames if _within(f, frames[0], options.until))
+    return RunOptions(
+        ReplayChoice(spec, rig, rectify=rectify, frame_ids=frame_ids, recorded_skip=before.opening.frame_skip),
+        _changed(before.config, options.set),
+        wiring,
+        map_folders(before.opening),
+        output=options.output,
+        overwrite=options.overwrite,
+        frame=options.frame,
+        max_lost_percent=options.max_lost,
+        quiet=options.quiet,
+        verbose=options.verbose,
+        step_from_s=options.seek if options.step else None,
+        replayed=before if follow else None,
+        command="replay",
+    )
 
 
 def map_folders(opening: Opening) -> MapFolders:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stereo_sfm.commands.run import add_viewer_address
+from stereo_sfm.commands._options import add_viewer_address
 from stereo_sfm.errors import StereoSfmError
 
 if TYPE_CHECKING:

@@ -133,7 +133,7 @@ class LoopCloser:
     def _judge(self, keyframe: Keyframe, candidates: list[tuple[int, float]], why_none: str) -> LoopResult:
         if not candidates:
             return _no_loop(keyframe.kf_id, why_none, 0.0, ())
-        view = place_view_of(keyframe, self._rig, self._config.disparity_sigma)
+        view = place_view_of(keyframe, self._rig, self._config.disparity_sigma_px)
         verdicts = [self._verify(keyframe, view, candidate) for candidate, _ in candidates]
         reasons = [verdict.reason for verdict in verdicts]
         loops = {
@@ -160,7 +160,7 @@ class LoopCloser:
         centre = self._store[candidate]
         around = [self._store[k] for k in self._store.best_connected(candidate, CLOUD_KEYFRAMES)]
         around = [k for k in around if k.submap_id == centre.submap_id]
-        cloud = gather(centre, around, self._rig, config.disparity_sigma)
+        cloud = gather(centre, around, self._rig, config.disparity_sigma_px)
         rng = np.random.default_rng([config.seed, keyframe.kf_id, candidate])
         return verify(view, cloud, self._rig, config, rng)
 
@@ -169,14 +169,14 @@ class LoopCloser:
         config, candidate_T_kf = self._config, se3.inverse(verdict.b_T_a)
         way = self._graph.way(candidate, kf_id)
         if way is not None:
-            metres = config.gate_metres + config.gate_per_metre * way.metres
-            degrees = config.gate_degrees + config.gate_degrees_per_metre * way.metres
+            metres = config.gate_m + config.gate_m_per_m * way.metres
+            degrees = config.gate_deg + config.gate_deg_per_m * way.metres
             near = within(se3.inverse(way.a_T_b) @ candidate_T_kf, metres, degrees)
             against = "" if near else "against_odometry"
         else:
             jump = self._graph.jump(candidate, kf_id, candidate_T_kf)
             reached = jump is None or jump.off <= jump.radius + DRIFT_PER_METRE * jump.walked
-            enough = verdict.inliers >= 2 * config.min_inliers and verdict.share >= config.unknown_way_share
+            enough = verdict.inliers >= 2 * config.min_inliers and verdict.share >= config.min_inlier_share_after_gap
             against = "out_of_reach" if not reached else "" if enough else "too_few_inliers"
         return _Hypothesis(kf_id, candidate, candidate_T_kf, verdict.inliers, against, way is None)
 

@@ -55,20 +55,20 @@ def verify(
         view.descriptors[corners_b],
         cloud.descriptors[corners_a],
         cloud.ids[corners_a],
-        config.max_distance,
+        config.max_distance_bits,
         config.match_ratio,
     )
     rows_b, rows_a = corners_b[at_b], corners_a[at_a]
     if len(rows_b) < max(config.min_match_fraction * len(corners_b), 4):
         return rejection("too_few_matches", len(rows_b))
     matches = _pair(view, cloud, rows_b, rows_a)
-    start = ransac_pose(matches, rig, rng, config.pixel_sigma, config.ransac_iterations)
+    start = ransac_pose(matches, rig, rng, config.sigma_px, config.ransac_iterations)
     if start is None:
         return rejection("no_pose")
-    agree = int(consistent(start, matches, rig, config.pixel_sigma).sum())
+    agree = int(consistent(start, matches, rig, config.sigma_px).sum())
     if agree < RANSAC_SHARE * max(config.min_inliers, config.min_inlier_share * len(corners_b)):
         return rejection("too_few_inliers", agree)
-    pose = refine_pose(start, matches, rig, config.pixel_sigma, GUIDED[0][1])
+    pose = refine_pose(start, matches, rig, config.sigma_px, GUIDED[0][1])
     return verify_near(pose.b_T_a, view, cloud, rig, config, move_points)
 
 
@@ -79,10 +79,10 @@ def verify_near(
     pose: Pose | None = None
     rows_b = rows_a = np.zeros(0, np.int64)
     for radius, iterations in GUIDED:
-        rows_b, rows_a = match_guided(b_T_a, view, cloud, rig, config.max_distance, radius)
+        rows_b, rows_a = match_guided(b_T_a, view, cloud, rig, config.max_distance_bits, radius)
         if len(rows_b) < 4:
             return rejection("too_few_inliers", len(rows_b))
-        pose = refine_pose(b_T_a, _pair(view, cloud, rows_b, rows_a), rig, config.pixel_sigma, iterations)
+        pose = refine_pose(b_T_a, _pair(view, cloud, rows_b, rows_a), rig, config.sigma_px, iterations)
         b_T_a = pose.b_T_a
     assert pose is not None
     rows_a, rows_b = rows_a[pose.inlier], rows_b[pose.inlier]
@@ -119,7 +119,7 @@ def refine_with_points(
         obs_pt=obs_pt,
         uv_left=np.concatenate([cloud.uv_left[views], view.uv_left[rows_b]]),
         uv_right=np.concatenate([cloud.uv_right[views], view.uv_right[rows_b]]),
-        sigma=np.full((len(obs_pt), 2), config.disparity_sigma),
+        sigma=np.full((len(obs_pt), 2), config.disparity_sigma_px),
     )
     return se3.inverse(bundle_adjust(rig, bundle).world_T_kf[-1])
 

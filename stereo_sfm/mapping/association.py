@@ -76,7 +76,7 @@ def match(
     pairs = map_kernels.match_near(
         sightings.uv_left, sightings.uv_right, as_words(sightings.descriptors),
         predicted_left, predicted_right, as_words(descriptors),
-        config.match_radius_px, config.match_distance, config.match_ratio,
+        config.match_radius_px, config.match_distance_bits, config.match_ratio,
     )  # fmt: skip
     found = np.flatnonzero(pairs >= 0)
     return found, pairs[found]

@@ -26,7 +26,7 @@ def weak_points(map_: Map, rig: Rig, rows: I64, newest: int, config: MapperConfi
     lost = points.last_seen[rows] < newest
     few = lost & (points.obs_count[rows] < config.min_observations)
     error, parallax = _quality(map_, rig, rows)
-    bad = (error > config.max_error) & (points.obs_count[rows] >= 2)
+    bad = (error > config.max_error_sigmas) & (points.obs_count[rows] >= 2)
     narrow = lost & (parallax < np.deg2rad(config.min_parallax_deg))
     gone = points.obs_count[rows] == 0
     return rows[few | bad | narrow | gone]

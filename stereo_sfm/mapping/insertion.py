@@ -83,7 +83,7 @@ def _solve_pose(
         np.asarray(keyframe.uv_right)[known],
         np.repeat(map_.points.sigma[rows[known]].astype(float)[:, None], 2, 1),
     )
-    result = bundle_adjust(rig, bundle, BundleConfig(rounds=3, huber=config.huber, move_points=False))
+    result = bundle_adjust(rig, bundle, BundleConfig(rounds=3, huber=config.huber_sigmas, move_points=False))
     return result.world_T_kf[0] if result.inlier[:, 0].sum() >= max(MIN_POSE_POINTS, count // 2) else guess
 
 

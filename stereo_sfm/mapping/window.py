@@ -33,7 +33,7 @@ class Window:
 
 def bundle_config(config: MapperConfig) -> BundleConfig:
     """How the mapper adjusts its windows."""
-    return BundleConfig(rounds=config.rounds, iterations=config.iterations, huber=config.huber)
+    return BundleConfig(rounds=config.rounds, iterations=config.iterations, huber=config.huber_sigmas)
 
 
 def covisible_window(map_: Map, row: int, config: MapperConfig) -> Window:

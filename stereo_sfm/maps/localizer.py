@@ -94,4 +94,4 @@ class Localizer:
         return nowhere("not_confirmed_yet", place.inliers)
 
     def _within_gate(self, guess: F64, place: Location) -> bool:
-        return within(se3.inverse(guess) @ place.map_T_cam, self._config.gate_metres, self._config.gate_degrees)
+        return within(se3.inverse(guess) @ place.map_T_cam, self._config.gate_m, self._config.gate_deg)

@@ -71,7 +71,7 @@ class Relocalizer:
 
     def locate(self, keyframe: Keyframe) -> Location:
         """Find the camera of a keyframe (its pose is ignored) in the map."""
-        view = place_view_of(keyframe, self._rig, self._config.disparity_sigma)
+        view = place_view_of(keyframe, self._rig, self._config.disparity_sigma_px)
         found: list[Location] = []
         reason = "no_candidate"
         for row in self._places(self._database.scores(self._vocabulary.bag(keyframe.corners.descriptors))):
@@ -87,7 +87,7 @@ class Relocalizer:
 
     def locate_near(self, keyframe: Keyframe, guess: F64) -> Location:
         """Find the camera near a predicted map_T_cam (4, 4): as `locate`, but only around the guess."""
-        view = place_view_of(keyframe, self._rig, self._config.disparity_sigma)
+        view = place_view_of(keyframe, self._rig, self._config.disparity_sigma_px)
         row = self._nearest(guess)
         start = se3.inverse(guess) @ self._map.map_T_kf[row]
         verdict = verify_near(start, view, self.cloud(row), self._rig, self._config)
@@ -102,7 +102,7 @@ class Relocalizer:
         order = np.lexsort((np.arange(len(shared)), -shared))[: self._config.relocalize_keyframes]
         order = order[shared[order] > 0]
         centre, *others = (self._keyframes[k] for k in order.tolist())
-        cloud = gather(centre, others, self._rig, self._config.disparity_sigma)
+        cloud = gather(centre, others, self._rig, self._config.disparity_sigma_px)
         mapped = cloud.ids >= 0
         at = np.searchsorted(self._map.pt_ids, cloud.ids[mapped])
         sigmas = cloud.sigmas.copy()

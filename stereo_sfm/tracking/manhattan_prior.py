@@ -28,7 +28,7 @@ class RotationFilter:
 
     def __init__(self, config: ManhattanConfig) -> None:
         self._config = config
-        self._drift = np.radians(config.drift_deg_per_frame) ** 2
+        self._drift = np.radians(config.drift_sigma_deg_per_frame) ** 2
         self._gate = np.radians(config.gate_deg)
         self._seen: list[F64] = []  # odom_R_axes of the measurements that are to define the axes
         self._odom_R_axes: F64 | None = None
@@ -56,7 +56,7 @@ class RotationFilter:
             self._settle(seen)
             return odom_R_cam
         error = se3.so3_log(self._odom_R_axes @ nearest_turn(seen, self._odom_R_axes).T)
-        noise = found.sigma**2 + np.radians(self._config.model_deg) ** 2
+        noise = found.sigma**2 + np.radians(self._config.model_sigma_deg) ** 2
         if np.linalg.norm(error) > min(self._gate, 4 * np.sqrt(self._variance + noise) + 1e-9):
             self.refused += 1
             return odom_R_cam
@@ -75,7 +75,7 @@ class RotationFilter:
             return
         columns = np.concatenate([axes.T for axes in self._seen])
         self._odom_R_axes = rotation_between(np.tile(np.eye(3), (len(self._seen), 1)), columns)
-        self._variance = np.radians(self._config.model_deg) ** 2 / len(self._seen)
+        self._variance = np.radians(self._config.model_sigma_deg) ** 2 / len(self._seen)
 
 
 class ManhattanTracker:

@@ -249,7 +249,7 @@ def test_eval_of_bad_files(cli: Run, tmp_path: Path, args: tuple[str, ...], word
         ("run", "data", "-c", "folder"),
         ("config", "dump", "-c", "folder"),
         ("config", "dump", "-c", "noise.toml"),
-        ("ablation", "data", "-o", "file", "--features", "orb", "--systems", "none"),
+        ("ablation", "sim:aisle", "-o", "file", "--features", "orb", "--systems", "none"),
         ("eval", "folder", "--ref", "folder/trajectory_map.tum", "--plot", "file"),
         ("export", "folder", "--format", "tum", "-o", "file/x"),
         ("rectify", "data", "-o", "file"),

@@ -82,7 +82,8 @@ def test_broken_cells_are_run_again_refused_ones_are_not() -> None:
     assert not finished(None)
     assert not finished({"schema": 1, "status": "none", "reason": "internal error: x", "traceback": "..."})
     assert finished({"schema": 1, "status": "none", "reason": "weak_structure in 5 of 5 frames", "frames": 5})
-    assert finished(run_cell(replace(CELL, features="surf")))  # refused whenever it is asked
+    refused = replace(CELL, stage="pose_graph", settings=("loop.vocabulary=/no/such/file",))
+    assert finished(run_cell(refused))  # whenever it is asked
     assert not finished(run_cell(replace(CELL, source="/no/such/folder")))  # perhaps it is not mounted now
     assert not finished({"schema": 1, "status": "none", "reason": "no such file or folder: /data"})
 

@@ -66,7 +66,7 @@ def test_identical_aisles_are_not_taken_for_each_other(vocabulary: voc.Vocabular
 def test_without_the_odometry_gate_identical_aisles_deceive(vocabulary: voc.Vocabulary) -> None:
     """The gate is what saves the test above: appearance and geometry alone accept the twin aisle."""
     walk = make_walk([0, 4], alike=1.0, seed=0)  # so far apart that neither is seen from the other
-    blind = dataclasses.replace(LoopConfig(), gate_metres=100.0, gate_degrees=360.0)
+    blind = dataclasses.replace(LoopConfig(), gate_m=100.0, gate_deg=360.0)
     loops = [r for r in close(walk, vocabulary, blind) if r.candidate_kf_id >= 0]
     assert any(error_of(walk, loop) > 1.0 for loop in loops)
 
@@ -74,7 +74,7 @@ def test_without_the_odometry_gate_identical_aisles_deceive(vocabulary: voc.Voca
 def test_of_two_places_that_look_alike_the_one_that_shows_more_is_taken(vocabulary: voc.Vocabulary) -> None:
     """Half of the products stand in both aisles, and odometry allows everything."""
     walk = make_walk([0, 4, 0], alike=0.5, seed=0)
-    blind = dataclasses.replace(LoopConfig(), gate_metres=100.0, gate_degrees=360.0)
+    blind = dataclasses.replace(LoopConfig(), gate_m=100.0, gate_deg=360.0)
     again = next(i for i, p in enumerate(walk.world_T_kf) if i > 90 and abs(p[0, 3]) < 0.1 and p[2, 2] > 0.9)
     results = close(walk, vocabulary, blind)[again + 4 :]
     loops = [r for r in results if r.candidate_kf_id >= 0]

@@ -108,4 +108,4 @@ class FramePoseSolver:
             self._shutter.row_seconds(tracks.uv), tracks.origin, tracks.direction, tracks.rho, tracks.variance,
             tracks.uv, tracks.uv_right, self._cameras.cams, self._cameras.right_T_left, sigma_px, CAUCHY_SCALES,
         )  # fmt: skip
-        return PoseSolution(pose, velocity, covariance, error, sigma_px, self._config.max_error)
+        return PoseSolution(pose, velocity, covariance, error, sigma_px, self._config.max_error_sigmas)

@@ -1,0 +1,156 @@
+"""One run from typed options to its folder: what `run` and `replay` do."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stereo_sfm.commands._stop import INTERRUPTED, StopRequest
+from stereo_sfm.errors import StereoSfmError, from_os_error
+
+if TYPE_CHECKING:
+    from drivers.choice import SourceChoice
+    from stereo_sfm.commands._step import Stepper
+    from stereo_sfm.config import Config
+    from stereo_sfm.eval.record import RunRecord
+    from stereo_sfm.log.recorded import RecordedRun
+    from stereo_sfm.maps.folders import MapFolders
+    from stereo_sfm.messages import Sink
+    from stereo_sfm.pipeline.session import Session, Wiring
+    from stereo_sfm.viz.match_pictures import MatchPictures
+
+TRACKING_FAILED = 4
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """One run.
+
+    Attributes:
+        source: what is read. config: what decides the result. wiring: how the stages run, what is logged and shown.
+        folders: the maps that it begins with and leaves behind.
+        output: its folder; None: runs/DATE_NAME. overwrite: replace the run that lies there.
+        frame: whose poses the trajectories hold, "cam0" or "body".
+        max_lost_percent: frames without a pose above which the run counts as failed.
+        matches: every so many frames a picture of the matches; None: no pictures.
+        quiet: no progress and no summary. verbose: say what happens.
+        step_from_s: stop at every frame from this second on and wait for the user; None: do not stop.
+        replayed: an earlier run whose schedule is followed.
+        command: what messages call it.
+    """
+
+    source: SourceChoice
+    config: Config
+    wiring: Wiring
+    folders: MapFolders
+    output: Path | None = None
+    overwrite: bool = False
+    frame: str = "cam0"
+    max_lost_percent: float = 20.0
+    matches: int | None = None
+    quiet: bool = False
+    verbose: bool = False
+    step_from_s: float | None = None
+    replayed: RecordedRun | None = None
+    command: str = "run"
+
+
+def execute(options: RunOptions) -> tuple[int, Path]:
+    """Run, write the output folder, print the closing summary: the exit code and the folder."""
+    from stereo_sfm.eval.record import RunRecord
+    from stereo_sfm.eval.run_results import write_results
+    from stereo_sfm.eval.statistics import failure, summary
+    from stereo_sfm.export.run_folder import link_latest
+    from stereo_sfm.pipeline.session import Session
+
+    o = options
+    o.source.refuse_to_overwrite(o.output)
+    record, pictures, stepper = RunRecord.of(o.config, o.folders.localize_only), _pictures(o.matches), _stepper(o)
+    sinks, wiring = _sinks(o, record, pictures), _wiring(o)
+    with StopRequest() as stop:
+        with Session(o.source, o.config, sinks, wiring, o.folders, o.output, o.overwrite, o.replayed) as session:
+            stop.then = session.stop
+            if stop.asked:  # while it was opened
+                session.stop()
+            if pictures is not None:
+                pictures.folder = session.folder / "matches"
+            begin = time.perf_counter()
+            interrupted, problem = _follow(session, record, stop, o.quiet or stepper is not None, stepper)
+            wall_s = time.perf_counter() - begin
+        stop.then = None
+        folder, info = session.folder, session.info
+        stats, evaluations = write_results(
+            folder, info.name, info.rig, o.config, record, wall_s, info.ground_truth, o.frame, o.source.numbering,
+            o.max_lost_percent,
+        )  # fmt: skip
+        link_latest(folder)
+    if not o.quiet:
+        print("\n".join([*summary(stats, evaluations), f"written to {folder} (start with {folder / 'report.md'})"]))
+    if problem is not None:
+        raise problem
+    if interrupted:
+        return INTERRUPTED, folder
+    failed = failure(stats)
+    if failed:
+        print(f"stereo-sfm {o.command}: {failed}; {folder / 'report.md'} says why", file=sys.stderr)
+        return TRACKING_FAILED, folder
+    return 0, folder
+
+
+def _wiring(options: RunOptions) -> Wiring:
+    """In one process where the next frame waits for somebody, or a sink needs the images."""
+    from dataclasses import replace
+
+    alone = options.matches is not None or options.step_from_s is not None
+    return replace(options.wiring, inline=options.wiring.inline or alone)
+
+
+def _sinks(options: RunOptions, record: RunRecord, pictures: MatchPictures | None) -> list[Sink]:
+    from stereo_sfm.log.events import EventLines
+
+    sinks: list[Sink] = [record] if pictures is None else [record, pictures]
+    return [*sinks, EventLines()] if options.verbose else sinks
+
+
+def _pictures(every: int | None) -> MatchPictures | None:
+    if every is None:
+        return None
+    if every < 1:
+        raise StereoSfmError("--matches takes a number of frames of at least 1")
+    from stereo_sfm.viz.match_pictures import MatchPictures
+
+    return MatchPictures(every)
+
+
+def _stepper(options: RunOptions) -> Stepper | None:
+    if options.step_from_s is None:
+        return None
+    from stereo_sfm.commands._step import Stepper
+
+    return Stepper(options.step_from_s)
+
+
+def _follow(
+    session: Session, record: RunRecord, stop: StopRequest, quiet: bool, stepper: Stepper | None
+) -> tuple[bool, StereoSfmError | None]:
+    """To the end, to Ctrl-C, or to an error; what was tracked until then stays in the record."""
+    from stereo_sfm.commands._progress import first_state, frame_state, progress
+
+    info = session.info
+    with progress(info.name, info.frame_count, quiet, state=first_state()) as bar:
+        try:
+            for frame in session:
+                bar.step(frame_state(frame))
+                if stepper is not None and not stepper.go_on(frame):
+                    session.stop()
+        except KeyboardInterrupt:
+            return True, None
+        except (StereoSfmError, OSError) as error:
+            said = from_os_error(error) if isinstance(error, OSError) else error
+            if said is None or not len(record.frames):
+                raise
+            return False, said
+        return stop.asked, None

@@ -1,0 +1,113 @@
+"""A setting: a dataclass field with a default, one sentence, and the values that it takes. One validator for all.
+
+Names carry their unit as the suffix `_px`, `_m`, `_s`, `_deg`, `_bits`; a standard deviation is `sigma_UNIT` or
+`..._sigma_UNIT`; a multiple of one is `..._sigmas`. What has no unit is a count or a ratio.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Iterator
+from dataclasses import field
+from typing import Any, TypeVar
+
+from stereo_sfm.errors import StereoSfmError, did_you_mean
+
+T = TypeVar("T")
+
+
+def number(default: float, least: float, most: float, text: str) -> Any:
+    """A field that takes numbers from `least` to `most`; `text` is one sentence without its full stop."""
+    return field(default=default, metadata={"text": text, "range": (least, most)})
+
+
+def word(default: str, words: Iterable[str], text: str) -> Any:
+    """A field that takes one of these words."""
+    return field(default=default, metadata={"text": text, "words": tuple(words)})
+
+
+def switch(default: bool, text: str) -> Any:
+    """A field that is true or false."""
+    return field(default=default, metadata={"text": text})
+
+
+def path(text: str) -> Any:
+    """A field that holds the path of a file, empty by default."""
+    return field(default="", metadata={"text": text})
+
+
+def walk(section: Any, place: str = "") -> Iterator[tuple[str, dataclasses.Field[Any], Any]]:
+    """Every setting of a tree of dataclasses: its dotted name, its field, its value."""
+    for f in dataclasses.fields(section):
+        value = getattr(section, f.name)
+        if dataclasses.is_dataclass(value):
+            yield from walk(value, f"{place}{f.name}.")
+        else:
+            yield place + f.name, f, value
+
+
+def check(tree: Any) -> None:
+    """Every value is one that its setting takes.
+
+    Raises:
+        StereoSfmError: a word or a number that it does not take.
+    """
+    for name, f, value in walk(tree):
+        words: tuple[str, ...] = f.metadata.get("words", ())
+        if words and value not in words:
+            raise StereoSfmError(
+                f"configuration: {name} is '{value}'{did_you_mean(value, words)}: choose one of {', '.join(words)}"
+            )
+        if "range" in f.metadata and not f.metadata["range"][0] <= value <= f.metadata["range"][1]:
+            least, most = f.metadata["range"]
+            raise StereoSfmError(f"configuration: {name} is {plain(value)}: it must be from {least:g} to {most:g}")
+
+
+def plain(value: float) -> str:
+    """A number as people write it: whole ones with all digits."""
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def check_names(tree: Any, data: dict[str, Any], place: str = "") -> None:
+    """Every key of nested values is a setting.
+
+    Raises:
+        StereoSfmError: one is not; the message names the nearest that is.
+    """
+    own = {f.name: getattr(tree, f.name) for f in dataclasses.fields(tree)}
+    for key, value in data.items():
+        if key not in own:
+            raise StereoSfmError(
+                f"configuration: there is no {place}{key}{did_you_mean(key, own)} "
+                "('stereo-sfm config dump' shows every key)"
+            )
+        if dataclasses.is_dataclass(own[key]):
+            if not isinstance(value, dict):
+                first = dataclasses.fields(own[key])[0].name
+                raise StereoSfmError(f"configuration: {key} is a section of settings, as {key}.{first}")
+            check_names(own[key], value, f"{place}{key}.")  # pyright: ignore[reportUnknownArgumentType]
+
+
+def explained(tree: Any) -> str:
+    """The tree as TOML, above each setting a comment with its sentence and what it takes."""
+    import tomli_w
+
+    lines: list[str] = []
+    section = ""
+    for name, f, value in walk(tree):
+        head, _, key = name.rpartition(".")
+        if head != section:
+            lines.append(f"[{head}]\n# {(type(getattr(tree, head)).__doc__ or head).splitlines()[0]}\n")
+            section = head
+        text = f"[{name}]\n{tomli_w.dumps(value)}" if isinstance(value, dict) else tomli_w.dumps({key: value})
+        lines.append(f"# {f.metadata['text']}{_takes(f)}.\n{text}")
+    return "\n".join(lines)
+
+
+def _takes(f: dataclasses.Field[Any]) -> str:
+    if "words" in f.metadata:
+        return f" ({' | '.join(f.metadata['words'])})"
+    if "range" in f.metadata:
+        least, most = f.metadata["range"]
+        return f" (from {least:g} to {most:g})"
+    return ""
