@@ -1,10 +1,10 @@
-"""Where images come from: one protocol, one table of names, `open_source(spec)` for all of them.
+"""Where images come from: one protocol, drivers as plugins, `open_source(spec)` for all of them.
 
 A source is a context manager that knows its rig before the first frame and yields `StereoImage` in stamp order.
 """
 
 from __future__ import annotations
 
-from drivers.source import Source, open_source
+from drivers.source import BaseSource, Source, open_source
 
-__all__ = ["Source", "open_source"]
+__all__ = ["BaseSource", "Source", "open_source"]

@@ -1,24 +1,39 @@
-"""The source protocol and the table of sources."""
+"""The source protocol, what drivers build on, and opening a source by its text."""
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Callable, Iterator
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, Any, Protocol, Self
 from urllib.parse import parse_qsl
 
+from drivers import registry
+from drivers.driver import Driver
+from drivers.options import SourceOptions, read_options
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.words import did_you_mean
 
 if TYPE_CHECKING:
     from calib.rig import Rig
     from drivers.rig_option import RigOption
-    from stereo_sfm.types import StereoImage, Trajectory
+    from stereo_sfm.types import I64, StereoImage, Trajectory
+
+_NO_COUNTERS: Mapping[str, float] = MappingProxyType({})
+
+
+@dataclass(frozen=True, eq=False)
+class Stamps:
+    """When the frames of a source were taken, known without reading their pixels."""
+
+    stamp_ns: I64  # (N,) of the left images
+    skew_ms: float = float("nan")  # largest difference between the eyes' stamps; NaN: not known
 
 
 class Source(Protocol):
-    """What every driver is."""
+    """Where images come from. Drivers inherit the usual answers from `BaseSource`."""
 
     @property
     def name(self) -> str:
@@ -45,6 +60,22 @@ class Source(Protocol):
         """Frames come whether or not somebody takes them."""
         ...
 
+    @property
+    def counters(self) -> Mapping[str, float]:
+        """What a live source counts about itself (drivers.live.counters); empty for files."""
+        ...
+
+    def stamps(self) -> Stamps | None:
+        """The stamps of all frames where they are known without reading pixels, else None."""
+        ...
+
+    def at(self, positions: Sequence[int]) -> Iterator[StereoImage]:
+        """The frames at ascending positions (0 is the first frame that iteration gives), and no others.
+
+        Sources that can read or render a frame alone do not touch those between.
+        """
+        ...
+
     def __enter__(self) -> Self: ...
 
     def __exit__(
@@ -54,67 +85,129 @@ class Source(Protocol):
     def __iter__(self) -> Iterator[StereoImage]: ...
 
 
-# name -> (module, factory). A factory takes what follows the colon and keyword options, and returns a Source.
-TABLE: dict[str, tuple[str, str]] = {
-    "sim": ("drivers.sim.source", "open_sim"),
-    "kitti": ("drivers.kitti", "open_kitti"),
-    "kitti_raw": ("drivers.kitti_raw", "open_kitti_raw"),
-    "euroc": ("drivers.euroc", "open_euroc"),
-    "tum_vi": ("drivers.euroc", "open_tum_vi"),
-    "tum_rgbd": ("drivers.tum_rgbd", "open_tum_rgbd"),
-    "images": ("drivers.images", "open_images"),
-    "kapture": ("drivers.kapture", "open_kapture"),
-    "mcap": ("drivers.mcap", "open_mcap"),
-    "t265": ("drivers.t265.source", "open_t265"),
-    "oak": ("drivers.oak", "open_oak"),
-}
+def chosen_frames(images: Iterator[StereoImage], positions: Sequence[int]) -> Iterator[StereoImage]:
+    """The frames at ascending positions of an iteration, which is read no further than the last of them."""
+    wanted = iter(positions)
+    position = next(wanted, None)
+    for number, image in enumerate(images if position is not None else ()):
+        if number == position:
+            yield image
+            position = next(wanted, None)
+            if position is None:
+                return
 
 
-DEVICES = ("t265", "oak")  # kinds that are live cameras
+class BaseSource(ABC):
+    """A source with the answers that most drivers give; a driver sets `name` and `rig` and says `__iter__`."""
+
+    name: str
+    rig: Rig
+    ground_truth: Trajectory | None = None
+    frame_count: int | None = None
+    live: bool = False
+    counters: Mapping[str, float] = _NO_COUNTERS
+
+    def stamps(self) -> Stamps | None:
+        return None
+
+    def at(self, positions: Sequence[int]) -> Iterator[StereoImage]:
+        return chosen_frames(iter(self), positions)
+
+    def close(self) -> None:
+        """Give back what was opened; called once more than needed at most."""
+        return
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @abstractmethod
+    def __iter__(self) -> Iterator[StereoImage]:
+        """Frames in the order of their stamps."""
+
+
+@dataclass(frozen=True)
+class Named:
+    """What a source's text stands for: a driver, a place, options; checked, and nothing opened yet."""
+
+    kind: str
+    driver: Driver[Any]
+    place: str
+    options: SourceOptions
+
+    def open(self) -> Source:
+        """The source, not yet entered."""
+        return self.driver.open(self.place, self.options)
+
+
+def look_up(spec: str | Path, rig: RigOption = None, **options: Any) -> Named:
+    """What a source's text stands for; arguments and errors as for `open_source`, but nothing is opened."""
+    kind, place, query = _split(str(spec))
+    given = {**dict(parse_qsl(query, keep_blank_values=True)), **options}
+    if rig is not None:
+        given["rig"] = rig
+    found = registry.driver(kind)
+    read = read_options(found.options, kind, given)
+    found.check(place, read)
+    return Named(kind, found, place, read)
+
+
+def open_source(spec: str | Path, rig: RigOption = None, **options: Any) -> Source:
+    """Open a source by its text.
+
+    Args:
+        spec: `KIND:PLACE?OPTION=VALUE&...` (`sim:loop?camera=pinhole&seed=3`, `t265`, `oak?fps=20`), or a file or folder
+            whose kind is recognised.
+        rig: calibration instead of the source's own, or a file of one.
+        **options: of the driver, as typed values or as text; they win over those in the text.
+
+    Raises:
+        StereoSfmError: unknown kind, missing or unrecognised folder, an option that the driver does not have, or
+            whatever the driver finds wrong.
+    """
+    return look_up(spec, rig, **options).open()
 
 
 def is_device(spec: str) -> bool:
-    """Whether a source's name stands for a live camera."""
-    return spec.partition(":")[0] in DEVICES
+    """Whether a source's text stands for a live camera."""
+    kind = _kind(spec)
+    return kind is not None and registry.driver(kind).cameras is not None
 
 
 def path_of(spec: str) -> Path:
     """The file or folder that a source's text names, if it names one."""
-    kind, colon, rest = spec.partition(":")
-    return Path(rest.partition("?")[0] if colon and kind in TABLE else spec).expanduser()
+    head = spec.partition("?")[0]
+    return Path(head.partition(":")[2] if _kind(spec) else spec if Path(spec).exists() else head).expanduser()
 
 
-def _factory(name: str) -> Callable[..., Source]:
-    module, attribute = TABLE[name]
-    return getattr(importlib.import_module(module), attribute)
+def _kind(text: str) -> str | None:
+    """The kind that a text begins with, None where it is a path."""
+    kind = text.partition("?")[0].partition(":")[0]
+    return kind if kind in registry.kinds() else None
 
 
-def open_source(spec: str | Path, rig: RigOption = None, **options: Any) -> Source:
-    """Open a source by name.
-
-    Args:
-        spec: `sim:loop?camera=pinhole&seed=3`, `t265`, `oak`, a folder (its kind is recognised), an .mcap file, or
-            `kind:path` to say the kind.
-        rig: calibration instead of the source's own, or a file of one.
-        **options: passed to the driver; options in the spec's query come as strings.
-
-    Raises:
-        StereoSfmError: unknown name, missing folder, unrecognised folder, or whatever the driver finds wrong.
-    """
-    if rig is not None:
-        options["rig"] = rig
-    text = str(spec)
-    kind, colon, rest = text.partition(":")
-    if kind in TABLE and (colon or text == kind):
-        rest, _, query = rest.partition("?")
-        return _factory(kind)(rest, **{**dict(parse_qsl(query, keep_blank_values=True)), **options})
-    path = Path(text).expanduser()
+def _split(text: str) -> tuple[str, str, str]:
+    """(kind, place, query) of a source's text."""
+    head, _, query = text.partition("?")
+    kind = _kind(text)
+    if kind is not None:
+        return kind, head.partition(":")[2], query
+    if Path(text).expanduser().exists():
+        head, query = text, ""
+    path = Path(head).expanduser()
     if not path.exists():
-        looks_like_path = "/" in text or "." in text
-        what = f"no such file or folder: {text}" if looks_like_path else f"unknown source '{text}'"
-        raise StereoSfmError(f"{what} (sources: {', '.join(TABLE)}, a dataset folder, or an .mcap file)")
-    if path.is_file():
-        return _factory("mcap")(str(path), **options)
-    from drivers.recognise import recognise_folder
+        raise _unknown(head)
+    return registry.recognise(path), str(path), query
 
-    return _factory(recognise_folder(path))(str(path), **options)
+
+def _unknown(text: str) -> StereoSfmError:
+    kind, colon, _ = text.partition(":")
+    known = registry.kinds()
+    hint = did_you_mean(kind, known)
+    is_path = ("/" in text or "." in text) and not (colon and hint)
+    what = f"no such file or folder: {text}" if is_path else f"unknown source '{text}'{hint}"
+    return StereoSfmError(f"{what} (sources: {', '.join(known)}, a dataset folder, or an .mcap file)")

@@ -21,7 +21,7 @@ from mcap_protobuf.writer import Writer as ProtobufWriter
 
 from calib.rig import Rig
 from drivers import open_source
-from drivers.mcap_topics import choose_topics
+from drivers.mcap.topics import choose_topics
 from drivers.memory import MemorySource
 from stereo_sfm.cli import main
 from stereo_sfm.errors import StereoSfmError

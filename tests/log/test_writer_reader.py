@@ -10,7 +10,7 @@ from mcap.reader import make_reader
 
 from calib.rig import Rig
 from drivers import open_source
-from drivers.mcap import McapSource
+from drivers.mcap.source import McapSource
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log import foxglove, topics
 from stereo_sfm.log.reader import LogReader

@@ -17,25 +17,26 @@ from calib.rig import Rig
 from drivers.folder_source import FolderSource, Shot, folder_of, need
 from drivers.ground_truth import moved, read_euroc
 from drivers.image_lists import Listing, pair_listings
-from drivers.rig_option import RigOption, chosen_rig
+from drivers.options import SourceOptions
+from drivers.rig_option import chosen_rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import Trajectory
 
 TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
 
 
-def open_euroc(path: str, rig: RigOption = None) -> FolderSource:
+def open_euroc(path: str, options: SourceOptions) -> FolderSource:
     """Open an ASL folder: the one that holds `mav0`, or `mav0` itself."""
     mav = _mav_folder(folder_of("euroc", path))
-    return _open(f"euroc:{_label(mav)}", mav, chosen_rig(rig, lambda: read_rig(mav)))
+    return _open(f"euroc:{_label(mav)}", mav, chosen_rig(options.rig, lambda: read_rig(mav)))
 
 
-def open_tum_vi(path: str, rig: RigOption = None) -> FolderSource:
+def open_tum_vi(path: str, options: SourceOptions) -> FolderSource:
     """Open a TUM VI folder: `mav0` beside `camchain.yaml` (or `dso/camchain.yaml`)."""
     mav = _mav_folder(folder_of("tum_vi", path))
     chains = [mav.parent / "camchain.yaml", mav.parent / "dso" / "camchain.yaml"]
     chain = next((c for c in chains if c.is_file()), chains[0])
-    return _open(f"tum_vi:{_label(mav)}", mav, chosen_rig(rig, lambda: read_kalibr(chain)))
+    return _open(f"tum_vi:{_label(mav)}", mav, chosen_rig(options.rig, lambda: read_kalibr(chain)))
 
 
 def _label(mav: Path) -> str:

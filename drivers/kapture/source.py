@@ -15,7 +15,8 @@ from calib.formats.kapture import read_kapture, read_kapture_cameras
 from calib.rig import Rig
 from drivers.folder_source import FolderSource, Shot, folder_of, need
 from drivers.image_lists import Listing, list_images, pair_listings
-from drivers.rig_option import RigOption, chosen_rig
+from drivers.options import SourceOptions
+from drivers.rig_option import chosen_rig
 from drivers.select import SelectedFrames
 from stereo_sfm.errors import StereoSfmError
 
@@ -26,7 +27,7 @@ T265_SIZE = (848, 800)
 ALIGNED_PAIRS = 5  # images from which a missing rotation between the eyes is found
 
 
-def open_kapture(path: str, rig: RigOption = None) -> FolderSource:
+def open_kapture(path: str, options: SourceOptions) -> FolderSource:
     """Open the first two cameras of a kapture folder.
 
     A T265 sample has no extrinsics: its eyes are taken to be at the nominal distance, and how the right one is turned
@@ -37,8 +38,8 @@ def open_kapture(path: str, rig: RigOption = None) -> FolderSource:
     left, right = _listings(folder)
     pairs = pair_listings(name, left, right)
     shots = [Shot(left[i][0], left[i][1], right[j][1], right_stamp_ns=right[j][0]) for i, j in pairs]
-    guessed = not rig and not _sensors(folder).with_name("rigs.txt").is_file()
-    source = FolderSource(name, chosen_rig(rig, lambda: _read_rig(folder)), shots)
+    guessed = not options.rig and not _sensors(folder).with_name("rigs.txt").is_file()
+    source = FolderSource(name, chosen_rig(options.rig, lambda: _read_rig(folder)), shots)
     if guessed:
         source.rig = _turned(name, source)
     return source

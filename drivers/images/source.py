@@ -7,6 +7,7 @@ the frame rate given and the numbers in the file names.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from calib.rig import Rig
 from drivers.folder_source import FolderSource, Shot, folder_of
@@ -20,8 +21,11 @@ from drivers.image_lists import (
     stamp_from_text,
     stamp_of,
 )
-from drivers.rig_option import RigOption, chosen_rig
+from drivers.rig_option import chosen_rig
 from stereo_sfm.errors import StereoSfmError
+
+if TYPE_CHECKING:
+    from drivers.images import ImagesOptions
 
 # folder names of the two eyes; the first two are also file name prefixes in one folder
 PAIRS = (("left", "right"), ("cam0", "cam1"), ("image_0", "image_1"), ("image_2", "image_3"), ("infra1", "infra2"))
@@ -30,13 +34,13 @@ RIG_SUFFIXES = (".yaml", ".yml", ".json", ".txt")
 TRUTH_NAMES = ("groundtruth.txt", "groundtruth.tum", "poses.tum", "poses.txt")
 
 
-def open_images(path: str, rig: RigOption = None, fps: float | str = 30.0) -> FolderSource:
+def open_images(path: str, options: ImagesOptions) -> FolderSource:
     """Open a pair of image folders.
 
     Args:
         path: the folder that holds both.
-        rig: a rig or rig file; without it the one found in the folder (rig.yaml, calib.yaml, ...).
-        fps: frames a second, used where nothing tells the stamps.
+        options: the frame rate, used where nothing tells the stamps, and the calibration; without it the one found in
+            the folder (rig.yaml, calib.yaml, ...).
     """
     folder = folder_of("images", path)
     name = f"images:{folder.resolve().name}"
@@ -45,7 +49,7 @@ def open_images(path: str, rig: RigOption = None, fps: float | str = 30.0) -> Fo
         raise StereoSfmError(
             f"{folder} holds no image pair (left/ and right/, cam0/ and cam1/, or left*, right* files)"
         )
-    stamps = _stamps(name, folder, found[0], fps)
+    stamps = _stamps(name, folder, found[0], options.fps)
     pairs = pair_files(name, *found)
     shots = [
         Shot(stamps[left], left, right, right_stamp_ns=_right_stamp(stamps[left], left, right))
@@ -55,7 +59,7 @@ def open_images(path: str, rig: RigOption = None, fps: float | str = 30.0) -> Fo
     truth = next((folder / n for n in TRUTH_NAMES if (folder / n).is_file()), None)
     return FolderSource(
         name,
-        chosen_rig(rig, lambda: _own_rig(folder)),
+        chosen_rig(options.rig, lambda: _own_rig(folder)),
         shots,
         read_trajectory(truth) if truth is not None else None,
     )
@@ -92,7 +96,7 @@ def _own_rig(folder: Path) -> Rig:
     return load_rig(path)
 
 
-def _stamps(name: str, folder: Path, files: list[Path], fps: float | str) -> dict[Path, int]:
+def _stamps(name: str, folder: Path, files: list[Path], fps: float) -> dict[Path, int]:
     """Nanoseconds of the left images."""
     times = folder / "times.txt"
     if times.is_file():
@@ -104,10 +108,7 @@ def _stamps(name: str, folder: Path, files: list[Path], fps: float | str) -> dic
     named = {p: stamp_of(p) for p in files}
     if None not in named.values():
         return {p: s or 0 for p, s in named.items()}
-    try:
-        period = 1e9 / float(fps)
-    except (ValueError, ZeroDivisionError):
-        raise StereoSfmError(f"fps must be a number above 0, got '{fps}'") from None
+    period = 1e9 / fps
     return {p: round(i * period) for p, i in zip(files, frame_numbers(files), strict=True)}
 
 

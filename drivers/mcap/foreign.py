@@ -15,7 +15,7 @@ import numpy as np
 
 from calib.rig import Rig
 from drivers.folder_source import SAMPLED
-from drivers.mcap_messages import (
+from drivers.mcap.messages import (
     BAD_MESSAGE,
     CAMERAS,
     IMUS,
@@ -27,10 +27,10 @@ from drivers.mcap_messages import (
     Transform,
     schema_name,
 )
-from drivers.mcap_rig import camera_of, chain, stereo_rig
-from drivers.mcap_topics import camera_topic, choose_topics, is_rectified
+from drivers.mcap.rig import camera_of, chain, stereo_rig
+from drivers.mcap.topics import camera_topic, choose_topics, is_rectified
 from drivers.rig_option import RigOption, chosen_rig
-from drivers.tum_rgbd import with_virtual_eye
+from drivers.tum_rgbd.source import with_virtual_eye
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log.reader import LogReader, Record
 from stereo_sfm.pixels import eight_bits, sensor_bits

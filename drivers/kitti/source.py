@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,23 +16,25 @@ from calib.formats.kitti import read_kitti as read_rig
 from drivers.folder_source import FolderSource, Shot, folder_of, need
 from drivers.ground_truth import moved, read_kitti, stamp_from_seconds
 from drivers.image_lists import lines_of, list_images, pair_files
-from drivers.rig_option import RigOption, chosen_rig
+from drivers.rig_option import chosen_rig
 from stereo_sfm.errors import StereoSfmError
+
+if TYPE_CHECKING:
+    from drivers.kitti import KittiOptions
 
 log = logging.getLogger("stereo_sfm")
 
 PERIOD_NS = 100_000_000  # 10 Hz, where times.txt is missing
 
 
-def open_kitti(path: str, sequence: str = "", rig: RigOption = None) -> FolderSource:
+def open_kitti(path: str, options: KittiOptions) -> FolderSource:
     """Open one sequence.
 
     Args:
         path: the sequence's folder, or the data set's root.
-        sequence: which one below the root, where there are several ("00").
-        rig: a rig or rig file that replaces the data set's calibration.
+        options: which sequence, and the calibration.
     """
-    folder = _sequence_folder(folder_of("kitti", path), sequence)
+    folder = _sequence_folder(folder_of("kitti", path), options.sequence)
     name = f"kitti:{folder.resolve().name}"
     eyes = next((pair for pair in ((0, 1), (2, 3)) if (folder / f"image_{pair[0]}").is_dir()), None)
     if eyes is None:
@@ -40,7 +43,7 @@ def open_kitti(path: str, sequence: str = "", rig: RigOption = None) -> FolderSo
     stamps = _read_times(folder / "times.txt", name, len(lefts))
     line = lines_of(name, lefts, len(stamps), "times.txt", first=0)
     shots = [Shot(stamps[line[left]], left, right) for left, right in pair_files(name, lefts, rights) if left in line]
-    chosen = chosen_rig(rig, lambda: read_rig(need(folder / "calib.txt", "KITTI calibration"), eyes=eyes))
+    chosen = chosen_rig(options.rig, lambda: read_rig(need(folder / "calib.txt", "KITTI calibration"), eyes=eyes))
     truth_file = folder.resolve().parent.parent / "poses" / f"{folder.resolve().name}.txt"
     truth = None
     if truth_file.is_file():

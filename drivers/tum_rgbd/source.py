@@ -16,7 +16,8 @@ from calib.rig import Rig
 from drivers.folder_source import FolderSource, Shot, folder_of, need
 from drivers.ground_truth import read_tum, stamp_from_seconds
 from drivers.image_lists import pair_by_stamp
-from drivers.rig_option import RigOption, chosen_rig
+from drivers.options import SourceOptions
+from drivers.rig_option import chosen_rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry.cameras import RadTan
 
@@ -35,7 +36,7 @@ INTRINSICS: dict[str, tuple[float, ...]] = {
 }
 
 
-def open_tum_rgbd(path: str, rig: RigOption = None) -> FolderSource:
+def open_tum_rgbd(path: str, options: SourceOptions) -> FolderSource:
     """Open a TUM RGB-D folder; its name says which of the three cameras took it, else a rig file must be given."""
     folder = folder_of("tum_rgbd", path)
     label = folder.resolve().name
@@ -50,7 +51,7 @@ def open_tum_rgbd(path: str, rig: RigOption = None) -> FolderSource:
     truth = folder / "groundtruth.txt"
     return FolderSource(
         f"tum_rgbd:{label}",
-        with_virtual_eye(chosen_rig(rig, lambda: _own_rig(folder, label))),
+        with_virtual_eye(chosen_rig(options.rig, lambda: _own_rig(folder, label))),
         shots,
         read_tum(truth) if truth.is_file() else None,
         DEPTH_SCALE,

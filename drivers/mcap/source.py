@@ -1,4 +1,4 @@
-"""MCAP files as a source: our own recordings to the bit; `drivers.mcap_foreign` reads what others wrote."""
+"""MCAP files as a source: our own recordings to the bit; `drivers.mcap.foreign` reads what others wrote."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
@@ -26,6 +26,9 @@ from stereo_sfm.log.reader import LogReader, Record
 from stereo_sfm.pixels import eight_bits
 from stereo_sfm.types import F32, I64, U8, ImuSamples, StereoImage, WheelSamples
 
+if TYPE_CHECKING:
+    from drivers.mcap import McapOptions
+
 log = logging.getLogger("stereo_sfm")
 
 _PARTS = (
@@ -40,13 +43,12 @@ _MARGIN_NS = 1_000_000_000  # inertial samples may lie this far from the frame t
 _WAITING = 8  # frames that may be begun before an incomplete one is given up
 
 
-def open_mcap(path: str, **options: Any) -> Source:
+def open_mcap(path: str, options: McapOptions) -> Source:
     """Open a recording or a run.
 
     Args:
         path: the file.
-        **options: `rig`, a calibration (a file or a `Rig`) that replaces the one in the file; for files by others
-            also `left`, `right`, `depth`: the image topics, where the names do not tell.
+        options: a calibration that replaces the one in the file; for files of others the image topics.
 
     Raises:
         StereoSfmError: no file, not MCAP, no images, no calibration, or images that do not fit the calibration.
@@ -56,19 +58,23 @@ def open_mcap(path: str, **options: Any) -> Source:
     reader = LogReader(Path(path).expanduser())
     try:
         if any(t.topic == topics.IMAGE_INFO and t.schema == "stereo_sfm.ImageInfo" for t in reader.topics):
-            return McapSource(reader, **options)
+            _refuse_topics(path, options)
+            return McapSource(reader, options.rig)
         about = reader.metadata(METADATA)
         if about.get("image_format") == "none":
             raise StereoSfmError(f"{path} is a run without its images: they are in {about.get('source')}")
-        from drivers.mcap_foreign import ForeignMcapSource
+        from drivers.mcap.foreign import ForeignMcapSource
 
-        return ForeignMcapSource(reader, **options)
-    except TypeError as error:
-        reader.close()
-        raise StereoSfmError(f"{path}: {str(error).rpartition('.')[2]}") from None
+        return ForeignMcapSource(reader, options.rig, options.left, options.right, options.depth)
     except BaseException:
         reader.close()
         raise
+
+
+def _refuse_topics(path: str, options: McapOptions) -> None:
+    """Our own files have one topic for each image: another one cannot be chosen."""
+    if options.left or options.right or options.depth:
+        raise StereoSfmError(f"{path} is a recording of stereo-sfm: left, right, depth are for files of other programs")
 
 
 def decode_image(record: Record) -> U8:

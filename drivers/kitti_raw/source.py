@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,10 +17,13 @@ from calib.formats.kitti import read_kitti as read_rig
 from drivers.folder_source import FolderSource, Shot, folder_of, need
 from drivers.ground_truth import moved
 from drivers.image_lists import lines_of, list_images, pair_files
-from drivers.rig_option import RigOption, chosen_rig
+from drivers.rig_option import chosen_rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, Trajectory
+
+if TYPE_CHECKING:
+    from drivers.kitti_raw import KittiRawOptions
 
 log = logging.getLogger("stereo_sfm")
 
@@ -27,21 +31,20 @@ EARTH_RADIUS = 6378137.0  # metres, as the development kit
 CALIBRATION = "calib_cam_to_cam.txt"
 
 
-def open_kitti_raw(path: str, drive: str = "", rig: RigOption = None) -> FolderSource:
+def open_kitti_raw(path: str, options: KittiRawOptions) -> FolderSource:
     """Open one drive (synchronised and rectified).
 
     Args:
         path: the drive's folder, or the date's folder that holds it.
-        drive: which one below the date, where there are several.
-        rig: a rig or rig file that replaces the data set's calibration.
+        options: which drive, and the calibration.
     """
-    folder = _drive_folder(folder_of("kitti_raw", path), drive)
+    folder = _drive_folder(folder_of("kitti_raw", path), options.drive)
     name = f"kitti_raw:{folder.resolve().name}"
     eyes = next((e for e in ((0, 1), (2, 3)) if (folder / f"image_0{e[0]}" / "data").is_dir()), None)
     if eyes is None:
         raise StereoSfmError(f"{folder} has neither image_00/data nor image_02/data")
     date = next((p for p in (folder, folder.resolve().parent) if (p / CALIBRATION).is_file()), folder.resolve().parent)
-    own = chosen_rig(rig, lambda: read_rig(need(date / CALIBRATION, "KITTI raw calibration"), eyes=eyes))
+    own = chosen_rig(options.rig, lambda: read_rig(need(date / CALIBRATION, "KITTI raw calibration"), eyes=eyes))
     lefts, rights = (list_images(folder / f"image_0{i}" / "data") for i in eyes)
     files = [folder / f"image_0{i}" / "timestamps.txt" for i in eyes]
     stamps = _read_times(need(files[0], "time stamps"))

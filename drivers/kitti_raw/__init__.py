@@ -1,0 +1,35 @@
+"""KITTI raw data as a kind of source; `drivers.kitti_raw.source` reads it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from drivers.driver import Certainty, Driver
+from drivers.options import SourceOptions, option
+
+if TYPE_CHECKING:
+    from drivers.source import Source
+
+
+@dataclass(frozen=True)
+class KittiRawOptions(SourceOptions):
+    """Options of `kitti_raw:FOLDER`."""
+
+    drive: str = option("", "which one below the date's folder, where there are several (0009)")
+
+
+def _open(place: str, options: KittiRawOptions) -> Source:
+    from drivers.kitti_raw.source import open_kitti_raw
+
+    return open_kitti_raw(place, options)
+
+
+def _recognise(path: Path) -> Certainty:
+    drives = (path, *sorted(path.glob("*_drive_*")))
+    found = any((drive / f"image_0{i}" / "data").is_dir() for drive in drives for i in (0, 2))
+    return Certainty.LAYOUT if found else Certainty.NO
+
+
+DRIVER = Driver("KITTI raw data: a drive with image_00/data", "FOLDER", KittiRawOptions, _open, recognise=_recognise)

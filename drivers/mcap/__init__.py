@@ -1,0 +1,39 @@
+"""MCAP files as a kind of source; `drivers.mcap.source` reads our own, `drivers.mcap.foreign` those of others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from drivers.driver import Certainty, Driver
+from drivers.options import SourceOptions, option
+
+if TYPE_CHECKING:
+    from drivers.source import Source
+
+
+@dataclass(frozen=True)
+class McapOptions(SourceOptions):
+    """Options of `mcap:FILE`. The topics are for files of other programs."""
+
+    left: str = option("", "topic of the left images, where the names do not tell")
+    right: str = option("", "topic of the right images, where the names do not tell")
+    depth: str = option("", "topic of the depth images, where the names do not tell")
+
+
+def _open(place: str, options: McapOptions) -> Source:
+    from drivers.mcap.source import open_mcap
+
+    return open_mcap(place, options)
+
+
+def _recognise(path: Path) -> Certainty:
+    if not path.is_file():
+        return Certainty.NO
+    return Certainty.MARKED if path.suffix == ".mcap" else Certainty.PERHAPS
+
+
+DRIVER = Driver(
+    "recordings and runs, and MCAP files of other programs", "FILE", McapOptions, _open, recognise=_recognise
+)

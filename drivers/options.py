@@ -1,0 +1,191 @@
+"""Options of a source: one dataclass a driver, read from the query of a source's text or from keyword arguments.
+
+A driver declares its options once, with their types, defaults, limits and a sentence each:
+
+    @dataclass(frozen=True)
+    class WebcamOptions(SourceOptions):
+        fps: float = option(30.0, "images a second", low=1, high=240)
+        flip: bool = option(False, "turn the images by 180 degrees")
+
+`webcam:0?fps=60&flip=1` and `open_source("webcam:0", fps=60, flip=True)` give the same options; whatever does not fit
+is one line for the user. The help and the table of drivers are made from the same declarations.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import Field, dataclass, field, fields
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.words import did_you_mean
+
+if TYPE_CHECKING:
+    from drivers.rig_option import RigOption
+else:
+    RigOption = Any  # annotations are evaluated when options are read: nothing heavy is imported for that
+
+O = TypeVar("O", bound="SourceOptions")  # noqa: E741
+
+_FLAGS = dict.fromkeys(("", "1", "true", "yes", "on"), True) | dict.fromkeys(("0", "false", "no", "off"), False)
+_NOTHING = ("auto", "none", "")  # how a text says None
+
+
+def option(
+    default: Any,
+    doc: str,
+    *,
+    low: float | None = None,
+    high: float | None = None,
+    read: Callable[[Any], Any] | None = None,
+) -> Any:
+    """One field of a driver's options.
+
+    Args:
+        default: its value when nothing is said.
+        doc: what it means, with its unit.
+        low, high: limits of a number, both inclusive.
+        read: makes the value from what the user gave, for types that no text says by itself; raises ValueError with
+            what it must be ("WIDTHxHEIGHT, such as 640x400").
+    """
+    return field(default=default, metadata={"doc": doc, "low": low, "high": high, "read": read})
+
+
+@dataclass(frozen=True)
+class SourceOptions:
+    """What every driver takes; a driver's own options inherit from it."""
+
+    rig: RigOption = option(None, "calibration instead of the source's own: a file of any dialect", read=lambda x: x)
+
+
+def read_options(cls: type[O], source: str, given: Mapping[str, Any]) -> O:
+    """A driver's options from what the user gave.
+
+    Args:
+        cls: the driver's options.
+        source: kind of the source, for messages ("t265").
+        given: name -> text of a query, or the value itself.
+
+    Raises:
+        StereoSfmError: an option that the driver does not have, or a value that does not fit.
+    """
+    known = {f.name: f for f in fields(cls)}
+    types = get_type_hints(cls)
+    values: dict[str, Any] = {}
+    for name, value in given.items():
+        if name not in known:
+            raise StereoSfmError(
+                f"{source} has no option '{name}'{did_you_mean(name, known)} (it has: {', '.join(sorted(known))})"
+            )
+        values[name] = _read(source, known[name], types[name], value)
+    return cls(**values)
+
+
+@dataclass(frozen=True)
+class OptionHelp:
+    """What a user should know of one option."""
+
+    name: str
+    default: str
+    wanted: str
+    doc: str
+
+
+def described(cls: type[SourceOptions]) -> Iterator[OptionHelp]:
+    """The options of a driver for people, in the order of their declaration."""
+    types = get_type_hints(cls)
+    for f in fields(cls):
+        custom = f.metadata.get("read") is not None
+        wanted = "" if custom else _wanted(types[f.name], f)
+        yield OptionHelp(f.name, _shown(f.default), wanted, str(f.metadata.get("doc", "")))
+
+
+def _shown(default: Any) -> str:
+    if isinstance(default, bool):
+        return "on" if default else "off"
+    if isinstance(default, tuple):
+        return "x".join(str(part) for part in default)  # pyright: ignore[reportUnknownVariableType]
+    return "" if default is None else f"{default:g}" if isinstance(default, float) else str(default)
+
+
+def _read(source: str, f: Field[Any], kind: Any, value: Any) -> Any:
+    """One value, of the field's type and within its limits."""
+    custom: Callable[[Any], Any] | None = f.metadata.get("read")
+    try:
+        return custom(value) if custom is not None else _limited(f, _convert(kind, value))
+    except ValueError as error:
+        wanted = str(error) if custom is not None else _wanted(kind, f)
+        raise StereoSfmError(f"{source}: option {f.name}={value}: it must be {wanted}") from None
+
+
+def _convert(kind: Any, value: Any) -> Any:
+    """A value of a type from itself or from text. Raises ValueError where it is none."""
+    if _optional(kind):
+        if value is None or (isinstance(value, str) and value.lower() in _NOTHING):
+            return None
+        return _convert(_inner(kind), value)
+    if get_origin(kind) is Literal:
+        word = str(value).lower()
+        if word not in get_args(kind):
+            raise ValueError(word)
+        return word
+    if kind is bool:
+        return _flag(value)
+    if kind is int:
+        return _whole(value)
+    if kind is float:
+        if isinstance(value, bool | None):
+            raise ValueError(value)
+        return float(value)
+    return Path(value).expanduser() if kind is Path else str(value)
+
+
+def _flag(value: Any) -> bool:
+    word = str(value).lower()
+    if word not in _FLAGS:
+        raise ValueError(word)
+    return _FLAGS[word]
+
+
+def _whole(value: Any) -> int:
+    if isinstance(value, str):
+        return int(value)
+    if isinstance(value, bool | float | None):
+        raise ValueError(value)
+    return operator.index(value)
+
+
+def _limited(f: Field[Any], value: Any) -> Any:
+    low, high = f.metadata.get("low"), f.metadata.get("high")
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        above = low is None or value >= low
+        if not (above and (high is None or value <= high)):
+            raise ValueError(value)
+    return value
+
+
+def _wanted(kind: Any, f: Field[Any]) -> str:
+    """What a value must be, for people."""
+    auto = "auto or " if _optional(kind) else ""
+    kind = _inner(kind)
+    if get_origin(kind) is Literal:
+        return f"{auto}one of {', '.join(get_args(kind))}"
+    if kind not in (int, float):
+        return auto + {bool: "on or off", Path: "a path"}.get(kind, "text")
+    number = "a whole number" if kind is int else "a number"
+    low, high = f.metadata.get("low"), f.metadata.get("high")
+    if low is None or high is None:
+        return auto + number
+    return f"{auto}{number} from {low:g} to {high:g}"
+
+
+def _optional(kind: Any) -> bool:
+    return get_origin(kind) in (Union, UnionType) and NoneType in get_args(kind)
+
+
+def _inner(kind: Any) -> Any:
+    """T of T | None."""
+    return next(k for k in get_args(kind) if k is not NoneType) if _optional(kind) else kind

@@ -1,0 +1,93 @@
+"""The drivers that are installed: entry points of the group `stereo_sfm.drivers`, ours and other packages' alike."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import tomllib
+from collections.abc import Iterator
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any
+
+from drivers.driver import Certainty, Driver
+from stereo_sfm.errors import StereoSfmError
+
+log = logging.getLogger("stereo_sfm")
+
+GROUP = "stereo_sfm.drivers"
+_OURS = "stereo-sfm"
+_PROJECT = Path(__file__).parents[1] / "pyproject.toml"  # in a checkout; an installed package has none
+
+
+@functools.cache
+def _found() -> dict[str, EntryPoint]:
+    """Kind -> where its driver is, in the order of the kinds.
+
+    In a checkout our own come from pyproject.toml itself: what was installed from it may be older, or nothing.
+    """
+    ours = _declared()
+    others = [e for e in entry_points(group=GROUP) if not ours or e.dist is None or e.dist.name != _OURS]
+    found: dict[str, EntryPoint] = {}
+    for entry in sorted([*ours, *others], key=lambda e: (e.name, e.value)):
+        known = found.setdefault(entry.name, entry)
+        if known.value != entry.value:
+            raise StereoSfmError(
+                f"two drivers are called '{entry.name}': {known.value} and {entry.value}; uninstall one of them"
+            )
+    return found
+
+
+def _declared() -> list[EntryPoint]:
+    if not _PROJECT.is_file():
+        return []
+    project = tomllib.loads(_PROJECT.read_text("utf-8")).get("project", {})
+    table: dict[str, str] = project.get("entry-points", {}).get(GROUP, {}) if project.get("name") == _OURS else {}
+    return [EntryPoint(name, value, GROUP) for name, value in table.items()]
+
+
+def kinds() -> tuple[str, ...]:
+    """The kinds of sources that can be opened; nothing is imported for it."""
+    return tuple(_found())
+
+
+@functools.cache
+def driver(kind: str) -> Driver[Any]:
+    """The driver of a kind, one of `kinds()`.
+
+    Raises:
+        StereoSfmError: its package is broken.
+    """
+    entry = _found()[kind]
+    try:
+        loaded = entry.load()
+    except Exception as error:
+        raise StereoSfmError(f"the driver '{kind}' ({entry.value}) cannot be loaded: {error!r}") from error
+    if not isinstance(loaded, Driver):
+        raise StereoSfmError(f"the driver '{kind}' ({entry.value}) is no drivers.driver.Driver")
+    return loaded  # pyright: ignore[reportUnknownVariableType]
+
+
+def drivers() -> Iterator[tuple[str, Driver[Any]]]:
+    """(kind, driver) of all drivers; one that is broken is a warning."""
+    for kind in kinds():
+        try:
+            found = driver(kind)
+        except StereoSfmError as error:
+            log.warning("%s", error)
+        else:
+            yield kind, found
+
+
+def recognise(path: Path) -> str:
+    """The kind of an existing file or folder: that of the driver that is surest of it.
+
+    Raises:
+        StereoSfmError: no driver knows it.
+    """
+    sure = {kind: found.recognise(path) for kind, found in drivers()}
+    best = max(sure, key=sure.__getitem__, default=None)  # the first of equally sure ones
+    if best is None or sure[best] is Certainty.NO:
+        known = "; ".join(f"{kind}: {found.summary}" for kind, found in drivers() if found.cameras is None)
+        raise StereoSfmError(f"{path} is no recording or data set that is known here ({known})")
+    return best

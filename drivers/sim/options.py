@@ -1,0 +1,62 @@
+"""What follows the question mark of `sim:SCENE?...`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from drivers.options import SourceOptions, option
+
+
+def _size(value: Any) -> tuple[int, int] | None:
+    """WIDTHxHEIGHT, "" and None for the camera's own."""
+    if not value:
+        return None
+    width, _, height = value.partition("x") if isinstance(value, str) else (str(value[0]), "", str(value[1]))
+    if not (width.isdigit() and height.isdigit() and 32 <= int(width) <= 4096 and 32 <= int(height) <= 4096):
+        raise ValueError("WIDTHxHEIGHT, such as 424x400")
+    return int(width), int(height)
+
+
+def _interval(value: Any) -> tuple[float, float]:
+    """Seconds from and to of FROM-TO; an empty one for no text."""
+    if not value:
+        return 0.0, 0.0
+    begin, _, end = value.partition("-") if isinstance(value, str) else (value[0], "", value[1])
+    try:
+        low, high = float(begin), float(end)
+    except ValueError:
+        low, high = 0.0, 0.0
+    if not 0 <= low < high:
+        raise ValueError("FROM-TO in seconds, such as 10-11.5")
+    return low, high
+
+
+@dataclass(frozen=True)
+class SimOptions(SourceOptions):
+    """Options of `sim:SCENE`."""
+
+    camera: Literal["fisheye", "pinhole", "distorted"] = option("fisheye", "lenses of the simulated pair")
+    size: tuple[int, int] | None = option(None, "WIDTHxHEIGHT, scales the images", read=_size)
+    seed: int = option(0, "of products, sensor, people", low=0, high=2**31)
+    walk: int = option(0, "another session through the same store", low=0, high=1000)
+    length: float = option(0.0, "metres driven, 0: the scene's own", low=0, high=10_000)
+    start: int = option(0, "first frame", low=0, high=10**7)
+    frames: int = option(0, "at most so many frames, 0: all", low=0, high=10**7)
+    rate: float = option(30.0, "frames a second", low=1, high=1000)
+    exchange: float = option(
+        0.0, "fraction of product rows exchanged against the same store with 0", low=0, high=1
+    )
+    returns: bool = option(True, "whether the camera comes back to where it has been")
+    people: int = option(-1, "how many, -1: the scene's own", low=-1, high=60)
+    speed: float = option(0.0, "metres a second, 0: the scene's own", low=0, high=5)
+    vibration: float = option(1.0, "scales the camera's shaking", low=0, high=10)
+    drop: float = option(0.0, "fraction of frames lost", low=0, high=0.9)
+    noise: float = option(1.0, "scales the sensor's noise", low=0, high=20)
+    blur: float = option(1.0, "scales the exposure time", low=0, high=10)
+    readout: float = option(
+        0.0, "seconds from the first row's exposure to the last's: a rolling shutter", low=0, high=0.1
+    )
+    dark: tuple[float, float] = option((0.0, 0.0), "FROM-TO in seconds: when the lights are out", read=_interval)
+    effects: bool = option(True, "off: clean pictures")
+    realtime: bool = option(False, "frames come by the clock")
