@@ -11,7 +11,6 @@ shared image ring.
 from __future__ import annotations
 
 import argparse
-import functools
 import tempfile
 import time
 from pathlib import Path
@@ -19,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 
+from drivers.choice import MadeSource
 from drivers.memory import MemorySource
 from drivers.paced import PacedSource
 from drivers.source import Source, open_source
@@ -68,9 +68,7 @@ def memory_mb(run: ProcessRun) -> dict[str, float]:
 def play(path: str, frames: int, paced: bool, folder: Path) -> None:
     numbers, memory = Numbers(), list[tuple[float, dict[str, float]]]()
     log = folder / f"{'realtime' if paced else 'fast'}.mcap"
-    with ProcessRun(
-        functools.partial(opened, path, frames, paced), Config(), [numbers], log=LogOptions(log, "raw")
-    ) as run:
+    with ProcessRun(MadeSource.of(opened, path, frames, paced), Config(), [numbers], log=LogOptions(log, "raw")) as run:
         begin = last = time.monotonic()
         first = 0.0
         done = 0

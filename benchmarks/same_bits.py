@@ -8,10 +8,10 @@ Compares the logs (trajectories, keyframes, map, loops, every frame's observatio
 from __future__ import annotations
 
 import argparse
-import functools
 import tempfile
 from pathlib import Path
 
+from drivers.choice import SourceChoice
 from drivers.source import open_source
 from stereo_sfm.config import Config
 from stereo_sfm.log.diff import diff
@@ -61,7 +61,7 @@ def main() -> int:
         print(f"inline: {frames} frames, {loops.count} loops closed", flush=True)
         for seed in range(args.runs):
             path = Path(name) / f"{seed}.mcap"
-            opener = functools.partial(open_source, str(recording))
+            opener = SourceChoice(str(recording))
             with ProcessRun(opener, config, log=LogOptions(path, "none"), delays=seed) as run:
                 for _ in run:
                     pass

@@ -11,7 +11,6 @@ process, which passes the messages on and copies the pictures that are shown.
 from __future__ import annotations
 
 import argparse
-import functools
 import tempfile
 from pathlib import Path
 
@@ -22,6 +21,7 @@ one_thread()
 import numpy as np
 import psutil
 
+from drivers.choice import MadeSource
 from drivers.select import SelectedFrames
 from drivers.source import Source, open_source
 from stereo_sfm.config import Config
@@ -48,7 +48,7 @@ def measure(spec: str, frames: int, viewer: ViewerOptions | None) -> dict[str, f
     begin: dict[str, float] = {}
     end: dict[str, float] = {}
     seen = 0
-    with ProcessRun(functools.partial(opened, spec, frames), Config(), viewer=viewer) as run:
+    with ProcessRun(MadeSource.of(opened, spec, frames), Config(), viewer=viewer) as run:
         watched = {s: psutil.Process(pid) for s, pid in run.pids.items() if s in ("tracker", "viewer")}
         watched["hub"] = psutil.Process()
         for seen, _ in enumerate(run, 1):

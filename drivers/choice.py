@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ParamSpec, Protocol
 
 from drivers.selection import EVERYTHING, Selection
-from drivers.source import is_device, open_source, path_of
+from drivers.source import is_device, look_up, open_source, path_of
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.words import one_of
 
 if TYPE_CHECKING:
     from calib.rig import Rig
@@ -17,8 +19,63 @@ if TYPE_CHECKING:
     from drivers.source import Source
     from stereo_sfm.log.provenance import Opening
 
+P = ParamSpec("P")
+
 # how a user says it -> projection of `calib.rectification`
 RECTIFY = {"none": "none", "pinhole": "pinhole", "wide": "epipolar"}
+
+
+class Opener(Protocol):
+    """What opens the source of a run, in the process that reads it; it can be pickled.
+
+    `SourceChoice` does for a source that a text names, `MadeSource` for one that a program makes.
+    """
+
+    @property
+    def spec(self) -> str:
+        """The text that names the source, "" when none does."""
+        ...
+
+    @property
+    def device(self) -> bool:
+        """Whether it is a camera: what it gave is gone unless it is logged."""
+        ...
+
+    @property
+    def opening(self) -> Opening:
+        """What a log keeps of it besides its name."""
+        ...
+
+    def __call__(self) -> Source:
+        """The source, not yet entered."""
+        ...
+
+
+@dataclass(frozen=True)
+class MadeSource:
+    """Opens a source that a program makes itself.
+
+    Attributes:
+        make: gives the source; a function of a module or a `functools.partial` of one, so that it can be pickled.
+    """
+
+    make: Callable[[], Source]
+    spec: str = ""
+    device: bool = False
+
+    @staticmethod
+    def of(make: Callable[P, Source], *args: P.args, **options: P.kwargs) -> MadeSource:
+        """Opens what `make` gives for these arguments."""
+        return MadeSource(functools.partial(make, *args, **options))
+
+    @property
+    def opening(self) -> Opening:
+        from stereo_sfm.log.provenance import Opening
+
+        return Opening()
+
+    def __call__(self) -> Source:
+        return self.make()
 
 
 @dataclass(frozen=True)
@@ -55,10 +112,11 @@ class SourceChoice:
         """As a user says it: paths may be relative, and the calibration may be a file.
 
         Raises:
-            StereoSfmError: a calibration that cannot be read, or an unknown way to rectify.
+            StereoSfmError: an unknown source or option, a calibration that cannot be read, an unknown way to rectify;
+                all of it before anything is opened.
         """
-        if rectify not in RECTIFY:
-            raise StereoSfmError(f"unknown rectification '{rectify}' (choose {', '.join(RECTIFY)})")
+        one_of(rectify, RECTIFY, "rectification")
+        look_up(source, **options)
         spec = str(source)
         if Path(spec).exists():
             spec = str(Path(spec).resolve())
@@ -66,7 +124,6 @@ class SourceChoice:
 
     @property
     def device(self) -> bool:
-        """Whether it is a camera: what it gave is gone unless it is logged."""
         return is_device(self.spec)
 
     @property
@@ -76,7 +133,6 @@ class SourceChoice:
 
     @property
     def opening(self) -> Opening:
-        """What a log keeps of it besides its name."""
         from stereo_sfm.log.provenance import Opening
 
         return Opening(self.rectify, self.rig, frame_skip=self.numbering)
@@ -90,7 +146,6 @@ class SourceChoice:
             raise StereoSfmError(f"{output} is what is read, or holds it: choose another -o")
 
     def __call__(self) -> Source:
-        """The source, not yet entered."""
         from drivers.paced import PacedSource
         from drivers.rectified import rectified
         from drivers.select import SelectedFrames

@@ -7,16 +7,16 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import cv2
 import numpy as np
 
 from calib.rig import Rig
+from drivers.source import BaseSource, Stamps
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.pixels import decode, decode_gray, eight_bits, sensor_bits
-from stereo_sfm.types import F32, I64, U8, U16, StereoImage, Trajectory
+from stereo_sfm.types import F32, U8, U16, StereoImage, Trajectory
 
 log = logging.getLogger("stereo_sfm")
 
@@ -76,10 +76,8 @@ def read_depth(path: Path, scale: float) -> F32:
     return depth
 
 
-class FolderSource:
+class FolderSource(BaseSource):
     """Frames from files, in stamp order. A frame with an unreadable file is dropped with a warning and counted."""
-
-    live: bool = False
 
     def __init__(
         self,
@@ -93,20 +91,12 @@ class FolderSource:
             raise StereoSfmError(f"{name}: no images")
         self.name = name
         self.rig = rig
-        self.ground_truth: Trajectory | None = ground_truth
+        self.ground_truth = ground_truth
         self.shots = sorted(shots, key=lambda shot: shot.stamp_ns)
         self.depth_scale = depth_scale
-        self.frame_count: int | None = len(self.shots)
+        self.frame_count = len(self.shots)
         self.bits = self._sensor_bits()
         self._check_first()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        return None
 
     def __iter__(self) -> Iterator[StereoImage]:
         dropped, read, unreadable = 0, 0, 0
@@ -147,11 +137,15 @@ class FolderSource:
             dropped_before=dropped,
         )
 
-    def stamps(self) -> tuple[I64, float]:
-        """Stamps of the left images, and the largest skew of the right ones in ms: NaN where they have no stamps."""
+    def at(self, positions: Sequence[int]) -> Iterator[StereoImage]:
+        for position in positions:
+            with suppress(UnreadableImage):
+                yield self._read(position, self.shots[position], 0)
+
+    def stamps(self) -> Stamps:
         skews = [abs(s.right_stamp_ns - s.stamp_ns) for s in self.shots if s.right_stamp_ns]
         skew_ms = max(skews) / 1e6 if skews else float("nan")
-        return np.array([s.stamp_ns for s in self.shots], np.int64), skew_ms
+        return Stamps(np.array([s.stamp_ns for s in self.shots], np.int64), skew_ms)
 
     def _sensor_bits(self) -> int:
         """Of sixteen-bit images: decided once, so that brightness does not jump between frames."""

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from types import TracebackType
-from typing import Self
 
 from calib.rig import Rig
+from drivers.source import BaseSource
 from stereo_sfm.types import StereoImage, Trajectory
 
 PERIOD_NS = 33_333_333  # of a repeated walk: 30 Hz
 
 
-class MemorySource:
+class MemorySource(BaseSource):
     """Gives the images as they are, or, with `count`, a longer walk made of them."""
-
-    live = False
 
     def __init__(
         self,
@@ -33,24 +30,20 @@ class MemorySource:
         there_and_back: the longer walk turns round at the ends, so that it goes on without a jump.
         """
         self.rig, self.images, self.ground_truth, self.name = rig, images, ground_truth, name
-        self.frame_count: int | None = len(images) if count is None else count
+        self.frame_count = self._length = len(images) if count is None else count
         self._count, self._there_and_back = count, there_and_back
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        return None
+    def at(self, positions: Sequence[int]) -> Iterator[StereoImage]:
+        return (self._frame(position) for position in positions)
 
     def __iter__(self) -> Iterator[StereoImage]:
+        return (self._frame(k) for k in range(self._length))
+
+    def _frame(self, k: int) -> StereoImage:
         if self._count is None:
-            yield from self.images
-            return
+            return self.images[k]
         n = len(self.images)
         period = max(2 * n - 2, 1) if self._there_and_back else n
-        for k in range(self._count):
-            at = k % period
-            image = self.images[at if at < n else period - at]
-            yield replace(image, frame_id=k, stamp_ns=1_000_000_000 + k * PERIOD_NS, dropped_before=0)
+        at = k % period
+        image = self.images[at if at < n else period - at]
+        return replace(image, frame_id=k, stamp_ns=1_000_000_000 + k * PERIOD_NS, dropped_before=0)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Self
 
 from calib.rectification import PROJECTIONS, rectify
 from calib.rig import Rig
-from drivers.source import Source
+from drivers.source import Source, Stamps
 from drivers.wrapped import WrappedSource
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import StereoImage, Trajectory
+from stereo_sfm.words import one_of
 
 
 class RectifiedSource(WrappedSource):
@@ -49,12 +50,20 @@ class RectifiedSource(WrappedSource):
             self._adopt()  # a camera tells its calibration when it is open
         return self
 
+    def stamps(self) -> Stamps | None:
+        return self.source.stamps()
+
+    def at(self, positions: Sequence[int]) -> Iterator[StereoImage]:
+        return map(self._seen, self.source.at(positions))
+
     def __iter__(self) -> Iterator[StereoImage]:
-        for image in self.source:
-            if image.right is None:
-                raise StereoSfmError(f"frame {image.frame_id} of {self.name} has no right image to rectify")
-            left, right = self.rectification.apply(image.left, image.right)
-            yield replace(image, left=left, right=right)
+        return map(self._seen, self.source)
+
+    def _seen(self, image: StereoImage) -> StereoImage:
+        if image.right is None:
+            raise StereoSfmError(f"frame {image.frame_id} of {self.name} has no right image to rectify")
+        left, right = self.rectification.apply(image.left, image.right)
+        return replace(image, left=left, right=right)
 
 
 def rectified(
@@ -64,6 +73,5 @@ def rectified(
     size: tuple[int, int] | None = None,
 ) -> Source:
     """The source itself for "none", else the source through that rectification."""
-    if projection not in PROJECTIONS:
-        raise StereoSfmError(f"unknown projection '{projection}' (choose {', '.join(PROJECTIONS)})")
+    one_of(projection, PROJECTIONS, "projection")
     return source if projection == "none" else RectifiedSource(source, projection, hfov_deg, size)

@@ -89,5 +89,5 @@ def recognise(path: Path) -> str:
     best = max(sure, key=sure.__getitem__, default=None)  # the first of equally sure ones
     if best is None or sure[best] is Certainty.NO:
         known = "; ".join(f"{kind}: {found.summary}" for kind, found in drivers() if found.cameras is None)
-        raise StereoSfmError(f"{path} is no recording or data set that is known here ({known})")
+        raise StereoSfmError(f"{path} is no dataset that is known here ({known})")
     return best

@@ -160,8 +160,8 @@ def open_source(spec: str | Path, rig: RigOption = None, **options: Any) -> Sour
     """Open a source by its text.
 
     Args:
-        spec: `KIND:PLACE?OPTION=VALUE&...` (`sim:loop?camera=pinhole&seed=3`, `t265`, `oak?fps=20`), or a file or folder
-            whose kind is recognised.
+        spec: `KIND:PLACE?OPTION=VALUE&...` (`sim:loop?camera=pinhole&seed=3`, `t265`, `oak?fps=20`), or a file or a
+            folder whose kind is recognised.
         rig: calibration instead of the source's own, or a file of one.
         **options: of the driver, as typed values or as text; they win over those in the text.
 

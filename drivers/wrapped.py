@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from types import TracebackType
 from typing import Self
 
 from calib.rig import Rig
-from drivers.source import Source
+from drivers.source import Source, Stamps, chosen_frames
 from stereo_sfm.types import StereoImage, Trajectory
 
 
@@ -38,9 +38,15 @@ class WrappedSource:
         return self.source.live
 
     @property
-    def counters(self) -> dict[str, float]:
-        """What a live source counts about itself (drivers.live.counters); empty for files."""
-        return getattr(self.source, "counters", {})
+    def counters(self) -> Mapping[str, float]:
+        return self.source.counters
+
+    def stamps(self) -> Stamps | None:
+        """Those of the frames that are passed on: not known before they are, unless a subclass knows."""
+        return None
+
+    def at(self, positions: Sequence[int]) -> Iterator[StereoImage]:
+        return chosen_frames(iter(self), positions)
 
     def __enter__(self) -> Self:
         self.source.__enter__()

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import logging
 import time
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
-from types import TracebackType
-from typing import Protocol, Self
+from typing import Protocol, TypeVar
 
-from calib.rig import Rig
 from drivers.live.buffers import Handoff, MotionBuffer, WheelBuffer
 from drivers.live.clock import ClockMap, TimeLine
 from drivers.live.counters import TROUBLE, Counters
 from drivers.live.errors import DeviceError, DeviceLost, FirmwareMissing
 from drivers.live.pairing import Pair, periods
-from stereo_sfm.types import ImuSamples, StereoImage, Trajectory
+from drivers.rig_option import RigOption, chosen_rig
+from drivers.source import BaseSource
+from stereo_sfm.types import ImuSamples, StereoImage
 
 logger = logging.getLogger("stereo_sfm")
 
@@ -49,7 +49,7 @@ class _Stalled(DeviceLost):
     """The camera is there but sends no images."""
 
 
-class LiveSource(ABC):
+class LiveSource(BaseSource):
     """Live stereo images with the camera's factory calibration.
 
     What happens when something goes wrong: images that are lost are counted in `dropped_before` of the next one; a
@@ -65,14 +65,11 @@ class LiveSource(ABC):
         stamp_at_start: the camera's stamps are of the start of the exposure, not of its middle.
     """
 
-    frame_count: int | None = None
     live = True
-    rig: Rig
 
     def __init__(self, name: str, title: str, period_ns: int, patience: Patience, stamp_at_start: bool = False) -> None:
         self.name = name
-        self.counters = Counters()
-        self.ground_truth: Trajectory | None = None
+        self.counters = self._counters = Counters()
         self._title, self._period_ns, self._patience = title, period_ns, patience
         self._stamp_at_start = stamp_at_start
         self._time, self._wheel = TimeLine(), WheelBuffer()
@@ -101,14 +98,6 @@ class LiveSource(ABC):
         return
 
     # ---- what a user sees
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
 
     def close(self) -> None:
         """Stop streaming, give the camera back, and say in one line what was counted."""
@@ -192,7 +181,7 @@ class LiveSource(ABC):
     def _count(self, dropped: int, lost_here: int, imu: int, wheel: int) -> None:
         amounts = {"pairs": 1, "dropped": dropped, "dropped_by_host": lost_here, "imu_samples": imu}
         for name, amount in {**amounts, "wheel_samples": wheel}.items():
-            self.counters.add(name, amount)
+            self._counters.add(name, amount)
         if dropped:
             self._warn_lost(dropped, lost_here)
 
@@ -209,7 +198,7 @@ class LiveSource(ABC):
     def _begin(self) -> None:
         self._segment = self._start()
         self._segment_frames = 0
-        self.counters.add("segments")
+        self._counters.add("segments")
 
     def _shut(self, camera_alive: bool) -> None:
         segment, self._segment = self._segment, None
@@ -224,7 +213,7 @@ class LiveSource(ABC):
             DeviceLost: it did not come back in time.
         """
         stalled = isinstance(error, _Stalled)
-        self.counters.add("stalls" if stalled else "disconnects")
+        self._counters.add("stalls" if stalled else "disconnects")
         logger.warning("%s; restarting it (frame %d)", error, self._frame_id)
         if stalled and not self._segment_frames:
             self._reset()  # it was restarted already, to no avail
@@ -245,3 +234,16 @@ class LiveSource(ABC):
                 ) from None
             logger.warning("%s is back: segment %d", self._title, int(self.counters["segments"]))
             return
+
+
+S = TypeVar("S", bound=LiveSource)
+
+
+def with_rig(source: S, rig: RigOption) -> S:
+    """The open source with the calibration that the user gave, if any; closed again when that is none."""
+    try:
+        source.rig = chosen_rig(rig, lambda: source.rig)
+    except BaseException:
+        source.close()
+        raise
+    return source

@@ -8,8 +8,7 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -30,11 +29,12 @@ from drivers.mcap.messages import (
 from drivers.mcap.rig import camera_of, chain, stereo_rig
 from drivers.mcap.topics import camera_topic, choose_topics, is_rectified
 from drivers.rig_option import RigOption, chosen_rig
+from drivers.source import BaseSource, Stamps
 from drivers.tum_rgbd.source import with_virtual_eye
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log.reader import LogReader, Record
 from stereo_sfm.pixels import eight_bits, sensor_bits
-from stereo_sfm.types import I64, ImuSamples, StereoImage, Trajectory
+from stereo_sfm.types import ImuSamples, StereoImage, Trajectory
 
 log = logging.getLogger("stereo_sfm")
 
@@ -51,10 +51,8 @@ class _Shot:
     picture: Picture
 
 
-class ForeignMcapSource:
+class ForeignMcapSource(BaseSource):
     """Pairs the images of two topics by their stamps. Frames without a partner count as dropped."""
-
-    live = False
 
     def __init__(
         self, reader: LogReader, rig: RigOption = None, left: str = "", right: str = "", depth: str = ""
@@ -74,7 +72,7 @@ class ForeignMcapSource:
             self.rig = with_virtual_eye(self.rig)
         self.ground_truth = self._read_truth()
         counts = {t.topic: t.count for t in reader.topics}
-        self.frame_count: int | None = min(counts[t] for t in (self.topics.left, self._other()) if t)
+        self.frame_count = min(counts[t] for t in (self.topics.left, self._other()) if t)
         self._tolerance_ns = self._period_ns() * 2 // 5
         self._bits = self._sensor_bits()
         self._check_first()
@@ -86,25 +84,20 @@ class ForeignMcapSource:
                 back_ns / 1e9,
             )
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
         self.reader.close()
 
     def __iter__(self) -> Iterator[StereoImage]:
         return self.frames()
 
-    def stamps(self) -> tuple[I64, float]:
-        """Stamps of all usable pairs, without decoding pixels, and the largest skew between the eyes in ms."""
+    def stamps(self) -> Stamps:
+        """Of all usable pairs."""
         pairs = [(a.stamp_ns, b.stamp_ns if b else a.stamp_ns) for a, b in self._pairs(None, None, []) if self._used(b)]
         table = np.array(pairs, np.int64).reshape(-1, 2)
         skew = (
             float(np.abs(table[:, 1] - table[:, 0]).max()) / 1e6 if len(table) and self.topics.right else float("nan")
         )
-        return table[:, 0].copy(), skew
+        return Stamps(table[:, 0].copy(), skew)
 
     def _used(self, other: _Shot | None) -> bool:
         return other is not None or not self._other()

@@ -6,8 +6,7 @@ import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
@@ -16,7 +15,7 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from calib.rig import Rig
 from drivers.folder_source import SHOWN_WARNINGS
 from drivers.rig_option import RigOption, chosen_rig
-from drivers.source import Source
+from drivers.source import BaseSource, Source, Stamps
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log import images, schema, topics
 from stereo_sfm.log.attached import attached_rig, attached_truth
@@ -24,7 +23,7 @@ from stereo_sfm.log.image_log import ImageInfo, ImuSample, WheelSample
 from stereo_sfm.log.provenance import METADATA
 from stereo_sfm.log.reader import LogReader, Record
 from stereo_sfm.pixels import eight_bits
-from stereo_sfm.types import F32, I64, U8, ImuSamples, StereoImage, WheelSamples
+from stereo_sfm.types import F32, U8, ImuSamples, StereoImage, WheelSamples
 
 if TYPE_CHECKING:
     from drivers.mcap import McapOptions
@@ -162,10 +161,8 @@ def _wheel(samples: list[WheelSample]) -> WheelSamples:
     return WheelSamples(stamps, np.array(linear, float).reshape(-1, 3), np.array(angular, float).reshape(-1, 3))
 
 
-class McapSource:
+class McapSource(BaseSource):
     """A recording or a run of ours: the images that the sensor gave (or the tracker saw), bit for bit."""
-
-    live = False
 
     def __init__(self, reader: LogReader, rig: RigOption = None) -> None:
         """Takes over the reader. `rig` replaces the recorded calibration."""
@@ -174,6 +171,7 @@ class McapSource:
         self.rig = chosen_rig(rig, self._recorded_rig)
         self._check_eyes()
         self.ground_truth = attached_truth(reader)  # world_T_cam0
+        self.frame_count = self._whole_count()
         self._incomplete = 0  # frames of the last reading
         self._decoders: dict[type[Any], Callable[[bytes], Any]] = {}
 
@@ -190,27 +188,21 @@ class McapSource:
             raise StereoSfmError(f"{self.name} holds no calibration: give one with --rig FILE")
         return rig
 
-    @property
-    def frame_count(self) -> int | None:
+    def _whole_count(self) -> int:
         """Frames whose every image is in the file."""
         counts = {t.topic: t.count for t in self.reader.topics}
         eyes = (topics.LEFT_IMAGE, topics.RIGHT_IMAGE, topics.DEPTH_IMAGE)
         return min(counts[t] for t in (topics.IMAGE_INFO, *eyes) if t in counts)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def close(self) -> None:
         self.reader.close()
 
     def __iter__(self) -> Iterator[StereoImage]:
         return self.frames()
 
-    def stamps(self) -> tuple[I64, float]:
-        """Stamps of all frames, without reading pixels, and NaN for the skew, which `image_info` holds."""
-        return self.reader.stamps(topics.LEFT_IMAGE), float("nan")
+    def stamps(self) -> Stamps:
+        """The skew is not known here: `image_info` holds it."""
+        return Stamps(self.reader.stamps(topics.LEFT_IMAGE))
 
     def frames(self, start_ns: int | None = None, until_ns: int | None = None) -> Iterator[StereoImage]:
         """Frames with stamps in [start_ns, until_ns], without reading what lies before.

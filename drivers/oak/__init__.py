@@ -1,15 +1,51 @@
-"""OAK cameras over depthai 3. Nothing of depthai is imported before a camera is asked for."""
+"""OAK cameras over depthai 3 as a kind of source. Nothing of depthai is imported before a camera is asked for."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+from drivers.driver import Attached, Cameras, Driver, UsbId
+from drivers.options import SourceOptions, option
 
 if TYPE_CHECKING:
-    from drivers.oak.source import OakSource
+    from drivers.source import Source
 
 
-def open_oak(rest: str = "", **options: Any) -> OakSource:
-    """Open an OAK: see drivers.oak.source.open_oak."""
-    from drivers.oak.source import open_oak as open_now
+def _size(value: Any) -> tuple[int, int]:
+    width, _, height = value.partition("x") if isinstance(value, str) else (str(value[0]), "", str(value[1]))
+    if not (width.isdigit() and height.isdigit() and 64 <= int(width) <= 4096 and 64 <= int(height) <= 4096):
+        raise ValueError("WIDTHxHEIGHT, such as 640x400 or 1280x800")
+    return int(width), int(height)
 
-    return open_now(rest, **options)
+
+@dataclass(frozen=True)
+class OakOptions(SourceOptions):
+    """Options of `oak`, `oak:ID` and `oak:ADDRESS`."""
+
+    size: tuple[int, int] = option((640, 400), "WIDTHxHEIGHT of the images", read=_size)
+    fps: float = option(30.0, "images a second", low=1, high=120)
+    exposure: int | None = option(None, "microseconds; auto: automatic exposure", low=20, high=33_000)
+    iso: int = option(400, "with manual exposure", low=100, high=1600)
+    anti_flicker: Literal["50", "60", "auto", "off"] = option("50", "Hz of the mains, with automatic exposure")
+    max_exposure: int | None = option(None, "microseconds, with automatic exposure", low=20, high=33_000)
+    imu: bool = option(True, "inertial samples travel with the images")
+    allow_slow: bool = option(False, "accept a USB 2 link, which loses images")
+    queue: int = option(30, "pairs that may wait for the tracker", low=1, high=100_000)
+    reconnect: float = option(20.0, "seconds to wait for a lost camera", low=0, high=86_400)
+
+
+def _open(place: str, options: OakOptions) -> Source:
+    from drivers.oak.source import open_oak
+
+    return open_oak(place, options)
+
+
+def _find(probe: bool) -> Sequence[Attached]:
+    from drivers.oak.attached import find_all
+
+    return find_all(probe)
+
+
+DRIVER = Driver("Luxonis OAK, over depthai 3", "ID", OakOptions, _open, cameras=Cameras("OAK", _find, (UsbId(0x03E7),)))

@@ -1,19 +1,20 @@
-"""The OAK as a source: `oak`, `oak:ID?size=640x400&fps=30`; options: see `open_oak`."""
+"""The OAK as a source: `oak`, `oak:ID?size=640x400&fps=30`."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from drivers.live.errors import DeviceFault, NotFound, TooSlowLink
-from drivers.live.options import Options
-from drivers.live.source import LiveSource, Patience
+from drivers.live.errors import NotFound, TooSlowLink
+from drivers.live.source import LiveSource, Patience, with_rig
 from drivers.oak.calibration import read_calibration
 from drivers.oak.library import NO_OAK, choose, device_error, find, load, on_usb
 from drivers.oak.stream import OakStream
-from drivers.rig_option import chosen_rig
+
+if TYPE_CHECKING:
+    from drivers.oak import OakOptions
 
 logger = logging.getLogger("stereo_sfm")
 
@@ -98,7 +99,7 @@ class OakSource(LiveSource):
             self._device.setIrFloodLightIntensity(0.0)
         pipeline.start()
         stream = OakStream(
-            dai, left, right, imu, s.size, self.counters, self._period_ns, s.queue_frames, lambda: _stop(pipeline)
+            dai, left, right, imu, s.size, self._counters, self._period_ns, s.queue_frames, lambda: _stop(pipeline)
         )
         stream.start()
         return stream
@@ -142,46 +143,29 @@ def _stop(pipeline: Any) -> None:
         pipeline.stop()
 
 
-def _size(text: str) -> tuple[int, int]:
-    width, _, height = text.partition("x")
-    if not (width.isdigit() and height.isdigit() and 64 <= int(width) <= 4096 and 64 <= int(height) <= 4096):
-        raise DeviceFault(f"oak: option size={text}: it must be WIDTHxHEIGHT, such as 640x400 or 1280x800")
-    return int(width), int(height)
+ANTI_FLICKER = {"50": "MAINS_50_HZ", "60": "MAINS_60_HZ", "auto": "AUTO", "off": "OFF"}  # of depthai
 
 
-def open_oak(rest: str = "", **options: Any) -> OakSource:
+def open_oak(wanted: str, options: OakOptions) -> OakSource:
     """Open an OAK.
 
     Args:
-        rest: id or network address, empty for the only one attached.
-        **options: `size` (640x400), `fps` (30), `exposure` ('auto' or microseconds), `iso` (with manual exposure),
-            `max_exposure` ('auto' or microseconds, with automatic exposure), `anti_flicker` (50, 60, auto, off),
-            `imu` (1, 0), `allow_slow` (1: accept USB 2), `queue` (pairs that may wait), `reconnect` (seconds to wait
-            for a lost camera), `rig` (calibration instead of the factory's).
+        wanted: id or network address, "" for the only one attached.
+        options: see there.
 
     Raises:
-        StereoSfmError: bad option; DeviceError: no camera, no permission, ...
+        DeviceError: no camera, no permission, ...
     """
-    opts = Options("oak", options)
-    flicker = {"50": "MAINS_50_HZ", "60": "MAINS_60_HZ", "auto": "AUTO", "off": "OFF"}
     settings = Settings(
-        size=_size(opts.text("size", "640x400")),
-        rate_hz=opts.number("fps", 30, 1, 120),
-        exposure_us=opts.microseconds("exposure", 20, 33_000),
-        iso=int(opts.number("iso", 400, 100, 1600)),
-        anti_flicker=opts.choice("anti_flicker", "50", flicker),
-        max_exposure_us=opts.microseconds("max_exposure", 20, 33_000),
-        imu=opts.flag("imu", True),
-        allow_slow=opts.flag("allow_slow", False),
-        queue_frames=int(opts.number("queue", 30, 1, 100_000)),
+        size=options.size,
+        rate_hz=options.fps,
+        exposure_us=options.exposure,
+        iso=options.iso,
+        anti_flicker=ANTI_FLICKER[options.anti_flicker],
+        max_exposure_us=options.max_exposure,
+        imu=options.imu,
+        allow_slow=options.allow_slow,
+        queue_frames=options.queue,
     )
-    patience = Patience(first_image_s=5.0, reconnect_s=opts.number("reconnect", 20, 0, 86_400))
-    rig = opts.anything("rig", None)
-    opts.finish()
-    source = OakSource(rest, settings, patience, f"oak:{rest}" if rest else "oak")
-    try:
-        source.rig = chosen_rig(rig, lambda: source.rig)
-    except BaseException:
-        source.close()
-        raise
-    return source
+    patience = Patience(first_image_s=5.0, reconnect_s=options.reconnect)
+    return with_rig(OakSource(wanted, settings, patience, f"oak:{wanted}" if wanted else "oak"), options.rig)

@@ -44,11 +44,12 @@ class SimOptions(SourceOptions):
     start: int = option(0, "first frame", low=0, high=10**7)
     frames: int = option(0, "at most so many frames, 0: all", low=0, high=10**7)
     rate: float = option(30.0, "frames a second", low=1, high=1000)
-    exchange: float = option(
-        0.0, "fraction of product rows exchanged against the same store with 0", low=0, high=1
-    )
+    exchange: float = option(0.0, "fraction of product rows exchanged against the same store with 0", low=0, high=1)
     returns: bool = option(True, "whether the camera comes back to where it has been")
     people: int = option(-1, "how many, -1: the scene's own", low=-1, high=60)
+    encounters: str = option(
+        "", "what people do to the robot, by turns: approach, stop, cover, lens, cart, beside, group; all"
+    )
     speed: float = option(0.0, "metres a second, 0: the scene's own", low=0, high=5)
     vibration: float = option(1.0, "scales the camera's shaking", low=0, high=10)
     drop: float = option(0.0, "fraction of frames lost", low=0, high=0.9)

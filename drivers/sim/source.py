@@ -5,15 +5,15 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
-from collections.abc import Iterator
-from types import TracebackType
-from typing import Any, Self
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from drivers.rig_option import chosen_rig
 from drivers.sim.effects import CLEAN, Effects, Sensor, brightness
 from drivers.sim.encounters import plan, present
 from drivers.sim.kernels import PERSON
+from drivers.sim.options import SimOptions
 from drivers.sim.people import crowd_at, moving
 from drivers.sim.render import Renderer, View
 from drivers.sim.rigs import make_rig
@@ -21,98 +21,12 @@ from drivers.sim.scenes import SCENES, Scene, crowd
 from drivers.sim.tables import Tables
 from drivers.sim.walks import Walk
 from drivers.sim.world import Layout, build_world
+from drivers.source import BaseSource, Stamps
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, StereoImage, Trajectory
 
 _EPOCH_NS = 1_000_000_000
-
-
-@dataclasses.dataclass(frozen=True)
-class SimOptions:
-    """What follows the question mark."""
-
-    camera: str = "fisheye"  # fisheye, pinhole, distorted
-    size: str = ""  # WIDTHxHEIGHT, scales the images
-    seed: int = 0  # products, sensor, people
-    walk: int = 0  # another walk through the same store
-    length: float = 0.0  # metres walked, 0: the scene's own
-    start: int = 0  # first frame
-    frames: int = 0  # at most so many frames, 0: all
-    rate: float = 30.0  # frames a second
-    exchange: float = 0.0  # fraction of product rows exchanged against the same store with 0
-    returns: bool = True  # whether a walk comes back to where it has been
-    people: int = -1  # how many, -1: the scene's own
-    encounters: str = ""  # what people do to the robot, by turns: approach, stop, cover, lens, cart, beside, group; all
-    speed: float = 0.0  # m/s, 0: the scene's own
-    vibration: float = 1.0
-    drop: float = 0.0  # fraction of frames lost
-    noise: float = 1.0  # scales the sensor's noise
-    blur: float = 1.0  # scales the exposure time
-    readout: float = 0.0  # seconds from the first row's exposure to the last's: a rolling shutter
-    dark: str = ""  # FROM-TO in seconds: when the lights are out
-    effects: bool = True  # off: clean pictures
-    realtime: bool = False  # frames come by the clock
-
-
-_SWITCH = {"1": True, "on": True, "true": True, "yes": True, "0": False, "off": False, "false": False, "no": False}
-
-
-def _read(name: str, kind: Any, value: Any) -> Any:
-    try:
-        if isinstance(kind, bool):
-            return value if isinstance(value, bool) else _SWITCH[str(value).lower()]
-        return type(kind)(value)
-    except (KeyError, ValueError):
-        raise StereoSfmError(f"sim: option {name}={value} is not {_WANTED[type(kind)]}") from None
-
-
-_WANTED = {bool: "on or off", int: "a whole number", float: "a number", str: "text"}
-_RANGES = {"length": (0, 10000), "start": (0, 10**7), "frames": (0, 10**7), "rate": (1, 1000), "exchange": (0, 1),
-           "drop": (0, 0.9), "noise": (0, 20), "blur": (0, 10), "readout": (0, 0.1),
-           "speed": (0, 5), "vibration": (0, 10),
-           "people": (-1, 60), "seed": (0, 2**31), "walk": (0, 1000)}  # fmt: skip
-
-
-def read_options(options: dict[str, Any]) -> SimOptions:
-    """Check and convert.
-
-    Raises:
-        StereoSfmError: unknown option, or a value out of range.
-    """
-    known = {f.name: f.default for f in dataclasses.fields(SimOptions)}
-    values: dict[str, Any] = {}
-    for name, value in options.items():
-        if name not in known:
-            raise StereoSfmError(f"sim: unknown option '{name}' (options: {', '.join(known)})")
-        values[name] = _read(name, known[name], value)
-        low, high = _RANGES.get(name, (None, None))
-        if low is not None and high is not None and not low <= values[name] <= high:
-            raise StereoSfmError(f"sim: option {name}={value} must be between {low} and {high}")
-    return SimOptions(**values)
-
-
-def _size(text: str) -> tuple[int, int] | None:
-    if not text:
-        return None
-    width, _, height = text.partition("x")
-    if not (width.isdigit() and height.isdigit() and 32 <= int(width) <= 4096 and 32 <= int(height) <= 4096):
-        raise StereoSfmError(f"sim: option size={text} must be WIDTHxHEIGHT, such as 424x400")
-    return int(width), int(height)
-
-
-def _interval(text: str) -> tuple[float, float]:
-    """Seconds from and to of FROM-TO; an empty one for no text."""
-    if not text:
-        return 0.0, 0.0
-    begin, _, end = text.partition("-")
-    try:
-        low, high = float(begin), float(end)
-    except ValueError:
-        low, high = 0.0, 0.0
-    if not 0 <= low < high:
-        raise StereoSfmError(f"sim: option dark={text} must be FROM-TO in seconds, such as 10-11.5")
-    return low, high
 
 
 @functools.lru_cache(maxsize=2)
@@ -138,18 +52,18 @@ def _noise_key(seed: int, frame_id: int, eye: int) -> int:
     return int(np.random.SeedSequence([seed, frame_id, eye]).generate_state(1, np.uint64)[0])
 
 
-class SimSource:
+class SimSource(BaseSource):
     """A source (drivers.source.Source) whose every frame can also be rendered alone, to the same bits."""
 
     def __init__(self, name: str, scene: Scene, options: SimOptions) -> None:
         self.name = f"sim:{name}"
         self.options = options
         self.live = options.realtime
-        self.rig = dataclasses.replace(make_rig(options.camera, _size(options.size)), readout_s=options.readout)
+        self.rig = dataclasses.replace(make_rig(options.camera, options.size), readout_s=options.readout)
         self._camera = self.rig  # as it is, whatever calibration is used instead
         self.layout = scene.layout
         self.effects = _effects(scene, options)
-        self._dark = _interval(options.dark)
+        self._dark = options.dark
         gait = dataclasses.replace(
             scene.gait, speed=options.speed or scene.gait.speed, vibration=scene.gait.vibration * options.vibration
         )
@@ -177,8 +91,8 @@ class SimSource:
             lost[0] = False
             ids = ids[~lost]
         self.frame_ids = ids
-        self.frame_count: int | None = len(ids)
-        self.ground_truth: Trajectory | None = Trajectory(
+        self.frame_count = len(ids)
+        self.ground_truth = Trajectory(
             np.array([self.stamp_ns(int(k)) for k in ids], np.int64), self.walk.poses(ids / o.rate)
         )
 
@@ -257,12 +171,14 @@ class SimSource:
         image = self.picture(self.row_poses(frame_id), frame_id, twist)
         return dataclasses.replace(image, dropped_before=dropped_before)
 
-    def __enter__(self) -> Self:
-        return self
+    def stamps(self) -> Stamps:
+        return Stamps(np.array([self.stamp_ns(int(k)) for k in self.frame_ids], np.int64), 0.0)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def at(self, positions: Sequence[int]) -> Iterator[StereoImage]:
+        return (self.frame(int(k)) for k in self.frame_ids[list(positions)])
+
+    def close(self) -> None:
+        """Let go of the renderer's memory."""
         self._renderer, self._sensors = None, []
 
     def __iter__(self) -> Iterator[StereoImage]:
@@ -274,13 +190,12 @@ class SimSource:
             previous = k
 
 
-def open_sim(rest: str = "", **options: Any) -> SimSource:
-    """Open `sim:rest`; see SimOptions for the options.
+def open_sim(scene: str, options: SimOptions) -> SimSource:
+    """Open `sim:SCENE`; `drivers.sim.SCENES` names the scenes.
 
     Raises:
-        StereoSfmError: unknown scene or option, or a bad value.
+        StereoSfmError: options that do not go together.
     """
-    name = rest or "loop"
-    if name not in SCENES:
-        raise StereoSfmError(f"sim: unknown scene '{name}' (scenes: {', '.join(SCENES)})")
-    return SimSource(name, SCENES[name], read_options(options))
+    source = SimSource(scene, SCENES[scene], options)
+    source.rig = chosen_rig(options.rig, lambda: source.rig)
+    return source

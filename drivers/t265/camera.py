@@ -15,8 +15,6 @@ from drivers.t265.firmware import VERSION
 from drivers.t265.link import Link, Timing
 from drivers.t265.messages import AntiFlicker, Id, Sensor, Status
 
-MIN_EXPOSURE_US, MAX_EXPOSURE_US = 200, 16_000  # librealsense's limits; below 200 the camera refuses
-MIN_GAIN, MAX_GAIN = 1.0, 10.0
 _MAX_STALE = 16  # transfers of an earlier session that may still lie in an endpoint
 
 

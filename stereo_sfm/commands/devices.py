@@ -8,12 +8,14 @@ import argparse
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
     parser.add_argument("--json", action="store_true", help="for programs")
-    parser.add_argument("--probe", action="store_true", help="start each OAK to read speed and calibration (seconds)")
+    parser.add_argument(
+        "--probe", action="store_true", help="start cameras that tell their calibration only then (seconds)"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """List them; 0 also when there are none."""
-    from drivers.devices import list_devices
+    from drivers.devices import list_devices, no_cameras
 
     cameras, problems = list_devices(probe=args.probe)
     if args.json:
@@ -32,7 +34,7 @@ def run(args: argparse.Namespace) -> int:
         widths = [max(len(r[k]) for r in rows) for k in range(7)]
         print("\n".join("  ".join(v.ljust(w) for v, w in zip(r, widths, strict=True)).rstrip() for r in rows))
     else:
-        print("no T265 or OAK attached (t265:simulated needs none)")
+        print(no_cameras())
     for problem in problems:
         print(problem)
     return 0

@@ -13,9 +13,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Rules on standard output, so that they can be piped; the way on standard error."""
-    from drivers.devices import UDEV_FILE, UDEV_RULES
+    from drivers.devices import UDEV_FILE, udev_rules
 
-    print(UDEV_RULES, end="")
+    print(udev_rules(), end="")
     if not args.quiet:
         print(
             f"\nInstall:  stereo-sfm udev -q | sudo tee {UDEV_FILE}\n"

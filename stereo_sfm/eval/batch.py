@@ -50,6 +50,7 @@ def run_one(task: BatchTask) -> dict[str, Any]:
     """Run one recording to the end; what goes wrong becomes part of the result."""
     import cv2
 
+    from drivers.choice import SourceChoice
     from stereo_sfm.eval.record import RunRecord
     from stereo_sfm.eval.run_results import write_results
     from stereo_sfm.export.run_folder import prepare_folder
@@ -62,7 +63,7 @@ def run_one(task: BatchTask) -> dict[str, Any]:
     try:
         prepare_folder(folder, overwrite=True)
         folders = MapFolders(map_out=folder / "map" if task.map_out else None)
-        opener = _Opener(task.spec)
+        opener = SourceChoice(task.spec)
         with Session(opener, task.config, [record], Wiring(inline=True), folders, folder, True) as session:
             for _ in session:
                 pass
@@ -79,16 +80,6 @@ def run_one(task: BatchTask) -> dict[str, Any]:
     temporary.write_text(json.dumps(result, indent=2, default=str), encoding="utf-8")
     temporary.replace(folder / RESULT)
     return result
-
-
-@dataclass(frozen=True)
-class _Opener:
-    spec: str
-
-    def __call__(self) -> Any:
-        from drivers.source import open_source
-
-        return open_source(self.spec)
 
 
 def finished(task: BatchTask) -> dict[str, Any] | None:

@@ -56,9 +56,8 @@ class MapFolders:
                 why = "may not be written to" if above.is_dir() else "is no folder"
                 raise StereoSfmError(f"cannot make --map-out {self.map_out}: {above} {why}")
 
-    def opening(self, opener: object) -> Opening:
-        """How a run begins: as its opener says, if it says anything, with the map that it begins with."""
-        opening: Opening = getattr(opener, "opening", Opening())
+    def opening(self, opening: Opening) -> Opening:
+        """How a run begins: as its source was opened, with the map that it begins with."""
         if self.map_in is None:
             return opening
         place, sha256 = str(self.map_in.resolve()), map_sha256(self.map_in)

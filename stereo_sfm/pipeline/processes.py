@@ -19,6 +19,7 @@ from multiprocessing.process import BaseProcess
 from types import TracebackType
 from typing import Any, Self
 
+from drivers.choice import Opener
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.maps.folders import MapFolders
@@ -51,7 +52,7 @@ class ProcessRun:
 
     def __init__(
         self,
-        opener: Callable[[], Any],
+        opener: Opener,
         config: Config,
         sinks: Sequence[Sink] = (),
         *,
@@ -224,13 +225,13 @@ class ProcessRun:
             rig=info.rig,
             config=self._config,
             ground_truth=info.ground_truth,
-            source_name=str(getattr(self._opener, "spec", info.name)),
+            source_name=self._opener.spec or info.name,
             ring_name=self._ring.name,
             applied=applied,
             realtime=realtime,
             folders=self._folders,
             delays=self._delays,
-            opening=self._folders.opening(self._opener),
+            opening=self._folders.opening(self._opener.opening),
         )
         jpeg = self._log is not None and self._log.image_format == "jpeg"
         for stage, control in self._controls.items():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from datetime import datetime
@@ -11,7 +11,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-from drivers.source import Source, is_device
+from drivers.choice import Opener
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.run_folder import FolderLock, default_folder, discard_files, prepare_folder
@@ -48,7 +48,7 @@ class Session:
 
     def __init__(
         self,
-        opener: Callable[[], Source],
+        opener: Opener,
         config: Config,
         sinks: Sequence[Sink],
         wiring: Wiring,
@@ -70,11 +70,6 @@ class Session:
         self._lock: FolderLock | None = None  # on the folder, until its last file is written
         self._began = False  # a frame has come
         self.info: SourceInfo
-
-    @property
-    def _spec(self) -> str:
-        """What the source was opened by, '' when the opener does not say."""
-        return str(getattr(self._opener, "spec", ""))
 
     @property
     def folder(self) -> Path:
@@ -125,7 +120,7 @@ class Session:
     def _name_folder(self, otherwise: str) -> Path:
         """By what the source was opened by, else by the given name."""
         if self._folder is None:
-            name = self._spec.rstrip("/").split("/")[-1] or otherwise
+            name = self._opener.spec.rstrip("/").split("/")[-1] or otherwise
             self._folder = default_folder(name, datetime.now())
         return self._folder
 
@@ -157,15 +152,15 @@ class Session:
         self.info = SourceInfo(source.name, source.rig, source.ground_truth, source.frame_count, source.live)
         folder = self._name_folder(source.name)
         self._prepare()
-        options = self._log_options(is_device(self._spec), folder)
+        options = self._log_options(self._opener.device, folder)
         sinks: list[Any] = list(self._sinks)
         jpeg = options is not None and options.image_format == "jpeg"
         if options is not None:
             log = RunLog(
                 LogWriter(options.path, compress=options.image_format != "raw"), source.rig, self._config,
-                source=self._spec or source.name, mode="inline",
+                source=self._opener.spec or source.name, mode="inline",
                 image_format=options.image_format, ground_truth=source.ground_truth,
-                opening=self._folders.opening(self._opener),
+                opening=self._folders.opening(self._opener.opening),
             )  # fmt: skip
             stack.callback(log.close)
             sinks.append(log)
@@ -197,7 +192,7 @@ class Session:
             self._sinks,
             realtime=None if self._wiring.mode is None else self._wiring.mode == "realtime",
             applied=None if self._replayed is None else self._replayed.applied,
-            log=self._log_options(is_device(self._spec), self.folder),
+            log=self._log_options(self._opener.device, self.folder),
             folders=self._folders,
             viewer=viewer,
             opened=self._prepare,

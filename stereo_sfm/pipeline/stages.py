@@ -55,8 +55,7 @@ def sensor_drop(image: StereoImage) -> Dropped | None:
 
 def source_counters(source: Source, frame_id: int) -> SourceCounters | None:
     """What a live source has counted until now; None for files, which count nothing."""
-    counts: dict[str, float] | None = getattr(source, "counters", None)
-    return SourceCounters(frame_id, dict(counts)) if counts else None
+    return SourceCounters(frame_id, dict(source.counters)) if source.counters else None
 
 
 class AnyCloser(Protocol):

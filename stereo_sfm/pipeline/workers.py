@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.rig import Rig
+from drivers.choice import Opener
 from stereo_sfm.config import STAGES, Config
 from stereo_sfm.errors import StereoSfmError, from_os_error
 from stereo_sfm.log.provenance import Opening
@@ -110,7 +111,7 @@ def prepare(stage: str, setup: Setup) -> Callable[[], None]:
 
 
 def run_capture(
-    to_main: Outbox, opener: Callable[[], Any], control: Connection, tracker: Connection, readers: list[Connection]
+    to_main: Outbox, opener: Opener, control: Connection, tracker: Connection, readers: list[Connection]
 ) -> None:
     """Open the source, tell main about it, read it to the end."""
     from stereo_sfm.pipeline.capture import CaptureStage, FreeSlots, SourceInfo, StopFlag

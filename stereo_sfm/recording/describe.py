@@ -8,7 +8,6 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,9 +21,6 @@ from stereo_sfm.log.provenance import CONFIG_FILE, ENDED_EARLY, METADATA, TOTALS
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.recorded import messages
 from stereo_sfm.types import I64
-
-if TYPE_CHECKING:
-    from drivers.source import Source
 
 log = logging.getLogger("stereo_sfm")
 
@@ -203,22 +199,15 @@ def _describe_source(out: Description, path: Path) -> None:
     with source:
         out.calibration = rig_lines(source.rig)
         out.ground_truth = 0 if source.ground_truth is None else len(source.ground_truth)
-        stamps, skew = _image_stamps(source)
+        listed = source.stamps()
+        stamps = np.array([image.stamp_ns for image in source], np.int64) if listed is None else listed.stamp_ns
         out.images = rate_of(stamps)
-        if np.isnan(out.skew_ms):
-            out.skew_ms = skew
+        if np.isnan(out.skew_ms) and listed is not None:
+            out.skew_ms = listed.skew_ms
         if out.kind == "folder":
             out.metadata["source"] = source.name
             out.seconds = float(stamps[-1] - stamps[0]) / 1e9 if len(stamps) else 0.0
     out.problems += _problems(out)
-
-
-def _image_stamps(source: Source) -> tuple[I64, float]:
-    """Stamps of the left images and the largest skew in ms, without decoding pixels where the source allows."""
-    listed: Any = getattr(source, "stamps", None)
-    if callable(listed):
-        return listed()  # pyright: ignore[reportReturnType]
-    return np.array([image.stamp_ns for image in source], np.int64), float("nan")
 
 
 def _problems(out: Description) -> list[str]:

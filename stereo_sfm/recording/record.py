@@ -66,7 +66,7 @@ def record(
                 yield Progress(frames, dropped, (image.stamp_ns - first_ns) / 1e9, writer.bytes_written)
         finally:
             if not writer.closed:
-                counted = {name: f"{value:g}" for name, value in getattr(source, "counters", {}).items() if value}
+                counted = {name: f"{value:g}" for name, value in source.counters.items() if value}
                 writer.metadata(TOTALS, counted | images.totals)
             if not frames:
                 writer.close()

@@ -13,7 +13,7 @@ import pytest
 from calib import load_rig, save_rig
 from calib.rig import Rig
 from drivers.rectified import RectifiedSource, rectified
-from drivers.source import open_source
+from drivers.source import BaseSource, open_source
 from stereo_sfm import read_trajectory
 from stereo_sfm.cli import main
 from stereo_sfm.errors import StereoSfmError
@@ -85,19 +85,17 @@ def test_a_replaced_calibration_is_replayed_too(tmp_path: Path) -> None:
     assert main(["replay", str(tmp_path / "a"), "-o", str(tmp_path / "b"), "--inline", "-q", "--check"]) == 0
 
 
-class LateRig:
+class LateRig(BaseSource):
     """A camera that tells its calibration when it is open."""
 
     def __init__(self, rig: Rig) -> None:
         self._source = open_source(SPEC)
-        self.name, self.ground_truth, self.frame_count, self.live = "late", None, None, True
+        self.name, self.live = "late", True
         self.rig, self._true = rig, self._source.rig
 
     def __enter__(self) -> Self:
         self.rig = self._true
         return self
-
-    def __exit__(self, *_: object) -> None: ...
 
     def __iter__(self) -> Iterator[StereoImage]:
         return iter(self._source)

@@ -12,7 +12,7 @@ import pytest
 
 from calib import save_rig
 from drivers.image_lists import pair_by_stamp
-from drivers.recognise import recognise_folder
+from drivers.registry import recognise
 from drivers.select import SelectedFrames
 from drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
@@ -306,7 +306,7 @@ def test_times_that_fit_no_image_are_refused(tmp_path: Path) -> None:
 def test_a_folder_of_something_else(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("milk\n")
     with pytest.raises(StereoSfmError, match="no dataset that is known") as error:
-        recognise_folder(tmp_path)
+        recognise(tmp_path)
     assert "\n" not in str(error.value)
 
 

@@ -13,9 +13,7 @@ from drivers.live.buffers import Handoff, MotionBuffer, WheelBuffer
 from drivers.live.clock import ClockMap, TimeLine
 from drivers.live.counters import COUNTERS, Counters
 from drivers.live.errors import DeviceLost
-from drivers.live.options import Options
 from drivers.live.pairing import LEFT, RIGHT, Eye, Pair, Pairer
-from stereo_sfm.errors import StereoSfmError
 
 PERIOD = 33_333_333
 PIXELS = np.zeros((1, 1), np.uint8)
@@ -131,15 +129,3 @@ def test_counters_have_every_documented_name() -> None:
     assert counters["dropped"] == 2
     with pytest.raises(KeyError):
         counters.add("colour")
-
-
-def test_options_say_what_is_wrong() -> None:
-    options = Options("cam", {"a": "7", "b": "yes", "c": "x", "e": "500"})
-    assert options.number("a", 1, 0, 10) == 7
-    assert options.flag("b", False)
-    assert options.microseconds("d", 1, 1000) is None
-    assert options.microseconds("e", 1, 1000) == 500
-    with pytest.raises(StereoSfmError, match="cam has no option 'c'"):
-        options.finish()
-    with pytest.raises(StereoSfmError, match="c=x: it must be one of p, q"):
-        Options("cam", {"c": "x"}).choice("c", "p", {"p": 1, "q": 2})

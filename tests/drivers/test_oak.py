@@ -18,7 +18,7 @@ from drivers.live.counters import Counters
 from drivers.live.errors import Busy, DeviceError, DeviceFault, DeviceLost, NoPermission, NotFound, TooSlowLink
 from drivers.oak import library
 from drivers.oak.calibration import read_calibration
-from drivers.oak.source import OakSource, open_oak
+from drivers.oak.source import OakSource
 from drivers.oak.stream import OakStream
 from drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
@@ -266,7 +266,7 @@ def test_a_host_only_pipeline_of_depthai() -> None:
 
 def test_stream_with_calibration_and_imu(fake: FakeOak) -> None:
     fake.skip = {5}
-    with open_oak(size="640x400", fps="30", exposure="8000", iso="800") as source:
+    with open_source("oak", size="640x400", fps="30", exposure="8000", iso="800") as source:
         images = take(source, 10)
     assert source.rig.baseline == pytest.approx(0.07512, abs=1e-5)
     assert source.rig.serial == "18443010"
@@ -282,7 +282,7 @@ def test_stream_with_calibration_and_imu(fake: FakeOak) -> None:
 
 
 def test_anti_banding(fake: FakeOak) -> None:
-    with open_oak(anti_flicker="60", max_exposure="10000", imu="0") as source:
+    with open_source("oak", anti_flicker="60", max_exposure="10000", imu="0") as source:
         assert take(source, 2)[1].imu is None
     control = fake.controls[0][1]
     assert control.antiBandingMode == dai.CameraControl.AntiBandingMode.MAINS_60_HZ
@@ -291,7 +291,7 @@ def test_anti_banding(fake: FakeOak) -> None:
 
 def test_a_lost_camera_comes_back_as_a_new_segment(fake: FakeOak, caplog: pytest.LogCaptureFixture) -> None:
     fake.loses_after = 5
-    with open_oak() as source:
+    with open_source("oak") as source:
         images = take(source, 10)
     assert [i.frame_id for i in images] == list(range(10))
     stamps = np.array([i.stamp_ns for i in images])
@@ -303,21 +303,21 @@ def test_a_lost_camera_comes_back_as_a_new_segment(fake: FakeOak, caplog: pytest
 def test_what_cannot_work_says_so(fake: FakeOak, monkeypatch: pytest.MonkeyPatch) -> None:
     fake.speed = "HIGH"
     with pytest.raises(TooSlowLink, match=r"cannot carry 61 MB/s.*USB 3"):
-        open_oak(size="1280x800")
-    with open_oak(size="640x400") as source:  # 15 MB/s fit
+        open_source("oak", size="1280x800")
+    with open_source("oak", size="640x400") as source:  # 15 MB/s fit
         assert source.rig.left.width == 640
     fake.open_error = "X_LINK_DEVICE_ALREADY_IN_USE"
     with pytest.raises(Busy, match="another program"):
-        open_oak()
+        open_source("oak")
     fake.open_error, fake.calibrated, fake.speed = "", False, "SUPER"
     with pytest.raises(DeviceFault, match="not calibrated"):
-        open_oak()
+        open_source("oak")
     fake.attached = 2
     with pytest.raises(DeviceFault, match="2 OAKs are attached"):
-        open_oak()
+        open_source("oak")
     with pytest.raises(NotFound, match=r"no OAK 'x' attached \(attached: 18443010, 18443011\)"):
-        open_oak("x")
+        open_source("oak:x")
     with pytest.raises(StereoSfmError, match="size=big"):
-        open_oak(size="big")
+        open_source("oak", size="big")
     with pytest.raises(StereoSfmError, match="no option 'colour'"):
-        open_oak(colour="1")
+        open_source("oak", colour="1")

@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from drivers.options import read_options
+from drivers.sim.options import SimOptions
 from drivers.sim.scenes import SCENES, random_poses
-from drivers.sim.source import SimSource, open_sim, read_options
+from drivers.sim.source import SimSource
 from drivers.sim.world import Layout
 from drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
@@ -24,7 +26,7 @@ SMALL = Layout(gondolas=2, gondola_length=5.0, products=40)
 def small(name: str = "loop", **options: object) -> SimSource:
     """A named scene in a store that is quick to build, small images."""
     scene = dataclasses.replace(SCENES[name], layout=SMALL)
-    return SimSource(name, scene, read_options({"size": "212x200", **options}))
+    return SimSource(name, scene, read_options(SimOptions, "sim", {"size": "212x200", **options}))
 
 
 def same(a: StereoImage, b: StereoImage) -> bool:
@@ -142,13 +144,13 @@ def test_random_poses_are_inside_and_upright() -> None:
     ("spec", "text"),
     [
         ("sim:shop", "unknown scene"),
-        ("sim:loop?colour=1", "unknown option"),
-        ("sim:loop?camera=gopro", "unknown camera"),
+        ("sim:loop?colour=1", "no option 'colour'"),
+        ("sim:loop?camera=gopro", "one of fisheye, pinhole"),
         ("sim:loop?seed=x", "whole number"),
-        ("sim:loop?rate=0", "between"),
+        ("sim:loop?rate=0", "from 1 to 1000"),
         ("sim:loop?size=big", "WIDTHxHEIGHT"),
         ("sim:loop?effects=maybe", "on or off"),
-        ("sim:loop?exchange=nan", "between"),
+        ("sim:loop?exchange=nan", "from 0 to 1"),
         ("sim:loop?dark=5", "FROM-TO"),
         ("sim:loop?dark=5-nan", "FROM-TO"),
     ],
@@ -166,7 +168,7 @@ def test_start_beyond_the_end() -> None:
 
 def test_default_is_the_loop() -> None:
     with pytest.raises(StereoSfmError, match="beyond"):
-        open_sim("", start=10**6)
+        open_source("sim", start=10**6)
 
 
 def test_bundled_recording_is_what_its_command_renders() -> None:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import drivers.t265
+from drivers import open_source
 from drivers.live.errors import (
     BootFailed,
     Busy,
@@ -34,7 +35,6 @@ from drivers.t265.simulated.bus import SimulatedBus
 from drivers.t265.simulated.camera import SimulatedCamera
 from drivers.t265.simulated.faults import Faults
 from drivers.t265.simulated.source import FAST, SimulatedT265Source, checked_firmware
-from drivers.t265.source import open_t265
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import StereoImage
 from tests.drivers.t265_rig import noise_content, open_camera, take
@@ -274,7 +274,7 @@ def test_usb2_may_be_allowed() -> None:
 def test_no_camera_is_one_line_at_once() -> None:
     began = time.monotonic()
     with pytest.raises(NotFound, match="no T265 attached") as caught:
-        open_t265(backend=SimulatedBus([]))
+        open_source("t265", backend=SimulatedBus([]))
     assert time.monotonic() - began < 1
     assert "\n" not in str(caught.value)
 
@@ -284,11 +284,11 @@ def test_firmware_is_needed_and_checked(tmp_path: Path, monkeypatch: pytest.Monk
     monkeypatch.delenv("STEREO_SFM_T265_FIRMWARE", raising=False)
     camera = SimulatedCamera(noise_content())
     with pytest.raises(FirmwareMissing, match="firmware extract FILE"):
-        open_t265(backend=SimulatedBus([camera]))
+        open_source("t265", backend=SimulatedBus([camera]))
     wrong = tmp_path / "wrong.mvcmd"
     wrong.write_bytes(b"MA2x" + bytes(100))
     with pytest.raises(FirmwareMissing, match=r"is not T265 firmware 0\.2\.0\.951"):
-        open_t265(backend=SimulatedBus([camera]), firmware=str(wrong))
+        open_source("t265", backend=SimulatedBus([camera]), firmware=str(wrong))
     assert camera.boot_bytes == b""
     with pytest.raises(FirmwareMissing):
         verified(b"")
@@ -298,13 +298,13 @@ def test_cameras_are_chosen_by_serial() -> None:
     cameras = [SimulatedCamera(noise_content(), serial=s) for s in ("000000000AAA", "000000000BBB")]
     bus = SimulatedBus(cameras)
     with pytest.raises(DeviceFault, match="2 T265s are attached"):
-        open_t265(backend=bus)
+        open_source("t265", backend=bus)
     access = Access(bus, "000000000bbb", checked_firmware, timing=FAST)
     with SimulatedT265Source(cameras[1], access, Settings(), Patience()) as source:
         assert source.info.serial == "000000000BBB"
         assert_honest(source, take(source, 3))
     with pytest.raises(NotFound, match=r"no T265 with serial 123.*000000000AAA, 000000000BBB"):
-        open_t265("123", backend=bus)
+        open_source("t265:123", backend=bus)
 
 
 def test_exposure_reaches_the_camera(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -334,7 +334,7 @@ def test_exposure_reaches_the_camera(monkeypatch: pytest.MonkeyPatch) -> None:
 )
 def test_bad_options_are_one_line(options: dict[str, str], line: str) -> None:
     with pytest.raises(StereoSfmError, match=line):
-        open_t265(backend=SimulatedBus([]), **options)
+        open_source("t265", backend=SimulatedBus([]), **options)
 
 
 # ---- what must never leave
@@ -408,5 +408,5 @@ def test_other_movidius_devices_are_left_alone(product: int, monkeypatch: pytest
 
     monkeypatch.setattr(bus, "get_device_descriptor", other)
     with pytest.raises(NotFound, match="no T265 attached"):
-        open_t265(backend=bus)
+        open_source("t265", backend=bus)
     assert camera.boot_bytes == b""

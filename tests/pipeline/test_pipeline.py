@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import functools
 import os
 import signal
 import threading
 from collections.abc import Iterator, Sequence
 from multiprocessing import shared_memory
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 import psutil
 import pytest
 
 from calib.rig import Rig
+from drivers.choice import MadeSource, SourceChoice
+from drivers.source import BaseSource
 from stereo_sfm.config import Config, load
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry.cameras import Pinhole
@@ -37,17 +36,17 @@ from stereo_sfm.types import Applied, Frame, StereoImage, Trajectory
 WIDTH, HEIGHT, BASELINE = 320, 240, 0.1
 
 
-class SlidingWall:
+class SlidingWall(BaseSource):
     """A camera that slides along a textured wall, out and back: exact, quick, and it sees places again."""
 
-    name, live, ground_truth = "wall", False, None
+    name = "wall"
 
     def __init__(self, frames: int, fail_at: int = -1, slow_s: float = 0.0) -> None:
         camera = Pinhole(WIDTH, HEIGHT, 200.0, 200.0, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
         left_T_right = np.eye(4)
         left_T_right[0, 3] = BASELINE
         self.rig = Rig(camera, camera, left_T_right)
-        self.frame_count: int | None = frames
+        self.frame_count = frames
         self._fail_at, self._slow_s = fail_at, slow_s
         rng = np.random.default_rng(4)
         coarse = rng.uniform(20, 230, (HEIGHT // 4, 1200 // 4))
@@ -56,14 +55,6 @@ class SlidingWall:
         for axis in (0, 1):
             wall = np.apply_along_axis(lambda r: np.convolve(r, kernel, "same"), axis, wall)
         self._wall = wall
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        return None
 
     def __iter__(self) -> Iterator[StereoImage]:
         import time
@@ -88,7 +79,7 @@ def inline_log(path: Path, source: SlidingWall, config: Config = CONFIG, schedul
     log.close()
 
 
-def process_log(path: Path, source: functools.partial[SlidingWall], **options: object) -> list[Frame]:
+def process_log(path: Path, source: MadeSource, **options: object) -> list[Frame]:
     with ProcessRun(source, CONFIG, log=LogOptions(path, "none"), **options) as run:  # type: ignore[arg-type]
         return list(run)
 
@@ -106,7 +97,7 @@ def inline(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_processes_with_delays_give_the_bits_of_inline(inline: Path, tmp_path: Path) -> None:
-    frames = process_log(tmp_path / "run.mcap", functools.partial(SlidingWall, 80), delays=1)
+    frames = process_log(tmp_path / "run.mcap", MadeSource.of(SlidingWall, 80), delays=1)
     assert len(frames) == 80
     assert same(inline, tmp_path / "run.mcap") == []
     with LogReader(inline) as reader:
@@ -123,7 +114,7 @@ def test_blas_has_the_configured_threads_inline_as_between_processes() -> None:
 
 
 def test_a_realtime_run_is_replayed_by_its_recorded_schedule(tmp_path: Path) -> None:
-    process_log(tmp_path / "live.mcap", functools.partial(SlidingWall, 60, slow_s=0.01), realtime=True, delays=2)
+    process_log(tmp_path / "live.mcap", MadeSource.of(SlidingWall, 60, slow_s=0.01), realtime=True, delays=2)
     with LogReader(tmp_path / "live.mcap") as reader:
         run = read_run(reader)
         tracked = {r.sequence for r in reader.messages(["/frame"])}
@@ -143,7 +134,7 @@ def test_a_realtime_run_is_replayed_by_its_recorded_schedule(tmp_path: Path) -> 
 )
 def test_a_killed_stage_ends_the_run_and_leaves_a_log(stage: str, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    run = ProcessRun(functools.partial(SlidingWall, 5000, slow_s=0.005), CONFIG, log=LogOptions(path, "none"))
+    run = ProcessRun(MadeSource.of(SlidingWall, 5000, slow_s=0.005), CONFIG, log=LogOptions(path, "none"))
     with pytest.raises(StageDied, match=f"the {stage} process was killed by SIGKILL"), run:  # noqa: PT012
         pids = run.pids
         name = run._ring.name if run._ring is not None else ""
@@ -161,13 +152,13 @@ def test_a_killed_stage_ends_the_run_and_leaves_a_log(stage: str, tmp_path: Path
 
 def test_an_error_in_a_stage_comes_back_with_its_traceback(tmp_path: Path) -> None:
     with pytest.raises(StageDied, match="the driver broke"):
-        process_log(tmp_path / "run.mcap", functools.partial(SlidingWall, 50, fail_at=20))
+        process_log(tmp_path / "run.mcap", MadeSource.of(SlidingWall, 50, fail_at=20))
     with LogReader(tmp_path / "run.mcap") as reader:
         assert sum(1 for _ in reader.messages(["/frame"])) == 20
         assert not ended_early(reader)
 
 
-def wired(in_processes: bool, source: functools.partial[SlidingWall], folders: MapFolders) -> Iterator[Frame]:
+def wired(in_processes: bool, source: MadeSource, folders: MapFolders) -> Iterator[Frame]:
     if not in_processes:
         yield from run_inline(source(), CONFIG, folders=folders)
         return
@@ -178,7 +169,7 @@ def wired(in_processes: bool, source: functools.partial[SlidingWall], folders: M
 @pytest.mark.parametrize("in_processes", [False, True])
 def test_what_a_source_gave_before_it_failed_is_mapped(in_processes: bool, tmp_path: Path) -> None:
     frames: list[Frame] = []
-    source, folders = functools.partial(SlidingWall, 80, fail_at=60), MapFolders(map_out=tmp_path / "map")
+    source, folders = MadeSource.of(SlidingWall, 80, fail_at=60), MapFolders(map_out=tmp_path / "map")
     with pytest.raises((RuntimeError, StageDied), match="the driver broke"):
         frames.extend(wired(in_processes, source, folders))
     assert [f.frame_id for f in frames] == list(range(60))
@@ -187,14 +178,14 @@ def test_what_a_source_gave_before_it_failed_is_mapped(in_processes: bool, tmp_p
 
 @pytest.mark.parametrize("in_processes", [False, True])
 def test_the_error_of_the_source_is_told_though_there_is_no_map_to_save(in_processes: bool, tmp_path: Path) -> None:
-    source, folders = functools.partial(SlidingWall, 80, fail_at=0), MapFolders(map_out=tmp_path / "map")
+    source, folders = MadeSource.of(SlidingWall, 80, fail_at=0), MapFolders(map_out=tmp_path / "map")
     with pytest.raises((RuntimeError, StageDied), match="the driver broke"):
         list(wired(in_processes, source, folders))
     assert not (tmp_path / "map").exists()
 
 
 def test_a_capture_process_that_is_killed_costs_nothing_that_it_read(tmp_path: Path) -> None:
-    source, folders = functools.partial(SlidingWall, 5000, slow_s=0.005), MapFolders(map_out=tmp_path / "map")
+    source, folders = MadeSource.of(SlidingWall, 5000, slow_s=0.005), MapFolders(map_out=tmp_path / "map")
     with pytest.raises(StageDied, match="the capture process was killed by SIGKILL"):  # noqa: PT012, SIM117
         with ProcessRun(source, CONFIG, folders=folders) as run:
             for k, _ in enumerate(run):
@@ -218,7 +209,7 @@ class StalledWall(SlidingWall):
 def test_a_stop_is_heard_though_no_image_comes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("stereo_sfm.pipeline.processes.STOP_GRACE_S", 0.5)
     folders = MapFolders(map_out=tmp_path / "map")
-    with ProcessRun(functools.partial(StalledWall, 50), CONFIG, folders=folders) as run:
+    with ProcessRun(MadeSource.of(StalledWall, 50), CONFIG, folders=folders) as run:
         frames: list[Frame] = []
         for frame in run:
             frames.append(frame)
@@ -229,13 +220,13 @@ def test_a_stop_is_heard_though_no_image_comes(monkeypatch: pytest.MonkeyPatch, 
 
 
 def test_a_stop_that_comes_too_late_is_no_error() -> None:
-    with ProcessRun(functools.partial(SlidingWall, 5), CONFIG) as run:
+    with ProcessRun(MadeSource.of(SlidingWall, 5), CONFIG) as run:
         assert len(list(run)) == 5
     run.stop()
 
 
 def test_a_stage_that_dies_before_it_is_set_up_is_named(tmp_path: Path) -> None:
-    run = ProcessRun(functools.partial(SlidingWall, 50), CONFIG, log=LogOptions(tmp_path / "run.mcap", "none"))
+    run = ProcessRun(MadeSource.of(SlidingWall, 50), CONFIG, log=LogOptions(tmp_path / "run.mcap", "none"))
 
     def kill() -> None:
         os.kill(run.pids["tracker"], signal.SIGKILL)
@@ -256,11 +247,10 @@ def test_the_users_number_of_threads_does_not_reach_the_stages(monkeypatch: pyte
 
 
 def test_a_source_that_cannot_be_opened_is_one_clear_line() -> None:
-    from drivers.source import open_source
 
     with (
         pytest.raises(StereoSfmError, match="unknown source 'nothing'"),
-        ProcessRun(functools.partial(open_source, "nothing"), CONFIG),
+        ProcessRun(SourceChoice("nothing"), CONFIG),
     ):
         pass
 
@@ -268,7 +258,7 @@ def test_a_source_that_cannot_be_opened_is_one_clear_line() -> None:
 def test_stop_finishes_what_is_in_flight(tmp_path: Path) -> None:
     seen = 0
     with ProcessRun(
-        functools.partial(SlidingWall, 5000, slow_s=0.005), CONFIG, log=LogOptions(tmp_path / "run.mcap", "none")
+        MadeSource.of(SlidingWall, 5000, slow_s=0.005), CONFIG, log=LogOptions(tmp_path / "run.mcap", "none")
     ) as run:
         for seen, _ in enumerate(run, 1):
             if seen == 30:
@@ -311,7 +301,7 @@ def test_any_process_killed_at_any_time(seed: int, tmp_path: Path) -> None:
     """At most half a second of frames is lost to the log, nobody is left behind."""
     rng = np.random.default_rng(seed)
     path, kill_at, seen = tmp_path / "run.mcap", int(rng.integers(5, 120)), 0
-    run = ProcessRun(functools.partial(SlidingWall, 5000, slow_s=0.005), CONFIG, log=LogOptions(path, "none"))
+    run = ProcessRun(MadeSource.of(SlidingWall, 5000, slow_s=0.005), CONFIG, log=LogOptions(path, "none"))
     with pytest.raises(StageDied, match="was killed by SIGKILL") as died, run:  # noqa: PT012
         pids = run.pids
         stage = sorted(pids)[int(rng.integers(len(pids)))]

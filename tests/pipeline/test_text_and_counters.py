@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import logging
 import multiprocessing
 from collections.abc import Callable, Iterator
@@ -12,6 +11,7 @@ from typing import Any, Self
 
 import pytest
 
+from drivers.choice import MadeSource
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.eval.statistics import statistics, summary
 from stereo_sfm.log import topics
@@ -78,7 +78,7 @@ class Kept:
 
 
 def between_processes(path: Path, sinks: list[Any]) -> None:
-    opener = functools.partial(TroubledWall, 12)
+    opener = MadeSource.of(TroubledWall, 12)
     with ProcessRun(opener, CONFIG, sinks, log=LogOptions(path, "none")) as run:
         assert len(list(run)) == 12
 
@@ -121,7 +121,7 @@ def test_warnings_and_counters_reach_the_log_and_the_sinks(
 def test_what_a_source_says_while_it_opens_is_kept(tmp_path: Path) -> None:
     kept = Kept()
     with ProcessRun(
-        functools.partial(TalkativeWall, 5), CONFIG, [kept], log=LogOptions(tmp_path / "run.mcap", "none")
+        MadeSource.of(TalkativeWall, 5), CONFIG, [kept], log=LogOptions(tmp_path / "run.mcap", "none")
     ) as run:
         assert len(list(run)) == 5
     assert kept.lines[0] == LogLine("capture", "INFO", "the wall boots")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import multiprocessing
 import os
 import signal
@@ -14,6 +13,7 @@ import numpy as np
 import psutil
 import pytest
 
+from drivers.choice import MadeSource
 from stereo_sfm.pipeline import processes, workers
 from stereo_sfm.pipeline.channels import DroppingOutbox, Inbox, Outbox
 from stereo_sfm.pipeline.processes import ProcessRun
@@ -48,7 +48,7 @@ def test_the_run_is_whole_whatever_the_viewer_does(
     monkeypatch.setattr(workers, "run_viewer", body)
     monkeypatch.setattr(processes, "VIEWER_GRACE_S", 0.5)
     log, viewer = LogOptions(tmp_path / "run.mcap", "none"), ViewerOptions("save", tmp_path / "run.rrd")
-    with ProcessRun(functools.partial(SlidingWall, FRAMES), CONFIG, log=log, viewer=viewer) as run:
+    with ProcessRun(MadeSource.of(SlidingWall, FRAMES), CONFIG, log=log, viewer=viewer) as run:
         pids = run.pids
         assert len(list(run)) == FRAMES
     assert same(inline, tmp_path / "run.mcap") == []
@@ -59,7 +59,7 @@ def test_the_run_is_whole_whatever_the_viewer_does(
 def test_a_killed_viewer_is_not_missed(inline: Path, tmp_path: Path) -> None:
     log, viewer = LogOptions(tmp_path / "run.mcap", "none"), ViewerOptions("save", tmp_path / "run.rrd")
     seen = 0
-    with ProcessRun(functools.partial(SlidingWall, FRAMES), CONFIG, log=log, viewer=viewer) as run:
+    with ProcessRun(MadeSource.of(SlidingWall, FRAMES), CONFIG, log=log, viewer=viewer) as run:
         for seen, _ in enumerate(run, 1):
             if seen == 20:
                 os.kill(run.pids["viewer"], signal.SIGKILL)

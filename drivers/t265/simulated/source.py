@@ -1,19 +1,13 @@
-"""`t265:simulated`: the whole driver on a simulated camera, firmware and all.
-
-Options besides those of a real camera: `images` (a source such as sim:loop, or 'room'), `frames` (how many are made
-before the start and then played forwards and backwards), `faults` (names of simulated.faults.PRESETS), `paced` (0: as
-fast as the host reads), `seed`.
-"""
+"""`t265:simulated`: the whole driver on a simulated camera, firmware and all."""
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drivers.live.options import Options
-from drivers.live.source import Patience
+from drivers.live.source import Patience, with_rig
 from drivers.t265 import messages as m
 from drivers.t265.acquire import Access
 from drivers.t265.camera import Settings
@@ -23,8 +17,11 @@ from drivers.t265.simulated.bus import SimulatedBus
 from drivers.t265.simulated.camera import SimulatedCamera
 from drivers.t265.simulated.content import room_content, source_content
 from drivers.t265.simulated.faults import preset
-from drivers.t265.source import T265Source
+from drivers.t265.source import T265Source, settings_of
 from stereo_sfm.types import I64, Trajectory
+
+if TYPE_CHECKING:
+    from drivers.t265 import T265Options
 
 # The simulated camera is quick to boot and to forgive.
 FAST = Timing(busy_wait_s=0.05, boot_s=3.0, boot_poll_s=0.02, settle_s=0.02)
@@ -61,17 +58,14 @@ class SimulatedT265Source(T265Source):
         return Trajectory(stamps, self.camera.content.pose(seconds))
 
 
-def open_simulated(
-    opts: Options, settings: Settings, patience: Patience, queue: int, allow_slow: bool
-) -> SimulatedT265Source:
-    """Called by `open_t265`."""
-    frames = int(opts.number("frames", 60, 1, 3000))
-    images = opts.text("images", "room")
-    faults = preset(opts.text("faults", "none"))
-    paced = opts.flag("paced", True)
-    seed = int(opts.number("seed", 0, 0, 2**31))
-    opts.finish()
-    content = room_content(frames, seed) if images == "room" else source_content(images, frames)
-    camera = SimulatedCamera(content, faults, paced)
-    access = Access(SimulatedBus([camera]), "", checked_firmware, allow_slow, FAST)
-    return SimulatedT265Source(camera, access, settings, replace(patience, reconnect_s=5.0), queue)
+def open_simulated(options: T265Options) -> SimulatedT265Source:
+    """A simulated camera that sees what the options say."""
+    content = (
+        room_content(options.frames, options.seed)
+        if options.images == "room"
+        else source_content(options.images, options.frames)
+    )
+    camera = SimulatedCamera(content, preset(options.faults), options.paced)
+    access = Access(SimulatedBus([camera]), "", checked_firmware, options.allow_slow, FAST)
+    source = SimulatedT265Source(camera, access, settings_of(options), Patience(reconnect_s=5.0), options.queue)
+    return with_rig(source, options.rig)
