@@ -10,7 +10,6 @@ import os
 import sys
 from collections.abc import Sequence
 
-from stereo_sfm import __version__
 from stereo_sfm.commands._stop import INTERRUPTED
 from stereo_sfm.errors import StereoSfmError, from_os_error
 
@@ -56,11 +55,9 @@ def _build_parser(chosen: str | None) -> argparse.ArgumentParser:
 
 
 def _print_versions() -> None:
-    from importlib.metadata import version
+    from stereo_sfm.log.provenance import versions
 
-    print(f"stereo-sfm {__version__}")
-    for package in ("numpy", "opencv-python-headless", "gtsam", "mcap", "numba", "rerun-sdk", "depthai"):
-        print(f"{package} {version(package)}")
+    print(versions(), end="")
 
 
 class _Standard(logging.Handler):

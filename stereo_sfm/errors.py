@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import importlib.util
 from collections.abc import Generator, Iterable
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,6 +20,17 @@ class StereoSfmError(Exception):
     """
 
     exit_code = 2
+
+
+def require(modules: tuple[str, ...], extra: str, purpose: str, error: type[StereoSfmError] = StereoSfmError) -> None:
+    """Ask for the libraries of one of the package's extras before they are imported.
+
+    Raises:
+        StereoSfmError (or the given kind): one of them is not installed.
+    """
+    missing = [name for name in modules if importlib.util.find_spec(name) is None]
+    if missing:
+        raise error(f"{purpose} needs {', '.join(missing)}: pip install 'stereo-sfm[{extra}]'")
 
 
 def from_os_error(error: OSError) -> StereoSfmError | None:

@@ -52,7 +52,7 @@ def load() -> Any:
         return importlib.import_module("depthai")
     except ImportError as error:
         raise DeviceFault(
-            f"depthai 3 is needed for an OAK and cannot be imported ({error}): pip install depthai"
+            f"depthai 3 is needed for an OAK and cannot be imported ({error}): pip install 'stereo-sfm[oak]'"
         ) from None
 
 
@@ -85,16 +85,20 @@ _USB_VENDOR, _USB_PRODUCTS = 0x03E7, (0x2485, 0xF63B, 0xF63C, 0xF63D)
 
 def on_usb() -> bool:
     """Whether an OAK is on the USB bus: a look of milliseconds, before depthai takes its second."""
-    import usb.core
-
     from drivers.t265.usb_device import default_backend
 
     try:
+        backend = default_backend()
+    except NotFound:
+        return False
+    import usb.core
+
+    try:
         found = usb.core.find(
-            backend=default_backend(),
+            backend=backend,
             custom_match=lambda d: d.idVendor == _USB_VENDOR and d.idProduct in _USB_PRODUCTS,
         )
-    except (usb.core.USBError, NotFound):
+    except usb.core.USBError:
         return False
     return found is not None
 

@@ -8,6 +8,7 @@ from typing import Any, Protocol, cast
 
 from drivers.live.errors import Busy, DeviceError, DeviceLost, NoPermission, NotFound
 from drivers.t265 import messages as m
+from stereo_sfm.errors import require
 
 SPEEDS = {0: "unknown", 1: "low", 2: "full", 3: "high", 4: "super", 5: "super+"}  # libusb_speed
 SUPER_SPEED = 4
@@ -40,6 +41,7 @@ def default_backend() -> Any:
     Raises:
         NotFound: there is no libusb at all.
     """
+    require(("usb", "libusb_package"), "t265,oak", "a camera on USB", NotFound)
     import libusb_package
     import usb.backend.libusb1
 

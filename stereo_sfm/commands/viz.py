@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stereo_sfm.commands._options import add_viewer_address
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import StereoSfmError, require
 
 if TYPE_CHECKING:
     from drivers.source import Source
@@ -39,6 +39,8 @@ def run(args: argparse.Namespace) -> int:
     from stereo_sfm.log.attached import attached_rig, attached_truth
     from stereo_sfm.log.provenance import METADATA
     from stereo_sfm.log.reader import LogReader
+
+    require(("rerun",), "viewer", "the viewer")
     from stereo_sfm.viz.sink import RerunSink
 
     mode = "save" if args.save else "serve" if args.serve else "spawn"

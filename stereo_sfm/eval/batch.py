@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from stereo_sfm.config import Config, dump
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import StereoSfmError, require
 
 RESULT = "result.json"
 RETRIES = 3  # of a task whose node died
@@ -116,11 +116,9 @@ def _run_on_ray(tasks: list[BatchTask], address: str | None) -> Iterator[tuple[B
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     if address is None:
         os.environ[LOOPBACK_ONLY] = "0"
-    try:
-        import ray
-        from ray.exceptions import RayError
-    except ImportError:
-        raise StereoSfmError("batch needs Ray: pip install 'stereo-sfm[batch]'") from None
+    require(("ray",), "batch", "many recordings at once")
+    import ray
+    from ray.exceptions import RayError
 
     # "local" even where a cluster once ran: without it Ray waits for the last one it remembers.
     ours = not ray.is_initialized()

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from drivers.choice import Opener
 from stereo_sfm.config import Config
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import StereoSfmError, require
 from stereo_sfm.export.run_folder import FolderLock, default_folder, discard_files, prepare_folder
 from stereo_sfm.maps.folders import MapFolders
 from stereo_sfm.messages import Sink
@@ -59,6 +59,8 @@ class Session:
     ) -> None:
         if wiring.inline and wiring.mode == "realtime":
             raise StereoSfmError("--mode realtime needs processes: leave --inline away")
+        if wiring.viz != "none":
+            require(("rerun",), "viewer", "the viewer")
         self._opener, self._config, self._sinks, self._wiring = opener, config, list(sinks), wiring
         self._folders, self._overwrite, self._replayed = folders, overwrite, replayed
         self._stack = ExitStack()
