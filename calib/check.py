@@ -8,6 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.amount import FOCAL_BOTH, FOCAL_RATIO, TURN
+from calib.choice import Choice, choose
+from calib.consequences import Consequences, consequences
 from calib.consistency import Correction, estimate
 from calib.rectification import Rectification
 from calib.rig import Rig
@@ -47,6 +49,8 @@ class CheckReport:
     region_median: F64  # (4, 5) px row error, NaN where fewer than 8 matches
     region_count: I64  # (4, 5)
     correction: Correction
+    choice: Choice  # what of it has the evidence to be written
+    consequences: Consequences  # of leaving that out
 
     @property
     def level(self) -> int:
@@ -68,6 +72,8 @@ class Limit:
     deviations: float
 
 
+DISPARITY_PX = Limit(0.5, 1.0, 2.5)
+LENGTH_PERCENT = Limit(1.5, 4.0, 0.0)
 SYSTEMATIC_PX = Limit(0.5, 0.75, 0.0)
 ROTATION_DEG = Limit(0.08, 0.11, 2.5)
 DIRECTION_DEG = Limit(1.5, 3.0, 4.0)
@@ -98,12 +104,15 @@ def check(rig: Rig, rectification: Rectification, windows: list[Window], rolling
     left = np.concatenate([w.rows.left for w in windows])[good]
     error = np.concatenate([w.rows.row_error for w in windows])[good]
     median, count = regions(left, error, rectification.rig.left.size)
+    choice = choose(correction.whole, correction.halves, rolling)
+    effect = consequences(rig, choice.apply(rig), windows)
     findings = (
+        _distances(rig, choice, effect),
         _rows(error, median, count),
         _baseline(rig),
         *_judged(correction),
     )
-    return CheckReport(findings, total, len(windows), median, count, correction)
+    return CheckReport(findings, total, len(windows), median, count, correction, choice, effect)
 
 
 def regions(left: F64, error: F64, size: tuple[int, int]) -> tuple[F64, I64]:
@@ -130,6 +139,16 @@ def level_of(value: float, sigma: float, limit: Limit) -> int:
     if abs(value) < limit.deviations * sigma:
         return 0
     return 2 if abs(value) > limit.fail else 1 if abs(value) > limit.warn else 0
+
+
+def _distances(rig: Rig, choice: Choice, effect: Consequences) -> Finding:
+    """What the terms that have the evidence do to distances and to the path, if they are not corrected."""
+    sigma = rig.left.fx * float(choice.sigma[1])
+    text = f"disparity off by {effect.disparity_px:+.2f} +- {sigma:.2f} px"
+    if not choice.written.any():
+        return Finding("distances", 0, f"the images prove no error; disparity known to {sigma:.2f} px")
+    level = max(level_of(effect.disparity_px, sigma, DISPARITY_PX), level_of(100 * effect.length, 0.0, LENGTH_PERCENT))
+    return Finding("distances", level, f"{text}: {effect.text}", True, (effect.disparity_px,), (sigma,))
 
 
 def _rows(error: F64, median: F64, count: I64) -> Finding:

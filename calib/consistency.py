@@ -18,25 +18,25 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.amount import FOCAL_BOTH, FOCAL_RATIO, TURN, amounts
+from calib.choice import TERMS, Estimate
 from calib.rig import Rig
 from calib.scene_model import (
     DIRECTION,
-    FOCAL,
-    FOCAL_RIGHT,
     NUISANCE,
-    ROTATION,
     SHARED,
     Problem,
     in_both,
     linearised,
     make_problem,
     moved,
+    part,
     tangents,
 )
 from calib.tracks import Window
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, Bool
 
+HALF_ITERATIONS = 10
 CORRELATED = 2.0  # the matches' errors are not independent: their deviation counts so many times
 # One standard deviation of what may be wrong before any image is seen: radians, radians, ratios, seconds.
 RIG_PRIOR = (0.05, 0.05, 0.05, 0.02, 0.02, 0.05, 0.05, 0.02)
@@ -82,6 +82,8 @@ class Correction:
     residual_px: float  # root mean square of the inliers after the fit
     travel: float  # how far the points of the liveliest window moved, as a fraction of the image's width
     explained: tuple[Bool, ...]  # for each window (N,) the points whose first moment the corrected rig explains
+    whole: Estimate  # of the terms that may be written
+    halves: tuple[Estimate, ...]  # the same of two parts of the recording, each on its own
     rolling: bool = False  # rows are exposed one after the other: what moves bends as if the lens did
 
     @property
@@ -97,18 +99,6 @@ class Correction:
         """
         several = len(self.explained) > 1
         return not self.rolling and several and self.travel > 0.04 and float(self.amount_sigma[FOCAL_BOTH]) < 0.007
-
-    def apply(self, rig: Rig) -> Rig:
-        """The rig turned and magnified as the images ask for; the focal length of both only if the motion shows it.
-
-        With a rolling shutter only what rows tell without motion: the turns about x and z and the right focal length.
-        """
-        vector = self.vector.copy()
-        vector[ROTATION], vector[FOCAL_RIGHT] = self.amount[TURN], self.amount[FOCAL_RATIO]
-        if self.rolling:
-            vector[ROTATION.start + 1], vector[DIRECTION] = 0.0, 0.0
-        vector[FOCAL] = self.amount[FOCAL_BOTH] if self.shows_focal else 0.0
-        return moved(rig, vector)
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,9 +123,27 @@ def estimate(rig: Rig, windows: list[Window], iterations: int = 18) -> Correctio
     amount[FOCAL_BOTH], sigma[FOCAL_BOTH] = _both(rig, problems, best, total[FOCAL_BOTH])
     residual = float(np.sqrt(np.mean(np.concatenate(final) ** 2)))
     travel = max(_travel(w) for w in windows) / rig.left.width
+    parts = [_fit(rig, half, ANY, best.vector, best.sigma, HALF_ITERATIONS) for half in _halves(problems)]
+    halves = tuple(_terms(fit, total) for fit in parts)
     return Correction(
-        best.vector, best.covariance, amount, sigma, best.sigma, kept, residual, travel, explained
+        best.vector, best.covariance, amount, sigma, best.sigma, kept, residual, travel, explained,
+        _terms(best, total), halves,
     )  # fmt: skip
+
+
+def _halves(problems: list[Problem]) -> tuple[list[Problem], list[Problem]]:
+    """Windows in turn; of a single one the points in turn."""
+    if len(problems) > 1:
+        return problems[0::2], problems[1::2]
+    return [part(problems[0], slice(0, None, 2))], [part(problems[0], slice(1, None, 2))]
+
+
+def _terms(fit: _Fit, total: F64) -> Estimate:
+    """What `calib.choice` chooses from."""
+    by_vector = np.zeros((TERMS, SHARED))
+    by_vector[:3], by_vector[5] = total[TURN], total[FOCAL_RATIO]
+    by_vector[3:5, DIRECTION] = np.eye(2)
+    return Estimate(by_vector @ fit.vector, by_vector @ fit.covariance @ by_vector.T)
 
 
 def _explained(window: Window, problem: Problem) -> Bool:

@@ -56,22 +56,37 @@ def in_both(window: Window) -> Bool:
     return np.isfinite(window.left[0]).all(1) & np.isfinite(window.right[0]).all(1)
 
 
+def inverse_distances(rig: Rig, left: F64, right: F64) -> F64:
+    """(N,) 1/m along the left rays of pixels (N, 2) in both images, negative beyond infinity, NaN outside a lens.
+
+    (b - rho t) seen from the right camera is parallel to its bearing r: r x R'b = rho r x R't, least squares in rho.
+    """
+    assert rig.right is not None
+    bearing, in_right = rig.left.unproject(left), rig.right.unproject(right)
+    rotation, t = rig.left_T_right[:3, :3], rig.left_T_right[:3, 3]
+    a, c = np.cross(in_right, bearing @ rotation), np.cross(in_right, t @ rotation)
+    return np.asarray((a * c).sum(1) / np.maximum((c * c).sum(1), 1e-12), float)
+
+
 def make_problem(rig: Rig, window: Window) -> Problem:
     seen = in_both(window)
     left, right = window.left[:, seen], window.right[:, seen]
     velocity = np.nan_to_num(window.right_velocity[:, seen])
-    assert rig.right is not None
     bearing = rig.left.unproject(left[0])
-    # (b - rho t) seen from the right eye is parallel to its bearing r: r x R'b = rho r x R't, least squares in rho.
-    in_right = rig.right.unproject(right[0])
-    rotation, t = rig.left_T_right[:3, :3], rig.left_T_right[:3, 3]
-    a, c = np.cross(in_right, bearing @ rotation), np.cross(in_right, t @ rotation)
-    rho = (a * c).sum(1) / np.maximum((c * c).sum(1), 1e-12)
+    rho = inverse_distances(rig, left[0], right[0])
     frames = np.broadcast_to(np.eye(4), (len(left), 4, 4)).copy()
     problem = Problem(left, right, velocity, bearing, rho, frames, np.ones((len(bearing), 4 * len(left))))
     for f in range(1, len(left)):
         frames[f] = _first_pose(rig.left, left[f], bearing, rho, frames[f - 1])
     return problem
+
+
+def part(problem: Problem, points: slice) -> Problem:
+    """The same window with some of its points."""
+    return Problem(
+        problem.left[:, points], problem.right[:, points], problem.velocity[:, points], problem.bearing[points].copy(),
+        problem.rho[points].copy(), problem.frame_T_first.copy(), problem.weight[points].copy(),
+    )  # fmt: skip
 
 
 def _first_pose(camera: Camera, uv: F64, bearing: F64, rho: F64, pose: F64) -> F64:

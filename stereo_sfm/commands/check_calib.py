@@ -56,11 +56,13 @@ def run(args: argparse.Namespace) -> int:
         report = check(rig, rectification, windows, rolling=readout.best_s > 0)
         report = replace(report, findings=(*report.findings, _shutter(rig.shutter, readout)))
     if args.correct is not None:
-        save_rig(report.correction.apply(rig), args.correct)
+        save_rig(report.choice.apply(rig), args.correct)
     if args.json:
         print(json.dumps(as_dict(report), indent=2))
     else:
         print(as_text(report, str(args.source)))
+        if args.correct is not None:
+            print("\n".join(_written(report, args.correct)))
     return 3 if report.verdict == "FAIL" else 0
 
 
@@ -110,6 +112,14 @@ def as_text(report: CheckReport, name: str) -> str:
     return "\n".join(lines)
 
 
+def _written(report: CheckReport, path: Path) -> list[str]:
+    """What the corrected rig holds, one line a term."""
+    lines = [f"{path}: {'corrected' if report.choice.written.any() else 'as it was, nothing has the evidence'}"]
+    lines += [f"  {term.line}" for term in report.choice.terms]
+    kept = "left as they are: images alone do not prove them"
+    return [*lines, f"  focal length of both cameras, length of the baseline: {kept}"]
+
+
 def _advice(report: CheckReport) -> str:
     names = [f.name for f in report.findings if f.level == report.level]
     what = " and ".join(names)
@@ -120,6 +130,8 @@ def _advice(report: CheckReport) -> str:
 
 def as_dict(report: CheckReport) -> dict[str, Any]:
     """Plain values for `--json`."""
+    from dataclasses import asdict
+
     import numpy as np
 
     return {
@@ -130,6 +142,8 @@ def as_dict(report: CheckReport) -> dict[str, Any]:
         "region_median_px": [[None if np.isnan(v) else round(float(v), 3) for v in r] for r in report.region_median],
         "region_count": report.region_count.tolist(),
         "noise_px": report.correction.noise_px,
+        "consequences": asdict(report.consequences),
+        "terms": [asdict(term) for term in report.choice.terms],
     }
 
 

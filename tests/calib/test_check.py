@@ -12,6 +12,7 @@ import pytest
 from calib import load_rig, save_rig
 from calib.amount import FOCAL_BOTH, FOCAL_RATIO, TURN
 from calib.check import CheckReport, Finding, check
+from calib.choice import choose
 from calib.consistency import Correction, estimate
 from calib.matches import Matches
 from calib.rectification import rectify
@@ -87,7 +88,7 @@ def test_a_turned_eye_is_measured(name: str, degrees: tuple[float, float, float]
     wrong = turned(RIGS[name], degrees)
     correction = estimate(wrong, SEEN[name])
     np.testing.assert_allclose(np.rad2deg(correction.amount[TURN]), -np.array(degrees), atol=0.02)
-    mended = correction.apply(wrong)
+    mended = choose(correction.whole, correction.halves).apply(wrong)
     left = np.rad2deg(se3.log(se3.inverse(mended.left_T_right) @ RIGS[name].left_T_right)[3:])
     assert np.abs(left).max() < 0.02
 
@@ -99,7 +100,6 @@ def test_focal_errors_are_measured(name: str) -> None:
     assert 100 * one.amount[FOCAL_RATIO] == pytest.approx(-1.98, abs=0.1)
     both = estimate(magnified(rig, 0.98, 0.98), SEEN[name])
     assert 100 * both.amount[FOCAL_BOTH] == pytest.approx(2.02, abs=0.4)
-    assert both.apply(magnified(rig, 0.98, 0.98)).left.fx == pytest.approx(rig.left.fx, rel=0.004)
 
 
 def test_the_same_input_gives_the_same_bits() -> None:

@@ -1,0 +1,82 @@
+"""Which terms of a correction are written: only what is proven, twice."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib.choice import TERMS, Estimate, choose
+from calib.consequences import consequences
+from calib.consistency import estimate
+from calib.rig import Rig
+from stereo_sfm.geometry import se3
+from tests.calib.test_check import RIGS, SEEN, magnified, turned, windows
+from tests.synthetic import pinhole_rig
+
+SIGMA = np.array([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-4])
+
+
+def said(*values: float) -> Estimate:
+    return Estimate(SIGMA * np.array(values), np.diag(SIGMA**2))
+
+
+def test_a_term_needs_several_sigmas_and_both_halves() -> None:
+    halves = said(8, 3, 8, 0, 0, -9), said(12, 3, -1, 0, 0, -6)
+    choice = choose(said(10, 3, 9, 0, 0, -7), halves)
+    assert choice.written.tolist() == [True, False, False, False, False, True]
+    assert "10 sigmas" in choice.terms[0].why and "4 are needed" in choice.terms[1].why
+    assert "but the halves" in choice.terms[2].why
+    assert choice.value[1] == choice.value[2] == 0.0
+
+
+def test_without_a_second_half_nothing_is_written_and_the_rig_is_the_same() -> None:
+    choice = choose(said(10, 10, 10, 10, 10, 10), ())
+    assert not choice.written.any()
+    assert choice.apply(RIGS["pinhole"]) is RIGS["pinhole"]
+
+
+def test_terms_that_trade_with_one_that_stays_take_its_part() -> None:
+    """A turn about x and the baseline's z look alike: known together they are doubtful, each alone is certain."""
+    covariance = np.diag(SIGMA**2)
+    a, b = 0, 4
+    covariance[a, a], covariance[b, b] = 25 * SIGMA[a] ** 2, 25 * SIGMA[b] ** 2
+    covariance[a, b] = covariance[b, a] = 24.5 * SIGMA[a] * SIGMA[b]
+    value = np.zeros(TERMS)
+    value[a], value[b] = 12 * SIGMA[a], 3 * SIGMA[b]
+    both = Estimate(value, covariance)
+    choice = choose(both, (both, both))
+    assert choice.written[a] and not choice.written[b]
+    assert choice.value[a] == pytest.approx(value[a] - 24.5 / 25 * 3 * SIGMA[a])
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_a_true_rig_is_left_to_the_bit(name: str) -> None:
+    correction = estimate(RIGS[name], SEEN[name])
+    assert choose(correction.whole, correction.halves).apply(RIGS[name]) is RIGS[name]
+
+
+def test_only_the_faulty_term_is_written_and_the_common_focal_length_never() -> None:
+    wrong = turned(magnified(RIGS["pinhole"], 0.98, 0.98), (0.0, 0.2, 0.0))
+    correction = estimate(wrong, SEEN["pinhole"])
+    choice = choose(correction.whole, correction.halves)
+    assert choice.written[1] and not choice.written[0] and not choice.written[2]
+    mended = choice.apply(wrong)
+    assert mended.left.fx == wrong.left.fx and mended.baseline == pytest.approx(wrong.baseline, rel=1e-12)
+
+
+def test_a_rolling_shutter_may_pretend_what_motion_shows() -> None:
+    choice = choose(said(10, 10, 10, 10, 10, 10), (said(10, 10, 10, 10, 10, 10),) * 2, rolling=True)
+    assert choice.written.tolist() == [True, False, True, False, False, True]
+
+
+def test_consequences_of_a_disparity_error() -> None:
+    """Pinhole, fx b = 40 px m: one pixel at 2 m (disparity 20 px) is 5 %, at 20 m (2 px) it is half or double."""
+    rig = pinhole_rig()
+    angle = 1.0 / rig.left.fx
+    true = Rig(rig.left, rig.right, rig.left_T_right @ se3.exp(np.array([0, 0, 0, 0, angle, 0])))
+    found = consequences(rig, true, windows(true))
+    assert abs(found.disparity_px) == pytest.approx(1.0, rel=0.1)
+    sign = -np.sign(found.disparity_px)
+    expected = [1 / (1 - sign * d) - 1 for d in (2 / 40, 5 / 40, 20 / 40)]
+    np.testing.assert_allclose(found.depth, expected, rtol=0.2)
+    assert np.sign(found.length) == sign and 0.02 < abs(found.length) < 0.3
