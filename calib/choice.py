@@ -26,6 +26,15 @@ SIGMAS = 4.0  # of its own that a term must be away from zero
 SHARE = 0.5  # of its value that either half must show, with the same sign
 
 
+def with_terms(rig: Rig, value: F64) -> Rig:
+    """The rig with the terms (6,) added; the very same when they are zero."""
+    if not value.any():
+        return rig
+    vector = np.zeros(SHARED)
+    vector[ROTATION], vector[DIRECTION], vector[FOCAL_RIGHT] = value[:3], value[3:5], value[5]
+    return moved(rig, vector)
+
+
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """The terms as one set of matches shows them."""
@@ -78,29 +87,27 @@ class Choice:
 
     def apply(self, rig: Rig) -> Rig:
         """The corrected rig; the very same when nothing is written."""
-        if not self.written.any():
-            return rig
-        vector = np.zeros(SHARED)
-        vector[ROTATION], vector[DIRECTION], vector[FOCAL_RIGHT] = self.value[:3], self.value[3:5], self.value[5]
-        return moved(rig, vector)
+        return with_terms(rig, self.value)
 
 
-def choose(whole: Estimate, halves: Sequence[Estimate], rolling: bool = False) -> Choice:
+def choose(whole: Estimate, halves: Sequence[Estimate], rolling: bool = False, sigmas: float | F64 = SIGMAS) -> Choice:
     """Drop the weakest term that lacks evidence until all that are left have it.
 
     Args:
         whole: of all matches. halves: each of its own part of them.
+        sigmas: of its own that a term must be away from zero; one number, or (6,).
         rolling: rows are exposed one after the other, and what only motion shows is not to be believed.
     """
+    needed = np.broadcast_to(sigmas, TERMS)
     kept = ~NOT_BY_ROWS if rolling else np.ones(TERMS, bool)
     while kept.any():
         strength, agreed = _evidence(whole, halves, kept)
-        weak = kept & ((strength < SIGMAS) | ~agreed)
+        weak = kept & ((strength < needed) | ~agreed)
         if not weak.any():
             break
         kept[np.argmin(np.where(weak, strength, np.inf))] = False
     final = whole.without(kept)
-    terms = tuple(_term(i, whole, halves, kept, rolling) for i in range(TERMS))
+    terms = tuple(_term(i, whole, halves, kept, rolling, needed[i]) for i in range(TERMS))
     alone = np.array([t.sigma for t in terms]) / SCALES
     return Choice(terms, final.value, np.where(kept, final.sigma, alone), kept)
 
@@ -110,10 +117,11 @@ def _evidence(whole: Estimate, halves: Sequence[Estimate], kept: Bool) -> tuple[
     here = whole.without(kept)
     parts = np.array([half.without(kept).value for half in halves]).reshape(-1, TERMS)
     strength = np.abs(here.value) / np.maximum(here.sigma, 1e-12)
-    return strength, (parts * np.sign(here.value) >= SHARE * np.abs(here.value)).all(0) & (len(parts) > 0)
+    shown = parts * np.sign(here.value) >= SHARE * np.abs(here.value)
+    return strength, np.asarray(shown.all(0) if len(parts) else np.zeros(TERMS, bool))
 
 
-def _term(i: int, whole: Estimate, halves: Sequence[Estimate], kept: Bool, rolling: bool) -> Term:
+def _term(i: int, whole: Estimate, halves: Sequence[Estimate], kept: Bool, rolling: bool, needed: float) -> Term:
     """A term that is left out is shown as it would be if it were the next to be written."""
     with_it = kept.copy()
     with_it[i] = True
@@ -125,8 +133,8 @@ def _term(i: int, whole: Estimate, halves: Sequence[Estimate], kept: Bool, rolli
         why = f"{strength[i]:.0f} sigmas, the halves of the recording say {said}"
     elif rolling and NOT_BY_ROWS[i]:
         why = "with a rolling shutter motion may pretend it"
-    elif strength[i] < SIGMAS:
-        why = f"{strength[i]:.1f} sigmas, {SIGMAS:g} are needed"
+    elif strength[i] < needed:
+        why = f"{strength[i]:.1f} sigmas, {needed:g} are needed"
     else:
         why = f"{strength[i]:.0f} sigmas, but the halves of the recording say {said}"
     value, sigma = float(SCALES[i] * here.value[i]), float(SCALES[i] * here.sigma[i])
