@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from calib.formats.common import read_text
 from calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 
@@ -85,9 +86,11 @@ def _recognise_folder(path: Path) -> str | None:
 
 def _recognise_file(path: Path) -> str | None:
     try:
-        text = path.read_text("utf-8-sig")
+        text = read_text(path)
     except (UnicodeDecodeError, OSError):
         raise StereoSfmError(f"calibration {path} is not a text file") from None
+    except ValueError as error:
+        raise StereoSfmError(f"calibration {path}: {error}") from None
     if path.suffix == ".json" or text.lstrip().startswith(("{", "[")):
         marks = {"basalt": '"T_imu_cam"', "depthai": '"cameraData"', "opencv": '"opencv-matrix"', "foxglove": '"K"'}
     elif path.suffix == ".txt":

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.formats.common import brown, numbers, padded, reading, unsupported
+from calib.formats.common import brown, numbers, padded, read_text, reading, unsupported
 from calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
@@ -93,9 +93,7 @@ def write_colmap(rig: Rig, folder: Path) -> None:
 
 
 def _lines(path: Path) -> list[list[str]]:
-    return [
-        line.split() for line in path.read_text("utf-8-sig").splitlines() if line.strip() and not line.startswith("#")
-    ]
+    return [line.split() for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
 
 
 def _rig(path: Path) -> tuple[int, int, F64]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +15,9 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, Pinhole, RadTan
 from stereo_sfm.types import F64
+
+MOST_BYTES = 4 << 20  # of a calibration file
+MOST_YAML = 512 << 10  # characters of one in YAML
 
 
 @contextmanager
@@ -27,26 +31,43 @@ def reading(path: Path | str, dialect: str) -> Generator[None]:
         raise StereoSfmError(f"no {dialect} calibration: {error.filename or path} does not exist") from None
     except KeyError as error:
         raise StereoSfmError(f"{dialect} calibration {path}: key {error.args[0]!r} is missing") from None
-    except (ValueError, TypeError, IndexError, AttributeError, OSError) as error:
+    except (ValueError, TypeError, IndexError, ArithmeticError, AttributeError, RecursionError, OSError) as error:
         first_line = (str(error).strip() or type(error).__name__).splitlines()[0]
         raise StereoSfmError(f"{dialect} calibration {path} is malformed: {first_line}") from None
 
 
+def read_text(path: Path) -> str:
+    """A calibration file's text.
+
+    Raises:
+        ValueError: larger than any calibration, or not text.
+    """
+    with path.open("rb") as file:
+        raw = file.read(MOST_BYTES + 1)
+    if len(raw) > MOST_BYTES:
+        raise ValueError(f"more than {MOST_BYTES >> 20} MiB are no calibration")
+    return raw.decode("utf-8-sig")
+
+
 def read_yaml(path: Path) -> dict[str, Any]:
     """`yaml_mapping` of a file."""
-    return yaml_mapping(path.read_text("utf-8-sig"))
+    return yaml_mapping(read_text(path))
 
 
 def yaml_mapping(text: str) -> dict[str, Any]:
-    """Keys and values of a YAML text.
+    """Keys and values of a YAML text; OpenCV's header `%YAML:1.0` and its matrices are understood.
 
     Raises:
-        ValueError: the text is not YAML, or not a mapping.
+        ValueError: the text is not YAML, not a mapping, or stands for more values than a calibration has.
     """
     import yaml
 
+    from calib.formats.yaml_loader import CalibrationLoader
+
+    if len(text) > MOST_YAML:
+        raise ValueError(f"more than {MOST_YAML >> 10} KiB are no calibration")
     try:
-        data = yaml.safe_load(text)
+        data = yaml.load(re.sub(r"\A\s*%YAML:[0-9.]+[^\n]*\n", "", text), CalibrationLoader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         raise ValueError(f"not YAML{f' (line {mark.line + 1})' if mark else ''}") from None
@@ -56,8 +77,15 @@ def yaml_mapping(text: str) -> dict[str, Any]:
 
 
 def read_json(path: Path) -> Any:
-    """Any JSON value; malformed text raises ValueError."""
-    return json.loads(path.read_text("utf-8-sig"))
+    """Any JSON value.
+
+    Raises:
+        ValueError: malformed, or nested too deeply.
+    """
+    try:
+        return json.loads(read_text(path))
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
 
 
 def write_yaml(path: Path, data: dict[str, Any]) -> None:

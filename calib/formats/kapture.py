@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.formats.colmap import colmap_camera, colmap_params
-from calib.formats.common import numbers, reading
+from calib.formats.common import numbers, read_text, reading
 from calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
@@ -80,7 +80,7 @@ def write_kapture(rig: Rig, folder: Path) -> None:
 
 
 def _lines(path: Path) -> list[list[str]]:
-    text = path.read_text("utf-8-sig").splitlines()
+    text = read_text(path).splitlines()
     return [[f.strip() for f in line.split(",")] for line in text if line.strip() and not line.startswith("#")]
 
 

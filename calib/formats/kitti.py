@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.formats.common import numbers, reading, stereo_only
+from calib.formats.common import numbers, read_text, reading, stereo_only
 from calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
@@ -60,7 +60,7 @@ def write_kitti(rig: Rig, path: Path) -> None:
 
 def _entries(path: Path) -> dict[str, list[float]]:
     out: dict[str, list[float]] = {}
-    for line in path.read_text("utf-8-sig").splitlines():
+    for line in read_text(path).splitlines():
         key, colon, values = line.partition(":")
         if colon:
             try:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from calib.formats.common import numbers, reading, rigid, rows, yaml_mapping, yaml_text
+from calib.formats.common import numbers, read_text, reading, rigid, rows, yaml_mapping, yaml_text
 from calib.rig import Rig
 from stereo_sfm.geometry.cameras import MODELS, Camera
 
@@ -15,7 +15,7 @@ KEY = "stereo_sfm_rig"
 def read_native(path: Path) -> Rig:
     """`rig.yaml` as `write_native` makes it."""
     with reading(path, "rig"):
-        text = path.read_text("utf-8-sig")
+        text = read_text(path)
     return rig_from_text(text, path)
 
 

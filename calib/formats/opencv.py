@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from calib.formats.common import brown, exact_rotation, numbers, padded, reading, unsupported
+from calib.formats.file_storage import matrix, read_storage
 from calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, KannalaBrandt
@@ -81,36 +82,21 @@ def _model(camera: Camera) -> str:
 
 
 def _matrices(path: Path) -> dict[str, Any]:
-    """Arrays under our names, `size` and `model` where the file has them."""
-    import cv2
-
-    if not path.is_file():
-        raise FileNotFoundError(2, "no such file", str(path))
-    try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-    except cv2.error as error:
-        raise ValueError(str(error.err or "not a FileStorage")) from None
-    if not storage.isOpened() or not storage.root().isMap():
-        raise ValueError("not an OpenCV FileStorage")
+    """Numbers under our names, `size` and `model` where the file has them."""
+    storage = read_storage(path)
     data: dict[str, Any] = {}
     for ours, names in _NAMES.items():
-        node = next((n for n in map(storage.getNode, names) if n.isMap()), None)
-        if node is not None:
-            data[ours] = np.asarray(node.mat(), float).ravel()
-    width, height = storage.getNode("image_width"), storage.getNode("image_height")
-    sizes = [storage.getNode(n) for n in ("image_size", "imageSize", "size")]
-    if not width.empty() and not height.empty():
-        data["size"] = [width.real(), height.real()]
-    else:
-        listed = next((n for n in sizes if n.isSeq() and n.size() == 2), None)
-        if listed is not None:
-            data["size"] = [listed.at(0).real(), listed.at(1).real()]
-    model = storage.getNode("distortion_model")
-    if model.isString():
-        data["model"] = model.string()
-    if "R" in data and len(data["R"]) == 3:
-        data["R"] = cv2.Rodrigues(np.asarray(data["R"]))[0].ravel()
-    storage.release()
+        found = next((m for m in map(matrix, map(storage.get, names)) if m is not None), None)
+        if found is not None:
+            data[ours] = found
+    sizes = [[storage.get("image_width"), storage.get("image_height")]]
+    sizes += [storage.get(name) for name in ("image_size", "imageSize", "size")]
+    size = next((s for s in sizes if isinstance(s, list) and len(s) == 2 and None not in s), None)
+    if size is not None:
+        data["size"] = numbers(size, 2)
+    data["model"] = storage.get("distortion_model")
+    if len(data.get("R", [])) == 3:
+        data["R"] = se3.so3_exp(np.array(data["R"])).ravel()
     return data
 
 

@@ -292,3 +292,48 @@ def test_scaled_rotation_is_refused(tmp_path: Path) -> None:
     (tmp_path / "camchain.yaml").write_text(yaml.safe_dump(data))
     with pytest.raises(StereoSfmError, match="not orthonormal"):
         load_rig(tmp_path / "camchain.yaml")
+
+
+def test_euroc_files_with_opencvs_header_and_matrices(tmp_path: Path) -> None:
+    """As Kimera-VIO's copy of EuRoC has them."""
+    save_rig(RADTAN, tmp_path, "euroc")
+    for path in tmp_path.rglob("sensor.yaml"):
+        path.write_text("%YAML:1.0\n" + path.read_text().replace("T_BS:", "T_BS: !!opencv-matrix"))
+    assert "opencv-matrix" in (tmp_path / "cam0" / "sensor.yaml").read_text()
+    same_rig(RADTAN, load_rig(tmp_path), 1e-12, body=True)
+
+
+def test_the_three_forms_of_opencvs_files(tmp_path: Path) -> None:
+    """What OpenCV itself writes is what is read, whichever form it has."""
+    for name in ("stereo.yml", "stereo.xml", "stereo.json"):
+        save_rig(RADTAN, tmp_path / name, "opencv")
+        same_rig(RADTAN, read_opencv(tmp_path / name), 1e-12, body=False)
+
+
+ALIASES = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n" for a, b in zip("abcdefghijklm", "bcdefghijklmn", strict=True)
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("rig.yaml", f"stereo_sfm_rig: 1\n{ALIASES}left: *n\n", "more values than any calibration"),
+        ("rig.yaml", "stereo_sfm_rig: 1\nleft: " + "[" * 10_000, "nested too deeply"),
+        ("rig.yaml", "stereo_sfm_rig: 1\nleft: &a {model: *a}\n", "holds itself"),
+        ("rig.yaml", "stereo_sfm_rig: 1\nleft: 1" + ":1" * 50_000, "100001 characters"),
+        ("rig.yaml", "stereo_sfm_rig: 1\n#" + "x" * (1 << 20), "no calibration"),
+        ("rig.yaml", "stereo_sfm_rig: 1\n#" + "x" * (5 << 20), "no calibration"),
+        ("basalt.json", '{"T_imu_cam": ' + "[" * 100_000, "nested too deeply"),
+        (
+            "stereo.yml",
+            "%YAML:1.0\nM1: !!opencv-matrix\n  rows: 90000\n  cols: 90000\n  dt: d\n  data: [1]",
+            "expected",
+        ),
+    ],
+)
+def test_texts_that_stand_for_more_than_a_calibration(tmp_path: Path, name: str, content: str, says: str) -> None:
+    (tmp_path / name).write_text(content)
+    with pytest.raises(StereoSfmError, match=says) as error:
+        load_rig(tmp_path / name)
+    assert "\n" not in str(error.value)

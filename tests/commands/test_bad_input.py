@@ -116,7 +116,9 @@ def test_unreadable_image_is_a_warning_and_a_dropped_frame(cli: Run, tmp_path: P
     root = make_kitti(tmp_path / "data", frames=5)
     (root / "sequences" / "00" / "image_0" / "000002.png").write_bytes(b"GIF89a")
     _, out, err = cli("run", root, "-o", "out", "--max-lost", 101)
-    assert "warning: kitti:00: cannot read" in err and "000002.png, frame 2 is dropped" in err
+    assert (
+        "warning: kitti:00: cannot read" in err and "000002.png (a compressed image cannot be decoded), frame 2" in err
+    )
     assert "/5 frames (1 dropped by capture)" in out
 
 

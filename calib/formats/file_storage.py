@@ -1,0 +1,65 @@
+"""OpenCV's FileStorage in its three forms (YAML, XML, JSON) as plain values.
+
+Read here and not by OpenCV, which allocates a matrix by the rows and columns that the text states.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from calib.formats.common import MOST_YAML, numbers, read_json, read_text, yaml_mapping
+
+Storage = dict[str, Any]  # a matrix is a mapping with rows, cols, dt and data
+
+
+def read_storage(path: Path) -> Storage:
+    """The top-level values of a file.
+
+    Raises:
+        ValueError: not a FileStorage.
+    """
+    text = read_text(path)
+    if text.lstrip().startswith("<"):
+        return _from_xml(text)
+    data = read_json(path) if text.lstrip().startswith("{") else yaml_mapping(text)
+    if not isinstance(data, dict):
+        raise ValueError("not an OpenCV FileStorage")
+    return data
+
+
+def _from_xml(text: str) -> Storage:
+    if len(text) > MOST_YAML:
+        raise ValueError(f"more than {MOST_YAML >> 10} KiB are no calibration")
+    try:
+        root = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise ValueError(f"not XML ({error})") from None
+    if root.tag != "opencv_storage":
+        raise ValueError("not an OpenCV FileStorage")
+    return {child.tag: _xml_value(child) for child in root}
+
+
+def _xml_value(element: ElementTree.Element) -> Any:
+    """Children by name as text; text without children as one word or a list of words."""
+    if len(element):
+        return {child.tag: _words(child.text) for child in element}
+    return _words(element.text)
+
+
+def _words(text: str | None) -> str | list[str]:
+    words = [word.strip('"') for word in (text or "").split()]
+    return words[0] if len(words) == 1 else words
+
+
+def matrix(value: Any) -> list[float] | None:
+    """The numbers of a matrix row by row; None for what is no matrix.
+
+    Raises:
+        ValueError: it holds fewer or more numbers than its rows and columns.
+    """
+    if not isinstance(value, dict) or "data" not in value:
+        return None
+    shape = numbers([value.get("rows", 0), value.get("cols", 0)], 2)
+    return numbers(value["data"], round(shape[0] * shape[1]))
