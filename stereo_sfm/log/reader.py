@@ -14,12 +14,14 @@ from typing import IO, Any, Self
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
-from mcap.records import Attachment, Channel, Schema, Statistics
+from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Message, Schema, Statistics
 from mcap.summary import Summary
 
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.log import scan
+from stereo_sfm.log import chunks, scan
+from stereo_sfm.log.chunks import PREFIX
 from stereo_sfm.log.index import tail
 from stereo_sfm.types import I64
 
@@ -109,7 +111,7 @@ class LogReader:
             summary = reader.get_summary()
             if summary is not None and index_is_whole and _complete(summary):
                 return reader, summary
-        except (*scan.DAMAGE, OSError, StopIteration):  # OSError: the file is shorter than its footer
+        except (*chunks.DAMAGE, OSError, StopIteration):  # OSError: the file is shorter than its footer
             pass
         index = scan.build_index(self._stream)
         if not index.closed:
@@ -166,12 +168,40 @@ class LogReader:
         Raises:
             StereoSfmError: a damaged chunk in a file that was closed.
         """
-        found = self._reader.iter_messages(None if topics is None else list(topics), starting_at=start, ending_at=until)
+        channels = {i: c for i, c in self.summary.channels.items() if topics is None or c.topic in topics}
         try:
-            for schema, channel, m in found:
+            for m in self._found(channels, start, until):
+                channel = channels[m.channel_id]
+                schema = self.summary.schemas[channel.schema_id] if channel.schema_id else None
                 yield Record(channel.topic, channel, schema, m.log_time, m.publish_time, m.sequence, m.data)
-        except scan.DAMAGE as error:
+        except chunks.DAMAGE as error:
             raise self._damaged(error) from None
+
+    def _found(self, wanted: Collection[int], start: int | None, until: int | None) -> Iterator[Message]:
+        if self.summary.chunk_indexes:
+            return chunks.in_order(self.summary.chunk_indexes, self._chunk, wanted, start, until)
+        inside = [m for m in scan.loose(self._stream) if m.channel_id in wanted]
+        inside = [
+            m for m in inside if (start is None or m.log_time >= start) and (until is None or m.log_time <= until)
+        ]
+        return iter(sorted(inside, key=lambda m: m.log_time))
+
+    def _chunk(self, index: ChunkIndex) -> Chunk:
+        raw = self._read(index.chunk_start_offset, index.chunk_length)
+        if raw[:1] != bytes([Opcode.CHUNK]):
+            raise ValueError("its index points to something else than a chunk")
+        return Chunk.read(ReadDataStream(io.BytesIO(raw[PREFIX:])))
+
+    def _read(self, offset: int, length: int) -> bytes:
+        """Bytes of the file.
+
+        Raises:
+            ValueError: it is not that long.
+        """
+        if not 0 <= offset <= offset + length <= self._bytes.seek(0, io.SEEK_END):
+            raise ValueError("its index points behind the end")
+        self._bytes.seek(offset)
+        return self._bytes.read(length)
 
     def _damaged(self, error: BaseException) -> StereoSfmError:
         said = str(error) or type(error).__name__
@@ -190,13 +220,13 @@ class LogReader:
 
     def _indexed_times(self, topic: str) -> list[I64] | None:
         """Log times of each channel of a topic in file order, None where the file has no index of its messages."""
-        chunks = self.summary.chunk_indexes
-        if not chunks or any(not c.message_index_offsets for c in chunks):
+        indexes = self.summary.chunk_indexes
+        if not indexes or any(not c.message_index_offsets for c in indexes):
             return None
         if self._times is None:
             try:
                 self._times = self._read_message_indexes()
-            except scan.DAMAGE as error:
+            except chunks.DAMAGE as error:
                 raise self._damaged(error) from None
         ids = [c.id for c in self.summary.channels.values() if c.topic == topic]
         return [self._times[i] for i in ids if i in self._times]
@@ -205,14 +235,13 @@ class LogReader:
         """Log times per channel. Behind each chunk lies a record per channel: opcode, length, channel, size, pairs."""
         found: dict[int, list[I64]] = {}
         for chunk in self.summary.chunk_indexes:
-            self._bytes.seek(chunk.chunk_start_offset + chunk.chunk_length)
-            data = self._bytes.read(chunk.message_index_length)
+            data = self._read(chunk.chunk_start_offset + chunk.chunk_length, chunk.message_index_length)
             at = 0
             while at < len(data):
                 _, length, channel_id, size = struct.unpack_from("<BQHI", data, at)
                 pairs = np.frombuffer(data, "<u8", size // 8, at + struct.calcsize("<BQHI"))
                 found.setdefault(channel_id, []).append(pairs[::2].astype(np.int64))
-                at += scan.PREFIX + length
+                at += PREFIX + length
         return {channel_id: np.concatenate(parts) for channel_id, parts in found.items()}
 
     def attachment(self, name: str) -> bytes | None:
@@ -220,14 +249,13 @@ class LogReader:
         for entry in self.summary.attachment_indexes:
             if entry.name != name:
                 continue
-            self._bytes.seek(entry.offset)
-            raw: bytes = self._bytes.read(entry.length)
             try:
+                raw = self._read(entry.offset, entry.length)
                 crc = struct.unpack("<I", raw[-4:])[0]
-                if crc and crc != zlib.crc32(raw[scan.PREFIX : -4]):
+                if crc and crc != zlib.crc32(raw[PREFIX:-4]):
                     raise ValueError("its checksum is wrong")
-                return Attachment.read(ReadDataStream(io.BytesIO(raw[scan.PREFIX :]))).data
-            except scan.DAMAGE as error:
+                return Attachment.read(ReadDataStream(io.BytesIO(raw[PREFIX:]))).data
+            except chunks.DAMAGE as error:
                 log.warning("%s: the attached %s is damaged (%s) and left out", self.path, name, error)
         return None
 
@@ -238,7 +266,7 @@ class LogReader:
             for record in self._reader.iter_metadata():
                 if record.name == name:
                     out.update(record.metadata)
-        except scan.DAMAGE as error:
+        except chunks.DAMAGE as error:
             log.warning("%s: metadata is damaged (%s) and left out", self.path, error)
         return out
 

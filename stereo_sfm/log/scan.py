@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import IO
 
 from mcap.data_stream import ReadDataStream, RecordBuilder
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import SeekingReader
 from mcap.records import (
@@ -28,27 +27,22 @@ from mcap.records import (
     MetadataIndex,
     Schema,
 )
-from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC
-from zstandard import ZstdError
 
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.log.chunks import DAMAGE, PREFIX, records
 from stereo_sfm.log.index import Index, Span
 
-PREFIX = 9  # opcode and length
 FOOTER_SIZE = PREFIX + 20
 _LAST_OPCODE = 0x0F
-# What broken bytes raise inside the library's parsers.
-DAMAGE = (
-    McapError,
-    ZstdError,
-    RuntimeError,  # lz4
-    ValueError,
-    struct.error,
-    EOFError,
-    KeyError,
-    MemoryError,
-    OverflowError,
+_OF_A_SUMMARY = (
+    Opcode.SCHEMA,
+    Opcode.CHANNEL,
+    Opcode.CHUNK_INDEX,
+    Opcode.ATTACHMENT_INDEX,
+    Opcode.METADATA_INDEX,
+    Opcode.STATISTICS,
+    Opcode.SUMMARY_OFFSET,
 )
 
 
@@ -111,15 +105,11 @@ def _mend_last_message_index(index: Index, stream: IO[bytes]) -> None:
         return  # something else was written behind it
     span = Span(Opcode.CHUNK, chunk.chunk_start_offset, chunk.chunk_length)
     builder = RecordBuilder()
-    offset = 0
     tables: dict[int, MessageIndex] = {}
-    for record in breakup_chunk(Chunk.read(_content(stream, span))):
+    for offset, record in records(Chunk.read(_content(stream, span))):
         if isinstance(record, Message):
             table = tables.setdefault(record.channel_id, MessageIndex(channel_id=record.channel_id, records=[]))
             table.records.append((record.log_time, offset))
-        single = RecordBuilder()
-        record.write(single)
-        offset += single.count
     chunk.message_index_offsets.clear()
     for channel_id, table in tables.items():
         chunk.message_index_offsets[channel_id] = chunk_end + builder.count
@@ -155,8 +145,19 @@ def summary_is_whole(stream: IO[bytes]) -> bool:
     opcode, length, start, _, crc = struct.unpack("<BQQQI", footer)
     if opcode != Opcode.FOOTER or length != FOOTER_SIZE - PREFIX or not 0 <= start <= footer_at:
         return False
+    if start and any(span.opcode not in _OF_A_SUMMARY for span in spans(stream, start) if span.end <= footer_at):
+        return False
     stream.seek(start)
     return crc == 0 or start == 0 or zlib.crc32(footer[:-4], zlib.crc32(stream.read(footer_at - start))) == crc
+
+
+def loose(stream: IO[bytes]) -> Iterator[Message]:
+    """Messages outside chunks in the order of the file."""
+    for span in spans(stream):
+        if span.opcode in (Opcode.DATA_END, Opcode.FOOTER):
+            return
+        if span.opcode == Opcode.MESSAGE:
+            yield Message.read(_content(stream, span), span.length - PREFIX)
 
 
 def _ends_well(stream: IO[bytes]) -> bool:
@@ -189,7 +190,7 @@ def _add_record(index: Index, stream: IO[bytes], span: Span) -> None:
 
 def _add_chunk(index: Index, chunk: Chunk, span: Span) -> None:
     counts: dict[int, int] = {}
-    for record in breakup_chunk(chunk, validate_crc=True):
+    for _, record in records(chunk):
         if isinstance(record, Schema):
             index.schemas[record.id] = record
         elif isinstance(record, Channel):
