@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -86,7 +86,14 @@ class FolderSource(BaseSource):
         shots: Sequence[Shot],
         ground_truth: Trajectory | None = None,
         depth_scale: float = 5000.0,
+        beside: Mapping[str, I64] | None = None,
     ) -> None:
+        """Args:
+        name: for people. rig: calibration of the images. shots: in any order.
+        ground_truth: world_T_cam0.
+        depth_scale: stored units of a depth image a metre.
+        beside: stamps in ns of what else was recorded and is not part of the frames, by name.
+        """
         if not shots:
             raise StereoSfmError(f"{name}: no images")
         self.name = name
@@ -94,6 +101,7 @@ class FolderSource(BaseSource):
         self.ground_truth = ground_truth
         self.shots = sorted(shots, key=lambda shot: shot.stamp_ns)
         self.depth_scale = depth_scale
+        self.beside = dict(beside or {})
         self.frame_count = len(self.shots)
         self.bits = self._sensor_bits()
         self._check_first()

@@ -14,6 +14,7 @@ from stereo_sfm.types import F64, I64, Trajectory
 # Where the quaternion's x y z w stand in a row after the stamp and the position.
 _XYZW = (0, 1, 2, 3)
 _WXYZ = (1, 2, 3, 0)
+POSITION = 4  # fields of a row that holds a stamp and a position alone
 
 
 def stamp_from_seconds(text: str) -> int:
@@ -31,8 +32,11 @@ def stamp_from_seconds(text: str) -> int:
     return stamp_ns
 
 
-def _rows(path: Path, least: int) -> list[list[str]]:
-    """Rows of a text table, commas or blanks between the fields, without comments and headings."""
+def _rows(path: Path, least: int, alone: bool = False) -> list[list[str]]:
+    """Rows of a text table, commas or blanks between the fields, without comments and headings.
+
+    `alone`: a stamp and a position without a quaternion will do, if all rows are such.
+    """
     try:
         lines = path.read_text("utf-8-sig").splitlines()
     except FileNotFoundError:
@@ -44,9 +48,11 @@ def _rows(path: Path, least: int) -> list[list[str]]:
         fields = line.replace(",", " ").split()
         if not fields or line.lstrip().startswith("#") or (number == 1 and fields[0][0].isalpha()):
             continue
+        if alone and not rows and len(fields) == POSITION:
+            least = POSITION
         if len(fields) < least:
             raise StereoSfmError(f"{path} line {number}: {len(fields)} fields where at least {least} are needed")
-        rows.append(fields)
+        rows.append(fields[:POSITION] if least == POSITION else fields)
     if not rows:
         raise StereoSfmError(f"{path} holds no poses")
     return rows
@@ -57,20 +63,29 @@ def _trajectory(path: Path, stamps: list[int], values: list[list[str]], order: t
         table = np.array(values, float)
     except ValueError as error:
         raise StereoSfmError(f"{path}: {error}") from None
-    keep = np.isfinite(table).all(axis=1) & (np.linalg.norm(table[:, 3:], axis=1) > 0.5)
+    oriented = table.shape[1] == 7 and not _never_turns(table[:, 3:][:, list(order)])
+    keep = np.isfinite(table).all(axis=1)
+    if oriented:
+        keep &= np.linalg.norm(table[:, 3:], axis=1) > 0.5
     if not keep.any():
         raise StereoSfmError(f"{path} holds no finite pose")
     stamp_ns: I64 = np.array(stamps, np.int64)[keep]
     table = table[keep]
     ascending, first = np.unique(stamp_ns, return_index=True)
-    quaternion = table[first, 3:][:, list(order)]
-    poses = se3.from_rotation_translation(se3.rotation_from_quaternion(quaternion), table[first, :3])
-    return Trajectory(ascending, poses)
+    rotation = np.broadcast_to(np.eye(3), (len(first), 3, 3))
+    if oriented:
+        rotation = se3.rotation_from_quaternion(table[first, 3:][:, list(order)])
+    return Trajectory(ascending, se3.from_rotation_translation(rotation, table[first, :3]), oriented)
+
+
+def _never_turns(xyzw: F64) -> bool:
+    """Whether quaternions (N, 4) are what writes a file of positions in a form with orientations: all 0, or all 1."""
+    return len(xyzw) > 1 and bool((xyzw[:, :3] == 0).all() and (xyzw[:, 3] == xyzw[0, 3]).all())
 
 
 def read_tum(path: Path) -> Trajectory:
-    """`t tx ty tz qx qy qz qw`, seconds and metres."""
-    rows = _rows(path, 8)
+    """`t tx ty tz qx qy qz qw`, seconds and metres; without a quaternion only positions."""
+    rows = _rows(path, 8, alone=True)
     try:
         stamps = [stamp_from_seconds(r[0]) for r in rows]
     except ValueError as error:
@@ -79,8 +94,11 @@ def read_tum(path: Path) -> Trajectory:
 
 
 def read_euroc(path: Path) -> Trajectory:
-    """`t_ns, x, y, z, qw, qx, qy, qz, ...`: `state_groundtruth_estimate0`, `mocap0`, `vicon0` (the sensor's poses)."""
-    rows = _rows(path, 8)
+    """`t_ns, x, y, z, qw, qx, qy, qz, ...`: `state_groundtruth_estimate0`, `mocap0`, `vicon0` (the sensor's poses).
+
+    Without a quaternion, as in `leica0`, only positions.
+    """
+    rows = _rows(path, 8, alone=True)
     try:
         stamps = [int(r[0]) for r in rows]
     except ValueError as error:
@@ -111,7 +129,7 @@ def read_kitti(path: Path, stamp_ns: I64 | None = None) -> Trajectory:
 
 def has_stamps(path: Path | str) -> bool:
     """Whether the lines of a trajectory file say their time: KITTI's do not."""
-    return len(_rows(Path(path).expanduser(), 8)[0]) != 12
+    return len(_rows(Path(path).expanduser(), 8, alone=True)[0]) != 12
 
 
 def read_trajectory(path: Path | str) -> Trajectory:
@@ -123,10 +141,10 @@ def read_trajectory(path: Path | str) -> Trajectory:
     path = Path(path).expanduser()
     if not has_stamps(path):
         return read_kitti(path)
-    first = _rows(path, 8)[0]
+    first = _rows(path, 8, alone=True)[0]
     return read_euroc(path) if first[0].isdigit() and len(first[0]) >= 15 else read_tum(path)
 
 
 def moved(trajectory: Trajectory, a_T_b: F64) -> Trajectory:
     """world_T_a -> world_T_b by the constant (4, 4) `a_T_b` between two points of one rigid body."""
-    return Trajectory(trajectory.stamp_ns.copy(), trajectory.poses @ a_T_b)
+    return Trajectory(trajectory.stamp_ns.copy(), trajectory.poses @ a_T_b, trajectory.oriented)

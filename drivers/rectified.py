@@ -42,7 +42,7 @@ class RectifiedSource(WrappedSource):
         truth = self.source.ground_truth
         if truth is None:
             return None
-        return Trajectory(truth.stamp_ns.copy(), truth.poses @ self.rectification.cam_T_rect)
+        return Trajectory(truth.stamp_ns.copy(), truth.poses @ self.rectification.cam_T_rect, truth.oriented)
 
     def __enter__(self) -> Self:
         super().__enter__()

@@ -231,6 +231,7 @@ class Trajectory(Message):
 
     stamp_ns: I64  # (N,) ascending
     poses: F64  # (N, 4, 4) world_T_cam, or world_T_body where the name says so
+    oriented: bool = True  # False: only the positions are known, the rotations mean nothing
 
     def __len__(self) -> int:
         return len(self.stamp_ns)

@@ -11,6 +11,8 @@ import csv
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from calib.formats.euroc import read_euroc as read_rig
 from calib.formats.kalibr import read_kalibr
 from calib.rig import Rig
@@ -20,7 +22,7 @@ from drivers.image_lists import Listing, pair_listings
 from drivers.options import SourceOptions
 from drivers.rig_option import chosen_rig
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.types import Trajectory
+from stereo_sfm.types import I64, Trajectory
 
 TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
 
@@ -59,7 +61,7 @@ def _open(name: str, mav: Path, rig: Rig) -> FolderSource:
         right = _read_listing(need(mav / "cam1", "second camera"))
         pairs = pair_listings(name, left, right)
         shots = [replace(shots[i], right=right[j][1], right_stamp_ns=right[j][0]) for i, j in pairs]
-    return FolderSource(name, rig, shots, _ground_truth(mav, rig))
+    return FolderSource(name, rig, shots, _ground_truth(mav, rig), beside=_inertial(mav))
 
 
 def _read_listing(camera: Path) -> Listing:
@@ -75,6 +77,16 @@ def _read_listing(camera: Path) -> Listing:
             except (ValueError, IndexError):
                 raise StereoSfmError(f"{path} line {number} is not 'stamp_ns,file'") from None
     return images
+
+
+def _inertial(mav: Path) -> dict[str, I64]:
+    """Stamps of the inertial samples, which the frames do not carry."""
+    path = mav / "imu0" / "data.csv"
+    if not path.is_file():
+        return {}
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        stamps = [row[0].strip() for row in csv.reader(file) if row]
+    return {"imu0": np.array([int(s) for s in stamps if s.isdecimal() and int(s) < 1 << 63], np.int64)}
 
 
 def _read_exposures(path: Path) -> dict[str, float]:

@@ -159,7 +159,7 @@ def _in_cam0(bodies: Trajectory, path: Path) -> Trajectory:
     if not (path.parent / "rig.yaml").is_file():
         raise StereoSfmError(f"{path} holds poses of the body, and no rig.yaml beside it leads to cam0")
     body_T_cam = load_rig(path.parent / "rig.yaml").body_T_left
-    return Trajectory(bodies.stamp_ns.copy(), se3.inverse(body_T_cam) @ bodies.poses @ body_T_cam)
+    return Trajectory(bodies.stamp_ns.copy(), se3.inverse(body_T_cam) @ bodies.poses @ body_T_cam, bodies.oriented)
 
 
 def _plot(folder: Path, name: str, result: Evaluation) -> None:

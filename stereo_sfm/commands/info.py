@@ -19,6 +19,7 @@ _SHOWN = ("images", "dropped", "max_skew_ns")  # totals that the line about the 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
     parser.add_argument("path", type=Path, help="an .mcap file or a dataset folder")
+    parser.add_argument("--rig", type=Path, help="calibration instead of the recording's own")
     parser.add_argument("--json", action="store_true", help="for machines")
 
 
@@ -29,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
     path: Path = args.path.expanduser()
     if not path.exists():
         raise StereoSfmError(f"no such file or folder: {path}")
-    found = describe_folder(path) if path.is_dir() else describe_file(path)
+    found = describe_folder(path, args.rig) if path.is_dir() else describe_file(path, args.rig)
     print(found.as_json() if args.json else "\n".join(_lines(found)))
     return 0
 

@@ -24,7 +24,7 @@ class Alignment:
         """The trajectory in the reference's frame and scale."""
         poses = trajectory.poses.copy()
         poses[:, :3, 3] *= self.scale
-        return Trajectory(trajectory.stamp_ns.copy(), self.transform @ poses)
+        return Trajectory(trajectory.stamp_ns.copy(), self.transform @ poses, trajectory.oriented)
 
 
 def align(estimate: Trajectory, reference: Trajectory, mode: str = "se3") -> Alignment:
@@ -40,6 +40,8 @@ def align(estimate: Trajectory, reference: Trajectory, mode: str = "se3") -> Ali
     """
     if mode == "none":
         return Alignment(np.eye(4), 1.0)
+    if mode == "origin" and not (estimate.oriented and reference.oriented):
+        raise StereoSfmError("positions without orientations have no first pose to align: try --align se3")
     if mode == "origin":
         return Alignment(reference.poses[0] @ se3.inverse(estimate.poses[0]), 1.0)
     if mode not in MODES:

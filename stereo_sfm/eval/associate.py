@@ -65,7 +65,10 @@ def associate(
             f"no stamps in common: the estimate covers {_span(estimate)}, the reference {_span(reference)} (seconds)"
         )
     stamps = estimate.stamp_ns[kept]
-    return Trajectory(stamps, estimate.poses[kept]), Trajectory(stamps.copy(), poses)
+    return (
+        Trajectory(stamps, estimate.poses[kept], estimate.oriented),
+        Trajectory(stamps.copy(), poses, reference.oriented),
+    )
 
 
 def _nearest(stamps: I64, wanted: I64) -> I64:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -37,6 +37,7 @@ class Evaluation:
     rpe_delta: str
     drift: Drift | None
     retail: RetailErrors | None
+    oriented: bool  # False: one of the two holds positions only, every rotation error is NaN
     estimate: Trajectory  # aligned, at the associated stamps
     reference: Trajectory
 
@@ -82,12 +83,18 @@ def evaluate(
     estimate, reference = associate(estimate, reference, interpolate, max_difference_ns)
     alignment = align(estimate, reference, mode)
     pairs = _pairs(reference.poses, delta)
-    rpe_m, rpe_rad = metrics.relative_errors(estimate.poses, reference.poses, pairs)
-    drift = metrics.kitti_drift(estimate.poses, reference.poses)
-    retail = metrics.retail_errors(estimate.poses, reference.poses)
-    sim3_ate, sim3_scale = _sim3(estimate, reference)
     aligned = alignment.apply(estimate)
+    oriented = estimate.oriented and reference.oriented
+    # Motions are compared in the body's axes; where those are unknown, in the reference's, after alignment.
+    moving, still = (estimate.poses, reference.poses) if oriented else (_positions(aligned), _positions(reference))
+    rpe_m, rpe_rad = metrics.relative_errors(moving, still, pairs)
+    drift = metrics.kitti_drift(moving, still)
+    retail = metrics.retail_errors(moving, still) if oriented else None
+    sim3_ate, sim3_scale = _sim3(estimate, reference)
     ape_m, ape_rad = metrics.absolute_errors(aligned.poses, reference.poses)
+    if not oriented:
+        ape_rad, rpe_rad = np.full_like(ape_rad, math.nan), np.full_like(rpe_rad, math.nan)
+        drift = None if drift is None else replace(drift, rotation_deg_per_m=math.nan)
     ape = Statistics.of(ape_m)
     length = reference.length
     return Evaluation(
@@ -105,9 +112,17 @@ def evaluate(
         rpe_delta=delta,
         drift=drift,
         retail=retail,
+        oriented=oriented,
         estimate=aligned,
         reference=reference,
     )
+
+
+def _positions(trajectory: Trajectory) -> F64:
+    """(N, 4, 4) poses that do not turn."""
+    poses = np.tile(np.eye(4), (len(trajectory), 1, 1))
+    poses[:, :3, 3] = trajectory.positions
+    return poses
 
 
 def _sim3(estimate: Trajectory, reference: Trajectory) -> tuple[float, float]:
@@ -141,12 +156,12 @@ def _leaning(result: Evaluation) -> str:
 
 def table(result: Evaluation) -> list[tuple[str, str]]:
     """What is said, line by line, as (name, value with unit)."""
-    ape, angle = result.ape_m, result.ape_deg
+    ape = result.ape_m
     rows = [
         ("compared", f"{result.frames} frames over {length(result.length_m)}, alignment {result.mode}"),
         ("ATE", f"{length(ape.rmse)} rmse, {length(ape.max)} max ({result.ate_percent:.3f} % of the path)"),
         ("ATE, Sim(3)", f"{length(result.ate_sim3_m)} rmse, scale {result.sim3_scale:.5f}"),
-        ("rotation", f"{angle.rmse:.3f} deg rmse, {angle.max:.3f} deg max{_leaning(result)}"),
+        ("rotation", _rotation(result)),
         (f"RPE per {result.rpe_delta}", _relative(result)),
     ]
     if result.drift is not None:
@@ -155,7 +170,7 @@ def table(result: Evaluation) -> list[tuple[str, str]]:
         rows.append(
             (
                 "drift",
-                f"{result.drift.translation_percent:.3f} %, {result.drift.rotation_deg_per_m:.5f} deg/m over "
+                f"{result.drift.translation_percent:.3f} %, {_turn(result.drift)}over "
                 f"{result.drift.segments} segments of {low:g} to {high:g} m ({note})",
             )
         )
@@ -172,9 +187,21 @@ def table(result: Evaluation) -> list[tuple[str, str]]:
     return rows
 
 
+def _rotation(result: Evaluation) -> str:
+    if not result.oriented:
+        return "not compared: one of the two holds positions only, without orientations"
+    return f"{result.ape_deg.rmse:.3f} deg rmse, {result.ape_deg.max:.3f} deg max{_leaning(result)}"
+
+
+def _turn(drift: Drift) -> str:
+    return f"{drift.rotation_deg_per_m:.5f} deg/m " if math.isfinite(drift.rotation_deg_per_m) else ""
+
+
 def _relative(result: Evaluation) -> str:
     if not result.rpe_m.count:
         return length(math.nan)
+    if not result.oriented:
+        return f"{length(result.rpe_m.rmse)} rmse"
     return f"{length(result.rpe_m.rmse)} rmse, {result.rpe_deg.rmse:.4f} deg rmse"
 
 

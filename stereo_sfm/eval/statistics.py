@@ -119,11 +119,12 @@ def summary(stats: dict[str, Any], evaluations: dict[str, Evaluation] | None = N
 
 def _against_truth(name: str, result: Evaluation) -> str:
     ate = f"{name} against ground truth: ATE {length(result.ape_m.rmse)} over {length(result.length_m)}"
+    turn = f"{result.rpe_deg.rmse:.3f} deg a frame" if result.oriented else ""
     if result.mode == "sim3":
-        return f"{ate} (Sim(3) aligned: one eye has no scale), rotation {result.rpe_deg.rmse:.3f} deg a frame"
+        return f"{ate} (Sim(3) aligned: one eye has no scale)" + (f", rotation {turn}" if turn else "")
     return (
         f"{ate} ({result.ate_percent:.3f} %, {result.mode.upper()} aligned), Sim(3) {length(result.ate_sim3_m)}, "
-        f"RPE {length(result.rpe_m.rmse)} {result.rpe_deg.rmse:.3f} deg a frame"
+        f"RPE {length(result.rpe_m.rmse)} {turn or 'a frame'}"
     )
 
 

@@ -61,7 +61,7 @@ def _read(reader: LogReader, name: str, parse: Callable[[bytes], T]) -> T | None
 def _trajectory(raw: bytes) -> Trajectory:
     """The inverse of `truth_to_bytes`."""
     with np.load(io.BytesIO(raw), allow_pickle=False) as arrays:
-        return Trajectory(arrays["stamp_ns"], arrays["poses"])
+        return Trajectory(arrays["stamp_ns"], arrays["poses"], "positions_only" not in arrays)
 
 
 def _config(raw: bytes, reader: LogReader) -> Config:

@@ -68,7 +68,8 @@ class WheelSample:
 def truth_to_bytes(trajectory: Trajectory) -> bytes:
     """Stamps and poses as npz, every bit: the topic holds quaternions, which are rounded."""
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, stamp_ns=trajectory.stamp_ns, poses=trajectory.poses)
+    mark = {} if trajectory.oriented else {"positions_only": np.ones(1, bool)}
+    np.savez_compressed(buffer, stamp_ns=trajectory.stamp_ns, poses=trajectory.poses, **mark)
     return buffer.getvalue()
 
 

@@ -84,17 +84,17 @@ def rate_of(stamps: I64) -> Rate:
     return Rate(len(stamps), 1e9 / period, jitter / 1e6, len(wide), longest, missing, int((steps <= 0).sum()))
 
 
-def describe_file(path: Path) -> Description:
-    """An MCAP file, ours or not.
+def describe_file(path: Path, rig: Path | None = None) -> Description:
+    """An MCAP file, ours or not; `rig` replaces its calibration or stands in for a missing one.
 
     Raises:
         StereoSfmError: no such file, or not MCAP.
     """
     with _said_once():
-        return _describe_file(path)
+        return _describe_file(path, rig)
 
 
-def _describe_file(path: Path) -> Description:
+def _describe_file(path: Path, own_rig: Path | None) -> Description:
     with LogReader(path) as reader:
         stamps = {topic.topic: reader.stamps(topic.topic) for topic in reader.topics}
         ends = [(int(x[0]), int(x[-1])) for name, x in stamps.items() if name != topics.GROUND_TRUTH and len(x)]
@@ -125,7 +125,7 @@ def _describe_file(path: Path) -> Description:
     if out.truncated:
         out.problems.append(f"{out.truncated}: 'stereo-sfm recover' writes a mended copy")
     if not lean:
-        _describe_source(out, path)
+        _describe_source(out, path, own_rig)
     return out
 
 
@@ -147,14 +147,14 @@ def _said_once() -> Generator[None]:
         log.removeFilter(new)
 
 
-def describe_folder(path: Path) -> Description:
-    """A dataset folder of any kind that the drivers know.
+def describe_folder(path: Path, rig: Path | None = None) -> Description:
+    """A dataset folder of any kind that the drivers know; `rig` as in `describe_file`.
 
     Raises:
         StereoSfmError: nothing known lies there.
     """
     out = Description(str(path), "folder")
-    _describe_source(out, path)
+    _describe_source(out, path, rig)
     return out
 
 
@@ -186,11 +186,11 @@ def _compare_eyes(out: Description, counts: dict[str, int]) -> None:
             )
 
 
-def _describe_source(out: Description, path: Path) -> None:
+def _describe_source(out: Description, path: Path, rig: Path | None) -> None:
     from drivers.source import open_source
 
     try:
-        source = open_source(path)
+        source = open_source(path, rig)
     except StereoSfmError as error:
         if out.kind == "folder":
             raise
@@ -206,6 +206,8 @@ def _describe_source(out: Description, path: Path) -> None:
             out.skew_ms = listed.skew_ms
         if out.kind == "folder":
             out.metadata["source"] = source.name
+            beside: dict[str, I64] = getattr(source, "beside", {})
+            out.rows += [(name, "samples beside the images", rate_of(times)) for name, times in beside.items()]
             out.seconds = float(stamps[-1] - stamps[0]) / 1e9 if len(stamps) else 0.0
     out.problems += _problems(out)
 

@@ -10,12 +10,14 @@ import cv2
 import numpy as np
 import pytest
 
-from calib import save_rig
+from calib import Rig, save_rig
 from drivers.image_lists import pair_by_stamp
 from drivers.registry import recognise
 from drivers.select import SelectedFrames
 from drivers.source import open_source
+from stereo_sfm.cli import main
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry.cameras import Pinhole
 from stereo_sfm.pixels import eight_bits
 from stereo_sfm.recording.describe import describe_folder
 from tests.drivers.dataset_folders import (
@@ -121,6 +123,21 @@ def test_euroc_pairs_by_stamp_when_one_eye_lacks_frames(tmp_path: Path, caplog: 
     assert [i.stamp_ns for i in images] == [START_NS + i * PERIOD_NS for i in (1, 2, 3)]
     assert images[0].right is not None and np.array_equal(images[0].right, picture(1, 1))
     assert "4 left and 3 right images, the 3 pairs are used" in caplog.text
+
+
+def test_info_tells_of_inertial_samples_and_takes_a_rig(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = make_euroc(tmp_path / "euroc")
+    (root / "mav0" / "imu0").mkdir()
+    rows = [f"{START_NS + i * 5_000_000},0,0,0,0,0,9.8" for i in range(40)]
+    (root / "mav0" / "imu0" / "data.csv").write_text("#timestamp,w\n" + "\n".join(rows) + "\n")
+    assert main(["info", str(root)]) == 0
+    assert "imu0  samples beside the images  40 at 200.00 Hz" in capsys.readouterr().out
+    rgbd = make_tum_rgbd(tmp_path).rename(tmp_path / "my_camera")
+    assert main(["info", str(rgbd)]) == 2
+    assert "give --rig FILE" in capsys.readouterr().err
+    save_rig(Rig(Pinhole(640, 480, 500, 500, 320, 240)), tmp_path / "rig.yaml")
+    assert main(["info", str(rgbd), "--rig", str(tmp_path / "rig.yaml")]) == 0
+    assert "fx 500.00" in capsys.readouterr().out
 
 
 def test_sixteen_bit_images_keep_their_upper_eight_bits(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from evo.tools import file_interface
 
 from drivers.ground_truth import read_euroc, read_kitti, read_trajectory, read_tum, stamp_from_seconds
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.eval.evaluate import evaluate, table
 from stereo_sfm.export.trajectories import fill_missing, seconds, write_euroc, write_kitti, write_tum
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import Trajectory
@@ -83,3 +84,35 @@ def test_malformed_files_are_one_line(text: str, message: str, tmp_path: Path) -
 def test_missing_file(tmp_path: Path) -> None:
     with pytest.raises(StereoSfmError, match="no trajectory at"):
         read_trajectory(tmp_path / "none.tum")
+
+
+@pytest.mark.parametrize("end", ["", " 0 0 0 1", " 0 0 0 0"], ids=["four fields", "unit quaternions", "zeros"])
+def test_positions_without_orientations_are_compared_as_positions(end: str, walk: Trajectory, tmp_path: Path) -> None:
+    path = tmp_path / "truth.tum"
+    lines = [
+        f"{seconds(int(t))} {p[0]} {p[1]} {p[2]}{end}\n" for t, p in zip(walk.stamp_ns, walk.positions, strict=True)
+    ]
+    path.write_text("".join(lines))
+    truth = read_trajectory(path)
+    assert not truth.oriented and read_tum(path).positions == pytest.approx(walk.positions)
+    moved = Trajectory(walk.stamp_ns, se3.exp(np.array([1.0, -2, 3, 0.4, 0.5, -1.2])) @ walk.poses)
+    for estimate, reference in ((moved, truth), (truth, moved)):
+        result = evaluate(estimate, reference)
+        assert result.ape_m.max < 1e-6 and result.rpe_m.max < 1e-6
+        assert np.isnan([result.ape_deg.rmse, result.rpe_deg.rmse]).all() and result.retail is None
+        rows = dict(table(result))
+        assert rows["rotation"].startswith("not compared") and not [v for v in rows.values() if "nan" in v]
+    with pytest.raises(StereoSfmError, match="positions without orientations"):
+        evaluate(moved, truth, "origin")
+
+
+def test_a_turning_trajectory_is_no_list_of_positions(walk: Trajectory, tmp_path: Path) -> None:
+    write_tum(tmp_path / "t.tum", walk)
+    assert read_trajectory(tmp_path / "t.tum").oriented
+
+
+def test_the_position_tracker_of_euroc(tmp_path: Path) -> None:
+    (tmp_path / "data.csv").write_text("#timestamp,x,y,z\n1403636579763555584,1,2,3\n1403636579813555456,2,2,3\n")
+    truth = read_trajectory(tmp_path / "data.csv")
+    assert not truth.oriented and truth.positions.tolist() == [[1, 2, 3], [2, 2, 3]]
+    assert truth.stamp_ns[0] == 1403636579763555584
