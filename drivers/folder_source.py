@@ -16,7 +16,7 @@ from calib.rig import Rig
 from drivers.source import BaseSource, Stamps
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.pixels import decode, decode_gray, eight_bits, sensor_bits
-from stereo_sfm.types import F32, U8, U16, StereoImage, Trajectory
+from stereo_sfm.types import F32, I64, U8, U16, StereoImage, Trajectory
 
 log = logging.getLogger("stereo_sfm")
 
@@ -101,7 +101,7 @@ class FolderSource(BaseSource):
         self.ground_truth = ground_truth
         self.shots = sorted(shots, key=lambda shot: shot.stamp_ns)
         self.depth_scale = depth_scale
-        self.beside = dict(beside or {})
+        self._beside = dict(beside or {})
         self.frame_count = len(self.shots)
         self.bits = self._sensor_bits()
         self._check_first()
@@ -153,7 +153,7 @@ class FolderSource(BaseSource):
     def stamps(self) -> Stamps:
         skews = [abs(s.right_stamp_ns - s.stamp_ns) for s in self.shots if s.right_stamp_ns]
         skew_ms = max(skews) / 1e6 if skews else float("nan")
-        return Stamps(np.array([s.stamp_ns for s in self.shots], np.int64), skew_ms)
+        return Stamps(np.array([s.stamp_ns for s in self.shots], np.int64), skew_ms, self._beside)
 
     def _sensor_bits(self) -> int:
         """Of sixteen-bit images: decided once, so that brightness does not jump between frames."""

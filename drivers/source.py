@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, Any, Protocol, Self
@@ -30,6 +30,7 @@ class Stamps:
 
     stamp_ns: I64  # (N,) of the left images
     skew_ms: float = float("nan")  # largest difference between the eyes' stamps; NaN: not known
+    beside: Mapping[str, I64] = field(default_factory=dict[str, "I64"])  # of what was recorded beside the frames
 
 
 class Source(Protocol):

@@ -195,7 +195,7 @@ def _add_chunk(index: Index, chunk: Chunk, span: Span) -> None:
             index.schemas[record.id] = record
         elif isinstance(record, Channel):
             index.channels[record.id] = record
-        elif isinstance(record, Message):
+        else:
             if record.channel_id not in index.channels:
                 raise ValueError(f"channel {record.channel_id} is not declared")
             counts[record.channel_id] = counts.get(record.channel_id, 0) + 1

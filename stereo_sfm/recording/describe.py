@@ -202,12 +202,11 @@ def _describe_source(out: Description, path: Path, rig: Path | None) -> None:
         listed = source.stamps()
         stamps = np.array([image.stamp_ns for image in source], np.int64) if listed is None else listed.stamp_ns
         out.images = rate_of(stamps)
-        if np.isnan(out.skew_ms) and listed is not None:
-            out.skew_ms = listed.skew_ms
+        if listed is not None:
+            out.skew_ms = listed.skew_ms if np.isnan(out.skew_ms) else out.skew_ms
+            out.rows += [(name, "samples beside the images", rate_of(times)) for name, times in listed.beside.items()]
         if out.kind == "folder":
             out.metadata["source"] = source.name
-            beside: dict[str, I64] = getattr(source, "beside", {})
-            out.rows += [(name, "samples beside the images", rate_of(times)) for name, times in beside.items()]
             out.seconds = float(stamps[-1] - stamps[0]) / 1e9 if len(stamps) else 0.0
     out.problems += _problems(out)
 
