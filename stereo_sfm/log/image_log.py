@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from foxglove_schemas_protobuf.Pose_pb2 import Pose
@@ -68,8 +69,10 @@ class WheelSample:
 def truth_to_bytes(trajectory: Trajectory) -> bytes:
     """Stamps and poses as npz, every bit: the topic holds quaternions, which are rounded."""
     buffer = io.BytesIO()
-    mark = {} if trajectory.oriented else {"positions_only": np.ones(1, bool)}
-    np.savez_compressed(buffer, stamp_ns=trajectory.stamp_ns, poses=trajectory.poses, **mark)
+    arrays: dict[str, Any] = {"stamp_ns": trajectory.stamp_ns, "poses": trajectory.poses}
+    if not trajectory.oriented:
+        arrays["positions_only"] = np.ones(1, bool)
+    np.savez_compressed(buffer, **arrays)
     return buffer.getvalue()
 
 
