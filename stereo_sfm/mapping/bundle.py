@@ -1,7 +1,9 @@
 """Bundle adjustment: arrays in, arrays out. Levenberg-Marquardt with the Schur complement over the points.
 
 Any camera model of geometry.kernels, one or two eyes, Huber's loss, fixed keyframes, removal of outliers between
-rounds, and the refinement of nothing but poses. The retail paper's equations 19-21 (local and full optimisation).
+rounds, and the refinement of nothing but poses. What a fixed keyframe sees depends on the points alone: it enters as a
+quadratic prior of each point, which may be kept for a whole round, so that a window may hang on many fixed keyframes.
+The retail paper's equations 19-21 (local and full optimisation).
 """
 
 from __future__ import annotations
@@ -32,6 +34,7 @@ class BundleConfig:
     tolerance: float = 1e-5  # relative decrease of the cost that ends a round
     damping: float = 1e-4  # first damping, relative to the diagonal
     move_points: bool = True  # False: nothing but poses
+    fixed_once: bool = False  # what fixed keyframes see is linearised once a round, not after every step
     dense: bool | None = None  # the solver of the reduced system; None: by size
 
 
@@ -63,76 +66,135 @@ class BundleResult:
     converged: bool
 
 
-class _State:
-    """Poses and points of one moment, their residuals and quadratic model."""
+@dataclass(frozen=True, eq=False)
+class _Prior:
+    """What the observations of fixed keyframes say about the points: quadratic models about x0, and what they cost."""
 
-    def __init__(self, rot: F64, pos: F64, points: F64, count: int) -> None:
+    x0: F64  # (P, 3)
+    h: F64  # (P, 6)
+    g: F64  # (P, 3)
+    cost: float
+
+
+class _Table:
+    """Observations of the moving or of the fixed keyframes, sorted by point, in columns as the kernels want them."""
+
+    def __init__(self, rig: Rig, bundle: Bundle, config: BundleConfig, rows: I64) -> None:
+        self.rows = rows = rows[np.argsort(bundle.obs_pt[rows], kind="stable")]
+        self.kf = np.ascontiguousarray(bundle.obs_kf[rows], np.int64)
+        self.pt = np.ascontiguousarray(bundle.obs_pt[rows], np.int64)
+        self.starts = np.searchsorted(self.pt, np.arange(len(bundle.points) + 1))
+        self._left = np.ascontiguousarray(bundle.uv_left[rows], float)
+        self._right = np.ascontiguousarray(bundle.uv_right[rows], float)
+        seen = np.stack([np.isfinite(self._left).all(1), np.isfinite(self._right[:, 0]) & rig.stereo], 1)
+        sigma = np.ones(seen.shape) if bundle.sigma is None else bundle.sigma[rows]
+        self._weights = np.where(seen, 1.0 / sigma, 0.0)
+        self.use = seen.copy()  # (M, 2) eyes that count
+        right = rig.right if rig.right is not None else rig.left
+        right_T_left = se3.inverse(rig.left_T_right)
+        self._cams = (rig.left.model_id, rig.left.params, right.model_id, right.params)
+        self._right_T_left = np.ascontiguousarray(right_T_left[:3, :3]), right_T_left[:3, 3].copy()
+        self._loss = float(config.huber), config.joint_loss
+        self.limit = 0.0  # above 0: the next `linearize` judges which eyes count
+
+    def linearize(self, state: _State) -> tuple[Linear, float]:
+        """Quadratic models of the observations at a state, and their robust cost."""
+        n = len(self.kf)
+        out: Linear = (np.empty((n, 6)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 2)))
+        cost = kernels.linearize(
+            *(state.rot, state.pos, state.points, self.kf, self.pt, self._left, self._right, self._weights),
+            *(self.use, self.limit, self._cams, *self._right_T_left, *self._loss, out),
+        )
+        self.limit = 0.0
+        return out, float(cost)
+
+    def sum_up(self, rot: F64, lin: Linear) -> tuple[F64, F64]:
+        """(P, 6) and (P, 3): the quadratic models of the points, in world axes."""
+        h, g = np.empty((len(self.starts) - 1, 6)), np.empty((len(self.starts) - 1, 3))
+        kernels.sum_up(self.starts, self.kf, rot, lin, h, g)
+        return h, g
+
+    def agreeing(self, chi2: F64, limit: float) -> Bool:
+        """(M, 2) which eyes agree, whether or not they had a say in it."""
+        return (self._weights > 0) & (chi2 <= limit)
+
+
+class _State:
+    """Poses and points of one moment, the quadratic model of what the moving keyframes see, and the cost."""
+
+    def __init__(self, rot: F64, pos: F64, points: F64) -> None:
         self.rot, self.pos, self.points = rot, pos, points
-        self.lin: Linear = (np.empty((count, 6)), np.empty((count, 3)), np.empty((count, 3)), np.empty((count, 2)))
+        self.lin: Linear
+        self.prior: _Prior
         self.cost = 0.0
 
 
 class _Solver:
     def __init__(self, rig: Rig, bundle: Bundle, config: BundleConfig) -> None:
         self.config = config
-        self.order = np.argsort(bundle.obs_pt, kind="stable")
-        self.obs_kf = np.ascontiguousarray(bundle.obs_kf[self.order], np.int64)
-        self.obs_pt = np.ascontiguousarray(bundle.obs_pt[self.order], np.int64)
-        self.uv_left = np.ascontiguousarray(bundle.uv_left[self.order], float)
-        self.uv_right = np.ascontiguousarray(bundle.uv_right[self.order], float)
-        self.starts = np.searchsorted(self.obs_pt, np.arange(len(bundle.points) + 1))
-        self.sight = self._weights(rig, bundle)
-        self.weights = self.sight
-        right = rig.right if rig.right is not None else rig.left
-        self.cams = (rig.left.model_id, rig.left.params, right.model_id, right.params)
-        right_T_left = se3.inverse(rig.left_T_right)
-        self.right_r, self.right_t = np.ascontiguousarray(right_T_left[:3, :3]), right_T_left[:3, 3].copy()
+        moves = ~bundle.fixed[bundle.obs_kf]
+        self.table = _Table(rig, bundle, config, np.flatnonzero(moves))
+        self.fixed = _Table(rig, bundle, config, np.flatnonzero(~moves))
         self.free = np.where(bundle.fixed, -1, np.cumsum(~bundle.fixed) - 1).astype(np.int64)
         self.moving = np.flatnonzero(~bundle.fixed)
         self.system: ReducedSystem | None = None
 
-    def _weights(self, rig: Rig, bundle: Bundle) -> F64:
-        """(M, 2) 1/sigma, 0 where an eye does not see."""
-        seen = np.stack([np.isfinite(self.uv_left).all(1), np.isfinite(self.uv_right[:, 0])], 1)
-        seen[:, 1] &= rig.stereo
-        sigma = np.ones(seen.shape) if bundle.sigma is None else bundle.sigma[self.order]
-        return np.where(seen, 1.0 / sigma, 0.0)
+    def _prior(self, state: _State) -> _Prior:
+        lin, cost = self.fixed.linearize(state)
+        return _Prior(state.points, *self.fixed.sum_up(state.rot, lin), cost)
 
-    def evaluate(self, state: _State) -> _State:
-        c = self.config
-        state.cost = kernels.linearize(
-            *(state.rot, state.pos, state.points, self.obs_kf, self.obs_pt, self.uv_left, self.uv_right, self.weights),
-            *(self.cams, self.right_r, self.right_t, float(c.huber), c.joint_loss, state.lin),
-        )
+    def evaluate(self, state: _State, prior: _Prior | None = None) -> _State:
+        """Fill in the model and the cost; `prior`: of an earlier state, whose model of the fixed part goes on."""
+        state.lin, state.cost = self.table.linearize(state)
+        state.prior = prior or self._prior(state)
+        state.cost += state.prior.cost
+        if prior is not None:
+            state.cost += kernels.prior_cost(state.points, prior.x0, prior.h, prior.g)
         return state
+
+    def begin_round(self, state: _State, judge: bool) -> None:
+        """Model everything anew, outliers left out."""
+        self.table.limit = self.fixed.limit = self.config.outlier_chi2 if judge else 0.0
+        self.evaluate(state)
 
     def _pose_system(self, state: _State, damping: float) -> tuple[F64, F64]:
         h, b = np.zeros((len(self.moving), 6, 6)), np.zeros((len(self.moving), 6))
-        kernels.pose_blocks(self.obs_kf, self.free, state.lin, h, b)
+        kernels.pose_blocks(self.table.kf, self.free, state.lin, h, b)
         diagonal = np.arange(6)
         # A keyframe without any inlier keeps its place: its block would be singular.
         h[:, diagonal, diagonal] += damping * h[:, diagonal, diagonal] + 1e-12
         return h, b
 
-    def _solve_poses(self, state: _State, damping: float) -> F64 | None:
+    def _solve_poses(self, state: _State, damping: float, blocks: tuple[F64, F64] | None) -> F64 | None:
         h, b = self._pose_system(state, damping)
-        if not self.config.move_points:
+        if blocks is None:
             return np.asarray(np.linalg.solve(h, b[..., None])[..., 0], float)
+        table = self.table
         if self.system is None:
-            self.system = ReducedSystem(self.starts, self.obs_kf, self.free, self.config.dense)
-        blocks = self.system.new_blocks(h)
+            self.system = ReducedSystem(table.starts, table.kf, self.free, self.config.dense)
+        matrix = self.system.new_blocks(h)
         kernels.reduce(
-            *(self.starts, self.obs_kf, self.free, state.rot, state.lin, damping),
-            *(self.system.most, blocks, self.system.slots, b),
+            *(table.starts, table.kf, self.free, state.rot, state.lin, *blocks),
+            *(self.system.most, matrix, self.system.slots, b),
         )
-        return self.system.solve(blocks, b)
+        return self.system.solve(matrix, b)
+
+    def _point_blocks(self, state: _State, damping: float) -> tuple[F64, F64] | None:
+        """Inverse blocks and right sides of the points; None when they stay."""
+        if not self.config.move_points:
+            return None
+        h, g = self.table.sum_up(state.rot, state.lin)
+        prior = state.prior
+        kernels.point_blocks(state.points, prior.x0, prior.h, prior.g, damping, h, g)
+        return h, g
 
     def step(self, state: _State, damping: float) -> _State | None:
         """The state after one damped step, or None where the system has no solution."""
         rot, pos, points = state.rot, state.pos, state.points
+        blocks = self._point_blocks(state, damping)
         xi = np.zeros((0, 6))
         if len(self.moving):
-            solved = self._solve_poses(state, damping)
+            solved = self._solve_poses(state, damping, blocks)
             if solved is None or not np.isfinite(solved).all():
                 return None
             xi = solved
@@ -140,17 +202,17 @@ class _Solver:
             rot, pos = rot.copy(), pos.copy()
             pos[self.moving] += (rot[self.moving] @ delta[:, :3, 3, None])[..., 0]
             rot[self.moving] = rot[self.moving] @ delta[:, :3, :3]
-        if self.config.move_points:
+        if blocks is not None:
             points = np.empty_like(points)
+            table = self.table
             kernels.point_steps(
-                self.starts, self.obs_kf, self.free, state.rot, state.lin, damping, xi, state.points, points
+                table.starts, table.kf, self.free, state.rot, state.lin, *blocks, xi, state.points, points
             )
-        return self.evaluate(_State(rot, pos, points, len(self.obs_kf)))
+        return self.evaluate(_State(rot, pos, points), state.prior if self.config.fixed_once else None)
 
     def descend(self, state: _State) -> tuple[_State, int, bool]:
         """Levenberg-Marquardt from one state: the best state, accepted steps, whether the cost stopped falling."""
         damping, accepted, c = self.config.damping, 0, self.config
-        state = self.evaluate(state)
         while accepted < c.iterations:
             trial = self.step(state, damping)
             if trial is None or not trial.cost <= state.cost:
@@ -163,12 +225,6 @@ class _Solver:
             if decrease <= c.tolerance * state.cost:
                 return state, accepted, True
         return state, accepted, False
-
-    def judge(self, state: _State) -> Bool:
-        """(M, 2) which eyes agree with a state, whether or not they had a say in it."""
-        self.weights = self.sight
-        self.evaluate(state)
-        return (self.sight > 0) & (state.lin[3] <= self.config.outlier_chi2)
 
 
 def bundle_adjust(rig: Rig, bundle: Bundle, config: BundleConfig | None = None) -> BundleResult:
@@ -186,13 +242,11 @@ def bundle_adjust(rig: Rig, bundle: Bundle, config: BundleConfig | None = None) 
         np.ascontiguousarray(bundle.world_T_kf[:, :3, :3], float),
         np.ascontiguousarray(bundle.world_T_kf[:, :3, 3], float),
         np.ascontiguousarray(bundle.points, float),
-        len(bundle.obs_kf),
     )
     iterations, converged, initial = 0, False, 0.0
     for index in range(config.rounds):
-        if index:
-            solver.weights = np.where(solver.judge(state), solver.sight, 0.0)
-        initial = solver.evaluate(state).cost
+        solver.begin_round(state, judge=index > 0)
+        initial = state.cost
         state, steps, converged = solver.descend(state)
         iterations += steps
     return _result(solver, bundle, state, initial, iterations, converged)
@@ -201,14 +255,14 @@ def bundle_adjust(rig: Rig, bundle: Bundle, config: BundleConfig | None = None) 
 def _result(
     solver: _Solver, bundle: Bundle, state: _State, initial: float, iterations: int, converged: bool
 ) -> BundleResult:
-    cost = state.cost
-    inlier_sorted = solver.judge(state)
-    inlier, chi2 = np.empty_like(inlier_sorted), np.empty_like(state.lin[3])
-    inlier[solver.order], chi2[solver.order] = inlier_sorted, state.lin[3]
+    inlier, chi2 = np.empty((len(bundle.obs_kf), 2), bool), np.empty((len(bundle.obs_kf), 2))
+    for table, found in ((solver.table, state.lin[3]), (solver.fixed, solver.fixed.linearize(state)[0][3])):
+        chi2[table.rows] = found
+        inlier[table.rows] = table.agreeing(found, solver.config.outlier_chi2)
     poses = bundle.world_T_kf.astype(float, copy=True)
     moved = se3.from_rotation_translation(state.rot, state.pos)[solver.moving]
     poses[solver.moving] = se3.orthonormalize(moved) if len(moved) else moved
-    return BundleResult(poses, state.points, inlier, chi2, cost, initial, iterations, converged)
+    return BundleResult(poses, state.points, inlier, chi2, state.cost, initial, iterations, converged)
 
 
 def _check(bundle: Bundle) -> None:

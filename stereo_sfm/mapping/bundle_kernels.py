@@ -11,7 +11,11 @@ and every block of the normal equations follows from A, g, p and R alone: with G
     H_kf = G^T A G,   H_point = R A R^T,   W = G^T A R^T,   b_kf = -G^T g,   b_point = -R g.
 
 The Schur complement over the points is Triggs et al., Bundle adjustment: a modern synthesis (2000), section 6.1.
-Observations are sorted by point. `weights` (M, 2) is 1/sigma of either eye, 0 where that eye is not used.
+Observations are sorted by point. What the points' fixed observations say is summed up in a quadratic prior of every
+point, (H (6,), g (3,)) in world axes about x0: cost = g.d + d^T H d / 2 with d = x - x0.
+
+Inner loops index arrays directly and keep rows that are read together beside each other: a view of a row costs more
+than the arithmetic on it.
 """
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false
@@ -37,74 +41,70 @@ def _huber(chi2, delta):
 
 
 @njit
-def _eye(model, params, x, y, z, u_obs, v_obs, w, j):
-    """Residual of one eye, scaled by w. Fills j (2, 3); returns ru, rv, chi2. A NaN v_obs means: only u was seen."""
+def _eye(model, params, x, y, z, u_obs, v_obs, w):
+    """Derivatives (u by x y z, v by x y z), residuals ru, rv of one eye, all scaled by w, and chi2; zeros where w is 0.
+
+    A NaN v_obs means: only u was seen.
+    """
+    if not w > 0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     u, v, j00, j01, j02, j10, j11, j12 = project_one(model, params, x, y, z)
     if not (math.isfinite(u) and math.isfinite(v)):
-        j[:] = 0.0
-        return 0.0, 0.0, UNPROJECTABLE
-    j[0, 0], j[0, 1], j[0, 2] = w * j00, w * j01, w * j02
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, UNPROJECTABLE
     ru = w * (u - u_obs)
-    if math.isfinite(v_obs):
-        rv = w * (v - v_obs)
-        j[1, 0], j[1, 1], j[1, 2] = w * j10, w * j11, w * j12
-    else:
-        rv = 0.0
-        j[1, :] = 0.0
-    return ru, rv, ru * ru + rv * rv
+    if not math.isfinite(v_obs):
+        return w * j00, w * j01, w * j02, 0.0, 0.0, 0.0, ru, 0.0, ru * ru
+    rv = w * (v - v_obs)
+    return w * j00, w * j01, w * j02, w * j10, w * j11, w * j12, ru, rv, ru * ru + rv * rv
 
 
 @njit
-def _add_eye(a, g, j, ru, rv, w):
-    """A += w J^T J, g += w J^T r."""
-    k = 0
-    for i in range(3):
-        g[i] += w * (j[0, i] * ru + j[1, i] * rv)
-        for m in range(i, 3):
-            a[k] += w * (j[0, i] * j[0, m] + j[1, i] * j[1, m])
-            k += 1
-
-
-@njit
-def linearize(rot, pos, points, obs_kf, obs_pt, uv_left, uv_right, weights, cams, right_r, right_t, delta, joint, out):
+def linearize(
+    rot, pos, points, obs_kf, obs_pt, uv_left, uv_right, weights, use, limit, cams, right_r, right_t, delta, joint, out
+):
     """Residuals and their quadratic model at one state.
 
     Args:
         rot, pos: (K, 3, 3), (K, 3) of world_T_kf. points: (P, 3) world.
-        obs_kf, obs_pt: (M,). uv_left, uv_right: (M, 2) px. weights: (M, 2) 1/px.
+        obs_kf, obs_pt: (M,). uv_left, uv_right: (M, 2) px. weights: (M, 2) 1/px of either eye, 0 where it sees nothing.
+        use: (M, 2) eyes that count. limit: above 0 those are judged here: the ones whose chi2 is not above it.
         cams: (left model, left params, right model, right params). right_r, right_t: right_T_left.
         delta: Huber's threshold in sigmas. joint: one loss over both eyes instead of one each.
-        out: (A (M, 6) upper triangle, g (M, 3), p (M, 3), chi2 (M, 2)), overwritten.
+        out: (A (M, 6) upper triangle, g (M, 3), p (M, 3), chi2 (M, 2)), overwritten; chi2 also where an eye does not
+            count.
 
     Returns:
         The robust cost, sum of rho(chi2) with rho(e^2) = e^2 / 2 near zero.
     """
     left_model, left_params, right_model, right_params = cams
-    a_out, g_out, p_out, chi2_out = out
-    jl = np.zeros((2, 3))
-    jr = np.zeros((2, 3))
-    jc = np.zeros((2, 3))
+    a, g, p, chi2 = out
+    r00, r01, r02 = right_r[0, 0], right_r[0, 1], right_r[0, 2]
+    r10, r11, r12 = right_r[1, 0], right_r[1, 1], right_r[1, 2]
+    r20, r21, r22 = right_r[2, 0], right_r[2, 1], right_r[2, 2]
+    t0, t1, t2 = right_t[0], right_t[1], right_t[2]
     cost = 0.0
     for o in range(obs_kf.shape[0]):
-        r, t, x = rot[obs_kf[o]], pos[obs_kf[o]], points[obs_pt[o]]
-        d0, d1, d2 = x[0] - t[0], x[1] - t[1], x[2] - t[2]
-        p0 = r[0, 0] * d0 + r[1, 0] * d1 + r[2, 0] * d2
-        p1 = r[0, 1] * d0 + r[1, 1] * d1 + r[2, 1] * d2
-        p2 = r[0, 2] * d0 + r[1, 2] * d1 + r[2, 2] * d2
-        p_out[o, 0], p_out[o, 1], p_out[o, 2] = p0, p1, p2
-        lu = lv = ru = rv = chi_l = chi_r = 0.0
-        w_l, w_r = weights[o, 0], weights[o, 1]
-        if w_l > 0:
-            lu, lv, chi_l = _eye(left_model, left_params, p0, p1, p2, uv_left[o, 0], uv_left[o, 1], w_l, jl)
-        if w_r > 0:
-            q0 = right_r[0, 0] * p0 + right_r[0, 1] * p1 + right_r[0, 2] * p2 + right_t[0]
-            q1 = right_r[1, 0] * p0 + right_r[1, 1] * p1 + right_r[1, 2] * p2 + right_t[1]
-            q2 = right_r[2, 0] * p0 + right_r[2, 1] * p1 + right_r[2, 2] * p2 + right_t[2]
-            ru, rv, chi_r = _eye(right_model, right_params, q0, q1, q2, uv_right[o, 0], uv_right[o, 1], w_r, jc)
-            for i in range(2):
-                for k in range(3):
-                    jr[i, k] = jc[i, 0] * right_r[0, k] + jc[i, 1] * right_r[1, k] + jc[i, 2] * right_r[2, k]
-        chi2_out[o, 0], chi2_out[o, 1] = chi_l, chi_r
+        k, i = obs_kf[o], obs_pt[o]
+        d0, d1, d2 = points[i, 0] - pos[k, 0], points[i, 1] - pos[k, 1], points[i, 2] - pos[k, 2]
+        p0 = rot[k, 0, 0] * d0 + rot[k, 1, 0] * d1 + rot[k, 2, 0] * d2
+        p1 = rot[k, 0, 1] * d0 + rot[k, 1, 1] * d1 + rot[k, 2, 1] * d2
+        p2 = rot[k, 0, 2] * d0 + rot[k, 1, 2] * d1 + rot[k, 2, 2] * d2
+        p[o, 0], p[o, 1], p[o, 2] = p0, p1, p2
+        x0, x1, x2, y0, y1, y2, ru, rv, chi_l = _eye(
+            left_model, left_params, p0, p1, p2, uv_left[o, 0], uv_left[o, 1], weights[o, 0]
+        )
+        q0 = r00 * p0 + r01 * p1 + r02 * p2 + t0
+        q1 = r10 * p0 + r11 * p1 + r12 * p2 + t1
+        q2 = r20 * p0 + r21 * p1 + r22 * p2 + t2
+        u0, u1, u2, v0, v1, v2, su, sv, chi_r = _eye(
+            right_model, right_params, q0, q1, q2, uv_right[o, 0], uv_right[o, 1], weights[o, 1]
+        )
+        u0, u1, u2 = u0 * r00 + u1 * r10 + u2 * r20, u0 * r01 + u1 * r11 + u2 * r21, u0 * r02 + u1 * r12 + u2 * r22
+        v0, v1, v2 = v0 * r00 + v1 * r10 + v2 * r20, v0 * r01 + v1 * r11 + v2 * r21, v0 * r02 + v1 * r12 + v2 * r22
+        chi2[o, 0], chi2[o, 1] = chi_l, chi_r
+        if limit > 0:
+            use[o, 0], use[o, 1] = weights[o, 0] > 0 and chi_l <= limit, weights[o, 1] > 0 and chi_r <= limit
+        chi_l, chi_r = chi_l if use[o, 0] else 0.0, chi_r if use[o, 1] else 0.0
         if joint:
             rho, s_l = _huber(chi_l + chi_r, delta)
             s_r = s_l
@@ -113,28 +113,17 @@ def linearize(rot, pos, points, obs_kf, obs_pt, uv_left, uv_right, weights, cams
             rho_l, s_l = _huber(chi_l, delta)
             rho_r, s_r = _huber(chi_r, delta)
             cost += rho_l + rho_r
-        a, g = a_out[o], g_out[o]
-        a[:] = 0.0
-        g[:] = 0.0
-        if w_l > 0 and chi_l < UNPROJECTABLE:
-            _add_eye(a, g, jl, lu, lv, s_l)
-        if w_r > 0 and chi_r < UNPROJECTABLE:
-            _add_eye(a, g, jr, ru, rv, s_r)
+        s_l, s_r = s_l if use[o, 0] else 0.0, s_r if use[o, 1] else 0.0
+        a[o, 0] = s_l * (x0 * x0 + y0 * y0) + s_r * (u0 * u0 + v0 * v0)
+        a[o, 1] = s_l * (x0 * x1 + y0 * y1) + s_r * (u0 * u1 + v0 * v1)
+        a[o, 2] = s_l * (x0 * x2 + y0 * y2) + s_r * (u0 * u2 + v0 * v2)
+        a[o, 3] = s_l * (x1 * x1 + y1 * y1) + s_r * (u1 * u1 + v1 * v1)
+        a[o, 4] = s_l * (x1 * x2 + y1 * y2) + s_r * (u1 * u2 + v1 * v2)
+        a[o, 5] = s_l * (x2 * x2 + y2 * y2) + s_r * (u2 * u2 + v2 * v2)
+        g[o, 0] = s_l * (x0 * ru + y0 * rv) + s_r * (u0 * su + v0 * sv)
+        g[o, 1] = s_l * (x1 * ru + y1 * rv) + s_r * (u1 * su + v1 * sv)
+        g[o, 2] = s_l * (x2 * ru + y2 * rv) + s_r * (u2 * su + v2 * sv)
     return cost
-
-
-@njit
-def _cross_blocks(a, p, r, ar, w):
-    """AR = A R^T (3, 3) and W = G^T A R^T (6, 3) of one observation."""
-    for k in range(3):
-        ar[0, k] = a[0] * r[k, 0] + a[1] * r[k, 1] + a[2] * r[k, 2]
-        ar[1, k] = a[1] * r[k, 0] + a[3] * r[k, 1] + a[4] * r[k, 2]
-        ar[2, k] = a[2] * r[k, 0] + a[4] * r[k, 1] + a[5] * r[k, 2]
-        w[0, k], w[1, k], w[2, k] = -ar[0, k], -ar[1, k], -ar[2, k]
-        # skew(p)^T v = v x p = -p x v
-        w[3, k] = ar[1, k] * p[2] - ar[2, k] * p[1]
-        w[4, k] = ar[2, k] * p[0] - ar[0, k] * p[2]
-        w[5, k] = ar[0, k] * p[1] - ar[1, k] * p[0]
 
 
 @njit
@@ -193,48 +182,91 @@ def _row_times_skew(row, p0, p1, p2):
 
 
 @njit
-def _point_block(first, last, obs_kf, rot, lin, damping, hinv, b):
-    """(H_point + damping diag)^-1 into hinv (3, 3) and b_point into b (3,). False where nothing sees it."""
+def _world_model(a, r, o, k):
+    """R A R^T of observation o in keyframe k, upper triangle."""
+    a0, a1, a2, a3, a4, a5 = a[o, 0], a[o, 1], a[o, 2], a[o, 3], a[o, 4], a[o, 5]
+    x0 = a0 * r[k, 0, 0] + a1 * r[k, 0, 1] + a2 * r[k, 0, 2]
+    x1 = a1 * r[k, 0, 0] + a3 * r[k, 0, 1] + a4 * r[k, 0, 2]
+    x2 = a2 * r[k, 0, 0] + a4 * r[k, 0, 1] + a5 * r[k, 0, 2]
+    y0 = a0 * r[k, 1, 0] + a1 * r[k, 1, 1] + a2 * r[k, 1, 2]
+    y1 = a1 * r[k, 1, 0] + a3 * r[k, 1, 1] + a4 * r[k, 1, 2]
+    y2 = a2 * r[k, 1, 0] + a4 * r[k, 1, 1] + a5 * r[k, 1, 2]
+    z0 = a0 * r[k, 2, 0] + a1 * r[k, 2, 1] + a2 * r[k, 2, 2]
+    z1 = a1 * r[k, 2, 0] + a3 * r[k, 2, 1] + a4 * r[k, 2, 2]
+    z2 = a2 * r[k, 2, 0] + a4 * r[k, 2, 1] + a5 * r[k, 2, 2]
+    return (
+        r[k, 0, 0] * x0 + r[k, 0, 1] * x1 + r[k, 0, 2] * x2,
+        r[k, 1, 0] * x0 + r[k, 1, 1] * x1 + r[k, 1, 2] * x2,
+        r[k, 2, 0] * x0 + r[k, 2, 1] * x1 + r[k, 2, 2] * x2,
+        r[k, 1, 0] * y0 + r[k, 1, 1] * y1 + r[k, 1, 2] * y2,
+        r[k, 2, 0] * y0 + r[k, 2, 1] * y1 + r[k, 2, 2] * y2,
+        r[k, 2, 0] * z0 + r[k, 2, 1] * z1 + r[k, 2, 2] * z2,
+    )
+
+
+@njit
+def sum_up(starts, obs_kf, rot, lin, h, g):
+    """The quadratic model of every point: h (P, 6) = sum of R A R^T, upper triangle, g (P, 3) = sum of R g."""
     a_all, g_all, _, _ = lin
-    h00 = h01 = h02 = h11 = h12 = h22 = 0.0
-    b[:] = 0.0
-    for o in range(first, last):
-        a, g, r = a_all[o], g_all[o], rot[obs_kf[o]]
-        for i in range(3):
-            b[i] -= r[i, 0] * g[0] + r[i, 1] * g[1] + r[i, 2] * g[2]
-        x0 = a[0] * r[0, 0] + a[1] * r[0, 1] + a[2] * r[0, 2]
-        x1 = a[1] * r[0, 0] + a[3] * r[0, 1] + a[4] * r[0, 2]
-        x2 = a[2] * r[0, 0] + a[4] * r[0, 1] + a[5] * r[0, 2]
-        h00 += r[0, 0] * x0 + r[0, 1] * x1 + r[0, 2] * x2
-        h01 += r[1, 0] * x0 + r[1, 1] * x1 + r[1, 2] * x2
-        h02 += r[2, 0] * x0 + r[2, 1] * x1 + r[2, 2] * x2
-        y0 = a[0] * r[1, 0] + a[1] * r[1, 1] + a[2] * r[1, 2]
-        y1 = a[1] * r[1, 0] + a[3] * r[1, 1] + a[4] * r[1, 2]
-        y2 = a[2] * r[1, 0] + a[4] * r[1, 1] + a[5] * r[1, 2]
-        h11 += r[1, 0] * y0 + r[1, 1] * y1 + r[1, 2] * y2
-        h12 += r[2, 0] * y0 + r[2, 1] * y1 + r[2, 2] * y2
-        z0 = a[0] * r[2, 0] + a[1] * r[2, 1] + a[2] * r[2, 2]
-        z1 = a[1] * r[2, 0] + a[3] * r[2, 1] + a[4] * r[2, 2]
-        z2 = a[2] * r[2, 0] + a[4] * r[2, 1] + a[5] * r[2, 2]
-        h22 += r[2, 0] * z0 + r[2, 1] * z1 + r[2, 2] * z2
-    scale = (h00 + h11 + h22) / 3.0
-    h00 += damping * h00
-    h11 += damping * h11
-    h22 += damping * h22
-    c00 = h11 * h22 - h12 * h12
-    c01 = h02 * h12 - h01 * h22
-    c02 = h01 * h12 - h02 * h11
-    det = h00 * c00 + h01 * c01 + h02 * c02
-    if not det > 1e-14 * scale * scale * scale:
-        return False
-    inv = 1.0 / det
-    hinv[0, 0] = c00 * inv
-    hinv[0, 1] = hinv[1, 0] = c01 * inv
-    hinv[0, 2] = hinv[2, 0] = c02 * inv
-    hinv[1, 1] = (h00 * h22 - h02 * h02) * inv
-    hinv[1, 2] = hinv[2, 1] = (h01 * h02 - h00 * h12) * inv
-    hinv[2, 2] = (h00 * h11 - h01 * h01) * inv
-    return True
+    for pt in range(starts.shape[0] - 1):
+        h0 = h1 = h2 = h3 = h4 = h5 = g0 = g1 = g2 = 0.0
+        for o in range(starts[pt], starts[pt + 1]):
+            k = obs_kf[o]
+            m0, m1, m2, m3, m4, m5 = _world_model(a_all, rot, o, k)
+            h0, h1, h2, h3, h4, h5 = h0 + m0, h1 + m1, h2 + m2, h3 + m3, h4 + m4, h5 + m5
+            x, y, z = g_all[o, 0], g_all[o, 1], g_all[o, 2]
+            g0 += rot[k, 0, 0] * x + rot[k, 0, 1] * y + rot[k, 0, 2] * z
+            g1 += rot[k, 1, 0] * x + rot[k, 1, 1] * y + rot[k, 1, 2] * z
+            g2 += rot[k, 2, 0] * x + rot[k, 2, 1] * y + rot[k, 2, 2] * z
+        h[pt, 0], h[pt, 1], h[pt, 2], h[pt, 3], h[pt, 4], h[pt, 5] = h0, h1, h2, h3, h4, h5
+        g[pt, 0], g[pt, 1], g[pt, 2] = g0, g1, g2
+
+
+@njit
+def prior_cost(points, x0, h, g):
+    """What the priors add to the cost at some points."""
+    cost = 0.0
+    for i in range(points.shape[0]):
+        d0, d1, d2 = points[i, 0] - x0[i, 0], points[i, 1] - x0[i, 1], points[i, 2] - x0[i, 2]
+        e0 = h[i, 0] * d0 + h[i, 1] * d1 + h[i, 2] * d2
+        e1 = h[i, 1] * d0 + h[i, 3] * d1 + h[i, 4] * d2
+        e2 = h[i, 2] * d0 + h[i, 4] * d1 + h[i, 5] * d2
+        cost += (g[i, 0] + 0.5 * e0) * d0 + (g[i, 1] + 0.5 * e1) * d1 + (g[i, 2] + 0.5 * e2) * d2
+    return cost
+
+
+@njit
+def point_blocks(points, x0, prior_h, prior_g, damping, h, g):
+    """Turns the sums of the moving keyframes, h (P, 6) and g (P, 3), into (H_point + damping diag)^-1 and b_point.
+
+    Both are zero for a point whose block is singular: nothing sees it.
+    """
+    for i in range(points.shape[0]):
+        d0, d1, d2 = points[i, 0] - x0[i, 0], points[i, 1] - x0[i, 1], points[i, 2] - x0[i, 2]
+        q0, q1, q2, q3, q4, q5 = (
+            prior_h[i, 0], prior_h[i, 1], prior_h[i, 2], prior_h[i, 3], prior_h[i, 4], prior_h[i, 5],
+        )  # fmt: skip
+        g[i, 0] = -g[i, 0] - prior_g[i, 0] - q0 * d0 - q1 * d1 - q2 * d2
+        g[i, 1] = -g[i, 1] - prior_g[i, 1] - q1 * d0 - q3 * d1 - q4 * d2
+        g[i, 2] = -g[i, 2] - prior_g[i, 2] - q2 * d0 - q4 * d1 - q5 * d2
+        h00, h01, h02 = h[i, 0] + q0, h[i, 1] + q1, h[i, 2] + q2
+        h11, h12, h22 = h[i, 3] + q3, h[i, 4] + q4, h[i, 5] + q5
+        scale = (h00 + h11 + h22) / 3.0
+        h00 += damping * h00
+        h11 += damping * h11
+        h22 += damping * h22
+        c00 = h11 * h22 - h12 * h12
+        c01 = h02 * h12 - h01 * h22
+        c02 = h01 * h12 - h02 * h11
+        det = h00 * c00 + h01 * c01 + h02 * c02
+        if not det > 1e-14 * scale * scale * scale:
+            h[i, 0] = h[i, 1] = h[i, 2] = h[i, 3] = h[i, 4] = h[i, 5] = 0.0
+            g[i, 0] = g[i, 1] = g[i, 2] = 0.0
+            continue
+        inv = 1.0 / det
+        h[i, 0], h[i, 1], h[i, 2] = c00 * inv, c01 * inv, c02 * inv
+        h[i, 3], h[i, 4] = (h00 * h22 - h02 * h02) * inv, (h01 * h02 - h00 * h12) * inv
+        h[i, 5] = (h00 * h11 - h01 * h01) * inv
 
 
 @njit
@@ -272,84 +304,90 @@ def list_pairs(starts, obs_kf, free, keys):
 
 
 @njit
-def reduce(starts, obs_kf, free, rot, lin, damping, most, blocks, slots, b):
+def _cross_block(a, p, r, o, k, w, n):
+    """W^T = (G^T A R^T)^T of observation o in keyframe k into w[n] (18,): column by column, six entries each."""
+    a0, a1, a2, a3, a4, a5 = a[o, 0], a[o, 1], a[o, 2], a[o, 3], a[o, 4], a[o, 5]
+    p0, p1, p2 = p[o, 0], p[o, 1], p[o, 2]
+    for c in range(3):
+        x, y, z = r[k, c, 0], r[k, c, 1], r[k, c, 2]
+        u, v, s = a0 * x + a1 * y + a2 * z, a1 * x + a3 * y + a4 * z, a2 * x + a4 * y + a5 * z
+        w[n, 6 * c], w[n, 6 * c + 1], w[n, 6 * c + 2] = -u, -v, -s
+        # skew(p)^T v = v x p = -p x v
+        w[n, 6 * c + 3], w[n, 6 * c + 4], w[n, 6 * c + 5] = v * p2 - s * p1, s * p0 - u * p2, u * p1 - v * p0
+
+
+@njit
+def reduce(starts, obs_kf, free, rot, lin, h_inv, b_point, most, blocks, slots, b):
     """Subtracts W H_point^-1 W^T and W H_point^-1 b_point of every point from the reduced system.
 
     Args:
         starts: (P + 1,) first observation of every point. free: (K,) row of a keyframe, -1 when it is fixed.
-        most: the largest number of free keyframes of one point.
+        h_inv, b_point: (P, 6), (P, 3), see `point_blocks`. most: the largest number of free keyframes of one point.
         blocks: (B, 6, 6) lower blocks of the reduced matrix, changed. slots: block of every pair in `list_pairs` order.
         b: (F, 6), changed.
     """
     a_all, _, p_all, _ = lin
-    hinv = np.zeros((3, 3))
-    bp = np.zeros(3)
-    ar = np.zeros((3, 3))
-    w_all = np.zeros((max(most, 1), 6, 3))
+    w = np.zeros((max(most, 1), 18))
     row = np.zeros(max(most, 1), np.int64)
-    y = np.zeros((6, 3))
+    y = np.zeros(18)
     i = 0
     for pt in range(starts.shape[0] - 1):
-        first, last = starts[pt], starts[pt + 1]
         n = 0
-        for o in range(first, last):
+        for o in range(starts[pt], starts[pt + 1]):
             c = free[obs_kf[o]]
             if c >= 0:
-                _cross_blocks(a_all[o], p_all[o], rot[obs_kf[o]], ar, w_all[n])
+                _cross_block(a_all, p_all, rot, o, obs_kf[o], w, n)
                 row[n] = c
                 n += 1
-        if not _point_block(first, last, obs_kf, rot, lin, damping, hinv, bp):
-            i += n * (n + 1) // 2
-            continue
+        h0, h1, h2, h3, h4, h5 = (
+            h_inv[pt, 0], h_inv[pt, 1], h_inv[pt, 2], h_inv[pt, 3], h_inv[pt, 4], h_inv[pt, 5],
+        )  # fmt: skip
+        b0, b1, b2 = b_point[pt, 0], b_point[pt, 1], b_point[pt, 2]
         for m in range(n):
-            w = w_all[m]
-            bc = b[row[m]]
+            c = row[m]
             for k in range(6):
-                y[k, 0] = w[k, 0] * hinv[0, 0] + w[k, 1] * hinv[1, 0] + w[k, 2] * hinv[2, 0]
-                y[k, 1] = w[k, 0] * hinv[0, 1] + w[k, 1] * hinv[1, 1] + w[k, 2] * hinv[2, 1]
-                y[k, 2] = w[k, 0] * hinv[0, 2] + w[k, 1] * hinv[1, 2] + w[k, 2] * hinv[2, 2]
-                bc[k] -= y[k, 0] * bp[0] + y[k, 1] * bp[1] + y[k, 2] * bp[2]
+                w0, w1, w2 = w[m, k], w[m, 6 + k], w[m, 12 + k]
+                y0, y1, y2 = w0 * h0 + w1 * h1 + w2 * h2, w0 * h1 + w1 * h3 + w2 * h4, w0 * h2 + w1 * h4 + w2 * h5
+                y[3 * k], y[3 * k + 1], y[3 * k + 2] = y0, y1, y2
+                b[c, k] -= y0 * b0 + y1 * b1 + y2 * b2
             for q in range(m + 1):
-                s, x = blocks[slots[i]], w_all[q]
+                slot = slots[i]
                 i += 1
-                if row[m] >= row[q]:
+                if c >= row[q]:
                     for k in range(6):
+                        y0, y1, y2 = y[3 * k], y[3 * k + 1], y[3 * k + 2]
                         for j in range(6):
-                            s[k, j] -= y[k, 0] * x[j, 0] + y[k, 1] * x[j, 1] + y[k, 2] * x[j, 2]
-                else:
+                            blocks[slot, k, j] -= y0 * w[q, j] + y1 * w[q, 6 + j] + y2 * w[q, 12 + j]
+                if c < row[q] or (c == row[q] and m != q):  # transposed; both where one keyframe sees the point twice
                     for k in range(6):
+                        y0, y1, y2 = y[3 * k], y[3 * k + 1], y[3 * k + 2]
                         for j in range(6):
-                            s[j, k] -= y[k, 0] * x[j, 0] + y[k, 1] * x[j, 1] + y[k, 2] * x[j, 2]
-                if row[m] == row[q] and m != q:  # one keyframe sees the point twice: both orders fall on its diagonal
-                    for k in range(6):
-                        for j in range(6):
-                            s[j, k] -= y[k, 0] * x[j, 0] + y[k, 1] * x[j, 1] + y[k, 2] * x[j, 2]
+                            blocks[slot, j, k] -= y0 * w[q, j] + y1 * w[q, 6 + j] + y2 * w[q, 12 + j]
 
 
 @njit
-def point_steps(starts, obs_kf, free, rot, lin, damping, step, points, out):
+def point_steps(starts, obs_kf, free, rot, lin, h_inv, b_point, step, points, out):
     """Back substitution: out = points + H_point^-1 (b_point - W^T step) with step (F, 6)."""
-    a_all, _, p_all, _ = lin
-    hinv = np.zeros((3, 3))
-    b = np.zeros(3)
-    v = np.zeros(3)
+    a, _, p, _ = lin
     for pt in range(starts.shape[0] - 1):
-        first, last = starts[pt], starts[pt + 1]
-        out[pt, 0], out[pt, 1], out[pt, 2] = points[pt, 0], points[pt, 1], points[pt, 2]
-        if not _point_block(first, last, obs_kf, rot, lin, damping, hinv, b):
-            continue
-        for o in range(first, last):
-            c = free[obs_kf[o]]
+        b0, b1, b2 = b_point[pt, 0], b_point[pt, 1], b_point[pt, 2]
+        for o in range(starts[pt], starts[pt + 1]):
+            k = obs_kf[o]
+            c = free[k]
             if c < 0:
                 continue
-            x, p, a, r = step[c], p_all[o], a_all[o], rot[obs_kf[o]]
-            v[0] = p[1] * x[5] - p[2] * x[4] - x[0]
-            v[1] = p[2] * x[3] - p[0] * x[5] - x[1]
-            v[2] = p[0] * x[4] - p[1] * x[3] - x[2]
-            u0 = a[0] * v[0] + a[1] * v[1] + a[2] * v[2]
-            u1 = a[1] * v[0] + a[3] * v[1] + a[4] * v[2]
-            u2 = a[2] * v[0] + a[4] * v[1] + a[5] * v[2]
-            for k in range(3):
-                b[k] -= r[k, 0] * u0 + r[k, 1] * u1 + r[k, 2] * u2
-        for k in range(3):
-            out[pt, k] += hinv[k, 0] * b[0] + hinv[k, 1] * b[1] + hinv[k, 2] * b[2]
+            v0 = p[o, 1] * step[c, 5] - p[o, 2] * step[c, 4] - step[c, 0]
+            v1 = p[o, 2] * step[c, 3] - p[o, 0] * step[c, 5] - step[c, 1]
+            v2 = p[o, 0] * step[c, 4] - p[o, 1] * step[c, 3] - step[c, 2]
+            u0 = a[o, 0] * v0 + a[o, 1] * v1 + a[o, 2] * v2
+            u1 = a[o, 1] * v0 + a[o, 3] * v1 + a[o, 4] * v2
+            u2 = a[o, 2] * v0 + a[o, 4] * v1 + a[o, 5] * v2
+            b0 -= rot[k, 0, 0] * u0 + rot[k, 0, 1] * u1 + rot[k, 0, 2] * u2
+            b1 -= rot[k, 1, 0] * u0 + rot[k, 1, 1] * u1 + rot[k, 1, 2] * u2
+            b2 -= rot[k, 2, 0] * u0 + rot[k, 2, 1] * u1 + rot[k, 2, 2] * u2
+        h0, h1, h2, h3, h4, h5 = (
+            h_inv[pt, 0], h_inv[pt, 1], h_inv[pt, 2], h_inv[pt, 3], h_inv[pt, 4], h_inv[pt, 5],
+        )  # fmt: skip
+        out[pt, 0] = points[pt, 0] + h0 * b0 + h1 * b1 + h2 * b2
+        out[pt, 1] = points[pt, 1] + h1 * b0 + h3 * b1 + h4 * b2
+        out[pt, 2] = points[pt, 2] + h2 * b0 + h4 * b1 + h5 * b2

@@ -44,10 +44,11 @@ class Covisibility:
 
     def neighbours(self, row: int, at_least: int = 1) -> tuple[I64, I64]:
         """(N,) keyframe rows and (N,) counts, most shared first, ties to the older."""
-        found = [(-n, other) for other, n in self._rows[row].items() if n >= at_least]
-        found.sort()
-        table = np.array(found, np.int64).reshape(-1, 2)
-        return table[:, 1].copy(), -table[:, 0]
+        shared = self._rows[row]
+        rows, counts = np.fromiter(shared, np.int64, len(shared)), np.fromiter(shared.values(), np.int64, len(shared))
+        rows, counts = rows[counts >= at_least], counts[counts >= at_least]
+        order = np.lexsort((rows, -counts))
+        return rows[order], counts[order]
 
     def matrix(self) -> scipy.sparse.csr_array:
         """(K, K) counts, both triangles, zero diagonal."""

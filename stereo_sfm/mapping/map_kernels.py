@@ -44,6 +44,33 @@ def list_observations(points, head, following, out):
 
 
 @njit
+def count_by_keyframe(points, head, following, obs_kf, counts):
+    """Adds to counts (K,) how many of these points every keyframe sees."""
+    for i in range(points.shape[0]):
+        o = head[points[i]]
+        while o >= 0:
+            counts[obs_kf[o]] += 1
+            o = following[o]
+
+
+@njit
+def list_sightings(points, head, following, obs_kf, kf_index, obs, pt):
+    """Fills obs and pt with the observations of points by the keyframes whose kf_index is not negative.
+
+    Point after point, newest first; pt is the index into points. Returns how many there are.
+    """
+    n = 0
+    for i in range(points.shape[0]):
+        o = head[points[i]]
+        while o >= 0:
+            if kf_index[obs_kf[o]] >= 0:
+                obs[n], pt[n] = o, i
+                n += 1
+            o = following[o]
+    return n
+
+
+@njit
 def unlink(rows, head, following, obs_pt, obs_kf, pairs):
     """Takes observations out of their points' lists, one by one.
 

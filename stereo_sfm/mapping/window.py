@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 
 from stereo_sfm.config import MapperConfig
 from stereo_sfm.geometry import se3
+from stereo_sfm.mapping import map_kernels
 from stereo_sfm.mapping.bundle import Bundle, BundleConfig, BundleResult
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.types import F64, I64, Bool
@@ -33,7 +34,7 @@ class Window:
 
 def bundle_config(config: MapperConfig) -> BundleConfig:
     """How the mapper adjusts its windows."""
-    return BundleConfig(rounds=config.rounds, iterations=config.iterations, huber=config.huber_sigmas)
+    return BundleConfig(config.rounds, config.iterations, config.huber_sigmas, fixed_once=True)
 
 
 def covisible_window(map_: Map, row: int, config: MapperConfig) -> Window:
@@ -57,21 +58,22 @@ def _window(map_: Map, moving: I64, config: MapperConfig) -> Window:
     seen = np.concatenate([table.pt[map_.observations_of_keyframe(int(k))] for k in moving])
     pts = np.unique(seen).astype(np.int64)
     pts = pts[points.alive[pts] & np.isfinite(points.xyz[pts, 0]) & (points.obs_count[pts] > 1)]
-    obs = map_.observations_of_points(pts)
-    around = np.setdiff1d(table.kf[obs], moving)
-    moving = np.sort(moving)
-    kfs = np.concatenate([moving, around]).astype(np.int64)
+    counts = np.zeros(len(map_.keyframes), np.int64)
+    map_kernels.count_by_keyframe(pts, points.head, table.following, table.kf, counts)
+    total, counts[moving] = int(counts.sum()), 0
+    kfs = np.concatenate([np.sort(moving), np.flatnonzero(counts)])
     fixed = np.arange(len(kfs)) >= len(moving)
     fixed |= kfs == 0
     kf_index = np.full(len(map_.keyframes), -1, np.int64)
     kf_index[kfs] = np.arange(len(kfs))
-    obs_kf, obs_pt = kf_index[table.kf[obs]], np.searchsorted(pts, table.pt[obs])
+    obs, obs_pt = np.empty(total, np.int64), np.empty(total, np.int64)
+    map_kernels.list_sightings(pts, points.head, table.following, table.kf, kf_index, obs, obs_pt)
     fixed[_floating(map_, kfs, fixed)] = True
     bundle = Bundle(
         map_.keyframes.map_T_kf[kfs],
         fixed,
         points.xyz[pts],
-        obs_kf,
+        kf_index[table.kf[obs]],
         obs_pt,
         table.uv_left[obs].astype(float),
         table.uv_right[obs].astype(float),
@@ -82,15 +84,13 @@ def _window(map_: Map, moving: I64, config: MapperConfig) -> Window:
 
 def _floating(map_: Map, kfs: I64, fixed: Bool) -> I64:
     """The oldest keyframe (index) of every part that too few shared points tie to a fixed one: it must not drift."""
-    index = {row: i for i, row in enumerate(kfs.tolist())}
-    pairs = [
-        (i, index[other])
-        for row, i in index.items()
-        for other in map_.covisibility.neighbours(row, TIE)[0].tolist()
-        if other in index
-    ]
-    table = np.array(pairs, np.int64).reshape(-1, 2)
-    edges = scipy.sparse.csr_array((np.ones(len(table), np.int8), (table[:, 0], table[:, 1])), shape=(len(kfs),) * 2)
+    index = np.full(len(map_.keyframes), -1, np.int64)
+    index[kfs] = np.arange(len(kfs))
+    free = np.flatnonzero(~fixed)
+    tied = [index[map_.covisibility.neighbours(int(kfs[i]), TIE)[0]] for i in free]
+    i, j = np.repeat(free, [len(others) for others in tied]), np.concatenate([np.zeros(0, np.int64), *tied])
+    i, j = i[j >= 0], j[j >= 0]
+    edges = scipy.sparse.csr_array((np.ones(len(i), np.int8), (i, j)), shape=(len(kfs),) * 2)
     label = connected_components(edges, directed=False)[1]
     floating = np.flatnonzero(~np.isin(label, label[fixed]))
     oldest = floating[np.lexsort((kfs[floating], label[floating]))]

@@ -107,6 +107,21 @@ def test_outliers_are_found_and_do_no_harm(rig: Rig) -> None:
     assert error < 1.5 * bound + 1e-3
 
 
+def test_a_fixed_part_linearised_once_a_round_leads_to_the_same_window(rig: Rig) -> None:
+    scene = make_scene(rig, 14, 500, noise_px=0.5, outliers=0.02)
+    bundle = bundle_of(scene, 0.01, 0.02)
+    fixed = np.arange(14) < 8
+    bundle = dataclasses.replace(bundle, fixed=fixed)
+    bundle.world_T_kf[fixed] = scene.world_T_kf[fixed]
+    exact = bundle_adjust(rig, bundle, BundleConfig(rounds=3, tolerance=1e-9, iterations=30))
+    once = bundle_adjust(rig, bundle, BundleConfig(rounds=3, tolerance=1e-9, iterations=30, fixed_once=True))
+    error = np.linalg.norm(exact.world_T_kf[:, :3, 3] - scene.world_T_kf[:, :3, 3], axis=1).max()
+    apart = np.linalg.norm(exact.world_T_kf[:, :3, 3] - once.world_T_kf[:, :3, 3], axis=1).max()
+    assert apart < 0.1 * error
+    assert once.cost == pytest.approx(exact.cost, rel=1e-3)
+    assert (once.inlier != exact.inlier).mean() < 1e-3
+
+
 def test_fixed_keyframes_stay_to_the_bit(rig: Rig) -> None:
     bundle = bundle_of(make_scene(rig, 8, 200))
     fixed = np.array([True, False, True, False, False, True, False, False])
