@@ -1,6 +1,6 @@
 PY ?= .venv/bin/python
 
-.PHONY: check test bench
+.PHONY: check test docs bench
 check:  ## lint, format, types
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
@@ -9,5 +9,8 @@ check:  ## lint, format, types
 test:  ## the fast tests
 	$(PY) -m pytest
 
-bench:  ## every number of the README
+docs:  ## the documentation as a site in build/site, its links checked
+	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict
+
+bench:  ## every number of the documentation
 	$(PY) -m benchmarks

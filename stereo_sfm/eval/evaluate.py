@@ -72,10 +72,12 @@ def evaluate(
     """Compare two trajectories of the same frame (world_T_cam0 with world_T_cam0).
 
     Args:
-        estimate: what is judged. reference: the truth.
+        estimate: what is judged.
+        reference: the truth.
         mode: the alignment, one of eval.align.MODES.
         delta: what relative errors are taken over: `5f` frames or `1m` metres.
-        interpolate, max_difference_ns: see `associate`.
+        interpolate: see `associate`.
+        max_difference_ns: see `associate`.
 
     Raises:
         StereoSfmError: nothing in common, or the alignment is not determined.

@@ -1,0 +1,77 @@
+"""Pages that the program writes itself: its commands, settings and sources as they are when the docs are built."""
+
+from __future__ import annotations
+
+import argparse
+import ast
+from pathlib import Path
+from typing import Any
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Replace `{{ commands }}` and its like; pages that lie outside docs/ link into it."""
+    for name, make in MAKERS.items():
+        mark = "{{ " + name + " }}"
+        if mark in markdown:
+            markdown = markdown.replace(mark, make())
+    for outside in ("CONTRIBUTING.md", "CHANGELOG.md"):
+        mark = "{{ " + outside + " }}"
+        if mark in markdown:
+            markdown = markdown.replace(mark, Path(outside).read_text().replace("](docs/", "]("))
+    return markdown
+
+
+def _commands() -> str:
+    import importlib
+
+    from stereo_sfm.cli import COMMANDS
+
+    parts: list[str] = []
+    for name, text in COMMANDS.items():
+        parser = argparse.ArgumentParser(
+            f"stereo-sfm {name}", description=text, formatter_class=lambda prog: argparse.HelpFormatter(prog, width=100)
+        )
+        importlib.import_module(f"stereo_sfm.commands.{name.replace('-', '_')}").add_arguments(parser)
+        parts.append(f"## {name}\n\n{text[:1].upper()}{text[1:]}.\n\n```text\n{parser.format_help()}```\n")
+    return "\n".join(parts)
+
+
+def _configuration() -> str:
+    import contextlib
+    import io
+
+    from stereo_sfm.cli import main
+
+    out = io.StringIO()
+    with contextlib.redirect_stdout(out):
+        main(["config", "dump"])
+    return f"```toml\n{out.getvalue()}```"
+
+
+def _sources() -> str:
+    from dataclasses import fields
+
+    from drivers.registry import drivers
+
+    found = dict(drivers())
+    rows = [f"| `{kind}` | {one.summary} | `{kind}:{one.place}` |" for kind, one in found.items()]
+    parts = ["| kind | what it reads | written as |", "|---|---|---|", *rows, ""]
+    for kind, one in found.items():
+        parts += [f"## {kind}", "", f"{one.summary[:1].upper()}{one.summary[1:]}.", ""]
+        parts += ["| option | default | meaning |", "|---|---|---|"]
+        for field in fields(one.options):
+            parts.append(f"| `{field.name}` | `{field.default}` | {field.metadata['doc']} |")
+        parts.append("")
+    return "\n".join(parts)
+
+
+def _examples() -> str:
+    parts: list[str] = []
+    for path in sorted(Path("examples").glob("*.py")):
+        text = path.read_text()
+        title = (ast.get_docstring(ast.parse(text)) or path.stem).splitlines()[0]
+        parts += [f"## {path.name}", "", title, "", "```python", text.rstrip(), "```", ""]
+    return "\n".join(parts)
+
+
+MAKERS = {"commands": _commands, "configuration": _configuration, "sources": _sources, "examples": _examples}
