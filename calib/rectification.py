@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.rig import Rig
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import StereoSfmError, one_of
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.rectify import epipolar_camera, pinhole_camera, remap_tables
@@ -92,8 +92,7 @@ def rectify(
     """
     if rig.right is None or rig.depth:
         raise StereoSfmError("rectification needs two eyes: this source has one")
-    if projection not in ("pinhole", "epipolar"):
-        raise StereoSfmError(f"unknown projection '{projection}': choose pinhole or epipolar")
+    one_of(projection, ("pinhole", "epipolar"), "projection")
     rect_R_left, rect_R_right = rectifying_rotations(rig.left_T_right)
     choose = pinhole_camera if projection == "pinhole" else epipolar_camera
     camera = choose(rig.left, rig.right, rect_R_left, rect_R_right, hfov_deg, size)

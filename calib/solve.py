@@ -13,7 +13,7 @@ import numpy as np
 
 from calib.rig import Rig
 from calib.targets import Detection
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import StereoSfmError, one_of
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, KannalaBrandt, RadTan
 from stereo_sfm.geometry.param_jacobian import parameter_jacobian, parameter_vector, with_parameters
@@ -70,8 +70,7 @@ def calibrate(
     Raises:
         StereoSfmError: too few views, or no start value fits them.
     """
-    if model not in MODELS:
-        raise StereoSfmError(f"unknown lens model '{model}' (choose {', '.join(MODELS)})")
+    one_of(model, MODELS, "lens model")
     observed = _gather(left, right, points)
     eyes = 1 if right is None else 2
     for eye in range(eyes):

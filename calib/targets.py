@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import StereoSfmError, one_of
 from stereo_sfm.types import F64, I64, U8
 
 KINDS = ("checkerboard", "charuco", "aprilgrid")
@@ -42,8 +42,7 @@ class Target:
     dictionary: str = "DICT_4X4_50"
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise StereoSfmError(f"unknown target '{self.kind}' (choose {', '.join(KINDS)})")
+        one_of(self.kind, KINDS, "target")
         if min(self.columns, self.rows) < 2 or not 0.001 < self.size < 2 or not 0.05 < self.ratio < 1:
             raise StereoSfmError("a target needs at least 2 x 2 elements, a size in metres, and a ratio below one")
 

@@ -49,8 +49,7 @@ def _configuration() -> str:
 
 
 def _sources() -> str:
-    from dataclasses import fields
-
+    from drivers.options import described
     from drivers.registry import drivers
 
     found = dict(drivers())
@@ -59,8 +58,9 @@ def _sources() -> str:
     for kind, one in found.items():
         parts += [f"## {kind}", "", f"{one.summary[:1].upper()}{one.summary[1:]}.", ""]
         parts += ["| option | default | meaning |", "|---|---|---|"]
-        for field in fields(one.options):
-            parts.append(f"| `{field.name}` | `{field.default}` | {field.metadata['doc']} |")
+        for option in described(one.options):
+            default = f"`{option.default}`" if option.default else ""
+            parts.append(f"| `{option.name}` | {default} | {option.doc}{': ' * bool(option.wanted)}{option.wanted} |")
         parts.append("")
     return "\n".join(parts)
 

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any, ParamSpec, Protocol
 
 from drivers.selection import EVERYTHING, Selection
 from drivers.source import is_device, look_up, open_source, path_of
-from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.words import one_of
+from stereo_sfm.errors import StereoSfmError, one_of
 
 if TYPE_CHECKING:
     from calib.rig import Rig

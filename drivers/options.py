@@ -20,8 +20,7 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.words import did_you_mean
+from stereo_sfm.errors import StereoSfmError, did_you_mean
 
 if TYPE_CHECKING:
     from drivers.rig_option import RigOption
@@ -100,7 +99,8 @@ def described(cls: type[SourceOptions]) -> Iterator[OptionHelp]:
     for f in fields(cls):
         custom = f.metadata.get("read") is not None
         wanted = "" if custom else _wanted(types[f.name], f)
-        yield OptionHelp(f.name, _shown(f.default), wanted, str(f.metadata.get("doc", "")))
+        default = "auto" if f.default is None and not custom else _shown(f.default)
+        yield OptionHelp(f.name, default, wanted, str(f.metadata.get("doc", "")))
 
 
 def _shown(default: Any) -> str:
@@ -117,7 +117,7 @@ def _read(source: str, f: Field[Any], kind: Any, value: Any) -> Any:
     try:
         return custom(value) if custom is not None else _limited(f, _convert(kind, value))
     except ValueError as error:
-        wanted = str(error) if custom is not None else _wanted(kind, f)
+        wanted = str(error) if custom is not None else _wanted(kind, f) + did_you_mean(str(value), _words(kind))
         raise StereoSfmError(f"{source}: option {f.name}={value}: it must be {wanted}") from None
 
 
@@ -180,6 +180,12 @@ def _wanted(kind: Any, f: Field[Any]) -> str:
     if low is None or high is None:
         return auto + number
     return f"{auto}{number} from {low:g} to {high:g}"
+
+
+def _words(kind: Any) -> tuple[str, ...]:
+    """The words of a Literal."""
+    kind = _inner(kind)
+    return get_args(kind) if get_origin(kind) is Literal else ()
 
 
 def _optional(kind: Any) -> bool:

@@ -10,9 +10,8 @@ from calib.rectification import PROJECTIONS, rectify
 from calib.rig import Rig
 from drivers.source import Source, Stamps
 from drivers.wrapped import WrappedSource
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import StereoSfmError, one_of
 from stereo_sfm.types import StereoImage, Trajectory
-from stereo_sfm.words import one_of
 
 
 class RectifiedSource(WrappedSource):

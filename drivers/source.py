@@ -13,8 +13,7 @@ from urllib.parse import parse_qsl
 from drivers import registry
 from drivers.driver import Driver
 from drivers.options import SourceOptions, read_options
-from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.words import did_you_mean
+from stereo_sfm.errors import StereoSfmError, did_you_mean
 
 if TYPE_CHECKING:
     from calib.rig import Rig

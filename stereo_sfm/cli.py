@@ -8,10 +8,11 @@ import io
 import logging
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import NoReturn
 
 from stereo_sfm.commands._stop import INTERRUPTED
-from stereo_sfm.errors import StereoSfmError, from_os_error
+from stereo_sfm.errors import StereoSfmError, did_you_mean, from_os_error
 
 # subcommand -> what `--help` says; the code is in stereo_sfm/commands/<name with _ for ->.py
 COMMANDS: dict[str, str] = {
@@ -33,6 +34,7 @@ COMMANDS: dict[str, str] = {
     "vocabulary": "train the words of place recognition, or describe them",
     "ablation": "features, estimators and modules of the papers side by side",
     "eval": "compare a trajectory with ground truth",
+    "sources": "what can be opened: kinds of cameras and data sets, with their options",
     "devices": "which cameras are attached",
     "t265": "firmware and reset of a T265",
     "udev": "rules that let everybody use the cameras (Linux)",
@@ -40,8 +42,32 @@ COMMANDS: dict[str, str] = {
 }
 
 
+class _Parser(argparse.ArgumentParser):
+    """A word or an option that is not known gets a guess at what was meant."""
+
+    def _check_value(self, action: argparse.Action, value: object) -> None:
+        try:
+            super()._check_value(action, value)
+        except argparse.ArgumentError as error:
+            if error.message and action.choices is not None:
+                error.message += did_you_mean(str(value), map(str, action.choices))
+            raise
+
+    def error(self, message: str) -> NoReturn:
+        unknown = message.partition("unrecognized arguments: ")[2].partition(" ")[0].partition("=")[0]
+        options = [name for parser in self._all() for name in parser._option_string_actions]  # pyright: ignore[reportPrivateUsage]
+        super().error(message + (did_you_mean(unknown, options) if unknown else ""))
+
+    def _all(self) -> Iterator[argparse.ArgumentParser]:
+        """This parser and those of the commands below it."""
+        yield self
+        for action in self._actions:
+            if isinstance(action, argparse._SubParsersAction):  # pyright: ignore[reportPrivateUsage]
+                yield from action.choices.values()
+
+
 def _build_parser(chosen: str | None) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="stereo-sfm",
         description="Visual structure-from-motion and SLAM for stereo cameras in retail stores.",
     )

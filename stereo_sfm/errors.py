@@ -46,11 +46,29 @@ def from_os_error(error: OSError) -> StereoSfmError | None:
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """ ", did you mean NAME?" for a misspelt word of a list; "" where none is near."""
+    """ ", did you mean NAME?" for a misspelt word of a list, whatever its case; "" where none is near."""
     from difflib import get_close_matches
 
-    near = get_close_matches(word.lower(), known, 1)
-    return f", did you mean {near[0]}?" if near else ""
+    names = {name.lower(): name for name in known}
+    near = get_close_matches(word.lower(), names, 1)
+    return f", did you mean {names[near[0]]}?" if near else ""
+
+
+def one_of(word: str, known: Iterable[str], what: str) -> str:
+    """The word, which must be one of a list.
+
+    Args:
+        word: as the user wrote it.
+        known: the list.
+        what: what such a word stands for, for the message: "scene", "projection".
+
+    Raises:
+        StereoSfmError: it is none of them; with the nearest one and all of them.
+    """
+    names = tuple(known)
+    if word in names:
+        return word
+    raise StereoSfmError(f"unknown {what} '{word}'{did_you_mean(word, names)} (choose one of {', '.join(names)})")
 
 
 @contextmanager

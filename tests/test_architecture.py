@@ -13,7 +13,6 @@ PACKAGES = ("stereo_sfm", "drivers", "calib")
 # The rooms, the ground floor first: each may import from rooms above it in this list, never from those below.
 ROOMS: tuple[str, ...] = (
     "stereo_sfm.errors",
-    "stereo_sfm.words",
     "stereo_sfm.timing",
     "stereo_sfm.types",
     "stereo_sfm.pixels",

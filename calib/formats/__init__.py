@@ -10,7 +10,7 @@ from typing import Any
 
 from calib.formats.common import read_text
 from calib.rig import Rig
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import StereoSfmError, one_of
 
 log = logging.getLogger("stereo_sfm")
 
@@ -108,6 +108,5 @@ def _recognise_file(path: Path) -> str | None:
 
 
 def _function(name: str, which: int) -> Callable[..., Any]:
-    if name not in FORMATS:
-        raise StereoSfmError(f"unknown calibration format '{name}' (known: {', '.join(FORMATS)})")
+    one_of(name, FORMATS, "calibration format")
     return getattr(importlib.import_module(f"calib.formats.{FORMATS[name][0]}"), str(FORMATS[name][which]))

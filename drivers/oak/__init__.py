@@ -26,7 +26,7 @@ class OakOptions(SourceOptions):
 
     size: tuple[int, int] = option((640, 400), "WIDTHxHEIGHT of the images", read=_size)
     fps: float = option(30.0, "images a second", low=1, high=120)
-    exposure: int | None = option(None, "microseconds; auto: automatic exposure", low=20, high=33_000)
+    exposure: int | None = option(None, "microseconds, or as the camera decides", low=20, high=33_000)
     iso: int = option(400, "with manual exposure", low=100, high=1600)
     anti_flicker: Literal["50", "60", "auto", "off"] = option("50", "Hz of the mains, with automatic exposure")
     max_exposure: int | None = option(None, "microseconds, with automatic exposure", low=20, high=33_000)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from drivers.driver import Driver
 from drivers.sim.options import SimOptions
-from stereo_sfm.words import one_of
+from stereo_sfm.errors import one_of
 
 if TYPE_CHECKING:
     from drivers.source import Source

@@ -16,7 +16,7 @@ import numpy as np
 from drivers.sim.people import Looks, Part, Thing, standing
 from drivers.sim.walks import Walk
 from drivers.sim.world import CLOTHES, SKIN
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import one_of
 from stereo_sfm.types import F64
 
 FIRST_S, PAUSE_S = 4.0, 3.0  # before the first encounter, and between the end of one and the beginning of the next
@@ -47,9 +47,8 @@ def plan(words: str, walk: Walk, rng: np.random.Generator) -> list[Encounter]:
         StereoSfmError: a word that names no kind.
     """
     kinds = list(KINDS) if words == "all" else [word for word in words.split(",") if word]
-    unknown = [kind for kind in kinds if kind not in KINDS]
-    if unknown:
-        raise StereoSfmError(f"sim: no encounter '{unknown[0]}' (encounters: {', '.join(KINDS)}, all)")
+    for kind in kinds:
+        one_of(kind, (*KINDS, "all"), "encounter")
     out: list[Encounter] = []
     begin = FIRST_S
     while kinds:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib.rig import Rig
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import one_of
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, KannalaBrandt, Pinhole, RadTan
 
@@ -57,9 +57,7 @@ def make_rig(name: str, size: tuple[int, int] | None = None) -> Rig:
     Raises:
         StereoSfmError: unknown name.
     """
-    if name not in CAMERAS:
-        raise StereoSfmError(f"sim: unknown camera '{name}' (cameras: {', '.join(CAMERAS)})")
-    rig = CAMERAS[name]()
+    rig = CAMERAS[one_of(name, CAMERAS, "camera")]()
     if size is None:
         return rig
     right = _scaled(rig.right, *size) if rig.right is not None else None

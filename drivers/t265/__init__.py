@@ -28,7 +28,7 @@ class T265Options(SourceOptions):
     """Options of `t265`, `t265:SERIAL` and `t265:simulated`; the last five are the simulated camera's."""
 
     exposure: int | None = option(
-        None, "microseconds; auto: automatic exposure", low=m.MIN_EXPOSURE_US, high=m.MAX_EXPOSURE_US
+        None, "microseconds, or as the camera decides", low=m.MIN_EXPOSURE_US, high=m.MAX_EXPOSURE_US
     )
     gain: float = option(2.0, "with manual exposure", low=m.MIN_GAIN, high=m.MAX_GAIN)
     anti_flicker: Literal["50", "60", "off"] = option("50", "Hz of the mains, with automatic exposure")

@@ -28,6 +28,15 @@ def typed(kind: type[T], args: argparse.Namespace) -> T:
     return kind(**{name: getattr(args, name) for name in names})
 
 
+def add_source(parser: argparse.ArgumentParser, default: str = "", metavar: str | None = None) -> None:
+    """The argument that names what is read; `default` says what is read without it."""
+    from drivers.registry import kinds
+
+    text = f"a folder or file, or KIND:PLACE?OPTION=VALUE of {', '.join(kinds())} ('stereo-sfm sources KIND')"
+    text += f" (default: {default})" if default else ""
+    parser.add_argument("source", nargs="?" if default else None, metavar=metavar, help=text)
+
+
 def add_source_arguments(parser: argparse.ArgumentParser) -> None:
     """Options that choose the calibration and a part of a source."""
     from drivers.choice import RECTIFY

@@ -85,10 +85,11 @@ def _check_files(rig: Path, report: Path, overwrite: bool) -> None:
 def make_target(args: argparse.Namespace) -> Target:
     """The target of the options or of the file."""
     from calib.targets import KINDS, Target, read_target
-    from stereo_sfm.errors import StereoSfmError
+    from stereo_sfm.errors import StereoSfmError, one_of
 
     if args.target not in KINDS:
-        return read_target(Path(args.target))
+        path = Path(args.target)
+        return read_target(path if path.exists() or path.suffix else Path(one_of(args.target, KINDS, "target")))
     if args.columns is None or args.rows is None or args.square is None:
         raise StereoSfmError("a target needs --columns, --rows and --square (metres), or a YAML file as --target")
     ratio = args.ratio if args.ratio is not None else 0.3 if args.target == "aprilgrid" else 0.75

@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from stereo_sfm.commands._options import add_source
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
@@ -18,7 +20,7 @@ SHUTTER_FRAMES = 200  # looked at for a rolling shutter
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument("source", help="a folder, an .mcap file, sim:..., t265 or oak")
+    add_source(parser)
     parser.add_argument("--rig", type=Path, default=None, help="calibration to judge instead of the source's own")
     parser.add_argument("--windows", type=int, default=10, help="short stretches of the recording to look at")
     parser.add_argument("--max-frames", type=int, default=600, help="stop reading after so many frames")

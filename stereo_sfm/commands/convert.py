@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import argparse
 
-from stereo_sfm.commands._options import source_choice, typed
+from stereo_sfm.commands._options import add_source, source_choice, typed
 from stereo_sfm.commands.record import RecordOptions, add_output_arguments, write
 from stereo_sfm.errors import StereoSfmError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
-    parser.add_argument("source", metavar="FOLDER", help="a dataset folder, an .mcap file, or KIND:PATH")
+    add_source(parser)
     add_output_arguments(parser)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stereo_sfm.commands._options import add_source_arguments, source_choice, typed
+from stereo_sfm.commands._options import add_source, add_source_arguments, source_choice, typed
 from stereo_sfm.commands._progress import progress
 from stereo_sfm.commands._stop import INTERRUPTED, StopRequest
 from stereo_sfm.errors import StereoSfmError
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
-    parser.add_argument("source", help="t265, oak, sim:SCENE, a dataset folder, an .mcap file, or KIND:PATH")
+    add_source(parser)
     add_output_arguments(parser)
 
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from stereo_sfm.commands._options import add_source
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -15,7 +18,7 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument("source", help="a folder, an .mcap file, sim:..., t265 or oak")
+    add_source(parser)
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder for the pictures and rig.yaml")
     parser.add_argument("--projection", choices=("epipolar", "pinhole"), default="epipolar")
     parser.add_argument("--hfov", type=float, default=None, metavar="DEG", help="horizontal field of view")
@@ -87,17 +90,10 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
 
 
 def spread(source: Source, count: int) -> Iterator[StereoImage]:
-    """About `count` frames evenly over the source, the first of a live one."""
-    step = 1
-    if source.frame_count is not None and not source.live:
-        step = max(1, source.frame_count // max(count, 1))
-    given = 0
-    for i, image in enumerate(source):
-        if i % step == 0:
-            given += 1
-            yield image
-        if given >= count:
-            return
+    """About `count` frames evenly over the source and no others; the first of one whose length is not known."""
+    known = source.frame_count if not source.live else None
+    step = max(1, (known or count) // count)
+    return islice(source.at(range(0, known or count, step)), count)
 
 
 def _error(text: str) -> Exception:

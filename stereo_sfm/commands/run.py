@@ -7,6 +7,7 @@ from pathlib import Path
 
 from stereo_sfm.commands._options import (
     add_config_arguments,
+    add_source,
     add_source_arguments,
     add_talk_arguments,
     add_wiring_arguments,
@@ -18,11 +19,7 @@ from stereo_sfm.commands._options import (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
-    parser.add_argument(
-        "source",
-        nargs="?",
-        help="a dataset folder, an .mcap file, sim:SCENE, t265, oak, or KIND:PATH (default: the bundled recording)",
-    )
+    add_source(parser, default="the bundled recording")
     parser.add_argument("-o", "--output", type=Path, help="output folder (default: runs/DATE_NAME)")
     parser.add_argument("--overwrite", action="store_true", help="replace the run that lies in the output folder")
     add_source_arguments(parser)

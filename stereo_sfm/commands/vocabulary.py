@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -89,19 +88,11 @@ def spread(count: int, wanted: int) -> list[int]:
 
 def _descriptors(spec: str, wanted: int) -> Iterator[U8]:
     """(N, 32) of images that lie evenly over a source; of the first ones where nobody knows how many it has."""
-    from drivers.sim.source import SimSource
     from drivers.source import open_source
     from stereo_sfm.maps.single_image import still_keyframe
 
     with open_source(spec) as source:
-        chosen = spread(source.frame_count or wanted, wanted)
-        if isinstance(source, SimSource):  # the simulator renders any frame alone
-            images = (source.frame(int(k)) for k in source.frame_ids[chosen])
-        else:
-            wanted_ones = set(chosen)
-            first = islice(source, max(chosen, default=-1) + 1)
-            images = (image for n, image in enumerate(first) if n in wanted_ones)
-        for image in images:
+        for image in source.at(spread(source.frame_count or wanted, wanted)):
             keyframe = still_keyframe(image, source.rig)
             if keyframe is not None:
                 yield keyframe.corners.descriptors

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import StereoSfmError, one_of
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, Trajectory
 
@@ -44,8 +44,7 @@ def align(estimate: Trajectory, reference: Trajectory, mode: str = "se3") -> Ali
         raise StereoSfmError("positions without orientations have no first pose to align: try --align se3")
     if mode == "origin":
         return Alignment(reference.poses[0] @ se3.inverse(estimate.poses[0]), 1.0)
-    if mode not in MODES:
-        raise StereoSfmError(f"unknown alignment '{mode}' ({', '.join(MODES)})")
+    one_of(mode, MODES, "alignment")
     try:
         transform, scale = se3.umeyama(estimate.positions, reference.positions, with_scale=mode == "sim3")
     except ValueError as error:

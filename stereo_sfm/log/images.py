@@ -10,7 +10,7 @@ import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import StereoSfmError, one_of
 from stereo_sfm.pixels import MOST_PIXELS, decode, decode_gray, eight_bits
 from stereo_sfm.types import F32, U8, U16, StereoImage
 
@@ -57,8 +57,7 @@ def encode_pixels(pixels: U8, image_format: str) -> bytes:
     """(H, W) u8 -> bytes of the file, or the pixels row by row for `raw`."""
     if image_format == "raw":
         return np.ascontiguousarray(pixels).tobytes()
-    if image_format not in FORMATS:
-        raise StereoSfmError(f"unknown image format '{image_format}' (known: {', '.join(FORMATS)})")
+    one_of(image_format, FORMATS, "image format")
     suffix, options = (".png", PNG_OPTIONS) if image_format == "png" else (".jpg", JPEG_OPTIONS)
     done, data = cv2.imencode(suffix, pixels, options)
     if not done:

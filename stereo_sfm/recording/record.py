@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from drivers.source import Source
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import StereoSfmError, one_of
 from stereo_sfm.log.image_log import ImageLog
 from stereo_sfm.log.images import FORMATS, encode_pair
 from stereo_sfm.log.provenance import TOTALS, Opening, write_provenance
@@ -49,8 +49,7 @@ def record(
     Raises:
         StereoSfmError: the file cannot be written, the disk is full, the source fails, or it gave no frame.
     """
-    if image_format not in FORMATS:
-        raise StereoSfmError(f"unknown image format '{image_format}' (known: {', '.join(FORMATS)})")
+    one_of(image_format, FORMATS, "image format")
     frames, dropped, first_ns = 0, 0, None
     with LogWriter(path, overwrite=overwrite, compress=image_format != "raw", clock=clock) as writer:
         write_provenance(

@@ -61,7 +61,7 @@ def test_what_is_not_said_is_the_default() -> None:
         ("flip", "maybe", "on or off"),
         ("word", "up", "one of left, right"),
         ("range", "x", "LOW-HIGH, such as 1-2"),
-        ("rat", "1", r"cam has no option 'rat': did you mean 'rate'\? \(it has: count, exposure"),
+        ("rat", "1", r"cam has no option 'rat', did you mean rate\? \(it has: count, exposure"),
         ("zzz", "1", r"cam has no option 'zzz' \(it has:"),
     ],
 )
@@ -77,7 +77,7 @@ def test_the_declaration_is_the_documentation() -> None:
     assert (helps["rate"].default, helps["rate"].wanted, helps["rate"].doc) == (
         "30", "a number from 1 to 120", "images a second",
     )  # fmt: skip
-    assert (helps["flip"].default, helps["range"].default, helps["exposure"].default) == ("off", "1x2", "")
+    assert (helps["flip"].default, helps["range"].default, helps["exposure"].default) == ("off", "1x2", "auto")
 
 
 def test_an_error_of_a_driver_is_not_reported_as_the_users() -> None:

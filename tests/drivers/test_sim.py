@@ -225,7 +225,7 @@ def test_encounters_come_by_turns_and_from_the_seed() -> None:
     assert [e.end for e in one.encounters] != [e.end for e in other.encounters]
     assert same(one.frame(200), same_seed.frame(200))
     assert {e.kind for e in small("loop", encounters="all", length=1000.0).encounters} == set(ENCOUNTER_SHARES)
-    with pytest.raises(StereoSfmError, match="no encounter 'dance'"):
+    with pytest.raises(StereoSfmError, match="unknown encounter 'dance'"):
         small("loop", encounters="cart,dance")
 
 

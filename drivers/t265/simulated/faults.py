@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import one_of
 
 NEVER = -1
 
@@ -71,8 +71,7 @@ def preset(names: str) -> Faults:
     """
     out, default = Faults(), Faults()
     for name in filter(None, names.split(",")):
-        if name not in PRESETS:
-            raise StereoSfmError(f"t265:simulated: unknown fault '{name}' (faults: {', '.join(PRESETS)})")
+        one_of(name, PRESETS, "fault")
         changed = {k: v for k, v in vars(PRESETS[name]).items() if v != getattr(default, k)}
         out = replace(out, **changed)
     return out

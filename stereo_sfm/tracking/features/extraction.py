@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from stereo_sfm.config import FeaturesConfig
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import one_of
 from stereo_sfm.types import F32, F64, U8, Bool, Message
 
 
@@ -69,9 +69,7 @@ def feature_kind(name: str) -> FeatureKind:
     Raises:
         StereoSfmError: unknown name.
     """
-    if name not in TABLE:
-        raise StereoSfmError(f"unknown features '{name}': choose one of {', '.join(TABLE)}")
-    return TABLE[name]
+    return TABLE[one_of(name, TABLE, "features")]
 
 
 class Extractor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 
 from stereo_sfm.config import OdometryConfig
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import one_of
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.tracking.features.odometry.base import Estimator
 
@@ -27,8 +27,7 @@ def make_estimator(config: OdometryConfig, camera: Camera) -> Estimator:
     Raises:
         StereoSfmError: unknown name.
     """
-    if config.method not in TABLE:
-        raise StereoSfmError(f"unknown odometry '{config.method}': choose one of flow, {', '.join(TABLE)}")
+    one_of(config.method, ("flow", *TABLE), "odometry")
     module, name = TABLE[config.method]
     factory = getattr(importlib.import_module(f"{_PACKAGE}.{module}"), name)
     return factory(config, camera) if config.method == "vp-r" else factory(config)

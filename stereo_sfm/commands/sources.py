@@ -1,0 +1,33 @@
+"""`stereo-sfm sources`: the kinds of sources that the installed drivers open, and the options of one."""
+
+from __future__ import annotations
+
+import argparse
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of this command."""
+    parser.add_argument("kind", nargs="?", metavar="KIND", help="one of them, with its options")
+
+
+def run(args: argparse.Namespace) -> int:
+    """List the kinds, or the options of one."""
+    from drivers.registry import driver, drivers, kinds
+    from stereo_sfm.errors import one_of
+
+    if args.kind is None:
+        rows = [(f"{kind}:{found.place}", found.summary) for kind, found in drivers()]
+        print("\n".join(_table(("source", "what it reads"), rows)))
+        return 0
+    from drivers.options import described
+
+    found = driver(one_of(args.kind, kinds(), "source"))
+    print(f"{args.kind}:{found.place}?OPTION=VALUE&...: {found.summary}\n")
+    rows = [(h.name, h.default or "-", ": ".join(filter(None, (h.doc, h.wanted)))) for h in described(found.options)]
+    print("\n".join(_table(("option", "default", "meaning"), rows)))
+    return 0
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> list[str]:
+    widths = [max(len(row[k]) for row in (head, *rows)) for k in range(len(head))]
+    return ["  ".join(text.ljust(w) for text, w in zip(row, widths, strict=True)).rstrip() for row in (head, *rows)]

@@ -1,0 +1,56 @@
+"""Frames at chosen positions: the same as those of an iteration, and no others are made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers import open_source
+from drivers.memory import MemorySource
+from drivers.rectified import rectified
+from drivers.replayed import ReplayedSource
+from drivers.sim.source import SimSource
+from drivers.source import Source
+from stereo_sfm.cli import main
+from tests.drivers.dataset_folders import make_kitti
+
+SPEC = "sim:aisle?camera=pinhole&size=160x100&frames=9&effects=0"
+
+
+def in_memory() -> MemorySource:
+    with open_source(SPEC) as source:
+        return MemorySource(source.rig, list(source), count=14, there_and_back=True)
+
+
+@pytest.mark.parametrize(
+    "opened",
+    [
+        lambda folder: open_source(SPEC),
+        lambda folder: open_source(f"{SPEC}&drop=0.3"),
+        lambda folder: open_source(make_kitti(folder, frames=9)),
+        lambda folder: in_memory(),
+        lambda folder: rectified(open_source(SPEC), "pinhole"),
+        lambda folder: ReplayedSource(open_source(SPEC), range(1, 9)),
+    ],
+)
+def test_the_frames_are_those_of_the_iteration(opened: Callable[[Path], Source], tmp_path: Path) -> None:
+    with opened(tmp_path) as source:
+        images = list(source)
+        for positions in ([0, 2, 5], [1], range(3), []):
+            chosen = list(source.at(positions))
+            assert [i.frame_id for i in chosen] == [images[k].frame_id for k in positions]
+            for image, k in zip(chosen, positions, strict=True):
+                assert image.stamp_ns == images[k].stamp_ns
+                np.testing.assert_array_equal(image.left, images[k].left)
+
+
+def test_rectify_renders_no_more_than_it_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rendered: list[int] = []
+    frame = SimSource.frame
+    monkeypatch.setattr(SimSource, "frame", lambda self, k, *rest: (rendered.append(k), frame(self, k, *rest))[1])
+    assert main(["rectify", SPEC, "--frames", "2", "-o", str(tmp_path / "out")]) == 0
+    assert rendered == [0, 4]
+    assert len(list((tmp_path / "out").glob("pair_*.png"))) == 2
