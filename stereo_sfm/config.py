@@ -328,11 +328,11 @@ def _as_float(value: Any) -> Any:
     return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
-def load(path: Path | None = None, overrides: Iterable[str] = (), base: dict[str, Any] | None = None) -> Config:
+def load(path: Path | str | None = None, overrides: Iterable[str] = (), base: dict[str, Any] | None = None) -> Config:
     """Defaults, `base`, a TOML file, then `key.subkey=value` overrides, values read as TOML (else as text)."""
     data: dict[str, Any] = _of_today(base or {})
     if path is not None:
-        data = _merge(data, _of_today(_read(path)))
+        data = _merge(data, _of_today(_read(Path(path).expanduser())))
     for override in overrides:
         data = _merge(data, _of_today(_parsed(override)))
     return from_dict(data)

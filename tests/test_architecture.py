@@ -34,6 +34,7 @@ ROOMS: tuple[str, ...] = (
     "stereo_sfm.viz",
     "stereo_sfm.pipeline",
     "stereo_sfm.eval",
+    "stereo_sfm.system",
     "stereo_sfm.demo",
     "stereo_sfm.commands",
     "stereo_sfm.cli",

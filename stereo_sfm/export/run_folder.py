@@ -17,6 +17,7 @@ from stereo_sfm.errors import StereoSfmError
 TRAJECTORIES = ("trajectory_odom.tum", "trajectory_odom.kitti", "trajectory_map.tum", "trajectory_map.kitti")
 PICTURES = ("trajectory.png", "errors.png", "tracking.png", "times.png")
 NUMBERS = ("keyframes.tum", "config.toml", "rig.yaml", "stats.json", "report.md")
+KEPT_MAP = "map"  # folder of the run's own map
 FILES = ("run.mcap", "run.rrd", *TRAJECTORIES, *NUMBERS, *PICTURES)
 
 
@@ -74,6 +75,9 @@ def prepare_folder(folder: Path, overwrite: bool) -> FolderLock:
 def discard_files(folder: Path) -> None:
     """Remove the files of a run; whatever else lies there stays."""
     made_later = [*folder.glob("export_*"), *folder.glob("matches/*.png")]
+    if (folder / KEPT_MAP / "map.json").is_file():
+        made_later += [folder / KEPT_MAP / name for name in ("map.json", "rig.yaml")]
+        made_later += [*(folder / KEPT_MAP).glob("*.npz")]
     for path in [*(folder / name for name in FILES), *(path for path in made_later if path.is_file())]:
         path.unlink(missing_ok=True)
 

@@ -39,7 +39,7 @@ from stereo_sfm.mapping import culling, window
 from stereo_sfm.mapping.bundle import BundleConfig, BundleResult, bundle_adjust
 from stereo_sfm.mapping.correction import apply_loop, fuse_pairs, loop_is_known
 from stereo_sfm.mapping.insertion import insert_keyframe
-from stereo_sfm.mapping.map import Map
+from stereo_sfm.mapping.map import Map, MapSnapshot
 from stereo_sfm.mapping.triangulate import triangulate
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.types import F64, I64, Bool, Keyframe, LoopResult, MapUpdate
@@ -232,6 +232,14 @@ class Mapper:
     def finish_job(self, result: BundleResult) -> None:
         """Bring the answer of the job taken last. It counts when it is due, not before."""
         self._answer = result
+
+    def snapshot(self) -> MapSnapshot:
+        """The living map."""
+        return self.map.snapshot()
+
+    def place(self, saved: MapSnapshot) -> LoopResult | None:
+        """Nowhere: this mapper began with no saved map."""
+        return None
 
     def _apply_job(self) -> None:
         assert self._job is not None

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Protocol
 
 from stereo_sfm.types import Keyframe, LoopResult, MapUpdate
+
+if TYPE_CHECKING:
+    from stereo_sfm.mapping.bundle import BundleResult
+    from stereo_sfm.mapping.map import MapSnapshot
+    from stereo_sfm.mapping.mapper import Job
 
 
 class AnyMapper(Protocol):
@@ -12,4 +18,43 @@ class AnyMapper(Protocol):
 
     def step(self, keyframe: Keyframe, loop: LoopResult | None = None) -> MapUpdate: ...
 
-    def finish(self, loops: list[LoopResult]) -> MapUpdate | None: ...
+    def finish(self, loops: Sequence[LoopResult]) -> MapUpdate | None: ...
+
+    # -- work beside the steps: a full bundle adjustment that another process computes ---------------------------------
+
+    @property
+    def job_due(self) -> bool:
+        """Whether the next step applies the answer of the job in the background."""
+        ...
+
+    def pending_job(self) -> Job | None:
+        """A job that nobody has taken yet."""
+        ...
+
+    def finish_job(self, result: BundleResult) -> None:
+        """The answer of the job that was taken last."""
+        ...
+
+    # -- what is kept ------------------------------------------------------------------------------------------------
+
+    def snapshot(self) -> MapSnapshot | None:
+        """The map that was made; None where none is made."""
+        ...
+
+    def place(self, saved: MapSnapshot) -> LoopResult | None:
+        """Where the map that was made lies in the saved map that the run began with; None: nowhere."""
+        ...
+
+
+class WithoutJobs:
+    """For a mapper that leaves nothing to other processes."""
+
+    @property
+    def job_due(self) -> bool:
+        return False
+
+    def pending_job(self) -> Job | None:
+        return None
+
+    def finish_job(self, result: BundleResult) -> None:
+        raise AssertionError("no job was given")

@@ -21,7 +21,6 @@ from stereo_sfm.maps.header import checksum
 from stereo_sfm.timing import NoSpans
 
 if TYPE_CHECKING:
-    from stereo_sfm.loop.vocabulary import Vocabulary
     from stereo_sfm.maps.saved_map import SavedMap
 
 
@@ -37,6 +36,7 @@ class MapFolders:
     map_in: Path | None = None
     localize_only: bool = False
     map_out: Path | None = None
+    kept: Path | None = None  # folder of the run's own map, for later exports; None: it is not kept
 
     def check(self, overwrite: bool = False) -> None:
         """Raises StereoSfmError for what cannot work, before anything is computed."""
@@ -88,49 +88,56 @@ def make_mapper(config: Config, rig: Rig, spans: NoSpans, folders: MapFolders) -
     return localizer if folders.localize_only else Extension(config.mapper, rig, spans, config.loop, localizer)
 
 
+def saved_map_of(mapper: AnyMapper, config: Config, rig: Rig) -> SavedMap | None:
+    """The map of a run as it can be saved; None where nothing is mapped."""
+    from stereo_sfm.maps.saved_map import SavedMap
+
+    snapshot = mapper.snapshot()
+    if snapshot is None or not len(snapshot.kf_ids) or not len(snapshot.points):
+        return None
+    vocabulary = configured_vocabulary(config.loop)
+    return SavedMap(snapshot, rig, vocabulary.id, np.zeros(len(snapshot.kf_ids), np.int64))
+
+
 def save_result(mapper: AnyMapper, config: Config, rig: Rig, folders: MapFolders) -> None:
-    """Write the map of a finished run to `map_out`, merged with `map_in`.
+    """Write the map of a finished run to `map_out`, merged with `map_in`, and to `kept`.
+
+    A run that goes on with a saved map and leaves none behind keeps none: its part alone is in no frame of its own.
 
     Raises:
         StereoSfmError: it cannot be merged, and the walk's own map was written instead (beside `map_out` where that is
             the map it should have been merged with).
         OSError: the disk does not take it.
     """
-    from stereo_sfm.mapping.mapper import Mapper
+    from stereo_sfm.maps.saved_map import save_map
 
-    if folders.map_out is None or not isinstance(mapper, Mapper):
+    kept = folders.kept if folders.map_in is None or folders.map_out is not None else None
+    if folders.map_out is None and kept is None:
         return
-    from stereo_sfm.maps.saved_map import SavedMap, save_map
-
-    snapshot = mapper.map.snapshot()
-    if not len(snapshot.kf_ids) or not len(snapshot.points):
-        log.warning("nothing was mapped: no map is written to %s", folders.map_out)
+    saved, out, failure = saved_map_of(mapper, config, rig), folders.map_out, ""
+    if saved is None:
+        if out is not None and not folders.localize_only:
+            log.warning("nothing was mapped: no map is written to %s", out)
         return
-    vocabulary = configured_vocabulary(config.loop)
-    saved, out, failure = (
-        SavedMap(snapshot, rig, vocabulary.id, np.zeros(len(snapshot.kf_ids), np.int64)),
-        folders.map_out,
-        "",
-    )
-    if folders.map_in is not None:
+    if folders.map_in is not None and out is not None:
         try:
-            saved = _merged(mapper, saved, folders.map_in, vocabulary, config)
+            saved = _merged(mapper, saved, folders.map_in, config)
         except StereoSfmError as error:
             out = _beside(out) if out.resolve() == folders.map_in.resolve() else out
             failure = f"not merged with {folders.map_in}: {error}; {out} is this walk alone"
-    save_map(saved, out)
+    for folder in dict.fromkeys(place.absolute() for place in (out, kept) if place is not None):
+        save_map(saved, folder)
     if failure:
         raise StereoSfmError(failure)
 
 
-def _merged(mapper: AnyMapper, walk: SavedMap, map_in: Path, vocabulary: Vocabulary, config: Config) -> SavedMap:
-    from stereo_sfm.maps.extension import Extension
+def _merged(mapper: AnyMapper, walk: SavedMap, map_in: Path, config: Config) -> SavedMap:
     from stereo_sfm.maps.merge import merge
     from stereo_sfm.maps.saved_map import load_map
 
     before = load_map(map_in, walk.rig)
-    place = mapper.place(before.snapshot) if isinstance(mapper, Extension) else None
-    return merge([before, walk], vocabulary, config.loop, config.mapper, place).saved
+    place = mapper.place(before.snapshot)
+    return merge([before, walk], configured_vocabulary(config.loop), config.loop, config.mapper, place).saved
 
 
 def _beside(folder: Path) -> Path:

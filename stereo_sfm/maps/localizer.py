@@ -12,13 +12,14 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.loop.verification import within
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.mapping.protocol import WithoutJobs
 from stereo_sfm.maps.relocalization import Location, Relocalizer, nowhere
 from stereo_sfm.types import F64, Keyframe, LoopResult, MapUpdate
 
 LOST_AFTER = 5  # keyframes without an answer near the prediction before the whole map is searched
 
 
-class Localizer:
+class Localizer(WithoutJobs):
     """One keyframe in, one `MapUpdate` out that moves nothing but `map_T_odom`.
 
     The first answer needs no guess; where it rests on few corners, a second keyframe must say the same. Later keyframes
@@ -67,6 +68,14 @@ class Localizer:
     def finish(self, loops: Sequence[LoopResult]) -> MapUpdate | None:
         """Nothing is left behind."""
         return None
+
+    def snapshot(self) -> None:
+        """It makes no map."""
+        return
+
+    def place(self, saved: MapSnapshot) -> None:
+        """It makes no map that could lie anywhere."""
+        return
 
     def _placed(self, keyframe: Keyframe) -> list[tuple[int, F64]]:
         """The keyframes (id, odom_T_cam) whose places are known with this one."""

@@ -52,7 +52,7 @@ class SavedMap:
         return np.unique(self.sessions).tolist()
 
 
-def save_map(saved: SavedMap, folder: Path) -> None:
+def save_map(saved: SavedMap, folder: Path | str) -> None:
     """Write a map folder, whole or not at all; what else lies in it stays.
 
     Raises:
@@ -60,6 +60,7 @@ def save_map(saved: SavedMap, folder: Path) -> None:
     """
     if not len(saved) or not len(saved.snapshot.points):
         raise StereoSfmError("the map is empty: nothing to save")
+    folder = Path(folder).expanduser()
     with replaced_folder(folder, frozenset({"map.json", "rig.yaml", *(f"{name}.npz" for name in _FILES)})) as draft:
         sums: dict[str, str] = {}
         for name, columns in _FILES.items():
@@ -84,15 +85,17 @@ def _column(saved: SavedMap, name: str) -> Any:
     return value.astype(np.float32) if name in ("uv_left", "uv_right") else value
 
 
-def load_map(folder: Path, rig: Rig | None = None) -> SavedMap:
+def load_map(folder: Path | str, rig: Rig | None = None) -> SavedMap:
     """Read a map folder.
 
     Args:
+        folder: as `--map-out` and `save_map` wrote it.
         rig: the camera the map shall be used with, checked against the map's own.
 
     Raises:
         StereoSfmError: no map, another version, damaged, empty, or made with another camera.
     """
+    folder = Path(folder).expanduser()
     head = read_header(folder, (*_FILES, "rig"))
     sums = head["sha256"]
     columns: dict[str, Any] = {}

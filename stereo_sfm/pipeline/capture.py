@@ -99,7 +99,7 @@ class CaptureStage:
             self.to_tracker.close()
 
     def _read(self) -> None:
-        meter = HealthMeter("capture")
+        meter = HealthMeter("capture", self.to_main.send)
         for image in self.source:
             if self.stop.asked:
                 break
@@ -116,13 +116,9 @@ class CaptureStage:
             self.to_tracker.send(message)
             self.to_main.send(message)
             self._last = image.frame_id
-            health = meter.add(self._last, (time.monotonic() - begin) * 1e3, self.to_tracker.waiting())
-            if health is not None:
-                self.to_main.send(health)
+            if meter.add(self._last, (time.monotonic() - begin) * 1e3, self.to_tracker.waiting()):
                 self._count(self._last)
-        health = meter.report(self._last, 0)
-        if health is not None:
-            self.to_main.send(health)
+        meter.report()
 
     def _count(self, frame_id: int) -> None:
         """Tell what the source has counted until now."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 import numpy as np
 
@@ -12,25 +13,28 @@ WINDOW = 90  # steps between two reports, and what they look back on
 
 
 class HealthMeter:
-    """Collects the duration of a stage's steps and reports every `WINDOW` of them."""
+    """Collects the duration of a stage's steps and sends a report of every `WINDOW` of them."""
 
-    def __init__(self, stage: str) -> None:
-        self._stage = stage
+    def __init__(self, stage: str, send: Callable[[Health], object]) -> None:
+        self._stage, self._send = stage, send
         self._ms: list[float] = []
         self._since = time.monotonic()
+        self._frame_id = -1
         self.dropped = 0
 
-    def add(self, frame_id: int, ms: float, waiting: int) -> Health | None:
-        """One more step of `ms` milliseconds with `waiting` messages behind it; a report when one is due."""
+    def add(self, frame_id: int, ms: float, waiting: int = 0) -> bool:
+        """One more step of `ms` milliseconds with `waiting` messages behind it; whether a report was sent."""
         self._ms.append(ms)
-        return self.report(frame_id, waiting) if len(self._ms) >= WINDOW else None
+        self._frame_id = frame_id
+        return len(self._ms) >= WINDOW and self.report(waiting)
 
-    def report(self, frame_id: int, waiting: int) -> Health | None:
-        """What is known since the last report; None when nothing happened."""
+    def report(self, waiting: int = 0) -> bool:
+        """Send what is known since the last report; False when nothing happened."""
         if not self._ms:
-            return None
+            return False
         now = time.monotonic()
         p50, p95, p99 = np.percentile(self._ms, (50, 95, 99))
         rate = len(self._ms) / max(now - self._since, 1e-9)
         self._ms, self._since = [], now
-        return Health(self._stage, frame_id, rate, waiting, float(p50), float(p95), float(p99), self.dropped)
+        self._send(Health(self._stage, self._frame_id, rate, waiting, float(p50), float(p95), float(p99), self.dropped))
+        return True

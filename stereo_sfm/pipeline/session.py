@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Self
 from drivers.choice import Opener
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError, require
-from stereo_sfm.export.run_folder import FolderLock, default_folder, discard_files, prepare_folder
+from stereo_sfm.export.run_folder import KEPT_MAP, FolderLock, default_folder, discard_files, prepare_folder
 from stereo_sfm.maps.folders import MapFolders
 from stereo_sfm.messages import Sink
 from stereo_sfm.pipeline.capture import SourceInfo
@@ -124,6 +124,7 @@ class Session:
         if self._folder is None:
             name = self._opener.spec.rstrip("/").split("/")[-1] or otherwise
             self._folder = default_folder(name, datetime.now())
+        self._folders = replace(self._folders, kept=self._folder / KEPT_MAP)
         return self._folder
 
     def _prepare(self) -> None:

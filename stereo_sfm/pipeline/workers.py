@@ -181,7 +181,7 @@ def run_tracker(
     inbox = Inbox[SlotImage | End](images)
     free, keyframes = Outbox(release), (Outbox(to_mapper), Outbox(to_loop))
     ready("tracker", setup, to_main)
-    meter = HealthMeter("tracker")
+    meter = HealthMeter("tracker", to_main.send)
     frame_id = -1
     while isinstance(message := _next_image(inbox), SlotImage):
         image = ring.read(message)
@@ -198,12 +198,8 @@ def run_tracker(
         now = time.monotonic()
         frame_id = image.frame_id
         to_main.send(StageTimes(frame_id, {**spans.take(), "latency": (now - message.captured_s) * 1e3}))
-        health = meter.add(frame_id, (now - begin) * 1e3, to_main.waiting())
-        if health is not None:
-            to_main.send(health)
-    health = meter.report(frame_id, 0)
-    if health is not None:
-        to_main.send(health)
+        meter.add(frame_id, (now - begin) * 1e3, to_main.waiting())
+    meter.report()
     for outbox in keyframes:
         outbox.send(End("tracker"))
         outbox.close()
@@ -220,7 +216,6 @@ def run_mapper(
     results: Connection,
 ) -> None:
     """Keyframes to map updates."""
-    from stereo_sfm.mapping.mapper import Mapper
     from stereo_sfm.messages import StageTimes
     from stereo_sfm.pipeline.health import HealthMeter
     from stereo_sfm.pipeline.stages import MapStage
@@ -237,18 +232,18 @@ def run_mapper(
     to_tracker, to_optimizer = Outbox(updates), Outbox(jobs)
     answers = Inbox[Any](results)
     ready("mapper", setup, to_main)
-    meter = HealthMeter("mapper")
+    meter = HealthMeter("mapper", to_main.send)
     frame_id, busy = -1, False
     while isinstance(keyframe := inbox.take(), Keyframe):
         delay()
         begin = time.monotonic()
-        if isinstance(mapper, Mapper) and busy and mapper.job_due:
+        if busy and mapper.job_due:
             mapper.finish_job(answers.take())
             busy = False
         update = stage.step(keyframe)
         to_main.send(update)
         to_tracker.send(update)
-        if isinstance(mapper, Mapper) and (job := mapper.pending_job()) is not None:
+        if (job := mapper.pending_job()) is not None:
             if busy:
                 answers.take()  # a newer loop made this job's answer useless
             to_optimizer.send(job)
@@ -256,18 +251,14 @@ def run_mapper(
         frame_id = keyframe.frame_id
         ms = (time.monotonic() - begin) * 1e3
         to_main.send(StageTimes(frame_id, {**spans.take(), "map": ms}))
-        health = meter.add(frame_id, ms, 0)
-        if health is not None:
-            to_main.send(health)
-    if isinstance(mapper, Mapper) and busy:
+        meter.add(frame_id, ms)
+    if busy:
         mapper.finish_job(answers.take())
     last = stage.finish()
     if last is not None:
         to_main.send(last)
     save_result(mapper, setup.config, setup.rig, setup.folders)
-    health = meter.report(frame_id, 0)
-    if health is not None:
-        to_main.send(health)
+    meter.report()
     to_tracker.close()
     to_optimizer.send(End("mapper"))
     to_optimizer.close()
@@ -307,7 +298,7 @@ def run_loop(to_main: Outbox, control: Connection, keyframes: Connection, to_map
     closer = make_closer(setup.config, setup.rig, spans, setup.folders.localize_only)
     inbox, outbox = Inbox[Keyframe | End](keyframes), Outbox(to_mapper)
     ready("loop", setup, to_main)
-    meter = HealthMeter("loop")
+    meter = HealthMeter("loop", to_main.send)
     frame_id = -1
     while isinstance(keyframe := inbox.take(), Keyframe):
         if closer is None:
@@ -319,12 +310,8 @@ def run_loop(to_main: Outbox, control: Connection, keyframes: Connection, to_map
         outbox.send(result)
         frame_id, ms = keyframe.frame_id, (time.monotonic() - begin) * 1e3
         to_main.send(StageTimes(frame_id, {**spans.take(), "loop": ms}))
-        health = meter.add(frame_id, ms, 0)
-        if health is not None:
-            to_main.send(health)
-    health = meter.report(frame_id, 0)
-    if health is not None:
-        to_main.send(health)
+        meter.add(frame_id, ms)
+    meter.report()
     outbox.close()
 
 

@@ -1,0 +1,158 @@
+"""Where images of a caller come in: what can be meant becomes what the stages take, the rest is one clear line.
+
+The stages take (H, W) 8-bit grey images of the calibration's size, contiguous in memory. A caller may also hand over
+colour in OpenCV's order (blue, green, red), 16-bit grey, and floats from 0 to 1 or from 0 to 255.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calib.rig import Rig
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry.cameras import Camera
+from stereo_sfm.pixels import eight_bits, sensor_bits
+from stereo_sfm.types import F32, U8, StereoImage
+
+log = logging.getLogger("stereo_sfm")
+
+
+class ImageDoor:
+    """Takes images one after the other: how bright white is in 16 bits or floats is seen once and kept."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._rig = rig
+        self._bits = 0  # of 16, in use so far
+        self._white = 0.0  # of floats: 1 or 255; 0 before the first
+        self._last_ns: int | None = None
+        self._count = 0
+
+    def image(
+        self, left: ArrayLike, right: ArrayLike | None, stamp_ns: int, depth: ArrayLike | None = None
+    ) -> StereoImage:
+        """The next image of a sequence, numbered in order.
+
+        Args:
+            left, right: of the rig's two cameras; `right` is None for one camera and for RGB-D.
+            stamp_ns: whole nanoseconds, later than the last.
+            depth: (H, W) metres along the left optical axis, NaN or 0 where unknown (RGB-D).
+
+        Raises:
+            StereoSfmError: what is no image of this rig, or a stamp that is not later.
+        """
+        image = self.checked(
+            StereoImage(self._count, self._later(stamp_ns), _array(left, "left"), _optional(right), _metres(depth))
+        )
+        self._last_ns = image.stamp_ns
+        self._count += 1
+        return image
+
+    def checked(self, image: StereoImage) -> StereoImage:
+        """An image of any source with pixels as the stages take them; the same object where they are so already.
+
+        Raises:
+            StereoSfmError: not an image of this rig.
+        """
+        rig = self._rig
+        two = rig.right is not None and not rig.depth
+        if two and image.right is None:
+            raise StereoSfmError(f"frame {image.frame_id} has no right image, but the calibration is of two cameras")
+        if rig.depth and image.depth is None:
+            raise StereoSfmError(
+                f"frame {image.frame_id} has no depth image, but the calibration is of an RGB-D camera"
+            )
+        left = self._grey(image.left, rig.left, "left")
+        right = None if image.right is None or rig.right is None else self._grey(image.right, rig.right, "right")
+        if image.depth is not None:
+            _check_size(image.depth, rig.left, "depth")
+        same = left is image.left and right is image.right
+        return image if same else replace(image, left=left, right=right)
+
+    def _later(self, stamp_ns: Any) -> int:
+        if isinstance(stamp_ns, bool) or not isinstance(stamp_ns, int | np.integer):
+            raise StereoSfmError(f"stamp_ns takes whole nanoseconds, got {stamp_ns!r}: seconds are to be times 1e9")
+        if self._last_ns is not None and stamp_ns <= self._last_ns:
+            raise StereoSfmError(f"stamp_ns is {stamp_ns}, not later than the last one, {self._last_ns}")
+        return int(stamp_ns)  # pyright: ignore[reportUnknownArgumentType]
+
+    def _grey(self, pixels: NDArray[Any], camera: Camera, side: str) -> U8:
+        """(H, W) or (H, W, channels) of any meaningful kind -> (H, W) u8, contiguous."""
+        if pixels.dtype == np.uint8 and pixels.ndim == 2 and pixels.flags.c_contiguous:
+            _check_size(pixels, camera, side)
+            return pixels
+        if pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] not in (1, 3, 4)):
+            raise StereoSfmError(
+                f"the {side} image has the shape {pixels.shape}: (H, W) grey or (H, W, 3) colour is meant"
+            )
+        _check_size(pixels, camera, side)
+        grey = self._in_bytes(pixels, side)
+        if grey.ndim == 3:
+            codes = {3: cv2.COLOR_BGR2GRAY, 4: cv2.COLOR_BGRA2GRAY}
+            code = codes.get(grey.shape[2])
+            grey = grey[..., 0] if code is None else cv2.cvtColor(grey, code)
+        return np.ascontiguousarray(grey, np.uint8)
+
+    def _in_bytes(self, pixels: NDArray[Any], side: str) -> U8:
+        if pixels.dtype == np.uint8:
+            return np.ascontiguousarray(pixels)
+        if pixels.dtype == np.uint16:
+            return eight_bits(np.ascontiguousarray(pixels), self._bits_with(pixels))
+        if np.issubdtype(pixels.dtype, np.floating):
+            return self._of_floats(pixels, side)
+        raise StereoSfmError(f"the {side} image has {pixels.dtype} pixels: uint8, uint16 or floats are taken")
+
+    def _bits_with(self, pixels: NDArray[Any]) -> int:
+        """How many of 16 bits are in use, this image included."""
+        bits = max(sensor_bits([pixels]), self._bits)
+        if bits != self._bits:
+            log.warning("16-bit images: the values use %d bits, so that %d is white", bits, 2**bits - 1)
+            self._bits = bits
+        return bits
+
+    def _of_floats(self, pixels: NDArray[Any], side: str) -> U8:
+        low, high = float(pixels.min()), float(pixels.max())
+        if not (np.isfinite(low) and np.isfinite(high)):
+            raise StereoSfmError(f"the {side} image holds values that are not finite")
+        if not self._white:
+            self._white = 1.0 if high <= 1.0 else 255.0
+        if low < 0 or high > self._white:
+            raise StereoSfmError(
+                f"the {side} image holds values from {low:g} to {high:g}: 0 to {self._white:g} as in the first image"
+            )
+        return np.round(pixels * (255.0 / self._white)).astype(np.uint8)
+
+
+def _array(pixels: ArrayLike, side: str) -> NDArray[Any]:
+    try:
+        return np.asarray(pixels)
+    except (ValueError, TypeError):
+        raise StereoSfmError(f"the {side} image is no array of numbers") from None
+
+
+def _optional(right: ArrayLike | None) -> NDArray[Any] | None:
+    return None if right is None else _array(right, "right")
+
+
+def _metres(depth: ArrayLike | None) -> F32 | None:
+    """(H, W) metres, NaN where 0 or negative."""
+    if depth is None:
+        return None
+    pixels = _array(depth, "depth")
+    if not np.issubdtype(pixels.dtype, np.floating):
+        raise StereoSfmError(f"the depth image has {pixels.dtype} pixels: floats in metres are meant")
+    metres = np.ascontiguousarray(pixels, np.float32)
+    return np.where(metres > 0, metres, np.float32(np.nan))
+
+
+def _check_size(pixels: NDArray[Any], camera: Camera, side: str) -> None:
+    height, width = pixels.shape[:2]
+    if (width, height) != (camera.width, camera.height):
+        raise StereoSfmError(
+            f"the {side} image is {width}x{height}, but the calibration is for {camera.width}x{camera.height}"
+        )

@@ -1,0 +1,156 @@
+"""The Python API: one's own loop gives the bits of a run, and what is no image of the rig is one line at the door."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import stereo_sfm as s
+from drivers.memory import MemorySource
+from stereo_sfm.pipeline.door import ImageDoor
+from tests.synthetic import pinhole_rig
+
+IMAGES = 12
+
+
+@pytest.fixture(scope="module")
+def recording() -> tuple[s.Rig, list[s.StereoImage]]:
+    with s.open_source(s.demo_recording()) as source:
+        return source.rig, [image for _, image in zip(range(IMAGES), source, strict=False)]
+
+
+def test_a_loop_of_ones_own_gives_the_bits_of_a_run(recording: tuple[s.Rig, list[s.StereoImage]]) -> None:
+    rig, images = recording
+    run = list(s.run(MemorySource(rig, images)))
+    updates: list[s.MapUpdate] = []
+    with s.System(rig) as system:
+        system.on(s.MapUpdate, updates.append)
+        own = [system.step(image.left, image.right, image.stamp_ns) for image in images]
+        at = system.map_T_cam
+    assert at is not None
+    for a, b in zip(run, own, strict=True):
+        assert a.odom_T_cam.tobytes() == b.odom_T_cam.tobytes() and a.state == b.state
+        assert np.linalg.eigvalsh(b.covariance).min() > 0
+    assert len(updates) >= 1 and set(updates[0].kf_ids.tolist()) <= set(system.map.kf_ids.tolist())
+    assert len(system.map.points) > 100 and len(system.trajectory()) == len(images)
+    np.testing.assert_allclose(at[:3, 3], own[-1].odom_T_cam[:3, 3], atol=0.05)
+    system.finish()  # once more does nothing
+    with pytest.raises(s.StereoSfmError, match="finished"):
+        system.step(images[0].left, images[0].right, 10**18)
+
+
+def test_odometry_alone_is_the_same_odometry(recording: tuple[s.Rig, list[s.StereoImage]]) -> None:
+    """Until the first map update arrives."""
+    rig, images = recording
+    tracker = s.Tracker(rig)
+    frames = [tracker.step(image.left, image.right, image.stamp_ns) for image in images[:4]]
+    run = list(s.run(MemorySource(rig, images[:4])))
+    assert all(a.odom_T_cam.tobytes() == b.odom_T_cam.tobytes() for a, b in zip(frames, run, strict=True))
+
+
+def test_a_map_is_saved_loaded_and_asked(recording: tuple[s.Rig, list[s.StereoImage]], tmp_path: Path) -> None:
+    rig, images = recording
+    with s.System(rig) as system:
+        assert list(system.run(images))[-1] is system.frame
+    system.save_map(str(tmp_path / "store"))
+    locator = s.MapLocator(s.load_map(str(tmp_path / "store")))
+    answer = locator.locate(images[6].left, images[6].right)
+    assert answer.found
+    known = system.trajectory().poses[6]
+    assert np.linalg.norm(answer.map_T_cam[:3, 3] - known[:3, 3]) < 0.02
+    assert locator.locate(images[6].left, images[6].right, near=known).found
+    black = np.zeros_like(images[6].left)
+    assert locator.locate(black, black).reason == "too_few_points"
+    with pytest.raises(s.StereoSfmError, match="not written as 'kolmap', did you mean colmap"):
+        s.export_map(system.saved_map(), tmp_path / "x", "kolmap")
+    s.export_trajectory(system.trajectory(), str(tmp_path / "path.tum"))
+    assert len(s.read_trajectory(tmp_path / "path.tum")) == IMAGES
+
+
+# -- the door ----------------------------------------------------------------------------------------------------------
+
+RIG = pinhole_rig()
+SIZE = (RIG.left.height, RIG.left.width)
+GREY = np.random.default_rng(1).integers(0, 256, SIZE, np.uint8)
+CONVERTED: dict[str, tuple[Callable[[], Any], int]] = {
+    "as it is": (lambda: GREY, 0),
+    "not contiguous": (lambda: np.asfortranarray(GREY), 0),
+    "a view": (lambda: np.repeat(GREY, 2, 1)[:, ::2], 0),
+    "lists": (lambda: GREY.astype(float).tolist(), 0),
+    "colour": (lambda: np.repeat(GREY[..., None], 3, 2), 0),
+    "colour with alpha": (lambda: np.dstack([GREY, GREY, GREY, GREY]), 0),
+    "one channel": (lambda: GREY[..., None], 0),
+    "floats to 255": (lambda: GREY.astype(np.float32), 0),
+    "floats to 1": (lambda: GREY / 255.0, 0),
+    "twelve bits": (lambda: GREY.astype(np.uint16) << 4, 0),
+    "sixteen bits": (lambda: GREY.astype(np.uint16) << 8, 0),
+}
+
+
+@pytest.mark.parametrize("name", CONVERTED)
+def test_what_can_be_meant_is_converted(name: str) -> None:
+    make, off = CONVERTED[name]
+    if name == "twelve bits":  # ten would show the same bits: the last of twelve says which
+        image = ImageDoor(RIG).image(make() | 1, make() | 1, 1)
+    else:
+        image = ImageDoor(RIG).image(make(), make(), 1)
+    assert image.right is not None
+    for pixels in (image.left, image.right):
+        assert pixels.dtype == np.uint8 and pixels.flags.c_contiguous
+        assert np.abs(pixels.astype(int) - GREY).max() <= off
+
+
+def test_colour_is_weighed_as_opencv_does() -> None:
+    blue = np.zeros((*SIZE, 3), np.uint8)
+    blue[..., 0] = 200
+    assert ImageDoor(RIG).image(blue, blue, 1).left[0, 0] == 23  # 0.114 of it
+
+
+def test_more_bits_later_are_taken_from_then_on(caplog: pytest.LogCaptureFixture) -> None:
+    door = ImageDoor(RIG)
+    dark = np.full(SIZE, 101, np.uint16)
+    assert door.image(dark, dark, 1).left[0, 0] == 101
+    light = np.full(SIZE, 4001, np.uint16)
+    assert door.image(light, light, 2).left[0, 0] == 250 and door.image(dark, dark, 3).left[0, 0] == 6
+
+
+REFUSED: dict[str, tuple[Any, Any, Any, str]] = {
+    "another size": (GREY[:, :-2], GREY, 1, "the left image is 638x480, but the calibration is for 640x480"),
+    "another size right": (GREY, GREY[:-1], 1, "the right image is 640x479"),
+    "turned": (GREY.T, GREY, 1, "the left image is 480x640"),
+    "two channels": (np.dstack([GREY, GREY]), GREY, 1, "(H, W) grey or (H, W, 3) colour is meant"),
+    "a number": (7, GREY, 1, "(H, W) grey"),
+    "text": ("left.png", GREY, 1, "(H, W) grey"),
+    "truth values": (GREY > 9, GREY, 1, "has bool pixels: uint8, uint16 or floats are taken"),
+    "whole numbers": (GREY.astype(np.int64), GREY, 1, "has int64 pixels"),
+    "not finite": (np.full(SIZE, np.nan), GREY, 1, "not finite"),
+    "negative": (GREY - 1.5, GREY, 1, "holds values from -1.5"),
+    "no right image": (GREY, None, 1, "frame 0 has no right image"),
+    "seconds": (GREY, GREY, 0.033, "stamp_ns takes whole nanoseconds, got 0.033"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_no_image_of_the_rig_is_one_line(name: str) -> None:
+    left, right, stamp_ns, said = REFUSED[name]
+    for step in (s.Tracker(RIG).step, s.System(RIG).step):
+        with pytest.raises(s.StereoSfmError) as error:
+            step(left, right, stamp_ns)
+        assert said in str(error.value) and "\n" not in str(error.value)
+
+
+def test_stamps_grow() -> None:
+    door = ImageDoor(RIG)
+    door.image(GREY, GREY, 5)
+    with pytest.raises(s.StereoSfmError, match="stamp_ns is 5, not later than the last one"):
+        door.image(GREY, GREY, 5)
+
+
+def test_a_source_of_anybody_is_checked_too() -> None:
+    small = s.StereoImage(0, 0, GREY[:100].copy(), GREY[:100].copy())
+    with pytest.raises(s.StereoSfmError, match="640x100, but the calibration is for 640x480"):
+        list(s.run(MemorySource(RIG, [small])))
