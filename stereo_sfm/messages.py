@@ -45,6 +45,13 @@ class SourceCounters:
     counts: dict[str, float]
 
 
+@dataclass(frozen=True)
+class LogEnded:
+    """The log takes no more; the run goes on."""
+
+    why: str
+
+
 class Sink(Protocol):
     """Takes every message of a run in order: StereoImage, Frame, Keyframe, MapUpdate, LoopResult, StageTimes, ..."""
 

@@ -211,7 +211,7 @@ class Dropped:
 
     frame_id: int
     stamp_ns: int
-    where: str  # "sensor", "capture", "ring", "viewer"
+    where: str  # "sensor", "ring" (capture), "log" (tracked, but not logged)
     why: str
     count: int = 1
 

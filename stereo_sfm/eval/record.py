@@ -16,7 +16,7 @@ from stereo_sfm.eval.frame_table import FrameTable, TimeTable
 from stereo_sfm.export.trajectories import fill_missing
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.keyframe_poses import KeyframePoses
-from stereo_sfm.messages import Health, SourceCounters, StageTimes
+from stereo_sfm.messages import Health, LogEnded, SourceCounters, StageTimes
 from stereo_sfm.types import (
     F64,
     I64,
@@ -63,7 +63,8 @@ class RunRecord:
     health: dict[str, Health] = field(
         default_factory=dict[str, Health]
     )  # by stage: the last word, but the worst p99 and queue
-    dropped: int = 0
+    drops: dict[str, int] = field(default_factory=dict[str, int])  # images by where they were dropped
+    log_ended: str = ""  # why the log is not complete
     source_counts: dict[str, float] = field(default_factory=dict[str, float])  # of a live camera, at the end
     map_T_kf: KeyframePoses = field(default_factory=KeyframePoses)
     map_points: set[int] = field(default_factory=set[int])
@@ -81,7 +82,9 @@ class RunRecord:
     def put(self, message: object) -> None:
         """Take one message of the run; those of other kinds are not kept."""
         if isinstance(message, Dropped):
-            self.dropped += message.count
+            self.drops[message.where] = self.drops.get(message.where, 0) + message.count
+        elif isinstance(message, LogEnded):
+            self.log_ended = message.why
         elif isinstance(message, Frame):
             self._put_frame(message)
         elif isinstance(message, Keyframe):

@@ -80,6 +80,20 @@ def _draw(
     return pictures
 
 
+def _drops(stats: dict[str, Any]) -> list[str]:
+    """What is missing between the camera and the log."""
+    lost, total = stats["dropped"] - stats["dropped_by_capture"], stats["frames"] + stats["dropped"]
+    slow = "were dropped because the stages are too slow: try --frame-skip, or fewer points (tracker.max_features)"
+    disk = "are not in the log, whose disk is too slow: take --image-format jpeg or --log lean"
+    rows = (
+        (stats["dropped_by_capture"], slow),
+        (lost, "never arrived: check the cable, disk and files"),
+        (stats["left_out_of_log"], disk),
+    )
+    out = [f"**WARN**: {n} frames ({100 * n / total:.1f} %) {what}" for n, what in rows if n]
+    return out + ([f"**WARN**: {stats['log_ended']}"] if stats["log_ended"] else [])
+
+
 def verdicts(stats: dict[str, Any], evaluations: dict[str, Evaluation]) -> list[str]:
     """What is good, what is not, and what to do about it."""
     out: list[str] = []
@@ -90,17 +104,14 @@ def verdicts(stats: dict[str, Any], evaluations: dict[str, Evaluation]) -> list[
     if reasons:
         out += [f"**WARN**: lost ({reason}): {ADVICE.get(reason, 'see stats.json')}" for reason in reasons]
     elif stats["tracked"]:
-        out.append("**PASS**: every frame after the first pose has one")
+        dropped = ", but for those that capture dropped" if stats["dropped_by_capture"] else ""
+        out.append(f"**PASS**: every frame after the first pose has one{dropped}")
     if stats["pieces"] > 1:
         out.append(
             f"**WARN**: the walk is in {stats['pieces']} pieces: tracking began again, and no place of one piece was "
             "recognised in another; drive through a place again that was seen before tracking was lost"
         )
-    if stats["dropped"]:
-        share = 100 * stats["dropped"] / (stats["frames"] + stats["dropped"])
-        out.append(
-            f"**WARN**: {stats['dropped']} frames ({share:.1f} %) never arrived: check the cable, disk and files"
-        )
+    out += _drops(stats)
     if stats["tracked"] and stats["inliers_median"] < FEW_INLIERS:
         out.append(
             f"**WARN**: only {stats['inliers_median']:.0f} points a frame: look at texture, exposure and calibration"

@@ -14,6 +14,7 @@ from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.messages import Health
 from stereo_sfm.types import F64, TrackState
 
+RING, LOG = "ring", "log"  # where images are dropped, see `Dropped`
 # Part of frames without a pose above which the run counts as failed.
 MAX_LOST_PERCENT = 20.0
 
@@ -35,7 +36,8 @@ def stage_times(record: RunRecord) -> dict[str, dict[str, float]]:
 def statistics(record: RunRecord, wall_s: float, evaluations: dict[str, Evaluation] | None = None) -> dict[str, Any]:
     """Everything countable about a run, as plain values for JSON."""
     tracked = int(record.tracked().sum())
-    frames = len(record.frames)
+    frames, drops = len(record.frames), record.drops
+    crowded_out = drops.get(RING, 0)
     lost = record.lost_intervals()
     drifts = record.closure_drifts()
     states, counts = np.unique(record.frames.state, return_counts=True)
@@ -45,9 +47,12 @@ def statistics(record: RunRecord, wall_s: float, evaluations: dict[str, Evaluati
         "frames": frames,
         "tracked": tracked,
         "unplaced": tracked - int(record.placed().sum()),  # a saved map did not know them
-        "dropped": record.dropped,
+        "dropped": sum(count for where, count in drops.items() if where != LOG),
+        "dropped_by_capture": crowded_out,  # the stages were too slow for them
+        "left_out_of_log": drops.get(LOG, 0),  # tracked, but not to be replayed
+        "log_ended": record.log_ended,
         "states": {TrackState(k).name: n for k, n in zip(states.tolist(), counts.tolist(), strict=True)},
-        "lost_percent": 100.0 * (frames - tracked) / frames if frames else 0.0,
+        "lost_percent": 100.0 * (frames + crowded_out - tracked) / max(frames + crowded_out, 1),
         "lost_intervals": [dataclasses.asdict(interval) for interval in lost],
         "pieces": record.pieces(),
         "keyframes": len(record.keyframes),
@@ -84,7 +89,10 @@ def failure(stats: dict[str, Any]) -> str:
     if not stats["tracked"]:
         return "tracking never initialised"
     if stats["lost_percent"] > stats["max_lost_percent"]:
-        return f"{stats['lost_percent']:.0f} % of the frames have no pose (limit {stats['max_lost_percent']:g} %)"
+        dropped = stats["dropped_by_capture"]
+        why = f", {thousands(dropped)} of them dropped by capture: the stages are too slow" if dropped else ""
+        limit = f"(limit {stats['max_lost_percent']:g} %)"
+        return f"{stats['lost_percent']:.0f} % of the frames have no pose {limit}{why}"
     if stats["unplaced"] == stats["tracked"]:
         return "the camera was never found in the map"
     return ""
@@ -100,7 +108,7 @@ def summary(stats: dict[str, Any], evaluations: dict[str, Evaluation] | None = N
     lost = stats["lost_intervals"]
     total = stats["frames"] + stats["dropped"]
     lines = [
-        f"tracked {thousands(stats['tracked'])}/{thousands(total)} frames ({stats['dropped']} dropped by capture), "
+        f"tracked {thousands(stats['tracked'])}/{thousands(total)} frames ({_dropped(stats)}), "
         f"{_lost(lost)}, {stats['keyframes']} keyframes, {thousands(stats['points'])} points",
     ]
     if stats["unplaced"]:
@@ -111,9 +119,25 @@ def summary(stats: dict[str, Any], evaluations: dict[str, Evaluation] | None = N
         lines.append(_loops(stats))
     if stats["camera"]:
         lines.append(_camera(stats["camera"]))
+    lines += _log(stats)
     lines.append(_times(stats))
     for name, result in (evaluations or {}).items():
         lines.append(_against_truth(name, result))
+    return lines
+
+
+def _dropped(stats: dict[str, Any]) -> str:
+    lost = stats["dropped"] - stats["dropped_by_capture"]
+    camera = f", {thousands(lost)} lost before" if lost else ""
+    return f"{thousands(stats['dropped_by_capture'])} dropped by capture{camera}"
+
+
+def _log(stats: dict[str, Any]) -> list[str]:
+    """What the log lacks."""
+    lines = [f"the log is not complete: {stats['log_ended']}"] if stats["log_ended"] else []
+    if stats["left_out_of_log"]:
+        noun = "image" if stats["left_out_of_log"] == 1 else "images"
+        lines.append(f"the log lacks {thousands(stats['left_out_of_log'])} {noun}: it was slower than the camera")
     return lines
 
 

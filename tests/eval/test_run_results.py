@@ -18,7 +18,8 @@ from stereo_sfm.eval.record import KeyframeRow, RunRecord
 from stereo_sfm.eval.run_results import scale_free, write_results
 from stereo_sfm.eval.statistics import failure, summary
 from stereo_sfm.geometry import se3
-from stereo_sfm.types import F64, Frame, Keyframe, LoopResult, MapUpdate, Observations, TrackState, Trajectory
+from stereo_sfm.messages import LogEnded
+from stereo_sfm.types import F64, Dropped, Frame, Keyframe, LoopResult, MapUpdate, Observations, TrackState, Trajectory
 from tests.synthetic import pinhole_rig
 
 COUNT = 30
@@ -195,3 +196,27 @@ def test_a_disk_that_is_full_is_named(tmp_path: Path, monkeypatch: pytest.Monkey
         write_results(tmp_path, "test", pinhole_rig(), Config(), record_of(walk(), 0), 1.0)
     assert str(from_os_error(caught.value)).startswith(f"cannot write to {tmp_path}: No space left")
     assert (tmp_path / "trajectory_odom.tum").exists()
+
+
+def test_what_capture_drops_has_no_pose(tmp_path: Path) -> None:
+    record = record_of(walk(), 0)
+    for k in range(120):
+        record.put(Dropped(100 + k, 1, "ring", "no free slot"))
+    record.put(Dropped(300, 1, "sensor", "lost", 3))
+    stats, _ = write_results(tmp_path, "test", pinhole_rig(), Config(), record, 1.0)
+    assert stats["lost_percent"] == pytest.approx(80.0)
+    assert "80 % of the frames have no pose (limit 20 %), 120 of them dropped by capture" in failure(stats)
+    assert summary(stats)[0].startswith("tracked 30/153 frames (120 dropped by capture, 3 lost before)")
+    report = (tmp_path / "report.md").read_text()
+    assert "**FAIL**: 80 % of the frames have no pose" in report and "120 frames (78.4 %) were dropped" in report
+
+
+def test_what_the_log_lacks_is_told_and_costs_nothing_else(tmp_path: Path) -> None:
+    record = record_of(walk(), 0)
+    record.put(Dropped(3, 1, "log", "the log is slower than the camera"))
+    record.put(LogEnded("recording stopped, No space left on device"))
+    stats, _ = write_results(tmp_path, "test", pinhole_rig(), Config(), record, 1.0)
+    assert stats["lost_percent"] == 0.0 and failure(stats) == "" and stats["dropped"] == 0
+    said = "\n".join(summary(stats))
+    assert "the log lacks 1 image:" in said and "the log is not complete: recording stopped" in said
+    assert "No space left on device" in (tmp_path / "report.md").read_text()
