@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from stereo_sfm.viz.match_pictures import MatchPictures
 
 TRACKING_FAILED = 4
+INLINE_END_S = 4.0  # after which a run in one process waits no longer for its source
 
 
 @dataclass(frozen=True)
@@ -70,16 +71,16 @@ def execute(options: RunOptions) -> tuple[int, Path]:
     o.source.refuse_to_overwrite(o.output)
     record, pictures, stepper = RunRecord.of(o.config, o.folders.localize_only), _pictures(o.matches), _stepper(o)
     sinks, wiring = _sinks(o, record, pictures), _wiring(o)
-    with StopRequest() as stop:
-        with Session(o.source, o.config, sinks, wiring, o.folders, o.output, o.overwrite, o.replayed) as session:
-            stop.then = session.stop
-            if stop.asked:  # while it was opened
-                session.stop()
+    session = Session(o.source, o.config, sinks, wiring, o.folders, o.output, o.overwrite, o.replayed)
+    with StopRequest(INLINE_END_S if wiring.inline else 0.0) as stop:
+        stop.then = session.stop
+        with session:
             if pictures is not None:
                 pictures.folder = session.folder / "matches"
             begin = time.perf_counter()
             interrupted, problem = _follow(session, record, stop, o.quiet or stepper is not None, stepper)
             wall_s = time.perf_counter() - begin
+            stop.finished()
         stop.then = None
         folder, info = session.folder, session.info
         stats, evaluations = write_results(

@@ -17,13 +17,15 @@ INTERRUPTED = 130  # exit code, as shells give it for Ctrl-C
 class StopRequest:
     """While entered, the first of the signals only sets `asked` and calls `then`; the loop ends at its next round."""
 
-    def __init__(self) -> None:
+    def __init__(self, limit_s: float = 0.0) -> None:
+        """Args: limit_s, seconds after which the first signal counts as the second; 0: never."""
         self.asked = False
+        self._limit_s = limit_s
         self.then: Callable[[], None] | None = None  # called in the handler: must be short
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> Self:
-        for number in STOP_SIGNALS:
+        for number in (*STOP_SIGNALS, signal.SIGALRM):
             if (number, signal.getsignal(number)) != (signal.SIGHUP, signal.SIG_IGN):  # which is what nohup does
                 self._previous[number] = signal.signal(number, self._handle)
         return self
@@ -31,13 +33,19 @@ class StopRequest:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self.finished()
         for number, handler in self._previous.items():
             signal.signal(number, handler)
+
+    def finished(self) -> None:
+        """What was to be finished is; what comes now may take its time."""
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.asked:
             raise KeyboardInterrupt
         self.asked = True
+        signal.setitimer(signal.ITIMER_REAL, self._limit_s)
         with contextlib.suppress(OSError):  # the terminal may be gone
             print("\nfinishing (once more to abort)", file=sys.stderr)
         if self.then is not None:

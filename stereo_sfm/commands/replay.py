@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -118,6 +119,10 @@ def _run_again(options: ReplayOptions, wiring: Wiring) -> RunOptions:
         frames: list[Frame] = [message for _, message in recorded.messages(reader, (topics.FRAME,))]
     if not frames:
         raise StereoSfmError(f"{path} holds no frames: nothing to replay")
+    left_out = sum(drop.count for drop in before.dropped if drop.where == "log")
+    if left_out and options.source is None:
+        text = "%s lacks %d images that were tracked (the log was too slow): the replay will differ"
+        logging.getLogger("stereo_sfm").warning(text, path, left_out)
     follow = options.schedule == "recorded" or (options.schedule is None and before.mode == "realtime")
     logged = options.source is None and before.image_format != "none"  # the images that the tracker saw
     spec = str(path) if logged else options.source or before.source

@@ -104,6 +104,7 @@ class ImageLog:
         self._truth = ground_truth
         self._format = image_format
         self._next_static_ns: int | None = None
+        self._left_out = 0
         self._totals = {"images": 0, "dropped": 0, "max_skew_ns": 0}
         writer.attach(RIG_FILE, rig_to_text(rig), "application/yaml")
         if ground_truth is not None:
@@ -132,10 +133,19 @@ class ImageLog:
         self._info(pair)
         self._pixels(image)
 
+    def without_pixels(self, image: StereoImage) -> None:
+        """What a player and an inertial estimator need of an image that is left out."""
+        self._left_out += 1
+        self._static(image.stamp_ns)
+        self._ground_truth(image.stamp_ns)
+        if self._format != "none":
+            self._samples(image)
+
     @property
     def totals(self) -> dict[str, str]:
         """Counts for the metadata at the end of the file."""
-        return {name: str(value) for name, value in self._totals.items()}
+        left_out = {"images left out": str(self._left_out)} if self._left_out else {}
+        return {name: str(value) for name, value in self._totals.items()} | left_out
 
     def _count(self, pair: StereoImage) -> None:
         skew = abs(pair.right_stamp_ns - pair.stamp_ns) if pair.right is not None and pair.right_stamp_ns else 0

@@ -18,6 +18,7 @@ from mcap.records import (
     ChunkIndex,
     DataEnd,
     Footer,
+    Metadata,
     MetadataIndex,
     Schema,
     Statistics,
@@ -73,6 +74,14 @@ class Index:
         times = [t for _, t in self.loose]
         times += [t for c in self.chunks for t in (c.message_start_time, c.message_end_time)]
         return (min(times), max(times)) if times else (0, 0)
+
+    def add_metadata(self, name: str, values: dict[str, str]) -> None:
+        """A record to be written at `end`."""
+        builder = RecordBuilder()
+        Metadata(name, values).write(builder)
+        record = builder.end()
+        self.metadata.append(MetadataIndex(self.end + len(self.lost_message_index), len(record), name))
+        self.lost_message_index += record
 
     def drop_last_chunk(self) -> None:
         """Forget the last chunk and everything behind it."""

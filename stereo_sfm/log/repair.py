@@ -18,14 +18,20 @@ from stereo_sfm.log.index import Index, Span, tail
 from stereo_sfm.log.scan import build_index, check_magic, spans
 
 
-def finish_in_place(path: Path) -> int:
+def finish_in_place(path: Path, metadata: tuple[str, dict[str, str]] | None = None) -> int:
     """Cut a file back to its last whole record and append the index; more chunks go if the disk has no room for it.
+
+    Args:
+        path: the file.
+        metadata: name and values of a record to add.
 
     Returns:
         The number of messages in the finished file.
     """
     with path.open("rb") as stream:
         index = build_index(stream)
+    if metadata is not None:
+        index.add_metadata(*metadata)
     with path.open("r+b", buffering=0) as stream:
         while True:
             stream.truncate(index.end)

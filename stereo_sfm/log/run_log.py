@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,13 @@ POINTS_NS = 5_000_000_000
 POINTS_SIZE = 50_000
 PATH_COLOR = (70, 150, 255, 255)
 OLD_TRACK = 30  # frames after which a track's colour no longer changes
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """An image that was tracked and is not in the log, without its pixels: a camera in real time does not wait."""
+
+    image: StereoImage
 
 
 class RunLog:
@@ -117,6 +125,11 @@ class RunLog:
         self._now_ns = pair.stamp_ns
         self._images.image(image)
 
+    def left_out(self, left: LeftOut) -> None:
+        """What belongs to an image whose pixels are not kept."""
+        self._now_ns = left.image.stamp_ns
+        self._images.without_pixels(left.image)
+
     def frame(self, frame: Frame) -> None:
         """The tracker's answer."""
         self._totals["frames"] += 1
@@ -191,6 +204,11 @@ class RunLog:
         if not self._writer.closed:  # a full disk is told by the next message of a stage
             text = foxglove.text(self._now_ns, line.level, line.text, line.stage)
             self._writer.write(topics.LOG, text, self._now_ns)
+
+    @property
+    def refused(self) -> bool:
+        """Whether the disk took no more and the file was closed before its time."""
+        return self._writer.refused
 
     def close(self, *, early: bool = False) -> None:
         """Write what is left and close the file. `early`: a stage was killed, its last words are missing."""
@@ -287,6 +305,7 @@ class RunLog:
 
     _actions: tuple[tuple[Any, Any], ...] = (
         ((StereoImage, LoggedImage), image),
+        (LeftOut, left_out),
         (Frame, frame),
         (Keyframe, keyframe),
         (MapUpdate, map_update),

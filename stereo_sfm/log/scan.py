@@ -160,6 +160,14 @@ def loose(stream: IO[bytes]) -> Iterator[Message]:
             yield Message.read(_content(stream, span), span.length - PREFIX)
 
 
+def is_closed(path: Path) -> bool:
+    """Whether a file of ours has its index and end."""
+    if path.stat().st_size < 2 * len(MCAP0_MAGIC):
+        return False
+    with path.open("rb") as stream:
+        return _ends_well(stream)
+
+
 def _ends_well(stream: IO[bytes]) -> bool:
     stream.seek(-len(MCAP0_MAGIC), 2)
     return stream.read() == MCAP0_MAGIC

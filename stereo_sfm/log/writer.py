@@ -95,6 +95,11 @@ class LogWriter:
         self._guarded(lambda: self._mcap.start(library="stereo-sfm"))
 
     @property
+    def refused(self) -> bool:
+        """Whether the disk took no more, and the file was closed for that."""
+        return self._failure is not None
+
+    @property
     def bytes_written(self) -> int:
         """Size of the file now."""
         return self._file.tell()

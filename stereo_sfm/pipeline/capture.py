@@ -6,6 +6,7 @@ import contextlib
 import threading
 import time
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 
@@ -15,6 +16,7 @@ from stereo_sfm.pipeline.channels import End, Outbox
 from stereo_sfm.pipeline.health import HealthMeter
 from stereo_sfm.pipeline.images import ImageRing, SlotImage
 from stereo_sfm.pipeline.stages import sensor_drop, source_counters
+from stereo_sfm.pipeline.watchdog import Pulse
 from stereo_sfm.types import Dropped, StereoImage, Trajectory
 
 
@@ -29,36 +31,52 @@ class SourceInfo:
     live: bool
 
 
+TRACKER_SLOTS = 4  # of the ring in real time, which the log cannot take
+
+
 class FreeSlots:
-    """Which slots of the ring are free: every reader gives each slot back once."""
+    """Which slots of the ring are free: the tracker and the log, or main in its place, give each slot back."""
 
-    def __init__(self, count: int, readers: list[Connection]) -> None:
-        self._readers = list(readers)
-        self._out = [0] * count
+    def __init__(self, count: int, tracker: Connection, log: Connection) -> None:
+        self._holds: dict[Connection, set[int]] = {tracker: set(), log: set()}
+        self._tracker, self._log = tracker, log
         self._free = deque(range(count))
+        self._log_share = max(count - TRACKER_SLOTS, 1)
 
-    def take(self, block: bool) -> int | None:
-        """A free slot; None when there is none and `block` is False, or when no reader is left."""
+    def take(self, block: bool) -> tuple[int, bool] | None:
+        """A free slot for the tracker, and whether it is for the log as well; None when none is to be had.
+
+        Args:
+            block: wait for one, as files are read, and leave nothing out of the log; otherwise the log holds no more
+                than its share of the slots, so that the tracker never waits for it.
+        """
         self._collect(0)
         while not self._free:
-            if not block or not self._readers:
+            if not block or not self._holds:
                 return None
             self._collect(None)
-        slot = self._free.popleft()
-        self._out[slot] = len(self._readers)
-        return slot
+        slot, logged = self._free.popleft(), self._log in self._holds
+        if not block:
+            logged = logged and len(self._holds[self._log]) < self._log_share
+        for reader in (self._tracker, self._log) if logged else (self._tracker,):
+            if reader in self._holds:
+                self._holds[reader].add(slot)
+        return slot, logged
 
     def _collect(self, timeout: float | None) -> None:
-        for connection in wait(self._readers, timeout):
-            assert isinstance(connection, Connection)
-            try:
-                slot: int = connection.recv()
-            except (EOFError, OSError):
-                self._readers.remove(connection)
-                continue
-            self._out[slot] -= 1
-            if self._out[slot] == 0:
-                self._free.append(slot)
+        while ready := wait(list(self._holds), timeout):
+            timeout = 0
+            for connection in ready:
+                assert isinstance(connection, Connection)
+                self._take_back(connection)
+
+    def _take_back(self, connection: Connection) -> None:
+        try:
+            back: set[int] = {connection.recv()}
+            self._holds[connection] -= back
+        except (EOFError, OSError):
+            back = self._holds.pop(connection)  # what a dead reader held nobody reads any more
+        self._free.extend(sorted(k for k in back if not any(k in held for held in self._holds.values())))
 
 
 class StopFlag:
@@ -84,6 +102,7 @@ class CaptureStage:
     slots: FreeSlots
     to_tracker: Outbox
     to_main: Outbox
+    pulse: Pulse
     stop: StopFlag
     realtime: bool
     jpeg: bool
@@ -100,19 +119,19 @@ class CaptureStage:
 
     def _read(self) -> None:
         meter = HealthMeter("capture", self.to_main.send)
-        for image in self.source:
+        for image in self._images():
             if self.stop.asked:
                 break
             begin = time.monotonic()
             drop = sensor_drop(image)
             if drop is not None:
                 self.to_main.send(drop)
-            slot = self.slots.take(block=not self.realtime)
-            if slot is None:
+            free = self.slots.take(block=not self.realtime)
+            if free is None:
                 meter.dropped += 1
                 self.to_main.send(Dropped(image.frame_id, image.stamp_ns, "ring", "no free slot: a stage is too slow"))
                 continue
-            message = self._put(slot, image, begin)
+            message = self._put(*free, image, begin)
             self.to_tracker.send(message)
             self.to_main.send(message)
             self._last = image.frame_id
@@ -120,16 +139,27 @@ class CaptureStage:
                 self._count(self._last)
         meter.report()
 
+    def _images(self) -> Iterator[StereoImage]:
+        """Of the source; the watchdog hears how long each takes to come."""
+        images = iter(self.source)
+        while True:
+            self.pulse.begin()
+            image = next(images, None)
+            self.pulse.end()
+            if image is None:
+                return
+            yield image
+
     def _count(self, frame_id: int) -> None:
         """Tell what the source has counted until now."""
         counters = source_counters(self.source, frame_id)
         if counters is not None:
             self.to_main.send(counters)
 
-    def _put(self, slot: int, image: StereoImage, begin: float) -> SlotImage:
+    def _put(self, slot: int, logged: bool, image: StereoImage, begin: float) -> SlotImage:
         if not self.jpeg:
-            return self.ring.write(slot, image, begin)
+            return self.ring.write(slot, image, begin, logged=logged)
         from stereo_sfm.log.images import encode_pair
 
-        logged = encode_pair(image, "jpeg")
-        return self.ring.write(slot, logged.image, begin, (logged.left, logged.right))
+        encoded = encode_pair(image, "jpeg")
+        return self.ring.write(slot, encoded.image, begin, (encoded.left, encoded.right), logged=logged)

@@ -38,7 +38,7 @@ class Lost(Exception):
 class Outbox:
     """Sends in a thread, so that two stages that write to each other never wait for one another's pipe.
 
-    At most `limit` messages wait; then `send` blocks, which is the back-pressure of the pipeline.
+    At most `limit` messages wait; then `send` blocks, which is the back-pressure of the pipeline. 0: any number.
     """
 
     def __init__(self, connection: Connection, limit: int = 64) -> None:
@@ -50,6 +50,14 @@ class Outbox:
     def send(self, message: object) -> None:
         """Give the message away."""
         self._queue.put((message,))
+
+    def offer(self, message: object, patience_s: float) -> bool:
+        """Give the message away, or say after so many seconds that there is no room for it."""
+        try:
+            self._queue.put((message,), timeout=patience_s)
+        except queue.Full:
+            return False
+        return True
 
     def waiting(self) -> int:
         """Messages not yet in the pipe."""

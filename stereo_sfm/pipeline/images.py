@@ -64,6 +64,7 @@ class SlotImage:
     has_depth: bool
     captured_s: float  # monotonic clock
     encoded: tuple[bytes, bytes | None] | None = None  # JPEG bytes whose decoded pixels the slot holds
+    logged: bool = True  # the log (main, where there is none) reads the slot and gives it back
 
 
 class ImageRing:
@@ -111,7 +112,12 @@ class ImageRing:
         return left, right, depth
 
     def write(
-        self, slot: int, image: StereoImage, captured_s: float, encoded: tuple[bytes, bytes | None] | None = None
+        self,
+        slot: int,
+        image: StereoImage,
+        captured_s: float,
+        encoded: tuple[bytes, bytes | None] | None = None,
+        logged: bool = True,
     ) -> SlotImage:
         """Put the pixels into a slot."""
         left, right, depth = self._arrays(slot)
@@ -121,7 +127,7 @@ class ImageRing:
         if depth is not None and image.depth is not None:
             depth[...] = image.depth
         bare = dataclasses.replace(image, left=_NO_PIXELS, right=None, depth=None)
-        return SlotImage(slot, bare, image.right is not None, image.depth is not None, captured_s, encoded)
+        return SlotImage(slot, bare, image.right is not None, image.depth is not None, captured_s, encoded, logged)
 
     def read(self, message: SlotImage) -> StereoImage:
         """The image with pixels of its own: the slot may be given back at once."""

@@ -11,6 +11,8 @@ from __future__ import annotations
 import contextlib
 import logging
 import multiprocessing
+import os
+import resource
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -23,22 +25,29 @@ from drivers.choice import Opener
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.maps.folders import MapFolders
-from stereo_sfm.messages import LogLine, Sink
-from stereo_sfm.pipeline import workers
+from stereo_sfm.messages import LogEnded, LogLine, Sink
+from stereo_sfm.pipeline import logger, workers
 from stereo_sfm.pipeline.capture import SourceInfo
 from stereo_sfm.pipeline.channels import DroppingOutbox, End, Failed, Outbox
 from stereo_sfm.pipeline.images import ImageLayout, ImageRing, SlotImage
 from stereo_sfm.pipeline.interrupts import ignored_by_children
 from stereo_sfm.pipeline.text import Listener, say
 from stereo_sfm.pipeline.threads import thread_environment
+from stereo_sfm.pipeline.watchdog import Beat, Watchdog
 from stereo_sfm.pipeline.workers import LogOptions, Ready, Setup, ViewerOptions
-from stereo_sfm.types import Applied, Frame
+from stereo_sfm.types import Applied, Dropped, Frame, StereoImage
+
+log = logging.getLogger("stereo_sfm")
 
 SINKS = ("logger", "viewer")
 PICTURE_NS = 100_000_000  # the viewer gets a picture at most so often
+LOOK_S = 0.5  # between two looks at who does not answer
 GRACE_S = 1.2  # for the logger to close its file after another stage died
-STOP_GRACE_S = 3.0  # without any message, for capture to see that it shall stop
+STOP_GRACE_S = 2.0  # for capture to see that it shall stop
+END_S = 3.0  # for a live run to end when it shall stop, and for any other without a message of its stages
 VIEWER_GRACE_S = 10.0  # for the viewer to show what waits when the run is over
+BACKLOG = 20_000  # messages for a logger that does not take them, in real time: then the run goes on without a log
+LEAST_FILES = 128  # that the processes may have open each
 
 
 class StageDied(StereoSfmError):
@@ -87,14 +96,20 @@ class ProcessRun:
         self._reports: dict[Connection, str] = {}
         self._controls: dict[str, Connection] = {}
         self._to_logger: Outbox | None = None
+        self._live = False  # nobody waits for the logger
+        self._left_out = 0  # images that the log lacks
+        self._abandoned = False
         self._release: Outbox | None = None
         self._to_viewer: DroppingOutbox | None = None
         self._next_picture_ns = 0
         self._ring: ImageRing | None = None
         self._ended: set[str] = set()
-        self._said_early: list[LogLine] = []  # while the source was opened
+        self._said_early: list[object] | None = []  # while the source was opened
         self._waiting = {"tracker", "mapper", "loop"}  # not ready yet
-        self._stopping = False
+        self._stopped_s: float | None = None  # when somebody asked for the end
+        self._progress_s = time.monotonic()  # of the last message that was more than a sign of life
+        self._look_s = self._listened_s = time.monotonic()
+        self._over_s: float | None = None  # when the last stage had ended
         self._woken, self._wake = self._pipe()  # `stop` may be called while the next message is awaited
         self._failure: StereoSfmError | None = None  # of the source: told when all that it gave is finished
         self._listener = Listener("main", self.publish)
@@ -103,6 +118,7 @@ class ProcessRun:
     # -- life --------------------------------------------------------------------------------------------------------
 
     def __enter__(self) -> Self:
+        _have_files(LEAST_FILES)
         self._listener.__enter__()
         try:
             self._start()
@@ -115,7 +131,7 @@ class ProcessRun:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is not None and not issubclass(kind, StageDied):
+        if self._reports:
             self._abandon()
         self._kill_all()
         self._listener.__exit__(None, None, None)
@@ -126,20 +142,34 @@ class ProcessRun:
         return {name: p.pid for name, p in self._processes.items() if p.pid is not None}
 
     def stop(self) -> None:
-        """Ask capture to end; everything in flight is finished and written."""
-        if not self._stopping:
-            self._stopping = True
-            for connection in (self._controls["capture"], self._wake):
-                with contextlib.suppress(OSError):  # capture is gone, or the whole run
+        """Ask capture to end; everything in flight is finished and written. May be called at any time."""
+        if self._stopped_s is not None:
+            return
+        self._stopped_s = time.monotonic()
+        for process in self._processes.values():
+            self._wake_up(process)
+        for connection in (self._controls.get("capture"), self._wake):
+            with contextlib.suppress(OSError):  # capture is gone, or the whole run
+                if connection is not None:
                     connection.send("stop")
 
+    @staticmethod
+    def _wake_up(process: BaseProcess) -> None:
+        """A stopped process can neither finish nor close its file."""
+        with contextlib.suppress(OSError, AttributeError):
+            if process.pid is not None:
+                os.kill(process.pid, signal.SIGCONT)
+
     def __iter__(self) -> Iterator[Frame]:
+        with contextlib.suppress(_Over):
+            yield from self._frames()
+        if self._failure is not None:
+            raise self._failure
+
+    def _frames(self) -> Iterator[Frame]:
         while self._reports:
-            ready = wait([*self._reports, self._woken], self._patience())
-            if not ready and "capture" not in self._reports.values():
-                break  # only the viewer is left, and it hangs
-            if not ready:  # asked to stop, it waits for an image that does not come
-                self._processes["capture"].kill()
+            ready = wait([*self._reports, self._woken], LOOK_S)
+            self._look()
             for connection in ready:
                 assert isinstance(connection, Connection)
                 try:
@@ -147,29 +177,75 @@ class ProcessRun:
                     if connection is self._woken:
                         continue
                 except (EOFError, OSError):
-                    self._died(connection)
+                    if connection in self._reports:
+                        self._died(connection)
                     continue
-                if isinstance(message, Failed):
-                    self._fail(connection, message)
-                elif isinstance(message, End):
-                    self._end(connection, message.stage)
-                elif isinstance(message, Ready):
-                    self._begin(message.stage)
-                else:
-                    if isinstance(message, LogLine):
-                        say(message)
-                    self._dispatch(message)
-                    if isinstance(message, Frame):
-                        yield message
-        if self._failure is not None:
-            raise self._failure
+                if connection in self._reports:  # else it was given up meanwhile
+                    frame = self._take(connection, message)
+                    if frame is not None:
+                        yield frame
 
-    def _patience(self) -> float | None:
-        """Seconds to wait for the next message; without end while a stage or the logger is at work."""
+    def _take(self, connection: Connection, message: object) -> Frame | None:
+        """One message of a stage; returned when it is a frame."""
+        self._watchdog.hear(self._reports[connection], message)
+        if isinstance(message, Beat):
+            return None
+        self._progress_s = time.monotonic()
+        if isinstance(message, Failed):
+            self._fail(connection, message)
+        elif isinstance(message, End):
+            self._end(connection, message.stage)
+        elif isinstance(message, Ready):
+            self._begin(message.stage)
+        else:
+            if isinstance(message, LogLine):
+                say(message)
+            self._dispatch(message)
+        return message if isinstance(message, Frame) else None
+
+    # -- who does not answer -----------------------------------------------------------------------------------------
+
+    def _look(self) -> None:
+        """Now and then look for stages that do not answer, and for an end that takes too long.
+
+        Raises:
+            _Over: nothing more is waited for.
+        """
+        now = time.monotonic()
+        if now - self._listened_s > 2 * LOOK_S:  # whoever takes the frames was busy
+            self._watchdog.excuse(now - self._listened_s)
+            self._progress_s = now
+        self._listened_s = now
+        if now < self._look_s:
+            return
+        self._look_s = now + LOOK_S
         waiting = set(self._reports.values())
-        if self._stopping and "capture" in waiting:
-            return STOP_GRACE_S
-        return VIEWER_GRACE_S if waiting == {"viewer"} else None
+        silent = self._watchdog.silent(sorted(waiting - {"viewer"}))
+        if waiting == {"viewer"}:
+            self._over_s = self._over_s or now
+            if now - self._over_s > VIEWER_GRACE_S:
+                raise _Over
+        elif self._stopped_s is not None:
+            self._hasten(now - self._stopped_s, now, silent)
+
+    def _hasten(self, waited_s: float, now: float, silent: list[str]) -> None:
+        """After somebody asked for the end: what does not end by itself is ended.
+
+        A stage may take its time while it works: for a map that shall be saved as long as it needs, for files as long
+        as something comes of it, for a live camera `END_S`.
+        """
+        if waited_s > STOP_GRACE_S and "capture" in self._reports.values():
+            self._processes["capture"].kill()  # it waits for an image that does not come
+            return
+        hurry = bool(silent) or self._folders.map_out is None
+        if waited_s > END_S and hurry and (self._live or now - self._progress_s > END_S):
+            self._end_now()
+
+    def _end_now(self) -> None:
+        missing = " and the ".join(sorted(set(self._reports.values()) - {"viewer"}))
+        log.warning("ended without waiting for the %s", missing)
+        self._abandon()
+        raise _Over
 
     # -- start -------------------------------------------------------------------------------------------------------
 
@@ -180,7 +256,7 @@ class ProcessRun:
         jobs, results = pipe(), pipe()
         tracker_free, second_free = pipe(), pipe()
         logged = pipe()
-        readers = [tracker_free[0], second_free[0]]
+        readers = (tracker_free[0], second_free[0])
         self._spawn("capture", workers.run_capture, self._opener, self._control("capture"), images[1], readers)
         self._spawn(
             "tracker", workers.run_tracker, self._control("tracker"), images[0], tracker_free[1], updates[0],
@@ -194,8 +270,7 @@ class ProcessRun:
         self._spawn("optimizer", workers.run_optimizer, self._control("optimizer"), jobs[0], results[1])
         keep: list[Connection] = []
         if self._log is not None:
-            self._spawn("logger", workers.run_logger, self._control("logger"), logged[0], second_free[1], self._log)
-            self._to_logger = Outbox(logged[1], 64)
+            self._spawn("logger", logger.run_logger, self._control("logger"), logged[0], second_free[1], self._log)
             keep = [logged[1]]
         else:
             self._release = Outbox(second_free[1], 64)
@@ -209,16 +284,20 @@ class ProcessRun:
             for end in ends:
                 if end not in keep:
                     end.close()  # only the workers hold these: their death must be seen as an end of file
+        self._watchdog = Watchdog(self.pids, log.warning)
         info = self._first_report()
+        self._live = info.live if self._realtime is None else self._realtime
+        if self._log is not None:
+            self._to_logger = Outbox(logged[1], BACKLOG if self._live else 0)
         if self._opened is not None:
             self._opened()
         self._set_up(info)
-        for line in self._said_early:
+        said, self._said_early = self._said_early, None
+        for line in said or ():
             self._dispatch(line)
 
     def _set_up(self, info: SourceInfo) -> None:
         self.info = info
-        realtime = info.live if self._realtime is None else self._realtime
         self._ring = ImageRing(ImageLayout.of(info.rig), self._config.pipeline.ring_slots)
         applied = None if self._applied is None else tuple(self._applied)
         setup = Setup(
@@ -228,7 +307,7 @@ class ProcessRun:
             source_name=self._opener.spec or info.name,
             ring_name=self._ring.name,
             applied=applied,
-            realtime=realtime,
+            realtime=self._live,
             folders=self._folders,
             delays=self._delays,
             opening=self._folders.opening(self._opener.opening),
@@ -237,6 +316,8 @@ class ProcessRun:
         for stage, control in self._controls.items():
             with contextlib.suppress(OSError):  # it died: its report tells
                 control.send((setup, jpeg) if stage == "capture" else setup)
+        if self._stopped_s is not None:
+            self._controls["capture"].send("stop")  # it was asked for while the source was opened
 
     def _begin(self, stage: str) -> None:
         """Capture goes when the last of the others is ready."""
@@ -271,42 +352,70 @@ class ProcessRun:
         """Capture's first word: what the source is, or why it cannot be opened."""
         connection = next(c for c, stage in self._reports.items() if stage == "capture")
         while True:
+            if not wait([connection], LOOK_S):
+                self._watchdog.silent(["capture"])
+                if self._stopped_s is not None and time.monotonic() - self._stopped_s > STOP_GRACE_S:
+                    raise KeyboardInterrupt
+                continue
             try:
                 message = connection.recv()
             except (EOFError, OSError):
                 raise StageDied(f"capture {self._how_it_died('capture')} before the source was open") from None
+            self._watchdog.hear("capture", message)
             if isinstance(message, Failed):
                 self._reports.pop(connection)
                 raise _error(message)
             if isinstance(message, SourceInfo):
                 return message
-            assert isinstance(message, LogLine)
-            say(message)
-            self._said_early.append(message)
+            if isinstance(message, LogLine):
+                say(message)
+                self.publish(message)
 
     # -- messages ----------------------------------------------------------------------------------------------------
 
     def publish(self, message: object) -> None:
         """Put a message of the caller's into the run's log, viewer and sinks."""
-        self._dispatch(message)
+        if self._said_early is not None:
+            self._said_early.append(message)
+        else:
+            self._dispatch(message)
 
     def _dispatch(self, message: object) -> None:
+        if isinstance(message, LogEnded):
+            log.warning("%s; the run goes on without it", message.why)
+        if isinstance(message, SlotImage) and not message.logged:
+            self._leave_out(message.image)
         if not isinstance(message, SlotImage):
             for sink in self._sinks:
                 sink.put(message)
         if self._to_viewer is not None:
             self._show(message)
         if self._to_logger is not None:
-            self._to_logger.send(message)
-        elif isinstance(message, SlotImage) and self._release is not None:
+            self._log_message(message)
+        elif isinstance(message, SlotImage) and message.logged and self._release is not None:
             self._release.send(message.slot)
+
+    def _leave_out(self, image: StereoImage) -> None:
+        """An image that the tracker has and the log has no time for."""
+        if self._to_logger is None or self._log is None or self._log.image_format == "none":
+            return
+        if not self._left_out:
+            log.warning("the log is slower than the camera: it lacks some of the images")
+        self._left_out += 1
+        self._dispatch(Dropped(image.frame_id, image.stamp_ns, "log", "the log is slower than the camera"))
+
+    def _log_message(self, message: object) -> None:
+        """To the logger, without waiting for it. Where files are read, the slots that it holds make the run wait."""
+        assert self._to_logger is not None
+        if not self._to_logger.offer(message, 0.0):
+            self._give_up_log(f"the logger has not taken the last {BACKLOG} messages")
 
     def _show(self, message: object) -> None:
         """Pass on to the viewer what it can take; it never holds anybody up."""
         assert self._to_viewer is not None and self._ring is not None
         if not isinstance(message, SlotImage):
             self._to_viewer.send(message)
-        elif message.image.stamp_ns >= self._next_picture_ns:
+        elif message.logged and message.image.stamp_ns >= self._next_picture_ns:
             self._next_picture_ns = message.image.stamp_ns + PICTURE_NS
             self._to_viewer.send(self._ring.read(message))
 
@@ -337,8 +446,11 @@ class ProcessRun:
         if stage == "viewer":  # closed or crashed: the run does not care
             self._ended.add(stage)
             return
-        if stage == "capture" and (self._stopping or not self._waiting):
-            if not self._stopping:
+        if stage == "logger" and self._live:
+            self._give_up_log(f"the {stage} process {self._how_it_died(stage)}")
+            return
+        if stage == "capture" and (self._stopped_s is not None or not self._waiting):
+            if self._stopped_s is None:
                 died = self._how_it_died(stage)
                 self._failure = StageDied(f"the {stage} process {died}; {self._what_remains(stage)}")
             self._end(connection, stage)
@@ -356,15 +468,19 @@ class ProcessRun:
             return "the run has no log"
         if stage == "logger" and not self._log.path.exists():
             return "there is no log"
-        if stage == "logger":
+        if self._open_log():
             return f"the log {self._log.path} is not closed, but readable (stereo-sfm recover writes a clean copy)"
         return f"the log {self._log.path} is complete up to then"
 
     def _fail(self, connection: Connection, failed: Failed) -> None:
         if failed.stage == "viewer":
-            logging.getLogger("stereo_sfm").warning("the viewer stopped: %s", failed.message.strip().splitlines()[-1])
+            log.warning("the viewer stopped: %s", failed.message.strip().splitlines()[-1])
             self._reports.pop(connection)
             self._ended.add("viewer")
+            return
+        if failed.stage == "logger" and self._live and not failed.ours:
+            self._reports.pop(connection)
+            self._give_up_log(f"the logger failed: {failed.message.strip().splitlines()[-1]}")
             return
         if failed.stage == "capture" and not self._waiting:
             self._failure = _error(failed)
@@ -372,22 +488,56 @@ class ProcessRun:
             return
         self._abandon()
         if self._failure is not None:
-            logging.getLogger("stereo_sfm").warning("%s", failed.message)
+            log.warning("%s", failed.message)
             raise self._failure
         raise _error(failed)
 
     def _abandon(self) -> None:
-        """Kill every stage but the logger, which closes its file."""
+        """Kill every stage but the logger, which closes its file; where it cannot, main does."""
+        if self._abandoned:
+            return
+        self._abandoned = True
         for stage, process in self._processes.items():
             if stage != "logger" and process.is_alive():
                 process.kill()
         logger = self._processes.get("logger")
-        if logger is None or self._to_logger is None:
+        if logger is None or self._to_logger is None or "logger" in self._ended:
             return
         until = time.monotonic() + GRACE_S
         if logger.is_alive():
-            self._to_logger.send(End("main", early=True))
+            self._wake_up(logger)
+            self._to_logger.offer(End("main", early=True), GRACE_S)
         logger.join(max(until - time.monotonic(), 0.0))
+        self._close_log(logger)
+
+    def _give_up_log(self, why: str) -> None:
+        """The run goes on without a log: nothing is more urgent than the pose."""
+        logger, self._to_logger = self._processes["logger"], None
+        for connection in [c for c, stage in self._reports.items() if stage == "logger"]:
+            del self._reports[connection]
+            connection.close()
+        self._ended.add("logger")
+        self._close_log(logger)
+        assert self._log is not None
+        self._dispatch(LogEnded(f"{why}: {self._log.path} ends here"))
+
+    def _close_log(self, logger: BaseProcess) -> None:
+        """End the logger and the file that it left open."""
+        if logger.is_alive():
+            logger.kill()
+        logger.join()
+        if self._log is not None and logger.exitcode != 0 and self._open_log():
+            from stereo_sfm.log.provenance import ENDED_EARLY, METADATA
+            from stereo_sfm.log.repair import finish_in_place
+
+            with contextlib.suppress(OSError, StereoSfmError):  # no room for its end: it is readable all the same
+                finish_in_place(self._log.path, (METADATA, ENDED_EARLY))
+
+    def _open_log(self) -> bool:
+        """Whether the log was not closed."""
+        from stereo_sfm.log.scan import is_closed
+
+        return self._log is not None and self._log.path.exists() and not is_closed(self._log.path)
 
     def _kill_all(self) -> None:
         for process in self._processes.values():
@@ -407,6 +557,23 @@ class ProcessRun:
         if stage in self._ended:
             process.join(1.0)
         return not process.is_alive()
+
+
+class _Over(Exception):
+    """Nothing more is waited for."""
+
+
+def _have_files(least: int) -> None:
+    """Let this process and its children open so many files.
+
+    Raises:
+        StereoSfmError: the system does not allow it.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft != resource.RLIM_INFINITY and soft < least:
+        if hard != resource.RLIM_INFINITY and hard < least:
+            raise StereoSfmError(f"only {hard} files may be open, a run needs {least}: raise 'ulimit -n', or --inline")
+        resource.setrlimit(resource.RLIMIT_NOFILE, (least, hard))
 
 
 def _error(failed: Failed) -> StereoSfmError:

@@ -16,7 +16,7 @@ from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError, require
 from stereo_sfm.export.run_folder import KEPT_MAP, FolderLock, default_folder, discard_files, prepare_folder
 from stereo_sfm.maps.folders import MapFolders
-from stereo_sfm.messages import Sink
+from stereo_sfm.messages import LogEnded, Sink
 from stereo_sfm.pipeline.capture import SourceInfo
 from stereo_sfm.pipeline.inline import run_inline
 from stereo_sfm.pipeline.processes import ProcessRun
@@ -150,6 +150,7 @@ class Session:
     def _enter_inline(self, stack: ExitStack) -> Iterator[Frame]:
         from stereo_sfm.log.run_log import RunLog
         from stereo_sfm.log.writer import LogWriter
+        from stereo_sfm.pipeline.logger import LogSink
 
         source = stack.enter_context(self._opener())
         self.info = SourceInfo(source.name, source.rig, source.ground_truth, source.frame_count, source.live)
@@ -159,14 +160,15 @@ class Session:
         sinks: list[Any] = list(self._sinks)
         jpeg = options is not None and options.image_format == "jpeg"
         if options is not None:
-            log = RunLog(
+            run_log = RunLog(
                 LogWriter(options.path, compress=options.image_format != "raw"), source.rig, self._config,
                 source=self._opener.spec or source.name, mode="inline",
                 image_format=options.image_format, ground_truth=source.ground_truth,
                 opening=self._folders.opening(self._opener.opening),
             )  # fmt: skip
-            stack.callback(log.close)
-            sinks.append(log)
+            sink = LogSink(run_log, lambda ended: self._log_ended(ended, sinks))
+            stack.callback(sink.close)
+            sinks.append(sink)
         if self._wiring.viz != "none":
             from stereo_sfm.viz.sink import RerunSink
 
@@ -183,6 +185,12 @@ class Session:
         frames = run_inline(source, self._config, sinks, schedule, self._folders, jpeg=jpeg)
         stack.callback(frames.close)
         return frames
+
+    @staticmethod
+    def _log_ended(ended: LogEnded, sinks: Sequence[Sink]) -> None:
+        log.warning("%s; the run goes on without it", ended.why)
+        for sink in sinks:
+            sink.put(ended)
 
     def _enter_processes(self, stack: ExitStack) -> Iterator[Frame]:
         self._name_folder("run")

@@ -26,6 +26,7 @@ from stereo_sfm.pipeline.channels import End, Failed, Inbox, Lost, Outbox
 from stereo_sfm.pipeline.interrupts import STOP_SIGNALS
 from stereo_sfm.pipeline.schedule import Lockstep, Realtime, Recorded, Schedule
 from stereo_sfm.pipeline.text import LOGGER, Listener
+from stereo_sfm.pipeline.watchdog import Pulse
 from stereo_sfm.types import Applied, Keyframe, LoopResult, MapUpdate, Trajectory
 from stereo_sfm.viz.server import LOOPBACK
 
@@ -48,14 +49,22 @@ class Setup:
     opening: Opening = field(default_factory=Opening)  # of the source
 
 
+class Report(Outbox):
+    """What a worker says to main, with its beat."""
+
+    def __init__(self, stage: str, connection: Connection) -> None:
+        super().__init__(connection, 512)
+        self.pulse = Pulse(stage, self.send)
+
+
 def guarded(stage: str, body: Callable[..., None], report: Connection, *args: Any) -> None:
     """Entry of every worker process."""
     for number in STOP_SIGNALS:
         signal.signal(number, signal.SIG_IGN)  # main decides what Ctrl-C means
-    to_main = Outbox(report, 512)
+    to_main = Report(stage, report)
     logging.getLogger(LOGGER).setLevel(logging.INFO)  # main decides what is printed
     try:
-        with Listener(stage, to_main.send):
+        with Listener(stage, to_main.send), to_main.pulse:
             body(to_main, *args)
         to_main.send(End(stage))
         to_main.close()
@@ -111,7 +120,11 @@ def prepare(stage: str, setup: Setup) -> Callable[[], None]:
 
 
 def run_capture(
-    to_main: Outbox, opener: Opener, control: Connection, tracker: Connection, readers: list[Connection]
+    to_main: Report,
+    opener: Opener,
+    control: Connection,
+    tracker: Connection,
+    readers: tuple[Connection, Connection],
 ) -> None:
     """Open the source, tell main about it, read it to the end."""
     from stereo_sfm.pipeline.capture import CaptureStage, FreeSlots, SourceInfo, StopFlag
@@ -129,9 +142,10 @@ def run_capture(
         stage = CaptureStage(
             source,
             ring,
-            FreeSlots(slots, readers),
+            FreeSlots(slots, *readers),
             to_tracker,
             to_main,
+            to_main.pulse,
             StopFlag(control, word == "stop"),
             setup.realtime,
             jpeg,
@@ -156,7 +170,7 @@ def _next_image(inbox: Inbox[Any]) -> Any:
 
 
 def run_tracker(
-    to_main: Outbox,
+    to_main: Report,
     control: Connection,
     images: Connection,
     release: Connection,
@@ -184,6 +198,7 @@ def run_tracker(
     meter = HealthMeter("tracker", to_main.send)
     frame_id = -1
     while isinstance(message := _next_image(inbox), SlotImage):
+        to_main.pulse.begin()
         image = ring.read(message)
         free.send(message.slot)
         delay()
@@ -199,6 +214,7 @@ def run_tracker(
         frame_id = image.frame_id
         to_main.send(StageTimes(frame_id, {**spans.take(), "latency": (now - message.captured_s) * 1e3}))
         meter.add(frame_id, (now - begin) * 1e3, to_main.waiting())
+        to_main.pulse.end()
     meter.report()
     for outbox in keyframes:
         outbox.send(End("tracker"))
@@ -207,7 +223,7 @@ def run_tracker(
 
 
 def run_mapper(
-    to_main: Outbox,
+    to_main: Report,
     control: Connection,
     keyframes: Connection,
     loops: Connection,
@@ -235,6 +251,7 @@ def run_mapper(
     meter = HealthMeter("mapper", to_main.send)
     frame_id, busy = -1, False
     while isinstance(keyframe := inbox.take(), Keyframe):
+        to_main.pulse.begin()
         delay()
         begin = time.monotonic()
         if busy and mapper.job_due:
@@ -252,6 +269,8 @@ def run_mapper(
         ms = (time.monotonic() - begin) * 1e3
         to_main.send(StageTimes(frame_id, {**spans.take(), "map": ms}))
         meter.add(frame_id, ms)
+        to_main.pulse.end()
+    to_main.pulse.begin()
     if busy:
         mapper.finish_job(answers.take())
     last = stage.finish()
@@ -270,7 +289,7 @@ def release_memory() -> None:
         ctypes.CDLL("libc.so.6").malloc_trim(0)
 
 
-def run_optimizer(to_main: Outbox, control: Connection, jobs: Connection, results: Connection) -> None:
+def run_optimizer(to_main: Report, control: Connection, jobs: Connection, results: Connection) -> None:
     """Full bundle adjustments, beside the mapper."""
     from stereo_sfm.mapping.mapper import Job, run_job
 
@@ -278,14 +297,16 @@ def run_optimizer(to_main: Outbox, control: Connection, jobs: Connection, result
     delay = prepare("optimizer", setup)
     inbox, outbox = Inbox[Job | End](jobs), Outbox(results)
     while isinstance(job := inbox.take(), Job):
+        to_main.pulse.begin()
         delay()
         outbox.send(run_job(job))
         del job
         release_memory()
+        to_main.pulse.end()
     outbox.close()
 
 
-def run_loop(to_main: Outbox, control: Connection, keyframes: Connection, to_mapper: Connection) -> None:
+def run_loop(to_main: Report, control: Connection, keyframes: Connection, to_mapper: Connection) -> None:
     """Keyframes to loop results."""
     from stereo_sfm.messages import StageTimes
     from stereo_sfm.pipeline.health import HealthMeter
@@ -303,6 +324,7 @@ def run_loop(to_main: Outbox, control: Connection, keyframes: Connection, to_map
     while isinstance(keyframe := inbox.take(), Keyframe):
         if closer is None:
             continue
+        to_main.pulse.begin()
         delay()
         begin = time.monotonic()
         result = closer.step(keyframe)
@@ -311,6 +333,7 @@ def run_loop(to_main: Outbox, control: Connection, keyframes: Connection, to_map
         frame_id, ms = keyframe.frame_id, (time.monotonic() - begin) * 1e3
         to_main.send(StageTimes(frame_id, {**spans.take(), "loop": ms}))
         meter.add(frame_id, ms)
+        to_main.pulse.end()
     meter.report()
     outbox.close()
 
@@ -323,45 +346,6 @@ class LogOptions:
     image_format: str = "png"  # png | raw | jpeg | none
 
 
-def run_logger(
-    to_main: Outbox, control: Connection, messages: Connection, release: Connection, options: LogOptions
-) -> None:
-    """Everything main passes on, into the MCAP file. The file is closed whatever happens to the others."""
-    from stereo_sfm.log.images import LoggedImage
-    from stereo_sfm.log.run_log import RunLog
-    from stereo_sfm.log.writer import LogWriter
-    from stereo_sfm.pipeline.images import ImageLayout, ImageRing, SlotImage
-
-    setup = Inbox[Setup](control).take()
-    prepare("logger", setup)
-    ring = ImageRing(ImageLayout.of(setup.rig), setup.config.pipeline.ring_slots, setup.ring_name)
-    mode = "realtime" if setup.realtime else "lockstep"
-    log = RunLog(
-        LogWriter(options.path, compress=options.image_format != "raw"), setup.rig, setup.config,
-        source=setup.source_name, mode=mode, image_format=options.image_format, ground_truth=setup.ground_truth,
-        opening=setup.opening,
-    )  # fmt: skip
-    inbox, free = Inbox[Any](messages), Outbox(release)
-    early = True
-    try:
-        while not isinstance(message := inbox.take(), End):
-            if isinstance(message, SlotImage):
-                image = ring.read(message)
-                free.send(message.slot)
-                if message.encoded is not None:
-                    log.put(LoggedImage(image, *message.encoded, "jpeg"))
-                else:
-                    log.put(image)
-            else:
-                log.put(message)
-        early = message.early
-    except Lost:
-        pass  # main is gone: what has arrived is kept
-    finally:
-        log.close(early=early)
-        ring.close()
-
-
 @dataclass(frozen=True)
 class ViewerOptions:
     """How a run is shown."""
@@ -371,7 +355,7 @@ class ViewerOptions:
     address: str = LOOPBACK  # of mode "serve"
 
 
-def run_viewer(to_main: Outbox, control: Connection, messages: Connection, options: ViewerOptions) -> None:
+def run_viewer(to_main: Report, control: Connection, messages: Connection, options: ViewerOptions) -> None:
     """What main passes on, into rerun."""
     from stereo_sfm.viz.sink import RerunSink
 
