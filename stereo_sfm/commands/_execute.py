@@ -85,7 +85,7 @@ def execute(options: RunOptions) -> tuple[int, Path]:
         folder, info = session.folder, session.info
         stats, evaluations = write_results(
             folder, info.name, info.rig, o.config, record, wall_s, info.ground_truth, o.frame, o.source.numbering,
-            o.max_lost_percent,
+            o.max_lost_percent, _why_not_started(o, record, folder, info.live),
         )  # fmt: skip
         link_latest(folder)
     if not o.quiet:
@@ -99,6 +99,16 @@ def execute(options: RunOptions) -> tuple[int, Path]:
         print(f"stereo-sfm {o.command}: {failed}; {folder / 'report.md'} says why", file=sys.stderr)
         return TRACKING_FAILED, folder
     return 0, folder
+
+
+def _why_not_started(options: RunOptions, record: RunRecord, folder: Path, live: bool) -> str:
+    """Of a run without any pose: from its source read once more, for a camera from the log."""
+    from drivers.choice import SourceChoice
+    from stereo_sfm.eval.start import why_not_started
+
+    if not len(record.frames) or record.tracked().any():
+        return ""
+    return why_not_started(SourceChoice(str(folder / "run.mcap")) if live else options.source)
 
 
 def _wiring(options: RunOptions) -> Wiring:

@@ -21,7 +21,9 @@ CHECK_FAILED = 3
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
     parser.add_argument("estimate", type=Path, help="a run's folder, or a trajectory file (TUM, KITTI, EuRoC)")
-    parser.add_argument("--ref", required=True, help="ground truth: a trajectory file, or a source that knows it")
+    parser.add_argument(
+        "--ref", help="ground truth: a trajectory file, or a source that knows it (default: what the run knows itself)"
+    )
     parser.add_argument("--which", choices=("odom", "map", "keyframes"), help="of a run (default: map, else odom)")
     parser.add_argument("--align", choices=("se3", "sim3", "origin", "none"), default="se3")
     parser.add_argument("--delta", default="1f", help="relative errors over frames (1f) or metres (1m)")
@@ -70,10 +72,12 @@ def _check_ranges(args: argparse.Namespace) -> None:
             raise StereoSfmError(f"{option} must be a number of at least 0, not {value:g}")
 
 
-def load(path: Path, which: str | None, spec: str) -> tuple[Trajectory, Trajectory]:
+def load(path: Path, which: str | None, spec: str | None) -> tuple[Trajectory, Trajectory]:
     """Estimate and reference: with the stamps of the other where one has none, and poses of the same frame."""
     file = estimate_file(path, which)
-    reference, truth_file = load_reference(spec, _opening(file.parent))
+    reference, truth_file = (
+        (own_truth(file.parent), None) if spec is None else load_reference(spec, _opening(file.parent))
+    )
     estimate = _with_stamps(file, reference)
     if truth_file is not None:
         reference = _with_stamps(truth_file, estimate)
@@ -95,6 +99,24 @@ def estimate_file(path: Path, which: str | None) -> Path:
     if found is None:
         raise StereoSfmError(f"{path} is no run's folder: it has no {' or '.join(names)}")
     return found
+
+
+def own_truth(folder: Path) -> Trajectory:
+    """The ground truth in the log of a run.
+
+    Raises:
+        StereoSfmError: there is none.
+    """
+    from stereo_sfm.log.attached import attached_truth
+    from stereo_sfm.log.reader import LogReader
+
+    log = folder / "run.mcap"
+    if log.is_file():
+        with LogReader(log) as reader:
+            truth = attached_truth(reader)
+        if truth is not None:
+            return truth
+    raise StereoSfmError(f"{folder} knows no ground truth: name it with --ref (a trajectory file, or a source)")
 
 
 def load_reference(spec: str, opening: Opening) -> tuple[Trajectory, Path | None]:

@@ -90,7 +90,7 @@ def _load(folder: Path) -> SavedMap:
     for place in (folder, folder / "map"):
         if (place / "map.json").is_file():
             return load_map(place)
-    raise StereoSfmError(f"{folder} holds no map (make one with 'run ... --map-out DIR')")
+    raise StereoSfmError(f"{folder} holds no map: nothing was mapped, or by an earlier version (run it again)")
 
 
 def _write_colmap(saved: SavedMap, output: Path, args: argparse.Namespace) -> None:

@@ -1,26 +1,29 @@
-"""`stereo-sfm viz`: show a run, or any MCAP recording, in rerun."""
+"""`stereo-sfm viz`: show a run, a saved map, or any MCAP recording, in rerun."""
 
 from __future__ import annotations
 
 import argparse
 import signal
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stereo_sfm.commands._options import add_viewer_address
+from stereo_sfm.commands._options import add_viewer_address, typed
 from stereo_sfm.errors import StereoSfmError, require
 
 if TYPE_CHECKING:
+    from calib.rig import Rig
     from drivers.source import Source
     from stereo_sfm.log.reader import LogReader
     from stereo_sfm.messages import Sink
-    from stereo_sfm.types import StereoImage
+    from stereo_sfm.types import StereoImage, Trajectory
+    from stereo_sfm.viz.sink import RerunSink
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
-    parser.add_argument("file", type=Path, help="run.mcap, a run's folder, or any recording")
+    parser.add_argument("file", type=Path, help="run.mcap, a run's folder, a saved map, or any recording")
     parser.add_argument("--source", help="where the images are, for a run whose log has none")
     parser.add_argument("--serve", action="store_true", help="to browsers, instead of opening a window")
     add_viewer_address(parser)
@@ -28,40 +31,80 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--overwrite", action="store_true", help="replace the file of --save")
 
 
+@dataclass(frozen=True)
+class VizOptions:
+    """Options of this command, as the parser names them."""
+
+    file: Path
+    source: str | None
+    serve: bool
+    viz_address: str
+    save: Path | None
+    overwrite: bool
+
+    @property
+    def mode(self) -> str:
+        """save | serve | spawn."""
+        return "save" if self.save else "serve" if self.serve else "spawn"
+
+    def sink(self, rig: Rig, name: str, truth: Trajectory | None = None) -> RerunSink:
+        """The viewer that they ask for."""
+        from stereo_sfm.viz.sink import RerunSink
+
+        return RerunSink(rig, name, self.mode, self.save, truth, self.viz_address)
+
+
 def run(args: argparse.Namespace) -> int:
-    """Feed a log to the viewer; with --serve stay until interrupted."""
-    path: Path = args.file / "run.mcap" if args.file.is_dir() else args.file
-    if not path.exists():
-        raise StereoSfmError(f"no recording at {path}")
-    if args.save is not None and args.save.is_file() and not args.overwrite:
-        raise StereoSfmError(f"{args.save} exists: choose another name or give --overwrite")
+    """Feed a log or a saved map to the viewer; with --serve stay until interrupted."""
+    options = typed(VizOptions, args)
+    file = options.file
+    is_map = (file / "map.json").is_file()
+    path = file / "run.mcap" if file.is_dir() else file
+    if not is_map and not path.exists():
+        raise StereoSfmError(f"no recording and no saved map at {file}")
+    if options.save is not None and options.save.is_file() and not options.overwrite:
+        raise StereoSfmError(f"{options.save} exists: choose another name or give --overwrite")
+    require(("rerun",), "viewer", "the viewer")
+    if is_map:
+        _show_map(options)
+    else:
+        _show_log(path, options)
+    if options.save is not None:
+        print(f"written to {options.save}: open it with 'rerun {options.save}'")
+    elif options.serve:
+        print("everything is sent; Ctrl-C ends")
+        signal.pause()
+    return 0
+
+
+def _show_map(options: VizOptions) -> None:
+    """A saved map: its keyframes and points at once, as one message of the mapper."""
+    from stereo_sfm.maps.saved_map import as_update, load_map
+
+    saved = load_map(options.file)
+    sink = options.sink(saved.rig, options.file.name)
+    sink.put(as_update(saved))
+    sink.close()
+
+
+def _show_log(path: Path, options: VizOptions) -> None:
     from stereo_sfm.log import topics
     from stereo_sfm.log.attached import attached_rig, attached_truth
     from stereo_sfm.log.provenance import METADATA
     from stereo_sfm.log.reader import LogReader
 
-    require(("rerun",), "viewer", "the viewer")
-    from stereo_sfm.viz.sink import RerunSink
-
-    mode = "save" if args.save else "serve" if args.serve else "spawn"
     with LogReader(path) as reader:
         names = {t.topic for t in reader.topics}
         rig = attached_rig(reader)
         name = reader.metadata(METADATA).get("source") or path.stem
-        has_images = args.source is not None or topics.LEFT_IMAGE in names or rig is None
-        if has_images:
-            with _images(reader, path, args.source) as source:
-                sink = RerunSink(source.rig, name, mode, args.save, source.ground_truth, args.viz_address)
+        if rig is None or options.source is not None or topics.LEFT_IMAGE in names:
+            with _images(reader, path, options.source) as source:
+                sink = options.sink(source.rig, name, source.ground_truth)
                 _play(reader, iter(source), sink)
         else:
-            assert rig is not None
-            sink = RerunSink(rig, name, mode, args.save, attached_truth(reader), args.viz_address)
+            sink = options.sink(rig, name, attached_truth(reader))
             _play(reader, iter(()), sink)
         sink.close()
-    if mode == "serve":
-        print("everything is sent; Ctrl-C ends")
-        signal.pause()
-    return 0
 
 
 def _images(reader: LogReader, path: Path, spec: str | None) -> Source:

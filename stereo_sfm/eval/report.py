@@ -17,6 +17,7 @@ ADVICE = {
     "no_consensus": "points disagreed about the motion: people or carts in view, or a wrong calibration (`info`)",
 }
 FEW_INLIERS = 60  # median points a frame below which the pose hangs on little
+LEAST_LENGTH_M = 1.0  # of a path whose length says something about the scale
 BIG_SCALE_ERROR = 0.02  # Sim(3) scale off by more than this points at the baseline
 
 
@@ -73,10 +74,12 @@ def _draw(
     if evaluations:
         plots.plot_errors(folder / "errors.png", evaluations)
         pictures.append("errors")
-    if len(record.frames):
+    if record.tracked().any():
         plots.plot_tracking(folder / "tracking.png", record)
+        pictures.append("tracking")
+    if len(record.frames):
         plots.plot_times(folder / "times.png", record, list(stats["ms"]))
-        pictures += ["tracking", "times"]
+        pictures.append("times")
     return pictures
 
 
@@ -116,10 +119,14 @@ def verdicts(stats: dict[str, Any], evaluations: dict[str, Evaluation]) -> list[
         out.append(
             f"**WARN**: only {stats['inliers_median']:.0f} points a frame: look at texture, exposure and calibration"
         )
-    for name, result in evaluations.items():
-        if result.mode != "sim3" and abs(result.sim3_scale - 1) > BIG_SCALE_ERROR:
-            out.append(
-                f"**WARN**: {name} is {100 * (1 / result.sim3_scale - 1):+.1f} % too long: "
-                "check the baseline and the calibration"
-            )
+    out += [text for name, result in evaluations.items() if (text := _length(name, result))]
     return out or ["nothing to say: no frames"]
+
+
+def _length(name: str, result: Evaluation) -> str:
+    """Whether a path is too long or too short; nothing of one too short to tell, or that has no scale of its own."""
+    off = 1 / result.sim3_scale - 1
+    if result.mode == "sim3" or result.length_m < LEAST_LENGTH_M or not abs(result.sim3_scale - 1) > BIG_SCALE_ERROR:
+        return ""
+    how = "long" if off > 0 else "short"
+    return f"**WARN**: {name} is {abs(100 * off):.1f} % too {how}: check the baseline and the calibration"

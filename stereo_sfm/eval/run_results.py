@@ -43,6 +43,7 @@ def write_results(
     frame: str = "cam0",
     step: int = 1,
     max_lost_percent: float = MAX_LOST_PERCENT,
+    why_not_started: str = "",
 ) -> tuple[dict[str, Any], dict[str, Evaluation]]:
     """Write trajectories, configuration, calibration, numbers and report.
 
@@ -55,6 +56,7 @@ def write_results(
         frame: "cam0" or "body", the frame whose poses the trajectory files hold. Errors are always those of cam0.
         step: every `step`-th frame of the source was used.
         max_lost_percent: frames without a pose above which the run counts as failed.
+        why_not_started: of a run that never had a pose, see `eval.start`.
 
     Returns:
         What stats.json holds, and the evaluations by trajectory name.
@@ -75,7 +77,7 @@ def write_results(
         save_rig(rig, folder / "rig.yaml")
         evaluations = _evaluate(estimates, reference, "sim3" if scale_free(config, rig) else "se3")
         stats = {"source": source_name, "frame": frame, **statistics(record, wall_s, evaluations)}
-        stats["max_lost_percent"] = max_lost_percent
+        stats |= {"max_lost_percent": max_lost_percent, "why_not_started": why_not_started}
         write_json(folder / "stats.json", stats)
         write_report(folder, source_name, record, stats, estimates, reference, evaluations)
     return stats, evaluations

@@ -87,7 +87,8 @@ def _health(report: Health) -> dict[str, float]:
 def failure(stats: dict[str, Any]) -> str:
     """Why the run counts as failed (exit code 4), or ''."""
     if not stats["tracked"]:
-        return "tracking never initialised"
+        why = stats.get("why_not_started", "")
+        return "tracking never initialised" + (f": {why}" if why else "")
     if stats["lost_percent"] > stats["max_lost_percent"]:
         dropped = stats["dropped_by_capture"]
         why = f", {thousands(dropped)} of them dropped by capture: the stages are too slow" if dropped else ""
@@ -105,11 +106,10 @@ def thousands(count: int) -> str:
 
 def summary(stats: dict[str, Any], evaluations: dict[str, Evaluation] | None = None) -> list[str]:
     """The closing lines of a run."""
-    lost = stats["lost_intervals"]
     total = stats["frames"] + stats["dropped"]
     lines = [
         f"tracked {thousands(stats['tracked'])}/{thousands(total)} frames ({_dropped(stats)}), "
-        f"{_lost(lost)}, {stats['keyframes']} keyframes, {thousands(stats['points'])} points",
+        f"{_lost(stats)}, {stats['keyframes']} keyframes, {thousands(stats['points'])} points",
     ]
     if stats["unplaced"]:
         lines.append(f"{thousands(stats['unplaced'])} of the tracked frames were not found in the map")
@@ -152,7 +152,10 @@ def _against_truth(name: str, result: Evaluation) -> str:
     )
 
 
-def _lost(intervals: list[dict[str, Any]]) -> str:
+def _lost(stats: dict[str, Any]) -> str:
+    if not stats["tracked"]:
+        return "never initialised"
+    intervals: list[dict[str, Any]] = stats["lost_intervals"]
     if not intervals:
         return "never lost"
     worst = max(intervals, key=lambda interval: interval["seconds"])

@@ -21,7 +21,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.mapping.map import Map, MapSnapshot
 from stereo_sfm.maps.header import check_counts, checksum, damaged, read_header, write_header
 from stereo_sfm.maps.replace_folder import replaced_folder
-from stereo_sfm.types import I64, Trajectory
+from stereo_sfm.types import I64, MapUpdate, Trajectory
 
 log = logging.getLogger("stereo_sfm")
 
@@ -208,3 +208,19 @@ def joined(maps: list[SavedMap]) -> SavedMap:
         raised["obs_pt"] += len(s.pt_ids)
     snapshot = MapSnapshot(**{name: np.concatenate(values) for name, values in parts.items()})
     return SavedMap(snapshot, first.rig, first.vocabulary_id, np.concatenate(sessions))
+
+
+def as_update(saved: SavedMap) -> MapUpdate:
+    """Everything in a map as one message of the mapper, for those who follow its updates."""
+    s, none = saved.snapshot, np.zeros(0, np.int64)
+    return MapUpdate(
+        version=1,
+        kf_id=int(s.kf_ids[-1]),
+        kf_ids=s.kf_ids.copy(),
+        map_T_kf=s.map_T_kf.copy(),
+        point_ids=s.pt_ids.copy(),
+        points_map=s.points.copy(),
+        culled_point_ids=none,
+        fused_point_ids=np.zeros((0, 2), np.int64),
+        map_T_odom=np.eye(4),
+    )

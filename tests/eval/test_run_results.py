@@ -69,6 +69,18 @@ def test_a_wrong_scale_of_two_eyes_is_said(tmp_path: Path) -> None:
     assert any("SE3 aligned" in line for line in lines) and "check the baseline" in report
 
 
+@pytest.mark.parametrize(("scale", "said"), [(3.0, "is 66.7 % too short"), (0.5, "is 100.0 % too long")])
+def test_a_length_is_too_long_or_too_short(tmp_path: Path, scale: float, said: str) -> None:
+    """Of a path of some metres; one of centimetres says nothing of the scale."""
+    for size, told in ((1.0, True), (0.02, False)):
+        truth, estimate = walk(), walk()
+        estimate[:, :3, 3] *= size
+        truth[:, :3, 3] *= size * scale
+        reference = Trajectory(np.arange(COUNT) * 10**8, truth)
+        write_results(tmp_path, "x", pinhole_rig(), Config(), record_of(estimate, 0), 1.0, reference)
+        assert (said in (tmp_path / "report.md").read_text()) == told
+
+
 def test_frames_without_a_place_in_the_map_are_left_out(tmp_path: Path) -> None:
     record = record_of(walk(), 10)
     mapped = record.mapped()

@@ -1,0 +1,27 @@
+"""What a run says when tracking never began: the quick checks of `calib.start` on its own first images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import islice
+
+from calib.start import why_no_start
+from drivers.source import Source
+from stereo_sfm.errors import StereoSfmError
+
+APART = 5  # frames from one image that is looked at to the next
+IMAGES = 3
+
+
+def why_not_started(opener: Callable[[], Source]) -> str:
+    """One line, "" where nothing is found or the images cannot be read again.
+
+    Args:
+        opener: gives the source that was run, not yet entered.
+    """
+    try:
+        with opener() as source:
+            images = list(islice(source, 0, APART * (IMAGES - 1) + 1, APART))
+            return why_no_start(source.rig, images)
+    except StereoSfmError:
+        return ""
