@@ -173,7 +173,8 @@ def _compare(run: Path, replay: Path) -> int:
     from stereo_sfm.log.reader import LogReader
     from stereo_sfm.log.recorded import ended_early
 
-    images = (topics.IMAGE_INFO, topics.LEFT_IMAGE, topics.RIGHT_IMAGE, topics.DEPTH_IMAGE, topics.IMU, topics.WHEEL)
+    images = (topics.IMAGE_INFO, topics.LEFT_IMAGE, topics.RIGHT_IMAGE, topics.DEPTH_IMAGE, topics.IMU, topics.WHEEL,
+              topics.FEATURES)  # fmt: skip
     with LogReader(run) as a, LogReader(replay) as b:
         not_logged = set(images) - {t.topic for t in b.topics}  # what the replay read, without --log full
         differences = [d for d in diff(a, b) if d.topic not in not_logged]

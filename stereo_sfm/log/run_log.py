@@ -94,6 +94,7 @@ class RunLog:
             opening=opening,
         )  # fmt: skip
         self._images = ImageLog(writer, rig, ground_truth, image_format, mapped=True)
+        self._pictured = image_format != "none"  # else there is nothing to draw the tracked points on
         self._map = MapView()
         self._map_T_odom: dict[int, F64] = {0: np.eye(4)}  # by map version
         self._version = 0
@@ -138,8 +139,9 @@ class RunLog:
         write(topics.FRAME, frame, stamp, sequence)
         write(topics.STATS, track_stats(frame), stamp, sequence)
         obs = frame.observations
-        dots = foxglove.point_annotations(stamp, obs.uv_left, _age_colors(obs.age, obs.inlier))
-        write(topics.FEATURES, dots, stamp, sequence)
+        if self._pictured:
+            dots = foxglove.point_annotations(stamp, obs.uv_left, _age_colors(obs.age, obs.inlier))
+            write(topics.FEATURES, dots, stamp, sequence)
         odom_T_body = frame.odom_T_cam @ self._left_T_body
         pose = foxglove.pose(odom_T_body)
         write(topics.ODOM_POSE, foxglove.pose_in_frame("odom", stamp, pose), stamp, sequence)

@@ -74,7 +74,7 @@ TABLE: tuple[Topic, ...] = (
     Topic(MAP_POSE, "foxglove.PoseInFrame", "every frame, body in map"),
     Topic(FRAME, "stereo_sfm.Frame", "every frame: the tracker's whole answer"),
     Topic(STATS, "stereo_sfm.TrackStats", "every frame: flat numbers to plot"),
-    Topic(FEATURES, "foxglove.ImageAnnotations", "every frame: tracked points in the left image"),
+    Topic(FEATURES, "foxglove.ImageAnnotations", "every frame of a log with images: tracked points in the left one"),
     Topic(KEYFRAME, "stereo_sfm.Keyframe", "every keyframe"),
     Topic(MAP_UPDATE, "stereo_sfm.MapUpdate", "every keyframe: the mapper's answer"),
     Topic(LOOP, "stereo_sfm.LoopResult", "every keyframe: the loop closer's answer, with reasons"),
