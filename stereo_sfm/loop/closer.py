@@ -98,6 +98,9 @@ class LoopCloser:
         if len(crowd) > CROWD:
             self._forgotten.add(crowd[1])
             self._store.remove(crowd[1])
+        if 2 * len(self._store) < len(self._database) - FRESH:
+            self._row = {k: row for row, k in enumerate(self._store.ids)}
+            self._database.keep(np.flatnonzero(np.isin(self._database.kf_ids, self._store.ids)))
 
     def _candidates(self, keyframe: Keyframe, bag: voc.Bag) -> tuple[list[tuple[int, float]], str]:
         """Places to verify as (keyframe, score), best first, and the reason when there are none."""

@@ -48,6 +48,31 @@ def _accumulate(words, weights, head, fill, following, block_entry, block_weight
             block = following[block]
 
 
+@njit
+def _copy_kept(
+    head, fill, following, block_entry, block_weight, renamed, to_head, to_fill, to_following, to_entry, to_weight
+):
+    """The postings of entries that have a new name (not -1), into empty chains. Returns the number of used blocks."""
+    used = 0
+    for w in range(head.shape[0]):
+        block = head[w]
+        while block >= 0:
+            for s in range(fill[block]):
+                entry = renamed[block_entry[block, s]]
+                if entry >= 0:
+                    target = to_head[w]
+                    if target < 0 or to_fill[target] == BLOCK:
+                        to_following[used] = target
+                        to_head[w] = used
+                        target = used
+                        used += 1
+                    to_entry[target, to_fill[target]] = entry
+                    to_weight[target, to_fill[target]] = block_weight[block, s]
+                    to_fill[target] += 1
+            block = following[block]
+    return used
+
+
 def _grown(array: Any, size: int, value: int = 0) -> Any:
     """A copy with at least `size` rows, doubling."""
     if len(array) >= size:
@@ -83,11 +108,7 @@ class PlaceDatabase:
         """Insert a keyframe; words beyond the known ones (a grown vocabulary) are added."""
         if len(bag.words):
             self._head = _grown(self._head, int(bag.words[-1]) + 1, -1)
-        need = self._used + len(bag.words)
-        self._fill = _grown(self._fill, need)
-        self._following = _grown(self._following, need, -1)
-        self._entry = _grown(self._entry, need)
-        self._weight = _grown(self._weight, need)
+        self._reserve(self._used + len(bag.words))
         self._used = _insert(
             bag.words,
             bag.weights,
@@ -102,6 +123,37 @@ class PlaceDatabase:
         self._kf_ids = _grown(self._kf_ids, self._count + 1)
         self._kf_ids[self._count] = kf_id
         self._count += 1
+
+    def keep(self, rows: I64) -> None:
+        """Forget all keyframes but those in these rows, (K,) ascending, which become 0, 1, 2, ...; no score changes."""
+        kf_ids = self.kf_ids[rows]
+        renamed = np.full(self._count, -1, np.int64)
+        renamed[rows] = np.arange(len(rows))
+        to = PlaceDatabase(len(self._head))
+        to._reserve(self._used)
+        to._used = _copy_kept(
+            self._head, self._fill, self._following, self._entry, self._weight, renamed,
+            to._head, to._fill, to._following, to._entry, to._weight,
+        )  # fmt: skip
+        to._kf_ids, to._count = np.append(kf_ids, np.zeros(64, np.int64)), len(rows)
+        to._trim()
+        self.__dict__ = to.__dict__
+
+    def _reserve(self, blocks: int) -> None:
+        """Room for so many blocks."""
+        self._fill, self._following = _grown(self._fill, blocks), _grown(self._following, blocks, -1)
+        self._entry, self._weight = _grown(self._entry, blocks), _grown(self._weight, blocks)
+
+    def _trim(self) -> None:
+        """Give back the blocks that nothing uses."""
+        self._fill, self._following = self._fill[: self._used].copy(), self._following[: self._used].copy()
+        self._entry, self._weight = self._entry[: self._used].copy(), self._weight[: self._used].copy()
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all arrays."""
+        arrays = (self._head, self._fill, self._following, self._entry, self._weight, self._kf_ids)
+        return sum(array.nbytes for array in arrays)
 
     def scores(self, bag: Bag) -> F64:
         """(K,) L1 score of every keyframe in order of insertion (see `vocabulary.score`)."""

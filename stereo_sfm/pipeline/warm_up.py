@@ -74,6 +74,7 @@ def keyframes(rig: Rig) -> list[Keyframe]:
 
 def warm_up_stage(stage: str, config: Config, rig: Rig) -> None:
     """Load (the first time ever: compile) what `stage` calls, on a scratch instance of it."""
+    from stereo_sfm.loop.database import PlaceDatabase
     from stereo_sfm.mapping.mapper import Mapper
 
     if stage == "tracker":
@@ -91,3 +92,4 @@ def warm_up_stage(stage: str, config: Config, rig: Rig) -> None:
         if closer is not None:
             for keyframe in keyframes(rig):
                 closer.step(keyframe)
+            PlaceDatabase(1).keep(np.zeros(0, np.int64))  # what a long run does now and then

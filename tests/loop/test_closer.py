@@ -11,7 +11,7 @@ import pytest
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
-from stereo_sfm.loop.closer import LoopCloser
+from stereo_sfm.loop.closer import FRESH, LoopCloser
 from stereo_sfm.loop.place_view import PlaceView
 from stereo_sfm.loop.verification import Verdict, rejection
 from stereo_sfm.types import F64, Keyframe, LoopResult
@@ -175,6 +175,7 @@ def test_a_view_seen_every_lap_is_remembered_a_few_times_and_still_closes(vocabu
     lap = len(walk.keyframes) // 7
     assert remembered[lap] == lap + 1  # nothing is forgotten on the first lap
     assert remembered[-1] - remembered[-1 - lap] < 0.3 * lap  # hardly anything is added on the last
+    assert len(closer._database) <= 2 * closer.remembered + FRESH + 1  # what is forgotten takes no room
     assert any(r.candidate_kf_id >= 0 for r in results[-lap:])
     assert all(error_of(walk, r) < 0.1 for r in results if r.candidate_kf_id >= 0)
 
