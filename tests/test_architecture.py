@@ -180,3 +180,14 @@ def test_the_rules_can_fail(tmp_path: Path) -> None:
     assert imports(bad, everywhere=False) == ["cv2"]
     assert "numpy" in loaded_with(ROOT / "stereo_sfm" / "eval" / "associate.py")
     assert room("stereo_sfm.pipeline.run.run") == "stereo_sfm.pipeline" and room("numpy.linalg") is None
+
+
+def test_an_argparse_namespace_ends_at_a_commands_entry() -> None:
+    """`run(args)` and the parsers of shared options take one; what does the work takes typed options."""
+    for path in sorted((ROOT / "stereo_sfm").rglob("*.py")):
+        if path.name == "_options.py":
+            continue
+        functions = [n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.FunctionDef)]
+        taking = [f.name for f in functions if any("Namespace" in ast.unparse(a.annotation or a) for a in f.args.args)]
+        allowed = {"run"} if path.parent.name == "commands" else {"_start_logging"}
+        assert set(taking) <= allowed, f"{path.name}: {', '.join(taking)}"

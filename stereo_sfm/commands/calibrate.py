@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from stereo_sfm.commands._options import typed
 from stereo_sfm.commands.convert_calib import NAMES
 
 if TYPE_CHECKING:
@@ -34,8 +36,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--overwrite", action="store_true", help="replace the rig and the report that are there")
 
 
+@dataclass(frozen=True)
+class CalibrateOptions:
+    """Options of this command, as the parser names them."""
+
+    source: str
+    target: str
+    columns: int | None
+    rows: int | None
+    square: float | None
+    ratio: float | None
+    dictionary: str
+    model: str
+    output: Path
+    format: str | None
+    report: Path | None
+    views: int
+    overwrite: bool
+
+
 def run(args: argparse.Namespace) -> int:
     """Gather, solve, judge, write."""
+    options = typed(CalibrateOptions, args)
     from dataclasses import replace
 
     from calib import save_rig
@@ -45,24 +67,24 @@ def run(args: argparse.Namespace) -> int:
     from calib.report import write_report
     from calib.solve import align_pairs, calibrate
 
-    report: Path = args.report or args.output.with_suffix(".html")
-    _check_files(args.output, report, args.overwrite)
-    target = make_target(args)
-    left, right, kept, size, readout_s = collect(args.source, target, args.views)
+    report: Path = options.report or options.output.with_suffix(".html")
+    _check_files(options.output, report, options.overwrite)
+    target = make_target(options)
+    left, right, kept, size, readout_s = collect(options.source, target, options.views)
     if target.kind == "checkerboard":
         right = align_pairs(left, right)
-    calibration = calibrate(left, right, target.points, size, args.model)
+    calibration = calibrate(left, right, target.points, size, options.model)
     views = [coverage(left, size), coverage(right, size)]
     quality = judge(calibration, min(views, key=lambda v: v.fraction))
-    save_rig(replace(calibration.rig, readout_s=readout_s), args.output, args.format)
+    save_rig(replace(calibration.rig, readout_s=readout_s), options.output, options.format)
     report.parent.mkdir(parents=True, exist_ok=True)
-    write_report(report, str(args.source), calibration, quality, views, kept[:: max(1, len(kept) // 3)][:3])
+    write_report(report, str(options.source), calibration, quality, views, kept[:: max(1, len(kept) // 3)][:3])
     for finding in quality.findings:
         print(f"  {VERDICTS[finding.level]}  {finding.name}: {finding.text}")
     for eye, view in zip(("left", "right"), views, strict=True):
         for advice in view.advice:
             print(f"  {eye} eye: {advice}")
-    print(f"verdict: {VERDICTS[quality.level]}, rig {args.output}, report {report}")
+    print(f"verdict: {VERDICTS[quality.level]}, rig {options.output}, report {report}")
     return 3 if VERDICTS[quality.level] == "FAIL" else 0
 
 
@@ -82,18 +104,18 @@ def _check_files(rig: Path, report: Path, overwrite: bool) -> None:
         raise StereoSfmError(f"cannot write the report {report}: it is a folder")
 
 
-def make_target(args: argparse.Namespace) -> Target:
+def make_target(options: CalibrateOptions) -> Target:
     """The target of the options or of the file."""
     from calib.targets import KINDS, Target, read_target
     from stereo_sfm.errors import StereoSfmError, one_of
 
-    if args.target not in KINDS:
-        path = Path(args.target)
-        return read_target(path if path.exists() or path.suffix else Path(one_of(args.target, KINDS, "target")))
-    if args.columns is None or args.rows is None or args.square is None:
+    if options.target not in KINDS:
+        path = Path(options.target)
+        return read_target(path if path.exists() or path.suffix else Path(one_of(options.target, KINDS, "target")))
+    if options.columns is None or options.rows is None or options.square is None:
         raise StereoSfmError("a target needs --columns, --rows and --square (metres), or a YAML file as --target")
-    ratio = args.ratio if args.ratio is not None else 0.3 if args.target == "aprilgrid" else 0.75
-    return Target(args.target, args.columns, args.rows, args.square, ratio, args.dictionary)
+    ratio = options.ratio if options.ratio is not None else 0.3 if options.target == "aprilgrid" else 0.75
+    return Target(options.target, options.columns, options.rows, options.square, ratio, options.dictionary)
 
 
 def collect(

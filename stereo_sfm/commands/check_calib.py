@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stereo_sfm.commands._options import add_source
+from stereo_sfm.commands._options import add_source, typed
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -30,8 +31,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
+@dataclass(frozen=True)
+class CheckOptions:
+    """Options of this command, as the parser names them."""
+
+    source: str
+    rig: Path | None
+    windows: int
+    max_frames: int
+    search: int
+    correct: Path | None
+    overwrite: bool
+    json: bool
+
+
 def run(args: argparse.Namespace) -> int:
     """Collect, judge, print."""
+    options = typed(CheckOptions, args)
     import itertools
     import json
     from dataclasses import replace
@@ -44,27 +60,27 @@ def run(args: argparse.Namespace) -> int:
     from stereo_sfm.config import Config
     from stereo_sfm.tracking.flow.readout import ReadoutSearch
 
-    _check(args)
-    with open_source(args.source) as source:
-        rig = source.rig if args.rig is None else load_rig(args.rig)
+    _check(options)
+    with open_source(options.source) as source:
+        rig = source.rig if options.rig is None else load_rig(options.rig)
         rectification = rectify(rig, "epipolar")
-        total = min(source.frame_count or args.max_frames, args.max_frames)
-        gap = 0 if source.live else max(0, total // args.windows - LONGEST)
-        corners = corners_for(total, args.windows)
+        total = min(source.frame_count or options.max_frames, options.max_frames)
+        gap = 0 if source.live else max(0, total // options.windows - LONGEST)
+        corners = corners_for(total, options.windows)
         shutter = ReadoutSearch(Config().tracker, rig)
-        images = _searched(itertools.islice(source, args.max_frames), shutter)
-        windows = collect(images, rectification, args.windows, gap, corners, args.search)
+        images = _searched(itertools.islice(source, options.max_frames), shutter)
+        windows = collect(images, rectification, options.windows, gap, corners, options.search)
         readout = shutter.errors()
         report = check(rig, rectification, windows, rolling=readout.best_s > 0)
         report = replace(report, findings=(*report.findings, _shutter(rig.shutter, readout)))
-    if args.correct is not None:
-        save_rig(report.choice.apply(rig), args.correct)
-    if args.json:
+    if options.correct is not None:
+        save_rig(report.choice.apply(rig), options.correct)
+    if options.json:
         print(json.dumps(as_dict(report), indent=2))
     else:
-        print(as_text(report, str(args.source)))
-        if args.correct is not None:
-            print("\n".join(_written(report, args.correct)))
+        print(as_text(report, str(options.source)))
+        if options.correct is not None:
+            print("\n".join(_written(report, options.correct)))
     return 3 if report.verdict == "FAIL" else 0
 
 
@@ -91,14 +107,18 @@ def _shutter(known: str, errors: ReadoutErrors) -> Finding:
     return Finding("shutter", 1, f"{better} {how}")
 
 
-def _check(args: argparse.Namespace) -> None:
+def _check(options: CheckOptions) -> None:
     from stereo_sfm.errors import StereoSfmError
 
-    for option, value in (("--windows", args.windows), ("--max-frames", args.max_frames), ("--search", args.search)):
+    for option, value in (
+        ("--windows", options.windows),
+        ("--max-frames", options.max_frames),
+        ("--search", options.search),
+    ):
         if value < 1:
             raise StereoSfmError(f"{option} must be at least 1, not {value}")
-    if args.correct is not None and args.correct.exists() and not args.overwrite:
-        raise StereoSfmError(f"{args.correct} exists: choose another name or give --overwrite")
+    if options.correct is not None and options.correct.exists() and not options.overwrite:
+        raise StereoSfmError(f"{options.correct} exists: choose another name or give --overwrite")
 
 
 def as_text(report: CheckReport, name: str) -> str:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from stereo_sfm.commands._options import typed
 from stereo_sfm.errors import StereoSfmError
 
 if TYPE_CHECKING:
@@ -35,39 +37,55 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plot", type=Path, metavar="FOLDER", help="draw trajectory.png and errors.png there")
 
 
+@dataclass(frozen=True)
+class EvalOptions:
+    """Options of this command, as the parser names them."""
+
+    estimate: Path
+    ref: str | None
+    which: str | None
+    align: str
+    delta: str
+    t_max_diff: float | None
+    max_ape: float | None
+    json: bool
+    plot: Path | None
+
+
 def run(args: argparse.Namespace) -> int:
     """Print the errors; exit code 3 when a check fails."""
+    options = typed(EvalOptions, args)
     from stereo_sfm.eval.associate import MAX_DIFFERENCE_NS
     from stereo_sfm.eval.evaluate import evaluate, table
 
-    _check_ranges(args)
+    _check_ranges(options)
     result = evaluate(
-        *load(args.estimate, args.which, args.ref),
-        args.align,
-        args.delta,
-        interpolate=args.t_max_diff is None,
-        max_difference_ns=MAX_DIFFERENCE_NS if args.t_max_diff is None else round(args.t_max_diff * 1e9),
+        *load(options.estimate, options.which, options.ref),
+        options.align,
+        options.delta,
+        interpolate=options.t_max_diff is None,
+        max_difference_ns=MAX_DIFFERENCE_NS if options.t_max_diff is None else round(options.t_max_diff * 1e9),
     )
     if result.frames > 1 and not result.rpe_m.count:
         raise StereoSfmError(
-            f"--delta {args.delta} is longer than what is compared: {result.frames} poses, {result.length_m:.3g} m"
+            f"--delta {options.delta} is longer than what is compared: {result.frames} poses, {result.length_m:.3g} m"
         )
-    if args.plot is not None:
-        _plot(args.plot, args.estimate.stem, result)
-    if args.json:
+    if options.plot is not None:
+        _plot(options.plot, options.estimate.stem, result)
+    if options.json:
         print(json.dumps(result.to_dict(), indent=2))
     else:
         rows = table(result)
         width = max(len(name) for name, _ in rows)
         print("\n".join(f"{name:<{width}}  {value}" for name, value in rows))
-    if args.max_ape is not None and not result.ape_m.rmse <= args.max_ape:
-        print(f"stereo-sfm eval: ATE {result.ape_m.rmse:.6g} m is above {args.max_ape:g} m", file=sys.stderr)
+    if options.max_ape is not None and not result.ape_m.rmse <= options.max_ape:
+        print(f"stereo-sfm eval: ATE {result.ape_m.rmse:.6g} m is above {options.max_ape:g} m", file=sys.stderr)
         return CHECK_FAILED
     return 0
 
 
-def _check_ranges(args: argparse.Namespace) -> None:
-    for option, value in (("--t-max-diff", args.t_max_diff), ("--max-ape", args.max_ape)):
+def _check_ranges(options: EvalOptions) -> None:
+    for option, value in (("--t-max-diff", options.t_max_diff), ("--max-ape", options.max_ape)):
         if value is not None and not 0 <= value < float("inf"):
             raise StereoSfmError(f"{option} must be a number of at least 0, not {value:g}")
 

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from stereo_sfm.commands._options import typed
 
 if TYPE_CHECKING:
     from stereo_sfm.maps.saved_map import SavedMap
@@ -36,49 +39,65 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--resolution", type=float, default=0.05, metavar="M", help="of the floor plan, metres a pixel")
 
 
+@dataclass(frozen=True)
+class ExportOptions:
+    """Options of this command, as the parser names them."""
+
+    source: Path
+    format: str
+    output: Path | None
+    overwrite: bool
+    which: str
+    images: str | None
+    rig: Path | None
+    walk: int | None
+    resolution: float
+
+
 def run(args: argparse.Namespace) -> int:
     """Write one format."""
+    options = typed(ExportOptions, args)
     from stereo_sfm.errors import StereoSfmError
 
-    if not args.source.is_dir():
-        raise StereoSfmError(f"{args.source} is not the folder of a run or a map")
-    if not 0 < args.resolution < float("inf"):
+    if not options.source.is_dir():
+        raise StereoSfmError(f"{options.source} is not the folder of a run or a map")
+    if not 0 < options.resolution < float("inf"):
         raise StereoSfmError("--resolution must be above 0 metres")
-    if args.images and args.format != "colmap":
+    if options.images and options.format != "colmap":
         raise StereoSfmError("--images goes with --format colmap")
-    if args.rig is not None and not args.images:
+    if options.rig is not None and not options.images:
         raise StereoSfmError("--rig goes with --images")
-    if args.walk is not None and not args.images and args.format not in TRAJECTORY_FORMATS:
+    if options.walk is not None and not options.images and options.format not in TRAJECTORY_FORMATS:
         raise StereoSfmError("--walk goes with --images and with trajectories")
-    write = _write_trajectories if args.format in TRAJECTORY_FORMATS else _write_map
-    paths = write(args, args.output or args.source / _default_name(args))
+    write = _write_trajectories if options.format in TRAJECTORY_FORMATS else _write_map
+    paths = write(options, options.output or options.source / _default_name(options))
     print(f"written to {', '.join(map(str, paths))}")
     return 0
 
 
-def _default_name(args: argparse.Namespace) -> str:
-    if args.format in MAP_FORMATS:
-        return MAP_FORMATS[args.format]
-    ending = "csv" if args.format == "euroc" else args.format
-    return f"export_{args.which}.{ending}"
+def _default_name(options: ExportOptions) -> str:
+    if options.format in MAP_FORMATS:
+        return MAP_FORMATS[options.format]
+    ending = "csv" if options.format == "euroc" else options.format
+    return f"export_{options.which}.{ending}"
 
 
-def _write_map(args: argparse.Namespace, output: Path) -> list[Path]:
+def _write_map(options: ExportOptions, output: Path) -> list[Path]:
     from stereo_sfm.export.floor_plan import export_floor_plan, plan_files
     from stereo_sfm.export.g2o import export_g2o
     from stereo_sfm.export.ply import export_ply
 
-    paths = [*plan_files(output)] if args.format == "floor-plan" else [output]
-    _check_free(args, paths)
-    saved = _load(args.source)
+    paths = [*plan_files(output)] if options.format == "floor-plan" else [output]
+    _check_free(options, paths)
+    saved = _load(options.source)
     output.parent.mkdir(parents=True, exist_ok=True)
     writers: dict[str, Callable[[SavedMap, Path], object]] = {
-        "colmap": lambda s, path: _write_colmap(s, path, args),
+        "colmap": lambda s, path: _write_colmap(s, path, options),
         "ply": export_ply,
         "g2o": export_g2o,
-        "floor-plan": lambda s, path: export_floor_plan(s, path, args.resolution),
+        "floor-plan": lambda s, path: export_floor_plan(s, path, options.resolution),
     }
-    writers[args.format](saved, output)
+    writers[options.format](saved, output)
     return paths
 
 
@@ -93,36 +112,36 @@ def _load(folder: Path) -> SavedMap:
     raise StereoSfmError(f"{folder} holds no map: nothing was mapped, or by an earlier version (run it again)")
 
 
-def _write_colmap(saved: SavedMap, output: Path, args: argparse.Namespace) -> None:
+def _write_colmap(saved: SavedMap, output: Path, options: ExportOptions) -> None:
     """The model, and the keyframes' pictures beside it where they are asked for."""
     from stereo_sfm.export.colmap import export_colmap
 
-    if not args.images:
+    if not options.images:
         export_colmap(saved, output)
         return
     from calib import load_rig
     from stereo_sfm.export.pictures import check_walk, open_pictures, walk_of_recording, write_pictures
 
-    check_walk(saved, args.walk)
-    source = open_pictures(args.images, saved.rig, load_rig(args.rig) if args.rig is not None else None)
+    check_walk(saved, options.walk)
+    source = open_pictures(options.images, saved.rig, load_rig(options.rig) if options.rig is not None else None)
     with source:
-        walk = args.walk if args.walk is not None else walk_of_recording(saved, source, args.images)
+        walk = options.walk if options.walk is not None else walk_of_recording(saved, source, options.images)
         export_colmap(saved, output)
-        write_pictures(saved, source, walk, output, args.images)
+        write_pictures(saved, source, walk, output, options.images)
 
 
-def _write_trajectories(args: argparse.Namespace, output: Path) -> list[Path]:
+def _write_trajectories(options: ExportOptions, output: Path) -> list[Path]:
     """One file, or one for each walk of a merged map."""
     from stereo_sfm.export import trajectories
 
-    found, what = _trajectories(args)
+    found, what = _trajectories(options)
     paths = [output if len(found) == 1 else _of_walk(output, walk) for walk in found]
-    _check_free(args, paths)
+    _check_free(options, paths)
     output.parent.mkdir(parents=True, exist_ok=True)
     for path, trajectory in zip(paths, found.values(), strict=True):
-        if args.format == "tum":
+        if options.format == "tum":
             trajectories.write_tum(path, trajectory, what)
-        elif args.format == "euroc":
+        elif options.format == "euroc":
             trajectories.write_euroc(path, trajectory, what)
         else:
             trajectories.write_kitti(path, trajectory.poses)
@@ -135,7 +154,7 @@ def _of_walk(path: Path, walk: int) -> Path:
     return path.with_name(f"{path.name.removesuffix(ending)}_walk{walk}{ending}")
 
 
-def _trajectories(args: argparse.Namespace) -> tuple[dict[int, Trajectory], str]:
+def _trajectories(options: ExportOptions) -> tuple[dict[int, Trajectory], str]:
     """A run's trajectory, or a map's keyframes, walk by walk; and which poses they are."""
     from drivers.ground_truth import read_trajectory
     from stereo_sfm.errors import StereoSfmError
@@ -143,23 +162,23 @@ def _trajectories(args: argparse.Namespace) -> tuple[dict[int, Trajectory], str]
     from stereo_sfm.export.trajectories import named_pose
     from stereo_sfm.maps.saved_map import walk_trajectory
 
-    name = {"odom": "trajectory_odom.tum", "map": "trajectory_map.tum", "keyframes": "keyframes.tum"}[args.which]
-    if (args.source / name).is_file():
-        if args.walk is not None:
+    name = {"odom": "trajectory_odom.tum", "map": "trajectory_map.tum", "keyframes": "keyframes.tum"}[options.which]
+    if (options.source / name).is_file():
+        if options.walk is not None:
             raise StereoSfmError("--walk goes with maps: a run is one walk")
-        return {0: read_trajectory(args.source / name)}, named_pose(args.source / name)
-    if not (args.source / "map.json").is_file():
-        raise StereoSfmError(f"{args.source} holds no {name}")
-    if args.which == "odom":
-        raise StereoSfmError(f"{args.source} is a map: it holds keyframes, not the odometry of a run")
-    saved = _load(args.source)
-    check_walk(saved, args.walk)
-    return {k: walk_trajectory(saved, k) for k in saved.walks if args.walk in (None, k)}, "world_T_cam0"
+        return {0: read_trajectory(options.source / name)}, named_pose(options.source / name)
+    if not (options.source / "map.json").is_file():
+        raise StereoSfmError(f"{options.source} holds no {name}")
+    if options.which == "odom":
+        raise StereoSfmError(f"{options.source} is a map: it holds keyframes, not the odometry of a run")
+    saved = _load(options.source)
+    check_walk(saved, options.walk)
+    return {k: walk_trajectory(saved, k) for k in saved.walks if options.walk in (None, k)}, "world_T_cam0"
 
 
-def _check_free(args: argparse.Namespace, paths: Sequence[Path]) -> None:
+def _check_free(options: ExportOptions, paths: Sequence[Path]) -> None:
     from stereo_sfm.errors import StereoSfmError
 
     there = [path for path in paths if path.exists()]
-    if there and not args.overwrite:
+    if there and not options.overwrite:
         raise StereoSfmError(f"{there[0]} exists: choose another -o, or say --overwrite")

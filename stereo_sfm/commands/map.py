@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from stereo_sfm.commands._options import typed
 
 if TYPE_CHECKING:
     from stereo_sfm.loop.vocabulary import Vocabulary
@@ -41,19 +44,43 @@ def _output(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--overwrite", action="store_true", help="replace the map that lies there")
 
 
+@dataclass(frozen=True)
+class MergeOptions:
+    """Options of `map merge`, as the parser names them."""
+
+    maps: list[Path]
+    output: Path
+    overwrite: bool
+    set: list[str]
+
+
+@dataclass(frozen=True)
+class PruneOptions:
+    """Options of `map prune`, as the parser names them."""
+
+    map: Path
+    output: Path
+    overwrite: bool
+    min_views: int
+    min_seen_share: float
+    unseen_sessions: int
+
+
 def run(args: argparse.Namespace) -> int:
     """Do what the action says."""
     if args.action == "export":
         from stereo_sfm.commands import export
 
         return export.run(args)
-    return {"info": _info, "merge": _merge, "prune": _prune}[args.action](args)
+    if args.action == "info":
+        return _info(args.map)
+    return _merge(typed(MergeOptions, args)) if args.action == "merge" else _prune(typed(PruneOptions, args))
 
 
-def _info(args: argparse.Namespace) -> int:
+def _info(folder: Path) -> int:
     from stereo_sfm.maps.saved_map import load_map
 
-    print("\n".join(describe(load_map(args.map))))
+    print("\n".join(describe(load_map(folder))))
     return 0
 
 
@@ -78,22 +105,22 @@ def describe(saved: SavedMap) -> list[str]:
     ]
 
 
-def _merge(args: argparse.Namespace) -> int:
+def _merge(options: MergeOptions) -> int:
     from stereo_sfm import config as configuration
     from stereo_sfm.errors import StereoSfmError
     from stereo_sfm.maps.merge import merge, share_a_walk
     from stereo_sfm.maps.saved_map import load_map, save_map
 
-    if len(args.maps) < 2:
+    if len(options.maps) < 2:
         raise StereoSfmError("merge takes at least two maps")
-    _check_free(args)
-    config = configuration.load(None, args.set)
-    maps = [load_map(folder) for folder in args.maps]
-    for (name_a, a), (name_b, b) in combinations(zip(args.maps, maps, strict=True), 2):
+    _check_free(options.output, options.overwrite)
+    config = configuration.load(None, options.set)
+    maps = [load_map(folder) for folder in options.maps]
+    for (name_a, a), (name_b, b) in combinations(zip(options.maps, maps, strict=True), 2):
         if share_a_walk(a, b):
             raise StereoSfmError(f"{name_a} and {name_b} hold the same walk: merge takes maps of different walks")
     result = merge(maps, _vocabulary(maps[0], config.loop.vocabulary), config.loop, config.mapper)
-    save_map(result.saved, args.output)
+    save_map(result.saved, options.output)
     print(f"{len(maps)} maps joined by {len(result.loops)} loops, {result.fused} points seen by more than one walk")
     print("\n".join(describe(result.saved)))
     return 0
@@ -106,27 +133,26 @@ def _vocabulary(saved: SavedMap, named: str) -> Vocabulary:
     return load_vocabulary(Path(named)) if named else default_vocabulary()
 
 
-def _prune(args: argparse.Namespace) -> int:
+def _prune(options: PruneOptions) -> int:
     from stereo_sfm.maps.merge import prune
     from stereo_sfm.maps.saved_map import load_map, save_map
 
-    _check_free(args)
-    saved = load_map(args.map)
-    pruned = prune(saved, args.min_views, args.min_seen_share, args.unseen_sessions)
-    save_map(pruned, args.output)
+    _check_free(options.output, options.overwrite)
+    saved = load_map(options.map)
+    pruned = prune(saved, options.min_views, options.min_seen_share, options.unseen_sessions)
+    save_map(pruned, options.output)
     before, after = saved.snapshot, pruned.snapshot
-    print(
-        f"{len(before.pt_ids)} points became {len(after.pt_ids)}, {len(saved)} keyframes {len(pruned)}: {args.output}"
-    )
+    counts = f"{len(before.pt_ids)} points became {len(after.pt_ids)}, {len(saved)} keyframes {len(pruned)}"
+    print(f"{counts}: {options.output}")
     return 0
 
 
-def _check_free(args: argparse.Namespace) -> None:
+def _check_free(output: Path, overwrite: bool) -> None:
     from stereo_sfm.errors import StereoSfmError
     from stereo_sfm.export.run_folder import is_free
 
-    if (args.output / "map.json").exists():
-        if not args.overwrite:
-            raise StereoSfmError(f"{args.output} holds a map: choose another -o, or say --overwrite")
-    elif not is_free(args.output):
-        raise StereoSfmError(f"{args.output} exists and is no map: choose another -o")
+    if (output / "map.json").exists():
+        if not overwrite:
+            raise StereoSfmError(f"{output} holds a map: choose another -o, or say --overwrite")
+    elif not is_free(output):
+        raise StereoSfmError(f"{output} exists and is no map: choose another -o")

@@ -26,16 +26,16 @@ def run(args: argparse.Namespace) -> int:
     """Dispatch."""
     if args.action == "reset":
         return _reset(args.serial)
-    return _extract(args) if args.kind == "extract" else _check()
+    return _extract(args.file, args.output, args.overwrite) if args.kind == "extract" else _check()
 
 
-def _extract(args: argparse.Namespace) -> int:
+def _extract(file: Path, output: Path | None, overwrite: bool) -> int:
     from drivers.t265 import firmware
 
-    target: Path = args.output or firmware.default_path()
-    if target.exists() and not args.overwrite:
+    target: Path = output or firmware.default_path()
+    if target.exists() and not overwrite:
         raise StereoSfmError(f"{target} exists: add --overwrite to replace it")
-    found = firmware.extract(args.file)
+    found = firmware.extract(file)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_bytes(found.data)

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from stereo_sfm.commands._options import typed
 
 if TYPE_CHECKING:
     from stereo_sfm.types import U8
@@ -37,48 +40,60 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     info.add_argument("file", nargs="?", type=Path, help="default: the one of the package")
 
 
+@dataclass(frozen=True)
+class TrainOptions:
+    """Options of `vocabulary train`, as the parser names them."""
+
+    sources: list[str]
+    output: Path
+    overwrite: bool
+    images: int
+    branching: int
+    depth: int
+    seed: int
+
+
 def run(args: argparse.Namespace) -> int:
     """Train or describe."""
     from stereo_sfm.loop.vocabulary_file import default_vocabulary, load_vocabulary
 
     if args.action == "train":
-        _train(args)
+        _train(typed(TrainOptions, args))
         return 0
     vocabulary = load_vocabulary(args.file) if args.file else default_vocabulary()
     print(f"{len(vocabulary)} words in {len(vocabulary.word)} nodes, id {vocabulary.id}")
     return 0
 
 
-def _check(args: argparse.Namespace) -> None:
+def _check(options: TrainOptions) -> None:
     from stereo_sfm.errors import StereoSfmError
 
     for option, value, least in (
-        ("--images", args.images, 1),
-        ("--branching", args.branching, 2),
-        ("--depth", args.depth, 1),
-        ("--seed", args.seed, 0),
+        ("--images", options.images, 1),
+        ("--branching", options.branching, 2),
+        ("--depth", options.depth, 1),
+        ("--seed", options.seed, 0),
     ):
         if value < least:
             raise StereoSfmError(f"{option} must be at least {least}, not {value}")
-    if args.output.exists() and not args.overwrite:
-        raise StereoSfmError(f"{args.output} exists: choose another name or give --overwrite")
+    if options.output.exists() and not options.overwrite:
+        raise StereoSfmError(f"{options.output} exists: choose another name or give --overwrite")
 
 
-def _train(args: argparse.Namespace) -> None:
+def _train(options: TrainOptions) -> None:
     from stereo_sfm.errors import StereoSfmError
     from stereo_sfm.loop.vocabulary import train
     from stereo_sfm.loop.vocabulary_file import save_vocabulary
 
-    _check(args)
-    images = [d for source in args.sources for d in _descriptors(source, args.images)]
+    _check(options)
+    images = [d for source in options.sources for d in _descriptors(source, options.images)]
     if not images:
         raise StereoSfmError("the sources hold no image with enough texture to train from")
-    vocabulary = train(images, args.branching, args.depth, args.seed)
-    save_vocabulary(vocabulary, args.output)
+    vocabulary = train(images, options.branching, options.depth, options.seed)
+    save_vocabulary(vocabulary, options.output)
     count = sum(len(d) for d in images)
-    print(
-        f"{len(vocabulary)} words from {count} descriptors of {len(images)} images, id {vocabulary.id}: {args.output}"
-    )
+    made = f"{len(vocabulary)} words from {count} descriptors of {len(images)} images"
+    print(f"{made}, id {vocabulary.id}: {options.output}")
 
 
 def spread(count: int, wanted: int) -> list[int]:
