@@ -39,6 +39,7 @@ COMMANDS: dict[str, str] = {
     "t265": "firmware and reset of a T265",
     "udev": "rules that let everybody use the cameras (Linux)",
     "config": "show the resolved configuration",
+    "compile": "compile the numerical kernels now, so that no first run waits for them",
 }
 
 

@@ -46,6 +46,14 @@ class SourceCounters:
 
 
 @dataclass(frozen=True)
+class Compiling:
+    """A kernel is compiled, once on this machine; for people who wait."""
+
+    stage: str
+    kernel: str
+
+
+@dataclass(frozen=True)
 class LogEnded:
     """The log takes no more; the run goes on."""
 

@@ -13,6 +13,7 @@ from stereo_sfm.errors import StereoSfmError, from_os_error
 
 if TYPE_CHECKING:
     from drivers.choice import SourceChoice
+    from stereo_sfm.commands._progress import CompilingShown
     from stereo_sfm.commands._step import Stepper
     from stereo_sfm.config import Config
     from stereo_sfm.eval.record import RunRecord
@@ -70,7 +71,8 @@ def execute(options: RunOptions) -> tuple[int, Path]:
     o = options
     o.source.refuse_to_overwrite(o.output)
     record, pictures, stepper = RunRecord.of(o.config, o.folders.localize_only), _pictures(o.matches), _stepper(o)
-    sinks, wiring = _sinks(o, record, pictures), _wiring(o)
+    shown, wiring = CompilingShown(), _wiring(o)
+    sinks = [*_sinks(o, record, pictures), shown]
     session = Session(o.source, o.config, sinks, wiring, o.folders, o.output, o.overwrite, o.replayed)
     with StopRequest(INLINE_END_S if wiring.inline else 0.0) as stop:
         stop.then = session.stop
@@ -78,8 +80,8 @@ def execute(options: RunOptions) -> tuple[int, Path]:
             if pictures is not None:
                 pictures.folder = session.folder / "matches"
             begin = time.perf_counter()
-            interrupted, problem = _follow(session, record, stop, o.quiet or stepper is not None, stepper)
-            wall_s = time.perf_counter() - begin
+            interrupted, problem = _follow(session, record, stop, o.quiet or stepper is not None, stepper, shown)
+            wall_s = time.perf_counter() - begin - session.waited_s(begin)
             stop.finished()
         stop.then = None
         folder, info = session.folder, session.info
@@ -145,13 +147,14 @@ def _stepper(options: RunOptions) -> Stepper | None:
 
 
 def _follow(
-    session: Session, record: RunRecord, stop: StopRequest, quiet: bool, stepper: Stepper | None
+    session: Session, record: RunRecord, stop: StopRequest, quiet: bool, stepper: Stepper | None, shown: CompilingShown
 ) -> tuple[bool, StereoSfmError | None]:
     """To the end, to Ctrl-C, or to an error; what was tracked until then stays in the record."""
-    from stereo_sfm.commands._progress import first_state, frame_state, progress
+    from stereo_sfm.commands._progress import frame_state, progress
 
     info = session.info
-    with progress(info.name, info.frame_count, quiet, state=first_state()) as bar:
+    with progress(info.name, info.frame_count, quiet) as bar:
+        shown.bar = bar
         try:
             for frame in session:
                 bar.step(frame_state(frame))

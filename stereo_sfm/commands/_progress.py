@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
+
+from stereo_sfm.messages import Compiling
 
 if TYPE_CHECKING:
     from stereo_sfm.types import Frame
@@ -24,6 +25,9 @@ class NoProgress:
 
     def step(self, state: str, line: str = "") -> None:
         """One more is done; `line` is printed above the bar and stays."""
+
+    def say(self, state: str) -> None:
+        """What goes on before the next one is done."""
 
 
 class TerminalProgress(NoProgress):
@@ -60,6 +64,9 @@ class TerminalProgress(NoProgress):
         if line:
             self._progress.console.print(line, markup=False, highlight=False)
 
+    def say(self, state: str) -> None:
+        self._progress.update(self._task, state=state)
+
 
 class LinesOnly(NoProgress):
     """Where there is no terminal: the lines that stay."""
@@ -83,10 +90,21 @@ def progress(
     return TerminalProgress(name, total, unit, done, state) if sys.stderr.isatty() else LinesOnly()
 
 
-def first_state() -> str:
-    """What the bar of a run says before the first frame."""
-    compiled = any((Path(__file__).parents[1] / "tracking").glob("**/__pycache__/*.nbi"))
-    return "" if compiled else "first run on this machine: compiling the numerical kernels"
+class CompilingShown:
+    """A sink: the first run on a machine compiles its kernels, and says which one beside the bar."""
+
+    def __init__(self) -> None:
+        self.bar = NoProgress()
+        self._kernels = 0
+
+    def put(self, message: object) -> None:
+        """Any message of a run."""
+        if not isinstance(message, Compiling):
+            return
+        self._kernels += 1
+        if self._kernels == 1 and isinstance(self.bar, LinesOnly):
+            print("first run on this machine: compiling the numerical kernels, a minute or two", file=sys.stderr)
+        self.bar.say(f"first run here: compiling {message.kernel} ({message.stage}), kernel {self._kernels}")
 
 
 def frame_state(frame: Frame) -> str:

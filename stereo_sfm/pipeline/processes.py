@@ -25,7 +25,7 @@ from drivers.choice import Opener
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.maps.folders import MapFolders
-from stereo_sfm.messages import LogEnded, LogLine, Sink
+from stereo_sfm.messages import Compiling, LogEnded, LogLine, Sink
 from stereo_sfm.pipeline import logger, workers
 from stereo_sfm.pipeline.capture import SourceInfo
 from stereo_sfm.pipeline.channels import DroppingOutbox, End, Failed, Outbox
@@ -99,6 +99,7 @@ class ProcessRun:
         self._live = False  # nobody waits for the logger
         self._left_out = 0  # images that the log lacks
         self._abandoned = False
+        self.began_s: float | None = None  # performance counter when every stage was ready
         self._release: Outbox | None = None
         self._to_viewer: DroppingOutbox | None = None
         self._next_picture_ns = 0
@@ -323,6 +324,7 @@ class ProcessRun:
         """Capture goes when the last of the others is ready."""
         self._waiting.discard(stage)
         if not self._waiting:
+            self.began_s = time.perf_counter()
             with contextlib.suppress(OSError):
                 self._controls["capture"].send("go")
 
@@ -381,6 +383,10 @@ class ProcessRun:
             self._dispatch(message)
 
     def _dispatch(self, message: object) -> None:
+        if isinstance(message, Compiling):
+            for sink in self._sinks:
+                sink.put(message)
+            return
         if isinstance(message, LogEnded):
             log.warning("%s; the run goes on without it", message.why)
         if isinstance(message, SlotImage) and not message.logged:

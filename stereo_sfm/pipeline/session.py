@@ -16,7 +16,7 @@ from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError, require
 from stereo_sfm.export.run_folder import KEPT_MAP, FolderLock, default_folder, discard_files, prepare_folder
 from stereo_sfm.maps.folders import MapFolders
-from stereo_sfm.messages import LogEnded, Sink
+from stereo_sfm.messages import Compiling, LogEnded, Sink
 from stereo_sfm.pipeline.capture import SourceInfo
 from stereo_sfm.pipeline.inline import run_inline
 from stereo_sfm.pipeline.processes import ProcessRun
@@ -26,6 +26,7 @@ from stereo_sfm.types import Dropped, Frame
 from stereo_sfm.viz.server import LOOPBACK
 
 if TYPE_CHECKING:
+    from stereo_sfm.kernel_cache import Compilation
     from stereo_sfm.log.recorded import RecordedRun
 
 log = logging.getLogger("stereo_sfm")
@@ -71,6 +72,7 @@ class Session:
         self._made: list[Path] = []  # folders, from the inside out
         self._lock: FolderLock | None = None  # on the folder, until its last file is written
         self._began = False  # a frame has come
+        self._compilation: Compilation | None = None  # in this process
         self.info: SourceInfo
 
     @property
@@ -119,6 +121,16 @@ class Session:
         if self._run is not None:
             self._run.stop()
 
+    def _compiling(self, kernel: str) -> None:
+        for sink in self._sinks:
+            sink.put(Compiling("run", kernel))
+
+    def waited_s(self, begin_s: float) -> float:
+        """Seconds of the performance counter after `begin_s` in which stages loaded or compiled their code."""
+        if self._run is None:
+            return 0.0 if self._compilation is None else self._compilation.seconds
+        return max((self._run.began_s or begin_s) - begin_s, 0.0)
+
     def _name_folder(self, otherwise: str) -> Path:
         """By what the source was opened by, else by the given name."""
         if self._folder is None:
@@ -148,10 +160,12 @@ class Session:
     # -- wirings -----------------------------------------------------------------------------------------------------
 
     def _enter_inline(self, stack: ExitStack) -> Iterator[Frame]:
+        from stereo_sfm.kernel_cache import listening
         from stereo_sfm.log.run_log import RunLog
         from stereo_sfm.log.writer import LogWriter
         from stereo_sfm.pipeline.logger import LogSink
 
+        self._compilation = stack.enter_context(listening(self._compiling))
         source = stack.enter_context(self._opener())
         self.info = SourceInfo(source.name, source.rig, source.ground_truth, source.frame_count, source.live)
         folder = self._name_folder(source.name)

@@ -22,6 +22,7 @@ from stereo_sfm.config import STAGES, Config
 from stereo_sfm.errors import StereoSfmError, from_os_error
 from stereo_sfm.log.provenance import Opening
 from stereo_sfm.maps.folders import MapFolders, make_mapper, save_result
+from stereo_sfm.messages import Compiling
 from stereo_sfm.pipeline.channels import End, Failed, Inbox, Lost, Outbox
 from stereo_sfm.pipeline.interrupts import STOP_SIGNALS
 from stereo_sfm.pipeline.schedule import Lockstep, Realtime, Recorded, Schedule
@@ -94,9 +95,11 @@ class Ready:
 
 def ready(stage: str, setup: Setup, to_main: Outbox) -> None:
     """Load the stage's code, and say so."""
+    from stereo_sfm.kernel_cache import listening
     from stereo_sfm.pipeline.warm_up import warm_up_stage
 
-    warm_up_stage(stage, setup.config, setup.rig)
+    with listening(lambda kernel: to_main.send(Compiling(stage, kernel))):
+        warm_up_stage(stage, setup.config, setup.rig)
     to_main.send(Ready(stage))
 
 
