@@ -98,6 +98,9 @@ def _shutter(known: str, errors: ReadoutErrors) -> Finding:
     own_ms, best_ms = 1e3 * float(errors.readout_s[0]), 1e3 * errors.best_s
     if not errors.shown:
         return Finding("shutter", 0, f"{known}; {UNKNOWN}", judged=False)
+    if errors.explained_otherwise:
+        how = "the gain does not follow the motion, as that of a rolling shutter does: the calibration may be off"
+        return Finding("shutter", 0, f"{known}; another readout fits {100 * errors.gain:.0f} % better, but {how}")
     if best_ms == own_ms:
         return Finding("shutter", 0, f"{known}; points are off by {errors.error_px[0]:.2f} px (median)")
     better = f"{known}, but points fit {100 * errors.gain:.0f} % better"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -13,16 +14,20 @@ from drivers.sim.source import SimSource
 from drivers.source import open_source
 from stereo_sfm.cli import main
 from stereo_sfm.config import TrackerConfig
-from stereo_sfm.tracking.flow.readout import LEAST_FRAMES, ReadoutErrors, ReadoutSearch
+from stereo_sfm.geometry import se3
+from stereo_sfm.tracking.flow.readout import LEAST_FRAMES, LEAST_GAIN, ReadoutErrors, ReadoutSearch
 from stereo_sfm.types import StereoImage
 
 WALK = "sim:aisle?camera=pinhole&size=320x200&start=60&frames=40&vibration=4"
 
 
-def search(spec: str, told_s: float) -> ReadoutErrors:
+def search(spec: str, told_s: float, yaw_deg: float = 0.0, most: int = 200) -> ReadoutErrors:
+    """The right camera is believed to be turned by `yaw_deg` more than it is."""
     with open_source(spec) as source:
-        found = ReadoutSearch(TrackerConfig(), dataclasses.replace(source.rig, readout_s=told_s))
-        for image in source:
+        turn = se3.exp(np.array([0, 0, 0, 0, np.radians(yaw_deg), 0]))
+        rig = dataclasses.replace(source.rig, readout_s=told_s, left_T_right=source.rig.left_T_right @ turn)
+        found = ReadoutSearch(TrackerConfig(), rig)
+        for image in itertools.islice(source, most):
             found.add(image)
     return found.errors()
 
@@ -36,6 +41,20 @@ def test_a_rolling_shutter_that_the_calibration_does_not_know() -> None:
 def test_a_global_shutter_and_one_that_is_known() -> None:
     assert search(WALK, 0.0).best_s == 0.0
     assert search(f"{WALK}&readout=0.025", 0.025).best_s == 0.025
+
+
+def test_a_global_shutter_with_a_wrong_calibration_is_no_rolling_one() -> None:
+    """Driving ahead, wrong disparities look like rows that are read one after the other."""
+    found = search("sim:aisle?camera=pinhole&size=320x200&start=60&frames=60&rate=10", 0.0, -0.4)
+    assert found.gain > LEAST_GAIN  # the fit alone would say that it is a rolling one
+    assert found.explained_otherwise
+    assert found.best_s == 0.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("yaw_deg", [-0.1, -0.05, 0.0, 0.05, 0.1])
+def test_kitti_has_a_global_shutter(yaw_deg: float, data_root: Path) -> None:
+    assert search(f"kitti:{data_root / 'kitti'}", 0.0, yaw_deg, 100).best_s == 0.0
 
 
 def test_too_few_frames_say_nothing() -> None:
