@@ -16,6 +16,7 @@ from typing import Any
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.settings import check, check_names, explained, number, path, switch, word
 
+LONGEST_LINE, LONGEST_TEXT = 4096, 1 << 20  # characters of a configuration
 MOST_CORES = 1024  # of a machine
 
 # Names of earlier versions, in files and in the logs of old runs -> the name of today.
@@ -338,16 +339,30 @@ def load(path: Path | str | None = None, overrides: Iterable[str] = (), base: di
     return from_dict(data)
 
 
+def parse_toml(text: str) -> dict[str, Any]:
+    """Nested values.
+
+    Raises:
+        ValueError: not TOML, or longer lines or deeper brackets than any configuration has.
+    """
+    if max(map(len, text.splitlines()), default=0) > LONGEST_LINE or len(text) > LONGEST_TEXT:
+        raise ValueError("it is too long for a configuration")
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+
+
 def _read(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text("utf-8-sig"))
+        return parse_toml(path.read_text("utf-8-sig"))
     except FileNotFoundError:
         raise StereoSfmError(f"no configuration file at {path}") from None
     except OSError as error:
         raise StereoSfmError(f"cannot read the configuration {path}: {error.strerror}") from None
     except UnicodeDecodeError:
         raise StereoSfmError(f"configuration {path}: it is no text (expected TOML)") from None
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:
         raise StereoSfmError(f"configuration {path}: {error}") from None
 
 
@@ -358,10 +373,10 @@ def _parsed(override: str) -> dict[str, Any]:
         raise StereoSfmError(f"--set takes key=value, got '{override}'")
     for text in (value, repr(value)):
         try:
-            return tomllib.loads(f"{key} = {text}")
-        except tomllib.TOMLDecodeError:
+            return parse_toml(f"{key} = {text}")
+        except ValueError:
             continue
-    raise StereoSfmError(f"--set cannot read '{override}'")
+    raise StereoSfmError(f"--set cannot read '{override[:80]}'")
 
 
 def dump(config: Config) -> str:

@@ -16,6 +16,7 @@ ROOMS: tuple[str, ...] = (
     "stereo_sfm.timing",
     "stereo_sfm.types",
     "stereo_sfm.pixels",
+    "stereo_sfm.arrays",
     "stereo_sfm.messages",
     "stereo_sfm.kernel_cache",
     "stereo_sfm.geometry",

@@ -146,7 +146,8 @@ class ForeignMcapSource(BaseSource):
         others: deque[_Shot] = deque()
         for record in self.reader.messages([*names, self.topics.imu], start_ns, until_ns):
             if record.topic == self.topics.imu:
-                imu.append(IMUS[schema_name(record)](record.data))
+                with suppress(*BAD_MESSAGE):
+                    imu.append(IMUS[schema_name(record)](record.data))
                 continue
             shot = self._shot(record)
             if shot is None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.message import DecodeError
 
 from calib.rig import Rig
 from drivers.folder_source import SHOWN_WARNINGS
@@ -82,16 +83,26 @@ def decode_image(record: Record) -> U8:
     Raises:
         ValueError: an encoding nobody knows, or damaged bytes.
     """
-    if record.schema is not None and record.schema.name == "foxglove.RawImage":
-        m = RawImage.FromString(record.data)
-        return eight_bits(images.decode_raw(m.data, m.width, m.height, m.step, m.encoding))
-    return images.decode_file(CompressedImage.FromString(record.data).data)
+    try:
+        if record.schema is not None and record.schema.name == "foxglove.RawImage":
+            m = RawImage.FromString(record.data)
+            return eight_bits(images.decode_raw(m.data, m.width, m.height, m.step, m.encoding))
+        return images.decode_file(CompressedImage.FromString(record.data).data)
+    except DecodeError:
+        raise ValueError("a damaged message") from None
 
 
 def decode_depth(record: Record) -> F32:
-    """Pixels of a depth RawImage record as (H, W) metres."""
-    m = RawImage.FromString(record.data)
-    return images.decode_depth(m.data, m.width, m.height, m.step, m.encoding)
+    """Pixels of a depth RawImage record as (H, W) metres.
+
+    Raises:
+        ValueError: another encoding, or damaged bytes.
+    """
+    try:
+        m = RawImage.FromString(record.data)
+        return images.decode_depth(m.data, m.width, m.height, m.step, m.encoding)
+    except DecodeError:
+        raise ValueError("a damaged message") from None
 
 
 def check_size(path: Path, what: str, pixels: U8 | F32, size: tuple[int, int]) -> None:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import logging
-import tomllib
-import zipfile
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -13,7 +10,8 @@ import numpy as np
 
 from calib.formats.native import rig_from_text
 from calib.rig import Rig
-from stereo_sfm.config import Config, from_dict
+from stereo_sfm.arrays import read_arrays
+from stereo_sfm.config import Config, from_dict, parse_toml
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log.image_log import RIG_FILE, TRUTH_FILE
 from stereo_sfm.log.provenance import CONFIG_FILE
@@ -53,19 +51,22 @@ def _read(reader: LogReader, name: str, parse: Callable[[bytes], T]) -> T | None
         return None
     try:
         return parse(raw)
-    except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile) as error:
+    except (ValueError, LookupError, RecursionError) as error:
         log.warning("%s: the attached %s is damaged (%s) and left out", reader.path, name, error)
         return None
 
 
 def _trajectory(raw: bytes) -> Trajectory:
     """The inverse of `truth_to_bytes`."""
-    with np.load(io.BytesIO(raw), allow_pickle=False) as arrays:
-        return Trajectory(arrays["stamp_ns"], arrays["poses"], "positions_only" not in arrays)
+    arrays = read_arrays(raw)
+    stamp_ns, poses = arrays["stamp_ns"], arrays["poses"]
+    if stamp_ns.dtype != np.int64 or poses.dtype != np.float64 or poses.shape != (*stamp_ns.shape, 4, 4):
+        raise ValueError("its arrays are no trajectory")
+    return Trajectory(stamp_ns, poses, "positions_only" not in arrays)
 
 
 def _config(raw: bytes, reader: LogReader) -> Config:
-    settings = tomllib.loads(raw.decode())
+    settings = parse_toml(raw.decode())
     try:
         return from_dict(settings)
     except StereoSfmError as error:

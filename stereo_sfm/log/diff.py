@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from google.protobuf.message import DecodeError
 from mcap_protobuf.decoder import DecoderFactory
 
 from stereo_sfm.errors import StereoSfmError
@@ -84,9 +85,15 @@ def _attachment(a: LogReader, b: LogReader) -> list[Difference]:
     one, other = a.attachment("calibration.yaml"), b.attachment("calibration.yaml")
     if one == other or one is None or other is None:
         return []
-    lines = itertools.zip_longest(one.decode().splitlines(), other.decode().splitlines(), fillvalue="(nothing)")
-    left, right = next((x, y) for x, y in lines if x != y)
+    lines = itertools.zip_longest(
+        one.decode(errors="replace").splitlines(), other.decode(errors="replace").splitlines(), fillvalue="(nothing)"
+    )
+    left, right = next(((x, y) for x, y in lines if x != y), ("one", "another encoding"))
     return [Difference("calibration.yaml", -1, -1, "line", left.strip(), right.strip())]
+
+
+def _lines(text: bytes) -> list[str]:
+    return text.decode(errors="replace").splitlines()
 
 
 class _Comparison:
@@ -127,7 +134,10 @@ class _Comparison:
         for field, one, other in (("frame id", a.sequence, b.sequence), ("log_time", a.log_time, b.log_time)):
             if one != other:
                 return Difference(a.topic, a.sequence, a.log_time, field, str(one), str(other))
-        found = self._content(a, b)
+        try:
+            found = self._content(a, b)
+        except (DecodeError, ValueError, TypeError, LookupError):  # one of them is damaged
+            found = ("bytes", f"{len(a.data)} bytes", f"{len(b.data)} other bytes")
         return Difference(a.topic, a.sequence, a.log_time, *found) if found else None
 
     def _content(self, a: Record, b: Record) -> tuple[str, str, str] | None:
@@ -226,5 +236,5 @@ def configurations(a: LogReader, b: LogReader) -> list[str]:
     one, other = a.attachment(CONFIG_FILE), b.attachment(CONFIG_FILE)
     if one is None or other is None or one == other:
         return []
-    first, second = one.decode().splitlines(), other.decode().splitlines()
+    first, second = _lines(one), _lines(other)
     return [f"{x.strip()} -> {y.strip()}" for x, y in itertools.zip_longest(first, second, fillvalue="") if x != y]

@@ -7,6 +7,8 @@ from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
+from google.protobuf.message import DecodeError
+
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log import schema, topics
@@ -47,17 +49,24 @@ def messages(
         reader: the open file.
         names: topics, None for all. Messages of unknown schemas are left out.
         start: first log time, inclusive. until: last log time, inclusive.
+
+    Raises:
+        StereoSfmError: a message, or the schema of a topic, is damaged.
     """
     decoders: dict[str, Callable[[bytes], Any] | None] = {}
     for record in reader.messages(names, start, until):
         if record.schema is None or record.channel.message_encoding != "protobuf":
             continue
         name = record.schema.name
-        if name not in decoders:
-            decoders[name] = _decoder(name, record.schema.data)
-        decode = decoders[name]
+        try:
+            if name not in decoders:
+                decoders[name] = _decoder(name, record.schema.data)
+            decode = decoders[name]
+            message = None if decode is None else decode(record.data)
+        except (ValueError, DecodeError) as error:
+            raise StereoSfmError(f"{reader.path}: {record.topic} cannot be read: {error}") from None
         if decode is not None:
-            yield record, decode(record.data)
+            yield record, message
 
 
 def _decoder(name: str, data: bytes) -> Callable[[bytes], Any] | None:

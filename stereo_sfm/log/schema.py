@@ -240,16 +240,22 @@ def decoder(cls: type[Any], schema: bytes) -> Callable[[bytes], Any]:
     Args:
         cls: the dataclass.
         schema: serialised FileDescriptorSet from the file, possibly of another version of this package.
+
+    Raises:
+        ValueError: the schema is damaged; the function raises it for damaged messages.
     """
-    (file,) = descriptor_pb2.FileDescriptorSet.FromString(schema).file
-    for message in file.message_type:
-        _bytes_for_arrays(message)
-    message_class = _class_from(file, full_name(cls))
+    try:
+        (file,) = descriptor_pb2.FileDescriptorSet.FromString(schema).file
+        for message in file.message_type:
+            _bytes_for_arrays(message)
+        message_class = _class_from(file, full_name(cls))
+    except (DecodeError, ValueError, TypeError, LookupError):
+        raise ValueError(f"the schema of {cls.__name__} messages is damaged") from None
 
     def decode(data: bytes) -> Any:
         try:
             return _read(message_class.FromString(data), cls)
-        except DecodeError:
+        except (DecodeError, ValueError, LookupError, OverflowError):
             raise ValueError(f"a damaged {cls.__name__} message") from None
         except TypeError as error:
             raise StereoSfmError(f"{cls.__name__} in this log was written by another version: {error}") from None

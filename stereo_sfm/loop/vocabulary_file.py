@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import zipfile
 from importlib.resources import as_file, files
 from pathlib import Path
 
 import numpy as np
 
+from stereo_sfm.arrays import read_arrays
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.loop.vocabulary import Vocabulary
@@ -31,14 +31,14 @@ def load_vocabulary(path: Path) -> Vocabulary:
     """
     again = "train one with 'stereo-sfm vocabulary train'"
     try:
-        with np.load(path, allow_pickle=False) as data:
-            version = int(data["version"])
-            if version != VERSION:
-                raise StereoSfmError(f"{path} is vocabulary version {version}, this program reads {VERSION}: {again}")
-            columns = [data[name] for name in _COLUMNS]
+        data = read_arrays(path.read_bytes())
+        version = int(data["version"])
+        if version != VERSION:
+            raise StereoSfmError(f"{path} is vocabulary version {version}, this program reads {VERSION}: {again}")
+        columns = [data[name] for name in _COLUMNS]
     except FileNotFoundError:
         raise StereoSfmError(f"no vocabulary at {path}: {again}") from None
-    except (KeyError, ValueError, OSError, EOFError, zipfile.BadZipFile):
+    except (KeyError, ValueError, TypeError, OSError):
         raise StereoSfmError(f"{path} is not a vocabulary file or is damaged: {again}") from None
     return Vocabulary(*columns)
 

@@ -46,7 +46,7 @@ def read_header(folder: Path, files: tuple[str, ...]) -> dict[str, Any]:
     try:
         head = json.loads(path.read_text("utf-8-sig"))
         version = head["version"] if head["kind"] == KIND else None
-    except (ValueError, KeyError, TypeError, OSError):
+    except (ValueError, KeyError, TypeError, OSError, RecursionError):
         raise damaged(folder, "map.json cannot be read") from None
     if version != VERSION:
         raise StereoSfmError(f"the map {folder} is version {version}, this program reads version {VERSION}")

@@ -6,9 +6,7 @@ The same map gives the same bytes. What is wrong with a folder is said in one li
 from __future__ import annotations
 
 import dataclasses
-import io
 import logging
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,8 +15,10 @@ import numpy as np
 
 from calib.formats.native import read_native, write_native
 from calib.rig import Rig
+from stereo_sfm.arrays import read_arrays
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.mapping.map import Map, MapSnapshot
+from stereo_sfm.maps.columns import check_columns
 from stereo_sfm.maps.header import check_counts, checksum, damaged, read_header, write_header
 from stereo_sfm.maps.replace_folder import replaced_folder
 from stereo_sfm.types import I64, MapUpdate, Trajectory
@@ -104,13 +104,17 @@ def load_map(folder: Path | str, rig: Rig | None = None) -> SavedMap:
             raw = (folder / f"{name}.npz").read_bytes()
             if checksum(raw) != sums[name]:
                 raise ValueError(name)
-            with np.load(io.BytesIO(raw), allow_pickle=False) as data:
-                columns.update({c: data[c] for c in wanted})
+            data = read_arrays(raw)
+            columns.update({c: data[c] for c in wanted})
         if checksum((folder / "rig.yaml").read_bytes()) != sums["rig"]:
             raise ValueError("rig")
         own = read_native(folder / "rig.yaml")
-    except (OSError, KeyError, ValueError, EOFError, TypeError, zipfile.BadZipFile, StereoSfmError):
+    except (OSError, KeyError, ValueError, StereoSfmError):
         raise damaged(folder, "a file is missing or was changed") from None
+    try:
+        check_columns(columns)
+    except ValueError as error:
+        raise damaged(folder, str(error)) from None
     sessions = columns.pop("sessions")
     for name in ("uv_left", "uv_right"):
         columns[name] = columns[name].astype(np.float64)

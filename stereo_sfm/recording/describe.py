@@ -104,7 +104,7 @@ def _describe_file(path: Path, own_rig: Path | None) -> Description:
             metadata=reader.metadata(METADATA),
         )  # fmt: skip
         config = reader.attachment(CONFIG_FILE)
-        out.config_sha256 = config_hash(config.decode()) if config is not None else ""
+        out.config_sha256 = config_hash(config.decode(errors="replace")) if config is not None else ""
         for topic in reader.topics:
             out.rows.append((topic.topic, topic.schema or topic.encoding, rate_of(stamps[topic.topic])))
             out.messages += topic.count
@@ -162,9 +162,13 @@ def _describe_infos(out: Description, reader: LogReader) -> None:
     """Skew and drops as our own recordings hold them: counted at the end, else (not closed) in every message."""
     out.totals = reader.metadata(TOTALS)
     if out.totals:
-        out.dropped = int(out.totals["dropped"])
-        out.skew_ms = int(out.totals["max_skew_ns"]) / 1e6
-        return
+        try:
+            out.dropped, skew_ns = int(out.totals["dropped"]), int(out.totals["max_skew_ns"])
+            out.skew_ms = skew_ns / 1e6
+            return
+        except (LookupError, ValueError, OverflowError):
+            out.problems.append("its totals are damaged: what they would say is counted anew")
+            out.totals, out.dropped = {}, 0
     skews = [0]
     infos = 0
     for _, info in messages(reader, [topics.IMAGE_INFO]):

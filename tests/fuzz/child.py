@@ -1,0 +1,63 @@
+"""Runs commands one after the other in a process of bounded memory and says what became of each.
+
+Reads one JSON list of arguments a line, writes one JSON object a line. "frames PATH" reads every frame of a source.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import resource
+import sys
+import time
+import traceback
+from typing import Any
+
+HEADROOM = 1 << 30  # bytes of address space beyond what the program needs when it is loaded
+
+
+def frames(path: str) -> int:
+    """Read a whole source as a command would."""
+    from drivers.source import open_source
+    from stereo_sfm.errors import StereoSfmError
+
+    try:
+        with open_source(path) as source:
+            for _ in source:
+                pass
+    except StereoSfmError as error:
+        print(f"stereo-sfm frames: {error}", file=sys.stderr)
+        return error.exit_code
+    return 0
+
+
+def outcome(argv: list[str]) -> dict[str, Any]:
+    """Exit code (None after an exception that no command should raise), standard error, processor seconds."""
+    from stereo_sfm.cli import main
+
+    code, trace = None, ""
+    said, began = io.StringIO(), time.process_time()
+    with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+        try:
+            code = frames(argv[1]) if argv[0] == "frames" else main(argv)
+        except SystemExit as end:
+            code = int(end.code or 0)
+        except BaseException:  # whatever it is, it is what the test looks for
+            trace = traceback.format_exc()
+    return {"code": code, "said": said.getvalue(), "trace": trace, "seconds": time.process_time() - began}
+
+
+def _limit() -> None:
+    with open("/proc/self/status") as status:
+        used = next(int(line.split()[1]) for line in status if line.startswith("VmSize")) << 10
+    resource.setrlimit(resource.RLIMIT_AS, (used + HEADROOM, used + HEADROOM))
+
+
+if __name__ == "__main__":
+    outcome(json.loads(sys.argv[1]))  # loads the libraries
+    _limit()
+    for line in sys.stdin:
+        result = outcome(json.loads(line))
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
+        print(json.dumps({**result, "peak_mb": peak}), flush=True)
