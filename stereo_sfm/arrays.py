@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import math
 import zipfile
+import zlib
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,7 @@ def read_arrays(raw: bytes) -> dict[str, Any]:
             if any(entry.compress_type not in _METHODS or entry.flag_bits & 1 for entry in entries):
                 raise ValueError("its arrays are packed in an unknown way")
             return {entry.filename.removesuffix(".npy"): _array(archive.read(entry)) for entry in entries}
-    except (zipfile.BadZipFile, zipfile.LargeZipFile, EOFError, OSError, zipfile.zlib.error, MemoryError) as error:
+    except (zipfile.BadZipFile, zipfile.LargeZipFile, EOFError, OSError, zlib.error, MemoryError) as error:
         raise ValueError(f"no npz file or a damaged one ({error})") from None
 
 

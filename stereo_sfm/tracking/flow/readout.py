@@ -81,9 +81,8 @@ class ReadoutSearch:
 
     def errors(self) -> ReadoutErrors:
         """What was found until now."""
-        errors = np.array(self._errors).reshape(-1, len(self._trackers))
-        known = np.isfinite(errors).all(axis=1)
-        known[:1] = False  # no motion led to the first
+        errors: F64 = np.array(self._errors, float).reshape(-1, len(self._trackers))
+        known = np.isfinite(errors).all(axis=1) & (np.arange(len(errors)) > 0)  # no motion led to the first
         if known.sum() < LEAST_FRAMES:
             return ReadoutErrors(self._readout_s, np.full(len(self._trackers), np.nan))
         mean = errors[known].mean(0)
@@ -101,6 +100,6 @@ def _follows(gain: F64, unusual: F64) -> float:
     """How surely one of two columns grows with the other: Spearman's rank correlation in standard deviations."""
     if np.ptp(gain) == 0 or np.ptp(unusual) == 0:
         return 0.0
-    ranks = [np.argsort(np.argsort(column, kind="stable")) for column in (gain, unusual)]
-    rho = float(np.corrcoef(ranks)[0, 1])
+    ranks = [np.argsort(np.argsort(column, kind="stable")) - 0.5 * (len(column) - 1) for column in (gain, unusual)]
+    rho = float(ranks[0] @ ranks[1] / np.sqrt((ranks[0] @ ranks[0]) * (ranks[1] @ ranks[1])))
     return rho * math.sqrt((len(gain) - 2) / max(1 - rho * rho, 1e-9))
