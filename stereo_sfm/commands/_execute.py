@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from stereo_sfm.commands._progress import CompilingShown, frame_state, progress
 from stereo_sfm.commands._stop import INTERRUPTED, StopRequest
 from stereo_sfm.errors import StereoSfmError, from_os_error
 
 if TYPE_CHECKING:
     from drivers.choice import SourceChoice
-    from stereo_sfm.commands._progress import CompilingShown
     from stereo_sfm.commands._step import Stepper
     from stereo_sfm.config import Config
     from stereo_sfm.eval.record import RunRecord
@@ -150,8 +150,6 @@ def _follow(
     session: Session, record: RunRecord, stop: StopRequest, quiet: bool, stepper: Stepper | None, shown: CompilingShown
 ) -> tuple[bool, StereoSfmError | None]:
     """To the end, to Ctrl-C, or to an error; what was tracked until then stays in the record."""
-    from stereo_sfm.commands._progress import frame_state, progress
-
     info = session.info
     with progress(info.name, info.frame_count, quiet) as bar:
         shown.bar = bar
