@@ -62,8 +62,10 @@ class RunOptions:
 
 def execute(options: RunOptions) -> tuple[int, Path]:
     """Run, write the output folder, print the closing summary: the exit code and the folder."""
+    from drivers.choice import SourceChoice
     from stereo_sfm.eval.record import RunRecord
     from stereo_sfm.eval.run_results import write_results
+    from stereo_sfm.eval.start import why_not_started
     from stereo_sfm.eval.statistics import failure, summary
     from stereo_sfm.export.run_folder import link_latest
     from stereo_sfm.pipeline.session import Session
@@ -85,9 +87,10 @@ def execute(options: RunOptions) -> tuple[int, Path]:
             stop.finished()
         stop.then = None
         folder, info = session.folder, session.info
+        images = SourceChoice(str(folder / "run.mcap")) if info.live else o.source  # to look at once more
         stats, evaluations = write_results(
             folder, info.name, info.rig, o.config, record, wall_s, info.ground_truth, o.frame, o.source.numbering,
-            o.max_lost_percent, _why_not_started(o, record, folder, info.live),
+            o.max_lost_percent, why_not_started(images, record),
         )  # fmt: skip
         link_latest(folder)
     if not o.quiet:
@@ -101,16 +104,6 @@ def execute(options: RunOptions) -> tuple[int, Path]:
         print(f"stereo-sfm {o.command}: {failed}; {folder / 'report.md'} says why", file=sys.stderr)
         return TRACKING_FAILED, folder
     return 0, folder
-
-
-def _why_not_started(options: RunOptions, record: RunRecord, folder: Path, live: bool) -> str:
-    """Of a run without any pose: from its source read once more, for a camera from the log."""
-    from drivers.choice import SourceChoice
-    from stereo_sfm.eval.start import why_not_started
-
-    if not len(record.frames) or record.tracked().any():
-        return ""
-    return why_not_started(SourceChoice(str(folder / "run.mcap")) if live else options.source)
 
 
 def _wiring(options: RunOptions) -> Wiring:

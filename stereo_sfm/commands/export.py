@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stereo_sfm.commands._options import typed
+from stereo_sfm.export.formats import MAP_FORMATS, TRAJECTORY_FORMATS, export_map, export_trajectory
 
 if TYPE_CHECKING:
     from stereo_sfm.maps.saved_map import SavedMap
     from stereo_sfm.types import Trajectory
-
-MAP_FORMATS = {"colmap": "model", "ply": "points.ply", "g2o": "pose_graph.g2o", "floor-plan": "floor_plan.png"}
-TRAJECTORY_FORMATS = ("tum", "kitti", "euroc")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -83,21 +81,15 @@ def _default_name(options: ExportOptions) -> str:
 
 
 def _write_map(options: ExportOptions, output: Path) -> list[Path]:
-    from stereo_sfm.export.floor_plan import export_floor_plan, plan_files
-    from stereo_sfm.export.g2o import export_g2o
-    from stereo_sfm.export.ply import export_ply
+    from stereo_sfm.export.floor_plan import plan_files
 
     paths = [*plan_files(output)] if options.format == "floor-plan" else [output]
     _check_free(options, paths)
     saved = _load(options.source)
-    output.parent.mkdir(parents=True, exist_ok=True)
-    writers: dict[str, Callable[[SavedMap, Path], object]] = {
-        "colmap": lambda s, path: _write_colmap(s, path, options),
-        "ply": export_ply,
-        "g2o": export_g2o,
-        "floor-plan": lambda s, path: export_floor_plan(s, path, options.resolution),
-    }
-    writers[options.format](saved, output)
+    if options.images:
+        _write_with_pictures(saved, output, options, options.images)
+    else:
+        export_map(saved, output, options.format, options.resolution)
     return paths
 
 
@@ -112,39 +104,26 @@ def _load(folder: Path) -> SavedMap:
     raise StereoSfmError(f"{folder} holds no map: nothing was mapped, or by an earlier version (run it again)")
 
 
-def _write_colmap(saved: SavedMap, output: Path, options: ExportOptions) -> None:
-    """The model, and the keyframes' pictures beside it where they are asked for."""
-    from stereo_sfm.export.colmap import export_colmap
-
-    if not options.images:
-        export_colmap(saved, output)
-        return
+def _write_with_pictures(saved: SavedMap, output: Path, options: ExportOptions, images: str) -> None:
+    """COLMAP's model, and the keyframes' pictures beside it."""
     from calib import load_rig
     from stereo_sfm.export.pictures import check_walk, open_pictures, walk_of_recording, write_pictures
 
     check_walk(saved, options.walk)
-    source = open_pictures(options.images, saved.rig, load_rig(options.rig) if options.rig is not None else None)
+    source = open_pictures(images, saved.rig, load_rig(options.rig) if options.rig is not None else None)
     with source:
-        walk = options.walk if options.walk is not None else walk_of_recording(saved, source, options.images)
-        export_colmap(saved, output)
-        write_pictures(saved, source, walk, output, options.images)
+        walk = options.walk if options.walk is not None else walk_of_recording(saved, source, images)
+        export_map(saved, output, "colmap")
+        write_pictures(saved, source, walk, output, images)
 
 
 def _write_trajectories(options: ExportOptions, output: Path) -> list[Path]:
     """One file, or one for each walk of a merged map."""
-    from stereo_sfm.export import trajectories
-
     found, what = _trajectories(options)
     paths = [output if len(found) == 1 else _of_walk(output, walk) for walk in found]
     _check_free(options, paths)
-    output.parent.mkdir(parents=True, exist_ok=True)
     for path, trajectory in zip(paths, found.values(), strict=True):
-        if options.format == "tum":
-            trajectories.write_tum(path, trajectory, what)
-        elif options.format == "euroc":
-            trajectories.write_euroc(path, trajectory, what)
-        else:
-            trajectories.write_kitti(path, trajectory.poses)
+        export_trajectory(trajectory, path, options.format, what)
     return paths
 
 

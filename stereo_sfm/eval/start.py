@@ -8,17 +8,21 @@ from itertools import islice
 from calib.start import why_no_start
 from drivers.source import Source
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.eval.record import RunRecord
 
 APART = 5  # frames from one image that is looked at to the next
 IMAGES = 3
 
 
-def why_not_started(opener: Callable[[], Source]) -> str:
-    """One line, "" where nothing is found or the images cannot be read again.
+def why_not_started(opener: Callable[[], Source], record: RunRecord) -> str:
+    """One line, "" where the run has a pose, nothing is found, or the images cannot be read again.
 
     Args:
         opener: gives the source that was run, not yet entered.
+        record: of the run.
     """
+    if not len(record.frames) or record.tracked().any():
+        return ""
     try:
         with opener() as source:
             images = list(islice(source, 0, APART * (IMAGES - 1) + 1, APART))

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from stereo_sfm.errors import StereoSfmError, did_you_mean
-from stereo_sfm.maps.saved_map import SavedMap
-from stereo_sfm.types import Trajectory
+
+if TYPE_CHECKING:
+    from stereo_sfm.maps.saved_map import SavedMap
+    from stereo_sfm.types import Trajectory
 
 # format -> name of what is written by default
 MAP_FORMATS = {"colmap": "model", "ply": "points.ply", "g2o": "pose_graph.g2o", "floor-plan": "floor_plan.png"}
