@@ -23,6 +23,15 @@ U16 = NDArray[np.uint16]
 Bool = NDArray[np.bool_]
 
 
+def shape(*axes: int) -> dict[str, tuple[int, ...]]:
+    """Metadata of an array field that is no plain row of numbers, so that a log gives it back as it was.
+
+    Args:
+        axes: of the array; -1 in front stands for the number of rows.
+    """
+    return {"shape": axes}
+
+
 def _freeze(obj: Any) -> None:
     for f in fields(obj):
         value = getattr(obj, f.name)
@@ -57,8 +66,8 @@ class ImuSamples(Message):
     """Inertial samples since the previous frame, in the IMU's own axes."""
 
     stamp_ns: I64  # (N,)
-    gyro: F64  # (N, 3) rad/s, NaN rows where only the accelerometer was sampled
-    accel: F64  # (N, 3) m/s^2, NaN rows where only the gyroscope was sampled
+    gyro: F64 = field(metadata=shape(-1, 3))  # (N, 3) rad/s, NaN rows where only the accelerometer was sampled
+    accel: F64 = field(metadata=shape(-1, 3))  # (N, 3) m/s^2, NaN rows where only the gyroscope was sampled
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +75,8 @@ class WheelSamples(Message):
     """Wheel odometry since the previous frame, body axes (x forward, y left)."""
 
     stamp_ns: I64  # (N,)
-    linear: F64  # (N, 3) m/s
-    angular: F64  # (N, 3) rad/s
+    linear: F64 = field(metadata=shape(-1, 3))  # (N, 3) m/s
+    angular: F64 = field(metadata=shape(-1, 3))  # (N, 3) rad/s
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +101,8 @@ class Observations(Message):
     """Points seen in one frame, one row each."""
 
     point_ids: I64  # (N,)
-    uv_left: F64  # (N, 2) px
-    uv_right: F64  # (N, 2) px, NaN where the right eye does not see it
+    uv_left: F64 = field(metadata=shape(-1, 2))  # (N, 2) px
+    uv_right: F64 = field(metadata=shape(-1, 2))  # (N, 2) px, NaN where the right eye does not see it
     age: I32  # (N,) frames since the track began
     inlier: Bool  # (N,) used in the pose
 
@@ -117,13 +126,13 @@ class Frame(Message):
 
     frame_id: int
     stamp_ns: int
-    odom_T_cam: F64  # (4, 4) continuous odometry pose
-    covariance: F64  # (6, 6) of odom_T_cam @ exp(xi), xi = (rho, phi) in camera axes
+    odom_T_cam: F64 = field(metadata=shape(4, 4))  # (4, 4) continuous odometry pose
+    covariance: F64 = field(metadata=shape(6, 6))  # (6, 6) of odom_T_cam @ exp(xi), xi = (rho, phi) in camera axes
     state: TrackState
     reason: str  # "" when OK, else why (a short stable word such as "too_few_points", "dark", "no_consensus")
     observations: Observations
     reference_kf_id: int  # -1 before the first keyframe
-    kf_T_cam: F64  # (4, 4) pose in the reference keyframe, for the final trajectory
+    kf_T_cam: F64 = field(metadata=shape(4, 4))  # (4, 4) pose in the reference keyframe, for the final trajectory
     map_version: int = 0  # last MapUpdate applied before this frame
     is_keyframe: bool = False
     stats: dict[str, float] = field(default_factory=dict[str, float])  # numbers worth plotting; no wall clock
@@ -133,10 +142,10 @@ class Frame(Message):
 class Corners(Message):
     """Corners that a detector finds again when it sees the place again: what place recognition knows a keyframe by."""
 
-    uv_left: F32  # (N, 2) px
-    uv_right: F32  # (N, 2) px
-    points_cam: F32  # (N, 3) metres in the keyframe's camera
-    descriptors: U8  # (N, 32) binary (oriented BRIEF)
+    uv_left: F32 = field(metadata=shape(-1, 2))  # (N, 2) px
+    uv_right: F32 = field(metadata=shape(-1, 2))  # (N, 2) px
+    points_cam: F32 = field(metadata=shape(-1, 3))  # (N, 3) metres in the keyframe's camera
+    descriptors: U8 = field(metadata=shape(-1, 32))  # (N, 32) binary (oriented BRIEF)
 
     @staticmethod
     def none() -> Corners:
@@ -159,12 +168,13 @@ class Keyframe(Message):
     kf_id: int  # 0, 1, 2, ...
     frame_id: int
     stamp_ns: int
-    odom_T_cam: F64  # (4, 4) at creation
+    odom_T_cam: F64 = field(metadata=shape(4, 4))  # (4, 4) at creation
     point_ids: I64  # (N,) tracks' ids: the same id is the same physical point in every keyframe of this run
-    uv_left: F64  # (N, 2) px; with a rolling shutter where they would be if all rows were exposed at the stamp
-    uv_right: F64  # (N, 2) px, NaN where unseen; the same
-    points_cam: F64  # (N, 3) metres in this keyframe's camera, NaN where the depth is unknown
-    descriptors: U8  # (N, 32) binary (oriented BRIEF), zero rows where none could be computed
+    # px; with a rolling shutter where they would be if all rows were exposed at the stamp
+    uv_left: F64 = field(metadata=shape(-1, 2))
+    uv_right: F64 = field(metadata=shape(-1, 2))  # the same, NaN where unseen
+    points_cam: F64 = field(metadata=shape(-1, 3))  # metres in this keyframe's camera, NaN where the depth is unknown
+    descriptors: U8 = field(metadata=shape(-1, 32))  # binary (oriented BRIEF), zero rows where none could be computed
     submap_id: int = 0  # grows when tracking restarts after it was lost
     corners: Corners = field(default_factory=Corners.none)  # what it is recognised by; none: nothing
 
@@ -176,15 +186,16 @@ class MapUpdate(Message):
     version: int
     kf_id: int  # the keyframe it answers
     kf_ids: I64  # (K,) living keyframes that are new or moved
-    map_T_kf: F64  # (K, 4, 4) their new poses
+    map_T_kf: F64 = field(metadata=shape(-1, 4, 4))  # (K, 4, 4) their new poses
     point_ids: I64  # (P,) new or moved points, in track ids
-    points_map: F64  # (P, 3)
+    points_map: F64 = field(metadata=shape(-1, 3))  # (P, 3)
     culled_point_ids: I64  # (C,)
-    fused_point_ids: I64  # (D, 2) old id -> id that replaces it
-    map_T_odom: F64  # (4, 4)
+    fused_point_ids: I64 = field(metadata=shape(-1, 2))  # (D, 2) old id -> id that replaces it
+    map_T_odom: F64 = field(metadata=shape(4, 4))  # (4, 4)
     culled_kf_ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))  # (R,) keyframes that the map gave up
     carrier_kf_ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))  # (R,) what each moves with from now on
-    carrier_T_kf: F64 = field(default_factory=lambda: np.zeros((0, 4, 4)))  # (R, 4, 4) its place there
+    # its place there
+    carrier_T_kf: F64 = field(default_factory=lambda: np.zeros((0, 4, 4)), metadata=shape(-1, 4, 4))
     refused_kf_ids: I64 = field(
         default_factory=lambda: np.zeros(0, np.int64)
     )  # (L,) whose accepted loop the map refused
@@ -196,9 +207,10 @@ class LoopResult(Message):
 
     kf_id: int
     candidate_kf_id: int  # -1: no loop
-    candidate_T_kf: F64  # (4, 4) identity when rejected
-    information: F64  # (6, 6) inverse covariance of candidate_T_kf @ exp(xi)
-    matches: I64  # (M, 2) point ids (candidate's, this keyframe's) that are one physical point
+    candidate_T_kf: F64 = field(metadata=shape(4, 4))  # (4, 4) identity when rejected
+    information: F64 = field(metadata=shape(6, 6))  # (6, 6) inverse covariance of candidate_T_kf @ exp(xi)
+    # (M, 2) point ids (candidate's, this keyframe's) that are one physical point
+    matches: I64 = field(metadata=shape(-1, 2))
     inliers: int  # corners of the keyframe that agree
     score: float
     reason: str  # "" when accepted, else why the best candidate was rejected ("no_candidate", "too_few_inliers", ...)

@@ -20,9 +20,9 @@ from drivers.source import BaseSource, Source, Stamps
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log import images, schema, topics
 from stereo_sfm.log.attached import attached_rig, attached_truth
-from stereo_sfm.log.image_log import ImageInfo, ImuSample, WheelSample
 from stereo_sfm.log.provenance import METADATA
 from stereo_sfm.log.reader import LogReader, Record
+from stereo_sfm.log.samples import ImageInfo, ImuSample, WheelSample
 from stereo_sfm.pixels import eight_bits
 from stereo_sfm.types import F32, U8, ImuSamples, StereoImage, WheelSamples
 

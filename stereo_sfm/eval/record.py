@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import itertools
 from dataclasses import dataclass, field
+from functools import singledispatchmethod
 
 import numpy as np
 import scipy.sparse
@@ -80,29 +81,37 @@ class RunRecord:
         return RunRecord(localize_only, followed=config.odometry.method == "flow")
 
     def put(self, message: object) -> None:
-        """Take one message of the run; those of other kinds are not kept."""
-        if isinstance(message, Dropped):
-            self.drops[message.where] = self.drops.get(message.where, 0) + message.count
-        elif isinstance(message, LogEnded):
-            self.log_ended = message.why
-        elif isinstance(message, Frame):
-            self._put_frame(message)
-        elif isinstance(message, Keyframe):
-            self.keyframes[message.kf_id] = KeyframeRow(
-                message.frame_id, message.stamp_ns, message.odom_T_cam, self._path_m, message.submap_id
-            )
-            self._see(message.point_ids)
-        elif isinstance(message, MapUpdate):
-            self._put_update(message)
-        elif isinstance(message, LoopResult):
-            self._put_loop(message)
-        elif isinstance(message, StageTimes):
-            self.stage_ms.add(message.frame_id, message.ms)
-        elif isinstance(message, Health):
-            self._put_health(message)
-        elif isinstance(message, SourceCounters):
-            self.source_counts = message.counts
+        """Take one message of the run."""
+        self._take(message)
 
+    @singledispatchmethod
+    def _take(self, message: object) -> None:
+        """Kinds without a method below are not kept."""
+
+    @_take.register
+    def _put_dropped(self, dropped: Dropped) -> None:
+        self.drops[dropped.where] = self.drops.get(dropped.where, 0) + dropped.count
+
+    @_take.register
+    def _put_log_ended(self, ended: LogEnded) -> None:
+        self.log_ended = ended.why
+
+    @_take.register
+    def _put_keyframe(self, keyframe: Keyframe) -> None:
+        self.keyframes[keyframe.kf_id] = KeyframeRow(
+            keyframe.frame_id, keyframe.stamp_ns, keyframe.odom_T_cam, self._path_m, keyframe.submap_id
+        )
+        self._see(keyframe.point_ids)
+
+    @_take.register
+    def _put_stage_times(self, times: StageTimes) -> None:
+        self.stage_ms.add(times.frame_id, times.ms)
+
+    @_take.register
+    def _put_counters(self, counters: SourceCounters) -> None:
+        self.source_counts = counters.counts
+
+    @_take.register
     def _put_frame(self, frame: Frame) -> None:
         if len(self.frames):
             step = frame.odom_T_cam[:3, 3] - self.frames.odom_T_cam[-1, :3, 3]
@@ -116,17 +125,20 @@ class RunRecord:
             self.seen_points = np.concatenate([self.seen_points, more])
         self.seen_points[point_ids] = True
 
+    @_take.register
     def _put_health(self, health: Health) -> None:
         before = self.health.get(health.stage, health)
         p99, queue = max(before.p99_ms, health.p99_ms), max(before.queue, health.queue)
         self.health[health.stage] = dataclasses.replace(health, p99_ms=p99, queue=queue)
 
+    @_take.register
     def _put_update(self, update: MapUpdate) -> None:
         self.map_T_kf.update(update)
         self.refused_kf_ids.update(update.refused_kf_ids.tolist())
         self.map_points.update(update.point_ids.tolist())
         self.map_points.difference_update(update.culled_point_ids.tolist(), update.fused_point_ids[:, 0].tolist())
 
+    @_take.register
     def _put_loop(self, loop: LoopResult) -> None:
         if loop.candidate_kf_id >= 0 and not loop.reason:
             self.closed.append(loop)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from functools import singledispatchmethod
 
 import numpy as np
 
@@ -29,19 +30,17 @@ class Events:
         self._told = (TrackState.OK, "")
         self._map_T_odom: F64 = np.eye(4)
 
+    @singledispatchmethod
     def of(self, message: object) -> LogLine | None:
         """The line for one message of the run, None when there is nothing to say."""
-        if isinstance(message, Frame):
-            return self._frame(message)
-        if isinstance(message, LoopResult):
-            return self._loop(message)
-        if isinstance(message, MapUpdate):
-            return self._map_update(message)
-        if isinstance(message, Dropped):
-            frames = "1 frame" if message.count == 1 else f"{message.count} frames"
-            return LogLine(message.where, "WARNING", f"{frames} dropped at {message.frame_id}: {_words(message.why)}")
         return None
 
+    @of.register
+    def _dropped(self, dropped: Dropped) -> LogLine | None:
+        frames = "1 frame" if dropped.count == 1 else f"{dropped.count} frames"
+        return LogLine(dropped.where, "WARNING", f"{frames} dropped at {dropped.frame_id}: {_words(dropped.why)}")
+
+    @of.register
     def _frame(self, frame: Frame) -> LogLine | None:
         self._first_ns = frame.stamp_ns if self._first_ns is None else self._first_ns
         now = (frame.state, frame.reason)
@@ -56,6 +55,7 @@ class Events:
         seconds = (frame.stamp_ns - self._first_ns) * 1e-9
         return LogLine("tracker", level, f"frame {frame.frame_id} at {seconds:.1f} s: {said}{why}")
 
+    @of.register
     def _loop(self, result: LoopResult) -> LogLine | None:
         if result.candidate_kf_id >= 0:
             seen = f"keyframe {result.kf_id} sees keyframe {result.candidate_kf_id} again"
@@ -65,6 +65,7 @@ class Events:
         refused = f"{len(result.rejected)} refused: {_words(result.reason)}"
         return LogLine("loop", "DEBUG", f"no loop at keyframe {result.kf_id}, {refused}")
 
+    @of.register
     def _map_update(self, update: MapUpdate) -> LogLine | None:
         if len(update.refused_kf_ids):
             ids = ", ".join(str(k) for k in update.refused_kf_ids.tolist())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.log import foxglove, topics
 from stereo_sfm.log.images import LoggedImage, depth_message, encode_pair, image_message
+from stereo_sfm.log.samples import ImageInfo, ImuSample, WheelSample
 from stereo_sfm.log.writer import LogWriter
 from stereo_sfm.types import ImuSamples, StereoImage, Trajectory, WheelSamples
 
@@ -22,48 +22,6 @@ TRUTH_FILE = "ground_truth.npz"
 SECOND_NS = 1_000_000_000
 # Players hold z for up: a frame above the map that stands as the first image does (x forward, y left, z up).
 LEVEL_T_MAP = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-
-
-@dataclass(frozen=True)
-class ImageInfo:
-    """What belongs to an image besides its pixels; tells the reader which messages make the frame whole."""
-
-    frame_id: int
-    stamp_ns: int
-    right_stamp_ns: int
-    exposure_us: float
-    gain: float
-    dropped_before: int
-    has_right: bool
-    has_depth: bool
-    imu_count: int  # -1: the source has no inertial unit
-    wheel_count: int  # -1: no wheel odometry
-
-
-@dataclass(frozen=True)
-class ImuSample:
-    """One inertial sample in the unit's own axes, NaN for what was not sampled."""
-
-    stamp_ns: int
-    gyro_x: float  # rad/s
-    gyro_y: float
-    gyro_z: float
-    accel_x: float  # m/s^2
-    accel_y: float
-    accel_z: float
-
-
-@dataclass(frozen=True)
-class WheelSample:
-    """One wheel odometry sample, body axes."""
-
-    stamp_ns: int
-    linear_x: float  # m/s
-    linear_y: float
-    linear_z: float
-    angular_x: float  # rad/s
-    angular_y: float
-    angular_z: float
 
 
 def truth_to_bytes(trajectory: Trajectory) -> bytes:

@@ -13,31 +13,11 @@ from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log import schema, topics
 from stereo_sfm.log.attached import attached_config, attached_rig
-from stereo_sfm.log.image_log import ImageInfo, ImuSample, WheelSample
 from stereo_sfm.log.provenance import ENDED_EARLY, METADATA, SOURCE_RIG_FILE, Opening
 from stereo_sfm.log.reader import LogReader, Record
-from stereo_sfm.log.track_stats import TrackStats
-from stereo_sfm.messages import Health, SourceCounters, StageTimes
-from stereo_sfm.types import Applied, Dropped, Frame, Keyframe, LoopResult, MapUpdate
+from stereo_sfm.types import Applied, Dropped
 
-TYPES: dict[str, type[Any]] = {
-    schema.full_name(cls): cls
-    for cls in (
-        Frame,
-        Keyframe,
-        MapUpdate,
-        LoopResult,
-        Applied,
-        Dropped,
-        ImageInfo,
-        ImuSample,
-        WheelSample,
-        TrackStats,
-        Health,
-        StageTimes,
-        SourceCounters,
-    )
-}
+TYPES: dict[str, type[Any]] = {topic.schema: message for message, topic in topics.OF.items()}
 
 
 def messages(

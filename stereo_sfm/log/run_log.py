@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from functools import singledispatchmethod
 from typing import Any
 
 import numpy as np
@@ -19,13 +20,11 @@ from stereo_sfm.log.map_view import MapView
 from stereo_sfm.log.provenance import ENDED_EARLY, METADATA, TOTALS, Opening, write_provenance
 from stereo_sfm.log.track_stats import track_stats
 from stereo_sfm.log.writer import LogWriter
-from stereo_sfm.messages import Health, LogLine, SourceCounters, StageTimes
+from stereo_sfm.messages import LogLine, SourceCounters
 from stereo_sfm.types import (
     F32,
     F64,
     I32,
-    Applied,
-    Dropped,
     Frame,
     Keyframe,
     LoopResult,
@@ -113,24 +112,31 @@ class RunLog:
         self._counts: dict[str, float] = {}  # of a live source
 
     def put(self, message: object) -> None:
-        """Any message of a run, by its type."""
-        for kind, action in self._actions:
-            if isinstance(message, kind):
-                action(self, message)
-                return
-        raise TypeError(f"no topic for {type(message).__name__}")
+        """Any message of a run."""
+        self._write(message)
 
+    @singledispatchmethod
+    def _write(self, message: object) -> None:
+        """As its row of topics says; a method below writes a message that is more than a message of its topic."""
+        row = topics.OF.get(type(message))
+        if row is None:
+            raise TypeError(f"no topic for {type(message).__name__}")
+        self._writer.write(row.name, message, *row.key(message, self._now_ns))
+
+    @_write.register
     def image(self, image: StereoImage | LoggedImage) -> None:
         """What the tracker sees."""
         pair = image.image if isinstance(image, LoggedImage) else image
         self._now_ns = pair.stamp_ns
         self._images.image(image)
 
+    @_write.register
     def left_out(self, left: LeftOut) -> None:
         """What belongs to an image whose pixels are not kept."""
         self._now_ns = left.image.stamp_ns
         self._images.without_pixels(left.image)
 
+    @_write.register
     def frame(self, frame: Frame) -> None:
         """The tracker's answer."""
         self._totals["frames"] += 1
@@ -150,6 +156,7 @@ class RunLog:
         self._frames.append((frame, pose))
         self._release_frames()
 
+    @_write.register
     def keyframe(self, keyframe: Keyframe) -> None:
         """A frame that enters the map."""
         self._totals["keyframes"] += 1
@@ -159,6 +166,7 @@ class RunLog:
         self._release_answers()
         self._release_updates()
 
+    @_write.register
     def map_update(self, update: MapUpdate) -> None:
         """The mapper's answer."""
         self._answers[0].append(update)
@@ -171,6 +179,7 @@ class RunLog:
         self._release_updates()
         self._release_frames()
 
+    @_write.register
     def loop(self, result: LoopResult) -> None:
         """The loop closer's answer."""
         self._totals["loops accepted"] += result.candidate_kf_id >= 0
@@ -180,27 +189,13 @@ class RunLog:
         self._results[result.kf_id] = result
         self._release_updates()
 
-    def applied(self, applied: Applied) -> None:
-        """Which update came before which frame."""
-        self._writer.write(topics.APPLIED, applied, applied.stamp_ns, applied.before_frame_id)
-
-    def dropped(self, dropped: Dropped) -> None:
-        """A frame that is missing."""
-        self._writer.write(topics.DROPPED, dropped, dropped.stamp_ns, dropped.frame_id)
-
-    def health(self, health: Health) -> None:
-        """How a stage keeps up."""
-        self._writer.write(topics.HEALTH, health, self._now_ns, health.frame_id)
-
-    def stage_times(self, times: StageTimes) -> None:
-        """Wall-clock milliseconds of a frame."""
-        self._writer.write(topics.STAGE_TIMES, times, self._now_ns, times.frame_id)
-
+    @_write.register
     def counters(self, counters: SourceCounters) -> None:
         """What the camera counts about itself."""
         self._counts = counters.counts
         self._writer.write(topics.COUNTERS, counters, self._now_ns, counters.frame_id)
 
+    @_write.register
     def line(self, line: LogLine) -> None:
         """A line for people."""
         if not self._writer.closed:  # a full disk is told by the next message of a stage
@@ -304,21 +299,6 @@ class RunLog:
         """From xi in camera axes to the body's position and rotation in the axes of `odom`, as Odometry has it."""
         turn = np.kron(np.eye(2), odom_T_body[:3, :3]) @ self._body_adjoint
         return turn @ covariance @ turn.T
-
-    _actions: tuple[tuple[Any, Any], ...] = (
-        ((StereoImage, LoggedImage), image),
-        (LeftOut, left_out),
-        (Frame, frame),
-        (Keyframe, keyframe),
-        (MapUpdate, map_update),
-        (LoopResult, loop),
-        (Applied, applied),
-        (Dropped, dropped),
-        (Health, health),
-        (StageTimes, stage_times),
-        (SourceCounters, counters),
-        (LogLine, line),
-    )
 
 
 def _interval(shortest_ns: int, size: int, usual: int) -> int:

@@ -39,28 +39,6 @@ _SCALARS: dict[Any, int] = {
     bool: _F.TYPE_BOOL,
     str: _F.TYPE_STRING,
 }
-# Axes after the first of every array field whose rows are not numbers; a -1 in front is the number of rows.
-SHAPES: dict[str, tuple[int, ...]] = {
-    "gyro": (-1, 3),
-    "accel": (-1, 3),
-    "linear": (-1, 3),
-    "angular": (-1, 3),
-    "uv_left": (-1, 2),
-    "uv_right": (-1, 2),
-    "odom_T_cam": (4, 4),
-    "kf_T_cam": (4, 4),
-    "map_T_odom": (4, 4),
-    "candidate_T_kf": (4, 4),
-    "covariance": (6, 6),
-    "information": (6, 6),
-    "points_cam": (-1, 3),
-    "points_map": (-1, 3),
-    "descriptors": (-1, 32),
-    "map_T_kf": (-1, 4, 4),
-    "carrier_T_kf": (-1, 4, 4),
-    "fused_point_ids": (-1, 2),
-    "matches": (-1, 2),
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,6 +47,7 @@ class _Field:
     kind: str  # "array", "scalar", "enum", "message", "numbers" (dict), "rows" (tuple of tuples)
     proto: int  # type of the scalar or of the array's items
     dtype: str = ""
+    shape: tuple[int, ...] = (-1,)  # of the array: `stereo_sfm.types.shape` in the field's metadata
     convert: Any = None  # enum class, nested dataclass, or the types of a row's items
 
 
@@ -80,12 +59,13 @@ def _array_dtype(annotation: Any) -> str | None:
     return np.dtype(dtype).name
 
 
-def _describe(name: str, annotation: Any) -> _Field:
+def _describe(field: dataclasses.Field[Any], annotation: Any) -> _Field:
+    name = field.name
     if isinstance(annotation, types.UnionType):
         annotation = next(a for a in annotation.__args__ if a is not type(None))
     dtype = _array_dtype(annotation)
     if dtype is not None:
-        return _Field(name, "array", _ARRAYS[dtype], dtype)
+        return _Field(name, "array", _ARRAYS[dtype], dtype, field.metadata.get("shape", (-1,)))
     if annotation in _SCALARS:
         return _Field(name, "scalar", _SCALARS[annotation])
     origin = typing.get_origin(annotation)
@@ -104,7 +84,7 @@ def _describe(name: str, annotation: Any) -> _Field:
 def fields_of(cls: type[Any]) -> tuple[_Field, ...]:
     """What the fields of a dataclass are on the wire."""
     hints = typing.get_type_hints(cls)
-    return tuple(_describe(f.name, hints[f.name]) for f in dataclasses.fields(cls))
+    return tuple(_describe(f, hints[f.name]) for f in dataclasses.fields(cls))
 
 
 def _add(
@@ -197,7 +177,7 @@ def encode(obj: Any) -> bytes:
 
 def _read_array(data: bytes, f: _Field) -> np.ndarray[Any, Any]:
     flat = np.frombuffer(data, np.dtype(f.dtype).newbyteorder("<")).astype(f.dtype)
-    return flat.reshape(SHAPES.get(f.name, (-1,)))
+    return flat.reshape(f.shape)
 
 
 def _read(message: Any, cls: type[Any]) -> Any:

@@ -8,6 +8,13 @@ dataclasses of `stereo_sfm.types` (see `schema`). `log_time` is the sensor stamp
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
+
+from stereo_sfm.log.samples import ImageInfo, ImuSample, WheelSample
+from stereo_sfm.log.schema import full_name
+from stereo_sfm.log.track_stats import TrackStats
+from stereo_sfm.messages import Health, SourceCounters, StageTimes
+from stereo_sfm.types import Applied, Dropped, Frame, Keyframe, LoopResult, MapUpdate
 
 SCHEMA_VERSION = "1"
 
@@ -45,47 +52,67 @@ LOG = "/log"
 
 @dataclass(frozen=True)
 class Topic:
-    """One row: name, schema, when it is written, whether `diff` compares it."""
+    """One row.
+
+    Attributes:
+        name: of the topic.
+        message: the dataclass of ours that it holds, or the protobuf name of Foxglove's message; "|" separates what an
+            image topic may hold.
+        when: it is written.
+        compare: whether `diff` compares it.
+        sequence: the field of `message` that is the frame id.
+    """
 
     name: str
-    schema: str  # protobuf full name; "|" separates what an image topic may hold
+    message: type[Any] | str
     when: str
     compare: bool = True
+    sequence: str = "frame_id"
+
+    @property
+    def schema(self) -> str:
+        """The protobuf names that it may hold, separated by "|"."""
+        return self.message if isinstance(self.message, str) else full_name(self.message)
+
+    def key(self, message: object, now_ns: int) -> tuple[int, int]:
+        """Log time and sequence of a message of ours: its own stamp, `now_ns` where it has none."""
+        return getattr(message, "stamp_ns", now_ns), getattr(message, self.sequence)
 
 
 _IMAGE = "foxglove.RawImage|foxglove.CompressedImage"
 
 TABLE: tuple[Topic, ...] = (
-    Topic(IMAGE_INFO, "stereo_sfm.ImageInfo", "every image, before its pixels"),
+    Topic(IMAGE_INFO, ImageInfo, "every image, before its pixels"),
     Topic(LEFT_IMAGE, _IMAGE, "every image"),
     Topic(RIGHT_IMAGE, _IMAGE, "every image of a stereo source"),
     Topic(DEPTH_IMAGE, "foxglove.RawImage", "every image of an RGB-D source, metres"),
     Topic(LEFT_CALIBRATION, "foxglove.CameraCalibration", "at the start and every second"),
     Topic(RIGHT_CALIBRATION, "foxglove.CameraCalibration", "at the start and every second"),
-    Topic(IMU, "stereo_sfm.ImuSample", "every sample"),
-    Topic(WHEEL, "stereo_sfm.WheelSample", "every sample"),
+    Topic(IMU, ImuSample, "every sample"),
+    Topic(WHEEL, WheelSample, "every sample"),
     Topic(GROUND_TRUTH, "foxglove.PoseInFrame", "every pose of the source's ground truth, in its own frame"),
-    Topic(DROPPED, "stereo_sfm.Dropped", "when frames are lost"),
-    Topic(APPLIED, "stereo_sfm.Applied", "when a map update is applied"),
+    Topic(DROPPED, Dropped, "when frames are lost"),
+    Topic(APPLIED, Applied, "when a map update is applied", sequence="before_frame_id"),
     Topic(TF, "foxglove.FrameTransforms", "every frame: map to odom, odom to body"),
     Topic(TF_STATIC, "foxglove.FrameTransforms", "at the start and every second: level, map, truth; body, eyes"),
     Topic(ODOMETRY, "foxglove.Odometry", "every frame, with covariance"),
     Topic(ODOM_POSE, "foxglove.PoseInFrame", "every frame, body in odom"),
     Topic(MAP_POSE, "foxglove.PoseInFrame", "every frame, body in map"),
-    Topic(FRAME, "stereo_sfm.Frame", "every frame: the tracker's whole answer"),
-    Topic(STATS, "stereo_sfm.TrackStats", "every frame: flat numbers to plot"),
+    Topic(FRAME, Frame, "every frame: the tracker's whole answer"),
+    Topic(STATS, TrackStats, "every frame: flat numbers to plot"),
     Topic(FEATURES, "foxglove.ImageAnnotations", "every frame of a log with images: tracked points in the left one"),
-    Topic(KEYFRAME, "stereo_sfm.Keyframe", "every keyframe"),
-    Topic(MAP_UPDATE, "stereo_sfm.MapUpdate", "every keyframe: the mapper's answer"),
-    Topic(LOOP, "stereo_sfm.LoopResult", "every keyframe: the loop closer's answer, with reasons"),
+    Topic(KEYFRAME, Keyframe, "every keyframe"),
+    Topic(MAP_UPDATE, MapUpdate, "every keyframe: the mapper's answer"),
+    Topic(LOOP, LoopResult, "every keyframe: the loop closer's answer, with reasons"),
     Topic(POINTS, "foxglove.PointCloud", "the whole map, at most every few seconds and at the end"),
     Topic(TRAJECTORY, "foxglove.PosesInFrame", "all keyframes, at most every second and at the end"),
     Topic(PATH, "foxglove.PointCloud", "the trajectory's positions, for players that draw no poses (rerun)"),
     Topic(SCENE, "foxglove.SceneUpdate", "loop and covisibility edges, with the trajectory"),
-    Topic(HEALTH, "stereo_sfm.Health", "every second and stage: rate, queue, latency (wall clock)", compare=False),
-    Topic(STAGE_TIMES, "stereo_sfm.StageTimes", "every frame: milliseconds in each stage (wall clock)", compare=False),
-    Topic(COUNTERS, "stereo_sfm.SourceCounters", "every few seconds: what a live camera counts", compare=False),
+    Topic(HEALTH, Health, "every second and stage: rate, queue, latency (wall clock)", compare=False),
+    Topic(STAGE_TIMES, StageTimes, "every frame: milliseconds in each stage (wall clock)", compare=False),
+    Topic(COUNTERS, SourceCounters, "every few seconds: what a live camera counts", compare=False),
     Topic(LOG, "foxglove.Log", "text for people", compare=False),
 )
 
 BY_NAME: dict[str, Topic] = {topic.name: topic for topic in TABLE}
+OF: dict[type[Any], Topic] = {topic.message: topic for topic in TABLE if isinstance(topic.message, type)}

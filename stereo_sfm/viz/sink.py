@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Mapping
+from functools import singledispatchmethod
 from pathlib import Path
 
 import cv2
@@ -94,31 +95,38 @@ class RerunSink:
             self._rec.log("map/ground_truth", line, static=True)
 
     def put(self, message: object) -> None:
-        """Any message of a run; kinds that are not shown are passed over."""
-        if isinstance(message, StereoImage):
-            self._images[message.frame_id] = message
-            if len(self._images) > KEPT:
-                self._show_alone(self._images.pop(min(self._images)))
-        elif isinstance(message, Frame):
-            self._put_frame(message)
-        elif isinstance(message, Keyframe):
-            self._put_keyframe(message)
-        elif isinstance(message, MapUpdate):
-            self._scene.update(message)
-        elif isinstance(message, LoopResult):
-            self._scene.loop(message)
-        elif isinstance(message, StageTimes):
-            for stage, ms in sorted(message.ms.items()):
-                self._rec.log(f"ms/{stage}", rr.Scalars(ms))
-        elif isinstance(message, Health):
-            self._rec.log(f"rate/{message.stage}", rr.Scalars(message.rate))
-        elif isinstance(message, LogLine):
-            self._text(message)
-        elif isinstance(message, Dropped):
-            self._put_dropped(message)
+        """Any message of a run."""
+        self._show(message)
         event = self._events.of(message)
         if event is not None:
             self._text(event)
+
+    @singledispatchmethod
+    def _show(self, message: object) -> None:
+        """Kinds without a method below are not shown."""
+
+    @_show.register
+    def _put_image(self, image: StereoImage) -> None:
+        self._images[image.frame_id] = image
+        if len(self._images) > KEPT:
+            self._show_alone(self._images.pop(min(self._images)))
+
+    @_show.register
+    def _put_update(self, update: MapUpdate) -> None:
+        self._scene.update(update)
+
+    @_show.register
+    def _put_loop(self, result: LoopResult) -> None:
+        self._scene.loop(result)
+
+    @_show.register
+    def _put_times(self, times: StageTimes) -> None:
+        for stage, ms in sorted(times.ms.items()):
+            self._rec.log(f"ms/{stage}", rr.Scalars(ms))
+
+    @_show.register
+    def _put_health(self, health: Health) -> None:
+        self._rec.log(f"rate/{health.stage}", rr.Scalars(health.rate))
 
     def close(self) -> None:
         """Everything is sent."""
@@ -132,6 +140,7 @@ class RerunSink:
         if self._mode == "save":
             self._rec.disconnect()  # writes the end of the file
 
+    @_show.register
     def _text(self, line: LogLine) -> None:
         self._rec.log("log", rr.TextLog(f"{line.stage}: {line.text}", level=line.level.replace("WARNING", "WARN")))
 
@@ -152,6 +161,7 @@ class RerunSink:
         if image.right is not None:
             self._rec.log("right/image", _jpeg(image.right))
 
+    @_show.register
     def _put_frame(self, frame: Frame) -> None:
         self._at(frame.frame_id, frame.stamp_ns)
         self._last_frame = frame.frame_id
@@ -210,12 +220,14 @@ class RerunSink:
 
     # -- the others --------------------------------------------------------------------------------------------------
 
+    @_show.register
     def _put_keyframe(self, keyframe: Keyframe) -> None:
         self._scene.keyframe(keyframe)
         image = self._images.pop(keyframe.frame_id, None)
         if image is not None:
             self._keyframe = (keyframe, image.left)
 
+    @_show.register
     def _put_dropped(self, dropped: Dropped) -> None:
         self._dropped += dropped.count
         self._rec.log("points/dropped", rr.Scalars(float(self._dropped)))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,12 +13,17 @@ from hypothesis import strategies as st
 from mcap.records import Schema
 from mcap_protobuf.decoder import DecoderFactory
 
+from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.log import schema
-from stereo_sfm.log.image_log import ImageInfo, ImuSample
+from stereo_sfm.log import recorded, schema, topics
+from stereo_sfm.log.reader import LogReader
+from stereo_sfm.log.run_log import RunLog
+from stereo_sfm.log.samples import ImageInfo, ImuSample
 from stereo_sfm.log.track_stats import TrackStats
-from stereo_sfm.messages import Health
+from stereo_sfm.log.writer import LogWriter
+from stereo_sfm.messages import Health, SourceCounters, StageTimes
 from stereo_sfm.types import (
+    F64,
     Applied,
     Corners,
     Dropped,
@@ -26,7 +33,9 @@ from stereo_sfm.types import (
     MapUpdate,
     Observations,
     TrackState,
+    shape,
 )
+from tests.log.recordings import fisheye_rig
 
 
 def _observations(n: int, rng: np.random.Generator) -> Observations:
@@ -81,13 +90,13 @@ def test_every_message_of_a_run_comes_back_with_every_bit(n: int, seed: int) -> 
         _assert_equal(message, decode(schema.encode(message)))
 
 
-def test_arrays_of_rows_have_their_shape_in_the_table() -> None:
-    """A field of a new shape in `types` must be added to SHAPES, or it would come back flat."""
+def test_arrays_of_rows_say_their_shape() -> None:
+    """A field of rows must say their shape in its metadata, or it would come back flat."""
     for message in _messages(3, 0):
         for f in schema.fields_of(type(message)):
             value = getattr(message, f.name)
             if isinstance(value, np.ndarray) and value.ndim > 1:
-                assert np.zeros(value.shape).reshape(schema.SHAPES[f.name]).shape == value.shape, f.name
+                assert np.zeros(value.shape).reshape(f.shape).shape == value.shape, f.name
 
 
 def test_other_readers_of_the_schema_see_the_same_numbers() -> None:
@@ -137,3 +146,49 @@ def test_a_log_without_a_needed_field_is_named() -> None:
 
     with pytest.raises(StereoSfmError, match="before_frame_id"):
         schema.decoder(Today, old)(data)
+
+
+def test_a_message_of_a_run_is_one_row_of_the_table() -> None:
+    """Writer and reader take the classes from the table; every message that flows has a row."""
+    assert set(topics.OF) >= {type(m) for m in _messages(3, 0)} | {Health, StageTimes, SourceCounters}
+    assert {row.schema: cls for cls, row in topics.OF.items()} == recorded.TYPES
+    for cls, row in topics.OF.items():
+        assert row.schema == f"stereo_sfm.{cls.__name__}" and topics.BY_NAME[row.name] is row
+    applied = Applied(3, before_frame_id=7, stamp_ns=11)
+    assert topics.OF[Applied].key(applied, 99) == (11, 7)
+    assert topics.OF[StageTimes].key(StageTimes(5, {}), 99) == (99, 5)
+
+
+@dataclass(frozen=True)
+class Probe:
+    """A message that nobody knows."""
+
+    frame_id: int
+    stamp_ns: int
+    points: F64 = field(metadata=shape(-1, 3))
+
+
+def test_a_new_message_is_one_dataclass_and_one_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    row = topics.Topic("/probe", Probe, "when asked")
+    monkeypatch.setitem(topics.OF, Probe, row)
+    monkeypatch.setitem(topics.BY_NAME, row.name, row)
+    monkeypatch.setitem(recorded.TYPES, row.schema, Probe)
+    probe = Probe(4, 1_000_000_000, np.arange(6.0).reshape(2, 3))
+    log = RunLog(
+        LogWriter(tmp_path / "a.mcap"), fisheye_rig(), Config(), source="x", mode="inline", image_format="none"
+    )
+    log.put(probe)
+    log.close()
+    with LogReader(tmp_path / "a.mcap") as reader:
+        ((record, back),) = recorded.messages(reader, ["/probe"])
+    assert (record.log_time, record.sequence) == (probe.stamp_ns, 4)
+    np.testing.assert_array_equal(back.points, probe.points)
+
+
+def test_a_message_without_a_row_is_refused(tmp_path: Path) -> None:
+    log = RunLog(
+        LogWriter(tmp_path / "a.mcap"), fisheye_rig(), Config(), source="x", mode="inline", image_format="none"
+    )
+    with pytest.raises(TypeError, match="no topic for object"):
+        log.put(object())
+    log.close()

@@ -1,0 +1,47 @@
+"""What a log holds of an image besides its pixels, one message each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class ImageInfo:
+    """What belongs to an image besides its pixels; tells the reader which messages make the frame whole."""
+
+    frame_id: int
+    stamp_ns: int
+    right_stamp_ns: int
+    exposure_us: float
+    gain: float
+    dropped_before: int
+    has_right: bool
+    has_depth: bool
+    imu_count: int  # -1: the source has no inertial unit
+    wheel_count: int  # -1: no wheel odometry
+
+
+@dataclass(frozen=True)
+class ImuSample:
+    """One inertial sample in the unit's own axes, NaN for what was not sampled."""
+
+    stamp_ns: int
+    gyro_x: float  # rad/s
+    gyro_y: float
+    gyro_z: float
+    accel_x: float  # m/s^2
+    accel_y: float
+    accel_z: float
+
+
+@dataclass(frozen=True)
+class WheelSample:
+    """One wheel odometry sample, body axes."""
+
+    stamp_ns: int
+    linear_x: float  # m/s
+    linear_y: float
+    linear_z: float
+    angular_x: float  # rad/s
+    angular_y: float
+    angular_z: float
