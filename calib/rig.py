@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from calib.imu import Imu
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.types import F64
@@ -31,6 +32,7 @@ class Rig:
     depth: bool = False  # RGB-D: the right eye is virtual, u_right = u_left - fx * baseline / depth
     name: str = ""
     serial: str = ""
+    imu: Imu | None = None  # what its inertial samples mean; None: they are not used
     readout_s: float = 0.0  # rolling shutter: seconds from the first row's exposure to the last's; 0: all at once
 
     def __post_init__(self) -> None:

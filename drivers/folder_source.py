@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from calib.rig import Rig
 from drivers.source import BaseSource, Stamps
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.pixels import decode, decode_gray, eight_bits, sensor_bits
-from stereo_sfm.types import F32, I64, U8, U16, StereoImage, Trajectory
+from stereo_sfm.types import F32, U8, U16, ImuSamples, StereoImage, Trajectory
 
 log = logging.getLogger("stereo_sfm")
 
@@ -86,13 +86,13 @@ class FolderSource(BaseSource):
         shots: Sequence[Shot],
         ground_truth: Trajectory | None = None,
         depth_scale: float = 5000.0,
-        beside: Mapping[str, I64] | None = None,
+        imu: ImuSamples | None = None,
     ) -> None:
         """Args:
         name: for people. rig: calibration of the images. shots: in any order.
         ground_truth: world_T_cam0.
         depth_scale: stored units of a depth image a metre.
-        beside: stamps in ns of what else was recorded and is not part of the frames, by name.
+        imu: all inertial samples, ascending: each goes with the frame that ends its interval.
         """
         if not shots:
             raise StereoSfmError(f"{name}: no images")
@@ -101,13 +101,13 @@ class FolderSource(BaseSource):
         self.ground_truth = ground_truth
         self.shots = sorted(shots, key=lambda shot: shot.stamp_ns)
         self.depth_scale = depth_scale
-        self._beside = dict(beside or {})
+        self._imu = imu
         self.frame_count = len(self.shots)
         self.bits = self._sensor_bits()
         self._check_first()
 
     def __iter__(self) -> Iterator[StereoImage]:
-        dropped, read, unreadable = 0, 0, 0
+        dropped, read, unreadable, sampled = 0, 0, 0, 0
         for frame_id, shot in enumerate(self.shots):
             try:
                 image = self._read(frame_id, shot, dropped)
@@ -119,6 +119,9 @@ class FolderSource(BaseSource):
                 continue
             dropped = 0
             read += 1
+            if self._imu is not None:
+                until = int(np.searchsorted(self._imu.stamp_ns, shot.stamp_ns, side="right"))
+                image, sampled = replace(image, imu=self._imu.part(slice(sampled, until))), until
             yield image
         if unreadable > SHOWN_WARNINGS:
             log.warning("%s: %d frames could not be read", self.name, unreadable)
@@ -153,7 +156,8 @@ class FolderSource(BaseSource):
     def stamps(self) -> Stamps:
         skews = [abs(s.right_stamp_ns - s.stamp_ns) for s in self.shots if s.right_stamp_ns]
         skew_ms = max(skews) / 1e6 if skews else float("nan")
-        return Stamps(np.array([s.stamp_ns for s in self.shots], np.int64), skew_ms, self._beside)
+        beside = {} if self._imu is None else {"imu0": self._imu.stamp_ns}
+        return Stamps(np.array([s.stamp_ns for s in self.shots], np.int64), skew_ms, beside)
 
     def _sensor_bits(self) -> int:
         """Of sixteen-bit images: decided once, so that brightness does not jump between frames."""

@@ -33,6 +33,7 @@ def chosen_rig(option: RigOption, own: Callable[[], Rig]) -> Rig:
     return replace(
         given,
         body_T_left=known.body_T_left if bodiless else given.body_T_left,
+        imu=given.imu or (known.imu if bodiless else None),
         readout_s=given.readout_s if stated else known.readout_s,
     )
 

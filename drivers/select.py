@@ -8,7 +8,7 @@ from dataclasses import replace
 from drivers.source import Source
 from drivers.wrapped import WrappedSource
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.types import StereoImage
+from stereo_sfm.types import ImuSamples, StereoImage
 
 LONGEST_S = 1e9  # seconds that any source can last
 
@@ -52,10 +52,13 @@ class SelectedFrames(WrappedSource):
 
     def __iter__(self) -> Iterator[StereoImage]:
         passed, seen, dropped, since = 0, 0, 0, 0
+        imu: list[ImuSamples] = []  # since the last frame that was passed on
         first_ns: int | None = None
         for image in self.source:
             first_ns = image.stamp_ns if first_ns is None else first_ns
             since = image.stamp_ns - first_ns
+            if image.imu is not None:
+                imu.append(image.imu)
             if self.end_ns is not None and since >= self.end_ns:
                 break
             if since < self.start_ns:
@@ -64,8 +67,10 @@ class SelectedFrames(WrappedSource):
             seen += 1
             if (seen - 1) % self.frame_skip:
                 continue
+            if len(imu) > 1:
+                image = replace(image, imu=ImuSamples.joined(imu))
             yield image if dropped == image.dropped_before else replace(image, dropped_before=dropped)
-            dropped = 0
+            dropped, imu = 0, []
             passed += 1
             if passed == self.max_frames:
                 return

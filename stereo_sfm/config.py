@@ -62,6 +62,9 @@ class TrackerConfig:
     )
     keyframe_share: float = number(0.75, 0, 1, "New keyframe when a smaller share of the last one's points is left")
     keyframe_max_frames: int = number(30, 1, 100_000, "Frames that a keyframe represents at most")
+    inertial: bool = switch(
+        True, "Use the IMU, where the source has one: prediction, and poses where images show nothing"
+    )
     lost_frames: int = number(
         15, 0, 100_000, "Frames without a pose after which a new submap begins, whichever the tracker"
     )

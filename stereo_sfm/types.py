@@ -8,6 +8,7 @@ z forward). Pixel (0, 0) is the centre of the top-left pixel.
 from __future__ import annotations
 
 import enum
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -59,6 +60,7 @@ class TrackState(enum.IntEnum):
     RECOVERED = 2  # first good pose after LOST frames, in the same odometry frame
     LOST = 3  # pose predicted only; `Frame.reason` says why
     RESTARTED = 4  # tracking began again as a new submap at the predicted pose
+    INERTIAL = 5  # the images show nothing: pose from the IMU since the last good one, with its covariance
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +70,19 @@ class ImuSamples(Message):
     stamp_ns: I64  # (N,)
     gyro: F64 = field(metadata=shape(-1, 3))  # (N, 3) rad/s, NaN rows where only the accelerometer was sampled
     accel: F64 = field(metadata=shape(-1, 3))  # (N, 3) m/s^2, NaN rows where only the gyroscope was sampled
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+    def part(self, rows: slice) -> ImuSamples:
+        """Some successive samples."""
+        return ImuSamples(self.stamp_ns[rows], self.gyro[rows], self.accel[rows])
+
+    @staticmethod
+    def joined(parts: Sequence[ImuSamples]) -> ImuSamples:
+        """One after the other."""
+        stamps, gyro, accel = zip(*((p.stamp_ns, p.gyro, p.accel) for p in parts), strict=True)
+        return ImuSamples(np.concatenate(stamps), np.concatenate(gyro), np.concatenate(accel))
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.formats.common import brown, numbers, padded, read_yaml, reading, rigid, unsupported, write_yaml
+from calib.formats.imu_files import read_imu
 from calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
@@ -21,7 +22,9 @@ def read_euroc(folder: Path | str) -> Rig:
     if not (root / "cam1" / "sensor.yaml").is_file():
         return Rig(left, body_T_left=body_T_left, name=folder.name)
     right, body_T_right = _sensor(root / "cam1" / "sensor.yaml")
-    return Rig(left, right, se3.inverse(body_T_left) @ body_T_right, body_T_left, name=folder.name)
+    left_T_body, file = se3.inverse(body_T_left), root / "imu0" / "sensor.yaml"
+    imu = read_imu(file, left_T_body) if file.is_file() else None
+    return Rig(left, right, left_T_body @ body_T_right, body_T_left, imu=imu, name=folder.name)
 
 
 def write_euroc(rig: Rig, folder: Path) -> None:

@@ -8,10 +8,13 @@ from typing import Any
 import numpy as np
 
 from calib.formats.common import brown, numbers, padded, read_yaml, reading, rigid, rows, unsupported, write_yaml
+from calib.formats.imu_files import read_imu
 from calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, KannalaBrandt
+
+IMU_FILES = ("imu.yaml", "imu_config.yaml", "imu0.yaml")  # beside the camchain
 
 
 def read_kalibr(path: Path | str, eyes: tuple[int, int] = (0, 1)) -> Rig:
@@ -31,7 +34,11 @@ def read_kalibr(path: Path | str, eyes: tuple[int, int] = (0, 1)) -> Rig:
             left_T_right = se3.inverse(body_T_left) @ se3.inverse(rigid(second["T_cam_imu"]))
         else:
             raise KeyError("T_cn_cnm1")
-        return Rig(left, _camera(second), left_T_right, body_T_left, name=path.stem)
+        file = next((f for f in (path.with_name(name) for name in IMU_FILES) if f.is_file()), None)
+        imu = None
+        if file is not None and "T_cam_imu" in first:
+            imu = read_imu(file, se3.inverse(body_T_left), float(first.get("timeshift_cam_imu", 0.0)))
+        return Rig(left, _camera(second), left_T_right, body_T_left, imu=imu, name=path.stem)
 
 
 def write_kalibr(rig: Rig, path: Path) -> None:

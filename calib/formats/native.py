@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.formats.common import numbers, read_text, reading, rigid, rows, yaml_mapping, yaml_text
+from calib.formats.imu_files import imu_from_plain, imu_to_plain
 from calib.rig import Rig
 from stereo_sfm.geometry.cameras import MODELS, Camera
 
@@ -33,6 +34,7 @@ def rig_from_text(text: str, where: Path | str) -> Rig:
             depth=bool(data.get("depth", False)),
             name=str(data.get("name", "")),
             serial=str(data.get("serial", "")),
+            imu=imu_from_plain(data["imu"]) if data.get("imu") else None,
             readout_s=float(data.get("readout_s") or 0.0),
         )
 
@@ -55,6 +57,7 @@ def rig_to_text(rig: Rig) -> str:
             "right": _plain(rig.right) if rig.right else None,
             "left_T_right": rows(rig.left_T_right),
             "body_T_left": rows(rig.body_T_left),
+            **({"imu": imu_to_plain(rig.imu)} if rig.imu else {}),
         },
     )
 

@@ -11,18 +11,17 @@ import csv
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from calib.formats.euroc import read_euroc as read_rig
 from calib.formats.kalibr import read_kalibr
 from calib.rig import Rig
 from drivers.folder_source import FolderSource, Shot, folder_of, need
 from drivers.ground_truth import moved, read_euroc
 from drivers.image_lists import Listing, pair_listings
+from drivers.imu_table import read_imu_samples
 from drivers.options import SourceOptions
 from drivers.rig_option import chosen_rig
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.types import I64, Trajectory
+from stereo_sfm.types import ImuSamples, Trajectory
 
 TRUTH_FOLDERS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
 
@@ -61,7 +60,7 @@ def _open(name: str, mav: Path, rig: Rig) -> FolderSource:
         right = _read_listing(need(mav / "cam1", "second camera"))
         pairs = pair_listings(name, left, right)
         shots = [replace(shots[i], right=right[j][1], right_stamp_ns=right[j][0]) for i, j in pairs]
-    return FolderSource(name, rig, shots, _ground_truth(mav, rig), beside=_inertial(mav))
+    return FolderSource(name, rig, shots, _ground_truth(mav, rig), imu=_inertial(mav))
 
 
 def _read_listing(camera: Path) -> Listing:
@@ -79,14 +78,10 @@ def _read_listing(camera: Path) -> Listing:
     return images
 
 
-def _inertial(mav: Path) -> dict[str, I64]:
-    """Stamps of the inertial samples, which the frames do not carry."""
+def _inertial(mav: Path) -> ImuSamples | None:
+    """`imu0/data.csv`: stamp_ns, angular velocity (rad/s), specific force (m/s^2)."""
     path = mav / "imu0" / "data.csv"
-    if not path.is_file():
-        return {}
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        stamps = [row[0].strip() for row in csv.reader(file) if row]
-    return {"imu0": np.array([int(s) for s in stamps if s.isdecimal() and int(s) < 1 << 63], np.int64)}
+    return read_imu_samples(path) if path.is_file() else None
 
 
 def _read_exposures(path: Path) -> dict[str, float]:

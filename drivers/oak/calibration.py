@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from calib.imu import Imu
 from calib.rig import Rig
 from drivers.live.errors import DeviceFault
 from stereo_sfm.geometry import se3
@@ -17,15 +17,7 @@ from stereo_sfm.types import F64
 _MAX_TILT_DEG = 5.0
 
 
-@dataclass(frozen=True, eq=False)
-class OakCalibration:
-    """Eyes, and where the IMU sits if the board knows it."""
-
-    rig: Rig
-    left_T_imu: F64 | None  # (4, 4)
-
-
-def read_calibration(dai: Any, handler: Any, size: tuple[int, int], name: str, serial: str) -> OakCalibration:
+def read_calibration(dai: Any, handler: Any, size: tuple[int, int], name: str, serial: str) -> Rig:
     """Calibration at an image size.
 
     Args:
@@ -43,8 +35,9 @@ def read_calibration(dai: Any, handler: Any, size: tuple[int, int], name: str, s
     except RuntimeError as error:
         raise DeviceFault(f"OAK {serial} is not calibrated ({str(error).splitlines()[0]})") from None
     _check(left_T_right, serial)
-    rig = Rig(eyes[0], eyes[1], left_T_right, name=name, serial=serial)
-    return OakCalibration(rig, _imu(dai, handler, left))
+    left_T_imu = _imu(dai, handler, left)
+    imu = None if left_T_imu is None else Imu(left_T_imu)
+    return Rig(eyes[0], eyes[1], left_T_right, imu=imu, name=name, serial=serial)
 
 
 def _eye(dai: Any, handler: Any, socket: Any, size: tuple[int, int]) -> Camera:

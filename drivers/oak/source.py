@@ -58,14 +58,13 @@ class OakSource(LiveSource):
             self._open()
             handler = self._device.getCalibration()
             product = str(self._device.getProductName() or self._device.getDeviceName())
-            found = read_calibration(self._dai, handler, settings.size, product, self._wanted)
+            self.rig = read_calibration(self._dai, handler, settings.size, product, self._wanted)
         except RuntimeError as error:
             self.close()
             raise device_error(error) from None
         except BaseException:
             self.close()
             raise
-        self.rig, self.left_T_imu = found.rig, found.left_T_imu
 
     def _open(self) -> None:
         self._device = self._dai.Device(choose(find(self._dai), self._wanted).info)

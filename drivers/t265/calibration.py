@@ -6,10 +6,9 @@ x right, y down, z forward.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from calib.imu import Imu
 from calib.rig import Rig
 from drivers.live.errors import DeviceFault
 from drivers.t265 import messages as m
@@ -20,15 +19,7 @@ from stereo_sfm.types import F64
 
 _BASELINE_M = (0.060, 0.068)
 _MAX_TILT_DEG = 2.0
-
-
-@dataclass(frozen=True, eq=False)
-class ImuCalibration:
-    """Where the IMU sits and how it errs. Samples of the driver are raw: corrected = scale @ raw + bias."""
-
-    left_T_imu: F64  # (4, 4)
-    gyro: MotionIntrinsics
-    accel: MotionIntrinsics
+LEAST_DENSITY = 1e-6  # a camera that knows no variance states 0
 
 
 def eye(intrinsics: CameraIntrinsics) -> KannalaBrandt:
@@ -65,9 +56,23 @@ def rig(
     return Rig(eye(left), eye(right), left_T_right, _rigid(body_T_left), name=name, serial=serial)
 
 
-def imu(body_T_left: F64, body_T_gyro: F64, gyro: MotionIntrinsics, accel: MotionIntrinsics) -> ImuCalibration:
-    """IMU calibration relative to the left eye."""
-    return ImuCalibration(se3.inverse(_rigid(body_T_left)) @ _rigid(body_T_gyro), gyro, accel)
+def imu(body_T_left: F64, body_T_gyro: F64, gyro: MotionIntrinsics, accel: MotionIntrinsics) -> Imu:
+    """The IMU relative to the left camera; the camera itself says corrected = scale @ raw + bias."""
+    return Imu(
+        left_T_imu=se3.inverse(_rigid(body_T_left)) @ _rigid(body_T_gyro),
+        gyro_matrix=gyro.scale,
+        gyro_bias=-gyro.bias,
+        accel_matrix=accel.scale,
+        accel_bias=-accel.bias,
+        gyro_noise=_density(gyro.noise_variance, m.GYRO_HZ),
+        accel_noise=_density(accel.noise_variance, m.ACCEL_HZ),
+        rate_hz=m.GYRO_HZ,
+    )
+
+
+def _density(variance: F64, rate_hz: float) -> float:
+    """Noise density from the variance (3,) of one sample."""
+    return max(float(np.sqrt(variance.mean() / rate_hz)), LEAST_DENSITY)
 
 
 def _rigid(body_T_sensor: F64) -> F64:

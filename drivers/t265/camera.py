@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import array
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from calib.rig import Rig
 from drivers.live.counters import Counters
@@ -72,7 +72,7 @@ class T265:
             time.sleep(self._timing.busy_wait_s)
         raise Busy(f"{self.link.what} stays busy: close the program that uses it, or replug it")
 
-    def calibration(self) -> tuple[Rig, calibration.ImuCalibration]:
+    def calibration(self) -> Rig:
         """Factory calibration of the eyes and the IMU. Only while stopped.
 
         Raises:
@@ -93,7 +93,7 @@ class T265:
             for s in (Sensor.LEFT, Sensor.RIGHT, Sensor.GYRO)
         )
         rig = calibration.rig(left, right, body_T_left, body_T_right, self.info.product, self.info.serial)
-        return rig, calibration.imu(body_T_left, body_T_gyro, gyro, accel)
+        return replace(rig, imu=calibration.imu(body_T_left, body_T_gyro, gyro, accel))
 
     def configure(self, settings: Settings) -> None:
         """Exposure, streams, and the camera's own tracking off. Only while stopped."""

@@ -20,6 +20,7 @@ VIDEO_BUFFER = 663 * 1024  # next multiple of a SuperSpeed packet: a frame ends 
 EVENT_BUFFER = 1024
 COMMAND_BUFFER = 1024
 PERIOD_NS = 1_000_000_000 // FRAME_RATE
+GYRO_HZ, ACCEL_HZ = 200.0, 62.5
 MIN_EXPOSURE_US, MAX_EXPOSURE_US = 200, 16_000  # librealsense's limits; below 200 the camera refuses
 MIN_GAIN, MAX_GAIN = 1.0, 10.0
 

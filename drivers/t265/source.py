@@ -43,7 +43,7 @@ class T265Source(LiveSource):
         self._access, self._settings, self._queue_frames = access, settings, queue_frames
         self._camera: T265 | None = acquire(access, self._counters)
         try:
-            self.rig, self.imu_calibration = self._camera.calibration()
+            self.rig = self._camera.calibration()
         except DeviceError:
             self.close()
             raise

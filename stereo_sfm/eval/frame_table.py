@@ -9,7 +9,7 @@ import numpy as np
 from stereo_sfm.mapping.columns import Columns, Spec
 from stereo_sfm.types import F32, F64, I32, I64, Bool, Frame, TrackState
 
-TRACKED = (TrackState.OK, TrackState.RECOVERED, TrackState.RESTARTED)
+TRACKED = (TrackState.OK, TrackState.RECOVERED, TrackState.RESTARTED, TrackState.INERTIAL)
 
 
 class FrameTable(Columns):

@@ -18,6 +18,7 @@ from stereo_sfm.export.trajectories import fill_missing
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.keyframe_poses import KeyframePoses
 from stereo_sfm.messages import Health, LogEnded, SourceCounters, StageTimes
+from stereo_sfm.tracking.inertial.smoothing import smooth_bridges
 from stereo_sfm.types import (
     F64,
     I64,
@@ -27,6 +28,7 @@ from stereo_sfm.types import (
     Keyframe,
     LoopResult,
     MapUpdate,
+    TrackState,
     Trajectory,
 )
 
@@ -181,21 +183,33 @@ class RunRecord:
         if not len(self.map_T_kf):
             return None
         known, following = self.map_T_kf.all(), self._following() if self.followed else dict[int, int]()
+        odom_T_cam, kf_T_cam = self._smoothed()
         rows = np.flatnonzero(self.placed())
         reference = self.frames.reference_kf_id[rows].tolist()
         stamps = self.frames.stamp_ns[rows]
-        poses = np.array([known[kf_id] for kf_id in reference]).reshape(-1, 4, 4) @ self.frames.kf_T_cam[rows]
+        poses = np.array([known[kf_id] for kf_id in reference]).reshape(-1, 4, 4) @ kf_T_cam[rows]
         between = [k for k, kf_id in enumerate(reference) if kf_id in following]
         if between:
             begin = [self.keyframes[reference[k]].stamp_ns for k in between]
             ends = [following[reference[k]] for k in between]
             end = np.array([self.keyframes[kf_id].stamp_ns for kf_id in ends])
             odom_T_end = np.array([self.keyframes[kf_id].odom_T_cam for kf_id in ends])
-            end_T_cam = se3.inverse(odom_T_end) @ self.frames.odom_T_cam[rows[between]]
+            end_T_cam = se3.inverse(odom_T_end) @ odom_T_cam[rows[between]]
             share = np.clip((stamps[between] - begin) / (end - begin), 0.0, 1.0)
             there = np.array([known[kf_id] for kf_id in ends]) @ end_T_cam
             poses[between] = se3.interpolate(poses[between], there, share)
         return Trajectory(stamps, poses)
+
+    def _smoothed(self) -> tuple[F64, F64]:
+        """(frames, 4, 4) odom_T_cam and kf_T_cam, with what the IMU alone gave brought to the good poses around it."""
+        odom_T_cam, kf_T_cam = self.frames.odom_T_cam, self.frames.kf_T_cam
+        inertial = self.frames.state == TrackState.INERTIAL
+        if not inertial.any():
+            return odom_T_cam, kf_T_cam
+        rows = np.flatnonzero(self.tracked())
+        odom_T_cam = odom_T_cam.copy()
+        odom_T_cam[rows] = smooth_bridges(self.frames.stamp_ns[rows], odom_T_cam[rows], inertial[rows])
+        return odom_T_cam, kf_T_cam @ se3.inverse(self.frames.odom_T_cam) @ odom_T_cam
 
     def _following(self) -> dict[int, int]:
         """The next keyframe of the same piece of odometry, by id, of those that the map knows."""

@@ -17,6 +17,7 @@ JUMP = (0.01, np.radians(0.1))  # metres, radians that the map moves against the
 STATES = {
     TrackState.INITIALIZING: "no pose yet",
     TrackState.LOST: "lost",
+    TrackState.INERTIAL: "going on by the IMU",
     TrackState.RECOVERED: "found again",
     TrackState.RESTARTED: "begins anew in another piece of the map",
 }

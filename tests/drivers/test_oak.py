@@ -107,8 +107,7 @@ def test_errors_of_depthai(text: str, kind: type[DeviceError]) -> None:
 
 
 def test_factory_calibration_in_metres_and_our_directions() -> None:
-    found = read_calibration(dai, calibration(), (1280, 800), "OAK-D", "1")
-    rig = found.rig
+    rig = read_calibration(dai, calibration(), (1280, 800), "OAK-D", "1")
     assert isinstance(rig.left, RadTan) and rig.right is not None
     np.testing.assert_allclose(rig.left.params[:4], [796.2, 796.5, 645.1, 398.7], rtol=1e-6)
     np.testing.assert_allclose(
@@ -125,26 +124,26 @@ def test_factory_calibration_in_metres_and_our_directions() -> None:
     np.testing.assert_allclose(
         rig.left_T_right[:3, 3], -right_T_left.T @ np.array([t["x"], t["y"], t["z"]]) / 100, atol=1e-6
     )
-    assert found.left_T_imu is not None
-    assert np.linalg.norm(found.left_T_imu[:3, 3]) == pytest.approx(0.0863, abs=1e-3)
+    assert rig.imu is not None
+    assert np.linalg.norm(rig.imu.left_T_imu[:3, 3]) == pytest.approx(0.0863, abs=1e-3)
 
 
 def test_calibration_of_another_image_size() -> None:
     """Half the size: the centre of pixel (0, 0) moves by a quarter of a pixel. Another shape: cut off evenly."""
-    half = read_calibration(dai, calibration(), (640, 400), "OAK-D", "1").rig.left
+    half = read_calibration(dai, calibration(), (640, 400), "OAK-D", "1").left
     assert (half.fx, half.cx, half.cy) == pytest.approx((398.1, (645.1 + 0.5) / 2 - 0.5, (398.7 + 0.5) / 2 - 0.5))
-    cut = read_calibration(dai, calibration(), (1280, 720), "OAK-D", "1").rig.left
+    cut = read_calibration(dai, calibration(), (1280, 720), "OAK-D", "1").left
     assert (cut.fx, cut.cx, cut.cy) == pytest.approx((796.2, 645.1, 358.7))
-    tall = read_calibration(dai, calibration(), (640, 480), "OAK-D", "1").rig.left
+    tall = read_calibration(dai, calibration(), (640, 480), "OAK-D", "1").left
     assert tall.fx == pytest.approx(796.2 * 0.6)
     assert tall.cx == pytest.approx((645.1 + 0.5) * 0.6 - 0.5 - 64)
 
 
 def test_wide_lenses_are_fisheyes_and_boards_may_not_know_their_imu() -> None:
     found = read_calibration(dai, calibration("oak_d_wide"), (1280, 800), "OAK-D-W", "2")
-    assert isinstance(found.rig.left, KannalaBrandt)
-    assert found.rig.left.distortion == pytest.approx((0.0312, -0.0124, 0.0041, -0.0011))
-    assert found.left_T_imu is None
+    assert isinstance(found.left, KannalaBrandt)
+    assert found.left.distortion == pytest.approx((0.0312, -0.0124, 0.0041, -0.0011))
+    assert found.imu is None
 
 
 def changed(**extrinsics: float) -> Any:

@@ -76,7 +76,8 @@ def test_boot_calibration_and_the_order_of_commands() -> None:
         for ours, theirs in ((source.rig.left, truth.left), (source.rig.right, truth.right)):
             np.testing.assert_allclose(ours.params[:8], theirs.params[:8], rtol=1e-6)
         np.testing.assert_allclose(source.rig.body_T_left[:3, :3], np.diag([1, -1, -1]), atol=1e-7)
-        imu = source.imu_calibration.left_T_imu
+        assert source.rig.imu is not None
+        imu = source.rig.imu.left_T_imu
         np.testing.assert_allclose(imu[:3, :3], np.diag([-1, -1, 1]), atol=1e-7)
         assert imu[0, 3] == pytest.approx(0.0107, abs=2e-4)
         images = take(source, 5)

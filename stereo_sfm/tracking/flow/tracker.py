@@ -26,6 +26,7 @@ from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.stereo import StereoMatcher
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.tracking.flow.tracks import Tracks
+from stereo_sfm.tracking.inertial.inertial_motion import InertialMotion
 from stereo_sfm.types import F64, Bool, Corners, Frame, Keyframe, MapUpdate, Observations, StereoImage, TrackState
 
 DARK = 30  # grey level; an image without a brighter pixel shows nothing
@@ -49,12 +50,15 @@ class Tracker:
         self._solver = FramePoseSolver(config, StereoCameras.of(rig), self._shutter)
         self._new_points = NewPoints(config, rig, self._stereo, self._follower, self._shutter)
         self._place_corners = place_corners
+        self._inertial = InertialMotion(rig.imu) if rig.imu is not None and config.inertial else None
         self._tracks = Tracks()
         self._state = TrackState.INITIALIZING
         self._pose: F64 = np.eye(4)
         self._velocity: F64 = np.zeros(6)  # tangent per second
         self._stamp_ns = 0
         self._lost = 0  # successive frames
+        self._searched = 0  # of these, in which there was something to see, or nothing to go on by
+        self._bridging = False  # tracking begins again where the IMU says, in the same submap
         self._submap_id = 0
         self._next_kf_id = 0
         self._kf_pose: F64 = np.eye(4)
@@ -73,6 +77,8 @@ class Tracker:
         with self._spans.span("pyramid"):
             images = self._prepare(image)
         self.solution = None
+        if self._inertial is not None:
+            self._inertial.feed(image.imu)
         if self._state == TrackState.INITIALIZING:
             return self._begin(image, images)
         expected = self._predict(image.stamp_ns)
@@ -102,10 +108,14 @@ class Tracker:
         return StereoPyramids(left, self._stereo.prepare(image))
 
     def _predict(self, stamp_ns: int) -> ExpectedMotion:
-        """Constant velocity."""
+        """By the IMU, else constant velocity."""
         seconds = (stamp_ns - self._stamp_ns) * 1e-9
         moved = self._velocity * seconds
-        return ExpectedMotion(self._pose @ se3.exp(moved), moved, seconds)
+        pose = self._pose @ se3.exp(moved)
+        if self._inertial is not None:
+            pose = self._inertial.predict(stamp_ns, pose)
+            moved = se3.log(se3.inverse(self._pose) @ pose)
+        return ExpectedMotion(pose, moved, seconds)
 
     def _track(self, images: StereoPyramids, expected: ExpectedMotion) -> tuple[Tracks, PoseSolution]:
         """Follow all points from where they are expected, match them in the right image and solve for the pose."""
@@ -129,16 +139,24 @@ class Tracker:
         tracks.age = tracks.age + np.int32(1)
         kept = tracks.misses < MAX_MISSES
         self._go_on(image, images, solution.pose, tracks.keep(kept))
+        if self._inertial is not None:
+            self._inertial.accept(image.stamp_ns, solution.pose)
         self._frames_since_kf += 1
         return inlier[kept]
 
     def _go_on(self, image: StereoImage, images: StereoPyramids, pose: F64, tracks: Tracks) -> None:
         self._pose, self._stamp_ns, self._tracks = pose, image.stamp_ns, tracks
-        self._state, self._lost = TrackState.OK, 0
+        self._state, self._lost, self._searched = TrackState.OK, 0, 0
         self._follower.accept(images.left, tracks)
 
     def _begin(self, image: StereoImage, images: StereoPyramids) -> tuple[Frame, Keyframe | None]:
         """First frame, or the first after a restart: points from stereo alone."""
+        bridge = self._bridge(image.stamp_ns) if self._bridging else None
+        if self._bridging and bridge is None:  # for too long
+            self._bridging = False
+            self._submap_id += 1
+        if bridge is not None:
+            self._pose = bridge[0]
         self._go_on(image, images, self._pose, Tracks())
         inlier = self._add_points(images, np.zeros(0, bool))
         if len(self._tracks) < 2 * self._config.min_features:
@@ -146,23 +164,39 @@ class Tracker:
             self._state = TrackState.INITIALIZING
             never = self._submap_id == 0 and self._next_kf_id == 0
             state = TrackState.INITIALIZING if never else TrackState.LOST
-            return self._without_pose(image, self._pose, state, "too_few_points"), None
+            return self._without_pose(image, self._pose, state, "too_few_points", bridge), None
+        first = self._next_kf_id == 0
         keyframe = self._make_keyframe(image, images)
-        state = TrackState.OK if self._submap_id == 0 else TrackState.RESTARTED
+        state = TrackState.OK if first else TrackState.RECOVERED if self._bridging else TrackState.RESTARTED
+        covariance = FIRST_COVARIANCE if bridge is None else bridge[1]
+        self._bridging = False
+        if self._inertial is not None:
+            self._inertial.begin(image.stamp_ns, self._pose)
         n = float(len(inlier))
         stats = {"tracked": n, "inliers": n, "right": n, "error": 0.0}
-        return self._frame(image, state, FIRST_COVARIANCE, inlier, keyframe, stats), keyframe
+        return self._frame(image, state, covariance, inlier, keyframe, stats), keyframe
+
+    def _bridge(self, stamp_ns: int) -> tuple[F64, F64] | None:
+        """Pose (4, 4) and covariance (6, 6) by the IMU since the last good pose; None where it does not know."""
+        if self._inertial is None or not self._inertial.bridges(stamp_ns):
+            return None
+        covariance = self._inertial.covariance(stamp_ns)
+        assert covariance is not None
+        return self._inertial.predict(stamp_ns, self._pose), covariance
 
     def _lose(self, image: StereoImage, predicted: F64, reason: str) -> tuple[Frame, None]:
         """Keep the last good frame's tracks and predict; after a while begin a new submap."""
         self._lost += 1
         self._follower.search_widely()
-        if self._lost > self._config.lost_frames:
+        bridge = self._bridge(image.stamp_ns)
+        self._searched += bridge is None or image.left.max() >= DARK
+        if self._searched > self._config.lost_frames:
             self._pose = predicted
             self._velocity = np.zeros(6)
-            self._submap_id += 1
+            self._bridging = bridge is not None
+            self._submap_id += not self._bridging
             self._state = TrackState.INITIALIZING
-        return self._without_pose(image, predicted, TrackState.LOST, reason), None
+        return self._without_pose(image, predicted, TrackState.LOST, reason, bridge), None
 
     def _add_points(self, images: StereoPyramids, inlier: Bool) -> Bool:
         """New points behind those that are followed, of which `inlier` (N,) agree; the new ones do."""
@@ -230,14 +264,21 @@ class Tracker:
             stats=stats,
         )
 
-    def _without_pose(self, image: StereoImage, predicted: F64, state: TrackState, reason: str) -> Frame:
-        """A frame whose pose is only predicted."""
+    def _without_pose(
+        self,
+        image: StereoImage,
+        predicted: F64,
+        state: TrackState,
+        reason: str,
+        bridge: tuple[F64, F64] | None = None,
+    ) -> Frame:
+        """A frame whose image gives no pose: predicted only, or by the IMU."""
         return Frame(
             frame_id=image.frame_id,
             stamp_ns=image.stamp_ns,
             odom_T_cam=predicted.copy(),
-            covariance=UNKNOWN_COVARIANCE.copy(),
-            state=state,
+            covariance=UNKNOWN_COVARIANCE.copy() if bridge is None else bridge[1],
+            state=state if bridge is None else TrackState.INERTIAL,
             reason="dark" if image.left.max() < DARK else reason,
             observations=Observations.empty(),
             reference_kf_id=self._next_kf_id - 1,

@@ -1,0 +1,57 @@
+"""`Imu`: where the inertial sensor of a rig sits, how it errs and how much it errs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.types import F64
+
+MOST_OFFSET_S = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Imu:
+    """A gyroscope and an accelerometer in one frame. Corrected samples are `matrix @ raw - bias`.
+
+    The default noise is that of a consumer sensor: a calibration that knows better says so.
+    """
+
+    left_T_imu: F64 = field(default_factory=lambda: np.eye(4))  # (4, 4)
+    gyro_matrix: F64 = field(default_factory=lambda: np.eye(3))  # (3, 3) scale and misalignment
+    gyro_bias: F64 = field(default_factory=lambda: np.zeros(3))  # (3,) rad/s
+    accel_matrix: F64 = field(default_factory=lambda: np.eye(3))  # (3, 3)
+    accel_bias: F64 = field(default_factory=lambda: np.zeros(3))  # (3,) m/s^2
+    gyro_noise: float = 2e-4  # rad/s/sqrt(Hz)
+    accel_noise: float = 3e-3  # m/s^2/sqrt(Hz)
+    gyro_walk: float = 3e-5  # rad/s^2/sqrt(Hz), of the bias
+    accel_walk: float = 3e-3  # m/s^3/sqrt(Hz)
+    rate_hz: float = 200.0
+    offset_s: float = (
+        0.0  # stamp of the IMU's clock minus the camera's at the same instant (Kalibr's timeshift_cam_imu)
+    )
+
+    def __post_init__(self) -> None:
+        rotation = self.left_T_imu[:3, :3]
+        if self.left_T_imu.shape != (4, 4) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4):
+            raise StereoSfmError("calibration holds a pose of the IMU that is not rigid: check left_T_imu")
+        arrays = (self.left_T_imu, self.gyro_matrix, self.gyro_bias, self.accel_matrix, self.accel_bias)
+        for array in arrays:
+            array.flags.writeable = False
+        noise = (self.gyro_noise, self.accel_noise, self.gyro_walk, self.accel_walk, self.rate_hz)
+        if not all(np.isfinite(a).all() for a in arrays) or not all(np.isfinite(n) and n > 0 for n in noise):
+            raise StereoSfmError(
+                "calibration of the IMU holds numbers that are not finite, or noise that is not positive"
+            )
+        if not abs(self.offset_s) <= MOST_OFFSET_S:
+            raise StereoSfmError(f"calibration has a time offset of {self.offset_s:g} s between camera and IMU")
+
+    def seen_from(self, new_T_left: F64) -> Imu:
+        """The same sensor after the left camera's frame was changed, (4, 4)."""
+        return replace(self, left_T_imu=new_T_left @ self.left_T_imu)
+
+    def correct(self, gyro: F64, accel: F64) -> tuple[F64, F64]:
+        """Raw samples (N, 3) rad/s and (N, 3) m/s^2 without scale errors, misalignment and known bias."""
+        return gyro @ self.gyro_matrix.T - self.gyro_bias, accel @ self.accel_matrix.T - self.accel_bias

@@ -1,0 +1,63 @@
+"""Inertial samples in a table of text, one row a sample."""
+
+from __future__ import annotations
+
+import csv
+import logging
+from pathlib import Path
+
+import numpy as np
+
+from stereo_sfm.types import ImuSamples
+
+log = logging.getLogger("stereo_sfm")
+
+MOST_GYRO, MOST_ACCEL = 50.0, 500.0  # rad/s, m/s^2: above what sensors on robots measure
+COLUMNS = 7
+
+
+def read_imu_samples(path: Path) -> ImuSamples | None:
+    """Samples of a table `stamp_ns, wx, wy, wz (rad/s), ax, ay, az (m/s^2)`, in the order of their stamps.
+
+    Rows that cannot be are left out with one warning; where the rest cannot be trusted (degrees, g), a warning says so
+    and there are none: a run goes on without them.
+    """
+    rows: list[list[float]] = []
+    stamps: list[int] = []
+    bad = 0
+    with path.open(encoding="utf-8-sig", newline="") as file:
+        for row in csv.reader(file):
+            if not row or row[0].lstrip().startswith("#"):
+                continue
+            try:
+                stamp, values = int(row[0]), [float(v) for v in row[1:COLUMNS]]
+            except ValueError:
+                bad += 1
+                continue
+            if len(values) < COLUMNS - 1 or not np.isfinite(values).all() or not 0 <= stamp < 1 << 63:
+                bad += 1
+                continue
+            stamps.append(stamp)
+            rows.append(values)
+    stamp_ns, first = np.unique(np.array(stamps, np.int64), return_index=True)
+    bad += len(stamps) - len(stamp_ns)
+    if bad:
+        log.warning("%s: %d samples are doubled or no samples, they are left out", path, bad)
+    if not len(stamp_ns):
+        return None
+    values = np.array(rows)[first]
+    why = _suspicious(values)
+    if why:
+        log.warning("%s: %s: the inertial samples are not used", path, why)
+        return None
+    return ImuSamples(stamp_ns, values[:, :3].copy(), values[:, 3:].copy())
+
+
+def _suspicious(values: np.ndarray) -> str:
+    """Why samples (N, 6) are not in rad/s and m/s^2; '' when they may be."""
+    gyro, accel = np.linalg.norm(values[:, :3], axis=1), np.linalg.norm(values[:, 3:], axis=1)
+    if np.percentile(gyro, 99) > MOST_GYRO or np.percentile(accel, 99) > MOST_ACCEL:
+        return f"rates of {gyro.max():.0f} and forces of {accel.max():.0f} are not in rad/s and m/s^2 (degrees?)"
+    if 0.5 < float(np.median(accel)) < 2:
+        return f"a median force of {np.median(accel):.2f} is in g, not in m/s^2"
+    return ""

@@ -1,0 +1,151 @@
+"""The tracker's inertial sense: where the camera should be next, and where it is while the images show nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib.imu import Imu
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.preintegration import GRAVITY, Preintegrated, preintegrate
+from stereo_sfm.tracking.inertial.sample_buffer import SampleBuffer
+from stereo_sfm.tracking.inertial.window import InertialState, InertialWindow
+from stereo_sfm.types import F64, ImuSamples
+
+NODE_NS = 200_000_000  # between the poses of the window
+BRIDGED_S, BRIDGED_M = 10.0, 0.5  # longest time and largest standard deviation that are gone through without images
+MOST_TURN_ERROR = 0.1  # rad/s between gyroscope and images, root mean square: more is another sensor's data
+JUDGED = 20  # intervals that the sensor is judged by
+MOST_GRAVITY_ERROR = 1.0  # m/s^2 of its size
+
+
+class InertialMotion:
+    """Fed with every image's samples; told every pose that the images gave."""
+
+    def __init__(self, imu: Imu) -> None:
+        self._imu = imu
+        self._buffer = SampleBuffer(imu)
+        self._window = InertialWindow()
+        self._state: InertialState | None = None
+        self._node_ns = self._last_ns = 0
+        self._odom_T_node: F64 = np.eye(4)
+        self._odom_T_last: F64 = np.eye(4)
+        self._gyro_bias: F64 = np.zeros(3)
+        self._begun = False
+        self._turn_errors: list[float] = []  # squared, rad/s
+        self.left_out = ""  # why the sensor is not believed
+
+    @property
+    def state(self) -> InertialState | None:
+        """Velocity, gravity and biases at the newest pose of the window; None while they are not known."""
+        return self._state
+
+    def feed(self, samples: ImuSamples | None) -> None:
+        """Samples up to the image that is tracked next."""
+        if samples is not None and len(samples):
+            self._buffer.add(samples)
+
+    def begin(self, stamp_ns: int, odom_T_cam: F64) -> None:
+        """The odometry begins anew here: poses from before do not go with those to come."""
+        self._begun, self._state = True, None
+        self._restart(stamp_ns, odom_T_cam @ self._imu.left_T_imu)
+
+    def _restart(self, stamp_ns: int, odom_T_imu: F64) -> None:
+        self._window.begin(odom_T_imu)
+        self._node_ns = self._last_ns = stamp_ns
+        self._odom_T_node = self._odom_T_last = odom_T_imu
+
+    def predict(self, stamp_ns: int, expected: F64) -> F64:
+        """(4, 4) odom_T_cam at a time after the last pose: the rotation by the gyroscope, the translation too once
+        velocity and gravity are known; `expected` (4, 4) where the samples do not reach."""
+        motion = self._motion(self._last_ns, stamp_ns)
+        if motion is None or self.left_out:
+            return expected
+        odom_R_imu = self._odom_T_last[:3, :3] @ motion.rotation
+        if self._state is None:
+            odom_R_cam = odom_R_imu @ self._imu.left_T_imu[:3, :3].T
+            return se3.from_rotation_translation(odom_R_cam, expected[:3, 3])
+        velocity, accel_bias = self._velocity(), self._state.accel_bias
+        t = motion.seconds
+        position = self._odom_T_last[:3, 3] + velocity * t + 0.5 * self._state.gravity * t * t
+        position = position + self._odom_T_last[:3, :3] @ motion.position_with(self._gyro_bias, accel_bias)
+        return se3.from_rotation_translation(odom_R_imu, position) @ se3.inverse(self._imu.left_T_imu)
+
+    def accept(self, stamp_ns: int, odom_T_cam: F64) -> None:
+        """The images gave this pose (4, 4)."""
+        odom_T_imu = odom_T_cam @ self._imu.left_T_imu
+        if not self._begun:
+            self.begin(stamp_ns, odom_T_cam)
+            return
+        self._judge(stamp_ns, odom_T_imu)
+        self._last_ns, self._odom_T_last = stamp_ns, odom_T_imu
+        if stamp_ns - self._node_ns < NODE_NS:
+            return
+        motion = self._motion(self._node_ns, stamp_ns)
+        if motion is None:  # samples are missing
+            self._state = None
+            self._restart(stamp_ns, odom_T_imu)
+            return
+        self._window.add(motion, odom_T_imu)
+        self._node_ns, self._odom_T_node = stamp_ns, odom_T_imu
+        self._buffer.forget(stamp_ns)
+        self._state = None if self.left_out else self._window.estimate()
+        self._gyro_bias = self._window.gyro_bias()[0] if self._state is None else self._state.gyro_bias
+
+    def bridges(self, stamp_ns: int) -> bool:
+        """Whether the motion since the last pose is known well enough to go on by it."""
+        seconds = (stamp_ns - self._last_ns) * 1e-9
+        if self._state is None or self.left_out or seconds > BRIDGED_S:
+            return False
+        covariance = self.covariance(stamp_ns)
+        return covariance is not None and float(np.sqrt(np.trace(covariance[:3, :3]) / 3)) < BRIDGED_M
+
+    def covariance(self, stamp_ns: int) -> F64 | None:
+        """(6, 6) of the predicted pose @ exp(xi), xi = (rho, phi) in camera axes; None where samples are missing."""
+        motion = self._motion(self._last_ns, stamp_ns)
+        if self._state is None or motion is None:
+            return None
+        t, odom_R_imu = motion.seconds, self._odom_T_last[:3, :3]
+        by = np.hstack([t * np.eye(3), 0.5 * t * t * np.eye(3), odom_R_imu @ motion.position_by_accel])
+        turn = (self._state.gyro_bias_sigma * t) ** 2 + self._imu.gyro_noise**2 * t
+        tilted = turn * (GRAVITY * t * t / 6) ** 2  # a tilt that grows with time pushes with gravity's share
+        noise = self._imu.accel_noise**2 * t**3 / 3 + tilted
+        position = by @ self._state.covariance @ by.T + noise * np.eye(3)
+        cam_R_odom = self._imu.left_T_imu[:3, :3] @ motion.rotation.T @ odom_R_imu.T
+        out = np.zeros((6, 6))
+        out[:3, :3], out[3:, 3:] = cam_R_odom @ position @ cam_R_odom.T, turn * np.eye(3)
+        return out
+
+    def _motion(self, begin_ns: int, end_ns: int) -> Preintegrated | None:
+        intervals = self._buffer.between(begin_ns, end_ns)
+        if intervals is None:
+            return None
+        return preintegrate(
+            intervals.seconds, intervals.gyro, intervals.accel, self._gyro_bias, np.zeros(3), self._imu.gyro_noise,
+            self._imu.accel_noise,
+        )  # fmt: skip
+
+    def _velocity(self) -> F64:
+        """(3,) m/s of the IMU at the last pose: the window's, taken on from its newest pose."""
+        assert self._state is not None
+        motion = self._motion(self._node_ns, self._last_ns) if self._last_ns > self._node_ns else None
+        if motion is None:
+            return self._state.velocity
+        turned = self._odom_T_node[:3, :3] @ motion.velocity_with(self._gyro_bias, self._state.accel_bias)
+        return self._state.velocity + self._state.gravity * motion.seconds + turned
+
+    def _judge(self, stamp_ns: int, odom_T_imu: F64) -> None:
+        """Compare with what the images showed: a sensor that contradicts them for long is left out."""
+        motion = self._motion(self._last_ns, stamp_ns)
+        if motion is None:
+            return
+        seen = self._odom_T_last[:3, :3].T @ odom_T_imu[:3, :3]
+        error = float(np.linalg.norm(se3.so3_log(motion.rotation.T @ seen))) / motion.seconds
+        self._turn_errors = [*self._turn_errors[1 - JUDGED :], error * error]
+        wrong = len(self._turn_errors) >= JUDGED and np.sqrt(np.mean(self._turn_errors)) > MOST_TURN_ERROR
+        size = 0.0 if self._state is None else abs(float(np.linalg.norm(self._state.gravity)) - GRAVITY)
+        if wrong:
+            self.left_out = "gyro_contradicts_images"
+        elif size > MOST_GRAVITY_ERROR:
+            self.left_out = "accelerometer_contradicts_images"
+        elif self.left_out and len(self._turn_errors) >= JUDGED:
+            self.left_out = ""

@@ -1,0 +1,75 @@
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.preintegration import GRAVITY, Preintegrated, preintegrate
+from stereo_sfm.types import F64
+
+DT = 0.005
+GYRO_NOISE, ACCEL_NOISE = 1.7e-4, 2.0e-3
+
+
+def samples(seed: int, n: int = 40, dt: float = DT) -> tuple[F64, F64, F64]:
+    """Smooth random rates, strong enough that second-order errors would show."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(n)[:, None] * dt
+    phase = rng.uniform(0, 6, (2, 3))
+    gyro = 1.5 * np.sin(3 * t + phase[0])
+    accel = 4 * np.cos(2 * t + phase[1]) + [0.3, -0.2, GRAVITY]
+    return np.full(n, dt), gyro, accel
+
+
+def ours(seed: int, gyro_bias: F64, accel_bias: F64) -> Preintegrated:
+    return preintegrate(*samples(seed), gyro_bias, accel_bias, GYRO_NOISE, ACCEL_NOISE)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_values_are_gtsams(seed: int) -> None:
+    gyro_bias, accel_bias = np.array([0.01, -0.02, 0.03]), np.array([0.1, -0.05, 0.02])
+    params = gtsam.PreintegrationParams.MakeSharedU(GRAVITY)
+    params.setGyroscopeCovariance(np.eye(3) * GYRO_NOISE**2)
+    params.setAccelerometerCovariance(np.eye(3) * ACCEL_NOISE**2)
+    params.setIntegrationCovariance(np.zeros((3, 3)))
+    theirs = gtsam.PreintegratedImuMeasurements(params, gtsam.imuBias.ConstantBias(accel_bias, gyro_bias))
+    seconds, gyro, accel = samples(seed, 2000, 1e-4)  # so fine that its tangent integration is exact as well
+    for dt, w, a in zip(seconds, gyro, accel, strict=True):
+        theirs.integrateMeasurement(a, w, dt)
+    mine = preintegrate(seconds, gyro, accel, gyro_bias, accel_bias, GYRO_NOISE, ACCEL_NOISE)
+    assert np.allclose(mine.rotation, theirs.deltaRij().matrix(), atol=1e-6)
+    assert np.allclose(mine.velocity, theirs.deltaVij(), atol=1e-6)
+    assert np.allclose(mine.position, theirs.deltaPij(), atol=1e-6)
+    assert mine.seconds == pytest.approx(theirs.deltaTij())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_bias_jacobians_are_the_differences(seed: int) -> None:
+    zero, step = np.zeros(3), 1e-6
+    base = ours(seed, zero, zero)
+    for axis in range(3):
+        bias = np.eye(3)[axis] * step
+        by_gyro, by_accel = ours(seed, bias, zero), ours(seed, zero, bias)
+        turned = se3.so3_log(base.rotation.T @ by_gyro.rotation) / step
+        assert np.allclose(turned, base.rotation_by_gyro[:, axis], atol=1e-6)
+        assert np.allclose((by_gyro.velocity - base.velocity) / step, base.velocity_by_gyro[:, axis], atol=1e-5)
+        assert np.allclose((by_gyro.position - base.position) / step, base.position_by_gyro[:, axis], atol=1e-5)
+        assert np.allclose((by_accel.velocity - base.velocity) / step, base.velocity_by_accel[:, axis], atol=1e-6)
+        assert np.allclose((by_accel.position - base.position) / step, base.position_by_accel[:, axis], atol=1e-6)
+
+
+def test_covariance_is_that_of_many_noisy_integrations() -> None:
+    seconds, gyro, accel = samples(0)
+    clean = preintegrate(seconds, gyro, accel, np.zeros(3), np.zeros(3), GYRO_NOISE, ACCEL_NOISE)
+    rng = np.random.default_rng(1)
+    errors: list[F64] = []
+    for _ in range(1500):
+        noisy = preintegrate(
+            seconds, gyro + rng.normal(0, GYRO_NOISE / DT**0.5, gyro.shape),
+            accel + rng.normal(0, ACCEL_NOISE / DT**0.5, accel.shape), np.zeros(3), np.zeros(3), 0.0, 0.0,
+        )  # fmt: skip
+        turned = se3.so3_log(clean.rotation.T @ noisy.rotation)
+        errors.append(np.concatenate([turned, noisy.velocity - clean.velocity, noisy.position - clean.position]))
+    found = np.sqrt(np.diag(np.cov(np.array(errors).T)))
+    assert np.allclose(found, np.sqrt(np.diag(clean.covariance)), rtol=0.1)
