@@ -20,6 +20,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from stereo_sfm import same_code
+
 if TYPE_CHECKING:
     from calib.formats import load_rig, save_rig
     from calib.rig import Rig
@@ -70,6 +72,8 @@ __all__ = [
 ]
 
 __version__ = "0.1.0"
+
+same_code.choose()
 
 # name -> (module, attribute)
 _LAZY: dict[str, tuple[str, str]] = {

@@ -5,6 +5,9 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import stereo_sfm  # noqa: F401  # before the libraries, which read its choice of machine code when they are loaded
+
+# isort: split
 import cv2
 import pytest
 from hypothesis import settings

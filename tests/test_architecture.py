@@ -12,6 +12,7 @@ PACKAGES = ("stereo_sfm", "drivers", "calib")
 
 # The rooms, the ground floor first: each may import from rooms above it in this list, never from those below.
 ROOMS: tuple[str, ...] = (
+    "stereo_sfm.same_code",
     "stereo_sfm.errors",
     "stereo_sfm.timing",
     "stereo_sfm.types",

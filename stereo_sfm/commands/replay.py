@@ -170,6 +170,7 @@ def _changed(config: Config, overrides: list[str]) -> Config:
 def _compare(run: Path, replay: Path) -> int:
     from stereo_sfm.log import topics
     from stereo_sfm.log.diff import diff
+    from stereo_sfm.log.provenance import other_conditions
     from stereo_sfm.log.reader import LogReader
     from stereo_sfm.log.recorded import ended_early
 
@@ -184,5 +185,9 @@ def _compare(run: Path, replay: Path) -> int:
             known = {t.topic for t in a.topics}
             differences = [d for d in differences if (0 <= d.frame_id < end or (d.frame_id < 0 and d.topic in known))]
             same = f"identical before frame {end}, the last keyframe of a run that was killed"
+        conditions = other_conditions(a, b) if differences else []
     print("\n".join(str(d) for d in differences) or same)
+    if conditions:
+        print("computed under other conditions, which may be why:")
+        print("\n".join(f"  {line}" for line in conditions))
     return DIFFERENT if differences else 0

@@ -11,6 +11,8 @@ from calib.formats.native import rig_to_text
 from calib.rig import Rig
 from stereo_sfm import __version__
 from stereo_sfm.config import Config, dump
+from stereo_sfm.log.machine import arithmetic
+from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.topics import SCHEMA_VERSION
 from stereo_sfm.log.writer import LogWriter
 
@@ -98,11 +100,24 @@ def config_hash(text: str) -> str:
 
 
 def versions() -> str:
-    """One line per package that results depend on."""
+    """One line per package, and per choice of machine code, that results depend on."""
     lines = [f"stereo-sfm {__version__}", f"python {platform.python_version()}", f"machine {platform.machine()}"]
     for package in _PACKAGES:
         try:
             lines.append(f"{package} {version(package)}")
         except PackageNotFoundError:
             lines.append(f"{package} missing")
+    lines += [f"{name} {value}" for name, value in arithmetic().items()]
     return "\n".join(lines) + "\n"
+
+
+def other_conditions(a: LogReader, b: LogReader) -> list[str]:
+    """What of the packages and the machine code differs between two runs, "name: a -> b"."""
+    one, other = (_by_name(reader.attachment(VERSIONS_FILE) or b"") for reader in (a, b))
+    names = [name for name in one if name in other and one[name] != other[name]]
+    return [f"{name}: {one[name]} -> {other[name]}" for name in names]
+
+
+def _by_name(text: bytes) -> dict[str, str]:
+    pairs = (line.partition(" ") for line in text.decode(errors="replace").splitlines())
+    return {name: value for name, _, value in pairs}
