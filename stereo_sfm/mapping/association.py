@@ -37,22 +37,21 @@ def local_keyframes(map_: Map, seen_points: I64, map_T_kf: F64, reach: float, co
         seen_points: rows of points that the new keyframe is known to see.
         reach: metres; keyframes that stood closer and looked less than 60 degrees elsewhere count as neighbours.
     """
-    obs = map_.observations_of_points(seen_points)
-    rows, counts = np.unique(map_.observations.kf[obs], return_counts=True)
-    first = rows[np.lexsort((rows, -counts))][: config.most_keyframes].astype(np.int64)
+    counts = map_.count_by_keyframe(seen_points)
+    rows = np.flatnonzero(counts)
+    first = rows[np.lexsort((rows, -counts[rows]))][: config.most_keyframes]
     second = [map_.covisibility.neighbours(int(k), config.connected_points)[0][:5] for k in first]
-    keyframes = map_.keyframes
-    apart = np.linalg.norm(keyframes.map_T_kf[:, :3, 3] - map_T_kf[:3, 3], axis=1)
-    cosine = keyframes.map_T_kf[:, :3, 2] @ map_T_kf[:3, 2]
-    near = np.flatnonzero(keyframes.alive & (apart < reach) & (cosine > 0.5))
-    near = near[np.argsort(apart[near], kind="stable")][: config.near_keyframes]
+    alive = map_.living_keyframes()
+    pose = map_.keyframes.map_T_kf[alive]
+    apart = np.linalg.norm(pose[:, :3, 3] - map_T_kf[:3, 3], axis=1)
+    near = np.flatnonzero((apart < reach) & (pose[:, :3, 2] @ map_T_kf[:3, 2] > 0.5))
+    near = alive[near[np.argsort(apart[near], kind="stable")]][: config.near_keyframes]
     return np.unique(np.concatenate([first, *second, near]).astype(np.int64))
 
 
 def points_in_view(map_: Map, rig: Rig, keyframes: I64, map_T_kf: F64) -> tuple[I64, F64, F64]:
     """Points of some keyframes that this pose should see from a like angle: rows, left and right pixels or NaN."""
-    seen = [map_.observations.pt[map_.observations_of_keyframe(int(k))] for k in keyframes]
-    rows = np.unique(np.concatenate([np.zeros(0, np.int32), *seen])).astype(np.int64)
+    rows = map_.points_of_keyframes(keyframes)
     rows = rows[map_.points.alive[rows] & np.isfinite(map_.points.xyz[rows, 0])]
     xyz = map_.points.xyz[rows]
     local = se3.transform(se3.inverse(map_T_kf), xyz)

@@ -138,8 +138,12 @@ class _Solver:
         self.free = np.where(bundle.fixed, -1, np.cumsum(~bundle.fixed) - 1).astype(np.int64)
         self.moving = np.flatnonzero(~bundle.fixed)
         self.system: ReducedSystem | None = None
+        n = len(bundle.points)
+        self._nothing = _Prior(bundle.points, np.zeros((n, 6)), np.zeros((n, 3)), 0.0)
 
     def _prior(self, state: _State) -> _Prior:
+        if not len(self.fixed.kf):
+            return self._nothing
         lin, cost = self.fixed.linearize(state)
         return _Prior(state.points, *self.fixed.sum_up(state.rot, lin), cost)
 
@@ -148,7 +152,7 @@ class _Solver:
         state.lin, state.cost = self.table.linearize(state)
         state.prior = prior or self._prior(state)
         state.cost += state.prior.cost
-        if prior is not None:
+        if prior is not None and prior is not self._nothing:
             state.cost += kernels.prior_cost(state.points, prior.x0, prior.h, prior.g)
         return state
 

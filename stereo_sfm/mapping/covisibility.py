@@ -36,6 +36,14 @@ class Covisibility:
                 else:
                     self._rows[x].pop(y, None)
 
+    def join(self, row: int, counts: I64) -> None:
+        """A keyframe shares counts (K,) more points with the others."""
+        others = np.flatnonzero(counts)
+        mine = self._rows[row]
+        for other, n in zip(others.tolist(), counts[others].tolist(), strict=True):
+            if other != row:
+                mine[other] = self._rows[other][row] = mine.get(other, 0) + n
+
     def drop(self, row: int) -> None:
         """A keyframe that is gone shares nothing."""
         for other in self._rows[row]:

@@ -7,6 +7,7 @@ import numpy as np
 from calib.rig import Rig
 from stereo_sfm.config import MapperConfig
 from stereo_sfm.geometry import se3
+from stereo_sfm.mapping import map_kernels
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.types import F64, I64, Bool
 
@@ -33,27 +34,14 @@ def weak_points(map_: Map, rig: Rig, rows: I64, newest: int, config: MapperConfi
 
 
 def _quality(map_: Map, rig: Rig, rows: I64) -> tuple[F64, F64]:
-    """(N,) root mean squared error of the left eyes in sigmas, and (N,) largest angle between a ray and the first."""
-    table, points, keyframes = map_.observations, map_.points, map_.keyframes
-    obs = map_.observations_of_points(rows)
-    order = np.argsort(rows, kind="stable")
-    index = order[np.searchsorted(rows[order], table.pt[obs])]
-    pose = keyframes.map_T_kf[table.kf[obs]]
-    ray = points.xyz[rows][index] - pose[:, :3, 3]
-    uv = rig.left.project(np.einsum("nji,nj->ni", pose[:, :3, :3], ray))
-    squared = np.nan_to_num(((uv - table.uv_left[obs]) ** 2).sum(1), nan=1e6) / (2 * table.sigma[obs] ** 2)
-    count = np.maximum(np.bincount(index, minlength=len(rows)), 1)
-    error = np.sqrt(np.bincount(index, squared, len(rows)) / count)
-    distance = np.linalg.norm(ray, axis=1)
-    unit = ray / np.maximum(distance, 1e-9)[:, None]
-    first = np.zeros((len(rows), 3))
-    first[index[::-1]] = unit[::-1]
-    angle = 2 * np.arcsin(np.clip(np.linalg.norm(unit - first[index], axis=1) / 2, 0, 1))
-    both = np.isfinite(table.uv_right[obs, 0])
-    angle = np.maximum(angle, np.where(both, rig.baseline / np.maximum(distance, 1e-9), 0))
-    parallax = np.zeros(len(rows))
-    np.maximum.at(parallax, index, angle)
-    return error, parallax
+    """(N,) root mean squared error of the left images in sigmas, and (N,) largest angle between a ray and the first."""
+    table, points, pose = map_.observations, map_.points, map_.keyframes.map_T_kf
+    out = np.empty((len(rows), 2))
+    map_kernels.judge_points(
+        rows, points.head, table.following, table.kf, table.uv_left, table.uv_right, table.sigma, pose[:, :3, :3],
+        pose[:, :3, 3], points.xyz, rig.left.model_id, rig.left.params, rig.baseline, out,
+    )  # fmt: skip
+    return out[:, 0], out[:, 1]
 
 
 def redundant_keyframe(map_: Map, newest: int, protected: Bool, config: MapperConfig) -> int:
@@ -69,17 +57,20 @@ def redundant_keyframe(map_: Map, newest: int, protected: Bool, config: MapperCo
         return -1
     neighbours, _ = map_.covisibility.neighbours(newest, config.connected_points)
     neighbours = np.sort(neighbours[~protected[neighbours]])
-    shares = np.array([_seen_by_others(map_, int(row)) for row in neighbours])
+    shares = _seen_by_others(map_, neighbours)
     if (shares > config.redundant_share).any():
         return int(neighbours[np.argmax(shares > config.redundant_share)])
     crowd = np.flatnonzero(_same_view(map_, newest, neighbours))
     return int(neighbours[crowd[np.argmax(shares[crowd])]]) if len(crowd) > config.crowd_keyframes else -1
 
 
-def _seen_by_others(map_: Map, row: int) -> float:
-    """Share of a keyframe's points that enough other keyframes see."""
-    pts = map_.observations.pt[map_.observations_of_keyframe(row)]
-    return float((map_.points.obs_count[pts] > OTHERS).mean()) if len(pts) else 0.0
+def _seen_by_others(map_: Map, rows: I64) -> F64:
+    """(N,) share of each keyframe's points that enough other keyframes see."""
+    shares, keyframes = np.empty(len(rows)), map_.keyframes
+    map_kernels.seen_shares(
+        rows, keyframes.obs_first, keyframes.obs_count, map_.observations.pt, map_.points.obs_count, OTHERS, shares
+    )
+    return shares
 
 
 def _same_view(map_: Map, newest: int, rows: I64) -> Bool:

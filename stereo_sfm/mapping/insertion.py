@@ -116,10 +116,7 @@ def fuse_points(map_: Map, first: int, second: int, config: MapperConfig) -> tup
     gone, stays = max(first, second), min(first, second)
     if gone == stays or not (map_.points.alive[gone] and map_.points.alive[stays]):
         return None
-    moving = map_.observations_of_points(np.array([gone]))
-    there = map_.observations_of_points(np.array([stays]))
-    table = map_.observations
-    if np.intersect1d(table.kf[moving], table.kf[there]).size:
+    if map_.share_a_keyframe(gone, stays):
         return None
     map_.fuse(gone, stays, config.match_sigma_px)
     return gone, stays

@@ -138,6 +138,21 @@ class Map:
         rows = np.arange(first, first + int(self.keyframes.obs_count[row]))
         return rows[self.observations.pt[rows] >= 0]
 
+    def points_of_keyframes(self, rows: I64) -> I64:
+        """Rows of the points that any of some keyframes sees, ascending."""
+        seen, keyframes = np.zeros(len(self.points), np.bool_), self.keyframes
+        rows = np.ascontiguousarray(rows, np.int64)
+        map_kernels.mark_seen(rows, keyframes.obs_first, keyframes.obs_count, self.observations.pt, seen)
+        return np.flatnonzero(seen)
+
+    def count_by_keyframe(self, points: I64) -> I64:
+        """(K,) how many of some points each keyframe sees."""
+        counts = np.zeros(len(self.keyframes), np.int64)
+        points = np.ascontiguousarray(points, np.int64)
+        table = self.observations
+        map_kernels.count_by_keyframe(points, self.points.head, table.following, table.kf, counts)
+        return counts
+
     def observations_of_points(self, rows: I64) -> I64:
         """Rows of all observations of some points, ascending."""
         rows = np.ascontiguousarray(rows, np.int64)
@@ -198,8 +213,7 @@ class Map:
         """Observations of the newest keyframe, one a point. Returns their rows."""
         if kf != len(self.keyframes) - 1:
             raise StereoSfmError("observations are added to the newest keyframe only")
-        earlier = self.observations_of_points(pt_rows)
-        self.covisibility.add(self.observations.kf[earlier].astype(np.int64), np.full(len(earlier), kf))
+        self.covisibility.join(kf, self.count_by_keyframe(pt_rows))
         rows = self.observations.append(
             len(pt_rows),
             kf=kf,
@@ -317,22 +331,16 @@ class Map:
         the surface a point is: what `old` was seen by, and what the point is seen by from now on, counts with `sigma`
         pixels.
         """
-        mine = set(self.observations.kf[self.observations_of_points(np.array([new]))].tolist())
-        moving = self.observations_of_points(np.array([old]))
-        double = np.isin(self.observations.kf[moving], sorted(mine))
-        self.remove_observations(moving[double])
-        moving = moving[~double]
-        kept = self.observations.kf[self.observations_of_points(np.array([new]))].astype(np.int64)
-        for obs in moving.tolist():
-            kf = int(self.observations.kf[obs])
-            self.covisibility.add(kept, np.full(len(kept), kf))
-            self.observations.pt[obs] = new
-            self.observations.sigma[obs] = sigma
-            self.observations.following[obs] = self.points.head[new]
-            self.points.head[new] = obs
-        points = self.points
+        points, table = self.points, self.observations
+        double = np.empty(int(points.obs_count[old]), np.int64)
+        if count := map_kernels.seen_together(old, new, points.head, table.following, table.kf, double):
+            self.remove_observations(double[:count])
+        pairs = np.empty((2, int(points.obs_count[old]) * int(points.obs_count[new])), np.int64)
+        points.obs_count[new] += map_kernels.hand_over(
+            old, new, points.head, table.following, table.pt, table.kf, table.sigma, sigma, pairs
+        )
+        self.covisibility.add(pairs[0], pairs[1])
         points.sigma[new] = sigma
-        points.obs_count[new] += len(moving)
         points.seen[new] += points.seen[old]
         points.expected[new] += points.expected[old]
         points.last_seen[new] = max(points.last_seen[new], points.last_seen[old])
@@ -340,6 +348,12 @@ class Map:
             points.descriptor_obs[new] = points.descriptor_obs[old]
         points.head[old], points.obs_count[old], points.alive[old], points.fused_into[old] = -1, 0, False, new
         self._changed_pt.append(np.array([new]))
+
+    def share_a_keyframe(self, first: int, second: int) -> bool:
+        """Whether one keyframe saw the points of both rows."""
+        points, table = self.points, self.observations
+        both = np.empty(int(points.obs_count[first]), np.int64)
+        return map_kernels.seen_together(first, second, points.head, table.following, table.kf, both) > 0
 
     # -- memory ------------------------------------------------------------------------------------------------------
 

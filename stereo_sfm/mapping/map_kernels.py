@@ -4,10 +4,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from stereo_sfm.geometry.hamming import BITS, hamming
-from stereo_sfm.geometry.kernels import njit
+from stereo_sfm.geometry.kernels import njit, project_one
+
+MOST_CELLS = 4096  # of match_near's grid, along either axis
 
 
 @njit
@@ -99,6 +103,45 @@ def unlink(rows, head, following, obs_pt, obs_kf, pairs):
 
 
 @njit
+def seen_together(old, new, head, following, obs_kf, out):
+    """Fills out with the observations of point `old` by keyframes that see `new` too. Returns how many there are."""
+    n = 0
+    o = head[old]
+    while o >= 0:
+        q = head[new]
+        while q >= 0 and obs_kf[q] != obs_kf[o]:
+            q = following[q]
+        if q >= 0:
+            out[n] = o
+            n += 1
+        o = following[o]
+    return n
+
+
+@njit
+def hand_over(old, new, head, following, obs_pt, obs_kf, obs_sigma, sigma, pairs):
+    """Moves the observations of point `old` to the front of the list of `new`, each from now on with `sigma`.
+
+    Fills pairs (2, N) with (a keyframe that sees `new`, one that saw `old`) and returns how many observations moved.
+    """
+    n = moved = 0
+    front, o = head[new], head[old]
+    last = -1
+    while o >= 0:
+        q = front
+        while q >= 0:
+            pairs[0, n], pairs[1, n] = obs_kf[q], obs_kf[o]
+            n += 1
+            q = following[q]
+        obs_pt[o], obs_sigma[o] = new, sigma
+        moved += 1
+        last, o = o, following[o]
+    if last >= 0:
+        following[last], head[new] = front, head[old]
+    return moved
+
+
+@njit
 def follow(rows, fused_into):
     """The living row that each row was fused into, in place; -1 stays."""
     for i in range(rows.shape[0]):
@@ -109,8 +152,102 @@ def follow(rows, fused_into):
 
 
 @njit
+def seen_shares(rows, first, count, obs_pt, pt_obs_count, others, out):
+    """Fills out with the share of each keyframe's points that more than `others` keyframes see; 0 without points."""
+    for i in range(rows.shape[0]):
+        k = rows[i]
+        points = seen = 0
+        for o in range(first[k], first[k] + count[k]):
+            if obs_pt[o] >= 0:
+                points += 1
+                seen += pt_obs_count[obs_pt[o]] > others
+        out[i] = seen / points if points else 0.0
+
+
+@njit
+def mark_seen(rows, first, count, obs_pt, marked):
+    """Sets marked (P,) at the points that these keyframes see."""
+    for i in range(rows.shape[0]):
+        k = rows[i]
+        for o in range(first[k], first[k] + count[k]):
+            if obs_pt[o] >= 0:
+                marked[obs_pt[o]] = True
+
+
+@njit
+def judge_points(points, head, following, obs_kf, uv_left, uv_right, sigma, rot, pos, xyz, cam, params, base, out):
+    """Fills out (N, 2): root mean squared error of the left images in sigmas, largest angle of a ray to the oldest's.
+
+    Args:
+        rot, pos: (K, 3, 3), (K, 3) of map_T_kf. xyz: (P, 3). cam, params: the left camera.
+        base: metres between the cameras, whose rays count where both see the point.
+    """
+    for i in range(points.shape[0]):
+        p = points[i]
+        oldest = o = head[p]
+        while o >= 0:
+            oldest = min(oldest, o)
+            o = following[o]
+        squared, chord, widest, n = 0.0, 0.0, 0.0, 0
+        f0 = f1 = f2 = 0.0
+        o = oldest
+        first = True
+        while o >= 0:
+            k = obs_kf[o]
+            d0, d1, d2 = xyz[p, 0] - pos[k, 0], xyz[p, 1] - pos[k, 1], xyz[p, 2] - pos[k, 2]
+            distance = max(math.sqrt(d0 * d0 + d1 * d1 + d2 * d2), 1e-9)
+            u0, u1, u2 = d0 / distance, d1 / distance, d2 / distance
+            if first:  # the oldest ray, before the list is walked from its head
+                f0, f1, f2 = u0, u1, u2
+                first = False
+                o = head[p]
+                continue
+            x = rot[k, 0, 0] * d0 + rot[k, 1, 0] * d1 + rot[k, 2, 0] * d2
+            y = rot[k, 0, 1] * d0 + rot[k, 1, 1] * d1 + rot[k, 2, 1] * d2
+            z = rot[k, 0, 2] * d0 + rot[k, 1, 2] * d1 + rot[k, 2, 2] * d2
+            u, v, _, _, _, _, _, _ = project_one(cam, params, x, y, z)
+            off = (u - uv_left[o, 0]) ** 2 + (v - uv_left[o, 1]) ** 2
+            squared += (off if math.isfinite(off) else 1e6) / (2 * sigma[o] * sigma[o])
+            chord = max(chord, (u0 - f0) ** 2 + (u1 - f1) ** 2 + (u2 - f2) ** 2)
+            if math.isfinite(uv_right[o, 0]):
+                widest = max(widest, base / distance)
+            n += 1
+            o = following[o]
+        out[i, 0] = math.sqrt(squared / max(n, 1))
+        out[i, 1] = max(2.0 * math.asin(min(math.sqrt(chord) / 2.0, 1.0)), widest)
+
+
+@njit
+def _cells(uv, size, least, columns, rows):
+    """Cell of each pixel, -1 for NaN: (N,), counted from the corner `least`."""
+    out = np.full(uv.shape[0], -1)
+    for i in range(uv.shape[0]):
+        if math.isfinite(uv[i, 0]) and math.isfinite(uv[i, 1]):
+            c, r = int((uv[i, 0] - least[0]) / size), int((uv[i, 1] - least[1]) / size)
+            out[i] = min(max(r, 0), rows - 1) * columns + min(max(c, 0), columns - 1)
+    return out
+
+
+@njit
+def _by_cell(cells, count):
+    """(count + 1,) where each cell begins in the list of members, and that list: members in order of their index."""
+    starts = np.zeros(count + 1, np.int64)
+    for i in range(cells.shape[0]):
+        if cells[i] >= 0:
+            starts[cells[i] + 1] += 1
+    for c in range(count):
+        starts[c + 1] += starts[c]
+    members, at = np.empty(starts[count], np.int64), starts[:count].copy()
+    for i in range(cells.shape[0]):
+        if cells[i] >= 0:
+            members[at[cells[i]]] = i
+            at[cells[i]] += 1
+    return starts, members
+
+
+@njit
 def match_near(uv, uv_right, words, predicted, predicted_right, candidate_words, radius, limit, ratio):
-    """Best candidate of each row, or -1: within `radius` px in both eyes, at most `limit` bits, mutual, distinct.
+    """Best candidate of each row, or -1: within `radius` px in both images, at most `limit` bits, mutual, distinct.
 
     Args:
         uv, uv_right: (N, 2) px observed, the right one NaN where unseen. words: (N, 4) uint64 descriptors, 0: none.
@@ -123,24 +260,40 @@ def match_near(uv, uv_right, words, predicted, predicted_right, candidate_words,
     second_bits = np.full(n, BITS + 1)
     owner = np.full(c, -1)
     owner_bits = np.full(c, BITS + 1)
+    least, most = np.full(2, np.inf), np.full(2, -np.inf)
     for i in range(n):
-        if words[i, 0] == 0 and words[i, 1] == 0:
+        for k in range(2):
+            if math.isfinite(uv[i, k]):
+                least[k], most[k] = min(least[k], uv[i, k] - radius), max(most[k], uv[i, k] + radius)
+    size = max(radius, 1.0)
+    if not (most[0] - least[0] < MOST_CELLS * size and most[1] - least[1] < MOST_CELLS * size):
+        return best  # nothing was observed, or not in an image
+    columns, rows = int((most[0] - least[0]) / size) + 1, int((most[1] - least[1]) / size) + 1
+    cells = _cells(uv, size, least, columns, rows)
+    starts, members = _by_cell(_cells(predicted, size, least, columns, rows), columns * rows)
+    for i in range(n):
+        if cells[i] < 0 or (words[i, 0] == 0 and words[i, 1] == 0):
             continue
-        for j in range(c):
-            du, dv = uv[i, 0] - predicted[j, 0], uv[i, 1] - predicted[j, 1]
-            if not du * du + dv * dv <= radius * radius:
-                continue
-            if candidate_words[j, 0] == 0 and candidate_words[j, 1] == 0:
-                continue
-            ru, rv = uv_right[i, 0] - predicted_right[j, 0], uv_right[i, 1] - predicted_right[j, 1]
-            if ru * ru + rv * rv > radius * radius:  # False where either is NaN
-                continue
-            bits = hamming(words, i, candidate_words, j)
-            if bits < best_bits[i]:
-                second_bits[i] = best_bits[i]
-                best_bits[i], best[i] = bits, j
-            elif bits < second_bits[i]:
-                second_bits[i] = bits
+        column, line = cells[i] % columns, cells[i] // columns
+        for r in range(max(line - 1, 0), min(line + 2, rows)):
+            for m in range(
+                starts[r * columns + max(column - 1, 0)], starts[r * columns + min(column + 1, columns - 1) + 1]
+            ):
+                j = members[m]
+                du, dv = uv[i, 0] - predicted[j, 0], uv[i, 1] - predicted[j, 1]
+                if not du * du + dv * dv <= radius * radius:
+                    continue
+                if candidate_words[j, 0] == 0 and candidate_words[j, 1] == 0:
+                    continue
+                ru, rv = uv_right[i, 0] - predicted_right[j, 0], uv_right[i, 1] - predicted_right[j, 1]
+                if ru * ru + rv * rv > radius * radius:  # False where either is NaN
+                    continue
+                bits = hamming(words, i, candidate_words, j)
+                if bits < best_bits[i]:
+                    second_bits[i] = best_bits[i]
+                    best_bits[i], best[i] = bits, j
+                elif bits < second_bits[i]:
+                    second_bits[i] = bits
         if best[i] >= 0 and (best_bits[i] > limit or best_bits[i] >= ratio * second_bits[i]):
             best[i] = -1
         j = best[i]

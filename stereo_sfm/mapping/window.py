@@ -55,11 +55,9 @@ def whole_map(map_: Map, config: MapperConfig) -> Window:
 
 def _window(map_: Map, moving: I64, config: MapperConfig) -> Window:
     table, points = map_.observations, map_.points
-    seen = np.concatenate([table.pt[map_.observations_of_keyframe(int(k))] for k in moving])
-    pts = np.unique(seen).astype(np.int64)
+    pts = map_.points_of_keyframes(moving)
     pts = pts[points.alive[pts] & np.isfinite(points.xyz[pts, 0]) & (points.obs_count[pts] > 1)]
-    counts = np.zeros(len(map_.keyframes), np.int64)
-    map_kernels.count_by_keyframe(pts, points.head, table.following, table.kf, counts)
+    counts = map_.count_by_keyframe(pts)
     total, counts[moving] = int(counts.sum()), 0
     kfs = np.concatenate([np.sort(moving), np.flatnonzero(counts)])
     fixed = np.arange(len(kfs)) >= len(moving)
