@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.rig import Rig
-from drivers.sim.source import SimSource
-from drivers.source import open_source
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.sim.source import SimSource
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.cloud import gather, match_guided
 from stereo_sfm.loop.place_view import place_view_of

@@ -17,9 +17,9 @@ one_thread()
 import cv2
 import numpy as np
 
-from drivers.select import SelectedFrames
-from drivers.source import open_source
 from stereo_sfm import config as configuration
+from stereo_sfm.drivers.select import SelectedFrames
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.eval.evaluate import Evaluation, evaluate, length
 from stereo_sfm.eval.record import RunRecord

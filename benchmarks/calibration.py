@@ -14,12 +14,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from calib.rig import Rig
-from calib.solve import Calibration, align_pairs, calibrate
-from calib.targets import Detection, Target
-from calib.views import find_pairs, read_pairs
-from drivers.sim.boards import Faults, render_boards
-from drivers.sim.rigs import make_rig
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calib.solve import Calibration, align_pairs, calibrate
+from stereo_sfm.calib.targets import Detection, Target
+from stereo_sfm.calib.views import find_pairs, read_pairs
+from stereo_sfm.drivers.sim.boards import Faults, render_boards
+from stereo_sfm.drivers.sim.rigs import make_rig
 from stereo_sfm.types import F64
 
 BOARD = Target("charuco", 8, 8, 0.06, 0.75, "DICT_5X5_100")

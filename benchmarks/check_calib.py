@@ -24,11 +24,11 @@ import numpy as np
 
 _sequences.one_thread()
 
-from calib.check import CheckReport, check
-from calib.rectification import rectify
-from calib.rig import Rig
-from calib.tracks import LONGEST, collect, corners_for
-from drivers.source import open_source
+from stereo_sfm.calib.check import CheckReport, check
+from stereo_sfm.calib.rectification import rectify
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calib.tracks import LONGEST, collect, corners_for
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.types import StereoImage

@@ -25,7 +25,7 @@ import resource
 
 import numpy as np
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.bundle import Bundle, BundleConfig, bundle_adjust
 from tests.synthetic import fisheye_rig, points_around, see, walk

@@ -16,10 +16,10 @@ from _sequences import data_root, one_thread
 
 one_thread()
 
-from drivers.memory import MemorySource
-from drivers.select import SelectedFrames
-from drivers.source import Source, open_source
 from stereo_sfm.config import Config
+from stereo_sfm.drivers.memory import MemorySource
+from stereo_sfm.drivers.select import SelectedFrames
+from stereo_sfm.drivers.source import Source, open_source
 from stereo_sfm.eval.evaluate import evaluate, length
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.geometry import se3

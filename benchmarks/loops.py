@@ -23,8 +23,8 @@ one_thread()
 
 import numpy as np
 
-from drivers.source import Source, open_source
 from stereo_sfm.config import Config
+from stereo_sfm.drivers.source import Source, open_source
 from stereo_sfm.eval.evaluate import evaluate
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.geometry import se3

@@ -18,11 +18,11 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from drivers.choice import MadeSource
-from drivers.memory import MemorySource
-from drivers.paced import PacedSource
-from drivers.source import Source, open_source
 from stereo_sfm.config import Config
+from stereo_sfm.drivers.choice import MadeSource
+from stereo_sfm.drivers.memory import MemorySource
+from stereo_sfm.drivers.paced import PacedSource
+from stereo_sfm.drivers.source import Source, open_source
 from stereo_sfm.messages import Health, StageTimes
 from stereo_sfm.pipeline.processes import ProcessRun
 from stereo_sfm.pipeline.workers import LogOptions

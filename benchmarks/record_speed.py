@@ -20,8 +20,8 @@ from tempfile import TemporaryDirectory
 import cv2
 import zstandard
 
-from drivers import Source, open_source
-from drivers.memory import MemorySource
+from stereo_sfm.drivers import Source, open_source
+from stereo_sfm.drivers.memory import MemorySource
 from stereo_sfm.log.images import FORMATS, PNG_OPTIONS
 from stereo_sfm.recording.record import record
 from stereo_sfm.types import U8, StereoImage

@@ -24,10 +24,10 @@ one_thread()
 
 import numpy as np
 
-from drivers.sim.effects import Sensor
-from drivers.sim.source import SimSource
-from drivers.source import open_source
 from stereo_sfm.config import Config
+from stereo_sfm.drivers.sim.effects import Sensor
+from stereo_sfm.drivers.sim.source import SimSource
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.vocabulary_file import default_vocabulary
 from stereo_sfm.mapping.mapper import Mapper

@@ -15,8 +15,8 @@ from _sequences import one_thread, sequences
 
 one_thread()
 
-from drivers.source import open_source
 from stereo_sfm.config import Config
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.eval.evaluate import evaluate, length
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.pipeline.run import run

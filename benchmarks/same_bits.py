@@ -11,9 +11,9 @@ import argparse
 import tempfile
 from pathlib import Path
 
-from drivers.choice import SourceChoice
-from drivers.source import open_source
 from stereo_sfm.config import Config
+from stereo_sfm.drivers.choice import SourceChoice
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.log.diff import diff
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.run_log import RunLog

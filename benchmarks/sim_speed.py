@@ -13,8 +13,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from drivers.sim.source import SimSource
-from drivers.source import open_source
+from stereo_sfm.drivers.sim.source import SimSource
+from stereo_sfm.drivers.source import open_source
 
 SOURCES = ("sim:loop", "sim:people", "sim:identical-aisles", "sim:loop?camera=pinhole", "sim:loop?size=424x400")
 FRAMES, REPEATS = 12, 3

@@ -18,8 +18,8 @@ one_thread()
 import cv2
 import numpy as np
 
-from drivers.source import open_source
 from stereo_sfm.config import Config
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.tracking.factory import make_tracker
 from stereo_sfm.types import StereoImage

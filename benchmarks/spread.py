@@ -18,8 +18,8 @@ one_thread()
 import cv2
 import numpy as np
 
-from drivers.source import open_source
 from stereo_sfm import config as configuration
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.eval.evaluate import evaluate, length
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.pipeline.run import run

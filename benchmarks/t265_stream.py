@@ -12,10 +12,10 @@ import time
 
 import numpy as np
 
-from drivers.source import open_source
-from drivers.t265 import messages as m
-from drivers.t265.simulated.bus import SimulatedBus
-from drivers.t265.simulated.source import SimulatedT265Source
+from stereo_sfm.drivers.source import open_source
+from stereo_sfm.drivers.t265 import messages as m
+from stereo_sfm.drivers.t265.simulated.bus import SimulatedBus
+from stereo_sfm.drivers.t265.simulated.source import SimulatedT265Source
 
 
 def measure(seconds: float, images: str, faults: str, frames: int) -> dict[str, float]:
@@ -64,7 +64,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=60)
     parser.add_argument("--images", default="room", help="room, or a source such as sim:loop")
-    parser.add_argument("--faults", default="none", help="names of drivers.t265.simulated.faults.PRESETS")
+    parser.add_argument("--faults", default="none", help="names of stereo_sfm.drivers.t265.simulated.faults.PRESETS")
     parser.add_argument("--frames", type=int, default=30, help="images made before the start")
     options = parser.parse_args()
     numbers = measure(options.seconds, options.images, options.faults, options.frames)

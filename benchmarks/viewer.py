@@ -21,11 +21,11 @@ one_thread()
 import numpy as np
 import psutil
 
-from drivers.choice import MadeSource
-from drivers.select import SelectedFrames
-from drivers.source import Source, open_source
 from stereo_sfm.config import Config
 from stereo_sfm.demo import demo_recording
+from stereo_sfm.drivers.choice import MadeSource
+from stereo_sfm.drivers.select import SelectedFrames
+from stereo_sfm.drivers.source import Source, open_source
 from stereo_sfm.pipeline.processes import ProcessRun
 from stereo_sfm.pipeline.workers import ViewerOptions
 

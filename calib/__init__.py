@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from calib.formats import load_rig, save_rig
-from calib.rig import Rig
+from stereo_sfm.calib.formats import load_rig, save_rig
+from stereo_sfm.calib.rig import Rig
 
 __all__ = ["Rig", "load_rig", "save_rig"]

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.rig import Rig
-from calib.scene_model import FOCAL, FOCAL_RIGHT, NUISANCE, ROTATION, SHARED, displacement
-from calib.tracks import Window
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calib.scene_model import FOCAL, FOCAL_RIGHT, NUISANCE, ROTATION, SHARED, displacement
+from stereo_sfm.calib.tracks import Window
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.types import F64

@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.amount import FOCAL_BOTH, FOCAL_RATIO, TURN
-from calib.choice import Choice, choose
-from calib.consequences import Consequences, consequences
-from calib.consistency import Correction, estimate
-from calib.rectification import Rectification
-from calib.rig import Rig
-from calib.scene_model import DIRECTION, SKEW
-from calib.tracks import LEAST, Window
+from stereo_sfm.calib.amount import FOCAL_BOTH, FOCAL_RATIO, TURN
+from stereo_sfm.calib.choice import Choice, choose
+from stereo_sfm.calib.consequences import Consequences, consequences
+from stereo_sfm.calib.consistency import Correction, estimate
+from stereo_sfm.calib.rectification import Rectification
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calib.scene_model import DIRECTION, SKEW
+from stereo_sfm.calib.tracks import LEAST, Window
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import F64, I64, Bool
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.rig import Rig
-from calib.scene_model import DIRECTION, FOCAL_RIGHT, ROTATION, SHARED, moved
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calib.scene_model import DIRECTION, FOCAL_RIGHT, ROTATION, SHARED, moved
 from stereo_sfm.types import F64, Bool
 
 TERMS = 6  # turn of the right camera (3), direction of the baseline (2), focal length of the right against the left

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.rig import Rig
-from calib.scene_model import inverse_distances
-from calib.tracks import Window
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calib.scene_model import inverse_distances
+from stereo_sfm.calib.tracks import Window
 from stereo_sfm.types import F64
 
 RANGES = (2.0, 5.0, 20.0)  # metres at which distances are compared

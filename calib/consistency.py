@@ -17,10 +17,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.amount import FOCAL_BOTH, FOCAL_RATIO, TURN, amounts
-from calib.choice import TERMS, Estimate
-from calib.rig import Rig
-from calib.scene_model import (
+from stereo_sfm.calib.amount import FOCAL_BOTH, FOCAL_RATIO, TURN, amounts
+from stereo_sfm.calib.choice import TERMS, Estimate
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calib.scene_model import (
     DIRECTION,
     NUISANCE,
     SHARED,
@@ -32,7 +32,7 @@ from calib.scene_model import (
     part,
     tangents,
 )
-from calib.tracks import Window
+from stereo_sfm.calib.tracks import Window
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, Bool
 
@@ -139,7 +139,7 @@ def _halves(problems: list[Problem]) -> tuple[list[Problem], list[Problem]]:
 
 
 def _terms(fit: _Fit, total: F64) -> Estimate:
-    """What `calib.choice` chooses from."""
+    """What `stereo_sfm.calib.choice` chooses from."""
     by_vector = np.zeros((TERMS, SHARED))
     by_vector[:3], by_vector[5] = total[TURN], total[FOCAL_RATIO]
     by_vector[3:5, DIRECTION] = np.eye(2)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.targets import Detection
+from stereo_sfm.calib.targets import Detection
 from stereo_sfm.types import F64, I64
 
 GRID = (5, 5)  # rows and columns of regions

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, U8, StereoImage
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.rectification import Rectification
+from stereo_sfm.calib.rectification import Rectification
 from stereo_sfm.types import F64, U8, Bool
 
 PATCH = 10  # half size of the correlation patch, px

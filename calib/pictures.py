@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.matches import Matches
+from stereo_sfm.calib.matches import Matches
 from stereo_sfm.types import U8
 
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.check import Finding, Limit, level_of
-from calib.coverage import Coverage
-from calib.solve import Calibration
+from stereo_sfm.calib.check import Finding, Limit, level_of
+from stereo_sfm.calib.coverage import Coverage
+from stereo_sfm.calib.solve import Calibration
 from stereo_sfm.geometry.stereo import epipolar_angle
 from stereo_sfm.types import F64
 

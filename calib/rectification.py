@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError, one_of
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from calib.check import VERDICTS
-from calib.coverage import Coverage
-from calib.matches import Matches
-from calib.pictures import encode_jpeg, side_by_side
-from calib.quality import Quality
-from calib.rectification import rectify
-from calib.solve import Calibration
+from stereo_sfm.calib.check import VERDICTS
+from stereo_sfm.calib.coverage import Coverage
+from stereo_sfm.calib.matches import Matches
+from stereo_sfm.calib.pictures import encode_jpeg, side_by_side
+from stereo_sfm.calib.quality import Quality
+from stereo_sfm.calib.rectification import rectify
+from stereo_sfm.calib.solve import Calibration
 from stereo_sfm.types import F64, U8
 
 _STYLE = """body{font:15px/1.5 sans-serif;max-width:1100px;margin:2em auto;padding:0 1em;color:#222}

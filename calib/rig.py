@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calib.imu import Imu
+from stereo_sfm.calib.imu import Imu
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.types import F64

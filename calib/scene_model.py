@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.rig import Rig
-from calib.tracks import Window
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calib.tracks import Window
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.stereo import rectifying_rotations

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.rig import Rig
-from calib.targets import Detection
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calib.targets import Detection
 from stereo_sfm.errors import StereoSfmError, one_of
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, KannalaBrandt, RadTan

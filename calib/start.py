@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.matches import match_pair
-from calib.rectification import rectify
-from calib.rig import Rig
+from stereo_sfm.calib.matches import match_pair
+from stereo_sfm.calib.rectification import rectify
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import U8, StereoImage

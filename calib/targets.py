@@ -69,7 +69,7 @@ class Target:
 
 def read_target(path: Path) -> Target:
     """A target file with Kalibr's keys (target_type, tagCols, ...) or those of `Target`."""
-    from calib.formats.common import read_yaml, reading
+    from stereo_sfm.calib.formats.common import read_yaml, reading
 
     with reading(path, "target"):
         data = read_yaml(path)

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from calib.matches import Matches, flattened, match_pair, pyramid_flow
-from calib.patches import Patches, Warp, align, cut, smooth, unstretched
-from calib.rectification import Rectification
+from stereo_sfm.calib.matches import Matches, flattened, match_pair, pyramid_flow
+from stereo_sfm.calib.patches import Patches, Warp, align, cut, smooth, unstretched
+from stereo_sfm.calib.rectification import Rectification
 from stereo_sfm.types import F64, U8, Bool, StereoImage
 
 STEP = 0.04  # of the width: a moment is kept when the points moved so far since the last one

@@ -6,8 +6,8 @@ import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from calib.coverage import is_new
-from calib.targets import Detection, Target
+from stereo_sfm.calib.coverage import is_new
+from stereo_sfm.calib.targets import Detection, Target
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import U8, StereoImage
 

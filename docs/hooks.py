@@ -49,8 +49,8 @@ def _configuration() -> str:
 
 
 def _sources() -> str:
-    from drivers.options import described
-    from drivers.registry import drivers
+    from stereo_sfm.drivers.options import described
+    from stereo_sfm.drivers.registry import drivers
 
     found = dict(drivers())
     rows = [f"| `{kind}` | {one.summary} | `{kind}:{one.place}` |" for kind, one in found.items()]

@@ -5,6 +5,6 @@ A source is a context manager that knows its rig before the first frame and yiel
 
 from __future__ import annotations
 
-from drivers.source import BaseSource, Source, open_source
+from stereo_sfm.drivers.source import BaseSource, Source, open_source
 
 __all__ = ["BaseSource", "Source", "open_source"]

@@ -8,19 +8,19 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, Protocol
 
-from drivers.selection import EVERYTHING, Selection
-from drivers.source import is_device, look_up, open_source, path_of
+from stereo_sfm.drivers.selection import EVERYTHING, Selection
+from stereo_sfm.drivers.source import is_device, look_up, open_source, path_of
 from stereo_sfm.errors import StereoSfmError, one_of
 
 if TYPE_CHECKING:
-    from calib.rig import Rig
-    from drivers.rig_option import RigOption
-    from drivers.source import Source
+    from stereo_sfm.calib.rig import Rig
+    from stereo_sfm.drivers.rig_option import RigOption
+    from stereo_sfm.drivers.source import Source
     from stereo_sfm.log.provenance import Opening
 
 P = ParamSpec("P")
 
-# how a user says it -> projection of `calib.rectification`
+# how a user says it -> projection of `stereo_sfm.calib.rectification`
 RECTIFY = {"none": "none", "pinhole": "pinhole", "wide": "epipolar"}
 
 
@@ -145,9 +145,9 @@ class SourceChoice:
             raise StereoSfmError(f"{output} is what is read, or holds it: choose another -o")
 
     def __call__(self) -> Source:
-        from drivers.paced import PacedSource
-        from drivers.rectified import rectified
-        from drivers.select import SelectedFrames
+        from stereo_sfm.drivers.paced import PacedSource
+        from stereo_sfm.drivers.rectified import rectified
+        from stereo_sfm.drivers.select import SelectedFrames
 
         source = open_source(self.spec, self.rig, **self.options)
         if self.selection != EVERYTHING:
@@ -160,7 +160,7 @@ def _loaded(rig: RigOption) -> Rig | None:
     """A calibration as it is, or from a file of any dialect."""
     if not isinstance(rig, str | Path):
         return rig
-    from calib import load_rig
+    from stereo_sfm.calib import load_rig
 
     return load_rig(rig)
 
@@ -182,6 +182,6 @@ class ReplayChoice(SourceChoice):
         return self.recorded_skip
 
     def __call__(self) -> Source:
-        from drivers.replayed import ReplayedSource
+        from stereo_sfm.drivers.replayed import ReplayedSource
 
         return ReplayedSource(super().__call__(), self.frame_ids)

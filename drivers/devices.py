@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from drivers import registry
-from drivers.driver import Attached, Cameras, UsbId
-from drivers.live.errors import DeviceError
+from stereo_sfm.drivers import registry
+from stereo_sfm.drivers.driver import Attached, Cameras, UsbId
+from stereo_sfm.drivers.live.errors import DeviceError
 
 UDEV_FILE = "/etc/udev/rules.d/70-stereo-sfm.rules"  # below 73: 'uaccess' works
 

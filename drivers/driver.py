@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic
 
-from drivers.options import O
+from stereo_sfm.drivers.options import O
 
 if TYPE_CHECKING:
-    from drivers.source import Source
+    from stereo_sfm.drivers.source import Source
 
 
 class Certainty(enum.IntEnum):
@@ -56,7 +56,7 @@ class Cameras:
     Attributes:
         title: of a camera, for people ("T265").
         find: the cameras that are attached; with True, cameras may be started for what they do not tell otherwise.
-            Raises `drivers.live.errors.DeviceError` when it cannot look. None: this driver cannot look.
+            Raises `stereo_sfm.drivers.live.errors.DeviceError` when it cannot look. None: this driver cannot look.
         usb: what users without rights must be let open, for the udev rules.
         without: a source of this kind that needs no camera ("t265:simulated"), "" when there is none.
     """

@@ -12,8 +12,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from calib.rig import Rig
-from drivers.source import BaseSource, Stamps
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.source import BaseSource, Stamps
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.pixels import decode, decode_gray, eight_bits, sensor_bits
 from stereo_sfm.types import F32, U8, U16, ImuSamples, StereoImage, Trajectory

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.ground_truth import stamp_from_seconds
+from stereo_sfm.drivers.ground_truth import stamp_from_seconds
 from stereo_sfm.errors import StereoSfmError
 
 log = logging.getLogger("stereo_sfm")

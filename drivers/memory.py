@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
-from calib.rig import Rig
-from drivers.source import BaseSource
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.source import BaseSource
 from stereo_sfm.types import StereoImage, Trajectory
 
 PERIOD_NS = 33_333_333  # of a repeated walk: 30 Hz

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_or
 from stereo_sfm.errors import StereoSfmError, did_you_mean
 
 if TYPE_CHECKING:
-    from drivers.rig_option import RigOption
+    from stereo_sfm.drivers.rig_option import RigOption
 else:
     RigOption = Any  # annotations are evaluated when options are read: nothing heavy is imported for that
 
@@ -57,7 +57,7 @@ def option(
 class SourceOptions:
     """What every driver takes; a driver's own options inherit from it."""
 
-    rig: RigOption = option(None, "calibration instead of the source's own: a file of any dialect", read=lambda x: x)
+    rig: RigOption = option(None, "calibration instead of the source's own: a file of any dialect", read=lambda x: x)  # noqa: RUF009
 
 
 def read_options(cls: type[O], source: str, given: Mapping[str, Any]) -> O:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 
-from drivers.source import Source
-from drivers.wrapped import WrappedSource
+from stereo_sfm.drivers.source import Source
+from stereo_sfm.drivers.wrapped import WrappedSource
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import StereoImage
 

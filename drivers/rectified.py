@@ -6,10 +6,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Self
 
-from calib.rectification import PROJECTIONS, rectify
-from calib.rig import Rig
-from drivers.source import Source, Stamps
-from drivers.wrapped import WrappedSource
+from stereo_sfm.calib.rectification import PROJECTIONS, rectify
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.source import Source, Stamps
+from stereo_sfm.drivers.wrapped import WrappedSource
 from stereo_sfm.errors import StereoSfmError, one_of
 from stereo_sfm.types import StereoImage, Trajectory
 

@@ -10,14 +10,14 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any
 
-from drivers.driver import Certainty, Driver
+from stereo_sfm.drivers.driver import Certainty, Driver
 from stereo_sfm.errors import StereoSfmError
 
 log = logging.getLogger("stereo_sfm")
 
 GROUP = "stereo_sfm.drivers"
 _OURS = "stereo-sfm"
-_PROJECT = Path(__file__).parents[1] / "pyproject.toml"  # in a checkout; an installed package has none
+_PROJECT = Path(__file__).resolve().parents[1] / "pyproject.toml"  # in a checkout; an installed package has none
 
 
 @functools.cache
@@ -64,7 +64,7 @@ def driver(kind: str) -> Driver[Any]:
     except Exception as error:
         raise StereoSfmError(f"the driver '{kind}' ({entry.value}) cannot be loaded: {error!r}") from error
     if not isinstance(loaded, Driver):
-        raise StereoSfmError(f"the driver '{kind}' ({entry.value}) is no drivers.driver.Driver")
+        raise StereoSfmError(f"the driver '{kind}' ({entry.value}) is no stereo_sfm.drivers.driver.Driver")
     return loaded  # pyright: ignore[reportUnknownVariableType]
 
 

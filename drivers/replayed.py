@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 
-from drivers.source import Source
-from drivers.wrapped import WrappedSource
+from stereo_sfm.drivers.source import Source
+from stereo_sfm.drivers.wrapped import WrappedSource
 from stereo_sfm.types import StereoImage
 
 

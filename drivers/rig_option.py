@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 
 RigOption = str | Path | Rig | None
@@ -40,8 +40,8 @@ def chosen_rig(option: RigOption, own: Callable[[], Rig]) -> Rig:
 
 def _load(path: Path) -> tuple[Rig, bool]:
     """The rig of a file, and whether files of its kind state a readout."""
-    from calib import load_rig
-    from calib.formats import recognise
+    from stereo_sfm.calib import load_rig
+    from stereo_sfm.calib.formats import recognise
 
     path = path.expanduser()
     kind = recognise(path) if path.exists() else None

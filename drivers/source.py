@@ -10,14 +10,14 @@ from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, Any, Protocol, Self
 from urllib.parse import parse_qsl
 
-from drivers import registry
-from drivers.driver import Driver
-from drivers.options import SourceOptions, read_options
+from stereo_sfm.drivers import registry
+from stereo_sfm.drivers.driver import Driver
+from stereo_sfm.drivers.options import SourceOptions, read_options
 from stereo_sfm.errors import StereoSfmError, did_you_mean
 
 if TYPE_CHECKING:
-    from calib.rig import Rig
-    from drivers.rig_option import RigOption
+    from stereo_sfm.calib.rig import Rig
+    from stereo_sfm.drivers.rig_option import RigOption
     from stereo_sfm.types import I64, StereoImage, Trajectory
 
 _NO_COUNTERS: Mapping[str, float] = MappingProxyType({})
@@ -62,7 +62,7 @@ class Source(Protocol):
 
     @property
     def counters(self) -> Mapping[str, float]:
-        """What a live source counts about itself (drivers.live.counters); empty for files."""
+        """What a live source counts about itself (stereo_sfm.drivers.live.counters); empty for files."""
         ...
 
     def stamps(self) -> Stamps | None:

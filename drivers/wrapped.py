@@ -6,8 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from types import TracebackType
 from typing import Self
 
-from calib.rig import Rig
-from drivers.source import Source, Stamps, chosen_frames
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.source import Source, Stamps, chosen_frames
 from stereo_sfm.types import StereoImage, Trajectory
 
 

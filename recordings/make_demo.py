@@ -13,8 +13,8 @@ from pathlib import Path
 
 import cv2
 
-from drivers.sim.source import SimSource
-from drivers.source import open_source
+from stereo_sfm.drivers.sim.source import SimSource
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.log.image_log import ImageLog
 from stereo_sfm.log.images import LoggedImage
 from stereo_sfm.log.provenance import write_provenance

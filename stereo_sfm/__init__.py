@@ -23,13 +23,13 @@ from typing import TYPE_CHECKING, Any
 from stereo_sfm import same_code
 
 if TYPE_CHECKING:
-    from calib.formats import load_rig, save_rig
-    from calib.rig import Rig
-    from drivers.ground_truth import read_trajectory
-    from drivers.source import open_source
+    from stereo_sfm.calib.formats import load_rig, save_rig
+    from stereo_sfm.calib.rig import Rig
     from stereo_sfm.config import Config
     from stereo_sfm.config import load as load_config
     from stereo_sfm.demo import demo_recording
+    from stereo_sfm.drivers.ground_truth import read_trajectory
+    from stereo_sfm.drivers.source import open_source
     from stereo_sfm.errors import StereoSfmError
     from stereo_sfm.eval.evaluate import evaluate
     from stereo_sfm.export.formats import export_map, export_trajectory
@@ -85,7 +85,7 @@ _LAZY: dict[str, tuple[str, str]] = {
     "LoopResult": ("stereo_sfm.types", "LoopResult"),
     "MapLocator": ("stereo_sfm.system", "MapLocator"),
     "MapUpdate": ("stereo_sfm.types", "MapUpdate"),
-    "Rig": ("calib.rig", "Rig"),
+    "Rig": ("stereo_sfm.calib.rig", "Rig"),
     "SavedMap": ("stereo_sfm.maps.saved_map", "SavedMap"),
     "StereoImage": ("stereo_sfm.types", "StereoImage"),
     "StereoSfmError": ("stereo_sfm.errors", "StereoSfmError"),
@@ -99,12 +99,12 @@ _LAZY: dict[str, tuple[str, str]] = {
     "export_trajectory": ("stereo_sfm.export.formats", "export_trajectory"),
     "load_config": ("stereo_sfm.config", "load"),
     "load_map": ("stereo_sfm.maps.saved_map", "load_map"),
-    "load_rig": ("calib.formats", "load_rig"),
-    "open_source": ("drivers.source", "open_source"),
-    "read_trajectory": ("drivers.ground_truth", "read_trajectory"),
+    "load_rig": ("stereo_sfm.calib.formats", "load_rig"),
+    "open_source": ("stereo_sfm.drivers.source", "open_source"),
+    "read_trajectory": ("stereo_sfm.drivers.ground_truth", "read_trajectory"),
     "run": ("stereo_sfm.pipeline.run", "run"),
     "save_map": ("stereo_sfm.maps.saved_map", "save_map"),
-    "save_rig": ("calib.formats", "save_rig"),
+    "save_rig": ("stereo_sfm.calib.formats", "save_rig"),
 }
 
 

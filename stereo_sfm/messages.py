@@ -39,7 +39,7 @@ class LogLine:
 
 @dataclass(frozen=True)
 class SourceCounters:
-    """What a live camera counts about itself (drivers.live.counters), up to a frame; never compared."""
+    """What a live camera counts about itself (stereo_sfm.drivers.live.counters), up to a frame; never compared."""
 
     frame_id: int
     counts: dict[str, float]

@@ -12,10 +12,10 @@ from typing import Any, Self, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.formats import load_rig
-from calib.rig import Rig
-from drivers.memory import MemorySource
+from stereo_sfm.calib.formats import load_rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
+from stereo_sfm.drivers.memory import MemorySource
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.log.map_view import MapView

@@ -7,7 +7,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.mapping.bundle import Bundle

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import stereo_sfm as s
-from drivers.memory import MemorySource
+from stereo_sfm.drivers.memory import MemorySource
 from stereo_sfm.pipeline.door import ImageDoor
 from tests.synthetic import pinhole_rig
 

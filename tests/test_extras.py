@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from drivers.live.errors import NotFound
 from stereo_sfm.cli import main
+from stereo_sfm.drivers.live.errors import NotFound
 from stereo_sfm.errors import StereoSfmError, require
 
 ROOT = Path(__file__).parents[1]

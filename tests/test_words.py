@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from calib.formats import FORMATS, load_rig
-from drivers import open_source
+from stereo_sfm.calib.formats import FORMATS, load_rig
 from stereo_sfm.cli import main
+from stereo_sfm.drivers import open_source
 from stereo_sfm.errors import StereoSfmError, did_you_mean, one_of
 
 

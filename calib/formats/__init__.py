@@ -8,8 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from calib.formats.common import read_text
-from calib.rig import Rig
+from stereo_sfm.calib.formats.common import read_text
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError, one_of
 
 log = logging.getLogger("stereo_sfm")
@@ -109,4 +109,4 @@ def _recognise_file(path: Path) -> str | None:
 
 def _function(name: str, which: int) -> Callable[..., Any]:
     one_of(name, FORMATS, "calibration format")
-    return getattr(importlib.import_module(f"calib.formats.{FORMATS[name][0]}"), str(FORMATS[name][which]))
+    return getattr(importlib.import_module(f"stereo_sfm.calib.formats.{FORMATS[name][0]}"), str(FORMATS[name][which]))

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from calib.formats.common import brown, numbers, padded, pose_dict, read_json, reading, unsupported
-from calib.rig import Rig
+from stereo_sfm.calib.formats.common import brown, numbers, padded, pose_dict, read_json, reading, unsupported
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, KannalaBrandt
 from stereo_sfm.types import F64

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.formats.common import brown, exact_rotation, numbers, padded, unsupported
-from calib.rig import Rig
+from stereo_sfm.calib.formats.common import brown, exact_rotation, numbers, padded, unsupported
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, KannalaBrandt

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.formats.common import brown, numbers, padded, read_text, reading, unsupported
-from calib.rig import Rig
+from stereo_sfm.calib.formats.common import brown, numbers, padded, read_text, reading, unsupported
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, KannalaBrandt

@@ -62,7 +62,7 @@ def yaml_mapping(text: str) -> dict[str, Any]:
     """
     import yaml
 
-    from calib.formats.yaml_loader import CalibrationLoader
+    from stereo_sfm.calib.formats.yaml_loader import CalibrationLoader
 
     if len(text) > MOST_YAML:
         raise ValueError(f"more than {MOST_YAML >> 10} KiB are no calibration")

@@ -8,8 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from calib.formats.common import brown, exact_rotation, numbers, padded, read_json, reading, stereo_only, unsupported
-from calib.rig import Rig
+from stereo_sfm.calib.formats.common import (
+    brown,
+    exact_rotation,
+    numbers,
+    padded,
+    read_json,
+    reading,
+    stereo_only,
+    unsupported,
+)
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, KannalaBrandt
 from stereo_sfm.types import F64

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from calib.formats.common import brown, numbers, padded, read_yaml, reading, rigid, unsupported, write_yaml
-from calib.formats.imu_files import read_imu
-from calib.rig import Rig
+from stereo_sfm.calib.formats.common import brown, numbers, padded, read_yaml, reading, rigid, unsupported, write_yaml
+from stereo_sfm.calib.formats.imu_files import read_imu
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, KannalaBrandt

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from calib.formats.common import MOST_YAML, numbers, read_json, read_text, yaml_mapping
+from stereo_sfm.calib.formats.common import MOST_YAML, numbers, read_json, read_text, yaml_mapping
 
 Storage = dict[str, Any]  # a matrix is a mapping with rows, cols, dt and data
 

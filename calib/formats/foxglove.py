@@ -6,9 +6,16 @@ import json
 from pathlib import Path
 from typing import Any
 
-from calib.formats.camera_info import CameraInfo, check_pair, info_from_rows, info_rows, infos_from_rig, rig_from_infos
-from calib.formats.common import read_json, reading
-from calib.rig import Rig
+from stereo_sfm.calib.formats.camera_info import (
+    CameraInfo,
+    check_pair,
+    info_from_rows,
+    info_rows,
+    infos_from_rig,
+    rig_from_infos,
+)
+from stereo_sfm.calib.formats.common import read_json, reading
+from stereo_sfm.calib.rig import Rig
 
 
 def read_foxglove(path: Path | str) -> Rig:

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from calib.formats.common import numbers, read_yaml, reading, rigid, rows
-from calib.imu import Imu
+from stereo_sfm.calib.formats.common import numbers, read_yaml, reading, rigid, rows
+from stereo_sfm.calib.imu import Imu
 from stereo_sfm.types import F64
 
 _NOISE = {  # ours -> EuRoC's and Kalibr's

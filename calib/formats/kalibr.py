@@ -7,9 +7,19 @@ from typing import Any
 
 import numpy as np
 
-from calib.formats.common import brown, numbers, padded, read_yaml, reading, rigid, rows, unsupported, write_yaml
-from calib.formats.imu_files import read_imu
-from calib.rig import Rig
+from stereo_sfm.calib.formats.common import (
+    brown,
+    numbers,
+    padded,
+    read_yaml,
+    reading,
+    rigid,
+    rows,
+    unsupported,
+    write_yaml,
+)
+from stereo_sfm.calib.formats.imu_files import read_imu
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, KannalaBrandt

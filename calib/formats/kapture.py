@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.formats.colmap import colmap_camera, colmap_params
-from calib.formats.common import numbers, read_text, reading
-from calib.rig import Rig
+from stereo_sfm.calib.formats.colmap import colmap_camera, colmap_params
+from stereo_sfm.calib.formats.common import numbers, read_text, reading
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.types import F64

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.formats.common import numbers, read_text, reading, stereo_only
-from calib.rig import Rig
+from stereo_sfm.calib.formats.common import numbers, read_text, reading, stereo_only
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Pinhole

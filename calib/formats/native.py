@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from calib.formats.common import numbers, read_text, reading, rigid, rows, yaml_mapping, yaml_text
-from calib.formats.imu_files import imu_from_plain, imu_to_plain
-from calib.rig import Rig
+from stereo_sfm.calib.formats.common import numbers, read_text, reading, rigid, rows, yaml_mapping, yaml_text
+from stereo_sfm.calib.formats.imu_files import imu_from_plain, imu_to_plain
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry.cameras import MODELS, Camera
 
 KEY = "stereo_sfm_rig"

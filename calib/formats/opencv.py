@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from calib.formats.common import brown, exact_rotation, numbers, padded, reading, unsupported
-from calib.formats.file_storage import matrix, read_storage
-from calib.rig import Rig
+from stereo_sfm.calib.formats.common import brown, exact_rotation, numbers, padded, reading, unsupported
+from stereo_sfm.calib.formats.file_storage import matrix, read_storage
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, KannalaBrandt
 from stereo_sfm.types import F64

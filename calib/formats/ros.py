@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from calib.formats.camera_info import CameraInfo, info_from_rows, info_rows, infos_from_rig, rig_from_infos
-from calib.formats.common import read_yaml, reading, write_yaml
-from calib.rig import Rig
+from stereo_sfm.calib.formats.camera_info import CameraInfo, info_from_rows, info_rows, infos_from_rig, rig_from_infos
+from stereo_sfm.calib.formats.common import read_yaml, reading, write_yaml
+from stereo_sfm.calib.rig import Rig
 
 _PARTNERS = (("left", "right"), ("cam0", "cam1"), ("camera0", "camera1"), ("fisheye1", "fisheye2"))
 

@@ -1,25 +1,25 @@
-"""EuRoC and TUM VI as kinds of sources; `drivers.euroc.source` reads both."""
+"""EuRoC and TUM VI as kinds of sources; `stereo_sfm.drivers.euroc.source` reads both."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drivers.driver import Certainty, Driver
-from drivers.options import SourceOptions
+from stereo_sfm.drivers.driver import Certainty, Driver
+from stereo_sfm.drivers.options import SourceOptions
 
 if TYPE_CHECKING:
-    from drivers.source import Source
+    from stereo_sfm.drivers.source import Source
 
 
 def _open_euroc(place: str, options: SourceOptions) -> Source:
-    from drivers.euroc.source import open_euroc
+    from stereo_sfm.drivers.euroc.source import open_euroc
 
     return open_euroc(place, options)
 
 
 def _open_tum_vi(place: str, options: SourceOptions) -> Source:
-    from drivers.euroc.source import open_tum_vi
+    from stereo_sfm.drivers.euroc.source import open_tum_vi
 
     return open_tum_vi(place, options)
 

@@ -11,15 +11,15 @@ import csv
 from dataclasses import replace
 from pathlib import Path
 
-from calib.formats.euroc import read_euroc as read_rig
-from calib.formats.kalibr import read_kalibr
-from calib.rig import Rig
-from drivers.folder_source import FolderSource, Shot, folder_of, need
-from drivers.ground_truth import moved, read_euroc
-from drivers.image_lists import Listing, pair_listings
-from drivers.imu_table import read_imu_samples
-from drivers.options import SourceOptions
-from drivers.rig_option import chosen_rig
+from stereo_sfm.calib.formats.euroc import read_euroc as read_rig
+from stereo_sfm.calib.formats.kalibr import read_kalibr
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.folder_source import FolderSource, Shot, folder_of, need
+from stereo_sfm.drivers.ground_truth import moved, read_euroc
+from stereo_sfm.drivers.image_lists import Listing, pair_listings
+from stereo_sfm.drivers.imu_table import read_imu_samples
+from stereo_sfm.drivers.options import SourceOptions
+from stereo_sfm.drivers.rig_option import chosen_rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import ImuSamples, Trajectory
 

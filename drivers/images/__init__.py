@@ -1,4 +1,4 @@
-"""Two folders of images as a kind of source; `drivers.images.source` reads them."""
+"""Two folders of images as a kind of source; `stereo_sfm.drivers.images.source` reads them."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drivers.driver import Certainty, Driver
-from drivers.options import SourceOptions, option
+from stereo_sfm.drivers.driver import Certainty, Driver
+from stereo_sfm.drivers.options import SourceOptions, option
 
 if TYPE_CHECKING:
-    from drivers.source import Source
+    from stereo_sfm.drivers.source import Source
 
 
 @dataclass(frozen=True)
@@ -21,13 +21,13 @@ class ImagesOptions(SourceOptions):
 
 
 def _open(place: str, options: ImagesOptions) -> Source:
-    from drivers.images.source import open_images
+    from stereo_sfm.drivers.images.source import open_images
 
     return open_images(place, options)
 
 
 def _recognise(path: Path) -> Certainty:
-    from drivers.images.source import find_pair
+    from stereo_sfm.drivers.images.source import find_pair
 
     return Certainty.PERHAPS if path.is_dir() and find_pair(path) is not None else Certainty.NO
 

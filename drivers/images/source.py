@@ -9,10 +9,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from calib.rig import Rig
-from drivers.folder_source import FolderSource, Shot, folder_of
-from drivers.ground_truth import read_trajectory
-from drivers.image_lists import (
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.folder_source import FolderSource, Shot, folder_of
+from stereo_sfm.drivers.ground_truth import read_trajectory
+from stereo_sfm.drivers.image_lists import (
     IMAGE_SUFFIXES,
     frame_numbers,
     lines_of,
@@ -21,11 +21,11 @@ from drivers.image_lists import (
     stamp_from_text,
     stamp_of,
 )
-from drivers.rig_option import chosen_rig
+from stereo_sfm.drivers.rig_option import chosen_rig
 from stereo_sfm.errors import StereoSfmError
 
 if TYPE_CHECKING:
-    from drivers.images import ImagesOptions
+    from stereo_sfm.drivers.images import ImagesOptions
 
 # folder names of the two eyes; the first two are also file name prefixes in one folder
 PAIRS = (("left", "right"), ("cam0", "cam1"), ("image_0", "image_1"), ("image_2", "image_3"), ("infra1", "infra2"))
@@ -87,7 +87,7 @@ def _has_images(folder: Path) -> bool:
 
 
 def _own_rig(folder: Path) -> Rig:
-    from calib import load_rig
+    from stereo_sfm.calib import load_rig
 
     candidates = [folder / f"{name}{suffix}" for name in RIG_NAMES for suffix in RIG_SUFFIXES]
     path = next((p for p in candidates if p.is_file()), None)

@@ -1,19 +1,19 @@
-"""kapture folders as a kind of source; `drivers.kapture.source` reads them."""
+"""kapture folders as a kind of source; `stereo_sfm.drivers.kapture.source` reads them."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drivers.driver import Certainty, Driver
-from drivers.options import SourceOptions
+from stereo_sfm.drivers.driver import Certainty, Driver
+from stereo_sfm.drivers.options import SourceOptions
 
 if TYPE_CHECKING:
-    from drivers.source import Source
+    from stereo_sfm.drivers.source import Source
 
 
 def _open(place: str, options: SourceOptions) -> Source:
-    from drivers.kapture.source import open_kapture
+    from stereo_sfm.drivers.kapture.source import open_kapture
 
     return open_kapture(place, options)
 

@@ -10,14 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.eye_rotation import align_eyes
-from calib.formats.kapture import read_kapture, read_kapture_cameras
-from calib.rig import Rig
-from drivers.folder_source import FolderSource, Shot, folder_of, need
-from drivers.image_lists import Listing, list_images, pair_listings
-from drivers.options import SourceOptions
-from drivers.rig_option import chosen_rig
-from drivers.select import SelectedFrames
+from stereo_sfm.calib.eye_rotation import align_eyes
+from stereo_sfm.calib.formats.kapture import read_kapture, read_kapture_cameras
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.folder_source import FolderSource, Shot, folder_of, need
+from stereo_sfm.drivers.image_lists import Listing, list_images, pair_listings
+from stereo_sfm.drivers.options import SourceOptions
+from stereo_sfm.drivers.rig_option import chosen_rig
+from stereo_sfm.drivers.select import SelectedFrames
 from stereo_sfm.errors import StereoSfmError
 
 log = logging.getLogger("stereo_sfm")

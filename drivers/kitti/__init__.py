@@ -1,4 +1,4 @@
-"""KITTI odometry as a kind of source; `drivers.kitti.source` reads it."""
+"""KITTI odometry as a kind of source; `stereo_sfm.drivers.kitti.source` reads it."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drivers.driver import Certainty, Driver
-from drivers.options import SourceOptions, option
+from stereo_sfm.drivers.driver import Certainty, Driver
+from stereo_sfm.drivers.options import SourceOptions, option
 
 if TYPE_CHECKING:
-    from drivers.source import Source
+    from stereo_sfm.drivers.source import Source
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class KittiOptions(SourceOptions):
 
 
 def _open(place: str, options: KittiOptions) -> Source:
-    from drivers.kitti.source import open_kitti
+    from stereo_sfm.drivers.kitti.source import open_kitti
 
     return open_kitti(place, options)
 

@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib.formats.kitti import read_kitti as read_rig
-from drivers.folder_source import FolderSource, Shot, folder_of, need
-from drivers.ground_truth import moved, read_kitti, stamp_from_seconds
-from drivers.image_lists import lines_of, list_images, pair_files
-from drivers.rig_option import chosen_rig
+from stereo_sfm.calib.formats.kitti import read_kitti as read_rig
+from stereo_sfm.drivers.folder_source import FolderSource, Shot, folder_of, need
+from stereo_sfm.drivers.ground_truth import moved, read_kitti, stamp_from_seconds
+from stereo_sfm.drivers.image_lists import lines_of, list_images, pair_files
+from stereo_sfm.drivers.rig_option import chosen_rig
 from stereo_sfm.errors import StereoSfmError
 
 if TYPE_CHECKING:
-    from drivers.kitti import KittiOptions
+    from stereo_sfm.drivers.kitti import KittiOptions
 
 log = logging.getLogger("stereo_sfm")
 

@@ -1,4 +1,4 @@
-"""KITTI raw data as a kind of source; `drivers.kitti_raw.source` reads it."""
+"""KITTI raw data as a kind of source; `stereo_sfm.drivers.kitti_raw.source` reads it."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drivers.driver import Certainty, Driver
-from drivers.options import SourceOptions, option
+from stereo_sfm.drivers.driver import Certainty, Driver
+from stereo_sfm.drivers.options import SourceOptions, option
 
 if TYPE_CHECKING:
-    from drivers.source import Source
+    from stereo_sfm.drivers.source import Source
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class KittiRawOptions(SourceOptions):
 
 
 def _open(place: str, options: KittiRawOptions) -> Source:
-    from drivers.kitti_raw.source import open_kitti_raw
+    from stereo_sfm.drivers.kitti_raw.source import open_kitti_raw
 
     return open_kitti_raw(place, options)
 

@@ -13,17 +13,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib.formats.kitti import read_kitti as read_rig
-from drivers.folder_source import FolderSource, Shot, folder_of, need
-from drivers.ground_truth import moved
-from drivers.image_lists import lines_of, list_images, pair_files
-from drivers.rig_option import chosen_rig
+from stereo_sfm.calib.formats.kitti import read_kitti as read_rig
+from stereo_sfm.drivers.folder_source import FolderSource, Shot, folder_of, need
+from stereo_sfm.drivers.ground_truth import moved
+from stereo_sfm.drivers.image_lists import lines_of, list_images, pair_files
+from stereo_sfm.drivers.rig_option import chosen_rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, Trajectory
 
 if TYPE_CHECKING:
-    from drivers.kitti_raw import KittiRawOptions
+    from stereo_sfm.drivers.kitti_raw import KittiRawOptions
 
 log = logging.getLogger("stereo_sfm")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-from drivers.live.counters import Counters
+from stereo_sfm.drivers.live.counters import Counters
 from stereo_sfm.types import U8
 
 LEFT, RIGHT = 0, 1

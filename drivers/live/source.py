@@ -9,13 +9,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
-from drivers.live.buffers import Handoff, MotionBuffer, WheelBuffer
-from drivers.live.clock import ClockMap, TimeLine
-from drivers.live.counters import TROUBLE, Counters
-from drivers.live.errors import DeviceError, DeviceLost, FirmwareMissing
-from drivers.live.pairing import Pair, periods
-from drivers.rig_option import RigOption, chosen_rig
-from drivers.source import BaseSource
+from stereo_sfm.drivers.live.buffers import Handoff, MotionBuffer, WheelBuffer
+from stereo_sfm.drivers.live.clock import ClockMap, TimeLine
+from stereo_sfm.drivers.live.counters import TROUBLE, Counters
+from stereo_sfm.drivers.live.errors import DeviceError, DeviceLost, FirmwareMissing
+from stereo_sfm.drivers.live.pairing import Pair, periods
+from stereo_sfm.drivers.rig_option import RigOption, chosen_rig
+from stereo_sfm.drivers.source import BaseSource
 from stereo_sfm.types import ImuSamples, StereoImage
 
 logger = logging.getLogger("stereo_sfm")
@@ -55,7 +55,7 @@ class LiveSource(BaseSource):
     What happens when something goes wrong: images that are lost are counted in `dropped_before` of the next one; a
     camera that stalls is restarted, then reset; one that is unplugged is waited for. Each restart begins a new
     segment: frame ids continue, stamps continue on the first segment's clock. When it does not come back, iteration
-    raises DeviceLost after the last image. `counters` (names: drivers.live.counters.COUNTERS) has the sums.
+    raises DeviceLost after the last image. `counters` (names: stereo_sfm.drivers.live.counters.COUNTERS) has the sums.
 
     Args:
         name: of the source.

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drivers.driver import Certainty, Driver
-from drivers.options import SourceOptions, option
+from stereo_sfm.drivers.driver import Certainty, Driver
+from stereo_sfm.drivers.options import SourceOptions, option
 
 if TYPE_CHECKING:
-    from drivers.source import Source
+    from stereo_sfm.drivers.source import Source
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class McapOptions(SourceOptions):
 
 
 def _open(place: str, options: McapOptions) -> Source:
-    from drivers.mcap.source import open_mcap
+    from stereo_sfm.drivers.mcap.source import open_mcap
 
     return open_mcap(place, options)
 

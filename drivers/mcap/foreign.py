@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from calib.rig import Rig
-from drivers.folder_source import SAMPLED
-from drivers.mcap.messages import (
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.folder_source import SAMPLED
+from stereo_sfm.drivers.mcap.messages import (
     BAD_MESSAGE,
     CAMERAS,
     IMUS,
@@ -26,11 +26,11 @@ from drivers.mcap.messages import (
     Transform,
     schema_name,
 )
-from drivers.mcap.rig import camera_of, chain, stereo_rig
-from drivers.mcap.topics import camera_topic, choose_topics, is_rectified
-from drivers.rig_option import RigOption, chosen_rig
-from drivers.source import BaseSource, Stamps
-from drivers.tum_rgbd.source import with_virtual_eye
+from stereo_sfm.drivers.mcap.rig import camera_of, chain, stereo_rig
+from stereo_sfm.drivers.mcap.topics import camera_topic, choose_topics, is_rectified
+from stereo_sfm.drivers.rig_option import RigOption, chosen_rig
+from stereo_sfm.drivers.source import BaseSource, Stamps
+from stereo_sfm.drivers.tum_rgbd.source import with_virtual_eye
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log.reader import LogReader, Record
 from stereo_sfm.pixels import eight_bits, sensor_bits

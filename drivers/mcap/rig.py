@@ -7,9 +7,9 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from calib.formats.common import brown
-from calib.rig import Rig
-from drivers.mcap.messages import CameraInfo, Transform
+from stereo_sfm.calib.formats.common import brown
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.mcap.messages import CameraInfo, Transform
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, KannalaBrandt, Pinhole

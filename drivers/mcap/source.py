@@ -1,4 +1,4 @@
-"""MCAP files as a source: our own recordings to the bit; `drivers.mcap.foreign` reads what others wrote."""
+"""MCAP files as a source: our own recordings to the bit; `stereo_sfm.drivers.mcap.foreign` reads what others wrote."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
 
-from calib.rig import Rig
-from drivers.folder_source import SHOWN_WARNINGS
-from drivers.rig_option import RigOption, chosen_rig
-from drivers.source import BaseSource, Source, Stamps
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.folder_source import SHOWN_WARNINGS
+from stereo_sfm.drivers.rig_option import RigOption, chosen_rig
+from stereo_sfm.drivers.source import BaseSource, Source, Stamps
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log import images, schema, topics
 from stereo_sfm.log.attached import attached_rig, attached_truth
@@ -27,7 +27,7 @@ from stereo_sfm.pixels import eight_bits
 from stereo_sfm.types import F32, U8, ImuSamples, StereoImage, WheelSamples
 
 if TYPE_CHECKING:
-    from drivers.mcap import McapOptions
+    from stereo_sfm.drivers.mcap import McapOptions
 
 log = logging.getLogger("stereo_sfm")
 
@@ -63,7 +63,7 @@ def open_mcap(path: str, options: McapOptions) -> Source:
         about = reader.metadata(METADATA)
         if about.get("image_format") == "none":
             raise StereoSfmError(f"{path} is a run without its images: they are in {about.get('source')}")
-        from drivers.mcap.foreign import ForeignMcapSource
+        from stereo_sfm.drivers.mcap.foreign import ForeignMcapSource
 
         return ForeignMcapSource(reader, options.rig, options.left, options.right, options.depth)
     except BaseException:

@@ -6,7 +6,7 @@ import logging
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 
-from drivers.mcap.messages import CAMERAS, ENCODINGS, IMUS, PICTURES, POSES, TRANSFORMS
+from stereo_sfm.drivers.mcap.messages import CAMERAS, ENCODINGS, IMUS, PICTURES, POSES, TRANSFORMS
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log.reader import LogReader, TopicInfo
 

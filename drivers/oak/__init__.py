@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
-from drivers.driver import Attached, Cameras, Driver, UsbId
-from drivers.options import SourceOptions, option
+from stereo_sfm.drivers.driver import Attached, Cameras, Driver, UsbId
+from stereo_sfm.drivers.options import SourceOptions, option
 
 if TYPE_CHECKING:
-    from drivers.source import Source
+    from stereo_sfm.drivers.source import Source
 
 
 def _size(value: Any) -> tuple[int, int]:
@@ -37,13 +37,13 @@ class OakOptions(SourceOptions):
 
 
 def _open(place: str, options: OakOptions) -> Source:
-    from drivers.oak.source import open_oak
+    from stereo_sfm.drivers.oak.source import open_oak
 
     return open_oak(place, options)
 
 
 def _find(probe: bool) -> Sequence[Attached]:
-    from drivers.oak.attached import find_all
+    from stereo_sfm.drivers.oak.attached import find_all
 
     return find_all(probe)
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from drivers.driver import Attached
-from drivers.oak import library
+from stereo_sfm.drivers.driver import Attached
+from stereo_sfm.drivers.oak import library
 
 
 def find_all(probe: bool) -> list[Attached]:

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from calib.imu import Imu
-from calib.rig import Rig
-from drivers.live.errors import DeviceFault
+from stereo_sfm.calib.imu import Imu
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.live.errors import DeviceFault
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, KannalaBrandt, RadTan
 from stereo_sfm.types import F64

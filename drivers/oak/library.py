@@ -7,7 +7,7 @@ import os
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.live.errors import Busy, DeviceError, DeviceFault, DeviceLost, NoPermission, NotFound
+from stereo_sfm.drivers.live.errors import Busy, DeviceError, DeviceFault, DeviceLost, NoPermission, NotFound
 
 # Read by depthai when it is imported. Since 3.7 it reports every import and pipeline to its maker unless told not to,
 # and it posts the camera's crash dumps. What the user has set stays.
@@ -85,7 +85,7 @@ _USB_VENDOR, _USB_PRODUCTS = 0x03E7, (0x2485, 0xF63B, 0xF63C, 0xF63D)
 
 def on_usb() -> bool:
     """Whether an OAK is on the USB bus: a look of milliseconds, before depthai takes its second."""
-    from drivers.t265.usb_device import default_backend
+    from stereo_sfm.drivers.t265.usb_device import default_backend
 
     try:
         backend = default_backend()

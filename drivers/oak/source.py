@@ -7,14 +7,14 @@ import logging
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from drivers.live.errors import NotFound, TooSlowLink
-from drivers.live.source import LiveSource, Patience, with_rig
-from drivers.oak.calibration import read_calibration
-from drivers.oak.library import NO_OAK, choose, device_error, find, load, on_usb
-from drivers.oak.stream import OakStream
+from stereo_sfm.drivers.live.errors import NotFound, TooSlowLink
+from stereo_sfm.drivers.live.source import LiveSource, Patience, with_rig
+from stereo_sfm.drivers.oak.calibration import read_calibration
+from stereo_sfm.drivers.oak.library import NO_OAK, choose, device_error, find, load, on_usb
+from stereo_sfm.drivers.oak.stream import OakStream
 
 if TYPE_CHECKING:
-    from drivers.oak import OakOptions
+    from stereo_sfm.drivers.oak import OakOptions
 
 logger = logging.getLogger("stereo_sfm")
 

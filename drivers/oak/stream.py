@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from drivers.live.buffers import Handoff, MotionBuffer
-from drivers.live.clock import ClockMap
-from drivers.live.counters import Counters
-from drivers.live.errors import DeviceLost
-from drivers.live.pairing import LEFT, RIGHT, Eye, Pair, Pairer
-from drivers.oak.library import device_error
+from stereo_sfm.drivers.live.buffers import Handoff, MotionBuffer
+from stereo_sfm.drivers.live.clock import ClockMap
+from stereo_sfm.drivers.live.counters import Counters
+from stereo_sfm.drivers.live.errors import DeviceLost
+from stereo_sfm.drivers.live.pairing import LEFT, RIGHT, Eye, Pair, Pairer
+from stereo_sfm.drivers.oak.library import device_error
 
 _WAIT = timedelta(milliseconds=200)
 _MAX_EXPOSURE_US = 1_000_000

@@ -1,23 +1,23 @@
-"""The simulated store as a kind of source; `drivers.sim.source` renders it."""
+"""The simulated store as a kind of source; `stereo_sfm.drivers.sim.source` renders it."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from drivers.driver import Driver
-from drivers.sim.options import SimOptions
+from stereo_sfm.drivers.driver import Driver
+from stereo_sfm.drivers.sim.options import SimOptions
 from stereo_sfm.errors import one_of
 
 if TYPE_CHECKING:
-    from drivers.source import Source
+    from stereo_sfm.drivers.source import Source
 
-# what `sim:` can show; the plans are in drivers.sim.scenes
+# what `sim:` can show; the plans are in stereo_sfm.drivers.sim.scenes
 SCENES = ("aisle", "loop", "identical-aisles", "people", "dark", "blank", "demo", "big")
 DEFAULT = "loop"
 
 
 def _open(place: str, options: SimOptions) -> Source:
-    from drivers.sim.source import open_sim
+    from stereo_sfm.drivers.sim.source import open_sim
 
     return open_sim(place or DEFAULT, options)
 

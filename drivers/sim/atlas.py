@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from drivers.sim.kernels import njit
+from stereo_sfm.drivers.sim.kernels import njit
 from stereo_sfm.types import F32, F64, I64, U8
 
 

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from calib.rig import Rig
-from calib.targets import Target, charuco_board
-from drivers.sim.effects import CLEAN, Effects, Sensor
-from drivers.sim.render import NOTHING, Renderer
-from drivers.sim.targets import Target as Picture
-from drivers.sim.targets import empty_room, move, place
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calib.targets import Target, charuco_board
+from stereo_sfm.drivers.sim.effects import CLEAN, Effects, Sensor
+from stereo_sfm.drivers.sim.render import NOTHING, Renderer
+from stereo_sfm.drivers.sim.targets import Target as Picture
+from stereo_sfm.drivers.sim.targets import empty_room, move, place
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, U8

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import math
 
-from drivers.sim import kernels
-from drivers.sim.kernels import njit_finite
-from drivers.sim.shading import shade
+from stereo_sfm.drivers.sim import kernels
+from stereo_sfm.drivers.sim.kernels import njit_finite
+from stereo_sfm.drivers.sim.shading import shade
 
 
 @njit_finite

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from drivers.sim.kernels import njit
-from drivers.sim.render import Eye, View
+from stereo_sfm.drivers.sim.kernels import njit
+from stereo_sfm.drivers.sim.render import Eye, View
 from stereo_sfm.types import F32, F64, U8
 
 

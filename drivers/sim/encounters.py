@@ -13,9 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.sim.people import Looks, Part, Thing, standing
-from drivers.sim.walks import Walk
-from drivers.sim.world import CLOTHES, SKIN
+from stereo_sfm.drivers.sim.people import Looks, Part, Thing, standing
+from stereo_sfm.drivers.sim.walks import Walk
+from stereo_sfm.drivers.sim.world import CLOTHES, SKIN
 from stereo_sfm.errors import one_of
 from stereo_sfm.types import F64
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from drivers.options import SourceOptions, option
+from stereo_sfm.drivers.options import SourceOptions, option
 
 
 def _size(value: Any) -> tuple[int, int] | None:

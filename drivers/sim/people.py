@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.sim.render import NOTHING, Moving
-from drivers.sim.tables import Tables
-from drivers.sim.world import CLOTHES, HAIR, SKIN
+from stereo_sfm.drivers.sim.render import NOTHING, Moving
+from stereo_sfm.drivers.sim.tables import Tables
+from stereo_sfm.drivers.sim.world import CLOTHES, HAIR, SKIN
 from stereo_sfm.types import F64
 
 Part = tuple[F64, F64, float, int]  # an ellipsoid: centre (3,), half sizes (3,), lean (radians about y), cloth

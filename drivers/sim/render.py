@@ -8,10 +8,10 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from calib.rig import Rig
-from drivers.sim.casting import cast, find_edges
-from drivers.sim.kernels import TARGET
-from drivers.sim.tables import Tables
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.sim.casting import cast, find_edges
+from stereo_sfm.drivers.sim.kernels import TARGET
+from stereo_sfm.drivers.sim.tables import Tables
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.types import F32, F64, I32, I64
 

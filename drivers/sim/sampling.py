@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from drivers.sim.kernels import njit_finite
+from stereo_sfm.drivers.sim.kernels import njit_finite
 
 
 @njit_finite

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from drivers.sim.effects import Effects
-from drivers.sim.people import Looks, Person
-from drivers.sim.walks import FORWARD, Gait
-from drivers.sim.world import CLOTHES, HAIR, Layout
+from stereo_sfm.drivers.sim.effects import Effects
+from stereo_sfm.drivers.sim.people import Looks, Person
+from stereo_sfm.drivers.sim.walks import FORWARD, Gait
+from stereo_sfm.drivers.sim.world import CLOTHES, HAIR, Layout
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import math
 
-from drivers.sim import kernels
-from drivers.sim.kernels import (
+from stereo_sfm.drivers.sim import kernels
+from stereo_sfm.drivers.sim.kernels import (
     BACK,
     BLOCK,
     BOARD,
@@ -23,7 +23,7 @@ from drivers.sim.kernels import (
     njit_finite,
     to_shelf,
 )
-from drivers.sim.sampling import over_plane, sample
+from stereo_sfm.drivers.sim.sampling import over_plane, sample
 
 
 @njit_finite

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.sim import labels
-from drivers.sim.atlas import Atlas
-from drivers.sim.kernels import BIN, SHELF
-from drivers.sim.tables import Builder
+from stereo_sfm.drivers.sim import labels
+from stereo_sfm.drivers.sim.atlas import Atlas
+from stereo_sfm.drivers.sim.kernels import BIN, SHELF
+from stereo_sfm.drivers.sim.tables import Builder
 
 
 @dataclass(frozen=True)

@@ -9,19 +9,19 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from drivers.rig_option import chosen_rig
-from drivers.sim.effects import CLEAN, Effects, Sensor, brightness
-from drivers.sim.encounters import plan, present
-from drivers.sim.kernels import PERSON
-from drivers.sim.options import SimOptions
-from drivers.sim.people import crowd_at, moving
-from drivers.sim.render import Renderer, View
-from drivers.sim.rigs import make_rig
-from drivers.sim.scenes import SCENES, Scene, crowd
-from drivers.sim.tables import Tables
-from drivers.sim.walks import Walk
-from drivers.sim.world import Layout, build_world
-from drivers.source import BaseSource, Stamps
+from stereo_sfm.drivers.rig_option import chosen_rig
+from stereo_sfm.drivers.sim.effects import CLEAN, Effects, Sensor, brightness
+from stereo_sfm.drivers.sim.encounters import plan, present
+from stereo_sfm.drivers.sim.kernels import PERSON
+from stereo_sfm.drivers.sim.options import SimOptions
+from stereo_sfm.drivers.sim.people import crowd_at, moving
+from stereo_sfm.drivers.sim.render import Renderer, View
+from stereo_sfm.drivers.sim.rigs import make_rig
+from stereo_sfm.drivers.sim.scenes import SCENES, Scene, crowd
+from stereo_sfm.drivers.sim.tables import Tables
+from stereo_sfm.drivers.sim.walks import Walk
+from stereo_sfm.drivers.sim.world import Layout, build_world
+from stereo_sfm.drivers.source import BaseSource, Stamps
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, StereoImage, Trajectory
@@ -53,7 +53,7 @@ def _noise_key(seed: int, frame_id: int, eye: int) -> int:
 
 
 class SimSource(BaseSource):
-    """A source (drivers.source.Source) whose every frame can also be rendered alone, to the same bits."""
+    """A source (stereo_sfm.drivers.source.Source) whose every frame can also be rendered alone, to the same bits."""
 
     def __init__(self, name: str, scene: Scene, options: SimOptions) -> None:
         self.name = f"sim:{name}"
@@ -191,7 +191,7 @@ class SimSource(BaseSource):
 
 
 def open_sim(scene: str, options: SimOptions) -> SimSource:
-    """Open `sim:SCENE`; `drivers.sim.SCENES` names the scenes.
+    """Open `sim:SCENE`; `stereo_sfm.drivers.sim.SCENES` names the scenes.
 
     Raises:
         StereoSfmError: options that do not go together.

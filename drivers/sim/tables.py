@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drivers.sim.atlas import Atlas
-from drivers.sim.kernels import SOLID
+from stereo_sfm.drivers.sim.atlas import Atlas
+from stereo_sfm.drivers.sim.kernels import SOLID
 from stereo_sfm.types import F64, I64, U8
 
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.sim import textures
-from drivers.sim.atlas import Atlas
-from drivers.sim.render import NOTHING, Moving
-from drivers.sim.tables import Tables, make_tables
+from stereo_sfm.drivers.sim import textures
+from stereo_sfm.drivers.sim.atlas import Atlas
+from stereo_sfm.drivers.sim.render import NOTHING, Moving
+from stereo_sfm.drivers.sim.tables import Tables, make_tables
 from stereo_sfm.types import F64, U8
 
 

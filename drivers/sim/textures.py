@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from drivers.sim.drawing import FONTS, background, barcode, cloud, finish, logo, put_word, small_print, word
+from stereo_sfm.drivers.sim.drawing import FONTS, background, barcode, cloud, finish, logo, put_word, small_print, word
 from stereo_sfm.types import U8
 
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.sim import textures
-from drivers.sim.shelves import Shop, add_shelf, board_heights, make_products
-from drivers.sim.tables import Builder, Tables, make_tables
+from stereo_sfm.drivers.sim import textures
+from stereo_sfm.drivers.sim.shelves import Shop, add_shelf, board_heights, make_products
+from stereo_sfm.drivers.sim.tables import Builder, Tables, make_tables
 
 CLOTHES, HAIR, SKIN = 8, 8, 10  # of the textures that people wear: patterned cloths, then two of hair, then skin
 FACING_MINUS_Y, FACING_PLUS_Y, FACING_MINUS_X, FACING_PLUS_X = 0, 1, 2, 3

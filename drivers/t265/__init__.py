@@ -1,4 +1,4 @@
-"""The Intel RealSense T265 as a kind of source; `drivers.t265.source` talks to it over raw USB."""
+"""The Intel RealSense T265 as a kind of source; `stereo_sfm.drivers.t265.source` talks to it over raw USB."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, Literal
 
-from drivers.driver import Attached, Cameras, Driver, UsbId
-from drivers.options import SourceOptions, option
-from drivers.t265 import messages as m
+from stereo_sfm.drivers.driver import Attached, Cameras, Driver, UsbId
+from stereo_sfm.drivers.options import SourceOptions, option
+from stereo_sfm.drivers.t265 import messages as m
 from stereo_sfm.errors import StereoSfmError
 
 if TYPE_CHECKING:
-    from drivers.source import Source
+    from stereo_sfm.drivers.source import Source
 
 SIMULATED = "simulated"
 
@@ -41,7 +41,7 @@ class T265Options(SourceOptions):
     backend: Any = option(None, "a pyusb backend, from Python only", read=_from_python)
     images: str = option("room", "what a simulated camera sees: room, or a source such as sim:loop")
     frames: int = option(60, "images made before the start, then played forwards and backwards", low=1, high=3000)
-    faults: str = option("none", "names of drivers.t265.simulated.faults.PRESETS, with commas between")
+    faults: str = option("none", "names of stereo_sfm.drivers.t265.simulated.faults.PRESETS, with commas between")
     paced: bool = option(True, "off: as fast as the host reads")
     seed: int = option(0, "of the simulated room", low=0, high=2**31)
 
@@ -51,10 +51,10 @@ _OF_THE_SIMULATED = ("images", "frames", "faults", "paced", "seed")
 
 def _open(place: str, options: T265Options) -> Source:
     if place == SIMULATED:
-        from drivers.t265.simulated.source import open_simulated
+        from stereo_sfm.drivers.t265.simulated.source import open_simulated
 
         return open_simulated(options)
-    from drivers.t265.source import open_t265
+    from stereo_sfm.drivers.t265.source import open_t265
 
     return open_t265(place, options)
 
@@ -68,7 +68,7 @@ def _check(place: str, options: T265Options) -> None:
 
 
 def _find(probe: bool) -> Sequence[Attached]:
-    from drivers.t265.attached import find
+    from stereo_sfm.drivers.t265.attached import find
 
     return find()
 

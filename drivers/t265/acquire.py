@@ -7,13 +7,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from drivers.live.counters import Counters
-from drivers.live.errors import Busy, DeviceError, DeviceFault, NotFound, TooSlowLink
-from drivers.t265.boot import boot
-from drivers.t265.camera import T265
-from drivers.t265.firmware import Firmware, load
-from drivers.t265.link import Link, Timing
-from drivers.t265.usb_device import SPEEDS, SUPER_SPEED, UsbDevice, attached, is_boot, place
+from stereo_sfm.drivers.live.counters import Counters
+from stereo_sfm.drivers.live.errors import Busy, DeviceError, DeviceFault, NotFound, TooSlowLink
+from stereo_sfm.drivers.t265.boot import boot
+from stereo_sfm.drivers.t265.camera import T265
+from stereo_sfm.drivers.t265.firmware import Firmware, load
+from stereo_sfm.drivers.t265.link import Link, Timing
+from stereo_sfm.drivers.t265.usb_device import SPEEDS, SUPER_SPEED, UsbDevice, attached, is_boot, place
 
 logger = logging.getLogger("stereo_sfm")
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from drivers.driver import Attached
-from drivers.live.counters import Counters
-from drivers.live.errors import DeviceError
-from drivers.t265 import firmware, usb_device
-from drivers.t265.camera import T265
-from drivers.t265.link import Link, Timing
-from drivers.t265.usb_device import SPEEDS, SUPER_SPEED, is_boot, place
+from stereo_sfm.drivers.driver import Attached
+from stereo_sfm.drivers.live.counters import Counters
+from stereo_sfm.drivers.live.errors import DeviceError
+from stereo_sfm.drivers.t265 import firmware, usb_device
+from stereo_sfm.drivers.t265.camera import T265
+from stereo_sfm.drivers.t265.link import Link, Timing
+from stereo_sfm.drivers.t265.usb_device import SPEEDS, SUPER_SPEED, is_boot, place
 
 
 def find() -> list[Attached]:

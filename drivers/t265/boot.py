@@ -9,11 +9,11 @@ from collections.abc import Generator
 from pathlib import Path
 from typing import IO, Any
 
-from drivers.live.errors import BootFailed, Busy
-from drivers.t265 import messages as m
-from drivers.t265.firmware import Firmware
-from drivers.t265.link import Timing, dispose
-from drivers.t265.usb_device import UsbDevice, attached, device_error, is_boot, place
+from stereo_sfm.drivers.live.errors import BootFailed, Busy
+from stereo_sfm.drivers.t265 import messages as m
+from stereo_sfm.drivers.t265.firmware import Firmware
+from stereo_sfm.drivers.t265.link import Timing, dispose
+from stereo_sfm.drivers.t265.usb_device import UsbDevice, attached, device_error, is_boot, place
 
 # Bytes of one transfer: whole packets, so that the camera sees one stream. One transfer of 9 MB needs more
 # memory in one piece than some kernels give (found on the virtual host controller of Linux 6.1).

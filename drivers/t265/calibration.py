@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.imu import Imu
-from calib.rig import Rig
-from drivers.live.errors import DeviceFault
-from drivers.t265 import messages as m
-from drivers.t265.protocol import CameraIntrinsics, MotionIntrinsics
+from stereo_sfm.calib.imu import Imu
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.live.errors import DeviceFault
+from stereo_sfm.drivers.t265 import messages as m
+from stereo_sfm.drivers.t265.protocol import CameraIntrinsics, MotionIntrinsics
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import KannalaBrandt
 from stereo_sfm.types import F64

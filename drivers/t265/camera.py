@@ -6,14 +6,14 @@ import array
 import time
 from dataclasses import dataclass, replace
 
-from calib.rig import Rig
-from drivers.live.counters import Counters
-from drivers.live.errors import Busy, DeviceFault
-from drivers.t265 import calibration, protocol
-from drivers.t265 import messages as m
-from drivers.t265.firmware import VERSION
-from drivers.t265.link import Link, Timing
-from drivers.t265.messages import AntiFlicker, Id, Sensor, Status
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.live.counters import Counters
+from stereo_sfm.drivers.live.errors import Busy, DeviceFault
+from stereo_sfm.drivers.t265 import calibration, protocol
+from stereo_sfm.drivers.t265 import messages as m
+from stereo_sfm.drivers.t265.firmware import VERSION
+from stereo_sfm.drivers.t265.link import Link, Timing
+from stereo_sfm.drivers.t265.messages import AntiFlicker, Id, Sensor, Status
 
 _MAX_STALE = 16  # transfers of an earlier session that may still lie in an endpoint
 

@@ -13,7 +13,7 @@ import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.live.errors import FirmwareMissing
+from stereo_sfm.drivers.live.errors import FirmwareMissing
 from stereo_sfm.errors import StereoSfmError
 
 VERSION = "0.2.0.951"

@@ -8,10 +8,10 @@ import threading
 from dataclasses import dataclass
 from typing import Any
 
-from drivers.live.errors import DeviceError, DeviceFault, DeviceLost
-from drivers.t265 import messages as m
-from drivers.t265 import protocol
-from drivers.t265.usb_device import UsbDevice, device_error, place
+from stereo_sfm.drivers.live.errors import DeviceError, DeviceFault, DeviceLost
+from stereo_sfm.drivers.t265 import messages as m
+from stereo_sfm.drivers.t265 import protocol
+from stereo_sfm.drivers.t265.usb_device import UsbDevice, device_error, place
 
 _BULK, _INTERRUPT = 2, 3
 _ENDPOINTS = {(m.COMMAND_OUT, _BULK), (m.COMMAND_IN, _BULK), (m.VIDEO_IN, _BULK), (m.EVENT_IN, _INTERRUPT)}

@@ -10,8 +10,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from drivers.t265 import messages as m
-from drivers.t265.messages import Id, Sensor
+from stereo_sfm.drivers.t265 import messages as m
+from stereo_sfm.drivers.t265.messages import Id, Sensor
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import F64
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.t265 import messages as m
-from drivers.t265.messages import Id, Sensor
-from drivers.t265.protocol import Buffer, ProtocolError
+from stereo_sfm.drivers.t265 import messages as m
+from stereo_sfm.drivers.t265.messages import Id, Sensor
+from stereo_sfm.drivers.t265.protocol import Buffer, ProtocolError
 from stereo_sfm.types import U8
 
 

@@ -5,17 +5,17 @@ from __future__ import annotations
 import functools
 from typing import TYPE_CHECKING
 
-from drivers.live.errors import DeviceError, DeviceLost
-from drivers.live.source import LiveSource, Patience, with_rig
-from drivers.t265 import messages as m
-from drivers.t265.acquire import Access, acquire
-from drivers.t265.camera import T265, Settings
-from drivers.t265.firmware import load
-from drivers.t265.messages import AntiFlicker
-from drivers.t265.stream import Stream
+from stereo_sfm.drivers.live.errors import DeviceError, DeviceLost
+from stereo_sfm.drivers.live.source import LiveSource, Patience, with_rig
+from stereo_sfm.drivers.t265 import messages as m
+from stereo_sfm.drivers.t265.acquire import Access, acquire
+from stereo_sfm.drivers.t265.camera import T265, Settings
+from stereo_sfm.drivers.t265.firmware import load
+from stereo_sfm.drivers.t265.messages import AntiFlicker
+from stereo_sfm.drivers.t265.stream import Stream
 
 if TYPE_CHECKING:
-    from drivers.t265 import T265Options
+    from stereo_sfm.drivers.t265 import T265Options
 
 
 class T265Source(LiveSource):
@@ -89,7 +89,7 @@ def open_t265(serial: str, options: T265Options) -> T265Source:
     """
     backend = options.backend
     if backend is None:
-        from drivers.t265.usb_device import default_backend
+        from stereo_sfm.drivers.t265.usb_device import default_backend
 
         backend = default_backend()
     access = Access(backend, serial, functools.partial(load, options.firmware), options.allow_slow)

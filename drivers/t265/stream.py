@@ -9,16 +9,16 @@ import threading
 import time
 from collections.abc import Callable
 
-from drivers.live.buffers import Handoff, MotionBuffer
-from drivers.live.clock import ClockMap
-from drivers.live.counters import Counters
-from drivers.live.errors import DeviceError
-from drivers.live.pairing import LEFT, RIGHT, Eye, Pair, Pairer
-from drivers.t265 import messages as m
-from drivers.t265 import protocol, samples
-from drivers.t265.camera import T265
-from drivers.t265.link import Timing
-from drivers.t265.messages import Sensor, Status
+from stereo_sfm.drivers.live.buffers import Handoff, MotionBuffer
+from stereo_sfm.drivers.live.clock import ClockMap
+from stereo_sfm.drivers.live.counters import Counters
+from stereo_sfm.drivers.live.errors import DeviceError
+from stereo_sfm.drivers.live.pairing import LEFT, RIGHT, Eye, Pair, Pairer
+from stereo_sfm.drivers.t265 import messages as m
+from stereo_sfm.drivers.t265 import protocol, samples
+from stereo_sfm.drivers.t265.camera import T265
+from stereo_sfm.drivers.t265.link import Timing
+from stereo_sfm.drivers.t265.messages import Sensor, Status
 
 logger = logging.getLogger("stereo_sfm")
 

@@ -6,8 +6,8 @@ import array
 import errno
 from typing import Any, Protocol, cast
 
-from drivers.live.errors import Busy, DeviceError, DeviceLost, NoPermission, NotFound
-from drivers.t265 import messages as m
+from stereo_sfm.drivers.live.errors import Busy, DeviceError, DeviceLost, NoPermission, NotFound
+from stereo_sfm.drivers.t265 import messages as m
 from stereo_sfm.errors import require
 
 SPEEDS = {0: "unknown", 1: "low", 2: "full", 3: "high", 4: "super", 5: "super+"}  # libusb_speed

@@ -1,19 +1,19 @@
-"""TUM RGB-D as a kind of source; `drivers.tum_rgbd.source` reads it."""
+"""TUM RGB-D as a kind of source; `stereo_sfm.drivers.tum_rgbd.source` reads it."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from drivers.driver import Certainty, Driver
-from drivers.options import SourceOptions
+from stereo_sfm.drivers.driver import Certainty, Driver
+from stereo_sfm.drivers.options import SourceOptions
 
 if TYPE_CHECKING:
-    from drivers.source import Source
+    from stereo_sfm.drivers.source import Source
 
 
 def _open(place: str, options: SourceOptions) -> Source:
-    from drivers.tum_rgbd.source import open_tum_rgbd
+    from stereo_sfm.drivers.tum_rgbd.source import open_tum_rgbd
 
     return open_tum_rgbd(place, options)
 

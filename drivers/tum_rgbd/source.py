@@ -12,12 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.rig import Rig
-from drivers.folder_source import FolderSource, Shot, folder_of, need
-from drivers.ground_truth import read_tum, stamp_from_seconds
-from drivers.image_lists import pair_by_stamp
-from drivers.options import SourceOptions
-from drivers.rig_option import chosen_rig
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.folder_source import FolderSource, Shot, folder_of, need
+from stereo_sfm.drivers.ground_truth import read_tum, stamp_from_seconds
+from stereo_sfm.drivers.image_lists import pair_by_stamp
+from stereo_sfm.drivers.options import SourceOptions
+from stereo_sfm.drivers.rig_option import chosen_rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry.cameras import RadTan
 

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import cv2
 
-from calib import load_rig
-from calib.rig import Rig
-from drivers.driver import Cameras, Driver
-from drivers.options import SourceOptions, option
-from drivers.source import BaseSource
+from stereo_sfm.calib import load_rig
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.driver import Cameras, Driver
+from stereo_sfm.drivers.options import SourceOptions, option
+from stereo_sfm.drivers.source import BaseSource
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import StereoImage
 

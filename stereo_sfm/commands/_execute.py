@@ -13,9 +13,9 @@ from stereo_sfm.commands._stop import INTERRUPTED, StopRequest
 from stereo_sfm.errors import StereoSfmError, from_os_error
 
 if TYPE_CHECKING:
-    from drivers.choice import SourceChoice
     from stereo_sfm.commands._step import Stepper
     from stereo_sfm.config import Config
+    from stereo_sfm.drivers.choice import SourceChoice
     from stereo_sfm.eval.record import RunRecord
     from stereo_sfm.log.recorded import RecordedRun
     from stereo_sfm.maps.folders import MapFolders
@@ -62,7 +62,7 @@ class RunOptions:
 
 def execute(options: RunOptions) -> tuple[int, Path]:
     """Run, write the output folder, print the closing summary: the exit code and the folder."""
-    from drivers.choice import SourceChoice
+    from stereo_sfm.drivers.choice import SourceChoice
     from stereo_sfm.eval.record import RunRecord
     from stereo_sfm.eval.run_results import write_results
     from stereo_sfm.eval.start import why_not_started

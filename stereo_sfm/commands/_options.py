@@ -15,8 +15,8 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.presets import PRESETS, preset
 
 if TYPE_CHECKING:
-    from drivers.choice import SourceChoice
     from stereo_sfm.config import Config
+    from stereo_sfm.drivers.choice import SourceChoice
     from stereo_sfm.pipeline.session import Wiring
 
 T = TypeVar("T")
@@ -30,7 +30,7 @@ def typed(kind: type[T], args: argparse.Namespace) -> T:
 
 def add_source(parser: argparse.ArgumentParser, default: str = "", metavar: str | None = None) -> None:
     """The argument that names what is read; `default` says what is read without it."""
-    from drivers.registry import kinds
+    from stereo_sfm.drivers.registry import kinds
 
     text = f"a folder or file, or KIND:PLACE?OPTION=VALUE of {', '.join(kinds())} ('stereo-sfm sources KIND')"
     text += f" (default: {default})" if default else ""
@@ -39,7 +39,7 @@ def add_source(parser: argparse.ArgumentParser, default: str = "", metavar: str 
 
 def add_source_arguments(parser: argparse.ArgumentParser) -> None:
     """Options that choose the calibration and a part of a source."""
-    from drivers.choice import RECTIFY
+    from stereo_sfm.drivers.choice import RECTIFY
 
     parser.add_argument("--rig", type=Path, metavar="FILE", help="calibration instead of the source's own")
     parser.add_argument(
@@ -136,10 +136,10 @@ def load_config(args: argparse.Namespace) -> Config:
 
 def source_choice(args: argparse.Namespace, realtime: bool = False, speed: float | None = None) -> SourceChoice:
     """The source that the options of `add_source_arguments` ask for; `realtime`: recordings at their own speed."""
-    from drivers.choice import SourceChoice
-    from drivers.selection import Selection
-    from drivers.source import is_device
     from stereo_sfm.demo import demo_recording
+    from stereo_sfm.drivers.choice import SourceChoice
+    from stereo_sfm.drivers.selection import Selection
+    from stereo_sfm.drivers.source import is_device
 
     spec = args.source if args.source is not None else str(demo_recording())
     if speed is None and realtime and not is_device(spec):

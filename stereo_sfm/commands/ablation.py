@@ -139,7 +139,7 @@ def _check_sources(cells: Sequence[Cell]) -> None:
     Raises:
         StereoSfmError: one does not.
     """
-    from drivers.source import open_source
+    from stereo_sfm.drivers.source import open_source
 
     for spec in dict.fromkeys(cell.source for cell in cells):
         with open_source(spec) as source:

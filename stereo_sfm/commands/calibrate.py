@@ -13,7 +13,7 @@ from stereo_sfm.commands._options import typed
 from stereo_sfm.commands.convert_calib import NAMES
 
 if TYPE_CHECKING:
-    from calib.targets import Detection, Target
+    from stereo_sfm.calib.targets import Detection, Target
     from stereo_sfm.types import U8
 
 
@@ -60,12 +60,12 @@ def run(args: argparse.Namespace) -> int:
     options = typed(CalibrateOptions, args)
     from dataclasses import replace
 
-    from calib import save_rig
-    from calib.check import VERDICTS
-    from calib.coverage import coverage
-    from calib.quality import judge
-    from calib.report import write_report
-    from calib.solve import align_pairs, calibrate
+    from stereo_sfm.calib import save_rig
+    from stereo_sfm.calib.check import VERDICTS
+    from stereo_sfm.calib.coverage import coverage
+    from stereo_sfm.calib.quality import judge
+    from stereo_sfm.calib.report import write_report
+    from stereo_sfm.calib.solve import align_pairs, calibrate
 
     report: Path = options.report or options.output.with_suffix(".html")
     _check_files(options.output, report, options.overwrite)
@@ -106,7 +106,7 @@ def _check_files(rig: Path, report: Path, overwrite: bool) -> None:
 
 def make_target(options: CalibrateOptions) -> Target:
     """The target of the options or of the file."""
-    from calib.targets import KINDS, Target, read_target
+    from stereo_sfm.calib.targets import KINDS, Target, read_target
     from stereo_sfm.errors import StereoSfmError, one_of
 
     if options.target not in KINDS:
@@ -125,9 +125,9 @@ def collect(
 
     The last value is the readout that the source's own calibration states: pictures of a target do not show it.
     """
-    from calib.coverage import coverage
-    from calib.views import find_pairs, gather, read_pairs, stereo_pairs
-    from drivers.source import open_source
+    from stereo_sfm.calib.coverage import coverage
+    from stereo_sfm.calib.views import find_pairs, gather, read_pairs, stereo_pairs
+    from stereo_sfm.drivers.source import open_source
     from stereo_sfm.errors import StereoSfmError
 
     def tell(number: int, left: list[Detection], right: list[Detection], size: tuple[int, int]) -> None:

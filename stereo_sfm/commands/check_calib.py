@@ -12,7 +12,7 @@ from stereo_sfm.commands._options import add_source, typed
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from calib.check import CheckReport, Finding
+    from stereo_sfm.calib.check import CheckReport, Finding
     from stereo_sfm.tracking.flow.readout import ReadoutErrors, ReadoutSearch
     from stereo_sfm.types import StereoImage
 
@@ -52,12 +52,12 @@ def run(args: argparse.Namespace) -> int:
     import json
     from dataclasses import replace
 
-    from calib import load_rig, save_rig
-    from calib.check import check
-    from calib.rectification import rectify
-    from calib.tracks import LONGEST, collect, corners_for
-    from drivers.source import open_source
+    from stereo_sfm.calib import load_rig, save_rig
+    from stereo_sfm.calib.check import check
+    from stereo_sfm.calib.rectification import rectify
+    from stereo_sfm.calib.tracks import LONGEST, collect, corners_for
     from stereo_sfm.config import Config
+    from stereo_sfm.drivers.source import open_source
     from stereo_sfm.tracking.flow.readout import ReadoutSearch
 
     _check(options)
@@ -93,7 +93,7 @@ def _searched(images: Iterable[StereoImage], shutter: ReadoutSearch) -> Iterator
 
 
 def _shutter(known: str, errors: ReadoutErrors) -> Finding:
-    from calib.check import UNKNOWN, Finding
+    from stereo_sfm.calib.check import UNKNOWN, Finding
 
     own_ms, best_ms = 1e3 * float(errors.readout_s[0]), 1e3 * errors.best_s
     if not errors.shown:

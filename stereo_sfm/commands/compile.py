@@ -13,9 +13,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run every stage once on made images; later runs find what was compiled."""
-    from drivers.source import open_source
     from stereo_sfm.config import Config
     from stereo_sfm.demo import demo_recording
+    from stereo_sfm.drivers.source import open_source
     from stereo_sfm.kernel_cache import listening
     from stereo_sfm.pipeline.warm_up import warm_up_stage
 

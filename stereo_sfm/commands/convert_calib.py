@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-# Kept here so that `--help` needs no import; calib.formats.FORMATS is the table (a test compares them).
+# Kept here so that `--help` needs no import; stereo_sfm.calib.formats.FORMATS is the table (a test compares them).
 NAMES = ("rig", "kalibr", "ros", "opencv", "euroc", "kitti", "basalt", "colmap", "foxglove", "kapture", "depthai")
 
 
@@ -21,8 +21,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read, write, say what it was."""
-    from calib import load_rig, save_rig
-    from calib.formats import recognise
+    from stereo_sfm.calib import load_rig, save_rig
+    from stereo_sfm.calib.formats import recognise
     from stereo_sfm.commands.rectify import parse_size
     from stereo_sfm.errors import StereoSfmError
 

@@ -15,7 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """List them; 0 also when there are none."""
-    from drivers.devices import list_devices, no_cameras
+    from stereo_sfm.drivers.devices import list_devices, no_cameras
 
     cameras, problems = list_devices(probe=args.probe)
     if args.json:

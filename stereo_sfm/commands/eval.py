@@ -139,8 +139,8 @@ def own_truth(folder: Path) -> Trajectory:
 
 def load_reference(spec: str, opening: Opening) -> tuple[Trajectory, Path | None]:
     """The ground truth of a file, and that file; or of a source, seen as the run saw its own."""
-    from drivers.choice import SourceChoice
-    from drivers.ground_truth import read_trajectory
+    from stereo_sfm.drivers.choice import SourceChoice
+    from stereo_sfm.drivers.ground_truth import read_trajectory
 
     path = Path(spec).expanduser()
     if path.is_file() and path.suffix != ".mcap":
@@ -165,7 +165,7 @@ def _opening(folder: Path) -> Opening:
 
 def _with_stamps(path: Path, other: Trajectory) -> Trajectory:
     """The trajectory of a file; one without stamps takes those of the other, line by line."""
-    from drivers.ground_truth import has_stamps, read_kitti, read_trajectory
+    from stereo_sfm.drivers.ground_truth import has_stamps, read_kitti, read_trajectory
 
     if has_stamps(path):
         return read_trajectory(path)
@@ -192,7 +192,7 @@ def _pose_frame(path: Path) -> str:
 
 def _in_cam0(bodies: Trajectory, path: Path) -> Trajectory:
     """world_T_body -> world_T_cam0, each with its first pose as the world, by the calibration beside the file."""
-    from calib import load_rig
+    from stereo_sfm.calib import load_rig
     from stereo_sfm.geometry import se3
     from stereo_sfm.types import Trajectory
 

@@ -106,7 +106,7 @@ def _load(folder: Path) -> SavedMap:
 
 def _write_with_pictures(saved: SavedMap, output: Path, options: ExportOptions, images: str) -> None:
     """COLMAP's model, and the keyframes' pictures beside it."""
-    from calib import load_rig
+    from stereo_sfm.calib import load_rig
     from stereo_sfm.export.pictures import check_walk, open_pictures, walk_of_recording, write_pictures
 
     check_walk(saved, options.walk)
@@ -135,7 +135,7 @@ def _of_walk(path: Path, walk: int) -> Path:
 
 def _trajectories(options: ExportOptions) -> tuple[dict[int, Trajectory], str]:
     """A run's trajectory, or a map's keyframes, walk by walk; and which poses they are."""
-    from drivers.ground_truth import read_trajectory
+    from stereo_sfm.drivers.ground_truth import read_trajectory
     from stereo_sfm.errors import StereoSfmError
     from stereo_sfm.export.pictures import check_walk
     from stereo_sfm.export.trajectories import named_pose

@@ -13,7 +13,7 @@ from stereo_sfm.commands._stop import INTERRUPTED, StopRequest
 from stereo_sfm.errors import StereoSfmError
 
 if TYPE_CHECKING:
-    from drivers.source import Source
+    from stereo_sfm.drivers.source import Source
     from stereo_sfm.log.provenance import Opening
     from stereo_sfm.recording.record import Progress
 

@@ -12,7 +12,7 @@ from stereo_sfm.commands._options import add_source
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from drivers.source import Source
+    from stereo_sfm.drivers.source import Source
     from stereo_sfm.types import StereoImage
 
 
@@ -34,11 +34,11 @@ def run(args: argparse.Namespace) -> int:
     import cv2
     import numpy as np
 
-    from calib import load_rig, save_rig
-    from calib.matches import match_pair
-    from calib.pictures import side_by_side
-    from calib.rectification import rectify
-    from drivers.source import open_source
+    from stereo_sfm.calib import load_rig, save_rig
+    from stereo_sfm.calib.matches import match_pair
+    from stereo_sfm.calib.pictures import side_by_side
+    from stereo_sfm.calib.rectification import rectify
+    from stereo_sfm.drivers.source import open_source
 
     if args.frames < 1:
         raise _error("--frames must be at least 1")

@@ -108,8 +108,8 @@ def _check(options: ReplayOptions) -> None:
 
 def _run_again(options: ReplayOptions, wiring: Wiring) -> RunOptions:
     """The run of a log as options."""
-    from drivers.choice import ReplayChoice
     from stereo_sfm.commands._execute import RunOptions
+    from stereo_sfm.drivers.choice import ReplayChoice
     from stereo_sfm.log import recorded, topics
     from stereo_sfm.log.reader import LogReader
 

@@ -12,14 +12,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """List the kinds, or the options of one."""
-    from drivers.registry import driver, drivers, kinds
+    from stereo_sfm.drivers.registry import driver, drivers, kinds
     from stereo_sfm.errors import one_of
 
     if args.kind is None:
         rows = [(f"{kind}:{found.place}", found.summary) for kind, found in drivers()]
         print("\n".join(_table(("source", "what it reads"), rows)))
         return 0
-    from drivers.options import described
+    from stereo_sfm.drivers.options import described
 
     found = driver(one_of(args.kind, kinds(), "source"))
     print(f"{args.kind}:{found.place}?OPTION=VALUE&...: {found.summary}\n")

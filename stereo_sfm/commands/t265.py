@@ -30,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _extract(file: Path, output: Path | None, overwrite: bool) -> int:
-    from drivers.t265 import firmware
+    from stereo_sfm.drivers.t265 import firmware
 
     target: Path = output or firmware.default_path()
     if target.exists() and not overwrite:
@@ -46,7 +46,7 @@ def _extract(file: Path, output: Path | None, overwrite: bool) -> int:
 
 
 def _check() -> int:
-    from drivers.t265 import firmware
+    from stereo_sfm.drivers.t265 import firmware
 
     path = firmware.find()
     firmware.load()
@@ -55,9 +55,9 @@ def _check() -> int:
 
 
 def _reset(serial: str) -> int:
-    from drivers.live.counters import Counters
-    from drivers.t265.acquire import Access, acquire
-    from drivers.t265.usb_device import default_backend
+    from stereo_sfm.drivers.live.counters import Counters
+    from stereo_sfm.drivers.t265.acquire import Access, acquire
+    from stereo_sfm.drivers.t265.usb_device import default_backend
 
     camera = acquire(Access(default_backend(), serial, allow_slow=True), Counters())
     camera.link.reset()

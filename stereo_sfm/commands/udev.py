@@ -13,7 +13,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Rules on standard output, so that they can be piped; the way on standard error."""
-    from drivers.devices import UDEV_FILE, udev_rules
+    from stereo_sfm.drivers.devices import UDEV_FILE, udev_rules
 
     print(udev_rules(), end="")
     if not args.quiet:

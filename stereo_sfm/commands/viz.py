@@ -13,8 +13,8 @@ from stereo_sfm.commands._options import add_viewer_address, typed
 from stereo_sfm.errors import StereoSfmError, require
 
 if TYPE_CHECKING:
-    from calib.rig import Rig
-    from drivers.source import Source
+    from stereo_sfm.calib.rig import Rig
+    from stereo_sfm.drivers.source import Source
     from stereo_sfm.log.reader import LogReader
     from stereo_sfm.messages import Sink
     from stereo_sfm.types import StereoImage, Trajectory
@@ -109,7 +109,7 @@ def _show_log(path: Path, options: VizOptions) -> None:
 
 def _images(reader: LogReader, path: Path, spec: str | None) -> Source:
     """Where the images come from: another source is opened as the run opened it."""
-    from drivers.choice import SourceChoice
+    from stereo_sfm.drivers.choice import SourceChoice
     from stereo_sfm.log.recorded import read_opening
 
     if spec is None:

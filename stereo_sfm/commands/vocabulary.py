@@ -103,7 +103,7 @@ def spread(count: int, wanted: int) -> list[int]:
 
 def _descriptors(spec: str, wanted: int) -> Iterator[U8]:
     """(N, 32) of images that lie evenly over a source; of the first ones where nobody knows how many it has."""
-    from drivers.source import open_source
+    from stereo_sfm.drivers.source import open_source
     from stereo_sfm.maps.single_image import still_keyframe
 
     with open_source(spec) as source:

@@ -117,8 +117,8 @@ def run_cell(cell: Cell) -> dict[str, Any]:
     Returns:
         Plain values for JSON: `status` is "ok" or "none" with `reason`; `opened` once the source was found good.
     """
-    from drivers.select import SelectedFrames
-    from drivers.source import open_source
+    from stereo_sfm.drivers.select import SelectedFrames
+    from stereo_sfm.drivers.source import open_source
     from stereo_sfm.pipeline.run import run
 
     answer: dict[str, Any] = {"schema": _SCHEMA, "cell": dataclasses.asdict(cell), "status": "none", "reason": ""}

@@ -50,7 +50,7 @@ def run_one(task: BatchTask) -> dict[str, Any]:
     """Run one recording to the end; what goes wrong becomes part of the result."""
     import cv2
 
-    from drivers.choice import SourceChoice
+    from stereo_sfm.drivers.choice import SourceChoice
     from stereo_sfm.eval.record import RunRecord
     from stereo_sfm.eval.run_results import write_results
     from stereo_sfm.eval.start import why_not_started

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from calib.rig import Rig
 from stereo_sfm import config as configuration
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError, writing_to
 from stereo_sfm.eval.evaluate import Evaluation, evaluate
@@ -61,7 +61,7 @@ def write_results(
     Returns:
         What stats.json holds, and the evaluations by trajectory name.
     """
-    from calib import save_rig
+    from stereo_sfm.calib import save_rig
 
     estimates = {"odometry": record.odometry()}
     mapped = record.mapped() if config.mapper.enabled or config.loop.enabled else None

@@ -1,12 +1,12 @@
-"""What a run says when tracking never began: the quick checks of `calib.start` on its own first images."""
+"""What a run says when tracking never began: the quick checks of `stereo_sfm.calib.start` on its own first images."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from itertools import islice
 
-from calib.start import why_no_start
-from drivers.source import Source
+from stereo_sfm.calib.start import why_no_start
+from stereo_sfm.drivers.source import Source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.eval.record import RunRecord
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.live.counters import TROUBLE
+from stereo_sfm.drivers.live.counters import TROUBLE
 from stereo_sfm.eval.evaluate import Evaluation, length
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.messages import Health

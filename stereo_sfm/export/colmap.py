@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.formats.colmap import write_colmap
-from calib.rig import Rig
+from stereo_sfm.calib.formats.colmap import write_colmap
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.mapping.map import MapSnapshot

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from calib.rectification import PROJECTIONS
-from calib.rig import Rig
-from drivers.rectified import rectified
-from drivers.source import Source, open_source
+from stereo_sfm.calib.rectification import PROJECTIONS
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.rectified import rectified
+from stereo_sfm.drivers.source import Source, open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.colmap import image_names
 from stereo_sfm.maps.saved_map import SavedMap, describe_rig, same_rig

@@ -8,9 +8,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from calib.formats.native import rig_from_text
-from calib.rig import Rig
 from stereo_sfm.arrays import read_arrays
+from stereo_sfm.calib.formats.native import rig_from_text
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config, from_dict, parse_toml
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log.image_log import RIG_FILE, TRUTH_FILE

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from foxglove_schemas_protobuf.Pose_pb2 import Pose
 
-from calib.formats.native import rig_to_text
-from calib.rig import Rig
+from stereo_sfm.calib.formats.native import rig_to_text
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.log import foxglove, topics
 from stereo_sfm.log.images import LoggedImage, depth_message, encode_pair, image_message

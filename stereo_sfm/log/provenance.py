@@ -7,9 +7,9 @@ import platform
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 
-from calib.formats.native import rig_to_text
-from calib.rig import Rig
 from stereo_sfm import __version__
+from stereo_sfm.calib.formats.native import rig_to_text
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config, dump
 from stereo_sfm.log.machine import arithmetic
 from stereo_sfm.log.reader import LogReader

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from foxglove_schemas_protobuf.Pose_pb2 import Pose
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.geometry import se3
 from stereo_sfm.log import foxglove, topics

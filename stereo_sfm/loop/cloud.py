@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.hamming import as_words, hamming
 from stereo_sfm.geometry.kernels import njit

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.loop import binary
 from stereo_sfm.types import F64, I64, U8, Bool, Keyframe
 

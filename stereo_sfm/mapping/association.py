@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.hamming import as_words

@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.kernels import njit, project_one
 from stereo_sfm.geometry.small_matrix import solve_symmetric

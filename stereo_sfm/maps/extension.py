@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import LoopConfig, MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.map import MapSnapshot

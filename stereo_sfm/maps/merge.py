@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import LoopConfig, MapperConfig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.loop.closer import LoopCloser

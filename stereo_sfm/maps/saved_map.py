@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from calib.formats.native import read_native, write_native
-from calib.rig import Rig
 from stereo_sfm.arrays import read_arrays
+from stereo_sfm.calib.formats.native import read_native, write_native
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.mapping.map import Map, MapSnapshot
 from stereo_sfm.maps.columns import check_columns

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.tracking.factory import make_tracker
 from stereo_sfm.types import Keyframe, StereoImage

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 
-from calib.rig import Rig
-from drivers.source import Source
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.source import Source
 from stereo_sfm.pipeline.channels import End, Outbox
 from stereo_sfm.pipeline.health import HealthMeter
 from stereo_sfm.pipeline.images import ImageRing, SlotImage

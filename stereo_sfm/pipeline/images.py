@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import F32, U8, StereoImage
 

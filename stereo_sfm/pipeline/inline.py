@@ -6,8 +6,8 @@ import logging
 from collections import deque
 from collections.abc import Generator, Sequence
 
-from drivers.source import Source
 from stereo_sfm.config import Config
+from stereo_sfm.drivers.source import Source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.maps.folders import MapFolders, make_mapper, save_result
 from stereo_sfm.messages import LogLine, Sink, StageTimes

@@ -21,8 +21,8 @@ from multiprocessing.process import BaseProcess
 from types import TracebackType
 from typing import Any, Self
 
-from drivers.choice import Opener
 from stereo_sfm.config import Config
+from stereo_sfm.drivers.choice import Opener
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.maps.folders import MapFolders
 from stereo_sfm.messages import Compiling, LogEnded, LogLine, Sink

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from drivers.source import Source
-from drivers.wrapped import WrappedSource
 from stereo_sfm.config import Config
+from stereo_sfm.drivers.source import Source
+from stereo_sfm.drivers.wrapped import WrappedSource
 from stereo_sfm.messages import Sink
 from stereo_sfm.types import Frame, StereoImage
 
@@ -26,7 +26,7 @@ def run(source: Source, config: Config | None = None, sinks: Sequence[Sink] = ()
     `stereo_sfm.pipeline.processes.ProcessRun` does the same over processes, `stereo_sfm.System` image by image.
 
     Args:
-        source: an open source, as `drivers.source.open_source` gives it.
+        source: an open source, as `stereo_sfm.drivers.source.open_source` gives it.
         config: what decides the result; the defaults when omitted.
         sinks: each gets every message of the run.
 

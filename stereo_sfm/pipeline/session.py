@@ -11,8 +11,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-from drivers.choice import Opener
 from stereo_sfm.config import Config
+from stereo_sfm.drivers.choice import Opener
 from stereo_sfm.errors import StereoSfmError, require
 from stereo_sfm.export.run_folder import KEPT_MAP, FolderLock, default_folder, discard_files, prepare_folder
 from stereo_sfm.maps.folders import MapFolders

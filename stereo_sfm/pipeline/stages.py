@@ -10,9 +10,9 @@ from collections import deque
 from collections.abc import Iterator
 from typing import Protocol, TypeVar
 
-from calib.rig import Rig
-from drivers.source import Source
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
+from stereo_sfm.drivers.source import Source
 from stereo_sfm.mapping.protocol import AnyMapper
 from stereo_sfm.messages import SourceCounters
 from stereo_sfm.pipeline.schedule import Schedule

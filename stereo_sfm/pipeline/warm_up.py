@@ -7,7 +7,7 @@ import dataclasses
 
 import numpy as np
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera

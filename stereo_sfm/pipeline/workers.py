@@ -16,9 +16,9 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from calib.rig import Rig
-from drivers.choice import Opener
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import STAGES, Config
+from stereo_sfm.drivers.choice import Opener
 from stereo_sfm.errors import StereoSfmError, from_os_error
 from stereo_sfm.log.provenance import Opening
 from stereo_sfm.maps.folders import MapFolders, make_mapper, save_result

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
@@ -191,7 +191,7 @@ def _compare_eyes(out: Description, counts: dict[str, int]) -> None:
 
 
 def _describe_source(out: Description, path: Path, rig: Path | None) -> None:
-    from drivers.source import open_source
+    from stereo_sfm.drivers.source import open_source
 
     try:
         source = open_source(path, rig)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.source import Source
+from stereo_sfm.drivers.source import Source
 from stereo_sfm.errors import StereoSfmError, one_of
 from stereo_sfm.log.image_log import ImageLog
 from stereo_sfm.log.images import FORMATS, encode_pair

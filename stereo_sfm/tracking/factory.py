@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.timing import NoSpans

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import ManhattanConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.procrustes import rotation_between

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.log.map_view import MapView
 from stereo_sfm.types import F64, Frame, Keyframe, LoopResult, MapUpdate
 from stereo_sfm.viz.shapes import spread_colors, strips, wire_cameras

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import rerun as rr
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.log.events import Events
 from stereo_sfm.messages import Health, LogLine, StageTimes

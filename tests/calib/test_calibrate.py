@@ -8,15 +8,15 @@ import cv2
 import numpy as np
 import pytest
 
-from calib import load_rig
-from calib.coverage import coverage, is_new
-from calib.rig import Rig
-from calib.solve import Calibration, align_pairs, calibrate, plane_pose
-from calib.targets import Detection, Target, read_target
-from calib.views import find_pairs
-from drivers.sim.boards import Faults, random_views, render_boards
-from drivers.sim.rigs import make_rig
+from stereo_sfm.calib import load_rig
+from stereo_sfm.calib.coverage import coverage, is_new
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calib.solve import Calibration, align_pairs, calibrate, plane_pose
+from stereo_sfm.calib.targets import Detection, Target, read_target
+from stereo_sfm.calib.views import find_pairs
 from stereo_sfm.cli import main
+from stereo_sfm.drivers.sim.boards import Faults, random_views, render_boards
+from stereo_sfm.drivers.sim.rigs import make_rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 

@@ -9,18 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib import load_rig, save_rig
-from calib.amount import FOCAL_BOTH, FOCAL_RATIO, TURN
-from calib.check import CheckReport, Finding, check
-from calib.choice import choose
-from calib.consistency import Correction, estimate
-from calib.matches import Matches
-from calib.rectification import rectify
-from calib.rig import Rig
-from calib.scene_model import DIRECTION, SKEW
-from calib.tracks import LONGEST, Window, collect, corners_for
-from drivers.source import open_source
+from stereo_sfm.calib import load_rig, save_rig
+from stereo_sfm.calib.amount import FOCAL_BOTH, FOCAL_RATIO, TURN
+from stereo_sfm.calib.check import CheckReport, Finding, check
+from stereo_sfm.calib.choice import choose
+from stereo_sfm.calib.consistency import Correction, estimate
+from stereo_sfm.calib.matches import Matches
+from stereo_sfm.calib.rectification import rectify
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calib.scene_model import DIRECTION, SKEW
+from stereo_sfm.calib.tracks import LONGEST, Window, collect, corners_for
 from stereo_sfm.cli import main
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera

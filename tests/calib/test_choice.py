@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.choice import TERMS, Estimate, choose
-from calib.consequences import consequences
-from calib.consistency import estimate
-from calib.rig import Rig
+from stereo_sfm.calib.choice import TERMS, Estimate, choose
+from stereo_sfm.calib.consequences import consequences
+from stereo_sfm.calib.consistency import estimate
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from tests.calib.test_check import RIGS, SEEN, magnified, turned, windows
 from tests.synthetic import pinhole_rig

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib import Rig, load_rig, save_rig
-from calib.formats import FORMATS, recognise
-from calib.rectification import rectify
+from stereo_sfm.calib import Rig, load_rig, save_rig
+from stereo_sfm.calib.formats import FORMATS, recognise
+from stereo_sfm.calib.rectification import rectify
 from stereo_sfm.cli import main
 from stereo_sfm.commands.convert_calib import NAMES
 from stereo_sfm.geometry import se3

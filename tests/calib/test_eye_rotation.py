@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.eye_rotation import align_eyes
-from drivers.source import open_source
+from stereo_sfm.calib.eye_rotation import align_eyes
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import StereoImage
 

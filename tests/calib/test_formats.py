@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib import Rig, load_rig, save_rig
-from calib.formats import FORMATS, recognise
-from calib.formats.euroc import read_euroc
-from calib.formats.kalibr import read_kalibr
-from calib.formats.kapture import read_kapture
-from calib.formats.kitti import read_kitti
-from calib.formats.opencv import read_opencv
+from stereo_sfm.calib import Rig, load_rig, save_rig
+from stereo_sfm.calib.formats import FORMATS, recognise
+from stereo_sfm.calib.formats.euroc import read_euroc
+from stereo_sfm.calib.formats.kalibr import read_kalibr
+from stereo_sfm.calib.formats.kapture import read_kapture
+from stereo_sfm.calib.formats.kitti import read_kitti
+from stereo_sfm.calib.formats.opencv import read_opencv
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, Epipolar, KannalaBrandt, Pinhole, RadTan

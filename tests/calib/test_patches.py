@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.patches import F32, align, cut, unstretched
+from stereo_sfm.calib.patches import F32, align, cut, unstretched
 from stereo_sfm.types import F64
 
 

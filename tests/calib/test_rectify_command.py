@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from calib import load_rig
-from calib.matches import match_pair
-from calib.rectification import rectify
-from drivers.rectified import RectifiedSource, rectified
-from drivers.source import open_source
+from stereo_sfm.calib import load_rig
+from stereo_sfm.calib.matches import match_pair
+from stereo_sfm.calib.rectification import rectify
 from stereo_sfm.cli import main
+from stereo_sfm.drivers.rectified import RectifiedSource, rectified
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import stereo_sfm as s
-from calib.start import why_no_start
+from stereo_sfm.calib.start import why_no_start
 from stereo_sfm.geometry import se3
 
 Change = Callable[[s.StereoImage], s.StereoImage]

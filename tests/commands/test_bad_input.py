@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from calib import save_rig
+from stereo_sfm.calib import save_rig
 from stereo_sfm.cli import main
 from stereo_sfm.eval.batch import names
 from tests.drivers.dataset_folders import make_euroc, make_images, make_kitti, make_tum_rgbd

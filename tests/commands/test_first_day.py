@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import stereo_sfm as s
-from calib import save_rig
+from stereo_sfm.calib import save_rig
 from stereo_sfm.cli import main
 
 

@@ -10,12 +10,12 @@ from typing import Self
 import numpy as np
 import pytest
 
-from calib import load_rig, save_rig
-from calib.rig import Rig
-from drivers.rectified import RectifiedSource, rectified
-from drivers.source import BaseSource, open_source
 from stereo_sfm import read_trajectory
+from stereo_sfm.calib import load_rig, save_rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.cli import main
+from stereo_sfm.drivers.rectified import RectifiedSource, rectified
+from stereo_sfm.drivers.source import BaseSource, open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry.cameras import Pinhole
 from stereo_sfm.log.reader import LogReader

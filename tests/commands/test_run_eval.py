@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import stereo_sfm
-from drivers.ground_truth import read_kitti, read_tum
 from stereo_sfm.cli import main
+from stereo_sfm.drivers.ground_truth import read_kitti, read_tum
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.export.trajectories import write_tum
 from stereo_sfm.geometry import se3

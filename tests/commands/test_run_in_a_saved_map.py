@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.ground_truth import read_tum
-from drivers.source import open_source
 from stereo_sfm.cli import main
+from stereo_sfm.drivers.ground_truth import read_tum
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.eval.associate import poses_at
 from stereo_sfm.geometry import se3
 from stereo_sfm.maps.saved_map import SavedMap, load_map

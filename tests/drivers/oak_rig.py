@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.oak.library import load
+from stereo_sfm.drivers.oak.library import load
 
 dai = load()
 FIXTURES = Path(__file__).parent / "fixtures"

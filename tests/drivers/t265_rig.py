@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from drivers.live.source import Patience
-from drivers.sim.rigs import fisheye
-from drivers.t265.acquire import Access
-from drivers.t265.camera import Settings
-from drivers.t265.simulated.bus import SimulatedBus
-from drivers.t265.simulated.camera import SimulatedCamera
-from drivers.t265.simulated.content import Content
-from drivers.t265.simulated.faults import Faults
-from drivers.t265.simulated.source import FAST, SimulatedT265Source, checked_firmware
+from stereo_sfm.drivers.live.source import Patience
+from stereo_sfm.drivers.sim.rigs import fisheye
+from stereo_sfm.drivers.t265.acquire import Access
+from stereo_sfm.drivers.t265.camera import Settings
+from stereo_sfm.drivers.t265.simulated.bus import SimulatedBus
+from stereo_sfm.drivers.t265.simulated.camera import SimulatedCamera
+from stereo_sfm.drivers.t265.simulated.content import Content
+from stereo_sfm.drivers.t265.simulated.faults import Faults
+from stereo_sfm.drivers.t265.simulated.source import FAST, SimulatedT265Source, checked_firmware
 from stereo_sfm.types import F64, StereoImage
 
 

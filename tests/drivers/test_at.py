@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers import open_source
-from drivers.memory import MemorySource
-from drivers.rectified import rectified
-from drivers.replayed import ReplayedSource
-from drivers.sim.source import SimSource
-from drivers.source import Source
 from stereo_sfm.cli import main
+from stereo_sfm.drivers import open_source
+from stereo_sfm.drivers.memory import MemorySource
+from stereo_sfm.drivers.rectified import rectified
+from stereo_sfm.drivers.replayed import ReplayedSource
+from stereo_sfm.drivers.sim.source import SimSource
+from stereo_sfm.drivers.source import Source
 from tests.drivers.dataset_folders import make_kitti
 
 SPEC = "sim:aisle?camera=pinhole&size=160x100&frames=9&effects=0"

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib import save_rig
-from drivers import open_source
-from drivers.choice import ReplayChoice, SourceChoice
-from drivers.selection import Selection
+from stereo_sfm.calib import save_rig
+from stereo_sfm.drivers import open_source
+from stereo_sfm.drivers.choice import ReplayChoice, SourceChoice
+from stereo_sfm.drivers.selection import Selection
 from stereo_sfm.errors import StereoSfmError
 
 SPEC = "sim:aisle?size=212x200&frames=8&effects=0"

@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
-from calib import Rig, save_rig
-from drivers.image_lists import pair_by_stamp
-from drivers.registry import recognise
-from drivers.select import SelectedFrames
-from drivers.source import open_source
+from stereo_sfm.calib import Rig, save_rig
 from stereo_sfm.cli import main
+from stereo_sfm.drivers.image_lists import pair_by_stamp
+from stereo_sfm.drivers.registry import recognise
+from stereo_sfm.drivers.select import SelectedFrames
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry.cameras import Pinhole
 from stereo_sfm.pixels import eight_bits

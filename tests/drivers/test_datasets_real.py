@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.source import Source, open_source
+from stereo_sfm.drivers.source import Source, open_source
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, StereoImage
 

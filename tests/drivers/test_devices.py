@@ -7,13 +7,13 @@ import re
 
 import pytest
 
-from drivers.devices import list_devices, udev_rules
-from drivers.driver import Attached
-from drivers.live.errors import DeviceFault
-from drivers.t265.simulated.bus import SimulatedBus
-from drivers.t265.simulated.camera import SimulatedCamera
-from drivers.t265.simulated.faults import Faults
 from stereo_sfm import cli
+from stereo_sfm.drivers.devices import list_devices, udev_rules
+from stereo_sfm.drivers.driver import Attached
+from stereo_sfm.drivers.live.errors import DeviceFault
+from stereo_sfm.drivers.t265.simulated.bus import SimulatedBus
+from stereo_sfm.drivers.t265.simulated.camera import SimulatedCamera
+from stereo_sfm.drivers.t265.simulated.faults import Faults
 from tests.drivers.oak_rig import FakeOak
 from tests.drivers.t265_rig import noise_content
 
@@ -27,14 +27,14 @@ def camera(faults: Faults | None = None, serial: str = "0000D0C0FFEE", booted: b
 def list_on(
     bus: SimulatedBus, monkeypatch: pytest.MonkeyPatch, probe: bool = False
 ) -> tuple[list[Attached], list[str]]:
-    monkeypatch.setattr("drivers.t265.usb_device.default_backend", lambda: bus)
+    monkeypatch.setattr("stereo_sfm.drivers.t265.usb_device.default_backend", lambda: bus)
     return list_devices(probe)
 
 
 @pytest.fixture
 def oak(monkeypatch: pytest.MonkeyPatch) -> FakeOak:
     fake = FakeOak(attached=0)
-    monkeypatch.setattr("drivers.oak.library.load", lambda: fake)
+    monkeypatch.setattr("stereo_sfm.drivers.oak.library.load", lambda: fake)
     return fake
 
 
@@ -82,19 +82,19 @@ def test_a_driver_that_cannot_look_does_not_hide_the_others(monkeypatch: pytest.
     def broken() -> None:
         raise DeviceFault("no depthai here")
 
-    monkeypatch.setattr("drivers.oak.library.load", broken)
+    monkeypatch.setattr("stereo_sfm.drivers.oak.library.load", broken)
     found, problems = list_on(SimulatedBus([camera()]), monkeypatch)
     assert [d.driver for d in found] == ["t265"]
     assert problems == ["oak: no depthai here"]
 
 
 def test_commands(oak: FakeOak, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr("drivers.t265.usb_device.default_backend", lambda: SimulatedBus([camera()]))
+    monkeypatch.setattr("stereo_sfm.drivers.t265.usb_device.default_backend", lambda: SimulatedBus([camera()]))
     assert cli.main(["devices"]) == 0
     assert re.search(r"t265:0000D0C0FFEE +t265 +0000D0C0FFEE +super +0\.2\.0\.951 +yes", capsys.readouterr().out)
     assert cli.main(["devices", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["devices"][0]["firmware"] == "0.2.0.951"
-    monkeypatch.setattr("drivers.t265.usb_device.default_backend", lambda: SimulatedBus([]))
+    monkeypatch.setattr("stereo_sfm.drivers.t265.usb_device.default_backend", lambda: SimulatedBus([]))
     assert cli.main(["devices"]) == 0
     assert "no OAK or T265 attached" in capsys.readouterr().out
     assert cli.main(["t265", "reset"]) == 2
@@ -103,7 +103,7 @@ def test_commands(oak: FakeOak, monkeypatch: pytest.MonkeyPatch, capsys: pytest.
 
 def test_reset_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     one = camera()
-    monkeypatch.setattr("drivers.t265.usb_device.default_backend", lambda: SimulatedBus([one]))
+    monkeypatch.setattr("stereo_sfm.drivers.t265.usb_device.default_backend", lambda: SimulatedBus([one]))
     assert cli.main(["t265", "reset"]) == 0
     assert not one.booted
     assert "boot state" in capsys.readouterr().out

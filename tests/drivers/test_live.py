@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.live.buffers import Handoff, MotionBuffer, WheelBuffer
-from drivers.live.clock import ClockMap, TimeLine
-from drivers.live.counters import COUNTERS, Counters
-from drivers.live.errors import DeviceLost
-from drivers.live.pairing import LEFT, RIGHT, Eye, Pair, Pairer
+from stereo_sfm.drivers.live.buffers import Handoff, MotionBuffer, WheelBuffer
+from stereo_sfm.drivers.live.clock import ClockMap, TimeLine
+from stereo_sfm.drivers.live.counters import COUNTERS, Counters
+from stereo_sfm.drivers.live.errors import DeviceLost
+from stereo_sfm.drivers.live.pairing import LEFT, RIGHT, Eye, Pair, Pairer
 
 PERIOD = 33_333_333
 PIXELS = np.zeros((1, 1), np.uint8)

@@ -19,11 +19,11 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from mcap.writer import Writer
 from mcap_protobuf.writer import Writer as ProtobufWriter
 
-from calib.rig import Rig
-from drivers import open_source
-from drivers.mcap.topics import choose_topics
-from drivers.memory import MemorySource
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.cli import main
+from stereo_sfm.drivers import open_source
+from stereo_sfm.drivers.mcap.topics import choose_topics
+from stereo_sfm.drivers.memory import MemorySource
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, KannalaBrandt, Pinhole, RadTan
@@ -369,7 +369,7 @@ def test_bad_calibrations_are_one_line(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 def test_a_given_rig_stands_in_for_a_missing_calibration(tmp_path: Path) -> None:
-    from calib import save_rig
+    from stereo_sfm.calib import save_rig
 
     path = _write(tmp_path / "a.mcap", calibrations=(), transforms=())
     save_rig(Rig(RADTAN, RADTAN, LEFT_T_RIGHT.copy()), tmp_path / "rig.yaml")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from drivers.memory import PERIOD_NS, MemorySource
+from stereo_sfm.drivers.memory import PERIOD_NS, MemorySource
 from tests.log.recordings import fisheye_rig, stereo_images
 
 

@@ -14,13 +14,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.live.counters import Counters
-from drivers.live.errors import Busy, DeviceError, DeviceFault, DeviceLost, NoPermission, NotFound, TooSlowLink
-from drivers.oak import library
-from drivers.oak.calibration import read_calibration
-from drivers.oak.source import OakSource
-from drivers.oak.stream import OakStream
-from drivers.source import open_source
+from stereo_sfm.drivers.live.counters import Counters
+from stereo_sfm.drivers.live.errors import (
+    Busy,
+    DeviceError,
+    DeviceFault,
+    DeviceLost,
+    NoPermission,
+    NotFound,
+    TooSlowLink,
+)
+from stereo_sfm.drivers.oak import library
+from stereo_sfm.drivers.oak.calibration import read_calibration
+from stereo_sfm.drivers.oak.source import OakSource
+from stereo_sfm.drivers.oak.stream import OakStream
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry.cameras import KannalaBrandt, RadTan
 from stereo_sfm.types import StereoImage
@@ -30,8 +38,8 @@ from tests.drivers.oak_rig import FIXTURES, PERIOD_S, SIZE, FakeOak, calibration
 @pytest.fixture
 def fake(monkeypatch: pytest.MonkeyPatch) -> FakeOak:
     oak = FakeOak()
-    monkeypatch.setattr("drivers.oak.source.load", lambda: oak)
-    monkeypatch.setattr("drivers.oak.source.on_usb", lambda: True)
+    monkeypatch.setattr("stereo_sfm.drivers.oak.source.load", lambda: oak)
+    monkeypatch.setattr("stereo_sfm.drivers.oak.source.on_usb", lambda: True)
     return oak
 
 
@@ -46,9 +54,9 @@ def test_depthai_is_imported_late_and_silenced(tmp_path: Path) -> None:
     """Nothing is imported with the driver; its telemetry queue stays empty; no internet socket is opened."""
     code = """
 import sys, os, socket
-import drivers.oak, drivers.oak.source, stereo_sfm
+import stereo_sfm.drivers.oak, stereo_sfm.drivers.oak.source, stereo_sfm
 assert not any(m == "depthai" or m.startswith("depthai.") for m in sys.modules), "imported too early"
-from drivers.oak.library import load, ENVIRONMENT
+from stereo_sfm.drivers.oak.library import load, ENVIRONMENT
 os.environ["DEPTHAI_LEVEL"] = "error"
 dai = load()
 assert os.environ["DEPTHAI_LEVEL"] == "error", "what the user has set stays"
@@ -67,7 +75,7 @@ assert not any(f" {i} " in t for i in inodes for t in tables), "an internet sock
 
 
 def test_no_camera_is_one_line_in_under_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("drivers.oak.source.on_usb", lambda: False)
+    monkeypatch.setattr("stereo_sfm.drivers.oak.source.on_usb", lambda: False)
     began = time.monotonic()
     with pytest.raises(NotFound, match="no OAK attached") as caught:
         open_source("oak")

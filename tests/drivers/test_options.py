@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import pytest
 
-from drivers.options import SourceOptions, described, option, read_options
+from stereo_sfm.drivers.options import SourceOptions, described, option, read_options
 from stereo_sfm.errors import StereoSfmError
 
 

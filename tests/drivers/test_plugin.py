@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
-from calib import save_rig
-from drivers import open_source
+from stereo_sfm.calib import save_rig
+from stereo_sfm.drivers import open_source
 
 ROOT = Path(__file__).parents[2]
 EXAMPLE = ROOT / "examples" / "webcam_driver"

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-import drivers
-from drivers import open_source, registry
-from drivers.driver import Certainty, Driver
-from drivers.options import SourceOptions, described
-from drivers.source import is_device, look_up, path_of
+from stereo_sfm import drivers
+from stereo_sfm.drivers import open_source, registry
+from stereo_sfm.drivers.driver import Certainty, Driver
+from stereo_sfm.drivers.options import SourceOptions, described
+from stereo_sfm.drivers.source import is_device, look_up, path_of
 from stereo_sfm.errors import StereoSfmError
 
 ROOT = Path(__file__).parents[2]
@@ -25,7 +25,8 @@ def test_ours_are_declared_where_those_of_others_are() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert set(project["entry-points"][registry.GROUP]) <= set(registry.kinds())
     packages = {p.parent.name for p in (ROOT / "drivers").glob("*/__init__.py") if "Driver(" in p.read_text()}
-    values = {v.split(":")[0].removeprefix("drivers.") for v in project["entry-points"][registry.GROUP].values()}
+    entries = project["entry-points"][registry.GROUP].values()
+    values = {v.split(":")[0].removeprefix("stereo_sfm.drivers.") for v in entries}
     assert packages == values
 
 
@@ -57,8 +58,8 @@ def test_a_typo_is_told_before_anything_heavy_is_loaded() -> None:
 
 
 def test_the_scenes_that_can_be_named_are_those_that_there_are() -> None:
-    from drivers import sim
-    from drivers.sim.scenes import SCENES
+    from stereo_sfm.drivers import sim
+    from stereo_sfm.drivers.sim.scenes import SCENES
 
     assert tuple(SCENES) == sim.SCENES
 
@@ -115,14 +116,14 @@ def test_a_broken_package_hides_no_other_driver(
 ) -> None:
     entries = {
         "broken": EntryPoint("broken", "no.such.module:DRIVER", registry.GROUP),
-        "else": EntryPoint("else", "drivers.driver:Certainty", registry.GROUP),
-        "sim": EntryPoint("sim", "drivers.sim:DRIVER", registry.GROUP),
+        "else": EntryPoint("else", "stereo_sfm.drivers.driver:Certainty", registry.GROUP),
+        "sim": EntryPoint("sim", "stereo_sfm.drivers.sim:DRIVER", registry.GROUP),
     }
     monkeypatch.setattr(registry, "_found", lambda: entries)
     registry.driver.cache_clear()
     try:
         assert [kind for kind, _ in registry.drivers()] == ["sim"]
         assert "'broken' (no.such.module:DRIVER) cannot be loaded" in caplog.text
-        assert "'else' (drivers.driver:Certainty) is no drivers.driver.Driver" in caplog.text
+        assert "'else' (stereo_sfm.drivers.driver:Certainty) is no stereo_sfm.drivers.driver.Driver" in caplog.text
     finally:
         registry.driver.cache_clear()

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.options import read_options
-from drivers.sim.options import SimOptions
-from drivers.sim.scenes import SCENES, random_poses
-from drivers.sim.source import SimSource
-from drivers.sim.world import Layout
-from drivers.source import open_source
+from stereo_sfm.drivers.options import read_options
+from stereo_sfm.drivers.sim.options import SimOptions
+from stereo_sfm.drivers.sim.scenes import SCENES, random_poses
+from stereo_sfm.drivers.sim.source import SimSource
+from stereo_sfm.drivers.sim.world import Layout
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import StereoImage
@@ -116,7 +116,7 @@ def test_walks_are_smooth_and_keep_clear_of_the_shelves(name: str, walk: int) ->
 
 def small_walk(name: str, walk: int):
     """The scene's own walk, without building its store."""
-    from drivers.sim.walks import Walk
+    from stereo_sfm.drivers.sim.walks import Walk
 
     scene = SCENES[name]
     route = scene.route(scene.layout, walk, True)

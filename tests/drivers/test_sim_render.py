@@ -9,17 +9,17 @@ import cv2
 import numpy as np
 import pytest
 
-from calib.rig import Rig
-from drivers.sim.effects import CLEAN, Effects, Sensor
-from drivers.sim.kernels import BLOCK, FACING, FRONT, PERSON, ROOM, TARGET
-from drivers.sim.people import crowd_at, moving
-from drivers.sim.render import Renderer, View
-from drivers.sim.rigs import CAMERAS, make_rig
-from drivers.sim.scenes import SCENES, crowd
-from drivers.sim.tables import Tables
-from drivers.sim.targets import Target, empty_room, move, place
-from drivers.sim.walks import FORWARD
-from drivers.sim.world import Layout, build_world
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.sim.effects import CLEAN, Effects, Sensor
+from stereo_sfm.drivers.sim.kernels import BLOCK, FACING, FRONT, PERSON, ROOM, TARGET
+from stereo_sfm.drivers.sim.people import crowd_at, moving
+from stereo_sfm.drivers.sim.render import Renderer, View
+from stereo_sfm.drivers.sim.rigs import CAMERAS, make_rig
+from stereo_sfm.drivers.sim.scenes import SCENES, crowd
+from stereo_sfm.drivers.sim.tables import Tables
+from stereo_sfm.drivers.sim.targets import Target, empty_room, move, place
+from stereo_sfm.drivers.sim.walks import FORWARD
+from stereo_sfm.drivers.sim.world import Layout, build_world
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, U8
 

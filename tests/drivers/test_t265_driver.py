@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-import drivers.t265
-from drivers import open_source
-from drivers.live.errors import (
+import stereo_sfm.drivers.t265
+from stereo_sfm.drivers import open_source
+from stereo_sfm.drivers.live.errors import (
     BootFailed,
     Busy,
     DeviceFault,
@@ -25,16 +25,16 @@ from drivers.live.errors import (
     NotFound,
     TooSlowLink,
 )
-from drivers.live.source import Patience
-from drivers.t265 import messages as m
-from drivers.t265.acquire import Access
-from drivers.t265.camera import Settings
-from drivers.t265.firmware import verified
-from drivers.t265.messages import AntiFlicker, Id
-from drivers.t265.simulated.bus import SimulatedBus
-from drivers.t265.simulated.camera import SimulatedCamera
-from drivers.t265.simulated.faults import Faults
-from drivers.t265.simulated.source import FAST, SimulatedT265Source, checked_firmware
+from stereo_sfm.drivers.live.source import Patience
+from stereo_sfm.drivers.t265 import messages as m
+from stereo_sfm.drivers.t265.acquire import Access
+from stereo_sfm.drivers.t265.camera import Settings
+from stereo_sfm.drivers.t265.firmware import verified
+from stereo_sfm.drivers.t265.messages import AntiFlicker, Id
+from stereo_sfm.drivers.t265.simulated.bus import SimulatedBus
+from stereo_sfm.drivers.t265.simulated.camera import SimulatedCamera
+from stereo_sfm.drivers.t265.simulated.faults import Faults
+from stereo_sfm.drivers.t265.simulated.source import FAST, SimulatedT265Source, checked_firmware
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import StereoImage
 from tests.drivers.t265_rig import noise_content, open_camera, take
@@ -354,7 +354,7 @@ def test_no_dangerous_message_can_be_sent() -> None:
 
 def test_only_two_functions_write_to_a_camera() -> None:
     """The command function, and the one that sends checked firmware to a camera in its boot state."""
-    folder = Path(drivers.t265.__file__).parent
+    folder = Path(stereo_sfm.drivers.t265.__file__).parent
     writers = [
         (path.name, line.strip())
         for path in sorted(folder.glob("*.py"))
@@ -369,8 +369,8 @@ def test_only_two_functions_write_to_a_camera() -> None:
 
 
 def test_firmware_goes_to_unbooted_cameras_only() -> None:
-    from drivers.t265.boot import boot
-    from drivers.t265.usb_device import attached
+    from stereo_sfm.drivers.t265.boot import boot
+    from stereo_sfm.drivers.t265.usb_device import attached
 
     camera = SimulatedCamera(noise_content())
     camera.booted = True

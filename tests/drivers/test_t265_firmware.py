@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from drivers.t265 import firmware
 from stereo_sfm import cli
+from stereo_sfm.drivers.t265 import firmware
 from stereo_sfm.errors import StereoSfmError
 
 BLOB = b"MA2x" + bytes(range(256)) * ((firmware.SIZE - 4) // 256 + 1)

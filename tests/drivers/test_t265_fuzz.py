@@ -11,17 +11,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.live.counters import Counters
-from drivers.live.errors import DeviceError
-from drivers.live.pairing import LEFT, RIGHT, Eye, EyeLock, Pairer
-from drivers.t265 import messages as m
-from drivers.t265 import protocol as p
-from drivers.t265 import samples
-from drivers.t265.link import Link, Timing
-from drivers.t265.messages import Id, Sensor
-from drivers.t265.simulated.bus import SimulatedBus
-from drivers.t265.simulated.camera import SimulatedCamera
-from drivers.t265.usb_device import attached
+from stereo_sfm.drivers.live.counters import Counters
+from stereo_sfm.drivers.live.errors import DeviceError
+from stereo_sfm.drivers.live.pairing import LEFT, RIGHT, Eye, EyeLock, Pairer
+from stereo_sfm.drivers.t265 import messages as m
+from stereo_sfm.drivers.t265 import protocol as p
+from stereo_sfm.drivers.t265 import samples
+from stereo_sfm.drivers.t265.link import Link, Timing
+from stereo_sfm.drivers.t265.messages import Id, Sensor
+from stereo_sfm.drivers.t265.simulated.bus import SimulatedBus
+from stereo_sfm.drivers.t265.simulated.camera import SimulatedCamera
+from stereo_sfm.drivers.t265.usb_device import attached
 from stereo_sfm.errors import StereoSfmError
 from tests.drivers.t265_rig import noise_content
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.memory import MemorySource
-from drivers.t265.simulated.content import Content, room_content, source_content
-from drivers.t265.simulated.faults import Faults
+from stereo_sfm.drivers.memory import MemorySource
+from stereo_sfm.drivers.t265.simulated.content import Content, room_content, source_content
+from stereo_sfm.drivers.t265.simulated.faults import Faults
 from stereo_sfm.geometry import se3
 from stereo_sfm.pipeline.run import run
 from stereo_sfm.types import TrackState

@@ -7,10 +7,10 @@ import struct
 import numpy as np
 import pytest
 
-from drivers.t265 import messages as m
-from drivers.t265 import protocol as p
-from drivers.t265 import samples
-from drivers.t265.messages import AntiFlicker, Id, Sensor
+from stereo_sfm.drivers.t265 import messages as m
+from stereo_sfm.drivers.t265 import protocol as p
+from stereo_sfm.drivers.t265 import samples
+from stereo_sfm.drivers.t265.messages import AntiFlicker, Id, Sensor
 
 FISHEYES = [p.StreamProfile(eye, 848, 800, m.PIXEL_FORMAT_Y8, 848, 30, to_host=True) for eye in (0x03, 0x23)]
 

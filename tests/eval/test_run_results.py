@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.errors import from_os_error
 from stereo_sfm.eval.evaluate import evaluate, table

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from evo.tools import file_interface
 
-from drivers.ground_truth import read_euroc, read_kitti, read_trajectory, read_tum, stamp_from_seconds
+from stereo_sfm.drivers.ground_truth import read_euroc, read_kitti, read_trajectory, read_tum, stamp_from_seconds
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.eval.evaluate import evaluate, table
 from stereo_sfm.export.trajectories import fill_missing, seconds, write_euroc, write_kitti, write_tum

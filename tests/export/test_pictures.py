@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from calib import save_rig
-from drivers.rectified import RectifiedSource, rectified
-from drivers.source import open_source
+from stereo_sfm.calib import save_rig
 from stereo_sfm.cli import main
+from stereo_sfm.drivers.rectified import RectifiedSource, rectified
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.colmap import export_colmap
 from stereo_sfm.export.pictures import check_walk, open_pictures, walk_of_recording, write_pictures

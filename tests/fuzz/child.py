@@ -19,7 +19,7 @@ HEADROOM = 1 << 30  # bytes of address space beyond what the program needs when 
 
 def frames(path: str) -> int:
     """Read a whole source as a command would."""
-    from drivers.source import open_source
+    from stereo_sfm.drivers.source import open_source
     from stereo_sfm.errors import StereoSfmError
 
     try:

@@ -21,10 +21,10 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from calib import save_rig
-from calib.formats import FORMATS
-from drivers.memory import MemorySource
+from stereo_sfm.calib import save_rig
+from stereo_sfm.calib.formats import FORMATS
 from stereo_sfm.config import Config, dump
+from stereo_sfm.drivers.memory import MemorySource
 from stereo_sfm.maps.saved_map import save_map
 from stereo_sfm.types import Trajectory
 from tests.calib.test_formats import CANNOT, RIGS, target

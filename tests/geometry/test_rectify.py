@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from calib.rectification import Rectification, rectify
-from calib.rig import Rig
+from stereo_sfm.calib.rectification import Rectification, rectify
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Pinhole, RadTan

@@ -21,7 +21,7 @@ def camera() -> str:
     given = os.environ.get("STEREO_SFM_CAMERA")
     if given:
         return given
-    from drivers.devices import list_devices
+    from stereo_sfm.drivers.devices import list_devices
 
     cameras, problems = list_devices()
     if len(cameras) == 1:

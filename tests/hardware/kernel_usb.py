@@ -15,14 +15,14 @@ import time
 from pathlib import Path
 from typing import Any
 
-from drivers.live.source import Patience
-from drivers.t265.acquire import Access
-from drivers.t265.camera import Settings
-from drivers.t265.link import Timing
-from drivers.t265.simulated.camera import SimulatedCamera
-from drivers.t265.simulated.faults import preset
-from drivers.t265.simulated.source import SimulatedT265Source, checked_firmware
-from drivers.t265.usb_device import attached, default_backend
+from stereo_sfm.drivers.live.source import Patience
+from stereo_sfm.drivers.t265.acquire import Access
+from stereo_sfm.drivers.t265.camera import Settings
+from stereo_sfm.drivers.t265.link import Timing
+from stereo_sfm.drivers.t265.simulated.camera import SimulatedCamera
+from stereo_sfm.drivers.t265.simulated.faults import preset
+from stereo_sfm.drivers.t265.simulated.source import SimulatedT265Source, checked_firmware
+from stereo_sfm.drivers.t265.usb_device import attached, default_backend
 from tests.drivers.t265_rig import noise_content
 from tests.hardware.usbip_server import SUPER_SPEED, UsbIpServer, import_device
 
@@ -105,7 +105,7 @@ def main() -> int:
     """Command line; 3 when a wrong image came, or none."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=10)
-    parser.add_argument("--faults", default="none", help="names of drivers.t265.simulated.faults.PRESETS")
+    parser.add_argument("--faults", default="none", help="names of stereo_sfm.drivers.t265.simulated.faults.PRESETS")
     parser.add_argument("--paced", action="store_true", help="30 Hz; else as fast as this computer reads")
     options = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.live.source import LiveSource
-from drivers.source import open_source
+from stereo_sfm.drivers.live.source import LiveSource
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.types import StereoImage
 
 pytestmark = pytest.mark.hardware
@@ -40,7 +40,7 @@ def take(source: LiveSource, seconds: float) -> list[StereoImage]:
 
 def test_attached(camera: str, report: dict[str, Any]) -> None:
     """`stereo-sfm devices` sees it."""
-    from drivers.devices import list_devices
+    from stereo_sfm.drivers.devices import list_devices
 
     began = time.monotonic()
     cameras, problems = list_devices()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 
-from drivers.t265 import messages as m
+from stereo_sfm.drivers.t265 import messages as m
 
 _DEVICE, _CONFIG, _STRING, _BOS = 1, 2, 3, 15
 _BULK, _INTERRUPT = 2, 3

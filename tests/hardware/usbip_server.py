@@ -13,8 +13,8 @@ import threading
 from collections import deque
 from dataclasses import dataclass
 
-from drivers.t265 import messages as m
-from drivers.t265.simulated.camera import Gone, SimulatedCamera
+from stereo_sfm.drivers.t265 import messages as m
+from stereo_sfm.drivers.t265.simulated.camera import Gone, SimulatedCamera
 from tests.hardware.usb_descriptors import standard_request
 
 VERSION = 0x0111

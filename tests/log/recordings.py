@@ -7,8 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from calib.rig import Rig
-from drivers.memory import MemorySource
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.memory import MemorySource
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import KannalaBrandt, Pinhole
 from stereo_sfm.recording.record import record

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.formats.native import rig_to_text
+from stereo_sfm.calib.formats.native import rig_to_text
 from stereo_sfm.config import Config, dump
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log.attached import attached_config, attached_rig, attached_truth

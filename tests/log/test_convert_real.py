@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers import open_source
 from stereo_sfm.cli import main
+from stereo_sfm.drivers import open_source
 from tests.log.recordings import assert_same_image
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.memory import MemorySource
 from stereo_sfm.cli import main
 from stereo_sfm.config import Config
+from stereo_sfm.drivers.memory import MemorySource
 from stereo_sfm.log import topics
 from stereo_sfm.log.diff import Difference, diff
 from stereo_sfm.log.reader import LogReader

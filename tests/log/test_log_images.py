@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers import open_source
+from stereo_sfm.drivers import open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log import images
 from stereo_sfm.log.image_log import ImageLog

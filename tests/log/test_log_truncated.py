@@ -18,9 +18,9 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
-from drivers import open_source
 from stereo_sfm.cli import main
 from stereo_sfm.commands import record as record_command
+from stereo_sfm.drivers import open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log import repair, topics
 from stereo_sfm.log.reader import LogReader
@@ -177,7 +177,7 @@ from pathlib import Path
 sys.path.insert(0, {root!r})
 import numpy as np
 from stereo_sfm.recording.record import record
-from drivers.memory import MemorySource
+from stereo_sfm.drivers.memory import MemorySource
 from tests.log.recordings import fisheye_rig, stereo_images
 
 class Slow(MemorySource):

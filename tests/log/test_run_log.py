@@ -21,9 +21,9 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
 
-from drivers import open_source
 from stereo_sfm.cli import main
 from stereo_sfm.config import Config, from_dict
+from stereo_sfm.drivers import open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.log import foxglove, schema, topics

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from calib.rig import Rig
-from drivers import open_source
-from drivers.mcap.source import McapSource
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers import open_source
+from stereo_sfm.drivers.mcap.source import McapSource
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log import foxglove, topics
 from stereo_sfm.log.reader import LogReader

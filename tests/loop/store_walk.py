@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F32, F64, I64, U8, Corners, Keyframe
 from tests.synthetic import fisheye_rig, see

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry.cameras import Epipolar
 from stereo_sfm.mapping.bundle import Bundle, BundleConfig, bundle_adjust

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.correction import loop_is_known

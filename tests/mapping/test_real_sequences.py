@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from drivers.source import open_source
 from stereo_sfm.config import Config
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.eval.evaluate import Evaluation, evaluate
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.pipeline.run import run

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.cli import main
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3

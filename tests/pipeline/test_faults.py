@@ -14,7 +14,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from drivers.choice import MadeSource
+from stereo_sfm.drivers.choice import MadeSource
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log import topics
 from stereo_sfm.log.reader import LogReader

@@ -13,10 +13,10 @@ import numpy as np
 import psutil
 import pytest
 
-from calib.rig import Rig
-from drivers.choice import MadeSource, SourceChoice
-from drivers.source import BaseSource
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config, load
+from stereo_sfm.drivers.choice import MadeSource, SourceChoice
+from stereo_sfm.drivers.source import BaseSource
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry.cameras import Pinhole
 from stereo_sfm.log.diff import diff

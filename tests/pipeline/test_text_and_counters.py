@@ -11,7 +11,7 @@ from typing import Any, Self
 
 import pytest
 
-from drivers.choice import MadeSource
+from stereo_sfm.drivers.choice import MadeSource
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.eval.statistics import statistics, summary
 from stereo_sfm.log import topics

@@ -13,7 +13,7 @@ import numpy as np
 import psutil
 import pytest
 
-from drivers.choice import MadeSource
+from stereo_sfm.drivers.choice import MadeSource
 from stereo_sfm.pipeline import processes, workers
 from stereo_sfm.pipeline.channels import DroppingOutbox, Inbox, Outbox
 from stereo_sfm.pipeline.processes import ProcessRun

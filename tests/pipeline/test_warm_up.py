@@ -8,14 +8,14 @@ import sys
 
 import numpy as np
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry.cameras import Pinhole
 from stereo_sfm.pipeline.warm_up import keyframes
 
 CHILD = """
 import sys
 from numba.core.dispatcher import Dispatcher
-from drivers.source import open_source
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.config import Config
 from stereo_sfm.demo import demo_recording
 from stereo_sfm.pipeline.inline import run_inline

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.rig import Rig
-from drivers.source import open_source
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config, FeaturesConfig, OdometryConfig, load
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.eval.evaluate import evaluate
 from stereo_sfm.geometry import se3

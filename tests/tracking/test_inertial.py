@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib import load_rig, save_rig
-from calib.imu import Imu
-from calib.rig import Rig
-from drivers.source import open_source
+from stereo_sfm.calib import load_rig, save_rig
+from stereo_sfm.calib.imu import Imu
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Pinhole
 from stereo_sfm.geometry.preintegration import GRAVITY
@@ -204,7 +204,7 @@ def test_a_drone_goes_on_in_the_dark_and_is_found_again(data_root: Path) -> None
             if image.frame_id == 72:
                 break
         truth, rig = source.ground_truth, source.rig
-    from drivers.memory import MemorySource
+    from stereo_sfm.drivers.memory import MemorySource
 
     config = Config()
     config = replace(config, mapper=replace(config.mapper, enabled=False), loop=replace(config.loop, enabled=False))

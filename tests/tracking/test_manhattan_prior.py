@@ -7,8 +7,8 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from drivers.source import open_source
 from stereo_sfm.config import ManhattanConfig, load
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.vanishing import Manhattan

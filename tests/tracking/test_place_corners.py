@@ -8,10 +8,10 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from calib.rig import Rig
-from drivers.sim.source import SimSource
-from drivers.source import open_source
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import load
+from stereo_sfm.drivers.sim.source import SimSource
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.verification import occupied_cells
 from stereo_sfm.maps.single_image import still_keyframe

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, Epipolar, KannalaBrandt, Pinhole, RadTan
 from stereo_sfm.tracking.flow import pose_solver

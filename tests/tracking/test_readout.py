@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib import load_rig, save_rig
-from drivers.sim.source import SimSource
-from drivers.source import open_source
+from stereo_sfm.calib import load_rig, save_rig
 from stereo_sfm.cli import main
 from stereo_sfm.config import TrackerConfig
+from stereo_sfm.drivers.sim.source import SimSource
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.geometry import se3
 from stereo_sfm.tracking.flow.readout import LEAST_FRAMES, LEAST_GAIN, ReadoutErrors, ReadoutSearch
 from stereo_sfm.types import StereoImage

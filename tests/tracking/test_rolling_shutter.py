@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from calib.rig import Rig
-from drivers.source import open_source
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import load
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.eval.evaluate import evaluate
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import KannalaBrandt, Pinhole

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.tracking.flow import klt

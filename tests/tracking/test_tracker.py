@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.rig import Rig
-from drivers.memory import MemorySource
-from drivers.rectified import RectifiedSource
-from drivers.source import Source, open_source
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import load
+from stereo_sfm.drivers.memory import MemorySource
+from stereo_sfm.drivers.rectified import RectifiedSource
+from stereo_sfm.drivers.source import Source, open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.eval.evaluate import evaluate
 from stereo_sfm.geometry import se3

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.source import open_source
 from stereo_sfm.config import OdometryConfig
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import KannalaBrandt
 from stereo_sfm.geometry.robust import Degenerate

@@ -14,8 +14,8 @@ from typing import Any
 import usb.backend
 import usb.core
 
-from drivers.t265 import messages as m
-from drivers.t265.simulated.camera import Gone, SimulatedCamera
+from stereo_sfm.drivers.t265 import messages as m
+from stereo_sfm.drivers.t265.simulated.camera import Gone, SimulatedCamera
 
 _ENDPOINTS = ((0x01, 2), (0x02, 2), (0x81, 2), (0x82, 2), (0x83, 3), (0x03, 3))  # address, type: bulk 2, interrupt 3
 

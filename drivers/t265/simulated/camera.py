@@ -11,13 +11,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from drivers.t265 import messages as m
-from drivers.t265.firmware import SIZE
-from drivers.t265.messages import Id, Sensor, Status
-from drivers.t265.protocol import StreamProfile
-from drivers.t265.simulated.content import Content
-from drivers.t265.simulated.faults import Faults
-from drivers.t265.simulated.wire import (
+from stereo_sfm.drivers.t265 import messages as m
+from stereo_sfm.drivers.t265.firmware import SIZE
+from stereo_sfm.drivers.t265.messages import Id, Sensor, Status
+from stereo_sfm.drivers.t265.protocol import StreamProfile
+from stereo_sfm.drivers.t265.simulated.content import Content
+from stereo_sfm.drivers.t265.simulated.faults import Faults
+from stereo_sfm.drivers.t265.simulated.wire import (
     OFFERED,
     Transfer,
     answer,

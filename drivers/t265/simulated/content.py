@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.rig import Rig
-from drivers.t265 import messages as m
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.t265 import messages as m
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, U8
@@ -54,8 +54,8 @@ class Content:
 
 def room_content(frames: int, seed: int = 0) -> Content:
     """The quick scene."""
-    from drivers.sim.rigs import fisheye
-    from drivers.t265.simulated.room import Room, walk
+    from stereo_sfm.drivers.sim.rigs import fisheye
+    from stereo_sfm.drivers.t265.simulated.room import Room, walk
 
     rig = fisheye()
     room = Room(rig, seed)
@@ -69,7 +69,7 @@ def source_content(spec: str, frames: int) -> Content:
     Raises:
         StereoSfmError: another camera, or no images.
     """
-    from drivers.source import open_source
+    from stereo_sfm.drivers.source import open_source
     from stereo_sfm.geometry.cameras import KannalaBrandt
 
     with open_source(spec) as source:

@@ -7,21 +7,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drivers.live.source import Patience, with_rig
-from drivers.t265 import messages as m
-from drivers.t265.acquire import Access
-from drivers.t265.camera import Settings
-from drivers.t265.firmware import SIZE, Firmware, verified
-from drivers.t265.link import Timing
-from drivers.t265.simulated.bus import SimulatedBus
-from drivers.t265.simulated.camera import SimulatedCamera
-from drivers.t265.simulated.content import room_content, source_content
-from drivers.t265.simulated.faults import preset
-from drivers.t265.source import T265Source, settings_of
+from stereo_sfm.drivers.live.source import Patience, with_rig
+from stereo_sfm.drivers.t265 import messages as m
+from stereo_sfm.drivers.t265.acquire import Access
+from stereo_sfm.drivers.t265.camera import Settings
+from stereo_sfm.drivers.t265.firmware import SIZE, Firmware, verified
+from stereo_sfm.drivers.t265.link import Timing
+from stereo_sfm.drivers.t265.simulated.bus import SimulatedBus
+from stereo_sfm.drivers.t265.simulated.camera import SimulatedCamera
+from stereo_sfm.drivers.t265.simulated.content import room_content, source_content
+from stereo_sfm.drivers.t265.simulated.faults import preset
+from stereo_sfm.drivers.t265.source import T265Source, settings_of
 from stereo_sfm.types import I64, Trajectory
 
 if TYPE_CHECKING:
-    from drivers.t265 import T265Options
+    from stereo_sfm.drivers.t265 import T265Options
 
 # The simulated camera is quick to boot and to forgive.
 FAST = Timing(busy_wait_s=0.05, boot_s=3.0, boot_poll_s=0.02, settle_s=0.02)

@@ -7,11 +7,11 @@ from typing import TypeAlias
 
 import numpy as np
 
-from calib.rig import Rig
-from drivers.t265 import messages as m
-from drivers.t265.messages import Id, Sensor, Status
-from drivers.t265.protocol import StreamProfile
-from drivers.t265.simulated.faults import Faults
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.t265 import messages as m
+from stereo_sfm.drivers.t265.messages import Id, Sensor, Status
+from stereo_sfm.drivers.t265.protocol import StreamProfile
+from stereo_sfm.drivers.t265.simulated.faults import Faults
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, U8
 

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.motion_only import bearing_errors, pose_covariance

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.tracking.flow import klt

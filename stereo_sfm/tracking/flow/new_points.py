@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.tracking.flow.corners import corner_mask, detect_corners
 from stereo_sfm.tracking.flow.follower import Follower

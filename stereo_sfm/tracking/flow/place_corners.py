@@ -10,7 +10,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.tracking.flow.corners import corner_mask
 from stereo_sfm.tracking.flow.klt import Pyramid, build_pyramid

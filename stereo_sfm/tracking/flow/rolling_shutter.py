@@ -16,7 +16,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.rig import Rig
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.geometry.se3_kernels import exp_into

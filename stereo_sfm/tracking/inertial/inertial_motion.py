@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.imu import Imu
+from stereo_sfm.calib.imu import Imu
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.preintegration import GRAVITY, Preintegrated, preintegrate
 from stereo_sfm.tracking.inertial.sample_buffer import SampleBuffer

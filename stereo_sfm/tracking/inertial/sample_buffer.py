@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.imu import Imu
+from stereo_sfm.calib.imu import Imu
 from stereo_sfm.types import F64, I64, ImuSamples
 
 MEMORY_S = 2.0  # how far back intervals may begin, besides the time since the last pose
