@@ -232,6 +232,13 @@ class LoopConfig:
     seed: int = number(0, 0, 10**9, "Of the samples of verification")
 
 
+@dataclass(frozen=True)
+class SelfCalibrationConfig:
+    """Whether the rotation of the right camera and its like are corrected from what is seen."""
+
+    mode: str = word("auto", ("auto", "off", "only-report"), "Correct the rig from what is seen, or only report it")
+
+
 STAGES = ("capture", "tracker", "mapper", "loop", "optimizer", "logger", "viewer")  # processes of a run
 
 
@@ -260,6 +267,7 @@ class Config:
     manhattan: ManhattanConfig = field(default_factory=ManhattanConfig)
     mapper: MapperConfig = field(default_factory=MapperConfig)
     loop: LoopConfig = field(default_factory=LoopConfig)
+    self_calibration: SelfCalibrationConfig = field(default_factory=SelfCalibrationConfig)
     pipeline: PipelineConfig = field(default_factory=PipelineConfig)
 
     def closes_loops(self, depth: bool, localize_only: bool) -> bool:

@@ -203,7 +203,7 @@ class System:
         Raises:
             StereoSfmError: nothing is mapped.
         """
-        saved = saved_map_of(self._run.map_stage.mapper, self.config, self.rig)
+        saved = saved_map_of(self._run.map_stage.mapper, self.config)
         if saved is None:
             raise StereoSfmError("nothing is mapped: no keyframe, or mapper.enabled=false")
         return saved

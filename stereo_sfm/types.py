@@ -192,6 +192,23 @@ class Keyframe(Message):
     descriptors: U8 = field(metadata=shape(-1, 32))  # binary (oriented BRIEF), zero rows where none could be computed
     submap_id: int = 0  # grows when tracking restarts after it was lost
     corners: Corners = field(default_factory=Corners.none)  # what it is recognised by; none: nothing
+    rig_terms: F64 = field(default_factory=lambda: np.zeros(6))  # (6,) the tracker's rig, as in `CalibrationUpdate`
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationUpdate(Message):
+    """The rig's terms that the mapper found: rotation of the right camera about x, y, z (3, radians), direction of the
+    baseline along y and z (2, radians), logarithm of the right focal length against the left."""
+
+    version: int  # of the map update that brings it
+    kf_id: int
+    stamp_ns: int
+    terms: F64  # (6,) added to the rig as its calibration says
+    terms_covariance: F64 = field(metadata=shape(6, 6))
+    since_kf_id: int  # first keyframe that was seen by the rig so corrected; those before stay as they were
+    applied: bool  # False: only reported
+    why: str  # "significant", "step" or "refined"
+    text: str  # for people
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,6 +231,7 @@ class MapUpdate(Message):
     refused_kf_ids: I64 = field(
         default_factory=lambda: np.zeros(0, np.int64)
     )  # (L,) whose accepted loop the map refused
+    calibration: CalibrationUpdate | None = None  # the rig from this update on, where that changes
 
 
 @dataclass(frozen=True, eq=False)

@@ -65,6 +65,11 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--odometry", metavar="NAME", help="motion estimator: flow (default), em-r, vp-r, r-um, um, eight-point, pnp"
     )
+    parser.add_argument(
+        "--self-calibrate",
+        choices=("auto", "off", "only-report"),
+        help="correct the rotation of the right camera from what is seen, where the evidence is there (default: auto)",
+    )
     parser.add_argument("--seed", type=int, help="of everything random (seed and loop.seed of the configuration)")
 
 
@@ -123,6 +128,7 @@ def load_config(args: argparse.Namespace) -> Config:
 
     overrides = [f"odometry.method={args.odometry}"] if args.odometry is not None else []
     overrides += [f"features.kind={args.features}"] if args.features is not None else []
+    overrides += [f"self_calibration.mode={args.self_calibrate}"] if args.self_calibrate is not None else []
     overrides += list(args.set) + ([f"seed={args.seed}", f"loop.seed={args.seed}"] if args.seed is not None else [])
     chosen = config.load(args.config, overrides, preset(args.preset))
     if args.features is not None and chosen.odometry.method == "flow":

@@ -23,6 +23,7 @@ from stereo_sfm.types import (
     F64,
     I64,
     Bool,
+    CalibrationUpdate,
     Dropped,
     Frame,
     Keyframe,
@@ -74,6 +75,7 @@ class RunRecord:
     seen_points: Bool = field(default_factory=lambda: np.zeros(1024, bool))  # by id: whether a keyframe had it
     closed: list[LoopResult] = field(default_factory=list[LoopResult])  # as the loop closer said
     refused_kf_ids: set[int] = field(default_factory=set[int])  # of loops that the mapper did not believe
+    calibrations: list[CalibrationUpdate] = field(default_factory=list[CalibrationUpdate])  # changes of the rig
     rejections: dict[str, int] = field(default_factory=dict[str, int])
     _path_m: float = 0.0
 
@@ -136,6 +138,8 @@ class RunRecord:
     @_take.register
     def _put_update(self, update: MapUpdate) -> None:
         self.map_T_kf.update(update)
+        if update.calibration is not None:
+            self.calibrations.append(update.calibration)
         self.refused_kf_ids.update(update.refused_kf_ids.tolist())
         self.map_points.update(update.point_ids.tolist())
         self.map_points.difference_update(update.culled_point_ids.tolist(), update.fused_point_ids[:, 0].tolist())

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from stereo_sfm.eval import plots
+from stereo_sfm.eval.calibration_results import calibration_table
 from stereo_sfm.eval.evaluate import Evaluation, table
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.eval.statistics import failure, summary, thousands
@@ -46,6 +47,7 @@ def write_report(
     for name, result in evaluations.items():
         lines += ["", f"## {name.capitalize()} against ground truth", "", "| | |", "|---|---|"]
         lines += [f"| {key} | {value} |" for key, value in table(result)]
+    lines += calibration_table(stats)
     if reference is None:
         lines += ["", "The source has no ground truth: `stereo-sfm eval` compares the trajectory with one."]
     lines += ["", "## Time per stage", "", "| stage | p50 | p95 | p99 | frames |", "|---|---|---|---|---|"]

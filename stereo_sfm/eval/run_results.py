@@ -12,6 +12,7 @@ from stereo_sfm import config as configuration
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError, writing_to
+from stereo_sfm.eval.calibration_results import write_corrected_rig
 from stereo_sfm.eval.evaluate import Evaluation, evaluate
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.eval.report import write_report
@@ -75,6 +76,7 @@ def write_results(
             _write_tum(folder / "keyframes.tum", keyframes, rig, frame)
         (folder / "config.toml").write_text(configuration.dump(config), encoding="utf-8")
         save_rig(rig, folder / "rig.yaml")
+        write_corrected_rig(folder, rig, record)
         evaluations = _evaluate(estimates, reference, "sim3" if scale_free(config, rig) else "se3")
         stats = {"source": source_name, "frame": frame, **statistics(record, wall_s, evaluations)}
         stats |= {"max_lost_percent": max_lost_percent, "why_not_started": why_not_started}

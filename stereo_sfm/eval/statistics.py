@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from stereo_sfm.drivers.live.counters import TROUBLE
+from stereo_sfm.eval.calibration_results import calibration_lines, calibration_stats
 from stereo_sfm.eval.evaluate import Evaluation, length
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.messages import Health
@@ -68,6 +69,7 @@ def statistics(record: RunRecord, wall_s: float, evaluations: dict[str, Evaluati
         "ms": stage_times(record),
         "health": {stage: _health(report) for stage, report in sorted(record.health.items())},
         "camera": record.source_counts,
+        "calibration": calibration_stats(record),
         "fingerprint": record.fingerprint(),
         "evaluation": {name: result.to_dict() for name, result in (evaluations or {}).items()},
     }
@@ -120,6 +122,7 @@ def summary(stats: dict[str, Any], evaluations: dict[str, Evaluation] | None = N
     if stats["camera"]:
         lines.append(_camera(stats["camera"]))
     lines += _log(stats)
+    lines += calibration_lines(stats)
     lines.append(_times(stats))
     for name, result in (evaluations or {}).items():
         lines.append(_against_truth(name, result))

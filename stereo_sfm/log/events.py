@@ -71,6 +71,10 @@ class Events:
         if len(update.refused_kf_ids):
             ids = ", ".join(str(k) for k in update.refused_kf_ids.tolist())
             return LogLine("mapper", "WARNING", f"the loop of keyframe {ids} contradicts the rest of the map: left out")
+        if update.calibration is not None:
+            said = "corrected" if update.calibration.applied else "seems wrong"
+            where = f"at keyframe {update.kf_id} ({update.calibration.why})"
+            return LogLine("mapper", "WARNING", f"rig {said} {where}: {update.calibration.text}")
         moved = se3.log(se3.inverse(self._map_T_odom) @ update.map_T_odom)
         metres, radians = float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:]))
         if metres < JUMP[0] and radians < JUMP[1]:

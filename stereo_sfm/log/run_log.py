@@ -248,7 +248,10 @@ class RunLog:
         for topic, queue in zip((topics.MAP_UPDATE, topics.LOOP), self._answers, strict=True):
             while queue and (everything or queue[0].kf_id in self._stamps):
                 answer = queue.popleft()
-                self._writer.write(topic, answer, *self._stamps.get(answer.kf_id, self._last))
+                stamps = self._stamps.get(answer.kf_id, self._last)
+                self._writer.write(topic, answer, *stamps)
+                if isinstance(answer, MapUpdate) and answer.calibration is not None:
+                    self._writer.write(topics.CALIBRATION, answer.calibration, *stamps)
 
     def _release_updates(self, everything: bool = False) -> None:
         while self._updates:

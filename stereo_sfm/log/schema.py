@@ -49,6 +49,7 @@ class _Field:
     dtype: str = ""
     shape: tuple[int, ...] = (-1,)  # of the array: `stereo_sfm.types.shape` in the field's metadata
     convert: Any = None  # enum class, nested dataclass, or the types of a row's items
+    optional: bool = False  # a nested dataclass that may be None
 
 
 def _array_dtype(annotation: Any) -> str | None:
@@ -61,7 +62,8 @@ def _array_dtype(annotation: Any) -> str | None:
 
 def _describe(field: dataclasses.Field[Any], annotation: Any) -> _Field:
     name = field.name
-    if isinstance(annotation, types.UnionType):
+    optional = isinstance(annotation, types.UnionType)
+    if optional:
         annotation = next(a for a in annotation.__args__ if a is not type(None))
     dtype = _array_dtype(annotation)
     if dtype is not None:
@@ -76,7 +78,7 @@ def _describe(field: dataclasses.Field[Any], annotation: Any) -> _Field:
     if isinstance(annotation, type) and issubclass(annotation, enum.IntEnum):
         return _Field(name, "enum", _F.TYPE_SINT64, convert=annotation)
     if dataclasses.is_dataclass(annotation):
-        return _Field(name, "message", _F.TYPE_MESSAGE, convert=annotation)
+        return _Field(name, "message", _F.TYPE_MESSAGE, convert=annotation, optional=optional)
     raise TypeError(f"no protobuf form for {name}: {annotation}")
 
 
@@ -199,6 +201,8 @@ def _read(message: Any, cls: type[Any]) -> Any:
         elif f.kind == "rows":
             rows = getattr(message, f.name)
             values[f.name] = tuple(tuple(getattr(r, f"item{i}") for i in range(len(f.convert))) for r in rows)
+        elif f.optional and not message.HasField(f.name):
+            values[f.name] = None
         else:
             values[f.name] = _read(getattr(message, f.name), f.convert)
     return cls(**values)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stereo_sfm.calib.choice import with_terms
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
@@ -54,6 +55,7 @@ class LoopCloser:
 
             vocabulary = configured_vocabulary(config)
         self._config, self._rig, self._spans = config, rig, spans or NoSpans()
+        self._source_rig, self._rig_terms = rig, np.zeros(6)
         self._vocabulary = vocabulary
         self._database = PlaceDatabase(len(vocabulary))
         self._row: dict[int, int] = {}  # of a keyframe in the database
@@ -75,6 +77,9 @@ class LoopCloser:
 
     def step(self, keyframe: Keyframe) -> LoopResult:
         """Look for the keyframe's place among the older ones, then remember it."""
+        if not np.array_equal(keyframe.rig_terms, self._rig_terms):  # the tracker's rig was corrected
+            self._rig_terms = keyframe.rig_terms
+            self._rig = with_terms(self._source_rig, self._rig_terms)
         self._graph.add(keyframe.kf_id, keyframe.odom_T_cam, keyframe.submap_id, keyframe.stamp_ns)
         with self._spans.span("loop_words"):
             bag = self._vocabulary.bag(keyframe.corners.descriptors)

@@ -32,6 +32,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stereo_sfm.calib.choice import with_terms
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import LoopConfig, MapperConfig
 from stereo_sfm.geometry import se3
@@ -40,9 +41,11 @@ from stereo_sfm.mapping.bundle import BundleConfig, BundleResult, bundle_adjust
 from stereo_sfm.mapping.correction import apply_loop, fuse_pairs, loop_is_known
 from stereo_sfm.mapping.insertion import insert_keyframe
 from stereo_sfm.mapping.map import Map, MapSnapshot
+from stereo_sfm.mapping.recalibration import recalibrate
+from stereo_sfm.mapping.self_calibration import Revision, SelfCalibration
 from stereo_sfm.mapping.triangulate import triangulate
 from stereo_sfm.timing import NoSpans
-from stereo_sfm.types import F64, I64, Bool, Keyframe, LoopResult, MapUpdate
+from stereo_sfm.types import F64, I64, Bool, CalibrationUpdate, Keyframe, LoopResult, MapUpdate
 
 YOUNG = 4  # observations up to which a point is triangulated anew before it is adjusted
 FIRST_WHOLE = 8  # keyframes beyond which full bundle adjustments begin
@@ -70,10 +73,20 @@ class Mapper:
     """Owner of the map."""
 
     def __init__(
-        self, config: MapperConfig, rig: Rig, spans: NoSpans | None = None, loop_config: LoopConfig | None = None
+        self,
+        config: MapperConfig,
+        rig: Rig,
+        spans: NoSpans | None = None,
+        loop_config: LoopConfig | None = None,
+        calibration: SelfCalibration | None = None,
     ) -> None:
-        """Empty map; `loop_config` says how an accepted loop is spread over the keyframes."""
+        """Empty map; `loop_config` says how an accepted loop is spread over the keyframes.
+
+        `calibration` says when the rig should change; None: never.
+        """
         self._config, self._rig, self._spans = config, rig, spans or NoSpans()
+        self._source_rig, self._calibration = rig, calibration
+        self._revised: CalibrationUpdate | None = None  # for the next update
         self._loop_config = loop_config or LoopConfig()
         self.map = Map()
         self._map_T_odom: F64 = np.eye(4)
@@ -109,6 +122,9 @@ class Mapper:
                 self._close(loop)
         with self._spans.span("associate"):
             row = self._insert(keyframe)
+        if self._calibration is not None:
+            with self._spans.span("calibrate"):
+                self._revise(self._calibration.add(keyframe))
         with self._spans.span("local_ba"):
             self._adjust(row)
         with self._spans.span("cull"):
@@ -133,6 +149,10 @@ class Mapper:
             if loop is not None and loop.candidate_kf_id >= 0:
                 self._close(loop)
         self._version += 1
+        if self._calibration is not None:
+            self._revise(self._calibration.finish())
+            if self._job is not None:
+                self._apply_job()
         return self._update(int(self.map.keyframes.kf_id[-1]))
 
     def _without_mapping(self, keyframe: Keyframe) -> MapUpdate:
@@ -148,6 +168,7 @@ class Mapper:
         fused = self.map.points.pt_id[np.array(self._fused, np.int64).reshape(-1, 2)]
         refused = np.array(self._refused, np.int64)
         self._culled, self._fused, self._refused = [], [], []
+        revised, self._revised = self._revised, None
         return MapUpdate(
             version=self._version,
             kf_id=kf_id,
@@ -162,7 +183,31 @@ class Mapper:
             carrier_kf_ids=self.map.keyframes.kf_id[delta.culled_kf[:, 1]],
             carrier_T_kf=delta.carrier_T_kf,
             refused_kf_ids=refused,
+            calibration=revised,
         )
+
+    # -- calibration -------------------------------------------------------------------------------------------------
+
+    @property
+    def rig(self) -> Rig:
+        """The rig that the map is true of: corrected, where that was found necessary."""
+        return self._rig
+
+    def _revise(self, revision: Revision | None) -> None:
+        """The rig changes: points move to where it sees them, and all keyframes are adjusted to that."""
+        if revision is None:
+            return
+        assert self._calibration is not None
+        row, applied = len(self.map.keyframes) - 1, self._calibration.applies
+        kf_id, stamp_ns = int(self.map.keyframes.kf_id[row]), int(self.map.keyframes.stamp_ns[row])
+        self._revised = CalibrationUpdate(
+            self._version, kf_id, stamp_ns, revision.terms, revision.covariance, revision.since_kf_id, applied,
+            revision.why, revision.text,
+        )  # fmt: skip
+        if applied:
+            before, self._rig = self._rig, with_terms(self._source_rig, revision.terms)
+            recalibrate(self.map, before, self._rig, self.map.kf_row(revision.since_kf_id))
+            self._order_full_bundle()
 
     # -- loops -------------------------------------------------------------------------------------------------------
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 from stereo_sfm.types import Keyframe, LoopResult, MapUpdate
 
 if TYPE_CHECKING:
+    from stereo_sfm.calib.rig import Rig
     from stereo_sfm.mapping.bundle import BundleResult
     from stereo_sfm.mapping.map import MapSnapshot
     from stereo_sfm.mapping.mapper import Job
@@ -33,6 +34,11 @@ class AnyMapper(Protocol):
 
     def finish_job(self, result: BundleResult) -> None:
         """The answer of the job that was taken last."""
+        ...
+
+    @property
+    def rig(self) -> Rig:
+        """The rig that the map is true of."""
         ...
 
     # -- what is kept ------------------------------------------------------------------------------------------------

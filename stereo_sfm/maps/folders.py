@@ -76,9 +76,10 @@ def make_mapper(config: Config, rig: Rig, spans: NoSpans, folders: MapFolders) -
     if folders.localize_only and not config.mapper.enabled and not config.loop.enabled:
         raise StereoSfmError("--localize-only recognises places: leave loop.enabled=true")
     from stereo_sfm.mapping.mapper import Mapper
+    from stereo_sfm.mapping.self_calibration import SelfCalibration
 
     if folders.map_in is None:
-        return Mapper(config.mapper, rig, spans, config.loop)
+        return Mapper(config.mapper, rig, spans, config.loop, SelfCalibration.wanted(config, rig))
     from stereo_sfm.maps.extension import Extension
     from stereo_sfm.maps.localizer import Localizer
     from stereo_sfm.maps.saved_map import load_map
@@ -88,7 +89,7 @@ def make_mapper(config: Config, rig: Rig, spans: NoSpans, folders: MapFolders) -
     return localizer if folders.localize_only else Extension(config.mapper, rig, spans, config.loop, localizer)
 
 
-def saved_map_of(mapper: AnyMapper, config: Config, rig: Rig) -> SavedMap | None:
+def saved_map_of(mapper: AnyMapper, config: Config) -> SavedMap | None:
     """The map of a run as it can be saved; None where nothing is mapped."""
     from stereo_sfm.maps.saved_map import SavedMap
 
@@ -96,10 +97,10 @@ def saved_map_of(mapper: AnyMapper, config: Config, rig: Rig) -> SavedMap | None
     if snapshot is None or not len(snapshot.kf_ids) or not len(snapshot.points):
         return None
     vocabulary = configured_vocabulary(config.loop)
-    return SavedMap(snapshot, rig, vocabulary.id, np.zeros(len(snapshot.kf_ids), np.int64))
+    return SavedMap(snapshot, mapper.rig, vocabulary.id, np.zeros(len(snapshot.kf_ids), np.int64))
 
 
-def save_result(mapper: AnyMapper, config: Config, rig: Rig, folders: MapFolders) -> None:
+def save_result(mapper: AnyMapper, config: Config, folders: MapFolders) -> None:
     """Write the map of a finished run to `map_out`, merged with `map_in`, and to `kept`.
 
     A run that goes on with a saved map and leaves none behind keeps none: its part alone is in no frame of its own.
@@ -114,7 +115,7 @@ def save_result(mapper: AnyMapper, config: Config, rig: Rig, folders: MapFolders
     kept = folders.kept if folders.map_in is None or folders.map_out is not None else None
     if folders.map_out is None and kept is None:
         return
-    saved, out, failure = saved_map_of(mapper, config, rig), folders.map_out, ""
+    saved, out, failure = saved_map_of(mapper, config), folders.map_out, ""
     if saved is None:
         if out is not None and not folders.localize_only:
             log.warning("nothing was mapped: no map is written to %s", out)

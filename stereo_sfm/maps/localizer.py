@@ -29,6 +29,7 @@ class Localizer(WithoutJobs):
     """
 
     def __init__(self, snapshot: MapSnapshot, rig: Rig, vocabulary: Vocabulary, config: LoopConfig) -> None:
+        self.rig = rig
         self._relocalizer = Relocalizer(snapshot, rig, vocabulary, config)
         self._config = config
         self._map_T_odom: F64 = np.eye(4)

@@ -17,6 +17,8 @@ from stereo_sfm.arrays import read_arrays
 from stereo_sfm.calib.formats.native import read_native, write_native
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.mapping.map import Map, MapSnapshot
 from stereo_sfm.maps.columns import check_columns
 from stereo_sfm.maps.header import check_counts, checksum, damaged, read_header, write_header
@@ -24,6 +26,9 @@ from stereo_sfm.maps.replace_folder import replaced_folder
 from stereo_sfm.types import I64, MapUpdate, Trajectory
 
 log = logging.getLogger("stereo_sfm")
+
+# What self-calibration may change of a rig: radians, share of the baseline, share of the right focal length.
+SAME_TURN, SAME_SHIFT, SAME_FOCAL = 0.01, 0.02, 0.01
 
 _FILES: dict[str, tuple[str, ...]] = {
     "keyframes": ("kf_ids", "frame_ids", "stamp_ns", "submap_ids", "map_T_kf", "sessions"),
@@ -135,20 +140,29 @@ def load_map(folder: Path | str, rig: Rig | None = None) -> SavedMap:
     return saved
 
 
-def same_rig(a: Rig, b: Rig) -> bool:
-    """Whether two rigs see the same way: models, sizes, parameters and the eyes' relative pose.
+def _same_parameters(a: Camera, b: Camera, focal: float) -> bool:
+    return np.allclose(a.params[:2], b.params[:2], rtol=focal, atol=0) and np.allclose(
+        a.params[2:], b.params[2:], rtol=1e-6, atol=1e-9
+    )
 
+
+def same_rig(a: Rig, b: Rig) -> bool:
+    """Whether two rigs are one camera: models, sizes and parameters, and the second camera where it was.
+
+    It may differ by what self-calibration corrects: its rotation, its direction and its focal length, a little.
     Readouts may differ: a map's pixels are those at the stamps.
     """
-    if a.depth != b.depth or not np.allclose(a.left_T_right, b.left_T_right, atol=1e-6):
+    turned = np.linalg.norm(se3.log(se3.inverse(a.left_T_right) @ b.left_T_right)[3:])
+    shifted = np.linalg.norm(a.left_T_right[:3, 3] - b.left_T_right[:3, 3])
+    if a.depth != b.depth or turned > SAME_TURN or shifted > SAME_SHIFT * max(a.baseline, 1e-6):
         return False
-    for x, y in ((a.left, b.left), (a.right, b.right)):
+    for x, y, focal in ((a.left, b.left, 1e-6), (a.right, b.right, SAME_FOCAL)):
         if (x is None) != (y is None):
             return False
         if (
             x is not None
             and y is not None
-            and (x.model != y.model or x.size != y.size or not np.allclose(x.params, y.params, rtol=1e-6, atol=1e-9))
+            and (x.model != y.model or x.size != y.size or not _same_parameters(x, y, focal))
         ):
             return False
     return True

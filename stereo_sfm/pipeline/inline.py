@@ -98,7 +98,7 @@ class InlineRun:
         counters = source_counters(self._source, self._last)
         if counters is not None:
             self.publish(counters)
-        save_result(self.map_stage.mapper, self._config, self._rig, self._folders)
+        save_result(self.map_stage.mapper, self._config, self._folders)
 
     def hear(self, line: LogLine) -> None:
         """From any thread; the sinks get it with the next frame."""

@@ -279,7 +279,7 @@ def run_mapper(
     last = stage.finish()
     if last is not None:
         to_main.send(last)
-    save_result(mapper, setup.config, setup.rig, setup.folders)
+    save_result(mapper, setup.config, setup.folders)
     meter.report()
     to_tracker.close()
     to_optimizer.send(End("mapper"))

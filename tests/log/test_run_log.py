@@ -38,6 +38,7 @@ from stereo_sfm.messages import Health, LogLine, SourceCounters, StageTimes
 from stereo_sfm.types import (
     F64,
     Applied,
+    CalibrationUpdate,
     Dropped,
     Frame,
     Keyframe,
@@ -97,13 +98,18 @@ def _keyframe(k: int) -> Keyframe:
     )  # fmt: skip
 
 
+def _calibration(k: int) -> CalibrationUpdate:
+    terms = np.arange(6) * 1e-3
+    return CalibrationUpdate(k + 1, k, START_NS, terms, np.diag(terms**2), 2, True, "step", "turned")
+
+
 def _answers(k: int) -> tuple[MapUpdate, LoopResult]:
     keyframe = _keyframe(k)
     map_T_odom = _map_T_odom(k + 1)
     update = MapUpdate(
         k + 1, k, np.array([k]), (map_T_odom @ keyframe.odom_T_cam)[None], keyframe.point_ids.copy(),
         np.random.default_rng(k + 99).normal(size=(len(keyframe.point_ids), 3)), np.array([10 * k]),
-        np.zeros((0, 2), np.int64), map_T_odom,
+        np.zeros((0, 2), np.int64), map_T_odom, calibration=_calibration(k) if k == 6 else None,
     )  # fmt: skip
     accepted = k in (5, 8)
     loop = LoopResult(
@@ -299,6 +305,7 @@ def test_messages_of_the_stages_come_back_whole(run: Path) -> None:
         (topics.KEYFRAME, Keyframe, [_keyframe(k) for k in range(10)]),
         (topics.MAP_UPDATE, MapUpdate, [_answers(k)[0] for k in range(10)]),
         (topics.LOOP, LoopResult, [_answers(k)[1] for k in range(10)]),
+        (topics.CALIBRATION, CalibrationUpdate, [_calibration(6)]),
     ):
         back = _all(run, topic, kind)
         assert [schema.encode(m) for m in back] == [schema.encode(m) for m in wanted]

@@ -239,7 +239,7 @@ def test_a_merge_that_fails_costs_no_map(
     out = tmp_path / ("store" if in_place else "other")
     config = Config(loop=LoopConfig(min_inliers=10**6))
     with pytest.raises(StereoSfmError, match="is this walk alone"):
-        save_result(mapper, config, walks[1].rig, MapFolders(tmp_path / "store", map_out=out))
+        save_result(mapper, config, MapFolders(tmp_path / "store", map_out=out))
     assert len(load_map(tmp_path / "store", walks[0].rig)) == len(maps[0])
     assert len(load_map(tmp_path / "store_walk1" if in_place else out, walks[0].rig)) == len(
         mapper.map.living_keyframes()

@@ -73,6 +73,10 @@ class FramePoseSolver:
         self._config, self._cameras, self._shutter = config, cameras, shutter
         self._noise = 1.0  # observed noise over config.sigma_px
 
+    def use(self, cameras: StereoCameras) -> None:
+        """From now on with these cameras."""
+        self._cameras = cameras
+
     def solve(self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64) -> PoseSolution:
         """Pose from where it is expected; from the previous pose (4, 4) when that finds no consensus."""
         config = self._config

@@ -35,6 +35,10 @@ class PlaceCorners:
             config.loop.corners, SCALE, LEVELS, edgeThreshold=BORDER, fastThreshold=FAST_THRESHOLD
         )
 
+    def use(self, rig: Rig) -> None:
+        """From now on with this rig."""
+        self._stereo.use(rig)
+
     @staticmethod
     def wanted(config: Config, rig: Rig) -> PlaceCorners | None:
         """None for a run that recognises no places, or a camera without depth."""

@@ -11,6 +11,7 @@ from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.tracking.depth_image import points_from_depth
 from stereo_sfm.tracking.flow import klt
+from stereo_sfm.tracking.flow.epipolar_gate import on_curve
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.tracking.flow.stereo_match import patch_sums, search_epipolar, triangulate
 from stereo_sfm.types import F32, F64, Bool, StereoImage
@@ -43,6 +44,15 @@ class StereoMatcher:
         self._candidates = int(np.clip(reach / 2**SEARCH_LEVEL * 1.2, 16, 160))
         narrow = np.sqrt(np.maximum(klt.WEIGHTS, 0)) ** 5  # the same Gaussian, about 0.63 times as wide
         self._narrow = (narrow / narrow.sum()).astype(np.float32)
+
+    def use(self, rig: Rig) -> None:
+        """From now on with this rig, whose left camera and baseline are about the same."""
+        self._rig, self._cameras = rig, StereoCameras.of(rig)
+
+    def placed(self, uv: F64, uv_right: F64) -> StereoMatch:
+        """Pixels (N, 2) that are matched already, NaN where not, as points of the present rig."""
+        seen = np.asarray(np.isfinite(uv_right).all(1))
+        return self._triangulated(np.ascontiguousarray(uv), np.ascontiguousarray(uv_right), seen, np.inf, -CLOSE)
 
     def prepare(self, image: StereoImage) -> klt.Pyramid | F32:
         """What `follow` and `match` need of the second eye: a pyramid, or the depth image."""
@@ -104,7 +114,9 @@ class StereoMatcher:
             uv, uv_right, *self._cameras.cams, self._cameras.left_T_right, self._config.sigma_px
         )
         with np.errstate(invalid="ignore"):
-            good &= (epipolar < max_epipolar_px) & (rho > least * np.sqrt(variance))
+            good &= on_curve(self._rig, uv, uv_right, epipolar, max_epipolar_px, good) & (
+                rho > least * np.sqrt(variance)
+            )
             good &= rho < 1.0 / (0.5 * self._min_depth)
         return StereoMatch(uv, uv_right, bearing, rho, variance, good)
 

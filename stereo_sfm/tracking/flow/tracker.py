@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from stereo_sfm.calib.choice import with_terms
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
@@ -22,6 +23,7 @@ from stereo_sfm.tracking.flow.map_points import take_update
 from stereo_sfm.tracking.flow.new_points import NewPoints
 from stereo_sfm.tracking.flow.place_corners import PlaceCorners
 from stereo_sfm.tracking.flow.pyramids import StereoPyramids
+from stereo_sfm.tracking.flow.rig_change import place_anew
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.stereo import StereoMatcher
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
@@ -42,7 +44,8 @@ class Tracker:
         self, config: TrackerConfig, rig: Rig, spans: NoSpans | None = None, place_corners: PlaceCorners | None = None
     ) -> None:
         """`place_corners`: what keyframes are recognised by; None: by nothing."""
-        self._config = config
+        self._config, self._rig = config, rig
+        self._rig_terms: F64 = np.zeros(6)  # of the correction in force
         self._spans = spans or NoSpans()
         self._stereo = StereoMatcher(config, rig)
         self._shutter = RollingShutter(rig)
@@ -68,8 +71,11 @@ class Tracker:
         self.solution: PoseSolution | None = None  # of the last image; None where points were only begun
 
     def apply(self, update: MapUpdate) -> None:
-        """Take the mapper's better positions of points."""
+        """Take the mapper's better positions of points, and the rig where that was corrected."""
         self._map_version = update.version
+        if update.calibration is not None and update.calibration.applied:
+            self._rig_terms = update.calibration.terms
+            self._use(with_terms(self._rig, self._rig_terms))
         self._tracks = take_update(self._tracks, update)
 
     def step(self, image: StereoImage) -> tuple[Frame, Keyframe | None]:
@@ -100,6 +106,14 @@ class Tracker:
                 inlier = self._add_points(images, inlier)
                 keyframe = self._make_keyframe(image, images)
         return self._frame(image, state, solution.covariance, inlier, keyframe, stats), keyframe
+
+    def _use(self, rig: Rig) -> None:
+        """Go on with a corrected rig: the points that are followed are where it sees them."""
+        self._stereo.use(rig)
+        self._solver.use(StereoCameras.of(rig))
+        if self._place_corners is not None:
+            self._place_corners.use(rig)
+        self._tracks = place_anew(self._tracks, self._stereo, self._shutter, self._pose, self._velocity)
 
     # -- stages ----------------------------------------------------------------------------------------------------
 
@@ -229,6 +243,7 @@ class Tracker:
             descriptors=describe(images.left[0], tracks.uv),
             submap_id=self._submap_id,
             corners=self._shutter.corners_at_stamp(corners, self._velocity),
+            rig_terms=self._rig_terms.copy(),
         )
         self._next_kf_id += 1
         self._kf_pose = self._pose.copy()

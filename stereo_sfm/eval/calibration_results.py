@@ -1,0 +1,75 @@
+"""What a run found out about its rig, for its output folder: numbers, lines for people, the corrected calibration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stereo_sfm.calib.choice import NAMES, SCALES, UNITS, with_terms
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.eval.record import RunRecord
+
+CORRECTED = "rig_corrected.yaml"
+
+
+def calibration_stats(record: RunRecord) -> list[dict[str, Any]]:
+    """Every change of the rig as plain values; terms in degrees and, of the focal length, per cent."""
+    first_ns = int(record.frames.stamp_ns[0]) if len(record.frames) else 0
+    return [
+        {
+            "kf_id": c.kf_id,
+            "seconds": (c.stamp_ns - first_ns) / 1e9,
+            "since_kf_id": c.since_kf_id,
+            "applied": c.applied,
+            "why": c.why,
+            "text": c.text,
+            "terms": (SCALES * c.terms).tolist(),
+            "covariance": (SCALES[:, None] * c.terms_covariance * SCALES).tolist(),
+        }
+        for c in record.calibrations
+    ]
+
+
+def calibration_lines(stats: dict[str, Any]) -> list[str]:
+    """A line for each change."""
+    return [
+        f"rig {'corrected' if c['applied'] else 'seems wrong'} at {c['seconds']:.1f} s ({c['why']}): {c['text']}"
+        for c in stats["calibration"]
+    ]
+
+
+def write_corrected_rig(folder: Path, rig: Rig, record: RunRecord) -> None:
+    """`rig_corrected.yaml` of the last change, its terms and their covariance in comments; nothing without one."""
+    from stereo_sfm.calib import save_rig
+
+    if not record.calibrations:
+        return
+    last = record.calibrations[-1]
+    path = folder / CORRECTED
+    save_rig(with_terms(rig, last.terms), path)
+    sigma = np.sqrt(np.diag(last.terms_covariance))
+    lines = ["", "# What self-calibration added to the source's calibration, and the covariance of these six numbers:"]
+    lines += [
+        f"# {name}: {value:+.5f} +- {deviation:.5f} {unit}"
+        for name, value, deviation, unit in zip(NAMES, SCALES * last.terms, SCALES * sigma, UNITS, strict=True)
+    ]
+    scaled = SCALES[:, None] * last.terms_covariance * SCALES
+    lines += ["# " + " ".join(f"{value:.4e}" for value in row) for row in scaled]
+    path.write_text(path.read_text("utf-8").rstrip() + "\n".join(lines) + "\n", encoding="utf-8")
+
+
+def calibration_table(stats: dict[str, Any]) -> list[str]:
+    """The part of report.md: how the terms went, empty when the rig stayed."""
+    if not stats["calibration"]:
+        return []
+    head = ["seconds", *(f"{n} ({u})" for n, u in zip(NAMES, UNITS, strict=True)), "why"]
+    lines = ["", "## Rig", "", "| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for c in stats["calibration"]:
+        sigma = np.sqrt(np.diag(np.array(c["covariance"])))
+        cells = [f"{v:+.3f} ± {s:.3f}" if v else "as it was" for v, s in zip(c["terms"], sigma, strict=True)]
+        lines.append("| " + " | ".join([f"{c['seconds']:.1f}", *cells, c["why"]]) + " |")
+    applied = all(c["applied"] for c in stats["calibration"])
+    told = "The run went on with it" if applied else "It was only reported"
+    return [*lines, "", f"{told}; `{CORRECTED}` holds the corrected calibration."]

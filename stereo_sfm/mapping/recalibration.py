@@ -1,0 +1,43 @@
+"""What a corrected rig does to the map: observations of before a step, and points where the new rig sees them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.geometry import se3
+from stereo_sfm.mapping.map import Map
+from stereo_sfm.mapping.triangulate import triangulate
+from stereo_sfm.types import I64
+
+
+def recalibrate(map_: Map, before: Rig, after: Rig, since_row: int) -> None:
+    """Points move to where `after` sees them; poses stay for the bundle adjustment that must follow.
+
+    Args:
+        map_: changed in place.
+        before, after: the rig until now and from now on.
+        since_row: first keyframe row that `after` is true of. What keyframes before it saw is rewritten as `after`
+            would have seen the same points, so that one rig is true of the whole map.
+    """
+    if since_row > 0:
+        _rewrite(map_, before, after, since_row)
+    rows = map_.living_points()
+    rows = rows[map_.points.obs_count[rows] > 0]
+    old = map_.points.xyz[rows].copy()
+    new = triangulate(map_, after, rows)
+    good = np.asarray(np.isfinite(new).all(1))
+    map_.move_points(rows[good], np.where(good[:, None], new, old)[good])
+
+
+def _rewrite(map_: Map, before: Rig, after: Rig, since_row: int) -> None:
+    """Right pixels of older keyframes go where the other rig puts their points; what they erred by stays."""
+    assert before.right is not None and after.right is not None
+    table = map_.observations
+    obs: I64 = np.flatnonzero((table.pt >= 0) & (table.kf < since_row) & np.isfinite(table.uv_right[:, 0]))
+    poses = se3.inverse(map_.keyframes.map_T_kf[table.kf[obs]])
+    points = map_.points.xyz[table.pt[obs]]
+    in_left = (poses[:, :3, :3] @ points[..., None])[..., 0] + poses[:, :3, 3]
+    was = before.right.project(se3.transform(se3.inverse(before.left_T_right), in_left))
+    now = after.right.project(se3.transform(se3.inverse(after.left_T_right), in_left))
+    table.uv_right[obs] = (table.uv_right[obs] + (now - was)).astype(table.uv_right.dtype)

@@ -1,0 +1,220 @@
+"""What the keyframes of a short stretch say about the rig that saw them.
+
+A bundle adjustment of its own: the window's keyframes, the points that its first keyframe sees with both cameras, and
+six terms of the rig (`calib.choice`): rotation of the right camera, direction of the baseline, focal length of the
+right camera against the left. Only what all keyframes and both cameras agree on counts, so disparity (which trades
+with the motion) is judged too. The answer is the information about the terms alone, points and motion eliminated;
+those of several windows add up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stereo_sfm.calib.choice import TERMS, with_terms
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calib.scene_model import inverse_distances, tangents
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.cameras import Camera
+from stereo_sfm.geometry.stereo import rectifying_rotations
+from stereo_sfm.mapping import rig_window_kernels
+from stereo_sfm.types import F64, I64, Keyframe
+
+LEAST_POINTS = 20
+MOST_POINTS = 160
+STEPS = 4  # of Gauss-Newton
+INFLATION = 2.0  # matches err together: their deviation counts so many times, as in `calib.consistency`
+NOISE_PX = 0.05, 5.0  # of one coordinate
+# One standard deviation of what may be wrong before any image is seen: radians, radians, ratio.
+PRIOR = np.array([0.01, 0.01, 0.01, 0.005, 0.005, 0.005])
+
+# Radians and ratio a radian of turning that a lens may pretend: a point that crosses the image meets all its errors.
+TURNED = np.array([0.0, 0.003, 0.0, 0.0, 0.0, 0.0015])
+# px at the image's border, of `_shapes`: what no lens model is better than.
+LENS_PRIOR = np.array([6.0, 2.0, 2.0, 2.0, *[0.5] * 6])
+
+
+@dataclass(frozen=True, eq=False)
+class RigInformation:
+    """Information about the terms: of one window, or the sum of several."""
+
+    matrix: F64  # (6, 6)
+    vector: F64  # (6,) matrix @ (the terms that fit best)
+
+    def __add__(self, other: RigInformation) -> RigInformation:
+        return RigInformation(self.matrix + other.matrix, self.vector + other.vector)
+
+    def doubted(self, angle: float) -> RigInformation:
+        """Less about what a lens that is not quite its model pretends when the camera turns by `angle` radians."""
+        sigma = TURNED[TURNED > 0] * max(angle, 1e-3)
+        columns = self.matrix[:, TURNED > 0]
+        lost = columns @ np.linalg.inv(columns[TURNED > 0] + np.diag(sigma**-2))
+        return RigInformation(self.matrix - lost @ columns.T, self.vector - lost @ self.vector[TURNED > 0])
+
+
+@dataclass(frozen=True, eq=False)
+class RigWindow:
+    """One window's answer."""
+
+    first_kf_id: int
+    last_kf_id: int
+    stamp_ns: int  # of the last keyframe
+    information: RigInformation
+    noise_px: float
+
+
+@dataclass(eq=False)
+class _Problem:
+    """One window's measurements and its own unknowns."""
+
+    uv_left: F64  # (F, N, 2) px
+    uv_right: F64  # (F, N, 2) px
+    bearing: F64  # (N, 3) unit, first left camera
+    rho: F64  # (N,) 1/m
+    frame_T_first: F64  # (F, 4, 4)
+    shapes: F64  # (2, F, N, 2, L) px
+    lens: F64  # (L,)
+
+
+def solve_window(rig: Rig, keyframes: Sequence[Keyframe], terms: F64) -> RigWindow | None:
+    """What the keyframes say, or None where they see too little together.
+
+    Args:
+        rig: as its calibration says. keyframes: in order of time. terms: (6,) what is known of the terms, to start at.
+    """
+    problem = _problem(with_terms(rig, terms), keyframes)
+    if problem is None:
+        return None
+    sigma = 1.0
+    for step in range(STEPS):
+        system = _System.of(with_terms(rig, terms), problem, sigma, hard=step >= 2)
+        sigma = float(np.clip(system.noise_px, *NOISE_PX))
+        terms = terms + system.step(problem, terms)
+        if not np.isfinite(terms).all():
+            return None
+    system = _System.of(with_terms(rig, terms), problem, sigma, hard=True)
+    sigma = float(np.clip(system.noise_px, *NOISE_PX))
+    information = system.information(problem, terms).doubted(_turned(keyframes))
+    last = keyframes[-1]
+    return RigWindow(keyframes[0].kf_id, last.kf_id, last.stamp_ns, information, sigma)
+
+
+def _problem(rig: Rig, keyframes: Sequence[Keyframe]) -> _Problem | None:
+    first = keyframes[0]
+    both = np.isfinite(first.uv_left).all(1) & np.isfinite(first.uv_right).all(1)
+    later = np.unique(np.concatenate([k.point_ids for k in keyframes[1:]]))
+    ids = first.point_ids[both & np.isin(first.point_ids, later)]
+    ids = ids[:: max(1, -(-len(ids) // MOST_POINTS))]
+    if len(ids) < LEAST_POINTS:
+        return None
+    uv_left, uv_right = np.full((2, len(keyframes), len(ids), 2), np.nan)
+    for f, keyframe in enumerate(keyframes):
+        _, at, of = np.intersect1d(ids, keyframe.point_ids, return_indices=True)
+        uv_left[f, at], uv_right[f, at] = keyframe.uv_left[of], keyframe.uv_right[of]
+    bearing, rho = rig.left.unproject(uv_left[0]), inverse_distances(rig, uv_left[0], uv_right[0])
+    good = np.isfinite(bearing).all(1) & np.isfinite(rho)
+    frames = np.array([se3.inverse(k.odom_T_cam) @ first.odom_T_cam for k in keyframes])
+    uv_left, uv_right = uv_left[:, good].copy(), uv_right[:, good].copy()
+    shapes = np.stack([_shapes(rig.left, uv_left), _shapes(rig.left, uv_right)])
+    return _Problem(uv_left, uv_right, bearing[good], rho[good], frames, shapes, np.zeros(len(LENS_PRIOR)))
+
+
+def _turned(keyframes: Sequence[Keyframe]) -> float:
+    """Radians that the camera turned by from keyframe to keyframe, added up."""
+    poses = np.array([k.odom_T_cam for k in keyframes])
+    return float(np.linalg.norm(se3.log(se3.inverse(poses[:-1]) @ poses[1:])[:, 3:], axis=1).sum())
+
+
+def _shapes(camera: Camera, uv: F64) -> F64:
+    """(..., 2, L) displacements of pixels by what both lenses may share, one pixel at the image's border.
+
+    Magnification, the first radial order, a shift and the second orders: they bend the flow of a turning camera, which
+    would pass for a disparity.
+    """
+    x, y = 2 * uv[..., 0] / camera.width - 1, (2 * uv[..., 1] - camera.height) / camera.width
+    r2, one, zero = x * x + y * y, np.ones_like(x), np.zeros_like(x)
+    u = [x, x * r2, one, zero, x * x, x * y, y * y, zero, zero, zero]
+    v = [y, y * r2, zero, one, zero, zero, zero, x * x, x * y, y * y]
+    return np.asarray(np.nan_to_num(np.stack([np.stack(u, -1), np.stack(v, -1)], -2)), float)
+
+
+@dataclass(frozen=True, eq=False)
+class _System:
+    """Normal equations of the terms with everything else eliminated, and the way back."""
+
+    matrix: F64  # (S, S) of the rig's terms and the lens's
+    gradient: F64  # (S,)
+    noise_px: float
+    pose_gain: F64  # (6 (F - 1), S)
+    pose_gradient: F64
+    point_gain: F64  # (N, 3, R)
+    point_gradient: F64  # (N, 3)
+
+    @staticmethod
+    def of(rig: Rig, problem: _Problem, sigma: float, hard: bool) -> _System:
+        """At the problem's present state."""
+        assert rig.right is not None
+        count, frames = len(problem.rho), len(problem.frame_T_first)
+        shared = TERMS + len(problem.lens)
+        size = shared + 6 * (frames - 1)
+        h, g = np.zeros((size, size)), np.zeros(size)
+        gain, gradient = np.zeros((count, 3, size)), np.zeros((count, 3))
+        squares, rows = np.zeros(count), np.zeros(count, np.int64)
+        rotation = rig.left_T_right[:3, :3]
+        rect_R_left, _ = rectifying_rotations(rig.left_T_right)
+        rig_window_kernels.accumulate(
+            problem.uv_left, problem.uv_right, problem.bearing, tangents(problem.bearing), problem.rho,
+            np.ascontiguousarray(problem.frame_T_first[:, :3, :3]),
+            np.ascontiguousarray(problem.frame_T_first[:, :3, 3]), problem.shapes, problem.lens,
+            (rig.left.model_id, rig.left.params, rig.right.model_id, rig.right.params),
+            np.ascontiguousarray(rotation.T), rig.left_T_right[:3, 3].copy(),
+            np.ascontiguousarray(-rig.baseline * (rotation.T @ rect_R_left[1:].T)), sigma, hard, INFLATION,
+            h, g, gain, gradient, squares, rows,
+        )  # fmt: skip
+        own = h[shared:, shared:] + 1e-6 * np.eye(size - shared)
+        pose_gain = np.asarray(np.linalg.solve(own, h[shared:, :shared]), float)
+        pose_gradient = np.asarray(np.linalg.solve(own, g[shared:]), float)
+        across = h[:shared, shared:]
+        matrix, reduced = h[:shared, :shared] - across @ pose_gain, g[:shared] - across @ pose_gradient
+        return _System(
+            0.5 * (matrix + matrix.T), reduced, _noise(squares, rows), pose_gain, pose_gradient, gain, gradient
+        )
+
+    def step(self, problem: _Problem, terms: F64) -> F64:
+        """(6,) step of the terms, back-substituted into the window's lens, motion and points."""
+        prior = np.concatenate([PRIOR, LENS_PRIOR]) ** -2
+        delta = -np.linalg.solve(
+            self.matrix + np.diag(prior), self.gradient + prior * np.concatenate([terms, problem.lens])
+        )
+        problem.lens = problem.lens + delta[TERMS:]
+        pose = -(self.pose_gradient + self.pose_gain @ delta)
+        step = -(self.point_gradient + self.point_gain @ np.concatenate([delta, pose]))
+        turned = problem.bearing + (tangents(problem.bearing) @ step[:, :2, None])[..., 0]
+        problem.bearing = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+        problem.rho = problem.rho + step[:, 2]
+        problem.frame_T_first[1:] = se3.exp(pose.reshape(-1, 6)) @ problem.frame_T_first[1:]
+        return np.asarray(delta[:TERMS], float)
+
+    def information(self, problem: _Problem, terms: F64) -> RigInformation:
+        """About the rig's terms alone, whatever the lens is."""
+        own = self.matrix[TERMS:, TERMS:] + np.diag(LENS_PRIOR**-2)
+        gain = np.linalg.solve(own, self.matrix[TERMS:, :TERMS]).T
+        matrix = self.matrix[:TERMS, :TERMS] - gain @ self.matrix[TERMS:, :TERMS]
+        gradient = self.gradient[:TERMS] - gain @ (self.gradient[TERMS:] + problem.lens / LENS_PRIOR**2)
+        return RigInformation(matrix, matrix @ terms - gradient)
+
+
+def _noise(squares: F64, rows: I64) -> float:
+    """Noise of one coordinate: median over the points of what their rows keep, freed of the median's bias.
+
+    A point's three unknowns leave k of its rows free; the median of chi-squared with k degrees of freedom is
+    k (1 - 2 / 9k)^3 (Wilson and Hilferty, PNAS 17, 1931).
+    """
+    usable = rows > 4
+    if not usable.any():
+        return NOISE_PX[1]
+    free = rows[usable] - 3
+    return float(np.median(np.sqrt(squares[usable] / free) / (1 - 2 / (9 * free)) ** 1.5))

@@ -1,0 +1,212 @@
+"""Compiled inner loop of `mapping.rig_window`: normal equations of one window with its points eliminated.
+
+Unknown are six terms of the rig (rotation of the right camera, direction of the baseline, focal ratio), what both
+lenses share, six numbers of every moment after the first, and of each point its bearing (2) and inverse distance in the
+first left camera. One row touches what is shared, its own moment and its point, so the work a point is small; the Schur
+complement over the points is Triggs et al., Bundle adjustment: a modern synthesis (2000), section 6.1.
+"""
+
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stereo_sfm.geometry.kernels import njit, project_one
+
+TERMS = 6  # of the rig
+
+
+@njit
+def _rows(cam, params, p, dp, uv, j_point, residual, at):
+    """Residual of one image of one point, NaN where it cannot be seen, and its derivative; `dp` (3, 3) is p's."""
+    u, v, j00, j01, j02, j10, j11, j12 = project_one(cam, params, p[0], p[1], p[2])
+    residual[at], residual[at + 1] = uv[0] - u, uv[1] - v
+    for k in range(3):
+        j_point[at, k] = j00 * dp[0, k] + j01 * dp[1, k] + j02 * dp[2, k]
+        j_point[at + 1, k] = j10 * dp[0, k] + j11 * dp[1, k] + j12 * dp[2, k]
+    return u, v, j00, j01, j02, j10, j11, j12
+
+
+@njit
+def _pose_row(j0, j1, j2, p, rho, out):
+    """A row (j) of the projection by a left perturbation (rho, phi) of the moment's pose, p scaled by `rho`."""
+    out[0], out[1], out[2] = rho * j0, rho * j1, rho * j2
+    out[3] = j2 * p[1] - j1 * p[2]
+    out[4] = j0 * p[2] - j2 * p[0]
+    out[5] = j1 * p[0] - j0 * p[1]
+
+
+@njit
+def _lens_rows(shape, lens, j_rig, residual, at):
+    """What the lens's terms do to one image's rows."""
+    for i in range(2):
+        for k in range(lens.shape[0]):
+            j_rig[at + i, TERMS + k] = shape[i, k]
+            residual[at + i] -= shape[i, k] * lens[k]
+
+
+@njit
+def accumulate(
+    uv_left, uv_right, bearing, tangent, rho, rot, pos, shapes, lens, cams, right_r, baseline, by_direction, sigma,
+    hard, inflation, h, g, gain, gradient, size, rows,
+):  # fmt: skip
+    """Fills the reduced normal equations and what gives the points' own steps.
+
+    Args:
+        uv_left, uv_right: (F, N, 2) px, NaN where not seen. bearing: (N, 3). tangent: (N, 3, 2). rho: (N,).
+        rot, pos: (F, 3, 3), (F, 3) of frame_T_first.
+        shapes: (2, F, N, 2, L) displacement of the pixels of each image by each of the lens's terms. lens: (L,) those.
+        cams: models and parameters of both cameras.
+        right_r: (3, 3) rotation of right_T_left. baseline: (3,) right camera in the left one.
+        by_direction: (3, 2) derivative of rho-scaled right coordinates by the baseline's direction.
+        sigma: px. hard: drop what is beyond six sigmas. inflation: of the deviations.
+        h: (R, R), g: (R,), R = 6 + L + 6 (F - 1), overwritten. gain: (N, 3, R), gradient: (N, 3), overwritten.
+        size: (N,) sum of squared residuals. rows: (N,) how many.
+    """
+    frames, count = uv_left.shape[0], uv_left.shape[1]
+    model_l, params_l, model_r, params_r = cams
+    shared = TERMS + lens.shape[0]
+    r_size = shared + 6 * (frames - 1)
+    h[:] = 0.0
+    g[:] = 0.0
+    residual = np.zeros(4)
+    j_point = np.zeros((4, 3))
+    j_rig = np.zeros((4, shared))
+    j_pose = np.zeros((4, 6))
+    p, q = np.zeros(3), np.zeros(3)
+    dp, dq = np.zeros((3, 3)), np.zeros((3, 3))
+    row = np.zeros(3)
+    hpp = np.zeros((3, 3))
+    for n in range(count):
+        hpp[:] = 0.0
+        gp = gradient[n]
+        hpr = gain[n]
+        gp[:] = 0.0
+        hpr[:] = 0.0
+        size[n] = 0.0
+        rows[n] = 0
+        for f in range(frames):
+            if not math.isfinite(uv_left[f, n, 0]):
+                continue
+            for i in range(3):
+                p[i] = rho[n] * pos[f, i]
+                for k in range(3):
+                    p[i] += rot[f, i, k] * bearing[n, k]
+                dp[i, 2] = pos[f, i]
+                for c in range(2):
+                    dp[i, c] = 0.0
+                    for k in range(3):
+                        dp[i, c] += rot[f, i, k] * tangent[n, k, c]
+            out = _rows(model_l, params_l, p, dp, uv_left[f, n], j_point, residual, 0)
+            if not math.isfinite(residual[0]):
+                continue
+            _pose_row(out[2], out[3], out[4], p, rho[n], j_pose[0])
+            _pose_row(out[5], out[6], out[7], p, rho[n], j_pose[1])
+            _lens_rows(shapes[0, f, n], lens, j_rig, residual, 0)
+            used = 2
+            if math.isfinite(uv_right[f, n, 0]):
+                for i in range(3):
+                    q[i] = 0.0
+                    for k in range(3):
+                        q[i] += right_r[i, k] * (p[k] - rho[n] * baseline[k])
+                    for c in range(3):
+                        dq[i, c] = 0.0
+                        for k in range(3):
+                            dq[i, c] += right_r[i, k] * (dp[k, c] - (baseline[k] if c == 2 else 0.0))
+                out = _rows(model_r, params_r, q, dq, uv_right[f, n], j_point, residual, 2)
+                if math.isfinite(residual[2]):
+                    used = 4
+                    _lens_rows(shapes[1, f, n], lens, j_rig, residual, 2)
+                    for k in range(2):
+                        j0, j1, j2 = out[2 + 3 * k], out[3 + 3 * k], out[4 + 3 * k]
+                        # by the rotation of the right camera: q x omega
+                        j_rig[2 + k, 0] = j1 * q[2] - j2 * q[1]
+                        j_rig[2 + k, 1] = j2 * q[0] - j0 * q[2]
+                        j_rig[2 + k, 2] = j0 * q[1] - j1 * q[0]
+                        for c in range(2):
+                            j_rig[2 + k, 3 + c] = rho[n] * (
+                                j0 * by_direction[0, c] + j1 * by_direction[1, c] + j2 * by_direction[2, c]
+                            )
+                        j_rig[2 + k, 5] = out[k] - params_r[2 + k]
+                        for i in range(3):
+                            row[i] = j0 * right_r[0, i] + j1 * right_r[1, i] + j2 * right_r[2, i]
+                        _pose_row(row[0], row[1], row[2], p, rho[n], j_pose[2 + k])
+            worst = 0.0
+            for i in range(used):
+                worst = max(worst, abs(residual[i]))
+                size[n] += residual[i] * residual[i]
+            rows[n] += used
+            ratio = worst / (3.0 * sigma)
+            w = 0.0 if hard and ratio > 2.0 else 1.0 / ((1.0 + ratio * ratio) * (inflation * sigma) ** 2)
+            if w == 0.0:
+                continue
+            o = shared + 6 * (f - 1)
+            for i in range(used):
+                r = residual[i]
+                for a in range(3):
+                    wa = w * j_point[i, a]
+                    gp[a] -= wa * r
+                    for b in range(3):
+                        hpp[a, b] += wa * j_point[i, b]
+                    for b in range(shared):
+                        hpr[a, b] += wa * j_rig[i, b]
+                    if f > 0:
+                        for b in range(6):
+                            hpr[a, o + b] += wa * j_pose[i, b]
+                for a in range(shared):
+                    wa = w * j_rig[i, a]
+                    g[a] -= wa * r
+                    for b in range(shared):
+                        h[a, b] += wa * j_rig[i, b]
+                    if f > 0:
+                        for b in range(6):
+                            h[a, o + b] += wa * j_pose[i, b]
+                if f > 0:
+                    for a in range(6):
+                        wa = w * j_pose[i, a]
+                        g[o + a] -= wa * r
+                        for b in range(6):
+                            h[o + a, o + b] += wa * j_pose[i, b]
+        _eliminate(hpp, gp, hpr, h, g, r_size)
+    for a in range(shared):
+        for b in range(shared, r_size):
+            h[b, a] = h[a, b]
+
+
+@njit
+def _eliminate(hpp, gp, hpr, h, g, r_size):
+    """Schur complement of one point; gp and hpr become hpp^-1 gp and hpp^-1 hpr. A point nothing is known of stays."""
+    a, b, c = hpp[0, 0], hpp[0, 1], hpp[0, 2]
+    d, e, f = hpp[1, 1], hpp[1, 2], hpp[2, 2]
+    damping = 1e-9 * (a + d + f)
+    a, d, f = a + damping, d + damping, f + damping
+    c00, c01, c02 = d * f - e * e, c * e - b * f, b * e - c * d
+    det = a * c00 + b * c01 + c * c02
+    if not det > 0.0:
+        gp[:] = 0.0
+        hpr[:] = 0.0
+        return
+    c11, c12, c22 = a * f - c * c, b * c - a * e, a * d - b * b
+    y = np.empty(3)
+    for j in range(r_size):
+        y[0], y[1], y[2] = hpr[0, j], hpr[1, j], hpr[2, j]
+        if y[0] == 0.0 and y[1] == 0.0 and y[2] == 0.0:
+            continue
+        x0 = (c00 * y[0] + c01 * y[1] + c02 * y[2]) / det
+        x1 = (c01 * y[0] + c11 * y[1] + c12 * y[2]) / det
+        x2 = (c02 * y[0] + c12 * y[1] + c22 * y[2]) / det
+        g[j] -= x0 * gp[0] + x1 * gp[1] + x2 * gp[2]
+        for i in range(r_size):
+            h[i, j] -= x0 * hpr[0, i] + x1 * hpr[1, i] + x2 * hpr[2, i]
+    for j in range(r_size):
+        y[0], y[1], y[2] = hpr[0, j], hpr[1, j], hpr[2, j]
+        hpr[0, j] = (c00 * y[0] + c01 * y[1] + c02 * y[2]) / det
+        hpr[1, j] = (c01 * y[0] + c11 * y[1] + c12 * y[2]) / det
+        hpr[2, j] = (c02 * y[0] + c12 * y[1] + c22 * y[2]) / det
+    g0, g1, g2 = gp[0], gp[1], gp[2]
+    gp[0] = (c00 * g0 + c01 * g1 + c02 * g2) / det
+    gp[1] = (c01 * g0 + c11 * g1 + c12 * g2) / det
+    gp[2] = (c02 * g0 + c12 * g1 + c22 * g2) / det

@@ -1,0 +1,124 @@
+"""A rig that corrects itself: exact keyframes with noise, true and faulty rigs, steps, and what the map makes of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stereo_sfm.calib.choice import with_terms
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.config import Config, MapperConfig, SelfCalibrationConfig
+from stereo_sfm.geometry import se3
+from stereo_sfm.mapping.mapper import Mapper
+from stereo_sfm.mapping.self_calibration import Revision, SelfCalibration
+from stereo_sfm.types import Keyframe
+from tests.synthetic import fisheye_rig, pinhole_rig, points_around, walk
+
+RIGS = {"fisheye": fisheye_rig(), "pinhole": pinhole_rig()}
+NOISE_PX = 0.15
+
+
+def turned(rig: Rig, degrees: tuple[float, float, float]) -> Rig:
+    return replace(rig, left_T_right=rig.left_T_right @ se3.exp(np.array([0, 0, 0, *np.deg2rad(degrees)])))
+
+
+def keyframes(rigs: list[Rig], believed: Rig, seed: int, noise_px: float = NOISE_PX) -> Iterator[Keyframe]:
+    """What a tracker with `believed` would send of a walk; keyframe k is seen by rigs[k].
+
+    Odometry is off by a few millimetres a step, as if it had drifted.
+    """
+    rng = np.random.default_rng(seed)
+    path = walk(len(rigs))
+    points = points_around(path, 60 * len(rigs), rng)
+    for k, (rig, pose) in enumerate(zip(rigs, path, strict=True)):
+        assert rig.right is not None
+        in_left = se3.transform(se3.inverse(pose), points)
+        near = np.flatnonzero((in_left[:, 2] > 0.3) & (np.linalg.norm(in_left, axis=1) < 8))
+        uv_left = rig.left.project(in_left[near])
+        uv_right = rig.right.project(se3.transform(se3.inverse(rig.left_T_right), in_left[near]))
+        seen = rig.left.inside(uv_left) & rig.right.inside(uv_right)
+        seen &= np.cumsum(seen) <= 200
+        ids, uv_left, uv_right = near[seen], uv_left[seen], uv_right[seen]
+        uv_left = uv_left + noise_px * rng.standard_normal(uv_left.shape)
+        uv_right = uv_right + noise_px * rng.standard_normal(uv_right.shape)
+        guess = pose @ se3.exp(0.003 * rng.standard_normal(6))
+        empty = np.zeros((len(ids), 32), np.uint8)
+        yield Keyframe(k, 5 * k, 10**9 // 3 * k, guess, ids, uv_left, uv_right, in_left[near][seen], empty)
+
+
+def revisions(
+    true: Rig | list[Rig], believed: Rig, seed: int, count: int = 24
+) -> tuple[SelfCalibration, list[Revision]]:
+    estimator = SelfCalibration(believed)
+    rigs = true if isinstance(true, list) else [true] * count
+    found = [estimator.add(k) for k in keyframes(rigs, believed, seed)] + [estimator.finish()]
+    return estimator, [r for r in found if r is not None]
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_a_true_rig_stays(name: str) -> None:
+    for seed in range(10):
+        assert not revisions(RIGS[name], RIGS[name], seed)[1]
+
+
+@pytest.mark.parametrize("name", RIGS)
+@pytest.mark.parametrize("degrees", [(0.05, 0, 0), (0, 0.1, 0), (0, -0.3, 0), (0, 0, 0.2), (0.1, -0.1, 0.1)])
+def test_a_turned_camera_is_found(name: str, degrees: tuple[float, float, float]) -> None:
+    true = RIGS[name]
+    wrong = turned(true, degrees)
+    estimator, found = revisions(true, wrong, 0)
+    assert found and found[0].since_kf_id == 0
+    mended = with_terms(wrong, estimator.terms)
+    left = np.rad2deg(se3.log(se3.inverse(mended.left_T_right) @ true.left_T_right)[3:])
+    assert np.abs(left[[0, 2]]).max() < 0.012 and abs(left[1]) < 0.015
+
+
+def test_a_knock_is_noticed_and_what_was_before_stays_as_it_was() -> None:
+    true = RIGS["pinhole"]
+    knocked = turned(true, (0.0, 0.2, 0.0))
+    estimator, found = revisions([true] * 24 + [knocked] * 16, true, 1)
+    assert found[0].why == "step" and 20 <= found[0].since_kf_id <= 28
+    assert np.rad2deg(estimator.terms[1]) == pytest.approx(0.2, abs=0.02)
+
+
+def test_the_same_keyframes_give_the_same_bits() -> None:
+    wrong = turned(RIGS["fisheye"], (0.0, 0.1, 0.0))
+    a, b = (revisions(RIGS["fisheye"], wrong, 3)[0].terms for _ in range(2))
+    assert a.any() and np.array_equal(a, b)
+
+
+def test_a_window_that_turns_counts_less_about_disparity() -> None:
+    from stereo_sfm.mapping.rig_window import solve_window
+
+    window = solve_window(RIGS["pinhole"], list(keyframes([RIGS["pinhole"]] * 4, RIGS["pinhole"], 0)), np.zeros(6))
+    assert window is not None
+    little, much = (np.diag(np.linalg.inv(window.information.doubted(a).matrix)) for a in (0.01, 1.0))
+    assert much[1] > 4 * little[1] and much[0] == pytest.approx(little[0], rel=0.3)
+
+
+@pytest.mark.parametrize("mode", ["auto", "off", "only-report"])
+def test_who_is_corrected(mode: str) -> None:
+    config = replace(Config(), self_calibration=SelfCalibrationConfig(mode))
+    stereo, mono = RIGS["pinhole"], Rig(RIGS["pinhole"].left)
+    assert (SelfCalibration.wanted(config, stereo) is None) == (mode == "off")
+    assert SelfCalibration.wanted(config, mono) is None
+    assert SelfCalibration.wanted(config, replace(stereo, depth=True)) is None
+
+
+@pytest.mark.parametrize("mode", [True, False])
+def test_the_map_is_made_anew_by_the_corrected_rig(mode: bool) -> None:
+    """0.2 degrees about y make a pinhole's path longer or shorter by several per cent; corrected, it has its length."""
+    true = RIGS["pinhole"]
+    wrong = turned(true, (0.0, 0.2, 0.0))
+    mapper = Mapper(MapperConfig(association="tracks"), wrong, calibration=SelfCalibration(wrong, mode))
+    updates = [mapper.step(k) for k in keyframes([true] * 24, wrong, 0)]
+    last = mapper.finish([])
+    told = [u.calibration for u in [*updates, last] if u is not None and u.calibration is not None]
+    assert told and all(c.applied == mode for c in told)
+    ends = mapper.map.keyframes.map_T_kf[[0, -1], :3, 3]
+    path = walk(24)[[0, -1], :3, 3]
+    ratio = np.linalg.norm(ends[1] - ends[0]) / np.linalg.norm(path[1] - path[0])
+    assert (abs(ratio - 1) < 0.01) == mode
