@@ -38,6 +38,12 @@ RENAMED = {
 }
 
 
+def estimator_names() -> tuple[str, ...]:
+    """The motion estimators beside `flow`: one file each in tracking/features/odometry/."""
+    folder = Path(__file__).parent / "tracking" / "features" / "odometry"
+    return tuple(sorted(path.stem.replace("_", "-") for path in folder.glob("[a-z]*.py")))
+
+
 @dataclass(frozen=True)
 class TrackerConfig:
     """The default tracker (tracking/flow/)."""
@@ -93,7 +99,7 @@ class FeaturesConfig:
 class OdometryConfig:
     """Which motion estimator, and its policy (tracking/features/odometry/); "flow" is the default tracker."""
 
-    method: str = word("flow", ("flow", "em-r", "vp-r", "r-um", "um", "eight-point", "pnp"), "Motion estimator")
+    method: str = word("flow", ("flow", *estimator_names()), "Motion estimator")
     reference: str = word(
         "frame", ("frame", "keyframe"), "Motion is estimated from the previous frame or the last keyframe"
     )

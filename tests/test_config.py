@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stereo_sfm.config import RENAMED, Config, dump, explain, from_dict, load
+from stereo_sfm.config import RENAMED, Config, dump, estimator_names, explain, from_dict, load
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.mapping.pose_graph import ROBUST
 from stereo_sfm.presets import PRESETS
 from stereo_sfm.settings import walk
 from stereo_sfm.tracking.features.extraction import TABLE as FEATURES
-from stereo_sfm.tracking.features.odometry.table import TABLE as METHODS
 from stereo_sfm.tracking.features.step_scale import SCALES
 
 
@@ -26,7 +25,7 @@ from stereo_sfm.tracking.features.step_scale import SCALES
     [
         ("loop.correction=pose_grap", "is 'pose_grap', did you mean pose_graph?: choose one of pose_graph, averaging"),
         ("loop.robust=foo", "loop.robust is 'foo': choose one of gnc, switchable, none"),
-        ("odometry.method=emr", "odometry.method is 'emr', did you mean em-r?: choose one of flow, em-r"),
+        ("odometry.method=emr", "odometry.method is 'emr', did you mean em-r?: choose one of flow, eight-point, em-r"),
         ("features.kind=SIFT", "features.kind is 'SIFT', did you mean sift?: choose one of orb, sift, akaze"),
         ("seed=-1", "seed is -1: it must be from 0 to"),
         ("features.ratio=-1", "features.ratio is -1: it must be from 0.01 to 1"),
@@ -96,7 +95,7 @@ def test_the_words_are_those_of_the_code_that_reads_them() -> None:
     words = {name: set(words) for name, words in words_of().items()}
     assert words["loop.robust"] == set(ROBUST)
     assert words["odometry.scale"] == set(SCALES)
-    assert words["odometry.method"] == {"flow", *METHODS}
+    assert words["odometry.method"] == {"flow", *estimator_names()}
     assert words["features.kind"] == set(FEATURES)
 
 

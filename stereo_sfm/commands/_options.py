@@ -11,6 +11,7 @@ import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
+from stereo_sfm.config import estimator_names
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.presets import PRESETS, preset
 
@@ -63,7 +64,7 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--preset", default="default", metavar="NAME", help=f"one of {', '.join(PRESETS)}")
     parser.add_argument("--features", metavar="NAME", help="descriptors of --odometry: orb, sift, akaze")
     parser.add_argument(
-        "--odometry", metavar="NAME", help="motion estimator: flow (default), em-r, vp-r, r-um, um, eight-point, pnp"
+        "--odometry", metavar="NAME", help=f"motion estimator: flow (default), {', '.join(estimator_names())}"
     )
     parser.add_argument(
         "--self-calibrate",

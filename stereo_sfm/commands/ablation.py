@@ -36,9 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes at once")
     parser.add_argument("--frames", type=int, default=0, metavar="N", help="at most so many frames of each source")
     parser.add_argument("--features", metavar="A,B", help="of orb, sift, akaze (default: all)")
-    parser.add_argument(
-        "--odometry", metavar="A,B", help="of em-r, vp-r, r-um, um, eight-point, pnp (default: first 4)"
-    )
+    parser.add_argument("--odometry", metavar="A,B", help="motion estimators (default: em-r, vp-r, r-um, um)")
     parser.add_argument("--stages", metavar="A,B", help="of tracking, mapping, averaging, pose_graph (default: all)")
     parser.add_argument("--systems", metavar="A,B", help="presets to add (default: all; none: leave them out)")
     parser.add_argument(
@@ -102,10 +100,10 @@ def ablation(options: AblationOptions) -> int:
 
 
 def _cells(options: AblationOptions) -> list[Cell]:
+    from stereo_sfm.config import estimator_names
     from stereo_sfm.eval import ablation
     from stereo_sfm.presets import PRESETS
     from stereo_sfm.tracking.features.extraction import TABLE as FEATURES
-    from stereo_sfm.tracking.features.odometry.table import TABLE as METHODS
 
     if options.jobs < 1 or options.frames < 0:
         raise StereoSfmError("--jobs must be at least 1 and --frames at least 0")
@@ -116,7 +114,7 @@ def _cells(options: AblationOptions) -> list[Cell]:
     return ablation.grid(
         _different(options.sources),
         _chosen(options.features, ablation.FEATURES, FEATURES, "features"),
-        _chosen(options.odometry, ablation.ESTIMATORS, METHODS, "odometry"),
+        _chosen(options.odometry, ablation.ESTIMATORS, estimator_names(), "odometry"),
         _chosen(options.stages, tuple(ablation.STAGES), ablation.STAGES, "stages"),
         () if options.systems == "none" else _chosen(options.systems, ablation.SYSTEMS, PRESETS, "systems"),
         options.frames,

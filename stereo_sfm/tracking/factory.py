@@ -9,10 +9,7 @@ from stereo_sfm.timing import NoSpans
 from stereo_sfm.tracking.protocol import AnyTracker
 from stereo_sfm.types import Trajectory
 
-__all__ = ["NEEDS_DEPTH", "AnyTracker", "make_tracker"]
-
-# methods that turn 3D points of the current frame into motion: they need a second eye or depth
-NEEDS_DEPTH = ("em-r", "vp-r", "r-um", "um")
+__all__ = ["AnyTracker", "make_tracker"]
 
 
 def make_tracker(
@@ -41,7 +38,9 @@ def _tracker(config: Config, rig: Rig, spans: NoSpans | None, ground_truth: Traj
         from stereo_sfm.tracking.flow.tracker import Tracker
 
         return Tracker(config.tracker, rig, spans, PlaceCorners.wanted(config, rig))
-    if not rig.stereo and method in NEEDS_DEPTH:
+    from stereo_sfm.tracking.features.estimators import estimator
+
+    if not rig.stereo and estimator(method).needs_depth:
         raise StereoSfmError(
             f"odometry {method} needs two eyes or depth, this camera has one eye: use eight-point or pnp"
         )

@@ -17,11 +17,11 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.motion_only import pose_covariance
 from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.timing import NoSpans
+from stereo_sfm.tracking.features.estimators import make_estimator
 from stereo_sfm.tracking.features.extraction import circle_mask
 from stereo_sfm.tracking.features.feature_view import FeatureView, ViewMaker
 from stereo_sfm.tracking.features.map_correction import KeyframePoses
-from stereo_sfm.tracking.features.odometry.base import Motion
-from stereo_sfm.tracking.features.odometry.table import make_estimator
+from stereo_sfm.tracking.features.motion_estimator import Motion
 from stereo_sfm.tracking.features.outgoing import keyframe_of, observations_of
 from stereo_sfm.tracking.features.pairing import Pairing
 from stereo_sfm.tracking.features.point_ids import PointIds

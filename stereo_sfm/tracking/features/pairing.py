@@ -9,7 +9,7 @@ from stereo_sfm.geometry.motion_only import bearing_errors
 from stereo_sfm.tracking.features.extraction import feature_kind
 from stereo_sfm.tracking.features.feature_view import FeatureView
 from stereo_sfm.tracking.features.matching import epipolar_inliers, match_features
-from stereo_sfm.tracking.features.odometry.base import FramePair
+from stereo_sfm.tracking.features.motion_estimator import FramePair
 from stereo_sfm.tracking.features.point_ids import PointIds
 from stereo_sfm.types import F64, I64
 

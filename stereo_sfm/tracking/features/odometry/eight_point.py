@@ -11,7 +11,7 @@ import numpy as np
 from stereo_sfm.config import OdometryConfig
 from stereo_sfm.geometry.essential import relative_pose
 from stereo_sfm.geometry.robust import Degenerate
-from stereo_sfm.tracking.features.odometry.base import FramePair, Motion
+from stereo_sfm.tracking.features.motion_estimator import EstimatorEntry, FramePair, Motion
 
 _MIN_SCALED = 5
 
@@ -65,3 +65,10 @@ class EightPoint:
             return Motion(pose.rotation, pose.direction, pose.inliers, metric=False, stats=stats)
         step = scale_from_points(pose.rotation, pose.direction, pair, pose.inliers)
         return Motion(pose.rotation, step * pose.direction, pose.inliers, stats=stats)
+
+
+ESTIMATOR = EstimatorEntry(
+    "essential matrix by eight points (sparse localization paper)",
+    lambda config, camera: EightPoint(config),
+    needs_depth=False,
+)

@@ -6,8 +6,8 @@ import numpy as np
 
 from stereo_sfm.config import OdometryConfig
 from stereo_sfm.geometry.essential import relative_pose
-from stereo_sfm.tracking.features.odometry.base import FramePair, Motion
-from stereo_sfm.tracking.features.odometry.translation import translation_for
+from stereo_sfm.tracking.features.motion_estimator import EstimatorEntry, FramePair, Motion
+from stereo_sfm.tracking.features.odometry._translation import translation_for
 
 
 class EmR:
@@ -31,3 +31,8 @@ class EmR:
         translation, inliers = translation_for(pose.rotation, pair, config, rng)
         stats = {"parallax_deg": float(np.degrees(pose.parallax)), "pure_rotation": float(pose.pure_rotation)}
         return Motion(pose.rotation, translation, inliers & pose.inliers, stats=stats)
+
+
+ESTIMATOR = EstimatorEntry(
+    "essential matrix, then 1-point translation (retail paper)", lambda config, camera: EmR(config), needs_depth=True
+)

@@ -16,7 +16,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.motion_only import bearing_errors, refine_pose
 from stereo_sfm.geometry.procrustes import refuse_line
 from stereo_sfm.geometry.robust import Degenerate
-from stereo_sfm.tracking.features.odometry.base import FramePair, Motion
+from stereo_sfm.tracking.features.motion_estimator import EstimatorEntry, FramePair, Motion
 from stereo_sfm.types import F64, Bool
 
 _PLANE_LIMIT = np.cos(np.radians(70.0))
@@ -90,3 +90,8 @@ class Pnp:
         inliers = np.zeros(len(pair.bearings_now), bool)
         inliers[rows[chosen]] = True
         return Motion(now_T_last[:3, :3], now_T_last[:3, 3], inliers)
+
+
+ESTIMATOR = EstimatorEntry(
+    "perspective-n-point (C++ course system)", lambda config, camera: Pnp(config), needs_depth=False
+)

@@ -8,7 +8,14 @@ from stereo_sfm.config import OdometryConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.procrustes import refuse_line, rigid, rigid_ransac
 from stereo_sfm.geometry.robust import Degenerate
-from stereo_sfm.tracking.features.odometry.base import FramePair, Motion, refuse_chance, thresholds, weights
+from stereo_sfm.tracking.features.motion_estimator import (
+    EstimatorEntry,
+    FramePair,
+    Motion,
+    refuse_chance,
+    thresholds,
+    weights,
+)
 
 
 class RUm:
@@ -33,3 +40,8 @@ class RUm:
         inliers = np.zeros(len(pair.bearings_now), bool)
         inliers[rows[chosen]] = True
         return Motion(now_T_last[:3, :3], now_T_last[:3, 3], inliers)
+
+
+ESTIMATOR = EstimatorEntry(
+    "3-point RANSAC, then Umeyama (retail paper)", lambda config, camera: RUm(config), needs_depth=True
+)

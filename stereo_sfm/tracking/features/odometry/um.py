@@ -8,7 +8,7 @@ from stereo_sfm.config import OdometryConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.procrustes import refuse_line, rigid
 from stereo_sfm.geometry.robust import Degenerate
-from stereo_sfm.tracking.features.odometry.base import FramePair, Motion, refuse_chance, weights
+from stereo_sfm.tracking.features.motion_estimator import EstimatorEntry, FramePair, Motion, refuse_chance, weights
 
 
 class Um:
@@ -27,3 +27,8 @@ class Um:
         now_T_last = rigid(source, target, weights(self._config, pair.sigmas[rows]))
         refuse_chance(se3.transform(now_T_last, source), pair.bearings_now[rows])
         return Motion(now_T_last[:3, :3], now_T_last[:3, 3], rows)
+
+
+ESTIMATOR = EstimatorEntry(
+    "Umeyama over all matches (retail paper)", lambda config, camera: Um(config), needs_depth=True
+)

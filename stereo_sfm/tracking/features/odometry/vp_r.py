@@ -12,8 +12,8 @@ from stereo_sfm.config import OdometryConfig
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.geometry.vanishing import Manhattan, ManhattanLimits
-from stereo_sfm.tracking.features.odometry.base import FramePair, Motion
-from stereo_sfm.tracking.features.odometry.translation import translation_for
+from stereo_sfm.tracking.features.motion_estimator import EstimatorEntry, FramePair, Motion
+from stereo_sfm.tracking.features.odometry._translation import translation_for
 from stereo_sfm.tracking.manhattan import ManhattanCompass
 from stereo_sfm.types import U8
 
@@ -43,3 +43,10 @@ class VpR:
         if known is not None:
             return known
         return self._compass.measure(image, frame_id, None if near is None else near.cam_R_axes)
+
+
+ESTIMATOR = EstimatorEntry(
+    "vanishing points, then 1-point translation (retail paper)",
+    lambda config, camera: VpR(config, camera),
+    needs_depth=True,
+)

@@ -1,13 +1,15 @@
-"""What a motion estimator gets and gives. One estimator per file; the table of names is in `table.py`."""
+"""What a motion estimator gets and gives. One estimator per file of `odometry/`."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 
 from stereo_sfm.config import OdometryConfig
+from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.robust import Degenerate
 from stereo_sfm.types import F64, U8, Bool, Message
 
@@ -63,6 +65,15 @@ class Estimator(Protocol):
             Degenerate: the data do not determine it; the reason is a short stable word.
         """
         ...
+
+
+@dataclass(frozen=True)
+class EstimatorEntry:
+    """What a file of `odometry/` offers, as its `ESTIMATOR`."""
+
+    summary: str
+    make: Callable[[OdometryConfig, Camera], Estimator]  # for the images of a camera
+    needs_depth: bool  # it turns 3D points of the current frame into motion: a second camera or depth images
 
 
 def thresholds(config: OdometryConfig, sigmas: F64) -> F64:
