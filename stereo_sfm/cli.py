@@ -7,6 +7,7 @@ import importlib
 import io
 import logging
 import os
+import select
 import sys
 from collections.abc import Iterator, Sequence
 from typing import NoReturn
@@ -118,11 +119,9 @@ def _mend_standard_streams() -> None:
 
 def _nobody_reads() -> bool:
     """Whether the reader of our output went away (`| head`): nothing is wrong, and nothing more can be said."""
-    try:
-        sys.stdout.flush()
-    except BrokenPipeError:
-        return True
-    return False
+    reader = select.poll()
+    reader.register(sys.stdout.fileno(), 0)
+    return any(event & (select.POLLERR | select.POLLHUP) for _, event in reader.poll(0))
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -48,3 +49,17 @@ def test_every_public_name_can_be_had() -> None:
     assert set(stereo_sfm.__all__) <= set(dir(stereo_sfm))
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = stereo_sfm.nothing
+
+
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_reader_that_goes_away_is_no_error(unbuffered: str) -> None:
+    """As `| head -1`, whether the output is buffered or not."""
+    command = [sys.executable, "-c", "import sys, stereo_sfm.cli as c; sys.exit(c.main())", "config", "dump"]
+    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=environment, text=True, bufsize=1
+    )
+    assert process.stdout is not None and process.stderr is not None
+    process.stdout.close()
+    errors = process.stderr.read()
+    assert (process.wait(), errors) == (0, "")
