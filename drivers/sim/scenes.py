@@ -81,6 +81,7 @@ SCENES: dict[str, Scene] = {
     "people": Scene(_STORE, _loop, 42.0, people=7),
     "dark": Scene(_STORE, _loop, 42.0, _DARK),
     "blank": Scene(Layout(fill=0.06), _loop, 42.0),
+    "sparse": Scene(Layout(fill=0.7, gaps=0.3, setback=0.3), _loop, 42.0),
     "demo": Scene(Layout(gondolas=2, gondola_length=3.6, products=120), _loop, 21.0, gait=Gait(speed=1.05)),
     "big": Scene(Layout(gondolas=9, gondola_length=18.0, products=420), _serpentine, 1000.0),
 }

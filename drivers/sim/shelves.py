@@ -37,6 +37,9 @@ class Shop:
     changes: np.random.Generator  # which product rows are exchanged
     exchange: float  # fraction of product rows
     fill: float  # fraction of product rows that are there
+    order: np.random.Generator  # which facings are sold out, and how far the others stand back
+    gaps: float  # fraction of facings that are sold out
+    setback: float  # metres, the most that a product row stands back
 
 
 def make_products(rng: np.random.Generator, atlas: Atlas, count: int) -> list[Product]:
@@ -65,6 +68,17 @@ def _facing(shop: Shop, p: Product, rows: int, deep: float, floor: float) -> lis
     return [front, low_top, up_front, low_top + upper * p.high, 1 / p.high, 1 / p.deep, 1 / p.wide]
 
 
+def _disorder(shop: Shop, boxes: list[float], back: float, deep: float, floor: float) -> list[float]:
+    """The boxes of a facing as customers leave it: sold out, or set back by about `back` metres."""
+    gone, shift = shop.order.random(2)
+    front, low_top, up_front, top, *inverses = boxes
+    if gone < shop.gaps:
+        return [front, floor, up_front, floor, *inverses]
+    shift = back + 0.06 * shop.setback * float(shift)
+    front, up_front = (min(w + shift, deep - 0.03) for w in (front, up_front))
+    return [front, low_top, up_front, top, *inverses]
+
+
 def _fill_level(
     b: Builder, shop: Shop, plan: np.random.Generator, extent: tuple[float, float], slot: tuple[float, float]
 ) -> None:
@@ -87,10 +101,14 @@ def _fill_level(
         pitch = p.wide + gap
         fits = min(count, int((end - u) / pitch))
         missing = shop.fill < 1 and plan.random() >= shop.fill
+        back = float(shop.order.random()) * min(shop.setback, deep - p.deep) if shop.setback > 0 else 0.0
         for k in range(0 if missing else fits):
             u0 = u + k * pitch
             cell = [u0, u0 + pitch, u0 + 0.5 * gap, u0 + 0.5 * gap + p.wide]
-            b.facings.append([*cell, *_facing(shop, p, rows, deep, floor)])
+            boxes = _facing(shop, p, rows, deep, floor)
+            if shop.gaps > 0 or back > 0:
+                boxes = _disorder(shop, boxes, back, deep, floor)
+            b.facings.append([*cell, *boxes])
             b.facings_i.append([shown.front, shown.side, shown.top, len(b.blocks) - 1, len(b.levels)])
         u += fits * pitch
         if fits < count:

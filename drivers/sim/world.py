@@ -28,6 +28,8 @@ class Layout:
     identical: bool = False
     products: int = 260
     fill: float = 1.0  # fraction of product rows that are there
+    gaps: float = 0.0  # fraction of the single facings that are sold out
+    setback: float = 0.0  # metres, the most that a product row stands back from the shelf's edge
 
     @property
     def room(self) -> tuple[float, float, float]:
@@ -151,6 +153,9 @@ def build_world(layout: Layout | None = None, seed: int = 0, exchange: float = 0
         np.random.default_rng([*root, 5]),
         exchange,
         layout.fill,
+        np.random.default_rng([*root, 8]),
+        layout.gaps,
+        layout.setback,
     )
     for k in range(layout.gondolas):
         _gondola(b, shop, root, k, layout)
