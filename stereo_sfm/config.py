@@ -64,7 +64,10 @@ class TrackerConfig:
     max_error_sigmas: float = number(3.0, 0.1, 1000, "Residual above which an observation is no inlier")
     max_epipolar_px: float = number(1.0, 0.01, 100, "Distance of a stereo match from its epipolar curve")
     max_window_disparity_px: float = number(
-        0.15, 0, 100, "Difference of the disparities of a narrow and a wide window: more is an edge in depth"
+        0.2, 0, 100, "Difference of two supports' disparities (a narrow window, a plane): more is an edge in depth"
+    )
+    max_surface_misfit: float = number(
+        8.0, 1, 1000, "Difference of matched windows over the typical one: more is an edge in depth"
     )
     keyframe_share: float = number(0.75, 0, 1, "New keyframe when a smaller share of the last one's points is left")
     keyframe_max_frames: int = number(30, 1, 100_000, "Frames that a keyframe represents at most")

@@ -107,10 +107,35 @@ def test_uncertain_distance_does_not_bias_the_pose() -> None:
 def test_triangulation_of_exact_pairs(camera: Camera) -> None:
     pose, points, uv, uv_right = scene(camera, 100, 7)
     cameras = StereoCameras.of(rig(camera))
-    bearing, rho, variance, epipolar = triangulate(uv, uv_right, *cameras.cams, cameras.left_T_right, 0.5)
+    bearing, rho, variance, epipolar = triangulate(
+        uv, uv_right, *cameras.cams, cameras.left_T_right, np.full(len(uv), 0.5)
+    )
     truth = se3.transform(se3.inverse(pose), points)
     good = np.isfinite(rho)
     assert good.mean() > 0.95
     assert np.abs((bearing / rho[:, None] - truth)[good]).max() < 1e-6
     assert epipolar[good].max() < 1e-6
     assert (variance[good] > 0).all()
+
+
+def test_uncertain_distances_do_not_shorten_a_step() -> None:
+    """Errors in variables: taken at the given distance, the derivatives make steps too short by its variance."""
+    camera, relative, steps = CAMERAS[2], 0.1, list[float]()
+    cameras = StereoCameras.of(rig(camera))
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        bearing = camera.unproject(rng.uniform([60, 60], [780, 740], (200, 2)))
+        bearing = bearing[bearing[:, 2] > 0.2]
+        points = bearing * rng.uniform(1, 3, (len(bearing), 1))
+        pose = se3.exp(np.array([0, 0, 0.06, 0, 0, 0]))
+        ahead = points - pose[:3, 3]
+        uv = camera.project(ahead) + rng.normal(0, 0.3, (len(points), 2))
+        rho = 1 / np.linalg.norm(points, axis=1)
+        noisy = rho * (1 + relative * rng.normal(size=len(rho)))
+        found = pose_solver.optimise_pose(
+            np.eye(4), np.zeros(6), 0.1, np.ones(6), np.zeros(0), np.zeros((len(rho), 3)), bearing, noisy,
+            (relative * rho) ** 2, uv, np.full_like(uv, np.nan), cameras.cams, cameras.right_T_left, 0.3, SCALES,
+        )[0]  # fmt: skip
+        steps.append(found[2, 3] / 0.06)
+    assert abs(np.mean(steps) - 1) < 3 * np.std(steps) / np.sqrt(len(steps)) + 1e-3
+    assert np.std(steps) / np.sqrt(len(steps)) < 0.002

@@ -12,6 +12,7 @@ from stereo_sfm.tracking.flow.coarse_rotation import CoarseRotation
 from stereo_sfm.tracking.flow.frame_pose import ExpectedMotion
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.tracks import Patches, Tracks
+from stereo_sfm.tracking.flow.visible_area import VisibleArea
 from stereo_sfm.types import F64, I64
 
 WELL_PREDICTED_PX = 3.0  # median distance of points from where they were expected; below, the half image is enough
@@ -20,8 +21,8 @@ WELL_PREDICTED_PX = 3.0  # median distance of points from where they were expect
 class Follower:
     """Knows the last image and how its points looked when they were first seen."""
 
-    def __init__(self, config: TrackerConfig, rig: Rig, shutter: RollingShutter) -> None:
-        self._config, self._rig, self._shutter = config, rig, shutter
+    def __init__(self, config: TrackerConfig, rig: Rig, area: VisibleArea, shutter: RollingShutter) -> None:
+        self._config, self._area, self._shutter = config, area, shutter
         self._patches = Patches(2 * config.max_features)
         self._last: klt.Pyramid | None = None
         self._coarse_rotation = CoarseRotation(rig.left, config.pyramid_levels)
@@ -47,7 +48,7 @@ class Follower:
             pyramid[0], uv, warp, tracks.slot, found, self._patches.patch, self._patches.gradients,
             self._patches.inverse_normal, self._patches.contrast, 6, klt.WEIGHTS, klt.COORDINATES,
         )  # fmt: skip
-        found &= (ncc > config.min_anchor_ncc) & self._rig.left.inside(uv, 1.0)
+        found &= (ncc > config.min_anchor_ncc) & self._area.inside(uv)
         out = tracks.keep(found)
         out.uv, out.warp = uv[found], warp[found]
         return out

@@ -14,7 +14,9 @@ from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.types import F64, Bool
 
-CAUCHY_SCALES = np.array([20.0, 10.0, 6.0, 4.0, 3.0, 2.0, 2.0])  # in sigmas, one Gauss-Newton step each
+# In sigmas, one Gauss-Newton step each. The last are narrow: what disagrees by two or three sigmas (corners where a
+# near edge crosses a far one, people who walk along) errs to one side, and bends the scale.
+CAUCHY_SCALES = np.array([20.0, 10.0, 6.0, 4.0, 2.0, 1.0, 1.0])
 MEDIAN_ERROR = 0.8  # of unit noise in the four rows of a point
 NOISE_RANGE = (0.3, 4.0)  # over config.sigma_px
 LEAST_DEPTH_SIGMA = 1e-3  # relative

@@ -6,29 +6,32 @@ import math
 
 import numpy as np
 
-from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import TrackerConfig
-from stereo_sfm.tracking.flow.corners import corner_mask, detect_corners
+from stereo_sfm.tracking.flow.corners import detect_corners
 from stereo_sfm.tracking.flow.follower import Follower
 from stereo_sfm.tracking.flow.pyramids import StereoPyramids
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.stereo import StereoMatcher
 from stereo_sfm.tracking.flow.tracks import Tracks
+from stereo_sfm.tracking.flow.visible_area import VisibleArea
 from stereo_sfm.types import F64
 
 LEAST_RHO = 1e-4  # 1/m
+SPACING = 0.75  # of the side of a square that each point would have for itself
 
 
 class NewPoints:
     """Finds them, spread over the image; point ids are never used again."""
 
     def __init__(
-        self, config: TrackerConfig, rig: Rig, stereo: StereoMatcher, follower: Follower, shutter: RollingShutter
+        self,
+        config: TrackerConfig,
+        area: VisibleArea,
+        stereo: StereoMatcher,
+        follower: Follower,
+        shutter: RollingShutter,
     ) -> None:
-        self._config, self._stereo, self._follower, self._shutter = config, stereo, follower, shutter
-        self._mask = corner_mask(rig.left, config.max_angle_deg)
-        area = 4.0 * self._mask.sum()
-        self._spacing = 0.75 * math.sqrt(area / config.max_features)
+        self._config, self._area, self._stereo, self._follower, self._shutter = config, area, stereo, follower, shutter
         self._next_point_id = 0
 
     def add(self, tracks: Tracks, images: StereoPyramids, pose: F64, velocity: F64) -> Tracks:
@@ -37,7 +40,9 @@ class NewPoints:
         missing = config.max_features - len(tracks)
         if missing <= 0:
             return tracks
-        corners = detect_corners(images.left[1], self._mask, tracks.uv, missing, self._spacing, config.corner_quality)
+        self._area.learn(images.left[1])
+        spacing = SPACING * math.sqrt(4.0 * self._area.mask.sum() / config.max_features)
+        corners = detect_corners(images.left[1], self._area.mask, tracks.uv, missing, spacing, config.corner_quality)
         match = self._stereo.match(images.left, images.right, corners)
         good = np.flatnonzero(match.good)
         rows, slots = self._follower.begin(images.left, match.uv_left[good])

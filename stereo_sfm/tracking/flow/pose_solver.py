@@ -1,10 +1,13 @@
 """Motion-only optimisation: the pose of one stereo frame from points of the local map, with covariance.
 
 Each point is known along a ray from where it was first seen, P = origin + direction / rho, with a variance of rho. The
-pose is solved by iteratively re-weighted Gauss-Newton on the pixels of both images while rho is marginalised in closed
-form (the four residuals of a point share one unknown: a rank-one update, Sherman-Morrison), so that a point whose
-distance is uncertain still gives rotation at full weight. Robust weights are Cauchy, narrowed in steps
-(graduated non-convexity, Yang et al., RA-L 5, 2020, with a Cauchy kernel).
+pose is solved by iteratively re-weighted Gauss-Newton on the pixels of both images, and every rho with it: eliminated
+first (the four residuals of a point share one unknown: a rank-one update, Sherman-Morrison), then moved by what the
+pose did. So a point whose distance is uncertain gives rotation at full weight, and the derivatives by the pose are
+taken where pose and distances agree. Taken at the distance as it was they would hold its error squared, and make every
+step too short by the variance of rho over rho squared (errors in variables; Fuller, Measurement Error Models, 1987,
+section 1.1). Robust weights are Cauchy, narrowed in steps (graduated non-convexity, Yang et al., RA-L 5, 2020, with a
+Cauchy kernel).
 
 Where rows are exposed one after the other (a rolling shutter), each point is seen from where the camera was at the time
 of its row: pose @ exp(seconds * velocity). The velocity is solved with the pose (Ait-Aider et al., Simultaneous object
@@ -23,6 +26,9 @@ import numpy as np
 from stereo_sfm.geometry.kernels import njit, project_one
 from stereo_sfm.geometry.se3_kernels import compose_into, exp_into
 from stereo_sfm.geometry.small_matrix import invert_symmetric, solve_symmetric
+
+MOST_SIGMAS = 4.0  # that a distance moves while a pose is solved
+LEAST_RHO = 1e-4  # 1/m
 
 
 @njit
@@ -77,13 +83,15 @@ def point_residuals(pose, px, py, pz, dx, dy, dz, uv_l, uv_r, cams, right_T_left
 
 @njit
 def _normal_equations(
-    pose, velocity, row_s, origin, direction, rho, variance, uv_l, uv_r, cams, right_T_left, sigma, scale, normal, rhs,
-    error,
+    pose, velocity, row_s, origin, direction, prior, variance, rho, uv_l, uv_r, cams, right_T_left, sigma, scale,
+    normal, rhs, error, elimination,
 ):  # fmt: skip
-    """Sums over all points, each with its distance marginalised; a robust weight by a Cauchy kernel of `scale` sigmas.
+    """Sums over all points, each with its distance eliminated; a robust weight by a Cauchy kernel of `scale` sigmas.
 
     Args:
+        prior, variance: (N,) what is known of each distance. rho: (N,) where it is linearised.
         normal (n, n), rhs (n,), error (N,): overwritten; see `optimise_pose`. n is 6, with a rolling shutter 12.
+        elimination: (N, 7) overwritten: minus the step of rho is its last column and the others times the pose's step.
 
     Returns:
         The sum of the weights.
@@ -111,6 +119,7 @@ def _normal_equations(
         )  # fmt: skip
         if rows == 0:
             error[k] = np.inf
+            elimination[k] = 0.0
             continue
         rr, gr, gg = 0.0, 0.0, 0.0
         for i in range(rows):
@@ -118,7 +127,10 @@ def _normal_equations(
             gr += ray[i] * res[i]
             gg += ray[i] * ray[i]
         c = variance[k] / (sigma * sigma + variance[k] * gg)
-        chi2 = max(rr - c * gr * gr, 0.0) * inv_s2
+        off, trust = rho[k] - prior[k], sigma * sigma / variance[k]
+        gr += trust * off
+        chi2 = max(rr + trust * off * off - c * gr * gr, 0.0) * inv_s2
+        elimination[k, 6] = c * gr
         error[k] = math.sqrt(chi2 / rows)
         w = 1.0 / (1.0 + chi2 / (rows * scale * scale))
         wi = w * inv_s2
@@ -128,6 +140,7 @@ def _normal_equations(
             for m in range(rows):
                 s += jac[m, i] * ray[m]
             jr[i] = s
+            elimination[k, i] = c * s
         for i in range(6):
             s = 0.0
             for m in range(rows):
@@ -160,6 +173,17 @@ def _normal_equations(
 
 
 @njit
+def _move_distances(rho, prior, variance, elimination, xi, row_s):
+    """Follow a step of the pose (and velocity) with every distance, within what is believable."""
+    for k in range(len(rho)):
+        step = elimination[k, 6]
+        for i in range(6):
+            step += elimination[k, i] * (xi[i] + row_s[k] * xi[6 + i] if len(row_s) > 0 else xi[i])
+        reach = MOST_SIGMAS * math.sqrt(variance[k])
+        rho[k] = max(min(max(rho[k] - step, prior[k] - reach), prior[k] + reach), LEAST_RHO)
+
+
+@njit
 def optimise_pose(
     pose, moved, seconds, velocity_sigma, row_s, origin, direction, rho, variance, uv_l, uv_r, cams, right_T_left,
     sigma, scales,
@@ -185,11 +209,12 @@ def optimise_pose(
     n = 12 if len(row_s) > 0 else 6
     normal, factor = np.zeros((n, n)), np.zeros((n, n))
     rhs, xi, move = np.zeros(n), np.zeros(n), np.zeros((4, 4))
+    prior, rho, elimination = rho, rho.copy(), np.zeros((len(rho), 7))
     for step in range(len(scales) + 1):  # after the last step once more, for errors and covariance
         scale = scales[min(step, len(scales) - 1)]
         used = _normal_equations(
-            pose, velocity, row_s, origin, direction, rho, variance, uv_l, uv_r, cams, right_T_left, sigma, scale,
-            normal, rhs, error,
+            pose, velocity, row_s, origin, direction, prior, variance, rho, uv_l, uv_r, cams, right_T_left, sigma,
+            scale, normal, rhs, error, elimination,
         )  # fmt: skip
         for i in range(n - 6):  # the velocity is the mean motion since the last frame, or nearly
             information = 1.0 / (velocity_sigma[i] * velocity_sigma[i])
@@ -209,6 +234,7 @@ def optimise_pose(
             break
         exp_into(xi, 1.0, move)
         compose_into(pose.copy(), move, pose)
+        _move_distances(rho, prior, variance, elimination, xi, row_s)
         for i in range(n - 6):
             moved[i] += xi[i]
             velocity[i] += xi[6 + i]

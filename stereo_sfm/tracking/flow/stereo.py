@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,10 +15,15 @@ from stereo_sfm.tracking.flow import klt
 from stereo_sfm.tracking.flow.epipolar_gate import on_curve
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.tracking.flow.stereo_match import patch_sums, search_epipolar, triangulate
+from stereo_sfm.tracking.flow.surface import fit_planes
+from stereo_sfm.tracking.flow.visible_area import VisibleArea
 from stereo_sfm.types import F32, F64, Bool, StereoImage
 
 SEARCH_LEVEL = 1
 CLOSE = 4.0  # sigmas
+LEAST_SIGMA_PX, MOST_SIGMA_PX = 0.15, 0.3  # of a disparity: no window is better, a worse one is none
+TYPICAL = 25  # percentile of the points' misfits that stands for windows on one surface
+LEAST_MISFIT = 0.5  # that counts as typical, in squares of the expected noise
 
 
 @dataclass
@@ -39,6 +45,8 @@ class StereoMatcher:
         self._config = config
         self._rig = rig
         self._cameras = StereoCameras.of(rig)
+        assert rig.right is not None
+        self._right_area = VisibleArea(rig.right, config.max_angle_deg)
         self._min_depth = config.min_depth_baselines * rig.baseline
         reach = rig.left.fx / config.min_depth_baselines
         self._candidates = int(np.clip(reach / 2**SEARCH_LEVEL * 1.2, 16, 160))
@@ -52,7 +60,8 @@ class StereoMatcher:
     def placed(self, uv: F64, uv_right: F64) -> StereoMatch:
         """Pixels (N, 2) that are matched already, NaN where not, as points of the present rig."""
         seen = np.asarray(np.isfinite(uv_right).all(1))
-        return self._triangulated(np.ascontiguousarray(uv), np.ascontiguousarray(uv_right), seen, np.inf, -CLOSE)
+        uv, uv_right = np.ascontiguousarray(uv), np.ascontiguousarray(uv_right)
+        return self._triangulated(uv, uv_right, self._usual_sigma(uv), seen, np.inf, -CLOSE)
 
     def prepare(self, image: StereoImage) -> klt.Pyramid | F32:
         """What `follow` and `match` need of the second eye: a pyramid, or the depth image."""
@@ -70,13 +79,14 @@ class StereoMatcher:
         guess_left = self._rig.left.project(points_cam)
         assert self._rig.right is not None
         guess = self._rig.right.project(se3.transform(self._cameras.right_T_left, points_cam)) + uv - guess_left
-        return self._refine(left, right, uv, guess, 0)
+        return self._on_one_surface(left, right, uv, self._refine(left, right, uv, guess, 0))[0]
 
     def match(self, left: klt.Pyramid, right: klt.Pyramid | F32, uv: F64) -> StereoMatch:
         """Stereo matches of new corners (N, 2) px."""
         config = self._config
         uv = np.ascontiguousarray(uv)
         if isinstance(right, tuple):
+            self._right_area.learn(right[1])
             uv_right = self._refine(left, right, uv, self._search(left, right, uv), 1)
             back = uv.copy()
             status, _ = klt.track_translation(
@@ -84,10 +94,13 @@ class StereoMatcher:
                 klt.WEIGHTS,
             )  # fmt: skip
             good = (status == klt.TRACKED) & (np.linalg.norm(back - uv, axis=1) < 0.5)
-            good &= self._one_surface(left, right, uv, uv_right)
+            good &= self._narrow_agrees(left, right, uv, uv_right)
+            uv_right, sigma_px = self._on_one_surface(left, right, uv, uv_right)
+            good &= np.isfinite(uv_right[:, 0])
         else:
             uv_right, good = self._from_depth(right, uv)
-        return self._triangulated(uv, uv_right, good, config.max_epipolar_px, -CLOSE)
+            sigma_px = self._usual_sigma(uv)
+        return self._triangulated(uv, uv_right, sigma_px, good, config.max_epipolar_px, -CLOSE)
 
     def match_coarse(self, left: klt.Pyramid, right: klt.Pyramid | F32, uv: F64) -> StereoMatch:
         """As `match`, in half the time: good to half a pixel, and with no look at depth edges."""
@@ -99,7 +112,8 @@ class StereoMatcher:
             left, right, uv, uv_right, SEARCH_LEVEL, SEARCH_LEVEL, 10, self._config.min_contrast, self._config.min_ncc,
             klt.WEIGHTS,
         )  # fmt: skip
-        return self._triangulated(uv, uv_right, status == klt.TRACKED, 2 * self._config.max_epipolar_px, 0.0)
+        sigma_px, good = self._usual_sigma(uv), status == klt.TRACKED
+        return self._triangulated(uv, uv_right, sigma_px, good, 2 * self._config.max_epipolar_px, 0.0)
 
     def _search(self, left: klt.Pyramid, right: klt.Pyramid, uv: F64) -> F64:
         """Right pixels (N, 2) to the pixel of the search level, NaN where nothing is alike."""
@@ -108,10 +122,16 @@ class StereoMatcher:
             *self._cameras.cams, self._cameras.right_T_left, self._min_depth, self._candidates, 25.0, 1.2,
         )  # fmt: skip
 
-    def _triangulated(self, uv: F64, uv_right: F64, good: Bool, max_epipolar_px: float, least: float) -> StereoMatch:
+    def _usual_sigma(self, uv: F64) -> F64:
+        """(N,) px along the epipolar curve, where a match does not tell: noise in both images."""
+        return np.full(len(uv), math.sqrt(2) * self._config.sigma_px)
+
+    def _triangulated(
+        self, uv: F64, uv_right: F64, sigma_px: F64, good: Bool, max_epipolar_px: float, least: float
+    ) -> StereoMatch:
         """`least`: inverse distance in its sigmas; a far point may come out behind the camera by noise."""
         bearing, rho, variance, epipolar = triangulate(
-            uv, uv_right, *self._cameras.cams, self._cameras.left_T_right, self._config.sigma_px
+            uv, uv_right, *self._cameras.cams, self._cameras.left_T_right, sigma_px
         )
         with np.errstate(invalid="ignore"):
             good &= on_curve(self._rig, uv, uv_right, epipolar, max_epipolar_px, good) & (
@@ -129,13 +149,32 @@ class StereoMatcher:
         out[status != klt.TRACKED] = np.nan
         return out
 
-    def _one_surface(self, left: klt.Pyramid, right: klt.Pyramid, uv: F64, uv_right: F64) -> Bool:
-        """Whether a narrower window finds the same disparity: it does not where a depth edge crosses the window."""
+    def _narrow_agrees(self, left: klt.Pyramid, right: klt.Pyramid, uv: F64, uv_right: F64) -> Bool:
+        """Whether a narrower window finds the same disparity."""
         narrow = np.nan_to_num(uv_right, nan=-1e3)
         status, _ = klt.track_translation(left, right, uv, narrow, 0, 0, 10, 0.5, 0.3, self._narrow)
         with np.errstate(invalid="ignore"):
             near = np.linalg.norm(narrow - uv_right, axis=1) < self._config.max_window_disparity_px
         return (status == klt.TRACKED) & near
+
+    def _on_one_surface(self, left: klt.Pyramid, right: klt.Pyramid, uv: F64, uv_right: F64) -> tuple[F64, F64]:
+        """Matches by their disparity planes, and their standard deviations in px.
+
+        NaN where a window is explained much worse than windows typically are, where the plane puts the match elsewhere
+        than the window as a whole, or where neither fixes it.
+        """
+        fitted, misfit, sigma_px = fit_planes(
+            left[0], right[0], np.ascontiguousarray(uv), uv_right, *self._cameras.cams[2:], self._cameras.right_T_left,
+            klt.WEIGHTS, klt.COORDINATES,
+        )  # fmt: skip
+        judged = np.isfinite(misfit)
+        typical = max(float(np.percentile(misfit[judged], TYPICAL)), LEAST_MISFIT) if judged.any() else LEAST_MISFIT
+        with np.errstate(invalid="ignore"):
+            good = np.linalg.norm(fitted - uv_right, axis=1) < self._config.max_window_disparity_px
+        good &= (misfit < self._config.max_surface_misfit * typical) & (sigma_px < MOST_SIGMA_PX)
+        good &= self._right_area.inside(uv_right)
+        fitted[~good] = np.nan
+        return fitted, np.maximum(sigma_px, LEAST_SIGMA_PX)
 
     def _from_depth(self, depth: F32, uv: F64) -> tuple[F64, Bool]:
         """Virtual right pixels from a depth image, NaN where it has a hole or an edge."""

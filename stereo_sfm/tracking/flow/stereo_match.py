@@ -119,8 +119,8 @@ def triangulate(uv_left, uv_right, model_l, params_l, model_r, params_r, left_T_
     """Distance of stereo matches along the left bearing, by least squares in the right image's epipolar direction.
 
     Returns:
-        bearing (N, 3) unit, left camera; rho (N,) inverse distance 1/m; variance (N,) of rho for `sigma` px noise in
-        each image; epipolar (N,) px distance of the right observation from the epipolar curve. NaN where impossible.
+        bearing (N, 3) unit, left camera; rho (N,) inverse distance 1/m; variance (N,) of rho for noise of `sigma` (N,)
+        px along the epipolar curve; epipolar (N,) px distance of the right observation from it. NaN where impossible.
     """
     n = uv_left.shape[0]
     bearing = np.full((n, 3), np.nan)
@@ -173,7 +173,7 @@ def triangulate(uv_left, uv_right, model_l, params_l, model_r, params_r, left_T_
         bearing[k, 0], bearing[k, 1], bearing[k, 2] = bx, by, bz
         rho[k] = r
         jj = ju * ju + jv * jv
-        variance[k] = 2.0 * sigma * sigma / jj
+        variance[k] = sigma[k] * sigma[k] / jj
         along = (ju * eu + jv * ev) / math.sqrt(jj)
         epipolar[k] = math.sqrt(max(eu * eu + ev * ev - along * along, 0.0))
     return bearing, rho, variance, epipolar

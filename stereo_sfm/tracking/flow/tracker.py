@@ -28,6 +28,7 @@ from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.stereo import StereoMatcher
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.tracking.flow.tracks import Tracks
+from stereo_sfm.tracking.flow.visible_area import VisibleArea
 from stereo_sfm.tracking.inertial.inertial_motion import InertialMotion
 from stereo_sfm.types import F64, Bool, Corners, Frame, Keyframe, MapUpdate, Observations, StereoImage, TrackState
 
@@ -49,9 +50,10 @@ class Tracker:
         self._spans = spans or NoSpans()
         self._stereo = StereoMatcher(config, rig)
         self._shutter = RollingShutter(rig)
-        self._follower = Follower(config, rig, self._shutter)
+        area = VisibleArea(rig.left, config.max_angle_deg)
+        self._follower = Follower(config, rig, area, self._shutter)
         self._solver = FramePoseSolver(config, StereoCameras.of(rig), self._shutter)
-        self._new_points = NewPoints(config, rig, self._stereo, self._follower, self._shutter)
+        self._new_points = NewPoints(config, area, self._stereo, self._follower, self._shutter)
         self._place_corners = place_corners
         self._inertial = InertialMotion(rig.imu) if rig.imu is not None and config.inertial else None
         self._tracks = Tracks()
