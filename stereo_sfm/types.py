@@ -212,6 +212,18 @@ class CalibrationUpdate(Message):
 
 
 @dataclass(frozen=True, eq=False)
+class RowErrors(Message):
+    """How well the rig fits what is seen, after a keyframe; averages over the last ones."""
+
+    kf_id: int
+    stamp_ns: int
+    region_px: F64  # (12,) signed distance from the epipolar curve by region, 3 rows of 4; NaN where nothing was seen
+    systematic_px: float  # root mean square over the regions
+    trend_px: float  # how much that has grown of late
+    warning: bool  # matches will be lost if it goes on
+
+
+@dataclass(frozen=True, eq=False)
 class MapUpdate(Message):
     """The mapper's answer to one keyframe (exactly one each, possibly 'nothing')."""
 
@@ -232,6 +244,7 @@ class MapUpdate(Message):
         default_factory=lambda: np.zeros(0, np.int64)
     )  # (L,) whose accepted loop the map refused
     calibration: CalibrationUpdate | None = None  # the rig from this update on, where that changes
+    row_errors: RowErrors | None = None  # of a camera with two eyes
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,9 +32,28 @@ def calibration_stats(record: RunRecord) -> list[dict[str, Any]]:
     ]
 
 
+def row_error_stats(record: RunRecord) -> dict[str, Any] | None:
+    """The last word about rows, and the worst; None where no two eyes were mapped."""
+    last = record.row_errors
+    if last is None:
+        return None
+    regions = [None if np.isnan(v) else round(float(v), 3) for v in last.region_px]
+    return {
+        "region_px": regions,
+        "systematic_px": last.systematic_px,
+        "trend_px": last.trend_px,
+        "worst_px": record.worst_rows_px,
+        "warning": last.warning,
+    }
+
+
 def calibration_lines(stats: dict[str, Any]) -> list[str]:
-    """A line for each change."""
-    return [
+    """A line for each change, and one about the rows."""
+    rows = stats["row_errors"]
+    off = [] if rows is None else [f"rows off by {rows['systematic_px']:.2f} px (worst {rows['worst_px']:.2f} px)"]
+    if rows is not None and rows["warning"]:
+        off[0] += ": the rig is not what its calibration says (stereo-sfm check-calib)"
+    return off + [
         f"rig {'corrected' if c['applied'] else 'seems wrong'} at {c['seconds']:.1f} s ({c['why']}): {c['text']}"
         for c in stats["calibration"]
     ]

@@ -29,6 +29,7 @@ from stereo_sfm.types import (
     Keyframe,
     LoopResult,
     MapUpdate,
+    RowErrors,
     TrackState,
     Trajectory,
 )
@@ -75,6 +76,8 @@ class RunRecord:
     seen_points: Bool = field(default_factory=lambda: np.zeros(1024, bool))  # by id: whether a keyframe had it
     closed: list[LoopResult] = field(default_factory=list[LoopResult])  # as the loop closer said
     refused_kf_ids: set[int] = field(default_factory=set[int])  # of loops that the mapper did not believe
+    row_errors: RowErrors | None = None  # the last
+    worst_rows_px: float = 0.0  # systematic part of the row error at its worst
     calibrations: list[CalibrationUpdate] = field(default_factory=list[CalibrationUpdate])  # changes of the rig
     rejections: dict[str, int] = field(default_factory=dict[str, int])
     _path_m: float = 0.0
@@ -140,6 +143,9 @@ class RunRecord:
         self.map_T_kf.update(update)
         if update.calibration is not None:
             self.calibrations.append(update.calibration)
+        if update.row_errors is not None:
+            self.row_errors = update.row_errors
+            self.worst_rows_px = max(self.worst_rows_px, update.row_errors.systematic_px)
         self.refused_kf_ids.update(update.refused_kf_ids.tolist())
         self.map_points.update(update.point_ids.tolist())
         self.map_points.difference_update(update.culled_point_ids.tolist(), update.fused_point_ids[:, 0].tolist())

@@ -30,6 +30,7 @@ class Events:
         self._first_ns: int | None = None
         self._told = (TrackState.OK, "")
         self._map_T_odom: F64 = np.eye(4)
+        self._rows_warned = False
 
     @singledispatchmethod
     def of(self, message: object) -> LogLine | None:
@@ -75,6 +76,12 @@ class Events:
             said = "corrected" if update.calibration.applied else "seems wrong"
             where = f"at keyframe {update.kf_id} ({update.calibration.why})"
             return LogLine("mapper", "WARNING", f"rig {said} {where}: {update.calibration.text}")
+        if update.row_errors is not None and update.row_errors.warning != self._rows_warned:
+            self._rows_warned = update.row_errors.warning
+            rows = f"{update.row_errors.systematic_px:.2f} px off their rows at keyframe {update.kf_id}"
+            if self._rows_warned:
+                return LogLine("mapper", "WARNING", f"matches are {rows}: the rig is not what its calibration says")
+            return LogLine("mapper", "INFO", f"matches are {rows}: the rig fits again")
         moved = se3.log(se3.inverse(self._map_T_odom) @ update.map_T_odom)
         metres, radians = float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:]))
         if metres < JUMP[0] and radians < JUMP[1]:

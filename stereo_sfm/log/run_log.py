@@ -252,6 +252,8 @@ class RunLog:
                 self._writer.write(topic, answer, *stamps)
                 if isinstance(answer, MapUpdate) and answer.calibration is not None:
                     self._writer.write(topics.CALIBRATION, answer.calibration, *stamps)
+                if isinstance(answer, MapUpdate) and answer.row_errors is not None:
+                    self._writer.write(topics.ROW_ERRORS, answer.row_errors, *stamps)
 
     def _release_updates(self, everything: bool = False) -> None:
         while self._updates:

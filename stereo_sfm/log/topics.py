@@ -14,7 +14,7 @@ from stereo_sfm.log.samples import ImageInfo, ImuSample, WheelSample
 from stereo_sfm.log.schema import full_name
 from stereo_sfm.log.track_stats import TrackStats
 from stereo_sfm.messages import Health, SourceCounters, StageTimes
-from stereo_sfm.types import Applied, CalibrationUpdate, Dropped, Frame, Keyframe, LoopResult, MapUpdate
+from stereo_sfm.types import Applied, CalibrationUpdate, Dropped, Frame, Keyframe, LoopResult, MapUpdate, RowErrors
 
 SCHEMA_VERSION = "1"
 
@@ -40,6 +40,7 @@ FEATURES = "/cam0/features"
 KEYFRAME = "/keyframe"
 MAP_UPDATE = "/map/update"
 CALIBRATION = "/calibration"
+ROW_ERRORS = "/calibration/row_errors"
 LOOP = "/loop"
 POINTS = "/map/points"
 TRAJECTORY = "/map/trajectory"
@@ -105,6 +106,7 @@ TABLE: tuple[Topic, ...] = (
     Topic(KEYFRAME, Keyframe, "every keyframe"),
     Topic(MAP_UPDATE, MapUpdate, "every keyframe: the mapper's answer"),
     Topic(CALIBRATION, CalibrationUpdate, "when the rig corrects itself, or would"),
+    Topic(ROW_ERRORS, RowErrors, "every keyframe of two eyes: how well the rig fits, by region, and the trend"),
     Topic(LOOP, LoopResult, "every keyframe: the loop closer's answer, with reasons"),
     Topic(POINTS, "foxglove.PointCloud", "the whole map, at most every few seconds and at the end"),
     Topic(TRAJECTORY, "foxglove.PosesInFrame", "all keyframes, at most every second and at the end"),

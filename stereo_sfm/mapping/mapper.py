@@ -42,10 +42,11 @@ from stereo_sfm.mapping.correction import apply_loop, fuse_pairs, loop_is_known
 from stereo_sfm.mapping.insertion import insert_keyframe
 from stereo_sfm.mapping.map import Map, MapSnapshot
 from stereo_sfm.mapping.recalibration import recalibrate
+from stereo_sfm.mapping.row_errors import RowMonitor
 from stereo_sfm.mapping.self_calibration import Revision, SelfCalibration
 from stereo_sfm.mapping.triangulate import triangulate
 from stereo_sfm.timing import NoSpans
-from stereo_sfm.types import F64, I64, Bool, CalibrationUpdate, Keyframe, LoopResult, MapUpdate
+from stereo_sfm.types import F64, I64, Bool, CalibrationUpdate, Keyframe, LoopResult, MapUpdate, RowErrors
 
 YOUNG = 4  # observations up to which a point is triangulated anew before it is adjusted
 FIRST_WHOLE = 8  # keyframes beyond which full bundle adjustments begin
@@ -87,6 +88,8 @@ class Mapper:
         self._config, self._rig, self._spans = config, rig, spans or NoSpans()
         self._source_rig, self._calibration = rig, calibration
         self._revised: CalibrationUpdate | None = None  # for the next update
+        self._rows = RowMonitor(rig) if rig.stereo and not rig.depth else None
+        self._row_errors: RowErrors | None = None  # for the next update
         self._loop_config = loop_config or LoopConfig()
         self.map = Map()
         self._map_T_odom: F64 = np.eye(4)
@@ -125,6 +128,8 @@ class Mapper:
         if self._calibration is not None:
             with self._spans.span("calibrate"):
                 self._revise(self._calibration.add(keyframe))
+        if self._rows is not None:
+            self._row_errors = self._rows.add(keyframe)
         with self._spans.span("local_ba"):
             self._adjust(row)
         with self._spans.span("cull"):
@@ -169,6 +174,7 @@ class Mapper:
         refused = np.array(self._refused, np.int64)
         self._culled, self._fused, self._refused = [], [], []
         revised, self._revised = self._revised, None
+        row_errors, self._row_errors = self._row_errors, None
         return MapUpdate(
             version=self._version,
             kf_id=kf_id,
@@ -184,6 +190,7 @@ class Mapper:
             carrier_T_kf=delta.carrier_T_kf,
             refused_kf_ids=refused,
             calibration=revised,
+            row_errors=row_errors,
         )
 
     # -- calibration -------------------------------------------------------------------------------------------------
@@ -208,6 +215,8 @@ class Mapper:
             before, self._rig = self._rig, with_terms(self._source_rig, revision.terms)
             recalibrate(self.map, before, self._rig, self.map.kf_row(revision.since_kf_id))
             self._order_full_bundle()
+            if self._rows is not None:
+                self._rows.use(self._rig)
 
     # -- loops -------------------------------------------------------------------------------------------------------
 

@@ -13,6 +13,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config, MapperConfig, SelfCalibrationConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.mapper import Mapper
+from stereo_sfm.mapping.row_errors import RowMonitor
 from stereo_sfm.mapping.self_calibration import Revision, SelfCalibration
 from stereo_sfm.types import Keyframe
 from tests.synthetic import fisheye_rig, pinhole_rig, points_around, walk
@@ -106,6 +107,23 @@ def test_who_is_corrected(mode: str) -> None:
     assert (SelfCalibration.wanted(config, stereo) is None) == (mode == "off")
     assert SelfCalibration.wanted(config, mono) is None
     assert SelfCalibration.wanted(config, replace(stereo, depth=True)) is None
+
+
+@pytest.mark.parametrize("degrees", [(0.2, 0.0, 0.0), (0.0, 0.0, 0.2)])
+def test_the_monitor_sees_rows_that_are_off(degrees: tuple[float, float, float]) -> None:
+    """A turn about x moves all rows by the focal length times it; one about z moves the sides apart."""
+    true = RIGS["pinhole"]
+    monitor = RowMonitor(turned(true, degrees))
+    seen = [monitor.add(k) for k in keyframes([true] * 6 + [true] * 6, true, 0)]
+    regions = seen[-1].region_px.reshape(3, 4)
+    angle = np.deg2rad(0.2)
+    if degrees[0]:
+        np.testing.assert_allclose(np.abs(regions[1]), true.left.fx * angle, rtol=0.15)
+        assert seen[-1].warning
+    else:
+        assert np.sign(regions[1, 0]) == -np.sign(regions[1, -1]) and np.abs(regions[1, [0, -1]]).min() > 0.4
+    monitor.use(true)
+    assert monitor.add(next(keyframes([true], true, 1))).systematic_px < 0.15
 
 
 @pytest.mark.parametrize("mode", [True, False])

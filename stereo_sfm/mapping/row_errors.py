@@ -1,0 +1,69 @@
+"""How well the rig fits what is seen, live: how far matches are from their epipolar curves, by region, and the trend.
+
+Noise has no side, so the median of a region is what the calibration is wrong by there. A slow and a fast average over
+the keyframes tell whether it grows. Disparity does not show in it (`mapping.self_calibration` sees that too).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.geometry.stereo import epipolar_angle
+from stereo_sfm.types import F64, Keyframe, RowErrors
+
+GRID = (3, 4)  # rows and columns of regions
+FAST, SLOW = 0.2, 0.04  # share of the newest keyframe in the averages
+LEAST = 5  # matches of a region
+WARN_PX = 0.5  # of the systematic part: from 1 px on matches are lost
+
+
+class RowMonitor:
+    """Takes the keyframes of a run in order."""
+
+    def __init__(self, rig: Rig) -> None:
+        """`rig`: two cameras."""
+        self.use(rig)
+
+    def use(self, rig: Rig) -> None:
+        """From now on with this rig: what was seen with another is forgotten."""
+        self._rig = rig
+        self._fast: F64 = np.full(GRID, np.nan)
+        self._slow: F64 = np.full(GRID, np.nan)
+
+    def add(self, keyframe: Keyframe) -> RowErrors:
+        """What is known after this keyframe."""
+        now = self._regions(keyframe)
+        self._fast, self._slow = _averaged(self._fast, now, FAST), _averaged(self._slow, now, SLOW)
+        systematic, before = _size(self._fast), _size(self._slow)
+        return RowErrors(
+            keyframe.kf_id, keyframe.stamp_ns, self._fast.ravel().copy(), systematic, systematic - before,
+            systematic > WARN_PX,
+        )  # fmt: skip
+
+    def _regions(self, keyframe: Keyframe) -> F64:
+        """Median row error of one keyframe by region, NaN where it has few matches."""
+        assert self._rig.right is not None
+        seen = np.isfinite(keyframe.uv_left).all(1) & np.isfinite(keyframe.uv_right).all(1)
+        uv = keyframe.uv_left[seen]
+        bearings = self._rig.left.unproject(uv), self._rig.right.unproject(keyframe.uv_right[seen])
+        error = self._rig.left.fx * epipolar_angle(*bearings, self._rig.left_T_right)
+        cell = np.clip((uv * GRID[::-1] / self._rig.left.size).astype(int), 0, np.array(GRID[::-1]) - 1)
+        region = np.where(np.isfinite(error), cell[:, 1] * GRID[1] + cell[:, 0], -1)
+        out = np.full(GRID[0] * GRID[1], np.nan)
+        for k in range(len(out)):
+            here = error[region == k]
+            if len(here) >= LEAST:
+                out[k] = np.median(here)
+        return out.reshape(GRID)
+
+
+def _averaged(before: F64, now: F64, share: float) -> F64:
+    mixed = np.where(np.isnan(before), now, (1 - share) * before + share * now)
+    return np.where(np.isnan(now), before, mixed)
+
+
+def _size(regions: F64) -> float:
+    """Root mean square over the regions that were seen; 0 where none was."""
+    known = regions[np.isfinite(regions)]
+    return float(np.sqrt((known**2).mean())) if len(known) else 0.0
