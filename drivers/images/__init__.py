@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 class ImagesOptions(SourceOptions):
     """Options of `images:FOLDER`."""
 
-    fps: float = option(30.0, "frames a second, where neither names nor times.txt tell the stamps", low=1e-3, high=1e5)
+    fps: float | None = option(
+        None, "frames a second, where neither names nor times.txt tell the stamps (30)", low=1e-3, high=1e5
+    )
 
 
 def _open(place: str, options: ImagesOptions) -> Source:

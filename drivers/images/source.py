@@ -6,6 +6,7 @@ the frame rate given and the numbers in the file names.
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,7 +28,10 @@ from stereo_sfm.errors import StereoSfmError
 if TYPE_CHECKING:
     from stereo_sfm.drivers.images import ImagesOptions
 
-# folder names of the two eyes; the first two are also file name prefixes in one folder
+log = logging.getLogger("stereo_sfm")
+
+ASSUMED_FPS = 30.0
+# folder names of the two cameras; the first two are also file name prefixes in one folder
 PAIRS = (("left", "right"), ("cam0", "cam1"), ("image_0", "image_1"), ("image_2", "image_3"), ("infra1", "infra2"))
 RIG_NAMES = ("rig", "calibration", "calib", "camchain", "stereo", "intrinsics")
 RIG_SUFFIXES = (".yaml", ".yml", ".json", ".txt")
@@ -96,7 +100,7 @@ def _own_rig(folder: Path) -> Rig:
     return load_rig(path)
 
 
-def _stamps(name: str, folder: Path, files: list[Path], fps: float) -> dict[Path, int]:
+def _stamps(name: str, folder: Path, files: list[Path], fps: float | None) -> dict[Path, int]:
     """Nanoseconds of the left images."""
     times = folder / "times.txt"
     if times.is_file():
@@ -108,6 +112,9 @@ def _stamps(name: str, folder: Path, files: list[Path], fps: float) -> dict[Path
     named = {p: stamp_of(p) for p in files}
     if None not in named.values():
         return {p: s or 0 for p, s in named.items()}
+    if fps is None:
+        fps = ASSUMED_FPS
+        log.warning("%s: neither names nor times.txt tell the stamps: %g images a second assumed (?fps=N)", name, fps)
     period = 1e9 / fps
     return {p: round(i * period) for p, i in zip(files, frame_numbers(files), strict=True)}
 

@@ -446,3 +446,19 @@ def test_files_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
 def test_a_part_that_cannot_be_is_refused(start: float, duration: float, tmp_path: Path) -> None:
     with open_source(make_kitti(tmp_path)) as source, pytest.raises(StereoSfmError, match="a part of a source"):
         SelectedFrames(source, start, duration)
+
+
+def test_an_assumed_frame_rate_is_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    make_images(tmp_path)
+    for side in ("left", "right"):
+        for k, path in enumerate(sorted((tmp_path / side).iterdir())):
+            path.rename(path.with_name(f"frame_{k:03d}{path.suffix}"))
+    (tmp_path / "times.txt").unlink(missing_ok=True)
+    with caplog.at_level(logging.WARNING, "stereo_sfm"):
+        open_source(f"images:{tmp_path}")
+        assert "30 images a second assumed (?fps=N)" in caplog.text
+        caplog.clear()
+        source = open_source(f"images:{tmp_path}?fps=10")
+    assert not caplog.text
+    stamps = [image.stamp_ns for image in source]
+    assert stamps[1] - stamps[0] == 100_000_000
