@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from stereo_sfm.drivers.source import Source
 
 # what `sim:` can show; the plans are in stereo_sfm.drivers.sim.scenes
-SCENES = ("aisle", "loop", "identical-aisles", "people", "dark", "blank", "demo", "big")
+SCENES = ("aisle", "loop", "identical-aisles", "people", "dark", "blank", "demo", "big", "sparse")
 DEFAULT = "loop"
 
 

@@ -161,7 +161,7 @@ def test_sixteen_bit_images_are_scaled_by_the_range_that_they_use(
         cv2.imwrite(str(path), (image.astype(np.uint16) << shift) + (1 << shift) // 2)
     dark = root / "left" / "0.png"  # the first image alone does not show the range
     cv2.imwrite(str(dark), np.full((48, 64), 3, np.uint16))
-    with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(root) as source:
+    with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(root, fps=30.0) as source:
         images = list(source)
     assert np.array_equal(images[1].left, picture(1, 0))
     assert images[0].right is not None and np.array_equal(images[0].right, picture(0, 1))
@@ -343,7 +343,7 @@ def test_many_unreadable_images_do_not_flood_the_terminal(tmp_path: Path, caplog
     for i in range(1, 12):
         (root / "left" / f"{i}.png").unlink()
         (root / "left" / f"{i}.png").write_bytes(b"x")
-    with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(root) as source:
+    with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(root, fps=30.0) as source:
         assert len(list(source)) == 1
     assert len(caplog.records) == 6 and "11 frames could not be read" in caplog.text
 
