@@ -61,6 +61,7 @@ class TrackState(enum.IntEnum):
     LOST = 3  # pose predicted only; `Frame.reason` says why
     RESTARTED = 4  # tracking began again as a new submap at the predicted pose
     INERTIAL = 5  # the images show nothing: pose from the IMU since the last good one, with its covariance
+    OCCLUDED = 6  # as LOST, while something before the camera covers what it knows
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,6 +19,7 @@ STATES = {
     TrackState.LOST: "lost",
     TrackState.INERTIAL: "going on by the IMU",
     TrackState.RECOVERED: "found again",
+    TrackState.OCCLUDED: "view covered",
     TrackState.RESTARTED: "begins anew in another piece of the map",
 }
 

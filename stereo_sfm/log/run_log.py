@@ -140,7 +140,7 @@ class RunLog:
     def frame(self, frame: Frame) -> None:
         """The tracker's answer."""
         self._totals["frames"] += 1
-        self._totals["lost"] += frame.state == TrackState.LOST
+        self._totals["lost"] += frame.state in (TrackState.LOST, TrackState.OCCLUDED)
         write, stamp, sequence = self._writer.write, frame.stamp_ns, frame.frame_id
         write(topics.FRAME, frame, stamp, sequence)
         write(topics.STATS, track_stats(frame), stamp, sequence)

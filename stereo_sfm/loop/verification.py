@@ -61,7 +61,7 @@ def verify(
     rows_b, rows_a = corners_b[at_b], corners_a[at_a]
     if len(rows_b) < max(config.min_match_fraction * len(corners_b), 4):
         return rejection("too_few_matches", len(rows_b))
-    matches = _pair(view, cloud, rows_b, rows_a)
+    matches = pair(view, cloud, rows_b, rows_a)
     start = ransac_pose(matches, rig, rng, config.sigma_px, config.ransac_iterations)
     if start is None:
         return rejection("no_pose")
@@ -82,7 +82,7 @@ def verify_near(
         rows_b, rows_a = match_guided(b_T_a, view, cloud, rig, config.max_distance_bits, radius)
         if len(rows_b) < 4:
             return rejection("too_few_inliers", len(rows_b))
-        pose = refine_pose(b_T_a, _pair(view, cloud, rows_b, rows_a), rig, config.sigma_px, iterations)
+        pose = refine_pose(b_T_a, pair(view, cloud, rows_b, rows_a), rig, config.sigma_px, iterations)
         b_T_a = pose.b_T_a
     assert pose is not None
     rows_a, rows_b = rows_a[pose.inlier], rows_b[pose.inlier]
@@ -124,7 +124,8 @@ def refine_with_points(
     return se3.inverse(bundle_adjust(rig, bundle).world_T_kf[-1])
 
 
-def _pair(view: PlaceView, cloud: Cloud, rows_b: I64, rows_a: I64) -> Matches:
+def pair(view: PlaceView, cloud: Cloud, rows_b: I64, rows_a: I64) -> Matches:
+    """Rows of the camera's view and of the cloud, one beside the other."""
     left_a, right_a = cloud.seen_by_centre(rows_a)
     return Matches(
         cloud.points[rows_a],

@@ -12,11 +12,18 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.maps.folders import MapFolders, make_mapper, save_result
 from stereo_sfm.messages import LogLine, Sink, StageTimes
 from stereo_sfm.pipeline.schedule import Lockstep, Schedule
-from stereo_sfm.pipeline.stages import LocalMailbox, MapStage, TrackStage, make_closer, sensor_drop, source_counters
+from stereo_sfm.pipeline.stages import (
+    LocalMailbox,
+    MapStage,
+    TrackStage,
+    make_closer,
+    make_tracker_with_places,
+    sensor_drop,
+    source_counters,
+)
 from stereo_sfm.pipeline.text import Listener
 from stereo_sfm.pipeline.threads import limited_threads
 from stereo_sfm.timing import Spans
-from stereo_sfm.tracking.factory import make_tracker
 from stereo_sfm.types import Frame, Keyframe, LoopResult, MapUpdate, StereoImage
 
 log = logging.getLogger("stereo_sfm")
@@ -41,7 +48,7 @@ class InlineRun:
         self._sinks = sinks
         self._updates: LocalMailbox[MapUpdate] = LocalMailbox()
         self._loops: LocalMailbox[LoopResult] = LocalMailbox()
-        tracker = make_tracker(config, source.rig, self._spans, source.ground_truth)
+        tracker = make_tracker_with_places(config, source.rig, self._spans, source.ground_truth)
         schedule = schedule or Lockstep(config.pipeline.update_lag_frames)
         self._track = TrackStage(tracker, schedule, self._updates)
         self._closer = make_closer(config, source.rig, self._spans, self._folders.localize_only)

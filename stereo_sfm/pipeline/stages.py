@@ -17,8 +17,8 @@ from stereo_sfm.mapping.protocol import AnyMapper
 from stereo_sfm.messages import SourceCounters
 from stereo_sfm.pipeline.schedule import Schedule
 from stereo_sfm.timing import NoSpans
-from stereo_sfm.tracking.factory import AnyTracker
-from stereo_sfm.types import Applied, Dropped, Frame, Keyframe, LoopResult, MapUpdate, StereoImage
+from stereo_sfm.tracking.factory import AnyTracker, make_tracker
+from stereo_sfm.types import Applied, Dropped, Frame, Keyframe, LoopResult, MapUpdate, StereoImage, Trajectory
 
 T_co = TypeVar("T_co", covariant=True)
 
@@ -116,6 +116,17 @@ class MapStage:
             return None
         loops = [self._loops.take() for _ in range(self._count - self._taken)] if self._loops is not None else []
         return self.mapper.finish(loops)
+
+
+def make_tracker_with_places(
+    config: Config, rig: Rig, spans: NoSpans | None = None, ground_truth: Trajectory | None = None
+) -> AnyTracker:
+    """The tracker that the configuration names; one that is lost searches its newest keyframes."""
+    if not rig.stereo:
+        return make_tracker(config, rig, spans, ground_truth)
+    from stereo_sfm.loop.recent_places import RecentPlaces
+
+    return make_tracker(config, rig, spans, ground_truth, RecentPlaces(config.loop, rig))
 
 
 def make_closer(

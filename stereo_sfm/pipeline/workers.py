@@ -185,15 +185,14 @@ def run_tracker(
     from stereo_sfm.messages import StageTimes
     from stereo_sfm.pipeline.health import HealthMeter
     from stereo_sfm.pipeline.images import ImageLayout, ImageRing, SlotImage
-    from stereo_sfm.pipeline.stages import TrackStage
+    from stereo_sfm.pipeline.stages import TrackStage, make_tracker_with_places
     from stereo_sfm.timing import Spans
-    from stereo_sfm.tracking.factory import make_tracker
 
     setup = Inbox[Setup](control).take()
     delay = prepare("tracker", setup)
     spans = Spans()
     ring = ImageRing(ImageLayout.of(setup.rig), setup.config.pipeline.ring_slots, setup.ring_name)
-    tracker = make_tracker(setup.config, setup.rig, spans, setup.ground_truth)
+    tracker = make_tracker_with_places(setup.config, setup.rig, spans, setup.ground_truth)
     stage = TrackStage(tracker, _schedule(setup), Inbox[MapUpdate](updates))
     inbox = Inbox[SlotImage | End](images)
     free, keyframes = Outbox(release), (Outbox(to_mapper), Outbox(to_loop))

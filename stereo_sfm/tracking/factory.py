@@ -6,24 +6,29 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.timing import NoSpans
-from stereo_sfm.tracking.protocol import AnyTracker
+from stereo_sfm.tracking.protocol import AnyTracker, Places
 from stereo_sfm.types import Trajectory
 
 __all__ = ["AnyTracker", "make_tracker"]
 
 
 def make_tracker(
-    config: Config, rig: Rig, spans: NoSpans | None = None, ground_truth: Trajectory | None = None
+    config: Config,
+    rig: Rig,
+    spans: NoSpans | None = None,
+    ground_truth: Trajectory | None = None,
+    places: Places | None = None,
 ) -> AnyTracker:
     """The tracker that `config.odometry.method` names.
 
     Args:
         ground_truth: only for `odometry.scale = "ground-truth"`, where the true length of each step is taken from it.
+        places: where the default tracker searches a camera that is lost.
 
     Raises:
         StereoSfmError: an unknown method, or one that this camera cannot serve.
     """
-    tracker = _tracker(config, rig, spans, ground_truth)
+    tracker = _tracker(config, rig, spans, ground_truth, places)
     if not config.manhattan.enabled:
         return tracker
     from stereo_sfm.tracking.manhattan_prior import ManhattanTracker
@@ -31,13 +36,15 @@ def make_tracker(
     return ManhattanTracker(tracker, config.manhattan, rig)
 
 
-def _tracker(config: Config, rig: Rig, spans: NoSpans | None, ground_truth: Trajectory | None) -> AnyTracker:
+def _tracker(
+    config: Config, rig: Rig, spans: NoSpans | None, ground_truth: Trajectory | None, places: Places | None
+) -> AnyTracker:
     method = config.odometry.method
     if method == "flow":
         from stereo_sfm.tracking.flow.place_corners import PlaceCorners
         from stereo_sfm.tracking.flow.tracker import Tracker
 
-        return Tracker(config.tracker, rig, spans, PlaceCorners.wanted(config, rig))
+        return Tracker(config.tracker, rig, spans, PlaceCorners.wanted(config, rig), places)
     from stereo_sfm.tracking.features.estimators import estimator
 
     if not rig.stereo and estimator(method).needs_depth:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Protocol
 
-from stereo_sfm.types import Frame, Keyframe, MapUpdate, StereoImage
+from stereo_sfm.types import F64, Frame, Keyframe, MapUpdate, StereoImage
 
 
 class AnyTracker(Protocol):
@@ -13,3 +14,15 @@ class AnyTracker(Protocol):
     def step(self, image: StereoImage) -> tuple[Frame, Keyframe | None]: ...
 
     def apply(self, update: MapUpdate) -> None: ...
+
+
+class Places(Protocol):
+    """Finds a camera that lost its way in what it saw before."""
+
+    def add(self, keyframe: Keyframe) -> None:
+        """Remember the newest keyframe."""
+        ...
+
+    def find(self, seen: Keyframe, expected: F64) -> Iterator[F64]:
+        """Poses odom_T_cam (4, 4) from which a camera expected at (4, 4) may see this; likely ones first."""
+        ...

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from stereo_sfm.calib.rig import Rig
@@ -16,6 +18,16 @@ from stereo_sfm.tracking.flow.visible_area import VisibleArea
 from stereo_sfm.types import F64, I64
 
 WELL_PREDICTED_PX = 3.0  # median distance of points from where they were expected; below, the half image is enough
+ALIKE = 1.25  # times nearer or further away: the window of a point still looks as it did
+
+
+@dataclass
+class Held:
+    """An image to go on from when all else is lost."""
+
+    pyramid: klt.Pyramid
+    tracks: Tracks
+    pose: F64  # (4, 4) odom_T_cam
 
 
 class Follower:
@@ -25,6 +37,7 @@ class Follower:
         self._config, self._area, self._shutter = config, area, shutter
         self._patches = Patches(2 * config.max_features)
         self._last: klt.Pyramid | None = None
+        self._held: Held | None = None
         self._coarse_rotation = CoarseRotation(rig.left, config.pyramid_levels)
         self._coarsest_level = config.pyramid_levels - 1
         self._first_level = self._coarsest_level  # of the pyramid, from which the search begins
@@ -32,18 +45,48 @@ class Follower:
 
     def follow(self, tracks: Tracks, pyramid: klt.Pyramid, expected: ExpectedMotion) -> Tracks:
         """Tracks that are found in the new left image, moved there."""
-        config = self._config
         assert self._last is not None
         guess = self._shutter.project(expected.pose, expected.velocity, tracks.points(), tracks.uv)
         guess = np.where(np.isfinite(guess), guess, tracks.uv)
+        return self._find(self._last, tracks, pyramid, guess, tracks.warp)
+
+    def hold(self, pyramid: klt.Pyramid, tracks: Tracks, pose: F64) -> None:
+        """Keep an image whose pose (4, 4) is beyond doubt, and its points, to go on from when all else is lost."""
+        self._held = Held(pyramid, tracks, pose)
+
+    def find_again(self, pyramid: klt.Pyramid, expected: ExpectedMotion) -> Tracks:
+        """The points that were held, as far as they are found from another pose, which may be far from that before."""
+        assert self._held is not None
+        guess, nearer = self._from(expected.pose)
+        ahead = np.isfinite(guess[:, 0])
+        tracks, guess, nearer = self._held.tracks.keep(ahead), guess[ahead], nearer[ahead]
+        self.search_widely()
+        return self._find(self._held.pyramid, tracks, pyramid, guess, tracks.warp * nearer[:, None, None])
+
+    def expected_again(self, pose: F64) -> int:
+        """How many of the points that were held should be found from a pose (4, 4): those that look as they did."""
+        guess, nearer = self._from(pose)
+        alike = (nearer < ALIKE) & (nearer > 1 / ALIKE)
+        return int((alike & self._area.inside(guess)).sum())
+
+    def _from(self, pose: F64) -> tuple[F64, F64]:
+        """Pixels (N, 2) of the points that were held, NaN behind the camera; how many times nearer (N,) they are."""
+        assert self._held is not None
+        tracks, points = self._held.tracks, self._held.tracks.points()
+        uv = self._shutter.project(pose, np.zeros(6), points, tracks.uv)
+        before, now = (np.linalg.norm(points - at, axis=1) for at in (self._held.pose[:3, 3], pose[:3, 3]))
+        return uv, before / np.maximum(now, 1e-6)
+
+    def _find(self, last: klt.Pyramid, tracks: Tracks, pyramid: klt.Pyramid, guess: F64, warp: F64) -> Tracks:
+        """Points of an image where they are in another, from guesses (N, 2) px and deformations (N, 2, 2)."""
+        config = self._config
         uv = guess.copy()
         status, _ = klt.track_translation(
-            self._last, pyramid, tracks.uv, uv, self._first_level, 0, 10, config.min_contrast, config.min_ncc,
-            klt.WEIGHTS,
-        )  # fmt: skip
+            last, pyramid, tracks.uv, uv, self._first_level, 0, 10, config.min_contrast, config.min_ncc, klt.WEIGHTS
+        )
         found = status == klt.TRACKED
         self._miss_px = float(np.median(np.linalg.norm(uv - guess, axis=1)[found])) if found.any() else np.inf
-        warp = tracks.warp.copy()
+        warp = warp.copy()
         ncc = klt.track_affine(
             pyramid[0], uv, warp, tracks.slot, found, self._patches.patch, self._patches.gradients,
             self._patches.inverse_normal, self._patches.contrast, 6, klt.WEIGHTS, klt.COORDINATES,
@@ -70,7 +113,7 @@ class Follower:
         """Follow the next image from this one; what other points looked like is forgotten."""
         self._last = pyramid
         self._first_level = 1 if self._miss_px < WELL_PREDICTED_PX else self._coarsest_level
-        self._patches.keep_only(tracks.slot)
+        self.keep_only(tracks)
 
     def begin(self, pyramid: klt.Pyramid, uv: F64) -> tuple[I64, I64]:
         """Remember how new points (N, 2) px look: rows (M,) of those with texture that found a place, their slots."""
@@ -83,5 +126,6 @@ class Follower:
         return np.flatnonzero(textured), slots[textured]
 
     def keep_only(self, tracks: Tracks) -> None:
-        """Drop the first appearances of all other points."""
-        self._patches.keep_only(tracks.slot)
+        """Drop the first appearances of all other points, but for those that are held."""
+        held = tracks.slot if self._held is None else self._held.tracks.slot
+        self._patches.keep_only(np.concatenate([tracks.slot, held]))

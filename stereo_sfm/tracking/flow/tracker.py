@@ -8,6 +8,8 @@ whole image for the loop closer.
 
 from __future__ import annotations
 
+from itertools import chain
+
 import numpy as np
 
 from stereo_sfm.calib.choice import with_terms
@@ -23,17 +25,28 @@ from stereo_sfm.tracking.flow.map_points import take_update
 from stereo_sfm.tracking.flow.new_points import NewPoints
 from stereo_sfm.tracking.flow.place_corners import PlaceCorners
 from stereo_sfm.tracking.flow.pyramids import StereoPyramids
+from stereo_sfm.tracking.flow.recovery import SURE_SHARE, Recovery, alike
 from stereo_sfm.tracking.flow.rig_change import place_anew
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.stereo import StereoMatcher
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.tracking.flow.tracks import Tracks
+from stereo_sfm.tracking.flow.trusted_motion import Expectation
 from stereo_sfm.tracking.flow.visible_area import VisibleArea
 from stereo_sfm.tracking.inertial.inertial_motion import InertialMotion
+from stereo_sfm.tracking.protocol import Places
 from stereo_sfm.types import F64, Bool, Corners, Frame, Keyframe, MapUpdate, Observations, StereoImage, TrackState
 
 DARK = 30  # grey level; an image without a brighter pixel shows nothing
+NOT_FOUND = (
+    Tracks(),
+    PoseSolution(np.eye(4), np.zeros(6), np.eye(6), np.zeros(0), 0.0, 0.0, "not_found"),
+)
 MAX_MISSES = 3  # successive frames after which a point that disagrees is given up
+TRUSTED_SHARE = 0.8  # of the points that are followed: a pose that so many agree with is beyond doubt ...
+TRUSTED_LEFT = 0.5  # ... if so many of the newest keyframe's points are left
+SAME_START = 0.05, 0.01  # metres, radians between poses from which the same is found
+LOOKS = 2
 FIRST_COVARIANCE = np.eye(6) * 1e-12  # of the first pose, which is the odometry frame
 UNKNOWN_COVARIANCE = np.eye(6)
 
@@ -42,9 +55,17 @@ class Tracker:
     """One `step` per image. Frame poses are odom_T_cam; the odometry frame is the first camera."""
 
     def __init__(
-        self, config: TrackerConfig, rig: Rig, spans: NoSpans | None = None, place_corners: PlaceCorners | None = None
+        self,
+        config: TrackerConfig,
+        rig: Rig,
+        spans: NoSpans | None = None,
+        place_corners: PlaceCorners | None = None,
+        places: Places | None = None,
     ) -> None:
-        """`place_corners`: what keyframes are recognised by; None: by nothing."""
+        """Args:
+        place_corners: what keyframes are recognised by; None: by nothing.
+        places: where a camera that is lost is searched; None: nowhere.
+        """
         self._config, self._rig = config, rig
         self._rig_terms: F64 = np.zeros(6)  # of the correction in force
         self._spans = spans or NoSpans()
@@ -56,13 +77,14 @@ class Tracker:
         self._new_points = NewPoints(config, area, self._stereo, self._follower, self._shutter)
         self._place_corners = place_corners
         self._inertial = InertialMotion(rig.imu) if rig.imu is not None and config.inertial else None
+        self._recovery = Recovery(place_corners, places, rig.left.size)
         self._tracks = Tracks()
         self._state = TrackState.INITIALIZING
         self._pose: F64 = np.eye(4)
         self._velocity: F64 = np.zeros(6)  # tangent per second
         self._stamp_ns = 0
         self._lost = 0  # successive frames
-        self._searched = 0  # of these, in which there was something to see, or nothing to go on by
+        self._searched = 0  # of these, the last ones that showed enough to search in
         self._bridging = False  # tracking begins again where the IMU says, in the same submap
         self._submap_id = 0
         self._next_kf_id = 0
@@ -90,23 +112,30 @@ class Tracker:
         if self._state == TrackState.INITIALIZING:
             return self._begin(image, images)
         expected = self._predict(image.stamp_ns)
-        tracks, solution = self._track(images, expected)
-        if not solution.good(self._config, len(self._tracks)):
-            turned = self._follower.turned(images.left, expected, self._pose)
-            tracks, solution = max((tracks, solution), self._track(images, turned), key=lambda found: found[1].inliers)
+        blind = self._lost and self._inertial is None
+        tracks, solution = NOT_FOUND if blind else self._follow(images, expected)
+        if solution.reason:
+            tracks, solution = self._search(image, images)
         self.solution = solution
         if solution.reason:
-            return self._lose(image, expected.pose, solution.reason)
+            return self._lose(image, solution.reason)
         self._solver.learn(solution)
         self._solver.refine_depth(tracks, solution)
         state = TrackState.OK if self._lost == 0 else TrackState.RECOVERED
         stats = _stats(tracks, solution)
+        trusted = solution.inliers >= max(TRUSTED_SHARE * len(tracks), TRUSTED_LEFT * self._kf_points)
+        if trusted:
+            self._recovery.motion.add(image.stamp_ns, solution.pose)
+            self._follower.hold(images.left, tracks.keep(solution.inlier), solution.pose)
+        again = bool(self._lost)
         inlier = self._accept(image, images, tracks, solution, expected.seconds)
         keyframe = None
-        if self._wants_keyframe():
+        if again or self._wants_keyframe():
             with self._spans.span("keyframe"):
                 inlier = self._add_points(images, inlier)
                 keyframe = self._make_keyframe(image, images)
+            if trusted:
+                self._recovery.remember(keyframe)
         return self._frame(image, state, solution.covariance, inlier, keyframe, stats), keyframe
 
     def _use(self, rig: Rig) -> None:
@@ -133,6 +162,14 @@ class Tracker:
             moved = se3.log(se3.inverse(self._pose) @ pose)
         return ExpectedMotion(pose, moved, seconds)
 
+    def _follow(self, images: StereoPyramids, expected: ExpectedMotion) -> tuple[Tracks, PoseSolution]:
+        """The points of the last image, from where they are expected, or as the whole image turned."""
+        tracks, solution = self._track(images, expected)
+        if solution.good(self._config, len(self._tracks)):
+            return tracks, solution
+        turned = self._follower.turned(images.left, expected, self._pose)
+        return max((tracks, solution), self._track(images, turned), key=lambda found: found[1].inliers)
+
     def _track(self, images: StereoPyramids, expected: ExpectedMotion) -> tuple[Tracks, PoseSolution]:
         """Follow all points from where they are expected, match them in the right image and solve for the pose."""
         with self._spans.span("flow"):
@@ -150,6 +187,8 @@ class Tracker:
             mean = se3.log(se3.inverse(self._pose) @ solution.pose) / seconds
             self._shutter.learn(mean, seconds)
             self._velocity = solution.velocity if self._shutter.active else mean
+        if self._lost:
+            self._velocity = self._recovery.motion.velocity()
         inlier = solution.inlier
         tracks.misses = np.where(inlier, 0, tracks.misses + 1).astype(np.int32)
         tracks.age = tracks.age + np.int32(1)
@@ -180,9 +219,13 @@ class Tracker:
             self._state = TrackState.INITIALIZING
             never = self._submap_id == 0 and self._next_kf_id == 0
             state = TrackState.INITIALIZING if never else TrackState.LOST
-            return self._without_pose(image, self._pose, state, "too_few_points", bridge), None
+            state, covariance = (state, UNKNOWN_COVARIANCE) if bridge is None else (TrackState.INERTIAL, bridge[1])
+            return self._without_pose(image, self._pose, state, "too_few_points", covariance), None
         first = self._next_kf_id == 0
         keyframe = self._make_keyframe(image, images)
+        self._recovery.motion.add(image.stamp_ns, self._pose)
+        self._recovery.remember(keyframe)
+        self._follower.hold(images.left, self._tracks, self._pose)
         state = TrackState.OK if first else TrackState.RECOVERED if self._bridging else TrackState.RESTARTED
         covariance = FIRST_COVARIANCE if bridge is None else bridge[1]
         self._bridging = False
@@ -200,19 +243,62 @@ class Tracker:
         assert covariance is not None
         return self._inertial.predict(stamp_ns, self._pose), covariance
 
-    def _lose(self, image: StereoImage, predicted: F64, reason: str) -> tuple[Frame, None]:
-        """Keep the last good frame's tracks and predict; after a while begin a new submap."""
+    def _expect(self, stamp_ns: int) -> Expectation:
+        """Where a camera that is lost may be: by the IMU, else as it moved when that could be trusted."""
+        bridge = self._bridge(stamp_ns)
+        return self._recovery.motion.expect(stamp_ns) if bridge is None else Expectation.of(*bridge)
+
+    def _search(self, image: StereoImage, images: StereoPyramids) -> tuple[Tracks, PoseSolution]:
+        """A camera that is lost: the points of the last trusted image, from wherever it may be now."""
+        expected = self._expect(image.stamp_ns)
+        seconds = (image.stamp_ns - self._stamp_ns) * 1e-9
+        tried: list[F64] = []
+        found: list[tuple[Tracks, PoseSolution]] = []
+        for pose in chain([expected.odom_T_cam], self._recovery.search(image, images, expected)):
+            if not any(alike(pose, other, *SAME_START) for other in tried):
+                tried.append(pose)
+                tracks, solution = self._look_from(pose, images, seconds)
+                visible = self._follower.expected_again(solution.pose)
+                if self._recovery.possible(expected, solution, visible):
+                    found.append((tracks, solution))
+                    if solution.inliers >= SURE_SHARE * visible:
+                        break
+        return self._recovery.best(found) or NOT_FOUND
+
+    def _look_from(self, pose: F64, images: StereoPyramids, seconds: float) -> tuple[Tracks, PoseSolution]:
+        """The points of the last trusted image from a pose (4, 4) that is nearly right, with a second look."""
+        tracks, solution = NOT_FOUND
+        for _ in range(LOOKS):
+            motion = ExpectedMotion(pose, se3.log(se3.inverse(self._pose) @ pose), seconds)
+            tracks = self._follower.find_again(images.left, motion)
+            tracks.uv_right = self._stereo.follow(images.left, images.right, tracks.uv, tracks.points(), pose)
+            solution = self._solver.solve(tracks, motion, pose)
+            if solution.reason:
+                break
+            pose = solution.pose
+        return tracks, solution
+
+    def _lose(self, image: StereoImage, reason: str) -> tuple[Frame, None]:
+        """Predict; after a while of free view begin a new submap."""
+        expected = self._expect(image.stamp_ns)
         self._lost += 1
         self._follower.search_widely()
         bridge = self._bridge(image.stamp_ns)
-        self._searched += bridge is None or image.left.max() >= DARK
+        seen = bridge is None or image.left.max() >= DARK
+        self._searched = self._searched + seen if self._recovery.free else 0
         if self._searched > self._config.lost_frames:
-            self._pose = predicted
+            self._pose = expected.odom_T_cam
             self._velocity = np.zeros(6)
             self._bridging = bridge is not None
             self._submap_id += not self._bridging
             self._state = TrackState.INITIALIZING
-        return self._without_pose(image, predicted, TrackState.LOST, reason, bridge), None
+            if not self._bridging:
+                self._recovery.motion.forget()
+        covered = not self._recovery.free and image.left.max() >= DARK
+        state = TrackState.OCCLUDED if covered else TrackState.LOST
+        state = state if bridge is None else TrackState.INERTIAL
+        covariance = expected.covariance if bridge is None else bridge[1]
+        return self._without_pose(image, expected.odom_T_cam, state, reason, covariance), None
 
     def _add_points(self, images: StereoPyramids, inlier: Bool) -> Bool:
         """New points behind those that are followed, of which `inlier` (N,) agree; the new ones do."""
@@ -287,15 +373,15 @@ class Tracker:
         predicted: F64,
         state: TrackState,
         reason: str,
-        bridge: tuple[F64, F64] | None = None,
+        covariance: F64 = UNKNOWN_COVARIANCE,
     ) -> Frame:
         """A frame whose image gives no pose: predicted only, or by the IMU."""
         return Frame(
             frame_id=image.frame_id,
             stamp_ns=image.stamp_ns,
             odom_T_cam=predicted.copy(),
-            covariance=UNKNOWN_COVARIANCE.copy() if bridge is None else bridge[1],
-            state=state if bridge is None else TrackState.INERTIAL,
+            covariance=covariance.copy(),
+            state=state,
             reason="dark" if image.left.max() < DARK else reason,
             observations=Observations.empty(),
             reference_kf_id=self._next_kf_id - 1,

@@ -1,0 +1,105 @@
+"""A covered lens: prediction while nothing is seen, and the way back into the same odometry."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+import pytest
+
+from stereo_sfm.config import Config
+from stereo_sfm.drivers.sim.options import SimOptions
+from stereo_sfm.drivers.sim.scenes import SCENES
+from stereo_sfm.drivers.sim.source import SimSource
+from stereo_sfm.drivers.sim.world import Layout
+from stereo_sfm.geometry import se3
+from stereo_sfm.pipeline.stages import make_tracker_with_places
+from stereo_sfm.tracking.flow.recovery import Recovery
+from stereo_sfm.tracking.flow.trusted_motion import TrustedMotion
+from stereo_sfm.types import F64, Frame, StereoImage, TrackState
+
+RATE, BEGIN, COVERED, FREE = 15, 60, range(72, 82), range(82, 90)  # frames: 0.67 s without sight
+
+
+@cache
+def drive() -> SimSource:
+    scene = dataclasses.replace(SCENES["aisle"], layout=Layout(gondolas=2, gondola_length=6.0, products=40))
+    return SimSource("aisle", scene, SimOptions(size=(424, 400), rate=RATE, speed=0.8))
+
+
+@cache
+def seen(frame_id: int) -> StereoImage:
+    return drive().frame(frame_id)
+
+
+def covered(frame_id: int) -> StereoImage:
+    """A cloth before both lenses."""
+    rng = np.random.default_rng(frame_id)
+    left, right = (rng.normal(90, 2, (400, 424)).astype(np.uint8) for _ in range(2))
+    return StereoImage(frame_id, drive().stamp_ns(frame_id), left, right)
+
+
+def tracked(images: Sequence[StereoImage]) -> list[Frame]:
+    tracker = make_tracker_with_places(Config(), drive().rig)
+    return [tracker.step(image)[0] for image in images]
+
+
+def error(a: Frame, b: Frame) -> tuple[float, float]:
+    """Metres and degrees by which the motion between two frames is wrong."""
+    true = se3.inverse(drive().pose(a.frame_id)) @ drive().pose(b.frame_id)
+    metres, radians = se3.extent(se3.inverse(true) @ se3.inverse(a.odom_T_cam) @ b.odom_T_cam)
+    return float(metres), float(np.rad2deg(radians))
+
+
+def test_a_covered_camera_is_found_again_at_first_sight() -> None:
+    images = [seen(k) for k in range(BEGIN, COVERED.start)] + [covered(k) for k in COVERED] + [seen(k) for k in FREE]
+    frames = {frame.frame_id: frame for frame in tracked(images)}
+    states = [frames[k].state for k in COVERED]
+    assert states == [TrackState.OCCLUDED] * len(COVERED)
+    sigmas = [float(np.sqrt(np.trace(frames[k].covariance[:3, :3]))) for k in COVERED]
+    assert sigmas == sorted(sigmas)
+    last = frames[COVERED[-1]]
+    metres, _ = error(frames[COVERED.start - 1], last)
+    assert metres < 0.15
+    assert metres < 3 * sigmas[-1]
+    again = [k for k in FREE if frames[k].state == TrackState.RECOVERED]
+    assert again
+    assert again[0] <= FREE.start + 2
+    metres, degrees = error(frames[COVERED.start - 1], frames[again[0]])
+    assert metres < 0.03
+    assert degrees < 0.3
+    assert frames[FREE[-1]].state == TrackState.OK
+
+
+def test_a_camera_that_comes_back_elsewhere_is_not_found() -> None:
+    turned = se3.exp(np.array([0, 0, 0, 0, np.pi, 0]))  # in one frame: no robot does that
+    elsewhere = [drive().picture(drive().pose(k) @ turned, k) for k in FREE]
+    images = [seen(k) for k in range(BEGIN, COVERED.start)] + [covered(k) for k in COVERED] + elsewhere
+    assert TrackState.RECOVERED not in [frame.state for frame in tracked(images)]
+
+
+def moving(seconds: F64) -> list[F64]:
+    """A robot that goes 1 m/s ahead and turns by 0.2 rad/s."""
+    return [se3.exp(np.array([0.0, 0.0, 1.0, 0.0, 0.2, 0.0]) * t) for t in seconds]
+
+
+def test_trusted_motion_is_the_mean_of_the_last_second_and_grows_unsure() -> None:
+    motion = TrustedMotion()
+    times = np.arange(0, 3, 0.1)
+    for t, pose in zip(times, moving(times), strict=True):
+        motion.add(round(t * 1e9), pose)
+    assert motion.velocity() == pytest.approx([0.0, 0.0, 1.0, 0.0, 0.2, 0.0], abs=1e-9)
+    soon, late = motion.expect(3_100_000_000), motion.expect(5_000_000_000)
+    assert se3.extent(se3.inverse(moving(np.array([3.1]))[0]) @ soon.odom_T_cam)[0] < 0.01
+    assert soon.sigma_m < 0.1 < late.sigma_m
+    assert soon.sigmas_off(soon.odom_T_cam) == 0
+    assert late.sigmas_off(moving(np.array([5.0]))[0]) < 1
+
+
+def test_without_places_nothing_is_searched() -> None:
+    recovery = Recovery(None, None, (424, 400))
+    recovery.motion.add(0, np.eye(4))
+    image = covered(0)
+    assert list(recovery.search(image, None, recovery.motion.expect(10**8))) == []  # type: ignore[arg-type]
