@@ -27,7 +27,7 @@ _sequences.one_thread()
 from stereo_sfm.calib.check import CheckReport, check
 from stereo_sfm.calib.rectification import rectify
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.calib.tracks import LONGEST, collect, corners_for
+from stereo_sfm.calib.tracks import MAX_FRAMES, collect, corners_for
 from stereo_sfm.drivers.source import open_source
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
@@ -93,7 +93,7 @@ def faults() -> list[Fault]:
 def judge(rig: Rig, images: list[StereoImage]) -> CheckReport:
     """As the command does for a recording of these images."""
     rectification = rectify(rig, "epipolar")
-    gap = max(0, len(images) // WINDOWS - LONGEST)
+    gap = max(0, len(images) // WINDOWS - MAX_FRAMES)
     return check(rig, rectification, collect(images, rectification, WINDOWS, gap, corners_for(len(images), WINDOWS)))
 
 

@@ -1,7 +1,7 @@
-"""What a correction of rotations, focal lengths and lenses amounts to, over the places where points were matched.
+"""The effect of a correction of rotations, focal lengths and lenses on pixels, over the places where points matched.
 
-The lens displacements of both eyes are carried into the right image (at infinity, where the eyes differ by a rotation)
-and fitted by a turn and a magnification; what no turn or magnification can explain is left out.
+The lens displacements of both cameras are mapped into the right image (at infinity, where the cameras differ by a
+rotation) and fitted by a rotation and a magnification; what neither explains is ignored.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ TURN, FOCAL_RATIO, FOCAL_BOTH = slice(0, 3), 3, 4
 
 
 def amounts(rig: Rig, windows: list[Window]) -> F64:
-    """(5, SHARED) that turns a correction's vector into the turn (3), right focal against left, and both focals."""
+    """(5, SHARED) maps a correction's vector to the rotation (3), the ratio of focal lengths, and their scale."""
     assert rig.right is not None
     left = np.concatenate([w.left[0] for w in windows])
     right = np.concatenate([w.right[0] for w in windows])
@@ -32,7 +32,7 @@ def amounts(rig: Rig, windows: list[Window]) -> F64:
     out[FOCAL_BOTH, FOCAL_RIGHT] = 0.5
     by_left, jac_left = _turn_and_scale(rig.left, in_left)
     by_right, jac_right = _turn_and_scale(rig.right, in_right)
-    # A pixel of the left image -> a direction of least length -> a pixel of the right image.
+    # A pixel of the left image -> its bearing -> a pixel of the right image.
     back = np.swapaxes(jac_left, 1, 2) @ np.linalg.inv(jac_left @ np.swapaxes(jac_left, 1, 2))
     across = jac_right @ rig.left_T_right[:3, :3].T @ back
     lens_left, lens_right = displacement(rig.left, left), displacement(rig.right, right)
@@ -45,12 +45,12 @@ def amounts(rig: Rig, windows: list[Window]) -> F64:
 
 
 def _turn_and_scale(camera: Camera, bearing: F64) -> tuple[F64, F64]:
-    """(N, 2, 4) what a turn of the camera and a larger focal length do to pixels, and (N, 2, 3) the projection's."""
+    """(N, 2, 4) derivative of pixels by the camera's rotation and focal length, and (N, 2, 3) by the bearing."""
     uv, jac = camera.project_jacobian(bearing)
     scale = (uv - [camera.cx, camera.cy])[..., None]
     return np.concatenate([jac @ se3.skew(bearing), scale], -1), jac
 
 
 def _fitted(by: F64, shapes: F64) -> F64:
-    """(4, K) least-squares turn and magnification of K displacement fields (N, 2, K)."""
+    """(4, K) least-squares rotation and magnification of K displacement fields (N, 2, K)."""
     return np.asarray(np.linalg.lstsq(by.reshape(-1, 4), shapes.reshape(-1, shapes.shape[2]), rcond=None)[0], float)

@@ -14,7 +14,7 @@ from stereo_sfm.calib.consistency import Correction, estimate
 from stereo_sfm.calib.rectification import Rectification
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.scene_model import DIRECTION, SKEW
-from stereo_sfm.calib.tracks import LEAST, Window
+from stereo_sfm.calib.tracks import MIN_POINTS, Window
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import F64, I64, Bool
 
@@ -100,7 +100,7 @@ def check(rig: Rig, rectification: Rectification, windows: list[Window], rolling
         )
     correction = replace(estimate(rig, windows), rolling=rolling)
     good = np.concatenate(correction.explained)
-    good = good if good.sum() >= LEAST else np.ones(total, bool)
+    good = good if good.sum() >= MIN_POINTS else np.ones(total, bool)
     left = np.concatenate([w.rows.left for w in windows])[good]
     error = np.concatenate([w.rows.row_error for w in windows])[good]
     median, count = regions(left, error, rectification.rig.left.size)

@@ -1,6 +1,6 @@
-"""Which terms of a correction have the evidence to be written into a calibration: those beyond several of their own
-standard deviations that both halves of the recording show, each on its own. What is left out stays as it is, and the
-others take the values that they have when it does."""
+"""Which terms of a correction are significant enough to be written into a calibration: those beyond several standard
+deviations that each half of the recording confirms on its own. Other terms stay unchanged, and the significant ones
+are estimated with the others held."""
 
 from __future__ import annotations
 
@@ -13,21 +13,25 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.scene_model import DIRECTION, FOCAL_RIGHT, ROTATION, SHARED, moved
 from stereo_sfm.types import F64, Bool
 
-TERMS = 6  # turn of the right camera (3), direction of the baseline (2), focal length of the right against the left
+TERMS = (
+    6  # rotation of the right camera (3), direction of the baseline (2), focal length of the right relative to the left
+)
 NAMES = (
     *(f"rotation of the right camera about {axis}" for axis in "xyz"),
     *(f"baseline direction, {axis}" for axis in "yz"),
-    "focal length, right against left",
+    "focal length, right relative to left",
 )
 UNITS = (*["degrees"] * 5, "%")
-SCALES = np.array([*[np.rad2deg(1.0)] * 5, 100.0])  # to those units
-NOT_BY_ROWS = np.array([False, True, False, True, True, False])  # what a rolling shutter's motion may pretend
-SIGMAS = 4.0  # of its own that a term must be away from zero
-SHARE = 0.5  # of its value that either half must show, with the same sign
+SCALES = np.array([*[np.rad2deg(1.0)] * 5, 100.0])  # from radians and ratios to UNITS
+ROLLING_SHUTTER_MIMICS = np.array(
+    [False, True, False, True, True, False]
+)  # terms that motion with a rolling shutter can mimic
+SIGMAS = 4.0  # standard deviations from zero that make a term significant
+MIN_SHARE_IN_HALVES = 0.5  # of a term's value that each half of the recording must show, with the same sign
 
 
 def with_terms(rig: Rig, value: F64) -> Rig:
-    """The rig with the terms (6,) added; the very same when they are zero."""
+    """The rig with the terms (6,) added; the same object when they are zero."""
     if not value.any():
         return rig
     vector = np.zeros(SHARED)
@@ -37,13 +41,13 @@ def with_terms(rig: Rig, value: F64) -> Rig:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """The terms as one set of matches shows them."""
+    """The terms estimated from one set of matches."""
 
-    value: F64  # (6,) radians and, of the focal length, ratio
+    value: F64  # (6,) radians; the focal length's is a ratio
     covariance: F64  # (6, 6)
 
     def without(self, kept: Bool) -> Estimate:
-        """The same with the terms that are not `kept` (6,) held at zero: the Gaussian's conditional."""
+        """The estimate with the terms that are not `kept` (6,) held at zero: the conditional Gaussian."""
         value, covariance = np.zeros(TERMS), np.zeros((TERMS, TERMS))
         inside, across = np.ix_(kept, kept), np.ix_(kept, ~kept)
         gain = self.covariance[across] @ np.linalg.pinv(self.covariance[np.ix_(~kept, ~kept)])
@@ -71,35 +75,35 @@ class Term:
 
     @property
     def line(self) -> str:
-        """For people."""
+        """One readable line."""
         what = f"{self.value:+.3f} +- {self.sigma:.3f} {self.unit}"
-        return f"{self.name}: {'written' if self.written else 'left as it is'}, {what} ({self.why})"
+        return f"{self.name}: {'written' if self.written else 'unchanged'}, {what} ({self.why})"
 
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """What may be written."""
+    """The significant terms."""
 
     terms: tuple[Term, ...]
     value: F64  # (6,) zero where nothing is written
-    sigma: F64  # (6,) of what is written; of the rest, how well it is known
+    sigma: F64  # (6,) standard deviations of all terms, written or not
     written: Bool  # (6,)
 
     def apply(self, rig: Rig) -> Rig:
-        """The corrected rig; the very same when nothing is written."""
+        """The corrected rig; the same object when nothing is written."""
         return with_terms(rig, self.value)
 
 
 def choose(whole: Estimate, halves: Sequence[Estimate], rolling: bool = False, sigmas: float | F64 = SIGMAS) -> Choice:
-    """Drop the weakest term that lacks evidence until all that are left have it.
+    """Drop the weakest insignificant term until all remaining terms are significant.
 
     Args:
-        whole: of all matches. halves: each of its own part of them.
-        sigmas: of its own that a term must be away from zero; one number, or (6,).
-        rolling: rows are exposed one after the other, and what only motion shows is not to be believed.
+        whole: estimated from all matches. halves: each from one part of them.
+        sigmas: standard deviations from zero that make a term significant; one number, or (6,).
+        rolling: rolling shutter; terms that motion can mimic are not written.
     """
     needed = np.broadcast_to(sigmas, TERMS)
-    kept = ~NOT_BY_ROWS if rolling else np.ones(TERMS, bool)
+    kept = ~ROLLING_SHUTTER_MIMICS if rolling else np.ones(TERMS, bool)
     while kept.any():
         strength, agreed = _evidence(whole, halves, kept)
         weak = kept & ((strength < needed) | ~agreed)
@@ -113,29 +117,29 @@ def choose(whole: Estimate, halves: Sequence[Estimate], rolling: bool = False, s
 
 
 def _evidence(whole: Estimate, halves: Sequence[Estimate], kept: Bool) -> tuple[F64, Bool]:
-    """(6,) values in their own standard deviations, and (6,) whether every half shows them too."""
+    """(6,) values in standard deviations, and (6,) whether every half confirms them."""
     here = whole.without(kept)
     parts = np.array([half.without(kept).value for half in halves]).reshape(-1, TERMS)
     strength = np.abs(here.value) / np.maximum(here.sigma, 1e-12)
-    shown = parts * np.sign(here.value) >= SHARE * np.abs(here.value)
+    shown = parts * np.sign(here.value) >= MIN_SHARE_IN_HALVES * np.abs(here.value)
     return strength, np.asarray(shown.all(0) if len(parts) else np.zeros(TERMS, bool))
 
 
 def _term(i: int, whole: Estimate, halves: Sequence[Estimate], kept: Bool, rolling: bool, needed: float) -> Term:
-    """A term that is left out is shown as it would be if it were the next to be written."""
+    """A term that is not written is reported with the value it would have if it were the next to be written."""
     with_it = kept.copy()
     with_it[i] = True
     strength, _ = _evidence(whole, halves, with_it)
     here, parts = whole.without(with_it), [h.without(with_it) for h in halves]
     values = tuple(float(SCALES[i] * h.value[i]) for h in parts)
-    said = " and ".join(f"{v:+.3f}" for v in values)
+    shown = " and ".join(f"{v:+.3f}" for v in values)
     if kept[i]:
-        why = f"{strength[i]:.0f} sigmas, the halves of the recording say {said}"
-    elif rolling and NOT_BY_ROWS[i]:
-        why = "with a rolling shutter motion may pretend it"
+        why = f"{strength[i]:.0f} sigmas, the halves of the recording give {shown}"
+    elif rolling and ROLLING_SHUTTER_MIMICS[i]:
+        why = "motion with a rolling shutter can mimic it"
     elif strength[i] < needed:
-        why = f"{strength[i]:.1f} sigmas, {needed:g} are needed"
+        why = f"{strength[i]:.1f} sigmas, at least {needed:g} required"
     else:
-        why = f"{strength[i]:.0f} sigmas, but the halves of the recording say {said}"
+        why = f"{strength[i]:.0f} sigmas, but the halves of the recording give {shown}"
     value, sigma = float(SCALES[i] * here.value[i]), float(SCALES[i] * here.sigma[i])
     return Term(NAMES[i], UNITS[i], value, sigma, values, bool(kept[i]), why)

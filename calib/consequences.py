@@ -1,4 +1,4 @@
-"""What an error of the calibration does to a path and to distances, in numbers that people can judge."""
+"""The effect of a calibration error on the trajectory and on distances."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ RANGES = (2.0, 5.0, 20.0)  # metres at which distances are compared
 
 @dataclass(frozen=True)
 class Consequences:
-    """What a rig makes of the world if another one is true."""
+    """The errors of a rig's measurements if another rig is the true one."""
 
     disparity_px: float  # median over the matches
-    depth: tuple[float, ...]  # relative error of distances at RANGES, inf where nothing is in front any more
-    length: float  # relative error of the path that follows points of this scene
+    depth: tuple[float, ...]  # relative error of distances at RANGES, inf where points end up behind the camera
+    length: float  # relative error of the length of a trajectory tracked on points of this scene
 
     @property
     def text(self) -> str:
-        """For people."""
+        """One readable line."""
         depths = ", ".join(f"{_percent(e)} at {r:g} m" for r, e in zip(RANGES, self.depth, strict=True))
-        return f"distances off by {depths}; length of the path by about {_percent(self.length)}"
+        return f"distances off by {depths}; length of the trajectory by about {_percent(self.length)}"
 
 
 def _percent(value: float) -> str:
@@ -34,9 +34,9 @@ def _percent(value: float) -> str:
 
 
 def consequences(rig: Rig, true: Rig, windows: list[Window]) -> Consequences:
-    """What `rig` makes of points that `true` sees at the places where the windows' points were matched.
+    """The errors of `rig` for points that `true` sees at the places where the windows' points were matched.
 
-    The length of the path follows from points moving by t * rho in the image (rho their inverse distance, t the
+    The error of the trajectory's length: points move by t * rho in the image (rho their inverse distance, t the
     camera's step): with rho' in its place, least squares over the points give t' = t * sum(rho rho') / sum(rho'^2).
     """
     left = np.concatenate([w.left[0] for w in windows])
@@ -58,7 +58,7 @@ def _depth_error(distance: float, rho: F64) -> float:
 
 
 def _believed(rig: Rig, true: Rig, left: F64, bearing: F64, rho: float) -> F64:
-    """(N,) inverse distances that `rig` gives points of one inverse distance on bearings (N, 3)."""
+    """(N,) inverse distances that `rig` measures for points of one true inverse distance on bearings (N, 3)."""
     assert true.right is not None
     in_right = (bearing - rho * true.left_T_right[:3, 3]) @ true.left_T_right[:3, :3]
     found = inverse_distances(rig, left, true.right.project(in_right))

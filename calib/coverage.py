@@ -1,4 +1,4 @@
-"""Which image regions, distances and tilts a set of views covers, and what to show the camera next."""
+"""Which image regions, distances and tilts a set of views covers, and which views to take next."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from stereo_sfm.calib.targets import Detection
 from stereo_sfm.types import F64, I64
 
 GRID = (5, 5)  # rows and columns of regions
-ENOUGH = 4  # views in a region
+MIN_VIEWS = 4  # in a region
 _ROWS = ("top", "upper", "middle", "lower", "bottom")
 _COLUMNS = ("left", "centre left", "centre", "centre right", "right")
 
 
 @dataclass(frozen=True, eq=False)
 class Coverage:
-    """What is there and what is missing."""
+    """What a set of views covers, and what is missing."""
 
     views: I64  # (5, 5) views with corners in each region
     near: int  # views in which the target fills more than a sixth of the image
@@ -32,26 +32,26 @@ class Coverage:
 
     @property
     def advice(self) -> list[str]:
-        """What is missing, in words; empty when nothing is."""
+        """Instructions for the missing views; empty when nothing is missing."""
         out: list[str] = []
-        thin = np.argwhere(self.views < ENOUGH)
+        thin = np.argwhere(self.views < MIN_VIEWS)
         names = [f"{_ROWS[r]} {_COLUMNS[c]}" for r, c in thin]
         if names:
             more = f" and {len(names) - 5} more" if len(names) > 5 else ""
-            out.append(f"hold the target into: {', '.join(names[:5])}{more}")
+            out.append(f"move the target to these parts of the image: {', '.join(names[:5])}{more}")
         if self.near < 3:
-            out.append("come nearer: fewer than 3 views fill a sixth of the image")
+            out.append("move the target closer: fewer than 3 views fill a sixth of the image")
         if self.far < 3:
-            out.append("go further: fewer than 3 views are small")
+            out.append("move the target away: fewer than 3 views fill less than a fifteenth of the image")
         if self.tilted < 5:
             out.append("tilt the target: fewer than 5 views are oblique")
         if self.total < 12:
-            out.append(f"take more views: {self.total} of at least 12")
+            out.append(f"take more views: {self.total} so far, at least 12 are needed")
         return out
 
 
 def coverage(detections: list[Detection], size: tuple[int, int]) -> Coverage:
-    """Of one eye's views; empty detections do not count."""
+    """The coverage of one camera's views; empty detections do not count."""
     views = np.zeros(GRID, np.int64)
     near = far = tilted = total = 0
     for detection in detections:
@@ -75,7 +75,7 @@ def _hull_area(uv: F64) -> float:
 
 
 def _asymmetry(uv: F64) -> float:
-    """Third moment of the corners along their axes: zero for a target seen square on, larger when it is oblique."""
+    """Third moment of the corners along their axes: zero for a target seen frontally, larger when it is oblique."""
     centred = uv - uv.mean(0)
     _, _, axes = np.linalg.svd(centred, full_matrices=False)
     along = centred @ axes.T
@@ -85,7 +85,7 @@ def _asymmetry(uv: F64) -> float:
 
 
 def is_new(detection: Detection, kept: list[Detection], width: int, least: float = 0.05) -> bool:
-    """Whether a view differs from all the kept ones by a mean corner shift of `least` of the width."""
+    """Whether a view differs from all kept ones by a mean corner shift of at least `least` of the image width."""
     for other in kept:
         common, a, b = np.intersect1d(detection.ids, other.ids, return_indices=True)
         if len(common) >= 4:

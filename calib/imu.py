@@ -1,4 +1,4 @@
-"""`Imu`: where the inertial sensor of a rig sits, how it errs and how much it errs."""
+"""`Imu`: pose, scale, misalignment, bias and noise of the inertial sensor of a rig."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ MOST_OFFSET_S = 1.0
 class Imu:
     """A gyroscope and an accelerometer in one frame. Corrected samples are `matrix @ raw - bias`.
 
-    The default noise is that of a consumer sensor: a calibration that knows better says so.
+    The default noise is that of a consumer sensor.
     """
 
     left_T_imu: F64 = field(default_factory=lambda: np.eye(4))  # (4, 4)
@@ -29,27 +29,23 @@ class Imu:
     gyro_walk: float = 3e-5  # rad/s^2/sqrt(Hz), of the bias
     accel_walk: float = 3e-3  # m/s^3/sqrt(Hz)
     rate_hz: float = 200.0
-    offset_s: float = (
-        0.0  # stamp of the IMU's clock minus the camera's at the same instant (Kalibr's timeshift_cam_imu)
-    )
+    offset_s: float = 0.0  # IMU stamp minus camera stamp of the same instant (Kalibr's timeshift_cam_imu)
 
     def __post_init__(self) -> None:
         rotation = self.left_T_imu[:3, :3]
         if self.left_T_imu.shape != (4, 4) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4):
-            raise StereoSfmError("calibration holds a pose of the IMU that is not rigid: check left_T_imu")
+            raise StereoSfmError("invalid calibration: the pose of the IMU is not rigid; check left_T_imu")
         arrays = (self.left_T_imu, self.gyro_matrix, self.gyro_bias, self.accel_matrix, self.accel_bias)
         for array in arrays:
             array.flags.writeable = False
         noise = (self.gyro_noise, self.accel_noise, self.gyro_walk, self.accel_walk, self.rate_hz)
         if not all(np.isfinite(a).all() for a in arrays) or not all(np.isfinite(n) and n > 0 for n in noise):
-            raise StereoSfmError(
-                "calibration of the IMU holds numbers that are not finite, or noise that is not positive"
-            )
+            raise StereoSfmError("invalid calibration of the IMU: a number is not finite, or a noise is not positive")
         if not abs(self.offset_s) <= MOST_OFFSET_S:
-            raise StereoSfmError(f"calibration has a time offset of {self.offset_s:g} s between camera and IMU")
+            raise StereoSfmError(f"invalid calibration: time offset of {self.offset_s:g} s between camera and IMU")
 
     def seen_from(self, new_T_left: F64) -> Imu:
-        """The same sensor after the left camera's frame was changed, (4, 4)."""
+        """The same sensor relative to another left camera frame, (4, 4)."""
         return replace(self, left_T_imu=new_T_left @ self.left_T_imu)
 
     def correct(self, gyro: F64, accel: F64) -> tuple[F64, F64]:

@@ -1,7 +1,7 @@
-"""Stereo matches to judge a calibration by: few, spread over the image, sub-pixel, and found without trusting rows.
+"""Stereo matches for checking a calibration: few, well distributed, sub-pixel, and not restricted to one row.
 
-Corners spread by a grid are searched in a band of rows of the other rectified image by normalised correlation, kept
-when the best place is clearly better than the next one, refined by Lucas-Kanade and kept when they come back.
+Corners, distributed by a grid, are searched in a band of rows of the other rectified image by normalised correlation,
+accepted if the best match is clearly better than the second best, refined by Lucas-Kanade and checked in reverse.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ WINDOW = (17, 17)  # of Lucas-Kanade
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """One pair's matches in rectified pixels."""
+    """The matches of one stereo pair in rectified pixels."""
 
     left: F64  # (N, 2)
     right: F64  # (N, 2)
@@ -30,7 +30,7 @@ class Matches:
 
     @property
     def row_error(self) -> F64:
-        """(N,) px: how much lower the right eye sees the point."""
+        """(N,) px: how much lower the right camera sees the point."""
         return self.right[:, 1] - self.left[:, 1]
 
 
@@ -42,20 +42,20 @@ def match_pair(
     search_rows: int = 14,
     max_disparity: float = 0.2,
 ) -> Matches:
-    """Match a rectified pair (always the same matches for the same images).
+    """Match a rectified pair; deterministic.
 
     Args:
-        rectification: that made the images; patches stay away from the black border and the outermost rays.
+        rectification: of the images; patches near the black border and the outermost rays are avoided.
         left: (H, W) rectified. right: (H, W) rectified.
-        max_matches: corners to try.
-        search_rows: rows above and below to search: how wrong the calibration may be.
+        max_matches: number of corners to try.
+        search_rows: rows to search above and below, the largest row error of the calibration.
         max_disparity: columns to search, as a fraction of the width.
     """
-    usable = _shrunk(rectification.left.trusted, PATCH + 2)
+    usable = _shrunk(rectification.left.well_calibrated, PATCH + 2)
     corners = spread_corners(left, usable, max_matches)
     guess = np.full_like(corners, np.nan)
     reach = round(max_disparity * left.shape[1])
-    right_usable = _shrunk(rectification.right.trusted, PATCH + 2)
+    right_usable = _shrunk(rectification.right.well_calibrated, PATCH + 2)
     for i, (u, v) in enumerate(np.round(corners).astype(int)):
         guess[i] = _search(left, right, int(u), int(v), reach, search_rows)
     found = np.isfinite(guess[:, 0])
@@ -76,7 +76,7 @@ def match_pair(
 
 
 def spread_corners(image: U8, usable: Bool, count: int) -> F64:
-    """(N, 2) px of the strongest corner of each grid cell, where it is strong at all."""
+    """(N, 2) px of the strongest corner of each grid cell, if it is strong enough."""
     import cv2
 
     strength: Any = cv2.cornerMinEigenVal(cv2.GaussianBlur(image, (0, 0), 0.8), 7)
@@ -103,7 +103,7 @@ def _shrunk(mask: Bool, border: int) -> Bool:
 
 
 def _search(left: U8, right: U8, u: int, v: int, reach: int, rows: int) -> tuple[float, float]:
-    """Best place of the patch around (u, v) in the right image, NaN when it is weak or not unique."""
+    """Best match of the patch around (u, v) in the right image, NaN when it is weak or not unique."""
     import cv2
 
     height, width = right.shape
@@ -122,7 +122,7 @@ def _search(left: U8, right: U8, u: int, v: int, reach: int, rows: int) -> tuple
 
 
 def flattened(image: U8) -> U8:
-    """The image less its local mean over its local contrast, so that the eyes' exposures do not matter."""
+    """The image minus its local mean, divided by its local contrast: independent of the cameras' exposures."""
     import cv2
 
     picture = image.astype(np.float32)
@@ -132,7 +132,7 @@ def flattened(image: U8) -> U8:
 
 
 def pyramid_flow(a: U8, b: U8, start: Any) -> tuple[Any, Bool]:
-    """Lucas-Kanade over a pyramid from image a to the next one b: (N, 2) float32 px and whether it came back."""
+    """Pyramidal Lucas-Kanade from image a to b: (N, 2) float32 px and whether the reverse flow agrees."""
     import cv2
 
     options: Any = {"winSize": WINDOW, "maxLevel": 4, "minEigThreshold": 1e-3}

@@ -1,4 +1,4 @@
-"""Pictures for people: a rectified pair side by side with epipolar lines and coloured row errors."""
+"""Drawing of a rectified pair side by side with epipolar lines and coloured row errors."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from stereo_sfm.types import U8
 
 
 def side_by_side(left: U8, right: U8, matches: Matches | None = None, line_every: int = 0) -> U8:
-    """Both rectified eyes with the same rows marked through both, and the matches by their row error.
+    """Both rectified images with common row lines, and the matches coloured by row error.
 
     Args:
         left: (H, W). right: (H, W).
         matches: drawn as dots: green below half a pixel of row error, yellow below one, red above.
-        line_every: rows between the lines; 0 chooses about sixteen lines.
+        line_every: rows between the lines; 0: about sixteen lines.
 
     Returns:
         (H, 2 W + gap, 3) BGR.
@@ -40,9 +40,9 @@ def side_by_side(left: U8, right: U8, matches: Matches | None = None, line_every
     return canvas
 
 
-def encode_jpeg(picture: U8, quality: int = 85) -> bytes:
-    """JPEG bytes of a picture."""
+def encode_jpeg(image: U8, quality: int = 85) -> bytes:
+    """JPEG bytes of an image."""
     import cv2
 
-    _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])
+    _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return data.tobytes()

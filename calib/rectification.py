@@ -1,4 +1,4 @@
-"""Rectification of a rig: the new rig, and the pictures it would have taken."""
+"""Rectification of a rig: the rectified rig and its images."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from stereo_sfm.geometry.stereo import rectifying_rotations
 from stereo_sfm.types import F64, U8, Bool
 
 PROJECTIONS = ("none", "pinhole", "epipolar")
-TRUSTED = np.deg2rad(75.0)  # from the axis: targets reach no further, and lens models beyond are guesses
+MAX_CALIBRATED_ANGLE = np.deg2rad(75.0)  # from the axis: calibration targets reach no further
 
 
 @dataclass(frozen=True, eq=False)
-class Eye:
-    """How one eye's images are turned into rectified ones."""
+class CameraRectification:
+    """Maps the images of one camera to rectified ones."""
 
     source: Camera
     target: Camera
@@ -33,7 +33,7 @@ class Eye:
     mask: Bool  # (H, W) pixels that have a source
 
     def apply(self, image: U8) -> U8:
-        """(H, W) of the source -> (H, W) of the target, black where there is no source."""
+        """(H, W) image of the source -> (H, W) image of the target, black where the source does not reach."""
         import cv2
 
         if image.shape[:2] != (self.source.height, self.source.width):
@@ -49,10 +49,10 @@ class Eye:
         return self.source.project(self.target.unproject(uv) @ self.target_R_source)
 
     @cached_property
-    def trusted(self) -> Bool:
-        """(H, W) pixels of the mask whose ray is so near the lens's axis that a calibration can be held to it."""
+    def well_calibrated(self) -> Bool:
+        """(H, W) pixels of the mask whose ray is close enough to the optical axis to be well calibrated."""
         axis = self.target_R_source[:, 2]
-        return self.mask & (np.nan_to_num(self.target.bearing_grid() @ axis, nan=-1.0) >= np.cos(TRUSTED))
+        return self.mask & (np.nan_to_num(self.target.bearing_grid() @ axis, nan=-1.0) >= np.cos(MAX_CALIBRATED_ANGLE))
 
     def from_source(self, uv: F64) -> F64:
         """(..., 2) px of the original image -> (..., 2) rectified px."""
@@ -61,12 +61,12 @@ class Eye:
 
 @dataclass(frozen=True, eq=False)
 class Rectification:
-    """Both eyes turned and projected so that a point lies on one row of both images."""
+    """Both cameras rotated and projected so that a point lies on the same row of both images."""
 
     rig: Rig  # equal cameras, baseline along +x
-    left: Eye
-    right: Eye
-    cam_T_rect: F64  # (4, 4) the rectified left eye in the original left eye: a rotation
+    left: CameraRectification
+    right: CameraRectification
+    cam_T_rect: F64  # (4, 4) pose of the rectified left camera in the original one: a rotation
 
     def apply(self, left: U8, right: U8) -> tuple[U8, U8]:
         """Both rectified images."""
@@ -82,22 +82,22 @@ def rectify(
     """Rectify a stereo rig.
 
     Args:
-        rig: two eyes.
-        projection: "pinhole" or "epipolar" ("none" is no rectification and has no answer here).
-        hfov_deg: horizontal field of view; None keeps what the projection sensibly can.
-        size: (width, height) px of the rectified images; None keeps about the resolution of the images' centre.
+        rig: two cameras.
+        projection: "pinhole" or "epipolar" ("none" is not valid here).
+        hfov_deg: horizontal field of view; None keeps what the projection can represent well.
+        size: (width, height) px of the rectified images; None keeps about the resolution of the image centre.
 
     Raises:
-        StereoSfmError: one eye, depth camera, unknown projection, or geometry that cannot be rectified.
+        StereoSfmError: one camera, depth camera, unknown projection, or geometry that cannot be rectified.
     """
     if rig.right is None or rig.depth:
-        raise StereoSfmError("rectification needs two eyes: this source has one")
+        raise StereoSfmError("rectification needs two cameras: this source has one")
     one_of(projection, ("pinhole", "epipolar"), "projection")
     rect_R_left, rect_R_right = rectifying_rotations(rig.left_T_right)
     choose = pinhole_camera if projection == "pinhole" else epipolar_camera
     camera = choose(rig.left, rig.right, rect_R_left, rect_R_right, hfov_deg, size)
-    left = Eye(rig.left, camera, rect_R_left, *remap_tables(rig.left, camera, rect_R_left))
-    right = Eye(rig.right, camera, rect_R_right, *remap_tables(rig.right, camera, rect_R_right))
+    left = CameraRectification(rig.left, camera, rect_R_left, *remap_tables(rig.left, camera, rect_R_left))
+    right = CameraRectification(rig.right, camera, rect_R_right, *remap_tables(rig.right, camera, rect_R_right))
     cam_T_rect = se3.from_rotation_translation(rect_R_left.T, np.zeros(3))
     baseline = se3.from_rotation_translation(np.eye(3), np.array([rig.baseline, 0.0, 0.0]))
     new = replace(
@@ -113,7 +113,7 @@ def rectify(
 
 
 def _rows_read(original: Camera, camera: Camera, rect_R_left: F64) -> float:
-    """What part of the original's rows the rectified image shows, along its middle column."""
+    """The fraction of the original rows that the rectified image shows, along its middle column."""
     column = np.array([[camera.cx, 0.0], [camera.cx, camera.height - 1.0]])
     rows = original.project(camera.unproject(column) @ rect_R_left)[:, 1]
     part = (rows[1] - rows[0]) / (original.height - 1)

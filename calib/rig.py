@@ -1,4 +1,4 @@
-"""`Rig`: the one calibration type of the project. Files of every dialect become this and are written from it."""
+"""`Rig`: the calibration type of the project; every file format is read into it and written from it."""
 
 from __future__ import annotations
 
@@ -11,60 +11,58 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.types import F64
 
-BASELINES = 1e-4, 100.0  # metres that the eyes can be apart
+BASELINE_RANGE_M = 1e-4, 100.0
 MOST_PIXELS = 10**8
 MOST_READOUT_S = 0.2
 
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """A camera with one or two eyes.
+    """One camera, or a stereo pair.
 
-    `left_T_right` takes points of the right eye into the left one: its translation is the position of the right eye
-    seen from the left, (+baseline, 0, 0) for an ideal pair. `right` is None for a monocular camera. An RGB-D camera has
-    `right` equal to `left` with a virtual baseline, and its images carry `depth`.
+    `left_T_right` maps points of the right camera to the left one: its translation is the position of the right camera
+    in the left one, (+baseline, 0, 0) for an ideal pair. `right` is None for a monocular camera. An RGB-D camera has
+    `right` equal to `left` with a virtual baseline, and its images have `depth`.
     """
 
     left: Camera
     right: Camera | None = None
     left_T_right: F64 = field(default_factory=lambda: np.eye(4))  # (4, 4)
     body_T_left: F64 = field(default_factory=lambda: np.eye(4))  # (4, 4)
-    depth: bool = False  # RGB-D: the right eye is virtual, u_right = u_left - fx * baseline / depth
+    depth: bool = False  # RGB-D: the right camera is virtual, u_right = u_left - fx * baseline / depth
     name: str = ""
     serial: str = ""
-    imu: Imu | None = None  # what its inertial samples mean; None: they are not used
-    readout_s: float = 0.0  # rolling shutter: seconds from the first row's exposure to the last's; 0: all at once
+    imu: Imu | None = None  # calibration of its inertial sensor; None: inertial samples are not used
+    readout_s: float = 0.0  # rolling shutter: seconds from the first row's exposure to the last's; 0: global shutter
 
     def __post_init__(self) -> None:
         for transform in (self.left_T_right, self.body_T_left):
             if transform.shape != (4, 4) or not np.allclose(
                 transform[:3, :3] @ transform[:3, :3].T, np.eye(3), atol=1e-4
             ):
-                raise StereoSfmError("calibration holds a transform that is not rigid: check the extrinsics")
+                raise StereoSfmError("invalid calibration: a transform is not rigid; check the extrinsics")
             transform.flags.writeable = False
             if not np.isfinite(transform).all():
-                raise StereoSfmError("calibration holds a transform that is not finite: check the extrinsics")
-        for eye, camera in (("left", self.left), ("right", self.right)):
+                raise StereoSfmError("invalid calibration: a transform is not finite; check the extrinsics")
+        for side, camera in (("left", self.left), ("right", self.right)):
             if camera is not None:
-                _check_camera(eye, camera)
+                _check_camera(side, camera)
         if not 0 <= self.readout_s <= MOST_READOUT_S:
             raise StereoSfmError(
-                f"calibration has a readout of {self.readout_s:g} s: seconds from the first row to the last are meant, "
+                f"invalid calibration: readout of {self.readout_s:g} s; give the seconds from first to last row, "
                 "0 for a global shutter"
             )
-        if self.right is not None and not BASELINES[0] <= self.baseline <= BASELINES[1]:
-            raise StereoSfmError(
-                f"calibration has a baseline of {self.baseline:g} m: the distance between the eyes in metres is meant"
-            )
+        if self.right is not None and not BASELINE_RANGE_M[0] <= self.baseline <= BASELINE_RANGE_M[1]:
+            raise StereoSfmError(f"invalid calibration: baseline of {self.baseline:g} m; give the extrinsics in metres")
 
     @property
     def stereo(self) -> bool:
-        """Two eyes (or one with depth)."""
+        """Whether there are two cameras (or one with depth)."""
         return self.right is not None
 
     @property
     def baseline(self) -> float:
-        """Metres between the eyes; 0 for one eye."""
+        """Distance between the cameras in metres; 0 for one camera."""
         return float(np.linalg.norm(self.left_T_right[:3, 3])) if self.stereo else 0.0
 
     @property
@@ -83,16 +81,16 @@ class Rig:
 
     @property
     def shutter(self) -> str:
-        """When its rows are exposed, for people."""
+        """The shutter as readable text."""
         return f"rows read within {1e3 * self.readout_s:g} ms" if self.readout_s else "all rows at once"
 
     def row_seconds(self, rows: F64) -> F64:
-        """Seconds from an image's stamp, which is the middle row's, to the exposure of other rows (pixels from 0)."""
+        """Seconds from an image's stamp, which is that of the middle row, to the exposure of other rows (pixels)."""
         return (rows / (self.left.height - 1) - 0.5) * self.readout_s
 
 
-def _check_camera(eye: str, camera: Camera) -> None:
-    """Raises StereoSfmError for numbers that no camera has."""
+def _check_camera(side: str, camera: Camera) -> None:
+    """Raises StereoSfmError for impossible intrinsics."""
     numbers = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
     wrong = [f"{name} {value:g}" for name, value in numbers.items() if not np.isfinite(value)]
     wrong += [f"distortion {value:g}" for value in camera.distortion if not np.isfinite(value)]
@@ -102,4 +100,4 @@ def _check_camera(eye: str, camera: Camera) -> None:
     if min(camera.width, camera.height) < 1 or camera.width * camera.height > MOST_PIXELS:
         wrong.append(f"size {camera.width}x{camera.height}")
     if wrong:
-        raise StereoSfmError(f"calibration of the {eye} eye cannot be: {', '.join(wrong)}")
+        raise StereoSfmError(f"invalid calibration of the {side} camera: {', '.join(wrong)}")

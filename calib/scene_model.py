@@ -1,6 +1,6 @@
-"""What a calibration predicts of points seen by both eyes at several moments, and the derivatives of that.
+"""Predicted observations of points seen by both cameras at several moments, with derivatives.
 
-The unknowns of the calibration and of the lenses are one vector, shared by all windows; see `calib.consistency`.
+The unknowns of extrinsics and lenses form one vector, shared by all windows; see `calib.consistency`.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from stereo_sfm.geometry.stereo import rectifying_rotations
 from stereo_sfm.types import F64, Bool
 
 ROTATION, DIRECTION, FOCAL, FOCAL_RIGHT, SKEW = slice(0, 3), slice(3, 5), 5, 6, 7
-NUISANCE = 10  # terms of one eye's lens displacement
+NUISANCE = 10  # terms of one camera's lens displacement
 SHARED = 8 + 2 * NUISANCE
 
 
 @dataclass(eq=False)
 class Problem:
-    """One window's measurements and its own unknowns."""
+    """The measurements and the unknowns of one window."""
 
     left: F64  # (F, N, 2)
     right: F64
     velocity: F64  # zero where unknown
-    bearing: F64  # (N, 3) unit, first left eye
+    bearing: F64  # (N, 3) unit, in the first left image
     rho: F64  # (N,) inverse distance
-    frame_T_first: F64  # (F, 4, 4) left eye's motion
+    frame_T_first: F64  # (F, 4, 4) motion of the left camera
     weight: F64  # (N, 4 F) of each row
 
 
 def moved(rig: Rig, vector: F64) -> Rig:
-    """The rig with rotation, direction and focal lengths changed; skew and lens displacement are not part of a rig."""
+    """The rig with corrected rotation, baseline direction and focal lengths; skew and lens displacement are ignored."""
     assert rig.right is not None
     rect_R_left, _ = rectifying_rotations(rig.left_T_right)
     t = rig.left_T_right[:3, 3] + rig.baseline * (vector[DIRECTION] @ rect_R_left[1:])
@@ -52,7 +52,7 @@ def _focal(camera: Camera, factor: float) -> Camera:
 
 
 def in_both(window: Window) -> Bool:
-    """(N,) the points that both eyes see at the first moment."""
+    """(N,) the points that both cameras see at the first moment."""
     return np.isfinite(window.left[0]).all(1) & np.isfinite(window.right[0]).all(1)
 
 
@@ -82,7 +82,7 @@ def make_problem(rig: Rig, window: Window) -> Problem:
 
 
 def part(problem: Problem, points: slice) -> Problem:
-    """The same window with some of its points."""
+    """The window with a subset of its points."""
     return Problem(
         problem.left[:, points], problem.right[:, points], problem.velocity[:, points], problem.bearing[points].copy(),
         problem.rho[points].copy(), problem.frame_T_first.copy(), problem.weight[points].copy(),
@@ -90,7 +90,7 @@ def part(problem: Problem, points: slice) -> Problem:
 
 
 def _first_pose(camera: Camera, uv: F64, bearing: F64, rho: F64, pose: F64) -> F64:
-    """frame_T_first (4, 4) by robust Gauss-Newton on the left eye with the points held, from `pose`."""
+    """frame_T_first (4, 4) by robust Gauss-Newton on the left images with fixed points, from `pose`."""
     seen = np.isfinite(uv[:, 0]) & (np.abs(rho) < 1e3)
     uv, bearing, rho = uv[seen], bearing[seen], rho[seen]
     for _ in range(20):
@@ -112,9 +112,9 @@ def _first_pose(camera: Camera, uv: F64, bearing: F64, rho: F64, pose: F64) -> F
 
 
 def displacement(camera: Camera, uv: F64) -> F64:
-    """(N, 2, NUISANCE) smooth displacements of about one pixel at the image's border.
+    """(N, 2, NUISANCE) smooth displacement fields of about one pixel at the image border.
 
-    A shift, every second-order term and the first two radial ones: the first orders of what a lens model can get wrong.
+    A shift, all second-order terms and the first two radial ones: the leading errors of a lens model.
     """
     x, y = 2 * uv[:, 0] / camera.width - 1, 2 * uv[:, 1] / camera.height - 1
     one, zero = np.ones_like(x), np.zeros_like(x)
@@ -126,9 +126,9 @@ def displacement(camera: Camera, uv: F64) -> F64:
 
 
 def linearised(rig: Rig, problem: Problem, vector: F64) -> tuple[F64, F64, F64]:
-    """Residuals (N, 4 F), derivatives of the prediction by the point (N, 4 F, 3) and by the rest (N, 4 F, R).
+    """Residuals (N, 4 F), derivatives of the prediction by the point (N, 4 F, 3) and by the other unknowns (N, 4 F, R).
 
-    The rest is the shared vector and the poses of all moments but the first, R = SHARED + 6 (F - 1).
+    The other unknowns are the shared vector and the poses of all moments but the first, R = SHARED + 6 (F - 1).
     """
     assert rig.right is not None
     count, frames = len(problem.bearing), len(problem.left)
@@ -147,26 +147,26 @@ def linearised(rig: Rig, problem: Problem, vector: F64) -> tuple[F64, F64, F64]:
         p_point = np.concatenate([move[:3, :3] @ tangent, np.broadcast_to(move[:3, 3, None], (count, 3, 1))], -1)
         q_point = rotation.T @ np.concatenate([p_point[..., :2], p_point[..., 2:] - t[:, None]], -1)
         p_pose = np.concatenate([rho[..., None] * np.eye(3), -se3.skew(p)], -1)
-        for eye, camera, points, point_d in ((0, rig.left, p, p_point), (1, rig.right, q, q_point)):
-            rows = slice(4 * f + 2 * eye, 4 * f + 2 * eye + 2)
-            seen = problem.right[f] if eye else problem.left[f]
+        for side, camera, points, point_d in ((0, rig.left, p, p_point), (1, rig.right, q, q_point)):
+            rows = slice(4 * f + 2 * side, 4 * f + 2 * side + 2)
+            seen = problem.right[f] if side else problem.left[f]
             uv, jac = camera.project_jacobian(points)
             shape = displacement(camera, np.nan_to_num(seen))
-            own = slice(8 + eye * NUISANCE, 8 + (eye + 1) * NUISANCE)
+            own = slice(8 + side * NUISANCE, 8 + (side + 1) * NUISANCE)
             predicted = uv + shape @ vector[own]
             by_point[:, rows] = jac @ point_d
             rest = by_rest[:, rows]
             rest[..., own] = shape
             rest[..., FOCAL] = uv - [camera.cx, camera.cy]
             pose = slice(SHARED + 6 * (f - 1), SHARED + 6 * f)
-            if eye:
+            if side:
                 predicted = predicted + vector[SKEW] * problem.velocity[f]
                 rest[..., FOCAL_RIGHT] = rest[..., FOCAL]
                 rest[..., SKEW] = problem.velocity[f]
                 rest[..., ROTATION] = jac @ se3.skew(q)
                 rest[..., DIRECTION] = (jac @ by_direction) * rho[..., None]
             if f:
-                rest[..., pose] = jac @ (rotation.T @ p_pose if eye else p_pose)
+                rest[..., pose] = jac @ (rotation.T @ p_pose if side else p_pose)
             residual[:, rows] = seen - predicted
     missing = ~np.isfinite(residual) | ~np.isfinite(by_point).all(2) | ~np.isfinite(by_rest).all(2)
     by_point[missing], by_rest[missing], residual[missing] = 0.0, 0.0, np.nan
@@ -174,7 +174,7 @@ def linearised(rig: Rig, problem: Problem, vector: F64) -> tuple[F64, F64, F64]:
 
 
 def tangents(bearing: F64) -> F64:
-    """(N, 3, 2) two directions across each bearing."""
+    """(N, 3, 2) two unit vectors perpendicular to each bearing."""
     helper = np.where(np.abs(bearing[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
     first = np.cross(bearing, helper)
     first /= np.linalg.norm(first, axis=1, keepdims=True)

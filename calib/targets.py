@@ -1,4 +1,4 @@
-"""Calibration targets: where their corners are in metres, and where an image shows them, by the corners' numbers."""
+"""Calibration targets: their corners in metres and their detection in images, by corner number."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ KINDS = ("checkerboard", "charuco", "aprilgrid")
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """The corners seen in one image."""
+    """The corners detected in one image."""
 
     ids: I64  # (K,) ascending
     uv: F64  # (K, 2) px
@@ -31,7 +31,7 @@ class Target:
 
     checkerboard: `columns` x `rows` inner corners, `size` metres between them.
     charuco: `columns` x `rows` squares of `size` metres with markers of `size * ratio` metres.
-    aprilgrid: `columns` x `rows` tags of `size` metres with gaps of `size * ratio` metres, as Kalibr draws it.
+    aprilgrid: `columns` x `rows` tags of `size` metres with gaps of `size * ratio` metres, as in Kalibr.
     """
 
     kind: str
@@ -44,11 +44,13 @@ class Target:
     def __post_init__(self) -> None:
         one_of(self.kind, KINDS, "target")
         if min(self.columns, self.rows) < 2 or not 0.001 < self.size < 2 or not 0.05 < self.ratio < 1:
-            raise StereoSfmError("a target needs at least 2 x 2 elements, a size in metres, and a ratio below one")
+            raise StereoSfmError(
+                "invalid target: at least 2 x 2 elements, a size in metres and a ratio below one are required"
+            )
 
     @property
     def points(self) -> F64:
-        """(N, 3) corners in metres on the plane z = 0, by their number."""
+        """(N, 3) corners in metres on the plane z = 0, by corner number."""
         if self.kind == "aprilgrid":
             pitch = self.size * (1 + self.ratio)
             corners = self.size * np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
@@ -61,7 +63,7 @@ class Target:
         return np.column_stack([np.asarray(xy, float), np.zeros(len(xy))]).astype(float)
 
     def detect(self, image: U8) -> Detection:
-        """Corners of the target in a grey image; empty when it is not there."""
+        """Corners of the target in a grey image; empty when it is not found."""
         found = {"checkerboard": _checkerboard, "charuco": _charuco, "aprilgrid": _aprilgrid}[self.kind](self, image)
         order = np.argsort(found.ids, kind="stable")
         return Detection(found.ids[order], found.uv[order])
@@ -131,7 +133,9 @@ def charuco_board(target: Target) -> Any:
 
     code = getattr(cv2.aruco, target.dictionary, None)
     if code is None:
-        raise StereoSfmError(f"unknown marker dictionary '{target.dictionary}' (OpenCV's names, such as DICT_5X5_100)")
+        raise StereoSfmError(
+            f"unknown marker dictionary '{target.dictionary}' (use a name of OpenCV, such as DICT_5X5_100)"
+        )
     dictionary = cv2.aruco.getPredefinedDictionary(code)
     squares = (target.columns, target.rows)
     return cv2.aruco.CharucoBoard(squares, target.size, target.size * target.ratio, dictionary)

@@ -1,4 +1,4 @@
-"""Points seen by both eyes at several moments: what a calibration can be judged by without a target."""
+"""Points tracked in both cameras at several moments, for checking a calibration without a target."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from stereo_sfm.calib.patches import Patches, Warp, align, cut, smooth, unstretc
 from stereo_sfm.calib.rectification import Rectification
 from stereo_sfm.types import F64, U8, Bool, StereoImage
 
-STEP = 0.04  # of the width: a moment is kept when the points moved so far since the last one
-MOMENTS = 6  # of a window
-LONGEST = 24  # frames of a window
-LEAST = 12  # points of a window
+MIN_MOTION = 0.04  # of the image width, between two moments
+MAX_MOMENTS = 6  # in a window
+MAX_FRAMES = 24  # in a window
+MIN_POINTS = 12  # in a window
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """The same N points in both eyes at F moments, in pixels of the original images, NaN where not seen."""
+    """The same N points in both cameras at F moments, in pixels of the original images, NaN where not seen."""
 
     left: F64  # (F, N, 2)
     right: F64  # (F, N, 2)
@@ -31,7 +31,7 @@ class Window:
 
 @dataclass(eq=False)
 class _Moment:
-    """Rectified positions (N, 2) px, NaN where lost, and the right eye's velocities in px/s."""
+    """Rectified positions (N, 2) px, NaN where lost, and the right camera's velocities in px/s."""
 
     left: F64
     right: F64
@@ -40,11 +40,11 @@ class _Moment:
 
 @dataclass(eq=False)
 class _Tracking:
-    """A window while it grows: rectified positions, float32."""
+    """A window under construction: rectified positions, float32."""
 
     start: Matches
     patches: Patches  # of the first left image
-    warps: tuple[Warp, Warp]  # to the left and the right eye of the last kept moment
+    warps: tuple[Warp, Warp]  # to the left and the right image of the last kept moment
     last: tuple[U8, U8]
     left: Any
     right: Any
@@ -64,12 +64,12 @@ def collect(
     max_matches: int = 400,
     search_rows: int = 14,
 ) -> list[Window]:
-    """Windows one after the other.
+    """Collect windows one after the other.
 
     Args:
-        images: pairs in order of time; those without a right image are skipped.
-        rectification: of the rig to judge.
-        windows: at most so many.
+        images: pairs in temporal order; those without a right image are skipped.
+        rectification: of the rig to check.
+        windows: maximum number.
         gap: frames between the end of one window and the start of the next.
         max_matches: corners of one window.
         search_rows: see `match_pair`.
@@ -87,14 +87,14 @@ def collect(
         left, right = pair = rectification.apply(image.left, image.right)
         if current is None:
             matches = match_pair(rectification, left, right, max_matches, search_rows)
-            current = _begin(matches, left, right, image.stamp_ns) if len(matches) >= LEAST else None
-            if current is not None and current.alive.sum() < LEAST:
+            current = _begin(matches, left, right, image.stamp_ns) if len(matches) >= MIN_POINTS else None
+            if current is not None and current.alive.sum() < MIN_POINTS:
                 current = None
             continue
         _advance(current, flattened(left), flattened(right), image.stamp_ns)
-        if _moved(current) > STEP * left.shape[1]:
+        if _moved(current) > MIN_MOTION * left.shape[1]:
             _keep(current, left, right)
-        if len(current.moments) == MOMENTS or current.age >= LONGEST or current.alive.mean() < 0.3:
+        if len(current.moments) == MAX_MOMENTS or current.age >= MAX_FRAMES or current.alive.mean() < 0.3:
             out.append(_close(current, rectification, pair))
             current, wait = None, gap
             if len(out) >= windows:
@@ -105,12 +105,12 @@ def collect(
 
 
 def corners_for(frames: int, windows: int) -> int:
-    """Corners of one window, more when a recording is too short for many windows."""
-    return int(np.clip(4800 / max(1.0, min(windows, frames / LONGEST)), 400, 1600))
+    """Number of corners in a window, more if a recording is too short for many windows."""
+    return int(np.clip(4800 / max(1.0, min(windows, frames / MAX_FRAMES)), 400, 1600))
 
 
 def _begin(matches: Matches, left: U8, right: U8, stamp_ns: int) -> _Tracking:
-    """Patches of the left eye, found again in the right eye."""
+    """Patches of the left image, aligned in the right image."""
     patches = cut(smooth(left), matches.left)
     here = unstretched(matches.left)
     there, good = align(patches, smooth(right), unstretched(matches.right))
@@ -134,13 +134,13 @@ def _advance(state: _Tracking, left: U8, right: U8, stamp_ns: int) -> None:
 
 
 def _moved(state: _Tracking) -> float:
-    """Median movement in px since the last kept moment."""
+    """Median motion in px since the last kept moment."""
     moved = np.linalg.norm(state.left - state.warps[0].uv, axis=1)[state.alive]
     return float(np.median(moved)) if len(moved) else 0.0
 
 
 def _keep(state: _Tracking, left: U8, right: U8) -> None:
-    """A moment: the first picture's patches found in both rectified images, from where the flow says they are."""
+    """Add a moment: align the first image's patches in both rectified images, starting from the flow."""
     here, good = align(state.patches, smooth(left), Warp(state.left, state.warps[0].stretch))
     there, good_right = align(state.patches, smooth(right), Warp(state.right, state.warps[1].stretch))
     state.alive &= good & good_right
@@ -152,8 +152,8 @@ def _keep(state: _Tracking, left: U8, right: U8) -> None:
 
 
 def _close(state: _Tracking, rectification: Rectification, pair: tuple[U8, U8]) -> Window:
-    """Keep the end too, and go back to the original images' pixels."""
-    if state.fresh and len(state.moments) < MOMENTS:
+    """Keep the last moment too, and convert to pixels of the original images."""
+    if state.fresh and len(state.moments) < MAX_MOMENTS:
         _keep(state, *pair)
     left = np.stack([rectification.left.to_source(m.left) for m in state.moments])
     right = np.stack([rectification.right.to_source(m.right) for m in state.moments])
@@ -162,6 +162,6 @@ def _close(state: _Tracking, rectification: Rectification, pair: tuple[U8, U8]) 
 
 
 def _in_source(rectification: Rectification, uv: F64, velocity: F64) -> F64:
-    """Velocity in rectified px/s -> in px/s of the original right image."""
+    """Velocity in rectified px/s -> px/s of the original right image."""
     step = 1e-3
     return (rectification.right.to_source(uv + step * velocity) - rectification.right.to_source(uv)) / step

@@ -1,4 +1,4 @@
-"""Pictures of a target from wherever they are: a folder of left and right images, or any source."""
+"""Images of a target from a folder of left and right images or from any source."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from stereo_sfm.calib.targets import Detection, Target
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import U8, StereoImage
 
-_PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".tif", ".tiff")
+_IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".tif", ".tiff")
 _SIDES = ((r"left", "right"), (r"cam0", "cam1"), (r"_0(?=\.)", "_1"), (r"_l(?=\.)", "_r"))
 
 
 def find_pairs(folder: Path) -> list[tuple[Path, Path]]:
-    """left*/right*, cam0/cam1 or *_0/*_1 pictures of a folder, in the order of the numbers in their names."""
-    files = {str(p.relative_to(folder)): p for p in folder.rglob("*") if p.suffix.lower() in _PICTURES}
+    """left*/right*, cam0/cam1 or *_0/*_1 images of a folder, in the order of the numbers in their names."""
+    files = {str(p.relative_to(folder)): p for p in folder.rglob("*") if p.suffix.lower() in _IMAGES}
     for left, right in _SIDES:
         pairs: list[tuple[Path, Path]] = []
         for name, path in files.items():
@@ -34,10 +34,10 @@ def _natural(name: str) -> list[int | str]:
 
 
 def read_pairs(pairs: list[tuple[Path, Path]]) -> Iterator[tuple[U8, U8]]:
-    """Grey pictures.
+    """Grey images.
 
     Raises:
-        StereoSfmError: a file is not a picture, or the sizes differ.
+        StereoSfmError: a file is not an image, or the sizes differ.
     """
     from stereo_sfm.pixels import decode_gray, eight_bits
 
@@ -48,11 +48,11 @@ def read_pairs(pairs: list[tuple[Path, Path]]) -> Iterator[tuple[U8, U8]]:
             try:
                 image = eight_bits(decode_gray(path.read_bytes()))
             except (OSError, ValueError):
-                raise StereoSfmError(f"cannot read the picture {path}") from None
+                raise StereoSfmError(f"cannot read the image {path}") from None
             found = (image.shape[1], image.shape[0])
             size = found if size == (0, 0) else size
             if found != size:
-                raise StereoSfmError(f"{path} is {found[0]}x{found[1]} px, the others {size[0]}x{size[1]}")
+                raise StereoSfmError(f"{path} is {found[0]}x{found[1]} px, the other images are {size[0]}x{size[1]}")
             images.append(image)
         yield images[0], images[1]
 
@@ -62,18 +62,18 @@ def gather(
     target: Target,
     limit: int,
     every_view: bool,
-    tell: Callable[[int, list[Detection], list[Detection], tuple[int, int]], None],
+    report: Callable[[int, list[Detection], list[Detection], tuple[int, int]], None],
 ) -> tuple[list[Detection], list[Detection], list[tuple[U8, U8]], tuple[int, int]]:
-    """Detect the target and keep views that add something.
+    """Detect the target and keep views that add information.
 
     Args:
-        pairs: grey pictures of both eyes.
-        limit: views at most.
-        every_view: keep views that look like earlier ones too (pictures taken one by one).
-        tell: called after each kept view with its number, both eyes' detections so far and the image size.
+        pairs: grey images of both cameras.
+        limit: maximum number of views.
+        every_view: keep views similar to earlier ones too (images taken one by one).
+        report: called after each kept view with its number, the detections of both cameras so far and the image size.
 
     Returns:
-        Detections of the left and right eye, the kept pictures, and (width, height) px.
+        Detections of the left and right camera, the kept images, and (width, height) px.
     """
     left: list[Detection] = []
     right: list[Detection] = []
@@ -88,15 +88,15 @@ def gather(
         left.append(da)
         right.append(db)
         kept.append((a, b))
-        tell(len(left), left, right, size)
+        report(len(left), left, right, size)
         if len(left) >= limit:
             break
     return left, right, kept, size
 
 
 def stereo_pairs(images: Iterator[StereoImage]) -> Iterator[tuple[U8, U8]]:
-    """Both eyes' pictures of a source's frames."""
+    """The stereo images of a source."""
     for image in images:
         if image.right is None:
-            raise StereoSfmError("the source has one eye: a stereo calibration needs two")
+            raise StereoSfmError("the source has one camera: a stereo calibration needs two")
         yield image.left, image.right

@@ -21,7 +21,7 @@ from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.log.map_view import MapView
 from stereo_sfm.loop.vocabulary_file import configured_vocabulary
 from stereo_sfm.maps.folders import MapFolders, saved_map_of
-from stereo_sfm.maps.relocalization import Location, Relocalizer, nowhere
+from stereo_sfm.maps.relocalization import Location, Relocalizer, not_found
 from stereo_sfm.maps.saved_map import SavedMap, load_map, save_map
 from stereo_sfm.maps.single_image import still_keyframe
 from stereo_sfm.messages import Sink
@@ -240,5 +240,5 @@ class MapLocator:
         image = ImageDoor(self._rig).image(left, right, 0)
         keyframe = still_keyframe(image, self._rig, config=self._config)
         if keyframe is None:
-            return nowhere("too_few_points")
+            return not_found("too_few_points")
         return self._relocalizer.locate(keyframe) if near is None else self._relocalizer.locate_near(keyframe, near)

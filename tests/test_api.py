@@ -65,7 +65,7 @@ def test_a_map_is_saved_loaded_and_asked(recording: tuple[s.Rig, list[s.StereoIm
     assert locator.locate(images[6].left, images[6].right, near=known).found
     black = np.zeros_like(images[6].left)
     assert locator.locate(black, black).reason == "too_few_points"
-    with pytest.raises(s.StereoSfmError, match="not written as 'kolmap', did you mean colmap"):
+    with pytest.raises(s.StereoSfmError, match="unknown map format 'kolmap', did you mean colmap"):
         s.export_map(system.saved_map(), tmp_path / "x", "kolmap")
     s.export_trajectory(system.trajectory(), str(tmp_path / "path.tum"))
     assert len(s.read_trajectory(tmp_path / "path.tum")) == IMAGES

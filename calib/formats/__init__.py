@@ -1,4 +1,4 @@
-"""One file per dialect, one table of them: every calibration file becomes a `Rig` and is written from one."""
+"""Calibration file formats, one module each: every calibration file is read into a `Rig` and written from one."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from stereo_sfm.errors import StereoSfmError, one_of
 
 log = logging.getLogger("stereo_sfm")
 
-# name -> (module, reader, writer, whether it writes a folder). The readers take a path and give a Rig.
+# name -> (module, reader, writer, whether it writes a folder). A reader takes a path and returns a Rig.
 FORMATS: dict[str, tuple[str, str, str, bool]] = {
     "rig": ("native", "read_native", "write_native", False),
     "kalibr": ("kalibr", "read_kalibr", "write_kalibr", False),
@@ -31,12 +31,12 @@ FORMATS: dict[str, tuple[str, str, str, bool]] = {
 
 
 def load_rig(path: Path | str, format: str | None = None, **options: Any) -> Rig:
-    """Read a calibration of any dialect.
+    """Read a calibration of any format.
 
     Args:
-        path: a file, or a folder for the dialects that keep one file an eye.
-        format: a name of `FORMATS`; None recognises it from the content.
-        **options: what the dialect's reader takes, such as `size=(width, height)` for OpenCV and KITTI.
+        path: a file, or a folder for formats with one file per camera.
+        format: a name of `FORMATS`; None detects it from the content.
+        **options: options of the format's reader, such as `size=(width, height)` for OpenCV and KITTI.
 
     Raises:
         StereoSfmError: missing, malformed or unrecognised.
@@ -53,7 +53,7 @@ def save_rig(rig: Rig, path: Path | str, format: str | None = None) -> None:
     name = format or {".json": "foxglove", ".xml": "opencv"}.get(path.suffix, "rig")
     write = _function(name, 2)
     if rig.readout_s and name != "rig":
-        log.warning("%s has no place for the readout of a rolling shutter (%g s): it is lost", name, rig.readout_s)
+        log.warning("%s cannot store the readout time of a rolling shutter (%g s): it is lost", name, rig.readout_s)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write(rig, path)
@@ -62,14 +62,14 @@ def save_rig(rig: Rig, path: Path | str, format: str | None = None) -> None:
 
 
 def recognise(path: Path) -> str:
-    """The dialect of a file or folder, by what it holds.
+    """The format of a file or folder, detected from its content.
 
     Raises:
-        StereoSfmError: none fits, or the file cannot be read as text.
+        StereoSfmError: no format matches, or the file is not text.
     """
     found = _recognise_folder(path) if path.is_dir() else _recognise_file(path)
     if found is None:
-        raise StereoSfmError(f"cannot tell the calibration format of {path}: name it ({', '.join(FORMATS)})")
+        raise StereoSfmError(f"cannot detect the calibration format of {path}: give it ({', '.join(FORMATS)})")
     return found
 
 

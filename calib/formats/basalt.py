@@ -1,4 +1,4 @@
-"""Basalt's calibration.json (cereal): `T_imu_cam` takes camera points into the body; models kb4, pinhole, radtan8."""
+"""Basalt's calibration.json (cereal): `T_imu_cam` maps camera points to the body; models kb4, pinhole, radtan8."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ def read_basalt(path: Path | str) -> Rig:
 
 
 def write_basalt(rig: Rig, path: Path) -> None:
-    """Intrinsics, extrinsics and resolution; Basalt fills what concerns the IMU with its defaults."""
-    eyes = [(rig.left, rig.body_T_left)]
+    """Intrinsics, extrinsics and resolution; Basalt uses its defaults for the IMU."""
+    cameras = [(rig.left, rig.body_T_left)]
     if rig.right is not None:
-        eyes.append((rig.right, rig.body_T_left @ rig.left_T_right))
+        cameras.append((rig.right, rig.body_T_left @ rig.left_T_right))
     value = {
-        "T_imu_cam": [pose_dict(body_T_cam) for _, body_T_cam in eyes],
-        "intrinsics": [_plain(camera) for camera, _ in eyes],
-        "resolution": [[camera.width, camera.height] for camera, _ in eyes],
+        "T_imu_cam": [pose_dict(body_T_cam) for _, body_T_cam in cameras],
+        "intrinsics": [_plain(camera) for camera, _ in cameras],
+        "resolution": [[camera.width, camera.height] for camera, _ in cameras],
         "cam_time_offset_ns": 0,
         "vignette": [],
     }
@@ -59,7 +59,7 @@ def _camera(data: dict[str, Any], resolution: Any) -> Camera:
     if kind in ("pinhole", "pinhole-radtan8"):
         coefficients = [] if kind == "pinhole" else numbers([p[k] for k in _RADTAN8])
         return brown((width, height), (fx, fy), (cx, cy), coefficients)
-    raise ValueError(f"camera type '{kind}' is not supported (kb4, pinhole and pinhole-radtan8 are)")
+    raise ValueError(f"camera type '{kind}' is not supported (supported: kb4, pinhole, pinhole-radtan8)")
 
 
 def _plain(camera: Camera) -> dict[str, Any]:

@@ -1,7 +1,7 @@
-"""What ROS CameraInfo and Foxglove CameraCalibration share: K D R P per eye, and a pair's extrinsics from R and P.
+"""The common part of ROS CameraInfo and Foxglove CameraCalibration: K D R P of a camera, extrinsics from R and P.
 
-R turns the eye into the rectified axes and P projects from there; the right eye's P[0, 3] is -fx * baseline. So two
-messages hold the whole rig: left_R_right = R1' R2 and the baseline along the rectified x axis.
+R rotates into the rectified camera and P projects from there; the right camera's P[0, 3] is -fx * baseline. Two
+messages thus hold the whole rig: left_R_right = R1' R2 and the baseline along the rectified x axis.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _BROWN = ("plumb_bob", "rational_polynomial", "")
 
 @dataclass(frozen=True, eq=False)
 class CameraInfo:
-    """One eye. K, R (3, 3), P (3, 4)."""
+    """One camera. K, R (3, 3), P (3, 4)."""
 
     width: int
     height: int
@@ -35,14 +35,14 @@ class CameraInfo:
     p: F64
 
     def camera(self) -> Camera:
-        """The lens.
+        """The camera model.
 
         Raises:
-            ValueError: a model that is not known, or a message of an uncalibrated camera (K is zero).
+            ValueError: unsupported model, or a message of an uncalibrated camera (K is zero).
         """
         k = self.k
         if k[0, 0] <= 0 or k[1, 1] <= 0:
-            raise ValueError("K is zero: the camera was not calibrated when this was written")
+            raise ValueError("K is zero: the camera is not calibrated")
         if self.distortion_model in _FISHEYE:
             coefficients = tuple(numbers(self.coefficients, 4))
             return KannalaBrandt(self.width, self.height, k[0, 0], k[1, 1], k[0, 2], k[1, 2], coefficients)
@@ -57,7 +57,7 @@ def rig_from_infos(left: CameraInfo, right: CameraInfo | None, name: str = "") -
         return Rig(left.camera(), name=name)
     baseline = left.p[0, 3] / left.p[0, 0] - right.p[0, 3] / right.p[0, 0] if left.p[0, 0] and right.p[0, 0] else 0.0
     if abs(baseline) < 1e-9:
-        raise ValueError("the right eye's P has no Tx = -fx * baseline: the pair's extrinsics are missing")
+        raise ValueError("the right camera's P has no Tx = -fx * baseline: the extrinsics are missing")
     transform = np.eye(4)
     transform[:3, :3] = left.r.T @ right.r
     transform[:3, 3] = left.r.T @ np.array([baseline, 0.0, 0.0])
@@ -65,9 +65,9 @@ def rig_from_infos(left: CameraInfo, right: CameraInfo | None, name: str = "") -
 
 
 def infos_from_rig(rig: Rig, fisheye_name: str) -> list[CameraInfo]:
-    """One or two messages; `fisheye_name` is the dialect's word for Kannala-Brandt.
+    """One or two messages; `fisheye_name` is the format's name of Kannala-Brandt.
 
-    P has the left eye's focal length and the image's centre, as good as any for consumers that rectify by it.
+    P has the left camera's focal length and the image centre: an arbitrary choice for consumers that rectify with it.
     """
     if rig.right is None:
         return [_info(rig.left, np.eye(3), np.column_stack([rig.left.matrix, np.zeros(3)]), fisheye_name)]
@@ -113,5 +113,5 @@ def info_from_rows(width: int, height: int, model: str, k: object, d: object, r:
 def check_pair(infos: list[CameraInfo], what: str) -> tuple[CameraInfo, CameraInfo | None]:
     """One or two messages in order left, right."""
     if not 1 <= len(infos) <= 2:
-        raise StereoSfmError(f"{what} holds {len(infos)} cameras: expected one or two")
+        raise StereoSfmError(f"{what} has {len(infos)} cameras: expected one or two")
     return infos[0], infos[1] if len(infos) == 2 else None

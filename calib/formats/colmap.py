@@ -1,4 +1,4 @@
-"""COLMAP text models: `cameras.txt` and, since 3.12, `rigs.txt` with the eyes' poses.
+"""COLMAP text models: `cameras.txt` and, since 3.12, `rigs.txt` with the cameras' poses.
 
 COLMAP puts the centre of the first pixel at (0.5, 0.5), so its principal point is ours plus half a pixel, and
 `sensor_from_rig` is the inverse of our camera pose in the rig.
@@ -29,12 +29,14 @@ _BROWN_MODELS: dict[str, tuple[int, tuple[int, ...]]] = {
 
 
 def colmap_camera(model: str, width: int, height: int, params: list[float], shift: float = 0.5) -> Camera:
-    """A camera from COLMAP's model name and parameters; `shift` px is taken off the principal point."""
+    """A camera from COLMAP's model name and parameters; `shift` px is subtracted from the principal point."""
     if model == "OPENCV_FISHEYE":
         fx, fy, cx, cy, *k = numbers(params, 8)
         return KannalaBrandt(width, height, fx, fy, cx - shift, cy - shift, tuple(k))
     if model not in _BROWN_MODELS:
-        raise ValueError(f"camera model '{model}' is not supported ({', '.join(_BROWN_MODELS)}, OPENCV_FISHEYE are)")
+        raise ValueError(
+            f"camera model '{model}' is not supported (supported: {', '.join(_BROWN_MODELS)}, OPENCV_FISHEYE)"
+        )
     focals, slots = _BROWN_MODELS[model]
     values = numbers(params, focals + 2 + len(slots))
     focal = (values[0], values[focals - 1])
@@ -68,14 +70,14 @@ def read_colmap(path: Path | str) -> Rig:
         rigs = path.with_name("rigs.txt")
         if len(cameras) != 2 or not rigs.is_file():
             raise StereoSfmError(
-                f"COLMAP calibration {path} holds {len(cameras)} cameras and no rigs.txt: no extrinsics"
+                f"COLMAP calibration {path} has {len(cameras)} cameras and no rigs.txt: the extrinsics are missing"
             )
         reference, other, other_T_reference = _rig(rigs)
         return Rig(cameras[reference], cameras[other], se3.inverse(other_T_reference), name=path.parent.name)
 
 
 def write_colmap(rig: Rig, folder: Path) -> None:
-    """`cameras.txt` and `rigs.txt`. The body's pose has no place there and is lost."""
+    """`cameras.txt` and `rigs.txt`. The body's pose is not stored."""
     folder.mkdir(parents=True, exist_ok=True)
     lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     for i, camera in enumerate([rig.left] if rig.right is None else [rig.left, rig.right], 1):

@@ -1,4 +1,4 @@
-"""What the readers and writers of every dialect share: one-line errors, lens models by coefficients, matrices."""
+"""Shared by the readers and writers of all formats: one-line errors, lens models by coefficients, matrices."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, Pinhole, RadTan
 from stereo_sfm.types import F64
 
-MOST_BYTES = 4 << 20  # of a calibration file
-MOST_YAML = 512 << 10  # characters of one in YAML
+MAX_FILE_BYTES = 4 << 20
+MAX_YAML_CHARS = 512 << 10
 
 
 @contextmanager
-def reading(path: Path | str, dialect: str) -> Generator[None]:
-    """Turn whatever goes wrong while a calibration is read into one line that names the file and the reason."""
+def reading(path: Path | str, file_format: str) -> Generator[None]:
+    """Convert any error while a calibration is read into one line that names the file and the reason."""
     try:
         yield
     except StereoSfmError:
         raise
     except FileNotFoundError as error:
-        raise StereoSfmError(f"no {dialect} calibration: {error.filename or path} does not exist") from None
+        raise StereoSfmError(f"no {file_format} calibration: {error.filename or path} does not exist") from None
     except KeyError as error:
-        raise StereoSfmError(f"{dialect} calibration {path}: key {error.args[0]!r} is missing") from None
+        raise StereoSfmError(f"{file_format} calibration {path}: key {error.args[0]!r} is missing") from None
     except (ValueError, TypeError, IndexError, ArithmeticError, AttributeError, RecursionError, OSError) as error:
         first_line = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise StereoSfmError(f"{dialect} calibration {path} is malformed: {first_line}") from None
+        raise StereoSfmError(f"{file_format} calibration {path} is malformed: {first_line}") from None
 
 
 def read_text(path: Path) -> str:
@@ -43,9 +43,9 @@ def read_text(path: Path) -> str:
         ValueError: larger than any calibration, or not text.
     """
     with path.open("rb") as file:
-        raw = file.read(MOST_BYTES + 1)
-    if len(raw) > MOST_BYTES:
-        raise ValueError(f"more than {MOST_BYTES >> 20} MiB are no calibration")
+        raw = file.read(MAX_FILE_BYTES + 1)
+    if len(raw) > MAX_FILE_BYTES:
+        raise ValueError(f"larger than {MAX_FILE_BYTES >> 20} MiB, which no calibration is")
     return raw.decode("utf-8-sig")
 
 
@@ -55,24 +55,24 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def yaml_mapping(text: str) -> dict[str, Any]:
-    """Keys and values of a YAML text; OpenCV's header `%YAML:1.0` and its matrices are understood.
+    """Keys and values of a YAML text; OpenCV's header `%YAML:1.0` and its matrices are supported.
 
     Raises:
-        ValueError: the text is not YAML, not a mapping, or stands for more values than a calibration has.
+        ValueError: the text is not YAML, not a mapping, or expands to more values than a calibration has.
     """
     import yaml
 
     from stereo_sfm.calib.formats.yaml_loader import CalibrationLoader
 
-    if len(text) > MOST_YAML:
-        raise ValueError(f"more than {MOST_YAML >> 10} KiB are no calibration")
+    if len(text) > MAX_YAML_CHARS:
+        raise ValueError(f"larger than {MAX_YAML_CHARS >> 10} KiB, which no calibration is")
     try:
         data = yaml.load(re.sub(r"\A\s*%YAML:[0-9.]+[^\n]*\n", "", text), CalibrationLoader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         raise ValueError(f"not YAML{f' (line {mark.line + 1})' if mark else ''}") from None
     if not isinstance(data, dict):
-        raise ValueError("expected keys and values")
+        raise ValueError("expected a mapping of keys to values")
     return data
 
 
@@ -89,19 +89,19 @@ def read_json(path: Path) -> Any:
 
 
 def write_yaml(path: Path, data: dict[str, Any]) -> None:
-    """`yaml_text` as a file."""
+    """Write `yaml_text` to a file."""
     path.write_text(yaml_text(data), encoding="utf-8")
 
 
 def yaml_text(data: dict[str, Any]) -> str:
-    """Keys in the order given, lists on one line, floats with every digit."""
+    """Keys in the order given, lists on one line, floats with all digits."""
     import yaml
 
     return yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=200)
 
 
 def numbers(values: Any, count: int | None = None) -> list[float]:
-    """A flat list of finite floats, of length `count` where it is given."""
+    """A flat list of finite floats, of length `count` where given."""
     flat = np.asarray(values, float).ravel()
     if count is not None and len(flat) != count:
         raise ValueError(f"expected {count} numbers, found {len(flat)}")
@@ -111,7 +111,7 @@ def numbers(values: Any, count: int | None = None) -> list[float]:
 
 
 def rigid(values: Any) -> F64:
-    """16 (or 12) numbers row by row -> (4, 4) with the rotation made exact when it was rounded in the file."""
+    """16 (or 12) numbers row by row -> (4, 4) with the rotation orthonormalized if it was rounded in the file."""
     flat = np.array(numbers(values))
     if len(flat) not in (12, 16):
         raise ValueError(f"a transform needs 12 or 16 numbers, found {len(flat)}")
@@ -121,7 +121,7 @@ def rigid(values: Any) -> F64:
 
 
 def exact_rotation(transform: F64) -> F64:
-    """(4, 4) whose rotation is orthonormal to rounding; a matrix that is not nearly a rotation raises ValueError."""
+    """(4, 4) with an orthonormal rotation; ValueError for a matrix that is not close to a rotation."""
     rotation = transform[:3, :3]
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
     if error > 1e-3 or np.linalg.det(rotation) < 0:
@@ -135,7 +135,9 @@ def brown(
     """Pinhole with OpenCV's coefficients k1 k2 p1 p2 [k3 [k4 k5 k6 [s1..s4 [tx ty]]]]; all zero is an ideal pinhole."""
     d = list(coefficients)
     if any(d[8:]):
-        raise ValueError("thin-prism and tilt coefficients are not supported: calibrate with at most eight")
+        raise ValueError(
+            "thin-prism and tilt coefficients are not supported: calibrate with at most eight coefficients"
+        )
     while d and d[-1] == 0:
         d.pop()
     args = int(size[0]), int(size[1]), float(focal[0]), float(focal[1]), float(centre[0]), float(centre[1])
@@ -143,25 +145,27 @@ def brown(
 
 
 def padded(camera: Camera, count: int) -> list[float]:
-    """The camera's coefficients filled with zeros to `count`."""
+    """The camera's coefficients, zero-padded to `count`."""
     return [*camera.distortion, *[0.0] * (count - len(camera.distortion))]
 
 
 def rows(matrix: F64) -> list[list[float]]:
-    """(R, C) as nested plain floats."""
+    """(R, C) as nested lists of floats."""
     return [[float(v) for v in row] for row in matrix]
 
 
-def stereo_only(right: Camera | None, dialect: str) -> Camera:
-    """The right eye, or an error for a dialect that only holds pairs."""
+def stereo_only(right: Camera | None, file_format: str) -> Camera:
+    """The right camera, or an error for a format of stereo pairs only."""
     if right is None:
-        raise StereoSfmError(f"{dialect} holds stereo pairs: this rig has one eye")
+        raise StereoSfmError(f"{file_format} stores stereo pairs only: this rig has one camera")
     return right
 
 
-def unsupported(camera: Camera, dialect: str) -> StereoSfmError:
-    """The error for a lens model that a dialect cannot express."""
-    return StereoSfmError(f"{dialect} has no lens model for '{camera.model}': rectify to pinhole first, or choose ours")
+def unsupported(camera: Camera, file_format: str) -> StereoSfmError:
+    """The error for a lens model that a format cannot express."""
+    return StereoSfmError(
+        f"{file_format} has no lens model for '{camera.model}': rectify to pinhole first, or use the format 'rig'"
+    )
 
 
 def pose_dict(a_T_b: F64) -> dict[str, float]:

@@ -29,7 +29,7 @@ _NO_RECTIFICATION: dict[str, Any] = {"rectifiedRotationLeft": [], "rectifiedRota
 
 
 def read_depthai(path: Path | str, left_socket: int | None = None, right_socket: int | None = None) -> Rig:
-    """The stereo pair that the file names, else sockets 1 and 2 (CAM_B left, CAM_C right)."""
+    """The stereo pair named in the file, else sockets 1 and 2 (CAM_B left, CAM_C right)."""
     path = Path(path)
     with reading(path, "depthai"):
         data = read_json(path)
@@ -43,7 +43,7 @@ def read_depthai(path: Path | str, left_socket: int | None = None, right_socket:
 
 
 def write_depthai(rig: Rig, path: Path) -> None:
-    """Sockets 1 and 2. The body's pose has no place there and is lost."""
+    """Sockets 1 and 2. The body's pose is not stored."""
     right = stereo_only(rig.right, "depthai")
     right_T_left = se3.inverse(rig.left_T_right)
     data = {
@@ -61,7 +61,7 @@ def _socket(asked: int | None, stated: int, usual: int) -> int:
 
 
 def _chain(cameras: dict[int, Any], start: int, end: int) -> F64:
-    """end_T_start by following each camera's extrinsics to the next, from either side; metres."""
+    """end_T_start by chaining the cameras' extrinsics from both ends; metres."""
     towards: dict[int, tuple[int, F64]] = {}
     for socket, camera in cameras.items():
         extrinsics = camera["extrinsics"]
@@ -74,12 +74,12 @@ def _chain(cameras: dict[int, Any], start: int, end: int) -> F64:
 
 
 def _to_root(towards: dict[int, tuple[int, F64]], socket: int) -> F64:
-    """root_T_socket, the root being the camera that leads no further."""
+    """root_T_socket; the root is the camera without extrinsics to another one."""
     out, seen = np.eye(4), {socket}
     while socket in towards:
         socket, step = towards[socket]
         if socket in seen:
-            raise ValueError("the extrinsics go round in a circle")
+            raise ValueError("the extrinsics form a cycle")
         seen.add(socket)
         out = step @ out
     return out
@@ -92,7 +92,7 @@ def _camera(data: dict[str, Any]) -> Camera:
     if kind == _FISHEYE:
         return KannalaBrandt(width, height, k[0, 0], k[1, 1], k[0, 2], k[1, 2], tuple(coefficients[:4]))
     if kind != _PERSPECTIVE:
-        raise ValueError(f"camera type {kind} is not supported (perspective and fisheye are)")
+        raise ValueError(f"camera type {kind} is not supported (supported: perspective, fisheye)")
     return brown((width, height), (k[0, 0], k[1, 1]), (k[0, 2], k[1, 2]), coefficients)
 
 

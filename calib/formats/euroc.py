@@ -15,7 +15,7 @@ from stereo_sfm.types import F64
 
 
 def read_euroc(folder: Path | str) -> Rig:
-    """The dataset's root, its `mav0`, or any folder that holds `cam0/sensor.yaml`; one eye when there is no cam1."""
+    """The dataset's root, its `mav0`, or any folder that holds `cam0/sensor.yaml`; one camera when there is no cam1."""
     folder = Path(folder)
     root = folder / "mav0" if (folder / "mav0").is_dir() else folder
     left, body_T_left = _sensor(root / "cam0" / "sensor.yaml")
@@ -29,10 +29,10 @@ def read_euroc(folder: Path | str) -> Rig:
 
 def write_euroc(rig: Rig, folder: Path) -> None:
     """`folder/cam0/sensor.yaml` and `cam1`."""
-    eyes = [(rig.left, rig.body_T_left)]
+    cameras = [(rig.left, rig.body_T_left)]
     if rig.right is not None:
-        eyes.append((rig.right, rig.body_T_left @ rig.left_T_right))
-    for i, (camera, body_T_cam) in enumerate(eyes):
+        cameras.append((rig.right, rig.body_T_left @ rig.left_T_right))
+    for i, (camera, body_T_cam) in enumerate(cameras):
         target = folder / f"cam{i}" / "sensor.yaml"
         target.parent.mkdir(parents=True, exist_ok=True)
         write_yaml(target, _plain(camera, body_T_cam, i))
@@ -60,7 +60,7 @@ def _plain(camera: Camera, body_T_cam: F64, index: int) -> dict[str, Any]:
         raise unsupported(camera, "EuRoC")
     if len(camera.distortion) > 4:
         raise StereoSfmError(
-            "EuRoC's sensor.yaml has four coefficients: this camera has more, choose opencv, ros or rig"
+            "EuRoC's sensor.yaml stores four coefficients, this camera has more: use the format opencv, ros or rig"
         )
     name = "equidistant" if camera.model == "kannala_brandt" else "radial-tangential"
     return {

@@ -1,6 +1,6 @@
 """OpenCV's FileStorage in its three forms (YAML, XML, JSON) as plain values.
 
-Read here and not by OpenCV, which allocates a matrix by the rows and columns that the text states.
+Not read with OpenCV, which allocates matrices of any size that the text states.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-from stereo_sfm.calib.formats.common import MOST_YAML, numbers, read_json, read_text, yaml_mapping
+from stereo_sfm.calib.formats.common import MAX_YAML_CHARS, numbers, read_json, read_text, yaml_mapping
 
 Storage = dict[str, Any]  # a matrix is a mapping with rows, cols, dt and data
 
@@ -30,8 +30,8 @@ def read_storage(path: Path) -> Storage:
 
 
 def _from_xml(text: str) -> Storage:
-    if len(text) > MOST_YAML:
-        raise ValueError(f"more than {MOST_YAML >> 10} KiB are no calibration")
+    if len(text) > MAX_YAML_CHARS:
+        raise ValueError(f"larger than {MAX_YAML_CHARS >> 10} KiB, which no calibration is")
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
@@ -54,10 +54,10 @@ def _words(text: str | None) -> str | list[str]:
 
 
 def matrix(value: Any) -> list[float] | None:
-    """The numbers of a matrix row by row; None for what is no matrix.
+    """The numbers of a matrix in row-major order; None if the value is not a matrix.
 
     Raises:
-        ValueError: it holds fewer or more numbers than its rows and columns.
+        ValueError: the number of values does not match its rows and columns.
     """
     if not isinstance(value, dict) or "data" not in value:
         return None

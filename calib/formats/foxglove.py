@@ -29,7 +29,7 @@ def read_foxglove(path: Path | str) -> Rig:
 
 
 def write_foxglove(rig: Rig, path: Path) -> None:
-    """A JSON list with one message an eye. The body's pose has no place there and is lost."""
+    """A JSON list with one message per camera. The body's pose is not stored."""
     messages = [
         {
             "timestamp": {"sec": 0, "nsec": 0},

@@ -1,4 +1,4 @@
-"""Calibration of an inertial sensor: our own keys, EuRoC's sensor.yaml, Kalibr's imu.yaml and time shift."""
+"""Calibration of an IMU: the keys of our rig file, EuRoC's sensor.yaml, Kalibr's imu.yaml and time shift."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def imu_to_plain(imu: Imu) -> dict[str, Any]:
 
 
 def imu_from_plain(data: dict[str, Any]) -> Imu:
-    """The inverse of `imu_to_plain`; what is missing has its default."""
+    """The inverse of `imu_to_plain`; missing keys get their defaults."""
     known: dict[str, Any] = {"left_T_imu": rigid(data["left_T_imu"])}
     for name, shape in (("gyro_matrix", (3, 3)), ("gyro_bias", (3,)), ("accel_matrix", (3, 3)), ("accel_bias", (3,))):
         if name in data:
@@ -40,7 +40,7 @@ def imu_from_plain(data: dict[str, Any]) -> Imu:
     known |= {name: float(data[name]) for name in (*_NOISE, "rate_hz", "offset_s") if name in data}
     unknown = set(data) - set(known)
     if unknown:
-        raise ValueError(f"unknown key of the IMU: {', '.join(sorted(unknown))}")
+        raise ValueError(f"unknown IMU key: {', '.join(sorted(unknown))}")
     return Imu(**known)
 
 

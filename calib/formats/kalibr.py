@@ -1,4 +1,4 @@
-"""Kalibr's camchain.yaml. `T_cn_cnm1` takes points of the previous camera into this one: cam1_T_cam0."""
+"""Kalibr's camchain.yaml. `T_cn_cnm1` maps points of the previous camera to this one: cam1_T_cam0."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, KannalaBrandt
 
-IMU_FILES = ("imu.yaml", "imu_config.yaml", "imu0.yaml")  # beside the camchain
+IMU_FILES = ("imu.yaml", "imu_config.yaml", "imu0.yaml")  # next to the camchain
 
 
-def read_kalibr(path: Path | str, eyes: tuple[int, int] = (0, 1)) -> Rig:
-    """cam0 and cam1 (or the two neighbours of `eyes`); the body is the IMU when its pose is known."""
+def read_kalibr(path: Path | str, pair: tuple[int, int] = (0, 1)) -> Rig:
+    """cam0 and cam1 (or the two cameras of `pair`); the body is the IMU when its pose is known."""
     path = Path(path)
     with reading(path, "Kalibr"):
         data = read_yaml(path)
-        first = data[f"cam{eyes[0]}"]
+        first = data[f"cam{pair[0]}"]
         left = _camera(first)
         body_T_left = se3.inverse(rigid(first["T_cam_imu"])) if "T_cam_imu" in first else np.eye(4)
-        second = data.get(f"cam{eyes[1]}")
+        second = data.get(f"cam{pair[1]}")
         if second is None:
             return Rig(left, body_T_left=body_T_left, name=path.stem)
         if "T_cn_cnm1" in second:
@@ -64,7 +64,7 @@ def write_kalibr(rig: Rig, path: Path) -> None:
 
 def _camera(data: dict[str, Any]) -> Camera:
     if data["camera_model"] != "pinhole":
-        raise StereoSfmError(f"Kalibr camera model '{data['camera_model']}' is not supported (pinhole is)")
+        raise StereoSfmError(f"Kalibr camera model '{data['camera_model']}' is not supported (supported: pinhole)")
     size = numbers(data["resolution"], 2)
     fx, fy, cx, cy = numbers(data["intrinsics"], 4)
     model, coefficients = data["distortion_model"], numbers(data.get("distortion_coeffs", []))
@@ -72,7 +72,7 @@ def _camera(data: dict[str, Any]) -> Camera:
         return KannalaBrandt(int(size[0]), int(size[1]), fx, fy, cx, cy, tuple(numbers(coefficients, 4)))
     if model in ("radtan", "none"):
         return brown([int(v) for v in size], (fx, fy), (cx, cy), coefficients if model == "radtan" else ())
-    raise StereoSfmError(f"Kalibr distortion model '{model}' is not supported (radtan, equidistant and none are)")
+    raise StereoSfmError(f"Kalibr distortion model '{model}' is not supported (supported: radtan, equidistant, none)")
 
 
 def _plain(camera: Camera, cam_T_imu: Any) -> dict[str, Any]:
@@ -80,7 +80,9 @@ def _plain(camera: Camera, cam_T_imu: Any) -> dict[str, Any]:
     if camera.model not in kinds:
         raise unsupported(camera, "Kalibr")
     if camera.model == "radtan" and len(camera.distortion) > 4:
-        raise StereoSfmError("Kalibr's radtan has four coefficients: this camera has more, choose opencv, ros or rig")
+        raise StereoSfmError(
+            "Kalibr's radtan has four coefficients, this camera has more: use the format opencv, ros or rig"
+        )
     name, count = kinds[camera.model]
     return {
         "T_cam_imu": rows(cam_T_imu),

@@ -1,6 +1,6 @@
 """kapture's `sensors.txt` and `rigs.txt`: COLMAP's model names, poses as sensor_from_rig, comma separated.
 
-The principal point is taken as it stands: kapture copies what the device or the tool before it reported.
+The principal point is read unchanged: kapture copies what the device or the tool before it reported.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def read_kapture(path: Path | str, left_T_right: F64 | None = None) -> Rig:
         left_T_right: (4, 4) extrinsics where the data set has no rigs.txt.
 
     Raises:
-        StereoSfmError: no cameras, malformed, or two cameras and no extrinsics from either place.
+        StereoSfmError: no camera, malformed, or two cameras without extrinsics.
     """
     path = Path(path)
     if path.is_dir():
@@ -42,7 +42,7 @@ def read_kapture(path: Path | str, left_T_right: F64 | None = None) -> Rig:
         if left_T_right is not None:
             return Rig(left, right, left_T_right, name=path.parent.name)
         if not rigs.is_file():
-            raise ValueError("it has two cameras but no rigs.txt beside it: the extrinsics are missing")
+            raise ValueError("it has two cameras but there is no rigs.txt: the extrinsics are missing")
         poses = _rig_poses(rigs)
         left_T_right = poses[left_id] @ se3.inverse(poses[right_id])
         return Rig(left, right, left_T_right, se3.inverse(poses[left_id]), name=path.parent.name)
@@ -57,19 +57,19 @@ def read_kapture_cameras(path: Path) -> dict[str, Camera]:
                 params = [float(v) for v in fields[6:]]
                 cameras[fields[0]] = colmap_camera(fields[3], int(fields[4]), int(fields[5]), params, shift=0.0)
         if not cameras:
-            raise ValueError("it lists no camera")
+            raise ValueError("no camera listed")
     return cameras
 
 
 def write_kapture(rig: Rig, folder: Path) -> None:
     """`sensors.txt` and `rigs.txt`, the rig's origin being the body."""
     folder.mkdir(parents=True, exist_ok=True)
-    eyes = [("cam0", rig.left, se3.inverse(rig.body_T_left))]
+    cameras = [("cam0", rig.left, se3.inverse(rig.body_T_left))]
     if rig.right is not None:
-        eyes.append(("cam1", rig.right, se3.inverse(rig.body_T_left @ rig.left_T_right)))
+        cameras.append(("cam1", rig.right, se3.inverse(rig.body_T_left @ rig.left_T_right)))
     sensors = ["# kapture format: 1.1", "# sensor_id, name, sensor_type, [sensor_params]+"]
     rigs = ["# kapture format: 1.1", "# rig_id, sensor_id, qw, qx, qy, qz, tx, ty, tz"]
-    for name, camera, cam_T_body in eyes:
+    for name, camera, cam_T_body in cameras:
         model, params = colmap_params(camera, shift=0.0)
         sensors.append(f"{name}, , camera, {model}, {camera.width}, {camera.height}, " + ", ".join(map(repr, params)))
         x, y, z, w = se3.quaternion_from_rotation(cam_T_body[:3, :3])

@@ -15,12 +15,12 @@ from stereo_sfm.geometry.cameras import Pinhole
 from stereo_sfm.types import F64
 
 
-def read_kitti(path: Path | str, size: tuple[int, int] | None = None, eyes: tuple[int, int] = (0, 1)) -> Rig:
-    """The rectified pair `eyes` (grey cameras 0 and 1, colour cameras 2 and 3).
+def read_kitti(path: Path | str, size: tuple[int, int] | None = None, pair: tuple[int, int] = (0, 1)) -> Rig:
+    """The rectified cameras `pair` (grey cameras 0 and 1, colour cameras 2 and 3).
 
     Args:
         path: calib.txt, calib_cam_to_cam.txt, or the folder that holds one of them.
-        size: (width, height) px; without it, what the file says, or that of the first image beside the file.
+        size: (width, height) px; default: as stated in the file, else that of the first image next to it.
     """
     path = Path(path)
     if path.is_dir():
@@ -29,8 +29,8 @@ def read_kitti(path: Path | str, size: tuple[int, int] | None = None, eyes: tupl
         )
     with reading(path, "KITTI"):
         entries = _entries(path)
-        cameras = [_projection(entries, i) for i in eyes]
-        width, height = size or _size(path, entries, eyes[0])
+        cameras = [_projection(entries, i) for i in pair]
+        width, height = size or _size(path, entries, pair[0])
         (k_left, t_left), (k_right, t_right) = cameras
         left, right = (Pinhole(width, height, k[0, 0], k[1, 1], k[0, 2], k[1, 2]) for k in (k_left, k_right))
         # p_camera_i = p_reference + t_i for every camera of the rectified rig.
@@ -49,7 +49,7 @@ def write_kitti(rig: Rig, path: Path) -> None:
     t = rig.left_T_right[:3, 3]
     tilted = not np.allclose(rig.left_T_right[:3, :3], np.eye(3), atol=1e-12)
     if rig.left.model != "pinhole" or right.model != "pinhole" or tilted:
-        raise StereoSfmError("KITTI's calib.txt holds rectified pinhole pairs only: rectify first")
+        raise StereoSfmError("KITTI's calib.txt stores rectified pinhole pairs only: rectify first")
     lines: list[str] = []
     for i, (camera, offset) in enumerate(((rig.left, np.zeros(3)), (right, -t))):
         projection = camera.matrix @ np.column_stack([np.eye(3), offset])
@@ -88,4 +88,4 @@ def _size(path: Path, entries: dict[str, list[float]], index: int) -> tuple[int,
     for picture in (p for f in folders if f.is_dir() for p in sorted(f.glob("*.png"))[:20]):
         with suppress(ValueError, OSError):
             return declared_size(picture.read_bytes())
-    raise ValueError("it does not state the image size and no image that can be read lies beside it")
+    raise ValueError("no image size stated, and no readable image next to the file")

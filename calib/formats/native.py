@@ -1,4 +1,4 @@
-"""Our own rig file: YAML, every number exact, every field of `Rig`."""
+"""Our own rig file: YAML with every field of `Rig`, lossless."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ KEY = "stereo_sfm_rig"
 
 
 def read_native(path: Path) -> Rig:
-    """`rig.yaml` as `write_native` makes it."""
+    """Read a `rig.yaml` as written by `write_native`."""
     with reading(path, "rig"):
         text = read_text(path)
     return rig_from_text(text, path)
 
 
 def rig_from_text(text: str, where: Path | str) -> Rig:
-    """The inverse of `rig_to_text`; `where` the text comes from is named when it is malformed."""
+    """The inverse of `rig_to_text`; `where` names the origin of the text in error messages."""
     with reading(where, "rig"):
         data = yaml_mapping(text)
         if data.get(KEY) != 1:
-            raise ValueError(f"{KEY} is {data.get(KEY)}, this version reads 1")
+            raise ValueError(f"{KEY} is {data.get(KEY)}, this version of the program reads 1")
         return Rig(
             left=_camera(data["left"]),
             right=_camera(data["right"]) if data.get("right") else None,
@@ -40,12 +40,12 @@ def rig_from_text(text: str, where: Path | str) -> Rig:
 
 
 def write_native(rig: Rig, path: Path) -> None:
-    """Every field; `read_native` gives the same bits back."""
+    """Write every field; `read_native` restores the same bits."""
     path.write_text(rig_to_text(rig), encoding="utf-8")
 
 
 def rig_to_text(rig: Rig) -> str:
-    """The rig as YAML, every number exact."""
+    """The rig as YAML, lossless."""
     return yaml_text(
         {
             KEY: 1,

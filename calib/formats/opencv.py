@@ -14,7 +14,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, KannalaBrandt
 from stereo_sfm.types import F64
 
-_NAMES = {  # ours -> what people write
+_NAMES = {  # our name -> common spellings
     "M1": ("M1", "K1", "cameraMatrix1", "camera_matrix_left", "cameraMatrixL", "camera_matrix", "cameraMatrix"),
     "M2": ("M2", "K2", "cameraMatrix2", "camera_matrix_right", "cameraMatrixR"),
     "D1": ("D1", "distCoeffs1", "dist_coeffs_left", "distCoeffsL", "distortion_coefficients", "distCoeffs"),
@@ -25,7 +25,7 @@ _NAMES = {  # ours -> what people write
 
 
 def read_opencv(path: Path | str, size: tuple[int, int] | None = None) -> Rig:
-    """One file, or `intrinsics.yml` with `extrinsics.yml` beside it as OpenCV's stereo sample writes them.
+    """One file, or `intrinsics.yml` with `extrinsics.yml` next to it as written by OpenCV's stereo sample.
 
     Four coefficients with `distortion_model: fisheye` (or equidistant) are Kannala-Brandt, all others Brown's.
     """
@@ -36,7 +36,7 @@ def read_opencv(path: Path | str, size: tuple[int, int] | None = None) -> Rig:
         if "R" not in data and extrinsics != path and extrinsics.is_file():
             data |= {k: v for k, v in _matrices(extrinsics).items() if k in ("R", "T")}
         if size is None and "size" not in data:
-            raise ValueError("it does not state the image size (image_width, image_height): give the size")
+            raise ValueError("no image size stated (image_width, image_height): give the size")
         width, height = size or numbers(data["size"], 2)
         fisheye = data.get("model") in ("fisheye", "equidistant", "kannala_brandt")
         left = _camera(data["M1"], data.get("D1", []), (int(width), int(height)), fisheye)
@@ -55,7 +55,7 @@ def write_opencv(rig: Rig, path: Path) -> None:
 
     cameras = [rig.left] if rig.right is None else [rig.left, rig.right]
     if len({_model(camera) for camera in cameras}) > 1:
-        raise unsupported(cameras[1], "OpenCV with two lens kinds")
+        raise unsupported(cameras[1], "OpenCV with two lens models")
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     if not storage.isOpened():
         raise OSError(0, "not a writable file")
@@ -82,7 +82,7 @@ def _model(camera: Camera) -> str:
 
 
 def _matrices(path: Path) -> dict[str, Any]:
-    """Numbers under our names, `size` and `model` where the file has them."""
+    """Numbers by our names, with `size` and `model` where the file has them."""
     storage = read_storage(path)
     data: dict[str, Any] = {}
     for ours, names in _NAMES.items():

@@ -1,4 +1,4 @@
-"""ROS camera_info YAML files, one an eye: `left.yaml` and `right.yaml` as camera_calibration writes them."""
+"""ROS camera_info YAML files, one per camera: `left.yaml` and `right.yaml` as written by camera_calibration."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _PARTNERS = (("left", "right"), ("cam0", "cam1"), ("camera0", "camera1"), ("fish
 
 
 def read_ros(path: Path | str) -> Rig:
-    """A folder with left.yaml and right.yaml, or the left file; its partner is found by name, else one eye."""
+    """A folder with left.yaml and right.yaml, or the left file; without a right file the rig has one camera."""
     left = Path(path)
     with reading(left, "ROS camera_info"):
         if left.is_dir():
@@ -24,7 +24,7 @@ def read_ros(path: Path | str) -> Rig:
 
 
 def write_ros(rig: Rig, folder: Path) -> None:
-    """`folder/left.yaml` and `folder/right.yaml`. The body's pose has no place there and is lost."""
+    """`folder/left.yaml` and `folder/right.yaml`. The body's pose is not stored."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, info in zip(("left", "right"), infos_from_rig(rig, "equidistant"), strict=False):
         flat = info_rows(info)

@@ -1,7 +1,7 @@
-"""YAML as calibrations use it, safe against texts that stand for more than they hold.
+"""A YAML loader for calibrations, safe against texts that expand to huge values.
 
-A few lines of aliases of aliases can mean billions of values, and brackets in brackets overflow the parser's stack:
-both are counted while the text is read, before any value is made.
+A few lines of nested aliases can expand to billions of values, and nested brackets overflow the parser's stack:
+both are counted while the text is parsed, before any value is built.
 """
 
 from __future__ import annotations
@@ -12,43 +12,43 @@ import yaml
 from yaml.events import AliasEvent
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
-MOST_VALUES = 20_000  # with every alias written out
+MAX_VALUES = 20_000  # with every alias written out
 MOST_DEPTH = 32
-LONGEST = 4096  # characters of one value
+MAX_VALUE_CHARS = 4096
 OPENCV_MATRIX = "tag:yaml.org,2002:opencv-matrix"
 
 
 class CalibrationLoader(yaml.SafeLoader):
-    """SafeLoader that knows OpenCV's matrices (as plain mappings) and limits what a text may stand for.
+    """SafeLoader that reads OpenCV's matrices (as plain mappings) and limits the size of the expanded text.
 
-    Its parsing raises ValueError for texts above the limits.
+    Raises ValueError for texts above the limits.
     """
 
     def __init__(self, stream: str) -> None:
         super().__init__(stream)
         self._depth = 0
-        self._values: dict[Node, int] = {}  # what each composed node stands for
+        self._values: dict[Node, int] = {}  # number of values that each composed node expands to
 
     def compose_node(self, parent: Node | None, index: Any) -> Node | None:
-        """As SafeLoader's."""
+        """As `SafeLoader.compose_node`, counting values."""
         self._depth += 1
         if self._depth > MOST_DEPTH:
-            raise ValueError("its values are nested too deeply")
+            raise ValueError("values are nested too deeply")
         alias = self.check_event(AliasEvent)
         node = super().compose_node(parent, index)
         self._depth -= 1
         if alias and node not in self._values:
-            raise ValueError("one of its values holds itself")
+            raise ValueError("a value contains itself")
         if node is not None and not alias:
             self._values[node] = self._count(node)
         return node
 
     def _count(self, node: Node) -> int:
-        if isinstance(node, ScalarNode) and len(node.value) > LONGEST:
-            raise ValueError(f"one of its values has {len(node.value)} characters")
+        if isinstance(node, ScalarNode) and len(node.value) > MAX_VALUE_CHARS:
+            raise ValueError(f"a value has {len(node.value)} characters")
         count = 1 + sum(self._values[child] for child in _children(node))
-        if max(count, len(self._values)) > MOST_VALUES:
-            raise ValueError("it stands for more values than any calibration")
+        if max(count, len(self._values)) > MAX_VALUES:
+            raise ValueError("it expands to more values than any calibration has")
         return count
 
 

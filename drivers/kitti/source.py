@@ -43,7 +43,7 @@ def open_kitti(path: str, options: KittiOptions) -> FolderSource:
     stamps = _read_times(folder / "times.txt", name, len(lefts))
     line = lines_of(name, lefts, len(stamps), "times.txt", first=0)
     shots = [Shot(stamps[line[left]], left, right) for left, right in pair_files(name, lefts, rights) if left in line]
-    chosen = chosen_rig(options.rig, lambda: read_rig(need(folder / "calib.txt", "KITTI calibration"), eyes=eyes))
+    chosen = chosen_rig(options.rig, lambda: read_rig(need(folder / "calib.txt", "KITTI calibration"), pair=eyes))
     truth_file = folder.resolve().parent.parent / "poses" / f"{folder.resolve().name}.txt"
     truth = None
     if truth_file.is_file():

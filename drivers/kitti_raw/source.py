@@ -44,7 +44,7 @@ def open_kitti_raw(path: str, options: KittiRawOptions) -> FolderSource:
     if eyes is None:
         raise StereoSfmError(f"{folder} has neither image_00/data nor image_02/data")
     date = next((p for p in (folder, folder.resolve().parent) if (p / CALIBRATION).is_file()), folder.resolve().parent)
-    own = chosen_rig(options.rig, lambda: read_rig(need(date / CALIBRATION, "KITTI raw calibration"), eyes=eyes))
+    own = chosen_rig(options.rig, lambda: read_rig(need(date / CALIBRATION, "KITTI raw calibration"), pair=eyes))
     lefts, rights = (list_images(folder / f"image_0{i}" / "data") for i in eyes)
     files = [folder / f"image_0{i}" / "timestamps.txt" for i in eyes]
     stamps = _read_times(need(files[0], "time stamps"))

@@ -139,11 +139,11 @@ def collect(
     readout_s = 0.0
     pairs = find_pairs(folder) if folder.is_dir() and not (folder / "mav0").is_dir() else []
     if pairs:
-        found = gather(read_pairs(pairs), target, limit, every_view=True, tell=tell)
+        found = gather(read_pairs(pairs), target, limit, every_view=True, report=tell)
     else:
         with open_source(source) as opened:
             try:
-                found = gather(stereo_pairs(iter(opened)), target, limit, every_view=False, tell=tell)
+                found = gather(stereo_pairs(iter(opened)), target, limit, every_view=False, report=tell)
             except KeyboardInterrupt:
                 raise StereoSfmError("interrupted before the calibration was computed") from None
             readout_s = opened.rig.readout_s

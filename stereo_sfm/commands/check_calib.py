@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     from stereo_sfm.calib import load_rig, save_rig
     from stereo_sfm.calib.check import check
     from stereo_sfm.calib.rectification import rectify
-    from stereo_sfm.calib.tracks import LONGEST, collect, corners_for
+    from stereo_sfm.calib.tracks import MAX_FRAMES, collect, corners_for
     from stereo_sfm.config import Config
     from stereo_sfm.drivers.source import open_source
     from stereo_sfm.tracking.flow.readout import ReadoutSearch
@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
         rig = source.rig if options.rig is None else load_rig(options.rig)
         rectification = rectify(rig, "epipolar")
         total = min(source.frame_count or options.max_frames, options.max_frames)
-        gap = 0 if source.live else max(0, total // options.windows - LONGEST)
+        gap = 0 if source.live else max(0, total // options.windows - MAX_FRAMES)
         corners = corners_for(total, options.windows)
         shutter = ReadoutSearch(Config().tracker, rig)
         images = _searched(itertools.islice(source, options.max_frames), shutter)

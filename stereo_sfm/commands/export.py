@@ -32,8 +32,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--rig", type=Path, metavar="FILE", help="calibration of --images instead of its own")
     parser.add_argument(
-        "--walk", type=int, metavar="N", help="of a merged map: this trajectory alone; with --images: what it shows"
+        "--session", type=int, metavar="N", help="only this session of a merged map; with --images: the one they show"
     )
+    parser.add_argument("--walk", dest="session", type=int, default=argparse.SUPPRESS, help=argparse.SUPPRESS)
     parser.add_argument("--resolution", type=float, default=0.05, metavar="M", help="of the floor plan, metres a pixel")
 
 
@@ -48,7 +49,7 @@ class ExportOptions:
     which: str
     images: str | None
     rig: Path | None
-    walk: int | None
+    session: int | None
     resolution: float
 
 
@@ -65,8 +66,8 @@ def run(args: argparse.Namespace) -> int:
         raise StereoSfmError("--images goes with --format colmap")
     if options.rig is not None and not options.images:
         raise StereoSfmError("--rig goes with --images")
-    if options.walk is not None and not options.images and options.format not in TRAJECTORY_FORMATS:
-        raise StereoSfmError("--walk goes with --images and with trajectories")
+    if options.session is not None and not options.images and options.format not in TRAJECTORY_FORMATS:
+        raise StereoSfmError("--session goes with --images and with trajectories")
     write = _write_trajectories if options.format in TRAJECTORY_FORMATS else _write_map
     paths = write(options, options.output or options.source / _default_name(options))
     print(f"written to {', '.join(map(str, paths))}")
@@ -87,7 +88,7 @@ def _write_map(options: ExportOptions, output: Path) -> list[Path]:
     _check_free(options, paths)
     saved = _load(options.source)
     if options.images:
-        _write_with_pictures(saved, output, options, options.images)
+        _write_with_images(saved, output, options, options.images)
     else:
         export_map(saved, output, options.format, options.resolution)
     return paths
@@ -104,21 +105,26 @@ def _load(folder: Path) -> SavedMap:
     raise StereoSfmError(f"{folder} holds no map: nothing was mapped, or by an earlier version (run it again)")
 
 
-def _write_with_pictures(saved: SavedMap, output: Path, options: ExportOptions, images: str) -> None:
+def _write_with_images(saved: SavedMap, output: Path, options: ExportOptions, images: str) -> None:
     """COLMAP's model, and the keyframes' pictures beside it."""
     from stereo_sfm.calib import load_rig
-    from stereo_sfm.export.pictures import check_walk, open_pictures, walk_of_recording, write_pictures
+    from stereo_sfm.export.keyframe_images import (
+        check_session,
+        open_recording,
+        session_of_recording,
+        write_keyframe_images,
+    )
 
-    check_walk(saved, options.walk)
-    source = open_pictures(images, saved.rig, load_rig(options.rig) if options.rig is not None else None)
+    check_session(saved, options.session)
+    source = open_recording(images, saved.rig, load_rig(options.rig) if options.rig is not None else None)
     with source:
-        walk = options.walk if options.walk is not None else walk_of_recording(saved, source, images)
+        walk = options.session if options.session is not None else session_of_recording(saved, source, images)
         export_map(saved, output, "colmap")
-        write_pictures(saved, source, walk, output, images)
+        write_keyframe_images(saved, source, walk, output, images)
 
 
 def _write_trajectories(options: ExportOptions, output: Path) -> list[Path]:
-    """One file, or one for each walk of a merged map."""
+    """One file, or one for each session of a merged map."""
     found, what = _trajectories(options)
     paths = [output if len(found) == 1 else _of_walk(output, walk) for walk in found]
     _check_free(options, paths)
@@ -134,25 +140,25 @@ def _of_walk(path: Path, walk: int) -> Path:
 
 
 def _trajectories(options: ExportOptions) -> tuple[dict[int, Trajectory], str]:
-    """A run's trajectory, or a map's keyframes, walk by walk; and which poses they are."""
+    """A run's trajectory, or a map's keyframes by session; and which poses they are."""
     from stereo_sfm.drivers.ground_truth import read_trajectory
     from stereo_sfm.errors import StereoSfmError
-    from stereo_sfm.export.pictures import check_walk
+    from stereo_sfm.export.keyframe_images import check_session
     from stereo_sfm.export.trajectories import named_pose
-    from stereo_sfm.maps.saved_map import walk_trajectory
+    from stereo_sfm.maps.saved_map import session_trajectory
 
     name = {"odom": "trajectory_odom.tum", "map": "trajectory_map.tum", "keyframes": "keyframes.tum"}[options.which]
     if (options.source / name).is_file():
-        if options.walk is not None:
-            raise StereoSfmError("--walk goes with maps: a run is one walk")
+        if options.session is not None:
+            raise StereoSfmError("--session goes with maps: a run is one session")
         return {0: read_trajectory(options.source / name)}, named_pose(options.source / name)
     if not (options.source / "map.json").is_file():
         raise StereoSfmError(f"{options.source} holds no {name}")
     if options.which == "odom":
         raise StereoSfmError(f"{options.source} is a map: it holds keyframes, not the odometry of a run")
     saved = _load(options.source)
-    check_walk(saved, options.walk)
-    return {k: walk_trajectory(saved, k) for k in saved.walks if options.walk in (None, k)}, "world_T_cam0"
+    check_session(saved, options.session)
+    return {k: session_trajectory(saved, k) for k in saved.session_ids if options.session in (None, k)}, "world_T_cam0"
 
 
 def _check_free(options: ExportOptions, paths: Sequence[Path]) -> None:

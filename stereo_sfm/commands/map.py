@@ -108,7 +108,7 @@ def describe(saved: SavedMap) -> list[str]:
 def _merge(options: MergeOptions) -> int:
     from stereo_sfm import config as configuration
     from stereo_sfm.errors import StereoSfmError
-    from stereo_sfm.maps.merge import merge, share_a_walk
+    from stereo_sfm.maps.merge import merge, share_a_session
     from stereo_sfm.maps.saved_map import load_map, save_map
 
     if len(options.maps) < 2:
@@ -117,7 +117,7 @@ def _merge(options: MergeOptions) -> int:
     config = configuration.load(None, options.set)
     maps = [load_map(folder) for folder in options.maps]
     for (name_a, a), (name_b, b) in combinations(zip(options.maps, maps, strict=True), 2):
-        if share_a_walk(a, b):
+        if share_a_session(a, b):
             raise StereoSfmError(f"{name_a} and {name_b} hold the same walk: merge takes maps of different walks")
     result = merge(maps, _vocabulary(maps[0], config.loop.vocabulary), config.loop, config.mapper)
     save_map(result.saved, options.output)

@@ -1,1 +1,1 @@
-"""What leaves the project: trajectories, COLMAP, PLY, g2o, floor plans."""
+"""Exporters: trajectories, COLMAP, PLY, g2o, floor plans."""

@@ -1,6 +1,6 @@
-"""A floor plan of the store: occupancy from points, free space along the rays to them, aligned to the aisles.
+"""A floor plan of the store: occupancy from map points, free space from their rays, aligned with the aisles.
 
-Written as ROS's map_server reads it: a grey PNG (white free, black occupied, grey unknown) and a YAML beside it.
+Written in the format of ROS's map_server: a grey PNG (white free, black occupied, grey unknown) and a YAML file.
 """
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportMissingTypeArgument=false
@@ -21,20 +21,20 @@ from stereo_sfm.maps.saved_map import SavedMap
 from stereo_sfm.types import F64, I32, U8, Bool
 
 FREE, OCCUPIED, UNKNOWN = 254, 0, 205
-LOW, HIGH = 0.15, 1.9  # metres above the floor that a robot can bump into
-MAX_RANGE = 6.0  # metres; stereo points further away blur the plan
-MARGIN = 0.5  # metres around what was seen
-MIN_HITS = 3  # points that make a cell occupied
+LOW, HIGH = 0.15, 1.9  # height range in metres of obstacles for the robot
+MAX_RANGE = 6.0  # metres; farther stereo points are too uncertain
+MARGIN = 0.5  # metres around the observed area
+MIN_HITS = 3  # points in an occupied cell
 MAX_CELLS = 10**8  # 500 m x 500 m at 5 cm
 
 
 @dataclass(frozen=True, eq=False)
 class FloorPlan:
-    """Row 0 of `image` is the far end of y, as pictures are; cell (0, 0) of map_server is its last row."""
+    """A floor plan. Row 0 of `image` has the largest y; cell (0, 0) of map_server is in the last row."""
 
     image: U8  # (H, W) FREE, OCCUPIED or UNKNOWN
     resolution: float  # metres per pixel
-    origin: tuple[float, float]  # metres, lower left corner of the picture in the floor frame
+    origin: tuple[float, float]  # metres, lower left corner of the image in the floor frame
     map_T_floor: F64  # (4, 4) floor frame: x and y along the aisles and across, z up, z = 0 on the floor
 
 
@@ -42,7 +42,7 @@ def make_floor_plan(s: MapSnapshot, resolution: float = 0.05) -> FloorPlan:
     """Find the floor and the aisles' direction, then count hits and passing rays per cell.
 
     Raises:
-        StereoSfmError: too few points, or cells of no size or too small a one.
+        StereoSfmError: too few points, or an invalid resolution.
     """
     if not (math.isfinite(resolution) and resolution > 0):
         raise StereoSfmError(f"the resolution of a floor plan must be above 0 metres, not {resolution}")
@@ -60,7 +60,7 @@ def make_floor_plan(s: MapSnapshot, resolution: float = 0.05) -> FloorPlan:
     cells = np.ceil((corners.max(0) + MARGIN - low) / resolution)
     if not cells.prod() <= MAX_CELLS:
         raise StereoSfmError(
-            f"a floor plan with {resolution:g} m a pixel would be {cells[0]:.3g} x {cells[1]:.3g} pixels"
+            f"a floor plan with {resolution:g} m per pixel would have {cells[0]:.3g} x {cells[1]:.3g} pixels"
         )
     size = cells.astype(int)
     passed = np.zeros((size[1], size[0]), np.int32)
@@ -78,7 +78,7 @@ def _paint(hits: I32, passed: I32) -> U8:
     rays = cv2.boxFilter(passed.astype(np.float32), -1, (3, 3))
     occupied = (hits > 0) & (blurred >= MIN_HITS) & (blurred > 0.25 * rays)
     image = np.full(hits.shape, UNKNOWN, np.uint8)
-    image[passed > 1] = FREE  # one ray alone may belong to a wrong point
+    image[passed > 1] = FREE  # a single ray may belong to an outlier
     image[occupied] = OCCUPIED
     return np.ascontiguousarray(image[::-1])
 
@@ -105,10 +105,12 @@ def _trace(start, end, low, resolution, passed):
 
 
 def find_floor(s: MapSnapshot) -> F64:
-    """map_T_floor (4, 4): z up from the floor plane, x along the dominant horizontal direction of what stands on it."""
+    """map_T_floor (4, 4): z up from the floor plane, x along the dominant direction of the structure above it."""
     down = s.map_T_kf[:, :3, 1].mean(0)
     if np.linalg.norm(down) < 0.3:
-        raise StereoSfmError("no floor plan: the cameras look in all directions, which way is down is not known")
+        raise StereoSfmError(
+            "no floor plan: the vertical direction is unknown, since the cameras look in all directions"
+        )
     down /= np.linalg.norm(down)
     centre = s.map_T_kf[:, :3, 3].mean(0)
     below = (s.points - centre) @ down
@@ -150,7 +152,7 @@ def _floor_plane(points: F64, candidates: Bool, down: F64) -> tuple[F64, float]:
 def aisle_direction(flat: F64) -> float:
     """Angle in radians, within 45 degrees of 0, that makes the points (N, 2) fall on the fewest lines.
 
-    Shelf fronts along an axis give a histogram of few high bars: the angle with the largest sum of squared counts.
+    Shelf fronts along an axis give a histogram with few high bars: the result maximizes the sum of squared counts.
     """
     if len(flat) < 10:
         return 0.0
@@ -172,7 +174,7 @@ def aisle_direction(flat: F64) -> float:
 
 
 def plan_files(path: Path) -> tuple[Path, Path]:
-    """PATH.png and PATH.yaml; `path` may carry either ending, any other dot in it is part of the name."""
+    """PATH.png and PATH.yaml; `path` may have either suffix, any other dot is part of the name."""
     name = path.name.removesuffix(".png").removesuffix(".yaml")
     return path.with_name(f"{name}.png"), path.with_name(f"{name}.yaml")
 

@@ -1,4 +1,4 @@
-"""One map or trajectory in the format of another program, by the format's name."""
+"""Export a map or trajectory by the name of the format."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ TRAJECTORY_FORMATS = ("tum", "kitti", "euroc")
 
 
 def export_map(saved: SavedMap, path: str | Path, format: str, resolution_m: float = 0.05) -> None:
-    """Write a map in the format of another program; what lies at the path is replaced.
+    """Write a map in the format of another program; existing files are replaced.
 
     Args:
         saved: from `System.saved_map()` or `load_map(...)`.
         path: a file, or a folder for colmap.
         format: one of `MAP_FORMATS`.
-        resolution_m: of the floor plan, metres a pixel.
+        resolution_m: of the floor plan, metres per pixel.
 
     Raises:
-        StereoSfmError: another format.
+        StereoSfmError: unknown format.
     """
     from stereo_sfm.export.colmap import export_colmap
     from stereo_sfm.export.floor_plan import export_floor_plan
@@ -47,15 +47,15 @@ def export_map(saved: SavedMap, path: str | Path, format: str, resolution_m: flo
 def export_trajectory(
     trajectory: Trajectory, path: str | Path, format: str = "tum", what: str = "world_T_cam0"
 ) -> None:
-    """Write a trajectory as a file of other programs; what lies at the path is replaced.
+    """Write a trajectory file for other programs; an existing file is replaced.
 
     Args:
         trajectory: from `System.trajectory()`, `read_trajectory(...)`, ...
         format: one of `TRAJECTORY_FORMATS`.
-        what: which poses they are, for the file's heading.
+        what: meaning of the poses, for the header of the file.
 
     Raises:
-        StereoSfmError: another format.
+        StereoSfmError: unknown format.
     """
     from stereo_sfm.export import trajectories
 
@@ -70,7 +70,7 @@ def export_trajectory(
 def _check(format: str, known: Sequence[str], kind: str) -> None:
     if format not in known:
         near = did_you_mean(format, known)
-        raise StereoSfmError(f"a {kind} is not written as '{format}'{near}: choose one of {', '.join(known)}")
+        raise StereoSfmError(f"unknown {kind} format '{format}'{near}: choose one of {', '.join(known)}")
 
 
 def _ready(path: str | Path) -> Path:

@@ -1,4 +1,4 @@
-"""The keyframes as a pose graph in g2o's text form, written by GTSAM (which knows the order of the information)."""
+"""The keyframes as a pose graph in g2o's text format, written by GTSAM."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from stereo_sfm.maps.saved_map import SavedMap
 
 
 def graph_edges(s: MapSnapshot) -> Edges:
-    """Edges between keyframes that follow each other in a submap, and between those that share many points."""
+    """Edges between consecutive keyframes of a submap, and between keyframes that share many points."""
     shape = (len(s.kf_ids), len(s.pt_ids))
     sees = scipy.sparse.csr_array((np.ones(len(s.obs_kf), np.int32), (s.obs_kf, s.obs_pt)), shape=shape)
     shared = scipy.sparse.triu(sees @ sees.T, 1).tocoo()
@@ -40,5 +40,5 @@ def export_g2o(saved: SavedMap, path: Path) -> None:
         noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([radians] * 3 + [metres] * 3))
         measured = gtsam.Pose3(se3.orthonormalize(pose))
         graph.add(gtsam.BetweenFactorPose3(int(s.kf_ids[i]), int(s.kf_ids[j]), measured, noise))
-    path.open("ab").close()  # raises OSError where GTSAM would write nothing and say nothing
+    path.open("ab").close()  # raises OSError where GTSAM would fail silently
     gtsam.writeG2o(graph, values, str(path))

@@ -1,4 +1,4 @@
-"""Point clouds as binary little-endian PLY, with scalars that CloudCompare and MeshLab show."""
+"""Point clouds as binary little-endian PLY, with scalar fields for CloudCompare and MeshLab."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def write_ply(path: Path, points: F64, colours: U8 | None = None, scalars: dict[
 
 
 def export_ply(saved: SavedMap, path: Path) -> None:
-    """A map's points, coloured from red (seen by two keyframes) to blue (seen by many)."""
+    """The points of a map, coloured from red (seen by two keyframes) to blue (seen by many)."""
     s = saved.snapshot
     views = np.bincount(s.obs_pt, minlength=len(s.pt_ids)).astype(float)
     share = np.clip((views - 2) / 8, 0, 1)

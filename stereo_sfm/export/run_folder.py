@@ -17,7 +17,7 @@ from stereo_sfm.errors import StereoSfmError
 TRAJECTORIES = ("trajectory_odom.tum", "trajectory_odom.kitti", "trajectory_map.tum", "trajectory_map.kitti")
 PICTURES = ("trajectory.png", "errors.png", "tracking.png", "times.png")
 NUMBERS = ("keyframes.tum", "config.toml", "rig.yaml", "stats.json", "report.md")
-KEPT_MAP = "map"  # folder of the run's own map
+KEPT_MAP = "map"  # subfolder with the run's own map
 FILES = ("run.mcap", "run.rrd", *TRAJECTORIES, *NUMBERS, *PICTURES)
 
 
@@ -28,18 +28,18 @@ def default_folder(source_name: str, now: datetime) -> Path:
 
 
 def is_free(folder: Path) -> bool:
-    """Whether nothing is there, or an empty folder."""
+    """Whether the path does not exist or is an empty folder."""
     return not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
 
 
 class FolderLock:
-    """Says that a folder is a run's, as long as this object lives; nothing is written, a killed run leaves nothing."""
+    """Locks an output folder as long as this object exists; no file is written, a killed run leaves no lock."""
 
     def __init__(self, folder: Path) -> None:
         """Lock an existing folder.
 
         Raises:
-            StereoSfmError: another run has it.
+            StereoSfmError: another run holds the lock.
         """
         descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
         self.release = weakref.finalize(self, os.close, descriptor)
@@ -47,33 +47,34 @@ class FolderLock:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             self.release()
-            raise StereoSfmError(f"a run is writing to {folder}: choose another -o, or wait for its end") from None
-        except OSError:  # a network folder without locks
+            raise StereoSfmError(
+                f"another run is writing to {folder}: choose another -o, or wait for its end"
+            ) from None
+        except OSError:  # a network file system without locks
             return
 
 
 def prepare_folder(folder: Path, overwrite: bool) -> FolderLock:
-    """Make the folder of a new run; an empty one will do. It is the run's as long as the lock lives.
+    """Create the folder of a new run, or take an empty one, and lock it.
 
-    With `overwrite` the files of an earlier run are removed, so that none of them is taken for this run's; whatever
-    else lies there stays.
+    With `overwrite` the files of an earlier run are removed, other files stay.
 
     Raises:
-        StereoSfmError: it holds something that may not be overwritten, another run has it, or it cannot be made.
+        StereoSfmError: it is not empty, locked by another run, or cannot be created.
     """
     try:
         if not (overwrite or is_free(folder)):
-            raise StereoSfmError(f"{folder} exists: choose another -o, or say --overwrite")
+            raise StereoSfmError(f"{folder} exists: choose another -o, or add --overwrite")
         folder.mkdir(parents=True, exist_ok=True)
         lock = FolderLock(folder)
         discard_files(folder)
         return lock
     except OSError as error:
-        raise StereoSfmError(f"cannot make the output folder {folder}: {error.strerror}") from None
+        raise StereoSfmError(f"cannot create the output folder {folder}: {error.strerror}") from None
 
 
 def discard_files(folder: Path) -> None:
-    """Remove the files of a run; whatever else lies there stays."""
+    """Remove the files of a run; other files stay."""
     made_later = [*folder.glob("export_*"), *folder.glob("matches/*.png")]
     if (folder / KEPT_MAP / "map.json").is_file():
         made_later += [folder / KEPT_MAP / name for name in ("map.json", "rig.yaml")]
@@ -83,7 +84,7 @@ def discard_files(folder: Path) -> None:
 
 
 def link_latest(folder: Path) -> None:
-    """Let `runs/latest` point to a folder in `runs`, where the file system has links."""
+    """Point `runs/latest` to a folder in `runs`, if the file system supports links."""
     link = folder.parent / "latest"
     if folder.parent.name != "runs" or (link.exists() and not link.is_symlink()):
         return
@@ -95,11 +96,11 @@ def link_latest(folder: Path) -> None:
 
 
 def write_json(path: Path, data: object) -> None:
-    """Indented, floats as they are, numpy numbers as plain ones."""
+    """Indented JSON; numpy scalars become plain numbers."""
     path.write_text(json.dumps(data, indent=2, default=_plain) + "\n", encoding="utf-8")
 
 
 def _plain(value: object) -> object:
     if isinstance(value, np.generic):
         return value.item()
-    raise TypeError(f"{type(value).__name__} has no JSON form")
+    raise TypeError(f"{type(value).__name__} is not JSON serializable")

@@ -1,4 +1,4 @@
-"""Writers of trajectories in the three text forms that evaluation tools read."""
+"""Writers of trajectories in the text formats of TUM, KITTI and EuRoC."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from stereo_sfm.types import F64, I64, Trajectory
 
 
 def seconds(stamp_ns: int) -> str:
-    """Nanoseconds -> decimal seconds with every digit."""
+    """Nanoseconds -> decimal seconds, exact."""
     sign = "-" if stamp_ns < 0 else ""
     whole, part = divmod(abs(int(stamp_ns)), 10**9)
     return f"{sign}{whole}.{part:09d}"
 
 
 def write_tum(path: Path, trajectory: Trajectory, what: str = "world_T_cam0") -> None:
-    """`t tx ty tz qx qy qz qw`, seconds and metres; `what` names the pose in the heading."""
+    """`t tx ty tz qx qy qz qw`, seconds and metres; `what` names the pose in the header."""
     lines = [f"# {what}: stamp_s tx ty tz qx qy qz qw"]
     quaternions = se3.quaternion_from_rotation(trajectory.poses[:, :3, :3])
     for stamp, t, q in zip(trajectory.stamp_ns, trajectory.positions, quaternions, strict=True):
@@ -28,9 +28,9 @@ def write_tum(path: Path, trajectory: Trajectory, what: str = "world_T_cam0") ->
 
 
 def named_pose(path: Path, otherwise: str = "world_T_cam0") -> str:
-    """What the heading of a trajectory file says its poses are, "world_T_cam0" or "world_T_body".
+    """The name of the poses in the header of a trajectory file, "world_T_cam0" or "world_T_body".
 
-    A file that somebody else wrote may have any heading, or none: then `otherwise`.
+    `otherwise` for files of other programs without such a header.
     """
     with path.open() as stream:
         found = re.match(r"#.*\b(world_T_(?:cam0|body))\b", stream.readline())
@@ -38,7 +38,7 @@ def named_pose(path: Path, otherwise: str = "world_T_cam0") -> str:
 
 
 def write_kitti(path: Path, poses: F64) -> None:
-    """Twelve numbers a line for each of (N, 4, 4), relative to the first."""
+    """Twelve numbers per line for each pose of (N, 4, 4), relative to the first."""
     relative = se3.inverse(poses[0]) @ poses if len(poses) else poses
     rows = relative[:, :3, :].reshape(-1, 12)
     path.write_text("".join(" ".join(f"{v:.9e}" for v in row) + "\n" for row in rows), encoding="utf-8")
@@ -54,15 +54,15 @@ def write_euroc(path: Path, trajectory: Trajectory, what: str = "world_T_cam0") 
 
 
 def fill_missing(frame_ids: I64, poses: F64, step: int = 1) -> F64:
-    """One pose for every frame id from the first to the last, for forms without stamps.
+    """One pose for every frame id from the first to the last, for formats without stamps.
 
     Args:
         frame_ids: (N,) ascending.
         poses: (N, 4, 4).
-        step: ids that follow each other (every third frame of a source was used: 3).
+        step: difference of consecutive ids (3 if every third frame of a source was used).
 
     Returns:
-        (M, 4, 4): missing ones lie on the geodesic between their neighbours.
+        (M, 4, 4): missing poses are interpolated on the geodesic between their neighbours.
     """
     if not len(frame_ids):
         return poses

@@ -18,7 +18,7 @@ from stereo_sfm.types import F64, Bool
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """One eye: image size in pixels, focal lengths and principal point in pixels, distortion coefficients."""
+    """One camera: image size in pixels, focal lengths and principal point in pixels, distortion coefficients."""
 
     width: int
     height: int
@@ -27,7 +27,7 @@ class Camera:
     cx: float
     cy: float
     distortion: tuple[float, ...] = ()
-    params: F64 = field(init=False, repr=False)  # (16,) as geometry.kernels wants it
+    params: F64 = field(init=False, repr=False)  # (16,) in the layout of geometry.kernels
 
     model: ClassVar[str] = ""
     model_id: ClassVar[int] = -1
@@ -35,7 +35,7 @@ class Camera:
 
     def __post_init__(self) -> None:
         if len(self.distortion) > self.max_coefficients:
-            raise ValueError(f"{self.model} takes at most {self.max_coefficients} distortion coefficients")
+            raise ValueError(f"{self.model} has at most {self.max_coefficients} distortion coefficients")
         p = np.zeros(kernels.PARAMS)
         p[:4] = self.fx, self.fy, self.cx, self.cy
         p[4 : 4 + len(self.distortion)] = self.distortion
@@ -58,7 +58,7 @@ class Camera:
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
 
     def project(self, points: F64) -> F64:
-        """Points (..., 3) in this camera -> (..., 2) px; NaN where the camera cannot see by its model."""
+        """Points (..., 3) in this camera -> (..., 2) px; NaN outside the range of the model."""
         points = np.asarray(points, float)
         flat = np.ascontiguousarray(points.reshape(-1, 3))
         return kernels.project_many(self.model_id, self.params, flat).reshape(*points.shape[:-1], 2)
@@ -77,7 +77,7 @@ class Camera:
         return kernels.unproject_many(self.model_id, self.params, flat).reshape(*uv.shape[:-1], 3)
 
     def inside(self, uv: F64, border: float = 0.0) -> Bool:
-        """(..., 2) px -> whether the pixel lies in the image, `border` px from the edge; False for NaN."""
+        """(..., 2) px -> whether the pixel is in the image, at least `border` px from the edge; False for NaN."""
         u, v = uv[..., 0], uv[..., 1]
         return (u >= border) & (v >= border) & (u <= self.width - 1 - border) & (v <= self.height - 1 - border)
 
@@ -109,7 +109,7 @@ class RadTan(Camera):
     max_coefficients: ClassVar[int] = 8
 
     def _limit(self, params: F64) -> float:
-        """Largest squared normalised radius up to which the radial part grows, 0 if it always does (to 20)."""
+        """Largest squared normalised radius up to which the radial part grows, 0 if it always does (up to 20)."""
         r = np.linspace(0, 20, 40001)[1:]
         r2 = r * r
         k1, k2, _, _, k3, k4, k5, k6 = params[4:12]
@@ -140,8 +140,8 @@ class KannalaBrandt(Camera):
 class Epipolar(Camera):
     """Wide rectified projection: u = fx * longitude + cx along the baseline, v = fy * angle of the epipolar plane + cy.
 
-    With both eyes rotated so that the baseline is their x axis, a row of one image and the same row of the other are
-    the two halves of one epipolar plane, at any field of view below 180 degrees.
+    If both cameras are rotated so that the baseline is their x axis, equal rows of both images lie in one epipolar
+    plane, for any field of view below 180 degrees.
     """
 
     model: ClassVar[str] = "epipolar"

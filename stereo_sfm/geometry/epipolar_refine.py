@@ -1,4 +1,4 @@
-"""Least squares on the epipolar geometry of two views, with the valleys of a narrow view in mind."""
+"""Least squares on the epipolar geometry of two views, robust to the local minima of narrow views."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ def refine_motion(
     bearings1: F64,
     scale: float,
     iterations: int = 8,
-    slope_moves: bool = True,
+    full_derivative: bool = True,
 ) -> tuple[F64, F64]:
     """Gauss-Newton on the spherical Sampson distance with Cauchy weights of width `scale` radians.
 
-    Five parameters: a rotation vector on the left of `rotation` and two on the sphere of directions. With `slope_moves`
-    it is the whole derivative of the distance, and ends in the nearest minimum. Without, the denominator is held in
-    each step: a biased answer, drawn towards the middle of the view, but one that crosses from valley to valley.
+    Five parameters: a rotation vector on the left of `rotation` and two on the sphere of directions.
+    `full_derivative` differentiates the whole distance and converges to the nearest minimum. Otherwise the denominator
+    is fixed in each step: biased towards the centre of the view, but able to leave local minima.
     """
     for _ in range(iterations):
         p = bearings0 @ rotation.T
@@ -32,7 +32,7 @@ def refine_motion(
         residual = error / slope
         weight = 1.0 / (1.0 + (residual / scale) ** 2)
         by_rotation, by_direction = np.cross(p, np.cross(bearings1, direction)), np.cross(p, bearings1)
-        if slope_moves:
+        if full_derivative:
             half_rotation = np.cross(p, np.cross(plane1, direction)) - 2 * error[:, None] * by_rotation
             half_direction = np.cross(p, plane1) + np.cross(bearings1, plane0) - 2 * error[:, None] * by_direction
             by_rotation = by_rotation - (residual / slope)[:, None] * half_rotation
@@ -53,20 +53,21 @@ def refine_motion(
 def refine_from_many(
     rotation: F64, direction: F64, still: F64, bearings0: F64, bearings1: F64, scale: float
 ) -> tuple[F64, F64]:
-    """`refine_motion` from a solution and from steps along each axis with the rotation `still`; the best one.
+    """The best of `refine_motion` from a solution and from translations along each axis with the rotation `still`.
 
-    In a narrow view a small step sideways looks like a turn, and the cost has a valley for each: one start is not
-    enough. Give all matches (Cauchy weights bear the outliers), not those that one solution chose, or that one wins.
-    The signs of the directions are free.
+    In a narrow view a small sideways translation resembles a rotation, and the cost has a minimum for each: one start
+    is not enough. Pass all matches (Cauchy weights handle outliers), not the inliers of one solution, which would
+    favour it. The signs of the directions are arbitrary.
     """
     starts = [(rotation, direction), *((still, axis) for axis in np.eye(3))]
     starts += [
-        refine_motion(still, axis, bearings0, bearings1, scale, iterations=8, slope_moves=False) for axis in np.eye(3)
+        refine_motion(still, axis, bearings0, bearings1, scale, iterations=8, full_derivative=False)
+        for axis in np.eye(3)
     ]
     refined = [refine_motion(r, d, bearings0, bearings1, scale, iterations=12) for r, d in starts]
     costs = [
         np.log1p((epipolar_residuals((se3.skew(d) @ r)[None], bearings0, bearings1)[0] / scale) ** 2).sum()
         for r, d in refined
     ]
-    best = int(np.argmin(costs))  # a plane has two exact answers: the first one stays unless another is clearly better
+    best = int(np.argmin(costs))  # a plane has two exact solutions: keep the first unless another is clearly better
     return refined[best] if costs[best] < 0.99 * costs[0] - 1e-9 * len(bearings0) else refined[0]

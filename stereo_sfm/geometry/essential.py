@@ -1,7 +1,7 @@
 """Relative pose of two calibrated views from point matches: eight-point, five-point, decomposition, refinement.
 
 Retail paper equations 1-5; sparse localization paper equations 21-43; Hartley and Zisserman, Multiple View Geometry
-(2nd ed.), sections 9.6 and 11.2. Bearings instead of pixels, hence the same code for pinhole and fisheye.
+(2nd ed.), sections 9.6 and 11.2. On bearings instead of pixels, hence the same code for pinhole and fisheye.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from stereo_sfm.geometry.robust import Consensus, Degenerate, ransac
 from stereo_sfm.geometry.two_view import epipolar_residuals, parallax_angles, ray_depths
 from stereo_sfm.types import F64, I64, Bool
 
-_MIN_GAIN = 9.0  # how much a translation must improve the fit of a rotation to be believed
+_MIN_GAIN = 9.0  # ratio by which a translation must improve the fit of a pure rotation to be accepted
 _W = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True, eq=False)
 class RelativePose:
-    """p1 = rotation @ p0 + scale * direction, the scale unknown."""
+    """p1 = rotation @ p0 + scale * direction with unknown scale."""
 
     rotation: F64  # (3, 3)
-    direction: F64  # (3,) unit; NaN-free also for pure rotation, where it means nothing
+    direction: F64  # (3,) unit; finite but meaningless for pure rotation
     inliers: Bool  # (N,) of the epipolar geometry
     in_front: Bool  # (N,) inliers that triangulate in front of both cameras
     parallax: float  # radians, median over inliers of the angle between R b0 and b1
-    pure_rotation: bool  # a rotation alone explains the inliers: the direction is not determined
+    pure_rotation: bool  # the inliers fit a pure rotation: the direction is undetermined
 
 
 def _conditioning(vectors: F64) -> F64:
-    """(3, 3) similarity of Hartley's normalization when all vectors look forward, else the identity."""
+    """(3, 3) similarity of Hartley's normalization when all vectors point forward, else the identity."""
     if vectors[..., 2].min() < 0.05:
         return np.eye(3)
     xy = vectors[..., :2] / vectors[..., 2:]
@@ -61,7 +61,7 @@ def eight_point(x0: F64, x1: F64) -> F64:
         x0, x1: (N, 3), N >= 8.
 
     Raises:
-        Degenerate: "too_few_matches"; "degenerate_points" where the equations leave more than one solution (points on
+        Degenerate: "too_few_matches"; "degenerate_points" where the equations have more than one solution (points on
             a line or a plane, repeated points, no translation).
     """
     if len(x0) < 8:
@@ -105,7 +105,7 @@ def decompose(essential: F64) -> tuple[F64, F64]:
 def choose_in_front(
     rotations: F64, translations: F64, bearings0: F64, bearings1: F64, min_parallax: float = 0.0
 ) -> tuple[int, Bool]:
-    """Which motion puts the most points in front of both cameras, and which points those are.
+    """Index of the motion with most points in front of both cameras, and those points.
 
     Raises:
         Degenerate: "ambiguous_cheirality" when the runner-up has almost as many (more than 0.8 of them).
@@ -159,11 +159,11 @@ def essential_ransac(
 
 
 def _small_motion(bearings0: F64, bearings1: F64, chosen: Bool, still: F64, off: F64, threshold: float) -> RelativePose:
-    """The motion where a rotation alone (`still`) leaves every inlier within two thresholds.
+    """The motion where a pure rotation (`still`) leaves every inlier within two thresholds.
 
     Without translation the squared angles `off` (two directions, noise of both views) are about 6.1 times the squared
-    Sampson distances in the median; a translation is believed when it makes them more than 9 times as large, and when
-    at least two thirds of the points then lie in front.
+    Sampson distances in the median; a translation is accepted if it makes them more than 9 times as large, and if at
+    least two thirds of the points then lie in front.
     """
     b0, b1 = bearings0[chosen], bearings1[chosen]
     direction = np.linalg.svd(np.cross(b0 @ still.T, b1), full_matrices=False)[2][-1]
@@ -185,7 +185,7 @@ def _small_motion(bearings0: F64, bearings1: F64, chosen: Bool, still: F64, off:
 def _rotation_alone(
     bearings0: F64, bearings1: F64, threshold: float, rng: np.random.Generator, refusal: Degenerate
 ) -> RelativePose:
-    """The rotation that explains the matches where no essential matrix does: without any noise none is determined."""
+    """The pure rotation of the matches where no essential matrix fits: noise-free matches do not determine one."""
     try:
         chosen = rotation_ransac(bearings0, bearings1, 2 * threshold, rng).inliers
         refuse_line(bearings0[chosen], 2 * threshold)
@@ -209,11 +209,11 @@ def relative_pose(
     min_ratio: float = 0.25,
     need_direction: bool = True,
 ) -> RelativePose:
-    """Rotation and direction of translation between two views, with the pure-rotation case recognised.
+    """Rotation and direction of translation between two views, with detection of pure rotation.
 
-    A rotation alone is fitted to the inliers; when it explains (almost) all of them, the essential matrix is arbitrary
+    A pure rotation is fitted to the inliers; if it fits (almost) all of them, the essential matrix is arbitrary
     and the decomposition may pick a twisted rotation, so the fitted rotation is returned with `pure_rotation` set.
-    Without `need_direction`, points so far that the sign of their depth is open do not matter.
+    Without `need_direction`, points too far for a reliable sign of depth are ignored.
 
     Raises:
         Degenerate: as `essential_ransac`, `decompose` and `choose_in_front`; "collinear" as `refuse_line`.
@@ -244,11 +244,11 @@ def relative_pose(
         best, front = int(np.argmax(np.trace(rotations, axis1=1, axis2=2))), np.ones(len(b0), bool)
     rotation, direction = rotations[best], translations[best]
     if refine:
-        # The denominator held: biased towards the middle of the view, which on real images (TUM fr1_xyz, 1 to 3 degrees
-        # of parallax) is nearer to the truth than the exact minimum: 0.6 against 1.0 degrees of rotation in the mean.
-        for _ in range(3):  # refine, then let the better motion say who agrees with it
+        # Fixed denominator: biased towards the centre of the view, which on real images (TUM fr1_xyz, 1 to 3 degrees of
+        # parallax) is closer to the truth than the exact minimum: mean rotation error 0.6 instead of 1.0 degrees.
+        for _ in range(3):  # refine, then update the inliers
             rotation, direction = refine_motion(
-                rotation, direction, bearings0[chosen], bearings1[chosen], 0.5 * threshold, slope_moves=False
+                rotation, direction, bearings0[chosen], bearings1[chosen], 0.5 * threshold, full_derivative=False
             )
             chosen = epipolar_residuals((se3.skew(direction) @ rotation)[None], bearings0, bearings1)[0] <= threshold
         depth0, depth1 = ray_depths(bearings0, bearings1, rotation, direction)

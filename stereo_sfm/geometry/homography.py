@@ -1,4 +1,4 @@
-"""Homographies between bearings, and the guard that keeps a monocular start away from planes and pure rotations.
+"""Homographies between bearings, and the test that rejects planes and pure rotations for monocular initialization.
 
 Four-point DLT (Hartley and Zisserman, section 4.1) on bearings: b1 ~ H b0. The choice between a homography and an
 epipolar geometry follows ORB-SLAM (Mur-Artal, Montiel, Tardos, T-RO 31, 2015, section IV): both are scored by

@@ -1,7 +1,7 @@
 """Compiled scalar camera kernels. One function per model; `project_one` and `unproject_one` dispatch on its id.
 
-Everything that projects (cameras, motion-only optimisation, bundle adjustment, the simulator) calls these, so there is
-one implementation of each model. `params` is always a (16,) float64 array: fx fy cx cy, eight distortion
+Everything that projects (cameras, motion-only optimisation, bundle adjustment, the simulator) uses these: each model
+has one implementation. `params` is always a (16,) float64 array: fx fy cx cy, eight distortion
 coefficients, then the limit of validity at index 12 (pinhole: largest squared normalised radius; Kannala-Brandt:
 largest angle from the axis; 0 means none).
 """
@@ -161,7 +161,7 @@ def unproject_one(model, p, u, v):
 def _kb_theta(p, d):
     """Solve theta * (1 + k1 theta^2 + ...) = d on [0, limit] by Newton steps kept inside a shrinking bracket.
 
-    A step that is not at most half as long as the one before goes to the middle: near the limit Newton may cycle.
+    A step longer than half the previous one is replaced by bisection: near the limit Newton may cycle.
     """
     lo, hi = 0.0, p[12]
     h2 = hi * hi
@@ -190,7 +190,7 @@ def _kb_theta(p, d):
 def _radtan_undistort(p, mx, my):
     """Newton on the 2-D distortion, started from the fixed-point iterate; NaN beyond the monotonic radius."""
     x, y = mx, my
-    for _ in range(8):  # a few contractions bring the start inside Newton's basin
+    for _ in range(8):  # fixed-point steps into Newton's region of convergence
         r2 = x * x + y * y
         num = 1 + r2 * (p[4] + r2 * (p[5] + r2 * p[8]))
         den = 1 + r2 * (p[9] + r2 * (p[10] + r2 * p[11]))

@@ -1,8 +1,8 @@
 """Straight edges of the scene as great circles on the sphere of bearings, for any camera.
 
-A line in space and the camera centre span a plane; the plane's normal is all that a view tells about the line's
-direction (perpendicular to it). A pinhole image is searched as it is. A fisheye image bends lines, so it is first
-looked at through the faces of a cube (pinhole views of one angular resolution), where they are straight again.
+A line in space and the camera centre span a plane; the plane's normal is all that one view shows of the line's
+direction (perpendicular to it). A pinhole image is searched directly. A fisheye image bends lines, so it is first
+resampled to the faces of a cube (pinhole views of one angular resolution), where they are straight.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import numpy as np
 from stereo_sfm.geometry.cameras import Camera, Pinhole
 from stereo_sfm.types import F32, F64, U8, Message
 
-_CUBE_EDGE = 1.02  # tangent of half a face's angle: faces overlap a little, so that no line is lost at an edge
-_BORDER_PX = 4  # segments this near to the end of the image are the image's edge
+_CUBE_EDGE = 1.02  # tangent of half a face's angle: faces overlap slightly, so that no line is lost at an edge
+_BORDER_PX = 4  # segments closer to the image border are artefacts of it
 _MAX_PINHOLE_TAN = 1.7  # an undistorted single face up to about 60 degrees from the axis
 
 
@@ -42,7 +42,7 @@ class _Face:
     focal: float
     centre: tuple[float, float]
     maps: tuple[F32, F32] | None  # for cv2.remap; None where the image itself is the face
-    margin: F32 | None  # (H, W) px to the nearest pixel that the camera does not see; None where all is seen
+    margin: F32 | None  # (H, W) px to the nearest pixel outside the camera's view; None where every pixel is valid
 
 
 class LineDetector:
@@ -50,7 +50,7 @@ class LineDetector:
 
     def __init__(self, camera: Camera, min_length_px: float = 15.0, max_lines: int = 600) -> None:
         """Args:
-        camera: the eye whose images will come.
+        camera: of the images.
         min_length_px: shorter segments are dropped. max_lines: the longest are kept.
         """
         self._faces = _faces(camera)
@@ -87,7 +87,7 @@ class LineDetector:
 
 
 def _inside(segments: F64, shape: tuple[int, ...], margin: F32 | None) -> np.ndarray:
-    """(L,) segments whose ends and middle are not at the border of what the camera sees."""
+    """(L,) segments whose ends and middle are not at the border of the camera's view."""
     probes = np.concatenate([segments, segments.mean(axis=1, keepdims=True)], axis=1)
     u = np.rint(probes[..., 0]).astype(int).clip(0, shape[1] - 1)
     v = np.rint(probes[..., 1]).astype(int).clip(0, shape[0] - 1)

@@ -17,7 +17,7 @@ from stereo_sfm.types import F64
 
 @dataclass(frozen=True, eq=False)
 class RefinedPose:
-    """cam_T_ref with the residuals it leaves."""
+    """cam_T_ref with residuals and covariance."""
 
     cam_T_ref: F64  # (4, 4)
     residuals: F64  # (N,) radians
@@ -31,9 +31,9 @@ def bearing_errors(cam_T_ref: F64, points: F64, bearings: F64) -> F64:
 
 
 def pose_covariance(points_cam: F64, sigma: float) -> F64:
-    """(6, 6) covariance of a camera pose T @ exp(xi) that was fitted to N points with `sigma` radians of noise each.
+    """(6, 6) covariance of a camera pose T @ exp(xi) fitted to N points with `sigma` radians of noise each.
 
-    Points (N, 3) in the camera. Directions that the points do not fix get a large, finite variance.
+    Points (N, 3) in the camera. Undetermined directions get a large, finite variance.
     """
     distance = np.linalg.norm(points_cam, axis=1).clip(1e-9)
     unit = points_cam / distance[:, None]
@@ -44,14 +44,14 @@ def pose_covariance(points_cam: F64, sigma: float) -> F64:
 
 
 def refine_pose(points: F64, bearings: F64, cam_T_ref: F64, sigma: float, iterations: int = 10) -> RefinedPose:
-    """Least squares from a start that is already close.
+    """Least squares from a close initial pose.
 
     Args:
         points: (N, 3) metres in the reference frame. bearings: (N, 3) unit, in the camera.
-        cam_T_ref: (4, 4) start. sigma: radians, noise of a bearing; Huber's bound is 2 sigma.
+        cam_T_ref: (4, 4) initial pose. sigma: radians, noise of a bearing; Huber's bound is 2 sigma.
 
     Raises:
-        Degenerate: "too_few_points" below three, "ill_conditioned" where the points do not fix the pose.
+        Degenerate: "too_few_points" below three, "ill_conditioned" where the points do not determine the pose.
     """
     if len(points) < 3:
         raise Degenerate("too_few_points", f"{len(points)} where 3 are needed")
@@ -69,7 +69,7 @@ def refine_pose(points: F64, bearings: F64, cam_T_ref: F64, sigma: float, iterat
         gradient = np.einsum("n,nij,ni->j", weight, jac, error)
         scale = np.sqrt(np.diag(hessian)).clip(1e-300)
         if np.linalg.cond(hessian / np.outer(scale, scale)) > 1e12:
-            raise Degenerate("ill_conditioned", "the points do not fix the pose")
+            raise Degenerate("ill_conditioned", "the points do not determine the pose")
         step = -np.linalg.solve(hessian, gradient)
         cam_T_ref = se3.exp(step) @ cam_T_ref
         if np.abs(step).max() < 1e-9:

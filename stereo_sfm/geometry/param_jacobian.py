@@ -1,4 +1,4 @@
-"""How a pixel moves with a camera's own parameters: what calibration needs beside `Camera.project_jacobian`."""
+"""Derivatives of a pixel by the camera's own parameters, for calibration."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from stereo_sfm.types import F64
 
 
 def parameter_vector(camera: Camera) -> F64:
-    """(4 + n,) fx fy cx cy and the n distortion coefficients the camera was made with."""
+    """(4 + n,) fx fy cx cy and the n distortion coefficients of the camera."""
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])
 
 
 def with_parameters(camera: Camera, vector: F64) -> Camera:
-    """The same kind of camera with other parameters, in the order of `parameter_vector`."""
+    """A camera of the same model with other parameters, in the order of `parameter_vector`."""
     fx, fy, cx, cy, *distortion = (float(v) for v in vector)
     return type(camera)(camera.width, camera.height, fx, fy, cx, cy, tuple(distortion))
 
@@ -27,7 +27,7 @@ def parameter_jacobian(camera: Camera, points: F64) -> F64:
         points: (N, 3) in the camera.
 
     Returns:
-        (N, 2, 4 + n); rows of points the camera cannot see are not meaningful.
+        (N, 2, 4 + n); rows of points outside the camera's view are meaningless.
     """
     count = len(camera.distortion)
     jac = np.zeros((len(points), 2, 4 + count))
@@ -39,7 +39,7 @@ def parameter_jacobian(camera: Camera, points: F64) -> F64:
 
 
 def _distorted(camera: Camera, points: F64) -> tuple[F64, F64]:
-    """(N, 2) pixel before focal length and centre, and its derivative (N, 2, n) by the coefficients."""
+    """(N, 2) pixel before focal length and principal point, and its derivative (N, 2, n) by the coefficients."""
     uv = camera.project(points)
     distorted = (uv - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
     if camera.model == "kannala_brandt":

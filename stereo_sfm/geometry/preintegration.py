@@ -1,4 +1,4 @@
-"""Inertial samples between two times as one relative motion that does not depend on where it began.
+"""Preintegration of inertial samples into one relative motion, independent of the initial state.
 
 Forster, Carlone, Dellaert, Scaramuzza: On-Manifold Preintegration for Real-Time Visual-Inertial Odometry, TRO 33, 2017;
 equations 35 to 38 and the recursive forms of the appendix. Rates are constant over each interval.
@@ -27,9 +27,9 @@ class Preintegrated:
     rotation: F64  # (3, 3) i_R_j
     velocity: F64  # (3,) m/s
     position: F64  # (3,) m
-    gyro_bias: F64  # (3,) rad/s, taken off the samples
-    accel_bias: F64  # (3,) m/s^2, the same
-    rotation_by_gyro: F64  # (3, 3) derivative of the rotation's right tangent by the gyro's bias
+    gyro_bias: F64  # (3,) rad/s, subtracted from the samples
+    accel_bias: F64  # (3,) m/s^2, subtracted from the samples
+    rotation_by_gyro: F64  # (3, 3) derivative of the rotation's right tangent by the gyroscope bias
     velocity_by_gyro: F64  # (3, 3)
     velocity_by_accel: F64  # (3, 3)
     position_by_gyro: F64  # (3, 3)
@@ -54,11 +54,11 @@ class Preintegrated:
 def preintegrate(
     seconds: F64, gyro: F64, accel: F64, gyro_bias: F64, accel_bias: F64, gyro_noise: float, accel_noise: float
 ) -> Preintegrated:
-    """Put intervals together.
+    """Integrate samples.
 
     Args:
         seconds: (N,) length of each interval. gyro: (N, 3) rad/s. accel: (N, 3) m/s^2, specific force.
-        gyro_bias, accel_bias: (3,) what is taken off the samples.
+        gyro_bias, accel_bias: (3,) subtracted from the samples.
         gyro_noise, accel_noise: densities, rad/s/sqrt(Hz) and m/s^2/sqrt(Hz).
     """
     parts = _integrate(

@@ -54,10 +54,10 @@ def rotation_ransac(
 
 
 def refuse_line(bearings: F64, threshold: float) -> None:
-    """Points on one line of the image (a great circle) do not determine a motion.
+    """Reject points on one line of the image (a great circle), which do not determine a motion.
 
     Args:
-        bearings: (N, 3). threshold: radians, root mean square distance from the great circle that counts as none.
+        bearings: (N, 3). threshold: radians, root mean square distance from a great circle.
 
     Raises:
         Degenerate: "collinear".
@@ -90,7 +90,7 @@ def rigid(source: F64, target: F64, weights: F64 | None = None) -> F64:
     mean_s, mean_t = w @ source, w @ target
     u, s, vt = np.linalg.svd((target - mean_t).T @ (w[:, None] * (source - mean_s)))
     if not s[1] > 1e-10 * max(s[0], 1e-300):
-        raise Degenerate("collinear", "the points do not fix a rotation")
+        raise Degenerate("collinear", "the points do not determine a rotation")
     rotation = _proper(u, vt)
     return se3.from_rotation_translation(rotation, mean_t - rotation @ mean_s)
 

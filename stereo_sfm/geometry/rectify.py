@@ -1,7 +1,7 @@
-"""Rectified projections of a stereo pair: which camera both eyes get, and the tables that fill its pixels.
+"""Rectified projections of a stereo pair: the common virtual camera, and the tables that resample images to it.
 
-Rectification is a choice of projection. Pinhole keeps straight lines straight and crops a fisheye's field of view;
-the epipolar-aligned projection (Abraham and Foerstner, ISPRS Journal 59, 2005) keeps it, rows being epipolar planes.
+The pinhole projection keeps straight lines straight and crops a fisheye's field of view; the epipolar-aligned
+projection (Abraham and Foerstner, ISPRS Journal 59, 2005) keeps the field of view, rows being epipolar planes.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry.cameras import Camera, Epipolar, Pinhole
 from stereo_sfm.types import F64, Bool
 
-PINHOLE_LIMIT_DEG = 150.0  # a wider pinhole image is almost all stretched edge
+PINHOLE_LIMIT_DEG = 150.0  # wider pinhole images consist mostly of stretched borders
 EPIPOLAR_LIMIT_DEG = 175.0  # the poles of the epipolar projection lie on the baseline
 FISHEYE_PINHOLE_DEG = 100.0  # default field of view of a fisheye's pinhole rectification
 
@@ -30,8 +30,8 @@ def pinhole_camera(
 ) -> Pinhole:
     """The ideal camera of a pinhole rectification.
 
-    Without a field of view it is, for eyes of less than 120 degrees, the largest one without black borders, else
-    `FISHEYE_PINHOLE_DEG`. A pair that is rectified already keeps its camera.
+    The default field of view is the largest one without black borders for cameras below 120 degrees, else
+    `FISHEYE_PINHOLE_DEG`. A rectified pair keeps its camera.
     """
     width, height = size or left.size
     if size is None and hfov_deg is None and _is_rectified(left, right, rect_R_left, rect_R_right):
@@ -62,8 +62,8 @@ def epipolar_camera(
 ) -> Epipolar:
     """The wide camera of an epipolar-aligned rectification.
 
-    It covers what either eye sees within `hfov_deg` (default: all, at most `EPIPOLAR_LIMIT_DEG`) along the baseline
-    and at most as much across it, at the resolution of the left eye's centre unless a size is given.
+    It covers the views of both within `hfov_deg` (default: all, at most `EPIPOLAR_LIMIT_DEG`) along the baseline
+    and at most as much across it, at the resolution of the left camera's centre unless a size is given.
     """
     limit = np.deg2rad(EPIPOLAR_LIMIT_DEG if hfov_deg is None else hfov_deg) / 2
     _check_fov(np.rad2deg(2 * limit), EPIPOLAR_LIMIT_DEG, "epipolar")
@@ -93,7 +93,7 @@ def epipolar_camera(
 def remap_tables(
     source: Camera, target: Camera, target_R_source: F64
 ) -> tuple[NDArray[np.int16], NDArray[np.uint16], Bool]:
-    """Fixed-point tables for `cv2.remap` that turn images of `source` into images of `target`.
+    """Fixed-point tables for `cv2.remap` from images of `source` to images of `target`.
 
     Returns:
         (H, W, 2) and (H, W) tables, and the (H, W) mask of pixels that have a source.
@@ -101,7 +101,7 @@ def remap_tables(
     import cv2
 
     uv = source.project(target.bearing_grid() @ target_R_source)
-    valid = source.inside(uv, -1e-6)  # a pair that is rectified already keeps its border pixels
+    valid = source.inside(uv, -1e-6)  # a rectified pair keeps its border pixels
     uv = np.where(valid[..., None], uv, -100.0).astype(np.float32)
     tables: Any = cv2.convertMaps(uv[..., 0], uv[..., 1], cv2.CV_16SC2)
     return tables[0], tables[1], valid
@@ -109,7 +109,7 @@ def remap_tables(
 
 def _check_fov(hfov_deg: float, limit_deg: float, projection: str) -> None:
     if not 10 <= hfov_deg <= limit_deg:
-        raise StereoSfmError(f"a {projection} field of view of {hfov_deg:g} degrees: choose 10 to {limit_deg:g}")
+        raise StereoSfmError(f"invalid {projection} field of view of {hfov_deg:g} degrees: choose 10 to {limit_deg:g}")
 
 
 def _is_rectified(left: Camera, right: Camera, rect_R_left: F64, rect_R_right: F64) -> bool:
@@ -125,12 +125,12 @@ def _lattice(camera: Camera, count: int = 65) -> F64:
 
 
 def _middle(camera: Camera, rect_R_cam: F64) -> F64:
-    """(3,) rectified direction of the image's middle."""
+    """(3,) rectified bearing of the image centre."""
     return rect_R_cam @ camera.unproject(np.array([0.5 * (camera.width - 1), 0.5 * (camera.height - 1)]))
 
 
 def _horizontal_fov(camera: Camera) -> float:
-    """Radians between the bearings at the ends of the middle row; beyond the lens's range counts as 180 degrees."""
+    """Radians between the bearings at the ends of the middle row; 180 degrees beyond the range of the lens model."""
     ends = camera.unproject(np.array([[0.0, camera.cy], [camera.width - 1.0, camera.cy]]))
     if not np.isfinite(ends).all():
         return float(np.pi)
@@ -138,24 +138,24 @@ def _horizontal_fov(camera: Camera) -> float:
 
 
 def _inner_rectangle(left: Camera, right: Camera, rect_R_left: F64, rect_R_right: F64) -> tuple[float, ...]:
-    """x0 x1 y0 y1 on the plane z = 1 that both eyes cover entirely."""
+    """x0 x1 y0 y1 on the plane z = 1 that both cameras cover entirely."""
     x0 = y0 = -np.inf
     x1 = y1 = np.inf
     for camera, rotation in ((left, rect_R_left), (right, rect_R_right)):
         rays = camera.unproject(_lattice(camera)) @ rotation.T
         x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
         if any(np.isnan(edge).all() for edge in (x[:, 0], x[:, -1], y[0], y[-1])):
-            raise StereoSfmError("the lens model ends inside the image: give a field of view")
+            raise StereoSfmError("the lens model does not cover the whole image: give a field of view")
         # Corners beyond the lens model's range lie further out than the edges that count here.
         x0, x1 = max(x0, np.nanmax(x[:, 0])), min(x1, np.nanmin(x[:, -1]))
         y0, y1 = max(y0, np.nanmax(y[0])), min(y1, np.nanmin(y[-1]))
     if not (x1 - x0 > 0.05 and y1 - y0 > 0.05):
-        raise StereoSfmError("the eyes share no pinhole view: check the extrinsics, or give a field of view")
+        raise StereoSfmError("the cameras have no common pinhole view: check the extrinsics, or give a field of view")
     return float(x0), float(x1), float(y0), float(y1)
 
 
 def _extent(angles: list[F64], limit: float) -> tuple[float, float]:
     finite = np.concatenate([a[np.isfinite(a)] for a in angles])
     if len(finite) == 0:
-        raise StereoSfmError("the eyes see nothing around the common viewing direction: check the extrinsics")
+        raise StereoSfmError("the cameras do not cover the common viewing direction: check the extrinsics")
     return float(max(finite.min(), -limit)), float(min(finite.max(), limit))

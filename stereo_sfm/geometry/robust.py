@@ -1,4 +1,4 @@
-"""Random sample consensus over batches of hypotheses, seeded, and the refusal that every estimator here may give.
+"""Seeded random sample consensus over batches of hypotheses, and the exception of degenerate data.
 
 RANSAC: Fischler and Bolles, CACM 24 (1981); scored by truncated squares (MSAC: Torr and Zisserman, CVIU 78, 2000),
 which separates hypotheses with equal inlier counts. All hypotheses of a batch are solved and scored as arrays.
@@ -15,7 +15,7 @@ from stereo_sfm.types import F64, I64, Bool
 
 
 class Degenerate(ValueError):
-    """The data do not determine the answer. `reason` is a short stable word that a log or a table can carry."""
+    """The data do not determine the result. `reason` is a short stable identifier for logs and tables."""
 
     def __init__(self, reason: str, detail: str = "") -> None:
         super().__init__(f"{reason}: {detail}" if detail else reason)
@@ -24,7 +24,7 @@ class Degenerate(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Consensus:
-    """The winning model of a RANSAC and what agrees with it."""
+    """The best model of a RANSAC and its inliers."""
 
     model: F64
     inliers: Bool  # (N,)
@@ -47,7 +47,7 @@ def sample_indices(rng: np.random.Generator, batch: int, count: int, size: int) 
 
 
 def needed_samples(inlier_ratio: float, size: int, confidence: float) -> int:
-    """Samples after which one was free of outliers with probability `confidence`."""
+    """Number of samples after which one is free of outliers with probability `confidence`."""
     clean = inlier_ratio**size
     if clean >= 1.0 - 1e-12:
         return 1
@@ -73,11 +73,11 @@ def ransac(
     """Best model by truncated squared residuals.
 
     Args:
-        count: number of data. sample_size: data per hypothesis.
+        count: number of data points. sample_size: data points per hypothesis.
         solve: (B, sample_size) indices -> (M, ...) models; M may differ from B, models must be finite.
         residuals: (M, ...) models -> (M, N) non-negative residuals (NaN counts as an outlier).
         threshold: largest residual of an inlier, one number or (N,).
-        min_inliers, min_ratio: what the consensus must reach, as a count and as a share of `count`.
+        min_inliers, min_ratio: minimum consensus, as a count and as a fraction of `count`.
 
     Raises:
         Degenerate: "too_few_matches" or "no_consensus".

@@ -140,7 +140,7 @@ def rotation_from_quaternion(xyzw: F64) -> F64:
 
 
 def orthonormalize(a_T_b: F64) -> F64:
-    """Nearest transform with an exact rotation (SVD), against the drift of long products."""
+    """Nearest transform with an exact rotation (SVD), against numerical drift of long products."""
     u, _, vt = np.linalg.svd(a_T_b[..., :3, :3])
     det = np.linalg.det(u @ vt)
     u[..., :, 2] *= det[..., None]
@@ -148,7 +148,7 @@ def orthonormalize(a_T_b: F64) -> F64:
 
 
 def extent(a_T_b: F64) -> tuple[F64, F64]:
-    """How far apart two frames are: (...) metres between their origins and (...) radians between their axes."""
+    """Size of a transform: (...) metres of translation and (...) radians of rotation."""
     trace = np.trace(a_T_b[..., :3, :3], axis1=-2, axis2=-1)
     return np.linalg.norm(a_T_b[..., :3, 3], axis=-1), np.arccos(np.clip((trace - 1) / 2, -1, 1))
 

@@ -1,4 +1,4 @@
-"""Compiled rigid motions into arrays that are there already: what `se3` does, inside kernels that allocate nothing."""
+"""Compiled versions of `se3` functions that write into given arrays, for kernels without allocation."""
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false
 
@@ -11,7 +11,7 @@ from stereo_sfm.geometry.kernels import njit
 
 @njit
 def exp_into(xi, seconds, out):
-    """exp(seconds * xi) of a tangent (6,) = (rho, phi) a second, into `out` (4, 4)."""
+    """exp(seconds * xi) of a tangent (6,) = (rho, phi) per second, into `out` (4, 4)."""
     rx, ry, rz = xi[0] * seconds, xi[1] * seconds, xi[2] * seconds
     px, py, pz = xi[3] * seconds, xi[4] * seconds, xi[5] * seconds
     xx, yy, zz = px * px, py * py, pz * pz

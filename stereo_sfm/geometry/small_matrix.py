@@ -1,7 +1,7 @@
 """Compiled algebra of small symmetric positive definite matrices, in plain loops.
 
-LAPACK inside a compiled kernel costs seconds of compilation, its overhead at this size, and answers that differ in the
-last bits from one processor to the next; these loops do not.
+LAPACK inside a compiled kernel costs seconds of compilation, has overhead at this size, and its results differ in the
+last bits between processors; these loops avoid all three.
 """
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportUnknownVariableType=false

@@ -1,4 +1,4 @@
-"""Two views of one scene: the rotations that make a pair's rows agree, epipolar errors, triangulation."""
+"""Stereo geometry: rectifying rotations, epipolar errors, triangulation."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from stereo_sfm.types import F64
 
 
 def rectifying_rotations(left_T_right: F64) -> tuple[F64, F64]:
-    """Rotations into the common rectified axes: x along the baseline, z as near to both optical axes as that allows.
+    """Rotations into the common rectified axes: x along the baseline, z as close to both optical axes as possible.
 
     Fusiello, Trucco, Verri, Machine Vision and Applications 12 (2000), section 3, with the mean of both axes.
 
@@ -20,15 +20,17 @@ def rectifying_rotations(left_T_right: F64) -> tuple[F64, F64]:
         (3, 3) rect_R_left and (3, 3) rect_R_right.
 
     Raises:
-        StereoSfmError: eyes swapped, or a baseline along the viewing direction.
+        StereoSfmError: left and right swapped, or a baseline along the viewing direction.
     """
     baseline = left_T_right[:3, 3]
     x = baseline / np.linalg.norm(baseline)
     forward = left_T_right[:3, 2] + np.array([0.0, 0.0, 1.0])
     if abs(x @ forward) > 0.9 * np.linalg.norm(forward) or np.linalg.norm(forward) < 0.2:
-        raise StereoSfmError("the eyes look along their baseline or apart: such a pair cannot be rectified")
+        raise StereoSfmError(
+            "the cameras look along their baseline or in different directions: such a pair cannot be rectified"
+        )
     if x[0] < 0 and abs(x[0]) > abs(x[1]):
-        raise StereoSfmError("the right eye lies on the left of the left eye: the eyes or the extrinsics are swapped")
+        raise StereoSfmError("the right camera is to the left of the left camera: images or extrinsics are swapped")
     y = np.cross(forward, x)
     y /= np.linalg.norm(y)
     rect_R_left = np.stack([x, y, np.cross(x, y)])
@@ -39,7 +41,7 @@ def epipolar_angle(bearings_left: F64, bearings_right: F64, left_T_right: F64) -
     """Signed angle (...,) in radians between the epipolar planes of two bearings, positive when the right one is lower.
 
     Args:
-        bearings_left: (..., 3) in the left eye. bearings_right: (..., 3) in the right eye.
+        bearings_left: (..., 3) in the left camera. bearings_right: (..., 3) in the right camera.
         left_T_right: (4, 4).
     """
     rect_R_left, rect_R_right = rectifying_rotations(left_T_right)
@@ -49,14 +51,14 @@ def epipolar_angle(bearings_left: F64, bearings_right: F64, left_T_right: F64) -
 
 
 def triangulate(bearings_left: F64, bearings_right: F64, left_T_right: F64) -> F64:
-    """Midpoint of the shortest segment between two rays, in the left eye.
+    """Midpoint of the shortest segment between two rays, in the left camera.
 
     Args:
-        bearings_left: (..., 3) unit, in the left eye. bearings_right: (..., 3) unit, in the right eye.
+        bearings_left: (..., 3) unit, in the left camera. bearings_right: (..., 3) unit, in the right camera.
         left_T_right: (4, 4).
 
     Returns:
-        (..., 3) metres; NaN where the rays are parallel or meet behind an eye.
+        (..., 3) metres; NaN where the rays are parallel or meet behind a camera.
     """
     a = bearings_left
     b = bearings_right @ left_T_right[:3, :3].T

@@ -25,7 +25,7 @@ def ray_depths(bearings0: F64, bearings1: F64, rotation: F64, translation: F64) 
 
 
 def parallax_angles(bearings0: F64, bearings1: F64, rotation: F64) -> F64:
-    """(N,) radians between R b0 and b1: what a translation adds to a rotation."""
+    """(N,) radians between R b0 and b1: the parallax due to translation."""
     rotated = bearings0 @ rotation.T
     return np.arctan2(np.linalg.norm(np.cross(rotated, bearings1), axis=1), (rotated * bearings1).sum(1))
 

@@ -25,22 +25,22 @@ _SPLITS = 90  # positions of the second on the great circle of the first; the ot
 
 @dataclass(frozen=True)
 class ManhattanLimits:
-    """When the structure is strong enough to be believed."""
+    """Acceptance thresholds."""
 
-    min_lines: int = 20  # segments at all
-    min_lines_per_axis: int = 4  # segments that point to each of at least two axes
-    min_share: float = 0.35  # of the segments' total angular length that points to the three axes
+    min_lines: int = 20  # segments in total
+    min_lines_per_axis: int = 4  # segments of each of at least two axes
+    min_share: float = 0.35  # of the total angular length, in segments of the three axes
     max_sigma_deg: float = 0.25  # standard deviation of the rotation about its worst axis
-    tolerance_deg: float = 1.0  # of a segment's plane to the axis it points to, in the last round
+    tolerance_deg: float = 1.0  # between a segment's plane and its axis, in the last round
 
 
 @dataclass(frozen=True, eq=False)
 class Manhattan(Message):
-    """Orientation of the camera in the world's three directions."""
+    """Orientation of the camera relative to the three Manhattan directions."""
 
-    cam_R_axes: F64  # (3, 3) columns are the three axes seen from the camera; up to the 24 turns of a cube
+    cam_R_axes: F64  # (3, 3) columns are the axes in the camera; up to the 24 rotations of a cube
     covariance: F64  # (3, 3) rad^2 of a rotation vector w with exp(w) @ cam_R_axes
-    share: float  # of the angular length of all segments that agree
+    share: float  # inlier fraction of the total angular length
     lines_per_axis: I64  # (3,)
     labels: I64  # (L,) axis of each segment, -1 for none
 
@@ -51,7 +51,7 @@ class Manhattan(Message):
 
 
 def polar_grid(lines: LineSegments) -> F64:
-    """(90, 360) response: every pair of segments votes for where their planes meet.
+    """(90, 360) response: every pair of segments votes for the intersection of their planes.
 
     The vote is length times length times sin(2 angle between the planes), as the paper's, smoothed by 3 x 3 cells.
     """
@@ -118,7 +118,7 @@ def refine(lines: LineSegments, cam_R_axes: F64, limits: ManhattanLimits) -> Man
     """Gauss-Newton on the angles between each segment's plane and its nearest axis, in narrowing rounds.
 
     Raises:
-        Degenerate: "weak_structure" when the segments do not fix all three angles or too few agree.
+        Degenerate: "weak_structure" when the segments do not determine all three angles or too few agree.
     """
     rotation = cam_R_axes
     final = np.radians(limits.tolerance_deg)
@@ -128,22 +128,22 @@ def refine(lines: LineSegments, cam_R_axes: F64, limits: ManhattanLimits) -> Man
         offset = lines.normals @ rotation  # (L, 3) sine of the angle between plane and axis
         axis = np.argmin(np.abs(offset), axis=1)
         error = np.take_along_axis(offset, axis[:, None], 1)[:, 0]
-        # A segment whose plane holds two axes at once (seen along an axis) says nothing about which.
+        # A segment whose plane contains two axes (seen along an axis) is ambiguous.
         second = np.sort(np.abs(offset), axis=1)[:, 1]
         chosen = (np.abs(error) < np.sin(tolerance)) & (second > 2 * np.sin(tolerance))
         labels = np.where(chosen, axis, -1)
         directions = rotation.T[axis]
         jac = np.cross(directions, lines.normals)  # d(n . exp(w) d) / dw
-        # Length settles how well a plane is known; Tukey's weight forgets what does not fit.
+        # Long segments determine their plane better; Tukey's weight suppresses outliers.
         weight = np.where(chosen, lines.angles**2 * (1 - (error / np.sin(tolerance)) ** 2) ** 2, 0.0)
         hessian = jac.T @ (weight[:, None] * jac)
         if np.linalg.eigvalsh(hessian)[0] <= 1e-6 * max(float(weight.sum()), 1e-12):
-            raise Degenerate("weak_structure", "the segments do not fix the orientation")
+            raise Degenerate("weak_structure", "the segments do not determine the orientation")
         step = np.asarray(-np.linalg.solve(hessian, jac.T @ (weight * error)), np.float64)
         rotation = se3.so3_exp(step) @ rotation
         spread = float(np.sqrt((weight * error**2).sum() / weight.sum()))
     weight = np.where(labels >= 0, lines.angles**2, 0.0)
-    count = max(float(weight.sum() ** 2 / np.maximum((weight**2).sum(), 1e-12)), 1.0)  # segments that really count
+    count = max(float(weight.sum() ** 2 / np.maximum((weight**2).sum(), 1e-12)), 1.0)  # effective number of segments
     covariance = np.linalg.inv(hessian / np.maximum(weight.sum(), 1e-12)) * spread**2 / count
     share = float(lines.angles[labels >= 0].sum() / lines.angles.sum())
     per_axis = np.bincount(labels[labels >= 0], minlength=3).astype(np.int64)
@@ -167,11 +167,11 @@ def estimate(
     limits: ManhattanLimits | None = None,
     expected: F64 | None = None,
 ) -> Manhattan:
-    """Camera orientation in the Manhattan directions, or a refusal.
+    """Camera orientation relative to the Manhattan directions.
 
     Args:
-        expected: (3, 3) where the axes should be by the last frame; tried beside the search, and it decides which of
-            the 24 equivalent turns is returned.
+        expected: (3, 3) prediction from the last frame; an additional candidate, which also selects one of the 24
+            equivalent rotations.
 
     Raises:
         Degenerate: "too_few_lines", "no_lines", "weak_structure".

@@ -1,1 +1,1 @@
-"""What saves, opens, merges, extends and relocalizes in maps that outlive a run."""
+"""Persistent maps: saving, loading, merging, extending, and relocalization."""

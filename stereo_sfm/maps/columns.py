@@ -1,4 +1,4 @@
-"""The columns of a saved map: what each holds, checked before anything is computed with it."""
+"""The columns of a saved map, validated on loading."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from typing import Any
 
 import numpy as np
 
-MOST_ID = 1 << 40  # ids count up from 0
-RIGID = 1e-6  # how far a rotation may be from orthonormal
+MAX_ID = 1 << 40  # ids count up from 0
+ROTATION_TOLERANCE = 1e-6  # deviation of a rotation from orthonormal
 
 
 @dataclass(frozen=True)
 class Column:
-    """One array: its rows are as many as its table's, an index points into another table."""
+    """One array of a table; an index column refers to rows of another table."""
 
     table: str
     dtype: str
     shape: tuple[int, ...] = ()  # of one row
-    index: str = ""  # the table it points into
+    index: str = ""  # the table it refers to
     ascending: bool = False
-    unknown: bool = False  # NaN where nothing was seen
+    unknown: bool = False  # NaN means not observed
 
 
 COLUMNS: dict[str, Column] = {
@@ -50,10 +50,10 @@ COLUMNS: dict[str, Column] = {
 
 
 def check_columns(arrays: Mapping[str, Any]) -> None:
-    """Whether the arrays make up a map.
+    """Check that the arrays form a map.
 
     Raises:
-        ValueError: one does not; the message names it.
+        ValueError: an invalid array, named in the message.
     """
     rows = {name: len(np.atleast_1d(arrays[first])) for name, first in _FIRST.items()}
     for name, column in COLUMNS.items():
@@ -63,9 +63,9 @@ def check_columns(arrays: Mapping[str, Any]) -> None:
         if array.dtype.kind == "f" and not (np.isfinite(array) | (column.unknown & np.isnan(array))).all():
             raise ValueError(f"{name} is not finite")
         if array.dtype.kind == "i" and name != "stamp_ns":
-            _check_numbers(name, array, column, rows.get(column.index, MOST_ID))
+            _check_numbers(name, array, column, rows.get(column.index, MAX_ID))
     rotations = arrays["map_T_kf"][:, :3, :3]
-    if not np.allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3), atol=RIGID):
+    if not np.allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3), atol=ROTATION_TOLERANCE):
         raise ValueError("map_T_kf is not rigid")
 
 

@@ -1,4 +1,4 @@
-"""Go on with a saved map: the walk is mapped as always, and placed in the saved map as soon as it is found there."""
+"""Continue a saved map: the session is mapped as usual, and transformed into the saved map once relocalized."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from stereo_sfm.types import F64, Keyframe, LoopResult, MapUpdate
 
 
 class Extension(Mapper):
-    """A mapper whose updates are in the frame of a saved map once a keyframe was found there.
+    """A mapper whose updates are in the frame of a saved map once a keyframe was relocalized in it.
 
-    Until then they are in the walk's own map frame, which begins at its first keyframe; the update that tells of the
-    first place found holds every keyframe and point again, moved. The walk's own map (`map`) keeps its own frame:
-    `export.merge` joins the two when the run is saved.
+    Until then they are in the session's own map frame, which begins at its first keyframe; the update of the first
+    relocalization contains all keyframes and points, transformed. The session's own map (`map`) keeps its frame:
+    `maps.merge` joins the two when the run is saved.
     """
 
     def __init__(
@@ -31,33 +31,33 @@ class Extension(Mapper):
     ) -> None:
         super().__init__(config, rig, spans, loop_config)
         self._localizer = localizer
-        self._saved_T_walk: F64 | None = None
-        self._found: tuple[int, Location] | None = None  # the keyframe that was found first, and where
+        self._saved_T_session: F64 | None = None
+        self._found: tuple[int, Location] | None = None  # the first relocalized keyframe, and its location
 
     def step(self, keyframe: Keyframe, loop: LoopResult | None = None) -> MapUpdate:
-        """As the mapper's, in the saved map's frame where that is known."""
+        """As the mapper's, in the saved map's frame once it is known."""
         update = super().step(keyframe, loop)
-        if self._saved_T_walk is not None:
-            return self._in_saved_map(update, self._saved_T_walk)
+        if self._saved_T_session is not None:
+            return self._in_saved_map(update, self._saved_T_session)
         place = self._localizer.step(keyframe)
         if not self._localizer.found:
             return update
         assert self._localizer.last is not None
         self._found = keyframe.kf_id, self._localizer.last
-        self._saved_T_walk = se3.orthonormalize(place.map_T_odom @ se3.inverse(update.map_T_odom))
-        return self._in_saved_map(self._with_everything(update), self._saved_T_walk)
+        self._saved_T_session = se3.orthonormalize(place.map_T_odom @ se3.inverse(update.map_T_odom))
+        return self._in_saved_map(self._with_everything(update), self._saved_T_session)
 
     def finish(self, loops: Sequence[LoopResult]) -> MapUpdate | None:
         """As the mapper's."""
         update = super().finish(loops)
-        if update is None or self._saved_T_walk is None:
+        if update is None or self._saved_T_session is None:
             return update
-        return self._in_saved_map(update, self._saved_T_walk)
+        return self._in_saved_map(update, self._saved_T_session)
 
     def place(self, saved: MapSnapshot) -> LoopResult | None:
-        """The first place found, as a loop from a keyframe of the saved map to a living one of the walk; None: none.
+        """The first relocalization, as a loop from a keyframe of the saved map to a live one of the session, or None.
 
-        The ids are each map's own.
+        Ids are those of the respective map.
         """
         if self._found is None:
             return None
@@ -89,10 +89,10 @@ class Extension(Mapper):
         )
 
     @staticmethod
-    def _in_saved_map(update: MapUpdate, saved_T_walk: F64) -> MapUpdate:
+    def _in_saved_map(update: MapUpdate, saved_T_session: F64) -> MapUpdate:
         return dataclasses.replace(
             update,
-            map_T_kf=saved_T_walk @ update.map_T_kf,
-            points_map=se3.transform(saved_T_walk, update.points_map),
-            map_T_odom=saved_T_walk @ update.map_T_odom,
+            map_T_kf=saved_T_session @ update.map_T_kf,
+            points_map=se3.transform(saved_T_session, update.points_map),
+            map_T_odom=saved_T_session @ update.map_T_odom,
         )

@@ -1,4 +1,4 @@
-"""Maps that a run starts from or leaves behind."""
+"""The maps that a run loads and saves."""
 
 from __future__ import annotations
 
@@ -29,35 +29,35 @@ log = logging.getLogger("stereo_sfm")
 
 @dataclass(frozen=True)
 class MapFolders:
-    """`localize_only`: place the odometry in the map at `map_in` and change nothing. Otherwise the walk is mapped as
-    always, placed in the map at `map_in`, if any, once it is found there, and merged with it when it is saved to
-    `map_out`."""
+    """With `localize_only` the odometry is localized in the map at `map_in`, which stays unchanged. Otherwise the
+    session is mapped as usual, transformed into the map at `map_in`, if any, once relocalized, and merged with it when
+    saved to `map_out`."""
 
     map_in: Path | None = None
     localize_only: bool = False
     map_out: Path | None = None
-    kept: Path | None = None  # folder of the run's own map, for later exports; None: it is not kept
+    kept: Path | None = None  # folder of the run's own map, for later exports; None: not saved
 
     def check(self, overwrite: bool = False) -> None:
-        """Raises StereoSfmError for what cannot work, before anything is computed."""
+        """Raises StereoSfmError for invalid combinations, before anything is computed."""
         if self.localize_only and self.map_in is None:
-            raise StereoSfmError("--localize-only needs the map to localize in: add --map-in DIR")
+            raise StereoSfmError("--localize-only needs a map: add --map-in DIR")
         if self.localize_only and self.map_out is not None:
-            raise StereoSfmError("--localize-only changes no map: leave --map-out away")
+            raise StereoSfmError("--localize-only changes no map: omit --map-out")
         if self.map_in is not None and not (self.map_in / "map.json").exists():
-            raise StereoSfmError(f"no map at {self.map_in}: 'stereo-sfm run ... --map-out DIR' makes one")
+            raise StereoSfmError(f"no map at {self.map_in}: 'stereo-sfm run ... --map-out DIR' creates one")
         if self.map_out is not None and self.map_out.exists() and not overwrite:
-            raise StereoSfmError(f"{self.map_out} exists: choose another --map-out, or say --overwrite")
+            raise StereoSfmError(f"{self.map_out} exists: choose another --map-out, or add --overwrite")
         if self.map_out is not None and self.map_out.exists() and not self.map_out.is_dir():
             raise StereoSfmError(f"{self.map_out} is a file: --map-out takes a folder")
         if self.map_out is not None:
             above = next(folder for folder in self.map_out.absolute().parents if folder.exists())
             if not above.is_dir() or not os.access(above, os.W_OK):
-                why = "may not be written to" if above.is_dir() else "is no folder"
-                raise StereoSfmError(f"cannot make --map-out {self.map_out}: {above} {why}")
+                why = "is not writable" if above.is_dir() else "is not a folder"
+                raise StereoSfmError(f"cannot create --map-out {self.map_out}: {above} {why}")
 
     def opening(self, opening: Opening) -> Opening:
-        """How a run begins: as its source was opened, with the map that it begins with."""
+        """The opening of the source, completed with the map that the run loads."""
         if self.map_in is None:
             return opening
         place, sha256 = str(self.map_in.resolve()), map_sha256(self.map_in)
@@ -65,16 +65,16 @@ class MapFolders:
 
 
 def map_sha256(folder: Path) -> str:
-    """What tells a saved map from any other: its map.json holds the checksums of all its files."""
+    """Identifies a saved map: its map.json contains the checksums of all its files."""
     return checksum((folder / "map.json").read_bytes())
 
 
 def make_mapper(config: Config, rig: Rig, spans: NoSpans, folders: MapFolders) -> AnyMapper:
     """The mapper, or the localizer in a saved map."""
     if not folders.localize_only and not config.mapper.enabled and (folders.map_in or folders.map_out):
-        raise StereoSfmError("there is no map without the mapper: leave mapper.enabled=true, or --map-in and --map-out")
+        raise StereoSfmError("maps need the mapper: set mapper.enabled=true, or omit --map-in and --map-out")
     if folders.localize_only and not config.mapper.enabled and not config.loop.enabled:
-        raise StereoSfmError("--localize-only recognises places: leave loop.enabled=true")
+        raise StereoSfmError("--localize-only needs place recognition: set loop.enabled=true")
     from stereo_sfm.mapping.mapper import Mapper
     from stereo_sfm.mapping.self_calibration import SelfCalibration
 
@@ -90,7 +90,7 @@ def make_mapper(config: Config, rig: Rig, spans: NoSpans, folders: MapFolders) -
 
 
 def saved_map_of(mapper: AnyMapper, config: Config) -> SavedMap | None:
-    """The map of a run as it can be saved; None where nothing is mapped."""
+    """The map of a run for saving; None if nothing was mapped."""
     from stereo_sfm.maps.saved_map import SavedMap
 
     snapshot = mapper.snapshot()
@@ -103,12 +103,12 @@ def saved_map_of(mapper: AnyMapper, config: Config) -> SavedMap | None:
 def save_result(mapper: AnyMapper, config: Config, folders: MapFolders) -> None:
     """Write the map of a finished run to `map_out`, merged with `map_in`, and to `kept`.
 
-    A run that goes on with a saved map and leaves none behind keeps none: its part alone is in no frame of its own.
+    A run that continues a saved map without `map_out` saves nothing: its part alone is in the saved map's frame.
 
     Raises:
-        StereoSfmError: it cannot be merged, and the walk's own map was written instead (beside `map_out` where that is
-            the map it should have been merged with).
-        OSError: the disk does not take it.
+        StereoSfmError: it cannot be merged, and the session's own map was written instead (next to `map_out` where that
+            is the map to merge with).
+        OSError: the map cannot be written.
     """
     from stereo_sfm.maps.saved_map import save_map
 
@@ -124,24 +124,24 @@ def save_result(mapper: AnyMapper, config: Config, folders: MapFolders) -> None:
         try:
             saved = _merged(mapper, saved, folders.map_in, config)
         except StereoSfmError as error:
-            out = _beside(out) if out.resolve() == folders.map_in.resolve() else out
-            failure = f"not merged with {folders.map_in}: {error}; {out} is this walk alone"
+            out = _unused_name(out) if out.resolve() == folders.map_in.resolve() else out
+            failure = f"not merged with {folders.map_in}: {error}; {out} contains this session alone"
     for folder in dict.fromkeys(place.absolute() for place in (out, kept) if place is not None):
         save_map(saved, folder)
     if failure:
         raise StereoSfmError(failure)
 
 
-def _merged(mapper: AnyMapper, walk: SavedMap, map_in: Path, config: Config) -> SavedMap:
+def _merged(mapper: AnyMapper, session: SavedMap, map_in: Path, config: Config) -> SavedMap:
     from stereo_sfm.maps.merge import merge
     from stereo_sfm.maps.saved_map import load_map
 
-    before = load_map(map_in, walk.rig)
+    before = load_map(map_in, session.rig)
     place = mapper.place(before.snapshot)
-    return merge([before, walk], configured_vocabulary(config.loop), config.loop, config.mapper, place).saved
+    return merge([before, session], configured_vocabulary(config.loop), config.loop, config.mapper, place).saved
 
 
-def _beside(folder: Path) -> Path:
-    """A free name next to a folder."""
+def _unused_name(folder: Path) -> Path:
+    """An unused name next to a folder."""
     names = (folder.with_name(f"{folder.name}_walk{k}") for k in itertools.count(1))
     return next(name for name in names if not name.exists())

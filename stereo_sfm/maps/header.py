@@ -1,4 +1,4 @@
-"""`map.json`: what a saved map says about itself, checked field by field."""
+"""`map.json`, the header of a saved map, validated field by field."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ COUNTS = ("keyframes", "points", "observations", "sessions")
 
 
 def damaged(folder: Path, what: str) -> StereoSfmError:
-    """The error of a map folder that is not as it was saved."""
+    """The error of a map folder that was changed after saving."""
     return StereoSfmError(f"the map {folder} is damaged: {what}; save it again")
 
 
 def checksum(raw: bytes) -> str:
-    """As it stands in map.json."""
+    """The checksum as written in map.json."""
     return hashlib.sha256(raw).hexdigest()
 
 
-def write_header(folder: Path, counts: dict[str, int], vocabulary_id: str, sums: dict[str, str]) -> None:
-    """Write map.json with the numbers of rows by name and the checksums of the files by name."""
-    head = {"kind": KIND, "version": VERSION, **counts, "vocabulary": vocabulary_id, "sha256": sums}
+def write_header(folder: Path, counts: dict[str, int], vocabulary_id: str, checksums: dict[str, str]) -> None:
+    """Write map.json with the row counts and the checksums of the files, by name."""
+    head = {"kind": KIND, "version": VERSION, **counts, "vocabulary": vocabulary_id, "sha256": checksums}
     (folder / "map.json").write_text(json.dumps(head, indent=1) + "\n", encoding="utf-8")
 
 
@@ -38,11 +38,11 @@ def read_header(folder: Path, files: tuple[str, ...]) -> dict[str, Any]:
         files: names that must have a checksum.
 
     Raises:
-        StereoSfmError: no map, another version, or a field that is missing or no sense.
+        StereoSfmError: no map, another version, or a missing or invalid field.
     """
     path = folder / "map.json"
     if not path.is_file():
-        raise StereoSfmError(f"no map at {folder}: there is no map.json (make one with 'run ... --map-out')")
+        raise StereoSfmError(f"no map at {folder}: there is no map.json (create one with 'run ... --map-out')")
     try:
         head = json.loads(path.read_text("utf-8-sig"))
         version = head["version"] if head["kind"] == KIND else None
@@ -55,14 +55,14 @@ def read_header(folder: Path, files: tuple[str, ...]) -> dict[str, Any]:
             raise damaged(folder, f"map.json has no number '{name}'")
     if not isinstance(head.get("vocabulary"), str):
         raise damaged(folder, "map.json has no text 'vocabulary'")
-    sums = head.get("sha256")
-    if not isinstance(sums, dict) or not all(isinstance(sums.get(name), str) for name in files):
+    checksums = head.get("sha256")
+    if not isinstance(checksums, dict) or not all(isinstance(checksums.get(name), str) for name in files):
         raise damaged(folder, "map.json lacks checksums")
     return head
 
 
 def check_counts(folder: Path, head: dict[str, Any], counts: dict[str, int]) -> None:
-    """Raises StereoSfmError where map.json and the files tell other numbers."""
+    """Raises StereoSfmError where the counts in map.json and in the files differ."""
     for name in COUNTS:
         if head[name] != counts[name]:
-            raise damaged(folder, f"map.json says {head[name]} {name}, the files hold {counts[name]}")
+            raise damaged(folder, f"map.json says {head[name]} {name}, the files have {counts[name]}")

@@ -1,4 +1,4 @@
-"""Localize only: in place of a mapper, a stage that holds a finished map and places the odometry frame in it."""
+"""Localization only: replaces the mapper by a stage that localizes the odometry frame in a finished map."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from stereo_sfm.loop.verification import within
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.mapping.map import MapSnapshot
 from stereo_sfm.mapping.protocol import WithoutJobs
-from stereo_sfm.maps.relocalization import Location, Relocalizer, nowhere
+from stereo_sfm.maps.relocalization import Location, Relocalizer, not_found
 from stereo_sfm.types import F64, Keyframe, LoopResult, MapUpdate
 
-LOST_AFTER = 5  # keyframes without an answer near the prediction before the whole map is searched
+LOST_AFTER = 5  # keyframes not found near the prediction before the whole map is searched
 
 
 class Localizer(WithoutJobs):
-    """One keyframe in, one `MapUpdate` out that moves nothing but `map_T_odom`.
+    """For each keyframe, a `MapUpdate` that changes only `map_T_odom`.
 
-    The first answer needs no guess; where it rests on few corners, a second keyframe must say the same. Later keyframes
-    are looked for around the prediction; after some failures, or when tracking restarted as another submap, the whole
-    map is searched again. `found` is False until the first answer.
-    Keyframes from before the first answer of their submap get their places with it, by odometry.
+    The first location needs no prediction; if it has few inliers, a second keyframe must confirm it. Later keyframes
+    are searched around the prediction; after some failures, or when tracking restarted in another submap, the whole
+    map is searched again. `found` is False until the first location.
+    Keyframes before the first location of their submap are placed with it, by odometry.
     """
 
     def __init__(self, snapshot: MapSnapshot, rig: Rig, vocabulary: Vocabulary, config: LoopConfig) -> None:
@@ -36,17 +36,17 @@ class Localizer(WithoutJobs):
         self._version = 0
         self._submap = -1
         self._failures = 0
-        self._unsure: F64 | None = None  # map_T_odom by the newest keyframe, if it rests on few corners
-        self._waiting: list[tuple[int, F64]] | None = []  # keyframes of this submap without a place; None: it has one
+        self._unconfirmed: F64 | None = None  # map_T_odom by the newest keyframe, if it has few inliers
+        self._waiting: list[tuple[int, F64]] | None = []  # keyframes of this submap without a location; None: located
         self.found = False
-        self.last: Location | None = None  # what was said about the newest keyframe
+        self.last: Location | None = None  # result of the newest keyframe
 
     def step(self, keyframe: Keyframe, loop: LoopResult | None = None) -> MapUpdate:
-        """Place a keyframe in the map; `loop` is taken for the mapper's signature and not used."""
+        """Localize a keyframe in the map; `loop` belongs to the mapper's signature and is unused."""
         self._version += 1
         if keyframe.submap_id != self._submap:
             self._submap, self._failures, self._waiting = keyframe.submap_id, LOST_AFTER, []
-            self._unsure = None
+            self._unconfirmed = None
         self.last = self._locate(keyframe)
         if self.last.found:
             self._map_T_odom = se3.orthonormalize(self.last.map_T_cam @ se3.inverse(keyframe.odom_T_cam))
@@ -67,19 +67,19 @@ class Localizer(WithoutJobs):
         )
 
     def finish(self, loops: Sequence[LoopResult]) -> MapUpdate | None:
-        """Nothing is left behind."""
+        """No pending work."""
         return None
 
     def snapshot(self) -> None:
-        """It makes no map."""
+        """No map is built."""
         return
 
     def place(self, saved: MapSnapshot) -> None:
-        """It makes no map that could lie anywhere."""
+        """No map is built that could be placed."""
         return
 
     def _placed(self, keyframe: Keyframe) -> list[tuple[int, F64]]:
-        """The keyframes (id, odom_T_cam) whose places are known with this one."""
+        """The keyframes (id, odom_T_cam) whose locations become known with this one."""
         newest = keyframe.kf_id, keyframe.odom_T_cam
         if self._waiting is None:
             return [newest]
@@ -95,13 +95,13 @@ class Localizer(WithoutJobs):
             if not near.found or self._within_gate(guess, near):
                 return near
         place = self._relocalizer.locate(keyframe)
-        before, self._unsure = self._unsure, None
-        if not place.found or place.sure:
+        before, self._unconfirmed = self._unconfirmed, None
+        if not place.found or place.confident:
             return place
         if before is not None and self._within_gate(before @ keyframe.odom_T_cam, place):
             return place
-        self._unsure = se3.orthonormalize(place.map_T_cam @ se3.inverse(keyframe.odom_T_cam))
-        return nowhere("not_confirmed_yet", place.inliers)
+        self._unconfirmed = se3.orthonormalize(place.map_T_cam @ se3.inverse(keyframe.odom_T_cam))
+        return not_found("not_confirmed_yet", place.inliers)
 
     def _within_gate(self, guess: F64, place: Location) -> bool:
         return within(se3.inverse(guess) @ place.map_T_cam, self._config.gate_m, self._config.gate_deg)

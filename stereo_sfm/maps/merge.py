@@ -1,4 +1,4 @@
-"""Several walks of one store become one map: loops between them, one pose graph, full bundle adjustment."""
+"""Merging maps of several sessions in one store: loops between them, one pose graph, full bundle adjustment."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from stereo_sfm.types import I64, Bool, LoopResult
 
 _MAPPER = MapperConfig()
 log = logging.getLogger("stereo_sfm")
-SAME_SHARE = 0.5  # of the pixels at common times: pictures taken twice have hardly any in common
-MERGE_PAUSE = 2  # keyframes between two loops of a merge: every link between the walks helps
+MIN_SHARED_PIXELS = 0.5  # of the pixels at common times, in maps of one session; different images share hardly any
+MERGE_PAUSE = 2  # keyframes between two loops of a merge: every link between the sessions helps
 
 
 @dataclass(frozen=True, eq=False)
 class Merge:
-    """The common map and how it came about."""
+    """The merged map and statistics of the merge."""
 
     saved: SavedMap
-    loops: list[LoopResult]  # applied, in ids of the common map
-    fused: int  # points that became one with another
+    loops: list[LoopResult]  # applied, in ids of the merged map
+    fused: int  # points fused with another one
 
 
 def merge(
@@ -43,24 +43,24 @@ def merge(
     mapper: MapperConfig = _MAPPER,
     place: LoopResult | None = None,
 ) -> Merge:
-    """One map of all; the first keeps its frame.
+    """Merge maps into one; the first keeps its frame.
 
     Args:
         maps: two or more.
-        vocabulary: of the search for loops. Maps keep their descriptors, so it need not be the one they were made with.
+        vocabulary: of the loop search. Maps store descriptors, so it need not be the one they were built with.
         config: of the loops.
         mapper: of the bundle adjustment at the end.
-        place: a loop from the first map to the second that is known already, in the ids of each.
+        place: a known loop from the first map to the second, in the ids of each.
 
     Raises:
-        StereoSfmError: other cameras, or a map that no loop joins to the rest.
+        StereoSfmError: different cameras, or a map that no loop joins to the others.
     """
     side_by_side = joined(list(maps))
     map_ = restore_map(side_by_side.snapshot)
-    map_.points.sigma[:] = map_.observations.sigma[:] = mapper.sigma_px  # what is fused from now on counts less
+    map_.points.sigma[:] = map_.observations.sigma[:] = mapper.sigma_px  # points fused from now on count less
     closer = LoopCloser(dataclasses.replace(config, pause=MERGE_PAUSE), side_by_side.rig, vocabulary)
-    walks, stamps = side_by_side.sessions, side_by_side.snapshot.stamp_ns
-    begins = {k: int(stamps[walks == k].min()) for k in side_by_side.walks}  # clocks of walks have nothing in common
+    sessions, stamps = side_by_side.sessions, side_by_side.snapshot.stamp_ns
+    begins = {k: int(stamps[sessions == k].min()) for k in side_by_side.session_ids}  # sessions have unrelated clocks
     loops: list[LoopResult] = []
     fused = 0
     if place is not None:
@@ -72,8 +72,8 @@ def merge(
         if done.applied:
             loops.append(known)
             fused += len(done.fused)
-    for keyframe, walk in zip(side_by_side.snapshot.keyframes(), walks.tolist(), strict=True):
-        result = closer.step(dataclasses.replace(keyframe, stamp_ns=keyframe.stamp_ns - begins[walk]))
+    for keyframe, k in zip(side_by_side.snapshot.keyframes(), sessions.tolist(), strict=True):
+        result = closer.step(dataclasses.replace(keyframe, stamp_ns=keyframe.stamp_ns - begins[k]))
         if result.candidate_kf_id >= 0:
             done = apply_loop(map_, result, loops, config)
             if done.applied:
@@ -82,58 +82,58 @@ def merge(
     _check_joined(maps, loops)
     full_adjustment(map_, side_by_side.rig, mapper)
     snapshot = map_.snapshot()
-    session = dict(zip(side_by_side.snapshot.kf_ids.tolist(), side_by_side.sessions.tolist(), strict=True))
-    sessions = np.array([session[k] for k in snapshot.kf_ids.tolist()], np.int64)
-    return Merge(SavedMap(snapshot, side_by_side.rig, vocabulary.id, sessions), loops, fused)
+    session_of = dict(zip(side_by_side.snapshot.kf_ids.tolist(), sessions.tolist(), strict=True))
+    merged = np.array([session_of[k] for k in snapshot.kf_ids.tolist()], np.int64)
+    return Merge(SavedMap(snapshot, side_by_side.rig, vocabulary.id, merged), loops, fused)
 
 
-def share_a_walk(a: SavedMap, b: SavedMap) -> bool:
-    """Whether a walk of one map is one of the other: the same pixels were seen at the same times.
+def share_a_session(a: SavedMap, b: SavedMap) -> bool:
+    """Whether two maps have a session in common: the same pixels observed at the same times.
 
-    Times alone tell nothing, they begin at zero in many recordings.
+    Stamps alone are not enough, they begin at zero in many recordings.
     """
-    return any(_same_walk(_sightings(a, m), _sightings(b, n)) for m in a.walks for n in b.walks)
+    return any(_same_session(_sightings(a, m), _sightings(b, n)) for m in a.session_ids for n in b.session_ids)
 
 
-def _sightings(saved: SavedMap, walk: int) -> dict[int, set[tuple[float, float]]]:
-    """The pixels (as files hold them) of what the left eye saw in a walk, by the time of the keyframe."""
+def _sightings(saved: SavedMap, session: int) -> dict[int, set[tuple[float, float]]]:
+    """The observed pixels of the left camera in a session (float32 as in files), by the keyframe's stamp."""
     s = saved.snapshot
-    rows = np.flatnonzero((saved.sessions == walk)[s.obs_kf])
+    rows = np.flatnonzero((saved.sessions == session)[s.obs_kf])
     out: dict[int, set[tuple[float, float]]] = {}
     for stamp, (u, v) in zip(s.stamp_ns[s.obs_kf[rows]].tolist(), s.uv_left[rows].astype(np.float32), strict=True):
         out.setdefault(stamp, set()).add((float(u), float(v)))
     return out
 
 
-def _same_walk(a: dict[int, set[tuple[float, float]]], b: dict[int, set[tuple[float, float]]]) -> bool:
+def _same_session(a: dict[int, set[tuple[float, float]]], b: dict[int, set[tuple[float, float]]]) -> bool:
     times = a.keys() & b.keys()
     same = sum(len(a[t] & b[t]) for t in times)
-    return same > SAME_SHARE * sum(min(len(a[t]), len(b[t])) for t in times)
+    return same > MIN_SHARED_PIXELS * sum(min(len(a[t]), len(b[t])) for t in times)
 
 
 def _ends(maps: Sequence[SavedMap], ids: str) -> I64:
-    """(maps,) above which the ids of the next map begin when `joined` has raised them."""
+    """(maps,) first free id after each map in the numbering of `joined`."""
     return np.cumsum([int(getattr(saved.snapshot, ids).max()) + 1 for saved in maps])
 
 
 def _check_joined(maps: Sequence[SavedMap], loops: list[LoopResult]) -> None:
-    """Every map must hang together with the first one."""
+    """Raises StereoSfmError unless loops connect every map to the first one."""
     ends = _ends(maps, "kf_ids")
     group = np.arange(len(maps))
     for loop in loops:
         a, b = group[np.searchsorted(ends, [loop.candidate_kf_id, loop.kf_id], side="right")]
         group[group == max(a, b)] = min(a, b)
-    apart = len(np.unique(group))
-    if apart > 1:
+    groups = len(np.unique(group))
+    if groups > 1:
         raise StereoSfmError(
-            f"the {len(maps)} maps stay in {apart} pieces: no loop joins them (are they of one store?)"
+            f"the {len(maps)} maps remain {groups} separate maps: no loop joins them (are they of one store?)"
         )
 
 
 def full_adjustment(map_: Map, rig: Rig, config: MapperConfig) -> None:
-    """Bundle adjustment of everything as the mapper does it, the first keyframe held fast.
+    """Bundle adjustment of the whole map with the mapper's settings, the first keyframe fixed.
 
-    Observations that disagree afterwards go, and with them the points that too few keyframes still see.
+    Outlier observations are removed afterwards, and points that too few keyframes still observe.
     """
     part = window.whole_map(map_, config)
     result = bundle_adjust(rig, part.bundle, window.bundle_config(config))
@@ -143,15 +143,15 @@ def full_adjustment(map_: Map, rig: Rig, config: MapperConfig) -> None:
 
 
 def prune(saved: SavedMap, min_views: int = 0, min_seen_share: float = 0.0, unseen_sessions: int = 0) -> SavedMap:
-    """Leave out points that are no longer there, then keyframes without points.
+    """Remove outdated points, then keyframes without points.
 
     Args:
-        min_views: points seen by fewer keyframes go.
-        min_seen_share: points that were seen in less than this share of the keyframes in whose view they lay go.
-        unseen_sessions: points that no keyframe of the newest so many walks saw go.
+        min_views: remove points observed by fewer keyframes.
+        min_seen_share: remove points observed in a smaller share of the keyframes in whose view they lie.
+        unseen_sessions: remove points not observed in this many of the newest sessions.
 
     Raises:
-        StereoSfmError: nothing would be left, or an argument out of its range.
+        StereoSfmError: the map would become empty, or an argument is out of range.
     """
     if min_views < 0 or unseen_sessions < 0:
         raise StereoSfmError("--min-views and --unseen-sessions must be at least 0")
@@ -169,16 +169,16 @@ def prune(saved: SavedMap, min_views: int = 0, min_seen_share: float = 0.0, unse
     obs = keep[s.obs_pt]
     keyframes = np.bincount(s.obs_kf[obs], minlength=len(s.kf_ids)) > 0
     if not keep.any() or not keyframes.any():
-        raise StereoSfmError("pruning so much would leave an empty map: ask for less")
+        raise StereoSfmError("pruning would leave an empty map: use lower limits")
     return dataclasses.replace(saved, snapshot=_subset(s, keyframes, keep, obs), sessions=saved.sessions[keyframes])
 
 
 def _subset(s: MapSnapshot, keyframes: Bool, points: Bool, obs: Bool) -> MapSnapshot:
-    """The rows that are kept (boolean masks); points of a keyframe that goes are carried by one that sees them."""
+    """The rows selected by boolean masks; points anchored in a removed keyframe get another one that observes them."""
     kf_row, pt_row = np.cumsum(keyframes) - 1, np.cumsum(points) - 1
     obs_kf, obs_pt = kf_row[s.obs_kf[obs]], pt_row[s.obs_pt[obs]]
     corners = keyframes[s.corner_kf]
-    anchors = np.where(keyframes[s.anchors[points]], kf_row[s.anchors[points]], _first_seer(obs_kf, obs_pt, points))
+    anchors = np.where(keyframes[s.anchors[points]], kf_row[s.anchors[points]], _first_observer(obs_kf, obs_pt, points))
     return MapSnapshot(
         kf_ids=s.kf_ids[keyframes],
         frame_ids=s.frame_ids[keyframes],
@@ -203,8 +203,8 @@ def _subset(s: MapSnapshot, keyframes: Bool, points: Bool, obs: Bool) -> MapSnap
     )
 
 
-def _first_seer(obs_kf: I64, obs_pt: I64, points: Bool) -> I64:
-    """(P,) oldest keyframe that sees each kept point, 0 where none does."""
+def _first_observer(obs_kf: I64, obs_pt: I64, points: Bool) -> I64:
+    """(P,) oldest keyframe that observes each kept point, 0 if none."""
     first = np.full(int(points.sum()), np.iinfo(np.int64).max)
     np.minimum.at(first, obs_pt, obs_kf)
     return np.where(first == np.iinfo(np.int64).max, 0, first)

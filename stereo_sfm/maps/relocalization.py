@@ -1,4 +1,4 @@
-"""Where is this camera in a saved map? Retrieval by words, pose from bearings, verification; no guess needed."""
+"""Relocalization in a saved map: bag-of-words retrieval, pose from bearings, verification; no prediction needed."""
 
 from __future__ import annotations
 
@@ -19,36 +19,36 @@ from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.mapping.map import MapSnapshot
 from stereo_sfm.types import F64, I64, Keyframe
 
-SAME_METRES, SAME_DEGREES = 0.2, 5.0  # two answers closer than this are one
-RIVAL = 0.85  # another place with this share of the inliers makes the answer ambiguous
-SURE = 2.0  # times the inliers asked for: no need to look at more candidates, or for a second opinion
-MIN_RANGE_SIGMA = 0.003  # metres
+SAME_PLACE_M, SAME_PLACE_DEG = 0.2, 5.0  # closer results are the same place
+AMBIGUITY_RATIO = 0.85  # a result is ambiguous if another place has this share of its inliers
+CONFIDENCE_FACTOR = 2.0  # times the required inliers: no further candidates or confirmation needed
+MIN_RANGE_SIGMA_M = 0.003
 
 
 @dataclass(frozen=True, eq=False)
 class Location:
-    """The answer; `reason` is empty when the camera was found."""
+    """The result; `reason` is empty when the camera was found."""
 
     reason: str  # "", "no_candidate", "ambiguous", or why the best candidate failed
     map_T_cam: F64  # (4, 4)
     information: F64  # (6, 6) of map_T_cam @ exp(xi)
-    kf_id: int  # the map's keyframe that showed the place, -1: none
+    kf_id: int  # matched keyframe of the map, -1: none
     inliers: int
-    pairs: I64  # (M, 2) the map's point ids, the camera's
-    sure: bool = False  # the inliers are more than enough
+    pairs: I64  # (M, 2) point ids of the map and of the camera
+    confident: bool = False  # far more inliers than required
 
     @property
     def found(self) -> bool:
-        """Whether the pose may be used."""
+        """Whether the pose is valid."""
         return not self.reason
 
 
-def nowhere(reason: str, inliers: int = 0) -> Location:
+def not_found(reason: str, inliers: int = 0) -> Location:
     return Location(reason, np.eye(4), np.zeros((6, 6)), -1, inliers, np.zeros((0, 2), np.int64))
 
 
 class Relocalizer:
-    """A map ready to be asked. Its answers depend on the map, the configuration and the view only."""
+    """Finds cameras in a map. Results depend on the map, the configuration and the view only."""
 
     def __init__(self, snapshot: MapSnapshot, rig: Rig, vocabulary: Vocabulary, config: LoopConfig) -> None:
         self._map, self._rig, self._vocabulary = snapshot, rig, vocabulary
@@ -57,7 +57,7 @@ class Relocalizer:
         self._config = dataclasses.replace(
             config,
             min_match_fraction=0.0,
-            min_inliers=config.relocalize_inliers // 3,  # rivals are worth knowing
+            min_inliers=config.relocalize_inliers // 3,  # competing places must be known
             min_inlier_share=0.0,
             min_cells=config.relocalize_cells,
         )
@@ -81,22 +81,22 @@ class Relocalizer:
                 reason = verdict.reason if reason == "no_candidate" else reason
                 continue
             found.append(self._location(row, verdict, self._config.relocalize_share))
-            if found[-1].sure:
+            if found[-1].confident:
                 break
-        return self._choose(found) if found else nowhere(reason)
+        return self._choose(found) if found else not_found(reason)
 
     def locate_near(self, keyframe: Keyframe, guess: F64) -> Location:
-        """Find the camera near a predicted map_T_cam (4, 4): as `locate`, but only around the guess."""
+        """As `locate`, but only around a predicted map_T_cam (4, 4)."""
         view = place_view_of(keyframe, self._rig, self._config.disparity_sigma_px)
         row = self._nearest(guess)
         start = se3.inverse(guess) @ self._map.map_T_kf[row]
         verdict = verify_near(start, view, self.cloud(row), self._rig, self._config)
         if verdict.reason:
-            return nowhere(verdict.reason, verdict.inliers)
+            return not_found(verdict.reason, verdict.inliers)
         return self._choose([self._location(row, verdict, self._near_share)])
 
     def cloud(self, row: int) -> Cloud:
-        """The map around a keyframe row, in its camera: what it and its neighbours show."""
+        """The points of a keyframe row and its neighbours, in its camera frame."""
         shared = (self._sees @ self._sees[[row]].T).toarray()[:, 0]
         shared[row] = shared.max() + 1
         order = np.lexsort((np.arange(len(shared)), -shared))[: self._config.relocalize_keyframes]
@@ -106,11 +106,11 @@ class Relocalizer:
         mapped = cloud.ids >= 0
         at = np.searchsorted(self._map.pt_ids, cloud.ids[mapped])
         sigmas = cloud.sigmas.copy()
-        sigmas[mapped] = np.maximum(sigmas[mapped] / np.sqrt(self._views[at]), MIN_RANGE_SIGMA)
+        sigmas[mapped] = np.maximum(sigmas[mapped] / np.sqrt(self._views[at]), MIN_RANGE_SIGMA_M)
         return dataclasses.replace(cloud, sigmas=sigmas)
 
     def _places(self, scores: F64) -> list[int]:
-        """The best rows, each of another place: a place counts what it and its neighbours in time score together."""
+        """The best rows, each of another place; the score of a place includes its temporal neighbours."""
         padded = np.pad(scores, 1)
         together = scores + padded[:-2] + padded[2:]
         chosen: list[int] = []
@@ -126,23 +126,23 @@ class Relocalizer:
         return int(np.argmin(metres + radians))
 
     def _location(self, row: int, verdict: Verdict, share: float) -> Location:
-        """The place that a verdict stands for, if this share of the camera's corners is asked for."""
+        """The location of a verification, requiring this share of the camera's corners."""
         map_T_cam = self._map.map_T_kf[row] @ se3.inverse(verdict.b_T_a)
         kf_id = int(self._map.kf_ids[row])
-        enough, sure = (
+        enough, confident = (
             verdict.inliers >= times * self._config.relocalize_inliers and verdict.share >= times * share
-            for times in (1.0, SURE)
+            for times in (1.0, CONFIDENCE_FACTOR)
         )
         reason = "" if enough else "too_few_inliers"
-        return Location(reason, map_T_cam, verdict.information, kf_id, verdict.inliers, verdict.pairs, sure)
+        return Location(reason, map_T_cam, verdict.information, kf_id, verdict.inliers, verdict.pairs, confident)
 
     def _choose(self, found: list[Location]) -> Location:
-        """The answer with most inliers, if they are enough and no other place comes near it."""
+        """The location with most inliers, if they suffice and no other place is comparable."""
         best = max(found, key=lambda x: x.inliers)
         if best.reason:
-            return nowhere(best.reason, best.inliers)
+            return not_found(best.reason, best.inliers)
         for other in found:
-            apart = not within(se3.inverse(best.map_T_cam) @ other.map_T_cam, SAME_METRES, SAME_DEGREES)
-            if apart and other.inliers > RIVAL * best.inliers:
-                return nowhere("ambiguous", best.inliers)
+            distinct = not within(se3.inverse(best.map_T_cam) @ other.map_T_cam, SAME_PLACE_M, SAME_PLACE_DEG)
+            if distinct and other.inliers > AMBIGUITY_RATIO * best.inliers:
+                return not_found("ambiguous", best.inliers)
         return best

@@ -1,4 +1,4 @@
-"""A folder of files that is there whole or not at all: written beside its place, then renamed into it."""
+"""Atomic replacement of a folder: written under a temporary name, then renamed."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from pathlib import Path
 
 @contextmanager
 def replaced_folder(folder: Path, names: frozenset[str]) -> Generator[Path]:
-    """An empty folder to write into; at the end of the block it takes the place of `folder`.
+    """An empty folder to write into; it replaces `folder` at the end of the block.
 
-    Until then what lies in `folder` is untouched, and it stays so when the block raises or the process is killed
-    (between the two renames at the end it is called .NAME.old). A folder that holds other files than `names`, or cannot
-    be renamed (a mount, the working directory), stays as it is and gets the new files one after the other.
+    Until then `folder` is unchanged, also if the block raises or the process is killed (between the two renames at the
+    end it is called .NAME.old). A folder with files other than `names`, or one that cannot be renamed (a mount, the
+    working directory), is kept and gets the new files one by one.
     """
     folder = folder.resolve()
     folder.parent.mkdir(parents=True, exist_ok=True)
     keep = folder.exists() and (_cannot_move(folder) or any(path.name not in names for path in folder.iterdir()))
     draft = folder / ".partial" if keep else folder.with_name(f".{folder.name}.partial")
-    _remove(draft)  # of a process that was killed
+    _remove(draft)  # of a killed process
     draft.mkdir()
     try:
         yield draft

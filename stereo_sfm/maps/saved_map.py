@@ -1,6 +1,6 @@
-"""A saved map: a versioned folder of `map.json`, `rig.yaml` and four npz files; it holds no image.
+"""A saved map: a versioned folder of `map.json`, `rig.yaml` and four npz files, without images.
 
-The same map gives the same bytes. What is wrong with a folder is said in one line.
+Equal maps give equal bytes. An invalid folder gives a one-line error.
 """
 
 from __future__ import annotations
@@ -40,25 +40,25 @@ _FILES: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True, eq=False)
 class SavedMap:
-    """A map at rest, and what is needed to use it again."""
+    """A map with everything needed to use it again."""
 
     snapshot: MapSnapshot
     rig: Rig
     vocabulary_id: str
-    sessions: I64  # (K,) in which walk a keyframe was made: 0, 1, ...
+    sessions: I64  # (K,) session of each keyframe: 0, 1, ...
 
     def __len__(self) -> int:
         """Number of keyframes."""
         return len(self.snapshot.kf_ids)
 
     @property
-    def walks(self) -> list[int]:
-        """The walks that still have keyframes, ascending."""
+    def session_ids(self) -> list[int]:
+        """The sessions that have keyframes, ascending."""
         return np.unique(self.sessions).tolist()
 
 
 def save_map(saved: SavedMap, folder: Path | str) -> None:
-    """Write a map folder, whole or not at all; what else lies in it stays.
+    """Write a map folder atomically; other files in it stay.
 
     Raises:
         StereoSfmError: the map is empty.
@@ -67,25 +67,25 @@ def save_map(saved: SavedMap, folder: Path | str) -> None:
         raise StereoSfmError("the map is empty: nothing to save")
     folder = Path(folder).expanduser()
     with replaced_folder(folder, frozenset({"map.json", "rig.yaml", *(f"{name}.npz" for name in _FILES)})) as draft:
-        sums: dict[str, str] = {}
+        checksums: dict[str, str] = {}
         for name, columns in _FILES.items():
             path = draft / f"{name}.npz"
             np.savez_compressed(path, **{c: _column(saved, c) for c in columns})
-            sums[name] = checksum(path.read_bytes())
+            checksums[name] = checksum(path.read_bytes())
         write_native(saved.rig, draft / "rig.yaml")
-        sums["rig"] = checksum((draft / "rig.yaml").read_bytes())
-        write_header(draft, _counts(saved), saved.vocabulary_id, sums)
+        checksums["rig"] = checksum((draft / "rig.yaml").read_bytes())
+        write_header(draft, _counts(saved), saved.vocabulary_id, checksums)
 
 
 def _counts(saved: SavedMap) -> dict[str, int]:
-    """What map.json says of the size of the map."""
+    """The row counts in map.json."""
     s = saved.snapshot
     sessions = int(saved.sessions.max(initial=-1)) + 1
     return {"keyframes": len(s.kf_ids), "points": len(s.pt_ids), "observations": len(s.obs_kf), "sessions": sessions}
 
 
 def _column(saved: SavedMap, name: str) -> Any:
-    """Pixels as float32: that is how the map holds them."""
+    """Pixels as float32, as stored in the map."""
     value = saved.sessions if name == "sessions" else getattr(saved.snapshot, name)
     return value.astype(np.float32) if name in ("uv_left", "uv_right") else value
 
@@ -94,24 +94,24 @@ def load_map(folder: Path | str, rig: Rig | None = None) -> SavedMap:
     """Read a map folder.
 
     Args:
-        folder: as `--map-out` and `save_map` wrote it.
-        rig: the camera the map shall be used with, checked against the map's own.
+        folder: as written by `--map-out` and `save_map`.
+        rig: the camera to use the map with, checked against the map's own.
 
     Raises:
-        StereoSfmError: no map, another version, damaged, empty, or made with another camera.
+        StereoSfmError: no map, another version, damaged, empty, or built with another camera.
     """
     folder = Path(folder).expanduser()
     head = read_header(folder, (*_FILES, "rig"))
-    sums = head["sha256"]
+    checksums = head["sha256"]
     columns: dict[str, Any] = {}
     try:
         for name, wanted in _FILES.items():
             raw = (folder / f"{name}.npz").read_bytes()
-            if checksum(raw) != sums[name]:
+            if checksum(raw) != checksums[name]:
                 raise ValueError(name)
             data = read_arrays(raw)
             columns.update({c: data[c] for c in wanted})
-        if checksum((folder / "rig.yaml").read_bytes()) != sums["rig"]:
+        if checksum((folder / "rig.yaml").read_bytes()) != checksums["rig"]:
             raise ValueError("rig")
         own = read_native(folder / "rig.yaml")
     except (OSError, KeyError, ValueError, StereoSfmError):
@@ -125,14 +125,14 @@ def load_map(folder: Path | str, rig: Rig | None = None) -> SavedMap:
         columns[name] = columns[name].astype(np.float64)
     snapshot = MapSnapshot(**columns)
     if not len(snapshot.kf_ids) or not len(snapshot.points):
-        raise StereoSfmError(f"the map {folder} is empty: it holds no keyframes or no points")
+        raise StereoSfmError(f"the map {folder} is empty: it has no keyframes or no points")
     if rig is not None and not same_rig(own, rig):
         raise StereoSfmError(
-            f"the map {folder} was made with another camera ({describe_rig(own)}) than this one ({describe_rig(rig)})"
+            f"the map {folder} was built with another camera ({describe_rig(own)}) than this one ({describe_rig(rig)})"
         )
     if rig is not None and abs(own.readout_s - rig.readout_s) > 1e-3:
         log.warning(
-            "the map %s was made with %s, this camera has %s: is readout_s in rig.yaml right?",
+            "the map %s was built with %s, this camera has %s: check readout_s in rig.yaml",
             folder, own.shutter, rig.shutter,
         )  # fmt: skip
     saved = SavedMap(snapshot, own, head["vocabulary"], sessions)
@@ -147,10 +147,10 @@ def _same_parameters(a: Camera, b: Camera, focal: float) -> bool:
 
 
 def same_rig(a: Rig, b: Rig) -> bool:
-    """Whether two rigs are one camera: models, sizes and parameters, and the second camera where it was.
+    """Whether two rigs have the same models, sizes, parameters and relative pose.
 
-    It may differ by what self-calibration corrects: its rotation, its direction and its focal length, a little.
-    Readouts may differ: a map's pixels are those at the stamps.
+    Small differences, as from self-calibration, are allowed in rotation, baseline direction and focal length of the
+    right camera. Readouts may differ: pixels of maps are corrected to the stamps.
     """
     turned = np.linalg.norm(se3.log(se3.inverse(a.left_T_right) @ b.left_T_right)[3:])
     shifted = np.linalg.norm(a.left_T_right[:3, 3] - b.left_T_right[:3, 3])
@@ -169,12 +169,12 @@ def same_rig(a: Rig, b: Rig) -> bool:
 
 
 def describe_rig(rig: Rig) -> str:
-    """A camera in a few words."""
+    """A short description of a rig."""
     return f"{rig.left.model} {rig.left.width}x{rig.left.height} f={rig.left.fx:.1f} b={1000 * rig.baseline:.0f} mm"
 
 
 def restore_map(snapshot: MapSnapshot) -> Map:
-    """A `Map` that can grow further, with the same ids."""
+    """A `Map` that can be extended, with the same ids."""
     map_ = Map()
     map_.add_points(snapshot.pt_ids, snapshot.points, 0)
     map_.points.anchor[:] = snapshot.anchors
@@ -186,25 +186,27 @@ def restore_map(snapshot: MapSnapshot) -> Map:
     return map_
 
 
-def walk_trajectory(saved: SavedMap, walk: int) -> Trajectory:
-    """The keyframes of one walk in the order of time.
+def session_trajectory(saved: SavedMap, session: int) -> Trajectory:
+    """The keyframes of one session in temporal order.
 
     Raises:
-        StereoSfmError: two of them have one time.
+        StereoSfmError: two of them have the same stamp.
     """
-    rows = np.flatnonzero(saved.sessions == walk)
+    rows = np.flatnonzero(saved.sessions == session)
     rows = rows[saved.snapshot.stamp_ns[rows].argsort(kind="stable")]
     stamp_ns = saved.snapshot.stamp_ns[rows]
     if (np.diff(stamp_ns) <= 0).any():
-        raise StereoSfmError(f"walk {walk} of the map holds two keyframes of one time: it is no single walk")
+        raise StereoSfmError(
+            f"session {session} of the map has two keyframes of the same stamp: it is not a single session"
+        )
     return Trajectory(stamp_ns, saved.snapshot.map_T_kf[rows])
 
 
 def joined(maps: list[SavedMap]) -> SavedMap:
-    """All maps in one, side by side: ids, submaps and sessions of the later ones are raised above the earlier's.
+    """Concatenate maps: ids, submaps and sessions of later ones are offset to follow those of earlier ones.
 
     Raises:
-        StereoSfmError: they were made with different cameras.
+        StereoSfmError: they were built with different cameras.
     """
     first = maps[0]
     parts: dict[str, list[Any]] = {f.name: [] for f in dataclasses.fields(MapSnapshot)}
@@ -229,7 +231,7 @@ def joined(maps: list[SavedMap]) -> SavedMap:
 
 
 def as_update(saved: SavedMap) -> MapUpdate:
-    """Everything in a map as one message of the mapper, for those who follow its updates."""
+    """A whole map as one message of the mapper."""
     s, none = saved.snapshot, np.zeros(0, np.int64)
     return MapUpdate(
         version=1,

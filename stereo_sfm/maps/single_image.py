@@ -1,4 +1,4 @@
-"""A single stereo image as a keyframe: the same corners, stereo matches and descriptors that tracking makes."""
+"""A single stereo image as a keyframe, with the corners, stereo matches and descriptors of tracking."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from stereo_sfm.types import Keyframe, StereoImage
 def still_keyframe(
     image: StereoImage, rig: Rig, max_features: int = 1000, config: Config | None = None
 ) -> Keyframe | None:
-    """What a tracker that starts at this image makes of it (pose identity); None where it sees too little."""
+    """The keyframe of a tracker that starts at this image (pose identity); None with too few points."""
     config = config or Config()
     config = dataclasses.replace(config, tracker=dataclasses.replace(config.tracker, max_features=max_features))
     return make_tracker(config, rig).step(image)[1]

@@ -1,1 +1,1 @@
-"""Writing any source to a recording, and describing one."""
+"""Recording a source to a file, and describing recordings."""

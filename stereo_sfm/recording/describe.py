@@ -1,4 +1,4 @@
-"""What a recording or a dataset folder holds and what is wrong with it: rates, jitter, gaps, skew, calibration."""
+"""Contents and problems of a recording or dataset folder: rates, jitter, gaps, skew, calibration."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ from stereo_sfm.types import I64
 log = logging.getLogger("stereo_sfm")
 
 GAP = 1.5  # periods without a frame that count as a gap
-MAX_SKEW_MS = 1.0  # between the eyes, above which tracking suffers
+MAX_SKEW_MS = 1.0  # between the cameras, above which tracking degrades
 MAX_JITTER = 0.2  # of the period
 
 
 @dataclass(frozen=True)
 class Rate:
-    """How regularly something comes. Milliseconds; NaN with fewer than three stamps."""
+    """Regularity of stamps. Milliseconds; NaN with fewer than three stamps."""
 
     count: int
     hz: float
     jitter_ms: float  # 95 % of the intervals are within this of the median
     gaps: int
     longest_gap_s: float
-    missing: int  # frames that would fill the gaps
-    backwards: int  # stamps not later than the one before
+    missing: int  # estimated frames lost in the gaps
+    backwards: int  # stamps not later than the previous one
 
 
 @dataclass
@@ -58,13 +58,13 @@ class Description:
     rows: list[tuple[str, str, Rate]] = field(default_factory=list[tuple[str, str, Rate]])  # topic, schema, rate
     images: Rate | None = None
     dropped: int = 0
-    skew_ms: float = float("nan")  # largest difference between the eyes' stamps
+    skew_ms: float = float("nan")  # largest difference between the cameras' stamps
     calibration: list[str] = field(default_factory=list[str])
     ground_truth: int = 0
     problems: list[str] = field(default_factory=list[str])
 
     def as_json(self) -> str:
-        """For machines; NaN becomes null."""
+        """As JSON values; NaN becomes null."""
         text = json.dumps(asdict(self), default=str)
         return json.dumps(json.loads(text, parse_constant=lambda _: None), indent=2)
 
@@ -85,12 +85,12 @@ def rate_of(stamps: I64) -> Rate:
 
 
 def describe_file(path: Path, rig: Path | None = None) -> Description:
-    """An MCAP file, ours or not; `rig` replaces its calibration or stands in for a missing one.
+    """Describe an MCAP file, ours or not; `rig` replaces its calibration or provides a missing one.
 
     Raises:
         StereoSfmError: no such file, or not MCAP.
     """
-    with _said_once():
+    with _without_duplicates():
         return _describe_file(path, rig)
 
 
@@ -109,36 +109,36 @@ def _describe_file(path: Path, own_rig: Path | None) -> Description:
             out.rows.append((topic.topic, topic.schema or topic.encoding, rate_of(stamps[topic.topic])))
             out.messages += topic.count
         _describe_infos(out, reader)
-        _compare_eyes(out, {topic.topic: topic.count for topic in reader.topics})
+        _compare_cameras(out, {topic.topic: topic.count for topic in reader.topics})
         lean = out.metadata.get("image_format") == "none"
         if lean:
             rig = attached_rig(reader)
             if rig is None:
-                out.problems.append("its calibration is damaged")
+                out.problems.append("the calibration is damaged")
             else:
                 out.calibration = rig_lines(rig)
             out.images = rate_of(reader.stamps(topics.FRAME))
     if lean and (out.images is None or not out.images.count):
-        out.problems.append("it holds no frames")
+        out.problems.append("no frames")
     if ENDED_EARLY.items() <= out.metadata.items():
-        out.problems.append("the run was killed: what its stages would have said last is missing")
+        out.problems.append("the run was killed: the final messages of its stages are missing")
     if out.truncated:
-        out.problems.append(f"{out.truncated}: 'stereo-sfm recover' writes a mended copy")
+        out.problems.append(f"{out.truncated}: 'stereo-sfm recover' writes a repaired copy")
     if not lean:
         _describe_source(out, path, own_rig)
     return out
 
 
 @contextmanager
-def _said_once() -> Generator[None]:
-    """The file is opened as a log and as a source: what both find is one warning."""
-    said = set[str]()
+def _without_duplicates() -> Generator[None]:
+    """The file is opened as a log and as a source: a warning of both is shown once."""
+    seen = set[str]()
 
     def new(record: logging.LogRecord) -> bool:
         text = record.getMessage()
-        before = len(said)
-        said.add(text)
-        return len(said) > before
+        before = len(seen)
+        seen.add(text)
+        return len(seen) > before
 
     log.addFilter(new)
     try:
@@ -148,10 +148,10 @@ def _said_once() -> Generator[None]:
 
 
 def describe_folder(path: Path, rig: Path | None = None) -> Description:
-    """A dataset folder of any kind that the drivers know; `rig` as in `describe_file`.
+    """Describe a dataset folder of any known kind; `rig` as in `describe_file`.
 
     Raises:
-        StereoSfmError: nothing known lies there.
+        StereoSfmError: not a known dataset.
     """
     out = Description(str(path), "folder")
     _describe_source(out, path, rig)
@@ -159,7 +159,7 @@ def describe_folder(path: Path, rig: Path | None = None) -> Description:
 
 
 def _describe_infos(out: Description, reader: LogReader) -> None:
-    """Skew and drops as our own recordings hold them: counted at the end, else (not closed) in every message."""
+    """Skew and drops as stored in our recordings: totals at the end, else (not closed) in every message."""
     out.totals = reader.metadata(TOTALS)
     if out.totals:
         try:
@@ -167,7 +167,7 @@ def _describe_infos(out: Description, reader: LogReader) -> None:
             out.skew_ms = skew_ns / 1e6
             return
         except (LookupError, ValueError, OverflowError):
-            out.problems.append("its totals are damaged: what they would say is counted anew")
+            out.problems.append("the totals are damaged: they are counted again")
             out.totals, out.dropped = {}, 0
     skews = [0]
     infos = 0
@@ -180,13 +180,13 @@ def _describe_infos(out: Description, reader: LogReader) -> None:
         out.skew_ms = max(skews) / 1e6
 
 
-def _compare_eyes(out: Description, counts: dict[str, int]) -> None:
-    """Our own recordings say of every frame which images it has."""
+def _compare_cameras(out: Description, counts: dict[str, int]) -> None:
+    """Our recordings list the images of every frame."""
     frames = counts.get(topics.IMAGE_INFO, 0)
     for topic in (topics.LEFT_IMAGE, topics.RIGHT_IMAGE, topics.DEPTH_IMAGE):
         if 0 < counts.get(topic, frames) < frames:
             out.problems.append(
-                f"{frames - counts[topic]} of {frames} images of {topic} are missing: those frames are left out"
+                f"{frames - counts[topic]} of {frames} images of {topic} are missing: those frames are skipped"
             )
 
 
@@ -219,31 +219,31 @@ def _problems(out: Description) -> list[str]:
     found: list[str] = []
     rate = out.images
     if rate is None or not rate.count:
-        return [*found, "no image can be used"]
+        return [*found, "no usable images"]
     if rate.backwards:
-        found.append(f"{rate.backwards} image stamps are not later than the one before")
+        found.append(f"{rate.backwards} image stamps are not later than the previous one")
     if rate.gaps:
         found.append(
             f"{rate.gaps} gaps between images (longest {rate.longest_gap_s:.3f} s, about {rate.missing} frames missing)"
         )
     if rate.jitter_ms > MAX_JITTER * 1e3 / rate.hz:
-        found.append(f"image stamps jitter by {rate.jitter_ms:.1f} ms: are they the sensor's?")
+        found.append(f"image stamps jitter by {rate.jitter_ms:.1f} ms: are they stamps of the sensor?")
     if out.skew_ms > MAX_SKEW_MS:
-        found.append(f"the eyes are up to {out.skew_ms:.2f} ms apart: a moving camera sees two different scenes")
+        found.append(f"the cameras are up to {out.skew_ms:.2f} ms apart: in motion they see different scenes")
     return found
 
 
 def rig_lines(rig: Rig) -> list[str]:
-    """The calibration for people, one line per eye and one for the pair."""
+    """The calibration as text, one line per camera and one for the pair."""
     lines = [f"left  {_camera_line(rig.left)}"]
     if rig.readout_s:
         lines.append(f"rolling shutter, {rig.shutter}")
     if rig.depth:
         return [*lines, f"depth image, virtual baseline {rig.baseline * 1e3:.1f} mm"]
     if rig.right is None:
-        return [*lines, "one eye"]
+        return [*lines, "one camera"]
     angle = np.degrees(se3.extent(rig.left_T_right)[1])
-    pair = f"baseline {rig.baseline * 1e3:.2f} mm, eyes turned by {angle:.2f} deg"
+    pair = f"baseline {rig.baseline * 1e3:.2f} mm, relative rotation {angle:.2f} deg"
     return [*lines, f"right {_camera_line(rig.right)}", pair]
 
 

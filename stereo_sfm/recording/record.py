@@ -1,4 +1,4 @@
-"""Write a source to a file, nothing else: what `stereo-sfm record` and `convert` do."""
+"""Write a source to a file, for `stereo-sfm record` and `convert`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from stereo_sfm.log.writer import LogWriter
 
 @dataclass(frozen=True)
 class Progress:
-    """State of a recording after one more frame."""
+    """Progress of a recording."""
 
     frames: int
     dropped: int
@@ -35,19 +35,19 @@ def record(
     clock: Callable[[], int] = time.time_ns,
     opening: Opening | None = None,
 ) -> Generator[Progress, None, None]:
-    """Write every frame of an open source; yields after each. Stop iterating (or close the iterator) to stop.
+    """Write every frame of an open source; yields after each one. Close the iterator to stop.
 
     Args:
         source: entered by the caller.
         path: the .mcap file.
         image_format: "png" (lossless), "raw" or "jpeg" (lossy).
         overwrite: replace an existing file.
-        mode: goes into the metadata.
+        mode: for the metadata.
         clock: wall clock in nanoseconds, for `publish_time`.
         opening: how the source was opened.
 
     Raises:
-        StereoSfmError: the file cannot be written, the disk is full, the source fails, or it gave no frame.
+        StereoSfmError: the file cannot be written, the disk is full, the source fails, or it yields no frame.
     """
     one_of(image_format, FORMATS, "image format")
     frames, dropped, first_ns = 0, 0, None
@@ -69,6 +69,6 @@ def record(
                 writer.metadata(TOTALS, counted | images.totals)
             if not frames:
                 writer.close()
-                path.unlink()  # nothing but a calibration
+                path.unlink()  # it contains only a calibration
     if not frames:
-        raise StereoSfmError(f"{source.name} gave no image: nothing was recorded")
+        raise StereoSfmError(f"{source.name} yielded no image: nothing was recorded")

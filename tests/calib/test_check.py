@@ -18,7 +18,7 @@ from stereo_sfm.calib.matches import Matches
 from stereo_sfm.calib.rectification import rectify
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.scene_model import DIRECTION, SKEW
-from stereo_sfm.calib.tracks import LONGEST, Window, collect, corners_for
+from stereo_sfm.calib.tracks import MAX_FRAMES, Window, collect, corners_for
 from stereo_sfm.cli import main
 from stereo_sfm.drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
@@ -135,7 +135,7 @@ def test_time_skew_is_measured() -> None:
 
 def judge(rig: Rig, images: list[StereoImage]) -> CheckReport:
     rectification = rectify(rig, "epipolar")
-    gap = max(0, len(images) // 10 - LONGEST)
+    gap = max(0, len(images) // 10 - MAX_FRAMES)
     return check(rig, rectification, collect(images, rectification, 10, gap, corners_for(len(images), 10)))
 
 

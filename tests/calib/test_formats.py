@@ -112,13 +112,13 @@ def test_a_readout_that_a_dialect_cannot_state(tmp_path: Path, caplog: pytest.Lo
     save_rig(rig, tmp_path / "rig.yaml")
     assert not caplog.records
     save_rig(rig, tmp_path / "camchain.yaml", "kalibr")
-    assert "kalibr has no place for the readout" in caplog.text
+    assert "kalibr cannot store the readout" in caplog.text
     (tmp_path / "rig.yaml").write_text((tmp_path / "rig.yaml").read_text().replace("readout_s: 0.02", "readout_s:"))
     assert load_rig(tmp_path / "rig.yaml").readout_s == 0.0
 
 
 def test_a_readout_in_milliseconds_is_told() -> None:
-    with pytest.raises(StereoSfmError, match="readout of 28 s: seconds"):
+    with pytest.raises(StereoSfmError, match="readout of 28 s; give the seconds"):
         Rig(FISHEYE.left, readout_s=28.0)
 
 
@@ -164,7 +164,7 @@ def test_kitti_raw_colour_pair(tmp_path: Path) -> None:
     size = "S_rect_02: 1242 375\nS_rect_03: 1242 375\n"
     text = f"calib_time: 09-Jan-2012 13:57:47\n{size}P_rect_02: {p2}\nP_rect_03: {p3}\n"
     (tmp_path / "calib_cam_to_cam.txt").write_text(text)
-    rig = read_kitti(tmp_path, eyes=(2, 3))
+    rig = read_kitti(tmp_path, pair=(2, 3))
     assert rig.left.size == (1242, 375)
     point = np.array([1.0, -2.0, 9.0, 1.0])  # in the reference camera
     for camera, cam_T_ref, p in (
@@ -254,8 +254,8 @@ def test_basalt_quaternion_is_camera_to_body(tmp_path: Path) -> None:
             "camera_matrix: {data: [1, 2]}\nimage_width: 3\nimage_height: 4",
             "'distortion_model' is missing",
         ),
-        ("rig.yaml", "stereo_sfm_rig: 2", "this version reads 1"),
-        ("rig.yaml", "hello: 1", "cannot tell the calibration format"),
+        ("rig.yaml", "stereo_sfm_rig: 2", "this version of the program reads 1"),
+        ("rig.yaml", "hello: 1", "cannot detect the calibration format"),
         ("calib.txt", "P0: 1 2 3\nP1: 4", "expected 12 numbers"),
         ("b.json", '{"T_imu_cam": 3}', "'value0' is missing"),
         ("f.json", '[{"K": [0,0,0,0,0,0,0,0,0], "width": 1, "height": 1}]', "not calibrated"),
@@ -320,7 +320,7 @@ ALIASES = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     [
         ("rig.yaml", f"stereo_sfm_rig: 1\n{ALIASES}left: *n\n", "more values than any calibration"),
         ("rig.yaml", "stereo_sfm_rig: 1\nleft: " + "[" * 10_000, "nested too deeply"),
-        ("rig.yaml", "stereo_sfm_rig: 1\nleft: &a {model: *a}\n", "holds itself"),
+        ("rig.yaml", "stereo_sfm_rig: 1\nleft: &a {model: *a}\n", "contains itself"),
         ("rig.yaml", "stereo_sfm_rig: 1\nleft: 1" + ":1" * 50_000, "100001 characters"),
         ("rig.yaml", "stereo_sfm_rig: 1\n#" + "x" * (1 << 20), "no calibration"),
         ("rig.yaml", "stereo_sfm_rig: 1\n#" + "x" * (5 << 20), "no calibration"),

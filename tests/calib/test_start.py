@@ -26,28 +26,28 @@ def turned(image: np.ndarray) -> np.ndarray:
 
 
 CHANGES: dict[str, tuple[Change, str]] = {
-    "exchanged": (lambda i: replace(i, left=i.right, right=i.left), "left and right are exchanged"),
+    "swapped": (lambda i: replace(i, left=i.right, right=i.left), "left and right are swapped"),
     "upside down": (lambda i: replace(i, left=turned(i.left), right=turned(i.right)), "both images are upside down"),
     "left down": (lambda i: replace(i, left=turned(i.left)), "the left image is upside down: 0 stereo"),
     "right down": (lambda i: replace(i, right=turned(i.right)), "the right image is upside down: 0 stereo"),
     "dark": (lambda i: replace(i, left=i.left // 40, right=i.right // 40), "nearly black"),
     "light": (lambda i: replace(i, left=np.maximum(i.left, 250), right=i.right), "nearly white"),
-    "covered": (lambda i: replace(i, left=i.left // 100 + 90, right=i.right), "show nothing"),
+    "covered": (lambda i: replace(i, left=i.left // 100 + 90, right=i.right), "no contrast"),
 }
 
 
 @pytest.mark.parametrize("name", CHANGES)
-def test_a_mistake_in_the_images_is_named(images: tuple[s.Rig, list[s.StereoImage]], name: str) -> None:
+def test_a_mistake_in_the_images_is_reported(images: tuple[s.Rig, list[s.StereoImage]], name: str) -> None:
     rig, good = images
-    change, said = CHANGES[name]
+    change, message = CHANGES[name]
     why = why_no_start(rig, [change(image) for image in good])
-    assert said in why and "\n" not in why
+    assert message in why and "\n" not in why
 
 
-def test_a_transform_the_wrong_way_round_is_named(images: tuple[s.Rig, list[s.StereoImage]]) -> None:
+def test_an_inverted_transform_is_reported(images: tuple[s.Rig, list[s.StereoImage]]) -> None:
     rig, good = images
     inverted = replace(rig, left_T_right=se3.inverse(rig.left_T_right))
-    assert why_no_start(inverted, good).startswith("left_T_right is the wrong way round: 0 stereo matches")
+    assert why_no_start(inverted, good).startswith("left_T_right is inverted: 0 stereo matches")
 
 
 def test_the_calibration_of_other_cameras_is_suspected(images: tuple[s.Rig, list[s.StereoImage]]) -> None:
@@ -56,5 +56,5 @@ def test_the_calibration_of_other_cameras_is_suspected(images: tuple[s.Rig, list
     assert "is this the calibration of these cameras?" in why_no_start(replace(rig, left_T_right=bent), good)
 
 
-def test_good_images_are_left_alone(images: tuple[s.Rig, list[s.StereoImage]]) -> None:
+def test_good_images_give_no_diagnosis(images: tuple[s.Rig, list[s.StereoImage]]) -> None:
     assert why_no_start(*images) == ""

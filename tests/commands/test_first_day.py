@@ -37,9 +37,9 @@ def test_a_run_with_exchanged_cameras_says_so(folder: Path, tmp_path: Path, caps
     assert main(["run", "--inline", f"images:{swapped}", "-o", str(tmp_path / "out")]) == 4
     out, err = capsys.readouterr()
     assert "tracked 0/9 frames" in out and "never initialised" in out and "never lost" not in out
-    assert "tracking never initialised: left and right are exchanged" in err
+    assert "tracking never initialised: left and right are swapped" in err
     report = (tmp_path / "out" / "report.md").read_text()
-    assert "left and right are exchanged" in report and "tracking.png" not in report
+    assert "left and right are swapped" in report and "tracking.png" not in report
     assert not (tmp_path / "out" / "tracking.png").exists()
 
 

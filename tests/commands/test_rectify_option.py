@@ -111,5 +111,5 @@ def test_a_camera_tells_its_calibration_when_it_is_open() -> None:
 
 def test_one_eye_cannot_be_rectified() -> None:
     true = open_source(SPEC).rig
-    with pytest.raises(StereoSfmError, match="rectification needs two eyes"):
+    with pytest.raises(StereoSfmError, match="rectification needs two cameras"):
         rectified(LateRig(Rig(true.left)), "epipolar")

@@ -79,9 +79,11 @@ def test_another_walk_is_placed_in_the_map(tmp_path: Path, store: Path) -> None:
 def test_another_walk_is_joined_with_the_map(tmp_path: Path, store: Path) -> None:
     assert second_walk(tmp_path, store, "--map-out", str(tmp_path / "both")) == 0
     both: SavedMap = load_map(tmp_path / "both")
-    assert both.walks == [0, 1]
+    assert both.session_ids == [0, 1]
     assert len(both) > len(load_map(store))
-    seen_by = [np.unique(both.snapshot.obs_pt[both.sessions[both.snapshot.obs_kf] == walk]) for walk in both.walks]
+    seen_by = [
+        np.unique(both.snapshot.obs_pt[both.sessions[both.snapshot.obs_kf] == walk]) for walk in both.session_ids
+    ]
     assert len(np.intersect1d(*seen_by)) > 50
     assert np.median(errors_in_the_map(tmp_path / "run")) < 0.03
 
@@ -94,7 +96,7 @@ def test_another_tracker_is_placed_in_the_map_as_well(tmp_path: Path, store: Pat
 def test_without_recognition_there_is_no_place(tmp_path: Path, store: Path, capsys: pytest.CaptureFixture[str]) -> None:
     off = ["--set", "mapper.enabled=false", "--set", "loop.enabled=false"]
     assert second_walk(tmp_path, store, "--localize-only", *off) == 2
-    assert "leave loop.enabled=true" in capsys.readouterr().err
+    assert "set loop.enabled=true" in capsys.readouterr().err
 
 
 def test_a_dark_recording_has_no_map_and_says_that_tracking_never_began(

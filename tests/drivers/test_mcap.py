@@ -401,7 +401,7 @@ def test_info_speaks_of_gaps_skew_and_topics(tmp_path: Path, capsys: pytest.Capt
     text = capsys.readouterr().out
     assert "images: 38 at 20.00 Hz, jitter 0.00 ms, 1 gaps up to 0.150 s" in text
     assert "problem: 1 gaps between images (longest 0.150 s, about 2 frames missing)" in text
-    assert "problem: the eyes are up to 3.00 ms apart" in text
+    assert "problem: the cameras are up to 3.00 ms apart" in text
     assert "/stereo/left/image_raw" in text and "foxglove.RawImage" in text and "radtan 64x48" in text
     assert main(["info", str(path), "--json"]) == 0
     import json

@@ -19,7 +19,7 @@ from stereo_sfm.export.g2o import export_g2o, graph_edges
 from stereo_sfm.export.ply import export_ply
 from stereo_sfm.export.trajectories import named_pose, write_tum
 from stereo_sfm.geometry import se3
-from stereo_sfm.maps.saved_map import SavedMap, joined, save_map, walk_trajectory
+from stereo_sfm.maps.saved_map import SavedMap, joined, save_map, session_trajectory
 from tests.loop.store_walk import StoreWalk
 from tests.maps.maps import small_map
 
@@ -171,20 +171,20 @@ def test_trajectories_of_a_merged_map_are_a_file_for_each_walk(
     assert (tmp_path / "one.txt").read_bytes() == (tmp_path / "m" / names[1]).read_bytes()
     assert main(export) == 2
     assert f"{names[0]} exists: choose another -o" in capsys.readouterr().err
-    assert main([*export, "--walk", "2", "-o", str(tmp_path / "two.txt")]) == 2
-    assert "the map holds no walk 2 (it holds 0, 1)" in capsys.readouterr().err
+    assert main([*export, "--session", "2", "-o", str(tmp_path / "two.txt")]) == 2
+    assert "the map has no session 2 (it has 0, 1)" in capsys.readouterr().err
 
 
 def test_a_walk_with_two_keyframes_of_one_time_is_no_trajectory(saved: SavedMap) -> None:
     twice = dataclasses.replace(joined([saved, saved]), sessions=np.zeros(2 * len(saved), np.int64))
-    with pytest.raises(StereoSfmError, match="walk 0 of the map holds two keyframes of one time"):
-        walk_trajectory(twice, 0)
+    with pytest.raises(StereoSfmError, match="session 0 of the map has two keyframes of the same stamp"):
+        session_trajectory(twice, 0)
 
 
 @pytest.mark.parametrize("what", ["world_T_body", "world_T_cam0"])
 def test_exported_poses_of_a_run_keep_their_name(tmp_path: Path, saved: SavedMap, what: str) -> None:
     """`run --frame body` writes poses of the body: no export may call them the camera's."""
-    trajectory = walk_trajectory(saved, 0)
+    trajectory = session_trajectory(saved, 0)
     write_tum(tmp_path / "trajectory_map.tum", trajectory, what)
     for kind in ("tum", "euroc"):
         assert main(["export", str(tmp_path), "--format", kind, "-o", str(tmp_path / kind)]) == 0

@@ -27,14 +27,14 @@ def test_overwriting_a_run_that_is_going_on_is_refused_and_touches_nothing(tmp_p
     other = subprocess.Popen([sys.executable, "-c", OTHER, str(tmp_path)], stdout=-1, text=True)
     assert other.stdout is not None and other.stdout.readline() == "mine\n"
     (tmp_path / "run.mcap").write_text("of the other")
-    with pytest.raises(StereoSfmError, match=r"a run is writing to .*: choose another -o, or wait"):
+    with pytest.raises(StereoSfmError, match=r"another run is writing to .*: choose another -o, or wait"):
         prepare_folder(tmp_path, overwrite=True)
     assert (tmp_path / "run.mcap").exists()
     os.kill(other.pid, signal.SIGKILL)
     other.wait()
     lock = prepare_folder(tmp_path, overwrite=True)  # a killed run holds nothing
     assert list(tmp_path.iterdir()) == []
-    with pytest.raises(StereoSfmError, match="a run is writing"):
+    with pytest.raises(StereoSfmError, match="another run is writing"):
         prepare_folder(tmp_path, overwrite=True)
     del lock
     prepare_folder(tmp_path, overwrite=True)

@@ -158,7 +158,7 @@ def test_images_follow_the_tables_and_are_black_outside() -> None:
 
 def test_refusals() -> None:
     rig = fisheye_rig()
-    with pytest.raises(StereoSfmError, match="two eyes"):
+    with pytest.raises(StereoSfmError, match="two cameras"):
         rectify(Rig(rig.left), "pinhole")
     with pytest.raises(StereoSfmError, match="unknown projection"):
         rectify(rig, "mercator")

@@ -88,5 +88,5 @@ def test_info_of_a_run_whose_calibration_is_damaged_tells_the_rest(tmp_path: Pat
         writer.metadata("stereo_sfm", {"image_format": "none", "source": "elsewhere"})
         writer.attach(RIG_FILE, b"\xff\xfe\x00")
     found = describe_file(path)
-    assert "its calibration is damaged" in found.problems
+    assert "the calibration is damaged" in found.problems
     assert found.metadata["source"] == "elsewhere"

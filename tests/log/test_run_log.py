@@ -398,11 +398,7 @@ def test_a_recording_is_no_run_and_a_run_without_images_says_where_they_are(
         open_source(path)
     assert main(["info", str(path)]) == 0
     text = capsys.readouterr().out
-    assert (
-        "frames, without their images: 0" in text
-        and "baseline 64.10 mm" in text
-        and "problem: it holds no frames" in text
-    )
+    assert "frames, without their images: 0" in text and "baseline 64.10 mm" in text and "problem: no frames" in text
 
 
 def _put_frames(log: RunLog, count: int) -> None:

@@ -15,7 +15,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
 from stereo_sfm.mapping.mapper import Mapper
 from stereo_sfm.maps.folders import MapFolders, save_result
-from stereo_sfm.maps.merge import full_adjustment, merge, prune, share_a_walk
+from stereo_sfm.maps.merge import full_adjustment, merge, prune, share_a_session
 from stereo_sfm.maps.saved_map import SavedMap, joined, load_map, restore_map, save_map
 from stereo_sfm.types import LoopResult
 from tests.loop.store_walk import StoreWalk, make_walk
@@ -24,7 +24,7 @@ from tests.synthetic import pinhole_rig
 
 
 @pytest.fixture(scope="module")
-def walks() -> list[StoreWalk]:
+def drives() -> list[StoreWalk]:
     """Two walks through one store: the first two aisles, and later the first one again, with frames of their own."""
     both = make_walk([0, 1, 0], seed=31)
     second = next(
@@ -35,13 +35,13 @@ def walks() -> list[StoreWalk]:
 
 
 @pytest.fixture(scope="module")
-def vocabulary(walks: list[StoreWalk]) -> voc.Vocabulary:
-    return voc.train([k.descriptors for k in walks[0].keyframes], depth=3)
+def vocabulary(drives: list[StoreWalk]) -> voc.Vocabulary:
+    return voc.train([k.descriptors for k in drives[0].keyframes], depth=3)
 
 
 @pytest.fixture(scope="module")
-def maps(walks: list[StoreWalk]) -> list[SavedMap]:
-    return [map_of_walk(w) for w in walks]
+def maps(drives: list[StoreWalk]) -> list[SavedMap]:
+    return [map_of_walk(w) for w in drives]
 
 
 @pytest.fixture(scope="module")
@@ -53,10 +53,10 @@ def merged(maps: list[SavedMap], vocabulary: voc.Vocabulary) -> SavedMap:
 
 
 def test_merged_map_has_both_walks_where_they_were(
-    walks: list[StoreWalk], maps: list[SavedMap], merged: SavedMap
+    drives: list[StoreWalk], maps: list[SavedMap], merged: SavedMap
 ) -> None:
     assert len(merged) == sum(map(len, maps))
-    truth = np.concatenate([w.world_T_kf for w in walks])
+    truth = np.concatenate([w.world_T_kf for w in drives])
     expected = se3.inverse(truth[0]) @ truth
     error = np.linalg.norm(merged.snapshot.map_T_kf[:, :3, 3] - expected[:, :3, 3], axis=1)
     aisle = np.abs(truth[:, 0, 3]) < 0.1
@@ -71,7 +71,7 @@ def test_merged_map_names_the_vocabulary_it_was_compared_with(merged: SavedMap, 
     assert merged.vocabulary_id == vocabulary.id
 
 
-def test_wrong_observations_leave_the_map_in_the_full_adjustment(walks: list[StoreWalk], maps: list[SavedMap]) -> None:
+def test_wrong_observations_leave_the_map_in_the_full_adjustment(drives: list[StoreWalk], maps: list[SavedMap]) -> None:
     s = maps[1].snapshot
     views = np.bincount(s.obs_pt, minlength=len(s.pt_ids))
     many, two = np.flatnonzero(views[s.obs_pt] > 4)[::400], np.flatnonzero(views[s.obs_pt] == 2)[::400]
@@ -89,14 +89,14 @@ def test_wrong_observations_leave_the_map_in_the_full_adjustment(walks: list[Sto
     assert kept[s.obs_pt[many]].all() and not kept[s.obs_pt[two]][:3].any()
     still = np.bincount(after.obs_pt, minlength=len(after.pt_ids))[np.searchsorted(after.pt_ids, s.pt_ids[kept])]
     assert (still[views[kept] >= 2] >= 2).all()
-    truth = se3.inverse(walks[1].world_T_kf[0]) @ walks[1].world_T_kf
+    truth = se3.inverse(drives[1].world_T_kf[0]) @ drives[1].world_T_kf
     error = np.linalg.norm(after.map_T_kf[:, :3, 3] - truth[:, :3, 3], axis=1)
     assert np.sqrt((error**2).mean()) < 0.02
 
 
 def test_maps_that_share_nothing_are_not_joined(maps: list[SavedMap], vocabulary: voc.Vocabulary) -> None:
     stranger = map_of_walk(make_walk([0], seed=99))
-    with pytest.raises(StereoSfmError, match="2 pieces: no loop joins them"):
+    with pytest.raises(StereoSfmError, match="2 separate maps: no loop joins them"):
         merge([maps[1], stranger], vocabulary, LoopConfig())
 
 
@@ -107,16 +107,16 @@ def test_maps_of_different_cameras_are_not_joined(maps: list[SavedMap]) -> None:
 
 def test_a_walk_is_known_again(maps: list[SavedMap], merged: SavedMap) -> None:
     for saved in maps:
-        assert share_a_walk(saved, saved)
-        assert share_a_walk(merged, saved)
+        assert share_a_session(saved, saved)
+        assert share_a_session(merged, saved)
     part = np.arange(len(maps[0])) < 20
     s = maps[0].snapshot
     snapshot = dataclasses.replace(s, **{f: getattr(s, f)[part[s.obs_kf]] for f in ("obs_kf", "obs_pt", "uv_left")})
-    assert share_a_walk(dataclasses.replace(maps[0], snapshot=snapshot), maps[0])
-    assert not share_a_walk(maps[0], maps[1])
+    assert share_a_session(dataclasses.replace(maps[0], snapshot=snapshot), maps[0])
+    assert not share_a_session(maps[0], maps[1])
     again = map_of_walk(make_walk([0, 1], seed=31, noise_px=0.3))  # the same times, pictures of their own
     assert set(again.snapshot.stamp_ns.tolist()) & set(s.stamp_ns.tolist())
-    assert not share_a_walk(maps[0], again)
+    assert not share_a_session(maps[0], again)
 
 
 def test_side_by_side_keeps_every_row(maps: list[SavedMap]) -> None:
@@ -192,22 +192,22 @@ def test_prune_refuses_numbers_out_of_range(
 
 
 def test_a_known_place_joins_what_the_search_does_not(
-    walks: list[StoreWalk], maps: list[SavedMap], vocabulary: voc.Vocabulary
+    drives: list[StoreWalk], maps: list[SavedMap], vocabulary: voc.Vocabulary
 ) -> None:
     blind = LoopConfig(min_inliers=10**6)
-    with pytest.raises(StereoSfmError, match="stay in 2 pieces"):
+    with pytest.raises(StereoSfmError, match="remain 2 separate maps"):
         merge(maps, vocabulary, blind)
     here = 5
-    distance = np.linalg.norm(walks[0].world_T_kf[:, :3, 3] - walks[1].world_T_kf[here, :3, 3], axis=1)
+    distance = np.linalg.norm(drives[0].world_T_kf[:, :3, 3] - drives[1].world_T_kf[here, :3, 3], axis=1)
     there = int(np.argmin(distance))
-    physical = {walks[0].physical[p]: p for p in maps[0].snapshot.pt_ids.tolist()}
-    seen = [p for p in maps[1].snapshot.pt_ids.tolist() if walks[1].physical[p] in physical]
+    physical = {drives[0].physical[p]: p for p in maps[0].snapshot.pt_ids.tolist()}
+    seen = [p for p in maps[1].snapshot.pt_ids.tolist() if drives[1].physical[p] in physical]
     place = LoopResult(
         kf_id=int(maps[1].snapshot.kf_ids[here]),
         candidate_kf_id=int(maps[0].snapshot.kf_ids[there]),
-        candidate_T_kf=se3.inverse(walks[0].world_T_kf[there]) @ walks[1].world_T_kf[here],
+        candidate_T_kf=se3.inverse(drives[0].world_T_kf[there]) @ drives[1].world_T_kf[here],
         information=np.eye(6) * 1e4,
-        matches=np.array([[physical[walks[1].physical[p]], p] for p in seen[:100]]),
+        matches=np.array([[physical[drives[1].physical[p]], p] for p in seen[:100]]),
         inliers=100,
         score=0.0,
         reason="",
@@ -216,7 +216,7 @@ def test_a_known_place_joins_what_the_search_does_not(
     assert len(result.loops) == 1 and result.fused == 100
     error = np.linalg.norm(
         result.saved.snapshot.map_T_kf[len(maps[0]) :, :3, 3]
-        - (se3.inverse(walks[0].world_T_kf[0]) @ walks[1].world_T_kf)[:, :3, 3],
+        - (se3.inverse(drives[0].world_T_kf[0]) @ drives[1].world_T_kf)[:, :3, 3],
         axis=1,
     )
     assert np.median(error) < 0.1
@@ -224,23 +224,23 @@ def test_a_known_place_joins_what_the_search_does_not(
 
 def test_a_merged_map_is_one_piece(merged: SavedMap, maps: list[SavedMap], vocabulary: voc.Vocabulary) -> None:
     """What joined its walks is not in the file: with a third map they still count as one."""
-    with pytest.raises(StereoSfmError, match="the 2 maps stay in 2 pieces"):
+    with pytest.raises(StereoSfmError, match="the 2 maps remain 2 separate maps"):
         merge([merged, maps[1]], vocabulary, LoopConfig(min_inliers=10**6))
 
 
 @pytest.mark.parametrize("in_place", [True, False])
 def test_a_merge_that_fails_costs_no_map(
-    tmp_path: Path, walks: list[StoreWalk], maps: list[SavedMap], in_place: bool
+    tmp_path: Path, drives: list[StoreWalk], maps: list[SavedMap], in_place: bool
 ) -> None:
     save_map(maps[0], tmp_path / "store")
-    mapper = Mapper(MapperConfig(), walks[1].rig)
-    for k, keyframe in enumerate(walks[1].keyframes[:5]):
+    mapper = Mapper(MapperConfig(), drives[1].rig)
+    for k, keyframe in enumerate(drives[1].keyframes[:5]):
         mapper.step(dataclasses.replace(keyframe, kf_id=k))
     out = tmp_path / ("store" if in_place else "other")
     config = Config(loop=LoopConfig(min_inliers=10**6))
-    with pytest.raises(StereoSfmError, match="is this walk alone"):
+    with pytest.raises(StereoSfmError, match="contains this session alone"):
         save_result(mapper, config, MapFolders(tmp_path / "store", map_out=out))
-    assert len(load_map(tmp_path / "store", walks[0].rig)) == len(maps[0])
-    assert len(load_map(tmp_path / "store_walk1" if in_place else out, walks[0].rig)) == len(
+    assert len(load_map(tmp_path / "store", drives[0].rig)) == len(maps[0])
+    assert len(load_map(tmp_path / "store_walk1" if in_place else out, drives[0].rig)) == len(
         mapper.map.living_keyframes()
     )

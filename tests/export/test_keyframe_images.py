@@ -15,7 +15,7 @@ from stereo_sfm.drivers.rectified import RectifiedSource, rectified
 from stereo_sfm.drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.colmap import export_colmap
-from stereo_sfm.export.pictures import check_walk, open_pictures, walk_of_recording, write_pictures
+from stereo_sfm.export.keyframe_images import check_session, open_recording, session_of_recording, write_keyframe_images
 from stereo_sfm.maps.saved_map import SavedMap, joined, save_map
 from stereo_sfm.types import StereoImage
 from tests.maps.maps import small_map
@@ -67,8 +67,8 @@ def test_each_recording_gives_the_pictures_of_its_own_walk(tmp_path: Path, saved
     export_colmap(both, tmp_path)
     for walk, one in enumerate((saved, later(saved))):
         pictures = recording(one, 50 + 100 * walk)
-        assert walk_of_recording(both, pictures, "day") == walk
-        write_pictures(both, pictures, walk, tmp_path)
+        assert session_of_recording(both, pictures, "day") == walk
+        write_keyframe_images(both, pictures, walk, tmp_path)
         assert sum(1 for _ in (tmp_path / "images").rglob("*.png")) == 2 * len(saved) * (walk + 1)
     for name in names_in(tmp_path):
         picture = cv2.imread(str(tmp_path / "images" / name), cv2.IMREAD_GRAYSCALE)
@@ -77,28 +77,30 @@ def test_each_recording_gives_the_pictures_of_its_own_walk(tmp_path: Path, saved
 
 def test_a_recording_that_cannot_be_told_is_refused(tmp_path: Path, saved: SavedMap) -> None:
     pictures = recording(saved, 50)
-    with pytest.raises(StereoSfmError, match="any of the walks 0, 1 of the map by its times: say --walk N"):
-        walk_of_recording(joined([saved, saved]), pictures, "day")
-    with pytest.raises(StereoSfmError, match="day lacks keyframes of every walk"):
-        walk_of_recording(joined([saved, later(saved)]), pictures[1:], "day")
-    with pytest.raises(StereoSfmError, match="no walk 2"):
-        check_walk(joined([saved, saved]), 2)
+    with pytest.raises(
+        StereoSfmError, match=r"matches several sessions of the map \(0, 1\): choose one with --session N"
+    ):
+        session_of_recording(joined([saved, saved]), pictures, "day")
+    with pytest.raises(StereoSfmError, match="day lacks keyframes of every session"):
+        session_of_recording(joined([saved, later(saved)]), pictures[1:], "day")
+    with pytest.raises(StereoSfmError, match="no session 2"):
+        check_session(joined([saved, saved]), 2)
     with pytest.raises(StereoSfmError, match=f"another day lacks {len(saved)} of the map's keyframes"):
-        write_pictures(later(saved), pictures, 0, tmp_path, "another day")
+        write_keyframe_images(later(saved), pictures, 0, tmp_path, "another day")
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(("how", "option"), [("none", "none"), ("pinhole", "pinhole"), ("epipolar", "wide")])
 def test_pictures_are_those_that_the_maps_camera_saw(how: str, option: str) -> None:
     rig = rectified(open_source(SPEC), how).rig
-    source = open_pictures(SPEC, rig)
+    source = open_recording(SPEC, rig)
     assert isinstance(source, RectifiedSource) == (option != "none")
     assert np.array_equal(source.rig.left.params, rig.left.params)
 
 
 def test_pictures_of_another_camera_are_refused(saved: SavedMap) -> None:
     with pytest.raises(StereoSfmError, match=r"150x140 .*is not the map's \(kannala_brandt 848x800"):
-        open_pictures(SPEC, saved.rig)
+        open_recording(SPEC, saved.rig)
 
 
 def test_export_of_a_rectified_run_writes_rectified_pictures(

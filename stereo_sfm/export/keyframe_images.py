@@ -1,0 +1,106 @@
+"""The images of a map's keyframes, read from the recording that the map was built from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from stereo_sfm.calib.rectification import PROJECTIONS
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.rectified import rectified
+from stereo_sfm.drivers.source import Source, open_source
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.export.colmap import image_names
+from stereo_sfm.maps.saved_map import SavedMap, describe_rig, same_rig
+from stereo_sfm.types import U8, StereoImage
+
+Key = tuple[int, int]  # frame id, stamp in ns
+
+
+def open_recording(spec: str, map_rig: Rig, own_rig: Rig | None = None) -> Source:
+    """A recording, not yet entered, as seen by the map's camera: unchanged, or rectified as in the run.
+
+    Args:
+        spec: the recording.
+        map_rig: the map's camera.
+        own_rig: calibration that replaces the recording's own.
+
+    Raises:
+        StereoSfmError: it was recorded with another camera.
+    """
+    source = open_source(spec, own_rig)
+    for how in PROJECTIONS:
+        try:
+            seen = rectified(source, how)
+        except StereoSfmError:  # one camera, or two that cannot be rectified this way
+            continue
+        if same_rig(seen.rig, map_rig):
+            return seen
+    raise StereoSfmError(
+        f"the camera of {spec} ({describe_rig(source.rig)}) is not the map's ({describe_rig(map_rig)}), rectified or"
+        " not: give the recording of this map, and the --rig of its run if any"
+    )
+
+
+def check_session(saved: SavedMap, session: int | None) -> None:
+    """Raises StereoSfmError for a session that is not in the map."""
+    if session is not None and session not in saved.session_ids:
+        raise StereoSfmError(f"the map has no session {session} (it has {', '.join(map(str, saved.session_ids))})")
+
+
+def session_of_recording(saved: SavedMap, recording: Iterable[StereoImage], name: str) -> int:
+    """The session whose keyframes, identified by frame id and stamp, are all in a recording.
+
+    Raises:
+        StereoSfmError: no session of the map matches, or more than one.
+    """
+    if len(saved.session_ids) == 1:
+        return saved.session_ids[0]
+    frames = {(image.frame_id, image.stamp_ns) for image in recording}
+    fits = [session for session in saved.session_ids if frames.issuperset(_names(saved, session, "left"))]
+    if not fits:
+        raise StereoSfmError(f"{name} lacks keyframes of every session of the map: is it one of its recordings?")
+    if len(fits) > 1:
+        raise StereoSfmError(
+            f"{name} matches several sessions of the map ({', '.join(map(str, fits))}): choose one with --session N"
+        )
+    return fits[0]
+
+
+def write_keyframe_images(
+    saved: SavedMap, recording: Iterable[StereoImage], session: int, folder: Path, name: str = "the recording"
+) -> None:
+    """Write the keyframe images of one session as PNG below folder/images, named as in the COLMAP model.
+
+    Raises:
+        StereoSfmError: the recording lacks some of them, or one cannot be written.
+    """
+    names = {side: _names(saved, session, side) for side in ("left", "right")}
+    missing = set(names["left"])
+    for image in recording:
+        key = (image.frame_id, image.stamp_ns)
+        if key in missing:
+            missing.discard(key)
+            _write(folder / "images" / names["left"][key], image.left)
+            if image.right is not None:
+                _write(folder / "images" / names["right"][key], image.right)
+        if not missing:
+            return
+    raise StereoSfmError(f"{name} lacks {len(missing)} of the map's keyframes: is it the recording of this map?")
+
+
+def _names(saved: SavedMap, session: int, side: str) -> dict[Key, str]:
+    """The image names of one session by frame id and stamp."""
+    s = saved.snapshot
+    rows = zip(
+        s.frame_ids.tolist(), s.stamp_ns.tolist(), image_names(saved, side), saved.sessions.tolist(), strict=True
+    )
+    return {(frame_id, stamp_ns): name for frame_id, stamp_ns, name, other in rows if other == session}
+
+
+def _write(path: Path, pixels: U8) -> None:
+    import cv2
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if not cv2.imwrite(str(path), pixels):
+        raise StereoSfmError(f"cannot write {path}")
