@@ -65,7 +65,7 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, default=60)
     parser.add_argument("--images", default="room", help="room, or a source such as sim:loop")
     parser.add_argument("--faults", default="none", help="names of stereo_sfm.drivers.t265.simulated.faults.PRESETS")
-    parser.add_argument("--frames", type=int, default=30, help="images made before the start")
+    parser.add_argument("--frames", type=int, default=30, help="images rendered before the start")
     options = parser.parse_args()
     numbers = measure(options.seconds, options.images, options.faults, options.frames)
     for name, value in numbers.items():

@@ -1,4 +1,4 @@
-"""Where images come from: one protocol, drivers as plugins, `open_source(spec)` for all of them.
+"""Sources of images: one protocol, drivers as plugins, and `open_source(spec)` for all of them.
 
 A source is a context manager that knows its rig before the first frame and yields `StereoImage` in stamp order.
 """

@@ -1,4 +1,4 @@
-"""Which source a command reads, and which part of it seen how: chosen here, opened in whichever process reads it."""
+"""The choice of a source, its part, rectification and speed, made here and opened in the process that reads it."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ if TYPE_CHECKING:
 
 P = ParamSpec("P")
 
-# how a user says it -> projection of `stereo_sfm.calib.rectification`
+# user's name -> projection of `stereo_sfm.calib.rectification`
 RECTIFY = {"none": "none", "pinhole": "pinhole", "wide": "epipolar"}
 
 
 class Opener(Protocol):
-    """What opens the source of a run, in the process that reads it; it can be pickled.
+    """Opens the source of a run in the process that reads it; picklable.
 
-    `SourceChoice` does for a source that a text names, `MadeSource` for one that a program makes.
+    `SourceChoice` opens a source given by its text, `MadeSource` one created by a program.
     """
 
     @property
     def spec(self) -> str:
-        """The text that names the source, "" when none does."""
+        """The text of the source, "" if it has none."""
         ...
 
     @property
     def device(self) -> bool:
-        """Whether it is a camera: what it gave is gone unless it is logged."""
+        """Whether it is a live camera, whose images are lost unless they are logged."""
         ...
 
     @property
     def opening(self) -> Opening:
-        """What a log keeps of it besides its name."""
+        """What a log records about it besides its name."""
         ...
 
     def __call__(self) -> Source:
@@ -52,10 +52,10 @@ class Opener(Protocol):
 
 @dataclass(frozen=True)
 class MadeSource:
-    """Opens a source that a program makes itself.
+    """Opens a source created by a program.
 
     Attributes:
-        make: gives the source; a function of a module or a `functools.partial` of one, so that it can be pickled.
+        make: returns the source; a module-level function or a `functools.partial` of one, so that it can be pickled.
     """
 
     make: Callable[[], Source]
@@ -64,7 +64,7 @@ class MadeSource:
 
     @staticmethod
     def of(make: Callable[P, Source], *args: P.args, **options: P.kwargs) -> MadeSource:
-        """Opens what `make` gives for these arguments."""
+        """Opens the source that `make` returns for these arguments."""
         return MadeSource(functools.partial(make, *args, **options))
 
     @property
@@ -79,17 +79,17 @@ class MadeSource:
 
 @dataclass(frozen=True)
 class SourceChoice:
-    """A source by its text, with what replaces its calibration and which of its frames are passed on.
+    """A source by its text, with its calibration, part, rectification and speed.
 
-    Calling it gives the source, not yet entered. It can be pickled: it holds no open file and no camera.
+    Calling it returns the source, not yet entered. Picklable: it holds no open file and no camera.
 
     Attributes:
-        spec: what `open_source` takes. Files and folders are absolute in it: a log says where its images are.
+        spec: what `open_source` takes. Paths in it are absolute, since a log records where its images are.
         rig: calibration instead of the source's own.
         options: of the driver, as keyword arguments of `open_source`; those in `spec` come as text.
         selection: the part of the source.
         rectify: a key of RECTIFY: none, pinhole (crops a fisheye), wide (keeps its view).
-        speed: frames come no earlier than their stamps say, so many times as fast; None: as fast as they are read.
+        speed: playback speed relative to the stamps; None: as fast as they are read.
     """
 
     spec: str
@@ -108,7 +108,7 @@ class SourceChoice:
         speed: float | None = None,
         **options: Any,
     ) -> SourceChoice:
-        """As a user says it: paths may be relative, and the calibration may be a file.
+        """From user input: paths may be relative, and the calibration may be a file.
 
         Raises:
             StereoSfmError: an unknown source or option, a calibration that cannot be read, an unknown way to rectify;
@@ -127,7 +127,7 @@ class SourceChoice:
 
     @property
     def numbering(self) -> int:
-        """Frames of the source from one that is passed on to the next."""
+        """Frames of the source between consecutive frames passed on."""
         return self.selection.frame_skip
 
     @property
@@ -137,12 +137,12 @@ class SourceChoice:
         return Opening(self.rectify, self.rig, frame_skip=self.numbering)
 
     def refuse_to_overwrite(self, output: Path | None) -> None:
-        """Raises StereoSfmError when the source is the file that is to be written, or lies in the folder."""
+        """Raises StereoSfmError when the source is the output file, or lies in the output folder."""
         source = path_of(self.spec)
         if output is None or not source.exists() or not output.exists():
             return
         if output.resolve() in (source.resolve(), *source.resolve().parents):
-            raise StereoSfmError(f"{output} is what is read, or holds it: choose another -o")
+            raise StereoSfmError(f"{output} is the source, or contains it: choose another -o")
 
     def __call__(self) -> Source:
         from stereo_sfm.drivers.paced import PacedSource
@@ -157,7 +157,7 @@ class SourceChoice:
 
 
 def _loaded(rig: RigOption) -> Rig | None:
-    """A calibration as it is, or from a file of any dialect."""
+    """A calibration, or the one of a file of any format."""
     if not isinstance(rig, str | Path):
         return rig
     from stereo_sfm.calib import load_rig

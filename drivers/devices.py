@@ -1,4 +1,4 @@
-"""Which live cameras are attached, and the udev rules they need: what the installed drivers say."""
+"""Attached live cameras and their udev rules, from the installed drivers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ UDEV_FILE = "/etc/udev/rules.d/70-stereo-sfm.rules"  # below 73: 'uaccess' works
 
 
 def camera_drivers() -> dict[str, Cameras]:
-    """Kind -> what its driver says of its cameras."""
+    """Kind -> camera description of its driver."""
     return {kind: found.cameras for kind, found in registry.drivers() if found.cameras is not None}
 
 
@@ -18,10 +18,10 @@ def list_devices(probe: bool = False) -> tuple[list[Attached], list[str]]:
     """All attached cameras.
 
     Args:
-        probe: cameras may be started (seconds) to read their calibration.
+        probe: cameras may be started (takes seconds) to read their calibration.
 
     Returns:
-        Cameras, and what kept a driver from looking.
+        Cameras, and errors of drivers that could not search.
     """
     cameras: list[Attached] = []
     problems: list[str] = []
@@ -34,7 +34,7 @@ def list_devices(probe: bool = False) -> tuple[list[Attached], list[str]]:
 
 
 def no_cameras() -> str:
-    """What to say when none is attached."""
+    """The message when none is attached."""
     drivers = camera_drivers().values()
     titles = " or ".join(driver.title for driver in drivers if driver.find is not None)
     without = [driver.without for driver in drivers if driver.without]
@@ -42,14 +42,14 @@ def no_cameras() -> str:
 
 
 def udev_rules() -> str:
-    """Rules that let whoever sits at this computer, and the group plugdev, open the cameras of all drivers."""
+    """Rules that let the local user and the group plugdev open the cameras of all drivers."""
     drivers = camera_drivers()
     ids = {usb for driver in drivers.values() for usb in driver.usb}
     whole = {usb.vendor for usb in ids if usb.product is None}  # such a rule covers all of a vendor's products
     needed = [usb for usb in ids if usb.product is None or usb.vendor not in whole]
     needed.sort(key=lambda usb: (usb.vendor, usb.product or 0))
     titles = " and ".join(driver.title for driver in drivers.values() if driver.usb)
-    first = f"# stereo-sfm: {titles} for whoever sits at this computer, and for the group plugdev"
+    first = f"# stereo-sfm: {titles} for the local user and the group plugdev"
     return "\n".join([first, *map(_rule, needed), ""])
 
 

@@ -1,4 +1,4 @@
-"""What a driver is: how a kind of source is named, recognised, found and opened.
+"""The driver interface: how a kind of source is named, recognised, found and opened.
 
 A driver registers one `Driver` under the entry point group `stereo_sfm.drivers`; the entry point's name is the kind
 that users write ("t265", "kitti"). The module of the entry point is imported to list the drivers: it imports nothing
@@ -20,12 +20,12 @@ if TYPE_CHECKING:
 
 
 class Certainty(enum.IntEnum):
-    """How sure a driver is that a file or folder is its own; the surest driver opens it."""
+    """A driver's confidence that a file or folder is of its kind; the most confident driver opens it."""
 
     NO = 0
-    PERHAPS = 1  # it can be read, and so can much else
-    LAYOUT = 2  # it looks as this kind does
-    MARKED = 3  # a file says so
+    PERHAPS = 1  # readable, but not specific
+    LAYOUT = 2  # the layout of this kind
+    MARKED = 3  # explicitly marked by a file
 
 
 @dataclass(frozen=True)
@@ -51,13 +51,13 @@ class Attached:
 
 @dataclass(frozen=True)
 class Cameras:
-    """What a driver of live cameras says besides: `devices` and `udev` are made from it.
+    """Additional description of live cameras, used by `devices` and `udev`.
 
     Attributes:
-        title: of a camera, for people ("T265").
-        find: the cameras that are attached; with True, cameras may be started for what they do not tell otherwise.
-            Raises `stereo_sfm.drivers.live.errors.DeviceError` when it cannot look. None: this driver cannot look.
-        usb: what users without rights must be let open, for the udev rules.
+        title: readable name of a camera ("T265").
+        find: the cameras that are attached; with True, cameras may be started for more information.
+            Raises `stereo_sfm.drivers.live.errors.DeviceError` when it cannot search. None: the driver cannot search.
+        usb: devices that the udev rules make accessible.
         without: a source of this kind that needs no camera ("t265:simulated"), "" when there is none.
     """
 
@@ -83,8 +83,8 @@ class Driver(Generic[O]):
         summary: what it reads, one line.
         place: what follows the colon, for help ("FOLDER", "[SERIAL]").
         options: its options: a frozen dataclass that inherits from `SourceOptions`.
-        open: the source at a place, not yet entered. Raises StereoSfmError for what the user can mend.
-        check: raises StereoSfmError for a place or options that cannot be, at once and without opening anything.
+        open: the source at a place, not yet entered. Raises StereoSfmError for user errors.
+        check: raises StereoSfmError for an invalid place or options, without opening anything.
         recognise: whether an existing file or folder is of this kind.
         cameras: of a driver of live cameras; None for files.
     """

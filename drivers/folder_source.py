@@ -1,4 +1,4 @@
-"""What all dataset folders share: a list of image files with stamps, a rig, and ground truth where there is one."""
+"""Base of dataset folders: a list of image files with stamps, a rig, and ground truth if available."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from stereo_sfm.types import F32, U8, U16, ImuSamples, StereoImage, Trajectory
 
 log = logging.getLogger("stereo_sfm")
 
-SHOWN_WARNINGS = 5  # of unreadable images, one by one; then only their number
-SAMPLED = 8  # frames that say how many of sixteen bits the sensor uses
+SHOWN_WARNINGS = 5  # of unreadable images, one by one; then only their count
+SAMPLED = 8  # frames sampled for the number of used bits of sixteen
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def read_depth(path: Path, scale: float) -> F32:
 
     Args:
         path: the file.
-        scale: stored units a metre.
+        scale: stored units per metre.
 
     Raises:
         UnreadableImage: missing, or not decodable.
@@ -89,9 +89,9 @@ class FolderSource(BaseSource):
         imu: ImuSamples | None = None,
     ) -> None:
         """Args:
-        name: for people. rig: calibration of the images. shots: in any order.
+        name: for messages. rig: calibration of the images. shots: in any order.
         ground_truth: world_T_cam0.
-        depth_scale: stored units of a depth image a metre.
+        depth_scale: stored units of a depth image per metre.
         imu: all inertial samples, ascending: each goes with the frame that ends its interval.
         """
         if not shots:
@@ -160,7 +160,7 @@ class FolderSource(BaseSource):
         return Stamps(np.array([s.stamp_ns for s in self.shots], np.int64), skew_ms, beside)
 
     def _sensor_bits(self) -> int:
-        """Of sixteen-bit images: decided once, so that brightness does not jump between frames."""
+        """The used bits of sixteen-bit images, determined once, so that brightness does not jump between frames."""
         if not any(image.dtype == np.uint16 for image in self._sample(1)):
             return 16
         bits = sensor_bits(image for image in self._sample(SAMPLED) if image.dtype == np.uint16)
@@ -169,7 +169,7 @@ class FolderSource(BaseSource):
         return bits
 
     def _sample(self, count: int) -> Iterator[Any]:
-        """The readable images of so many frames, spread evenly."""
+        """The readable images of `SAMPLED` evenly spaced frames."""
         for i in sorted({k * (len(self.shots) - 1) // max(count - 1, 1) for k in range(count)}):
             for path in (self.shots[i].left, self.shots[i].right):
                 with suppress(UnreadableImage):
@@ -177,7 +177,7 @@ class FolderSource(BaseSource):
                         yield read_gray(path)
 
     def _check_first(self) -> None:
-        """The images must fit the calibration, and that is said before the first frame."""
+        """Raises StereoSfmError before the first frame if the images do not match the calibration."""
         try:
             self._read(0, self.shots[0], 0)
         except UnreadableImage:
@@ -193,7 +193,7 @@ class FolderSource(BaseSource):
 
 
 def folder_of(name: str, path: str) -> Path:
-    """The folder a user named.
+    """The folder given by the user.
 
     Raises:
         StereoSfmError: it does not exist.
@@ -208,7 +208,7 @@ def need(path: Path, what: str) -> Path:
     """`path`, which must exist.
 
     Raises:
-        StereoSfmError: it does not; `what` says what it is.
+        StereoSfmError: it does not; `what` describes it.
     """
     if not path.exists():
         raise StereoSfmError(f"no {what} at {path}")

@@ -1,4 +1,4 @@
-"""Readers of trajectory files: TUM, KITTI and EuRoC/ASL text. They hold reference poses and estimates alike."""
+"""Readers of trajectory files: TUM, KITTI and EuRoC/ASL text. For reference poses and estimates."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, I64, Trajectory
 
-# Where the quaternion's x y z w stand in a row after the stamp and the position.
+# Columns of the quaternion's x y z w, after the stamp and the position.
 _XYZW = (0, 1, 2, 3)
 _WXYZ = (1, 2, 3, 0)
-POSITION = 4  # fields of a row that holds a stamp and a position alone
+POSITION = 4  # fields of a row with a stamp and a position only
 
 
 def stamp_from_seconds(text: str) -> int:
-    """Decimal seconds as text -> integer nanoseconds, exact (a float64 keeps only about 200 ns of today's epoch).
+    """Decimal seconds as text -> integer nanoseconds, exact (a float64 resolves only about 200 ns of Unix time).
 
     Raises:
         ValueError: not a number.
@@ -33,9 +33,9 @@ def stamp_from_seconds(text: str) -> int:
 
 
 def _rows(path: Path, least: int, alone: bool = False) -> list[list[str]]:
-    """Rows of a text table, commas or blanks between the fields, without comments and headings.
+    """Rows of a text table, separated by commas or blanks, without comments and headers.
 
-    `alone`: a stamp and a position without a quaternion will do, if all rows are such.
+    `alone`: rows may have a stamp and a position without a quaternion, if all rows do.
     """
     try:
         lines = path.read_text("utf-8-sig").splitlines()
@@ -51,10 +51,10 @@ def _rows(path: Path, least: int, alone: bool = False) -> list[list[str]]:
         if alone and not rows and len(fields) == POSITION:
             least = POSITION
         if len(fields) < least:
-            raise StereoSfmError(f"{path} line {number}: {len(fields)} fields where at least {least} are needed")
+            raise StereoSfmError(f"{path} line {number}: {len(fields)} fields, at least {least} expected")
         rows.append(fields[:POSITION] if least == POSITION else fields)
     if not rows:
-        raise StereoSfmError(f"{path} holds no poses")
+        raise StereoSfmError(f"{path} contains no poses")
     return rows
 
 
@@ -68,7 +68,7 @@ def _trajectory(path: Path, stamps: list[int], values: list[list[str]], order: t
     if oriented:
         keep &= np.linalg.norm(table[:, 3:], axis=1) > 0.5
     if not keep.any():
-        raise StereoSfmError(f"{path} holds no finite pose")
+        raise StereoSfmError(f"{path} contains no finite pose")
     stamp_ns: I64 = np.array(stamps, np.int64)[keep]
     table = table[keep]
     ascending, first = np.unique(stamp_ns, return_index=True)
@@ -79,7 +79,7 @@ def _trajectory(path: Path, stamps: list[int], values: list[list[str]], order: t
 
 
 def _never_turns(xyzw: F64) -> bool:
-    """Whether quaternions (N, 4) are what writes a file of positions in a form with orientations: all 0, or all 1."""
+    """Whether quaternions (N, 4) are placeholders of a file with positions only: all 0, or all identity."""
     return len(xyzw) > 1 and bool((xyzw[:, :3] == 0).all() and (xyzw[:, 3] == xyzw[0, 3]).all())
 
 
@@ -107,7 +107,7 @@ def read_euroc(path: Path) -> Trajectory:
 
 
 def read_kitti(path: Path, stamp_ns: I64 | None = None) -> Trajectory:
-    """Twelve numbers a line, the (3, 4) rows of world_T_cam0.
+    """Twelve numbers per line, the (3, 4) rows of world_T_cam0.
 
     Args:
         path: the file.
@@ -128,12 +128,12 @@ def read_kitti(path: Path, stamp_ns: I64 | None = None) -> Trajectory:
 
 
 def has_stamps(path: Path | str) -> bool:
-    """Whether the lines of a trajectory file say their time: KITTI's do not."""
+    """Whether a trajectory file has stamps: KITTI's does not."""
     return len(_rows(Path(path).expanduser(), 8, alone=True)[0]) != 12
 
 
 def read_trajectory(path: Path | str) -> Trajectory:
-    """A trajectory of whichever of the three forms the file has.
+    """Read a trajectory in any of the three formats.
 
     Raises:
         StereoSfmError: no such file, or not a trajectory.
@@ -146,5 +146,5 @@ def read_trajectory(path: Path | str) -> Trajectory:
 
 
 def moved(trajectory: Trajectory, a_T_b: F64) -> Trajectory:
-    """world_T_a -> world_T_b by the constant (4, 4) `a_T_b` between two points of one rigid body."""
+    """world_T_a -> world_T_b by the constant (4, 4) `a_T_b` between two frames of one rigid body."""
     return Trajectory(trajectory.stamp_ns.copy(), trajectory.poses @ a_T_b, trajectory.oriented)

@@ -1,7 +1,7 @@
-"""Lists of image files: their order, their stamps, and which left image belongs to which right one.
+"""Lists of image files: order, stamps, and pairing of left and right images.
 
-Images are paired by what their names say: by stamps where the names are times, by numbers otherwise. A position in a
-list says nothing once an image is missing, so lists whose names do not tell are refused.
+Images are paired by their names: by stamps where the names are times, by numbers otherwise. Positions in the list are
+unreliable once an image is missing, so lists with other names are refused.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from stereo_sfm.errors import StereoSfmError
 log = logging.getLogger("stereo_sfm")
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
-EARLIEST_NS = 10**17  # file names that are times are after 1973; smaller numbers count frames
-MAX_SKEW_NS = 3_000_000  # stamps of one synchronised pair differ by less
+EARLIEST_NS = 10**17  # names that are stamps are after 1973; smaller numbers are frame numbers
+MAX_SKEW_NS = 3_000_000  # maximum difference of the stamps of a synchronised pair
 Listing = list[tuple[int, Path]]  # (stamp_ns, file) of one camera
 
 
@@ -55,7 +55,7 @@ def numbers_of(images: list[Path]) -> list[int] | None:
 
 
 def stamp_of(path: Path) -> int | None:
-    """Nanoseconds that a file's name tells (left_1403636579763555584, 1305031102.175304); None where it is no time."""
+    """The stamp in ns in a file name (left_1403636579763555584, 1305031102.175304); None if it is not a time."""
     found = re.fullmatch(r"[^0-9]*([0-9]+(?:\.[0-9]+)?)[^0-9]*", path.stem)
     stamp_ns = stamp_from_text(found[1]) if found else None
     return stamp_ns if stamp_ns is not None and stamp_ns > EARLIEST_NS else None
@@ -72,12 +72,12 @@ def stamp_from_text(text: str) -> int | None:
 
 
 def pair_files(name: str, left: list[Path], right: list[Path]) -> list[tuple[Path, Path]]:
-    """Left and right images of the same moment, by the stamps or else by the numbers in their names.
+    """Left and right images of the same moment, paired by the stamps, else by the numbers in their names.
 
-    Images without a partner are left out with a warning.
+    Unpaired images are skipped with a warning.
 
     Raises:
-        StereoSfmError: the names do not tell which images belong together.
+        StereoSfmError: the names do not determine the pairs.
     """
     if all(stamp_of(p) is not None for p in (*left, *right)):
         a, b = ([(stamp_of(p) or 0, p) for p in files] for files in (left, right))
@@ -87,8 +87,8 @@ def pair_files(name: str, left: list[Path], right: list[Path]) -> list[tuple[Pat
         pairs = [(0, 0)]
     if pairs is None:
         raise StereoSfmError(
-            f"{name}: the names of the images do not tell which left image ({left[0].name}, ...) belongs to which "
-            f"right one ({right[0].name}, ...): name both of a pair by the same number or by their times"
+            f"{name}: cannot pair the left images ({left[0].name}, ...) with the "
+            f"right images ({right[0].name}, ...): name both images of a pair by the same number or by their stamps"
         )
     _tell_unpaired(name, len(left), len(right), len(pairs))
     return [(left[i], right[j]) for i, j in pairs]
@@ -105,25 +105,25 @@ def _by_key(left: Sequence[object] | None, right: Sequence[object] | None) -> li
 
 
 def pair_listings(name: str, left: Listing, right: Listing) -> list[tuple[int, int]]:
-    """Indices (i, j) of the images of two cameras that were exposed together, by their stamps.
+    """Indices (i, j) of simultaneous images of two cameras, by their stamps.
 
     Raises:
-        StereoSfmError: no two are; the message says how far apart they are.
+        StereoSfmError: no pair; the message states the stamp difference.
     """
     stamps = [s for s, _ in left], [s for s, _ in right]
     pairs = pair_by_stamp(*stamps, MAX_SKEW_NS)
     if not pairs and left and right:
-        apart_ms = _median_distance(*stamps) / 1e6
+        difference_ms = _median_distance(*stamps) / 1e6
         raise StereoSfmError(
-            f"{name}: left and right images are {apart_ms:.6g} ms apart by their stamps, and only images within "
-            f"{MAX_SKEW_NS / 1e6:g} ms are one pair: both cameras must be triggered together and have one clock"
+            f"{name}: the stamps of left and right images differ by {difference_ms:.6g} ms, more than the allowed "
+            f"{MAX_SKEW_NS / 1e6:g} ms: both cameras must be triggered together and share a clock"
         )
     _tell_unpaired(name, len(left), len(right), len(pairs))
     return pairs
 
 
 def _median_distance(left: Sequence[int], right: Sequence[int]) -> float:
-    """Median over the left stamps of how far the nearest right one is, nanoseconds."""
+    """Median distance from a left stamp to the nearest right one, nanoseconds."""
     a, b = np.asarray(left, np.int64), np.sort(np.asarray(right, np.int64))
     after = np.clip(np.searchsorted(b, a), 0, len(b) - 1)
     return float(np.median(np.minimum(np.abs(b[after] - a), np.abs(b[np.maximum(after - 1, 0)] - a))))
@@ -135,19 +135,19 @@ def _tell_unpaired(name: str, left: int, right: int, pairs: int) -> None:
 
 
 def lines_of(name: str, images: list[Path], lines: int, what: str, first: int | None = None) -> dict[Path, int]:
-    """Which line of a list of `lines` stamps belongs to which image; images behind the last line are left out.
+    """The line of each image in a list of `lines` stamps; images after the last line are skipped.
 
-    Images and lines go together in order where there are as many, else by the images' numbers.
+    Images and lines are matched in order if their counts are equal, else by the images' numbers.
 
     Args:
         name: of the source, for messages.
         images: files in order.
         lines: of the list.
         what: the list's name, for messages.
-        first: number of the first line's image; None finds out whether it is 0 or 1.
+        first: number of the first line's image; None: detect whether it is 0 or 1.
 
     Raises:
-        StereoSfmError: the numbers do not say which line is whose.
+        StereoSfmError: the numbers do not determine the lines.
     """
     if len(images) == lines:
         return {image: line for line, image in enumerate(images)}
@@ -156,16 +156,16 @@ def lines_of(name: str, images: list[Path], lines: int, what: str, first: int | 
         first = 0 if min(numbers) == 0 else 1 if max(numbers) == lines else None
     if numbers is None or first is None or min(numbers) < first:
         raise StereoSfmError(
-            f"{name}: {len(images)} images but {lines} lines in {what}, and the numbers in the images' names do not "
-            "say which line is whose"
+            f"{name}: {len(images)} images but {lines} lines in {what}, and the numbers in the image names do not "
+            "match the lines"
         )
     places = {image: n - first for image, n in zip(images, numbers, strict=True) if n - first < lines}
-    log.warning("%s: %d images and %d lines in %s, %d belong together", name, len(images), lines, what, len(places))
+    log.warning("%s: %d images and %d lines in %s, %d matched", name, len(images), lines, what, len(places))
     return places
 
 
 def frame_numbers(images: list[Path]) -> list[int]:
-    """Places 0, 1, ... of images in time by their numbers, whose common step is one frame; by order without numbers."""
+    """Frame indices 0, 1, ... of images by their numbers, whose common step is one frame; by order without numbers."""
     numbers = numbers_of(images)
     if numbers is None or sorted(numbers) != numbers:
         return list(range(len(images)))

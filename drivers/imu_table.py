@@ -1,4 +1,4 @@
-"""Inertial samples in a table of text, one row a sample."""
+"""Inertial samples in a text table, one row per sample."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ COLUMNS = 7
 
 
 def read_imu_samples(path: Path) -> ImuSamples | None:
-    """Samples of a table `stamp_ns, wx, wy, wz (rad/s), ax, ay, az (m/s^2)`, in the order of their stamps.
+    """Samples of a table `stamp_ns, wx, wy, wz (rad/s), ax, ay, az (m/s^2)`, in stamp order.
 
-    Rows that cannot be are left out with one warning; where the rest cannot be trusted (degrees, g), a warning says so
-    and there are none: a run goes on without them.
+    Invalid rows are skipped with one warning; if the units are wrong (degrees, g), all samples are discarded with a
+    warning, and the run continues without them.
     """
     rows: list[list[float]] = []
     stamps: list[int] = []
@@ -42,7 +42,7 @@ def read_imu_samples(path: Path) -> ImuSamples | None:
     stamp_ns, first = np.unique(np.array(stamps, np.int64), return_index=True)
     bad += len(stamps) - len(stamp_ns)
     if bad:
-        log.warning("%s: %d samples are doubled or no samples, they are left out", path, bad)
+        log.warning("%s: %d duplicate or invalid samples are skipped", path, bad)
     if not len(stamp_ns):
         return None
     values = np.array(rows)[first]
@@ -54,10 +54,10 @@ def read_imu_samples(path: Path) -> ImuSamples | None:
 
 
 def _suspicious(values: np.ndarray) -> str:
-    """Why samples (N, 6) are not in rad/s and m/s^2; '' when they may be."""
+    """Why samples (N, 6) cannot be in rad/s and m/s^2; '' if they can."""
     gyro, accel = np.linalg.norm(values[:, :3], axis=1), np.linalg.norm(values[:, 3:], axis=1)
     if np.percentile(gyro, 99) > MOST_GYRO or np.percentile(accel, 99) > MOST_ACCEL:
-        return f"rates of {gyro.max():.0f} and forces of {accel.max():.0f} are not in rad/s and m/s^2 (degrees?)"
+        return f"rates up to {gyro.max():.0f} and forces up to {accel.max():.0f} are not in rad/s and m/s^2 (degrees?)"
     if 0.5 < float(np.median(accel)) < 2:
         return f"a median force of {np.median(accel):.2f} is in g, not in m/s^2"
     return ""

@@ -9,11 +9,11 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.drivers.source import BaseSource
 from stereo_sfm.types import StereoImage, Trajectory
 
-PERIOD_NS = 33_333_333  # of a repeated walk: 30 Hz
+PERIOD_NS = 33_333_333  # of a repeated sequence: 30 Hz
 
 
 class MemorySource(BaseSource):
-    """Gives the images as they are, or, with `count`, a longer walk made of them."""
+    """Yields the images unchanged, or, with `count`, a longer sequence that repeats them."""
 
     def __init__(
         self,
@@ -25,9 +25,9 @@ class MemorySource(BaseSource):
         there_and_back: bool = False,
     ) -> None:
         """Args:
-        rig, images, ground_truth, name: what the source gives.
-        count: images of a longer walk, numbered and stamped anew at 30 Hz; None plays the images once, unchanged.
-        there_and_back: the longer walk turns round at the ends, so that it goes on without a jump.
+        rig, images, ground_truth, name: contents of the source.
+        count: length of the repeated sequence, renumbered and stamped at 30 Hz; None yields the images once, unchanged.
+        there_and_back: the repeated sequence reverses at the ends, so that it has no jump.
         """
         self.rig, self.images, self.ground_truth, self.name = rig, images, ground_truth, name
         self.frame_count = self._length = len(images) if count is None else count

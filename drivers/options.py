@@ -1,14 +1,14 @@
-"""Options of a source: one dataclass a driver, read from the query of a source's text or from keyword arguments.
+"""Options of a source: one dataclass per driver, parsed from the query of a source's text or from keyword arguments.
 
-A driver declares its options once, with their types, defaults, limits and a sentence each:
+A driver declares its options once, with types, defaults, limits and descriptions:
 
     @dataclass(frozen=True)
     class WebcamOptions(SourceOptions):
-        fps: float = option(30.0, "images a second", low=1, high=240)
-        flip: bool = option(False, "turn the images by 180 degrees")
+        fps: float = option(30.0, "images per second", low=1, high=240)
+        flip: bool = option(False, "rotate the images by 180 degrees")
 
-`webcam:0?fps=60&flip=1` and `open_source("webcam:0", fps=60, flip=True)` give the same options; whatever does not fit
-is one line for the user. The help and the table of drivers are made from the same declarations.
+`webcam:0?fps=60&flip=1` and `open_source("webcam:0", fps=60, flip=True)` give the same options; an invalid value is a
+one-line error. The help and the table of drivers are generated from the same declarations.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ else:
 O = TypeVar("O", bound="SourceOptions")  # noqa: E741
 
 _FLAGS = dict.fromkeys(("", "1", "true", "yes", "on"), True) | dict.fromkeys(("0", "false", "no", "off"), False)
-_NOTHING = ("auto", "none", "")  # how a text says None
+_NOTHING = ("auto", "none", "")  # texts that mean None
 
 
 def option(
@@ -44,24 +44,24 @@ def option(
     """One field of a driver's options.
 
     Args:
-        default: its value when nothing is said.
-        doc: what it means, with its unit.
+        default: its default value.
+        doc: description with its unit.
         low, high: limits of a number, both inclusive.
-        read: makes the value from what the user gave, for types that no text says by itself; raises ValueError with
-            what it must be ("WIDTHxHEIGHT, such as 640x400").
+        read: converts the user's value, for types without a standard text form; raises ValueError with a description of
+            valid values ("WIDTHxHEIGHT, such as 640x400").
     """
     return field(default=default, metadata={"doc": doc, "low": low, "high": high, "read": read})
 
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """What every driver takes; a driver's own options inherit from it."""
+    """Options of every driver; a driver's own options inherit from it."""
 
-    rig: RigOption = option(None, "calibration instead of the source's own: a file of any dialect", read=lambda x: x)  # noqa: RUF009
+    rig: RigOption = option(None, "calibration instead of the source's own: a file of any format", read=lambda x: x)  # noqa: RUF009
 
 
 def read_options(cls: type[O], source: str, given: Mapping[str, Any]) -> O:
-    """A driver's options from what the user gave.
+    """A driver's options from user input.
 
     Args:
         cls: the driver's options.
@@ -69,7 +69,7 @@ def read_options(cls: type[O], source: str, given: Mapping[str, Any]) -> O:
         given: name -> text of a query, or the value itself.
 
     Raises:
-        StereoSfmError: an option that the driver does not have, or a value that does not fit.
+        StereoSfmError: unknown option, or invalid value.
     """
     known = {f.name: f for f in fields(cls)}
     types = get_type_hints(cls)
@@ -85,7 +85,7 @@ def read_options(cls: type[O], source: str, given: Mapping[str, Any]) -> O:
 
 @dataclass(frozen=True)
 class OptionHelp:
-    """What a user should know of one option."""
+    """Description of one option for users."""
 
     name: str
     default: str
@@ -94,7 +94,7 @@ class OptionHelp:
 
 
 def described(cls: type[SourceOptions]) -> Iterator[OptionHelp]:
-    """The options of a driver for people, in the order of their declaration."""
+    """Descriptions of the options of a driver, in the order of their declaration."""
     types = get_type_hints(cls)
     for f in fields(cls):
         custom = f.metadata.get("read") is not None
@@ -122,7 +122,7 @@ def _read(source: str, f: Field[Any], kind: Any, value: Any) -> Any:
 
 
 def _convert(kind: Any, value: Any) -> Any:
-    """A value of a type from itself or from text. Raises ValueError where it is none."""
+    """A value of a type from itself or from text. Raises ValueError for invalid values."""
     if _optional(kind):
         if value is None or (isinstance(value, str) and value.lower() in _NOTHING):
             return None
@@ -168,7 +168,7 @@ def _limited(f: Field[Any], value: Any) -> Any:
 
 
 def _wanted(kind: Any, f: Field[Any]) -> str:
-    """What a value must be, for people."""
+    """Description of the valid values."""
     auto = "auto or " if _optional(kind) else ""
     kind = _inner(kind)
     if get_origin(kind) is Literal:
@@ -183,7 +183,7 @@ def _wanted(kind: Any, f: Field[Any]) -> str:
 
 
 def _words(kind: Any) -> tuple[str, ...]:
-    """The words of a Literal."""
+    """The values of a Literal."""
     kind = _inner(kind)
     return get_args(kind) if get_origin(kind) is Literal else ()
 

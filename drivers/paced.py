@@ -1,4 +1,4 @@
-"""A recording or the simulator as if it were a live camera: every frame comes at its time, taken or not."""
+"""A recording or the simulator played in real time like a live camera."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from stereo_sfm.types import StereoImage
 
 
 class PacedSource(WrappedSource):
-    """Passes on another source's frames no earlier than their stamps say, counted from the first one."""
+    """Delays another source's frames according to their stamps, relative to the first one."""
 
     def __init__(self, source: Source, speed: float = 1.0) -> None:
         """Args: source, entered and left with this one; speed, 2 plays twice as fast.
@@ -21,7 +21,7 @@ class PacedSource(WrappedSource):
             StereoSfmError: a speed that is not above 0.
         """
         if not speed > 0:
-            raise StereoSfmError(f"a speed must be above 0 (1: as it was recorded), got {speed:g}")
+            raise StereoSfmError(f"the speed must be above 0 (1: real time), got {speed:g}")
         super().__init__(source)
         self._speed = speed
 

@@ -46,7 +46,7 @@ class RectifiedSource(WrappedSource):
     def __enter__(self) -> Self:
         super().__enter__()
         if self.source.rig is not self._source_rig:
-            self._adopt()  # a camera tells its calibration when it is open
+            self._adopt()  # the calibration of a camera is known once it is open
         return self
 
     def stamps(self) -> Stamps | None:
@@ -71,6 +71,6 @@ def rectified(
     hfov_deg: float | None = None,
     size: tuple[int, int] | None = None,
 ) -> Source:
-    """The source itself for "none", else the source through that rectification."""
+    """The source itself for "none", else the rectified source."""
     one_of(projection, PROJECTIONS, "projection")
     return source if projection == "none" else RectifiedSource(source, projection, hfov_deg, size)

@@ -1,4 +1,4 @@
-"""The drivers that are installed: entry points of the group `stereo_sfm.drivers`, ours and other packages' alike."""
+"""The drivers that are installed: entry points of the group `stereo_sfm.drivers`, of this and other packages."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ _PROJECT = Path(__file__).resolve().parents[1] / "pyproject.toml"  # in a checko
 
 @functools.cache
 def _found() -> dict[str, EntryPoint]:
-    """Kind -> where its driver is, in the order of the kinds.
+    """Kind -> entry point of its driver, sorted by kind.
 
-    In a checkout our own come from pyproject.toml itself: what was installed from it may be older, or nothing.
+    In a checkout our own come from pyproject.toml: the installed metadata may be missing or outdated.
     """
     ours = _declared()
     others = [e for e in entry_points(group=GROUP) if not ours or e.dist is None or e.dist.name != _OURS]
@@ -47,7 +47,7 @@ def _declared() -> list[EntryPoint]:
 
 
 def kinds() -> tuple[str, ...]:
-    """The kinds of sources that can be opened; nothing is imported for it."""
+    """The kinds of sources that can be opened; imports no driver."""
     return tuple(_found())
 
 
@@ -64,12 +64,12 @@ def driver(kind: str) -> Driver[Any]:
     except Exception as error:
         raise StereoSfmError(f"the driver '{kind}' ({entry.value}) cannot be loaded: {error!r}") from error
     if not isinstance(loaded, Driver):
-        raise StereoSfmError(f"the driver '{kind}' ({entry.value}) is no stereo_sfm.drivers.driver.Driver")
+        raise StereoSfmError(f"the driver '{kind}' ({entry.value}) is not a stereo_sfm.drivers.driver.Driver")
     return loaded  # pyright: ignore[reportUnknownVariableType]
 
 
 def drivers() -> Iterator[tuple[str, Driver[Any]]]:
-    """(kind, driver) of all drivers; one that is broken is a warning."""
+    """(kind, driver) of all drivers; a broken one gives a warning."""
     for kind in kinds():
         try:
             found = driver(kind)
@@ -80,14 +80,14 @@ def drivers() -> Iterator[tuple[str, Driver[Any]]]:
 
 
 def recognise(path: Path) -> str:
-    """The kind of an existing file or folder: that of the driver that is surest of it.
+    """The kind of an existing file or folder: that of the most confident driver.
 
     Raises:
-        StereoSfmError: no driver knows it.
+        StereoSfmError: no driver recognises it.
     """
     sure = {kind: found.recognise(path) for kind, found in drivers()}
-    best = max(sure, key=sure.__getitem__, default=None)  # the first of equally sure ones
+    best = max(sure, key=sure.__getitem__, default=None)  # the first of equally confident ones
     if best is None or sure[best] is Certainty.NO:
         known = "; ".join(f"{kind}: {found.summary}" for kind, found in drivers() if found.cameras is None)
-        raise StereoSfmError(f"{path} is no dataset that is known here ({known})")
+        raise StereoSfmError(f"{path} is not a known kind of dataset ({known})")
     return best

@@ -1,4 +1,4 @@
-"""The frames that an earlier run tracked, in their order: what it dropped is left out."""
+"""The frames that an earlier run tracked, in order, without those it dropped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The `rig` option that every dataset driver takes: a calibration that replaces the data set's own."""
+"""The `rig` option of dataset drivers: a calibration that replaces the dataset's own."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ RigOption = str | Path | Rig | None
 
 
 def chosen_rig(option: RigOption, own: Callable[[], Rig]) -> Rig:
-    """The rig given by the user, as a `Rig` or a file of any dialect that `calib` reads, else the data set's own.
+    """The rig given by the user, as a `Rig` or a file of any supported format, else the dataset's own.
 
-    A given rig that does not know its body keeps the data set's, so that ground truth of the body stays usable; so does
-    one of a dialect that cannot state a readout.
+    A given rig without a body pose takes the dataset's, so that ground truth of the body stays usable; likewise the
+    readout, if the file format cannot store it.
     """
     if option is None or option == "":
         return own()
@@ -39,7 +39,7 @@ def chosen_rig(option: RigOption, own: Callable[[], Rig]) -> Rig:
 
 
 def _load(path: Path) -> tuple[Rig, bool]:
-    """The rig of a file, and whether files of its kind state a readout."""
+    """The rig of a file, and whether its format stores a readout."""
     from stereo_sfm.calib import load_rig
     from stereo_sfm.calib.formats import recognise
 

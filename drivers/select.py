@@ -1,4 +1,4 @@
-"""Part of a source: from a time on, for a time, every k-th frame, at most n."""
+"""Part of a source: start time, duration, frame step, maximum number of frames."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from stereo_sfm.drivers.wrapped import WrappedSource
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import ImuSamples, StereoImage
 
-LONGEST_S = 1e9  # seconds that any source can last
+MAX_DURATION_S = 1e9  # of any source
 
 
 class SelectedFrames(WrappedSource):
-    """A source that passes on some frames of another one. Frames left out on purpose do not count as dropped."""
+    """A source that passes on some frames of another one. Frames skipped on purpose do not count as dropped."""
 
     def __init__(
         self,
@@ -25,25 +25,27 @@ class SelectedFrames(WrappedSource):
         max_frames: int | None = None,
     ) -> None:
         """Args:
-        source: where the frames come from; it is entered and left with this one.
+        source: the source of the frames; it is entered and left with this one.
         start_s: seconds after the first frame at which the part begins.
         duration_s: seconds that the part lasts.
         frame_skip: 1 passes every frame, 3 every third.
-        max_frames: how many frames are passed at most.
+        max_frames: maximum number of frames.
         """
         if frame_skip < 1 or not start_s >= 0 or not duration_s > 0 or (max_frames is not None and max_frames < 1):
-            raise StereoSfmError("a part of a source needs frame skip and frames of at least 1, and times above 0")
-        if start_s > LONGEST_S:
-            raise StereoSfmError(f"a part of a source cannot begin {start_s:g} s after the first frame")
+            raise StereoSfmError(
+                "invalid part of a source: frame skip and frames must be at least 1, and times above 0"
+            )
+        if start_s > MAX_DURATION_S:
+            raise StereoSfmError(f"invalid part of a source: start {start_s:g} s after the first frame")
         super().__init__(source)
         self.start_ns = round(start_s * 1e9)
-        self.end_ns = None if duration_s > LONGEST_S else self.start_ns + round(duration_s * 1e9)
+        self.end_ns = None if duration_s > MAX_DURATION_S else self.start_ns + round(duration_s * 1e9)
         self.frame_skip = frame_skip
         self.max_frames = max_frames
 
     @property
     def frame_count(self) -> int | None:
-        """At most so many frames; None where the part depends on stamps that are not read yet."""
+        """Upper bound of the number of frames; None if it depends on stamps not read yet."""
         count = self.source.frame_count
         if count is None or self.start_ns or self.end_ns is not None:
             return self.max_frames
@@ -77,6 +79,6 @@ class SelectedFrames(WrappedSource):
         if first_ns is not None and not seen:
             until = "" if self.end_ns is None else f" until {self.end_ns * 1e-9:g} s"
             raise StereoSfmError(
-                f"nothing is left of {self.name}: no frame from {self.start_ns * 1e-9:g} s on{until}, "
+                f"no frames selected of {self.name}: none from {self.start_ns * 1e-9:g} s on{until}, "
                 f"the last one read is at {since * 1e-9:.2f} s"
             )

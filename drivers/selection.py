@@ -1,4 +1,4 @@
-"""Which part of a source is wanted."""
+"""The selected part of a source."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Selection:
-    """From a time on, for a time, every k-th frame, at most so many; everything by default.
+    """Start time, duration, frame step and maximum number of frames; everything by default.
 
     Attributes:
         start_s: seconds after the first frame at which the part begins.
         duration_s: seconds that the part lasts.
         frame_skip: 1 passes every frame, 3 every third.
-        max_frames: how many frames are passed at most.
+        max_frames: maximum number of frames.
     """
 
     start_s: float = 0.0

@@ -1,4 +1,4 @@
-"""The source protocol, what drivers build on, and opening a source by its text."""
+"""The source protocol, its base class for drivers, and opening a source by its text."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ _NO_COUNTERS: Mapping[str, float] = MappingProxyType({})
 
 @dataclass(frozen=True, eq=False)
 class Stamps:
-    """When the frames of a source were taken, known without reading their pixels."""
+    """The stamps of the frames of a source, known without reading pixels."""
 
     stamp_ns: I64  # (N,) of the left images
-    skew_ms: float = float("nan")  # largest difference between the eyes' stamps; NaN: not known
-    beside: Mapping[str, I64] = field(default_factory=dict[str, "I64"])  # of what was recorded beside the frames
+    skew_ms: float = float("nan")  # largest difference between left and right stamps; NaN: not known
+    beside: Mapping[str, I64] = field(default_factory=dict[str, "I64"])  # stamps of other recorded sensors, by name
 
 
 class Source(Protocol):
-    """Where images come from. Drivers inherit the usual answers from `BaseSource`."""
+    """A source of images. Drivers inherit defaults from `BaseSource`."""
 
     @property
     def name(self) -> str:
-        """For people: "sim:loop", "euroc:mh01"."""
+        """Readable name: "sim:loop", "euroc:mh01"."""
         ...
 
     @property
@@ -57,22 +57,22 @@ class Source(Protocol):
 
     @property
     def live(self) -> bool:
-        """Frames come whether or not somebody takes them."""
+        """Frames arrive whether or not they are consumed."""
         ...
 
     @property
     def counters(self) -> Mapping[str, float]:
-        """What a live source counts about itself (stereo_sfm.drivers.live.counters); empty for files."""
+        """Counters of a live source (stereo_sfm.drivers.live.counters); empty for files."""
         ...
 
     def stamps(self) -> Stamps | None:
-        """The stamps of all frames where they are known without reading pixels, else None."""
+        """The stamps of all frames if known without reading pixels, else None."""
         ...
 
     def at(self, positions: Sequence[int]) -> Iterator[StereoImage]:
-        """The frames at ascending positions (0 is the first frame that iteration gives), and no others.
+        """The frames at ascending positions (0 is the first frame of the iteration).
 
-        Sources that can read or render a frame alone do not touch those between.
+        Sources with random access do not read or render the frames between.
         """
         ...
 
@@ -86,7 +86,7 @@ class Source(Protocol):
 
 
 def chosen_frames(images: Iterator[StereoImage], positions: Sequence[int]) -> Iterator[StereoImage]:
-    """The frames at ascending positions of an iteration, which is read no further than the last of them."""
+    """The frames at ascending positions of an iteration, which is read up to the last of them."""
     wanted = iter(positions)
     position = next(wanted, None)
     for number, image in enumerate(images if position is not None else ()):
@@ -98,7 +98,7 @@ def chosen_frames(images: Iterator[StereoImage], positions: Sequence[int]) -> It
 
 
 class BaseSource(ABC):
-    """A source with the answers that most drivers give; a driver sets `name` and `rig` and says `__iter__`."""
+    """A source with common defaults; a driver sets `name` and `rig` and implements `__iter__`."""
 
     name: str
     rig: Rig
@@ -114,7 +114,7 @@ class BaseSource(ABC):
         return chosen_frames(iter(self), positions)
 
     def close(self) -> None:
-        """Give back what was opened; called once more than needed at most."""
+        """Release resources; may be called twice."""
         return
 
     def __enter__(self) -> Self:
@@ -127,12 +127,12 @@ class BaseSource(ABC):
 
     @abstractmethod
     def __iter__(self) -> Iterator[StereoImage]:
-        """Frames in the order of their stamps."""
+        """Frames in stamp order."""
 
 
 @dataclass(frozen=True)
 class Named:
-    """What a source's text stands for: a driver, a place, options; checked, and nothing opened yet."""
+    """A parsed source text: driver, place, options; validated, nothing opened yet."""
 
     kind: str
     driver: Driver[Any]
@@ -145,7 +145,7 @@ class Named:
 
 
 def look_up(spec: str | Path, rig: RigOption = None, **options: Any) -> Named:
-    """What a source's text stands for; arguments and errors as for `open_source`, but nothing is opened."""
+    """Parse a source's text; arguments and errors as for `open_source`, but nothing is opened."""
     kind, place, query = _split(str(spec))
     given = {**dict(parse_qsl(query, keep_blank_values=True)), **options}
     if rig is not None:
@@ -161,31 +161,31 @@ def open_source(spec: str | Path, rig: RigOption = None, **options: Any) -> Sour
 
     Args:
         spec: `KIND:PLACE?OPTION=VALUE&...` (`sim:loop?camera=pinhole&seed=3`, `t265`, `oak?fps=20`), or a file or a
-            folder whose kind is recognised.
-        rig: calibration instead of the source's own, or a file of one.
-        **options: of the driver, as typed values or as text; they win over those in the text.
+            folder of a recognised kind.
+        rig: calibration instead of the source's own, or a calibration file.
+        **options: of the driver, as typed values or as text; they override those in the text.
 
     Raises:
-        StereoSfmError: unknown kind, missing or unrecognised folder, an option that the driver does not have, or
-            whatever the driver finds wrong.
+        StereoSfmError: unknown kind, missing or unrecognised folder, an unknown option, or
+            any error found by the driver.
     """
     return look_up(spec, rig, **options).open()
 
 
 def is_device(spec: str) -> bool:
-    """Whether a source's text stands for a live camera."""
+    """Whether a source's text denotes a live camera."""
     kind = _kind(spec)
     return kind is not None and registry.driver(kind).cameras is not None
 
 
 def path_of(spec: str) -> Path:
-    """The file or folder that a source's text names, if it names one."""
+    """The file or folder of a source's text, if any."""
     head = spec.partition("?")[0]
     return Path(head.partition(":")[2] if _kind(spec) else spec if Path(spec).exists() else head).expanduser()
 
 
 def _kind(text: str) -> str | None:
-    """The kind that a text begins with, None where it is a path."""
+    """The kind at the beginning of a text, None if it is a path."""
     kind = text.partition("?")[0].partition(":")[0]
     return kind if kind in registry.kinds() else None
 

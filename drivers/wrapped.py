@@ -1,4 +1,4 @@
-"""What sources that stand in front of another source have in common."""
+"""Base of sources that wrap another source."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from stereo_sfm.types import StereoImage, Trajectory
 
 
 class WrappedSource:
-    """Another source, entered and left with this one; a subclass says what is different."""
+    """Another source, entered and left with this one; subclasses override what differs."""
 
     def __init__(self, source: Source) -> None:
         self.source = source
@@ -42,7 +42,7 @@ class WrappedSource:
         return self.source.counters
 
     def stamps(self) -> Stamps | None:
-        """Those of the frames that are passed on: not known before they are, unless a subclass knows."""
+        """The stamps of the frames passed on: unknown in advance, unless a subclass knows them."""
         return None
 
     def at(self, positions: Sequence[int]) -> Iterator[StereoImage]:

@@ -35,7 +35,7 @@ def _is_tum_vi(path: Path) -> Certainty:
 
 EUROC = Driver("EuRoC, ASL: mav0/ with cam0, cam1", "FOLDER", SourceOptions, _open_euroc, recognise=_is_euroc)
 TUM_VI = Driver(
-    "TUM VI: mav0/ beside camchain.yaml (or dso/camchain.yaml)",
+    "TUM VI: mav0/ next to camchain.yaml (or dso/camchain.yaml)",
     "FOLDER",
     SourceOptions,
     _open_tum_vi,

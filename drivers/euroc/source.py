@@ -1,6 +1,7 @@
 """EuRoC/ASL folders (`mav0/cam0/data.csv`, `sensor.yaml`) and TUM VI (the same layout with a Kalibr camchain).
 
-EuRoC: Burri et al., IJRR 2016; poses of `state_groundtruth_estimate0` are the body's (the IMU), cameras sit at `T_BS`.
+EuRoC: Burri et al., IJRR 2016; `state_groundtruth_estimate0` has poses of the body (the IMU), `T_BS` those of the
+cameras.
 TUM VI: Schubert et al., IROS 2018; `mocap0` holds the IMU's poses, Kalibr's `T_cam_imu` is the inverse of `T_BS`, and
 sixteen-bit images carry the sensor's twelve bits in their upper part.
 """
@@ -33,7 +34,7 @@ def open_euroc(path: str, options: SourceOptions) -> FolderSource:
 
 
 def open_tum_vi(path: str, options: SourceOptions) -> FolderSource:
-    """Open a TUM VI folder: `mav0` beside `camchain.yaml` (or `dso/camchain.yaml`)."""
+    """Open a TUM VI folder: `mav0` next to `camchain.yaml` (or `dso/camchain.yaml`)."""
     mav = _mav_folder(folder_of("tum_vi", path))
     chains = [mav.parent / "camchain.yaml", mav.parent / "dso" / "camchain.yaml"]
     chain = next((c for c in chains if c.is_file()), chains[0])

@@ -1,7 +1,7 @@
-"""Two folders of images (or one with left*/right* files) with a rig file: the form anybody can bring.
+"""Two folders of images (or one with left*/right* files) with a rig file: the simplest dataset format.
 
-Stamps come from times.txt (a line of seconds a frame), else from file names that are nanoseconds or seconds, else from
-the frame rate given and the numbers in the file names.
+Stamps come from times.txt (seconds, one line per frame), else from file names in nanoseconds or seconds, else from the
+given frame rate and the numbers in the file names.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def open_images(path: str, options: ImagesOptions) -> FolderSource:
     """Open a pair of image folders.
 
     Args:
-        path: the folder that holds both.
+        path: the folder with both.
         options: the frame rate, used where nothing tells the stamps, and the calibration; without it the one found in
             the folder (rig.yaml, calib.yaml, ...).
     """
@@ -51,7 +51,7 @@ def open_images(path: str, options: ImagesOptions) -> FolderSource:
     found = find_pair(folder)
     if found is None:
         raise StereoSfmError(
-            f"{folder} holds no image pair (left/ and right/, cam0/ and cam1/, or left*, right* files)"
+            f"{folder} contains no image pair (left/ and right/, cam0/ and cam1/, or left*, right* files)"
         )
     stamps = _stamps(name, folder, found[0], options.fps)
     pairs = pair_files(name, *found)
@@ -106,7 +106,7 @@ def _stamps(name: str, folder: Path, files: list[Path], fps: float | None) -> di
     if times.is_file():
         stamps = [stamp_from_text(line) for line in times.read_text("utf-8-sig").split()]
         if None in stamps:
-            raise StereoSfmError(f"{times} must hold one time in seconds for each of the {len(files)} frames")
+            raise StereoSfmError(f"{times} must have one time in seconds for each of the {len(files)} frames")
         lines = lines_of(name, files, len(stamps), times.name)
         return {file: stamps[line] or 0 for file, line in lines.items()}
     named = {p: stamp_of(p) for p in files}
@@ -120,6 +120,6 @@ def _stamps(name: str, folder: Path, files: list[Path], fps: float | None) -> di
 
 
 def _right_stamp(stamp_ns: int, left: Path, right: Path) -> int:
-    """The right image's stamp where both names are times, 0 where they do not tell it."""
+    """The right image's stamp if both names are times, else 0."""
     named = stamp_of(left), stamp_of(right)
     return 0 if named[0] is None or named[1] is None else stamp_ns + named[1] - named[0]

@@ -22,16 +22,16 @@ from stereo_sfm.errors import StereoSfmError
 
 log = logging.getLogger("stereo_sfm")
 
-T265_BASELINE = 0.064  # metres, the nominal distance of a T265's eyes
+T265_BASELINE = 0.064  # metres, nominal baseline of a T265
 T265_SIZE = (848, 800)
-ALIGNED_PAIRS = 5  # images from which a missing rotation between the eyes is found
+ALIGNED_PAIRS = 5  # images for estimating a missing rotation between the cameras
 
 
 def open_kapture(path: str, options: SourceOptions) -> FolderSource:
     """Open the first two cameras of a kapture folder.
 
-    A T265 sample has no extrinsics: its eyes are taken to be at the nominal distance, and how the right one is turned
-    is found from the images.
+    A T265 sample has no extrinsics: the nominal baseline is assumed, and the rotation of the right camera is estimated
+    from the images.
     """
     folder = folder_of("kapture", path)
     name = f"kapture:{folder.resolve().name}"
@@ -46,14 +46,16 @@ def open_kapture(path: str, options: SourceOptions) -> FolderSource:
 
 
 def _turned(name: str, source: FolderSource) -> Rig:
-    """The source's nominal rig with the right eye turned as its images show."""
+    """The nominal rig with the rotation of the right camera estimated from the images."""
     step = max(len(source.shots) // ALIGNED_PAIRS, 1)
     found = align_eyes(source.rig, SelectedFrames(source, frame_skip=step, max_frames=ALIGNED_PAIRS))
     if found is None:
-        log.warning("%s: no extrinsics, parallel eyes at the nominal %g m are used", name, T265_BASELINE)
+        log.warning(
+            "%s: no extrinsics: assuming parallel cameras with the nominal baseline of %g m", name, T265_BASELINE
+        )
         return source.rig
     log.warning(
-        "%s: no extrinsics, the nominal %g m are used and the right eye is turned until %d matches fit to %.1f px "
+        "%s: no extrinsics: assuming a baseline of %g m, right camera rotated to fit %d matches to %.1f px "
         "(parallel: %.1f px)",
         name,
         T265_BASELINE,
@@ -75,14 +77,14 @@ def _read_rig(folder: Path) -> Rig:
         return read_kapture(sensors)
     cameras = list(read_kapture_cameras(sensors).values())
     if len(cameras) < 2 or any(c.size != T265_SIZE or c.model != "kannala_brandt" for c in cameras[:2]):
-        raise StereoSfmError(f"{folder} does not say where two cameras sit (rigs.txt): give --rig FILE")
+        raise StereoSfmError(f"{folder} has no extrinsics of two cameras (rigs.txt): give --rig FILE")
     left_T_right = np.eye(4)
     left_T_right[0, 3] = T265_BASELINE
     return read_kapture(sensors, left_T_right)
 
 
 def _listings(folder: Path) -> tuple[Listing, Listing]:
-    """(stamp_ns, file) of both eyes."""
+    """(stamp_ns, file) of both cameras."""
     records = folder / "sensors" / "records_camera.txt"
     if not records.is_file():
         left, right = ([(_stamp(p.stem), p) for p in list_images(folder / f"fisheye{i}")] for i in (1, 2))

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 class KittiOptions(SourceOptions):
     """Options of `kitti:FOLDER`."""
 
-    sequence: str = option("", "which one below the data set's root, where there are several (00)")
+    sequence: str = option("", "which sequence, if the folder is the root of the dataset (00)")
 
 
 def _open(place: str, options: KittiOptions) -> Source:

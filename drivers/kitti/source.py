@@ -61,12 +61,12 @@ def _sequence_folder(folder: Path, sequence: str) -> Path:
     if len(found) == 1:
         return root / found[0]
     if not found:
-        raise StereoSfmError(f"{root} holds no KITTI sequence (a folder with image_0 and image_1)")
-    raise StereoSfmError(f"{folder} holds sequences {', '.join(found)}: say which, as in {root / found[0]}")
+        raise StereoSfmError(f"{root} contains no KITTI sequence (a folder with image_0 and image_1)")
+    raise StereoSfmError(f"{folder} contains sequences {', '.join(found)}: choose one, as in {root / found[0]}")
 
 
 def _read_times(path: Path, name: str, count: int) -> list[int]:
-    """Stamps in ns, one a line; `count` of them where there is no file."""
+    """Stamps in ns, one per line; `count` stamps at 10 Hz without a file."""
     if not path.is_file():
         log.warning("%s: no times.txt, frames are stamped at 10 Hz", name)
         return [i * PERIOD_NS for i in range(count)]

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 class KittiRawOptions(SourceOptions):
     """Options of `kitti_raw:FOLDER`."""
 
-    drive: str = option("", "which one below the date's folder, where there are several (0009)")
+    drive: str = option("", "which drive, if the folder is that of the date (0009)")
 
 
 def _open(place: str, options: KittiRawOptions) -> Source:

@@ -64,7 +64,7 @@ def _drive_folder(folder: Path, drive: str) -> Path:
     found = sorted(p for p in folder.glob("*_drive_*") if drive in p.name and p.is_dir())
     if len(found) != 1:
         names = ", ".join(p.name for p in found) or "none"
-        raise StereoSfmError(f"{folder} must hold one KITTI raw drive, found {names}: name its folder")
+        raise StereoSfmError(f"{folder} must contain one KITTI raw drive, found {names}: give the folder of the drive")
     return found[0]
 
 
@@ -135,4 +135,4 @@ def _read_rigid(path: Path) -> F64:
     try:
         return se3.from_rotation_translation(entries["R"].reshape(3, 3), entries["T"])
     except (KeyError, ValueError):
-        raise StereoSfmError(f"{path} must hold R (nine numbers) and T (three)") from None
+        raise StereoSfmError(f"{path} must contain R (nine numbers) and T (three)") from None

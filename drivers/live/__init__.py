@@ -1,1 +1,1 @@
-"""What live cameras share: errors, counters, pairing of the eyes, clocks, hand-over to the consumer."""
+"""Shared by live cameras: errors, counters, stereo pairing, clocks, buffers to the consumer."""

@@ -1,4 +1,4 @@
-"""Hand-over between the threads that read the camera and the one that consumes."""
+"""Buffers between the threads that read the camera and the consumer."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import numpy as np
 from stereo_sfm.types import ImuSamples, WheelSamples
 
 T = TypeVar("T")
-_MAX_SAMPLES = 20_000  # about a minute and a half of inertial samples: older ones go when nobody takes them
+_MAX_SAMPLES = 20_000  # about a minute and a half of inertial samples: older ones are discarded if not consumed
 
 
 class Handoff(Generic[T]):
-    """A bounded queue that throws away its oldest item when it is full, and remembers how much was in it."""
+    """A bounded queue that discards its oldest item when full, and counts the discarded frames."""
 
     def __init__(self, size: int) -> None:
         self._items: deque[tuple[T, int]] = deque()
@@ -25,7 +25,7 @@ class Handoff(Generic[T]):
         self._ready = threading.Condition()
 
     def put(self, item: T, weight: int = 1) -> None:
-        """Hand over an item that stands for `weight` frames if it is lost."""
+        """Add an item that counts as `weight` frames if discarded."""
         with self._ready:
             if len(self._items) >= self._size:
                 self._lost += self._items.popleft()[1]
@@ -33,13 +33,13 @@ class Handoff(Generic[T]):
             self._ready.notify()
 
     def fail(self, error: BaseException) -> None:
-        """The producer has ended: the consumer gets the items that are left, then this error."""
+        """End of the producer: the consumer gets the remaining items, then this error."""
         with self._ready:
             self._failure = self._failure or error
             self._ready.notify()
 
     def get(self, timeout_s: float) -> tuple[T, int] | None:
-        """The oldest item and the frames thrown away before it; None when none came in time."""
+        """The oldest item and the number of frames discarded before it; None on timeout."""
         with self._ready:
             self._ready.wait_for(lambda: self._items or self._failure, timeout_s)
             if not self._items:
@@ -51,7 +51,7 @@ class Handoff(Generic[T]):
 
 
 class MotionBuffer:
-    """Inertial samples on their way to the next image."""
+    """Inertial samples waiting for the next image."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -62,7 +62,7 @@ class MotionBuffer:
             self._rows.append((stamp_ns, is_gyro, xyz))
 
     def take(self, until_ns: int) -> ImuSamples | None:
-        """Samples up to a stamp, in the order of time; None when there are none."""
+        """Samples up to a stamp, in temporal order; None when there are none."""
         with self._lock:
             taken = sorted(r for r in self._rows if r[0] <= until_ns)
             kept = [r for r in self._rows if r[0] > until_ns]
@@ -76,7 +76,7 @@ class MotionBuffer:
 
 
 class WheelBuffer:
-    """Wheel odometry that another program pushes, on its way to the next image."""
+    """Wheel odometry pushed by another program, waiting for the next image."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -87,7 +87,7 @@ class WheelBuffer:
             self._rows.append((stamp_ns, linear, angular))
 
     def take(self, until_ns: int) -> WheelSamples | None:
-        """Samples up to a stamp, in the order of time; None when there are none."""
+        """Samples up to a stamp, in temporal order; None when there are none."""
         with self._lock:
             taken = sorted(r for r in self._rows if r[0] <= until_ns)
             self._rows = deque((r for r in self._rows if r[0] > until_ns), maxlen=_MAX_SAMPLES)

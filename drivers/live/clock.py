@@ -1,4 +1,4 @@
-"""The camera's clock beside this computer's, and one time line over restarts of the camera. Pure."""
+"""Mapping between the camera's clock and the host's, and one time line over restarts of the camera. Pure."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ GOOD_HALF_TRIP_NS = 250_000  # librealsense accepts a reading whose half round t
 
 
 class ClockMap:
-    """host = camera + offset, from readings of the camera's clock between two looks at ours."""
+    """host = camera + offset, from readings of the camera's clock between two readings of ours."""
 
     def __init__(self) -> None:
         self._offset_ns: int | None = None
@@ -16,7 +16,7 @@ class ClockMap:
         """Take a reading; the first is always kept, later ones when their round trip was short.
 
         Returns:
-            Whether it was good enough to stop trying.
+            Whether it was accurate enough to stop.
         """
         half = (host_after_ns - host_before_ns) // 2
         good = half < GOOD_HALF_TRIP_NS
@@ -39,10 +39,10 @@ class ClockMap:
 
 
 class TimeLine:
-    """Stamps of the first segment's camera clock, continued when the camera restarts with another one.
+    """Stamps of the first segment's camera clock, continued when the camera restarts with a new clock.
 
     Inside a segment differences of stamps are differences of the camera's clock exactly. Between segments they are
-    as good as two clock readings.
+    as accurate as two clock readings.
     """
 
     def __init__(self) -> None:
@@ -62,7 +62,7 @@ class TimeLine:
         return camera_ns + self._shift
 
     def frame_stamp(self, camera_ns: int) -> int:
-        """As `stamp`, and never before the last frame's, whatever the clock readings say."""
+        """As `stamp`, but always after the stamp of the last frame."""
         self._last = max(self.stamp(camera_ns), self._last + 1)
         return self._last
 

@@ -1,4 +1,4 @@
-"""Numbers every live source keeps about itself. The pipeline writes them in the log and the summary."""
+"""Counters of live sources, written to the log and the summary."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ import threading
 # name -> what it counts. `source.counters` holds every name of this table, 0 at the start.
 COUNTERS: dict[str, str] = {
     "pairs": "stereo images handed to the consumer",
-    "dropped": "frames that did not arrive, from the gaps in the camera's stamps and counters; sum of dropped_before",
-    "dropped_by_host": "of these: frames thrown away here because the consumer was too slow",
-    "unpaired": "single images whose other eye never came",
-    "skewed": "pairs with the same counter whose eyes differ by 1 ms or more (not used)",
-    "counter_mismatch": "times the eyes' frame counters began to differ by another amount (time decides then)",
-    "implausible": "well-formed images refused because counter and time contradict the frames before",
+    "dropped": "frames that did not arrive, by gaps in the camera's stamps and counters; sum of dropped_before",
+    "dropped_by_host": "of these: frames discarded on the host because the consumer was too slow",
+    "unpaired": "images of one camera without the other camera's image",
+    "skewed": "pairs with the same counter whose stamps differ by 1 ms or more (not used)",
+    "counter_mismatch": "changes of the offset between the cameras' frame counters (stamps decide then)",
+    "implausible": "well-formed images rejected because counter and stamp contradict earlier frames",
     "half_frames": "image transfers that ended early or late",
-    "malformed": "transfers and events that are no message of the protocol",
-    "stalls": "times no image came for 500 ms",
-    "disconnects": "times the camera went away or failed",
-    "segments": "times streaming began; more than 1 means that the camera was restarted",
-    "busy_retries": "times the camera answered busy and was asked again",
+    "malformed": "transfers and events that are not messages of the protocol",
+    "stalls": "times without an image for 500 ms",
+    "disconnects": "times the camera disconnected or failed",
+    "segments": "starts of streaming; more than 1 if the camera was restarted",
+    "busy_retries": "commands repeated because the camera was busy",
     "imu_samples": "inertial samples handed to the consumer",
     "wheel_samples": "wheel odometry samples handed to the consumer",
     "camera_errors": "error messages from the camera itself",
@@ -26,7 +26,7 @@ COUNTERS: dict[str, str] = {
     "clock_uncertainty_us": "half the round trip of the last accepted clock reading",
 }
 
-# Those that are not 0 only when something went wrong.
+# Those that are nonzero only after a problem.
 TROUBLE = frozenset(COUNTERS) - {
     "pairs",
     "segments",
@@ -38,7 +38,7 @@ TROUBLE = frozenset(COUNTERS) - {
 
 
 class Counters(dict[str, float]):
-    """Counts that several threads add to. Reading is reading a dict."""
+    """Thread-safe counters, readable as a dict."""
 
     def __init__(self) -> None:
         super().__init__(dict.fromkeys(COUNTERS, 0))

@@ -1,4 +1,4 @@
-"""What can go wrong with a camera, one class per thing a person can do about it. Messages are one line."""
+"""Errors of cameras, one class per remedy. Messages are one line."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from stereo_sfm.errors import StereoSfmError
 
 
 class DeviceError(StereoSfmError):
-    """Any trouble with an attached camera."""
+    """Any error of a camera."""
 
 
 class NotFound(DeviceError):
@@ -14,28 +14,28 @@ class NotFound(DeviceError):
 
 
 class NoPermission(DeviceError):
-    """The operating system does not let this user open the camera."""
+    """The user has no permission to open the camera."""
 
 
 class Busy(DeviceError):
-    """Another program holds the camera."""
+    """Another program uses the camera."""
 
 
 class TooSlowLink(DeviceError):
-    """The camera hangs on a link that cannot carry its images."""
+    """The USB link is too slow for the images."""
 
 
 class FirmwareMissing(DeviceError):
-    """The camera needs a firmware file that is not here or not the right one."""
+    """The camera needs a firmware file that is missing or wrong."""
 
 
 class BootFailed(DeviceError):
-    """The camera took its firmware but did not come back."""
+    """The camera did not come back after loading its firmware."""
 
 
 class DeviceLost(DeviceError):
-    """The camera is gone: unplugged, crashed, or silent."""
+    """The camera is unplugged, crashed, or does not respond."""
 
 
 class DeviceFault(DeviceError):
-    """The camera answers, but not what it should."""
+    """The camera gives an unexpected answer."""

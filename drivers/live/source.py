@@ -1,4 +1,4 @@
-"""What every live camera does the same: segments of streaming on one time line, restarts, counters."""
+"""Base of live cameras: streaming segments on one time line, restarts, counters."""
 
 from __future__ import annotations
 
@@ -21,47 +21,47 @@ from stereo_sfm.types import ImuSamples, StereoImage
 logger = logging.getLogger("stereo_sfm")
 
 _RETRY_S = 0.2
-_QUIET_S = 1.0  # between two lines about lost frames
+_QUIET_S = 1.0  # between two warnings about lost frames
 
 
 class Segment(Protocol):
-    """One stretch of streaming without a restart."""
+    """A period of streaming without a restart."""
 
     pairs: Handoff[Pair]
     motion: MotionBuffer  # stamps of the camera's clock
     clock: ClockMap  # known when the first pair is there
 
     def stop(self, camera_alive: bool = True) -> None:
-        """End streaming; a camera that is alive is told."""
+        """Stop streaming; a responding camera gets the command."""
         ...
 
 
 @dataclass(frozen=True)
 class Patience:
-    """How long a live source waits."""
+    """Timeouts of a live source."""
 
-    stall_s: float = 0.5  # no image for so long: the camera has stopped
-    first_image_s: float = 3.0  # the first image of a segment may take its time
-    reconnect_s: float = 20.0  # looking for a lost camera
+    stall_s: float = 0.5  # without an image: the camera has stalled
+    first_image_s: float = 3.0  # timeout of the first image of a segment
+    reconnect_s: float = 20.0  # searching for a lost camera
 
 
 class _Stalled(DeviceLost):
-    """The camera is there but sends no images."""
+    """The camera is connected but sends no images."""
 
 
 class LiveSource(BaseSource):
     """Live stereo images with the camera's factory calibration.
 
-    What happens when something goes wrong: images that are lost are counted in `dropped_before` of the next one; a
-    camera that stalls is restarted, then reset; one that is unplugged is waited for. Each restart begins a new
-    segment: frame ids continue, stamps continue on the first segment's clock. When it does not come back, iteration
-    raises DeviceLost after the last image. `counters` (names: stereo_sfm.drivers.live.counters.COUNTERS) has the sums.
+    Failures: lost images are counted in `dropped_before` of the next one; a stalled camera is restarted, then reset; an
+    unplugged camera is waited for. Each restart begins a new segment: frame ids continue, stamps continue on the first
+    segment's clock. If the camera does not come back, iteration raises DeviceLost after the last image. `counters`
+    (names: stereo_sfm.drivers.live.counters.COUNTERS) has the totals.
 
     Args:
         name: of the source.
         title: of the camera, for messages.
         period_ns: nominal time between frames.
-        patience: waits.
+        patience: timeouts.
         stamp_at_start: the camera's stamps are of the start of the exposure, not of its middle.
     """
 
@@ -79,28 +79,28 @@ class LiveSource(BaseSource):
         self._unsaid, self._quiet_until = 0, 0.0
         self._summed_up = False
 
-    # ---- what a camera brings
+    # ---- implemented by each camera
 
     @abstractmethod
     def _start(self) -> Segment:
-        """Open the camera if it is not open, and stream.
+        """Open the camera if necessary, and start streaming.
 
         Raises:
-            DeviceError: it cannot be.
+            DeviceError: it failed.
         """
 
     @abstractmethod
     def _release(self) -> None:
-        """Give the camera back; it may be gone, or never have been open."""
+        """Release the camera; it may be disconnected, or never have been open."""
 
     def _reset(self) -> None:
-        """A restart did not help: something stronger before the next one, while the camera is still open."""
+        """A stronger reset after a restart did not help, while the camera is still open."""
         return
 
-    # ---- what a user sees
+    # ---- public interface
 
     def close(self) -> None:
-        """Stop streaming, give the camera back, and say in one line what was counted."""
+        """Stop streaming, release the camera, and log the counters in one line."""
         self._shut(camera_alive=True)
         trouble = {k: v for k, v in self.counters.items() if v and k in TROUBLE}
         if self._frame_id and not self._summed_up:
@@ -112,7 +112,7 @@ class LiveSource(BaseSource):
     def push_wheel(
         self, linear: tuple[float, float, float], angular: tuple[float, float, float], host_ns: int | None = None
     ) -> None:
-        """Wheel odometry to travel with the images, body axes (x forward, y left); ignored before the first image.
+        """Add wheel odometry to pass on with the images, body axes (x forward, y left); ignored before the first image.
 
         Args:
             linear: m/s. angular: rad/s.
@@ -186,14 +186,14 @@ class LiveSource(BaseSource):
             self._warn_lost(dropped, lost_here)
 
     def _warn_lost(self, dropped: int, lost_here: int) -> None:
-        """One line a second at most; what was not said yet goes into the next one."""
+        """At most one warning per second; later losses are included in the next one."""
         self._unsaid += dropped
         if time.monotonic() >= self._quiet_until:
             why = " (this computer is too slow)" if lost_here else ""
             logger.warning("%s: %d frame(s) lost before frame %d%s", self._title, self._unsaid, self._frame_id, why)
             self._unsaid, self._quiet_until = 0, time.monotonic() + _QUIET_S
 
-    # ---- life and death of segments
+    # ---- segments
 
     def _begin(self) -> None:
         self._segment = self._start()
@@ -207,7 +207,7 @@ class LiveSource(BaseSource):
         self._release()
 
     def _recover(self, error: DeviceError) -> None:
-        """Bring the camera back as a new segment.
+        """Restart the camera in a new segment.
 
         Raises:
             DeviceLost: it did not come back in time.
@@ -216,7 +216,7 @@ class LiveSource(BaseSource):
         self._counters.add("stalls" if stalled else "disconnects")
         logger.warning("%s; restarting it (frame %d)", error, self._frame_id)
         if stalled and not self._segment_frames:
-            self._reset()  # it was restarted already, to no avail
+            self._reset()  # a restart did not help
             stalled = False
         self._shut(camera_alive=stalled)
         deadline = time.monotonic() + self._patience.reconnect_s
@@ -240,7 +240,7 @@ S = TypeVar("S", bound=LiveSource)
 
 
 def with_rig(source: S, rig: RigOption) -> S:
-    """The open source with the calibration that the user gave, if any; closed again when that is none."""
+    """The open source with the user's calibration, if any; closed again if that is invalid."""
     try:
         source.rig = chosen_rig(rig, lambda: source.rig)
     except BaseException:

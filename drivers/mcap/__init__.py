@@ -1,4 +1,4 @@
-"""MCAP files as a kind of source; `drivers.mcap.source` reads our own, `drivers.mcap.foreign` those of others."""
+"""MCAP files as a kind of source; see `drivers.mcap.source` for our own, `drivers.mcap.foreign` for other programs'."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 class McapOptions(SourceOptions):
     """Options of `mcap:FILE`. The topics are for files of other programs."""
 
-    left: str = option("", "topic of the left images, where the names do not tell")
-    right: str = option("", "topic of the right images, where the names do not tell")
-    depth: str = option("", "topic of the depth images, where the names do not tell")
+    left: str = option("", "topic of the left images, if the names are ambiguous")
+    right: str = option("", "topic of the right images, if the names are ambiguous")
+    depth: str = option("", "topic of the depth images, if the names are ambiguous")
 
 
 def _open(place: str, options: McapOptions) -> Source:

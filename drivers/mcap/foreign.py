@@ -1,4 +1,4 @@
-"""MCAP files of other programs as a source: two image topics, their calibrations and what else can be used."""
+"""MCAP files of other programs as a source: two image topics, their calibrations, and other usable topics."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ log = logging.getLogger("stereo_sfm")
 
 _STATIC_NS = 10_000_000_000  # the fixed transforms must come within the first ten seconds
 _STEP_BACK_NS = 200_000_000  # messages of several threads may be out of order by less
-_WAITING = 30  # images of one eye that wait for the other eye at most
+_WAITING = 30  # maximum number of images of one camera that wait for the other
 
 
 @dataclass
 class _Shot:
-    """One image of one eye, not decoded."""
+    """An image of one camera, not decoded."""
 
     stamp_ns: int
     picture: Picture
@@ -62,7 +62,7 @@ class ForeignMcapSource(BaseSource):
         Args:
             reader: the open file.
             rig: calibration that replaces or supplies the one in the file.
-            left: image topic of the left eye when the names do not tell. right, depth: likewise.
+            left: image topic of the left camera if the names are ambiguous. right, depth: likewise.
         """
         self.reader = reader
         self.name = str(reader.path)
@@ -79,7 +79,7 @@ class ForeignMcapSource(BaseSource):
         back_ns = reader.step_back_ns(self.topics.left)
         if back_ns > _STEP_BACK_NS:
             log.warning(
-                "%s: the clock goes back by %.1f s in it: images from before and after are mixed by their stamps",
+                "%s: the clock goes back by %.1f s in it: images from before and after are merged by their stamps",
                 self.name,
                 back_ns / 1e9,
             )
@@ -125,7 +125,7 @@ class ForeignMcapSource(BaseSource):
             right = eight_bits(other.picture.gray(), self._bits) if other and self.topics.right else None
             depth = other.picture.depth() if other and self.topics.depth else None
         except BAD_MESSAGE as error:
-            log.warning("%s: image at %d ns is left out: %s", self.name, left.stamp_ns, error)
+            log.warning("%s: image at %d ns is skipped: %s", self.name, left.stamp_ns, error)
             return None
         self._check_size("left", pixels.shape, self.rig.left.size)
         if right is not None and self.rig.right is not None:
@@ -140,7 +140,7 @@ class ForeignMcapSource(BaseSource):
     def _pairs(
         self, start_ns: int | None, until_ns: int | None, imu: list[tuple[int, list[float]]]
     ) -> Iterator[tuple[_Shot, _Shot | None]]:
-        """(left, right or depth) by stamp; a left image alone comes with None. Inertial samples are put into `imu`."""
+        """(left, right or depth) by stamp; an unpaired left image has None. Inertial samples are put into `imu`."""
         names = [t for t in (self.topics.left, self._other()) if t]
         lefts: deque[_Shot] = deque()
         others: deque[_Shot] = deque()
@@ -180,13 +180,15 @@ class ForeignMcapSource(BaseSource):
     def _recorded_rig(self) -> Rig:
         names = tuple(camera_topic(t, self.topics.cameras) for t in (self.topics.left, self.topics.right) if t)
         if not all(names):
-            raise StereoSfmError(f"{self.name} holds no calibration of its images: give one with --rig FILE")
+            raise StereoSfmError(f"{self.name} has no calibration of its images: give one with --rig FILE")
         infos = [self._camera_info(name) for name in names]
         rectified = is_rectified(self.topics.left)
         if len(infos) == 1:
             return Rig(camera_of(infos[0], names[0], rectified), name=self.reader.path.stem)
         if names[0] == names[1]:
-            raise StereoSfmError(f"{self.name} has one calibration, {names[0]}, for two eyes: give one with --rig FILE")
+            raise StereoSfmError(
+                f"{self.name} has one calibration, {names[0]}, for two cameras: give one with --rig FILE"
+            )
         rig = stereo_rig(infos[0], infos[1], (names[0], names[1]), rectified, self._fixed_transforms())
         return Rig(rig.left, rig.right, rig.left_T_right, name=self.reader.path.stem)
 
@@ -209,7 +211,7 @@ class ForeignMcapSource(BaseSource):
         return out
 
     def _read_truth(self) -> Trajectory | None:
-        """Poses of the left camera where a transform tells how it sits on the tracked body, else of the body itself."""
+        """Poses of the left camera if its pose on the tracked body is known, else of the body itself."""
         rows: list[Transform] = []
         for record in self.reader.messages([self.topics.truth] if self.topics.truth else []):
             try:
@@ -233,7 +235,7 @@ class ForeignMcapSource(BaseSource):
         return int(np.median(np.diff(stamps))) if len(stamps) > 1 else 100_000_000
 
     def _sensor_bits(self) -> int:
-        """Of sixteen-bit images: decided once, so that brightness does not jump between frames."""
+        """The used bits of sixteen-bit images, determined once, so that brightness does not jump between frames."""
         if not any(image.dtype == np.uint16 for image in self._sample(1)):
             return 16
         bits = sensor_bits(image for image in self._sample(SAMPLED) if image.dtype == np.uint16)
@@ -242,7 +244,7 @@ class ForeignMcapSource(BaseSource):
         return bits
 
     def _sample(self, count: int) -> Iterator[Any]:
-        """Readable images of both eyes from so many times, spread evenly."""
+        """Readable images of both cameras at evenly spaced times."""
         first, last = self.reader.time_range
         for topic in filter(None, (self.topics.left, self.topics.right)):
             for k in range(count):
@@ -253,7 +255,7 @@ class ForeignMcapSource(BaseSource):
                         yield shot.picture.gray()
 
     def _check_first(self) -> None:
-        """The images must fit the calibration, and that is said before the first frame."""
+        """Raises StereoSfmError before the first frame if the images do not match the calibration."""
         for left, other in self._pairs(None, None, []):
             if self._used(other):
                 self._decode(0, left, other, 0)

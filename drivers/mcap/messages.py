@@ -1,7 +1,7 @@
-"""Messages of files that others wrote, made neutral: images, calibrations, transforms of Foxglove (protobuf) and ROS 2.
+"""Messages of other programs in common types: images, calibrations, transforms of Foxglove (protobuf) and ROS 2.
 
 CDR is the plain form of OMG's Common Data Representation: a four-byte header, then fields aligned to their own size
-counted from the end of that header; strings carry their length with the closing zero.
+counted from the end of that header; strings are preceded by their length including the terminating zero.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from stereo_sfm.log.reader import Record
 from stereo_sfm.pixels import decode_gray
 from stereo_sfm.types import F32, F64, U8, U16
 
-# What damaged or unexpected message bytes raise.
+# Exceptions of damaged or unexpected messages.
 BAD_MESSAGE = (ValueError, DecodeError, struct.error, IndexError)
 
 
 @dataclass(frozen=True)
 class Picture:
-    """An image that is not decoded yet."""
+    """An image, not decoded."""
 
     stamp_ns: int  # 0 where the message has none
     frame: str
@@ -59,7 +59,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class CameraInfo:
-    """One eye's calibration as ROS and Foxglove have it."""
+    """The calibration of one camera as in ROS and Foxglove."""
 
     frame: str
     width: int
@@ -68,7 +68,7 @@ class CameraInfo:
     d: list[float]
     k: F64  # (3, 3)
     r: F64  # (3, 3) rotates camera points into the rectified frame
-    p: F64  # (3, 4) projection of rectified points; p[0, 3] = -fx * baseline in the right eye
+    p: F64  # (3, 4) projection of rectified points; p[0, 3] = -fx * baseline in the right camera
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class _Cdr:
         length = self.take("I")
         out = bytes(self._data[self._at : self._at + length])
         if len(out) != length:
-            raise ValueError("a ROS 2 message is cut off")
+            raise ValueError("a ROS 2 message is truncated")
         self._at += length
         return out
 
@@ -146,7 +146,7 @@ def _picture_ros_compressed(data: bytes) -> Picture:
     stamp_ns, frame = cdr.header()
     encoding = cdr.text()
     blob = cdr.blob()
-    if "compressedDepth" in encoding:  # the depth transport puts its own header before the PNG
+    if "compressedDepth" in encoding:  # the depth transport has a header before the PNG
         blob = blob[blob.find(b"\x89PNG") :]
     return Picture(stamp_ns, frame, True, blob)
 

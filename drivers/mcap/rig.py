@@ -20,7 +20,7 @@ _FISHEYE = ("kannala_brandt", "equidistant", "fisheye")
 
 
 def camera_of(info: CameraInfo, topic: str, rectified: bool) -> Camera:
-    """Lens model of one eye.
+    """Lens model of one camera.
 
     Args:
         info: its calibration message.
@@ -28,14 +28,14 @@ def camera_of(info: CameraInfo, topic: str, rectified: bool) -> Camera:
         rectified: the images are rectified, so that the pinhole of P holds.
 
     Raises:
-        StereoSfmError: uncalibrated, or a lens model we do not have.
+        StereoSfmError: uncalibrated, or an unsupported lens model.
     """
     size = (info.width, info.height)
     if rectified and info.p[0, 0] > 0:
         return Pinhole(*size, info.p[0, 0], info.p[1, 1], info.p[0, 2], info.p[1, 2])
     k = info.k
     if k[0, 0] <= 0:
-        raise StereoSfmError(f"{topic} says that the camera is not calibrated: give a calibration with --rig FILE")
+        raise StereoSfmError(f"the camera of {topic} is not calibrated: give a calibration with --rig FILE")
     focal, centre = (k[0, 0], k[1, 1]), (k[0, 2], k[1, 2])
     model = info.model.lower()
     if model in _FISHEYE:
@@ -51,10 +51,10 @@ def camera_of(info: CameraInfo, topic: str, rectified: bool) -> Camera:
 def stereo_rig(
     left: CameraInfo, right: CameraInfo, topics: tuple[str, str], rectified: bool, transforms: Iterable[Transform]
 ) -> Rig:
-    """Both eyes and where the right one stands.
+    """The rig of both cameras with the extrinsics.
 
     Raises:
-        StereoSfmError: neither the transforms nor P tell.
+        StereoSfmError: extrinsics neither in the transforms nor in P.
     """
     cameras = tuple(camera_of(info, topic, rectified) for info, topic in zip((left, right), topics, strict=True))
     left_T_right = chain(list(transforms), left.frame, right.frame) if not rectified else None
@@ -86,7 +86,7 @@ def chain(transforms: list[Transform], parent: str, child: str) -> F64 | None:
 
 
 def _from_projections(left: CameraInfo, right: CameraInfo, rectified: bool) -> F64 | None:
-    """From the right eye's P: p_rect_left = p_rect_right + (baseline, 0, 0), and R takes a camera to its rect frame."""
+    """From the right camera's P: p_rect_left = p_rect_right + (baseline, 0, 0), and R rotates into it."""
     if right.p[0, 3] == 0 or right.p[0, 0] <= 0:
         return None
     shift = np.eye(4)

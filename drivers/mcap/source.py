@@ -1,4 +1,4 @@
-"""MCAP files as a source: our own recordings to the bit; `stereo_sfm.drivers.mcap.foreign` reads what others wrote."""
+"""MCAP files as a source: our own recordings, bit-exact; `stereo_sfm.drivers.mcap.foreign` reads other programs'."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ _PARTS = (
     topics.IMU,
     topics.WHEEL,
 )
-_MARGIN_NS = 1_000_000_000  # inertial samples may lie this far from the frame that carries them
-_WAITING = 8  # frames that may be begun before an incomplete one is given up
+_MARGIN_NS = 1_000_000_000  # maximum distance of inertial samples from their frame
+_WAITING = 8  # frames begun before an incomplete one is skipped
 
 
 def open_mcap(path: str, options: McapOptions) -> Source:
@@ -48,13 +48,13 @@ def open_mcap(path: str, options: McapOptions) -> Source:
 
     Args:
         path: the file.
-        options: a calibration that replaces the one in the file; for files of others the image topics.
+        options: a calibration that replaces the one in the file; for files of other programs the image topics.
 
     Raises:
         StereoSfmError: no file, not MCAP, no images, no calibration, or images that do not fit the calibration.
     """
     if not path:
-        raise StereoSfmError("which file? mcap:FILE.mcap")
+        raise StereoSfmError("no file given: use mcap:FILE.mcap")
     reader = LogReader(Path(path).expanduser())
     try:
         if any(t.topic == topics.IMAGE_INFO and t.schema == "stereo_sfm.ImageInfo" for t in reader.topics):
@@ -62,7 +62,7 @@ def open_mcap(path: str, options: McapOptions) -> Source:
             return McapSource(reader, options.rig)
         about = reader.metadata(METADATA)
         if about.get("image_format") == "none":
-            raise StereoSfmError(f"{path} is a run without its images: they are in {about.get('source')}")
+            raise StereoSfmError(f"{path} is a run without images: they are in {about.get('source')}")
         from stereo_sfm.drivers.mcap.foreign import ForeignMcapSource
 
         return ForeignMcapSource(reader, options.rig, options.left, options.right, options.depth)
@@ -72,7 +72,7 @@ def open_mcap(path: str, options: McapOptions) -> Source:
 
 
 def _refuse_topics(path: str, options: McapOptions) -> None:
-    """Our own files have one topic for each image: another one cannot be chosen."""
+    """Our own files have fixed image topics: they cannot be chosen."""
     if options.left or options.right or options.depth:
         raise StereoSfmError(f"{path} is a recording of stereo-sfm: left, right, depth are for files of other programs")
 
@@ -81,7 +81,7 @@ def decode_image(record: Record) -> U8:
     """Pixels of a RawImage or CompressedImage record as (H, W) u8.
 
     Raises:
-        ValueError: an encoding nobody knows, or damaged bytes.
+        ValueError: unknown encoding, or damaged bytes.
     """
     try:
         if record.schema is not None and record.schema.name == "foxglove.RawImage":
@@ -96,7 +96,7 @@ def decode_depth(record: Record) -> F32:
     """Pixels of a depth RawImage record as (H, W) metres.
 
     Raises:
-        ValueError: another encoding, or damaged bytes.
+        ValueError: unsupported encoding, or damaged bytes.
     """
     try:
         m = RawImage.FromString(record.data)
@@ -106,7 +106,7 @@ def decode_depth(record: Record) -> F32:
 
 
 def check_size(path: Path, what: str, pixels: U8 | F32, size: tuple[int, int]) -> None:
-    """Raises StereoSfmError when an image does not fit its calibration."""
+    """Raises StereoSfmError when an image does not match its calibration."""
     height, width = pixels.shape
     if (width, height) != size:
         raise StereoSfmError(
@@ -117,7 +117,7 @@ def check_size(path: Path, what: str, pixels: U8 | F32, size: tuple[int, int]) -
 
 @dataclass
 class _Parts:
-    """The messages of one frame as they come."""
+    """The messages of one frame while it is read."""
 
     info: ImageInfo | None = None
     left: U8 | None = None
@@ -127,7 +127,7 @@ class _Parts:
     wheel: list[WheelSample] = field(default_factory=list[WheelSample])
 
     def whole(self) -> bool:
-        """Everything that `info` promises is there."""
+        """Whether all images and samples announced by `info` have arrived."""
         i = self.info
         return (
             i is not None
@@ -173,7 +173,7 @@ def _wheel(samples: list[WheelSample]) -> WheelSamples:
 
 
 class McapSource(BaseSource):
-    """A recording or a run of ours: the images that the sensor gave (or the tracker saw), bit for bit."""
+    """A recording or a run of ours: the images of the sensor (or of the tracker), bit for bit."""
 
     def __init__(self, reader: LogReader, rig: RigOption = None) -> None:
         """Takes over the reader. `rig` replaces the recorded calibration."""
@@ -187,20 +187,20 @@ class McapSource(BaseSource):
         self._decoders: dict[type[Any], Callable[[bytes], Any]] = {}
 
     def _check_eyes(self) -> None:
-        """Raises StereoSfmError when the calibration has an eye that the recording has not."""
+        """Raises StereoSfmError when the recording lacks the images of a camera of the calibration."""
         recorded = {t.topic for t in self.reader.topics if t.count}
         what, topic = ("depth", topics.DEPTH_IMAGE) if self.rig.depth else ("right", topics.RIGHT_IMAGE)
         if topics.LEFT_IMAGE in recorded and self.rig.stereo and topic not in recorded:
-            raise StereoSfmError(f"{self.name} holds no {what} images, but its calibration (or --rig) has them")
+            raise StereoSfmError(f"{self.name} has no {what} images, but its calibration (or --rig) has that camera")
 
     def _recorded_rig(self) -> Rig:
         rig = attached_rig(self.reader)
         if rig is None:
-            raise StereoSfmError(f"{self.name} holds no calibration: give one with --rig FILE")
+            raise StereoSfmError(f"{self.name} has no calibration: give one with --rig FILE")
         return rig
 
     def _whole_count(self) -> int:
-        """Frames whose every image is in the file."""
+        """Number of frames with all images in the file."""
         counts = {t.topic: t.count for t in self.reader.topics}
         eyes = (topics.LEFT_IMAGE, topics.RIGHT_IMAGE, topics.DEPTH_IMAGE)
         return min(counts[t] for t in (topics.IMAGE_INFO, *eyes) if t in counts)
@@ -212,11 +212,11 @@ class McapSource(BaseSource):
         return self.frames()
 
     def stamps(self) -> Stamps:
-        """The skew is not known here: `image_info` holds it."""
+        """Stamps without skew, which is in `image_info`."""
         return Stamps(self.reader.stamps(topics.LEFT_IMAGE))
 
     def frames(self, start_ns: int | None = None, until_ns: int | None = None) -> Iterator[StereoImage]:
-        """Frames with stamps in [start_ns, until_ns], without reading what lies before.
+        """Frames with stamps in [start_ns, until_ns], without reading earlier ones.
 
         Raises:
             StereoSfmError: pixels that do not fit the calibration, or a damaged file.
@@ -238,10 +238,10 @@ class McapSource(BaseSource):
             yield from self._take(pending, _WAITING)
         yield from self._take(pending, 0, at_edge=first_ns is not None or bool(self.reader.truncated))
         if self._incomplete > SHOWN_WARNINGS:
-            log.warning("%s: %d frames were incomplete and left out", self.name, self._incomplete)
+            log.warning("%s: %d frames were incomplete and skipped", self.name, self._incomplete)
 
     def _take(self, pending: dict[int, _Parts], waiting: int, at_edge: bool = False) -> Iterator[StereoImage]:
-        """The whole frames in front; a frame that stays incomplete while `waiting` others came is left out."""
+        """The complete frames at the front; a frame still incomplete after `waiting` others is skipped."""
         while pending:
             sequence = next(iter(pending))
             parts = pending[sequence]
@@ -254,7 +254,7 @@ class McapSource(BaseSource):
                 self._incomplete += 1
                 if self._incomplete > SHOWN_WARNINGS:
                     continue
-                log.warning("%s: frame %d is incomplete and left out", self.name, sequence)
+                log.warning("%s: frame %d is incomplete and skipped", self.name, sequence)
 
     def _add(self, parts: _Parts, record: Record) -> None:
         try:

@@ -1,4 +1,4 @@
-"""Which topics of a foreign recording are the eyes, their calibrations and the ground truth: by schema and by name."""
+"""Detection of the image, calibration and ground-truth topics of a foreign recording by schema and name."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from stereo_sfm.log.reader import LogReader, TopicInfo
 
 log = logging.getLogger("stereo_sfm")
 
-# What names of a left and a right eye contain, the most telling first.
+# Parts of names of left and right cameras, most specific first.
 _SIDES = (
     ("left", "right"),
     ("cam0", "cam1"),
@@ -32,7 +32,7 @@ _TRUTH = ("ground_truth", "groundtruth", "mocap", "vicon")
 
 @dataclass(frozen=True)
 class ChosenTopics:
-    """Topic names; "" for what is not there."""
+    """Topic names; "" for missing ones."""
 
     left: str
     right: str
@@ -44,19 +44,19 @@ class ChosenTopics:
 
 
 def choose_topics(reader: LogReader, left: str = "", right: str = "", depth: str = "") -> ChosenTopics:
-    """Find the eyes.
+    """Find the image topics.
 
     Args:
         reader: the open file.
-        left: image topic the user named, "" to find it. right, depth: likewise.
+        left: image topic given by the user, "" to find it. right, depth: likewise.
 
     Raises:
-        StereoSfmError: no images, an unknown topic, or more than two images whose names tell nothing.
+        StereoSfmError: no images, an unknown topic, or more than two images with ambiguous names.
     """
     rows = [t for t in reader.topics if t.encoding in ENCODINGS]
     pictures = [t.topic for t in rows if t.schema in PICTURES]
     if not pictures:
-        raise StereoSfmError(f"{reader.path} holds no images ({_content(reader.topics)})")
+        raise StereoSfmError(f"{reader.path} contains no images ({_content(reader.topics)})")
     for name in (left, right, depth):
         if name and name not in pictures:
             raise StereoSfmError(f"{reader.path} has no image topic {name} (there are: {', '.join(pictures)})")
@@ -79,13 +79,13 @@ def choose_topics(reader: LogReader, left: str = "", right: str = "", depth: str
 
 
 def camera_topic(image: str, cameras: tuple[str, ...]) -> str:
-    """The calibration beside an image topic: the one that shares the longest path with it, "" when none shares any."""
+    """The calibration of an image topic: the topic with the longest common path, "" if there is none."""
     best = max(cameras, key=lambda c: _shared(image, c), default="")
     return best if best and _shared(image, best) else ""
 
 
 def is_rectified(topic: str) -> bool:
-    """Whether an image topic holds rectified images, by its name."""
+    """Whether an image topic has rectified images, by its name."""
     return "rect" in topic.lower() and "unrect" not in topic.lower()
 
 
@@ -125,9 +125,9 @@ def _pair(name: str, eyes: list[str], cameras: tuple[str, ...]) -> tuple[str, st
     if len(eyes) == 1:
         return eyes[0], ""
     if len(eyes) == 2:
-        log.warning("%s: taking %s as the left eye and %s as the right one", name, *sorted(eyes))
+        log.warning("%s: assuming %s is the left camera and %s the right one", name, *sorted(eyes))
         return sorted(eyes)[0], sorted(eyes)[1]
     raise StereoSfmError(
-        f"{name} has {len(eyes)} image topics and their names do not tell left from right: "
-        f"say mcap:FILE?left=TOPIC&right=TOPIC ({', '.join(eyes)})"
+        f"{name} has {len(eyes)} image topics with ambiguous names: "
+        f"choose with mcap:FILE?left=TOPIC&right=TOPIC ({', '.join(eyes)})"
     )

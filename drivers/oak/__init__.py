@@ -25,13 +25,13 @@ class OakOptions(SourceOptions):
     """Options of `oak`, `oak:ID` and `oak:ADDRESS`."""
 
     size: tuple[int, int] = option((640, 400), "WIDTHxHEIGHT of the images", read=_size)
-    fps: float = option(30.0, "images a second", low=1, high=120)
-    exposure: int | None = option(None, "microseconds, or as the camera decides", low=20, high=33_000)
+    fps: float = option(30.0, "images per second", low=1, high=120)
+    exposure: int | None = option(None, "microseconds; auto: by the camera", low=20, high=33_000)
     iso: int = option(400, "with manual exposure", low=100, high=1600)
     anti_flicker: Literal["50", "60", "auto", "off"] = option("50", "Hz of the mains, with automatic exposure")
     max_exposure: int | None = option(None, "microseconds, with automatic exposure", low=20, high=33_000)
-    imu: bool = option(True, "inertial samples travel with the images")
-    allow_slow: bool = option(False, "accept a USB 2 link, which loses images")
+    imu: bool = option(True, "pass on inertial samples with the images")
+    allow_slow: bool = option(False, "accept a USB 2 link, with lost images")
     queue: int = option(30, "pairs that may wait for the tracker", low=1, high=100_000)
     reconnect: float = option(20.0, "seconds to wait for a lost camera", low=0, high=86_400)
 

@@ -1,4 +1,4 @@
-"""Which OAKs are attached: seen on the bus, and started when more must be known."""
+"""Attached OAKs: listed from the bus, and started for more information."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from stereo_sfm.drivers.oak import library
 
 
 def find_all(probe: bool) -> list[Attached]:
-    """All cameras; with `probe` each is started (seconds) to read its speed and calibration."""
+    """All cameras; with `probe` each is started (takes seconds) to read its speed and calibration."""
     dai = library.load()
     return [_probed(dai, one) if probe else _seen(one) for one in library.find(dai)]
 

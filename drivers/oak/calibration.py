@@ -1,4 +1,4 @@
-"""The factory calibration of an OAK as this project's rig. depthai speaks centimetres and p_dst = T p_src."""
+"""The factory calibration of an OAK as this project's rig. depthai uses centimetres and p_dst = T p_src."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def read_calibration(dai: Any, handler: Any, size: tuple[int, int], name: str, s
         name, serial: for the rig.
 
     Raises:
-        DeviceFault: not calibrated, an unknown lens model, or extrinsics that are none.
+        DeviceFault: not calibrated, an unknown lens model, or invalid extrinsics.
     """
     left, right = dai.CameraBoardSocket.CAM_B, dai.CameraBoardSocket.CAM_C
     try:
@@ -44,26 +44,28 @@ def _eye(dai: Any, handler: Any, socket: Any, size: tuple[int, int]) -> Camera:
     matrix, width, height = handler.getDefaultIntrinsics(socket)
     fx, fy, cx, cy = _scaled(np.array(matrix, float), (int(width), int(height)), size)
     if not (fx > 0 and fy > 0 and 0 < cx < size[0] and 0 < cy < size[1]):
-        raise DeviceFault(f"OAK's factory calibration makes no sense: focal length {fx} {fy}, centre {cx} {cy}")
+        raise DeviceFault(f"invalid factory calibration of the OAK: focal length {fx} {fy}, centre {cx} {cy}")
     model = handler.getDistortionModel(socket)
     coefficients = [float(c) for c in handler.getDistortionCoefficients(socket)]
     if model == dai.CameraModel.Fisheye:
         return KannalaBrandt(*size, fx, fy, cx, cy, tuple(coefficients[:4]))
     if model != dai.CameraModel.Perspective:
-        raise DeviceFault(f"OAK's lens model {model} is not known here: calibrate it with 'stereo-sfm calibrate'")
+        raise DeviceFault(f"unsupported lens model {model} of the OAK: calibrate it with 'stereo-sfm calibrate'")
     if any(coefficients[8:]):
-        raise DeviceFault("OAK's calibration has thin-prism or tilt terms, which are not known here: calibrate it")
+        raise DeviceFault(
+            "the OAK's calibration has unsupported thin-prism or tilt terms: calibrate it with 'stereo-sfm calibrate'"
+        )
     return RadTan(*size, fx, fy, cx, cy, tuple(coefficients[:8]))
 
 
 def _scaled(matrix: F64, at: tuple[int, int], size: tuple[int, int]) -> tuple[float, float, float, float]:
-    """Focal lengths and centre after the camera has scaled its image to cover `size` and cut off the rest evenly.
+    """Focal lengths and principal point after the camera has scaled its image to cover `size` and cropped it centrally.
 
-    depthai's own getCameraIntrinsics pads where the camera crops, and forgets that a pixel's centre moves by half a
-    pixel when four become one.
+    depthai's own getCameraIntrinsics pads where the camera crops, and ignores the half-pixel shift of pixel centres
+    under binning.
     """
     if at[0] <= 0 or at[1] <= 0:
-        raise DeviceFault("OAK's factory calibration does not say for which image size it is")
+        raise DeviceFault("the OAK's factory calibration does not state its image size")
     s = max(size[0] / at[0], size[1] / at[1])
     cx, cy = ((matrix[k, 2] + 0.5) * s - 0.5 - (at[k] * s - size[k]) / 2 for k in (0, 1))
     return float(matrix[0, 0] * s), float(matrix[1, 1] * s), float(cx), float(cy)
@@ -79,13 +81,13 @@ def _check(left_T_right: F64, serial: str) -> None:
     baseline, tilt = left_T_right[:3, 3], float(np.degrees(np.linalg.norm(se3.so3_log(left_T_right[:3, :3]))))
     if not (0.01 <= baseline[0] <= 1.0 and np.linalg.norm(baseline[1:]) < 0.2 * baseline[0]) or tilt > _MAX_TILT_DEG:
         raise DeviceFault(
-            f"OAK {serial}: factory extrinsics make no sense: right eye at {np.round(baseline * 1e3, 1)} mm, "
+            f"OAK {serial}: invalid factory extrinsics, right camera at {np.round(baseline * 1e3, 1)} mm, "
             f"{tilt:.1f} degrees from parallel"
         )
 
 
 def _imu(dai: Any, handler: Any, left: Any) -> F64 | None:
-    """(4, 4) left_T_imu; many boards do not know it."""
+    """(4, 4) left_T_imu; unknown on many boards."""
     try:
         transform = _metres(handler.getImuToCameraExtrinsics(left, False, dai.LengthUnit.CENTIMETER))
     except (RuntimeError, IndexError):

@@ -1,4 +1,4 @@
-"""depthai, imported late and without its telemetry; which cameras it sees; what its errors mean."""
+"""depthai, imported lazily and without telemetry: attached cameras and translation of errors."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 
 from stereo_sfm.drivers.live.errors import Busy, DeviceError, DeviceFault, DeviceLost, NoPermission, NotFound
 
-# Read by depthai when it is imported. Since 3.7 it reports every import and pipeline to its maker unless told not to,
-# and it posts the camera's crash dumps. What the user has set stays.
+# Read by depthai when it is imported. Since 3.7 it reports every import and pipeline to its vendor unless disabled,
+# and uploads crash dumps of the camera. Variables set by the user are kept.
 ENVIRONMENT = {
     "DEPTHAI_TELEMETRY": "0",
     "DEPTHAI_CRASHDUMP": "0",
@@ -19,25 +19,25 @@ ENVIRONMENT = {
     "DEPTHAI_INSTALL_SIGNAL_HANDLER": "0",
     "DEPTHAI_LEVEL": "off",  # it logs to standard output
     "DEPTHAI_SEARCH_TIMEOUT": "2000",
-    "DEPTHAI_RECONNECT_TIMEOUT": "0",  # a lost camera is our business: it becomes a new segment
+    "DEPTHAI_RECONNECT_TIMEOUT": "0",  # we handle reconnection ourselves, with a new segment
 }
 
-# Lower case pieces of depthai's messages -> what they mean. The first that fits counts.
+# Lower-case parts of depthai's messages -> error and message; the first match is used.
 _MEANINGS: tuple[tuple[str, type[DeviceError], str], ...] = (
     ("no available devices", NotFound, "no OAK attached: plug it into a USB 3 port"),
-    ("cannot find any device", NotFound, "no such OAK attached ('stereo-sfm devices' lists those that are)"),
+    ("cannot find any device", NotFound, "no such OAK attached ('stereo-sfm devices' lists the attached ones)"),
     ("insufficient_permissions", NoPermission, "no permission: install the udev rule that 'stereo-sfm udev' prints"),
     ("insufficient permissions", NoPermission, "no permission: install the udev rule that 'stereo-sfm udev' prints"),
     ("already_in_use", Busy, "another program uses the OAK: close it"),
     ("already in use", Busy, "another program uses the OAK: close it"),
-    ("x_link_error", DeviceLost, "the OAK is gone (unplugged, or its firmware crashed)"),
-    ("couldn't read data from stream", DeviceLost, "the OAK is gone (unplugged, or its firmware crashed)"),
-    ("closed", DeviceLost, "the OAK is gone (unplugged, or its firmware crashed)"),
-    ("disconnected", DeviceLost, "the OAK is gone (unplugged, or its firmware crashed)"),
+    ("x_link_error", DeviceLost, "the OAK was disconnected (unplugged, or its firmware crashed)"),
+    ("couldn't read data from stream", DeviceLost, "the OAK was disconnected (unplugged, or its firmware crashed)"),
+    ("closed", DeviceLost, "the OAK was disconnected (unplugged, or its firmware crashed)"),
+    ("disconnected", DeviceLost, "the OAK was disconnected (unplugged, or its firmware crashed)"),
 )
 
 
-NO_OAK = "no OAK attached: plug it into a USB 3 port (one in the network needs its address, oak:192.168.1.44)"
+NO_OAK = "no OAK attached: plug it into a USB 3 port (a network camera needs its address, oak:192.168.1.44)"
 
 
 def load() -> Any:
@@ -52,12 +52,12 @@ def load() -> Any:
         return importlib.import_module("depthai")
     except ImportError as error:
         raise DeviceFault(
-            f"depthai 3 is needed for an OAK and cannot be imported ({error}): pip install 'stereo-sfm[oak]'"
+            f"the OAK driver needs depthai 3, which cannot be imported ({error}): pip install 'stereo-sfm[oak]'"
         ) from None
 
 
 def device_error(error: Exception) -> DeviceError:
-    """An exception of depthai as one of ours."""
+    """An exception of depthai translated to one of ours."""
     if isinstance(error, DeviceError):
         return error
     text = str(error).lower()
@@ -69,22 +69,22 @@ def device_error(error: Exception) -> DeviceError:
 
 @dataclass(frozen=True)
 class Found:
-    """A camera that depthai sees, not opened."""
+    """A camera found by depthai, not opened."""
 
     device_id: str
-    name: str  # USB path or address in the network
+    name: str  # USB path or network address
     state: str
     protocol: str
     status: str
     info: Any  # depthai.DeviceInfo
 
 
-# USB product ids of vendor 03e7: unbooted, booted, bootloader, flash-booted. 2150 is a T265 and not here on purpose.
+# USB product ids of vendor 03e7: unbooted, booted, bootloader, flash-booted. 2150 is a T265 and deliberately absent.
 _USB_VENDOR, _USB_PRODUCTS = 0x03E7, (0x2485, 0xF63B, 0xF63C, 0xF63D)
 
 
 def on_usb() -> bool:
-    """Whether an OAK is on the USB bus: a look of milliseconds, before depthai takes its second."""
+    """Whether an OAK is on the USB bus: takes milliseconds, whereas depthai takes a second."""
     from stereo_sfm.drivers.t265.usb_device import default_backend
 
     try:
@@ -104,7 +104,7 @@ def on_usb() -> bool:
 
 
 def find(dai: Any) -> list[Found]:
-    """All attached to USB or the network, in half a second, without booting any."""
+    """All attached to USB or the network, within half a second, without booting any."""
     try:
         infos = dai.Device.getAllAvailableDevices()
     except RuntimeError as error:
@@ -141,5 +141,5 @@ def choose(found: list[Found], wanted: str) -> Found:
                 return one
         raise NotFound(f"no OAK '{wanted}' attached (attached: {', '.join(f.device_id for f in found)})")
     if len(found) > 1:
-        raise DeviceFault(f"{len(found)} OAKs are attached: name one, oak:ID ('stereo-sfm devices' lists them)")
+        raise DeviceFault(f"{len(found)} OAKs are attached: choose one with oak:ID ('stereo-sfm devices' lists them)")
     return found[0]

@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger("stereo_sfm")
 
-_USB2_BYTES_PER_S = 30e6  # what a high-speed link carries in practice
+_USB2_BYTES_PER_S = 30e6  # practical throughput of a high-speed link
 _IMU_RATE_HZ = 200
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What the user chooses."""
+    """Stream settings."""
 
     size: tuple[int, int] = (640, 400)
     rate_hz: float = 30.0
@@ -43,7 +43,7 @@ class OakSource(LiveSource):
     Args:
         wanted: id or address, empty for the only one.
         settings: what to stream.
-        patience: waits.
+        patience: timeouts.
         name: of the source.
     """
 
@@ -93,7 +93,7 @@ class OakSource(LiveSource):
         pipeline = dai.Pipeline(self._device)
         left, right = (self._eye(pipeline, getattr(dai.CameraBoardSocket, name)) for name in ("CAM_B", "CAM_C"))
         imu = self._imu(pipeline) if s.imu and self._device.getConnectedIMU() else None
-        with contextlib.suppress(RuntimeError):  # cameras without a projector say that they have none
+        with contextlib.suppress(RuntimeError):  # cameras without a projector raise
             self._device.setIrLaserDotProjectorIntensity(0.0)
             self._device.setIrFloodLightIntensity(0.0)
         pipeline.start()

@@ -1,4 +1,4 @@
-"""One segment of an OAK: threads that only drain depthai's queues, since an exception inside its nodes kills Python."""
+"""One segment of an OAK: threads that drain depthai's queues, since an exception inside its nodes terminates Python."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from stereo_sfm.drivers.live.buffers import Handoff, MotionBuffer
 from stereo_sfm.drivers.live.clock import ClockMap
 from stereo_sfm.drivers.live.counters import Counters
 from stereo_sfm.drivers.live.errors import DeviceLost
-from stereo_sfm.drivers.live.pairing import LEFT, RIGHT, Eye, Pair, Pairer
+from stereo_sfm.drivers.live.pairing import LEFT, RIGHT, CameraImage, Pair, Pairer
 from stereo_sfm.drivers.oak.library import device_error
 
 _WAIT = timedelta(milliseconds=200)
@@ -23,7 +23,7 @@ _ISO_PER_GAIN = 100.0
 
 
 class OakStream:
-    """Pairs come out of `pairs`, inertial samples out of `motion` (camera clock).
+    """Provides pairs in `pairs` and inertial samples in `motion` (camera clock).
 
     Args:
         dai: the library.
@@ -31,7 +31,7 @@ class OakStream:
         size: (width, height) that every image must have, px.
         counters: shared with the source.
         period_ns: nominal time between frames.
-        queue_frames: pairs that wait for the consumer before the oldest is thrown away.
+        queue_frames: pairs waiting for the consumer before the oldest is discarded.
         end: called once, when streaming ends.
     """
 
@@ -77,14 +77,14 @@ class OakStream:
             thread.join()
 
     def _drain(self, queue: Any, take: Callable[[Any], None]) -> None:
-        """No thread dies unseen: its error is the consumer's."""
+        """Run a thread; its error is passed to the consumer."""
         try:
             while not self._stopping.is_set():
                 message = queue.get(_WAIT)
                 if message is not None:
                     take(message)
         except self._dai.MessageQueue.QueueException:
-            self.pairs.fail(DeviceLost("the OAK is gone (unplugged, or its firmware crashed)"))
+            self.pairs.fail(DeviceLost("the OAK was disconnected (unplugged, or its firmware crashed)"))
         except RuntimeError as error:
             self.pairs.fail(device_error(error))
         except BaseException as error:
@@ -102,8 +102,8 @@ class OakStream:
         if pair is not None:
             self.pairs.put(pair, weight=1 + pair.dropped_before)
 
-    def _eye(self, frame: Any) -> Eye | None:
-        """An image at mid-exposure on the camera's clock; None when it is no image of the asked size."""
+    def _eye(self, frame: Any) -> CameraImage | None:
+        """An image at mid-exposure on the camera's clock; None if it is not an image of the requested size."""
         pixels = np.array(frame.getFrame())
         if pixels.dtype != np.uint8 or pixels.shape != (self._size[1], self._size[0]):
             return None
@@ -112,13 +112,13 @@ class OakStream:
             return None
         stamp = _nanoseconds(frame.getTimestampDevice(self._dai.CameraExposureOffset.MIDDLE))
         gain = frame.getSensitivity() / _ISO_PER_GAIN
-        return Eye(stamp, frame.getSequenceNum(), pixels, exposure_us, gain)
+        return CameraImage(stamp, frame.getSequenceNum(), pixels, exposure_us, gain)
 
     def _map_clock(self, frame: Any) -> None:
-        """depthai maps its stamps to this computer's clock itself; the first image tells how."""
+        """The clock offset from the first image: depthai maps its stamps to the host clock itself."""
         middle = self._dai.CameraExposureOffset.MIDDLE
         host, camera = _nanoseconds(frame.getTimestamp(middle)), _nanoseconds(frame.getTimestampDevice(middle))
-        # dai.Clock is the monotonic clock on Linux; the difference makes it ours everywhere
+        # dai.Clock is the monotonic clock on Linux; the difference corrects for it elsewhere
         shift = time.monotonic_ns() - _nanoseconds(self._dai.Clock.now())
         self.clock.add(host + shift, camera, host + shift)
 

@@ -19,7 +19,7 @@ SIMULATED = "simulated"
 
 def _from_python(value: Any) -> Any:
     if isinstance(value, str):
-        raise ValueError("an object: it can be given from Python only")
+        raise ValueError("a Python object (not available on the command line)")
     return value
 
 
@@ -28,21 +28,21 @@ class T265Options(SourceOptions):
     """Options of `t265`, `t265:SERIAL` and `t265:simulated`; the last five are the simulated camera's."""
 
     exposure: int | None = option(
-        None, "microseconds, or as the camera decides", low=m.MIN_EXPOSURE_US, high=m.MAX_EXPOSURE_US
+        None, "microseconds; auto: by the camera", low=m.MIN_EXPOSURE_US, high=m.MAX_EXPOSURE_US
     )
     gain: float = option(2.0, "with manual exposure", low=m.MIN_GAIN, high=m.MAX_GAIN)
     anti_flicker: Literal["50", "60", "off"] = option("50", "Hz of the mains, with automatic exposure")
-    imu: bool = option(True, "inertial samples travel with the images")
-    firmware: str | None = option(None, "path of the firmware file; auto: where 't265 firmware extract' puts it")
-    allow_slow: bool = option(False, "accept a USB 2 link, which loses images")
-    stamp: Literal["middle", "start"] = option("middle", "which moment of the exposure the camera's stamps mean")
+    imu: bool = option(True, "pass on inertial samples with the images")
+    firmware: str | None = option(None, "path of the firmware file; auto: the file written by 't265 firmware extract'")
+    allow_slow: bool = option(False, "accept a USB 2 link, with lost images")
+    stamp: Literal["middle", "start"] = option("middle", "the moment of the exposure of the camera's stamps")
     queue: int = option(30, "pairs that may wait for the tracker", low=1, high=100_000)
     reconnect: float = option(20.0, "seconds to wait for a lost camera", low=0, high=86_400)
     backend: Any = option(None, "a pyusb backend, from Python only", read=_from_python)
-    images: str = option("room", "what a simulated camera sees: room, or a source such as sim:loop")
-    frames: int = option(60, "images made before the start, then played forwards and backwards", low=1, high=3000)
-    faults: str = option("none", "names of stereo_sfm.drivers.t265.simulated.faults.PRESETS, with commas between")
-    paced: bool = option(True, "off: as fast as the host reads")
+    images: str = option("room", "scene of a simulated camera: room, or a source such as sim:loop")
+    frames: int = option(60, "images rendered before the start, then played forwards and backwards", low=1, high=3000)
+    faults: str = option("none", "names of stereo_sfm.drivers.t265.simulated.faults.PRESETS, separated by commas")
+    paced: bool = option(True, "real time; off: as fast as the host reads")
     seed: int = option(0, "of the simulated room", low=0, high=2**31)
 
 
@@ -64,7 +64,7 @@ def _check(place: str, options: T265Options) -> None:
         return
     for f in fields(options):
         if f.name in _OF_THE_SIMULATED and getattr(options, f.name) != f.default:
-            raise StereoSfmError(f"t265: option {f.name} is for t265:{SIMULATED}")
+            raise StereoSfmError(f"t265: option {f.name} is only valid for t265:{SIMULATED}")
 
 
 def _find(probe: bool) -> Sequence[Attached]:

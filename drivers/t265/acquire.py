@@ -1,4 +1,4 @@
-"""From "a T265" to one that runs and is opened: choose it, boot it, check its link."""
+"""Selecting, booting and opening a T265, with a check of its link."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ logger = logging.getLogger("stereo_sfm")
 
 @dataclass(frozen=True)
 class Access:
-    """Which camera, and how to get at it."""
+    """Selection of a camera and its firmware."""
 
     backend: Any  # pyusb's
     serial: str = ""  # empty: the only one
@@ -33,7 +33,7 @@ def acquire(access: Access, counters: Counters) -> T265:
     """Open the wanted camera, booting it first when it has no firmware.
 
     Raises:
-        DeviceError: each kind with its own line.
+        DeviceError: each kind with its own message.
     """
     devices = attached(access.backend)
     if not devices:
@@ -42,13 +42,13 @@ def acquire(access: Access, counters: Counters) -> T265:
         return _by_serial(devices, access, counters)
     if len(devices) > 1:
         raise DeviceFault(
-            f"{len(devices)} T265s are attached: name one by its serial, t265:SERIAL ('stereo-sfm devices' lists them)"
+            f"{len(devices)} T265s are attached: choose one with t265:SERIAL ('stereo-sfm devices' lists them)"
         )
     return _open(devices[0], access, counters)
 
 
 def _by_serial(devices: list[UsbDevice], access: Access, counters: Counters) -> T265:
-    """Running cameras first; those without firmware say their serial only after it."""
+    """Running cameras first; without firmware the serial is unknown."""
     trouble: DeviceError | None = None
     seen: list[str] = []
     for device in sorted(devices, key=is_boot):

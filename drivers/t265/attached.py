@@ -1,4 +1,4 @@
-"""Which T265s are attached: a running camera is asked; one without firmware can only be seen."""
+"""Attached T265s: a running camera is queried; one without firmware is only listed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from stereo_sfm.drivers.t265.usb_device import SPEEDS, SUPER_SPEED, is_boot, pla
 
 
 def find() -> list[Attached]:
-    """All cameras, booted or not; looking boots nothing."""
+    """All cameras, booted or not; none is booted."""
     return [_described(device) for device in usb_device.attached(usb_device.default_backend())]
 
 

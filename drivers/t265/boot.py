@@ -1,4 +1,4 @@
-"""From the boot state to the running camera: send the firmware, wait until it is back on another bus."""
+"""Booting the camera: send the firmware, wait until it reappears on another bus."""
 
 from __future__ import annotations
 
@@ -15,22 +15,21 @@ from stereo_sfm.drivers.t265.firmware import Firmware
 from stereo_sfm.drivers.t265.link import Timing, dispose
 from stereo_sfm.drivers.t265.usb_device import UsbDevice, attached, device_error, is_boot, place
 
-# Bytes of one transfer: whole packets, so that the camera sees one stream. One transfer of 9 MB needs more
-# memory in one piece than some kernels give (found on the virtual host controller of Linux 6.1).
+# Bytes of one transfer: whole packets, so that the camera receives one stream. One transfer of 9 MB needs more
+# contiguous memory than some kernels provide (seen on the virtual host controller of Linux 6.1).
 _CHUNK = 256 * 1024
 
 
 def boot(device: UsbDevice, firmware: Firmware, backend: Any, timing: Timing) -> UsbDevice:
-    """Send the firmware to one camera and return it as it comes back.
+    """Send the firmware to one camera and return the running camera.
 
-    The bus and address change, so the camera is recognised as a running one that was not there before, at the same
-    chain of ports when there is a choice.
+    The bus and address change, so it is identified as a new running camera, preferably at the same chain of ports.
 
     Raises:
         NoPermission, Busy, BootFailed.
     """
     if not is_boot(device):
-        raise ValueError("only a T265 in its boot state takes firmware")
+        raise ValueError("only a T265 in its boot state accepts firmware")
     with _one_booter(timing):
         before = {place(d) for d in attached(backend) if not is_boot(d)}
         _send(device, firmware, timing)
@@ -46,9 +45,9 @@ def _send(device: UsbDevice, firmware: Firmware, timing: Timing) -> None:
         for at in range(0, len(firmware.data), _CHUNK):
             chunk = firmware.data[at : at + _CHUNK]
             if device.write(m.BOOT_OUT, chunk, timing.boot_ms) != len(chunk):
-                raise BootFailed("T265 stopped taking its firmware half way: replug it and try again")
+                raise BootFailed("the T265 stopped accepting its firmware halfway: replug it and try again")
     except usb.core.USBTimeoutError:
-        raise BootFailed("T265 does not take its firmware: replug it, directly into the computer") from None
+        raise BootFailed("the T265 does not accept its firmware: replug it directly into the computer") from None
     except (usb.core.USBError, ValueError, LookupError) as error:
         raise device_error(error, f"cannot boot the T265 on {place(device)}") from None
     finally:
@@ -64,16 +63,16 @@ def _wait(device: UsbDevice, before: set[str], backend: Any, timing: Timing) -> 
         if new:
             time.sleep(timing.settle_s)
             return (same_port or new)[0]
-    raise BootFailed(f"T265 took its firmware but did not come back within {timing.boot_s:.0f} s: replug it")
+    raise BootFailed(f"the T265 did not restart after loading its firmware within {timing.boot_s:.0f} s: replug it")
 
 
 @contextlib.contextmanager
 def _one_booter(timing: Timing) -> Generator[None]:
-    """Two programs that boot cameras at once make both fail: a lock between processes."""
+    """A lock between processes: booting cameras from two programs at once fails."""
     path = Path(tempfile.gettempdir()) / "stereo-sfm-t265-boot.lock"
     try:
         file = path.open("a")
-    except OSError:  # another user's lock file: boot without
+    except OSError:  # another user's lock file: boot without the lock
         yield
         return
     with file:
@@ -88,7 +87,7 @@ def _one_booter(timing: Timing) -> Generator[None]:
 def _try_lock(file: IO[str]) -> bool:
     try:
         import fcntl
-    except ImportError:  # Windows has no such lock
+    except ImportError:  # not available on Windows
         return True
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

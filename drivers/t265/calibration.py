@@ -1,6 +1,6 @@
-"""The factory calibration the camera holds, as this project's rig.
+"""The camera's factory calibration as a rig.
 
-Wire: p_body = R p_sensor + t, rotation column-major, metres; the body's axes are x right, y up, z backward, the eyes'
+Wire: p_body = R p_sensor + t, rotation column-major, metres; body axes are x right, y up, z backward, camera axes
 x right, y down, z forward.
 """
 
@@ -19,20 +19,20 @@ from stereo_sfm.types import F64
 
 _BASELINE_M = (0.060, 0.068)
 _MAX_TILT_DEG = 2.0
-LEAST_DENSITY = 1e-6  # a camera that knows no variance states 0
+LEAST_DENSITY = 1e-6  # a camera without known variances states 0
 
 
 def eye(intrinsics: CameraIntrinsics) -> KannalaBrandt:
-    """One eye's camera model.
+    """The camera model of one camera.
 
     Raises:
-        DeviceFault: numbers that no T265 has.
+        DeviceFault: implausible for a T265.
     """
     i = intrinsics
     fine = (i.width, i.height) == (m.WIDTH, m.HEIGHT) and all(150 < f < 450 for f in (i.fx, i.fy))
     if not fine or abs(i.cx - m.WIDTH / 2) > 100 or abs(i.cy - m.HEIGHT / 2) > 100:
         raise DeviceFault(
-            f"T265's factory calibration makes no sense: {i.width}x{i.height}, focal length {i.fx:.1f} {i.fy:.1f}, "
+            f"invalid factory calibration of the T265: {i.width}x{i.height}, focal length {i.fx:.1f} {i.fy:.1f}, "
             f"centre {i.cx:.1f} {i.cy:.1f}"
         )
     return KannalaBrandt(i.width, i.height, i.fx, i.fy, i.cx, i.cy, i.distortion)
@@ -41,7 +41,7 @@ def eye(intrinsics: CameraIntrinsics) -> KannalaBrandt:
 def rig(
     left: CameraIntrinsics, right: CameraIntrinsics, body_T_left: F64, body_T_right: F64, name: str, serial: str
 ) -> Rig:
-    """The stereo rig, checked: baseline 60 to 68 mm to the right, eyes within 2 degrees of parallel.
+    """The stereo rig, checked: baseline 60 to 68 mm to the right, cameras parallel within 2 degrees.
 
     Raises:
         DeviceFault: the extrinsics are not those of a T265.
@@ -50,14 +50,14 @@ def rig(
     baseline = left_T_right[:3, 3]
     tilt = float(np.degrees(np.linalg.norm(se3.so3_log(left_T_right[:3, :3]))))
     if not _BASELINE_M[0] <= baseline[0] <= _BASELINE_M[1] or np.linalg.norm(baseline[1:]) > 0.01:
-        raise DeviceFault(f"T265's factory extrinsics make no sense: right eye at {np.round(baseline * 1e3, 1)} mm")
+        raise DeviceFault(f"invalid factory extrinsics of the T265: right camera at {np.round(baseline * 1e3, 1)} mm")
     if tilt > _MAX_TILT_DEG:
-        raise DeviceFault(f"T265's factory extrinsics make no sense: eyes {tilt:.1f} degrees from parallel")
+        raise DeviceFault(f"invalid factory extrinsics of the T265: cameras {tilt:.1f} degrees from parallel")
     return Rig(eye(left), eye(right), left_T_right, _rigid(body_T_left), name=name, serial=serial)
 
 
 def imu(body_T_left: F64, body_T_gyro: F64, gyro: MotionIntrinsics, accel: MotionIntrinsics) -> Imu:
-    """The IMU relative to the left camera; the camera itself says corrected = scale @ raw + bias."""
+    """The IMU relative to the left camera; the camera defines corrected = scale @ raw + bias."""
     return Imu(
         left_T_imu=se3.inverse(_rigid(body_T_left)) @ _rigid(body_T_gyro),
         gyro_matrix=gyro.scale,
@@ -78,5 +78,5 @@ def _density(variance: F64, rate_hz: float) -> float:
 def _rigid(body_T_sensor: F64) -> F64:
     rotation = body_T_sensor[:3, :3]
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
-        raise DeviceFault("T265's factory extrinsics hold a rotation that is none")
+        raise DeviceFault("invalid factory extrinsics of the T265: a rotation matrix is not orthonormal")
     return se3.orthonormalize(body_T_sensor)

@@ -1,4 +1,4 @@
-"""One running T265: who it is, its calibration, its settings, start and stop (DRIVERS: the start sequence)."""
+"""A running T265: identity, calibration, settings, start and stop."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from stereo_sfm.drivers.t265.firmware import VERSION
 from stereo_sfm.drivers.t265.link import Link, Timing
 from stereo_sfm.drivers.t265.messages import AntiFlicker, Id, Sensor, Status
 
-_MAX_STALE = 16  # transfers of an earlier session that may still lie in an endpoint
+_MAX_STALE = 16  # transfers of an earlier session that an endpoint may still hold
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What the user chooses."""
+    """Stream settings."""
 
     exposure_us: int | None = None  # None: automatic
     gain: float = 2.0  # with manual exposure
@@ -29,15 +29,15 @@ class Settings:
 
 
 class T265:
-    """A camera that runs, with the interface claimed.
+    """A running camera with the interface claimed.
 
     Args:
         link: opened.
         counters: where retries are counted.
-        timing: waits.
+        timing: timeouts.
 
     Raises:
-        DeviceError: it does not answer sensibly, runs other firmware, or has lost its calibration.
+        DeviceError: invalid answer, other firmware, or missing calibration.
     """
 
     def __init__(self, link: Link, counters: Counters, timing: Timing) -> None:
@@ -45,14 +45,16 @@ class T265:
         self._ask(protocol.low_power(False))
         self.info = protocol.decode_device_info(self._ask(protocol.request(Id.GET_DEVICE_INFO)))
         if self.info.firmware != VERSION:
-            raise DeviceFault(f"{link.what} runs firmware {self.info.firmware}; this driver knows {VERSION}. Replug it")
+            raise DeviceFault(
+                f"{link.what} runs firmware {self.info.firmware}; this driver supports {VERSION}: replug it"
+            )
         if not self.info.healthy:
             raise DeviceFault(f"{link.what} (serial {self.info.serial}) reports a hardware error: replug it")
-        self.link.command(protocol.request(Id.STOP))  # a program that crashed may have left it streaming
+        self.link.command(protocol.request(Id.STOP))  # a crashed program may have left it streaming
         self._drain()
 
     def _drain(self) -> None:
-        """Take what an earlier session left in the endpoints: the camera stays busy until its last words are read."""
+        """Drain the endpoints of an earlier session: the camera stays busy until they are read."""
         buffer = array.array("B", bytes(m.VIDEO_BUFFER))
         for endpoint in (m.VIDEO_IN, m.EVENT_IN):
             for _ in range(_MAX_STALE):
@@ -60,7 +62,7 @@ class T265:
                     break
 
     def _ask(self, request: bytes) -> protocol.Buffer:
-        """Command with the answer's status checked; a busy camera is asked again."""
+        """Command with the answer's status checked; repeated while the camera is busy."""
         message = int.from_bytes(request[4:6], "little")
         for _ in range(self._timing.busy_tries):
             status, payload = self.link.command(request)
@@ -73,10 +75,10 @@ class T265:
         raise Busy(f"{self.link.what} stays busy: close the program that uses it, or replug it")
 
     def calibration(self) -> Rig:
-        """Factory calibration of the eyes and the IMU. Only while stopped.
+        """Factory calibration of the cameras and the IMU. Only while stopped.
 
         Raises:
-            DeviceFault: missing or senseless.
+            DeviceFault: missing or invalid.
         """
         if not self.info.calibrated:
             raise DeviceFault(f"{self.link.what} (serial {self.info.serial}) has lost its factory calibration")
@@ -105,7 +107,7 @@ class T265:
         self._ask(protocol.six_dof(False))
 
     def _choose_streams(self, imu: bool) -> list[protocol.StreamProfile]:
-        """Both eyes at 848x800, 30 Hz; gyroscope and accelerometer at their highest rate."""
+        """Both cameras at 848x800, 30 Hz; gyroscope and accelerometer at their highest rate."""
         offered = protocol.decode_streams(self._ask(protocol.request(Id.GET_SUPPORTED_RAW_STREAMS)))
         chosen: list[protocol.StreamProfile] = []
         for sensor in (Sensor.LEFT, Sensor.RIGHT, *((Sensor.GYRO, Sensor.ACCEL) if imu else ())):
@@ -124,11 +126,11 @@ class T265:
         return chosen
 
     def start(self) -> None:
-        """Begin to stream. The readers must run already."""
+        """Start streaming. The readers must be running."""
         self._ask(protocol.request(Id.START))
 
     def stop(self) -> None:
-        """End streaming, whatever the camera says about it."""
+        """Stop streaming, ignoring errors of the camera."""
         self.link.command(protocol.request(Id.STOP))
 
     def time_ns(self) -> int:
@@ -136,5 +138,5 @@ class T265:
         return protocol.decode_time(self._ask(protocol.request(Id.GET_TIME)))
 
     def temperatures(self) -> list[protocol.Temperature]:
-        """All probes."""
+        """All temperature probes."""
         return protocol.decode_temperature(self._ask(protocol.request(Id.GET_TEMPERATURE)))

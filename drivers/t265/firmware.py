@@ -1,7 +1,7 @@
-"""The camera's firmware: where the user's copy is, whether it is the right one, and how to get it out of librealsense.
+"""The camera's firmware: locating and verifying the user's copy, and extracting it from librealsense.
 
-The file is Intel's and may not be shipped here. Anybody who has librealsense 2.34 to 2.53.1, or a pyrealsense2 wheel
-of these versions, has it: `stereo-sfm t265 firmware extract FILE`.
+The file belongs to Intel and may not be redistributed. librealsense 2.34 to 2.53.1 and the pyrealsense2 wheels of
+these versions contain it: `stereo-sfm t265 firmware extract FILE`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ OFFICIAL = frozenset({SHA1})
 
 @dataclass(frozen=True)
 class Firmware:
-    """Bytes that were checked: made by `verified` only."""
+    """Verified firmware, created by `verified` only."""
 
     data: bytes
 
@@ -48,7 +48,7 @@ def verified(data: bytes, accepted: frozenset[str] = OFFICIAL, what: str = "this
 
 
 def default_path() -> Path:
-    """Where `extract` puts the file and the driver looks for it."""
+    """The path where `extract` writes the file and the driver expects it."""
     base = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
     return base / "stereo-sfm" / FILE_NAME
 
@@ -57,20 +57,20 @@ def find(path: str | Path | None = None) -> Path:
     """The user's firmware file: the given one, the environment's, or the one in the configuration folder.
 
     Raises:
-        FirmwareMissing: with how to get it.
+        FirmwareMissing: the message says how to get it.
     """
     given = path or os.environ.get(ENVIRONMENT)
     candidate = Path(given).expanduser() if given else default_path()
     if candidate.is_file():
         return candidate
     raise FirmwareMissing(
-        f"the T265 needs its firmware and there is none at {candidate}: run 'stereo-sfm t265 firmware extract FILE' "
+        f"no T265 firmware at {candidate}: run 'stereo-sfm t265 firmware extract FILE' "
         f"on a pyrealsense2 2.53.1 wheel or librealsense2.so, or set {ENVIRONMENT}"
     )
 
 
 def load(path: str | Path | None = None) -> Firmware:
-    """Find, read and check."""
+    """Find, read and verify the firmware."""
     found = find(path)
     return verified(found.read_bytes(), what=str(found))
 
@@ -82,7 +82,7 @@ def extract(source: Path, accepted: frozenset[str] = OFFICIAL) -> Firmware:
     """The firmware inside a librealsense library, a pyrealsense2 extension or wheel, or the firmware file itself.
 
     Raises:
-        StereoSfmError: the file cannot be read, or holds no or another firmware.
+        StereoSfmError: the file cannot be read, or contains no or another firmware.
     """
     try:
         members = _members(source)
@@ -95,8 +95,8 @@ def extract(source: Path, accepted: frozenset[str] = OFFICIAL) -> Firmware:
             if hashlib.sha1(candidate).hexdigest() in accepted:
                 return Firmware(candidate)
         versions += [version] if version else []
-    held = f"it holds firmware {', '.join(sorted(set(versions)))}" if versions else "it holds none"
-    raise StereoSfmError(f"no T265 firmware {VERSION} in {source}: {held}. librealsense 2.34 to 2.53.1 has it")
+    held = f"it contains firmware {', '.join(sorted(set(versions)))}" if versions else "it contains none"
+    raise StereoSfmError(f"no T265 firmware {VERSION} in {source}: {held}. Use librealsense 2.34 to 2.53.1")
 
 
 def _members(source: Path) -> list[bytes]:
@@ -108,7 +108,7 @@ def _members(source: Path) -> list[bytes]:
 
 
 def _by_magic(data: bytes) -> list[bytes]:
-    """Whatever looks like the start of a firmware of the right size (files without symbols)."""
+    """Candidates of the right size with the firmware's first bytes (files without symbols)."""
     out: list[bytes] = []
     at = data.find(_MAGIC)
     while at >= 0 and at + SIZE <= len(data):

@@ -1,4 +1,4 @@
-"""The opened camera: commands, endpoint reads, reset. The only place from which commands leave."""
+"""The opened camera: commands, endpoint reads, reset. All commands are sent from here."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ _ENDPOINTS = {(m.COMMAND_OUT, _BULK), (m.COMMAND_IN, _BULK), (m.VIDEO_IN, _BULK)
 
 @dataclass(frozen=True)
 class Timing:
-    """How long to wait for what."""
+    """Timeouts."""
 
     command_ms: int = 3000
     read_ms: int = 300  # one blocking read of an image or event endpoint
     busy_tries: int = 5
     busy_wait_s: float = 1.0
     boot_ms: int = 10_000  # sending the firmware
-    boot_s: float = 10.0  # until the camera is back
+    boot_s: float = 10.0  # until the camera reappears
     boot_poll_s: float = 0.1
-    settle_s: float = 0.3  # after it is back, before the first command
+    settle_s: float = 0.3  # after it reappears, before the first command
     clock_s: float = 0.5  # between clock readings
 
 
 class Link:
-    """Interface 0 of one T265 that runs.
+    """Interface 0 of a running T265.
 
     Args:
         device: from `usb_device.attached`.
@@ -68,12 +68,12 @@ class Link:
             endpoints = {(e.bEndpointAddress, e.bmAttributes & 3) for e in configuration[(0, 0)].endpoints()}
             missing = _ENDPOINTS - endpoints
             if missing:
-                raise DeviceFault(f"{self.what} has no endpoint {min(missing)[0]:#04x}: not a T265 this driver knows")
+                raise DeviceFault(f"{self.what} has no endpoint {min(missing)[0]:#04x}: this T265 is not supported")
             usb.util.claim_interface(self.device, 0)
         except usb.core.USBError as error:
             raise device_error(error, f"cannot open the {self.what}") from None
         except (LookupError, ValueError, TypeError, AttributeError, NotImplementedError) as error:
-            raise DeviceFault(f"{self.what} describes itself in a way that makes no sense ({error})") from None
+            raise DeviceFault(f"{self.what} has invalid descriptors ({error})") from None
 
     def command(self, request: bytes) -> tuple[int, protocol.Buffer]:
         """Send one request and wait for its answer.
@@ -82,7 +82,7 @@ class Link:
             Status and payload.
 
         Raises:
-            ValueError: the request is not one that this driver may send (a bug, never the camera's doing).
+            ValueError: the request is not on the list of safe ones (a bug of the driver).
             ProtocolError, DeviceLost, DeviceError.
         """
         import usb.core
@@ -98,7 +98,7 @@ class Link:
                     got = self.device.read(m.COMMAND_IN, buffer, self._timing.command_ms)
                     try:
                         return protocol.response_payload(memoryview(buffer)[:got].tobytes(), message)
-                    except protocol.ProtocolError:  # perhaps the late answer to a command that timed out
+                    except protocol.ProtocolError:  # possibly the late answer to a command that timed out
                         if last:
                             raise
             except usb.core.USBTimeoutError:
@@ -108,7 +108,7 @@ class Link:
         raise AssertionError("unreachable")
 
     def read(self, endpoint: int, buffer: array.array[int], timeout_ms: int) -> int:
-        """One transfer from an IN endpoint; 0 when nothing came in time.
+        """One transfer from an IN endpoint; 0 on timeout.
 
         Raises:
             DeviceLost, DeviceError.
@@ -123,7 +123,7 @@ class Link:
             raise device_error(error, self.what) from None
 
     def reset(self) -> None:
-        """Vendor request that drops the camera to its boot state. It often dies in the middle of the answer."""
+        """Vendor request that drops the camera to its boot state. It often disconnects during the answer."""
         import usb.core
 
         with self._lock:
@@ -133,12 +133,12 @@ class Link:
                 return
 
     def close(self) -> None:
-        """Give the interface back. Readers must have ended."""
+        """Release the interface. Readers must have ended."""
         dispose(self.device)
 
 
 def dispose(device: UsbDevice | Any) -> None:
-    """Release what pyusb holds; a camera that is gone cannot be released, and that is fine."""
+    """Release pyusb's resources; errors of a disconnected camera are ignored."""
     import contextlib
 
     import usb.core

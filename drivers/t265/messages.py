@@ -1,4 +1,4 @@
-"""Numbers of the T265's run-time protocol: ids, sensors, statuses, sizes (librealsense 2.53.1, t265-messages.h).
+"""Constants of the T265's run-time protocol: ids, sensors, statuses, sizes (librealsense 2.53.1, t265-messages.h).
 
 Little-endian, packed. A request starts with u32 length, u16 id; a response adds u16 status.
 """
@@ -21,12 +21,12 @@ EVENT_BUFFER = 1024
 COMMAND_BUFFER = 1024
 PERIOD_NS = 1_000_000_000 // FRAME_RATE
 GYRO_HZ, ACCEL_HZ = 200.0, 62.5
-MIN_EXPOSURE_US, MAX_EXPOSURE_US = 200, 16_000  # librealsense's limits; below 200 the camera refuses
+MIN_EXPOSURE_US, MAX_EXPOSURE_US = 200, 16_000  # librealsense's limits; the camera rejects values below 200
 MIN_GAIN, MAX_GAIN = 1.0, 10.0
 
 
 class Id(enum.IntEnum):
-    """Messages this driver sends or understands."""
+    """Messages that this driver sends or decodes."""
 
     GET_DEVICE_INFO = 0x0001
     GET_TIME = 0x0002
@@ -50,8 +50,8 @@ class Id(enum.IntEnum):
     SLAM_ERROR = 0x9000
 
 
-# The only ids that can leave this machine. Everything else, above all what writes EEPROM, configuration or
-# calibration, is refused by the one function that writes commands (link.py).
+# The only ids that may be sent. All others, in particular those that write EEPROM, configuration or calibration, are
+# refused by the one function that writes commands (link.py).
 SENDABLE = frozenset(
     {
         Id.GET_DEVICE_INFO,
@@ -113,7 +113,7 @@ class Status(enum.IntEnum):
 
 
 def status_name(status: int) -> str:
-    """For people."""
+    """Readable name of a status."""
     try:
         return Status(status).name
     except ValueError:
@@ -121,7 +121,7 @@ def status_name(status: int) -> str:
 
 
 class AntiFlicker(enum.IntEnum):
-    """Mains frequency the automatic exposure avoids to beat with."""
+    """Mains frequency for the flicker suppression of the automatic exposure."""
 
     OFF = 0
     HZ_50 = 1

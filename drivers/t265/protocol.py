@@ -19,7 +19,7 @@ Buffer: TypeAlias = bytes | bytearray | memoryview
 
 
 class ProtocolError(StereoSfmError):
-    """Bytes that are not the message they should be."""
+    """Bytes that are not the expected message."""
 
 
 # ---- requests
@@ -47,12 +47,12 @@ def extrinsics(sensor: int) -> bytes:
 
 
 def exposure_mode(auto: bool, anti_flicker: m.AntiFlicker) -> bytes:
-    """Automatic exposure of both eyes, or of none. Only while stopped."""
+    """Automatic exposure of both cameras, or of none. Only while stopped."""
     return request(Id.EXPOSURE_MODE_CONTROL, struct.pack("<BB", 3 if auto else 0, anti_flicker if auto else 0))
 
 
 def set_exposure(exposure_us: int, gain: float) -> bytes:
-    """The same manual exposure for both eyes."""
+    """The same manual exposure for both cameras."""
     entries = b"".join(struct.pack("<B3xIf", eye, exposure_us, gain) for eye in (Sensor.LEFT, Sensor.RIGHT))
     return request(Id.SET_EXPOSURE, struct.pack("<BB", 2, 0) + entries)
 
@@ -64,7 +64,7 @@ def six_dof(enabled: bool) -> bytes:
 
 @dataclass(frozen=True)
 class StreamProfile:
-    """One raw stream the camera offers, or is asked for."""
+    """One raw stream, offered or requested."""
 
     sensor: int
     width: int
@@ -97,7 +97,7 @@ def raw_streams(profiles: Sequence[StreamProfile]) -> bytes:
 
 @dataclass(frozen=True)
 class DeviceInfo:
-    """Who the camera is."""
+    """Identity of the camera."""
 
     firmware: str
     serial: str
@@ -109,7 +109,7 @@ class DeviceInfo:
 
 @dataclass(frozen=True, eq=False)
 class CameraIntrinsics:
-    """Kannala-Brandt eye as the factory measured it, px."""
+    """Factory calibration of one Kannala-Brandt camera, px."""
 
     width: int
     height: int
@@ -132,7 +132,7 @@ class MotionIntrinsics:
 
 @dataclass(frozen=True)
 class Temperature:
-    """One probe, degrees Celsius."""
+    """One temperature probe, degrees Celsius."""
 
     index: int  # 0 vision processor, 1 IMU, 2 Bluetooth
     celsius: float
@@ -149,7 +149,7 @@ def response_payload(data: Buffer, message: int) -> tuple[int, Buffer]:
         raise ProtocolError(f"T265 answered {len(data)} bytes, less than a header")
     length, got, status = struct.unpack_from("<IHH", data)
     if length != len(data):
-        raise ProtocolError(f"T265 answered {len(data)} bytes but says {length}")
+        raise ProtocolError(f"T265 answered {len(data)} bytes but states a length of {length}")
     if got != message:
         raise ProtocolError(f"T265 answered message {got:#06x} to {message:#06x}")
     return status, data[8:]
@@ -161,7 +161,7 @@ def _unpack(layout: str, payload: Buffer, what: str) -> tuple[int | float, ...]:
         raise ProtocolError(f"T265's {what} has {len(payload)} bytes, not {size}")
     values = struct.unpack(layout, payload)
     if not all(math.isfinite(v) for v in values):
-        raise ProtocolError(f"T265's {what} holds numbers that are not finite")
+        raise ProtocolError(f"T265's {what} has numbers that are not finite")
     return values
 
 

@@ -1,4 +1,4 @@
-"""Decode what the T265 sends by itself: images, inertial samples, statuses. Layouts: t265-messages.h of v2.53.1."""
+"""Decoding of the T265's streams: images, inertial samples, statuses. Layouts: t265-messages.h of v2.53.1."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from stereo_sfm.types import U8
 
 @dataclass(frozen=True, eq=False)
 class VideoSample:
-    """One eye's image."""
+    """The image of one camera."""
 
     sensor: int
     stamp_ns: int  # camera clock
@@ -38,7 +38,7 @@ class MotionSample:
 
 @dataclass(frozen=True)
 class StatusEvent:
-    """The camera says something about itself."""
+    """A status of the camera."""
 
     message: int
     status: int
@@ -49,14 +49,14 @@ _VIDEO = struct.Struct("<IIfI")
 _MOTION = struct.Struct("<IfI3f")
 MOTION_BYTES = _SAMPLE.size + _MOTION.size
 MAX_EXPOSURE_US, MAX_GAIN = 1_000_000, 1000.0
-MAX_MOTION = {Sensor.GYRO: 100.0, Sensor.ACCEL: 1000.0}  # far above what the BMI055 can say (35 rad/s, 160 m/s^2)
+MAX_MOTION = {Sensor.GYRO: 100.0, Sensor.ACCEL: 1000.0}  # far above the range of the BMI055 (35 rad/s, 160 m/s^2)
 
 
 def decode_video_endpoint(data: Buffer) -> VideoSample | StatusEvent:
     """One transfer of endpoint 0x81: exactly one message.
 
     Raises:
-        ProtocolError: half a frame, or anything else that is not one.
+        ProtocolError: an incomplete or invalid frame.
     """
     if len(data) == 8:
         return _decode_status(data)
@@ -85,7 +85,7 @@ def decode_events(data: Buffer) -> tuple[list[MotionSample | StatusEvent], int]:
     """One transfer of endpoint 0x83: several messages back to back.
 
     Returns:
-        What was understood, and how many messages were damaged (a wrong length loses the rest of the transfer).
+        Decoded messages, and the number of damaged ones (a wrong length loses the rest of the transfer).
     """
     events: list[MotionSample | StatusEvent] = []
     damaged = offset = 0
@@ -111,7 +111,7 @@ def _decode_event(message: int, data: Buffer) -> MotionSample | StatusEvent | No
     if message in (Id.STATUS, Id.ERROR, Id.SLAM_ERROR) and len(data) == 8:
         return _decode_status(data)
     if message in (Id.GET_POSE, Id.RELOCALIZATION_EVENT):
-        return None  # the camera's own tracking, which this driver turns off
+        return None  # the camera's own tracking, which is turned off
     raise ProtocolError(f"unknown event {message:#06x}")
 
 

@@ -22,11 +22,11 @@ class T265Source(LiveSource):
     """Live stereo images of one T265, with its inertial samples.
 
     Args:
-        access: which camera, and how to get at it.
+        access: selection of the camera and its firmware.
         settings: exposure and streams.
-        patience: waits.
+        patience: timeouts.
         queue_frames: pairs that may wait for the consumer.
-        stamp_at_start: what the camera's stamps mean.
+        stamp_at_start: the camera's stamps are of the start of the exposure.
         name: of the source.
     """
 
@@ -73,7 +73,7 @@ ANTI_FLICKER = {"50": AntiFlicker.HZ_50, "60": AntiFlicker.HZ_60, "off": AntiFli
 
 
 def settings_of(options: T265Options) -> Settings:
-    """What the camera is told."""
+    """The settings sent to the camera."""
     return Settings(options.exposure, options.gain, ANTI_FLICKER[options.anti_flicker], options.imu)
 
 

@@ -13,7 +13,7 @@ from stereo_sfm.drivers.live.buffers import Handoff, MotionBuffer
 from stereo_sfm.drivers.live.clock import ClockMap
 from stereo_sfm.drivers.live.counters import Counters
 from stereo_sfm.drivers.live.errors import DeviceError
-from stereo_sfm.drivers.live.pairing import LEFT, RIGHT, Eye, Pair, Pairer
+from stereo_sfm.drivers.live.pairing import LEFT, RIGHT, CameraImage, Pair, Pairer
 from stereo_sfm.drivers.t265 import messages as m
 from stereo_sfm.drivers.t265 import protocol, samples
 from stereo_sfm.drivers.t265.camera import T265
@@ -24,17 +24,17 @@ logger = logging.getLogger("stereo_sfm")
 
 _CLOCK_TRIES = 3
 _TEMPERATURE_S = 10.0
-_STOP_S = 0.5  # waiting for the camera to say that it has stopped
+_STOP_S = 0.5  # waiting for the camera to confirm the stop
 
 
 class Stream:
-    """From `start` to `stop`. Pairs come out of `pairs`, inertial samples out of `motion` (camera clock).
+    """Streaming from `start` to `stop`, with pairs in `pairs` and inertial samples in `motion` (camera clock).
 
     Args:
         camera: configured and stopped.
         counters: shared with the source.
-        timing: waits.
-        queue_frames: pairs that wait for the consumer before the oldest is thrown away.
+        timing: timeouts.
+        queue_frames: pairs waiting for the consumer before the oldest is discarded.
     """
 
     def __init__(self, camera: T265, counters: Counters, timing: Timing, queue_frames: int) -> None:
@@ -44,15 +44,15 @@ class Stream:
         self.clock = ClockMap()
         self._goodbye = threading.Event()  # STOP was sent: DEVICE_STOPPED ends a reader
         self._stopping = threading.Event()  # readers end now
-        self._stopped = (threading.Event(), threading.Event())  # the camera said so: video, events
+        self._stopped = (threading.Event(), threading.Event())  # confirmed by the camera: video, events
         self._pairer: Pairer | None = None
         self._threads: list[threading.Thread] = []
 
     def start(self) -> None:
-        """Clock, readers, START, in this order.
+        """Start the clock, the readers, and the stream, in this order.
 
         Raises:
-            DeviceError: nothing runs then.
+            DeviceError: start failed, everything is stopped.
         """
         self._read_clock()
         self._pairer = Pairer(self._counters, m.PERIOD_NS, now_ns=self._camera.time_ns())
@@ -67,7 +67,7 @@ class Stream:
             raise
 
     def stop(self, camera_alive: bool = True) -> None:
-        """End streaming and the threads. A camera that is alive is told, and given a moment to say goodbye."""
+        """Stop streaming and the threads. A responding camera gets the command and some time to confirm."""
         if camera_alive:
             for said in self._stopped:
                 said.clear()
@@ -84,7 +84,7 @@ class Stream:
             thread.join()
 
     def _guard(self, work: Callable[[], None]) -> None:
-        """No thread dies unseen: its error is the consumer's."""
+        """Run a thread; its error is passed to the consumer."""
         try:
             work()
         except BaseException as error:
@@ -98,7 +98,7 @@ class Stream:
         while not self._ended(self._stopped[0]):
             size = self._camera.link.read(m.VIDEO_IN, buffer, self._timing.read_ms)
             if size and self._take_video(memoryview(buffer)[:size]):
-                buffer = array.array("B", bytes(m.VIDEO_BUFFER))  # the image keeps the old one
+                buffer = array.array("B", bytes(m.VIDEO_BUFFER))  # the image keeps the previous buffer
 
     def _take_video(self, data: memoryview) -> bool:
         """Whether the transfer was an image."""
@@ -112,7 +112,7 @@ class Stream:
             self._take_status(message, self._stopped[0])
             return False
         side = LEFT if message.sensor == Sensor.LEFT else RIGHT
-        eye = Eye(message.stamp_ns, message.frame_id, message.pixels, float(message.exposure_us), message.gain)
+        eye = CameraImage(message.stamp_ns, message.frame_id, message.pixels, float(message.exposure_us), message.gain)
         pair = self._pairer.push(side, eye) if self._pairer else None
         if pair is not None:
             self.pairs.put(pair, weight=1 + pair.dropped_before)
@@ -134,7 +134,7 @@ class Stream:
                     self._take_status(event, self._stopped[1])
 
     def _take_status(self, event: samples.StatusEvent, stopped: threading.Event) -> None:
-        """DEVICE_STOPPED matters while stopping only: a stale one can come right after a start."""
+        """DEVICE_STOPPED matters only while stopping: a stale one can arrive right after a start."""
         if event.status == Status.DEVICE_STOPPED:
             stopped.set()
         elif event.status != Status.SUCCESS:
@@ -144,7 +144,7 @@ class Stream:
     def _keep_clock(self) -> None:
         next_temperature = 0.0
         while not self._stopping.wait(self._timing.clock_s):
-            with contextlib.suppress(DeviceError):  # the readers notice a lost camera
+            with contextlib.suppress(DeviceError):  # the readers detect a lost camera
                 self._read_clock()
                 if time.monotonic() >= next_temperature:
                     next_temperature = time.monotonic() + _TEMPERATURE_S

@@ -1,4 +1,4 @@
-"""pyusb, typed: which cameras are attached, and what its errors mean."""
+"""Typed access to pyusb: attached cameras and translation of errors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _GONE = {errno.ENODEV, errno.EIO, errno.EPIPE, errno.EPROTO, errno.ESHUTDOWN, er
 
 
 class UsbDevice(Protocol):
-    """What this driver uses of `usb.core.Device`."""
+    """The part of `usb.core.Device` used by this driver."""
 
     idVendor: int
     idProduct: int
@@ -36,10 +36,10 @@ class UsbDevice(Protocol):
 
 
 def default_backend() -> Any:
-    """libusb from its wheel, with the system's as a second choice.
+    """libusb from its wheel, else the system's.
 
     Raises:
-        NotFound: there is no libusb at all.
+        NotFound: libusb is missing.
     """
     require(("usb", "libusb_package"), "t265,oak", "a camera on USB", NotFound)
     import libusb_package
@@ -47,12 +47,12 @@ def default_backend() -> Any:
 
     backend = libusb_package.get_libusb1_backend() or usb.backend.libusb1.get_backend()
     if backend is None:
-        raise NotFound("libusb is not usable here: install libusb-1.0 (package libusb-1.0-0 on Debian)")
+        raise NotFound("libusb not found: install libusb-1.0 (package libusb-1.0-0 on Debian)")
     return backend
 
 
 def attached(backend: Any) -> list[UsbDevice]:
-    """Every T265 on the bus, booted or not, in the order of the bus."""
+    """Every T265 on the bus, booted or not, in bus order."""
     import usb.core
 
     wanted = {m.BOOT_ID, *m.RUN_IDS}
@@ -69,17 +69,17 @@ def _id(device: Any) -> tuple[int, int]:
 
 
 def is_boot(device: UsbDevice) -> bool:
-    """Whether the camera waits for its firmware."""
+    """Whether the camera is waiting for its firmware."""
     return _id(device) == m.BOOT_ID
 
 
 def place(device: UsbDevice) -> str:
-    """Where it is, as `lsusb` says it."""
+    """Its location as in `lsusb`."""
     return f"bus {device.bus} address {device.address}"
 
 
 def device_error(error: Exception, what: str) -> DeviceError:
-    """A pyusb error as one of ours, with what to do."""
+    """A pyusb error translated to one of ours, with a remedy."""
     number = getattr(error, "errno", None)
     if number in (errno.EACCES, errno.EPERM):
         return NoPermission(
@@ -88,5 +88,5 @@ def device_error(error: Exception, what: str) -> DeviceError:
     if number == errno.EBUSY:
         return Busy(f"{what}: another program uses it. Close that program (or replug the camera)")
     if number in _GONE:
-        return DeviceLost(f"{what}: the camera is gone (unplugged, or its firmware crashed)")
+        return DeviceLost(f"{what}: the camera was disconnected (unplugged, or its firmware crashed)")
     return DeviceError(f"{what}: {error}")

@@ -1,7 +1,7 @@
 """TUM RGB-D folders: rgb.txt, depth.txt, groundtruth.txt (Sturm et al., IROS 2012).
 
-The depth images are registered to the colour images as the camera delivers them, lens distortion included: depth pixel
-(u, v) belongs to colour pixel (u, v). The rig's right eye is virtual: the same lens, `VIRTUAL_BASELINE` to the right.
+The depth images are registered to the colour images including lens distortion: depth pixel
+(u, v) belongs to colour pixel (u, v). The right camera is virtual: same lens, `VIRTUAL_BASELINE` to the right.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from stereo_sfm.geometry.cameras import RadTan
 
 log = logging.getLogger("stereo_sfm")
 
-DEPTH_SCALE = 5000.0  # stored units a metre
-MAX_SKEW_NS = 20_000_000  # colour and depth within 20 ms, as the benchmark's own tools
+DEPTH_SCALE = 5000.0  # stored units per metre
+MAX_SKEW_NS = 20_000_000  # colour and depth within 20 ms, as in the benchmark's tools
 READOUT_S = 0.028  # of these cameras' rolling shutter, as Kerl et al. (ICCV 2015) model it
 VIRTUAL_BASELINE = 0.08  # metres, close to the structured-light baseline of the sensor
 
@@ -37,7 +37,7 @@ INTRINSICS: dict[str, tuple[float, ...]] = {
 
 
 def open_tum_rgbd(path: str, options: SourceOptions) -> FolderSource:
-    """Open a TUM RGB-D folder; its name says which of the three cameras took it, else a rig file must be given."""
+    """Open a TUM RGB-D folder; its name determines which of the three cameras it is from, else a rig file is needed."""
     folder = folder_of("tum_rgbd", path)
     label = folder.resolve().name
     colour = _read_listing(need(folder / "rgb.txt", "colour image list"))
@@ -59,7 +59,7 @@ def open_tum_rgbd(path: str, options: SourceOptions) -> FolderSource:
 
 
 def with_virtual_eye(rig: Rig) -> Rig:
-    """The rig of a colour camera with depth: a second, virtual eye with the same lens."""
+    """The rig of a colour camera with depth: with a virtual right camera of the same lens."""
     if rig.depth and rig.stereo:
         return rig
     left_T_right = np.eye(4)
@@ -72,7 +72,7 @@ def _own_rig(folder: Path, label: str) -> Rig:
         if key in label:
             return Rig(RadTan(640, 480, fx, fy, cx, cy, tuple(distortion)), name=f"tum_rgbd {key}", readout_s=READOUT_S)
     raise StereoSfmError(
-        f"{folder}: the folder's name does not say which camera took it ({', '.join(INTRINSICS)}): give --rig FILE"
+        f"{folder}: the folder's name does not contain the camera ({', '.join(INTRINSICS)}): give --rig FILE"
     )
 
 

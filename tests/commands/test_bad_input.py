@@ -61,7 +61,7 @@ def test_unknown_source_name(cli: Run) -> None:
 
 def test_folder_of_something_else(cli: Run, tmp_path: Path) -> None:
     (tmp_path / "holiday").mkdir()
-    assert_one_line(cli("run", "holiday"), "no dataset that is known here", "KITTI", "EuRoC")
+    assert_one_line(cli("run", "holiday"), "not a known kind of dataset", "KITTI", "EuRoC")
 
 
 @pytest.mark.parametrize("make", [make_kitti, make_euroc, make_images])
@@ -208,7 +208,7 @@ def test_file_that_is_no_mcap(cli: Run, tmp_path: Path) -> None:
         (("--frame-skip", "0"), "at least 1"),
         (("--max-frames", "0"), "at least 1"),
         (("--start", "-1"), "above 0"),
-        (("--start", "1000"), "nothing is left"),
+        (("--start", "1000"), "no frames selected"),
     ],
 )
 def test_options_that_mean_nothing(cli: Run, tmp_path: Path, args: tuple[str, ...], word: str) -> None:
@@ -292,12 +292,12 @@ def test_a_speed_that_means_nothing(cli: Run, tmp_path: Path, speed: str) -> Non
 def test_a_mistake_leaves_no_output_folder(cli: Run, tmp_path: Path, wiring: tuple[str, ...]) -> None:
     root = make_images(tmp_path / "data", ["0.png", "1.png", "2.png"])
     (tmp_path / "nothing").mkdir()
-    assert_one_line(cli("run", "nothing", "-o", "r/x", *wiring), "no dataset that is known here")
+    assert_one_line(cli("run", "nothing", "-o", "r/x", *wiring), "not a known kind of dataset")
     assert_one_line(cli("run", root, "-o", "r/x", "--features", "surf", "--odometry", "um", *wiring), "surf")
     assert not (tmp_path / "r").exists()
     (tmp_path / "used").mkdir()
     (tmp_path / "used" / "thesis.tex").write_text("years of work")
-    assert_one_line(cli("run", "nothing", "-o", "used", *wiring), "no dataset that is known here")
+    assert_one_line(cli("run", "nothing", "-o", "used", *wiring), "not a known kind of dataset")
     assert_one_line(cli("run", root, "-o", "used", *wiring), "used exists", "--overwrite")
 
 
@@ -341,7 +341,7 @@ def test_info_warns_once_of_a_truncated_file(cli: Run, tmp_path: Path) -> None:
 
 def test_a_recording_of_nothing_leaves_no_file(cli: Run) -> None:
     source = "sim:aisle?camera=pinhole&size=64x48&frames=2"
-    assert_one_line(cli("record", source, "-o", "a.mcap", "--start", "1000"), "nothing is left")
+    assert_one_line(cli("record", source, "-o", "a.mcap", "--start", "1000"), "no frames selected")
     assert not Path("a.mcap").exists()
 
 
@@ -468,10 +468,10 @@ def test_nothing_is_written_over_what_is_read(cli: Run, tmp_path: Path) -> None:
     Path("b.mcap").symlink_to("a.mcap")
     for command in ("record", "convert"):
         for output in ("a.mcap", "b.mcap"):
-            assert_one_line(cli(command, "a.mcap", "-o", output, "--overwrite"), "is what is read", "another -o")
+            assert_one_line(cli(command, "a.mcap", "-o", output, "--overwrite"), "is the source", "another -o")
     assert cli("run", "a.mcap", "-o", "r", "-q", "--log", "full", "--max-lost", "100")[0] in (0, 4)
     logged = (tmp_path / "r" / "run.mcap").read_bytes()
-    assert_one_line(cli("run", "mcap:r/run.mcap", "-o", "r", "--overwrite"), "is what is read, or holds it")
+    assert_one_line(cli("run", "mcap:r/run.mcap", "-o", "r", "--overwrite"), "is the source, or contains it")
     assert_one_line(cli("replay", "r", "-o", "r", "--overwrite"), "holds the run that is to be replayed")
     assert (tmp_path / "a.mcap").read_bytes() == before
     assert (tmp_path / "r" / "run.mcap").read_bytes() == logged

@@ -13,14 +13,16 @@ from stereo_sfm.drivers.live.buffers import Handoff, MotionBuffer, WheelBuffer
 from stereo_sfm.drivers.live.clock import ClockMap, TimeLine
 from stereo_sfm.drivers.live.counters import COUNTERS, Counters
 from stereo_sfm.drivers.live.errors import DeviceLost
-from stereo_sfm.drivers.live.pairing import LEFT, RIGHT, Eye, Pair, Pairer
+from stereo_sfm.drivers.live.pairing import LEFT, RIGHT, CameraImage, Pair, Pairer
 
 PERIOD = 33_333_333
 PIXELS = np.zeros((1, 1), np.uint8)
 
 
-def eye(frame: int, shift_ns: int = 0, counter: int | None = None) -> Eye:
-    return Eye(1_000_000_000 + frame * PERIOD + shift_ns, frame if counter is None else counter, PIXELS, 1000, 1)
+def eye(frame: int, shift_ns: int = 0, counter: int | None = None) -> CameraImage:
+    return CameraImage(
+        1_000_000_000 + frame * PERIOD + shift_ns, frame if counter is None else counter, PIXELS, 1000, 1
+    )
 
 
 @settings(max_examples=60, deadline=None)

@@ -338,7 +338,7 @@ def test_bad_files_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[st
     (tmp_path / "text.mcap").write_text("hello")
     assert "not an MCAP file" in _error(tmp_path / "text.mcap", capsys)
     no_images = _write(tmp_path / "none.mcap", [])
-    assert "holds no images (its topics: " in _error(no_images, capsys)
+    assert "contains no images (its topics: " in _error(no_images, capsys)
     nothing = _write(tmp_path / "nothing.mcap", [], [], transforms=())
     assert "no messages at all" in _error(nothing, capsys)
 
@@ -359,7 +359,7 @@ def test_bad_calibrations_are_one_line(tmp_path: Path, capsys: pytest.CaptureFix
         message.width = 32
 
     missing = _write(tmp_path / "a.mcap", calibrations=())
-    assert "holds no calibration of its images: give one with --rig FILE" in _error(missing, capsys)
+    assert "has no calibration of its images: give one with --rig FILE" in _error(missing, capsys)
     assert "not calibrated" in _error(_write(tmp_path / "b.mcap", edit=uncalibrated), capsys)
     assert "lens model 'fisheye62' is not supported" in _error(_write(tmp_path / "c.mcap", edit=strange), capsys)
     assert "no transform from 'left_optical' to 'right_optical'" in _error(
@@ -439,7 +439,7 @@ def test_our_own_file_without_the_right_eye_says_so(tmp_path: Path, caplog: pyte
         open_source(without)
     with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(some) as source:
         assert len(list(source)) == 30
-    assert caplog.text.count("is incomplete and left out") == 5
+    assert caplog.text.count("is incomplete and skipped") == 5
     assert "10 frames were incomplete" in caplog.text
 
 

@@ -75,7 +75,7 @@ def test_text_that_names_a_source() -> None:
 
 
 def test_options_of_the_simulated_t265_are_not_the_cameras() -> None:
-    with pytest.raises(StereoSfmError, match="option faults is for t265:simulated"):
+    with pytest.raises(StereoSfmError, match="option faults is only valid for t265:simulated"):
         open_source("t265?faults=unplug")
 
 
@@ -98,7 +98,7 @@ def test_the_driver_that_is_surest_of_a_folder_opens_it(monkeypatch: pytest.Monk
     _register(monkeypatch, a=sure(Certainty.PERHAPS), b=sure(Certainty.MARKED), c=sure(Certainty.LAYOUT))
     assert registry.recognise(tmp_path) == "b"
     _register(monkeypatch, a=sure(Certainty.NO))
-    with pytest.raises(StereoSfmError, match="is no dataset that is known here"):
+    with pytest.raises(StereoSfmError, match="is not a known kind of dataset"):
         registry.recognise(tmp_path)
 
 
@@ -124,6 +124,6 @@ def test_a_broken_package_hides_no_other_driver(
     try:
         assert [kind for kind, _ in registry.drivers()] == ["sim"]
         assert "'broken' (no.such.module:DRIVER) cannot be loaded" in caplog.text
-        assert "'else' (stereo_sfm.drivers.driver:Certainty) is no stereo_sfm.drivers.driver.Driver" in caplog.text
+        assert "'else' (stereo_sfm.drivers.driver:Certainty) is not a stereo_sfm.drivers.driver.Driver" in caplog.text
     finally:
         registry.driver.cache_clear()

@@ -51,7 +51,7 @@ def test_by_symbols(tmp_path: Path) -> None:
 def test_another_version_is_named(tmp_path: Path) -> None:
     path = tmp_path / "librealsense2.so"
     path.write_bytes(library(BLOB[:1000], (0, 1, 0, 279)))
-    with pytest.raises(StereoSfmError, match=r"holds firmware 0\.1\.0\.279"):
+    with pytest.raises(StereoSfmError, match=r"contains firmware 0\.1\.0\.279"):
         firmware.extract(path, ACCEPTED)
 
 

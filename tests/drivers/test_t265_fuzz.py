@@ -13,7 +13,7 @@ import pytest
 
 from stereo_sfm.drivers.live.counters import Counters
 from stereo_sfm.drivers.live.errors import DeviceError
-from stereo_sfm.drivers.live.pairing import LEFT, RIGHT, Eye, EyeLock, Pairer
+from stereo_sfm.drivers.live.pairing import LEFT, RIGHT, CameraImage, ContinuityFilter, Pairer
 from stereo_sfm.drivers.t265 import messages as m
 from stereo_sfm.drivers.t265 import protocol as p
 from stereo_sfm.drivers.t265 import samples
@@ -133,7 +133,7 @@ def test_no_wrong_frame_among_damaged_transfers() -> None:
             except p.ProtocolError:
                 continue
             assert isinstance(sample, samples.VideoSample)
-            eye = Eye(sample.stamp_ns, sample.frame_id, sample.pixels, sample.exposure_us, sample.gain)
+            eye = CameraImage(sample.stamp_ns, sample.frame_id, sample.pixels, sample.exposure_us, sample.gain)
             pair = pairer.push(LEFT if sample.sensor == Sensor.LEFT else RIGHT, eye)
             if pair is not None:
                 pairs += 1
@@ -217,11 +217,11 @@ def test_damaged_answers_through_the_link(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_lock_follows_a_camera_whose_counter_really_changed() -> None:
-    lock = EyeLock(m.PERIOD_NS, None)
+    lock = ContinuityFilter(m.PERIOD_NS, None)
     none = np.zeros((1, 1), np.uint8)
 
-    def eye(counter: int, periods: float) -> Eye:
-        return Eye(round(periods * m.PERIOD_NS), counter, none, 1, 1)
+    def eye(counter: int, periods: float) -> CameraImage:
+        return CameraImage(round(periods * m.PERIOD_NS), counter, none, 1, 1)
 
     assert all(lock.accept(eye(k, k)) for k in range(3))
     assert not lock.accept(eye(2, 2))  # a repeated one

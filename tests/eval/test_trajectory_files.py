@@ -66,7 +66,7 @@ def test_missing_frames_are_filled_on_the_geodesic() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "holds no poses"),
+        ("", "contains no poses"),
         ("1 2 3\n", "line 1: 3 fields"),
         ("1 0 0 0 0 0 0 one\n", "one"),
         ("1 0 0 0 0 0 0 0\n", "no finite pose"),

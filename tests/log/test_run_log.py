@@ -394,7 +394,7 @@ def test_a_recording_is_no_run_and_a_run_without_images_says_where_they_are(
     log = RunLog(LogWriter(path), fisheye_rig(), Config(), source="a.mcap", mode="inline", image_format="none")
     log.image(source.images[0])
     log.close()
-    with pytest.raises(StereoSfmError, match=r"a run without its images: they are in a\.mcap"):
+    with pytest.raises(StereoSfmError, match=r"a run without images: they are in a\.mcap"):
         open_source(path)
     assert main(["info", str(path)]) == 0
     text = capsys.readouterr().out

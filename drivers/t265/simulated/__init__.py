@@ -1,1 +1,1 @@
-"""A T265 that needs no hardware: it speaks the protocol behind pyusb's backend interface, with faults to order."""
+"""A simulated T265: the protocol behind pyusb's backend interface, with configurable faults."""

@@ -21,7 +21,7 @@ _ENDPOINTS = ((0x01, 2), (0x02, 2), (0x81, 2), (0x82, 2), (0x83, 3), (0x03, 3)) 
 
 
 def usb_error(number: int, text: str) -> usb.core.USBError:
-    """As pyusb's libusb backend raises it."""
+    """An error as raised by pyusb's libusb backend."""
     if number == errno.ETIMEDOUT:
         return usb.core.USBTimeoutError(text, -7, number)
     return usb.core.USBError(text, -1, number)
@@ -51,7 +51,7 @@ class SimulatedBus(usb.backend.IBackend):
         self.cameras = list(cameras)
         self._claimed: dict[int, int] = {}  # camera -> generation
         self._lock = threading.Lock()
-        self.thread_ns = 0  # CPU time spent in here, to be taken off the driver's
+        self.thread_ns = 0  # CPU time spent here, to be subtracted from the driver's
 
     # ---- enumeration
 
@@ -192,7 +192,7 @@ class SimulatedBus(usb.backend.IBackend):
         self._alive(dev_handle)
         if (bmRequestType, bRequest) == (0x40, 0x10):
             dev_handle.camera.reset()
-            raise usb_error(errno.EPIPE, "Pipe error")  # what a real one does
+            raise usb_error(errno.EPIPE, "Pipe error")  # as a real camera
         if (bmRequestType, bRequest) == (0xC0, 0x11):
             return self._fill(data, [(10).to_bytes(4, "little") + bytes(4)])
         raise usb_error(errno.EPIPE, "Pipe error")

@@ -1,4 +1,4 @@
-"""The camera itself: answers commands, makes frames and inertial samples by its own clock."""
+"""The simulated camera: answers commands, generates frames and inertial samples by its own clock."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from stereo_sfm.drivers.t265.simulated.wire import (
     video_transfer,
 )
 
-_QUEUE_FRAMES = 4  # what the camera can hold when the host does not read
+_QUEUE_FRAMES = 4  # buffered while the host does not read
 _LATENCY_NS = 12_000_000  # from mid-exposure to the first byte
 _GYRO_NS, _ACCEL_NS = 5_000_000, 16_000_000
 
 
 class Gone(Exception):
-    """The camera left the bus in the middle of something."""
+    """The camera left the bus during an operation."""
 
 
 @dataclass
@@ -60,8 +60,8 @@ class SimulatedCamera:
     """A T265 between power-up and unplugging, any number of times.
 
     Args:
-        content: what it sees.
-        faults: what goes wrong.
+        content: the scene.
+        faults: simulated faults.
         paced: frames come at 30 Hz by the clock; else as fast as the host reads.
         serial: 12 hexadecimal digits.
     """
@@ -72,10 +72,10 @@ class SimulatedCamera:
         self.content, self.faults, self.paced, self.serial = content, faults or Faults(), paced, serial
         self.booted = False
         self.generation = 0  # changes whenever the camera leaves the bus
-        self.absent_until_ns = 0  # host clock; -1 for ever
+        self.absent_until_ns = 0  # host clock; -1: forever
         self.received: list[int] = []  # ids of commands, for tests
         self.boot_bytes = b""
-        self.sent_frames = 0  # pairs due so far (host that reads or not)
+        self.sent_frames = 0  # pairs due so far, read or not
         self.overruns = 0  # frames lost because the host did not read
         self._first_ns = 0  # host clock at the first START
         self._boot_ns = time.monotonic_ns()
@@ -88,15 +88,15 @@ class SimulatedCamera:
         self._left_T_imu = left_T_imu(content.rig)
         self._noise = random.Random(1)
 
-    # ---- the bus sees
+    # ---- called by the bus
 
     @property
     def present(self) -> bool:
-        """Whether it is on the bus at all."""
+        """Whether it is on the bus."""
         return 0 <= self.absent_until_ns <= time.monotonic_ns()
 
     def leave(self, seconds: float) -> None:
-        """Off the bus for a time (for ever when negative)."""
+        """Off the bus for a time (forever if negative)."""
         with self._changed:
             self.generation += 1
             self.absent_until_ns = -1 if seconds < 0 else time.monotonic_ns() + round(seconds * 1e9)
@@ -105,7 +105,7 @@ class SimulatedCamera:
             self._changed.notify_all()
 
     def unplug(self, seconds: float) -> None:
-        """Loses power: comes back without firmware."""
+        """Power loss: it comes back without firmware."""
         self.booted = False
         self.leave(seconds)
 
@@ -214,14 +214,14 @@ class SimulatedCamera:
     # ---- endpoints the host reads
 
     def read_answer(self, timeout_s: float, generation: int) -> bytes | None:
-        """Endpoint 0x82; None when the time is over."""
+        """Endpoint 0x82; None on timeout."""
         with self._changed:
             self._changed.wait_for(lambda: self._answers or self.generation != generation, timeout_s)
             self._check(generation)
             return self._answers.popleft() if self._answers else None
 
     def read_video(self, timeout_s: float, generation: int) -> Transfer | None:
-        """Endpoint 0x81: the next transfer as pieces of bytes."""
+        """Endpoint 0x81: the next transfer as chunks of bytes."""
         deadline = time.monotonic() + timeout_s
         with self._changed:
             while True:
@@ -236,7 +236,7 @@ class SimulatedCamera:
                 self._changed.wait(max(wait, 1e-4))
 
     def read_events(self, timeout_s: float, generation: int, size: int) -> bytes | None:
-        """Endpoint 0x83: as many messages as are due and fit."""
+        """Endpoint 0x83: all messages that are due and fit."""
         deadline = time.monotonic() + timeout_s
         with self._changed:
             while True:
@@ -281,7 +281,7 @@ class SimulatedCamera:
         return [status_event(Status.DEVICE_STOPPED)]
 
     def _expose(self, s: _Session, now: int) -> None:
-        """Make the transfers of the next frame that is due."""
+        """Generate the transfers of the next due frame."""
         if self.paced:
             due = (now - s.start_ns - _LATENCY_NS) // m.PERIOD_NS - 1
             if due < s.next_frame:

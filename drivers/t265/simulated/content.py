@@ -1,4 +1,4 @@
-"""What the simulated camera sees: images, poses, inertial truth, all by the time since it first streamed."""
+"""The scene of the simulated camera: images, poses, inertial truth, by the time since it first streamed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _STEP_S = 2e-3
 
 @dataclass(frozen=True, eq=False)
 class Content:
-    """Pre-rendered images that are played forwards and backwards without end."""
+    """Pre-rendered images that are played forwards and backwards endlessly."""
 
     rig: Rig
     images: list[tuple[U8, U8]]  # (800, 848) each
@@ -53,7 +53,7 @@ class Content:
 
 
 def room_content(frames: int, seed: int = 0) -> Content:
-    """The quick scene."""
+    """The default scene."""
     from stereo_sfm.drivers.sim.rigs import fisheye
     from stereo_sfm.drivers.t265.simulated.room import Room, walk
 
@@ -67,7 +67,7 @@ def source_content(spec: str, frames: int) -> Content:
     """Images of any source with a fisheye pair of 848x800: the simulated store, a recording of a real T265.
 
     Raises:
-        StereoSfmError: another camera, or no images.
+        StereoSfmError: unsuitable camera, or no images.
     """
     from stereo_sfm.drivers.source import open_source
     from stereo_sfm.geometry.cameras import KannalaBrandt
@@ -86,7 +86,7 @@ def source_content(spec: str, frames: int) -> Content:
                 break
         truth = source.ground_truth
     if not images:
-        raise StereoSfmError(f"{spec} has no images to show")
+        raise StereoSfmError(f"{spec} has no images")
     if truth is None:
         still = np.eye(4)
         return Content(rig, images, lambda t: np.broadcast_to(still, (len(t), 4, 4)))

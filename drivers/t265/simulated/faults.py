@@ -1,4 +1,4 @@
-"""What can be made to go wrong with the simulated camera. Frame numbers count since the camera first streamed."""
+"""Faults of the simulated camera. Frame numbers count since the camera first streamed."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ class Faults:
     drop_right: frozenset[int] = frozenset()
     swapped: frozenset[int] = frozenset()  # frames whose right image is sent first
     right_skew_ns: Mapping[int, int] = field(default_factory=dict[int, int])  # added to the right stamp
-    empty: frozenset[int] = frozenset()  # frames whose left image says frameLength 0
-    half: Mapping[int, int] = field(default_factory=dict[int, int])  # frame -> bytes after which the left one ends
+    empty: frozenset[int] = frozenset()  # frames whose left image states frameLength 0
+    half: Mapping[int, int] = field(default_factory=dict[int, int])  # frame -> bytes after which the left image ends
     split: Mapping[int, int] = field(default_factory=dict[int, int])  # as half, the rest comes as another transfer
-    garbage: frozenset[int] = frozenset()  # frames before which a transfer of nonsense comes
+    garbage: frozenset[int] = frozenset()  # frames preceded by an invalid transfer
     counter_skips: frozenset[int] = frozenset()  # frames at which the left counter advances by one too many
     stall_at: int = NEVER  # from this frame on no images, until restarted
     stall_survives_restart: bool = False  # only a reset helps
-    unplug_at: int = NEVER  # the camera goes away in the middle of this frame
+    unplug_at: int = NEVER  # the camera disconnects during this frame
     unplugged_s: float = 0.5  # and comes back after this time, as an unbooted one; negative: never
-    busy_answers: int = 0  # so many commands to choose streams are answered with DEVICE_BUSY
+    busy_answers: int = 0  # number of stream selection commands answered with DEVICE_BUSY
     stale_stopped: bool = False  # DEVICE_STOPPED of an earlier session right after the start
     returns_after_boot: bool = True
     silent_commands: bool = False  # no command is answered
@@ -42,7 +42,7 @@ def _every(step: int, start: int, count: int = 100_000) -> frozenset[int]:
     return frozenset(range(start, start + step * count, step))
 
 
-# A camera on a bad day, by names for `t265:simulated?faults=drops,unplug`.
+# Presets for `t265:simulated?faults=drops,unplug`.
 PRESETS: dict[str, Faults] = {
     "none": Faults(),
     "drops": Faults(drop_left=_every(50, 20), drop_right=_every(70, 45)),
@@ -64,7 +64,7 @@ PRESETS: dict[str, Faults] = {
 
 
 def preset(names: str) -> Faults:
-    """Faults of several names, separated by commas.
+    """The faults of several presets, separated by commas.
 
     Raises:
         StereoSfmError: unknown name.

@@ -1,7 +1,7 @@
 # pyright: reportUntypedFunctionDecorator=false
-"""A textured room seen through a fisheye pair: quick pictures with exact truth for the simulated camera.
+"""A textured room seen through a fisheye pair: fast rendering with exact ground truth for the simulated camera.
 
-The simulated store (`sim:`) is the better scene and takes seconds a frame; this one takes milliseconds.
+The simulated store (`sim:`) is more realistic and takes seconds per frame; this one takes milliseconds.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ def _trace(bearings: F32, rotation: F64, origin: F64, half: F64, texture: U8, sc
     """Brightness of the inside of a box along every ray; 0 where a pixel has no ray.
 
     Args:
-        bearings: (H, W, 3) in the eye, NaN where there is none.
-        rotation, origin: world_T_eye. half: (3,) half the box's size, m.
+        bearings: (H, W, 3) in the camera, NaN where there is none.
+        rotation, origin: world_T_cam. half: (3,) half the box's size, m.
         texture: (6, S, S). scale: texels per metre. out: (H, W) to fill.
     """
     size = texture.shape[1]
@@ -86,7 +86,7 @@ class Room:
         return np.clip(20 + 215 * np.clip((wall - 0.5) * 2.2 + 0.5, 0, 1), 0, 255).astype(np.uint8)
 
     def render(self, world_T_cam: F64) -> tuple[U8, U8]:
-        """(H, W) left and right for the left eye's pose."""
+        """(H, W) left and right for the left camera's pose."""
         poses = (world_T_cam, world_T_cam @ self._rig.left_T_right)
         images: list[U8] = []
         for bearings, pose in zip(self._eyes, poses, strict=True):
@@ -98,7 +98,7 @@ class Room:
 
 
 def walk(seconds: F64) -> F64:
-    """(N,) s -> (N, 4, 4) world_T_cam: a slow loop through the room at about 0.5 m/s, looking ahead and around."""
+    """(N,) s -> (N, 4, 4) world_T_cam: a slow loop through the room at about 0.5 m/s, looking around."""
     t = np.asarray(seconds, float)
     phase = 0.25 * t
     position = np.stack([2.2 * np.sin(phase), 0.12 * np.sin(1.9 * t), -1.5 + 1.5 * np.cos(phase) + 0.4 * phase * 0], -1)

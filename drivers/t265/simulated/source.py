@@ -1,4 +1,4 @@
-"""`t265:simulated`: the whole driver on a simulated camera, firmware and all."""
+"""`t265:simulated`: the complete driver on a simulated camera, including firmware."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from stereo_sfm.types import I64, Trajectory
 if TYPE_CHECKING:
     from stereo_sfm.drivers.t265 import T265Options
 
-# The simulated camera is quick to boot and to forgive.
+# The simulated camera needs short timeouts only.
 FAST = Timing(busy_wait_s=0.05, boot_s=3.0, boot_poll_s=0.02, settle_s=0.02)
 
 
@@ -33,13 +33,13 @@ def simulated_firmware() -> bytes:
 
 
 def checked_firmware() -> Firmware:
-    """The simulated firmware through the same check as a real one."""
+    """The simulated firmware, verified like a real one."""
     data = simulated_firmware()
     return verified(data, frozenset({hashlib.sha1(data).hexdigest()}))
 
 
 class SimulatedT265Source(T265Source):
-    """As the real one, and it knows the truth afterwards."""
+    """As the real source, with ground truth afterwards."""
 
     def __init__(
         self, camera: SimulatedCamera, access: Access, settings: Settings, patience: Patience, queue: int = 30
@@ -48,18 +48,18 @@ class SimulatedT265Source(T265Source):
         super().__init__(access, settings, patience, queue, name="t265:simulated")
 
     def frame_shown(self, stamp_ns: int) -> int:
-        """Which frame, counted since the camera first streamed, an image with this stamp shows."""
+        """The frame number, since the camera first streamed, of an image with this stamp."""
         return round(self.camera.seconds_of(stamp_ns - self._time.stamp(0)) * m.FRAME_RATE)
 
     def truth(self, stamps: I64) -> Trajectory:
-        """True poses at (N,) stamps of images that came."""
+        """True poses at (N,) stamps of received images."""
         stamps = np.array(stamps, np.int64)
         seconds = np.array([self.camera.seconds_of(int(s) - self._time.stamp(0)) for s in stamps])
         return Trajectory(stamps, self.camera.content.pose(seconds))
 
 
 def open_simulated(options: T265Options) -> SimulatedT265Source:
-    """A simulated camera that sees what the options say."""
+    """A simulated camera with the scene of the options."""
     content = (
         room_content(options.frames, options.seed)
         if options.images == "room"

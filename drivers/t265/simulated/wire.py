@@ -1,4 +1,4 @@
-"""The other end of the protocol: what the camera packs. Written from the layouts, not from the driver's decoder."""
+"""Encoding of the camera's messages. Written from the layouts, independent of the driver's decoder."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from stereo_sfm.drivers.t265.simulated.faults import Faults
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, U8
 
-Transfer: TypeAlias = list[bytes | memoryview]  # pieces of one USB transfer, so that pixels are copied once only
+Transfer: TypeAlias = list[bytes | memoryview]  # chunks of one USB transfer, so that pixels are copied only once
 
 OFFERED = [
     StreamProfile(Sensor.LEFT, 848, 800, m.PIXEL_FORMAT_Y8, 848, 30),
@@ -26,18 +26,18 @@ OFFERED = [
     StreamProfile(0x08, 0, 0, 0, 0, 0),
 ]
 
-# The body: x right, y up, z backward, midway between the eyes. The IMU: x left, y up, z forward.
+# The body: x right, y up, z backward, midway between the cameras. The IMU: x left, y up, z forward.
 _OPTICAL_TO_BODY = np.diag([1.0, -1.0, -1.0])
 _BODY_T_IMU = se3.from_rotation_translation(np.diag([-1.0, 1.0, -1.0]), np.array([-0.0213, 0.0, 0.0]))
 
 
 def body_T_left(rig: Rig) -> F64:
-    """(4, 4) left eye in the body."""
+    """(4, 4) left camera in the body."""
     return se3.from_rotation_translation(_OPTICAL_TO_BODY, np.array([-rig.left_T_right[0, 3] / 2, 0, 0]))
 
 
 def left_T_imu(rig: Rig) -> F64:
-    """(4, 4) IMU in the left eye."""
+    """(4, 4) IMU in the left camera."""
     return se3.inverse(body_T_left(rig)) @ _BODY_T_IMU
 
 
