@@ -47,6 +47,15 @@ class KeyframeRow:
 
 
 @dataclass(frozen=True)
+class Closure:
+    """One accepted loop, without the points that it matched."""
+
+    kf_id: int
+    candidate_kf_id: int
+    candidate_T_kf: F64
+
+
+@dataclass(frozen=True)
 class LostInterval:
     """Frames in a row without a pose of their own."""
 
@@ -74,7 +83,7 @@ class RunRecord:
     map_T_kf: KeyframePoses = field(default_factory=KeyframePoses)
     map_points: set[int] = field(default_factory=set[int])
     seen_points: Bool = field(default_factory=lambda: np.zeros(1024, bool))  # by id: whether a keyframe had it
-    closed: list[LoopResult] = field(default_factory=list[LoopResult])  # as the loop closer said
+    closed: list[Closure] = field(default_factory=list[Closure])  # as the loop closer said
     refused_kf_ids: set[int] = field(default_factory=set[int])  # of loops that the mapper did not believe
     row_errors: RowErrors | None = None  # the last
     worst_rows_px: float = 0.0  # systematic part of the row error at its worst
@@ -153,12 +162,12 @@ class RunRecord:
     @_take.register
     def _put_loop(self, loop: LoopResult) -> None:
         if loop.candidate_kf_id >= 0 and not loop.reason:
-            self.closed.append(loop)
+            self.closed.append(Closure(loop.kf_id, loop.candidate_kf_id, loop.candidate_T_kf))
         for _, _, reason in loop.rejected:
             self.rejections[reason] = self.rejections.get(reason, 0) + 1
 
     @property
-    def loops(self) -> list[LoopResult]:
+    def loops(self) -> list[Closure]:
         """Accepted loops that the map holds."""
         return [x for x in self.closed if x.kf_id not in self.refused_kf_ids]
 

@@ -20,7 +20,7 @@ class MapView:
         self.point_ids: I64 = np.zeros(0, np.int64)
         self.points: F64 = np.zeros((0, 3))
         self._poses = KeyframePoses()
-        self._recent: list[Keyframe] = []
+        self._recent: list[tuple[int, I64]] = []  # keyframes: id, and those of the points that they see
         self._covisible: list[tuple[int, int]] = []
         self._loops: list[tuple[int, int]] = []
         self._refused: set[int] = set()  # kf_ids whose loops the mapper did not believe
@@ -28,10 +28,10 @@ class MapView:
     def keyframe(self, keyframe: Keyframe, map_T_odom: F64) -> None:
         """A new keyframe, at its odometry pose until the mapper moves it."""
         self._poses.add(keyframe.kf_id, map_T_odom @ keyframe.odom_T_cam)
-        for other in self._recent:
-            if np.isin(keyframe.point_ids, other.point_ids, assume_unique=True).sum() >= COVISIBLE_POINTS:
-                self._covisible.append((other.kf_id, keyframe.kf_id))
-        self._recent = [*self._recent[1 - COVISIBLE_KEYFRAMES :], keyframe]
+        for kf_id, point_ids in self._recent:
+            if np.isin(keyframe.point_ids, point_ids, assume_unique=True).sum() >= COVISIBLE_POINTS:
+                self._covisible.append((kf_id, keyframe.kf_id))
+        self._recent = [*self._recent[1 - COVISIBLE_KEYFRAMES :], (keyframe.kf_id, keyframe.point_ids)]
 
     def loop(self, result: LoopResult) -> None:
         """An answer of the loop closer."""

@@ -9,12 +9,14 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import is_dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from mcap.data_stream import RecordBuilder
+from mcap.records import ChunkIndex
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import build_file_descriptor_set
@@ -54,6 +56,26 @@ class _File:
         os.close(self._fd)
 
 
+class _ChunkIndex:
+    """The index of the chunks as the bytes that end the file, in place of the library's list of objects.
+
+    A long run writes 150 chunks a minute, and their index stays in memory until the end.
+    """
+
+    def __init__(self) -> None:
+        self._records = RecordBuilder()
+
+    def append(self, index: ChunkIndex) -> None:
+        index.write(self._records)
+
+    def __iter__(self) -> Iterator[Self]:
+        return iter((self,))
+
+    def write(self, summary: RecordBuilder) -> None:
+        """All of them, once."""
+        summary.write(self._records.end())
+
+
 class LogWriter:
     """Writes messages in the order they come; topics are registered when first used."""
 
@@ -87,6 +109,7 @@ class LogWriter:
         self._clock = clock
         compression = CompressionType.ZSTD if compress else CompressionType.NONE
         self._mcap = Writer(self._file, chunk_size=2 * CHUNK_BYTES, compression=compression)  # pyright: ignore[reportArgumentType]
+        setattr(self._mcap, "_Writer__chunk_indices", _ChunkIndex())  # noqa: B010  # no name that is checked
         self._channels: dict[str, int] = {}
         self._pending_bytes = 0
         self._pending_since: tuple[int, int] = (0, 0)  # log and publish time of the oldest message not yet written

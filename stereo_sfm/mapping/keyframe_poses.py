@@ -25,13 +25,14 @@ class KeyframePoses:
         self._poses[kf_id], self._all = map_T_kf, None
 
     def update(self, update: MapUpdate) -> None:
-        """Take the poses of one update."""
+        """Take the poses of one update; copies, so that none keeps the others of its update in memory."""
         self._all = None
-        self._poses.update(zip(update.kf_ids.tolist(), update.map_T_kf, strict=True))
+        for kf_id, map_T_kf in zip(update.kf_ids.tolist(), update.map_T_kf, strict=True):
+            self._poses[kf_id] = map_T_kf.copy()
         culled, carriers = update.culled_kf_ids.tolist(), update.carrier_kf_ids.tolist()
         for kf_id, carrier, carrier_T_kf in zip(culled, carriers, update.carrier_T_kf, strict=True):
             self._poses.pop(kf_id, None)
-            self._carried[kf_id] = carrier, carrier_T_kf
+            self._carried[kf_id] = carrier, carrier_T_kf.copy()
 
     def all(self) -> dict[int, F64]:
         """map_T_kf (4, 4) by id, ascending. What is carried by a keyframe that no update told of is left out."""
