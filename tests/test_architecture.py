@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -201,3 +202,9 @@ def test_an_argparse_namespace_ends_at_a_commands_entry() -> None:
         taking = [f.name for f in functions if any("Namespace" in ast.unparse(a.annotation or a) for a in f.args.args)]
         allowed = {"run"} if path.parent.name == "commands" else {"_start_logging"}
         assert set(taking) <= allowed, f"{path.name}: {', '.join(taking)}"
+
+
+def test_test_files_have_names_of_their_own() -> None:
+    """They are imported by name: of two that share one the second is never run."""
+    names = Counter(path.name for path in (ROOT / "tests").rglob("test_*.py"))
+    assert [name for name, count in names.items() if count > 1] == []

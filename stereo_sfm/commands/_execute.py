@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -76,7 +77,7 @@ def execute(options: RunOptions) -> tuple[int, Path]:
     shown, wiring = CompilingShown(), _wiring(o)
     sinks = [*_sinks(o, record, pictures), shown]
     session = Session(o.source, o.config, sinks, wiring, o.folders, o.output, o.overwrite, o.replayed)
-    with StopRequest(INLINE_END_S if wiring.inline else 0.0) as stop:
+    with StopRequest(INLINE_END_S if wiring.inline else 0.0) as stop, closing(session):
         stop.then = session.stop
         with session:
             if pictures is not None:

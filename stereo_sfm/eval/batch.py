@@ -8,6 +8,7 @@ import os
 import time
 import traceback
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -65,15 +66,16 @@ def run_one(task: BatchTask) -> dict[str, Any]:
         prepare_folder(folder, overwrite=True)
         folders = MapFolders(map_out=folder / "map" if task.map_out else None)
         opener = SourceChoice(task.spec)
-        with Session(opener, task.config, [record], Wiring(inline=True), folders, folder, True) as session:
-            for _ in session:
-                pass
-        info = session.info
-        wall_s = time.perf_counter() - begin
-        why = why_not_started(opener, record)
-        stats, _ = write_results(
-            folder, info.name, info.rig, task.config, record, wall_s, info.ground_truth, why_not_started=why
-        )
+        with closing(Session(opener, task.config, [record], Wiring(inline=True), folders, folder, True)) as session:
+            with session:
+                for _ in session:
+                    pass
+            info = session.info
+            wall_s = time.perf_counter() - begin
+            why = why_not_started(opener, record)
+            stats, _ = write_results(
+                folder, info.name, info.rig, task.config, record, wall_s, info.ground_truth, why_not_started=why
+            )
         result |= {"ok": True, "stats": stats}
     except StereoSfmError as error:
         result |= {"ok": False, "error": str(error)}

@@ -132,7 +132,7 @@ def summary(stats: dict[str, Any], evaluations: dict[str, Evaluation] | None = N
 
 def _dropped(stats: dict[str, Any]) -> str:
     lost = stats["dropped"] - stats["dropped_by_capture"]
-    camera = f", {thousands(lost)} lost before" if lost else ""
+    camera = f", {thousands(lost)} lost before capture" if lost else ""
     return f"{thousands(stats['dropped_by_capture'])} dropped by capture{camera}"
 
 

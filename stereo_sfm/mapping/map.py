@@ -259,10 +259,14 @@ class Map:
             before, after: (K, 4, 4) map_T_kf before and after it by row, right for the living keyframes.
         """
         rows = self.living_points()
-        anchor = self.points.anchor[rows]
-        anchor = np.where(self.keyframes.alive[anchor], anchor, self.keyframes.carrier[anchor])
+        anchor = self._anchors(rows)
         local = np.einsum("nji,nj->ni", before[anchor, :3, :3], self.points.xyz[rows] - before[anchor, :3, 3])
         self.move_points(rows, np.einsum("nij,nj->ni", after[anchor, :3, :3], local) + after[anchor, :3, 3])
+
+    def _anchors(self, rows: I64) -> I64:
+        """Living keyframes that carry points of these rows: what carries the anchor, where that was culled."""
+        anchor = self.points.anchor[rows]
+        return np.where(self.keyframes.alive[anchor], anchor, self.keyframes.carrier[anchor])
 
     def remove_observations(self, rows: I64) -> None:
         """Forget observations; their points stay, even without any."""
@@ -432,7 +436,7 @@ class Map:
             map_T_kf=k.map_T_kf[kfs],
             pt_ids=p.pt_id[pts],
             points=p.xyz[pts],
-            anchors=kf_index[p.anchor[pts]],
+            anchors=kf_index[self._anchors(pts)],
             seen=p.seen[pts].astype(np.int64),
             expected=p.expected[pts].astype(np.int64),
             obs_kf=kf_index[table.kf[obs]],

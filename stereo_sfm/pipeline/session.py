@@ -45,7 +45,10 @@ class Wiring:
 
 
 class Session:
-    """Enter it, iterate for the frames; `info` and `folder` say what runs and where its files go."""
+    """Enter it, iterate for the frames; `info` and `folder` say what runs and where its files go.
+
+    Its folder stays locked after the last frame, for the files of the results; `close` ends that.
+    """
 
     def __init__(
         self,
@@ -97,6 +100,11 @@ class Session:
         self._stack.__exit__(kind, error, trace)
         self._clean_up(error)
 
+    def close(self) -> None:
+        """The last file is written: the folder is free for another run."""
+        if self._lock is not None:
+            self._lock.release()
+
     def _clean_up(self, error: BaseException | None) -> None:
         """A mistake that ended the run before its first frame leaves nothing behind that is in the way of the next."""
         if self._folder is None or self._lock is None or error is None:
@@ -106,7 +114,7 @@ class Session:
             with suppress(OSError):  # somebody else put something there
                 for folder in self._made:
                     folder.rmdir()
-        self._lock.release()
+        self.close()
 
     def __iter__(self) -> Iterator[Frame]:
         for frame in self._frames:

@@ -119,7 +119,7 @@ def test_unreadable_image_is_a_warning_and_a_dropped_frame(cli: Run, tmp_path: P
     assert (
         "warning: kitti:00: cannot read" in err and "000002.png (a compressed image cannot be decoded), frame 2" in err
     )
-    assert "/5 frames (1 dropped by capture)" in out
+    assert "/5 frames (0 dropped by capture, 1 lost before capture)" in out
 
 
 def test_no_readable_image_at_all(cli: Run, tmp_path: Path) -> None:

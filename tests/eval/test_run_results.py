@@ -218,7 +218,7 @@ def test_what_capture_drops_has_no_pose(tmp_path: Path) -> None:
     stats, _ = write_results(tmp_path, "test", pinhole_rig(), Config(), record, 1.0)
     assert stats["lost_percent"] == pytest.approx(80.0)
     assert "80 % of the frames have no pose (limit 20 %), 120 of them dropped by capture" in failure(stats)
-    assert summary(stats)[0].startswith("tracked 30/153 frames (120 dropped by capture, 3 lost before)")
+    assert summary(stats)[0].startswith("tracked 30/153 frames (120 dropped by capture, 3 lost before capture)")
     report = (tmp_path / "report.md").read_text()
     assert "**FAIL**: 80 % of the frames have no pose" in report and "120 frames (78.4 %) were dropped" in report
 

@@ -212,7 +212,8 @@ def test_culled_keyframe_leaves_the_chain_and_its_points_find_another_anchor() -
     assert int(m.points.anchor[m.point_rows(np.array([0]))[0]]) == 1
     snap = m.snapshot()
     assert snap.kf_ids.tolist() == [1, 2]
-    assert (snap.obs_kf < 2).all() and (snap.anchors[np.isin(snap.pt_ids, [0, 11, 12])] >= 0).all()
+    assert (snap.obs_kf < 2).all()
+    assert (snap.anchors >= 0).all()  # point 10, which nobody sees now, goes with the carrier
 
 
 def test_culled_keyframes_move_with_what_carries_them_and_are_told_once() -> None:
