@@ -60,11 +60,11 @@ def epipolar_errors(calibration: Calibration) -> tuple[F64, F64]:
     observed, rig = calibration.observed, calibration.rig
     assert rig.right is not None
     key = {}
-    for i in np.flatnonzero(observed.eye == 1):
+    for i in np.flatnonzero(observed.side == 1):
         key[(int(observed.view[i]), *observed.point[i])] = i
     pairs = [
         (i, key[k])
-        for i in np.flatnonzero(observed.eye == 0)
+        for i in np.flatnonzero(observed.side == 0)
         if (k := (int(observed.view[i]), *observed.point[i])) in key
     ]
     if not pairs:

@@ -110,10 +110,10 @@ def _image(figure: Any) -> str:
 
 def _residuals(calibration: Calibration) -> Any:
     observed, residual = calibration.observed, calibration.residual
-    eyes = int(observed.eye.max()) + 1
+    eyes = int(observed.side.max()) + 1
     figure, axes = _figure(eyes)
     for eye, axis in enumerate(axes):
-        rows = observed.eye == eye
+        rows = observed.side == eye
         uv, r = observed.uv[rows], residual[rows]
         size = np.linalg.norm(r, axis=1)
         scale = 0.03 * calibration.rig.left.width / max(float(np.quantile(size, 0.9)), 1e-6)

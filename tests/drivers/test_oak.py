@@ -220,7 +220,7 @@ def test_a_closed_queue_is_a_lost_camera() -> None:
     right.send(frame(2, 0, 5))
     assert stream.pairs.get(2.0) is not None
     left.close()
-    with pytest.raises(DeviceLost, match="gone"):
+    with pytest.raises(DeviceLost, match="disconnected"):
         stream.pairs.get(2.0)
     stream.stop()
 

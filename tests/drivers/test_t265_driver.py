@@ -248,9 +248,9 @@ def test_wheel_odometry_travels_with_the_images() -> None:
         (Faults(refuse_open=13), NoPermission, "no permission.*'stereo-sfm udev'"),
         (Faults(refuse_claim=16), Busy, "another program uses it"),
         (Faults(uncalibrated=True), DeviceFault, "lost its factory calibration"),
-        (Faults(firmware=(0, 0, 18, 5715)), DeviceFault, "runs firmware 0.0.18.5715.*knows 0.2.0.951"),
+        (Faults(firmware=(0, 0, 18, 5715)), DeviceFault, "runs firmware 0.0.18.5715.*supports 0.2.0.951"),
         (Faults(silent_commands=True), DeviceLost, "does not answer message 0x0025"),
-        (Faults(returns_after_boot=False), BootFailed, "did not come back within"),
+        (Faults(returns_after_boot=False), BootFailed, "did not restart after loading its firmware"),
     ],
 )
 def test_what_cannot_work_says_so_in_one_line(faults: Faults, error: type[StereoSfmError], line: str) -> None:
