@@ -157,6 +157,7 @@ class MapperConfig:
     huber_sigmas: float = number(
         0.75, 0, 1000, "Residual where the loss becomes linear; narrow, as depths near edges err to one side"
     )
+    cauchy_sigmas: float = number(1.0, 0, 1000, "Scale of the redescending loss in the rounds after the first; 0: none")
     rounds: int = number(2, 1, 100, "Rounds of bundle adjustment, outliers are judged between them")
     iterations: int = number(5, 1, 1000, "Iterations of a round")
     association: str = word(

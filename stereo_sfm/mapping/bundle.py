@@ -29,6 +29,7 @@ class BundleConfig:
     rounds: int = 2  # after each round but the last, observations are judged anew
     iterations: int = 10  # most accepted steps of a round
     huber: float = 2.0  # sigmas where the loss turns linear; 0 means least squares
+    cauchy: float = 0.0  # sigmas, the scale of a redescending loss in all rounds but the first; 0: Huber's throughout
     joint_loss: bool = False  # one loss over both eyes of an observation instead of one each
     outlier_chi2: float = 9.21  # squared normalised residual of an eye above which it is an outlier (99 % of 2 dof)
     tolerance: float = 1e-5  # relative decrease of the cost that ends a round
@@ -94,16 +95,19 @@ class _Table:
         right_T_left = se3.inverse(rig.left_T_right)
         self._cams = (rig.left.model_id, rig.left.params, right.model_id, right.params)
         self._right_T_left = np.ascontiguousarray(right_T_left[:3, :3]), right_T_left[:3, 3].copy()
-        self._loss = float(config.huber), config.joint_loss
+        self._config = config
+        self.redescends = False  # the next `linearize` uses Cauchy's loss
         self.limit = 0.0  # above 0: the next `linearize` judges which eyes count
 
     def linearize(self, state: _State) -> tuple[Linear, float]:
         """Quadratic models of the observations at a state, and their robust cost."""
         n = len(self.kf)
         out: Linear = (np.empty((n, 6)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 2)))
+        scale = float(self._config.cauchy if self.redescends else self._config.huber)
         cost = kernels.linearize(
             *(state.rot, state.pos, state.points, self.kf, self.pt, self._left, self._right, self._weights),
-            *(self.use, self.limit, self._cams, *self._right_T_left, *self._loss, out),
+            *(self.use, self.limit, self._cams, *self._right_T_left, scale),
+            *(self.redescends, self._config.joint_loss, out),
         )
         self.limit = 0.0
         return out, float(cost)
@@ -157,8 +161,9 @@ class _Solver:
         return state
 
     def begin_round(self, state: _State, judge: bool) -> None:
-        """Model everything anew, outliers left out."""
+        """Model everything anew, outliers left out; `judge`: in all rounds but the first."""
         self.table.limit = self.fixed.limit = self.config.outlier_chi2 if judge else 0.0
+        self.table.redescends = self.fixed.redescends = judge and self.config.cauchy > 0
         self.evaluate(state)
 
     def _pose_system(self, state: _State, damping: float) -> tuple[F64, F64]:

@@ -41,6 +41,15 @@ def _huber(chi2, delta):
 
 
 @njit
+def _loss(chi2, scale, redescends):
+    """(cost, weight) of Cauchy's loss of a scale in sigmas if it redescends, else of Huber's with that threshold."""
+    if not redescends:
+        return _huber(chi2, scale)
+    scale2 = scale * scale
+    return 0.5 * scale2 * math.log(1.0 + chi2 / scale2), 1.0 / (1.0 + chi2 / scale2)
+
+
+@njit
 def _eye(model, params, x, y, z, u_obs, v_obs, w):
     """Derivatives (u by x y z, v by x y z), residuals ru, rv of one eye, all scaled by w, and chi2; zeros where w is 0.
 
@@ -60,7 +69,23 @@ def _eye(model, params, x, y, z, u_obs, v_obs, w):
 
 @njit
 def linearize(
-    rot, pos, points, obs_kf, obs_pt, uv_left, uv_right, weights, use, limit, cams, right_r, right_t, delta, joint, out
+    rot,
+    pos,
+    points,
+    obs_kf,
+    obs_pt,
+    uv_left,
+    uv_right,
+    weights,
+    use,
+    limit,
+    cams,
+    right_r,
+    right_t,
+    scale,
+    redescends,
+    joint,
+    out,
 ):
     """Residuals and their quadratic model at one state.
 
@@ -69,7 +94,7 @@ def linearize(
         obs_kf, obs_pt: (M,). uv_left, uv_right: (M, 2) px. weights: (M, 2) 1/px of either eye, 0 where it sees nothing.
         use: (M, 2) eyes that count. limit: above 0 those are judged here: the ones whose chi2 is not above it.
         cams: (left model, left params, right model, right params). right_r, right_t: right_T_left.
-        delta: Huber's threshold in sigmas. joint: one loss over both eyes instead of one each.
+        scale, redescends: of the loss, see `_loss`. joint: one loss over both eyes instead of one each.
         out: (A (M, 6) upper triangle, g (M, 3), p (M, 3), chi2 (M, 2)), overwritten; chi2 also where an eye does not
             count.
 
@@ -106,12 +131,12 @@ def linearize(
             use[o, 0], use[o, 1] = weights[o, 0] > 0 and chi_l <= limit, weights[o, 1] > 0 and chi_r <= limit
         chi_l, chi_r = chi_l if use[o, 0] else 0.0, chi_r if use[o, 1] else 0.0
         if joint:
-            rho, s_l = _huber(chi_l + chi_r, delta)
+            rho, s_l = _loss(chi_l + chi_r, scale, redescends)
             s_r = s_l
             cost += rho
         else:
-            rho_l, s_l = _huber(chi_l, delta)
-            rho_r, s_r = _huber(chi_r, delta)
+            rho_l, s_l = _loss(chi_l, scale, redescends)
+            rho_r, s_r = _loss(chi_r, scale, redescends)
             cost += rho_l + rho_r
         s_l, s_r = s_l if use[o, 0] else 0.0, s_r if use[o, 1] else 0.0
         a[o, 0] = s_l * (x0 * x0 + y0 * y0) + s_r * (u0 * u0 + v0 * v0)

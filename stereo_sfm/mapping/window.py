@@ -34,7 +34,7 @@ class Window:
 
 def bundle_config(config: MapperConfig) -> BundleConfig:
     """How the mapper adjusts its windows."""
-    return BundleConfig(config.rounds, config.iterations, config.huber_sigmas, fixed_once=True)
+    return BundleConfig(config.rounds, config.iterations, config.huber_sigmas, config.cauchy_sigmas, fixed_once=True)
 
 
 def covisible_window(map_: Map, row: int, config: MapperConfig) -> Window:

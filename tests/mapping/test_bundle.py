@@ -216,3 +216,19 @@ def test_empty_bundle_is_its_own_answer() -> None:
     )
     result = bundle_adjust(rig, bundle)
     assert result.cost == 0.0 and np.array_equal(result.points, bundle.points)
+
+
+def test_a_redescending_loss_is_not_pulled_by_what_errs_to_one_side(rig: Rig) -> None:
+    """A fifth of the right pixels errs by two pixels to one side, as at depth edges: the size of the scene stays."""
+    scene = make_scene(rig, 6, 300, noise_px=0.3)
+    right = scene.uv_right.copy()
+    right[::5, 0] += 2.0
+    scene = dataclasses.replace(scene, uv_right=right)
+    spread = np.linalg.norm(np.diff(scene.world_T_kf[:, :3, 3], axis=0), axis=1).sum()
+    errors: list[float] = []
+    for cauchy in (0.0, 1.0):
+        config = BundleConfig(rounds=2, huber=0.75, cauchy=cauchy, iterations=30, outlier_chi2=1e9)
+        result = bundle_adjust(rig, bundle_of(scene), config)
+        found = np.linalg.norm(np.diff(result.world_T_kf[:, :3, 3], axis=0), axis=1).sum()
+        errors.append(abs(found / spread - 1))
+    assert errors[1] < 0.9 * errors[0]
