@@ -18,34 +18,34 @@ from stereo_sfm.errors import StereoSfmError, did_you_mean, from_os_error
 # subcommand -> what `--help` says; the code is in stereo_sfm/commands/<name with _ for ->.py
 COMMANDS: dict[str, str] = {
     "run": "turn a source into a trajectory and a map",
-    "replay": "execute a run again from its log, to the same bits",
-    "viz": "show a run or a recording in rerun",
-    "batch": "many recordings at once, on this machine or a cluster",
+    "replay": "repeat a run from its log, bit for bit",
+    "viz": "show a run, a saved map or a recording in rerun",
+    "batch": "run many recordings, on this machine or on a cluster",
     "record": "write a source to an MCAP file",
-    "info": "what a recording or dataset folder holds, and what is wrong with it",
-    "convert": "dataset folder to MCAP",
-    "recover": "mended copy of a recording that was cut off",
-    "diff": "whether two logs hold the same, and where they part",
-    "rectify": "write rectified pictures with epipolar lines to look at",
-    "calibrate": "calibrate a stereo rig from pictures of a target",
-    "check-calib": "judge a rig's calibration from any recording, without a target",
-    "convert-calib": "calibration files between Kalibr, ROS, OpenCV, Basalt, COLMAP, Foxglove, EuRoC, KITTI and ours",
-    "map": "what a saved map holds; merge, prune and export maps",
-    "export": "a run or a map in the formats of other programs",
-    "vocabulary": "train the words of place recognition, or describe them",
-    "ablation": "features, estimators and modules of the papers side by side",
+    "info": "describe a recording or dataset folder and its problems",
+    "convert": "convert a dataset folder to MCAP",
+    "recover": "repair a recording that was cut off",
+    "diff": "compare two logs and show where they first differ",
+    "rectify": "write rectified image pairs with epipolar lines for inspection",
+    "calibrate": "calibrate a stereo rig from images of a target",
+    "check-calib": "check a calibration on any recording, without a target",
+    "convert-calib": "convert a calibration between the formats of Kalibr, ROS, OpenCV, COLMAP, EuRoC and others",
+    "map": "describe, merge, prune and export saved maps",
+    "export": "export a run or a map to the formats of other programs",
+    "vocabulary": "train or describe the vocabulary of place recognition",
+    "ablation": "compare the features, estimators and modules of the papers",
     "eval": "compare a trajectory with ground truth",
-    "sources": "what can be opened: kinds of cameras and data sets, with their options",
-    "devices": "which cameras are attached",
-    "t265": "firmware and reset of a T265",
-    "udev": "rules that let everybody use the cameras (Linux)",
+    "sources": "list the kinds of cameras and datasets that can be opened, and their options",
+    "devices": "list the attached cameras",
+    "t265": "install or check the firmware of a T265, or reset the camera",
+    "udev": "print udev rules for using the cameras without root (Linux)",
     "config": "show the resolved configuration",
-    "compile": "compile the numerical kernels now, so that no first run waits for them",
+    "compile": "compile the numerical kernels now, so that the first run starts at once",
 }
 
 
 class _Parser(argparse.ArgumentParser):
-    """A word or an option that is not known gets a guess at what was meant."""
+    """Suggests the nearest known word for an unknown value or option."""
 
     def _check_value(self, action: argparse.Action, value: object) -> None:
         try:
@@ -73,7 +73,9 @@ def _build_parser(chosen: str | None) -> argparse.ArgumentParser:
         prog="stereo-sfm",
         description="Visual structure-from-motion and SLAM for stereo cameras in retail stores.",
     )
-    parser.add_argument("--version", action="store_true", help="versions of this package and what it runs on")
+    parser.add_argument(
+        "--version", action="store_true", help="print the versions of this package and its dependencies"
+    )
     commands = parser.add_subparsers(dest="command", metavar="COMMAND")
     for name, text in COMMANDS.items():
         sub = commands.add_parser(name, help=text, description=text)
@@ -89,7 +91,7 @@ def _print_versions() -> None:
 
 
 class _Standard(logging.Handler):
-    """One line on standard error a message, wherever standard error points at that time."""
+    """Prints each message as one line on the current standard error."""
 
     def emit(self, record: logging.LogRecord) -> None:
         print(f"{record.levelname.lower()}: {record.getMessage()}", file=sys.stderr)
@@ -101,11 +103,11 @@ def _start_logging(options: argparse.Namespace) -> None:
     screen = _Standard(logging.INFO if verbose else logging.ERROR if quiet else logging.WARNING)
     log.handlers = [screen]
     log.propagate = False
-    log.setLevel(logging.INFO)  # the log of a run holds what the screen leaves out
+    log.setLevel(logging.INFO)  # the log of a run also holds what is not printed
 
 
-def _mend_standard_streams() -> None:
-    """Closed ones lead nowhere; a character that the terminal does not know becomes another."""
+def _repair_standard_streams() -> None:
+    """Open closed streams on the null device; replace characters that the terminal cannot show."""
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:
             os.fstat(number)
@@ -117,8 +119,8 @@ def _mend_standard_streams() -> None:
             stream.reconfigure(errors="replace")
 
 
-def _nobody_reads() -> bool:
-    """Whether the reader of our output went away (`| head`): nothing is wrong, and nothing more can be said."""
+def _output_closed() -> bool:
+    """Whether the reader of standard output has closed it (`| head`), which is no error."""
     reader = select.poll()
     reader.register(sys.stdout.fileno(), 0)
     return any(event & (select.POLLERR | select.POLLHUP) for _, event in reader.poll(0))
@@ -130,7 +132,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Exit codes: 0 ok, 1 internal error, 2 bad input, 3 check failed, 4 tracking failed, 130 interrupted.
     """
     if argv is None:
-        _mend_standard_streams()
+        _repair_standard_streams()
     args = list(sys.argv[1:] if argv is None else argv)
     chosen = next((a for a in args if a in COMMANDS), None)
     parser = _build_parser(chosen)
@@ -149,16 +151,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"stereo-sfm {options.command}: {error}", file=sys.stderr)
         return error.exit_code
     except BrokenPipeError:
-        if not _nobody_reads():
+        if not _output_closed():
             raise
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except OSError as error:
-        said = from_os_error(error)
-        if said is None:
+        known = from_os_error(error)
+        if known is None:
             raise
-        print(f"stereo-sfm {options.command}: {said}", file=sys.stderr)
-        return said.exit_code
+        print(f"stereo-sfm {options.command}: {known}", file=sys.stderr)
+        return known.exit_code
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED

@@ -16,10 +16,10 @@ from typing import Any
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.settings import check, check_names, explained, number, path, switch, word
 
-LONGEST_LINE, LONGEST_TEXT = 4096, 1 << 20  # characters of a configuration
-MOST_CORES = 1024  # of a machine
+MAX_LINE, MAX_TEXT = 4096, 1 << 20  # characters of a configuration file
+MAX_CORES = 1024  # of a machine
 
-# Names of earlier versions, in files and in the logs of old runs -> the name of today.
+# Names of earlier versions, in files and in the logs of old runs -> the current name.
 RENAMED = {
     "tracker.max_error": "tracker.max_error_sigmas",
     "manhattan.model_deg": "manhattan.model_sigma_deg",
@@ -51,8 +51,10 @@ class TrackerConfig:
     max_features: int = number(400, 1, 20_000, "Points followed at once")
     min_features: int = number(15, 3, 10_000, "Inliers below which a frame is lost")
     pyramid_levels: int = number(4, 2, 10, "Levels of the image pyramid, each half as large")
-    min_contrast: float = number(2.0, 0, 255, "Grey levels of standard deviation below which a window is no point")
-    min_ncc: float = number(0.6, -1, 1, "Correlation of a window with the previous frame's below which it is dropped")
+    min_contrast: float = number(
+        2.0, 0, 255, "Standard deviation of the grey levels of a window below which it is not used"
+    )
+    min_ncc: float = number(0.6, -1, 1, "Correlation with the window in the previous frame below which a track ends")
     min_anchor_ncc: float = number(0.85, -1, 1, "The same with the point's first appearance, affinely deformed")
     max_angle_deg: float = number(88.0, 1, 180, "Angle from the optical axis beyond which an image is not used")
     corner_quality: float = number(0.005, 0, 1, "Least corner response, as a share of the strong ones in the image")
@@ -61,7 +63,7 @@ class TrackerConfig:
     depth_sigma_px: float = number(
         3.0, 0.001, 1000, "Noise of an observation that refines a depth: its errors repeat from frame to frame"
     )
-    max_error_sigmas: float = number(3.0, 0.1, 1000, "Residual above which an observation is no inlier")
+    max_error_sigmas: float = number(3.0, 0.1, 1000, "Residual above which an observation is an outlier")
     max_epipolar_px: float = number(1.0, 0.01, 100, "Distance of a stereo match from its epipolar curve")
     max_window_disparity_px: float = number(
         0.2, 0, 100, "Difference of two supports' disparities (a narrow window, a plane): more is an edge in depth"
@@ -84,14 +86,16 @@ class FeaturesConfig:
     """Descriptors and matching of the selectable trackers (tracking/features/)."""
 
     kind: str = word("sift", ("orb", "sift", "akaze"), "Detector and descriptor")
-    count: int = number(0, 0, 100_000, "Most keypoints of an image; 0: OpenCV's own default (ORB 500, others no limit)")
+    count: int = number(
+        0, 0, 100_000, "Largest number of keypoints per image; 0: OpenCV's default (ORB 500, others no limit)"
+    )
     ratio: float = number(0.8, 0.01, 1, "Lowe's ratio: best distance below this share of the second best")
     mask_radius_px: float = number(
         0.0, 0, 100_000, "Keypoints only this near to the last keyframe's stereo points; 0: everywhere"
     )
     stereo_check: str = word("rig", ("rig", "ransac"), "Epipolar check of left-right matches: calibrated or estimated")
     epipolar_px: float = number(1.5, 0.01, 1000, "Largest distance to the epipolar line, in pixels at the image centre")
-    stereo_only: bool = switch(True, "With two cameras, only points that both see (as the thesis)")
+    stereo_only: bool = switch(True, "With two cameras, use only points seen by both (as the thesis)")
     motion_check: bool = switch(False, "Fundamental RANSAC on matches between frames before the estimator's own")
     motion_window_deg: float = number(
         0.0, 0, 360, "Matches that moved by more than this angle between frames are dropped; 0: none"
@@ -124,21 +128,23 @@ class OdometryConfig:
     keyframe_rescue_inliers: int = number(0, 0, 100_000, "New keyframe at once below this many inliers")
     monocular: bool = switch(False, "Use the left camera alone, whatever the source has (pnp)")
     init_share: float = number(0.9, 0, 1, "Monocular start: share of the matches that must fit the essential matrix")
-    init_epipolar_px: float = number(2.0, 0.01, 1000, "Monocular start: what counts as fitting")
+    init_epipolar_px: float = number(2.0, 0.01, 1000, "Monocular start: epipolar error up to which a match fits")
     init_parallax_deg: float = number(1.0, 0, 90, "Monocular start: least median parallax")
 
 
 @dataclass(frozen=True)
 class ManhattanConfig:
-    """Rotation prior from the world's three directions (tracking/flow/)."""
+    """Rotation prior from the three dominant directions of the building (tracking/flow/)."""
 
     enabled: bool = switch(False, "Correct the odometry's rotation by the building's three directions")
     every: int = number(
-        15, 1, 10_000_000, "Frames from one measurement to the next; one costs several frames of tracking"
+        15, 1, 10_000_000, "Frames between measurements; one costs as much time as tracking several frames"
     )
-    settle_frames: int = number(10, 1, 100_000, "Measurements that must agree before the axes are believed")
+    settle_frames: int = number(10, 1, 100_000, "Measurements that must agree before the axes are accepted")
     gate_deg: float = number(3.0, 0, 180, "Distance from the prediction above which a measurement is refused")
-    model_sigma_deg: float = number(0.15, 1e-6, 90, "How exactly the world follows three directions")
+    model_sigma_deg: float = number(
+        0.15, 1e-6, 90, "Standard deviation of the building's edges from the three directions"
+    )
     drift_sigma_deg_per_frame: float = number(
         0.01, 0, 90, "The tracker's rotation error in one frame; it grows with the root of the frames"
     )
@@ -148,17 +154,17 @@ class ManhattanConfig:
 class MapperConfig:
     """Local mapping (mapping/mapper.py)."""
 
-    enabled: bool = switch(True, "Keep a map and adjust it; false: odometry alone")
+    enabled: bool = switch(True, "Build and optimize a map; false: odometry alone")
     window_keyframes: int = number(
-        12, 0, 10_000, "Keyframes that local bundle adjustment moves, the new one included; 0: all connected ones"
+        12, 0, 10_000, "Keyframes optimized by local bundle adjustment, the new one included; 0: all connected"
     )
     connected_points: int = number(15, 1, 100_000, "Shared points that make two keyframes neighbours")
     sigma_px: float = number(0.4, 0.001, 100, "Noise of one coordinate of a tracked point")
     huber_sigmas: float = number(
-        0.75, 0, 1000, "Residual where the loss becomes linear; narrow, as depths near edges err to one side"
+        0.75, 0, 1000, "Residual where the loss becomes linear; small because depths at edges are biased"
     )
     cauchy_sigmas: float = number(1.0, 0, 1000, "Scale of the redescending loss in the rounds after the first; 0: none")
-    rounds: int = number(2, 1, 100, "Rounds of bundle adjustment, outliers are judged between them")
+    rounds: int = number(2, 1, 100, "Rounds of bundle adjustment, with outliers removed between them")
     iterations: int = number(5, 1, 1000, "Iterations of a round")
     association: str = word(
         "map",
@@ -169,19 +175,21 @@ class MapperConfig:
     match_distance_bits: int = number(50, 0, 256, "Largest distance of descriptors")
     match_ratio: float = number(0.85, 0.01, 1, "Best distance below this share of the second best")
     match_sigma_px: float = number(1.0, 0.001, 100, "Noise of one coordinate of a point found again by its descriptor")
-    match_min: int = number(12, 0, 100_000, "Agreeing matches below which none is believed")
-    near_keyframes: int = number(10, 0, 10_000, "Keyframes standing close by whose points are searched too")
-    near_depths: float = number(0.3, 0, 1000, "How close these stand, in median depths of the new keyframe")
+    match_min: int = number(12, 0, 100_000, "Consistent matches below which none is used")
+    near_keyframes: int = number(10, 0, 10_000, "Nearby keyframes whose points are searched too")
+    near_depths: float = number(
+        0.3, 0, 1000, "Distance up to which keyframes are nearby, in median depths of the new keyframe"
+    )
     min_observations: int = number(2, 0, 10_000, "Keyframes below which a point that is no longer tracked is culled")
     max_error_sigmas: float = number(3.0, 0, 1000, "Mean error of a point's observations above which it is culled")
     min_parallax_deg: float = number(0.1, 0, 90, "Largest angle between a point's rays below which it is too uncertain")
     redundant_share: float = number(
-        0.9, 0, 10, "A keyframe goes when this share of its points is seen by three others; above 1: never"
+        0.9, 0, 10, "A keyframe is removed when three others see this share of its points; above 1: never"
     )
-    crowd_keyframes: int = number(5, 1, 10_000, "Keyframes with the same view that stay")
+    crowd_keyframes: int = number(5, 1, 10_000, "Keyframes kept of one view")
     full_ba_growth: float = number(1.15, 1, 1e6, "Full bundle adjustment when the map has grown by this factor")
     full_ba_lag_keyframes: int = number(
-        5, 1, 10_000, "Keyframes until its answer is applied (in large maps a tenth of their keyframes)"
+        5, 1, 10_000, "Keyframes until its result is applied (in large maps a tenth of their keyframes)"
     )
 
     @property
@@ -194,14 +202,14 @@ class MapperConfig:
 class LoopConfig:
     """Loop closing (loop/closer.py), and finding the camera in a saved map."""
 
-    enabled: bool = switch(True, "Look for loops")
+    enabled: bool = switch(True, "Search for loops")
     correction: str = word(
         "pose_graph", ("pose_graph", "averaging"), "How the loop's error is spread over the keyframes"
     )
     robust: str = word("gnc", ("gnc", "switchable", "none"), "How the pose graph withstands a false loop")
-    vocabulary: str = path("Vocabulary file; empty: the one of the package")
-    grow_every: int = number(0, 0, 1_000_000, "Keyframes between growths of the vocabulary in a new place; 0: never")
-    score_ratio: float = number(0.9, 0, 10, "Candidates score above this share of the connected keyframes' score")
+    vocabulary: str = path("Vocabulary file; empty: the one in the package")
+    grow_every: int = number(0, 0, 1_000_000, "Keyframes between extensions of the vocabulary in a new place; 0: never")
+    score_ratio: float = number(0.9, 0, 10, "Candidates must score above this share of the connected keyframes' score")
     reference: str = word(
         "weakest", ("weakest", "best"), "Which of the connected keyframes' scores (weakest finds more; paper: best)"
     )
@@ -210,36 +218,36 @@ class LoopConfig:
     min_gap: int = number(10, 0, 1_000_000, "Keyframes between a keyframe and its candidate")
     max_candidates: int = number(3, 1, 1000, "Places verified for a keyframe")
     corners: int = number(
-        400, 1, 20_000, "Corners by which a keyframe is recognised: tracked points are seldom detected again"
+        400, 1, 20_000, "Corners for recognising a keyframe, since tracked points are seldom detected again"
     )
     proximity: bool = switch(True, "Verify also the old keyframe that should be nearest by odometry")
-    pause: int = number(10, 0, 1_000_000, "Keyframes after an accepted loop in which none is searched")
+    pause: int = number(10, 0, 1_000_000, "Keyframes after an accepted loop without a search for another")
     min_match_fraction: float = number(0.15, 0, 1, "Share of the keyframe's corners that must match (paper: 0.3)")
     max_distance_bits: int = number(60, 0, 256, "Largest distance of matching descriptors")
     match_ratio: float = number(0.9, 0.01, 1, "Nearest distance below this share of the second nearest")
-    sigma_px: float = number(1.0, 0.001, 100, "Noise of a point found again from another side")
+    sigma_px: float = number(1.0, 0.001, 100, "Noise of a point found again from another viewpoint")
     disparity_sigma_px: float = number(0.5, 0.001, 100, "Noise of a stereo point's disparity")
-    ransac_iterations: int = number(400, 1, 1_000_000, "Hypotheses of the verification")
-    min_inliers: int = number(30, 1, 1_000_000, "Inliers below which a loop is refused")
+    ransac_iterations: int = number(400, 1, 1_000_000, "RANSAC hypotheses of the verification")
+    min_inliers: int = number(30, 1, 1_000_000, "Inliers below which a loop is rejected")
     min_inlier_share: float = number(0.15, 0, 1, "The same as a share of the keyframe's corners")
-    min_cells: int = number(8, 0, 48, "Of the image's 8 x 6 cells, those that must hold inliers")
+    min_cells: int = number(8, 0, 48, "Cells of a grid of 8 x 6 over the image that must contain inliers")
     consistent: int = number(2, 1, 1000, "Successive keyframes that must agree on a loop")
     consistent_window: int = number(4, 1, 1000, "Keyframes within which they must agree")
     min_inlier_share_after_gap: float = number(
-        0.3, 0, 1, "Share of inliers where tracking broke in between, so that odometry cannot speak for the loop"
+        0.3, 0, 1, "Share of inliers required after a loss of tracking, where odometry cannot confirm the loop"
     )
     gate_m: float = number(0.3, 0, 1e6, "Distance by which a loop may contradict odometry")
-    gate_m_per_m: float = number(0.01, 0, 1e3, "What is added for every metre travelled since")
+    gate_m_per_m: float = number(0.01, 0, 1e3, "Increase of this limit per metre travelled since")
     gate_deg: float = number(3.0, 0, 360, "Angle by which a loop may contradict odometry")
-    gate_deg_per_m: float = number(0.3, 0, 360, "What is added for every metre travelled since")
-    relocalize_candidates: int = number(16, 1, 10_000, "Places of a saved map that are verified")
-    relocalize_keyframes: int = number(6, 1, 1000, "Keyframes whose points make up a place")
+    gate_deg_per_m: float = number(0.3, 0, 360, "Increase of this limit per metre travelled since")
+    relocalize_candidates: int = number(16, 1, 10_000, "Places of a saved map that are verified for an image")
+    relocalize_keyframes: int = number(6, 1, 1000, "Keyframes whose points form a place")
     relocalize_inliers: int = number(56, 1, 100_000, "Corners that must agree with the pose found in a saved map")
     relocalize_share: float = number(
         0.25, 0, 1, "The same as a share of the camera's corners (near a guess: min_inlier_share)"
     )
-    relocalize_cells: int = number(6, 0, 48, "Of the image's 8 x 6 cells, those that must hold them")
-    seed: int = number(0, 0, 10**9, "Of the samples of verification")
+    relocalize_cells: int = number(6, 0, 48, "Cells of a grid of 8 x 6 over the image that must contain them")
+    seed: int = number(0, 0, 10**9, "Seed of the RANSAC samples of the verification")
 
 
 @dataclass(frozen=True)
@@ -254,10 +262,12 @@ STAGES = ("capture", "tracker", "mapper", "loop", "optimizer", "logger", "viewer
 
 @dataclass(frozen=True)
 class PipelineConfig:
-    """How the stages are wired (pipeline/)."""
+    """Connections between the stages (pipeline/)."""
 
-    update_lag_frames: int = number(5, 1, 10_000, "Frames after a keyframe before which its map update is applied")
-    loop_lag_keyframes: int = number(2, 0, 10_000, "Keyframes after which a keyframe's loop reaches the mapper")
+    update_lag_frames: int = number(
+        5, 1, 10_000, "Frames between a keyframe and the frame before which its map update is applied"
+    )
+    loop_lag_keyframes: int = number(2, 0, 10_000, "Keyframes after which the loop of a keyframe reaches the mapper")
     ring_slots: int = number(8, 1, 1024, "Image pairs in shared memory between capture and the stages")
     threads: int = number(1, 1, 256, "Threads of OpenCV and BLAS in each process")
     cpus: dict[str, tuple[int, ...]] = field(
@@ -270,7 +280,7 @@ class PipelineConfig:
 class Config:
     """Everything that decides what a run computes. The resolved tree is saved with every run."""
 
-    seed: int = number(0, 0, 10**9, "Of the estimators of --odometry")
+    seed: int = number(0, 0, 10**9, "Seed of the estimators of --odometry")
     tracker: TrackerConfig = field(default_factory=TrackerConfig)
     features: FeaturesConfig = field(default_factory=FeaturesConfig)
     odometry: OdometryConfig = field(default_factory=OdometryConfig)
@@ -281,7 +291,7 @@ class Config:
     pipeline: PipelineConfig = field(default_factory=PipelineConfig)
 
     def closes_loops(self, depth: bool, localize_only: bool) -> bool:
-        """Whether a run looks for loops: it maps, and its camera knows depth (two cameras, or a depth image)."""
+        """Whether a run searches for loops: it maps, and has depth (from two cameras or a depth image)."""
         return self.loop.enabled and self.mapper.enabled and depth and not localize_only
 
 
@@ -294,7 +304,7 @@ def _merge(base: dict[str, Any], extra: dict[str, Any]) -> dict[str, Any]:
 
 
 def renamed(data: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
-    """Nested values under the names of today, and the old names that were met."""
+    """Nested values under current names, and the old names that were found."""
     out, met = dict(data), list[str]()
     for old, new in RENAMED.items():
         (section, old_key), new_key = old.split("."), new.split(".")[1]
@@ -308,8 +318,8 @@ def renamed(data: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     return out, met
 
 
-def _of_today(data: dict[str, Any]) -> dict[str, Any]:
-    """One layer of values under the names of today; says so where a name is an old one."""
+def _with_current_names(data: dict[str, Any]) -> dict[str, Any]:
+    """One layer of values under current names; logs a warning for each old name."""
     out, met = renamed(data)
     for old in met:
         logging.getLogger("stereo_sfm").warning("configuration: %s is called %s now", old, RENAMED[old])
@@ -317,7 +327,7 @@ def _of_today(data: dict[str, Any]) -> dict[str, Any]:
 
 
 def from_dict(data: dict[str, Any]) -> Config:
-    """Nested plain values over the defaults; names of earlier versions are taken in silence.
+    """Nested plain values over the defaults; names of earlier versions are accepted silently.
 
     Raises:
         StereoSfmError: an unknown key, a value of the wrong type, or one that its setting does not take.
@@ -341,9 +351,9 @@ def _check_cores(cpus: dict[str, tuple[int, ...]]) -> None:
     unknown = sorted(set(cpus) - set(STAGES))
     if unknown:
         raise StereoSfmError(f"configuration: pipeline.cpus names '{unknown[0]}': the stages are {', '.join(STAGES)}")
-    wrong = [core for cores in cpus.values() for core in cores if not 0 <= core < MOST_CORES]
+    wrong = [core for cores in cpus.values() for core in cores if not 0 <= core < MAX_CORES]
     if wrong:
-        raise StereoSfmError(f"configuration: pipeline.cpus names core {wrong[0]}: cores are 0 to {MOST_CORES - 1}")
+        raise StereoSfmError(f"configuration: pipeline.cpus names core {wrong[0]}: cores are 0 to {MAX_CORES - 1}")
 
 
 def _as_float(value: Any) -> Any:
@@ -352,11 +362,11 @@ def _as_float(value: Any) -> Any:
 
 def load(path: Path | str | None = None, overrides: Iterable[str] = (), base: dict[str, Any] | None = None) -> Config:
     """Defaults, `base`, a TOML file, then `key.subkey=value` overrides, values read as TOML (else as text)."""
-    data: dict[str, Any] = _of_today(base or {})
+    data: dict[str, Any] = _with_current_names(base or {})
     if path is not None:
-        data = _merge(data, _of_today(_read(Path(path).expanduser())))
+        data = _merge(data, _with_current_names(_read(Path(path).expanduser())))
     for override in overrides:
-        data = _merge(data, _of_today(_parsed(override)))
+        data = _merge(data, _with_current_names(_parsed(override)))
     return from_dict(data)
 
 
@@ -364,9 +374,9 @@ def parse_toml(text: str) -> dict[str, Any]:
     """Nested values.
 
     Raises:
-        ValueError: not TOML, or longer lines or deeper brackets than any configuration has.
+        ValueError: not TOML, too long, or nested too deeply.
     """
-    if max(map(len, text.splitlines()), default=0) > LONGEST_LINE or len(text) > LONGEST_TEXT:
+    if max(map(len, text.splitlines()), default=0) > MAX_LINE or len(text) > MAX_TEXT:
         raise ValueError("it is too long for a configuration")
     try:
         return tomllib.loads(text)
@@ -382,7 +392,7 @@ def _read(path: Path) -> dict[str, Any]:
     except OSError as error:
         raise StereoSfmError(f"cannot read the configuration {path}: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise StereoSfmError(f"configuration {path}: it is no text (expected TOML)") from None
+        raise StereoSfmError(f"configuration {path}: it is not a text file (expected TOML)") from None
     except ValueError as error:
         raise StereoSfmError(f"configuration {path}: {error}") from None
 
@@ -408,5 +418,5 @@ def dump(config: Config) -> str:
 
 
 def explain(config: Config) -> str:
-    """The same with a sentence above every setting."""
+    """As `dump`, with the description of every setting as a comment above it."""
     return explained(config)

@@ -1,4 +1,4 @@
-"""The recording that comes with the package, so that there is something to run on."""
+"""The recording that comes with the package."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ def demo_recording() -> Path:
     """The bundled recording: inside an installed package, or in `recordings/` of a checkout.
 
     Raises:
-        StereoSfmError: neither is there.
+        StereoSfmError: it is in neither place.
     """
     package = Path(__file__).parent
     for path in (package / "data" / "demo.mcap", package.parent / "recordings" / "demo.mcap"):

@@ -1,4 +1,4 @@
-"""The one error root of the project."""
+"""The exception for everything that the user can fix, and helpers for its messages."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_OF_THE_DISK = (*_FULL, errno.EROFS, errno.EIO)
+_DISK_ERRORS = (*_FULL, errno.EROFS, errno.EIO)
 
 
 class StereoSfmError(Exception):
-    """Something the user can mend: bad input, calibration, configuration or device.
+    """Something the user can fix: bad input, calibration, configuration or device.
 
     The message is one line that says what is wrong and what to do. The command line prints it and exits with
     ``exit_code``; every other exception is an internal error and keeps its traceback.
@@ -23,7 +23,7 @@ class StereoSfmError(Exception):
 
 
 def require(modules: tuple[str, ...], extra: str, purpose: str, error: type[StereoSfmError] = StereoSfmError) -> None:
-    """Ask for the libraries of one of the package's extras before they are imported.
+    """Check that the libraries of one of the package's extras are installed.
 
     Raises:
         StereoSfmError (or the given kind): one of them is not installed.
@@ -34,19 +34,19 @@ def require(modules: tuple[str, ...], extra: str, purpose: str, error: type[Ster
 
 
 def from_os_error(error: OSError) -> StereoSfmError | None:
-    """What the system says of a file as one line; None for what is no fault of a file (a pipe between processes)."""
-    kept = "what was written until then is kept"
+    """A one-line error for a problem with a file; None for others (a pipe between processes)."""
+    kept = "what was written so far is kept"
     if error.filename is None:
-        return StereoSfmError(f"cannot write: {error.strerror}; {kept}") if error.errno in _OF_THE_DISK else None
+        return StereoSfmError(f"cannot write: {error.strerror}; {kept}") if error.errno in _DISK_ERRORS else None
     if error.errno in _FULL:
         return StereoSfmError(f"cannot write to {error.filename}: {error.strerror}; {kept}")
     if isinstance(error, FileExistsError):
-        return StereoSfmError(f"{error.filename}: a file of that name is there already")
+        return StereoSfmError(f"{error.filename}: a file with this name exists already")
     return StereoSfmError(f"{error.filename}: {error.strerror}")
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """ ", did you mean NAME?" for a misspelt word of a list, whatever its case; "" where none is near."""
+    """ ", did you mean NAME?" with the nearest known word, ignoring case; "" if none is near."""
     from difflib import get_close_matches
 
     names = {name.lower(): name for name in known}
@@ -55,15 +55,15 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 
 
 def one_of(word: str, known: Iterable[str], what: str) -> str:
-    """The word, which must be one of a list.
+    """Return a word after checking that it is known.
 
     Args:
         word: as the user wrote it.
         known: the list.
-        what: what such a word stands for, for the message: "scene", "projection".
+        what: what the word names, for the message: "scene", "projection".
 
     Raises:
-        StereoSfmError: it is none of them; with the nearest one and all of them.
+        StereoSfmError: unknown; the message lists the nearest word and all of them.
     """
     names = tuple(known)
     if word in names:
@@ -73,7 +73,7 @@ def one_of(word: str, known: Iterable[str], what: str) -> str:
 
 @contextmanager
 def writing_to(folder: Path) -> Generator[None]:
-    """Let a disk error name the folder: the system names files that it cannot open, not those that it cannot fill."""
+    """Add the folder to disk errors: the system names files that cannot be opened, but not when the disk is full."""
     try:
         yield
     except OSError as error:

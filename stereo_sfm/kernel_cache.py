@@ -1,4 +1,4 @@
-"""Where compiled kernels are kept between runs, and what there is to say while they are compiled.
+"""Where compiled kernels are kept between runs, and notifications while they are compiled.
 
 numba keeps them beside the source files. Where those may not be written to (an installation of another user, a
 read-only file system) they go to the user's cache, else to a folder of temporary files, and what was compiled at the
@@ -28,7 +28,7 @@ COMPILING = "numba:compile"
 
 
 def usable(folder: Path) -> bool:
-    """Whether files can be made in a folder; it is made if need be."""
+    """Whether files can be created in a folder, which is created if needed."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
@@ -38,7 +38,7 @@ def usable(folder: Path) -> bool:
 
 
 def private(folder: Path) -> bool:
-    """Whether a folder is ours alone: what lies in it is executed."""
+    """Whether only this user can write to a folder: its content is executed."""
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
         found = folder.lstat()
@@ -59,7 +59,7 @@ def choose_folder(root: Path = ROOT) -> Path | None:
     return shared if private(shared) else Path(tempfile.mkdtemp(prefix="stereo-sfm-"))
 
 
-def take_along(root: Path, folder: Path) -> None:
+def copy_compiled(root: Path, folder: Path) -> None:
     """Copy what was compiled beside the source files to where numba looks for it in another folder."""
     for source in (p for package in PACKAGES for p in sorted((root / package).rglob("__pycache__"))):
         target = folder / UserProvidedCacheLocator.get_suitable_cache_subpath(str(source.parent / "module.py"))
@@ -75,7 +75,7 @@ def _prepare() -> bool:
     try:
         folder = choose_folder()
         if folder is not None:
-            take_along(ROOT, folder)
+            copy_compiled(ROOT, folder)
             config.CACHE_DIR = os.environ[VARIABLE] = str(folder)  # pyright: ignore[reportAttributeAccessIssue]
     except OSError:
         return False
@@ -91,31 +91,31 @@ def jit(**options: Any) -> Any:
 
 
 class Compilation(event.Listener):
-    """What is compiled while it listens: how many kernels, and the seconds that took."""
+    """Counts the kernels compiled while it listens, and the seconds this takes."""
 
-    def __init__(self, tell: Callable[[str], None]) -> None:
+    def __init__(self, report: Callable[[str], None]) -> None:
         self.kernels, self.seconds = 0, 0.0
-        self._tell, self._since, self._depth = tell, 0.0, 0
+        self._report, self._since, self._depth = report, 0.0, 0
 
     def on_start(self, event: Any) -> None:
-        """A kernel, perhaps for another one that calls it."""
+        """Compilation of a kernel begins, possibly within that of its caller."""
         if not self._depth:
             self._since = time.perf_counter()
         self._depth += 1
         self.kernels += 1
-        self._tell(event.data["dispatcher"].py_func.__name__.strip("_"))
+        self._report(event.data["dispatcher"].py_func.__name__.strip("_"))
 
     def on_end(self, event: Any) -> None:
-        """It is compiled."""
+        """Compilation of a kernel ends."""
         self._depth -= 1
         if not self._depth:
             self.seconds += time.perf_counter() - self._since
 
 
 @contextmanager
-def listening(tell: Callable[[str], None]) -> Generator[Compilation]:
-    """Tell the name of every kernel that has to be compiled inside; those that are only loaded are not told."""
-    listener = Compilation(tell)
+def listening(report: Callable[[str], None]) -> Generator[Compilation]:
+    """Report the name of every kernel compiled in the `with` block, not of those loaded from the cache."""
+    listener = Compilation(report)
     event.register(COMPILING, listener)
     try:
         yield listener

@@ -1,4 +1,4 @@
-"""Where the messages of a run go besides the stages: the log, the viewer, the output folder. Nothing reads back."""
+"""Messages about a run for the log, the viewer and the output folder. Nothing is read back from them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Health:
 
 @dataclass(frozen=True)
 class LogLine:
-    """A line for people, from the process of some stage."""
+    """A human-readable line from the process of a stage."""
 
     stage: str
     level: str  # a name of `logging`
@@ -39,7 +39,7 @@ class LogLine:
 
 @dataclass(frozen=True)
 class SourceCounters:
-    """What a live camera counts about itself (stereo_sfm.drivers.live.counters), up to a frame; never compared."""
+    """Counters of a live camera (stereo_sfm.drivers.live.counters) up to a frame; never compared."""
 
     frame_id: int
     counts: dict[str, float]
@@ -47,7 +47,7 @@ class SourceCounters:
 
 @dataclass(frozen=True)
 class Compiling:
-    """A kernel is compiled, once on this machine; for people who wait."""
+    """A kernel is being compiled, once on this machine."""
 
     stage: str
     kernel: str
@@ -55,7 +55,7 @@ class Compiling:
 
 @dataclass(frozen=True)
 class LogEnded:
-    """The log takes no more; the run goes on."""
+    """The log has ended early; the run continues."""
 
     why: str
 

@@ -1,6 +1,6 @@
-"""Grey pixels from the bytes of image files, and from sixteen bits to eight.
+"""Decoding of image files to grey, and conversion from 16 to 8 bits.
 
-A file is decoded only after its header has said how large the picture is: a few kilobytes of PNG or JPEG can stand for
+The size in the header is checked before a file is decoded: a few kilobytes of PNG or JPEG can expand to
 gigabytes of pixels.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from stereo_sfm.types import U8, U16
 
-MOST_PIXELS = 10**8  # of one image; above what any camera of a rig has
+MAX_PIXELS = 10**8  # of one image, more than any camera of a rig has
 LEFT_ALIGNED = 0xF  # bits that are always zero when a sensor of at most twelve bits fills the upper part of sixteen
 
 
@@ -24,7 +24,7 @@ def declared_size(data: bytes) -> tuple[int, int]:
     """(width, height) that the header of an image file declares; no pixel is decoded.
 
     Raises:
-        ValueError: no image file, or larger than `MOST_PIXELS`.
+        ValueError: not an image file, or larger than `MAX_PIXELS`.
     """
     from PIL import Image
 
@@ -34,11 +34,11 @@ def declared_size(data: bytes) -> tuple[int, int]:
             with Image.open(io.BytesIO(data)) as image:
                 width, height = image.size
     except Image.DecompressionBombError:
-        raise ValueError(f"a compressed image has more than {MOST_PIXELS} pixels") from None
+        raise ValueError(f"a compressed image has more than {MAX_PIXELS} pixels") from None
     except (OSError, ValueError, SyntaxError, ArithmeticError, LookupError, TypeError, MemoryError):
         raise ValueError("a compressed image cannot be decoded") from None
-    if width * height > MOST_PIXELS:
-        raise ValueError(f"a compressed image of {width}x{height} has more than {MOST_PIXELS} pixels")
+    if width * height > MAX_PIXELS:
+        raise ValueError(f"a compressed image of {width}x{height} has more than {MAX_PIXELS} pixels")
     return width, height
 
 
@@ -46,7 +46,7 @@ def decode(data: bytes, flags: int) -> np.ndarray[Any, Any]:
     """The pixels of an image file as OpenCV's `flags` want them.
 
     Raises:
-        ValueError: no image file, damaged, or too large.
+        ValueError: not an image file, damaged, or too large.
     """
     declared_size(data)
     try:
@@ -62,7 +62,7 @@ def decode_gray(data: bytes) -> U8 | U16:
     """Bytes of any image file that OpenCV reads -> (H, W) grey with the file's depth of eight or sixteen bits.
 
     Raises:
-        ValueError: no image file, damaged, too large, or of another depth.
+        ValueError: not an image file, damaged, too large, or of another depth.
     """
     image = decode(data, cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE)
     if image.dtype not in (np.uint8, np.uint16):
@@ -71,7 +71,7 @@ def decode_gray(data: bytes) -> U8 | U16:
 
 
 def sensor_bits(images: Iterable[U16]) -> int:
-    """How many of sixteen bits a sensor uses (8, 10, 12, 14 or 16), from some of its images.
+    """How many of the 16 bits a sensor uses (8, 10, 12, 14 or 16), from some of its images.
 
     Values whose lowest bits are always zero fill the upper part of the sixteen (TUM VI: twelve bits), so that full
     white is 65,535; others begin at the lowest bit, and the largest one tells.

@@ -31,7 +31,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "mapper": {"enabled": False},
         "loop": {"enabled": False},
     },
-    # Visual SLAM of the C++ course: one eye, ORB, essential matrix at the start, PnP against the last keyframe and
+    # Visual SLAM of the C++ course: one camera, ORB, essential matrix at the start, PnP against the last keyframe and
     # motion-only bundle adjustment, keyframes after more than 19 frames with fewer than 80 inliers; below 60 at once,
     # or tracking would end before the 19 frames do.
     "cpp-course": {

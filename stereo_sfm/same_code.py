@@ -1,8 +1,8 @@
-"""The same machine code on every x86-64 processor with AVX2, whatever else it has.
+"""Use the same machine code on every x86-64 processor with AVX2, whatever other features it has.
 
 numpy, OpenCV and OpenBLAS choose code by the processor's features, and code for AVX-512 sums in another order than code
 for AVX2: keyframes' descriptors and whole paths then differ in their last bits, and after a few decisions in
-millimetres. Here AVX-512 is left unused, in this process and those that it starts. The variables are those that each
+millimetres. AVX-512 is therefore disabled in this process and those that it starts. The variables are those that each
 library documents; one that is set already is left as it is, and so is everything once a library is loaded.
 """
 
@@ -19,7 +19,7 @@ CPU_INFO = Path("/proc/cpuinfo")
 
 
 def choose() -> None:
-    """Set the variables, if nothing is loaded yet that has read them; processes started from here do as this one."""
+    """Set the variables if no library has read them yet; child processes inherit them."""
     if CHOICE in os.environ:
         return
     free = not any(name in sys.modules for name in LIBRARIES)
@@ -29,7 +29,7 @@ def choose() -> None:
 
 
 def variables(features: frozenset[str]) -> dict[str, str]:
-    """What makes a processor with these features (as Linux names them) compute as one with AVX2 and no more."""
+    """Environment variables that restrict a processor with these features (Linux names) to AVX2."""
     if not {"avx2", "fma"} <= features:
         return {}
     chosen = {"OPENBLAS_CORETYPE": "Haswell"}

@@ -1,4 +1,4 @@
-"""A setting: a dataclass field with a default, one sentence, and the values that it takes. One validator for all.
+"""A setting: a dataclass field with a default, a description and its valid values. One validator for all.
 
 Names carry their unit as the suffix `_px`, `_m`, `_s`, `_deg`, `_bits`; a standard deviation is `sigma_UNIT` or
 `..._sigma_UNIT`; a multiple of one is `..._sigmas`. What has no unit is a count or a ratio.
@@ -17,22 +17,22 @@ T = TypeVar("T")
 
 
 def number(default: float, least: float, most: float, text: str) -> Any:
-    """A field that takes numbers from `least` to `most`; `text` is one sentence without its full stop."""
+    """A number from `least` to `most`; `text` describes it in one sentence without its full stop."""
     return field(default=default, metadata={"text": text, "range": (least, most)})
 
 
 def word(default: str, words: Iterable[str], text: str) -> Any:
-    """A field that takes one of these words."""
+    """One of these words."""
     return field(default=default, metadata={"text": text, "words": tuple(words)})
 
 
 def switch(default: bool, text: str) -> Any:
-    """A field that is true or false."""
+    """True or false."""
     return field(default=default, metadata={"text": text})
 
 
 def path(text: str) -> Any:
-    """A field that holds the path of a file, empty by default."""
+    """The path of a file, empty by default."""
     return field(default="", metadata={"text": text})
 
 
@@ -47,10 +47,10 @@ def walk(section: Any, place: str = "") -> Iterator[tuple[str, dataclasses.Field
 
 
 def check(tree: Any) -> None:
-    """Every value is one that its setting takes.
+    """Check that every value is valid for its setting.
 
     Raises:
-        StereoSfmError: a word or a number that it does not take.
+        StereoSfmError: an unknown word or a number out of range.
     """
     for name, f, value in walk(tree):
         words: tuple[str, ...] = f.metadata.get("words", ())
@@ -64,15 +64,15 @@ def check(tree: Any) -> None:
 
 
 def plain(value: float) -> str:
-    """A number as people write it: whole ones with all digits."""
+    """A number as text, whole numbers with all digits."""
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def check_names(tree: Any, data: dict[str, Any], place: str = "") -> None:
-    """Every key of nested values is a setting.
+    """Check that every key of nested values is a setting.
 
     Raises:
-        StereoSfmError: one is not; the message names the nearest that is.
+        StereoSfmError: one is not; the message suggests the nearest setting.
     """
     own = {f.name: getattr(tree, f.name) for f in dataclasses.fields(tree)}
     for key, value in data.items():
@@ -89,7 +89,7 @@ def check_names(tree: Any, data: dict[str, Any], place: str = "") -> None:
 
 
 def explained(tree: Any) -> str:
-    """The tree as TOML, above each setting a comment with its sentence and what it takes."""
+    """The tree as TOML, with the description and valid values of each setting as a comment above it."""
     import tomli_w
 
     lines: list[str] = []

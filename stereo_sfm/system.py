@@ -1,4 +1,4 @@
-"""The system in one's own loop: feed it images, ask it for poses, the live map, and where an image is."""
+"""The system for use in a program's own loop: images in; poses, the live map and places in saved maps out."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from stereo_sfm.maps.relocalization import Location, Relocalizer, not_found
 from stereo_sfm.maps.saved_map import SavedMap, load_map, save_map
 from stereo_sfm.maps.single_image import still_keyframe
 from stereo_sfm.messages import Sink
-from stereo_sfm.pipeline.door import ImageDoor
+from stereo_sfm.pipeline.image_input import ImageInput
 from stereo_sfm.pipeline.inline import InlineRun
 from stereo_sfm.pipeline.text import Listener
 from stereo_sfm.pipeline.threads import limited_threads
@@ -42,29 +42,29 @@ def _rig(rig: Rig | str | Path) -> Rig:
 class Tracker:
     """Odometry alone: one image in, one `Frame` out, no map and no loops.
 
-    A frame says its pose `odom_T_cam`, the pose's covariance, the state, the reason when there is no pose, and the
+    A frame has the pose `odom_T_cam`, its covariance, the state, the reason when there is no pose, and the
     points that were seen.
     """
 
     def __init__(self, rig: Rig | str | Path, config: Config | None = None) -> None:
         """Args: rig, the calibration or its file. config: the default when omitted."""
         self._rig = _rig(rig)
-        self._door = ImageDoor(self._rig)
+        self._input = ImageInput(self._rig)
         self._tracker = make_tracker(config or Config(), self._rig)
 
     def step(self, left: ArrayLike, right: ArrayLike | None, stamp_ns: int, depth: ArrayLike | None = None) -> Frame:
         """Track the next image.
 
         Args:
-            left, right: (H, W) 8-bit grey, or what `stereo_sfm.pipeline.door` can make it of; no right image for one
+            left, right: (H, W) 8-bit grey, or what `stereo_sfm.pipeline.image_input` accepts; no right image for one
                 camera and for RGB-D.
-            stamp_ns: when it was taken, whole nanoseconds.
+            stamp_ns: time of the exposure, whole nanoseconds.
             depth: (H, W) metres (RGB-D).
 
         Raises:
-            StereoSfmError: what is no image of this rig.
+            StereoSfmError: not an image of this rig.
         """
-        return self._tracker.step(self._door.image(left, right, stamp_ns, depth))[0]
+        return self._tracker.step(self._input.image(left, right, stamp_ns, depth))[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +94,7 @@ class _Callbacks:
 class System:
     """Tracking, mapping and loop closing in this process, one image at a time: the same bits as `stereo-sfm run`.
 
-    Use it in a `with` statement, or call `finish` after the last image: the map then takes what was still under way.
+    Use it in a `with` statement, or call `finish` after the last image, so that pending work reaches the map.
     """
 
     def __init__(
@@ -108,8 +108,8 @@ class System:
         """Args:
         rig: the calibration or its file.
         config: what decides the result; the default when omitted.
-        map_in: folder of a saved map of this place to go on with.
-        localize_only: find the camera in `map_in` and change no map.
+        map_in: folder of a saved map of this place to continue.
+        localize_only: localize the camera in `map_in` without changing the map.
         sinks: each gets every message, in order.
         """
         self.rig, self.config = _rig(rig), config or Config()
@@ -119,11 +119,11 @@ class System:
         self._callbacks = _Callbacks()
         self._map_T_odom: F64 = np.eye(4)
         self._callbacks.add(MapUpdate, self._take)
-        self._door = ImageDoor(self.rig)
+        self._input = ImageInput(self.rig)
         every = (self._record, self._callbacks, *sinks)
         self._run = InlineRun(MemorySource(self.rig, []), self.config, every, folders=folders)
         self._open = ExitStack()
-        self._open.enter_context(Listener("main", self._run.hear))
+        self._open.enter_context(Listener("main", self._run.add_line))
         self._open.enter_context(limited_threads(self.config.pipeline.threads))
         self._finished = False
         self.frame: Frame | None = None
@@ -134,13 +134,13 @@ class System:
 
     def step(self, left: ArrayLike, right: ArrayLike | None, stamp_ns: int, depth: ArrayLike | None = None) -> Frame:
         """Take the next image through all stages; the arguments are those of `Tracker.step`."""
-        return self.step_image(self._door.image(left, right, stamp_ns, depth))
+        return self.step_image(self._input.image(left, right, stamp_ns, depth))
 
     def step_image(self, image: StereoImage) -> Frame:
         """The same with an image of a source, which keeps its number."""
         if self._finished:
-            raise StereoSfmError("this system is finished: begin another one")
-        self.frame = self._run.step(self._door.checked(image))
+            raise StereoSfmError("this system is finished: create a new one")
+        self.frame = self._run.step(self._input.checked(image))
         return self.frame
 
     def run(self, images: Iterable[StereoImage]) -> Iterator[Frame]:
@@ -154,7 +154,7 @@ class System:
         self._callbacks.add(kind, callback)
 
     def finish(self) -> None:
-        """After the last image; once more does nothing."""
+        """Call after the last image; further calls do nothing."""
         if not self._finished:
             self._finished = True
             with self._open:
@@ -172,7 +172,7 @@ class System:
             self._finished = True
             self._open.close()
 
-    # -- what is known ------------------------------------------------------------------------------------------------
+    # -- results ------------------------------------------------------------------------------------------------------
 
     @property
     def map_T_cam(self) -> F64 | None:
@@ -190,15 +190,15 @@ class System:
         """world_T_cam0 of the frames that have a pose.
 
         Args:
-            which: "map", as the map says it now, or "odom", as odometry said it then.
+            which: "map", with the corrections of the map so far, or "odom", as odometry estimated it at the time.
         """
         if which not in ("map", "odom"):
-            raise StereoSfmError(f"there is a trajectory 'map' and one 'odom', not '{which}'")
+            raise StereoSfmError(f"unknown trajectory '{which}': choose 'map' or 'odom'")
         mapped = self._record.mapped() if which == "map" else None
         return self._record.odometry() if mapped is None else mapped
 
     def saved_map(self) -> SavedMap:
-        """The map to keep, to export, or to ask where an image is.
+        """The map, to be saved, exported, or used for localization.
 
         Raises:
             StereoSfmError: nothing is mapped.
@@ -214,15 +214,15 @@ class System:
 
 
 class MapLocator:
-    """A saved map that says where an image was taken, without a guess or near one."""
+    """Localizes images in a saved map, without or with a prior pose."""
 
     def __init__(
         self, saved: SavedMap | str | Path, rig: Rig | str | Path | None = None, config: Config | None = None
     ) -> None:
         """Args:
         saved: a map, or its folder.
-        rig: of the camera that asks; the map's own when omitted.
-        config: its loop settings count.
+        rig: of the camera to localize; the map's own when omitted.
+        config: its `loop` section is used.
         """
         self._config = config or Config()
         saved = saved if isinstance(saved, SavedMap) else load_map(saved)
@@ -231,13 +231,13 @@ class MapLocator:
         self._relocalizer = Relocalizer(saved.snapshot, self._rig, vocabulary, self._config.loop)
 
     def locate(self, left: ArrayLike, right: ArrayLike | None, near: F64 | None = None) -> Location:
-        """Where a pair of images was taken: `map_T_cam`, its information matrix, and `reason`, empty when found.
+        """Localize an image pair: `map_T_cam`, its information matrix, and `reason`, empty when found.
 
         Args:
             left, right: as `Tracker.step` takes them.
             near: (4, 4) map_T_cam to search around only; None searches the whole map.
         """
-        image = ImageDoor(self._rig).image(left, right, 0)
+        image = ImageInput(self._rig).image(left, right, 0)
         keyframe = still_keyframe(image, self._rig, config=self._config)
         if keyframe is None:
             return not_found("too_few_points")

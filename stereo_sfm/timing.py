@@ -1,4 +1,4 @@
-"""Stage times for reports. The core never reads a clock: the shell hands it one of these, by default the null one."""
+"""Stage times for reports. The core never reads a clock: its caller passes one of these, by default the null object."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ Bool = NDArray[np.bool_]
 
 
 def shape(*axes: int) -> dict[str, tuple[int, ...]]:
-    """Metadata of an array field that is no plain row of numbers, so that a log gives it back as it was.
+    """Metadata of an array field with more than one axis, so that its shape can be restored from a log.
 
     Args:
         axes: of the array; -1 in front stands for the number of rows.
@@ -100,7 +100,7 @@ class StereoImage(Message):
     """One synchronised pair (or a single image, or an image with depth), as a driver yields it."""
 
     frame_id: int
-    stamp_ns: int  # sensor clock, mid-exposure, left eye
+    stamp_ns: int  # sensor clock, mid-exposure, left camera
     left: U8  # (H, W)
     right: U8 | None = None  # (H, W); None for monocular and RGB-D sources
     depth: F32 | None = None  # (H, W) metres along the left optical axis, NaN where unknown (RGB-D sources)
@@ -118,7 +118,7 @@ class Observations(Message):
 
     point_ids: I64  # (N,)
     uv_left: F64 = field(metadata=shape(-1, 2))  # (N, 2) px
-    uv_right: F64 = field(metadata=shape(-1, 2))  # (N, 2) px, NaN where the right eye does not see it
+    uv_right: F64 = field(metadata=shape(-1, 2))  # (N, 2) px, NaN where the right camera does not see it
     age: I32  # (N,) frames since the track began
     inlier: Bool  # (N,) used in the pose
 
@@ -156,7 +156,7 @@ class Frame(Message):
 
 @dataclass(frozen=True, eq=False)
 class Corners(Message):
-    """Corners that a detector finds again when it sees the place again: what place recognition knows a keyframe by."""
+    """Corners that a detector finds again when the place is revisited: a keyframe is recognised by them."""
 
     uv_left: F32 = field(metadata=shape(-1, 2))  # (N, 2) px
     uv_right: F32 = field(metadata=shape(-1, 2))  # (N, 2) px
@@ -192,7 +192,7 @@ class Keyframe(Message):
     points_cam: F64 = field(metadata=shape(-1, 3))  # metres in this keyframe's camera, NaN where the depth is unknown
     descriptors: U8 = field(metadata=shape(-1, 32))  # binary (oriented BRIEF), zero rows where none could be computed
     submap_id: int = 0  # grows when tracking restarts after it was lost
-    corners: Corners = field(default_factory=Corners.none)  # what it is recognised by; none: nothing
+    corners: Corners = field(default_factory=Corners.none)  # for place recognition
     rig_terms: F64 = field(default_factory=lambda: np.zeros(6))  # (6,) the tracker's rig, as in `CalibrationUpdate`
 
 
@@ -209,7 +209,7 @@ class CalibrationUpdate(Message):
     since_kf_id: int  # first keyframe that was seen by the rig so corrected; those before stay as they were
     applied: bool  # False: only reported
     why: str  # "significant", "step" or "refined"
-    text: str  # for people
+    text: str  # human-readable
 
 
 @dataclass(frozen=True, eq=False)
@@ -237,15 +237,17 @@ class MapUpdate(Message):
     culled_point_ids: I64  # (C,)
     fused_point_ids: I64 = field(metadata=shape(-1, 2))  # (D, 2) old id -> id that replaces it
     map_T_odom: F64 = field(metadata=shape(4, 4))  # (4, 4)
-    culled_kf_ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))  # (R,) keyframes that the map gave up
-    carrier_kf_ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))  # (R,) what each moves with from now on
-    # its place there
+    culled_kf_ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))  # (R,) keyframes removed from the map
+    carrier_kf_ids: I64 = field(
+        default_factory=lambda: np.zeros(0, np.int64)
+    )  # (R,) the keyframe that each moves with from now on
+    # their poses relative to those
     carrier_T_kf: F64 = field(default_factory=lambda: np.zeros((0, 4, 4)), metadata=shape(-1, 4, 4))
     refused_kf_ids: I64 = field(
         default_factory=lambda: np.zeros(0, np.int64)
-    )  # (L,) whose accepted loop the map refused
+    )  # (L,) whose accepted loop the mapper rejected
     calibration: CalibrationUpdate | None = None  # the rig from this update on, where that changes
-    row_errors: RowErrors | None = None  # of a camera with two eyes
+    row_errors: RowErrors | None = None  # only with two cameras
 
 
 @dataclass(frozen=True, eq=False)

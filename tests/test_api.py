@@ -1,4 +1,4 @@
-"""The Python API: one's own loop gives the bits of a run, and what is no image of the rig is one line at the door."""
+"""The Python API: one's own loop gives the bits of a run, and unsuitable images give a one-line error."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 import stereo_sfm as s
 from stereo_sfm.drivers.memory import MemorySource
-from stereo_sfm.pipeline.door import ImageDoor
+from stereo_sfm.pipeline.image_input import ImageInput
 from tests.synthetic import pinhole_rig
 
 IMAGES = 12
@@ -71,7 +71,7 @@ def test_a_map_is_saved_loaded_and_asked(recording: tuple[s.Rig, list[s.StereoIm
     assert len(s.read_trajectory(tmp_path / "path.tum")) == IMAGES
 
 
-# -- the door ----------------------------------------------------------------------------------------------------------
+# -- input images ------------------------------------------------------------------------------------------------------
 
 RIG = pinhole_rig()
 SIZE = (RIG.left.height, RIG.left.width)
@@ -95,9 +95,9 @@ CONVERTED: dict[str, tuple[Callable[[], Any], int]] = {
 def test_what_can_be_meant_is_converted(name: str) -> None:
     make, off = CONVERTED[name]
     if name == "twelve bits":  # ten would show the same bits: the last of twelve says which
-        image = ImageDoor(RIG).image(make() | 1, make() | 1, 1)
+        image = ImageInput(RIG).image(make() | 1, make() | 1, 1)
     else:
-        image = ImageDoor(RIG).image(make(), make(), 1)
+        image = ImageInput(RIG).image(make(), make(), 1)
     assert image.right is not None
     for pixels in (image.left, image.right):
         assert pixels.dtype == np.uint8 and pixels.flags.c_contiguous
@@ -107,28 +107,28 @@ def test_what_can_be_meant_is_converted(name: str) -> None:
 def test_colour_is_weighed_as_opencv_does() -> None:
     blue = np.zeros((*SIZE, 3), np.uint8)
     blue[..., 0] = 200
-    assert ImageDoor(RIG).image(blue, blue, 1).left[0, 0] == 23  # 0.114 of it
+    assert ImageInput(RIG).image(blue, blue, 1).left[0, 0] == 23  # 0.114 of it
 
 
 def test_more_bits_later_are_taken_from_then_on(caplog: pytest.LogCaptureFixture) -> None:
-    door = ImageDoor(RIG)
+    images = ImageInput(RIG)
     dark = np.full(SIZE, 101, np.uint16)
-    assert door.image(dark, dark, 1).left[0, 0] == 101
+    assert images.image(dark, dark, 1).left[0, 0] == 101
     light = np.full(SIZE, 4001, np.uint16)
-    assert door.image(light, light, 2).left[0, 0] == 250 and door.image(dark, dark, 3).left[0, 0] == 6
+    assert images.image(light, light, 2).left[0, 0] == 250 and images.image(dark, dark, 3).left[0, 0] == 6
 
 
 REFUSED: dict[str, tuple[Any, Any, Any, str]] = {
     "another size": (GREY[:, :-2], GREY, 1, "the left image is 638x480, but the calibration is for 640x480"),
     "another size right": (GREY, GREY[:-1], 1, "the right image is 640x479"),
     "turned": (GREY.T, GREY, 1, "the left image is 480x640"),
-    "two channels": (np.dstack([GREY, GREY]), GREY, 1, "(H, W) grey or (H, W, 3) colour is meant"),
+    "two channels": (np.dstack([GREY, GREY]), GREY, 1, "expected (H, W) grey or (H, W, 3) colour"),
     "a number": (7, GREY, 1, "(H, W) grey"),
     "text": ("left.png", GREY, 1, "(H, W) grey"),
-    "truth values": (GREY > 9, GREY, 1, "has bool pixels: uint8, uint16 or floats are taken"),
+    "truth values": (GREY > 9, GREY, 1, "has bool pixels: expected uint8, uint16 or floats"),
     "whole numbers": (GREY.astype(np.int64), GREY, 1, "has int64 pixels"),
     "not finite": (np.full(SIZE, np.nan), GREY, 1, "not finite"),
-    "negative": (GREY - 1.5, GREY, 1, "holds values from -1.5"),
+    "negative": (GREY - 1.5, GREY, 1, "has values from -1.5"),
     "no right image": (GREY, None, 1, "frame 0 has no right image"),
     "seconds": (GREY, GREY, 0.033, "stamp_ns takes whole nanoseconds, got 0.033"),
 }
@@ -144,10 +144,10 @@ def test_what_is_no_image_of_the_rig_is_one_line(name: str) -> None:
 
 
 def test_stamps_grow() -> None:
-    door = ImageDoor(RIG)
-    door.image(GREY, GREY, 5)
+    images = ImageInput(RIG)
+    images.image(GREY, GREY, 5)
     with pytest.raises(s.StereoSfmError, match="stamp_ns is 5, not later than the last one"):
-        door.image(GREY, GREY, 5)
+        images.image(GREY, GREY, 5)
 
 
 def test_a_source_of_anybody_is_checked_too() -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from stereo_sfm import kernel_cache
-from stereo_sfm.kernel_cache import ROOT, choose_folder, listening, private, take_along
+from stereo_sfm.kernel_cache import ROOT, choose_folder, copy_compiled, listening, private
 
 
 @pytest.fixture
@@ -52,8 +52,8 @@ def test_what_was_compiled_at_the_installation_is_taken_along(tmp_path: Path) ->
     cache = tmp_path / "stereo_sfm" / "geometry" / "__pycache__"
     cache.mkdir(parents=True)
     (cache / "kernels.f-1.py311.nbi").write_bytes(b"index")
-    take_along(tmp_path, tmp_path / "kept")
-    take_along(tmp_path, tmp_path / "kept")
+    copy_compiled(tmp_path, tmp_path / "kept")
+    copy_compiled(tmp_path, tmp_path / "kept")
     assert [p.read_bytes() for p in (tmp_path / "kept").rglob("*.nbi")] == [b"index"]
 
 

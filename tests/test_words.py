@@ -1,4 +1,4 @@
-"""A word that is none of a list gets a guess at what was meant, everywhere by one function."""
+"""The nearest known word is suggested for an unknown one, everywhere by one function."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ def test_the_nearest_word_is_guessed() -> None:
 def test_one_of_a_list() -> None:
     assert one_of("b", ("a", "b"), "letter") == "b"
     with pytest.raises(
-        StereoSfmError, match=r"^unknown eye 'rigth', did you mean right\? \(choose one of left, right\)$"
+        StereoSfmError, match=r"^unknown camera 'rigth', did you mean right\? \(choose one of left, right\)$"
     ):
-        one_of("rigth", ("left", "right"), "eye")
+        one_of("rigth", ("left", "right"), "camera")
 
 
 @pytest.mark.parametrize(
-    ("command", "said"),
+    ("command", "expected"),
     [
         ("run sim:aile", "did you mean aisle?"),
         ("run sim:loop?camera=fishey", "did you mean fisheye?"),
@@ -39,14 +39,14 @@ def test_one_of_a_list() -> None:
         ("sources t256", "did you mean t265?"),
     ],
 )
-def test_commands_guess(command: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_commands_guess(command: str, expected: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(command.split()) == 2
     error = capsys.readouterr().err
-    assert said in error and len(error.splitlines()) == 1
+    assert expected in error and len(error.splitlines()) == 1
 
 
 @pytest.mark.parametrize(
-    ("command", "said"),
+    ("command", "expected"),
     [
         ("rectfy x", "did you mean rectify?"),
         ("run --log ful", "did you mean full?"),
@@ -54,10 +54,10 @@ def test_commands_guess(command: str, said: str, capsys: pytest.CaptureFixture[s
         ("export run --format colmp", "did you mean colmap?"),
     ],
 )
-def test_the_command_line_guesses(command: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_line_guesses(command: str, expected: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         main(command.split())
-    assert stop.value.code == 2 and said in capsys.readouterr().err.splitlines()[-1]
+    assert stop.value.code == 2 and expected in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_formats_of_calibrations_are_guessed(tmp_path: object) -> None:

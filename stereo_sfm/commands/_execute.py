@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stereo_sfm.commands._progress import CompilingShown, frame_state, progress
+from stereo_sfm.commands._progress import CompilationProgress, frame_state, progress
 from stereo_sfm.commands._stop import INTERRUPTED, StopRequest
 from stereo_sfm.errors import StereoSfmError, from_os_error
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from stereo_sfm.viz.match_pictures import MatchPictures
 
 TRACKING_FAILED = 4
-INLINE_END_S = 4.0  # after which a run in one process waits no longer for its source
+INLINE_END_S = 4.0  # a run in one process waits this long for its source to stop
 
 
 @dataclass(frozen=True)
@@ -34,15 +34,15 @@ class RunOptions:
 
     Attributes:
         source: what is read. config: what decides the result. wiring: how the stages run, what is logged and shown.
-        folders: the maps that it begins with and leaves behind.
-        output: its folder; None: runs/DATE_NAME. overwrite: replace the run that lies there.
+        folders: the maps that it loads and saves.
+        output: its folder; None: runs/DATE_NAME. overwrite: replace an existing run.
         frame: whose poses the trajectories hold, "cam0" or "body".
         max_lost_percent: frames without a pose above which the run counts as failed.
-        matches: every so many frames a picture of the matches; None: no pictures.
-        quiet: no progress and no summary. verbose: say what happens.
+        matches: frames between two pictures of the matches; None: no pictures.
+        quiet: no progress and no summary. verbose: print events.
         step_from_s: stop at every frame from this second on and wait for the user; None: do not stop.
         replayed: an earlier run whose schedule is followed.
-        command: what messages call it.
+        command: the command's name in messages.
     """
 
     source: SourceChoice
@@ -74,7 +74,7 @@ def execute(options: RunOptions) -> tuple[int, Path]:
     o = options
     o.source.refuse_to_overwrite(o.output)
     record, pictures, stepper = RunRecord.of(o.config, o.folders.localize_only), _pictures(o.matches), _stepper(o)
-    shown, wiring = CompilingShown(), _wiring(o)
+    shown, wiring = CompilationProgress(), _wiring(o)
     sinks = [*_sinks(o, record, pictures), shown]
     session = Session(o.source, o.config, sinks, wiring, o.folders, o.output, o.overwrite, o.replayed)
     with StopRequest(INLINE_END_S if wiring.inline else 0.0) as stop, closing(session):
@@ -102,17 +102,17 @@ def execute(options: RunOptions) -> tuple[int, Path]:
         return INTERRUPTED, folder
     failed = failure(stats)
     if failed:
-        print(f"stereo-sfm {o.command}: {failed}; {folder / 'report.md'} says why", file=sys.stderr)
+        print(f"stereo-sfm {o.command}: {failed}; see {folder / 'report.md'}", file=sys.stderr)
         return TRACKING_FAILED, folder
     return 0, folder
 
 
 def _wiring(options: RunOptions) -> Wiring:
-    """In one process where the next frame waits for somebody, or a sink needs the images."""
+    """As asked for, but in one process when stepping, or when a sink needs the images."""
     from dataclasses import replace
 
-    alone = options.matches is not None or options.step_from_s is not None
-    return replace(options.wiring, inline=options.wiring.inline or alone)
+    needs_inline = options.matches is not None or options.step_from_s is not None
+    return replace(options.wiring, inline=options.wiring.inline or needs_inline)
 
 
 def _sinks(options: RunOptions, record: RunRecord, pictures: MatchPictures | None) -> list[Sink]:
@@ -126,7 +126,7 @@ def _pictures(every: int | None) -> MatchPictures | None:
     if every is None:
         return None
     if every < 1:
-        raise StereoSfmError("--matches takes a number of frames of at least 1")
+        raise StereoSfmError("--matches must be at least 1")
     from stereo_sfm.viz.match_pictures import MatchPictures
 
     return MatchPictures(every)
@@ -141,9 +141,14 @@ def _stepper(options: RunOptions) -> Stepper | None:
 
 
 def _follow(
-    session: Session, record: RunRecord, stop: StopRequest, quiet: bool, stepper: Stepper | None, shown: CompilingShown
+    session: Session,
+    record: RunRecord,
+    stop: StopRequest,
+    quiet: bool,
+    stepper: Stepper | None,
+    shown: CompilationProgress,
 ) -> tuple[bool, StereoSfmError | None]:
-    """To the end, to Ctrl-C, or to an error; what was tracked until then stays in the record."""
+    """Run to the end, to Ctrl-C, or to an error; what was tracked so far stays in the record."""
     info = session.info
     with progress(info.name, info.frame_count, quiet) as bar:
         shown.bar = bar
@@ -155,8 +160,8 @@ def _follow(
         except KeyboardInterrupt:
             return True, None
         except (StereoSfmError, OSError) as error:
-            said = from_os_error(error) if isinstance(error, OSError) else error
-            if said is None or not len(record.frames):
+            known = from_os_error(error) if isinstance(error, OSError) else error
+            if known is None or not len(record.frames):
                 raise
-            return False, said
+            return False, known
         return stop.asked, None

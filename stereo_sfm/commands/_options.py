@@ -30,7 +30,7 @@ def typed(kind: type[T], args: argparse.Namespace) -> T:
 
 
 def add_source(parser: argparse.ArgumentParser, default: str = "", metavar: str | None = None) -> None:
-    """The argument that names what is read; `default` says what is read without it."""
+    """The argument that names the source; `default` describes what is used without it."""
     from stereo_sfm.drivers.registry import kinds
 
     text = f"a folder or file, or KIND:PLACE?OPTION=VALUE of {', '.join(kinds())} ('stereo-sfm sources KIND')"
@@ -42,24 +42,24 @@ def add_source_arguments(parser: argparse.ArgumentParser) -> None:
     """Options that choose the calibration and a part of a source."""
     from stereo_sfm.drivers.choice import RECTIFY
 
-    parser.add_argument("--rig", type=Path, metavar="FILE", help="calibration instead of the source's own")
+    parser.add_argument("--rig", type=Path, metavar="FILE", help="calibration file to use instead of the source's own")
     parser.add_argument(
         "--rectify",
         choices=RECTIFY,
         default="none",
-        help="turn the images into rectified ones first: pinhole (crops a fisheye), wide (keeps its view)",
+        help="rectify the images first: pinhole (crops a fisheye image), wide (keeps its field of view)",
     )
-    parser.add_argument("--start", type=float, default=0.0, metavar="S", help="seconds to leave out at the beginning")
-    parser.add_argument("--duration", type=float, default=float("inf"), metavar="S", help="seconds to use")
+    parser.add_argument("--start", type=float, default=0.0, metavar="S", help="skip the first S seconds")
+    parser.add_argument("--duration", type=float, default=float("inf"), metavar="S", help="stop after S seconds")
     parser.add_argument("--frame-skip", type=int, default=1, metavar="K", help="use every K-th frame")
     parser.add_argument("--max-frames", type=int, metavar="N", help="stop after N frames")
 
 
 def add_config_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options that make the configuration."""
-    parser.add_argument("-c", "--config", type=Path, metavar="FILE", help="configuration in TOML")
+    """Options that set the configuration."""
+    parser.add_argument("-c", "--config", type=Path, metavar="FILE", help="configuration file (TOML)")
     parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help="one value, as tracker.max_features=600"
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="set one value, as in tracker.max_features=600"
     )
     parser.add_argument("--preset", default="default", metavar="NAME", help=f"one of {', '.join(PRESETS)}")
     parser.add_argument("--features", metavar="NAME", help="descriptors of --odometry: orb, sift, akaze")
@@ -71,60 +71,68 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("auto", "off", "only-report"),
         help="correct the rotation of the right camera from what is seen, where the evidence is there (default: auto)",
     )
-    parser.add_argument("--seed", type=int, help="of everything random (seed and loop.seed of the configuration)")
+    parser.add_argument("--seed", type=int, help="random seed (sets seed and loop.seed)")
 
 
 def add_wiring_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options that say how the stages run, and what is logged and shown.
+    """Options for how the stages run, and what is logged and shown.
 
-    They never change the result of lockstep, but for JPEG images: the tracker sees what the log holds.
+    They never change the result in lockstep, except for JPEG images: the tracker sees them as logged.
     """
-    parser.add_argument("--inline", action="store_true", help="all stages in one process; the same bits")
+    parser.add_argument("--inline", action="store_true", help="run all stages in one process; the result is the same")
     parser.add_argument(
         "--mode",
         choices=("lockstep", "realtime"),
-        help="lockstep waits for every stage (files); realtime drops what comes too fast (devices); default by source",
+        help="lockstep waits for every stage (default for files); realtime drops images (default for devices)",
     )
     parser.add_argument(
-        "--realtime", action="store_true", help="--mode realtime; recordings and sim: play at their own speed"
+        "--realtime",
+        action="store_true",
+        help="same as --mode realtime; recordings and sim: are played at their own speed",
     )
-    parser.add_argument("--speed", type=float, metavar="X", help="play a recording as if live, X times as fast")
+    parser.add_argument("--speed", type=float, metavar="X", help="play a recording as if live, at X times its speed")
     parser.add_argument(
         "--log",
         choices=("full", "lean", "none"),
-        help="run.mcap with images, without them, or none (default: full for devices, lean for recordings)",
+        help="write run.mcap with images (full), without (lean), or not at all (default: full for devices, else lean)",
     )
     parser.add_argument(
         "--image-format",
         choices=("png", "raw", "jpeg"),
-        help="images of --log full (default: raw for devices, which leaves the time to track; else png)",
+        help="image format of --log full (default: raw, the fastest, for devices; png for others)",
     )
     parser.add_argument(
-        "--viz", choices=("none", "spawn", "serve", "save"), default="none", help="show it in rerun; save: run.rrd"
+        "--viz",
+        choices=("none", "spawn", "serve", "save"),
+        default="none",
+        help="show the run in rerun: open the viewer (spawn), serve browsers (serve) or write run.rrd (save)",
     )
     add_viewer_address(parser)
 
 
 def add_viewer_address(parser: argparse.ArgumentParser) -> None:
-    """Option that opens a viewer to other computers."""
+    """Option that makes a served viewer reachable from other computers."""
     parser.add_argument(
         "--viz-address",
         default="127.0.0.1",
         metavar="ADDRESS",
-        help="what a served viewer listens on (default: this computer only; 0.0.0.0 lets everybody look and write)",
+        help="address a served viewer listens on (default: this computer only; 0.0.0.0: anyone can view and write)",
     )
 
 
-def add_talk_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options that say how much is told."""
+def add_verbosity_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options for how much is printed."""
     parser.add_argument("-q", "--quiet", action="store_true", help="no progress and no summary")
     parser.add_argument(
-        "-v", "--verbose", action="store_true", help="say what happens: lost, found again, loops, jumps of the map"
+        "-v",
+        "--verbose",
+        action="store_true",
+        help="print events: loss and recovery of tracking, loops, map corrections",
     )
 
 
 def load_config(args: argparse.Namespace) -> Config:
-    """The configuration that the options of `add_config_arguments` ask for."""
+    """The configuration given by the options of `add_config_arguments`."""
     from stereo_sfm import config
 
     overrides = [f"odometry.method={args.odometry}"] if args.odometry is not None else []
@@ -136,13 +144,13 @@ def load_config(args: argparse.Namespace) -> Config:
         raise StereoSfmError("--features needs an estimator that uses descriptors: add --odometry em-r (or another)")
     if chosen.odometry.scale != "stereo" and chosen.odometry.method == "flow":
         logging.getLogger("stereo_sfm").warning(
-            "odometry.scale does nothing with the default tracker, whose steps have a length: it is for --odometry"
+            "odometry.scale has no effect on the default tracker, which knows the scale: it is for --odometry"
         )
     return chosen
 
 
 def source_choice(args: argparse.Namespace, realtime: bool = False, speed: float | None = None) -> SourceChoice:
-    """The source that the options of `add_source_arguments` ask for; `realtime`: recordings at their own speed."""
+    """The source given by the options of `add_source_arguments`; `realtime`: recordings at their own speed."""
     from stereo_sfm.demo import demo_recording
     from stereo_sfm.drivers.choice import SourceChoice
     from stereo_sfm.drivers.selection import Selection
@@ -156,7 +164,7 @@ def source_choice(args: argparse.Namespace, realtime: bool = False, speed: float
 
 
 def wiring_of(args: argparse.Namespace) -> Wiring:
-    """What the options of `add_wiring_arguments` ask for."""
+    """The wiring given by the options of `add_wiring_arguments`."""
     from stereo_sfm.pipeline.session import Wiring
 
     mode = "realtime" if args.realtime else args.mode

@@ -1,4 +1,4 @@
-"""Progress on a terminal, the same for every command: done, rate, time left, a state. Nothing where there is none."""
+"""Progress on a terminal, the same for every command: count, rate, time left, state. Nothing without a terminal."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class NoProgress:
     def step(self, state: str, line: str = "") -> None:
         """One more is done; `line` is printed above the bar and stays."""
 
-    def say(self, state: str) -> None:
-        """What goes on before the next one is done."""
+    def show(self, state: str) -> None:
+        """Show a state before the next step is done."""
 
 
 class TerminalProgress(NoProgress):
@@ -64,12 +64,12 @@ class TerminalProgress(NoProgress):
         if line:
             self._progress.console.print(line, markup=False, highlight=False)
 
-    def say(self, state: str) -> None:
+    def show(self, state: str) -> None:
         self._progress.update(self._task, state=state)
 
 
 class LinesOnly(NoProgress):
-    """Where there is no terminal: the lines that stay."""
+    """Without a terminal: prints only the permanent lines."""
 
     def step(self, state: str, line: str = "") -> None:
         if line:
@@ -79,35 +79,35 @@ class LinesOnly(NoProgress):
 def progress(
     name: str, total: int | None, quiet: bool, unit: str = "frames", done: int = 0, state: str = ""
 ) -> NoProgress:
-    """A bar if standard error is a terminal and nobody asked for quiet.
+    """A progress bar if standard error is a terminal and `quiet` is false.
 
     Args:
-        name: of what is done. total: how many there are, None where nobody knows. done: of them before it begins.
-        quiet: nothing at all. unit: what is counted. state: what stands beside the bar until the first step.
+        name: of the task. total: number of steps, None if unknown. done: steps done before.
+        quiet: show nothing. unit: what is counted. state: text beside the bar until the first step.
     """
     if quiet:
         return NoProgress()
     return TerminalProgress(name, total, unit, done, state) if sys.stderr.isatty() else LinesOnly()
 
 
-class CompilingShown:
-    """A sink: the first run on a machine compiles its kernels, and says which one beside the bar."""
+class CompilationProgress:
+    """A sink that shows which kernel the first run on a machine is compiling."""
 
     def __init__(self) -> None:
         self.bar = NoProgress()
         self._kernels = 0
 
     def put(self, message: object) -> None:
-        """Any message of a run."""
+        """Take any message of a run."""
         if not isinstance(message, Compiling):
             return
         self._kernels += 1
         if self._kernels == 1 and isinstance(self.bar, LinesOnly):
             print("first run on this machine: compiling the numerical kernels, a minute or two", file=sys.stderr)
-        self.bar.say(f"first run here: compiling {message.kernel} ({message.stage}), kernel {self._kernels}")
+        self.bar.show(f"first run here: compiling {message.kernel} ({message.stage}), kernel {self._kernels}")
 
 
 def frame_state(frame: Frame) -> str:
-    """What the bar of a run says of a frame."""
+    """The state of a frame beside the progress bar."""
     state = frame.state.name if not frame.reason else f"{frame.state.name} ({frame.reason})"
     return f"{state} · {int(frame.observations.inlier.sum())} points"

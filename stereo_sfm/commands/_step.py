@@ -1,4 +1,4 @@
-"""`replay --step`: stop at every frame, from a time on, and say what became of it."""
+"""`replay --step`: stop at every frame from a given time on and describe it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Stepper:
         self._first_ns: int | None = None
 
     def go_on(self, frame: Frame) -> bool:
-        """Show a frame and wait for Enter; False when the user has seen enough (q, or the end of the input)."""
+        """Show a frame and wait for Enter; False when the user quits (q, or the end of the input)."""
         self._first_ns = frame.stamp_ns if self._first_ns is None else self._first_ns
         seconds = (frame.stamp_ns - self._first_ns) * 1e-9
         if seconds < self._seek_s:

@@ -15,7 +15,7 @@ INTERRUPTED = 130  # exit code, as shells give it for Ctrl-C
 
 
 class StopRequest:
-    """While entered, the first of the signals only sets `asked` and calls `then`; the loop ends at its next round."""
+    """While entered, the first signal only sets `asked` and calls `then`; the loop ends at its next iteration."""
 
     def __init__(self, limit_s: float = 0.0) -> None:
         """Args: limit_s, seconds after which the first signal counts as the second; 0: never."""
@@ -26,7 +26,7 @@ class StopRequest:
 
     def __enter__(self) -> Self:
         for number in (*STOP_SIGNALS, signal.SIGALRM):
-            if (number, signal.getsignal(number)) != (signal.SIGHUP, signal.SIG_IGN):  # which is what nohup does
+            if (number, signal.getsignal(number)) != (signal.SIGHUP, signal.SIG_IGN):  # as set by nohup
                 self._previous[number] = signal.signal(number, self._handle)
         return self
 
@@ -38,7 +38,7 @@ class StopRequest:
             signal.signal(number, handler)
 
     def finished(self) -> None:
-        """What was to be finished is; what comes now may take its time."""
+        """The run has finished; the time limit no longer applies."""
         signal.setitimer(signal.ITIMER_REAL, 0.0)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
@@ -47,6 +47,6 @@ class StopRequest:
         self.asked = True
         signal.setitimer(signal.ITIMER_REAL, self._limit_s)
         with contextlib.suppress(OSError):  # the terminal may be gone
-            print("\nfinishing (once more to abort)", file=sys.stderr)
+            print("\nfinishing (Ctrl-C again to abort)", file=sys.stderr)
         if self.then is not None:
             self.then()

@@ -1,4 +1,4 @@
-"""`stereo-sfm ablation`: features, estimators and modules of the papers on any sources, beside our default."""
+"""`stereo-sfm ablation`: features, estimators and modules of the papers on any sources, and the default system."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from stereo_sfm.eval.ablation import Cell
 
-# configuration that tells the cells apart -> the option that chooses it
+# configuration that distinguishes the cells -> the option that chooses it
 DECIDED = {
     "seed": "--seed",
     "features.kind": "--features",
@@ -32,22 +32,26 @@ DECIDED = {
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
     parser.add_argument("sources", nargs="+", metavar="SOURCE", help="dataset folders, recordings, sim:SCENE")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="tables, plots and cells")
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes at once")
-    parser.add_argument("--frames", type=int, default=0, metavar="N", help="at most so many frames of each source")
-    parser.add_argument("--features", metavar="A,B", help="of orb, sift, akaze (default: all)")
+    parser.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="DIR", help="folder of tables, plots and results"
+    )
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="number of parallel processes")
+    parser.add_argument("--frames", type=int, default=0, metavar="N", help="use at most N frames of each source")
+    parser.add_argument("--features", metavar="A,B", help="some of orb, sift, akaze (default: all)")
     parser.add_argument("--odometry", metavar="A,B", help="motion estimators (default: em-r, vp-r, r-um, um)")
-    parser.add_argument("--stages", metavar="A,B", help="of tracking, mapping, averaging, pose_graph (default: all)")
-    parser.add_argument("--systems", metavar="A,B", help="presets to add (default: all; none: leave them out)")
+    parser.add_argument(
+        "--stages", metavar="A,B", help="some of tracking, mapping, averaging, pose_graph (default: all)"
+    )
+    parser.add_argument("--systems", metavar="A,B", help="presets to add (default: all; none: omit them)")
     parser.add_argument(
         "--set",
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="one value in every cell, as odometry.refine=false",
+        help="set one value in every cell, as in odometry.refine=false",
     )
-    parser.add_argument("--seed", type=int, default=0, help="of everything random")
-    parser.add_argument("--again", action="store_true", help="compute cells anew that are there already")
+    parser.add_argument("--seed", type=int, default=0, help="random seed")
+    parser.add_argument("--again", action="store_true", help="recompute cells that have a result")
     parser.add_argument("-q", "--quiet", action="store_true", help="no progress")
 
 
@@ -89,13 +93,13 @@ def ablation(options: AblationOptions) -> int:
     report = write_report(folder, answers)
     if not whole:
         print(
-            f"interrupted with {len(answers)} of {len(cells)} cells; the same command goes on: {report}",
+            f"interrupted with {len(answers)} of {len(cells)} cells; run the same command to continue: {report}",
             file=sys.stderr,
         )
         return INTERRUPTED
     if not options.quiet:
         good = sum(answer["status"] == "ok" for answer in answers)
-        print(f"{good} of {len(cells)} cells with a result, {len(cells) - good} with a reason why not: {report}")
+        print(f"{good} of {len(cells)} cells with a result, {len(cells) - good} without, see the reasons in {report}")
     return 0
 
 
@@ -110,7 +114,7 @@ def _cells(options: AblationOptions) -> list[Cell]:
     for setting in options.set:
         key = setting.partition("=")[0].strip()
         if key in DECIDED:
-            raise StereoSfmError(f"--set {key}: the cells differ in it, choose them with {DECIDED[key]}")
+            raise StereoSfmError(f"--set {key} has no effect here: use {DECIDED[key]} to choose the cells")
     return ablation.grid(
         _different(options.sources),
         _chosen(options.features, ablation.FEATURES, FEATURES, "features"),
@@ -132,17 +136,17 @@ def _different(sources: Sequence[str]) -> list[str]:
 
 
 def _check_sources(cells: Sequence[Cell]) -> None:
-    """Before anything is computed: every source can be opened and knows the truth that the cells are judged by.
+    """Check, before anything is computed, that every source can be opened and has ground truth.
 
     Raises:
-        StereoSfmError: one does not.
+        StereoSfmError: one cannot be opened or has none.
     """
     from stereo_sfm.drivers.source import open_source
 
     for spec in dict.fromkeys(cell.source for cell in cells):
         with open_source(spec) as source:
             if source.ground_truth is None:
-                raise StereoSfmError(f"{source.name} has no ground truth: there is nothing to judge the cells by")
+                raise StereoSfmError(f"{source.name} has no ground truth to evaluate the cells against")
 
 
 def _chosen(text: str | None, default: Sequence[str], known: Iterable[str], what: str) -> Sequence[str]:
@@ -157,12 +161,12 @@ def _chosen(text: str | None, default: Sequence[str], known: Iterable[str], what
 
 
 def _run_all(cells: Sequence[Cell], store: Path, jobs: int, quiet: bool, total: int) -> bool:
-    """Spread the cells over processes; each file is written by the process that computed it.
+    """Distribute the cells over processes; each file is written by the process that computed it.
 
-    After Ctrl-C the cells that run are finished, and no other is begun.
+    After Ctrl-C the running cells are finished and no other is started.
 
     Returns:
-        Whether it came to the end.
+        Whether all cells were run.
     """
     import multiprocessing
     from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -180,7 +184,7 @@ def _run_all(cells: Sequence[Cell], store: Path, jobs: int, quiet: bool, total: 
     ):
         try:
             while True:
-                # Not all at once: what waits in the pool could not be called back.
+                # Not all at once: jobs waiting in the pool could not be cancelled.
                 while left and len(running) < jobs and not stop.asked:
                     cell = left.pop()
                     with ignored_by_children():
@@ -196,7 +200,7 @@ def _run_all(cells: Sequence[Cell], store: Path, jobs: int, quiet: bool, total: 
                 return False
             raise StereoSfmError(
                 "a process died while it computed a cell (too little memory? try fewer --jobs); "
-                "what is finished is kept, the same command goes on from there"
+                "finished cells are kept, run the same command to continue"
             ) from None
         except KeyboardInterrupt:
             for child in multiprocessing.active_children():

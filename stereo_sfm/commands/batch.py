@@ -23,15 +23,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     parser.add_argument("recordings", nargs="+", help="files, folders, sim:SCENE, or quoted patterns")
     parser.add_argument(
-        "-o", "--output", type=Path, required=True, help="folder of all results; continued if it exists"
+        "-o", "--output", type=Path, required=True, help="folder for all results; an existing batch is continued"
     )
-    parser.add_argument("--address", help="of a Ray cluster (default: this machine)")
-    parser.add_argument("--no-merge", action="store_true", help="do not join the walks' maps into one")
+    parser.add_argument("--address", help="address of a Ray cluster (default: this machine)")
+    parser.add_argument("--no-merge", action="store_true", help="do not merge the maps of the recordings")
     add_config_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run all, write the table, merge the maps. A recording that fails stops none of the others."""
+    """Run all, write the table, merge the maps. A failed recording does not stop the others."""
     from stereo_sfm.commands._options import load_config
     from stereo_sfm.eval import batch
 
@@ -73,7 +73,7 @@ def _results(tasks: Sequence[BatchTask], address: str | None) -> Iterator[tuple[
 
 
 def _expand(patterns: list[str]) -> list[str]:
-    """Patterns as the shell would expand them, everything else as it is; paths made absolute for other nodes."""
+    """Expand patterns as a shell does; paths become absolute for other nodes."""
     out: list[str] = []
     for pattern in patterns:
         found = sorted(glob.glob(pattern))

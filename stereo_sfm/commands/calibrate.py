@@ -1,4 +1,4 @@
-"""`stereo-sfm calibrate`: pictures of a target become a rig, a report and a verdict."""
+"""`stereo-sfm calibrate`: a rig, a report and a verdict from images of a target."""
 
 from __future__ import annotations
 
@@ -19,21 +19,25 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument("source", help="a folder of left*/right* pictures, a recording, a live camera, any source")
+    parser.add_argument(
+        "source", help="a folder of left*/right* images, a recording, a live camera, or any other source"
+    )
     parser.add_argument("--target", required=True, help="charuco, checkerboard, aprilgrid, or a target's YAML file")
     parser.add_argument("--columns", type=int, help="inner corners (checkerboard), squares (charuco), tags (aprilgrid)")
     parser.add_argument("--rows", type=int)
-    parser.add_argument("--square", type=float, metavar="M", help="metres: side of a square or of an AprilTag")
+    parser.add_argument("--square", type=float, metavar="M", help="side of a square or of an AprilTag in metres")
     parser.add_argument("--ratio", type=float, default=None, help="marker / square (charuco), gap / tag (aprilgrid)")
     parser.add_argument("--dictionary", default="DICT_4X4_50", help="charuco markers, OpenCV's name")
     parser.add_argument(
         "--model", choices=("pinhole", "rational", "kb4"), default="pinhole", help="lens (fisheye: kb4)"
     )
     parser.add_argument("-o", "--output", type=Path, required=True, help="rig file to write")
-    parser.add_argument("--format", choices=NAMES, default=None, help="its format (default: ours; see convert-calib)")
+    parser.add_argument(
+        "--format", choices=NAMES, default=None, help="format of the rig file (default: rig; see convert-calib)"
+    )
     parser.add_argument("--report", type=Path, default=None, help="HTML report (default: beside the rig)")
-    parser.add_argument("--views", type=int, default=60, help="views at most")
-    parser.add_argument("--overwrite", action="store_true", help="replace the rig and the report that are there")
+    parser.add_argument("--views", type=int, default=60, help="largest number of views to use")
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing rig and report")
 
 
 @dataclass(frozen=True)
@@ -56,7 +60,7 @@ class CalibrateOptions:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Gather, solve, judge, write."""
+    """Collect views, calibrate, judge, write."""
     options = typed(CalibrateOptions, args)
     from dataclasses import replace
 
@@ -89,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check_files(rig: Path, report: Path, overwrite: bool) -> None:
-    """Before the pictures are searched: both can be written, and nothing is lost by it."""
+    """Check before the images are searched that both files can be written without losing existing ones."""
     from stereo_sfm.errors import StereoSfmError
 
     if rig.resolve() == report.resolve():
@@ -99,7 +103,7 @@ def _check_files(rig: Path, report: Path, overwrite: bool) -> None:
             raise StereoSfmError(f"{path} exists: choose another file or give --overwrite")
         folder = next(p for p in path.absolute().parents if p.exists())
         if not folder.is_dir() or not os.access(folder, os.W_OK):
-            raise StereoSfmError(f"cannot write {path}: {folder} is no folder that can be written to")
+            raise StereoSfmError(f"cannot write {path}: {folder} is not a writable folder")
     if report.is_dir():
         raise StereoSfmError(f"cannot write the report {report}: it is a folder")
 
@@ -121,29 +125,29 @@ def make_target(options: CalibrateOptions) -> Target:
 def collect(
     source: str, target: Target, limit: int
 ) -> tuple[list[Detection], list[Detection], list[tuple[U8, U8]], tuple[int, int], float]:
-    """Detections of both eyes from a folder of pictures or from a source, telling what is still missing.
+    """Detections of both cameras from a folder of images or from a source, reporting which views are still missing.
 
-    The last value is the readout that the source's own calibration states: pictures of a target do not show it.
+    The last value is the readout time in the source's own calibration: images of a target do not show it.
     """
     from stereo_sfm.calib.coverage import coverage
     from stereo_sfm.calib.views import find_pairs, gather, read_pairs, stereo_pairs
     from stereo_sfm.drivers.source import open_source
     from stereo_sfm.errors import StereoSfmError
 
-    def tell(number: int, left: list[Detection], right: list[Detection], size: tuple[int, int]) -> None:
+    def report(number: int, left: list[Detection], right: list[Detection], size: tuple[int, int]) -> None:
         advice = coverage(left, size).advice or coverage(right, size).advice
         seen = f"{len(left[-1])} and {len(right[-1])} corners"
-        print(f"view {number}: {seen}; {advice[0] if advice else 'enough, more does no harm'}", file=sys.stderr)
+        print(f"view {number}: {seen}; {advice[0] if advice else 'enough views, more do no harm'}", file=sys.stderr)
 
     folder = Path(source).expanduser()
     readout_s = 0.0
     pairs = find_pairs(folder) if folder.is_dir() and not (folder / "mav0").is_dir() else []
     if pairs:
-        found = gather(read_pairs(pairs), target, limit, every_view=True, report=tell)
+        found = gather(read_pairs(pairs), target, limit, every_view=True, report=report)
     else:
         with open_source(source) as opened:
             try:
-                found = gather(stereo_pairs(iter(opened)), target, limit, every_view=False, report=tell)
+                found = gather(stereo_pairs(iter(opened)), target, limit, every_view=False, report=report)
             except KeyboardInterrupt:
                 raise StereoSfmError("interrupted before the calibration was computed") from None
             readout_s = opened.rig.readout_s

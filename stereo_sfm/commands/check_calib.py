@@ -22,11 +22,13 @@ SHUTTER_FRAMES = 200  # looked at for a rolling shutter
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     add_source(parser)
-    parser.add_argument("--rig", type=Path, default=None, help="calibration to judge instead of the source's own")
-    parser.add_argument("--windows", type=int, default=10, help="short stretches of the recording to look at")
-    parser.add_argument("--max-frames", type=int, default=600, help="stop reading after so many frames")
-    parser.add_argument("--search", type=int, default=14, metavar="ROWS", help="rows to search above and below")
-    parser.add_argument("--correct", type=Path, default=None, metavar="FILE", help="write the corrected rig there")
+    parser.add_argument("--rig", type=Path, default=None, help="calibration file to check instead of the source's own")
+    parser.add_argument("--windows", type=int, default=10, help="number of short segments of the recording to use")
+    parser.add_argument("--max-frames", type=int, default=600, help="stop after N frames")
+    parser.add_argument(
+        "--search", type=int, default=14, metavar="ROWS", help="search range for row errors, in rows above and below"
+    )
+    parser.add_argument("--correct", type=Path, default=None, metavar="FILE", help="write the corrected rig to FILE")
     parser.add_argument("--overwrite", action="store_true", help="replace the file of --correct")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
@@ -85,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _searched(images: Iterable[StereoImage], shutter: ReadoutSearch) -> Iterator[StereoImage]:
-    """The images, the first of them tracked on the way."""
+    """Pass the images on, and the first of them to the search for a rolling shutter."""
     for number, image in enumerate(images):
         if number < SHUTTER_FRAMES and image.right is not None:
             shutter.add(image)
@@ -99,14 +101,14 @@ def _shutter(known: str, errors: ReadoutErrors) -> Finding:
     if not errors.shown:
         return Finding("shutter", 0, f"{known}; {UNKNOWN}", judged=False)
     if errors.explained_otherwise:
-        how = "the gain does not follow the motion, as that of a rolling shutter does: the calibration may be off"
+        how = "the gain does not depend on the motion as with a rolling shutter: the calibration may be wrong"
         return Finding("shutter", 0, f"{known}; another readout fits {100 * errors.gain:.0f} % better, but {how}")
     if best_ms == own_ms:
         return Finding("shutter", 0, f"{known}; points are off by {errors.error_px[0]:.2f} px (median)")
     better = f"{known}, but points fit {100 * errors.gain:.0f} % better"
     if best_ms < own_ms:
-        return Finding("shutter", 1, f"{better} within {best_ms:g} ms: is readout_s in rig.yaml right?")
-    how = f"if rows are read within {best_ms:g} ms or more: set readout_s in rig.yaml, a data sheet tells it"
+        return Finding("shutter", 1, f"{better} with a readout of {best_ms:g} ms: check readout_s in rig.yaml")
+    how = f"with a readout of {best_ms:g} ms or more: set readout_s in rig.yaml (see the data sheet)"
     return Finding("shutter", 1, f"{better} {how}")
 
 
@@ -125,12 +127,12 @@ def _check(options: CheckOptions) -> None:
 
 
 def as_text(report: CheckReport, name: str) -> str:
-    """What a person reads."""
+    """The report as text."""
     import numpy as np
 
-    lines = [f"{name}: {report.matches} stereo matches in {report.windows} stretches"]
+    lines = [f"{name}: {report.matches} stereo matches in {report.windows} segments"]
     lines += [f"  {f.verdict or '  - '}  {f.name}: {f.text}" for f in report.findings]
-    lines.append("row error by image region (median, px; - where nothing was matched):")
+    lines.append("row error by image region (median, px; - without matches):")
     for row in report.region_median:
         lines.append("  " + "  ".join("     -" if np.isnan(v) else f"{v:+6.2f}" for v in row))
     lines.append(f"verdict: {report.verdict}" + (_advice(report) if report.level else ""))
@@ -138,10 +140,10 @@ def as_text(report: CheckReport, name: str) -> str:
 
 
 def _written(report: CheckReport, path: Path) -> list[str]:
-    """What the corrected rig holds, one line a term."""
-    lines = [f"{path}: {'corrected' if report.choice.written.any() else 'as it was, nothing has the evidence'}"]
+    """The content of the corrected rig, one line per parameter."""
+    lines = [f"{path}: {'corrected' if report.choice.written.any() else 'unchanged, the images support no correction'}"]
     lines += [f"  {term.line}" for term in report.choice.terms]
-    kept = "left as they are: images alone do not prove them"
+    kept = "unchanged: they cannot be determined from images alone"
     return [*lines, f"  focal length of both cameras, length of the baseline: {kept}"]
 
 
@@ -150,7 +152,7 @@ def _advice(report: CheckReport) -> str:
     what = " and ".join(names)
     if report.verdict == "WARN":
         return f" (usable; {what} could be better)"
-    return f" ({what}): calibrate again, or try 'check-calib --correct rig.yaml' and check that"
+    return f" ({what}): calibrate again, or try 'check-calib --correct rig.yaml' and check the corrected file"
 
 
 def as_dict(report: CheckReport) -> dict[str, Any]:

@@ -8,24 +8,24 @@ import sys
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
-    parser.add_argument("-q", "--quiet", action="store_true", help="do not say what is compiled")
+    parser.add_argument("-q", "--quiet", action="store_true", help="do not print what is compiled")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run every stage once on made images; later runs find what was compiled."""
+    """Run every stage once on synthetic images; later runs load the compiled kernels."""
     from stereo_sfm.config import Config
     from stereo_sfm.demo import demo_recording
     from stereo_sfm.drivers.source import open_source
     from stereo_sfm.kernel_cache import listening
     from stereo_sfm.pipeline.warm_up import warm_up_stage
 
-    def tell(kernel: str) -> None:
+    def report(kernel: str) -> None:
         if not args.quiet:
             print(f"compiling {kernel}", file=sys.stderr)
 
-    with listening(tell) as compilation, open_source(str(demo_recording())) as source:
+    with listening(report) as compilation, open_source(str(demo_recording())) as source:
         for stage in ("tracker", "mapper", "loop"):
             warm_up_stage(stage, Config(), source.rig)
     if not args.quiet:
-        print(f"{compilation.kernels} kernels compiled in {compilation.seconds:.0f} s; no run waits for them any more")
+        print(f"{compilation.kernels} kernels compiled in {compilation.seconds:.0f} s; later runs start at once")
     return 0

@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print every setting with its value and what it means, as TOML that `run -c` reads."""
+    """Print every setting with its value and description, as TOML that `run -c` reads."""
     from stereo_sfm import config
 
     print(config.explain(load_config(args)), end="")

@@ -16,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Convert everything that the source holds."""
+    """Convert the whole source."""
     options, choice = typed(RecordOptions, args), source_choice(args)
     choice.refuse_to_overwrite(options.output)
     with choice() as source:

@@ -1,4 +1,4 @@
-"""`stereo-sfm convert-calib IN OUT`: one calibration dialect to another."""
+"""`stereo-sfm convert-calib IN OUT`: convert between calibration formats."""
 
 from __future__ import annotations
 
@@ -11,16 +11,20 @@ NAMES = ("rig", "kalibr", "ros", "opencv", "euroc", "kitti", "basalt", "colmap",
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
-    parser.add_argument("input", type=Path, help="calibration file, or folder of one file an eye")
+    parser.add_argument("input", type=Path, help="calibration file, or folder with one file per camera")
     parser.add_argument("output", type=Path, help="file, or folder for ros, euroc, colmap and kapture")
-    parser.add_argument("--from", dest="source", choices=NAMES, default=None, help="default: by the content")
-    parser.add_argument("--to", dest="target", choices=NAMES, default=None, help="default: by the ending, else ours")
+    parser.add_argument(
+        "--from", dest="source", choices=NAMES, default=None, help="input format (default: by its content)"
+    )
+    parser.add_argument(
+        "--to", dest="target", choices=NAMES, default=None, help="output format (default: by the file name, else rig)"
+    )
     parser.add_argument("--size", default=None, metavar="WxH", help="image size, for files that do not state it")
     parser.add_argument("--overwrite", action="store_true", help="write over an existing file or into a folder")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read, write, say what it was."""
+    """Read, write, and print a description."""
     from stereo_sfm.calib import load_rig, save_rig
     from stereo_sfm.calib.formats import recognise
     from stereo_sfm.commands.rectify import parse_size
@@ -33,9 +37,9 @@ def run(args: argparse.Namespace) -> int:
     source = args.source or recognise(args.input)
     options = {} if args.size is None else {"size": parse_size(args.size)}
     if options and source not in ("opencv", "kitti"):
-        raise StereoSfmError(f"--size is for opencv and kitti files: a {source} file states its own")
+        raise StereoSfmError(f"--size is for opencv and kitti files: a {source} file contains the size")
     rig = load_rig(args.input, source, **options)
     save_rig(rig, args.output, args.target)
-    eyes = rig.left.model if rig.right is None else f"{rig.left.model} pair, baseline {1000 * rig.baseline:.2f} mm"
-    print(f"{source}: {eyes}, {rig.left.width}x{rig.left.height} px -> {args.output}")
+    cameras = rig.left.model if rig.right is None else f"{rig.left.model} pair, baseline {1000 * rig.baseline:.2f} mm"
+    print(f"{source}: {cameras}, {rig.left.width}x{rig.left.height} px -> {args.output}")
     return 0

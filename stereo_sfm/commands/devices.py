@@ -1,4 +1,4 @@
-"""`stereo-sfm devices`: which cameras are attached."""
+"""`stereo-sfm devices`: list the attached cameras."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import argparse
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
-    parser.add_argument("--json", action="store_true", help="for programs")
+    parser.add_argument("--json", action="store_true", help="print JSON")
     parser.add_argument(
-        "--probe", action="store_true", help="start cameras that tell their calibration only then (seconds)"
+        "--probe", action="store_true", help="start cameras whose calibration cannot be read otherwise (takes seconds)"
     )
 
 

@@ -1,4 +1,4 @@
-"""`stereo-sfm diff`: whether two logs hold the same, and where they part first."""
+"""`stereo-sfm diff`: compare two logs and show where they first differ."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("a", type=Path, metavar="A.mcap", help="one log")
     parser.add_argument("b", type=Path, metavar="B.mcap", help="the other")
     parser.add_argument("--topics", nargs="+", default=[], metavar="TOPIC", help="compare only these")
-    parser.add_argument("--tol", type=float, default=0.0, metavar="X", help="numbers may differ by this much")
-    parser.add_argument("--all", action="store_true", help="the first difference of every topic, not only the first")
+    parser.add_argument("--tol", type=float, default=0.0, metavar="X", help="tolerance for numbers")
+    parser.add_argument(
+        "--all", action="store_true", help="print the first difference of every topic, not only the first of all"
+    )
 
 
 def run(args: argparse.Namespace) -> int:

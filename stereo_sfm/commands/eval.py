@@ -24,17 +24,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
     parser.add_argument("estimate", type=Path, help="a run's folder, or a trajectory file (TUM, KITTI, EuRoC)")
     parser.add_argument(
-        "--ref", help="ground truth: a trajectory file, or a source that knows it (default: what the run knows itself)"
+        "--ref",
+        help="ground truth: a trajectory file, or a source that has it (default: the ground truth in the run's log)",
     )
-    parser.add_argument("--which", choices=("odom", "map", "keyframes"), help="of a run (default: map, else odom)")
-    parser.add_argument("--align", choices=("se3", "sim3", "origin", "none"), default="se3")
-    parser.add_argument("--delta", default="1f", help="relative errors over frames (1f) or metres (1m)")
     parser.add_argument(
-        "--t-max-diff", type=float, metavar="S", help="compare nearest stamps within S seconds instead of interpolating"
+        "--which", choices=("odom", "map", "keyframes"), help="trajectory of a run (default: map, else odom)"
     )
-    parser.add_argument("--max-ape", type=float, metavar="METRES", help="exit with 3 if the ATE is above")
+    parser.add_argument("--align", choices=("se3", "sim3", "origin", "none"), default="se3")
+    parser.add_argument("--delta", default="1f", help="distance of relative errors in frames (1f) or metres (1m)")
+    parser.add_argument(
+        "--t-max-diff",
+        type=float,
+        metavar="S",
+        help="compare the nearest poses within S seconds instead of interpolating",
+    )
+    parser.add_argument("--max-ape", type=float, metavar="METRES", help="exit with 3 if the ATE is larger")
     parser.add_argument("--json", action="store_true", help="print JSON")
-    parser.add_argument("--plot", type=Path, metavar="FOLDER", help="draw trajectory.png and errors.png there")
+    parser.add_argument("--plot", type=Path, metavar="FOLDER", help="write trajectory.png and errors.png to FOLDER")
 
 
 @dataclass(frozen=True)
@@ -68,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
     )
     if result.frames > 1 and not result.rpe_m.count:
         raise StereoSfmError(
-            f"--delta {options.delta} is longer than what is compared: {result.frames} poses, {result.length_m:.3g} m"
+            f"--delta {options.delta} is longer than the compared part: {result.frames} poses, {result.length_m:.3g} m"
         )
     if options.plot is not None:
         _plot(options.plot, options.estimate.stem, result)
@@ -91,7 +97,7 @@ def _check_ranges(options: EvalOptions) -> None:
 
 
 def load(path: Path, which: str | None, spec: str | None) -> tuple[Trajectory, Trajectory]:
-    """Estimate and reference: with the stamps of the other where one has none, and poses of the same frame."""
+    """Estimate and reference, both with stamps and with poses of the same frame."""
     file = estimate_file(path, which)
     reference, truth_file = (
         (own_truth(file.parent), None) if spec is None else load_reference(spec, _opening(file.parent))
@@ -115,7 +121,7 @@ def estimate_file(path: Path, which: str | None) -> Path:
     names = ["keyframes.tum"] if which == "keyframes" else names
     found = next((path / name for name in names if (path / name).is_file()), None)
     if found is None:
-        raise StereoSfmError(f"{path} is no run's folder: it has no {' or '.join(names)}")
+        raise StereoSfmError(f"{path} is not the folder of a run: it has no {' or '.join(names)}")
     return found
 
 
@@ -134,11 +140,11 @@ def own_truth(folder: Path) -> Trajectory:
             truth = attached_truth(reader)
         if truth is not None:
             return truth
-    raise StereoSfmError(f"{folder} knows no ground truth: name it with --ref (a trajectory file, or a source)")
+    raise StereoSfmError(f"{folder} contains no ground truth: give it with --ref (a trajectory file, or a source)")
 
 
 def load_reference(spec: str, opening: Opening) -> tuple[Trajectory, Path | None]:
-    """The ground truth of a file, and that file; or of a source, seen as the run saw its own."""
+    """The ground truth in a file, and that file; or of a source, opened as the run opened its own."""
     from stereo_sfm.drivers.choice import SourceChoice
     from stereo_sfm.drivers.ground_truth import read_trajectory
 
@@ -152,7 +158,7 @@ def load_reference(spec: str, opening: Opening) -> tuple[Trajectory, Path | None
 
 
 def _opening(folder: Path) -> Opening:
-    """How the run of a folder saw its source; as it is where the folder has no log."""
+    """How a run opened its source; the default if its folder has no log."""
     from stereo_sfm.log.provenance import Opening
     from stereo_sfm.log.reader import LogReader
     from stereo_sfm.log.recorded import read_opening
@@ -164,7 +170,7 @@ def _opening(folder: Path) -> Opening:
 
 
 def _with_stamps(path: Path, other: Trajectory) -> Trajectory:
-    """The trajectory of a file; one without stamps takes those of the other, line by line."""
+    """The trajectory in a file; without stamps it takes those of the other, line by line."""
     from stereo_sfm.drivers.ground_truth import has_stamps, read_kitti, read_trajectory
 
     if has_stamps(path):
@@ -172,13 +178,13 @@ def _with_stamps(path: Path, other: Trajectory) -> Trajectory:
     lines = len(read_trajectory(path))
     if lines != len(other):
         raise StereoSfmError(
-            f"{path} has no stamps and {lines} lines, what it is compared with {len(other)} poses: take the TUM form"
+            f"{path} has no stamps, and its {lines} lines do not match {len(other)} poses: use the TUM format"
         )
     return read_kitti(path, other.stamp_ns)
 
 
 def _pose_frame(path: Path) -> str:
-    """Whose poses a file holds, "cam0" or "body", by its heading or else by its run; "" where nothing says it."""
+    """The frame of the poses in a file, "cam0" or "body", by its header or by its run; "" if unknown."""
     from stereo_sfm.export.trajectories import named_pose
 
     named = named_pose(path, "").removeprefix("world_T_")
@@ -197,7 +203,9 @@ def _in_cam0(bodies: Trajectory, path: Path) -> Trajectory:
     from stereo_sfm.types import Trajectory
 
     if not (path.parent / "rig.yaml").is_file():
-        raise StereoSfmError(f"{path} holds poses of the body, and no rig.yaml beside it leads to cam0")
+        raise StereoSfmError(
+            f"{path} holds poses of the body, and there is no rig.yaml beside it to convert them to cam0"
+        )
     body_T_cam = load_rig(path.parent / "rig.yaml").body_T_left
     return Trajectory(bodies.stamp_ns.copy(), se3.inverse(body_T_cam) @ bodies.poses @ body_T_cam, bodies.oriented)
 

@@ -118,25 +118,25 @@ def _write_with_images(saved: SavedMap, output: Path, options: ExportOptions, im
     check_session(saved, options.session)
     source = open_recording(images, saved.rig, load_rig(options.rig) if options.rig is not None else None)
     with source:
-        walk = options.session if options.session is not None else session_of_recording(saved, source, images)
+        session = options.session if options.session is not None else session_of_recording(saved, source, images)
         export_map(saved, output, "colmap")
-        write_keyframe_images(saved, source, walk, output, images)
+        write_keyframe_images(saved, source, session, output, images)
 
 
 def _write_trajectories(options: ExportOptions, output: Path) -> list[Path]:
     """One file, or one for each session of a merged map."""
     found, what = _trajectories(options)
-    paths = [output if len(found) == 1 else _of_walk(output, walk) for walk in found]
+    paths = [output if len(found) == 1 else _of_session(output, session) for session in found]
     _check_free(options, paths)
     for path, trajectory in zip(paths, found.values(), strict=True):
         export_trajectory(trajectory, path, options.format, what)
     return paths
 
 
-def _of_walk(path: Path, walk: int) -> Path:
+def _of_session(path: Path, session: int) -> Path:
     """map.tum -> map_walk1.tum."""
     ending = path.suffix if path.suffix in (".tum", ".kitti", ".csv", ".txt") else ""
-    return path.with_name(f"{path.name.removesuffix(ending)}_walk{walk}{ending}")
+    return path.with_name(f"{path.name.removesuffix(ending)}_walk{session}{ending}")
 
 
 def _trajectories(options: ExportOptions) -> tuple[dict[int, Trajectory], str]:

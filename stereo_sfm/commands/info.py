@@ -1,4 +1,4 @@
-"""`stereo-sfm info`: what a recording or dataset folder holds, and what is wrong with it."""
+"""`stereo-sfm info`: describe a recording or dataset folder and its problems."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ if TYPE_CHECKING:
     from stereo_sfm.recording.describe import Description, Rate
 
 
-_SHOWN = ("images", "dropped", "max_skew_ns")  # totals that the line about the images tells
+_SHOWN = ("images", "dropped", "max_skew_ns")  # totals in the line about the images
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
     parser.add_argument("path", type=Path, help="an .mcap file or a dataset folder")
-    parser.add_argument("--rig", type=Path, help="calibration instead of the recording's own")
-    parser.add_argument("--json", action="store_true", help="for machines")
+    parser.add_argument("--rig", type=Path, help="calibration file to use instead of the recording's own")
+    parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Describe and return 0; problems are printed, they are no error of this command."""
+    """Describe and return 0, also when problems are found and printed."""
     from stereo_sfm.recording.describe import describe_file, describe_folder
 
     path: Path = args.path.expanduser()
@@ -46,7 +46,7 @@ def _lines(found: Description) -> list[str]:
         lines.append(f"  {'config_sha256':<14} {found.config_sha256}")
     if found.images is not None:
         what = "frames, without their images" if found.metadata.get("image_format") == "none" else "images"
-        lines.append(f"{what}: {_rate(found.images)}, {found.dropped} counted as dropped" + _skew(found))
+        lines.append(f"{what}: {_rate(found.images)}, {found.dropped} dropped" + _skew(found))
     rest = {name: value for name, value in found.totals.items() if name not in _SHOWN}
     if rest:
         lines.append("totals: " + ", ".join(f"{value} {name}" for name, value in rest.items()))
@@ -62,7 +62,7 @@ def _lines(found: Description) -> list[str]:
 
 
 def _skew(found: Description) -> str:
-    return "" if math.isnan(found.skew_ms) else f", eyes at most {found.skew_ms:.3f} ms apart"
+    return "" if math.isnan(found.skew_ms) else f", left and right at most {found.skew_ms:.3f} ms apart"
 
 
 def _rate(rate: Rate) -> str:

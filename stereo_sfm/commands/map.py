@@ -1,4 +1,4 @@
-"""`stereo-sfm map`: what a saved map holds; merge, prune and export maps."""
+"""`stereo-sfm map`: describe, merge, prune and export saved maps."""
 
 from __future__ import annotations
 
@@ -18,30 +18,40 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
-    info = actions.add_parser("info", help="what a map holds")
+    info = actions.add_parser("info", help="describe a map")
     info.add_argument("map", type=Path, help="map folder")
-    merge = actions.add_parser("merge", help="several walks of one store become one map")
-    merge.add_argument("maps", type=Path, nargs="+", metavar="MAP", help="map folders; the first keeps its frame")
+    merge = actions.add_parser("merge", help="merge the maps of several sessions in one store")
+    merge.add_argument(
+        "maps", type=Path, nargs="+", metavar="MAP", help="map folders; the result is in the frame of the first"
+    )
     _output(merge)
-    merge.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="configuration, as in 'run'")
-    prune = actions.add_parser("prune", help="leave out points that are no longer there")
+    merge.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="set a configuration value, as in 'run'"
+    )
+    prune = actions.add_parser("prune", help="remove points that are no longer there")
     prune.add_argument("map", type=Path, help="map folder")
     _output(prune)
-    prune.add_argument("--min-views", type=int, default=0, metavar="N", help="points seen by fewer keyframes go")
     prune.add_argument(
-        "--min-seen-share", type=float, default=0.0, metavar="X", help="points seen in less of the views they lay in go"
+        "--min-views", type=int, default=0, metavar="N", help="remove points seen by fewer than N keyframes"
     )
     prune.add_argument(
-        "--unseen-sessions", type=int, default=0, metavar="N", help="points that the newest N walks did not see go"
+        "--min-seen-share",
+        type=float,
+        default=0.0,
+        metavar="X",
+        help="remove points seen in less than this share of the keyframes that had them in view",
+    )
+    prune.add_argument(
+        "--unseen-sessions", type=int, default=0, metavar="N", help="remove points not seen in the newest N sessions"
     )
     from stereo_sfm.commands import export
 
-    export.add_arguments(actions.add_parser("export", help="a map in the formats of other programs"))
+    export.add_arguments(actions.add_parser("export", help="export a map to the formats of other programs"))
 
 
 def _output(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder of the new map")
-    parser.add_argument("--overwrite", action="store_true", help="replace the map that lies there")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="folder for the new map")
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing map")
 
 
 @dataclass(frozen=True)
@@ -67,7 +77,7 @@ class PruneOptions:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do what the action says."""
+    """Run the chosen action."""
     if args.action == "export":
         from stereo_sfm.commands import export
 
@@ -85,7 +95,7 @@ def _info(folder: Path) -> int:
 
 
 def describe(saved: SavedMap) -> list[str]:
-    """What a map holds, for people."""
+    """The content of a map as text."""
     import numpy as np
 
     s = saved.snapshot
@@ -95,10 +105,10 @@ def describe(saved: SavedMap) -> list[str]:
     rig = saved.rig
     return [
         f"{len(s.kf_ids)} keyframes, {len(s.pt_ids)} points, {len(s.obs_kf)} observations"
-        f" ({views.mean():.1f} views a point)",
-        f"recognised by {len(s.corner_kf)} corners of {len(np.unique(s.corner_kf))} keyframes",
-        f"{int(saved.sessions.max()) + 1} walk(s), {len(np.unique(s.submap_ids))} submap(s),"
-        f" {float(steps[s.submap_ids[1:] == s.submap_ids[:-1]].sum()):.1f} m between keyframes",
+        f" ({views.mean():.1f} per point)",
+        f"{len(s.corner_kf)} corners for place recognition in {len(np.unique(s.corner_kf))} keyframes",
+        f"{int(saved.sessions.max()) + 1} session(s), {len(np.unique(s.submap_ids))} submap(s),"
+        f" {float(steps[s.submap_ids[1:] == s.submap_ids[:-1]].sum()):.1f} m of path along the keyframes",
         f"points extend {extent[0]:.1f} x {extent[1]:.1f} x {extent[2]:.1f} m",
         f"camera {rig.left.model} {rig.left.width}x{rig.left.height}, baseline {1000 * rig.baseline:.1f} mm",
         f"vocabulary {saved.vocabulary_id}",
@@ -118,16 +128,18 @@ def _merge(options: MergeOptions) -> int:
     maps = [load_map(folder) for folder in options.maps]
     for (name_a, a), (name_b, b) in combinations(zip(options.maps, maps, strict=True), 2):
         if share_a_session(a, b):
-            raise StereoSfmError(f"{name_a} and {name_b} hold the same walk: merge takes maps of different walks")
+            raise StereoSfmError(
+                f"{name_a} and {name_b} contain the same session: merge takes maps of different sessions"
+            )
     result = merge(maps, _vocabulary(maps[0], config.loop.vocabulary), config.loop, config.mapper)
     save_map(result.saved, options.output)
-    print(f"{len(maps)} maps joined by {len(result.loops)} loops, {result.fused} points seen by more than one walk")
+    print(f"{len(maps)} maps joined by {len(result.loops)} loops, {result.fused} points seen in more than one session")
     print("\n".join(describe(result.saved)))
     return 0
 
 
 def _vocabulary(saved: SavedMap, named: str) -> Vocabulary:
-    """The vocabulary to compare maps with: any will do, since maps keep their descriptors."""
+    """The vocabulary to compare maps with: any can be used, since maps keep their descriptors."""
     from stereo_sfm.loop.vocabulary_file import default_vocabulary, load_vocabulary
 
     return load_vocabulary(Path(named)) if named else default_vocabulary()
@@ -142,7 +154,7 @@ def _prune(options: PruneOptions) -> int:
     pruned = prune(saved, options.min_views, options.min_seen_share, options.unseen_sessions)
     save_map(pruned, options.output)
     before, after = saved.snapshot, pruned.snapshot
-    counts = f"{len(before.pt_ids)} points became {len(after.pt_ids)}, {len(saved)} keyframes {len(pruned)}"
+    counts = f"{len(before.pt_ids)} -> {len(after.pt_ids)} points, {len(saved)} -> {len(pruned)} keyframes"
     print(f"{counts}: {options.output}")
     return 0
 
@@ -153,6 +165,6 @@ def _check_free(output: Path, overwrite: bool) -> None:
 
     if (output / "map.json").exists():
         if not overwrite:
-            raise StereoSfmError(f"{output} holds a map: choose another -o, or say --overwrite")
+            raise StereoSfmError(f"{output} holds a map: choose another -o or give --overwrite")
     elif not is_free(output):
-        raise StereoSfmError(f"{output} exists and is no map: choose another -o")
+        raise StereoSfmError(f"{output} exists and is not a map: choose another -o")

@@ -41,7 +41,7 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True)
 class RecordOptions:
-    """What `record` and `convert` write, as the parser names it."""
+    """Options of `record` and `convert`, as the parser names them."""
 
     output: Path
     image_format: str
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def write(source: Source, options: RecordOptions, mode: str, opening: Opening | None = None) -> int:
-    """Write an entered source and say what came of it."""
+    """Write an entered source and print a summary."""
     from stereo_sfm.recording.record import record
 
     path = options.output

@@ -1,4 +1,4 @@
-"""`stereo-sfm recover`: a mended copy of a file that was not closed or is damaged."""
+"""`stereo-sfm recover`: a repaired copy of a file that was not closed or is damaged."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from stereo_sfm.errors import StereoSfmError
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
-    parser.add_argument("input", type=Path, metavar="IN.mcap", help="the file as it was left")
+    parser.add_argument("input", type=Path, metavar="IN.mcap", help="the file to repair")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.mcap", help="file to write")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing file")
 
@@ -23,7 +23,7 @@ def run(args: argparse.Namespace) -> int:
     if target.exists() and not args.overwrite:
         raise StereoSfmError(f"{target} exists: choose another name or use --overwrite")
     if target.exists() and target.samefile(source):
-        raise StereoSfmError("the mended copy needs another name: the original is kept")
+        raise StereoSfmError("the repaired copy needs another name: the original is kept")
     try:
         found = recover(source, target)
     except OSError as error:
@@ -31,12 +31,12 @@ def run(args: argparse.Namespace) -> int:
     first, last = found.time_range
     print(f"{target}: {found.messages} messages, {(last - first) / 1e9:.1f} s, {len(found.channels)} topics")
     if found.closed and not found.bad_chunks:
-        print(f"{source} was whole: nothing was missing")
+        print(f"{source} was complete: nothing had to be repaired")
         return 0
     lost = source.stat().st_size - found.end
     if not found.closed:
-        print(f"{source} was not closed: the last {lost} bytes are no whole record and are left out")
+        print(f"{source} was not closed: the incomplete record in its last {lost} bytes is omitted")
     if found.bad_chunks:
         size = sum(span.length for span in found.bad_chunks)
-        print(f"{len(found.bad_chunks)} damaged chunks ({size} bytes) are left out")
+        print(f"{len(found.bad_chunks)} damaged chunks ({size} bytes) are omitted")
     return 0

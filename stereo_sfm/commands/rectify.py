@@ -1,4 +1,4 @@
-"""`stereo-sfm rectify`: rectified pairs with epipolar lines that a person can check, the rig, and the row error."""
+"""`stereo-sfm rectify`: rectified image pairs with epipolar lines for inspection, the rig, and the row error."""
 
 from __future__ import annotations
 
@@ -19,18 +19,20 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the command."""
     add_source(parser)
-    parser.add_argument("-o", "--output", type=Path, required=True, help="folder for the pictures and rig.yaml")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="folder for the images and rig.yaml")
     parser.add_argument("--projection", choices=("epipolar", "pinhole"), default="epipolar")
     parser.add_argument("--hfov", type=float, default=None, metavar="DEG", help="horizontal field of view")
     parser.add_argument("--size", default=None, metavar="WxH", help="size of the rectified images")
     parser.add_argument("--rig", type=Path, default=None, help="calibration to use instead of the source's own")
-    parser.add_argument("--frames", type=int, default=5, help="pairs to write, spread over the source (default 5)")
-    parser.add_argument("--plain", action="store_true", help="write left and right images without lines instead")
+    parser.add_argument(
+        "--frames", type=int, default=5, help="pairs to write, evenly spread over the source (default: 5)"
+    )
+    parser.add_argument("--plain", action="store_true", help="write the left and right images without lines")
     parser.add_argument("--overwrite", action="store_true", help="write into a folder that is not empty")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Write the pictures, print the row error."""
+    """Write the images, print the row error."""
     import cv2
     import numpy as np
 
@@ -52,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
             if image.right is None:
                 raise _error(f"frame {image.frame_id} has no right image")
             left, right = rectification.apply(image.left, image.right)
-            if not errors:  # only now: the first pair has shown that the calibration is for these images
+            if not errors:  # only now, when the calibration is known to match the images
                 args.output.mkdir(parents=True, exist_ok=True)
                 save_rig(rectification.rig, args.output / "rig.yaml")
             matches = match_pair(rectification, left, right)
@@ -75,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
         return 0
     size = np.abs(row)
     print(f"row error of {len(row)} matches: median {np.median(row):+.2f} px,", end=" ")
-    print(f"of its size {np.median(size):.2f}, 95 % below {np.quantile(size, 0.95):.2f} px")
+    print(f"median size {np.median(size):.2f}, 95 % below {np.quantile(size, 0.95):.2f} px")
     return 0
 
 
@@ -90,7 +92,7 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
 
 
 def spread(source: Source, count: int) -> Iterator[StereoImage]:
-    """About `count` frames evenly over the source and no others; the first of one whose length is not known."""
+    """About `count` frames evenly spread over the source, or the first ones if its length is unknown."""
     known = source.frame_count if not source.live else None
     step = max(1, (known or count) // count)
     return islice(source.at(range(0, known or count, step)), count)

@@ -1,4 +1,4 @@
-"""`stereo-sfm replay`: execute a run again from its log, to the same bits."""
+"""`stereo-sfm replay`: repeat a run from its log, bit for bit."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stereo_sfm.commands._options import add_talk_arguments, add_wiring_arguments, typed, wiring_of
+from stereo_sfm.commands._options import add_verbosity_arguments, add_wiring_arguments, typed, wiring_of
 from stereo_sfm.errors import StereoSfmError
 
 if TYPE_CHECKING:
@@ -26,23 +26,27 @@ DIFFERENT = 3
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
     parser.add_argument("run", type=Path, help="run.mcap or the folder of a run")
-    parser.add_argument("--source", help="where the images are (default: in the log, else the run's own source)")
+    parser.add_argument("--source", help="source of the images (default: the log, else the run's own source)")
     parser.add_argument("-o", "--output", type=Path, help="output folder (default: runs/DATE_NAME)")
-    parser.add_argument("--overwrite", action="store_true", help="replace the run that lies in the output folder")
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing run in the output folder")
     parser.add_argument(
         "--schedule",
         choices=("recorded", "lockstep"),
-        help="when map updates reach the tracker: as the run recorded it, or by the lockstep rule (default: as it ran)",
+        help="when map updates reach the tracker: as recorded, or by the lockstep rule (default: as in the run)",
     )
-    parser.add_argument("--until", type=float, metavar="S", help="stop after this many seconds")
-    parser.add_argument("--step", action="store_true", help="show every frame and wait for Enter (in one process)")
-    parser.add_argument("--seek", type=float, default=0.0, metavar="S", help="with --step: go to this second first")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change a value, to compare")
-    parser.add_argument("--check", action="store_true", help="compare with the run; exit with 3 when they differ")
+    parser.add_argument("--until", type=float, metavar="S", help="stop after S seconds")
+    parser.add_argument("--step", action="store_true", help="describe every frame and wait for Enter (in one process)")
+    parser.add_argument("--seek", type=float, default=0.0, metavar="S", help="with --step: go to second S first")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="change a configuration value, to compare"
+    )
+    parser.add_argument("--check", action="store_true", help="compare with the run; exit with 3 if they differ")
     add_wiring_arguments(parser)
-    parser.add_argument("--frame", choices=("cam0", "body"), default="cam0", help="whose poses the trajectories hold")
+    parser.add_argument(
+        "--frame", choices=("cam0", "body"), default="cam0", help="frame whose poses the trajectories contain"
+    )
     parser.add_argument("--max-lost", type=float, default=100.0, metavar="PERCENT", help=argparse.SUPPRESS)
-    add_talk_arguments(parser)
+    add_verbosity_arguments(parser)
 
 
 @dataclass(frozen=True)
@@ -66,14 +70,14 @@ class ReplayOptions:
 
     @property
     def log_file(self) -> Path:
-        """Of the run."""
+        """The log of the run."""
         return self.run / "run.mcap" if self.run.is_dir() else self.run
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read what the run was, do it again, compare if asked."""
+    """Read the run, repeat it, and compare if asked to."""
     if args.realtime or args.speed is not None:
-        raise StereoSfmError("a replay takes its time from the run: --realtime and --speed go with 'run'")
+        raise StereoSfmError("a replay takes its timing from the run: --realtime and --speed go with 'run'")
     wiring = wiring_of(args)
     if args.check and wiring.log == "none":
         raise StereoSfmError("--check compares the logs of both runs: it needs --log lean or full")
@@ -92,16 +96,16 @@ def replay(options: ReplayOptions, wiring: Wiring) -> int:
 
 
 def _check(options: ReplayOptions) -> None:
-    """Raises StereoSfmError for options that do not go together, and for a run that is not there."""
+    """Raises StereoSfmError for incompatible options, and for a run that does not exist."""
     path = options.log_file
     if options.seek and not options.step:
-        raise StereoSfmError("--seek goes with --step: every frame must be executed to reach a later one")
+        raise StereoSfmError("--seek goes with --step: all earlier frames must be executed to reach a later one")
     if options.check and options.until is not None:
         raise StereoSfmError("--check compares whole runs: omit --until")
     if options.until is not None and not options.until >= 0:
         raise StereoSfmError(f"--until takes seconds after the first frame, got {options.until:g}")
     if options.output is not None and options.output.resolve() == path.resolve().parent:
-        raise StereoSfmError(f"{options.output} holds the run that is to be replayed: choose another -o")
+        raise StereoSfmError(f"{options.output} contains the run to be replayed: choose another -o")
     if not path.exists():
         raise StereoSfmError(f"no run at {path}: 'stereo-sfm run' writes run.mcap into its folder")
 
@@ -118,10 +122,10 @@ def _run_again(options: ReplayOptions, wiring: Wiring) -> RunOptions:
         before = recorded.read_run(reader)
         frames: list[Frame] = [message for _, message in recorded.messages(reader, (topics.FRAME,))]
     if not frames:
-        raise StereoSfmError(f"{path} holds no frames: nothing to replay")
+        raise StereoSfmError(f"{path} contains no frames: nothing to replay")
     left_out = sum(drop.count for drop in before.dropped if drop.where == "log")
     if left_out and options.source is None:
-        text = "%s lacks %d images that were tracked (the log was too slow): the replay will differ"
+        text = "%s lacks %d tracked images (the log was too slow): the replay will differ"
         logging.getLogger("stereo_sfm").warning(text, path, left_out)
     follow = options.schedule == "recorded" or (options.schedule is None and before.mode == "realtime")
     logged = options.source is None and before.image_format != "none"  # the images that the tracker saw
@@ -146,14 +150,16 @@ def _run_again(options: ReplayOptions, wiring: Wiring) -> RunOptions:
 
 
 def map_folders(opening: Opening) -> MapFolders:
-    """The saved map that the run began with, as it was then."""
+    """The saved map that the run started from, as it was then."""
     from stereo_sfm.maps.folders import MapFolders, map_sha256
 
     if not opening.map_in:
         return MapFolders()
     folder = Path(opening.map_in)
     if not (folder / "map.json").exists() or map_sha256(folder) != opening.map_sha256:
-        raise StereoSfmError(f"the run began with the map at {folder}, which is gone or another now: put it back")
+        raise StereoSfmError(
+            f"the run started from the map in {folder}, which is missing or has changed since: restore it"
+        )
     return MapFolders(folder, opening.localize_only)
 
 
@@ -177,10 +183,10 @@ def _compare(run: Path, replay: Path) -> int:
     images = (topics.IMAGE_INFO, topics.LEFT_IMAGE, topics.RIGHT_IMAGE, topics.DEPTH_IMAGE, topics.IMU, topics.WHEEL,
               topics.FEATURES)  # fmt: skip
     with LogReader(run) as a, LogReader(replay) as b:
-        not_logged = set(images) - {t.topic for t in b.topics}  # what the replay read, without --log full
+        not_logged = set(images) - {t.topic for t in b.topics}  # read by the replay, but not logged without --log full
         differences = [d for d in diff(a, b) if d.topic not in not_logged]
         same = "identical"
-        if ended_early(a):  # the replay ends with the last logged frame: its mapper finishes where the run's went on
+        if ended_early(a):  # the replay ends with the last logged frame, where the mapper of the run continued
             end = max((record.sequence for record in a.messages((topics.KEYFRAME,))), default=0)
             known = {t.topic for t in a.topics}
             differences = [d for d in differences if (0 <= d.frame_id < end or (d.frame_id < 0 and d.topic in known))]
@@ -188,6 +194,6 @@ def _compare(run: Path, replay: Path) -> int:
         conditions = other_conditions(a, b) if differences else []
     print("\n".join(str(d) for d in differences) or same)
     if conditions:
-        print("computed under other conditions, which may be why:")
+        print("possible reason: the versions or the processor are different:")
         print("\n".join(f"  {line}" for line in conditions))
     return DIFFERENT if differences else 0

@@ -9,7 +9,7 @@ from stereo_sfm.commands._options import (
     add_config_arguments,
     add_source,
     add_source_arguments,
-    add_talk_arguments,
+    add_verbosity_arguments,
     add_wiring_arguments,
     load_config,
     source_choice,
@@ -21,21 +21,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
     add_source(parser, default="the bundled recording")
     parser.add_argument("-o", "--output", type=Path, help="output folder (default: runs/DATE_NAME)")
-    parser.add_argument("--overwrite", action="store_true", help="replace the run that lies in the output folder")
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing run in the output folder")
     add_source_arguments(parser)
     add_config_arguments(parser)
     add_wiring_arguments(parser)
-    parser.add_argument("--map-in", type=Path, metavar="DIR", help="go on with a saved map of this place")
-    parser.add_argument("--localize-only", action="store_true", help="find the camera in --map-in, change no map")
+    parser.add_argument("--map-in", type=Path, metavar="DIR", help="start from a saved map of this place")
+    parser.add_argument(
+        "--localize-only", action="store_true", help="localize the camera in --map-in without changing the map"
+    )
     parser.add_argument("--map-out", type=Path, metavar="DIR", help="save the map (merged with --map-in, if given)")
-    parser.add_argument("--frame", choices=("cam0", "body"), default="cam0", help="whose poses the trajectories hold")
     parser.add_argument(
-        "--max-lost", type=float, default=20.0, metavar="PERCENT", help="exit with 4 when more frames have no pose"
+        "--frame", choices=("cam0", "body"), default="cam0", help="frame whose poses the trajectories contain"
     )
     parser.add_argument(
-        "--matches", type=int, metavar="K", help="every K frames a picture of the matches with the last keyframe"
+        "--max-lost",
+        type=float,
+        default=20.0,
+        metavar="PERCENT",
+        help="exit with 4 if more than PERCENT of the frames have no pose",
     )
-    add_talk_arguments(parser)
+    parser.add_argument(
+        "--matches", type=int, metavar="K", help="write a picture of the matches with the last keyframe every K frames"
+    )
+    add_verbosity_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""`stereo-sfm sources`: the kinds of sources that the installed drivers open, and the options of one."""
+"""`stereo-sfm sources`: list the kinds of sources that can be opened, or the options of one."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import argparse
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
-    parser.add_argument("kind", nargs="?", metavar="KIND", help="one of them, with its options")
+    parser.add_argument("kind", nargs="?", metavar="KIND", help="kind whose options to list (default: list the kinds)")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""`stereo-sfm t265`: the firmware a T265 needs, and resetting one."""
+"""`stereo-sfm t265`: install or check the firmware of a T265, or reset the camera."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from stereo_sfm.errors import StereoSfmError
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
-    firmware = actions.add_parser("firmware", help="get or check the firmware file (Intel's: not shipped here)")
+    firmware = actions.add_parser("firmware", help="install or check the firmware file (Intel's, not included here)")
     kinds = firmware.add_subparsers(dest="kind", metavar="ACTION", required=True)
-    extract = kinds.add_parser("extract", help="take it out of a librealsense library or pyrealsense2 wheel you have")
+    extract = kinds.add_parser("extract", help="extract it from a librealsense library or a pyrealsense2 wheel")
     extract.add_argument("file", type=Path, help="librealsense2.so, a pyrealsense2 .so, .pyd or .whl, or the .mvcmd")
-    extract.add_argument("-o", "--output", type=Path, help="where to put it (default: where the driver looks)")
+    extract.add_argument("-o", "--output", type=Path, help="file to write (default: where the driver looks for it)")
     extract.add_argument("--overwrite", action="store_true", help="replace an existing file")
-    kinds.add_parser("check", help="is the file there, and is it the right one")
-    reset = actions.add_parser("reset", help="restart a camera that hangs")
-    reset.add_argument("--serial", default="", help="of the camera (default: the only one)")
+    kinds.add_parser("check", help="check that the file is installed and intact")
+    reset = actions.add_parser("reset", help="restart a camera that does not respond")
+    reset.add_argument("--serial", default="", help="serial number of the camera (default: the only one)")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -50,7 +50,7 @@ def _check() -> int:
 
     path = firmware.find()
     firmware.load()
-    print(f"T265 firmware {firmware.VERSION} at {path}: SHA-1 is right")
+    print(f"T265 firmware {firmware.VERSION} at {path}: SHA-1 is correct")
     return 0
 
 
@@ -62,5 +62,5 @@ def _reset(serial: str) -> int:
     camera = acquire(Access(default_backend(), serial, allow_slow=True), Counters())
     camera.link.reset()
     camera.link.close()
-    print(f"T265 {camera.info.serial} is back in its boot state; the next run or record boots it")
+    print(f"T265 {camera.info.serial} was reset; the next run or recording boots it")
     return 0

@@ -1,4 +1,4 @@
-"""`stereo-sfm udev`: the rules that let people use the cameras without being root."""
+"""`stereo-sfm udev`: print the udev rules for using the cameras without root."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import sys
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
-    parser.add_argument("-q", "--quiet", action="store_true", help="the rules only, without what to do with them")
+    parser.add_argument("-q", "--quiet", action="store_true", help="print the rules without instructions")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Rules on standard output, so that they can be piped; the way on standard error."""
+    """Print the rules on standard output, for piping, and the instructions on standard error."""
     from stereo_sfm.drivers.devices import UDEV_FILE, udev_rules
 
     print(udev_rules(), end="")
@@ -20,7 +20,7 @@ def run(args: argparse.Namespace) -> int:
         print(
             f"\nInstall:  stereo-sfm udev -q | sudo tee {UDEV_FILE}\n"
             "          sudo udevadm control --reload-rules && sudo udevadm trigger\n"
-            "then replug the camera. In a container: mount /dev/bus/usb and allow the device class 'c 189:* rmw'.",
+            "then reconnect the camera. In a container: mount /dev/bus/usb and allow the device class 'c 189:* rmw'.",
             file=sys.stderr,
         )
     return 0

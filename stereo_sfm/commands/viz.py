@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
     parser.add_argument("file", type=Path, help="run.mcap, a run's folder, a saved map, or any recording")
-    parser.add_argument("--source", help="where the images are, for a run whose log has none")
-    parser.add_argument("--serve", action="store_true", help="to browsers, instead of opening a window")
+    parser.add_argument("--source", help="source of the images, for a run whose log has none")
+    parser.add_argument("--serve", action="store_true", help="serve the viewer to browsers instead of opening a window")
     add_viewer_address(parser)
     parser.add_argument("--save", type=Path, metavar="FILE.rrd", help="write a rerun file instead of showing it")
     parser.add_argument("--overwrite", action="store_true", help="replace the file of --save")
@@ -48,14 +48,14 @@ class VizOptions:
         return "save" if self.save else "serve" if self.serve else "spawn"
 
     def sink(self, rig: Rig, name: str, truth: Trajectory | None = None) -> RerunSink:
-        """The viewer that they ask for."""
+        """The viewer for these options."""
         from stereo_sfm.viz.sink import RerunSink
 
         return RerunSink(rig, name, self.mode, self.save, truth, self.viz_address)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Feed a log or a saved map to the viewer; with --serve stay until interrupted."""
+    """Send a log or a saved map to the viewer; with --serve, until interrupted."""
     options = typed(VizOptions, args)
     file = options.file
     is_map = (file / "map.json").is_file()
@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
     if options.save is not None:
         print(f"written to {options.save}: open it with 'rerun {options.save}'")
     elif options.serve:
-        print("everything is sent; Ctrl-C ends")
+        print("all data sent; press Ctrl-C to stop")
         signal.pause()
     return 0
 
@@ -108,7 +108,7 @@ def _show_log(path: Path, options: VizOptions) -> None:
 
 
 def _images(reader: LogReader, path: Path, spec: str | None) -> Source:
-    """Where the images come from: another source is opened as the run opened it."""
+    """The source of the images, opened as the run opened its own."""
     from stereo_sfm.drivers.choice import SourceChoice
     from stereo_sfm.log.recorded import read_opening
 
@@ -119,7 +119,7 @@ def _images(reader: LogReader, path: Path, spec: str | None) -> Source:
 
 
 def _play(reader: LogReader, images: Iterator[StereoImage], sink: Sink) -> None:
-    """The answers in the order of the log, every image before the frame that was tracked in it."""
+    """Send the messages in the order of the log, each image before its frame."""
     from stereo_sfm.log import recorded, topics
     from stereo_sfm.types import Frame
 

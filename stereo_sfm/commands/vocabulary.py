@@ -1,4 +1,4 @@
-"""`stereo-sfm vocabulary`: train a vocabulary, or say what one holds."""
+"""`stereo-sfm vocabulary`: train or describe a vocabulary."""
 
 from __future__ import annotations
 
@@ -13,16 +13,20 @@ from stereo_sfm.commands._options import typed
 if TYPE_CHECKING:
     from stereo_sfm.types import U8
 
-# What the package's vocabulary was trained on: `stereo-sfm vocabulary train -o FILE` makes it again.
+# The training data of the package's vocabulary: `stereo-sfm vocabulary train -o FILE` reproduces it.
 DEFAULT_SOURCES = tuple(f"sim:{scene}?people=0&seed={seed}" for seed in (101, 102) for scene in ("loop", "big"))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
-    train = actions.add_parser("train", help="cluster the descriptors of some sources into words")
+    train = actions.add_parser("train", help="train a vocabulary on the images of some sources")
     train.add_argument(
-        "sources", nargs="*", default=list(DEFAULT_SOURCES), metavar="SOURCE", help="default: the package's own"
+        "sources",
+        nargs="*",
+        default=list(DEFAULT_SOURCES),
+        metavar="SOURCE",
+        help="training data (default: that of the package's vocabulary)",
     )
     train.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="vocabulary file (.npz)")
     train.add_argument("--overwrite", action="store_true", help="replace an existing file")
@@ -33,11 +37,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="images of each source, evenly spread (default: %(default)s)",
     )
-    train.add_argument("--branching", type=int, default=10, help="children of a node of the tree")
+    train.add_argument("--branching", type=int, default=10, help="children of each node of the tree")
     train.add_argument("--depth", type=int, default=4, help="levels of the tree")
-    train.add_argument("--seed", type=int, default=0, help="of the clustering")
-    info = actions.add_parser("info", help="what a vocabulary holds")
-    info.add_argument("file", nargs="?", type=Path, help="default: the one of the package")
+    train.add_argument("--seed", type=int, default=0, help="random seed of the clustering")
+    info = actions.add_parser("info", help="describe a vocabulary")
+    info.add_argument("file", nargs="?", type=Path, help="vocabulary file (default: the one in the package)")
 
 
 @dataclass(frozen=True)
@@ -88,7 +92,7 @@ def _train(options: TrainOptions) -> None:
     _check(options)
     images = [d for source in options.sources for d in _descriptors(source, options.images)]
     if not images:
-        raise StereoSfmError("the sources hold no image with enough texture to train from")
+        raise StereoSfmError("the sources contain no image with enough texture for training")
     vocabulary = train(images, options.branching, options.depth, options.seed)
     save_vocabulary(vocabulary, options.output)
     count = sum(len(d) for d in images)
@@ -102,7 +106,7 @@ def spread(count: int, wanted: int) -> list[int]:
 
 
 def _descriptors(spec: str, wanted: int) -> Iterator[U8]:
-    """(N, 32) of images that lie evenly over a source; of the first ones where nobody knows how many it has."""
+    """(N, 32) of images evenly spread over a source, or of its first images if their number is unknown."""
     from stereo_sfm.drivers.source import open_source
     from stereo_sfm.maps.single_image import still_keyframe
 

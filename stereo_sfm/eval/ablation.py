@@ -1,4 +1,4 @@
-"""One cell of the papers' ablation: a source, a front end, an estimator and the modules behind it; run and judged.
+"""One cell of the papers' ablation: a source, a front end, an estimator and later modules, run and evaluated.
 
 A cell is a pure function of its description, so its answer is kept as a JSON file and not computed twice.
 """
@@ -47,23 +47,23 @@ class Cell:
 
     source: str
     system: str  # a preset's name; "grid" for a combination of features and estimator
-    features: str  # "" for what the system uses
-    method: str  # "" for what the system uses
-    stage: str  # of STAGES, or "" for what the system does
-    frames: int  # at most so many, 0: all
+    features: str  # "" for the default of the system
+    method: str  # "" for the default of the system
+    stage: str  # of STAGES, or "" for the default of the system
+    frames: int  # largest number, 0: all
     seed: int = 0
-    settings: tuple[str, ...] = ()  # SECTION.KEY=VALUE, over what the system and the others say
+    settings: tuple[str, ...] = ()  # SECTION.KEY=VALUE, applied last
 
     @property
     def name(self) -> str:
-        """For people, without the source."""
+        """Readable name, without the source."""
         if self.system != "grid":
             return self.system + (f" {self.stage}" if self.stage else "")
         return f"{self.features} {self.method} {self.stage}"
 
     @property
     def file_name(self) -> str:
-        """Unique, readable, the same in every session, and another one when the configuration is another."""
+        """Unique, readable and reproducible; different for different configurations."""
         *others, settings = dataclasses.astuple(self)
         own = (*others, settings) if settings else tuple(others)
         described = (_SCHEMA, own, dataclasses.asdict(self.config()))
@@ -95,7 +95,7 @@ def grid(
     seed: int = 0,
     settings: Sequence[str] = (),
 ) -> list[Cell]:
-    """Every cell once, whatever is named twice; the quick ones of each source first."""
+    """Every cell once; the fast ones of each source first."""
     given = tuple(dict.fromkeys(settings))
     cells: list[Cell] = []
     for source in sources:
@@ -112,10 +112,10 @@ def grid(
 
 
 def run_cell(cell: Cell) -> dict[str, Any]:
-    """Run and judge; every failure becomes a stated reason.
+    """Run and evaluate; a failure becomes a result with a reason.
 
     Returns:
-        Plain values for JSON: `status` is "ok" or "none" with `reason`; `opened` once the source was found good.
+        Plain values for JSON: `status` is "ok" or "none" with `reason`; `opened` once the source has been opened.
     """
     from stereo_sfm.drivers.select import SelectedFrames
     from stereo_sfm.drivers.source import open_source
@@ -138,7 +138,7 @@ def run_cell(cell: Cell) -> dict[str, Any]:
         answer |= _judge(record, config, truth)
     except StereoSfmError as error:
         answer["reason"] = str(error)
-    except Exception:  # a cell that breaks is a finding of the table, not the end of the grid
+    except Exception:  # a failed cell is a result and does not end the grid
         answer["reason"] = "internal error: " + traceback.format_exc().strip().splitlines()[-1]
         answer["traceback"] = traceback.format_exc()
     return answer
@@ -161,7 +161,7 @@ def _describe(record: RunRecord, wall_s: float) -> dict[str, Any]:
 
 
 def _judge(record: RunRecord, config: Config, truth: Trajectory | None) -> dict[str, Any]:
-    """Errors of the trajectory that the last module gives: the map's where there is one, else the odometry."""
+    """Errors of the final trajectory: that of the map if there is one, else that of the odometry."""
     estimate = record.mapped() if config.mapper.enabled else record.odometry()
     tracked = record.tracked()
     if tracked.mean() < _MIN_TRACKED if len(tracked) else True:
@@ -194,9 +194,9 @@ def load_answer(path: Path) -> dict[str, Any] | None:
 
 
 def finished(answer: dict[str, Any] | None) -> bool:
-    """Whether a cell need not be run again: it has a result or a refusal.
+    """Whether a cell need not be run again: it has a result or a reason for having none.
 
-    One that broke, or whose source could not be opened, is no answer (neither is a refusal that does not tell which).
+    Cells that crashed, or whose source could not be opened, are run again.
     """
     return answer is not None and "traceback" not in answer and ("frames" in answer or "opened" in answer)
 

@@ -1,4 +1,4 @@
-"""The ablation as tables, pictures and checked findings: the retail paper's Table II and Figure 5 for each sequence."""
+"""The ablation as tables, plots and checked claims: the retail paper's Table II and Figure 5 for each sequence."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from stereo_sfm.types import F64, Trajectory
 
 Answer = dict[str, Any]
 
-# What the papers print, where they used the same data: (part of the source's name, system, what, value).
+# Published numbers on the same data: (part of the source's name, system, what, value).
 PUBLISHED: tuple[tuple[str, str, str, str], ...] = (
     ("freiburg1_xyz", "Sparse Visual Localization, table I (whole sequence)", "ATE (equation 44)", "0.167 m"),
     ("kitti:07", "Retail thesis, table II, tracking", "relative 0.012 rad, 0.17 m; absolute", "0.27 rad, 33.95 m"),
@@ -55,7 +55,7 @@ def row_of(answer: Answer) -> dict[str, Any]:
         "abs rot [rad]": retail["absolute_rotation_rad"],
         "ATE Sim(3) [m]": metrics["ate_sim3_m"],
     }
-    if not monocular:  # lengths of a monocular run have no metres before Sim(3)
+    if not monocular:  # a monocular run has no metric scale before Sim(3)
         row |= {
             "rel trans mean [m]": rpe["mean"],
             "rel trans std [m]": rpe["std"],
@@ -128,7 +128,7 @@ def write_csv(path: Path, answers: Sequence[Answer]) -> None:
 
 
 def _settings(answer: Answer) -> tuple[str, ...]:
-    """What `--set` changed in a cell."""
+    """The values given by `--set` in a cell."""
     return tuple(answer["cell"].get("settings", ()))
 
 
@@ -142,7 +142,7 @@ def _metres(error: float) -> str:
 
 
 def _ate_sim3(answer: Answer) -> float:
-    """Metres, of a cell that has a result: the shape of the path without its scale."""
+    """Metres, of a cell with a result: the error of the path apart from its scale."""
     return float(answer["metrics"]["ate_sim3_m"])
 
 
@@ -187,29 +187,29 @@ def findings(answers: Sequence[Answer]) -> list[str]:
             lines.append(
                 f"RANSAC needed with {kind}: {'yes' if agreed else 'no'} "
                 f"(R-Um {_metres(_ate(robust))}, Um {_metres(_ate(plain))}; "
-                f"rotation {_turn(robust):.2g} and {_turn(plain):.2g} rad a frame)"
+                f"rotation {_turn(robust):.2g} and {_turn(plain):.2g} rad per frame)"
             )
     return lines + _against_default(answers)
 
 
 def _against_default(answers: Sequence[Answer]) -> list[str]:
-    """Whether our default beats every other cell in accuracy and in time."""
+    """Whether the default system beats every other cell in accuracy and in time."""
     ours = [a for a in answers if a["cell"]["system"] == "default" and a["status"] == "ok"]
     others = [a for a in answers if a["cell"]["system"] != "default" and a["status"] == "ok" and not a["monocular"]]
     if not ours or not others:
         return []
     lines: list[str] = []
-    for error, name in ((_ate, "ATE"), (_ate_sim3, "ATE after Sim(3)"), (_step, "translation from frame to frame")):
+    for error, name in ((_ate, "ATE"), (_ate_sim3, "Sim(3) ATE"), (_step, "translation from frame to frame")):
         best, closest = min(ours, key=error), min(others, key=error)
         lines.append(
-            f"our default is more accurate than every cell, {name}: {'yes' if error(best) < error(closest) else 'no'} "
+            f"the default is more accurate than every cell, {name}: {'yes' if error(best) < error(closest) else 'no'} "
             f"({_cell_name(best)} {error(best):.3g} m, next {_cell_name(closest)} {error(closest):.3g} m)"
         )
     fastest = min(others, key=lambda a: a["track_ms"])
     slowest = max(ours, key=lambda a: a["track_ms"])
     lines.append(
-        f"our default is faster than every cell: {'yes' if slowest['track_ms'] < fastest['track_ms'] else 'no'} "
-        f"({_cell_name(slowest)} {slowest['track_ms']:.0f} ms a frame, "
+        f"the default is faster than every cell: {'yes' if slowest['track_ms'] < fastest['track_ms'] else 'no'} "
+        f"({_cell_name(slowest)} {slowest['track_ms']:.0f} ms per frame, "
         f"next {_cell_name(fastest)} {fastest['track_ms']:.0f} ms)"
     )
     return lines
@@ -229,7 +229,7 @@ def _path(points: Any) -> Trajectory:
 
 
 def write_plots(folder: Path, slug: str, answers: Sequence[Answer]) -> list[str]:
-    """Figure 5 of the retail paper: estimators by features, then the modules one after the other. File names."""
+    """Figure 5 of the retail paper: estimators by features, then the modules in order. Returns the file names."""
     good = [a for a in answers if a["status"] == "ok"]
     groups: dict[str, list[Answer]] = {}
     for answer in good:
@@ -252,7 +252,7 @@ def write_plots(folder: Path, slug: str, answers: Sequence[Answer]) -> list[str]
 
 
 def write_report(folder: Path, answers: Sequence[Answer]) -> Path:
-    """ablation.md, ablation.csv and the pictures. Returns the path of the first."""
+    """ablation.md, ablation.csv and the plots. Returns the path of the first."""
     write_csv(folder / "ablation.csv", answers)
     lines = ["# Ablation", ""]
     lines += [
@@ -277,7 +277,7 @@ def write_report(folder: Path, answers: Sequence[Answer]) -> Path:
         lines += [overview(own), ""]
         checked = findings(own)
         if checked:
-            lines += ["Findings, checked:", "", *[f"- {line}" for line in checked], ""]
+            lines += ["Claims of the papers, checked:", "", *[f"- {line}" for line in checked], ""]
         lines += [markdown_table(own), ""]
         published = [row for row in PUBLISHED if row[0] in name or row[0] in source]
         lines += [f"- published: {system}: {what} {value}" for _, system, what, value in published]

@@ -1,4 +1,4 @@
-"""What runs in the processes of an ablation."""
+"""The worker processes of an ablation."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from stereo_sfm.eval.ablation import Cell, run_cell, save_answer
 
 
 def one_thread() -> None:
-    """Cells run side by side: inside one, libraries compute in one thread."""
+    """Limit libraries to one thread, since cells run in parallel."""
     import cv2
     import numba
 
@@ -17,9 +17,9 @@ def one_thread() -> None:
 
 
 def compute(cell: Cell, path: Path) -> str:
-    """Run a cell, write its file, and say in a line what came out."""
+    """Run a cell, write its file, and return a line that summarizes the result."""
     answer = run_cell(cell)
     save_answer(path, answer)
     if answer["status"] != "ok":
         return f"no result: {answer['reason']}"
-    return f"ATE {answer['metrics']['ape_m']['rmse']:.4g} m, {answer['track_ms'] or 0:.0f} ms a frame"
+    return f"ATE {answer['metrics']['ape_m']['rmse']:.4g} m, {answer['track_ms'] or 0:.0f} ms per frame"

@@ -1,4 +1,4 @@
-"""Moving an estimate onto a reference before the two are compared."""
+"""Alignment of an estimate to a reference before the two are compared."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def align(estimate: Trajectory, reference: Trajectory, mode: str = "se3") -> Ali
 
     Args:
         estimate: (N,) poses. reference: (N,) poses.
-        mode: `se3` and `sim3` least squares over the positions (Umeyama 1991); `origin` puts the first poses onto each
-            other; `none` compares as they are.
+        mode: `se3` and `sim3` least squares over the positions (Umeyama 1991); `origin` aligns the first poses with
+            each other; `none`: no alignment.
 
     Raises:
         StereoSfmError: too few poses, or a path that does not determine the alignment.

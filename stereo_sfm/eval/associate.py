@@ -1,4 +1,4 @@
-"""Which pose of an estimate belongs to which pose of a reference: by stamp."""
+"""Association of the poses of an estimate and a reference by stamp."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def poses_at(trajectory: Trajectory, stamp_ns: I64, max_gap_ns: int = MAX_GAP_NS
     Args:
         trajectory: (N,) poses.
         stamp_ns: (M,) times.
-        max_gap_ns: times between poses further apart than this are left out, as are times before and after.
+        max_gap_ns: times between poses further apart than this are omitted, as are times before and after.
 
     Returns:
         (K, 4, 4) poses and (K,) indices into `stamp_ns`.
@@ -44,10 +44,10 @@ def associate(
     """The parts of two trajectories that can be compared, with the estimate's stamps.
 
     Args:
-        estimate: what is judged.
-        reference: the truth.
+        estimate: the trajectory to evaluate.
+        reference: the ground truth.
         interpolate: take the reference at the estimate's stamps; else its nearest pose.
-        max_difference_ns: nearest poses further apart than this are left out.
+        max_difference_ns: nearest poses further apart than this are omitted.
 
     Raises:
         StereoSfmError: the two have no time in common.

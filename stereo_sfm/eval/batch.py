@@ -19,7 +19,7 @@ from stereo_sfm.errors import StereoSfmError, require
 
 RESULT = "result.json"
 RETRIES = 3  # of a task whose node died
-# Ray's own switch for one computer alone, the default where firewalls ask: every port of it on the loopback address.
+# Ray's own switch for a single computer: all its ports are on the loopback address.
 LOOPBACK_ONLY = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 
 
@@ -34,7 +34,7 @@ class BatchTask:
 
 
 def names(recordings: Sequence[str]) -> list[str]:
-    """A folder name for each recording, unique and in order."""
+    """A unique folder name for each recording, in order."""
     stems = [Path(r).stem or r for r in recordings]
     taken = {s for s in stems if stems.count(s) == 1}
     out: list[str] = []
@@ -48,7 +48,7 @@ def names(recordings: Sequence[str]) -> list[str]:
 
 
 def run_one(task: BatchTask) -> dict[str, Any]:
-    """Run one recording to the end; what goes wrong becomes part of the result."""
+    """Run one recording to the end; errors become part of the result."""
     import cv2
 
     from stereo_sfm.drivers.choice import SourceChoice
@@ -122,11 +122,11 @@ def _run_on_ray(tasks: list[BatchTask], address: str | None) -> Iterator[tuple[B
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     if address is None:
         os.environ[LOOPBACK_ONLY] = "0"
-    require(("ray",), "batch", "many recordings at once")
+    require(("ray",), "batch", "running many recordings")
     import ray
     from ray.exceptions import RayError
 
-    # "local" even where a cluster once ran: without it Ray waits for the last one it remembers.
+    # Always "local": otherwise Ray waits for the last cluster that it knows, even if that is gone.
     ours = not ray.is_initialized()
     if ours:
         ray.init(address=address or "local", include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
@@ -182,7 +182,7 @@ def write_table(rows: Sequence[Sequence[str]], folder: Path) -> None:
 
 
 def merge_maps(folders: Sequence[Path], config: Config, out: Path) -> str:
-    """One map of all walks that loops can join; a line that says what became of them."""
+    """Merge the maps of all sessions that loops connect; returns a line about the result."""
     from stereo_sfm.loop.vocabulary_file import configured_vocabulary
     from stereo_sfm.maps.merge import merge
     from stereo_sfm.maps.saved_map import load_map, save_map
@@ -198,4 +198,4 @@ def merge_maps(folders: Sequence[Path], config: Config, out: Path) -> str:
             alone.append(f"{folder.parent.name} ({error})")
     save_map(common, out)
     text = f"one map of {', '.join(joined)}: {len(common)} keyframes, {out}"
-    return text + (f"; not joined: {'; '.join(alone)}" if alone else "")
+    return text + (f"; not connected: {'; '.join(alone)}" if alone else "")

@@ -1,4 +1,4 @@
-"""What a run found out about its rig, for its output folder: numbers, lines for people, the corrected calibration."""
+"""Results of self-calibration for the output folder: numbers, lines of the summary, the corrected calibration."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def calibration_stats(record: RunRecord) -> list[dict[str, Any]]:
 
 
 def row_error_stats(record: RunRecord) -> dict[str, Any] | None:
-    """The last word about rows, and the worst; None where no two eyes were mapped."""
+    """The last row errors and the largest; None without two cameras."""
     last = record.row_errors
     if last is None:
         return None
@@ -48,13 +48,13 @@ def row_error_stats(record: RunRecord) -> dict[str, Any] | None:
 
 
 def calibration_lines(stats: dict[str, Any]) -> list[str]:
-    """A line for each change, and one about the rows."""
+    """A line for each change of the calibration, and one about the row errors."""
     rows = stats["row_errors"]
-    off = [] if rows is None else [f"rows off by {rows['systematic_px']:.2f} px (worst {rows['worst_px']:.2f} px)"]
+    off = [] if rows is None else [f"row error {rows['systematic_px']:.2f} px (worst {rows['worst_px']:.2f} px)"]
     if rows is not None and rows["warning"]:
-        off[0] += ": the rig is not what its calibration says (stereo-sfm check-calib)"
+        off[0] += ": the calibration does not fit (see check-calib)"
     return off + [
-        f"rig {'corrected' if c['applied'] else 'seems wrong'} at {c['seconds']:.1f} s ({c['why']}): {c['text']}"
+        f"calibration {'corrected' if c['applied'] else 'doubtful'} at {c['seconds']:.1f} s ({c['why']}): {c['text']}"
         for c in stats["calibration"]
     ]
 
@@ -80,15 +80,15 @@ def write_corrected_rig(folder: Path, rig: Rig, record: RunRecord) -> None:
 
 
 def calibration_table(stats: dict[str, Any]) -> list[str]:
-    """The part of report.md: how the terms went, empty when the rig stayed."""
+    """The section of report.md about changes of the calibration, empty if there were none."""
     if not stats["calibration"]:
         return []
     head = ["seconds", *(f"{n} ({u})" for n, u in zip(NAMES, UNITS, strict=True)), "why"]
-    lines = ["", "## Rig", "", "| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    lines = ["", "## Calibration", "", "| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for c in stats["calibration"]:
         sigma = np.sqrt(np.diag(np.array(c["covariance"])))
-        cells = [f"{v:+.3f} ± {s:.3f}" if v else "as it was" for v, s in zip(c["terms"], sigma, strict=True)]
+        cells = [f"{v:+.3f} ± {s:.3f}" if v else "unchanged" for v, s in zip(c["terms"], sigma, strict=True)]
         lines.append("| " + " | ".join([f"{c['seconds']:.1f}", *cells, c["why"]]) + " |")
     applied = all(c["applied"] for c in stats["calibration"])
-    told = "The run went on with it" if applied else "It was only reported"
-    return [*lines, "", f"{told}; `{CORRECTED}` holds the corrected calibration."]
+    use = "The run used the corrections" if applied else "They were only reported"
+    return [*lines, "", f"{use}; `{CORRECTED}` holds the corrected calibration."]

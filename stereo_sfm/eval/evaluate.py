@@ -1,4 +1,4 @@
-"""Everything that is said about one estimate and one reference, and how it is printed."""
+"""The evaluation of an estimate against a reference, and how it is printed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from stereo_sfm.eval.associate import MAX_DIFFERENCE_NS, associate
 from stereo_sfm.eval.metrics import Drift, RetailErrors, Statistics
 from stereo_sfm.types import F64, Trajectory
 
-STRAIGHT = 0.02  # extent of a path aside, as a share of its extent along, below which it counts as a line
+STRAIGHT = 0.02  # lateral extent of a path, as a share of its length, below which it counts as straight
 
 
 @dataclass(frozen=True)
@@ -72,10 +72,10 @@ def evaluate(
     """Compare two trajectories of the same frame (world_T_cam0 with world_T_cam0).
 
     Args:
-        estimate: what is judged.
-        reference: the truth.
+        estimate: the trajectory to evaluate.
+        reference: the ground truth.
         mode: the alignment, one of eval.align.MODES.
-        delta: what relative errors are taken over: `5f` frames or `1m` metres.
+        delta: distance of relative errors: `5f` frames or `1m` metres.
         interpolate: see `associate`.
         max_difference_ns: see `associate`.
 
@@ -121,7 +121,7 @@ def evaluate(
 
 
 def _positions(trajectory: Trajectory) -> F64:
-    """(N, 4, 4) poses that do not turn."""
+    """(N, 4, 4) poses without rotation."""
     poses = np.tile(np.eye(4), (len(trajectory), 1, 1))
     poses[:, :3, 3] = trajectory.positions
     return poses
@@ -149,15 +149,15 @@ def _pairs(reference: F64, delta: str) -> metrics.I64:
     raise StereoSfmError(f"--delta takes frames or metres, as in 1f or 0.5m, got '{delta}'")
 
 
-def _leaning(result: Evaluation) -> str:
-    """Said where positions hardly say how the paths lie to each other about their own direction."""
+def _straightness_note(result: Evaluation) -> str:
+    """A note if positions hardly determine the rotation of the paths about their direction."""
     spread = np.linalg.svd(result.reference.positions - result.reference.positions.mean(0), compute_uv=False)
     straight = result.mode != "origin" and len(spread) > 1 and spread[1] < STRAIGHT * spread[0]
-    return " (the path is nearly straight: the alignment leaves the turn about it open)" if straight else ""
+    return " (the path is nearly straight: the alignment does not determine the rotation about it)" if straight else ""
 
 
 def table(result: Evaluation) -> list[tuple[str, str]]:
-    """What is said, line by line, as (name, value with unit)."""
+    """The printed lines as (name, value with unit)."""
     ape = result.ape_m
     rows = [
         ("compared", f"{result.frames} frames over {length(result.length_m)}, alignment {result.mode}"),
@@ -168,11 +168,11 @@ def table(result: Evaluation) -> list[tuple[str, str]]:
     ]
     if result.drift is not None:
         low, high = result.drift.lengths_m[0], result.drift.lengths_m[-1]
-        note = "KITTI's lengths" if result.drift.standard else "shorter than KITTI's: the path is"
+        note = "KITTI's lengths" if result.drift.standard else "shorter than KITTI's, as is the path"
         rows.append(
             (
                 "drift",
-                f"{result.drift.translation_percent:.3f} %, {_turn(result.drift)}over "
+                f"{result.drift.translation_percent:.3f} %, {_rotation_drift(result.drift)}over "
                 f"{result.drift.segments} segments of {low:g} to {high:g} m ({note})",
             )
         )
@@ -180,22 +180,25 @@ def table(result: Evaluation) -> list[tuple[str, str]]:
         e = result.retail
         rows += [
             (
-                "frame to frame (eq. 23, 24)",
+                "error between frames (retail thesis, eq. 23, 24)",
                 f"{e.relative_rotation_rad_mean:.3e} ± {e.relative_rotation_rad_std:.1e} rad, "
                 f"{e.relative_translation_m2_mean:.3e} ± {e.relative_translation_m2_std:.1e} m²",
             ),
-            ("last frame (eq. 23, 24)", f"{e.absolute_rotation_rad:.3e} rad, {e.absolute_translation_m2:.3e} m²"),
+            (
+                "error of the last frame (retail thesis, eq. 23, 24)",
+                f"{e.absolute_rotation_rad:.3e} rad, {e.absolute_translation_m2:.3e} m²",
+            ),
         ]
     return rows
 
 
 def _rotation(result: Evaluation) -> str:
     if not result.oriented:
-        return "not compared: one of the two holds positions only, without orientations"
-    return f"{result.ape_deg.rmse:.3f} deg rmse, {result.ape_deg.max:.3f} deg max{_leaning(result)}"
+        return "not compared: one of the trajectories has no orientations"
+    return f"{result.ape_deg.rmse:.3f} deg rmse, {result.ape_deg.max:.3f} deg max{_straightness_note(result)}"
 
 
-def _turn(drift: Drift) -> str:
+def _rotation_drift(drift: Drift) -> str:
     return f"{drift.rotation_deg_per_m:.5f} deg/m " if math.isfinite(drift.rotation_deg_per_m) else ""
 
 
@@ -208,7 +211,7 @@ def _relative(result: Evaluation) -> str:
 
 
 def length(metres: float) -> str:
-    """Metres for people: 4.6 mm, 27.1 mm, 0.449 m, 92.0 m."""
+    """A length as text: 4.6 mm, 27.1 mm, 0.449 m, 92.0 m."""
     if not math.isfinite(metres):
         return "not defined"
     if abs(metres) < 0.1:

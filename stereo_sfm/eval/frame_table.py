@@ -1,4 +1,4 @@
-"""The frames of a run as columns: a day of them fits into memory."""
+"""The frames of a run as columns, so that those of a day fit into memory."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ TRACKED = (TrackState.OK, TrackState.RECOVERED, TrackState.RESTARTED, TrackState
 
 
 class FrameTable(Columns):
-    """One row a frame, without its observations."""
+    """One row per frame, without its observations."""
 
     frame_id: I64
     stamp_ns: I64
@@ -37,7 +37,7 @@ class FrameTable(Columns):
 
     def __init__(self) -> None:
         super().__init__()
-        self.reasons: list[str] = []  # every one once
+        self.reasons: list[str] = []  # without repetition
 
     def add(self, frame: Frame) -> None:
         """Append a frame."""
@@ -79,7 +79,7 @@ class TimeTable(Columns):
         self.stages: list[str] = []
 
     def add(self, frame_id: int, ms: dict[str, float]) -> None:
-        """Append what the stages took for a frame; of what is told twice the later counts."""
+        """Append the times of the stages for a frame; a later value replaces an earlier one."""
         self.stages += [stage for stage in ms if stage not in self.stages]
         ids = [self.stages.index(stage) for stage in ms]
         self.append(len(ms), frame_id=frame_id, stage_id=np.array(ids, np.int32), ms=np.array([*ms.values()]))

@@ -14,7 +14,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, I64
 
 KITTI_LENGTHS = tuple(100.0 * i for i in range(1, 9))  # metres
-SHORTEST_PATH = 0.5  # metres; below it drift over a distance says nothing
+SHORTEST_PATH = 0.5  # metres; below it drift over a distance is meaningless
 KITTI_STEP = 10  # a segment starts at every tenth frame
 
 
@@ -48,7 +48,7 @@ class Statistics:
 
 
 def rotation_angle(rotation: F64) -> F64:
-    """(..., 3, 3) -> angle in radians, in [0, pi]; exact also where acos of the trace loses its digits."""
+    """(..., 3, 3) -> angle in radians, in [0, pi]; accurate also where acos of the trace is not."""
     return np.linalg.norm(se3.so3_log(rotation), axis=-1)
 
 

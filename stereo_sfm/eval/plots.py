@@ -1,4 +1,4 @@
-"""Pictures of a run, drawn without a display."""
+"""Plots of a run, drawn without a display."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def plot_tracking(path: Path, record: RunRecord) -> None:
 
 
 def plot_times(path: Path, record: RunRecord, stages: Sequence[str]) -> None:
-    """Milliseconds a frame for the longest stages."""
+    """Milliseconds per frame of the longest stages."""
     figure = Figure(figsize=(8, 3), layout="constrained")
     axes = figure.subplots()
     seconds, times = _seconds(record), record.times()

@@ -1,4 +1,4 @@
-"""What is kept of a run for its output folder: a few numbers a frame, keyframes, loops, times. A sink."""
+"""The data of a run for its output folder: a few numbers per frame, keyframes, loops, times. A sink."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class KeyframeRow:
     stamp_ns: int
     odom_T_cam: F64
     path_m: float  # odometry path up to here
-    submap_id: int  # of the unbroken piece of odometry
+    submap_id: int  # of the uninterrupted odometry
 
 
 @dataclass(frozen=True)
@@ -69,8 +69,8 @@ class LostInterval:
 class RunRecord:
     """Collects the messages of one run."""
 
-    localize_only: bool = False  # a saved map places every piece of odometry
-    followed: bool = True  # points are followed from frame to frame: errors grow slowly from keyframe to keyframe
+    localize_only: bool = False  # a saved map gives the pose of every submap
+    followed: bool = True  # points are tracked from frame to frame: errors grow slowly from keyframe to keyframe
     frames: FrameTable = field(default_factory=FrameTable)
     keyframes: dict[int, KeyframeRow] = field(default_factory=dict[int, KeyframeRow])
     stage_ms: TimeTable = field(default_factory=TimeTable)
@@ -83,10 +83,10 @@ class RunRecord:
     map_T_kf: KeyframePoses = field(default_factory=KeyframePoses)
     map_points: set[int] = field(default_factory=set[int])
     seen_points: Bool = field(default_factory=lambda: np.zeros(1024, bool))  # by id: whether a keyframe had it
-    closed: list[Closure] = field(default_factory=list[Closure])  # as the loop closer said
-    refused_kf_ids: set[int] = field(default_factory=set[int])  # of loops that the mapper did not believe
+    closed: list[Closure] = field(default_factory=list[Closure])  # accepted by the loop closer
+    refused_kf_ids: set[int] = field(default_factory=set[int])  # of loops that the mapper rejected
     row_errors: RowErrors | None = None  # the last
-    worst_rows_px: float = 0.0  # systematic part of the row error at its worst
+    worst_rows_px: float = 0.0  # largest systematic row error
     calibrations: list[CalibrationUpdate] = field(default_factory=list[CalibrationUpdate])  # changes of the rig
     rejections: dict[str, int] = field(default_factory=dict[str, int])
     _path_m: float = 0.0
@@ -181,7 +181,7 @@ class RunRecord:
         """(frames,) milliseconds by stage, NaN where a stage did not run."""
         return self.stage_ms.of_frames(self.frames.frame_id)
 
-    # -- what it comes to ------------------------------------------------------------------------------------------
+    # -- results ---------------------------------------------------------------------------------------------
 
     def tracked(self) -> Bool:
         """(frames,) whether the frame has a pose of its own."""
@@ -195,9 +195,9 @@ class RunRecord:
     def mapped(self) -> Trajectory | None:
         """map_T_cam after the last map update of the frames that have a place in the map; None without any.
 
-        A frame stands where its reference keyframe says. Where points are followed from frame to frame, the next
-        keyframe has its say too, the more the nearer it comes: the map moved both since the frame was tracked, and not
-        alike.
+        A frame moves with its reference keyframe. Where points are tracked from frame to frame, the next
+        keyframe contributes too, the more the nearer it is: the map has moved both since the frame was tracked, by
+        different amounts.
         """
         if not len(self.map_T_kf):
             return None
@@ -220,7 +220,7 @@ class RunRecord:
         return Trajectory(stamps, poses)
 
     def _smoothed(self) -> tuple[F64, F64]:
-        """(frames, 4, 4) odom_T_cam and kf_T_cam, with what the IMU alone gave brought to the good poses around it."""
+        """(frames, 4, 4) odom_T_cam and kf_T_cam, poses from the IMU adjusted to the good ones around."""
         odom_T_cam, kf_T_cam = self.frames.odom_T_cam, self.frames.kf_T_cam
         inertial = self.frames.state == TrackState.INERTIAL
         if not inertial.any():
@@ -231,25 +231,25 @@ class RunRecord:
         return odom_T_cam, kf_T_cam @ se3.inverse(self.frames.odom_T_cam) @ odom_T_cam
 
     def _following(self) -> dict[int, int]:
-        """The next keyframe of the same piece of odometry, by id, of those that the map knows."""
+        """The next keyframe in the same submap, by id, for those in the map."""
         known = self.map_T_kf.all()
         pairs = itertools.pairwise(k for k in sorted(self.keyframes) if k in known)
         return {a: b for a, b in pairs if self.keyframes[a].submap_id == self.keyframes[b].submap_id}
 
     def placed(self) -> Bool:
-        """(frames,) whether the frame has a place in the map; all tracked ones unless a saved map did not know them."""
+        """(frames,) whether the frame has a pose in the map: all tracked ones, unless not found in a saved map."""
         known = np.array([*self.map_T_kf.all()], np.int64)
         return self.tracked() & np.isin(self.frames.reference_kf_id, known)
 
     def keyframe_trajectory(self) -> Trajectory:
-        """Of the keyframes, in the map where there is one."""
+        """The trajectory of the keyframes, in the map if there is one."""
         rows, known = sorted(self.keyframes.items()), self.map_T_kf.all()
         poses = [known.get(kf_id, row.odom_T_cam) for kf_id, row in rows]
         stamps = np.array([row.stamp_ns for _, row in rows], np.int64)
         return Trajectory(stamps, np.array(poses).reshape(-1, 4, 4))
 
     def pose_per_frame(self, poses: F64, kept: Bool, step: int = 1) -> F64:
-        """One pose for each frame id of the run: what was lost lies between its neighbours.
+        """One pose for each frame id of the run: lost ones are interpolated.
 
         Args:
             poses: (M, 4, 4) of the frames that `kept` (frames,) marks.
@@ -285,9 +285,9 @@ class RunRecord:
         reason = self.frames.reasons_of(np.array([begin]))[0]
         return LostInterval(int(self.frames.frame_id[begin]), end - begin, seconds, reason)
 
-    def pieces(self) -> int:
-        """How many pieces the walk is in: tracking restarted after it was lost, and no loop joins what is before and
-        after. Where one piece lies beside the other is only predicted.
+    def unconnected_submaps(self) -> int:
+        """Number of parts of the map that no loop connects, because tracking restarted after it was lost. Their
+        relative poses are only predicted.
         """
         submaps = sorted({row.submap_id for row in self.keyframes.values()})
         if self.localize_only or len(submaps) < 2:
@@ -299,7 +299,7 @@ class RunRecord:
         return int(connected_components(graph, directed=False)[0])
 
     def closure_drifts(self) -> list[float]:
-        """At each loop within a piece of odometry: how far that was off, as a share of the path between its ends."""
+        """For each loop without a loss of tracking: error of the odometry as a share of the path between both ends."""
         drifts: list[float] = []
         for loop in self.loops:
             old, new = self.keyframes[loop.candidate_kf_id], self.keyframes[loop.kf_id]
@@ -311,7 +311,7 @@ class RunRecord:
         return drifts
 
     def fingerprint(self) -> str:
-        """Eight hex digits of the poses' bits: two runs with the same ones gave the same result."""
+        """Eight hex digits of a hash of all poses: equal for runs with the same result."""
         digest = hashlib.sha256()
         for stamp_ns, odom_T_cam in zip(self.frames.stamp_ns, self.frames.odom_T_cam, strict=True):
             digest.update(stamp_ns.tobytes())

@@ -1,4 +1,4 @@
-"""report.md: a run for people, with pictures, verdicts, and what to do next."""
+"""report.md: the results of a run with plots, verdicts and advice."""
 
 from __future__ import annotations
 
@@ -13,13 +13,25 @@ from stereo_sfm.eval.statistics import failure, summary, thousands
 from stereo_sfm.types import Trajectory
 
 ADVICE = {
-    "dark": "images were dark: more light, or a longer exposure",
-    "too_few_points": "too few points could be followed: look at the images (blur, bare walls, a covered lens)",
-    "no_consensus": "points disagreed about the motion: people or carts in view, or a wrong calibration (`info`)",
+    "dark": "images were dark: use more light or a longer exposure",
+    "too_few_points": "too few points could be tracked: check the images (blur, bare walls, a covered lens)",
+    "no_consensus": "points did not agree on one motion: people or carts in view, or a wrong calibration",
 }
-FEW_INLIERS = 60  # median points a frame below which the pose hangs on little
-LEAST_LENGTH_M = 1.0  # of a path whose length says something about the scale
-BIG_SCALE_ERROR = 0.02  # Sim(3) scale off by more than this points at the baseline
+# Why a loop candidate was rejected (`LoopResult.rejected`), as in docs/glossary.md.
+REJECTIONS = {
+    "too_few_matches": "too few corners have a similar descriptor",
+    "no_pose": "the matches fit no pose",
+    "too_few_inliers": "too few matches fit one pose",
+    "not_spread": "the inliers cover too small a part of the image",
+    "against_odometry": "the pose contradicts the odometry by more than drift can explain",
+    "out_of_reach": "the camera cannot have moved there while tracking was lost",
+    "better_elsewhere": "another candidate of the same keyframe has many more inliers",
+    "ambiguous": "another place fits as well, and no odometry decides between them",
+    "not_confirmed_yet": "not enough successive keyframes agree on the loop yet",
+}
+FEW_INLIERS = 60  # median points per frame below which the pose is poorly constrained
+LEAST_LENGTH_M = 1.0  # shortest path whose length is compared
+BIG_SCALE_ERROR = 0.02  # Sim(3) scale error above which the baseline is suspected
 
 
 def write_report(
@@ -34,8 +46,8 @@ def write_report(
     """Write report.md and its pictures.
 
     Args:
-        folder: the run's.
-        source_name: what was run on.
+        folder: of the run.
+        source_name: name of the source.
         record, stats: of the run.
         estimates: trajectories by name ("odometry", "map").
         reference: ground truth in its own frame, or None.
@@ -49,13 +61,30 @@ def write_report(
         lines += [f"| {key} | {value} |" for key, value in table(result)]
     lines += calibration_table(stats)
     if reference is None:
-        lines += ["", "The source has no ground truth: `stereo-sfm eval` compares the trajectory with one."]
+        lines += [
+            "",
+            "The source has no ground truth. `stereo-sfm eval RUN --ref TRUTH` compares the trajectory with one.",
+        ]
+    lines += _rejections(stats["loops_rejected"])
     lines += ["", "## Time per stage", "", "| stage | p50 | p95 | p99 | frames |", "|---|---|---|---|---|"]
     for stage, ms in stats["ms"].items():
         count = thousands(int(ms["frames"]))
         lines.append(f"| {stage} | {ms['p50']:.2f} ms | {ms['p95']:.2f} ms | {ms['p99']:.2f} ms | {count} |")
+    lines += [
+        "",
+        "`track`, `map` and `loop` are the stages and run in parallel; the other rows are steps of them. `latency` is",
+    ]
+    lines += ["the time from the arrival of an image to its pose."]
     lines += ["", *(f"![{name}]({name}.png)\n" for name in pictures)]
     (folder / "report.md").write_text("\n".join(lines), encoding="utf-8")
+
+
+def _rejections(counts: dict[str, int]) -> list[str]:
+    """A table of the reasons why loop candidates were rejected; empty if none were."""
+    if not counts:
+        return []
+    rows = [f"| {reason.replace('_', ' ')} | {n} | {REJECTIONS.get(reason, '')} |" for reason, n in counts.items()]
+    return ["", "## Rejected loop candidates", "", "| reason | candidates | meaning |", "|---|---|---|", *rows]
 
 
 def _draw(
@@ -65,7 +94,7 @@ def _draw(
     estimates: dict[str, Trajectory],
     evaluations: dict[str, Evaluation],
 ) -> list[str]:
-    """Draw what there is to draw; the pictures' names."""
+    """Draw the plots; returns their names."""
     pictures: list[str] = []
     aligned = {name: result.estimate for name, result in evaluations.items()}
     shown = aligned or {name: t for name, t in estimates.items() if len(t)}
@@ -86,13 +115,13 @@ def _draw(
 
 
 def _drops(stats: dict[str, Any]) -> list[str]:
-    """What is missing between the camera and the log."""
+    """Images lost between the camera and the log."""
     lost, total = stats["dropped"] - stats["dropped_by_capture"], stats["frames"] + stats["dropped"]
     slow = "were dropped because the stages are too slow: try --frame-skip, or fewer points (tracker.max_features)"
-    disk = "are not in the log, whose disk is too slow: take --image-format jpeg or --log lean"
+    disk = "are not in the log because its disk is too slow: use --image-format jpeg or --log lean"
     rows = (
         (stats["dropped_by_capture"], slow),
-        (lost, "never arrived: check the cable, disk and files"),
+        (lost, "never arrived: check the cable, the disk and the files"),
         (stats["left_out_of_log"], disk),
     )
     out = [f"**WARN**: {n} frames ({100 * n / total:.1f} %) {what}" for n, what in rows if n]
@@ -100,33 +129,33 @@ def _drops(stats: dict[str, Any]) -> list[str]:
 
 
 def verdicts(stats: dict[str, Any], evaluations: dict[str, Evaluation]) -> list[str]:
-    """What is good, what is not, and what to do about it."""
+    """What is good, what is not, and advice."""
     out: list[str] = []
     failed = failure(stats)
     if failed:
         out.append(f"**FAIL**: {failed}")
     reasons = sorted({interval["reason"] for interval in stats["lost_intervals"]})
     if reasons:
-        out += [f"**WARN**: lost ({reason}): {ADVICE.get(reason, 'see stats.json')}" for reason in reasons]
+        out += [f"**WARN**: tracking was lost ({reason}): {ADVICE.get(reason, 'see stats.json')}" for reason in reasons]
     elif stats["tracked"]:
-        dropped = ", but for those that capture dropped" if stats["dropped_by_capture"] else ""
-        out.append(f"**PASS**: every frame after the first pose has one{dropped}")
+        dropped = ", except those dropped by capture" if stats["dropped_by_capture"] else ""
+        out.append(f"**PASS**: every frame after the first pose has a pose{dropped}")
     if stats["pieces"] > 1:
         out.append(
-            f"**WARN**: the walk is in {stats['pieces']} pieces: tracking began again, and no place of one piece was "
-            "recognised in another; drive through a place again that was seen before tracking was lost"
+            f"**WARN**: the map is in {stats['pieces']} unconnected submaps: tracking restarted, and no place of one "
+            "was recognised in another; drive again through a place that was seen before tracking was lost"
         )
     out += _drops(stats)
     if stats["tracked"] and stats["inliers_median"] < FEW_INLIERS:
         out.append(
-            f"**WARN**: only {stats['inliers_median']:.0f} points a frame: look at texture, exposure and calibration"
+            f"**WARN**: only {stats['inliers_median']:.0f} points per frame: check texture, exposure and calibration"
         )
     out += [text for name, result in evaluations.items() if (text := _length(name, result))]
-    return out or ["nothing to say: no frames"]
+    return out or ["no frames"]
 
 
 def _length(name: str, result: Evaluation) -> str:
-    """Whether a path is too long or too short; nothing of one too short to tell, or that has no scale of its own."""
+    """Whether a path is too long or too short; "" if it is too short to decide or has no scale."""
     off = 1 / result.sim3_scale - 1
     if result.mode == "sim3" or result.length_m < LEAST_LENGTH_M or not abs(result.sim3_scale - 1) > BIG_SCALE_ERROR:
         return ""

@@ -55,12 +55,12 @@ def write_results(
         wall_s: seconds it took.
         reference: ground truth (world_T_cam0), or None.
         frame: "cam0" or "body", the frame whose poses the trajectory files hold. Errors are always those of cam0.
-        step: every `step`-th frame of the source was used.
+        step: every `step`-th frame of the source was processed.
         max_lost_percent: frames without a pose above which the run counts as failed.
-        why_not_started: of a run that never had a pose, see `eval.start`.
+        why_not_started: reason for a run without any pose, see `eval.start`.
 
     Returns:
-        What stats.json holds, and the evaluations by trajectory name.
+        The content of stats.json, and the evaluations by trajectory name.
     """
     from stereo_sfm.calib import save_rig
 
@@ -86,12 +86,12 @@ def write_results(
 
 
 def scale_free(config: Config, rig: Rig) -> bool:
-    """Whether the lengths of a run are in no unit: one eye, and no other source of scale."""
+    """Whether the scale of a run is unknown: one camera, and no other source of scale."""
     return config.odometry.monocular or (not rig.stereo and config.odometry.scale == "unit")
 
 
 def _evaluate(estimates: dict[str, Trajectory], reference: Trajectory | None, best: str) -> dict[str, Evaluation]:
-    """By name, aligned as `best` says; a path too short to align is compared from its first pose, one pose is not."""
+    """By name, aligned as `best` says; short paths are aligned at the first pose."""
     evaluations: dict[str, Evaluation] = {}
     if reference is None:
         return evaluations

@@ -1,4 +1,4 @@
-"""What a run says when tracking never began: the quick checks of `stereo_sfm.calib.start` on its own first images."""
+"""Why tracking never began: the quick checks of `stereo_sfm.calib.start` on the first images of the run."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from stereo_sfm.drivers.source import Source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.eval.record import RunRecord
 
-APART = 5  # frames from one image that is looked at to the next
+APART = 5  # frames between two checked images
 IMAGES = 3
 
 
 def why_not_started(opener: Callable[[], Source], record: RunRecord) -> str:
-    """One line, "" where the run has a pose, nothing is found, or the images cannot be read again.
+    """One line, "" if the run has a pose, no reason is found, or the images cannot be read again.
 
     Args:
         opener: gives the source that was run, not yet entered.

@@ -1,4 +1,4 @@
-"""The numbers of a run: stats.json, and the lines that a user pastes into a bug report."""
+"""The numbers of a run: stats.json, and the closing lines for the screen and for bug reports."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ def stage_times(record: RunRecord) -> dict[str, dict[str, float]]:
 
 
 def statistics(record: RunRecord, wall_s: float, evaluations: dict[str, Evaluation] | None = None) -> dict[str, Any]:
-    """Everything countable about a run, as plain values for JSON."""
+    """The numbers of a run as plain values for JSON."""
     tracked = int(record.tracked().sum())
     frames, drops = len(record.frames), record.drops
-    crowded_out = drops.get(RING, 0)
+    dropped_by_capture = drops.get(RING, 0)
     lost = record.lost_intervals()
     drifts = record.closure_drifts()
     states, counts = np.unique(record.frames.state, return_counts=True)
@@ -47,15 +47,15 @@ def statistics(record: RunRecord, wall_s: float, evaluations: dict[str, Evaluati
     return {
         "frames": frames,
         "tracked": tracked,
-        "unplaced": tracked - int(record.placed().sum()),  # a saved map did not know them
+        "unplaced": tracked - int(record.placed().sum()),  # not found in the saved map
         "dropped": sum(count for where, count in drops.items() if where != LOG),
-        "dropped_by_capture": crowded_out,  # the stages were too slow for them
-        "left_out_of_log": drops.get(LOG, 0),  # tracked, but not to be replayed
+        "dropped_by_capture": dropped_by_capture,  # the stages were too slow
+        "left_out_of_log": drops.get(LOG, 0),  # tracked, but missing in the log
         "log_ended": record.log_ended,
         "states": {TrackState(k).name: n for k, n in zip(states.tolist(), counts.tolist(), strict=True)},
-        "lost_percent": 100.0 * (frames + crowded_out - tracked) / max(frames + crowded_out, 1),
+        "lost_percent": 100.0 * (frames + dropped_by_capture - tracked) / max(frames + dropped_by_capture, 1),
         "lost_intervals": [dataclasses.asdict(interval) for interval in lost],
-        "pieces": record.pieces(),
+        "pieces": record.unconnected_submaps(),
         "keyframes": len(record.keyframes),
         "points": len(record.map_points) or int(record.seen_points.sum()),
         "inliers_median": float(np.median(record.frames.inliers)) if frames else 0.0,
@@ -117,7 +117,7 @@ def summary(stats: dict[str, Any], evaluations: dict[str, Evaluation] | None = N
     if stats["unplaced"]:
         lines.append(f"{thousands(stats['unplaced'])} of the tracked frames were not found in the map")
     if stats["pieces"] > 1:
-        lines.append(f"{stats['pieces']} pieces that no loop joins: how they lie to each other is only predicted")
+        lines.append(f"{stats['pieces']} submaps that no loop connects: their relative poses are only predicted")
     if stats["loops_accepted"] or stats["loops_rejected"]:
         lines.append(_loops(stats))
     if stats["camera"]:
@@ -137,7 +137,7 @@ def _dropped(stats: dict[str, Any]) -> str:
 
 
 def _log(stats: dict[str, Any]) -> list[str]:
-    """What the log lacks."""
+    """What is missing in the log."""
     lines = [f"the log is not complete: {stats['log_ended']}"] if stats["log_ended"] else []
     if stats["left_out_of_log"]:
         noun = "image" if stats["left_out_of_log"] == 1 else "images"
@@ -147,12 +147,12 @@ def _log(stats: dict[str, Any]) -> list[str]:
 
 def _against_truth(name: str, result: Evaluation) -> str:
     ate = f"{name} against ground truth: ATE {length(result.ape_m.rmse)} over {length(result.length_m)}"
-    turn = f"{result.rpe_deg.rmse:.3f} deg a frame" if result.oriented else ""
+    rotation = f"{result.rpe_deg.rmse:.3f} deg per frame" if result.oriented else ""
     if result.mode == "sim3":
-        return f"{ate} (Sim(3) aligned: one eye has no scale)" + (f", rotation {turn}" if turn else "")
+        return f"{ate} (Sim(3) aligned: one camera has no scale)" + (f", rotation {rotation}" if rotation else "")
     return (
         f"{ate} ({result.ate_percent:.3f} %, {result.mode.upper()} aligned), Sim(3) {length(result.ate_sim3_m)}, "
-        f"RPE {length(result.rpe_m.rmse)} {turn or 'a frame'}"
+        f"RPE {length(result.rpe_m.rmse)} {rotation or 'per frame'}"
     )
 
 
@@ -168,7 +168,7 @@ def _lost(stats: dict[str, Any]) -> str:
 
 
 def _camera(counts: dict[str, float]) -> str:
-    """What went wrong in a live camera, by its own counters."""
+    """Problems of a live camera by its own counters."""
     trouble = [f"{name.replace('_', ' ')} {count:g}" for name, count in counts.items() if count and name in TROUBLE]
     return f"camera: {counts.get('pairs', 0):g} stereo images, {', '.join(trouble) or 'nothing lost'}"
 
@@ -181,7 +181,7 @@ def _loops(stats: dict[str, Any]) -> str:
         f" ({reasons})" if reasons else ""
     )
     drift = stats["closure_drift_percent_median"]
-    return text if drift is None else f"{text} · drift at closures {drift:.2f} % (median)"
+    return text if drift is None else f"{text} · odometry drift at loops {drift:.2f} % of the path (median)"
 
 
 def _times(stats: dict[str, Any]) -> str:
@@ -191,4 +191,4 @@ def _times(stats: dict[str, Any]) -> str:
         if stage in ("track", "map", "loop")
     ]
     rate = f"{stats['frames_per_s']:.1f} frames/s"
-    return " · ".join([*parts, rate, f"result {stats['fingerprint']}"])
+    return " · ".join([*parts, rate, f"result hash {stats['fingerprint']}"])

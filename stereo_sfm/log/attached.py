@@ -40,7 +40,7 @@ def attached_config(reader: LogReader) -> Config | None:
     """The configuration of a run.
 
     Raises:
-        StereoSfmError: it is of a version with other settings.
+        StereoSfmError: it was written by a version with other settings.
     """
     return _read(reader, CONFIG_FILE, lambda raw: _config(raw, reader))
 
@@ -52,7 +52,7 @@ def _read(reader: LogReader, name: str, parse: Callable[[bytes], T]) -> T | None
     try:
         return parse(raw)
     except (ValueError, LookupError, RecursionError) as error:
-        log.warning("%s: the attached %s is damaged (%s) and left out", reader.path, name, error)
+        log.warning("%s: the attached %s is damaged (%s) and ignored", reader.path, name, error)
         return None
 
 
@@ -61,7 +61,7 @@ def _trajectory(raw: bytes) -> Trajectory:
     arrays = read_arrays(raw)
     stamp_ns, poses = arrays["stamp_ns"], arrays["poses"]
     if stamp_ns.dtype != np.int64 or poses.dtype != np.float64 or poses.shape != (*stamp_ns.shape, 4, 4):
-        raise ValueError("its arrays are no trajectory")
+        raise ValueError("its arrays are not a trajectory")
     return Trajectory(stamp_ns, poses, "positions_only" not in arrays)
 
 

@@ -1,7 +1,7 @@
-"""What lies in a chunk of an MCAP file, and the messages of many chunks in the order of time.
+"""The content of a chunk of an MCAP file, and the messages of many chunks in the order of time.
 
 A chunk states how large its content is. That is checked against a limit and against what the compressed data itself
-states before anything is decompressed: a few kilobytes can stand for gigabytes.
+declares before anything is decompressed: a few kilobytes can expand to gigabytes.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, ChunkIndex, Message, Schema
 
-MOST_BYTES = 1 << 28  # of a chunk's content: a hundred times what writers put into one
-MOST_RECORDS = 1_000_000  # of a chunk
+MAX_BYTES = 1 << 28  # of a chunk's content: a hundred times the usual size
+MAX_RECORDS = 1_000_000  # of a chunk
 PREFIX = 9  # opcode and length of a record
-# What broken bytes raise inside the library's parsers.
+# Exceptions of the library's parsers on damaged data.
 DAMAGE = (
     McapError,
     zstandard.ZstdError,
@@ -40,14 +40,14 @@ def content(chunk: Chunk) -> bytes:
     """The decompressed records of a chunk, their checksum verified where there is one.
 
     Raises:
-        ValueError: larger than it states or than a chunk may be, of an unknown compression, or damaged.
+        ValueError: larger than declared or than the limit, of an unknown compression, or damaged.
     """
     size = chunk.uncompressed_size
-    if size > MOST_BYTES:
-        raise ValueError(f"a chunk states {size} bytes, more than {MOST_BYTES} are not read")
+    if size > MAX_BYTES:
+        raise ValueError(f"a chunk declares {size} bytes: more than {MAX_BYTES} are not read")
     data = _decompressed(chunk.compression, chunk.data, size)
     if len(data) != size:
-        raise ValueError("a chunk does not hold as many bytes as it states")
+        raise ValueError("a chunk does not contain as many bytes as it declares")
     if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
         raise ValueError("the checksum of a chunk is wrong")
     return data
@@ -59,9 +59,9 @@ def _decompressed(compression: str, data: bytes, size: int) -> bytes:
     if compression == "lz4":
         return lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
     if compression != "zstd":
-        raise ValueError(f"the compression '{compression}' is not known")
-    if zstandard.frame_content_size(data) not in (-1, size):  # the library allocates what the frame states
-        raise ValueError("a chunk does not hold as many bytes as it states")
+        raise ValueError(f"unknown compression '{compression}'")
+    if zstandard.frame_content_size(data) not in (-1, size):  # the library allocates the size in the frame's header
+        raise ValueError("a chunk does not contain as many bytes as it declares")
     return zstandard.ZstdDecompressor().decompress(data, max_output_size=size) if size else b""
 
 
@@ -69,7 +69,7 @@ def records(chunk: Chunk) -> Iterator[tuple[int, Schema | Channel | Message]]:
     """Each schema, channel and message of a chunk with its offset in the content.
 
     Raises:
-        ValueError: as `content`, or more than `MOST_RECORDS`.
+        ValueError: as `content`, or more than `MAX_RECORDS`.
     """
     data = content(chunk)
     stream = ReadDataStream(BytesIO(data))
@@ -78,8 +78,8 @@ def records(chunk: Chunk) -> Iterator[tuple[int, Schema | Channel | Message]]:
         at = stream.count
         opcode, length = struct.unpack("<BQ", stream.read(PREFIX))
         count += 1
-        if count > MOST_RECORDS:
-            raise ValueError(f"a chunk holds more than {MOST_RECORDS} records")
+        if count > MAX_RECORDS:
+            raise ValueError(f"a chunk holds more than {MAX_RECORDS} records")
         if opcode == Opcode.MESSAGE:
             yield at, Message.read(stream, length)
         elif opcode == Opcode.CHANNEL:

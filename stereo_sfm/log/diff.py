@@ -22,7 +22,7 @@ IMAGE_SCHEMAS = ("foxglove.RawImage", "foxglove.CompressedImage")
 
 @dataclass(frozen=True)
 class Difference:
-    """Where two logs part."""
+    """The first difference of two logs in a topic."""
 
     topic: str
     frame_id: int  # -1: the topic as a whole
@@ -37,7 +37,7 @@ class Difference:
 
 
 def compared(topic: str, a: LogReader, b: LogReader) -> bool:
-    """Whether a topic counts: those of the table say so; of topics of others, everything is compared."""
+    """Whether a topic is compared: by the table of topics; topics of other programs always are."""
     row = topics.BY_NAME.get(topic)
     return row is None or row.compare or (topic not in _names(a) and topic not in _names(b))
 
@@ -53,7 +53,7 @@ def diff(a: LogReader, b: LogReader, only: Collection[str] = (), tolerance: floa
         a: one log.
         b: the other.
         only: topics to look at, all that are compared when empty.
-        tolerance: how far two numbers of a message may lie apart.
+        tolerance: tolerance for the numbers of a message.
 
     Raises:
         StereoSfmError: `only` names a topic that neither log has.
@@ -160,7 +160,7 @@ class _Comparison:
 
 
 def _interleaved(a: Iterator[Record], b: Iterator[Record]) -> Iterator[tuple[int, Record]]:
-    """One of each in turn, so that neither side runs far ahead."""
+    """One of each in turn, so that neither side gets far ahead."""
     for one, other in itertools.zip_longest(a, b):
         if one is not None:
             yield 0, one
@@ -169,7 +169,7 @@ def _interleaved(a: Iterator[Record], b: Iterator[Record]) -> Iterator[tuple[int
 
 
 def _pixels(a: Any, b: Any) -> tuple[str, str, str] | None:
-    """Images are the same when their pixels are, whatever the compression."""
+    """Images are equal if their pixels are, regardless of the compression."""
     one, other = (_decode_image(m) for m in (a, b))
     if one.shape != other.shape:
         return "size", f"{one.shape[1]}x{one.shape[0]}", f"{other.shape[1]}x{other.shape[0]}"

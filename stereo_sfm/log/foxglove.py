@@ -1,4 +1,4 @@
-"""Our types as Foxglove messages: calibration, poses, transforms, points, annotations, lines, text."""
+"""The project's types as Foxglove messages: calibration, poses, transforms, points, annotations, lines, text."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def odometry(stamp_ns: int, odom_T_body: Pose, covariance: F64) -> Odometry:
 
 
 def calibration(camera: Camera, frame: str, stamp_ns: int, projection_tx: float = 0.0) -> CameraCalibration:
-    """One eye. A model Foxglove has no name for is published as uncalibrated (K[0] is 0), as its schema says."""
+    """One camera. A model unknown to Foxglove is published as uncalibrated (K[0] is 0), as its schema specifies."""
     out = CameraCalibration(frame_id=frame, width=camera.width, height=camera.height)
     names = {"pinhole": ("plumb_bob", 5), "radtan": ("plumb_bob", 5), "kannala_brandt": ("kannala_brandt", 4)}
     name, count = names.get(camera.model, ("", 0))
@@ -168,5 +168,5 @@ def scene(frame: str, stamp_ns: int, entities: Iterable[tuple[str, LinePrimitive
 
 
 def text(stamp_ns: int, level: str, message: str, name: str = "stereo_sfm") -> Log:
-    """A line for people; `level` is a name of `logging`."""
+    """A human-readable line; `level` is a name of `logging`."""
     return stamp(Log(level=LEVELS.get(level, 2), message=message, name=name), stamp_ns)  # pyright: ignore[reportArgumentType]

@@ -20,12 +20,12 @@ from stereo_sfm.types import ImuSamples, StereoImage, Trajectory, WheelSamples
 RIG_FILE = "calibration.yaml"
 TRUTH_FILE = "ground_truth.npz"
 SECOND_NS = 1_000_000_000
-# Players hold z for up: a frame above the map that stands as the first image does (x forward, y left, z up).
+# Viewers take z as up: a parent frame of the map, aligned with the first camera (x forward, y left, z up).
 LEVEL_T_MAP = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 
 
 def truth_to_bytes(trajectory: Trajectory) -> bytes:
-    """Stamps and poses as npz, every bit: the topic holds quaternions, which are rounded."""
+    """Stamps and poses as npz, without loss: the quaternions of the topic are rounded."""
     buffer = io.BytesIO()
     arrays: dict[str, Any] = {"stamp_ns": trajectory.stamp_ns, "poses": trajectory.poses}
     if not trajectory.oriented:
@@ -53,7 +53,7 @@ class ImageLog:
             rig: calibration of the images.
             ground_truth: truth_T_cam0 where the source has it.
             image_format: one of `images.FORMATS`, or "none" for no images.
-            mapped: the file gets a map, which begins at the first image: say how it stands and where the truth lies.
+            mapped: the file gets a map with its origin at the first image: log how both are oriented.
         """
         self._writer = writer
         self._rig = rig
@@ -75,7 +75,7 @@ class ImageLog:
             image: a pair, or one that `encode_pair` has encoded already.
 
         Raises:
-            ValueError: a bare pair for a JPEG log: whoever tracks must see the decoded pixels, so encode first.
+            ValueError: an unencoded pair for a JPEG log: the tracker must see the decoded pixels, so encode first.
         """
         pair = image.image if isinstance(image, LoggedImage) else image
         self._static(pair.stamp_ns)
@@ -92,7 +92,7 @@ class ImageLog:
         self._pixels(image)
 
     def without_pixels(self, image: StereoImage) -> None:
-        """What a player and an inertial estimator need of an image that is left out."""
+        """Log an image without pixels: its info and its inertial and wheel samples."""
         self._left_out += 1
         self._static(image.stamp_ns)
         self._ground_truth(image.stamp_ns)
@@ -150,7 +150,7 @@ class ImageLog:
                 self._writer.write(topics.WHEEL, WheelSample(stamp_ns, *row), stamp_ns, pair.frame_id)
 
     def _static(self, stamp_ns: int) -> None:
-        """Calibration and the transforms inside the rig, at the start and every second: players that seek need them."""
+        """Calibration and transforms of the rig, at the start and every second: players need them after seeking."""
         if self._next_static_ns is not None and stamp_ns < self._next_static_ns:
             return
         self._next_static_ns = stamp_ns + SECOND_NS
@@ -166,7 +166,7 @@ class ImageLog:
         self._writer.write(topics.TF_STATIC, foxglove.transforms(stamp_ns, rows), stamp_ns)
 
     def _above_body(self, stamp_ns: int) -> list[tuple[str, str, Pose]]:
-        """How the map stands, and the truth in the map: they share the first image's pose."""
+        """The orientation of the map, and the ground truth in the map: they share the first image's pose."""
         if self._map_rows is None:
             self._map_rows = [("level", "map", foxglove.pose(LEVEL_T_MAP))] if self._mapped else []
             if self._mapped and self._truth is not None and len(self._truth):

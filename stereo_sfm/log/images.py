@@ -11,11 +11,11 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 
 from stereo_sfm.errors import StereoSfmError, one_of
-from stereo_sfm.pixels import MOST_PIXELS, decode, decode_gray, eight_bits
+from stereo_sfm.pixels import MAX_PIXELS, decode, decode_gray, eight_bits
 from stereo_sfm.types import F32, U8, U16, StereoImage
 
 FORMATS = ("png", "raw", "jpeg")
-# Average filter and run-length matching: of 26 settings the smallest file per millisecond on real T265 and EuRoC
+# Average filter and run-length matching: of 26 settings the best ratio of size to time on real T265 and EuRoC
 # images (benchmarks/record_speed.py); OpenCV's default is larger and slower.
 PNG_OPTIONS = (
     cv2.IMWRITE_PNG_COMPRESSION,
@@ -30,7 +30,7 @@ JPEG_OPTIONS = (cv2.IMWRITE_JPEG_QUALITY, 90)
 
 @dataclass(frozen=True)
 class LoggedImage:
-    """A pair as the log stores it. `image` is what the log will give back: the tracker of a lossy run must take it."""
+    """A pair as the log stores it. `image` has the decoded pixels, which the tracker of a lossy run must use."""
 
     image: StereoImage
     left: bytes
@@ -39,12 +39,12 @@ class LoggedImage:
 
 
 def encode_pair(image: StereoImage, image_format: str, decode: bool = True) -> LoggedImage:
-    """Encode both eyes; for JPEG the pixels of `LoggedImage.image` are the decoded ones.
+    """Encode both images; for JPEG the pixels of `LoggedImage.image` are the decoded ones.
 
     Args:
         image: the pair.
         image_format: one of `FORMATS`.
-        decode: False saves the decoding of JPEG where nobody looks at the pixels again.
+        decode: False skips the decoding of JPEG if the pixels are not used again.
     """
     left = encode_pixels(image.left, image_format)
     right = None if image.right is None else encode_pixels(image.right, image_format)
@@ -120,8 +120,8 @@ def decode_raw(data: bytes, width: int, height: int, step: int, encoding: str, b
     depth, channels, conversion = layout
     row = width * channels * depth
     step = step or row
-    if width * height > MOST_PIXELS:
-        raise ValueError(f"an image of {width}x{height} has more than {MOST_PIXELS} pixels")
+    if width * height > MAX_PIXELS:
+        raise ValueError(f"an image of {width}x{height} has more than {MAX_PIXELS} pixels")
     if step < row or len(data) < step * (height - 1) + row:
         raise ValueError(f"an image of {width}x{height} {encoding} has only {len(data)} bytes")
     rows = np.frombuffer(data[: step * height].ljust(step * height, b"\0"), np.uint8).reshape(height, step)[:, :row]

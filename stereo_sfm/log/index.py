@@ -44,7 +44,7 @@ class Index:
     """What a summary section is made of."""
 
     end: int  # of the last whole record of the data section
-    closed: bool = False  # the file has its end mark
+    closed: bool = False  # the file has its closing magic bytes
     schemas: dict[int, Schema] = field(default_factory=dict[int, Schema])
     channels: dict[int, Channel] = field(default_factory=dict[int, Channel])
     chunks: list[ChunkIndex] = field(default_factory=list[ChunkIndex])
@@ -84,7 +84,7 @@ class Index:
         self.lost_message_index += record
 
     def drop_last_chunk(self) -> None:
-        """Forget the last chunk and everything behind it."""
+        """Drop the last chunk and everything after it."""
         self.end = self.chunks.pop().chunk_start_offset
         self.chunk_counts.pop()
         self.attachments = [a for a in self.attachments if a.offset < self.end]

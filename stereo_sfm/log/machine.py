@@ -1,4 +1,4 @@
-"""What of the processor decides bits: OpenCV, BLAS and the compiled kernels each choose their code by its features."""
+"""Properties of the processor that affect the last bits: OpenCV, BLAS and the kernels choose code by its features."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ FEATURES = 512  # OpenCV numbers the features of all processors below
 
 
 def arithmetic() -> dict[str, str]:
-    """By name, as a log keeps it: two machines where these are equal give the same bits."""
+    """Properties by name, as kept in a log: machines with equal properties give the same bits."""
     return {
         "processor": _processor(),
         "opencv_dispatch": _opencv_dispatch(),
@@ -27,7 +27,7 @@ def _processor() -> str:
 
 
 def _opencv_dispatch() -> str:
-    """The sets of instructions that OpenCV was built for and finds here, less what OPENCV_CPU_DISABLE takes away."""
+    """The instruction sets used by OpenCV here, without those disabled by OPENCV_CPU_DISABLE."""
     import cv2
 
     built: list[str] = []

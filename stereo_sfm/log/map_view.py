@@ -1,4 +1,4 @@
-"""The map as the log shows it: keyframe poses, points and edges, put together from the messages of a run."""
+"""The map as the log shows it: keyframe poses, points and edges, assembled from the messages of a run."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class MapView:
         self._recent: list[tuple[int, I64]] = []  # keyframes: id, and those of the points that they see
         self._covisible: list[tuple[int, int]] = []
         self._loops: list[tuple[int, int]] = []
-        self._refused: set[int] = set()  # kf_ids whose loops the mapper did not believe
+        self._refused: set[int] = set()  # kf_ids whose loops the mapper rejected
 
     def keyframe(self, keyframe: Keyframe, map_T_odom: F64) -> None:
         """A new keyframe, at its odometry pose until the mapper moves it."""

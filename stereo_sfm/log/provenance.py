@@ -1,4 +1,4 @@
-"""Where a file comes from: versions, source, configuration, as metadata and attachments."""
+"""The origin of a file: versions, source and configuration, as metadata and attachments."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from stereo_sfm.log.topics import SCHEMA_VERSION
 from stereo_sfm.log.writer import LogWriter
 
 METADATA = "stereo_sfm"
-TOTALS = "totals"  # written at the end: what a reader would else have to count
+TOTALS = "totals"  # counts, written at the end
 ENDED_EARLY = {"ended": "early"}  # in the metadata of a run that was killed
 CONFIG_FILE = "config.toml"
 SOURCE_RIG_FILE = "source_calibration.yaml"
@@ -38,7 +38,7 @@ _PACKAGES = (
 
 @dataclass(frozen=True, eq=False)
 class Opening:
-    """How a run began, besides the source's name: what a replay must do again."""
+    """How a run was started, besides the source's name: what a replay must repeat."""
 
     rectify: str = "none"  # none | pinhole | wide
     rig: Rig | None = None  # calibration that replaced the source's own, before rectification
@@ -58,16 +58,16 @@ def write_provenance(
     config: Config | None = None,
     opening: Opening | None = None,
 ) -> None:
-    """Record where everything in the file comes from.
+    """Record the origin of everything in the file.
 
     Args:
         writer: the open file.
-        source: the source's name for people.
+        source: the source's name.
         serial: serial number of the device, "" for none.
-        mode: how the file came about: "record", "inline", "lockstep", "realtime".
+        mode: how the file was made: "record", "inline", "lockstep", "realtime".
         image_format: one of `images.FORMATS`.
         config: what decided the results of a run.
-        opening: how the run began.
+        opening: how the run was started.
     """
     values = {
         "version": __version__,
@@ -112,7 +112,7 @@ def versions() -> str:
 
 
 def other_conditions(a: LogReader, b: LogReader) -> list[str]:
-    """What of the packages and the machine code differs between two runs, "name: a -> b"."""
+    """Differences of the packages and the machine code of two runs, "name: a -> b"."""
     one, other = (_by_name(reader.attachment(VERSIONS_FILE) or b"") for reader in (a, b))
     names = [name for name in one if name in other and one[name] != other[name]]
     return [f"{name}: {one[name]} -> {other[name]}" for name in names]

@@ -51,8 +51,8 @@ class TopicInfo:
     count: int
 
 
-class _Mended:
-    """The whole records of a file followed by the index that it lacks, as one stream."""
+class _Repaired:
+    """The complete records of a file followed by its missing index, as one stream."""
 
     def __init__(self, stream: IO[bytes], end: int, tail: bytes) -> None:
         self._stream, self._end, self._tail, self._at = stream, end, tail, 0
@@ -75,7 +75,7 @@ class _Mended:
 
 
 class LogReader:
-    """Opens a file, closed or cut off. `truncated` says what was found wrong, "" when nothing."""
+    """Opens a file, closed or cut off. `truncated` describes its damage, "" if there is none."""
 
     def __init__(self, path: Path) -> None:
         """Open and read the index.
@@ -85,7 +85,7 @@ class LogReader:
         """
         self.path = path
         if path.exists() and not path.is_file():
-            raise StereoSfmError(f"cannot read {path}: it is no file")
+            raise StereoSfmError(f"cannot read {path}: it is not a file")
         try:
             self._stream: IO[bytes] = path.open("rb")
         except OSError as error:
@@ -119,10 +119,10 @@ class LogReader:
         elif not index_is_whole:
             self.truncated = f"its index is damaged, {index.messages} messages recovered"
         if index.bad_chunks:
-            self.truncated += f"{', ' if self.truncated else ''}{len(index.bad_chunks)} damaged chunks left out"
+            self.truncated += f"{', ' if self.truncated else ''}{len(index.bad_chunks)} damaged chunks omitted"
         if self.truncated:
-            log.warning("%s: %s ('stereo-sfm recover' writes a mended copy)", self.path, self.truncated)
-        self._bytes = _Mended(self._stream, index.end, tail(index))
+            log.warning("%s: %s ('stereo-sfm recover' writes a repaired copy)", self.path, self.truncated)
+        self._bytes = _Repaired(self._stream, index.end, tail(index))
         reader = SeekingReader(self._bytes, validate_crcs=True)
         summary = reader.get_summary()
         assert summary is not None
@@ -189,7 +189,7 @@ class LogReader:
     def _chunk(self, index: ChunkIndex) -> Chunk:
         raw = self._read(index.chunk_start_offset, index.chunk_length)
         if raw[:1] != bytes([Opcode.CHUNK]):
-            raise ValueError("its index points to something else than a chunk")
+            raise ValueError("its index does not point to a chunk")
         return Chunk.read(ReadDataStream(io.BytesIO(raw[PREFIX:])))
 
     def _read(self, offset: int, length: int) -> bytes:
@@ -199,13 +199,13 @@ class LogReader:
             ValueError: it is not that long.
         """
         if not 0 <= offset <= offset + length <= self._bytes.seek(0, io.SEEK_END):
-            raise ValueError("its index points behind the end")
+            raise ValueError("its index points beyond the end")
         self._bytes.seek(offset)
         return self._bytes.read(length)
 
     def _damaged(self, error: BaseException) -> StereoSfmError:
         said = str(error) or type(error).__name__
-        return StereoSfmError(f"{self.path} is damaged ({said}): 'stereo-sfm recover' copies what is whole")
+        return StereoSfmError(f"{self.path} is damaged ({said}): 'stereo-sfm recover' copies the undamaged part")
 
     def stamps(self, topic: str) -> I64:
         """Log times of a topic in ascending order, from the index alone where the file has one."""
@@ -256,7 +256,7 @@ class LogReader:
                     raise ValueError("its checksum is wrong")
                 return Attachment.read(ReadDataStream(io.BytesIO(raw[PREFIX:]))).data
             except chunks.DAMAGE as error:
-                log.warning("%s: the attached %s is damaged (%s) and left out", self.path, name, error)
+                log.warning("%s: the attached %s is damaged (%s) and ignored", self.path, name, error)
         return None
 
     def metadata(self, name: str) -> dict[str, str]:
@@ -267,7 +267,7 @@ class LogReader:
                 if record.name == name:
                     out.update(record.metadata)
         except chunks.DAMAGE as error:
-            log.warning("%s: metadata is damaged (%s) and left out", self.path, error)
+            log.warning("%s: metadata is damaged (%s) and ignored", self.path, error)
         return out
 
     @property
@@ -280,7 +280,7 @@ class LogReader:
 
 
 def _complete(summary: Summary) -> bool:
-    """Whether the index alone tells everything: other writers may leave parts of it out."""
+    """Whether the index is complete: other writers may omit parts of it."""
     statistics = summary.statistics
     if statistics is None or any(c.schema_id and c.schema_id not in summary.schemas for c in summary.channels.values()):
         return False

@@ -1,4 +1,4 @@
-"""Messages of a log as our own types again, and what a replay needs to know of a run."""
+"""Messages of a log as the project's types, and what a replay needs to know about a run."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ TYPES: dict[str, type[Any]] = {topic.schema: message for message, topic in topic
 def messages(
     reader: LogReader, names: Collection[str] | None = None, start: int | None = None, until: int | None = None
 ) -> Iterator[tuple[Record, Any]]:
-    """Records with their decoded messages: our dataclasses, or Foxglove's protobuf messages.
+    """Records with their decoded messages: the project's dataclasses, or Foxglove's protobuf messages.
 
     Args:
         reader: the open file.
-        names: topics, None for all. Messages of unknown schemas are left out.
+        names: topics, None for all. Messages of unknown schemas are omitted.
         start: first log time, inclusive. until: last log time, inclusive.
 
     Raises:
@@ -63,7 +63,7 @@ def _decoder(name: str, data: bytes) -> Callable[[bytes], Any] | None:
 
 @dataclass(frozen=True)
 class RecordedRun:
-    """How a run came about."""
+    """How a run was made."""
 
     source: str
     mode: str  # "inline", "lockstep", "realtime"
@@ -82,7 +82,9 @@ def read_run(reader: LogReader) -> RecordedRun:
     """
     config = attached_config(reader)
     if config is None:
-        raise StereoSfmError(f"{reader.path} is no log of a run: it holds no configuration ('stereo-sfm run' takes it)")
+        raise StereoSfmError(
+            f"{reader.path} is not the log of a run: it has no configuration (use 'stereo-sfm run' instead)"
+        )
     about = reader.metadata(METADATA)
     found: dict[str, list[Any]] = {topics.APPLIED: [], topics.DROPPED: []}
     for record, message in messages(reader, tuple(found)):
@@ -99,7 +101,7 @@ def read_run(reader: LogReader) -> RecordedRun:
 
 
 def ended_early(reader: LogReader) -> bool:
-    """Whether the log lacks what the run would have said last: the run was killed, or the file was cut off."""
+    """Whether the log lacks the end of the run: the run was killed, or the file was cut off."""
     return bool(reader.truncated) or ENDED_EARLY.items() <= reader.metadata(METADATA).items()
 
 

@@ -1,7 +1,7 @@
-"""Mend files that were not closed.
+"""Repair files that were not closed.
 
-One mechanism, three uses: `recover` copies the whole records and appends the index, a full disk cuts the file back and
-appends it, and the reader (`log.reader`) puts it behind the file in memory.
+One mechanism, three uses: `recover` copies the complete records and appends the index, a full disk cuts the file back
+and appends it, and the reader (`log.reader`) appends it in memory.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from stereo_sfm.log.scan import build_index, check_magic, spans
 
 
 def finish_in_place(path: Path, metadata: tuple[str, dict[str, str]] | None = None) -> int:
-    """Cut a file back to its last whole record and append the index; more chunks go if the disk has no room for it.
+    """Cut a file back to its last complete record and append the index; if needed, cut more chunks to make room for it.
 
     Args:
         path: the file.
@@ -53,7 +53,7 @@ def _write_all(write: Callable[[bytes], int | None], data: bytes) -> None:
 
 
 def _declarations(index: Index) -> bytes:
-    """Schema and channel records, to stand in for those of a chunk that is left out; repeating them is allowed."""
+    """Schema and channel records, to replace those of an omitted chunk; repeating them is allowed."""
     builder = RecordBuilder()
     for record in (*index.schemas.values(), *index.channels.values()):
         record.write(builder)
@@ -61,10 +61,10 @@ def _declarations(index: Index) -> bytes:
 
 
 def recover(source: Path, target: Path) -> Index:
-    """Copy what is whole and append the index.
+    """Copy the complete records and append the index.
 
     Raises:
-        StereoSfmError: not an MCAP file, or nothing in it.
+        StereoSfmError: not an MCAP file, or an empty one.
     """
     with source.open("rb") as stream:
         check_magic(stream, source)

@@ -1,4 +1,4 @@
-"""`RunLog`: everything a run says, as topics. A sink of the pipeline."""
+"""`RunLog`: all messages of a run as topics. A sink of the pipeline."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ from stereo_sfm.types import (
     Trajectory,
 )
 
-# The whole trajectory with its edges, and the whole map, at most so often; less often as they grow, so that they take
-# no more room a second in a long run.
+# Shortest intervals of the whole trajectory with its edges, and of the whole map; longer as they grow, so that a long
+# run needs no more space per second.
 TRAJECTORY_NS = 1_000_000_000
 TRAJECTORY_SIZE = 200  # keyframes
 POINTS_NS = 5_000_000_000
@@ -55,7 +55,7 @@ class RunLog:
     """Writes a run.
 
     The messages of the stages may arrive interleaved in any way, as from several processes; each stage's own must come
-    in order. What is put together from several stages (map pose, points, edges) waits until everything it needs has
+    in order. What is assembled from several stages (map pose, points, edges) waits until everything it needs has
     come, so that the content of every topic is the same however the stages were scheduled.
     """
 
@@ -117,7 +117,7 @@ class RunLog:
 
     @singledispatchmethod
     def _write(self, message: object) -> None:
-        """As its row of topics says; a method below writes a message that is more than a message of its topic."""
+        """Write a message as its row of topics says; those with a method below write more than that."""
         row = topics.OF.get(type(message))
         if row is None:
             raise TypeError(f"no topic for {type(message).__name__}")
@@ -132,7 +132,7 @@ class RunLog:
 
     @_write.register
     def left_out(self, left: LeftOut) -> None:
-        """What belongs to an image whose pixels are not kept."""
+        """An image whose pixels are not kept."""
         self._now_ns = left.image.stamp_ns
         self._images.without_pixels(left.image)
 
@@ -191,24 +191,24 @@ class RunLog:
 
     @_write.register
     def counters(self, counters: SourceCounters) -> None:
-        """What the camera counts about itself."""
+        """Counters of a live camera."""
         self._counts = counters.counts
         self._writer.write(topics.COUNTERS, counters, self._now_ns, counters.frame_id)
 
     @_write.register
     def line(self, line: LogLine) -> None:
-        """A line for people."""
-        if not self._writer.closed:  # a full disk is told by the next message of a stage
+        """A human-readable line."""
+        if not self._writer.closed:  # a full disk is reported with the next message of a stage
             text = foxglove.text(self._now_ns, line.level, line.text, line.stage)
             self._writer.write(topics.LOG, text, self._now_ns)
 
     @property
     def refused(self) -> bool:
-        """Whether the disk took no more and the file was closed before its time."""
+        """Whether the disk was full and the file was closed early."""
         return self._writer.refused
 
     def close(self, *, early: bool = False) -> None:
-        """Write what is left and close the file. `early`: a stage was killed, its last words are missing."""
+        """Write what is left and close the file. `early`: a stage was killed, its last messages are missing."""
         if self._closed or self._writer.closed:  # closed by itself when the disk was full
             return
         self._closed = True
@@ -231,7 +231,7 @@ class RunLog:
             self._show_frame(*self._frames.popleft())
 
     def _show_frame(self, frame: Frame, odom_pose: Pose) -> None:
-        """Where the body is in the map, by the version of the map that the frame used."""
+        """The pose of the body in the version of the map that the frame used."""
         older = sorted(v for v in self._map_T_odom if v <= frame.map_version)
         for version in older[:-1]:
             del self._map_T_odom[version]
@@ -244,7 +244,7 @@ class RunLog:
         self._writer.write(topics.TF, foxglove.transforms(stamp, rows), stamp, sequence)
 
     def _release_answers(self, everything: bool = False) -> None:
-        """Write what the mapper and the loop closer said, stamped as the keyframe that it answers."""
+        """Write the messages of the mapper and the loop closer with the stamp of their keyframe."""
         for topic, queue in zip((topics.MAP_UPDATE, topics.LOOP), self._answers, strict=True):
             while queue and (everything or queue[0].kf_id in self._stamps):
                 answer = queue.popleft()
@@ -307,7 +307,7 @@ class RunLog:
 
 
 def _interval(shortest_ns: int, size: int, usual: int) -> int:
-    """Nanoseconds to the next time something is shown whole."""
+    """Nanoseconds until the whole trajectory or map is written again."""
     return shortest_ns * max(size, usual) // usual
 
 

@@ -1,4 +1,4 @@
-"""What a log holds of an image besides its pixels, one message each."""
+"""Messages of a log that belong to an image besides its pixels."""
 
 from __future__ import annotations
 

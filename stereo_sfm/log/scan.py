@@ -1,6 +1,6 @@
 """Read an MCAP file record by record, however it ended, and make its index.
 
-Checksums are verified; what is whole is found, what is not is named.
+Checksums are verified; damaged chunks are listed.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _OF_A_SUMMARY = (
 
 
 def check_magic(stream: IO[bytes], path: Path) -> None:
-    """Raises StereoSfmError when the file is no MCAP file."""
+    """Raises StereoSfmError if the file is not an MCAP file."""
     stream.seek(0)
     start = stream.read(len(MCAP0_MAGIC))
     if not start:
@@ -57,7 +57,7 @@ def check_magic(stream: IO[bytes], path: Path) -> None:
 
 
 def spans(stream: IO[bytes], start: int = len(MCAP0_MAGIC)) -> Iterator[Span]:
-    """Whole records from `start` on, until the bytes stop making sense."""
+    """Complete records from `start` on, up to the first damaged one."""
     size = stream.seek(0, 2)
     offset = start
     while offset + PREFIX <= size:
@@ -76,7 +76,7 @@ def _content(stream: IO[bytes], span: Span) -> ReadDataStream:
 
 
 def build_index(stream: IO[bytes]) -> Index:
-    """Read every record of the data section. Chunks whose checksum is wrong are listed in `bad_chunks` and left out."""
+    """Read every record of the data section. Chunks whose checksum is wrong are listed in `bad_chunks` and omitted."""
     index = Index(end=len(MCAP0_MAGIC))
     index.schemas, index.channels = _listed_at_the_end(stream)
     for span in spans(stream):
@@ -91,12 +91,12 @@ def build_index(stream: IO[bytes]) -> Index:
             index.bad_chunks.append(span)
         index.end = span.end
     if not index.closed and index.chunks:
-        _mend_last_message_index(index, stream)
+        _repair_last_message_index(index, stream)
     return index
 
 
-def _mend_last_message_index(index: Index, stream: IO[bytes]) -> None:
-    """The records that index the messages of the last chunk may be missing or cut off: make them again."""
+def _repair_last_message_index(index: Index, stream: IO[bytes]) -> None:
+    """The records that index the messages of the last chunk may be missing or cut off: recreate them."""
     chunk = index.chunks[-1]
     if chunk.message_index_offsets.keys() == index.chunk_counts[-1].keys():
         return
@@ -161,7 +161,7 @@ def loose(stream: IO[bytes]) -> Iterator[Message]:
 
 
 def is_closed(path: Path) -> bool:
-    """Whether a file of ours has its index and end."""
+    """Whether a file of this package has its index and end."""
     if path.stat().st_size < 2 * len(MCAP0_MAGIC):
         return False
     with path.open("rb") as stream:

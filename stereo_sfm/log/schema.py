@@ -1,9 +1,9 @@
 """Dataclasses as protobuf messages: the schema is made from the dataclass, arrays cross as blocks of bytes.
 
-An array field is declared to the world as a packed `repeated double` (float, sfixed64, sfixed32, bool), so that every
-player shows numbers. On the wire a packed field of fixed-size numbers is the same as a `bytes` field holding the array
+An array field is declared as a packed `repeated double` (float, sfixed64, sfixed32, bool), so that every
+viewer shows numbers. On the wire a packed field of fixed-size numbers is the same as a `bytes` field holding the array
 in little-endian order (protobuf encoding guide, "packed repeated fields"; a bool is a one-byte varint). So our own
-code reads and writes through a twin message in which those fields are `bytes`: one memory copy, no Python loop.
+code reads and writes a twin message in which those fields are `bytes`: one memory copy, no Python loop.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def _describe(field: dataclasses.Field[Any], annotation: Any) -> _Field:
 
 @functools.cache
 def fields_of(cls: type[Any]) -> tuple[_Field, ...]:
-    """What the fields of a dataclass are on the wire."""
+    """The fields of a dataclass as they are encoded."""
     hints = typing.get_type_hints(cls)
     return tuple(_describe(f, hints[f.name]) for f in dataclasses.fields(cls))
 

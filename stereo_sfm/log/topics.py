@@ -1,4 +1,4 @@
-"""The one table of topics: what is written where, how often, and whether two runs are compared on it.
+"""The table of topics: what is written, when, and whether `diff` compares it.
 
 Foxglove schemas wherever one exists, so that Foxglove and rerun show them; `stereo_sfm.*` schemas are made from the
 dataclasses of `stereo_sfm.types` (see `schema`). `log_time` is the sensor stamp, `publish_time` the wall clock,
@@ -58,9 +58,9 @@ class Topic:
 
     Attributes:
         name: of the topic.
-        message: the dataclass of ours that it holds, or the protobuf name of Foxglove's message; "|" separates what an
-            image topic may hold.
-        when: it is written.
+        message: the dataclass that it contains, or the protobuf name of Foxglove's message; "|" separates what an
+            image topic may contain.
+        when: when it is written.
         compare: whether `diff` compares it.
         sequence: the field of `message` that is the frame id.
     """
@@ -73,11 +73,11 @@ class Topic:
 
     @property
     def schema(self) -> str:
-        """The protobuf names that it may hold, separated by "|"."""
+        """The protobuf names of its messages, separated by "|"."""
         return self.message if isinstance(self.message, str) else full_name(self.message)
 
     def key(self, message: object, now_ns: int) -> tuple[int, int]:
-        """Log time and sequence of a message of ours: its own stamp, `now_ns` where it has none."""
+        """Log time and sequence of a message: its own stamp, or `now_ns` if it has none."""
         return getattr(message, "stamp_ns", now_ns), getattr(message, self.sequence)
 
 
@@ -96,7 +96,7 @@ TABLE: tuple[Topic, ...] = (
     Topic(DROPPED, Dropped, "when frames are lost"),
     Topic(APPLIED, Applied, "when a map update is applied", sequence="before_frame_id"),
     Topic(TF, "foxglove.FrameTransforms", "every frame: map to odom, odom to body"),
-    Topic(TF_STATIC, "foxglove.FrameTransforms", "at the start and every second: level, map, truth; body, eyes"),
+    Topic(TF_STATIC, "foxglove.FrameTransforms", "at the start and every second: level, map, truth; body, cameras"),
     Topic(ODOMETRY, "foxglove.Odometry", "every frame, with covariance"),
     Topic(ODOM_POSE, "foxglove.PoseInFrame", "every frame, body in odom"),
     Topic(MAP_POSE, "foxglove.PoseInFrame", "every frame, body in map"),
@@ -110,12 +110,12 @@ TABLE: tuple[Topic, ...] = (
     Topic(LOOP, LoopResult, "every keyframe: the loop closer's answer, with reasons"),
     Topic(POINTS, "foxglove.PointCloud", "the whole map, at most every few seconds and at the end"),
     Topic(TRAJECTORY, "foxglove.PosesInFrame", "all keyframes, at most every second and at the end"),
-    Topic(PATH, "foxglove.PointCloud", "the trajectory's positions, for players that draw no poses (rerun)"),
+    Topic(PATH, "foxglove.PointCloud", "the trajectory's positions, for viewers that draw no poses (rerun)"),
     Topic(SCENE, "foxglove.SceneUpdate", "loop and covisibility edges, with the trajectory"),
     Topic(HEALTH, Health, "every second and stage: rate, queue, latency (wall clock)", compare=False),
     Topic(STAGE_TIMES, StageTimes, "every frame: milliseconds in each stage (wall clock)", compare=False),
-    Topic(COUNTERS, SourceCounters, "every few seconds: what a live camera counts", compare=False),
-    Topic(LOG, "foxglove.Log", "text for people", compare=False),
+    Topic(COUNTERS, SourceCounters, "every few seconds: counters of a live camera", compare=False),
+    Topic(LOG, "foxglove.Log", "human-readable text", compare=False),
 )
 
 BY_NAME: dict[str, Topic] = {topic.name: topic for topic in TABLE}

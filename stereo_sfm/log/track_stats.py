@@ -1,4 +1,4 @@
-"""A frame as flat numbers, so that every player can plot them."""
+"""The statistics of a frame as flat numbers, which every viewer can plot."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ NAN = float("nan")
 
 @dataclass(frozen=True)
 class TrackStats:
-    """Flat numbers of one frame, so that every player can plot them; NaN where the tracker does not know."""
+    """Statistics of one frame as flat numbers, which every viewer can plot; NaN where not available."""
 
     frame_id: int
     state: int

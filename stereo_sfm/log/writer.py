@@ -1,6 +1,6 @@
-"""`LogWriter`: the one writer of an MCAP file. Chunks of at most 4 MiB or 0.4 s, each handed to the system at once.
+"""`LogWriter` writes an MCAP file in chunks of at most 4 MiB or 0.4 s, each written at once.
 
-So `kill -9` loses less than half a second, and a full disk leaves a file that is closed properly at the last chunk
+So `kill -9` loses less than half a second, and a full disk leaves a properly closed file up to the last chunk
 that fitted.
 """
 
@@ -50,7 +50,7 @@ class _File:
         return self._position
 
     def flush(self) -> None:
-        """Nothing waits here."""
+        """Nothing is buffered."""
 
     def close(self) -> None:
         os.close(self._fd)
@@ -119,7 +119,7 @@ class LogWriter:
 
     @property
     def refused(self) -> bool:
-        """Whether the disk took no more, and the file was closed for that."""
+        """Whether the file was closed because the disk was full."""
         return self._failure is not None
 
     @property
@@ -152,7 +152,7 @@ class LogWriter:
             raise self._failure or ValueError(f"{self.path} is closed")
         if not 0 <= log_time < 2**63:
             raise StereoSfmError(
-                f"a stamp of {log_time / 1e9:g} s cannot be logged: MCAP has none below 0 or after 2262"
+                f"a stamp of {log_time / 1e9:g} s cannot be logged: MCAP allows times from 0 to the year 2262"
             )
         data: bytes = schema.encode(message) if is_dataclass(message) else message.SerializeToString()
         now = self._clock()
@@ -165,7 +165,7 @@ class LogWriter:
         self._guarded(lambda: self._mcap.add_message(channel, log_time, data, now, sequence & 0xFFFFFFFF))
 
     def flush(self) -> None:
-        """Hand everything written so far to the system."""
+        """Write everything so far to the file."""
         self._pending_bytes = 0
         self._guarded(self._mcap.flush)
 
@@ -215,7 +215,7 @@ class LogWriter:
             self._file.close()
             messages = repair.finish_in_place(self.path)
             self._failure = StereoSfmError(
-                f"recording stopped, {error.strerror or error}: {self.path} is closed and readable up to there "
+                f"recording stopped, {error.strerror or error}: {self.path} is closed and readable up to that point "
                 f"({messages} messages, {self.path.stat().st_size / 1e6:.1f} MB)"
             )
             raise self._failure from None

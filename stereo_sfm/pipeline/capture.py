@@ -16,13 +16,13 @@ from stereo_sfm.pipeline.channels import End, Outbox
 from stereo_sfm.pipeline.health import HealthMeter
 from stereo_sfm.pipeline.images import ImageRing, SlotImage
 from stereo_sfm.pipeline.stages import sensor_drop, source_counters
-from stereo_sfm.pipeline.watchdog import Pulse
+from stereo_sfm.pipeline.watchdog import HeartbeatThread
 from stereo_sfm.types import Dropped, StereoImage, Trajectory
 
 
 @dataclass(frozen=True, eq=False)
 class SourceInfo:
-    """What the others need to know of the source before the first frame."""
+    """What the other stages need to know about the source before the first frame."""
 
     name: str
     rig: Rig
@@ -31,11 +31,11 @@ class SourceInfo:
     live: bool
 
 
-TRACKER_SLOTS = 4  # of the ring in real time, which the log cannot take
+TRACKER_SLOTS = 4  # of the ring, reserved from the log in real time
 
 
 class FreeSlots:
-    """Which slots of the ring are free: the tracker and the log, or main in its place, give each slot back."""
+    """The free slots of the ring: the tracker and the log (or main in its place) return each slot."""
 
     def __init__(self, count: int, tracker: Connection, log: Connection) -> None:
         self._holds: dict[Connection, set[int]] = {tracker: set(), log: set()}
@@ -44,10 +44,10 @@ class FreeSlots:
         self._log_share = max(count - TRACKER_SLOTS, 1)
 
     def take(self, block: bool) -> tuple[int, bool] | None:
-        """A free slot for the tracker, and whether it is for the log as well; None when none is to be had.
+        """A free slot for the tracker, and whether it is for the log as well; None if none is available.
 
         Args:
-            block: wait for one, as files are read, and leave nothing out of the log; otherwise the log holds no more
+            block: wait for a slot (files) and omit nothing from the log; otherwise the log holds no more
                 than its share of the slots, so that the tracker never waits for it.
         """
         self._collect(0)
@@ -75,12 +75,12 @@ class FreeSlots:
             back: set[int] = {connection.recv()}
             self._holds[connection] -= back
         except (EOFError, OSError):
-            back = self._holds.pop(connection)  # what a dead reader held nobody reads any more
+            back = self._holds.pop(connection)  # nobody reads the slots of a dead reader any more
         self._free.extend(sorted(k for k in back if not any(k in held for held in self._holds.values())))
 
 
 class StopFlag:
-    """Set when main says stop, or is gone: a thread waits for it."""
+    """Set by a thread when main sends stop or has ended."""
 
     def __init__(self, control: Connection, asked: bool = False) -> None:
         self.asked = asked
@@ -95,26 +95,26 @@ class StopFlag:
 
 @dataclass
 class CaptureStage:
-    """Reads the source into the ring and tells the tracker and main."""
+    """Reads the source into the ring and notifies the tracker and main."""
 
     source: Source
     ring: ImageRing
     slots: FreeSlots
     to_tracker: Outbox
     to_main: Outbox
-    pulse: Pulse
+    pulse: HeartbeatThread
     stop: StopFlag
     realtime: bool
     jpeg: bool
     _last: int = -1  # frame id
 
     def run(self) -> None:
-        """Until the source ends or somebody asks to stop."""
+        """Run until the source ends or a stop is requested."""
         try:
             self._read()
         finally:
-            self._count(self._last)  # above all when the source failed
-            self.to_tracker.send(End("capture"))  # what was read until then is finished
+            self._count(self._last)  # also when the source failed
+            self.to_tracker.send(End("capture"))  # what was read so far is processed
             self.to_tracker.close()
 
     def _read(self) -> None:
@@ -140,7 +140,7 @@ class CaptureStage:
         meter.report()
 
     def _images(self) -> Iterator[StereoImage]:
-        """Of the source; the watchdog hears how long each takes to come."""
+        """The images of the source; the watchdog measures how long each takes."""
         images = iter(self.source)
         while True:
             self.pulse.begin()
@@ -151,7 +151,7 @@ class CaptureStage:
             yield image
 
     def _count(self, frame_id: int) -> None:
-        """Tell what the source has counted until now."""
+        """Send the source's counters."""
         counters = source_counters(self.source, frame_id)
         if counters is not None:
             self.to_main.send(counters)

@@ -1,4 +1,4 @@
-"""One-way pipes between two processes: one writer, one reader, no lock that a killed process could take along."""
+"""One-way pipes between two processes: one writer, one reader, and no lock that a killed process could hold."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class End:
-    """The stage has said everything."""
+    """The stage has sent its last message."""
 
     stage: str
-    early: bool = False  # another stage died: what it would still have said is missing
+    early: bool = False  # another stage died: its last messages are missing
 
 
 @dataclass(frozen=True)
@@ -26,13 +26,13 @@ class Failed:
     """The stage ended with an error."""
 
     stage: str
-    message: str  # one line for an error of ours, else the traceback
+    message: str  # one line for a StereoSfmError, else the traceback
     ours: bool
     exit_code: int
 
 
 class Lost(Exception):
-    """The process at the other end is gone."""
+    """The process at the other end has ended."""
 
 
 class Outbox:
@@ -48,11 +48,11 @@ class Outbox:
         self._thread.start()
 
     def send(self, message: object) -> None:
-        """Give the message away."""
+        """Queue a message."""
         self._queue.put((message,))
 
     def offer(self, message: object, patience_s: float) -> bool:
-        """Give the message away, or say after so many seconds that there is no room for it."""
+        """Queue a message; False if there was no room for it within so many seconds."""
         try:
             self._queue.put((message,), timeout=patience_s)
         except queue.Full:
@@ -80,7 +80,7 @@ class Outbox:
 
 
 class DroppingOutbox:
-    """As `Outbox`, but `send` never blocks: when too much waits, the oldest goes (the viewer is slow or closed)."""
+    """As `Outbox`, but `send` never blocks: when too many wait, the oldest is dropped (a slow or closed viewer)."""
 
     def __init__(self, connection: Connection, limit: int = 256) -> None:
         self._connection = connection
@@ -91,7 +91,7 @@ class DroppingOutbox:
         self._thread.start()
 
     def send(self, message: object) -> None:
-        """Give the message away, perhaps to nobody."""
+        """Queue a message, which may be dropped later."""
         self._waiting.append(message)
         self._more.release()
 
@@ -121,7 +121,7 @@ class Inbox(Generic[T]):
         """The next message.
 
         Raises:
-            Lost: the sender is gone.
+            Lost: the sender has ended.
         """
         try:
             return self._connection.recv()

@@ -9,7 +9,7 @@ import numpy as np
 
 from stereo_sfm.messages import Health
 
-WINDOW = 90  # steps between two reports, and what they look back on
+WINDOW = 90  # steps between two reports, and in each of them
 
 
 class HealthMeter:
@@ -29,7 +29,7 @@ class HealthMeter:
         return len(self._ms) >= WINDOW and self.report(waiting)
 
     def report(self, waiting: int = 0) -> bool:
-        """Send what is known since the last report; False when nothing happened."""
+        """Send a report of the steps since the last one; False if there were none."""
         if not self._ms:
             return False
         now = time.monotonic()

@@ -1,6 +1,6 @@
 """Images between processes: a ring of slots in shared memory. Messages carry the slot, never the pixels.
 
-The capture stage owns the slots. A slot is free again when all its readers have given it back.
+The capture stage owns the slots. A slot is free again when all its readers have returned it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from stereo_sfm.types import F32, U8, StereoImage
 
 SHARED = Path("/dev/shm")  # where Linux keeps shared memory
 PREFIX = "stereo_sfm_ring_"
-YOUNG_S = 2.0  # a ring this young may not be locked by its owner yet
+MIN_AGE_S = 2.0  # a newer ring may not be locked by its owner yet
 _NO_PIXELS = np.zeros((0, 0), np.uint8)
 
 
@@ -64,7 +64,7 @@ class SlotImage:
     has_depth: bool
     captured_s: float  # monotonic clock
     encoded: tuple[bytes, bytes | None] | None = None  # JPEG bytes whose decoded pixels the slot holds
-    logged: bool = True  # the log (main, where there is none) reads the slot and gives it back
+    logged: bool = True  # the log (main, where there is none) reads and returns the slot
 
 
 class ImageRing:
@@ -77,17 +77,17 @@ class ImageRing:
         self._memory = self._make() if name is None else shared_memory.SharedMemory(name)
 
     def _make(self) -> shared_memory.SharedMemory:
-        """A block that is ours for as long as this process lives, and all of it there: nobody else can fill its place.
+        """A block that is locked for the life of this process, with all its memory allocated.
 
         Raises:
-            StereoSfmError: there is not so much shared memory.
+            StereoSfmError: there is not enough shared memory.
         """
         remove_abandoned()
         size = max(self.layout.size * self.slots, 1)
         try:
             memory = shared_memory.SharedMemory(PREFIX + secrets.token_hex(8), create=True, size=size)
             descriptor: int = memory._fd  # pyright: ignore[reportAttributeAccessIssue]
-            with contextlib.suppress(OSError):  # where shared memory has no locks nobody looks for them
+            with contextlib.suppress(OSError):  # where shared memory has no locks, none is checked
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             _allocate(memory, descriptor, size)
         except OSError as error:
@@ -130,7 +130,7 @@ class ImageRing:
         return SlotImage(slot, bare, image.right is not None, image.depth is not None, captured_s, encoded, logged)
 
     def read(self, message: SlotImage) -> StereoImage:
-        """The image with pixels of its own: the slot may be given back at once."""
+        """The image with its own copy of the pixels, so that the slot can be returned at once."""
         left, right, depth = self._arrays(message.slot)
         return dataclasses.replace(
             message.image,
@@ -147,7 +147,7 @@ class ImageRing:
 
 
 def _allocate(memory: shared_memory.SharedMemory, descriptor: int, size: int) -> None:
-    """Have the pages now: a file system that fills up later would end the run by SIGBUS."""
+    """Allocate the pages now: a file system that fills up later would end the run with SIGBUS."""
     if not hasattr(os, "posix_fallocate"):
         return
     try:
@@ -158,11 +158,11 @@ def _allocate(memory: shared_memory.SharedMemory, descriptor: int, size: int) ->
         raise
 
 
-def remove_abandoned(folder: Path = SHARED, young_s: float = YOUNG_S) -> None:
+def remove_abandoned(folder: Path = SHARED, min_age_s: float = MIN_AGE_S) -> None:
     """Remove the rings of runs that were killed with all their processes: nobody holds their lock any more."""
     for path in sorted(folder.glob(f"{PREFIX}*")):
         with contextlib.suppress(OSError):  # of another user, or in use
-            if time.time() - path.stat().st_mtime < young_s:
+            if time.time() - path.stat().st_mtime < min_age_s:
                 continue
             descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
             try:

@@ -42,7 +42,7 @@ class InlineRun:
         jpeg: bool = False,
     ) -> None:
         self._config, self._rig, self._folders = config, source.rig, folders or MapFolders()
-        self._said: deque[LogLine] = deque()
+        self._lines: deque[LogLine] = deque()
         self._jpeg, self._source, self._last = jpeg, source, -1
         self._spans = Spans()
         self._sinks = sinks
@@ -98,7 +98,7 @@ class InlineRun:
         self._updates.append(update)
 
     def finish(self) -> None:
-        """What the last keyframes left behind."""
+        """Finish the pending work after the last image."""
         update = self.map_stage.finish()
         if update is not None:
             self.publish(update)
@@ -107,14 +107,14 @@ class InlineRun:
             self.publish(counters)
         save_result(self.map_stage.mapper, self._config, self._folders)
 
-    def hear(self, line: LogLine) -> None:
-        """From any thread; the sinks get it with the next frame."""
-        self._said.append(line)
+    def add_line(self, line: LogLine) -> None:
+        """Take a line from any thread; the sinks get it with the next frame."""
+        self._lines.append(line)
 
     def publish(self, message: object) -> None:
-        """To every sink, after what was said before."""
-        while self._said:
-            self._pass_on(self._said.popleft())
+        """Send a message to every sink, after the waiting lines."""
+        while self._lines:
+            self._pass_on(self._lines.popleft())
         self._pass_on(message)
 
     def _pass_on(self, message: object) -> None:
@@ -136,24 +136,24 @@ def run_inline(
         source: an open source. config: what decides the result.
         sinks: every message of the run goes to each, in order.
         schedule: when updates reach the tracker; lockstep when omitted.
-        folders: maps to start from and to leave behind.
-        jpeg: the sinks store images as JPEG, so the tracker sees what they will give back.
+        folders: maps to load and to save.
+        jpeg: the sinks store images as JPEG, so the tracker gets the decoded pixels.
     """
     run = InlineRun(source, config, sinks, schedule, folders, jpeg)
-    with Listener("main", run.hear), limited_threads(config.pipeline.threads):
+    with Listener("main", run.add_line), limited_threads(config.pipeline.threads):
         images, failure = iter(source), None
         while True:
             try:
                 image = next(images)
             except StopIteration:
                 break
-            except (Exception, KeyboardInterrupt) as error:  # what the source gave until then is kept
+            except (Exception, KeyboardInterrupt) as error:  # what was read so far is kept
                 failure = error
                 break
             frame = run.step(image)
             try:
                 yield frame
-            except GeneratorExit:  # nobody wants more
+            except GeneratorExit:  # the caller stopped iterating
                 run.finish()
                 raise
         try:

@@ -1,4 +1,4 @@
-"""Ctrl-C reaches every process of the terminal, SIGTERM often the whole group; the main one decides what they mean."""
+"""Ctrl-C reaches every process of the terminal, SIGTERM often the whole group; only the main process handles them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ STOP_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SI
 
 @contextmanager
 def ignored_by_children() -> Generator[None]:
-    """Processes started inside never see Ctrl-C, from their first moment on."""
+    """Processes started in the `with` block ignore Ctrl-C from the start."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     try:
         yield

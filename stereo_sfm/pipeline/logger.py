@@ -1,4 +1,4 @@
-"""The process that writes the log. It owns the file, and closes it whatever happens to the others."""
+"""The process that writes the log. It owns the file, and closes it whatever happens to the other processes."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ BACKLOG = 96  # messages, about a third of them images, that wait in this proces
 
 
 class LogSink:
-    """A log that may end before its run does: what a full disk refuses is told once, and no later message fails."""
+    """A log that may end before its run does: a full disk is reported once, and later messages are ignored."""
 
-    def __init__(self, log: RunLog, tell: Callable[[LogEnded], None]) -> None:
-        self._log, self._tell = log, tell
+    def __init__(self, log: RunLog, report: Callable[[LogEnded], None]) -> None:
+        self._log, self._report = log, report
         self._ended = False
 
     def put(self, message: object) -> None:
-        """Any message of a run."""
+        """Take any message of a run."""
         if not self._ended and not isinstance(message, LogEnded):
             self._attempt(lambda: self._log.put(message))
 
@@ -45,13 +45,13 @@ class LogSink:
             if not self._log.refused:
                 raise
             self._ended = True
-            self._tell(LogEnded(str(error)))
+            self._report(LogEnded(str(error)))
 
 
 def run_logger(
     to_main: Report, control: Connection, messages: Connection, release: Connection, options: LogOptions
 ) -> None:
-    """Everything main passes on, into the MCAP file."""
+    """Write the messages from main to the MCAP file."""
     setup = Inbox[Setup](control).take()
     prepare("logger", setup)
     ring = ImageRing(ImageLayout.of(setup.rig), setup.config.pipeline.ring_slots, setup.ring_name)
@@ -76,13 +76,13 @@ def run_logger(
 
 
 class _Receiver:
-    """Takes messages as they come, so that a disk that is slow for a moment holds no slot of the ring."""
+    """Receives messages at once, so that a slow disk does not hold slots of the ring."""
 
     def __init__(self, inbox: Inbox[Any], ring: ImageRing, free: Outbox, pixels: bool) -> None:
         self._inbox, self._ring, self._free, self._pixels = inbox, ring, free, pixels
 
     def run(self, arrived: queue.Queue[Any]) -> None:
-        """Until main says `End`, or is gone: what has arrived is kept."""
+        """Run until main sends `End` or has ended; what has arrived is kept."""
         message: Any = None
         while not isinstance(message, End):
             message = End("main", early=True)

@@ -1,9 +1,9 @@
-"""The stages as processes. This is the hub: it starts them, passes their messages on, and ends the run in order.
+"""The stages as processes: the hub starts them, forwards their messages, and ends the run in order.
 
-Who talks to whom: capture -> tracker (images by slot), tracker -> mapper and loop (keyframes), loop -> mapper (loop
+Connections: capture -> tracker (images by slot), tracker -> mapper and loop (keyframes), loop -> mapper (loop
 results), mapper -> tracker (updates), mapper <-> optimizer (full bundle adjustment), every stage -> main, main ->
 logger and viewer. Every arrow is a pipe of its own, so a killed process leaves no lock behind, and its death is an end
-of file to whoever listens to it.
+of file to its readers.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ from stereo_sfm.pipeline.capture import SourceInfo
 from stereo_sfm.pipeline.channels import DroppingOutbox, End, Failed, Outbox
 from stereo_sfm.pipeline.images import ImageLayout, ImageRing, SlotImage
 from stereo_sfm.pipeline.interrupts import ignored_by_children
-from stereo_sfm.pipeline.text import Listener, say
+from stereo_sfm.pipeline.text import Listener, emit
 from stereo_sfm.pipeline.threads import thread_environment
-from stereo_sfm.pipeline.watchdog import Beat, Watchdog
+from stereo_sfm.pipeline.watchdog import Heartbeat, Watchdog
 from stereo_sfm.pipeline.workers import LogOptions, Ready, Setup, ViewerOptions
 from stereo_sfm.types import Applied, Dropped, Frame, StereoImage
 
 log = logging.getLogger("stereo_sfm")
 
 SINKS = ("logger", "viewer")
-PICTURE_NS = 100_000_000  # the viewer gets a picture at most so often
-LOOK_S = 0.5  # between two looks at who does not answer
-GRACE_S = 1.2  # for the logger to close its file after another stage died
-STOP_GRACE_S = 2.0  # for capture to see that it shall stop
-END_S = 3.0  # for a live run to end when it shall stop, and for any other without a message of its stages
-VIEWER_GRACE_S = 10.0  # for the viewer to show what waits when the run is over
-BACKLOG = 20_000  # messages for a logger that does not take them, in real time: then the run goes on without a log
-LEAST_FILES = 128  # that the processes may have open each
+PICTURE_NS = 100_000_000  # shortest interval between pictures for the viewer
+CHECK_S = 0.5  # between two checks for processes that do not respond
+GRACE_S = 1.2  # time for the logger to close its file after another stage died
+STOP_GRACE_S = 2.0  # time for capture to react to a stop
+END_S = 3.0  # time for a live run to end after a stop; for others, the longest time without a message
+VIEWER_GRACE_S = 10.0  # time for the viewer to show waiting messages after the run
+BACKLOG = 20_000  # messages waiting for the logger in real time, beyond which the log is given up
+MIN_OPEN_FILES = 128  # per process
 
 
 class StageDied(StereoSfmError):
@@ -80,9 +80,9 @@ class ProcessRun:
             config: what decides the result.
             sinks: get every message of the run but the images, in this process.
             realtime: drop images and take updates as they come; None: as the source says (`live`).
-            applied: schedule of an earlier realtime run to follow.
+            applied: schedule of an earlier realtime run to repeat.
             log: write everything to an MCAP file.
-            folders: maps to start from and to leave behind.
+            folders: maps to load and to save.
             viewer: show the run while it goes on.
             delays: seed of random delays in every stage, for tests.
             opened: called when the source is open, before anything is written.
@@ -96,8 +96,8 @@ class ProcessRun:
         self._reports: dict[Connection, str] = {}
         self._controls: dict[str, Connection] = {}
         self._to_logger: Outbox | None = None
-        self._live = False  # nobody waits for the logger
-        self._left_out = 0  # images that the log lacks
+        self._live = False  # the logger is never waited for
+        self._left_out = 0  # images missing in the log
         self._abandoned = False
         self.began_s: float | None = None  # performance counter when every stage was ready
         self._release: Outbox | None = None
@@ -105,21 +105,21 @@ class ProcessRun:
         self._next_picture_ns = 0
         self._ring: ImageRing | None = None
         self._ended: set[str] = set()
-        self._said_early: list[object] | None = []  # while the source was opened
+        self._early_messages: list[object] | None = []  # while the source was opened
         self._waiting = {"tracker", "mapper", "loop"}  # not ready yet
-        self._stopped_s: float | None = None  # when somebody asked for the end
-        self._progress_s = time.monotonic()  # of the last message that was more than a sign of life
+        self._stopped_s: float | None = None  # when a stop was requested
+        self._progress_s = time.monotonic()  # of the last message other than a heartbeat
         self._look_s = self._listened_s = time.monotonic()
         self._over_s: float | None = None  # when the last stage had ended
         self._woken, self._wake = self._pipe()  # `stop` may be called while the next message is awaited
-        self._failure: StereoSfmError | None = None  # of the source: told when all that it gave is finished
+        self._failure: StereoSfmError | None = None  # of the source: raised when all its images are processed
         self._listener = Listener("main", self.publish)
         self.info: SourceInfo
 
-    # -- life --------------------------------------------------------------------------------------------------------
+    # -- life cycle ---------------------------------------------------------------------------------------------------
 
     def __enter__(self) -> Self:
-        _have_files(LEAST_FILES)
+        _raise_file_limit(MIN_OPEN_FILES)
         self._listener.__enter__()
         try:
             self._start()
@@ -143,14 +143,14 @@ class ProcessRun:
         return {name: p.pid for name, p in self._processes.items() if p.pid is not None}
 
     def stop(self) -> None:
-        """Ask capture to end; everything in flight is finished and written. May be called at any time."""
+        """Request the end; everything in flight is finished and written. May be called at any time."""
         if self._stopped_s is not None:
             return
         self._stopped_s = time.monotonic()
         for process in self._processes.values():
             self._wake_up(process)
         for connection in (self._controls.get("capture"), self._wake):
-            with contextlib.suppress(OSError):  # capture is gone, or the whole run
+            with contextlib.suppress(OSError):  # capture or the whole run has ended
                 if connection is not None:
                     connection.send("stop")
 
@@ -162,15 +162,15 @@ class ProcessRun:
                 os.kill(process.pid, signal.SIGCONT)
 
     def __iter__(self) -> Iterator[Frame]:
-        with contextlib.suppress(_Over):
+        with contextlib.suppress(_Finished):
             yield from self._frames()
         if self._failure is not None:
             raise self._failure
 
     def _frames(self) -> Iterator[Frame]:
         while self._reports:
-            ready = wait([*self._reports, self._woken], LOOK_S)
-            self._look()
+            ready = wait([*self._reports, self._woken], CHECK_S)
+            self._check_stages()
             for connection in ready:
                 assert isinstance(connection, Connection)
                 try:
@@ -181,15 +181,15 @@ class ProcessRun:
                     if connection in self._reports:
                         self._died(connection)
                     continue
-                if connection in self._reports:  # else it was given up meanwhile
+                if connection in self._reports:  # else it was closed meanwhile
                     frame = self._take(connection, message)
                     if frame is not None:
                         yield frame
 
     def _take(self, connection: Connection, message: object) -> Frame | None:
         """One message of a stage; returned when it is a frame."""
-        self._watchdog.hear(self._reports[connection], message)
-        if isinstance(message, Beat):
+        self._watchdog.received(self._reports[connection], message)
+        if isinstance(message, Heartbeat):
             return None
         self._progress_s = time.monotonic()
         if isinstance(message, Failed):
@@ -200,43 +200,43 @@ class ProcessRun:
             self._begin(message.stage)
         else:
             if isinstance(message, LogLine):
-                say(message)
+                emit(message)
             self._dispatch(message)
         return message if isinstance(message, Frame) else None
 
-    # -- who does not answer -----------------------------------------------------------------------------------------
+    # -- unresponsive stages -----------------------------------------------------------------------------------------
 
-    def _look(self) -> None:
-        """Now and then look for stages that do not answer, and for an end that takes too long.
+    def _check_stages(self) -> None:
+        """Check at intervals for stages that do not respond, and for an end that takes too long.
 
         Raises:
-            _Over: nothing more is waited for.
+            _Finished: nothing more is waited for.
         """
         now = time.monotonic()
-        if now - self._listened_s > 2 * LOOK_S:  # whoever takes the frames was busy
+        if now - self._listened_s > 2 * CHECK_S:  # the consumer of the frames was busy
             self._watchdog.excuse(now - self._listened_s)
             self._progress_s = now
         self._listened_s = now
         if now < self._look_s:
             return
-        self._look_s = now + LOOK_S
+        self._look_s = now + CHECK_S
         waiting = set(self._reports.values())
         silent = self._watchdog.silent(sorted(waiting - {"viewer"}))
         if waiting == {"viewer"}:
             self._over_s = self._over_s or now
             if now - self._over_s > VIEWER_GRACE_S:
-                raise _Over
+                raise _Finished
         elif self._stopped_s is not None:
-            self._hasten(now - self._stopped_s, now, silent)
+            self._enforce_end(now - self._stopped_s, now, silent)
 
-    def _hasten(self, waited_s: float, now: float, silent: list[str]) -> None:
-        """After somebody asked for the end: what does not end by itself is ended.
+    def _enforce_end(self, waited_s: float, now: float, silent: list[str]) -> None:
+        """After a stop request: end the stages that do not end by themselves.
 
-        A stage may take its time while it works: for a map that shall be saved as long as it needs, for files as long
-        as something comes of it, for a live camera `END_S`.
+        A stage may take time while it works: for a map to be saved as long as it needs, for files as long
+        as it makes progress, for a live camera `END_S`.
         """
         if waited_s > STOP_GRACE_S and "capture" in self._reports.values():
-            self._processes["capture"].kill()  # it waits for an image that does not come
+            self._processes["capture"].kill()  # it is waiting for an image
             return
         hurry = bool(silent) or self._folders.map_out is None
         if waited_s > END_S and hurry and (self._live or now - self._progress_s > END_S):
@@ -246,7 +246,7 @@ class ProcessRun:
         missing = " and the ".join(sorted(set(self._reports.values()) - {"viewer"}))
         log.warning("ended without waiting for the %s", missing)
         self._abandon()
-        raise _Over
+        raise _Finished
 
     # -- start -------------------------------------------------------------------------------------------------------
 
@@ -293,8 +293,8 @@ class ProcessRun:
         if self._opened is not None:
             self._opened()
         self._set_up(info)
-        said, self._said_early = self._said_early, None
-        for line in said or ():
+        early, self._early_messages = self._early_messages, None
+        for line in early or ():
             self._dispatch(line)
 
     def _set_up(self, info: SourceInfo) -> None:
@@ -315,13 +315,13 @@ class ProcessRun:
         )
         jpeg = self._log is not None and self._log.image_format == "jpeg"
         for stage, control in self._controls.items():
-            with contextlib.suppress(OSError):  # it died: its report tells
+            with contextlib.suppress(OSError):  # it died: its report gives the reason
                 control.send((setup, jpeg) if stage == "capture" else setup)
         if self._stopped_s is not None:
-            self._controls["capture"].send("stop")  # it was asked for while the source was opened
+            self._controls["capture"].send("stop")  # requested while the source was being opened
 
     def _begin(self, stage: str) -> None:
-        """Capture goes when the last of the others is ready."""
+        """Start capture when the last of the other stages is ready."""
         self._waiting.discard(stage)
         if not self._waiting:
             self.began_s = time.perf_counter()
@@ -351,10 +351,10 @@ class ProcessRun:
         self._reports[report] = stage
 
     def _first_report(self) -> SourceInfo:
-        """Capture's first word: what the source is, or why it cannot be opened."""
+        """The first message of capture: what the source is, or why it cannot be opened."""
         connection = next(c for c, stage in self._reports.items() if stage == "capture")
         while True:
-            if not wait([connection], LOOK_S):
+            if not wait([connection], CHECK_S):
                 self._watchdog.silent(["capture"])
                 if self._stopped_s is not None and time.monotonic() - self._stopped_s > STOP_GRACE_S:
                     raise KeyboardInterrupt
@@ -363,22 +363,22 @@ class ProcessRun:
                 message = connection.recv()
             except (EOFError, OSError):
                 raise StageDied(f"capture {self._how_it_died('capture')} before the source was open") from None
-            self._watchdog.hear("capture", message)
+            self._watchdog.received("capture", message)
             if isinstance(message, Failed):
                 self._reports.pop(connection)
                 raise _error(message)
             if isinstance(message, SourceInfo):
                 return message
             if isinstance(message, LogLine):
-                say(message)
+                emit(message)
                 self.publish(message)
 
     # -- messages ----------------------------------------------------------------------------------------------------
 
     def publish(self, message: object) -> None:
         """Put a message of the caller's into the run's log, viewer and sinks."""
-        if self._said_early is not None:
-            self._said_early.append(message)
+        if self._early_messages is not None:
+            self._early_messages.append(message)
         else:
             self._dispatch(message)
 
@@ -388,7 +388,7 @@ class ProcessRun:
                 sink.put(message)
             return
         if isinstance(message, LogEnded):
-            log.warning("%s; the run goes on without it", message.why)
+            log.warning("%s; the run continues without it", message.why)
         if isinstance(message, SlotImage) and not message.logged:
             self._leave_out(message.image)
         if not isinstance(message, SlotImage):
@@ -402,22 +402,22 @@ class ProcessRun:
             self._release.send(message.slot)
 
     def _leave_out(self, image: StereoImage) -> None:
-        """An image that the tracker has and the log has no time for."""
+        """An image for the tracker that the log is too slow to take."""
         if self._to_logger is None or self._log is None or self._log.image_format == "none":
             return
         if not self._left_out:
-            log.warning("the log is slower than the camera: it lacks some of the images")
+            log.warning("the log is slower than the camera: some of the images are omitted")
         self._left_out += 1
         self._dispatch(Dropped(image.frame_id, image.stamp_ns, "log", "the log is slower than the camera"))
 
     def _log_message(self, message: object) -> None:
-        """To the logger, without waiting for it. Where files are read, the slots that it holds make the run wait."""
+        """Send to the logger without waiting. When reading files, the slots that it holds make the run wait."""
         assert self._to_logger is not None
         if not self._to_logger.offer(message, 0.0):
             self._give_up_log(f"the logger has not taken the last {BACKLOG} messages")
 
     def _show(self, message: object) -> None:
-        """Pass on to the viewer what it can take; it never holds anybody up."""
+        """Forward to the viewer what it can take, without waiting."""
         assert self._to_viewer is not None and self._ring is not None
         if not isinstance(message, SlotImage):
             self._to_viewer.send(message)
@@ -436,7 +436,7 @@ class ProcessRun:
                 self._to_viewer.send(End("main"))
                 self._to_viewer.close()
 
-    # -- death -------------------------------------------------------------------------------------------------------
+    # -- failures ----------------------------------------------------------------------------------------------------
 
     def _how_it_died(self, stage: str) -> str:
         process = self._processes[stage]
@@ -449,7 +449,7 @@ class ProcessRun:
     def _died(self, connection: Connection) -> None:
         """End of file without `End`: find the one that died first, close the log, raise."""
         stage = self._reports.pop(connection)
-        if stage == "viewer":  # closed or crashed: the run does not care
+        if stage == "viewer":  # closed or crashed: the run continues
             self._ended.add(stage)
             return
         if stage == "logger" and self._live:
@@ -464,7 +464,7 @@ class ProcessRun:
         self._processes[stage].join(0.5)
         consequence = self._processes[stage].exitcode == workers.UPSTREAM_LOST
         if consequence and any(s not in SINKS for s in self._reports.values()):
-            return  # its neighbour is the cause, and will be found
+            return  # another stage is the cause, and will be found
         message = f"the {stage} process {self._how_it_died(stage)}"
         self._abandon()
         raise StageDied(f"{message}; {self._what_remains(stage)}")
@@ -476,7 +476,7 @@ class ProcessRun:
             return "there is no log"
         if self._open_log():
             return f"the log {self._log.path} is not closed, but readable (stereo-sfm recover writes a clean copy)"
-        return f"the log {self._log.path} is complete up to then"
+        return f"the log {self._log.path} is complete up to that point"
 
     def _fail(self, connection: Connection, failed: Failed) -> None:
         if failed.stage == "viewer":
@@ -499,7 +499,7 @@ class ProcessRun:
         raise _error(failed)
 
     def _abandon(self) -> None:
-        """Kill every stage but the logger, which closes its file; where it cannot, main does."""
+        """Kill every stage but the logger, which closes its file; if it cannot, main does."""
         if self._abandoned:
             return
         self._abandoned = True
@@ -517,7 +517,7 @@ class ProcessRun:
         self._close_log(logger)
 
     def _give_up_log(self, why: str) -> None:
-        """The run goes on without a log: nothing is more urgent than the pose."""
+        """Continue the run without a log."""
         logger, self._to_logger = self._processes["logger"], None
         for connection in [c for c, stage in self._reports.items() if stage == "logger"]:
             del self._reports[connection]
@@ -536,7 +536,7 @@ class ProcessRun:
             from stereo_sfm.log.provenance import ENDED_EARLY, METADATA
             from stereo_sfm.log.repair import finish_in_place
 
-            with contextlib.suppress(OSError, StereoSfmError):  # no room for its end: it is readable all the same
+            with contextlib.suppress(OSError, StereoSfmError):  # no room for its index: it is readable nevertheless
                 finish_in_place(self._log.path, (METADATA, ENDED_EARLY))
 
     def _open_log(self) -> bool:
@@ -558,19 +558,19 @@ class ProcessRun:
             self._ring = None
 
     def _finished(self, process: BaseProcess) -> bool:
-        """Whether the process has said its last word and is only leaving."""
+        """Whether the process has sent its last message and is about to exit."""
         stage = next(s for s, p in self._processes.items() if p is process)
         if stage in self._ended:
             process.join(1.0)
         return not process.is_alive()
 
 
-class _Over(Exception):
+class _Finished(Exception):
     """Nothing more is waited for."""
 
 
-def _have_files(least: int) -> None:
-    """Let this process and its children open so many files.
+def _raise_file_limit(least: int) -> None:
+    """Raise the limit of open files for this process and its children.
 
     Raises:
         StereoSfmError: the system does not allow it.

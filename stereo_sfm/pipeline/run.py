@@ -1,4 +1,4 @@
-"""The one way into a run, whichever way its stages are wired."""
+"""Run the system on an open source from Python."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from stereo_sfm.types import Frame, StereoImage
 
 
 class CheckedSource(WrappedSource):
-    """A source of anybody: its images as the stages take them, or an error that says what is wrong with them."""
+    """Any source, with its images checked and converted to what the stages take."""
 
     def __iter__(self) -> Iterator[StereoImage]:
-        from stereo_sfm.pipeline.door import ImageDoor
+        from stereo_sfm.pipeline.image_input import ImageInput
 
-        return map(ImageDoor(self.rig).checked, self.source)
+        return map(ImageInput(self.rig).checked, self.source)
 
 
 def run(source: Source, config: Config | None = None, sinks: Sequence[Sink] = ()) -> Iterator[Frame]:
@@ -31,7 +31,7 @@ def run(source: Source, config: Config | None = None, sinks: Sequence[Sink] = ()
         sinks: each gets every message of the run.
 
     Raises:
-        StereoSfmError: an image that is not of the source's calibration.
+        StereoSfmError: an image that does not fit the source's calibration.
     """
     from stereo_sfm.pipeline.inline import run_inline
 

@@ -1,4 +1,4 @@
-"""When the tracker takes the mapper's answers. The one decision that could depend on timing, so it has one place."""
+"""When the tracker applies map updates: the only decision that could depend on timing."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from stereo_sfm.types import Applied
 
 
 class Schedule(Protocol):
-    """Says, before each frame, how many updates must be applied first."""
+    """Decides, before each frame, how many updates are applied first."""
 
     def keyframe(self, frame_index: int) -> None:
         """The frame with this index (0, 1, 2, ... as tracked) became a keyframe: one more update will come."""
         ...
 
     def due(self, frame_index: int, frame_id: int) -> int | None:
-        """How many updates to wait for before this frame; None: take what is there, wait for nothing."""
+        """How many updates to wait for before this frame; None: take those available without waiting."""
         ...
 
 
@@ -40,7 +40,7 @@ class Lockstep:
 
 
 class Realtime:
-    """Whatever the mapper has finished by now. `Applied` messages record the choice."""
+    """The updates that the mapper has finished so far. `Applied` messages record the choice."""
 
     def keyframe(self, frame_index: int) -> None:
         pass

@@ -45,9 +45,9 @@ class Wiring:
 
 
 class Session:
-    """Enter it, iterate for the frames; `info` and `folder` say what runs and where its files go.
+    """Enter it and iterate over the frames; `info` describes the source and `folder` is the output folder.
 
-    Its folder stays locked after the last frame, for the files of the results; `close` ends that.
+    The folder stays locked after the last frame, while the results are written; `close` unlocks it.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class Session:
         replayed: RecordedRun | None = None,
     ) -> None:
         if wiring.inline and wiring.mode == "realtime":
-            raise StereoSfmError("--mode realtime needs processes: leave --inline away")
+            raise StereoSfmError("--mode realtime needs processes: omit --inline")
         if wiring.viz != "none":
             require(("rerun",), "viewer", "the viewer")
         self._opener, self._config, self._sinks, self._wiring = opener, config, list(sinks), wiring
@@ -101,17 +101,17 @@ class Session:
         self._clean_up(error)
 
     def close(self) -> None:
-        """The last file is written: the folder is free for another run."""
+        """Unlock the folder for another run, after its last file was written."""
         if self._lock is not None:
             self._lock.release()
 
     def _clean_up(self, error: BaseException | None) -> None:
-        """A mistake that ended the run before its first frame leaves nothing behind that is in the way of the next."""
+        """Remove the new folder if an error ended the run before its first frame."""
         if self._folder is None or self._lock is None or error is None:
             return
         if not self._began and isinstance(error, StereoSfmError) and error.exit_code == StereoSfmError.exit_code:
             discard_files(self._folder)
-            with suppress(OSError):  # somebody else put something there
+            with suppress(OSError):  # it is not empty
                 for folder in self._made:
                     folder.rmdir()
         self.close()
@@ -134,13 +134,13 @@ class Session:
             sink.put(Compiling("run", kernel))
 
     def waited_s(self, begin_s: float) -> float:
-        """Seconds of the performance counter after `begin_s` in which stages loaded or compiled their code."""
+        """Seconds after `begin_s` (performance counter) in which stages loaded or compiled their code."""
         if self._run is None:
             return 0.0 if self._compilation is None else self._compilation.seconds
         return max((self._run.began_s or begin_s) - begin_s, 0.0)
 
     def _name_folder(self, otherwise: str) -> Path:
-        """By what the source was opened by, else by the given name."""
+        """A folder named after the source, else after the given name."""
         if self._folder is None:
             name = self._opener.spec.rstrip("/").split("/")[-1] or otherwise
             self._folder = default_folder(name, datetime.now())
@@ -148,21 +148,21 @@ class Session:
         return self._folder
 
     def _prepare(self) -> None:
-        """Make the folder, once the source is open: what is wrong with the source is told first, and leaves none."""
+        """Make the folder once the source is open, so that errors of the source come first and leave no folder."""
         self._made = [place for place in (self.folder, *self.folder.parents) if not place.exists()]
         self._lock = prepare_folder(self.folder, self._overwrite)
 
     def _log_options(self, live: bool, folder: Path) -> LogOptions | None:
         kind = self._wiring.log or ("full" if live else "lean")
         if kind != "full" and self._wiring.image_format is not None:
-            log.warning("--image-format does nothing: only --log full keeps images, this run has --log %s", kind)
+            log.warning("--image-format has no effect: only --log full keeps images, this run has --log %s", kind)
         if kind == "none":
             return None
         pixels = self._wiring.image_format or ("raw" if live else "png")
         return LogOptions(folder / "run.mcap", pixels if kind == "full" else "none")
 
     def _ring_drops(self) -> list[Dropped]:
-        """Images that the run to be repeated dropped for want of time."""
+        """Images that the run to be repeated dropped because it was too slow."""
         return [] if self._replayed is None else [d for d in self._replayed.dropped if d.where == "ring"]
 
     # -- wirings -----------------------------------------------------------------------------------------------------
@@ -210,7 +210,7 @@ class Session:
 
     @staticmethod
     def _log_ended(ended: LogEnded, sinks: Sequence[Sink]) -> None:
-        log.warning("%s; the run goes on without it", ended.why)
+        log.warning("%s; the run continues without it", ended.why)
         for sink in sinks:
             sink.put(ended)
 

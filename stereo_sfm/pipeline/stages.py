@@ -46,7 +46,7 @@ class LocalMailbox(deque[T_co]):  # type: ignore[type-var]
 
 
 def sensor_drop(image: StereoImage) -> Dropped | None:
-    """What the sensor or its driver lost just before an image."""
+    """Images lost by the sensor or its driver just before an image."""
     if not image.dropped_before:
         return None
     first = image.frame_id - image.dropped_before
@@ -54,7 +54,7 @@ def sensor_drop(image: StereoImage) -> Dropped | None:
 
 
 def source_counters(source: Source, frame_id: int) -> SourceCounters | None:
-    """What a live source has counted until now; None for files, which count nothing."""
+    """Counters of a live source so far; None for files, which have none."""
     return SourceCounters(frame_id, dict(source.counters)) if source.counters else None
 
 

@@ -1,4 +1,4 @@
-"""What the package says on its logger, from any process of a run, to the run's sinks: the log and the viewer."""
+"""Lines of the package's logger, from any process of a run, for the run's sinks: the log and the viewer."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Listener(logging.Handler):
     """While entered, passes every line of the package's logger on as a `LogLine`."""
 
     def __init__(self, stage: str, put: Callable[[LogLine], None]) -> None:
-        """Args: stage, whose process this is; put, takes the lines, from whichever thread says them."""
+        """Args: stage, whose process this is; put, takes the lines, from any thread."""
         super().__init__()
         self._stage, self._put = stage, put
 
@@ -35,8 +35,8 @@ class Listener(logging.Handler):
         logging.getLogger(LOGGER).removeHandler(self)
 
 
-def say(line: LogLine) -> None:
-    """Say in this process what another one said, as loudly as this one is set to; listeners pass it over."""
+def emit(line: LogLine) -> None:
+    """Log a line from another process at this process's level; listeners ignore it."""
     logger = logging.getLogger(LOGGER)
     level = logging.getLevelNamesMapping().get(line.level, logging.WARNING)
     if logger.isEnabledFor(level):

@@ -1,4 +1,4 @@
-"""How many threads the numerical libraries use: sums come out in another order, and other bits, with another number."""
+"""The number of threads of the numerical libraries, on which the order of sums and so the last bits depend."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMB
 
 @contextmanager
 def limited_threads(threads: int) -> Generator[None]:
-    """So many threads of BLAS and OpenCV in this process, while inside."""
+    """Limit the threads of BLAS and OpenCV in this process."""
     import cv2
     from threadpoolctl import threadpool_limits
 
@@ -28,7 +28,7 @@ def limited_threads(threads: int) -> Generator[None]:
 
 @contextmanager
 def thread_environment(threads: int) -> Generator[None]:
-    """Processes that are started inside begin with so many threads, whatever the environment said before."""
+    """Limit the threads of processes started in the `with` block, whatever the environment says."""
     before = {variable: os.environ.get(variable) for variable in VARIABLES}
     os.environ.update(dict.fromkeys(VARIABLES, str(threads)))
     try:

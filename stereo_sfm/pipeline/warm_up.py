@@ -21,7 +21,7 @@ WALL = 2.0  # metres ahead
 
 
 def images(rig: Rig) -> list[StereoImage]:
-    """Both eyes pass a wall of grey squares: enough for points, matches and keyframes in any camera."""
+    """A stereo pair passing a wall of grey squares: enough for points, matches and keyframes in any camera."""
     rng = np.random.default_rng(0)
     texture = np.kron(rng.integers(20, 230, (64, 64)), np.ones((8, 8))).astype(np.uint8)
     out: list[StereoImage] = []
@@ -38,7 +38,7 @@ def images(rig: Rig) -> list[StereoImage]:
 
 
 def _wall(camera: Camera, world_T_cam: F64, texture: U8) -> U8:
-    """Picture of the plane z = WALL, covered by `texture`, a centimetre a pixel."""
+    """Image of the plane z = WALL covered by `texture` with one centimetre per pixel."""
     grid = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), -1).reshape(-1, 2)
     ray = camera.unproject(grid.astype(float)) @ world_T_cam[:3, :3].T
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -48,7 +48,7 @@ def _wall(camera: Camera, world_T_cam: F64, texture: U8) -> U8:
 
 
 def keyframes(rig: Rig) -> list[Keyframe]:
-    """Keyframes of made points: what the mapper and the loop closer work on. Halfway all are seen anew: a loop."""
+    """Keyframes of synthetic points for the mapper and the loop closer. Halfway all points are revisited: a loop."""
     rng = np.random.default_rng(0)
     margin = min(40.0, rig.left.width / 4, rig.left.height / 4)
     uv = rng.uniform([margin, margin], [rig.left.width - margin, rig.left.height - margin], (POINTS, 2))
@@ -92,4 +92,4 @@ def warm_up_stage(stage: str, config: Config, rig: Rig) -> None:
         if closer is not None:
             for keyframe in keyframes(rig):
                 closer.step(keyframe)
-            PlaceDatabase(1).keep(np.zeros(0, np.int64))  # what a long run does now and then
+            PlaceDatabase(1).keep(np.zeros(0, np.int64))  # as in a long run

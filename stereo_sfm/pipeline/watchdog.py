@@ -1,6 +1,6 @@
-"""Who does not answer. Every process says every second that it is there, and for how long it has been at one thing.
+"""Detects processes that do not respond. Each sends a heartbeat every second with the duration of its current step.
 
-Nothing here reaches what a run computes: a stage never waits for its own beat, and main only puts into words what it
+Nothing here affects what a run computes: a stage never waits for its own heartbeat, and main only reports those it
 misses.
 """
 
@@ -14,35 +14,35 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-BEAT_S = 1.0
-SILENT_S = 3.0  # without a word from a process that computes nothing
-LONG_S = 10.0  # at one image, one keyframe, one answer of the source
-WORDS = {"T": "stopped by a signal", "t": "held by a debugger", "D": "waiting for a disk or a device"}
+HEARTBEAT_S = 1.0
+SILENT_S = 3.0  # without a message from an idle process
+LONG_STEP_S = 10.0  # for one image, one keyframe, or one read from the source
+PROCESS_STATES = {"T": "stopped by a signal", "t": "held by a debugger", "D": "waiting for a disk or a device"}
 
 
 @dataclass(frozen=True)
-class Beat:
-    """A sign of life."""
+class Heartbeat:
+    """Sent regularly by each process."""
 
     stage: str
-    step_s: float  # seconds that the process has been at one step; 0 while it waits for work
+    step_s: float  # duration of the current step; 0 while the process waits for work
 
 
-class Pulse:
-    """While entered, a thread of the process sends its beats; the stage says with `step` when it works."""
+class HeartbeatThread:
+    """While entered, a thread sends heartbeats; the stage marks its steps with `begin` and `end`."""
 
-    def __init__(self, stage: str, send: Callable[[Beat], None]) -> None:
+    def __init__(self, stage: str, send: Callable[[Heartbeat], None]) -> None:
         self._stage, self._send = stage, send
         self._since: float | None = None
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
 
     def begin(self) -> None:
-        """A step begins."""
+        """Mark the beginning of a step."""
         self._since = time.monotonic()
 
     def end(self) -> None:
-        """It is done."""
+        """Mark the end of the step."""
         self._since = None
 
     def __enter__(self) -> Self:
@@ -55,67 +55,69 @@ class Pulse:
         self._over.set()
 
     def _work(self) -> None:
-        while not self._over.wait(BEAT_S):
+        while not self._over.wait(HEARTBEAT_S):
             since = self._since
-            self._send(Beat(self._stage, 0.0 if since is None else time.monotonic() - since))
+            self._send(Heartbeat(self._stage, 0.0 if since is None else time.monotonic() - since))
 
 
 class Watchdog:
-    """Knows when each process was heard last, and tells once of each silence."""
+    """Keeps the time of the last message of each process, and reports each silence once."""
 
-    def __init__(self, pids: Mapping[str, int], tell: Callable[[str], None]) -> None:
-        self._pids, self._tell = dict(pids), tell
+    def __init__(self, pids: Mapping[str, int], report: Callable[[str], None]) -> None:
+        self._pids, self._report = dict(pids), report
         now = time.monotonic()
         self._heard = dict.fromkeys(pids, now)
         self._computed = dict.fromkeys(pids, 0.0)  # processor seconds
-        self._told: dict[str, float] = {}  # since when the silence that was told of lasts
+        self._reported: dict[str, float] = {}  # start of each reported silence
         self._long: set[str] = set()
 
-    def hear(self, stage: str, message: object) -> None:
-        """Any message of a process."""
+    def received(self, stage: str, message: object) -> None:
+        """Take any message of a process."""
         if stage in self._heard:
             self._heard[stage] = time.monotonic()
-            if isinstance(message, Beat):
+            if isinstance(message, Heartbeat):
                 self._computed[stage] = _status(self._pids[stage])[1]
                 self._judge_step(message)
 
     def excuse(self, seconds: float) -> None:
-        """Main did not listen for so long."""
+        """Ignore a time in which main did not receive messages."""
         self._heard = {stage: heard + seconds for stage, heard in self._heard.items()}
 
     def silent(self, stages: Iterable[str]) -> list[str]:
-        """Which of these do not answer; the first time it is told, and as well when one answers again."""
+        """The stages that do not respond; the beginning and the end of each silence are reported."""
         now, found = time.monotonic(), list[str]()
         for stage in stages:
             if self._silent_s(stage, now) > SILENT_S:
                 found.append(stage)
-                self._say(stage, now)
-            elif stage in self._told:
-                self._tell(f"the {stage} answers again after {now - self._told.pop(stage):.0f} s")
+                self._report_silence(stage, now)
+            elif stage in self._reported:
+                self._report(f"the {stage} responds again after {now - self._reported.pop(stage):.0f} s")
         return found
 
     def _silent_s(self, stage: str, now: float) -> float:
-        """A process that computes is no silent one, even where a library lets no other thread of it speak."""
+        """Seconds of silence; a process that computes is not silent, even if a library blocks its other threads."""
         if now - self._heard[stage] > SILENT_S:
             state, computed = _status(self._pids[stage])
-            if computed > self._computed[stage] and state not in WORDS:
+            if computed > self._computed[stage] and state not in PROCESS_STATES:
                 self._computed[stage], self._heard[stage] = computed, now
         return now - self._heard[stage]
 
-    def _say(self, stage: str, now: float) -> None:
-        if stage in self._told:
+    def _report_silence(self, stage: str, now: float) -> None:
+        if stage in self._reported:
             return
-        self._told[stage] = self._heard[stage]
-        why = WORDS.get(_status(self._pids[stage])[0], "")
-        self._tell(f"the {stage} does not answer for {now - self._heard[stage]:.0f} s" + (f": {why}" if why else ""))
+        self._reported[stage] = self._heard[stage]
+        why = PROCESS_STATES.get(_status(self._pids[stage])[0], "")
+        self._report(
+            f"the {stage} has not responded for {now - self._heard[stage]:.0f} s" + (f": {why}" if why else "")
+        )
 
-    def _judge_step(self, beat: Beat) -> None:
-        if beat.step_s < LONG_S:
+    def _judge_step(self, beat: Heartbeat) -> None:
+        if beat.step_s < LONG_STEP_S:
             self._long.discard(beat.stage)
         elif beat.stage not in self._long:
             self._long.add(beat.stage)
-            what = "waited for the source" if beat.stage == "capture" else "been at one step"
-            self._tell(f"the {beat.stage} has {what} for {beat.step_s:.0f} s")
+            what = "waited for the source" if beat.stage == "capture" else "been busy with one step"
+            self._report(f"the {beat.stage} has {what} for {beat.step_s:.0f} s")
 
 
 def _status(pid: int) -> tuple[str, float]:

@@ -1,4 +1,4 @@
-"""What each process of the pipeline runs. A worker gets its pipes; its last word is End, or Failed."""
+"""The bodies of the processes. Each worker gets its pipes; its last message is End or Failed."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ from stereo_sfm.pipeline.channels import End, Failed, Inbox, Lost, Outbox
 from stereo_sfm.pipeline.interrupts import STOP_SIGNALS
 from stereo_sfm.pipeline.schedule import Lockstep, Realtime, Recorded, Schedule
 from stereo_sfm.pipeline.text import LOGGER, Listener
-from stereo_sfm.pipeline.watchdog import Pulse
+from stereo_sfm.pipeline.watchdog import HeartbeatThread
 from stereo_sfm.types import Applied, Keyframe, LoopResult, MapUpdate, Trajectory
 from stereo_sfm.viz.server import LOOPBACK
 
-UPSTREAM_LOST = 70  # exit code of a worker whose neighbour died: not the cause
+UPSTREAM_LOST = 70  # exit code of a worker that ended because another one died
 
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """What every stage is told once the source is open."""
+    """What every stage gets once the source is open."""
 
     rig: Rig
     config: Config
     ground_truth: Trajectory | None
     source_name: str
     ring_name: str
-    applied: tuple[Applied, ...] | None  # a recorded schedule to follow
+    applied: tuple[Applied, ...] | None  # a recorded schedule to repeat
     realtime: bool
     folders: MapFolders
     delays: int | None  # seed of random delays in every stage (tests)
@@ -51,17 +51,17 @@ class Setup:
 
 
 class Report(Outbox):
-    """What a worker says to main, with its beat."""
+    """The messages of a worker to main, with its heartbeat."""
 
     def __init__(self, stage: str, connection: Connection) -> None:
         super().__init__(connection, 512)
-        self.pulse = Pulse(stage, self.send)
+        self.pulse = HeartbeatThread(stage, self.send)
 
 
 def guarded(stage: str, body: Callable[..., None], report: Connection, *args: Any) -> None:
     """Entry of every worker process."""
     for number in STOP_SIGNALS:
-        signal.signal(number, signal.SIG_IGN)  # main decides what Ctrl-C means
+        signal.signal(number, signal.SIG_IGN)  # main handles Ctrl-C
     to_main = Report(stage, report)
     logging.getLogger(LOGGER).setLevel(logging.INFO)  # main decides what is printed
     try:
@@ -77,9 +77,11 @@ def guarded(stage: str, body: Callable[..., None], report: Connection, *args: An
         to_main.close()
         os._exit(error.exit_code)
     except BaseException as error:
-        said = from_os_error(error) if isinstance(error, OSError) else None
+        known = from_os_error(error) if isinstance(error, OSError) else None
         failed = (
-            Failed(stage, str(said), True, said.exit_code) if said else Failed(stage, traceback.format_exc(), False, 1)
+            Failed(stage, str(known), True, known.exit_code)
+            if known
+            else Failed(stage, traceback.format_exc(), False, 1)
         )
         to_main.send(failed)
         to_main.close()
@@ -94,7 +96,7 @@ class Ready:
 
 
 def ready(stage: str, setup: Setup, to_main: Outbox) -> None:
-    """Load the stage's code, and say so."""
+    """Load the stage's code and send `Ready`."""
     from stereo_sfm.kernel_cache import listening
     from stereo_sfm.pipeline.warm_up import warm_up_stage
 
@@ -107,7 +109,7 @@ def prepare(stage: str, setup: Setup) -> Callable[[], None]:
     """Threads and cores of this process; returns what injects a random delay (tests) or nothing."""
     import cv2
 
-    cv2.setNumThreads(setup.config.pipeline.threads)  # of BLAS: as the environment says
+    cv2.setNumThreads(setup.config.pipeline.threads)  # BLAS: set by the environment
     cpus = setup.config.pipeline.cpus.get(stage)
     if cpus and hasattr(os, "sched_setaffinity"):
         try:
@@ -129,7 +131,7 @@ def run_capture(
     tracker: Connection,
     readers: tuple[Connection, Connection],
 ) -> None:
-    """Open the source, tell main about it, read it to the end."""
+    """Open the source, describe it to main, read it to the end."""
     from stereo_sfm.pipeline.capture import CaptureStage, FreeSlots, SourceInfo, StopFlag
     from stereo_sfm.pipeline.images import ImageLayout, ImageRing
 
@@ -140,7 +142,7 @@ def run_capture(
         delay = prepare("capture", setup)
         slots = setup.config.pipeline.ring_slots
         ring = ImageRing(ImageLayout.of(source.rig), slots, setup.ring_name)
-        word = Inbox[str](control).take()  # main says go when every stage is ready, or stop
+        word = Inbox[str](control).take()  # main sends go when every stage is ready, or stop
         to_tracker = Outbox(tracker)
         stage = CaptureStage(
             source,
@@ -165,7 +167,7 @@ def _schedule(setup: Setup) -> Schedule:
 
 
 def _next_image(inbox: Inbox[Any]) -> Any:
-    """A capture process that was killed has said everything: what it read until then is finished."""
+    """If capture was killed, what it read so far is processed."""
     try:
         return inbox.take()
     except Lost:
@@ -264,7 +266,7 @@ def run_mapper(
         to_tracker.send(update)
         if (job := mapper.pending_job()) is not None:
             if busy:
-                answers.take()  # a newer loop made this job's answer useless
+                answers.take()  # a newer loop made the result of this job obsolete
             to_optimizer.send(job)
             busy = True
         frame_id = keyframe.frame_id
@@ -286,13 +288,13 @@ def run_mapper(
 
 
 def release_memory() -> None:
-    """Give what was freed back to the system, where the C library can do that (glibc)."""
+    """Return freed memory to the system, where the C library supports it (glibc)."""
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL("libc.so.6").malloc_trim(0)
 
 
 def run_optimizer(to_main: Report, control: Connection, jobs: Connection, results: Connection) -> None:
-    """Full bundle adjustments, beside the mapper."""
+    """Full bundle adjustment in parallel with the mapper."""
     from stereo_sfm.mapping.mapper import Job, run_job
 
     setup = Inbox[Setup](control).take()
@@ -342,7 +344,7 @@ def run_loop(to_main: Report, control: Connection, keyframes: Connection, to_map
 
 @dataclass(frozen=True)
 class LogOptions:
-    """Where a run's log goes and what it holds."""
+    """The file of a run's log and what it contains."""
 
     path: Path
     image_format: str = "png"  # png | raw | jpeg | none
@@ -358,7 +360,7 @@ class ViewerOptions:
 
 
 def run_viewer(to_main: Report, control: Connection, messages: Connection, options: ViewerOptions) -> None:
-    """What main passes on, into rerun."""
+    """Send the messages from main to rerun."""
     from stereo_sfm.viz.sink import RerunSink
 
     setup = Inbox[Setup](control).take()

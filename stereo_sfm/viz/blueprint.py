@@ -1,4 +1,4 @@
-"""What a user of the viewer sees first."""
+"""The initial layout of the viewer."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ LEGEND = rrb.Corner2D.LeftTop
 BACKGROUND = (17, 19, 24)
 GRID = (60, 64, 74)
 STAGES = ("track", "map", "loop")  # the stages; other times are steps inside them
-LEVELS = ("CRITICAL", "ERROR", "WARN", "INFO")  # candidates that the loop closer turned down are DEBUG
+LEVELS = ("CRITICAL", "ERROR", "WARN", "INFO")  # rejected loop candidates are DEBUG
 
 
 def blueprint(name: str) -> rrb.Blueprint:
-    """The map large, both eyes, the matches, and the numbers over time.
+    """A large view of the map, both images, the matches, and time series.
 
     Args:
         name: of the source; a path is cut to its last part.
@@ -23,7 +23,7 @@ def blueprint(name: str) -> rrb.Blueprint:
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Vertical(_map(title), _log(), row_shares=[5, 1]),
-            rrb.Vertical(_eyes(), _matches(), _plots(), row_shares=[5, 3, 5]),
+            rrb.Vertical(_images(), _matches(), _plots(), row_shares=[5, 3, 5]),
             column_shares=[10, 9],
         ),
         rrb.TimePanel(state="collapsed", timeline="seconds"),
@@ -42,7 +42,7 @@ def _map(title: str) -> rrb.Spatial3DView:
     )
 
 
-def _eyes() -> rrb.Horizontal:
+def _images() -> rrb.Horizontal:
     return rrb.Horizontal(
         rrb.Spatial2DView(
             origin="/map/camera/left", name="left: tracks by age, new blue, old red", background=BACKGROUND
@@ -61,10 +61,10 @@ def _plots() -> rrb.Vertical:
     return rrb.Vertical(
         rrb.TimeSeriesView(origin="/points", name="points", plot_legend=LEGEND),
         rrb.Tabs(
-            rrb.TimeSeriesView(origin="/ms", contents=stages, name="milliseconds a stage", plot_legend=LEGEND),
+            rrb.TimeSeriesView(origin="/ms", contents=stages, name="milliseconds per stage", plot_legend=LEGEND),
             rrb.TimeSeriesView(origin="/ms", contents=steps, name="steps of the stages"),
             rrb.TimeSeriesView(origin="/ms", contents=["+ /ms/latency"], name="latency"),
-            rrb.TimeSeriesView(origin="/rate", name="frames a second"),
+            rrb.TimeSeriesView(origin="/rate", name="frames per second"),
         ),
     )
 

@@ -12,10 +12,10 @@ from stereo_sfm.viz.shapes import spread_colors, strips, wire_cameras
 
 ODOMETRY, MAPPED, LOOP = (255, 160, 40), (70, 150, 255), (255, 60, 60)
 COVISIBLE, CAMERA = (70, 84, 110), (240, 240, 240)
-MAP_SHARE = 40  # the whole map is drawn anew when it has grown by this part of its keyframes
-LINE_EVERY = 10  # frames between two pictures of the odometry's line, more as it grows
+MAP_SHARE = 40  # the whole map is redrawn when it has grown by 1 / MAP_SHARE
+LINE_EVERY = 10  # frames between two updates of the odometry's line, more as it grows
 USUAL_FRAMES = 2000
-CAMERA_SIZE = 0.06  # of the walk's extent
+CAMERA_SIZE = 0.06  # of the trajectory's extent
 
 
 class MapScene:
@@ -31,7 +31,7 @@ class MapScene:
         self._rec.log("map", rr.ViewCoordinates.RDF, static=True)
 
     def frame(self, frame: Frame) -> None:
-        """Where the camera is now."""
+        """The current pose of the camera."""
         pose = self._map_T_odom @ frame.odom_T_cam
         self._odometry.append(frame.odom_T_cam[:3, 3])
         self._rec.log("map/camera", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
@@ -43,7 +43,7 @@ class MapScene:
         self._rec.log("map/odometry", _lines(line[None], ODOMETRY, 1.0))
 
     def show_camera(self, extent: float) -> None:
-        """The pyramid of the camera, larger when the walk has grown."""
+        """The pyramid of the camera, scaled with the trajectory."""
         size = max(0.15, CAMERA_SIZE * extent)
         if 0.8 < size / max(self._size, 1e-9) < 1.25:
             return
@@ -65,7 +65,7 @@ class MapScene:
         self._map.loop(result)
 
     def update(self, update: MapUpdate) -> None:
-        """The mapper's answer; as the map grows, and after each jump, the whole map is drawn anew."""
+        """The mapper's answer; the whole map is redrawn as it grows and after each correction."""
         jumped = float(np.abs(update.map_T_odom - self._map_T_odom).max()) > 1e-3 and len(update.kf_ids) > 20
         self._map.update(update)
         self._map_T_odom = update.map_T_odom

@@ -1,6 +1,6 @@
-"""rerun's viewers as processes of their own, because only so they can be told which addresses to listen on.
+"""rerun's viewers as separate processes, since only then the address to listen on can be chosen.
 
-Whoever reaches a viewer's ports sees what is shown and can write into it: they are open to this computer alone unless
+Anyone who can reach a viewer's ports can view the data and write to it: they are open to this computer only unless
 the user asks for another address.
 """
 
@@ -24,8 +24,8 @@ from stereo_sfm.errors import StereoSfmError
 LOOPBACK = "127.0.0.1"
 EVERYWHERE = ("0.0.0.0", "::")
 WEB_PORT, GRPC_PORT = 9090, 9876
-MEMORY_LIMIT = "1GB"  # of the viewer, which keeps its history
-START_S = 20.0  # that a viewer has to listen
+MEMORY_LIMIT = "1GB"  # of the viewer's history
+START_S = 20.0  # time for a viewer to start listening
 PR_SET_PDEATHSIG = 1
 
 
@@ -36,10 +36,10 @@ def serve(address: str) -> tuple[str, str]:
         address: of the network interface to listen on; one of `EVERYWHERE` for all.
 
     Returns:
-        Where to send a recording, and a line for people: where to look, and who else can.
+        Where to send a recording, and a line with the viewer's address and who can reach it.
 
     Raises:
-        StereoSfmError: a port is taken, the address is not ours, or the server does not start.
+        StereoSfmError: a port is in use, the address is not one of this computer, or the server does not start.
     """
     _check_free(address, GRPC_PORT, WEB_PORT)
     ports = ("--port", str(GRPC_PORT), "--web-viewer-port", str(WEB_PORT))
@@ -49,12 +49,12 @@ def serve(address: str) -> tuple[str, str]:
     _wait_for(process, here, GRPC_PORT, WEB_PORT)
     host = socket.gethostname() if address in EVERYWHERE else address
     page = f"http://{_url_host(host)}:{WEB_PORT}/?url={quote(_proxy(host), safe='')}"
-    who = "this computer only" if address == LOOPBACK else f"everybody who reaches {address} can look and write"
+    who = "this computer only" if address == LOOPBACK else f"anyone who can reach {address} can view and write"
     return _proxy(here), f"viewer: {page} (ports {WEB_PORT} and {GRPC_PORT} of {address}: {who})"
 
 
 def open_window() -> str:
-    """Open a viewer of this computer, or take the one that is open; where to send a recording.
+    """Open a viewer on this computer, or use the one that is open; returns where to send a recording.
 
     Raises:
         StereoSfmError: there is no viewer or no screen.
@@ -70,7 +70,7 @@ _SILENT: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEV
 
 
 def _executable() -> str:
-    """The viewer that belongs to the installed rerun-sdk, wherever the PATH leads: another version would not do."""
+    """The viewer of the installed rerun-sdk, regardless of the PATH: another version would not work."""
     package = importlib.util.find_spec("rerun_cli")
     folder = Path(package.origin).parent if package is not None and package.origin is not None else None
     bundled = None if folder is None else shutil.which("rerun", path=f"{folder}:{folder}/Rerun.app/Contents/MacOS")
@@ -81,7 +81,7 @@ def _executable() -> str:
 
 
 def _end_with_parent() -> None:
-    """In the child: die with the process that started it, however that ends (Linux)."""
+    """In the child: exit with the parent process, however that ends (Linux)."""
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
@@ -93,7 +93,7 @@ def _wait_for(process: subprocess.Popen[Any], address: str, *ports: int) -> None
             raise StereoSfmError(f"cannot open the viewer: rerun ended with exit code {process.returncode}")
         if time.monotonic() > until:
             process.kill()
-            raise StereoSfmError(f"cannot open the viewer: rerun does not listen after {START_S:.0f} s")
+            raise StereoSfmError(f"cannot open the viewer: rerun has not started after {START_S:.0f} s")
         time.sleep(0.05)
 
 
@@ -107,7 +107,7 @@ def _check_free(address: str, *ports: int) -> None:
     try:
         family = socket.getaddrinfo(address, 0)[0][0]
     except socket.gaierror:
-        raise StereoSfmError(f"'{address}' is no address to listen on: try 127.0.0.1 or 0.0.0.0") from None
+        raise StereoSfmError(f"'{address}' is not an address to listen on: try 127.0.0.1 or 0.0.0.0") from None
     for port in ports:
         with socket.socket(family) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -115,7 +115,7 @@ def _check_free(address: str, *ports: int) -> None:
                 probe.bind((address, port))
             except OSError as error:
                 why = "is another viewer open?" if _answers(address, port) else str(error.strerror)
-                raise StereoSfmError(f"port {port} of {address} is taken: {why}") from None
+                raise StereoSfmError(f"port {port} of {address} is in use: {why}") from None
 
 
 def _url_host(host: str) -> str:

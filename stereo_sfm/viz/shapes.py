@@ -1,4 +1,4 @@
-"""What the viewer draws, as arrays: colours, wire cameras, and many lines at once."""
+"""Arrays for the viewer: colours, camera pyramids, and many lines at once."""
 
 from __future__ import annotations
 

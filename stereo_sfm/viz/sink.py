@@ -33,10 +33,10 @@ from stereo_sfm.viz.shapes import age_colors, spread_colors, strips, turbo
 
 log = logging.getLogger("stereo_sfm")
 JPEG_QUALITY = 80
-MATCHES_DRAWN = 100  # more lines than that hide the picture: every k-th is drawn
+MATCHES_DRAWN = 100  # more lines would hide the image: every k-th is drawn
 MATCHES_EVERY = 5  # pictures between two pictures of matches
-KEPT = 64  # images that wait for their frame: more than the stages have between them
-GRACE_S = 5.0  # that a viewer has to take what is left
+KEPT = 64  # images waiting for their frame, more than the stages can hold
+GRACE_S = 5.0  # time for a viewer to take the remaining messages
 TRUTH = (95, 200, 110)
 SERIES: Mapping[str, tuple[int, int, int]] = {
     "points/tracked": (90, 170, 255),
@@ -77,11 +77,11 @@ class RerunSink:
             self._rec.connect_grpc(open_window(), default_blueprint=blueprint(name))
         else:
             assert path is not None
-            path.open("ab").close()  # rerun's own error for a file that cannot be written is no OSError
+            path.open("ab").close()  # raises OSError if the file cannot be written, unlike rerun
             self._rec.save(path, default_blueprint=blueprint(name))
         self._scene = MapScene(self._rec, rig)
         self._events = Events()
-        self._images: dict[int, StereoImage] = {}  # that wait for their frame
+        self._images: dict[int, StereoImage] = {}  # waiting for their frame
         self._pictures = 0
         self._keyframe: tuple[Keyframe, U8] | None = None
         self._first_ns: int | None = None
@@ -95,7 +95,7 @@ class RerunSink:
             self._rec.log("map/ground_truth", line, static=True)
 
     def put(self, message: object) -> None:
-        """Any message of a run."""
+        """Take any message of a run."""
         self._show(message)
         event = self._events.of(message)
         if event is not None:
@@ -129,14 +129,14 @@ class RerunSink:
         self._rec.log(f"rate/{health.stage}", rr.Scalars(health.rate))
 
     def close(self) -> None:
-        """Everything is sent."""
+        """Send what is left and disconnect."""
         for frame_id in sorted(self._images):
             self._show_alone(self._images[frame_id])
         self._scene.show()
         try:
             self._rec.flush(timeout_sec=1e38 if self._mode == "save" else GRACE_S)
         except RuntimeError as error:
-            log.warning("the viewer does not answer, what it shows is not complete: %s", str(error).splitlines()[0])
+            log.warning("the viewer does not respond, what it shows is incomplete: %s", str(error).splitlines()[0])
         if self._mode == "save":
             self._rec.disconnect()  # writes the end of the file
 
@@ -152,7 +152,7 @@ class RerunSink:
         self._rec.set_time("seconds", duration=np.timedelta64(stamp_ns - self._first_ns, "ns"))
 
     def _show_alone(self, image: StereoImage) -> None:
-        """An image that nobody tracked, as in a recording without a run."""
+        """An image without a frame, as in a recording without a run."""
         if image.frame_id <= self._last_frame:  # a keyframe whose message was dropped, or a late picture
             return
         self._at(image.frame_id, image.stamp_ns)
@@ -171,7 +171,7 @@ class RerunSink:
         self._scene.frame(frame)
         image = self._images.pop(frame.frame_id, None)
         if image is not None:
-            self._show_eyes(frame, image)
+            self._show_images(frame, image)
             if self._pictures % MATCHES_EVERY == 0:
                 self._show_matches(frame, image.left)
             self._pictures += 1
@@ -185,7 +185,7 @@ class RerunSink:
         dots = rr.Points2D(obs.uv_left, colors=age_colors(obs.age), radii=rr.Radius.ui_points(2.5))
         self._rec.log("map/camera/left/features", dots)
 
-    def _show_eyes(self, frame: Frame, image: StereoImage) -> None:
+    def _show_images(self, frame: Frame, image: StereoImage) -> None:
         """Both images, tracks by age in the left one, lines by disparity in the right one."""
         self._rec.log("map/camera/left/image", _jpeg(image.left))
         self._show_tracks(frame)
@@ -218,7 +218,7 @@ class RerunSink:
         self._rec.log("matches/image", _jpeg(np.hstack([before, now])))
         self._rec.log("matches/lines", rr.LineStrips2D(strips(ends), colors=colors, radii=rr.Radius.ui_points(0.6)))
 
-    # -- the others --------------------------------------------------------------------------------------------------
+    # -- other messages----------------------------------------------------------------------------------------------
 
     @_show.register
     def _put_keyframe(self, keyframe: Keyframe) -> None:

@@ -227,7 +227,7 @@ def test_configuration_that_is_not_toml(cli: Run, tmp_path: Path) -> None:
         (("est.tum", "--ref", "none.tum"), "none.tum"),
         (("late.tum", "--ref", "ref.tum"), "no stamps in common"),
         (("bad.tum", "--ref", "ref.tum"), "bad.tum line 1"),
-        (("folder", "--ref", "ref.tum"), "no run's folder"),
+        (("folder", "--ref", "ref.tum"), "not the folder of a run"),
         (("est.tum", "--ref", "data"), "has no ground truth"),
         (("est.tum", "--ref", "ref.tum", "--delta", "x"), "--delta"),
         (("est.tum", "--ref", "ref.tum", "--delta", "1000f"), "--delta 1000f is longer"),
@@ -313,16 +313,16 @@ def test_an_empty_output_folder_will_do(cli: Run, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("args", "said"),
     [
-        (("--image-format", "jpeg", "--log", "none"), "--image-format does nothing"),
-        (("--image-format", "jpeg"), "--image-format does nothing"),
-        (("--set", "odometry.scale=ground-truth"), "odometry.scale does nothing"),
+        (("--image-format", "jpeg", "--log", "none"), "--image-format has no effect"),
+        (("--image-format", "jpeg"), "--image-format has no effect"),
+        (("--set", "odometry.scale=ground-truth"), "odometry.scale has no effect"),
     ],
 )
 def test_options_without_effect_are_a_warning(cli: Run, tmp_path: Path, args: tuple[str, ...], said: str) -> None:
     root = make_images(tmp_path / "data", ["0.png", "1.png"])
     _, _, err = cli("run", root, "-o", "out", "--max-lost", 101, *args)
     assert len([line for line in err.splitlines() if line.startswith("warning: ") and said in line]) == 1
-    assert "does nothing" not in cli("run", root, "-o", "other", "--log", "full", "--image-format", "png")[2]
+    assert "has no effect" not in cli("run", root, "-o", "other", "--log", "full", "--image-format", "png")[2]
 
 
 def test_rectify_of_no_frames(cli: Run, tmp_path: Path) -> None:
@@ -368,7 +368,7 @@ def test_overwriting_a_run_leaves_nothing_of_it(cli: Run, tmp_path: Path) -> Non
 def test_a_map_is_not_written_over_something_else(cli: Run, tmp_path: Path, command: tuple[str, ...]) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "rig.yaml").write_text("years of work")
-    assert_one_line(cli("map", *command, "-o", "run", "--overwrite"), "run exists and is no map")
+    assert_one_line(cli("map", *command, "-o", "run", "--overwrite"), "run exists and is not a map")
     assert_one_line(cli("map", *command, "-o", "run/rig.yaml"), "exists and is no map")
     assert (tmp_path / "run" / "rig.yaml").read_text() == "years of work"
 
@@ -472,7 +472,7 @@ def test_nothing_is_written_over_what_is_read(cli: Run, tmp_path: Path) -> None:
     assert cli("run", "a.mcap", "-o", "r", "-q", "--log", "full", "--max-lost", "100")[0] in (0, 4)
     logged = (tmp_path / "r" / "run.mcap").read_bytes()
     assert_one_line(cli("run", "mcap:r/run.mcap", "-o", "r", "--overwrite"), "is the source, or contains it")
-    assert_one_line(cli("replay", "r", "-o", "r", "--overwrite"), "holds the run that is to be replayed")
+    assert_one_line(cli("replay", "r", "-o", "r", "--overwrite"), "contains the run to be replayed")
     assert (tmp_path / "a.mcap").read_bytes() == before
     assert (tmp_path / "r" / "run.mcap").read_bytes() == logged
 

@@ -58,11 +58,11 @@ def test_a_run_keeps_its_map_and_knows_its_truth(
     assert main(["run", "--inline", "-q", "--max-frames", "3", "--log", "none", "--overwrite", "-o", str(run),
                  "--set", "mapper.enabled=false"]) == 0  # fmt: skip
     assert not (run / "map" / "map.json").exists()  # of the run before
-    assert main(["eval", str(run)]) == 2 and "knows no ground truth: name it with --ref" in capsys.readouterr().err
+    assert main(["eval", str(run)]) == 2 and "contains no ground truth: give it with --ref" in capsys.readouterr().err
 
 
 def test_ablation_of_a_source_without_truth_is_refused(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["ablation", f"images:{folder}", "-o", str(tmp_path / "a")]) == 2
-    assert "has no ground truth: there is nothing to judge the cells by" in capsys.readouterr().err
+    assert "has no ground truth to evaluate the cells against" in capsys.readouterr().err

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from stereo_sfm import kernel_cache
-from stereo_sfm.commands._progress import CompilingShown, LinesOnly, NoProgress
+from stereo_sfm.commands._progress import CompilationProgress, LinesOnly, NoProgress
 from stereo_sfm.messages import Compiling
 from stereo_sfm.pipeline.processes import ProcessRun
 from tests.pipeline.test_pipeline import CONFIG, MadeSource, SlidingWall
@@ -27,7 +27,7 @@ class Bar(NoProgress):
 
 
 def test_the_bar_names_each_kernel(capsys: pytest.CaptureFixture[str]) -> None:
-    shown, bar = CompilingShown(), Bar()
+    shown, bar = CompilationProgress(), Bar()
     shown.bar = bar
     shown.put(Compiling("tracker", "match_rows"))
     shown.put("anything else")
@@ -35,7 +35,7 @@ def test_the_bar_names_each_kernel(capsys: pytest.CaptureFixture[str]) -> None:
     assert len(bar.said) == 2
     assert bar.said[1] == "first run here: compiling reduce (mapper), kernel 2"
     shown.bar = LinesOnly()  # no terminal: one line, not a hundred
-    fresh = CompilingShown()
+    fresh = CompilationProgress()
     fresh.bar = LinesOnly()
     fresh.put(Compiling("tracker", "match_rows"))
     fresh.put(Compiling("tracker", "match_columns"))
@@ -63,6 +63,6 @@ def test_a_first_run_and_a_run_after_compile(tmp_path: Path) -> None:
     assert "first run on this machine: compiling" in first.stderr
     assert json.loads((tmp_path / "first" / "stats.json").read_text())["wall_s"] < 0.5 * wall_s
     made = subprocess.run([*command, "compile"], capture_output=True, text=True, env=environment)
-    assert made.returncode == 0 and "no run waits for them any more" in made.stdout
+    assert made.returncode == 0 and "later runs start at once" in made.stdout
     again = subprocess.run([*run[:-1], str(tmp_path / "again")], capture_output=True, text=True, env=environment)
     assert "compiling" not in again.stderr

@@ -32,7 +32,7 @@ def test_the_log_names_the_map(tmp_path: Path, localize_only: bool) -> None:
     opening = logged(tmp_path, Opening(map_in=str(store), map_sha256=map_sha256(store), localize_only=localize_only))
     assert map_folders(opening) == MapFolders(store, localize_only)
     (store / "map.json").write_text("{ }")
-    with pytest.raises(StereoSfmError, match="another now"):
+    with pytest.raises(StereoSfmError, match="has changed since"):
         map_folders(opening)
     (store / "map.json").unlink()
     with pytest.raises(StereoSfmError, match="gone"):

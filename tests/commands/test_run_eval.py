@@ -105,7 +105,7 @@ def test_eval_of_body_poses(
     assert ate(body.with_suffix(".kitti"), "--ref", camera, capsys=capsys) < 1e-6  # has no heading
     (folder / "rig.yaml").unlink()
     assert main(["eval", str(body), "--ref", str(source)]) == 2
-    assert "poses of the body, and no rig.yaml" in capsys.readouterr().err
+    assert "poses of the body, and there is no rig.yaml" in capsys.readouterr().err
 
 
 def test_eval_prints_the_runs_errors(
@@ -131,11 +131,11 @@ def test_eval_of_a_file_without_stamps(data_root: Path, tmp_path: Path, capsys: 
     short = tmp_path / "short.txt"
     short.write_text("\n".join(poses.read_text().splitlines()[:50]))
     assert main(["eval", str(short), "--ref", str(poses)]) == 2
-    assert "no stamps and 50 lines, what it is compared with 120 poses" in capsys.readouterr().err
+    assert "no stamps, and its 50 lines do not match 120 poses" in capsys.readouterr().err
     stamped = tmp_path / "stamped.tum"
     write_tum(stamped, read_kitti(poses, np.arange(120, dtype=np.int64) * 10**8))
     assert main(["eval", str(stamped), "--ref", str(short)]) == 2
-    assert "short.txt has no stamps and 50 lines" in capsys.readouterr().err
+    assert "short.txt has no stamps, and its 50 lines" in capsys.readouterr().err
     assert ate(stamped, "--ref", poses, capsys=capsys) < 1e-6
 
 

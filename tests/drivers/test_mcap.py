@@ -415,7 +415,7 @@ def test_info_of_our_own_file_and_of_a_cut_off_one(tmp_path: Path, capsys: pytes
     write_recording(path, MemorySource(fisheye_rig(), stereo_images(40, np.random.default_rng(0))))
     assert main(["info", str(path)]) == 0
     text = capsys.readouterr().out
-    assert "40 at 30.00 Hz" in text and "1 counted as dropped, eyes at most 0.040 ms apart" in text
+    assert "40 at 30.00 Hz" in text and "1 dropped, left and right at most 0.040 ms apart" in text
     assert "closed properly" in text and "baseline 64.10 mm" in text
     path.write_bytes(path.read_bytes()[:-1500])
     assert main(["info", str(path)]) == 0
@@ -500,5 +500,5 @@ def test_a_clock_that_goes_back_is_said(tmp_path: Path, caplog: pytest.LogCaptur
 
 def test_a_pipe_is_no_recording(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.mcap")
-    with pytest.raises(StereoSfmError, match="it is no file"):
+    with pytest.raises(StereoSfmError, match="it is not a file"):
         LogReader(tmp_path / "a.mcap")

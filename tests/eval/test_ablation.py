@@ -193,7 +193,7 @@ def test_ctrl_c_finishes_the_running_cell_and_begins_no_other(
     chosen = ["--features", "orb", "--odometry", "em-r,r-um", "--stages", "tracking", "--systems", "none", "-q"]
     assert main(["ablation", SIM, "-o", str(tmp_path), *chosen]) == 130
     assert len(begun) == 1 and len(list((tmp_path / "cells").iterdir())) == 1
-    assert "interrupted with 1 of 2 cells; the same command goes on" in capsys.readouterr().err
+    assert "interrupted with 1 of 2 cells; run the same command to continue" in capsys.readouterr().err
     assert (tmp_path / "ablation.md").exists()
 
 
@@ -224,7 +224,7 @@ def test_settings_are_part_of_a_cell_and_leave_the_names_of_others_alone(tmp_pat
         (["/no/such/folder"], "no such file or folder: /no/such/folder"),
         ([SIM, "euroc:nowhere"], "no folder nowhere"),
         ([SIM, "--set", "odometry.refin=false"], "refin"),
-        ([SIM, "--set", "odometry.method=um"], "choose them with --odometry"),
+        ([SIM, "--set", "odometry.method=um"], "use --odometry to choose the cells"),
     ],
 )
 def test_mistakes_are_told_before_any_cell_runs(

@@ -59,7 +59,7 @@ def test_one_eye_is_judged_after_its_scale(tmp_path: Path) -> None:
     config = Config(odometry=dataclasses.replace(Config().odometry, method="pnp", monocular=True))
     assert scale_free(config, pinhole_rig())
     _, lines, report = results(tmp_path, record_of(walk(), 0), pinhole_rig(), config)
-    assert any("one eye has no scale" in line for line in lines) and "baseline" not in report
+    assert any("one camera has no scale" in line for line in lines) and "baseline" not in report
     assert not any("SE3" in line for line in lines)
 
 
@@ -96,7 +96,7 @@ def test_never_found_in_the_map_is_a_failure(tmp_path: Path) -> None:
     assert not (tmp_path / "trajectory_map.tum").exists() and (tmp_path / "trajectory_odom.tum").exists()
 
 
-def test_pieces_that_no_loop_joins_are_said(tmp_path: Path) -> None:
+def test_unconnected_submaps_are_reported(tmp_path: Path) -> None:
     record, none = record_of(walk(), 0), np.zeros(0, np.int64)
     nothing = np.zeros((0, 2))
     for kf_id, submap in ((0, 0), (10, 1), (20, 1)):
@@ -105,20 +105,23 @@ def test_pieces_that_no_loop_joins_are_said(tmp_path: Path) -> None:
             np.zeros((0, 32), np.uint8), submap_id=submap,
         )  # fmt: skip
         record.put(keyframe)
-    assert record.pieces() == 2
+    assert record.unconnected_submaps() == 2
     _, lines, report = results(tmp_path, record, pinhole_rig(), Config())
-    assert any("2 pieces that no loop joins" in line for line in lines) and "the walk is in 2 pieces" in report
+    assert (
+        any("2 submaps that no loop connects" in line for line in lines)
+        and "the map is in 2 unconnected submaps" in report
+    )
     loop = LoopResult(20, 0, np.eye(4), np.eye(6), none.reshape(-1, 2), 50, 0.1, "", ())
     record.put(loop)
-    assert record.pieces() == 1
-    assert record.closure_drifts() == []  # what lay between the pieces was not odometry
-    assert not any("pieces" in line for line in results(tmp_path, record, pinhole_rig(), Config())[1])
+    assert record.unconnected_submaps() == 1
+    assert record.closure_drifts() == []  # there was no odometry between the submaps
+    assert not any("no loop connects" in line for line in results(tmp_path, record, pinhole_rig(), Config())[1])
 
 
-def test_a_saved_map_holds_the_pieces_together() -> None:
+def test_a_saved_map_connects_all_submaps() -> None:
     record = RunRecord(localize_only=True)
     record.keyframes = {k: KeyframeRow(k, k, np.eye(4), 0.0, submap_id=k) for k in range(3)}
-    assert record.pieces() == 1
+    assert record.unconnected_submaps() == 1
 
 
 def test_frames_go_over_from_one_keyframes_place_to_the_next(tmp_path: Path) -> None:

@@ -59,7 +59,7 @@ def test_what_is_no_trajectory_is_left_out(data: bytes, tmp_path: Path, caplog: 
 def test_what_is_no_configuration_makes_no_run(data: bytes, tmp_path: Path) -> None:
     with (
         LogReader(log_with(tmp_path / "a.mcap", {CONFIG_FILE: data})) as reader,
-        pytest.raises(StereoSfmError, match=r"a\.mcap is no log of a run"),
+        pytest.raises(StereoSfmError, match=r"a\.mcap is not the log of a run"),
     ):
         read_run(reader)
 

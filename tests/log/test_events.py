@@ -1,4 +1,4 @@
-"""What happens in a run is told once, in words: losing the way, loops, jumps of the map, dropped frames."""
+"""The events of a run are reported once: loss of tracking, loops, corrections of the map, dropped frames."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ def told(*messages: object) -> list[tuple[str, str]]:
     return [(line.level, line.text) for line in lines if line is not None]
 
 
-def test_a_lost_way_is_told_when_it_begins_and_when_it_ends() -> None:
+def test_the_beginning_and_the_end_of_a_loss_are_reported() -> None:
     lost = TrackState.LOST
     states = [TrackState.OK, lost, lost, TrackState.RECOVERED, TrackState.OK, lost, TrackState.RESTARTED]
     reasons = ["", "dark", "dark", "", "", "too_few_points", ""]
     assert told(*(frame(i, s, r) for i, (s, r) in enumerate(zip(states, reasons, strict=True)))) == [
         ("WARNING", "frame 1 at 0.1 s: lost (dark)"),
-        ("INFO", "frame 3 at 0.3 s: found again"),
+        ("INFO", "frame 3 at 0.3 s: tracking recovered"),
         ("WARNING", "frame 5 at 0.5 s: lost (too few points)"),
-        ("WARNING", "frame 6 at 0.6 s: begins anew in another piece of the map"),
+        ("WARNING", "frame 6 at 0.6 s: tracking restarted in a new submap"),
     ]
 
 
-def test_another_reason_is_told() -> None:
+def test_another_reason_is_reported() -> None:
     lost = TrackState.LOST
     assert [text for _, text in told(frame(0, lost, "dark"), frame(1, lost, "no_consensus"))] == [
         "frame 0 at 0.0 s: lost (dark)",
@@ -52,17 +52,17 @@ def test_another_reason_is_told() -> None:
     ]
 
 
-def test_loops_and_refused_loops_are_told() -> None:
+def test_loops_and_rejected_loops_are_reported() -> None:
     accepted = LoopResult(9, 2, np.eye(4), np.eye(6), PAIRS, 87, 0.4, "")
     refused = LoopResult(10, -1, np.eye(4), np.eye(6), PAIRS, 3, 0.1, "too_few_inliers", ((1, 0.1, "x"), (2, 0.1, "x")))
     nothing = LoopResult(11, -1, np.eye(4), np.eye(6), PAIRS, 0, 0.0, "no_candidate")
     assert told(accepted, refused, nothing) == [
         ("INFO", "keyframe 9 sees keyframe 2 again, 87 inliers"),
-        ("DEBUG", "no loop at keyframe 10, 2 refused: too few inliers"),
+        ("DEBUG", "no loop at keyframe 10, 2 rejected: too few inliers"),
     ]
 
 
-def test_small_steps_of_the_map_are_told_once_they_add_up() -> None:
+def test_small_corrections_of_the_map_are_reported_once_they_add_up() -> None:
     steps = [update(k, 0.004 * k) for k in range(7)]
     assert [text for _, text in told(*steps)] == [
         "map corrected by 0.012 m, 0.00 deg at keyframe 3",
@@ -70,7 +70,7 @@ def test_small_steps_of_the_map_are_told_once_they_add_up() -> None:
     ]
 
 
-def test_dropped_frames_are_told() -> None:
+def test_dropped_frames_are_reported() -> None:
     assert told(Dropped(5, 0, "ring", "no free slot"), Dropped(8, 0, "sensor", "lost", 3)) == [
         ("WARNING", "1 frame dropped at 5: no free slot"),
         ("WARNING", "3 frames dropped at 8: lost"),
@@ -86,4 +86,4 @@ def test_a_verbose_run_tells_them_on_the_screen(
     assert main(["run", source, *options]) in (0, 4)
     said = capsys.readouterr().err
     assert ("tracker: frame 10 at 1.0 s: lost (dark)" in said) == verbose
-    assert ("found again" in said) == verbose
+    assert ("tracking recovered" in said) == verbose

@@ -117,7 +117,7 @@ def test_recover_tells_what_was_missing(whole: Whole, tmp_path: Path, capsys: py
     assert main(["recover", str(short), "-o", str(out)]) == 0
     assert "was not closed" in capsys.readouterr().out
     assert main(["recover", str(path), "-o", str(out), "--overwrite"]) == 0
-    assert "nothing was missing" in capsys.readouterr().out
+    assert "nothing had to be repaired" in capsys.readouterr().out
     assert main(["diff", str(path), str(out)]) == 0
     assert main(["recover", str(path), "-o", str(out)]) == 2
     assert main(["recover", str(path), "-o", str(path), "--overwrite"]) == 2

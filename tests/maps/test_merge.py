@@ -171,7 +171,7 @@ def test_commands(
     for pair in ([a, a], [both, b]):
         assert main(["map", "merge", *pair, "-o", str(tmp_path / "c")]) == 2
         error = capsys.readouterr().err
-        assert f"{pair[0]} and {pair[1]} hold the same walk" in error and len(error.splitlines()) == 1
+        assert f"{pair[0]} and {pair[1]} contain the same session" in error and len(error.splitlines()) == 1
     assert not (tmp_path / "c").exists()
     assert main(["map", "prune", both, "--min-views", "3", "-o", str(tmp_path / "d")]) == 0
     assert len(load_map(tmp_path / "d").snapshot.pt_ids) < len(load_map(Path(both)).snapshot.pt_ids)

@@ -1,4 +1,4 @@
-"""Slow disks, full disks, processes that hang: the pose comes first, what happens is told, and every end is quick."""
+"""Slow and full disks, unresponsive processes: the pose comes first, faults are reported, every run ends quickly."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_in_lockstep_the_run_waits_for_the_logger_and_says_so(
             if k == 10:
                 pause(run.pids["logger"], SILENT_S + 2)
     assert same(inline, tmp_path / "run.mcap") == []
-    assert "the logger does not answer" in caplog.text and "the logger answers again" in caplog.text
+    assert "the logger has not responded" in caplog.text and "the logger responds again" in caplog.text
 
 
 def full_disk(
@@ -123,7 +123,7 @@ def test_a_live_run_goes_on_without_its_log(
     with ProcessRun(source, CONFIG, [kept], realtime=True, log=LogOptions(path, "raw")) as run:
         assert len(list(run)) + sum(d.where == "ring" for d in kept.drops) == frames
     (ended,) = kept.ended
-    assert why in ended.why and "the run goes on without it" in caplog.text
+    assert why in ended.why and "the run continues without it" in caplog.text
     assert closed(path)
 
 
@@ -176,7 +176,7 @@ def test_a_stopped_process_is_named_and_the_run_ends_in_time(
     def wait_and_stop() -> None:
         nonlocal begin
         until = time.monotonic() + 4 * SILENT_S
-        while f"the {stage} does not answer" not in caplog.text and time.monotonic() < until:
+        while f"the {stage} has not responded" not in caplog.text and time.monotonic() < until:
             time.sleep(0.1)
         begin = time.monotonic()
         run.stop()
@@ -186,7 +186,7 @@ def test_a_stopped_process_is_named_and_the_run_ends_in_time(
             if k == 10:
                 os.kill(run.pids[stage], signal.SIGSTOP)
                 threading.Thread(target=wait_and_stop).start()
-    assert f"the {stage} does not answer" in caplog.text and "stopped by a signal" in caplog.text
+    assert f"the {stage} has not responded" in caplog.text and "stopped by a signal" in caplog.text
     assert time.monotonic() - begin < END_S
     assert closed(path)
 
@@ -225,7 +225,7 @@ def test_a_stage_that_hangs_keeps_neither_the_end_nor_the_log(
 
 
 def never() -> SlidingWall:
-    """A source whose device does not answer."""
+    """A source whose device does not respond."""
     time.sleep(600)
     return SlidingWall(1)
 
@@ -256,11 +256,11 @@ def test_a_process_that_computes_is_not_silent(monkeypatch: pytest.MonkeyPatch) 
     time.sleep(0.5)
     assert watchdog.silent(["mapper"]) == ["mapper"] == watchdog.silent(["mapper"])
     (said,) = told
-    assert said.startswith("the mapper does not answer") and said.endswith(": stopped by a signal")
+    assert said.startswith("the mapper has not responded") and said.endswith(": stopped by a signal")
     os.kill(busy.pid, signal.SIGCONT)
     time.sleep(0.5)
     assert watchdog.silent(["mapper"]) == []
-    assert told[1].startswith("the mapper answers again")
+    assert told[1].startswith("the mapper responds again")
     busy.kill()
     busy.join()
 
@@ -279,8 +279,8 @@ def test_too_few_open_files_are_raised_or_named(monkeypatch: pytest.MonkeyPatch)
     asked: list[tuple[int, int]] = []
     monkeypatch.setattr(resource, "setrlimit", lambda _, limits: asked.append(limits))
     monkeypatch.setattr(resource, "getrlimit", lambda _: (40, 4096))
-    processes._have_files(128)
+    processes._raise_file_limit(128)
     assert asked == [(128, 4096)]
     monkeypatch.setattr(resource, "getrlimit", lambda _: (40, 40))
     with pytest.raises(StereoSfmError, match="only 40 files may be open, a run needs 128: raise 'ulimit -n'"):
-        processes._have_files(128)
+        processes._raise_file_limit(128)

@@ -65,7 +65,7 @@ def test_the_ring_of_a_killed_run_is_removed_by_the_next_and_that_of_a_living_on
     os.killpg(owners[0].pid, signal.SIGKILL)  # with Python's own resource tracker
     owners[0].wait()
     assert killed.is_file() and living.is_file()
-    remove_abandoned(young_s=0.0)
+    remove_abandoned(min_age_s=0.0)
     assert not killed.exists()
     assert living.is_file()
     owners[1].terminate()
@@ -77,5 +77,5 @@ def test_a_ring_that_is_being_made_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / f"{images.PREFIX}new").write_bytes(b"")
     remove_abandoned(tmp_path)
     assert list(tmp_path.iterdir())
-    remove_abandoned(tmp_path, young_s=-1.0)
+    remove_abandoned(tmp_path, min_age_s=-1.0)
     assert not list(tmp_path.iterdir())

@@ -87,7 +87,7 @@ def test_check_calib_tells(capsys: pytest.CaptureFixture[str], tmp_path: Path) -
     assert "cannot be judged with a rolling shutter" in told
     save_rig(dataclasses.replace(rig, readout_s=0.1), tmp_path / "long.yaml")
     assert main(["check-calib", source, "--rig", str(tmp_path / "long.yaml")]) == 0
-    assert "is readout_s in rig.yaml right?" in capsys.readouterr().out
+    assert "check readout_s in rig.yaml" in capsys.readouterr().out
 
 
 def test_check_calib_of_a_pair_that_misses_right_images(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -37,7 +37,7 @@ sys.stdin.read()
 
 
 @pytest.mark.parametrize(
-    ("address", "who"), [("127.0.0.1", "this computer only"), ("0.0.0.0", "everybody who reaches 0.0.0.0")]
+    ("address", "who"), [("127.0.0.1", "this computer only"), ("0.0.0.0", "anyone who can reach 0.0.0.0")]
 )
 def test_a_served_viewer_listens_where_it_was_asked_to_and_says_so(
     ports: tuple[int, int], address: str, who: str
@@ -61,7 +61,7 @@ def test_a_port_that_is_taken_is_said(ports: tuple[int, int]) -> None:
         with socket.socket() as taken:
             taken.bind(("127.0.0.1", port))
             taken.listen()
-            with pytest.raises(StereoSfmError, match=rf"port {port} of 127.0.0.1 is taken: is another viewer open\?"):
+            with pytest.raises(StereoSfmError, match=rf"port {port} of 127.0.0.1 is in use: is another viewer open\?"):
                 server.serve("127.0.0.1")
 
 

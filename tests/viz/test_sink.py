@@ -94,7 +94,7 @@ def test_the_map_is_shown(shown: Recording) -> None:
 def test_the_log_has_loops_and_why_there_was_none(shown: Recording) -> None:
     texts = [what.text.as_arrow_array().to_pylist()[0] for what in shown.of("log")]
     assert texts[-2:] == ["loop: keyframe 2 sees keyframe 0 again, 40 inliers",
-                          "loop: no loop at keyframe 3, 1 refused: too few inliers"]  # fmt: skip
+                          "loop: no loop at keyframe 3, 1 rejected: too few inliers"]  # fmt: skip
 
 
 def test_drops_and_rates_are_series(shown: Recording) -> None:
@@ -167,4 +167,4 @@ def test_a_viewer_that_does_not_answer_is_a_warning(
     monkeypatch.setattr(logging.getLogger("stereo_sfm"), "propagate", True)
     viewer = sink.RerunSink(SlidingWall(1).rig, "wall", "save", tmp_path / "run.rrd")
     viewer.close()
-    assert "the viewer does not answer" in caplog.text and "more" not in caplog.text
+    assert "the viewer does not respond" in caplog.text and "more" not in caplog.text

@@ -1,4 +1,4 @@
-"""Where images of a caller come in: what can be meant becomes what the stages take, the rest is one clear line.
+"""Images from a caller: converted to what the stages take, or rejected with a one-line error.
 
 The stages take (H, W) 8-bit grey images of the calibration's size, contiguous in memory. A caller may also hand over
 colour in OpenCV's order (blue, green, red), 16-bit grey, and floats from 0 to 1 or from 0 to 255.
@@ -23,12 +23,12 @@ from stereo_sfm.types import F32, U8, StereoImage
 log = logging.getLogger("stereo_sfm")
 
 
-class ImageDoor:
-    """Takes images one after the other: how bright white is in 16 bits or floats is seen once and kept."""
+class ImageInput:
+    """Converts successive images; the white level of 16-bit and float images is determined from them."""
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
-        self._bits = 0  # of 16, in use so far
+        self._bits = 0  # of 16, used so far
         self._white = 0.0  # of floats: 1 or 255; 0 before the first
         self._last_ns: int | None = None
         self._count = 0
@@ -44,7 +44,7 @@ class ImageDoor:
             depth: (H, W) metres along the left optical axis, NaN or 0 where unknown (RGB-D).
 
         Raises:
-            StereoSfmError: what is no image of this rig, or a stamp that is not later.
+            StereoSfmError: not an image of this rig, or a stamp that is not later than the last.
         """
         image = self.checked(
             StereoImage(self._count, self._later(stamp_ns), _array(left, "left"), _optional(right), _metres(depth))
@@ -54,7 +54,7 @@ class ImageDoor:
         return image
 
     def checked(self, image: StereoImage) -> StereoImage:
-        """An image of any source with pixels as the stages take them; the same object where they are so already.
+        """An image of any source with pixels as the stages take them; the same object if they already are.
 
         Raises:
             StereoSfmError: not an image of this rig.
@@ -62,10 +62,10 @@ class ImageDoor:
         rig = self._rig
         two = rig.right is not None and not rig.depth
         if two and image.right is None:
-            raise StereoSfmError(f"frame {image.frame_id} has no right image, but the calibration is of two cameras")
+            raise StereoSfmError(f"frame {image.frame_id} has no right image, but the calibration is for two cameras")
         if rig.depth and image.depth is None:
             raise StereoSfmError(
-                f"frame {image.frame_id} has no depth image, but the calibration is of an RGB-D camera"
+                f"frame {image.frame_id} has no depth image, but the calibration is for an RGB-D camera"
             )
         left = self._grey(image.left, rig.left, "left")
         right = None if image.right is None or rig.right is None else self._grey(image.right, rig.right, "right")
@@ -76,7 +76,7 @@ class ImageDoor:
 
     def _later(self, stamp_ns: Any) -> int:
         if isinstance(stamp_ns, bool) or not isinstance(stamp_ns, int | np.integer):
-            raise StereoSfmError(f"stamp_ns takes whole nanoseconds, got {stamp_ns!r}: seconds are to be times 1e9")
+            raise StereoSfmError(f"stamp_ns takes whole nanoseconds, got {stamp_ns!r}: multiply seconds by 1e9")
         if self._last_ns is not None and stamp_ns <= self._last_ns:
             raise StereoSfmError(f"stamp_ns is {stamp_ns}, not later than the last one, {self._last_ns}")
         return int(stamp_ns)  # pyright: ignore[reportUnknownArgumentType]
@@ -88,7 +88,7 @@ class ImageDoor:
             return pixels
         if pixels.ndim not in (2, 3) or (pixels.ndim == 3 and pixels.shape[2] not in (1, 3, 4)):
             raise StereoSfmError(
-                f"the {side} image has the shape {pixels.shape}: (H, W) grey or (H, W, 3) colour is meant"
+                f"the {side} image has the shape {pixels.shape}: expected (H, W) grey or (H, W, 3) colour"
             )
         _check_size(pixels, camera, side)
         grey = self._in_bytes(pixels, side)
@@ -105,25 +105,25 @@ class ImageDoor:
             return eight_bits(np.ascontiguousarray(pixels), self._bits_with(pixels))
         if np.issubdtype(pixels.dtype, np.floating):
             return self._of_floats(pixels, side)
-        raise StereoSfmError(f"the {side} image has {pixels.dtype} pixels: uint8, uint16 or floats are taken")
+        raise StereoSfmError(f"the {side} image has {pixels.dtype} pixels: expected uint8, uint16 or floats")
 
     def _bits_with(self, pixels: NDArray[Any]) -> int:
-        """How many of 16 bits are in use, this image included."""
+        """How many of 16 bits are used, including this image."""
         bits = max(sensor_bits([pixels]), self._bits)
         if bits != self._bits:
-            log.warning("16-bit images: the values use %d bits, so that %d is white", bits, 2**bits - 1)
+            log.warning("16-bit images: the values use %d bits, %d is taken as white", bits, 2**bits - 1)
             self._bits = bits
         return bits
 
     def _of_floats(self, pixels: NDArray[Any], side: str) -> U8:
         low, high = float(pixels.min()), float(pixels.max())
         if not (np.isfinite(low) and np.isfinite(high)):
-            raise StereoSfmError(f"the {side} image holds values that are not finite")
+            raise StereoSfmError(f"the {side} image contains values that are not finite")
         if not self._white:
             self._white = 1.0 if high <= 1.0 else 255.0
         if low < 0 or high > self._white:
             raise StereoSfmError(
-                f"the {side} image holds values from {low:g} to {high:g}: 0 to {self._white:g} as in the first image"
+                f"the {side} image has values from {low:g} to {high:g}: expected 0 to {self._white:g} as in the first"
             )
         return np.round(pixels * (255.0 / self._white)).astype(np.uint8)
 
@@ -132,7 +132,7 @@ def _array(pixels: ArrayLike, side: str) -> NDArray[Any]:
     try:
         return np.asarray(pixels)
     except (ValueError, TypeError):
-        raise StereoSfmError(f"the {side} image is no array of numbers") from None
+        raise StereoSfmError(f"the {side} image is not an array of numbers") from None
 
 
 def _optional(right: ArrayLike | None) -> NDArray[Any] | None:
@@ -145,7 +145,7 @@ def _metres(depth: ArrayLike | None) -> F32 | None:
         return None
     pixels = _array(depth, "depth")
     if not np.issubdtype(pixels.dtype, np.floating):
-        raise StereoSfmError(f"the depth image has {pixels.dtype} pixels: floats in metres are meant")
+        raise StereoSfmError(f"the depth image has {pixels.dtype} pixels: expected floats in metres")
     metres = np.ascontiguousarray(pixels, np.float32)
     return np.where(metres > 0, metres, np.float32(np.nan))
 
