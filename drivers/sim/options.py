@@ -59,5 +59,9 @@ class SimOptions(SourceOptions):
         0.0, "seconds from the first row's exposure to the last's: a rolling shutter", low=0, high=0.1
     )
     dark: tuple[float, float] = option((0.0, 0.0), "FROM-TO in seconds: when the lights are out", read=_interval)
+    imu: Literal["", "ideal", "t265", "oak"] = option("", "inertial samples as of an ideal sensor, a T265's, an OAK's")
+    imu_offset_ms: float = option(
+        0.0, "clock of the inertial sensor minus the camera's, known to the calibration", low=-1000, high=1000
+    )
     effects: bool = option(True, "off: clean pictures")
     realtime: bool = option(False, "frames come by the clock")

@@ -12,6 +12,7 @@ import numpy as np
 from stereo_sfm.drivers.rig_option import chosen_rig
 from stereo_sfm.drivers.sim.effects import CLEAN, Effects, Sensor, brightness
 from stereo_sfm.drivers.sim.encounters import plan, present
+from stereo_sfm.drivers.sim.inertial import InertialSensor
 from stereo_sfm.drivers.sim.kernels import PERSON
 from stereo_sfm.drivers.sim.options import SimOptions
 from stereo_sfm.drivers.sim.people import crowd_at, moving
@@ -24,7 +25,7 @@ from stereo_sfm.drivers.sim.world import Layout, build_world
 from stereo_sfm.drivers.source import BaseSource, Stamps
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
-from stereo_sfm.types import F64, StereoImage, Trajectory
+from stereo_sfm.types import F64, ImuSamples, StereoImage, Trajectory
 
 _EPOCH_NS = 1_000_000_000
 
@@ -70,6 +71,11 @@ class SimSource(BaseSource):
         route = scene.route(scene.layout, options.walk, options.returns)
         rng = np.random.default_rng([options.seed, options.walk, 31])
         self.walk = Walk(route, gait, rng, options.length or scene.length)
+        self._inertial = None
+        if options.imu:
+            seeds = np.random.default_rng([options.seed, options.walk, 83])
+            self._inertial = InertialSensor(options.imu, self.walk, seeds, options.imu_offset_ms * 1e-3)
+            self.rig = self._camera = dataclasses.replace(self.rig, imu=self._inertial.imu)
         count = scene.people if options.people < 0 else options.people
         self.people = crowd(scene, count, np.random.default_rng([options.seed, 47]))
         self.encounters = plan(options.encounters, self.walk, np.random.default_rng([options.seed, options.walk, 71]))
@@ -169,7 +175,14 @@ class SimSource(BaseSource):
         before, after = self.walk.poses(np.array([seconds - step, seconds + step]))
         twist = se3.log(se3.inverse(before) @ after) / (2 * step)
         image = self.picture(self.row_poses(frame_id), frame_id, twist)
-        return dataclasses.replace(image, dropped_before=dropped_before)
+        return dataclasses.replace(image, dropped_before=dropped_before, imu=self._sampled(frame_id, dropped_before))
+
+    def _sampled(self, frame_id: int, dropped_before: int) -> ImuSamples | None:
+        """Inertial samples since the frame before."""
+        if self._inertial is None:
+            return None
+        begin = (frame_id - 1 - dropped_before) / self.options.rate
+        return self._inertial.samples(begin, frame_id / self.options.rate, _EPOCH_NS)
 
     def stamps(self) -> Stamps:
         return Stamps(np.array([self.stamp_ns(int(k)) for k in self.frame_ids], np.int64), 0.0)

@@ -70,9 +70,21 @@ class Walk:
     def poses(self, seconds: F64) -> F64:
         """Times (N,) -> world_T_cam (N, 4, 4): x right, y down, z forward."""
         seconds = np.asarray(seconds, float)
+        return self.steady(seconds) @ self.shake(seconds)
+
+    def shake(self, seconds: F64) -> F64:
+        """Times (N,) -> sway and tremble, steady_T_cam (N, 4, 4)."""
         amplitude, frequency, phase = self._sines
-        shake = (amplitude * np.sin(2 * np.pi * frequency * seconds[:, None, None] + phase)).sum(-1)  # (N, 6)
-        return self.steady(seconds) @ se3.exp(shake)
+        return se3.exp((amplitude * np.sin(2 * np.pi * frequency * seconds[:, None, None] + phase)).sum(-1))
+
+    def course(self, seconds: F64, derivative: int = 0) -> F64:
+        """Times (N,) -> x, y (metres) and heading (rad) of the walker (N, 3), or their derivatives by time."""
+        return np.asarray(self._path(seconds, derivative), float)
+
+    @property
+    def walker_R_cam(self) -> F64:
+        """(3, 3) from the camera without shake to the walker's axes: x ahead, z up."""
+        return FORWARD @ se3.so3_exp(np.array([np.deg2rad(self.gait.pitch_deg), 0, 0]))
 
     def steady(self, seconds: F64) -> F64:
         """`poses` without sway and tremble."""
@@ -81,9 +93,7 @@ class Walk:
             se3.so3_exp(np.stack([0 * heading, 0 * heading, heading], -1)),
             np.stack([x, y, np.full_like(x, self.gait.height)], -1),
         )
-        pitch = np.deg2rad(self.gait.pitch_deg)
-        walker_R_cam = FORWARD @ se3.so3_exp(np.array([pitch, 0, 0]))
-        walker_T_cam = se3.from_rotation_translation(walker_R_cam, np.zeros(3))
+        walker_T_cam = se3.from_rotation_translation(self.walker_R_cam, np.zeros(3))
         return world_T_walker @ walker_T_cam
 
 

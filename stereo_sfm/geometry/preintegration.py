@@ -1,7 +1,9 @@
 """Preintegration of inertial samples into one relative motion, independent of the initial state.
 
 Forster, Carlone, Dellaert, Scaramuzza: On-Manifold Preintegration for Real-Time Visual-Inertial Odometry, TRO 33, 2017;
-equations 35 to 38 and the recursive forms of the appendix. Rates are constant over each interval.
+equations 35 to 38 and the recursive forms of the appendix. Rates are constant over each interval, and forces act in the
+axes at its middle: at 200 Hz and 1 rad/s the axes at its beginning would be off by a seventieth of a degree, 0.02 m/s^2
+of gravity, always to the same side.
 """
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false
@@ -93,14 +95,16 @@ def _integrate(seconds, gyro, accel, gyro_bias, accel_bias, gyro_density2, accel
     rotation, velocity, position = np.eye(3), np.zeros(3), np.zeros(3)
     r_g, v_g, v_a = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
     p_g, p_a, covariance = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((9, 9))
-    turn, right = np.eye(3), np.eye(3)
+    turn, right, half, half_right = np.eye(3), np.eye(3), np.eye(3), np.eye(3)
     step = np.eye(9)
     for k in range(len(seconds)):
         dt = seconds[k]
         if dt <= 0:
             continue
-        a = accel[k] - accel_bias
         _exp_and_jacobian((gyro[k] - gyro_bias) * dt, turn, right)
+        _exp_and_jacobian((gyro[k] - gyro_bias) * (0.5 * dt), half, half_right)
+        a = half @ (accel[k] - accel_bias)
+        middle, r_g_middle = rotation @ half, r_g - half @ half_right * (0.5 * dt)
         force = rotation @ a
         skew = np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
         turned_force = rotation @ skew
@@ -115,10 +119,10 @@ def _integrate(seconds, gyro, accel, gyro_bias, accel_bias, gyro_density2, accel
             covariance[6 + i, 6 + i] += 0.25 * accel_density2 * dt * dt * dt
             covariance[3 + i, 6 + i] += 0.5 * accel_density2 * dt * dt
             covariance[6 + i, 3 + i] += 0.5 * accel_density2 * dt * dt
-        p_a += v_a * dt - 0.5 * rotation * dt * dt
-        p_g += v_g * dt - 0.5 * turned_force @ r_g * dt * dt
-        v_a -= rotation * dt
-        v_g -= turned_force @ r_g * dt
+        p_a += v_a * dt - 0.5 * middle * dt * dt
+        p_g += v_g * dt - 0.5 * turned_force @ r_g_middle * dt * dt
+        v_a -= middle * dt
+        v_g -= turned_force @ r_g_middle * dt
         r_g = turn.T @ r_g - right * dt
         position += velocity * dt + 0.5 * force * dt * dt
         velocity += force * dt

@@ -1,0 +1,118 @@
+"""The simulated inertial sensor: exact rates and forces along a walk, and what sensors of robots make of them.
+
+The T265 (BMI055) states its own noise: variances 5.15e-6 (rad/s)^2 of a gyroscope sample at 200 Hz, 6.7e-5 (m/s^2)^2
+of an accelerometer sample at 62.5 Hz, 5e-7 and 1e-4 of the biases, taken as what they wander in 100 s. The OAK's BMI270
+has the noise densities of its data sheet, 0.007 degrees/s and 160 micro-g per root hertz.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from stereo_sfm.calib.imu import Imu
+from stereo_sfm.drivers.sim.walks import Walk
+from stereo_sfm.geometry import se3
+from stereo_sfm.types import F64, I64, ImuSamples
+
+RATE_HZ = 200.0
+PHASE = 0.3  # of a period: samples and images are not taken at the same times
+_GRAVITY = np.array([0.0, 0.0, -9.80665])  # m/s^2, world
+_STEP_S = 2e-3  # of the differences below, which err by less than 1e-9 of the fastest shake
+_FIRST = np.array([1 / 280, -4 / 105, 1 / 5, -4 / 5, 0, 4 / 5, -1 / 5, 4 / 105, -1 / 280]) / _STEP_S
+_SECOND = np.array([-1 / 560, 8 / 315, -1 / 5, 8 / 5, -205 / 72, 8 / 5, -1 / 5, 8 / 315, -1 / 560]) / _STEP_S**2
+_AROUND: F64 = np.linspace(-4 * _STEP_S, 4 * _STEP_S, 9)
+
+
+@dataclass(frozen=True)
+class Grade:
+    """How good a sensor is."""
+
+    gyro_noise: float = 0.0  # rad/s/sqrt(Hz)
+    accel_noise: float = 0.0  # m/s^2/sqrt(Hz)
+    gyro_walk: float = 0.0  # rad/s^2/sqrt(Hz)
+    accel_walk: float = 0.0  # m/s^3/sqrt(Hz)
+    gyro_bias: float = 0.0  # rad/s, standard deviation when switched on; the calibration does not know it
+    accel_bias: float = 0.0  # m/s^2, the same
+    scale: float = 0.0  # standard deviation of scale and misalignment, which the calibration knows
+    known_bias: float = 0.0  # m/s^2 of the accelerometer that the calibration knows
+
+
+GRADES = {
+    "ideal": Grade(),
+    "t265": Grade(1.6e-4, 1.04e-3, 7e-5, 1e-3, 0.004, 0.03, scale=0.01, known_bias=0.15),
+    "oak": Grade(1.22e-4, 1.57e-3, 2e-5, 3e-4, 0.008, 0.08),
+}
+_MOUNTS = {  # left_R_imu up to a few degrees, and metres
+    "ideal": (np.diag([-1.0, -1.0, 1.0]), (0.032, 0.004, -0.006)),
+    "t265": (np.diag([-1.0, -1.0, 1.0]), (0.032, 0.004, -0.006)),
+    "oak": (np.array([[0, 1.0, 0], [1.0, 0, 0], [0, 0, -1.0]]), (0.038, -0.011, -0.009)),
+}
+
+
+class InertialSensor:
+    """Gyroscope and accelerometer at a fixed place of the camera. `imu` is what the calibration knows of them."""
+
+    def __init__(self, name: str, walk: Walk, rng: np.random.Generator, offset_s: float = 0.0) -> None:
+        """`name` of GRADES; `offset_s`: its clock minus the camera's."""
+        self._walk, grade = walk, GRADES[name]
+        turn, place = _MOUNTS[name]
+        left_T_imu = se3.from_rotation_translation(turn @ se3.so3_exp(np.array([0.02, -0.03, 0.015])), np.array(place))
+        gyro_matrix, accel_matrix = (np.eye(3) + rng.normal(0, grade.scale, (3, 3)) for _ in range(2))
+        known = Imu()  # its noise, where the sensor has none: a filter cannot do without
+        self.imu = Imu(
+            left_T_imu=left_T_imu, gyro_matrix=gyro_matrix, accel_matrix=accel_matrix,
+            accel_bias=rng.normal(0, grade.known_bias, 3), gyro_noise=grade.gyro_noise or known.gyro_noise,
+            accel_noise=grade.accel_noise or known.accel_noise, gyro_walk=grade.gyro_walk or known.gyro_walk,
+            accel_walk=grade.accel_walk or known.accel_walk, rate_hz=RATE_HZ, offset_s=offset_s,
+        )  # fmt: skip
+        self._gyro_error, self._accel_error = self._errors(grade, rng)
+
+    def _errors(self, grade: Grade, rng: np.random.Generator) -> tuple[F64, F64]:
+        """(N, 3) each: bias, its walk and white noise of every sample."""
+        shape = (int((self._walk.duration + 1) * RATE_HZ) + 1, 3)
+        out: list[F64] = []
+        for noise, wander, bias in (
+            (grade.gyro_noise, grade.gyro_walk, grade.gyro_bias),
+            (grade.accel_noise, grade.accel_walk, grade.accel_bias),
+        ):
+            walked = np.cumsum(rng.normal(0, wander / RATE_HZ**0.5, shape), axis=0)
+            out.append(rng.normal(0, bias, 3) + walked + rng.normal(0, noise * RATE_HZ**0.5, shape))
+        return out[0], out[1]
+
+    def exact(self, seconds: F64) -> tuple[F64, F64]:
+        """Angular velocity (N, 3) rad/s and specific force (N, 3) m/s^2 in the sensor's axes at some times (N,).
+
+        world_T_imu is a turn about the vertical on a spline, times the shake: the derivatives of the first are the
+        spline's, those of the second, a few sines, are differences of eighth order.
+        """
+        steady = se3.from_rotation_translation(self._walk.walker_R_cam, np.zeros(3))
+        around = self._walk.shake(np.add.outer(seconds, _AROUND).ravel())
+        walker_T_imu = (steady @ around @ self.imu.left_T_imu).reshape(-1, len(_AROUND), 4, 4)
+        now = walker_T_imu[:, len(_AROUND) // 2]
+        speed = np.einsum("k,nkij->nij", _FIRST, walker_T_imu)
+        acceleration = np.einsum("k,nki->ni", _SECOND, walker_T_imu[..., :3, 3])
+        (heading, rate, rate_change) = (self._walk.course(seconds, k)[:, 2, None] for k in range(3))
+        up = np.array([0.0, 0.0, 1.0])
+        place, drift = now[:, :3, 3], speed[:, :3, 3]
+        turning = 2 * rate * np.cross(up, drift) + rate_change * np.cross(up, place)
+        turning += rate**2 * np.cross(up, np.cross(up, place))
+        world_R_walker = se3.so3_exp(heading * up)
+        course = self._walk.course(seconds, 2) * [1, 1, 0]
+        force = np.einsum("nji,nj->ni", world_R_walker, course - _GRAVITY) + acceleration + turning
+        skew = np.einsum("nji,njk->nik", now[:, :3, :3], speed[:, :3, :3])
+        gyro = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], -1)
+        gyro = gyro + np.einsum("nji,nj->ni", now[:, :3, :3], rate * up)
+        return gyro, np.einsum("nji,nj->ni", now[:, :3, :3], force)
+
+    def samples(self, begin: float, end: float, epoch_ns: int) -> ImuSamples:
+        """What was sampled after one time until another (seconds of the walk, camera's clock)."""
+        rows = np.arange(*(max(0, int(np.floor(t * RATE_HZ - PHASE + 1e-9)) + 1) for t in (begin, end)))
+        seconds: F64 = np.asarray((rows + PHASE) / RATE_HZ, np.float64)
+        gyro, accel = self.exact(seconds)
+        imu = self.imu
+        gyro = (gyro + self._gyro_error[rows] + imu.gyro_bias) @ np.linalg.inv(imu.gyro_matrix).T
+        accel = (accel + self._accel_error[rows] + imu.accel_bias) @ np.linalg.inv(imu.accel_matrix).T
+        stamp_ns: I64 = epoch_ns + np.round((seconds + imu.offset_s) * 1e9).astype(np.int64)
+        return ImuSamples(stamp_ns, gyro.astype(np.float64), accel.astype(np.float64))
