@@ -17,7 +17,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Pinhole
 from stereo_sfm.geometry.preintegration import GRAVITY
 from stereo_sfm.pipeline.run import run
-from stereo_sfm.tracking.inertial.inertial_motion import InertialMotion
+from stereo_sfm.tracking.inertial.inertial_motion import InertialMotion, roll_pitch_deg
 from stereo_sfm.tracking.inertial.sample_buffer import SampleBuffer
 from stereo_sfm.tracking.inertial.smoothing import smooth_bridges
 from stereo_sfm.types import F64, ImuSamples, StereoImage, TrackState
@@ -87,6 +87,16 @@ def test_gravity_biases_and_velocity_are_found(seed: int) -> None:
     h = 1e-4
     now, later = ((session.pose(6.0 + d) @ LEFT_T_IMU)[:3, 3] for d in (-h, h))
     np.testing.assert_allclose(state.velocity, (later - now) / (2 * h), atol=0.02)
+
+
+def test_roll_and_pitch_against_gravity() -> None:
+    tilted = se3.so3_exp(np.array([np.radians(20), 0, 0])) @ se3.so3_exp(np.array([0, 0, np.radians(10)]))
+    np.testing.assert_allclose(roll_pitch_deg(tilted.T @ [0.0, GRAVITY, 0.0]), (10, 20), atol=1e-9)
+    session = Session()
+    pose = session.pose(6.0)
+    level = follow(session, 6.0).level(pose)
+    assert level is not None and follow(session, 1.0).level(pose) is None
+    np.testing.assert_allclose(level, roll_pitch_deg(pose[:3, :3].T @ [0.0, GRAVITY, 0.0]), atol=0.2)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -129,6 +129,7 @@ class Tracker:
             self._follower.hold(images.left, tracks.keep(solution.inlier), solution.pose)
         again = bool(self._lost)
         inlier = self._accept(image, images, tracks, solution, expected.seconds)
+        stats |= self._level()
         keyframe = None
         if again or self._wants_keyframe():
             with self._spans.span("keyframe"):
@@ -198,6 +199,11 @@ class Tracker:
             self._inertial.accept(image.stamp_ns, solution.pose)
         self._frames_since_kf += 1
         return inlier[kept]
+
+    def _level(self) -> dict[str, float]:
+        """Where gravity is known: roll and pitch."""
+        level = None if self._inertial is None else self._inertial.level(self._pose)
+        return {} if level is None else {"roll_deg": level[0], "pitch_deg": level[1]}
 
     def _go_on(self, image: StereoImage, images: StereoPyramids, pose: F64, tracks: Tracks) -> None:
         self._pose, self._stamp_ns, self._tracks = pose, image.stamp_ns, tracks

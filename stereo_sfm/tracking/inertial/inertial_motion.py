@@ -39,6 +39,15 @@ class InertialMotion:
         """Velocity, gravity and biases at the newest pose of the window; None while they are not known."""
         return self._state
 
+    def level(self, odom_T_cam: F64) -> tuple[float, float] | None:
+        """Roll and pitch in degrees of the camera (4, 4) against measured gravity; None while that is not known.
+
+        Roll is positive to the right, pitch upwards.
+        """
+        if self._state is None:
+            return None
+        return roll_pitch_deg(odom_T_cam[:3, :3].T @ self._state.gravity)
+
     def feed(self, samples: ImuSamples | None) -> None:
         """Samples up to the image that is tracked next."""
         if samples is not None and len(samples):
@@ -149,3 +158,9 @@ class InertialMotion:
             self.left_out = "accelerometer_contradicts_images"
         elif self.left_out and len(self._turn_errors) >= JUDGED:
             self.left_out = ""
+
+
+def roll_pitch_deg(down: F64) -> tuple[float, float]:
+    """Degrees to the right and upwards of a camera (x right, y down, z forward) that sees gravity along `down` (3,)."""
+    x, y, z = (down / np.linalg.norm(down)).tolist()
+    return float(np.degrees(np.arctan2(x, y))), float(np.degrees(np.arcsin(np.clip(-z, -1.0, 1.0))))

@@ -3,8 +3,11 @@
 Stereo knows the size of the motion, so that everything but the rotation is linear: the initialization of Qin and Shen
 (Robust Initialization of Monocular Visual-Inertial Estimation, IROS 2017) without its scale, over a sliding window. The
 rotation of the odometry drifts; what of it tilts gravity, the accelerometer shows, and the gyroscope's bias, which is
-found from those rotations, is corrected by it.
+found from those rotations, is corrected by it. Velocities but the newest are eliminated one after the other: the cost
+is that of one pass over the window.
 """
+
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.geometry.preintegration import GRAVITY, Preintegrated
 from stereo_sfm.types import F64
 
@@ -42,99 +46,127 @@ class InertialWindow:
     """Poses (odom_T_imu) and the preintegrated motions between them, oldest first."""
 
     def __init__(self) -> None:
-        self._poses: list[F64] = []
-        self._motions: list[Preintegrated] = []
+        self._newest: F64 = np.eye(4)
+        self._links: list[F64] = []  # one row (LINK,) a motion: see `_link`
+        self._turns: list[tuple[F64, F64]] = []  # information (3, 3) and right-hand side (3,) of the gyroscope's bias
 
     @property
     def seconds(self) -> float:
         """How much time it covers."""
-        return sum(m.seconds for m in self._motions)
+        return float(sum(link[0] for link in self._links))
 
     def begin(self, odom_T_imu: F64) -> None:
         """A first pose; nothing before it counts."""
-        self._poses, self._motions = [odom_T_imu], []
+        self._newest, self._links, self._turns = odom_T_imu, [], []
 
     def add(self, motion: Preintegrated, odom_T_imu: F64) -> None:
         """The next pose and the motion to it."""
-        self._poses.append(odom_T_imu)
-        self._motions.append(motion)
+        self._links.append(_link(motion, self._newest, odom_T_imu))
+        self._turns.append(_turn(motion, self._newest, odom_T_imu))
+        self._newest = odom_T_imu
         while self.seconds > LONGEST_S:
-            del self._poses[0], self._motions[0]
+            del self._links[0], self._turns[0]
 
     def gyro_bias(self) -> tuple[F64, float]:
         """(3,) rad/s and its standard deviation: what makes the integrated rotations those of the poses."""
-        information, rhs = np.eye(3) / GYRO_BIAS_SIGMA**2, np.zeros(3)
-        for (i, j), m in zip(zip(self._poses, self._poses[1:], strict=False), self._motions, strict=True):
-            seen = m.rotation.T @ i[:3, :3].T @ j[:3, :3]
-            variance = 2 * ROTATION_SIGMA**2 + float(m.covariance[0, 0])
-            jacobian = m.rotation_by_gyro
-            information += jacobian.T @ jacobian / variance
-            rhs += jacobian.T @ (se3.so3_log(seen) + jacobian @ m.gyro_bias) / variance
-        sigma = float(np.sqrt(np.trace(np.linalg.inv(information)) / 3))
-        return np.linalg.solve(information, rhs).astype(np.float64), sigma
+        information = np.eye(3) / GYRO_BIAS_SIGMA**2 + sum(i for i, _ in self._turns)
+        covariance = np.linalg.inv(information).astype(np.float64)
+        rhs = np.zeros(3) + sum(r for _, r in self._turns)
+        return covariance @ rhs, float(np.sqrt(np.trace(covariance) / 3))
 
     def estimate(self) -> InertialState | None:
         """None while the window is too short."""
         if self.seconds < LEAST_S:
             return None
         gyro_bias, gyro_sigma = self.gyro_bias()
-        gravity, n = self._first_gravity(), len(self._poses)
-        g = slice(3 * n, 3 * n + 3)
-        normal, x = np.zeros((0, 0)), np.zeros(0)
-        for _ in range(STEPS):  # the size of gravity is known: linearised along its direction, as is its drift
-            normal, target = self._normal_equations(gyro_bias, gravity)
-            down = gravity / np.linalg.norm(gravity)
-            normal[g, g] += np.outer(down, down) / GRAVITY_SIGMA**2
-            target[g] += down * GRAVITY / GRAVITY_SIGMA**2
-            x = np.linalg.solve(normal, target).astype(np.float64)
-            gravity = x[g]
-        inverse = np.linalg.inv(normal).astype(np.float64)
-        keep = np.r_[3 * n - 3 : 3 * n + 6]
-        gyro_bias = gyro_bias + self._poses[-1][:3, :3].T @ x[-3:]
-        gyro_sigma = float(np.hypot(gyro_sigma, np.sqrt(np.trace(inverse[-3:, -3:]) / 3)))
+        x, covariance = _solve(np.array(self._links), gyro_bias)
+        gyro_bias = gyro_bias + self._newest[:3, :3].T @ x[9:]
+        gyro_sigma = float(np.hypot(gyro_sigma, np.sqrt(np.trace(covariance[9:, 9:]) / 3)))
         return InertialState(
-            velocity=x[3 * n - 3 : 3 * n].copy(),
-            gravity=gravity.copy(),
+            velocity=x[:3].copy(),
+            gravity=x[3:6].copy(),
             gyro_bias=gyro_bias,
-            accel_bias=x[-6:-3].copy(),
-            covariance=inverse[np.ix_(keep, keep)],
+            accel_bias=x[6:9].copy(),
+            covariance=covariance[:9, :9].copy(),
             gyro_bias_sigma=gyro_sigma,
         )
 
-    def _first_gravity(self) -> F64:
-        """Opposite to the mean specific force: right to the mean acceleration."""
-        force = sum(p[:3, :3] @ m.velocity for p, m in zip(self._poses, self._motions, strict=False))
-        return -np.asarray(force) / self.seconds
 
-    def _normal_equations(self, gyro_bias: F64, gravity: F64) -> tuple[F64, F64]:
-        """Of velocities (N, 3), gravity at the newest pose, accelerometer bias, drift of the rotation (rad/s): matrix,
-        right-hand side."""
-        n = len(self._poses)
-        size = 3 * n + 9
-        normal, rhs = np.zeros((size, size)), np.zeros(size)
-        normal[-6:-3, -6:-3] += np.eye(3) / ACCEL_BIAS_SIGMA**2
-        normal[-3:, -3:] += np.eye(3) / DRIFT_SIGMA**2
-        since = -self.seconds  # from the newest pose
-        for k, m in enumerate(self._motions):
-            i, j, t = self._poses[k], self._poses[k + 1], m.seconds
-            i_R_odom = i[:3, :3].T
-            tilt = -se3.skew(gravity) * (since + 0.5 * t)  # of gravity by the drift until the newest pose
-            since += t
-            # velocities i and j, gravity, bias, drift -> position and velocity in the axes of i
-            jacobian = np.zeros((6, 15))
-            jacobian[:3, :3], jacobian[:3, 6:9] = i_R_odom * t, 0.5 * i_R_odom * t * t
-            jacobian[:3, 9:12], jacobian[:3, 12:] = m.position_by_accel, 0.5 * i_R_odom @ tilt * t * t
-            jacobian[3:, :3], jacobian[3:, 3:6], jacobian[3:, 6:9] = -i_R_odom, i_R_odom, -i_R_odom * t
-            jacobian[3:, 9:12], jacobian[3:, 12:] = -m.velocity_by_accel, -i_R_odom @ tilt * t
-            zero = np.zeros(3)
-            moved = i_R_odom @ (j[:3, 3] - i[:3, 3]) - m.position_with(gyro_bias, zero)
-            known = np.concatenate([moved, m.velocity_with(gyro_bias, zero)])
-            covariance = m.covariance[3:, 3:][np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])].copy()
-            covariance[:3, :3] += 2 * POSITION_SIGMA_M**2 * np.eye(3)
-            # A pose that is turned by an error turns the force with it.
-            covariance[3:, 3:] += (ROTATION_SIGMA * GRAVITY * t) ** 2 * np.eye(3)
-            weight = np.linalg.inv(covariance)
-            at = np.r_[3 * k : 3 * k + 6, 3 * n : 3 * n + 9]
-            normal[np.ix_(at, at)] += jacobian.T @ weight @ jacobian
-            rhs[at] += jacobian.T @ weight @ known
-        return normal, rhs
+def _turn(m: Preintegrated, i: F64, j: F64) -> tuple[F64, F64]:
+    """What two poses (4, 4) say of the gyroscope's bias: information (3, 3) and right-hand side (3,)."""
+    seen = se3.so3_log(m.rotation.T @ i[:3, :3].T @ j[:3, :3])
+    jacobian = m.rotation_by_gyro
+    weighted = jacobian.T / (2 * ROTATION_SIGMA**2 + float(m.covariance[0, 0]))
+    return weighted @ jacobian, weighted @ (seen + jacobian @ m.gyro_bias)
+
+
+def _link(m: Preintegrated, i: F64, j: F64) -> F64:
+    """A motion between two poses (4, 4) as one row: seconds, i_R_odom, position and velocity (6,) without biases, their
+    derivatives by the gyroscope's (6, 3) and the accelerometer's (6, 3) bias, weight (6, 6)."""
+    i_R_odom, t, zero = i[:3, :3].T, m.seconds, np.zeros(3)
+    covariance = m.covariance[3:, 3:][np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])].copy()
+    covariance[:3, :3] += 2 * POSITION_SIGMA_M**2 * np.eye(3)
+    # A pose that is turned by an error turns the force with it.
+    covariance[3:, 3:] += (ROTATION_SIGMA * GRAVITY * t) ** 2 * np.eye(3)
+    moved = i_R_odom @ (j[:3, 3] - i[:3, 3]) - m.position_with(zero, zero)
+    by_gyro = np.vstack([-m.position_by_gyro, m.velocity_by_gyro])
+    by_accel = np.vstack([m.position_by_accel, -m.velocity_by_accel])
+    parts = (i_R_odom, moved, m.velocity_with(zero, zero), by_gyro, by_accel, np.linalg.inv(covariance))
+    return np.concatenate([[t], *(part.ravel() for part in parts)])
+
+
+@njit
+def _solve(links, gyro_bias):
+    """Newest velocity, gravity there, accelerometer bias, drift of the rotation (rad/s): (12,) and covariance."""
+    total, gravity = 0.0, np.zeros(3)
+    for k in range(len(links)):  # opposite to the mean specific force: right to the mean acceleration
+        total += links[k, 0]
+        gravity -= np.ascontiguousarray(links[k, 1:10]).reshape(3, 3).T @ links[k, 13:16]
+    gravity /= total
+    x, normal = np.zeros(12), np.zeros((12, 12))
+    for _ in range(STEPS):  # the size of gravity is known: linearised along its direction, as is its drift
+        normal, target = _normal_equations(links, gyro_bias, gravity, total)
+        down = gravity / np.sqrt((gravity * gravity).sum())
+        for a in range(3):
+            target[3 + a] += down[a] * GRAVITY / GRAVITY_SIGMA**2
+            for b in range(3):
+                normal[3 + a, 3 + b] += down[a] * down[b] / GRAVITY_SIGMA**2
+        x = np.linalg.solve(normal, target)
+        gravity = x[3:6].copy()
+    return x, np.linalg.inv(normal)
+
+
+@njit
+def _normal_equations(links, gyro_bias, gravity, total):
+    """(12, 12) and (12,): each motion ties velocities i and j, gravity, bias and drift (15); i is then eliminated."""
+    normal, rhs = np.zeros((12, 12)), np.zeros(12)
+    for a in range(3):
+        normal[6 + a, 6 + a] = 1.0 / ACCEL_BIAS_SIGMA**2
+        normal[9 + a, 9 + a] = 1.0 / DRIFT_SIGMA**2
+    skew = np.array([[0.0, -gravity[2], gravity[1]], [gravity[2], 0.0, -gravity[0]], [-gravity[1], gravity[0], 0.0]])
+    since = -total  # from the newest pose
+    jacobian, joint, joint_rhs = np.zeros((6, 15)), np.zeros((15, 15)), np.zeros(15)
+    for k in range(len(links)):
+        link, t = links[k], links[k, 0]
+        i_R_odom = link[1:10].copy().reshape(3, 3)
+        known = link[10:16] + link[16:34].copy().reshape(6, 3) @ gyro_bias
+        weight = link[52:88].copy().reshape(6, 6)
+        tilted = -i_R_odom @ skew * (since + 0.5 * t)  # of gravity by the drift until the newest pose
+        since += t
+        jacobian[:3, :3], jacobian[3:, :3], jacobian[3:, 3:6] = i_R_odom * t, -i_R_odom, i_R_odom
+        jacobian[:3, 6:9], jacobian[3:, 6:9] = 0.5 * t * t * i_R_odom, -t * i_R_odom
+        jacobian[:, 9:12] = link[34:52].copy().reshape(6, 3)
+        jacobian[:3, 12:], jacobian[3:, 12:] = 0.5 * t * t * tilted, -t * tilted
+        weighted = jacobian.T @ weight
+        joint[:] = weighted @ jacobian
+        joint_rhs[:] = weighted @ known
+        joint[:3, :3] += normal[:3, :3]
+        joint[:3, 6:] += normal[:3, 3:]
+        joint[6:, :3] += normal[3:, :3]
+        joint[6:, 6:] += normal[3:, 3:]
+        joint_rhs[:3] += rhs[:3]
+        joint_rhs[6:] += rhs[3:]
+        out = joint[3:, :3].copy() @ np.linalg.inv(joint[:3, :3].copy())
+        normal[:] = joint[3:, 3:] - out @ joint[:3, 3:].copy()
+        rhs[:] = joint_rhs[3:] - out @ joint_rhs[:3]
+    return normal, rhs
