@@ -61,12 +61,22 @@ def open_images(path: str, options: ImagesOptions) -> FolderSource:
         if left in stamps
     ]
     truth = next((folder / n for n in TRUTH_NAMES if (folder / n).is_file()), None)
-    return FolderSource(
+    source = FolderSource(
         name,
         chosen_rig(options.rig, lambda: _own_rig(folder)),
         shots,
         read_trajectory(truth) if truth is not None else None,
     )
+    if options.fps is None and not _stamped(folder, found[0]):
+        log.info(
+            "%s: neither names nor times.txt tell the stamps: %g images a second assumed (?fps=N)", name, ASSUMED_FPS
+        )
+    return source
+
+
+def _stamped(folder: Path, files: list[Path]) -> bool:
+    """Whether something tells when the images were taken."""
+    return (folder / "times.txt").is_file() or None not in [stamp_of(file) for file in files]
 
 
 def find_pair(folder: Path) -> tuple[list[Path], list[Path]] | None:
@@ -112,10 +122,7 @@ def _stamps(name: str, folder: Path, files: list[Path], fps: float | None) -> di
     named = {p: stamp_of(p) for p in files}
     if None not in named.values():
         return {p: s or 0 for p, s in named.items()}
-    if fps is None:
-        fps = ASSUMED_FPS
-        log.warning("%s: neither names nor times.txt tell the stamps: %g images a second assumed (?fps=N)", name, fps)
-    period = 1e9 / fps
+    period = 1e9 / (fps or ASSUMED_FPS)
     return {p: round(i * period) for p, i in zip(files, frame_numbers(files), strict=True)}
 
 

@@ -74,8 +74,11 @@ def keyframes(rig: Rig) -> list[Keyframe]:
 
 def warm_up_stage(stage: str, config: Config, rig: Rig) -> None:
     """Load (the first time ever: compile) what `stage` calls, on a scratch instance of it."""
+    from stereo_sfm.calib.choice import TERMS
     from stereo_sfm.loop.database import PlaceDatabase
     from stereo_sfm.mapping.mapper import Mapper
+    from stereo_sfm.mapping.rig_window import solve_window
+    from stereo_sfm.mapping.self_calibration import SelfCalibration
 
     if stage == "tracker":
         tracker = make_tracker(config, rig)
@@ -86,6 +89,8 @@ def warm_up_stage(stage: str, config: Config, rig: Rig) -> None:
         for keyframe in keyframes(rig):
             mapper.step(keyframe)
         mapper.finish([])
+        if SelfCalibration.wanted(config, rig) is not None:
+            solve_window(rig, keyframes(rig)[:: FRAMES // 4], np.zeros(TERMS))
     elif stage == "loop":
         eager = dataclasses.replace(config.loop, min_gap=1, min_score=0.0, pause=0)
         closer = make_closer(dataclasses.replace(config, loop=eager), rig)

@@ -24,7 +24,7 @@ def test_a_term_needs_several_sigmas_and_both_halves() -> None:
     halves = said(8, 3, 8, 0, 0, -9), said(12, 3, -1, 0, 0, -6)
     choice = choose(said(10, 3, 9, 0, 0, -7), halves)
     assert choice.written.tolist() == [True, False, False, False, False, True]
-    assert "10 sigmas" in choice.terms[0].why and "4 are needed" in choice.terms[1].why
+    assert "10 sigmas" in choice.terms[0].why and "at least 4 required" in choice.terms[1].why
     assert "but the halves" in choice.terms[2].why
     assert choice.value[1] == choice.value[2] == 0.0
 

@@ -369,7 +369,7 @@ def test_a_map_is_not_written_over_something_else(cli: Run, tmp_path: Path, comm
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "rig.yaml").write_text("years of work")
     assert_one_line(cli("map", *command, "-o", "run", "--overwrite"), "run exists and is not a map")
-    assert_one_line(cli("map", *command, "-o", "run/rig.yaml"), "exists and is no map")
+    assert_one_line(cli("map", *command, "-o", "run/rig.yaml"), "exists and is not a map")
     assert (tmp_path / "run" / "rig.yaml").read_text() == "years of work"
 
 

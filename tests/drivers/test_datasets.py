@@ -456,7 +456,7 @@ def test_an_assumed_frame_rate_is_reported(tmp_path: Path, caplog: pytest.LogCap
         for k, path in enumerate(sorted((tmp_path / side).iterdir())):
             path.rename(path.with_name(f"frame_{k:03d}{path.suffix}"))
     (tmp_path / "times.txt").unlink(missing_ok=True)
-    with caplog.at_level(logging.WARNING, "stereo_sfm"):
+    with caplog.at_level(logging.INFO, "stereo_sfm"):
         open_source(f"images:{tmp_path}")
         assert "30 images a second assumed (?fps=N)" in caplog.text
         caplog.clear()
