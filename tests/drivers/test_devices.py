@@ -106,7 +106,7 @@ def test_reset_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFi
     monkeypatch.setattr("stereo_sfm.drivers.t265.usb_device.default_backend", lambda: SimulatedBus([one]))
     assert cli.main(["t265", "reset"]) == 0
     assert not one.booted
-    assert "boot state" in capsys.readouterr().out
+    assert "the next run or recording boots it" in capsys.readouterr().out
 
 
 def test_udev_rules_cover_all_ids(capsys: pytest.CaptureFixture[str]) -> None:
