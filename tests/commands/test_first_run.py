@@ -26,6 +26,7 @@ class Bar(NoProgress):
         self.said.append(state)
 
 
+@pytest.mark.slow
 def test_the_bar_names_each_kernel(capsys: pytest.CaptureFixture[str]) -> None:
     shown, bar = CompilationProgress(), Bar()
     shown.bar = bar

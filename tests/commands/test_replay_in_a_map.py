@@ -35,7 +35,7 @@ def test_the_log_names_the_map(tmp_path: Path, localize_only: bool) -> None:
     with pytest.raises(StereoSfmError, match="has changed since"):
         map_folders(opening)
     (store / "map.json").unlink()
-    with pytest.raises(StereoSfmError, match="gone"):
+    with pytest.raises(StereoSfmError, match="missing or has changed"):
         map_folders(opening)
 
 
