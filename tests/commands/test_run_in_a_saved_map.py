@@ -67,7 +67,8 @@ def test_the_map_holds_what_it_is_recognised_by(store: Path, capsys: pytest.Capt
     saved = load_map(store)
     assert len(np.unique(saved.snapshot.corner_kf)) == len(saved) >= 10
     assert main(["map", "info", str(store)]) == 0
-    assert f"{len(saved.snapshot.corner_kf)} corners for place recognition in {len(saved)} keyframes" in capsys.readouterr().out
+    count = len(saved.snapshot.corner_kf)
+    assert f"{count} corners for place recognition in {len(saved)} keyframes" in capsys.readouterr().out
 
 
 def test_another_walk_is_placed_in_the_map(tmp_path: Path, store: Path) -> None:
