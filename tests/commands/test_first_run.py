@@ -20,21 +20,20 @@ from tests.pipeline.test_pipeline import CONFIG, MadeSource, SlidingWall
 
 class Bar(NoProgress):
     def __init__(self) -> None:
-        self.said: list[str] = []
+        self.shown: list[str] = []
 
-    def say(self, state: str) -> None:
-        self.said.append(state)
+    def show(self, state: str) -> None:
+        self.shown.append(state)
 
 
-@pytest.mark.slow
 def test_the_bar_names_each_kernel(capsys: pytest.CaptureFixture[str]) -> None:
     shown, bar = CompilationProgress(), Bar()
     shown.bar = bar
     shown.put(Compiling("tracker", "match_rows"))
     shown.put("anything else")
     shown.put(Compiling("mapper", "reduce"))
-    assert len(bar.said) == 2
-    assert bar.said[1] == "first run here: compiling reduce (mapper), kernel 2"
+    assert len(bar.shown) == 2
+    assert bar.shown[1] == "first run here: compiling reduce (mapper), kernel 2"
     shown.bar = LinesOnly()  # no terminal: one line, not a hundred
     fresh = CompilationProgress()
     fresh.bar = LinesOnly()

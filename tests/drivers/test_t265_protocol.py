@@ -50,10 +50,10 @@ def test_response_header_is_checked() -> None:
     assert status == 0
     assert p.decode_time(payload) == 123456789
     for bad, why in (
-        (good[:-1], "16"),
+        (good[:-1], "states a length of 16"),
         (good[:5], "less than a header"),
         (struct.pack("<IHHQ", 16, Id.START, 0, 1), "answered message"),
-        (struct.pack("<IHHQ", 17, Id.GET_TIME, 0, 1), "17"),
+        (struct.pack("<IHHQ", 17, Id.GET_TIME, 0, 1), "states a length of 17"),
     ):
         with pytest.raises(p.ProtocolError, match=why):
             p.response_payload(bad, Id.GET_TIME)
