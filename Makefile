@@ -4,7 +4,7 @@ PY ?= .venv/bin/python
 check:  ## lint, format, types
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
-	$(PY) -m pyright
+	$(PY) -m pyright --pythonpath $(PY)
 
 test:  ## the fast tests
 	$(PY) -m pytest
