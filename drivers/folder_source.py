@@ -14,14 +14,14 @@ import numpy as np
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.drivers.source import BaseSource, Stamps
+from stereo_sfm.drivers.used_bits import used_bits
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.pixels import decode, decode_gray, eight_bits, sensor_bits
+from stereo_sfm.pixels import decode, decode_gray, eight_bits
 from stereo_sfm.types import F32, U8, U16, ImuSamples, StereoImage, Trajectory
 
 log = logging.getLogger("stereo_sfm")
 
 SHOWN_WARNINGS = 5  # of unreadable images, one by one; then only their count
-SAMPLED = 8  # frames sampled for the number of used bits of sixteen
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class FolderSource(BaseSource):
         self.depth_scale = depth_scale
         self._imu = imu
         self.frame_count = len(self.shots)
-        self.bits = self._sensor_bits()
+        self.bits = used_bits(name, self._sample)
         self._check_first()
 
     def __iter__(self) -> Iterator[StereoImage]:
@@ -159,17 +159,8 @@ class FolderSource(BaseSource):
         beside = {} if self._imu is None else {"imu0": self._imu.stamp_ns}
         return Stamps(np.array([s.stamp_ns for s in self.shots], np.int64), skew_ms, beside)
 
-    def _sensor_bits(self) -> int:
-        """The used bits of sixteen-bit images, determined once, so that brightness does not jump between frames."""
-        if not any(image.dtype == np.uint16 for image in self._sample(1)):
-            return 16
-        bits = sensor_bits(image for image in self._sample(SAMPLED) if image.dtype == np.uint16)
-        if bits < 16:
-            log.warning("%s: its sixteen-bit images use %d bits, these are scaled to eight", self.name, bits)
-        return bits
-
     def _sample(self, count: int) -> Iterator[Any]:
-        """The readable images of `SAMPLED` evenly spaced frames."""
+        """The readable images of so many evenly spaced frames."""
         for i in sorted({k * (len(self.shots) - 1) // max(count - 1, 1) for k in range(count)}):
             for path in (self.shots[i].left, self.shots[i].right):
                 with suppress(UnreadableImage):

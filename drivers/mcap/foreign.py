@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.drivers.folder_source import SAMPLED
 from stereo_sfm.drivers.mcap.messages import (
     BAD_MESSAGE,
     CAMERAS,
@@ -31,9 +30,10 @@ from stereo_sfm.drivers.mcap.topics import camera_topic, choose_topics, is_recti
 from stereo_sfm.drivers.rig_option import RigOption, chosen_rig
 from stereo_sfm.drivers.source import BaseSource, Stamps
 from stereo_sfm.drivers.tum_rgbd.source import with_virtual_eye
+from stereo_sfm.drivers.used_bits import used_bits
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log.reader import LogReader, Record
-from stereo_sfm.pixels import eight_bits, sensor_bits
+from stereo_sfm.pixels import eight_bits
 from stereo_sfm.types import ImuSamples, StereoImage, Trajectory
 
 log = logging.getLogger("stereo_sfm")
@@ -74,7 +74,7 @@ class ForeignMcapSource(BaseSource):
         counts = {t.topic: t.count for t in reader.topics}
         self.frame_count = min(counts[t] for t in (self.topics.left, self._other()) if t)
         self._tolerance_ns = self._period_ns() * 2 // 5
-        self._bits = self._sensor_bits()
+        self._bits = used_bits(self.name, self._sample)
         self._check_first()
         back_ns = reader.step_back_ns(self.topics.left)
         if back_ns > _STEP_BACK_NS:
@@ -233,15 +233,6 @@ class ForeignMcapSource(BaseSource):
     def _period_ns(self) -> int:
         stamps = [r.log_time for r in itertools.islice(self.reader.messages([self.topics.left]), 20)]
         return int(np.median(np.diff(stamps))) if len(stamps) > 1 else 100_000_000
-
-    def _sensor_bits(self) -> int:
-        """The used bits of sixteen-bit images, determined once, so that brightness does not jump between frames."""
-        if not any(image.dtype == np.uint16 for image in self._sample(1)):
-            return 16
-        bits = sensor_bits(image for image in self._sample(SAMPLED) if image.dtype == np.uint16)
-        if bits < 16:
-            log.warning("%s: its sixteen-bit images use %d bits, these are scaled to eight", self.name, bits)
-        return bits
 
     def _sample(self, count: int) -> Iterator[Any]:
         """Readable images of both cameras at evenly spaced times."""

@@ -7,7 +7,7 @@ import numpy as np
 from stereo_sfm.calib.imu import Imu
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.preintegration import GRAVITY, Preintegrated, preintegrate
-from stereo_sfm.tracking.inertial.sample_buffer import SampleBuffer
+from stereo_sfm.tracking.inertial.sample_buffer import Intervals, SampleBuffer
 from stereo_sfm.tracking.inertial.window import InertialState, InertialWindow
 from stereo_sfm.types import F64, ImuSamples
 
@@ -31,6 +31,7 @@ class InertialMotion:
         self._odom_T_last: F64 = np.eye(4)
         self._gyro_bias: F64 = np.zeros(3)
         self._begun = False
+        self._integrated: dict[tuple[int, int], Preintegrated | None] = {}  # by interval, since the last samples
         self._turn_errors: list[float] = []  # squared, rad/s
         self.left_out = ""  # why the sensor is not believed
 
@@ -50,6 +51,7 @@ class InertialMotion:
 
     def feed(self, samples: ImuSamples | None) -> None:
         """Samples up to the image that is tracked next."""
+        self._integrated.clear()
         if samples is not None and len(samples):
             self._buffer.add(samples)
 
@@ -99,6 +101,7 @@ class InertialMotion:
         self._buffer.forget(stamp_ns)
         self._state = None if self.left_out else self._window.estimate()
         self._gyro_bias = self._window.gyro_bias()[0] if self._state is None else self._state.gyro_bias
+        self._integrated.clear()
 
     def bridges(self, stamp_ns: int) -> bool:
         """Whether the motion since the last pose is known well enough to go on by it."""
@@ -125,9 +128,13 @@ class InertialMotion:
         return out
 
     def _motion(self, begin_ns: int, end_ns: int) -> Preintegrated | None:
-        intervals = self._buffer.between(begin_ns, end_ns)
-        if intervals is None:
-            return None
+        """From one time to another with the biases of today; each is asked for several times a frame."""
+        if (begin_ns, end_ns) not in self._integrated:
+            intervals = self._buffer.between(begin_ns, end_ns)
+            self._integrated[begin_ns, end_ns] = None if intervals is None else self._preintegrate(intervals)
+        return self._integrated[begin_ns, end_ns]
+
+    def _preintegrate(self, intervals: Intervals) -> Preintegrated:
         return preintegrate(
             intervals.seconds, intervals.gyro, intervals.accel, self._gyro_bias, np.zeros(3), self._imu.gyro_noise,
             self._imu.accel_noise,
