@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.settings import check, check_names, explained, number, path, switch, word
+from stereo_sfm.settings import explained, merge, number, path, read, switch, word
 
 MAX_LINE, MAX_TEXT = 4096, 1 << 20  # characters of a configuration file
 MAX_CORES = 1024  # of a machine
@@ -295,14 +295,6 @@ class Config:
         return self.loop.enabled and self.mapper.enabled and depth and not localize_only
 
 
-def _merge(base: dict[str, Any], extra: dict[str, Any]) -> dict[str, Any]:
-    out = dict(base)
-    for key, value in extra.items():
-        old = out.get(key)
-        out[key] = _merge(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
-    return out
-
-
 def renamed(data: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """Nested values under current names, and the old names that were found."""
     out, met = dict(data), list[str]()
@@ -332,17 +324,8 @@ def from_dict(data: dict[str, Any]) -> Config:
     Raises:
         StereoSfmError: an unknown key, a value of the wrong type, or one that its setting does not take.
     """
-    import dacite
-
     data, _ = renamed(data)
-    check_names(Config(), data)
-    merged = _merge(dataclasses.asdict(Config()), data)
-    rules = dacite.Config(strict=True, type_hooks={float: _as_float}, cast=[tuple])
-    try:
-        config = dacite.from_dict(Config, merged, rules)
-    except dacite.DaciteError as error:
-        raise StereoSfmError(f"configuration: {error} (see 'stereo-sfm config dump' for every key)") from None
-    check(config)
+    config = read(Config(), data, "stereo-sfm config dump")
     _check_cores(config.pipeline.cpus)
     return config
 
@@ -356,17 +339,13 @@ def _check_cores(cpus: dict[str, tuple[int, ...]]) -> None:
         raise StereoSfmError(f"configuration: pipeline.cpus names core {wrong[0]}: cores are 0 to {MAX_CORES - 1}")
 
 
-def _as_float(value: Any) -> Any:
-    return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
-
-
 def load(path: Path | str | None = None, overrides: Iterable[str] = (), base: dict[str, Any] | None = None) -> Config:
     """Defaults, `base`, a TOML file, then `key.subkey=value` overrides, values read as TOML (else as text)."""
     data: dict[str, Any] = _with_current_names(base or {})
     if path is not None:
-        data = _merge(data, _with_current_names(_read(Path(path).expanduser())))
+        data = merge(data, _with_current_names(read_toml(Path(path).expanduser())))
     for override in overrides:
-        data = _merge(data, _with_current_names(_parsed(override)))
+        data = merge(data, _with_current_names(parse_override(override)))
     return from_dict(data)
 
 
@@ -384,7 +363,12 @@ def parse_toml(text: str) -> dict[str, Any]:
         raise ValueError("it is nested too deeply") from None
 
 
-def _read(path: Path) -> dict[str, Any]:
+def read_toml(path: Path) -> dict[str, Any]:
+    """The nested values of a configuration file.
+
+    Raises:
+        StereoSfmError: it cannot be read, or is not TOML.
+    """
     try:
         return parse_toml(path.read_text("utf-8-sig"))
     except FileNotFoundError:
@@ -397,7 +381,7 @@ def _read(path: Path) -> dict[str, Any]:
         raise StereoSfmError(f"configuration {path}: {error}") from None
 
 
-def _parsed(override: str) -> dict[str, Any]:
+def parse_override(override: str) -> dict[str, Any]:
     """`key.subkey=value` as nested values."""
     key, equals, value = override.partition("=")
     if not equals:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Iterator
 from dataclasses import field
+from operator import attrgetter
 from typing import Any, TypeVar
 
 from stereo_sfm.errors import StereoSfmError, did_you_mean
@@ -31,9 +32,14 @@ def switch(default: bool, text: str) -> Any:
     return field(default=default, metadata={"text": text})
 
 
-def path(text: str) -> Any:
-    """The path of a file, empty by default."""
-    return field(default="", metadata={"text": text})
+def path(text: str, default: str = "") -> Any:
+    """The path of a file or folder."""
+    return field(default=default, metadata={"text": text})
+
+
+def line(default: str, text: str) -> Any:
+    """Any text of one line."""
+    return field(default=default, metadata={"text": text})
 
 
 def walk(section: Any, place: str = "") -> Iterator[tuple[str, dataclasses.Field[Any], Any]]:
@@ -68,7 +74,41 @@ def plain(value: float) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def check_names(tree: Any, data: dict[str, Any], place: str = "") -> None:
+def merge(base: dict[str, Any], extra: dict[str, Any]) -> dict[str, Any]:
+    """Nested values with those of `extra` in place of their own."""
+    out = dict(base)
+    for key, value in extra.items():
+        old = out.get(key)
+        out[key] = merge(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
+    return out
+
+
+def read(tree: T, data: dict[str, Any], see: str) -> T:
+    """A tree of settings with some of its values replaced.
+
+    Args:
+        tree: the defaults. data: nested plain values, as of a TOML file. see: the command that shows every key.
+
+    Raises:
+        StereoSfmError: an unknown key, a value of the wrong type, or one that its setting does not take.
+    """
+    import dacite
+
+    check_names(tree, data, see)
+    rules = dacite.Config(strict=True, type_hooks={float: _as_float}, cast=[tuple])
+    try:
+        done = dacite.from_dict(type(tree), merge(dataclasses.asdict(tree), data), rules)  # pyright: ignore[reportArgumentType]
+    except dacite.DaciteError as error:
+        raise StereoSfmError(f"configuration: {error} (see '{see}' for every key)") from None
+    check(done)
+    return done
+
+
+def _as_float(value: Any) -> Any:
+    return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+def check_names(tree: Any, data: dict[str, Any], see: str, place: str = "") -> None:
     """Check that every key of nested values is a setting.
 
     Raises:
@@ -78,14 +118,13 @@ def check_names(tree: Any, data: dict[str, Any], place: str = "") -> None:
     for key, value in data.items():
         if key not in own:
             raise StereoSfmError(
-                f"configuration: there is no {place}{key}{did_you_mean(key, own)} "
-                "('stereo-sfm config dump' shows every key)"
+                f"configuration: there is no {place}{key}{did_you_mean(key, own)} ('{see}' shows every key)"
             )
         if dataclasses.is_dataclass(own[key]):
             if not isinstance(value, dict):
                 first = dataclasses.fields(own[key])[0].name
                 raise StereoSfmError(f"configuration: {key} is a section of settings, as {key}.{first}")
-            check_names(own[key], value, f"{place}{key}.")  # pyright: ignore[reportUnknownArgumentType]
+            check_names(own[key], value, see, f"{place}{key}.")  # pyright: ignore[reportUnknownArgumentType]
 
 
 def explained(tree: Any) -> str:
@@ -97,7 +136,8 @@ def explained(tree: Any) -> str:
     for name, f, value in walk(tree):
         head, _, key = name.rpartition(".")
         if head != section:
-            lines.append(f"[{head}]\n# {(type(getattr(tree, head)).__doc__ or head).splitlines()[0]}\n")
+            about = type(attrgetter(head)(tree)).__doc__ or head
+            lines.append(f"[{head}]\n# {about.splitlines()[0]}\n")
             section = head
         text = f"[{name}]\n{tomli_w.dumps(value)}" if isinstance(value, dict) else tomli_w.dumps({key: value})
         lines.append(f"# {f.metadata['text']}{_takes(f)}.\n{text}")

@@ -40,6 +40,7 @@ ROOMS: tuple[str, ...] = (
     "stereo_sfm.eval",
     "stereo_sfm.system",
     "stereo_sfm.demo",
+    "stereo_sfm.service",
     "stereo_sfm.commands",
     "stereo_sfm.cli",
 )

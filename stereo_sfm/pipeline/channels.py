@@ -6,6 +6,7 @@ import contextlib
 import queue
 import threading
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any, Generic, TypeVar
@@ -82,8 +83,14 @@ class Outbox:
 class DroppingOutbox:
     """As `Outbox`, but `send` never blocks: when too many wait, the oldest is dropped (a slow or closed viewer)."""
 
-    def __init__(self, connection: Connection, limit: int = 256) -> None:
-        self._connection = connection
+    def __init__(
+        self,
+        connection: Connection,
+        limit: int = 256,
+        write: Callable[[Connection, Any], None] = Connection.send,
+    ) -> None:
+        """Args: limit, most messages that wait; write, puts one into the pipe (`Connection.send_bytes` for bytes)."""
+        self._connection, self._write = connection, write
         self._waiting: deque[object] = deque(maxlen=limit)
         self._more = threading.Semaphore(0)
         self._closing = False
@@ -105,7 +112,7 @@ class DroppingOutbox:
             while True:
                 self._more.acquire()
                 if self._waiting:
-                    self._connection.send(self._waiting.popleft())
+                    self._write(self._connection, self._waiting.popleft())
                 elif self._closing:
                     break
         self._connection.close()

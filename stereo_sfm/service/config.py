@@ -1,0 +1,164 @@
+"""`robot.toml`: what the service runs, keeps and offers."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stereo_sfm.config import load as load_config
+from stereo_sfm.config import parse_override, read_toml
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.presets import PRESETS, preset
+from stereo_sfm.service.outputs.settings import OutputsConfig, PageConfig, SecurityConfig
+from stereo_sfm.settings import explained, line, merge, number, path, read, switch, word
+
+if TYPE_CHECKING:
+    from stereo_sfm.config import Config
+    from stereo_sfm.drivers.choice import SourceChoice
+
+SEE = "stereo-sfm serve --print-config"
+MAP_MODES = ("extend", "localize", "new", "none")
+RECORDING_MODES = ("off", "full", "lean", "black_box")
+
+
+@dataclass(frozen=True)
+class SourceConfig:
+    """Where the images come from."""
+
+    spec: str = line("", "A camera, recording or simulator, as `stereo-sfm run` takes it")
+    rig: str = path("Calibration file to use instead of the source's own")
+    rectify: str = word("none", ("none", "pinhole", "wide"), "Rectify the images first")
+    speed: float = number(1.0, 0.01, 1000, "Speed at which a recording is played")
+    repeat: bool = switch(False, "Play a recording again and again")
+
+
+@dataclass(frozen=True)
+class TrackingConfig:
+    """What decides poses and map."""
+
+    config: str = path("Configuration file of `stereo-sfm run -c`")
+    preset: str = word("default", tuple(PRESETS), "Preset that the configuration file refines")
+
+
+@dataclass(frozen=True)
+class MapConfig:
+    """The saved map."""
+
+    folder: str = path("Folder of the saved map", "store")
+    mode: str = word(
+        "extend",
+        MAP_MODES,
+        "Continue the saved map or begin it, localize in it without changing it, begin a new one, or keep none",
+    )
+    save_every_min: float = number(5.0, 0.05, 1440, "Minutes between two saves while running")
+
+
+@dataclass(frozen=True)
+class RecordingConfig:
+    """What is recorded, and how much of it is kept."""
+
+    folder: str = path("Folder of the recordings", "recordings")
+    mode: str = word(
+        "off", RECORDING_MODES, "Nothing, everything, everything but images, or images of the last minutes only"
+    )
+    image_format: str = word("png", ("png", "raw", "jpeg"), "Format of the images; JPEG is lossy")
+    segment_min: float = number(1.0, 0.02, 1440, "Minutes after which a new segment begins")
+    segment_mb: float = number(2000.0, 1, 1e6, "Megabytes after which a new segment begins")
+    quota_gb: float = number(20.0, 0.01, 1e6, "Gigabytes of all recordings; the oldest unmarked are deleted")
+    quota_percent: float = number(80.0, 1, 100, "The same in percent of the disk")
+    min_free_gb: float = number(1.0, 0, 1e6, "Gigabytes that stay free: below that no images are recorded")
+    black_box_min: float = number(10.0, 0.05, 1e5, "Minutes of images that a black box keeps")
+    mark_before_s: float = number(30.0, 0, 86400, "Seconds before a mark that are kept")
+    mark_after_s: float = number(30.0, 0, 86400, "Seconds after a mark that are kept")
+    mark_losses: bool = switch(True, "Mark the places where tracking was lost")
+
+
+@dataclass(frozen=True)
+class WatchdogConfig:
+    """When a stage counts as hung."""
+
+    silent_s: float = number(1.0, 0.5, 60, "Seconds without a sign of life")
+    busy_s: float = number(10.0, 2, 600, "Seconds for one image or one keyframe")
+
+
+@dataclass(frozen=True)
+class RobotConfig:
+    """The whole service."""
+
+    source: SourceConfig = field(default_factory=SourceConfig)
+    tracking: TrackingConfig = field(default_factory=TrackingConfig)
+    map: MapConfig = field(default_factory=MapConfig)
+    recording: RecordingConfig = field(default_factory=RecordingConfig)
+    outputs: OutputsConfig = field(default_factory=OutputsConfig)
+    page: PageConfig = field(default_factory=PageConfig)
+    security: SecurityConfig = field(default_factory=SecurityConfig)
+    watchdog: WatchdogConfig = field(default_factory=WatchdogConfig)
+
+    def section(self, output: str) -> Any:
+        """The section of an output."""
+        return self.page if output == "page" else getattr(self.outputs, output)
+
+    def pipeline(self) -> Config:
+        """The configuration of the stages.
+
+        Raises:
+            StereoSfmError: its file is invalid.
+        """
+        return load_config(self.tracking.config or None, (), preset(self.tracking.preset))
+
+    def opener(self) -> SourceChoice:
+        """The source, not yet opened.
+
+        Raises:
+            StereoSfmError: none is named, or it is invalid.
+        """
+        from stereo_sfm.drivers.choice import SourceChoice
+        from stereo_sfm.drivers.source import is_device
+
+        s = self.source
+        if not s.spec:
+            raise StereoSfmError('robot.toml names no source: add [source] spec = "t265:" or another')
+        speed = None if is_device(s.spec) else s.speed
+        return SourceChoice.of(s.spec, s.rig or None, rectify=s.rectify, speed=speed)
+
+
+def load(file: Path | str | None = None, overrides: Iterable[str] = ()) -> RobotConfig:
+    """Defaults, a TOML file, then `section.key=value` overrides. Paths are relative to the file's folder.
+
+    Raises:
+        StereoSfmError: the file cannot be read, has an unknown key, or a value that its setting does not take.
+    """
+    data: dict[str, Any] = {}
+    if file is not None:
+        data = read_toml(Path(file).expanduser())
+    for override in overrides:
+        data = merge(data, parse_override(override))
+    config = read(RobotConfig(), data, SEE)
+    return config if file is None else _absolute(config, Path(file).expanduser().resolve().parent)
+
+
+def explain(config: RobotConfig) -> str:
+    """The configuration as TOML, with the description of every setting as a comment above it."""
+    return explained(config)
+
+
+def _absolute(config: RobotConfig, folder: Path) -> RobotConfig:
+    """With the paths of its sections absolute."""
+
+    def placed(text: str) -> str:
+        return str(folder / Path(text).expanduser()) if text else text
+
+    return dataclasses.replace(
+        config,
+        source=dataclasses.replace(config.source, rig=placed(config.source.rig)),
+        tracking=dataclasses.replace(config.tracking, config=placed(config.tracking.config)),
+        map=dataclasses.replace(config.map, folder=placed(config.map.folder)),
+        recording=dataclasses.replace(config.recording, folder=placed(config.recording.folder)),
+        security=dataclasses.replace(
+            config.security,
+            **{name: placed(getattr(config.security, name)) for name in ("token_file", "tls_cert", "tls_key")},
+        ),
+    )

@@ -1,0 +1,6 @@
+"""The outputs of the service, one module each: whatever has `make(config) -> Publisher`."""
+
+from __future__ import annotations
+
+# name of the output and its section in robot.toml -> where its publisher is made; imported in the output's own process
+OUTPUTS: dict[str, str] = {}

@@ -1,0 +1,58 @@
+"""The sections of robot.toml about outputs, the operator's page and who may connect."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from stereo_sfm.settings import line, number, path, switch
+
+
+@dataclass(frozen=True)
+class PoseSocketConfig:
+    """Poses for other programs, one message each, on a socket."""
+
+    enabled: bool = switch(False, "Send poses on a socket")
+    address: str = line("tcp://127.0.0.1:7000", "tcp://ADDRESS:PORT, or the path of a local socket")
+
+
+@dataclass(frozen=True)
+class FoxgloveConfig:
+    """The topics of the log, live, for Foxglove and whatever speaks its WebSocket protocol."""
+
+    enabled: bool = switch(False, "Serve Foxglove")
+    address: str = line("127.0.0.1", "Address to listen on")
+    port: int = number(8765, 1, 65535, "Port to listen on")
+
+
+@dataclass(frozen=True)
+class Ros2Config:
+    """Odometry, transforms, map and services for ROS 2."""
+
+    enabled: bool = switch(False, "Publish to ROS 2 (needs rclpy)")
+
+
+@dataclass(frozen=True)
+class PageConfig:
+    """The operator's page."""
+
+    enabled: bool = switch(False, "Serve the page")
+    address: str = line("127.0.0.1", "Address to listen on")
+    port: int = number(8080, 1, 65535, "Port to listen on")
+
+
+@dataclass(frozen=True)
+class SecurityConfig:
+    """Who may connect from other computers."""
+
+    token_file: str = path("File with the token that others must send; needed to listen beyond this computer")
+    tls_cert: str = path("Certificate (PEM), for encrypted connections")
+    tls_key: str = path("Its key")
+
+
+@dataclass(frozen=True)
+class OutputsConfig:
+    """The outputs."""
+
+    pose_socket: PoseSocketConfig = field(default_factory=PoseSocketConfig)
+    foxglove: FoxgloveConfig = field(default_factory=FoxgloveConfig)
+    ros2: Ros2Config = field(default_factory=Ros2Config)
