@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from pathlib import PurePosixPath
 
 from stereo_sfm.drivers.mcap.messages import CAMERAS, ENCODINGS, IMUS, PICTURES, POSES, TRANSFORMS
-from stereo_sfm.drivers.mcap.recording import Recording
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.log.reader import TopicInfo
+from stereo_sfm.log.reader import LogReader, TopicInfo
 
 log = logging.getLogger("stereo_sfm")
 
@@ -39,16 +38,16 @@ class ChosenTopics:
     right: str
     depth: str
     truth: str
-    imu: tuple[str, ...]  # one, or the gyroscope's and the accelerometer's
+    imu: str
     cameras: tuple[str, ...]
     transforms: tuple[str, ...]
 
 
-def choose_topics(reader: Recording, left: str = "", right: str = "", depth: str = "") -> ChosenTopics:
+def choose_topics(reader: LogReader, left: str = "", right: str = "", depth: str = "") -> ChosenTopics:
     """Find the image topics.
 
     Args:
-        reader: the open recording.
+        reader: the open file.
         left: image topic given by the user, "" to find it. right, depth: likewise.
 
     Raises:
@@ -73,19 +72,10 @@ def choose_topics(reader: Recording, left: str = "", right: str = "", depth: str
         right,
         "" if right else depth,
         next((t.topic for t in rows if t.schema in POSES and any(w in t.topic.lower() for w in _TRUTH)), ""),
-        _imu_topics([t.topic for t in rows if t.schema in IMUS]),
+        next((t.topic for t in rows if t.schema in IMUS), ""),
         cameras,
         tuple(t.topic for t in rows if t.schema in TRANSFORMS),
     )
-
-
-def _imu_topics(topics: list[str]) -> tuple[str, ...]:
-    """The first IMU; both topics of one whose gyroscope and accelerometer are separate."""
-    for gyro in topics:
-        accel = gyro.replace("gyro", "accel")
-        if accel != gyro and accel in topics:
-            return gyro, accel
-    return tuple(topics[:1])
 
 
 def camera_topic(image: str, cameras: tuple[str, ...]) -> str:
@@ -139,5 +129,5 @@ def _pair(name: str, eyes: list[str], cameras: tuple[str, ...]) -> tuple[str, st
         return sorted(eyes)[0], sorted(eyes)[1]
     raise StereoSfmError(
         f"{name} has {len(eyes)} image topics with ambiguous names: "
-        f"choose with '{name}?left=TOPIC&right=TOPIC' ({', '.join(eyes)})"
+        f"choose with mcap:FILE?left=TOPIC&right=TOPIC ({', '.join(eyes)})"
     )

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from stereo_sfm.config import TrackerConfig
+from stereo_sfm.tracking.flow.consensus import PROOF, among_moving
 from stereo_sfm.tracking.flow.corners import detect_corners
 from stereo_sfm.tracking.flow.follower import Follower
 from stereo_sfm.tracking.flow.pyramids import StereoPyramids
@@ -47,6 +48,8 @@ class NewPoints:
         good = np.flatnonzero(match.good)
         rows, slots = self._follower.begin(images.left, match.uv_left[good])
         new, n = good[rows], len(rows)
+        rho = np.maximum(match.rho[new], LEAST_RHO)
+        moving = among_moving(match.uv_left[new], rho, tracks)
         origin, direction = self._shutter.rays(pose, velocity, match.uv_left[new], match.bearing[new])
         tracks = tracks.append(
             Tracks(
@@ -55,10 +58,11 @@ class NewPoints:
                 uv_right=match.uv_right[new],
                 origin=origin,
                 direction=direction,
-                rho=np.maximum(match.rho[new], LEAST_RHO),
+                rho=rho,
                 variance=match.variance[new],
                 age=np.zeros(n, np.int32),
-                misses=np.zeros(n, np.int32),
+                misses=np.where(moving, PROOF, 0).astype(np.int32),
+                moving=moving,
                 warp=np.tile(np.eye(2), (n, 1, 1)),
                 slot=slots,
                 mapped=np.zeros(n, bool),

@@ -16,6 +16,8 @@ from stereo_sfm.tracking.protocol import Places
 from stereo_sfm.types import F64, Corners, Keyframe, StereoImage
 
 REACH = 3.0  # sigmas of the expectation within which a camera is looked for
+NEAR = 0.4  # of the median distance of the newest keyframe's corners
+FADING = 0.9  # of what a free view shows, from keyframe to keyframe
 GRID = (8, 6)  # columns and rows of the image in which corners are counted
 SURE_SHARE = 0.6  # of the points that should be visible: no need to look elsewhere
 SAME_PLACE = 0.1, 0.03  # metres, radians between two answers that are one
@@ -32,7 +34,8 @@ class Recovery:
     def __init__(self, place_corners: PlaceCorners | None, places: Places | None, size: tuple[int, int]) -> None:
         """`size`: width and height of the left image. Without `places` nothing is searched."""
         self._place_corners, self._places, self._size = place_corners, places, size
-        self._cells = 0  # in which the newest keyframe had corners
+        self._near = 0.0  # metres from the camera, nearer than most of what the newest keyframe showed
+        self._cells = 0.0  # in which the newest keyframes had corners further away
         self.motion = TrustedMotion()
         self.free = True  # whether the last image that was searched shows as much as the newest keyframe
 
@@ -40,7 +43,9 @@ class Recovery:
         """A new keyframe that later images may be found in."""
         if self._places is not None:
             self._places.add(keyframe)
-        self._cells = self._occupied(keyframe.corners)
+        if len(keyframe.corners):
+            self._near = NEAR * float(np.median(np.linalg.norm(keyframe.corners.points_cam, axis=1)))
+        self._cells = max(self._occupied(keyframe.corners), FADING * self._cells)
 
     def search(self, image: StereoImage, images: StereoPyramids, expected: Expectation) -> Iterator[F64]:
         """Poses odom_T_cam (4, 4) within reach of where the camera is expected, from which it may see this image."""
@@ -72,10 +77,9 @@ class Recovery:
         return None if any(s.inliers > RIVAL * best[1].inliers for s in rivals) else best
 
     def _occupied(self, corners: Corners) -> int:
-        """How many cells of the image hold a corner."""
-        column, row = (
-            np.clip(corners.uv_left[:, k] * GRID[k] / self._size[k], 0, GRID[k] - 1).astype(np.int64) for k in (0, 1)
-        )
+        """How many cells of the image hold a corner that is not on something close before the camera."""
+        uv = corners.uv_left[np.linalg.norm(corners.points_cam, axis=1) > self._near]
+        column, row = (np.clip(uv[:, k] * GRID[k] / self._size[k], 0, GRID[k] - 1).astype(np.int64) for k in (0, 1))
         return len(np.unique(row * GRID[0] + column))
 
 

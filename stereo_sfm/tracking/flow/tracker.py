@@ -19,6 +19,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.tracking.descriptors import describe
 from stereo_sfm.tracking.flow import klt
+from stereo_sfm.tracking.flow.consensus import after_frame, without_moving
 from stereo_sfm.tracking.flow.follower import Follower
 from stereo_sfm.tracking.flow.frame_pose import ExpectedMotion, FramePoseSolver, PoseSolution
 from stereo_sfm.tracking.flow.map_points import take_update
@@ -45,6 +46,7 @@ NOT_FOUND = (
 MAX_MISSES = 3  # successive frames after which a point that disagrees is given up
 TRUSTED_SHARE = 0.8  # of the points that are followed: a pose that so many agree with is beyond doubt ...
 TRUSTED_LEFT = 0.5  # ... if so many of the newest keyframe's points are left
+COVERED_SHARE = 0.1  # that a frame whose view is covered counts towards beginning anew
 SAME_START = 0.05, 0.01  # metres, radians between poses from which the same is found
 LOOKS = 2
 FIRST_COVARIANCE = np.eye(6) * 1e-12  # of the first pose, which is the odometry frame
@@ -84,7 +86,7 @@ class Tracker:
         self._velocity: F64 = np.zeros(6)  # tangent per second
         self._stamp_ns = 0
         self._lost = 0  # successive frames
-        self._searched = 0  # of these, the last ones that showed enough to search in
+        self._searched = 0.0  # of these, the last ones that showed enough to search in
         self._bridging = False  # tracking begins again where the IMU says, in the same submap
         self._submap_id = 0
         self._next_kf_id = 0
@@ -119,14 +121,15 @@ class Tracker:
         self.solution = solution
         if solution.reason:
             return self._lose(image, solution.reason)
-        self._solver.learn(solution)
+        self._solver.learn(tracks, solution, self._standing(), expected)
         self._solver.refine_depth(tracks, solution)
         state = TrackState.OK if self._lost == 0 else TrackState.RECOVERED
         stats = _stats(tracks, solution)
-        trusted = solution.inliers >= max(TRUSTED_SHARE * len(tracks), TRUSTED_LEFT * self._kf_points)
+        agree = int((solution.inlier & ~tracks.moving).sum())
+        trusted = agree >= max(TRUSTED_SHARE * float((~tracks.moving).sum()), TRUSTED_LEFT * self._kf_points)
         if trusted:
             self._recovery.motion.add(image.stamp_ns, solution.pose)
-            self._follower.hold(images.left, tracks.keep(solution.inlier), solution.pose)
+            self._follower.hold(images.left, tracks.keep(solution.inlier & ~tracks.moving), solution.pose)
         again = bool(self._lost)
         inlier = self._accept(image, images, tracks, solution, expected.seconds)
         stats |= self._level()
@@ -166,7 +169,7 @@ class Tracker:
     def _follow(self, images: StereoPyramids, expected: ExpectedMotion) -> tuple[Tracks, PoseSolution]:
         """The points of the last image, from where they are expected, or as the whole image turned."""
         tracks, solution = self._track(images, expected)
-        if solution.good(self._config, len(self._tracks)):
+        if solution.good(self._config, self._standing()):
             return tracks, solution
         turned = self._follower.turned(images.left, expected, self._pose)
         return max((tracks, solution), self._track(images, turned), key=lambda found: found[1].inliers)
@@ -178,7 +181,7 @@ class Tracker:
         with self._spans.span("stereo"):
             tracks.uv_right = self._stereo.follow(images.left, images.right, tracks.uv, tracks.points(), expected.pose)
         with self._spans.span("pose"):
-            return tracks, self._solver.solve(tracks, expected, self._pose)
+            return tracks, self._solver.solve(tracks, expected, self._pose, self._standing())
 
     def _accept(
         self, image: StereoImage, images: StereoPyramids, tracks: Tracks, solution: PoseSolution, seconds: float
@@ -190,11 +193,10 @@ class Tracker:
             self._velocity = solution.velocity if self._shutter.active else mean
         if self._lost:
             self._velocity = self._recovery.motion.velocity()
-        inlier = solution.inlier
-        tracks.misses = np.where(inlier, 0, tracks.misses + 1).astype(np.int32)
+        inlier = solution.inlier & ~tracks.moving
         tracks.age = tracks.age + np.int32(1)
-        kept = tracks.misses < MAX_MISSES
-        self._go_on(image, images, solution.pose, tracks.keep(kept))
+        tracks, kept = after_frame(tracks, solution.inlier, MAX_MISSES, self._solver.alert)
+        self._go_on(image, images, solution.pose, tracks)
         if self._inertial is not None:
             self._inertial.accept(image.stamp_ns, solution.pose)
         self._frames_since_kf += 1
@@ -207,7 +209,7 @@ class Tracker:
 
     def _go_on(self, image: StereoImage, images: StereoPyramids, pose: F64, tracks: Tracks) -> None:
         self._pose, self._stamp_ns, self._tracks = pose, image.stamp_ns, tracks
-        self._state, self._lost, self._searched = TrackState.OK, 0, 0
+        self._state, self._lost, self._searched = TrackState.OK, 0, 0.0
         self._follower.accept(images.left, tracks)
 
     def _begin(self, image: StereoImage, images: StereoPyramids) -> tuple[Frame, Keyframe | None]:
@@ -291,7 +293,7 @@ class Tracker:
         self._follower.search_widely()
         bridge = self._bridge(image.stamp_ns)
         seen = bridge is None or image.left.max() >= DARK
-        self._searched = self._searched + seen if self._recovery.free else 0
+        self._searched += seen * (1.0 if self._recovery.free else COVERED_SHARE)
         if self._searched > self._config.lost_frames:
             self._pose = expected.odom_T_cam
             self._velocity = np.zeros(6)
@@ -309,21 +311,26 @@ class Tracker:
     def _add_points(self, images: StereoPyramids, inlier: Bool) -> Bool:
         """New points behind those that are followed, of which `inlier` (N,) agree; the new ones do."""
         self._tracks = self._new_points.add(self._tracks, images, self._pose, self._velocity)
-        return np.concatenate([inlier, np.ones(len(self._tracks) - len(inlier), bool)])
+        return np.concatenate([inlier, ~self._tracks.moving[len(inlier) :]])
 
     # -- messages --------------------------------------------------------------------------------------------------
 
     def _wants_keyframe(self) -> bool:
         config = self._config
-        left = len(self._tracks)  # new points come with keyframes only
+        left = self._standing()  # new points come with keyframes only
         return self._frames_since_kf >= config.keyframe_max_frames or left < config.keyframe_share * self._kf_points
 
+    def _standing(self) -> int:
+        """Points that are followed and not on something that moves."""
+        return int((~self._tracks.moving).sum())
+
     def _make_keyframe(self, image: StereoImage, images: StereoPyramids) -> Keyframe:
-        tracks = self._tracks
+        tracks = self._tracks.keep(~self._tracks.moving)
         points_cam = se3.transform(se3.inverse(self._pose), tracks.points())
         corners = Corners.none()
         if self._place_corners is not None:
             corners = self._place_corners.find_in(images.left, images.right)
+            corners = without_moving(corners, self._tracks)
         uv_left, uv_right = self._shutter.at_stamp(tracks.uv, tracks.uv_right, points_cam, self._velocity)
         keyframe = Keyframe(
             kf_id=self._next_kf_id,
@@ -341,7 +348,7 @@ class Tracker:
         )
         self._next_kf_id += 1
         self._kf_pose = self._pose.copy()
-        self._kf_points = len(tracks)
+        self._kf_points = self._standing()
         self._frames_since_kf = 0
         return keyframe
 
@@ -400,7 +407,8 @@ def _stats(tracks: Tracks, solution: PoseSolution) -> dict[str, float]:
     """Numbers worth plotting."""
     return {
         "tracked": float(len(tracks)),
-        "inliers": float(solution.inliers),
+        "inliers": float((solution.inlier & ~tracks.moving).sum()),
+        "moving": float(tracks.moving.mean()) if len(tracks) else 0.0,
         "right": float(np.isfinite(tracks.uv_right[:, 0]).sum()),
         "error": float(np.median(solution.error[solution.inlier])),
     }

@@ -25,6 +25,7 @@ class Tracks:
     misses: I32 = field(default_factory=lambda: np.zeros(0, np.int32))  # successive frames as an outlier
     warp: F64 = field(default_factory=lambda: np.zeros((0, 2, 2)))  # deformation since the first appearance
     slot: I64 = field(default_factory=lambda: np.zeros(0, np.int64))  # row in the `Patches`
+    moving: Bool = field(default_factory=lambda: np.zeros(0, bool))  # on something that moves: counts for nothing
     mapped: Bool = field(default_factory=lambda: np.zeros(0, bool))  # position given by the map
 
     def __len__(self) -> int:

@@ -1,0 +1,168 @@
+"""People in front of the camera: is the pose kept while they fill the view, and found again after they covered it?
+
+Every kind of encounter of the simulator (`sim:...?encounters=KIND`), for the fisheye and the pinhole pair at 30 and 15
+frames a second, half-size images, 0.8 m/s. An encounter that takes more than 60 % of the view of a camera counts as
+covering. Of those is printed how many were found again in the same submap within 0.5 s of free sight, the median and
+the largest error of the motion since before, and how many were found at a wrong place. Of the others: lost frames,
+steps that are wrong by more than 10 mm or 0.2 degrees while the state says OK, and the error of the frame poses beside
+that of the same drive without people.
+
+    python benchmarks/people.py [--count 30] [--kinds approach,cover] [--cameras fisheye] [--rates 15] [--full-size]
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass, field
+
+from _sequences import one_thread
+
+one_thread()
+
+import cv2
+import numpy as np
+
+from stereo_sfm.config import Config
+from stereo_sfm.drivers.sim.encounters import KINDS, Encounter
+from stereo_sfm.drivers.sim.source import SimSource
+from stereo_sfm.drivers.source import open_source
+from stereo_sfm.eval.evaluate import evaluate
+from stereo_sfm.geometry import se3
+from stereo_sfm.pipeline.run import run
+from stereo_sfm.types import F64, Frame, TrackState, Trajectory
+
+HALF = {"fisheye": "424x400", "pinhole": "320x200"}
+SCENES = {"beside": "sim:loop?length=24"}  # 20 s together need a longer way than an aisle
+FREE, COVERING = 0.05, 0.6  # share of the view
+SOON_S = 0.5
+TRACKED = (TrackState.OK, TrackState.RECOVERED)
+WRONG_M, WRONG_DEG = 0.5, 10.0  # a camera found again so far from the truth is at another place
+STEP_MM, STEP_DEG = 10.0, 0.2
+
+
+@dataclass
+class Numbers:
+    """Of one kind of encounter."""
+
+    covering: int = 0
+    found: int = 0
+    wrong: int = 0
+    metres: list[float] = field(default_factory=list[float])
+    degrees: list[float] = field(default_factory=list[float])
+    partly: int = 0
+    lost: int = 0
+    steps: int = 0
+    errors: list[tuple[float, float]] = field(default_factory=list[tuple[float, float]])  # with and without people
+
+    @property
+    def count(self) -> int:
+        """Encounters."""
+        return self.covering + self.partly
+
+    def row(self, name: str) -> str:
+        """A line of the table."""
+        off = f"{_of(self.metres, 1e3)} | {_of(self.degrees, 1)}"
+        covered = f"| {self.found} of {self.covering} | {off} | {self.wrong} "
+        with_people, without = np.array(self.errors).reshape(-1, 2).T
+        errors = f"{_of(with_people.tolist(), 1e3)} | {_of(without.tolist(), 1e3)}"
+        return f"| {name} {covered}| {self.partly} | {self.lost} | {self.steps} | {errors} |"
+
+
+def _of(values: list[float], scale: float) -> str:
+    """Median and largest."""
+    return f"{scale * np.median(values):.2g} ({scale * max(values):.2g})" if values else "–"
+
+
+def drive(spec: str) -> tuple[SimSource, list[Frame]]:
+    """The frames of one drive, with mapping and loops."""
+    cv2.setRNGSeed(0)
+    with open_source(spec) as source:
+        assert isinstance(source, SimSource)
+        return source, list(run(source, Config()))
+
+
+def motion_error(source: SimSource, a: Frame, b: Frame) -> tuple[float, float]:
+    """Metres and degrees by which the motion from frame a to b is wrong."""
+    true = se3.inverse(source.pose(a.frame_id)) @ source.pose(b.frame_id)
+    metres, radians = se3.extent(se3.inverse(true) @ se3.inverse(a.odom_T_cam) @ b.odom_T_cam)
+    return float(metres), float(np.rad2deg(radians))
+
+
+def judge(source: SimSource, frames: list[Frame], encounter: Encounter, numbers: Numbers) -> None:
+    """Add one encounter."""
+    rate = source.options.rate
+    first, last = (int(np.clip(s * rate, 1, len(frames) - 1)) for s in (encounter.begin, encounter.end))
+    shares = np.array([source.moving_share(k).max() for k in range(first, last + 1)])
+    if shares.max() > COVERING:
+        seen = np.flatnonzero(shares > FREE)
+        _covered(source, frames, first + int(seen[0]), first + int(seen[-1]), numbers)
+        return
+    numbers.partly += 1
+    for before, after in zip(frames[first - 1 : last], frames[first : last + 1], strict=True):
+        numbers.lost += after.state not in TRACKED
+        if before.state == after.state == TrackState.OK:
+            metres, degrees = motion_error(source, before, after)
+            numbers.steps += 1e3 * metres > STEP_MM or degrees > STEP_DEG
+
+
+def _covered(source: SimSource, frames: list[Frame], begin: int, end: int, numbers: Numbers) -> None:
+    """An encounter that takes (nearly) all of the view; people are there from frame `begin` to `end`."""
+    soon = frames[begin : min(end + 1 + round(SOON_S * source.options.rate), len(frames) - 1) + 1]
+    numbers.covering += 1
+    found = soon[-1].state in TRACKED and all(frame.state != TrackState.RESTARTED for frame in soon)
+    if not found:
+        return
+    metres, degrees = motion_error(source, frames[begin - 1], soon[-1])
+    numbers.wrong += metres > WRONG_M or degrees > WRONG_DEG
+    numbers.found += 1
+    numbers.metres.append(metres)
+    numbers.degrees.append(degrees)
+
+
+def position_error(source: SimSource, frames: list[Frame]) -> float:
+    """RMSE of the positions of a drive's frame poses, aligned."""
+    stamps = np.array([frame.stamp_ns for frame in frames], np.int64)
+    poses: F64 = np.array([frame.odom_T_cam for frame in frames])
+    assert source.ground_truth is not None
+    return evaluate(Trajectory(stamps, poses), source.ground_truth).ape_m.rmse
+
+
+def encounters(kind: str, camera: str, rate: int, count: int, size: str) -> Numbers:
+    """Drives until there were so many encounters."""
+    numbers, seed = Numbers(), 0
+    while numbers.count < count:
+        scene = SCENES.get(kind, "sim:aisle?returns=off")
+        spec = f"{scene}&camera={camera}&rate={rate}&speed=0.8&seed={seed}{size}"
+        source, frames = drive(f"{spec}&encounters={kind}")
+        for encounter in source.encounters[: count - numbers.count]:
+            judge(source, frames, encounter, numbers)
+        if not numbers.covering:
+            numbers.errors.append((position_error(source, frames), position_error(*drive(spec))))
+        seed += 1
+    return numbers
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--count", type=int, default=30, help="encounters of each kind")
+    parser.add_argument("--kinds", default=",".join(KINDS))
+    parser.add_argument("--cameras", default="fisheye,pinhole")
+    parser.add_argument("--rates", default="30,15")
+    parser.add_argument("--full-size", action="store_true")
+    args = parser.parse_args()
+    print(
+        "| encounters | found again | mm: median (most) | deg | wrong place | partly | lost frames | wrong steps"
+        " | error mm: median (most) | without people |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|")
+    for camera in args.cameras.split(","):
+        size = "" if args.full_size else f"&size={HALF[camera]}"
+        for rate in map(int, args.rates.split(",")):
+            for kind in args.kinds.split(","):
+                numbers = encounters(kind, camera, rate, args.count, size)
+                print(numbers.row(f"{kind}, {camera}, {rate} Hz"), flush=True)
+
+
+if __name__ == "__main__":
+    main()

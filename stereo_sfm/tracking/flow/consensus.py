@@ -1,0 +1,112 @@
+"""Which motion is the camera's when something else moves before it: points that have stood still for long decide.
+
+While most points agree, all of them have the same say. When agreement falls, a second motion is among them: then only
+settled points solve for the pose, young ones follow it, and what keeps disagreeing in company is marked as moving.
+Marked points are followed on, so that nothing new is begun on what moves, but count for nothing until they have stood
+still for a while.
+"""
+
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportMissingTypeArgument=false
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stereo_sfm.geometry.kernels import njit
+from stereo_sfm.geometry.se3_kernels import compose_into, exp_into
+from stereo_sfm.tracking.flow.pose_solver import point_residuals
+from stereo_sfm.tracking.flow.tracks import Tracks
+from stereo_sfm.types import F64, Bool, Corners
+
+AGREEMENT = 0.8  # share of the points below which something moves
+LEFT = 0.65  # share of those that were looked for, likewise
+SAME = 0.9  # of the settled points that agree with what they decide, agree with what all do: then all decide
+ALERT_S = 1.0  # after that, or while points are marked as moving
+SETTLED_S = 0.3  # a point that was followed for so long decides
+COMPANY, NEIGHBOURS = 3, 6  # a point moves if so many of its nearest neighbours disagree as well
+SAME_DEPTH = 0.3  # logarithm of the ratio of two distances
+PROOF = 4  # successive frames in which a moving point must agree to be believed again
+
+
+def after_frame(tracks: Tracks, inlier: Bool, misses_allowed: int, alert: bool) -> tuple[Tracks, Bool]:
+    """Tracks with `misses` and `moving` brought up to date; what disagrees for long is dropped, in company marked.
+
+    Args:
+        inlier: (N,) which points agree with the pose. misses_allowed: successive frames of disagreement.
+        alert: whether something may move; if not, nothing is marked.
+
+    Returns:
+        The tracks that stay, and which rows (N,) these are.
+    """
+    still = ~tracks.moving
+    misses = np.where(inlier, 0, tracks.misses + 1)
+    proof = np.where(inlier, tracks.misses - 1, PROOF)
+    tracks.misses = np.where(still, misses, proof).astype(np.int32)
+    out = still & (tracks.misses >= misses_allowed)
+    disagree = tracks.moving | (tracks.misses > 0)
+    joins = np.zeros(len(tracks), bool)
+    rows = np.flatnonzero(out) if alert else np.zeros(0, np.int64)
+    joins[rows] = _company(tracks.uv[rows], tracks.rho[rows], tracks.uv, tracks.rho, disagree) > COMPANY
+    tracks.misses[joins] = PROOF
+    tracks.moving = (tracks.moving | joins) & (tracks.misses > 0)
+    kept = ~out | joins
+    return tracks.keep(kept), kept
+
+
+def among_moving(uv: F64, rho: F64, tracks: Tracks) -> Bool:
+    """(M,) which of new points, (M, 2) px and (M,) 1/m, are begun on what moves."""
+    return _company(uv, rho, tracks.uv, tracks.rho, tracks.moving) >= COMPANY
+
+
+def _company(uv: F64, rho: F64, among_uv: F64, among_rho: F64, marked: Bool) -> F64:
+    """How many of the NEIGHBOURS nearest in the image are marked (N,) and about as far away, for each of M points."""
+    if not len(uv) or not marked.any():
+        return np.zeros(len(uv))
+    squared = ((uv[:, None] - among_uv[None]) ** 2).sum(-1)
+    nearest = np.argsort(squared, axis=1, kind="stable")[:, :NEIGHBOURS]
+    alike = np.abs(np.log(among_rho[nearest] / rho[:, None])) < SAME_DEPTH
+    return (marked[nearest] & alike).sum(1)
+
+
+def without_moving(corners: Corners, tracks: Tracks) -> Corners:
+    """The corners that are not on something that moves."""
+    if not tracks.moving.any():
+        return corners
+    distance = np.linalg.norm(corners.points_cam, axis=1).astype(np.float64)
+    still = ~among_moving(corners.uv_left.astype(np.float64), 1.0 / np.maximum(distance, 1e-6), tracks)
+    return Corners(
+        corners.uv_left[still], corners.uv_right[still], corners.points_cam[still], corners.descriptors[still]
+    )
+
+
+@njit
+def errors_at(
+    pose, velocity, row_s, origin, direction, rho, variance, uv_l, uv_r, cams, right_T_left, sigma
+):  # fmt: skip
+    """(N,) whitened errors of points at a pose, as `pose_solver.optimise_pose` gives them; its arguments."""
+    error = np.full(len(rho), np.inf)
+    res, jac, ray = np.zeros(4), np.zeros((4, 6)), np.zeros(4)
+    row, step = pose.copy(), np.zeros((4, 4))
+    for k in range(len(rho)):
+        ir = 1.0 / rho[k]
+        g = -ir * ir
+        if len(row_s) > 0:
+            exp_into(velocity, row_s[k], step)
+            compose_into(pose, step, row)
+        rows = point_residuals(
+            row, origin[k, 0] + direction[k, 0] * ir, origin[k, 1] + direction[k, 1] * ir,
+            origin[k, 2] + direction[k, 2] * ir, direction[k, 0] * g, direction[k, 1] * g, direction[k, 2] * g,
+            uv_l[k], uv_r[k], cams, right_T_left, res, jac, ray,
+        )  # fmt: skip
+        if rows == 0:
+            continue
+        rr, gr, gg = 0.0, 0.0, 0.0
+        for i in range(rows):
+            rr += res[i] * res[i]
+            gr += ray[i] * res[i]
+            gg += ray[i] * ray[i]
+        c = variance[k] / (sigma * sigma + variance[k] * gg)
+        error[k] = math.sqrt(max(rr - c * gr * gr, 0.0) / rows) / sigma
+    return error

@@ -1,0 +1,95 @@
+"""Something moves before the camera: points that stood still for long decide, what moves is marked."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stereo_sfm.config import TrackerConfig
+from stereo_sfm.drivers.sim.rigs import make_rig
+from stereo_sfm.geometry import se3
+from stereo_sfm.tracking.flow.consensus import PROOF, after_frame, among_moving
+from stereo_sfm.tracking.flow.frame_pose import ExpectedMotion, FramePoseSolver
+from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
+from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
+from stereo_sfm.tracking.flow.tracks import Tracks
+from stereo_sfm.types import F64, Bool
+
+RIG = make_rig("pinhole")
+SECONDS = 1 / 15
+MOVED = se3.exp(np.array([0.0, 0.0, 0.055, 0.0, 0.002, 0.0]))  # of the camera since the last frame
+STILL, MOVING = 60, 150
+
+
+def scene(rng: np.random.Generator) -> tuple[Tracks, Bool]:
+    """Old points of the store and more young ones on somebody who walks ahead of the camera, as fast as it does."""
+    store = rng.uniform([-2.0, -1.2, 2.5], [2.0, 1.2, 7.0], (STILL, 3))
+    person = rng.uniform([-0.3, -0.4, 1.0], [0.3, 0.4, 1.3], (MOVING, 3))
+    before = np.concatenate([store, person])
+    now = np.concatenate([se3.transform(se3.inverse(MOVED), store), person])
+    n = len(before)
+    distance = np.linalg.norm(before, axis=1)
+    assert RIG.right is not None
+    uv = RIG.left.project(now) + rng.normal(0, 0.2, (n, 2))
+    uv_right = RIG.right.project(se3.transform(se3.inverse(RIG.left_T_right), now)) + rng.normal(0, 0.2, (n, 2))
+    on_person = np.arange(n) >= STILL
+    tracks = Tracks(
+        point_ids=np.arange(n, dtype=np.int64),
+        uv=uv,
+        uv_right=uv_right,
+        origin=np.zeros((n, 3)),
+        direction=before / distance[:, None],
+        rho=1 / distance,
+        variance=np.full(n, 1e-5),
+        age=np.where(on_person, 1, 20).astype(np.int32),
+        misses=np.zeros(n, np.int32),
+        warp=np.tile(np.eye(2), (n, 1, 1)),
+        slot=np.arange(n, dtype=np.int64),
+        mapped=np.zeros(n, bool),
+        moving=np.zeros(n, bool),
+    )
+    return tracks, on_person
+
+
+def off(pose: F64) -> float:
+    """Metres from the truth."""
+    return float(se3.extent(se3.inverse(MOVED) @ pose)[0])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_settled_points_decide_against_more_young_ones(seed: int) -> None:
+    tracks, on_person = scene(np.random.default_rng(seed))
+    solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
+    expected = ExpectedMotion(MOVED @ se3.exp(np.full(6, 0.002)), np.zeros(6), SECONDS)
+    solution = solver.solve(tracks, expected, np.eye(4), before=400)
+    assert off(solution.pose) < 0.005
+    assert solution.inlier[~on_person].mean() > 0.9
+    assert solution.inlier[on_person].mean() < 0.15
+    assert np.sqrt(np.trace(solution.covariance[:3, :3])) < 0.01
+    solver.learn(tracks, solution, 400, expected)
+    assert solver.alert
+
+
+def test_what_disagrees_in_company_is_marked_and_followed_on() -> None:
+    tracks, on_person = scene(np.random.default_rng(0))
+    for _ in range(3):
+        tracks, kept = after_frame(tracks, ~on_person, 3, alert=True)
+        assert kept[~on_person].all()
+        on_person = on_person[kept]
+    assert on_person.sum() > 0.8 * MOVING
+    assert tracks.moving[on_person].all()
+    assert not tracks.moving[~on_person].any()
+    begun = among_moving(tracks.uv, tracks.rho, tracks)
+    assert begun[on_person].mean() > 0.9
+    assert begun[~on_person].mean() < 0.1
+    for _ in range(PROOF):
+        tracks, _ = after_frame(tracks, np.ones(len(tracks), bool), 3, alert=True)
+    assert not tracks.moving.any()
+
+
+def test_nothing_is_marked_where_nothing_moves() -> None:
+    tracks, on_person = scene(np.random.default_rng(0))
+    for _ in range(3):
+        tracks, _ = after_frame(tracks, ~on_person[: len(tracks)], 3, alert=False)
+    assert len(tracks) == STILL
+    assert not tracks.moving.any()
