@@ -3,4 +3,6 @@
 from __future__ import annotations
 
 # name of the output and its section in robot.toml -> where its publisher is made; imported in the output's own process
-OUTPUTS: dict[str, str] = {}
+OUTPUTS: dict[str, str] = {
+    "pose_socket": "stereo_sfm.service.outputs.pose_socket:make",
+}

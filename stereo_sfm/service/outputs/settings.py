@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from stereo_sfm.settings import line, number, path, switch
+from stereo_sfm.settings import line, number, path, switch, word
 
 
 @dataclass(frozen=True)
@@ -13,6 +13,7 @@ class PoseSocketConfig:
 
     enabled: bool = switch(False, "Send poses on a socket")
     address: str = line("tcp://127.0.0.1:7000", "tcp://ADDRESS:PORT, or the path of a local socket")
+    format: str = word("json", ("json", "protobuf"), "Lines of JSON, or protobuf messages with their length before")
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,7 @@ class FoxgloveConfig:
     enabled: bool = switch(False, "Serve Foxglove")
     address: str = line("127.0.0.1", "Address to listen on")
     port: int = number(8765, 1, 65535, "Port to listen on")
+    picture_hz: float = number(5.0, 0, 60, "Images a second")
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,12 @@ class Ros2Config:
     """Odometry, transforms, map and services for ROS 2."""
 
     enabled: bool = switch(False, "Publish to ROS 2 (needs rclpy)")
+    namespace: str = line("", "Namespace of the node, its topics and services")
+    map_frame: str = line("map", "Name of the map's frame")
+    odom_frame: str = line("odom", "Name of the odometry's frame")
+    base_frame: str = line("base_link", "Name of the robot's frame")
+    tf: bool = switch(True, "Publish the transforms from map to odom and from odom to the robot")
+    use_sim_time: bool = switch(False, "Stamp messages by the camera's clock, as of a simulator or a played bag")
 
 
 @dataclass(frozen=True)
@@ -38,6 +46,7 @@ class PageConfig:
     enabled: bool = switch(False, "Serve the page")
     address: str = line("127.0.0.1", "Address to listen on")
     port: int = number(8080, 1, 65535, "Port to listen on")
+    picture_hz: float = number(4.0, 0, 30, "Images a second")
 
 
 @dataclass(frozen=True)

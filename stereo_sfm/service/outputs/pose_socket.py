@@ -1,0 +1,232 @@
+"""Poses on a socket: one message a pose to every client that is connected.
+
+A client that does not read misses poses; nobody waits for it. What it missed is counted in its next message.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import socket
+import stat
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from ssl import SSLWantReadError, SSLWantWriteError
+from typing import TYPE_CHECKING
+
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.service.messages import PoseUpdate, ServiceMessage, Started
+from stereo_sfm.service.outputs.access import Access, access
+from stereo_sfm.service.outputs.pose_message import FORMATS, pose_message
+from stereo_sfm.service.outputs.robot_axes import RobotAxes
+from stereo_sfm.service.publisher import ServiceClient
+
+if TYPE_CHECKING:
+    from stereo_sfm.service.config import RobotConfig
+
+log = logging.getLogger("stereo_sfm")
+
+MOST_CLIENTS = 32
+BUFFER_BYTES = 1 << 16  # of the system for one client: a slow one is not far behind
+HELLO_S = 5.0  # to encrypt and to say the token
+HELLO_BYTES = 4200
+SOCKET_MODE = 0o660
+
+
+def make(config: RobotConfig) -> PoseSocket:
+    """The output."""
+    section = config.outputs.pose_socket
+    place = Place.read(section.address)
+    rules = access(config.security, place.host) if place.host else Access()
+    return PoseSocket(place, section.format, rules)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where to listen: a port of an address, or a local socket."""
+
+    host: str = ""
+    port: int = 0
+    path: Path | None = None
+
+    @staticmethod
+    def read(text: str) -> Place:
+        """`tcp://ADDRESS:PORT`, or a path.
+
+        Raises:
+            StereoSfmError: neither.
+        """
+        if not text.startswith("tcp://"):
+            if not text or "://" in text:
+                raise StereoSfmError(f"pose socket '{text}': give tcp://127.0.0.1:7000 or the path of a socket")
+            return Place(path=Path(text).expanduser())
+        host, _, port = text.removeprefix("tcp://").rpartition(":")
+        if not host or not port.isdigit() or not 0 <= int(port) <= 65535:
+            raise StereoSfmError(f"pose socket '{text}': give an address and a port, such as tcp://127.0.0.1:7000")
+        return Place(host.strip("[]"), int(port))
+
+    def listen(self) -> socket.socket:
+        """A listening socket.
+
+        Raises:
+            StereoSfmError: the place is taken, or not ours.
+        """
+        try:
+            return self._local() if self.path is not None else self._tcp()
+        except (OSError, UnicodeError) as error:
+            why = getattr(error, "strerror", None) or error
+            raise StereoSfmError(f"pose socket: cannot listen on {self}: {why}") from None
+
+    def _tcp(self) -> socket.socket:
+        family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
+        return socket.create_server((self.host, self.port), family=family, backlog=MOST_CLIENTS)
+
+    def _local(self) -> socket.socket:
+        assert self.path is not None
+        if self.path.exists() and stat.S_ISSOCK(self.path.stat().st_mode) and not _answers(self.path):
+            self.path.unlink()  # left by a process that was killed
+        server = socket.socket(socket.AF_UNIX)
+        server.bind(str(self.path))
+        self.path.chmod(SOCKET_MODE)
+        server.listen(MOST_CLIENTS)
+        return server
+
+    def __str__(self) -> str:
+        return str(self.path) if self.path is not None else f"tcp://{self.host}:{self.port}"
+
+
+def _answers(path: Path) -> bool:
+    with socket.socket(socket.AF_UNIX) as probe:
+        return probe.connect_ex(str(path)) == 0
+
+
+class _Client:
+    """One connection: what the system has not taken yet, and how many poses were left out because of that."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        self.connection = connection
+        self.pending = b""
+        self.missed = 0
+
+    def flush(self) -> bool:
+        """Give the system what waits; False where it has no room.
+
+        Raises:
+            OSError: the client has gone.
+        """
+        try:
+            while self.pending:
+                self.pending = self.pending[self.connection.send(self.pending) :]
+        except (BlockingIOError, InterruptedError, SSLWantReadError, SSLWantWriteError):
+            return False
+        return True
+
+
+class PoseSocket:
+    """The publisher of poses on a socket."""
+
+    wants: frozenset[type[ServiceMessage]] = frozenset({Started, PoseUpdate})
+    picture_hz = 0.0
+
+    def __init__(self, place: Place, form: str, rules: Access | None = None) -> None:
+        """Args: place, where to listen. form: a key of FORMATS. rules: for those who connect."""
+        self._place, self._format, self._rules = place, FORMATS[form](), rules or Access()
+        self._server: socket.socket | None = None
+        self._clients: list[_Client] = []
+        self._guests = 0  # connected, and have not said the token yet
+        self._lock = threading.Lock()
+        self._axes: RobotAxes | None = None
+
+    @property
+    def port(self) -> int:
+        """The port, where it listens on one."""
+        return 0 if self._server is None or self._place.path is not None else self._server.getsockname()[1]
+
+    def open(self, service: ServiceClient) -> None:
+        """Listen."""
+        self._server = self._place.listen()
+        threading.Thread(target=self._accept, args=(self._server,), daemon=True).start()
+
+    def put(self, message: ServiceMessage) -> None:
+        """Send a pose to those who have room for it."""
+        if isinstance(message, Started):
+            self._axes = RobotAxes(message.rig)
+        elif isinstance(message, PoseUpdate) and self._axes is not None:
+            with self._lock:
+                clients = list(self._clients)
+            if clients:
+                self._send(self._format.body(pose_message(message, self._axes)), clients)
+
+    def close(self) -> None:
+        """Close all connections."""
+        if self._server is not None:
+            self._server.close()
+        for client in self._clients:
+            client.connection.close()
+        if self._place.path is not None:
+            self._place.path.unlink(missing_ok=True)
+
+    def _send(self, body: bytes, clients: list[_Client]) -> None:
+        for client in clients:
+            try:
+                if not client.flush():
+                    client.missed += 1
+                    continue
+                client.pending, client.missed = self._format.framed(body, client.missed), 0
+                client.flush()
+            except OSError:
+                self._forget(client)
+
+    def _forget(self, client: _Client) -> None:
+        client.connection.close()
+        with self._lock:
+            self._clients.remove(client)
+
+    def _accept(self, server: socket.socket) -> None:
+        while True:
+            try:
+                connection, _ = server.accept()
+            except OSError:
+                return
+            with self._lock:
+                full = len(self._clients) + self._guests >= MOST_CLIENTS
+                self._guests += not full
+            if full:
+                connection.close()
+            else:
+                threading.Thread(target=self._welcome, args=(connection,), daemon=True).start()
+
+    def _welcome(self, connection: socket.socket) -> None:
+        """Encrypt and ask for the token where that is needed; then the client gets poses."""
+        client = None
+        with contextlib.suppress(OSError, UnicodeError):
+            connection.settimeout(HELLO_S)
+            if self._rules.tls is not None:
+                connection = self._rules.tls.wrap_socket(connection, server_side=True)
+            if not self._rules.token or self._rules.allows(_first_line(connection)):
+                client = _Client(_streaming(connection))
+        if client is None:
+            connection.close()
+        with self._lock:
+            self._guests -= 1
+            self._clients += [client] if client is not None else []
+
+
+def _streaming(connection: socket.socket) -> socket.socket:
+    """A connection that never blocks and does not keep old poses."""
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
+    if connection.family != socket.AF_UNIX:
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    connection.setblocking(False)
+    return connection
+
+
+def _first_line(connection: socket.socket) -> str:
+    data = b""
+    while not data.endswith(b"\n") and len(data) < HELLO_BYTES:
+        more = connection.recv(HELLO_BYTES - len(data))
+        if not more:
+            break
+        data += more
+    return data.decode("ascii").strip()
