@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from stereo_sfm.calib.check import CheckReport, Finding
-    from stereo_sfm.tracking.flow.readout import ReadoutErrors, ReadoutSearch
+    from stereo_sfm.tracking.flow.readout import Readout, ReadoutSearch
     from stereo_sfm.types import StereoImage
 
 SHUTTER_FRAMES = 200  # looked at for a rolling shutter
@@ -72,8 +72,8 @@ def run(args: argparse.Namespace) -> int:
         shutter = ReadoutSearch(Config().tracker, rig)
         images = _searched(itertools.islice(source, options.max_frames), shutter)
         windows = collect(images, rectification, options.windows, gap, corners, options.search)
-        readout = shutter.errors()
-        report = check(rig, rectification, windows, rolling=readout.best_s > 0)
+        readout = shutter.measured()
+        report = check(rig, rectification, windows, rolling=readout.best_s != 0)
         report = replace(report, findings=(*report.findings, _shutter(rig.shutter, readout)))
     if options.correct is not None:
         save_rig(report.choice.apply(rig), options.correct)
@@ -94,22 +94,20 @@ def _searched(images: Iterable[StereoImage], shutter: ReadoutSearch) -> Iterator
         yield image
 
 
-def _shutter(known: str, errors: ReadoutErrors) -> Finding:
+def _shutter(known: str, readout: Readout) -> Finding:
     from stereo_sfm.calib.check import UNKNOWN, Finding
 
-    own_ms, best_ms = 1e3 * float(errors.readout_s[0]), 1e3 * errors.best_s
-    if not errors.shown:
-        return Finding("shutter", 0, f"{known}; {UNKNOWN}", judged=False)
-    if errors.explained_otherwise:
-        how = "the gain does not depend on the motion as with a rolling shutter: the calibration may be wrong"
-        return Finding("shutter", 0, f"{known}; another readout fits {100 * errors.gain:.0f} % better, but {how}")
-    if best_ms == own_ms:
-        return Finding("shutter", 0, f"{known}; points are off by {errors.error_px[0]:.2f} px (median)")
-    better = f"{known}, but points fit {100 * errors.gain:.0f} % better"
-    if best_ms < own_ms:
-        return Finding("shutter", 1, f"{better} with a readout of {best_ms:g} ms: check readout_s in rig.yaml")
-    how = f"with a readout of {best_ms:g} ms or more: set readout_s in rig.yaml (see the data sheet)"
-    return Finding("shutter", 1, f"{better} {how}")
+    measured = f"{1e3 * abs(readout.measured_s):.0f} ± {1e3 * readout.sigma_s:.0f} ms"
+    if not readout.known:
+        return Finding("shutter", 0, f"{known}; {UNKNOWN} unsteadily", judged=False)
+    if not readout.differs:
+        error = f"points are off by {readout.error_px:.2f} px (median)"
+        return Finding("shutter", 0, f"{known}; {error}; measured from the motion: {measured}")
+    if readout.measured_s < 0:
+        upwards = f"{known}, but the motion shows rows read from the last to the first within {measured}"
+        return Finding("shutter", 1, f"{upwards}, which no calibration can say: read the images the other way up")
+    what = "check readout_s in rig.yaml" if readout.told_s else "set readout_s in rig.yaml (see the data sheet)"
+    return Finding("shutter", 1, f"{known}, but the motion shows rows read within {measured}: {what}")
 
 
 def _check(options: CheckOptions) -> None:

@@ -1,17 +1,23 @@
-"""Does the camera expose its rows one after the other? The residuals of tracking with several readouts tell.
+"""Within what time are the rows of an image exposed? Measured from how points move between images.
 
-That points fit better with another readout is not enough. A camera that drives straight ahead displaces the rows of a
-rolling shutter in every image by the same amount, and so does a calibration that is slightly wrong: a right camera
-turned by 0.1 degrees makes KITTI's global shutter fit 10 % better with rows read within 30 ms. What a wrong calibration
-displaces stays in place when the motion changes, what the rows displace changes with it: then the right readout gains
-the more the further the motion is from the usual one, while for a wrong calibration every unusual motion makes the
-other readout fit worse. So the gain must grow with the distance of the angular velocity from its median.
+A row exposed s after an image's stamp sees from where the camera is then: points are displaced by s times what the
+velocity does to them. A steady velocity displaces a point by the same amount in successive images, and a calibration
+that is slightly wrong does so as well, in proportion to the velocity. A change of velocity does what no calibration
+does: it displaces the rows of an image against those of the image before by readout * (row / rows - 1/2) * J *
+(change of velocity), with J the derivatives of pixels by the pose. The readout is the coefficient of this
+displacement in a regression of the points' movements, beside the pose of the image and the displacement by the
+velocity itself, with robust weights. Its standard error is from the spread between images, which also differ in what
+the regression leaves out (cluster-robust; Liang and Zeger, Biometrika 73, 1986). A camera that moves steadily leaves
+the readout unknown, and the standard error says so.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -19,87 +25,143 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.tracking.flow.tracker import Tracker
-from stereo_sfm.types import F64, StereoImage
+from stereo_sfm.types import F64, I64, StereoImage
 
-READOUTS_S = (0.0, 0.01, 0.02, 0.03)  # the errors tell it to about 10 ms
-LEAST_FRAMES = 20
-NEARLY = 0.1  # of the gain: errors are flat beyond the true readout
-LEAST_EVIDENCE = 2.0  # standard deviations by which the gain must follow the motion
-LEAST_GAIN = 0.05  # global shutters gain up to 0.03 by chance and by faults of the lens model
+LEAST_PAIRS = 20  # of images
+LEAST_POINTS = 30  # in both images of a pair
+DEVIATIONS = 4.0  # a readout differs from the calibration's by more standard errors than that, ...
+DIFFERENT_S = 0.005  # ... and by more than this, since velocities between images are known to some percent only
+KNOWN_S = 0.005  # with a greater standard error a readout of 20 ms, a common one, cannot be told from none
+CAUCHY = 2.0  # standard deviations
+ROUNDS = 4  # of reweighting
 
 
-@dataclass(frozen=True, eq=False)
-class ReadoutErrors:
-    """How well the points of a recording fit, by readout."""
+@dataclass(frozen=True)
+class Readout:
+    """What a recording shows of its camera's rows."""
 
-    readout_s: F64  # (R,) seconds, the first one the rig's own
-    error_px: F64  # (R,) mean over the frames of the median residual; NaN without enough frames
-    evidence: float = math.inf  # how surely the best one's gain grows with unusual motion, in standard deviations
+    told_s: float  # the calibration's
+    measured_s: float  # NaN without enough images; negative: read from the bottom up
+    sigma_s: float  # standard error
+    error_px: float  # median distance of points from where they are expected, mean over the images
+
+    @property
+    def differs(self) -> bool:
+        """Whether the calibration's readout is wrong."""
+        return abs(self.measured_s - self.told_s) > max(DEVIATIONS * self.sigma_s, DIFFERENT_S)
+
+    @property
+    def known(self) -> bool:
+        """Whether the recording shows it: a camera that moves steadily does not."""
+        return self.differs or self.sigma_s < KNOWN_S
 
     @property
     def best_s(self) -> float:
-        """The shortest readout that fits about as well as the best; the rig's own where none is clearly better."""
-        if not self.gain > LEAST_GAIN or self.explained_otherwise:
-            return float(self.readout_s[0])
-        enough = self.error_px.min() + NEARLY * (self.error_px[0] - self.error_px.min())
-        return float(self.readout_s[self.error_px <= enough].min())
+        """The measured one where the calibration's is wrong, else that."""
+        return self.measured_s if self.differs else self.told_s
 
-    @property
-    def explained_otherwise(self) -> bool:
-        """Whether another readout fits better, but not as rows do that follow the motion: as a wrong calibration."""
-        return self.gain > LEAST_GAIN and not self.evidence > LEAST_EVIDENCE
 
-    @property
-    def shown(self) -> bool:
-        """Whether the recording tells readouts apart: a camera that hardly moves fits them all."""
-        return float(np.ptp(self.error_px)) > LEAST_GAIN * float(self.error_px.min())
+@dataclass(frozen=True, eq=False)
+class _View:
+    """The points of one image that agree with its pose."""
 
-    @property
-    def gain(self) -> float:
-        """By what part the error is smaller with the best one than with the rig's own; NaN when it is not known."""
-        return float(1 - self.error_px.min() / self.error_px[0])
+    stamp_ns: int
+    odom_T_cam: F64  # (4, 4)
+    point_ids: I64  # (N,)
+    uv: F64  # (N, 2) px
+    points: F64  # (N, 3) metres, odometry frame
 
 
 class ReadoutSearch:
-    """One tracker for each readout, on the same images."""
+    """Tracks a recording and measures its readout on the way."""
 
     def __init__(self, config: TrackerConfig, rig: Rig) -> None:
-        readouts = (rig.readout_s, *(s for s in READOUTS_S if abs(s - rig.readout_s) > 0.004))
-        self._readout_s = np.array(readouts)
-        self._trackers = [Tracker(config, replace(rig, readout_s=s)) for s in readouts]
-        self._errors: list[list[float]] = []
-        self._poses: list[F64] = []
-        self._stamps: list[int] = []
+        self._rig, self._tracker = rig, Tracker(config, rig)
+        self._views: deque[_View] = deque(maxlen=4)
+        self._pairs: list[tuple[float, float]] = []  # weighted sums: displacement * movement, displacement squared
+        self._error_px: list[float] = []
 
     def add(self, image: StereoImage) -> None:
         """Track one more image."""
-        frames = [tracker.step(image)[0] for tracker in self._trackers]
-        solutions = [tracker.solution for tracker in self._trackers]
-        self._errors.append([math.nan if s is None else s.residual_px for s in solutions])
-        self._poses.append(frames[0].odom_T_cam)
-        self._stamps.append(image.stamp_ns)
+        frame, _ = self._tracker.step(image)
+        seen, solution = frame.observations, self._tracker.solution
+        if solution is None or solution.reason:
+            self._views.clear()
+            return
+        self._error_px.append(solution.residual_px)
+        good = seen.inlier
+        points = self._tracker.points[good]
+        self._views.append(_View(image.stamp_ns, frame.odom_T_cam, seen.point_ids[good], seen.uv_left[good], points))
+        if len(self._views) == 4:
+            self._compare(*self._views)
 
-    def errors(self) -> ReadoutErrors:
+    def measured(self) -> Readout:
         """What was found until now."""
-        errors: F64 = np.array(self._errors, float).reshape(-1, len(self._trackers))
-        known = np.isfinite(errors).all(axis=1) & (np.arange(len(errors)) > 0)  # no motion led to the first
-        if known.sum() < LEAST_FRAMES:
-            return ReadoutErrors(self._readout_s, np.full(len(self._trackers), np.nan))
-        mean = errors[known].mean(0)
-        gain = errors[:, 0] ** 2 - errors[:, int(mean.argmin())] ** 2
-        return ReadoutErrors(self._readout_s, mean, _follows(gain[known], self._unusual()[known]))
+        product, square = np.array(self._pairs, float).reshape(-1, 2).T
+        total = float(square.sum())
+        if len(self._pairs) < LEAST_PAIRS or total <= 0:
+            return Readout(self._rig.readout_s, math.nan, math.nan, math.nan)
+        readout_s = float(product.sum()) / total
+        rest = product - readout_s * square
+        neighbours = float(rest[1:] @ rest[:-1])  # successive pairs share an image
+        sigma_s = math.sqrt(rest @ rest + 2 * max(neighbours, 0.0)) / total
+        return Readout(self._rig.readout_s, readout_s, sigma_s, float(np.mean(self._error_px)))
 
-    def _unusual(self) -> F64:
-        """(F,) rad/s between the angular velocity that led to each frame and the median one."""
-        poses, seconds = np.array(self._poses), np.diff(self._stamps) * 1e-9
-        turns = se3.so3_log((se3.inverse(poses[:-1]) @ poses[1:])[:, :3, :3]) / np.maximum(seconds, 1e-6)[:, None]
-        return np.concatenate([[0.0], np.linalg.norm(turns - np.median(turns, axis=0), axis=1)])
+    def _compare(self, first: _View, before: _View, now: _View, last: _View) -> None:
+        """Of four successive views the two in the middle, whose velocities are known."""
+        velocities = _velocity((first, before, now)), _velocity((before, now, last))
+        _, i, j = np.intersect1d(before.point_ids, now.point_ids, return_indices=True)
+        if len(i) < LEAST_POINTS or velocities[0] is None or velocities[1] is None:
+            return
+        points = now.points[j]
+        uv_before, _ = self._project(before, points)
+        uv_now, by_pose = self._project(now, points)
+        moved = (now.uv[j] - uv_now) - (before.uv[i] - uv_before)
+        row = (now.uv[j, 1] / (self._rig.left.height - 1) - 0.5)[:, None]
+        by_velocity = row * (by_pose @ (0.5 * (velocities[0] + velocities[1])))
+        by_change = row * (by_pose @ (velocities[1] - velocities[0]))
+        columns = np.concatenate([by_pose, by_velocity[..., None], by_change[..., None]], axis=2)
+        visible = np.isfinite(columns).all(axis=(1, 2)) & np.isfinite(moved).all(axis=1)
+        if visible.sum() >= LEAST_POINTS:
+            self._pairs.append(_last_coefficient(columns[visible], moved[visible]))
+
+    def _project(self, view: _View, points: F64) -> tuple[F64, F64]:
+        """Pixels (N, 2) of points (N, 3) and their derivatives (N, 2, 6) by odom_T_cam @ exp(xi)."""
+        points_cam = se3.transform(se3.inverse(view.odom_T_cam), points)
+        uv, by_point = self._rig.left.project_jacobian(points_cam)
+        return uv, np.concatenate([-by_point, by_point @ se3.skew(points_cam)], axis=2)
 
 
-def _follows(gain: F64, unusual: F64) -> float:
-    """How surely one of two columns grows with the other: Spearman's rank correlation in standard deviations."""
-    if np.ptp(gain) == 0 or np.ptp(unusual) == 0:
-        return 0.0
-    ranks = [np.argsort(np.argsort(column, kind="stable")) - 0.5 * (len(column) - 1) for column in (gain, unusual)]
-    rho = float(ranks[0] @ ranks[1] / np.sqrt((ranks[0] @ ranks[0]) * (ranks[1] @ ranks[1])))
-    return rho * math.sqrt((len(gain) - 2) / max(1 - rho * rho, 1e-9))
+def _velocity(views: Sequence[_View]) -> F64 | None:
+    """(6,) tangent a second at the second of three views, exact for a constant acceleration; None without times."""
+    means: list[F64] = []
+    seconds: list[float] = []
+    for a, b in pairwise(views):
+        seconds.append((b.stamp_ns - a.stamp_ns) * 1e-9)
+        if seconds[-1] <= 0:
+            return None
+        means.append(se3.log(se3.inverse(a.odom_T_cam) @ b.odom_T_cam) / seconds[-1])
+    return (seconds[1] * means[0] + seconds[0] * means[1]) / (seconds[0] + seconds[1])
+
+
+def _last_coefficient(columns: F64, moved: F64) -> tuple[float, float]:
+    """Normal equation of the last column's coefficient in a robust regression, the others eliminated.
+
+    Args:
+        columns: (N, 2, C). moved: (N, 2) px.
+
+    Returns:
+        Right and left side, in units of the noise.
+    """
+    weight, sigma = np.ones(len(moved)), 1.0
+    flat, target = columns.reshape(2 * len(moved), -1), moved.ravel()
+    for _ in range(ROUNDS):
+        weighted = flat * np.repeat(weight, 2)[:, None]
+        coefficients = np.linalg.pinv(weighted.T @ flat, hermitian=True) @ (weighted.T @ target)
+        error = np.hypot(*(target - flat @ coefficients).reshape(-1, 2).T)
+        sigma = max(float(np.median(error)) / math.sqrt(2 * math.log(2)), 1e-3)  # of a Rayleigh distribution
+        weight = 1 / (1 + (error / (CAUCHY * sigma)) ** 2)
+    weighted = flat * np.repeat(weight / sigma**2, 2)[:, None]
+    normal, right = weighted.T @ flat, weighted.T @ target
+    eliminated = normal[-1, :-1] @ np.linalg.pinv(normal[:-1, :-1], hermitian=True)
+    return float(right[-1] - eliminated @ right[:-1]), float(normal[-1, -1] - eliminated @ normal[:-1, -1])

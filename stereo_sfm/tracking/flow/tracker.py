@@ -96,6 +96,11 @@ class Tracker:
         self._map_version = 0
         self.solution: PoseSolution | None = None  # of the last image; None where points were only begun
 
+    @property
+    def points(self) -> F64:
+        """(N, 3) metres, odometry frame: the points of the last frame's observations, where that has a pose."""
+        return self._tracks.points()
+
     def apply(self, update: MapUpdate) -> None:
         """Take the mapper's better positions of points, and the rig where that was corrected."""
         self._map_version = update.version
