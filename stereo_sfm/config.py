@@ -158,6 +158,9 @@ class MapperConfig:
     window_keyframes: int = number(
         12, 0, 10_000, "Keyframes optimized by local bundle adjustment, the new one included; 0: all connected"
     )
+    fixed_keyframes: int = number(
+        40, 0, 10_000, "Older keyframes that hold those in place, the ones that share most points with them; 0: all"
+    )
     connected_points: int = number(15, 1, 100_000, "Shared points that make two keyframes neighbours")
     sigma_px: float = number(0.4, 0.001, 100, "Noise of one coordinate of a tracked point")
     huber_sigmas: float = number(
@@ -196,6 +199,11 @@ class MapperConfig:
     def most_keyframes(self) -> int | None:
         """`window_keyframes` as the end of a slice: None takes all."""
         return self.window_keyframes if self.window_keyframes > 0 else None
+
+    @property
+    def most_fixed(self) -> int | None:
+        """`fixed_keyframes` as the end of a slice: None takes all."""
+        return self.fixed_keyframes if self.fixed_keyframes > 0 else None
 
 
 @dataclass(frozen=True)

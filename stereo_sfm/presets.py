@@ -14,7 +14,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "retail-thesis": {
         "features": {"kind": "sift", "mask_radius_px": 40.0, "stereo_check": "ransac"},
         "odometry": {"method": "em-r", "refine": False, "weighted": False},
-        "mapper": {"association": "previous", "window_keyframes": 0, "redundant_share": 2.0},
+        "mapper": {"association": "previous", "window_keyframes": 0, "fixed_keyframes": 0, "redundant_share": 2.0},
         "loop": {
             "reference": "best",
             "robust": "none",

@@ -14,7 +14,7 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
-from stereo_sfm.loop import p3p
+from stereo_sfm.loop import p3p, pose_kernels
 from stereo_sfm.types import F64, I64, Bool
 
 CHI2_2DOF_95 = 5.991
@@ -118,7 +118,7 @@ def refine_pose(b_T_a: F64, matches: Matches, rig: Rig, pixel_sigma: float, iter
 
 
 def _normal_equations(t: F64, m: Matches, rig: Rig, pixel_sigma: float, inlier: Bool) -> tuple[F64, F64, float]:
-    hessian, gradient, cost, count = np.zeros((6, 6)), np.zeros(6), 0.0, 0
+    hessian, gradient, sums = np.zeros((6, 6)), np.zeros(6), np.zeros(2)
     back = se3.inverse(t)
     eyes: list[tuple[Camera, F64]] = [(rig.left, np.eye(4))]
     if rig.right is not None:
@@ -128,30 +128,9 @@ def _normal_equations(t: F64, m: Matches, rig: Rig, pixel_sigma: float, inlier: 
             (m.points_a, m.sigmas_a, (m.uv_left_b, m.uv_right_b)[eye], t, True),
             (m.points_b, m.sigmas_b, (m.uv_left_a, m.uv_right_a)[eye], back, False),
         ):
-            rows = np.flatnonzero(inlier & np.isfinite(points[:, 0]) & np.isfinite(uv[:, 0]))
-            source = points[rows]
-            seen = se3.transform(eye_T_left @ pose, source)
-            projected, jac = camera.project_jacobian(seen)
-            ok = np.isfinite(projected[:, 0])
-            rows, source, projected, jac = rows[ok], source[ok], projected[ok], jac[ok]
-            moved = se3.transform(t, source) if forward else source  # in b, where xi acts
-            dmove = np.concatenate([np.broadcast_to(np.eye(3), (len(rows), 3, 3)), -se3.skew(moved)], axis=2)
-            rotation = eye_T_left[:3, :3] if forward else -(eye_T_left @ back)[:3, :3]
-            j = jac @ (rotation @ dmove)
-            weight, residual = _whiten(projected - uv[rows], jac, eye_T_left @ pose, source, sigmas[rows], pixel_sigma)
-            jw = np.swapaxes(j, 1, 2) @ weight
-            hessian += (jw @ j).sum(0)
-            gradient += (jw @ (projected - uv[rows])[..., None]).sum(0)[:, 0]
-            cost += float(residual.sum())
-            count += len(rows)
-    return hessian, gradient, float(np.sqrt(cost / max(2 * count, 1)))
-
-
-def _whiten(error: F64, jac: F64, pose: F64, source: F64, sigmas: F64, pixel_sigma: float) -> tuple[F64, F64]:
-    """Inverse covariances (N, 2, 2) with the range uncertainty, and squared normalised errors (N,)."""
-    ray = source / np.maximum(np.linalg.norm(source, axis=1), 1e-9)[:, None] * sigmas[:, None]
-    d = (jac @ (pose[:3, :3] @ ray[..., None]))[..., 0]
-    s2 = pixel_sigma**2
-    outer = d[:, :, None] * d[:, None, :]
-    weight = (np.eye(2) - outer / (s2 + (d * d).sum(1))[:, None, None]) / s2
-    return weight, np.einsum("ni,nij,nj->n", error, weight, error)
+            turn = eye_T_left[:3, :3] if forward else -(eye_T_left @ back)[:3, :3]
+            pose_kernels.add_normal_equations(
+                t, eye_T_left @ pose, np.ascontiguousarray(turn), forward, points, sigmas, uv, inlier,
+                camera.model_id, camera.params, pixel_sigma, hessian, gradient, sums,
+            )  # fmt: skip
+    return hessian, gradient, float(np.sqrt(sums[0] / max(2 * sums[1], 1)))

@@ -16,7 +16,7 @@ from stereo_sfm.loop.database import PlaceDatabase
 from stereo_sfm.loop.graph import KeyframeGraph
 from stereo_sfm.loop.keyframe_store import KeyframeStore
 from stereo_sfm.loop.place_view import PlaceView, place_view_of
-from stereo_sfm.loop.verification import Verdict, verify, within
+from stereo_sfm.loop.verification import Verdict, looks_alike, rejection, verify, within
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.types import F64, Keyframe, LoopResult
@@ -63,7 +63,6 @@ class LoopCloser:
         self._graph = KeyframeGraph()
         self._pending: list[_Hypothesis] = []
         self._last_loop = -(10**9)
-        self._forgotten: set[int] = set()
 
     @property
     def vocabulary(self) -> Vocabulary:
@@ -97,11 +96,11 @@ class LoopCloser:
     def _forget(self, newest: int) -> None:
         """Of a view that was seen many times keep the first and the last few: a day in one store fits into memory."""
         settled = newest - FRESH
-        if settled not in self._row or settled in self._forgotten:
+        if settled not in self._store:
             return
-        crowd = [k for k in self._graph.same_view(settled) if k <= settled and k not in self._forgotten]
+        crowd = [k for k in self._graph.same_view(settled) if k <= settled]
         if len(crowd) > CROWD:
-            self._forgotten.add(crowd[1])
+            self._graph.forget(crowd[1])
             self._store.remove(crowd[1])
         if 2 * len(self._store) < len(self._database) - FRESH:
             self._row = {k: row for row, k in enumerate(self._store.ids)}
@@ -121,7 +120,8 @@ class LoopCloser:
         bound = max(config.score_ratio * reference, config.min_score)
         excluded = self._near(keyframe.kf_id, connected)
         ids = self._database.kf_ids
-        good = [int(i) for i in np.flatnonzero(scores > bound) if int(ids[i]) not in excluded]
+        good = [i for i in np.flatnonzero(scores > bound).tolist() if int(ids[i]) in self._store]
+        good = [i for i in good if int(ids[i]) not in excluded]
         good.sort(key=lambda i: (-scores[i], i))
         places: list[int] = []
         if config.proximity:
@@ -136,7 +136,7 @@ class LoopCloser:
     def _near(self, kf_id: int, connected: list[int]) -> set[int]:
         """Keyframes that cannot be loops: connected to this one, or just before it in the same piece of odometry."""
         before = range(max(kf_id - self._config.min_gap, 0), kf_id + 1)
-        return {*connected, *(k for k in before if self._graph.unbroken(k, kf_id)), *self._forgotten}
+        return {*connected, *(k for k in before if self._graph.unbroken(k, kf_id))}
 
     def _judge(self, keyframe: Keyframe, candidates: list[tuple[int, float]], why_none: str) -> LoopResult:
         if not candidates:
@@ -166,6 +166,8 @@ class LoopCloser:
     def _verify(self, keyframe: Keyframe, view: PlaceView, candidate: int) -> Verdict:
         config = self._config
         centre = self._store[candidate]
+        if not looks_alike(view, centre, config):
+            return rejection("too_few_matches")
         around = [self._store[k] for k in self._store.best_connected(candidate, CLOUD_KEYFRAMES)]
         around = [k for k in around if k.submap_id == centre.submap_id]
         cloud = gather(centre, around, self._rig, config.disparity_sigma_px)

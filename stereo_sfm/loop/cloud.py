@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
@@ -14,6 +15,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.hamming import as_words, hamming
 from stereo_sfm.geometry.kernels import njit
+from stereo_sfm.geometry.pixel_grid import cells_near, make_grid
 from stereo_sfm.loop.place_view import PlaceView, place_view_of
 from stereo_sfm.types import F64, I64, U8, Bool, Keyframe
 
@@ -38,6 +40,12 @@ class Cloud:
     def __len__(self) -> int:
         return len(self.ids)
 
+    def part(self, rows: slice) -> Cloud:
+        """Some of its rows, not copied."""
+        columns: dict[str, Any] = {f.name: getattr(self, f.name)[rows] for f in fields(self)}
+        columns["centre_T_kf"] = self.centre_T_kf
+        return Cloud(**columns)
+
     def seen_by_centre(self, rows: I64) -> tuple[F64, F64]:
         """Left and right pixels (N, 2) of these rows in the centre's image, NaN for views of other keyframes."""
         own = (self.view[rows] == 0)[:, None]
@@ -51,39 +59,34 @@ def gather(centre: Keyframe, others: Sequence[Keyframe], rig: Rig, disparity_sig
     """
     keyframes = [centre, *others]
     centre_T_kf = np.stack([se3.inverse(centre.odom_T_cam) @ k.odom_T_cam for k in keyframes])
-    parts: list[Cloud] = []
-    for k, keyframe in enumerate(keyframes):
-        view = place_view_of(keyframe, rig, disparity_sigma)
+    views = [place_view_of(keyframe, rig, disparity_sigma) for keyframe in keyframes]
+    cloud, count = _room(sum(len(view.ids) for view in views), centre_T_kf), 0
+    for k, view in enumerate(views):
         ids = view.ids.copy()
         nameless = np.flatnonzero(ids < 0)
         ids[nameless] = -1 - k * CORNERS - nameless
         if k and len(nameless):
-            so_far = _joined(parts, centre_T_kf)
+            so_far = cloud.part(slice(count))
             rows, at = match_guided(se3.inverse(centre_T_kf[k]), view, so_far, rig, SAME_CORNER_BITS, SAME_CORNER_PX)
             corner = view.corner[rows]
             known, first = np.unique(so_far.ids[at[corner]], return_index=True)
             ids[rows[corner][first]] = known
-        deep = np.isfinite(view.points[:, 2])
-        parts.append(
-            Cloud(
-                ids[deep],
-                se3.transform(centre_T_kf[k], view.points[deep]),
-                view.sigmas[deep],
-                view.descriptors[deep],
-                view.uv_left[deep],
-                view.uv_right[deep],
-                view.corner[deep],
-                np.full(int(deep.sum()), k),
-                centre_T_kf,
-            )
-        )
-    return _joined(parts, centre_T_kf)
+        deep = np.flatnonzero(np.isfinite(view.points[:, 2]))
+        new = cloud.part(slice(count, count + len(deep)))
+        new.ids[:], new.view[:], new.points[:] = ids[deep], k, se3.transform(centre_T_kf[k], view.points[deep])
+        for name in ("sigmas", "descriptors", "uv_left", "uv_right", "corner"):
+            getattr(new, name)[:] = getattr(view, name)[deep]
+        count += len(deep)
+    return cloud.part(slice(count))
 
 
-def _joined(parts: list[Cloud], centre_T_kf: F64) -> Cloud:
-    names = [f.name for f in fields(Cloud) if f.name != "centre_T_kf"]
-    columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-    return Cloud(**columns, centre_T_kf=centre_T_kf)
+def _room(count: int, centre_T_kf: F64) -> Cloud:
+    """A cloud of so many rows to be filled in."""
+    three, two, one = (np.empty((count, n)) for n in (3, 2, 1))
+    return Cloud(
+        np.empty(count, np.int64), three, one[:, 0], np.empty((count, 32), np.uint8), two, two.copy(),
+        np.empty(count, bool), np.empty(count, np.int64), centre_T_kf,
+    )  # fmt: skip
 
 
 def match_guided(
@@ -111,24 +114,25 @@ def _nearest_within(uv_b, words_b, kind_b, uv_a, words_a, kind_a, radius, max_di
     low = np.full(n, max_distance + 1, np.int32)
     best_a = np.full(m, -1, np.int32)
     low_a = np.full(m, max_distance + 1, np.int32)
-    order = np.argsort(uv_b[:, 0])
-    columns = uv_b[order, 0]
+    frame, shape, starts, members = make_grid(uv_b, radius)
     for j in range(m):
-        if not np.isfinite(uv_a[j, 0]):
+        if not math.isfinite(uv_a[j, 0]):
             continue
-        for at in range(np.searchsorted(columns, uv_a[j, 0] - radius), n):
-            if columns[at] > uv_a[j, 0] + radius:
-                break
-            i = order[at]
-            if abs(uv_b[i, 1] - uv_a[j, 1]) > radius or kind_b[i] != kind_a[j]:
-                continue
-            d = hamming(words_b, i, words_a, j)
-            if d < low[i]:
-                low[i] = d
-                best[i] = j
-            if d < low_a[j] or (d == low_a[j] and i < best_a[j]):
-                low_a[j] = d
-                best_a[j] = i
+        left, right, top, bottom = cells_near(uv_a[j, 0], uv_a[j, 1], frame, shape)
+        for line in range(top, bottom if left < right else top):
+            for at in range(starts[line * shape[0] + left], starts[line * shape[0] + right]):
+                i = members[at]
+                if abs(uv_b[i, 0] - uv_a[j, 0]) > radius or abs(uv_b[i, 1] - uv_a[j, 1]) > radius:
+                    continue
+                if kind_b[i] != kind_a[j]:
+                    continue
+                d = hamming(words_b, i, words_a, j)
+                if d < low[i]:
+                    low[i] = d
+                    best[i] = j
+                if d < low_a[j] or (d == low_a[j] and i < best_a[j]):
+                    low_a[j] = d
+                    best_a[j] = i
     for i in range(n):
         if best[i] >= 0 and best_a[best[i]] != i:
             best[i] = -1

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Container
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import scipy.sparse
 from scipy.sparse.csgraph import dijkstra
 
 from stereo_sfm.geometry import se3
-from stereo_sfm.types import F64, I64
+from stereo_sfm.mapping.columns import Columns, Spec
+from stereo_sfm.types import F64, I64, Bool
 
 NEAR_METRES, NEAR_RADIANS = 1.5, 0.7  # keyframes that should see the same things
 SAME_METRES, SAME_RADIANS = 0.3, 0.25  # keyframes that show the same view
@@ -35,70 +37,101 @@ class Jump:
     walked: float  # metres of odometry between the gap and the loop's two ends
 
 
+class _Nodes(Columns):
+    """One row a keyframe."""
+
+    kf_id: I64  # ascending
+    stamp_ns: I64
+    chain: I64  # number of the unbroken piece of odometry
+    odom_T_cam: F64  # (K, 4, 4)
+    anchored: F64  # (K, 4, 4) the same, taken back at each loop to where its older end stood
+    frame: I64  # the chain whose coordinates `anchored` is in
+    walked: F64  # metres since the start
+    kept: Bool  # may be found again
+
+    SPEC: ClassVar[Spec] = {
+        "kf_id": (np.int64, (), -1),
+        "stamp_ns": (np.int64, (), 0),
+        "chain": (np.int64, (), 0),
+        "odom_T_cam": (np.float64, (4, 4), np.eye(4)),
+        "anchored": (np.float64, (4, 4), np.eye(4)),
+        "frame": (np.int64, (), 0),
+        "walked": (np.float64, (), 0.0),
+        "kept": (np.bool_, (), True),
+    }
+
+
+class _Loops(Columns):
+    """One row an accepted loop."""
+
+    ends: I64  # (L, 2) rows of the keyframes a and b
+    a_T_b: F64  # (L, 4, 4)
+
+    SPEC: ClassVar[Spec] = {"ends": (np.int64, (2,), -1), "a_T_b": (np.float64, (4, 4), np.eye(4))}
+
+
 class KeyframeGraph:
     """Keyframes in order of time; consecutive ones are linked by odometry unless tracking restarted between them."""
 
     def __init__(self) -> None:
-        self._poses: dict[int, F64] = {}  # odom_T_cam
-        self._chain: dict[int, int] = {}  # number of the unbroken piece of odometry
-        self._loops: list[tuple[int, int, F64]] = []  # a, b, a_T_b
-        self._last = -1
-        self._ids: I64 = np.zeros(64, np.int64)
-        self._stack: F64 = np.empty((64, 4, 4))  # odom_T_cam of _ids, for vectorised search
-        self._anchored: F64 = np.empty((64, 4, 4))  # the same, taken back at each loop to where its older end stood
-        self._chains: I64 = np.zeros(64, np.int64)
-        self._walked: F64 = np.zeros(64)  # metres since the start
-        self._stamps: I64 = np.zeros(64, np.int64)
+        self._nodes, self._loops = _Nodes(), _Loops()
         self._joined: dict[int, int] = {}  # number of the chains' group that loops hold together
-        self._frames: I64 = np.zeros(64, np.int64)  # the chain whose coordinates _anchored is in
-        self._count = 0
+
+    def _row(self, kf_id: int) -> int:
+        return int(np.searchsorted(self._nodes.kf_id, kf_id))
 
     def add(self, kf_id: int, odom_T_cam: F64, chain: int, stamp_ns: int = 0) -> None:
         """Append the newest keyframe of an unbroken piece of odometry called `chain`."""
-        step = np.linalg.norm(odom_T_cam[:3, 3] - self._poses[self._last][:3, 3]) if self._last >= 0 else 0.0
-        self._poses[kf_id], self._chain[kf_id], self._last = odom_T_cam, chain, kf_id
-        if self._count == len(self._ids):
-            self._ids, self._stack = np.tile(self._ids, 2), np.tile(self._stack, (2, 1, 1))
-            self._chains, self._frames = np.tile(self._chains, 2), np.tile(self._frames, 2)
-            self._anchored, self._walked = np.tile(self._anchored, (2, 1, 1)), np.tile(self._walked, 2)
-            self._stamps = np.tile(self._stamps, 2)
-        self._stamps[self._count] = stamp_ns
+        anchored, frame, walked = odom_T_cam, chain, 0.0
+        if len(self._nodes):
+            last = self._nodes.odom_T_cam[-1]
+            walked = float(self._nodes.walked[-1] + np.linalg.norm(odom_T_cam[:3, 3] - last[:3, 3]))
+            if self._nodes.chain[-1] == chain:
+                anchored, frame = self._nodes.anchored[-1] @ se3.inverse(last) @ odom_T_cam, self._nodes.frame[-1]
         self._joined.setdefault(chain, chain)
-        self._ids[self._count], self._stack[self._count], self._chains[self._count] = kf_id, odom_T_cam, chain
-        self._anchored[self._count], self._frames[self._count] = odom_T_cam, chain
-        self._walked[self._count] = (self._walked[self._count - 1] if self._count else 0.0) + float(step)
-        if self._count and self._chains[self._count - 1] == chain:
-            moved = se3.inverse(self._stack[self._count - 1]) @ odom_T_cam
-            self._anchored[self._count] = self._anchored[self._count - 1] @ moved
-            self._frames[self._count] = self._frames[self._count - 1]
-        self._count += 1
+        self._nodes.append(
+            1, kf_id=kf_id, stamp_ns=stamp_ns, chain=chain, odom_T_cam=odom_T_cam, anchored=anchored, frame=frame,
+            walked=walked,
+        )  # fmt: skip
+
+    def forget(self, kf_id: int) -> None:
+        """A keyframe that is not to be found any more; the ways that lead over it stay."""
+        self._nodes.kept[self._row(kf_id)] = False
 
     def unbroken(self, a: int, b: int) -> bool:
         """Whether odometry leads from one keyframe to the other."""
-        return a in self._chain and self._chain[a] == self._chain[b]
+        row_a, row_b, nodes = self._row(a), self._row(b), self._nodes
+        known = row_a < len(nodes) and nodes.kf_id[row_a] == a
+        return bool(known and nodes.chain[row_a] == nodes.chain[row_b])
 
     def same_view(self, kf_id: int) -> list[int]:
         """Keyframes, this one among them, that stood where it stood and looked where it looked, oldest first."""
-        part = slice(0, self._count)
-        row = int(np.searchsorted(self._ids[part], kf_id))
-        metres, radians = se3.extent(se3.inverse(self._anchored[part]) @ self._anchored[row])
-        same = (metres < SAME_METRES) & (radians < SAME_RADIANS) & (self._frames[part] == self._frames[row])
-        return self._ids[part][same].tolist()
+        nodes, row = self._nodes, self._row(kf_id)
+        rows, _, radians = self._around(nodes.anchored, row, nodes.frame, SAME_METRES)
+        return nodes.kf_id[rows[radians < SAME_RADIANS]].tolist()
 
     def nearby(self, kf_id: int, excluded: Container[int]) -> list[int]:
         """The keyframe of the same piece of odometry that stood nearest and looked the same way, if near at all."""
-        part = slice(0, self._count)
-        metres, radians = se3.extent(se3.inverse(self._stack[part]) @ self._poses[kf_id])
-        close = (metres < NEAR_METRES) & (radians < NEAR_RADIANS) & (self._chains[part] == self._chain[kf_id])
-        rows = [r for r in np.flatnonzero(close).tolist() if int(self._ids[r]) not in excluded]
-        return [int(self._ids[min(rows, key=lambda r: (metres[r] + 1 - np.cos(radians[r]), r))])] if rows else []
+        nodes, row = self._nodes, self._row(kf_id)
+        rows, metres, radians = self._around(nodes.odom_T_cam, row, nodes.chain, NEAR_METRES)
+        apart = metres + 1 - np.cos(radians)
+        for k in np.argsort(apart, kind="stable").tolist():
+            if radians[k] < NEAR_RADIANS and int(nodes.kf_id[rows[k]]) not in excluded:
+                return [int(nodes.kf_id[rows[k]])]
+        return []
+
+    def _around(self, poses: F64, row: int, frame: I64, reach: float) -> tuple[I64, F64, F64]:
+        """Kept rows whose poses are in the same frame as that of `row` and nearer than `reach`; metres and radians."""
+        rows = np.flatnonzero(self._nodes.kept & (frame == frame[row]))
+        rows = rows[np.linalg.norm(poses[rows, :3, 3] - poses[row, :3, 3], axis=1) < reach]
+        return rows, *se3.extent(se3.inverse(poses[rows]) @ poses[row])
 
     def add_loop(self, a: int, b: int, a_T_b: F64) -> None:
         """Link two keyframes whose relative pose was verified."""
-        self._loops.append((a, b, a_T_b))
-        row_a, row_b = np.searchsorted(self._ids[: self._count], (a, b)).tolist()
-        self._anchored[row_b], self._frames[row_b] = self._anchored[row_a] @ a_T_b, self._frames[row_a]
-        keep, gone = self._joined[self._chain[a]], self._joined[self._chain[b]]
+        nodes, row_a, row_b = self._nodes, self._row(a), self._row(b)
+        self._loops.append(1, ends=(row_a, row_b), a_T_b=a_T_b)
+        nodes.anchored[row_b], nodes.frame[row_b] = nodes.anchored[row_a] @ a_T_b, nodes.frame[row_a]
+        keep, gone = self._joined[int(nodes.chain[row_a])], self._joined[int(nodes.chain[row_b])]
         self._joined = {chain: keep if group == gone else group for chain, group in self._joined.items()}
 
     def jump(self, a: int, b: int, a_T_b: F64) -> Jump | None:
@@ -107,21 +140,23 @@ class KeyframeGraph:
         In the dark a robot goes on as before, stops, turns or goes half as fast again: all this is in a ball around the
         middle of the way that its speed makes likely.
         """
-        group = np.array([self._joined[chain] for chain in self._chains[: self._count].tolist()])
-        ours = {self._joined[self._chain[a]], self._joined[self._chain[b]]}
+        nodes = self._nodes
+        chains, chain_of = np.unique(nodes.chain, return_inverse=True)
+        group = np.array([self._joined[chain] for chain in chains.tolist()])[chain_of]
+        ours = {group[self._row(a)], group[self._row(b)]}
         gaps = [
-            (int(self._stamps[k + 1] - self._stamps[k]), k, velocity)
+            (int(nodes.stamp_ns[k + 1] - nodes.stamp_ns[k]), k, velocity)
             for k in np.flatnonzero(group[1:] != group[:-1]).tolist()
             if {group[k], group[k + 1]} == ours
-            and self._stamps[k + 1] > self._stamps[k]
+            and nodes.stamp_ns[k + 1] > nodes.stamp_ns[k]
             and (velocity := self._velocity(k)) is not None
         ]
         if not gaps:
             return None
         ns, k, velocity = min(gaps, key=lambda gap: gap[:2])
-        if self._joined[self._chain[a]] != group[k]:
+        if group[self._row(a)] != group[k]:
             a, b, a_T_b = b, a, se3.inverse(a_T_b)
-        before, after = self.way(int(self._ids[k]), a), self.way(b, int(self._ids[k + 1]))
+        before, after = self.way(int(nodes.kf_id[k]), a), self.way(b, int(nodes.kf_id[k + 1]))
         assert before is not None and after is not None
         moved = before.a_T_b @ a_T_b @ after.a_T_b
         off = float(np.linalg.norm(moved[:3, 3] - 0.5e-9 * ns * velocity))
@@ -130,32 +165,31 @@ class KeyframeGraph:
 
     def _velocity(self, row: int) -> F64 | None:
         """(3,) metres a second before a keyframe, in its camera; None for the first of a piece."""
-        if row == 0 or self._chains[row - 1] != self._chains[row] or self._stamps[row] <= self._stamps[row - 1]:
+        nodes = self._nodes
+        if row == 0 or nodes.chain[row - 1] != nodes.chain[row] or nodes.stamp_ns[row] <= nodes.stamp_ns[row - 1]:
             return None
-        step = se3.inverse(self._stack[row]) @ self._stack[row - 1]
-        return -step[:3, 3] / (1e-9 * float(self._stamps[row] - self._stamps[row - 1]))
+        step = se3.inverse(nodes.odom_T_cam[row]) @ nodes.odom_T_cam[row - 1]
+        return -step[:3, 3] / (1e-9 * float(nodes.stamp_ns[row] - nodes.stamp_ns[row - 1]))
 
     def way(self, a: int, b: int) -> Way | None:
         """The way with the fewest metres, or None where tracking broke and no loop joins the pieces (Dijkstra)."""
-        loops = np.array([loop[:2] for loop in self._loops], np.int64).reshape(-1, 2)
-        rows = np.unique(np.searchsorted(self._ids[: self._count], np.append(loops.ravel(), (a, b))))
-        nodes = self._ids[rows]
-        linked = np.flatnonzero(self._chains[rows[:-1]] == self._chains[rows[1:]])
-        ends = np.concatenate([np.stack([linked, linked + 1], 1), np.searchsorted(nodes, loops)])
+        nodes, loops = self._nodes, self._loops.ends
+        rows = np.unique(np.append(loops.ravel(), (self._row(a), self._row(b))))
+        linked = np.flatnonzero(nodes.chain[rows[:-1]] == nodes.chain[rows[1:]])
+        ends = np.concatenate([np.stack([linked, linked + 1], 1), np.searchsorted(rows, loops)])
         metres = np.zeros(len(ends))
-        metres[: len(linked)] = self._walked[rows[linked + 1]] - self._walked[rows[linked]]
+        metres[: len(linked)] = nodes.walked[rows[linked + 1]] - nodes.walked[rows[linked]]
         best = _shortest_of_each_pair(ends, metres)
-        start, goal = np.searchsorted(nodes, (a, b)).tolist()
-        path = _shortest_path(len(nodes), ends[best], metres[best], start, goal)
+        start, goal = np.searchsorted(rows, (self._row(a), self._row(b))).tolist()
+        path = _shortest_path(len(rows), ends[best], metres[best], start, goal)
         if path is None:
             return None
         a_T_b, total = np.eye(4), 0.0
         for edge, forward in path:
             k = int(best[edge])
-            p, q = nodes[ends[k]].tolist()
-            p_T_q = (
-                self._loops[k - len(linked)][2] if k >= len(linked) else se3.inverse(self._poses[p]) @ self._poses[q]
-            )
+            p, q = rows[ends[k]]
+            odometry = se3.inverse(nodes.odom_T_cam[p]) @ nodes.odom_T_cam[q] if k < len(linked) else None
+            p_T_q = self._loops.a_T_b[k - len(linked)] if odometry is None else odometry
             a_T_b = a_T_b @ (p_T_q if forward else se3.inverse(p_T_q))
             total += float(metres[k])
         return Way(a_T_b, total)
@@ -178,11 +212,12 @@ def _shortest_path(count: int, ends: I64, metres: F64, start: int, goal: int) ->
     distance, before = dijkstra(graph, directed=False, indices=start, return_predecessors=True)
     if not np.isfinite(distance[goal]):
         return None
-    edge_of = {(min(i, j), max(i, j)): k for k, (i, j) in enumerate(ends.tolist())}
+    keys = ends.min(1) * count + ends.max(1)  # of no two edges the same
+    order = np.argsort(keys)
     path: list[tuple[int, bool]] = []
     while goal != start:
         last = int(before[goal])
-        edge = edge_of[min(last, goal), max(last, goal)]
+        edge = int(order[np.searchsorted(keys, min(last, goal) * count + max(last, goal), sorter=order)])
         path.append((edge, int(ends[edge, 0]) == last))
         goal = last
     return path[::-1]

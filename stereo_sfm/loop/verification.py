@@ -17,10 +17,11 @@ from stereo_sfm.loop import binary
 from stereo_sfm.loop.absolute_pose import Matches, Pose, consistent, ransac_pose, refine_pose
 from stereo_sfm.loop.cloud import Cloud, match_guided
 from stereo_sfm.loop.place_view import PlaceView
-from stereo_sfm.mapping.bundle import Bundle, bundle_adjust
-from stereo_sfm.types import F64, I64
+from stereo_sfm.mapping.bundle import Bundle, BundleConfig, bundle_adjust
+from stereo_sfm.types import F64, I64, Keyframe
 
 GUIDED = (12.0, 4), (6.0, 10)  # rounds: radius of the search in px, most iterations
+FIRST_SHARE = 0.2  # of the matches that a place must have in the end, with the candidate alone
 RANSAC_SHARE = 0.4  # of the corners that must agree in the end, for the pose of three of them
 GRID = (8, 6)  # columns, rows
 
@@ -40,6 +41,15 @@ class Verdict:
 def rejection(reason: str, inliers: int = 0) -> Verdict:
     """A verdict against."""
     return Verdict(reason, np.eye(4), np.zeros((6, 6)), np.zeros((0, 2), np.int64), inliers, 0.0)
+
+
+def looks_alike(view: PlaceView, candidate: Keyframe, config: LoopConfig) -> bool:
+    """Whether a camera's corners match those of one keyframe well enough to gather the points around it."""
+    descriptors = view.descriptors[view.corner]
+    matched, _, _ = binary.match_descriptors(
+        descriptors, candidate.corners.descriptors, None, config.max_distance_bits, config.match_ratio
+    )
+    return len(matched) >= FIRST_SHARE * config.min_match_fraction * len(descriptors)
 
 
 def verify(
@@ -121,7 +131,7 @@ def refine_with_points(
         uv_right=np.concatenate([cloud.uv_right[views], view.uv_right[rows_b]]),
         sigma=np.full((len(obs_pt), 2), config.disparity_sigma_px),
     )
-    return se3.inverse(bundle_adjust(rig, bundle).world_T_kf[-1])
+    return se3.inverse(bundle_adjust(rig, bundle, BundleConfig(fixed_once=True)).world_T_kf[-1])
 
 
 def pair(view: PlaceView, cloud: Cloud, rows_b: I64, rows_a: I64) -> Matches:

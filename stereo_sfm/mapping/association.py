@@ -16,9 +16,11 @@ from stereo_sfm.config import MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.hamming import as_words
 from stereo_sfm.mapping import map_kernels
-from stereo_sfm.mapping.bundle import Bundle, BundleConfig, bundle_adjust
 from stereo_sfm.mapping.map import Map
+from stereo_sfm.mapping.pose_only import adjust_pose
 from stereo_sfm.types import F64, I64, U8, Bool
+
+MATCH_HUBER = 1.5  # sigmas where the loss of a match turns linear
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +42,7 @@ def local_keyframes(map_: Map, seen_points: I64, map_T_kf: F64, reach: float, co
     counts = map_.count_by_keyframe(seen_points)
     rows = np.flatnonzero(counts)
     first = rows[np.lexsort((rows, -counts[rows]))][: config.most_keyframes]
-    second = [map_.covisibility.neighbours(int(k), config.connected_points)[0][:5] for k in first]
+    second = [map_.neighbours(int(k), config.connected_points)[0][:5] for k in first]
     alive = map_.living_keyframes()
     pose = map_.keyframes.map_T_kf[alive]
     apart = np.linalg.norm(pose[:, :3, 3] - map_T_kf[:3, 3], axis=1)
@@ -51,20 +53,19 @@ def local_keyframes(map_: Map, seen_points: I64, map_T_kf: F64, reach: float, co
 
 def points_in_view(map_: Map, rig: Rig, keyframes: I64, map_T_kf: F64) -> tuple[I64, F64, F64]:
     """Points of some keyframes that this pose should see from a like angle: rows, left and right pixels or NaN."""
+    points = map_.points
     rows = map_.points_of_keyframes(keyframes)
-    rows = rows[map_.points.alive[rows] & np.isfinite(map_.points.xyz[rows, 0])]
-    xyz = map_.points.xyz[rows]
-    local = se3.transform(se3.inverse(map_T_kf), xyz)
-    uv_left = rig.left.project(local)
-    then = xyz - map_.keyframes.map_T_kf[map_.points.anchor[rows], :3, 3]
-    now = xyz - map_T_kf[:3, 3]
-    far_then, far_now = np.linalg.norm(then, axis=1), np.linalg.norm(now, axis=1)
-    alike = (then * now).sum(1) > 0.8 * far_then * far_now
-    alike &= (far_now < 2.0 * far_then) & (far_then < 2.0 * far_now)
-    visible = rig.left.inside(uv_left, 2.0) & alike
-    uv_right = np.full_like(uv_left, np.nan)
-    if rig.right is not None:
-        uv_right = rig.right.project(se3.transform(se3.inverse(rig.left_T_right), local))
+    rows = rows[points.alive[rows] & np.isfinite(points.xyz[rows, 0])]
+    uv_left, uv_right = np.empty((2, len(rows), 2))
+    right = rig.left if rig.right is None else rig.right
+    map_kernels.predict(
+        points.xyz[rows], map_.keyframes.map_T_kf[points.anchor[rows], :3, 3], map_T_kf, se3.inverse(map_T_kf),
+        se3.inverse(rig.left_T_right), (rig.left.model_id, rig.left.params, right.model_id, right.params),
+        uv_left, uv_right,
+    )  # fmt: skip
+    visible = rig.left.inside(uv_left, 2.0)
+    if rig.right is None:
+        uv_right[:] = np.nan
     return rows[visible], uv_left[visible], uv_right[visible]
 
 
@@ -87,13 +88,9 @@ def agreeing(rig: Rig, map_T_kf: F64, xyz: F64, uv_left: F64, uv_right: F64, con
     nothing = np.zeros(count, bool)
     if count < config.match_min:
         return nothing
-    rows = np.arange(count)
-    bundle = Bundle(
-        map_T_kf[None], np.zeros(1, bool), xyz, np.zeros(count, np.int64), rows, uv_left, uv_right,
-        np.full((count, 2), config.match_sigma_px),
-    )  # fmt: skip
-    result = bundle_adjust(rig, bundle, BundleConfig(rounds=3, huber=1.5, move_points=False))
-    good = result.inlier[:, 0] & (result.inlier[:, 1] | ~np.isfinite(uv_right[:, 0]))
+    sigma = np.full(count, config.match_sigma_px)
+    _, inlier = adjust_pose(rig, map_T_kf, xyz, uv_left, uv_right, sigma, MATCH_HUBER)
+    good = inlier[:, 0] & (inlier[:, 1] | ~np.isfinite(uv_right[:, 0]))
     if good.sum() < max(config.match_min, 0.5 * count):
         return nothing
     return good

@@ -1,7 +1,7 @@
 """Bundle adjustment: arrays in, arrays out. Levenberg-Marquardt with the Schur complement over the points.
 
 Any camera model of geometry.kernels, one or two eyes, Huber's loss, fixed keyframes, removal of outliers between
-rounds, and the refinement of nothing but poses. What a fixed keyframe sees depends on the points alone: it enters as a
+rounds. What a fixed keyframe sees depends on the points alone: it enters as a
 quadratic prior of each point, which may be kept for a whole round, so that a window may hang on many fixed keyframes.
 The retail paper's equations 19-21 (local and full optimisation).
 """
@@ -34,7 +34,6 @@ class BundleConfig:
     outlier_chi2: float = 9.21  # squared normalised residual of an eye above which it is an outlier (99 % of 2 dof)
     tolerance: float = 1e-5  # relative decrease of the cost that ends a round
     damping: float = 1e-4  # first damping, relative to the diagonal
-    move_points: bool = True  # False: nothing but poses
     fixed_once: bool = False  # what fixed keyframes see is linearised once a round, not after every step
     dense: bool | None = None  # the solver of the reduced system; None: by size
 
@@ -174,10 +173,8 @@ class _Solver:
         h[:, diagonal, diagonal] += damping * h[:, diagonal, diagonal] + 1e-12
         return h, b
 
-    def _solve_poses(self, state: _State, damping: float, blocks: tuple[F64, F64] | None) -> F64 | None:
+    def _solve_poses(self, state: _State, damping: float, blocks: tuple[F64, F64]) -> F64 | None:
         h, b = self._pose_system(state, damping)
-        if blocks is None:
-            return np.asarray(np.linalg.solve(h, b[..., None])[..., 0], float)
         table = self.table
         if self.system is None:
             self.system = ReducedSystem(table.starts, table.kf, self.free, self.config.dense)
@@ -188,10 +185,8 @@ class _Solver:
         )
         return self.system.solve(matrix, b)
 
-    def _point_blocks(self, state: _State, damping: float) -> tuple[F64, F64] | None:
-        """Inverse blocks and right sides of the points; None when they stay."""
-        if not self.config.move_points:
-            return None
+    def _point_blocks(self, state: _State, damping: float) -> tuple[F64, F64]:
+        """Inverse blocks and right sides of the points."""
         h, g = self.table.sum_up(state.rot, state.lin)
         prior = state.prior
         kernels.point_blocks(state.points, prior.x0, prior.h, prior.g, damping, h, g)
@@ -206,17 +201,10 @@ class _Solver:
             solved = self._solve_poses(state, damping, blocks)
             if solved is None or not np.isfinite(solved).all():
                 return None
-            xi = solved
-            delta = se3.exp(xi)
-            rot, pos = rot.copy(), pos.copy()
-            pos[self.moving] += (rot[self.moving] @ delta[:, :3, 3, None])[..., 0]
-            rot[self.moving] = rot[self.moving] @ delta[:, :3, :3]
-        if blocks is not None:
-            points = np.empty_like(points)
-            table = self.table
-            kernels.point_steps(
-                table.starts, table.kf, self.free, state.rot, state.lin, *blocks, xi, state.points, points
-            )
+            xi, rot, pos = solved, rot.copy(), pos.copy()
+            kernels.move_poses(self.moving, xi, rot, pos)
+        points, table = np.empty_like(points), self.table
+        kernels.point_steps(table.starts, table.kf, self.free, state.rot, state.lin, *blocks, xi, state.points, points)
         return self.evaluate(_State(rot, pos, points), state.prior if self.config.fixed_once else None)
 
     def descend(self, state: _State) -> tuple[_State, int, bool]:

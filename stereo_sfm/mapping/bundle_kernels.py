@@ -27,6 +27,7 @@ import math
 import numpy as np
 
 from stereo_sfm.geometry.kernels import njit, project_one
+from stereo_sfm.geometry.se3_kernels import compose_into, exp_into
 
 UNPROJECTABLE = 1e6  # chi2 of an observation whose point left the camera's field: no gradient, steps there are refused
 
@@ -199,6 +200,20 @@ def pose_blocks(obs_kf, free, lin, h, b):
         for i in range(6):
             for k in range(i + 1, 6):
                 h[c, i, k] = h[c, k, i]
+
+
+@njit
+def move_poses(rows, xi, rot, pos):
+    """world_T_kf exp(xi) of some rows of rot (K, 3, 3) and pos (K, 3), in place; xi (F, 6)."""
+    before, delta, after = np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((4, 4))
+    for i in range(rows.shape[0]):
+        k = rows[i]
+        for r in range(3):
+            before[r, 0], before[r, 1], before[r, 2], before[r, 3] = rot[k, r, 0], rot[k, r, 1], rot[k, r, 2], pos[k, r]
+        exp_into(xi[i], 1.0, delta)
+        compose_into(before, delta, after)
+        for r in range(3):
+            rot[k, r, 0], rot[k, r, 1], rot[k, r, 2], pos[k, r] = after[r, 0], after[r, 1], after[r, 2], after[r, 3]
 
 
 @njit

@@ -72,7 +72,7 @@ def apply_loop(
 def loop_is_known(map_: Map, loop: LoopResult, connected_points: int) -> bool:
     """Whether the map says already what a loop says: its two sides share points, and stand as the loop has them."""
     a, b = map_.kf_row(loop.candidate_kf_id), map_.kf_row(loop.kf_id)
-    beside_a, beside_b = (map_.covisibility.neighbours(row, connected_points)[0] for row in (a, b))
+    beside_a, beside_b = (map_.neighbours(row, connected_points)[0] for row in (a, b))
     if not len(np.intersect1d(np.append(beside_a, a), beside_b)):
         return False
     poses = map_.keyframes.map_T_kf
@@ -162,7 +162,7 @@ def walk_edges(map_: Map, poses: F64) -> Edges:
         previous = int(map_.keyframes.previous[row])
         if previous >= 0 and alive[previous]:
             pairs.add((previous, row))
-        for other in map_.covisibility.neighbours(row, STRONG)[0].tolist():
+        for other in map_.neighbours(row, STRONG)[0].tolist():
             if alive[other]:
                 pairs.add((min(row, other), max(row, other)))
     table = np.array(sorted(pairs), np.int64).reshape(-1, 2)

@@ -55,7 +55,7 @@ def redundant_keyframe(map_: Map, newest: int, protected: Bool, config: MapperCo
     """
     if config.redundant_share > 1:
         return -1
-    neighbours, _ = map_.covisibility.neighbours(newest, config.connected_points)
+    neighbours, _ = map_.neighbours(newest, config.connected_points)
     neighbours = np.sort(neighbours[~protected[neighbours]])
     shares = _seen_by_others(map_, neighbours)
     if (shares > config.redundant_share).any():

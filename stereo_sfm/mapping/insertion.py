@@ -10,8 +10,8 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping import association
-from stereo_sfm.mapping.bundle import Bundle, BundleConfig, bundle_adjust
 from stereo_sfm.mapping.map import Map
+from stereo_sfm.mapping.pose_only import adjust_pose
 from stereo_sfm.types import F64, I64, Bool, Keyframe
 
 MIN_POSE_POINTS = 10  # known points from which a keyframe's pose is solved before it enters the map
@@ -73,18 +73,11 @@ def _solve_pose(
     count = int(known.sum())
     if count < MIN_POSE_POINTS:
         return guess
-    bundle = Bundle(
-        guess[None],
-        np.zeros(1, bool),
-        map_.points.xyz[rows[known]],
-        np.zeros(count, np.int64),
-        np.arange(count),
-        np.asarray(keyframe.uv_left)[known],
-        np.asarray(keyframe.uv_right)[known],
-        np.repeat(map_.points.sigma[rows[known]].astype(float)[:, None], 2, 1),
-    )
-    result = bundle_adjust(rig, bundle, BundleConfig(rounds=3, huber=config.huber_sigmas, move_points=False))
-    return result.world_T_kf[0] if result.inlier[:, 0].sum() >= max(MIN_POSE_POINTS, count // 2) else guess
+    rows = rows[known]
+    points, uv_left, uv_right = map_.points, keyframe.uv_left[known], keyframe.uv_right[known]
+    sigma = points.sigma[rows].astype(float)
+    pose, inlier = adjust_pose(rig, guess, points.xyz[rows], uv_left, uv_right, sigma, config.huber_sigmas)
+    return pose if inlier[:, 0].sum() >= max(MIN_POSE_POINTS, count // 2) else guess
 
 
 def _find_again(
@@ -96,8 +89,11 @@ def _find_again(
     reach = config.near_depths * float(np.nanmedian(depth)) if np.isfinite(depth).any() else 0.0
     around = association.local_keyframes(map_, tracked, pose, reach, config)
     points, uv_left, uv_right = association.points_in_view(map_, rig, around, pose)
-    map_.points.expected[np.union1d(points, tracked)] += 1
-    other = ~np.isin(points, tracked)
+    followed = np.zeros(len(map_.points), bool)
+    followed[tracked] = True
+    other = ~followed[points]
+    followed[points] = True
+    map_.points.expected[followed] += 1
     points, uv_left, uv_right = points[other], uv_left[other], uv_right[other]
     sightings = association.Sightings(
         np.asarray(keyframe.uv_left),

@@ -16,7 +16,6 @@ import numpy as np
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping import map_kernels
-from stereo_sfm.mapping.covisibility import Covisibility
 from stereo_sfm.mapping.tables import KeyframeTable, ObservationTable, PointTable
 from stereo_sfm.types import F32, F64, I64, U8, Corners, Keyframe
 
@@ -90,13 +89,12 @@ class MapSnapshot:
 
 
 class Map:
-    """Keyframes, points, observations, covisibility."""
+    """Keyframes, points, observations."""
 
     def __init__(self) -> None:
         self.keyframes = KeyframeTable()
         self.points = PointTable(1024)
         self.observations = ObservationTable(4096)
-        self.covisibility = Covisibility()
         self.corners: dict[int, Corners] = {}  # of living keyframes, by row
         self._kf_rows: dict[int, int] = {}
         self._pt_rows = np.full(1024, -1, np.int32)  # by id
@@ -153,6 +151,16 @@ class Map:
         map_kernels.count_by_keyframe(points, self.points.head, table.following, table.kf, counts)
         return counts
 
+    def neighbours(self, row: int, at_least: int = 1) -> tuple[I64, I64]:
+        """(N,) rows of the keyframes that share points with one, and (N,) how many: most first, ties to the older."""
+        keyframes, table = self.keyframes, self.observations
+        rows, counts = map_kernels.shared(
+            row, keyframes.obs_first, keyframes.obs_count, self.points.head, table.following, table.pt, table.kf
+        )
+        rows, counts = rows[counts >= at_least], counts[counts >= at_least]
+        order = np.lexsort((rows, -counts))
+        return rows[order], counts[order]
+
     def observations_of_points(self, rows: I64) -> I64:
         """Rows of all observations of some points, ascending."""
         rows = np.ascontiguousarray(rows, np.int64)
@@ -190,7 +198,6 @@ class Map:
         )
         self._kf_rows[keyframe.kf_id] = row
         self.corners[row] = keyframe.corners
-        self.covisibility.grow(row + 1)
         self._changed_kf.add(row)
         return row
 
@@ -213,7 +220,6 @@ class Map:
         """Observations of the newest keyframe, one a point. Returns their rows."""
         if kf != len(self.keyframes) - 1:
             raise StereoSfmError("observations are added to the newest keyframe only")
-        self.covisibility.join(kf, self.count_by_keyframe(pt_rows))
         rows = self.observations.append(
             len(pt_rows),
             kf=kf,
@@ -276,9 +282,7 @@ class Map:
         if not len(rows):
             return
         points = table.pt[rows].astype(np.int64)
-        pairs = np.empty((2, int(self.points.obs_count[points].sum())), np.int64)
-        count = map_kernels.unlink(rows, self.points.head, table.following, table.pt, table.kf, pairs)
-        self.covisibility.add(pairs[0, :count], pairs[1, :count], -1)
+        map_kernels.unlink(rows, self.points.head, table.following, table.pt)
         np.subtract.at(self.points.obs_count, points, 1)
         self._renew_descriptors(np.unique(points))
 
@@ -310,16 +314,13 @@ class Map:
         self.remove_observations(rows)
         self.keyframes.alive[row] = False
         del self.corners[row]
-        self.covisibility.drop(row)
         self.keyframes.previous[self.keyframes.previous == row] = self.keyframes.previous[row]
-        for point in points[self.points.anchor[points] == row].tolist():
-            seen = self.observations.kf[self.observations_of_points(np.array([point]))]
-            if len(seen):
-                self.points.anchor[point] = seen.min()
+        table, orphans = self.observations, points[self.points.anchor[points] == row]
+        map_kernels.anchor_anew(orphans, self.points.head, table.following, table.kf, self.points.anchor)
 
     def _carry(self, row: int) -> None:
         """Tie a keyframe, and those that it carries, to another."""
-        others, _ = self.covisibility.neighbours(row)
+        others, _ = self.neighbours(row)
         carrier = int(others[0]) if len(others) else max(int(self.keyframes.previous[row]), 0)
         table = self.keyframes
         carrier_T_row = se3.inverse(table.map_T_kf[carrier]) @ table.map_T_kf[row]
@@ -339,11 +340,8 @@ class Map:
         double = np.empty(int(points.obs_count[old]), np.int64)
         if count := map_kernels.seen_together(old, new, points.head, table.following, table.kf, double):
             self.remove_observations(double[:count])
-        pairs = np.empty((2, int(points.obs_count[old]) * int(points.obs_count[new])), np.int64)
-        points.obs_count[new] += map_kernels.hand_over(
-            old, new, points.head, table.following, table.pt, table.kf, table.sigma, sigma, pairs
-        )
-        self.covisibility.add(pairs[0], pairs[1])
+        table.sigma[self.observations_of_points(np.array([old]))] = sigma
+        points.obs_count[new] += map_kernels.hand_over(old, new, points.head, table.following, table.pt)
         points.sigma[new] = sigma
         points.seen[new] += points.seen[old]
         points.expected[new] += points.expected[old]

@@ -10,8 +10,7 @@ import numpy as np
 
 from stereo_sfm.geometry.hamming import BITS, hamming
 from stereo_sfm.geometry.kernels import njit, project_one
-
-MOST_CELLS = 4096  # of match_near's grid, along either axis
+from stereo_sfm.geometry.pixel_grid import cells_near, make_grid
 
 
 @njit
@@ -58,6 +57,24 @@ def count_by_keyframe(points, head, following, obs_kf, counts):
 
 
 @njit
+def shared(row, first, count, head, following, obs_pt, obs_kf):
+    """(N,) keyframes that share points with keyframe `row`, as they are found, and (N,) how many points."""
+    counts, found = np.zeros(first.shape[0], np.int64), np.empty(first.shape[0], np.int64)
+    n = 0
+    for o in range(first[row], first[row] + count[row]):
+        q = head[obs_pt[o]] if obs_pt[o] >= 0 else -1
+        while q >= 0:
+            k = obs_kf[q]
+            if k != row:
+                if counts[k] == 0:
+                    found[n] = k
+                    n += 1
+                counts[k] += 1
+            q = following[q]
+    return found[:n], counts[found[:n]]
+
+
+@njit
 def list_sightings(points, head, following, obs_kf, kf_index, obs, pt):
     """Fills obs and pt with the observations of points by the keyframes whose kf_index is not negative.
 
@@ -75,31 +92,19 @@ def list_sightings(points, head, following, obs_kf, kf_index, obs, pt):
 
 
 @njit
-def unlink(rows, head, following, obs_pt, obs_kf, pairs):
-    """Takes observations out of their points' lists, one by one.
-
-    Fills pairs (2, N) with (its keyframe, another keyframe that still saw the point) and returns how many there are; N
-    is at most the sum of the lengths of the lists.
-    """
-    n = 0
+def unlink(rows, head, following, obs_pt):
+    """Takes observations out of their points' lists."""
     for i in range(rows.shape[0]):
         row = rows[i]
         p = obs_pt[row]
-        before = -1
-        o = head[p]
-        while o >= 0:
-            if o == row:
-                if before < 0:
-                    head[p] = following[o]
-                else:
-                    following[before] = following[o]
-            else:
-                pairs[0, n], pairs[1, n] = obs_kf[row], obs_kf[o]
-                n += 1
-                before = o
-            o = following[o]
+        before, o = -1, head[p]
+        while o != row:
+            before, o = o, following[o]
+        if before < 0:
+            head[p] = following[row]
+        else:
+            following[before] = following[row]
         obs_pt[row] = -1
-    return n
 
 
 @njit
@@ -119,21 +124,13 @@ def seen_together(old, new, head, following, obs_kf, out):
 
 
 @njit
-def hand_over(old, new, head, following, obs_pt, obs_kf, obs_sigma, sigma, pairs):
-    """Moves the observations of point `old` to the front of the list of `new`, each from now on with `sigma`.
-
-    Fills pairs (2, N) with (a keyframe that sees `new`, one that saw `old`) and returns how many observations moved.
-    """
-    n = moved = 0
+def hand_over(old, new, head, following, obs_pt):
+    """Moves the observations of point `old` to the front of the list of `new`. Returns how many there are."""
+    moved = 0
     front, o = head[new], head[old]
     last = -1
     while o >= 0:
-        q = front
-        while q >= 0:
-            pairs[0, n], pairs[1, n] = obs_kf[q], obs_kf[o]
-            n += 1
-            q = following[q]
-        obs_pt[o], obs_sigma[o] = new, sigma
+        obs_pt[o] = new
         moved += 1
         last, o = o, following[o]
     if last >= 0:
@@ -149,6 +146,18 @@ def follow(rows, fused_into):
         while r >= 0 and fused_into[r] >= 0:
             r = fused_into[r]
         rows[i] = r
+
+
+@njit
+def anchor_anew(points, head, following, obs_kf, anchor):
+    """Points go with the oldest keyframe that sees them, where one does."""
+    for i in range(points.shape[0]):
+        o = head[points[i]]
+        oldest = obs_kf[o] if o >= 0 else anchor[points[i]]
+        while o >= 0:
+            oldest = min(oldest, obs_kf[o])
+            o = following[o]
+        anchor[points[i]] = oldest
 
 
 @njit
@@ -218,31 +227,36 @@ def judge_points(points, head, following, obs_kf, uv_left, uv_right, sigma, rot,
 
 
 @njit
-def _cells(uv, size, least, columns, rows):
-    """Cell of each pixel, -1 for NaN: (N,), counted from the corner `least`."""
-    out = np.full(uv.shape[0], -1)
-    for i in range(uv.shape[0]):
-        if math.isfinite(uv[i, 0]) and math.isfinite(uv[i, 1]):
-            c, r = int((uv[i, 0] - least[0]) / size), int((uv[i, 1] - least[1]) / size)
-            out[i] = min(max(r, 0), rows - 1) * columns + min(max(c, 0), columns - 1)
-    return out
+def predict(xyz, anchors, map_T_kf, kf_T_map, right_T_left, cams, uv_left, uv_right):
+    """Fills uv_left and uv_right (N, 2) with where a keyframe should see points; NaN where it would not know them.
+
+    Args:
+        xyz: (N, 3) in the map. anchors: (N, 3) where the keyframes stood that saw them first: from less than half or
+            more than twice that distance, or a direction whose cosine to that one is below 0.8, they look otherwise.
+        cams: (left model, left params, right model, right params).
+    """
+    left_model, left_params, right_model, right_params = cams
+    for i in range(xyz.shape[0]):
+        uv_left[i, 0] = uv_left[i, 1] = uv_right[i, 0] = uv_right[i, 1] = math.nan
+        x, y, z = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+        a0, a1, a2 = x - anchors[i, 0], y - anchors[i, 1], z - anchors[i, 2]
+        b0, b1, b2 = x - map_T_kf[0, 3], y - map_T_kf[1, 3], z - map_T_kf[2, 3]
+        then, now = a0 * a0 + a1 * a1 + a2 * a2, b0 * b0 + b1 * b1 + b2 * b2
+        if now >= 4.0 * then or then >= 4.0 * now or a0 * b0 + a1 * b1 + a2 * b2 <= 0.8 * math.sqrt(then * now):
+            continue
+        p0, p1, p2 = _moved(kf_T_map, x, y, z)
+        uv_left[i, 0], uv_left[i, 1], _, _, _, _, _, _ = project_one(left_model, left_params, p0, p1, p2)
+        p0, p1, p2 = _moved(right_T_left, p0, p1, p2)
+        uv_right[i, 0], uv_right[i, 1], _, _, _, _, _, _ = project_one(right_model, right_params, p0, p1, p2)
 
 
 @njit
-def _by_cell(cells, count):
-    """(count + 1,) where each cell begins in the list of members, and that list: members in order of their index."""
-    starts = np.zeros(count + 1, np.int64)
-    for i in range(cells.shape[0]):
-        if cells[i] >= 0:
-            starts[cells[i] + 1] += 1
-    for c in range(count):
-        starts[c + 1] += starts[c]
-    members, at = np.empty(starts[count], np.int64), starts[:count].copy()
-    for i in range(cells.shape[0]):
-        if cells[i] >= 0:
-            members[at[cells[i]]] = i
-            at[cells[i]] += 1
-    return starts, members
+def _moved(t, x, y, z):
+    return (
+        t[0, 0] * x + t[0, 1] * y + t[0, 2] * z + t[0, 3],
+        t[1, 0] * x + t[1, 1] * y + t[1, 2] * z + t[1, 3],
+        t[2, 0] * x + t[2, 1] * y + t[2, 2] * z + t[2, 3],
+    )
 
 
 @njit
@@ -260,25 +274,13 @@ def match_near(uv, uv_right, words, predicted, predicted_right, candidate_words,
     second_bits = np.full(n, BITS + 1)
     owner = np.full(c, -1)
     owner_bits = np.full(c, BITS + 1)
-    least, most = np.full(2, np.inf), np.full(2, -np.inf)
+    frame, shape, starts, members = make_grid(predicted, radius)
     for i in range(n):
-        for k in range(2):
-            if math.isfinite(uv[i, k]):
-                least[k], most[k] = min(least[k], uv[i, k] - radius), max(most[k], uv[i, k] + radius)
-    size = max(radius, 1.0)
-    if not (most[0] - least[0] < MOST_CELLS * size and most[1] - least[1] < MOST_CELLS * size):
-        return best  # nothing was observed, or not in an image
-    columns, rows = int((most[0] - least[0]) / size) + 1, int((most[1] - least[1]) / size) + 1
-    cells = _cells(uv, size, least, columns, rows)
-    starts, members = _by_cell(_cells(predicted, size, least, columns, rows), columns * rows)
-    for i in range(n):
-        if cells[i] < 0 or (words[i, 0] == 0 and words[i, 1] == 0):
+        if not math.isfinite(uv[i, 0]) or (words[i, 0] == 0 and words[i, 1] == 0):
             continue
-        column, line = cells[i] % columns, cells[i] // columns
-        for r in range(max(line - 1, 0), min(line + 2, rows)):
-            for m in range(
-                starts[r * columns + max(column - 1, 0)], starts[r * columns + min(column + 1, columns - 1) + 1]
-            ):
+        left, right, top, bottom = cells_near(uv[i, 0], uv[i, 1], frame, shape)
+        for r in range(top, bottom if left < right else top):
+            for m in range(starts[r * shape[0] + left], starts[r * shape[0] + right]):
                 j = members[m]
                 du, dv = uv[i, 0] - predicted[j, 0], uv[i, 1] - predicted[j, 1]
                 if not du * du + dv * dv <= radius * radius:

@@ -14,6 +14,10 @@ drifted part of the map. Where the robot stays, the same old points hold it.
 A loop that the map knows already (the place was found again before, its two sides share points) only fuses the points
 that it pairs: a robot that passes the same places all day must not pay for them again.
 
+What bounds the time. A window holds the keyframes nearest to the newest, and as fixed ones those that share most points
+with them: a limited number of each, and with them of points and observations. Of views that are seen again and again a
+few are kept (`culling`). So a keyframe costs the same after hours in the same aisles.
+
 Local windows pass a small error of scale on from one to the next, which only all keyframes together see. So full
 bundle adjustment runs beside the mapping after a loop, and whenever the map has grown by a share. It is a job of arrays
 (`pending_job`) whose answer (`finish_job`) is applied a fixed number of keyframes later, wherever it was computed; if
@@ -243,7 +247,7 @@ class Mapper:
             self._order_full_bundle()
 
     def _order_full_bundle(self) -> None:
-        part = window.whole_map(self.map, self._config)
+        part = window.whole_map(self.map)
         self._job = Job(self._rig, window.bundle_config(self._config), part, len(self.map.keyframes) - 1)
         self._job_taken, self._answer = False, None
         lag = max(self._config.full_ba_lag_keyframes, round(LAG_SHARE * len(self.map.living_keyframes())))

@@ -38,34 +38,38 @@ def bundle_config(config: MapperConfig) -> BundleConfig:
 
 
 def covisible_window(map_: Map, row: int, config: MapperConfig) -> Window:
-    """The keyframe, those that share most points with it, and the points of all of them; the rest is fixed.
+    """The keyframe, those that share most points with it, and the points of all of them; others hold these, fixed.
 
     The map's first keyframe never moves, nor does the oldest keyframe of a part that nothing fixed is connected to.
     """
-    others, _ = map_.covisibility.neighbours(row, config.connected_points)
+    others, _ = map_.neighbours(row, config.connected_points)
     if not len(others):
-        others, _ = map_.covisibility.neighbours(row)
-    return _window(map_, np.concatenate([[row], others])[: config.most_keyframes].astype(np.int64), config)
+        others, _ = map_.neighbours(row)
+    return _window(map_, np.concatenate([[row], others])[: config.most_keyframes].astype(np.int64), config.most_fixed)
 
 
-def whole_map(map_: Map, config: MapperConfig) -> Window:
+def whole_map(map_: Map) -> Window:
     """Every living keyframe and point; of each unconnected part the oldest keyframe is fixed."""
-    return _window(map_, map_.living_keyframes(), config)
+    return _window(map_, map_.living_keyframes())
 
 
-def _window(map_: Map, moving: I64, config: MapperConfig) -> Window:
+def _window(map_: Map, moving: I64, most_fixed: int | None = None) -> Window:
     table, points = map_.observations, map_.points
     pts = map_.points_of_keyframes(moving)
     pts = pts[points.alive[pts] & np.isfinite(points.xyz[pts, 0]) & (points.obs_count[pts] > 1)]
     counts = map_.count_by_keyframe(pts)
-    total, counts[moving] = int(counts.sum()), 0
-    kfs = np.concatenate([np.sort(moving), np.flatnonzero(counts)])
+    room = int(counts.sum())
+    counts[moving] = 0
+    seeing = np.flatnonzero(counts)
+    held = np.sort(seeing[np.argsort(-counts[seeing], kind="stable")][:most_fixed])
+    kfs = np.concatenate([np.sort(moving), held])
     fixed = np.arange(len(kfs)) >= len(moving)
     fixed |= kfs == 0
     kf_index = np.full(len(map_.keyframes), -1, np.int64)
     kf_index[kfs] = np.arange(len(kfs))
-    obs, obs_pt = np.empty(total, np.int64), np.empty(total, np.int64)
-    map_kernels.list_sightings(pts, points.head, table.following, table.kf, kf_index, obs, obs_pt)
+    obs, obs_pt = np.empty(room, np.int64), np.empty(room, np.int64)
+    total = map_kernels.list_sightings(pts, points.head, table.following, table.kf, kf_index, obs, obs_pt)
+    obs, obs_pt = obs[:total], obs_pt[:total]
     fixed[_floating(map_, kfs, fixed)] = True
     bundle = Bundle(
         map_.keyframes.map_T_kf[kfs],
@@ -85,7 +89,7 @@ def _floating(map_: Map, kfs: I64, fixed: Bool) -> I64:
     index = np.full(len(map_.keyframes), -1, np.int64)
     index[kfs] = np.arange(len(kfs))
     free = np.flatnonzero(~fixed)
-    tied = [index[map_.covisibility.neighbours(int(kfs[i]), TIE)[0]] for i in free]
+    tied = [index[map_.neighbours(int(kfs[i]), TIE)[0]] for i in free]
     i, j = np.repeat(free, [len(others) for others in tied]), np.concatenate([np.zeros(0, np.int64), *tied])
     i, j = i[j >= 0], j[j >= 0]
     edges = scipy.sparse.csr_array((np.ones(len(i), np.int8), (i, j)), shape=(len(kfs),) * 2)

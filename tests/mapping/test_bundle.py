@@ -9,8 +9,10 @@ import pytest
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Epipolar
 from stereo_sfm.mapping.bundle import Bundle, BundleConfig, bundle_adjust
+from stereo_sfm.mapping.pose_only import adjust_pose
 from tests import gtsam_oracle
 from tests.synthetic import Scene, disturb, fisheye_rig, make_scene, pinhole_rig
 
@@ -133,12 +135,36 @@ def test_fixed_keyframes_stay_to_the_bit(rig: Rig) -> None:
     assert everything.cost < everything.initial_cost
 
 
-def test_poses_alone_leave_points_untouched(rig: Rig) -> None:
-    scene = make_scene(rig, 6, 300, noise_px=0.3)
-    bundle = dataclasses.replace(bundle_of(scene), points=scene.points)
-    result = bundle_adjust(rig, bundle, BundleConfig(move_points=False))
-    assert np.array_equal(result.points, scene.points)
-    np.testing.assert_allclose(result.world_T_kf, scene.world_T_kf, atol=5e-3)
+def test_a_pose_alone_is_found_among_outliers_and_only_they_are_left_out(rig: Rig) -> None:
+    scene = make_scene(rig, 6, 300, noise_px=0.3, outliers=0.1)
+    for k in range(6):
+        mine = scene.obs_kf == k
+        points, left, right = scene.points[scene.obs_pt[mine]], scene.uv_left[mine], scene.uv_right[mine]
+        start = scene.world_T_kf[k] @ se3.exp(np.array([0.05, -0.03, 0.04, 0.01, 0.02, -0.01]))
+        pose, inlier = adjust_pose(rig, start, points, left, right, np.full(len(points), 0.3), 2.0)
+        np.testing.assert_allclose(pose, scene.world_T_kf[k], atol=5e-3)
+        assert not inlier[scene.outlier[mine], 0].any()
+        assert inlier[~scene.outlier[mine], 0].mean() > 0.97
+
+
+def test_a_pose_alone_is_that_of_a_bundle_whose_points_are_held_fast(rig: Rig) -> None:
+    """Many fixed keyframes that saw the points exactly hold them where they are."""
+    scene = make_scene(rig, 1, 200, noise_px=0.3)
+    points, left, right = scene.points[scene.obs_pt], scene.uv_left, scene.uv_right
+    start = scene.world_T_kf[0] @ se3.exp(np.array([0.02, -0.01, 0.02, 0.01, 0.0, -0.01]))
+    pose, _ = adjust_pose(rig, start, points, left, right, np.full(len(points), 0.3), 2.0)
+    assert rig.right is not None
+    count, rows = len(points), np.arange(len(points))
+    exact = rig.left.project(se3.transform(se3.inverse(scene.world_T_kf[0]), points))
+    right_T_world = se3.inverse(scene.world_T_kf[0] @ rig.left_T_right)
+    bundle = Bundle(
+        np.stack([start, scene.world_T_kf[0]]), np.array([False, True]), points, np.repeat([0, 1], count),
+        np.concatenate([rows, rows]), np.concatenate([left, exact]),
+        np.concatenate([right, rig.right.project(se3.transform(right_T_world, points))]),
+        np.repeat([[0.3, 0.3], [1e-4, 1e-4]], count, axis=0),
+    )  # fmt: skip
+    result = bundle_adjust(rig, bundle, BundleConfig(rounds=3, huber=2.0))
+    np.testing.assert_allclose(pose, result.world_T_kf[0], atol=1e-4)
 
 
 def test_order_of_observations_does_not_matter(rig: Rig) -> None:

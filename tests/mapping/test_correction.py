@@ -79,7 +79,7 @@ def test_loop_takes_the_drift_away_and_carries_the_points(walk: StoreWalk) -> No
     )
     assert len(done.fused) == len(loop.matches) > 20
     assert len(map_.living_points()) == alive - len(done.fused)
-    assert map_.covisibility.neighbours(b)[0].tolist().count(a) == 1  # the two sides now share points
+    assert map_.neighbours(b)[0].tolist().count(a) == 1  # the two sides now share points
 
 
 def turning_walk(degrees_per_100m: float, side_m: float = 30.0, step_m: float = 0.5) -> tuple[Map, F64]:

@@ -9,8 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from stereo_sfm.config import MapperConfig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
+from stereo_sfm.mapping import window
 from stereo_sfm.mapping.map import Map, MapSnapshot
 from stereo_sfm.types import I64, Keyframe
 
@@ -73,7 +75,9 @@ def check(m: Map) -> None:
         for a in seen:
             for b in seen:
                 expected[a, b] += a != b
-    assert np.array_equal(m.covisibility.matrix().toarray(), expected)
+    for row in range(size):
+        others, counts = m.neighbours(row)
+        assert np.array_equal(np.bincount(others, counts, size), expected[row])
 
 
 def edit(m: Map, rng: np.random.Generator) -> None:
@@ -241,6 +245,19 @@ def test_neighbours_come_in_order() -> None:
     insert(m, keyframe(1, np.arange(0, 9)))
     insert(m, keyframe(2, np.arange(4, 9)))
     insert(m, keyframe(3, np.array([0, 5, 8])))
-    rows, counts = m.covisibility.neighbours(1)
+    rows, counts = m.neighbours(1)
     assert rows.tolist() == [0, 2, 3] and counts.tolist() == [5, 5, 3]
-    assert m.covisibility.neighbours(3, at_least=2)[0].tolist() == [1, 2]
+    assert m.neighbours(3, at_least=2)[0].tolist() == [1, 2]
+
+
+def test_a_window_holds_only_the_fixed_keyframes_that_share_most_points() -> None:
+    m = Map()
+    for k in range(30):
+        insert(m, keyframe(k, np.unique([*range(5), *range(5 + k, 25 + k)])))
+    part = window.covisible_window(m, 29, MapperConfig(window_keyframes=3, fixed_keyframes=4, connected_points=5))
+    assert part.kf_rows.tolist() == [27, 28, 29, 23, 24, 25, 26]
+    assert part.bundle.fixed.tolist() == [False] * 3 + [True] * 4
+    assert set(part.kf_rows[part.bundle.obs_kf].tolist()) == set(part.kf_rows.tolist())
+    assert np.array_equal(m.observations.kf[part.obs_rows], part.kf_rows[part.bundle.obs_kf])
+    everything = window.covisible_window(m, 29, MapperConfig(window_keyframes=3, fixed_keyframes=0, connected_points=5))
+    assert len(everything.kf_rows) == 30

@@ -1,0 +1,68 @@
+"""Compiled normal equations of a relative pose (loop/absolute_pose.py)."""
+
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stereo_sfm.geometry.kernels import njit, project_one
+
+
+@njit
+def add_normal_equations(
+    t, camera_T_source, turn, forward, points, sigmas, uv, use, model, params, pixel_sigma, hessian, gradient, sums
+):
+    """Adds what points seen in one image say about exp(xi) @ t to hessian (6, 6), gradient (6,) and sums.
+
+    Args:
+        t: (4, 4) b_T_a. camera_T_source: (4, 4) from the points' frame into the camera.
+        turn: (3, 3) derivative of the point in the camera by the point in b.
+        forward: the points are in a, and t takes them to b; else they are in b.
+        points, sigmas, uv, use: (N, 3), (N,) metres along the ray, (N, 2) px, (N,); NaN where unknown.
+        sums: (2,) squared normalised errors, and how many points.
+    """
+    s2 = pixel_sigma * pixel_sigma
+    j = np.empty((2, 6))
+    for i in range(points.shape[0]):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        if not use[i] or not math.isfinite(x) or not math.isfinite(uv[i, 0]):
+            continue
+        u, v, j00, j01, j02, j10, j11, j12 = project_one(model, params, *_moved(camera_T_source, x, y, z))
+        if not math.isfinite(u):
+            continue
+        b0, b1, b2 = _moved(t, x, y, z) if forward else (x, y, z)
+        for k, (a0, a1, a2) in enumerate(((j00, j01, j02), (j10, j11, j12))):
+            g0 = a0 * turn[0, 0] + a1 * turn[1, 0] + a2 * turn[2, 0]
+            g1 = a0 * turn[0, 1] + a1 * turn[1, 1] + a2 * turn[2, 1]
+            g2 = a0 * turn[0, 2] + a1 * turn[1, 2] + a2 * turn[2, 2]
+            j[k, 0], j[k, 1], j[k, 2] = g0, g1, g2
+            j[k, 3], j[k, 4], j[k, 5] = b1 * g2 - b2 * g1, b2 * g0 - b0 * g2, b0 * g1 - b1 * g0
+        # The range is uncertain along the ray: covariance s2 I + d d^T, inverted by Sherman and Morrison.
+        ray = sigmas[i] / max(math.sqrt(x * x + y * y + z * z), 1e-9)
+        r0 = camera_T_source[0, 0] * x + camera_T_source[0, 1] * y + camera_T_source[0, 2] * z
+        r1 = camera_T_source[1, 0] * x + camera_T_source[1, 1] * y + camera_T_source[1, 2] * z
+        r2 = camera_T_source[2, 0] * x + camera_T_source[2, 1] * y + camera_T_source[2, 2] * z
+        d0, d1 = ray * (j00 * r0 + j01 * r1 + j02 * r2), ray * (j10 * r0 + j11 * r1 + j12 * r2)
+        q = s2 + d0 * d0 + d1 * d1
+        w00, w01, w11 = (1.0 - d0 * d0 / q) / s2, -d0 * d1 / q / s2, (1.0 - d1 * d1 / q) / s2
+        e0, e1 = u - uv[i, 0], v - uv[i, 1]
+        f0, f1 = w00 * e0 + w01 * e1, w01 * e0 + w11 * e1
+        for k in range(6):
+            h0, h1 = w00 * j[0, k] + w01 * j[1, k], w01 * j[0, k] + w11 * j[1, k]
+            gradient[k] += j[0, k] * f0 + j[1, k] * f1
+            for m in range(6):
+                hessian[k, m] += h0 * j[0, m] + h1 * j[1, m]
+        sums[0] += e0 * f0 + e1 * f1
+        sums[1] += 1.0
+
+
+@njit
+def _moved(t, x, y, z):
+    return (
+        t[0, 0] * x + t[0, 1] * y + t[0, 2] * z + t[0, 3],
+        t[1, 0] * x + t[1, 1] * y + t[1, 2] * z + t[1, 3],
+        t[2, 0] * x + t[2, 1] * y + t[2, 2] * z + t[2, 3],
+    )
