@@ -29,7 +29,7 @@ import numpy as np
 from stereo_sfm import config as configuration
 from stereo_sfm.calib.choice import with_terms
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.drivers.source import open_source
+from stereo_sfm.drivers.source import BaseSource, open_source
 from stereo_sfm.eval.evaluate import evaluate
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.geometry import se3
@@ -48,18 +48,12 @@ def turned(rig: Rig, degrees: tuple[float, float, float], share: float = 1.0) ->
     return dataclasses.replace(rig, left_T_right=rig.left_T_right @ se3.exp(twist))
 
 
-class Rendered:
+class Rendered(BaseSource):
     """A source of images that are rendered already, with any belief about the rig."""
 
     def __init__(self, images: list[StereoImage], rig: Rig, ground_truth: Trajectory | None) -> None:
-        self.name, self.rig, self.ground_truth, self.live = "rendered", rig, ground_truth, False
+        self.name, self.rig, self.ground_truth = "rendered", rig, ground_truth
         self.frame_count, self._images = len(images), images
-
-    def __enter__(self) -> Rendered:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
 
     def __iter__(self) -> Iterator[StereoImage]:
         return iter(self._images)

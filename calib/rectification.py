@@ -96,12 +96,14 @@ def rectify(
     rect_R_left, rect_R_right = rectifying_rotations(rig.left_T_right)
     choose = pinhole_camera if projection == "pinhole" else epipolar_camera
     camera = choose(rig.left, rig.right, rect_R_left, rect_R_right, hfov_deg, size)
-    left = CameraRectification(rig.left, camera, rect_R_left, *remap_tables(rig.left, camera, rect_R_left))
-    right = CameraRectification(rig.right, camera, rect_R_right, *remap_tables(rig.right, camera, rect_R_right))
+    left = _rectified(rig.left, rig.left_mask, camera, rect_R_left)
+    right = _rectified(rig.right, rig.right_mask, camera, rect_R_right)
     cam_T_rect = se3.from_rotation_translation(rect_R_left.T, np.zeros(3))
     baseline = se3.from_rotation_translation(np.eye(3), np.array([rig.baseline, 0.0, 0.0]))
     new = replace(
         rig,
+        left_mask=None if rig.left_mask is None else left.mask.copy(),
+        right_mask=None if rig.right_mask is None else right.mask.copy(),
         left=camera,
         right=camera,
         left_T_right=baseline,
@@ -110,6 +112,14 @@ def rectify(
         readout_s=rig.readout_s * _rows_read(rig.left, camera, rect_R_left),
     )
     return Rectification(new, left, right, cam_T_rect)
+
+
+def _rectified(source: Camera, used: Bool | None, target: Camera, target_R_source: F64) -> CameraRectification:
+    """The tables of one camera; what `used` (H, W) does not cover has no source."""
+    found = CameraRectification(source, target, target_R_source, *remap_tables(source, target, target_R_source))
+    if used is None:
+        return found
+    return replace(found, mask=found.mask & (found.apply(used.astype(np.uint8)) > 0))
 
 
 def _rows_read(original: Camera, camera: Camera, rect_R_left: F64) -> float:

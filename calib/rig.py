@@ -9,11 +9,12 @@ import numpy as np
 from stereo_sfm.calib.imu import Imu
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry.cameras import Camera
-from stereo_sfm.types import F64
+from stereo_sfm.types import F64, Bool
 
 BASELINE_RANGE_M = 1e-4, 100.0
 MOST_PIXELS = 10**8
 MOST_READOUT_S = 0.2
+SMALLEST_SHARE = 0.05  # of an image's pixels, that a mask must leave
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +34,8 @@ class Rig:
     name: str = ""
     serial: str = ""
     imu: Imu | None = None  # calibration of its inertial sensor; None: inertial samples are not used
+    left_mask: Bool | None = None  # (H, W) True where the image is used (stereo_sfm.calib.mask); None: everywhere
+    right_mask: Bool | None = None  # (H, W)
     readout_s: float = 0.0  # rolling shutter: seconds from the first row's exposure to the last's; 0: global shutter
 
     def __post_init__(self) -> None:
@@ -47,6 +50,8 @@ class Rig:
         for side, camera in (("left", self.left), ("right", self.right)):
             if camera is not None:
                 _check_camera(side, camera)
+        _check_mask("left", self.left_mask, self.left)
+        _check_mask("right", self.right_mask, self.right)
         if not 0 <= self.readout_s <= MOST_READOUT_S:
             raise StereoSfmError(
                 f"invalid calibration: readout of {self.readout_s:g} s; give the seconds from first to last row, "
@@ -59,6 +64,12 @@ class Rig:
     def stereo(self) -> bool:
         """Whether there are two cameras (or one with depth)."""
         return self.right is not None
+
+    @property
+    def masked_share(self) -> tuple[float, float]:
+        """Share of the left and right image's pixels that are not used."""
+        left, right = (0.0 if mask is None else 1.0 - float(mask.mean()) for mask in (self.left_mask, self.right_mask))
+        return left, right
 
     @property
     def baseline(self) -> float:
@@ -101,3 +112,20 @@ def _check_camera(side: str, camera: Camera) -> None:
         wrong.append(f"size {camera.width}x{camera.height}")
     if wrong:
         raise StereoSfmError(f"invalid calibration of the {side} camera: {', '.join(wrong)}")
+
+
+def _check_mask(side: str, mask: Bool | None, camera: Camera | None) -> None:
+    """Raises StereoSfmError for a mask that is not of the camera's size or leaves nothing to see."""
+    if mask is None:
+        return
+    if camera is None or mask.shape != (camera.height, camera.width):
+        size = "there is no such camera" if camera is None else f"its images {camera.width}x{camera.height}"
+        raise StereoSfmError(
+            f"invalid calibration: the mask of the {side} camera is {mask.shape[1]}x{mask.shape[0]} px, {size}"
+        )
+    if mask.mean() < SMALLEST_SHARE:
+        raise StereoSfmError(
+            f"invalid calibration: the mask of the {side} camera leaves {100 * mask.mean():.1f} % of its image; "
+            "black pixels are not used, all others are"
+        )
+    mask.flags.writeable = False

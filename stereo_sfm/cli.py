@@ -29,6 +29,7 @@ COMMANDS: dict[str, str] = {
     "rectify": "write rectified image pairs with epipolar lines for inspection",
     "calibrate": "calibrate a stereo rig from images of a target",
     "check-calib": "check a calibration on any recording, without a target",
+    "mask": "find what shows the robot itself, or nothing, in the images of a recording",
     "convert-calib": "convert a calibration between the formats of Kalibr, ROS, OpenCV, COLMAP, EuRoC and others",
     "map": "describe, merge, prune and export saved maps",
     "export": "export a run or a map to the formats of other programs",

@@ -7,8 +7,10 @@ from typing import Any
 
 from stereo_sfm.calib.formats.common import numbers, read_text, reading, rigid, rows, yaml_mapping, yaml_text
 from stereo_sfm.calib.formats.imu_files import imu_from_plain, imu_to_plain
+from stereo_sfm.calib.mask import mask_from_text, mask_to_text
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry.cameras import MODELS, Camera
+from stereo_sfm.types import Bool
 
 KEY = "stereo_sfm_rig"
 
@@ -17,11 +19,15 @@ def read_native(path: Path) -> Rig:
     """Read a `rig.yaml` as written by `write_native`."""
     with reading(path, "rig"):
         text = read_text(path)
-    return rig_from_text(text, path)
+    return rig_from_text(text, path, path.parent)
 
 
-def rig_from_text(text: str, where: Path | str) -> Rig:
-    """The inverse of `rig_to_text`; `where` names the origin of the text in error messages."""
+def rig_from_text(text: str, where: Path | str, folder: Path | None = None) -> Rig:
+    """The inverse of `rig_to_text`.
+
+    Args:
+        text: YAML. where: its origin, for error messages. folder: of the mask files that it names; None: it may not.
+    """
     with reading(where, "rig"):
         data = yaml_mapping(text)
         if data.get(KEY) != 1:
@@ -36,6 +42,8 @@ def rig_from_text(text: str, where: Path | str) -> Rig:
             serial=str(data.get("serial", "")),
             imu=imu_from_plain(data["imu"]) if data.get("imu") else None,
             readout_s=float(data.get("readout_s") or 0.0),
+            left_mask=_mask(data["left"], folder),
+            right_mask=_mask(data.get("right") or {}, folder),
         )
 
 
@@ -53,8 +61,8 @@ def rig_to_text(rig: Rig) -> str:
             "serial": rig.serial,
             "depth": rig.depth,
             "readout_s": float(rig.readout_s),
-            "left": _plain(rig.left),
-            "right": _plain(rig.right) if rig.right else None,
+            "left": _plain(rig.left, rig.left_mask),
+            "right": _plain(rig.right, rig.right_mask) if rig.right else None,
             "left_T_right": rows(rig.left_T_right),
             "body_T_left": rows(rig.body_T_left),
             **({"imu": imu_to_plain(rig.imu)} if rig.imu else {}),
@@ -71,11 +79,16 @@ def _camera(data: dict[str, Any]) -> Camera:
     return model(width, height, fx, fy, cx, cy, tuple(numbers(data["distortion"])))
 
 
-def _plain(camera: Camera) -> dict[str, Any]:
+def _mask(data: dict[str, Any], folder: Path | None) -> Bool | None:
+    return mask_from_text(str(data["mask"]), folder) if data.get("mask") else None
+
+
+def _plain(camera: Camera, mask: Bool | None) -> dict[str, Any]:
     return {
         "model": camera.model,
         "size": [camera.width, camera.height],
         "focal": [float(camera.fx), float(camera.fy)],
         "centre": [float(camera.cx), float(camera.cy)],
         "distortion": list(camera.distortion),
+        **({"mask": mask_to_text(mask)} if mask is not None else {}),
     }

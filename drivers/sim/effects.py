@@ -11,7 +11,9 @@ import cv2
 import numpy as np
 
 from stereo_sfm.drivers.sim.kernels import njit
+from stereo_sfm.drivers.sim.lens import Dirt, compressed, flicker
 from stereo_sfm.drivers.sim.render import Eye, View
+from stereo_sfm.drivers.sim.robot import RobotView
 from stereo_sfm.types import F32, F64, U8
 
 
@@ -27,6 +29,9 @@ class Effects:
     read_noise: float = 0.9  # standard deviation in grey levels, in the dark
     shot_noise: float = 0.02  # variance in grey levels per grey level
     black_level: float = 3.0
+    dirt: float = 0.0  # spots on the lens, 0 to 1
+    flicker: float = 0.0  # swing of the lamps' brightness at twice the mains frequency
+    jpeg: int = 0  # quality of a lossy link; 0: none
     drop: float = 0.0  # fraction of frames that never arrive
 
 
@@ -36,7 +41,12 @@ CLEAN = Effects(0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 class Sensor:
     """One eye's lens and sensor: what depends on the pixel only."""
 
-    def __init__(self, eye: Eye, effects: Effects) -> None:
+    def __init__(
+        self, eye: Eye, effects: Effects, robot: RobotView | None = None, rng: np.random.Generator | None = None
+    ) -> None:
+        """`robot`: what this camera sees of the robot. `rng`: of the dirt on this lens."""
+        self.robot = robot
+        self._dirt = Dirt(eye.grid.shape[:2], effects.dirt, rng) if effects.dirt > 0 and rng is not None else None
         grid = eye.grid
         camera = eye.camera
         corners = camera.unproject(np.array([[0, camera.cy], [camera.width - 1, camera.cy]]))
@@ -66,8 +76,10 @@ class Sensor:
             blurred = np.empty_like(image)
             _blur(image, view.depth, self._jacobian, self._steepest, twist * effects.exposure_s, blurred)
             image = blurred
+        image = image if self.robot is None else self.robot.over(image)
         if effects.lens_blur_px > 0:
             image = np.asarray(cv2.GaussianBlur(image, (5, 5), effects.lens_blur_px), np.float32)
+        image = image if self._dirt is None else self._dirt.over(image)
         out = np.empty(image.shape, np.uint8)
         read, shot = effects.read_noise**2, effects.shot_noise
         _digitise(
@@ -80,7 +92,7 @@ class Sensor:
             effects.black_level,
             out,
         )
-        return out
+        return compressed(out, effects.jpeg)
 
 
 def brightness(effects: Effects, seconds: float, seed: int) -> float:
@@ -89,7 +101,7 @@ def brightness(effects: Effects, seconds: float, seed: int) -> float:
     swing = 0.7 * math.sin(2 * math.pi * seconds / 13.0 + phase[0]) + 0.3 * math.sin(
         2 * math.pi * seconds / 4.1 + phase[1]
     )
-    return effects.gain * (1 + effects.drift * swing)
+    return effects.gain * (1 + effects.drift * swing) * flicker(effects.flicker, seconds, effects.exposure_s)
 
 
 @njit

@@ -55,6 +55,10 @@ class SimOptions(SourceOptions):
     drop: float = option(0.0, "fraction of frames lost", low=0, high=0.9)
     noise: float = option(1.0, "scales the sensor's noise", low=0, high=20)
     blur: float = option(1.0, "scales the exposure time", low=0, high=10)
+    robot: bool = option(False, "the robot's own edge and a hand rail are in view")
+    dirt: float = option(0.0, "spots on the lenses", low=0, high=1)
+    flicker: float = option(0.0, "swing of the lamps' brightness, 100 times a second", low=0, high=1)
+    jpeg: int = option(0, "quality of a lossy link, 0: none", low=0, high=100)
     readout: float = option(
         0.0, "seconds from the first row's exposure to the last's: a rolling shutter", low=0, high=0.1
     )

@@ -18,6 +18,7 @@ from stereo_sfm.drivers.sim.options import SimOptions
 from stereo_sfm.drivers.sim.people import crowd_at, moving
 from stereo_sfm.drivers.sim.render import Renderer, View
 from stereo_sfm.drivers.sim.rigs import make_rig
+from stereo_sfm.drivers.sim.robot import RobotView
 from stereo_sfm.drivers.sim.scenes import SCENES, Scene, crowd
 from stereo_sfm.drivers.sim.tables import Tables
 from stereo_sfm.drivers.sim.walks import Walk
@@ -42,6 +43,9 @@ def _effects(scene: Scene, options: SimOptions) -> Effects:
     return dataclasses.replace(
         e,
         drop=options.drop,
+        dirt=options.dirt,
+        flicker=options.flicker,
+        jpeg=options.jpeg,
         exposure_s=e.exposure_s * options.blur,
         read_noise=e.read_noise * options.noise,
         shot_noise=e.shot_noise * options.noise**2,
@@ -116,8 +120,22 @@ class SimSource(BaseSource):
         """Made when first needed: its rays take a while."""
         if self._renderer is None:
             self._renderer = Renderer(self.world, self._camera)
-            self._sensors = [Sensor(eye, self.effects) for eye in self._renderer.eyes]
+            self._sensors = self._make_sensors(self._renderer)
         return self._renderer
+
+    def _make_sensors(self, renderer: Renderer) -> list[Sensor]:
+        camera, poses = self._camera.left, (np.eye(4), self._camera.left_T_right)
+        ends = np.array([[camera.cx, camera.height - 1.0], [camera.width - 1.0, camera.cy]])
+        down, side = np.nan_to_num(np.arccos(camera.unproject(ends)[:, 2]), nan=np.pi / 2)
+        return [
+            Sensor(
+                eye,
+                self.effects,
+                RobotView(eye, poses[k], (down, side)) if self.options.robot else None,
+                np.random.default_rng([self.options.seed, k, 101]),
+            )
+            for k, eye in enumerate(renderer.eyes)
+        ]
 
     def pose(self, frame_id: int) -> F64:
         """world_T_cam0 (4, 4) of a frame."""

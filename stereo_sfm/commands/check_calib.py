@@ -13,10 +13,14 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from stereo_sfm.calib.check import CheckReport, Finding
+    from stereo_sfm.calib.rig import Rig
+    from stereo_sfm.recording.masks import RecordedMasks
     from stereo_sfm.tracking.flow.readout import Readout, ReadoutSearch
     from stereo_sfm.types import StereoImage
 
 SHUTTER_FRAMES = 200  # looked at for a rolling shutter
+FIXED_SHARE = 0.003  # of an image, from which on the robot in view is worth a mask
+SIDES = ("left", "right")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -60,6 +64,7 @@ def run(args: argparse.Namespace) -> int:
     from stereo_sfm.calib.tracks import MAX_FRAMES, collect, corners_for
     from stereo_sfm.config import Config
     from stereo_sfm.drivers.source import open_source
+    from stereo_sfm.recording.masks import RecordedMasks
     from stereo_sfm.tracking.flow.readout import ReadoutSearch
 
     _check(options)
@@ -70,11 +75,12 @@ def run(args: argparse.Namespace) -> int:
         gap = 0 if source.live else max(0, total // options.windows - MAX_FRAMES)
         corners = corners_for(total, options.windows)
         shutter = ReadoutSearch(Config().tracker, rig)
-        images = _searched(itertools.islice(source, options.max_frames), shutter)
+        masks = RecordedMasks(rig)
+        images = _searched(itertools.islice(source, options.max_frames), shutter, masks)
         windows = collect(images, rectification, options.windows, gap, corners, options.search)
         readout = shutter.measured()
         report = check(rig, rectification, windows, rolling=readout.best_s != 0)
-        report = replace(report, findings=(*report.findings, _shutter(rig.shutter, readout)))
+        report = replace(report, findings=(*report.findings, _shutter(rig.shutter, readout), *_robot(masks, rig)))
     if options.correct is not None:
         save_rig(report.choice.apply(rig), options.correct)
     if options.json:
@@ -86,9 +92,10 @@ def run(args: argparse.Namespace) -> int:
     return 3 if report.verdict == "FAIL" else 0
 
 
-def _searched(images: Iterable[StereoImage], shutter: ReadoutSearch) -> Iterator[StereoImage]:
-    """Pass the images on, and the first of them to the search for a rolling shutter."""
+def _searched(images: Iterable[StereoImage], shutter: ReadoutSearch, masks: RecordedMasks) -> Iterator[StereoImage]:
+    """Pass the images on, to the search for the robot in view, and the first ones to that for a rolling shutter."""
     for number, image in enumerate(images):
+        masks.add(image)
         if number < SHUTTER_FRAMES and image.right is not None:
             shutter.add(image)
         yield image
@@ -108,6 +115,24 @@ def _shutter(known: str, readout: Readout) -> Finding:
         return Finding("shutter", 1, f"{upwards}, which no calibration can say: read the images the other way up")
     what = "check readout_s in rig.yaml" if readout.told_s else "set readout_s in rig.yaml (see the data sheet)"
     return Finding("shutter", 1, f"{known}, but the motion shows rows read within {measured}: {what}")
+
+
+def _robot(masks: RecordedMasks, rig: Rig) -> list[Finding]:
+    """What is seen of the robot itself and not masked; nothing where the recording cannot tell."""
+    from stereo_sfm.calib.check import Finding
+
+    if not masks.turned:
+        return []
+    used = (rig.left_mask, rig.right_mask)
+    fixed = [
+        found.fixed if mask is None else found.fixed & mask for found, mask in zip(masks.find(), used, strict=False)
+    ]
+    shares = [float(part.mean()) for part in fixed]
+    text = " and ".join(f"{100 * share:.1f} % of the {side} image" for side, share in zip(SIDES, shares, strict=False))
+    if max(shares) < FIXED_SHARE:
+        return [Finding("mask", 0, f"{text} stays in place while the camera turns")]
+    advice = "points there stick to the image: mask it ('stereo-sfm mask')"
+    return [Finding("mask", 1, f"{text} stays in place while the camera turns: {advice}")]
 
 
 def _check(options: CheckOptions) -> None:

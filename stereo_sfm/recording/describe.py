@@ -235,7 +235,7 @@ def _problems(out: Description) -> list[str]:
 
 def rig_lines(rig: Rig) -> list[str]:
     """The calibration as text, one line per camera and one for the pair."""
-    lines = [f"left  {_camera_line(rig.left)}"]
+    lines = [f"left  {_camera_line(rig.left)}{_mask_text(rig.masked_share[0])}"]
     if rig.readout_s:
         lines.append(f"rolling shutter, {rig.shutter}")
     if rig.depth:
@@ -244,7 +244,11 @@ def rig_lines(rig: Rig) -> list[str]:
         return [*lines, "one camera"]
     angle = np.degrees(se3.extent(rig.left_T_right)[1])
     pair = f"baseline {rig.baseline * 1e3:.2f} mm, relative rotation {angle:.2f} deg"
-    return [*lines, f"right {_camera_line(rig.right)}", pair]
+    return [*lines, f"right {_camera_line(rig.right)}{_mask_text(rig.masked_share[1])}", pair]
+
+
+def _mask_text(share: float) -> str:
+    return f", {100 * share:.0f} % masked" if share else ""
 
 
 def _camera_line(camera: Camera) -> str:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stereo_sfm.calib.mask import uncovered
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import FeaturesConfig
 from stereo_sfm.geometry import se3
@@ -17,6 +18,7 @@ from stereo_sfm.tracking.features.matching import epipolar_inliers, match_featur
 from stereo_sfm.types import F64, I32, I64, U8, Bool, Message, StereoImage
 
 MIN_DISPARITY_PX = 0.5  # below, the depth is treated as unknown
+MASK_MARGIN_PX = 15  # half of the patch that ORB describes: keypoints keep so far from what a mask covers
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +46,7 @@ class ViewMaker:
         self._config = config
         self._rig = rig
         self._left = Extractor(config)
+        self._masks = _kept(rig.left_mask), _kept(rig.right_mask)
         self._norm = feature_kind(config.kind).norm
         self._threshold = config.epipolar_px * rig.pixel_angle
         right_T_left = se3.inverse(rig.left_T_right)
@@ -51,7 +54,7 @@ class ViewMaker:
 
     def make(self, image: StereoImage, mask: U8 | None, rng: np.random.Generator) -> FeatureView:
         """Features of the left eye; with stereo only those that the other eye confirms (retail paper, IV-A3)."""
-        features = self._left.extract(image.left, mask)
+        features = self._left.extract(image.left, _both(self._masks[0], mask))
         bearings = self._rig.left.unproject(features.uv)
         seen = np.isfinite(bearings[:, 2])
         features, bearings = features.rows(seen), bearings[seen]
@@ -71,7 +74,7 @@ class ViewMaker:
         """(N, 3) points and (N, 2) right pixels, NaN where unmatched."""
         assert self._rig.right is not None
         points, uv_right = np.full((len(features), 3), np.nan), np.full((len(features), 2), np.nan)
-        other = self._left.extract(right_image)
+        other = self._left.extract(right_image, self._masks[1])
         matches = match_features(features, other, self._norm, self._config.ratio)
         other_bearings = self._rig.right.unproject(other.uv)
         matches = matches[np.isfinite(other_bearings[matches[:, 1], 2])]
@@ -90,3 +93,12 @@ class ViewMaker:
         if self._config.stereo_check == "ransac" or self._essential is None:
             return epipolar_inliers(a, b, self._threshold, rng)
         return epipolar_residuals(self._essential[None], a, b)[0] <= self._threshold
+
+
+def _kept(mask: Bool | None) -> U8 | None:
+    """A camera's mask as OpenCV's detectors want it: no keypoint whose surroundings touch what is not used."""
+    return None if mask is None else uncovered(mask, MASK_MARGIN_PX).astype(np.uint8)
+
+
+def _both(a: U8 | None, b: U8 | None) -> U8 | None:
+    return a if b is None else b if a is None else np.where(a > 0, b, 0).astype(np.uint8)

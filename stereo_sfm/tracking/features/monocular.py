@@ -42,7 +42,7 @@ class MonocularTracker:
         self._config = config
         self._odometry = config.odometry
         self._spans = spans or NoSpans()
-        self._views = ViewMaker(config.features, Rig(rig.left))
+        self._views = ViewMaker(config.features, Rig(rig.left, left_mask=rig.left_mask))
         self._kind = feature_kind(config.features.kind)
         self._pixel = rig.pixel_angle
         self._ids = PointIds()

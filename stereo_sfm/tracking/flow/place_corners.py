@@ -10,6 +10,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from stereo_sfm.calib.mask import half_size, uncovered
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.tracking.flow.corners import corner_mask
@@ -29,6 +30,7 @@ class PlaceCorners:
         self._levels = config.tracker.pyramid_levels
         self._stereo = StereoMatcher(config.tracker, rig)
         mask = corner_mask(rig.left, config.tracker.max_angle_deg)
+        mask &= True if rig.left_mask is None else uncovered(half_size(rig.left_mask), BORDER)
         everywhere = mask[BORDER:-BORDER, BORDER:-BORDER].all()
         self._mask = None if everywhere else mask.astype(np.uint8)  # a mask that masks nothing takes time
         self._orb = cv2.ORB.create(

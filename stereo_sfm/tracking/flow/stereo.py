@@ -46,7 +46,7 @@ class StereoMatcher:
         self._rig = rig
         self._cameras = StereoCameras.of(rig)
         assert rig.right is not None
-        self._right_area = VisibleArea(rig.right, config.max_angle_deg)
+        self._right_area = VisibleArea(rig.right, config.max_angle_deg, rig.right_mask)
         self._min_depth = config.min_depth_baselines * rig.baseline
         reach = rig.left.fx / config.min_depth_baselines
         self._candidates = int(np.clip(reach / 2**SEARCH_LEVEL * 1.2, 16, 160))

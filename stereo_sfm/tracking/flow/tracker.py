@@ -73,7 +73,7 @@ class Tracker:
         self._spans = spans or NoSpans()
         self._stereo = StereoMatcher(config, rig)
         self._shutter = RollingShutter(rig)
-        area = VisibleArea(rig.left, config.max_angle_deg)
+        area = VisibleArea(rig.left, config.max_angle_deg, rig.left_mask)
         self._follower = Follower(config, rig, area, self._shutter)
         self._solver = FramePoseSolver(config, StereoCameras.of(rig), self._shutter)
         self._new_points = NewPoints(config, area, self._stereo, self._follower, self._shutter)

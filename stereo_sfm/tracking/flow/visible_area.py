@@ -11,6 +11,7 @@ import math
 import cv2
 import numpy as np
 
+from stereo_sfm.calib.mask import half_size, uncovered
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.tracking.flow.corners import corner_mask
 from stereo_sfm.types import F64, U8, Bool
@@ -26,7 +27,8 @@ WINDOW = 7  # px of the half image: what weighs in the windows of points keeps o
 class VisibleArea:
     """The part of one camera's image in which points may lie."""
 
-    def __init__(self, camera: Camera, max_angle_deg: float) -> None:
+    def __init__(self, camera: Camera, max_angle_deg: float, mask: Bool | None = None) -> None:
+        """`mask`: (H, W) of the camera's image, True where it is used (`Rig.left_mask`); None: everywhere."""
         grid = camera.bearing_grid(2 * STEP)
         with np.errstate(invalid="ignore"):
             angle = np.nan_to_num(np.degrees(np.arccos(np.clip(grid[..., 2], -1, 1))), nan=180.0)
@@ -35,7 +37,8 @@ class VisibleArea:
         self._lit = np.zeros(181)  # share of the pixels at each degree, the most ever seen
         self._rim_deg = 181
         self._allowed = corner_mask(camera, max_angle_deg)
-        self._shown = np.ones_like(self._allowed)  # (H / 2, W / 2) off the rim
+        self._used = np.ones_like(self._allowed) if mask is None else uncovered(half_size(mask), WINDOW // 2)
+        self._shown = self._used  # (H / 2, W / 2) off the rim and what the mask covers
 
     @property
     def mask(self) -> Bool:
@@ -54,7 +57,7 @@ class VisibleArea:
         if rim >= LEAST_RIM_DEG and rim != self._rim_deg:
             self._rim_deg = rim
             shown = self._camera.valid_mask(math.radians(rim), step=2).astype(np.uint8)
-            self._shown = cv2.erode(shown, np.ones((WINDOW, WINDOW), np.uint8)) > 0
+            self._shown = (cv2.erode(shown, np.ones((WINDOW, WINDOW), np.uint8)) > 0) & self._used
 
     def inside(self, uv: F64) -> Bool:
         """Which pixels (N, 2) are in the image and off the rim; not those that are NaN."""

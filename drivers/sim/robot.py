@@ -1,0 +1,56 @@
+"""The robot's own parts in view: the edge of its top in front of the cameras, and the post of a hand rail beside them.
+
+They are planes fixed to the left camera, seen by both cameras from where these are, so that their disparity is true.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stereo_sfm.drivers.sim.render import Eye
+from stereo_sfm.types import F32, F64, Bool
+
+BELOW_M = 0.22  # from the left camera down to the robot's top
+TOP_BEGINS = 0.72  # of the angle from the axis down to the last row: where the top's edge is seen
+POST_M = 0.24, 0.27  # to the right of the left camera
+POST_AHEAD = 0.55  # of the angle from the axis to the last column: where the post is seen
+CELL_M = 0.02  # of the pattern on both: screws, scratches, labels
+
+
+class RobotView:
+    """What one camera sees of the robot."""
+
+    def __init__(self, eye: Eye, left_T_camera: F64, reach: tuple[float, float]) -> None:
+        """Args:
+        eye: the camera's rays. left_T_camera: (4, 4) its pose in the left camera. reach: radians from the left
+            camera's axis down to its last row, and to the side to its last column.
+        """
+        rays = np.nan_to_num(eye.grid, nan=0.0) @ left_T_camera[:3, :3].T
+        centre = left_T_camera[:3, 3]
+        top = _hit(rays, centre, 1, BELOW_M)
+        ahead = BELOW_M / np.tan(TOP_BEGINS * reach[0])
+        on_top = (top[..., 2] < ahead) & (np.abs(top[..., 0]) < 0.4)
+        distance = POST_M[0] / np.tan(POST_AHEAD * reach[1])
+        post = _hit(rays, centre, 2, max(distance, 0.02))
+        on_post = (post[..., 0] > POST_M[0]) & (post[..., 0] < POST_M[1]) & (post[..., 1] > -0.3)
+        self.covered: Bool = np.asarray(on_top | on_post)  # (H, W)
+        pattern = np.where(on_post, _pattern(post[..., 0], post[..., 1]), _pattern(top[..., 0], top[..., 2]))
+        self.brightness: F32 = pattern.astype(np.float32)  # (H, W) grey levels
+
+    def over(self, image: F32) -> F32:
+        """The image (H, W) with the robot before it."""
+        return np.where(self.covered, self.brightness, image)
+
+
+def _hit(rays: F64, centre: F64, axis: int, at: float) -> F64:
+    """Where rays (H, W, 3) from a centre (3,) meet the plane of the left camera's coordinate `axis`; NaN where not."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = (at - centre[axis]) / rays[..., axis]
+        return np.where((t > 0)[..., None], centre + t[..., None] * rays, np.nan)
+
+
+def _pattern(a: F64, b: F64) -> F64:
+    """Grey levels of the surface at coordinates in metres: cells of random shade, and some plain ones."""
+    i, j = (np.floor(np.nan_to_num(v) / CELL_M).astype(np.int64) for v in (a, b))
+    shade = ((i * 73856093) ^ (j * 19349663)) % 97 / 97.0
+    return np.where(shade < 0.4, 70.0, 40.0 + 120.0 * shade)
