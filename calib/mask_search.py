@@ -156,7 +156,7 @@ def _closed(fixed: Bool, plain: Bool) -> Bool:
     """The fixed parts with the plain surfaces between them, without small ones."""
     element = np.ones((WINDOW, WINDOW), np.uint8)
     part = cv2.morphologyEx(fixed.astype(np.uint8), cv2.MORPH_CLOSE, element)
-    part |= _enclosed(plain, part > 0)
+    part = np.asarray(part, np.uint8) | _enclosed(plain, part > 0)
     count, labels, stats, _ = cv2.connectedComponentsWithStats(part)
     large = np.flatnonzero(stats[:, cv2.CC_STAT_AREA] >= SMALLEST * part.size)
     return np.isin(labels, large[large > 0]) if count > 1 else np.zeros_like(fixed)
