@@ -29,6 +29,7 @@ def test_what_is_there_passes_and_what_is_missing_is_named() -> None:
         (["viz", "{demo}"], "rerun", "viewer"),
         (["run", "t265", "--inline"], "usb", "t265"),
         (["batch", "{demo}", "-o", "out"], "ray", "batch"),
+        (["run", "rosbag:drive.bag", "--inline"], "rosbags", "ros"),
     ],
 )
 def test_missing_extra_is_one_line(
@@ -47,6 +48,7 @@ def test_missing_extra_is_one_line(
 def test_extras_hold_what_their_names_say() -> None:
     extras = PROJECT["optional-dependencies"]
     core = " ".join(PROJECT["dependencies"])
-    for extra, library in (("viewer", "rerun-sdk"), ("t265", "pyusb"), ("oak", "depthai"), ("batch", "ray")):
+    libraries = {"viewer": "rerun-sdk", "t265": "pyusb", "oak": "depthai", "batch": "ray", "ros": "rosbags"}
+    for extra, library in libraries.items():
         assert any(line.startswith(library) for line in extras[extra]) and library not in core
         assert extra in extras["all"][0]

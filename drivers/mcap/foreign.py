@@ -1,4 +1,4 @@
-"""MCAP files of other programs as a source: two image topics, their calibrations, and other usable topics."""
+"""Recordings of other programs as a source: two image topics, their calibrations, and other usable topics."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from stereo_sfm.calib.imu import Imu
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.drivers.mcap.messages import (
     BAD_MESSAGE,
@@ -21,10 +22,12 @@ from stereo_sfm.drivers.mcap.messages import (
     POSES,
     TRANSFORMS,
     CameraInfo,
+    ImuReading,
     Picture,
     Transform,
     schema_name,
 )
+from stereo_sfm.drivers.mcap.recording import Recording
 from stereo_sfm.drivers.mcap.rig import camera_of, chain, stereo_rig
 from stereo_sfm.drivers.mcap.topics import camera_topic, choose_topics, is_rectified
 from stereo_sfm.drivers.rig_option import RigOption, chosen_rig
@@ -32,7 +35,7 @@ from stereo_sfm.drivers.source import BaseSource, Stamps
 from stereo_sfm.drivers.tum_rgbd.source import with_virtual_eye
 from stereo_sfm.drivers.used_bits import used_bits
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.log.reader import LogReader, Record
+from stereo_sfm.log.reader import Record
 from stereo_sfm.pixels import eight_bits
 from stereo_sfm.types import ImuSamples, StereoImage, Trajectory
 
@@ -51,23 +54,23 @@ class _Shot:
     picture: Picture
 
 
-class ForeignMcapSource(BaseSource):
+class ForeignSource(BaseSource):
     """Pairs the images of two topics by their stamps. Frames without a partner count as dropped."""
 
     def __init__(
-        self, reader: LogReader, rig: RigOption = None, left: str = "", right: str = "", depth: str = ""
+        self, reader: Recording, rig: RigOption = None, left: str = "", right: str = "", depth: str = ""
     ) -> None:
         """Takes over the reader.
 
         Args:
-            reader: the open file.
+            reader: the open recording.
             rig: calibration that replaces or supplies the one in the file.
             left: image topic of the left camera if the names are ambiguous. right, depth: likewise.
         """
         self.reader = reader
         self.name = str(reader.path)
         self.topics = choose_topics(reader, left, right, depth)
-        self.rig = chosen_rig(rig, self._recorded_rig)
+        self.rig = self._with_imu(chosen_rig(rig, self._recorded_rig))
         if self.topics.depth:
             self.rig = with_virtual_eye(self.rig)
         self.ground_truth = self._read_truth()
@@ -109,7 +112,7 @@ class ForeignMcapSource(BaseSource):
             StereoSfmError: images that do not fit the calibration.
         """
         dropped = 0
-        imu: list[tuple[int, list[float]]] = []
+        imu: list[ImuReading] = []
         for frame_id, (left, other) in enumerate(self._pairs(start_ns, until_ns, imu)):
             image = self._decode(frame_id, left, other, dropped) if self._used(other) else None
             dropped = 0 if image is not None else dropped + 1
@@ -138,16 +141,16 @@ class ForeignMcapSource(BaseSource):
         )
 
     def _pairs(
-        self, start_ns: int | None, until_ns: int | None, imu: list[tuple[int, list[float]]]
+        self, start_ns: int | None, until_ns: int | None, imu: list[ImuReading]
     ) -> Iterator[tuple[_Shot, _Shot | None]]:
         """(left, right or depth) by stamp; an unpaired left image has None. Inertial samples are put into `imu`."""
         names = [t for t in (self.topics.left, self._other()) if t]
         lefts: deque[_Shot] = deque()
         others: deque[_Shot] = deque()
-        for record in self.reader.messages([*names, self.topics.imu], start_ns, until_ns):
-            if record.topic == self.topics.imu:
-                with suppress(*BAD_MESSAGE):
-                    imu.append(IMUS[schema_name(record)](record.data))
+        for record in self.reader.messages([*names, *self.topics.imu], start_ns, until_ns):
+            if record.topic in self.topics.imu:
+                reading = _imu_reading(record)
+                imu += [reading] if reading is not None else []
                 continue
             shot = self._shot(record)
             if shot is None:
@@ -199,6 +202,17 @@ class ForeignMcapSource(BaseSource):
             except BAD_MESSAGE as error:
                 raise StereoSfmError(f"{self.name}: calibration on {topic} cannot be read: {error}") from None
         raise StereoSfmError(f"{self.name}: {topic} is empty")
+
+    def _with_imu(self, rig: Rig) -> Rig:
+        """The rig with the pose of the IMU, where the recording has one and its transforms say where it is."""
+        if rig.imu is not None or not self.topics.imu:
+            return rig
+        reading = next((r for m in self.reader.messages(self.topics.imu) if (r := _imu_reading(m)) is not None), None)
+        left_T_imu = chain(self._fixed_transforms(), self._left_frame(), reading.frame) if reading else None
+        if left_T_imu is None:
+            log.info("%s: no transform from the left camera to the IMU: its samples are not used", self.name)
+            return rig
+        return replace(rig, imu=Imu(left_T_imu))
 
     def _fixed_transforms(self) -> list[Transform]:
         out: list[Transform] = []
@@ -260,9 +274,15 @@ class ForeignMcapSource(BaseSource):
             )
 
 
-def _take_imu(buffer: list[tuple[int, list[float]]], until_ns: int) -> ImuSamples:
+def _imu_reading(record: Record) -> ImuReading | None:
+    with suppress(*BAD_MESSAGE):
+        return IMUS[schema_name(record)](record.data)
+    return None
+
+
+def _take_imu(buffer: list[ImuReading], until_ns: int) -> ImuSamples:
     """Remove the samples up to a stamp from the buffer."""
-    taken = [s for s in buffer if s[0] <= until_ns]
-    buffer[:] = [s for s in buffer if s[0] > until_ns]
-    values = np.array([v for _, v in taken], float).reshape(-1, 6)
-    return ImuSamples(np.array([t for t, _ in taken], np.int64), values[:, :3].copy(), values[:, 3:].copy())
+    taken = sorted((s for s in buffer if s.stamp_ns <= until_ns), key=lambda s: s.stamp_ns)
+    buffer[:] = [s for s in buffer if s.stamp_ns > until_ns]
+    values = np.array([s.values for s in taken], float).reshape(-1, 6)
+    return ImuSamples(np.array([s.stamp_ns for s in taken], np.int64), values[:, :3].copy(), values[:, 3:].copy())

@@ -81,6 +81,15 @@ class Transform:
     matrix: F64
 
 
+@dataclass(frozen=True)
+class ImuReading:
+    """One inertial message."""
+
+    stamp_ns: int
+    frame: str
+    values: list[float]  # (6,) rad/s and m/s^2 in the IMU's frame, NaN for what the message does not measure
+
+
 class _Cdr:
     """Reads CDR fields one after the other."""
 
@@ -203,13 +212,15 @@ def _odometry_ros(data: bytes) -> Transform:
     return Transform(stamp_ns, parent, cdr.text(), cdr.pose())
 
 
-def _imu_ros(data: bytes) -> tuple[int, list[float]]:
+def _imu_ros(data: bytes) -> ImuReading:
+    """A covariance of -1 stands for a quantity that is not measured (sensor_msgs/Imu)."""
     cdr = _Cdr(data)
-    stamp_ns, _ = cdr.header()
+    stamp_ns, frame = cdr.header()
     cdr.take("d", 13)
-    gyro = cdr.take("d", 3)
-    cdr.take("d", 9)
-    return stamp_ns, [*gyro, *cdr.take("d", 3)]
+    gyro, gyro_known = cdr.take("d", 3), cdr.take("d", 9)[0] != -1
+    accel, accel_known = cdr.take("d", 3), cdr.take("d", 9)[0] != -1
+    nothing = (float("nan"),) * 3
+    return ImuReading(stamp_ns, frame, [*(gyro if gyro_known else nothing), *(accel if accel_known else nothing)])
 
 
 PICTURES: dict[str, Callable[[bytes], Picture]] = {
@@ -232,7 +243,7 @@ POSES: dict[str, Callable[[bytes], Transform]] = {
     "geometry_msgs/msg/PoseStamped": _pose_ros,
     "nav_msgs/msg/Odometry": _odometry_ros,
 }
-IMUS: dict[str, Callable[[bytes], tuple[int, list[float]]]] = {"sensor_msgs/msg/Imu": _imu_ros}
+IMUS: dict[str, Callable[[bytes], ImuReading]] = {"sensor_msgs/msg/Imu": _imu_ros}
 ENCODINGS = ("protobuf", "cdr")
 
 

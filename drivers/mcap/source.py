@@ -63,9 +63,9 @@ def open_mcap(path: str, options: McapOptions) -> Source:
         about = reader.metadata(METADATA)
         if about.get("image_format") == "none":
             raise StereoSfmError(f"{path} is a run without images: they are in {about.get('source')}")
-        from stereo_sfm.drivers.mcap.foreign import ForeignMcapSource
+        from stereo_sfm.drivers.mcap.foreign import ForeignSource
 
-        return ForeignMcapSource(reader, options.rig, options.left, options.right, options.depth)
+        return ForeignSource(reader, options.rig, options.left, options.right, options.depth)
     except BaseException:
         reader.close()
         raise

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from pathlib import PurePosixPath
 
 from stereo_sfm.drivers.mcap.messages import CAMERAS, ENCODINGS, IMUS, PICTURES, POSES, TRANSFORMS
+from stereo_sfm.drivers.mcap.recording import Recording
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.log.reader import LogReader, TopicInfo
+from stereo_sfm.log.reader import TopicInfo
 
 log = logging.getLogger("stereo_sfm")
 
@@ -38,16 +39,16 @@ class ChosenTopics:
     right: str
     depth: str
     truth: str
-    imu: str
+    imu: tuple[str, ...]  # one, or the gyroscope's and the accelerometer's
     cameras: tuple[str, ...]
     transforms: tuple[str, ...]
 
 
-def choose_topics(reader: LogReader, left: str = "", right: str = "", depth: str = "") -> ChosenTopics:
+def choose_topics(reader: Recording, left: str = "", right: str = "", depth: str = "") -> ChosenTopics:
     """Find the image topics.
 
     Args:
-        reader: the open file.
+        reader: the open recording.
         left: image topic given by the user, "" to find it. right, depth: likewise.
 
     Raises:
@@ -72,10 +73,19 @@ def choose_topics(reader: LogReader, left: str = "", right: str = "", depth: str
         right,
         "" if right else depth,
         next((t.topic for t in rows if t.schema in POSES and any(w in t.topic.lower() for w in _TRUTH)), ""),
-        next((t.topic for t in rows if t.schema in IMUS), ""),
+        _imu_topics([t.topic for t in rows if t.schema in IMUS]),
         cameras,
         tuple(t.topic for t in rows if t.schema in TRANSFORMS),
     )
+
+
+def _imu_topics(topics: list[str]) -> tuple[str, ...]:
+    """The first IMU; both topics of one whose gyroscope and accelerometer are separate."""
+    for gyro in topics:
+        accel = gyro.replace("gyro", "accel")
+        if accel != gyro and accel in topics:
+            return gyro, accel
+    return tuple(topics[:1])
 
 
 def camera_topic(image: str, cameras: tuple[str, ...]) -> str:
@@ -129,5 +139,5 @@ def _pair(name: str, eyes: list[str], cameras: tuple[str, ...]) -> tuple[str, st
         return sorted(eyes)[0], sorted(eyes)[1]
     raise StereoSfmError(
         f"{name} has {len(eyes)} image topics with ambiguous names: "
-        f"choose with mcap:FILE?left=TOPIC&right=TOPIC ({', '.join(eyes)})"
+        f"choose with '{name}?left=TOPIC&right=TOPIC' ({', '.join(eyes)})"
     )

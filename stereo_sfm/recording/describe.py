@@ -147,13 +147,13 @@ def _without_duplicates() -> Generator[None]:
         log.removeFilter(new)
 
 
-def describe_folder(path: Path, rig: Path | None = None) -> Description:
-    """Describe a dataset folder of any known kind; `rig` as in `describe_file`.
+def describe_dataset(path: Path, rig: Path | None = None) -> Description:
+    """Describe a dataset folder of any known kind, or a ROS bag; `rig` as in `describe_file`.
 
     Raises:
         StereoSfmError: not a known dataset.
     """
-    out = Description(str(path), "folder")
+    out = Description(str(path), "folder" if path.is_dir() else "bag")
     _describe_source(out, path, rig)
     return out
 
@@ -196,7 +196,7 @@ def _describe_source(out: Description, path: Path, rig: Path | None) -> None:
     try:
         source = open_source(path, rig)
     except StereoSfmError as error:
-        if out.kind == "folder":
+        if out.kind != "mcap":
             raise
         out.problems.append(str(error))
         return
@@ -209,7 +209,7 @@ def _describe_source(out: Description, path: Path, rig: Path | None) -> None:
         if listed is not None:
             out.skew_ms = listed.skew_ms if np.isnan(out.skew_ms) else out.skew_ms
             out.rows += [(name, "samples beside the images", rate_of(times)) for name, times in listed.beside.items()]
-        if out.kind == "folder":
+        if out.kind != "mcap":
             out.metadata["source"] = source.name
             out.seconds = float(stamps[-1] - stamps[0]) / 1e9 if len(stamps) else 0.0
     out.problems += _problems(out)

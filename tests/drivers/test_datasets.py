@@ -19,7 +19,7 @@ from stereo_sfm.drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry.cameras import Pinhole
 from stereo_sfm.pixels import eight_bits
-from stereo_sfm.recording.describe import describe_folder
+from stereo_sfm.recording.describe import describe_dataset
 from tests.drivers.dataset_folders import (
     FRAMES,
     PERIOD_NS,
@@ -261,7 +261,7 @@ def test_images_named_by_time_are_paired_by_time(tmp_path: Path, caplog: pytest.
     for image, number in zip(images, kept, strict=True):
         assert image.right is not None and np.array_equal(image.right, picture(number, 1))
     assert "10 left and 9 right images, the 9 pairs are used" in caplog.text
-    assert describe_folder(tmp_path).skew_ms == pytest.approx(1.5)
+    assert describe_dataset(tmp_path).skew_ms == pytest.approx(1.5)
 
 
 @pytest.mark.parametrize("folder", [make_euroc, None], ids=["euroc", "images"])
@@ -293,7 +293,7 @@ def test_numbered_images_are_paired_by_number_and_keep_their_times(left: str, ri
     assert [i.stamp_ns for i in images] == [i * 10**8 for i in kept]
     for image, number in zip(images, kept, strict=True):
         assert image.right is not None and np.array_equal(image.right, picture(number, 1))
-    assert math.isnan(describe_folder(tmp_path).skew_ms)  # nobody knows it
+    assert math.isnan(describe_dataset(tmp_path).skew_ms)  # nobody knows it
 
 
 def test_names_that_do_not_tell_the_pairs_are_refused(tmp_path: Path) -> None:

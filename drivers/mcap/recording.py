@@ -1,0 +1,37 @@
+"""What a recording of another program must offer to be a source."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import Protocol
+
+from stereo_sfm.log.reader import Record, TopicInfo
+
+
+class Recording(Protocol):
+    """Messages by topic and time: an MCAP file (`stereo_sfm.log.reader.LogReader`) or a ROS bag."""
+
+    path: Path
+
+    @property
+    def topics(self) -> list[TopicInfo]:
+        """Every topic that has messages, by name."""
+        ...
+
+    @property
+    def time_range(self) -> tuple[int, int]:
+        """First and last log time, nanoseconds."""
+        ...
+
+    def messages(
+        self, topics: Collection[str] | None = None, start: int | None = None, until: int | None = None
+    ) -> Iterator[Record]:
+        """Messages of some topics (None: all) in the order of their log time, both ends inclusive."""
+        ...
+
+    def step_back_ns(self, topic: str) -> int:
+        """How far the log time goes back at most from one message of a topic to the next."""
+        ...
+
+    def close(self) -> None: ...

@@ -1,0 +1,144 @@
+"""ROS bags as sources: the same images, calibration and inertial samples as went into them, and the same poses."""
+
+from __future__ import annotations
+
+import functools
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stereo_sfm.cli import main
+from stereo_sfm.drivers import open_source
+from stereo_sfm.drivers.registry import recognise
+from stereo_sfm.drivers.source import Source
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.system import Tracker
+from stereo_sfm.types import F64, StereoImage
+from tests.drivers.ros_bags import KINDS, write_bag
+
+SIMULATED = "sim:loop?size=212x200&frames=12&start=40&imu=t265"
+
+
+@functools.cache
+def _simulated() -> tuple[Source, list[StereoImage]]:
+    with open_source(SIMULATED) as source:
+        return source, list(source)
+
+
+@pytest.mark.parametrize(("kind", "packed"), [*((kind, False) for kind in KINDS), (KINDS[0], True)])
+def test_what_went_in_comes_out(kind: str, packed: bool, tmp_path: Path) -> None:
+    source, images = _simulated()
+    path = write_bag(tmp_path, kind, source.rig, images, packed)
+    assert recognise(path) == "rosbag"
+    with open_source(path) as bag:
+        assert bag.frame_count == len(images) and bag.rig.imu is not None and source.rig.imu is not None
+        np.testing.assert_array_equal(bag.rig.left.params, source.rig.left.params)
+        np.testing.assert_allclose(bag.rig.left_T_right, source.rig.left_T_right, atol=1e-12)
+        np.testing.assert_allclose(bag.rig.imu.left_T_imu, source.rig.imu.left_T_imu, atol=1e-12)
+        read = list(bag)
+    assert [image.stamp_ns for image in read] == [image.stamp_ns for image in images]
+    for a, b in zip(read, images, strict=True):
+        np.testing.assert_array_equal(a.left, b.left)
+        np.testing.assert_array_equal(a.right, b.right)
+        assert a.imu is not None and b.imu is not None
+    for name in ("stamp_ns", "gyro", "accel"):
+        both = [np.concatenate([getattr(i.imu, name) for i in some]) for some in (read, images)]
+        np.testing.assert_array_equal(both[0], both[1][: len(both[0])])
+        assert len(both[0]) >= len(both[1]) - 1  # a sample later than the last image has no image
+
+
+def test_the_poses_are_those_of_the_images(tmp_path: Path) -> None:
+    source, images = _simulated()
+    path = write_bag(tmp_path, KINDS[0], source.rig, images)
+    with open_source(path) as bag:
+        found, expected = _positions(bag, list(bag)), _positions(source, images)
+    truth = source.ground_truth
+    assert truth is not None and truth.length > 0.1
+    np.testing.assert_allclose(found, expected, atol=2e-3)
+    error = np.linalg.norm(found[-1] - (np.linalg.inv(truth.poses[0]) @ truth.poses[-1])[:3, 3])
+    assert error < 0.05 * truth.length
+
+
+def _positions(source: Source, images: list[StereoImage]) -> F64:
+    tracker = Tracker(source.rig)
+    return np.array([tracker.step(i.left, i.right, i.stamp_ns).odom_T_cam[:3, 3] for i in images])
+
+
+@pytest.mark.parametrize("kind", [KINDS[0], KINDS[3]])
+def test_the_commands_take_bags(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source, images = _simulated()
+    path = write_bag(tmp_path, kind, source.rig, images)
+    assert main(["info", str(path), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["images"]["count"] == len(images) and abs(found["images"]["hz"] - 30) < 0.5
+    assert not found["problems"] and found["calibration"]
+    assert any("imu" in row[0] for row in found["rows"])
+    out = tmp_path / "run"
+    assert main(["run", str(path), "--inline", "-o", str(out), "--log", "none"]) == 0
+    lines = (out / "trajectory_odom.tum").read_text().splitlines()
+    assert len([line for line in lines if not line.startswith("#")]) == len(images)
+    assert main(["check-calib", str(path), "--windows", "1"]) in (0, 3)
+
+
+def test_separate_topics_of_gyroscope_and_accelerometer(tmp_path: Path) -> None:
+    """As realsense-ros writes them: -1 in the covariance of what a message does not measure."""
+    source, images = _simulated()
+    nothing, start = np.full(3, np.nan), images[0].stamp_ns
+
+    def halves(bag: object) -> None:
+        for k in range(10):
+            bag.imu(start + k * 10**7, np.array([1.0, 2.0, k]), nothing, "/camera/gyro/sample")  # pyright: ignore
+            bag.imu(start + k * 10**7 + 1, nothing, np.array([0.0, k, 9.8]), "/camera/accel/sample")  # pyright: ignore
+
+    plain = [StereoImage(i.frame_id, i.stamp_ns, i.left, i.right) for i in images]
+    path = write_bag(tmp_path, KINDS[0], source.rig, plain, extra=halves)
+    with open_source(path) as bag:
+        samples = [i.imu for i in bag]
+    gyro = np.concatenate([s.gyro for s in samples if s is not None])
+    accel = np.concatenate([s.accel for s in samples if s is not None])
+    assert len(gyro) == 20
+    np.testing.assert_array_equal(gyro[::2, 2], np.arange(10))
+    np.testing.assert_array_equal(accel[1::2, 1], np.arange(10))
+    assert np.isnan(gyro[1::2]).all() and np.isnan(accel[::2]).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_bad_bags_are_one_line(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source, images = _simulated()
+    path = write_bag(tmp_path, kind, source.rig, images[:3])
+    inside = path if path.is_file() else max(path.glob("bag*"), key=lambda p: p.stat().st_size)
+    whole = inside.read_bytes()
+    rng = np.random.default_rng(KINDS.index(kind))
+    damaged = bytearray(whole)
+    for at in rng.integers(200, len(whole), 2000):
+        damaged[at] ^= 0xFF
+    for data in (b"", whole[:100], whole[: len(whole) // 3], bytes(damaged)):
+        inside.write_bytes(data)
+        said = _error_of(path)
+        assert "\n" not in said and (str(path) in said or len(data) == len(whole))  # flipped pixels are no damage
+    inside.unlink()
+    assert main(["info", str(path)]) == StereoSfmError.exit_code
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+def _error_of(path: Path) -> str:
+    """What reading a bag says, "" if it can be read."""
+    try:
+        with open_source(path) as bag:
+            list(bag)
+    except StereoSfmError as error:
+        return str(error)
+    return ""
+
+
+def test_a_missing_topic_and_a_missing_place_are_one_line(tmp_path: Path) -> None:
+    source, images = _simulated()
+    path = write_bag(tmp_path, KINDS[0], source.rig, images[:3])
+    with pytest.raises(StereoSfmError, match="no image topic /x"):
+        open_source(f"{path}?left=/x")
+    with pytest.raises(StereoSfmError, match="no bag given"):
+        open_source("rosbag:")
+    with pytest.raises(StereoSfmError, match="no bag at"):
+        open_source(f"rosbag:{tmp_path / 'nothing'}")
