@@ -6,6 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.columns import Columns, Spec
 from stereo_sfm.types import F32, F64, I32, I64, Bool, Frame, TrackState
 
@@ -17,8 +18,8 @@ class FrameTable(Columns):
 
     frame_id: I64
     stamp_ns: I64
-    odom_T_cam: F64  # (F, 4, 4)
-    kf_T_cam: F64  # (F, 4, 4) in the reference keyframe
+    odom: F64  # (F, 3, 4) the upper rows of odom_T_cam
+    kf: F64  # (F, 3, 4) those of kf_T_cam: in the reference keyframe
     reference_kf_id: I64
     inliers: I32
     state: I32  # a TrackState
@@ -27,8 +28,8 @@ class FrameTable(Columns):
     SPEC: ClassVar[Spec] = {
         "frame_id": (np.int64, (), -1),
         "stamp_ns": (np.int64, (), 0),
-        "odom_T_cam": (np.float64, (4, 4), np.eye(4)),
-        "kf_T_cam": (np.float64, (4, 4), np.eye(4)),
+        "odom": (np.float64, (3, 4), np.eye(3, 4)),
+        "kf": (np.float64, (3, 4), np.eye(3, 4)),
         "reference_kf_id": (np.int64, (), -1),
         "inliers": (np.int32, (), 0),
         "state": (np.int32, (), 0),
@@ -47,13 +48,23 @@ class FrameTable(Columns):
             1,
             frame_id=frame.frame_id,
             stamp_ns=frame.stamp_ns,
-            odom_T_cam=frame.odom_T_cam,
-            kf_T_cam=frame.kf_T_cam,
+            odom=frame.odom_T_cam[:3],
+            kf=frame.kf_T_cam[:3],
             reference_kf_id=frame.reference_kf_id,
             inliers=int(frame.observations.inlier.sum()),
             state=int(frame.state),
             reason_id=self.reasons.index(frame.reason),
         )
+
+    @property
+    def odom_T_cam(self) -> F64:
+        """(F, 4, 4)."""
+        return se3.from_rotation_translation(self.odom[:, :, :3], self.odom[:, :, 3])
+
+    @property
+    def kf_T_cam(self) -> F64:
+        """(F, 4, 4)."""
+        return se3.from_rotation_translation(self.kf[:, :, :3], self.kf[:, :, 3])
 
     @property
     def tracked(self) -> Bool:

@@ -35,7 +35,7 @@ from stereo_sfm.types import (
 )
 
 
-@dataclass
+@dataclass(slots=True)
 class KeyframeRow:
     """One keyframe."""
 
@@ -46,7 +46,7 @@ class KeyframeRow:
     submap_id: int  # of the uninterrupted odometry
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Closure:
     """One accepted loop, without the points that it matched."""
 
@@ -130,7 +130,7 @@ class RunRecord:
     @_take.register
     def _put_frame(self, frame: Frame) -> None:
         if len(self.frames):
-            step = frame.odom_T_cam[:3, 3] - self.frames.odom_T_cam[-1, :3, 3]
+            step = frame.odom_T_cam[:3, 3] - self.frames.odom[-1, :, 3]
             self._path_m += float(np.linalg.norm(step))
         self.frames.add(frame)
 

@@ -108,8 +108,10 @@ def ready(stage: str, setup: Setup, to_main: Outbox) -> None:
 def prepare(stage: str, setup: Setup) -> Callable[[], None]:
     """Threads and cores of this process; returns what injects a random delay (tests) or nothing."""
     import cv2
+    from threadpoolctl import threadpool_limits
 
-    cv2.setNumThreads(setup.config.pipeline.threads)  # BLAS: set by the environment
+    cv2.setNumThreads(setup.config.pipeline.threads)
+    threadpool_limits(setup.config.pipeline.threads)  # the environment said so for the first run of this program only
     cpus = setup.config.pipeline.cpus.get(stage)
     if cpus and hasattr(os, "sched_setaffinity"):
         try:
