@@ -146,7 +146,7 @@ class RunLog:
         write(topics.STATS, track_stats(frame), stamp, sequence)
         obs = frame.observations
         if self._pictured:
-            dots = foxglove.point_annotations(stamp, obs.uv_left, _age_colors(obs.age, obs.inlier))
+            dots = foxglove.point_annotations(stamp, obs.uv_left, age_colors(obs.age, obs.inlier))
             write(topics.FEATURES, dots, stamp, sequence)
         odom_T_body = frame.odom_T_cam @ self._left_T_body
         pose = foxglove.pose(odom_T_body)
@@ -311,7 +311,7 @@ def _interval(shortest_ns: int, size: int, usual: int) -> int:
     return shortest_ns * max(size, usual) // usual
 
 
-def _age_colors(age: I32, inlier: Any) -> F32:
+def age_colors(age: I32, inlier: Any) -> F32:
     """(N, 4) from blue (new) over green to red (old); grey where the pose does not use the point."""
     t = np.clip(age / OLD_TRACK, 0.0, 1.0)
     colors = np.stack([t, 1.0 - np.abs(2.0 * t - 1.0), 1.0 - t, np.ones_like(t)], 1).astype(np.float32)

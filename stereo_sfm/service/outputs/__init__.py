@@ -4,5 +4,7 @@ from __future__ import annotations
 
 # name of the output and its section in robot.toml -> where its publisher is made; imported in the output's own process
 OUTPUTS: dict[str, str] = {
+    "foxglove": "stereo_sfm.service.outputs.foxglove_server:make",
+    "page": "stereo_sfm.service.page.server:make",
     "pose_socket": "stereo_sfm.service.outputs.pose_socket:make",
 }

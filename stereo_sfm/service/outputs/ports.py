@@ -25,13 +25,11 @@ def ports(config: RobotConfig) -> list[str]:
         who = _who(host) if address.startswith("tcp://") else "this computer, user and group of the service"
         rows.append(f"pose socket  {address}  {who}")
     if outputs.foxglove.enabled:
-        scheme = "wss" if config.security.tls_cert and not is_loopback(outputs.foxglove.address) else "ws"
-        place = f"{scheme}://{outputs.foxglove.address}:{outputs.foxglove.port}"
-        rows.append(f"foxglove     {place}  {_who(outputs.foxglove.address, 'no token: Foxglove has none')}")
+        rows.append(f"foxglove     ws://{outputs.foxglove.address}:{outputs.foxglove.port}  this computer only")
     if outputs.ros2.enabled:
         rows.append("ros2         DDS, as ROS_DOMAIN_ID and ROS_LOCALHOST_ONLY say  no token: ROS 2 has none")
     return rows or [_NONE]
 
 
-def _who(address: str, needs: str = "with the token") -> str:
-    return "this computer only" if is_loopback(address) else f"anyone who can reach {address}, {needs}"
+def _who(address: str) -> str:
+    return "this computer only" if is_loopback(address) else f"anyone who can reach {address} and has the token"

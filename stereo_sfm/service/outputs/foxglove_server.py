@@ -1,0 +1,267 @@
+"""The topics of the log, live, on Foxglove's WebSocket, with the commands of the service.
+
+Topics, schemas and frames are those of the log (`stereo_sfm.log.topics`), so that one layout shows both; two are
+added, `/service/status` and `/service/health`. The protocol has no client authentication: it is served to this computer
+alone.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.errors import StereoSfmError, require
+from stereo_sfm.log import foxglove, schema, topics
+from stereo_sfm.log.image_log import LEVEL_T_MAP
+from stereo_sfm.log.run_log import PATH_COLOR, age_colors
+from stereo_sfm.messages import Health
+from stereo_sfm.service.messages import (
+    Event,
+    HealthReport,
+    MapCloud,
+    Picture,
+    PoseUpdate,
+    ServiceMessage,
+    Started,
+    Status,
+)
+from stereo_sfm.service.outputs.access import is_loopback
+from stereo_sfm.service.publisher import COMMANDS, ServiceClient
+
+if TYPE_CHECKING:
+    from stereo_sfm.service.config import RobotConfig
+
+log = logging.getLogger("stereo_sfm")
+
+STATUS, REPORT = "/service/status", "/service/health"
+SERVICES = ("status", "save_map", "load_map", "reset", "relocalize", "start_recording", "stop_recording", "mark")
+JPEG_QUALITY = 80
+REQUEST_BYTES = 1 << 14
+ANSWER_S = 30.0
+BACKLOG = 256  # messages that wait for one client; the oldest is dropped
+
+
+def make(config: RobotConfig) -> FoxgloveOutput:
+    """The output."""
+    section = config.outputs.foxglove
+    return FoxgloveOutput(section.address, section.port, section.picture_hz)
+
+
+class FoxgloveOutput:
+    """The publisher on Foxglove's WebSocket."""
+
+    wants: frozenset[type[ServiceMessage]] = frozenset(
+        {Started, Status, PoseUpdate, MapCloud, Picture, HealthReport, Event}
+    )
+
+    def __init__(self, address: str, port: int, picture_hz: float) -> None:
+        """Args: address and port, where to listen. picture_hz: images a second.
+
+        Raises:
+            StereoSfmError: the address is not of this computer alone.
+        """
+        if not is_loopback(address):
+            raise StereoSfmError(
+                f"Foxglove's protocol has no token: listen on 127.0.0.1, not {address}, and put a proxy in front"
+            )
+        self._address, self._port, self.picture_hz = address, port, picture_hz
+        self._server: Any = None
+        self._channels: dict[str, Any] = {}
+        self._rig: Rig | None = None
+        self._stamp_ns = 0  # of the newest pose: for messages without a stamp of the sensor
+
+    @property
+    def port(self) -> int:
+        """The port that it listens on."""
+        return 0 if self._server is None else self._server.port
+
+    def open(self, service: ServiceClient) -> None:
+        """Listen."""
+        require(("foxglove",), "serve", "the Foxglove output")
+        import foxglove as sdk
+        from foxglove.websocket import Capability
+
+        self._context = sdk.Context()
+        try:
+            self._server = sdk.start_server(
+                name="stereo-sfm",
+                host=self._address,
+                port=self._port,
+                capabilities=[Capability.Services, Capability.Parameters],
+                supported_encodings=["json"],
+                services=[_service(name, service) for name in SERVICES],
+                server_listener=_settings(service),
+                context=self._context,
+                message_backlog_size=BACKLOG,
+            )
+        except Exception as error:  # the library has no exception of its own for a port that is taken
+            raise StereoSfmError(f"Foxglove: cannot listen on {self._address}:{self._port}: {error}") from None
+
+    def close(self) -> None:
+        """Stop listening."""
+        if self._server is not None:
+            self._server.stop()
+
+    def put(self, message: ServiceMessage) -> None:
+        """Publish a message under its topics."""
+        writers: dict[type, Callable[[Any], None]] = {
+            Started: self._started,
+            Status: self._status,
+            PoseUpdate: self._pose,
+            MapCloud: self._cloud,
+            Picture: self._picture,
+            HealthReport: self._health,
+            Event: self._event,
+        }
+        writers[type(message)](message)
+
+    # -- messages -----------------------------------------------------------------------------------------------------
+
+    def _started(self, started: Started) -> None:
+        self._rig = started.rig
+        self._static()
+
+    def _static(self) -> None:
+        """Calibrations and fixed transforms; again with every status, for viewers that come later."""
+        if self._rig is None:
+            return
+        rig, stamp = self._rig, self._stamp_ns
+        rows = [("level", "map", foxglove.pose(LEVEL_T_MAP)), ("body", "cam0", foxglove.pose(rig.body_T_left))]
+        self._log(topics.LEFT_CALIBRATION, foxglove.calibration(rig.left, "cam0", stamp))
+        if rig.right is not None and not rig.depth:
+            rows.append(("cam0", "cam1", foxglove.pose(rig.left_T_right)))
+            self._log(topics.RIGHT_CALIBRATION, foxglove.calibration(rig.right, "cam1", stamp))
+        self._log(topics.TF_STATIC, foxglove.transforms(stamp, rows))
+
+    def _status(self, status: Status) -> None:
+        self._static()
+        self._json(STATUS, asdict(status))
+
+    def _pose(self, update: PoseUpdate) -> None:
+        self._stamp_ns = stamp = update.stamp_ns
+        in_map, correction, in_odom = foxglove.poses(
+            np.stack([update.map_T_body, update.map_T_odom, update.odom_T_body])
+        )
+        self._log(topics.ODOMETRY, foxglove.odometry(stamp, in_odom, update.covariance))
+        self._log(topics.ODOM_POSE, foxglove.pose_in_frame("odom", stamp, in_odom))
+        self._log(topics.MAP_POSE, foxglove.pose_in_frame("map", stamp, in_map))
+        rows = (("map", "odom", correction), ("odom", "body", in_odom))
+        self._log(topics.TF, foxglove.transforms(stamp, rows))
+
+    def _cloud(self, cloud: MapCloud) -> None:
+        stamp, positions = cloud.stamp_ns, cloud.map_T_kf[:, :3, 3]
+        self._log(topics.POINTS, foxglove.point_cloud("map", stamp, cloud.points.astype(float), cloud.point_ids))
+        self._log(topics.TRAJECTORY, foxglove.poses_in_frame("map", stamp, cloud.map_T_kf))
+        self._log(topics.PATH, foxglove.point_cloud("map", stamp, positions, cloud.kf_ids, PATH_COLOR))
+
+    def _picture(self, picture: Picture) -> None:
+        data = cv2.imencode(".jpg", picture.left, (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))[1].tobytes()
+        image = foxglove.stamp(CompressedImage(frame_id="cam0", format="jpeg", data=data), picture.stamp_ns)
+        self._log(topics.LEFT_IMAGE, image)
+        colors = age_colors(picture.age, picture.inlier)
+        self._log(topics.FEATURES, foxglove.point_annotations(picture.stamp_ns, picture.uv, colors))
+
+    def _health(self, report: HealthReport) -> None:
+        for health in report.stages.values():
+            self._own(topics.HEALTH, Health, health)
+        self._json(REPORT, {name: value for name, value in asdict(report).items() if name != "stages"})
+
+    def _event(self, event: Event) -> None:
+        self._log(topics.LOG, foxglove.text(self._stamp_ns, event.level.upper(), event.text, event.stage))
+
+    # -- channels -----------------------------------------------------------------------------------------------------
+
+    def _log(self, topic: str, message: Any) -> None:
+        """A message of Foxglove's schemas."""
+        if topic not in self._channels:
+            from mcap_protobuf.schema import build_file_descriptor_set
+
+            data = build_file_descriptor_set(type(message)).SerializeToString()
+            self._channels[topic] = self._channel(topic, message.DESCRIPTOR.full_name, data)
+        self._channels[topic].log(message.SerializeToString(), log_time=self._stamp_ns)
+
+    def _own(self, topic: str, kind: type[Any], message: Any) -> None:
+        """A message of ours."""
+        if topic not in self._channels:
+            self._channels[topic] = self._channel(topic, schema.full_name(kind), schema.schema_data(kind))
+        self._channels[topic].log(schema.encode(message), log_time=self._stamp_ns)
+
+    def _json(self, topic: str, values: dict[str, Any]) -> None:
+        from foxglove import Channel
+
+        if topic not in self._channels:
+            kind = {"type": "object", "title": topic}
+            self._channels[topic] = Channel(topic, schema=kind, context=self._context)
+        self._channels[topic].log(
+            json.loads(json.dumps(values), parse_constant=lambda _: None), log_time=self._stamp_ns
+        )
+
+    def _channel(self, topic: str, name: str, data: bytes) -> Any:
+        from foxglove import Channel, Schema
+
+        kind = Schema(name=name, encoding="protobuf", data=data)
+        return Channel(topic, schema=kind, message_encoding="protobuf", context=self._context)
+
+
+def _service(name: str, service: ServiceClient) -> Any:
+    """A command as a service that takes and gives JSON objects."""
+    from foxglove import Schema
+    from foxglove.websocket import MessageSchema, Service, ServiceSchema
+
+    arguments = {
+        key: {"type": "string" if isinstance(value, str) else "number", "default": value}
+        for key, value in COMMANDS[name].arguments.items()
+    }
+
+    def described(what: str, properties: dict[str, Any]) -> MessageSchema:
+        data = json.dumps({"type": "object", "title": f"{name} {what}", "properties": properties}).encode()
+        return MessageSchema(encoding="json", schema=Schema(name=f"{name}_{what}", encoding="jsonschema", data=data))
+
+    answer = {"ok": {"type": "boolean"}, "text": {"type": "string"}, "data": {"type": "object"}}
+    kind = ServiceSchema(name=name, request=described("request", arguments), response=described("response", answer))
+    return Service(name=f"/{name}", schema=kind, handler=lambda request: _answer(name, service, request.payload))
+
+
+def _answer(name: str, service: ServiceClient, payload: bytes) -> bytes:
+    """What the service says to a request, which may be anything."""
+    try:
+        arguments = json.loads(payload) if payload.strip() and len(payload) <= REQUEST_BYTES else {}
+    except ValueError:
+        arguments = None
+    if not isinstance(arguments, dict) or len(payload) > REQUEST_BYTES:
+        return json.dumps({"ok": False, "text": f"{name} takes a small JSON object", "data": {}}).encode()
+    try:
+        reply = service.call(name, ANSWER_S, **{str(key): value for key, value in arguments.items()})
+    except StereoSfmError as error:
+        return json.dumps({"ok": False, "text": str(error), "data": {}}).encode()
+    return json.dumps({"ok": reply.ok, "text": reply.text, "data": reply.data}, default=str).encode()
+
+
+def _settings(service: ServiceClient) -> Any:
+    """The settings that may change while running, as parameters."""
+    from foxglove.websocket import Parameter, ServerListener
+
+    def known(names: list[str]) -> list[Parameter]:
+        settings: dict[str, Any] = service.call("status").data.get("settings", {})
+        return [Parameter(name, value=value) for name, value in settings.items() if not names or name in names]
+
+    class Listener(ServerListener):
+        def on_get_parameters(self, client: Any, param_names: list[str], request_id: str | None = None) -> list[Any]:
+            return known(param_names)
+
+        def on_set_parameters(self, client: Any, parameters: list[Any], request_id: str | None = None) -> list[Any]:
+            for parameter in parameters:
+                reply = service.call("set_setting", name=parameter.name, value=str(parameter.get_value()))
+                if not reply.ok:
+                    log.warning("%s is not set: %s", parameter.name, reply.text)
+            return known([parameter.name for parameter in parameters])
+
+    return Listener()

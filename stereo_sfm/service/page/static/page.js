@@ -1,0 +1,203 @@
+"use strict";
+const $ = (id) => document.getElementById(id);
+const show = (id, text) => { if ($(id).textContent !== text) $(id).textContent = text; };
+const number = (value, digits = 1) => value === null || value === undefined ? "–" : Number(value).toFixed(digits);
+const STATES = { running: "good", starting: "warn", lost: "bad", camera_gone: "bad", disk_full: "warn", stopping: "warn" };
+let live = null, map = { version: 0, points: [], path: [] }, last = null, heard = 0, asked = 0;
+
+async function ask(path, options) {
+  const answer = await fetch(path, options);
+  if (answer.status === 401) login();
+  return answer;
+}
+
+async function command(name, values = {}) {
+  const mine = ++asked, say = (text) => mine === asked && show("answer", text);  // the newest command's answer stays
+  say("…");
+  const headers = { "Content-Type": "application/json", "X-Stereo-Sfm": "1" };
+  try {
+    const answer = await ask(`api/command/${name}`, { method: "POST", headers, body: JSON.stringify(values) });
+    const reply = await answer.json();
+    say(reply.text || (reply.ok ? "done" : "refused"));
+  } catch { say("the service does not answer"); }
+  refresh();
+}
+
+function row(table, cells, problem) {
+  const tr = table.insertRow();
+  for (const cell of cells) {
+    const td = tr.insertCell();
+    if (cell instanceof Node) td.append(cell); else td.textContent = cell;
+    if (problem) td.className = "problem";
+  }
+}
+
+function button(text, action) {
+  const made = document.createElement("button");
+  made.textContent = text;
+  made.onclick = action;
+  return made;
+}
+
+function showState(state) {
+  const s = state.status, alive = Date.now() - heard < 3000;
+  const name = !alive ? "no answer" : s ? s.state : "waiting";
+  show("state", name.replace("_", " "));
+  $("state").className = `badge ${alive && s ? STATES[s.state] || "warn" : "bad"}`;
+  show("reason", alive ? (s ? s.reason : "") : "The service does not answer.");
+  show("remedy", alive ? (s ? s.remedy : "") : "Is it running? See the log of its unit.");
+  show("source", state.source);
+  const recording = s && s.recording !== "off";
+  $("record").className = recording ? "on" : "";
+  show("record", recording ? `Stop recording (${s.recording})` : "Record");
+  $("record").onclick = () => command(recording ? "stop_recording" : "start_recording");
+  const p = state.pose;
+  show("pose", p ? `x ${number(p.x, 2)} m, y ${number(p.y, 2)} m, heading ${number(p.heading * 180 / Math.PI, 0)}°, `
+    + `${p.speed === null ? "–" : number(p.speed, 2)} m/s · ${p.state}${p.reason ? ` (${p.reason})` : ""}`
+    + `${p.localized ? " · in the saved map" : ""}` : "no pose yet");
+}
+
+function showHealth(state) {
+  const h = state.health, table = document.createElement("table"), s = state.status || {};
+  table.id = "health";
+  if (h) {
+    const dropped = Object.entries(h.dropped).filter(([, n]) => n).map(([where, n]) => `${n} ${where}`).join(", ");
+    const heat = h.counters.temperature_c;
+    row(table, ["Rate", `${number(h.rate_hz)} images a second`]);
+    row(table, ["Latency", `${number(h.latency_ms[0])} ms, 95 % below ${number(h.latency_ms[1])} ms`]);
+    row(table, ["Dropped images", dropped || "none"], Boolean(dropped));
+    if (heat) row(table, ["Camera temperature", `${number(heat, 0)} °C`], heat > 75);
+    row(table, ["Disk", `${number(h.disk_free / 1e9)} GB free, recordings ${number(h.recording_bytes / 1e9)} GB`], h.disk_free < 1e9);
+    row(table, ["Calibration", h.row_error_px === null ? "not known yet" : `row error ${number(h.row_error_px, 2)} px`], h.row_error_px > 0.5);
+    row(table, ["Restarts", String(h.restarts)], h.restarts > 0);
+  }
+  if (s.recording_problem) row(table, ["Recording", s.recording_problem], true);
+  if (s.map_folder) row(table, ["Map saved", s.map_saved_ns ? new Date(s.map_saved_ns / 1e6).toLocaleTimeString() : "not yet"]);
+  if ($("health").innerHTML !== table.innerHTML) $("health").replaceWith(table);
+}
+
+function showEvents(state) {
+  const lines = state.events.map((e) => `${e.level}|${new Date(e.unix_ns / 1e6).toLocaleTimeString()}  ${e.text}`).reverse();
+  if ($("events").dataset.lines === lines.join("\n")) return;
+  $("events").dataset.lines = lines.join("\n");
+  $("events").replaceChildren(...lines.map((line) => {
+    const li = document.createElement("li");
+    [li.className, li.textContent] = [line.split("|", 1)[0], line.slice(line.indexOf("|") + 1)];
+    return li;
+  }));
+}
+
+function drawPlan(state) {
+  const canvas = $("plan"), g = canvas.getContext("2d"), p = state.pose;
+  g.clearRect(0, 0, canvas.width, canvas.height);
+  if (!map.points.length && !map.path.length && !p) return;
+  const range = (k) => {  // without the outermost hundredth of the points, but with the whole path
+    const sorted = map.points.map((v) => v[k]).sort((a, b) => a - b), cut = Math.floor(sorted.length / 100);
+    const inner = sorted.length ? [sorted[cut], sorted[sorted.length - 1 - cut]] : [];
+    const values = [...inner, ...map.path.map((v) => v[k]), ...(p ? [k ? p.y : p.x] : [])];
+    return [Math.min(...values), Math.max(...values)];
+  };
+  const [x0, x1] = range(0), [y0, y1] = range(1), margin = 24;
+  const scale = Math.min((canvas.width - 2 * margin) / Math.max(y1 - y0, 2), (canvas.height - 2 * margin) / Math.max(x1 - x0, 2));
+  // x forward is up, y left is left
+  const at = (x, y) => [canvas.width / 2 - (y - (y0 + y1) / 2) * scale, canvas.height / 2 - (x - (x0 + x1) / 2) * scale];
+  for (const [x, y, z] of map.points) {
+    g.fillStyle = `hsl(${Math.max(0, Math.min(240, 200 - 80 * z))} 60% 50%)`;
+    g.fillRect(...at(x, y), 2, 2);
+  }
+  g.strokeStyle = "#3b82f6"; g.lineWidth = 2; g.beginPath();
+  for (const [x, y] of map.path) g.lineTo(...at(x, y));
+  g.stroke();
+  if (p) {
+    g.save(); g.translate(...at(p.x, p.y)); g.rotate(-p.heading);
+    g.fillStyle = p.tracked ? "#f97316" : "#c0271a";
+    g.beginPath(); g.moveTo(0, -12); g.lineTo(8, 9); g.lineTo(0, 4); g.lineTo(-8, 9); g.fill(); g.restore();
+  }
+  const metres = [1, 2, 5, 10, 20, 50].find((m) => m * scale > 60) || 100;
+  g.strokeStyle = g.fillStyle = "#888"; g.beginPath(); g.moveTo(12, canvas.height - 12);
+  g.lineTo(12 + metres * scale, canvas.height - 12); g.stroke(); g.font = "16px system-ui";
+  g.fillText(`${metres} m`, 12, canvas.height - 18);
+}
+
+async function refreshMap(version) {
+  if (version !== map.version) map = await (await ask("api/map")).json();
+}
+
+async function refresh() {
+  try {
+    const rows = await (await ask("api/recordings")).json(), table = document.createElement("table");
+    table.id = "recordings";
+    for (const r of Array.isArray(rows) ? rows : []) {
+      const open = document.createElement("a");
+      [open.href, open.textContent, open.download] = [`api/recordings/${encodeURIComponent(r.id)}/0`, "download", ""];
+      const gone = button("delete", () => confirm(`Delete ${r.name}?`) && command("delete_recording", { id: r.id }));
+      const actions = document.createElement("span");
+      actions.append(open, gone);
+      const size = `${Math.floor(r.seconds / 60)}:${String(Math.floor(r.seconds % 60)).padStart(2, "0")} min, ${number(r.bytes / 1e6, 0)} MB`;
+      row(table, [`${r.name}${r.marked ? " ★" : ""}`, size, r.problem || "no problems", actions]);
+    }
+    if (!table.rows.length) row(table, ["none"]);
+    $("recordings").replaceWith(table);
+    if (!$("settings").contains(document.activeElement)) showSettings(await (await ask("api/settings")).json());
+  } catch { /* the next state says that the service does not answer */ }
+}
+
+function showSettings(values) {
+  const table = document.createElement("table");
+  table.id = "settings";
+  for (const [name, value] of Object.entries(values || {})) {
+    const field = document.createElement("input");
+    [field.value, field.ariaLabel] = [value, name];
+    const set = button("set", () => command("set_setting", { name, value: field.value }));
+    const both = document.createElement("span");
+    both.append(field, set);
+    row(table, [name, both]);
+  }
+  if (!table.rows.length) row(table, ["none may be changed while running"]);
+  $("settings").replaceWith(table);
+}
+
+function login() {
+  $("login").hidden = false; $("all").hidden = true;
+  if (live) { live.close(); live = null; }
+}
+
+$("login").onsubmit = async (event) => {
+  event.preventDefault();
+  const headers = { "Content-Type": "application/json" };
+  const answer = await fetch("login", { method: "POST", headers, body: JSON.stringify({ token: $("token").value }) });
+  show("login-answer", answer.ok ? "" : (await answer.json()).text);
+  if (!answer.ok) return;
+  $("token").value = ""; $("login").hidden = true; $("all").hidden = false;
+  start();
+};
+
+function nextImage() {
+  const img = $("image");
+  if (document.hidden || !live) return;
+  fetch("api/image.jpg").then((answer) => answer.status === 200 ? answer.blob() : null).then((blob) => {
+    if (!blob) return;
+    const reader = new FileReader();
+    reader.onload = () => { img.src = reader.result; };
+    reader.readAsDataURL(blob);
+  }).catch(() => {});
+}
+
+async function start() {
+  if (live || (await ask("api/map")).status !== 200) return;
+  live = new EventSource("api/live");
+  live.onmessage = (event) => {
+    last = JSON.parse(event.data); heard = Date.now();
+    refreshMap(last.map_version);
+    showState(last); showHealth(last); showEvents(last); drawPlan(last);
+  };
+  refresh();
+}
+
+for (const made of document.querySelectorAll("[data-command]")) {
+  made.onclick = () => (!made.dataset.ask || confirm(made.dataset.ask)) && command(made.dataset.command);
+}
+setInterval(nextImage, 300);
+setInterval(refresh, 10000);
+setInterval(() => { if (last) showState(last); if (!live && $("login").hidden) start().catch(() => {}); }, 2000);
+start().catch(() => {});

@@ -1,0 +1,150 @@
+"""The Foxglove output, seen by a plain WebSocket client."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.Odometry_pb2 import Odometry
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.log import topics
+from stereo_sfm.messages import Health
+from stereo_sfm.service.messages import Event
+from stereo_sfm.service.outputs.foxglove_server import REPORT, SERVICES, STATUS, FoxgloveOutput
+from stereo_sfm.service.publisher import Reply
+from tests.service.service_messages import FakeService, cloud, health, picture, pose_update, started, status
+
+connect = pytest.importorskip("websockets.sync.client").connect
+pytest.importorskip("foxglove")
+
+
+@contextmanager
+def _serving(service: FakeService | None = None) -> Iterator[tuple[FoxgloveOutput, Any]]:
+    output = FoxgloveOutput("127.0.0.1", 0, 5.0)
+    output.open(service or FakeService())
+    try:
+        with connect(f"ws://127.0.0.1:{output.port}", subprotocols=["foxglove.sdk.v1"]) as client:
+            yield output, client
+    finally:
+        output.close()
+
+
+def _wait(client: Any, wanted: Callable[[Any], Any]) -> Any:
+    """The first thing found in what the server says, which is a dict or bytes."""
+    for _ in range(500):
+        said = client.recv(timeout=5)
+        found = wanted(said if isinstance(said, bytes) else json.loads(said))
+        if found is not None:
+            return found
+    raise AssertionError("it never came")
+
+
+def _channels(client: Any, count: int) -> dict[str, dict[str, Any]]:
+    known: dict[str, dict[str, Any]] = {}
+
+    def take(said: Any) -> bool | None:
+        if isinstance(said, dict) and said["op"] == "advertise":
+            known.update({c["topic"]: c for c in said["channels"]})
+        return True if len(known) >= count else None
+
+    _wait(client, take)
+    return known
+
+
+def _everything(output: FoxgloveOutput) -> None:
+    for message in (started(), pose_update(1), status(), cloud(), picture(), health()):
+        output.put(message)
+    output.put(Event(0, "warning", "tracker", "lost in aisle 3"))
+
+
+def test_the_topics_are_those_of_the_log() -> None:
+    with _serving() as (output, client):
+        _everything(output)
+        known = _channels(client, 16)
+        names = set(known) - {STATUS, REPORT}
+        assert names <= set(topics.BY_NAME) and {topics.TF, topics.POINTS, topics.LEFT_IMAGE, topics.LOG} <= names
+        assert all(known[name]["schemaName"] in topics.BY_NAME[name].schema.split("|") for name in names)
+        wanted = {1: topics.ODOMETRY, 2: topics.LEFT_IMAGE, 3: topics.POINTS, 4: STATUS}
+        rows = [{"id": i, "channelId": known[topic]["id"]} for i, topic in wanted.items()]
+        client.send(json.dumps({"op": "subscribe", "subscriptions": rows}))
+        client.send(json.dumps({"op": "getParameters", "parameterNames": [], "id": "x"}))
+        _wait(client, lambda said: True if isinstance(said, dict) and said["op"] == "parameterValues" else None)
+        _everything(output)
+        got: dict[int, bytes] = {}
+
+        def take(said: Any) -> bool | None:
+            if isinstance(said, bytes) and said[0] == 1:
+                got.setdefault(struct.unpack_from("<I", said, 1)[0], said[13:])
+            return True if len(got) == len(wanted) else None
+
+        _wait(client, take)
+    odometry, sent = Odometry.FromString(got[1]), pose_update(1)
+    assert (odometry.frame_id, odometry.body_frame_id) == ("odom", "body")
+    np.testing.assert_allclose(odometry.pose_covariance, sent.covariance.ravel())
+    image = cv2.imdecode(np.frombuffer(CompressedImage.FromString(got[2]).data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    assert np.abs(image.astype(int) - picture().left).mean() < 6
+    points = PointCloud.FromString(got[3])
+    assert len(points.data) // points.point_stride == len(cloud().points)
+    assert json.loads(got[4])["state"] == "running"
+
+
+def _call(client: Any, number: int, payload: bytes) -> dict[str, Any]:
+    client.send(struct.pack("<BIII", 2, number, 7, 4) + b"json" + payload)
+
+    def take(said: Any) -> Any:
+        if isinstance(said, bytes) and said[0] == 3:
+            size = struct.unpack_from("<I", said, 9)[0]
+            return json.loads(said[13 + size :])
+        return None
+
+    return _wait(client, take)
+
+
+def test_the_services_are_commands() -> None:
+    service = FakeService({"save_map": Reply(False, "the disk is full")})
+    with _serving(service) as (_, client):
+        rows = _wait(client, lambda said: said["services"] if said.get("op") == "advertiseServices" else None)
+        numbers = {row["name"].strip("/"): row["id"] for row in rows}
+        assert set(numbers) == set(SERVICES) and "delete_recording" not in numbers
+        assert _call(client, numbers["mark"], b'{"text": "bump"}') == {"ok": True, "text": "mark done", "data": {}}
+        assert service.calls[-1] == ("mark", {"text": "bump"})
+        assert _call(client, numbers["save_map"], b"")["text"] == "the disk is full"
+        count = len(service.calls)
+        for bad in (b"[1]", b"{", b'{"texd": 1}', b'{"text": 5}', b'{"text": "%s"}' % (b"x" * 20_000)):
+            answer = _call(client, numbers["mark"], bad)
+            assert not answer["ok"] and answer["text"] and "\n" not in answer["text"]
+        assert len(service.calls) == count
+
+
+def test_settings_are_parameters() -> None:
+    service = FakeService({"status": Reply(True, "", {"settings": {"recording.mode": "off", "page.picture_hz": 4.0}})})
+    with _serving(service) as (_, client):
+        client.send(json.dumps({"op": "getParameters", "parameterNames": [], "id": "a"}))
+        values = _wait(client, lambda said: said["parameters"] if said.get("op") == "parameterValues" else None)
+        assert {v["name"]: v["value"] for v in values} == {"recording.mode": "off", "page.picture_hz": 4.0}
+        row = {"name": "recording.mode", "value": "full"}
+        client.send(json.dumps({"op": "setParameters", "parameters": [row], "id": "b"}))
+        _wait(client, lambda said: said["parameters"] if said.get("op") == "parameterValues" else None)
+    assert ("set_setting", {"name": "recording.mode", "value": "full"}) in service.calls
+
+
+def test_it_stays_on_this_computer() -> None:
+    with pytest.raises(StereoSfmError, match="no token"):
+        FoxgloveOutput("0.0.0.0", 8765, 5.0)
+    with _serving() as (output, _), pytest.raises(StereoSfmError, match="cannot listen"):
+        FoxgloveOutput("127.0.0.1", output.port, 5.0).open(FakeService())
+
+
+def test_health_is_one_message_a_stage() -> None:
+    with _serving() as (output, client):
+        output.put(health(stages={n: Health(n, 1, 30.0, 0, 1.0, 2.0, 3.0, 0) for n in ("tracker", "mapper")}))
+        assert set(_channels(client, 2)) == {topics.HEALTH, REPORT}

@@ -1,0 +1,295 @@
+"""The operator's page: what it shows and does in a real browser, and what it refuses to others."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
+from stereo_sfm.service.config import RobotConfig
+from stereo_sfm.service.messages import Event, ServiceState
+from stereo_sfm.service.outputs.access import Access
+from stereo_sfm.service.outputs.ports import ports
+from stereo_sfm.service.outputs.settings import FoxgloveConfig, OutputsConfig, PageConfig, PoseSocketConfig
+from stereo_sfm.service.page import server
+from stereo_sfm.service.page.server import PageOutput
+from stereo_sfm.service.publisher import Reply
+from tests.service.browser import CHROMIUM, Browser
+from tests.service.service_messages import FakeService, cloud, health, picture, pose_update, started, status
+
+pytest.importorskip("starlette")
+pytest.importorskip("uvicorn")
+
+TOKEN = "a-token-of-thirty-two-characters"
+COMMAND = {"Content-Type": "application/json", "X-Stereo-Sfm": "1"}
+
+
+def _recordings(folder: Path) -> dict[str, Reply]:
+    files = [folder / "drive" / f"{i}.mcap" for i in range(2)]
+    for file in files:
+        file.parent.mkdir(exist_ok=True)
+        file.write_bytes(file.name.encode() * 1000)
+    row = {
+        "id": "r1", "name": "drive <b>1</b>", "unix_ns": 0, "seconds": 75.0, "bytes": 12e6, "marked": True,
+        "mode": "full", "problem": "2 gaps between images",
+    }  # fmt: skip
+    return {
+        "recordings": Reply(True, "", {"recordings": [row]}),
+        "recording_files": Reply(True, "", {"files": [str(f) for f in files]}),
+        "status": Reply(True, "", {"settings": {"recording.mode": "off"}}),
+        "save_map": Reply(False, "the disk is full"),
+    }
+
+
+@contextmanager
+def _serving(service: FakeService | None = None, rules: Access | None = None) -> Iterator[PageOutput]:
+    output = PageOutput("127.0.0.1", 0, 4.0, rules)
+    output.open(service or FakeService())
+    try:
+        yield output
+    finally:
+        output.close()
+
+
+def _ask(
+    output: PageOutput, method: str, path: str, body: bytes | str | None = None, headers: dict[str, str] | None = None
+) -> tuple[int, bytes, dict[str, str]]:
+    connection = http.client.HTTPConnection("127.0.0.1", output.port, timeout=10)
+    try:
+        connection.request(method, path, body, headers or {})
+        answer = connection.getresponse()
+        return answer.status, answer.read(), {k.lower(): v for k, v in answer.getheaders()}
+    finally:
+        connection.close()
+
+
+def _show(output: PageOutput, frame: int, state: ServiceState = ServiceState.RUNNING, **others: Any) -> None:
+    pose = se3.exp(np.array([0.3, 0, 0.5 + 0.05 * frame, 0, 0.4, 0]))
+    messages = [started(), pose_update(frame, pose), picture(frame), health(), status(state, **others)]
+    for message in (*messages, cloud(3000, 12)):
+        output.put(message)
+
+
+# -- in a browser ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
+@pytest.mark.parametrize(("width", "height"), [(1280, 900), (390, 844)])
+def test_an_operator_sees_and_does_everything(width: int, height: int, tmp_path: Path) -> None:
+    service = FakeService(_recordings(tmp_path))
+    with _serving(service) as output, Browser(width, height) as browser:
+        stop = threading.Event()
+        told = {"state": ServiceState.RUNNING, "reason": "", "remedy": ""}
+
+        def feed() -> None:
+            frame = 0
+            while not stop.wait(0.1):
+                _show(output, frame := frame + 1, **told)
+
+        output.put(Event(0, "warning", "tracker", "lost in <i>aisle 3</i>"))
+        feeding = threading.Thread(target=feed)
+        feeding.start()
+        try:
+            browser.go(f"http://127.0.0.1:{output.port}/")
+            browser.until("document.getElementById('state').textContent === 'running'")
+            browser.until("document.getElementById('image').naturalWidth === 320")
+            drawn = "[...document.getElementById('plan').getContext('2d').getImageData(0,0,640,480).data]"
+            assert browser.until(f"{drawn}.filter(v => v).length > 4000")
+            text = browser.run("document.body.innerText")
+            for shown in ("29.9 images a second", "14.0 ms", "3 ring", "51 °C", "42.0 GB free", "row error 0.12 px"):
+                assert shown in text
+            browser.until("document.getElementById('recordings').innerText.includes('drive <b>1</b>')")  # no markup
+            assert "1:15 min, 12 MB" in text or "1:15 min, 12 MB" in browser.run("document.body.innerText")
+            assert "2 gaps between images" in browser.run("document.body.innerText")
+            assert "lost in <i>aisle 3</i>" in browser.run("document.getElementById('events').innerText")
+            assert browser.run("document.documentElement.scrollWidth") <= width  # nothing hangs over the side
+            browser.screenshot(tmp_path / "running.png")
+            browser.run("document.querySelector('[data-command=save_map]').click()")
+            browser.until("document.getElementById('answer').textContent === 'the disk is full'")
+            browser.run("document.getElementById('record').click()")
+            browser.until("document.getElementById('answer').textContent === 'start_recording done'")
+            browser.run("document.querySelector('[data-command=mark]').click()")
+            browser.run("window.confirm = () => true; document.querySelector('[data-command=reset]').click()")
+            browser.run("[...document.querySelectorAll('#recordings button')][0].click()")
+            browser.until("document.getElementById('answer').textContent === 'delete_recording done'")
+            told.update(state=ServiceState.CAMERA_GONE, reason="The camera is gone.", remedy="Plug it in again.")
+            browser.until("document.getElementById('remedy').textContent === 'Plug it in again.'")
+            assert browser.run("document.getElementById('state').className") == "badge bad"
+            browser.screenshot(tmp_path / "gone.png")
+        finally:
+            stop.set()
+            feeding.join()
+        names = [name for name, _ in service.calls]
+        assert {"save_map", "start_recording", "mark", "reset"} <= set(names)
+        assert ("delete_recording", {"id": "r1"}) in service.calls
+        output.close()
+        browser.until("document.getElementById('state').textContent === 'no answer'")
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
+def test_a_token_is_asked_for_in_the_browser() -> None:
+    with _serving(rules=Access(TOKEN)) as output, Browser(800, 600) as browser:
+        _show(output, 1)
+        browser.go(f"http://127.0.0.1:{output.port}/")
+        browser.until("!document.getElementById('login').hidden")
+        give = "document.getElementById('token').value = '%s'; document.getElementById('login').requestSubmit()"
+        browser.run(give % "wrong")
+        browser.until("document.getElementById('login-answer').textContent === 'this is not the token'")
+        browser.run(give % TOKEN)
+        browser.until("document.getElementById('state').textContent === 'running'")
+        assert browser.run(
+            "document.getElementById('login').hidden && !document.cookie && !location.href.includes('tok')"
+        )
+
+
+# -- without one -------------------------------------------------------------------------------------------------------
+
+
+def test_the_live_state_is_a_stream_of_events() -> None:
+    with _serving() as output:
+        _show(output, 3, ServiceState.LOST, reason="It is dark.")
+        connection = http.client.HTTPConnection("127.0.0.1", output.port, timeout=10)
+        connection.request("GET", "/api/live")
+        answer = connection.getresponse()
+        first = json.loads(answer.readline().removeprefix(b"data: "))
+        output.put(pose_update(9, tracked=False, state="LOST"))
+        frames = [
+            json.loads(line[6:])["pose"]["frame_id"]
+            for line in (answer.readline() for _ in range(8))
+            if line[6:].strip()
+        ]
+        connection.close()
+    assert first["status"]["reason"] == "It is dark." and first["pose"]["frame_id"] == 3 and frames[-1] == 9
+    assert first["pose"]["x"] > 0.5 and first["pose"]["heading"] == pytest.approx(-0.4)
+    assert first["health"]["latency_ms"] == [14.0, 21.5]
+
+
+def test_the_map_is_thinned_and_nothing_grows() -> None:
+    with _serving() as output:
+        output.put(started())
+        for i in range(300):
+            output.put(Event(i, "info", "map", "saved"))
+        output.put(cloud(200_000, 10_000))
+        shown = json.loads(_ask(output, "GET", "/api/map")[1])
+        live = output._state.snapshot()  # pyright: ignore[reportPrivateUsage]
+    assert 1000 < len(shown["points"]) <= 6001 and 100 < len(shown["path"]) <= 3001
+    assert len(json.loads(live)["events"]) == 60 and len(live) < 20_000
+
+
+def test_images_are_made_only_while_somebody_looks() -> None:
+    with _serving() as output:
+        output.put(picture(1))
+        assert _ask(output, "GET", "/api/image.jpg")[0] == 204
+        output.put(picture(2))
+        code, data, headers = _ask(output, "GET", "/api/image.jpg")
+        assert code == 200 and data[:2] == b"\xff\xd8" and headers["content-type"] == "image/jpeg"
+
+
+def test_recordings_are_loaded_by_id_and_number(tmp_path: Path) -> None:
+    service = FakeService(_recordings(tmp_path))
+    (tmp_path / "secret").write_text("secret")
+    with _serving(service) as output:
+        code, data, headers = _ask(output, "GET", "/api/recordings/r1/1")
+        assert code == 200 and data == b"1.mcap" * 1000 and 'filename="drive_1.mcap"' in headers["content-disposition"]
+        for path in (
+            "/api/recordings/r1/2", "/api/recordings/r1/-1", "/api/recordings/..%2f..%2fsecret/0x", "/../secret",
+            "/static/../secret", "/%2e%2e/secret", "/api/recordings/../../secret", "/page", "/app.py",
+        ):  # fmt: skip
+            code, data, _ = _ask(output, "GET", path)
+            assert code == 404 and b"secret" not in data, path
+
+
+def test_commands_of_other_sites_and_too_large_ones_are_refused() -> None:
+    service = FakeService()
+    with _serving(service) as output:
+        body = b'{"text": "bump"}'
+        form = {"Content-Type": "text/plain"}
+        assert _ask(output, "POST", "/api/command/mark", body, form)[0] == 403
+        assert _ask(output, "POST", "/api/command/mark", body, {**COMMAND, "Content-Type": "text/plain"})[0] == 400
+        assert _ask(output, "POST", "/api/command/mark", b"[" * 50, COMMAND)[0] == 400
+        assert _ask(output, "POST", "/api/command/mark", b" " * 20_000 + body, COMMAND)[0] == 400
+        assert _ask(output, "POST", "/api/command/recording_files", body, COMMAND)[0] == 404
+        assert _ask(output, "GET", "/api/command/mark")[0] == 405
+        assert not service.calls
+        code, data, _ = _ask(output, "POST", "/api/command/mark", b'{"tekst": 1}', COMMAND)
+        assert code == 200 and not json.loads(data)["ok"] and not service.calls
+        assert _ask(output, "POST", "/api/command/mark", body, COMMAND)[0] == 200
+        assert service.calls == [("mark", {"text": "bump"})]
+        codes = [_ask(output, "POST", "/api/command/mark", body, COMMAND)[0] for _ in range(60)]
+        assert 429 in codes
+
+
+def test_only_this_computers_names_are_answered_and_headers_are_safe() -> None:
+    """A page elsewhere may let its own name point here (DNS rebinding): such requests carry that name."""
+    with _serving() as output:
+        for host, code in (
+            ("evil.example", 421),
+            ("localhost:1", 200),
+            ("127.0.0.1", 200),
+            ("127.0.0.1.evil.example", 421),
+        ):
+            assert _ask(output, "GET", "/", None, {"Host": host})[0] == code, host
+        headers = _ask(output, "GET", "/")[2]
+    assert "default-src 'self'" in headers["content-security-policy"] and headers["x-content-type-options"] == "nosniff"
+    assert "server" not in headers
+
+
+def test_nothing_is_told_without_the_token() -> None:
+    with _serving(rules=Access(TOKEN)) as output:
+        _show(output, 1)
+        assert _ask(output, "GET", "/")[0] == 200  # the page itself says nothing
+        for path in (
+            "/api/live",
+            "/api/map",
+            "/api/image.jpg",
+            "/api/recordings",
+            "/api/recordings/r1/0",
+            "/api/settings",
+        ):
+            assert _ask(output, "GET", path)[0] == 401, path
+        assert _ask(output, "POST", "/api/command/reset", b"{}", COMMAND)[0] == 401
+        assert _ask(output, "GET", f"/api/map?token={TOKEN}")[0] == 401  # never in an address
+        assert _ask(output, "GET", "/api/map", None, {"Authorization": "Bearer wrong"})[0] == 401
+        assert _ask(output, "GET", "/api/map", None, {"Authorization": f"Bearer {TOKEN}"})[0] == 200
+        code, _, headers = _ask(output, "POST", "/login", json.dumps({"token": TOKEN}), COMMAND)
+        cookie = headers["set-cookie"]
+        assert code == 200 and TOKEN not in cookie and "HttpOnly" in cookie and "samesite=strict" in cookie.lower()
+        assert _ask(output, "GET", "/api/map", None, {"Cookie": cookie.split(";")[0]})[0] == 200
+        codes = [_ask(output, "POST", "/login", b'{"token": "x"}', COMMAND)[0] for _ in range(8)]
+        assert codes[0] == 401 and codes[-1] == 429
+
+
+def test_a_port_that_is_taken_and_a_missing_token_are_one_line() -> None:
+    with _serving() as output, pytest.raises(StereoSfmError, match=f"cannot listen on 127.0.0.1:{output.port}"):
+        PageOutput("127.0.0.1", output.port, 4.0).open(FakeService())
+    with pytest.raises(StereoSfmError, match=r"security\.token_file"):
+        server.make(RobotConfig(page=PageConfig(True, "0.0.0.0")))
+
+
+def test_what_is_open_is_listed() -> None:
+    assert ports(RobotConfig()) == ["nothing listens: no output and no page is enabled"]
+    outputs = OutputsConfig(PoseSocketConfig(True, "tcp://0.0.0.0:7000"), FoxgloveConfig(True))
+    lines = ports(RobotConfig(outputs=outputs, page=PageConfig(True)))
+    assert len(lines) == 3 and "http://127.0.0.1:8080  this computer only" in lines[0]
+    assert "anyone who can reach 0.0.0.0 and has the token" in lines[1] and "ws://127.0.0.1:8765" in lines[2]
+
+
+def test_closing_takes_less_than_a_second_with_a_page_open() -> None:
+    with _serving() as output:
+        connection = http.client.HTTPConnection("127.0.0.1", output.port, timeout=10)
+        connection.request("GET", "/api/live")
+        connection.getresponse().readline()
+        begin = time.monotonic()
+        output.close()
+        assert time.monotonic() - begin < 1.5
+        connection.close()
