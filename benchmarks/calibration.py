@@ -1,4 +1,4 @@
-"""How well targets calibrate: rendered boards with exact truth, and real pictures beside OpenCV's own calibration.
+"""How well targets calibrate: rendered boards with exact truth, and real images beside OpenCV's own calibration.
 
 python benchmarks/calibration.py --rendered            five seeds, fisheye and pinhole, noise and blur
 python benchmarks/calibration.py --real DATA_FOLDER    reprojection beside cv2.stereoCalibrate
@@ -59,8 +59,8 @@ def rendered(seeds: int, views: int) -> bool:
 
 
 def real(root: Path) -> None:
-    """Reprojection error of the real pictures, ours and OpenCV's on the same detections."""
-    print("pictures                  ours px  on all corners  OpenCV px  (root mean square)  ours s  OpenCV s")
+    """Reprojection error of the real images, ours and OpenCV's on the same detections."""
+    print("images                    ours px  on all corners  OpenCV px  (root mean square)  ours s  OpenCV s")
     for folder, (target, model) in REAL.items():
         pairs = list(read_pairs(find_pairs(root / folder)))
         size = (pairs[0][0].shape[1], pairs[0][0].shape[0])
@@ -109,10 +109,10 @@ def opencv(left: list[Detection], right: list[Detection], points: F64, size: tup
             guess = np.array([[0.3 * size[0], 0, size[0] / 2], [0, 0.3 * size[0], size[1] / 2], [0, 0, 1]])
             flags = cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC | cv2.fisheye.CALIB_FIX_SKEW
             flags |= cv2.fisheye.CALIB_USE_INTRINSIC_GUESS
-            eyes: list[Any] = [guess.copy(), np.zeros((4, 1)), guess.copy(), np.zeros((4, 1))]
-            return float(cv2.fisheye.stereoCalibrate(xyz, *uv, *eyes, size, flags=flags, criteria=criteria)[0])
-        alone = [cv2.calibrateCamera(xyz, u, size, None, None) for u in uv]  # type: ignore[call-overload]
-        guesses = [m for eye in alone for m in eye[1:3]]
+            guesses: list[Any] = [guess.copy(), np.zeros((4, 1)), guess.copy(), np.zeros((4, 1))]
+            return float(cv2.fisheye.stereoCalibrate(xyz, *uv, *guesses, size, flags=flags, criteria=criteria)[0])
+        single = [cv2.calibrateCamera(xyz, u, size, None, None) for u in uv]  # type: ignore[call-overload]
+        guesses = [m for result in single for m in result[1:3]]
         flags = cv2.CALIB_USE_INTRINSIC_GUESS
         return float(cv2.stereoCalibrate(xyz, *uv, *guesses, size, flags=flags, criteria=criteria)[0])
     except cv2.error:

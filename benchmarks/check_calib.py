@@ -35,7 +35,7 @@ from stereo_sfm.types import StereoImage
 
 SOURCES = ("kitti", "euroc_mh01", "tum_vi_room1", "t265_office")
 SIMULATED = tuple(f"sim:loop?frames=200&rate=15&camera={c}" for c in ("fisheye", "pinhole", "distorted"))
-AXES = ("pitch", "yaw", "roll")  # about x, y, z of the eye
+AXES = ("pitch", "yaw", "roll")  # about x, y, z of the camera
 WINDOWS = 10
 TURN_DEG, FOCAL = 0.2, 0.02
 
@@ -50,11 +50,11 @@ class Fault:
     index: int = 0
 
 
-def turned(rig: Rig, eye: str, axis: int, degrees: float) -> Rig:
-    """One eye rotated about its own centre."""
+def turned(rig: Rig, side: str, axis: int, degrees: float) -> Rig:
+    """One camera rotated about its own centre."""
     turn = np.zeros(6)
     turn[3 + axis] = np.deg2rad(degrees)
-    if eye == "right":
+    if side == "right":
         return replace(rig, left_T_right=rig.left_T_right @ se3.exp(turn))
     return replace(rig, left_T_right=se3.inverse(se3.exp(turn)) @ rig.left_T_right)
 
@@ -70,21 +70,21 @@ def _focal(camera: Camera, factor: float) -> Camera:
 
 
 def faults() -> list[Fault]:
-    """The true rig, every axis of each eye and each focal length, both signs."""
+    """The true rig, every axis of each camera and each focal length, both signs."""
     out = [Fault("true", lambda rig: rig)]
-    for eye, (axis, name), sign in itertools.product(("right", "left"), enumerate(AXES), (1, -1)):
+    for side, (axis, name), sign in itertools.product(("right", "left"), enumerate(AXES), (1, -1)):
         out.append(
             Fault(
-                f"{eye} {name} {sign * TURN_DEG:+.1f}°",
-                lambda rig, e=eye, a=axis, d=sign * TURN_DEG: turned(rig, e, a, d),
-                "rotation between the eyes",
+                f"{side} {name} {sign * TURN_DEG:+.1f}°",
+                lambda rig, e=side, a=axis, d=sign * TURN_DEG: turned(rig, e, a, d),
+                "rotation between the cameras",
                 axis,
             )
         )
     for name, left, right in (("right", 0, 1), ("left", 1, 0), ("both", 1, 1)):
         for sign in (1, -1):
             a, b = 1 + sign * FOCAL * left, 1 + sign * FOCAL * right
-            finding = "focal length, both eyes" if left and right else "focal length, right against left"
+            finding = "focal length, both cameras" if left and right else "focal length, right relative to left"
             change = f"{name} focal {100 * sign * FOCAL:+.0f} %"
             out.append(Fault(change, lambda rig, a=a, b=b: magnified(rig, a, b), finding))
     return out
@@ -111,7 +111,7 @@ def cell(report: CheckReport, fault: Fault) -> tuple[str, bool]:
 
 def _all(report: CheckReport) -> str:
     """What is said of an unchanged rig: the turn, the focal lengths' ratio, both focal lengths."""
-    names = ("rotation between the eyes", "focal length, right against left", "focal length, both eyes")
+    names = ("rotation between the cameras", "focal length, right relative to left", "focal length, both cameras")
     parts: list[str] = []
     for f in (f for name in names for f in report.findings if f.name == name):
         numbers = ", ".join(f"{v:+.2f}±{s:.2f}" for v, s in zip(f.value, f.sigma, strict=True))

@@ -3,7 +3,7 @@
     python benchmarks/full_ba.py            1,000 keyframes, 100,000 points, 600,000 observations
     python benchmarks/full_ba.py --solvers  one step of either solver at growing numbers of keyframes
 
-The camera walks the same 125 m circuit twice, so that the reduced camera system has loops and not just a band.
+The camera sequences the same 125 m circuit twice, so that the reduced camera system has loops and not just a band.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.bundle import Bundle, BundleConfig, bundle_adjust
-from tests.synthetic import fisheye_rig, points_around, see, walk
+from tests.synthetic import camera_path, fisheye_rig, points_around, see
 
 
 def circuit(rig: Rig, keyframes: int, points: int, observations: int) -> tuple[Bundle, np.ndarray]:
     """Two rounds of one circle, 0.25 m a keyframe; drift in the start that closes nothing. Bundle, true poses."""
     rng = np.random.default_rng(0)
-    truth = walk(keyframes, 0.25, 4 * np.pi / keyframes)
+    truth = camera_path(keyframes, 0.25, 4 * np.pi / keyframes)
     xyz = points_around(truth, points, rng)
     tables: list[tuple[np.ndarray, ...]] = []
     for k, pose in enumerate(truth):

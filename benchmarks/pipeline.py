@@ -1,8 +1,8 @@
-"""The whole pipeline on a recorded fisheye walk: frames a second, drops, latency, memory.
+"""The whole pipeline on a recorded fisheye sequence: frames a second, drops, latency, memory.
 
     python -m benchmarks pipeline -- [--recording FILE.mcap] [--minutes 5]
 
-Without a recording, `sim:loop` (848x800, 30 Hz) is recorded first as raw images. The walk is played forwards and
+Without a recording, `sim:loop` (848x800, 30 Hz) is recorded first as raw images. The sequence is played forwards and
 backwards, over and over, so that it can go on for minutes without a jump. First as fast as the stages can, then in real
 time at 30 Hz, with mapping, loops and logging on. Memory is the sum of the unique set sizes of all processes plus the
 shared image ring.

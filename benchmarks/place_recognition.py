@@ -1,10 +1,10 @@
 """Place recognition: query time against the number of keyframes, and precision and recall in identical aisles.
 
-The walks go through every aisle of a store whose aisles hold the same products in the same order, and come back
+The sequences go through every aisle of a store whose aisles hold the same products in the same order, and come back
 through the first one. "Words alone" takes the best-scored place as the answer, as the bag of words would; "words and
 geometry" adds the verification; "all" is the loop closer with odometry and agreement of successive keyframes.
 
-`--cut` takes the walks of any scene apart instead: tracking is lost at five places of each and begins anew four
+`--cut` takes the sequences of any scene apart instead: tracking is lost at five places of each and begins anew four
 keyframes later, with odometry that knows nothing of what was before; counted is the first loop that joins the pieces.
 
     python benchmarks/place_recognition.py --seeds 10
@@ -28,7 +28,7 @@ from _sequences import one_thread
 one_thread()
 
 import numpy as np
-from _sparse_walk import SparseWalk, walk_keyframes
+from _sparse_sequence import SparseSequence, sequence_keyframes
 
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
@@ -45,12 +45,12 @@ NEAR_METRES, NEAR_DEGREES, GAP = 1.0, 25.0, 12  # a return: so near to an older 
 
 @dataclass
 class Count:
-    """Over all walks."""
+    """Over all sequences."""
 
     accepted: int = 0
     false: int = 0
-    walks_with_return: int = 0
-    walks_found: int = 0
+    sequences_with_return: int = 0
+    sequences_found: int = 0
     worst_m: float = 0.0
     errors: list[float] = field(default_factory=list[float])
 
@@ -60,8 +60,8 @@ class Count:
         precision = f"{true / self.accepted:9.3f}" if self.accepted else "        -"
         median = f"{1e3 * float(np.median(self.errors)):8.1f}" if self.errors else "       -"
         return (
-            f"{name:22s} {self.accepted:8d}  {self.false:5d}  {precision}  {self.walks_found:5d} of"
-            f" {self.walks_with_return:2d}  {median}  {self.worst_m:8.3f}"
+            f"{name:22s} {self.accepted:8d}  {self.false:5d}  {precision}  {self.sequences_found:5d} of"
+            f" {self.sequences_with_return:2d}  {median}  {self.worst_m:8.3f}"
         )
 
 
@@ -94,25 +94,25 @@ def query_times(vocabulary: Vocabulary, sizes: tuple[int, ...] = (100, 1000, 10_
         print(f"{size:9d}   {'  '.join(f'{t:8.3f}' for t in np.median(times, axis=0))}")
 
 
-def returns(walk: SparseWalk) -> set[int]:
+def returns(sequence: SparseSequence) -> set[int]:
     """Keyframes that see an older place again."""
     out: set[int] = set()
-    for k in range(GAP, len(walk.world_T_kf)):
-        relative = se3.inverse(walk.world_T_kf[: k - GAP + 1]) @ walk.world_T_kf[k]
+    for k in range(GAP, len(sequence.world_T_kf)):
+        relative = se3.inverse(sequence.world_T_kf[: k - GAP + 1]) @ sequence.world_T_kf[k]
         turned = np.rad2deg(np.linalg.norm(se3.log(relative)[:, 3:], axis=1))
         if ((np.linalg.norm(relative[:, :3, 3], axis=1) < NEAR_METRES) & (turned < NEAR_DEGREES)).any():
             out.add(k)
     return out
 
 
-def judge(walk: SparseWalk, results: list[LoopResult], count: Count) -> None:
-    """Add one walk's accepted loops."""
-    again = returns(walk)
+def judge(sequence: SparseSequence, results: list[LoopResult], count: Count) -> None:
+    """Add one sequence's accepted loops."""
+    again = returns(sequence)
     found = False
     for r in results:
         if r.candidate_kf_id < 0:
             continue
-        true = se3.inverse(walk.world_T_kf[r.candidate_kf_id]) @ walk.world_T_kf[r.kf_id]
+        true = se3.inverse(sequence.world_T_kf[r.candidate_kf_id]) @ sequence.world_T_kf[r.kf_id]
         error = se3.inverse(true) @ r.candidate_T_kf
         metres = float(np.linalg.norm(error[:3, 3]))
         wrong = metres > FALSE_METRES or np.rad2deg(np.linalg.norm(se3.log(error)[3:])) > FALSE_DEGREES
@@ -122,18 +122,18 @@ def judge(walk: SparseWalk, results: list[LoopResult], count: Count) -> None:
         if not wrong:
             count.errors.append(metres)
             found |= r.kf_id in again
-    count.walks_with_return += bool(again)
-    count.walks_found += bool(again) and found
+    count.sequences_with_return += bool(again)
+    count.sequences_found += bool(again) and found
 
 
-def words_alone(walk: SparseWalk, vocabulary: Vocabulary, config: LoopConfig) -> list[LoopResult]:
+def words_alone(sequence: SparseSequence, vocabulary: Vocabulary, config: LoopConfig) -> list[LoopResult]:
     """The best-scored old keyframe of every keyframe, taken to stand exactly there, where the words say so."""
     everything = dataclasses.replace(
         config, min_match_fraction=0.0, min_inliers=10**6, max_candidates=1, pause=0, enabled=True
     )
-    closer = LoopCloser(everything, walk.rig, vocabulary)
+    closer = LoopCloser(everything, sequence.rig, vocabulary)
     out: list[LoopResult] = []
-    for keyframe in walk.keyframes:
+    for keyframe in sequence.keyframes:
         result = closer.step(keyframe)
         if result.rejected:
             candidate, score, _ = result.rejected[0]
@@ -150,75 +150,75 @@ WAYS = {
 
 
 def identical_aisles(spec: str, seeds: int, vocabulary: Vocabulary, cache: Path | None) -> int:
-    """The table, after every walk; returns the number of false loops of the whole closer."""
+    """The table, after every sequence; returns the number of false loops of the whole closer."""
     counts = {name: Count() for name in ("words alone", *WAYS)}
     reasons: Counter[str] = Counter()
     for seed in range(seeds):
         begin = time.perf_counter()
-        walk = _walk(f"{spec}{'&' if '?' in spec else '?'}seed={seed}&walk={seed}", cache)
-        judge(walk, words_alone(walk, vocabulary, LoopConfig()), counts["words alone"])
+        sequence = _sequence(f"{spec}{'&' if '?' in spec else '?'}seed={seed}&walk={seed}", cache)
+        judge(sequence, words_alone(sequence, vocabulary, LoopConfig()), counts["words alone"])
         for name, config in WAYS.items():
-            closer = LoopCloser(config, walk.rig, vocabulary)
-            results = [closer.step(k) for k in walk.keyframes]
-            judge(walk, results, counts[name])
+            closer = LoopCloser(config, sequence.rig, vocabulary)
+            results = [closer.step(k) for k in sequence.keyframes]
+            judge(sequence, results, counts[name])
             if name == "all":
                 reasons.update(reason for r in results for _, _, reason in r.rejected)
         seconds = time.perf_counter() - begin
-        print(f"\n{spec}, {seed + 1} walks (the last: {len(walk.keyframes)} keyframes, {seconds:.0f} s)")
-        print("                       accepted  false  precision  walks found  median mm  worst m")
+        print(f"\n{spec}, {seed + 1} sequences (the last: {len(sequence.keyframes)} keyframes, {seconds:.0f} s)")
+        print("                       accepted  false  precision  sequences found  median mm  worst m")
         for name, count in counts.items():
             print(count.row(name))
         print("rejected by all: " + ", ".join(f"{n} {r}" for r, n in sorted(reasons.items())), flush=True)
     return counts["all"].false
 
 
-def cut_walks(spec: str, seeds: int, vocabulary: Vocabulary, cache: Path | None) -> None:
-    """One line: how many walks that tracking lost half-way were joined, rightly or wrongly."""
+def cut_sequences(spec: str, seeds: int, vocabulary: Vocabulary, cache: Path | None) -> None:
+    """One line: how many sequences that tracking lost half-way were joined, rightly or wrongly."""
     answers: Counter[str] = Counter()
     for seed in range(seeds):
-        walk = _walk(f"{spec}{'&' if '?' in spec else '?'}seed={seed}&walk={seed}", cache)
-        answers.update(_joined(walk, round(share * len(walk.keyframes)), vocabulary) for share in CUTS)
+        sequence = _sequence(f"{spec}{'&' if '?' in spec else '?'}seed={seed}&walk={seed}", cache)
+        answers.update(_joined(sequence, round(share * len(sequence.keyframes)), vocabulary) for share in CUTS)
     gap = f"{LEFT_OUT} keyframes left out"
     print(f"{spec}, cut in two, {gap}: " + ", ".join(f"{answers[k]} {k}" for k in ("right", "wrong", "never")))
 
 
-def _joined(walk: SparseWalk, cut: int, vocabulary: Vocabulary) -> str:
+def _joined(sequence: SparseSequence, cut: int, vocabulary: Vocabulary) -> str:
     """How the pieces before keyframe `cut` and after the gap are joined: "right", "wrong" or "never"."""
-    closer = LoopCloser(LoopConfig(), walk.rig, vocabulary)
-    rest = walk.keyframes[cut + LEFT_OUT :]
+    closer = LoopCloser(LoopConfig(), sequence.rig, vocabulary)
+    rest = sequence.keyframes[cut + LEFT_OUT :]
     begin = se3.inverse(rest[0].odom_T_cam)
     anew = [dataclasses.replace(k, submap_id=1, odom_T_cam=begin @ k.odom_T_cam) for k in rest]
-    for keyframe in [*walk.keyframes[:cut], *anew]:
+    for keyframe in [*sequence.keyframes[:cut], *anew]:
         loop = closer.step(keyframe)
         if 0 <= loop.candidate_kf_id < cut <= loop.kf_id:
             count = Count()
-            judge(walk, [loop], count)
+            judge(sequence, [loop], count)
             return "wrong" if count.false else "right"
     return "never"
 
 
-def _walk(spec: str, cache: Path | None) -> SparseWalk:
+def _sequence(spec: str, cache: Path | None) -> SparseSequence:
     """Rendered, or as it was stored by an earlier run."""
     path = cache / f"{hashlib.sha256(spec.encode()).hexdigest()[:12]}.pkl" if cache else None
     if path is not None and path.exists():
         return pickle.loads(path.read_bytes())
-    walk = walk_keyframes(spec)
+    sequence = sequence_keyframes(spec)
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(pickle.dumps(walk))
-    return walk
+        path.write_bytes(pickle.dumps(sequence))
+    return sequence
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("source", nargs="?", default="sim:identical-aisles")
     parser.add_argument("--seeds", type=int, default=10)
-    parser.add_argument("--cache", type=Path, help="folder that keeps rendered walks for the next run")
-    parser.add_argument("--cut", action="store_true", help="walks in which tracking is lost once")
+    parser.add_argument("--cache", type=Path, help="folder that keeps rendered sequences for the next run")
+    parser.add_argument("--cut", action="store_true", help="sequences in which tracking is lost once")
     args = parser.parse_args()
     vocabulary = default_vocabulary()
     if args.cut:
-        cut_walks(args.source, args.seeds, vocabulary, args.cache)
+        cut_sequences(args.source, args.seeds, vocabulary, args.cache)
         return 0
     query_times(vocabulary)
     false = identical_aisles(args.source, args.seeds, vocabulary, args.cache) if args.seeds else 0

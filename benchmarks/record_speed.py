@@ -37,7 +37,7 @@ def load(spec: str, distinct: int) -> tuple[Source, list[StereoImage]]:
 
 def measure_recording(source: Source, images: list[StereoImage], count: int, folder: Path) -> None:
     """One line per image format."""
-    raw_bytes = sum(eye.nbytes for eye in (images[0].left, images[0].right) if eye is not None)
+    raw_bytes = sum(pixels.nbytes for pixels in (images[0].left, images[0].right) if pixels is not None)
     titles = ("ms/frame", "CPU ms", "of a core", "MB/s at 30 Hz", "of raw", "CPU ms to read")
     print(f"{'format':8}" + "".join(f"{title:>15}" for title in titles))
     for image_format in FORMATS:
@@ -89,13 +89,13 @@ def encoders() -> dict[str, Callable[[U8], bytes]]:
 
 def measure_encoders(images: list[StereoImage], count: int) -> None:
     """One line per way to store an image."""
-    eyes = [eye for image in images for eye in (image.left, image.right) if eye is not None][:count]
+    arrays = [pixels for image in images for pixels in (image.left, image.right) if pixels is not None][:count]
     for name, encode in encoders().items():
-        encode(eyes[0])
+        encode(arrays[0])
         begin = time.process_time()
-        size = sum(len(encode(eye)) for eye in eyes)
-        spent = (time.process_time() - begin) / len(eyes)
-        print(f"{name:28} {spent * 1e3:7.2f} ms an image  {size / sum(eye.nbytes for eye in eyes):.3f} of raw")
+        size = sum(len(encode(pixels)) for pixels in arrays)
+        spent = (time.process_time() - begin) / len(arrays)
+        print(f"{name:28} {spent * 1e3:7.2f} ms an image  {size / sum(pixels.nbytes for pixels in arrays):.3f} of raw")
 
 
 def main() -> None:

@@ -1,8 +1,8 @@
-"""Localize-only in a saved map: single stereo images from random places of a walk, without a guess.
+"""Localize-only in a saved map: single stereo images from random places of a sequence, without a guess.
 
 The map is made by a run over the source (or taken from --map), saved, and loaded again. The questions are images from
-poses between those of the walk: shifted by up to 20 cm to the side and turned by up to 10 degrees. A second round asks
-the same in the store after a fifth of the products was exchanged.
+poses between those of the sequence: shifted by up to 20 cm to the side and turned by up to 10 degrees. A second round
+does the same in the store after a fifth of the products was exchanged.
 
     python benchmarks/relocalization.py
     python benchmarks/relocalization.py --map runs/loop/map "sim:loop"
@@ -68,17 +68,17 @@ def alignment(saved: SavedMap, source: SimSource) -> F64:
 
 
 def questions(source: SimSource, count: int, seed: int) -> Iterator[tuple[StereoImage, F64]]:
-    """Images from random poses near the walk, and the poses."""
+    """Images from random poses near the sequence, and the poses."""
     rng = np.random.default_rng(seed)
-    sensors = [Sensor(eye, source.effects) for eye in source.renderer.eyes]
+    sensors = [Sensor(side, source.effects) for side in source.renderer.cameras]
     for n in range(count):
-        pose = source.walk.poses(np.array([rng.uniform(0, source.walk.duration)]))[0]
+        pose = source.drive.poses(np.array([rng.uniform(0, source.drive.duration)]))[0]
         shift, turn = rng.uniform(-1, 1, 3) * ASIDE_METRES, np.deg2rad(rng.uniform(-1, 1, 3) * TURN_DEGREES)
         pose = pose @ se3.exp(np.concatenate([shift, turn]))
         views = source.renderer.render(pose)
         left, right = (
-            sensor.expose(view, np.zeros(6), 1.0, 2 * n + eye)
-            for eye, (sensor, view) in enumerate(zip(sensors, views, strict=True))
+            sensor.expose(view, np.zeros(6), 1.0, 2 * n + side)
+            for side, (sensor, view) in enumerate(zip(sensors, views, strict=True))
         )
         yield StereoImage(n, n, left, right), pose
 
@@ -119,7 +119,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("source", nargs="?", default="sim:loop")
     parser.add_argument("--map", type=Path, help="map folder of this source instead of a new run")
-    parser.add_argument("--stored", type=Path, help="pictures (N, 2, H, W) of the source in a .npy file")
+    parser.add_argument("--stored", type=Path, help="images (N, 2, H, W) of the source in a .npy file")
     parser.add_argument("--queries", type=int, default=50)
     parser.add_argument("--seed", type=int, default=1)
     args = parser.parse_args()

@@ -52,11 +52,11 @@ Pair = tuple[U8, U8, F32]  # left, right, range along the left ray in metres, Na
 
 def read_pairs(folder: Path) -> tuple[Rig, Iterator[Pair]]:
     """A folder of rendered pairs."""
-    said = json.loads((folder / "rig.json").read_text())
-    size = said["width"], said["height"]
+    stored = json.loads((folder / "rig.json").read_text())
+    size = stored["width"], stored["height"]
     left, right = (
-        KannalaBrandt(*size, eye["fx"], eye["fy"], eye["cx"], eye["cy"], tuple(eye["k"]))
-        for eye in (said["left"], said["right"])
+        KannalaBrandt(*size, camera["fx"], camera["fy"], camera["cx"], camera["cy"], tuple(camera["k"]))
+        for camera in (stored["left"], stored["right"])
     )
 
     def pairs() -> Iterator[Pair]:
@@ -66,7 +66,7 @@ def read_pairs(folder: Path) -> tuple[Rig, Iterator[Pair]]:
             metres = np.where(steps > 0, steps * 0.00025, np.nan).astype(np.float32)
             yield np.asarray(images[0], np.uint8), np.asarray(images[1], np.uint8), metres
 
-    return Rig(left, right, np.array(said["left_T_right"])), pairs()
+    return Rig(left, right, np.array(stored["left_T_right"])), pairs()
 
 
 def simulated_pairs(source: SimSource, every: int, count: int) -> Iterator[Pair]:
@@ -190,8 +190,10 @@ def scale_error(make_source: Callable[[], SimSource], every: int, frames: int) -
             stamps.append(frame.stamp_ns)
             poses.append(frame.odom_T_cam)
         assert source.ground_truth is not None
-        said = evaluate(Trajectory(np.array(stamps), np.array(poses)), source.ground_truth)
-    return f"{100 * (1 / said.sim3_scale - 1):+.3f} % over {said.length_m:.1f} m, ATE {1e3 * said.ape_m.rmse:.1f} mm"
+        stored = evaluate(Trajectory(np.array(stamps), np.array(poses)), source.ground_truth)
+    return (
+        f"{100 * (1 / stored.sim3_scale - 1):+.3f} % over {stored.length_m:.1f} m, ATE {1e3 * stored.ape_m.rmse:.1f} mm"
+    )
 
 
 def main() -> None:

@@ -1,5 +1,5 @@
-"""Is this calibration good? Judged from any recording, without a target: row errors by region, what a small bundle
-adjustment would change, and a verdict with its reasons."""
+"""Checks a calibration with any recording, without a target: row errors by region, the correction that a small bundle
+adjustment estimates, and a verdict with its reasons."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ VERDICTS = ("PASS", "WARN", "FAIL")
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at."""
+    """The result of one check."""
 
     name: str
     level: int  # index into VERDICTS
     text: str
-    judged: bool = True  # False: the recording does not show all of it, which is no fault of the calibration
-    value: tuple[float, ...] = ()  # what should be added, in the text's unit
+    judged: bool = True  # False: the recording does not contain the motion or points that the check needs
+    value: tuple[float, ...] = ()  # the estimated correction, in the text's unit
     sigma: tuple[float, ...] = ()  # its standard deviation
 
     @property
     def verdict(self) -> str:
-        """PASS, WARN, FAIL, or nothing when it is not judged."""
+        """PASS, WARN or FAIL; empty if not judged."""
         return VERDICTS[self.level] if self.judged or self.level else ""
 
 
 @dataclass(frozen=True, eq=False)
 class CheckReport:
-    """The answer."""
+    """All checks of a calibration."""
 
     findings: tuple[Finding, ...]
     matches: int
@@ -49,12 +49,12 @@ class CheckReport:
     region_median: F64  # (4, 5) px row error, NaN where fewer than 8 matches
     region_count: I64  # (4, 5)
     correction: Correction
-    choice: Choice  # what of it has the evidence to be written
-    consequences: Consequences  # of leaving that out
+    choice: Choice  # its significant terms
+    consequences: Consequences  # of not applying them
 
     @property
     def level(self) -> int:
-        """The worst finding's."""
+        """Level of the worst finding, index into VERDICTS."""
         return max(f.level for f in self.findings)
 
     @property
@@ -65,13 +65,14 @@ class CheckReport:
 
 @dataclass(frozen=True)
 class Limit:
-    """A value warns above `warn` and fails above `fail`, when it is also that many deviations from zero."""
+    """Absolute values above which a check warns and fails, if the value is also significant."""
 
     warn: float
     fail: float
-    deviations: float
+    deviations: float  # standard deviations from zero that make a value significant
 
 
+# benchmarks/check_calib.py checks these limits with known errors added to good calibrations.
 DISPARITY_PX = Limit(0.5, 1.0, 2.5)
 LENGTH_PERCENT = Limit(1.5, 4.0, 0.0)
 SYSTEMATIC_PX = Limit(0.5, 0.75, 0.0)
@@ -87,16 +88,16 @@ ROLLING = "cannot be judged with a rolling shutter"
 def check(rig: Rig, rectification: Rectification, windows: list[Window], rolling: bool = False) -> CheckReport:
     """Judge `rig` by windows collected through its rectification.
 
-    `rolling`: rows are exposed one after the other; what only motion shows is not judged then.
+    `rolling`: rolling shutter; parameters that only motion determines are not judged then.
 
     Raises:
-        StereoSfmError: too few matches to say anything.
+        StereoSfmError: too few matches.
     """
     total = sum(len(w.rows) for w in windows)
     if total < 40:
         raise StereoSfmError(
-            f"only {total} stereo matches in the whole source: too dark, too plain, swapped eyes, or a calibration"
-            " so wrong that nothing matches"
+            f"only {total} stereo matches in all images: too dark, too little texture, swapped cameras, or a wrong"
+            " calibration"
         )
     correction = replace(estimate(rig, windows), rolling=rolling)
     good = np.concatenate(correction.explained)
@@ -142,11 +143,11 @@ def level_of(value: float, sigma: float, limit: Limit) -> int:
 
 
 def _distances(rig: Rig, choice: Choice, effect: Consequences) -> Finding:
-    """What the terms that have the evidence do to distances and to the path, if they are not corrected."""
+    """Effect of the significant terms on distances and on the trajectory's length if they are not corrected."""
     sigma = rig.left.fx * float(choice.sigma[1])
     text = f"disparity off by {effect.disparity_px:+.2f} +- {sigma:.2f} px"
     if not choice.written.any():
-        return Finding("distances", 0, f"the images prove no error; disparity known to {sigma:.2f} px")
+        return Finding("distances", 0, f"no significant error; disparity known to {sigma:.2f} px")
     level = max(level_of(effect.disparity_px, sigma, DISPARITY_PX), level_of(100 * effect.length, 0.0, LENGTH_PERCENT))
     return Finding("distances", level, f"{text}: {effect.text}", True, (effect.disparity_px,), (sigma,))
 
@@ -160,7 +161,7 @@ def _rows(error: F64, median: F64, count: I64) -> Finding:
     else:
         systematic = worst = float(abs(np.median(error)))
     text = (
-        f"median {np.median(error):+.2f} px, of its size {np.median(np.abs(error)):.2f} px;"
+        f"median {np.median(error):+.2f} px, absolute median {np.median(np.abs(error)):.2f} px;"
         f" systematic part {systematic:.2f} px, worst region {worst:.2f} px"
     )
     return Finding("row error", level_of(systematic, 0.0, SYSTEMATIC_PX), text)
@@ -184,27 +185,27 @@ def _judged(correction: Correction) -> list[Finding]:
     why = UNKNOWN if still else ROLLING
     turn = np.rad2deg(amount[TURN]), np.rad2deg(sigma[TURN])
     shown = (turn[1] < 0.06) & np.array([True, still, True])
-    rotation = _measured("rotation between the eyes", *turn, ROTATION_DEG, "degrees", shown, "xyz", why)
+    rotation = _measured("rotation between the cameras", *turn, ROTATION_DEG, "degrees", shown, "xyz", why)
     along = np.rad2deg(correction.vector[DIRECTION]), np.rad2deg(correction.sigma[DIRECTION])
     direction = _measured("baseline direction", *along, DIRECTION_DEG, "degrees", (along[1] < 1.1) & still, "yz", why)
     ratio = 100 * amount[[FOCAL_RATIO]], 100 * sigma[[FOCAL_RATIO]]
-    right = _measured("focal length, right against left", *ratio, FOCAL_RIGHT_PERCENT, "%", ratio[1] < 0.4)
+    right = _measured("focal length, right relative to left", *ratio, FOCAL_RIGHT_PERCENT, "%", ratio[1] < 0.4)
     both = 100 * amount[[FOCAL_BOTH]], 100 * sigma[[FOCAL_BOTH]]
     shown = np.array([correction.shows_focal])
-    common = _measured("focal length, both eyes", *both, FOCAL_PERCENT, "%", shown, why=why)
+    common = _measured("focal length, both cameras", *both, FOCAL_PERCENT, "%", shown, why=why)
     skew = 1e3 * correction.vector[[SKEW]], 1e3 * correction.sigma[[SKEW]]
-    time = _measured("time skew of the right eye", *skew, SKEW_MS, "ms", skew[1] < 1.0)
+    time = _measured("time skew of the right camera", *skew, SKEW_MS, "ms", skew[1] < 1.0)
     return [rotation, replace(direction, level=min(direction.level, 1)), right, common, time]
 
 
 def _measured(
     name: str, value: F64, sigma: F64, limit: Limit, unit: str, known: Bool, axes: str = "", why: str = UNKNOWN
 ) -> Finding:
-    """A finding about what should be added to the calibration, with its standard deviation.
+    """A finding about a parameter's estimated correction and its standard deviation.
 
     Args:
-        value: (K,) in `unit`. sigma: (K,). known: (K,) whether the recording shows it. axes: K letters.
-        why: it does not.
+        value: (K,) in `unit`. sigma: (K,). known: (K,) whether the recording determines it. axes: K letters.
+        why: text for the components that it does not determine.
     """
     levels = [level_of(float(v), float(s), limit) for v, s in zip(value[known], sigma[known], strict=True)]
     text = f"off by {_list(value)} +- {_list(sigma, '')} {unit}" + (f" ({' '.join(axes)})" if axes else "")

@@ -1,14 +1,14 @@
-"""A small bundle adjustment that asks points seen by both eyes, several times, how the calibration should change.
+"""A small bundle adjustment that estimates a correction of the calibration from points tracked in both cameras.
 
-Unknown are the rotation of the right eye (3), the direction of the baseline (2), the focal length of both eyes and of
-the right one alone (2), the time skew of the right eye (1), a smooth displacement of each image for the lens's own
-imperfection (10 each, held small by a prior), the motion of each window (6 for each moment after the first) and the
-points (bearing and inverse depth, so that points at infinity and beyond stay what they are). Points and motions are
+The unknowns are the rotation of the right camera (3), the direction of the baseline (2), the focal length of both
+cameras and of the right one relative to the left (2), the time skew of the right camera (1), a smooth displacement of
+each image for errors of the lens model (10 each, with a prior), the motion of each window (6 for each moment after the
+first) and the points (bearing and inverse depth, which also represents points at infinity). Points and motions are
 eliminated by the Schur complement.
 
-A turn and a shift of the picture, or a focal length and a radial displacement, are hard to tell apart, and it does not
-matter which it is: what counts is where the pictures are wrong. So the answer is the turn and the magnification that
-the whole correction amounts to over the matches (`calib.amount`), which are known far better than their parts.
+A rotation and a shift of the image, or a focal length and a radial displacement, are strongly correlated. The result is
+therefore the rotation and the magnification that the complete correction amounts to at the matches (`calib.amount`);
+they are determined much better than the single parameters.
 """
 
 from __future__ import annotations
@@ -37,54 +37,55 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, Bool
 
 HALF_ITERATIONS = 10
-CORRELATED = 2.0  # the matches' errors are not independent: their deviation counts so many times
-# One standard deviation of what may be wrong before any image is seen: radians, radians, ratios, seconds.
+CORRELATED = 2.0  # factor on the deviation of the matches' errors, which are not independent
+# Prior standard deviations of the rig's corrections: radians, radians, ratios, seconds.
 RIG_PRIOR = (0.05, 0.05, 0.05, 0.02, 0.02, 0.05, 0.05, 0.02)
 
 
 @dataclass(frozen=True)
 class Lens:
-    """How far the lenses may be from their model: one standard deviation in px at the image's border."""
+    """Prior of the displacements from the lens model: one standard deviation in px at the image's border."""
 
     shift: float
     bend: float  # second order
     radial: tuple[float, float]  # third and fifth order
-    heavy: bool  # a Cauchy prior (but not above 5 px): good lenses need nothing, bad ones are believed
+    heavy_tailed: bool  # a Cauchy prior, at most 5 px wide: strong for good lenses, weak for bad ones
 
-    def trust(self, vector: F64) -> F64:
-        """(SHARED,) inverse variances at the present estimate."""
+    def information(self, vector: F64) -> F64:
+        """(SHARED,) inverse prior variances at the present estimate (SHARED,)."""
         one = (self.shift, self.shift, *[self.bend] * (NUISANCE - 4), *self.radial)
         prior = np.array(RIG_PRIOR + one + one)
-        trust = 1 / prior**2
-        if self.heavy:
+        information = 1 / prior**2
+        if self.heavy_tailed:
             lens = np.arange(len(RIG_PRIOR), SHARED)
             bent = lens[(lens - len(RIG_PRIOR)) % NUISANCE >= 2]
-            trust[bent] = np.maximum(trust[bent] / (1 + (vector[bent] / prior[bent]) ** 2), 0.04)
-        return trust
+            information[bent] = np.maximum(information[bent] / (1 + (vector[bent] / prior[bent]) ** 2), 0.04)
+        return information
 
 
-ANY = Lens(0.3, 0.15, (5.0, 2.0), heavy=True)
-# The focal length of both eyes hides behind the radial order: two views of the lens, their difference is doubt.
-CUBIC = Lens(0.3, 0.15, (5.0, 1e-3), heavy=False)
-QUINTIC = Lens(0.3, 0.15, (5.0, 1.0), heavy=False)
+ANY = Lens(0.3, 0.15, (5.0, 2.0), heavy_tailed=True)
+# The focal length of both cameras is correlated with the radial displacement. It is estimated with two priors of the
+# lens; the difference of the two estimates enters its standard deviation.
+CUBIC = Lens(0.3, 0.15, (5.0, 1e-3), heavy_tailed=False)
+QUINTIC = Lens(0.3, 0.15, (5.0, 1.0), heavy_tailed=False)
 
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """What should be added to the calibration, with standard deviations."""
+    """The estimated correction of the calibration, with standard deviations."""
 
     vector: F64  # (SHARED,)
     covariance: F64  # (SHARED, SHARED)
-    amount: F64  # (5,) turn of the right eye in radians, right focal length against left, both: see `calib.amount`
+    amount: F64  # (5,) rotation of the right camera in rad, right focal length relative to left, both: `calib.amount`
     amount_sigma: F64  # (5,)
     noise_px: float  # of one measured coordinate, robust
     points: int
     residual_px: float  # root mean square of the inliers after the fit
-    travel: float  # how far the points of the liveliest window moved, as a fraction of the image's width
-    explained: tuple[Bool, ...]  # for each window (N,) the points whose first moment the corrected rig explains
+    travel: float  # largest median motion of a window's points, as a fraction of the image's width
+    explained: tuple[Bool, ...]  # for each window (N,) inliers of the corrected rig at the first moment
     whole: Estimate  # of the terms that may be written
-    halves: tuple[Estimate, ...]  # the same of two parts of the recording, each on its own
-    rolling: bool = False  # rows are exposed one after the other: what moves bends as if the lens did
+    halves: tuple[Estimate, ...]  # the same from each half of the recording
+    rolling: bool = False  # rolling shutter: motion distorts the images like an error of the lens model
 
     @property
     def sigma(self) -> F64:
@@ -93,9 +94,9 @@ class Correction:
 
     @property
     def shows_focal(self) -> bool:
-        """Whether there is enough motion to tell the focal length of both eyes from the lenses' imperfection.
+        """Whether there is enough motion to separate the focal length of both cameras from the lens displacements.
 
-        One window does not show it: its matches err together, which their deviation does not say.
+        One window is not enough: the errors of its matches are correlated, which the covariance does not contain.
         """
         several = len(self.explained) > 1
         return not self.rolling and several and self.travel > 0.04 and float(self.amount_sigma[FOCAL_BOTH]) < 0.007
@@ -103,7 +104,7 @@ class Correction:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """One minimum."""
+    """One minimum of the cost."""
 
     vector: F64
     covariance: F64
@@ -132,14 +133,14 @@ def estimate(rig: Rig, windows: list[Window], iterations: int = 18) -> Correctio
 
 
 def _halves(problems: list[Problem]) -> tuple[list[Problem], list[Problem]]:
-    """Windows in turn; of a single one the points in turn."""
+    """Even and odd windows; of a single window, even and odd points."""
     if len(problems) > 1:
         return problems[0::2], problems[1::2]
     return [part(problems[0], slice(0, None, 2))], [part(problems[0], slice(1, None, 2))]
 
 
 def _terms(fit: _Fit, total: F64) -> Estimate:
-    """What `stereo_sfm.calib.choice` chooses from."""
+    """The terms from which `stereo_sfm.calib.choice` selects."""
     by_vector = np.zeros((TERMS, SHARED))
     by_vector[:3], by_vector[5] = total[TURN], total[FOCAL_RATIO]
     by_vector[3:5, DIRECTION] = np.eye(2)
@@ -153,7 +154,7 @@ def _explained(window: Window, problem: Problem) -> Bool:
 
 
 def _both(rig: Rig, problems: list[Problem], start: _Fit, total: F64) -> tuple[float, float]:
-    """The magnification of both eyes: mean of two views of the lens, half their difference added to its deviation."""
+    """Magnification of both cameras and its deviation: mean and half the difference with two priors of the lens."""
     fits = [_fit(rig, problems, lens, start.vector, start.sigma, 8) for lens in (CUBIC, QUINTIC)]
     values = [float(total @ f.vector) for f in fits]
     deviation = max(float(np.sqrt(total @ f.covariance @ total)) for f in fits)
@@ -161,18 +162,18 @@ def _both(rig: Rig, problems: list[Problem], start: _Fit, total: F64) -> tuple[f
 
 
 def _travel(window: Window) -> float:
-    """Median over the points of the farthest they were from where they began, px of the left eye."""
+    """Median over the points of the largest distance from the first position, px of the left image."""
     far = np.linalg.norm(window.left - window.left[0], axis=2)
     return float(np.median(np.nan_to_num(np.fmax.reduce(far, axis=0))))
 
 
 def _fit(rig: Rig, problems: list[Problem], lens: Lens, vector: F64, sigma: float, iterations: int) -> _Fit:
-    """Gauss-Newton with weights renewed each time; the problems' points and motions move along."""
+    """Iteratively reweighted Gauss-Newton; updates the points and motions of `problems` in place."""
     hessian = np.eye(SHARED)
     for iteration in range(iterations):
         current = moved(rig, vector)
-        trust = lens.trust(vector)
-        hessian, gradient = np.diag(trust), vector * trust
+        information = lens.information(vector)
+        hessian, gradient = np.diag(information), vector * information
         steps: list[tuple[Problem, _Solved]] = []
         sizes: list[F64] = []
         for problem in problems:
@@ -216,7 +217,7 @@ def _weights(residual: F64, sigma: float, hard: bool) -> F64:
 
 @dataclass(frozen=True, eq=False)
 class _Solved:
-    """What gives a window's own step once the shared one is known: step = -(gradient + gain @ the rest's step)."""
+    """Back-substitution of a window's own unknowns: step = -(gradient + gain @ step of the other unknowns)."""
 
     pose_gain: F64  # (6 (F - 1), SHARED)
     pose_gradient: F64

@@ -9,7 +9,7 @@ import numpy as np
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import F64
 
-MOST_OFFSET_S = 1.0
+MAX_OFFSET_S = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +41,7 @@ class Imu:
         noise = (self.gyro_noise, self.accel_noise, self.gyro_walk, self.accel_walk, self.rate_hz)
         if not all(np.isfinite(a).all() for a in arrays) or not all(np.isfinite(n) and n > 0 for n in noise):
             raise StereoSfmError("invalid calibration of the IMU: a number is not finite, or a noise is not positive")
-        if not abs(self.offset_s) <= MOST_OFFSET_S:
+        if not abs(self.offset_s) <= MAX_OFFSET_S:
             raise StereoSfmError(f"invalid calibration: time offset of {self.offset_s:g} s between camera and IMU")
 
     def seen_from(self, new_T_left: F64) -> Imu:

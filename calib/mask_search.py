@@ -20,10 +20,10 @@ from stereo_sfm.types import F32, F64, U8, Bool
 WIDEST = 640  # px: wider images are halved
 WINDOW = 5  # px, side of the compared windows: a thin rail fills it
 TURNED_DEG = 8.0  # between two compared images: many times the window, whichever the lens
-MOST_IMAGES = 80  # kept of a recording
-MOST_PAIRS = 120
-LEAST_VOTES = 10  # pairs in which a window has texture in both images
-ALIKE, ALWAYS = 0.75, 0.9  # correlation of windows that show the same, and the share of the pairs in which they do
+MAX_IMAGES = 80  # kept of a recording
+MAX_PAIRS = 120
+MIN_VOTES = 10  # pairs in which a window has texture in both images
+SIMILAR, ALWAYS = 0.75, 0.9  # correlation of windows that show the same, and the share of the pairs in which they do
 TEXTURE = 4.0  # grey levels, standard deviation in a window: well above a sensor's noise
 PLAIN_SHARE = 0.9  # of the images, in which a part of the robot without texture has none
 DARK, DARK_QUANTILE = 0.12, 0.95  # of the median brightness; the share of images in which it is darker
@@ -60,7 +60,7 @@ class MaskSearch:
             self._rotations.append(world_R_cam)
             self._submaps.append(submap_id)
             self._images.append(tuple(_reduced(image) for image in images))
-            if len(self._images) > MOST_IMAGES:
+            if len(self._images) > MAX_IMAGES:
                 self._rotations, self._submaps = self._rotations[::2], self._submaps[::2]
                 self._images = self._images[::2]
                 self._every *= 2
@@ -75,13 +75,13 @@ class MaskSearch:
         turned = np.degrees(np.arccos(np.clip(axes @ axes.T, -1, 1))) > TURNED_DEG
         turned &= np.equal.outer(self._submaps, self._submaps)
         found = [(i, j) for i, j in itertools.combinations(range(len(axes)), 2) if turned[i, j]]
-        step = max(1, -(-len(found) // MOST_PAIRS))
+        step = max(1, -(-len(found) // MAX_PAIRS))
         return found[::step]
 
     @property
     def turned(self) -> bool:
         """Whether the camera has turned enough for `find`."""
-        return len(self.pairs) >= LEAST_VOTES
+        return len(self.pairs) >= MIN_VOTES
 
     def find(self) -> list[FoundMask]:
         """The masks, one for each camera.
@@ -90,7 +90,7 @@ class MaskSearch:
             StereoSfmError: the camera has not turned enough to tell the robot from distant scenery.
         """
         pairs = self.pairs
-        if len(pairs) < LEAST_VOTES:
+        if len(pairs) < MIN_VOTES:
             raise StereoSfmError(
                 f"the camera turns too little in this recording to tell the robot from distant scenery: {len(pairs)} "
                 f"pairs of images differ in heading by {TURNED_DEG:g} degrees; record a drive with a turn"
@@ -148,8 +148,8 @@ def _fixed(moments: list[tuple[F32, F32, F32]], pairs: list[tuple[int, int]]) ->
         textured = (deviation_a > TEXTURE) & (deviation_b > TEXTURE)
         together = cv2.blur(a * b, (WINDOW, WINDOW)) - mean_a * mean_b
         votes += textured
-        alike += textured & (together > ALIKE * deviation_a * deviation_b)
-    return (votes >= LEAST_VOTES) & (alike > ALWAYS * votes)
+        alike += textured & (together > SIMILAR * deviation_a * deviation_b)
+    return (votes >= MIN_VOTES) & (alike > ALWAYS * votes)
 
 
 def _closed(fixed: Bool, plain: Bool) -> Bool:

@@ -125,10 +125,10 @@ def flattened(image: U8) -> U8:
     """The image minus its local mean, divided by its local contrast: independent of the cameras' exposures."""
     import cv2
 
-    picture = image.astype(np.float32)
-    mean: Any = cv2.blur(picture, (27, 27))
-    spread: Any = np.sqrt(np.maximum(cv2.blur(picture * picture, (27, 27)) - mean * mean, 0))
-    return np.clip(128 + 48 * (picture - mean) / (spread + 4), 0, 255).astype(np.uint8)
+    grey = image.astype(np.float32)
+    mean: Any = cv2.blur(grey, (27, 27))
+    spread: Any = np.sqrt(np.maximum(cv2.blur(grey * grey, (27, 27)) - mean * mean, 0))
+    return np.clip(128 + 48 * (grey - mean) / (spread + 4), 0, 255).astype(np.uint8)
 
 
 def pyramid_flow(a: U8, b: U8, start: Any) -> tuple[Any, Bool]:

@@ -1,4 +1,4 @@
-"""Whether a finished calibration can be trusted: numbers, their limits, and the verdict."""
+"""Quality of a finished calibration: its measures, their limits and the verdict."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ CENTRE_SIGMA_PX = Limit(0.6, 2.0, 0.0)
 
 @dataclass(frozen=True, eq=False)
 class Quality:
-    """The judgement of a calibration."""
+    """The measures of a calibration, each with a verdict."""
 
     findings: tuple[Finding, ...]
-    epipolar_px: F64  # (K,) row error of corners that both eyes saw, px at the left eye's centre
+    epipolar_px: F64  # (K,) row error of corners seen by both cameras, px at the centre of the left image
     epipolar_uv: F64  # (K, 2) where, in the left image
 
     @property
     def level(self) -> int:
-        """The worst finding's."""
+        """Level of the worst finding, index into VERDICTS."""
         return max(f.level for f in self.findings)
 
 
 def judge(calibration: Calibration, views: Coverage) -> Quality:
-    """Judge by reprojection, epipolar error, the parameters' deviations and coverage."""
+    """Judge by reprojection error, epipolar error, the parameters' standard deviations and coverage."""
     sigma = dict(zip(calibration.names, calibration.sigma, strict=True))
     rig = calibration.rig
     focal = 100 * max(v for n, v in sigma.items() if n.endswith(("fx", "fy"))) / rig.left.fx
@@ -56,7 +56,7 @@ def judge(calibration: Calibration, views: Coverage) -> Quality:
 
 
 def epipolar_errors(calibration: Calibration) -> tuple[F64, F64]:
-    """Row errors (K,) px and places (K, 2) of the corners that both eyes saw in one view."""
+    """Row errors (K,) px and positions (K, 2) px in the left image of the corners seen by both cameras."""
     observed, rig = calibration.observed, calibration.rig
     assert rig.right is not None
     key = {}

@@ -1,4 +1,4 @@
-"""The calibration's report: one HTML file with its pictures inside."""
+"""The report of a calibration: one HTML file with embedded images."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 
 from stereo_sfm.calib.check import VERDICTS
 from stereo_sfm.calib.coverage import Coverage
+from stereo_sfm.calib.drawing import encode_jpeg, side_by_side
 from stereo_sfm.calib.matches import Matches
-from stereo_sfm.calib.pictures import encode_jpeg, side_by_side
 from stereo_sfm.calib.quality import Quality
 from stereo_sfm.calib.rectification import rectify
 from stereo_sfm.calib.solve import Calibration
@@ -36,7 +36,7 @@ def write_report(
 
     Args:
         path: of the HTML file. title: usually the source.
-        views: coverage of each eye. pairs: some original pictures of both eyes, to show rectified.
+        views: coverage of each camera. pairs: some original images of both cameras, shown rectified.
     """
     verdict = VERDICTS[quality.level]
     rows = "".join(
@@ -57,7 +57,7 @@ def write_report(
     if calibration.rig.right is not None:
         parts += ["<h2>Epipolar error</h2>", _image(_epipolar(calibration, quality))]
         parts += [
-            "<h2>Rectified pairs</h2><p>A point lies on one line in both pictures.</p>",
+            "<h2>Rectified pairs</h2><p>A point lies on the same row of both images.</p>",
             *_rectified(calibration, pairs),
         ]
     page = f"<!doctype html><meta charset='utf-8'><title>{html.escape(title)}</title><style>{_STYLE}</style>"
@@ -66,11 +66,11 @@ def write_report(
 
 def _advice(views: list[Coverage]) -> str:
     lines = [
-        f"<li>{eye} eye: {html.escape(a)}</li>"
-        for eye, v in zip(("left", "right"), views, strict=False)
+        f"<li>{side} camera: {html.escape(a)}</li>"
+        for side, v in zip(("left", "right"), views, strict=False)
         for a in v.advice
     ]
-    return f"<h2>To make it better</h2><ul>{''.join(lines)}</ul>" if lines else ""
+    return f"<h2>How to improve it</h2><ul>{''.join(lines)}</ul>" if lines else ""
 
 
 def _parameters(calibration: Calibration) -> str:
@@ -89,8 +89,8 @@ def _parameters(calibration: Calibration) -> str:
         for n, v, s in zip(calibration.names, values, calibration.sigma, strict=True)
     )
     used = f"{len(calibration.observed.view)} corners of {len(np.unique(calibration.observed.view))} views"
-    gone = f"{calibration.removed_corners} corners and {calibration.removed_views} views removed as wrong"
-    return f"<p>{used}; {gone}.</p><table>{rows}</table>"
+    removed = f"{calibration.removed_corners} corners and {calibration.removed_views} views removed as outliers"
+    return f"<p>{used}; {removed}.</p><table>{rows}</table>"
 
 
 def _figure(columns: int) -> tuple[Any, Any]:
@@ -110,10 +110,9 @@ def _image(figure: Any) -> str:
 
 def _residuals(calibration: Calibration) -> Any:
     observed, residual = calibration.observed, calibration.residual
-    eyes = int(observed.side.max()) + 1
-    figure, axes = _figure(eyes)
-    for eye, axis in enumerate(axes):
-        rows = observed.side == eye
+    figure, axes = _figure(int(observed.side.max()) + 1)
+    for side, axis in enumerate(axes):
+        rows = observed.side == side
         uv, r = observed.uv[rows], residual[rows]
         size = np.linalg.norm(r, axis=1)
         scale = 0.03 * calibration.rig.left.width / max(float(np.quantile(size, 0.9)), 1e-6)
@@ -122,7 +121,7 @@ def _residuals(calibration: Calibration) -> Any:
         )
         figure.colorbar(arrows, ax=axis, label="px")
         axis.set(xlim=(0, calibration.rig.left.width), ylim=(calibration.rig.left.height, 0), aspect="equal")
-        axis.set_title(f"{('left', 'right')[eye]}: {np.sqrt((size**2).mean()):.3f} px rms")
+        axis.set_title(f"{('left', 'right')[side]}: {np.sqrt((size**2).mean()):.3f} px rms")
     return figure
 
 
@@ -150,6 +149,6 @@ def _rectified(calibration: Calibration, pairs: list[tuple[U8, U8]]) -> list[str
     rectification = rectify(calibration.rig, projection)
     out: list[str] = []
     for left, right in pairs:
-        picture = side_by_side(*rectification.apply(left, right), Matches(np.zeros((0, 2)), np.zeros((0, 2))))
-        out.append(f"<img src='data:image/jpeg;base64,{base64.b64encode(encode_jpeg(picture)).decode()}'>")
+        image = side_by_side(*rectification.apply(left, right), Matches(np.zeros((0, 2)), np.zeros((0, 2))))
+        out.append(f"<img src='data:image/jpeg;base64,{base64.b64encode(encode_jpeg(image)).decode()}'>")
     return out

@@ -12,8 +12,8 @@ from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.types import F64, Bool
 
 BASELINE_RANGE_M = 1e-4, 100.0
-MOST_PIXELS = 10**8
-MOST_READOUT_S = 0.2
+MAX_PIXELS = 10**8
+MAX_READOUT_S = 0.2
 SMALLEST_SHARE = 0.05  # of an image's pixels, that a mask must leave
 
 
@@ -52,7 +52,7 @@ class Rig:
                 _check_camera(side, camera)
         _check_mask("left", self.left_mask, self.left)
         _check_mask("right", self.right_mask, self.right)
-        if not 0 <= self.readout_s <= MOST_READOUT_S:
+        if not 0 <= self.readout_s <= MAX_READOUT_S:
             raise StereoSfmError(
                 f"invalid calibration: readout of {self.readout_s:g} s; give the seconds from first to last row, "
                 "0 for a global shutter"
@@ -108,7 +108,7 @@ def _check_camera(side: str, camera: Camera) -> None:
     wrong += [f"{name} {numbers[name]:g}" for name in ("fx", "fy") if numbers[name] <= 0]
     wrong += [f"cx {camera.cx:g}"] if abs(camera.cx) > 2 * camera.width else []
     wrong += [f"cy {camera.cy:g}"] if abs(camera.cy) > 2 * camera.height else []
-    if min(camera.width, camera.height) < 1 or camera.width * camera.height > MOST_PIXELS:
+    if min(camera.width, camera.height) < 1 or camera.width * camera.height > MAX_PIXELS:
         wrong.append(f"size {camera.width}x{camera.height}")
     if wrong:
         raise StereoSfmError(f"invalid calibration of the {side} camera: {', '.join(wrong)}")

@@ -25,7 +25,7 @@ SHOWN_WARNINGS = 5  # of unreadable images, one by one; then only their count
 
 
 @dataclass(frozen=True)
-class Shot:
+class FrameFiles:
     """The files of one frame."""
 
     stamp_ns: int
@@ -83,34 +83,34 @@ class FolderSource(BaseSource):
         self,
         name: str,
         rig: Rig,
-        shots: Sequence[Shot],
+        frames: Sequence[FrameFiles],
         ground_truth: Trajectory | None = None,
         depth_scale: float = 5000.0,
         imu: ImuSamples | None = None,
     ) -> None:
         """Args:
-        name: for messages. rig: calibration of the images. shots: in any order.
+        name: for messages. rig: calibration of the images. frames: in any order.
         ground_truth: world_T_cam0.
         depth_scale: stored units of a depth image per metre.
         imu: all inertial samples, ascending: each goes with the frame that ends its interval.
         """
-        if not shots:
+        if not frames:
             raise StereoSfmError(f"{name}: no images")
         self.name = name
         self.rig = rig
         self.ground_truth = ground_truth
-        self.shots = sorted(shots, key=lambda shot: shot.stamp_ns)
+        self.frames = sorted(frames, key=lambda frame: frame.stamp_ns)
         self.depth_scale = depth_scale
         self._imu = imu
-        self.frame_count = len(self.shots)
+        self.frame_count = len(self.frames)
         self.bits = used_bits(name, self._sample)
         self._check_first()
 
     def __iter__(self) -> Iterator[StereoImage]:
         dropped, read, unreadable, sampled = 0, 0, 0, 0
-        for frame_id, shot in enumerate(self.shots):
+        for frame_id, frame in enumerate(self.frames):
             try:
-                image = self._read(frame_id, shot, dropped)
+                image = self._read(frame_id, frame, dropped)
             except UnreadableImage as error:
                 dropped += 1
                 unreadable += 1
@@ -120,49 +120,49 @@ class FolderSource(BaseSource):
             dropped = 0
             read += 1
             if self._imu is not None:
-                until = int(np.searchsorted(self._imu.stamp_ns, shot.stamp_ns, side="right"))
+                until = int(np.searchsorted(self._imu.stamp_ns, frame.stamp_ns, side="right"))
                 image, sampled = replace(image, imu=self._imu.part(slice(sampled, until))), until
             yield image
         if unreadable > SHOWN_WARNINGS:
             log.warning("%s: %d frames could not be read", self.name, unreadable)
         if not read:
-            raise StereoSfmError(f"{self.name}: none of the {len(self.shots)} images can be read")
+            raise StereoSfmError(f"{self.name}: none of the {len(self.frames)} images can be read")
 
-    def _read(self, frame_id: int, shot: Shot, dropped: int) -> StereoImage:
-        left = eight_bits(read_gray(shot.left), self.bits)
-        right = eight_bits(read_gray(shot.right), self.bits) if shot.right is not None else None
-        depth = read_depth(shot.depth, self.depth_scale) if shot.depth is not None else None
-        self._check_size(shot.left, left, self.rig.left.size)
+    def _read(self, frame_id: int, frame: FrameFiles, dropped: int) -> StereoImage:
+        left = eight_bits(read_gray(frame.left), self.bits)
+        right = eight_bits(read_gray(frame.right), self.bits) if frame.right is not None else None
+        depth = read_depth(frame.depth, self.depth_scale) if frame.depth is not None else None
+        self._check_size(frame.left, left, self.rig.left.size)
         if right is not None and self.rig.right is not None:
-            self._check_size(shot.right, right, self.rig.right.size)
+            self._check_size(frame.right, right, self.rig.right.size)
         if depth is not None:
-            self._check_size(shot.depth, depth, self.rig.left.size)
+            self._check_size(frame.depth, depth, self.rig.left.size)
         return StereoImage(
             frame_id,
-            shot.stamp_ns,
+            frame.stamp_ns,
             left,
             right,
             depth,
-            right_stamp_ns=shot.right_stamp_ns if shot.right_stamp_ns != shot.stamp_ns else 0,
-            exposure_us=shot.exposure_us,
+            right_stamp_ns=frame.right_stamp_ns if frame.right_stamp_ns != frame.stamp_ns else 0,
+            exposure_us=frame.exposure_us,
             dropped_before=dropped,
         )
 
     def at(self, positions: Sequence[int]) -> Iterator[StereoImage]:
         for position in positions:
             with suppress(UnreadableImage):
-                yield self._read(position, self.shots[position], 0)
+                yield self._read(position, self.frames[position], 0)
 
     def stamps(self) -> Stamps:
-        skews = [abs(s.right_stamp_ns - s.stamp_ns) for s in self.shots if s.right_stamp_ns]
+        skews = [abs(s.right_stamp_ns - s.stamp_ns) for s in self.frames if s.right_stamp_ns]
         skew_ms = max(skews) / 1e6 if skews else float("nan")
-        beside = {} if self._imu is None else {"imu0": self._imu.stamp_ns}
-        return Stamps(np.array([s.stamp_ns for s in self.shots], np.int64), skew_ms, beside)
+        others = {} if self._imu is None else {"imu0": self._imu.stamp_ns}
+        return Stamps(np.array([s.stamp_ns for s in self.frames], np.int64), skew_ms, others)
 
     def _sample(self, count: int) -> Iterator[Any]:
         """The readable images of so many evenly spaced frames."""
-        for i in sorted({k * (len(self.shots) - 1) // max(count - 1, 1) for k in range(count)}):
-            for path in (self.shots[i].left, self.shots[i].right):
+        for i in sorted({k * (len(self.frames) - 1) // max(count - 1, 1) for k in range(count)}):
+            for path in (self.frames[i].left, self.frames[i].right):
                 with suppress(UnreadableImage):
                     if path is not None:
                         yield read_gray(path)
@@ -170,7 +170,7 @@ class FolderSource(BaseSource):
     def _check_first(self) -> None:
         """Raises StereoSfmError before the first frame if the images do not match the calibration."""
         try:
-            self._read(0, self.shots[0], 0)
+            self._read(0, self.frames[0], 0)
         except UnreadableImage:
             return
 

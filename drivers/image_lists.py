@@ -90,7 +90,7 @@ def pair_files(name: str, left: list[Path], right: list[Path]) -> list[tuple[Pat
             f"{name}: cannot pair the left images ({left[0].name}, ...) with the "
             f"right images ({right[0].name}, ...): name both images of a pair by the same number or by their stamps"
         )
-    _tell_unpaired(name, len(left), len(right), len(pairs))
+    _warn_unpaired(name, len(left), len(right), len(pairs))
     return [(left[i], right[j]) for i, j in pairs]
 
 
@@ -118,7 +118,7 @@ def pair_listings(name: str, left: Listing, right: Listing) -> list[tuple[int, i
             f"{name}: the stamps of left and right images differ by {difference_ms:.6g} ms, more than the allowed "
             f"{MAX_SKEW_NS / 1e6:g} ms: both cameras must be triggered together and share a clock"
         )
-    _tell_unpaired(name, len(left), len(right), len(pairs))
+    _warn_unpaired(name, len(left), len(right), len(pairs))
     return pairs
 
 
@@ -129,7 +129,7 @@ def _median_distance(left: Sequence[int], right: Sequence[int]) -> float:
     return float(np.median(np.minimum(np.abs(b[after] - a), np.abs(b[np.maximum(after - 1, 0)] - a))))
 
 
-def _tell_unpaired(name: str, left: int, right: int, pairs: int) -> None:
+def _warn_unpaired(name: str, left: int, right: int, pairs: int) -> None:
     if pairs < max(left, right):
         log.warning("%s: %d left and %d right images, the %d pairs are used", name, left, right, pairs)
 

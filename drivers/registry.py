@@ -85,9 +85,9 @@ def recognise(path: Path) -> str:
     Raises:
         StereoSfmError: no driver recognises it.
     """
-    sure = {kind: found.recognise(path) for kind, found in drivers()}
-    best = max(sure, key=sure.__getitem__, default=None)  # the first of equally confident ones
-    if best is None or sure[best] is Certainty.NO:
+    certainty = {kind: found.recognise(path) for kind, found in drivers()}
+    best = max(certainty, key=certainty.__getitem__, default=None)  # the first of equally confident ones
+    if best is None or certainty[best] is Certainty.NO:
         known = "; ".join(f"{kind}: {found.summary}" for kind, found in drivers() if found.cameras is None)
         raise StereoSfmError(f"{path} is not a known kind of dataset ({known})")
     return best

@@ -29,7 +29,7 @@ class Stamps:
 
     stamp_ns: I64  # (N,) of the left images
     skew_ms: float = float("nan")  # largest difference between left and right stamps; NaN: not known
-    beside: Mapping[str, I64] = field(default_factory=dict[str, "I64"])  # stamps of other recorded sensors, by name
+    others: Mapping[str, I64] = field(default_factory=dict[str, "I64"])  # stamps of other recorded sensors, by name
 
 
 class Source(Protocol):

@@ -24,7 +24,7 @@ def _noise(dimension: int, huber: float) -> Any:
 
 
 def stereo_graph(rig: Rig, bundle: Bundle, huber: float = 0.0) -> Graph:
-    """GenericStereoFactor3D for observations with both eyes, GenericProjectionFactor for the left eye alone."""
+    """GenericStereoFactor3D for observations with both cameras, GenericProjectionFactor for the left camera alone."""
     cam = rig.left
     stereo = gtsam.Cal3_S2Stereo(cam.fx, cam.fy, 0, cam.cx, cam.cy, rig.baseline)
     mono = gtsam.Cal3_S2(cam.fx, cam.fy, 0, cam.cx, cam.cy)
@@ -45,7 +45,7 @@ def _fisheye(camera: Camera) -> Any:
 
 
 def fisheye_graph(rig: Rig, bundle: Bundle, huber: float = 0.0) -> Graph:
-    """One projection factor per eye, the right one behind left_T_right."""
+    """One projection factor per camera, the right one behind left_T_right."""
     assert rig.right is not None
     left_k, right_k, offset = _fisheye(rig.left), _fisheye(rig.right), gtsam.Pose3(rig.left_T_right)
     graph, noise = gtsam.NonlinearFactorGraph(), _noise(2, huber)

@@ -19,7 +19,7 @@ def pinhole_rig(baseline: float = 0.1) -> Rig:
 
 
 def fisheye_rig() -> Rig:
-    """Pair like a T265's: 848x800, 165 degrees, 64 mm, eyes slightly turned against each other."""
+    """Pair like a T265's: 848x800, 165 degrees, 64 mm, cameras slightly turned against each other."""
     left = KannalaBrandt(848, 800, 285.0, 286.0, 424.0, 400.0, (-0.004, 0.038, -0.036, 0.006))
     right = KannalaBrandt(848, 800, 285.5, 285.2, 420.0, 402.0, (-0.005, 0.040, -0.037, 0.006))
     return Rig(left, right, se3.exp(np.array([0.064, 0.0003, -0.0002, 0.002, -0.004, 0.001])))
@@ -39,8 +39,8 @@ class Scene:
     outlier: Bool  # (M,)
 
 
-def walk(count: int, step: float = 0.25, yaw_per_step: float = 0.02) -> F64:
-    """(K, 4, 4) world_T_cam of somebody who walks forward (world z) and slowly turns, with some sway."""
+def camera_path(count: int, step: float = 0.25, yaw_per_step: float = 0.02) -> F64:
+    """(K, 4, 4) world_T_cam of somebody who sequences forward (world z) and slowly turns, with some sway."""
     pose, out = np.eye(4), []
     for k in range(count):
         out.append(
@@ -79,9 +79,9 @@ def make_scene(
     seed: int = 0,
     poses: F64 | None = None,
 ) -> Scene:
-    """Random shelves along a walk; at most `max_obs` observations, chosen at random; right eyes drop out at times."""
+    """Random points of shelves along a path; at most `max_obs` random observations, some without the right camera."""
     rng = np.random.default_rng(seed)
-    world_T_kf = walk(keyframes) if poses is None else poses
+    world_T_kf = camera_path(keyframes) if poses is None else poses
     xyz = points_around(world_T_kf, points, rng)
     kf, pt, left, right = [], [], [], []
     for k, pose in enumerate(world_T_kf):
@@ -136,7 +136,7 @@ def keyframe_stream(
     broken_at: int = -1,
     seed: int = 0,
 ) -> KeyframeStream:
-    """A walk seen through tracks that break.
+    """A sequence seen through tracks that break.
 
     A point that stays in view is tracked for at most `track_length` keyframes and comes back later under a new id with
     the descriptor it had, a few bits changed; every new track sits up to half a pixel beside the point.

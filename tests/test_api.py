@@ -136,11 +136,11 @@ REFUSED: dict[str, tuple[Any, Any, Any, str]] = {
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_is_no_image_of_the_rig_is_one_line(name: str) -> None:
-    left, right, stamp_ns, said = REFUSED[name]
+    left, right, stamp_ns, message = REFUSED[name]
     for step in (s.Tracker(RIG).step, s.System(RIG).step):
         with pytest.raises(s.StereoSfmError) as error:
             step(left, right, stamp_ns)
-        assert said in str(error.value) and "\n" not in str(error.value)
+        assert message in str(error.value) and "\n" not in str(error.value)
 
 
 def test_stamps_grow() -> None:

@@ -21,7 +21,7 @@ from stereo_sfm.tracking.features.step_scale import SCALES
 
 
 @pytest.mark.parametrize(
-    ("override", "said"),
+    ("override", "message"),
     [
         ("loop.correction=pose_grap", "is 'pose_grap', did you mean pose_graph?: choose one of pose_graph, averaging"),
         ("loop.robust=foo", "loop.robust is 'foo': choose one of gnc, switchable, none"),
@@ -47,10 +47,10 @@ from stereo_sfm.tracking.features.step_scale import SCALES
         ("tracker.max_features=many", "tracker.max_features"),
     ],
 )
-def test_what_a_setting_does_not_take_is_refused(override: str, said: str) -> None:
+def test_what_a_setting_does_not_take_is_refused(override: str, message: str) -> None:
     with pytest.raises(StereoSfmError) as error:
         load(overrides=[override])
-    assert said in str(error.value) and "\n" not in str(error.value)
+    assert message in str(error.value) and "\n" not in str(error.value)
 
 
 SETTINGS = [*walk(Config())]

@@ -35,7 +35,7 @@ def test_one_of_a_list() -> None:
         ("run --preset retail-tesis", "did you mean retail-thesis?"),
         ("run --set odometry.method=epnp", "did you mean pnp?"),
         ("run --set traker.max_features=3", "did you mean tracker?"),
-        ("calibrate pictures --target chessboard -o x.yaml", "did you mean checkerboard?"),
+        ("calibrate images --target chessboard -o x.yaml", "did you mean checkerboard?"),
         ("sources t256", "did you mean t265?"),
     ],
 )

@@ -85,7 +85,7 @@ def _size(path: Path, entries: dict[str, list[float]], index: int) -> tuple[int,
     folders = (path.parent / f"image_{index}", path.parent / f"image_{index:02d}" / "data")
     from stereo_sfm.pixels import declared_size
 
-    for picture in (p for f in folders if f.is_dir() for p in sorted(f.glob("*.png"))[:20]):
+    for image in (p for f in folders if f.is_dir() for p in sorted(f.glob("*.png"))[:20]):
         with suppress(ValueError, OSError):
-            return declared_size(picture.read_bytes())
+            return declared_size(image.read_bytes())
     raise ValueError("no image size stated, and no readable image next to the file")

@@ -13,7 +13,7 @@ from yaml.events import AliasEvent
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 MAX_VALUES = 20_000  # with every alias written out
-MOST_DEPTH = 32
+MAX_DEPTH = 32
 MAX_VALUE_CHARS = 4096
 OPENCV_MATRIX = "tag:yaml.org,2002:opencv-matrix"
 
@@ -32,7 +32,7 @@ class CalibrationLoader(yaml.SafeLoader):
     def compose_node(self, parent: Node | None, index: Any) -> Node | None:
         """As `SafeLoader.compose_node`, counting values."""
         self._depth += 1
-        if self._depth > MOST_DEPTH:
+        if self._depth > MAX_DEPTH:
             raise ValueError("values are nested too deeply")
         alias = self.check_event(AliasEvent)
         node = super().compose_node(parent, index)

@@ -15,7 +15,7 @@ from pathlib import Path
 from stereo_sfm.calib.formats.euroc import read_euroc as read_rig
 from stereo_sfm.calib.formats.kalibr import read_kalibr
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.drivers.folder_source import FolderSource, Shot, folder_of, need
+from stereo_sfm.drivers.folder_source import FolderSource, FrameFiles, folder_of, need
 from stereo_sfm.drivers.ground_truth import moved, read_euroc
 from stereo_sfm.drivers.image_lists import Listing, pair_listings
 from stereo_sfm.drivers.imu_table import read_imu_samples
@@ -56,12 +56,12 @@ def _mav_folder(folder: Path) -> Path:
 def _open(name: str, mav: Path, rig: Rig) -> FolderSource:
     left = _read_listing(mav / "cam0")
     exposures = _read_exposures(mav / "cam0" / "times.txt")
-    shots = [Shot(stamp, file, exposure_us=exposures.get(file.stem, float("nan"))) for stamp, file in left]
+    frames = [FrameFiles(stamp, file, exposure_us=exposures.get(file.stem, float("nan"))) for stamp, file in left]
     if rig.stereo:
         right = _read_listing(need(mav / "cam1", "second camera"))
         pairs = pair_listings(name, left, right)
-        shots = [replace(shots[i], right=right[j][1], right_stamp_ns=right[j][0]) for i, j in pairs]
-    return FolderSource(name, rig, shots, _ground_truth(mav, rig), imu=_inertial(mav))
+        frames = [replace(frames[i], right=right[j][1], right_stamp_ns=right[j][0]) for i, j in pairs]
+    return FolderSource(name, rig, frames, _ground_truth(mav, rig), imu=_inertial(mav))
 
 
 def _read_listing(camera: Path) -> Listing:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.drivers.folder_source import FolderSource, Shot, folder_of
+from stereo_sfm.drivers.folder_source import FolderSource, FrameFiles, folder_of
 from stereo_sfm.drivers.ground_truth import read_trajectory
 from stereo_sfm.drivers.image_lists import (
     IMAGE_SUFFIXES,
@@ -55,8 +55,8 @@ def open_images(path: str, options: ImagesOptions) -> FolderSource:
         )
     stamps = _stamps(name, folder, found[0], options.fps)
     pairs = pair_files(name, *found)
-    shots = [
-        Shot(stamps[left], left, right, right_stamp_ns=_right_stamp(stamps[left], left, right))
+    frames = [
+        FrameFiles(stamps[left], left, right, right_stamp_ns=_right_stamp(stamps[left], left, right))
         for left, right in pairs
         if left in stamps
     ]
@@ -64,7 +64,7 @@ def open_images(path: str, options: ImagesOptions) -> FolderSource:
     source = FolderSource(
         name,
         chosen_rig(options.rig, lambda: _own_rig(folder)),
-        shots,
+        frames,
         read_trajectory(truth) if truth is not None else None,
     )
     if options.fps is None and not _stamped(folder, found[0]):

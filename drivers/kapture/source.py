@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from stereo_sfm.calib.eye_rotation import align_eyes
+from stereo_sfm.calib.camera_rotation import align_cameras
 from stereo_sfm.calib.formats.kapture import read_kapture, read_kapture_cameras
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.drivers.folder_source import FolderSource, Shot, folder_of, need
+from stereo_sfm.drivers.folder_source import FolderSource, FrameFiles, folder_of, need
 from stereo_sfm.drivers.image_lists import Listing, list_images, pair_listings
 from stereo_sfm.drivers.options import SourceOptions
 from stereo_sfm.drivers.rig_option import chosen_rig
@@ -37,9 +37,9 @@ def open_kapture(path: str, options: SourceOptions) -> FolderSource:
     name = f"kapture:{folder.resolve().name}"
     left, right = _listings(folder)
     pairs = pair_listings(name, left, right)
-    shots = [Shot(left[i][0], left[i][1], right[j][1], right_stamp_ns=right[j][0]) for i, j in pairs]
+    frames = [FrameFiles(left[i][0], left[i][1], right[j][1], right_stamp_ns=right[j][0]) for i, j in pairs]
     guessed = not options.rig and not _sensors(folder).with_name("rigs.txt").is_file()
-    source = FolderSource(name, chosen_rig(options.rig, lambda: _read_rig(folder)), shots)
+    source = FolderSource(name, chosen_rig(options.rig, lambda: _read_rig(folder)), frames)
     if guessed:
         source.rig = _turned(name, source)
     return source
@@ -47,8 +47,8 @@ def open_kapture(path: str, options: SourceOptions) -> FolderSource:
 
 def _turned(name: str, source: FolderSource) -> Rig:
     """The nominal rig with the rotation of the right camera estimated from the images."""
-    step = max(len(source.shots) // ALIGNED_PAIRS, 1)
-    found = align_eyes(source.rig, SelectedFrames(source, frame_skip=step, max_frames=ALIGNED_PAIRS))
+    step = max(len(source.frames) // ALIGNED_PAIRS, 1)
+    found = align_cameras(source.rig, SelectedFrames(source, frame_skip=step, max_frames=ALIGNED_PAIRS))
     if found is None:
         log.warning(
             "%s: no extrinsics: assuming parallel cameras with the nominal baseline of %g m", name, T265_BASELINE
@@ -89,14 +89,14 @@ def _listings(folder: Path) -> tuple[Listing, Listing]:
     if not records.is_file():
         left, right = ([(_stamp(p.stem), p) for p in list_images(folder / f"fisheye{i}")] for i in (1, 2))
         return left, right
-    eyes: dict[str, Listing] = {i: [] for i in list(read_kapture_cameras(_sensors(folder)))[:2]}
-    if len(eyes) < 2:
+    cameras: dict[str, Listing] = {i: [] for i in list(read_kapture_cameras(_sensors(folder)))[:2]}
+    if len(cameras) < 2:
         raise StereoSfmError(f"{folder} has one camera, two are needed")
     for line in records.read_text("utf-8-sig").splitlines():
         fields = [f.strip() for f in line.split(",")]
-        if len(fields) == 3 and fields[1] in eyes:
-            eyes[fields[1]].append((_stamp(fields[0]), folder / "sensors" / "records_data" / fields[2]))
-    left, right = eyes.values()
+        if len(fields) == 3 and fields[1] in cameras:
+            cameras[fields[1]].append((_stamp(fields[0]), folder / "sensors" / "records_data" / fields[2]))
+    left, right = cameras.values()
     return left, right
 
 

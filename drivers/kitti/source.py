@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stereo_sfm.calib.formats.kitti import read_kitti as read_rig
-from stereo_sfm.drivers.folder_source import FolderSource, Shot, folder_of, need
+from stereo_sfm.drivers.folder_source import FolderSource, FrameFiles, folder_of, need
 from stereo_sfm.drivers.ground_truth import moved, read_kitti, stamp_from_seconds
 from stereo_sfm.drivers.image_lists import lines_of, list_images, pair_files
 from stereo_sfm.drivers.rig_option import chosen_rig
@@ -36,19 +36,21 @@ def open_kitti(path: str, options: KittiOptions) -> FolderSource:
     """
     folder = _sequence_folder(folder_of("kitti", path), options.sequence)
     name = f"kitti:{folder.resolve().name}"
-    eyes = next((pair for pair in ((0, 1), (2, 3)) if (folder / f"image_{pair[0]}").is_dir()), None)
-    if eyes is None:
+    sides = next((pair for pair in ((0, 1), (2, 3)) if (folder / f"image_{pair[0]}").is_dir()), None)
+    if sides is None:
         raise StereoSfmError(f"{folder} has neither image_0 nor image_2")
-    lefts, rights = (list_images(folder / f"image_{i}") for i in eyes)
+    lefts, rights = (list_images(folder / f"image_{i}") for i in sides)
     stamps = _read_times(folder / "times.txt", name, len(lefts))
     line = lines_of(name, lefts, len(stamps), "times.txt", first=0)
-    shots = [Shot(stamps[line[left]], left, right) for left, right in pair_files(name, lefts, rights) if left in line]
-    chosen = chosen_rig(options.rig, lambda: read_rig(need(folder / "calib.txt", "KITTI calibration"), pair=eyes))
+    frames = [
+        FrameFiles(stamps[line[left]], left, right) for left, right in pair_files(name, lefts, rights) if left in line
+    ]
+    chosen = chosen_rig(options.rig, lambda: read_rig(need(folder / "calib.txt", "KITTI calibration"), pair=sides))
     truth_file = folder.resolve().parent.parent / "poses" / f"{folder.resolve().name}.txt"
     truth = None
     if truth_file.is_file():
         truth = moved(read_kitti(truth_file, np.array(stamps, np.int64)), chosen.body_T_left)
-    return FolderSource(name, chosen, shots, truth)
+    return FolderSource(name, chosen, frames, truth)
 
 
 def _sequence_folder(folder: Path, sequence: str) -> Path:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stereo_sfm.calib.formats.kitti import read_kitti as read_rig
-from stereo_sfm.drivers.folder_source import FolderSource, Shot, folder_of, need
+from stereo_sfm.drivers.folder_source import FolderSource, FrameFiles, folder_of, need
 from stereo_sfm.drivers.ground_truth import moved
 from stereo_sfm.drivers.image_lists import lines_of, list_images, pair_files
 from stereo_sfm.drivers.rig_option import chosen_rig
@@ -40,22 +40,24 @@ def open_kitti_raw(path: str, options: KittiRawOptions) -> FolderSource:
     """
     folder = _drive_folder(folder_of("kitti_raw", path), options.drive)
     name = f"kitti_raw:{folder.resolve().name}"
-    eyes = next((e for e in ((0, 1), (2, 3)) if (folder / f"image_0{e[0]}" / "data").is_dir()), None)
-    if eyes is None:
+    sides = next((e for e in ((0, 1), (2, 3)) if (folder / f"image_0{e[0]}" / "data").is_dir()), None)
+    if sides is None:
         raise StereoSfmError(f"{folder} has neither image_00/data nor image_02/data")
     date = next((p for p in (folder, folder.resolve().parent) if (p / CALIBRATION).is_file()), folder.resolve().parent)
-    own = chosen_rig(options.rig, lambda: read_rig(need(date / CALIBRATION, "KITTI raw calibration"), pair=eyes))
-    lefts, rights = (list_images(folder / f"image_0{i}" / "data") for i in eyes)
-    files = [folder / f"image_0{i}" / "timestamps.txt" for i in eyes]
+    own = chosen_rig(options.rig, lambda: read_rig(need(date / CALIBRATION, "KITTI raw calibration"), pair=sides))
+    lefts, rights = (list_images(folder / f"image_0{i}" / "data") for i in sides)
+    files = [folder / f"image_0{i}" / "timestamps.txt" for i in sides]
     stamps = _read_times(need(files[0], "time stamps"))
     others = _read_times(files[1]) if files[1].is_file() else []
     line = lines_of(name, lefts, len(stamps), "timestamps.txt", first=0)
-    shots = [
-        Shot(stamps[line[left]], left, right, right_stamp_ns=others[line[left]] if len(others) == len(stamps) else 0)
+    frames = [
+        FrameFiles(
+            stamps[line[left]], left, right, right_stamp_ns=others[line[left]] if len(others) == len(stamps) else 0
+        )
         for left, right in pair_files(name, lefts, rights)
         if left in line
     ]
-    return FolderSource(name, own, shots, _ground_truth(folder, date, stamps, own.body_T_left))
+    return FolderSource(name, own, frames, _ground_truth(folder, date, stamps, own.body_T_left))
 
 
 def _drive_folder(folder: Path, drive: str) -> Path:

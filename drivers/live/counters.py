@@ -27,7 +27,7 @@ COUNTERS: dict[str, str] = {
 }
 
 # Those that are nonzero only after a problem.
-TROUBLE = frozenset(COUNTERS) - {
+LOSSES = frozenset(COUNTERS) - {
     "pairs",
     "segments",
     "imu_samples",

@@ -11,7 +11,7 @@ from typing import Protocol, TypeVar
 
 from stereo_sfm.drivers.live.buffers import Handoff, MotionBuffer, WheelBuffer
 from stereo_sfm.drivers.live.clock import ClockMap, TimeLine
-from stereo_sfm.drivers.live.counters import TROUBLE, Counters
+from stereo_sfm.drivers.live.counters import LOSSES, Counters
 from stereo_sfm.drivers.live.errors import DeviceError, DeviceLost, FirmwareMissing
 from stereo_sfm.drivers.live.pairing import Pair, periods
 from stereo_sfm.drivers.rig_option import RigOption, chosen_rig
@@ -76,7 +76,7 @@ class LiveSource(BaseSource):
         self._segment: Segment | None = None
         self._frame_id = 0
         self._segment_frames = 0
-        self._unsaid, self._quiet_until = 0, 0.0
+        self._unreported, self._quiet_until = 0, 0.0
         self._summed_up = False
 
     # ---- implemented by each camera
@@ -102,12 +102,12 @@ class LiveSource(BaseSource):
     def close(self) -> None:
         """Stop streaming, release the camera, and log the counters in one line."""
         self._shut(camera_alive=True)
-        trouble = {k: v for k, v in self.counters.items() if v and k in TROUBLE}
+        losses = {k: v for k, v in self.counters.items() if v and k in LOSSES}
         if self._frame_id and not self._summed_up:
             self._summed_up = True
-            said = ", ".join(f"{name} {count:.0f}" for name, count in trouble.items()) or "nothing lost"
-            level = logging.WARNING if trouble else logging.INFO
-            logger.log(level, "%s: %d stereo images, %s", self._title, self._frame_id, said)
+            text = ", ".join(f"{name} {count:.0f}" for name, count in losses.items()) or "nothing lost"
+            level = logging.WARNING if losses else logging.INFO
+            logger.log(level, "%s: %d stereo images, %s", self._title, self._frame_id, text)
 
     def push_wheel(
         self, linear: tuple[float, float, float], angular: tuple[float, float, float], host_ns: int | None = None
@@ -187,11 +187,11 @@ class LiveSource(BaseSource):
 
     def _warn_lost(self, dropped: int, lost_here: int) -> None:
         """At most one warning per second; later losses are included in the next one."""
-        self._unsaid += dropped
+        self._unreported += dropped
         if time.monotonic() >= self._quiet_until:
             why = " (this computer is too slow)" if lost_here else ""
-            logger.warning("%s: %d frame(s) lost before frame %d%s", self._title, self._unsaid, self._frame_id, why)
-            self._unsaid, self._quiet_until = 0, time.monotonic() + _QUIET_S
+            logger.warning("%s: %d frame(s) lost before frame %d%s", self._title, self._unreported, self._frame_id, why)
+            self._unreported, self._quiet_until = 0, time.monotonic() + _QUIET_S
 
     # ---- segments
 

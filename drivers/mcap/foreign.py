@@ -17,13 +17,13 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.drivers.mcap.messages import (
     BAD_MESSAGE,
     CAMERAS,
+    IMAGES,
     IMUS,
-    PICTURES,
     POSES,
     TRANSFORMS,
     CameraInfo,
+    ImageMessage,
     ImuReading,
-    Picture,
     Transform,
     schema_name,
 )
@@ -32,7 +32,7 @@ from stereo_sfm.drivers.mcap.rig import camera_of, chain, stereo_rig
 from stereo_sfm.drivers.mcap.topics import camera_topic, choose_topics, is_rectified
 from stereo_sfm.drivers.rig_option import RigOption, chosen_rig
 from stereo_sfm.drivers.source import BaseSource, Stamps
-from stereo_sfm.drivers.tum_rgbd.source import with_virtual_eye
+from stereo_sfm.drivers.tum_rgbd.source import with_virtual_camera
 from stereo_sfm.drivers.used_bits import used_bits
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log.reader import Record
@@ -47,11 +47,11 @@ _WAITING = 30  # maximum number of images of one camera that wait for the other
 
 
 @dataclass
-class _Shot:
+class _StampedImage:
     """An image of one camera, not decoded."""
 
     stamp_ns: int
-    picture: Picture
+    message: ImageMessage
 
 
 class ForeignSource(BaseSource):
@@ -72,7 +72,7 @@ class ForeignSource(BaseSource):
         self.topics = choose_topics(reader, left, right, depth)
         self.rig = self._with_imu(chosen_rig(rig, self._recorded_rig))
         if self.topics.depth:
-            self.rig = with_virtual_eye(self.rig)
+            self.rig = with_virtual_camera(self.rig)
         self.ground_truth = self._read_truth()
         counts = {t.topic: t.count for t in reader.topics}
         self.frame_count = min(counts[t] for t in (self.topics.left, self._other()) if t)
@@ -102,7 +102,7 @@ class ForeignSource(BaseSource):
         )
         return Stamps(table[:, 0].copy(), skew)
 
-    def _used(self, other: _Shot | None) -> bool:
+    def _used(self, other: _StampedImage | None) -> bool:
         return other is not None or not self._other()
 
     def frames(self, start_ns: int | None = None, until_ns: int | None = None) -> Iterator[StereoImage]:
@@ -122,11 +122,13 @@ class ForeignSource(BaseSource):
     def _other(self) -> str:
         return self.topics.right or self.topics.depth
 
-    def _decode(self, frame_id: int, left: _Shot, other: _Shot | None, dropped: int) -> StereoImage | None:
+    def _decode(
+        self, frame_id: int, left: _StampedImage, other: _StampedImage | None, dropped: int
+    ) -> StereoImage | None:
         try:
-            pixels = eight_bits(left.picture.gray(), self._bits)
-            right = eight_bits(other.picture.gray(), self._bits) if other and self.topics.right else None
-            depth = other.picture.depth() if other and self.topics.depth else None
+            pixels = eight_bits(left.message.gray(), self._bits)
+            right = eight_bits(other.message.gray(), self._bits) if other and self.topics.right else None
+            depth = other.message.depth() if other and self.topics.depth else None
         except BAD_MESSAGE as error:
             log.warning("%s: image at %d ns is skipped: %s", self.name, left.stamp_ns, error)
             return None
@@ -142,23 +144,23 @@ class ForeignSource(BaseSource):
 
     def _pairs(
         self, start_ns: int | None, until_ns: int | None, imu: list[ImuReading]
-    ) -> Iterator[tuple[_Shot, _Shot | None]]:
+    ) -> Iterator[tuple[_StampedImage, _StampedImage | None]]:
         """(left, right or depth) by stamp; an unpaired left image has None. Inertial samples are put into `imu`."""
         names = [t for t in (self.topics.left, self._other()) if t]
-        lefts: deque[_Shot] = deque()
-        others: deque[_Shot] = deque()
+        lefts: deque[_StampedImage] = deque()
+        others: deque[_StampedImage] = deque()
         for record in self.reader.messages([*names, *self.topics.imu], start_ns, until_ns):
             if record.topic in self.topics.imu:
                 reading = _imu_reading(record)
                 imu += [reading] if reading is not None else []
                 continue
-            shot = self._shot(record)
-            if shot is None:
+            image = self._image_of(record)
+            if image is None:
                 continue
             if len(names) == 1:
-                yield shot, None
+                yield image, None
                 continue
-            (lefts if record.topic == names[0] else others).append(shot)
+            (lefts if record.topic == names[0] else others).append(image)
             while lefts and others:
                 skew = others[0].stamp_ns - lefts[0].stamp_ns
                 if skew < -self._tolerance_ns:
@@ -172,13 +174,13 @@ class ForeignSource(BaseSource):
             if len(others) > _WAITING:
                 others.popleft()
 
-    def _shot(self, record: Record) -> _Shot | None:
+    def _image_of(self, record: Record) -> _StampedImage | None:
         try:
-            picture = PICTURES[schema_name(record)](record.data)
+            message = IMAGES[schema_name(record)](record.data)
         except BAD_MESSAGE as error:
             log.warning("%s: a message of %s cannot be read: %s", self.name, record.topic, error)
             return None
-        return _Shot(picture.stamp_ns or record.log_time, picture)
+        return _StampedImage(message.stamp_ns or record.log_time, message)
 
     def _recorded_rig(self) -> Rig:
         names = tuple(camera_topic(t, self.topics.cameras) for t in (self.topics.left, self.topics.right) if t)
@@ -241,8 +243,8 @@ class ForeignSource(BaseSource):
         return Trajectory(np.array([row.stamp_ns for row in rows], np.int64), poses)
 
     def _left_frame(self) -> str:
-        first = next((self._shot(r) for r in self.reader.messages([self.topics.left])), None)
-        return first.picture.frame if first else ""
+        first = next((self._image_of(r) for r in self.reader.messages([self.topics.left])), None)
+        return first.message.frame if first else ""
 
     def _period_ns(self) -> int:
         stamps = [r.log_time for r in itertools.islice(self.reader.messages([self.topics.left]), 20)]
@@ -254,10 +256,10 @@ class ForeignSource(BaseSource):
         for topic in filter(None, (self.topics.left, self.topics.right)):
             for k in range(count):
                 at = self.reader.messages([topic], first + k * (last - first) // max(count, 1))
-                shot = next((shot for record in at if (shot := self._shot(record)) is not None), None)
+                image = next((image for record in at if (image := self._image_of(record)) is not None), None)
                 with suppress(*BAD_MESSAGE):
-                    if shot is not None:
-                        yield shot.picture.gray()
+                    if image is not None:
+                        yield image.message.gray()
 
     def _check_first(self) -> None:
         """Raises StereoSfmError before the first frame if the images do not match the calibration."""

@@ -31,7 +31,7 @@ BAD_MESSAGE = (ValueError, DecodeError, struct.error, IndexError)
 
 
 @dataclass(frozen=True)
-class Picture:
+class ImageMessage:
     """An image, not decoded."""
 
     stamp_ns: int  # 0 where the message has none
@@ -132,32 +132,32 @@ class _Cdr:
         return se3.from_rotation_translation(rotation, v[:3])
 
 
-def _picture_foxglove_raw(data: bytes) -> Picture:
+def _image_foxglove_raw(data: bytes) -> ImageMessage:
     m = RawImage.FromString(data)
-    return Picture(foxglove.stamp_of(m), m.frame_id, False, m.data, m.width, m.height, m.step, m.encoding)
+    return ImageMessage(foxglove.stamp_of(m), m.frame_id, False, m.data, m.width, m.height, m.step, m.encoding)
 
 
-def _picture_foxglove_compressed(data: bytes) -> Picture:
+def _image_foxglove_compressed(data: bytes) -> ImageMessage:
     m = CompressedImage.FromString(data)
-    return Picture(foxglove.stamp_of(m), m.frame_id, True, m.data)
+    return ImageMessage(foxglove.stamp_of(m), m.frame_id, True, m.data)
 
 
-def _picture_ros_raw(data: bytes) -> Picture:
+def _image_ros_raw(data: bytes) -> ImageMessage:
     cdr = _Cdr(data)
     stamp_ns, frame = cdr.header()
     height, width, encoding = cdr.take("I"), cdr.take("I"), cdr.text()
     big, step = bool(cdr.take("B")), cdr.take("I")
-    return Picture(stamp_ns, frame, False, cdr.blob(), width, height, step, encoding, big)
+    return ImageMessage(stamp_ns, frame, False, cdr.blob(), width, height, step, encoding, big)
 
 
-def _picture_ros_compressed(data: bytes) -> Picture:
+def _image_ros_compressed(data: bytes) -> ImageMessage:
     cdr = _Cdr(data)
     stamp_ns, frame = cdr.header()
     encoding = cdr.text()
     blob = cdr.blob()
     if "compressedDepth" in encoding:  # the depth transport has a header before the PNG
         blob = blob[blob.find(b"\x89PNG") :]
-    return Picture(stamp_ns, frame, True, blob)
+    return ImageMessage(stamp_ns, frame, True, blob)
 
 
 def _camera_foxglove(data: bytes) -> CameraInfo:
@@ -223,11 +223,11 @@ def _imu_ros(data: bytes) -> ImuReading:
     return ImuReading(stamp_ns, frame, [*(gyro if gyro_known else nothing), *(accel if accel_known else nothing)])
 
 
-PICTURES: dict[str, Callable[[bytes], Picture]] = {
-    "foxglove.RawImage": _picture_foxglove_raw,
-    "foxglove.CompressedImage": _picture_foxglove_compressed,
-    "sensor_msgs/msg/Image": _picture_ros_raw,
-    "sensor_msgs/msg/CompressedImage": _picture_ros_compressed,
+IMAGES: dict[str, Callable[[bytes], ImageMessage]] = {
+    "foxglove.RawImage": _image_foxglove_raw,
+    "foxglove.CompressedImage": _image_foxglove_compressed,
+    "sensor_msgs/msg/Image": _image_ros_raw,
+    "sensor_msgs/msg/CompressedImage": _image_ros_compressed,
 }
 CAMERAS: dict[str, Callable[[bytes], CameraInfo]] = {
     "foxglove.CameraCalibration": _camera_foxglove,

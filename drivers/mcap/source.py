@@ -126,7 +126,7 @@ class _Parts:
     imu: list[ImuSample] = field(default_factory=list[ImuSample])
     wheel: list[WheelSample] = field(default_factory=list[WheelSample])
 
-    def whole(self) -> bool:
+    def complete(self) -> bool:
         """Whether all images and samples announced by `info` have arrived."""
         i = self.info
         return (
@@ -180,13 +180,13 @@ class McapSource(BaseSource):
         self.reader = reader
         self.name = str(reader.path)
         self.rig = chosen_rig(rig, self._recorded_rig)
-        self._check_eyes()
+        self._check_cameras()
         self.ground_truth = attached_truth(reader)  # world_T_cam0
-        self.frame_count = self._whole_count()
+        self.frame_count = self._complete_count()
         self._incomplete = 0  # frames of the last reading
         self._decoders: dict[type[Any], Callable[[bytes], Any]] = {}
 
-    def _check_eyes(self) -> None:
+    def _check_cameras(self) -> None:
         """Raises StereoSfmError when the recording lacks the images of a camera of the calibration."""
         recorded = {t.topic for t in self.reader.topics if t.count}
         what, topic = ("depth", topics.DEPTH_IMAGE) if self.rig.depth else ("right", topics.RIGHT_IMAGE)
@@ -199,11 +199,11 @@ class McapSource(BaseSource):
             raise StereoSfmError(f"{self.name} has no calibration: give one with --rig FILE")
         return rig
 
-    def _whole_count(self) -> int:
+    def _complete_count(self) -> int:
         """Number of frames with all images in the file."""
         counts = {t.topic: t.count for t in self.reader.topics}
-        eyes = (topics.LEFT_IMAGE, topics.RIGHT_IMAGE, topics.DEPTH_IMAGE)
-        return min(counts[t] for t in (topics.IMAGE_INFO, *eyes) if t in counts)
+        image_topics = (topics.LEFT_IMAGE, topics.RIGHT_IMAGE, topics.DEPTH_IMAGE)
+        return min(counts[t] for t in (topics.IMAGE_INFO, *image_topics) if t in counts)
 
     def close(self) -> None:
         self.reader.close()
@@ -223,14 +223,14 @@ class McapSource(BaseSource):
         """
         first = None if start_ns is None else start_ns - _MARGIN_NS
         last = None if until_ns is None else until_ns + _MARGIN_NS
-        for image in self._whole_frames(first, last):
+        for image in self._complete_frames(first, last):
             if until_ns is not None and image.stamp_ns > until_ns:
                 return
             if start_ns is None or image.stamp_ns >= start_ns:
                 self._check(image)
                 yield image
 
-    def _whole_frames(self, first_ns: int | None, last_ns: int | None) -> Iterator[StereoImage]:
+    def _complete_frames(self, first_ns: int | None, last_ns: int | None) -> Iterator[StereoImage]:
         pending: dict[int, _Parts] = {}
         self._incomplete = 0
         for record in self.reader.messages(_PARTS, first_ns, last_ns):
@@ -245,10 +245,10 @@ class McapSource(BaseSource):
         while pending:
             sequence = next(iter(pending))
             parts = pending[sequence]
-            if not parts.whole() and len(pending) <= waiting:
+            if not parts.complete() and len(pending) <= waiting:
                 return
             del pending[sequence]
-            if parts.whole():
+            if parts.complete():
                 yield parts.image()
             elif not at_edge:
                 self._incomplete += 1

@@ -6,7 +6,7 @@ import logging
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 
-from stereo_sfm.drivers.mcap.messages import CAMERAS, ENCODINGS, IMUS, PICTURES, POSES, TRANSFORMS
+from stereo_sfm.drivers.mcap.messages import CAMERAS, ENCODINGS, IMAGES, IMUS, POSES, TRANSFORMS
 from stereo_sfm.drivers.mcap.recording import Recording
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log.reader import TopicInfo
@@ -55,19 +55,19 @@ def choose_topics(reader: Recording, left: str = "", right: str = "", depth: str
         StereoSfmError: no images, an unknown topic, or more than two images with ambiguous names.
     """
     rows = [t for t in reader.topics if t.encoding in ENCODINGS]
-    pictures = [t.topic for t in rows if t.schema in PICTURES]
-    if not pictures:
+    image_topics = [t.topic for t in rows if t.schema in IMAGES]
+    if not image_topics:
         raise StereoSfmError(f"{reader.path} contains no images ({_content(reader.topics)})")
     for name in (left, right, depth):
-        if name and name not in pictures:
-            raise StereoSfmError(f"{reader.path} has no image topic {name} (there are: {', '.join(pictures)})")
+        if name and name not in image_topics:
+            raise StereoSfmError(f"{reader.path} has no image topic {name} (there are: {', '.join(image_topics)})")
     cameras = tuple(t.topic for t in rows if t.schema in CAMERAS)
-    eyes = [t for t in pictures if not _is_depth(t)]
+    candidates = [t for t in image_topics if not _is_depth(t)]
     if not left:
-        left, found = _pair(str(reader.path), eyes or pictures, cameras)
+        left, found = _pair(str(reader.path), candidates or image_topics, cameras)
         right = right or ("" if depth else found)
     if not right and not depth:
-        depth = next((t for t in pictures if _is_depth(t) and t != left), "")
+        depth = next((t for t in image_topics if _is_depth(t) and t != left), "")
     return ChosenTopics(
         left,
         right,
@@ -122,22 +122,22 @@ def _shared(a: str, b: str) -> int:
     return count
 
 
-def _pair(name: str, eyes: list[str], cameras: tuple[str, ...]) -> tuple[str, str]:
+def _pair(name: str, candidates: list[str], cameras: tuple[str, ...]) -> tuple[str, str]:
     pairs = [
         (topic, topic.replace(one, other))
         for one, other in _SIDES
-        for topic in eyes
-        if one in topic and topic.replace(one, other) in eyes
+        for topic in candidates
+        if one in topic and topic.replace(one, other) in candidates
     ]
     if pairs:
         order = {pair: i for i, pair in reversed(list(enumerate(pairs)))}
         return min(order, key=lambda p: (not camera_topic(p[0], cameras), is_rectified(p[0]), len(p[0]), order[p]))
-    if len(eyes) == 1:
-        return eyes[0], ""
-    if len(eyes) == 2:
-        log.warning("%s: assuming %s is the left camera and %s the right one", name, *sorted(eyes))
-        return sorted(eyes)[0], sorted(eyes)[1]
+    if len(candidates) == 1:
+        return candidates[0], ""
+    if len(candidates) == 2:
+        log.warning("%s: assuming %s is the left camera and %s the right one", name, *sorted(candidates))
+        return sorted(candidates)[0], sorted(candidates)[1]
     raise StereoSfmError(
-        f"{name} has {len(eyes)} image topics with ambiguous names: "
-        f"choose with '{name}?left=TOPIC&right=TOPIC' ({', '.join(eyes)})"
+        f"{name} has {len(candidates)} image topics with ambiguous names: "
+        f"choose with '{name}?left=TOPIC&right=TOPIC' ({', '.join(candidates)})"
     )

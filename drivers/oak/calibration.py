@@ -30,17 +30,17 @@ def read_calibration(dai: Any, handler: Any, size: tuple[int, int], name: str, s
     """
     left, right = dai.CameraBoardSocket.CAM_B, dai.CameraBoardSocket.CAM_C
     try:
-        eyes = [_eye(dai, handler, socket, size) for socket in (left, right)]
+        cameras = [_camera(dai, handler, socket, size) for socket in (left, right)]
         left_T_right = _metres(handler.getCameraExtrinsics(right, left, False, dai.LengthUnit.CENTIMETER))
     except RuntimeError as error:
         raise DeviceFault(f"OAK {serial} is not calibrated ({str(error).splitlines()[0]})") from None
     _check(left_T_right, serial)
     left_T_imu = _imu(dai, handler, left)
     imu = None if left_T_imu is None else Imu(left_T_imu)
-    return Rig(eyes[0], eyes[1], left_T_right, imu=imu, name=name, serial=serial)
+    return Rig(cameras[0], cameras[1], left_T_right, imu=imu, name=name, serial=serial)
 
 
-def _eye(dai: Any, handler: Any, socket: Any, size: tuple[int, int]) -> Camera:
+def _camera(dai: Any, handler: Any, socket: Any, size: tuple[int, int]) -> Camera:
     matrix, width, height = handler.getDefaultIntrinsics(socket)
     fx, fy, cx, cy = _scaled(np.array(matrix, float), (int(width), int(height)), size)
     if not (fx > 0 and fy > 0 and 0 < cx < size[0] and 0 < cy < size[1]):

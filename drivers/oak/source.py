@@ -91,7 +91,7 @@ class OakSource(LiveSource):
     def _stream(self) -> OakStream:
         dai, s = self._dai, self._settings
         pipeline = dai.Pipeline(self._device)
-        left, right = (self._eye(pipeline, getattr(dai.CameraBoardSocket, name)) for name in ("CAM_B", "CAM_C"))
+        left, right = (self._camera(pipeline, getattr(dai.CameraBoardSocket, name)) for name in ("CAM_B", "CAM_C"))
         imu = self._imu(pipeline) if s.imu and self._device.getConnectedIMU() else None
         with contextlib.suppress(RuntimeError):  # cameras without a projector raise
             self._device.setIrLaserDotProjectorIntensity(0.0)
@@ -103,7 +103,7 @@ class OakSource(LiveSource):
         stream.start()
         return stream
 
-    def _eye(self, pipeline: Any, socket: Any) -> Any:
+    def _camera(self, pipeline: Any, socket: Any) -> Any:
         dai, s = self._dai, self._settings
         camera = pipeline.create(dai.node.Camera).build(socket, sensorFps=s.rate_hz)
         set_exposure(dai, camera.initialControl, s)

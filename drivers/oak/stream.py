@@ -91,18 +91,18 @@ class OakStream:
             self.pairs.fail(error)
 
     def _take_image(self, side: int, frame: Any) -> None:
-        eye = self._eye(frame)
-        if eye is None:
+        image = self._camera(frame)
+        if image is None:
             self._counters.add("malformed")
             return
         with self._lock:
             if side == LEFT and not self.clock.known:
                 self._map_clock(frame)
-            pair = self._pairer.push(side, eye)
+            pair = self._pairer.push(side, image)
         if pair is not None:
             self.pairs.put(pair, weight=1 + pair.dropped_before)
 
-    def _eye(self, frame: Any) -> CameraImage | None:
+    def _camera(self, frame: Any) -> CameraImage | None:
         """An image at mid-exposure on the camera's clock; None if it is not an image of the requested size."""
         pixels = np.array(frame.getFrame())
         if pixels.dtype != np.uint8 or pixels.shape != (self._size[1], self._size[0]):

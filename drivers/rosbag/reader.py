@@ -32,8 +32,8 @@ class BagSource(ForeignSource):
 
     def stamps(self) -> Stamps:
         listed = super().stamps()
-        beside = {t: np.array([r.log_time for r in self.reader.messages([t])], np.int64) for t in self.topics.imu}
-        return replace(listed, beside=beside)
+        others = {t: np.array([r.log_time for r in self.reader.messages([t])], np.int64) for t in self.topics.imu}
+        return replace(listed, others=others)
 
 
 def open_bag(place: str, options: McapOptions) -> BagSource:

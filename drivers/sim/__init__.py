@@ -11,7 +11,7 @@ from stereo_sfm.errors import one_of
 if TYPE_CHECKING:
     from stereo_sfm.drivers.source import Source
 
-# what `sim:` can show; the plans are in stereo_sfm.drivers.sim.scenes
+# names of the scenes in stereo_sfm.drivers.sim.scenes, which is slow to import
 SCENES = ("aisle", "loop", "identical-aisles", "people", "dark", "blank", "demo", "big", "sparse")
 DEFAULT = "loop"
 

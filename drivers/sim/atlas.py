@@ -1,8 +1,8 @@
 """All textures in one byte array, each as a ripmap: filtered for every pair of horizontal and vertical scales.
 
-A shelf seen along its aisle shrinks its pictures in one direction only; a ripmap (anisotropic mip pyramid, as in
+A shelf seen along its aisle shrinks its textures in one direction only; a ripmap (anisotropic mip pyramid, as in
 Larson and Shah 1990) filters each axis by its own footprint, so that nothing aliases and nothing blurs needlessly.
-Level (i, j) of a (h, w) picture lies in a (2h, 2w) block at column 2w - (2w >> i), row 2h - (2h >> j).
+Level (i, j) of a (h, w) image lies in a (2h, 2w) block at column 2w - (2w >> i), row 2h - (2h >> j).
 """
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false
@@ -20,7 +20,7 @@ from stereo_sfm.types import F32, F64, I64, U8
 
 @njit
 def _fill_ripmap(block, out):
-    """Complete `block` (2h, 2w) float, whose first quarter is the picture, by pair means; round into `out`."""
+    """Complete `block` (2h, 2w) float, whose first quarter is the image, by pair means; round into `out`."""
     h, w = block.shape[0] // 2, block.shape[1] // 2
     x0, n = w, w // 2
     while n >= 1:  # halve along the rows
@@ -68,7 +68,7 @@ def _resize(image: U8, w: int, h: int) -> U8:
 
 @dataclass
 class Atlas:
-    """Collects pictures and packs them."""
+    """Collects images and packs them."""
 
     blocks: list[U8] = field(default_factory=list[U8])
     table: list[tuple[int, int, int, int]] = field(default_factory=list[tuple[int, int, int, int]])
@@ -76,7 +76,7 @@ class Atlas:
     used: int = 0
 
     def add(self, image: U8, size: tuple[float, float] = (0.0, 0.0), wrap: bool = False) -> int:
-        """Add a picture.
+        """Add an image.
 
         Args:
             image: (h, w), resized to powers of two.

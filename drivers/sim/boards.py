@@ -1,4 +1,4 @@
-"""Rendered views of a calibration target: what a person does in front of a camera, with exact truth."""
+"""Rendered views of a calibration target moved in front of a camera, with ground truth."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.targets import Target, charuco_board
 from stereo_sfm.drivers.sim.effects import CLEAN, Effects, Sensor
-from stereo_sfm.drivers.sim.render import NOTHING, Renderer
-from stereo_sfm.drivers.sim.targets import Target as Picture
-from stereo_sfm.drivers.sim.targets import empty_room, move, place
+from stereo_sfm.drivers.sim.render import NO_OBJECTS, Renderer
+from stereo_sfm.drivers.sim.targets import FlatTarget, empty_room, move, place
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, U8
@@ -22,15 +21,15 @@ TEXELS = 2048
 
 @dataclass(frozen=True)
 class Faults:
-    """What the sensor adds to the clean pictures."""
+    """Effects of the lens and the sensor."""
 
     lens_blur_px: float = 0.6
     read_noise: float = 1.5  # grey levels
     vignetting: float = 0.3
 
 
-def board_picture(target: Target) -> tuple[U8, F64]:
-    """(TEXELS, TEXELS) picture of the target and (2,) its size in metres; the first corner square starts at (0, 0).
+def board_image(target: Target) -> tuple[U8, F64]:
+    """(TEXELS, TEXELS) image of the target and (2,) its size in metres; the first corner square starts at (0, 0).
 
     Checkerboards get a white margin of one square, which `corner_origin` accounts for.
     """
@@ -46,18 +45,18 @@ def board_picture(target: Target) -> tuple[U8, F64]:
         image = np.kron(squares, np.ones((512, 512), np.uint8))
         size = target.size * np.array([target.columns + 3.0, target.rows + 3.0])
     else:
-        raise StereoSfmError(f"a {target.kind} is not drawn here: choose charuco or checkerboard")
+        raise StereoSfmError(f"cannot render a target of kind {target.kind}: choose charuco or checkerboard")
     return cv2.resize(image, (TEXELS, TEXELS), interpolation=cv2.INTER_AREA).astype(np.uint8), size
 
 
 def corner_origin(target: Target) -> F64:
-    """(4, 4) picture_T_target: where the target's own origin lies in the picture's frame."""
+    """(4, 4) board_T_target: pose of the target's frame in the frame of the board's image."""
     shift = 2 * target.size if target.kind == "checkerboard" else 0.0
     return se3.from_rotation_translation(np.eye(3), np.array([shift, shift, 0.0]))
 
 
 def random_views(rig: Rig, size: F64, count: int, seed: int, field_deg: float) -> F64:
-    """(count, 4, 4) left_T_picture: near and far, tilted, spread over a cone of `field_deg`."""
+    """(count, 4, 4) left_T_board: near and far, tilted, spread over a cone of `field_deg`."""
     rng = np.random.default_rng([seed, 71])
     middle = np.eye(4)
     middle[:2, 3] = -0.5 * size
@@ -77,27 +76,27 @@ def random_views(rig: Rig, size: F64, count: int, seed: int, field_deg: float) -
 def render_boards(
     rig: Rig, target: Target, count: int = 24, seed: int = 0, faults: Faults | None = None, field_deg: float = 50.0
 ) -> tuple[list[tuple[U8, U8]], F64]:
-    """Pairs of pictures of the target, and (count, 4, 4) left_T_target.
+    """Stereo images of the target, and (count, 4, 4) left_T_target.
 
     Args:
-        rig: two eyes. faults: of the sensor; None: `Faults()`.
+        rig: two cameras. faults: of the sensor; None: `Faults()`.
         field_deg: full angle of the cone in which the target's middle moves.
     """
     if rig.right is None:
-        raise StereoSfmError("boards are rendered for two eyes")
+        raise StereoSfmError("rendering calibration boards needs two cameras")
     faults = faults or Faults()
-    picture, size = board_picture(target)
+    image, size = board_image(target)
     world_T_board = se3.from_rotation_translation(np.eye(3), np.array([6.0, 5.0, 1.8]))
-    shown = Picture(picture, float(size[0]), float(size[1]), world_T_board)
-    world, moving = place(empty_room(), [shown], NOTHING)
+    board = FlatTarget(image, float(size[0]), float(size[1]), world_T_board)
+    world, moving = place(empty_room(), [board], NO_OBJECTS)
     renderer = Renderer(world, rig)
     effects = Effects(
         **{**vars(CLEAN), "lens_blur_px": faults.lens_blur_px, "read_noise": faults.read_noise,
            "vignetting": faults.vignetting}
     )  # fmt: skip
-    sensors = [Sensor(eye, effects) for eye in renderer.eyes]
+    sensors = [Sensor(side, effects) for side in renderer.cameras]
     poses = random_views(rig, size, count, seed, field_deg)
-    moving = move(moving, shown, world_T_board)
+    moving = move(moving, board, world_T_board)
     pairs: list[tuple[U8, U8]] = []
     for i, pose in enumerate(poses):
         views = renderer.render(world_T_board @ se3.inverse(pose), moving)

@@ -32,7 +32,7 @@ def cast(
     w,
     moving,
     near,
-    world_T_eye,
+    world_T_cam,
     pixels,
     offsets,
     keep,
@@ -46,16 +46,16 @@ def cast(
     ts,
     hits,
 ):
-    """What some pixels show, each the mean over one ray per offset, and what was there counted `keep` times.
+    """Render pixels: each the mean over one ray per offset and `keep` times the old value.
 
     Args:
-        near: groups and blocks by distance (render.Near). world_T_eye: (4, 4).
+        near: groups and blocks by distance (render.Near). world_T_cam: (4, 4).
         pixels: (M,) flat indices. offsets: (K, 2) px inside a pixel; one row for its centre alone.
         grid, du, dv: (H * W, 3) bearings and their change per pixel. angles: (H * W,) radians a pixel gathers.
         image, depth, ids: (H * W,) written: brightness; and with one offset distance along the ray (m), surface.
         ts, hits: (N,) scratch; so many rays are traced, then shaded, which is faster than one by one.
     """
-    r, ox, oy, oz = world_T_eye, world_T_eye[0, 3], world_T_eye[1, 3], world_T_eye[2, 3]
+    r, ox, oy, oz = world_T_cam, world_T_cam[0, 3], world_T_cam[1, 3], world_T_cam[2, 3]
     rays = offsets.shape[0]
     block = ts.shape[0] // rays
     narrow = 1 / math.sqrt(rays + keep)

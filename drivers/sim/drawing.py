@@ -1,4 +1,4 @@
-"""Strokes that the procedural pictures share: words, small print, barcodes, logos, clouds. Grey, seeded."""
+"""Drawing primitives of the procedural textures: words, small print, barcodes, logos, clouds. Grey, seeded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a sensor does to a picture: motion blur, exposure, vignetting, noise, eight bits; random by seed, frame, eye."""
+"""Effects of lens and sensor: motion blur, exposure, vignetting, noise, eight bits. Seeded by frame and camera."""
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportMissingTypeArgument=false
 
@@ -12,18 +12,18 @@ import numpy as np
 
 from stereo_sfm.drivers.sim.kernels import njit
 from stereo_sfm.drivers.sim.lens import Dirt, compressed, flicker
-from stereo_sfm.drivers.sim.render import Eye, View
+from stereo_sfm.drivers.sim.render import CameraRays, View
 from stereo_sfm.drivers.sim.robot import RobotView
 from stereo_sfm.types import F32, F64, U8
 
 
 @dataclass(frozen=True)
 class Effects:
-    """A sensor's faults; all of them off is `CLEAN`."""
+    """Effects of a lens and a sensor; `CLEAN` has none."""
 
     exposure_s: float = 0.004  # motion blur and StereoImage.exposure_us
     lens_blur_px: float = 0.45  # standard deviation of the lens's point spread
-    gain: float = 1.2  # brightness of the whole picture
+    gain: float = 1.2  # brightness of the image
     drift: float = 0.12  # relative swing of the exposure over time
     vignetting: float = 0.35  # loss at the edge of the field
     read_noise: float = 0.9  # standard deviation in grey levels, in the dark
@@ -39,16 +39,16 @@ CLEAN = Effects(0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 class Sensor:
-    """One eye's lens and sensor: what depends on the pixel only."""
+    """Lens and sensor of one camera, with tables by pixel."""
 
     def __init__(
-        self, eye: Eye, effects: Effects, robot: RobotView | None = None, rng: np.random.Generator | None = None
+        self, rays: CameraRays, effects: Effects, robot: RobotView | None = None, rng: np.random.Generator | None = None
     ) -> None:
         """`robot`: what this camera sees of the robot. `rng`: of the dirt on this lens."""
         self.robot = robot
-        self._dirt = Dirt(eye.grid.shape[:2], effects.dirt, rng) if effects.dirt > 0 and rng is not None else None
-        grid = eye.grid
-        camera = eye.camera
+        self._dirt = Dirt(rays.grid.shape[:2], effects.dirt, rng) if effects.dirt > 0 and rng is not None else None
+        grid = rays.grid
+        camera = rays.camera
         corners = camera.unproject(np.array([[0, camera.cy], [camera.width - 1, camera.cy]]))
         edge = np.nanmax(np.arccos(np.clip(corners[:, 2], -1, 1))) if np.isfinite(corners[:, 2]).any() else 1.6
         angle = np.arccos(np.clip(np.nan_to_num(grid[..., 2], nan=-1.0), -1, 1))
@@ -64,11 +64,11 @@ class Sensor:
             self._steepest = float(np.linalg.norm(self._jacobian, axis=(2, 3)).max())
 
     def expose(self, view: View, twist: F64, brightness: float, key: int) -> U8:
-        """A picture as the sensor gives it.
+        """(H, W) image of the sensor.
 
         Args:
-            twist: (6,) velocity of the eye in its own axes, metres and radians a second.
-            brightness: exposure relative to the clean picture. key: of the noise, one for each frame and eye.
+            twist: (6,) velocity of the camera in its own axes, metres and radians a second.
+            brightness: exposure relative to the clean image. key: of the noise, one for each frame and camera.
         """
         effects = self.effects
         image = view.image
@@ -96,7 +96,7 @@ class Sensor:
 
 
 def brightness(effects: Effects, seconds: float, seed: int) -> float:
-    """Exposure over time: two slow swings, the same at the same time."""
+    """Exposure at a time: the gain with two slow oscillations."""
     phase = np.random.default_rng([seed, 91]).uniform(0, 2 * np.pi, 2)
     swing = 0.7 * math.sin(2 * math.pi * seconds / 13.0 + phase[0]) + 0.3 * math.sin(
         2 * math.pi * seconds / 4.1 + phase[1]
@@ -108,7 +108,7 @@ def brightness(effects: Effects, seconds: float, seed: int) -> float:
 def _blur(image, depth, jacobian, steepest, move, out):
     """Average along each pixel's path while the shutter is open, symmetric about mid-exposure.
 
-    A point at depth t along bearing b moves by -(v + w x (t b)) in the eye; the pixel follows by J(b) times that / t.
+    A point at depth t along bearing b moves by -(v + w x (t b)) in the camera frame, its pixel by J(b) times that / t.
     """
     h, w = image.shape
     speed = math.sqrt(move[0] * move[0] + move[1] * move[1] + move[2] * move[2])

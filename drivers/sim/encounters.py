@@ -1,9 +1,9 @@
-"""What people do to a robot: come at it, stop before it, cover its lenses, push a cart past, walk along with it.
+"""Encounters of people with the robot: they approach, stop in front of it, cover its lenses, push a cart past it or
+accompany it.
 
-An encounter is a function of time: where people and their things are, given where the robot's walk is. Places are
-metres along the robot's route (ahead of it) and aside (to its left), so that an encounter follows the aisle round a
-corner.
-Everything random is drawn when the encounter is planned.
+An encounter is a function of time: the positions of people and their things, given the robot's drive. Positions are
+metres along the robot's route and aside (to its left), so that an encounter follows the aisle round a corner. All
+random numbers are drawn when the encounter is planned.
 """
 
 from __future__ import annotations
@@ -13,22 +13,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stereo_sfm.drivers.sim.people import Looks, Part, Thing, standing
-from stereo_sfm.drivers.sim.walks import Walk
+from stereo_sfm.drivers.sim.drives import Drive
+from stereo_sfm.drivers.sim.people import Appearance, Part, Thing, standing
 from stereo_sfm.drivers.sim.world import CLOTHES, SKIN
 from stereo_sfm.errors import one_of
 from stereo_sfm.types import F64
 
 FIRST_S, PAUSE_S = 4.0, 3.0  # before the first encounter, and between the end of one and the beginning of the next
 STRIDE = 0.75  # metres of a step
-LEFT_EYE, RIGHT_EYE = 0.0, 0.064  # metres right of the camera's origin
+LEFT_LENS, RIGHT_LENS = 0.0, 0.064  # metres right of the camera's origin
 
-Things = Callable[[float], list[Thing]]  # seconds -> what is there
+Things = Callable[[float], list[Thing]]  # seconds -> things present
 
 
 @dataclass(frozen=True, eq=False)
 class Encounter:
-    """One meeting, and when somebody is near for it."""
+    """One encounter and its interval of time."""
 
     kind: str
     begin: float  # seconds
@@ -36,15 +36,15 @@ class Encounter:
     things: Things
 
     def at(self, seconds: float) -> list[Thing]:
-        """Who is there at a time: nobody before the beginning and after the end."""
+        """The people and things at a time; empty outside the interval."""
         return self.things(seconds) if self.begin <= seconds <= self.end else []
 
 
-def plan(words: str, walk: Walk, rng: np.random.Generator) -> list[Encounter]:
-    """Encounters of the kinds named (separated by commas; `all`: every kind), in turn until the walk ends.
+def plan(words: str, drive: Drive, rng: np.random.Generator) -> list[Encounter]:
+    """Encounters of the named kinds (separated by commas; `all`: every kind), in turn until the drive ends.
 
     Raises:
-        StereoSfmError: a word that names no kind.
+        StereoSfmError: an unknown kind.
     """
     kinds = list(KINDS) if words == "all" else [word for word in words.split(",") if word]
     for kind in kinds:
@@ -53,8 +53,8 @@ def plan(words: str, walk: Walk, rng: np.random.Generator) -> list[Encounter]:
     begin = FIRST_S
     while kinds:
         kind = kinds[len(out) % len(kinds)]
-        encounter = KINDS[kind](walk, begin, np.random.default_rng(rng.integers(2**32)))
-        if encounter.end > walk.duration:
+        encounter = KINDS[kind](drive, begin, np.random.default_rng(rng.integers(2**32)))
+        if encounter.end > drive.duration:
             break
         out.append(encounter)
         begin = encounter.end + PAUSE_S
@@ -62,7 +62,7 @@ def plan(words: str, walk: Walk, rng: np.random.Generator) -> list[Encounter]:
 
 
 def present(encounters: Sequence[Encounter], seconds: float) -> list[Thing]:
-    """Everybody who is met at a time."""
+    """The people and things of all encounters at a time."""
     return [thing for encounter in encounters for thing in encounter.at(seconds)]
 
 
@@ -72,68 +72,68 @@ def _smooth(x: float) -> float:
     return x * x * (3 - 2 * x)
 
 
-def _person(walk: Walk, looks: Looks, metres: float, aside: float, towards: bool) -> Thing:
-    """Somebody on the robot's route who walks as the robot does, or towards it."""
-    at, heading = walk.place(metres, aside)
-    return standing(looks, at, heading + (np.pi if towards else 0.0), metres / STRIDE * np.pi)
+def _person(drive: Drive, appearance: Appearance, metres: float, aside: float, towards: bool) -> Thing:
+    """A person on the robot's route who walks in its direction, or towards it."""
+    at, heading = drive.place(metres, aside)
+    return standing(appearance, at, heading + (np.pi if towards else 0.0), metres / STRIDE * np.pi)
 
 
-def _approach(walk: Walk, begin: float, rng: np.random.Generator) -> Encounter:
-    """Straight at the robot, up to a hand's breadth or half a metre, there for up to a second, then past it."""
-    looks, speed = Looks.random(rng), float(rng.uniform(0.8, 1.3))
+def _approach(drive: Drive, begin: float, rng: np.random.Generator) -> Encounter:
+    """Walks up to the robot, waits at 0.24 to 0.6 m for up to a second, then passes it."""
+    appearance, speed = Appearance.random(rng), float(rng.uniform(0.8, 1.3))
     middle, side = float(rng.uniform(-0.12, 0.12)), float(rng.choice([-1, 1])) * float(rng.uniform(0.36, 0.45))
     gap, hesitation = float(rng.uniform(0.24, 0.6)), float(rng.uniform(0.0, 1.0))
     met = begin + 3.0
-    aside, gone = met + hesitation, met + hesitation + 0.5
+    aside, passed = met + hesitation, met + hesitation + 0.5
 
     def things(seconds: float) -> list[Thing]:
-        robot = walk.walked(seconds)
+        robot = drive.distance(seconds)
         metres = robot + gap
         if seconds < met:
-            metres = walk.walked(met) + gap + speed * (met - seconds)
-        elif seconds > gone:
-            metres = walk.walked(gone) + gap - speed * (seconds - gone)
-        return [_person(walk, looks, metres, middle + (side - middle) * _smooth((seconds - aside) / 0.5), True)]
+            metres = drive.distance(met) + gap + speed * (met - seconds)
+        elif seconds > passed:
+            metres = drive.distance(passed) + gap - speed * (seconds - passed)
+        return [_person(drive, appearance, metres, middle + (side - middle) * _smooth((seconds - aside) / 0.5), True)]
 
-    return Encounter("approach", begin, gone + 1.5, things)
+    return Encounter("approach", begin, passed + 1.5, things)
 
 
-def _stop(walk: Walk, begin: float, rng: np.random.Generator) -> Encounter:
-    """Comes, stands in the robot's way, and steps aside when it is near."""
-    looks, speed, side = Looks.random(rng), float(rng.uniform(0.8, 1.3)), float(rng.choice([-1, 1]))
+def _stop(drive: Drive, begin: float, rng: np.random.Generator) -> Encounter:
+    """Blocks the robot's route and steps aside when the robot is near."""
+    appearance, speed, side = Appearance.random(rng), float(rng.uniform(0.8, 1.3)), float(rng.choice([-1, 1]))
     middle, near = float(rng.uniform(-0.15, 0.15)), float(rng.uniform(0.5, 0.9))
     sway = rng.uniform(0, 2 * np.pi, 2)
-    stands = begin + 2.0
-    at = walk.walked(stands) + float(rng.uniform(2.2, 3.4))
-    aside = walk.when(at - near)
-    end = max(aside + 1.0, walk.when(at + 0.5))
+    stopped = begin + 2.0
+    at = drive.distance(stopped) + float(rng.uniform(2.2, 3.4))
+    aside = drive.when(at - near)
+    end = max(aside + 1.0, drive.when(at + 0.5))
 
     def things(seconds: float) -> list[Thing]:
-        metres = at + speed * max(stands - seconds, 0.0)
+        metres = at + speed * max(stopped - seconds, 0.0)
         moved = middle + (side * 0.6 - middle) * _smooth((seconds - aside) / 0.7)
         swayed = 0.02 * np.sin(2 * np.pi * 0.35 * seconds + sway)
-        place, heading = walk.place(metres + float(swayed[0]), moved + float(swayed[1]))
-        return [standing(looks, place, heading + np.pi, (metres + moved) / STRIDE * np.pi)]
+        place, heading = drive.place(metres + float(swayed[0]), moved + float(swayed[1]))
+        return [standing(appearance, place, heading + np.pi, (metres + moved) / STRIDE * np.pi)]
 
     return Encounter("stop", begin, end, things)
 
 
-def _covering(walk: Walk, begin: float, rng: np.random.Generator, kind: str) -> Encounter:
-    """Something held before the lenses for 0.5 to 3 s: a bag before both, or a hand before one."""
-    lasts, comes = float(rng.uniform(0.5, 3.0)), float(rng.uniform(0.15, 0.35))
-    corner = float(rng.uniform(0, 2 * np.pi))  # from where
-    eye, cloth = float(rng.choice([LEFT_EYE, RIGHT_EYE])), int(rng.integers(CLOTHES))
+def _covering(drive: Drive, begin: float, rng: np.random.Generator, kind: str) -> Encounter:
+    """Covers the lenses for 0.5 to 3 s: both with a bag, or one with a hand."""
+    lasts, approach = float(rng.uniform(0.5, 3.0)), float(rng.uniform(0.15, 0.35))  # seconds
+    corner = float(rng.uniform(0, 2 * np.pi))  # direction from which it comes
+    lens_x, cloth = float(rng.choice([LEFT_LENS, RIGHT_LENS])), int(rng.integers(CLOTHES))
     phase, lens = rng.uniform(0, 2 * np.pi, 3), kind == "lens"
     parts = _hand() if lens else _bag(cloth, rng)
-    held = np.array([eye if lens else 0.5 * (LEFT_EYE + RIGHT_EYE), 0.0, 0.026 if lens else 0.12])
+    held = np.array([lens_x if lens else 0.5 * (LEFT_LENS + RIGHT_LENS), 0.0, 0.026 if lens else 0.12])
     away = np.array([np.cos(corner), np.sin(corner), 0.12]) * (0.5 if lens else 1.2)
-    opened = begin + comes + lasts
-    end = opened + comes
+    opened = begin + approach + lasts
+    end = opened + approach
 
     def things(seconds: float) -> list[Thing]:
-        off = 1.0 - _smooth((seconds - begin) / comes) + _smooth((seconds - opened) / comes)
+        off = 1.0 - _smooth((seconds - begin) / approach) + _smooth((seconds - opened) / approach)
         tremble = 0.004 * np.sin(2 * np.pi * np.array([1.1, 1.7, 0.8]) * seconds + phase)
-        world_T_cam = walk.steady(np.array([seconds]))[0]
+        world_T_cam = drive.steady(np.array([seconds]))[0]
         return [Thing(parts, world_T_cam[:3, :3] @ _roll(corner), _moved(world_T_cam, held + off * away + tremble))]
 
     return Encounter(kind, begin, end, things)
@@ -150,7 +150,7 @@ def _roll(angle: float) -> F64:
 
 
 def _bag(cloth: int, rng: np.random.Generator) -> list[Part]:
-    """A shopping bag with a hand and an arm that hold it, before the camera (z into the picture)."""
+    """A shopping bag with a hand and an arm in front of the camera (camera axes)."""
     return [
         (np.zeros(3), np.array([0.48, float(rng.uniform(0.42, 0.48)), 0.1]), 0.0, cloth),
         (np.array([0.42, 0.0, -0.02]), np.array([0.09, 0.05, 0.04]), 0.0, SKIN),
@@ -159,7 +159,7 @@ def _bag(cloth: int, rng: np.random.Generator) -> list[Part]:
 
 
 def _hand() -> list[Part]:
-    """Palm, fingers and forearm before one lens (z into the picture, the arm along x)."""
+    """Palm, fingers and forearm in front of one lens (camera axes, the arm along x)."""
     fingers: list[Part] = [
         (np.array([-0.07, 0.021 * k, 0.002 * abs(k)]), np.array([0.055, 0.0125, 0.012]), 0.0, SKIN)
         for k in (-1.5, -0.5, 0.5, 1.5)
@@ -171,9 +171,9 @@ def _hand() -> list[Part]:
     ]
 
 
-def _cart(walk: Walk, begin: float, rng: np.random.Generator) -> Encounter:
-    """Somebody with a full cart, who comes towards the robot or overtakes it, close beside it."""
-    looks, towards = Looks.random(rng), bool(rng.random() < 0.5)
+def _cart(drive: Drive, begin: float, rng: np.random.Generator) -> Encounter:
+    """A person with a full cart who passes close to the robot, towards it or overtaking it."""
+    appearance, towards = Appearance.random(rng), bool(rng.random() < 0.5)
     aside = float(rng.choice([-1, 1])) * float(rng.uniform(0.55, 0.68))
     speed = -float(rng.uniform(0.6, 1.0)) if towards else float(rng.uniform(1.3, 1.7))
     parts = _cart_parts(rng)
@@ -181,9 +181,9 @@ def _cart(walk: Walk, begin: float, rng: np.random.Generator) -> Encounter:
     end = met + (2.0 if towards else 5.0)
 
     def things(seconds: float) -> list[Thing]:
-        metres = walk.walked(met) + speed * (seconds - met)
-        person = _person(walk, looks, metres, aside, towards)
-        cart_at, heading = walk.place(metres + (-0.75 if towards else 0.75), aside)
+        metres = drive.distance(met) + speed * (seconds - met)
+        person = _person(drive, appearance, metres, aside, towards)
+        cart_at, heading = drive.place(metres + (-0.75 if towards else 0.75), aside)
         heading += np.pi if towards else 0.0
         c, s = np.cos(heading), np.sin(heading)
         turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
@@ -193,7 +193,7 @@ def _cart(walk: Walk, begin: float, rng: np.random.Generator) -> Encounter:
 
 
 def _cart_parts(rng: np.random.Generator) -> list[Part]:
-    """A shopping cart: rods around a basket, wheels, a handle, and what was bought (x ahead)."""
+    """A shopping cart: rods around a basket, a handle and goods (x ahead)."""
     rods: list[Part] = [
         (np.array([0.0, y, z]), np.array([0.46, 0.012, 0.012]), 0.0, CLOTHES + 1)
         for y in (-0.25, 0.25)
@@ -210,7 +210,7 @@ def _cart_parts(rng: np.random.Generator) -> list[Part]:
         for y in (-0.25, 0.25)
     ]
     rods.append((np.array([-0.5, 0.0, 1.0]), np.array([0.02, 0.28, 0.02]), 0.0, CLOTHES))
-    bought: list[Part] = [
+    goods: list[Part] = [
         (
             np.array([rng.uniform(-0.3, 0.3), rng.uniform(-0.14, 0.14), rng.uniform(0.5, 0.95)]),
             rng.uniform(0.06, 0.16, 3),
@@ -219,53 +219,59 @@ def _cart_parts(rng: np.random.Generator) -> list[Part]:
         )
         for _ in range(9)
     ]
-    return rods + bought
+    return rods + goods
 
 
-def _beside(walk: Walk, begin: float, rng: np.random.Generator) -> Encounter:
+def _accompany(drive: Drive, begin: float, rng: np.random.Generator) -> Encounter:
     """Walks ahead and to one side, at the robot's speed, for 20 s."""
-    looks, side = Looks.random(rng), float(rng.choice([-1, 1]))
+    appearance, side = Appearance.random(rng), float(rng.choice([-1, 1]))
     ahead, aside = float(rng.uniform(0.8, 1.6)), float(rng.uniform(0.3, 0.55))
     phase = rng.uniform(0, 2 * np.pi, 2)
     end = begin + 20.0
 
     def things(seconds: float) -> list[Thing]:
         away = 2.5 * (1.0 - _smooth((seconds - begin) / 2.5) + _smooth((seconds - end + 2.0) / 2.0))
-        metres = walk.walked(seconds) + ahead + away + 0.12 * np.sin(2 * np.pi * 0.11 * seconds + phase[0])
-        return [_person(walk, looks, metres, side * aside + 0.06 * np.sin(0.8 * seconds + phase[1]), False)]
+        metres = drive.distance(seconds) + ahead + away + 0.12 * np.sin(2 * np.pi * 0.11 * seconds + phase[0])
+        return [_person(drive, appearance, metres, side * aside + 0.06 * np.sin(0.8 * seconds + phase[1]), False)]
 
     return Encounter("beside", begin, end, things)
 
 
-def _group(walk: Walk, begin: float, rng: np.random.Generator) -> Encounter:
-    """Three to five people on one half of the aisle: the robot comes near, follows them for a while, they hurry on."""
+def _group(drive: Drive, begin: float, rng: np.random.Generator) -> Encounter:
+    """Three to five people on one half of the aisle: the robot catches up, follows for 2 to 5 s, then they walk off."""
     side, count = float(rng.choice([-1, 1])), int(rng.integers(3, 6))
-    everybody = [Looks.random(rng) for _ in range(count)]
+    people = [Appearance.random(rng) for _ in range(count)]
     aside = side * np.linspace(-0.2, 0.7, count) + rng.uniform(-0.05, 0.05, count)
     ahead, sway = float(rng.uniform(0.35, 0.5)) + rng.uniform(0.0, 0.25, count), rng.uniform(0, 2 * np.pi, count)
     follows = float(rng.uniform(2.0, 5.0))
-    near, gone = begin + 3.0, begin + 3.0 + follows
-    end = gone + 3.0
+    near, leaving = begin + 3.0, begin + 3.0 + follows
+    end = leaving + 3.0
 
     def things(seconds: float) -> list[Thing]:
-        away = 3.0 * (1.0 - _smooth((seconds - begin) / (near - begin)) + _smooth((seconds - gone) / (end - gone)))
-        robot = walk.walked(seconds)
+        away = 3.0 * (
+            1.0 - _smooth((seconds - begin) / (near - begin)) + _smooth((seconds - leaving) / (end - leaving))
+        )
+        robot = drive.distance(seconds)
         return [
             _person(
-                walk, looks, robot + ahead[k] + away + 0.08 * np.sin(1.3 * seconds + sway[k]), float(aside[k]), False
+                drive,
+                appearance,
+                robot + ahead[k] + away + 0.08 * np.sin(1.3 * seconds + sway[k]),
+                float(aside[k]),
+                False,
             )
-            for k, looks in enumerate(everybody)
+            for k, appearance in enumerate(people)
         ]
 
     return Encounter("group", begin, end, things)
 
 
-KINDS: dict[str, Callable[[Walk, float, np.random.Generator], Encounter]] = {
+KINDS: dict[str, Callable[[Drive, float, np.random.Generator], Encounter]] = {
     "approach": _approach,
     "stop": _stop,
-    "cover": lambda walk, begin, rng: _covering(walk, begin, rng, "cover"),
-    "lens": lambda walk, begin, rng: _covering(walk, begin, rng, "lens"),
+    "cover": lambda drive, begin, rng: _covering(drive, begin, rng, "cover"),
+    "lens": lambda drive, begin, rng: _covering(drive, begin, rng, "lens"),
     "cart": _cart,
-    "beside": _beside,
+    "beside": _accompany,
     "group": _group,
 }

@@ -1,7 +1,7 @@
-"""The simulated inertial sensor: exact rates and forces along a walk, and what sensors of robots make of them.
+"""The simulated inertial sensor: exact angular rates and specific forces along a drive, with noise and biases.
 
-The T265 (BMI055) states its own noise: variances 5.15e-6 (rad/s)^2 of a gyroscope sample at 200 Hz, 6.7e-5 (m/s^2)^2
-of an accelerometer sample at 62.5 Hz, 5e-7 and 1e-4 of the biases, taken as what they wander in 100 s. The OAK's BMI270
+The T265 (BMI055) reports its own noise: variances 5.15e-6 (rad/s)^2 of a gyroscope sample at 200 Hz, 6.7e-5 (m/s^2)^2
+of an accelerometer sample at 62.5 Hz, 5e-7 and 1e-4 of the biases, taken as their drift in 100 s. The OAK's BMI270
 has the noise densities of its data sheet, 0.007 degrees/s and 160 micro-g per root hertz.
 """
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stereo_sfm.calib.imu import Imu
-from stereo_sfm.drivers.sim.walks import Walk
+from stereo_sfm.drivers.sim.drives import Drive
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, I64, ImuSamples
 
@@ -27,21 +27,21 @@ _AROUND: F64 = np.linspace(-4 * _STEP_S, 4 * _STEP_S, 9)
 
 @dataclass(frozen=True)
 class Grade:
-    """How good a sensor is."""
+    """Noise and errors of a sensor."""
 
     gyro_noise: float = 0.0  # rad/s/sqrt(Hz)
     accel_noise: float = 0.0  # m/s^2/sqrt(Hz)
     gyro_walk: float = 0.0  # rad/s^2/sqrt(Hz)
     accel_walk: float = 0.0  # m/s^3/sqrt(Hz)
-    gyro_bias: float = 0.0  # rad/s, standard deviation when switched on; the calibration does not know it
+    gyro_bias: float = 0.0  # rad/s, standard deviation when switched on; not in the calibration
     accel_bias: float = 0.0  # m/s^2, the same
-    scale: float = 0.0  # standard deviation of scale and misalignment, which the calibration knows
-    known_bias: float = 0.0  # m/s^2 of the accelerometer that the calibration knows
+    scale: float = 0.0  # standard deviation of scale and misalignment, which the calibration contains
+    calibrated_bias: float = 0.0  # m/s^2 of the accelerometer, which the calibration contains
 
 
 GRADES = {
     "ideal": Grade(),
-    "t265": Grade(1.6e-4, 1.04e-3, 7e-5, 1e-3, 0.004, 0.03, scale=0.01, known_bias=0.15),
+    "t265": Grade(1.6e-4, 1.04e-3, 7e-5, 1e-3, 0.004, 0.03, scale=0.01, calibrated_bias=0.15),
     "oak": Grade(1.22e-4, 1.57e-3, 2e-5, 3e-4, 0.008, 0.08),
 }
 _MOUNTS = {  # left_R_imu up to a few degrees, and metres
@@ -52,62 +52,62 @@ _MOUNTS = {  # left_R_imu up to a few degrees, and metres
 
 
 class InertialSensor:
-    """Gyroscope and accelerometer at a fixed place of the camera. `imu` is what the calibration knows of them."""
+    """Gyroscope and accelerometer at a fixed place of the camera. `imu` is their calibration."""
 
-    def __init__(self, name: str, walk: Walk, rng: np.random.Generator, offset_s: float = 0.0) -> None:
+    def __init__(self, name: str, drive: Drive, rng: np.random.Generator, offset_s: float = 0.0) -> None:
         """`name` of GRADES; `offset_s`: its clock minus the camera's."""
-        self._walk, grade = walk, GRADES[name]
+        self._drive, grade = drive, GRADES[name]
         turn, place = _MOUNTS[name]
         left_T_imu = se3.from_rotation_translation(turn @ se3.so3_exp(np.array([0.02, -0.03, 0.015])), np.array(place))
         gyro_matrix, accel_matrix = (np.eye(3) + rng.normal(0, grade.scale, (3, 3)) for _ in range(2))
-        known = Imu()  # its noise, where the sensor has none: a filter cannot do without
+        default = Imu()  # its noise is used for the ideal sensor: a filter needs a positive one
         self.imu = Imu(
             left_T_imu=left_T_imu, gyro_matrix=gyro_matrix, accel_matrix=accel_matrix,
-            accel_bias=rng.normal(0, grade.known_bias, 3), gyro_noise=grade.gyro_noise or known.gyro_noise,
-            accel_noise=grade.accel_noise or known.accel_noise, gyro_walk=grade.gyro_walk or known.gyro_walk,
-            accel_walk=grade.accel_walk or known.accel_walk, rate_hz=RATE_HZ, offset_s=offset_s,
+            accel_bias=rng.normal(0, grade.calibrated_bias, 3), gyro_noise=grade.gyro_noise or default.gyro_noise,
+            accel_noise=grade.accel_noise or default.accel_noise, gyro_walk=grade.gyro_walk or default.gyro_walk,
+            accel_walk=grade.accel_walk or default.accel_walk, rate_hz=RATE_HZ, offset_s=offset_s,
         )  # fmt: skip
         self._gyro_error, self._accel_error = self._errors(grade, rng)
 
     def _errors(self, grade: Grade, rng: np.random.Generator) -> tuple[F64, F64]:
-        """(N, 3) each: bias, its walk and white noise of every sample."""
-        shape = (int((self._walk.duration + 1) * RATE_HZ) + 1, 3)
+        """(N, 3) each: bias, its random walk and white noise of every sample."""
+        shape = (int((self._drive.duration + 1) * RATE_HZ) + 1, 3)
         out: list[F64] = []
         for noise, wander, bias in (
             (grade.gyro_noise, grade.gyro_walk, grade.gyro_bias),
             (grade.accel_noise, grade.accel_walk, grade.accel_bias),
         ):
-            walked = np.cumsum(rng.normal(0, wander / RATE_HZ**0.5, shape), axis=0)
-            out.append(rng.normal(0, bias, 3) + walked + rng.normal(0, noise * RATE_HZ**0.5, shape))
+            drift = np.cumsum(rng.normal(0, wander / RATE_HZ**0.5, shape), axis=0)
+            out.append(rng.normal(0, bias, 3) + drift + rng.normal(0, noise * RATE_HZ**0.5, shape))
         return out[0], out[1]
 
     def exact(self, seconds: F64) -> tuple[F64, F64]:
-        """Angular velocity (N, 3) rad/s and specific force (N, 3) m/s^2 in the sensor's axes at some times (N,).
+        """Angular velocity (N, 3) rad/s and specific force (N, 3) m/s^2 in the sensor's axes at times (N,) in seconds.
 
-        world_T_imu is a turn about the vertical on a spline, times the shake: the derivatives of the first are the
-        spline's, those of the second, a few sines, are differences of eighth order.
+        world_T_imu is a rotation about the vertical and a translation on a spline, times the vibration. Derivatives of
+        the first are those of the spline; those of the second, a few sines, are differences of eighth order.
         """
-        steady = se3.from_rotation_translation(self._walk.walker_R_cam, np.zeros(3))
-        around = self._walk.shake(np.add.outer(seconds, _AROUND).ravel())
-        walker_T_imu = (steady @ around @ self.imu.left_T_imu).reshape(-1, len(_AROUND), 4, 4)
-        now = walker_T_imu[:, len(_AROUND) // 2]
-        speed = np.einsum("k,nkij->nij", _FIRST, walker_T_imu)
-        acceleration = np.einsum("k,nki->ni", _SECOND, walker_T_imu[..., :3, 3])
-        (heading, rate, rate_change) = (self._walk.course(seconds, k)[:, 2, None] for k in range(3))
+        steady = se3.from_rotation_translation(self._drive.robot_R_cam, np.zeros(3))
+        around = self._drive.shake(np.add.outer(seconds, _AROUND).ravel())
+        robot_T_imu = (steady @ around @ self.imu.left_T_imu).reshape(-1, len(_AROUND), 4, 4)
+        now = robot_T_imu[:, len(_AROUND) // 2]
+        speed = np.einsum("k,nkij->nij", _FIRST, robot_T_imu)
+        acceleration = np.einsum("k,nki->ni", _SECOND, robot_T_imu[..., :3, 3])
+        (heading, rate, rate_change) = (self._drive.course(seconds, k)[:, 2, None] for k in range(3))
         up = np.array([0.0, 0.0, 1.0])
         place, drift = now[:, :3, 3], speed[:, :3, 3]
         turning = 2 * rate * np.cross(up, drift) + rate_change * np.cross(up, place)
         turning += rate**2 * np.cross(up, np.cross(up, place))
-        world_R_walker = se3.so3_exp(heading * up)
-        course = self._walk.course(seconds, 2) * [1, 1, 0]
-        force = np.einsum("nji,nj->ni", world_R_walker, course - _GRAVITY) + acceleration + turning
+        world_R_robot = se3.so3_exp(heading * up)
+        course = self._drive.course(seconds, 2) * [1, 1, 0]
+        force = np.einsum("nji,nj->ni", world_R_robot, course - _GRAVITY) + acceleration + turning
         skew = np.einsum("nji,njk->nik", now[:, :3, :3], speed[:, :3, :3])
         gyro = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], -1)
         gyro = gyro + np.einsum("nji,nj->ni", now[:, :3, :3], rate * up)
         return gyro, np.einsum("nji,nj->ni", now[:, :3, :3], force)
 
     def samples(self, begin: float, end: float, epoch_ns: int) -> ImuSamples:
-        """What was sampled after one time until another (seconds of the walk, camera's clock)."""
+        """Samples after `begin` until `end` (seconds of the drive, camera's clock)."""
         rows = np.arange(*(max(0, int(np.floor(t * RATE_HZ - PHASE + 1e-9)) + 1) for t in (begin, end)))
         seconds: F64 = np.asarray((rows + PHASE) / RATE_HZ, np.float64)
         gyro, accel = self.exact(seconds)

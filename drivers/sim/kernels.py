@@ -1,10 +1,10 @@
-"""Compiled ray casting of the store: a room, groups of boxes, shelves whose slots hold products, people, pictures.
+"""Compiled ray casting of the store: a room, groups of boxes, shelves with products in their slots, people, targets.
 
 A shelf block is an axis-aligned box seen from its front: u runs to the viewer's right, w goes into the shelf, z up. Its
-levels are open slots between boards; each slot is a row of facings, walked like a one-dimensional grid.
+levels are open slots between boards; each slot is a row of facings, traversed like a one-dimensional grid.
 
-A hit is (t, id); `id` packs index << 12 | part << 7 | kind << 4 | face, so that two pixels show the same flat piece of
-surface exactly when their ids agree. The tables that all kernels take are described in tables.Tables.
+A hit is (t, id); `id` packs index << 12 | part << 7 | kind << 4 | face, so that two pixels show the same flat surface
+exactly when their ids agree. The tables that all kernels take are described in tables.Tables.
 """
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportPrivateUsage=false
@@ -38,7 +38,7 @@ njit_finite: Any = jit(**_OPTIONS, fastmath={"nnan", "nsz"})
 
 @njit_finite
 def pack(kind, index, part, face):
-    """One integer for a flat piece of surface."""
+    """One integer for a flat surface."""
     return (index << 12) | ((part & 31) << 7) | (kind << 4) | face
 
 
@@ -87,7 +87,7 @@ def _product(facings, c, base, ou, ow, oz, iu, iw, iz, depth, limit):
 
 @njit_finite
 def _slot(levels_i, facings, bins, k, base, ou, ow, oz, du, iu, iw, iz, t_in, t_out, depth):
-    """Walk the facings of level k from t_in to t_out -> (t, facing, face), facing -1 for none."""
+    """Traverse the facings of level k from t_in to t_out -> (t, facing, face), facing -1 for none."""
     first, last, offset = levels_i[k, 0], levels_i[k, 1], levels_i[k, 2]
     if last <= first:
         return t_out, -1, -1
@@ -114,7 +114,7 @@ def _slot(levels_i, facings, bins, k, base, ou, ow, oz, du, iu, iw, iz, t_in, t_
 @njit_finite
 def to_shelf(blocks, b, facing, x, y):
     """Horizontal point of the world -> (u, w) of shelf block b."""
-    if facing == 0:  # its front looks to -y
+    if facing == 0:  # its front faces -y
         return x - blocks[b, 0], y - blocks[b, 1]
     if facing == 1:  # +y
         return blocks[b, 3] - x, blocks[b, 4] - y

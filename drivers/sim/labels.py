@@ -23,7 +23,7 @@ from stereo_sfm.types import U8
 def label(rng: np.random.Generator, h: int, w: int) -> U8:
     """One product's front, (h, w)."""
     image, ink, paper = background(rng, h, w)
-    if rng.random() < 0.5:  # a picture: blobs of contents
+    if rng.random() < 0.5:  # an illustration of the contents
         y0, y1 = int(h * rng.uniform(0.35, 0.5)), int(h * rng.uniform(0.75, 0.95))
         noise = cloud(rng, (y1 - y0, w), 3, int(rng.integers(3, 9)))
         image[y0:y1] = np.where(noise > rng.uniform(0.35, 0.6), noise * 255, image[y0:y1] * 0.8)

@@ -1,4 +1,4 @@
-"""What follows the question mark of `sim:SCENE?...`."""
+"""Options of `sim:SCENE?...`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from stereo_sfm.drivers.options import SourceOptions, option
 
 
 def _size(value: Any) -> tuple[int, int] | None:
-    """WIDTHxHEIGHT, "" and None for the camera's own."""
+    """WIDTHxHEIGHT; "" and None: the camera's own."""
     if not value:
         return None
     width, _, height = value.partition("x") if isinstance(value, str) else (str(value[0]), "", str(value[1]))
@@ -19,7 +19,7 @@ def _size(value: Any) -> tuple[int, int] | None:
 
 
 def _interval(value: Any) -> tuple[float, float]:
-    """Seconds from and to of FROM-TO; an empty one for no text."""
+    """Seconds of FROM-TO; (0, 0) if empty."""
     if not value:
         return 0.0, 0.0
     begin, _, end = value.partition("-") if isinstance(value, str) else (value[0], "", value[1])
@@ -38,20 +38,20 @@ class SimOptions(SourceOptions):
 
     camera: Literal["fisheye", "pinhole", "distorted"] = option("fisheye", "lenses of the simulated pair")
     size: tuple[int, int] | None = option(None, "WIDTHxHEIGHT, scales the images", read=_size)
-    seed: int = option(0, "of products, sensor, people", low=0, high=2**31)
+    seed: int = option(0, "seed of products, sensor noise and people", low=0, high=2**31)
     walk: int = option(0, "another session through the same store", low=0, high=1000)
     length: float = option(0.0, "metres driven, 0: the scene's own", low=0, high=10_000)
     start: int = option(0, "first frame", low=0, high=10**7)
     frames: int = option(0, "at most so many frames, 0: all", low=0, high=10**7)
     rate: float = option(30.0, "frames a second", low=1, high=1000)
-    exchange: float = option(0.0, "fraction of product rows exchanged against the same store with 0", low=0, high=1)
-    returns: bool = option(True, "whether the camera comes back to where it has been")
+    exchange: float = option(0.0, "fraction of product rows with another product than at 0", low=0, high=1)
+    returns: bool = option(True, "whether the camera returns to earlier places")
     people: int = option(-1, "how many, -1: the scene's own", low=-1, high=60)
     encounters: str = option(
-        "", "what people do to the robot, by turns: approach, stop, cover, lens, cart, beside, group; all"
+        "", "encounters of people with the robot, in turn: approach, stop, cover, lens, cart, beside, group; all"
     )
     speed: float = option(0.0, "metres a second, 0: the scene's own", low=0, high=5)
-    vibration: float = option(1.0, "scales the camera's shaking", low=0, high=10)
+    vibration: float = option(1.0, "scales the camera's vibration", low=0, high=10)
     drop: float = option(0.0, "fraction of frames lost", low=0, high=0.9)
     noise: float = option(1.0, "scales the sensor's noise", low=0, high=20)
     blur: float = option(1.0, "scales the exposure time", low=0, high=10)
@@ -60,12 +60,12 @@ class SimOptions(SourceOptions):
     flicker: float = option(0.0, "swing of the lamps' brightness, 100 times a second", low=0, high=1)
     jpeg: int = option(0, "quality of a lossy link, 0: none", low=0, high=100)
     readout: float = option(
-        0.0, "seconds from the first row's exposure to the last's: a rolling shutter", low=0, high=0.1
+        0.0, "rolling shutter: seconds from the exposure of the first row to that of the last", low=0, high=0.1
     )
-    dark: tuple[float, float] = option((0.0, 0.0), "FROM-TO in seconds: when the lights are out", read=_interval)
-    imu: Literal["", "ideal", "t265", "oak"] = option("", "inertial samples as of an ideal sensor, a T265's, an OAK's")
+    dark: tuple[float, float] = option((0.0, 0.0), "FROM-TO in seconds: interval with the lights off", read=_interval)
+    imu: Literal["", "ideal", "t265", "oak"] = option("", "inertial samples of an ideal sensor, a T265 or an OAK")
     imu_offset_ms: float = option(
-        0.0, "clock of the inertial sensor minus the camera's, known to the calibration", low=-1000, high=1000
+        0.0, "clock of the inertial sensor minus the camera's; part of the calibration", low=-1000, high=1000
     )
-    effects: bool = option(True, "off: clean pictures")
-    realtime: bool = option(False, "frames come by the clock")
+    effects: bool = option(True, "off: images without blur, noise and vignetting")
+    realtime: bool = option(False, "deliver frames in real time")

@@ -1,4 +1,4 @@
-"""Who and what moves through the store: things made of ellipsoids, and customers in patterned clothes."""
+"""Moving objects of the store: things made of ellipsoids, and customers in patterned clothes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stereo_sfm.drivers.sim.render import NOTHING, Moving
+from stereo_sfm.drivers.sim.render import NO_OBJECTS, Moving
 from stereo_sfm.drivers.sim.tables import Tables
 from stereo_sfm.drivers.sim.world import CLOTHES, HAIR, SKIN
 from stereo_sfm.types import F64
@@ -25,8 +25,8 @@ class Thing:
 
 
 @dataclass(frozen=True)
-class Looks:
-    """What a person looks like."""
+class Appearance:
+    """Size and clothes of a person."""
 
     height: float
     shirt: int  # index of a cloth
@@ -34,10 +34,10 @@ class Looks:
     hair: int  # and shoes
 
     @staticmethod
-    def random(rng: np.random.Generator) -> Looks:
-        """Two different cloths, one of two colours of hair, any height of a grown-up."""
+    def random(rng: np.random.Generator) -> Appearance:
+        """Two different cloths, one of two hair colours, the height of an adult."""
         shirt, trousers = rng.choice(CLOTHES, 2, replace=False)
-        return Looks(float(rng.uniform(1.55, 1.9)), int(shirt), int(trousers), HAIR + int(rng.integers(2)))
+        return Appearance(float(rng.uniform(1.55, 1.9)), int(shirt), int(trousers), HAIR + int(rng.integers(2)))
 
 
 @dataclass(frozen=True)
@@ -47,23 +47,23 @@ class Person:
     start: tuple[float, float]
     end: tuple[float, float]
     speed: float
-    phase: float  # metres already walked at time 0
-    looks: Looks
+    phase: float  # metres along the lap at time 0
+    appearance: Appearance
 
 
 def _pose(person: Person, seconds: float) -> tuple[F64, float, float]:
     """Position (2,), heading, phase of the step."""
     a, b = np.array(person.start), np.array(person.end)
     span = float(np.linalg.norm(b - a))
-    walked = person.phase + person.speed * seconds
-    lap = walked % (2 * span)
+    distance = person.phase + person.speed * seconds
+    lap = distance % (2 * span)
     forward = lap < span
     s = lap / span if forward else 2 - lap / span
-    way = (b - a) if forward else (a - b)
-    return a + s * (b - a), float(np.arctan2(way[1], way[0])), walked / 0.75 * np.pi
+    direction = (b - a) if forward else (a - b)
+    return a + s * (b - a), float(np.arctan2(direction[1], direction[0])), distance / 0.75 * np.pi
 
 
-def _limbs(person: Looks, step: float) -> list[Part]:
+def _limbs(person: Appearance, step: float) -> list[Part]:
     """Ellipsoids in the person's axes (x ahead, z up), legs and arms swinging with the phase of the step."""
     h, swing = person.height, 0.45 * np.sin(step)
     skin = SKIN
@@ -93,22 +93,22 @@ def _limbs(person: Looks, step: float) -> list[Part]:
     return out
 
 
-def standing(looks: Looks, at: F64, heading: float, step: float) -> Thing:
+def standing(appearance: Appearance, at: F64, heading: float, step: float) -> Thing:
     """A person at a place on the floor (2,), facing `heading` (radians), in the middle of a step."""
     c, s = np.cos(heading), np.sin(heading)
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
-    return Thing(_limbs(looks, step), turn, np.array([at[0], at[1], 0]))
+    return Thing(_limbs(appearance, step), turn, np.array([at[0], at[1], 0]))
 
 
 def crowd_at(people: Iterable[Person], seconds: float) -> list[Thing]:
-    """Everybody as they are at a time."""
-    return [standing(person.looks, *_pose(person, seconds)) for person in people]
+    """All people at a time in seconds."""
+    return [standing(person.appearance, *_pose(person, seconds)) for person in people]
 
 
 def moving(world: Tables, things: list[Thing]) -> Moving:
-    """Things as the renderer takes them."""
+    """Things in the renderer's arrays."""
     if not things:
-        return NOTHING
+        return NO_OBJECTS
     boxes: list[F64] = []
     ranges: list[list[int]] = []
     rows: list[F64] = []
@@ -125,7 +125,7 @@ def moving(world: Tables, things: list[Thing]) -> Moving:
             cloths.append(int(world.surfaces[4 + cloth]))
         boxes.append(np.concatenate([lo, hi]))
         ranges.append([first, len(rows)])
-    return NOTHING._replace(
+    return NO_OBJECTS._replace(
         persons=np.array(boxes),
         persons_i=np.array(ranges, np.int64),
         ellipsoids=np.array(rows),

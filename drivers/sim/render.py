@@ -1,4 +1,4 @@
-"""`Renderer`: clean pictures, depth and surface ids of a world from any pose, for any rig."""
+"""`Renderer`: images without sensor effects, depth and surface ids of a world from any pose, for any rig."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.types import F32, F64, I32, I64
 
 EDGE_RAYS = np.array([[-0.11, -0.37], [0.38, 0.09], [-0.27, 0.28]])  # px, about the centre's own ray
-EDGE_CONTRAST = 5.0  # least step of brightness (of 255) worth several rays
+EDGE_CONTRAST = 5.0  # step of brightness (of 255) above which a pixel gets several rays
 SCRATCH = 1024  # rays traced before they are shaded
-BREADTH = 1.3  # width of the texture filter in pixels: above 1 nothing crawls when the camera moves
+BREADTH = 1.3  # width of the texture filter in pixels, above 1 against aliasing
 _CENTRE = np.zeros((1, 2))
 _STEPS = (np.arange(6) - 2.5) / 6
-TARGET_RAYS = np.stack(np.meshgrid(_STEPS, _STEPS), -1).reshape(-1, 2)  # flat pictures are for sub-pixel measurement
+TARGET_RAYS = np.stack(np.meshgrid(_STEPS, _STEPS), -1).reshape(-1, 2)  # for sub-pixel accuracy of flat targets
 
 
 class Moving(NamedTuple):
-    """What differs from frame to frame, or is put into a store: people and flat pictures."""
+    """Objects that move from frame to frame or are added to a store: people and flat targets."""
 
     persons: F64  # (Q, 6) boxes
     persons_i: I64  # (Q, 2) ellipsoid range
@@ -35,7 +35,7 @@ class Moving(NamedTuple):
     targets_i: I64  # (N,) texture
 
 
-NOTHING = Moving(
+NO_OBJECTS = Moving(
     np.zeros((0, 6)),
     np.zeros((0, 2), np.int64),
     np.zeros((0, 14)),
@@ -47,21 +47,21 @@ NOTHING = Moving(
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One eye's picture."""
+    """One camera's image without sensor effects."""
 
-    image: F32  # (H, W) brightness, 0..255 before exposure, 0 where the lens shows nothing
-    depth: F32  # (H, W) metres along the ray of the pixel's centre, NaN where the lens shows nothing
-    ids: I32  # (H, W) surface of the pixel's centre, -1 where the lens shows nothing
+    image: F32  # (H, W) brightness, 0..255 before exposure, 0 outside the lens's field of view
+    depth: F32  # (H, W) metres along the ray of the pixel's centre, NaN outside the field of view
+    ids: I32  # (H, W) surface of the pixel's centre, -1 outside the field of view
 
 
-class Eye:
-    """A camera's rays, computed once."""
+class CameraRays:
+    """The rays of a camera's pixels."""
 
     def __init__(self, camera: Camera, max_angle_deg: float = 93.0) -> None:
         self.camera = camera
         grid = camera.bearing_grid()
         grid[np.nan_to_num(grid[..., 2], nan=-2.0) < np.cos(np.deg2rad(max_angle_deg))] = np.nan
-        self.grid = grid  # (H, W, 3) unit bearings, NaN where the lens shows nothing
+        self.grid = grid  # (H, W, 3) unit bearings, NaN outside the field of view
         self.du, self.dv = (
             np.gradient(grid, axis=1),
             np.gradient(grid, axis=0),
@@ -73,7 +73,7 @@ class Eye:
 
 
 class Near(NamedTuple):
-    """Groups by distance from an eye, and within each group its blocks, nearest first; distances in metres."""
+    """Groups by distance from a camera, and within each group its blocks, nearest first; distances in metres."""
 
     groups: I64  # (G,)
     group_gaps: F64  # (G,)
@@ -87,7 +87,7 @@ def _gaps(boxes: F64, origin: F64) -> F64:
 
 
 def _near(world: Tables, origin: F64, reach: float) -> Near:
-    """`reach`: metres that an eye moves about the origin while its rows are read."""
+    """`reach`: metres that a camera moves about the origin while its rows are read."""
     groups, blocks = (np.maximum(_gaps(boxes, origin) - reach, 0) for boxes in (world.groups, world.blocks))
     order = np.argsort(groups, kind="stable")
     member = np.repeat(np.arange(len(groups)), np.diff(world.groups_i, axis=1).ravel())
@@ -100,35 +100,35 @@ class Renderer:
 
     def __init__(self, world: Tables, rig: Rig) -> None:
         self.world, self.rig = world, rig
-        self.eyes = [Eye(c) for c in (rig.left, rig.right) if c is not None]
+        self.cameras = [CameraRays(c) for c in (rig.left, rig.right) if c is not None]
         self._ts, self._hits = np.empty(SCRATCH), np.empty(SCRATCH, np.int64)
 
-    def render(self, world_T_cam: F64, moving: Moving = NOTHING) -> tuple[View, View]:
-        """Both eyes at a pose of the left eye; the second is the first for a single camera.
+    def render(self, world_T_cam: F64, moving: Moving = NO_OBJECTS) -> tuple[View, View]:
+        """Views of both cameras; of a single camera the first twice.
 
-        `world_T_cam`: (4, 4), or with a rolling shutter one for each row (H, 4, 4).
+        `world_T_cam`: (4, 4) pose of the left camera, or with a rolling shutter one for each row (H, 4, 4).
         """
         left = self.view(0, world_T_cam, moving)
-        return left, self.view(1, world_T_cam @ self.rig.left_T_right, moving) if len(self.eyes) > 1 else left
+        return left, self.view(1, world_T_cam @ self.rig.left_T_right, moving) if len(self.cameras) > 1 else left
 
-    def view(self, eye: int, world_T_eye: F64, moving: Moving = NOTHING) -> View:
-        """One eye at its own pose (4, 4), or poses of its rows (H, 4, 4)."""
-        rays, shape = self.eyes[eye], self.eyes[eye].grid.shape[:2]
+    def view(self, side: int, world_T_cam: F64, moving: Moving = NO_OBJECTS) -> View:
+        """One camera at its own pose (4, 4), or poses of its rows (H, 4, 4)."""
+        rays, shape = self.cameras[side], self.cameras[side].grid.shape[:2]
         view = View(
             np.zeros(shape, np.float32),
             np.full(shape, np.nan, np.float32),
             np.full(shape, -1, np.int32),
         )
-        self._cast(rays, world_T_eye, moving, rays.valid, _CENTRE, 0, view)
+        self._cast(rays, world_T_cam, moving, rays.valid, _CENTRE, 0, view)
         found = np.empty(view.ids.size, np.int64)
         edges = found[: find_edges(view.image, view.ids, rays.inner, EDGE_CONTRAST, found)]
-        self._cast(rays, world_T_eye, moving, edges, EDGE_RAYS, 1, view)
+        self._cast(rays, world_T_cam, moving, edges, EDGE_RAYS, 1, view)
         if len(moving.targets):
             shown = ((view.ids >> 4) & 7 == TARGET) & (view.ids >= 0)
             near = cv2.dilate(shown.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
             self._cast(
                 rays,
-                world_T_eye,
+                world_T_cam,
                 moving,
                 np.flatnonzero(near & rays.inner),
                 TARGET_RAYS,
@@ -139,8 +139,8 @@ class Renderer:
 
     def _cast(
         self,
-        rays: Eye,
-        world_T_eye: F64,
+        rays: CameraRays,
+        world_T_cam: F64,
         moving: Moving,
         pixels: I64,
         offsets: F64,
@@ -148,7 +148,7 @@ class Renderer:
         view: View,
     ) -> None:
         """Write flat `pixels` of the view: the mean over rays at `offsets` (K, 2) px and `keep` times the old value."""
-        poses = np.ascontiguousarray(world_T_eye, float).reshape(-1, 4, 4)  # one, or one for each row
+        poses = np.ascontiguousarray(world_T_cam, float).reshape(-1, 4, 4)  # one, or one for each row
         origins = poses[:, :3, 3]
         middle = origins[len(origins) // 2]
         near = _near(self.world, middle, float(np.linalg.norm(origins - middle, axis=1).max()))

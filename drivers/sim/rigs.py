@@ -17,7 +17,7 @@ _T265 = (
 
 
 def fisheye() -> Rig:
-    """848 x 800, Kannala-Brandt, 64 mm, a small rotation between the eyes as factory files have it."""
+    """848 x 800, Kannala-Brandt, 64 mm, a small rotation between the cameras as in factory calibrations."""
     left, right = (KannalaBrandt(848, 800, fx, fy, cx, cy, k) for fx, fy, cx, cy, k in _T265)
     left_T_right = se3.exp(np.array([0.06394, 0.00021, -0.00034, 0.0021, -0.0034, 0.0016]))
     left_T_right[:3, 3] = 0.06394, 0.00021, -0.00034
@@ -26,14 +26,14 @@ def fisheye() -> Rig:
 
 def pinhole() -> Rig:
     """640 x 400, ideal pinholes, 75 mm, rectified."""
-    eye = Pinhole(640, 400, 399.3, 399.3, 321.7, 203.4)
+    camera = Pinhole(640, 400, 399.3, 399.3, 321.7, 203.4)
     left_T_right = np.eye(4)
     left_T_right[0, 3] = 0.075
-    return Rig(eye, eye, left_T_right, name="sim pinhole", serial="sim-640x400")
+    return Rig(camera, camera, left_T_right, name="sim pinhole", serial="sim-640x400")
 
 
 def distorted() -> Rig:
-    """640 x 400 with lens distortion of each eye, 75 mm, not rectified."""
+    """640 x 400 with lens distortion of each camera, 75 mm, not rectified."""
     left = RadTan(640, 400, 401.2, 401.6, 318.9, 204.8, (-0.092, 0.061, 0.0004, -0.0007, -0.012))
     right = RadTan(640, 400, 400.4, 400.7, 322.3, 199.1, (-0.090, 0.058, -0.0003, 0.0005, -0.011))
     left_T_right = se3.exp(np.array([0.0, 0.0, 0.0, -0.0018, 0.0042, 0.0027]))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereo_sfm.drivers.sim.render import Eye
+from stereo_sfm.drivers.sim.render import CameraRays
 from stereo_sfm.types import F32, F64, Bool
 
 BELOW_M = 0.22  # from the left camera down to the robot's top
@@ -20,12 +20,12 @@ CELL_M = 0.02  # of the pattern on both: screws, scratches, labels
 class RobotView:
     """What one camera sees of the robot."""
 
-    def __init__(self, eye: Eye, left_T_camera: F64, reach: tuple[float, float]) -> None:
+    def __init__(self, camera: CameraRays, left_T_camera: F64, reach: tuple[float, float]) -> None:
         """Args:
-        eye: the camera's rays. left_T_camera: (4, 4) its pose in the left camera. reach: radians from the left
+        camera: the camera's rays. left_T_camera: (4, 4) its pose in the left camera. reach: radians from the left
             camera's axis down to its last row, and to the side to its last column.
         """
-        rays = np.nan_to_num(eye.grid, nan=0.0) @ left_T_camera[:3, :3].T
+        rays = np.nan_to_num(camera.grid, nan=0.0) @ left_T_camera[:3, :3].T
         centre = left_T_camera[:3, 3]
         top = _hit(rays, centre, 1, BELOW_M)
         ahead = BELOW_M / np.tan(TOP_BEGINS * reach[0])

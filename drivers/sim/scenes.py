@@ -1,4 +1,4 @@
-"""Named scenes: a store's plan, a route through it, who else is there, and what the sensor does."""
+"""Named scenes: a store's floor plan, a route through it, people, and the sensor's effects."""
 
 from __future__ import annotations
 
@@ -7,23 +7,23 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from stereo_sfm.drivers.sim.drives import FORWARD, Gait
 from stereo_sfm.drivers.sim.effects import Effects
-from stereo_sfm.drivers.sim.people import Looks, Person
-from stereo_sfm.drivers.sim.walks import FORWARD, Gait
+from stereo_sfm.drivers.sim.people import Appearance, Person
 from stereo_sfm.drivers.sim.world import CLOTHES, HAIR, Layout
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64
 
-Route = Callable[[Layout, int, bool], F64]  # (layout, walk number, returns) -> polyline (N, 2) metres
+Route = Callable[[Layout, int, bool], F64]  # (layout, session number, returns) -> polyline (N, 2) metres
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything about a simulated recording that its name decides."""
+    """The part of a simulated recording that its name determines."""
 
     layout: Layout
     route: Route
-    length: float  # metres walked, if the route is as long
+    length: float  # metres driven, if the route is as long
     effects: Effects = field(default_factory=Effects)
     gait: Gait = field(default_factory=Gait)
     people: int = 0
@@ -34,9 +34,9 @@ def _ends(layout: Layout) -> tuple[float, float]:
     return layout.margin - 1.3, layout.margin + layout.gondola_length + 1.3
 
 
-def _aisle(layout: Layout, walk: int, returns: bool) -> F64:
+def _aisle(layout: Layout, session: int, returns: bool) -> F64:
     """Down one aisle; back up the same aisle when it returns."""
-    k = 1 + walk % (layout.gondolas - 1)
+    k = 1 + session % (layout.gondolas - 1)
     a, b = _ends(layout)
     y = layout.aisle_y(k)
     down = [(a, y), (b, y)]
@@ -44,23 +44,23 @@ def _aisle(layout: Layout, walk: int, returns: bool) -> F64:
     return np.array(down + back)
 
 
-def _loop(layout: Layout, walk: int, returns: bool) -> F64:
-    """Round and round one gondola, begun in the middle of an aisle."""
-    k = walk % layout.gondolas if walk else 1
+def _loop(layout: Layout, session: int, returns: bool) -> F64:
+    """Laps around one gondola, starting in the middle of an aisle."""
+    k = session % layout.gondolas if session else 1
     a, b = _ends(layout)
     y0, y1 = layout.aisle_y(k), layout.aisle_y(k + 1)
-    x = a + (b - a) * (0.3 + 0.13 * (walk % 4))
+    x = a + (b - a) * (0.3 + 0.13 * (session % 4))
     lap = [(b, y0), (b, y1), (a, y1), (a, y0)]
-    if walk % 2:  # the other way round
+    if session % 2:  # the other direction
         lap = [(a, y0), (a, y1), (b, y1), (b, y0)]
     return np.array([(x, y0), *(lap * (12 if returns else 1)), (x, y0)])
 
 
-def _serpentine(layout: Layout, walk: int, returns: bool) -> F64:
-    """Up and down every inner aisle in turn; then over to the first two again when it returns."""
+def _serpentine(layout: Layout, session: int, returns: bool) -> F64:
+    """Along every inner aisle in turn; then along the first two again when it returns."""
     a, b = _ends(layout)
     aisles = list(range(1, layout.gondolas))
-    if walk % 2:
+    if session % 2:
         aisles.reverse()
     points: list[tuple[float, float]] = []
     x = a
@@ -113,6 +113,6 @@ def crowd(scene: Scene, count: int, rng: np.random.Generator) -> list[Person]:
         shirt, trousers = rng.choice(CLOTHES, 2, replace=False)
         hair = HAIR + int(rng.integers(2))
         speed, phase = float(rng.uniform(0.5, 1.2)), float(rng.uniform(0, 20))
-        looks = Looks(float(rng.uniform(1.55, 1.9)), int(shirt), int(trousers), hair)
-        out.append(Person(start, end, speed, phase, looks))
+        appearance = Appearance(float(rng.uniform(1.55, 1.9)), int(shirt), int(trousers), hair)
+        out.append(Person(start, end, speed, phase, appearance))
     return out

@@ -1,4 +1,4 @@
-"""Shelves and what stands on them: rows of facings, several of each product side by side, stacked and set back."""
+"""Shelves and their products: rows of facings, several of each product side by side, stacked and set back."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from stereo_sfm.drivers.sim.tables import Builder
 
 @dataclass(frozen=True)
 class Product:
-    """A carton: metres, and its pictures."""
+    """A carton: its size in metres and its textures."""
 
     wide: float
     high: float
@@ -26,7 +26,7 @@ class Product:
 
 @dataclass(frozen=True)
 class Shop:
-    """What every shelf of a store shares."""
+    """Common to all shelves of a store."""
 
     products: list[Product]
     rails: list[int]  # textures
@@ -36,10 +36,10 @@ class Shop:
     stock: np.random.Generator  # how full the shelves are
     changes: np.random.Generator  # which product rows are exchanged
     exchange: float  # fraction of product rows
-    fill: float  # fraction of product rows that are there
-    order: np.random.Generator  # which facings are sold out, and how far the others stand back
+    fill: float  # fraction of product rows that are present
+    order: np.random.Generator  # which facings are sold out, and how far the others are set back
     gaps: float  # fraction of facings that are sold out
-    setback: float  # metres, the most that a product row stands back
+    setback: float  # metres, largest setback of a product row
 
 
 def make_products(rng: np.random.Generator, atlas: Atlas, count: int) -> list[Product]:
@@ -69,10 +69,10 @@ def _facing(shop: Shop, p: Product, rows: int, deep: float, floor: float) -> lis
 
 
 def _disorder(shop: Shop, boxes: list[float], back: float, deep: float, floor: float) -> list[float]:
-    """The boxes of a facing as customers leave it: sold out, or set back by about `back` metres."""
-    gone, shift = shop.order.random(2)
+    """The boxes of a facing, sold out or set back by about `back` metres."""
+    sold_out, shift = shop.order.random(2)
     front, low_top, up_front, top, *inverses = boxes
-    if gone < shop.gaps:
+    if sold_out < shop.gaps:
         return [front, floor, up_front, floor, *inverses]
     shift = back + 0.06 * shop.setback * float(shift)
     front, up_front = (min(w + shift, deep - 0.03) for w in (front, up_front))
@@ -117,7 +117,7 @@ def _fill_level(
 
 
 def _index_level(b: Builder, first: int, wide: float) -> None:
-    """Bins that say which facing reaches into each BIN metres of a level, and the level's row."""
+    """Bins that map each BIN metres of a level to a facing, and the level's row."""
     last, offset, n = len(b.facings), len(b.bins), int(wide / BIN) + 1
     ends = np.array([row[1] for row in b.facings[first:]])
     found = np.minimum(np.searchsorted(ends, np.arange(n) * BIN, "right"), max(last - first - 1, 0))

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from stereo_sfm.drivers.rig_option import chosen_rig
+from stereo_sfm.drivers.sim.drives import Drive
 from stereo_sfm.drivers.sim.effects import CLEAN, Effects, Sensor, brightness
 from stereo_sfm.drivers.sim.encounters import plan, present
 from stereo_sfm.drivers.sim.inertial import InertialSensor
@@ -21,7 +22,6 @@ from stereo_sfm.drivers.sim.rigs import make_rig
 from stereo_sfm.drivers.sim.robot import RobotView
 from stereo_sfm.drivers.sim.scenes import SCENES, Scene, crowd
 from stereo_sfm.drivers.sim.tables import Tables
-from stereo_sfm.drivers.sim.walks import Walk
 from stereo_sfm.drivers.sim.world import Layout, build_world
 from stereo_sfm.drivers.source import BaseSource, Stamps
 from stereo_sfm.errors import StereoSfmError
@@ -52,20 +52,20 @@ def _effects(scene: Scene, options: SimOptions) -> Effects:
     )
 
 
-def _noise_key(seed: int, frame_id: int, eye: int) -> int:
-    """64 bits that differ for every picture."""
-    return int(np.random.SeedSequence([seed, frame_id, eye]).generate_state(1, np.uint64)[0])
+def _noise_key(seed: int, frame_id: int, side: int) -> int:
+    """64 bits that differ for every image."""
+    return int(np.random.SeedSequence([seed, frame_id, side]).generate_state(1, np.uint64)[0])
 
 
 class SimSource(BaseSource):
-    """A source (stereo_sfm.drivers.source.Source) whose every frame can also be rendered alone, to the same bits."""
+    """A source (stereo_sfm.drivers.source.Source) that can also render single frames, with the same bits."""
 
     def __init__(self, name: str, scene: Scene, options: SimOptions) -> None:
         self.name = f"sim:{name}"
         self.options = options
         self.live = options.realtime
         self.rig = dataclasses.replace(make_rig(options.camera, options.size), readout_s=options.readout)
-        self._camera = self.rig  # as it is, whatever calibration is used instead
+        self._camera = self.rig  # the true rig, also if another calibration is used
         self.layout = scene.layout
         self.effects = _effects(scene, options)
         self._dark = options.dark
@@ -74,26 +74,26 @@ class SimSource(BaseSource):
         )
         route = scene.route(scene.layout, options.walk, options.returns)
         rng = np.random.default_rng([options.seed, options.walk, 31])
-        self.walk = Walk(route, gait, rng, options.length or scene.length)
+        self.drive = Drive(route, gait, rng, options.length or scene.length)
         self._inertial = None
         if options.imu:
             seeds = np.random.default_rng([options.seed, options.walk, 83])
-            self._inertial = InertialSensor(options.imu, self.walk, seeds, options.imu_offset_ms * 1e-3)
+            self._inertial = InertialSensor(options.imu, self.drive, seeds, options.imu_offset_ms * 1e-3)
             self.rig = self._camera = dataclasses.replace(self.rig, imu=self._inertial.imu)
         count = scene.people if options.people < 0 else options.people
         self.people = crowd(scene, count, np.random.default_rng([options.seed, 47]))
-        self.encounters = plan(options.encounters, self.walk, np.random.default_rng([options.seed, options.walk, 71]))
+        self.encounters = plan(options.encounters, self.drive, np.random.default_rng([options.seed, options.walk, 71]))
         self._choose_frames()
         self._renderer: Renderer | None = None
-        self._glimpse: Renderer | None = None  # small, for `moving_share`
+        self._small_renderer: Renderer | None = None  # for `moving_share`
         self._sensors: list[Sensor] = []
 
     def _choose_frames(self) -> None:
-        """Which frames arrive, and the truth at them."""
+        """Select the frames that arrive, and their ground truth."""
         o = self.options
-        total = int(self.walk.duration * o.rate) + 1
+        total = int(self.drive.duration * o.rate) + 1
         if o.start >= total:
-            raise StereoSfmError(f"sim: start={o.start} is beyond the walk's {total} frames")
+            raise StereoSfmError(f"sim: start={o.start} is beyond the scene's {total} frames")
         last = min(total, o.start + o.frames) if o.frames else total
         ids = np.arange(o.start, last)
         if self.effects.drop > 0:
@@ -103,7 +103,7 @@ class SimSource(BaseSource):
         self.frame_ids = ids
         self.frame_count = len(ids)
         self.ground_truth = Trajectory(
-            np.array([self.stamp_ns(int(k)) for k in ids], np.int64), self.walk.poses(ids / o.rate)
+            np.array([self.stamp_ns(int(k)) for k in ids], np.int64), self.drive.poses(ids / o.rate)
         )
 
     def stamp_ns(self, frame_id: int) -> int:
@@ -117,7 +117,7 @@ class SimSource(BaseSource):
 
     @property
     def renderer(self) -> Renderer:
-        """Made when first needed: its rays take a while."""
+        """Created when first needed."""
         if self._renderer is None:
             self._renderer = Renderer(self.world, self._camera)
             self._sensors = self._make_sensors(self._renderer)
@@ -129,57 +129,60 @@ class SimSource(BaseSource):
         down, side = np.nan_to_num(np.arccos(camera.unproject(ends)[:, 2]), nan=np.pi / 2)
         return [
             Sensor(
-                eye,
+                rays,
                 self.effects,
-                RobotView(eye, poses[k], (down, side)) if self.options.robot else None,
+                RobotView(rays, poses[k], (down, side)) if self.options.robot else None,
                 np.random.default_rng([self.options.seed, k, 101]),
             )
-            for k, eye in enumerate(renderer.eyes)
+            for k, rays in enumerate(renderer.cameras)
         ]
 
     def pose(self, frame_id: int) -> F64:
         """world_T_cam0 (4, 4) of a frame."""
-        return self.walk.poses(np.array([frame_id / self.options.rate]))[0]
+        return self.drive.poses(np.array([frame_id / self.options.rate]))[0]
 
     def row_poses(self, frame_id: int) -> F64:
         """world_T_cam0 of the rows of a frame: (H, 4, 4), or (4, 4) where all are exposed at once."""
         if self.options.readout == 0:
             return self.pose(frame_id)
         seconds = self._camera.row_seconds(np.arange(float(self._camera.left.height)))
-        return self.walk.poses(frame_id / self.options.rate + seconds)
+        return self.drive.poses(frame_id / self.options.rate + seconds)
 
     def clean(self, frame_id: int) -> tuple[View, View]:
-        """Brightness, depth and surfaces of a frame without the sensor's faults."""
+        """Brightness, depth and surfaces of a frame without the sensor's effects."""
         return self.view(self.row_poses(frame_id), frame_id / self.options.rate)
 
     def view(self, world_T_cam: F64, seconds: float = 0.0) -> tuple[View, View]:
-        """Brightness, depth and surfaces from a pose (4, 4) or poses of rows (H, 4, 4), people as at `seconds`."""
+        """Brightness, depth and surfaces from a pose (4, 4) or poses of rows (H, 4, 4), with people at `seconds`."""
         things = crowd_at(self.people, seconds) + present(self.encounters, seconds)
         return self.renderer.render(world_T_cam, moving(self.world, things))
 
     def moving_share(self, frame_id: int) -> F64:
-        """Truth: the share of each eye's view (2,) that people and their things take in a frame."""
-        if self._glimpse is None:
+        """Ground truth: the share (2,) of each camera's image that people and their things cover in a frame."""
+        if self._small_renderer is None:
             size = (round(self._camera.left.width / 8), round(self._camera.left.height / 8))
-            self._glimpse = Renderer(self.world, make_rig(self.options.camera, size))
+            self._small_renderer = Renderer(self.world, make_rig(self.options.camera, size))
         seconds = frame_id / self.options.rate
         things = crowd_at(self.people, seconds) + present(self.encounters, seconds)
         if not things:
             return np.zeros(2)
-        views = self._glimpse.render(self.pose(frame_id), moving(self.world, things))
+        views = self._small_renderer.render(self.pose(frame_id), moving(self.world, things))
         return np.array([((view.ids >> 4) & 7 == PERSON)[view.ids >= 0].mean() for view in views])
 
-    def picture(self, world_T_cam: F64, frame_id: int = 0, twist: F64 | None = None) -> StereoImage:
-        """What the sensor gives at any pose, moving by `twist` (6,) a second in camera axes, as that frame.
+    def image_at(self, world_T_cam: F64, frame_id: int = 0, twist: F64 | None = None) -> StereoImage:
+        """The image of a frame from any pose.
 
-        `world_T_cam`: (4, 4), or (H, 4, 4) of the rows.
+        Args:
+            world_T_cam: (4, 4), or (H, 4, 4) of the rows.
+            frame_id: decides time, people and noise.
+            twist: (6,) velocity in camera axes, metres and radians a second; for motion blur.
         """
         o, seconds = self.options, frame_id / self.options.rate
         twist = np.zeros(6) if twist is None else twist
         twists = [twist, se3.adjoint(se3.inverse(self._camera.left_T_right)) @ twist]
         dark = self._dark[0] <= seconds < self._dark[1]
         level = 0.0 if dark else brightness(self.effects, seconds, o.seed)
-        views = self.view(world_T_cam, seconds)  # before the sensors: it makes them
+        views = self.view(world_T_cam, seconds)  # first: it creates the sensors
         left, right = (
             sensor.expose(view, twists[k], level, _noise_key(o.seed, frame_id, k))
             for k, (sensor, view) in enumerate(zip(self._sensors, views, strict=True))
@@ -188,15 +191,15 @@ class SimSource(BaseSource):
         return StereoImage(frame_id, self.stamp_ns(frame_id), left, right, exposure_us=exposure_us, gain=level)
 
     def frame(self, frame_id: int, dropped_before: int = 0) -> StereoImage:
-        """Render one frame of the walk."""
+        """Render one frame."""
         seconds, step = frame_id / self.options.rate, 1e-4
-        before, after = self.walk.poses(np.array([seconds - step, seconds + step]))
+        before, after = self.drive.poses(np.array([seconds - step, seconds + step]))
         twist = se3.log(se3.inverse(before) @ after) / (2 * step)
-        image = self.picture(self.row_poses(frame_id), frame_id, twist)
+        image = self.image_at(self.row_poses(frame_id), frame_id, twist)
         return dataclasses.replace(image, dropped_before=dropped_before, imu=self._sampled(frame_id, dropped_before))
 
     def _sampled(self, frame_id: int, dropped_before: int) -> ImuSamples | None:
-        """Inertial samples since the frame before."""
+        """Inertial samples since the previous frame."""
         if self._inertial is None:
             return None
         begin = (frame_id - 1 - dropped_before) / self.options.rate
@@ -209,7 +212,7 @@ class SimSource(BaseSource):
         return (self.frame(int(k)) for k in self.frame_ids[list(positions)])
 
     def close(self) -> None:
-        """Let go of the renderer's memory."""
+        """Free the renderer's memory."""
         self._renderer, self._sensors = None, []
 
     def __iter__(self) -> Iterator[StereoImage]:
@@ -225,7 +228,7 @@ def open_sim(scene: str, options: SimOptions) -> SimSource:
     """Open `sim:SCENE`; `stereo_sfm.drivers.sim.SCENES` names the scenes.
 
     Raises:
-        StereoSfmError: options that do not go together.
+        StereoSfmError: incompatible options.
     """
     source = SimSource(scene, SCENES[scene], options)
     source.rig = chosen_rig(options.rig, lambda: source.rig)

@@ -28,7 +28,7 @@ class Tables(NamedTuple):
     bins: I64  # (N,) first facing whose cell reaches into a bin of BIN metres
     texels: U8  # (M,)
     textures: I64  # (T, 4) offset, log2 width, log2 height, wraps
-    texture_sizes: F64  # (T, 2) metres, (0, 0) for pictures that stretch
+    texture_sizes: F64  # (T, 2) metres, (0, 0) for images that stretch
     surfaces: I64  # (4 + SKIN + 1,) textures of floor, floor wear, ceiling, walls, then people's clothes, hair, skin
 
 

@@ -1,4 +1,4 @@
-"""Flat pictures of metric size at a pose: calibration boards, posters, walls of dots; alone or inside a store."""
+"""Flat images of metric size at a pose: calibration boards, posters, walls of dots; alone or inside a store."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import numpy as np
 
 from stereo_sfm.drivers.sim import textures
 from stereo_sfm.drivers.sim.atlas import Atlas
-from stereo_sfm.drivers.sim.render import NOTHING, Moving
+from stereo_sfm.drivers.sim.render import NO_OBJECTS, Moving
 from stereo_sfm.drivers.sim.tables import Tables, make_tables
 from stereo_sfm.types import F64, U8
 
 
 @dataclass(frozen=True, eq=False)
-class Target:
-    """A picture on a rectangle.
+class FlatTarget:
+    """An image on a rectangle.
 
-    Its frame: origin at the outer corner of the top-left pixel, x to the right of the picture, y down, z into it (the
-    right-handed continuation), so that a camera in front of it sees it upright with an identity rotation.
+    Its frame: origin at the outer corner of the top-left pixel, x right, y down, z away from the viewer, so that a
+    camera in front of it sees it upright with an identity rotation.
     """
 
     image: U8  # (h, w); sides that are powers of two are used as they are, others are resampled
@@ -40,8 +40,8 @@ def empty_room(extent: tuple[float, float, float] = (12.0, 10.0, 3.6), seed: int
     return make_tables(atlas, extent, surfaces)
 
 
-def place(world: Tables, targets: list[Target], moving: Moving = NOTHING) -> tuple[Tables, Moving]:
-    """The world with the targets' pictures, and the targets added to what moves; move them with `move`."""
+def place(world: Tables, targets: list[FlatTarget], moving: Moving = NO_OBJECTS) -> tuple[Tables, Moving]:
+    """The world with the targets' images, and the moving objects with the targets; `move` moves them."""
     atlas = Atlas(used=len(world.texels))
     for target in targets:
         atlas.add(target.image)
@@ -57,13 +57,13 @@ def place(world: Tables, targets: list[Target], moving: Moving = NOTHING) -> tup
     return world, moving._replace(targets=rows, targets_i=indices)
 
 
-def move(moving: Moving, target: Target, world_T_target: F64, index: int = 0) -> Moving:
-    """Target number `index` at another pose."""
+def move(moving: Moving, target: FlatTarget, world_T_target: F64, index: int = 0) -> Moving:
+    """FlatTarget number `index` at another pose."""
     rows = moving.targets.copy()
     rows[index] = _row(target, world_T_target)
     return moving._replace(targets=rows)
 
 
-def _row(target: Target, world_T_target: F64) -> F64:
+def _row(target: FlatTarget, world_T_target: F64) -> F64:
     rotation, origin = world_T_target[:3, :3], world_T_target[:3, 3]
     return np.concatenate([rotation.ravel(), origin, [target.width, target.height]])

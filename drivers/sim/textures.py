@@ -1,4 +1,4 @@
-"""Procedural pictures of the building: boards, price rails, floor, ceiling, posters, signs, clothes. Grey, seeded."""
+"""Procedural textures of the building: boards, price rails, floor, ceiling, posters, signs, clothes. Grey, seeded."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def wall(rng: np.random.Generator, size: int = 512) -> U8:
 
 
 def poster(rng: np.random.Generator, h: int = 256, w: int = 256) -> U8:
-    """A poster or sign: a frame, a picture, a big word."""
+    """A poster or sign: a frame, an image, a big word."""
     image, ink, paper = background(rng, h, w)
     y0 = int(h * rng.uniform(0.4, 0.6))
     noise = cloud(rng, (h - y0, w), 4, int(rng.integers(4, 12)))

@@ -27,9 +27,9 @@ class Layout:
     shelf_top: float = 1.9
     identical: bool = False
     products: int = 260
-    fill: float = 1.0  # fraction of product rows that are there
+    fill: float = 1.0  # fraction of product rows that are present
     gaps: float = 0.0  # fraction of the single facings that are sold out
-    setback: float = 0.0  # metres, the most that a product row stands back from the shelf's edge
+    setback: float = 0.0  # metres, largest setback of a product row from the shelf's edge
 
     @property
     def room(self) -> tuple[float, float, float]:
@@ -96,8 +96,8 @@ def _walls(b: Builder, shop: Shop, seed: tuple[int, ...], layout: Layout) -> Non
             is_door = plan.random() < 0.2
             wide, high = (0.95, 2.1) if is_door else (float(plan.uniform(0.7, 1.5)), float(plan.uniform(0.8, 1.5)))
             z = 0.0 if is_door else float(plan.uniform(0.7, 1.4))
-            picture = textures.door(plan) if is_door else textures.poster(plan, int(high * 260), int(wide * 260))
-            k = b.atlas.add(picture)
+            image = textures.door(plan) if is_door else textures.poster(plan, int(high * 260), int(wide * 260))
+            k = b.atlas.add(image)
             b.solid((min(x, x + inside), y, z), (max(x, x + inside), y + wide, z + high), [k] * 6)
             y += wide + float(plan.uniform(0.15, 0.7))
         b.end_group(first)
@@ -111,10 +111,10 @@ def _furniture(b: Builder, shop: Shop, seed: tuple[int, ...], layout: Layout) ->
     first = len(b.blocks)
     for k in range(layout.gondolas + 1):
         number = 1 if layout.identical else k + 1
-        picture = b.atlas.add(textures.sign(number, np.random.default_rng([*seed, 4, number])))
+        texture = b.atlas.add(textures.sign(number, np.random.default_rng([*seed, 4, number])))
         for x in (layout.margin + 0.6, x1 - layout.margin - 0.6):
             y = layout.aisle_y(k)
-            b.solid((x - 0.03, y - 0.6, z1 - 1.0), (x + 0.03, y + 0.6, z1 - 0.4), [picture, picture] + [shop.steel] * 4)
+            b.solid((x - 0.03, y - 0.6, z1 - 1.0), (x + 0.03, y + 0.6, z1 - 0.4), [texture, texture] + [shop.steel] * 4)
     b.end_group(first)
     for x in (0.55, x1 - 0.95):
         first = len(b.blocks)
@@ -136,7 +136,7 @@ def build_world(layout: Layout | None = None, seed: int = 0, exchange: float = 0
 
     Args:
         layout: its plan. seed: products, labels and stock.
-        exchange: fraction of the product rows whose product is another one than in the same store with 0.
+        exchange: fraction of the product rows with another product than at 0.
     """
     layout = layout or Layout()
     b, root = Builder(), (seed, 17)

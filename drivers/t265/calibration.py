@@ -19,10 +19,10 @@ from stereo_sfm.types import F64
 
 _BASELINE_M = (0.060, 0.068)
 _MAX_TILT_DEG = 2.0
-LEAST_DENSITY = 1e-6  # a camera without known variances states 0
+MIN_DENSITY = 1e-6  # a camera without known variances states 0
 
 
-def eye(intrinsics: CameraIntrinsics) -> KannalaBrandt:
+def camera_model(intrinsics: CameraIntrinsics) -> KannalaBrandt:
     """The camera model of one camera.
 
     Raises:
@@ -53,7 +53,7 @@ def rig(
         raise DeviceFault(f"invalid factory extrinsics of the T265: right camera at {np.round(baseline * 1e3, 1)} mm")
     if tilt > _MAX_TILT_DEG:
         raise DeviceFault(f"invalid factory extrinsics of the T265: cameras {tilt:.1f} degrees from parallel")
-    return Rig(eye(left), eye(right), left_T_right, _rigid(body_T_left), name=name, serial=serial)
+    return Rig(camera_model(left), camera_model(right), left_T_right, _rigid(body_T_left), name=name, serial=serial)
 
 
 def imu(body_T_left: F64, body_T_gyro: F64, gyro: MotionIntrinsics, accel: MotionIntrinsics) -> Imu:
@@ -72,7 +72,7 @@ def imu(body_T_left: F64, body_T_gyro: F64, gyro: MotionIntrinsics, accel: Motio
 
 def _density(variance: F64, rate_hz: float) -> float:
     """Noise density from the variance (3,) of one sample."""
-    return max(float(np.sqrt(variance.mean() / rate_hz)), LEAST_DENSITY)
+    return max(float(np.sqrt(variance.mean() / rate_hz)), MIN_DENSITY)
 
 
 def _rigid(body_T_sensor: F64) -> F64:

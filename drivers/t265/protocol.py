@@ -53,7 +53,7 @@ def exposure_mode(auto: bool, anti_flicker: m.AntiFlicker) -> bytes:
 
 def set_exposure(exposure_us: int, gain: float) -> bytes:
     """The same manual exposure for both cameras."""
-    entries = b"".join(struct.pack("<B3xIf", eye, exposure_us, gain) for eye in (Sensor.LEFT, Sensor.RIGHT))
+    entries = b"".join(struct.pack("<B3xIf", side, exposure_us, gain) for side in (Sensor.LEFT, Sensor.RIGHT))
     return request(Id.SET_EXPOSURE, struct.pack("<BB", 2, 0) + entries)
 
 

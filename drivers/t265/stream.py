@@ -69,13 +69,13 @@ class Stream:
     def stop(self, camera_alive: bool = True) -> None:
         """Stop streaming and the threads. A responding camera gets the command and some time to confirm."""
         if camera_alive:
-            for said in self._stopped:
-                said.clear()
+            for stopped in self._stopped:
+                stopped.clear()
             self._goodbye.set()
             with contextlib.suppress(DeviceError):
                 self._camera.stop()
-                for said in self._stopped:
-                    said.wait(_STOP_S)
+                for stopped in self._stopped:
+                    stopped.wait(_STOP_S)
         self._join()
 
     def _join(self) -> None:
@@ -112,8 +112,10 @@ class Stream:
             self._take_status(message, self._stopped[0])
             return False
         side = LEFT if message.sensor == Sensor.LEFT else RIGHT
-        eye = CameraImage(message.stamp_ns, message.frame_id, message.pixels, float(message.exposure_us), message.gain)
-        pair = self._pairer.push(side, eye) if self._pairer else None
+        image = CameraImage(
+            message.stamp_ns, message.frame_id, message.pixels, float(message.exposure_us), message.gain
+        )
+        pair = self._pairer.push(side, image) if self._pairer else None
         if pair is not None:
             self.pairs.put(pair, weight=1 + pair.dropped_before)
         return True

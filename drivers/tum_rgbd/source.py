@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.drivers.folder_source import FolderSource, Shot, folder_of, need
+from stereo_sfm.drivers.folder_source import FolderSource, FrameFiles, folder_of, need
 from stereo_sfm.drivers.ground_truth import read_tum, stamp_from_seconds
 from stereo_sfm.drivers.image_lists import pair_by_stamp
 from stereo_sfm.drivers.options import SourceOptions
@@ -47,18 +47,18 @@ def open_tum_rgbd(path: str, options: SourceOptions) -> FolderSource:
         log.warning(
             "tum_rgbd:%s: %d of %d colour images have no depth image", label, len(colour) - len(pairs), len(colour)
         )
-    shots = [Shot(colour[i][0], colour[i][1], depth=depth[j][1]) for i, j in pairs]
+    frames = [FrameFiles(colour[i][0], colour[i][1], depth=depth[j][1]) for i, j in pairs]
     truth = folder / "groundtruth.txt"
     return FolderSource(
         f"tum_rgbd:{label}",
-        with_virtual_eye(chosen_rig(options.rig, lambda: _own_rig(folder, label))),
-        shots,
+        with_virtual_camera(chosen_rig(options.rig, lambda: _own_rig(folder, label))),
+        frames,
         read_tum(truth) if truth.is_file() else None,
         DEPTH_SCALE,
     )
 
 
-def with_virtual_eye(rig: Rig) -> Rig:
+def with_virtual_camera(rig: Rig) -> Rig:
     """The rig of a colour camera with depth: with a virtual right camera of the same lens."""
     if rig.depth and rig.stereo:
         return rig

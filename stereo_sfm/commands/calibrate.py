@@ -85,9 +85,9 @@ def run(args: argparse.Namespace) -> int:
     write_report(report, str(options.source), calibration, quality, views, kept[:: max(1, len(kept) // 3)][:3])
     for finding in quality.findings:
         print(f"  {VERDICTS[finding.level]}  {finding.name}: {finding.text}")
-    for eye, view in zip(("left", "right"), views, strict=True):
+    for side, view in zip(("left", "right"), views, strict=True):
         for advice in view.advice:
-            print(f"  {eye} eye: {advice}")
+            print(f"  {side} camera: {advice}")
     print(f"verdict: {VERDICTS[quality.level]}, rig {options.output}, report {report}")
     return 3 if VERDICTS[quality.level] == "FAIL" else 0
 

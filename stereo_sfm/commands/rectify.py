@@ -37,8 +37,8 @@ def run(args: argparse.Namespace) -> int:
     import numpy as np
 
     from stereo_sfm.calib import load_rig, save_rig
+    from stereo_sfm.calib.drawing import side_by_side
     from stereo_sfm.calib.matches import match_pair
-    from stereo_sfm.calib.pictures import side_by_side
     from stereo_sfm.calib.rectification import rectify
     from stereo_sfm.drivers.source import open_source
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from stereo_sfm.drivers.live.counters import TROUBLE
+from stereo_sfm.drivers.live.counters import LOSSES
 from stereo_sfm.eval.calibration_results import calibration_lines, calibration_stats, row_error_stats
 from stereo_sfm.eval.evaluate import Evaluation, length
 from stereo_sfm.eval.record import RunRecord
@@ -169,8 +169,8 @@ def _lost(stats: dict[str, Any]) -> str:
 
 def _camera(counts: dict[str, float]) -> str:
     """Problems of a live camera by its own counters."""
-    trouble = [f"{name.replace('_', ' ')} {count:g}" for name, count in counts.items() if count and name in TROUBLE]
-    return f"camera: {counts.get('pairs', 0):g} stereo images, {', '.join(trouble) or 'nothing lost'}"
+    losses = [f"{name.replace('_', ' ')} {count:g}" for name, count in counts.items() if count and name in LOSSES]
+    return f"camera: {counts.get('pairs', 0):g} stereo images, {', '.join(losses) or 'nothing lost'}"
 
 
 def _loops(stats: dict[str, Any]) -> str:

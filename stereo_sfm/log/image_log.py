@@ -128,11 +128,11 @@ class ImageLog:
 
     def _pixels(self, logged: LoggedImage) -> None:
         pair = logged.image
-        eyes = (
+        channels = (
             (topics.LEFT_IMAGE, "cam0", pair.left, logged.left),
             (topics.RIGHT_IMAGE, "cam1", pair.right, logged.right),
         )
-        for topic, frame, pixels, data in eyes:
+        for topic, frame, pixels, data in channels:
             if pixels is None or data is None:
                 continue
             message = image_message(data, (pixels.shape[1], pixels.shape[0]), logged.format, frame)

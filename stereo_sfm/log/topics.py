@@ -106,7 +106,7 @@ TABLE: tuple[Topic, ...] = (
     Topic(KEYFRAME, Keyframe, "every keyframe"),
     Topic(MAP_UPDATE, MapUpdate, "every keyframe: the mapper's answer"),
     Topic(CALIBRATION, CalibrationUpdate, "when the rig corrects itself, or would"),
-    Topic(ROW_ERRORS, RowErrors, "every keyframe of two eyes: how well the rig fits, by region, and the trend"),
+    Topic(ROW_ERRORS, RowErrors, "every keyframe of a stereo camera: row errors by region, and their trend"),
     Topic(LOOP, LoopResult, "every keyframe: the loop closer's answer, with reasons"),
     Topic(POINTS, "foxglove.PointCloud", "the whole map, at most every few seconds and at the end"),
     Topic(TRAJECTORY, "foxglove.PosesInFrame", "all keyframes, at most every second and at the end"),

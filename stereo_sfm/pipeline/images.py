@@ -39,9 +39,9 @@ class ImageLayout:
     def of(rig: Rig) -> ImageLayout:
         """What this rig's images need."""
         left = (rig.left.height, rig.left.width)
-        eyes = rig.right is not None and not rig.depth
-        assert rig.right is not None or not eyes
-        right = (rig.right.height, rig.right.width) if eyes and rig.right is not None else None
+        stereo = rig.right is not None and not rig.depth
+        assert rig.right is not None or not stereo
+        right = (rig.right.height, rig.right.width) if stereo and rig.right is not None else None
         return ImageLayout(left, right, left if rig.depth else None)
 
     @property

@@ -208,7 +208,7 @@ def _describe_source(out: Description, path: Path, rig: Path | None) -> None:
         out.images = rate_of(stamps)
         if listed is not None:
             out.skew_ms = listed.skew_ms if np.isnan(out.skew_ms) else out.skew_ms
-            out.rows += [(name, "samples beside the images", rate_of(times)) for name, times in listed.beside.items()]
+            out.rows += [(name, "samples beside the images", rate_of(times)) for name, times in listed.others.items()]
         if out.kind != "mcap":
             out.metadata["source"] = source.name
             out.seconds = float(stamps[-1] - stamps[0]) / 1e9 if len(stamps) else 0.0

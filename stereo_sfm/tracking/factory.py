@@ -49,11 +49,11 @@ def _tracker(
 
     if not rig.stereo and estimator(method).needs_depth:
         raise StereoSfmError(
-            f"odometry {method} needs two eyes or depth, this camera has one eye: use eight-point or pnp"
+            f"odometry {method} needs two cameras or depth, this source has one camera: use eight-point or pnp"
         )
     if not rig.stereo and method == "eight-point" and config.odometry.scale == "stereo":
         raise StereoSfmError(
-            "one eye has no scale: choose --set odometry.scale=unit (steps of odometry.unit_step_m) or ground-truth"
+            "one camera has no scale: choose --set odometry.scale=unit (steps of odometry.unit_step_m) or ground-truth"
         )
     if method == "pnp" and (config.odometry.monocular or not rig.stereo):
         from stereo_sfm.tracking.features.monocular import MonocularTracker

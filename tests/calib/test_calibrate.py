@@ -1,4 +1,4 @@
-"""Calibration from targets: exact corners, noisy corners, rendered boards, real pictures, and the command."""
+"""Calibration from targets: exact corners, noisy corners, rendered boards, real images, and the command."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ RIGS = {"fisheye": ("kb4", 110.0), "distorted": ("pinhole", 45.0)}
 
 
 def corners(rig: Rig, poses: np.ndarray, noise: float, seed: int = 0) -> tuple[list[Detection], list[Detection]]:
-    """What both eyes would detect without pictures."""
+    """What both cameras would detect without images."""
     rng = np.random.default_rng(seed)
     out: tuple[list[Detection], list[Detection]] = ([], [])
     for pose in poses:
         p = se3.transform(pose, CHARUCO.points)
-        for eye, (camera, q) in enumerate(
+        for side, (camera, q) in enumerate(
             ((rig.left, p), (rig.right, se3.transform(se3.inverse(rig.left_T_right), p)))
         ):
             assert camera is not None
             uv = camera.project(q)
             seen = np.flatnonzero(camera.inside(uv, 3))
-            out[eye].append(Detection(seen, uv[seen] + noise * rng.standard_normal((len(seen), 2))))
+            out[side].append(Detection(seen, uv[seen] + noise * rng.standard_normal((len(seen), 2))))
     return out
 
 
@@ -149,7 +149,7 @@ def test_aprilgrid_layout_is_kalibrs(data_root: Path) -> None:
 
 
 def test_command_on_a_few_real_pictures(data_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pictures = tmp_path / "pictures"
+    pictures = tmp_path / "images"
     pictures.mkdir()
     for path in (data_root / "calib_aprilgrid_euroc").glob("*.jpg"):
         if int(path.stem.split("_")[0]) % 3 == 0:

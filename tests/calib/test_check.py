@@ -112,15 +112,15 @@ def test_a_still_camera_does_not_show_the_focal_length_of_both_eyes() -> None:
     for factor in (1.0, 1.02, 0.98):
         rig = magnified(RIGS["pinhole"], factor, factor)
         report = check(rig, rectify(rig), still)
-        both = finding(report, "focal length, both eyes")
+        both = finding(report, "focal length, both cameras")
         assert not both.judged and both.level == 0 and "move the camera" in both.text
     one = magnified(RIGS["pinhole"], 1.02, 1)
-    assert finding(check(one, rectify(one), still), "focal length, right against left").level == 2
+    assert finding(check(one, rectify(one), still), "focal length, right relative to left").level == 2
 
 
 def test_one_window_does_not_show_the_focal_length_of_both_eyes() -> None:
     rig = magnified(RIGS["pinhole"], 0.98, 0.98)
-    both = [finding(check(rig, rectify(rig), SEEN["pinhole"][:n]), "focal length, both eyes") for n in (1, 2)]
+    both = [finding(check(rig, rectify(rig), SEEN["pinhole"][:n]), "focal length, both cameras") for n in (1, 2)]
     assert [(f.judged, f.level) for f in both] == [(False, 0), (True, 2)]
 
 
@@ -144,7 +144,7 @@ SLOW = [pytest.param(f, marks=pytest.mark.slow) for f in ("euroc_mh01", "t265_of
 
 @pytest.mark.parametrize("folder", ["tum_vi_room1", *SLOW])
 def test_real_recordings(data_root: Path, folder: str) -> None:
-    """benchmarks/check_calib.py tries every axis and both eyes."""
+    """benchmarks/check_calib.py tries every axis and both cameras."""
     with open_source(data_root / folder) as source:
         images, rig = list(source), source.rig
     assert judge(rig, images).verdict == "PASS"
@@ -153,7 +153,7 @@ def test_real_recordings(data_root: Path, folder: str) -> None:
     assert judge(magnified(rig, 1, 1.02), images).verdict == "FAIL"
     if folder in ("euroc_mh01", "kitti"):  # the others hardly move
         for factor in (1.02, 0.98):
-            assert finding(judge(magnified(rig, factor, factor), images), "focal length, both eyes").level == 2
+            assert finding(judge(magnified(rig, factor, factor), images), "focal length, both cameras").level == 2
 
 
 def test_command_verdict_exit_code_and_correction(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -168,10 +168,10 @@ def test_command_verdict_exit_code_and_correction(tmp_path: Path, capsys: pytest
     result = json.loads(capsys.readouterr().out)
     assert result["verdict"] == "FAIL"
     findings = {f["name"]: f for f in result["findings"]}
-    rotation = findings["rotation between the eyes"]
+    rotation = findings["rotation between the cameras"]
     assert rotation["verdict"] == "FAIL" and rotation["value"][0] == pytest.approx(-0.2, abs=0.03)
-    assert findings["focal length, both eyes"]["judged"] is False  # three frames
-    assert findings["focal length, both eyes"]["verdict"] is None
+    assert findings["focal length, both cameras"]["judged"] is False  # three frames
+    assert findings["focal length, both cameras"]["verdict"] is None
     assert load_rig(mended).baseline == pytest.approx(0.075, rel=0.01)
 
 

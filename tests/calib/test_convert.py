@@ -54,7 +54,7 @@ def test_depthai_reads_our_file_in_centimetres(tmp_path: Path) -> None:
     expected = se3.inverse(rig.left_T_right)
     np.testing.assert_allclose(theirs[:3, :3], expected[:3, :3], atol=1e-6)
     np.testing.assert_allclose(theirs[:3, 3], 100 * expected[:3, 3], atol=1e-4)
-    assert theirs[0, 3] < -6  # left to right: the right eye lies on the right
+    assert theirs[0, 3] < -6  # left to right: the right camera lies on the right
     back = load_rig(tmp_path / "oak.json")
     np.testing.assert_allclose(back.left_T_right, rig.left_T_right, atol=1e-12)
 

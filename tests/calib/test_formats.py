@@ -133,7 +133,7 @@ def test_one_eye(tmp_path: Path, name: str) -> None:
 
 def test_kalibr_chain_is_cam1_from_cam0(data_root: Path) -> None:
     rig = read_kalibr(data_root / "tum_vi_room1" / "camchain.yaml")
-    assert rig.left_T_right[0, 3] == pytest.approx(0.10092, abs=1e-4)  # the right eye is on the right
+    assert rig.left_T_right[0, 3] == pytest.approx(0.10092, abs=1e-4)  # the right camera is on the right
     assert rig.baseline == pytest.approx(0.10095, abs=1e-4)
     assert isinstance(rig.left, KannalaBrandt) and rig.left.size == (1024, 1024)
     # the chain and the two T_cam_imu of the same file agree

@@ -16,13 +16,13 @@ from tests.synthetic import pinhole_rig
 SIGMA = np.array([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-4])
 
 
-def said(*values: float) -> Estimate:
+def estimated(*values: float) -> Estimate:
     return Estimate(SIGMA * np.array(values), np.diag(SIGMA**2))
 
 
 def test_a_term_needs_several_sigmas_and_both_halves() -> None:
-    halves = said(8, 3, 8, 0, 0, -9), said(12, 3, -1, 0, 0, -6)
-    choice = choose(said(10, 3, 9, 0, 0, -7), halves)
+    halves = estimated(8, 3, 8, 0, 0, -9), estimated(12, 3, -1, 0, 0, -6)
+    choice = choose(estimated(10, 3, 9, 0, 0, -7), halves)
     assert choice.written.tolist() == [True, False, False, False, False, True]
     assert "10 sigmas" in choice.terms[0].why and "at least 4 required" in choice.terms[1].why
     assert "but the halves" in choice.terms[2].why
@@ -30,7 +30,7 @@ def test_a_term_needs_several_sigmas_and_both_halves() -> None:
 
 
 def test_without_a_second_half_nothing_is_written_and_the_rig_is_the_same() -> None:
-    choice = choose(said(10, 10, 10, 10, 10, 10), ())
+    choice = choose(estimated(10, 10, 10, 10, 10, 10), ())
     assert not choice.written.any()
     assert choice.apply(RIGS["pinhole"]) is RIGS["pinhole"]
 
@@ -65,7 +65,7 @@ def test_only_the_faulty_term_is_written_and_the_common_focal_length_never() -> 
 
 
 def test_a_rolling_shutter_may_pretend_what_motion_shows() -> None:
-    choice = choose(said(10, 10, 10, 10, 10, 10), (said(10, 10, 10, 10, 10, 10),) * 2, rolling=True)
+    choice = choose(estimated(10, 10, 10, 10, 10, 10), (estimated(10, 10, 10, 10, 10, 10),) * 2, rolling=True)
     assert choice.written.tolist() == [True, False, True, False, False, True]
 
 

@@ -311,17 +311,17 @@ def test_an_empty_output_folder_will_do(cli: Run, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("args", "said"),
+    ("args", "message"),
     [
         (("--image-format", "jpeg", "--log", "none"), "--image-format has no effect"),
         (("--image-format", "jpeg"), "--image-format has no effect"),
         (("--set", "odometry.scale=ground-truth"), "odometry.scale has no effect"),
     ],
 )
-def test_options_without_effect_are_a_warning(cli: Run, tmp_path: Path, args: tuple[str, ...], said: str) -> None:
+def test_options_without_effect_are_a_warning(cli: Run, tmp_path: Path, args: tuple[str, ...], message: str) -> None:
     root = make_images(tmp_path / "data", ["0.png", "1.png"])
     _, _, err = cli("run", root, "-o", "out", "--max-lost", 101, *args)
-    assert len([line for line in err.splitlines() if line.startswith("warning: ") and said in line]) == 1
+    assert len([line for line in err.splitlines() if line.startswith("warning: ") and message in line]) == 1
     assert "has no effect" not in cli("run", root, "-o", "other", "--log", "full", "--image-format", "png")[2]
 
 
@@ -483,7 +483,7 @@ def test_a_file_in_the_place_of_the_map_is_told_before_anything_is_computed(cli:
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("line", "message"),
     [
         ("P1: 50 0 32 0 0 50 24 0 0 0 1 0", "baseline of 0 m"),
         ("P1: 50 0 32 -25e12 0 50 24 0 0 0 1 0", "give the extrinsics in metres"),
@@ -492,7 +492,7 @@ def test_a_file_in_the_place_of_the_map_is_told_before_anything_is_computed(cli:
         ("P1: 50 0 nan -25 0 50 24 0 0 0 1 0", "calib"),
     ],
 )
-def test_a_calibration_that_cannot_be(cli: Run, tmp_path: Path, line: str, said: str) -> None:
+def test_a_calibration_that_cannot_be(cli: Run, tmp_path: Path, line: str, message: str) -> None:
     root = make_kitti(tmp_path / "k")
     (root / "sequences" / "00" / "calib.txt").write_text(f"P0: 50 0 32 0 0 50 24 0 0 0 1 0\n{line}\n")
-    assert_one_line(cli("run", root), said)
+    assert_one_line(cli("run", root), message)

@@ -60,7 +60,7 @@ def test_a_rectified_recording_can_be_run(tmp_path: Path) -> None:
 
 
 def test_the_trajectory_is_the_one_of_the_raw_images(tmp_path: Path) -> None:
-    """In other axes (those of the rectified eye) the same walk, to within the error of both."""
+    """In other axes (those of the rectified camera) the same sequence, to within the error of both."""
     assert run(tmp_path / "a", "none") == 0
     assert run(tmp_path / "b", "wide") == 0
     raw, wide = (read_trajectory(tmp_path / name / "trajectory_odom.tum") for name in "ab")

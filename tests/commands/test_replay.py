@@ -94,9 +94,9 @@ def test_the_log_of_a_killed_run_is_compared_as_far_as_it_goes(
         (killed / "run.mcap").write_bytes(data[: int(kept * len(data))])
         capsys.readouterr()
         assert main(["replay", str(killed), "-o", str(tmp_path / f"{name}2"), "--check", "--inline", "-q"]) == 0
-        said = capsys.readouterr().out.splitlines()[-1]
-        assert said.startswith("identical before frame ") and "killed" in said
-        assert int(said.split()[3].rstrip(",")) > 60 * kept - 25
+        message = capsys.readouterr().out.splitlines()[-1]
+        assert message.startswith("identical before frame ") and "killed" in message
+        assert int(message.split()[3].rstrip(",")) > 60 * kept - 25
     assert main(["replay", str(killed), "-o", str(tmp_path / "different"), "--check", "--inline", "-q",
                  "--set", "tracker.max_features=150"]) == 3  # fmt: skip
 

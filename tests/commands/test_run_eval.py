@@ -168,9 +168,9 @@ def test_lost_frames_are_said_and_filled(data_root: Path, tmp_path: Path, capsys
     broken = sorted((folder / "right").iterdir())[17]
     broken.write_bytes(b"x")
     assert main(["run", "--inline", str(folder), "-o", str(tmp_path / "out")]) == 0
-    said = capsys.readouterr().out
-    assert "tracked 20/24 frames (0 dropped by capture, 1 lost before capture), 1 lost interval (max 0." in said
-    assert " s, dark)" in said
+    message = capsys.readouterr().out
+    assert "tracked 20/24 frames (0 dropped by capture, 1 lost before capture), 1 lost interval (max 0." in message
+    assert " s, dark)" in message
     stats = json.loads((tmp_path / "out" / "stats.json").read_text())
     assert stats["states"]["LOST"] == 3 and stats["dropped"] == 1
     assert stats["lost_intervals"][0]["first_frame_id"] == 10 and stats["lost_intervals"][0]["frames"] == 3

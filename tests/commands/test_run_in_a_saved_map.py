@@ -36,7 +36,7 @@ def world_T_map(spec: str = FIRST) -> F64:
 
 
 def errors_in_the_map(run: Path) -> F64:
-    """(N,) metres between the map trajectory of the second walk and the truth in the first walk's frame."""
+    """(N,) metres between the map trajectory of the second sequence and the truth in the first sequence's frame."""
     with open_source(SECOND) as source:
         assert source.ground_truth is not None
         estimate = read_tum(run / "trajectory_map.tum")
@@ -45,7 +45,7 @@ def errors_in_the_map(run: Path) -> F64:
         return np.linalg.norm(estimate.poses[rows, :3, 3] - truth[:, :3, 3], axis=1)
 
 
-def second_walk(tmp_path: Path, store: Path, *options: str) -> int:
+def second_sequence(tmp_path: Path, store: Path, *options: str) -> int:
     given = [
         "--map-in",
         str(store),
@@ -71,32 +71,33 @@ def test_the_map_holds_what_it_is_recognised_by(store: Path, capsys: pytest.Capt
     assert f"{count} corners for place recognition in {len(saved)} keyframes" in capsys.readouterr().out
 
 
-def test_another_walk_is_placed_in_the_map(tmp_path: Path, store: Path) -> None:
-    assert second_walk(tmp_path, store, "--localize-only") == 0
+def test_another_sequence_is_placed_in_the_map(tmp_path: Path, store: Path) -> None:
+    assert second_sequence(tmp_path, store, "--localize-only") == 0
     errors = errors_in_the_map(tmp_path / "run")
     assert len(errors) >= 30 and np.median(errors) < 0.03 and errors.max() < 0.1
 
 
-def test_another_walk_is_joined_with_the_map(tmp_path: Path, store: Path) -> None:
-    assert second_walk(tmp_path, store, "--map-out", str(tmp_path / "both")) == 0
+def test_another_sequence_is_joined_with_the_map(tmp_path: Path, store: Path) -> None:
+    assert second_sequence(tmp_path, store, "--map-out", str(tmp_path / "both")) == 0
     both: SavedMap = load_map(tmp_path / "both")
     assert both.session_ids == [0, 1]
     assert len(both) > len(load_map(store))
     seen_by = [
-        np.unique(both.snapshot.obs_pt[both.sessions[both.snapshot.obs_kf] == walk]) for walk in both.session_ids
+        np.unique(both.snapshot.obs_pt[both.sessions[both.snapshot.obs_kf] == sequence])
+        for sequence in both.session_ids
     ]
     assert len(np.intersect1d(*seen_by)) > 50
     assert np.median(errors_in_the_map(tmp_path / "run")) < 0.03
 
 
 def test_another_tracker_is_placed_in_the_map_as_well(tmp_path: Path, store: Path) -> None:
-    assert second_walk(tmp_path, store, "--localize-only", "--odometry", "r-um", "--features", "orb") == 0
+    assert second_sequence(tmp_path, store, "--localize-only", "--odometry", "r-um", "--features", "orb") == 0
     assert np.median(errors_in_the_map(tmp_path / "run")) < 0.1
 
 
 def test_without_recognition_there_is_no_place(tmp_path: Path, store: Path, capsys: pytest.CaptureFixture[str]) -> None:
     off = ["--set", "mapper.enabled=false", "--set", "loop.enabled=false"]
-    assert second_walk(tmp_path, store, "--localize-only", *off) == 2
+    assert second_sequence(tmp_path, store, "--localize-only", *off) == 2
     assert "set loop.enabled=true" in capsys.readouterr().err
 
 
@@ -105,7 +106,7 @@ def test_a_dark_recording_has_no_map_and_says_that_tracking_never_began(
 ) -> None:
     options = ["--duration", "1", "--inline", "-o", str(tmp_path / "run"), "--map-out", str(tmp_path / "map")]
     assert main(["run", "sim:aisle?size=212x200&rate=10&dark=0-20", *options]) == 4
-    said = capsys.readouterr().err
-    assert "nothing was mapped" in said
-    assert "tracking never initialised" in said
+    message = capsys.readouterr().err
+    assert "nothing was mapped" in message
+    assert "tracking never initialised" in message
     assert not (tmp_path / "map").exists()

@@ -15,24 +15,24 @@ PERIOD_NS = 50_000_000
 START_NS = 1_403_636_579_763_555_584
 
 
-def picture(frame: int, eye: int) -> U8:
-    """(HEIGHT, WIDTH) noise, different for each frame and eye."""
-    rng = np.random.default_rng([frame, eye])
+def picture(frame: int, side: int) -> U8:
+    """(HEIGHT, WIDTH) noise, different for each frame and camera."""
+    rng = np.random.default_rng([frame, side])
     return rng.integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8)
 
 
-def write_images(folder: Path, eye: int, names: list[str]) -> None:
-    """One picture for each name."""
+def write_images(folder: Path, side: int, names: list[str]) -> None:
+    """One image for each name."""
     folder.mkdir(parents=True)
     for i, name in enumerate(names):
-        cv2.imwrite(str(folder / name), picture(i, eye))
+        cv2.imwrite(str(folder / name), picture(i, side))
 
 
 def make_kitti(root: Path, frames: int = FRAMES) -> Path:
     """Data set root with sequence 00; the camera moves 1 m forward a frame."""
     sequence = root / "sequences" / "00"
-    for eye in (0, 1):
-        write_images(sequence / f"image_{eye}", eye, [f"{i:06d}.png" for i in range(frames)])
+    for side in (0, 1):
+        write_images(sequence / f"image_{side}", side, [f"{i:06d}.png" for i in range(frames)])
     (sequence / "calib.txt").write_text("P0: 50 0 32 0 0 50 24 0 0 0 1 0\nP1: 50 0 32 -25 0 50 24 0 0 0 1 0\n")
     (sequence / "times.txt").write_text("".join(f"{i * 0.1:.6e}\n" for i in range(frames)))
     (root / "poses").mkdir()
@@ -43,12 +43,12 @@ def make_kitti(root: Path, frames: int = FRAMES) -> Path:
 def make_euroc(root: Path, frames: int = FRAMES) -> Path:
     """EuRoC folder whose body is 1 m above the camera and looks the other way."""
     stamps = [START_NS + i * PERIOD_NS for i in range(frames)]
-    for eye in (0, 1):
-        camera = root / "mav0" / f"cam{eye}"
-        write_images(camera / "data", eye, [f"{s}.png" for s in stamps])
+    for side in (0, 1):
+        camera = root / "mav0" / f"cam{side}"
+        write_images(camera / "data", side, [f"{s}.png" for s in stamps])
         (camera / "data.csv").write_text("#timestamp [ns],filename\n" + "".join(f"{s},{s}.png\n" for s in stamps))
         (camera / "sensor.yaml").write_text(
-            f"T_BS: {{cols: 4, rows: 4, data: [-1, 0, 0, {-0.1 * eye}, 0, 1, 0, -1, 0, 0, -1, 0, 0, 0, 0, 1]}}\n"
+            f"T_BS: {{cols: 4, rows: 4, data: [-1, 0, 0, {-0.1 * side}, 0, 1, 0, -1, 0, 0, -1, 0, 0, 0, 0, 1]}}\n"
             f"resolution: [{WIDTH}, {HEIGHT}]\ncamera_model: pinhole\nintrinsics: [50, 50, 32, 24]\n"
             "distortion_model: radial-tangential\ndistortion_coefficients: [-0.1, 0.01, 0, 0]\n"
         )
@@ -71,8 +71,8 @@ body_T_left: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 def make_images(root: Path, names: list[str] | None = None) -> Path:
     """left/ and right/ with rig.yaml."""
     names = names or [f"{i}.png" for i in range(12)]
-    for eye, side in enumerate(("left", "right")):
-        write_images(root / side, eye, names)
+    for index, side in enumerate(("left", "right")):
+        write_images(root / side, index, names)
     (root / "rig.yaml").write_text(RIG)
     return root
 
@@ -97,15 +97,15 @@ def make_tum_rgbd(root: Path) -> Path:
 
 
 def make_kapture(root: Path) -> Path:
-    """Full kapture layout: the right eye 0.2 m to the right, both 1 m in front of the rig's origin."""
+    """Full kapture layout: the right camera 0.2 m to the right, both 1 m in front of the rig's origin."""
     sensors = root / "sensors"
     sensors.mkdir(parents=True)
     camera = f"camera, PINHOLE, {WIDTH}, {HEIGHT}, 50, 50, 32, 24"
     (sensors / "sensors.txt").write_text(f"# kapture format: 1.1\na, , {camera}\nb, , {camera}\n")
     (sensors / "rigs.txt").write_text("# r\nrig, a, 1, 0, 0, 0, 0, 0, -1\nrig, b, 1, 0, 0, 0, -0.2, 0, -1\n")
     lines = ["# timestamp, device_id, image_path"]
-    for eye, name in enumerate("ab"):
-        write_images(sensors / "records_data" / name, eye, [f"{i}.png" for i in range(FRAMES)])
+    for side, name in enumerate("ab"):
+        write_images(sensors / "records_data" / name, side, [f"{i}.png" for i in range(FRAMES)])
         lines += [f"{START_NS + i * PERIOD_NS}, {name}, {name}/{i}.png" for i in range(FRAMES)]
     (sensors / "records_camera.txt").write_text("\n".join(lines) + "\n")
     return root
@@ -114,9 +114,9 @@ def make_kapture(root: Path) -> Path:
 def make_kitti_raw(root: Path) -> Path:
     """A date with one drive that goes 1 m east a frame, heading east."""
     drive = root / "2011_09_26_drive_0001_sync"
-    for eye in (0, 1):
-        write_images(drive / f"image_0{eye}" / "data", eye, [f"{i:010d}.png" for i in range(FRAMES)])
-        (drive / f"image_0{eye}" / "timestamps.txt").write_text(
+    for side in (0, 1):
+        write_images(drive / f"image_0{side}" / "data", side, [f"{i:010d}.png" for i in range(FRAMES)])
+        (drive / f"image_0{side}" / "timestamps.txt").write_text(
             "".join(f"2011-09-26 13:02:25.{i}00000001\n" for i in range(FRAMES))
         )
     (root / "calib_cam_to_cam.txt").write_text(

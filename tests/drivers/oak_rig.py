@@ -63,7 +63,7 @@ class FakeOak:
         self.outputs: list[dict[str, Any]] = []
         self.controls: list[Any] = []
         self.projector: list[float] = []
-        self.skip: set[int] = set()  # sequence numbers of the left eye that never come
+        self.skip: set[int] = set()  # sequence numbers of the left camera that never come
 
     def __getattr__(self, name: str) -> Any:
         return getattr(dai, name)

@@ -87,11 +87,11 @@ class BagWriter:
     def imu(self, stamp_ns: int, gyro: F64, accel: F64, topic: str = "/imu/data") -> None:
         """NaN stands for what is not measured."""
         kind, zeros = "sensor_msgs/msg/Imu", np.zeros(9)
-        said = [np.r_[-1.0, np.zeros(8)] if np.isnan(v).any() else zeros for v in (gyro, accel)]
+        covariance = [np.r_[-1.0, np.zeros(8)] if np.isnan(v).any() else zeros for v in (gyro, accel)]
         values = [self._vector(np.nan_to_num(v)) for v in (gyro, accel)]
         level = self.make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
         header = self.header(stamp_ns, FRAMES[2])
-        message = self.make(kind, header, level, zeros, values[0], said[0], values[1], said[1])
+        message = self.make(kind, header, level, zeros, values[0], covariance[0], values[1], covariance[1])
         self.put(topic, kind, message, stamp_ns)
 
     def _vector(self, xyz: F64) -> Any:

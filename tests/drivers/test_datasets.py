@@ -242,12 +242,12 @@ def test_left_and_right_files_in_one_folder(tmp_path: Path) -> None:
 
 def skewed_stereo(root: Path, skew_ns: int, missing: int | None = None) -> Path:
     """Ten pairs 25 ms apart in time, their names the stamps; one right image may be missing."""
-    for eye, side in enumerate(("left", "right")):
+    for index, side in enumerate(("left", "right")):
         (root / side).mkdir()
         for i in range(10):
             if side == "left" or i != missing:
-                name = f"{START_NS + i * 25_000_000 + eye * skew_ns}.png"
-                cv2.imwrite(str(root / side / name), picture(i, eye))
+                name = f"{START_NS + i * 25_000_000 + index * skew_ns}.png"
+                cv2.imwrite(str(root / side / name), picture(i, index))
     (root / "rig.yaml").write_text(RIG)
     return root
 
@@ -332,7 +332,7 @@ def test_a_folder_of_something_else(tmp_path: Path) -> None:
 def test_unreadable_images_are_dropped_and_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     root = make_kitti(tmp_path, frames=6)
     sequence = root / "sequences" / "00"
-    (sequence / "image_0" / "000002.png").write_bytes(b"not a picture")
+    (sequence / "image_0" / "000002.png").write_bytes(b"not a image")
     (sequence / "image_1" / "000003.png").write_bytes(b"")
     with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(root) as source:
         images = list(source)
@@ -407,12 +407,12 @@ def test_pairs_take_the_smallest_difference_first() -> None:
     assert pair_by_stamp([], [1], 5) == []
 
 
-@pytest.mark.parametrize("eye", [0, 1])
+@pytest.mark.parametrize("side", [0, 1])
 def test_a_missing_kitti_image_leaves_the_stamps_of_the_others(
-    eye: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    side: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     root = make_kitti(tmp_path, frames=6)
-    (root / "sequences" / "00" / f"image_{eye}" / "000002.png").unlink()
+    (root / "sequences" / "00" / f"image_{side}" / "000002.png").unlink()
     with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(root) as source:
         stamps = [image.stamp_ns for image in source]
         truth = source.ground_truth
@@ -428,11 +428,11 @@ def test_ground_truth_that_is_not_finite_is_refused(tmp_path: Path) -> None:
         open_source(root)
 
 
-@pytest.mark.parametrize(("text", "said"), [("nan", "not a time"), ("1e99", "too large"), ("x", "not a time")])
-def test_times_that_are_none_are_refused(text: str, said: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("text", "message"), [("nan", "not a time"), ("1e99", "too large"), ("x", "not a time")])
+def test_times_that_are_none_are_refused(text: str, message: str, tmp_path: Path) -> None:
     root = make_kitti(tmp_path)
     (root / "sequences" / "00" / "times.txt").write_text(f"0\n{text}\n0.2\n0.3\n")
-    with pytest.raises(StereoSfmError, match=said):
+    with pytest.raises(StereoSfmError, match=message):
         open_source(root)
 
 

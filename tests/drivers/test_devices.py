@@ -111,8 +111,8 @@ def test_reset_command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFi
 
 def test_udev_rules_cover_all_ids(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["udev", "-q"]) == 0
-    said = capsys.readouterr()
-    assert said.out == udev_rules() and said.err == ""
+    message = capsys.readouterr()
+    assert message.out == udev_rules() and message.err == ""
     rules = [line for line in udev_rules().splitlines() if not line.startswith("#")]
     for vendor, product in (("8087", "0b37"), ("8087", "0af3"), ("03e7", None)):
         fitting = [r for r in rules if f'ATTR{{idVendor}}=="{vendor}"' in r and (product is None or product in r)]

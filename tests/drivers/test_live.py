@@ -19,7 +19,7 @@ PERIOD = 33_333_333
 PIXELS = np.zeros((1, 1), np.uint8)
 
 
-def eye(frame: int, shift_ns: int = 0, counter: int | None = None) -> CameraImage:
+def camera_image(frame: int, shift_ns: int = 0, counter: int | None = None) -> CameraImage:
     return CameraImage(
         1_000_000_000 + frame * PERIOD + shift_ns, frame if counter is None else counter, PIXELS, 1000, 1
     )
@@ -28,7 +28,7 @@ def eye(frame: int, shift_ns: int = 0, counter: int | None = None) -> CameraImag
 @settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_any_losses_and_any_interleaving_are_accounted_for(data: st.DataObject) -> None:
-    """Images of each eye come in order; the eyes interleave within three frames; any of them may be lost."""
+    """Images of each camera come in order; the cameras interleave within three frames; any of them may be lost."""
     frames = 30
     arrivals: list[tuple[float, int, int]] = []
     alive: list[set[int]] = []
@@ -41,7 +41,7 @@ def test_any_losses_and_any_interleaving_are_accounted_for(data: st.DataObject) 
     pairer = Pairer(counters, PERIOD)
     pairs: list[Pair] = []
     for _, side, frame in sorted(arrivals):
-        pair = pairer.push(side, eye(frame, shift_ns=300_000 * side))
+        pair = pairer.push(side, camera_image(frame, shift_ns=300_000 * side))
         if pair is not None:
             pairs.append(pair)
     expected = sorted(alive[LEFT] & alive[RIGHT])
@@ -53,20 +53,20 @@ def test_any_losses_and_any_interleaving_are_accounted_for(data: st.DataObject) 
 def test_without_a_known_rate_losses_go_by_the_counter() -> None:
     counters = Counters()
     pairer = Pairer(counters, 0)
-    pairs = [p for k in (0, 1, 5) for side in (LEFT, RIGHT) if (p := pairer.push(side, eye(k * 3, counter=k)))]
+    pairs = [p for k in (0, 1, 5) for side in (LEFT, RIGHT) if (p := pairer.push(side, camera_image(k * 3, counter=k)))]
     assert [p.dropped_before for p in pairs] == [0, 0, 3]
 
 
 def test_a_one_eyed_camera_is_noticed() -> None:
     counters = Counters()
     pairer = Pairer(counters, PERIOD)
-    assert not any(pairer.push(LEFT, eye(k)) for k in range(40))
+    assert not any(pairer.push(LEFT, camera_image(k)) for k in range(40))
     assert counters["unpaired"] == 10
 
 
 def test_stamps_from_before_the_start_are_refused() -> None:
     pairer = Pairer(counters := Counters(), PERIOD, now_ns=60_000_000_000)
-    assert not any(pairer.push(side, eye(0)) for side in (LEFT, RIGHT))
+    assert not any(pairer.push(side, camera_image(0)) for side in (LEFT, RIGHT))
     assert counters["implausible"] == 2
 
 

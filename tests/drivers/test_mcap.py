@@ -38,12 +38,12 @@ RADTAN = RadTan(W, H, 50.0, 51.0, 31.0, 23.0, (-0.2, 0.05, 0.001, -0.002))
 LEFT_T_RIGHT = se3.exp(np.array([0.12, 0.001, -0.002, 0.01, 0.02, -0.015]))
 
 
-def _pixels(i: int, eye: int) -> U8:
-    return np.random.default_rng(2 * i + eye).integers(0, 256, (H, W), np.uint8)
+def _pixels(i: int, side: int) -> U8:
+    return np.random.default_rng(2 * i + side).integers(0, 256, (H, W), np.uint8)
 
 
-def _raw(i: int, eye: int, frame: str) -> RawImage:
-    return RawImage(frame_id=frame, width=W, height=H, encoding="mono8", step=W, data=_pixels(i, eye).tobytes())
+def _raw(i: int, side: int, frame: str) -> RawImage:
+    return RawImage(frame_id=frame, width=W, height=H, encoding="mono8", step=W, data=_pixels(i, side).tobytes())
 
 
 def _write(
@@ -54,7 +54,7 @@ def _write(
     cameras: Sequence[Camera] = (RADTAN, RADTAN),
     image: Callable[[int, int, str], Any] = _raw,
     transforms: Sequence[tuple[str, str, Any]] = (("left_optical", "right_optical", LEFT_T_RIGHT),),
-    edit: Callable[[int, CameraCalibration], None] = lambda eye, message: None,
+    edit: Callable[[int, CameraCalibration], None] = lambda side, message: None,
     count: int = 6,
     skew_ns: int = 0,
     skip: Sequence[tuple[int, int]] = (),
@@ -62,19 +62,19 @@ def _write(
 ) -> Path:
     """A stereo recording as somebody else may write it."""
     with path.open("wb") as stream, ProtobufWriter(stream) as writer:
-        for eye, topic in enumerate(calibrations):
-            message = foxglove.calibration(cameras[eye], frames[eye], 10**9)
-            edit(eye, message)
+        for side, topic in enumerate(calibrations):
+            message = foxglove.calibration(cameras[side], frames[side], 10**9)
+            edit(side, message)
             writer.write_message(topic, message, 10**9, 10**9)
         if transforms:
             rows = [(parent, child, foxglove.pose(matrix)) for parent, child, matrix in transforms]
             writer.write_message("/tf", foxglove.transforms(10**9, rows), 10**9, 10**9)
         for i in range(count):
-            for eye, topic in enumerate(names):
-                if (i, eye) in skip:
+            for side, topic in enumerate(names):
+                if (i, side) in skip:
                     continue
-                stamp = 10**9 + i * PERIOD_NS + eye * skew_ns
-                message = foxglove.stamp(image(i, eye, frames[eye]), stamp)
+                stamp = 10**9 + i * PERIOD_NS + side * skew_ns
+                message = foxglove.stamp(image(i, side, frames[side]), stamp)
                 writer.write_message(topic, message, stamp + 7_000_000, stamp)  # logged later than taken
         extra(writer)
     return path
@@ -116,9 +116,9 @@ def test_baseline_from_the_projection_matrices(tmp_path: Path) -> None:
         k, d, k, d, (W, H), right_T_left[:3, :3], right_T_left[:3, 3], flags=cv2.CALIB_ZERO_DISPARITY
     )
 
-    def edit(eye: int, message: CameraCalibration) -> None:
-        message.R[:] = out[eye].ravel()
-        message.P[:] = out[2 + eye].ravel()
+    def edit(side: int, message: CameraCalibration) -> None:
+        message.R[:] = out[side].ravel()
+        message.P[:] = out[2 + side].ravel()
 
     with open_source(_write(tmp_path / "a.mcap", transforms=(), edit=edit)) as source:
         np.testing.assert_allclose(source.rig.left_T_right, LEFT_T_RIGHT, atol=1e-9)
@@ -181,9 +181,9 @@ def test_missing_partners_count_as_dropped(tmp_path: Path) -> None:
 def test_compressed_images_and_fisheye_lenses(tmp_path: Path) -> None:
     lens = KannalaBrandt(W, H, 20.0, 20.5, 31.0, 23.0, (0.01, -0.02, 0.003, -0.0004))
 
-    def image(i: int, eye: int, frame: str) -> CompressedImage:
-        data = cv2.imencode(".png", _pixels(i, eye))[1].tobytes()
-        return CompressedImage(frame_id=frame, format="png", data=b"broken" if (i, eye) == (3, 0) else data)
+    def image(i: int, side: int, frame: str) -> CompressedImage:
+        data = cv2.imencode(".png", _pixels(i, side))[1].tobytes()
+        return CompressedImage(frame_id=frame, format="png", data=b"broken" if (i, side) == (3, 0) else data)
 
     path = _write(tmp_path / "a.mcap", cameras=(lens, lens), image=image)
     with open_source(path) as source:
@@ -197,8 +197,8 @@ def test_compressed_images_and_fisheye_lenses(tmp_path: Path) -> None:
 def test_twelve_of_sixteen_bits_become_eight(
     compressed: bool, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def deep(i: int, eye: int, frame: str) -> Any:
-        pixels = _pixels(i, eye).astype(np.uint16) * 16 + 5
+    def deep(i: int, side: int, frame: str) -> Any:
+        pixels = _pixels(i, side).astype(np.uint16) * 16 + 5
         if compressed:
             return CompressedImage(frame_id=frame, format="png", data=cv2.imencode(".png", pixels)[1].tobytes())
         return RawImage(frame_id=frame, width=W, height=H, encoding="mono16", step=2 * W, data=pixels.tobytes())
@@ -213,8 +213,8 @@ def test_twelve_of_sixteen_bits_become_eight(
 
 
 def test_depth_beside_an_image_makes_an_rgbd_source(tmp_path: Path) -> None:
-    def image(i: int, eye: int, frame: str) -> RawImage:
-        if not eye:
+    def image(i: int, side: int, frame: str) -> RawImage:
+        if not side:
             return _raw(i, 0, frame)
         depth = np.full((H, W), 2000 + i, np.uint16)
         depth[0] = 0
@@ -272,11 +272,11 @@ def test_ros_2_file(tmp_path: Path) -> None:
             writer.add_message(channels[topic], stamp, bytes(store.serialize_cdr(message, kind)), stamp)
 
         roi = t["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-        zeros, eye = np.zeros(9), np.eye(3).ravel()
+        zeros, identity = np.zeros(9), np.eye(3).ravel()
         for side in ("left", "right"):
             info = t["sensor_msgs/msg/CameraInfo"](
                 header(10**9, f"{side}_frame"), H, W, "plumb_bob", np.array([*RADTAN.distortion, 0.0]),
-                RADTAN.matrix.ravel(), eye, np.zeros(12), 0, 0, roi,
+                RADTAN.matrix.ravel(), identity, np.zeros(12), 0, 0, roi,
             )  # fmt: skip
             put(f"/{side}/camera_info", "sensor_msgs/msg/CameraInfo", info, 10**9)
         q = se3.quaternion_from_rotation(LEFT_T_RIGHT[:3, :3])
@@ -342,20 +342,20 @@ def test_bad_files_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[st
     nothing = _write(tmp_path / "nothing.mcap", [], [], transforms=())
     assert "no messages at all" in _error(nothing, capsys)
 
-    def video(i: int, eye: int, frame: str) -> CompressedVideo:
+    def video(i: int, side: int, frame: str) -> CompressedVideo:
         return CompressedVideo(frame_id=frame, format="h264", data=b"x")
 
     assert "is video, which is not supported" in _error(_write(tmp_path / "video.mcap", image=video), capsys)
 
 
 def test_bad_calibrations_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    def uncalibrated(eye: int, message: CameraCalibration) -> None:
+    def uncalibrated(side: int, message: CameraCalibration) -> None:
         message.K[0] = 0.0
 
-    def strange(eye: int, message: CameraCalibration) -> None:
+    def strange(side: int, message: CameraCalibration) -> None:
         message.distortion_model = "fisheye62"
 
-    def small(eye: int, message: CameraCalibration) -> None:
+    def small(side: int, message: CameraCalibration) -> None:
         message.width = 32
 
     missing = _write(tmp_path / "a.mcap", calibrations=())
@@ -452,7 +452,7 @@ def test_info_counts_the_images_that_are_missing(tmp_path: Path, capsys: pytest.
 
 
 def _copy_without_right_images(source: Path, path: Path, kept: int) -> None:
-    """The same file, as if the right eye had failed after some images."""
+    """The same file, as if the right camera had failed after some images."""
     from mcap.reader import make_reader
     from mcap.writer import Writer
 
@@ -484,9 +484,9 @@ def _copy_without_right_images(source: Path, path: Path, kept: int) -> None:
 def test_a_clock_that_goes_back_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     def again(writer: ProtobufWriter) -> None:
         for i in range(3):
-            for eye, topic in enumerate(("/stereo/left/image_raw", "/stereo/right/image_raw")):
+            for side, topic in enumerate(("/stereo/left/image_raw", "/stereo/right/image_raw")):
                 stamp = 10**9 + i * PERIOD_NS + PERIOD_NS // 2
-                writer.write_message(topic, foxglove.stamp(_raw(i, eye, "x"), stamp), stamp, stamp)
+                writer.write_message(topic, foxglove.stamp(_raw(i, side, "x"), stamp), stamp, stamp)
 
     path = _write(tmp_path / "a.mcap", count=10, extra=again)
     with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(path):

@@ -15,13 +15,13 @@ def test_images_come_as_they_are() -> None:
         assert source.frame_count == 4
 
 
-def test_a_longer_walk_is_numbered_anew_and_turns_round_at_the_ends() -> None:
+def test_a_longer_sequence_is_numbered_anew_and_turns_round_at_the_ends() -> None:
     images = stereo_images(3, np.random.default_rng(0))
     source = MemorySource(fisheye_rig(), images, count=8, there_and_back=True)
-    walk = list(source)
-    assert [np.flatnonzero([x.left is y.left for y in images]).item() for x in walk] == [0, 1, 2, 1, 0, 1, 2, 1]
-    assert [x.frame_id for x in walk] == list(range(8))
-    assert set(np.diff([x.stamp_ns for x in walk])) == {PERIOD_NS}
-    assert not any(x.dropped_before for x in walk)
+    sequence = list(source)
+    assert [np.flatnonzero([x.left is y.left for y in images]).item() for x in sequence] == [0, 1, 2, 1, 0, 1, 2, 1]
+    assert [x.frame_id for x in sequence] == list(range(8))
+    assert set(np.diff([x.stamp_ns for x in sequence])) == {PERIOD_NS}
+    assert not any(x.dropped_before for x in sequence)
     again = list(MemorySource(fisheye_rig(), images, count=4))
     assert again[3].left is images[0].left and source.frame_count == 8

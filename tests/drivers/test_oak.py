@@ -236,7 +236,7 @@ def test_images_of_another_size_are_refused() -> None:
     assert counters["malformed"] == 1
 
 
-class Eye(dai.node.ThreadedHostNode):  # depthai's own base of host nodes
+class CameraNode(dai.node.ThreadedHostNode):  # depthai's own base of host nodes
     """Sends frames from a thread of depthai; an exception in `run` would abort Python, so there is none."""
 
     def __init__(self, socket: int) -> None:
@@ -256,7 +256,7 @@ class Eye(dai.node.ThreadedHostNode):  # depthai's own base of host nodes
 def test_a_host_only_pipeline_of_depthai() -> None:
     """Real nodes, real threads, real output queues; only the camera is missing."""
     with dai.Pipeline(createImplicitDevice=False) as pipeline:
-        nodes = [pipeline.create(Eye, socket) for socket in (1, 2)]
+        nodes = [pipeline.create(CameraNode, socket) for socket in (1, 2)]
         queues = [n.output.createOutputQueue(maxSize=32, blocking=False) for n in nodes]
         stream, counters = stream_of(*queues)
         stream.start()

@@ -49,7 +49,7 @@ def test_what_is_not_said_is_the_default() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "said"),
+    ("name", "value", "message"),
     [
         ("rate", "0", "option rate=0: it must be a number from 1 to 120"),
         ("rate", "nan", "a number from 1 to 120"),
@@ -65,8 +65,8 @@ def test_what_is_not_said_is_the_default() -> None:
         ("zzz", "1", r"cam has no option 'zzz' \(it has:"),
     ],
 )
-def test_what_does_not_fit_is_one_line(name: str, value: object, said: str) -> None:
-    with pytest.raises(StereoSfmError, match=said) as caught:
+def test_what_does_not_fit_is_one_line(name: str, value: object, message: str) -> None:
+    with pytest.raises(StereoSfmError, match=message) as caught:
         read_options(Some, "cam", {name: value})
     assert "\n" not in str(caught.value)
 

@@ -38,7 +38,7 @@ def videos(tmp_path_factory: pytest.TempPathFactory) -> Path:
         save_rig(source.rig, folder / "rig.yaml")
         size = source.rig.left.size
         codec = cv2.VideoWriter_fourcc(*"MJPG")  # type: ignore[attr-defined]
-        writers = [cv2.VideoWriter(str(folder / f"{eye}.avi"), codec, 30.0, size) for eye in ("left", "right")]
+        writers = [cv2.VideoWriter(str(folder / f"{side}.avi"), codec, 30.0, size) for side in ("left", "right")]
         for image in source:
             assert image.right is not None
             for writer, pixels in zip(writers, (image.left, image.right), strict=True):
@@ -67,13 +67,13 @@ def test_it_is_listed_and_documented_and_its_mistakes_are_one_line(installed: Pa
     assert "webcam:LEFT,RIGHT" in call(installed, videos, "sources").stdout
     assert "images a second" in call(installed, videos, "sources", "webcam").stdout
     assert "webcam" in call(installed, videos, "run", "--help").stdout
-    for source, said in (
+    for source, message in (
         ("webcam:0", "name the left and the right camera"),
         ("webcam:left.avi,right.avi?fsp=3", "webcam has no option 'fsp', did you mean fps?"),
         ("webcam:left.avi,right.avi", "give --rig FILE"),
     ):
         done = call(installed, videos, "record", source, "-o", "none.mcap")
-        assert done.returncode == 2 and said in done.stderr and len(done.stderr.splitlines()) == 1
+        assert done.returncode == 2 and message in done.stderr and len(done.stderr.splitlines()) == 1
 
 
 def test_the_tutorial_shows_the_example_as_it_is() -> None:

@@ -53,8 +53,8 @@ def test_a_typo_is_told_before_anything_heavy_is_loaded() -> None:
         "try: open_source('sim:aile')\nexcept StereoSfmError as error: print(error)\n"
         "print('numba' in sys.modules, 'cv2' in sys.modules)"
     )
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert "unknown scene 'aile', did you mean aisle?" in said and "False False" in said
+    message = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert "unknown scene 'aile', did you mean aisle?" in message and "False False" in message
 
 
 def test_the_scenes_that_can_be_named_are_those_that_there_are() -> None:

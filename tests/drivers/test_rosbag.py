@@ -116,8 +116,8 @@ def test_bad_bags_are_one_line(kind: str, tmp_path: Path, capsys: pytest.Capture
         damaged[at] ^= 0xFF
     for data in (b"", whole[:100], whole[: len(whole) // 3], bytes(damaged)):
         inside.write_bytes(data)
-        said = _error_of(path)
-        assert "\n" not in said and (str(path) in said or len(data) == len(whole))  # flipped pixels are no damage
+        message = _error_of(path)
+        assert "\n" not in message and (str(path) in message or len(data) == len(whole))  # flipped pixels are no damage
     inside.unlink()
     assert main(["info", str(path)]) == StereoSfmError.exit_code
     assert len(capsys.readouterr().err.strip().splitlines()) == 1

@@ -42,7 +42,7 @@ def test_frames_alone_and_in_order_are_the_same_bits() -> None:
     assert not same(in_order[0], in_order[1])
 
 
-def test_seed_walk_and_effects_change_the_pictures() -> None:
+def test_seed_session_and_effects_change_the_pictures() -> None:
     base = small().frame(100)
     changes: list[dict[str, Any]] = [
         {"seed": 1},
@@ -94,12 +94,12 @@ def test_truth_belongs_to_the_frames_that_arrive() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(SCENES))
-@pytest.mark.parametrize("walk", [0, 1])
-def test_walks_are_smooth_and_keep_clear_of_the_shelves(name: str, walk: int) -> None:
+@pytest.mark.parametrize("session", [0, 1])
+def test_drives_are_smooth_and_keep_clear_of_the_shelves(name: str, session: int) -> None:
     scene = SCENES[name]
-    source_walk = small_walk(name, walk)
-    seconds = np.arange(0, source_walk.duration, 0.01)
-    poses = source_walk.poses(seconds)
+    drive = small_drive(name, session)
+    seconds = np.arange(0, drive.duration, 0.01)
+    poses = drive.poses(seconds)
     twist = se3.log(se3.inverse(poses[:-1]) @ poses[1:]) / 0.01
     assert np.linalg.norm(twist[:, :3], axis=1).max() < 1.35
     assert np.rad2deg(np.linalg.norm(twist[:, 3:], axis=1)).max() < 90
@@ -114,18 +114,18 @@ def test_walks_are_smooth_and_keep_clear_of_the_shelves(name: str, walk: int) ->
     assert np.abs(np.linalg.det(poses[:, :3, :3]) - 1).max() < 1e-9
 
 
-def small_walk(name: str, walk: int):
-    """The scene's own walk, without building its store."""
-    from stereo_sfm.drivers.sim.walks import Walk
+def small_drive(name: str, session: int):
+    """The scene's own drive, without building its store."""
+    from stereo_sfm.drivers.sim.drives import Drive
 
     scene = SCENES[name]
-    route = scene.route(scene.layout, walk, True)
-    return Walk(route, scene.gait, np.random.default_rng([0, walk, 31]), scene.length)
+    route = scene.route(scene.layout, session, True)
+    return Drive(route, scene.gait, np.random.default_rng([0, session, 31]), scene.length)
 
 
 def test_loop_comes_back_and_overlaps() -> None:
-    walk = small_walk("loop", 0)
-    poses = walk.poses(np.arange(0, walk.duration, 1 / 30))
+    drive = small_drive("loop", 0)
+    poses = drive.poses(np.arange(0, drive.duration, 1 / 30))
     at, ahead = poses[:, :2, 3], poses[:, :3, 2]
     late = np.arange(len(at)) > 600
     near = np.linalg.norm(at[late][:, None] - at[None, :200], axis=2) < 0.3
@@ -172,7 +172,7 @@ def test_default_is_the_loop() -> None:
 
 
 def test_bundled_recording_is_what_its_command_renders() -> None:
-    """The demo comes from the simulator as it is now: same rig, same truth, same pictures up to JPEG's loss."""
+    """The demo comes from the simulator as it is now: same rig, same truth, same images up to JPEG's loss."""
     recording = Path(__file__).parents[2] / "recordings" / "demo.mcap"
     script = (recording.parent / "make_demo.py").read_text()
     spec = next(line.split('"')[1] for line in script.splitlines() if line.startswith("SOURCE"))
@@ -199,7 +199,7 @@ def test_the_lights_go_out_for_a_while() -> None:
     assert source.frame(0).left.max() > 100 and source.frame(4).left.max() < 30
 
 
-ENCOUNTER_SHARES = {  # kind: least and most share of the fuller eye's view at the fullest moment
+ENCOUNTER_SHARES = {  # kind: least and most share of the fuller camera's view at the fullest moment
     "approach": (0.2, 1.0), "stop": (0.1, 1.0), "cover": (0.85, 1.0), "lens": (0.7, 1.0), "cart": (0.08, 0.8),
     "beside": (0.05, 0.7), "group": (0.2, 0.8),
 }  # fmt: skip
@@ -229,11 +229,11 @@ def test_encounters_come_by_turns_and_from_the_seed() -> None:
         small("loop", encounters="cart,dance")
 
 
-def test_who_walks_beside_keeps_the_distance() -> None:
+def test_a_person_walking_beside_the_robot_keeps_the_distance() -> None:
     source = small("loop", encounters="beside", speed=0.8, length=30.0)
     encounter = source.encounters[0]
     gaps = [
-        float(np.linalg.norm(encounter.at(t)[0].at[:2] - source.walk.poses(np.array([t]))[0, :2, 3]))
+        float(np.linalg.norm(encounter.at(t)[0].at[:2] - source.drive.poses(np.array([t]))[0, :2, 3]))
         for t in np.arange(encounter.begin + 3, encounter.end - 3, 0.5)
     ]
     assert min(gaps) > 0.5 and max(gaps) < 2.2

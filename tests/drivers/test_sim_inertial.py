@@ -1,4 +1,4 @@
-"""The simulated inertial sensor against the exact poses of its walk."""
+"""The simulated inertial sensor against the exact poses of its drive."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ def sampled(source: SimSource, frames: int) -> ImuSamples:
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("begin", [0.5, 5.0])
 def test_integrating_exact_samples_gives_the_pose(seed: int, begin: float) -> None:
-    walk = sim(seed=seed).walk
-    sensor = InertialSensor("ideal", walk, np.random.default_rng(0))
+    drive = sim(seed=seed).drive
+    sensor = InertialSensor("ideal", drive, np.random.default_rng(0))
     dt, n = 1e-4, 30_000  # so fine that the rule of integration does not show
     seconds = begin + (np.arange(n) + 0.5) * dt
     gyro, accel = sensor.exact(seconds)
     motion = preintegrate(np.full(n, dt), gyro, accel, np.zeros(3), np.zeros(3), 1e-4, 1e-3)
     h = 1e-4
-    start, end = walk.poses(np.array([begin, begin + n * dt])) @ sensor.imu.left_T_imu
-    speed = np.diff((walk.poses(begin + np.array([-h, h])) @ sensor.imu.left_T_imu)[:, :3, 3], axis=0)[0] / (2 * h)
+    start, end = drive.poses(np.array([begin, begin + n * dt])) @ sensor.imu.left_T_imu
+    speed = np.diff((drive.poses(begin + np.array([-h, h])) @ sensor.imu.left_T_imu)[:, :3, 3], axis=0)[0] / (2 * h)
     t = motion.seconds
     position = start[:3, 3] + speed * t - [0, 0, 0.5 * GRAVITY * t * t] + start[:3, :3] @ motion.position
     np.testing.assert_allclose(start[:3, :3] @ motion.rotation, end[:3, :3], atol=1e-6)
@@ -63,10 +63,10 @@ def test_samples_arrive_with_the_frame_that_ends_their_interval() -> None:
 
 @pytest.mark.parametrize("name", ["t265", "oak"])
 def test_noise_is_the_data_sheets_and_the_calibration_takes_off_what_it_knows(name: str) -> None:
-    walk, grade = sim().walk, GRADES[name]
+    drive, grade = sim().drive, GRADES[name]
     truth: list[float] = []
     for seed in range(12):
-        sensor = InertialSensor(name, walk, np.random.default_rng(seed))
+        sensor = InertialSensor(name, drive, np.random.default_rng(seed))
         samples = sensor.samples(0.0, 10.0, 0)
         gyro, accel = sensor.imu.correct(samples.gyro, samples.accel)
         exact = sensor.exact(samples.stamp_ns * 1e-9)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.sim.drives import FORWARD
 from stereo_sfm.drivers.sim.effects import CLEAN, Effects, Sensor
 from stereo_sfm.drivers.sim.kernels import BLOCK, FACING, FRONT, PERSON, ROOM, TARGET
 from stereo_sfm.drivers.sim.people import crowd_at, moving
@@ -17,8 +18,7 @@ from stereo_sfm.drivers.sim.render import Renderer, View
 from stereo_sfm.drivers.sim.rigs import CAMERAS, make_rig
 from stereo_sfm.drivers.sim.scenes import SCENES, crowd
 from stereo_sfm.drivers.sim.tables import Tables
-from stereo_sfm.drivers.sim.targets import Target, empty_room, move, place
-from stereo_sfm.drivers.sim.walks import FORWARD
+from stereo_sfm.drivers.sim.targets import FlatTarget, empty_room, move, place
 from stereo_sfm.drivers.sim.world import Layout, build_world
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, U8
@@ -47,9 +47,9 @@ def pose_at(x: float, y: float, heading: float, pitch: float = -0.1) -> F64:
 POSE = pose_at(4.0, SMALL.aisle_y(1) + 0.2, 0.3)
 
 
-def hit_points(rig_eye: Renderer, eye: int, view: View, pose: F64) -> F64:
+def hit_points(renderer: Renderer, side: int, view: View, pose: F64) -> F64:
     """(H, W, 3) in the world."""
-    return se3.transform(pose, rig_eye.eyes[eye].grid * view.depth[..., None])
+    return se3.transform(pose, renderer.cameras[side].grid * view.depth[..., None])
 
 
 def kind_of(view: View) -> np.ndarray:
@@ -65,9 +65,9 @@ def test_rows_of_a_rolling_shutter_see_what_their_own_pose_sees() -> None:
     rolling = r.render(poses)
     for row in (0, 57, 100, height - 1):
         still = r.render(poses[row])
-        for eye in (0, 1):
-            assert np.array_equal(rolling[eye].depth[row], still[eye].depth[row], equal_nan=True)
-            assert np.array_equal(rolling[eye].ids[row], still[eye].ids[row])
+        for side in (0, 1):
+            assert np.array_equal(rolling[side].depth[row], still[side].depth[row], equal_nan=True)
+            assert np.array_equal(rolling[side].ids[row], still[side].ids[row])
 
 
 @pytest.mark.parametrize("camera", sorted(CAMERAS))
@@ -106,7 +106,7 @@ def product_boxes(world: Tables) -> F64:
 
 
 @pytest.mark.parametrize("fill", [1.0, 0.2])
-def test_walking_the_shelves_finds_what_testing_every_box_finds(fill: float) -> None:
+def test_shelf_traversal_finds_the_same_hits_as_testing_every_box(fill: float) -> None:
     world = store() if fill == 1 else build_world(dataclasses.replace(SMALL, fill=fill), seed=3)
     assert fill == 1 or len(world.facings) < 0.4 * len(store().facings)
     boxes = product_boxes(world)
@@ -115,7 +115,7 @@ def test_walking_the_shelves_finds_what_testing_every_box_finds(fill: float) -> 
     for pose in (POSE, pose_at(6.5, SMALL.aisle_y(1), -2.4, 0.3)):
         view = r.view(0, pose)
         shown = np.flatnonzero(view.ids.ravel() >= 0)[::9]
-        rays = r.eyes[0].grid.reshape(-1, 3)[shown] @ pose[:3, :3].T
+        rays = r.cameras[0].grid.reshape(-1, 3)[shown] @ pose[:3, :3].T
         with np.errstate(divide="ignore"):
             a, b = ((boxes[None, :, i : i + 3] - pose[:3, 3]) / rays[:, None] for i in (0, 3))
         enter, leave = np.minimum(a, b).max(2), np.maximum(a, b).min(2)
@@ -128,12 +128,12 @@ def test_walking_the_shelves_finds_what_testing_every_box_finds(fill: float) -> 
 
 @pytest.mark.parametrize("camera", sorted(CAMERAS))
 def test_both_eyes_see_the_same_points(camera: str) -> None:
-    """A left pixel's point, projected by the exact model, is what the right eye sees there: bits of depth agree."""
+    """A left pixel's point, projected by the exact model, is what the right camera sees there: bits of depth agree."""
     r = renderer(camera)
     left, right = r.render(POSE)
     rig: Rig = r.rig
     assert rig.right is not None
-    points = se3.transform(se3.inverse(rig.left_T_right), r.eyes[0].grid * left.depth[..., None])
+    points = se3.transform(se3.inverse(rig.left_T_right), r.cameras[0].grid * left.depth[..., None])
     uv = rig.right.project(points)
     ok = rig.right.inside(uv, 2)
     near = np.round(uv[ok]).astype(int)
@@ -143,11 +143,11 @@ def test_both_eyes_see_the_same_points(camera: str) -> None:
     inverse = look_up(np.nan_to_num(1 / right.depth), uv)
     error = np.abs(inverse[ok] * np.linalg.norm(points[ok], axis=1) - 1)[same]
     assert np.median(error) < 1e-4
-    # Brightness agrees too: lights, textures and filters do not depend on the eye.
+    # Brightness agrees too: lights, textures and filters do not depend on the camera.
     warped = look_up(right.image, uv)
     step = np.abs(warped - left.image)[ok][same]
     assert np.median(step) < 1.0
-    # Mean shift between the eyes, by flow from the exact prediction, along and across the epipolar line.
+    # Mean shift between the cameras, by flow from the exact prediction, along and across the epipolar line.
     shift = _mean_shift(left.image, right.image, left.ids, uv)
     assert np.abs(shift).max() < 0.03
 
@@ -221,7 +221,7 @@ def test_identical_aisles_repeat_products_and_not_the_stock() -> None:
 
 
 def board() -> tuple[U8, F64]:
-    """A chessboard picture (1024, 1024) of one metre, 8 x 8 squares, and its inner corners (49, 3)."""
+    """A chessboard image (1024, 1024) of one metre, 8 x 8 squares, and its inner corners (49, 3)."""
     squares = (np.indices((8, 8)).sum(0) % 2 * 255).astype(np.uint8)
     at = np.arange(1, 8) / 8
     corners = np.stack(np.meshgrid(at, at), -1).reshape(-1, 2)
@@ -232,7 +232,7 @@ def board() -> tuple[U8, F64]:
 def test_corners_of_a_board_are_where_the_model_projects_them(camera: str) -> None:
     picture, corners = board()
     rng, rig = np.random.default_rng(2), make_rig(camera)
-    target = Target(picture, 1.0, 1.0, np.eye(4))
+    target = FlatTarget(picture, 1.0, 1.0, np.eye(4))
     world, moving = place(empty_room(), [target])
     r, world_T_cam, errors = Renderer(world, rig), pose_at(3, 5, 0, 0), list[F64]()
     assert rig.right is not None
@@ -242,15 +242,15 @@ def test_corners_of_a_board_are_where_the_model_projects_them(camera: str) -> No
         views = r.render(world_T_cam, move(moving, target, world_T_cam @ cam_T_board))
         assert (kind_of(views[0]) == TARGET).mean() > 0.05
         poses = (cam_T_board, se3.inverse(rig.left_T_right) @ cam_T_board)
-        for eye, view, eye_T_board in zip((rig.left, rig.right), views, poses, strict=True):
-            uv = eye.project(se3.transform(eye_T_board, corners))
+        for lens, view, lens_T_board in zip((rig.left, rig.right), views, poses, strict=True):
+            uv = lens.project(se3.transform(lens_T_board, corners))
             image = np.rint(np.clip(cv2.GaussianBlur(view.image, (0, 0), 1.0), 0, 255)).astype(np.uint8)
             start = uv.astype(np.float32).reshape(-1, 1, 2).copy()
             found = cv2.cornerSubPix(image, start, (5, 5), (-1, -1), (3, 60, 1e-4))
-            errors.append((found.reshape(-1, 2) - uv)[eye.inside(uv, 10)])
+            errors.append((found.reshape(-1, 2) - uv)[lens.inside(uv, 10)])
     error = np.concatenate(errors)
     assert len(error) > 120
-    assert np.sqrt((error**2).mean()) < 0.03  # what the corner finder itself leaves on exact pictures
+    assert np.sqrt((error**2).mean()) < 0.03  # what the corner finder itself leaves on exact images
     assert np.abs(error.mean(0)).max() < 0.006
 
 
@@ -262,7 +262,7 @@ def _flat_view(r: Renderer, value: float) -> View:
 def test_noise_has_the_stated_variance() -> None:
     r = renderer("pinhole")
     effects = Effects(exposure_s=0, lens_blur_px=0, gain=1, drift=0, vignetting=0, read_noise=1.5, shot_noise=0.05)
-    sensor = Sensor(r.eyes[0], effects)
+    sensor = Sensor(r.cameras[0], effects)
     for value in (20.0, 120.0):
         images = [sensor.expose(_flat_view(r, value), np.zeros(6), 1.0, key).astype(float) for key in (1, 2)]
         expected = 1.5**2 + 0.05 * value + 1 / 12
@@ -274,22 +274,22 @@ def test_noise_has_the_stated_variance() -> None:
 def test_clean_sensor_only_rounds_and_blur_follows_the_motion() -> None:
     r = renderer("pinhole")
     view = r.view(0, POSE)
-    plain = Sensor(r.eyes[0], CLEAN).expose(view, np.ones(6), 1.0, 5)
+    plain = Sensor(r.cameras[0], CLEAN).expose(view, np.ones(6), 1.0, 5)
     assert (plain == np.clip(np.floor(view.image + 0.5), 0, 255)).all()
-    sensor = Sensor(r.eyes[0], Effects(0.02, 0, 1.0, 0, 0, 0, 0, 0))
+    sensor = Sensor(r.cameras[0], Effects(0.02, 0, 1.0, 0, 0, 0, 0, 0))
     assert (sensor.expose(view, np.zeros(6), 1.0, 5) == plain).all()
     turned = sensor.expose(view, np.array([0, 0, 0, 0, 1.0, 0]), 1.0, 5).astype(float)  # yaw: rows blur
     gradient = [[np.abs(np.diff(i.astype(float), axis=a)).mean() for a in (1, 0)] for i in (plain, turned)]
     assert gradient[1][0] < 0.65 * gradient[0][0]
     assert gradient[1][1] > 0.8 * gradient[0][1]
-    # A blurred picture is the mean of the sharp ones along the motion.
+    # A blurred image is the mean of the sharp ones along the motion.
     steps = (np.arange(9) - 4) / 9 * 0.02
     sharp = [r.view(0, POSE @ se3.exp(np.array([0, 0, 0, 0, s, 0]))).image for s in steps]
     inner = np.s_[20:-20, 20:-20]
     assert np.abs(np.clip(np.mean(sharp, 0), 0, 255) - turned)[inner].mean() < 1.5
 
 
-def test_people_walk_and_the_store_stands() -> None:
+def test_people_move_and_the_store_does_not() -> None:
     people = crowd(dataclasses.replace(SCENES["people"], layout=SMALL), 6, np.random.default_rng(0))
     world = store()
     moved = [moving(world, crowd_at(people, t)) for t in (0.0, 1.0)]
@@ -297,12 +297,12 @@ def test_people_walk_and_the_store_stands() -> None:
     assert (shift > 0.2).all() and (shift < 1.6).all()
     alone = moving(world, crowd_at(people[:1], 0.0))
     at = alone.persons[0]
-    eye = pose_at(0.5 * (at[0] + at[3]) - 2.0, 0.5 * (at[1] + at[4]), 0.0)
+    viewpoint = pose_at(0.5 * (at[0] + at[3]) - 2.0, 0.5 * (at[1] + at[4]), 0.0)
     r = renderer("pinhole")
-    with_one, without = r.view(0, eye, alone), r.view(0, eye)
+    with_one, without = r.view(0, viewpoint, alone), r.view(0, viewpoint)
     shown = kind_of(with_one) == PERSON
     assert 0.01 < shown.mean() < 0.5
-    points = hit_points(r, 0, with_one, eye)[shown]
+    points = hit_points(r, 0, with_one, viewpoint)[shown]
     assert (points > at[:3] - 1e-6).all() and (points < at[3:] + 1e-6).all()
     far = cv2.dilate(shown.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
     assert (with_one.image == without.image)[far].all()

@@ -133,7 +133,7 @@ _NAMES += ["split", "garbage", "counters", "busy", "stale"]
         (Faults(split={5: 240_128, 9: 44}), {"dropped": 2, "half_frames": 4}),
         (Faults(garbage=frozenset(range(2, 12))), {"dropped": 0}),
         (Faults(counter_skips=frozenset({5})), {"dropped": 0, "counter_mismatch": 1}),
-        (Faults(busy_answers=2), {"dropped": 0, "busy_retries": 2}),
+        (Faults(busy_replies=2), {"dropped": 0, "busy_retries": 2}),
         (Faults(stale_stopped=True), {"dropped": 0, "segments": 1}),
     ],
     ids=[
@@ -261,7 +261,7 @@ def test_what_cannot_work_says_so_in_one_line(faults: Faults, error: type[Stereo
 
 def test_a_camera_that_stays_busy_is_named_busy() -> None:
     with (
-        open_camera(Faults(busy_answers=99), booted=True, timing={"busy_wait_s": 0.01}) as source,
+        open_camera(Faults(busy_replies=99), booted=True, timing={"busy_wait_s": 0.01}) as source,
         pytest.raises(Busy, match="stays busy"),
     ):
         take(source, 1)

@@ -86,9 +86,9 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     assert firmware.default_path().read_bytes() == BLOB
     assert cli.main(["t265", "firmware", "extract", "x.whl"]) == 2
     assert cli.main(["t265", "firmware", "check"]) == 2  # it is not the real one
-    said = capsys.readouterr()
-    assert "written to" in said.out
-    assert "--overwrite" in said.err and "is not T265 firmware" in said.err
+    message = capsys.readouterr()
+    assert "written to" in message.out
+    assert "--overwrite" in message.err and "is not T265 firmware" in message.err
 
 
 def test_nothing_of_the_firmware_is_in_this_repository() -> None:

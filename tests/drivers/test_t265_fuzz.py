@@ -60,7 +60,7 @@ def answers() -> dict[int, bytes]:
         p.request(Id.GET_TEMPERATURE),
     ):  # fmt: skip
         camera.command(request)
-        out[request[4]] = camera.read_answer(0, camera.generation) or b""
+        out[request[4]] = camera.read_reply(0, camera.generation) or b""
     return out
 
 
@@ -133,8 +133,8 @@ def test_no_wrong_frame_among_damaged_transfers() -> None:
             except p.ProtocolError:
                 continue
             assert isinstance(sample, samples.VideoSample)
-            eye = CameraImage(sample.stamp_ns, sample.frame_id, sample.pixels, sample.exposure_us, sample.gain)
-            pair = pairer.push(LEFT if sample.sensor == Sensor.LEFT else RIGHT, eye)
+            image = CameraImage(sample.stamp_ns, sample.frame_id, sample.pixels, sample.exposure_us, sample.gain)
+            pair = pairer.push(LEFT if sample.sensor == Sensor.LEFT else RIGHT, image)
             if pair is not None:
                 pairs += 1
                 # bits of the stamp below half a period cannot be told from jitter; the pair must be of this moment
@@ -197,12 +197,12 @@ def test_damaged_answers_through_the_link(monkeypatch: pytest.MonkeyPatch) -> No
     bus, rng = SimulatedBus([camera]), random.Random(5)
     link = Link(attached(bus)[0], Timing(command_ms=1))
     good = answers()
-    original = camera.read_answer
+    original = camera.read_reply
 
     def damaged(wait: float, generation: int) -> bytes:
         return damage(original(wait, generation) or good[1], rng)[: m.COMMAND_BUFFER]
 
-    monkeypatch.setattr(camera, "read_answer", damaged)
+    monkeypatch.setattr(camera, "read_reply", damaged)
     began, fine = time.monotonic(), 0
     for _ in range(COUNT // 20):
         try:
@@ -210,7 +210,7 @@ def test_damaged_answers_through_the_link(monkeypatch: pytest.MonkeyPatch) -> No
             fine += status == 0 and len(payload) == 8
         except (DeviceError, p.ProtocolError):
             pass
-        camera._answers.clear()
+        camera._replies.clear()
     assert time.monotonic() - began < 20
     assert fine < COUNT // 40
     link.close()
@@ -220,12 +220,16 @@ def test_lock_follows_a_camera_whose_counter_really_changed() -> None:
     lock = ContinuityFilter(m.PERIOD_NS, None)
     none = np.zeros((1, 1), np.uint8)
 
-    def eye(counter: int, periods: float) -> CameraImage:
+    def camera_image(counter: int, periods: float) -> CameraImage:
         return CameraImage(round(periods * m.PERIOD_NS), counter, none, 1, 1)
 
-    assert all(lock.accept(eye(k, k)) for k in range(3))
-    assert not lock.accept(eye(2, 2))  # a repeated one
-    assert not lock.accept(eye(900, 2.2))
-    assert lock.accept(eye(5, 5))  # two lost
-    assert lock.accept(eye(90, 6))  # the next in time, whatever its counter says
-    assert [lock.accept(eye(k, 500.3 + k)) for k in range(3)] == [False, False, True]  # another clock, consistently
+    assert all(lock.accept(camera_image(k, k)) for k in range(3))
+    assert not lock.accept(camera_image(2, 2))  # a repeated one
+    assert not lock.accept(camera_image(900, 2.2))
+    assert lock.accept(camera_image(5, 5))  # two lost
+    assert lock.accept(camera_image(90, 6))  # the next in time, whatever its counter says
+    assert [lock.accept(camera_image(k, 500.3 + k)) for k in range(3)] == [
+        False,
+        False,
+        True,
+    ]  # another clock, consistently

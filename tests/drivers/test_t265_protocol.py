@@ -12,7 +12,7 @@ from stereo_sfm.drivers.t265 import protocol as p
 from stereo_sfm.drivers.t265 import samples
 from stereo_sfm.drivers.t265.messages import AntiFlicker, Id, Sensor
 
-FISHEYES = [p.StreamProfile(eye, 848, 800, m.PIXEL_FORMAT_Y8, 848, 30, to_host=True) for eye in (0x03, 0x23)]
+FISHEYES = [p.StreamProfile(camera, 848, 800, m.PIXEL_FORMAT_Y8, 848, 30, to_host=True) for camera in (0x03, 0x23)]
 
 GOLDEN = {
     "06 00 00 00 01 00": p.request(Id.GET_DEVICE_INFO),
@@ -71,11 +71,18 @@ def test_device_info() -> None:
 
 
 def test_calibration_messages() -> None:
-    eye = p.decode_camera_intrinsics(
+    camera = p.decode_camera_intrinsics(
         struct.pack("<2I4fI5f", 848, 800, 419.5, 387.0, 286.25, 287.5, 4, -0.5, 0.25, -0.125, 0.0625, 0)
     )
-    assert (eye.width, eye.height, eye.fx, eye.fy, eye.cx, eye.cy) == (848, 800, 286.25, 287.5, 419.5, 387.0)
-    assert eye.distortion == (-0.5, 0.25, -0.125, 0.0625)
+    assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (
+        848,
+        800,
+        286.25,
+        287.5,
+        419.5,
+        387.0,
+    )
+    assert camera.distortion == (-0.5, 0.25, -0.125, 0.0625)
     with pytest.raises(p.ProtocolError, match="lens model 1"):
         p.decode_camera_intrinsics(struct.pack("<2I4fI5f", 848, 800, 1, 1, 1, 1, 1, 0, 0, 0, 0, 0))
     rotation = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])

@@ -207,7 +207,7 @@ def test_settings_are_part_of_a_cell_and_leave_the_names_of_others_alone(tmp_pat
     plain = replace(CELL, settings=("odometry.refine=false", "odometry.inlier_sigmas=0"))
     assert not plain.config().odometry.refine and plain.config().odometry.inlier_sigmas == 0.0
     assert plain.config().odometry.method == "pnp"
-    same = replace(CELL, settings=("odometry.refine=true",))  # as without, but said
+    same = replace(CELL, settings=("odometry.refine=true",))  # the default, given explicitly
     assert len({CELL.file_name, plain.file_name, same.file_name}) == 3
     described = (1, (SIM, "grid", "orb", "pnp", "tracking", 0, 0), asdict(CELL.config()))
     assert hashlib.sha256(repr(described).encode()).hexdigest()[:8] in CELL.file_name  # as before there were settings
@@ -219,7 +219,7 @@ def test_settings_are_part_of_a_cell_and_leave_the_names_of_others_alone(tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "message"),
     [
         (["/no/such/folder"], "no such file or folder: /no/such/folder"),
         ([SIM, "euroc:nowhere"], "no folder nowhere"),
@@ -228,9 +228,9 @@ def test_settings_are_part_of_a_cell_and_leave_the_names_of_others_alone(tmp_pat
     ],
 )
 def test_mistakes_are_told_before_any_cell_runs(
-    words: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    words: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["ablation", *words, "-o", str(tmp_path / "out"), "--features", "orb", "--systems", "none"]) == 2
     lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1 and said in lines[0]
+    assert len(lines) == 1 and message in lines[0]
     assert not (tmp_path / "out").exists()

@@ -15,8 +15,8 @@ from stereo_sfm.types import F64, Trajectory
 SEED = 5
 
 
-def noisy_walk(count: int = 120) -> tuple[Trajectory, Trajectory]:
-    """(estimate, reference): a turning walk, the estimate with drift, noise, another scale and another world."""
+def noisy_sequence(count: int = 120) -> tuple[Trajectory, Trajectory]:
+    """(estimate, reference): a turning sequence, the estimate with drift, noise, another scale and another world."""
     rng = np.random.default_rng(SEED)
     step = se3.exp(np.array([0.02, 0.01, 0.3, 0.01, 0.05, -0.02]))
     reference: list[F64] = [np.eye(4)]
@@ -45,7 +45,7 @@ def evo_errors(estimate: Trajectory, reference: Trajectory, metric: evo_metrics.
 
 @pytest.mark.parametrize("mode", ["se3", "sim3", "none"])
 def test_absolute_errors_equal_evos(mode: str) -> None:
-    estimate, reference = noisy_walk()
+    estimate, reference = noisy_sequence()
     ours = evaluate(estimate, reference, mode)
     position = evo_errors(estimate, reference, evo_metrics.APE(evo_metrics.PoseRelation.translation_part), mode)
     angle = evo_errors(estimate, reference, evo_metrics.APE(evo_metrics.PoseRelation.rotation_angle_deg), mode)
@@ -56,7 +56,7 @@ def test_absolute_errors_equal_evos(mode: str) -> None:
 
 @pytest.mark.parametrize("delta", [1, 7])
 def test_relative_errors_equal_evos(delta: int) -> None:
-    estimate, reference = noisy_walk()
+    estimate, reference = noisy_sequence()
     ours = evaluate(estimate, reference, "none", f"{delta}f")
     for relation, statistics in (
         (evo_metrics.PoseRelation.translation_part, ours.rpe_m),
@@ -69,6 +69,6 @@ def test_relative_errors_equal_evos(delta: int) -> None:
 
 
 def test_sim3_finds_the_scale_that_was_put_in() -> None:
-    estimate, reference = noisy_walk()
+    estimate, reference = noisy_sequence()
     assert evaluate(estimate, reference, "sim3").alignment.scale == pytest.approx(1 / 1.05, rel=0.01)
     assert evaluate(estimate, reference).sim3_scale == pytest.approx(1 / 1.05, rel=0.01)

@@ -44,7 +44,7 @@ def test_times_are_of_the_frames_that_were_tracked() -> None:
     table.add(3, {"track": 4.0, "flow": 1.0})
     table.add(9, {"track": 7.0})  # a frame that never came
     table.add(5, {"track": 5.0})
-    table.add(5, {"track": 6.0})  # said again
+    table.add(5, {"track": 6.0})  # a second time
     times = table.of_frames(np.array([3, 4, 5]))
     assert list(times) == ["track", "flow"]
     np.testing.assert_array_equal(times["track"], [4.0, np.nan, 6.0])

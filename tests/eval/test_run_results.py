@@ -25,7 +25,7 @@ from tests.synthetic import pinhole_rig
 COUNT = 30
 
 
-def walk() -> F64:
+def camera_path() -> F64:
     steps: F64 = np.arange(float(COUNT))[:, None] * np.array([0.0, 0, 0.1, 0, 0.02, 0])
     return se3.exp(steps)
 
@@ -47,7 +47,7 @@ def record_of(poses: F64, placed_from: int) -> RunRecord:
 
 
 def results(tmp_path: Path, record: RunRecord, rig: Rig, config: Config) -> tuple[dict[str, Any], list[str], str]:
-    truth = walk()
+    truth = camera_path()
     truth[:, :3, 3] *= 3.0
     stats, evaluations = write_results(
         tmp_path, "test", rig, config, record, 1.0, Trajectory(np.arange(COUNT) * 10**8, truth)
@@ -58,31 +58,31 @@ def results(tmp_path: Path, record: RunRecord, rig: Rig, config: Config) -> tupl
 def test_one_eye_is_judged_after_its_scale(tmp_path: Path) -> None:
     config = Config(odometry=dataclasses.replace(Config().odometry, method="pnp", monocular=True))
     assert scale_free(config, pinhole_rig())
-    _, lines, report = results(tmp_path, record_of(walk(), 0), pinhole_rig(), config)
+    _, lines, report = results(tmp_path, record_of(camera_path(), 0), pinhole_rig(), config)
     assert any("one camera has no scale" in line for line in lines) and "baseline" not in report
     assert not any("SE3" in line for line in lines)
 
 
 def test_a_wrong_scale_of_two_eyes_is_said(tmp_path: Path) -> None:
     assert not scale_free(Config(), pinhole_rig())
-    _, lines, report = results(tmp_path, record_of(walk(), 0), pinhole_rig(), Config())
+    _, lines, report = results(tmp_path, record_of(camera_path(), 0), pinhole_rig(), Config())
     assert any("SE3 aligned" in line for line in lines) and "check the baseline" in report
 
 
-@pytest.mark.parametrize(("scale", "said"), [(3.0, "is 66.7 % too short"), (0.5, "is 100.0 % too long")])
-def test_a_length_is_too_long_or_too_short(tmp_path: Path, scale: float, said: str) -> None:
+@pytest.mark.parametrize(("scale", "message"), [(3.0, "is 66.7 % too short"), (0.5, "is 100.0 % too long")])
+def test_a_length_is_too_long_or_too_short(tmp_path: Path, scale: float, message: str) -> None:
     """Of a path of some metres; one of centimetres says nothing of the scale."""
     for size, told in ((1.0, True), (0.02, False)):
-        truth, estimate = walk(), walk()
+        truth, estimate = camera_path(), camera_path()
         estimate[:, :3, 3] *= size
         truth[:, :3, 3] *= size * scale
         reference = Trajectory(np.arange(COUNT) * 10**8, truth)
         write_results(tmp_path, "x", pinhole_rig(), Config(), record_of(estimate, 0), 1.0, reference)
-        assert (said in (tmp_path / "report.md").read_text()) == told
+        assert (message in (tmp_path / "report.md").read_text()) == told
 
 
 def test_frames_without_a_place_in_the_map_are_left_out(tmp_path: Path) -> None:
-    record = record_of(walk(), 10)
+    record = record_of(camera_path(), 10)
     mapped = record.mapped()
     assert mapped is not None and len(mapped) == COUNT - 10 and len(record.odometry()) == COUNT
     stats, lines, _ = results(tmp_path, record, pinhole_rig(), Config())
@@ -91,17 +91,17 @@ def test_frames_without_a_place_in_the_map_are_left_out(tmp_path: Path) -> None:
 
 
 def test_never_found_in_the_map_is_a_failure(tmp_path: Path) -> None:
-    stats, _, _ = results(tmp_path, record_of(walk(), COUNT), pinhole_rig(), Config())
+    stats, _, _ = results(tmp_path, record_of(camera_path(), COUNT), pinhole_rig(), Config())
     assert "never found" in failure(stats)
     assert not (tmp_path / "trajectory_map.tum").exists() and (tmp_path / "trajectory_odom.tum").exists()
 
 
 def test_unconnected_submaps_are_reported(tmp_path: Path) -> None:
-    record, none = record_of(walk(), 0), np.zeros(0, np.int64)
+    record, none = record_of(camera_path(), 0), np.zeros(0, np.int64)
     nothing = np.zeros((0, 2))
     for kf_id, submap in ((0, 0), (10, 1), (20, 1)):
         keyframe = Keyframe(
-            kf_id, kf_id, kf_id * 10**8, walk()[kf_id], none, nothing, nothing, np.zeros((0, 3)),
+            kf_id, kf_id, kf_id * 10**8, camera_path()[kf_id], none, nothing, nothing, np.zeros((0, 3)),
             np.zeros((0, 32), np.uint8), submap_id=submap,
         )  # fmt: skip
         record.put(keyframe)
@@ -126,19 +126,19 @@ def test_a_saved_map_connects_all_submaps() -> None:
 
 def test_frames_go_over_from_one_keyframes_place_to_the_next(tmp_path: Path) -> None:
     """The map moved the second keyframe by 9 cm after the frames between were tracked: each takes its share."""
-    record, none = record_of(walk(), 0), np.zeros(0, np.int64)
-    record.keyframes = {k: KeyframeRow(k, k * 10**8, walk()[k], 0.0, submap_id=0) for k in (0, 10, 20)}
+    record, none = record_of(camera_path(), 0), np.zeros(0, np.int64)
+    record.keyframes = {k: KeyframeRow(k, k * 10**8, camera_path()[k], 0.0, submap_id=0) for k in (0, 10, 20)}
     aside = np.eye(4)
     aside[0, 3] = 0.09
     record.put(
         MapUpdate(
-            40, 20, np.array([10]), (aside @ walk()[10])[None], none, np.zeros((0, 3)), none, none.reshape(-1, 2),
-            np.eye(4),
+            40, 20, np.array([10]), (aside @ camera_path()[10])[None], none, np.zeros((0, 3)), none,
+            none.reshape(-1, 2), np.eye(4),
         )
     )  # fmt: skip
     mapped = record.mapped()
     assert mapped is not None
-    off = mapped.poses[:, 0, 3] - walk()[:, 0, 3]
+    off = mapped.poses[:, 0, 3] - camera_path()[:, 0, 3]
     np.testing.assert_allclose(off[:11], 0.009 * np.arange(11), atol=1e-6)
     np.testing.assert_allclose(off[10:21], 0.009 * np.arange(10, -1, -1), atol=1e-6)
     np.testing.assert_allclose(off[21:], 0.0, atol=1e-12)
@@ -148,18 +148,18 @@ def test_frames_located_by_a_keyframe_each_stay_with_it() -> None:
     """An estimator that refers each frame to the last keyframe knows nothing of its place to the next one."""
     pnp = dataclasses.replace(Config().odometry, method="pnp")
     record = RunRecord.of(Config(odometry=pnp))
-    record.frames = record_of(walk(), 0).frames
+    record.frames = record_of(camera_path(), 0).frames
     record.frames.keep(np.arange(10))
-    record.keyframes = {k: KeyframeRow(k, k * 10**8, walk()[k], 0.0, submap_id=0) for k in (0, 10)}
-    record.map_T_kf.add(0, walk()[0])
+    record.keyframes = {k: KeyframeRow(k, k * 10**8, camera_path()[k], 0.0, submap_id=0) for k in (0, 10)}
+    record.map_T_kf.add(0, camera_path()[0])
     record.map_T_kf.add(10, np.eye(4))
     mapped = record.mapped()
     assert mapped is not None
-    np.testing.assert_array_equal(mapped.poses, walk()[:10])
+    np.testing.assert_array_equal(mapped.poses, camera_path()[:10])
 
 
 def test_one_pose_is_compared_with_nothing(tmp_path: Path) -> None:
-    record = record_of(walk()[:1], 0)
+    record = record_of(camera_path()[:1], 0)
     _, lines, report = results(tmp_path, record, pinhole_rig(), Config())
     assert not any("ground truth" in line or "nan" in line for line in lines) and "nan" not in report
 
@@ -168,14 +168,14 @@ def test_a_straight_path_says_that_its_rotation_is_open(tmp_path: Path) -> None:
     truth = np.tile(np.eye(4), (COUNT, 1, 1))
     truth[:, 2, 3] = np.arange(COUNT) * 0.1
     truth[:, 0, 3] = 1e-4 * np.sin(np.arange(COUNT))
-    straight, curved = (Trajectory(np.arange(COUNT) * 10**8, poses) for poses in (truth, walk()))
-    for path, said in ((straight, True), (curved, False)):
+    straight, curved = (Trajectory(np.arange(COUNT) * 10**8, poses) for poses in (truth, camera_path()))
+    for path, message in ((straight, True), (curved, False)):
         rows = dict(table(evaluate(path, path)))
-        assert ("nearly straight" in rows["rotation"]) == said
+        assert ("nearly straight" in rows["rotation"]) == message
 
 
 def test_a_loop_that_the_map_refused_is_no_accepted_one(tmp_path: Path) -> None:
-    record = record_of(walk(), 0)
+    record = record_of(camera_path(), 0)
     none = np.zeros(0, np.int64)
     pairs = none.reshape(-1, 2)
     for kf_id in (10, 20):
@@ -191,7 +191,7 @@ def test_a_loop_that_the_map_refused_is_no_accepted_one(tmp_path: Path) -> None:
 
 
 def test_the_report_and_the_exit_code_know_the_same_limit(tmp_path: Path) -> None:
-    record = record_of(walk(), 0)
+    record = record_of(camera_path(), 0)
     for k in range(COUNT, COUNT + 10):  # a quarter is lost
         record.put(
             Frame(k, k * 10**8, np.eye(4), np.eye(6), TrackState.LOST, "dark", Observations.empty(), 0, np.eye(4))
@@ -208,13 +208,13 @@ def test_a_disk_that_is_full_is_named(tmp_path: Path, monkeypatch: pytest.Monkey
 
     monkeypatch.setattr("stereo_sfm.eval.run_results.write_report", full)
     with pytest.raises(OSError, match="No space") as caught:
-        write_results(tmp_path, "test", pinhole_rig(), Config(), record_of(walk(), 0), 1.0)
+        write_results(tmp_path, "test", pinhole_rig(), Config(), record_of(camera_path(), 0), 1.0)
     assert str(from_os_error(caught.value)).startswith(f"cannot write to {tmp_path}: No space left")
     assert (tmp_path / "trajectory_odom.tum").exists()
 
 
 def test_what_capture_drops_has_no_pose(tmp_path: Path) -> None:
-    record = record_of(walk(), 0)
+    record = record_of(camera_path(), 0)
     for k in range(120):
         record.put(Dropped(100 + k, 1, "ring", "no free slot"))
     record.put(Dropped(300, 1, "sensor", "lost", 3))
@@ -227,11 +227,11 @@ def test_what_capture_drops_has_no_pose(tmp_path: Path) -> None:
 
 
 def test_what_the_log_lacks_is_told_and_costs_nothing_else(tmp_path: Path) -> None:
-    record = record_of(walk(), 0)
+    record = record_of(camera_path(), 0)
     record.put(Dropped(3, 1, "log", "the log is slower than the camera"))
     record.put(LogEnded("recording stopped, No space left on device"))
     stats, _ = write_results(tmp_path, "test", pinhole_rig(), Config(), record, 1.0)
     assert stats["lost_percent"] == 0.0 and failure(stats) == "" and stats["dropped"] == 0
-    said = "\n".join(summary(stats))
-    assert "the log lacks 1 image:" in said and "the log is not complete: recording stopped" in said
+    message = "\n".join(summary(stats))
+    assert "the log lacks 1 image:" in message and "the log is not complete: recording stopped" in message
     assert "No space left on device" in (tmp_path / "report.md").read_text()

@@ -15,35 +15,39 @@ from stereo_sfm.types import Trajectory
 
 
 @pytest.fixture
-def walk() -> Trajectory:
+def trajectory() -> Trajectory:
     rng = np.random.default_rng(3)
     stamps = 1_553_180_224_360_915_899 + np.arange(20, dtype=np.int64) * 33_333_337
     return Trajectory(stamps, se3.exp(rng.normal(size=(20, 6))))
 
 
-def test_tum_keeps_every_nanosecond_and_evo_reads_it(walk: Trajectory, tmp_path: Path) -> None:
+def test_tum_keeps_every_nanosecond_and_evo_reads_it(trajectory: Trajectory, tmp_path: Path) -> None:
     path = tmp_path / "t.tum"
-    write_tum(path, walk)
+    write_tum(path, trajectory)
     for read in (read_tum(path), read_trajectory(path)):
-        assert read.stamp_ns.tolist() == walk.stamp_ns.tolist()
-        assert read.poses == pytest.approx(walk.poses, abs=1e-8)
-    assert np.array(file_interface.read_tum_trajectory_file(path).poses_se3) == pytest.approx(walk.poses, abs=1e-8)
+        assert read.stamp_ns.tolist() == trajectory.stamp_ns.tolist()
+        assert read.poses == pytest.approx(trajectory.poses, abs=1e-8)
+    assert np.array(file_interface.read_tum_trajectory_file(path).poses_se3) == pytest.approx(
+        trajectory.poses, abs=1e-8
+    )
 
 
-def test_euroc_round_trip_and_evo(walk: Trajectory, tmp_path: Path) -> None:
+def test_euroc_round_trip_and_evo(trajectory: Trajectory, tmp_path: Path) -> None:
     path = tmp_path / "t.csv"
-    write_euroc(path, walk)
+    write_euroc(path, trajectory)
     for read in (read_euroc(path), read_trajectory(path)):
-        assert read.stamp_ns.tolist() == walk.stamp_ns.tolist()
-        assert read.poses == pytest.approx(walk.poses, abs=1e-8)
-    assert np.array(file_interface.read_euroc_csv_trajectory(path).poses_se3) == pytest.approx(walk.poses, abs=1e-8)
+        assert read.stamp_ns.tolist() == trajectory.stamp_ns.tolist()
+        assert read.poses == pytest.approx(trajectory.poses, abs=1e-8)
+    assert np.array(file_interface.read_euroc_csv_trajectory(path).poses_se3) == pytest.approx(
+        trajectory.poses, abs=1e-8
+    )
 
 
-def test_kitti_is_relative_to_the_first_pose_and_evo_reads_it(walk: Trajectory, tmp_path: Path) -> None:
+def test_kitti_is_relative_to_the_first_pose_and_evo_reads_it(trajectory: Trajectory, tmp_path: Path) -> None:
     path = tmp_path / "t.txt"
-    write_kitti(path, walk.poses)
-    expected = se3.inverse(walk.poses[0]) @ walk.poses
-    assert read_kitti(path, walk.stamp_ns).poses == pytest.approx(expected, abs=1e-8)
+    write_kitti(path, trajectory.poses)
+    expected = se3.inverse(trajectory.poses[0]) @ trajectory.poses
+    assert read_kitti(path, trajectory.stamp_ns).poses == pytest.approx(expected, abs=1e-8)
     assert read_trajectory(path).poses == pytest.approx(expected, abs=1e-8)
     assert np.array(file_interface.read_kitti_poses_file(path).poses_se3) == pytest.approx(expected, abs=1e-8)
 
@@ -87,15 +91,18 @@ def test_missing_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("end", ["", " 0 0 0 1", " 0 0 0 0"], ids=["four fields", "unit quaternions", "zeros"])
-def test_positions_without_orientations_are_compared_as_positions(end: str, walk: Trajectory, tmp_path: Path) -> None:
+def test_positions_without_orientations_are_compared_as_positions(
+    end: str, trajectory: Trajectory, tmp_path: Path
+) -> None:
     path = tmp_path / "truth.tum"
     lines = [
-        f"{seconds(int(t))} {p[0]} {p[1]} {p[2]}{end}\n" for t, p in zip(walk.stamp_ns, walk.positions, strict=True)
+        f"{seconds(int(t))} {p[0]} {p[1]} {p[2]}{end}\n"
+        for t, p in zip(trajectory.stamp_ns, trajectory.positions, strict=True)
     ]
     path.write_text("".join(lines))
     truth = read_trajectory(path)
-    assert not truth.oriented and read_tum(path).positions == pytest.approx(walk.positions)
-    moved = Trajectory(walk.stamp_ns, se3.exp(np.array([1.0, -2, 3, 0.4, 0.5, -1.2])) @ walk.poses)
+    assert not truth.oriented and read_tum(path).positions == pytest.approx(trajectory.positions)
+    moved = Trajectory(trajectory.stamp_ns, se3.exp(np.array([1.0, -2, 3, 0.4, 0.5, -1.2])) @ trajectory.poses)
     for estimate, reference in ((moved, truth), (truth, moved)):
         result = evaluate(estimate, reference)
         assert result.ape_m.max < 1e-6 and result.rpe_m.max < 1e-6
@@ -106,8 +113,8 @@ def test_positions_without_orientations_are_compared_as_positions(end: str, walk
         evaluate(moved, truth, "origin")
 
 
-def test_a_turning_trajectory_is_no_list_of_positions(walk: Trajectory, tmp_path: Path) -> None:
-    write_tum(tmp_path / "t.tum", walk)
+def test_a_turning_trajectory_is_no_list_of_positions(trajectory: Trajectory, tmp_path: Path) -> None:
+    write_tum(tmp_path / "t.tum", trajectory)
     assert read_trajectory(tmp_path / "t.tum").oriented
 
 

@@ -20,18 +20,18 @@ from stereo_sfm.export.ply import export_ply
 from stereo_sfm.export.trajectories import named_pose, write_tum
 from stereo_sfm.geometry import se3
 from stereo_sfm.maps.saved_map import SavedMap, joined, save_map, session_trajectory
-from tests.loop.store_walk import StoreWalk
+from tests.loop.store_sequence import StoreSequence
 from tests.maps.maps import small_map
 
 
 @pytest.fixture(scope="module")
-def walk_and_map() -> tuple[StoreWalk, SavedMap]:
+def sequence_and_map() -> tuple[StoreSequence, SavedMap]:
     return small_map()
 
 
 @pytest.fixture(scope="module")
-def saved(walk_and_map: tuple[StoreWalk, SavedMap]) -> SavedMap:
-    return walk_and_map[1]
+def saved(sequence_and_map: tuple[StoreSequence, SavedMap]) -> SavedMap:
+    return sequence_and_map[1]
 
 
 def test_colmap_reads_the_model_and_its_own_projection_meets_the_pixels(tmp_path: Path, saved: SavedMap) -> None:
@@ -42,7 +42,7 @@ def test_colmap_reads_the_model_and_its_own_projection_meets_the_pixels(tmp_path
     assert model.num_images() == 2 * len(s.kf_ids)
     assert model.num_frames() == len(s.kf_ids)
     assert model.num_points3D() == len(s.pt_ids)
-    image = model.images[2 * 4 + 2]  # the right eye of the fifth keyframe
+    image = model.images[2 * 4 + 2]  # the right camera of the fifth keyframe
     assert image.name == f"right/{int(s.frame_ids[4]):06d}.png"
     cam_T_map = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
     expected = se3.inverse(s.map_T_kf[4] @ saved.rig.left_T_right)
@@ -99,14 +99,14 @@ def test_ply_holds_the_points(tmp_path: Path, saved: SavedMap) -> None:
     assert views == (saved.snapshot.obs_pt == 7).sum() and session == 0
 
 
-def test_floor_plan_of_one_aisle(walk_and_map: tuple[StoreWalk, SavedMap]) -> None:
-    walk, saved = walk_and_map
+def test_floor_plan_of_one_aisle(sequence_and_map: tuple[StoreSequence, SavedMap]) -> None:
+    sequence, saved = sequence_and_map
     plan = make_floor_plan(saved.snapshot, 0.05)
     floor_T_map = se3.inverse(plan.map_T_floor)
     cameras = se3.transform(floor_T_map, saved.snapshot.map_T_kf[:, :3, 3])
     column = ((cameras[:, 0] - plan.origin[0]) / 0.05).astype(int)
     row = plan.image.shape[0] - 1 - ((cameras[:, 1] - plan.origin[1]) / 0.05).astype(int)
-    inside = walk.world_T_kf[:, 2, 3] > 1.0
+    inside = sequence.world_T_kf[:, 2, 3] > 1.0
     assert (plan.image[row[inside], column[inside]] == FREE).mean() > 0.9  # where the robot went is free
     assert set(np.unique(plan.image)) <= {FREE, OCCUPIED, UNKNOWN}
     # Shelf fronts stand 0.9 to 1.2 m left and right of the path, along it.
@@ -151,7 +151,7 @@ def test_export_command(tmp_path: Path, saved: SavedMap, capsys: pytest.CaptureF
 
 
 @pytest.mark.parametrize(("kind", "ending"), [("tum", "tum"), ("kitti", "kitti"), ("euroc", "csv")])
-def test_trajectories_of_a_merged_map_are_a_file_for_each_walk(
+def test_trajectories_of_a_merged_map_are_a_file_for_each_sequence(
     tmp_path: Path, saved: SavedMap, kind: str, ending: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     both = joined([saved, saved])
@@ -175,7 +175,7 @@ def test_trajectories_of_a_merged_map_are_a_file_for_each_walk(
     assert "the map has no session 2 (it has 0, 1)" in capsys.readouterr().err
 
 
-def test_a_walk_with_two_keyframes_of_one_time_is_no_trajectory(saved: SavedMap) -> None:
+def test_a_sequence_with_two_keyframes_of_one_time_is_no_trajectory(saved: SavedMap) -> None:
     twice = dataclasses.replace(joined([saved, saved]), sessions=np.zeros(2 * len(saved), np.int64))
     with pytest.raises(StereoSfmError, match="session 0 of the map has two keyframes of the same stamp"):
         session_trajectory(twice, 0)

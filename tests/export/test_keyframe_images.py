@@ -1,4 +1,4 @@
-"""Pictures of a map's keyframes: each walk's own, from its own recording."""
+"""Pictures of a map's keyframes: each sequence's own, from its own recording."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ def saved() -> SavedMap:
 
 
 def later(saved: SavedMap, by_ns: int = LATER_NS) -> SavedMap:
-    """The same walk on another day: frame ids begin anew, the clock does not."""
+    """The same sequence on another day: frame ids begin anew, the clock does not."""
     return dataclasses.replace(
         saved, snapshot=dataclasses.replace(saved.snapshot, stamp_ns=saved.snapshot.stamp_ns + by_ns)
     )
 
 
 def recording(saved: SavedMap, grey: int) -> list[StereoImage]:
-    """One picture of one grey for every keyframe."""
+    """One image of one grey for every keyframe."""
     s = saved.snapshot
     picture = np.full((4, 6), grey, np.uint8)
     return [
@@ -62,14 +62,14 @@ def test_every_picture_of_a_merged_map_has_a_name_of_its_own(tmp_path: Path, sav
     assert pycolmap.Reconstruction(str(tmp_path)).num_images() == len(names)
 
 
-def test_each_recording_gives_the_pictures_of_its_own_walk(tmp_path: Path, saved: SavedMap) -> None:
+def test_each_recording_gives_the_pictures_of_its_own_sequence(tmp_path: Path, saved: SavedMap) -> None:
     both = joined([saved, later(saved)])
     export_colmap(both, tmp_path)
-    for walk, one in enumerate((saved, later(saved))):
-        pictures = recording(one, 50 + 100 * walk)
-        assert session_of_recording(both, pictures, "day") == walk
-        write_keyframe_images(both, pictures, walk, tmp_path)
-        assert sum(1 for _ in (tmp_path / "images").rglob("*.png")) == 2 * len(saved) * (walk + 1)
+    for sequence, one in enumerate((saved, later(saved))):
+        pictures = recording(one, 50 + 100 * sequence)
+        assert session_of_recording(both, pictures, "day") == sequence
+        write_keyframe_images(both, pictures, sequence, tmp_path)
+        assert sum(1 for _ in (tmp_path / "images").rglob("*.png")) == 2 * len(saved) * (sequence + 1)
     for name in names_in(tmp_path):
         picture = cv2.imread(str(tmp_path / "images" / name), cv2.IMREAD_GRAYSCALE)
         assert picture is not None and int(picture[0, 0]) == (150 if "walk1" in name else 50)

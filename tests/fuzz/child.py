@@ -37,15 +37,15 @@ def outcome(argv: list[str]) -> dict[str, Any]:
     from stereo_sfm.cli import main
 
     code, trace = None, ""
-    said, began = io.StringIO(), time.process_time()
-    with contextlib.redirect_stderr(said), contextlib.redirect_stdout(io.StringIO()):
+    message, began = io.StringIO(), time.process_time()
+    with contextlib.redirect_stderr(message), contextlib.redirect_stdout(io.StringIO()):
         try:
             code = frames(argv[1]) if argv[0] == "frames" else main(argv)
         except SystemExit as end:
             code = int(end.code or 0)
         except BaseException:  # whatever it is, it is what the test looks for
             trace = traceback.format_exc()
-    return {"code": code, "said": said.getvalue(), "trace": trace, "seconds": time.process_time() - began}
+    return {"code": code, "message": message.getvalue(), "trace": trace, "seconds": time.process_time() - began}
 
 
 def _limit() -> None:

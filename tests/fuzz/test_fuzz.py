@@ -87,9 +87,9 @@ def check(child: Child, case: str, argv: list[str]) -> list[str]:
         wrong.append(found["trace"][-1500:])
     elif found["code"] not in (0, 1, 2, 3) or (found["code"] == 1 and argv[0] != "diff"):
         wrong.append(f"exit code {found['code']}")
-    errors = [line for line in found["said"].splitlines() if not line.startswith("warning: ")]
-    if not found["trace"] and (len(errors) != (found["code"] == 2) or len(found["said"].splitlines()) > MOST_LINES):
-        wrong.append(f"says {found['said'][:600]!r}")
+    errors = [line for line in found["message"].splitlines() if not line.startswith("warning: ")]
+    if not found["trace"] and (len(errors) != (found["code"] == 2) or len(found["message"].splitlines()) > MOST_LINES):
+        wrong.append(f"says {found['message'][:600]!r}")
     if found["seconds"] > MOST_SECONDS:
         wrong.append(f"{found['seconds']:.1f} s")
     return [f"{case}: {' '.join(argv[:1])}: {text}" for text in wrong]
@@ -249,7 +249,7 @@ def test_bombs(kind: str, recordings: list[Path], saved_map: Path, child: Child,
     [
         ({"trace": "Traceback ... IndexError"}, "IndexError"),
         ({"code": 2}, "says ''"),
-        ({"code": 2, "said": "a\nb\n"}, "says 'a"),
+        ({"code": 2, "message": "a\nb\n"}, "says 'a"),
         ({"code": 1}, "exit code 1"),
         ({"seconds": 60.0}, "60.0 s"),
     ],
@@ -260,7 +260,7 @@ def test_faults_are_seen(found: dict[str, Any], says: str) -> None:
             pass
 
         def outcome(self, argv: list[str]) -> dict[str, Any]:
-            return {"code": 0, "said": "", "trace": "", "seconds": 0.0, **found}
+            return {"code": 0, "message": "", "trace": "", "seconds": 0.0, **found}
 
     faults = check(Answers(), "case", ["info"])
     assert faults and says in faults[0]

@@ -34,7 +34,7 @@ CASES = [
 
 
 def points_before(rig: Rig, count: int = 4000) -> np.ndarray:
-    """(N, 3) points from near to far around the left eye's axis, in the left eye."""
+    """(N, 3) points from near to far around the left camera's axis, in the left camera."""
     rng = np.random.default_rng(7)
     directions = rng.standard_normal((count, 3)) * [1.2, 1.2, 0.5] + [0, 0, 1]
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -42,7 +42,7 @@ def points_before(rig: Rig, count: int = 4000) -> np.ndarray:
 
 
 def both_eyes(rectification: Rectification, points_left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where the original eyes see the points, in rectified pixels; only points inside both images."""
+    """Where the original cameras see the points, in rectified pixels; only points inside both images."""
     left, right = rectification.left, rectification.right
     original = rectification_source[id(rectification)]
     uv_left = original.left.project(points_left)
@@ -121,9 +121,9 @@ def test_pinhole_default_has_no_black_border() -> None:
 
 def test_pinhole_default_copes_with_corners_beyond_the_lens_model() -> None:
     folding = (-0.314, 0.136, 0.0002, -0.0007, -0.0331)
-    eye = RadTan(752, 480, 459.7, 458.7, 369.9, 248.2, folding)
-    assert np.isnan(eye.unproject(np.array([751.0, 479.0]))).any() or eye.params[12] > 0
-    narrow = replace(eye, fx=420.0, fy=420.0)
+    camera = RadTan(752, 480, 459.7, 458.7, 369.9, 248.2, folding)
+    assert np.isnan(camera.unproject(np.array([751.0, 479.0]))).any() or camera.params[12] > 0
+    narrow = replace(camera, fx=420.0, fy=420.0)
     assert np.isnan(narrow.unproject(np.array([751.0, 479.0]))).any()
     rectification = rectify(Rig(narrow, narrow, se3.exp(np.array([0.11, 0, 0, 0, 0, 0]))), "pinhole")
     assert 300 < rectification.rig.left.fx < 500

@@ -116,9 +116,9 @@ def run_in_guest(
             subprocess.run(
                 qemu, stdin=subprocess.DEVNULL, stdout=out, stderr=subprocess.STDOUT, timeout=timeout_s, check=False
             )
-        said = console.read_text(errors="replace")
-    line = next((text for text in said.splitlines() if text.startswith("REPORT ")), None)
-    return (json.loads(line.removeprefix("REPORT ")) if line else None), said
+        message = console.read_text(errors="replace")
+    line = next((text for text in message.splitlines() if text.startswith("REPORT ")), None)
+    return (json.loads(line.removeprefix("REPORT ")) if line else None), message
 
 
 def main() -> int:
@@ -137,9 +137,9 @@ def main() -> int:
         print(lack, file=sys.stderr)
         return 2
     arguments = ["--seconds", options.seconds, "--faults", options.faults, *(["--paced"] if options.paced else [])]
-    report, said = run_in_guest(given, arguments, options.timeout, options.accel)
+    report, message = run_in_guest(given, arguments, options.timeout, options.accel)
     if report is None:
-        print(said)
+        print(message)
         return 1
     print(json.dumps(report, indent=2))
     return 3 if report["wrong_images"] else 0

@@ -64,7 +64,7 @@ def test_opens_with_a_sensible_calibration(camera: str, report: dict[str, Any]) 
 
 
 def test_streams_without_loss(camera: str, report: dict[str, Any]) -> None:
-    """The stamps are regular, the eyes belong together, nothing is lost, the IMU runs."""
+    """The stamps are regular, the cameras belong together, nothing is lost, the IMU runs."""
     with open_camera(camera) as source:
         began, cpu = time.monotonic(), time.process_time()
         images = [
@@ -123,7 +123,7 @@ def test_stops_and_starts_again_at_once(camera: str, report: dict[str, Any]) -> 
 @pytest.mark.parametrize("exposure_us", [2000, 8000])
 def test_manual_exposure_is_obeyed(camera: str, exposure_us: int, report: dict[str, Any]) -> None:
     if "simulated" in camera:
-        pytest.skip("the simulated camera's pictures are made before")
+        pytest.skip("the simulated camera's images are made before")
     with open_camera(camera, exposure=str(exposure_us)) as source:
         images = take(source, 2.0)
     got = [i.exposure_us for i in images[-10:]]

@@ -50,8 +50,8 @@ def test_through_the_kernel_of_a_guest(faults: str, report: dict[str, Any]) -> N
     lack = missing(KERNEL)
     if lack or KERNEL is None:
         pytest.skip(lack)
-    got, said = run_in_guest(KERNEL, ["--seconds", "15", "--faults", faults], timeout_s=400)
-    assert got is not None, said[-3000:]
+    got, message = run_in_guest(KERNEL, ["--seconds", "15", "--faults", faults], timeout_s=400)
+    assert got is not None, message[-3000:]
     report |= got
     assert got["wrong_images"] == 0
     assert any("03e7:2150" in d for d in got["usb_devices"])

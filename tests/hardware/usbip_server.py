@@ -14,7 +14,7 @@ from collections import deque
 from dataclasses import dataclass
 
 from stereo_sfm.drivers.t265 import messages as m
-from stereo_sfm.drivers.t265.simulated.camera import Gone, SimulatedCamera
+from stereo_sfm.drivers.t265.simulated.camera import Disconnected, SimulatedCamera
 from tests.hardware.usb_descriptors import standard_request
 
 VERSION = 0x0111
@@ -60,7 +60,7 @@ class _Endpoint(threading.Thread):
             return found is not None
 
     def run(self) -> None:
-        with contextlib.suppress(Gone, OSError):
+        with contextlib.suppress(Disconnected, OSError):
             while self.session.alive:
                 with self.ready:
                     if not self.ready.wait_for(lambda: self.waiting, _POLL_S):
@@ -77,7 +77,7 @@ class _Endpoint(threading.Thread):
             pieces = camera.read_video(_POLL_S, generation)
             return memoryview(b"".join(pieces) if pieces else b"")
         if self.address == m.COMMAND_IN:
-            return memoryview(camera.read_answer(_POLL_S, generation) or b"")
+            return memoryview(camera.read_reply(_POLL_S, generation) or b"")
         return memoryview(camera.read_events(_POLL_S, generation, m.EVENT_BUFFER) or b"")
 
     def _complete(self) -> None:
@@ -106,7 +106,7 @@ class _Session:
             endpoint.start()
         watch = threading.Thread(target=self._watch, daemon=True)
         watch.start()
-        with contextlib.suppress(OSError, EOFError, Gone):
+        with contextlib.suppress(OSError, EOFError, Disconnected):
             while True:
                 command, number, _, direction, endpoint = struct.unpack(">5I", _exactly(self.connection, 20))
                 rest = _exactly(self.connection, 28)

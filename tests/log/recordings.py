@@ -20,7 +20,7 @@ EPOCH_NS = 1_700_000_000_000_000_000
 
 
 def fisheye_rig(width: int = 96, height: int = 80) -> Rig:
-    """Two fisheye eyes that are not parallel, numbers with every digit used."""
+    """Two fisheye cameras that are not parallel, numbers with every digit used."""
     left = KannalaBrandt(width, height, 31.7 / 3, 31.9 / 3, 47.123456789, 40.1, (-0.0101, 0.0423, -0.0301, 0.0061))
     right = KannalaBrandt(width, height, 31.5 / 3, 31.4 / 3, 48.3, 39.7, (-0.0102, 0.0411, -0.0299, 0.0059))
     left_T_right = se3.exp(np.array([0.0641, 0.0002, -0.0001, 0.002, -0.003, 0.001]))
@@ -28,7 +28,7 @@ def fisheye_rig(width: int = 96, height: int = 80) -> Rig:
 
 
 def stereo_images(count: int, rng: np.random.Generator, size: tuple[int, int] = (96, 80)) -> list[StereoImage]:
-    """Textured pairs with inertial and wheel samples, a gap, and a right eye that is a little late."""
+    """Textured pairs with inertial and wheel samples, a gap, and a right camera that is a little late."""
     width, height = size
     images: list[StereoImage] = []
     for i in range(count):
@@ -70,7 +70,7 @@ def depth_images(count: int, rng: np.random.Generator) -> tuple[Rig, list[Stereo
     return Rig(camera, camera, left_T_right, depth=True), images
 
 
-def walk_truth(count: int, rng: np.random.Generator) -> Trajectory:
+def sequence_truth(count: int, rng: np.random.Generator) -> Trajectory:
     """Poses at 100 Hz around the frames of `stereo_images`."""
     stamps = START_NS - 20_000_000 + np.arange(count) * 10_000_000
     return Trajectory(stamps.astype(np.int64), se3.exp(rng.normal(size=(count, 6))))

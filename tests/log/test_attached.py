@@ -19,7 +19,7 @@ from stereo_sfm.log.recorded import read_run
 from stereo_sfm.log.writer import LogWriter
 from stereo_sfm.recording.describe import describe_file
 from stereo_sfm.types import Trajectory
-from tests.synthetic import fisheye_rig, walk
+from tests.synthetic import camera_path, fisheye_rig
 
 
 def log_with(path: Path, files: dict[str, str | bytes]) -> Path:
@@ -30,7 +30,7 @@ def log_with(path: Path, files: dict[str, str | bytes]) -> Path:
 
 
 def test_files_come_back_to_the_bit(tmp_path: Path) -> None:
-    rig, truth = fisheye_rig(), Trajectory(np.arange(5, dtype=np.int64) * 1000 + 7, walk(5))
+    rig, truth = fisheye_rig(), Trajectory(np.arange(5, dtype=np.int64) * 1000 + 7, camera_path(5))
     files = {RIG_FILE: rig_to_text(rig), TRUTH_FILE: truth_to_bytes(truth), CONFIG_FILE: dump(Config())}
     with LogReader(log_with(tmp_path / "a.mcap", files)) as reader:
         back, poses = attached_rig(reader), attached_truth(reader)

@@ -17,8 +17,10 @@ PAIRS = np.zeros((0, 2), np.int64)
 
 
 def frame(frame_id: int, state: TrackState, reason: str = "") -> Frame:
-    eye = np.eye(4)
-    return Frame(frame_id, frame_id * 100_000_000, eye, np.eye(6), state, reason, Observations.empty(), 0, eye)
+    identity = np.eye(4)
+    return Frame(
+        frame_id, frame_id * 100_000_000, identity, np.eye(6), state, reason, Observations.empty(), 0, identity
+    )
 
 
 def update(kf_id: int, metres: float) -> MapUpdate:
@@ -84,6 +86,6 @@ def test_a_verbose_run_tells_them_on_the_screen(
     source = "sim:aisle?size=212x200&rate=10&dark=1-1.5"
     options = ["--duration", "2", "--inline", "--log", "none", "-o", str(tmp_path), *(["-v"] if verbose else [])]
     assert main(["run", source, *options]) in (0, 4)
-    said = capsys.readouterr().err
-    assert ("tracker: frame 10 at 1.0 s: lost (dark)" in said) == verbose
-    assert ("tracking recovered" in said) == verbose
+    message = capsys.readouterr().err
+    assert ("tracker: frame 10 at 1.0 s: lost (dark)" in message) == verbose
+    assert ("tracking recovered" in message) == verbose

@@ -17,7 +17,7 @@ from stereo_sfm.log.diff import Difference, diff
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.writer import LogWriter
 from stereo_sfm.types import Frame, Observations, StereoImage, TrackState
-from tests.log.recordings import fisheye_rig, stereo_images, walk_truth, write_recording
+from tests.log.recordings import fisheye_rig, sequence_truth, stereo_images, write_recording
 
 
 def _frames(count: int) -> list[Frame]:
@@ -101,7 +101,7 @@ def test_nan_equals_nan_and_counts_are_named(tmp_path: Path) -> None:
 
 def test_lossless_formats_are_the_same_images(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
-    images, truth = stereo_images(6, rng), walk_truth(20, rng)
+    images, truth = stereo_images(6, rng), sequence_truth(20, rng)
     for name in ("png", "raw"):
         write_recording(tmp_path / f"{name}.mcap", MemorySource(fisheye_rig(), images, truth), name)
     assert _diff(tmp_path / "png.mcap", tmp_path / "raw.mcap") == []

@@ -97,7 +97,7 @@ def test_encodings_of_other_programs() -> None:
 
 
 def test_bayer_patterns_start_at_the_right_colour() -> None:
-    """A picture that is red only: green 0.299 of 200 everywhere when the pattern is understood."""
+    """A image that is red only: green 0.299 of 200 everywhere when the pattern is understood."""
     for pattern, (row, column) in {"rggb": (0, 0), "bggr": (1, 1), "gbrg": (1, 0), "grbg": (0, 1)}.items():
         mosaic = np.zeros((12, 12), np.uint8)
         mosaic[row::2, column::2] = 200

@@ -32,8 +32,8 @@ from tests.log.recordings import (
     MemorySource,
     assert_same_image,
     fisheye_rig,
+    sequence_truth,
     stereo_images,
-    walk_truth,
     write_recording,
 )
 
@@ -51,7 +51,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Whole:
     rng = np.random.default_rng(0)
     images = stereo_images(40, rng)
     path = tmp_path_factory.mktemp("whole") / "whole.mcap"
-    write_recording(path, MemorySource(fisheye_rig(), images, walk_truth(30, rng)))
+    write_recording(path, MemorySource(fisheye_rig(), images, sequence_truth(30, rng)))
     return Whole((path, images))
 
 
@@ -299,9 +299,9 @@ def test_changed_bytes_give_the_right_frames_or_one_line(
     bad.write_bytes(data)
     by_id = {image.frame_id: image for image in images}
     for candidate in (bad, out):
-        said = _use(candidate, bad, out, by_id)
-        assert "\n" not in said
-        if said:
+        message = _use(candidate, bad, out, by_id)
+        assert "\n" not in message
+        if message:
             return
 
 

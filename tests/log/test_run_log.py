@@ -53,8 +53,8 @@ from tests.log.recordings import (
     START_NS,
     MemorySource,
     fisheye_rig,
+    sequence_truth,
     stereo_images,
-    walk_truth,
     write_recording,
 )
 
@@ -139,7 +139,7 @@ def _streams() -> list[list[object]]:
 def _write(path: Path, order: np.random.Generator | None) -> None:
     """Without `order` each stream after the other's cause; with it, at random."""
     log = RunLog(LogWriter(path, clock=lambda: 0), fisheye_rig(), Config(), source="test", mode="inline",
-                 ground_truth=walk_truth(30, np.random.default_rng(0)))  # fmt: skip
+                 ground_truth=sequence_truth(30, np.random.default_rng(0)))  # fmt: skip
     log.image(stereo_images(1, np.random.default_rng(0))[0])
     streams = [list(reversed(s)) for s in _streams()]
     while any(streams):
@@ -275,7 +275,7 @@ def test_points_trajectory_and_edges_are_the_map_at_the_end(run: Path) -> None:
 
 def test_what_is_shown_whole_comes_less_often_as_it_grows(tmp_path: Path) -> None:
     """A run of 1,000 keyframes, three a second: the trajectory takes no more room a second at the end."""
-    path, eye = tmp_path / "a.mcap", np.eye(4)
+    path, identity = tmp_path / "a.mcap", np.eye(4)
     config = from_dict({"loop": {"enabled": False}})
     log = RunLog(LogWriter(path), fisheye_rig(), config, source="t", mode="inline", image_format="none")
     none, nothing = np.zeros(0, np.int64), np.zeros((0, 2))
@@ -283,7 +283,11 @@ def test_what_is_shown_whole_comes_less_often_as_it_grows(tmp_path: Path) -> Non
         keyframe = replace(_keyframe(0), kf_id=k, stamp_ns=START_NS + k * 333_333_333, point_ids=none, uv_left=nothing)
         log.put(keyframe)
         pairs = nothing.astype(np.int64)
-        log.put(MapUpdate(k + 1, k, np.array([k]), eye[None].copy(), none, np.zeros((0, 3)), none, pairs, eye.copy()))
+        log.put(
+            MapUpdate(
+                k + 1, k, np.array([k]), identity[None].copy(), none, np.zeros((0, 3)), none, pairs, identity.copy()
+            )
+        )
     log.close()
     shown = _all(path, topics.TRAJECTORY, PosesInFrame)
     stamps = np.array([foxglove.stamp_of(m) for m in shown[:-1]])

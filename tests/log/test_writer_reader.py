@@ -22,8 +22,8 @@ from tests.log.recordings import (
     assert_same_image,
     depth_images,
     fisheye_rig,
+    sequence_truth,
     stereo_images,
-    walk_truth,
     write_recording,
 )
 
@@ -40,7 +40,7 @@ def _assert_same_rig(a: Rig, b: Rig) -> None:
 @pytest.mark.parametrize("image_format", ["raw", "png"])
 def test_a_lossless_recording_gives_back_every_bit(tmp_path: Path, image_format: str) -> None:
     rng = np.random.default_rng(1)
-    images, truth = stereo_images(12, rng), walk_truth(60, rng)
+    images, truth = stereo_images(12, rng), sequence_truth(60, rng)
     path = tmp_path / "a.mcap"
     write_recording(path, MemorySource(fisheye_rig(), images, truth), image_format)
     with open_source(path) as source:

@@ -1,4 +1,4 @@
-"""Three-point pose, its RANSAC, and the refinement over both eyes and both directions."""
+"""Three-point pose, its RANSAC, and the refinement over both cameras and both directions."""
 
 from __future__ import annotations
 

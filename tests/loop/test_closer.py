@@ -1,4 +1,4 @@
-"""The loop closer on synthetic walks with exact truth: true loops are found, copies of an aisle are not loops."""
+"""The loop closer on synthetic sequences with exact truth: true loops are found, copies of an aisle are not loops."""
 
 from __future__ import annotations
 
@@ -15,41 +15,41 @@ from stereo_sfm.loop.closer import FRESH, LoopCloser
 from stereo_sfm.loop.place_view import PlaceView
 from stereo_sfm.loop.verification import Verdict, rejection
 from stereo_sfm.types import F64, Keyframe, LoopResult
-from tests.loop.store_walk import StoreWalk, make_walk
+from tests.loop.store_sequence import StoreSequence, make_sequence
 
 
 @pytest.fixture(scope="module")
 def vocabulary() -> voc.Vocabulary:
-    return voc.train([k.descriptors for k in make_walk([0], seed=99).keyframes], depth=3)
+    return voc.train([k.descriptors for k in make_sequence([0], seed=99).keyframes], depth=3)
 
 
-def close(walk: StoreWalk, vocabulary: voc.Vocabulary, config: LoopConfig | None = None) -> list[LoopResult]:
-    closer = LoopCloser(config or LoopConfig(), walk.rig, vocabulary)
-    return [closer.step(k) for k in walk.keyframes]
+def close(sequence: StoreSequence, vocabulary: voc.Vocabulary, config: LoopConfig | None = None) -> list[LoopResult]:
+    closer = LoopCloser(config or LoopConfig(), sequence.rig, vocabulary)
+    return [closer.step(k) for k in sequence.keyframes]
 
 
-def error_of(walk: StoreWalk, loop: LoopResult) -> float:
-    truth = se3.inverse(walk.world_T_kf[loop.candidate_kf_id]) @ walk.world_T_kf[loop.kf_id]
+def error_of(sequence: StoreSequence, loop: LoopResult) -> float:
+    truth = se3.inverse(sequence.world_T_kf[loop.candidate_kf_id]) @ sequence.world_T_kf[loop.kf_id]
     return float(np.linalg.norm((se3.inverse(truth) @ loop.candidate_T_kf)[:3, 3]))
 
 
-def test_a_walk_that_returns_is_closed_and_its_points_are_paired(vocabulary: voc.Vocabulary) -> None:
-    walk = make_walk([0, 1, 0], seed=3)
-    results = close(walk, vocabulary)
-    assert [r.kf_id for r in results] == [k.kf_id for k in walk.keyframes]  # exactly one answer each
+def test_a_sequence_that_returns_is_closed_and_its_points_are_paired(vocabulary: voc.Vocabulary) -> None:
+    sequence = make_sequence([0, 1, 0], seed=3)
+    results = close(sequence, vocabulary)
+    assert [r.kf_id for r in results] == [k.kf_id for k in sequence.keyframes]  # exactly one answer each
     loops = [r for r in results if r.candidate_kf_id >= 0]
-    second_visit = next(i for i, p in enumerate(walk.world_T_kf) if i > 90 and abs(p[0, 3]) < 0.1 and p[2, 2] > 0.9)
+    second_visit = next(i for i, p in enumerate(sequence.world_T_kf) if i > 90 and abs(p[0, 3]) < 0.1 and p[2, 2] > 0.9)
     assert any(r.kf_id >= second_visit for r in loops)
     for loop in loops:
-        assert error_of(walk, loop) < 0.1
+        assert error_of(sequence, loop) < 0.1
         assert loop.inliers >= LoopConfig().min_inliers
-        right = [walk.physical[a] == walk.physical[b] for a, b in loop.matches.tolist()]
+        right = [sequence.physical[a] == sequence.physical[b] for a, b in loop.matches.tolist()]
         assert np.mean(right) > 0.95
         assert np.linalg.eigvalsh(loop.information).min() > 0
 
 
 def test_every_rejection_has_a_reason(vocabulary: voc.Vocabulary) -> None:
-    results = close(make_walk([0, 1, 0], seed=3), vocabulary)
+    results = close(make_sequence([0, 1, 0], seed=3), vocabulary)
     for r in results:
         assert (r.reason == "") == (r.candidate_kf_id >= 0)
         assert all(reason and kf_id >= 0 for kf_id, _, reason in r.rejected)
@@ -57,39 +57,39 @@ def test_every_rejection_has_a_reason(vocabulary: voc.Vocabulary) -> None:
 
 @pytest.mark.parametrize("seed", range(2))
 def test_identical_aisles_are_not_taken_for_each_other(vocabulary: voc.Vocabulary, seed: int) -> None:
-    walk = make_walk([0, 1, 0], alike=1.0, seed=seed)
-    loops = [r for r in close(walk, vocabulary) if r.candidate_kf_id >= 0]
-    assert all(error_of(walk, loop) < 0.1 for loop in loops)
-    assert any(walk.world_T_kf[r.kf_id][2, 2] > 0.9 and r.kf_id > 90 for r in loops)
+    sequence = make_sequence([0, 1, 0], alike=1.0, seed=seed)
+    loops = [r for r in close(sequence, vocabulary) if r.candidate_kf_id >= 0]
+    assert all(error_of(sequence, loop) < 0.1 for loop in loops)
+    assert any(sequence.world_T_kf[r.kf_id][2, 2] > 0.9 and r.kf_id > 90 for r in loops)
 
 
 def test_without_the_odometry_gate_identical_aisles_deceive(vocabulary: voc.Vocabulary) -> None:
     """The gate is what saves the test above: appearance and geometry alone accept the twin aisle."""
-    walk = make_walk([0, 4], alike=1.0, seed=0)  # so far apart that neither is seen from the other
+    sequence = make_sequence([0, 4], alike=1.0, seed=0)  # so far apart that neither is seen from the other
     blind = dataclasses.replace(LoopConfig(), gate_m=100.0, gate_deg=360.0)
-    loops = [r for r in close(walk, vocabulary, blind) if r.candidate_kf_id >= 0]
-    assert any(error_of(walk, loop) > 1.0 for loop in loops)
+    loops = [r for r in close(sequence, vocabulary, blind) if r.candidate_kf_id >= 0]
+    assert any(error_of(sequence, loop) > 1.0 for loop in loops)
 
 
 def test_of_two_places_that_look_alike_the_one_that_shows_more_is_taken(vocabulary: voc.Vocabulary) -> None:
     """Half of the products stand in both aisles, and odometry allows everything."""
-    walk = make_walk([0, 4, 0], alike=0.5, seed=0)
+    sequence = make_sequence([0, 4, 0], alike=0.5, seed=0)
     blind = dataclasses.replace(LoopConfig(), gate_m=100.0, gate_deg=360.0)
-    again = next(i for i, p in enumerate(walk.world_T_kf) if i > 90 and abs(p[0, 3]) < 0.1 and p[2, 2] > 0.9)
-    results = close(walk, vocabulary, blind)[again + 4 :]
+    again = next(i for i, p in enumerate(sequence.world_T_kf) if i > 90 and abs(p[0, 3]) < 0.1 and p[2, 2] > 0.9)
+    results = close(sequence, vocabulary, blind)[again + 4 :]
     loops = [r for r in results if r.candidate_kf_id >= 0]
-    assert loops and all(error_of(walk, r) < 0.1 for r in loops)
+    assert loops and all(error_of(sequence, r) < 0.1 for r in loops)
     assert any(reason == "better_elsewhere" for r in results for _, _, reason in r.rejected)
 
 
-def scripted(walk: StoreWalk, answers: dict[tuple[int, int], tuple[int, F64]]) -> Callable[..., Verdict]:
+def scripted(sequence: StoreSequence, answers: dict[tuple[int, int], tuple[int, F64]]) -> Callable[..., Verdict]:
     """In place of `LoopCloser._verify`: (keyframe, candidate) -> inliers, and the error of the relative pose."""
 
     def answer(_: LoopCloser, keyframe: Keyframe, __: PlaceView, candidate: int) -> Verdict:
         if (keyframe.kf_id, candidate) not in answers:
             return rejection("too_few_matches")
         inliers, error = answers[keyframe.kf_id, candidate]
-        truth = se3.inverse(walk.world_T_kf[candidate]) @ walk.world_T_kf[keyframe.kf_id]
+        truth = se3.inverse(sequence.world_T_kf[candidate]) @ sequence.world_T_kf[keyframe.kf_id]
         nothing = np.zeros((0, 2), np.int64)
         return Verdict("", se3.inverse(truth @ error), np.eye(6), nothing, inliers, inliers / 300)
 
@@ -97,27 +97,27 @@ def scripted(walk: StoreWalk, answers: dict[tuple[int, int], tuple[int, F64]]) -
 
 
 def answers_of(
-    walk: StoreWalk, vocabulary: voc.Vocabulary, monkeypatch: pytest.MonkeyPatch, script: dict[tuple[int, int], int],
-    wrong: set[int], keyframes: list[Keyframe] | None = None,
+    sequence: StoreSequence, vocabulary: voc.Vocabulary, monkeypatch: pytest.MonkeyPatch,
+    script: dict[tuple[int, int], int], wrong: set[int], keyframes: list[Keyframe] | None = None,
 ) -> list[LoopResult]:  # fmt: skip
     """Results where these candidates are verified with so many inliers, those in `wrong` five metres off."""
     off = se3.exp(np.array([0, 0, 5.0, 0, 0, 0]))
     answers = {key: (inliers, off if key[1] in wrong else np.eye(4)) for key, inliers in script.items()}
-    monkeypatch.setattr(LoopCloser, "_verify", scripted(walk, answers))
+    monkeypatch.setattr(LoopCloser, "_verify", scripted(sequence, answers))
     monkeypatch.setattr(
         LoopCloser,
         "_candidates",
         lambda self, keyframe, bag: ([(c, 0.5) for k, c in script if k == keyframe.kf_id], "no_candidate"),
     )
-    return close(walk if keyframes is None else dataclasses.replace(walk, keyframes=keyframes), vocabulary)
+    return close(sequence if keyframes is None else dataclasses.replace(sequence, keyframes=keyframes), vocabulary)
 
 
 def test_a_twin_that_odometry_refutes_does_not_stand_against_the_true_place(
     vocabulary: voc.Vocabulary, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    walk = make_walk([0], seed=3)
+    sequence = make_sequence([0], seed=3)
     script = {(k, c): n for k in (28, 29) for c, n in ((k - 25, 60), (10, 130))}
-    results = answers_of(walk, vocabulary, monkeypatch, script, wrong={10})
+    results = answers_of(sequence, vocabulary, monkeypatch, script, wrong={10})
     assert results[28].rejected == ((3, 0.5, "not_confirmed_yet"), (10, 0.5, "against_odometry"))
     assert results[29].candidate_kf_id == 4 and results[29].rejected == ((10, 0.5, "against_odometry"),)
 
@@ -125,17 +125,17 @@ def test_a_twin_that_odometry_refutes_does_not_stand_against_the_true_place(
 def test_two_places_in_one_image_are_ambiguous_where_no_way_decides(
     vocabulary: voc.Vocabulary, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    walk = make_walk([0], seed=3)
-    anew = [dataclasses.replace(k, submap_id=int(k.kf_id >= 20), stamp_ns=0) for k in walk.keyframes]
+    sequence = make_sequence([0], seed=3)
+    anew = [dataclasses.replace(k, submap_id=int(k.kf_id >= 20), stamp_ns=0) for k in sequence.keyframes]
     one, other = {(25, 5): 200, (26, 6): 210}, {(26, 12): 205}
-    alone = answers_of(walk, vocabulary, monkeypatch, one, set(), anew)
+    alone = answers_of(sequence, vocabulary, monkeypatch, one, set(), anew)
     assert alone[25].reason == "not_confirmed_yet" and alone[26].candidate_kf_id == 6
-    both = answers_of(walk, vocabulary, monkeypatch, one | other, {12}, anew)
+    both = answers_of(sequence, vocabulary, monkeypatch, one | other, {12}, anew)
     assert both[26].candidate_kf_id == -1 and [why for _, _, why in both[26].rejected] == ["ambiguous"] * 2
 
 
 def test_pause_after_a_loop(vocabulary: voc.Vocabulary) -> None:
-    results = close(make_walk([0, 0], seed=5), vocabulary, dataclasses.replace(LoopConfig(), pause=7))
+    results = close(make_sequence([0, 0], seed=5), vocabulary, dataclasses.replace(LoopConfig(), pause=7))
     accepted = [r.kf_id for r in results if r.candidate_kf_id >= 0]
     assert len(accepted) >= 2
     assert min(np.diff(accepted)) > 7
@@ -143,70 +143,70 @@ def test_pause_after_a_loop(vocabulary: voc.Vocabulary) -> None:
 
 
 def test_disabled_answers_every_keyframe_with_nothing(vocabulary: voc.Vocabulary) -> None:
-    results = close(make_walk([0], seed=5), vocabulary, dataclasses.replace(LoopConfig(), enabled=False))
+    results = close(make_sequence([0], seed=5), vocabulary, dataclasses.replace(LoopConfig(), enabled=False))
     assert {r.reason for r in results} == {"disabled"}
 
 
-def test_same_walk_same_bits(vocabulary: voc.Vocabulary) -> None:
+def test_same_sequence_same_bits(vocabulary: voc.Vocabulary) -> None:
     def bits() -> list[bytes]:
         return [
             r.candidate_T_kf.tobytes() + r.matches.tobytes() + r.information.tobytes() + repr(r.rejected).encode()
-            for r in close(make_walk([0, 0], seed=6), vocabulary)
+            for r in close(make_sequence([0, 0], seed=6), vocabulary)
         ]
 
     assert bits() == bits()
 
 
 def test_vocabulary_grows_online(vocabulary: voc.Vocabulary) -> None:
-    walk = make_walk([0, 0], seed=7)
-    closer = LoopCloser(dataclasses.replace(LoopConfig(), grow_every=5), walk.rig, vocabulary)
-    results = [closer.step(k) for k in walk.keyframes]
+    sequence = make_sequence([0, 0], seed=7)
+    closer = LoopCloser(dataclasses.replace(LoopConfig(), grow_every=5), sequence.rig, vocabulary)
+    results = [closer.step(k) for k in sequence.keyframes]
     assert len(closer.vocabulary) > len(vocabulary)
-    assert any(r.candidate_kf_id >= 0 and error_of(walk, r) < 0.05 for r in results)
+    assert any(r.candidate_kf_id >= 0 and error_of(sequence, r) < 0.05 for r in results)
 
 
 def test_a_view_seen_every_lap_is_remembered_a_few_times_and_still_closes(vocabulary: voc.Vocabulary) -> None:
-    walk = make_walk([0, 1] * 7, seed=3)
-    closer = LoopCloser(LoopConfig(), walk.rig, vocabulary)
+    sequence = make_sequence([0, 1] * 7, seed=3)
+    closer = LoopCloser(LoopConfig(), sequence.rig, vocabulary)
     results, remembered = list[LoopResult](), list[int]()
-    for keyframe in walk.keyframes:
+    for keyframe in sequence.keyframes:
         results.append(closer.step(keyframe))
         remembered.append(closer.remembered)
-    lap = len(walk.keyframes) // 7
+    lap = len(sequence.keyframes) // 7
     assert remembered[lap] == lap + 1  # nothing is forgotten on the first lap
     assert remembered[-1] - remembered[-1 - lap] < 0.3 * lap  # hardly anything is added on the last
     assert len(closer._database) <= 2 * closer.remembered + FRESH + 1  # what is forgotten takes no room
     assert any(r.candidate_kf_id >= 0 for r in results[-lap:])
-    assert all(error_of(walk, r) < 0.1 for r in results if r.candidate_kf_id >= 0)
+    assert all(error_of(sequence, r) < 0.1 for r in results if r.candidate_kf_id >= 0)
 
 
 def test_tracking_that_began_anew_finds_the_place_it_just_left(vocabulary: voc.Vocabulary) -> None:
     """Dark for a moment: the new submap joins the old one at once, not when the robot comes round again."""
-    walk = make_walk([0], seed=3)
+    sequence = make_sequence([0], seed=3)
     break_at = 20
     astray = se3.exp(np.array([5.0, 1, -8, 0.2, 1.0, 0]))
     keyframes = [
         k
         if i < break_at
         else dataclasses.replace(k, submap_id=1, odom_T_cam=astray @ k.odom_T_cam, point_ids=k.point_ids + 10**6)
-        for i, k in enumerate(walk.keyframes[: break_at + 8])
+        for i, k in enumerate(sequence.keyframes[: break_at + 8])
     ]
-    loops = [r for r in close(dataclasses.replace(walk, keyframes=keyframes), vocabulary) if r.candidate_kf_id >= 0]
+    loops = [r for r in close(dataclasses.replace(sequence, keyframes=keyframes), vocabulary) if r.candidate_kf_id >= 0]
     assert loops and loops[0].candidate_kf_id < break_at <= loops[0].kf_id < break_at + 5
-    assert all(error_of(walk, loop) < 0.05 for loop in loops)
+    assert all(error_of(sequence, loop) < 0.05 for loop in loops)
 
 
 def test_tracking_that_began_anew_in_a_twin_aisle_does_not_join_the_first(vocabulary: voc.Vocabulary) -> None:
-    """Dark between two identical aisles: the robot cannot have driven back so fast as the pictures say."""
-    walk = make_walk([0, 1], alike=1.0, seed=0)
-    turned = next(i for i, pose in enumerate(walk.world_T_kf) if pose[0, 3] > 1.0)
-    rest = walk.keyframes[turned + 2 :]
+    """Dark between two identical aisles: the robot cannot have driven back so fast as the images say."""
+    sequence = make_sequence([0, 1], alike=1.0, seed=0)
+    turned = next(i for i, pose in enumerate(sequence.world_T_kf) if pose[0, 3] > 1.0)
+    rest = sequence.keyframes[turned + 2 :]
     begin = se3.inverse(rest[0].odom_T_cam)
-    keyframes = walk.keyframes[:turned] + [
+    keyframes = sequence.keyframes[:turned] + [
         dataclasses.replace(k, submap_id=1, odom_T_cam=begin @ k.odom_T_cam, point_ids=k.point_ids + 10**6)
         for k in rest
     ]
-    results = close(dataclasses.replace(walk, keyframes=keyframes), vocabulary)
+    results = close(dataclasses.replace(sequence, keyframes=keyframes), vocabulary)
     across = [r for r in results if r.candidate_kf_id >= 0 and r.candidate_kf_id < turned < r.kf_id]
-    assert all(error_of(walk, r) < 0.1 for r in across)
+    assert all(error_of(sequence, r) < 0.1 for r in across)
     assert any(reason == "out_of_reach" for r in results for _, _, reason in r.rejected)

@@ -1,4 +1,4 @@
-"""A loop applied to a real map of a synthetic walk: poses, points, fusion, and a false loop that changes nothing."""
+"""Loops applied to the map of a synthetic sequence: poses, points, fusion, and the rejection of a false loop."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.correction import apply_loop
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.types import F64, Keyframe, LoopResult
-from tests.loop.store_walk import StoreWalk, make_walk
+from tests.loop.store_sequence import StoreSequence, make_sequence
 
 
 @pytest.fixture(scope="module")
-def walk() -> StoreWalk:
-    return make_walk([0, 0], seed=11)
+def sequence() -> StoreSequence:
+    return make_sequence([0, 0], seed=11)
 
 
-def raw_map(walk: StoreWalk) -> Map:
+def raw_map(sequence: StoreSequence) -> Map:
     """Keyframes where odometry says, points where their first keyframe saw them."""
     map_ = Map()
-    for k in walk.keyframes:
+    for k in sequence.keyframes:
         row = map_.add_keyframe(k, k.odom_T_cam)
         new = map_.point_rows(k.point_ids) < 0
         map_.add_points(k.point_ids[new], se3.transform(k.odom_T_cam, k.points_cam[new]), row)
@@ -33,14 +33,18 @@ def raw_map(walk: StoreWalk) -> Map:
     return map_
 
 
-def true_loop(walk: StoreWalk, a: int, b: int) -> LoopResult:
+def true_loop(sequence: StoreSequence, a: int, b: int) -> LoopResult:
     """The loop between two keyframes as truth has it, with the points that both saw."""
-    seen = {walk.physical[i]: i for i in walk.keyframes[a].point_ids.tolist()}
-    pairs = [(seen[walk.physical[i]], i) for i in walk.keyframes[b].point_ids.tolist() if walk.physical[i] in seen]
+    seen = {sequence.physical[i]: i for i in sequence.keyframes[a].point_ids.tolist()}
+    pairs = [
+        (seen[sequence.physical[i]], i)
+        for i in sequence.keyframes[b].point_ids.tolist()
+        if sequence.physical[i] in seen
+    ]
     return LoopResult(
         kf_id=b,
         candidate_kf_id=a,
-        candidate_T_kf=se3.inverse(walk.world_T_kf[a]) @ walk.world_T_kf[b],
+        candidate_T_kf=se3.inverse(sequence.world_T_kf[a]) @ sequence.world_T_kf[b],
         information=np.eye(6) * 1e6,
         matches=np.array(pairs, np.int64).reshape(-1, 2),
         inliers=len(pairs),
@@ -49,10 +53,10 @@ def true_loop(walk: StoreWalk, a: int, b: int) -> LoopResult:
     )
 
 
-def ends(walk: StoreWalk) -> tuple[int, int]:
+def ends(sequence: StoreSequence) -> tuple[int, int]:
     """The last keyframe, and the nearest to it of the first visit."""
-    b = len(walk.keyframes) - 1
-    distance = np.linalg.norm(walk.world_T_kf[:30, :3, 3] - walk.world_T_kf[b, :3, 3], axis=1)
+    b = len(sequence.keyframes) - 1
+    distance = np.linalg.norm(sequence.world_T_kf[:30, :3, 3] - sequence.world_T_kf[b, :3, 3], axis=1)
     return int(distance.argmin()), b
 
 
@@ -62,16 +66,16 @@ def trajectory_error(map_: Map, truth: F64) -> float:
     return float(np.sqrt(((here[:, :3, 3] - moved) ** 2).sum(1).mean()))
 
 
-def test_loop_takes_the_drift_away_and_carries_the_points(walk: StoreWalk) -> None:
-    map_ = raw_map(walk)
-    a, b = ends(walk)
-    before = trajectory_error(map_, walk.world_T_kf)
+def test_loop_takes_the_drift_away_and_carries_the_points(sequence: StoreSequence) -> None:
+    map_ = raw_map(sequence)
+    a, b = ends(sequence)
+    before = trajectory_error(map_, sequence.world_T_kf)
     alive = len(map_.living_points())
     local = se3.transform(se3.inverse(map_.keyframes.map_T_kf[b]), map_.points.xyz[map_.points.anchor == b])
-    loop = true_loop(walk, a, b)
+    loop = true_loop(sequence, a, b)
     done = apply_loop(map_, loop, [], LoopConfig())
     assert done.applied
-    assert trajectory_error(map_, walk.world_T_kf) < 0.7 * before
+    assert trajectory_error(map_, sequence.world_T_kf) < 0.7 * before
     relative = se3.inverse(map_.keyframes.map_T_kf[a]) @ map_.keyframes.map_T_kf[b]
     assert np.linalg.norm((se3.inverse(loop.candidate_T_kf) @ relative)[:3, 3]) < 0.02
     assert np.allclose(
@@ -82,7 +86,7 @@ def test_loop_takes_the_drift_away_and_carries_the_points(walk: StoreWalk) -> No
     assert map_.neighbours(b)[0].tolist().count(a) == 1  # the two sides now share points
 
 
-def turning_walk(degrees_per_100m: float, side_m: float = 30.0, step_m: float = 0.5) -> tuple[Map, F64]:
+def turning_sequence(degrees_per_100m: float, side_m: float = 30.0, step_m: float = 0.5) -> tuple[Map, F64]:
     """A map of keyframes around a square back to its beginning, whose heading drifts, and the truth of its poses."""
     truth, drifted = [np.eye(4)], [np.eye(4)]
     per_side = round(side_m / step_m)
@@ -107,9 +111,9 @@ def turning_walk(degrees_per_100m: float, side_m: float = 30.0, step_m: float = 
 
 
 @pytest.mark.parametrize("degrees_per_100m", [0.5, 2.0, 5.0])
-def test_a_walk_whose_heading_drifts_evenly_closes(degrees_per_100m: float) -> None:
+def test_a_sequence_whose_heading_drifts_evenly_closes(degrees_per_100m: float) -> None:
     """Such errors add up: after 120 m the ends are 0.2 to 2.2 m apart, and the true loop is believed."""
-    map_, truth = turning_walk(degrees_per_100m)
+    map_, truth = turning_sequence(degrees_per_100m)
     last = len(truth) - 1
     before = trajectory_error(map_, truth)
     loop = LoopResult(
@@ -121,7 +125,7 @@ def test_a_walk_whose_heading_drifts_evenly_closes(degrees_per_100m: float) -> N
 
 def test_a_loop_that_no_drift_explains_is_refused() -> None:
     """The next aisle looks the same: 1.5 m aside after 40 m."""
-    map_, truth = turning_walk(0.5, side_m=10.0)
+    map_, truth = turning_sequence(0.5, side_m=10.0)
     last = len(truth) - 1
     poses = map_.keyframes.map_T_kf.copy()
     aside = se3.inverse(truth[0]) @ truth[last] @ se3.exp(np.array([1.5, 0, 0, 0, 0, 0]))
@@ -130,59 +134,64 @@ def test_a_loop_that_no_drift_explains_is_refused() -> None:
     assert np.array_equal(map_.keyframes.map_T_kf, poses)
 
 
-def test_false_loop_changes_nothing(walk: StoreWalk) -> None:
-    map_ = raw_map(walk)
-    a, b = ends(walk)
-    apply_loop(map_, true_loop(walk, a, b), [], LoopConfig())
+def test_false_loop_changes_nothing(sequence: StoreSequence) -> None:
+    map_ = raw_map(sequence)
+    a, b = ends(sequence)
+    apply_loop(map_, true_loop(sequence, a, b), [], LoopConfig())
     poses, points = map_.keyframes.map_T_kf.copy(), map_.points.xyz.copy()
-    false = dataclasses.replace(true_loop(walk, a, b - 5), candidate_T_kf=se3.exp(np.array([1.5, 0, 1.0, 0, 0.3, 0])))
-    done = apply_loop(map_, false, [true_loop(walk, a, b)], LoopConfig())
+    false = dataclasses.replace(
+        true_loop(sequence, a, b - 5), candidate_T_kf=se3.exp(np.array([1.5, 0, 1.0, 0, 0.3, 0]))
+    )
+    done = apply_loop(map_, false, [true_loop(sequence, a, b)], LoopConfig())
     assert not done.applied
     assert np.array_equal(map_.keyframes.map_T_kf, poses)
     assert np.array_equal(map_.points.xyz, points, equal_nan=True)
 
 
-def test_averaging_meets_the_loop_exactly(walk: StoreWalk) -> None:
-    map_ = raw_map(walk)
-    a, b = ends(walk)
-    loop = true_loop(walk, a, b)
+def test_averaging_meets_the_loop_exactly(sequence: StoreSequence) -> None:
+    map_ = raw_map(sequence)
+    a, b = ends(sequence)
+    loop = true_loop(sequence, a, b)
     assert apply_loop(map_, loop, [], dataclasses.replace(LoopConfig(), correction="averaging")).applied
     relative = se3.inverse(map_.keyframes.map_T_kf[a]) @ map_.keyframes.map_T_kf[b]
     assert np.allclose(relative, loop.candidate_T_kf, atol=1e-9)
 
 
-def test_unknown_correction_is_refused(walk: StoreWalk) -> None:
+def test_unknown_correction_is_refused(sequence: StoreSequence) -> None:
     with pytest.raises(StereoSfmError, match=r"loop\.correction"):
         apply_loop(
-            raw_map(walk), true_loop(walk, *ends(walk)), [], dataclasses.replace(LoopConfig(), correction="magic")
+            raw_map(sequence),
+            true_loop(sequence, *ends(sequence)),
+            [],
+            dataclasses.replace(LoopConfig(), correction="magic"),
         )
 
 
 @pytest.mark.parametrize("correction", ["pose_graph", "averaging"])
-def test_a_submap_is_brought_to_the_rest_by_the_loop(walk: StoreWalk, correction: str) -> None:
+def test_a_submap_is_brought_to_the_rest_by_the_loop(sequence: StoreSequence, correction: str) -> None:
     """Tracking restarted somewhere: the second piece begins at an odometry pose that means nothing."""
-    a, b = ends(walk)
-    half = len(walk.keyframes) // 2
+    a, b = ends(sequence)
+    half = len(sequence.keyframes) // 2
     astray = se3.exp(np.array([5.0, 1, -8, 0.2, 1.0, 0]))
     pieces = [
         k if i < half else dataclasses.replace(k, submap_id=1, odom_T_cam=astray @ k.odom_T_cam)
-        for i, k in enumerate(walk.keyframes)
+        for i, k in enumerate(sequence.keyframes)
     ]
-    lost = dataclasses.replace(walk, keyframes=pieces)
+    lost = dataclasses.replace(sequence, keyframes=pieces)
     for k in range(half, len(pieces)):  # no track survives the break
         ids = pieces[k].point_ids + 10**6
         pieces[k] = dataclasses.replace(pieces[k], point_ids=ids)
-    lost.physical.update({i + 10**6: p for i, p in walk.physical.items()})
+    lost.physical.update({i + 10**6: p for i, p in sequence.physical.items()})
     map_ = raw_map(lost)
     config = dataclasses.replace(LoopConfig(), correction=correction)
     assert apply_loop(map_, true_loop(lost, a, b), [], config).applied
-    assert trajectory_error(map_, walk.world_T_kf) < 0.3
+    assert trajectory_error(map_, sequence.world_T_kf) < 0.3
 
 
-def test_same_map_same_bits(walk: StoreWalk) -> None:
+def test_same_map_same_bits(sequence: StoreSequence) -> None:
     def bits() -> bytes:
-        map_ = raw_map(walk)
-        apply_loop(map_, true_loop(walk, *ends(walk)), [], LoopConfig())
+        map_ = raw_map(sequence)
+        apply_loop(map_, true_loop(sequence, *ends(sequence)), [], LoopConfig())
         return map_.keyframes.map_T_kf.tobytes() + map_.points.xyz.tobytes()
 
     assert bits() == bits()

@@ -1,4 +1,4 @@
-"""The mapper on synthetic walks: it must take drift out, find points again, keep its promises about frames and bits."""
+"""The mapper on synthetic sequences: drift, re-observed points, frames of reference and reproducibility."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from stereo_sfm.mapping.keyframe_poses import KeyframePoses
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.mapping.mapper import Mapper, run_job
 from stereo_sfm.types import F64, LoopResult, MapUpdate
-from tests.synthetic import KeyframeStream, fisheye_rig, keyframe_stream, pinhole_rig, walk
+from tests.synthetic import KeyframeStream, camera_path, fisheye_rig, keyframe_stream, pinhole_rig
 
 CONFIG = MapperConfig()
 
@@ -52,8 +52,8 @@ def rig(request: pytest.FixtureRequest) -> Rig:
     return pinhole_rig() if request.param == "pinhole" else fisheye_rig()
 
 
-def test_a_walk_loses_its_drift(rig: Rig) -> None:
-    stream = keyframe_stream(rig, walk(18), drift=(0.01, 0.003), outliers=0.03)
+def test_a_sequence_loses_its_drift(rig: Rig) -> None:
+    stream = keyframe_stream(rig, camera_path(18), drift=(0.01, 0.003), outliers=0.03)
     mapper, _ = run(stream)
     assert error(mapper.map.keyframes.map_T_kf, stream.world_T_kf) < 0.4 * error(odometry(stream), stream.world_T_kf)
 
@@ -101,12 +101,12 @@ def test_updates_alone_rebuild_the_map() -> None:
 
 
 def test_map_and_odometry_are_one_frame_before_a_loop() -> None:
-    _, updates = run(keyframe_stream(pinhole_rig(), walk(6)))
+    _, updates = run(keyframe_stream(pinhole_rig(), camera_path(6)))
     assert all(np.array_equal(u.map_T_odom, np.eye(4)) for u in updates)
 
 
 def test_where_no_track_connects_odometry_holds(rig: Rig) -> None:
-    stream = keyframe_stream(rig, walk(10), broken_at=6)
+    stream = keyframe_stream(rig, camera_path(10), broken_at=6)
     mapper, _ = run(stream, dataclasses.replace(CONFIG, association="tracks"))
     step = se3.inverse(mapper.map.keyframes.map_T_kf[5]) @ mapper.map.keyframes.map_T_kf[6]
     expected = se3.inverse(stream.world_T_kf[5]) @ stream.world_T_kf[6]
@@ -114,7 +114,7 @@ def test_where_no_track_connects_odometry_holds(rig: Rig) -> None:
 
 
 def test_weak_points_go_and_tracked_ones_stay(rig: Rig) -> None:
-    stream = keyframe_stream(rig, walk(14), outliers=0.05)
+    stream = keyframe_stream(rig, camera_path(14), outliers=0.05)
     mapper, updates = run(stream)
     points = mapper.map.points
     old = mapper.map.living_points()
@@ -139,7 +139,7 @@ def test_keyframes_of_one_place_are_thinned_out() -> None:
 
 
 def test_retail_papers_rule_only_knows_the_previous_keyframe() -> None:
-    stream = keyframe_stream(fisheye_rig(), walk(12))
+    stream = keyframe_stream(fisheye_rig(), camera_path(12))
     paper = dataclasses.replace(CONFIG, association="previous", window_keyframes=0, redundant_share=2.0)
     mapper, updates = run(stream, paper)
     assert sum(len(u.fused_point_ids) for u in updates) == 0
@@ -176,7 +176,7 @@ def test_taking_back_rows_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_switched_off_it_repeats_odometry() -> None:
-    stream = keyframe_stream(pinhole_rig(), walk(5))
+    stream = keyframe_stream(pinhole_rig(), camera_path(5))
     mapper, updates = run(stream, dataclasses.replace(CONFIG, enabled=False))
     assert len(mapper.map.keyframes) == 0
     for keyframe, update in zip(stream.keyframes, updates, strict=True):
@@ -186,7 +186,7 @@ def test_switched_off_it_repeats_odometry() -> None:
 
 def ring(count: int) -> F64:
     """(K, 4, 4) once round a circle and a little further."""
-    return walk(count, 0.25, 2 * np.pi / (count - 5))
+    return camera_path(count, 0.25, 2 * np.pi / (count - 5))
 
 
 def true_loop(stream: KeyframeStream, kf: int, candidate: int) -> LoopResult:
@@ -206,7 +206,7 @@ def true_loop(stream: KeyframeStream, kf: int, candidate: int) -> LoopResult:
     )
 
 
-def walk_with_loop(stream: KeyframeStream, elsewhere: bool = False) -> tuple[Mapper, list[MapUpdate]]:
+def sequence_with_loop(stream: KeyframeStream, elsewhere: bool = False) -> tuple[Mapper, list[MapUpdate]]:
     """One true loop two keyframes before the end; `elsewhere`: the job is run by somebody else."""
     config = dataclasses.replace(CONFIG, full_ba_lag_keyframes=3, full_ba_growth=np.inf, association="tracks")
     mapper, updates = Mapper(config, stream.rig), []
@@ -224,7 +224,7 @@ def test_a_loop_moves_the_map_and_not_the_odometry() -> None:
     stream = keyframe_stream(
         pinhole_rig(), ring(40), points=800, noise_px=1.0, drift=(0.01, 0.003), per_keyframe=100, track_length=3
     )
-    mapper, updates = walk_with_loop(stream)
+    mapper, updates = sequence_with_loop(stream)
     without, _ = run(stream, dataclasses.replace(CONFIG, association="tracks"))
     closing = next(i for i, u in enumerate(updates) if not np.array_equal(u.map_T_odom, np.eye(4)))
     before, after = updates[closing - 1], updates[closing]
@@ -242,14 +242,14 @@ def test_a_loop_moves_the_map_and_not_the_odometry() -> None:
 
 def test_full_adjustment_gives_the_same_bits_wherever_it_runs() -> None:
     stream = keyframe_stream(pinhole_rig(), ring(26), drift=(0.01, 0.003), per_keyframe=60)
-    here, there = walk_with_loop(stream)[0].map, walk_with_loop(stream, elsewhere=True)[0].map
+    here, there = sequence_with_loop(stream)[0].map, sequence_with_loop(stream, elsewhere=True)[0].map
     assert here.keyframes.map_T_kf.tobytes() == there.keyframes.map_T_kf.tobytes()
     assert here.points.xyz.tobytes() == there.points.xyz.tobytes()
 
 
 def test_a_loop_that_the_map_knows_only_fuses(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = keyframe_stream(pinhole_rig(), ring(40), points=800, per_keyframe=100, track_length=3)
-    mapper, _ = walk_with_loop(stream)
+    mapper, _ = sequence_with_loop(stream)
     mapper.finish([])
     again = true_loop(stream, len(stream.keyframes) - 8, 2)
     assert loop_is_known(mapper.map, again, CONFIG.connected_points)
@@ -261,7 +261,7 @@ def test_a_loop_that_the_map_knows_only_fuses(monkeypatch: pytest.MonkeyPatch) -
 
 def test_a_loop_that_contradicts_the_map_is_refused_and_told() -> None:
     stream = keyframe_stream(pinhole_rig(), ring(40), points=800, per_keyframe=100, track_length=3)
-    mapper, _ = walk_with_loop(stream)
+    mapper, _ = sequence_with_loop(stream)
     mapper.finish([])
     before = mapper.map.keyframes.map_T_kf.copy()
     loop = true_loop(stream, len(stream.keyframes) - 8, 2)
@@ -280,7 +280,7 @@ def test_no_limit_of_the_window_takes_all_keyframes() -> None:
 
 def test_a_place_keeps_a_bounded_number_of_keyframes() -> None:
     """To and fro along the same wall: new tracks every time, so no keyframe is redundant by its points."""
-    once = walk(12, 0.1, 0.0)
+    once = camera_path(12, 0.1, 0.0)
     stream = keyframe_stream(pinhole_rig(), np.concatenate([once, once[::-1]] * 6), points=600, track_length=4)
     bounded, _ = run(stream, dataclasses.replace(CONFIG, redundant_share=0.999))
     every, _ = run(stream, dataclasses.replace(CONFIG, redundant_share=2.0))

@@ -1,4 +1,4 @@
-"""Pose graph and transformation averaging on walks with known truth."""
+"""Pose graph and transformation averaging on sequences with known truth."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from stereo_sfm.types import F64
 
 
 def ring(count: int = 60) -> tuple[F64, F64]:
-    """Truth of a round walk that ends where it began, and the same walk with drifting odometry."""
+    """Truth of a round sequence that ends where it began, and the same sequence with drifting odometry."""
     angle = np.linspace(0, 2 * np.pi, count)
     truth = np.array(
         [
@@ -91,8 +91,8 @@ def test_averaging_spreads_an_even_error_exactly() -> None:
     assert np.allclose(out[19], truth[15] @ step, atol=1e-12)  # what comes after the loop moves as one
 
 
-def test_averaging_is_worse_than_the_pose_graph_on_a_round_walk() -> None:
-    """As the paper found: the average suits walks without turns (its STORE2), not these."""
+def test_averaging_is_worse_than_the_pose_graph_on_a_round_sequence() -> None:
+    """As the paper found: the average suits sequences without turns (its STORE2), not these."""
     truth, odom = ring()
     edges = join([chain(odom), loop_edge(0, 59, se3.inverse(truth[0]) @ truth[59])])
     graph = optimise(odom, edges, np.array([0]))

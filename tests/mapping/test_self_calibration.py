@@ -16,7 +16,7 @@ from stereo_sfm.mapping.mapper import Mapper
 from stereo_sfm.mapping.row_errors import RowMonitor
 from stereo_sfm.mapping.self_calibration import Revision, SelfCalibration
 from stereo_sfm.types import Keyframe
-from tests.synthetic import fisheye_rig, pinhole_rig, points_around, walk
+from tests.synthetic import camera_path, fisheye_rig, pinhole_rig, points_around
 
 RIGS = {"fisheye": fisheye_rig(), "pinhole": pinhole_rig()}
 NOISE_PX = 0.15
@@ -27,12 +27,12 @@ def turned(rig: Rig, degrees: tuple[float, float, float]) -> Rig:
 
 
 def keyframes(rigs: list[Rig], believed: Rig, seed: int, noise_px: float = NOISE_PX) -> Iterator[Keyframe]:
-    """What a tracker with `believed` would send of a walk; keyframe k is seen by rigs[k].
+    """What a tracker with `believed` would send of a sequence; keyframe k is seen by rigs[k].
 
     Odometry is off by a few millimetres a step, as if it had drifted.
     """
     rng = np.random.default_rng(seed)
-    path = walk(len(rigs))
+    path = camera_path(len(rigs))
     points = points_around(path, 60 * len(rigs), rng)
     for k, (rig, pose) in enumerate(zip(rigs, path, strict=True)):
         assert rig.right is not None
@@ -137,6 +137,6 @@ def test_the_map_is_made_anew_by_the_corrected_rig(mode: bool) -> None:
     told = [u.calibration for u in [*updates, last] if u is not None and u.calibration is not None]
     assert told and all(c.applied == mode for c in told)
     ends = mapper.map.keyframes.map_T_kf[[0, -1], :3, 3]
-    path = walk(24)[[0, -1], :3, 3]
+    path = camera_path(24)[[0, -1], :3, 3]
     ratio = np.linalg.norm(ends[1] - ends[0]) / np.linalg.norm(path[1] - path[0])
     assert (abs(ratio - 1) < 0.01) == mode

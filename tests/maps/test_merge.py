@@ -1,4 +1,4 @@
-"""Several walks of one store in one map, and what pruning leaves."""
+"""Several sequences of one store in one map, and what pruning leaves."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from stereo_sfm.maps.folders import MapFolders, save_result
 from stereo_sfm.maps.merge import full_adjustment, merge, prune, share_a_session
 from stereo_sfm.maps.saved_map import SavedMap, joined, load_map, restore_map, save_map
 from stereo_sfm.types import LoopResult
-from tests.loop.store_walk import StoreWalk, make_walk
-from tests.maps.maps import map_of_walk, same
+from tests.loop.store_sequence import StoreSequence, make_sequence
+from tests.maps.maps import map_of_sequence, same
 from tests.synthetic import pinhole_rig
 
 
 @pytest.fixture(scope="module")
-def drives() -> list[StoreWalk]:
-    """Two walks through one store: the first two aisles, and later the first one again, with frames of their own."""
-    both = make_walk([0, 1, 0], seed=31)
+def drives() -> list[StoreSequence]:
+    """Two sessions in one store, each in its own frame: the first two aisles, and later the first one again."""
+    both = make_sequence([0, 1, 0], seed=31)
     second = next(
         k for k in range(90, len(both.keyframes)) if both.world_T_kf[k, 2, 3] < 0 and both.world_T_kf[k, 0, 3] < 1
     )
@@ -35,13 +35,13 @@ def drives() -> list[StoreWalk]:
 
 
 @pytest.fixture(scope="module")
-def vocabulary(drives: list[StoreWalk]) -> voc.Vocabulary:
+def vocabulary(drives: list[StoreSequence]) -> voc.Vocabulary:
     return voc.train([k.descriptors for k in drives[0].keyframes], depth=3)
 
 
 @pytest.fixture(scope="module")
-def maps(drives: list[StoreWalk]) -> list[SavedMap]:
-    return [map_of_walk(w) for w in drives]
+def maps(drives: list[StoreSequence]) -> list[SavedMap]:
+    return [map_of_sequence(w) for w in drives]
 
 
 @pytest.fixture(scope="module")
@@ -52,8 +52,8 @@ def merged(maps: list[SavedMap], vocabulary: voc.Vocabulary) -> SavedMap:
     return result.saved
 
 
-def test_merged_map_has_both_walks_where_they_were(
-    drives: list[StoreWalk], maps: list[SavedMap], merged: SavedMap
+def test_merged_map_has_both_sequences_where_they_were(
+    drives: list[StoreSequence], maps: list[SavedMap], merged: SavedMap
 ) -> None:
     assert len(merged) == sum(map(len, maps))
     truth = np.concatenate([w.world_T_kf for w in drives])
@@ -71,7 +71,9 @@ def test_merged_map_names_the_vocabulary_it_was_compared_with(merged: SavedMap, 
     assert merged.vocabulary_id == vocabulary.id
 
 
-def test_wrong_observations_leave_the_map_in_the_full_adjustment(drives: list[StoreWalk], maps: list[SavedMap]) -> None:
+def test_wrong_observations_leave_the_map_in_the_full_adjustment(
+    drives: list[StoreSequence], maps: list[SavedMap]
+) -> None:
     s = maps[1].snapshot
     views = np.bincount(s.obs_pt, minlength=len(s.pt_ids))
     many, two = np.flatnonzero(views[s.obs_pt] > 4)[::400], np.flatnonzero(views[s.obs_pt] == 2)[::400]
@@ -95,7 +97,7 @@ def test_wrong_observations_leave_the_map_in_the_full_adjustment(drives: list[St
 
 
 def test_maps_that_share_nothing_are_not_joined(maps: list[SavedMap], vocabulary: voc.Vocabulary) -> None:
-    stranger = map_of_walk(make_walk([0], seed=99))
+    stranger = map_of_sequence(make_sequence([0], seed=99))
     with pytest.raises(StereoSfmError, match="2 separate maps: no loop joins them"):
         merge([maps[1], stranger], vocabulary, LoopConfig())
 
@@ -105,7 +107,7 @@ def test_maps_of_different_cameras_are_not_joined(maps: list[SavedMap]) -> None:
         joined([maps[0], dataclasses.replace(maps[1], rig=pinhole_rig())])
 
 
-def test_a_walk_is_known_again(maps: list[SavedMap], merged: SavedMap) -> None:
+def test_a_sequence_is_known_again(maps: list[SavedMap], merged: SavedMap) -> None:
     for saved in maps:
         assert share_a_session(saved, saved)
         assert share_a_session(merged, saved)
@@ -114,7 +116,7 @@ def test_a_walk_is_known_again(maps: list[SavedMap], merged: SavedMap) -> None:
     snapshot = dataclasses.replace(s, **{f: getattr(s, f)[part[s.obs_kf]] for f in ("obs_kf", "obs_pt", "uv_left")})
     assert share_a_session(dataclasses.replace(maps[0], snapshot=snapshot), maps[0])
     assert not share_a_session(maps[0], maps[1])
-    again = map_of_walk(make_walk([0, 1], seed=31, noise_px=0.3))  # the same times, pictures of their own
+    again = map_of_sequence(make_sequence([0, 1], seed=31, noise_px=0.3))  # the same times, images of their own
     assert set(again.snapshot.stamp_ns.tolist()) & set(s.stamp_ns.tolist())
     assert not share_a_session(maps[0], again)
 
@@ -129,7 +131,7 @@ def test_side_by_side_keeps_every_row(maps: list[SavedMap]) -> None:
     assert len(np.unique(both.kf_ids)) == len(both.kf_ids) and len(np.unique(both.pt_ids)) == len(both.pt_ids)
 
 
-def test_prune_by_sessions_forgets_what_the_newest_walk_did_not_see(merged: SavedMap) -> None:
+def test_prune_by_sessions_forgets_what_the_newest_sequence_did_not_see(merged: SavedMap) -> None:
     pruned = prune(merged, unseen_sessions=1)
     s = pruned.snapshot
     assert 0 < len(s.pt_ids) < len(merged.snapshot.pt_ids)
@@ -192,7 +194,7 @@ def test_prune_refuses_numbers_out_of_range(
 
 
 def test_a_known_place_joins_what_the_search_does_not(
-    drives: list[StoreWalk], maps: list[SavedMap], vocabulary: voc.Vocabulary
+    drives: list[StoreSequence], maps: list[SavedMap], vocabulary: voc.Vocabulary
 ) -> None:
     blind = LoopConfig(min_inliers=10**6)
     with pytest.raises(StereoSfmError, match="remain 2 separate maps"):
@@ -223,14 +225,14 @@ def test_a_known_place_joins_what_the_search_does_not(
 
 
 def test_a_merged_map_is_one_piece(merged: SavedMap, maps: list[SavedMap], vocabulary: voc.Vocabulary) -> None:
-    """What joined its walks is not in the file: with a third map they still count as one."""
+    """What joined its sequences is not in the file: with a third map they still count as one."""
     with pytest.raises(StereoSfmError, match="the 2 maps remain 2 separate maps"):
         merge([merged, maps[1]], vocabulary, LoopConfig(min_inliers=10**6))
 
 
 @pytest.mark.parametrize("in_place", [True, False])
 def test_a_merge_that_fails_costs_no_map(
-    tmp_path: Path, drives: list[StoreWalk], maps: list[SavedMap], in_place: bool
+    tmp_path: Path, drives: list[StoreSequence], maps: list[SavedMap], in_place: bool
 ) -> None:
     save_map(maps[0], tmp_path / "store")
     mapper = Mapper(MapperConfig(), drives[1].rig)

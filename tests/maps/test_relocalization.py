@@ -1,4 +1,4 @@
-"""Finding a camera in a saved map without a guess, refusing what is elsewhere, and following a walk inside a map."""
+"""Relocalization in a saved map without a prior, its refusal elsewhere, and a sequence tracked in the map."""
 
 from __future__ import annotations
 
@@ -15,54 +15,56 @@ from stereo_sfm.maps.extension import Extension
 from stereo_sfm.maps.localizer import Localizer
 from stereo_sfm.maps.relocalization import Relocalizer
 from stereo_sfm.types import F64, U8, Corners
-from tests.loop.store_walk import StoreWalk, make_walk
-from tests.maps.maps import map_of_walk
+from tests.loop.store_sequence import StoreSequence, make_sequence
+from tests.maps.maps import map_of_sequence
 
 
 @pytest.fixture(scope="module")
-def walk() -> StoreWalk:
+def sequence() -> StoreSequence:
     """Two aisles; the map is made of the first pass through both, the second pass through the first aisle asks."""
-    return make_walk([0, 1, 0], seed=21, max_points=450)
+    return make_sequence([0, 1, 0], seed=21, max_points=450)
 
 
 @pytest.fixture(scope="module")
-def first_pass(walk: StoreWalk) -> int:
+def first_pass(sequence: StoreSequence) -> int:
     return next(
-        k for k in range(90, len(walk.keyframes)) if walk.world_T_kf[k, 2, 3] < 0 and walk.world_T_kf[k, 0, 3] < 1
+        k
+        for k in range(90, len(sequence.keyframes))
+        if sequence.world_T_kf[k, 2, 3] < 0 and sequence.world_T_kf[k, 0, 3] < 1
     )
 
 
 @pytest.fixture(scope="module")
-def vocabulary(walk: StoreWalk) -> voc.Vocabulary:
-    return voc.train([k.descriptors for k in walk.keyframes[:80]], depth=3)
+def vocabulary(sequence: StoreSequence) -> voc.Vocabulary:
+    return voc.train([k.descriptors for k in sequence.keyframes[:80]], depth=3)
 
 
 @pytest.fixture(scope="module")
-def relocalizer(walk: StoreWalk, first_pass: int, vocabulary: voc.Vocabulary) -> Relocalizer:
-    part = dataclasses.replace(walk, keyframes=walk.keyframes[:first_pass], world_T_kf=walk.world_T_kf[:first_pass])
-    return Relocalizer(map_of_walk(part).snapshot, walk.rig, vocabulary, LoopConfig())
+def relocalizer(sequence: StoreSequence, first_pass: int, vocabulary: voc.Vocabulary) -> Relocalizer:
+    part = sequence.first(first_pass)
+    return Relocalizer(map_of_sequence(part).snapshot, sequence.rig, vocabulary, LoopConfig())
 
 
-def true_pose(walk: StoreWalk, k: int) -> F64:
-    return se3.inverse(walk.world_T_kf[0]) @ walk.world_T_kf[k]
+def true_pose(sequence: StoreSequence, k: int) -> F64:
+    return se3.inverse(sequence.world_T_kf[0]) @ sequence.world_T_kf[k]
 
 
-def test_views_of_the_known_aisle_is_found(walk: StoreWalk, first_pass: int, relocalizer: Relocalizer) -> None:
+def test_views_of_the_known_aisle_is_found(sequence: StoreSequence, first_pass: int, relocalizer: Relocalizer) -> None:
     errors = []
-    asked = range(first_pass + 8, len(walk.keyframes), 3)
+    asked = range(first_pass + 8, len(sequence.keyframes), 3)
     for k in asked:
-        location = relocalizer.locate(walk.keyframes[k])
+        location = relocalizer.locate(sequence.keyframes[k])
         if not location.found:
             continue
-        error = se3.inverse(true_pose(walk, k)) @ location.map_T_cam
+        error = se3.inverse(true_pose(sequence, k)) @ location.map_T_cam
         errors.append((np.linalg.norm(error[:3, 3]), np.rad2deg(np.linalg.norm(se3.log(error)[3:]))))
         assert np.linalg.eigvalsh(location.information).min() > 0
     assert len(errors) >= 0.9 * len(asked)
     assert np.max(errors, axis=0)[0] < 0.05 and np.max(errors, axis=0)[1] < 1.0
 
 
-def test_a_strange_place_is_not_found(walk: StoreWalk, relocalizer: Relocalizer) -> None:
-    elsewhere = make_walk([0], seed=77)
+def test_a_strange_place_is_not_found(sequence: StoreSequence, relocalizer: Relocalizer) -> None:
+    elsewhere = make_sequence([0], seed=77)
     for keyframe in elsewhere.keyframes[2::8]:
         location = relocalizer.locate(keyframe)
         assert not location.found and location.reason
@@ -73,76 +75,78 @@ def _exchanged(descriptors: U8, rng: np.random.Generator) -> U8:
     return np.where(rng.random((len(descriptors), 1)) < 0.2, looks, descriptors)
 
 
-def test_a_fifth_of_the_products_exchanged(walk: StoreWalk, first_pass: int, relocalizer: Relocalizer) -> None:
+def test_a_fifth_of_the_products_exchanged(sequence: StoreSequence, first_pass: int, relocalizer: Relocalizer) -> None:
     rng = np.random.default_rng(0)
     found = 0
-    asked = range(first_pass + 8, len(walk.keyframes), 4)
+    asked = range(first_pass + 8, len(sequence.keyframes), 4)
     for k in asked:
-        keyframe = walk.keyframes[k]
+        keyframe = sequence.keyframes[k]
         corners = dataclasses.replace(keyframe.corners, descriptors=_exchanged(keyframe.corners.descriptors, rng))
         changed = dataclasses.replace(keyframe, descriptors=_exchanged(keyframe.descriptors, rng), corners=corners)
         location = relocalizer.locate(changed)
         if location.found:
             found += 1
-            assert np.linalg.norm((se3.inverse(true_pose(walk, k)) @ location.map_T_cam)[:3, 3]) < 0.05
+            assert np.linalg.norm((se3.inverse(true_pose(sequence, k)) @ location.map_T_cam)[:3, 3]) < 0.05
     assert found >= 0.8 * len(asked)
 
 
-def test_no_share_may_be_asked_for(walk: StoreWalk, first_pass: int, vocabulary: voc.Vocabulary) -> None:
-    part = dataclasses.replace(walk, keyframes=walk.keyframes[:first_pass], world_T_kf=walk.world_T_kf[:first_pass])
+def test_no_share_may_be_asked_for(sequence: StoreSequence, first_pass: int, vocabulary: voc.Vocabulary) -> None:
+    part = sequence.first(first_pass)
     config = dataclasses.replace(LoopConfig(), relocalize_share=0.0, min_inlier_share=0.0)
-    lenient = Relocalizer(map_of_walk(part).snapshot, walk.rig, vocabulary, config)
-    keyframe = walk.keyframes[first_pass + 8]
+    lenient = Relocalizer(map_of_sequence(part).snapshot, sequence.rig, vocabulary, config)
+    keyframe = sequence.keyframes[first_pass + 8]
     place = lenient.locate(keyframe)
     assert place.found and lenient.locate_near(keyframe, place.map_T_cam).found
 
 
-def test_a_view_without_points_has_a_reason(walk: StoreWalk, relocalizer: Relocalizer) -> None:
+def test_a_view_without_points_has_a_reason(sequence: StoreSequence, relocalizer: Relocalizer) -> None:
     blind = dataclasses.replace(
-        walk.keyframes[3], descriptors=np.zeros_like(walk.keyframes[3].descriptors), corners=Corners.none()
+        sequence.keyframes[3], descriptors=np.zeros_like(sequence.keyframes[3].descriptors), corners=Corners.none()
     )
     location = relocalizer.locate(blind)
     assert location.reason == "no_candidate"
 
 
 def test_localizer_places_the_odometry_frame_and_keeps_it(
-    walk: StoreWalk, first_pass: int, vocabulary: voc.Vocabulary
+    sequence: StoreSequence, first_pass: int, vocabulary: voc.Vocabulary
 ) -> None:
-    part = dataclasses.replace(walk, keyframes=walk.keyframes[:first_pass], world_T_kf=walk.world_T_kf[:first_pass])
-    localizer = Localizer(map_of_walk(part).snapshot, walk.rig, vocabulary, LoopConfig())
+    part = sequence.first(first_pass)
+    localizer = Localizer(map_of_sequence(part).snapshot, sequence.rig, vocabulary, LoopConfig())
     start = first_pass + 8
-    odom = se3.inverse(walk.keyframes[start].odom_T_cam)
-    for n, k in enumerate(range(start, len(walk.keyframes))):
-        keyframe = dataclasses.replace(walk.keyframes[k], kf_id=n, odom_T_cam=odom @ walk.keyframes[k].odom_T_cam)
+    odom = se3.inverse(sequence.keyframes[start].odom_T_cam)
+    for n, k in enumerate(range(start, len(sequence.keyframes))):
+        keyframe = dataclasses.replace(
+            sequence.keyframes[k], kf_id=n, odom_T_cam=odom @ sequence.keyframes[k].odom_T_cam
+        )
         update = localizer.step(keyframe)
         assert update.kf_id == n and update.version == n + 1 and len(update.point_ids) == 0
-        error = se3.inverse(true_pose(walk, k)) @ update.map_T_odom @ keyframe.odom_T_cam
+        error = se3.inverse(true_pose(sequence, k)) @ update.map_T_odom @ keyframe.odom_T_cam
         assert localizer.found
         assert np.linalg.norm(error[:3, 3]) < 0.08
 
 
-def test_localizer_before_it_is_found(walk: StoreWalk, vocabulary: voc.Vocabulary, first_pass: int) -> None:
-    part = dataclasses.replace(walk, keyframes=walk.keyframes[:first_pass], world_T_kf=walk.world_T_kf[:first_pass])
-    localizer = Localizer(map_of_walk(part).snapshot, walk.rig, vocabulary, LoopConfig())
-    update = localizer.step(make_walk([0], seed=77).keyframes[4])
+def test_localizer_before_it_is_found(sequence: StoreSequence, vocabulary: voc.Vocabulary, first_pass: int) -> None:
+    part = sequence.first(first_pass)
+    localizer = Localizer(map_of_sequence(part).snapshot, sequence.rig, vocabulary, LoopConfig())
+    update = localizer.step(make_sequence([0], seed=77).keyframes[4])
     assert not localizer.found
     assert np.array_equal(update.map_T_odom, np.eye(4)) and len(update.kf_ids) == 0  # no place is claimed
     assert localizer.last is not None and localizer.last.reason
 
 
-def test_same_question_same_bits(walk: StoreWalk, first_pass: int, relocalizer: Relocalizer) -> None:
-    answers = [relocalizer.locate(walk.keyframes[first_pass + 10]) for _ in range(2)]
+def test_same_question_same_bits(sequence: StoreSequence, first_pass: int, relocalizer: Relocalizer) -> None:
+    answers = [relocalizer.locate(sequence.keyframes[first_pass + 10]) for _ in range(2)]
     assert answers[0].map_T_cam.tobytes() == answers[1].map_T_cam.tobytes()
     assert np.array_equal(answers[0].pairs, answers[1].pairs)
 
 
 def test_what_came_before_the_first_answer_is_placed_with_it(
-    walk: StoreWalk, first_pass: int, vocabulary: voc.Vocabulary
+    sequence: StoreSequence, first_pass: int, vocabulary: voc.Vocabulary
 ) -> None:
-    part = dataclasses.replace(walk, keyframes=walk.keyframes[:first_pass], world_T_kf=walk.world_T_kf[:first_pass])
-    localizer = Localizer(map_of_walk(part).snapshot, walk.rig, vocabulary, LoopConfig())
+    part = sequence.first(first_pass)
+    localizer = Localizer(map_of_sequence(part).snapshot, sequence.rig, vocabulary, LoopConfig())
     rows = range(first_pass + 5, first_pass + 9)
-    keyframes = [dataclasses.replace(walk.keyframes[k], kf_id=n) for n, k in enumerate(rows)]
+    keyframes = [dataclasses.replace(sequence.keyframes[k], kf_id=n) for n, k in enumerate(rows)]
     blind = [
         dataclasses.replace(k, descriptors=np.zeros_like(k.descriptors), corners=Corners.none()) for k in keyframes[:2]
     ]
@@ -150,38 +154,38 @@ def test_what_came_before_the_first_answer_is_placed_with_it(
     update = localizer.step(keyframes[2])
     assert update.kf_ids.tolist() == [0, 1, 2]
     for k, pose in zip(rows, update.map_T_kf, strict=False):
-        assert np.linalg.norm((se3.inverse(true_pose(walk, k)) @ pose)[:3, 3]) < 0.1
+        assert np.linalg.norm((se3.inverse(true_pose(sequence, k)) @ pose)[:3, 3]) < 0.1
     assert localizer.step(keyframes[3]).kf_ids.tolist() == [3]
 
 
 @pytest.mark.parametrize("astray", [False, True])
 def test_an_answer_of_few_points_needs_a_second_one(
-    walk: StoreWalk, first_pass: int, vocabulary: voc.Vocabulary, astray: bool
+    sequence: StoreSequence, first_pass: int, vocabulary: voc.Vocabulary, astray: bool
 ) -> None:
-    part = dataclasses.replace(walk, keyframes=walk.keyframes[:first_pass], world_T_kf=walk.world_T_kf[:first_pass])
-    saved, config = map_of_walk(part).snapshot, LoopConfig()
-    first, second = (dataclasses.replace(walk.keyframes[first_pass + k], kf_id=n) for n, k in enumerate((6, 7)))
-    seen = Relocalizer(saved, walk.rig, vocabulary, config).locate(first).inliers
+    part = sequence.first(first_pass)
+    saved, config = map_of_sequence(part).snapshot, LoopConfig()
+    first, second = (dataclasses.replace(sequence.keyframes[first_pass + k], kf_id=n) for n, k in enumerate((6, 7)))
+    seen = Relocalizer(saved, sequence.rig, vocabulary, config).locate(first).inliers
     if astray:  # odometry says that the robot drove two metres between them
         second = dataclasses.replace(second, odom_T_cam=se3.exp(np.array([2.0, 0, 0, 0, 0, 0])) @ second.odom_T_cam)
     hardly_enough = dataclasses.replace(config, relocalize_inliers=round(0.8 * seen))
-    localizer = Localizer(saved, walk.rig, vocabulary, hardly_enough)
+    localizer = Localizer(saved, sequence.rig, vocabulary, hardly_enough)
     assert len(localizer.step(first).kf_ids) == 0 and not localizer.found
     assert localizer.last is not None and localizer.last.reason == "not_confirmed_yet"
     assert localizer.step(second).kf_ids.tolist() == ([] if astray else [0, 1])
     assert localizer.found != astray
 
 
-def test_a_walk_goes_on_in_the_frame_of_the_saved_map(
-    walk: StoreWalk, first_pass: int, vocabulary: voc.Vocabulary
+def test_a_sequence_goes_on_in_the_frame_of_the_saved_map(
+    sequence: StoreSequence, first_pass: int, vocabulary: voc.Vocabulary
 ) -> None:
-    part = dataclasses.replace(walk, keyframes=walk.keyframes[:first_pass], world_T_kf=walk.world_T_kf[:first_pass])
-    localizer = Localizer(map_of_walk(part).snapshot, walk.rig, vocabulary, LoopConfig())
-    extension = Extension(MapperConfig(), walk.rig, None, LoopConfig(), localizer)
+    part = sequence.first(first_pass)
+    localizer = Localizer(map_of_sequence(part).snapshot, sequence.rig, vocabulary, LoopConfig())
+    extension = Extension(MapperConfig(), sequence.rig, None, LoopConfig(), localizer)
     rows = range(first_pass + 5, first_pass + 15)
-    odom = se3.inverse(walk.keyframes[rows[0]].odom_T_cam)
+    odom = se3.inverse(sequence.keyframes[rows[0]].odom_T_cam)
     keyframes = [
-        dataclasses.replace(walk.keyframes[k], kf_id=n, odom_T_cam=odom @ walk.keyframes[k].odom_T_cam)
+        dataclasses.replace(sequence.keyframes[k], kf_id=n, odom_T_cam=odom @ sequence.keyframes[k].odom_T_cam)
         for n, k in enumerate(rows)
     ]
     blind = [
@@ -196,5 +200,5 @@ def test_a_walk_goes_on_in_the_frame_of_the_saved_map(
     last = updates[-1].map_T_odom
     assert localizer.found and np.abs(last - np.eye(4)).max() > 0.1
     for k, pose in zip(rows, poses.all().values(), strict=True):  # those from before it was found too
-        assert np.linalg.norm((se3.inverse(true_pose(walk, k)) @ pose)[:3, 3]) < 0.1
+        assert np.linalg.norm((se3.inverse(true_pose(sequence, k)) @ pose)[:3, 3]) < 0.1
     assert np.linalg.norm((se3.inverse(poses.all()[9]) @ last @ keyframes[9].odom_T_cam)[:3, 3]) < 0.05

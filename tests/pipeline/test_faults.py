@@ -255,8 +255,8 @@ def test_a_process_that_computes_is_not_silent(monkeypatch: pytest.MonkeyPatch) 
     os.kill(busy.pid, signal.SIGSTOP)
     time.sleep(0.5)
     assert watchdog.silent(["mapper"]) == ["mapper"] == watchdog.silent(["mapper"])
-    (said,) = told
-    assert said.startswith("the mapper has not responded") and said.endswith(": stopped by a signal")
+    (message,) = told
+    assert message.startswith("the mapper has not responded") and message.endswith(": stopped by a signal")
     os.kill(busy.pid, signal.SIGCONT)
     time.sleep(0.5)
     assert watchdog.silent(["mapper"]) == []

@@ -289,7 +289,7 @@ def test_a_recorded_schedule_is_followed() -> None:
 def test_trajectory_of_the_wall_is_right() -> None:
     frames = list(run_inline(SlidingWall(40), CONFIG))
     x = np.array([f.odom_T_cam[0, 3] for f in frames])
-    depth = 200 * BASELINE / 10  # the eyes see the wall ten pixels apart
+    depth = 200 * BASELINE / 10  # the cameras see the wall ten pixels apart
     expected = 4 * np.minimum(np.arange(40), 40 - np.arange(40)) * depth / 200
     assert np.abs(x - expected).max() < 0.002
     assert isinstance(Trajectory(np.arange(40), np.array([f.odom_T_cam for f in frames])).length, float)

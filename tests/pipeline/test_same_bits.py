@@ -28,5 +28,5 @@ def test_simulated_loop() -> None:
 
 
 @pytest.mark.slow
-def test_real_walk(data_root: Path) -> None:
+def test_real_sequence(data_root: Path) -> None:
     identical_runs(str(data_root / "euroc_mh01"))

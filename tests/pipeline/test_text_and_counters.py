@@ -107,8 +107,8 @@ def test_warnings_and_counters_reach_the_log_and_the_sinks(
     assert texts.count((stage, "wall sent no image for 500 ms")) == 1
     assert logged[-1].counts == counts
     assert (totals["pairs"], totals["stalls"], totals["frames"]) == ("12", "1", "12")
-    said = [r for r in caplog.records if r.getMessage() == "wall sent no image for 500 ms"]
-    assert [r.levelname for r in said] == ["WARNING"]  # once on the screen too, wherever it was said
+    message = [r for r in caplog.records if r.getMessage() == "wall sent no image for 500 ms"]
+    assert [r.levelname for r in message] == ["WARNING"]  # once on the screen too, wherever it was said
     if stage == "capture":  # a stage tells everything, main shows what it is set to show
         assert LogLine(stage, "INFO", "wall is back") in kept.lines
         assert "wall is back" not in caplog.text
@@ -140,9 +140,9 @@ def test_every_worker_passes_on_what_it_says(stage: str) -> None:
     process = context.Process(target=workers.guarded, args=(stage, _warn, send))
     process.start()
     send.close()
-    said = _all(receive)
+    message = _all(receive)
     process.join()
-    assert said == [LogLine(stage, "WARNING", "somebody is tired"), End(stage)]
+    assert message == [LogLine(stage, "WARNING", "somebody is tired"), End(stage)]
 
 
 def _all(receive: Connection) -> list[object]:

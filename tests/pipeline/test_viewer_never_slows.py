@@ -1,4 +1,4 @@
-"""A viewer that is slow, hangs, or was closed costs the run nothing but pictures."""
+"""A viewer that is slow, hangs, or was closed costs the run nothing but images."""
 
 from __future__ import annotations
 

@@ -44,6 +44,6 @@ def test_nothing_is_compiled_after_the_warm_up() -> None:
 
 
 def test_images_of_any_size_have_a_warm_up() -> None:
-    eye = Pinhole(64, 48, 50.0, 50.0, 32.0, 24.0)
-    made = keyframes(Rig(eye, eye, np.eye(4) + 0.1 * np.eye(4, k=3)))
+    camera = Pinhole(64, 48, 50.0, 50.0, 32.0, 24.0)
+    made = keyframes(Rig(camera, camera, np.eye(4) + 0.1 * np.eye(4, k=3)))
     assert made and all(len(keyframe.point_ids) for keyframe in made)

@@ -26,7 +26,7 @@ SPEC = "sim:aisle?camera=pinhole&frames=7&size=480x300"
 
 @cache
 def rendered() -> tuple[Rig, tuple[StereoImage, ...], F64]:
-    """Rig, frames and true poses of a short walk."""
+    """Rig, frames and true poses of a short sequence."""
     with open_source(SPEC) as source:
         images = tuple(source)
         assert source.ground_truth is not None
@@ -64,7 +64,7 @@ def step_errors(frames: list[Frame], poses: F64) -> tuple[F64, F64]:
         ("eight-point", "orb", 0.3, 0.03),
     ],
 )
-def test_every_estimator_follows_a_walk(method: str, kind: str, degrees: float, metres: float) -> None:
+def test_every_estimator_follows_a_sequence(method: str, kind: str, degrees: float, metres: float) -> None:
     _, images, poses = rendered()
     frames = [frame for frame, _ in track(config_for(method, kind), images)]
     assert all(frame.state == TrackState.OK for frame in frames)
@@ -141,7 +141,7 @@ def test_map_updates_move_the_odometry_and_fuse_ids() -> None:
 
 def test_one_eye_is_refused_where_depth_is_needed() -> None:
     rig, _, _ = rendered()
-    with pytest.raises(StereoSfmError, match="one eye"):
+    with pytest.raises(StereoSfmError, match="one camera"):
         make_tracker(config_for("em-r"), Rig(rig.left))
     with pytest.raises(StereoSfmError, match=r"odometry\.scale=unit"):
         make_tracker(config_for("eight-point"), Rig(rig.left))
@@ -156,11 +156,11 @@ def test_one_eye_with_unit_steps_and_with_true_steps() -> None:
             config_for("eight-point", scale=scale, unit_step_m=0.3), Rig(rig.left), None, Trajectory(stamps, poses)
         )
         frames = [tracker.step(image)[0] for image in alone]
-        walked = np.linalg.norm(np.diff([frame.odom_T_cam[:3, 3] for frame in frames], axis=0), axis=1)
+        lengths = np.linalg.norm(np.diff([frame.odom_T_cam[:3, 3] for frame in frames], axis=0), axis=1)
         true = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-        moved = walked > 0  # a pure rotation has no direction, so no step
+        moved = lengths > 0  # a pure rotation has no direction, so no step
         assert moved.sum() >= 3
-        np.testing.assert_allclose(walked[moved], true[moved] if step is None else step, rtol=1e-6)
+        np.testing.assert_allclose(lengths[moved], true[moved] if step is None else step, rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", list(PRESETS))

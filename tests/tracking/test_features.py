@@ -1,4 +1,4 @@
-"""Keypoints, descriptors and matching on a textured picture that moves by a known amount."""
+"""Keypoints, descriptors and matching on a textured image that moves by a known amount."""
 
 from __future__ import annotations
 

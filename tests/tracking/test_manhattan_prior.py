@@ -27,7 +27,7 @@ def measurement(world_R_cam: F64, rng: np.random.Generator, sigma: float = 1e-3)
     return Manhattan(noisy, np.eye(3) * sigma**2, 0.8, np.array([9, 9, 9]), np.zeros(27, np.int64))
 
 
-def walk(frames: int, bias_deg: float = 0.02) -> tuple[list[F64], list[F64]]:
+def camera_path(frames: int, bias_deg: float = 0.02) -> tuple[list[F64], list[F64]]:
     """True rotations, and what a tracker makes of them whose heading drifts by `bias_deg` a frame."""
     truth, drifted = [np.eye(3)], [np.eye(3)]
     for k in range(frames):
@@ -42,7 +42,7 @@ def degrees(a: F64, b: F64) -> float:
 
 
 def test_drift_stays_bounded() -> None:
-    truth, drifted = walk(400)
+    truth, drifted = camera_path(400)
     rng = np.random.default_rng(0)
     rotation, prior = np.eye(3), RotationFilter(CONFIG)
     for k in range(1, 401):
@@ -92,7 +92,7 @@ class Walker:
 
 
 def test_updates_reach_the_tracker_in_its_own_frame() -> None:
-    _, drifted = walk(30)
+    _, drifted = camera_path(30)
     poses = [se3.from_rotation_translation(r, np.array([0.1 * k, 0, 0])) for k, r in enumerate(drifted)]
     inner = Walker(poses)
     tracker = ManhattanTracker(inner, CONFIG, pinhole_rig())

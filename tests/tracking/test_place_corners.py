@@ -22,17 +22,17 @@ SOURCE = "sim:loop?size=424x400&rate=10"
 
 
 @pytest.fixture(scope="module")
-def walk() -> SimSource:
+def sequence() -> SimSource:
     source = open_source(SOURCE)
     assert isinstance(source, SimSource)
     return source
 
 
-def keyframe_at(walk: SimSource, row: int) -> tuple[Keyframe, F64]:
-    assert walk.ground_truth is not None
-    keyframe = still_keyframe(walk.frame(int(walk.frame_ids[row])), walk.rig)
+def keyframe_at(sequence: SimSource, row: int) -> tuple[Keyframe, F64]:
+    assert sequence.ground_truth is not None
+    keyframe = still_keyframe(sequence.frame(int(sequence.frame_ids[row])), sequence.rig)
     assert keyframe is not None
-    return keyframe, walk.ground_truth.poses[row]
+    return keyframe, sequence.ground_truth.poses[row]
 
 
 def share_found_again(rig: Rig, b_T_a: F64, a: Corners, uv_b: F32, descriptors_b: U8) -> float:
@@ -50,20 +50,20 @@ def share_found_again(rig: Rig, b_T_a: F64, a: Corners, uv_b: F32, descriptors_b
 
 
 @pytest.mark.parametrize("rows", [(40, 42), (100, 103), (200, 198)])
-def test_corners_are_found_again_a_step_further(walk: SimSource, rows: tuple[int, int]) -> None:
-    (a, world_T_a), (b, world_T_b) = (keyframe_at(walk, row) for row in rows)
+def test_corners_are_found_again_a_step_further(sequence: SimSource, rows: tuple[int, int]) -> None:
+    (a, world_T_a), (b, world_T_b) = (keyframe_at(sequence, row) for row in rows)
     b_T_a = se3.inverse(world_T_b) @ world_T_a
     assert 0.1 < se3.extent(b_T_a)[0] < 0.5
     assert min(len(a.corners), len(b.corners)) > 250
-    assert share_found_again(walk.rig, b_T_a, a.corners, b.corners.uv_left, b.corners.descriptors) > 0.4
+    assert share_found_again(sequence.rig, b_T_a, a.corners, b.corners.uv_left, b.corners.descriptors) > 0.4
 
 
-def test_corners_lie_all_over_the_image_and_have_depth(walk: SimSource) -> None:
-    corners = keyframe_at(walk, 40)[0].corners
-    assert occupied_cells(corners.uv_left.astype(np.float64), walk.rig.left.size) > 20
+def test_corners_lie_all_over_the_image_and_have_depth(sequence: SimSource) -> None:
+    corners = keyframe_at(sequence, 40)[0].corners
+    assert occupied_cells(corners.uv_left.astype(np.float64), sequence.rig.left.size) > 20
     assert np.isfinite(corners.points_cam).all() and np.isfinite(corners.uv_right).all()
-    assert walk.rig.right is not None
-    right = walk.rig.right.project(se3.transform(se3.inverse(walk.rig.left_T_right), corners.points_cam))
+    assert sequence.rig.right is not None
+    right = sequence.rig.right.project(se3.transform(se3.inverse(sequence.rig.left_T_right), corners.points_cam))
     assert np.percentile(np.linalg.norm(right - corners.uv_right, axis=1), 90) < 1.0
 
 
@@ -88,14 +88,14 @@ def test_they_are_the_image_s_whatever_tracks_in_it() -> None:
         assert len(a) > 200 and np.array_equal(a, b)
 
 
-def test_a_black_image_has_none(walk: SimSource) -> None:
-    image = walk.frame(int(walk.frame_ids[0]))
+def test_a_black_image_has_none(sequence: SimSource) -> None:
+    image = sequence.frame(int(sequence.frame_ids[0]))
     dark = np.zeros_like(image.left)
-    assert still_keyframe(dataclasses.replace(image, left=dark, right=dark.copy()), walk.rig) is None
+    assert still_keyframe(dataclasses.replace(image, left=dark, right=dark.copy()), sequence.rig) is None
 
 
-def test_an_eye_that_sees_nothing_leaves_none(walk: SimSource) -> None:
-    image = walk.frame(int(walk.frame_ids[40]))
+def test_an_eye_that_sees_nothing_leaves_none(sequence: SimSource) -> None:
+    image = sequence.frame(int(sequence.frame_ids[40]))
     covered = StereoImage(0, 0, image.left, np.full_like(image.left, 90))
-    keyframe = still_keyframe(covered, walk.rig)
+    keyframe = still_keyframe(covered, sequence.rig)
     assert keyframe is None or len(keyframe.corners) < 10

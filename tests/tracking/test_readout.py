@@ -22,7 +22,7 @@ from stereo_sfm.geometry.cameras import RadTan
 from stereo_sfm.tracking.flow.readout import LEAST_PAIRS, Readout, ReadoutSearch
 from stereo_sfm.types import StereoImage
 
-WALK = "sim:aisle?camera=pinhole&size=320x200&start=60&frames=40"
+AISLE = "sim:aisle?camera=pinhole&size=320x200&start=60&frames=40"
 
 
 @functools.cache
@@ -64,29 +64,29 @@ def bent(k1: float) -> Callable[[Rig], Rig]:
 
 @pytest.mark.parametrize(("vibration", "seed"), [(1, 0), (4, 0), (4, 1), (4, 2)])
 def test_a_rolling_shutter_that_the_calibration_does_not_know(vibration: int, seed: int) -> None:
-    found = search(f"{WALK}&vibration={vibration}&seed={seed}&readout=0.025", 0.0)
+    found = search(f"{AISLE}&vibration={vibration}&seed={seed}&readout=0.025", 0.0)
     assert found.differs and found.known
     assert found.best_s == pytest.approx(0.025, abs=0.004)
     assert found.sigma_s < 0.002
 
 
 def test_a_global_shutter_and_one_that_is_known() -> None:
-    known = search(f"{WALK}&vibration=4&seed=0&readout=0.025", 0.025)
+    known = search(f"{AISLE}&vibration=4&seed=0&readout=0.025", 0.025)
     assert known.known and known.best_s == 0.025
-    believed = search(f"{WALK}&vibration=4&seed=1", 0.025)
+    believed = search(f"{AISLE}&vibration=4&seed=1", 0.025)
     assert believed.differs and believed.best_s == pytest.approx(0.0, abs=0.002)
 
 
 @pytest.mark.parametrize("change", [lambda rig: rig, turned(0, 0.2), turned(1, 0.2), turned(2, 0.3), bent(0.03)])
 def test_a_global_shutter_is_no_rolling_one_whatever_the_calibration_says(change: Callable[[Rig], Rig]) -> None:
-    found = search(f"{WALK}&vibration=4&seed=1", 0.0, change)
+    found = search(f"{AISLE}&vibration=4&seed=1", 0.0, change)
     assert found.known and not found.differs and found.best_s == 0.0
     assert abs(found.measured_s) < 0.003
 
 
 def test_a_steady_drive_with_a_wrong_calibration_shows_no_readout() -> None:
     """Driving ahead, wrong disparities look like rows that are read one after the other."""
-    assert search(f"{WALK}&frames=60&rate=10", 0.0, turned(1, -0.4)).best_s == 0.0
+    assert search(f"{AISLE}&frames=60&rate=10", 0.0, turned(1, -0.4)).best_s == 0.0
 
 
 @pytest.mark.slow
@@ -120,7 +120,7 @@ def test_fisheyes_in_stores(spec: str, readout_s: float, seed: int) -> None:
 
 def test_too_few_frames_say_nothing() -> None:
     found = search(
-        f"{WALK}&vibration=4&frames={LEAST_PAIRS + 3}", 0.0
+        f"{AISLE}&vibration=4&frames={LEAST_PAIRS + 3}", 0.0
     )  # two velocities need four images; the first has no motion
     assert np.isnan(found.measured_s)
     assert not found.known and found.best_s == 0.0
@@ -128,11 +128,11 @@ def test_too_few_frames_say_nothing() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_camera_that_glides_shows_no_readout(seed: int) -> None:
-    assert not search(f"{WALK}&vibration=0&seed={seed}&readout=0.025", 0.0).known
+    assert not search(f"{AISLE}&vibration=0&seed={seed}&readout=0.025", 0.0).known
 
 
 def test_check_calib_tells(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    source = f"{WALK}&vibration=4&readout=0.025"
+    source = f"{AISLE}&vibration=4&readout=0.025"
     assert main(["check-calib", source, "--correct", str(tmp_path / "corrected.yaml")]) in (0, 3)
     told = capsys.readouterr().out
     assert "shutter: rows read within 25 ms; points are off by" in told
@@ -161,4 +161,4 @@ def test_check_calib_of_a_pair_that_misses_right_images(monkeypatch: pytest.Monk
         return dataclasses.replace(image, right=None) if frame_id % 15 == 0 else image
 
     monkeypatch.setattr(SimSource, "frame", without)
-    assert main(["check-calib", f"{WALK}&vibration=4"]) in (0, 3)
+    assert main(["check-calib", f"{AISLE}&vibration=4"]) in (0, 3)

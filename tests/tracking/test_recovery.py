@@ -75,7 +75,7 @@ def test_a_covered_camera_is_found_again_at_first_sight() -> None:
 
 def test_a_camera_that_comes_back_elsewhere_is_not_found() -> None:
     turned = se3.exp(np.array([0, 0, 0, 0, np.pi, 0]))  # in one frame: no robot does that
-    elsewhere = [drive().picture(drive().pose(k) @ turned, k) for k in FREE]
+    elsewhere = [drive().image_at(drive().pose(k) @ turned, k) for k in FREE]
     images = [seen(k) for k in range(BEGIN, COVERED.start)] + [covered(k) for k in COVERED] + elsewhere
     assert TrackState.RECOVERED not in [frame.state for frame in tracked(images)]
 

@@ -1,4 +1,4 @@
-"""Rows exposed one after the other: exact scenes, and the tracker on a rendered walk."""
+"""Rows exposed one after the other: exact scenes, and the tracker on a rendered sequence."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ def ate_mm(rig: Rig, images: list[StereoImage], truth: Trajectory) -> float:
     return evaluate(Trajectory(np.array([f.stamp_ns for f in frames]), poses), truth).ape_m.rmse * 1e3
 
 
-def test_a_rendered_walk_with_a_rolling_shutter() -> None:
+def test_a_rendered_sequence_with_a_rolling_shutter() -> None:
     """A shaken camera whose rows take 25 ms: several times nearer to the truth than without their times."""
     with open_source("sim:aisle?camera=pinhole&size=320x200&start=60&frames=60&vibration=4&readout=0.025") as source:
         images, truth = list(source), source.ground_truth
@@ -163,7 +163,7 @@ def test_a_rendered_walk_with_a_rolling_shutter() -> None:
     assert known < unknown / 2.5
 
 
-def test_keyframes_of_a_rendered_walk_are_as_if_seen_at_once() -> None:
+def test_keyframes_of_a_rendered_sequence_are_as_if_seen_at_once() -> None:
     """What the map gets: pixels where the points are at the stamp, of tracked and new points and of corners."""
     spec = "sim:aisle?camera=pinhole&size=320x200&rate=10&start=20&frames=40&vibration=4&readout=0.05"
     with open_source(spec) as source:

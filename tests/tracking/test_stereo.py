@@ -24,7 +24,7 @@ def texture() -> F32:
 
 
 def see_plane(rig: Rig, depth: float, pattern: F32, gain: float, offset: float) -> tuple[U8, U8]:
-    """Both eyes' images of a plane `depth` metres ahead of the left one, the right image brighter or darker."""
+    """Both cameras' images of a plane `depth` metres ahead of the left one, the right image brighter or darker."""
     images: list[U8] = []
     for camera, left_T_cam, brightness in (
         (rig.left, np.eye(4), (1.0, 0.0)),

@@ -1,4 +1,4 @@
-"""The default tracker on real and simulated walks, and on what goes wrong in a store."""
+"""The default tracker on real and simulated sequences, and on what goes wrong in a store."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ def brighter(images: Iterator[StereoImage]) -> Iterator[StereoImage]:
     """The exposure jumps up by half and back down to sixty percent."""
     for image in images:
         gain = 1.5 if 20 <= image.frame_id < 40 else 0.6 if image.frame_id >= 40 else 1.0
-        eyes = [np.clip(e.astype(float) * gain, 0, 255).astype(np.uint8) for e in (image.left, image.right)]
-        yield dataclasses.replace(image, left=eyes[0], right=eyes[1])
+        cameras = [np.clip(e.astype(float) * gain, 0, 255).astype(np.uint8) for e in (image.left, image.right)]
+        yield dataclasses.replace(image, left=cameras[0], right=cameras[1])
 
 
 @pytest.mark.parametrize("change", [None, black, dropped, brighter], ids=lambda c: c.__name__ if c else "as recorded")

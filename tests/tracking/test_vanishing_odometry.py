@@ -22,7 +22,7 @@ from tests.tracking.synthetic_views import frame_pair
 
 
 def orientations(spec: str) -> tuple[list[F64], list[F64], list[F64]]:
-    """Measured cam_R_axes, true cam_R_world and covariances along a walk."""
+    """Measured cam_R_axes, true cam_R_world and covariances along a sequence."""
     measured: list[F64] = []
     truth: list[F64] = []
     covariances: list[F64] = []

@@ -1,4 +1,4 @@
-"""Where points may lie: off the rim of a fisheye's picture, whatever the scene shows."""
+"""Where points may lie: off the rim of a fisheye's image, whatever the scene shows."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_a_dark_scene_hides_no_lens() -> None:
     area.learn(np.zeros_like(half_image(camera, 80, 100)))
     assert (area.mask == before).all()
     area.learn(half_image(camera, 70, 160))
-    area.learn(half_image(camera, 85, 160))  # what is lit once belongs to the picture
+    area.learn(half_image(camera, 85, 160))  # what is lit once belongs to the image
     assert area.mask[before & (angles(camera) < 77)].all()
 
 

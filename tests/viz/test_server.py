@@ -45,9 +45,9 @@ def test_a_served_viewer_listens_where_it_was_asked_to_and_says_so(
     command = [sys.executable, "-c", SERVE, *map(str, ports), address]
     parent = subprocess.Popen(command, stdin=-1, stdout=-1, text=True)
     assert parent.stdout is not None
-    destination, said = parent.stdout.readline().strip(), parent.stdout.readline()
+    destination, message = parent.stdout.readline().strip(), parent.stdout.readline()
     assert destination == f"rerun+http://127.0.0.1:{ports[1]}/proxy"
-    assert who in said and str(ports[0]) in said
+    assert who in message and str(ports[0]) in message
     (viewer,) = psutil.Process(parent.pid).children()
     listening = {(c.laddr.ip, c.laddr.port) for c in viewer.net_connections() if c.status == psutil.CONN_LISTEN}
     assert listening == {(address, port) for port in ports}

@@ -15,7 +15,7 @@ import usb.backend
 import usb.core
 
 from stereo_sfm.drivers.t265 import messages as m
-from stereo_sfm.drivers.t265.simulated.camera import Gone, SimulatedCamera
+from stereo_sfm.drivers.t265.simulated.camera import Disconnected, SimulatedCamera
 
 _ENDPOINTS = ((0x01, 2), (0x02, 2), (0x81, 2), (0x82, 2), (0x83, 3), (0x03, 3))  # address, type: bulk 2, interrupt 3
 
@@ -149,9 +149,9 @@ class SimulatedBus(usb.backend.IBackend):
         try:
             if ep == m.VIDEO_IN:
                 return self._fill(buff, camera.read_video(wait, generation))
-            answer = camera.read_answer(wait, generation)
-            return self._fill(buff, None if answer is None else [answer])
-        except Gone:
+            reply = camera.read_reply(wait, generation)
+            return self._fill(buff, None if reply is None else [reply])
+        except Disconnected:
             raise usb_error(errno.ENODEV, "No such device (it may have been disconnected)") from None
         finally:
             self.thread_ns += time.thread_time_ns() - began
@@ -161,22 +161,22 @@ class SimulatedBus(usb.backend.IBackend):
         began = time.thread_time_ns()
         try:
             data = dev_handle.camera.read_events(timeout / 1e3, dev_handle.generation, len(buff))
-        except Gone:
+        except Disconnected:
             raise usb_error(errno.ENODEV, "No such device (it may have been disconnected)") from None
         finally:
             self.thread_ns += time.thread_time_ns() - began
         return self._fill(buff, None if data is None else [data])
 
     @staticmethod
-    def _fill(buff: array.array[int], pieces: Sequence[bytes | memoryview] | None) -> int:
-        if pieces is None:
+    def _fill(buff: array.array[int], chunks: Sequence[bytes | memoryview] | None) -> int:
+        if chunks is None:
             raise usb_error(errno.ETIMEDOUT, "Operation timed out")
         view, at = memoryview(buff), 0
-        for piece in pieces:
-            if at + len(piece) > len(view):
+        for chunk in chunks:
+            if at + len(chunk) > len(view):
                 raise usb_error(errno.EOVERFLOW, "Overflow")
-            view[at : at + len(piece)] = piece
-            at += len(piece)
+            view[at : at + len(chunk)] = chunk
+            at += len(chunk)
         return at
 
     def ctrl_transfer(

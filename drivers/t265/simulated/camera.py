@@ -20,13 +20,13 @@ from stereo_sfm.drivers.t265.simulated.faults import Faults
 from stereo_sfm.drivers.t265.simulated.wire import (
     OFFERED,
     Transfer,
-    answer,
     device_info,
     extrinsics,
     intrinsics,
     left_T_imu,
     motion_intrinsics,
     motion_sample,
+    reply,
     status_event,
     video_transfer,
 )
@@ -36,7 +36,7 @@ _LATENCY_NS = 12_000_000  # from mid-exposure to the first byte
 _GYRO_NS, _ACCEL_NS = 5_000_000, 16_000_000
 
 
-class Gone(Exception):
+class Disconnected(Exception):
     """The camera left the bus during an operation."""
 
 
@@ -51,7 +51,7 @@ class _Session:
     next_gyro_ns: int = 0
     next_accel_ns: int = 0
     counter_extra: int = 0
-    stopped_said: set[int] = field(default_factory=set[int])
+    stop_reported: set[int] = field(default_factory=set[int])
     stopping: bool = False
     leaving: bool = False  # unplugged after what is pending
 
@@ -80,8 +80,8 @@ class SimulatedCamera:
         self._first_ns = 0  # host clock at the first START
         self._boot_ns = time.monotonic_ns()
         self._session: _Session | None = None
-        self._answers: deque[bytes] = deque()
-        self._busy_left = self.faults.busy_answers
+        self._replies: deque[bytes] = deque()
+        self._busy_remaining = self.faults.busy_replies
         self._stall_done = self._unplug_done = False
         self._streams: set[int] = set()
         self._changed = threading.Condition()
@@ -101,7 +101,7 @@ class SimulatedCamera:
             self.generation += 1
             self.absent_until_ns = -1 if seconds < 0 else time.monotonic_ns() + round(seconds * 1e9)
             self._session = None
-            self._answers.clear()
+            self._replies.clear()
             self._changed.notify_all()
 
     def unplug(self, seconds: float) -> None:
@@ -134,40 +134,40 @@ class SimulatedCamera:
             if self.faults.silent_commands:
                 return
             if length != len(data):
-                self._answers.append(answer(message, Status.INVALID_REQUEST_LEN))
+                self._replies.append(reply(message, Status.INVALID_REQUEST_LEN))
             else:
-                self._answers.append(self._handle(message, data[6:]))
+                self._replies.append(self._handle(message, data[6:]))
             self._changed.notify_all()
 
     def _handle(self, message: int, body: bytes) -> bytes:
         rig = self.content.rig
         if message == Id.GET_DEVICE_INFO:
-            return answer(message, 0, device_info(self.faults, self.serial))
+            return reply(message, 0, device_info(self.faults, self.serial))
         if message == Id.GET_TIME:
-            return answer(message, 0, struct.pack("<Q", self.clock_ns(time.monotonic_ns())))
+            return reply(message, 0, struct.pack("<Q", self.clock_ns(time.monotonic_ns())))
         if message == Id.GET_SUPPORTED_RAW_STREAMS:
-            return answer(message, 0, struct.pack("<HH", len(OFFERED), 0) + b"".join(p.encode() for p in OFFERED))
+            return reply(message, 0, struct.pack("<HH", len(OFFERED), 0) + b"".join(p.encode() for p in OFFERED))
         if message == Id.GET_CAMERA_INTRINSICS:
-            return answer(message, 0, intrinsics(rig, body[0]))
+            return reply(message, 0, intrinsics(rig, body[0]))
         if message == Id.GET_MOTION_INTRINSICS:
-            return answer(message, 0, motion_intrinsics(body[0]))
+            return reply(message, 0, motion_intrinsics(body[0]))
         if message == Id.GET_EXTRINSICS:
-            return answer(message, 0, extrinsics(rig, body[0]))
+            return reply(message, 0, extrinsics(rig, body[0]))
         if message == Id.GET_TEMPERATURE:
-            return answer(message, 0, struct.pack("<IIffIff", 2, 0, 41.0, 85.0, 1, 38.0, 85.0))
+            return reply(message, 0, struct.pack("<IIffIff", 2, 0, 41.0, 85.0, 1, 38.0, 85.0))
         if message in (Id.SET_LOW_POWER_MODE, Id.SLAM_6DOF_CONTROL, Id.SET_EXPOSURE):
-            return answer(message, Status.SUCCESS)
+            return reply(message, Status.SUCCESS)
         if message == Id.EXPOSURE_MODE_CONTROL:
-            return answer(message, Status.DEVICE_BUSY if self._session else Status.SUCCESS)
+            return reply(message, Status.DEVICE_BUSY if self._session else Status.SUCCESS)
         if message == Id.RAW_STREAMS_CONTROL:
-            return answer(message, self._choose(body))
+            return reply(message, self._choose(body))
         if message in (Id.START, Id.STOP):
-            return answer(message, self._start() if message == Id.START else self._stop())
-        return answer(message, Status.UNKNOWN_MESSAGE_ID)
+            return reply(message, self._start() if message == Id.START else self._stop())
+        return reply(message, Status.UNKNOWN_MESSAGE_ID)
 
     def _choose(self, body: bytes) -> Status:
-        if self._session or self._busy_left > 0:
-            self._busy_left -= 1
+        if self._session or self._busy_remaining > 0:
+            self._busy_remaining -= 1
             return Status.DEVICE_BUSY
         (count,) = struct.unpack_from("<H", body)
         profiles = [StreamProfile.decode(body, 2 + 12 * i) for i in range(count)]
@@ -213,12 +213,12 @@ class SimulatedCamera:
 
     # ---- endpoints the host reads
 
-    def read_answer(self, timeout_s: float, generation: int) -> bytes | None:
+    def read_reply(self, timeout_s: float, generation: int) -> bytes | None:
         """Endpoint 0x82; None on timeout."""
         with self._changed:
-            self._changed.wait_for(lambda: self._answers or self.generation != generation, timeout_s)
+            self._changed.wait_for(lambda: self._replies or self.generation != generation, timeout_s)
             self._check(generation)
-            return self._answers.popleft() if self._answers else None
+            return self._replies.popleft() if self._replies else None
 
     def read_video(self, timeout_s: float, generation: int) -> Transfer | None:
         """Endpoint 0x81: the next transfer as chunks of bytes."""
@@ -251,7 +251,7 @@ class SimulatedCamera:
 
     def _check(self, generation: int) -> None:
         if self.generation != generation or not self.present:
-            raise Gone
+            raise Disconnected
 
     def _until_video_s(self, now: int) -> float:
         s = self._session
@@ -264,19 +264,19 @@ class SimulatedCamera:
         if s is None:
             return None
         if s.stopping:
-            return self._say_stopped(s, m.VIDEO_IN)
+            return self._report_stopped(s, m.VIDEO_IN)
         if not s.pending and s.leaving:
             self.unplug(self.faults.unplugged_s)
-            raise Gone
+            raise Disconnected
         if not s.pending and Sensor.LEFT in self._streams and not self.stalled:
             self._expose(s, now)
         return s.pending.popleft() if s.pending else None
 
-    def _say_stopped(self, s: _Session, endpoint: int) -> Transfer | None:
-        if endpoint in s.stopped_said:
+    def _report_stopped(self, s: _Session, endpoint: int) -> Transfer | None:
+        if endpoint in s.stop_reported:
             return None
-        s.stopped_said.add(endpoint)
-        if len(s.stopped_said) == 2:
+        s.stop_reported.add(endpoint)
+        if len(s.stop_reported) == 2:
             self._session = None
         return [status_event(Status.DEVICE_STOPPED)]
 
@@ -328,8 +328,8 @@ class SimulatedCamera:
         if s is None:
             return b""
         if s.stopping:
-            said = self._say_stopped(s, m.EVENT_IN)
-            return b"".join(said) if said else b""
+            event = self._report_stopped(s, m.EVENT_IN)
+            return b"".join(event) if event else b""
         due: list[tuple[int, int]] = []
         room = size // 52
         while len(due) < room:

@@ -55,12 +55,12 @@ class Content:
 def room_content(frames: int, seed: int = 0) -> Content:
     """The default scene."""
     from stereo_sfm.drivers.sim.rigs import fisheye
-    from stereo_sfm.drivers.t265.simulated.room import Room, walk
+    from stereo_sfm.drivers.t265.simulated.room import Room, camera_path
 
     rig = fisheye()
     room = Room(rig, seed)
-    images = [room.render(pose) for pose in walk(np.arange(frames) / m.FRAME_RATE)]
-    return Content(rig, images, walk)
+    images = [room.render(pose) for pose in camera_path(np.arange(frames) / m.FRAME_RATE)]
+    return Content(rig, images, camera_path)
 
 
 def source_content(spec: str, frames: int) -> Content:

@@ -27,7 +27,7 @@ class Faults:
     stall_survives_restart: bool = False  # only a reset helps
     unplug_at: int = NEVER  # the camera disconnects during this frame
     unplugged_s: float = 0.5  # and comes back after this time, as an unbooted one; negative: never
-    busy_answers: int = 0  # number of stream selection commands answered with DEVICE_BUSY
+    busy_replies: int = 0  # number of stream selection commands answered with DEVICE_BUSY
     stale_stopped: bool = False  # DEVICE_STOPPED of an earlier session right after the start
     returns_after_boot: bool = True
     silent_commands: bool = False  # no command is answered
@@ -55,7 +55,7 @@ PRESETS: dict[str, Faults] = {
     "crash": Faults(stall_at=60, stall_survives_restart=True),
     "unplug": Faults(unplug_at=45, unplugged_s=1.0),
     "gone": Faults(unplug_at=45, unplugged_s=-1.0),
-    "busy": Faults(busy_answers=2, stale_stopped=True),
+    "busy": Faults(busy_replies=2, stale_stopped=True),
     "usb2": Faults(speed=3),
     "permission": Faults(refuse_open=13),
     "in-use": Faults(refuse_claim=16),

@@ -72,7 +72,7 @@ class Room:
         assert rig.right is not None
         rng = np.random.default_rng(seed)
         self._rig = rig
-        self._eyes = [eye.bearing_grid().astype(np.float32) for eye in (rig.left, rig.right)]
+        self._bearings = [camera.bearing_grid().astype(np.float32) for camera in (rig.left, rig.right)]
         self._texture = np.stack([self._wall(rng) for _ in range(6)])
 
     @staticmethod
@@ -89,7 +89,7 @@ class Room:
         """(H, W) left and right for the left camera's pose."""
         poses = (world_T_cam, world_T_cam @ self._rig.left_T_right)
         images: list[U8] = []
-        for bearings, pose in zip(self._eyes, poses, strict=True):
+        for bearings, pose in zip(self._bearings, poses, strict=True):
             out = np.empty(bearings.shape[:2], np.uint8)
             rotation = np.ascontiguousarray(pose[:3, :3])
             _trace(bearings, rotation, pose[:3, 3].copy(), _HALF_SIZE_M, self._texture, _TEXTURE_PX_PER_M, out)
@@ -97,7 +97,7 @@ class Room:
         return images[0], images[1]
 
 
-def walk(seconds: F64) -> F64:
+def camera_path(seconds: F64) -> F64:
     """(N,) s -> (N, 4, 4) world_T_cam: a slow loop through the room at about 0.5 m/s, looking around."""
     t = np.asarray(seconds, float)
     phase = 0.25 * t

@@ -41,7 +41,7 @@ def left_T_imu(rig: Rig) -> F64:
     return se3.inverse(body_T_left(rig)) @ _BODY_T_IMU
 
 
-def answer(message: int, status: int, payload: bytes = b"") -> bytes:
+def reply(message: int, status: int, payload: bytes = b"") -> bytes:
     return struct.pack("<IHH", 8 + len(payload), message, status) + payload
 
 
@@ -57,9 +57,11 @@ def device_info(faults: Faults, serial: str) -> bytes:
 
 
 def intrinsics(rig: Rig, sensor: int) -> bytes:
-    eye = rig.left if sensor == Sensor.LEFT else rig.right
-    assert eye is not None
-    return struct.pack("<2I4fI5f", eye.width, eye.height, eye.cx, eye.cy, eye.fx, eye.fy, 4, *eye.distortion, 0.0)
+    camera = rig.left if sensor == Sensor.LEFT else rig.right
+    assert camera is not None
+    return struct.pack(
+        "<2I4fI5f", camera.width, camera.height, camera.cx, camera.cy, camera.fx, camera.fy, 4, *camera.distortion, 0.0
+    )
 
 
 def motion_intrinsics(sensor: int) -> bytes:

@@ -1,9 +1,10 @@
-"""Keyframes of a walk around shelves with exact truth: descriptors that flip some bits from view to view, new point
+"""Keyframes of a sequence around shelves with exact truth: descriptors that flip some bits from view to view, new point
 ids whenever a point comes back after it was out of sight, corners of which a half is found again, odometry that drifts,
 and aisles that may be copies."""
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,13 +19,17 @@ CORNERS = 300  # of a keyframe
 
 
 @dataclass(frozen=True, eq=False)
-class StoreWalk:
+class StoreSequence:
     """Truth beside what a tracker would send."""
 
     rig: Rig
     keyframes: list[Keyframe]
     world_T_kf: F64  # (K, 4, 4)
     physical: dict[int, int]  # point id -> index of the physical point
+
+    def first(self, count: int) -> StoreSequence:
+        """The first `count` keyframes."""
+        return dataclasses.replace(self, keyframes=self.keyframes[:count], world_T_kf=self.world_T_kf[:count])
 
 
 def shelf_points(aisles: int, alike: float, rng: np.random.Generator, per_aisle: int = 1200) -> tuple[F64, U8]:
@@ -52,9 +57,9 @@ def shelf_points(aisles: int, alike: float, rng: np.random.Generator, per_aisle:
     return np.concatenate(points), np.concatenate(looks)
 
 
-def aisle_walk(aisles: list[int], step: float = 0.3) -> F64:
+def aisle_sequence(aisles: list[int], step: float = 0.3) -> F64:
     """(K, 4, 4) world_T_cam along +z through one aisle after the other; between aisles the camera turns in place,
-    walks over outside the shelves, and comes to the start of the next aisle."""
+    sequences over outside the shelves, and comes to the start of the next aisle."""
     poses = []
     for previous, aisle in zip([None, *aisles], aisles, strict=False):
         if previous is not None:
@@ -81,20 +86,20 @@ def drift(world_T_kf: F64, rng: np.random.Generator, per_metre: float, turn_per_
     return se3.orthonormalize(np.array(poses))
 
 
-def make_walk(
+def make_sequence(
     aisles: list[int],
     alike: float = 0.0,
     seed: int = 0,
     flip: float = 0.06,
     noise_px: float = 0.4,
     max_points: int = 300,
-) -> StoreWalk:
-    """Keyframes of a walk through the aisles, in this order."""
+) -> StoreSequence:
+    """Keyframes of a sequence through the aisles, in this order."""
     rng, corner_rng = np.random.default_rng(seed), np.random.default_rng([seed, 1])
     rig = fisheye_rig()
     points, looks = shelf_points(max(aisles) + 1, alike, rng)
     strength = corner_rng.random(len(points))
-    world_T_kf = aisle_walk(aisles)
+    world_T_kf = aisle_sequence(aisles)
     odom = drift(world_T_kf, rng, 0.004, 0.0006)
     tracks: dict[int, int] = {}  # physical point -> its id while it stays in sight
     physical: dict[int, int] = {}
@@ -110,7 +115,7 @@ def make_walk(
         strongest = _strongest(rig, pose, points, strength, corner_rng)
         corners = _seen(rig, pose, points[strongest], looks[strongest], corner_rng, flip, noise_px)
         keyframes.append(_keyframe(k, odom[k], ids, seen, corners))
-    return StoreWalk(rig, keyframes, world_T_kf, physical)
+    return StoreSequence(rig, keyframes, world_T_kf, physical)
 
 
 def _visible(rig: Rig, pose: F64, points: F64, tracks: dict[int, int], rng: np.random.Generator, most: int) -> I64:

@@ -1,4 +1,4 @@
-"""Drawing of a rectified pair side by side with epipolar lines and coloured row errors."""
+"""Drawing of a rectified pair side by side with epipolar lines and row errors in colour."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Walks of a camera through a store: smooth in position and direction, with the sway and tremble of a pushed cart.
+"""Drives of the robot's camera through a store: smooth in position and direction, with the vibration of wheels.
 
-A route is a polyline on the floor, walked at a varying speed and smoothed over time by a Gaussian, so that corners
+A route is a polyline on the floor, driven at a varying speed and smoothed over time by a Gaussian, so that corners
 become curves; position and heading are then cubic splines of time (twice continuously differentiable), and a few sines
 with the frequencies of steps and wheels are added.
 """
@@ -22,21 +22,21 @@ _RATE = 120.0  # samples a second of the dense route
 
 @dataclass(frozen=True)
 class Gait:
-    """How the camera is carried."""
+    """Motion and mounting of the camera."""
 
     speed: float = 0.95  # m/s
     height: float = 1.25  # metres above the floor
     pitch_deg: float = -4.0  # below the horizon is negative
-    vibration: float = 1.0  # scale of sway and tremble
+    vibration: float = 1.0  # scale of the vibration
     turn_seconds: float = 0.65  # Gaussian width that rounds the corners
-    stand_seconds: float = 1.0  # at rest before the walk
+    rest_seconds: float = 1.0  # at rest before the drive
 
 
-class Walk:
+class Drive:
     """world_T_cam at any time from 0 to `duration` seconds."""
 
     def __init__(self, route: F64, gait: Gait, rng: np.random.Generator, length: float) -> None:
-        """`route` (N, 2) metres is walked for `length` metres at most."""
+        """`route`: (N, 2) metres, driven for `length` metres at most."""
         self.gait = gait
         t, arc = _progress(gait, rng, length, route)
         self.duration = float(t[-1])
@@ -49,18 +49,18 @@ class Walk:
         self._times, self._arc = t, arc
         self._sines = _sines(rng, gait.vibration)
 
-    def walked(self, seconds: float) -> float:
-        """Metres of the route behind the walker."""
+    def distance(self, seconds: float) -> float:
+        """Metres driven along the route."""
         return float(np.interp(seconds, self._times, self._arc))
 
     def when(self, metres: float) -> float:
-        """Seconds until so much of the route is behind the walker; the end of the walk where it is not so long."""
+        """Seconds until so many metres are driven; the end of the drive if it is shorter."""
         return float(np.interp(metres, self._arc, self._times))
 
     def place(self, metres: float, aside: float = 0.0) -> tuple[F64, float]:
-        """Position (2,) and heading after so many metres of the route, `aside` metres to the left of it.
+        """Position (2,) and heading in radians after some metres of the route, `aside` metres to the left of it.
 
-        Before its beginning and beyond its end the route goes straight on.
+        Before its start and beyond its end the route is extended in a straight line.
         """
         x, y, heading = self._path(self.when(metres)).tolist()
         ahead, left = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
@@ -73,35 +73,35 @@ class Walk:
         return self.steady(seconds) @ self.shake(seconds)
 
     def shake(self, seconds: F64) -> F64:
-        """Times (N,) -> sway and tremble, steady_T_cam (N, 4, 4)."""
+        """Times (N,) -> vibration, steady_T_cam (N, 4, 4)."""
         amplitude, frequency, phase = self._sines
         return se3.exp((amplitude * np.sin(2 * np.pi * frequency * seconds[:, None, None] + phase)).sum(-1))
 
     def course(self, seconds: F64, derivative: int = 0) -> F64:
-        """Times (N,) -> x, y (metres) and heading (rad) of the walker (N, 3), or their derivatives by time."""
+        """Times (N,) -> x, y (metres) and heading (rad) of the robot (N, 3), or their derivatives by time."""
         return np.asarray(self._path(seconds, derivative), float)
 
     @property
-    def walker_R_cam(self) -> F64:
-        """(3, 3) from the camera without shake to the walker's axes: x ahead, z up."""
+    def robot_R_cam(self) -> F64:
+        """(3, 3) from the camera without vibration to the robot's axes: x ahead, z up."""
         return FORWARD @ se3.so3_exp(np.array([np.deg2rad(self.gait.pitch_deg), 0, 0]))
 
     def steady(self, seconds: F64) -> F64:
-        """`poses` without sway and tremble."""
+        """`poses` without vibration."""
         x, y, heading = self._path(seconds).T
-        world_T_walker = se3.from_rotation_translation(
+        world_T_robot = se3.from_rotation_translation(
             se3.so3_exp(np.stack([0 * heading, 0 * heading, heading], -1)),
             np.stack([x, y, np.full_like(x, self.gait.height)], -1),
         )
-        walker_T_cam = se3.from_rotation_translation(self.walker_R_cam, np.zeros(3))
-        return world_T_walker @ walker_T_cam
+        robot_T_cam = se3.from_rotation_translation(self.robot_R_cam, np.zeros(3))
+        return world_T_robot @ robot_T_cam
 
 
 def _progress(gait: Gait, rng: np.random.Generator, length: float, route: F64) -> tuple[F64, F64]:
-    """Times (N,) and metres walked (N,): at rest, a soft start, a speed that wanders by a tenth."""
+    """Times (N,) and metres driven (N,): at rest, a smooth start, then a speed that varies by a tenth."""
     length = min(length, float(np.linalg.norm(np.diff(route, axis=0), axis=1).sum()))
-    t = np.arange(0, gait.stand_seconds + 1.4 * length / gait.speed + 3, 1 / _RATE)
-    start = np.clip((t - gait.stand_seconds) / 1.5, 0, 1)
+    t = np.arange(0, gait.rest_seconds + 1.4 * length / gait.speed + 3, 1 / _RATE)
+    start = np.clip((t - gait.rest_seconds) / 1.5, 0, 1)
     phase = rng.uniform(0, 2 * np.pi, 2)
     speed = gait.speed * (1 + 0.08 * np.sin(0.9 * t + phase[0]) + 0.05 * np.sin(2.3 * t + phase[1]))
     speed *= start * start * (3 - 2 * start)
@@ -111,7 +111,7 @@ def _progress(gait: Gait, rng: np.random.Generator, length: float, route: F64) -
 
 
 def _heading(xy: F64, route: F64) -> F64:
-    """(N,) radians of the direction of travel, unwrapped; held where the walker stands."""
+    """(N,) radians of the direction of travel, unwrapped; constant while the robot is at rest."""
     velocity = np.gradient(xy, axis=0) * _RATE
     moving = np.linalg.norm(velocity, axis=1) > 0.02
     first = np.arctan2(*(route[1] - route[0])[::-1])
@@ -121,7 +121,7 @@ def _heading(xy: F64, route: F64) -> F64:
 
 
 def _sines(rng: np.random.Generator, scale: float) -> tuple[F64, F64, F64]:
-    """Amplitudes, frequencies (Hz) and phases (6, K) of the shake's tangent (metres, radians; camera axes)."""
+    """Amplitudes, frequencies (Hz) and phases (6, K) of the vibration's tangent (metres, radians; camera axes)."""
     bands = ((0.9, 1.0), (1.8, 0.6), (3.1, 0.12), (6.7, 0.03))
     size = np.array([0.012, 0.009, 0.006, np.deg2rad(0.35), np.deg2rad(0.5), np.deg2rad(0.45)])
     amplitude = scale * size[:, None] * np.array([a for _, a in bands]) * rng.uniform(0.5, 1.0, (6, len(bands)))

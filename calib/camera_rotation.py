@@ -1,7 +1,7 @@
-"""How the right eye is turned against the left one, from pictures alone: for rigs whose extrinsics nobody wrote down.
+"""Rotation between the cameras from stereo matches, for rigs with unknown extrinsics.
 
-Matched points must lie in one plane with both centres. With the baseline's direction taken as known, the three angles
-of the right eye follow from a robust fit of that condition; its length cannot follow from pictures and stays.
+Matched bearings satisfy the epipolar constraint. With a known direction of the baseline, the three angles of the right
+camera follow from a robust fit of that constraint; the length of the baseline is not observable and stays.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, U8, StereoImage
 
 FEATURES = 2000  # of one image
-MAX_DISTANCE = 40  # bits of 256 that matched descriptors differ in at most
+MAX_HAMMING = 40  # of 256 bits, between matched ORB descriptors
 SOFT_PX = 0.5  # scale of the Cauchy loss
-LEAST_MATCHES = 100
+MIN_MATCHES = 100
 
 
 @dataclass(frozen=True, eq=False)
-class EyeRotation:
-    """A rig with its right eye turned, and how well matches fit before and after."""
+class CameraRotation:
+    """A rig with a corrected rotation of the right camera, and the epipolar errors before and after."""
 
     rig: Rig
     matches: int
@@ -33,11 +33,11 @@ class EyeRotation:
     sigma_deg: F64  # (3,) standard deviation of the angles about x, y, z
 
 
-def align_eyes(rig: Rig, images: Iterable[StereoImage]) -> EyeRotation | None:
-    """Turn the right eye of `rig` so that points matched in the images lie in their epipolar planes.
+def align_cameras(rig: Rig, images: Iterable[StereoImage]) -> CameraRotation | None:
+    """Rotate the right camera of `rig` so that stereo matches satisfy the epipolar constraint.
 
     Args:
-        rig: two eyes; the turn looked for is a few degrees at most.
+        rig: two cameras; its rotation is wrong by a few degrees at most.
         images: a few pairs, of different views if possible.
 
     Returns:
@@ -49,11 +49,11 @@ def align_eyes(rig: Rig, images: Iterable[StereoImage]) -> EyeRotation | None:
     pairs = [_match(image.left, image.right) for image in images if image.right is not None]
     if not pairs:
         return None
-    uv_left, uv_right = (np.concatenate([p[eye] for p in pairs]) for eye in (0, 1))
+    uv_left, uv_right = (np.concatenate([p[side] for p in pairs]) for side in (0, 1))
     left, right = rig.left.unproject(uv_left), rig.right.unproject(uv_right)
     seen = np.isfinite(left).all(1) & np.isfinite(right).all(1)
     left, right = left[seen], right[seen]
-    if len(left) < LEAST_MATCHES:
+    if len(left) < MIN_MATCHES:
         return None
     normal = np.cross(rig.left_T_right[:3, 3], left)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -68,7 +68,7 @@ def align_eyes(rig: Rig, images: Iterable[StereoImage]) -> EyeRotation | None:
     after = np.abs(residual_px(fit.x))
     noise = 1.4826 * float(np.median(after))
     covariance = np.linalg.inv(fit.jac.T @ fit.jac) * noise**2
-    return EyeRotation(
+    return CameraRotation(
         replace(rig, left_T_right=transform),
         len(left),
         float(np.median(np.abs(residual_px(np.zeros(3))))),
@@ -78,7 +78,7 @@ def align_eyes(rig: Rig, images: Iterable[StereoImage]) -> EyeRotation | None:
 
 
 def _match(left: U8, right: U8) -> tuple[F64, F64]:
-    """(N, 2) px in each image of mutually nearest ORB points."""
+    """(N, 2) px in each image of mutually nearest ORB features."""
     import cv2
 
     orb: Any = cv2.ORB_create(FEATURES)  # pyright: ignore[reportAttributeAccessIssue]
@@ -87,7 +87,7 @@ def _match(left: U8, right: U8) -> tuple[F64, F64]:
     if descriptors_left is None or descriptors_right is None:
         return np.zeros((0, 2)), np.zeros((0, 2))
     found = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(descriptors_left, descriptors_right)
-    good = [m for m in found if m.distance <= MAX_DISTANCE]
+    good = [m for m in found if m.distance <= MAX_HAMMING]
     a = np.array([keys_left[m.queryIdx].pt for m in good]).reshape(-1, 2)
     b = np.array([keys_right[m.trainIdx].pt for m in good]).reshape(-1, 2)
     return a, b

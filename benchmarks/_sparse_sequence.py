@@ -1,4 +1,4 @@
-"""Keyframes of a simulated walk without rendering every frame of it.
+"""Keyframes of a simulated sequence without rendering every frame of it.
 
 Images are rendered every so many metres; corners, stereo points and descriptors come from the tracker's own code; a
 point keeps its id from one keyframe to the next when descriptor and true motion agree; odometry is the truth with a
@@ -27,7 +27,7 @@ DRIFT_PER_METRE, TURN_PER_METRE = 0.005, 0.0005  # random part of a step, and ra
 
 
 @dataclass(frozen=True, eq=False)
-class SparseWalk:
+class SparseSequence:
     """Keyframes with drifting odometry, and where they truly are."""
 
     rig: Rig
@@ -59,7 +59,7 @@ def drifted(world_T_kf: F64, seed: int) -> F64:
     return se3.orthonormalize(np.array(poses))
 
 
-def walk_keyframes(spec: str) -> SparseWalk:
+def sequence_keyframes(spec: str) -> SparseSequence:
     """Render and describe the keyframes of `sim:...`."""
     source = open_source(spec)
     assert isinstance(source, SimSource) and source.ground_truth is not None
@@ -67,7 +67,7 @@ def walk_keyframes(spec: str) -> SparseWalk:
     world_T_kf = source.ground_truth.poses[rows]
     odom = drifted(world_T_kf, source.options.seed + 1000 * source.options.walk)
     keyframes = list(_described(source, source.frame_ids[rows], world_T_kf, odom))
-    return SparseWalk(source.rig, keyframes, world_T_kf)
+    return SparseSequence(source.rig, keyframes, world_T_kf)
 
 
 def _described(source: SimSource, frame_ids: I64, world_T_kf: F64, odom: F64) -> Iterator[Keyframe]:
