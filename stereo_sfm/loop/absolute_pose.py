@@ -1,8 +1,7 @@
-"""Pose of one stereo camera relative to another from matched points, in both directions and both eyes.
+"""Relative pose of two stereo cameras from matched points, with reprojection in both directions and both images.
 
-Frame a holds known points (a keyframe's, or the map's); frame b is the camera to find. Rows are matches. Where b has
-stereo points too, they are projected back into a. A point's range is uncertain along its ray: the error of a far point
-seen from another side is weighed by that.
+Frame a has known points (of a keyframe or the map); the pose of frame b is estimated. Rows are matches. Where b has
+stereo points too, they are projected into a. The uncertainty of a point's range along its ray is part of the weights.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ CHI2_2DOF_95 = 5.991
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """N matched points; NaN rows where something is unknown."""
+    """N matched points; NaN rows for unknown values."""
 
     points_a: F64  # (N, 3) metres in frame a, never NaN
     sigmas_a: F64  # (N,) metres, uncertainty along the ray from a
@@ -43,14 +42,14 @@ class Pose:
 
     b_T_a: F64  # (4, 4)
     information: F64  # (6, 6) of exp(xi) @ b_T_a, equal to that of inverse(b_T_a) @ exp(xi)
-    inlier: Bool  # (N,) agrees in every direction that could be checked
-    rms: float  # normalised error of the inliers (1 = as noisy as assumed)
+    inlier: Bool  # (N,) consistent in every direction that could be checked
+    rms: float  # normalised error of the inliers (1: the noise is as assumed)
 
 
 def ransac_pose(
     matches: Matches, rig: Rig, rng: np.random.Generator, pixel_sigma: float, iterations: int = 400
 ) -> F64 | None:
-    """b_T_a (4, 4) with the least truncated error, or None when no sample of three gives one."""
+    """b_T_a (4, 4) with the smallest truncated error, or None if no sample of three gives a pose."""
     if len(matches) < 4:
         return None
     bearings = rig.left.unproject(matches.uv_left_b)
@@ -88,7 +87,7 @@ def _distinct_triples(rng: np.random.Generator, n: int, count: int) -> I64:
 
 
 def consistent(b_T_a: F64, matches: Matches, rig: Rig, pixel_sigma: float) -> Bool:
-    """(N,): the error is within the 95 % bound forwards, and backwards where b knows the point."""
+    """(N,): the error is within the 95 % bound from a to b, and from b to a where b has the point."""
     ahead = _errors(b_T_a, matches.points_a, matches.sigmas_a, matches.uv_left_b, rig.left, pixel_sigma)
     back = _errors(se3.inverse(b_T_a), matches.points_b, matches.sigmas_b, matches.uv_left_a, rig.left, pixel_sigma)
     return (ahead < CHI2_2DOF_95) & ~(back >= CHI2_2DOF_95)
@@ -99,7 +98,7 @@ def _errors(t: F64, points: F64, sigmas: F64, uv: F64, camera: Camera, pixel_sig
 
 
 def refine_pose(b_T_a: F64, matches: Matches, rig: Rig, pixel_sigma: float, iterations: int = 10) -> Pose:
-    """Gauss-Newton on exp(xi) @ b_T_a over both eyes and both directions, with the inliers of every round."""
+    """Gauss-Newton on exp(xi) @ b_T_a over both images and both directions, with the inliers of every iteration."""
     t = b_T_a
     inlier = consistent(t, matches, rig, pixel_sigma)
     hessian, rms = np.zeros((6, 6)), float("inf")
@@ -120,17 +119,17 @@ def refine_pose(b_T_a: F64, matches: Matches, rig: Rig, pixel_sigma: float, iter
 def _normal_equations(t: F64, m: Matches, rig: Rig, pixel_sigma: float, inlier: Bool) -> tuple[F64, F64, float]:
     hessian, gradient, sums = np.zeros((6, 6)), np.zeros(6), np.zeros(2)
     back = se3.inverse(t)
-    eyes: list[tuple[Camera, F64]] = [(rig.left, np.eye(4))]
+    cameras: list[tuple[Camera, F64]] = [(rig.left, np.eye(4))]
     if rig.right is not None:
-        eyes.append((rig.right, se3.inverse(rig.left_T_right)))
-    for eye, (camera, eye_T_left) in enumerate(eyes):
+        cameras.append((rig.right, se3.inverse(rig.left_T_right)))
+    for side, (camera, cam_T_left) in enumerate(cameras):
         for points, sigmas, uv, pose, forward in (
-            (m.points_a, m.sigmas_a, (m.uv_left_b, m.uv_right_b)[eye], t, True),
-            (m.points_b, m.sigmas_b, (m.uv_left_a, m.uv_right_a)[eye], back, False),
+            (m.points_a, m.sigmas_a, (m.uv_left_b, m.uv_right_b)[side], t, True),
+            (m.points_b, m.sigmas_b, (m.uv_left_a, m.uv_right_a)[side], back, False),
         ):
-            turn = eye_T_left[:3, :3] if forward else -(eye_T_left @ back)[:3, :3]
+            turn = cam_T_left[:3, :3] if forward else -(cam_T_left @ back)[:3, :3]
             pose_kernels.add_normal_equations(
-                t, eye_T_left @ pose, np.ascontiguousarray(turn), forward, points, sigmas, uv, inlier,
+                t, cam_T_left @ pose, np.ascontiguousarray(turn), forward, points, sigmas, uv, inlier,
                 camera.model_id, camera.params, pixel_sigma, hessian, gradient, sums,
             )  # fmt: skip
     return hessian, gradient, float(np.sqrt(sums[0] / max(2 * sums[1], 1)))

@@ -155,7 +155,7 @@ def match_descriptors(
     best, first, second = _two_nearest(a, b, groups)
     ok = (best >= 0) & (first <= max_distance) & (first <= ratio * second)
     if mutual and ok.any():
-        asked, back_row = np.unique(best[ok], return_inverse=True)
-        back, _, _ = _two_nearest(b[asked], a, np.arange(len(a)))
+        queried, back_row = np.unique(best[ok], return_inverse=True)
+        back, _, _ = _two_nearest(b[queried], a, np.arange(len(a)))
         ok[ok] = back[back_row] == np.flatnonzero(ok)
     return q_rows[ok], t_rows[best[ok]], first[ok].astype(np.float32)

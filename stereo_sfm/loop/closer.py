@@ -1,4 +1,4 @@
-"""The loop closer: one keyframe in, exactly one answer out."""
+"""The loop closer: one result for each keyframe."""
 
 from __future__ import annotations
 
@@ -22,29 +22,32 @@ from stereo_sfm.timing import NoSpans
 from stereo_sfm.types import F64, Keyframe, LoopResult
 
 CLOUD_KEYFRAMES = 4  # connected keyframes whose points are added to a candidate's own
-PLACE_RADIUS = 3  # candidates this many keyframes apart are one place: only the best of them is verified
-FRESH, CROWD = 30, 5  # newest keyframes, which are all kept; keyframes of one view beyond which one is forgotten
+PLACE_RADIUS = 3  # candidates at most so many keyframes apart are one place: only the best of them is verified
+KEPT_NEWEST = 30  # newest keyframes, none of which is removed
+MAX_SAME_VIEW = 5  # keyframes of one view; of more, one is removed
 DRIFT_PER_METRE = 0.003  # of the odometry on both sides of a gap
-RIVAL = 0.5  # share of a loop's inliers with which another place makes it ambiguous, where odometry cannot decide
-REFUTED = "against_odometry", "out_of_reach"  # what cannot be, however much it looks so
-AGREE_METRES, AGREE_DEGREES = 0.15, 2.0  # how well two keyframes must agree on a loop
+RIVAL = 0.5  # share of a loop's inliers above which another place makes it ambiguous
+CONTRADICTED = "against_odometry", "out_of_reach"  # reasons of impossible hypotheses, which are no rivals
+AGREE_METRES, AGREE_DEGREES = 0.15, 2.0  # largest difference of two keyframes' estimates of one loop
 
 
 @dataclass(frozen=True, eq=False)
 class _Hypothesis:
+    """A geometrically verified candidate."""
+
     kf_id: int
     candidate_kf_id: int
     candidate_T_kf: F64
     inliers: int
-    against: str  # what odometry has to say against it
-    on_its_own: bool  # no odometry leads from one end to the other: nothing but the pictures speaks for it
+    against: str  # reason to reject it by odometry, "" if there is none
+    unconnected: bool  # no path of odometry and loops connects its ends: only appearance supports it
 
 
 class LoopCloser:
-    """Owner of the place database.
+    """Finds loops; owns the place database.
 
-    Appearance proposes (bag of words), geometry decides (`verify`), odometry must allow it (a loop may not contradict
-    the way walked by more than drift can explain), and successive keyframes must agree.
+    Candidates by appearance (bag of words) are verified geometrically (`verify`). A loop must not contradict odometry
+    by more than drift can explain, and successive keyframes must agree on it.
     """
 
     def __init__(
@@ -58,7 +61,7 @@ class LoopCloser:
         self._source_rig, self._rig_terms = rig, np.zeros(6)
         self._vocabulary = vocabulary
         self._database = PlaceDatabase(len(vocabulary))
-        self._row: dict[int, int] = {}  # of a keyframe in the database
+        self._row: dict[int, int] = {}  # keyframe id -> row in the database
         self._store = KeyframeStore()
         self._graph = KeyframeGraph()
         self._pending: list[_Hypothesis] = []
@@ -66,16 +69,16 @@ class LoopCloser:
 
     @property
     def vocabulary(self) -> Vocabulary:
-        """The vocabulary as it is now: it may have grown."""
+        """The current vocabulary, which may have grown."""
         return self._vocabulary
 
     @property
-    def remembered(self) -> int:
-        """Number of keyframes that may be found again."""
+    def keyframe_count(self) -> int:
+        """Number of keyframes that can be candidates."""
         return len(self._store)
 
     def step(self, keyframe: Keyframe) -> LoopResult:
-        """Look for the keyframe's place among the older ones, then remember it."""
+        """Look for a loop with earlier keyframes, then add the keyframe."""
         if not np.array_equal(keyframe.rig_terms, self._rig_terms):  # the tracker's rig was corrected
             self._rig_terms = keyframe.rig_terms
             self._rig = with_terms(self._source_rig, self._rig_terms)
@@ -89,25 +92,25 @@ class LoopCloser:
         self._row[keyframe.kf_id] = len(self._database)
         self._database.add(keyframe.kf_id, bag)
         self._store.add(keyframe)
-        self._forget(keyframe.kf_id)
+        self._cull(keyframe.kf_id)
         self._grow(keyframe)
         return result
 
-    def _forget(self, newest: int) -> None:
-        """Of a view that was seen many times keep the first and the last few: a day in one store fits into memory."""
-        settled = newest - FRESH
+    def _cull(self, newest: int) -> None:
+        """Of many keyframes of one view keep the first and the last few, which bounds memory in a known place."""
+        settled = newest - KEPT_NEWEST
         if settled not in self._store:
             return
-        crowd = [k for k in self._graph.same_view(settled) if k <= settled]
-        if len(crowd) > CROWD:
-            self._graph.forget(crowd[1])
-            self._store.remove(crowd[1])
-        if 2 * len(self._store) < len(self._database) - FRESH:
+        same_view = [k for k in self._graph.same_view(settled) if k <= settled]
+        if len(same_view) > MAX_SAME_VIEW:
+            self._graph.exclude(same_view[1])
+            self._store.remove(same_view[1])
+        if 2 * len(self._store) < len(self._database) - KEPT_NEWEST:
             self._row = {k: row for row, k in enumerate(self._store.ids)}
             self._database.keep(np.flatnonzero(np.isin(self._database.kf_ids, self._store.ids)))
 
     def _candidates(self, keyframe: Keyframe, bag: voc.Bag) -> tuple[list[tuple[int, float]], str]:
-        """Places to verify as (keyframe, score), best first, and the reason when there are none."""
+        """Candidates as (keyframe, score), best first, and the reason if there are none."""
         config = self._config
         if not config.enabled:
             return [], "disabled"
@@ -134,7 +137,7 @@ class LoopCloser:
         return [(k, float(scores[self._row[k]])) for k in places], "no_candidate"
 
     def _near(self, kf_id: int, connected: list[int]) -> set[int]:
-        """Keyframes that cannot be loops: connected to this one, or just before it in the same piece of odometry."""
+        """Keyframes that cannot be candidates: connected to this one, or shortly before it in the same submap."""
         before = range(max(kf_id - self._config.min_gap, 0), kf_id + 1)
         return {*connected, *(k for k in before if self._graph.unbroken(k, kf_id))}
 
@@ -149,12 +152,12 @@ class LoopCloser:
             for k, verdict in enumerate(verdicts)
             if not verdict.reason
         }
-        most = max((loop.inliers for loop in loops.values() if not loop.against), default=0)
+        best_inliers = max((loop.inliers for loop in loops.values() if not loop.against), default=0)
         self._pending = [h for h in self._pending if keyframe.kf_id - h.kf_id < self._config.consistent_window]
-        self._pending += [h for h in loops.values() if h.against or h.inliers >= RIVAL * most]
+        self._pending += [h for h in loops.values() if h.against or h.inliers >= RIVAL * best_inliers]
         accepted = -1
         for k in sorted(loops, key=lambda k: -loops[k].inliers):
-            reasons[k] = loops[k].against or self._doubt(loops[k], most)
+            reasons[k] = loops[k].against or self._objection(loops[k], best_inliers)
             if not reasons[k]:
                 accepted = k
                 break
@@ -175,43 +178,46 @@ class LoopCloser:
         return verify(view, cloud, self._rig, config, rng)
 
     def _hypothesis(self, kf_id: int, candidate: int, verdict: Verdict) -> _Hypothesis:
-        """A verified candidate, and what is known of the way to it."""
+        """A verified candidate, compared with the odometry between its ends."""
         config, candidate_T_kf = self._config, se3.inverse(verdict.b_T_a)
-        way = self._graph.way(candidate, kf_id)
-        if way is not None:
-            metres = config.gate_m + config.gate_m_per_m * way.metres
-            degrees = config.gate_deg + config.gate_deg_per_m * way.metres
-            near = within(se3.inverse(way.a_T_b) @ candidate_T_kf, metres, degrees)
+        path = self._graph.path(candidate, kf_id)
+        if path is not None:
+            metres = config.gate_m + config.gate_m_per_m * path.metres
+            degrees = config.gate_deg + config.gate_deg_per_m * path.metres
+            near = within(se3.inverse(path.a_T_b) @ candidate_T_kf, metres, degrees)
             against = "" if near else "against_odometry"
         else:
-            jump = self._graph.jump(candidate, kf_id, candidate_T_kf)
-            reached = jump is None or jump.off <= jump.radius + DRIFT_PER_METRE * jump.walked
+            gap = self._graph.gap_motion(candidate, kf_id, candidate_T_kf)
+            reached = gap is None or gap.deviation <= gap.tolerance + DRIFT_PER_METRE * gap.distance
             enough = verdict.inliers >= 2 * config.min_inliers and verdict.share >= config.min_inlier_share_after_gap
             against = "out_of_reach" if not reached else "" if enough else "too_few_inliers"
-        return _Hypothesis(kf_id, candidate, candidate_T_kf, verdict.inliers, against, way is None)
+        return _Hypothesis(kf_id, candidate, candidate_T_kf, verdict.inliers, against, path is None)
 
-    def _doubt(self, loop: _Hypothesis, most: int) -> str:
-        """Why a loop that odometry allows is none yet, '' if it is one; `most`: inliers of the best such candidate."""
-        if loop.inliers < RIVAL * most:
+    def _objection(self, loop: _Hypothesis, best_inliers: int) -> str:
+        """Why a loop that odometry allows is not accepted, '' if it is.
+
+        `best_inliers`: of the best candidate that odometry allows.
+        """
+        if loop.inliers < RIVAL * best_inliers:
             return "better_elsewhere"
-        rivals = [h for h in self._pending if h.against not in REFUTED and h.inliers > RIVAL * loop.inliers]
-        if loop.on_its_own and any(self._same_loop(h, loop) is False for h in rivals):
+        rivals = [h for h in self._pending if h.against not in CONTRADICTED and h.inliers > RIVAL * loop.inliers]
+        if loop.unconnected and any(self._same_loop(h, loop) is False for h in rivals):
             return "ambiguous"
-        return "" if self._agreed(loop) else "not_confirmed_yet"
+        return "" if self._confirmed(loop) else "not_confirmed_yet"
 
-    def _agreed(self, new: _Hypothesis) -> bool:
-        """Whether enough earlier keyframes found the same loop."""
+    def _confirmed(self, new: _Hypothesis) -> bool:
+        """Whether enough keyframes found the same loop."""
         votes = {h.kf_id for h in self._pending if not h.against and (h is new or self._same_loop(h, new))}
         return len(votes) >= self._config.consistent
 
-    def _same_loop(self, old: _Hypothesis, new: _Hypothesis) -> bool | None:
-        """Whether two loops say the same; None where no way leads from one to the other."""
-        back = self._graph.way(old.candidate_kf_id, new.candidate_kf_id)
-        ahead = self._graph.way(new.kf_id, old.kf_id)
+    def _same_loop(self, earlier: _Hypothesis, new: _Hypothesis) -> bool | None:
+        """Whether two loops agree; None if no path connects them."""
+        back = self._graph.path(earlier.candidate_kf_id, new.candidate_kf_id)
+        ahead = self._graph.path(new.kf_id, earlier.kf_id)
         if back is None or ahead is None:
             return None
         implied = back.a_T_b @ new.candidate_T_kf @ ahead.a_T_b
-        return within(se3.inverse(old.candidate_T_kf) @ implied, AGREE_METRES, AGREE_DEGREES)
+        return within(se3.inverse(earlier.candidate_T_kf) @ implied, AGREE_METRES, AGREE_DEGREES)
 
     def _accept(
         self,

@@ -1,4 +1,4 @@
-"""Points around a keyframe, its own and those of connected keyframes: what a camera is matched to."""
+"""Points around a keyframe, its own and those of connected keyframes, for matching with a camera's view."""
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false
 
@@ -19,22 +19,22 @@ from stereo_sfm.geometry.pixel_grid import cells_near, make_grid
 from stereo_sfm.loop.place_view import PlaceView, place_view_of
 from stereo_sfm.types import F64, I64, U8, Bool, Keyframe
 
-SAME_CORNER_PX, SAME_CORNER_BITS = 4.0, 50  # corners of two keyframes that are so near and so alike are one
-CORNERS = 10**6  # more than a keyframe has
+SAME_CORNER_PX, SAME_CORNER_BITS = 4.0, 50  # largest differences of one corner in two keyframes
+CORNERS = 10**6  # more than a keyframe has: makes temporary ids of corners unique
 
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
     """M described points in the frame of a centre camera; a physical point may have several rows (views)."""
 
-    ids: I64  # (M,) point ids; negative for corners that are no points
+    ids: I64  # (M,) point ids; negative for corners that are not map points
     points: F64  # (M, 3) metres in the centre's camera
     sigmas: F64  # (M,) metres along the ray of the row's own keyframe
     descriptors: U8  # (M, 32)
     uv_left: F64  # (M, 2) px in the image of the row's own keyframe
     uv_right: F64  # (M, 2)
     corner: Bool  # (M,) of `Keyframe.corners`; False: a point
-    view: I64  # (M,) which keyframe that is: row of centre_T_kf
+    view: I64  # (M,) the row's own keyframe: row of centre_T_kf
     centre_T_kf: F64  # (V, 4, 4); row 0 is the centre
 
     def __len__(self) -> int:
@@ -53,9 +53,10 @@ class Cloud:
 
 
 def gather(centre: Keyframe, others: Sequence[Keyframe], rig: Rig, disparity_sigma: float) -> Cloud:
-    """What the centre shows, then what `others` (near in time) show, moved into its camera by odometry.
+    """Corners and points of the centre, then of `others` (near in time), transformed into its camera by odometry.
 
-    Only rows with depth are taken. Corners that keyframes show at one place and that look alike share an id.
+    Rows without depth are left out. Corners of several keyframes with about the same position and descriptor share an
+    id.
     """
     keyframes = [centre, *others]
     centre_T_kf = np.stack([se3.inverse(centre.odom_T_cam) @ k.odom_T_cam for k in keyframes])

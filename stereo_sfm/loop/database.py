@@ -1,7 +1,7 @@
 """Place database: an inverted index from words to keyframes, in arrays that grow by doubling.
 
-Postings of a word are a chain of blocks, so adding a keyframe never moves the others and a query touches only the
-postings of the words it asks for.
+Postings of a word are a chain of blocks, so adding a keyframe never moves the others and a query reads only the
+postings of its words.
 """
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportMissingTypeArgument=false
@@ -105,7 +105,7 @@ class PlaceDatabase:
         return self._kf_ids[: self._count]
 
     def add(self, kf_id: int, bag: Bag) -> None:
-        """Insert a keyframe; words beyond the known ones (a grown vocabulary) are added."""
+        """Insert a keyframe; new words of a grown vocabulary are added."""
         if len(bag.words):
             self._head = _grown(self._head, int(bag.words[-1]) + 1, -1)
         self._reserve(self._used + len(bag.words))
@@ -125,7 +125,7 @@ class PlaceDatabase:
         self._count += 1
 
     def keep(self, rows: I64) -> None:
-        """Forget all keyframes but those in these rows, (K,) ascending, which become 0, 1, 2, ...; no score changes."""
+        """Remove all keyframes but those in the given rows (K,), ascending, which become 0, 1, ...; scores stay."""
         kf_ids = self.kf_ids[rows]
         renamed = np.full(self._count, -1, np.int64)
         renamed[rows] = np.arange(len(rows))
@@ -140,12 +140,12 @@ class PlaceDatabase:
         self.__dict__ = to.__dict__
 
     def _reserve(self, blocks: int) -> None:
-        """Room for so many blocks."""
+        """Allocate at least so many blocks."""
         self._fill, self._following = _grown(self._fill, blocks), _grown(self._following, blocks, -1)
         self._entry, self._weight = _grown(self._entry, blocks), _grown(self._weight, blocks)
 
     def _trim(self) -> None:
-        """Give back the blocks that nothing uses."""
+        """Free unused blocks."""
         self._fill, self._following = self._fill[: self._used].copy(), self._following[: self._used].copy()
         self._entry, self._weight = self._entry[: self._used].copy(), self._weight[: self._used].copy()
 

@@ -1,4 +1,4 @@
-"""What is known of the way between two keyframes: odometry along the walk, and accepted loops as short cuts."""
+"""Relative poses of keyframes from odometry and accepted loops: shortest paths in the graph of both."""
 
 from __future__ import annotations
 
@@ -14,40 +14,42 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.columns import Columns, Spec
 from stereo_sfm.types import F64, I64, Bool
 
-NEAR_METRES, NEAR_RADIANS = 1.5, 0.7  # keyframes that should see the same things
-SAME_METRES, SAME_RADIANS = 0.3, 0.25  # keyframes that show the same view
-GAP_METRES, GAP_SHARE, SLOW = 0.3, 0.75, 0.5  # reach without tracking: metres, share of the way, least metres a second
-HOP_METRES = 1e-6  # added to each edge of a way: of equal ways the one with fewer edges
+NEAR_METRES, NEAR_RADIANS = 1.5, 0.7  # between keyframes with overlapping views
+SAME_METRES, SAME_RADIANS = 0.3, 0.25  # between keyframes of the same view
+GAP_METRES = 0.3  # constant part of the tolerance after a gap in tracking
+GAP_SHARE = 0.75  # part of the tolerance proportional to the distance at the speed before the gap
+MIN_SPEED = 0.5  # metres a second, lower bound of that speed
+HOP_METRES = 1e-6  # added to each edge, so that of equally long paths the one with fewer edges is chosen
 
 
 @dataclass(frozen=True, eq=False)
-class Way:
-    """The shortest known way from keyframe a to keyframe b."""
+class GraphPath:
+    """The shortest path from keyframe a to keyframe b."""
 
-    a_T_b: F64  # (4, 4) composed along it
-    metres: float  # walked on it: the drift it may hold grows with this
+    a_T_b: F64  # (4, 4) composed along the path
+    metres: float  # of odometry on it, to which its drift is proportional
 
 
 @dataclass(frozen=True, eq=False)
-class Jump:
-    """What a loop says of the motion while tracking was lost, beside what the robot's speed before says."""
+class GapMotion:
+    """The motion during a loss of tracking that a loop implies, compared with a prediction from the speed before."""
 
-    off: float  # metres between where the loop puts the camera after the gap and where it is expected
-    radius: float  # metres by which a robot that stops, turns or hurries can be off
-    walked: float  # metres of odometry between the gap and the loop's two ends
+    deviation: float  # metres between the implied and the predicted position after the gap
+    tolerance: float  # metres, largest deviation of a robot that stops, turns or accelerates
+    distance: float  # metres of odometry between the gap and the loop's two ends
 
 
 class _Nodes(Columns):
-    """One row a keyframe."""
+    """One row for each keyframe."""
 
     kf_id: I64  # ascending
     stamp_ns: I64
-    chain: I64  # number of the unbroken piece of odometry
+    chain: I64  # number of the uninterrupted part of the odometry
     odom_T_cam: F64  # (K, 4, 4)
-    anchored: F64  # (K, 4, 4) the same, taken back at each loop to where its older end stood
-    frame: I64  # the chain whose coordinates `anchored` is in
-    walked: F64  # metres since the start
-    kept: Bool  # may be found again
+    anchored: F64  # (K, 4, 4) the same, corrected at each loop to the pose of its older end
+    frame: I64  # the chain whose frame `anchored` is in
+    distance: F64  # metres since the start
+    kept: Bool  # False: no longer a candidate
 
     SPEC: ClassVar[Spec] = {
         "kf_id": (np.int64, (), -1),
@@ -56,13 +58,13 @@ class _Nodes(Columns):
         "odom_T_cam": (np.float64, (4, 4), np.eye(4)),
         "anchored": (np.float64, (4, 4), np.eye(4)),
         "frame": (np.int64, (), 0),
-        "walked": (np.float64, (), 0.0),
+        "distance": (np.float64, (), 0.0),
         "kept": (np.bool_, (), True),
     }
 
 
 class _Loops(Columns):
-    """One row an accepted loop."""
+    """One row for each accepted loop."""
 
     ends: I64  # (L, 2) rows of the keyframes a and b
     a_T_b: F64  # (L, 4, 4)
@@ -75,47 +77,47 @@ class KeyframeGraph:
 
     def __init__(self) -> None:
         self._nodes, self._loops = _Nodes(), _Loops()
-        self._joined: dict[int, int] = {}  # number of the chains' group that loops hold together
+        self._joined: dict[int, int] = {}  # chain -> number of the group of chains that loops connect
 
     def _row(self, kf_id: int) -> int:
         return int(np.searchsorted(self._nodes.kf_id, kf_id))
 
     def add(self, kf_id: int, odom_T_cam: F64, chain: int, stamp_ns: int = 0) -> None:
-        """Append the newest keyframe of an unbroken piece of odometry called `chain`."""
-        anchored, frame, walked = odom_T_cam, chain, 0.0
+        """Append the newest keyframe; `chain` numbers the uninterrupted part of the odometry it belongs to."""
+        anchored, frame, distance = odom_T_cam, chain, 0.0
         if len(self._nodes):
             last = self._nodes.odom_T_cam[-1]
-            walked = float(self._nodes.walked[-1] + np.linalg.norm(odom_T_cam[:3, 3] - last[:3, 3]))
+            distance = float(self._nodes.distance[-1] + np.linalg.norm(odom_T_cam[:3, 3] - last[:3, 3]))
             if self._nodes.chain[-1] == chain:
                 anchored, frame = self._nodes.anchored[-1] @ se3.inverse(last) @ odom_T_cam, self._nodes.frame[-1]
         self._joined.setdefault(chain, chain)
         self._nodes.append(
             1, kf_id=kf_id, stamp_ns=stamp_ns, chain=chain, odom_T_cam=odom_T_cam, anchored=anchored, frame=frame,
-            walked=walked,
+            distance=distance,
         )  # fmt: skip
 
-    def forget(self, kf_id: int) -> None:
-        """A keyframe that is not to be found any more; the ways that lead over it stay."""
+    def exclude(self, kf_id: int) -> None:
+        """Remove a keyframe from the candidates; paths over it stay."""
         self._nodes.kept[self._row(kf_id)] = False
 
     def unbroken(self, a: int, b: int) -> bool:
-        """Whether odometry leads from one keyframe to the other."""
+        """Whether odometry connects two keyframes without interruption."""
         row_a, row_b, nodes = self._row(a), self._row(b), self._nodes
         known = row_a < len(nodes) and nodes.kf_id[row_a] == a
         return bool(known and nodes.chain[row_a] == nodes.chain[row_b])
 
     def same_view(self, kf_id: int) -> list[int]:
-        """Keyframes, this one among them, that stood where it stood and looked where it looked, oldest first."""
+        """Keyframes with about the same pose, this one included, oldest first."""
         nodes, row = self._nodes, self._row(kf_id)
         rows, _, radians = self._around(nodes.anchored, row, nodes.frame, SAME_METRES)
         return nodes.kf_id[rows[radians < SAME_RADIANS]].tolist()
 
     def nearby(self, kf_id: int, excluded: Container[int]) -> list[int]:
-        """The keyframe of the same piece of odometry that stood nearest and looked the same way, if near at all."""
+        """The nearest keyframe of the same chain with an overlapping view, if there is one."""
         nodes, row = self._nodes, self._row(kf_id)
         rows, metres, radians = self._around(nodes.odom_T_cam, row, nodes.chain, NEAR_METRES)
-        apart = metres + 1 - np.cos(radians)
-        for k in np.argsort(apart, kind="stable").tolist():
+        difference = metres + 1 - np.cos(radians)
+        for k in np.argsort(difference, kind="stable").tolist():
             if radians[k] < NEAR_RADIANS and int(nodes.kf_id[rows[k]]) not in excluded:
                 return [int(nodes.kf_id[rows[k]])]
         return []
@@ -131,14 +133,14 @@ class KeyframeGraph:
         nodes, row_a, row_b = self._nodes, self._row(a), self._row(b)
         self._loops.append(1, ends=(row_a, row_b), a_T_b=a_T_b)
         nodes.anchored[row_b], nodes.frame[row_b] = nodes.anchored[row_a] @ a_T_b, nodes.frame[row_a]
-        keep, gone = self._joined[int(nodes.chain[row_a])], self._joined[int(nodes.chain[row_b])]
-        self._joined = {chain: keep if group == gone else group for chain, group in self._joined.items()}
+        keep, dropped = self._joined[int(nodes.chain[row_a])], self._joined[int(nodes.chain[row_b])]
+        self._joined = {chain: keep if group == dropped else group for chain, group in self._joined.items()}
 
-    def jump(self, a: int, b: int, a_T_b: F64) -> Jump | None:
-        """What a loop between two pieces of the walk says of the shortest gap between them; None where none is known.
+    def gap_motion(self, a: int, b: int, a_T_b: F64) -> GapMotion | None:
+        """The motion over the shortest gap between two chains that a loop between them implies; None without a gap.
 
-        In the dark a robot goes on as before, stops, turns or goes half as fast again: all this is in a ball around the
-        middle of the way that its speed makes likely.
+        Without tracking a robot may continue, stop, turn or accelerate by half: all its positions are in a ball around
+        the middle of the distance at its last speed.
         """
         nodes = self._nodes
         chains, chain_of = np.unique(nodes.chain, return_inverse=True)
@@ -156,29 +158,29 @@ class KeyframeGraph:
         ns, k, velocity = min(gaps, key=lambda gap: gap[:2])
         if group[self._row(a)] != group[k]:
             a, b, a_T_b = b, a, se3.inverse(a_T_b)
-        before, after = self.way(int(nodes.kf_id[k]), a), self.way(b, int(nodes.kf_id[k + 1]))
+        before, after = self.path(int(nodes.kf_id[k]), a), self.path(b, int(nodes.kf_id[k + 1]))
         assert before is not None and after is not None
         moved = before.a_T_b @ a_T_b @ after.a_T_b
-        off = float(np.linalg.norm(moved[:3, 3] - 0.5e-9 * ns * velocity))
-        radius = GAP_METRES + GAP_SHARE * 1e-9 * ns * max(float(np.linalg.norm(velocity)), SLOW)
-        return Jump(off, radius, before.metres + after.metres)
+        deviation = float(np.linalg.norm(moved[:3, 3] - 0.5e-9 * ns * velocity))
+        tolerance = GAP_METRES + GAP_SHARE * 1e-9 * ns * max(float(np.linalg.norm(velocity)), MIN_SPEED)
+        return GapMotion(deviation, tolerance, before.metres + after.metres)
 
     def _velocity(self, row: int) -> F64 | None:
-        """(3,) metres a second before a keyframe, in its camera; None for the first of a piece."""
+        """(3,) metres a second before a keyframe, in its camera frame; None for the first of a chain."""
         nodes = self._nodes
         if row == 0 or nodes.chain[row - 1] != nodes.chain[row] or nodes.stamp_ns[row] <= nodes.stamp_ns[row - 1]:
             return None
         step = se3.inverse(nodes.odom_T_cam[row]) @ nodes.odom_T_cam[row - 1]
         return -step[:3, 3] / (1e-9 * float(nodes.stamp_ns[row] - nodes.stamp_ns[row - 1]))
 
-    def way(self, a: int, b: int) -> Way | None:
-        """The way with the fewest metres, or None where tracking broke and no loop joins the pieces (Dijkstra)."""
+    def path(self, a: int, b: int) -> GraphPath | None:
+        """The shortest path (Dijkstra), None if neither odometry nor loops connect the keyframes."""
         nodes, loops = self._nodes, self._loops.ends
         rows = np.unique(np.append(loops.ravel(), (self._row(a), self._row(b))))
         linked = np.flatnonzero(nodes.chain[rows[:-1]] == nodes.chain[rows[1:]])
         ends = np.concatenate([np.stack([linked, linked + 1], 1), np.searchsorted(rows, loops)])
         metres = np.zeros(len(ends))
-        metres[: len(linked)] = nodes.walked[rows[linked + 1]] - nodes.walked[rows[linked]]
+        metres[: len(linked)] = nodes.distance[rows[linked + 1]] - nodes.distance[rows[linked]]
         best = _shortest_of_each_pair(ends, metres)
         start, goal = np.searchsorted(rows, (self._row(a), self._row(b))).tolist()
         path = _shortest_path(len(rows), ends[best], metres[best], start, goal)
@@ -192,11 +194,11 @@ class KeyframeGraph:
             p_T_q = self._loops.a_T_b[k - len(linked)] if odometry is None else odometry
             a_T_b = a_T_b @ (p_T_q if forward else se3.inverse(p_T_q))
             total += float(metres[k])
-        return Way(a_T_b, total)
+        return GraphPath(a_T_b, total)
 
 
 def _shortest_of_each_pair(ends: I64, metres: F64) -> I64:
-    """Rows of the edges (E, 2) that no other edge between the same nodes undercuts; the first of equals."""
+    """Rows of the edges (E, 2) that are the shortest between their nodes; the first of equals."""
     low, high = ends.min(1), ends.max(1)
     order = np.lexsort((np.arange(len(ends)), metres, high, low))
     new = np.ones(len(order), bool)
@@ -205,14 +207,14 @@ def _shortest_of_each_pair(ends: I64, metres: F64) -> I64:
 
 
 def _shortest_path(count: int, ends: I64, metres: F64, start: int, goal: int) -> list[tuple[int, bool]] | None:
-    """Edges from start to goal, each with whether it is walked from its first end to its second."""
+    """Edges from start to goal, each with whether it is traversed from its first end to its second."""
     if start == goal:
         return []
     graph = scipy.sparse.coo_array((metres + HOP_METRES, (ends[:, 0], ends[:, 1])), shape=(count, count)).tocsr()
     distance, before = dijkstra(graph, directed=False, indices=start, return_predecessors=True)
     if not np.isfinite(distance[goal]):
         return None
-    keys = ends.min(1) * count + ends.max(1)  # of no two edges the same
+    keys = ends.min(1) * count + ends.max(1)  # unique
     order = np.argsort(keys)
     path: list[tuple[int, bool]] = []
     while goal != start:

@@ -1,4 +1,4 @@
-"""Keyframes that the loop closer has seen, and which of them share points."""
+"""Keyframes of the loop closer and their covisibility."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from stereo_sfm.types import I32, I64, Keyframe
 
 
 class _Sightings(Columns):
-    """One row a point of a keyframe; those of a point are a linked list, as in the map."""
+    """One row for each point of each keyframe; those of a point are a linked list, as in the map."""
 
     kf: I32  # id
-    point: I32  # id that stands for the point, -1: removed
+    point: I32  # representative id of the point, -1: removed
     following: I32  # next older row of the same point, -1: last
 
     SPEC: ClassVar[Spec] = {"kf": (np.int32, (), -1), "point": (np.int32, (), -1), "following": (np.int32, (), -1)}
 
 
 class KeyframeStore:
-    """Keyframes by id. Two point ids that a loop found to be one physical point count as one from then on."""
+    """Keyframes by id. Point ids that a loop has associated count as one point."""
 
     def __init__(self) -> None:
         self._keyframes: dict[int, Keyframe] = {}
-        self._rows: dict[int, tuple[int, int]] = {}  # the first of its sightings, and how many
+        self._rows: dict[int, tuple[int, int]] = {}  # keyframe id -> its first sighting, number of them
         self._sightings = _Sightings()
         self._head: I32 = np.zeros(0, np.int32)  # by point id: newest row
         self._merged_into: I32 = np.zeros(0, np.int32)  # by point id: another id, -1: none
@@ -43,24 +43,24 @@ class KeyframeStore:
 
     @property
     def sightings(self) -> int:
-        """Rows in use, those of removed keyframes included that were not taken back yet."""
+        """Rows in use, including those of removed keyframes until the next compaction."""
         return len(self._sightings)
 
     def _points(self, point_ids: I64) -> I64:
-        """(N,) ids that stand for points."""
+        """(N,) representative ids of points."""
         self._reserve(int(point_ids.max(initial=-1)) + 1)
         points = point_ids.copy()
         map_kernels.follow(points, self._merged_into)
         return points
 
     def _reserve(self, size: int) -> None:
-        """Room for point ids below `size`."""
+        """Allocate point ids below `size`."""
         if size > len(self._head):
             more = np.full(max(size, 2 * len(self._head)) - len(self._head), -1, np.int32)
             self._head, self._merged_into = (np.concatenate([a, more]) for a in (self._head, self._merged_into))
 
     def add(self, keyframe: Keyframe) -> None:
-        """Remember a keyframe."""
+        """Add a keyframe."""
         self._keyframes[keyframe.kf_id] = keyframe
         self.ids.append(keyframe.kf_id)
         points = np.unique(self._points(keyframe.point_ids))
@@ -69,7 +69,7 @@ class KeyframeStore:
         map_kernels.link(rows.start, self._head, self._sightings.following, self._sightings.point)
 
     def remove(self, kf_id: int) -> None:
-        """Forget a keyframe."""
+        """Remove a keyframe."""
         self.ids.remove(kf_id)
         del self._keyframes[kf_id]
         first, count = self._rows.pop(kf_id)
@@ -79,10 +79,10 @@ class KeyframeStore:
             self._compact()
 
     def _compact(self) -> None:
-        """Take back the rows of what was removed."""
+        """Free the rows of removed keyframes."""
         table, firsts = self._sightings, np.array([first for first, _ in self._rows.values()], np.int64)
         kept = np.concatenate([np.arange(first, first + count) for first, count in self._rows.values()])
-        place = np.full(len(table) + 1, -1, np.int32)  # the last one stands for -1: none
+        place = np.full(len(table) + 1, -1, np.int32)  # the last entry is for -1: none
         place[kept] = np.arange(len(kept))
         self._head[:] = place[self._head]
         table.keep(kept)
@@ -94,14 +94,14 @@ class KeyframeStore:
         """(M, 2) point ids: the second is the same physical point as the first."""
         table = self._sightings
         for k in range(len(pairs)):
-            keep, drop = self._points(pairs[k]).tolist()
-            if keep == drop:
+            root, merged_root = self._points(pairs[k]).tolist()
+            if root == merged_root:
                 continue
-            both = np.empty(len(self.ids), np.int64)  # what one keyframe knew by both names counts once
-            count = map_kernels.seen_together(drop, keep, self._head, table.following, table.kf, both)
+            both = np.empty(len(self.ids), np.int64)  # a keyframe with both ids counts once
+            count = map_kernels.seen_together(merged_root, root, self._head, table.following, table.kf, both)
             map_kernels.unlink(both[:count], self._head, table.following, table.point)
-            map_kernels.hand_over(drop, keep, self._head, table.following, table.point)
-            self._head[drop], self._merged_into[drop] = -1, keep
+            map_kernels.hand_over(merged_root, root, self._head, table.following, table.point)
+            self._head[merged_root], self._merged_into[merged_root] = -1, root
 
     def _shared(self, point_ids: I64) -> tuple[I64, I64]:
         """(K,) ids of the keyframes that see some of these points, ascending, and (K,) how many."""

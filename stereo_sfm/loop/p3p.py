@@ -1,5 +1,5 @@
 """Three-point absolute pose and its RANSAC, compiled, for bearings of any camera (Persson & Nordberg, Lambda Twist,
-ECCV 2018; our own derivation of its steps)."""
+ECCV 2018; the steps are derived anew)."""
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportMissingTypeArgument=false
 

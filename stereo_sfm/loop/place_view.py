@@ -1,4 +1,4 @@
-"""What one keyframe shows to place recognition: the corners that it is known by, and its points."""
+"""A keyframe for place recognition: the corners of its image and its map points, with descriptors."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from stereo_sfm.types import F64, I64, U8, Bool, Keyframe
 
 @dataclass(frozen=True, eq=False)
 class PlaceView:
-    """N described pixels: corners tell whether a place is the same, points are what two sides of a loop share."""
+    """N pixels with descriptors: corners, by which a place is recognised, and points, which a loop associates."""
 
-    ids: I64  # (N,) point ids; corners that are no points have -1
+    ids: I64  # (N,) point ids; -1 for corners that are not map points
     uv_left: F64  # (N, 2) px
     uv_right: F64  # (N, 2) px, NaN where unseen
     points: F64  # (N, 3) metres in this camera, NaN where the depth is unknown

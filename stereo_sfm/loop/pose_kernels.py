@@ -15,14 +15,14 @@ from stereo_sfm.geometry.kernels import njit, project_one
 def add_normal_equations(
     t, camera_T_source, turn, forward, points, sigmas, uv, use, model, params, pixel_sigma, hessian, gradient, sums
 ):
-    """Adds what points seen in one image say about exp(xi) @ t to hessian (6, 6), gradient (6,) and sums.
+    """Adds the information of points seen in one image about exp(xi) @ t to hessian (6, 6), gradient (6,) and sums.
 
     Args:
         t: (4, 4) b_T_a. camera_T_source: (4, 4) from the points' frame into the camera.
         turn: (3, 3) derivative of the point in the camera by the point in b.
         forward: the points are in a, and t takes them to b; else they are in b.
         points, sigmas, uv, use: (N, 3), (N,) metres along the ray, (N, 2) px, (N,); NaN where unknown.
-        sums: (2,) squared normalised errors, and how many points.
+        sums: (2,) squared normalised errors, and the number of points.
     """
     s2 = pixel_sigma * pixel_sigma
     j = np.empty((2, 6))

@@ -1,4 +1,4 @@
-"""Where is a camera that saw nothing for a while? Its newest keyframes tell, by the descriptors of their corners."""
+"""Relocalization after a short loss of tracking in the newest keyframes, by the descriptors of their corners."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from stereo_sfm.loop.place_view import PlaceView, place_view_of
 from stereo_sfm.loop.verification import pair
 from stereo_sfm.types import F64, Keyframe
 
-REMEMBERED = 12  # newest keyframes
-ASKED = 2  # of them, those that should look most alike
-AROUND = 2  # keyframes whose points are added to those of the one that is asked
-WINDOWS = 0.05, 0.12, 0.3  # shares of the image's width
-PIXEL_SIGMA = 2.0  # px, of a corner found again from so far away
-LEAST, AGREEING = 12, 0.5  # corners that must agree, and as a share of those that were matched
-METRES_A_RADIAN = 2.0  # a view differs as much after so many metres as after a turn by one radian
+NEWEST_KEYFRAMES = 12  # searched
+CANDIDATES = 2  # of them that are matched: those whose views should be most similar
+NEIGHBOURS = 2  # keyframes whose points are added to a candidate's own
+WINDOWS = 0.05, 0.12, 0.3  # radius of the search, as shares of the image's width
+PIXEL_SIGMA = 2.0  # px, of a corner matched from a distant view
+MIN_INLIERS, MIN_INLIER_SHARE = 12, 0.5  # of the matched corners
+METRES_PER_RADIAN = 2.0  # a translation that changes the view as much as a rotation by one radian
 
 
 class RecentPlaces:
@@ -30,36 +30,37 @@ class RecentPlaces:
 
     def __init__(self, config: LoopConfig, rig: Rig) -> None:
         self._config, self._rig = config, rig
-        self._keyframes: deque[Keyframe] = deque(maxlen=REMEMBERED)
+        self._keyframes: deque[Keyframe] = deque(maxlen=NEWEST_KEYFRAMES)
 
     def add(self, keyframe: Keyframe) -> None:
-        """Remember the newest; another submap begins anew."""
+        """Add the newest keyframe; a new submap discards the earlier ones."""
         if self._keyframes and self._keyframes[-1].submap_id != keyframe.submap_id:
             self._keyframes.clear()
         self._keyframes.append(keyframe)
 
-    def find(self, seen: Keyframe, expected: F64) -> Iterator[F64]:
-        """Poses odom_T_cam (4, 4) from which the camera may see what it sees: most likely first, none of them certain.
+    def find(self, keyframe: Keyframe, expected: F64) -> Iterator[F64]:
+        """Hypotheses odom_T_cam (4, 4) of the camera's pose, most likely first, not verified.
 
         Args:
-            seen: what the camera sees; its pose is not used. expected: (4, 4) odom_T_cam. Corners are first looked for
-                near where they would be from there, then further and further away.
+            keyframe: what the camera sees; its pose is not used.
+            expected: (4, 4) odom_T_cam; corners are searched for around their projections from there, in growing
+                windows.
         """
-        view = place_view_of(seen, self._rig, self._config.disparity_sigma_px)
-        clouds = [(k, self._around(k)) for k in self._order(expected)[:ASKED]]
+        view = place_view_of(keyframe, self._rig, self._config.disparity_sigma_px)
+        clouds = [(k, self._around(k)) for k in self._order(expected)[:CANDIDATES]]
         for share in WINDOWS:
             for centre, cloud in clouds:
-                rng = np.random.default_rng([self._config.seed, seen.frame_id, centre.kf_id])
+                rng = np.random.default_rng([self._config.seed, keyframe.frame_id, centre.kf_id])
                 b_T_a = self._match(se3.inverse(expected) @ centre.odom_T_cam, view, cloud, share, rng)
                 if b_T_a is not None:
                     yield se3.orthonormalize(centre.odom_T_cam @ se3.inverse(b_T_a))
 
     def _around(self, centre: Keyframe) -> Cloud:
-        others = sorted(self._keyframes, key=lambda k: (abs(k.kf_id - centre.kf_id), k.kf_id))[1 : 1 + AROUND]
+        others = sorted(self._keyframes, key=lambda k: (abs(k.kf_id - centre.kf_id), k.kf_id))[1 : 1 + NEIGHBOURS]
         return gather(centre, others, self._rig, self._config.disparity_sigma_px)
 
     def _match(self, b_T_a: F64, view: PlaceView, cloud: Cloud, share: float, rng: np.random.Generator) -> F64 | None:
-        """A better b_T_a by corners within a share of the image's width of where they are expected."""
+        """b_T_a from corners within a share of the image's width of their projections; None if too few agree."""
         config, rig = self._config, self._rig
         window = share * rig.left.width
         rows_b, rows_a = match_guided(b_T_a, view, cloud, rig, config.max_distance_bits, window)
@@ -69,12 +70,12 @@ class RecentPlaces:
         if start is None:
             return None
         pose = refine_pose(start, matches, rig, PIXEL_SIGMA)
-        enough = pose.inlier.sum() >= max(LEAST, AGREEING * len(matches))
+        enough = pose.inlier.sum() >= max(MIN_INLIERS, MIN_INLIER_SHARE * len(matches))
         return pose.b_T_a if enough else None
 
     def _order(self, expected: F64) -> list[Keyframe]:
-        def differs(keyframe: Keyframe) -> tuple[float, int]:
+        def difference(keyframe: Keyframe) -> tuple[float, int]:
             metres, radians = se3.extent(se3.inverse(keyframe.odom_T_cam) @ expected)
-            return float(metres + METRES_A_RADIAN * radians), -keyframe.kf_id
+            return float(metres + METRES_PER_RADIAN * radians), -keyframe.kf_id
 
-        return sorted(self._keyframes, key=differs)
+        return sorted(self._keyframes, key=difference)

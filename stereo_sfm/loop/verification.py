@@ -1,7 +1,7 @@
-"""Geometric verification: does this camera really see the place of that keyframe, and from where?
+"""Geometric verification of a loop candidate, and the relative pose.
 
-Descriptors propose pairs; a pose from bearings and stereo points in both directions decides; the map around the
-candidate is then projected with that pose to find the pairs that the first matching missed.
+Descriptor matches give a pose from bearings and stereo points in both directions (RANSAC); the points around the
+candidate are then projected with that pose to find the matches that the first matching missed.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from stereo_sfm.loop.place_view import PlaceView
 from stereo_sfm.mapping.bundle import Bundle, BundleConfig, bundle_adjust
 from stereo_sfm.types import F64, I64, Keyframe
 
-GUIDED = (12.0, 4), (6.0, 10)  # rounds: radius of the search in px, most iterations
-FIRST_SHARE = 0.2  # of the matches that a place must have in the end, with the candidate alone
-RANSAC_SHARE = 0.4  # of the corners that must agree in the end, for the pose of three of them
+GUIDED = (12.0, 4), (6.0, 10)  # rounds of guided matching: radius of the search in px, maximum of iterations
+FIRST_SHARE = 0.2  # of the required matches that the candidate alone must have
+RANSAC_SHARE = 0.4  # of the required inliers that the pose from three points must already have
 GRID = (8, 6)  # columns, rows
 
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """The answer for one candidate."""
+    """The result for one candidate."""
 
-    reason: str  # "" when the place is confirmed
+    reason: str  # of the rejection, "" if the place is confirmed
     b_T_a: F64  # (4, 4) from the candidate's frame into the camera's
     information: F64  # (6, 6)
-    pairs: I64  # (M, 2) point ids: candidate's, camera's; corners that are no points are left out
-    inliers: int  # corners that agree
-    share: float  # of the camera's corners that these are
+    pairs: I64  # (M, 2) point ids: candidate's, camera's; corners that are not map points are left out
+    inliers: int  # corners that agree with the pose
+    share: float  # of the camera's corners that are inliers
 
 
 def rejection(reason: str, inliers: int = 0) -> Verdict:
-    """A verdict against."""
+    """The result for a rejected candidate."""
     return Verdict(reason, np.eye(4), np.zeros((6, 6)), np.zeros((0, 2), np.int64), inliers, 0.0)
 
 
@@ -55,10 +55,10 @@ def looks_alike(view: PlaceView, candidate: Keyframe, config: LoopConfig) -> boo
 def verify(
     view: PlaceView, cloud: Cloud, rig: Rig, config: LoopConfig, rng: np.random.Generator, move_points: bool = True
 ) -> Verdict:
-    """Match, place, match again along the projection, and judge. See the reasons below for what is asked for.
+    """Match, estimate the pose, match again by projection, and decide.
 
     Args:
-        move_points: finish with a bundle that moves the points too (those of stereo are noisy, those of a map less so).
+        move_points: finish with a bundle adjustment of the points too (stereo points are noisy, map points less so).
     """
     corners_b, corners_a = np.flatnonzero(view.corner), np.flatnonzero(cloud.corner)
     at_b, at_a, _ = binary.match_descriptors(
@@ -85,7 +85,7 @@ def verify(
 def verify_near(
     b_T_a: F64, view: PlaceView, cloud: Cloud, rig: Rig, config: LoopConfig, move_points: bool = False
 ) -> Verdict:
-    """The second half of `verify`: from a pose that is nearly right."""
+    """The second half of `verify`, starting from an approximate pose b_T_a (4, 4)."""
     pose: Pose | None = None
     rows_b = rows_a = np.zeros(0, np.int64)
     for radius, iterations in GUIDED:
@@ -111,10 +111,9 @@ def verify_near(
 def refine_with_points(
     b_T_a: F64, view: PlaceView, cloud: Cloud, rows_b: I64, rows_a: I64, rig: Rig, config: LoopConfig
 ) -> F64:
-    """b_T_a from a bundle over all views of the matched points, the candidate's side held fast.
+    """b_T_a from a bundle adjustment over all views of the matched points; the candidate's poses are fixed.
 
-    The retail paper finds the loop's pose this way (section IV-C3). Moving the points with it removes the bias that
-    noisy stereo depth has on a pose from fixed points.
+    As in the retail paper (section IV-C3). Adjusting the points removes the bias of a pose from noisy stereo points.
     """
     ids = np.unique(cloud.ids[rows_a])
     views = np.flatnonzero(np.isin(cloud.ids, ids))
@@ -135,7 +134,7 @@ def refine_with_points(
 
 
 def pair(view: PlaceView, cloud: Cloud, rows_b: I64, rows_a: I64) -> Matches:
-    """Rows of the camera's view and of the cloud, one beside the other."""
+    """Matches of rows of the camera's view and of the cloud."""
     left_a, right_a = cloud.seen_by_centre(rows_a)
     return Matches(
         cloud.points[rows_a],
@@ -150,13 +149,13 @@ def pair(view: PlaceView, cloud: Cloud, rows_b: I64, rows_a: I64) -> Matches:
 
 
 def occupied_cells(uv: F64, size: tuple[int, int]) -> int:
-    """How many cells of an 8 x 6 grid over the image hold a point."""
+    """Number of cells of an 8 x 6 grid over the image that contain a point."""
     column = np.clip((uv[:, 0] * GRID[0] / size[0]).astype(int), 0, GRID[0] - 1)
     row = np.clip((uv[:, 1] * GRID[1] / size[1]).astype(int), 0, GRID[1] - 1)
     return len(np.unique(row * GRID[0] + column))
 
 
 def within(error: F64, metres: float, degrees: float) -> bool:
-    """Whether a transform (4, 4) moves by at most so much."""
+    """Whether a transform (4, 4) is within limits of translation and rotation."""
     moved, turned = se3.extent(error)
     return bool(moved <= metres and np.rad2deg(turned) <= degrees)

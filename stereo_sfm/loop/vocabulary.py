@@ -54,7 +54,7 @@ class Vocabulary:
         return np.where(binary.present(descriptors), self.word[node], -1).astype(np.int32), distance
 
     def bag(self, descriptors: U8) -> Bag:
-        """Term frequency times inverse document frequency, scaled to sum one; empty when nothing is known."""
+        """Term frequency times inverse document frequency, scaled to sum one; empty without known words."""
         ids, _ = self.look_up(descriptors)
         words, counts = np.unique(ids[ids >= 0], return_counts=True)
         weights = counts * self.idf[words]
@@ -124,10 +124,10 @@ def grow(
 
     Args:
         descriptors: (N, 32) of a new environment, one view of each point is enough.
-        min_distance: bits from the nearest word above which a descriptor asks for a new word.
+        min_distance: bits from the nearest word above which a descriptor needs a new word.
 
     Returns:
-        The grown vocabulary (the same object when nothing was far). A new word gets its parent word's idf.
+        The grown vocabulary (the same object if no word was added). A new word gets its parent word's idf.
     """
     words = as_words(descriptors)
     node, distance = binary.descend(words, vocabulary.centroids, vocabulary.first_child, vocabulary.child_count)

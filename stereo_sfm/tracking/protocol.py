@@ -17,12 +17,12 @@ class AnyTracker(Protocol):
 
 
 class Places(Protocol):
-    """Finds a camera that lost its way in what it saw before."""
+    """Relocalization in recent keyframes after a loss of tracking."""
 
     def add(self, keyframe: Keyframe) -> None:
-        """Remember the newest keyframe."""
+        """Add the newest keyframe."""
         ...
 
-    def find(self, seen: Keyframe, expected: F64) -> Iterator[F64]:
-        """Poses odom_T_cam (4, 4) from which a camera expected at (4, 4) may see this; likely ones first."""
+    def find(self, keyframe: Keyframe, expected: F64) -> Iterator[F64]:
+        """Hypotheses odom_T_cam (4, 4) of the keyframe's pose near an `expected` one (4, 4), most likely first."""
         ...

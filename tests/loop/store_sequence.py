@@ -1,6 +1,5 @@
-"""Keyframes of a sequence around shelves with exact truth: descriptors that flip some bits from view to view, new point
-ids whenever a point comes back after it was out of sight, corners of which a half is found again, odometry that drifts,
-and aisles that may be copies."""
+"""Synthetic keyframes of a sequence around shelves with exact truth: descriptors with bit errors, new point ids for
+points that return into view, corners of which half is found again, drifting odometry, and aisles that may be copies."""
 
 from __future__ import annotations
 
@@ -20,7 +19,7 @@ CORNERS = 300  # of a keyframe
 
 @dataclass(frozen=True, eq=False)
 class StoreSequence:
-    """Truth beside what a tracker would send."""
+    """Keyframes as from a tracker, and their ground truth."""
 
     rig: Rig
     keyframes: list[Keyframe]
@@ -33,11 +32,11 @@ class StoreSequence:
 
 
 def shelf_points(aisles: int, alike: float, rng: np.random.Generator, per_aisle: int = 1200) -> tuple[F64, U8]:
-    """(P, 3) points on both sides of parallel aisles 3 m apart, and (P, 32) what each looks like.
+    """(P, 3) points on both sides of parallel aisles 3 m apart, and (P, 32) their descriptors.
 
-    `alike`: share of the points of the other aisles that are copies of those in the first; 0: all else is new too.
+    `alike`: share of the points of the other aisles that are copies of those in the first aisle.
     """
-    points, looks = [], []
+    points, descriptors = [], []
     for aisle in range(aisles):
         if aisle == 0 or not alike:
             local = np.stack(
@@ -48,18 +47,18 @@ def shelf_points(aisles: int, alike: float, rng: np.random.Generator, per_aisle:
                 ],
                 1,
             )
-            look = rng.integers(0, 256, (per_aisle, 32), dtype=np.uint8)
+            descriptor = rng.integers(0, 256, (per_aisle, 32), dtype=np.uint8)
         points.append(local + np.array([3.0 * aisle, 0, 0]))
-        looks.append(look.copy())
+        descriptors.append(descriptor.copy())
         if aisle and 0 < alike < 1:
             other = rng.random(per_aisle) >= alike
-            looks[-1][other] = rng.integers(0, 256, (int(other.sum()), 32), dtype=np.uint8)
-    return np.concatenate(points), np.concatenate(looks)
+            descriptors[-1][other] = rng.integers(0, 256, (int(other.sum()), 32), dtype=np.uint8)
+    return np.concatenate(points), np.concatenate(descriptors)
 
 
 def aisle_sequence(aisles: list[int], step: float = 0.3) -> F64:
-    """(K, 4, 4) world_T_cam along +z through one aisle after the other; between aisles the camera turns in place,
-    sequences over outside the shelves, and comes to the start of the next aisle."""
+    """(K, 4, 4) world_T_cam along +z through one aisle after the other; between aisles the camera turns in place and
+    moves outside the shelves to the start of the next aisle."""
     poses = []
     for previous, aisle in zip([None, *aisles], aisles, strict=False):
         if previous is not None:
@@ -97,7 +96,7 @@ def make_sequence(
     """Keyframes of a sequence through the aisles, in this order."""
     rng, corner_rng = np.random.default_rng(seed), np.random.default_rng([seed, 1])
     rig = fisheye_rig()
-    points, looks = shelf_points(max(aisles) + 1, alike, rng)
+    points, descriptors = shelf_points(max(aisles) + 1, alike, rng)
     strength = corner_rng.random(len(points))
     world_T_kf = aisle_sequence(aisles)
     odom = drift(world_T_kf, rng, 0.004, 0.0006)
@@ -111,15 +110,15 @@ def make_sequence(
         physical.update(zip(range(len(physical), len(physical) + len(new)), new, strict=True))
         tracks = kept | dict(zip(new, range(len(physical) - len(new), len(physical)), strict=True))
         ids = [tracks[p] for p in rows.tolist()]
-        seen = _seen(rig, pose, points[rows], looks[rows], rng, flip, noise_px)
+        seen = _seen(rig, pose, points[rows], descriptors[rows], rng, flip, noise_px)
         strongest = _strongest(rig, pose, points, strength, corner_rng)
-        corners = _seen(rig, pose, points[strongest], looks[strongest], corner_rng, flip, noise_px)
+        corners = _seen(rig, pose, points[strongest], descriptors[strongest], corner_rng, flip, noise_px)
         keyframes.append(_keyframe(k, odom[k], ids, seen, corners))
     return StoreSequence(rig, keyframes, world_T_kf, physical)
 
 
 def _visible(rig: Rig, pose: F64, points: F64, tracks: dict[int, int], rng: np.random.Generator, most: int) -> I64:
-    """Rows in sight: those that are tracked already, then others at random."""
+    """Visible rows: those already tracked, then others at random."""
     seen, _, right = see(rig, pose, points, max_depth=5.0)
     rows = np.flatnonzero(seen & np.isfinite(right[:, 0]))
     order = rng.random(len(rows)) - np.isin(rows, list(tracks))
@@ -127,23 +126,23 @@ def _visible(rig: Rig, pose: F64, points: F64, tracks: dict[int, int], rng: np.r
 
 
 def _strongest(rig: Rig, pose: F64, points: F64, strength: F64, rng: np.random.Generator) -> I64:
-    """Rows in sight that a detector prefers: much the same ones from view to view."""
+    """Visible rows that a detector prefers: mostly the same ones from view to view."""
     seen, _, right = see(rig, pose, points, max_depth=5.0)
     rows = np.flatnonzero(seen & np.isfinite(right[:, 0]))
     return rows[np.argsort(-strength[rows] - rng.normal(0, 0.3, len(rows)), kind="stable")][:CORNERS]
 
 
 def _seen(
-    rig: Rig, pose: F64, points: F64, looks: U8, rng: np.random.Generator, flip: float, noise_px: float
+    rig: Rig, pose: F64, points: F64, descriptors: U8, rng: np.random.Generator, flip: float, noise_px: float
 ) -> Corners:
-    """How points look from there."""
+    """Descriptors of points from one viewpoint."""
     _, left, right = see(rig, pose, points)
     left, right = left + rng.normal(0, noise_px, left.shape), right + rng.normal(0, noise_px, right.shape)
     cam = se3.transform(se3.inverse(pose), points)
     distance = np.linalg.norm(cam, axis=1, keepdims=True)
     cam *= 1 + rng.normal(0, noise_px, (len(cam), 1)) * distance / (rig.left.fx * rig.baseline)
-    flips = np.packbits(rng.random((len(looks), 256)) < flip, axis=1)
-    return Corners(_float32(left), _float32(right), _float32(cam), looks ^ flips)
+    flips = np.packbits(rng.random((len(descriptors), 256)) < flip, axis=1)
+    return Corners(_float32(left), _float32(right), _float32(cam), descriptors ^ flips)
 
 
 def _float32(values: F64) -> F32:

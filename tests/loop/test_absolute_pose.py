@@ -13,7 +13,7 @@ from stereo_sfm.types import F64
 from tests.synthetic import fisheye_rig, pinhole_rig, see
 
 
-def test_p3p_holds_the_true_pose_among_its_solutions() -> None:
+def test_p3p_contains_the_true_pose() -> None:
     rng = np.random.default_rng(0)
     for _ in range(500):
         b_T_a = se3.exp(rng.normal(size=6) * [1, 1, 1, 0.7, 0.7, 0.7])
@@ -30,7 +30,7 @@ def test_p3p_refuses_degenerate_points() -> None:
 
 
 def scene(rig: Rig, count: int, outliers: float, rng: np.random.Generator) -> tuple[F64, ap.Matches, np.ndarray]:
-    """Truth, matches, and which of them are wrong."""
+    """True pose, matches, and the mask of outliers."""
     b_T_a = se3.exp(np.array([0.3, 0.05, -0.4, 0.02, 0.25, 0.03]))
     points_a = rng.uniform([-2, -1, 2], [2, 1, 6], (count, 3))
     points_b = se3.transform(b_T_a, points_a)
@@ -76,7 +76,7 @@ def test_information_predicts_the_scatter() -> None:
     assert 3.0 < np.mean(normalised) < 24.0  # six degrees of freedom
 
 
-def test_nothing_to_place_from_three_matches() -> None:
+def test_no_pose_from_three_matches() -> None:
     rig = fisheye_rig()
     _, matches, _ = scene(rig, 3, 0.0, np.random.default_rng(0))
     assert ap.ransac_pose(matches, rig, np.random.default_rng(0), 1.0) is None

@@ -11,7 +11,7 @@ import pytest
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
-from stereo_sfm.loop.closer import FRESH, LoopCloser
+from stereo_sfm.loop.closer import KEPT_NEWEST, LoopCloser
 from stereo_sfm.loop.place_view import PlaceView
 from stereo_sfm.loop.verification import Verdict, rejection
 from stereo_sfm.types import F64, Keyframe, LoopResult
@@ -33,7 +33,7 @@ def error_of(sequence: StoreSequence, loop: LoopResult) -> float:
     return float(np.linalg.norm((se3.inverse(truth) @ loop.candidate_T_kf)[:3, 3]))
 
 
-def test_a_sequence_that_returns_is_closed_and_its_points_are_paired(vocabulary: voc.Vocabulary) -> None:
+def test_a_sequence_that_returns_has_a_loop_and_its_points_are_associated(vocabulary: voc.Vocabulary) -> None:
     sequence = make_sequence([0, 1, 0], seed=3)
     results = close(sequence, vocabulary)
     assert [r.kf_id for r in results] == [k.kf_id for k in sequence.keyframes]  # exactly one answer each
@@ -64,15 +64,15 @@ def test_identical_aisles_are_not_taken_for_each_other(vocabulary: voc.Vocabular
 
 
 def test_without_the_odometry_gate_identical_aisles_deceive(vocabulary: voc.Vocabulary) -> None:
-    """The gate is what saves the test above: appearance and geometry alone accept the twin aisle."""
+    """Without the gate of the test above, appearance and geometry accept the twin aisle."""
     sequence = make_sequence([0, 4], alike=1.0, seed=0)  # so far apart that neither is seen from the other
     blind = dataclasses.replace(LoopConfig(), gate_m=100.0, gate_deg=360.0)
     loops = [r for r in close(sequence, vocabulary, blind) if r.candidate_kf_id >= 0]
     assert any(error_of(sequence, loop) > 1.0 for loop in loops)
 
 
-def test_of_two_places_that_look_alike_the_one_that_shows_more_is_taken(vocabulary: voc.Vocabulary) -> None:
-    """Half of the products stand in both aisles, and odometry allows everything."""
+def test_of_two_similar_places_the_one_with_more_inliers_is_accepted(vocabulary: voc.Vocabulary) -> None:
+    """Half of the products are in both aisles, and odometry allows everything."""
     sequence = make_sequence([0, 4, 0], alike=0.5, seed=0)
     blind = dataclasses.replace(LoopConfig(), gate_m=100.0, gate_deg=360.0)
     again = next(i for i, p in enumerate(sequence.world_T_kf) if i > 90 and abs(p[0, 3]) < 0.1 and p[2, 2] > 0.9)
@@ -100,9 +100,9 @@ def answers_of(
     sequence: StoreSequence, vocabulary: voc.Vocabulary, monkeypatch: pytest.MonkeyPatch,
     script: dict[tuple[int, int], int], wrong: set[int], keyframes: list[Keyframe] | None = None,
 ) -> list[LoopResult]:  # fmt: skip
-    """Results where these candidates are verified with so many inliers, those in `wrong` five metres off."""
-    off = se3.exp(np.array([0, 0, 5.0, 0, 0, 0]))
-    answers = {key: (inliers, off if key[1] in wrong else np.eye(4)) for key, inliers in script.items()}
+    """Results if these candidates are verified with so many inliers; those in `wrong` are five metres off."""
+    deviation = se3.exp(np.array([0, 0, 5.0, 0, 0, 0]))
+    answers = {key: (inliers, deviation if key[1] in wrong else np.eye(4)) for key, inliers in script.items()}
     monkeypatch.setattr(LoopCloser, "_verify", scripted(sequence, answers))
     monkeypatch.setattr(
         LoopCloser,
@@ -112,7 +112,7 @@ def answers_of(
     return close(sequence if keyframes is None else dataclasses.replace(sequence, keyframes=keyframes), vocabulary)
 
 
-def test_a_twin_that_odometry_refutes_does_not_stand_against_the_true_place(
+def test_a_twin_contradicted_by_odometry_does_not_make_the_true_place_ambiguous(
     vocabulary: voc.Vocabulary, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sequence = make_sequence([0], seed=3)
@@ -122,7 +122,7 @@ def test_a_twin_that_odometry_refutes_does_not_stand_against_the_true_place(
     assert results[29].candidate_kf_id == 4 and results[29].rejected == ((10, 0.5, "against_odometry"),)
 
 
-def test_two_places_in_one_image_are_ambiguous_where_no_way_decides(
+def test_two_places_without_a_path_between_them_are_ambiguous(
     vocabulary: voc.Vocabulary, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sequence = make_sequence([0], seed=3)
@@ -142,7 +142,7 @@ def test_pause_after_a_loop(vocabulary: voc.Vocabulary) -> None:
     assert all(results[accepted[0] + i].reason == "paused" for i in range(1, 8))
 
 
-def test_disabled_answers_every_keyframe_with_nothing(vocabulary: voc.Vocabulary) -> None:
+def test_disabled_gives_no_loop_for_every_keyframe(vocabulary: voc.Vocabulary) -> None:
     results = close(make_sequence([0], seed=5), vocabulary, dataclasses.replace(LoopConfig(), enabled=False))
     assert {r.reason for r in results} == {"disabled"}
 
@@ -165,23 +165,23 @@ def test_vocabulary_grows_online(vocabulary: voc.Vocabulary) -> None:
     assert any(r.candidate_kf_id >= 0 and error_of(sequence, r) < 0.05 for r in results)
 
 
-def test_a_view_seen_every_lap_is_remembered_a_few_times_and_still_closes(vocabulary: voc.Vocabulary) -> None:
+def test_of_a_view_seen_every_lap_a_few_keyframes_are_kept_and_loops_still_found(vocabulary: voc.Vocabulary) -> None:
     sequence = make_sequence([0, 1] * 7, seed=3)
     closer = LoopCloser(LoopConfig(), sequence.rig, vocabulary)
-    results, remembered = list[LoopResult](), list[int]()
+    results, keyframe_count = list[LoopResult](), list[int]()
     for keyframe in sequence.keyframes:
         results.append(closer.step(keyframe))
-        remembered.append(closer.remembered)
+        keyframe_count.append(closer.keyframe_count)
     lap = len(sequence.keyframes) // 7
-    assert remembered[lap] == lap + 1  # nothing is forgotten on the first lap
-    assert remembered[-1] - remembered[-1 - lap] < 0.3 * lap  # hardly anything is added on the last
-    assert len(closer._database) <= 2 * closer.remembered + FRESH + 1  # what is forgotten takes no room
+    assert keyframe_count[lap] == lap + 1  # nothing is forgotten on the first lap
+    assert keyframe_count[-1] - keyframe_count[-1 - lap] < 0.3 * lap  # hardly anything is added on the last
+    assert len(closer._database) <= 2 * closer.keyframe_count + KEPT_NEWEST + 1  # what is forgotten takes no room
     assert any(r.candidate_kf_id >= 0 for r in results[-lap:])
     assert all(error_of(sequence, r) < 0.1 for r in results if r.candidate_kf_id >= 0)
 
 
-def test_tracking_that_began_anew_finds_the_place_it_just_left(vocabulary: voc.Vocabulary) -> None:
-    """Dark for a moment: the new submap joins the old one at once, not when the robot comes round again."""
+def test_a_new_submap_is_connected_at_once_with_the_place_just_left(vocabulary: voc.Vocabulary) -> None:
+    """After a moment of darkness the new submap is connected at once, not only after another lap."""
     sequence = make_sequence([0], seed=3)
     break_at = 20
     astray = se3.exp(np.array([5.0, 1, -8, 0.2, 1.0, 0]))
@@ -196,8 +196,8 @@ def test_tracking_that_began_anew_finds_the_place_it_just_left(vocabulary: voc.V
     assert all(error_of(sequence, loop) < 0.05 for loop in loops)
 
 
-def test_tracking_that_began_anew_in_a_twin_aisle_does_not_join_the_first(vocabulary: voc.Vocabulary) -> None:
-    """Dark between two identical aisles: the robot cannot have driven back so fast as the images say."""
+def test_a_new_submap_in_a_twin_aisle_is_not_connected_with_the_first_aisle(vocabulary: voc.Vocabulary) -> None:
+    """Dark between two identical aisles: the robot cannot have returned as fast as the images suggest."""
     sequence = make_sequence([0, 1], alike=1.0, seed=0)
     turned = next(i for i, pose in enumerate(sequence.world_T_kf) if pose[0, 3] > 1.0)
     rest = sequence.keyframes[turned + 2 :]

@@ -1,4 +1,4 @@
-"""What is matched to what: corners and points of keyframes, and which rows are one physical thing."""
+"""Clouds of keyframes: corners and points, and which rows show one physical point."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def sequence() -> StoreSequence:
     return make_sequence([0], seed=4)
 
 
-def test_corners_come_first_and_are_no_points(sequence: StoreSequence) -> None:
+def test_corners_come_first_and_are_not_map_points(sequence: StoreSequence) -> None:
     keyframe = sequence.keyframes[5]
     view, n = place_view_of(keyframe, sequence.rig, SIGMA), len(keyframe.corners)
     assert view.corner.sum() == n == 300
@@ -48,7 +48,7 @@ def test_points_without_a_descriptor_are_left_out(sequence: StoreSequence) -> No
     assert np.array_equal(view.ids[300:], keyframe.point_ids[1::2])
 
 
-def test_corners_of_neighbours_at_one_place_share_an_id(sequence: StoreSequence) -> None:
+def test_the_same_corner_in_two_keyframes_has_one_id(sequence: StoreSequence) -> None:
     cloud = gather(sequence.keyframes[5], [sequence.keyframes[k] for k in (6, 4, 7)], sequence.rig, SIGMA)
     views = [cloud.ids[cloud.corner & (cloud.view == k)] for k in range(4)]
     assert all(len(np.unique(ids)) == len(ids) == 300 for ids in views)
@@ -62,7 +62,7 @@ def test_corners_of_neighbours_at_one_place_share_an_id(sequence: StoreSequence)
 
 
 def test_two_corners_of_one_keyframe_never_share_an_id(sequence: StoreSequence) -> None:
-    """Each keyframe shows the same corner twice, as detectors of several scales do."""
+    """Each keyframe has the same corner twice, as detectors of several scales give it."""
 
     def doubled(k: int) -> Keyframe:
         c = sequence.keyframes[k].corners
@@ -75,7 +75,7 @@ def test_two_corners_of_one_keyframe_never_share_an_id(sequence: StoreSequence) 
         assert len(np.unique(ids)) == len(ids) == 600
 
 
-def test_only_like_is_paired_with_like(sequence: StoreSequence) -> None:
+def test_corners_match_corners_and_points_match_points(sequence: StoreSequence) -> None:
     a, b = sequence.keyframes[5], sequence.keyframes[6]
     cloud, view = gather(a, [], sequence.rig, SIGMA), place_view_of(b, sequence.rig, SIGMA)
     b_T_a = se3.inverse(sequence.world_T_kf[6]) @ sequence.world_T_kf[5]

@@ -1,4 +1,4 @@
-"""What is forgotten takes no room, and no score changes by it."""
+"""Removing keyframes frees memory and changes no score."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def bags(count: int) -> list[Bag]:
     return out
 
 
-def test_keyframes_that_stay_score_the_same_bits() -> None:
+def test_scores_of_remaining_keyframes_keep_their_bits() -> None:
     made = bags(60)
     database, small = PlaceDatabase(WORDS), PlaceDatabase(WORDS)
     kept = np.array([0, 3, 4, 17, 18, 40])
@@ -38,7 +38,7 @@ def test_keyframes_that_stay_score_the_same_bits() -> None:
     assert (database.scores(made[55]) == small.scores(made[55])).all()
 
 
-def test_a_robot_in_a_known_place_needs_no_more_room() -> None:
+def test_memory_does_not_grow_in_a_known_place() -> None:
     database, sizes = PlaceDatabase(WORDS), list[int]()
     for k, bag in enumerate(bags(1500)):
         database.add(k, bag)

@@ -1,4 +1,4 @@
-"""What the loop closer knows of the way between keyframes."""
+"""Shortest paths between keyframes over odometry and loops, and motion over gaps in tracking."""
 
 from __future__ import annotations
 
@@ -15,35 +15,35 @@ def at(x: float, turn: float = 0.0) -> F64:
     return se3.exp(np.array([x, 0, 0, 0, 0, 0])) @ se3.exp(np.array([0, 0, 0, 0, turn, 0]))
 
 
-def test_a_way_without_loops_is_the_odometry_and_its_length() -> None:
+def test_a_path_without_loops_is_the_odometry_and_its_length() -> None:
     graph = KeyframeGraph()
     for k, x in enumerate((0.0, 1.0, 2.5)):
         graph.add(k, at(x), 0)
-    way = graph.way(0, 2)
-    assert way is not None and way.metres == pytest.approx(2.5)
-    np.testing.assert_allclose(way.a_T_b, at(2.5), atol=1e-12)
+    path = graph.path(0, 2)
+    assert path is not None and path.metres == pytest.approx(2.5)
+    np.testing.assert_allclose(path.a_T_b, at(2.5), atol=1e-12)
 
 
-def test_a_loop_is_a_short_cut() -> None:
+def test_a_loop_shortens_the_path() -> None:
     graph = KeyframeGraph()
     for k in range(20):
         graph.add(k, at(float(k)), 0)
     graph.add_loop(0, 19, at(0.1))
-    way = graph.way(1, 19)
-    assert way is not None and way.metres == pytest.approx(1.0)
-    np.testing.assert_allclose(way.a_T_b, at(-0.9), atol=1e-12)
+    path = graph.path(1, 19)
+    assert path is not None and path.metres == pytest.approx(1.0)
+    np.testing.assert_allclose(path.a_T_b, at(-0.9), atol=1e-12)
 
 
-def test_where_tracking_broke_no_way_is_known_until_a_loop_joins_the_pieces() -> None:
+def test_no_path_over_a_loss_of_tracking_until_a_loop_connects_the_submaps() -> None:
     graph = KeyframeGraph()
     graph.add(0, at(0.0), 0)
     graph.add(1, at(5.0), 1)
-    assert graph.way(0, 1) is None
+    assert graph.path(0, 1) is None
     graph.add_loop(0, 1, at(0.2))
-    assert graph.way(0, 1) is not None
+    assert graph.path(0, 1) is not None
 
 
-def test_the_nearest_keyframe_that_looks_the_same_way_is_found() -> None:
+def test_the_nearest_keyframe_with_the_same_direction_is_found() -> None:
     graph = KeyframeGraph()
     for k, pose in enumerate((at(0.0), at(1.0), at(1.2, 2.0), at(9.0), at(1.1))):
         graph.add(k, pose, 0)
@@ -69,7 +69,7 @@ def test_the_same_view_is_found_in_spite_of_drift_once_a_loop_is_known() -> None
     assert graph.same_view(0) == [0, 2, 3]
 
 
-def test_poses_of_unrelated_pieces_of_odometry_are_not_compared() -> None:
+def test_poses_of_unconnected_submaps_are_not_compared() -> None:
     graph = KeyframeGraph()
     graph.add(0, at(0.0), 0)
     graph.add(1, at(0.0), 1)  # tracking broke: the numbers are the same, the place is not known
@@ -80,7 +80,7 @@ def test_poses_of_unrelated_pieces_of_odometry_are_not_compared() -> None:
     assert graph.same_view(0) == [0, 1, 2]
 
 
-def test_it_grows_beyond_its_first_size() -> None:
+def test_the_graph_grows_beyond_its_first_allocation() -> None:
     graph = KeyframeGraph()
     for k in range(200):
         graph.add(k, at(k % 10 * 1.0), 0)
@@ -88,7 +88,7 @@ def test_it_grows_beyond_its_first_size() -> None:
 
 
 def broken(seconds: float) -> KeyframeGraph:
-    """A metre a second along x for five seconds, then so many seconds without tracking; keyframe 6 begins anew."""
+    """A metre a second along x for 5 s, then `seconds` without tracking; keyframe 6 starts a new submap."""
     graph = KeyframeGraph()
     for k in range(6):
         graph.add(k, at(float(k)), 0, k * 10**9)
@@ -97,31 +97,33 @@ def broken(seconds: float) -> KeyframeGraph:
 
 
 @pytest.mark.parametrize(("moved", "possible"), [(0.0, True), (1.0, True), (1.5, True), (-1.4, False), (3.4, False)])
-def test_how_far_a_robot_gets_without_tracking(moved: float, possible: bool) -> None:
-    jump = broken(1.0).jump(3, 6, at(2.0 + moved))
-    assert jump is not None
-    assert jump.off == pytest.approx(abs(moved - 0.5)) and jump.walked == pytest.approx(2.0)
-    assert (jump.off < jump.radius) == possible
+def test_tolerance_of_the_motion_over_a_gap(moved: float, possible: bool) -> None:
+    gap_motion = broken(1.0).gap_motion(3, 6, at(2.0 + moved))
+    assert gap_motion is not None
+    assert gap_motion.deviation == pytest.approx(abs(moved - 0.5)) and gap_motion.distance == pytest.approx(2.0)
+    assert (gap_motion.deviation < gap_motion.tolerance) == possible
 
 
-def test_the_gap_is_the_same_from_its_other_side() -> None:
+def test_the_gap_is_symmetric() -> None:
     graph = broken(1.0)
-    there, back = graph.jump(3, 6, at(2.7)), graph.jump(6, 3, at(-2.7))
+    there, back = graph.gap_motion(3, 6, at(2.7)), graph.gap_motion(6, 3, at(-2.7))
     assert there is not None and back is not None
-    assert (there.off, there.radius, there.walked) == pytest.approx((back.off, back.radius, back.walked))
+    assert (there.deviation, there.tolerance, there.distance) == pytest.approx(
+        (back.deviation, back.tolerance, back.distance)
+    )
 
 
-def test_nothing_is_known_of_a_gap_without_time_or_speed() -> None:
-    assert broken(-3.0).jump(3, 6, at(2.0)) is None  # another clock
+def test_no_prediction_over_a_gap_without_time_or_speed() -> None:
+    assert broken(-3.0).gap_motion(3, 6, at(2.0)) is None  # another clock
     graph = KeyframeGraph()
     graph.add(0, at(0.0), 0, 0)
     graph.add(1, at(0.0), 1, 10**9)
-    assert graph.jump(0, 1, at(0.5)) is None
+    assert graph.gap_motion(0, 1, at(0.5)) is None
 
 
-def test_pieces_joined_through_a_third_share_its_gaps() -> None:
+def test_submaps_connected_through_a_third_share_its_gaps() -> None:
     graph = broken(1.0)
     graph.add(7, at(0.0), 2, 9 * 10**9)
     graph.add_loop(6, 7, at(0.5))
-    jump = graph.jump(5, 7, at(1.5))
-    assert jump is not None and jump.off == pytest.approx(0.5)
+    gap_motion = graph.gap_motion(5, 7, at(1.5))
+    assert gap_motion is not None and gap_motion.deviation == pytest.approx(0.5)

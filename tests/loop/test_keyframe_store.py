@@ -1,4 +1,4 @@
-"""Which keyframes share points, against plain sets."""
+"""Covisibility of keyframes against plain sets."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def keyframe(kf_id: int, point_ids: I64) -> Keyframe:
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 10**6))
-def test_keyframes_share_what_their_points_say(seed: int) -> None:
+def test_shared_points_agree_with_plain_sets(seed: int) -> None:
     rng = np.random.default_rng(seed)
     store, name, seen = KeyframeStore(), {}, {}
     for kf_id in range(60):
@@ -51,7 +51,7 @@ def test_keyframes_share_what_their_points_say(seed: int) -> None:
         assert store.best_connected(kf_id, 4) == best[:4]
 
 
-def test_what_was_removed_takes_no_room() -> None:
+def test_removed_keyframes_take_no_memory() -> None:
     store = KeyframeStore()
     for kf_id in range(400):
         store.add(keyframe(kf_id, np.arange(50 * kf_id, 50 * kf_id + 100)))

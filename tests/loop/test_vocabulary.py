@@ -18,7 +18,7 @@ LOOKS = np.random.default_rng(0).integers(0, 256, (2000, 32), dtype=np.uint8)
 
 
 def picture(rng: np.random.Generator, which: np.ndarray, flip: float = 0.05) -> U8:
-    """Noisy views of the looks `which`."""
+    """Noisy descriptors of the places `which`."""
     return LOOKS[which] ^ np.packbits(rng.random((len(which), 256)) < flip, axis=1)
 
 
@@ -34,9 +34,7 @@ def vocabulary(places: list[np.ndarray]) -> voc.Vocabulary:
     return voc.train([picture(rng, p) for p in places], branching=8, depth=4)
 
 
-def test_another_view_of_a_place_scores_above_all_other_places(
-    vocabulary: voc.Vocabulary, places: list[np.ndarray]
-) -> None:
+def test_another_view_of_a_place_has_the_highest_score(vocabulary: voc.Vocabulary, places: list[np.ndarray]) -> None:
     rng = np.random.default_rng(3)
     database = PlaceDatabase(len(vocabulary))
     for k, place in enumerate(places):
@@ -71,24 +69,24 @@ def test_training_twice_gives_the_same_bits(places: list[np.ndarray], vocabulary
     assert other.id != vocabulary.id
 
 
-def test_zero_rows_are_no_words(vocabulary: voc.Vocabulary) -> None:
+def test_zero_rows_have_no_word(vocabulary: voc.Vocabulary) -> None:
     ids, _ = vocabulary.look_up(np.zeros((3, 32), np.uint8))
     assert (ids == -1).all()
     bag = vocabulary.bag(np.zeros((3, 32), np.uint8))
     assert len(bag.words) == 0 and len(bag.weights) == 0
 
 
-def test_growth_tells_apart_what_the_old_words_took_for_one(vocabulary: voc.Vocabulary) -> None:
-    """In a new environment many different things fall into one word; afterwards other places score less."""
+def test_growth_separates_places_that_shared_old_words(vocabulary: voc.Vocabulary) -> None:
+    """In a new environment many different descriptors share one word; after growth other places score less."""
     rng = np.random.default_rng(5)
-    looks = rng.integers(0, 256, (3000, 32), dtype=np.uint8)
-    grown = voc.grow(vocabulary, looks)
+    descriptors = rng.integers(0, 256, (3000, 32), dtype=np.uint8)
+    grown = voc.grow(vocabulary, descriptors)
     assert len(grown) > len(vocabulary)
-    assert voc.grow(grown, looks[:0]) is grown
+    assert voc.grow(grown, descriptors[:0]) is grown
 
     def contrast(v: voc.Vocabulary) -> float:
-        noisy = looks ^ np.packbits(rng.random((3000, 256)) < 0.02, axis=1)
-        bags = [v.bag(looks[k : k + 300]) for k in range(0, 3000, 300)]
+        noisy = descriptors ^ np.packbits(rng.random((3000, 256)) < 0.02, axis=1)
+        bags = [v.bag(descriptors[k : k + 300]) for k in range(0, 3000, 300)]
         again = [v.bag(noisy[k : k + 300]) for k in range(0, 3000, 300)]
         table = np.array([[voc.score(a, b) for b in again] for a in bags])
         return float(np.diag(table).mean() / table[~np.eye(10, dtype=bool)].mean())
@@ -128,7 +126,7 @@ def test_bad_files_get_one_line(tmp_path: Path, vocabulary: voc.Vocabulary) -> N
         load_vocabulary(path)
 
 
-def test_matching_finds_the_right_partners_and_ratio_spares_views_of_one_point() -> None:
+def test_matching_finds_the_true_pairs_and_the_ratio_test_ignores_views_of_one_point() -> None:
     rng = np.random.default_rng(7)
     which = np.arange(100)
     query, train = picture(rng, which), picture(rng, np.repeat(which, 2))

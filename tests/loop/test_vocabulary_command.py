@@ -1,4 +1,4 @@
-"""`stereo-sfm vocabulary` on real images: anybody can train one again and gets the same bytes."""
+"""`stereo-sfm vocabulary` on real images: training is reproducible byte for byte."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_numbers_out_of_range_are_refused(
 
 
 @pytest.mark.parametrize(("count", "wanted"), [(99, 50), (7, 3), (3, 7), (5, 5), (0, 4), (10, 1)])
-def test_as_many_images_as_asked_for(count: int, wanted: int) -> None:
+def test_the_requested_number_of_images(count: int, wanted: int) -> None:
     chosen = spread(count, wanted)
     assert len(set(chosen)) == min(wanted, count)
     assert set(chosen) <= set(range(count))
