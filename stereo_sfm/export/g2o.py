@@ -8,7 +8,7 @@ import numpy as np
 import scipy.sparse
 
 from stereo_sfm.geometry import se3
-from stereo_sfm.mapping.correction import ODOMETRY, STRONG
+from stereo_sfm.mapping.correction import COVISIBLE_POINTS, ODOMETRY
 from stereo_sfm.mapping.map import MapSnapshot
 from stereo_sfm.mapping.pose_graph import Edges, edges_of_poses
 from stereo_sfm.maps.saved_map import SavedMap
@@ -19,7 +19,7 @@ def graph_edges(s: MapSnapshot) -> Edges:
     shape = (len(s.kf_ids), len(s.pt_ids))
     sees = scipy.sparse.csr_array((np.ones(len(s.obs_kf), np.int32), (s.obs_kf, s.obs_pt)), shape=shape)
     shared = scipy.sparse.triu(sees @ sees.T, 1).tocoo()
-    strong = shared.data >= STRONG
+    strong = shared.data >= COVISIBLE_POINTS
     follow = np.flatnonzero(s.submap_ids[1:] == s.submap_ids[:-1])
     i = np.concatenate([follow, shared.row[strong]])
     j = np.concatenate([follow + 1, shared.col[strong]])

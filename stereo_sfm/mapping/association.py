@@ -1,7 +1,7 @@
-"""Projection-guided matching: which points of the map a keyframe sees again although no track connects them.
+"""Matching by projection: association of a keyframe's tracks with points of the map that no track connects.
 
-Candidates are points of keyframes that share points with this one, of their neighbours, and of keyframes that stood
-close by. A match must lie near its prediction in both eyes, look alike, and be each other's best; together the matches
+Candidates are points of keyframes that share points with this one, of their neighbours, and of nearby keyframes. A
+match must be near its projection in both images, have similar descriptors, and be mutually best; all matches together
 must agree with one pose.
 """
 
@@ -20,12 +20,12 @@ from stereo_sfm.mapping.map import Map
 from stereo_sfm.mapping.pose_only import adjust_pose
 from stereo_sfm.types import F64, I64, U8, Bool
 
-MATCH_HUBER = 1.5  # sigmas where the loss of a match turns linear
+MATCH_HUBER = 1.5  # sigmas where the loss of a match becomes linear
 
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """What a keyframe sees, one row each."""
+    """Observations of a keyframe, one row each."""
 
     uv_left: F64  # (N, 2) px
     uv_right: F64  # (N, 2) px, NaN where unseen
@@ -36,8 +36,8 @@ def local_keyframes(map_: Map, seen_points: I64, map_T_kf: F64, reach: float, co
     """Rows of keyframes whose points may be in view.
 
     Args:
-        seen_points: rows of points that the new keyframe is known to see.
-        reach: metres; keyframes that stood closer and looked less than 60 degrees elsewhere count as neighbours.
+        seen_points: rows of points that the new keyframe observes.
+        reach: metres; keyframes closer than that whose optical axes differ by less than 60 degrees are neighbours.
     """
     counts = map_.count_by_keyframe(seen_points)
     rows = np.flatnonzero(counts)
@@ -45,14 +45,14 @@ def local_keyframes(map_: Map, seen_points: I64, map_T_kf: F64, reach: float, co
     second = [map_.neighbours(int(k), config.connected_points)[0][:5] for k in first]
     alive = map_.living_keyframes()
     pose = map_.keyframes.map_T_kf[alive]
-    apart = np.linalg.norm(pose[:, :3, 3] - map_T_kf[:3, 3], axis=1)
-    near = np.flatnonzero((apart < reach) & (pose[:, :3, 2] @ map_T_kf[:3, 2] > 0.5))
-    near = alive[near[np.argsort(apart[near], kind="stable")]][: config.near_keyframes]
+    metres = np.linalg.norm(pose[:, :3, 3] - map_T_kf[:3, 3], axis=1)
+    near = np.flatnonzero((metres < reach) & (pose[:, :3, 2] @ map_T_kf[:3, 2] > 0.5))
+    near = alive[near[np.argsort(metres[near], kind="stable")]][: config.near_keyframes]
     return np.unique(np.concatenate([first, *second, near]).astype(np.int64))
 
 
 def points_in_view(map_: Map, rig: Rig, keyframes: I64, map_T_kf: F64) -> tuple[I64, F64, F64]:
-    """Points of some keyframes that this pose should see from a like angle: rows, left and right pixels or NaN."""
+    """Points of keyframes visible from this pose at a similar angle and distance: rows, left and right px or NaN."""
     points = map_.points
     rows = map_.points_of_keyframes(keyframes)
     rows = rows[points.alive[rows] & np.isfinite(points.xyz[rows, 0])]
@@ -83,14 +83,14 @@ def match(
 
 
 def agreeing(rig: Rig, map_T_kf: F64, xyz: F64, uv_left: F64, uv_right: F64, config: MapperConfig) -> Bool:
-    """Which matches (N,) agree with one pose near the given one; none where too few do."""
+    """Which matches (N,) agree with one pose near the given one; none if too few do."""
     count = len(xyz)
-    nothing = np.zeros(count, bool)
+    none = np.zeros(count, bool)
     if count < config.match_min:
-        return nothing
+        return none
     sigma = np.full(count, config.match_sigma_px)
     _, inlier = adjust_pose(rig, map_T_kf, xyz, uv_left, uv_right, sigma, MATCH_HUBER)
     good = inlier[:, 0] & (inlier[:, 1] | ~np.isfinite(uv_right[:, 0]))
     if good.sum() < max(config.match_min, 0.5 * count):
-        return nothing
+        return none
     return good

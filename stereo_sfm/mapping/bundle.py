@@ -1,8 +1,8 @@
 """Bundle adjustment: arrays in, arrays out. Levenberg-Marquardt with the Schur complement over the points.
 
-Any camera model of geometry.kernels, one or two eyes, Huber's loss, fixed keyframes, removal of outliers between
-rounds. What a fixed keyframe sees depends on the points alone: it enters as a
-quadratic prior of each point, which may be kept for a whole round, so that a window may hang on many fixed keyframes.
+Any camera model of geometry.kernels, one or two cameras, Huber's loss, fixed keyframes, removal of outliers between
+rounds. Observations of fixed keyframes depend on the points alone: they enter as a quadratic prior of each point, which
+may be kept for a round, so that many fixed keyframes cost little.
 The retail paper's equations 19-21 (local and full optimisation).
 """
 
@@ -24,17 +24,17 @@ Linear = tuple[F64, F64, F64, F64]  # A (M, 6), g (M, 3), p (M, 3), chi2 (M, 2)
 
 @dataclass(frozen=True)
 class BundleConfig:
-    """How a bundle is adjusted."""
+    """Settings of `bundle_adjust`."""
 
-    rounds: int = 2  # after each round but the last, observations are judged anew
-    iterations: int = 10  # most accepted steps of a round
-    huber: float = 2.0  # sigmas where the loss turns linear; 0 means least squares
+    rounds: int = 2  # after each round but the last, outliers are determined anew
+    iterations: int = 10  # maximum of accepted steps of a round
+    huber: float = 2.0  # sigmas where the loss becomes linear; 0 means least squares
     cauchy: float = 0.0  # sigmas, the scale of a redescending loss in all rounds but the first; 0: Huber's throughout
-    joint_loss: bool = False  # one loss over both eyes of an observation instead of one each
-    outlier_chi2: float = 9.21  # squared normalised residual of an eye above which it is an outlier (99 % of 2 dof)
+    joint_loss: bool = False  # one loss over both images of an observation instead of one each
+    outlier_chi2: float = 9.21  # squared normalised residual in one image that makes an outlier (99 % of 2 dof)
     tolerance: float = 1e-5  # relative decrease of the cost that ends a round
     damping: float = 1e-4  # first damping, relative to the diagonal
-    fixed_once: bool = False  # what fixed keyframes see is linearised once a round, not after every step
+    fixed_once: bool = False  # observations of fixed keyframes are linearised once a round, not after every step
     dense: bool | None = None  # the solver of the reduced system; None: by size
 
 
@@ -47,8 +47,8 @@ class Bundle:
     points: F64  # (P, 3) world
     obs_kf: I64  # (M,) row of world_T_kf
     obs_pt: I64  # (M,) row of points
-    uv_left: F64  # (M, 2) px, NaN where the left eye does not see it
-    uv_right: F64  # (M, 2) px, NaN where the right eye does not; only the row NaN: u alone counts (rectified, depth)
+    uv_left: F64  # (M, 2) px, NaN where not observed
+    uv_right: F64  # (M, 2) px, NaN where not observed; only the row NaN: u alone counts (rectified, depth)
     sigma: F64 | None = None  # (M, 2) px of (left, right); None: 1
 
 
@@ -58,8 +58,8 @@ class BundleResult:
 
     world_T_kf: F64  # (K, 4, 4)
     points: F64  # (P, 3)
-    inlier: Bool  # (M, 2) per eye; False also where the eye does not see
-    chi2: F64  # (M, 2) squared normalised residuals at the end, of outliers too; 0 where the eye does not see
+    inlier: Bool  # (M, 2) per image; False also where not observed
+    chi2: F64  # (M, 2) squared normalised residuals at the end, of outliers too; 0 where not observed
     cost: float  # robust cost over the inliers at the end
     initial_cost: float  # the same function at the start of the last round
     iterations: int  # accepted steps
@@ -68,7 +68,7 @@ class BundleResult:
 
 @dataclass(frozen=True, eq=False)
 class _Prior:
-    """What the observations of fixed keyframes say about the points: quadratic models about x0, and what they cost."""
+    """The observations of fixed keyframes as quadratic models of the points about x0, and their cost."""
 
     x0: F64  # (P, 3)
     h: F64  # (P, 6)
@@ -77,7 +77,7 @@ class _Prior:
 
 
 class _Table:
-    """Observations of the moving or of the fixed keyframes, sorted by point, in columns as the kernels want them."""
+    """Observations of the moving or of the fixed keyframes, sorted by point, in columns for the kernels."""
 
     def __init__(self, rig: Rig, bundle: Bundle, config: BundleConfig, rows: I64) -> None:
         self.rows = rows = rows[np.argsort(bundle.obs_pt[rows], kind="stable")]
@@ -89,14 +89,14 @@ class _Table:
         seen = np.stack([np.isfinite(self._left).all(1), np.isfinite(self._right[:, 0]) & rig.stereo], 1)
         sigma = np.ones(seen.shape) if bundle.sigma is None else bundle.sigma[rows]
         self._weights = np.where(seen, 1.0 / sigma, 0.0)
-        self.use = seen.copy()  # (M, 2) eyes that count
+        self.use = seen.copy()  # (M, 2) images that count
         right = rig.right if rig.right is not None else rig.left
         right_T_left = se3.inverse(rig.left_T_right)
         self._cams = (rig.left.model_id, rig.left.params, right.model_id, right.params)
         self._right_T_left = np.ascontiguousarray(right_T_left[:3, :3]), right_T_left[:3, 3].copy()
         self._config = config
         self.redescends = False  # the next `linearize` uses Cauchy's loss
-        self.limit = 0.0  # above 0: the next `linearize` judges which eyes count
+        self.limit = 0.0  # above 0: the next `linearize` determines which images count
 
     def linearize(self, state: _State) -> tuple[Linear, float]:
         """Quadratic models of the observations at a state, and their robust cost."""
@@ -118,12 +118,12 @@ class _Table:
         return h, g
 
     def agreeing(self, chi2: F64, limit: float) -> Bool:
-        """(M, 2) which eyes agree, whether or not they had a say in it."""
+        """(M, 2) which images agree, whether or not they counted."""
         return (self._weights > 0) & (chi2 <= limit)
 
 
 class _State:
-    """Poses and points of one moment, the quadratic model of what the moving keyframes see, and the cost."""
+    """Poses and points, the quadratic model of the moving keyframes' observations, and the cost."""
 
     def __init__(self, rot: F64, pos: F64, points: F64) -> None:
         self.rot, self.pos, self.points = rot, pos, points
@@ -151,7 +151,7 @@ class _Solver:
         return _Prior(state.points, *self.fixed.sum_up(state.rot, lin), cost)
 
     def evaluate(self, state: _State, prior: _Prior | None = None) -> _State:
-        """Fill in the model and the cost; `prior`: of an earlier state, whose model of the fixed part goes on."""
+        """Fill in the model and the cost; `prior`: model of the fixed keyframes from an earlier state, to reuse it."""
         state.lin, state.cost = self.table.linearize(state)
         state.prior = prior or self._prior(state)
         state.cost += state.prior.cost
@@ -160,7 +160,7 @@ class _Solver:
         return state
 
     def begin_round(self, state: _State, judge: bool) -> None:
-        """Model everything anew, outliers left out; `judge`: in all rounds but the first."""
+        """Linearise anew without outliers; `judge`: determine outliers, in all rounds but the first."""
         self.table.limit = self.fixed.limit = self.config.outlier_chi2 if judge else 0.0
         self.table.redescends = self.fixed.redescends = judge and self.config.cauchy > 0
         self.evaluate(state)
@@ -169,7 +169,7 @@ class _Solver:
         h, b = np.zeros((len(self.moving), 6, 6)), np.zeros((len(self.moving), 6))
         kernels.pose_blocks(self.table.kf, self.free, state.lin, h, b)
         diagonal = np.arange(6)
-        # A keyframe without any inlier keeps its place: its block would be singular.
+        # A keyframe without any inlier keeps its pose: its block would be singular.
         h[:, diagonal, diagonal] += damping * h[:, diagonal, diagonal] + 1e-12
         return h, b
 
@@ -193,7 +193,7 @@ class _Solver:
         return h, g
 
     def step(self, state: _State, damping: float) -> _State | None:
-        """The state after one damped step, or None where the system has no solution."""
+        """The state after one damped step, or None if the system has no solution."""
         rot, pos, points = state.rot, state.pos, state.points
         blocks = self._point_blocks(state, damping)
         xi = np.zeros((0, 6))
@@ -208,7 +208,7 @@ class _Solver:
         return self.evaluate(_State(rot, pos, points), state.prior if self.config.fixed_once else None)
 
     def descend(self, state: _State) -> tuple[_State, int, bool]:
-        """Levenberg-Marquardt from one state: the best state, accepted steps, whether the cost stopped falling."""
+        """Levenberg-Marquardt from one state: the best state, accepted steps, whether it converged."""
         damping, accepted, c = self.config.damping, 0, self.config
         while accepted < c.iterations:
             trial = self.step(state, damping)
@@ -227,7 +227,7 @@ class _Solver:
 def bundle_adjust(rig: Rig, bundle: Bundle, config: BundleConfig | None = None) -> BundleResult:
     """Poses and points that minimise the robust reprojection error.
 
-    A point that no remaining observation sees stays where it is; one on a single ray moves onto it and binds no pose.
+    A point without inliers stays where it is; one on a single ray moves onto it and constrains no pose.
 
     Raises:
         StereoSfmError: arrays of different lengths, or indices out of range.
@@ -274,4 +274,4 @@ def _check(bundle: Bundle) -> None:
         (bundle.obs_pt, len(bundle.points), "point"),
     ):
         if count and (int(rows.min()) < 0 or int(rows.max()) >= size):
-            raise StereoSfmError(f"bundle adjustment got an observation of a {what} that is not there")
+            raise StereoSfmError(f"bundle adjustment got an observation of a {what} that does not exist")

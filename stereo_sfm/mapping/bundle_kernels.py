@@ -11,11 +11,11 @@ and every block of the normal equations follows from A, g, p and R alone: with G
     H_kf = G^T A G,   H_point = R A R^T,   W = G^T A R^T,   b_kf = -G^T g,   b_point = -R g.
 
 The Schur complement over the points is Triggs et al., Bundle adjustment: a modern synthesis (2000), section 6.1.
-Observations are sorted by point. What the points' fixed observations say is summed up in a quadratic prior of every
-point, (H (6,), g (3,)) in world axes about x0: cost = g.d + d^T H d / 2 with d = x - x0.
+Observations are sorted by point. The observations of fixed keyframes are summed up in a quadratic prior of every point,
+(H (6,), g (3,)) in world axes about x0: cost = g.d + d^T H d / 2 with d = x - x0.
 
-Inner loops index arrays directly and keep rows that are read together beside each other: a view of a row costs more
-than the arithmetic on it.
+Inner loops index arrays directly, and rows that are read together are adjacent: a view of a row costs more than the
+arithmetic on it.
 """
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false
@@ -29,7 +29,7 @@ import numpy as np
 from stereo_sfm.geometry.kernels import njit, project_one
 from stereo_sfm.geometry.se3_kernels import compose_into, exp_into
 
-UNPROJECTABLE = 1e6  # chi2 of an observation whose point left the camera's field: no gradient, steps there are refused
+UNPROJECTABLE = 1e6  # chi2 of a point outside the camera's field of view: without gradient, so such steps are rejected
 
 
 @njit
@@ -51,8 +51,8 @@ def _loss(chi2, scale, redescends):
 
 
 @njit
-def _eye(model, params, x, y, z, u_obs, v_obs, w):
-    """Derivatives (u by x y z, v by x y z), residuals ru, rv of one eye, all scaled by w, and chi2; zeros where w is 0.
+def _project(model, params, x, y, z, u_obs, v_obs, w):
+    """Derivatives (u by x y z, v by x y z) and residuals ru, rv of one image, scaled by w, and chi2; zeros if w is 0.
 
     A NaN v_obs means: only u was seen.
     """
@@ -92,11 +92,11 @@ def linearize(
 
     Args:
         rot, pos: (K, 3, 3), (K, 3) of world_T_kf. points: (P, 3) world.
-        obs_kf, obs_pt: (M,). uv_left, uv_right: (M, 2) px. weights: (M, 2) 1/px of either eye, 0 where it sees nothing.
-        use: (M, 2) eyes that count. limit: above 0 those are judged here: the ones whose chi2 is not above it.
+        obs_kf, obs_pt: (M,). uv_left, uv_right: (M, 2) px. weights: (M, 2) 1/px of either image, 0 where not observed.
+        use: (M, 2) images that count. limit: if above 0, `use` is set here to those whose chi2 is not above it.
         cams: (left model, left params, right model, right params). right_r, right_t: right_T_left.
-        scale, redescends: of the loss, see `_loss`. joint: one loss over both eyes instead of one each.
-        out: (A (M, 6) upper triangle, g (M, 3), p (M, 3), chi2 (M, 2)), overwritten; chi2 also where an eye does not
+        scale, redescends: of the loss, see `_loss`. joint: one loss over both images instead of one each.
+        out: (A (M, 6) upper triangle, g (M, 3), p (M, 3), chi2 (M, 2)), overwritten; chi2 also of images that do not
             count.
 
     Returns:
@@ -116,13 +116,13 @@ def linearize(
         p1 = rot[k, 0, 1] * d0 + rot[k, 1, 1] * d1 + rot[k, 2, 1] * d2
         p2 = rot[k, 0, 2] * d0 + rot[k, 1, 2] * d1 + rot[k, 2, 2] * d2
         p[o, 0], p[o, 1], p[o, 2] = p0, p1, p2
-        x0, x1, x2, y0, y1, y2, ru, rv, chi_l = _eye(
+        x0, x1, x2, y0, y1, y2, ru, rv, chi_l = _project(
             left_model, left_params, p0, p1, p2, uv_left[o, 0], uv_left[o, 1], weights[o, 0]
         )
         q0 = r00 * p0 + r01 * p1 + r02 * p2 + t0
         q1 = r10 * p0 + r11 * p1 + r12 * p2 + t1
         q2 = r20 * p0 + r21 * p1 + r22 * p2 + t2
-        u0, u1, u2, v0, v1, v2, su, sv, chi_r = _eye(
+        u0, u1, u2, v0, v1, v2, su, sv, chi_r = _project(
             right_model, right_params, q0, q1, q2, uv_right[o, 0], uv_right[o, 1], weights[o, 1]
         )
         u0, u1, u2 = u0 * r00 + u1 * r10 + u2 * r20, u0 * r01 + u1 * r11 + u2 * r21, u0 * r02 + u1 * r12 + u2 * r22
@@ -264,7 +264,7 @@ def sum_up(starts, obs_kf, rot, lin, h, g):
 
 @njit
 def prior_cost(points, x0, h, g):
-    """What the priors add to the cost at some points."""
+    """The cost of the priors at the points."""
     cost = 0.0
     for i in range(points.shape[0]):
         d0, d1, d2 = points[i, 0] - x0[i, 0], points[i, 1] - x0[i, 1], points[i, 2] - x0[i, 2]

@@ -1,7 +1,7 @@
-"""What an accepted loop does to the map: keyframes move, points follow their anchors, paired points become one.
+"""Correction of the map for an accepted loop: keyframes move, points follow their anchors, matched points are fused.
 
-Nothing here touches the odometry: the caller derives `map_T_odom` from the newest keyframe, so that the map pose jumps
-and the odometry pose does not.
+The odometry stays: the caller derives `map_T_odom` from the newest keyframe, so that the map pose jumps and the
+odometry pose does not.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from stereo_sfm.mapping.map import Map
 from stereo_sfm.mapping.pose_graph import Edges, edges_of_poses, join, optimise
 from stereo_sfm.types import F64, I64, LoopResult
 
-STRONG = 30  # shared points that make an edge of the pose graph beside those of the walk
-ODOMETRY = 0.004, 0.0006  # metres and radians per metre that an edge of the walk may be wrong by
-RELAXED = 6.0  # squared sigmas that a loop may keep
-DRIFT = 0.003, 0.0003  # metres and radians per metre that a walk as a whole may drift by: scale and heading
-LOOP_SIGMAS = 0.01, 0.003  # metres, radians: at least this uncertain
+COVISIBLE_POINTS = 30  # shared points of keyframes that get an edge in the pose graph
+ODOMETRY = 0.004, 0.0006  # standard deviation of an odometry edge: metres and radians per metre
+MAX_STRAIN = 6.0  # squared error in sigmas that a loop may keep: chi-squared of six degrees of freedom has this mean
+DRIFT = 0.003, 0.0003  # systematic drift of scale and heading: metres and radians per metre of the path
+LOOP_SIGMAS = 0.01, 0.003  # smallest standard deviation of a loop: metres, radians
 
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """What was done."""
+    """The result of `apply_loop`."""
 
-    applied: bool  # False: the pose graph did not believe the loop, nothing moved
-    fused: list[tuple[int, int]]  # point rows (gone, stays)
+    applied: bool  # False: the pose graph rejected the loop, nothing moved
+    fused: list[tuple[int, int]]  # point rows (removed, kept)
 
 
 def apply_loop(
@@ -44,11 +44,11 @@ def apply_loop(
 
     Args:
         map_: changed in place.
-        earlier: loops applied before, which must keep holding.
-        match_sigma_px: noise of one coordinate of a point that was fused.
+        earlier: loops applied before, which stay in the pose graph.
+        match_sigma_px: noise of one coordinate of a fused point.
 
     Returns:
-        `applied` False when the loop contradicts the rest of the graph; the map is then as it was.
+        `applied` is False if the loop contradicts the rest of the graph; the map is then unchanged.
     """
     a, b = map_.kf_row(loop.candidate_kf_id), map_.kf_row(loop.kf_id)
     if not (map_.keyframes.alive[a] and map_.keyframes.alive[b]):
@@ -70,10 +70,10 @@ def apply_loop(
 
 
 def loop_is_known(map_: Map, loop: LoopResult, connected_points: int) -> bool:
-    """Whether the map says already what a loop says: its two sides share points, and stand as the loop has them."""
+    """Whether the map already agrees with a loop: its two sides share points, and their relative pose is the loop's."""
     a, b = map_.kf_row(loop.candidate_kf_id), map_.kf_row(loop.kf_id)
-    beside_a, beside_b = (map_.neighbours(row, connected_points)[0] for row in (a, b))
-    if not len(np.intersect1d(np.append(beside_a, a), beside_b)):
+    around_a, around_b = (map_.neighbours(row, connected_points)[0] for row in (a, b))
+    if not len(np.intersect1d(np.append(around_a, a), around_b)):
         return False
     poses = map_.keyframes.map_T_kf
     error = se3.log(se3.inverse(loop.candidate_T_kf) @ se3.inverse(poses[a]) @ poses[b])
@@ -82,30 +82,30 @@ def loop_is_known(map_: Map, loop: LoopResult, connected_points: int) -> bool:
 
 
 def fuse_pairs(map_: Map, pairs: I64, match_sigma_px: float) -> list[tuple[int, int]]:
-    """Make one point of each pair of ids (M, 2) that are two living points; the first of a pair stays.
+    """Fuse each pair of ids (M, 2) that are two living points; the first of a pair is kept.
 
     Returns:
-        Rows (gone, stays).
+        Rows (removed, kept).
     """
     fused: list[tuple[int, int]] = []
-    for keep, drop in pairs.tolist():
-        new, old = map_.point_rows(np.array([keep, drop]))
-        if new >= 0 and old >= 0 and new != old and map_.points.alive[new] and map_.points.alive[old]:
-            map_.fuse(int(old), int(new), match_sigma_px)
-            fused.append((int(old), int(new)))
+    for kept_id, removed_id in pairs.tolist():
+        kept, removed = map_.point_rows(np.array([kept_id, removed_id]))
+        if kept >= 0 and removed >= 0 and kept != removed and map_.points.alive[kept] and map_.points.alive[removed]:
+            map_.fuse(int(removed), int(kept), match_sigma_px)
+            fused.append((int(removed), int(kept)))
     return fused
 
 
 def _averaged(map_: Map, before: F64, loop: LoopResult, earlier: Sequence[LoopResult]) -> F64:
-    """The error spread over the walk that led to the loop. Pieces that the loop joins move as rigid bodies only.
+    """The loop's error distributed over the path that led to it. Parts that the loop connects move as rigid bodies.
 
-    Between two walks (submaps) that hang together already, the younger one's way from its first keyframe takes it.
+    Between two submaps that are connected already, the path of the newer one from its first keyframe takes the error.
     """
     a, b = map_.kf_row(loop.candidate_kf_id), map_.kf_row(loop.kf_id)
-    walk, closed = walk_edges(map_, before), loop_edges(map_, [*earlier, loop])
-    piece = _pieces(len(before), walk, closed, len(closed) - 1)
-    if piece[a] != piece[b]:
-        return _brought_together(before, loop, a, b, piece)
+    odometry, closed = odometry_edges(map_, before), loop_edges(map_, [*earlier, loop])
+    part = _parts(len(before), odometry, closed, len(closed) - 1)
+    if part[a] != part[b]:
+        return _connected(before, loop, a, b, part)
     if a > b:
         raise StereoSfmError("transformation averaging needs a loop back to an older keyframe")
     after, submap = before.copy(), map_.keyframes.submap_id
@@ -117,77 +117,77 @@ def _averaged(map_: Map, before: F64, loop: LoopResult, earlier: Sequence[LoopRe
     return after
 
 
-def _brought_together(before: F64, loop: LoopResult, a: int, b: int, piece: I64) -> F64:
-    """The younger of two pieces moved to where the loop has it."""
+def _connected(before: F64, loop: LoopResult, a: int, b: int, part: I64) -> F64:
+    """The poses with the newer of two unconnected parts moved as a rigid body to fit the loop."""
     after = before.copy()
     move = before[a] @ loop.candidate_T_kf @ se3.inverse(before[b])
-    rows = piece == piece[b] if piece[b] > piece[a] else piece == piece[a]
-    after[rows] = (move if piece[b] > piece[a] else se3.inverse(move)) @ before[rows]
+    rows = part == part[b] if part[b] > part[a] else part == part[a]
+    after[rows] = (move if part[b] > part[a] else se3.inverse(move)) @ before[rows]
     return after
 
 
 def _optimised(
     map_: Map, before: F64, loop: LoopResult, earlier: Sequence[LoopResult], config: LoopConfig
 ) -> F64 | None:
-    """Poses that agree with the walk and the loops, or None where they contradict each other.
+    """Poses that agree with odometry and loops, or None if the loop contradicts them.
 
-    The walk counts as exact as a good tracker makes it; where the loop then stays strained, as much drift is allowed as
-    may add up along the way.
+    Odometry first has the accuracy of good tracking; if the loop is then strained, as much systematic drift is allowed
+    as may accumulate along the path.
     """
     a, b = map_.kf_row(loop.candidate_kf_id), map_.kf_row(loop.kf_id)
-    walk = walk_edges(map_, before)
+    odometry = odometry_edges(map_, before)
     closed = loop_edges(map_, [*earlier, loop])
-    piece = _pieces(len(before), walk, closed, len(closed) - 1)
+    part = _parts(len(before), odometry, closed, len(closed) - 1)
     start = before
-    if piece[a] != piece[b]:  # a submap that this loop joins to the rest: bring it there as a rigid body first
-        start = _brought_together(before, loop, a, b, piece)
-    fixed = _first_of_each_piece(len(before), join([walk, closed]))
-    result = optimise(start, join([walk, closed]), fixed, config.robust)
-    if result.weights[-1] < 0.5 or _strain(result.poses, closed) > RELAXED:
-        result = optimise(start, join([_loosened(walk, before, a, b), closed]), fixed, config.robust)
+    if part[a] != part[b]:  # a submap that this loop connects with the rest: move it there as a rigid body first
+        start = _connected(before, loop, a, b, part)
+    fixed = _first_of_each_part(len(before), join([odometry, closed]))
+    result = optimise(start, join([odometry, closed]), fixed, config.robust)
+    if result.weights[-1] < 0.5 or _strain(result.poses, closed) > MAX_STRAIN:
+        result = optimise(start, join([_with_drift(odometry, before, a, b), closed]), fixed, config.robust)
     return result.poses if result.weights[-1] >= 0.5 else None
 
 
 def _strain(poses: F64, closed: Edges) -> float:
-    """Squared error in sigmas that the last loop keeps; 6 is what noise alone leaves."""
+    """Squared error of the last loop in sigmas; its mean is 6 for noise alone."""
     error = se3.log(se3.inverse(closed.i_T_j[-1]) @ se3.inverse(poses[closed.i[-1]]) @ poses[closed.j[-1]])
     return float((error**2 / np.repeat(closed.sigmas[-1], 3) ** 2).sum())
 
 
-def walk_edges(map_: Map, poses: F64) -> Edges:
-    """Edges between keyframes that follow each other and those that share many points (the covisibility graph)."""
+def odometry_edges(map_: Map, poses: F64) -> Edges:
+    """Edges between consecutive keyframes and between those that share many points (the covisibility graph)."""
     alive = map_.keyframes.alive
     pairs: set[tuple[int, int]] = set()
     for row in map_.living_keyframes().tolist():
         previous = int(map_.keyframes.previous[row])
         if previous >= 0 and alive[previous]:
             pairs.add((previous, row))
-        for other in map_.neighbours(row, STRONG)[0].tolist():
+        for other in map_.neighbours(row, COVISIBLE_POINTS)[0].tolist():
             if alive[other]:
                 pairs.add((min(row, other), max(row, other)))
     table = np.array(sorted(pairs), np.int64).reshape(-1, 2)
     return edges_of_poses(poses, table[:, 0], table[:, 1], *ODOMETRY)
 
 
-def _loosened(walk: Edges, poses: F64, a: int, b: int) -> Edges:
-    """The edges of the walk as uncertain as drift from row a to row b makes them.
+def _with_drift(odometry: Edges, poses: F64, a: int, b: int) -> Edges:
+    """The odometry edges with the uncertainty of systematic drift from row a to row b.
 
-    A wrong scale or a turning heading is alike in all edges. Their errors add up along the way instead of averaging
-    out, and edges beside each other know nothing that one alone does not. The sum of the variances of the edges of
-    DRIFT along the way is (DRIFT * way)^2.
+    An error of scale or heading is the same in all edges: it accumulates along the path instead of averaging out, and
+    parallel edges are not independent. The variances of the edges along the path sum up to (DRIFT * path length)^2.
     """
-    length = np.linalg.norm(poses[walk.j, :3, 3] - poses[walk.i, :3, 3], axis=1)
-    graph = scipy.sparse.coo_array((length + 1e-9, (walk.i, walk.j)), shape=(len(poses), len(poses))).tocsr()
-    way = float(dijkstra(graph, directed=False, indices=a)[b])
-    if not np.isfinite(way):
-        return walk
-    beside = len(walk) / max(len(np.unique(walk.j)), 1)
-    drift = np.square(DRIFT) * (length * way)[:, None]
-    return dataclasses.replace(walk, sigmas=np.sqrt(beside * (walk.sigmas**2 + drift)))
+    length = np.linalg.norm(poses[odometry.j, :3, 3] - poses[odometry.i, :3, 3], axis=1)
+    shape = (len(poses), len(poses))
+    graph = scipy.sparse.coo_array((length + 1e-9, (odometry.i, odometry.j)), shape=shape).tocsr()
+    path = float(dijkstra(graph, directed=False, indices=a)[b])
+    if not np.isfinite(path):
+        return odometry
+    parallel = len(odometry) / max(len(np.unique(odometry.j)), 1)
+    drift = np.square(DRIFT) * (length * path)[:, None]
+    return dataclasses.replace(odometry, sigmas=np.sqrt(parallel * (odometry.sigmas**2 + drift)))
 
 
 def loop_edges(map_: Map, loops: Sequence[LoopResult]) -> Edges:
-    """Edges of loops whose keyframes still live, in order; the last loop given is always among them."""
+    """Edges of loops between living keyframes, in order; the last given loop is always among them."""
     alive = map_.keyframes.alive
     rows = [(map_.kf_row(x.candidate_kf_id), map_.kf_row(x.kf_id)) for x in loops]
     kept = [k for k, (i, j) in enumerate(rows) if alive[i] and alive[j]]
@@ -202,16 +202,16 @@ def loop_edges(map_: Map, loops: Sequence[LoopResult]) -> Edges:
 
 
 def loop_sigmas(information: F64) -> tuple[float, float]:
-    """Metres and radians of a measured relative pose, never more certain than LOOP_SIGMAS."""
+    """Standard deviations of a measured relative pose in metres and radians, at least LOOP_SIGMAS."""
     covariance = np.linalg.pinv(information)
     metres, radians = np.sqrt(np.trace(covariance[:3, :3]) / 3), np.sqrt(np.trace(covariance[3:, 3:]) / 3)
     return max(float(metres), LOOP_SIGMAS[0]), max(float(radians), LOOP_SIGMAS[1])
 
 
-def _pieces(count: int, walk: Edges, closed: Edges, without: int) -> I64:
-    """(K,) which connected piece a keyframe is in when the loop edge `without` is left out."""
-    i = np.concatenate([walk.i, np.delete(closed.i, without)])
-    j = np.concatenate([walk.j, np.delete(closed.j, without)])
+def _parts(count: int, odometry: Edges, closed: Edges, without: int) -> I64:
+    """(K,) connected component of each keyframe without the loop edge `without`."""
+    i = np.concatenate([odometry.i, np.delete(closed.i, without)])
+    j = np.concatenate([odometry.j, np.delete(closed.j, without)])
     return _components(count, i, j)
 
 
@@ -220,8 +220,8 @@ def _components(count: int, i: I64, j: I64) -> I64:
     return connected_components(graph, directed=False)[1].astype(np.int64)
 
 
-def _first_of_each_piece(count: int, edges: Edges) -> I64:
-    """Rows that hold the pieces of the graph in place: the oldest of each."""
-    piece = _components(count, edges.i, edges.j)
+def _first_of_each_part(count: int, edges: Edges) -> I64:
+    """The oldest row of each connected component, which is fixed."""
+    part = _components(count, edges.i, edges.j)
     used = np.unique(np.concatenate([edges.i, edges.j]))
-    return used[np.unique(piece[used], return_index=True)[1]]
+    return used[np.unique(part[used], return_index=True)[1]]

@@ -1,4 +1,4 @@
-"""What leaves the map: weak points and redundant keyframes."""
+"""Culling of weak points and redundant keyframes."""
 
 from __future__ import annotations
 
@@ -11,16 +11,15 @@ from stereo_sfm.mapping import map_kernels
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.types import F64, I64, Bool
 
-OTHERS = 3  # keyframes that must see a point before one more is redundant
-CROWD_DEPTHS, CROWD_DEG = 0.15, 15.0  # keyframes so near, in median depths, and so alike in direction see the same
+OTHERS = 3  # keyframes that observe a point, beyond which one more is redundant
+SAME_VIEW_DEPTHS, SAME_VIEW_DEG = 0.15, 15.0  # keyframes of the same view: distance in median depths, angle
 
 
 def weak_points(map_: Map, rig: Rig, rows: I64, newest: int, config: MapperConfig) -> I64:
-    """Of some points those that should go.
+    """The rows of points to cull.
 
-    A point that the newest keyframe sees stays unless its observations disagree: a far point without parallax still
-    tells the tracker how the camera turns. One that is no longer tracked must have been seen by enough keyframes, from
-    rays far enough apart.
+    A point that the newest keyframe sees is kept unless its observations disagree: a far point without parallax still
+    determines the rotation of the camera. One that is no longer tracked needs enough observations and enough parallax.
     """
     points = map_.points
     rows = rows[points.alive[rows]]
@@ -29,8 +28,8 @@ def weak_points(map_: Map, rig: Rig, rows: I64, newest: int, config: MapperConfi
     error, parallax = _quality(map_, rig, rows)
     bad = (error > config.max_error_sigmas) & (points.obs_count[rows] >= 2)
     narrow = lost & (parallax < np.deg2rad(config.min_parallax_deg))
-    gone = points.obs_count[rows] == 0
-    return rows[few | bad | narrow | gone]
+    unseen = points.obs_count[rows] == 0
+    return rows[few | bad | narrow | unseen]
 
 
 def _quality(map_: Map, rig: Rig, rows: I64) -> tuple[F64, F64]:
@@ -45,10 +44,10 @@ def _quality(map_: Map, rig: Rig, rows: I64) -> tuple[F64, F64]:
 
 
 def redundant_keyframe(map_: Map, newest: int, protected: Bool, config: MapperConfig) -> int:
-    """A neighbour of the newest keyframe that the map can do without, -1: none.
+    """A redundant neighbour of the newest keyframe, -1: none.
 
-    One whose points are seen well enough by others, oldest first; else, where the robot passes again and again, the
-    one of a crowd whose points are seen best by others: a place keeps `crowd_keyframes` views however often it is seen.
+    The oldest one whose points are seen well enough by others; else, in a place that the robot visits often, the one
+    of several with the same view whose points are seen best by others: a view keeps `crowd_keyframes` keyframes.
 
     Args:
         protected: (K,) keyframes that must stay (the first, those of loops, the newest ones).
@@ -60,8 +59,8 @@ def redundant_keyframe(map_: Map, newest: int, protected: Bool, config: MapperCo
     shares = _seen_by_others(map_, neighbours)
     if (shares > config.redundant_share).any():
         return int(neighbours[np.argmax(shares > config.redundant_share)])
-    crowd = np.flatnonzero(_same_view(map_, newest, neighbours))
-    return int(neighbours[crowd[np.argmax(shares[crowd])]]) if len(crowd) > config.crowd_keyframes else -1
+    same = np.flatnonzero(_same_view(map_, newest, neighbours))
+    return int(neighbours[same[np.argmax(shares[same])]]) if len(same) > config.crowd_keyframes else -1
 
 
 def _seen_by_others(map_: Map, rows: I64) -> F64:
@@ -74,9 +73,9 @@ def _seen_by_others(map_: Map, rows: I64) -> F64:
 
 
 def _same_view(map_: Map, newest: int, rows: I64) -> Bool:
-    """(N,) which keyframes stand where the newest stands and look where it looks."""
+    """(N,) which keyframes have about the pose of the newest."""
     poses = map_.keyframes.map_T_kf
     pts = map_.observations.pt[map_.observations_of_keyframe(newest)]
     depth = np.nanmedian(np.linalg.norm(map_.points.xyz[pts] - poses[newest, :3, 3], axis=1)) if len(pts) else 0.0
     metres, radians = se3.extent(se3.inverse(poses[rows]) @ poses[newest])
-    return (metres < CROWD_DEPTHS * depth) & (radians < np.deg2rad(CROWD_DEG))
+    return (metres < SAME_VIEW_DEPTHS * depth) & (radians < np.deg2rad(SAME_VIEW_DEG))

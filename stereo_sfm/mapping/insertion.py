@@ -1,4 +1,4 @@
-"""How a keyframe enters the map: which of its points are known, where it stands, what is new."""
+"""Insertion of a keyframe: association of its points with the map, its pose, and new points."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from stereo_sfm.mapping.map import Map
 from stereo_sfm.mapping.pose_only import adjust_pose
 from stereo_sfm.types import F64, I64, Bool, Keyframe
 
-MIN_POSE_POINTS = 10  # known points from which a keyframe's pose is solved before it enters the map
+MIN_POSE_POINTS = 10  # known points from which a keyframe's pose is solved before insertion
 
 
 @dataclass(frozen=True, eq=False)
 class Insertion:
-    """What came of it."""
+    """The result of `insert_keyframe`."""
 
     row: int  # of the keyframe
-    fused: list[tuple[int, int]]  # point rows (gone, the one that replaced it)
+    fused: list[tuple[int, int]]  # point rows (removed, the one that replaced it)
 
 
 def insert_keyframe(map_: Map, rig: Rig, keyframe: Keyframe, guess: F64, config: MapperConfig) -> Insertion:
-    """A keyframe with its points.
+    """Insert a keyframe with its points.
 
     Args:
-        guess: (4, 4) map_T_kf as odometry has it.
+        guess: (4, 4) map_T_kf by odometry.
     """
     rows, usable = _identify(map_, keyframe, config)
     pose = _solve_pose(map_, rig, keyframe, rows, usable & (rows >= 0), guess, config)
@@ -54,7 +54,7 @@ def insert_keyframe(map_: Map, rig: Rig, keyframe: Keyframe, guess: F64, config:
 
 
 def _identify(map_: Map, keyframe: Keyframe, config: MapperConfig) -> tuple[I64, Bool]:
-    """(N,) point row of each track, -1 when new, and (N,) which may be used: not those whose point was culled."""
+    """(N,) point row of each track, -1 if new, and (N,) which may be used: tracks of culled points may not."""
     rows = map_.point_rows(np.asarray(keyframe.point_ids))
     usable = (rows < 0) | map_.points.alive[np.maximum(rows, 0)] if len(map_.points) else np.ones(len(rows), bool)
     usable &= np.isfinite(keyframe.uv_left).all(axis=1)
@@ -67,7 +67,7 @@ def _identify(map_: Map, keyframe: Keyframe, config: MapperConfig) -> tuple[I64,
 def _solve_pose(
     map_: Map, rig: Rig, keyframe: Keyframe, rows: I64, known: Bool, guess: F64, config: MapperConfig
 ) -> F64:
-    """(4, 4) map_T_kf from the points that are known, where they are enough; else the guess."""
+    """(4, 4) map_T_kf from the known points; the guess if there are too few."""
     known = known.copy()
     known[known] = np.isfinite(map_.points.xyz[rows[known], 0])
     count = int(known.sum())
@@ -83,7 +83,7 @@ def _solve_pose(
 def _find_again(
     map_: Map, rig: Rig, keyframe: Keyframe, rows: I64, usable: Bool, pose: F64, config: MapperConfig
 ) -> I64:
-    """(M, 2) pairs (row of the keyframe, point row) that look alike where the point should be."""
+    """(M, 2) pairs (row of the keyframe, point row) that match by descriptor near the point's projection."""
     tracked = rows[usable & (rows >= 0)]
     depth = np.linalg.norm(keyframe.points_cam, axis=1)
     reach = config.near_depths * float(np.nanmedian(depth)) if np.isfinite(depth).any() else 0.0
@@ -108,14 +108,14 @@ def _find_again(
 
 
 def fuse_points(map_: Map, first: int, second: int, config: MapperConfig) -> tuple[int, int] | None:
-    """Make two points one, the older survives; refused where one keyframe saw both. Returns (gone, stays) or None."""
-    gone, stays = max(first, second), min(first, second)
-    if gone == stays or not (map_.points.alive[gone] and map_.points.alive[stays]):
+    """Fuse two points, the older is kept; not if one keyframe saw both. Returns (removed, kept) or None."""
+    removed, kept = max(first, second), min(first, second)
+    if removed == kept or not (map_.points.alive[removed] and map_.points.alive[kept]):
         return None
-    if map_.share_a_keyframe(gone, stays):
+    if map_.share_a_keyframe(removed, kept):
         return None
-    map_.fuse(gone, stays, config.match_sigma_px)
-    return gone, stays
+    map_.fuse(removed, kept, config.match_sigma_px)
+    return removed, kept
 
 
 def _first_of_each(rows: I64) -> I64:

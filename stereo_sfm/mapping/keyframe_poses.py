@@ -1,4 +1,4 @@
-"""The keyframes' poses as the mapper's updates tell them, for whoever follows a run from outside the mapper."""
+"""Poses of all keyframes from the mapper's updates, for log, viewer and evaluation."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class KeyframePoses:
         return kf_id in self._poses
 
     def add(self, kf_id: int, map_T_kf: F64) -> None:
-        """A keyframe that no update has told of yet."""
+        """Add a keyframe before the first update that contains it."""
         self._poses[kf_id], self._all = map_T_kf, None
 
     def update(self, update: MapUpdate) -> None:
@@ -35,7 +35,7 @@ class KeyframePoses:
             self._carried[kf_id] = carrier, carrier_T_kf.copy()
 
     def all(self) -> dict[int, F64]:
-        """map_T_kf (4, 4) by id, ascending. What is carried by a keyframe that no update told of is left out."""
+        """map_T_kf (4, 4) by id, ascending, without keyframes whose carrier is unknown."""
         if self._all is None:
             self._all = self._put_together()
         return self._all

@@ -1,10 +1,10 @@
 """The map: columns for keyframes and points and one observation table. Owned by the mapper alone.
 
-Ids are never used again: a culled keyframe or point keeps its row and loses `alive`, a fused point keeps its id as
-another name of the point that replaced it. Keyframe rows are forever; point and observation rows are until `compact`
-takes back those of what is gone, so that a day in the same aisles fits into memory. The observations of a keyframe are
-one run of rows; those of a point a linked list through the table, so that inserting a keyframe costs what it sees and
-not what the map holds.
+Ids are never reused: a culled keyframe or point keeps its row and loses `alive`, a fused point keeps its id as an alias
+of the point that replaced it. Keyframe rows are permanent; point and observation rows stay until `compact` frees those
+of removed ones, so that a day in the same aisles fits into memory. The observations of a keyframe are
+one run of rows; those of a point a linked list through the table, so that the cost of inserting a keyframe
+depends on its observations, not on the size of the map.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from stereo_sfm.types import F32, F64, I64, U8, Corners, Keyframe
 
 @dataclass(frozen=True, eq=False)
 class MapDelta:
-    """What changed since the last delta, as copies."""
+    """Changes since the last delta, as copies."""
 
     kf_rows: I64  # (K,) new or moved living keyframes, ascending
     map_T_kf: F64  # (K, 4, 4)
     culled_kf: I64  # (R, 2) rows: a culled keyframe, the keyframe that carries it
-    carrier_T_kf: F64  # (R, 4, 4) its place there
+    carrier_T_kf: F64  # (R, 4, 4) its pose relative to the carrier
     pt_rows: I64  # (P,) new or moved living points, ascending
     xyz: F64  # (P, 3)
 
@@ -51,14 +51,14 @@ class MapSnapshot:
     uv_left: F64  # (M, 2) px
     uv_right: F64  # (M, 2) px
     descriptors: U8  # (M, 32)
-    corner_kf: I64  # (C,) index into kf_ids, ascending: what keyframes are recognised by, see `Keyframe.corners`
+    corner_kf: I64  # (C,) index into kf_ids, ascending: corners for place recognition, see `Keyframe.corners`
     corner_uv_left: F32  # (C, 2) px
     corner_uv_right: F32  # (C, 2) px
     corner_points: F32  # (C, 3) metres in the keyframe's camera
     corner_descriptors: U8  # (C, 32)
 
     def keyframes(self) -> list[Keyframe]:
-        """As a tracker would send them, with map poses for odometry and map points for stereo ones."""
+        """Keyframes as from a tracker, with poses and points of the map."""
         rows = np.arange(len(self.kf_ids) + 1)
         seen, corners = np.searchsorted(self.obs_kf, rows), np.searchsorted(self.corner_kf, rows)
         return [
@@ -116,7 +116,7 @@ class Map:
         return row
 
     def point_rows(self, pt_ids: I64) -> I64:
-        """(N,) row of each point id, through fusions; -1 where the id is unknown. A culled point's is not alive."""
+        """(N,) row of each point id after fusions; -1 for an unknown id. Rows of culled points are not alive."""
         known = (pt_ids >= 0) & (pt_ids < len(self._pt_rows))
         rows = np.where(known, self._pt_rows[np.where(known, pt_ids, 0)], -1).astype(np.int64)
         map_kernels.follow(rows, self.points.fused_into)
@@ -131,20 +131,20 @@ class Map:
         return np.flatnonzero(self.keyframes.alive)
 
     def observations_of_keyframe(self, row: int) -> I64:
-        """Rows of the observations a keyframe has."""
+        """Rows of the observations of a keyframe."""
         first = int(self.keyframes.obs_first[row])
         rows = np.arange(first, first + int(self.keyframes.obs_count[row]))
         return rows[self.observations.pt[rows] >= 0]
 
     def points_of_keyframes(self, rows: I64) -> I64:
-        """Rows of the points that any of some keyframes sees, ascending."""
+        """Rows of the points that any of the keyframes observes, ascending."""
         seen, keyframes = np.zeros(len(self.points), np.bool_), self.keyframes
         rows = np.ascontiguousarray(rows, np.int64)
         map_kernels.mark_seen(rows, keyframes.obs_first, keyframes.obs_count, self.observations.pt, seen)
         return np.flatnonzero(seen)
 
     def count_by_keyframe(self, points: I64) -> I64:
-        """(K,) how many of some points each keyframe sees."""
+        """(K,) number of the points that each keyframe observes."""
         counts = np.zeros(len(self.keyframes), np.int64)
         points = np.ascontiguousarray(points, np.int64)
         table = self.observations
@@ -152,7 +152,7 @@ class Map:
         return counts
 
     def neighbours(self, row: int, at_least: int = 1) -> tuple[I64, I64]:
-        """(N,) rows of the keyframes that share points with one, and (N,) how many: most first, ties to the older."""
+        """(N,) rows of the keyframes that share points with one, and (N,) how many: most first, then oldest first."""
         keyframes, table = self.keyframes, self.observations
         rows, counts = map_kernels.shared(
             row, keyframes.obs_first, keyframes.obs_count, self.points.head, table.following, table.pt, table.kf
@@ -202,7 +202,7 @@ class Map:
         return row
 
     def add_points(self, pt_ids: I64, xyz: F64, anchor: int, sigma: float = 1.0) -> I64:
-        """New points; ids that are known already are refused. Returns their rows."""
+        """Add points with new ids. Returns their rows."""
         if len(pt_ids) and (self.point_rows(pt_ids) >= 0).any():
             raise StereoSfmError("a point id is in the map already: ids are never used twice")
         rows = np.arange(len(self.points), len(self.points) + len(pt_ids))
@@ -247,7 +247,7 @@ class Map:
         self._changed_kf.update(rows.tolist())
 
     def keyframe_poses(self) -> F64:
-        """(K, 4, 4) map_T_kf of every row; culled keyframes are where their carriers have taken them."""
+        """(K, 4, 4) map_T_kf of every row; culled keyframes have moved with their carriers."""
         poses = self.keyframes.map_T_kf.copy()
         gone = np.flatnonzero(~self.keyframes.alive)
         poses[gone] = poses[self.keyframes.carrier[gone]] @ self.keyframes.carrier_T_kf[gone]
@@ -262,7 +262,7 @@ class Map:
         """Points follow their anchors after a correction.
 
         Args:
-            before, after: (K, 4, 4) map_T_kf before and after it by row, right for the living keyframes.
+            before, after: (K, 4, 4) map_T_kf before and after it by row, valid for the living keyframes.
         """
         rows = self.living_points()
         anchor = self._anchors(rows)
@@ -275,7 +275,7 @@ class Map:
         return np.where(self.keyframes.alive[anchor], anchor, self.keyframes.carrier[anchor])
 
     def remove_observations(self, rows: I64) -> None:
-        """Forget observations; their points stay, even without any."""
+        """Remove observations; their points stay, even without any."""
         rows = np.unique(np.asarray(rows, np.int64))
         table = self.observations
         rows = rows[table.pt[rows] >= 0]
@@ -296,16 +296,16 @@ class Map:
             self.points.descriptor_obs[point] = described[-1] if len(described) else -1
 
     def cull_points(self, rows: I64) -> None:
-        """Points that go, with all their observations."""
+        """Cull points with all their observations."""
         rows = rows[self.points.alive[rows]]
         self.remove_observations(self.observations_of_points(rows))
         self.points.alive[rows] = False
 
     def cull_keyframe(self, row: int) -> None:
-        """A keyframe that goes.
+        """Cull a keyframe.
 
-        Its points pass to the oldest keyframe that still sees them; its place stays known, tied to the living keyframe
-        that shared most points with it (else to the one before it).
+        Its points pass to the oldest keyframe that still observes them; its pose is kept relative to the living
+        keyframe that shared most points with it (else to the one before it).
         """
         self._carry(row)
         self._culled_kf.append(row)
@@ -319,7 +319,7 @@ class Map:
         map_kernels.anchor_anew(orphans, self.points.head, table.following, table.kf, self.points.anchor)
 
     def _carry(self, row: int) -> None:
-        """Tie a keyframe, and those that it carries, to another."""
+        """Make another keyframe the carrier of a keyframe and of those that it carries."""
         others, _ = self.neighbours(row)
         carrier = int(others[0]) if len(others) else max(int(self.keyframes.previous[row]), 0)
         table = self.keyframes
@@ -330,7 +330,7 @@ class Map:
         table.carrier[carried], table.carrier[row] = carrier, carrier
 
     def fuse(self, old: int, new: int, sigma: float = 1.0) -> None:
-        """The points of two rows are one: `new` takes over the observations and the names of `old`.
+        """Fuse the points of two rows: `new` takes over the observations and ids of `old`.
 
         Where one keyframe saw both, the observation of `new` stays. Two tracks agree less well than one about where on
         the surface a point is: what `old` was seen by, and what the point is seen by from now on, counts with `sigma`
@@ -360,19 +360,19 @@ class Map:
     # -- memory ------------------------------------------------------------------------------------------------------
 
     @property
-    def mostly_gone(self) -> bool:
-        """Whether less than half of the rows of points or observations still stand for something."""
+    def mostly_removed(self) -> bool:
+        """Whether more than half of the rows of points or observations are unused."""
         living = self.points.alive
         seen = int(self.points.obs_count[living].sum())
         return len(living) > max(2 * int(living.sum()), 1024) or len(self.observations) > max(2 * seen, 4096)
 
     def compact(self) -> I64:
-        """Take back the rows of points and observations that are gone; the order of the others stays.
+        """Free the rows of removed points and observations; the order of the others stays.
 
         The ids of culled points, which must stay known, share one row from then on.
 
         Returns:
-            (P,) the row that each point row has become.
+            (P,) the new row of each point row.
         """
         points, table = self.points, self.observations
         now = np.arange(len(points))
@@ -403,7 +403,7 @@ class Map:
     # -- copies ------------------------------------------------------------------------------------------------------
 
     def take_delta(self) -> MapDelta:
-        """What changed since the last call."""
+        """Changes since the last call."""
         kf = np.array(sorted(self._changed_kf), np.int64)
         kf = kf[self.keyframes.alive[kf]]
         gone = np.array(self._culled_kf, np.int64)
@@ -416,7 +416,7 @@ class Map:
         return MapDelta(kf, self.keyframes.map_T_kf[kf], *culled, pt, self.points.xyz[pt])
 
     def snapshot(self) -> MapSnapshot:
-        """Everything that lives."""
+        """Copy of the living keyframes, points and observations."""
         kfs, pts, table = self.living_keyframes(), self.living_points(), self.observations
         pts = pts[np.argsort(self.points.pt_id[pts])]
         kf_index = np.full(len(self.keyframes), -1, np.int64)

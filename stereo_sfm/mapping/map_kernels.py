@@ -1,4 +1,4 @@
-"""Compiled walks over the observation lists of a map's points (mapping/map.py)."""
+"""Compiled loops over the observation lists of a map's points (mapping/map.py)."""
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false
 
@@ -58,7 +58,7 @@ def count_by_keyframe(points, head, following, obs_kf, counts):
 
 @njit
 def shared(row, first, count, head, following, obs_pt, obs_kf):
-    """(N,) keyframes that share points with keyframe `row`, as they are found, and (N,) how many points."""
+    """(N,) keyframes that share points with keyframe `row`, unordered, and (N,) the number of points."""
     counts, found = np.zeros(first.shape[0], np.int64), np.empty(first.shape[0], np.int64)
     n = 0
     for o in range(first[row], first[row] + count[row]):
@@ -150,7 +150,7 @@ def follow(rows, fused_into):
 
 @njit
 def anchor_anew(points, head, following, obs_kf, anchor):
-    """Points go with the oldest keyframe that sees them, where one does."""
+    """Anchors of points: the oldest keyframe that observes them, if any."""
     for i in range(points.shape[0]):
         o = head[points[i]]
         oldest = obs_kf[o] if o >= 0 else anchor[points[i]]
@@ -206,7 +206,7 @@ def judge_points(points, head, following, obs_kf, uv_left, uv_right, sigma, rot,
             d0, d1, d2 = xyz[p, 0] - pos[k, 0], xyz[p, 1] - pos[k, 1], xyz[p, 2] - pos[k, 2]
             distance = max(math.sqrt(d0 * d0 + d1 * d1 + d2 * d2), 1e-9)
             u0, u1, u2 = d0 / distance, d1 / distance, d2 / distance
-            if first:  # the oldest ray, before the list is walked from its head
+            if first:  # the oldest ray, before the list is traversed from its head
                 f0, f1, f2 = u0, u1, u2
                 first = False
                 o = head[p]
@@ -228,7 +228,7 @@ def judge_points(points, head, following, obs_kf, uv_left, uv_right, sigma, rot,
 
 @njit
 def predict(xyz, anchors, map_T_kf, kf_T_map, right_T_left, cams, uv_left, uv_right):
-    """Fills uv_left and uv_right (N, 2) with where a keyframe should see points; NaN where it would not know them.
+    """Fills uv_left and uv_right (N, 2) with the predicted pixels of points in a keyframe; NaN where not recognisable.
 
     Args:
         xyz: (N, 3) in the map. anchors: (N, 3) where the keyframes stood that saw them first: from less than half or

@@ -1,29 +1,27 @@
 """The mapper: one keyframe (and perhaps a loop) in, exactly one `MapUpdate` out. It alone owns the map.
 
-What the frames mean. Keyframes and points live in the map frame, the tracker's frames in the odometry frame, and
-map_T_odom joins them. It is the identity until a loop is corrected or the whole map adjusted, and changes then only: by
-what the newest keyframe moved, so that the newest points keep their places in the odometry frame and the odometry pose
-does not jump.
+Frames of reference. Keyframes and points are in the map frame, the tracker's frames in the odometry frame; map_T_odom
+relates them. It is the identity until a loop is corrected or the whole map is adjusted, and then changes by the motion
+of the newest keyframe, so that the newest points stay in the odometry frame and the odometry pose does not jump.
 
-What bounds the drift. Local bundle adjustment moves keyframes and points in the map frame. The update carries the moved
-points; the tracker takes them through the inverse of map_T_odom and solves the next frames against them. So the
-odometry frame's origin stays, and the pose goes where the adjusted map says. A point found again by its descriptor is
-fused with the older one: the tracker's track takes over the older point's name and place, and with it the older, less
-drifted part of the map. Where the robot stays, the same old points hold it.
+Drift. Local bundle adjustment moves keyframes and points in the map frame. The update contains the moved points; the
+tracker transforms them by the inverse of map_T_odom and solves the next frames against them. A point re-observed by its
+descriptor is fused with the older one: its track then belongs to the older point, and with it to the older, less
+drifted part of the map. In a place that the robot does not leave, the same old points bound the drift.
 
-A loop that the map knows already (the place was found again before, its two sides share points) only fuses the points
-that it pairs: a robot that passes the same places all day must not pay for them again.
+A loop that the map already contains (an earlier loop closed the same place, its two sides share points) only fuses the
+points that it pairs, so that a robot that passes the same places all day does not repeat the correction.
 
-What bounds the time. A window holds the keyframes nearest to the newest, and as fixed ones those that share most points
-with them: a limited number of each, and with them of points and observations. Of views that are seen again and again a
-few are kept (`culling`). So a keyframe costs the same after hours in the same aisles.
+Time. A window contains the keyframes nearest to the newest and, as fixed ones, those that share most points with them:
+a limited number of each, and with them of points and observations. Of views that are seen again and again a few are
+kept (`culling`). So a keyframe costs the same after hours in the same aisles.
 
-Local windows pass a small error of scale on from one to the next, which only all keyframes together see. So full
-bundle adjustment runs beside the mapping after a loop, and whenever the map has grown by a share. It is a job of arrays
-(`pending_job`) whose answer (`finish_job`) is applied a fixed number of keyframes later, wherever it was computed; if
-nobody brought it by then, the mapper computes it itself. Keyframes made meanwhile move with the one before them.
+Local windows propagate a small error of scale from one to the next that only all keyframes together correct. So a full
+bundle adjustment runs concurrently with mapping after a loop, and whenever the map has grown by a share. It is a job of
+arrays (`pending_job`) whose result (`finish_job`) is applied a fixed number of keyframes later, wherever it was
+computed; without a result by then, the mapper computes it. Keyframes added in between move with the one before them.
 
-The retail paper's mapping (section IV-B) is configuration: association = "previous" (a point is known when the previous
+The retail paper's mapping (section IV-B) is configuration: association = "previous" (a point is known if the previous
 keyframe saw it, else it is new), window_keyframes = 0 (all connected keyframes move), redundant_share = 2 (no keyframe
 is culled).
 """
@@ -52,21 +50,21 @@ from stereo_sfm.mapping.triangulate import triangulate
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.types import F64, I64, Bool, CalibrationUpdate, Keyframe, LoopResult, MapUpdate, RowErrors
 
-YOUNG = 4  # observations up to which a point is triangulated anew before it is adjusted
-FIRST_WHOLE = 8  # keyframes beyond which full bundle adjustments begin
-GROWN_CLOSED = 1.1  # a loop that says nothing new leads to full bundle adjustment when the map has grown by so much
-LAG_SHARE = 0.1  # of the living keyframes: a large bundle gets more time before its answer is due
-RECENT = 3  # newest keyframes: whose points are judged, and which are never redundant
+MAX_TRIANGULATED = 4  # observations up to which a point is triangulated anew before each adjustment
+FIRST_FULL_BUNDLE = 8  # keyframes of the first full bundle adjustment
+GROWTH_AT_KNOWN_LOOP = 1.1  # growth of the map after which a known loop starts a full bundle adjustment
+LAG_SHARE = 0.1  # of the living keyframes: a large bundle gets more time before its result is due
+RECENT = 3  # newest keyframes, whose points are checked and which are never redundant
 
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """Work that may be done elsewhere: `run_job`."""
+    """A full bundle adjustment for `run_job`, possibly in another process."""
 
     rig: Rig
     config: BundleConfig
     window: window.Window
-    newest: int  # keyframe row that was the newest when the job was made
+    newest: int  # row of the newest keyframe when the job was created
 
 
 def run_job(job: Job) -> BundleResult:
@@ -85,9 +83,11 @@ class Mapper:
         loop_config: LoopConfig | None = None,
         calibration: SelfCalibration | None = None,
     ) -> None:
-        """Empty map; `loop_config` says how an accepted loop is spread over the keyframes.
+        """Empty map.
 
-        `calibration` says when the rig should change; None: never.
+        Args:
+            loop_config: how an accepted loop is distributed over the keyframes.
+            calibration: estimates corrections of the rig; None: the rig stays.
         """
         self._config, self._rig, self._spans = config, rig, spans or NoSpans()
         self._source_rig, self._calibration = rig, calibration
@@ -99,24 +99,24 @@ class Mapper:
         self._map_T_odom: F64 = np.eye(4)
         self._version = 0
         self._culled: list[I64] = []
-        self._fused: list[tuple[int, int]] = []  # rows (gone, stays)
+        self._fused: list[tuple[int, int]] = []  # rows (removed, kept)
         self._adjusted: I64 = np.zeros(0, np.int64)  # point rows of the last window
         self._thin: I64 = np.zeros(0, np.int64)  # point rows with too few observations that may still get more
         self._loops: list[LoopResult] = []
         self._refused: list[int] = []  # kf_ids whose loops contradict the rest of the map
         self._job: Job | None = None
         self._job_due = -1
-        self._whole = FIRST_WHOLE  # living keyframes at the last full bundle adjustment
+        self._size_at_full_bundle = FIRST_FULL_BUNDLE  # living keyframes at the last full bundle adjustment
         self._job_taken = False
-        self._answer: BundleResult | None = None
+        self._result: BundleResult | None = None
 
     # -- messages ----------------------------------------------------------------------------------------------------
 
     def step(self, keyframe: Keyframe, loop: LoopResult | None = None) -> MapUpdate:
-        """Put a keyframe into the map and improve the map around it.
+        """Insert a keyframe and adjust the map around it.
 
         Args:
-            keyframe: the newest. loop: the loop closer's answer to an earlier keyframe, or none.
+            keyframe: the newest. loop: the loop closer's result for an earlier keyframe, or none.
         """
         self._version += 1
         if not self._config.enabled:
@@ -140,15 +140,15 @@ class Mapper:
             self._cull(row)
         self._bundle_when_grown(self._config.full_ba_growth)
         update = self._update(keyframe.kf_id)
-        if self._job is None and self.map.mostly_gone:
+        if self._job is None and self.map.mostly_removed:
             self._thin = np.unique(self.map.compact()[self._thin])
         return update
 
     def finish(self, loops: Sequence[LoopResult]) -> MapUpdate | None:
-        """After the last keyframe: loops that no keyframe brought any more, and the work in the background.
+        """After the last keyframe: remaining loops and the work in the background.
 
         Returns:
-            A last update, or None when there is nothing to say.
+            The last update, or None without a map.
         """
         if not self._config.enabled or not len(self.map.keyframes):
             return None
@@ -201,11 +201,11 @@ class Mapper:
 
     @property
     def rig(self) -> Rig:
-        """The rig that the map is true of: corrected, where that was found necessary."""
+        """The rig of the map, with the corrections estimated so far."""
         return self._rig
 
     def _revise(self, revision: Revision | None) -> None:
-        """The rig changes: points move to where it sees them, and all keyframes are adjusted to that."""
+        """Correct the rig: points move to their positions with the new rig, and a full bundle adjustment follows."""
         if revision is None:
             return
         assert self._calibration is not None
@@ -225,16 +225,16 @@ class Mapper:
     # -- loops -------------------------------------------------------------------------------------------------------
 
     def _close(self, loop: LoopResult) -> None:
-        """Correct the map for a loop that the pose graph believes, and order a full bundle adjustment."""
-        told, loop = loop, self._between_living(loop)
+        """Correct the map for a loop that the pose graph accepts, and start a full bundle adjustment."""
+        received, loop = loop, self._between_living(loop)
         if loop.candidate_kf_id == loop.kf_id or loop_is_known(self.map, loop, self._config.connected_points):
             self._fused += fuse_pairs(self.map, loop.matches, self._config.match_sigma_px)
-            self._bundle_when_grown(GROWN_CLOSED)
+            self._bundle_when_grown(GROWTH_AT_KNOWN_LOOP)
             return
         before = self.map.keyframes.map_T_kf[-1].copy()
         correction = apply_loop(self.map, loop, self._loops, self._loop_config, self._config.match_sigma_px)
         if not correction.applied:
-            self._refused.append(told.kf_id)
+            self._refused.append(received.kf_id)
             return
         self._loops.append(loop)
         self._fused += correction.fused
@@ -242,20 +242,20 @@ class Mapper:
         self._order_full_bundle()
 
     def _bundle_when_grown(self, factor: float) -> None:
-        """Order a full bundle adjustment once the map has grown by a factor since the last."""
-        if self._job is None and len(self.map.living_keyframes()) >= factor * self._whole:
-            self._order_full_bundle()
+        """Start a full bundle adjustment if the map has grown by a factor since the last."""
+        if self._job is None and len(self.map.living_keyframes()) >= factor * self._size_at_full_bundle:
+            self._start_full_bundle()
 
-    def _order_full_bundle(self) -> None:
+    def _start_full_bundle(self) -> None:
         part = window.whole_map(self.map)
         self._job = Job(self._rig, window.bundle_config(self._config), part, len(self.map.keyframes) - 1)
-        self._job_taken, self._answer = False, None
+        self._job_taken, self._result = False, None
         lag = max(self._config.full_ba_lag_keyframes, round(LAG_SHARE * len(self.map.living_keyframes())))
         self._job_due = len(self.map.keyframes) + lag
-        self._whole = len(self.map.living_keyframes())
+        self._size_at_full_bundle = len(self.map.living_keyframes())
 
     def _between_living(self, loop: LoopResult) -> LoopResult:
-        """The same loop between the living keyframes that carry its two ends, where one was culled meanwhile."""
+        """The loop between the living keyframes that carry its two ends, if one of them was culled."""
         keyframes = self.map.keyframes
         rows = [self.map.kf_row(loop.candidate_kf_id), self.map.kf_row(loop.kf_id)]
         ends = [row if keyframes.alive[row] else int(keyframes.carrier[row]) for row in rows]
@@ -264,45 +264,45 @@ class Mapper:
         offset = [np.eye(4) if e == r else keyframes.carrier_T_kf[r] for e, r in zip(ends, rows, strict=True)]
         ids, candidate_T_kf = keyframes.kf_id[ends].tolist(), offset[0] @ loop.candidate_T_kf @ se3.inverse(offset[1])
         matches = loop.matches
-        if ids[0] > ids[1]:  # the candidate's carrier is the younger of the two: a loop looks back
+        if ids[0] > ids[1]:  # the candidate's carrier is the newer one: swap, the candidate is the older keyframe
             ids, candidate_T_kf, matches = ids[::-1], se3.inverse(candidate_T_kf), matches[:, ::-1]
         return dataclasses.replace(
             loop, candidate_kf_id=ids[0], kf_id=ids[1], candidate_T_kf=candidate_T_kf, matches=matches
         )
 
     def _follow_newest(self, before: F64) -> None:
-        """The odometry frame goes with the newest keyframe, whose map_T_kf was `before`."""
+        """Move the odometry frame with the newest keyframe, whose map_T_kf was `before`."""
         moved = self.map.keyframes.map_T_kf[-1] @ se3.inverse(before)
         self._map_T_odom = se3.orthonormalize(moved @ self._map_T_odom)
 
     @property
     def job_due(self) -> bool:
-        """Whether the next `step` applies the answer of the job in the background."""
+        """Whether the next `step` applies the result of the job in the background."""
         return self._job is not None and len(self.map.keyframes) >= self._job_due
 
     def pending_job(self) -> Job | None:
-        """The full bundle adjustment that nobody has taken yet, once."""
+        """The full bundle adjustment to compute, returned once."""
         if self._job is None or self._job_taken:
             return None
         self._job_taken = True
         return self._job
 
     def finish_job(self, result: BundleResult) -> None:
-        """Bring the answer of the job taken last. It counts when it is due, not before."""
-        self._answer = result
+        """Deliver the result of the job taken last; it is applied when it is due, not before."""
+        self._result = result
 
     def snapshot(self) -> MapSnapshot:
         """The living map."""
         return self.map.snapshot()
 
     def place(self, saved: MapSnapshot) -> LoopResult | None:
-        """Nowhere: this mapper began with no saved map."""
+        """None: this mapper started without a saved map."""
         return None
 
     def _apply_job(self) -> None:
         assert self._job is not None
-        job, result = self._job, self._answer or run_job(self._job)
-        self._job, self._answer = None, None
+        job, result = self._job, self._result or run_job(self._job)
+        self._job, self._result = None, None
         after = self.map.keyframes.map_T_kf.copy()
         newest = after[job.newest].copy()
         after[job.window.kf_rows] = result.world_T_kf
@@ -327,8 +327,8 @@ class Mapper:
             return
         seen = self._seen_by(row)
         count = self.map.points.obs_count[seen]
-        young = seen[(count > 1) & (count <= YOUNG)]
-        self.map.move_points(young, triangulate(self.map, self._rig, young))
+        recent = seen[(count > 1) & (count <= MAX_TRIANGULATED)]
+        self.map.move_points(recent, triangulate(self.map, self._rig, recent))
         part = window.covisible_window(self.map, row, self._config)
         self._adjusted = part.pt_rows
         result = bundle_adjust(self._rig, part.bundle, window.bundle_config(self._config))
@@ -349,11 +349,11 @@ class Mapper:
         self._thin = rows[points.alive[rows] & (points.obs_count[rows] < self._config.min_observations)]
 
     def _seen_by(self, row: int) -> I64:
-        """Point rows that a keyframe sees."""
+        """Point rows that a keyframe observes."""
         return self.map.observations.pt[self.map.observations_of_keyframe(row)].astype(np.int64)
 
     def _protected(self) -> Bool:
-        """(K,) keyframes that stay: the first, the newest, those that loops join."""
+        """(K,) keyframes that must stay: the first, the newest and the ends of loops."""
         ends = [self.map.kf_row(k) for x in self._loops for k in (x.candidate_kf_id, x.kf_id)]
         protected = np.zeros(len(self.map.keyframes), bool)
         protected[[0, *ends]] = True

@@ -1,8 +1,8 @@
 """Keyframe optimisation as a pose graph (the retail paper's equation 22), robust against false loops.
 
 The paper minimises |K_i - i_T_j K_j| over all edges with Levenberg-Marquardt; here an edge's error is the logarithm
-of the same difference, weighed by how well the edge is known, and loops must earn their weight: graduated
-non-convexity (Yang et al., RA-L 5, 2020) keeps the edges of the walk and drops loops that contradict them.
+of the same difference, weighted by its covariance, and loops have robust weights: graduated non-convexity (Yang et al.,
+RA-L 5, 2020) keeps the edges of the odometry and drops loops that contradict them.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Edges:
     j: I64  # (E,)
     i_T_j: F64  # (E, 4, 4)
     sigmas: F64  # (E, 2) metres, radians
-    loop: Bool  # (E,) may be false
+    loop: Bool  # (E,) loops, which may be false; the others are odometry
 
     def __len__(self) -> int:
         return len(self.i)
@@ -36,10 +36,10 @@ class Edges:
 
 @dataclass(frozen=True, eq=False)
 class PoseGraphResult:
-    """Refined poses, and how much each edge counts in the end."""
+    """Refined poses, and the final weight of each edge."""
 
     poses: F64  # (K, 4, 4)
-    weights: F64  # (E,) 1 for edges of the walk, in [0, 1] for loops
+    weights: F64  # (E,) 1 for edges of the odometry, in [0, 1] for loops
     error: float
 
 
@@ -55,7 +55,7 @@ def join(edges: list[Edges]) -> Edges:
 
 
 def edges_of_poses(poses: F64, i: I64, j: I64, metres_per_metre: float, radians_per_metre: float) -> Edges:
-    """Edges that hold what the poses (K, 4, 4) say now; uncertainty grows with the distance between the two."""
+    """Edges of the current relative poses (K, 4, 4); uncertainty grows with the distance between the two."""
     relative = se3.inverse(poses[i]) @ poses[j]
     length = np.linalg.norm(relative[:, :3, 3], axis=1)
     turn = np.linalg.norm(se3.log(relative)[:, 3:], axis=1) if len(i) else np.zeros(0)
@@ -86,7 +86,7 @@ def optimise(poses: F64, edges: Edges, fixed: I64, robust: str = "gnc") -> PoseG
         result, weights = _graduated(gtsam, plain, values, edges)
     else:
         result, weights = _levenberg(gtsam, plain, values), np.ones(len(edges))
-        if robust == "switchable" and edges.loop.any():  # from the least-squares answer, where no true loop is far off
+        if robust == "switchable" and edges.loop.any():  # start from least squares: no true loop is far off
             result = _levenberg(gtsam, _graph(gtsam, edges, fixed, values, robust=True), result)
             loops = np.flatnonzero(edges.loop)
             weights[loops] = [_switch(2 * plain.at(int(e)).error(result)) for e in loops]
@@ -117,7 +117,7 @@ def _levenberg(gtsam: Any, graph: Any, values: Any) -> Any:
 
 
 def _graduated(gtsam: Any, graph: Any, values: Any, edges: Edges) -> tuple[Any, F64]:
-    """Graduated non-convexity with a truncated loss; edges of the walk are known to be true."""
+    """Graduated non-convexity with a truncated loss; edges of the odometry are known inliers."""
     params = gtsam.GncLMParams(gtsam.LevenbergMarquardtParams())
     params.setLossType(gtsam.GncLossType.TLS)
     params.setKnownInliers([k for k in range(graph.size()) if k >= len(edges) or not edges.loop[k]])

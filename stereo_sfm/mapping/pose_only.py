@@ -1,4 +1,4 @@
-"""One camera against points that stay: what bundle adjustment minimises, for a single pose, in one compiled loop."""
+"""Pose of one keyframe from fixed points: the cost of bundle adjustment for a single pose, in one compiled loop."""
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false
 
@@ -37,7 +37,7 @@ def _model(pose, points, kf, pt, uv_left, uv_right, weights, use, limit, cams, r
 def _descend(
     pose, points, kf, pt, uv_left, uv_right, weights, use, cams, right_r, right_t, huber, rounds, iterations, lin, other
 ):
-    """Levenberg-Marquardt on pose (4, 4), in place, outliers left out from the second round on.
+    """Levenberg-Marquardt on pose (4, 4), in place, without outliers from the second round on.
 
     Returns:
         (M, 2) squared normalised residuals in the end.

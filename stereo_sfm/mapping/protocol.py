@@ -1,4 +1,4 @@
-"""What every mapper is."""
+"""The protocol of mappers."""
 
 from __future__ import annotations
 

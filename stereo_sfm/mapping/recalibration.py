@@ -1,4 +1,4 @@
-"""What a corrected rig does to the map: observations of before a step, and points where the new rig sees them."""
+"""Changes of the map after a correction of the rig: observations from before a step, and positions of points."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from stereo_sfm.types import I64
 
 
 def recalibrate(map_: Map, before: Rig, after: Rig, since_row: int) -> None:
-    """Points move to where `after` sees them; poses stay for the bundle adjustment that must follow.
+    """Move points to their positions with the rig `after`; poses stay for the bundle adjustment that must follow.
 
     Args:
         map_: changed in place.
         before, after: the rig until now and from now on.
-        since_row: first keyframe row that `after` is true of. What keyframes before it saw is rewritten as `after`
-            would have seen the same points, so that one rig is true of the whole map.
+        since_row: first keyframe row of the rig `after`. Observations of earlier keyframes are rewritten as `after`
+            would have made them, so that one rig is valid for the whole map.
     """
     if since_row > 0:
         _rewrite(map_, before, after, since_row)
@@ -31,7 +31,7 @@ def recalibrate(map_: Map, before: Rig, after: Rig, since_row: int) -> None:
 
 
 def _rewrite(map_: Map, before: Rig, after: Rig, since_row: int) -> None:
-    """Right pixels of older keyframes go where the other rig puts their points; what they erred by stays."""
+    """Move right pixels of older keyframes to their projections by the other rig; residuals stay."""
     assert before.right is not None and after.right is not None
     table = map_.observations
     obs: I64 = np.flatnonzero((table.pt >= 0) & (table.kf < since_row) & np.isfinite(table.uv_right[:, 0]))

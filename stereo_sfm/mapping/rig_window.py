@@ -1,10 +1,10 @@
-"""What the keyframes of a short stretch say about the rig that saw them.
+"""Information about the rig from a few consecutive keyframes.
 
-A bundle adjustment of its own: the window's keyframes, the points that its first keyframe sees with both cameras, and
+A separate bundle adjustment of the window's keyframes, the points that its first keyframe sees with both cameras, and
 six terms of the rig (`calib.choice`): rotation of the right camera, direction of the baseline, focal length of the
-right camera against the left. Only what all keyframes and both cameras agree on counts, so disparity (which trades
-with the motion) is judged too. The answer is the information about the terms alone, points and motion eliminated;
-those of several windows add up.
+right camera relative to the left. Points and motion are unknowns too, so errors of disparity, which are correlated with
+the motion, are estimated as well. The result is the information about the terms with points and motion eliminated; that
+of several windows is summed.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from stereo_sfm.geometry.stereo import rectifying_rotations
 from stereo_sfm.mapping import rig_window_kernels
 from stereo_sfm.types import F64, I64, Keyframe
 
-LEAST_POINTS = 20
-MOST_POINTS = 160
+MIN_POINTS = 20
+MAX_POINTS = 160
 STEPS = 4  # of Gauss-Newton
-INFLATION = 2.0  # matches err together: their deviation counts so many times, as in `calib.consistency`
-NOISE_PX = 0.05, 5.0  # of one coordinate
-# One standard deviation of what may be wrong before any image is seen: radians, radians, ratio.
+INFLATION = 2.0  # factor on the deviation of the matches' errors, which are correlated, as in `calib.consistency`
+NOISE_PX = 0.05, 5.0  # limits of the estimated noise of one coordinate
+# Prior standard deviations of the terms: radians, radians, ratio.
 PRIOR = np.array([0.01, 0.01, 0.01, 0.005, 0.005, 0.005])
 
-# Radians and ratio a radian of turning that a lens may pretend: a point that crosses the image meets all its errors.
-TURNED = np.array([0.0, 0.003, 0.0, 0.0, 0.0, 0.0015])
-# px at the image's border, of `_shapes`: what no lens model is better than.
+# Apparent change of the terms by errors of the lens model, in radians and ratio per radian that the camera turns.
+LENS_ERROR_PER_RADIAN = np.array([0.0, 0.003, 0.0, 0.0, 0.0, 0.0015])
+# Prior standard deviations of `_shapes`, px at the image's border.
 LENS_PRIOR = np.array([6.0, 2.0, 2.0, 2.0, *[0.5] * 6])
 
 
@@ -47,17 +47,18 @@ class RigInformation:
     def __add__(self, other: RigInformation) -> RigInformation:
         return RigInformation(self.matrix + other.matrix, self.vector + other.vector)
 
-    def doubted(self, angle: float) -> RigInformation:
-        """Less about what a lens that is not quite its model pretends when the camera turns by `angle` radians."""
-        sigma = TURNED[TURNED > 0] * max(angle, 1e-3)
-        columns = self.matrix[:, TURNED > 0]
-        lost = columns @ np.linalg.inv(columns[TURNED > 0] + np.diag(sigma**-2))
-        return RigInformation(self.matrix - lost @ columns.T, self.vector - lost @ self.vector[TURNED > 0])
+    def with_lens_error(self, angle: float) -> RigInformation:
+        """Less information, for errors of the lens model while the camera turns by `angle` radians."""
+        affected = LENS_ERROR_PER_RADIAN > 0
+        sigma = LENS_ERROR_PER_RADIAN[affected] * max(angle, 1e-3)
+        columns = self.matrix[:, affected]
+        lost = columns @ np.linalg.inv(columns[affected] + np.diag(sigma**-2))
+        return RigInformation(self.matrix - lost @ columns.T, self.vector - lost @ self.vector[affected])
 
 
 @dataclass(frozen=True, eq=False)
 class RigWindow:
-    """One window's answer."""
+    """The result of one window."""
 
     first_kf_id: int
     last_kf_id: int
@@ -80,10 +81,10 @@ class _Problem:
 
 
 def solve_window(rig: Rig, keyframes: Sequence[Keyframe], terms: F64) -> RigWindow | None:
-    """What the keyframes say, or None where they see too little together.
+    """The information of a window, or None if its keyframes have too few common points.
 
     Args:
-        rig: as its calibration says. keyframes: in order of time. terms: (6,) what is known of the terms, to start at.
+        rig: the calibrated rig. keyframes: in order of time. terms: (6,) initial corrections.
     """
     problem = _problem(with_terms(rig, terms), keyframes)
     if problem is None:
@@ -97,7 +98,7 @@ def solve_window(rig: Rig, keyframes: Sequence[Keyframe], terms: F64) -> RigWind
             return None
     system = _System.of(with_terms(rig, terms), problem, sigma, hard=True)
     sigma = float(np.clip(system.noise_px, *NOISE_PX))
-    information = system.information(problem, terms).doubted(_turned(keyframes))
+    information = system.information(problem, terms).with_lens_error(_turned(keyframes))
     last = keyframes[-1]
     return RigWindow(keyframes[0].kf_id, last.kf_id, last.stamp_ns, information, sigma)
 
@@ -107,8 +108,8 @@ def _problem(rig: Rig, keyframes: Sequence[Keyframe]) -> _Problem | None:
     both = np.isfinite(first.uv_left).all(1) & np.isfinite(first.uv_right).all(1)
     later = np.unique(np.concatenate([k.point_ids for k in keyframes[1:]]))
     ids = first.point_ids[both & np.isin(first.point_ids, later)]
-    ids = ids[:: max(1, -(-len(ids) // MOST_POINTS))]
-    if len(ids) < LEAST_POINTS:
+    ids = ids[:: max(1, -(-len(ids) // MAX_POINTS))]
+    if len(ids) < MIN_POINTS:
         return None
     uv_left, uv_right = np.full((2, len(keyframes), len(ids), 2), np.nan)
     for f, keyframe in enumerate(keyframes):
@@ -123,16 +124,16 @@ def _problem(rig: Rig, keyframes: Sequence[Keyframe]) -> _Problem | None:
 
 
 def _turned(keyframes: Sequence[Keyframe]) -> float:
-    """Radians that the camera turned by from keyframe to keyframe, added up."""
+    """Sum of the rotations from keyframe to keyframe in radians."""
     poses = np.array([k.odom_T_cam for k in keyframes])
     return float(np.linalg.norm(se3.log(se3.inverse(poses[:-1]) @ poses[1:])[:, 3:], axis=1).sum())
 
 
 def _shapes(camera: Camera, uv: F64) -> F64:
-    """(..., 2, L) displacements of pixels by what both lenses may share, one pixel at the image's border.
+    """(..., 2, L) displacements of pixels by errors that both lenses may share, one pixel at the image's border.
 
     Magnification, the first radial order, a shift and the second orders: they bend the flow of a turning camera, which
-    would pass for a disparity.
+    is similar to an error of disparity.
     """
     x, y = 2 * uv[..., 0] / camera.width - 1, (2 * uv[..., 1] - camera.height) / camera.width
     r2, one, zero = x * x + y * y, np.ones_like(x), np.zeros_like(x)
@@ -143,7 +144,7 @@ def _shapes(camera: Camera, uv: F64) -> F64:
 
 @dataclass(frozen=True, eq=False)
 class _System:
-    """Normal equations of the terms with everything else eliminated, and the way back."""
+    """Normal equations of the terms with the other unknowns eliminated, and their back-substitution."""
 
     matrix: F64  # (S, S) of the rig's terms and the lens's
     gradient: F64  # (S,)
@@ -155,7 +156,7 @@ class _System:
 
     @staticmethod
     def of(rig: Rig, problem: _Problem, sigma: float, hard: bool) -> _System:
-        """At the problem's present state."""
+        """The system at the problem's present state."""
         assert rig.right is not None
         count, frames = len(problem.rho), len(problem.frame_T_first)
         shared = TERMS + len(problem.lens)
@@ -208,7 +209,7 @@ class _System:
 
 
 def _noise(squares: F64, rows: I64) -> float:
-    """Noise of one coordinate: median over the points of what their rows keep, freed of the median's bias.
+    """Noise of one coordinate: median over the points of their residuals, corrected for the median's bias.
 
     A point's three unknowns leave k of its rows free; the median of chi-squared with k degrees of freedom is
     k (1 - 2 / 9k)^3 (Wilson and Hilferty, PNAS 17, 1931).

@@ -1,7 +1,8 @@
-"""How well the rig fits what is seen, live: how far matches are from their epipolar curves, by region, and the trend.
+"""Online check of the calibration: distances of stereo matches from their epipolar curves by region, and their trend.
 
-Noise has no side, so the median of a region is what the calibration is wrong by there. A slow and a fast average over
-the keyframes tell whether it grows. Disparity does not show in it (`mapping.self_calibration` sees that too).
+Noise is symmetric, so the median of a region is the calibration's error there. The difference of a fast and a slow
+average over the keyframes shows whether it grows. Errors of disparity are not visible (`mapping.self_calibration`
+estimates them too).
 """
 
 from __future__ import annotations
@@ -13,28 +14,28 @@ from stereo_sfm.geometry.stereo import epipolar_angle
 from stereo_sfm.types import F64, Keyframe, RowErrors
 
 GRID = (3, 4)  # rows and columns of regions
-FAST, SLOW = 0.2, 0.04  # share of the newest keyframe in the averages
-LEAST = 5  # matches of a region
-WARN_PX = 0.5  # of the systematic part: from 1 px on matches are lost
+FAST_SHARE, SLOW_SHARE = 0.2, 0.04  # weight of the newest keyframe in the averages
+MIN_MATCHES = 5  # of a region
+WARN_PX = 0.5  # of the systematic part; from 1 px on matches are lost
 
 
 class RowMonitor:
-    """Takes the keyframes of a run in order."""
+    """Row errors of the keyframes of a run, in order."""
 
     def __init__(self, rig: Rig) -> None:
         """`rig`: two cameras."""
         self.use(rig)
 
     def use(self, rig: Rig) -> None:
-        """From now on with this rig: what was seen with another is forgotten."""
+        """Start again with another rig."""
         self._rig = rig
         self._fast: F64 = np.full(GRID, np.nan)
         self._slow: F64 = np.full(GRID, np.nan)
 
     def add(self, keyframe: Keyframe) -> RowErrors:
-        """What is known after this keyframe."""
+        """The averages after this keyframe."""
         now = self._regions(keyframe)
-        self._fast, self._slow = _averaged(self._fast, now, FAST), _averaged(self._slow, now, SLOW)
+        self._fast, self._slow = _averaged(self._fast, now, FAST_SHARE), _averaged(self._slow, now, SLOW_SHARE)
         systematic, before = _size(self._fast), _size(self._slow)
         return RowErrors(
             keyframe.kf_id, keyframe.stamp_ns, self._fast.ravel().copy(), systematic, systematic - before,
@@ -53,7 +54,7 @@ class RowMonitor:
         out = np.full(GRID[0] * GRID[1], np.nan)
         for k in range(len(out)):
             here = error[region == k]
-            if len(here) >= LEAST:
+            if len(here) >= MIN_MATCHES:
                 out[k] = np.median(here)
         return out.reshape(GRID)
 
@@ -64,6 +65,6 @@ def _averaged(before: F64, now: F64, share: float) -> F64:
 
 
 def _size(regions: F64) -> float:
-    """Root mean square over the regions that were seen; 0 where none was."""
+    """Root mean square over the regions with matches; 0 without any."""
     known = regions[np.isfinite(regions)]
     return float(np.sqrt((known**2).mean())) if len(known) else 0.0

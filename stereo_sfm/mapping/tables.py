@@ -1,4 +1,4 @@
-"""The columns of the map (mapping/map.py): keyframes, points, and which keyframe saw which point where."""
+"""The columns of the map (mapping/map.py): keyframes, points and observations."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from stereo_sfm.types import F32, F64, I32, I64, U8, Bool
 
 
 class KeyframeTable(Columns):
-    """One row a keyframe."""
+    """One row for each keyframe."""
 
     kf_id: I64
     frame_id: I64
@@ -21,7 +21,7 @@ class KeyframeTable(Columns):
     previous: I64  # row of the keyframe before it in the same submap, -1: none
     obs_first: I64  # first row of its observations
     obs_count: I64  # observations made, of which some may have been removed since
-    carrier: I64  # of a culled keyframe: the row of the one it moves with, -1 while it lives
+    carrier: I64  # of a culled keyframe: the row of the one it moves with, -1 if alive
     carrier_T_kf: F64  # (K, 4, 4)
     alive: Bool
 
@@ -41,17 +41,17 @@ class KeyframeTable(Columns):
 
 
 class PointTable(Columns):
-    """One row a physical point."""
+    """One row for each physical point."""
 
     pt_id: I64
     xyz: F64  # (P, 3) map frame, NaN until it is triangulated
     anchor: I32  # keyframe row that carries the point when keyframes are corrected
     head: I32  # newest observation, -1: none
     obs_count: I32
-    seen: I32  # keyframes that saw it
-    expected: I32  # keyframes in whose view it lay
-    last_seen: I32  # newest keyframe row that saw it
-    descriptor_obs: I32  # observation whose descriptor stands for the point, -1: none has one
+    seen: I32  # number of keyframes that observed it
+    expected: I32  # number of keyframes in whose view it was
+    last_seen: I32  # newest keyframe row that observed it
+    descriptor_obs: I32  # observation whose descriptor represents the point, -1: none
     sigma: F32  # px, noise of its next observation
     fused_into: I32  # row of the point that replaced it, -1: none
     alive: Bool
@@ -73,7 +73,7 @@ class PointTable(Columns):
 
 
 class ObservationTable(Columns):
-    """One row an observation: which keyframe saw which point where."""
+    """One row for each observation of a point in a keyframe."""
 
     kf: I32  # keyframe row
     pt: I32  # point row, -1 when the observation was removed

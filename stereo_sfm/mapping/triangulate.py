@@ -1,8 +1,8 @@
-"""Points from their observations, the keyframes given: what bundle adjustment needs to start near the minimum.
+"""Triangulation of points from all their observations with fixed keyframes, as initial values of bundle adjustment.
 
-A point's first depth comes from one pair of eyes and may be far off (a fisheye sees points along its own baseline). The
-first time that several keyframes see it, distances along its first ray are tried from near to far, and the best is
-refined by Levenberg-Marquardt with a Cauchy loss, each point with its own damping.
+A point's first depth comes from one stereo pair and may be far off (a fisheye sees points along its own baseline). When
+several keyframes observe it, distances along its first ray are tried from near to far, and the best is refined by
+Levenberg-Marquardt with a Cauchy loss, each point with its own damping.
 """
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false
@@ -21,13 +21,13 @@ from stereo_sfm.mapping.map import Map
 from stereo_sfm.types import F64, I64
 
 TRIALS = 8  # distances tried
-NEAREST, FARTHEST = 4.0, 4000.0  # baselines (a rig with one eye: of 5 cm)
+NEAREST, FARTHEST = 4.0, 4000.0  # baselines (a rig with one camera: of 5 cm)
 STEPS = 8
 
 
 @njit
 def _accumulate(cam, params, p0, p1, p2, u_obs, v_obs, inv_sigma, m, h, b):
-    """Adds one eye's normal equations in the axes of m (3, 3) = world -> eye. Returns its Cauchy cost."""
+    """Adds one image's normal equations in the axes of m (3, 3) = world -> camera. Returns its Cauchy cost."""
     u, v, j00, j01, j02, j10, j11, j12 = project_one(cam, params, p0, p1, p2)
     if not (math.isfinite(u) and math.isfinite(v)):
         return 10.0
@@ -90,7 +90,7 @@ def refine_points(
     """Improves points (P, 3) in place.
 
     Args:
-        rays, origins: (P, 3) unit first ray and where it starts, world. trials: (T,) metres tried along it.
+        rays, origins: (P, 3) unit first ray and its origin, world. trials: (T,) metres tried along it.
         starts: (P + 1,) first observation of each point. rot, pos: world_T_kf. obs_kf, uv_left, uv_right, sigma:
         (M, ...) sorted by point. cams, right_r, right_t: as in bundle_kernels.linearize.
     """

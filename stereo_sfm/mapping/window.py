@@ -1,6 +1,6 @@
-"""Parts of the map as bundles: the covisible window around a keyframe, or everything.
+"""Parts of the map as bundles: the covisible window around a keyframe, or the whole map.
 
-A point that only one keyframe sees binds nothing: it stays out of the bundle and goes where its keyframe goes.
+A point that only one keyframe observes constrains no pose: it is left out of the bundle and moves with its keyframe.
 """
 
 from __future__ import annotations
@@ -18,29 +18,29 @@ from stereo_sfm.mapping.bundle import Bundle, BundleConfig, BundleResult
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.types import F64, I64, Bool
 
-TIE = 10  # shared points that hold one keyframe to another
+MIN_SHARED_POINTS = 10  # that connect two keyframes
 
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """A bundle and where its rows came from."""
+    """A bundle and the rows of the map that it contains."""
 
     bundle: Bundle
-    kf_rows: I64  # (K,) keyframe rows, those that may move first
-    moving: int  # how many of them may move
+    kf_rows: I64  # (K,) keyframe rows, the moving ones first
+    moving: int  # number of moving ones
     pt_rows: I64  # (P,)
     obs_rows: I64  # (M,)
 
 
 def bundle_config(config: MapperConfig) -> BundleConfig:
-    """How the mapper adjusts its windows."""
+    """The mapper's settings of bundle adjustment."""
     return BundleConfig(config.rounds, config.iterations, config.huber_sigmas, config.cauchy_sigmas, fixed_once=True)
 
 
 def covisible_window(map_: Map, row: int, config: MapperConfig) -> Window:
-    """The keyframe, those that share most points with it, and the points of all of them; others hold these, fixed.
+    """The keyframe, those that share most points with it, and all their points; other keyframes are fixed.
 
-    The map's first keyframe never moves, nor does the oldest keyframe of a part that nothing fixed is connected to.
+    The map's first keyframe is fixed, and so is the oldest keyframe of a part that no fixed keyframe is connected to.
     """
     others, _ = map_.neighbours(row, config.connected_points)
     if not len(others):
@@ -85,12 +85,12 @@ def _window(map_: Map, moving: I64, most_fixed: int | None = None) -> Window:
 
 
 def _floating(map_: Map, kfs: I64, fixed: Bool) -> I64:
-    """The oldest keyframe (index) of every part that too few shared points tie to a fixed one: it must not drift."""
+    """The oldest keyframe (index) of every part that too few shared points connect with a fixed keyframe."""
     index = np.full(len(map_.keyframes), -1, np.int64)
     index[kfs] = np.arange(len(kfs))
     free = np.flatnonzero(~fixed)
-    tied = [index[map_.neighbours(int(kfs[i]), TIE)[0]] for i in free]
-    i, j = np.repeat(free, [len(others) for others in tied]), np.concatenate([np.zeros(0, np.int64), *tied])
+    linked = [index[map_.neighbours(int(kfs[i]), MIN_SHARED_POINTS)[0]] for i in free]
+    i, j = np.repeat(free, [len(others) for others in linked]), np.concatenate([np.zeros(0, np.int64), *linked])
     i, j = i[j >= 0], j[j >= 0]
     edges = scipy.sparse.csr_array((np.ones(len(i), np.int8), (i, j)), shape=(len(kfs),) * 2)
     label = connected_components(edges, directed=False)[1]
@@ -101,7 +101,7 @@ def _floating(map_: Map, kfs: I64, fixed: Bool) -> I64:
 
 
 def write_back(map_: Map, part: Window, result: BundleResult) -> None:
-    """New poses and points of what still lives; eyes that disagree lose their observation."""
+    """Write poses and points of living rows into the map; observations of images that disagree are removed."""
     moved = np.flatnonzero(~part.bundle.fixed & map_.keyframes.alive[part.kf_rows])
     _carry_single_points(map_, part.kf_rows[moved], result.world_T_kf[moved])
     map_.move_keyframes(part.kf_rows[moved], result.world_T_kf[moved])
@@ -115,7 +115,7 @@ def write_back(map_: Map, part: Window, result: BundleResult) -> None:
 
 
 def _carry_single_points(map_: Map, kf_rows: I64, after: F64) -> None:
-    """Points that only one of these keyframes sees go with it."""
+    """Points that only one of these keyframes observes move with it."""
     table, points = map_.observations, map_.points
     for row, pose in zip(kf_rows.tolist(), after, strict=True):
         seen = table.pt[map_.observations_of_keyframe(row)].astype(np.int64)

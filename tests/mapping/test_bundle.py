@@ -1,4 +1,4 @@
-"""Bundle adjustment against exact truth, against GTSAM, and against its own other paths."""
+"""Bundle adjustment against exact truth, against GTSAM, and its solvers against each other."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_sparse_and_dense_solvers_agree(rig: Rig) -> None:
     np.testing.assert_allclose(sparse.world_T_kf, dense.world_T_kf, atol=1e-6)
 
 
-def test_outliers_are_found_and_do_no_harm(rig: Rig) -> None:
+def test_outliers_are_rejected_and_do_not_bias(rig: Rig) -> None:
     scene = make_scene(rig, 10, 600, noise_px=0.5, outliers=0.1)
     clean = make_scene(rig, 10, 600, noise_px=0.5)
     result = bundle_adjust(rig, bundle_of(scene), BundleConfig(rounds=3))
@@ -207,7 +207,7 @@ def test_sigma_weighs_observations(rig: Rig) -> None:
 
 
 def test_undetermined_points_and_keyframes_stay(rig: Rig) -> None:
-    """A point on one ray and a keyframe that sees nothing are no reason to fail."""
+    """A point on one ray and a keyframe without observations are not errors."""
     scene = make_scene(rig, 5, 100)
     bundle = bundle_of(scene)
     keep = (bundle.obs_kf != 3) & (bundle.obs_pt != 7)
@@ -230,11 +230,11 @@ def test_bad_tables_are_refused() -> None:
     bundle = bundle_of(make_scene(rig, 3, 50))
     with pytest.raises(StereoSfmError, match="different lengths"):
         bundle_adjust(rig, dataclasses.replace(bundle, obs_kf=bundle.obs_kf[:-1]))
-    with pytest.raises(StereoSfmError, match="keyframe that is not there"):
+    with pytest.raises(StereoSfmError, match="keyframe that does not exist"):
         bundle_adjust(rig, dataclasses.replace(bundle, obs_kf=bundle.obs_kf + 1))
 
 
-def test_empty_bundle_is_its_own_answer() -> None:
+def test_an_empty_bundle_is_unchanged() -> None:
     rig = pinhole_rig()
     none = np.zeros(0, np.int64)
     bundle = Bundle(
@@ -244,7 +244,7 @@ def test_empty_bundle_is_its_own_answer() -> None:
     assert result.cost == 0.0 and np.array_equal(result.points, bundle.points)
 
 
-def test_a_redescending_loss_is_not_pulled_by_what_errs_to_one_side(rig: Rig) -> None:
+def test_a_redescending_loss_is_not_biased_by_one_sided_errors(rig: Rig) -> None:
     """A fifth of the right pixels errs by two pixels to one side, as at depth edges: the size of the scene stays."""
     scene = make_scene(rig, 6, 300, noise_px=0.3)
     right = scene.uv_right.copy()

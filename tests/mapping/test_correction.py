@@ -22,7 +22,7 @@ def sequence() -> StoreSequence:
 
 
 def raw_map(sequence: StoreSequence) -> Map:
-    """Keyframes where odometry says, points where their first keyframe saw them."""
+    """Keyframes at their odometry poses, points where their first keyframe observed them."""
     map_ = Map()
     for k in sequence.keyframes:
         row = map_.add_keyframe(k, k.odom_T_cam)
@@ -34,7 +34,7 @@ def raw_map(sequence: StoreSequence) -> Map:
 
 
 def true_loop(sequence: StoreSequence, a: int, b: int) -> LoopResult:
-    """The loop between two keyframes as truth has it, with the points that both saw."""
+    """The true loop between two keyframes, with the points that both observe."""
     seen = {sequence.physical[i]: i for i in sequence.keyframes[a].point_ids.tolist()}
     pairs = [
         (seen[sequence.physical[i]], i)
@@ -54,7 +54,7 @@ def true_loop(sequence: StoreSequence, a: int, b: int) -> LoopResult:
 
 
 def ends(sequence: StoreSequence) -> tuple[int, int]:
-    """The last keyframe, and the nearest to it of the first visit."""
+    """The last keyframe, and the nearest one of the first visit."""
     b = len(sequence.keyframes) - 1
     distance = np.linalg.norm(sequence.world_T_kf[:30, :3, 3] - sequence.world_T_kf[b, :3, 3], axis=1)
     return int(distance.argmin()), b
@@ -66,7 +66,7 @@ def trajectory_error(map_: Map, truth: F64) -> float:
     return float(np.sqrt(((here[:, :3, 3] - moved) ** 2).sum(1).mean()))
 
 
-def test_loop_takes_the_drift_away_and_carries_the_points(sequence: StoreSequence) -> None:
+def test_a_loop_removes_the_drift_and_moves_the_points(sequence: StoreSequence) -> None:
     map_ = raw_map(sequence)
     a, b = ends(sequence)
     before = trajectory_error(map_, sequence.world_T_kf)
@@ -111,8 +111,8 @@ def turning_sequence(degrees_per_100m: float, side_m: float = 30.0, step_m: floa
 
 
 @pytest.mark.parametrize("degrees_per_100m", [0.5, 2.0, 5.0])
-def test_a_sequence_whose_heading_drifts_evenly_closes(degrees_per_100m: float) -> None:
-    """Such errors add up: after 120 m the ends are 0.2 to 2.2 m apart, and the true loop is believed."""
+def test_a_true_loop_is_accepted_after_systematic_heading_drift(degrees_per_100m: float) -> None:
+    """Such errors accumulate: after 120 m the ends are 0.2 to 2.2 m apart, and the true loop is accepted."""
     map_, truth = turning_sequence(degrees_per_100m)
     last = len(truth) - 1
     before = trajectory_error(map_, truth)
@@ -148,7 +148,7 @@ def test_false_loop_changes_nothing(sequence: StoreSequence) -> None:
     assert np.array_equal(map_.points.xyz, points, equal_nan=True)
 
 
-def test_averaging_meets_the_loop_exactly(sequence: StoreSequence) -> None:
+def test_averaging_satisfies_the_loop_exactly(sequence: StoreSequence) -> None:
     map_ = raw_map(sequence)
     a, b = ends(sequence)
     loop = true_loop(sequence, a, b)
@@ -168,8 +168,8 @@ def test_unknown_correction_is_refused(sequence: StoreSequence) -> None:
 
 
 @pytest.mark.parametrize("correction", ["pose_graph", "averaging"])
-def test_a_submap_is_brought_to_the_rest_by_the_loop(sequence: StoreSequence, correction: str) -> None:
-    """Tracking restarted somewhere: the second piece begins at an odometry pose that means nothing."""
+def test_a_loop_connects_a_submap_with_the_rest(sequence: StoreSequence, correction: str) -> None:
+    """Tracking restarted: the odometry pose of the second submap is arbitrary."""
     a, b = ends(sequence)
     half = len(sequence.keyframes) // 2
     astray = se3.exp(np.array([5.0, 1, -8, 0.2, 1.0, 0]))

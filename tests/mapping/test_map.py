@@ -57,7 +57,7 @@ def test_points_of_a_snapshot_are_in_order_of_their_ids() -> None:
 
 
 def check(m: Map) -> None:
-    """Lists, counts and covisibility say what the observation table says."""
+    """Lists, counts and covisibility agree with the observation table."""
     table = m.observations
     live = np.flatnonzero(table.pt >= 0)
     for p in range(len(m.points)):
@@ -81,7 +81,7 @@ def check(m: Map) -> None:
 
 
 def edit(m: Map, rng: np.random.Generator) -> None:
-    """Something that a mapper does to a map, any number of times in any order."""
+    """Random operations of a mapper on a map."""
     choice = rng.integers(0, 6)
     next_kf = len(m.keyframes)
     if choice < 3 or next_kf < 2:
@@ -107,7 +107,7 @@ def edit(m: Map, rng: np.random.Generator) -> None:
 
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 10**6))
-def test_random_edits_keep_every_index_true(seed: int) -> None:
+def test_random_edits_keep_every_index_consistent(seed: int) -> None:
     rng = np.random.default_rng(seed)
     m = Map()
     for _ in range(25):
@@ -118,7 +118,7 @@ def test_random_edits_keep_every_index_true(seed: int) -> None:
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 10**6))
 def test_a_compacted_map_is_the_same_map(seed: int) -> None:
-    """The same edits, once with rows taken back now and then: same snapshots, same names, same lists."""
+    """The same edits, once with compaction now and then: same snapshots, ids and lists."""
     a, b = Map(), Map()
     for step in range(40):
         for m in (a, b):
@@ -142,15 +142,15 @@ def test_a_compacted_map_is_the_same_map(seed: int) -> None:
     assert np.array_equal(a.points.pt_id[rows_a[living]], b.points.pt_id[rows_b[living]])
 
 
-def test_rows_are_taken_back_when_most_are_gone() -> None:
+def test_rows_are_freed_when_most_are_removed() -> None:
     m = Map()
     for k in range(40):
         insert(m, keyframe(k, np.arange(200 * k, 200 * k + 200)))
         m.cull_points(m.point_rows(np.arange(200 * k, 200 * k + 150)))
-    assert m.mostly_gone
+    assert m.mostly_removed
     before = m.nbytes
     m.compact()
-    assert not m.mostly_gone
+    assert not m.mostly_removed
     assert m.nbytes < before / 2
 
 
@@ -166,7 +166,7 @@ def test_ids_are_never_used_twice() -> None:
         m.kf_row(9)
 
 
-def test_fused_names_follow_chains() -> None:
+def test_fused_ids_follow_chains() -> None:
     m = Map()
     insert(m, keyframe(0, np.array([0, 1])))
     insert(m, keyframe(1, np.array([2, 3])))
@@ -193,7 +193,7 @@ def test_points_follow_their_anchors() -> None:
     np.testing.assert_allclose(again, local, atol=1e-12)
 
 
-def test_deltas_tell_what_changed_once() -> None:
+def test_deltas_contain_each_change_once() -> None:
     m = Map()
     insert(m, keyframe(0, np.arange(4)))
     delta = m.take_delta()
@@ -220,7 +220,7 @@ def test_culled_keyframe_leaves_the_chain_and_its_points_find_another_anchor() -
     assert (snap.anchors >= 0).all()  # point 10, which nobody sees now, goes with the carrier
 
 
-def test_culled_keyframes_move_with_what_carries_them_and_are_told_once() -> None:
+def test_culled_keyframes_move_with_their_carriers_and_are_reported_once() -> None:
     m = Map()
     for k in range(4):
         insert(m, keyframe(k, np.array([0, 10 + k])))

@@ -21,7 +21,7 @@ CONFIG = MapperConfig()
 
 
 def to_and_fro(count: int, reach: int = 10, step: float = 0.1) -> F64:
-    """(K, 4, 4) somebody who steps sideways along one shelf, again and again."""
+    """(K, 4, 4) poses of a camera that moves sideways along one shelf, again and again."""
     x = np.abs((np.arange(count) + reach) % (2 * reach) - reach) * step
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, 0, 3] = x - x[0]
@@ -34,12 +34,12 @@ def run(stream: KeyframeStream, config: MapperConfig = CONFIG) -> tuple[Mapper, 
 
 
 def error(poses: F64, truth: F64) -> float:
-    """RMSE of positions, metres, no alignment: both start at the first truth."""
+    """RMSE of positions in metres without alignment: both start at the first true pose."""
     return float(np.sqrt(((poses[:, :3, 3] - truth[:, :3, 3]) ** 2).sum(1).mean()))
 
 
 def place(count: int) -> KeyframeStream:
-    """In one place, with points lost and found and some outliers."""
+    """In one place, with points lost and re-observed and some outliers."""
     return keyframe_stream(fisheye_rig(), to_and_fro(count), points=300, track_length=3, per_keyframe=80, outliers=0.02)
 
 
@@ -58,8 +58,8 @@ def test_a_sequence_loses_its_drift(rig: Rig) -> None:
     assert error(mapper.map.keyframes.map_T_kf, stream.world_T_kf) < 0.4 * error(odometry(stream), stream.world_T_kf)
 
 
-def test_points_found_again_bound_the_drift(rig: Rig) -> None:
-    """In one place for long: tracks alone drift on, points found again hold."""
+def test_reobserved_points_bound_the_drift(rig: Rig) -> None:
+    """In one place for long: with tracks alone the drift grows, re-observed points bound it."""
     stream = keyframe_stream(rig, to_and_fro(30), points=300, track_length=2, noise_px=0.6, per_keyframe=60)
     with_matches, _ = run(stream)
     without, _ = run(stream, dataclasses.replace(CONFIG, association="tracks"))
@@ -79,7 +79,7 @@ def test_fused_points_are_truly_one() -> None:
 
 
 def test_updates_alone_rebuild_the_map() -> None:
-    """Whoever applies every update has the mapper's poses and points."""
+    """Applying every update gives the mapper's poses and points."""
     stream = place(20)
     mapper, updates = run(stream)
     poses = KeyframePoses()
@@ -105,7 +105,7 @@ def test_map_and_odometry_are_one_frame_before_a_loop() -> None:
     assert all(np.array_equal(u.map_T_odom, np.eye(4)) for u in updates)
 
 
-def test_where_no_track_connects_odometry_holds(rig: Rig) -> None:
+def test_odometry_is_used_without_connecting_tracks(rig: Rig) -> None:
     stream = keyframe_stream(rig, camera_path(10), broken_at=6)
     mapper, _ = run(stream, dataclasses.replace(CONFIG, association="tracks"))
     step = se3.inverse(mapper.map.keyframes.map_T_kf[5]) @ mapper.map.keyframes.map_T_kf[6]
@@ -113,7 +113,7 @@ def test_where_no_track_connects_odometry_holds(rig: Rig) -> None:
     assert np.linalg.norm(step[:3, 3] - expected[:3, 3]) < 0.02
 
 
-def test_weak_points_go_and_tracked_ones_stay(rig: Rig) -> None:
+def test_weak_points_are_culled_and_tracked_ones_kept(rig: Rig) -> None:
     stream = keyframe_stream(rig, camera_path(14), outliers=0.05)
     mapper, updates = run(stream)
     points = mapper.map.points
@@ -164,10 +164,10 @@ def test_same_keyframes_same_bits() -> None:
             assert bits(getattr(first, field.name)) == bits(getattr(second, field.name)), field.name
 
 
-def test_taking_back_rows_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compaction_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = place(30)
     plain = run(stream)[1]
-    monkeypatch.setattr(Map, "mostly_gone", True)
+    monkeypatch.setattr(Map, "mostly_removed", True)
     compacted, updates = run(stream)
     assert (~compacted.map.points.alive).sum() == 1  # the row that stands for all culled points
     for first, second in zip(plain, updates, strict=True):
@@ -175,7 +175,7 @@ def test_taking_back_rows_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> Non
             assert bits(getattr(first, field.name)) == bits(getattr(second, field.name)), field.name
 
 
-def test_switched_off_it_repeats_odometry() -> None:
+def test_disabled_mapping_repeats_odometry() -> None:
     stream = keyframe_stream(pinhole_rig(), camera_path(5))
     mapper, updates = run(stream, dataclasses.replace(CONFIG, enabled=False))
     assert len(mapper.map.keyframes) == 0
@@ -185,12 +185,12 @@ def test_switched_off_it_repeats_odometry() -> None:
 
 
 def ring(count: int) -> F64:
-    """(K, 4, 4) once round a circle and a little further."""
+    """(K, 4, 4) one lap on a circle and a little further."""
     return camera_path(count, 0.25, 2 * np.pi / (count - 5))
 
 
 def true_loop(stream: KeyframeStream, kf: int, candidate: int) -> LoopResult:
-    """What a perfect loop closer would say."""
+    """The result of a perfect loop closer."""
     old = np.unique(np.concatenate([stream.keyframes[k].point_ids for k in range(candidate - 2, candidate + 3)]))
     new = stream.keyframes[kf].point_ids
     _, i, j = np.intersect1d(stream.truth_of_id[old], stream.truth_of_id[new], return_indices=True)
@@ -207,7 +207,7 @@ def true_loop(stream: KeyframeStream, kf: int, candidate: int) -> LoopResult:
 
 
 def sequence_with_loop(stream: KeyframeStream, elsewhere: bool = False) -> tuple[Mapper, list[MapUpdate]]:
-    """One true loop two keyframes before the end; `elsewhere`: the job is run by somebody else."""
+    """One true loop two keyframes before the end; `elsewhere`: the job is computed outside the mapper."""
     config = dataclasses.replace(CONFIG, full_ba_lag_keyframes=3, full_ba_growth=np.inf, association="tracks")
     mapper, updates = Mapper(config, stream.rig), []
     last = len(stream.keyframes)
@@ -247,7 +247,7 @@ def test_full_adjustment_gives_the_same_bits_wherever_it_runs() -> None:
     assert here.points.xyz.tobytes() == there.points.xyz.tobytes()
 
 
-def test_a_loop_that_the_map_knows_only_fuses(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_known_loop_only_fuses_points(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = keyframe_stream(pinhole_rig(), ring(40), points=800, per_keyframe=100, track_length=3)
     mapper, _ = sequence_with_loop(stream)
     mapper.finish([])
@@ -259,7 +259,7 @@ def test_a_loop_that_the_map_knows_only_fuses(monkeypatch: pytest.MonkeyPatch) -
     assert not loop_is_known(mapper.map, wrong, CONFIG.connected_points)
 
 
-def test_a_loop_that_contradicts_the_map_is_refused_and_told() -> None:
+def test_a_loop_that_contradicts_the_map_is_rejected_and_reported() -> None:
     stream = keyframe_stream(pinhole_rig(), ring(40), points=800, per_keyframe=100, track_length=3)
     mapper, _ = sequence_with_loop(stream)
     mapper.finish([])
@@ -279,7 +279,7 @@ def test_no_limit_of_the_window_takes_all_keyframes() -> None:
 
 
 def test_a_place_keeps_a_bounded_number_of_keyframes() -> None:
-    """To and fro along the same wall: new tracks every time, so no keyframe is redundant by its points."""
+    """Back and forth along one wall: new tracks every time, so no keyframe is redundant by its points."""
     once = camera_path(12, 0.1, 0.0)
     stream = keyframe_stream(pinhole_rig(), np.concatenate([once, once[::-1]] * 6), points=600, track_length=4)
     bounded, _ = run(stream, dataclasses.replace(CONFIG, redundant_share=0.999))

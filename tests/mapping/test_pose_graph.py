@@ -13,7 +13,7 @@ from stereo_sfm.types import F64
 
 
 def ring(count: int = 60) -> tuple[F64, F64]:
-    """Truth of a round sequence that ends where it began, and the same sequence with drifting odometry."""
+    """True poses of a closed lap, and the same lap with drifting odometry."""
     angle = np.linspace(0, 2 * np.pi, count)
     truth = np.array(
         [
@@ -42,7 +42,7 @@ def error(poses: F64, truth: F64) -> float:
 
 
 @pytest.mark.parametrize("robust", ["gnc", "switchable", "none"])
-def test_a_true_loop_takes_the_drift_away(robust: str) -> None:
+def test_a_true_loop_removes_the_drift(robust: str) -> None:
     truth, odom = ring()
     edges = join([chain(odom), loop_edge(0, 59, se3.inverse(truth[0]) @ truth[59])])
     result = optimise(odom, edges, np.array([0]), robust)
@@ -66,7 +66,7 @@ def test_a_false_loop_cannot_bend_the_map(robust: str) -> None:
     assert error(bent.poses, good.poses) > 0.2  # what the robust ways prevent
 
 
-def test_unknown_way_is_refused() -> None:
+def test_an_unknown_method_is_rejected() -> None:
     truth, odom = ring(5)
     with pytest.raises(StereoSfmError, match=r"loop\.robust"):
         optimise(odom, chain(truth), np.array([0]), "hope")
@@ -79,7 +79,7 @@ def test_same_graph_same_bits() -> None:
     assert len(runs) == 1
 
 
-def test_averaging_spreads_an_even_error_exactly() -> None:
+def test_averaging_removes_a_uniform_error_exactly() -> None:
     truth = np.tile(np.eye(4), (20, 1, 1))
     truth[:, 2, 3] = np.arange(20)
     drifted = truth.copy()
@@ -91,7 +91,7 @@ def test_averaging_spreads_an_even_error_exactly() -> None:
     assert np.allclose(out[19], truth[15] @ step, atol=1e-12)  # what comes after the loop moves as one
 
 
-def test_averaging_is_worse_than_the_pose_graph_on_a_round_sequence() -> None:
+def test_averaging_is_worse_than_the_pose_graph_on_a_closed_lap() -> None:
     """As the paper found: the average suits sequences without turns (its STORE2), not these."""
     truth, odom = ring()
     edges = join([chain(odom), loop_edge(0, 59, se3.inverse(truth[0]) @ truth[59])])

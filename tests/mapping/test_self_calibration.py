@@ -1,4 +1,4 @@
-"""A rig that corrects itself: exact keyframes with noise, true and faulty rigs, steps, and what the map makes of it."""
+"""Self-calibration: exact keyframes with noise, true and faulty rigs, steps, and the correction of the map."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def turned(rig: Rig, degrees: tuple[float, float, float]) -> Rig:
 
 
 def keyframes(rigs: list[Rig], believed: Rig, seed: int, noise_px: float = NOISE_PX) -> Iterator[Keyframe]:
-    """What a tracker with `believed` would send of a sequence; keyframe k is seen by rigs[k].
+    """Keyframes of a tracker with the calibration `believed`; keyframe k is observed with rigs[k].
 
     Odometry is off by a few millimetres a step, as if it had drifted.
     """
@@ -77,7 +77,7 @@ def test_a_turned_camera_is_found(name: str, degrees: tuple[float, float, float]
     assert np.abs(left[[0, 2]]).max() < 0.012 and abs(left[1]) < 0.015
 
 
-def test_a_knock_is_noticed_and_what_was_before_stays_as_it_was() -> None:
+def test_a_step_is_detected_and_earlier_keyframes_keep_their_rig() -> None:
     true = RIGS["pinhole"]
     knocked = turned(true, (0.0, 0.2, 0.0))
     estimator, found = revisions([true] * 24 + [knocked] * 16, true, 1)
@@ -91,17 +91,17 @@ def test_the_same_keyframes_give_the_same_bits() -> None:
     assert a.any() and np.array_equal(a, b)
 
 
-def test_a_window_that_turns_counts_less_about_disparity() -> None:
+def test_a_turning_window_has_less_information_about_disparity() -> None:
     from stereo_sfm.mapping.rig_window import solve_window
 
     window = solve_window(RIGS["pinhole"], list(keyframes([RIGS["pinhole"]] * 4, RIGS["pinhole"], 0)), np.zeros(6))
     assert window is not None
-    little, much = (np.diag(np.linalg.inv(window.information.doubted(a).matrix)) for a in (0.01, 1.0))
+    little, much = (np.diag(np.linalg.inv(window.information.with_lens_error(a).matrix)) for a in (0.01, 1.0))
     assert much[1] > 4 * little[1] and much[0] == pytest.approx(little[0], rel=0.3)
 
 
 @pytest.mark.parametrize("mode", ["auto", "off", "only-report"])
-def test_who_is_corrected(mode: str) -> None:
+def test_which_runs_are_corrected(mode: str) -> None:
     config = replace(Config(), self_calibration=SelfCalibrationConfig(mode))
     stereo, mono = RIGS["pinhole"], Rig(RIGS["pinhole"].left)
     assert (SelfCalibration.wanted(config, stereo) is None) == (mode == "off")
@@ -110,8 +110,8 @@ def test_who_is_corrected(mode: str) -> None:
 
 
 @pytest.mark.parametrize("degrees", [(0.2, 0.0, 0.0), (0.0, 0.0, 0.2)])
-def test_the_monitor_sees_rows_that_are_off(degrees: tuple[float, float, float]) -> None:
-    """A turn about x moves all rows by the focal length times it; one about z moves the sides apart."""
+def test_the_monitor_measures_row_errors(degrees: tuple[float, float, float]) -> None:
+    """A rotation about x shifts all rows by focal length times angle; one about z tilts them."""
     true = RIGS["pinhole"]
     monitor = RowMonitor(turned(true, degrees))
     seen = [monitor.add(k) for k in keyframes([true] * 6 + [true] * 6, true, 0)]
@@ -127,8 +127,8 @@ def test_the_monitor_sees_rows_that_are_off(degrees: tuple[float, float, float])
 
 
 @pytest.mark.parametrize("mode", [True, False])
-def test_the_map_is_made_anew_by_the_corrected_rig(mode: bool) -> None:
-    """0.2 degrees about y make a pinhole's path longer or shorter by several per cent; corrected, it has its length."""
+def test_the_map_is_corrected_with_the_rig(mode: bool) -> None:
+    """0.2 degrees about y change the length of the path by several per cent; corrected, it is right."""
     true = RIGS["pinhole"]
     wrong = turned(true, (0.0, 0.2, 0.0))
     mapper = Mapper(MapperConfig(association="tracks"), wrong, calibration=SelfCalibration(wrong, mode))

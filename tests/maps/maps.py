@@ -14,7 +14,7 @@ from tests.loop.store_sequence import StoreSequence, make_sequence
 
 
 def map_of_sequence(sequence: StoreSequence, vocabulary_id: str = "") -> SavedMap:
-    """Every keyframe at its true pose relative to the first; points where their first keyframe saw them."""
+    """Every keyframe at its true pose relative to the first; points where their first keyframe observed them."""
     map_ = Map()
     for k, pose in zip(sequence.keyframes, se3.inverse(sequence.world_T_kf[0]) @ sequence.world_T_kf, strict=True):
         row = map_.add_keyframe(k, pose)
@@ -32,7 +32,7 @@ def small_map(seed: int = 0, noise_px: float = 0.2) -> tuple[StoreSequence, Save
 
 
 def same(a: Any, b: Any) -> bool:
-    """Whether two dataclasses of arrays hold the same bits."""
+    """Whether two dataclasses of arrays have the same bits."""
     return all(
         np.array_equal(x, y, equal_nan=x.dtype.kind == "f") if isinstance(x, np.ndarray) else x == y
         for x, y in ((getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a))

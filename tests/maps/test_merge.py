@@ -1,4 +1,4 @@
-"""Several sequences of one store in one map, and what pruning leaves."""
+"""Several sessions of one store in one map, and pruning."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def merged(maps: list[SavedMap], vocabulary: voc.Vocabulary) -> SavedMap:
     return result.saved
 
 
-def test_merged_map_has_both_sequences_where_they_were(
+def test_a_merged_map_keeps_the_poses_of_both_sessions(
     drives: list[StoreSequence], maps: list[SavedMap], merged: SavedMap
 ) -> None:
     assert len(merged) == sum(map(len, maps))
@@ -67,7 +67,7 @@ def test_merged_map_has_both_sequences_where_they_were(
     assert len(shared) > 100
 
 
-def test_merged_map_names_the_vocabulary_it_was_compared_with(merged: SavedMap, vocabulary: voc.Vocabulary) -> None:
+def test_a_merged_map_names_the_vocabulary_of_the_comparison(merged: SavedMap, vocabulary: voc.Vocabulary) -> None:
     assert merged.vocabulary_id == vocabulary.id
 
 
@@ -96,18 +96,18 @@ def test_wrong_observations_leave_the_map_in_the_full_adjustment(
     assert np.sqrt((error**2).mean()) < 0.02
 
 
-def test_maps_that_share_nothing_are_not_joined(maps: list[SavedMap], vocabulary: voc.Vocabulary) -> None:
+def test_maps_without_common_points_are_not_merged(maps: list[SavedMap], vocabulary: voc.Vocabulary) -> None:
     stranger = map_of_sequence(make_sequence([0], seed=99))
     with pytest.raises(StereoSfmError, match="2 separate maps: no loop joins them"):
         merge([maps[1], stranger], vocabulary, LoopConfig())
 
 
-def test_maps_of_different_cameras_are_not_joined(maps: list[SavedMap]) -> None:
+def test_maps_of_different_cameras_are_not_merged(maps: list[SavedMap]) -> None:
     with pytest.raises(StereoSfmError, match="different cameras"):
         joined([maps[0], dataclasses.replace(maps[1], rig=pinhole_rig())])
 
 
-def test_a_sequence_is_known_again(maps: list[SavedMap], merged: SavedMap) -> None:
+def test_a_session_is_found_in_the_map(maps: list[SavedMap], merged: SavedMap) -> None:
     for saved in maps:
         assert share_a_session(saved, saved)
         assert share_a_session(merged, saved)
@@ -131,7 +131,7 @@ def test_side_by_side_keeps_every_row(maps: list[SavedMap]) -> None:
     assert len(np.unique(both.kf_ids)) == len(both.kf_ids) and len(np.unique(both.pt_ids)) == len(both.pt_ids)
 
 
-def test_prune_by_sessions_forgets_what_the_newest_sequence_did_not_see(merged: SavedMap) -> None:
+def test_prune_by_sessions_removes_points_that_the_newest_session_did_not_observe(merged: SavedMap) -> None:
     pruned = prune(merged, unseen_sessions=1)
     s = pruned.snapshot
     assert 0 < len(s.pt_ids) < len(merged.snapshot.pt_ids)
@@ -193,7 +193,7 @@ def test_prune_refuses_numbers_out_of_range(
     assert not (tmp_path / "p").exists()
 
 
-def test_a_known_place_joins_what_the_search_does_not(
+def test_a_given_place_merges_maps_that_the_search_does_not(
     drives: list[StoreSequence], maps: list[SavedMap], vocabulary: voc.Vocabulary
 ) -> None:
     blind = LoopConfig(min_inliers=10**6)
@@ -224,14 +224,14 @@ def test_a_known_place_joins_what_the_search_does_not(
     assert np.median(error) < 0.1
 
 
-def test_a_merged_map_is_one_piece(merged: SavedMap, maps: list[SavedMap], vocabulary: voc.Vocabulary) -> None:
-    """What joined its sequences is not in the file: with a third map they still count as one."""
+def test_a_merged_map_is_connected(merged: SavedMap, maps: list[SavedMap], vocabulary: voc.Vocabulary) -> None:
+    """The loops between its sessions are not in the file: with a third map they still count as connected."""
     with pytest.raises(StereoSfmError, match="the 2 maps remain 2 separate maps"):
         merge([merged, maps[1]], vocabulary, LoopConfig(min_inliers=10**6))
 
 
 @pytest.mark.parametrize("in_place", [True, False])
-def test_a_merge_that_fails_costs_no_map(
+def test_a_failed_merge_keeps_the_maps(
     tmp_path: Path, drives: list[StoreSequence], maps: list[SavedMap], in_place: bool
 ) -> None:
     save_map(maps[0], tmp_path / "store")

@@ -21,7 +21,7 @@ from tests.maps.maps import map_of_sequence
 
 @pytest.fixture(scope="module")
 def sequence() -> StoreSequence:
-    """Two aisles; the map is made of the first pass through both, the second pass through the first aisle asks."""
+    """Two aisles: the map is of the first pass through both; the second pass through the first aisle is localized."""
     return make_sequence([0, 1, 0], seed=21, max_points=450)
 
 
@@ -49,7 +49,7 @@ def true_pose(sequence: StoreSequence, k: int) -> F64:
     return se3.inverse(sequence.world_T_kf[0]) @ sequence.world_T_kf[k]
 
 
-def test_views_of_the_known_aisle_is_found(sequence: StoreSequence, first_pass: int, relocalizer: Relocalizer) -> None:
+def test_views_of_the_known_aisle_are_found(sequence: StoreSequence, first_pass: int, relocalizer: Relocalizer) -> None:
     errors = []
     asked = range(first_pass + 8, len(sequence.keyframes), 3)
     for k in asked:
@@ -63,7 +63,7 @@ def test_views_of_the_known_aisle_is_found(sequence: StoreSequence, first_pass: 
     assert np.max(errors, axis=0)[0] < 0.05 and np.max(errors, axis=0)[1] < 1.0
 
 
-def test_a_strange_place_is_not_found(sequence: StoreSequence, relocalizer: Relocalizer) -> None:
+def test_an_unknown_place_is_not_found(sequence: StoreSequence, relocalizer: Relocalizer) -> None:
     elsewhere = make_sequence([0], seed=77)
     for keyframe in elsewhere.keyframes[2::8]:
         location = relocalizer.locate(keyframe)
@@ -90,7 +90,7 @@ def test_a_fifth_of_the_products_exchanged(sequence: StoreSequence, first_pass: 
     assert found >= 0.8 * len(asked)
 
 
-def test_no_share_may_be_asked_for(sequence: StoreSequence, first_pass: int, vocabulary: voc.Vocabulary) -> None:
+def test_a_share_of_zero_is_allowed(sequence: StoreSequence, first_pass: int, vocabulary: voc.Vocabulary) -> None:
     part = sequence.first(first_pass)
     config = dataclasses.replace(LoopConfig(), relocalize_share=0.0, min_inlier_share=0.0)
     lenient = Relocalizer(map_of_sequence(part).snapshot, sequence.rig, vocabulary, config)
@@ -134,13 +134,13 @@ def test_localizer_before_it_is_found(sequence: StoreSequence, vocabulary: voc.V
     assert localizer.last is not None and localizer.last.reason
 
 
-def test_same_question_same_bits(sequence: StoreSequence, first_pass: int, relocalizer: Relocalizer) -> None:
+def test_same_keyframe_same_bits(sequence: StoreSequence, first_pass: int, relocalizer: Relocalizer) -> None:
     answers = [relocalizer.locate(sequence.keyframes[first_pass + 10]) for _ in range(2)]
     assert answers[0].map_T_cam.tobytes() == answers[1].map_T_cam.tobytes()
     assert np.array_equal(answers[0].pairs, answers[1].pairs)
 
 
-def test_what_came_before_the_first_answer_is_placed_with_it(
+def test_keyframes_before_the_first_localization_are_placed_with_it(
     sequence: StoreSequence, first_pass: int, vocabulary: voc.Vocabulary
 ) -> None:
     part = sequence.first(first_pass)
@@ -159,7 +159,7 @@ def test_what_came_before_the_first_answer_is_placed_with_it(
 
 
 @pytest.mark.parametrize("astray", [False, True])
-def test_an_answer_of_few_points_needs_a_second_one(
+def test_a_localization_with_few_points_needs_a_second_one(
     sequence: StoreSequence, first_pass: int, vocabulary: voc.Vocabulary, astray: bool
 ) -> None:
     part = sequence.first(first_pass)
@@ -176,7 +176,7 @@ def test_an_answer_of_few_points_needs_a_second_one(
     assert localizer.found != astray
 
 
-def test_a_sequence_goes_on_in_the_frame_of_the_saved_map(
+def test_a_session_continues_in_the_frame_of_the_saved_map(
     sequence: StoreSequence, first_pass: int, vocabulary: voc.Vocabulary
 ) -> None:
     part = sequence.first(first_pass)

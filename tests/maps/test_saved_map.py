@@ -1,4 +1,4 @@
-"""Map folders: round trips to the bit, growing further, and one line for each thing that can be wrong."""
+"""Map folders: round trips to the bit, extension, and one line for each error."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_restored_map_is_the_same_map_and_can_grow(saved: SavedMap) -> None:
     assert map_.neighbours(row)[0][0] == row - 1
 
 
-def test_keyframes_of_a_map_see_its_points_where_they_are(saved: SavedMap) -> None:
+def test_keyframes_of_a_map_observe_its_points_at_their_positions(saved: SavedMap) -> None:
     keyframe = saved.snapshot.keyframes()[5]
     error = saved.rig.left.project(keyframe.points_cam) - keyframe.uv_left
     assert np.median(np.linalg.norm(error, axis=1)) < 3.0
@@ -59,7 +59,7 @@ def spoil(folder: Path, **changes: object) -> None:
     (folder / "map.json").write_text(json.dumps({**head, **changes}))
 
 
-def test_each_fault_has_its_line(tmp_path: Path, saved: SavedMap) -> None:
+def test_each_error_has_its_line(tmp_path: Path, saved: SavedMap) -> None:
     with pytest.raises(StereoSfmError, match=r"there is no map\.json"):
         load_map(tmp_path / "nothing")
     folder = tmp_path / "m"
@@ -79,7 +79,7 @@ def test_each_fault_has_its_line(tmp_path: Path, saved: SavedMap) -> None:
 
 @pytest.mark.parametrize("name", ["keyframes.npz", "points.npz", "observations.npz", "corners.npz", "rig.yaml"])
 @pytest.mark.parametrize("harm", ["cut", "flip", "remove"])
-def test_damaged_files_are_noticed(tmp_path: Path, saved: SavedMap, name: str, harm: str) -> None:
+def test_damaged_files_are_rejected(tmp_path: Path, saved: SavedMap, name: str, harm: str) -> None:
     save_map(saved, tmp_path / "m")
     path = tmp_path / "m" / name
     raw = bytearray(path.read_bytes())
@@ -94,7 +94,7 @@ def test_damaged_files_are_noticed(tmp_path: Path, saved: SavedMap, name: str, h
         load_map(tmp_path / "m")
 
 
-def test_an_edited_focal_length_is_noticed(tmp_path: Path, saved: SavedMap) -> None:
+def test_an_edited_focal_length_is_rejected(tmp_path: Path, saved: SavedMap) -> None:
     save_map(saved, tmp_path / "m")
     path = tmp_path / "m" / "rig.yaml"
     focal = f"{saved.rig.left.fx!r}"
@@ -118,13 +118,13 @@ def test_each_field_of_map_json_is_checked(tmp_path: Path, saved: SavedMap, fiel
         load_map(tmp_path / "m")
 
 
-@pytest.mark.parametrize("beside", [[], ["notes.txt"]])
-def test_a_save_that_fails_leaves_the_map_that_was_there(
-    tmp_path: Path, saved: SavedMap, monkeypatch: pytest.MonkeyPatch, beside: list[str]
+@pytest.mark.parametrize("other_files", [[], ["notes.txt"]])
+def test_a_failed_save_keeps_the_old_map(
+    tmp_path: Path, saved: SavedMap, monkeypatch: pytest.MonkeyPatch, other_files: list[str]
 ) -> None:
     folder = tmp_path / "m"
     save_map(saved, folder)
-    for name in beside:
+    for name in other_files:
         (folder / name).write_text("mine")
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
 
@@ -146,7 +146,7 @@ def test_a_save_that_fails_leaves_the_map_that_was_there(
     assert {path.name for path in folder.iterdir()} == before.keys()
 
 
-def test_a_map_is_saved_into_the_folder_one_stands_in(
+def test_a_map_can_be_saved_into_the_working_directory(
     tmp_path: Path, saved: SavedMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -168,7 +168,7 @@ def test_empty_map_is_not_saved(tmp_path: Path, saved: SavedMap) -> None:
 
 
 def test_empty_map_is_not_loaded(tmp_path: Path, saved: SavedMap) -> None:
-    """Somebody else's program wrote a whole folder without a single point."""
+    """A complete folder of another program without a single point."""
     folder = tmp_path / "m"
     save_map(saved, folder)
     sums = json.loads((folder / "map.json").read_text())["sha256"]
