@@ -190,9 +190,9 @@ def scale_error(make_source: Callable[[], SimSource], every: int, frames: int) -
             stamps.append(frame.stamp_ns)
             poses.append(frame.odom_T_cam)
         assert source.ground_truth is not None
-        stored = evaluate(Trajectory(np.array(stamps), np.array(poses)), source.ground_truth)
+        result = evaluate(Trajectory(np.array(stamps), np.array(poses)), source.ground_truth)
     return (
-        f"{100 * (1 / stored.sim3_scale - 1):+.3f} % over {stored.length_m:.1f} m, ATE {1e3 * stored.ape_m.rmse:.1f} mm"
+        f"{100 * (1 / result.sim3_scale - 1):+.3f} % over {result.length_m:.1f} m, ATE {1e3 * result.ape_m.rmse:.1f} mm"
     )
 
 

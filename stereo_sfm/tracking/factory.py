@@ -1,4 +1,4 @@
-"""Which tracker a configuration asks for: the default one by flow, or descriptors around a named estimator."""
+"""The tracker of a configuration: the default one by optical flow, or descriptors around a named estimator."""
 
 from __future__ import annotations
 

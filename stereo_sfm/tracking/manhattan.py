@@ -11,7 +11,7 @@ from stereo_sfm.types import F64, U8
 
 
 class ManhattanCompass:
-    """Measures one eye's images; pure apart from its detector's tables."""
+    """Measures the images of one camera; pure apart from its detector's tables."""
 
     def __init__(self, camera: Camera, limits: ManhattanLimits | None = None) -> None:
         self._detector = LineDetector(camera)

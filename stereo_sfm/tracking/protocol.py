@@ -1,4 +1,4 @@
-"""What every tracker is."""
+"""The protocol of trackers."""
 
 from __future__ import annotations
 

@@ -43,17 +43,17 @@ def scene(camera: Pinhole | KannalaBrandt, seed: int) -> tuple[F64, F64, F64, F6
     uv = rng.uniform([80, 80], [camera.width - 80, camera.height - 80], (200, 2))
     points_cam = camera.unproject(uv) * rng.uniform(1, 8, (200, 1))
     points = se3.transform(pose, points_cam)
-    cameras: list[F64] = []
-    for cam_T_eye in (np.eye(4), LEFT_T_RIGHT):
+    pixels: list[F64] = []
+    for left_T_cam in (np.eye(4), LEFT_T_RIGHT):
         seen = uv.copy()
         for _ in range(30):
             seconds = (seen[:, 1] / (camera.height - 1) - 0.5) * 0.03
-            poses = [pose @ se3.exp(VELOCITY * s) @ cam_T_eye for s in seconds]
+            poses = [pose @ se3.exp(VELOCITY * s) @ left_T_cam for s in seconds]
             seen = np.array(
                 [camera.project(se3.transform(se3.inverse(t), p[None]))[0] for t, p in zip(poses, points, strict=True)]
             )
-        cameras.append(seen)
-    return pose, points, cameras[0], cameras[1]
+        pixels.append(seen)
+    return pose, points, pixels[0], pixels[1]
 
 
 def solve(shutter: RollingShutter, points: F64, uv: F64, uv_right: F64, start: F64, sigma: float) -> tuple[F64, F64]:

@@ -33,7 +33,7 @@ class Features(Message):
 class FeatureKind:
     """One row of the table: how to make the detector, and how its descriptors are compared."""
 
-    create: Callable[[int], Any]  # most keypoints (0: OpenCV's default) -> cv2.Feature2D
+    create: Callable[[int], Any]  # maximum of keypoints (0: OpenCV's default) -> cv2.Feature2D
     norm: int  # cv2.NORM_*
     width: int  # descriptor length
 

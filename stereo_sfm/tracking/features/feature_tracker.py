@@ -148,7 +148,7 @@ class FeatureTracker:
         return motion, self._ids.give_new(view)
 
     def _lose(self, image: StereoImage, view: FeatureView, reason: str) -> tuple[Frame, Keyframe | None]:
-        """No motion: keep moving as before; after several such frames start again there as a new submap."""
+        """No motion: continue with the last velocity; after several such frames start a new submap there."""
         self._lost += 1
         self._odom_T_cam = self._odom_T_cam @ self._velocity
         if self._lost <= self._config.tracker.lost_frames or len(view) < self._odometry.min_inliers:

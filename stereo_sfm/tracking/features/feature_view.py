@@ -1,4 +1,4 @@
-"""One image turned into features with bearings and, where a second eye or a depth image sees them, 3D points."""
+"""Features of one image with bearings and, where a second camera or a depth image sees them, 3D points."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MASK_MARGIN_PX = 15  # half of the patch that ORB describes: keypoints keep so f
 
 @dataclass(frozen=True, eq=False)
 class FeatureView(Message):
-    """Features of one frame, one row each, in the left eye."""
+    """Features of the left image of one frame, one row each."""
 
     frame_id: int
     image: U8
@@ -53,7 +53,7 @@ class ViewMaker:
         self._essential = essential_from_motion(right_T_left[:3, :3], right_T_left[:3, 3]) if rig.stereo else None
 
     def make(self, image: StereoImage, mask: U8 | None, rng: np.random.Generator) -> FeatureView:
-        """Features of the left eye; with stereo only those that the other eye confirms (retail paper, IV-A3)."""
+        """Features of the left image; with stereo only those matched in the right one (retail paper, IV-A3)."""
         features = self._left.extract(image.left, _both(self._masks[0], mask))
         bearings = self._rig.left.unproject(features.uv)
         seen = np.isfinite(bearings[:, 2])

@@ -1,4 +1,4 @@
-"""Points of the last keyframes with the descriptors that found them: what a monocular tracker looks for again."""
+"""Points of the last keyframes with descriptors, for matching in the monocular tracker."""
 
 from __future__ import annotations
 

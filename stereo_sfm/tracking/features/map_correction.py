@@ -1,4 +1,4 @@
-"""How the map moves a tracker whose odometry goes on from where local mapping puts the newest keyframe."""
+"""Corrections by the map of a tracker whose odometry continues from the newest keyframe's pose in the map."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ from stereo_sfm.tracking.features.point_ids import PointIds
 from stereo_sfm.types import F64, I64, Bool, Frame, Keyframe, MapUpdate, StereoImage, TrackState
 
 _FIRST_VIEW_LASTS = 60  # frames that a first view waits for its partner
-_MAX_STEP = 0.5  # of the median distance of the points: a larger step between frames is no motion but an error
+_MAX_STEP = 0.5  # of the median distance of the points: a larger step between frames is an error
 _MAX_TURN = np.radians(30.0)
 _REPROJECT_PX = 3.0
 
@@ -76,7 +76,7 @@ class MonocularTracker:
         return replace(view, ids=ids, points=points)
 
     def step(self, image: StereoImage) -> tuple[Frame, Keyframe | None]:
-        """Track one image; only its left eye is looked at."""
+        """Track one image, by its left camera only."""
         rng = np.random.default_rng((self._config.seed, image.frame_id))
         with self._spans.span("features"):
             view = self._views.make(replace(image, right=None, depth=None), None, rng)

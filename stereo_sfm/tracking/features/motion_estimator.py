@@ -1,4 +1,4 @@
-"""What a motion estimator gets and gives. One estimator per file of `odometry/`."""
+"""Input and output of motion estimators. One estimator per file of `odometry/`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BETTER_THAN_CHANCE = 3.0  # ... and how many times nearer a motion must bring th
 
 @dataclass(frozen=True, eq=False)
 class FramePair(Message):
-    """Matches between a reference view ("last") and the current one ("now"), left eye, one row each."""
+    """Matches between the left images of a reference view ("last") and the current one ("now"), one row each."""
 
     bearings_last: F64  # (N, 3) unit
     bearings_now: F64  # (N, 3) unit
@@ -69,7 +69,7 @@ class Estimator(Protocol):
 
 @dataclass(frozen=True)
 class EstimatorEntry:
-    """What a file of `odometry/` offers, as its `ESTIMATOR`."""
+    """The entry of a file of `odometry/`, its `ESTIMATOR`."""
 
     summary: str
     make: Callable[[OdometryConfig, Camera], Estimator]  # for the images of a camera
@@ -82,13 +82,13 @@ def thresholds(config: OdometryConfig, sigmas: F64) -> F64:
 
 
 def refuse_chance(moved: F64, bearings_now: F64) -> None:
-    """A motion must put the points nearer to where they are seen than to where other points are seen.
+    """Reject a motion that fits the matches no better than random pairs of the same points.
 
-    Stereo points are so uncertain along their rays that any motion "agrees" with many of them: counting inliers cannot
-    refuse matches that are all wrong. The angles can, compared with those of the same points in shifted pairs.
+    Stereo points are so uncertain along their rays that any motion "agrees" with many of them: the number of inliers
+    does not reject matches that are all wrong. The angles do, compared with those of the same points in shifted pairs.
 
     Args:
-        moved: (N, 3) points where the motion takes them. bearings_now: (N, 3) where they are seen.
+        moved: (N, 3) points moved by the motion. bearings_now: (N, 3) their observed bearings.
 
     Raises:
         Degenerate: "no_consensus".

@@ -1,4 +1,4 @@
-"""Views as the messages that leave a descriptor tracker."""
+"""Messages of the descriptor trackers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Views paired by descriptors: what the estimators get, and ids carried over from the last keyframe."""
+"""Matching of views by descriptors: input of the estimators, and ids carried over from the last keyframe."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Pairing:
         return rows[epipolar_inliers(a, b, 2 * config.epipolar_px * self._pixel, rng)]
 
     def pair(self, reference: FeatureView, view: FeatureView, rows: I64) -> FramePair:
-        """Matched rows (M, 2) as the estimators want them."""
+        """Matched rows (M, 2) as input of the estimators."""
         a, b = rows[:, 0], rows[:, 1]
         return FramePair(
             bearings_last=reference.bearings[a],

@@ -1,4 +1,4 @@
-"""Which observation is which physical point: ids that pass from view to view through matches."""
+"""Point ids, carried from view to view by matches."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.types import F64, U8, Bool
 
-BORDER = 12  # of the half image, where no corners are looked for
+BORDER = 12  # px of the half image, without corners
 
 
 @njit
@@ -68,7 +68,7 @@ def _block_all(blocked, points, radius):
 
 
 def corner_mask(camera: Camera, max_angle_deg: float) -> Bool:
-    """(H/2, W/2) where corners may lie: what looks into the world, not too far from the axis or near to the border."""
+    """(H/2, W/2) where corners may lie: valid pixels, neither too far from the axis nor too near to the border."""
     half = camera.valid_mask(math.radians(max_angle_deg), step=2)
     half[:BORDER] = half[-BORDER:] = False
     half[:, :BORDER] = half[:, -BORDER:] = False
@@ -76,13 +76,13 @@ def corner_mask(camera: Camera, max_angle_deg: float) -> Bool:
 
 
 def detect_corners(half_image: U8, mask: Bool, taken: F64, count: int, spacing: float, quality: float) -> F64:
-    """New corners where no point is yet.
+    """New corners in areas without points.
 
     Args:
         half_image: (H/2, W/2) level 1 of the pyramid: corners of the finest pixels would be noise.
-        mask: (H/2, W/2) where corners may lie. taken: (N, 2) px of the full image, points that exist.
-        count: at most so many. spacing: least distance in px of the full image.
-        quality: least response, as a fraction of the 95th percentile of the cells' best.
+        mask: (H/2, W/2) where corners may lie. taken: (N, 2) px of the full image, existing points.
+        count: maximum number. spacing: minimum distance in px of the full image.
+        quality: minimum response, as a fraction of the 95th percentile of the cells' best.
 
     Returns:
         (M, 2) float64 px of the full image, strongest first.

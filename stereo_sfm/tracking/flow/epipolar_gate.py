@@ -1,8 +1,8 @@
-"""Which matches lie on their epipolar curves, also where the rig is not quite what its calibration says.
+"""Test whether stereo matches lie on their epipolar curves, also with an error of the calibration.
 
-Such a rig puts all matches off their curves by a distance that changes slowly over the image. Self-calibration finds
-the fault only if points stay, so a plane through the distances is fitted where most matches would be refused, and those
-near it are kept. Matches that are wrong one by one fit no plane.
+An error of the calibration shifts all matches off their curves by a distance that varies slowly over the image. If most
+matches would be rejected, a plane is fitted to the distances, and matches near it are kept, so that self-calibration
+has points to work with. Single wrong matches fit no plane.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry.stereo import epipolar_angle
 from stereo_sfm.types import F64, Bool
 
-LEAST_MATCHES = 20
-MOST = 0.5  # share of the matches that must agree
-FARTHEST = 4.0  # times the usual distance that the plane may be off
+MIN_MATCHES = 20
+MIN_SHARE = 0.5  # of the matches that must be near the curves, or near the plane
+MAX_OFFSET = 4.0  # of the plane, in units of the usual limit
 
 
 def on_curve(rig: Rig, uv_left: F64, uv_right: F64, distance_px: F64, usual_px: float, candidates: Bool) -> Bool:
-    """(N,) matches that are believed.
+    """(N,) accepted matches.
 
     Args:
         uv_left, uv_right: (N, 2) px. distance_px: (N,) from the epipolar curve, unsigned.
-        usual_px: limit. candidates: (N,) matches that nothing else speaks against.
+        usual_px: limit. candidates: (N,) matches that passed all other tests.
     """
     with np.errstate(invalid="ignore"):
         near = distance_px < usual_px
-    if not np.isfinite(usual_px) or candidates.sum() < LEAST_MATCHES or near[candidates].mean() >= MOST:
+    if not np.isfinite(usual_px) or candidates.sum() < MIN_MATCHES or near[candidates].mean() >= MIN_SHARE:
         return near
     assert rig.right is not None
     signed = np.full(len(near), np.nan)
@@ -36,8 +36,8 @@ def on_curve(rig: Rig, uv_left: F64, uv_right: F64, distance_px: F64, usual_px: 
     shape = np.column_stack([np.ones(len(near)), uv_left / [rig.left.width, rig.left.height]])
     plane = shape @ _fit(shape[candidates], signed[candidates], usual_px)
     with np.errstate(invalid="ignore"):
-        fitted = (np.abs(signed - plane) < usual_px) & (np.abs(plane) < FARTHEST * usual_px)
-    return fitted if fitted[candidates].mean() > MOST else near
+        fitted = (np.abs(signed - plane) < usual_px) & (np.abs(plane) < MAX_OFFSET * usual_px)
+    return fitted if fitted[candidates].mean() > MIN_SHARE else near
 
 
 def _fit(shape: F64, values: F64, scale: float) -> F64:

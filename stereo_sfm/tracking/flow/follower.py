@@ -1,4 +1,4 @@
-"""Points followed from one left image to the next: by translation, then aligned with their first appearance."""
+"""Tracking of points from one left image to the next: by translation, then alignment with their first appearance."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from stereo_sfm.tracking.flow.tracks import Patches, Tracks
 from stereo_sfm.tracking.flow.visible_area import VisibleArea
 from stereo_sfm.types import F64, I64
 
-WELL_PREDICTED_PX = 3.0  # median distance of points from where they were expected; below, the half image is enough
-ALIKE = 1.25  # times nearer or further away: the window of a point still looks as it did
+WELL_PREDICTED_PX = 3.0  # median error of the predictions below which the search starts in the half image
+MAX_SCALE_CHANGE = 1.25  # of the distance to a point, within which its window still matches
 
 
 @dataclass
 class Held:
-    """An image to go on from when all else is lost."""
+    """The last trusted image, from which tracking is recovered."""
 
     pyramid: klt.Pyramid
     tracks: Tracks
@@ -31,7 +31,7 @@ class Held:
 
 
 class Follower:
-    """Knows the last image and how its points looked when they were first seen."""
+    """Tracks points from the last image, with the windows of their first appearances."""
 
     def __init__(self, config: TrackerConfig, rig: Rig, area: VisibleArea, shutter: RollingShutter) -> None:
         self._config, self._area, self._shutter = config, area, shutter
@@ -40,22 +40,22 @@ class Follower:
         self._held: Held | None = None
         self._coarse_rotation = CoarseRotation(rig.left, config.pyramid_levels)
         self._coarsest_level = config.pyramid_levels - 1
-        self._first_level = self._coarsest_level  # of the pyramid, from which the search begins
-        self._miss_px = np.inf  # median distance of points from where they were expected
+        self._first_level = self._coarsest_level  # of the pyramid, at which the search starts
+        self._miss_px = np.inf  # median error of the predictions
 
     def follow(self, tracks: Tracks, pyramid: klt.Pyramid, expected: ExpectedMotion) -> Tracks:
-        """Tracks that are found in the new left image, moved there."""
+        """The tracks found in the new left image, at their new pixels."""
         assert self._last is not None
         guess = self._shutter.project(expected.pose, expected.velocity, tracks.points(), tracks.uv)
         guess = np.where(np.isfinite(guess), guess, tracks.uv)
         return self._find(self._last, tracks, pyramid, guess, tracks.warp)
 
     def hold(self, pyramid: klt.Pyramid, tracks: Tracks, pose: F64) -> None:
-        """Keep an image whose pose (4, 4) is beyond doubt, and its points, to go on from when all else is lost."""
+        """Keep an image with a trusted pose (4, 4) and its points for recovery."""
         self._held = Held(pyramid, tracks, pose)
 
     def find_again(self, pyramid: klt.Pyramid, expected: ExpectedMotion) -> Tracks:
-        """The points that were held, as far as they are found from another pose, which may be far from that before."""
+        """The held points that are found from another, possibly distant pose."""
         assert self._held is not None
         guess, nearer = self._from(expected.pose)
         ahead = np.isfinite(guess[:, 0])
@@ -64,13 +64,13 @@ class Follower:
         return self._find(self._held.pyramid, tracks, pyramid, guess, tracks.warp * nearer[:, None, None])
 
     def expected_again(self, pose: F64) -> int:
-        """How many of the points that were held should be found from a pose (4, 4): those that look as they did."""
+        """Number of held points that should be found from a pose (4, 4): visible, at a similar distance."""
         guess, nearer = self._from(pose)
-        alike = (nearer < ALIKE) & (nearer > 1 / ALIKE)
-        return int((alike & self._area.inside(guess)).sum())
+        similar = (nearer < MAX_SCALE_CHANGE) & (nearer > 1 / MAX_SCALE_CHANGE)
+        return int((similar & self._area.inside(guess)).sum())
 
     def _from(self, pose: F64) -> tuple[F64, F64]:
-        """Pixels (N, 2) of the points that were held, NaN behind the camera; how many times nearer (N,) they are."""
+        """Pixels (N, 2) of the held points, NaN behind the camera, and the ratio (N,) of old to new distance."""
         assert self._held is not None
         tracks, points = self._held.tracks, self._held.tracks.points()
         uv = self._shutter.project(pose, np.zeros(6), points, tracks.uv)
@@ -78,7 +78,7 @@ class Follower:
         return uv, before / np.maximum(now, 1e-6)
 
     def _find(self, last: klt.Pyramid, tracks: Tracks, pyramid: klt.Pyramid, guess: F64, warp: F64) -> Tracks:
-        """Points of an image where they are in another, from guesses (N, 2) px and deformations (N, 2, 2)."""
+        """Find points of one image in another, starting at guesses (N, 2) px and deformations (N, 2, 2)."""
         config = self._config
         uv = guess.copy()
         status, _ = klt.track_translation(
@@ -97,7 +97,7 @@ class Follower:
         return out
 
     def turned(self, pyramid: klt.Pyramid, expected: ExpectedMotion, last_pose: F64) -> ExpectedMotion:
-        """The expected motion with the rotation that aligns the whole images; the search begins at the top level."""
+        """The expected motion with the rotation that aligns the coarsest images; the search starts at the top level."""
         assert self._last is not None
         cur_R_prev = expected.pose[:3, :3].T @ last_pose[:3, :3]
         cur_R_prev = self._coarse_rotation.align(self._last, pyramid, cur_R_prev)
@@ -106,17 +106,17 @@ class Follower:
         return ExpectedMotion(pose, se3.log(se3.inverse(last_pose) @ pose), expected.seconds)
 
     def search_widely(self) -> None:
-        """The next search begins at the top level: the prediction cannot be trusted."""
+        """Start the next search at the top level, for an unreliable prediction."""
         self._first_level = self._coarsest_level
 
     def accept(self, pyramid: klt.Pyramid, tracks: Tracks) -> None:
-        """Follow the next image from this one; what other points looked like is forgotten."""
+        """Track the next image from this one; appearances of other points are dropped."""
         self._last = pyramid
         self._first_level = 1 if self._miss_px < WELL_PREDICTED_PX else self._coarsest_level
         self.keep_only(tracks)
 
     def begin(self, pyramid: klt.Pyramid, uv: F64) -> tuple[I64, I64]:
-        """Remember how new points (N, 2) px look: rows (M,) of those with texture that found a place, their slots."""
+        """Store the appearance of new points (N, 2) px: rows (M,) of those with texture and a slot, their slots."""
         store = self._patches
         slots = store.take(len(uv))
         textured = klt.make_patches(
@@ -126,6 +126,6 @@ class Follower:
         return np.flatnonzero(textured), slots[textured]
 
     def keep_only(self, tracks: Tracks) -> None:
-        """Drop the first appearances of all other points, but for those that are held."""
+        """Drop the first appearances of all points that are neither in `tracks` nor held."""
         held = tracks.slot if self._held is None else self._held.tracks.slot
         self._patches.keep_only(np.concatenate([tracks.slot, held]))

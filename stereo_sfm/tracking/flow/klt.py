@@ -1,7 +1,7 @@
 """Optical flow of points: translation between images, affine against the patch where a point was first seen.
 
 Shi & Tomasi, Good Features to Track (CVPR 1994): translation follows a feature from frame to frame; the affine model
-against its first appearance removes the drift, and its dissimilarity tells when a window no longer shows one surface
+against its first appearance removes the drift, and its dissimilarity detects windows that no longer show one surface
 (an occlusion, or a depth discontinuity inside the window). Both are inverse compositional (Baker & Matthews, IJCV 56,
 2004). The brightness of a window is normalised by its mean and contrast, so that exposure jumps do not matter.
 
@@ -32,7 +32,7 @@ WIDE_SIZE = (SIZE + 2) * STRIDE
 RAW_SIZE = (SIZE + 4) * STRIDE
 FINE, COARSE = 0.01, 0.1  # px, last step of a translation: in the image itself, and where a finer level follows
 MAX_REACH = 60.0  # px from the centre of a warped window
-TRACKED, OUTSIDE, FLAT, DIVERGED, UNLIKE = 0, 1, 2, 3, 4  # why a point was not followed
+TRACKED, OUTSIDE, FLAT, DIVERGED, UNLIKE = 0, 1, 2, 3, 4  # result for a point
 
 Pyramid = tuple[U8, ...]
 
@@ -251,10 +251,10 @@ def track_translation(prev, cur, uv_prev, uv_cur, first_level, last_level, itera
 
 @njit
 def make_patches(pyramid, uv, slots, weights, coordinates, patch, gradients, inverse_normal, contrast):
-    """Remember the appearance of points for `track_affine`.
+    """Store the appearance of points for `track_affine`.
 
     Args:
-        pyramid: of the image where the points are first seen. uv: (N, 2) px. coordinates: COORDINATES.
+        pyramid: of the image in which the points are first observed. uv: (N, 2) px. coordinates: COORDINATES.
         slots: (N,) rows of the store that follows: patch (M, FLAT_SIZE), gradients (M, 2, FLAT_SIZE), inverse_normal
             (M, 6, 6), contrast (M,); these rows are filled in.
 

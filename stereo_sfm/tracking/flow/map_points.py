@@ -1,4 +1,4 @@
-"""What the mapper knows better about the points that are followed."""
+"""Updates of the tracked points by the mapper: fused and culled ids, positions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ NEAREST_M = 1e-6
 
 
 def take_update(tracks: Tracks, update: MapUpdate) -> Tracks:
-    """The tracks with fused points under one id, without culled ones, and placed where the map places them."""
+    """The tracks with fused points under one id, without culled ones, at their positions in the map."""
     tracks = _without_culled(_fused(tracks, update.fused_point_ids), update.culled_point_ids)
     rows, found = _rows_of(update.point_ids, tracks.point_ids)
     if len(found):
@@ -21,7 +21,7 @@ def take_update(tracks: Tracks, update: MapUpdate) -> Tracks:
 
 
 def _fused(tracks: Tracks, pairs: I64) -> Tracks:
-    """Ids replaced by those that live on, (D, 2) old and new; each id once, the older track stays."""
+    """Ids replaced after fusion, (D, 2) old and new; of tracks with the same id the older one stays."""
     old, first = np.unique(pairs[:, 0], return_index=True)
     if not len(old):
         return tracks
@@ -36,7 +36,7 @@ def _without_culled(tracks: Tracks, culled: I64) -> Tracks:
 
 
 def _rows_of(ids: I64, wanted: I64) -> tuple[Bool, I64]:
-    """Which of the wanted ids (N,) are in `ids`, as a mask (N,), and where each of those is."""
+    """Mask (N,) of the wanted ids that are in `ids`, and the rows of those."""
     if not len(ids) or not len(wanted):
         return np.zeros(len(wanted), bool), np.zeros(0, np.int64)
     order = np.argsort(ids, kind="stable")
@@ -46,7 +46,7 @@ def _rows_of(ids: I64, wanted: I64) -> tuple[Bool, I64]:
 
 
 def _place(tracks: Tracks, rows: Bool, points: F64) -> None:
-    """Put some tracks at points (M, 3) of the odometry frame, along new rays from where they were first seen."""
+    """Move tracks to points (M, 3) of the odometry frame, along new rays from their origins."""
     ray = points - tracks.origin[rows]
     distance = np.maximum(np.linalg.norm(ray, axis=1), NEAREST_M)
     tracks.direction[rows] = ray / distance[:, None]

@@ -1,8 +1,8 @@
-"""What a keyframe is recognised by: ORB corners of the whole image, tracked or not, with their stereo depth.
+"""Corners for place recognition: ORB features of the image, tracked or not, with their stereo depth.
 
-The points that flow follows were corners where they were first seen. Where they are now, a detector finds others, and
-when the place is seen again a third choice: one in eight comes back. So place recognition has corners of its own. One
-spot may be a corner on several levels: that is what makes it known again from nearer or farther away.
+Tracked points were corners in the image of their first observation. In the present image a detector selects other
+points, and other ones again when the place is revisited: one in eight tracked points is detected again. So place
+recognition has corners of its own. One spot may be a corner on several levels, for matching at other distances.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from stereo_sfm.tracking.flow.klt import Pyramid, build_pyramid
 from stereo_sfm.tracking.flow.stereo import StereoMatcher
 from stereo_sfm.types import F32, Corners, StereoImage
 
-LEVELS, SCALE = 4, 1.2  # of ORB in the half image: more levels cost more than they find again
+LEVELS, SCALE = 4, 1.2  # of ORB in the half image; more levels add few matches
 FAST_THRESHOLD = 10  # grey levels
-BORDER = 15  # px of each level, where no corners are looked for
+BORDER = 15  # px of each level, without corners
 
 
 class PlaceCorners:
@@ -32,27 +32,27 @@ class PlaceCorners:
         mask = corner_mask(rig.left, config.tracker.max_angle_deg)
         mask &= True if rig.left_mask is None else uncovered(half_size(rig.left_mask), BORDER)
         everywhere = mask[BORDER:-BORDER, BORDER:-BORDER].all()
-        self._mask = None if everywhere else mask.astype(np.uint8)  # a mask that masks nothing takes time
+        self._mask = None if everywhere else mask.astype(np.uint8)  # a mask costs time
         self._orb = cv2.ORB.create(
             config.loop.corners, SCALE, LEVELS, edgeThreshold=BORDER, fastThreshold=FAST_THRESHOLD
         )
 
     def use(self, rig: Rig) -> None:
-        """From now on with this rig."""
+        """Use another rig."""
         self._stereo.use(rig)
 
     @staticmethod
     def wanted(config: Config, rig: Rig) -> PlaceCorners | None:
-        """None for a run that recognises no places, or a camera without depth."""
+        """The detector of a run, None without place recognition or without depth."""
         recognised = config.mapper.enabled or config.loop.enabled
         return PlaceCorners(config, rig) if rig.stereo and recognised else None
 
     def find(self, image: StereoImage) -> Corners:
-        """About as many as the configuration says, the strongest of each level, of those that both eyes see."""
+        """The strongest corners of each level that both cameras see, about as many as configured."""
         return self.find_in(build_pyramid(image.left, self._levels), self._stereo.prepare(image))
 
     def find_in(self, left: Pyramid, right: Pyramid | F32) -> Corners:
-        """As `find`, of a left image's pyramid and what `StereoMatcher.prepare` makes of the second eye."""
+        """As `find`, from the left image's pyramid and `StereoMatcher.prepare` of the second camera."""
         keypoints, descriptors = self._orb.detectAndCompute(left[1], self._mask)
         if not len(keypoints):
             return Corners.none()

@@ -1,18 +1,17 @@
 """Motion-only optimisation: the pose of one stereo frame from points of the local map, with covariance.
 
-Each point is known along a ray from where it was first seen, P = origin + direction / rho, with a variance of rho. The
-pose is solved by iteratively re-weighted Gauss-Newton on the pixels of both images, and every rho with it: eliminated
-first (the four residuals of a point share one unknown: a rank-one update, Sherman-Morrison), then moved by what the
-pose did. So a point whose distance is uncertain gives rotation at full weight, and the derivatives by the pose are
-taken where pose and distances agree. Taken at the distance as it was they would hold its error squared, and make every
-step too short by the variance of rho over rho squared (errors in variables; Fuller, Measurement Error Models, 1987,
-section 1.1). Robust weights are Cauchy, narrowed in steps (graduated non-convexity, Yang et al., RA-L 5, 2020, with a
-Cauchy kernel).
+A point lies on the ray of its first observation, P = origin + direction / rho, with a variance of rho. The pose is
+solved by iteratively re-weighted Gauss-Newton on the pixels of both images, together with every rho: rho is eliminated
+first (the four residuals of a point share one unknown: a rank-one update, Sherman-Morrison), then updated by back
+substitution. So a point with an uncertain distance contributes to the rotation at full weight, and the derivatives by
+the pose are taken at consistent pose and distances. At the prior distances they would contain its squared error, and
+every step would be too short by the variance of rho over rho squared (errors in variables; Fuller, Measurement Error
+Models, 1987, section 1.1). Robust weights are Cauchy, narrowed in steps (graduated non-convexity, Yang et al., RA-L 5,
+2020, with a Cauchy kernel).
 
-Where rows are exposed one after the other (a rolling shutter), each point is seen from where the camera was at the time
-of its row: pose @ exp(seconds * velocity). The velocity is solved with the pose (Ait-Aider et al., Simultaneous object
-pose and velocity computation using a single view from a rolling shutter camera, ECCV 2006), held by the mean since the
-last frame.
+With a rolling shutter, each point is observed from the pose at the time of its row: pose @ exp(seconds * velocity). The
+velocity is solved with the pose (Ait-Aider et al., Simultaneous object pose and velocity computation using a single
+view from a rolling shutter camera, ECCV 2006), with the mean velocity since the last frame as its prior.
 """
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportMissingTypeArgument=false
@@ -27,13 +26,13 @@ from stereo_sfm.geometry.kernels import njit, project_one
 from stereo_sfm.geometry.se3_kernels import compose_into, exp_into
 from stereo_sfm.geometry.small_matrix import invert_symmetric, solve_symmetric
 
-MOST_SIGMAS = 4.0  # that a distance moves while a pose is solved
-LEAST_RHO = 1e-4  # 1/m
+MAX_SIGMAS = 4.0  # change of an inverse distance while a pose is solved
+MIN_RHO = 1e-4  # 1/m
 
 
 @njit
 def point_residuals(pose, px, py, pz, dx, dy, dz, uv_l, uv_r, cams, right_T_left, res, jac, ray):
-    """Residuals of one point in both eyes.
+    """Residuals of one point in both images.
 
     Args:
         pose: (4, 4) odom_T_cam. px..pz: the point and dx..dz: its derivative by rho, odometry frame. cams: models and
@@ -41,7 +40,7 @@ def point_residuals(pose, px, py, pz, dx, dy, dz, uv_l, uv_r, cams, right_T_left
         res (4,), jac (4, 6), ray (4,): filled in; derivatives by odom_T_cam @ exp(xi) and by rho.
 
     Returns:
-        0 when the left pixel cannot be predicted, 2 with the left eye only, 4 with both.
+        0 if the left pixel cannot be predicted, 2 with the left image only, 4 with both.
     """
     model_l, params_l, model_r, params_r = cams
     qx, qy, qz = px - pose[0, 3], py - pose[1, 3], pz - pose[2, 3]
@@ -89,7 +88,7 @@ def _normal_equations(
     """Sums over all points, each with its distance eliminated; a robust weight by a Cauchy kernel of `scale` sigmas.
 
     Args:
-        prior, variance: (N,) what is known of each distance. rho: (N,) where it is linearised.
+        prior, variance: (N,) of each inverse distance. rho: (N,) where it is linearised.
         normal (n, n), rhs (n,), error (N,): overwritten; see `optimise_pose`. n is 6, with a rolling shutter 12.
         elimination: (N, 7) overwritten: minus the step of rho is its last column and the others times the pose's step.
 
@@ -174,13 +173,13 @@ def _normal_equations(
 
 @njit
 def _move_distances(rho, prior, variance, elimination, xi, row_s):
-    """Follow a step of the pose (and velocity) with every distance, within what is believable."""
+    """Back substitution: update every inverse distance for a step of the pose (and velocity), within limits."""
     for k in range(len(rho)):
         step = elimination[k, 6]
         for i in range(6):
             step += elimination[k, i] * (xi[i] + row_s[k] * xi[6 + i] if len(row_s) > 0 else xi[i])
-        reach = MOST_SIGMAS * math.sqrt(variance[k])
-        rho[k] = max(min(max(rho[k] - step, prior[k] - reach), prior[k] + reach), LEAST_RHO)
+        reach = MAX_SIGMAS * math.sqrt(variance[k])
+        rho[k] = max(min(max(rho[k] - step, prior[k] - reach), prior[k] + reach), MIN_RHO)
 
 
 @njit
@@ -192,8 +191,8 @@ def optimise_pose(
 
     Args:
         pose: (4, 4) odom_T_cam to start from.
-        moved: (6,) tangent from the last frame's pose to that one, `seconds` before. velocity_sigma: (6,) by how much
-            the velocity at this frame differs from the mean since the last. These are for rolling shutters only.
+        moved: (6,) tangent from the last frame's pose to that one, `seconds` before. velocity_sigma: (6,) standard
+            deviation of the velocity at this frame from the mean since the last. These are for rolling shutters only.
         row_s: (N,) seconds from the pose's time to that of the row of each point; empty for a global shutter.
         origin, direction: (N, 3) odometry frame. rho, variance: (N,) 1/m.
         uv_l, uv_r: (N, 2) px, NaN in uv_r where unseen.
@@ -201,7 +200,7 @@ def optimise_pose(
 
     Returns:
         pose (4, 4), velocity (6,) a second, covariance (6, 6) of pose @ exp(xi), error (N,) root of the whitened
-        squared residual over the number of rows (1 is as expected; inf when not visible).
+        squared residual over the number of rows (1: as expected; inf if not visible).
     """
     rate = 1.0 / seconds if seconds > 0 else 0.0
     pose, moved, velocity = pose.copy(), moved.copy(), moved * rate
@@ -210,13 +209,13 @@ def optimise_pose(
     normal, factor = np.zeros((n, n)), np.zeros((n, n))
     rhs, xi, move = np.zeros(n), np.zeros(n), np.zeros((4, 4))
     prior, rho, elimination = rho, rho.copy(), np.zeros((len(rho), 7))
-    for step in range(len(scales) + 1):  # after the last step once more, for errors and covariance
+    for step in range(len(scales) + 1):  # the last pass is for errors and covariance
         scale = scales[min(step, len(scales) - 1)]
         used = _normal_equations(
             pose, velocity, row_s, origin, direction, prior, variance, rho, uv_l, uv_r, cams, right_T_left, sigma,
             scale, normal, rhs, error, elimination,
         )  # fmt: skip
-        for i in range(n - 6):  # the velocity is the mean motion since the last frame, or nearly
+        for i in range(n - 6):  # prior of the velocity: the mean motion since the last frame
             information = 1.0 / (velocity_sigma[i] * velocity_sigma[i])
             difference = velocity[i] - moved[i] * rate
             normal[i, i] += information * rate * rate
@@ -251,8 +250,8 @@ def refine_depth(
 ):
     """Update rho and its variance (in place) by one frame's observations, pose and velocity given.
 
-    `sigma` is larger than the pixel noise: successive errors of one patch are alike, and the pose was fitted to the
-    same pixels. `floor` is the least relative standard deviation.
+    `sigma` is larger than the pixel noise: successive errors of one patch are correlated, and the pose was fitted to
+    the same pixels. `floor` is the smallest relative standard deviation.
     """
     res, jac, ray = np.zeros(4), np.zeros((4, 6)), np.zeros(4)
     row, step = pose.copy(), np.zeros((4, 4))  # the pose at the point's row

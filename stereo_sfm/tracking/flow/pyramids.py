@@ -1,4 +1,4 @@
-"""What one stereo image becomes before it is tracked."""
+"""The image pyramids of a stereo image."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from stereo_sfm.types import F32
 
 @dataclass(frozen=True)
 class StereoPyramids:
-    """Both cameras' images as flow wants them."""
+    """Input of the flow tracker from one stereo image."""
 
     left: klt.Pyramid
     right: klt.Pyramid | F32  # the second camera's pyramid, or the depth image of an RGB-D camera

@@ -20,15 +20,15 @@ from stereo_sfm.tracking.flow.visible_area import VisibleArea
 from stereo_sfm.types import F32, F64, Bool, StereoImage
 
 SEARCH_LEVEL = 1
-CLOSE = 4.0  # sigmas
-LEAST_SIGMA_PX, MOST_SIGMA_PX = 0.15, 0.3  # of a disparity: no window is better, a worse one is none
-TYPICAL = 25  # percentile of the points' misfits that stands for windows on one surface
-LEAST_MISFIT = 0.5  # that counts as typical, in squares of the expected noise
+BEHIND_SIGMAS = 4.0  # by which noise may put a far point behind the camera
+MIN_SIGMA_PX, MAX_SIGMA_PX = 0.15, 0.3  # of a disparity: lower bound, and limit of acceptance
+TYPICAL = 25  # percentile of the points' misfits that is typical of windows on one surface
+MIN_MISFIT = 0.5  # lower bound of the typical misfit, in squares of the expected noise
 
 
 @dataclass
 class StereoMatch:
-    """New points seen by both eyes; arrays of equal length, rows are usable where `good`."""
+    """Stereo matches; arrays of equal length, rows are usable where `good`."""
 
     uv_left: F64  # (N, 2) px
     uv_right: F64  # (N, 2) px
@@ -39,7 +39,7 @@ class StereoMatch:
 
 
 class StereoMatcher:
-    """Finds points of the left image in the right one, whatever the camera model."""
+    """Finds points of the left image in the right one, for any camera model."""
 
     def __init__(self, config: TrackerConfig, rig: Rig) -> None:
         self._config = config
@@ -54,17 +54,17 @@ class StereoMatcher:
         self._narrow = (narrow / narrow.sum()).astype(np.float32)
 
     def use(self, rig: Rig) -> None:
-        """From now on with this rig, whose left camera and baseline are about the same."""
+        """Use another rig, whose left camera and baseline are about the same."""
         self._rig, self._cameras = rig, StereoCameras.of(rig)
 
     def placed(self, uv: F64, uv_right: F64) -> StereoMatch:
-        """Pixels (N, 2) that are matched already, NaN where not, as points of the present rig."""
+        """Triangulate matched pixels (N, 2), NaN where unmatched, with the present rig."""
         seen = np.asarray(np.isfinite(uv_right).all(1))
         uv, uv_right = np.ascontiguousarray(uv), np.ascontiguousarray(uv_right)
-        return self._triangulated(uv, uv_right, self._usual_sigma(uv), seen, np.inf, -CLOSE)
+        return self._triangulated(uv, uv_right, self._usual_sigma(uv), seen, np.inf, -BEHIND_SIGMAS)
 
     def prepare(self, image: StereoImage) -> klt.Pyramid | F32:
-        """What `follow` and `match` need of the second eye: a pyramid, or the depth image."""
+        """The second camera's input of `follow` and `match`: a pyramid, or the depth image."""
         if self._rig.depth:
             assert image.depth is not None
             return image.depth
@@ -100,10 +100,10 @@ class StereoMatcher:
         else:
             uv_right, good = self._from_depth(right, uv)
             sigma_px = self._usual_sigma(uv)
-        return self._triangulated(uv, uv_right, sigma_px, good, config.max_epipolar_px, -CLOSE)
+        return self._triangulated(uv, uv_right, sigma_px, good, config.max_epipolar_px, -BEHIND_SIGMAS)
 
     def match_coarse(self, left: klt.Pyramid, right: klt.Pyramid | F32, uv: F64) -> StereoMatch:
-        """As `match`, in half the time: good to half a pixel, and with no look at depth edges."""
+        """As `match`, in half the time: accurate to half a pixel, without the test for depth edges."""
         uv = np.ascontiguousarray(uv)
         if not isinstance(right, tuple):
             return self.match(left, right, uv)
@@ -116,26 +116,26 @@ class StereoMatcher:
         return self._triangulated(uv, uv_right, sigma_px, good, 2 * self._config.max_epipolar_px, 0.0)
 
     def _search(self, left: klt.Pyramid, right: klt.Pyramid, uv: F64) -> F64:
-        """Right pixels (N, 2) to the pixel of the search level, NaN where nothing is alike."""
+        """Right pixels (N, 2), accurate to a pixel of the search level, NaN without a match."""
         return search_epipolar(
             left[SEARCH_LEVEL], right[SEARCH_LEVEL], patch_sums(right[SEARCH_LEVEL]), uv, 2.0**SEARCH_LEVEL,
             *self._cameras.cams, self._cameras.right_T_left, self._min_depth, self._candidates, 25.0, 1.2,
         )  # fmt: skip
 
     def _usual_sigma(self, uv: F64) -> F64:
-        """(N,) px along the epipolar curve, where a match does not tell: noise in both images."""
+        """(N,) px along the epipolar curve for matches without an estimate of their own: noise of both images."""
         return np.full(len(uv), math.sqrt(2) * self._config.sigma_px)
 
     def _triangulated(
-        self, uv: F64, uv_right: F64, sigma_px: F64, good: Bool, max_epipolar_px: float, least: float
+        self, uv: F64, uv_right: F64, sigma_px: F64, good: Bool, max_epipolar_px: float, min_rho_sigmas: float
     ) -> StereoMatch:
-        """`least`: inverse distance in its sigmas; a far point may come out behind the camera by noise."""
+        """`min_rho_sigmas`: smallest inverse distance in its standard deviations; noise may make it negative."""
         bearing, rho, variance, epipolar = triangulate(
             uv, uv_right, *self._cameras.cams, self._cameras.left_T_right, sigma_px
         )
         with np.errstate(invalid="ignore"):
             good &= on_curve(self._rig, uv, uv_right, epipolar, max_epipolar_px, good) & (
-                rho > least * np.sqrt(variance)
+                rho > min_rho_sigmas * np.sqrt(variance)
             )
             good &= rho < 1.0 / (0.5 * self._min_depth)
         return StereoMatch(uv, uv_right, bearing, rho, variance, good)
@@ -150,7 +150,7 @@ class StereoMatcher:
         return out
 
     def _narrow_agrees(self, left: klt.Pyramid, right: klt.Pyramid, uv: F64, uv_right: F64) -> Bool:
-        """Whether a narrower window finds the same disparity."""
+        """Whether a narrower window gives the same disparity."""
         narrow = np.nan_to_num(uv_right, nan=-1e3)
         status, _ = klt.track_translation(left, right, uv, narrow, 0, 0, 10, 0.5, 0.3, self._narrow)
         with np.errstate(invalid="ignore"):
@@ -160,23 +160,23 @@ class StereoMatcher:
     def _on_one_surface(self, left: klt.Pyramid, right: klt.Pyramid, uv: F64, uv_right: F64) -> tuple[F64, F64]:
         """Matches by their disparity planes, and their standard deviations in px.
 
-        NaN where a window is explained much worse than windows typically are, where the plane puts the match elsewhere
-        than the window as a whole, or where neither fixes it.
+        NaN where a window's residual is much larger than typical, where the match by the plane differs from that of the
+        window, or where its standard deviation is too large.
         """
         fitted, misfit, sigma_px = fit_planes(
             left[0], right[0], np.ascontiguousarray(uv), uv_right, *self._cameras.cams[2:], self._cameras.right_T_left,
             klt.WEIGHTS, klt.COORDINATES,
         )  # fmt: skip
-        judged = np.isfinite(misfit)
-        typical = max(float(np.percentile(misfit[judged], TYPICAL)), LEAST_MISFIT) if judged.any() else LEAST_MISFIT
+        tested = np.isfinite(misfit)
+        typical = max(float(np.percentile(misfit[tested], TYPICAL)), MIN_MISFIT) if tested.any() else MIN_MISFIT
         with np.errstate(invalid="ignore"):
             good = np.linalg.norm(fitted - uv_right, axis=1) < self._config.max_window_disparity_px
-        good &= (misfit < self._config.max_surface_misfit * typical) & (sigma_px < MOST_SIGMA_PX)
+        good &= (misfit < self._config.max_surface_misfit * typical) & (sigma_px < MAX_SIGMA_PX)
         good &= self._right_area.inside(uv_right)
         fitted[~good] = np.nan
-        return fitted, np.maximum(sigma_px, LEAST_SIGMA_PX)
+        return fitted, np.maximum(sigma_px, MIN_SIGMA_PX)
 
     def _from_depth(self, depth: F32, uv: F64) -> tuple[F64, Bool]:
-        """Virtual right pixels from a depth image, NaN where it has a hole or an edge."""
+        """Virtual right pixels from a depth image, NaN at holes and edges, and where they are finite."""
         uv_right = points_from_depth(self._rig, depth, uv)[1]
         return uv_right, np.isfinite(uv_right[:, 0])

@@ -1,4 +1,4 @@
-"""A rig as the compiled kernels want it."""
+"""A rig as arguments of the compiled kernels."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from stereo_sfm.types import F64
 
 @dataclass(frozen=True)
 class StereoCameras:
-    """Model ids and parameters of both cameras, and where they are."""
+    """Model ids and parameters of both cameras, and their relative pose."""
 
     model_l: int
     params_l: F64

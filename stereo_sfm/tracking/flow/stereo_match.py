@@ -1,4 +1,4 @@
-"""Where a point of the left image lies in the right one: search along its epipolar curve, in any camera model."""
+"""Stereo matching by a search along the epipolar curve, for any camera model."""
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportMissingTypeArgument=false
 # pyright: reportPrivateUsage=false

@@ -1,10 +1,10 @@
-"""Do two windows show one surface? What is left of their difference once its disparity plane is fitted tells.
+"""Test whether two matched windows show one surface, by the residual of a fitted disparity plane.
 
-A window of the left image and its match in the right one show the same pixels where they lie on one smooth surface: the
-difference is noise and, to first order, the gradient along the epipolar direction times a disparity that is a plane
-over the window (slanted supports, Bleyer et al., PatchMatch Stereo, BMVC 2011). Where a depth edge crosses the window,
-one side of it is covered or uncovered between the cameras, and no plane explains those pixels. Such a match is a
-mixture of surfaces and its corner often no point at all, whatever its disparity says.
+If a window of the left image and its match in the right one show one smooth surface, their difference is noise and, to
+first order, the gradient along the epipolar direction times a disparity that is a plane over the window (slanted
+supports, Bleyer et al., PatchMatch Stereo, BMVC 2011). If a depth edge crosses the window, one side of it is occluded
+in one camera, and no plane explains those pixels. Such a match is a mixture of surfaces, and its corner is often no
+physical point.
 """
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportPrivateUsage=false
@@ -31,17 +31,17 @@ from stereo_sfm.tracking.flow.klt import (
     _sample_wide,
 )
 
-CELL = 4  # px, side of the cells whose difference is judged
+CELL = 4  # px, side of the cells whose residuals are tested
 CELLS = SIZE // CELL
 NOISE = 2.0  # grey levels, of the difference of two pixels
-INTERPOLATION = 0.1  # px, what sampling between pixels is worth: times the gradient, more noise
-SPREAD = 0.25  # 1 / root of the pixels that a window is worth as independent measurements of its disparity
-DAMPING = 0.02  # of the plane's slopes, as a share of what is known of the disparity itself
+INTERPOLATION = 0.1  # px, noise of interpolation: times the gradient, in grey levels
+SPREAD = 0.25  # 1 / root of the number of independent measurements of disparity in a window
+DAMPING = 0.02  # of the plane's slopes, as a share of the information about the disparity itself
 
 
 @njit
 def _epipolar(model_r, params_r, right_T_left, ur, vr):
-    """Unit direction (2,) px in the right image in which a nearer point lies; NaN where there is none."""
+    """Unit direction (2,) px in the right image towards nearer points; NaN if undefined."""
     ex, ey, ez = unproject_one(model_r, params_r, ur, vr)
     if math.isnan(ex):
         return math.nan, math.nan
@@ -57,7 +57,7 @@ def _epipolar(model_r, params_r, right_T_left, ur, vr):
 
 @njit
 def fit_planes(left, right, uv, uv_right, model_r, params_r, right_T_left, weights, coordinates):
-    """Disparity planes of matched windows, and how badly they explain them.
+    """Disparity planes of matched windows, and their residuals.
 
     Args:
         left, right: (H, W) uint8. uv, uv_right: (N, 2) px, matches to a fraction of a pixel; NaN is skipped.
@@ -65,8 +65,8 @@ def fit_planes(left, right, uv, uv_right, model_r, params_r, right_T_left, weigh
 
     Returns:
         (N, 2) px in the right image: the match with the plane taken into account. (N,) the worst cell's mean squared
-        difference in squares of the noise expected, inf where not judged. (N,) standard deviation in px of the match
-        along the epipolar direction by what is left of the difference, inf where not judged.
+        residual in squares of the expected noise, inf where not tested. (N,) standard deviation in px of the match
+        along the epipolar direction by the residual, inf where not tested.
     """
     n = uv.shape[0]
     out = uv_right.copy()
@@ -140,8 +140,8 @@ def fit_planes(left, right, uv, uv_right, model_r, params_r, right_T_left, weigh
                     total += (tmp[at] + tmp[at + 1]) + (tmp[at + 2] + tmp[at + 3])
                 worst = max(worst, total / (CELL * CELL))
         misfit[k] = worst
-        alone = known - normal[3, 0] * normal[3, 0] / normal[3, 3]  # what the gradients across cannot explain as well
-        sigma[k] = SPREAD * math.sqrt(_dot(window, weights, tmp) / max(alone, 1e-6))
+        information = known - normal[3, 0] * normal[3, 0] / normal[3, 3]  # with a shift across the curve eliminated
+        sigma[k] = SPREAD * math.sqrt(_dot(window, weights, tmp) / max(information, 1e-6))
         out[k, 0] = ur - (x[0] * eu - x[3] * ev)
         out[k, 1] = vr - (x[0] * ev + x[3] * eu)
     return out, misfit, sigma

@@ -27,7 +27,7 @@ from stereo_sfm.tracking.flow.new_points import NewPoints
 from stereo_sfm.tracking.flow.place_corners import PlaceCorners
 from stereo_sfm.tracking.flow.pyramids import StereoPyramids
 from stereo_sfm.tracking.flow.recovery import SURE_SHARE, Recovery, alike
-from stereo_sfm.tracking.flow.rig_change import place_anew
+from stereo_sfm.tracking.flow.rig_change import triangulate_tracks
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.stereo import StereoMatcher
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
@@ -153,7 +153,7 @@ class Tracker:
         self._solver.use(StereoCameras.of(rig))
         if self._place_corners is not None:
             self._place_corners.use(rig)
-        self._tracks = place_anew(self._tracks, self._stereo, self._shutter, self._pose, self._velocity)
+        self._tracks = triangulate_tracks(self._tracks, self._stereo, self._shutter, self._pose, self._velocity)
 
     # -- stages ----------------------------------------------------------------------------------------------------
 

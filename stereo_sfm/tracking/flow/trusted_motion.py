@@ -1,6 +1,6 @@
-"""Where a camera that sees nothing is expected: from the last second of motion that could be trusted.
+"""Prediction of the pose during a loss of tracking, from the last second of trusted motion.
 
-The covariance grows by what a robot can do in the meantime: brake, speed up, turn.
+The covariance grows with the possible accelerations and turns of a robot.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ import numpy as np
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64
 
-WINDOW_S = 1.0  # of motion that the velocity is the mean of
-FADE_S = 4.0  # in which a robot that sees nothing slows down to a third
-ACCELERATION = 1.0  # m/s^2, standard deviation of what a robot may do
-MOST_SPEED = 1.0  # m/s by which it then differs from before
-TURNING = 1.0  # rad/s^2, likewise
-MOST_TURN_RATE = 0.7  # rad/s, likewise
+WINDOW_S = 1.0  # of motion whose mean is the velocity
+FADE_S = 4.0  # time constant with which the predicted velocity decreases
+ACCELERATION = 1.0  # m/s^2, standard deviation of a robot's acceleration
+MAX_SPEED_CHANGE = 1.0  # m/s
+TURN_ACCELERATION = 1.0  # rad/s^2, standard deviation
+MAX_TURN_RATE_CHANGE = 0.7  # rad/s
 FIRST_SIGMAS = (0.01, 0.005)  # metres, radians: of the last trusted pose and its velocity
 
 
 @dataclass(frozen=True, eq=False)
 class Expectation:
-    """Where a camera is, as far as its motion before tells."""
+    """A predicted pose with its uncertainty."""
 
     odom_T_cam: F64  # (4, 4)
     sigma_m: float  # of the position, along every axis
@@ -43,25 +43,25 @@ class Expectation:
         return np.diag(np.repeat(np.square([self.sigma_m, self.sigma_rad]), 3))
 
     def sigmas_off(self, pose: F64) -> float:
-        """How far a pose (4, 4) is from here, in standard deviations of the worse of position and rotation."""
+        """Difference of a pose (4, 4) in standard deviations, the larger of position and rotation."""
         metres, radians = se3.extent(se3.inverse(self.odom_T_cam) @ pose)
         return max(float(metres) / self.sigma_m, float(radians) / self.sigma_rad)
 
 
 class TrustedMotion:
-    """The poses of the last second that were beyond doubt."""
+    """The trusted poses of the last second."""
 
     def __init__(self) -> None:
         self._poses: deque[tuple[int, F64]] = deque()
 
     def add(self, stamp_ns: int, odom_T_cam: F64) -> None:
-        """The pose of a frame that most of what was seen agrees with."""
+        """Add the pose of a frame that most points agree with."""
         self._poses.append((stamp_ns, odom_T_cam))
         while stamp_ns - self._poses[1 if len(self._poses) > 1 else 0][0] > WINDOW_S * 1e9:
             self._poses.popleft()
 
     def forget(self) -> None:
-        """What was before is another odometry."""
+        """Discard all poses: a new odometry begins."""
         self._poses.clear()
 
     def velocity(self) -> F64:
@@ -72,10 +72,10 @@ class TrustedMotion:
         return np.asarray(se3.log(se3.inverse(first) @ last)) / ((last_ns - first_ns) * 1e-9)
 
     def expect(self, stamp_ns: int) -> Expectation:
-        """Where the camera is at a time, if it goes on more and more slowly as it went when it was last sure."""
+        """The predicted pose at a time, with the last velocity decreasing exponentially."""
         last_ns, last = self._poses[-1]
         seconds = max((stamp_ns - last_ns) * 1e-9, 0.0)
         moved = self.velocity() * FADE_S * -math.expm1(-seconds / FADE_S)
-        metres = min(0.5 * ACCELERATION * seconds, MOST_SPEED) * seconds
-        radians = min(0.5 * TURNING * seconds, MOST_TURN_RATE) * seconds
+        metres = min(0.5 * ACCELERATION * seconds, MAX_SPEED_CHANGE) * seconds
+        radians = min(0.5 * TURN_ACCELERATION * seconds, MAX_TURN_RATE_CHANGE) * seconds
         return Expectation(last @ se3.exp(moved), FIRST_SIGMAS[0] + metres, FIRST_SIGMAS[1] + radians)

@@ -1,7 +1,7 @@
-"""Where an image shows the world: not beyond the edge of the lens's picture, which the calibration does not know.
+"""The part of an image inside the lens's image circle, which the calibration does not describe.
 
-A fisheye's picture ends in a dark rim that moves with the camera. A window on it holds an edge that stands still, and
-what it says about motion is: none. Where the picture ends is seen: beyond that angle from the axis nothing is ever lit.
+The image circle of a fisheye ends in a dark rim that moves with the camera: a window on it has a static edge and would
+measure no motion. The rim is found from the images: beyond its angle from the axis no pixel is ever bright.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.tracking.flow.corners import corner_mask
 from stereo_sfm.types import F64, U8, Bool
 
-STEP = 2  # px of the half image between those that are looked at
-CENTRE_DEG = 45.0  # up to here an image is lit as scenes are
-LEAST_RIM_DEG = 60.0  # no lens shows less; dark surroundings do
-LIT = 0.3  # of the median brightness in the centre
-LIT_SHARE = 0.1  # of the pixels at one angle, that show that the lens's picture has not ended
-WINDOW = 7  # px of the half image: what weighs in the windows of points keeps off the rim
+STEP = 2  # px of the half image between the sampled ones
+CENTRE_DEG = 45.0  # angle from the axis within which the brightness is that of the scene
+MIN_RIM_DEG = 60.0  # smaller angles are dark surroundings, not the rim
+LIT = 0.3  # of the median brightness in the centre, above which a pixel is bright
+LIT_SHARE = 0.1  # of bright pixels at one angle, above which it is inside the image circle
+WINDOW = 7  # px of the half image: margin to the rim for the windows of points
 
 
 class VisibleArea:
@@ -34,7 +34,7 @@ class VisibleArea:
             angle = np.nan_to_num(np.degrees(np.arccos(np.clip(grid[..., 2], -1, 1))), nan=180.0)
         self._camera = camera
         self._degree = angle.astype(np.int64)  # (H / 4, W / 4)
-        self._lit = np.zeros(181)  # share of the pixels at each degree, the most ever seen
+        self._lit = np.zeros(181)  # largest share of bright pixels so far at each degree
         self._rim_deg = 181
         self._allowed = corner_mask(camera, max_angle_deg)
         self._used = np.ones_like(self._allowed) if mask is None else uncovered(half_size(mask), WINDOW // 2)
@@ -46,21 +46,21 @@ class VisibleArea:
         return self._allowed & self._shown
 
     def learn(self, half_image: U8) -> None:
-        """Look at one more image, level 1 of its pyramid."""
-        if self._degree[0, 0] < LEAST_RIM_DEG:
+        """Update the rim with an image, level 1 of its pyramid."""
+        if self._degree[0, 0] < MIN_RIM_DEG:
             return
         sparse, degree = half_image[::STEP, ::STEP], self._degree
         lit = sparse > LIT * np.median(sparse[degree < CENTRE_DEG])
         share = np.bincount(degree[lit], minlength=181) / np.maximum(np.bincount(degree.ravel(), minlength=181), 1)
         self._lit = np.maximum(self._lit, share)
         rim = int(np.flatnonzero(self._lit >= LIT_SHARE).max(initial=0)) + 1
-        if rim >= LEAST_RIM_DEG and rim != self._rim_deg:
+        if rim >= MIN_RIM_DEG and rim != self._rim_deg:
             self._rim_deg = rim
             shown = self._camera.valid_mask(math.radians(rim), step=2).astype(np.uint8)
             self._shown = (cv2.erode(shown, np.ones((WINDOW, WINDOW), np.uint8)) > 0) & self._used
 
     def inside(self, uv: F64) -> Bool:
-        """Which pixels (N, 2) are in the image and off the rim; not those that are NaN."""
+        """Which pixels (N, 2) are in the image and inside the rim; False for NaN."""
         inside = self._camera.inside(uv, 1.0)
         u, v = np.rint(uv[inside] / 2).astype(np.int64).T
         inside[inside] = self._shown[np.minimum(v, self._shown.shape[0] - 1), np.minimum(u, self._shown.shape[1] - 1)]

@@ -1,1 +1,1 @@
-"""What an inertial sensor says of the motion: prediction, and the motion itself where images fail."""
+"""Inertial motion: prediction, and the motion itself when images fail."""

@@ -1,4 +1,4 @@
-"""The tracker's inertial sense: where the camera should be next, and where it is while the images show nothing."""
+"""Inertial prediction of the tracker: the next pose, and poses while the images give none."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from stereo_sfm.tracking.inertial.window import InertialState, InertialWindow
 from stereo_sfm.types import F64, ImuSamples
 
 NODE_NS = 200_000_000  # between the poses of the window
-BRIDGED_S, BRIDGED_M = 10.0, 0.5  # longest time and largest standard deviation that are gone through without images
-MOST_TURN_ERROR = 0.1  # rad/s between gyroscope and images, root mean square: more is another sensor's data
-JUDGED = 20  # intervals that the sensor is judged by
-MOST_GRAVITY_ERROR = 1.0  # m/s^2 of its size
+BRIDGED_S, BRIDGED_M = 10.0, 0.5  # longest time and largest standard deviation without images
+MAX_TURN_ERROR = 0.1  # rad/s between gyroscope and images, root mean square: more is another sensor's data
+JUDGED = 20  # intervals for the comparison with the images
+MAX_GRAVITY_ERROR = 1.0  # m/s^2 of its size
 
 
 class InertialMotion:
-    """Fed with every image's samples; told every pose that the images gave."""
+    """Integrates the samples of every image; corrected by the poses from images."""
 
     def __init__(self, imu: Imu) -> None:
         self._imu = imu
@@ -33,7 +33,7 @@ class InertialMotion:
         self._begun = False
         self._integrated: dict[tuple[int, int], Preintegrated | None] = {}  # by interval, since the last samples
         self._turn_errors: list[float] = []  # squared, rad/s
-        self.left_out = ""  # why the sensor is not believed
+        self.left_out = ""  # why the sensor is not used
 
     @property
     def state(self) -> InertialState | None:
@@ -87,7 +87,7 @@ class InertialMotion:
         if not self._begun:
             self.begin(stamp_ns, odom_T_cam)
             return
-        self._judge(stamp_ns, odom_T_imu)
+        self._compare(stamp_ns, odom_T_imu)
         self._last_ns, self._odom_T_last = stamp_ns, odom_T_imu
         if stamp_ns - self._node_ns < NODE_NS:
             return
@@ -149,7 +149,7 @@ class InertialMotion:
         turned = self._odom_T_node[:3, :3] @ motion.velocity_with(self._gyro_bias, self._state.accel_bias)
         return self._state.velocity + self._state.gravity * motion.seconds + turned
 
-    def _judge(self, stamp_ns: int, odom_T_imu: F64) -> None:
+    def _compare(self, stamp_ns: int, odom_T_imu: F64) -> None:
         """Compare with what the images showed: a sensor that contradicts them for long is left out."""
         motion = self._motion(self._last_ns, stamp_ns)
         if motion is None:
@@ -157,11 +157,11 @@ class InertialMotion:
         seen = self._odom_T_last[:3, :3].T @ odom_T_imu[:3, :3]
         error = float(np.linalg.norm(se3.so3_log(motion.rotation.T @ seen))) / motion.seconds
         self._turn_errors = [*self._turn_errors[1 - JUDGED :], error * error]
-        wrong = len(self._turn_errors) >= JUDGED and np.sqrt(np.mean(self._turn_errors)) > MOST_TURN_ERROR
+        wrong = len(self._turn_errors) >= JUDGED and np.sqrt(np.mean(self._turn_errors)) > MAX_TURN_ERROR
         size = 0.0 if self._state is None else abs(float(np.linalg.norm(self._state.gravity)) - GRAVITY)
         if wrong:
             self.left_out = "gyro_contradicts_images"
-        elif size > MOST_GRAVITY_ERROR:
+        elif size > MAX_GRAVITY_ERROR:
             self.left_out = "accelerometer_contradicts_images"
         elif self.left_out and len(self._turn_errors) >= JUDGED:
             self.left_out = ""

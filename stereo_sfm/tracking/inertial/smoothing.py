@@ -1,4 +1,4 @@
-"""Poses that the IMU alone gave, afterwards: the images before and after such a stretch say how it erred.
+"""Smoothing of poses from the IMU alone, by the images before and after such an interval.
 
 From the last good pose on, an error of the velocity grows with time and one of the acceleration (gravity's direction,
 bias) with its square; position and velocity where the images come back determine both.

@@ -21,7 +21,7 @@ from stereo_sfm.geometry.preintegration import GRAVITY, Preintegrated
 from stereo_sfm.types import F64
 
 LONGEST_S = 10.0  # of the window
-LEAST_S = 1.5  # of motion before velocity and gravity count as known
+MIN_S = 1.5  # of motion before velocity and gravity are used
 POSITION_SIGMA_M = 0.0015  # of one pose against the next
 ROTATION_SIGMA = 5e-4  # rad, the same
 GRAVITY_SIGMA = 0.02  # m/s^2 of its size, which varies over the earth
@@ -76,7 +76,7 @@ class InertialWindow:
 
     def estimate(self) -> InertialState | None:
         """None while the window is too short."""
-        if self.seconds < LEAST_S:
+        if self.seconds < MIN_S:
             return None
         gyro_bias, gyro_sigma = self.gyro_bias()
         x, covariance = _solve(np.array(self._links), gyro_bias)
