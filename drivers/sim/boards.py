@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.targets import Target, charuco_board
-from stereo_sfm.drivers.sim.effects import CLEAN, Effects, Sensor
+from stereo_sfm.drivers.sim.effects import CLEAN, Sensor
 from stereo_sfm.drivers.sim.render import NO_OBJECTS, Renderer
 from stereo_sfm.drivers.sim.targets import FlatTarget, empty_room, move, place
 from stereo_sfm.errors import StereoSfmError
@@ -90,10 +90,9 @@ def render_boards(
     board = FlatTarget(image, float(size[0]), float(size[1]), world_T_board)
     world, moving = place(empty_room(), [board], NO_OBJECTS)
     renderer = Renderer(world, rig)
-    effects = Effects(
-        **{**vars(CLEAN), "lens_blur_px": faults.lens_blur_px, "read_noise": faults.read_noise,
-           "vignetting": faults.vignetting}
-    )  # fmt: skip
+    effects = replace(
+        CLEAN, lens_blur_px=faults.lens_blur_px, read_noise=faults.read_noise, vignetting=faults.vignetting
+    )
     sensors = [Sensor(side, effects) for side in renderer.cameras]
     poses = random_views(rig, size, count, seed, field_deg)
     moving = move(moving, board, world_T_board)

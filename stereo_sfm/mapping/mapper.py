@@ -218,7 +218,7 @@ class Mapper:
         if applied:
             before, self._rig = self._rig, with_terms(self._source_rig, revision.terms)
             recalibrate(self.map, before, self._rig, self.map.kf_row(revision.since_kf_id))
-            self._order_full_bundle()
+            self._start_full_bundle()
             if self._rows is not None:
                 self._rows.use(self._rig)
 
@@ -239,7 +239,7 @@ class Mapper:
         self._loops.append(loop)
         self._fused += correction.fused
         self._follow_newest(before)
-        self._order_full_bundle()
+        self._start_full_bundle()
 
     def _bundle_when_grown(self, factor: float) -> None:
         """Start a full bundle adjustment if the map has grown by a factor since the last."""
