@@ -14,7 +14,6 @@ from stereo_sfm.calib.mask import encode_mask, half_size, read_mask, uncovered
 from stereo_sfm.calib.mask_search import MaskSearch, masked
 from stereo_sfm.calib.rectification import rectify
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.cli import main
 from stereo_sfm.config import Config
 from stereo_sfm.drivers.sim.source import SimSource
 from stereo_sfm.drivers.source import open_source
@@ -148,25 +147,15 @@ def test_recording_without_turns_cannot_tell() -> None:
         search.find()
 
 
-@pytest.mark.slow
-def test_automatic_mask_is_as_good_as_no_robot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Odometry with the robot in view and its mask, against the same drive without the robot."""
-    scene = "sim:loop?camera=pinhole&size=320x200&rate=10&frames=330"
-    assert main(["mask", scene + "&robot=true", "-o", str(tmp_path / "mask.png"), "-q"]) == 0
-    errors: dict[str, float] = {}
-    for name, spec in {
-        "none": [scene],
-        "masked": [scene + "&robot=true", "--rig", str(tmp_path / "mask.yaml")],
-    }.items():
-        assert main(["run", *spec, "--inline", "-o", str(tmp_path / name), "-q"]) == 0
-        capsys.readouterr()
-        assert main(["eval", str(tmp_path / name), "--json"]) == 0
-        errors[name] = _first_number(capsys.readouterr().out)
-    assert errors["masked"] < 1.3 * errors["none"] + 0.005
-
-
-def _first_number(text: str) -> float:
-    import json
-
-    answer = json.loads(text)
-    return float(answer["ape_m"]["rmse"])
+def test_found_mask_keeps_points_off_the_robot() -> None:
+    search, source = searched(SCENE + "&robot=true&frames=400")
+    robot = source._sensors[0].robot  # pyright: ignore[reportPrivateUsage]
+    assert robot is not None
+    features = replace(Config().features, stereo_only=False)
+    image, on_robot = source.frame(0), dict[str, int]()
+    for name, rig in {"unmasked": source.rig, "masked": masked(source.rig, search.find())}.items():
+        uv = ViewMaker(features, rig).make(image, None, np.random.default_rng(0)).features.uv
+        u, v = np.rint(uv).astype(int).T
+        on_robot[name] = int(robot.covered[v, u].sum())
+        assert len(uv) > 200
+    assert on_robot["masked"] == 0 and on_robot["unmasked"] > 50
