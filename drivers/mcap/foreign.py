@@ -117,7 +117,7 @@ class ForeignSource(BaseSource):
             image = self._decode(frame_id, left, other, dropped) if self._used(other) else None
             dropped = 0 if image is not None else dropped + 1
             if image is not None:
-                yield replace(image, imu=_take_imu(imu, left.stamp_ns)) if self.topics.imu else image
+                yield replace(image, imu=take_imu(imu, left.stamp_ns)) if self.topics.imu else image
 
     def _other(self) -> str:
         return self.topics.right or self.topics.depth
@@ -282,7 +282,7 @@ def _imu_reading(record: Record) -> ImuReading | None:
     return None
 
 
-def _take_imu(buffer: list[ImuReading], until_ns: int) -> ImuSamples:
+def take_imu(buffer: list[ImuReading], until_ns: int) -> ImuSamples:
     """Remove the samples up to a stamp from the buffer."""
     taken = sorted((s for s in buffer if s.stamp_ns <= until_ns), key=lambda s: s.stamp_ns)
     buffer[:] = [s for s in buffer if s.stamp_ns > until_ns]

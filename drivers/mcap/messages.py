@@ -223,6 +223,15 @@ def _imu_ros(data: bytes) -> ImuReading:
     return ImuReading(stamp_ns, frame, [*(gyro if gyro_known else nothing), *(accel if accel_known else nothing)])
 
 
+def _velocity_ros(data: bytes) -> tuple[int, tuple[float, ...], tuple[float, ...]]:
+    """(stamp_ns, m/s, rad/s) of the body in its own axes, of an odometry."""
+    cdr = _Cdr(data)
+    stamp_ns, _ = cdr.header()
+    cdr.text()
+    cdr.take("d", 7 + 36)
+    return stamp_ns, cdr.take("d", 3), cdr.take("d", 3)
+
+
 IMAGES: dict[str, Callable[[bytes], ImageMessage]] = {
     "foxglove.RawImage": _image_foxglove_raw,
     "foxglove.CompressedImage": _image_foxglove_compressed,
@@ -244,6 +253,9 @@ POSES: dict[str, Callable[[bytes], Transform]] = {
     "nav_msgs/msg/Odometry": _odometry_ros,
 }
 IMUS: dict[str, Callable[[bytes], ImuReading]] = {"sensor_msgs/msg/Imu": _imu_ros}
+VELOCITIES: dict[str, Callable[[bytes], tuple[int, tuple[float, ...], tuple[float, ...]]]] = {
+    "nav_msgs/msg/Odometry": _velocity_ros
+}
 ENCODINGS = ("protobuf", "cdr")
 
 

@@ -7,4 +7,5 @@ OUTPUTS: dict[str, str] = {
     "foxglove": "stereo_sfm.service.outputs.foxglove_server:make",
     "page": "stereo_sfm.service.page.server:make",
     "pose_socket": "stereo_sfm.service.outputs.pose_socket:make",
+    "ros2": "stereo_sfm.service.outputs.ros2:make",
 }
