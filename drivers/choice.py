@@ -90,6 +90,7 @@ class SourceChoice:
         selection: the part of the source.
         rectify: a key of RECTIFY: none, pinhole (crops a fisheye), wide (keeps its view).
         speed: playback speed relative to the stamps; None: as fast as they are read.
+        repeat: play it again and again.
     """
 
     spec: str
@@ -98,6 +99,7 @@ class SourceChoice:
     selection: Selection = EVERYTHING
     rectify: str = "none"
     speed: float | None = None
+    repeat: bool = False
 
     @staticmethod
     def of(
@@ -147,12 +149,14 @@ class SourceChoice:
     def __call__(self) -> Source:
         from stereo_sfm.drivers.paced import PacedSource
         from stereo_sfm.drivers.rectified import rectified
+        from stereo_sfm.drivers.repeated import RepeatedSource
         from stereo_sfm.drivers.select import SelectedFrames
 
         source = open_source(self.spec, self.rig, **self.options)
         if self.selection != EVERYTHING:
             source = SelectedFrames(source, **vars(self.selection))
         source = rectified(source, RECTIFY[self.rectify])
+        source = RepeatedSource(source) if self.repeat else source
         return source if self.speed is None else PacedSource(source, self.speed)
 
 

@@ -21,6 +21,8 @@ COMMANDS: dict[str, str] = {
     "replay": "repeat a run from its log, bit for bit",
     "viz": "show a run, a saved map or a recording in rerun",
     "batch": "run many recordings, on this machine or on a cluster",
+    "serve": "run without end on a robot: poses for others, the map kept, the recordings in bounds",
+    "service": "install the service on this computer, remove it, or show its state",
     "record": "write a source to an MCAP file",
     "info": "describe a recording or dataset folder and its problems",
     "convert": "convert a dataset folder to MCAP",

@@ -54,6 +54,27 @@ class Compiling:
 
 
 @dataclass(frozen=True)
+class MapSaved:
+    """The map of a run so far was written on request, or why it was not."""
+
+    folder: str
+    keyframes: int
+    why: str = ""  # it was not written
+
+
+@dataclass(frozen=True)
+class Localized:
+    """From this map update on poses are in the frame of the saved map that the run began with."""
+
+    version: int
+
+
+@dataclass(frozen=True)
+class Relocalize:
+    """A request: search the whole saved map for the camera."""
+
+
+@dataclass(frozen=True)
 class LogEnded:
     """The log has ended early; the run continues."""
 

@@ -13,6 +13,9 @@ if TYPE_CHECKING:
     from stereo_sfm.drivers.source import Source
 
 
+RECORDING = "recording.json"  # in a folder of segments
+
+
 @dataclass(frozen=True)
 class McapOptions(SourceOptions):
     """Options of `mcap:FILE`. The topics are for files of other programs."""
@@ -25,10 +28,17 @@ class McapOptions(SourceOptions):
 def _open(place: str, options: McapOptions) -> Source:
     from stereo_sfm.drivers.mcap.source import open_mcap
 
+    folder = Path(place).expanduser()
+    if place and folder.is_dir():
+        from stereo_sfm.drivers.mcap.segments import SegmentsSource
+
+        return SegmentsSource(folder, options)
     return open_mcap(place, options)
 
 
 def _recognise(path: Path) -> Certainty:
+    if (path / RECORDING).is_file() and any(path.glob("*.mcap")):
+        return Certainty.MARKED
     if not path.is_file():
         return Certainty.NO
     return Certainty.MARKED if path.suffix == ".mcap" else Certainty.PERHAPS

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections import deque
 from dataclasses import dataclass
 from functools import singledispatchmethod
@@ -41,6 +42,7 @@ TRAJECTORY_SIZE = 200  # keyframes
 POINTS_NS = 5_000_000_000
 POINTS_SIZE = 50_000
 PATH_COLOR = (70, 150, 255, 255)
+KEPT_STAMPS = 10_000  # of keyframes, whose answers may still come
 OLD_TRACK = 30  # frames after which a track's colour no longer changes
 
 
@@ -70,6 +72,7 @@ class RunLog:
         image_format: str = "png",
         ground_truth: Trajectory | None = None,
         opening: Opening | None = None,
+        whole_map: bool = True,
     ) -> None:
         """Begin a log.
 
@@ -82,17 +85,21 @@ class RunLog:
             image_format: "png", "raw", "jpeg" (only with images from `encode_pair`), or "none" for no images.
             ground_truth: world_T_cam0 where the source has it.
             opening: how the source was opened.
+            whole_map: now and then the whole map and trajectory, for viewers; memory and file grow with it.
         """
-        self._writer = writer
         self._left_T_body = se3.inverse(rig.body_T_left)
         self._body_adjoint = se3.adjoint(rig.body_T_left)
         localize_only = opening is not None and opening.localize_only
         self._loops = config.closes_loops(rig.stereo, localize_only)  # whether results will come
-        write_provenance(
-            writer, source=source, serial=rig.serial, mode=mode, image_format=image_format, config=config,
+        self._whole_map = whole_map
+        self._provenance = functools.partial(
+            write_provenance, source=source, serial=rig.serial, mode=mode, image_format=image_format, config=config,
             opening=opening,
         )  # fmt: skip
-        self._images = ImageLog(writer, rig, ground_truth, image_format, mapped=True)
+        self._image_log = functools.partial(
+            ImageLog, rig=rig, ground_truth=ground_truth, image_format=image_format, mapped=True
+        )
+        self._begin(writer)
         self._pictured = image_format != "none"  # else there is nothing to draw the tracked points on
         self._map = MapView()
         self._map_T_odom: dict[int, F64] = {0: np.eye(4)}  # by map version
@@ -107,9 +114,21 @@ class RunLog:
         self._next_points_ns: int | None = None
         self._last: tuple[int, int] = (0, 0)  # stamp and frame id of the newest keyframe shown
         self._now_ns = 0
-        self._totals = dict.fromkeys(("frames", "lost", "keyframes", "loops accepted", "loop candidates rejected"), 0)
         self._closed = False
         self._counts: dict[str, float] = {}  # of a live source
+
+    def _begin(self, writer: LogWriter) -> None:
+        """Begin a file."""
+        self._writer = writer
+        self._provenance(writer)
+        self._images = self._image_log(writer)
+        self._totals = dict.fromkeys(("frames", "lost", "keyframes", "loops accepted", "loop candidates rejected"), 0)
+
+    def next_file(self, writer: LogWriter) -> None:
+        """Close the file and go on in another one, where what is still awaited will be written."""
+        if not self._writer.closed:
+            self._end()
+        self._begin(writer)
 
     def put(self, message: object) -> None:
         """Any message of a run."""
@@ -163,6 +182,8 @@ class RunLog:
         self._writer.write(topics.KEYFRAME, keyframe, keyframe.stamp_ns, keyframe.frame_id)
         self._keyframes[keyframe.kf_id] = keyframe
         self._stamps[keyframe.kf_id] = (keyframe.stamp_ns, keyframe.frame_id)
+        if len(self._stamps) > KEPT_STAMPS:
+            del self._stamps[next(iter(self._stamps))]
         self._release_answers()
         self._release_updates()
 
@@ -216,8 +237,15 @@ class RunLog:
             self._release_answers(everything=True)
             self._release_updates(everything=True)
             self._release_frames(everything=True)
-            self._show_trajectory()
-            self._show_points()
+            if self._whole_map:
+                self._show_trajectory()
+                self._show_points()
+        finally:
+            self._end(early=early)
+
+    def _end(self, *, early: bool = False) -> None:
+        """Write the totals and close the file."""
+        try:
             totals = {name: str(int(value)) for name, value in self._totals.items()}
             counted = {name: f"{value:g}" for name, value in self._counts.items() if value}
             self._writer.metadata(TOTALS, counted | self._images.totals | totals)
@@ -235,7 +263,7 @@ class RunLog:
         older = sorted(v for v in self._map_T_odom if v <= frame.map_version)
         for version in older[:-1]:
             del self._map_T_odom[version]
-        map_T_odom = self._map_T_odom[older[-1]]
+        map_T_odom = self._map_T_odom[older[-1] if older else min(self._map_T_odom)]  # none: a frame written again
         map_T_body = map_T_odom @ frame.odom_T_cam @ self._left_T_body
         stamp, sequence = frame.stamp_ns, frame.frame_id
         map_pose, correction = foxglove.poses(np.stack([map_T_body, map_T_odom]))
@@ -267,6 +295,9 @@ class RunLog:
         keyframe, result = self._keyframes.pop(update.kf_id, None), self._results.pop(update.kf_id, None)
         if keyframe is not None:
             self._last = (keyframe.stamp_ns, keyframe.frame_id)
+        if not self._whole_map:
+            return
+        if keyframe is not None:
             self._map.keyframe(keyframe, update.map_T_odom)
         if result is not None:
             self._map.loop(result)

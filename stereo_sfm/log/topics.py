@@ -20,6 +20,7 @@ SCHEMA_VERSION = "1"
 
 LEFT_IMAGE = "/cam0/image"
 RIGHT_IMAGE = "/cam1/image"
+THUMBNAIL = "/cam0/thumbnail"
 DEPTH_IMAGE = "/depth/image"
 LEFT_CALIBRATION = "/cam0/calibration"
 RIGHT_CALIBRATION = "/cam1/calibration"
@@ -87,6 +88,7 @@ TABLE: tuple[Topic, ...] = (
     Topic(IMAGE_INFO, ImageInfo, "every image, before its pixels"),
     Topic(LEFT_IMAGE, _IMAGE, "every image"),
     Topic(RIGHT_IMAGE, _IMAGE, "every image of a stereo source"),
+    Topic(THUMBNAIL, "foxglove.CompressedImage", "every few seconds of a recording: the left image, small"),
     Topic(DEPTH_IMAGE, "foxglove.RawImage", "every image of an RGB-D source, metres"),
     Topic(LEFT_CALIBRATION, "foxglove.CameraCalibration", "at the start and every second"),
     Topic(RIGHT_CALIBRATION, "foxglove.CameraCalibration", "at the start and every second"),

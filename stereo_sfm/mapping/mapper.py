@@ -295,8 +295,16 @@ class Mapper:
         """The living map."""
         return self.map.snapshot()
 
-    def place(self, saved: MapSnapshot) -> LoopResult | None:
-        """None: this mapper started without a saved map."""
+    @property
+    def found(self) -> bool:
+        """Never: this mapper began with no saved map."""
+        return False
+
+    def relocalize(self) -> None:
+        """Nothing: this mapper began with no saved map."""
+
+    def place(self) -> LoopResult | None:
+        """Nowhere: this mapper began with no saved map."""
         return None
 
     def _apply_job(self) -> None:

@@ -47,7 +47,16 @@ class AnyMapper(Protocol):
         """The map that was made; None where none is made."""
         ...
 
-    def place(self, saved: MapSnapshot) -> LoopResult | None:
+    @property
+    def found(self) -> bool:
+        """Whether updates are in the frame of the saved map that the run began with."""
+        ...
+
+    def relocalize(self) -> None:
+        """Search the whole saved map with the next keyframe, where that is what this mapper does."""
+        ...
+
+    def place(self) -> LoopResult | None:
         """Where the map that was made lies in the saved map that the run began with; None: nowhere."""
         ...
 

@@ -10,7 +10,6 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import LoopConfig, MapperConfig
 from stereo_sfm.geometry import se3
-from stereo_sfm.mapping.map import MapSnapshot
 from stereo_sfm.mapping.mapper import Mapper
 from stereo_sfm.maps.localizer import Localizer
 from stereo_sfm.maps.relocalization import Location
@@ -54,7 +53,12 @@ class Extension(Mapper):
             return update
         return self._in_saved_map(update, self._saved_T_session)
 
-    def place(self, saved: MapSnapshot) -> LoopResult | None:
+    @property
+    def found(self) -> bool:
+        """Whether a keyframe was relocalized in the saved map."""
+        return self._saved_T_session is not None
+
+    def place(self) -> LoopResult | None:
         """The first relocalization, as a loop from a keyframe of the saved map to a live one of the session, or None.
 
         Ids are those of the respective map.
@@ -66,6 +70,7 @@ class Extension(Mapper):
         alive = bool(table.alive[row])
         living = kf_id if alive else int(table.kf_id[table.carrier[row]])
         kf_T_living = np.eye(4) if alive else se3.inverse(table.carrier_T_kf[row])
+        saved = self._localizer.saved
         candidate = saved.map_T_kf[int(np.searchsorted(saved.kf_ids, where.kf_id))]
         return LoopResult(
             kf_id=living,

@@ -37,6 +37,7 @@ class MapFolders:
     localize_only: bool = False
     map_out: Path | None = None
     kept: Path | None = None  # folder of the run's own map, for later exports; None: not saved
+    session: Path | None = None  # folder for `unfinished.save_session` at the end; None: not saved
 
     def check(self, overwrite: bool = False) -> None:
         """Raises StereoSfmError for invalid combinations, before anything is computed."""
@@ -137,8 +138,8 @@ def _merged(mapper: AnyMapper, session: SavedMap, map_in: Path, config: Config) 
     from stereo_sfm.maps.saved_map import load_map
 
     before = load_map(map_in, session.rig)
-    place = mapper.place(before.snapshot)
-    return merge([before, session], configured_vocabulary(config.loop), config.loop, config.mapper, place).saved
+    vocabulary = configured_vocabulary(config.loop)
+    return merge([before, session], vocabulary, config.loop, config.mapper, mapper.place()).saved
 
 
 def _unused_name(folder: Path) -> Path:

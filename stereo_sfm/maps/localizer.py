@@ -29,7 +29,7 @@ class Localizer(WithoutJobs):
     """
 
     def __init__(self, snapshot: MapSnapshot, rig: Rig, vocabulary: Vocabulary, config: LoopConfig) -> None:
-        self.rig = rig
+        self.rig, self.saved = rig, snapshot
         self._relocalizer = Relocalizer(snapshot, rig, vocabulary, config)
         self._config = config
         self._map_T_odom: F64 = np.eye(4)
@@ -74,7 +74,11 @@ class Localizer(WithoutJobs):
         """No map is built."""
         return
 
-    def place(self, saved: MapSnapshot) -> None:
+    def relocalize(self) -> None:
+        """Do not trust the prediction: search the whole map with the next keyframe."""
+        self._failures = LOST_AFTER
+
+    def place(self) -> None:
         """No map is built that could be placed."""
         return
 

@@ -25,13 +25,27 @@ def replaced_folder(folder: Path, names: frozenset[str]) -> Generator[Path]:
     draft.mkdir()
     try:
         yield draft
+        for path in draft.iterdir():
+            _sync(path)
         if keep:
             for path in sorted(draft.iterdir()):
                 path.replace(folder / path.name)
         else:
             _swap(draft, folder)
+        _sync(folder.parent)
     finally:
         _remove(draft)
+
+
+def _sync(path: Path) -> None:
+    """A file or folder survives a loss of power from now on."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError:  # a file system that cannot
+        return
+    finally:
+        os.close(descriptor)
 
 
 def _cannot_move(folder: Path) -> bool:

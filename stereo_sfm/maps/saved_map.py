@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -57,8 +58,11 @@ class SavedMap:
         return np.unique(self.sessions).tolist()
 
 
-def save_map(saved: SavedMap, folder: Path | str) -> None:
+def save_map(saved: SavedMap, folder: Path | str, beside: Mapping[str, bytes] | None = None) -> None:
     """Write a map folder atomically; other files in it stay.
+
+    Args:
+        saved: the map. folder: where. beside: further files of the folder, by name.
 
     Raises:
         StereoSfmError: the map is empty.
@@ -66,7 +70,9 @@ def save_map(saved: SavedMap, folder: Path | str) -> None:
     if not len(saved) or not len(saved.snapshot.points):
         raise StereoSfmError("the map is empty: nothing to save")
     folder = Path(folder).expanduser()
-    with replaced_folder(folder, frozenset({"map.json", "rig.yaml", *(f"{name}.npz" for name in _FILES)})) as draft:
+    beside = beside or {}
+    names = frozenset({"map.json", "rig.yaml", *beside, *(f"{name}.npz" for name in _FILES)})
+    with replaced_folder(folder, names) as draft:
         checksums: dict[str, str] = {}
         for name, columns in _FILES.items():
             path = draft / f"{name}.npz"
@@ -75,6 +81,8 @@ def save_map(saved: SavedMap, folder: Path | str) -> None:
         write_native(saved.rig, draft / "rig.yaml")
         checksums["rig"] = checksum((draft / "rig.yaml").read_bytes())
         write_header(draft, _counts(saved), saved.vocabulary_id, checksums)
+        for name, data in beside.items():
+            (draft / name).write_bytes(data)
 
 
 def _counts(saved: SavedMap) -> dict[str, int]:

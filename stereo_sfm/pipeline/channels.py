@@ -122,7 +122,7 @@ class Inbox(Generic[T]):
     """Receiving end; `take` blocks."""
 
     def __init__(self, connection: Connection) -> None:
-        self._connection = connection
+        self.connection = connection
 
     def take(self) -> T:
         """The next message.
@@ -131,10 +131,10 @@ class Inbox(Generic[T]):
             Lost: the sender has ended.
         """
         try:
-            return self._connection.recv()
+            return self.connection.recv()
         except (EOFError, OSError):
             raise Lost from None
 
     def ready(self) -> bool:
         """Whether a message is there: only the realtime schedule asks."""
-        return self._connection.poll(0)
+        return self.connection.poll(0)

@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerContext, SpawnContext
 from multiprocessing.process import BaseProcess
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
@@ -26,7 +27,7 @@ from stereo_sfm.config import Config
 from stereo_sfm.drivers.choice import Opener
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.maps.folders import MapFolders
-from stereo_sfm.messages import Compiling, LogEnded, LogLine, Sink
+from stereo_sfm.messages import Compiling, Localized, LogEnded, LogLine, MapSaved, Relocalize, Sink
 from stereo_sfm.pipeline import logger, workers
 from stereo_sfm.pipeline.capture import SourceInfo
 from stereo_sfm.pipeline.channels import DroppingOutbox, End, Failed, Outbox
@@ -42,7 +43,7 @@ log = logging.getLogger("stereo_sfm")
 
 SINKS = ("logger", "viewer")
 PICTURE_NS = 100_000_000  # shortest interval between pictures for the viewer
-CHECK_S = 0.5  # between two checks for processes that do not respond
+CHECK_S = 0.25  # between two checks for processes that do not respond
 GRACE_S = 1.2  # time for the logger to close its file after another stage died
 STOP_GRACE_S = 2.0  # time for capture to react to a stop
 END_S = 3.0  # time for a live run to end after a stop; for others, the longest time without a message
@@ -73,6 +74,8 @@ class ProcessRun:
         viewer: ViewerOptions | None = None,
         delays: int | None = None,
         opened: Callable[[], None] | None = None,
+        images: Callable[[SlotImage], None] | None = None,
+        silent_s: float | None = None,
     ) -> None:
         """Prepare a run.
 
@@ -87,11 +90,13 @@ class ProcessRun:
             viewer: show the run while it goes on.
             delays: seed of random delays in every stage, for tests.
             opened: called when the source is open, before anything is written.
+            images: takes each image in place of a log, and calls `release` when it was read.
+            silent_s: a stage that does not respond for so long ends the run; None: it is only reported.
         """
         self._opener, self._config, self._sinks = opener, config, list(sinks)
         self._realtime, self._applied, self._log, self._delays = realtime, applied, log, delays
         self._folders, self._viewer = folders or MapFolders(), viewer
-        self._opened = opened
+        self._opened, self._images, self._silent_s = opened, images, silent_s
         self._context = _context()
         self._processes: dict[str, BaseProcess] = {}
         self._reports: dict[Connection, str] = {}
@@ -223,6 +228,9 @@ class ProcessRun:
         self._look_s = now + CHECK_S
         waiting = set(self._reports.values())
         silent = self._watchdog.silent(sorted(waiting - {"viewer"}))
+        if silent and self._silent_s is not None and self._stopped_s is None:
+            self._abandon()
+            raise StageDied(f"the {silent[0]} process does not respond")
         if waiting == {"viewer"}:
             self._over_s = self._over_s or now
             if now - self._over_s > VIEWER_GRACE_S:
@@ -286,7 +294,7 @@ class ProcessRun:
             for end in ends:
                 if end not in keep:
                     end.close()  # only the workers hold these: their death must be seen as an end of file
-        self._watchdog = Watchdog(self.pids, log.warning)
+        self._watchdog = Watchdog(self.pids, log.warning, self._silent_s)
         info = self._first_report()
         self._live = info.live if self._realtime is None else self._realtime
         if self._log is not None:
@@ -384,7 +392,7 @@ class ProcessRun:
             self._dispatch(message)
 
     def _dispatch(self, message: object) -> None:
-        if isinstance(message, Compiling):
+        if isinstance(message, Compiling | Localized | MapSaved):
             for sink in self._sinks:
                 sink.put(message)
             return
@@ -399,8 +407,36 @@ class ProcessRun:
             self._show(message)
         if self._to_logger is not None:
             self._log_message(message)
-        elif isinstance(message, SlotImage) and message.logged and self._release is not None:
+        elif isinstance(message, SlotImage) and message.logged:
+            (self._images or self.release)(message)
+
+    def release(self, message: SlotImage) -> None:
+        """Return the slot of an image that `images` took; from any thread."""
+        if self._release is not None:
             self._release.send(message.slot)
+
+    def pixels(self, message: SlotImage) -> StereoImage:
+        """A copy of an image whose slot was not returned yet."""
+        assert self._ring is not None
+        return self._ring.read(message)
+
+    @property
+    def ring(self) -> tuple[ImageLayout, int, str]:
+        """Of the images in shared memory, for processes that read them: layout, slots, name."""
+        assert self._ring is not None
+        return self._ring.layout, self._ring.slots, self._ring.name
+
+    def save_map(self, folder: Path) -> None:
+        """Request that the map so far is written; `MapSaved` answers. The run goes on meanwhile."""
+        self._ask_mapper(folder)
+
+    def relocalize(self) -> None:
+        """Request that the whole saved map is searched for the camera with the next keyframe."""
+        self._ask_mapper(Relocalize())
+
+    def _ask_mapper(self, request: Path | Relocalize) -> None:
+        with contextlib.suppress(OSError):  # the mapper has ended
+            self._controls["mapper"].send(request)
 
     def _leave_out(self, image: StereoImage) -> None:
         """An image for the tracker that the log is too slow to take."""

@@ -1,4 +1,4 @@
-"""Detects processes that do not respond. Each sends a heartbeat every second with the duration of its current step.
+"""Detects processes that do not respond. Each sends heartbeats with the duration of its current step.
 
 Nothing here affects what a run computes: a stage never waits for its own heartbeat, and main only reports those it
 misses.
@@ -14,7 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-HEARTBEAT_S = 1.0
+HEARTBEAT_S = 0.25
 SILENT_S = 3.0  # without a message from an idle process
 LONG_STEP_S = 10.0  # for one image, one keyframe, or one read from the source
 PROCESS_STATES = {"T": "stopped by a signal", "t": "held by a debugger", "D": "waiting for a disk or a device"}
@@ -63,8 +63,9 @@ class HeartbeatThread:
 class Watchdog:
     """Keeps the time of the last message of each process, and reports each silence once."""
 
-    def __init__(self, pids: Mapping[str, int], report: Callable[[str], None]) -> None:
+    def __init__(self, pids: Mapping[str, int], report: Callable[[str], None], silent_s: float | None = None) -> None:
         self._pids, self._report = dict(pids), report
+        self._limit_s = SILENT_S if silent_s is None else silent_s
         now = time.monotonic()
         self._heard = dict.fromkeys(pids, now)
         self._computed = dict.fromkeys(pids, 0.0)  # processor seconds
@@ -87,7 +88,7 @@ class Watchdog:
         """The stages that do not respond; the beginning and the end of each silence are reported."""
         now, found = time.monotonic(), list[str]()
         for stage in stages:
-            if self._silent_s(stage, now) > SILENT_S:
+            if self._silent_s(stage, now) > self._limit_s:
                 found.append(stage)
                 self._report_silence(stage, now)
             elif stage in self._reported:
@@ -96,9 +97,10 @@ class Watchdog:
 
     def _silent_s(self, stage: str, now: float) -> float:
         """Seconds of silence; a process that computes is not silent, even if a library blocks its other threads."""
-        if now - self._heard[stage] > SILENT_S:
+        if now - self._heard[stage] > self._limit_s:
             state, computed = _status(self._pids[stage])
-            if computed > self._computed[stage] and state not in PROCESS_STATES:
+            busy = computed > self._computed[stage] or _runnable(self._pids[stage])
+            if busy and state not in PROCESS_STATES:
                 self._computed[stage], self._heard[stage] = computed, now
         return now - self._heard[stage]
 
@@ -118,6 +120,15 @@ class Watchdog:
             self._long.add(beat.stage)
             what = "waited for the source" if beat.stage == "capture" else "been busy with one step"
             self._report(f"the {beat.stage} has {what} for {beat.step_s:.0f} s")
+
+
+def _runnable(pid: int) -> bool:
+    """Whether a thread of the process waits for a core: the computer is overloaded, not the process stuck."""
+    try:
+        stats = [path.read_text() for path in Path(f"/proc/{pid}/task").glob("*/stat")]
+    except OSError:
+        return False
+    return any(text.rpartition(")")[2].split()[0] == "R" for text in stats)
 
 
 def _status(pid: int) -> tuple[str, float]:

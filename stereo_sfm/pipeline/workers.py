@@ -22,7 +22,7 @@ from stereo_sfm.drivers.choice import Opener
 from stereo_sfm.errors import StereoSfmError, from_os_error
 from stereo_sfm.log.provenance import Opening
 from stereo_sfm.maps.folders import MapFolders, make_mapper, save_result
-from stereo_sfm.messages import Compiling
+from stereo_sfm.messages import Compiling, Localized
 from stereo_sfm.pipeline.channels import End, Failed, Inbox, Lost, Outbox
 from stereo_sfm.pipeline.interrupts import STOP_SIGNALS
 from stereo_sfm.pipeline.schedule import Lockstep, Realtime, Recorded, Schedule
@@ -240,6 +240,7 @@ def run_mapper(
     """Keyframes to map updates."""
     from stereo_sfm.messages import StageTimes
     from stereo_sfm.pipeline.health import HealthMeter
+    from stereo_sfm.pipeline.map_saver import MapSaver
     from stereo_sfm.pipeline.stages import MapStage
     from stereo_sfm.timing import Spans
 
@@ -253,10 +254,11 @@ def run_mapper(
     inbox = Inbox[Keyframe | End](keyframes)
     to_tracker, to_optimizer = Outbox(updates), Outbox(jobs)
     answers = Inbox[Any](results)
+    saver = MapSaver(mapper, setup.config, to_main.send)
     ready("mapper", setup, to_main)
     meter = HealthMeter("mapper", to_main.send)
-    frame_id, busy = -1, False
-    while isinstance(keyframe := inbox.take(), Keyframe):
+    frame_id, busy, found = -1, False, False
+    while isinstance(keyframe := saver.next(inbox, control), Keyframe):
         to_main.pulse.begin()
         delay()
         begin = time.monotonic()
@@ -264,6 +266,10 @@ def run_mapper(
             mapper.finish_job(answers.take())
             busy = False
         update = stage.step(keyframe)
+        saver.changed = True
+        if mapper.found and not found:
+            found = True
+            to_main.send(Localized(update.version))
         to_main.send(update)
         to_tracker.send(update)
         if (job := mapper.pending_job()) is not None:
@@ -277,6 +283,7 @@ def run_mapper(
         meter.add(frame_id, ms)
         to_main.pulse.end()
     to_main.pulse.begin()
+    saver.finish(setup.folders.session)
     if busy:
         mapper.finish_job(answers.take())
     last = stage.finish()

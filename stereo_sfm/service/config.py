@@ -121,8 +121,9 @@ class RobotConfig:
         s = self.source
         if not s.spec:
             raise StereoSfmError('robot.toml names no source: add [source] spec = "t265:" or another')
-        speed = None if is_device(s.spec) else s.speed
-        return SourceChoice.of(s.spec, s.rig or None, rectify=s.rectify, speed=speed)
+        device = is_device(s.spec)
+        choice = SourceChoice.of(s.spec, s.rig or None, rectify=s.rectify, speed=None if device else s.speed)
+        return dataclasses.replace(choice, repeat=s.repeat and not device)
 
 
 def load(file: Path | str | None = None, overrides: Iterable[str] = ()) -> RobotConfig:

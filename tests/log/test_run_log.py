@@ -172,7 +172,7 @@ def _all(path: Path, topic: str, kind: type) -> list:
 def test_every_topic_of_the_table_that_a_run_has_is_there(run: Path) -> None:
     with LogReader(run) as reader:
         present = {t.topic: t.schema for t in reader.topics}
-        assert set(present) == {t.name for t in topics.TABLE} - {topics.DEPTH_IMAGE, topics.WHEEL}
+        assert set(present) == {t.name for t in topics.TABLE} - {topics.DEPTH_IMAGE, topics.WHEEL, topics.THUMBNAIL}
         assert all(name in topics.BY_NAME[t].schema.split("|") for t, name in present.items())
         assert b"[tracker]" in (reader.attachment("config.toml") or b"")
         assert len(reader.metadata("stereo_sfm")["config_sha256"]) == 12

@@ -1,0 +1,46 @@
+"""`stereo-sfm serve`: the service on a robot."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from pathlib import Path
+from types import FrameType
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of this command."""
+    parser.add_argument("-c", "--config", type=Path, metavar="FILE", help="robot.toml")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="set one value, as in source.spec=t265:"
+    )
+    parser.add_argument("--print-config", action="store_true", help="print every setting with its description")
+    parser.add_argument("-q", "--quiet", action="store_true", help="print errors only")
+    parser.add_argument("-v", "--verbose", action="store_true", help="print what goes well, too")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve until the source ends, SIGTERM or Ctrl-C."""
+    from stereo_sfm.service.config import explain, load
+    from stereo_sfm.service.service import Service
+
+    config = load(args.config, args.set)
+    if args.print_config:
+        print(explain(config), end="")
+        return 0
+    service = Service(config)
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        service.stop(f"{signal.Signals(number).name} received")
+
+    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+        if (number, signal.getsignal(number)) != (signal.SIGHUP, signal.SIG_IGN):
+            signal.signal(number, stop)
+    with service:
+        while not service.wait(1.0):  # a short wait lets signals through
+            pass
+    if service.error is not None:
+        raise service.error
+    sys.stdout.flush()
+    return 0

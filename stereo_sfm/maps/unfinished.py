@@ -1,0 +1,95 @@
+"""The map of a session that goes on: its own part alone, and where it lies in the saved map that it continues."""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stereo_sfm.arrays import read_arrays
+from stereo_sfm.config import Config
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.loop.vocabulary_file import configured_vocabulary
+from stereo_sfm.maps.header import read_header
+from stereo_sfm.maps.merge import merge
+from stereo_sfm.maps.replace_folder import replaced_folder
+from stereo_sfm.maps.saved_map import SavedMap, load_map, save_map
+from stereo_sfm.types import LoopResult
+
+PLACE = "place.npz"
+_FIELDS = ("kf_id", "candidate_kf_id", "candidate_T_kf", "information", "matches", "inliers", "score")
+
+
+def save_session(saved: SavedMap, place: LoopResult | None, folder: Path) -> None:
+    """Write a session's part.
+
+    Args:
+        saved: its own map. place: where that lies in the saved map it continues; None: nowhere. folder: replaced.
+    """
+    beside: dict[str, bytes] = {PLACE: b""}
+    if place is not None:
+        buffer = io.BytesIO()
+        fields: dict[str, Any] = {name: np.asarray(getattr(place, name)) for name in _FIELDS}
+        np.savez(buffer, **fields)
+        beside[PLACE] = buffer.getvalue()
+    save_map(saved, folder, beside)
+
+
+def load_place(folder: Path) -> LoopResult | None:
+    """Where the session of a folder lies in the saved map that it continues.
+
+    Raises:
+        StereoSfmError: the file is damaged.
+    """
+    try:
+        raw = (folder / PLACE).read_bytes()
+        if not raw:
+            return None
+        data = read_arrays(raw)
+        ids = [int(data[name]) for name in ("kf_id", "candidate_kf_id", "inliers")]
+        relative, information, matches = (np.asarray(data[n]) for n in ("candidate_T_kf", "information", "matches"))
+        return LoopResult(ids[0], ids[1], relative, information, matches, ids[2], float(data["score"]), "")
+    except (OSError, KeyError, ValueError, TypeError):
+        raise StereoSfmError(f"{folder} is damaged: its {PLACE} cannot be read") from None
+
+
+def publish(base: Path | None, session: Path, out: Path, config: Config) -> int:
+    """Write the saved map that a session makes of the one it continues.
+
+    Args:
+        base: the saved map that the session began with, None for none. session: of `save_session`.
+        out: replaced by the result.
+        config: of loops and mapping.
+
+    Returns:
+        Keyframes of the result.
+
+    Raises:
+        StereoSfmError: the session was not found in the saved map, or a folder is damaged; `out` stays as it is.
+    """
+    if base is None:
+        copy_map(session, out)
+        return read_header(out, ())["keyframes"]
+    part = load_map(session)
+    place = load_place(session)
+    if place is None:
+        raise StereoSfmError(f"the session was not found in the saved map {base} yet")
+    vocabulary = configured_vocabulary(config.loop)
+    saved = merge([load_map(base, part.rig), part], vocabulary, config.loop, config.mapper, place).saved
+    save_map(saved, out)
+    return len(saved)
+
+
+def copy_map(folder: Path, to: Path) -> None:
+    """A copy of a map folder that later saves of it do not change; it shares its files where the disk can do that."""
+    files = [path for path in sorted(folder.iterdir()) if path.is_file() and path.name != PLACE]
+    with replaced_folder(to, frozenset(path.name for path in files)) as draft:
+        for path in files:
+            try:
+                os.link(path, draft / path.name)
+            except OSError:
+                shutil.copy2(path, draft / path.name)

@@ -1,0 +1,107 @@
+"""What is deleted when recordings take too much room, and what is not."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from stereo_sfm.recording.segments import Segment, recordings, segments
+
+GB = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Disk:
+    """Total and free bytes of the disk of a folder."""
+
+    total: int
+    free: int
+
+    @staticmethod
+    def of(folder: Path) -> Disk:
+        usage = shutil.disk_usage(folder)
+        return Disk(usage.total, usage.free)
+
+
+@dataclass(frozen=True)
+class Quota:
+    """Limits of all recordings in a folder."""
+
+    bytes: float
+    percent: float = 100.0  # of the disk
+    min_free: float = 0.0  # bytes
+
+    def excess(self, used: int, disk: Disk) -> float:
+        """Bytes of recordings that are too many."""
+        return max(used - min(self.bytes, disk.total * self.percent / 100.0), 0.0)
+
+    def lacking(self, disk: Disk) -> float:
+        """Bytes that should be free and are not."""
+        return max(self.min_free - disk.free, 0.0)
+
+
+def used_bytes(root: Path) -> int:
+    """Bytes of all recordings."""
+    return sum(segment.bytes for folder in recordings(root) for segment in segments(folder))
+
+
+def make_room(root: Path, quota: Quota, current: Segment | None, disk: Callable[[Path], Disk] = Disk.of) -> float:
+    """Delete the oldest segments that nobody marked until the quota is kept, and images until enough is free.
+
+    Poses are never deleted because something else has filled the disk.
+
+    Args:
+        root: of the recordings. current: being written, never deleted. disk: how full the disk is.
+
+    Returns:
+        Bytes by which the quota is still exceeded: everything else is marked.
+    """
+    excess = quota.excess(used_bytes(root), disk(root))
+    for folder in recordings(root) if excess > 0 else ():
+        for segment in segments(folder):
+            if segment == current or segment.marked:
+                continue
+            size = segment.bytes
+            segment.delete()
+            excess -= size
+            if excess <= 0:
+                break
+        if excess <= 0:
+            break
+    _free_images(root, quota.lacking(disk(root)), current)
+    return max(excess, 0.0)
+
+
+def _free_images(root: Path, lacking: float, current: Segment | None) -> None:
+    """Delete the oldest images that nobody marked until so many bytes are free."""
+    for segment in (s for folder in recordings(root) for s in segments(folder)):
+        if lacking <= 0:
+            return
+        if segment != current and not segment.marked and segment.images.exists():
+            lacking -= segment.images.stat().st_size
+            segment.images.unlink()
+
+
+def forget_images(root: Path, keep_s: float, segment_s: float, current: Segment | None) -> int:
+    """Black box: delete images of unmarked segments older than the last `keep_s` seconds of recorded time.
+
+    Time is counted in recorded seconds, newest first, so that setting the clock deletes nothing. The last segment of a
+    recording counts as `segment_s` long.
+
+    Returns:
+        How many segments lost their images.
+    """
+    kept_s, count = 0.0, 0
+    for folder in reversed(recordings(root)):
+        following: int | None = None
+        for segment in reversed(segments(folder)):
+            length_s = segment_s if following is None else float(following - segment.second)
+            following = segment.second
+            if segment != current:
+                if kept_s >= keep_s and not segment.marked and segment.images.exists():
+                    segment.images.unlink(missing_ok=True)
+                    count += 1
+                kept_s += length_s
+    return count

@@ -1,0 +1,251 @@
+"""Records a run into segments without ever blocking it: a disk that is slow or full costs images, not poses.
+
+Two threads write the two files of a segment. Images wait in a short queue and are dropped when it is full, poses in a
+long one. When the disk is full, images stop first (`min_free`); poses go on in what is left, then in a reserve.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.config import Config
+from stereo_sfm.log.image_log import ImageLog
+from stereo_sfm.log.provenance import Opening, write_provenance
+from stereo_sfm.log.run_log import RunLog
+from stereo_sfm.log.writer import LogWriter
+from stereo_sfm.recording.quota import Disk, Quota, forget_images, make_room, used_bytes
+from stereo_sfm.recording.segment_writers import ImageWriter, PoseWriter, Thumbnail
+from stereo_sfm.recording.segments import Segment, new_recording
+from stereo_sfm.types import Dropped, Frame, ImuSamples, Observations, StereoImage
+
+EVERY_S = 2.0  # between two looks at the disk
+SLOW_S = 5.0  # after an image was dropped the disk counts as slow
+RESERVE, RESERVE_BYTES = ".reserve", 32 << 20
+THUMBNAIL_S = 2.0
+
+
+@dataclass(frozen=True)
+class Policy:
+    """What is recorded, and how much is kept."""
+
+    root: Path
+    mode: str  # full | lean | black_box
+    image_format: str  # one of `images.FORMATS`
+    segment_s: float
+    segment_bytes: float
+    quota: Quota
+    black_box_s: float
+    mark_before_s: float
+    mark_after_s: float
+
+
+@dataclass(frozen=True)
+class RecorderState:
+    """How a recording is doing."""
+
+    recording: str  # its folder's name
+    segment: str
+    bytes: int  # of all recordings
+    images_dropped: int
+    problem: str  # "" or one line
+    full: bool = False  # the problem is a full disk
+
+
+class SegmentRecorder:
+    """One recording. `image`, `put` and `mark` never block."""
+
+    def __init__(
+        self,
+        policy: Policy,
+        rig: Rig,
+        config: Config,
+        source: str,
+        opening: Opening | None = None,
+        disk: Callable[[Path], Disk] = Disk.of,
+    ) -> None:
+        """Args:
+        policy: what is kept. rig, config, source, opening: of the run. disk: how full the disk is.
+
+        Raises:
+            OSError: the folder cannot be made.
+        """
+        self._policy, self._disk = policy, disk
+        self.folder = new_recording(policy.root, source, policy.mode, datetime.now())
+        self._number, self._began_ns = 0, -1
+        self.segment: Segment | None = None
+        self._segment_ns = self._newest_ns = 0
+        self._history: deque[tuple[Segment, int]] = deque(maxlen=10_000)  # with the stamp of its beginning
+        self._marked_until_ns, self._mark_text = -1, ""
+        self._next_thumbnail_ns = 0
+        self._missed: list[StereoImage] = []  # images dropped since the last one kept, without their pixels
+        self.images_dropped, self._dropped_s = 0, -SLOW_S
+        self._used = used_bytes(policy.root)
+        self._no_room, self._only_marked = "", ""
+        self._over, self._looking = threading.Event(), threading.Lock()
+        begin = functools.partial(_begin_images, rig, source, policy.image_format, opening)
+        self._images = ImageWriter(policy.image_format, begin, self._look_now)
+        self._poses = PoseWriter(
+            functools.partial(_run_log, rig=rig, config=config, source=source, opening=opening), self._make_room_now
+        )
+        self._keep_reserve()
+        self._keeper = threading.Thread(target=self._keep_house, name="housekeeping", daemon=True)
+        self._keeper.start()
+
+    # -- what comes in -----------------------------------------------------------------------------------------------
+
+    def image(self, image: StereoImage) -> bool:
+        """An image with its pixels; False if it was dropped."""
+        self._turn_page(image.stamp_ns)
+        if image.stamp_ns >= self._next_thumbnail_ns:
+            self._next_thumbnail_ns = image.stamp_ns + int(THUMBNAIL_S * 1e9)
+            self._poses.put(Thumbnail(image))
+        if self._policy.mode == "lean":
+            return True
+        if self._no_room or not self._images.put(self._with_missed(image)):
+            self._drop(image)
+            return False
+        self._missed = []
+        return True
+
+    def put(self, message: object) -> None:
+        """Any other message of the run."""
+        if isinstance(message, Frame):
+            message = replace(message, observations=Observations.empty())
+        self._poses.put(message)
+
+    def mark(self, text: str) -> None:
+        """Keep what lies around now."""
+        now_ns = self._newest_ns
+        self._marked_until_ns = now_ns + int(self._policy.mark_after_s * 1e9)
+        self._mark_text = text
+        from_ns, ends_ns = now_ns - int(self._policy.mark_before_s * 1e9), now_ns + 1
+        for segment, begins_ns in reversed(self._history):
+            if ends_ns <= from_ns:
+                break
+            with contextlib.suppress(OSError):  # deleted meanwhile, or no room
+                segment.mark(text)
+            ends_ns = begins_ns
+
+    def change(self, policy: Policy) -> None:
+        """Other limits from now on; folder, mode and format stay."""
+        self._policy = replace(policy, root=self._policy.root, mode=self._policy.mode)
+
+    def state(self) -> RecorderState:
+        """How it is doing."""
+        slow = time.monotonic() - self._dropped_s < SLOW_S
+        problems = [self._poses.problem, self._no_room or self._images.problem, self._only_marked]
+        problems.append("the disk is slow: images are left out" if slow else "")
+        problem = next(filter(None, problems), "")
+        return RecorderState(
+            self.folder.name, "" if self.segment is None else self.segment.name, self._used, self.images_dropped,
+            problem, bool(self._poses.problem or self._no_room or self._images.problem),
+        )  # fmt: skip
+
+    def close(self, patience_s: float = 2.0) -> None:
+        """Write what waits, as far as the disk takes it in this time, and close the files."""
+        self._over.set()
+        until = time.monotonic() + patience_s
+        for writer in (self._poses, self._images):
+            writer.close()
+        for writer in (self._poses, self._images):
+            writer.join(max(until - time.monotonic(), 0.1))
+
+    # -- segments ----------------------------------------------------------------------------------------------------
+
+    def _turn_page(self, stamp_ns: int) -> None:
+        """Begin a new segment when the time or the size of one is reached."""
+        if self._began_ns < 0:
+            self._began_ns = stamp_ns
+        p, written = self._policy, self._images.bytes_written + self._poses.bytes_written
+        full = stamp_ns - self._segment_ns >= p.segment_s * 1e9 or written >= p.segment_bytes
+        self._newest_ns = stamp_ns
+        if self.segment is not None and not full:
+            return
+        self.segment = Segment.of(self.folder, self._number, max(round((stamp_ns - self._began_ns) / 1e9), 0))
+        self._number, self._segment_ns = self._number + 1, stamp_ns
+        self._history.append((self.segment, stamp_ns))
+        for writer in (self._images, self._poses):
+            writer.turn(self.segment)
+        if stamp_ns <= self._marked_until_ns:
+            with contextlib.suppress(OSError):
+                self.segment.mark(self._mark_text)
+
+    def _drop(self, image: StereoImage) -> None:
+        self.images_dropped += 1
+        self._dropped_s = time.monotonic()
+        self._missed.append(replace(image, left=image.left[:0], right=None, depth=None))
+        del self._missed[:-1000]
+        why = self._no_room or "the disk is slow"
+        self._poses.put(Dropped(image.frame_id, image.stamp_ns, "log", why))
+
+    def _with_missed(self, image: StereoImage) -> StereoImage:
+        """An image that says how many were dropped before it, with their inertial samples."""
+        if not self._missed:
+            return image
+        samples = [i.imu for i in (*self._missed, image) if i.imu is not None]
+        dropped = image.dropped_before + sum(1 + i.dropped_before for i in self._missed)
+        return replace(image, dropped_before=dropped, imu=ImuSamples.joined(samples) if samples else None)
+
+    # -- the disk ----------------------------------------------------------------------------------------------------
+
+    def _keep_house(self) -> None:
+        while not self._over.wait(EVERY_S):
+            self._look_now()
+
+    def _look_now(self) -> None:
+        with self._looking, contextlib.suppress(OSError):  # the disk is gone: the writers say so
+            self._look_at_disk()
+
+    def _look_at_disk(self) -> None:
+        p, current = self._policy, self.segment
+        if p.mode == "black_box":
+            forget_images(p.root, p.black_box_s, p.segment_s, current)
+        excess = make_room(p.root, p.quota, current, self._disk)
+        self._used = used_bytes(p.root)
+        disk = self._disk(p.root)
+        if disk.free < p.quota.min_free:
+            self._no_room = f"disk full: {disk.free / 1e6:.0f} MB free, images need {p.quota.min_free / 1e6:.0f} MB"
+        elif excess > (0 if current is None else current.bytes):
+            self._no_room = "the quota is taken by marked recordings: delete some of them; images are not recorded"
+        else:
+            self._no_room = ""
+            if not self._poses.problem:
+                self._keep_reserve()
+
+    def _make_room_now(self) -> None:
+        """The disk refused poses: delete what may be deleted, give up the reserve."""
+        with contextlib.suppress(OSError):
+            (self._policy.root / RESERVE).unlink(missing_ok=True)
+            quota = replace(self._policy.quota, min_free=max(self._policy.quota.min_free, float(RESERVE_BYTES)))
+            make_room(self._policy.root, quota, self.segment, self._disk)
+
+    def _keep_reserve(self) -> None:
+        """Space that poses can still be written into when others have filled the disk."""
+        path = self._policy.root / RESERVE
+        with contextlib.suppress(OSError):
+            if not path.exists() and self._disk(self._policy.root).free > 4 * RESERVE_BYTES:
+                with path.open("wb") as file:
+                    os.posix_fallocate(file.fileno(), 0, RESERVE_BYTES)
+
+
+def _begin_images(rig: Rig, source: str, image_format: str, opening: Opening | None, writer: LogWriter) -> ImageLog:
+    write_provenance(
+        writer, source=source, serial=rig.serial, mode="record", image_format=image_format, opening=opening
+    )
+    return ImageLog(writer, rig, None, image_format)
+
+
+def _run_log(writer: LogWriter, rig: Rig, config: Config, source: str, opening: Opening | None) -> RunLog:
+    return RunLog(
+        writer, rig, config, source=source, mode="realtime", image_format="none", opening=opening, whole_map=False
+    )

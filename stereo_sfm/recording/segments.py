@@ -1,0 +1,170 @@
+"""The folders of a recording that goes on all day.
+
+    ROOT/00007_2026-11-22_151400/      a recording; numbers only grow, so that a wrong clock changes no order
+        recording.json                 source, mode and beginning
+        00012_000720.mcap              segment 12, from second 720 on: poses, keyframes, map updates, events, thumbnails
+        00012_000720.images.mcap       its images with inertial and wheel samples: a recording of its own
+        00012_000720.marked            kept whatever the quota says; a line of text for each mark
+
+Each file opens alone; the folder is a source that plays the images of all its segments.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import re
+import shutil
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from stereo_sfm.errors import StereoSfmError
+
+ABOUT = "recording.json"
+KIND = "stereo_sfm_recording"
+IMAGES, POSES, MARKED = ".images.mcap", ".mcap", ".marked"
+_FOLDER = re.compile(r"(\d{5,})_[\d_-]+")
+_SEGMENT = re.compile(r"(\d{5,})_(\d{6,})[a-z]?")  # a letter: begun again after the disk refused a file
+
+
+@dataclass(frozen=True)
+class Segment:
+    """One segment on disk."""
+
+    folder: Path
+    name: str  # NUMBER_SECOND
+
+    @staticmethod
+    def of(folder: Path, number: int, second: int) -> Segment:
+        """The segment with this number that begins in this second of its recording."""
+        return Segment(folder, f"{number:05d}_{second:06d}")
+
+    @property
+    def second(self) -> int:
+        """Of its recording, when it began."""
+        return int(self.name.partition("_")[2].rstrip("abcdefghijklmnopqrstuvwxyz"))
+
+    @property
+    def poses(self) -> Path:
+        return self.folder / f"{self.name}{POSES}"
+
+    @property
+    def images(self) -> Path:
+        return self.folder / f"{self.name}{IMAGES}"
+
+    @property
+    def mark_file(self) -> Path:
+        return self.folder / f"{self.name}{MARKED}"
+
+    @property
+    def marked(self) -> bool:
+        """Whether it is kept."""
+        return self.mark_file.exists()
+
+    @property
+    def bytes(self) -> int:
+        """On disk."""
+        return _size(self.poses) + _size(self.images)
+
+    def mark(self, text: str) -> None:
+        """Keep it."""
+        with self.mark_file.open("a", encoding="utf-8") as file:
+            file.write(f"{text}\n")
+
+    def delete(self) -> None:
+        """Remove it, and its recording with the last of its segments."""
+        for path in (self.images, self.poses, self.mark_file):
+            path.unlink(missing_ok=True)
+        if not segments(self.folder):
+            (self.folder / ABOUT).unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # somebody put something there
+                self.folder.rmdir()
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except OSError:
+        return 0
+
+
+def recordings(root: Path) -> list[Path]:
+    """The recordings in a folder, oldest first."""
+    found = [path for path in root.glob("*_*") if _FOLDER.fullmatch(path.name) and path.is_dir()]
+    return sorted(found, key=lambda path: (int(path.name.partition("_")[0]), path.name))
+
+
+def segments(folder: Path) -> list[Segment]:
+    """The segments of one recording, oldest first."""
+    names = {path.name.partition(".")[0] for path in folder.glob("*.mcap")}
+    found = [name for name in names if _SEGMENT.fullmatch(name)]
+    return [Segment(folder, name) for name in sorted(found, key=lambda name: (int(name.partition("_")[0]), name))]
+
+
+def new_recording(root: Path, source: str, mode: str, now: datetime) -> Path:
+    """Make the folder of a new recording.
+
+    Raises:
+        OSError: it cannot be made.
+    """
+    root.mkdir(parents=True, exist_ok=True)
+    last = recordings(root)
+    number = int(last[-1].name.partition("_")[0]) + 1 if last else 1
+    folder = root / f"{number:05d}_{now:%Y-%m-%d_%H%M%S}"
+    folder.mkdir()
+    about = {"kind": KIND, "version": 1, "source": source, "mode": mode, "began": now.isoformat(timespec="seconds")}
+    (folder / ABOUT).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+    return folder
+
+
+def about(folder: Path) -> dict[str, Any]:
+    """What recording.json says; empty where it is missing or damaged."""
+    try:
+        data = json.loads((folder / ABOUT).read_text("utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return data if isinstance(data, dict) and data.get("kind") == KIND else {}
+
+
+def listed(folder: Path) -> dict[str, str | int | bool]:
+    """A recording in a list: plain values."""
+    parts, head = segments(folder), about(folder)
+    return {
+        "id": folder.name,
+        "began": str(head.get("began", "")),
+        "source": str(head.get("source", "")),
+        "mode": str(head.get("mode", "")),
+        "seconds": parts[-1].second if parts else 0,  # up to the beginning of its last segment
+        "segments": len(parts),
+        "with_images": sum(segment.images.exists() for segment in parts),
+        "bytes": sum(segment.bytes for segment in parts),
+        "marked": any(segment.marked for segment in parts),
+    }
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a folder holds the segments of a recording."""
+    return path.is_dir() and (path / ABOUT).is_file() and bool(about(path))
+
+
+def delete_recording(root: Path, name: str) -> None:
+    """Remove a whole recording.
+
+    Raises:
+        StereoSfmError: there is none of this name.
+    """
+    shutil.rmtree(find_recording(root, name))
+
+
+def find_recording(root: Path, name: str) -> Path:
+    """The folder of a recording by its name.
+
+    Raises:
+        StereoSfmError: there is none of this name.
+    """
+    for folder in recordings(root):
+        if folder.name == name:
+            return folder
+    raise StereoSfmError(f"there is no recording '{name}'")

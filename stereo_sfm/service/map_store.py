@@ -1,0 +1,166 @@
+"""The saved map of the service on disk.
+
+Beside the map's folder STORE lie, while the service runs: `.STORE.base`, the map that the session began with, and
+`.STORE.session`, the session's own part as it was saved last. A process of low priority joins the two into STORE, so
+that STORE is always a whole map, whenever the power fails. What was not joined at the end is joined at the next start.
+"""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+import shutil
+import time
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+
+from stereo_sfm.config import Config
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.maps.folders import MapFolders
+from stereo_sfm.maps.unfinished import copy_map, publish
+from stereo_sfm.pipeline.interrupts import ignored_by_children
+from stereo_sfm.pipeline.threads import thread_environment
+
+log = logging.getLogger("stereo_sfm")
+NICE = 10
+
+
+@dataclass(frozen=True)
+class Joined:
+    """How a save ended: keyframes of the saved map, or why there is none."""
+
+    keyframes: int = 0
+    why: str = ""
+
+
+@dataclass
+class MapStore:
+    """One saved map and the session that continues it."""
+
+    folder: Path
+    mode: str  # of config.MAP_MODES
+    config: Config
+    saved_ns: int = 0  # Unix time of the last save
+    _base: Path | None = None
+    _process: BaseProcess | None = None
+    _result: Connection | None = None
+    _done: Joined | None = None
+    _fresh: bool = field(default=True)  # no session has begun yet
+
+    @property
+    def saves(self) -> bool:
+        """Whether this mode changes the saved map."""
+        return self.mode in ("extend", "new")
+
+    @property
+    def session(self) -> Path:
+        """The session's own part."""
+        return self.folder.with_name(f".{self.folder.name}.session")
+
+    def begin(self) -> MapFolders:
+        """The maps of a new session; a session that was not joined in an earlier life is joined first.
+
+        Raises:
+            StereoSfmError: there is no map to localize in, or it is damaged.
+        """
+        self.cancel()
+        base = self.folder.with_name(f".{self.folder.name}.base")
+        if self.mode == "none":
+            return MapFolders()
+        if self.mode == "localize":
+            folders = MapFolders(map_in=self.folder, localize_only=True)
+            folders.check()
+            return folders
+        self.folder.parent.mkdir(parents=True, exist_ok=True)
+        if self._fresh:
+            self._join_left_over(base)
+            if self.mode == "new" and (self.folder / "map.json").exists():
+                self._set_aside()
+        self._fresh = False
+        shutil.rmtree(self.session, ignore_errors=True)
+        shutil.rmtree(base, ignore_errors=True)
+        self._base = None
+        if (self.folder / "map.json").exists():
+            copy_map(self.folder, base)
+            self._base = base
+        return MapFolders(map_in=self._base, session=self.session)
+
+    def _set_aside(self) -> None:
+        """A new map begins: the one there is kept under another name."""
+        old = self.folder.with_name(f"{self.folder.name}_{time.strftime('%Y%m%d_%H%M%S')}")
+        self.folder.rename(old)
+        log.warning("map.mode is new: the map %s is called %s now", self.folder, old)
+
+    def _join_left_over(self, base: Path) -> None:
+        if self.mode != "extend" or not (self.session / "map.json").exists():
+            return
+        before = base if (base / "map.json").exists() else None
+        try:
+            publish(before, self.session, self.folder, self.config)
+            log.info("the session that was not finished last time is in the saved map now")
+        except (StereoSfmError, OSError) as error:
+            log.warning("the session of last time is not in the saved map: %s", error)
+
+    def join(self) -> None:
+        """Begin to write the saved map from the session's part: at once where it is all there is, else in a process."""
+        self.cancel()
+        if self._base is None:
+            self._done = _published(None, self.session, self.folder, self.config)
+            return
+        context = multiprocessing.get_context("spawn")
+        self._result, send = context.Pipe(duplex=False)
+        arguments = (self._base, self.session, self.folder, self.config, send)
+        with ignored_by_children(), thread_environment(1):
+            self._process = context.Process(target=_publish, args=arguments, name="map saver", daemon=True)
+            self._process.start()
+        send.close()
+
+    @property
+    def pid(self) -> int | None:
+        """Of the process that joins, while there is one."""
+        return None if self._process is None else self._process.pid
+
+    def joined(self, timeout_s: float = 0.0) -> Joined | None:
+        """The result of `join`, once; None while it goes on."""
+        result, self._done = self._done, None
+        if result is None:
+            if self._result is None or not self._result.poll(timeout_s):
+                return None
+            try:
+                result = self._result.recv()
+            except (EOFError, OSError):
+                result = Joined(why="the process that saves the map was killed")
+            self.cancel()
+        assert result is not None
+        if not result.why:
+            self.saved_ns = time.time_ns()
+        return result
+
+    def cancel(self) -> None:
+        """End the process that joins; the saved map stays as it is."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.join()
+        if self._result is not None:
+            self._result.close()
+        self._process = self._result = None
+
+    def finished(self) -> None:
+        """The session is in the saved map: nothing is left to do at the next start."""
+        for folder in (self.session, self.folder.with_name(f".{self.folder.name}.base")):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _publish(base: Path | None, session: Path, out: Path, config: Config, send: Connection) -> None:
+    os.nice(NICE)
+    send.send(_published(base, session, out, config))
+
+
+def _published(base: Path | None, session: Path, out: Path, config: Config) -> Joined:
+    try:
+        return Joined(publish(base, session, out, config))
+    except (StereoSfmError, OSError) as error:
+        return Joined(why=str(error))

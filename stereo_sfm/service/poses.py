@@ -1,0 +1,108 @@
+"""Frames and map updates of a run as pose updates: the body's pose in both frames, its velocity, and when that was."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+
+import numpy as np
+
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.geometry import se3
+from stereo_sfm.messages import Localized
+from stereo_sfm.service.messages import PoseUpdate
+from stereo_sfm.types import F64, Frame, MapUpdate, TrackState
+
+TRACKED = (TrackState.OK, TrackState.RECOVERED, TrackState.RESTARTED)
+KEPT_VERSIONS = 256  # of the map, which frames may still refer to
+WINDOW = 300  # images over which the delay from exposure to this computer is estimated
+
+
+class HostClock:
+    """The sensor's clock against this computer's clocks, from when images arrived.
+
+    The image that took least time on its way, among the newest ones, tells the offset. Steps of the wall clock change
+    nothing but the wall clock times given from then on.
+    """
+
+    def __init__(self) -> None:
+        self._offsets: deque[int] = deque(maxlen=WINDOW)  # monotonic clock minus stamp
+        self._captured: dict[int, float] = {}
+
+    def image(self, frame_id: int, stamp_ns: int, captured_s: float) -> None:
+        """An image was handed over by its driver at a time of the monotonic clock."""
+        self._offsets.append(int(captured_s * 1e9) - stamp_ns)
+        self._captured[frame_id] = captured_s
+        if len(self._captured) > WINDOW:
+            del self._captured[next(iter(self._captured))]
+
+    def captured_s(self, frame_id: int) -> float:
+        """When an image arrived; now where that is not known."""
+        return self._captured.get(frame_id, time.monotonic())
+
+    def unix_ns(self, stamp_ns: int) -> int:
+        """A stamp as Unix time."""
+        offset = min(self._offsets, default=time.monotonic_ns() - stamp_ns)
+        return stamp_ns + offset + time.time_ns() - time.monotonic_ns()
+
+
+class PoseMaker:
+    """The poses of one session."""
+
+    def __init__(self, rig: Rig, session: int, clock: HostClock) -> None:
+        self._left_T_body = se3.inverse(rig.body_T_left)
+        self._adjoint = se3.adjoint(rig.body_T_left)
+        self._session, self._clock = session, clock
+        self._map_T_odom: dict[int, F64] = {0: np.eye(4)}
+        self._localized_from: int | None = None
+        self._before: tuple[int, F64, F64] | None = None  # stamp, odom_T_body, covariance in body axes
+
+    def localized(self, message: Localized) -> None:
+        """The saved map was found."""
+        self._localized_from = message.version
+
+    def update(self, update: MapUpdate) -> None:
+        """A version of the map."""
+        self._map_T_odom[update.version] = update.map_T_odom
+        if len(self._map_T_odom) > KEPT_VERSIONS:
+            del self._map_T_odom[next(iter(self._map_T_odom))]
+
+    def frame(self, frame: Frame) -> PoseUpdate:
+        """The pose at a frame, in the map as the frame knew it."""
+        version = self._known(frame.map_version)
+        odom_T_body = frame.odom_T_cam @ self._left_T_body
+        in_body = self._adjoint @ frame.covariance @ self._adjoint.T
+        tracked = frame.state in TRACKED
+        twist, twist_covariance = self._twist(frame.stamp_ns, odom_T_body, in_body, tracked)
+        turn = np.kron(np.eye(2), odom_T_body[:3, :3])
+        return PoseUpdate(
+            frame_id=frame.frame_id,
+            stamp_ns=frame.stamp_ns,
+            unix_ns=self._clock.unix_ns(frame.stamp_ns),
+            captured_s=self._clock.captured_s(frame.frame_id),
+            state=frame.state.name,
+            reason=frame.reason,
+            map_T_odom=self._map_T_odom[version].copy(),
+            odom_T_body=odom_T_body,
+            covariance=turn @ in_body @ turn.T,
+            twist=twist,
+            twist_covariance=twist_covariance,
+            map_version=version,
+            session=self._session,
+            localized=self._localized_from is not None and version >= self._localized_from,
+            tracked=tracked,
+        )
+
+    def _known(self, version: int) -> int:
+        """The newest version told of that is not newer than this one."""
+        if version in self._map_T_odom:
+            return version
+        return max((v for v in self._map_T_odom if v <= version), default=next(iter(self._map_T_odom)))
+
+    def _twist(self, stamp_ns: int, odom_T_body: F64, covariance: F64, tracked: bool) -> tuple[F64, F64]:
+        """Mean velocity since the frame before, body axes, with its covariance; NaN where either has no pose."""
+        before, self._before = self._before, (stamp_ns, odom_T_body, covariance) if tracked else None
+        if before is None or not tracked or stamp_ns <= before[0]:
+            return np.full(6, np.nan), np.full((6, 6), np.nan)
+        seconds = (stamp_ns - before[0]) * 1e-9
+        return se3.log(se3.inverse(before[1]) @ odom_T_body) / seconds, (before[2] + covariance) / seconds**2

@@ -1,0 +1,237 @@
+"""Recording all day: segments, the quota, black box, marks, and disks that are full or slow."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stereo_sfm.config import Config
+from stereo_sfm.drivers.source import open_source
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.log import topics
+from stereo_sfm.log.reader import LogReader
+from stereo_sfm.recording import recorder as module
+from stereo_sfm.recording import segment_writers
+from stereo_sfm.recording.quota import Disk, Quota, forget_images, make_room, used_bytes
+from stereo_sfm.recording.recorder import Policy, SegmentRecorder
+from stereo_sfm.recording.segments import Segment, delete_recording, is_recording, listed, recordings, segments
+from stereo_sfm.types import Frame, ImuSamples, Observations, StereoImage, TrackState
+from tests.pipeline.test_pipeline import SlidingWall
+
+GB = 1e9
+ROOMY = Disk(int(100 * GB), int(90 * GB))
+PERIOD_NS = 33_333_333
+
+
+def policy(root: Path, **changes: object) -> Policy:
+    default = Policy(root, "full", "png", 0.99, 1e9, Quota(10 * GB), 10.0, 1.0, 1.0)
+    return replace(default, **changes)  # pyright: ignore[reportArgumentType]
+
+
+def frame(image: StereoImage) -> Frame:
+    pose, none = np.eye(4), Observations.empty()
+    return Frame(image.frame_id, image.stamp_ns, pose, np.eye(6), TrackState.OK, "", none, -1, pose)
+
+
+def wait_for(what: Callable[[], object]) -> None:
+    end = time.monotonic() + 20.0
+    while not what():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def record(to: SegmentRecorder, images: list[StereoImage]) -> None:
+    for image in images:
+        to.image(image)
+        to.put(frame(image))
+        while to._images._queue.qsize() > 8:  # pyright: ignore[reportPrivateUsage]
+            time.sleep(0.005)
+
+
+def start(root: Path, disk: Callable[[Path], Disk] = lambda _: ROOMY, **changes: object) -> SegmentRecorder:
+    return SegmentRecorder(policy(root, **changes), SlidingWall(1).rig, Config(), "wall", disk=disk)
+
+
+def fake(root: Path, seconds: list[int], size: int = 1000) -> list[Segment]:
+    """A recording of empty segments."""
+    folder = module.new_recording(root, "fake", "full", datetime(2026, 1, 2))
+    made = [Segment.of(folder, k, second) for k, second in enumerate(seconds)]
+    for segment in made:
+        segment.images.write_bytes(bytes(size))
+        segment.poses.write_bytes(bytes(size // 10))
+    return made
+
+
+def test_segments_open_alone_and_replay_as_one(tmp_path: Path) -> None:
+    images = list(SlidingWall(100))
+    recorder = start(tmp_path)
+    record(recorder, images)
+    recorder.close(20.0)
+    (folder,) = recordings(tmp_path)
+    parts = segments(folder)
+    assert [part.name for part in parts] == ["00000_000000", "00001_000001", "00002_000002", "00003_000003"]
+    with open_source(folder) as whole:
+        again = list(whole)
+        assert whole.frame_count == 100 and whole.rig.baseline == SlidingWall(1).rig.baseline
+        listed_stamps = whole.stamps()
+        assert listed_stamps is not None and len(listed_stamps.stamp_ns) == 100
+    for a, b in zip(images, again, strict=True):
+        assert (a.frame_id, a.stamp_ns) == (b.frame_id, b.stamp_ns)
+        np.testing.assert_array_equal(a.left, b.left)
+        assert a.right is not None and b.right is not None
+        np.testing.assert_array_equal(a.right, b.right)
+    with open_source(parts[2].images) as alone:
+        assert [image.frame_id for image in alone] == list(range(60, 90))
+    with LogReader(parts[2].poses) as reader:
+        assert reader.truncated == "" and reader.metadata("totals")["frames"] == "30"
+        assert len(list(reader.messages([topics.THUMBNAIL]))) == 1
+    assert is_recording(folder) and listed(folder)["segments"] == 4
+    delete_recording(tmp_path, folder.name)
+    assert recordings(tmp_path) == []
+    with pytest.raises(StereoSfmError, match="no recording"):
+        delete_recording(tmp_path, "../..")
+
+
+def test_a_segment_ends_at_its_size(tmp_path: Path) -> None:
+    recorder = start(tmp_path, segment_s=1e9, segment_bytes=2e6, image_format="raw")
+    record(recorder, list(SlidingWall(90)))
+    recorder.close(20.0)
+    sizes = [segment.images.stat().st_size for segment in segments(recorder.folder)]
+    assert len(sizes) >= 3 and max(sizes) < 8e6  # a chunk and what waits beyond the limit
+
+
+def test_the_oldest_unmarked_goes_first(tmp_path: Path) -> None:
+    old, new = fake(tmp_path, [0, 60, 120]), fake(tmp_path, [0, 60])
+    old[1].mark("bump")
+    quota = Quota(bytes=3 * 1100)
+    assert make_room(tmp_path, quota, new[-1], lambda _: ROOMY) == 0
+    assert [s.name for s in segments(old[0].folder)] == [old[1].name] and len(segments(new[0].folder)) == 2
+    assert make_room(tmp_path, Quota(bytes=10), new[-1], lambda _: ROOMY) == 2 * 1100 - 10  # marked and current stay
+    assert used_bytes(tmp_path) == 2200
+    old[1].mark_file.unlink()
+    make_room(tmp_path, Quota(bytes=1100), new[-1], lambda _: ROOMY)
+    assert recordings(tmp_path) == [new[0].folder]
+
+
+def test_percent_and_free_space_count_as_well() -> None:
+    disk = Disk(1000, 100)
+    assert Quota(bytes=1e9, percent=50).excess(600, disk) == 100
+    assert Quota(bytes=1e9, min_free=300).lacking(disk) == 200
+    assert Quota(bytes=1e9).excess(600, disk) == 0
+
+
+def test_a_disk_that_others_filled_costs_images_only(tmp_path: Path) -> None:
+    parts = fake(tmp_path, [0, 60, 120])
+    parts[0].mark("bump")
+    assert make_room(tmp_path, Quota(1e9, min_free=50), parts[-1], lambda _: Disk(10**9, 0)) == 0
+    assert [s.images.exists() for s in parts] == [True, False, True] and all(s.poses.exists() for s in parts)
+
+
+def test_a_black_box_counts_recorded_time(tmp_path: Path) -> None:
+    old, new = fake(tmp_path, [0, 60, 120, 180]), fake(tmp_path, [0, 60, 120])
+    old[1].mark("loss")
+    assert forget_images(tmp_path, keep_s=180.0, segment_s=60.0, current=new[-1]) == 2
+    assert [s.images.exists() for s in (*old, *new)] == [False, True, False, True, True, True, True]
+    assert all(s.poses.exists() for s in (*old, *new))
+
+
+def test_marks_keep_what_lies_around(tmp_path: Path) -> None:
+    recorder = start(tmp_path, segment_s=0.49, mark_before_s=0.6, mark_after_s=0.6)
+    images = list(SlidingWall(150))
+    record(recorder, images[:75])  # 2.5 s
+    recorder.mark("bump")
+    record(recorder, images[75:])
+    recorder.close(20.0)
+    marked = [number for number, segment in enumerate(segments(recorder.folder)) if segment.marked]
+    assert marked == [3, 4, 5, 6]
+
+
+def test_a_full_disk_costs_images_and_no_pose(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "EVERY_S", 0.02)
+    free = [int(90 * GB)]
+    recorder = start(tmp_path, lambda _: Disk(int(100 * GB), free[0]), quota=Quota(10 * GB, min_free=GB))
+    images = list(SlidingWall(90))
+    images = [replace(i, imu=ImuSamples(np.array([i.stamp_ns]), np.zeros((1, 3)), np.ones((1, 3)))) for i in images]
+    record(recorder, images[:30])
+    free[0] = int(0.5 * GB)
+    wait_for(lambda: recorder.state().problem)
+    assert recorder.state().full and "disk full" in recorder.state().problem
+    record(recorder, images[30:60])
+    free[0] = int(90 * GB)
+    wait_for(lambda: not recorder.state().full)
+    record(recorder, images[60:])
+    recorder.close(20.0)
+    poses = [r.sequence for s in segments(recorder.folder) for r in messages(s.poses, topics.FRAME)]
+    drops = [r.sequence for s in segments(recorder.folder) for r in messages(s.poses, topics.DROPPED)]
+    assert sorted(poses) == list(range(90)) and drops == list(range(30, 60)) and recorder.images_dropped == 30
+    with open_source(recorder.folder) as source:
+        kept = list(source)
+    assert [i.frame_id for i in kept] == [*range(30), *range(60, 90)] and kept[30].dropped_before == 30
+    assert kept[30].imu is not None and len(kept[30].imu) == 31  # those of the dropped images, too
+
+
+def messages(path: Path, topic: str) -> list[object]:
+    with LogReader(path) as reader:
+        return list(reader.messages([topic]))
+
+
+def test_a_disk_that_refuses_everything_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(segment_writers, "AGAIN_S", 0.05)
+    refuse = [False]
+    real = segment_writers.LogWriter.write
+
+    def write(self: segment_writers.LogWriter, *args: object) -> None:
+        if refuse[0]:
+            self.close()
+            raise StereoSfmError("recording stopped, No space left on device")
+        real(self, *args)  # pyright: ignore[reportArgumentType]
+
+    monkeypatch.setattr(segment_writers.LogWriter, "write", write)
+    recorder = start(tmp_path)
+    images = list(SlidingWall(60))
+    record(recorder, images[:10])
+    wait_for(lambda: recorder._poses._queue.empty())  # pyright: ignore[reportPrivateUsage]
+    refuse[0] = True
+    record(recorder, images[10:20])
+    wait_for(lambda: "No space" in recorder.state().problem)
+    assert not (tmp_path / module.RESERVE).exists()  # given up for poses
+    refuse[0] = False
+    wait_for(lambda: not recorder._poses.problem)  # pyright: ignore[reportPrivateUsage]
+    record(recorder, images[20:])
+    recorder.close(20.0)
+    poses = {r.sequence for s in segments(recorder.folder) for r in messages(s.poses, topics.FRAME)}
+    assert poses == set(range(60))
+
+
+def test_a_slow_disk_drops_images_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = segment_writers.ImageLog.image
+
+    def slow(self: segment_writers.ImageLog, image: object) -> None:
+        time.sleep(0.1)
+        real(self, image)  # pyright: ignore[reportArgumentType]
+
+    monkeypatch.setattr(segment_writers.ImageLog, "image", slow)
+    recorder = start(tmp_path)
+    began = time.monotonic()
+    for image in SlidingWall(60):
+        recorder.image(image)
+        recorder.put(frame(image))
+    assert time.monotonic() - began < 2.0 and recorder.images_dropped > 20
+    assert recorder.state().problem == "the disk is slow: images are left out"
+    recorder.close(20.0)
+    poses = [r.sequence for s in segments(recorder.folder) for r in messages(s.poses, topics.FRAME)]
+    assert poses == list(range(60))
+
+
+def test_a_folder_without_images_says_so(tmp_path: Path) -> None:
+    recorder = start(tmp_path, mode="lean")
+    record(recorder, list(SlidingWall(30)))
+    recorder.close(20.0)
+    with pytest.raises(StereoSfmError, match="no segment with images"):
+        open_source(recorder.folder)

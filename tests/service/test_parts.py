@@ -1,0 +1,168 @@
+"""The parts of the service that need no processes: state, poses, map cloud, camera, notifications."""
+
+from __future__ import annotations
+
+import dataclasses
+import socket
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stereo_sfm.drivers.choice import SourceChoice
+from stereo_sfm.drivers.repeated import RepeatedSource
+from stereo_sfm.geometry import se3
+from stereo_sfm.messages import Localized
+from stereo_sfm.service.camera import patient, same_camera
+from stereo_sfm.service.hub import Hub
+from stereo_sfm.service.map_follower import MapFollower
+from stereo_sfm.service.messages import MapCloud, ServiceState, Status
+from stereo_sfm.service.notify import SystemdNotifier
+from stereo_sfm.service.poses import HostClock, PoseMaker
+from stereo_sfm.service.states import Facts, judge
+from stereo_sfm.types import F64, Frame, MapUpdate, Observations, TrackState
+from tests.pipeline.test_pipeline import SlidingWall
+from tests.synthetic import pinhole_rig
+
+NONE = np.zeros(0, np.int64)
+MS = 1_000_000
+
+
+def frame(k: int, pose: F64, version: int = 0, state: TrackState = TrackState.OK) -> Frame:
+    covariance = np.diag([1e-4, 1e-4, 4e-4, 1e-6, 1e-6, 1e-6])
+    return Frame(k, 1000 + k * 33 * MS, pose, covariance, state, "", Observations.empty(), -1, np.eye(4), version)
+
+
+def update(version: int, map_T_odom: F64, point_ids: list[int], culled: tuple[int, ...] = ()) -> MapUpdate:
+    ids = np.array(point_ids, np.int64)
+    return MapUpdate(
+        version, version, np.array([version]), map_T_odom[None], ids, np.ones((len(ids), 3)) * version,
+        np.array(culled, np.int64), np.zeros((0, 2), np.int64), map_T_odom,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("facts", "state"),
+    [
+        (Facts(), ServiceState.STARTING),
+        (Facts(starting="", image_s=9.9, pose_s=9.9), ServiceState.RUNNING),
+        (Facts(starting="", image_s=9.9, pose_s=9.0), ServiceState.LOST),
+        (Facts(starting="", image_s=8.0, pose_s=8.0), ServiceState.CAMERA_GONE),
+        (Facts(source_error="no T265 found"), ServiceState.CAMERA_GONE),
+        (Facts(starting="", image_s=9.9, pose_s=9.9, disk_problem="full"), ServiceState.DISK_FULL),
+        (Facts(starting="", image_s=9.9, pose_s=9.0, disk_problem="full"), ServiceState.LOST),
+        (Facts(stopping="SIGTERM", source_error="x"), ServiceState.STOPPING),
+    ],
+)
+def test_what_hurts_most_is_the_state(facts: Facts, state: ServiceState) -> None:
+    judged, reason = judge(facts, 10.0)
+    assert judged == state and bool(reason) == (state != ServiceState.RUNNING)
+
+
+def test_velocity_and_covariance_are_those_of_the_body() -> None:
+    rig = dataclasses.replace(pinhole_rig(), body_T_left=se3.exp(np.array([0.3, 0.0, 0.2, 0.5, -0.5, 0.5])))
+    maker = PoseMaker(rig, 1, HostClock())
+    body_twist = np.array([0.6, 0.1, 0.0, 0.0, 0.0, 0.4])  # a second
+    odom_T_body = [se3.exp(body_twist * 0.033 * k) for k in range(3)]
+    poses = [maker.frame(frame(k, odom_T_body[k] @ rig.body_T_left)) for k in range(3)]
+    assert np.isnan(poses[0].twist).all()
+    np.testing.assert_allclose(poses[2].twist, body_twist, atol=1e-9)
+    np.testing.assert_allclose(poses[2].odom_T_body, odom_T_body[2], atol=1e-12)
+    lost = maker.frame(frame(3, np.eye(4), state=TrackState.LOST))
+    assert not lost.tracked and np.isnan(lost.twist).all()
+    assert np.isnan(maker.frame(frame(4, np.eye(4))).twist).all()
+    # the covariance says how the body scatters in odom when the camera does as it says
+    rng = np.random.default_rng(1)
+    xi = rng.multivariate_normal(np.zeros(6), frame(0, np.eye(4)).covariance, 4000)
+    cam = odom_T_body[2] @ rig.body_T_left
+    scattered = np.array([(cam @ se3.exp(x) @ se3.inverse(rig.body_T_left))[:3, 3] for x in xi])
+    np.testing.assert_allclose(np.cov(scattered.T), poses[2].covariance[:3, :3], atol=6e-5)
+
+
+def test_poses_are_in_the_map_that_their_frame_knew() -> None:
+    maker, moved = PoseMaker(pinhole_rig(), 7, HostClock()), se3.exp(np.array([1.0, 0, 0, 0, 0, 0]))
+    maker.update(update(1, np.eye(4), [1]))
+    maker.localized(Localized(2))
+    maker.update(update(2, moved, [1]))
+    before, after = maker.frame(frame(0, np.eye(4), 1)), maker.frame(frame(1, np.eye(4), 2))
+    assert not before.localized and after.localized and after.session == 7
+    assert before.map_T_body[0, 3] == 0.0 and after.map_T_body[0, 3] == 1.0
+    for version in range(3, 1000):
+        maker.update(update(version, moved, [1]))
+    assert maker.frame(frame(2, np.eye(4), 999)).map_version == 999
+
+
+def test_the_sensors_clock_is_that_of_the_fastest_image(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = HostClock()
+    for k in range(1000):
+        clock.image(k, k * 33 * MS, 100.0 + k * 0.033 + (0.002 if k % 7 else 0.001))
+    monkeypatch.setattr("time.monotonic_ns", lambda: int(133e9))
+    monkeypatch.setattr("time.time_ns", lambda: int(1_000_133e9))
+    assert abs(clock.unix_ns(0) - int(1_000_100.001e9)) < 1000
+    monkeypatch.setattr("time.time_ns", lambda: int(1_003_733e9))  # the wall clock was set an hour later
+    assert abs(clock.unix_ns(0) - int(1_003_700.001e9)) < 1000
+    assert len(clock._captured) <= 301  # pyright: ignore[reportPrivateUsage]
+
+
+def test_the_cloud_forgets_what_the_mapper_removed() -> None:
+    clouds: list[MapCloud] = []
+    follower = MapFollower(1, clouds.append)
+    follower.close()
+    for version in range(1, 200):  # ten points at a time, those of ten versions live
+        old = tuple(range(10 * (version - 10), 10 * (version - 9)))
+        follower.apply(update(version, np.eye(4), list(range(10 * version, 10 * version + 10)), old))
+    cloud = follower.cloud(5, 199)
+    assert len(cloud.point_ids) == 100 and cloud.point_ids.min() == 1900 and (np.diff(cloud.point_ids) > 0).all()
+    assert cloud.points[-1, 0] == 199.0 and not cloud.saved
+
+
+def test_a_late_callback_gets_the_newest_state_first_and_a_failing_one_disturbs_nobody() -> None:
+    hub, got = Hub(()), list[Status]()
+    hub.publish(Status(ServiceState.LOST, "dark"))
+    hub.on(Status, lambda status: 1 / 0)
+    done = hub.on(Status, got.append)
+    hub.publish(Status(ServiceState.RUNNING))
+    done()
+    hub.publish(Status(ServiceState.STOPPING))
+    hub.close()
+    for _ in range(100):
+        if len(got) >= 2:
+            break
+        __import__("time").sleep(0.02)
+    assert [status.state for status in got] == [ServiceState.LOST, ServiceState.RUNNING]
+
+
+def test_a_repeated_source_never_ends_and_its_stamps_go_on() -> None:
+    images = iter(RepeatedSource(SlidingWall(5)))
+    got = [next(images) for _ in range(13)]
+    assert [image.frame_id for image in got] == list(range(13))
+    assert set(np.diff([image.stamp_ns for image in got])) == {33_333_333}
+    np.testing.assert_array_equal(got[11].left, got[1].left)
+
+
+def test_only_the_same_camera_is_taken_again() -> None:
+    camera = patient(SourceChoice.of("t265:?exposure=8000"))
+    assert camera.options == {"reconnect": 86_400.0}
+    assert same_camera(camera, "905312110123").spec == "t265:905312110123?exposure=8000"
+    named = SourceChoice.of("t265:simulated?reconnect=5")
+    assert patient(named) == named and same_camera(named, "1") == named
+    assert patient(SourceChoice.of("sim:loop")) == same_camera(SourceChoice.of("sim:loop"), "1")
+
+
+def test_systemd_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    address = str(tmp_path / "notify")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(address)
+        monkeypatch.setenv("NOTIFY_SOCKET", address)
+        monkeypatch.setenv("WATCHDOG_USEC", "2000000")
+        notifier = SystemdNotifier()
+        notifier.ready()
+        notifier.status("running")
+        notifier.status("running")
+        notifier.reloading()
+        notifier.stopping()
+        told = [systemd.recv(1000).decode() for _ in range(4)]
+    assert notifier.watchdog_s == 1.0 and told[:2] == ["READY=1", "STATUS=running"] and told[3] == "STOPPING=1"
+    assert told[2].startswith("RELOADING=1\nMONOTONIC_USEC=")
+    monkeypatch.delenv("NOTIFY_SOCKET")
+    SystemdNotifier().ready()  # nothing listens: nothing happens

@@ -1,0 +1,174 @@
+"""The table of faults in docs/tasks/service.md, each caused for real on a running service."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import psutil
+import pytest
+
+from stereo_sfm.drivers.choice import MadeSource
+from stereo_sfm.drivers.source import open_source
+from stereo_sfm.log import topics
+from stereo_sfm.log.reader import LogReader
+from stereo_sfm.maps.saved_map import load_map
+from stereo_sfm.recording.segments import recordings, segments
+from stereo_sfm.service.config import MapConfig, RecordingConfig, RobotConfig
+from stereo_sfm.service.messages import PoseUpdate, ServiceState, Status
+from stereo_sfm.service.service import Service
+from tests.service.endless import endless_wall
+from tests.service.test_service import STOP_S, wait_for
+
+pytestmark = pytest.mark.slow
+DEMO = Path(__file__).parents[2] / "recordings" / "demo.mcap"
+
+
+def config(tmp_path: Path, root: Path | None = None) -> RobotConfig:
+    recording = RecordingConfig(
+        str(root or tmp_path / "recordings"), "full", "raw", segment_min=0.05, quota_gb=1.0, min_free_gb=0.0
+    )
+    return RobotConfig(map=MapConfig(str(tmp_path / "store")), recording=recording)
+
+
+class Running:
+    """A service with what it said."""
+
+    def __init__(self, service: Service) -> None:
+        self.service, self.poses, self.states = service, list[PoseUpdate](), list[Status]()
+        service.on(PoseUpdate, self.poses.append)
+        service.on(Status, self.states.append)
+
+    def more_poses(self, count: int = 30) -> None:
+        before = len(self.poses)
+        wait_for(lambda: len(self.poses) >= before + count)
+
+    def no_pose_is_missing(self) -> bool:
+        return [p.frame_id for p in self.poses] == list(range(len(self.poses)))
+
+
+@contextmanager
+def running(settings: RobotConfig) -> Generator[Running]:
+    with Service(settings, MadeSource.of(endless_wall)) as service:
+        watched = Running(service)
+        watched.more_poses()
+        yield watched
+
+
+@pytest.mark.parametrize("fault", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_dead_or_hung_recorder_costs_no_pose(fault: signal.Signals, tmp_path: Path) -> None:
+    with running(config(tmp_path)) as watched:
+        pid = watched.service.pids["recorder"]
+        os.kill(pid, fault)
+        wait_for(lambda: watched.service.pids.get("recorder") not in (None, pid))
+        watched.more_poses(90)
+        assert watched.no_pose_is_missing() and watched.service.status().data["health"]["restarts"] == 0
+    first, second = recordings(tmp_path / "recordings")
+    for folder in (first, second):
+        with open_source(folder) as source:
+            assert sum(1 for _ in source) > 5
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="mounts a small disk")
+def test_a_disk_that_somebody_fills(tmp_path: Path) -> None:
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=200m", "none", str(disk)], check=False)
+    if mounted.returncode:
+        pytest.skip("cannot mount here")
+    try:
+        settings = config(tmp_path, disk / "recordings")
+        settings = replace(settings, recording=replace(settings.recording, min_free_gb=0.02))
+        with running(settings) as watched:
+            filler = disk / "somebody"
+            fill(filler)
+            wait_for(lambda: watched.states[-1].state == ServiceState.DISK_FULL)
+            watched.more_poses(60)
+            filler.unlink()
+            wait_for(lambda: watched.states[-1].state == ServiceState.RUNNING)
+            watched.more_poses(60)
+            assert watched.no_pose_is_missing()
+        (folder,) = recordings(disk / "recordings")
+        logged = set[int]()
+        for segment in segments(folder):
+            with LogReader(segment.poses) as reader:
+                logged |= {record.sequence for record in reader.messages([topics.FRAME])}
+        assert set(range(1, len(watched.poses) - 1)) - logged == set()
+    finally:
+        subprocess.run(["umount", "-l", str(disk)], check=False)
+
+
+def fill(path: Path) -> None:
+    with path.open("wb") as file:
+        try:
+            while True:
+                os.write(file.fileno(), bytes(1 << 16))
+        except OSError:
+            return
+
+
+def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with running(config(tmp_path, tmp_path / "file" / "recordings")) as watched:
+        wait_for(lambda: watched.states[-1].recording_problem)
+        assert "cannot record to" in watched.states[-1].recording_problem
+        watched.more_poses()
+        assert watched.no_pose_is_missing()
+
+
+def serve(tmp_path: Path) -> subprocess.Popen[str]:
+    options = {
+        "source.spec": DEMO,
+        "source.repeat": "true",
+        "map.folder": tmp_path / "store",
+        "map.save_every_min": 0.05,
+        "recording.folder": tmp_path / "recordings",
+        "recording.mode": "full",
+    }
+    arguments = [part for name, value in options.items() for part in ("--set", f"{name}={value}")]
+    command = [sys.executable, "-m", "stereo_sfm.cli", "serve", "-v", *arguments]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+
+
+def said(process: subprocess.Popen[str], text: str) -> str:
+    assert process.stderr is not None
+    for line in process.stderr:
+        if text in line:
+            return line
+    raise AssertionError(f"it never said '{text}'")
+
+
+def test_kill_9_of_the_service_itself_leaves_nobody_and_loses_nothing(tmp_path: Path) -> None:
+    process = serve(tmp_path)
+    said(process, "is saved")
+    said(process, "is saved")
+    children = psutil.Process(process.pid).children(recursive=True)
+    assert len(children) >= 6
+    process.kill()
+    process.wait()
+    _, alive = psutil.wait_procs(children, timeout=STOP_S)
+    assert not alive
+    assert len(load_map(tmp_path / "store")) > 0
+    (folder,) = recordings(tmp_path / "recordings")
+    with open_source(folder) as source:
+        assert sum(1 for _ in source) > 30
+    again = serve(tmp_path)
+    said(again, "recognised")
+    began = time.monotonic()
+    again.send_signal(signal.SIGTERM)
+    said(again, "SIGTERM received")
+    assert again.wait(STOP_S + 1.0) == 0 and time.monotonic() - began < STOP_S
+    load_map(tmp_path / "store")
+
+
+def test_a_mistake_is_one_line(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "stereo_sfm.cli", "serve", "--set", f"source.spec={tmp_path / 'none.mcap'}"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
