@@ -19,6 +19,7 @@ RIG = make_rig("pinhole")
 SECONDS = 1 / 15
 MOVED = se3.exp(np.array([0.0, 0.0, 0.055, 0.0, 0.002, 0.0]))  # of the camera since the last frame
 STILL, MOVING = 60, 150
+NONE = np.zeros(0, bool)
 
 
 def scene(rng: np.random.Generator) -> tuple[Tracks, Bool]:
@@ -66,14 +67,44 @@ def test_settled_points_decide_against_more_young_ones(seed: int) -> None:
     assert solution.inlier[~on_person].mean() > 0.9
     assert solution.inlier[on_person].mean() < 0.15
     assert np.sqrt(np.trace(solution.covariance[:3, :3])) < 0.01
-    solver.learn(tracks, solution, 400, expected)
+    solver.learn(tracks, solution, expected)
     assert solver.alert
+
+
+def test_a_smaller_group_that_moves_is_marked_at_once() -> None:
+    tracks, on_person = scene(np.random.default_rng(1))
+    fewer = np.arange(len(tracks)) < STILL + 50
+    tracks, on_person = tracks.keep(fewer), on_person[fewer]
+    tracks.age[:] = 0  # nothing has settled: most decide
+    solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
+    expected = ExpectedMotion(MOVED @ se3.exp(np.full(6, 0.002)), np.zeros(6), SECONDS)
+    solution = solver.solve(tracks, expected, np.eye(4), before=len(tracks))
+    assert off(solution.pose) < 0.005
+    assert solution.moving[on_person].mean() > 0.7
+    assert not solution.moving[~on_person].any()
+    solver.learn(tracks, solution, expected)
+    assert solver.alert
+
+
+def test_too_little_of_an_open_view_is_no_pose() -> None:
+    tracks, on_person = scene(np.random.default_rng(2))
+    store = tracks.keep(~on_person)
+    solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
+    expected = ExpectedMotion(MOVED, np.zeros(6), SECONDS)
+    solver.learn(store, solver.solve(store, expected, np.eye(4), before=STILL), expected)
+    assert not solver.alert
+    assert solver.open_view > 0.9 * STILL
+    solver.learn(tracks, solver.solve(tracks, expected, np.eye(4), before=400), expected)
+    assert solver.alert
+    seen = on_person | (np.arange(len(tracks)) >= STILL - 9)
+    left = tracks.keep(seen)
+    assert solver.solve(left, expected, np.eye(4), before=400).reason
 
 
 def test_what_disagrees_in_company_is_marked_and_followed_on() -> None:
     tracks, on_person = scene(np.random.default_rng(0))
     for _ in range(3):
-        tracks, kept = after_frame(tracks, ~on_person, 3, alert=True)
+        tracks, kept = after_frame(tracks, ~on_person, NONE, 3, alert=True)
         assert kept[~on_person].all()
         on_person = on_person[kept]
     assert on_person.sum() > 0.8 * MOVING
@@ -83,13 +114,13 @@ def test_what_disagrees_in_company_is_marked_and_followed_on() -> None:
     assert begun[on_person].mean() > 0.9
     assert begun[~on_person].mean() < 0.1
     for _ in range(PROOF):
-        tracks, _ = after_frame(tracks, np.ones(len(tracks), bool), 3, alert=True)
+        tracks, _ = after_frame(tracks, np.ones(len(tracks), bool), NONE, 3, alert=True)
     assert not tracks.moving.any()
 
 
 def test_nothing_is_marked_where_nothing_moves() -> None:
     tracks, on_person = scene(np.random.default_rng(0))
     for _ in range(3):
-        tracks, _ = after_frame(tracks, ~on_person[: len(tracks)], 3, alert=False)
+        tracks, _ = after_frame(tracks, ~on_person[: len(tracks)], NONE, 3, alert=False)
     assert len(tracks) == STILL
     assert not tracks.moving.any()

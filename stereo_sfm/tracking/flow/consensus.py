@@ -1,7 +1,8 @@
 """Which motion is the camera's when something else moves before it: points that have stood still for long decide.
 
-While most points agree, all of them have the same say. When agreement falls, a second motion is among them: then only
-settled points solve for the pose, young ones follow it, and what keeps disagreeing in company is marked as moving.
+While most points agree, all of them have the same say. When points in company disagree, or many are gone, a second
+motion is looked for among them, and the camera's is the one that the longest followed points agree with, within what
+its motion until now makes likely. What follows another motion, or keeps disagreeing in company, is marked as moving.
 Marked points are followed on, so that nothing new is begun on what moves, but count for nothing until they have stood
 still for a while.
 """
@@ -20,21 +21,24 @@ from stereo_sfm.tracking.flow.pose_solver import point_residuals
 from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.types import F64, Bool, Corners
 
-AGREEMENT = 0.8  # share of the points below which something moves
-LEFT = 0.65  # share of those that were looked for, likewise
-SAME = 0.9  # of the settled points that agree with what they decide, agree with what all do: then all decide
+FEW = 8  # points in company, fewer are no motion of their own
+LEFT = 0.65  # share of the points that were looked for from which another motion is, if fewer agree
+SETTLED_S = 0.3  # a point that was followed for so long has its full say ...
+LEAST_SAY = 0.1  # ... and a new one this
+EVIDENCE = 0.2  # of the points that agree in an open view; with fewer the camera counts as covered
+MORE = 1.05  # times the say that all together have, so that others decide
 ALERT_S = 1.0  # after that, or while points are marked as moving
-SETTLED_S = 0.3  # a point that was followed for so long decides
 COMPANY, NEIGHBOURS = 3, 6  # a point moves if so many of its nearest neighbours disagree as well
 SAME_DEPTH = 0.3  # logarithm of the ratio of two distances
 PROOF = 4  # successive frames in which a moving point must agree to be believed again
 
 
-def after_frame(tracks: Tracks, inlier: Bool, misses_allowed: int, alert: bool) -> tuple[Tracks, Bool]:
+def after_frame(tracks: Tracks, inlier: Bool, moving: Bool, misses_allowed: int, alert: bool) -> tuple[Tracks, Bool]:
     """Tracks with `misses` and `moving` brought up to date; what disagrees for long is dropped, in company marked.
 
     Args:
-        inlier: (N,) which points agree with the pose. misses_allowed: successive frames of disagreement.
+        inlier: (N,) which points agree with the pose. moving: (N,) which have been seen to move in company; (0,): none.
+        misses_allowed: successive frames of disagreement.
         alert: whether something may move; if not, nothing is marked.
 
     Returns:
@@ -49,6 +53,8 @@ def after_frame(tracks: Tracks, inlier: Bool, misses_allowed: int, alert: bool) 
     joins = np.zeros(len(tracks), bool)
     rows = np.flatnonzero(out) if alert else np.zeros(0, np.int64)
     joins[rows] = _company(tracks.uv[rows], tracks.rho[rows], tracks.uv, tracks.rho, disagree) > COMPANY
+    if len(moving):
+        joins |= moving & still
     tracks.misses[joins] = PROOF
     tracks.moving = (tracks.moving | joins) & (tracks.misses > 0)
     kept = ~out | joins
@@ -68,6 +74,14 @@ def _company(uv: F64, rho: F64, among_uv: F64, among_rho: F64, marked: Bool) -> 
     nearest = np.argsort(squared, axis=1, kind="stable")[:, :NEIGHBOURS]
     alike = np.abs(np.log(among_rho[nearest] / rho[:, None])) < SAME_DEPTH
     return (marked[nearest] & alike).sum(1)
+
+
+def in_company(tracks: Tracks, points: Bool) -> Bool:
+    """(N,) which of some points, (N,), have such points around them at their own distance."""
+    rows, out = np.flatnonzero(points), np.zeros(len(points), bool)
+    if len(rows) >= FEW:
+        out[rows] = _company(tracks.uv[rows], tracks.rho[rows], tracks.uv, tracks.rho, points) > COMPANY
+    return out
 
 
 def without_moving(corners: Corners, tracks: Tracks) -> Corners:

@@ -11,7 +11,17 @@ import numpy as np
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.tracking.flow import pose_solver
-from stereo_sfm.tracking.flow.consensus import AGREEMENT, ALERT_S, LEFT, SAME, SETTLED_S, errors_at
+from stereo_sfm.tracking.flow.consensus import (
+    ALERT_S,
+    EVIDENCE,
+    FEW,
+    LEAST_SAY,
+    LEFT,
+    MORE,
+    SETTLED_S,
+    errors_at,
+    in_company,
+)
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.tracking.flow.tracks import Tracks
@@ -53,7 +63,7 @@ class PoseSolution:
     sigma_px: float  # what it is whitened by
     max_error: float
     reason: str = ""  # why there is no pose
-    judges: Bool = field(default_factory=lambda: np.zeros(0, bool))  # (N,) settled points, where they decided
+    moving: Bool = field(default_factory=lambda: np.zeros(0, bool))  # (N,) points that move in company; (0,): none
 
     @property
     def inlier(self) -> Bool:
@@ -82,6 +92,7 @@ class FramePoseSolver:
         self._config, self._cameras, self._shutter = config, cameras, shutter
         self._noise = 1.0  # observed noise over config.sigma_px
         self._alert_s = 0.0  # seconds for which something may still move
+        self.open_view = 0.0  # points that agree while nothing moves
         self._surprise = np.zeros(2)  # mean square of metres/s^2 and radians/s^2 between expected and found poses
 
     def use(self, cameras: StereoCameras) -> None:
@@ -91,29 +102,43 @@ class FramePoseSolver:
     def solve(self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, before: int = 0) -> PoseSolution:
         """Pose from where it is expected; from the previous pose (4, 4) when that finds no consensus.
 
-        Where not everything stands still, settled points decide; without them only an expected pose is believed.
+        `before`: points that stood still until now and were looked for. Where many of them disagree or are gone, other
+        motions are looked for, and that counts which the longest followed points agree with.
         """
         voters = ~tracks.moving
         if voters.sum() < self._config.min_features:
             return _no_pose(len(tracks), "too_few_points")
-        if self.alert:
-            return self._on_alert(tracks, expected, last_pose, voters)
         best = self._by_all(tracks, expected, last_pose, voters)
-        if best.reason or best.inliers >= max(AGREEMENT * voters.sum(), LEFT * before):
+        rest = voters & ~best.inlier
+        calm = in_company(tracks, rest).sum() < FEW and best.inliers >= LEFT * before
+        if calm and not self.alert:
             return best
-        settled = self._by_settled(tracks, expected, voters)
-        if settled is None or best.inlier[settled.judges].sum() > SAME * settled.inlier[settled.judges].sum():
+        chosen = self._choose(tracks, expected, last_pose, best, rest)
+        if not self.alert and not len(chosen.moving):
             return best
-        return settled
+        covered = (chosen.inlier & voters).sum() < EVIDENCE * self.open_view
+        return _no_pose(len(tracks), "too_few_points") if covered else chosen
 
-    def _on_alert(self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, voters: Bool) -> PoseSolution:
-        """Something moves: settled points decide."""
-        settled = self._by_settled(tracks, expected, voters)
-        if settled is not None:
-            return settled
-        best = self._by_all(tracks, expected, last_pose, voters)
-        likely = best.reason or self._likely(best.pose, expected)
-        return best if likely else _no_pose(len(tracks), "no_consensus")
+    def _choose(
+        self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, best: PoseSolution, rest: Bool
+    ) -> PoseSolution:
+        """Of the motions among the points, the camera's; `rest`: what disagrees with the best."""
+        voters = ~tracks.moving
+        other = self._by_rest(tracks, expected, last_pose, rest)
+        agreed = None if best.reason else self._grown(tracks, expected, best, best.inlier & voters, voters)
+        found = [agreed, self._by_settled(tracks, expected, voters), other]
+        likely = [s for s in found if s is not None and not s.reason and self._likely(s.pose, expected)]
+        if not likely:
+            return _no_pose(len(tracks), "no_consensus") if self.alert else best
+        say = tracks.mapped + np.minimum(tracks.age * expected.seconds, SETTLED_S) / SETTLED_S + LEAST_SAY
+        says = [float(say[s.inlier & voters].sum()) for s in likely]
+        k = int(np.argmax(says))
+        chosen = likely[0] if says[k] <= MORE * says[0] else likely[k]
+        for loser in found:
+            moving = np.zeros(len(tracks), bool) if loser is None else voters & loser.inlier & ~chosen.inlier
+            if in_company(tracks, moving).sum() >= FEW:
+                chosen.moving = chosen.moving | moving if len(chosen.moving) else moving
+        return chosen
 
     def _by_all(self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, voters: Bool) -> PoseSolution:
         """All points have the same say."""
@@ -128,16 +153,26 @@ class FramePoseSolver:
     def _by_settled(self, tracks: Tracks, expected: ExpectedMotion, voters: Bool) -> PoseSolution | None:
         """Points that have stood still for long decide, the others follow; None where there are too few."""
         settled = voters & (tracks.age * expected.seconds >= SETTLED_S)
-        if settled.sum() < self._config.min_features:
+        if settled.sum() < self._config.min_features or settled[voters].all():
             return None
-        first = self._optimise(tracks, expected, settled)
-        agree = first.inlier & settled
-        if agree.sum() < max(self._config.min_features, 0.5 * settled.sum()):
+        return self._grown(tracks, expected, self._optimise(tracks, expected, settled), settled, voters)
+
+    def _by_rest(self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, rest: Bool) -> PoseSolution | None:
+        """The motion of the points that disagree with all others: of something else, or the camera's."""
+        if rest.sum() < FEW:
             return None
-        start = dataclasses.replace(expected, pose=first.pose)
-        solution = self._optimise(tracks, start, first.inlier & voters)
-        solution.judges = settled
-        return solution
+        still = ExpectedMotion(last_pose, np.zeros(6), expected.seconds)
+        starts = [self._optimise(tracks, start, rest) for start in (still, expected)]
+        best = max(starts, key=lambda s: s.inlier[rest].sum())
+        return self._grown(tracks, expected, best, rest, ~tracks.moving)
+
+    def _grown(
+        self, tracks: Tracks, expected: ExpectedMotion, first: PoseSolution, by: Bool, voters: Bool
+    ) -> PoseSolution | None:
+        """The pose that some points gave, by all that agree with it; None where most of those do not."""
+        if (first.inlier & by).sum() < max(self._config.min_features, 0.5 * by.sum()):
+            return None
+        return self._optimise(tracks, dataclasses.replace(expected, pose=first.pose), first.inlier & voters)
 
     @property
     def alert(self) -> bool:
@@ -151,18 +186,15 @@ class FramePoseSolver:
         most = np.maximum(most, MOST_SURPRISE * np.sqrt(self._surprise))
         return bool((off < least + most * expected.seconds**2).all())
 
-    def learn(self, tracks: Tracks, solution: PoseSolution, before: int, expected: ExpectedMotion) -> None:
-        """Follow whether something moves before the camera and, while nothing does, the noise of points and motion.
-
-        `before`: points that stood still until now and were looked for.
-        """
+    def learn(self, tracks: Tracks, solution: PoseSolution, expected: ExpectedMotion) -> None:
+        """Follow whether something moves before the camera and, while nothing does, the noise of points and motion."""
         seconds = expected.seconds
-        voters = ~tracks.moving
-        agree = int(solution.inlier[voters].sum()) >= max(AGREEMENT * voters.sum(), LEFT * before)
-        overruled = len(solution.judges) > 0 and not agree
-        self._alert_s = ALERT_S if overruled or tracks.moving.any() else max(self._alert_s - seconds, 0.0)
+        moving = tracks.moving.sum() + solution.moving.sum() >= FEW
+        self._alert_s = ALERT_S if moving else max(self._alert_s - seconds, 0.0)
         if self.alert:
             return
+        share = 1.0 - math.exp(-seconds / MEMORY_S) if self.open_view else 1.0
+        self.open_view += share * (solution.inliers - self.open_view)
         median = float(np.median(solution.error[solution.inlier]))
         noise = self._noise * (0.9 + 0.1 * median / MEDIAN_ERROR)
         self._noise = min(max(noise, NOISE_RANGE[0]), NOISE_RANGE[1])

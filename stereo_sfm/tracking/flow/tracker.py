@@ -45,7 +45,8 @@ NOT_FOUND = (
 )
 MAX_MISSES = 3  # successive frames after which a point that disagrees is given up
 TRUSTED_SHARE = 0.8  # of the points that are followed: a pose that so many agree with is beyond doubt ...
-TRUSTED_LEFT = 0.5  # ... if so many of the newest keyframe's points are left
+TRUSTED_LEFT = 0.5  # ... if so many of the newest keyframe's points are left ...
+TRUSTED_OPEN = 0.3  # ... and so many of those that agree in an open view
 COVERED_SHARE = 0.1  # that a frame whose view is covered counts towards beginning anew
 SAME_START = 0.05, 0.01  # metres, radians between poses from which the same is found
 LOOKS = 2
@@ -126,12 +127,13 @@ class Tracker:
         self.solution = solution
         if solution.reason:
             return self._lose(image, solution.reason)
-        self._solver.learn(tracks, solution, self._standing(), expected)
+        self._solver.learn(tracks, solution, expected)
         self._solver.refine_depth(tracks, solution)
         state = TrackState.OK if self._lost == 0 else TrackState.RECOVERED
         stats = _stats(tracks, solution)
         agree = int((solution.inlier & ~tracks.moving).sum())
-        trusted = agree >= max(TRUSTED_SHARE * float((~tracks.moving).sum()), TRUSTED_LEFT * self._kf_points)
+        enough = max(TRUSTED_LEFT * self._kf_points, TRUSTED_OPEN * self._solver.open_view)
+        trusted = agree >= max(TRUSTED_SHARE * float((~tracks.moving).sum()), enough)
         if trusted:
             self._recovery.motion.add(image.stamp_ns, solution.pose)
             self._follower.hold(images.left, tracks.keep(solution.inlier & ~tracks.moving), solution.pose)
@@ -200,7 +202,7 @@ class Tracker:
             self._velocity = self._recovery.motion.velocity()
         inlier = solution.inlier & ~tracks.moving
         tracks.age = tracks.age + np.int32(1)
-        tracks, kept = after_frame(tracks, solution.inlier, MAX_MISSES, self._solver.alert)
+        tracks, kept = after_frame(tracks, solution.inlier, solution.moving, MAX_MISSES, self._solver.alert)
         self._go_on(image, images, solution.pose, tracks)
         if self._inertial is not None:
             self._inertial.accept(image.stamp_ns, solution.pose)
