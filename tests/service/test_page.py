@@ -40,8 +40,8 @@ def _recordings(folder: Path) -> dict[str, Reply]:
         file.parent.mkdir(exist_ok=True)
         file.write_bytes(file.name.encode() * 1000)
     row = {
-        "id": "r1", "name": "drive <b>1</b>", "unix_ns": 0, "seconds": 75.0, "bytes": 12e6, "marked": True,
-        "mode": "full", "problem": "2 gaps between images",
+        "id": "00007 <b>&1", "began": "2026-11-22T10:00:00", "source": "t265", "mode": "full", "seconds": 75,
+        "segments": 3, "with_images": 1, "bytes": 12_000_000, "marked": True,
     }  # fmt: skip
     return {
         "recordings": Reply(True, "", {"recordings": [row]}),
@@ -108,9 +108,9 @@ def test_an_operator_sees_and_does_everything(width: int, height: int, tmp_path:
             text = browser.run("document.body.innerText")
             for shown in ("29.9 images a second", "14.0 ms", "3 ring", "51 °C", "42.0 GB free", "row error 0.12 px"):
                 assert shown in text
-            browser.until("document.getElementById('recordings').innerText.includes('drive <b>1</b>')")  # no markup
+            browser.until("document.getElementById('recordings').innerText.includes('00007 <b>&1 ★')")  # no markup
             assert "1:15 min, 12 MB" in text or "1:15 min, 12 MB" in browser.run("document.body.innerText")
-            assert "2 gaps between images" in browser.run("document.body.innerText")
+            assert "2 of 3 segments without images" in browser.run("document.body.innerText")
             assert "lost in <i>aisle 3</i>" in browser.run("document.getElementById('events').innerText")
             assert browser.run("document.documentElement.scrollWidth") <= width  # nothing hangs over the side
             browser.screenshot(tmp_path / "running.png")
@@ -120,7 +120,10 @@ def test_an_operator_sees_and_does_everything(width: int, height: int, tmp_path:
             browser.until("document.getElementById('answer').textContent === 'start_recording done'")
             browser.run("document.querySelector('[data-command=mark]').click()")
             browser.run("window.confirm = () => true; document.querySelector('[data-command=reset]').click()")
-            browser.run("[...document.querySelectorAll('#recordings button')][0].click()")
+            buttons = "[...document.querySelectorAll('#recordings button')]"
+            browser.run(f"{buttons}.find(b => b.textContent === 'files').click()")
+            browser.until("document.querySelectorAll('#files a').length === 2")
+            browser.run(f"{buttons}.find(b => b.textContent === 'delete').click()")
             browser.until("document.getElementById('answer').textContent === 'delete_recording done'")
             told.update(state=ServiceState.CAMERA_GONE, reason="The camera is gone.", remedy="Plug it in again.")
             browser.until("document.getElementById('remedy').textContent === 'Plug it in again.'")
@@ -131,7 +134,7 @@ def test_an_operator_sees_and_does_everything(width: int, height: int, tmp_path:
             feeding.join()
         names = [name for name, _ in service.calls]
         assert {"save_map", "start_recording", "mark", "reset"} <= set(names)
-        assert ("delete_recording", {"id": "r1"}) in service.calls
+        assert ("delete_recording", {"id": "00007 <b>&1"}) in service.calls
         output.close()
         browser.until("document.getElementById('state').textContent === 'no answer'")
 
@@ -201,6 +204,8 @@ def test_recordings_are_loaded_by_id_and_number(tmp_path: Path) -> None:
     with _serving(service) as output:
         code, data, headers = _ask(output, "GET", "/api/recordings/r1/1")
         assert code == 200 and data == b"1.mcap" * 1000 and 'filename="drive_1.mcap"' in headers["content-disposition"]
+        names = json.loads(_ask(output, "GET", "/api/recordings/r1")[1])
+        assert names == [{"name": f"{i}.mcap", "bytes": 6000} for i in range(2)]
         for path in (
             "/api/recordings/r1/2", "/api/recordings/r1/-1", "/api/recordings/..%2f..%2fsecret/0x", "/../secret",
             "/static/../secret", "/%2e%2e/secret", "/api/recordings/../../secret", "/page", "/app.py",

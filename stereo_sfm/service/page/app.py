@@ -90,6 +90,7 @@ class Page:
             ("/api/image.jpg", self._image),
             ("/api/settings", self._settings),
             ("/api/recordings", self._recordings),
+            ("/api/recordings/{id}", self._files),
             ("/api/recordings/{id}/{number:int}", self._download),
         ]
         routes = [Route(path, self._file) for path in FILES]
@@ -166,6 +167,14 @@ class Page:
     async def _recordings(self, request: Request) -> Response:
         reply = await self._call("recordings", {})
         return JSONResponse(reply.data.get("recordings", []) if reply.ok else [])
+
+    async def _files(self, request: Request) -> Response:
+        """Names and sizes of a recording's files; their numbers are their places in this list."""
+        reply = await self._call("recording_files", {"id": request.path_params["id"]})
+        if not reply.ok:
+            return _no(404, reply.text)
+        files = [Path(text) for text in reply.data.get("files", [])]
+        return JSONResponse([{"name": f.name, "bytes": f.stat().st_size if f.is_file() else 0} for f in files])
 
     async def _download(self, request: Request) -> Response:
         """One file of a recording: the service says which files those are."""

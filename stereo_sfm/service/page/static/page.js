@@ -128,18 +128,27 @@ async function refresh() {
     const rows = await (await ask("api/recordings")).json(), table = document.createElement("table");
     table.id = "recordings";
     for (const r of Array.isArray(rows) ? rows : []) {
-      const open = document.createElement("a");
-      [open.href, open.textContent, open.download] = [`api/recordings/${encodeURIComponent(r.id)}/0`, "download", ""];
-      const gone = button("delete", () => confirm(`Delete ${r.name}?`) && command("delete_recording", { id: r.id }));
-      const actions = document.createElement("span");
-      actions.append(open, gone);
-      const size = `${Math.floor(r.seconds / 60)}:${String(Math.floor(r.seconds % 60)).padStart(2, "0")} min, ${number(r.bytes / 1e6, 0)} MB`;
-      row(table, [`${r.name}${r.marked ? " ★" : ""}`, size, r.problem || "no problems", actions]);
+      const open = button("files", () => listFiles(r.id)), actions = document.createElement("span");
+      actions.append(open, button("delete", () => confirm(`Delete ${r.id}?`) && command("delete_recording", { id: r.id })));
+      const length = `${Math.floor(r.seconds / 60)}:${String(Math.floor(r.seconds % 60)).padStart(2, "0")} min`;
+      const lean = r.segments - r.with_images;
+      const verdict = lean ? `${lean} of ${r.segments} segments without images` : "complete";
+      row(table, [`${r.id}${r.marked ? " ★" : ""}`, `${length}, ${number(r.bytes / 1e6, 0)} MB, ${r.mode}`, verdict, actions]);
     }
     if (!table.rows.length) row(table, ["none"]);
     $("recordings").replaceWith(table);
     if (!$("settings").contains(document.activeElement)) showSettings(await (await ask("api/settings")).json());
   } catch { /* the next state says that the service does not answer */ }
+}
+
+async function listFiles(id) {
+  const place = `api/recordings/${encodeURIComponent(id)}`, files = await (await ask(place)).json();
+  $("files").replaceChildren(...files.map((file, i) => {
+    const li = document.createElement("li"), a = document.createElement("a");
+    [a.href, a.textContent, a.download] = [`${place}/${i}`, `${file.name} (${number(file.bytes / 1e6)} MB)`, ""];
+    li.append(a);
+    return li;
+  }));
 }
 
 function showSettings(values) {

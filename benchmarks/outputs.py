@@ -1,0 +1,201 @@
+"""What the outputs of the service add to a pose's way, and what they cost the tracker.
+
+    python benchmarks/outputs.py [--source SPEC] [--frames N] [--rate HZ]
+
+The tracker takes images by the clock, as of a camera; each pose goes to every output, in its own process behind its
+queue, as the service does it. Clients of this process read them: lines of the pose socket, the WebSocket of Foxglove,
+and the topic `odom` where rclpy is installed; one more client of the pose socket never reads. Printed are, for each
+output, the time from the image to the pose at the client beside the tracker's own, and what the tracker spends a frame
+(processor time) with the outputs and without them, in turn.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import pickle
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from dataclasses import replace
+from typing import Any
+
+from _sequences import one_thread
+
+one_thread()
+
+import numpy as np
+
+from stereo_sfm.drivers.source import open_source
+from stereo_sfm.service.config import RobotConfig
+from stereo_sfm.service.link import OutputProcess
+from stereo_sfm.service.messages import Picture, PoseUpdate, ServiceState, Started, Status
+from stereo_sfm.service.outputs import OUTPUTS
+from stereo_sfm.service.outputs.settings import FoxgloveConfig, OutputsConfig, PageConfig, PoseSocketConfig, Ros2Config
+from stereo_sfm.service.publisher import Reply
+from stereo_sfm.system import Tracker
+from stereo_sfm.types import Frame, StereoImage
+
+SOCKET_PORT, FOXGLOVE_PORT, PAGE_PORT = 17000, 18765, 18080
+ROUNDS = 4  # with and without the outputs, in turn
+Arrivals = dict[int, float]  # frame id (or stamp) -> monotonic seconds
+
+
+def update_of(frame: Frame, captured_s: float) -> PoseUpdate:
+    """A frame of the tracker as the service sends it."""
+    return PoseUpdate(
+        frame.frame_id, frame.stamp_ns, frame.stamp_ns, captured_s, frame.state.name, frame.reason, np.eye(4),
+        frame.odom_T_cam, frame.covariance, np.zeros(6), np.eye(6), frame.map_version, 1, False, True,
+    )  # fmt: skip
+
+
+def read_socket(arrivals: Arrivals) -> None:
+    """A client of the pose socket."""
+    for line in socket.create_connection(("127.0.0.1", SOCKET_PORT)).makefile():
+        arrivals[json.loads(line)["stamp_ns"]] = time.monotonic()
+
+
+def read_foxglove(arrivals: Arrivals) -> None:
+    """A client of Foxglove's WebSocket that wants `/odom`."""
+    from websockets.exceptions import ConnectionClosed
+    from websockets.sync.client import connect
+
+    address = f"ws://127.0.0.1:{FOXGLOVE_PORT}"
+    with suppress(ConnectionClosed), connect(address, subprotocols=["foxglove.sdk.v1"], max_size=None) as client:  # type: ignore[list-item]
+        while True:
+            said = client.recv()
+            if isinstance(said, bytes) and said[0] == 1:
+                arrivals[struct.unpack_from("<Q", said, 5)[0]] = time.monotonic()
+            elif isinstance(said, str) and json.loads(said)["op"] == "advertise":
+                rows = [c for c in json.loads(said)["channels"] if c["topic"] == "/odom"]
+                wanted = [{"id": 1, "channelId": c["id"]} for c in rows]
+                client.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+
+
+def read_ros2(arrivals: Arrivals) -> None:
+    """A node that subscribes to `odom`."""
+    import rclpy
+    from nav_msgs.msg import Odometry
+
+    def received(message: Any) -> None:
+        stamp = message.header.stamp
+        arrivals[stamp.sec * 10**9 + stamp.nanosec] = time.monotonic()
+
+    rclpy.init(args=[])
+    node = rclpy.create_node("benchmark")
+    node.create_subscription(Odometry, "odom", received, 100)
+    rclpy.spin(node)
+
+
+def waits(port: int) -> bool:
+    """Whether somebody listens."""
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+class Outputs:
+    """Every output with its client, and one client that does not read."""
+
+    def __init__(self, started: Started) -> None:
+        sections = OutputsConfig(
+            PoseSocketConfig(True, f"tcp://127.0.0.1:{SOCKET_PORT}"),
+            FoxgloveConfig(True, port=FOXGLOVE_PORT),
+            Ros2Config(True),
+        )
+        config = RobotConfig(outputs=sections, page=PageConfig(True, port=PAGE_PORT))
+        names = [n for n in OUTPUTS if n != "ros2" or importlib.util.find_spec("rclpy") is not None]
+        self.processes = [OutputProcess(name, config, lambda *_: Reply(True)) for name in names]
+        readers: dict[str, Callable[[Arrivals], None]] = {
+            "pose_socket": read_socket,
+            "foxglove": read_foxglove,
+            "ros2": read_ros2,
+        }
+        self.arrivals: dict[str, Arrivals] = {name: {} for name in names if name in readers}
+        for process in self.processes:
+            process.start()
+        while not all(process.wants for process in self.processes) or not waits(SOCKET_PORT):
+            time.sleep(0.05)
+        for name, arrivals in self.arrivals.items():
+            threading.Thread(target=readers[name], args=(arrivals,), daemon=True).start()
+        self._silent = socket.create_connection(("127.0.0.1", SOCKET_PORT))
+        self._silent.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        self.offer(started)
+        self.offer(Status(ServiceState.RUNNING))
+        time.sleep(2.0)  # for the readers to be there
+
+    def offer(self, message: Any) -> None:
+        """To every output that wants it."""
+        data = pickle.dumps(message, pickle.HIGHEST_PROTOCOL)
+        for process in self.processes:
+            process.offer(type(message), data)
+
+    def close(self) -> None:
+        """End the processes."""
+        for process in self.processes:
+            process.close()
+
+
+def drive(
+    tracker: Tracker, images: list[StereoImage], first: int, rate: float, outputs: Outputs | None, captured: Arrivals,
+    done: Arrivals,
+) -> float:  # fmt: skip
+    """Track images by the clock; the tracker's processor time, milliseconds a frame."""
+    spent, begin = 0.0, time.monotonic()
+    for i, image in enumerate(images):
+        stamp = 10**9 + round((first + i) * 1e9 / rate)
+        time.sleep(max(0.0, begin + i / rate - time.monotonic()))
+        now, cpu = time.monotonic(), time.thread_time()
+        frame = tracker.step(image.left, image.right, stamp)
+        spent += time.thread_time() - cpu
+        captured[stamp], done[stamp] = now, time.monotonic()
+        if outputs is not None:
+            outputs.offer(update_of(replace(frame, frame_id=first + i), now))
+            if i % 6 == 0:
+                seen = frame.observations
+                outputs.offer(Picture(first + i, stamp, image.left, None, seen.uv_left, seen.age, seen.inlier))
+    return 1e3 * spent / len(images)
+
+
+def main() -> None:
+    """Print a table of latencies, and the tracker's time with and without the outputs."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--source", default="sim:loop?size=424x400&start=60")
+    parser.add_argument("--frames", type=int, default=60, help="of one round")
+    parser.add_argument("--rate", type=float, default=30.0)
+    args = parser.parse_args()
+    with open_source(f"{args.source}{'&' if '?' in args.source else '?'}frames={args.frames}") as source:
+        rig, name, images = source.rig, source.name, list(source)
+    images += images[::-1]  # forth and back, so that the tracker can go on
+    tracker, captured, done = Tracker(rig), Arrivals(), Arrivals()
+    drive(tracker, images, 0, args.rate, None, captured, done)  # kernels
+    with ExitStack() as open_:
+        outputs = Outputs(Started(1, name, rig, True))
+        open_.callback(outputs.close)
+        times: dict[bool, list[float]] = {True: [], False: []}
+        for k in range(2 * ROUNDS):
+            on = k % 2 == 0
+            first = (k + 1) * len(images)
+            times[on].append(drive(tracker, images, first, args.rate, outputs if on else None, captured, done))
+        time.sleep(0.5)
+    own = np.array([done[s] - captured[s] for s in done]) * 1e3
+    print(f"| output | image to pose, median | 95 % | added, median | 95 % | poses |\n|{'---|' * 6}")
+    print(f"| tracker | {np.median(own):.1f} ms | {np.percentile(own, 95):.1f} ms | | | {len(own)} |")
+    sent = ROUNDS * len(images)
+    for output, arrivals in outputs.arrivals.items():
+        whole = np.array([at - captured[s] for s, at in arrivals.items() if s in captured]) * 1e3
+        added = np.array([at - done[s] for s, at in arrivals.items() if s in done]) * 1e3
+        if not len(whole):
+            print(f"| {output} | no pose arrived | | | | 0 of {sent} |")
+            continue
+        cells = [np.median(whole), np.percentile(whole, 95), np.median(added), np.percentile(added, 95)]
+        print(f"| {output} | {' | '.join(f'{c:.1f} ms' for c in cells)} | {len(whole)} of {sent} |")
+    with_, without = np.median(times[True]), np.median(times[False])
+    print(f"\ntracker: {without:.2f} ms a frame alone, {with_:.2f} ms with all outputs ({with_ / without - 1:+.1%})")
+
+
+if __name__ == "__main__":
+    main()
