@@ -10,6 +10,7 @@ import logging
 import math
 import re
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,11 @@ from stereo_sfm.errors import StereoSfmError
 log = logging.getLogger("stereo_sfm")
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
-EARLIEST_NS = 10**17  # names that are stamps are after 1973; smaller numbers are frame numbers
+EARLIEST_NS, LATEST_NS = 10**17, 4 * 10**18  # names that are dates are between 1973 and 2096
+LEAST_COUNT = 10**9  # smaller whole numbers are frame numbers
+UNITS_NS = (1, 10**3, 10**6, 10**9)
+APART_NS = 3600 * 10**9  # images are not so far apart
+USUAL_STEP_NS = 2 * 10**6, 2 * 10**9  # between images: 500 to 0.5 Hz, which only one unit makes of any step
 MAX_SKEW_NS = 3_000_000  # maximum difference of the stamps of a synchronised pair
 Listing = list[tuple[int, Path]]  # (stamp_ns, file) of one camera
 
@@ -54,11 +59,48 @@ def numbers_of(images: list[Path]) -> list[int] | None:
     return None
 
 
-def stamp_of(path: Path) -> int | None:
-    """The stamp in ns in a file name (left_1403636579763555584, 1305031102.175304); None if it is not a time."""
-    found = re.fullmatch(r"[^0-9]*([0-9]+(?:\.[0-9]+)?)[^0-9]*", path.stem)
-    stamp_ns = stamp_from_text(found[1]) if found else None
-    return stamp_ns if stamp_ns is not None and stamp_ns > EARLIEST_NS else None
+def stamps_of(files: Sequence[Path], like: Sequence[Path] = ()) -> list[int] | None:
+    """The stamps in ns in file names (left_1403636579763555584, 1305031102.175304); None if these are not times.
+
+    Whole numbers count nanoseconds, microseconds, milliseconds or seconds of Unix time, or since a camera was started:
+    the unit that makes them dates, unless images would then be hours apart, else that of a usual frame rate.
+
+    Args:
+        like: files of the other camera, which determine the unit.
+    """
+    texts = [_number_in(p.stem) for p in files]
+    others = [_number_in(p.stem) for p in like] or texts
+    if None in texts or None in others:
+        return None
+    if any("." in (text or "") for text in others):
+        stamps = [stamp_from_text(text or "") for text in texts]
+        return None if any(s is None or s <= EARLIEST_NS for s in stamps) else [s or 0 for s in stamps]
+    if any((text or "").startswith("0") for text in others):
+        return None  # a frame number of fixed width
+    unit = _unit_of(sorted({int(text or 0) for text in others}))
+    return (
+        None
+        if unit is None or not all((text or "").isdecimal() for text in texts)
+        else [int(text or 0) * unit for text in texts]
+    )
+
+
+def _number_in(stem: str) -> str | None:
+    """The only number in a name."""
+    found = re.fullmatch(r"[^0-9]*([0-9]+(?:\.[0-9]+)?)[^0-9]*", stem)
+    return found[1] if found else None
+
+
+def _unit_of(numbers: list[int]) -> int | None:
+    """Nanoseconds of the unit in which ascending whole numbers count time; None for frame numbers."""
+    if numbers[-1] < LEAST_COUNT:
+        return None
+    dated = next((unit for unit in UNITS_NS if EARLIEST_NS < numbers[-1] * unit < LATEST_NS), None)
+    step = sorted(b - a for a, b in pairwise(numbers))[len(numbers) // 2 - 1] if len(numbers) > 1 else 0
+    if dated is not None and step * dated < APART_NS:
+        return dated
+    low, high = USUAL_STEP_NS
+    return next((unit for unit in UNITS_NS if low <= step * unit < high), None)
 
 
 def stamp_from_text(text: str) -> int | None:
@@ -79,8 +121,9 @@ def pair_files(name: str, left: list[Path], right: list[Path]) -> list[tuple[Pat
     Raises:
         StereoSfmError: the names do not determine the pairs.
     """
-    if all(stamp_of(p) is not None for p in (*left, *right)):
-        a, b = ([(stamp_of(p) or 0, p) for p in files] for files in (left, right))
+    stamps = stamps_of(left), stamps_of(right, left)
+    if stamps[0] is not None and stamps[1] is not None:
+        a, b = (list(zip(s, files, strict=True)) for s, files in ((stamps[0], left), (stamps[1], right)))
         return [(left[i], right[j]) for i, j in pair_listings(name, a, b)]
     pairs = _by_key([p.stem for p in left], [p.stem for p in right]) or _by_key(numbers_of(left), numbers_of(right))
     if pairs is None and len(left) == len(right) == 1:

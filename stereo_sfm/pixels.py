@@ -73,13 +73,13 @@ def decode_gray(data: bytes) -> U8 | U16:
 def sensor_bits(images: Iterable[U16]) -> int:
     """How many of the 16 bits a sensor uses (8, 10, 12, 14 or 16), from some of its images.
 
-    Values whose lowest bits are always zero fill the upper part of the sixteen (TUM VI: twelve bits), so that full
-    white is 65,535; others begin at the lowest bit, and the largest one tells.
+    Values whose lowest bits are always zero while the upper ones are used fill the upper part of the sixteen (TUM VI:
+    twelve bits), so that full white is 65,535; of all others the largest one tells.
     """
     used = 0
     for image in images:
         used |= int(np.bitwise_or.reduce(image, axis=None))
-    if not used & LEFT_ALIGNED:
+    if not used & LEFT_ALIGNED and used >> 12:
         return 16
     return max(8, used.bit_length() + used.bit_length() % 2)
 

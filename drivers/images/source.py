@@ -20,7 +20,7 @@ from stereo_sfm.drivers.image_lists import (
     list_images,
     pair_files,
     stamp_from_text,
-    stamp_of,
+    stamps_of,
 )
 from stereo_sfm.drivers.rig_option import chosen_rig
 from stereo_sfm.errors import StereoSfmError
@@ -54,11 +54,11 @@ def open_images(path: str, options: ImagesOptions) -> FolderSource:
             f"{folder} contains no image pair (left/ and right/, cam0/ and cam1/, or left*, right* files)"
         )
     stamps = _stamps(name, folder, found[0], options.fps)
-    pairs = pair_files(name, *found)
+    pairs = [pair for pair in pair_files(name, *found) if pair[0] in stamps]
+    skews = _skews(pairs)
     frames = [
-        FrameFiles(stamps[left], left, right, right_stamp_ns=_right_stamp(stamps[left], left, right))
-        for left, right in pairs
-        if left in stamps
+        FrameFiles(stamps[left], left, right, right_stamp_ns=0 if skew is None else stamps[left] + skew)
+        for (left, right), skew in zip(pairs, skews, strict=True)
     ]
     truth = next((folder / n for n in TRUTH_NAMES if (folder / n).is_file()), None)
     source = FolderSource(
@@ -76,7 +76,7 @@ def open_images(path: str, options: ImagesOptions) -> FolderSource:
 
 def _stamped(folder: Path, files: list[Path]) -> bool:
     """Whether something tells when the images were taken."""
-    return (folder / "times.txt").is_file() or None not in [stamp_of(file) for file in files]
+    return (folder / "times.txt").is_file() or stamps_of(files) is not None
 
 
 def find_pair(folder: Path) -> tuple[list[Path], list[Path]] | None:
@@ -119,14 +119,17 @@ def _stamps(name: str, folder: Path, files: list[Path], fps: float | None) -> di
             raise StereoSfmError(f"{times} must have one time in seconds for each of the {len(files)} frames")
         lines = lines_of(name, files, len(stamps), times.name)
         return {file: stamps[line] or 0 for file, line in lines.items()}
-    named = {p: stamp_of(p) for p in files}
-    if None not in named.values():
-        return {p: s or 0 for p, s in named.items()}
+    named = stamps_of(files)
+    if named is not None:
+        return dict(zip(files, named, strict=True))
     period = 1e9 / (fps or ASSUMED_FPS)
     return {p: round(i * period) for p, i in zip(files, frame_numbers(files), strict=True)}
 
 
-def _right_stamp(stamp_ns: int, left: Path, right: Path) -> int:
-    """The right image's stamp if both names are times, else 0."""
-    named = stamp_of(left), stamp_of(right)
-    return 0 if named[0] is None or named[1] is None else stamp_ns + named[1] - named[0]
+def _skews(pairs: list[tuple[Path, Path]]) -> list[int | None]:
+    """Nanoseconds from the left to the right stamp of each pair where the names are times."""
+    left, right = [a for a, _ in pairs], [b for _, b in pairs]
+    stamps = stamps_of(left), stamps_of(right, left)
+    if stamps[0] is None or stamps[1] is None:
+        return [None] * len(pairs)
+    return [b - a for a, b in zip(*stamps, strict=True)]

@@ -18,7 +18,7 @@ _SHOWN = ("images", "dropped", "max_skew_ns")  # totals in the line about the im
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
-    parser.add_argument("path", type=Path, help="an .mcap file, a ROS bag or a dataset folder")
+    parser.add_argument("source", help="an .mcap file, a ROS bag or a dataset folder, also as KIND:PLACE?OPTION=VALUE")
     parser.add_argument("--rig", type=Path, help="calibration file to use instead of the recording's own")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
@@ -26,13 +26,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Describe and return 0, also when problems are found and printed."""
     from stereo_sfm.drivers.registry import recognise
+    from stereo_sfm.drivers.source import path_of
     from stereo_sfm.recording.describe import describe_dataset, describe_file
 
-    path: Path = args.path.expanduser()
+    path = path_of(args.source)
     if not path.exists():
-        raise StereoSfmError(f"no such file or folder: {path}")
+        raise StereoSfmError(f"no such file or folder: {args.source}")
     in_one_file = path.is_file() and recognise(path) == "mcap"
-    found = describe_file(path, args.rig) if in_one_file else describe_dataset(path, args.rig)
+    found = describe_file(path, args.rig) if in_one_file else describe_dataset(args.source, args.rig)
     print(found.as_json() if args.json else "\n".join(_lines(found)))
     return 0
 

@@ -147,14 +147,18 @@ def _without_duplicates() -> Generator[None]:
         log.removeFilter(new)
 
 
-def describe_dataset(path: Path, rig: Path | None = None) -> Description:
-    """Describe a dataset folder of any known kind, or a ROS bag; `rig` as in `describe_file`.
+def describe_dataset(spec: str | Path, rig: Path | None = None) -> Description:
+    """Describe a dataset folder of any known kind, or a ROS bag, also as `KIND:PLACE?OPTIONS`.
+
+    `rig` as in `describe_file`.
 
     Raises:
         StereoSfmError: not a known dataset.
     """
-    out = Description(str(path), "folder" if path.is_dir() else "bag")
-    _describe_source(out, path, rig)
+    from stereo_sfm.drivers.source import path_of
+
+    out = Description(str(spec), "folder" if path_of(str(spec)).is_dir() else "bag")
+    _describe_source(out, spec, rig)
     return out
 
 
@@ -190,11 +194,11 @@ def _compare_cameras(out: Description, counts: dict[str, int]) -> None:
             )
 
 
-def _describe_source(out: Description, path: Path, rig: Path | None) -> None:
+def _describe_source(out: Description, spec: str | Path, rig: Path | None) -> None:
     from stereo_sfm.drivers.source import open_source
 
     try:
-        source = open_source(path, rig)
+        source = open_source(spec, rig)
     except StereoSfmError as error:
         if out.kind != "mcap":
             raise

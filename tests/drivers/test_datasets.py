@@ -12,7 +12,7 @@ import pytest
 
 from stereo_sfm.calib import Rig, save_rig
 from stereo_sfm.cli import main
-from stereo_sfm.drivers.image_lists import pair_by_stamp
+from stereo_sfm.drivers.image_lists import pair_by_stamp, stamps_of
 from stereo_sfm.drivers.registry import recognise
 from stereo_sfm.drivers.select import SelectedFrames
 from stereo_sfm.drivers.source import open_source
@@ -150,17 +150,19 @@ def test_sixteen_bit_images_keep_their_upper_eight_bits(tmp_path: Path) -> None:
         assert np.array_equal(next(iter(source)).left, picture(0, 0))
 
 
-@pytest.mark.parametrize(("bits", "shift"), [(12, 4), (10, 2), (14, 6), (8, 0)])
+@pytest.mark.parametrize(
+    ("bits", "shift", "lowest"), [(12, 4, 8), (10, 2, 2), (14, 6, 32), (8, 0, 0), (12, 4, 0), (10, 2, 0)]
+)
 def test_sixteen_bit_images_are_scaled_by_the_range_that_they_use(
-    bits: int, shift: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    bits: int, shift: int, lowest: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     root = make_images(tmp_path)
     for path in root.glob("*/*.png"):
         image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         assert image is not None
-        cv2.imwrite(str(path), (image.astype(np.uint16) << shift) + (1 << shift) // 2)
+        cv2.imwrite(str(path), (image.astype(np.uint16) << shift) + lowest)
     dark = root / "left" / "0.png"  # the first image alone does not show the range
-    cv2.imwrite(str(dark), np.full((48, 64), 3, np.uint16))
+    cv2.imwrite(str(dark), np.full((48, 64), 3 if lowest else 3 << shift, np.uint16))
     with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(root, fps=30.0) as source:
         images = list(source)
     assert np.array_equal(images[1].left, picture(1, 0))
@@ -294,6 +296,39 @@ def test_numbered_images_are_paired_by_number_and_keep_their_times(left: str, ri
     for image, number in zip(images, kept, strict=True):
         assert image.right is not None and np.array_equal(image.right, picture(number, 1))
     assert math.isnan(describe_dataset(tmp_path).skew_ms)  # nobody knows it
+
+
+@pytest.mark.parametrize(
+    ("names", "stamps"),
+    [
+        (["1403636579763555584", "1403636579813555584"], [1403636579763555584, 1403636579813555584]),
+        (["1403636579763555584", "1403636599763555584"], [1403636579763555584, 1403636599763555584]),  # every 20 s
+        (["left_1305031102.175304", "left_1305031102.211214"], [1305031102175304000, 1305031102211214000]),
+        (["1305031102", "1305031107"], [1305031102 * 10**9, 1305031107 * 10**9]),
+        (["1305031102175", "1305031102208"], [1305031102175 * 10**6, 1305031102208 * 10**6]),
+        (["1305031102175304"], [1305031102175304 * 10**3]),
+        (["2966666667", "3000000000", "3033333333"], [2966666667, 3000000000, 3033333333]),  # ns since the start
+        (["98000033333", "98000066666"], [98000033333000, 98000066666000]),  # us since the start
+        (["000001", "000002"], None),
+        (["0000000001", "0000000002"], None),
+        (["12", "13"], None),
+        (["20240101_000001", "20240101_000002"], None),
+        (["a", "b"], None),
+    ],
+)
+def test_names_that_are_times(names: list[str], stamps: list[int] | None) -> None:
+    assert stamps_of([Path(f"{name}.png") for name in names]) == stamps
+
+
+def test_the_unit_of_one_camera_is_that_of_the_other() -> None:
+    left = [Path(f"{2000000000 + i * 33333333}.png") for i in range(5)]
+    assert stamps_of([Path("2000001000.png")], left) == [2000001000]
+
+
+def test_info_takes_what_run_takes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    make_images(tmp_path)
+    assert main(["info", f"images:{tmp_path}?fps=10"]) == 0
+    assert "at 10.00 Hz" in capsys.readouterr().out
 
 
 def test_names_that_do_not_tell_the_pairs_are_refused(tmp_path: Path) -> None:
