@@ -15,6 +15,7 @@ BASELINE_RANGE_M = 1e-4, 100.0
 MAX_PIXELS = 10**8
 MAX_READOUT_S = 0.2
 SMALLEST_SHARE = 0.05  # of an image's pixels, that a mask must leave
+MAX_DISTORTION = 1e6  # rational models of real lenses have some hundred
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +105,7 @@ def _check_camera(side: str, camera: Camera) -> None:
     """Raises StereoSfmError for impossible intrinsics."""
     numbers = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
     wrong = [f"{name} {value:g}" for name, value in numbers.items() if not np.isfinite(value)]
-    wrong += [f"distortion {value:g}" for value in camera.distortion if not np.isfinite(value)]
+    wrong += [f"distortion {value:g}" for value in camera.distortion if not abs(value) <= MAX_DISTORTION]
     wrong += [f"{name} {numbers[name]:g}" for name in ("fx", "fy") if numbers[name] <= 0]
     wrong += [f"cx {camera.cx:g}"] if abs(camera.cx) > 2 * camera.width else []
     wrong += [f"cy {camera.cy:g}"] if abs(camera.cy) > 2 * camera.height else []

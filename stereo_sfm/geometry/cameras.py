@@ -39,7 +39,8 @@ class Camera:
         p = np.zeros(kernels.PARAMS)
         p[:4] = self.fx, self.fy, self.cx, self.cy
         p[4 : 4 + len(self.distortion)] = self.distortion
-        p[kernels.LIMIT] = self._limit(p)
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # coefficients that no lens has
+            p[kernels.LIMIT] = self._limit(p)
         p.flags.writeable = False
         object.__setattr__(self, "distortion", tuple(float(d) for d in self.distortion))
         object.__setattr__(self, "params", p)

@@ -8,6 +8,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry.cameras import Camera, Epipolar, KannalaBrandt, Pinhole, RadTan
 from stereo_sfm.geometry.param_jacobian import parameter_jacobian, parameter_vector, with_parameters
 
@@ -195,3 +197,12 @@ def test_too_many_coefficients() -> None:
         KannalaBrandt(10, 10, 1, 1, 1, 1, (0, 0, 0, 0, 0))
     with pytest.raises(ValueError, match="at most 0"):
         Pinhole(10, 10, 1, 1, 1, 1, (0.1,))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("camera", [RadTan, KannalaBrandt])
+@pytest.mark.parametrize("value", [1e300, float("inf"), float("nan"), 1e7])
+def test_a_distortion_that_no_lens_has_is_refused_in_one_line(camera: type[Camera], value: float) -> None:
+    lens = camera(64, 48, 50, 50, 32, 24, (0.1, value, 0.0, 0.0))
+    with pytest.raises(StereoSfmError, match="invalid calibration of the left camera: distortion"):
+        Rig(lens)
