@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 TRACKING_FAILED = 4
 INLINE_END_S = 4.0  # a run in one process waits this long for its source to stop
+LOOK_S = 3.0  # after an interruption, until which the images are looked at once more and the report gets pictures
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,8 @@ def execute(options: RunOptions) -> tuple[int, Path]:
         images = SourceChoice(str(folder / "run.mcap")) if info.live else o.source  # to look at once more
         stats, evaluations = write_results(
             folder, info.name, info.rig, o.config, record, wall_s, info.ground_truth, o.frame, o.source.numbering,
-            o.max_lost_percent, why_not_started(images, record),
+            o.max_lost_percent, why_not_started(images, record) if stop.since_s < LOOK_S else "",
+            lambda: stop.since_s < LOOK_S,
         )  # fmt: skip
         link_latest(folder)
     if not o.quiet:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import signal
 import sys
+import time
 from collections.abc import Callable
 from types import FrameType, TracebackType
 from typing import Any, Self
@@ -20,6 +21,7 @@ class StopRequest:
     def __init__(self, limit_s: float = 0.0) -> None:
         """Args: limit_s, seconds after which the first signal counts as the second; 0: never."""
         self.asked = False
+        self._asked_s = 0.0  # monotonic clock
         self._limit_s = limit_s
         self.then: Callable[[], None] | None = None  # called in the handler: must be short
         self._previous: dict[int, Any] = {}
@@ -37,6 +39,11 @@ class StopRequest:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
 
+    @property
+    def since_s(self) -> float:
+        """Seconds since the first signal; 0 before."""
+        return time.monotonic() - self._asked_s if self.asked else 0.0
+
     def finished(self) -> None:
         """The run has finished; the time limit no longer applies."""
         signal.setitimer(signal.ITIMER_REAL, 0.0)
@@ -44,7 +51,7 @@ class StopRequest:
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.asked:
             raise KeyboardInterrupt
-        self.asked = True
+        self.asked, self._asked_s = True, time.monotonic()
         signal.setitimer(signal.ITIMER_REAL, self._limit_s)
         with contextlib.suppress(OSError):  # the terminal may be gone
             print("\nfinishing (Ctrl-C again to abort)", file=sys.stderr)

@@ -15,6 +15,8 @@ from stereo_sfm.types import F64, TrackState, Trajectory
 
 AXES = ("x", "y", "z")
 SHOWN_STAGES = 6  # the longest ones
+MARGINS = {"left": 0.11, "right": 0.97, "bottom": 0.1, "top": 0.93}  # fixed: a constrained layout draws twice
+FLAT = {"left": 0.09, "right": 0.97, "bottom": 0.17, "top": 0.9}
 
 
 def _save(figure: Figure, path: Path) -> None:
@@ -31,8 +33,8 @@ def _plane(positions: F64) -> tuple[int, int]:
 
 def plot_trajectory(path: Path, estimates: dict[str, Trajectory], reference: Trajectory | None) -> None:
     """Paths in the plane of their greatest extent, metres, the start marked."""
-    figure = Figure(figsize=(7, 6), layout="constrained")
-    axes = figure.subplots()
+    figure = Figure(figsize=(7, 6))
+    axes = figure.subplots(gridspec_kw=MARGINS)
     shown = reference if reference is not None else next(iter(estimates.values()))
     a, b = _plane(shown.positions)
     if reference is not None:
@@ -49,8 +51,8 @@ def plot_trajectory(path: Path, estimates: dict[str, Trajectory], reference: Tra
 
 def plot_errors(path: Path, evaluations: dict[str, Evaluation]) -> None:
     """Absolute position error and its parts along the axes over time."""
-    figure = Figure(figsize=(8, 5), layout="constrained")
-    top, bottom = figure.subplots(2, sharex=True)
+    figure = Figure(figsize=(8, 5))
+    top, bottom = figure.subplots(2, sharex=True, gridspec_kw=MARGINS)
     for name, result in evaluations.items():
         seconds = (result.estimate.stamp_ns - result.estimate.stamp_ns[0]) / 1e9
         error = 1e3 * (result.estimate.positions - result.reference.positions)
@@ -75,8 +77,8 @@ def _angles(result: Evaluation) -> F64:
 
 def plot_tracking(path: Path, record: RunRecord) -> None:
     """Points used in each frame's pose, frames without a pose marked."""
-    figure = Figure(figsize=(8, 3), layout="constrained")
-    axes = figure.subplots()
+    figure = Figure(figsize=(8, 3))
+    axes = figure.subplots(gridspec_kw=FLAT)
     seconds = _seconds(record)
     axes.plot(seconds, record.frames.inliers, linewidth=1, label="points in the pose")
     lost = ~record.tracked()
@@ -94,8 +96,8 @@ def plot_tracking(path: Path, record: RunRecord) -> None:
 
 def plot_times(path: Path, record: RunRecord, stages: Sequence[str]) -> None:
     """Milliseconds per frame of the longest stages."""
-    figure = Figure(figsize=(8, 3), layout="constrained")
-    axes = figure.subplots()
+    figure = Figure(figsize=(8, 3))
+    axes = figure.subplots(gridspec_kw={**FLAT, "right": 0.78})
     seconds, times = _seconds(record), record.times()
     for stage in stages[:SHOWN_STAGES]:
         axes.plot(seconds, times[stage], ".-", markersize=2, linewidth=1, label=stage)

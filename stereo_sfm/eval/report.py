@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -42,8 +43,9 @@ def write_report(
     estimates: dict[str, Trajectory],
     reference: Trajectory | None,
     evaluations: dict[str, Evaluation],
+    go_on: Callable[[], bool] = lambda: True,
 ) -> None:
-    """Write report.md and its pictures.
+    """Write report.md, then its pictures.
 
     Args:
         folder: of the run.
@@ -52,8 +54,8 @@ def write_report(
         estimates: trajectories by name ("odometry", "map").
         reference: ground truth in its own frame, or None.
         evaluations: of the estimates, by the same names, where there is ground truth.
+        go_on: asked before each picture; the rest is left out once it says no.
     """
-    pictures = _draw(folder, record, stats, estimates, evaluations)
     lines = [f"# {source_name}", "", *(f"* {line}" for line in summary(stats, evaluations)), "", "## Verdict", ""]
     lines += [f"* {verdict}" for verdict in verdicts(stats, evaluations)]
     for name, result in evaluations.items():
@@ -75,8 +77,15 @@ def write_report(
         "`track`, `map` and `loop` are the stages and run in parallel; the other rows are steps of them. `latency` is",
     ]
     lines += ["the time from the arrival of an image to its pose."]
-    lines += ["", *(f"![{name}]({name}.png)\n" for name in pictures)]
-    (folder / "report.md").write_text("\n".join(lines), encoding="utf-8")
+    with (folder / "report.md").open("w", encoding="utf-8") as report:
+        report.write("\n".join(lines) + "\n")
+        for name, draw in _pictures(folder, record, stats, estimates, evaluations).items():
+            report.flush()
+            if not go_on():
+                report.write("\nFurther pictures were omitted: the run was interrupted.\n")
+                break
+            draw()
+            report.write(f"\n![{name}]({name}.png)\n")
 
 
 def _rejections(counts: dict[str, int]) -> list[str]:
@@ -87,30 +96,26 @@ def _rejections(counts: dict[str, int]) -> list[str]:
     return ["", "## Rejected loop candidates", "", "| reason | candidates | meaning |", "|---|---|---|", *rows]
 
 
-def _draw(
+def _pictures(
     folder: Path,
     record: RunRecord,
     stats: dict[str, Any],
     estimates: dict[str, Trajectory],
     evaluations: dict[str, Evaluation],
-) -> list[str]:
-    """Draw the plots; returns their names."""
-    pictures: list[str] = []
+) -> dict[str, Callable[[], None]]:
+    """What draws each picture, by its name."""
+    pictures: dict[str, Callable[[], None]] = {}
     aligned = {name: result.estimate for name, result in evaluations.items()}
     shown = aligned or {name: t for name, t in estimates.items() if len(t)}
     if shown:
         truth = next(iter(evaluations.values())).reference if evaluations else None
-        plots.plot_trajectory(folder / "trajectory.png", shown, truth)
-        pictures.append("trajectory")
+        pictures["trajectory"] = lambda: plots.plot_trajectory(folder / "trajectory.png", shown, truth)
     if evaluations:
-        plots.plot_errors(folder / "errors.png", evaluations)
-        pictures.append("errors")
+        pictures["errors"] = lambda: plots.plot_errors(folder / "errors.png", evaluations)
     if record.tracked().any():
-        plots.plot_tracking(folder / "tracking.png", record)
-        pictures.append("tracking")
+        pictures["tracking"] = lambda: plots.plot_tracking(folder / "tracking.png", record)
     if len(record.frames):
-        plots.plot_times(folder / "times.png", record, list(stats["ms"]))
-        pictures.append("times")
+        pictures["times"] = lambda: plots.plot_times(folder / "times.png", record, list(stats["ms"]))
     return pictures
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,7 @@ def write_results(
     step: int = 1,
     max_lost_percent: float = MAX_LOST_PERCENT,
     why_not_started: str = "",
+    go_on: Callable[[], bool] = lambda: True,
 ) -> tuple[dict[str, Any], dict[str, Evaluation]]:
     """Write trajectories, configuration, calibration, numbers and report.
 
@@ -58,6 +60,7 @@ def write_results(
         step: every `step`-th frame of the source was processed.
         max_lost_percent: frames without a pose above which the run counts as failed.
         why_not_started: reason for a run without any pose, see `eval.start`.
+        go_on: whether there is time for another picture.
 
     Returns:
         The content of stats.json, and the evaluations by trajectory name.
@@ -81,7 +84,7 @@ def write_results(
         stats = {"source": source_name, "frame": frame, **statistics(record, wall_s, evaluations)}
         stats |= {"max_lost_percent": max_lost_percent, "why_not_started": why_not_started}
         write_json(folder / "stats.json", stats)
-        write_report(folder, source_name, record, stats, estimates, reference, evaluations)
+        write_report(folder, source_name, record, stats, estimates, reference, evaluations, go_on)
     return stats, evaluations
 
 

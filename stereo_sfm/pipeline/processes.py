@@ -47,6 +47,7 @@ CHECK_S = 0.25  # between two checks for processes that do not respond
 GRACE_S = 1.2  # time for the logger to close its file after another stage died
 STOP_GRACE_S = 2.0  # time for capture to react to a stop
 END_S = 3.0  # time for a live run to end after a stop; for others, the longest time without a message
+EXIT_S = 1.0  # time for the processes to exit after their last messages
 VIEWER_GRACE_S = 10.0  # time for the viewer to show waiting messages after the run
 BACKLOG = 20_000  # messages waiting for the logger in real time, beyond which the log is given up
 MIN_OPEN_FILES = 128  # per process
@@ -583,23 +584,23 @@ class ProcessRun:
         return self._log is not None and self._log.path.exists() and not is_closed(self._log.path)
 
     def _kill_all(self) -> None:
-        for process in self._processes.values():
-            if process.is_alive() and not self._finished(process):
-                process.kill()
-            process.join()
-        for connection in (*self._reports, *self._controls.values(), self._woken, self._wake):
-            connection.close()
-        self._reports.clear()
-        if self._ring is not None:
-            self._ring.close()
-            self._ring = None
-
-    def _finished(self, process: BaseProcess) -> bool:
-        """Whether the process has sent its last message and is about to exit."""
-        stage = next(s for s, p in self._processes.items() if p is process)
-        if stage in self._ended:
-            process.join(1.0)
-        return not process.is_alive()
+        """End every process; also an interruption leaves nothing in shared memory."""
+        try:
+            until = time.monotonic() + EXIT_S
+            for stage, process in self._processes.items():
+                if stage in self._ended:  # it has sent its last message and is about to exit
+                    process.join(max(until - time.monotonic(), 0.0))
+                if process.is_alive():
+                    process.kill()
+            for process in self._processes.values():
+                process.join()
+        finally:
+            for connection in (*self._reports, *self._controls.values(), self._woken, self._wake):
+                connection.close()
+            self._reports.clear()
+            if self._ring is not None:
+                self._ring.close()
+                self._ring = None
 
 
 class _Finished(Exception):

@@ -202,6 +202,20 @@ def test_the_report_and_the_exit_code_know_the_same_limit(tmp_path: Path) -> Non
         assert ("FAIL" in (tmp_path / "report.md").read_text()) == wrong
 
 
+def test_a_report_in_a_hurry_has_its_text_and_the_pictures_drawn_so_far(tmp_path: Path) -> None:
+    answers = iter([True, False])
+
+    def go_on() -> bool:
+        assert "## Time per stage" in (tmp_path / "report.md").read_text()  # before any picture
+        return next(answers)
+
+    write_results(tmp_path, "test", pinhole_rig(), Config(), record_of(walk(), 0), 1.0, go_on=go_on)
+    report = (tmp_path / "report.md").read_text()
+    assert "![trajectory](trajectory.png)" in report and "![tracking]" not in report
+    assert "pictures were omitted" in report
+    assert [path.name for path in tmp_path.glob("*.png")] == ["trajectory.png"]
+
+
 def test_a_disk_that_is_full_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")  # as from a file that is open already
