@@ -66,3 +66,32 @@ def test_replay_names_other_machine_code(
     assert f"blas: {here['blas']} -> another" in capsys.readouterr().out
     with LogReader(tmp_path / "a" / "run.mcap") as a, LogReader(tmp_path / "b" / "run.mcap") as b:
         assert len(other_conditions(a, b)) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "value", "named"),
+    [
+        ("OPENCV_CPU_DISABLE", "AVX2,FMA3", "opencv_dispatch: "),
+        ("OPENBLAS_CORETYPE", "Nehalem", "blas: "),
+        ("OPENBLAS_CORETYPE", "Zen", "blas: "),
+    ],
+)
+def test_a_replay_by_other_code_is_identical_or_says_what_differs(
+    name: str, value: str, named: str, tmp_path: Path
+) -> None:
+    run = ["run", "sim:loop?frames=60&size=424x400&start=200", "--inline", "--quiet", "-o"]
+    assert main([*run, str(tmp_path / "a")]) == 0
+    again = ["replay", str(tmp_path / "a"), "--inline", "--check", "--quiet", "-o", str(tmp_path / "b")]
+    clean = {key: text for key, text in os.environ.items() if key not in SET}
+    done = subprocess.run(
+        [sys.executable, "-m", "stereo_sfm.cli", *again], env={**clean, name: value}, capture_output=True, text=True
+    )
+    with LogReader(tmp_path / "a" / "run.mcap") as a, LogReader(tmp_path / "b" / "run.mcap") as b:
+        (condition,) = other_conditions(a, b)
+    assert condition.startswith(named)
+    print(done.stdout)
+    if done.returncode == 3:
+        assert f"  {condition}" in done.stdout.splitlines()
+    else:
+        assert (done.returncode, done.stdout.strip()) == (0, "identical"), done.stderr
