@@ -209,7 +209,7 @@ def test_a_report_in_a_hurry_has_its_text_and_the_pictures_drawn_so_far(tmp_path
         assert "## Time per stage" in (tmp_path / "report.md").read_text()  # before any picture
         return next(answers)
 
-    write_results(tmp_path, "test", pinhole_rig(), Config(), record_of(walk(), 0), 1.0, go_on=go_on)
+    write_results(tmp_path, "test", pinhole_rig(), Config(), record_of(camera_path(), 0), 1.0, go_on=go_on)
     report = (tmp_path / "report.md").read_text()
     assert "![trajectory](trajectory.png)" in report and "![tracking]" not in report
     assert "pictures were omitted" in report
