@@ -129,7 +129,7 @@ def _stamps(name: str, folder: Path, files: list[Path], fps: float | None) -> di
 def _skews(pairs: list[tuple[Path, Path]]) -> list[int | None]:
     """Nanoseconds from the left to the right stamp of each pair where the names are times."""
     left, right = [a for a, _ in pairs], [b for _, b in pairs]
-    stamps = stamps_of(left), stamps_of(right, left)
-    if stamps[0] is None or stamps[1] is None:
+    stamps_left, stamps_right = stamps_of(left), stamps_of(right, left)
+    if stamps_left is None or stamps_right is None:
         return [None] * len(pairs)
-    return [b - a for a, b in zip(*stamps, strict=True)]
+    return [b - a for a, b in zip(stamps_left, stamps_right, strict=True)]
