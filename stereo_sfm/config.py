@@ -228,6 +228,11 @@ class LoopConfig:
     corners: int = number(
         400, 1, 20_000, "Corners for recognising a keyframe, since tracked points are seldom detected again"
     )
+    side_corners: int = number(
+        600, 0, 20_000, "Corners in views that face the shelves, by which a place is known in both directions; 0: none"
+    )
+    side_inliers: int = number(45, 1, 1_000_000, "Such corners that must agree for a loop across directions")
+    side_cells: int = number(6, 0, 48, "Cells of a grid of 8 x 6 over the image that must contain them")
     proximity: bool = switch(True, "Verify also the old keyframe that should be nearest by odometry")
     pause: int = number(10, 0, 1_000_000, "Keyframes after an accepted loop without a search for another")
     min_match_fraction: float = number(0.15, 0, 1, "Share of the keyframe's corners that must match (paper: 0.3)")

@@ -168,6 +168,12 @@ class Corners(Message):
         uv, xyz = np.zeros((0, 2), np.float32), np.zeros((0, 3), np.float32)
         return Corners(uv, uv.copy(), xyz, np.zeros((0, 32), np.uint8))
 
+    @staticmethod
+    def joined(parts: Sequence[Corners]) -> Corners:
+        """One after the other."""
+        parts = [Corners.none(), *parts]
+        return Corners(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Corners)))
+
     def __len__(self) -> int:
         return len(self.uv_left)
 
@@ -194,6 +200,7 @@ class Keyframe(Message):
     submap_id: int = 0  # grows when tracking restarts after it was lost
     corners: Corners = field(default_factory=Corners.none)  # for place recognition
     rig_terms: F64 = field(default_factory=lambda: np.zeros(6))  # (6,) the tracker's rig, as in `CalibrationUpdate`
+    sides: Corners = field(default_factory=Corners.none)  # described in views that face the shelves on both sides
 
 
 @dataclass(frozen=True, eq=False)

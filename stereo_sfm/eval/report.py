@@ -24,6 +24,7 @@ REJECTIONS = {
     "no_pose": "the matches fit no pose",
     "too_few_inliers": "too few matches fit one pose",
     "not_spread": "the inliers cover too small a part of the image",
+    "same_direction": "views to the side fit, but other corners do not, though the camera looks the same way",
     "against_odometry": "the pose contradicts the odometry by more than drift can explain",
     "out_of_reach": "the camera cannot have moved there while tracking was lost",
     "better_elsewhere": "another candidate of the same keyframe has many more inliers",

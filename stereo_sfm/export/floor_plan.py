@@ -15,6 +15,7 @@ import numpy as np
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.dominant_direction import dominant_direction
 from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.mapping.map import MapSnapshot
 from stereo_sfm.maps.saved_map import SavedMap
@@ -120,7 +121,7 @@ def find_floor(s: MapSnapshot) -> F64:
     axes = np.stack([x, np.cross(-down, x), -down], axis=1)
     flat = (s.points - centre) @ axes[:, :2]
     height = depth - (s.points - centre) @ down
-    yaw = aisle_direction(flat[(height > LOW) & (height < HIGH)])
+    yaw = dominant_direction(flat[(height > LOW) & (height < HIGH)])
     c, n = math.cos(yaw), math.sin(yaw)
     turned = axes @ np.array([[c, -n, 0], [n, c, 0], [0, 0, 1.0]])
     return se3.from_rotation_translation(turned, centre + depth * down)
@@ -147,30 +148,6 @@ def _floor_plane(points: F64, candidates: Bool, down: F64) -> tuple[F64, float]:
         if len(near) < 20:
             return down, level
     return normal, float(near.mean(0) @ normal)
-
-
-def aisle_direction(flat: F64) -> float:
-    """Angle in radians, within 45 degrees of 0, that makes the points (N, 2) fall on the fewest lines.
-
-    Shelf fronts along an axis give a histogram with few high bars: the result maximizes the sum of squared counts.
-    """
-    if len(flat) < 10:
-        return 0.0
-
-    def sharpness(angle: float) -> float:
-        c, n = math.cos(angle), math.sin(angle)
-        rotated = flat @ np.array([[c, -n], [n, c]])
-        total = 0.0
-        for axis in range(2):
-            values = rotated[:, axis]
-            counts = np.histogram(values, np.arange(values.min(), values.max() + 0.05, 0.05))[0].astype(float)
-            total += float((counts**2).sum())
-        return total
-
-    coarse = np.deg2rad(np.arange(-45, 45, 1.0))
-    best = coarse[int(np.argmax([sharpness(a) for a in coarse]))]
-    fine = best + np.deg2rad(np.arange(-1, 1.01, 0.1))
-    return float(fine[int(np.argmax([sharpness(a) for a in fine]))])
 
 
 def plan_files(path: Path) -> tuple[Path, Path]:

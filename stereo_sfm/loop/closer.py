@@ -16,6 +16,7 @@ from stereo_sfm.loop.database import PlaceDatabase
 from stereo_sfm.loop.graph import KeyframeGraph
 from stereo_sfm.loop.keyframe_store import KeyframeStore
 from stereo_sfm.loop.place_view import PlaceView, place_view_of
+from stereo_sfm.loop.sideways import LEAST, SIDE_FACTOR, TURNED, Fronts, front_of, sideways_config, with_neighbours
 from stereo_sfm.loop.verification import Verdict, looks_alike, rejection, verify, within
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.timing import NoSpans
@@ -28,7 +29,17 @@ MAX_SAME_VIEW = 5  # keyframes of one view; of more, one is removed
 DRIFT_PER_METRE = 0.003  # of the odometry on both sides of a gap
 RIVAL = 0.5  # share of a loop's inliers above which another place makes it ambiguous
 CONTRADICTED = "against_odometry", "out_of_reach"  # reasons of impossible hypotheses, which are no rivals
+SIDE_CANDIDATES = 1, 3  # across directions: besides the one by odometry, and without one
 AGREE_METRES, AGREE_DEGREES = 0.15, 2.0  # largest difference of two keyframes' estimates of one loop
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A keyframe whose place may be the newest one's."""
+
+    kf_id: int
+    score: float
+    sideways: bool = False  # by the corners of the views that face the shelves
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,9 +69,12 @@ class LoopCloser:
 
             vocabulary = configured_vocabulary(config)
         self._config, self._rig, self._spans = config, rig, spans or NoSpans()
+        self._side_config = sideways_config(config)
         self._source_rig, self._rig_terms = rig, np.zeros(6)
         self._vocabulary = vocabulary
         self._database = PlaceDatabase(len(vocabulary))
+        self._side_database = PlaceDatabase(len(vocabulary))  # with the same rows
+        self._fronts = Fronts()
         self._row: dict[int, int] = {}  # keyframe id -> row in the database
         self._store = KeyframeStore()
         self._graph = KeyframeGraph()
@@ -84,13 +98,15 @@ class LoopCloser:
             self._rig = with_terms(self._source_rig, self._rig_terms)
         self._graph.add(keyframe.kf_id, keyframe.odom_T_cam, keyframe.submap_id, keyframe.stamp_ns)
         with self._spans.span("loop_words"):
-            bag = self._vocabulary.bag(keyframe.corners.descriptors)
+            bag, side_bag = (self._vocabulary.bag(c.descriptors) for c in (keyframe.corners, keyframe.sides))
+        self._fronts.add(keyframe)
         with self._spans.span("loop_query"):
-            candidates, why_none = self._candidates(keyframe, bag)
+            candidates, why_none = self._candidates(keyframe, bag, side_bag)
         with self._spans.span("loop_verify"):
             result = self._judge(keyframe, candidates, why_none)
         self._row[keyframe.kf_id] = len(self._database)
         self._database.add(keyframe.kf_id, bag)
+        self._side_database.add(keyframe.kf_id, side_bag)
         self._store.add(keyframe)
         self._cull(keyframe.kf_id)
         self._grow(keyframe)
@@ -107,10 +123,12 @@ class LoopCloser:
             self._store.remove(same_view[1])
         if 2 * len(self._store) < len(self._database) - KEPT_NEWEST:
             self._row = {k: row for row, k in enumerate(self._store.ids)}
-            self._database.keep(np.flatnonzero(np.isin(self._database.kf_ids, self._store.ids)))
+            kept = np.flatnonzero(np.isin(self._database.kf_ids, self._store.ids))
+            self._database.keep(kept)
+            self._side_database.keep(kept)
 
-    def _candidates(self, keyframe: Keyframe, bag: voc.Bag) -> tuple[list[tuple[int, float]], str]:
-        """Candidates as (keyframe, score), best first, and the reason if there are none."""
+    def _candidates(self, keyframe: Keyframe, bag: voc.Bag, side_bag: voc.Bag) -> tuple[list[Candidate], str]:
+        """Places to verify, best first, those across directions at the end, and the reason when there are none."""
         config = self._config
         if not config.enabled:
             return [], "disabled"
@@ -134,24 +152,51 @@ class LoopCloser:
             kf_id = int(ids[i])
             if len(places) < wanted and all(abs(kf_id - other) > PLACE_RADIUS for other in places):
                 places.append(kf_id)
-        return [(k, float(scores[self._row[k]])) for k in places], "no_candidate"
+        found = [Candidate(k, float(scores[self._row[k]])) for k in places]
+        return found + self._side_candidates(keyframe, side_bag, excluded), "no_candidate"
+
+    def _side_candidates(self, keyframe: Keyframe, bag: voc.Bag, excluded: set[int]) -> list[Candidate]:
+        """The keyframe that should have seen the same fronts, by odometry, and those whose views look most alike."""
+        if len(keyframe.sides) < LEAST:
+            return []
+        scores = self._side_database.scores(bag)
+        graph_ids, cam_T_kf = self._graph.around(keyframe.kf_id)
+        excluded = excluded | set(graph_ids[cam_T_kf[:, 2, 2] >= TURNED].tolist())  # other corners show those
+        turned = graph_ids[self._fronts.turned(front_of(keyframe), cam_T_kf)].tolist()
+        places = [k for k in turned if k in self._store and k not in excluded][:1]
+        wanted = len(places) + (SIDE_CANDIDATES[0] if places else SIDE_CANDIDATES[1])
+        ids = self._side_database.kf_ids
+        for i in np.lexsort((np.arange(len(scores)), -with_neighbours(scores))).tolist():
+            if len(places) == wanted or scores[i] < self._config.min_score:
+                break
+            kf_id = int(ids[i])
+            free = kf_id in self._store and kf_id not in excluded
+            if free and all(abs(kf_id - other) > PLACE_RADIUS for other in places):
+                places.append(kf_id)
+        return [Candidate(k, float(scores[self._row[k]]), True) for k in places]
 
     def _near(self, kf_id: int, connected: list[int]) -> set[int]:
         """Keyframes that cannot be candidates: connected to this one, or shortly before it in the same submap."""
         before = range(max(kf_id - self._config.min_gap, 0), kf_id + 1)
         return {*connected, *(k for k in before if self._graph.unbroken(k, kf_id))}
 
-    def _judge(self, keyframe: Keyframe, candidates: list[tuple[int, float]], why_none: str) -> LoopResult:
+    def _judge(self, keyframe: Keyframe, candidates: list[Candidate], why_none: str) -> LoopResult:
+        verdicts: list[Verdict] = []
+        loops: dict[int, _Hypothesis] = {}
+        views: dict[bool, PlaceView] = {}
+        for k, candidate in enumerate(candidates):
+            if candidate.sideways and any(not loop.against for loop in loops.values()):
+                break
+            if candidate.sideways not in views:
+                sigma = self._config.disparity_sigma_px
+                views[candidate.sideways] = place_view_of(keyframe, self._rig, sigma, candidate.sideways)
+            verdicts.append(self._verify(keyframe, views[candidate.sideways], candidate))
+            if not verdicts[k].reason:
+                loops[k] = self._hypothesis(keyframe.kf_id, candidate, verdicts[k])
         if not candidates:
             return _no_loop(keyframe.kf_id, why_none, 0.0, ())
-        view = place_view_of(keyframe, self._rig, self._config.disparity_sigma_px)
-        verdicts = [self._verify(keyframe, view, candidate) for candidate, _ in candidates]
+        candidates = candidates[: len(verdicts)]
         reasons = [verdict.reason for verdict in verdicts]
-        loops = {
-            k: self._hypothesis(keyframe.kf_id, candidates[k][0], verdict)
-            for k, verdict in enumerate(verdicts)
-            if not verdict.reason
-        }
         best_inliers = max((loop.inliers for loop in loops.values() if not loop.against), default=0)
         self._pending = [h for h in self._pending if keyframe.kf_id - h.kf_id < self._config.consistent_window]
         self._pending += [h for h in loops.values() if h.against or h.inliers >= RIVAL * best_inliers]
@@ -161,25 +206,29 @@ class LoopCloser:
             if not reasons[k]:
                 accepted = k
                 break
-        rejected = tuple((*candidate, why) for candidate, why in zip(candidates, reasons, strict=True) if why)
+        rejected = tuple((c.kf_id, c.score, why) for c, why in zip(candidates, reasons, strict=True) if why)
         if accepted >= 0:
-            return self._accept(keyframe, *candidates[accepted], verdicts[accepted], rejected)
-        return _no_loop(keyframe.kf_id, reasons[0], candidates[0][1], rejected)
+            return self._accept(keyframe, candidates[accepted], verdicts[accepted], rejected)
+        return _no_loop(keyframe.kf_id, reasons[0], candidates[0].score, rejected)
 
-    def _verify(self, keyframe: Keyframe, view: PlaceView, candidate: int) -> Verdict:
-        config = self._config
-        centre = self._store[candidate]
-        if not looks_alike(view, centre, config):
+    def _verify(self, keyframe: Keyframe, view: PlaceView, candidate: Candidate) -> Verdict:
+        config = self._side_config if candidate.sideways else self._config
+        centre = self._store[candidate.kf_id]
+        if not candidate.sideways and not looks_alike(view, centre, config):
             return rejection("too_few_matches")
-        around = [self._store[k] for k in self._store.best_connected(candidate, CLOUD_KEYFRAMES)]
+        around = [self._store[k] for k in self._store.best_connected(candidate.kf_id, CLOUD_KEYFRAMES)]
         around = [k for k in around if k.submap_id == centre.submap_id]
-        cloud = gather(centre, around, self._rig, config.disparity_sigma_px)
-        rng = np.random.default_rng([config.seed, keyframe.kf_id, candidate])
-        return verify(view, cloud, self._rig, config, rng)
+        cloud = gather(centre, around, self._rig, config.disparity_sigma_px, candidate.sideways)
+        rng = np.random.default_rng([config.seed, keyframe.kf_id, candidate.kf_id])
+        verdict = verify(view, cloud, self._rig, config, rng, move_points=not candidate.sideways)
+        if candidate.sideways and verdict.b_T_a[2, 2] >= TURNED and not verdict.reason:
+            return rejection("same_direction", verdict.inliers)  # other corners show it more precisely
+        return verdict
 
-    def _hypothesis(self, kf_id: int, candidate: int, verdict: Verdict) -> _Hypothesis:
+    def _hypothesis(self, kf_id: int, of: Candidate, verdict: Verdict) -> _Hypothesis:
         """A verified candidate, compared with the odometry between its ends."""
         config, candidate_T_kf = self._config, se3.inverse(verdict.b_T_a)
+        candidate = of.kf_id
         path = self._graph.path(candidate, kf_id)
         if path is not None:
             metres = config.gate_m + config.gate_m_per_m * path.metres
@@ -189,7 +238,11 @@ class LoopCloser:
         else:
             gap = self._graph.gap_motion(candidate, kf_id, candidate_T_kf)
             reached = gap is None or gap.deviation <= gap.tolerance + DRIFT_PER_METRE * gap.distance
-            enough = verdict.inliers >= 2 * config.min_inliers and verdict.share >= config.min_inlier_share_after_gap
+            if of.sideways:
+                enough = verdict.inliers >= SIDE_FACTOR * config.side_inliers
+            else:
+                least = 2 * config.min_inliers
+                enough = verdict.inliers >= least and verdict.share >= config.min_inlier_share_after_gap
             against = "out_of_reach" if not reached else "" if enough else "too_few_inliers"
         return _Hypothesis(kf_id, candidate, candidate_T_kf, verdict.inliers, against, path is None)
 
@@ -222,24 +275,23 @@ class LoopCloser:
     def _accept(
         self,
         keyframe: Keyframe,
-        candidate: int,
-        score: float,
+        candidate: Candidate,
         verdict: Verdict,
         rejected: tuple[tuple[int, float, str], ...],
     ) -> LoopResult:
         candidate_T_kf = se3.inverse(verdict.b_T_a)
-        self._graph.add_loop(candidate, keyframe.kf_id, candidate_T_kf)
+        self._graph.add_loop(candidate.kf_id, keyframe.kf_id, candidate_T_kf)
         self._store.merge(verdict.pairs)
         self._last_loop = keyframe.kf_id
         self._pending.clear()
         return LoopResult(
             kf_id=keyframe.kf_id,
-            candidate_kf_id=candidate,
+            candidate_kf_id=candidate.kf_id,
             candidate_T_kf=candidate_T_kf,
             information=verdict.information,
             matches=verdict.pairs,
             inliers=verdict.inliers,
-            score=score,
+            score=candidate.score,
             reason="",
             rejected=rejected,
         )

@@ -52,15 +52,17 @@ class Cloud:
         return np.where(own, self.uv_left[rows], np.nan), np.where(own, self.uv_right[rows], np.nan)
 
 
-def gather(centre: Keyframe, others: Sequence[Keyframe], rig: Rig, disparity_sigma: float) -> Cloud:
+def gather(
+    centre: Keyframe, others: Sequence[Keyframe], rig: Rig, disparity_sigma: float, sideways: bool = False
+) -> Cloud:
     """Corners and points of the centre, then of `others` (near in time), transformed into its camera by odometry.
 
-    Rows without depth are left out. Corners of several keyframes with about the same position and descriptor share an
-    id.
+    Rows without depth are left out. `sideways`: the corners are those of the views that face the shelves.
+    Corners of several keyframes with about the same position and descriptor share an id.
     """
     keyframes = [centre, *others]
     centre_T_kf = np.stack([se3.inverse(centre.odom_T_cam) @ k.odom_T_cam for k in keyframes])
-    views = [place_view_of(keyframe, rig, disparity_sigma) for keyframe in keyframes]
+    views = [place_view_of(keyframe, rig, disparity_sigma, sideways) for keyframe in keyframes]
     cloud, count = _room(sum(len(view.ids) for view in views), centre_T_kf), 0
     for k, view in enumerate(views):
         ids = view.ids.copy()

@@ -112,6 +112,13 @@ class KeyframeGraph:
         rows, _, radians = self._around(nodes.anchored, row, nodes.frame, SAME_METRES)
         return nodes.kf_id[rows[radians < SAME_RADIANS]].tolist()
 
+    def around(self, kf_id: int) -> tuple[I64, F64]:
+        """Ids (K,) of all keyframes and their poses (K, 4, 4) in the camera of one, NaN where nothing leads there."""
+        nodes, row = self._nodes, self._row(kf_id)
+        poses = se3.inverse(nodes.anchored[row]) @ nodes.anchored
+        poses[nodes.frame != nodes.frame[row]] = np.nan
+        return nodes.kf_id, poses
+
     def nearby(self, kf_id: int, excluded: Container[int]) -> list[int]:
         """The nearest keyframe of the same chain with an overlapping view, if there is one."""
         nodes, row = self._nodes, self._row(kf_id)

@@ -21,12 +21,12 @@ class PlaceView:
     points: F64  # (N, 3) metres in this camera, NaN where the depth is unknown
     sigmas: F64  # (N,) metres along the ray
     descriptors: U8  # (N, 32), none of them zero
-    corner: Bool  # (N,) of `Keyframe.corners`; False: a point
+    corner: Bool  # (N,) of `Keyframe.corners` or `Keyframe.sides`; False: a point
 
 
-def place_view_of(keyframe: Keyframe, rig: Rig, disparity_sigma: float) -> PlaceView:
-    """Corners of a keyframe, then its points."""
-    c = keyframe.corners
+def place_view_of(keyframe: Keyframe, rig: Rig, disparity_sigma: float, sideways: bool = False) -> PlaceView:
+    """Corners of a keyframe (`sideways`: those of the views that face the shelves), then its points."""
+    c = keyframe.sides if sideways else keyframe.corners
     uv_left = np.concatenate([c.uv_left, keyframe.uv_left], dtype=np.float64)
     uv_right = np.concatenate([c.uv_right, keyframe.uv_right], dtype=np.float64)
     points = np.concatenate([c.points_cam, keyframe.points_cam], dtype=np.float64)

@@ -17,7 +17,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping import map_kernels
 from stereo_sfm.mapping.tables import KeyframeTable, ObservationTable, PointTable
-from stereo_sfm.types import F32, F64, I64, U8, Corners, Keyframe
+from stereo_sfm.types import F32, F64, I64, U8, Bool, Corners, Keyframe
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +56,7 @@ class MapSnapshot:
     corner_uv_right: F32  # (C, 2) px
     corner_points: F32  # (C, 3) metres in the keyframe's camera
     corner_descriptors: U8  # (C, 32)
+    corner_side: Bool  # (C,) those of `Keyframe.sides`, which follow the others of a keyframe
 
     def keyframes(self) -> list[Keyframe]:
         """Keyframes as from a tracker, with poses and points of the map."""
@@ -66,8 +67,17 @@ class MapSnapshot:
             for k in rows[:-1].tolist()
         ]
 
+    def _corners(self, rows: slice) -> Corners:
+        return Corners(
+            self.corner_uv_left[rows],
+            self.corner_uv_right[rows],
+            self.corner_points[rows],
+            self.corner_descriptors[rows],
+        )
+
     def _keyframe(self, k: int, seen: slice, corners: slice) -> Keyframe:
         points, pose = self.obs_pt[seen], self.map_T_kf[k]
+        sides = corners.stop - int(self.corner_side[corners].sum())
         return Keyframe(
             kf_id=int(self.kf_ids[k]),
             frame_id=int(self.frame_ids[k]),
@@ -79,12 +89,8 @@ class MapSnapshot:
             points_cam=(self.points[points] - pose[:3, 3]) @ pose[:3, :3],
             descriptors=self.descriptors[seen],
             submap_id=int(self.submap_ids[k]),
-            corners=Corners(
-                self.corner_uv_left[corners],
-                self.corner_uv_right[corners],
-                self.corner_points[corners],
-                self.corner_descriptors[corners],
-            ),
+            corners=self._corners(slice(corners.start, sides)),
+            sides=self._corners(slice(sides, corners.stop)),
         )
 
 
@@ -95,7 +101,7 @@ class Map:
         self.keyframes = KeyframeTable()
         self.points = PointTable(1024)
         self.observations = ObservationTable(4096)
-        self.corners: dict[int, Corners] = {}  # of living keyframes, by row
+        self.corners: dict[int, tuple[Corners, Corners]] = {}  # of living keyframes, by row: `corners`, `sides`
         self._kf_rows: dict[int, int] = {}
         self._pt_rows = np.full(1024, -1, np.int32)  # by id
         self._changed_kf: set[int] = set()
@@ -197,7 +203,7 @@ class Map:
             obs_first=len(self.observations),
         )
         self._kf_rows[keyframe.kf_id] = row
-        self.corners[row] = keyframe.corners
+        self.corners[row] = keyframe.corners, keyframe.sides
         self._changed_kf.add(row)
         return row
 
@@ -425,7 +431,8 @@ class Map:
         pt_index[pts] = np.arange(len(pts))
         obs = np.flatnonzero((table.pt >= 0) & (kf_index[table.kf] >= 0) & (pt_index[table.pt] >= 0))
         k, p = self.keyframes, self.points
-        corners, none = [self.corners[row] for row in kfs.tolist()], Corners.none()
+        counts = np.array([[len(c) for c in self.corners[row]] for row in kfs.tolist()], np.int64).reshape(-1, 2)
+        corners = Corners.joined([c for row in kfs.tolist() for c in self.corners[row]])
         return MapSnapshot(
             kf_ids=k.kf_id[kfs],
             frame_ids=k.frame_id[kfs],
@@ -442,16 +449,17 @@ class Map:
             uv_left=table.uv_left[obs].astype(np.float64),
             uv_right=table.uv_right[obs].astype(np.float64),
             descriptors=table.descriptor[obs],
-            corner_kf=np.repeat(np.arange(len(kfs)), [len(c) for c in corners]),
-            corner_uv_left=np.concatenate([none.uv_left, *(c.uv_left for c in corners)]),
-            corner_uv_right=np.concatenate([none.uv_right, *(c.uv_right for c in corners)]),
-            corner_points=np.concatenate([none.points_cam, *(c.points_cam for c in corners)]),
-            corner_descriptors=np.concatenate([none.descriptors, *(c.descriptors for c in corners)]),
+            corner_kf=np.repeat(np.arange(len(kfs)), counts.sum(1)),
+            corner_uv_left=corners.uv_left,
+            corner_uv_right=corners.uv_right,
+            corner_points=corners.points_cam,
+            corner_descriptors=corners.descriptors,
+            corner_side=np.repeat(np.tile([False, True], len(kfs)), counts.ravel()),
         )
 
     @property
     def nbytes(self) -> int:
         """Bytes of all columns."""
         tables = (self.keyframes, self.points, self.observations)
-        corners = sum(c.nbytes for c in self.corners.values())
+        corners = sum(c.nbytes for both in self.corners.values() for c in both)
         return sum(table.nbytes for table in tables) + self._pt_rows.nbytes + corners

@@ -46,6 +46,7 @@ COLUMNS: dict[str, Column] = {
     "corner_uv_right": Column("corners", "float32", (2,), unknown=True),
     "corner_points": Column("corners", "float32", (3,), unknown=True),
     "corner_descriptors": Column("corners", "uint8", (32,)),
+    "corner_side": Column("corners", "bool"),
 }
 
 

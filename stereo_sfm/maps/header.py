@@ -9,7 +9,7 @@ from typing import Any
 
 from stereo_sfm.errors import StereoSfmError
 
-VERSION = 2  # 1 had no corners
+VERSION, READ, SIDES_SINCE = 3, (2, 3), 3  # 1 had no corners, 2 none in views that face the shelves
 KIND = "stereo_sfm_map"
 COUNTS = ("keyframes", "points", "observations", "sessions")
 
@@ -48,7 +48,7 @@ def read_header(folder: Path, files: tuple[str, ...]) -> dict[str, Any]:
         version = head["version"] if head["kind"] == KIND else None
     except (ValueError, KeyError, TypeError, OSError, RecursionError):
         raise damaged(folder, "map.json cannot be read") from None
-    if version != VERSION:
+    if version not in READ:
         raise StereoSfmError(f"the map {folder} is version {version}, this program reads version {VERSION}")
     for name in COUNTS:
         if type(head.get(name)) is not int or head[name] < 0:

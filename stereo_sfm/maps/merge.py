@@ -135,7 +135,7 @@ def full_adjustment(map_: Map, rig: Rig, config: MapperConfig) -> None:
 
     Outlier observations are removed afterwards, and points that too few keyframes still observe.
     """
-    part = window.whole_map(map_, config)
+    part = window.whole_map(map_)
     result = bundle_adjust(rig, part.bundle, window.bundle_config(config))
     window.write_back(map_, part, result)
     map_.cull_points(part.pt_rows[map_.points.obs_count[part.pt_rows] < config.min_observations])
@@ -200,6 +200,7 @@ def _subset(s: MapSnapshot, keyframes: Bool, points: Bool, obs: Bool) -> MapSnap
         corner_uv_right=s.corner_uv_right[corners],
         corner_points=s.corner_points[corners],
         corner_descriptors=s.corner_descriptors[corners],
+        corner_side=s.corner_side[corners],
     )
 
 

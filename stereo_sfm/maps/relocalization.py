@@ -14,6 +14,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.loop.cloud import Cloud, gather
 from stereo_sfm.loop.database import PlaceDatabase
 from stereo_sfm.loop.place_view import place_view_of
+from stereo_sfm.loop.sideways import LEAST, SIDE_FACTOR, Fronts, front_of, sideways_config, with_neighbours
 from stereo_sfm.loop.verification import Verdict, verify, verify_near, within
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.mapping.map import MapSnapshot
@@ -61,48 +62,72 @@ class Relocalizer:
             min_inlier_share=0.0,
             min_cells=config.relocalize_cells,
         )
+        side = sideways_config(config)
+        self._side_config = dataclasses.replace(side, min_inliers=config.side_inliers // 2)
         shape = (len(snapshot.kf_ids), len(snapshot.pt_ids))
         ones = np.ones(len(snapshot.obs_kf), np.int32)
         self._sees = scipy.sparse.csr_array((ones, (snapshot.obs_kf, snapshot.obs_pt)), shape=shape)
         self._views = np.maximum(np.bincount(snapshot.obs_pt, minlength=shape[1]), 1)
-        self._database = PlaceDatabase(len(vocabulary))
+        self._database, self._side_database = PlaceDatabase(len(vocabulary)), PlaceDatabase(len(vocabulary))
+        self._fronts = Fronts()
         for k, keyframe in enumerate(self._keyframes):
             self._database.add(k, vocabulary.bag(keyframe.corners.descriptors))
+            self._side_database.add(k, vocabulary.bag(keyframe.sides.descriptors))
+            self._fronts.add(keyframe)
 
     def locate(self, keyframe: Keyframe) -> Location:
-        """Find the camera of a keyframe (its pose is ignored) in the map."""
-        view = place_view_of(keyframe, self._rig, self._config.disparity_sigma_px)
+        """Find the camera of a keyframe (its pose is ignored) in the map, if need be from another direction."""
+        ahead = self._search(keyframe, False)
+        if ahead.found or len(keyframe.sides) < LEAST:
+            return ahead
+        beside = self._search(keyframe, True)
+        return beside if beside.found else ahead
+
+    def _search(self, keyframe: Keyframe, sideways: bool) -> Location:
+        """Find it by its corners, or by those of the views that face the shelves."""
+        config = self._side_config if sideways else self._config
+        database = self._side_database if sideways else self._database
+        view = place_view_of(keyframe, self._rig, config.disparity_sigma_px, sideways)
+        bag = self._vocabulary.bag((keyframe.sides if sideways else keyframe.corners).descriptors)
         found: list[Location] = []
         reason = "no_candidate"
-        for row in self._places(self._database.scores(self._vocabulary.bag(keyframe.corners.descriptors))):
-            rng = np.random.default_rng([self._config.seed, row])
-            verdict = verify(view, self.cloud(row), self._rig, self._config, rng, move_points=False)
+        for row in self._places(database.scores(bag)):
+            rng = np.random.default_rng([config.seed, row])
+            verdict = verify(view, self.cloud(row, sideways), self._rig, config, rng, move_points=False)
             if verdict.reason:
                 reason = verdict.reason if reason == "no_candidate" else reason
                 continue
-            found.append(self._location(row, verdict, self._config.relocalize_share))
+            found.append(self._location(row, verdict, config.relocalize_share, sideways))
             if found[-1].confident:
                 break
         return self._choose(found) if found else not_found(reason)
 
     def locate_near(self, keyframe: Keyframe, guess: F64) -> Location:
         """As `locate`, but only around a predicted map_T_cam (4, 4)."""
-        view = place_view_of(keyframe, self._rig, self._config.disparity_sigma_px)
-        row = self._nearest(guess)
+        ahead = self._search_near(keyframe, guess, self._nearest(guess), False)
+        if ahead.found or len(keyframe.sides) < LEAST:
+            return ahead
+        rows = self._fronts.turned(front_of(keyframe), se3.inverse(guess) @ self._map.map_T_kf)
+        beside = self._search_near(keyframe, guess, rows[0], True) if len(rows) else ahead
+        return beside if beside.found else ahead
+
+    def _search_near(self, keyframe: Keyframe, guess: F64, row: int, sideways: bool) -> Location:
+        config = self._side_config if sideways else self._config
+        view = place_view_of(keyframe, self._rig, config.disparity_sigma_px, sideways)
         start = se3.inverse(guess) @ self._map.map_T_kf[row]
-        verdict = verify_near(start, view, self.cloud(row), self._rig, self._config)
+        verdict = verify_near(start, view, self.cloud(row, sideways), self._rig, config)
         if verdict.reason:
             return not_found(verdict.reason, verdict.inliers)
-        return self._choose([self._location(row, verdict, self._near_share)])
+        return self._choose([self._location(row, verdict, self._near_share, sideways)])
 
-    def cloud(self, row: int) -> Cloud:
+    def cloud(self, row: int, sideways: bool = False) -> Cloud:
         """The points of a keyframe row and its neighbours, in its camera frame."""
         shared = (self._sees @ self._sees[[row]].T).toarray()[:, 0]
         shared[row] = shared.max() + 1
         order = np.lexsort((np.arange(len(shared)), -shared))[: self._config.relocalize_keyframes]
         order = order[shared[order] > 0]
         centre, *others = (self._keyframes[k] for k in order.tolist())
-        cloud = gather(centre, others, self._rig, self._config.disparity_sigma_px)
+        cloud = gather(centre, others, self._rig, self._config.disparity_sigma_px, sideways)
         mapped = cloud.ids >= 0
         at = np.searchsorted(self._map.pt_ids, cloud.ids[mapped])
         sigmas = cloud.sigmas.copy()
@@ -111,8 +136,7 @@ class Relocalizer:
 
     def _places(self, scores: F64) -> list[int]:
         """The best rows, each of another place; the score of a place includes its temporal neighbours."""
-        padded = np.pad(scores, 1)
-        together = scores + padded[:-2] + padded[2:]
+        together = with_neighbours(scores)
         chosen: list[int] = []
         for row in np.lexsort((np.arange(len(scores)), -together)).tolist():
             if len(chosen) == self._config.relocalize_candidates or scores[row] <= 0:
@@ -125,13 +149,14 @@ class Relocalizer:
         metres, radians = se3.extent(se3.inverse(self._map.map_T_kf) @ guess)
         return int(np.argmin(metres + radians))
 
-    def _location(self, row: int, verdict: Verdict, share: float) -> Location:
-        """The location of a verification, requiring this share of the camera's corners."""
+    def _location(self, row: int, verdict: Verdict, share: float, sideways: bool) -> Location:
+        """The location of a verification; `share`: of the camera's corners, required but from another direction."""
+        least = SIDE_FACTOR * self._config.side_inliers if sideways else self._config.relocalize_inliers
+        share = 0.0 if sideways else share
         map_T_cam = self._map.map_T_kf[row] @ se3.inverse(verdict.b_T_a)
         kf_id = int(self._map.kf_ids[row])
         enough, confident = (
-            verdict.inliers >= times * self._config.relocalize_inliers and verdict.share >= times * share
-            for times in (1.0, CONFIDENCE_FACTOR)
+            verdict.inliers >= times * least and verdict.share >= times * share for times in (1.0, CONFIDENCE_FACTOR)
         )
         reason = "" if enough else "too_few_inliers"
         return Location(reason, map_T_cam, verdict.information, kf_id, verdict.inliers, verdict.pairs, confident)

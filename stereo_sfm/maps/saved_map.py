@@ -22,7 +22,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.mapping.map import Map, MapSnapshot
 from stereo_sfm.maps.columns import check_columns
-from stereo_sfm.maps.header import check_counts, checksum, damaged, read_header, write_header
+from stereo_sfm.maps.header import SIDES_SINCE, check_counts, checksum, damaged, read_header, write_header
 from stereo_sfm.maps.replace_folder import replaced_folder
 from stereo_sfm.types import I64, MapUpdate, Trajectory
 
@@ -35,7 +35,7 @@ _FILES: dict[str, tuple[str, ...]] = {
     "keyframes": ("kf_ids", "frame_ids", "stamp_ns", "submap_ids", "map_T_kf", "sessions"),
     "points": ("pt_ids", "points", "anchors", "seen", "expected"),
     "observations": ("obs_kf", "obs_pt", "uv_left", "uv_right", "descriptors"),
-    "corners": ("corner_kf", "corner_uv_left", "corner_uv_right", "corner_points", "corner_descriptors"),
+    "corners": ("corner_kf", "corner_uv_left", "corner_uv_right", "corner_points", "corner_descriptors", "corner_side"),
 }
 
 
@@ -118,6 +118,8 @@ def load_map(folder: Path | str, rig: Rig | None = None) -> SavedMap:
             if checksum(raw) != checksums[name]:
                 raise ValueError(name)
             data = read_arrays(raw)
+            if name == "corners" and head["version"] < SIDES_SINCE:
+                data["corner_side"] = np.zeros(len(data["corner_kf"]), bool)
             columns.update({c: data[c] for c in wanted})
         if checksum((folder / "rig.yaml").read_bytes()) != checksums["rig"]:
             raise ValueError("rig")
@@ -226,7 +228,8 @@ def joined(maps: list[SavedMap]) -> SavedMap:
             raise StereoSfmError("maps of different cameras cannot be merged")
         s = saved.snapshot
         for name, values in parts.items():
-            values.append(getattr(s, name) + raised.get(name, 0))
+            column = getattr(s, name)
+            values.append(column + raised[name] if name in raised else column)
         sessions.append(saved.sessions + next_session)
         next_session += int(saved.sessions.max()) + 1
         for name in ("kf_ids", "pt_ids", "submap_ids"):

@@ -42,9 +42,11 @@ def _tracker(
     method = config.odometry.method
     if method == "flow":
         from stereo_sfm.tracking.flow.place_corners import PlaceCorners
+        from stereo_sfm.tracking.flow.side_views import SideViews
         from stereo_sfm.tracking.flow.tracker import Tracker
 
-        return Tracker(config.tracker, rig, spans, PlaceCorners.wanted(config, rig), places)
+        corners, sides = PlaceCorners.wanted(config, rig), SideViews.wanted(config, rig)
+        return Tracker(config.tracker, rig, spans, corners, places, sides)
     from stereo_sfm.tracking.features.estimators import estimator
 
     if not rig.stereo and estimator(method).needs_depth:

@@ -14,7 +14,7 @@ import yaml
 from stereo_sfm.cli import main
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.colmap import export_colmap
-from stereo_sfm.export.floor_plan import FREE, OCCUPIED, UNKNOWN, aisle_direction, make_floor_plan
+from stereo_sfm.export.floor_plan import FREE, OCCUPIED, UNKNOWN, make_floor_plan
 from stereo_sfm.export.g2o import export_g2o, graph_edges
 from stereo_sfm.export.ply import export_ply
 from stereo_sfm.export.trajectories import named_pose, write_tum
@@ -120,15 +120,6 @@ def test_floor_plan_of_one_aisle(sequence_and_map: tuple[StoreSequence, SavedMap
     assert len(xy) > 50
     assert ((aside > 0.75) & (aside < 1.4)).mean() > 0.85
     assert min(abs(along[0]), abs(along[1])) < np.sin(np.deg2rad(2))  # the plan lies along the aisle
-
-
-def test_aisle_direction_finds_the_angle() -> None:
-    rng = np.random.default_rng(0)
-    walls = np.concatenate([np.stack([rng.uniform(0, 10, 500), np.full(500, y)], 1) for y in (0.0, 2.0, 4.5)])
-    for degrees in (-30.0, -3.0, 0.0, 12.0, 40.0):
-        c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
-        turned = walls @ np.array([[c, s], [-s, c]]) + rng.normal(0, 0.01, walls.shape)
-        assert np.rad2deg(aisle_direction(turned)) == pytest.approx(degrees, abs=0.5)
 
 
 def test_export_command(tmp_path: Path, saved: SavedMap, capsys: pytest.CaptureFixture[str]) -> None:

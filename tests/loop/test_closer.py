@@ -11,7 +11,7 @@ import pytest
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
-from stereo_sfm.loop.closer import KEPT_NEWEST, LoopCloser
+from stereo_sfm.loop.closer import KEPT_NEWEST, Candidate, LoopCloser
 from stereo_sfm.loop.place_view import PlaceView
 from stereo_sfm.loop.verification import Verdict, rejection
 from stereo_sfm.types import F64, Keyframe, LoopResult
@@ -85,7 +85,8 @@ def test_of_two_similar_places_the_one_with_more_inliers_is_accepted(vocabulary:
 def scripted(sequence: StoreSequence, answers: dict[tuple[int, int], tuple[int, F64]]) -> Callable[..., Verdict]:
     """In place of `LoopCloser._verify`: (keyframe, candidate) -> inliers, and the error of the relative pose."""
 
-    def answer(_: LoopCloser, keyframe: Keyframe, __: PlaceView, candidate: int) -> Verdict:
+    def answer(_: LoopCloser, keyframe: Keyframe, __: PlaceView, of: Candidate) -> Verdict:
+        candidate = of.kf_id
         if (keyframe.kf_id, candidate) not in answers:
             return rejection("too_few_matches")
         inliers, error = answers[keyframe.kf_id, candidate]
@@ -107,7 +108,7 @@ def answers_of(
     monkeypatch.setattr(
         LoopCloser,
         "_candidates",
-        lambda self, keyframe, bag: ([(c, 0.5) for k, c in script if k == keyframe.kf_id], "no_candidate"),
+        lambda self, keyframe, *_: ([Candidate(c, 0.5) for k, c in script if k == keyframe.kf_id], "no_candidate"),
     )
     return close(sequence if keyframes is None else dataclasses.replace(sequence, keyframes=keyframes), vocabulary)
 

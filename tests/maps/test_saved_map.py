@@ -70,11 +70,24 @@ def test_each_error_has_its_line(tmp_path: Path, saved: SavedMap) -> None:
     with pytest.raises(StereoSfmError, match="another camera"):
         load_map(folder, moved)
     spoil(folder, version=7)
-    with pytest.raises(StereoSfmError, match="version 7, this program reads version 2"):
+    with pytest.raises(StereoSfmError, match="version 7, this program reads version 3"):
         load_map(folder)
     (folder / "map.json").write_text("{")
     with pytest.raises(StereoSfmError, match=r"damaged: map\.json"):
         load_map(folder)
+
+
+def test_maps_without_side_views_are_read(tmp_path: Path, saved: SavedMap) -> None:
+    folder = tmp_path / "m"
+    save_map(saved, folder)
+    columns = dict(np.load(folder / "corners.npz"))
+    del columns["corner_side"]
+    np.savez_compressed(folder / "corners.npz", **columns)
+    head = json.loads((folder / "map.json").read_text())
+    head["sha256"]["corners"] = hashlib.sha256((folder / "corners.npz").read_bytes()).hexdigest()
+    (folder / "map.json").write_text(json.dumps({**head, "version": 2}))
+    read = load_map(folder).snapshot
+    assert not read.corner_side.any() and len(read.corner_side) == len(read.corner_kf)
 
 
 @pytest.mark.parametrize("name", ["keyframes.npz", "points.npz", "observations.npz", "corners.npz", "rig.yaml"])

@@ -29,6 +29,7 @@ from stereo_sfm.tracking.flow.pyramids import StereoPyramids
 from stereo_sfm.tracking.flow.recovery import SURE_SHARE, Recovery, alike
 from stereo_sfm.tracking.flow.rig_change import triangulate_tracks
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
+from stereo_sfm.tracking.flow.side_views import SideViews
 from stereo_sfm.tracking.flow.stereo import StereoMatcher
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.tracking.flow.tracks import Tracks
@@ -64,10 +65,12 @@ class Tracker:
         spans: NoSpans | None = None,
         place_corners: PlaceCorners | None = None,
         places: Places | None = None,
+        side_views: SideViews | None = None,
     ) -> None:
         """Args:
         place_corners: what keyframes are recognised by; None: by nothing.
         places: where a camera that is lost is searched; None: nowhere.
+        side_views: by what keyframes are recognised from the other direction too; None: by nothing.
         """
         self._config, self._rig = config, rig
         self._rig_terms: F64 = np.zeros(6)  # of the correction in force
@@ -78,7 +81,7 @@ class Tracker:
         self._follower = Follower(config, rig, area, self._shutter)
         self._solver = FramePoseSolver(config, StereoCameras.of(rig), self._shutter)
         self._new_points = NewPoints(config, area, self._stereo, self._follower, self._shutter)
-        self._place_corners = place_corners
+        self._place_corners, self._side_views = place_corners, side_views
         self._inertial = InertialMotion(rig.imu) if rig.imu is not None and config.inertial else None
         self._recovery = Recovery(place_corners, places, rig.left.size)
         self._tracks = Tracks()
@@ -155,6 +158,8 @@ class Tracker:
         self._solver.use(StereoCameras.of(rig))
         if self._place_corners is not None:
             self._place_corners.use(rig)
+        if self._side_views is not None:
+            self._side_views.use(rig)
         self._tracks = triangulate_tracks(self._tracks, self._stereo, self._shutter, self._pose, self._velocity)
 
     # -- stages ----------------------------------------------------------------------------------------------------
@@ -334,10 +339,13 @@ class Tracker:
     def _make_keyframe(self, image: StereoImage, images: StereoPyramids) -> Keyframe:
         tracks = self._tracks.keep(~self._tracks.moving)
         points_cam = se3.transform(se3.inverse(self._pose), tracks.points())
-        corners = Corners.none()
+        corners = sides = Corners.none()
         if self._place_corners is not None:
             corners = self._place_corners.find_in(images.left, images.right)
             corners = without_moving(corners, self._tracks)
+        if self._side_views is not None:
+            sides = self._side_views.find(images.left, images.right, corners, self._pose, self._submap_id)
+            sides = without_moving(sides, self._tracks)
         uv_left, uv_right = self._shutter.at_stamp(tracks.uv, tracks.uv_right, points_cam, self._velocity)
         keyframe = Keyframe(
             kf_id=self._next_kf_id,
@@ -352,6 +360,7 @@ class Tracker:
             submap_id=self._submap_id,
             corners=self._shutter.corners_at_stamp(corners, self._velocity),
             rig_terms=self._rig_terms.copy(),
+            sides=self._shutter.corners_at_stamp(sides, self._velocity),
         )
         self._next_kf_id += 1
         self._kf_pose = self._pose.copy()
