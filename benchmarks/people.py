@@ -5,7 +5,8 @@ frames a second, half-size images, 0.8 m/s. An encounter that takes more than 60
 covering. Of those is printed how many were found again in the same submap within 0.5 s of free sight, the median and
 the largest error of the motion since before, and how many were found at a wrong place. Of the others: lost frames,
 steps that are wrong by more than 10 mm or 0.2 degrees while the state says OK, and the error of the frame poses beside
-that of the same drive without people.
+that of the same drive without people. Below the table stands, for each camera and rate, how often each of the things
+held that must hold.
 
     python benchmarks/people.py [--count 30] [--kinds approach,cover] [--cameras fisheye] [--rates 15] [--full-size]
 """
@@ -13,7 +14,7 @@ that of the same drive without people.
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 from _sequences import one_thread
 
@@ -38,6 +39,8 @@ SOON_S = 0.5
 TRACKED = (TrackState.OK, TrackState.RECOVERED)
 WRONG_M, WRONG_DEG = 0.5, 10.0  # a camera found again so far from the truth is at another place
 STEP_MM, STEP_DEG = 10.0, 0.2
+AGAIN_M, AGAIN_DEG = 0.03, 0.3  # error over the time that the view was covered
+TIMES = 2.0  # the error without people
 
 
 @dataclass
@@ -52,12 +55,30 @@ class Numbers:
     partly: int = 0
     lost: int = 0
     steps: int = 0
+    exact: int = 0  # found again with little error
+    never_lost: int = 0
+    right: int = 0  # encounters without a wrong step
     errors: list[tuple[float, float]] = field(default_factory=list[tuple[float, float]])  # with and without people
 
     @property
     def count(self) -> int:
         """Encounters."""
         return self.covering + self.partly
+
+    def add(self, other: Numbers) -> None:
+        """Those of other encounters."""
+        for f in fields(self):
+            setattr(self, f.name, getattr(self, f.name) + getattr(other, f.name))
+
+    def held(self) -> str:
+        """How often each of the things held that must hold."""
+        near = sum(with_people <= TIMES * without for with_people, without in self.errors)
+        return (
+            f"covered: found again within {SOON_S} s {self.found} of {self.covering}, within {1e3 * AGAIN_M:.0f} mm and"
+            f" {AGAIN_DEG} deg {self.exact} of {self.covering}, at a wrong place {self.wrong} of {self.covering};"
+            f" in part: never lost {self.never_lost} of {self.partly}, no wrong step {self.right} of {self.partly},"
+            f" error at most {TIMES:.0f} times that without people in {near} of {len(self.errors)} drives"
+        )
 
     def row(self, name: str) -> str:
         """A line of the table."""
@@ -98,11 +119,14 @@ def judge(source: SimSource, frames: list[Frame], encounter: Encounter, numbers:
         _covered(source, frames, first + int(seen[0]), first + int(seen[-1]), numbers)
         return
     numbers.partly += 1
+    lost, steps = numbers.lost, numbers.steps
     for before, after in zip(frames[first - 1 : last], frames[first : last + 1], strict=True):
         numbers.lost += after.state not in TRACKED
         if before.state == after.state == TrackState.OK:
             metres, degrees = motion_error(source, before, after)
             numbers.steps += 1e3 * metres > STEP_MM or degrees > STEP_DEG
+    numbers.never_lost += numbers.lost == lost
+    numbers.right += numbers.steps == steps
 
 
 def _covered(source: SimSource, frames: list[Frame], begin: int, end: int, numbers: Numbers) -> None:
@@ -115,6 +139,7 @@ def _covered(source: SimSource, frames: list[Frame], begin: int, end: int, numbe
     metres, degrees = motion_error(source, frames[begin - 1], soon[-1])
     numbers.wrong += metres > WRONG_M or degrees > WRONG_DEG
     numbers.found += 1
+    numbers.exact += metres <= AGAIN_M and degrees <= AGAIN_DEG
     numbers.metres.append(metres)
     numbers.degrees.append(degrees)
 
@@ -156,12 +181,17 @@ def main() -> None:
         " | error mm: median (most) | without people |"
     )
     print("|---|---|---|---|---|---|---|---|---|---|")
+    held: list[str] = []
     for camera in args.cameras.split(","):
         size = "" if args.full_size else f"&size={HALF[camera]}"
         for rate in map(int, args.rates.split(",")):
+            together = Numbers()
             for kind in args.kinds.split(","):
                 numbers = encounters(kind, camera, rate, args.count, size)
                 print(numbers.row(f"{kind}, {camera}, {rate} Hz"), flush=True)
+                together.add(numbers)
+            held.append(f"{camera}, {rate} Hz: {together.held()}")
+    print("\n" + "\n".join(held))
 
 
 if __name__ == "__main__":

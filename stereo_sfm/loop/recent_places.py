@@ -32,6 +32,10 @@ class RecentPlaces:
         self._config, self._rig = config, rig
         self._keyframes: deque[Keyframe] = deque(maxlen=NEWEST_KEYFRAMES)
 
+    def use(self, rig: Rig) -> None:
+        """Use a corrected rig."""
+        self._rig = rig
+
     def add(self, keyframe: Keyframe) -> None:
         """Add the newest keyframe; a new submap discards the earlier ones."""
         if self._keyframes and self._keyframes[-1].submap_id != keyframe.submap_id:

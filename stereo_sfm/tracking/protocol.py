@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Protocol
 
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.types import F64, Frame, Keyframe, MapUpdate, StereoImage
 
 
@@ -18,6 +19,10 @@ class AnyTracker(Protocol):
 
 class Places(Protocol):
     """Relocalization in recent keyframes after a loss of tracking."""
+
+    def use(self, rig: Rig) -> None:
+        """Use a corrected rig."""
+        ...
 
     def add(self, keyframe: Keyframe) -> None:
         """Add the newest keyframe."""

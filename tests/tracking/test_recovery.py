@@ -9,16 +9,18 @@ from functools import cache
 import numpy as np
 import pytest
 
+from stereo_sfm.calib.choice import with_terms
 from stereo_sfm.config import Config
 from stereo_sfm.drivers.sim.options import SimOptions
 from stereo_sfm.drivers.sim.scenes import SCENES
 from stereo_sfm.drivers.sim.source import SimSource
 from stereo_sfm.drivers.sim.world import Layout
 from stereo_sfm.geometry import se3
+from stereo_sfm.loop.recent_places import RecentPlaces
 from stereo_sfm.pipeline.stages import make_tracker_with_places
 from stereo_sfm.tracking.flow.recovery import Recovery
 from stereo_sfm.tracking.flow.trusted_motion import TrustedMotion
-from stereo_sfm.types import F64, Frame, StereoImage, TrackState
+from stereo_sfm.types import F64, Frame, Keyframe, StereoImage, TrackState
 
 RATE, BEGIN, COVERED, FREE = 15, 60, range(72, 82), range(82, 90)  # frames: 0.67 s without sight
 
@@ -78,6 +80,28 @@ def test_a_camera_that_comes_back_elsewhere_is_not_found() -> None:
     elsewhere = [drive().image_at(drive().pose(k) @ turned, k) for k in FREE]
     images = [seen(k) for k in range(BEGIN, COVERED.start)] + [covered(k) for k in COVERED] + elsewhere
     assert TrackState.RECOVERED not in [frame.state for frame in tracked(images)]
+
+
+def keyframe(frame_id: int) -> Keyframe:
+    """What a tracker that begins there makes of an image."""
+    made = make_tracker_with_places(Config(), drive().rig).step(seen(frame_id))[1]
+    assert made is not None
+    return made
+
+
+def test_places_are_found_with_the_corrected_rig() -> None:
+    before, after = 71, FREE.start
+    expected = se3.inverse(drive().pose(before)) @ drive().pose(after)
+    wrong = with_terms(drive().rig, np.array([0.0, 0.02, 0.0, 0.0, 0.0, 0.0]))
+    found: list[list[F64]] = []
+    for rigs in ([wrong], [wrong, drive().rig], [drive().rig]):
+        places = RecentPlaces(Config().loop, rigs[0])
+        places.use(rigs[-1])
+        places.add(keyframe(before))
+        found.append(list(places.find(keyframe(after), expected)))
+    assert min(float(se3.extent(se3.inverse(expected) @ pose)[0]) for pose in found[1]) < 0.03
+    assert np.array_equal(found[1], found[2])
+    assert not np.array_equal(found[1], found[0])
 
 
 def moving(seconds: F64) -> list[F64]:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.tracking.flow.frame_pose import PoseSolution
 from stereo_sfm.tracking.flow.place_corners import PlaceCorners
@@ -38,6 +39,11 @@ class Recovery:
         self._cells = 0.0  # in which the newest keyframes had corners further away
         self.motion = TrustedMotion()
         self.free = True  # whether the last image that was searched shows as much as the newest keyframe
+
+    def use(self, rig: Rig) -> None:
+        """Use a corrected rig."""
+        if self._places is not None:
+            self._places.use(rig)
 
     def remember(self, keyframe: Keyframe) -> None:
         """A new keyframe that later images may be found in."""

@@ -156,6 +156,7 @@ class Tracker:
         """Go on with a corrected rig: the points that are followed are where it sees them."""
         self._stereo.use(rig)
         self._solver.use(StereoCameras.of(rig))
+        self._recovery.use(rig)
         if self._place_corners is not None:
             self._place_corners.use(rig)
         if self._side_views is not None:
