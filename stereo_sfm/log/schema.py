@@ -115,9 +115,10 @@ def _fill(message: descriptor_pb2.DescriptorProto, cls: type[Any], twin: bool, p
                 _add(row, f"item{i}", _SCALARS[item])
             _add(message, f.name, _F.TYPE_MESSAGE, repeated=True, type_name=f"{prefix}.{row.name}")
         else:
-            nested = message.nested_type.add(name=f.convert.__name__)
-            _fill(nested, f.convert, twin, f"{prefix}.{nested.name}")
-            _add(message, f.name, _F.TYPE_MESSAGE, type_name=f"{prefix}.{nested.name}")
+            name = f.convert.__name__
+            if all(known.name != name for known in message.nested_type):  # several fields may have one type
+                _fill(message.nested_type.add(name=name), f.convert, twin, f"{prefix}.{name}")
+            _add(message, f.name, _F.TYPE_MESSAGE, type_name=f"{prefix}.{name}")
 
 
 def _file(cls: type[Any], twin: bool) -> descriptor_pb2.FileDescriptorProto:
