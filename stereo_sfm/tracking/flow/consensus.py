@@ -70,8 +70,8 @@ def _company(uv: F64, rho: F64, among_uv: F64, among_rho: F64, marked: Bool) -> 
     """How many of the NEIGHBOURS nearest in the image are marked (N,) and about as far away, for each of M points."""
     if not len(uv) or not marked.any():
         return np.zeros(len(uv))
-    squared = ((uv[:, None] - among_uv[None]) ** 2).sum(-1)
-    nearest = np.argsort(squared, axis=1, kind="stable")[:, :NEIGHBOURS]
+    squared = np.square(uv[:, :1] - among_uv[:, 0]) + np.square(uv[:, 1:] - among_uv[:, 1])
+    nearest = squared.argpartition(min(NEIGHBOURS, len(among_uv)) - 1, axis=1)[:, :NEIGHBOURS]
     alike = np.abs(np.log(among_rho[nearest] / rho[:, None])) < SAME_DEPTH
     return (marked[nearest] & alike).sum(1)
 
