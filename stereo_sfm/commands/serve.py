@@ -15,6 +15,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="set one value, as in source.spec=t265:"
     )
+    parser.add_argument("--pose-socket", metavar="ADDRESS", help="send poses on tcp://ADDRESS:PORT or a local socket")
+    parser.add_argument("--print-ports", action="store_true", help="print what would listen, and who can reach it")
     parser.add_argument("--print-config", action="store_true", help="print every setting with its description")
     parser.add_argument("-q", "--quiet", action="store_true", help="print errors only")
     parser.add_argument("-v", "--verbose", action="store_true", help="print what goes well, too")
@@ -25,7 +27,14 @@ def run(args: argparse.Namespace) -> int:
     from stereo_sfm.service.config import explain, load
     from stereo_sfm.service.service import Service
 
-    config = load(args.config, args.set)
+    socket = "outputs.pose_socket"
+    poses = [f"{socket}.enabled=true", f'{socket}.address="{args.pose_socket}"'] if args.pose_socket else []
+    config = load(args.config, [*args.set, *poses])
+    if args.print_ports:
+        from stereo_sfm.service.outputs.ports import ports
+
+        print("\n".join(ports(config)))
+        return 0
     if args.print_config:
         print(explain(config), end="")
         return 0

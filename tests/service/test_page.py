@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from stereo_sfm.cli import main
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.service.config import RobotConfig
@@ -287,6 +288,14 @@ def test_what_is_open_is_listed() -> None:
     lines = ports(RobotConfig(outputs=outputs, page=PageConfig(True)))
     assert len(lines) == 3 and "http://127.0.0.1:8080  this computer only" in lines[0]
     assert "anyone who can reach 0.0.0.0 and has the token" in lines[1] and "ws://127.0.0.1:8765" in lines[2]
+
+
+def test_serve_prints_its_ports(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["serve", "--print-ports"]) == 0
+    assert capsys.readouterr().out == "nothing listens: no output and no page is enabled\n"
+    assert main(["serve", "--pose-socket", "tcp://127.0.0.1:7001", "--set", "page.enabled=true", "--print-ports"]) == 0
+    page, poses = capsys.readouterr().out.splitlines()
+    assert "127.0.0.1:8080" in page and "tcp://127.0.0.1:7001  this computer only" in poses
 
 
 def test_closing_takes_less_than_a_second_with_a_page_open() -> None:
