@@ -81,7 +81,6 @@ class WatchdogConfig:
     """When a stage counts as hung."""
 
     silent_s: float = number(1.0, 0.5, 60, "Seconds without a sign of life")
-    busy_s: float = number(10.0, 2, 600, "Seconds for one image or one keyframe")
 
 
 @dataclass(frozen=True)
