@@ -16,9 +16,12 @@ class RecordedMasks:
 
     def __init__(self, rig: Rig) -> None:
         self._tracker, self._search, self._submap = make_tracker(Config(), rig), MaskSearch(), 0
+        self._paired = rig.right is not None and not rig.depth
 
     def add(self, image: StereoImage) -> None:
-        """One image, or pair."""
+        """Add one image or pair; a pair without its right image is left out."""
+        if self._paired and image.right is None:
+            return
         frame, keyframe = self._tracker.step(image)
         self._submap = self._submap if keyframe is None else keyframe.submap_id
         if frame.state in TRACKED:
