@@ -104,6 +104,15 @@ def halves(spec: str) -> tuple[slice, slice]:
     return slice(0, int(up[-1]) + 1), slice(int(down[0]), None)
 
 
+def aligned(map_T_kf: F64, world_T_kf: F64) -> F64:
+    """world_T_map (4, 4) by rotations too: positions on a straight line leave the turn about it free."""
+    each = world_T_kf @ se3.inverse(map_T_kf)
+    u, _, vt = np.linalg.svd(each[:, :3, :3].mean(0))
+    rotation = u @ vt
+    shift = (world_T_kf[:, :3, 3] - map_T_kf[:, :3, 3] @ rotation.T).mean(0)
+    return se3.from_rotation_translation(rotation, shift)
+
+
 def merged(up: Drive, down: Drive) -> tuple[bool, float]:
     """Whether the two sessions became one map, and the metres by which the second is misplaced."""
     try:
@@ -113,7 +122,7 @@ def merged(up: Drive, down: Drive) -> tuple[bool, float]:
     s, offset = result.saved.snapshot, int(up.saved.snapshot.kf_ids.max()) + 1
     true = np.array([up.true_kf[k] if k < offset else down.true_kf[k - offset] for k in s.kf_ids.tolist()])
     first = s.kf_ids < offset
-    world_T_map = se3.umeyama(s.map_T_kf[first, :3, 3], true[first, :3, 3])[0]
+    world_T_map = aligned(s.map_T_kf[first], true[first])
     off = se3.transform(world_T_map, s.map_T_kf[~first, :3, 3]) - true[~first, :3, 3]
     return True, float(np.sqrt((off**2).sum(1).mean()))
 
@@ -122,7 +131,7 @@ def relocalized(up: Drive, spec: str, part: slice, queries: int, seed: int) -> t
     """Single images of the way down in the map of the way up: good, found, and wrong by more than FALSE_M."""
     s = up.saved.snapshot
     true = np.array([up.true_kf[k] for k in s.kf_ids.tolist()])
-    world_T_map = se3.umeyama(s.map_T_kf[:, :3, 3], true[:, :3, 3])[0]
+    world_T_map = aligned(s.map_T_kf, true)
     relocalizer = Relocalizer(s, up.saved.rig, default_vocabulary(), Config().loop)
     good = found = wrong = 0
     with open_source(spec) as source:
