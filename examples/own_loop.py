@@ -1,4 +1,4 @@
-"""Feed the system from a loop of one's own: pictures are read, stepped through, and the pose is there at once.
+"""Feed the system from a loop of one's own: each image is passed to `step`, which returns the frame with its pose.
 
     python examples/own_loop.py [FRAMES]
 

@@ -35,15 +35,15 @@ class WebcamSource(BaseSource):
             raise StereoSfmError("webcam: two webcams have no calibration of their own: give --rig FILE")
         self.name = f"webcam:{place}"
         self.rig = options.rig if isinstance(options.rig, Rig) else load_rig(options.rig)
-        eyes = place.split(",")
-        self.live = all(eye.isdigit() for eye in eyes)
+        cameras = place.split(",")
+        self.live = all(camera.isdigit() for camera in cameras)
         self._period_ns = 1e9 / options.fps
-        self._captures = [cv2.VideoCapture(int(eye) if self.live else eye) for eye in eyes]
-        for eye, capture in zip(eyes, self._captures, strict=True):
+        self._captures = [cv2.VideoCapture(int(camera) if self.live else camera) for camera in cameras]
+        for camera, capture in zip(cameras, self._captures, strict=True):
             capture.set(cv2.CAP_PROP_FPS, options.fps)
             if not capture.isOpened():
                 self.close()
-                raise StereoSfmError(f"webcam: cannot open {eye}")
+                raise StereoSfmError(f"webcam: cannot open {camera}")
 
     def __iter__(self) -> Iterator[StereoImage]:
         frame_id = 0

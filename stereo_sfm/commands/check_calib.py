@@ -113,7 +113,7 @@ def _shutter(known: str, readout: Readout) -> Finding:
     if readout.measured_s < 0:
         upwards = f"{known}, but the motion shows rows read from the last to the first within {measured}"
         return Finding("shutter", 1, f"{upwards}, which no calibration can say: read the images the other way up")
-    what = "check readout_s in rig.yaml" if readout.told_s else "set readout_s in rig.yaml (see the data sheet)"
+    what = "check readout_s in rig.yaml" if readout.calibrated_s else "set readout_s in rig.yaml (see the data sheet)"
     return Finding("shutter", 1, f"{known}, but the motion shows rows read within {measured}: {what}")
 
 

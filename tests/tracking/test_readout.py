@@ -19,7 +19,7 @@ from stereo_sfm.drivers.sim.source import SimSource
 from stereo_sfm.drivers.source import open_source
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import RadTan
-from stereo_sfm.tracking.flow.readout import LEAST_PAIRS, Readout, ReadoutSearch
+from stereo_sfm.tracking.flow.readout import MIN_PAIRS, Readout, ReadoutSearch
 from stereo_sfm.types import StereoImage
 
 AISLE = "sim:aisle?camera=pinhole&size=320x200&start=60&frames=40"
@@ -32,10 +32,10 @@ def recorded(spec: str, most: int) -> tuple[Rig, list[StereoImage]]:
         return source.rig, list(itertools.islice(source, most))
 
 
-def search(spec: str, told_s: float, change: Callable[[Rig], Rig] = lambda rig: rig, most: int = 200) -> Readout:
-    """As measured with a calibration that says `told_s` and is wrong by `change`."""
+def search(spec: str, calibrated_s: float, change: Callable[[Rig], Rig] = lambda rig: rig, most: int = 200) -> Readout:
+    """As measured with a calibration with readout `calibrated_s` that is wrong by `change`."""
     rig, images = recorded(spec, most)
-    found = ReadoutSearch(TrackerConfig(), change(dataclasses.replace(rig, readout_s=told_s)))
+    found = ReadoutSearch(TrackerConfig(), change(dataclasses.replace(rig, readout_s=calibrated_s)))
     for image in images:
         found.add(image)
     return found.measured()
@@ -120,7 +120,7 @@ def test_fisheyes_in_stores(spec: str, readout_s: float, seed: int) -> None:
 
 def test_too_few_frames_say_nothing() -> None:
     found = search(
-        f"{AISLE}&vibration=4&frames={LEAST_PAIRS + 3}", 0.0
+        f"{AISLE}&vibration=4&frames={MIN_PAIRS + 3}", 0.0
     )  # two velocities need four images; the first has no motion
     assert np.isnan(found.measured_s)
     assert not found.known and found.best_s == 0.0

@@ -1,4 +1,4 @@
-"""Which motion is the camera's when something else moves before it: points that have stood still for long decide.
+"""Moving objects: points that have been static for long determine the camera's motion, others are marked as moving.
 
 While most points agree, all of them have the same say. When points in company disagree, or many are gone, a second
 motion is looked for among them, and the camera's is the one that the longest followed points agree with, within what
@@ -30,7 +30,7 @@ MORE = 1.05  # times the say that all together have, so that others decide
 ALERT_S = 1.0  # after that, or while points are marked as moving
 COMPANY, NEIGHBOURS = 3, 6  # a point moves if so many of its nearest neighbours disagree as well
 SAME_DEPTH = 0.3  # logarithm of the ratio of two distances
-PROOF = 4  # successive frames in which a moving point must agree to be believed again
+PROOF = 4  # successive frames in which a moving point must agree to be used again
 
 
 def after_frame(tracks: Tracks, inlier: Bool, moving: Bool, misses_allowed: int, alert: bool) -> tuple[Tracks, Bool]:
@@ -42,7 +42,7 @@ def after_frame(tracks: Tracks, inlier: Bool, moving: Bool, misses_allowed: int,
         alert: whether something may move; if not, nothing is marked.
 
     Returns:
-        The tracks that stay, and which rows (N,) these are.
+        The remaining tracks, and their rows as a mask (N,).
     """
     still = ~tracks.moving
     misses = np.where(inlier, 0, tracks.misses + 1)
@@ -62,18 +62,18 @@ def after_frame(tracks: Tracks, inlier: Bool, moving: Bool, misses_allowed: int,
 
 
 def among_moving(uv: F64, rho: F64, tracks: Tracks) -> Bool:
-    """(M,) which of new points, (M, 2) px and (M,) 1/m, are begun on what moves."""
+    """(M,) which new points, (M, 2) px and (M,) 1/m, are on moving objects."""
     return _company(uv, rho, tracks.uv, tracks.rho, tracks.moving) >= COMPANY
 
 
 def _company(uv: F64, rho: F64, among_uv: F64, among_rho: F64, marked: Bool) -> F64:
-    """How many of the NEIGHBOURS nearest in the image are marked (N,) and about as far away, for each of M points."""
+    """(M,) number of the nearest NEIGHBOURS in the image that are marked (N,) and at about the same distance."""
     if not len(uv) or not marked.any():
         return np.zeros(len(uv))
     squared = np.square(uv[:, :1] - among_uv[:, 0]) + np.square(uv[:, 1:] - among_uv[:, 1])
     nearest = squared.argpartition(min(NEIGHBOURS, len(among_uv)) - 1, axis=1)[:, :NEIGHBOURS]
-    alike = np.abs(np.log(among_rho[nearest] / rho[:, None])) < SAME_DEPTH
-    return (marked[nearest] & alike).sum(1)
+    same_depth = np.abs(np.log(among_rho[nearest] / rho[:, None])) < SAME_DEPTH
+    return (marked[nearest] & same_depth).sum(1)
 
 
 def in_company(tracks: Tracks, points: Bool) -> Bool:
@@ -85,7 +85,7 @@ def in_company(tracks: Tracks, points: Bool) -> Bool:
 
 
 def without_moving(corners: Corners, tracks: Tracks) -> Corners:
-    """The corners that are not on something that moves."""
+    """The corners that are not on moving objects."""
     if not tracks.moving.any():
         return corners
     distance = np.linalg.norm(corners.points_cam, axis=1).astype(np.float64)
@@ -99,7 +99,7 @@ def without_moving(corners: Corners, tracks: Tracks) -> Corners:
 def errors_at(
     pose, velocity, row_s, origin, direction, rho, variance, uv_l, uv_r, cams, right_T_left, sigma
 ):  # fmt: skip
-    """(N,) whitened errors of points at a pose, as `pose_solver.optimise_pose` gives them; its arguments."""
+    """(N,) whitened errors of points at a pose, as from `pose_solver.optimise_pose`, with its arguments."""
     error = np.full(len(rho), np.inf)
     res, jac, ray = np.zeros(4), np.zeros((4, 6)), np.zeros(4)
     row, step = pose.copy(), np.zeros((4, 4))

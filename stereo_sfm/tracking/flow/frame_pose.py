@@ -1,4 +1,4 @@
-"""The pose of one frame: where it is expected, what motion-only optimisation makes of it, and how far to believe it."""
+"""The pose of one frame: prediction, motion-only optimisation, and the decision between points that disagree."""
 
 from __future__ import annotations
 
@@ -27,20 +27,21 @@ from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.types import F64, Bool
 
-# In sigmas, one Gauss-Newton step each. The last are narrow: what disagrees by two or three sigmas (corners where a
-# near edge crosses a far one, people who walk along) errs to one side, and bends the scale.
+# In sigmas, one Gauss-Newton step each. The last are narrow: points that disagree by two or three sigmas (corners where
+# a near edge crosses a far one, people who walk along) have one-sided errors, which bias the scale.
 CAUCHY_SCALES = np.array([20.0, 10.0, 6.0, 4.0, 2.0, 1.0, 1.0])
 MEDIAN_ERROR = 0.8  # of unit noise in the four rows of a point
 NOISE_RANGE = (0.3, 4.0)  # over config.sigma_px
-SURPRISE = (0.01, 4.0), (0.01, 6.0)  # metres and m/s^2, radians and rad/s^2 that no robot is too steady for
-MOST_SURPRISE = 5.0  # times what this one's motion did of late
-MEMORY_S = 5.0
-LEAST_DEPTH_SIGMA = 1e-3  # relative
+# Differences from the prediction that are possible for any robot: metres and m/s^2, radians and rad/s^2.
+MIN_LIMITS = (0.01, 4.0), (0.01, 6.0)
+LIMIT_SIGMAS = 5.0  # root mean squares of the recent differences, if that is more
+MEMORY_S = 5.0  # time constant of their average
+MIN_DEPTH_SIGMA = 1e-3  # relative
 
 
 @dataclass(frozen=True)
 class ExpectedMotion:
-    """How the camera is expected to have moved since the last frame."""
+    """The predicted motion since the last frame."""
 
     pose: F64  # (4, 4) odom_T_cam
     moved: F64  # (6,) tangent from the last frame's pose to this one
@@ -54,13 +55,13 @@ class ExpectedMotion:
 
 @dataclass
 class PoseSolution:
-    """What motion-only optimisation found."""
+    """The result of motion-only optimisation."""
 
     pose: F64  # (4, 4) odom_T_cam
-    velocity: F64  # (6,) tangent a second while the rows were read; as expected for a global shutter
+    velocity: F64  # (6,) tangent a second during the readout; the prediction for a global shutter
     covariance: F64  # (6, 6)
     error: F64  # (N,) whitened
-    sigma_px: float  # what it is whitened by
+    sigma_px: float  # noise by which it is whitened
     max_error: float
     reason: str = ""  # why there is no pose
     moving: Bool = field(default_factory=lambda: np.zeros(0, bool))  # (N,) points that move in company; (0,): none
@@ -72,7 +73,7 @@ class PoseSolution:
 
     @property
     def inliers(self) -> int:
-        """How many points agree with the pose."""
+        """Number of inliers."""
         return int(self.inlier.sum())
 
     @property
@@ -81,26 +82,26 @@ class PoseSolution:
         return math.nan if self.reason else self.sigma_px * float(np.median(self.error[np.isfinite(self.error)]))
 
     def good(self, config: TrackerConfig, before: int) -> bool:
-        """Whether most of the points that were followed agree."""
+        """Whether enough of the `before` tracked points are inliers."""
         return not self.reason and self.inliers > max(2 * config.min_features, 0.4 * before)
 
 
 class FramePoseSolver:
-    """Solves for the pose of each frame by the noise that the frames before have shown."""
+    """Solves for the pose of each frame with the noise of the previous frames."""
 
     def __init__(self, config: TrackerConfig, cameras: StereoCameras, shutter: RollingShutter) -> None:
         self._config, self._cameras, self._shutter = config, cameras, shutter
         self._noise = 1.0  # observed noise over config.sigma_px
         self._alert_s = 0.0  # seconds for which something may still move
         self.open_view = 0.0  # points that agree while nothing moves
-        self._surprise = np.zeros(2)  # mean square of metres/s^2 and radians/s^2 between expected and found poses
+        self._difference = np.zeros(2)  # mean square of metres/s^2 and radians/s^2 between expected and found poses
 
     def use(self, cameras: StereoCameras) -> None:
-        """From now on with these cameras."""
+        """Use other cameras."""
         self._cameras = cameras
 
     def solve(self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, before: int = 0) -> PoseSolution:
-        """Pose from where it is expected; from the previous pose (4, 4) when that finds no consensus.
+        """Solve for the pose, starting at the prediction; at the previous pose (4, 4) if that finds no consensus.
 
         `before`: points that stood still until now and were looked for. Where many of them disagree or are gone, other
         motions are looked for, and that counts which the longest followed points agree with.
@@ -141,7 +142,7 @@ class FramePoseSolver:
         return chosen
 
     def _by_all(self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, voters: Bool) -> PoseSolution:
-        """All points have the same say."""
+        """Solve with all points."""
         best = self._optimise(tracks, expected, voters)
         if best.inliers < 0.5 * voters.sum():
             still = ExpectedMotion(last_pose, np.zeros(6), expected.seconds)
@@ -151,7 +152,7 @@ class FramePoseSolver:
         return best
 
     def _by_settled(self, tracks: Tracks, expected: ExpectedMotion, voters: Bool) -> PoseSolution | None:
-        """Points that have stood still for long decide, the others follow; None where there are too few."""
+        """Solve with the points that have been static for long, then with all that agree; None with too few."""
         settled = voters & (tracks.age * expected.seconds >= SETTLED_S)
         if settled.sum() < self._config.min_features or settled[voters].all():
             return None
@@ -176,15 +177,15 @@ class FramePoseSolver:
 
     @property
     def alert(self) -> bool:
-        """Whether something moved before the camera within the last second."""
+        """Whether an object moved within the last second."""
         return self._alert_s > 0
 
     def _likely(self, pose: F64, expected: ExpectedMotion) -> bool:
-        """Whether the camera can be there, given where its motion until now would have taken it."""
+        """Whether a pose is near enough to the predicted one."""
         off = np.array(se3.extent(se3.inverse(expected.pose) @ pose))
-        least, most = np.array(SURPRISE).T
-        most = np.maximum(most, MOST_SURPRISE * np.sqrt(self._surprise))
-        return bool((off < least + most * expected.seconds**2).all())
+        constant, quadratic = np.array(MIN_LIMITS).T
+        quadratic = np.maximum(quadratic, LIMIT_SIGMAS * np.sqrt(self._difference))
+        return bool((off < constant + quadratic * expected.seconds**2).all())
 
     def learn(self, tracks: Tracks, solution: PoseSolution, expected: ExpectedMotion) -> None:
         """Follow whether something moves before the camera and, while nothing does, the noise of points and motion."""
@@ -200,18 +201,18 @@ class FramePoseSolver:
         self._noise = min(max(noise, NOISE_RANGE[0]), NOISE_RANGE[1])
         if seconds > 0:
             off = np.array(se3.extent(se3.inverse(expected.pose) @ solution.pose)) / seconds**2
-            self._surprise += (1.0 - math.exp(-seconds / MEMORY_S)) * (off**2 - self._surprise)
+            self._difference += (1.0 - math.exp(-seconds / MEMORY_S)) * (off**2 - self._difference)
 
     def refine_depth(self, tracks: Tracks, solution: PoseSolution) -> None:
-        """Better distances for the points that agree and that the map has not placed."""
+        """Update the distances of inliers whose position is not from the map."""
         pose_solver.refine_depth(
             solution.pose, solution.velocity, self._shutter.row_seconds(tracks.uv), tracks.origin, tracks.direction,
             tracks.rho, tracks.variance, tracks.uv, tracks.uv_right, solution.inlier & ~tracks.mapped,
-            self._cameras.cams, self._cameras.right_T_left, self._config.depth_sigma_px, LEAST_DEPTH_SIGMA,
+            self._cameras.cams, self._cameras.right_T_left, self._config.depth_sigma_px, MIN_DEPTH_SIGMA,
         )  # fmt: skip
 
     def _optimise(self, tracks: Tracks, expected: ExpectedMotion, voters: Bool) -> PoseSolution:
-        """The pose by those that have a say (N,), with the errors of all."""
+        """The pose by the points `voters` (N,), with the errors of all points."""
         if voters.all():
             return self._optimise_all(tracks, expected)
         best, cameras = self._optimise_all(tracks.keep(voters), expected), self._cameras

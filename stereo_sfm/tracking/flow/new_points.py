@@ -1,4 +1,4 @@
-"""New points where some are missing: corners of the left image that the second camera sees as well."""
+"""New points in areas without points: corners of the left image with a stereo match."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.tracking.flow.visible_area import VisibleArea
 from stereo_sfm.types import F64
 
-LEAST_RHO = 1e-4  # 1/m
-SPACING = 0.75  # of the side of a square that each point would have for itself
+MIN_RHO = 1e-4  # 1/m
+SPACING = 0.75  # of the side of the square per point if points were evenly spread
 
 
 class NewPoints:
-    """Finds them, spread over the image; point ids are never used again."""
+    """Finds new points, spread over the image; point ids are never reused."""
 
     def __init__(
         self,
@@ -36,7 +36,7 @@ class NewPoints:
         self._next_point_id = 0
 
     def add(self, tracks: Tracks, images: StereoPyramids, pose: F64, velocity: F64) -> Tracks:
-        """The tracks with new ones behind them, up to max_features; pose (4, 4) and velocity (6,) of the image."""
+        """The tracks followed by new ones, up to max_features; pose (4, 4) and velocity (6,) of the image."""
         config = self._config
         missing = config.max_features - len(tracks)
         if missing <= 0:
@@ -48,7 +48,7 @@ class NewPoints:
         good = np.flatnonzero(match.good)
         rows, slots = self._follower.begin(images.left, match.uv_left[good])
         new, n = good[rows], len(rows)
-        rho = np.maximum(match.rho[new], LEAST_RHO)
+        rho = np.maximum(match.rho[new], MIN_RHO)
         moving = among_moving(match.uv_left[new], rho, tracks)
         origin, direction = self._shutter.rays(pose, velocity, match.uv_left[new], match.bearing[new])
         tracks = tracks.append(

@@ -1,14 +1,14 @@
-"""Within what time are the rows of an image exposed? Measured from how points move between images.
+"""Measurement of the readout time of a rolling shutter from the motion of points between images.
 
-A row exposed s after an image's stamp sees from where the camera is then: points are displaced by s times what the
-velocity does to them. A steady velocity displaces a point by the same amount in successive images, and a calibration
-that is slightly wrong does so as well, in proportion to the velocity. A change of velocity does what no calibration
-does: it displaces the rows of an image against those of the image before by readout * (row / rows - 1/2) * J *
-(change of velocity), with J the derivatives of pixels by the pose. The readout is the coefficient of this
-displacement in a regression of the points' movements, beside the pose of the image and the displacement by the
-velocity itself, with robust weights. Its standard error is from the spread between images, which also differ in what
-the regression leaves out (cluster-robust; Liang and Zeger, Biometrika 73, 1986). A camera that moves steadily leaves
-the readout unknown, and the standard error says so.
+A row exposed s seconds after an image's stamp is exposed from the pose at that time: points are displaced by s times
+the derivative of their pixels by the camera's motion, times its velocity. A constant velocity displaces a point by the
+same amount in successive images, and so does an error of the calibration, in proportion to the velocity. A change of
+velocity has an effect that no calibration error has: it displaces the rows of an image relative to those of the
+previous one by readout * (row / rows - 1/2) * J * (change of velocity), with J the derivatives of pixels by the pose.
+The readout is the coefficient of this displacement in a robust regression of the points' motion, together with the pose
+of the image and the displacement by the velocity itself. Its standard error is from the spread between images
+(cluster-robust; Liang and Zeger, Biometrika 73, 1986). With constant velocity the readout is not observable, and the
+standard error is large.
 """
 
 from __future__ import annotations
@@ -27,38 +27,38 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.tracking.flow.tracker import Tracker
 from stereo_sfm.types import F64, I64, StereoImage
 
-LEAST_PAIRS = 20  # of images
-LEAST_POINTS = 30  # in both images of a pair
-DEVIATIONS = 4.0  # a readout differs from the calibration's by more standard errors than that, ...
-DIFFERENT_S = 0.005  # ... and by more than this, since velocities between images are known to some percent only
-KNOWN_S = 0.005  # with a greater standard error a readout of 20 ms, a common one, cannot be told from none
+MIN_PAIRS = 20  # of images
+MIN_POINTS = 30  # in both images of a pair
+DEVIATIONS = 4.0  # standard errors between measured and calibrated readout that make a difference significant
+DIFFERENT_S = 0.005  # smallest difference: velocities between images are accurate to a few percent only
+KNOWN_S = 0.005  # largest standard error with which a readout of 20 ms, a common one, differs from none
 CAUCHY = 2.0  # standard deviations
 ROUNDS = 4  # of reweighting
 
 
 @dataclass(frozen=True)
 class Readout:
-    """What a recording shows of its camera's rows."""
+    """The measured readout of a recording."""
 
-    told_s: float  # the calibration's
+    calibrated_s: float  # the calibration's
     measured_s: float  # NaN without enough images; negative: read from the bottom up
     sigma_s: float  # standard error
-    error_px: float  # median distance of points from where they are expected, mean over the images
+    error_px: float  # median reprojection error, mean over the images
 
     @property
     def differs(self) -> bool:
-        """Whether the calibration's readout is wrong."""
-        return abs(self.measured_s - self.told_s) > max(DEVIATIONS * self.sigma_s, DIFFERENT_S)
+        """Whether the measurement differs significantly from the calibration."""
+        return abs(self.measured_s - self.calibrated_s) > max(DEVIATIONS * self.sigma_s, DIFFERENT_S)
 
     @property
     def known(self) -> bool:
-        """Whether the recording shows it: a camera that moves steadily does not."""
+        """Whether the motion determines the readout."""
         return self.differs or self.sigma_s < KNOWN_S
 
     @property
     def best_s(self) -> float:
-        """The measured one where the calibration's is wrong, else that."""
-        return self.measured_s if self.differs else self.told_s
+        """The measured readout if it differs from the calibration's, else the calibration's."""
+        return self.measured_s if self.differs else self.calibrated_s
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,7 @@ class _View:
 
 
 class ReadoutSearch:
-    """Tracks a recording and measures its readout on the way."""
+    """Tracks a recording and measures its readout."""
 
     def __init__(self, config: TrackerConfig, rig: Rig) -> None:
         self._rig, self._tracker = rig, Tracker(config, rig)
@@ -96,10 +96,10 @@ class ReadoutSearch:
             self._compare(*self._views)
 
     def measured(self) -> Readout:
-        """What was found until now."""
+        """The result of the images so far."""
         product, square = np.array(self._pairs, float).reshape(-1, 2).T
         total = float(square.sum())
-        if len(self._pairs) < LEAST_PAIRS or total <= 0:
+        if len(self._pairs) < MIN_PAIRS or total <= 0:
             return Readout(self._rig.readout_s, math.nan, math.nan, math.nan)
         readout_s = float(product.sum()) / total
         rest = product - readout_s * square
@@ -108,10 +108,10 @@ class ReadoutSearch:
         return Readout(self._rig.readout_s, readout_s, sigma_s, float(np.mean(self._error_px)))
 
     def _compare(self, first: _View, before: _View, now: _View, last: _View) -> None:
-        """Of four successive views the two in the middle, whose velocities are known."""
+        """Add the motion between the second and third of four successive views, whose velocities are known."""
         velocities = _velocity((first, before, now)), _velocity((before, now, last))
         _, i, j = np.intersect1d(before.point_ids, now.point_ids, return_indices=True)
-        if len(i) < LEAST_POINTS or velocities[0] is None or velocities[1] is None:
+        if len(i) < MIN_POINTS or velocities[0] is None or velocities[1] is None:
             return
         points = now.points[j]
         uv_before, _ = self._project(before, points)
@@ -122,7 +122,7 @@ class ReadoutSearch:
         by_change = row * (by_pose @ (velocities[1] - velocities[0]))
         columns = np.concatenate([by_pose, by_velocity[..., None], by_change[..., None]], axis=2)
         visible = np.isfinite(columns).all(axis=(1, 2)) & np.isfinite(moved).all(axis=1)
-        if visible.sum() >= LEAST_POINTS:
+        if visible.sum() >= MIN_POINTS:
             self._pairs.append(_last_coefficient(columns[visible], moved[visible]))
 
     def _project(self, view: _View, points: F64) -> tuple[F64, F64]:

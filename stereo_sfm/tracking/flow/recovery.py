@@ -1,4 +1,4 @@
-"""What a tracker does while the camera sees nothing that it knows: expect, look whether the view is free, search."""
+"""Recovery after a loss of tracking: prediction, test whether the view is free, relocalization."""
 
 from __future__ import annotations
 
@@ -16,29 +16,29 @@ from stereo_sfm.tracking.flow.trusted_motion import Expectation, TrustedMotion
 from stereo_sfm.tracking.protocol import Places
 from stereo_sfm.types import F64, Corners, Keyframe, StereoImage
 
-REACH = 3.0  # sigmas of the expectation within which a camera is looked for
-NEAR = 0.4  # of the median distance of the newest keyframe's corners
-FADING = 0.9  # of what a free view shows, from keyframe to keyframe
+REACH = 3.0  # sigmas of the prediction within which hypotheses are accepted
+NEAR = 0.4  # of the median distance of the newest keyframe's corners: nearer ones may be on an occluding object
+FADING = 0.9  # factor on the number of occupied cells from keyframe to keyframe
 GRID = (8, 6)  # columns and rows of the image in which corners are counted
-SURE_SHARE = 0.6  # of the points that should be visible: no need to look elsewhere
-SAME_PLACE = 0.1, 0.03  # metres, radians between two answers that are one
-RIVAL = 0.6  # another place with this share of the points makes the answer ambiguous
-LEAST = 16  # points that agree
-AGREEING = 0.6  # of the points that are found
-FOUND_SHARE = 0.22  # of the points that should be visible, that are found and agree; the rest may still be covered
-FREE_SHARE = 0.5  # of the cells in which the newest keyframe had corners: with as many the view is free again
+SUFFICIENT_SHARE = 0.6  # of the visible points: with so many inliers the search ends
+SAME_PLACE = 0.1, 0.03  # metres, radians between two hypotheses of one place
+RIVAL = 0.6  # share of the inliers with which another place makes the result ambiguous
+MIN_INLIERS = 16
+MIN_INLIER_SHARE = 0.6  # of the points that are found
+MIN_RECALL = 0.22  # share of the visible points that are found and agree; the rest may still be covered
+FREE_SHARE = 0.5  # of the cells with corners in the newest keyframes, with which the view is free again
 
 
 class Recovery:
-    """Remembers the motion that can be trusted and the newest keyframes."""
+    """The trusted motion and the newest keyframes, for relocalization."""
 
     def __init__(self, place_corners: PlaceCorners | None, places: Places | None, size: tuple[int, int]) -> None:
-        """`size`: width and height of the left image. Without `places` nothing is searched."""
+        """`size`: width and height of the left image. Without `places` there is no search."""
         self._place_corners, self._places, self._size = place_corners, places, size
-        self._near = 0.0  # metres from the camera, nearer than most of what the newest keyframe showed
-        self._cells = 0.0  # in which the newest keyframes had corners further away
+        self._near = 0.0  # metres: corners nearer to the camera than this are not counted
+        self._cells = 0.0  # number of cells in which the newest keyframes had corners further away
         self.motion = TrustedMotion()
-        self.free = True  # whether the last image that was searched shows as much as the newest keyframe
+        self.free = True  # whether the last searched image has as many occupied cells as the newest keyframes
 
     def use(self, rig: Rig) -> None:
         """Use a corrected rig."""
@@ -46,7 +46,7 @@ class Recovery:
             self._places.use(rig)
 
     def remember(self, keyframe: Keyframe) -> None:
-        """A new keyframe that later images may be found in."""
+        """Add a keyframe for later searches."""
         if self._places is not None:
             self._places.add(keyframe)
         if len(keyframe.corners):
@@ -54,7 +54,7 @@ class Recovery:
         self._cells = max(self._occupied(keyframe.corners), FADING * self._cells)
 
     def search(self, image: StereoImage, images: StereoPyramids, expected: Expectation) -> Iterator[F64]:
-        """Poses odom_T_cam (4, 4) within reach of where the camera is expected, from which it may see this image."""
+        """Hypotheses odom_T_cam (4, 4) of the image's pose, within reach of the prediction."""
         if self._places is None or self._place_corners is None:
             return
         corners = self._place_corners.find_in(images.left, images.right)
@@ -64,39 +64,39 @@ class Recovery:
             yield from (pose for pose in candidates if expected.sigmas_off(pose) < REACH)
 
     def possible(self, expected: Expectation, solution: PoseSolution, visible: int) -> bool:
-        """Whether the camera can have come there, and the points say so.
+        """Whether a pose is within reach of the prediction and supported by the points.
 
-        Ceilings and shelves repeat: beside the points that agree, those count that disagree, and those that should be
-        visible from there (`visible` of them) and are not found.
+        Ceilings and shelves repeat: the share of inliers among the found points counts, and their share of the points
+        that are visible from there (`visible` of them).
         """
         share, recall = solution.inliers / max(len(solution.error), 1), solution.inliers / max(visible, 1)
-        if solution.reason or solution.inliers < LEAST or share < AGREEING or recall < FOUND_SHARE:
+        if solution.reason or solution.inliers < MIN_INLIERS or share < MIN_INLIER_SHARE or recall < MIN_RECALL:
             return False
         return expected.sigmas_off(solution.pose) < REACH
 
     def best(self, found: list[tuple[Tracks, PoseSolution]]) -> tuple[Tracks, PoseSolution] | None:
-        """The pose that most points agree with, unless another place comes near it."""
+        """The pose with the most inliers; None if another place has nearly as many."""
         if not found:
             return None
         best = max(found, key=lambda x: x[1].inliers)
-        rivals = [s for _, s in found if not alike(s.pose, best[1].pose, *SAME_PLACE)]
+        rivals = [s for _, s in found if not within(s.pose, best[1].pose, *SAME_PLACE)]
         return None if any(s.inliers > RIVAL * best[1].inliers for s in rivals) else best
 
     def _occupied(self, corners: Corners) -> int:
-        """How many cells of the image hold a corner that is not on something close before the camera."""
+        """Number of cells of the image with a corner that is not on an object close to the camera."""
         uv = corners.uv_left[np.linalg.norm(corners.points_cam, axis=1) > self._near]
         column, row = (np.clip(uv[:, k] * GRID[k] / self._size[k], 0, GRID[k] - 1).astype(np.int64) for k in (0, 1))
         return len(np.unique(row * GRID[0] + column))
 
 
-def alike(a: F64, b: F64, metres: float, radians: float) -> bool:
-    """Whether two poses (4, 4) are so near each other."""
+def within(a: F64, b: F64, metres: float, radians: float) -> bool:
+    """Whether two poses (4, 4) differ by less than a translation and a rotation."""
     moved, turned = se3.extent(se3.inverse(a) @ b)
     return bool(moved < metres and turned < radians)
 
 
 def _seen(image: StereoImage, corners: Corners) -> Keyframe:
-    """An image that became no keyframe, as a place is recognised by it."""
+    """The place-recognition part of a keyframe, of an image that is none."""
     return Keyframe(
         kf_id=-1,
         frame_id=image.frame_id,

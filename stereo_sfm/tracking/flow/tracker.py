@@ -26,7 +26,7 @@ from stereo_sfm.tracking.flow.map_points import take_update
 from stereo_sfm.tracking.flow.new_points import NewPoints
 from stereo_sfm.tracking.flow.place_corners import PlaceCorners
 from stereo_sfm.tracking.flow.pyramids import StereoPyramids
-from stereo_sfm.tracking.flow.recovery import SURE_SHARE, Recovery, alike
+from stereo_sfm.tracking.flow.recovery import SUFFICIENT_SHARE, Recovery, within
 from stereo_sfm.tracking.flow.rig_change import triangulate_tracks
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.side_views import SideViews
@@ -39,7 +39,7 @@ from stereo_sfm.tracking.inertial.inertial_motion import InertialMotion
 from stereo_sfm.tracking.protocol import Places
 from stereo_sfm.types import F64, Bool, Corners, Frame, Keyframe, MapUpdate, Observations, StereoImage, TrackState
 
-DARK = 30  # grey level; an image without a brighter pixel shows nothing
+DARK = 30  # grey level; an image without a brighter pixel is dark
 NOT_FOUND = (
     Tracks(),
     PoseSolution(np.eye(4), np.zeros(6), np.eye(6), np.zeros(0), 0.0, 0.0, "not_found"),
@@ -50,7 +50,7 @@ TRUSTED_LEFT = 0.5  # ... if so many of the newest keyframe's points are left ..
 TRUSTED_OPEN = 0.3  # ... and so many of those that agree in an open view
 COVERED_SHARE = 0.1  # that a frame whose view is covered counts towards beginning anew
 SAME_START = 0.05, 0.01  # metres, radians between poses from which the same is found
-LOOKS = 2
+ROUNDS = 2
 FIRST_COVARIANCE = np.eye(6) * 1e-12  # of the first pose, which is the odometry frame
 UNKNOWN_COVARIANCE = np.eye(6)
 
@@ -68,12 +68,12 @@ class Tracker:
         side_views: SideViews | None = None,
     ) -> None:
         """Args:
-        place_corners: what keyframes are recognised by; None: by nothing.
-        places: where a camera that is lost is searched; None: nowhere.
-        side_views: by what keyframes are recognised from the other direction too; None: by nothing.
+        place_corners: detector of the corners for place recognition; None: keyframes have none.
+        places: relocalization after a loss of tracking; None: there is none.
+        side_views: views for place recognition in the opposite direction; None: keyframes have none.
         """
         self._config, self._rig = config, rig
-        self._rig_terms: F64 = np.zeros(6)  # of the correction in force
+        self._rig_terms: F64 = np.zeros(6)  # current correction of the rig
         self._spans = spans or NoSpans()
         self._stereo = StereoMatcher(config, rig)
         self._shutter = RollingShutter(rig)
@@ -90,23 +90,23 @@ class Tracker:
         self._velocity: F64 = np.zeros(6)  # tangent per second
         self._stamp_ns = 0
         self._lost = 0  # successive frames
-        self._searched = 0.0  # of these, the last ones that showed enough to search in
-        self._bridging = False  # tracking begins again where the IMU says, in the same submap
+        self._searched = 0.0  # of these, those with a view to search in, weighted by COVERED_SHARE
+        self._bridging = False  # tracking restarts at the pose by the IMU, in the same submap
         self._submap_id = 0
         self._next_kf_id = 0
         self._kf_pose: F64 = np.eye(4)
         self._kf_points = 0
         self._frames_since_kf = 0
         self._map_version = 0
-        self.solution: PoseSolution | None = None  # of the last image; None where points were only begun
+        self.solution: PoseSolution | None = None  # of the last image; None for a first image
 
     @property
     def points(self) -> F64:
-        """(N, 3) metres, odometry frame: the points of the last frame's observations, where that has a pose."""
+        """(N, 3) metres, odometry frame: the points of the last frame's observations, if it has a pose."""
         return self._tracks.points()
 
     def apply(self, update: MapUpdate) -> None:
-        """Take the mapper's better positions of points, and the rig where that was corrected."""
+        """Apply the mapper's positions of points, and its correction of the rig."""
         self._map_version = update.version
         if update.calibration is not None and update.calibration.applied:
             self._rig_terms = update.calibration.terms
@@ -114,7 +114,7 @@ class Tracker:
         self._tracks = take_update(self._tracks, update)
 
     def step(self, image: StereoImage) -> tuple[Frame, Keyframe | None]:
-        """The pose of one image, and a keyframe when this frame becomes one."""
+        """The pose of one image, and the keyframe if this frame becomes one."""
         with self._spans.span("pyramid"):
             images = self._prepare(image)
         self.solution = None
@@ -153,7 +153,7 @@ class Tracker:
         return self._frame(image, state, solution.covariance, inlier, keyframe, stats), keyframe
 
     def _use(self, rig: Rig) -> None:
-        """Go on with a corrected rig: the points that are followed are where it sees them."""
+        """Use a corrected rig: the tracked points are triangulated anew."""
         self._stereo.use(rig)
         self._solver.use(StereoCameras.of(rig))
         self._recovery.use(rig)
@@ -180,26 +180,26 @@ class Tracker:
         return ExpectedMotion(pose, moved, seconds)
 
     def _follow(self, images: StereoPyramids, expected: ExpectedMotion) -> tuple[Tracks, PoseSolution]:
-        """The points of the last image, from where they are expected, or as the whole image turned."""
+        """Track the points of the last image, from the prediction or from the rotation of the whole image."""
         tracks, solution = self._track(images, expected)
-        if solution.good(self._config, self._standing()):
+        if solution.good(self._config, self._static_count()):
             return tracks, solution
         turned = self._follower.turned(images.left, expected, self._pose)
         return max((tracks, solution), self._track(images, turned), key=lambda found: found[1].inliers)
 
     def _track(self, images: StereoPyramids, expected: ExpectedMotion) -> tuple[Tracks, PoseSolution]:
-        """Follow all points from where they are expected, match them in the right image and solve for the pose."""
+        """Track all points from their predictions, match them in the right image and solve for the pose."""
         with self._spans.span("flow"):
             tracks = self._follower.follow(self._tracks, images.left, expected)
         with self._spans.span("stereo"):
             tracks.uv_right = self._stereo.follow(images.left, images.right, tracks.uv, tracks.points(), expected.pose)
         with self._spans.span("pose"):
-            return tracks, self._solver.solve(tracks, expected, self._pose, self._standing())
+            return tracks, self._solver.solve(tracks, expected, self._pose, self._static_count())
 
     def _accept(
         self, image: StereoImage, images: StereoPyramids, tracks: Tracks, solution: PoseSolution, seconds: float
     ) -> Bool:
-        """Go on from this image; which of the points that are kept (N,) agree with its pose."""
+        """Update the state with the image's pose; returns which of the remaining points (N,) are inliers."""
         if seconds > 0:
             mean = se3.log(se3.inverse(self._pose) @ solution.pose) / seconds
             self._shutter.learn(mean, seconds)
@@ -209,31 +209,31 @@ class Tracker:
         inlier = solution.inlier & ~tracks.moving
         tracks.age = tracks.age + np.int32(1)
         tracks, kept = after_frame(tracks, solution.inlier, solution.moving, MAX_MISSES, self._solver.alert)
-        self._go_on(image, images, solution.pose, tracks)
+        self._continue(image, images, solution.pose, tracks)
         if self._inertial is not None:
             self._inertial.accept(image.stamp_ns, solution.pose)
         self._frames_since_kf += 1
         return inlier[kept]
 
     def _level(self) -> dict[str, float]:
-        """Where gravity is known: roll and pitch."""
+        """Roll and pitch if gravity is known."""
         level = None if self._inertial is None else self._inertial.level(self._pose)
         return {} if level is None else {"roll_deg": level[0], "pitch_deg": level[1]}
 
-    def _go_on(self, image: StereoImage, images: StereoPyramids, pose: F64, tracks: Tracks) -> None:
+    def _continue(self, image: StereoImage, images: StereoPyramids, pose: F64, tracks: Tracks) -> None:
         self._pose, self._stamp_ns, self._tracks = pose, image.stamp_ns, tracks
         self._state, self._lost, self._searched = TrackState.OK, 0, 0.0
         self._follower.accept(images.left, tracks)
 
     def _begin(self, image: StereoImage, images: StereoPyramids) -> tuple[Frame, Keyframe | None]:
-        """First frame, or the first after a restart: points from stereo alone."""
+        """The first frame, or the first after a restart: points from stereo alone."""
         bridge = self._bridge(image.stamp_ns) if self._bridging else None
         if self._bridging and bridge is None:  # for too long
             self._bridging = False
             self._submap_id += 1
         if bridge is not None:
             self._pose = bridge[0]
-        self._go_on(image, images, self._pose, Tracks())
+        self._continue(image, images, self._pose, Tracks())
         inlier = self._add_points(images, np.zeros(0, bool))
         if len(self._tracks) < 2 * self._config.min_features:
             self._tracks = Tracks()
@@ -257,7 +257,7 @@ class Tracker:
         return self._frame(image, state, covariance, inlier, keyframe, stats), keyframe
 
     def _bridge(self, stamp_ns: int) -> tuple[F64, F64] | None:
-        """Pose (4, 4) and covariance (6, 6) by the IMU since the last good pose; None where it does not know."""
+        """Pose (4, 4) and covariance (6, 6) by the IMU since the last good pose; None if it is not accurate enough."""
         if self._inertial is None or not self._inertial.bridges(stamp_ns):
             return None
         covariance = self._inertial.covariance(stamp_ns)
@@ -265,31 +265,31 @@ class Tracker:
         return self._inertial.predict(stamp_ns, self._pose), covariance
 
     def _expect(self, stamp_ns: int) -> Expectation:
-        """Where a camera that is lost may be: by the IMU, else as it moved when that could be trusted."""
+        """The predicted pose of a lost camera: by the IMU, else by the last trusted motion."""
         bridge = self._bridge(stamp_ns)
         return self._recovery.motion.expect(stamp_ns) if bridge is None else Expectation.of(*bridge)
 
     def _search(self, image: StereoImage, images: StereoPyramids) -> tuple[Tracks, PoseSolution]:
-        """A camera that is lost: the points of the last trusted image, from wherever it may be now."""
+        """Relocalize a lost camera with the points of the last trusted image, from several hypotheses of its pose."""
         expected = self._expect(image.stamp_ns)
         seconds = (image.stamp_ns - self._stamp_ns) * 1e-9
         tried: list[F64] = []
         found: list[tuple[Tracks, PoseSolution]] = []
         for pose in chain([expected.odom_T_cam], self._recovery.search(image, images, expected)):
-            if not any(alike(pose, other, *SAME_START) for other in tried):
+            if not any(within(pose, other, *SAME_START) for other in tried):
                 tried.append(pose)
-                tracks, solution = self._look_from(pose, images, seconds)
+                tracks, solution = self._track_from(pose, images, seconds)
                 visible = self._follower.expected_again(solution.pose)
                 if self._recovery.possible(expected, solution, visible):
                     found.append((tracks, solution))
-                    if solution.inliers >= SURE_SHARE * visible:
+                    if solution.inliers >= SUFFICIENT_SHARE * visible:
                         break
         return self._recovery.best(found) or NOT_FOUND
 
-    def _look_from(self, pose: F64, images: StereoPyramids, seconds: float) -> tuple[Tracks, PoseSolution]:
-        """The points of the last trusted image from a pose (4, 4) that is nearly right, with a second look."""
+    def _track_from(self, pose: F64, images: StereoPyramids, seconds: float) -> tuple[Tracks, PoseSolution]:
+        """Track the points of the last trusted image from an approximate pose (4, 4), and again from the result."""
         tracks, solution = NOT_FOUND
-        for _ in range(LOOKS):
+        for _ in range(ROUNDS):
             motion = ExpectedMotion(pose, se3.log(se3.inverse(self._pose) @ pose), seconds)
             tracks = self._follower.find_again(images.left, motion)
             tracks.uv_right = self._stereo.follow(images.left, images.right, tracks.uv, tracks.points(), pose)
@@ -300,7 +300,7 @@ class Tracker:
         return tracks, solution
 
     def _lose(self, image: StereoImage, reason: str) -> tuple[Frame, None]:
-        """Predict; after a while of free view begin a new submap."""
+        """Predict the pose; after some frames with a free view start a new submap."""
         expected = self._expect(image.stamp_ns)
         self._lost += 1
         self._follower.search_widely()
@@ -322,7 +322,7 @@ class Tracker:
         return self._without_pose(image, expected.odom_T_cam, state, reason, covariance), None
 
     def _add_points(self, images: StereoPyramids, inlier: Bool) -> Bool:
-        """New points behind those that are followed, of which `inlier` (N,) agree; the new ones do."""
+        """Add new points after the tracked ones, of which `inlier` (N,) are inliers; returns the mask of all."""
         self._tracks = self._new_points.add(self._tracks, images, self._pose, self._velocity)
         return np.concatenate([inlier, ~self._tracks.moving[len(inlier) :]])
 
@@ -330,11 +330,11 @@ class Tracker:
 
     def _wants_keyframe(self) -> bool:
         config = self._config
-        left = self._standing()  # new points come with keyframes only
+        left = self._static_count()  # new points come with keyframes only
         return self._frames_since_kf >= config.keyframe_max_frames or left < config.keyframe_share * self._kf_points
 
-    def _standing(self) -> int:
-        """Points that are followed and not on something that moves."""
+    def _static_count(self) -> int:
+        """Number of tracked points that are not on moving objects."""
         return int((~self._tracks.moving).sum())
 
     def _make_keyframe(self, image: StereoImage, images: StereoPyramids) -> Keyframe:
@@ -365,7 +365,7 @@ class Tracker:
         )
         self._next_kf_id += 1
         self._kf_pose = self._pose.copy()
-        self._kf_points = self._standing()
+        self._kf_points = self._static_count()
         self._frames_since_kf = 0
         return keyframe
 
@@ -405,7 +405,7 @@ class Tracker:
         reason: str,
         covariance: F64 = UNKNOWN_COVARIANCE,
     ) -> Frame:
-        """A frame whose image gives no pose: predicted only, or by the IMU."""
+        """A frame without a pose from its image: predicted, or by the IMU."""
         return Frame(
             frame_id=image.frame_id,
             stamp_ns=image.stamp_ns,
@@ -421,7 +421,7 @@ class Tracker:
 
 
 def _stats(tracks: Tracks, solution: PoseSolution) -> dict[str, float]:
-    """Numbers worth plotting."""
+    """Statistics of a frame for plots."""
     return {
         "tracked": float(len(tracks)),
         "inliers": float((solution.inlier & ~tracks.moving).sum()),

@@ -1,4 +1,4 @@
-"""The points a tracker follows: one row each, with the patch of their first appearance."""
+"""Tracked points: one row each, with the patch of their first appearance."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Tracks:
 
 
 class Patches:
-    """First appearances of points, in slots that are used again."""
+    """First appearances of points, in reusable slots."""
 
     def __init__(self, capacity: int) -> None:
         self.patch: F32 = np.zeros((capacity, klt.FLAT_SIZE), np.float32)
@@ -61,6 +61,6 @@ class Patches:
         return slots
 
     def keep_only(self, slots: I64) -> None:
-        """Everything else is free again."""
+        """Free all other slots."""
         self._free[:] = True
         self._free[slots] = False
