@@ -1,9 +1,9 @@
-"""Keyframes of a robot that drives the same aisles for hours, without images: what a tracker would send of them.
+"""Keyframes of a robot that drives the same aisles for hours, without images, as from a tracker.
 
-A gondola in a room, the robot round it or along its longer side there and back. Every surface bears points with scores
-(the tracker takes the best it sees), descriptors that change with the direction of view, and noise in pixels. Tracks
-end where their points leave the view, and some earlier; points that are found anew get new ids, as in a tracker. The
-tracker's answer to map updates (fused and culled points) is the same as the real one's.
+A gondola in a room; the robot drives around it, or back and forth along its longer side. Every surface has points with
+scores (the tracker takes the best visible ones), descriptors that change with the direction of view, and noise in
+pixels. Tracks end where their points leave the view, and some earlier; re-observed points get new ids, as in a tracker.
+Map updates (fused and culled points) are applied as in the real tracker.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ HEIGHT = -1.3, 0.9  # metres, y is down
 REACH_M = 6.0
 TRACKS, CORNERS = 320, 400
 BROKEN = 0.08  # share of the tracks that end from one keyframe to the next
-FICKLE = 0.5  # spread of the scores from image to image, beside that of the points
+SCORE_NOISE = 0.5  # spread of the scores from image to image, relative to that of the points
 NOISE_PX, DEPTH_PX = 0.3, 0.3
 BITS = 0.05  # share of the bits of a descriptor that change from view to view
 TURNED_BITS = 0.25  # and between opposite directions of view
@@ -41,7 +41,7 @@ class Aisle:
         self.turned: U8 = np.packbits(rng.random((len(self.points), 256)) < TURNED_BITS, axis=1)
 
     def visible(self, world_T_cam: F64) -> Bool:
-        """(P,) on the near side of their surfaces, near enough, and not behind the gondola."""
+        """(P,) points that face the camera, are near enough, and not occluded by the gondola."""
         to_cam = world_T_cam[:3, 3] - self.points
         ahead = -(to_cam @ world_T_cam[:3, 2]) > 0.2
         seen = ahead & ((to_cam * self.normals).sum(1) > 0.05) & (np.linalg.norm(to_cam, axis=1) < REACH_M)
@@ -73,7 +73,7 @@ def _walls(rng: np.random.Generator, half: tuple[float, float], outwards: float)
 
 
 def there_and_back(count: int) -> F64:
-    """(K, 4, 4) world_T_cam along the gondola's longer side, forwards and backwards, looking along it."""
+    """(K, 4, 4) world_T_cam along the gondola's longer side, back and forth, looking along it."""
     length = int(2 * GONDOLA[0] / STEP_M)
     at = np.arange(count) % (2 * length)
     x = STEP_M * np.where(at < length, at, 2 * length - at) - GONDOLA[0]
@@ -81,7 +81,7 @@ def there_and_back(count: int) -> F64:
 
 
 def round_and_round(count: int) -> F64:
-    """(K, 4, 4) world_T_cam round the gondola."""
+    """(K, 4, 4) world_T_cam around the gondola."""
     half = np.array([3.0, 1.5])  # of the ellipse
     angle, poses = 0.0, list[F64]()
     for _ in range(count):
@@ -100,7 +100,7 @@ def _pose(position: F64, heading: float) -> F64:
 
 
 class SimulatedTracker:
-    """Keyframes in, as if images had been tracked between them."""
+    """Keyframes as if images had been tracked between them."""
 
     def __init__(self, aisle: Aisle, rig: Rig, seed: int = 0) -> None:
         self._aisle, self._rig, self._rng = aisle, rig, np.random.default_rng([seed, 1])
@@ -168,9 +168,9 @@ class SimulatedTracker:
         self._points, self._ids = self._points[mask], self._ids[mask]
 
     def _best(self, among: Bool, count: int) -> I64:
-        """Rows of the points that look best in this image."""
+        """Rows of the points with the best scores in this image."""
         rows = np.flatnonzero(among)
-        score = self._aisle.scores[rows] + self._rng.normal(0, FICKLE, len(rows))
+        score = self._aisle.scores[rows] + self._rng.normal(0, SCORE_NOISE, len(rows))
         return np.sort(rows[np.argsort(-score, kind="stable")[:count]])
 
     def _measured(self, rows: I64, left: F64, right: F64) -> tuple[F64, F64, F64]:

@@ -1,4 +1,4 @@
-"""Where the real sequences lie, and what other systems reach on them."""
+"""The real sequences, and the errors of other systems on them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PEERS: dict[str, dict[str, tuple[float, float]]] = {
 
 
 def one_thread() -> None:
-    """Before numpy and OpenCV are imported: every library computes in one thread."""
+    """Before numpy and OpenCV are imported: limit every library to one thread."""
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ[name] = "1"
     import cv2
@@ -36,7 +36,7 @@ def data_root() -> Path | None:
 
 
 def sequences(named: list[str]) -> list[tuple[str, str]]:
-    """(name, source) of what to run on: those named, else every sequence that is here, and the simulated ones."""
+    """(name, source) of the sequences to run on: those named, else all available ones and the simulated ones."""
     root = data_root()
     if named:
         return [(n, str(root / n) if root is not None and n in FOLDERS else n) for n in named]

@@ -1,8 +1,8 @@
 """Keyframes of a simulated sequence without rendering every frame of it.
 
-Images are rendered every so many metres; corners, stereo points and descriptors come from the tracker's own code; a
-point keeps its id from one keyframe to the next when descriptor and true motion agree; odometry is the truth with a
-drift that is a few times worse than the tracker's. So a hundred metres cost seconds per keyframe, not minutes.
+Images are rendered at distances of STEP_METRES; corners, stereo points and descriptors come from the tracker's own
+code; a point keeps its id from one keyframe to the next when descriptor and true motion agree; odometry is the truth
+with a drift that is a few times worse than the tracker's. So a hundred metres cost seconds per keyframe, not minutes.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ DRIFT_PER_METRE, TURN_PER_METRE = 0.005, 0.0005  # random part of a step, and ra
 
 @dataclass(frozen=True, eq=False)
 class SparseSequence:
-    """Keyframes with drifting odometry, and where they truly are."""
+    """Keyframes with drifting odometry, and their true poses."""
 
     rig: Rig
     keyframes: list[Keyframe]
@@ -36,7 +36,7 @@ class SparseSequence:
 
 
 def keyframe_rows(poses: F64) -> I64:
-    """Frames that become keyframes: so far from the last one, or turned so much."""
+    """Frames that become keyframes: by distance or rotation since the last one."""
     rows = [0]
     for k in range(1, len(poses)):
         step = se3.inverse(poses[rows[-1]]) @ poses[k]
@@ -87,7 +87,7 @@ def _described(source: SimSource, frame_ids: I64, world_T_kf: F64, odom: F64) ->
 
 
 def _continue_ids(ids: I64, kf_T_previous: F64, previous: Keyframe, still: Keyframe, rig: Rig) -> None:
-    """Give the points that the previous keyframe saw their ids."""
+    """Give points that the previous keyframe observed their ids."""
     cloud, view = gather(previous, [], rig, 0.3), place_view_of(still, rig, 0.3)
     rows_b, rows_a = match_guided(kf_T_previous, view, cloud, rig, 50, radius=4.0)
     points = ~view.corner[rows_b]

@@ -1,4 +1,4 @@
-"""The papers' ablation on every sequence that is here: `python -m benchmarks ablation -- -o DIR [--frames N] ...`."""
+"""The papers' ablation on all available sequences: `python -m benchmarks ablation -- -o DIR [--frames N] ...`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ SOURCES = ("kitti", "euroc_mh01", "rgbd_dataset_freiburg1_xyz", "sim:loop?camera
 
 
 def main(args: list[str]) -> int:
-    """All arguments go to `stereo-sfm ablation`; without -o the report lies in runs/ablation."""
+    """All arguments go to `stereo-sfm ablation`; without -o the report is written to runs/ablation."""
     one_thread()
     from stereo_sfm.cli import main as command
 

@@ -1,9 +1,9 @@
-"""Errors of the default system on every sequence, beside those of other systems.
+"""Errors of the default system on every sequence, compared with those of other systems.
 
     python benchmarks/accuracy.py [--odometry] [--max-frames N] [SEQUENCE ...]
 
 Real sequences are looked for in STEREO_SFM_DATA; `sim:` scenes are rendered. ATE is the RMSE after alignment,
-"rotation" that of the orientations. `--set manhattan.enabled=true` shows what the rotation prior does.
+"rotation" that of the orientations. `--set manhattan.enabled=true` enables the rotation prior.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def _errors(kind: str, result: Evaluation) -> str:
 
 
 def peer_rows(name: str, max_frames: int | None) -> list[str]:
-    """What other systems reach on the whole of the same sequence."""
+    """Errors of other systems on the complete sequence."""
     if max_frames is not None:
         return []
     return [

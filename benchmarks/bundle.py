@@ -1,4 +1,4 @@
-"""Local bundle adjustment beside GTSAM's Levenberg-Marquardt on the same window, one thread.
+"""Local bundle adjustment compared with GTSAM's Levenberg-Marquardt on the same window, one thread.
 
     python benchmarks/bundle.py
 
@@ -32,7 +32,7 @@ from tests.synthetic import disturb, make_scene, pinhole_rig
 
 
 def timed(function: Callable[[], Any], repeats: int = 3) -> tuple[float, Any]:
-    """Best milliseconds of some calls, and the last answer."""
+    """Best milliseconds of several calls, and the last result."""
     best, answer = float("inf"), None
     for _ in range(repeats):
         start = time.perf_counter()

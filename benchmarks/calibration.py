@@ -1,7 +1,7 @@
-"""How well targets calibrate: rendered boards with exact truth, and real images beside OpenCV's own calibration.
+"""Accuracy of the calibration with targets: rendered boards with ground truth, and real images compared with OpenCV.
 
 python benchmarks/calibration.py --rendered            five seeds, fisheye and pinhole, noise and blur
-python benchmarks/calibration.py --real DATA_FOLDER    reprojection beside cv2.stereoCalibrate
+python benchmarks/calibration.py --real DATA_FOLDER    reprojection error compared with cv2.stereoCalibrate
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def real(root: Path) -> None:
 
 
 def everywhere(result: Calibration, left: list[Detection], right: list[Detection], points: F64) -> float:
-    """Root mean square over the corners that OpenCV is given too, the ones we removed included."""
+    """Root mean square over all corners that OpenCV uses, including our outliers."""
     from stereo_sfm.geometry import se3
 
     assert result.rig.right is not None
@@ -120,7 +120,7 @@ def opencv(left: list[Detection], right: list[Detection], points: F64, size: tup
 
 
 def main() -> int:
-    """Run what was asked for."""
+    """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rendered", action="store_true")
     parser.add_argument("--real", type=Path, default=None, metavar="FOLDER")

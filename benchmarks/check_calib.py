@@ -1,13 +1,13 @@
-"""Does `check-calib` find faults put into true calibrations, and does it pass the true ones? One row a fault.
+"""Test of `check-calib` with known faults added to good calibrations, and with the good ones. One row for each fault.
 
-python benchmarks/check_calib.py                        the real sequences that are here and the simulated ones
+python benchmarks/check_calib.py                        all available real sequences and the simulated ones
 python benchmarks/check_calib.py kitti sim:loop         these
-python benchmarks/check_calib.py --faults pitch+ both-  some faults (the true rig is always judged)
+python benchmarks/check_calib.py --faults pitch+ both-  some faults (the true rig is always checked)
 
-Each cell reads the verdict, and what check-calib says should be added, +- its standard deviation: degrees about the
-axis of the turn, or per cent of focal length; for the true rig the turn about x, y, z, the right focal length against
-the left, and both, in brackets where the recording does not show it. Every cell rectifies, matches and judges anew
-with the faulty rig.
+Each cell has the verdict and the correction estimated by check-calib, +- its standard deviation: degrees about the axis
+of the rotation, or per cent of focal length; for the true rig the rotation about x, y, z, the right focal length
+relative to the left, and both, in brackets where not observable. Every cell rectifies, matches and checks anew with the
+faulty rig.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ TURN_DEG, FOCAL = 0.2, 0.02
 
 @dataclass(frozen=True)
 class Fault:
-    """What is done to a true rig, and which number of which finding should say so."""
+    """A change of a true rig, and the number of the finding that should detect it."""
 
     name: str
     apply: Callable[[Rig], Rig]
@@ -98,7 +98,7 @@ def judge(rig: Rig, images: list[StereoImage]) -> CheckReport:
 
 
 def cell(report: CheckReport, fault: Fault) -> tuple[str, bool]:
-    """What the table says, and whether it is as it should be (a fault that cannot be judged is said to be so)."""
+    """The cell's text, and whether it is as expected (a fault may be reported as not observable)."""
     if not fault.finding:
         worst = [f.name for f in report.findings if f.level == report.level] if report.level else []
         return report.verdict + "".join(f" ({w})" for w in worst) + _all(report), report.verdict == "PASS"
@@ -110,7 +110,7 @@ def cell(report: CheckReport, fault: Fault) -> tuple[str, bool]:
 
 
 def _all(report: CheckReport) -> str:
-    """What is said of an unchanged rig: the turn, the focal lengths' ratio, both focal lengths."""
+    """The findings of an unchanged rig: rotation, ratio of the focal lengths, both focal lengths."""
     names = ("rotation between the cameras", "focal length, right relative to left", "focal length, both cameras")
     parts: list[str] = []
     for f in (f for name in names for f in report.findings if f.name == name):
@@ -120,7 +120,7 @@ def _all(report: CheckReport) -> str:
 
 
 def main() -> int:
-    """One block a source; exit code 3 when a cell is not as it should be."""
+    """One block for each source; exit code 3 if a cell is not as expected."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sources", nargs="*")
     parser.add_argument("--faults", nargs="*", default=[], metavar="NAME", help="only faults whose name holds one")

@@ -1,4 +1,4 @@
-"""The tracking step of every feature and estimator of the papers beside ours, on the same images, one thread.
+"""The tracking step of every feature and estimator of the papers and of ours, on the same images, one thread.
 
     python benchmarks/estimators.py [--frames N] [SOURCE ...]
 
@@ -38,7 +38,7 @@ def step_ms(tracker: AnyTracker, image: StereoImage) -> float:
 
 
 def _ours(theirs: Config) -> Config:
-    """The default tracker, with what mapping and loops ask of it where theirs has that too."""
+    """The default tracker, with the work for mapping and loops if the other one has it too."""
     config = Config()
     mapper = dataclasses.replace(config.mapper, enabled=theirs.mapper.enabled)
     return dataclasses.replace(

@@ -1,9 +1,9 @@
-"""Full bundle adjustment of a large map, one core: time and memory, and where the banded solver overtakes the dense.
+"""Full bundle adjustment of a large map, one core: time, memory, and the size from which the banded solver is faster.
 
     python benchmarks/full_ba.py            1,000 keyframes, 100,000 points, 600,000 observations
     python benchmarks/full_ba.py --solvers  one step of either solver at growing numbers of keyframes
 
-The camera sequences the same 125 m circuit twice, so that the reduced camera system has loops and not just a band.
+The camera passes the same 125 m circuit twice, so that the reduced camera system has loops and not just a band.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from tests.synthetic import camera_path, fisheye_rig, points_around, see
 
 
 def circuit(rig: Rig, keyframes: int, points: int, observations: int) -> tuple[Bundle, np.ndarray]:
-    """Two rounds of one circle, 0.25 m a keyframe; drift in the start that closes nothing. Bundle, true poses."""
+    """Two laps on one circle, 0.25 m between keyframes; initial poses with drift. Bundle, true poses."""
     rng = np.random.default_rng(0)
     truth = camera_path(keyframes, 0.25, 4 * np.pi / keyframes)
     xyz = points_around(truth, points, rng)

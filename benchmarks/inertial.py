@@ -1,4 +1,4 @@
-"""What the IMU is worth: the EuRoC part as it is, at a third of its rate, and with three seconds of black images.
+"""Effect of the IMU: the EuRoC part as it is, at a third of its rate, and with three seconds of black images.
 
     python -m benchmarks inertial
 
@@ -30,14 +30,14 @@ DARK = range(80, 140)  # frames
 
 
 def darkened(images: list[StereoImage]) -> Iterator[StereoImage]:
-    """The same images, black where the light is out."""
+    """The same images, black while the light is off."""
     for image in images:
         black = np.zeros_like(image.left)
         yield dataclasses.replace(image, left=black, right=black) if image.frame_id in DARK else image
 
 
 def off_m(frame: Frame, before: Frame, truth: Trajectory) -> float:
-    """How far the live odometry is off, from the last frame before the dark on."""
+    """Error of the live odometry in metres from the last frame before the dark."""
     at = [int(np.argmin(np.abs(truth.stamp_ns - f.stamp_ns))) for f in (before, frame)]
     true = se3.inverse(truth.poses[at[0]]) @ truth.poses[at[1]]
     seen = se3.inverse(before.odom_T_cam) @ frame.odom_T_cam

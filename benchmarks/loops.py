@@ -1,7 +1,7 @@
-"""What mapping and loops do for the trajectory: odometry alone, with mapping, with mapping and loops, in one pass.
+"""Effect of mapping and loops on the trajectory: odometry alone, with mapping, with mapping and loops, in one pass.
 
-Every frame is rendered once and goes through all runs, so the numbers belong to the same images. The last lines are
-the hold-points: mapping and loops never worsen the odometry's error by more than 5 %.
+Every frame is rendered once and goes through all runs, so the numbers are of the same images. The last lines
+check that mapping and loops never increase the odometry's error by more than 5 %.
 
     python benchmarks/loops.py                       # sim:loop with the fisheye and the pinhole pair
     python benchmarks/loops.py sim:loop --frames 300
@@ -45,7 +45,7 @@ def configurations(only: str = "") -> dict[str, Config]:
 
 
 def images(source: Source, frames: int, stored: Path | None) -> Iterator[StereoImage]:
-    """The source's images; with `stored` (N, 2, H, W) the pictures come from that file instead of the renderer."""
+    """The source's images; with `stored` (N, 2, H, W) the pixels are read from that file instead of rendered."""
     if stored is None:
         for n, image in enumerate(source):
             if frames and n >= frames:
@@ -91,7 +91,7 @@ def measure(spec: str, frames: int, stored: Path | None, only: str) -> None:
 
 
 def _end_error(estimate: F64, truth: F64) -> float:
-    """Metres between the end points when the starts are laid on each other."""
+    """Metres between the end points with aligned start poses."""
     a, b = se3.inverse(estimate[0]) @ estimate[-1], se3.inverse(truth[0]) @ truth[-1]
     return float(np.linalg.norm(a[:3, 3] - b[:3, 3]))
 

@@ -1,15 +1,15 @@
-"""What a keyframe costs while the map grows, and where the robot stays.
+"""Time of a keyframe while the map grows, and in a place that the robot does not leave.
 
     python benchmarks/map_growth.py [--drive back|round --keyframes 10000]
 
 Without options: one insertion at 100, 1,000 and 10,000 keyframes, 1,000,000 points, 4,000,000 sightings. Every keyframe
 sees 400 points: 300 of the one before it, 100 new ones; every tenth also sees the 100 that were new 500 keyframes
-earlier, as in a loop; each brings 400 corners to be known by. An insertion is what the mapper asks of the map: new
+earlier, as in a loop; each has 400 corners for place recognition. An insertion is the mapper's work on the map: new
 points, observations, neighbours, the delta. Medians and 99th percentiles of the 100 insertions before each size; the
-worst one holds the doubling of a column.
+worst one includes the doubling of a column.
 
-With --drive: a robot there and back in one aisle, or round and round a gondola, for hours: the whole mapper and the
-loop closer on keyframes as a tracker would send them, without images (`_aisle.py`). Processor time by stage, medians of
+With --drive: a robot back and forth in one aisle, or around a gondola, for hours: the whole mapper and the
+loop closer on keyframes as from a tracker, without images (`_aisle.py`). Processor time by stage, medians of
 each tenth of the drive, beside that of ORB on a pair of images of noise in the same tenth, for a busy machine slows
 both; fails where a keyframe in the end takes more than 1.1 times as many ORBs as around the 500th.
 """
@@ -56,7 +56,7 @@ ORB_EVERY = 10  # keyframes
 
 
 def keyframe(kf_id: int, point_ids: I64, rng: np.random.Generator) -> Keyframe:
-    """Somewhere, seeing these points anyhow."""
+    """A keyframe at any pose with these points."""
     n = len(point_ids)
     return Keyframe(
         kf_id=kf_id,
@@ -78,7 +78,7 @@ def keyframe(kf_id: int, point_ids: I64, rng: np.random.Generator) -> Keyframe:
 
 
 def insert(map_: Map, kf: Keyframe) -> None:
-    """All that one keyframe asks of the map."""
+    """The work of one keyframe on the map."""
     row = map_.add_keyframe(kf, kf.odom_T_cam)
     new = map_.point_rows(kf.point_ids) < 0
     map_.add_points(kf.point_ids[new], kf.points_cam[new], row)
@@ -156,7 +156,7 @@ class Drive:
         self._orb = cv2.ORB_create(1000)  # pyright: ignore[reportAttributeAccessIssue]
 
     def step(self, k: int) -> None:
-        """The keyframe at the k-th pose, through all that is asked of it; full bundle adjustments are not timed."""
+        """All stages of the keyframe at the k-th pose; full bundle adjustments are not timed."""
         keyframe = self._tracker.step(self._poses[k])
         with self._spans.span("loop"):
             result = self.closer.step(keyframe)
@@ -181,7 +181,7 @@ class Drive:
         return float(np.median([ms.get(stage, 0.0) for ms in self.ms[first:last]]))
 
     def mean(self, first: int, last: int, stage: str) -> float:
-        """The same on average, in ORBs: where a keyframe is searched for loops, it takes many times the median."""
+        """The mean, in units of ORB: a keyframe with a loop search takes many times the median."""
         return float(np.mean([ms.get(stage, 0.0) for ms in self.ms[first:last]])) / self.orb(first, last)
 
     def orb(self, first: int, last: int) -> float:
@@ -199,7 +199,7 @@ class Drive:
 
 
 def drive(name: str, count: int) -> int:
-    """Print the table of a drive; 1 where a keyframe costs more and more."""
+    """Print the table of a drive; 1 if the time of a keyframe grows."""
     run, edges = Drive(DRIVES[name](count), Config()), np.linspace(0, count, 11).astype(int).tolist()
     columns = "".join(f"{stage:>12}" for stage in (*STAGES, "map p95", "loop p95", "ORB"))
     print(f"{'keyframes':>11}{columns}{'living':>9}{'points':>9}{'error mm':>9}{'RSS MiB':>9}")

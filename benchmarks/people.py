@@ -1,12 +1,12 @@
-"""People in front of the camera: is the pose kept while they fill the view, and found again after they covered it?
+"""People in front of the camera: tracking while they fill the view, and recovery after they covered it.
 
 Every kind of encounter of the simulator (`sim:...?encounters=KIND`), for the fisheye and the pinhole pair at 30 and 15
 frames a second, half-size images, 0.8 m/s. An encounter that takes more than 60 % of the view of a camera counts as
-covering. Of those is printed how many were found again in the same submap within 0.5 s of free sight, the median and
-the largest error of the motion since before, and how many were found at a wrong place. Of the others: lost frames,
-steps that are wrong by more than 10 mm or 0.2 degrees while the state says OK, and the error of the frame poses beside
-that of the same drive without people. Below the table stands, for each camera and rate, how often each of the things
-held that must hold.
+covering. Of those the table has the number recovered in the same submap within 0.5 s of a free view, the median and
+the largest error of the motion since before, and the number recovered at a wrong place. Of the others: lost frames,
+steps that are wrong by more than 10 mm or 0.2 degrees while the state says OK, and the error of the frame poses
+compared with the same drive without people. Below the table: for each camera and rate, how often each requirement was
+met.
 
     python benchmarks/people.py [--count 30] [--kinds approach,cover] [--cameras fisheye] [--rates 15] [--full-size]
 """
@@ -33,11 +33,11 @@ from stereo_sfm.pipeline.run import run
 from stereo_sfm.types import F64, Frame, TrackState, Trajectory
 
 HALF = {"fisheye": "424x400", "pinhole": "320x200"}
-SCENES = {"beside": "sim:loop?length=24"}  # 20 s together need a longer way than an aisle
+SCENES = {"beside": "sim:loop?length=24"}  # 20 s need a longer route than an aisle
 FREE, COVERING = 0.05, 0.6  # share of the view
 SOON_S = 0.5
 TRACKED = (TrackState.OK, TrackState.RECOVERED)
-WRONG_M, WRONG_DEG = 0.5, 10.0  # a camera found again so far from the truth is at another place
+WRONG_M, WRONG_DEG = 0.5, 10.0  # a larger error after recovery is another place
 STEP_MM, STEP_DEG = 10.0, 0.2
 AGAIN_M, AGAIN_DEG = 0.03, 0.3  # error over the time that the view was covered
 TIMES = 2.0  # the error without people
@@ -45,7 +45,7 @@ TIMES = 2.0  # the error without people
 
 @dataclass
 class Numbers:
-    """Of one kind of encounter."""
+    """Results of one kind of encounter."""
 
     covering: int = 0
     found: int = 0
@@ -153,7 +153,7 @@ def position_error(source: SimSource, frames: list[Frame]) -> float:
 
 
 def encounters(kind: str, camera: str, rate: int, count: int, size: str) -> Numbers:
-    """Drives until there were so many encounters."""
+    """Drives with that many encounters in total."""
     numbers, seed = Numbers(), 0
     while numbers.count < count:
         scene = SCENES.get(kind, "sim:aisle?returns=off")

@@ -3,7 +3,7 @@
     python -m benchmarks pipeline -- [--recording FILE.mcap] [--minutes 5]
 
 Without a recording, `sim:loop` (848x800, 30 Hz) is recorded first as raw images. The sequence is played forwards and
-backwards, over and over, so that it can go on for minutes without a jump. First as fast as the stages can, then in real
+backwards, repeatedly, so that it lasts for minutes without a jump. First as fast as the stages can, then in real
 time at 30 Hz, with mapping, loops and logging on. Memory is the sum of the unique set sizes of all processes plus the
 shared image ring.
 """
@@ -38,7 +38,7 @@ def opened(path: str, frames: int, paced: bool) -> Source:
 
 
 class Numbers:
-    """What the stages say, as a sink."""
+    """Sink that collects the stages' statistics."""
 
     def __init__(self) -> None:
         self.latency: list[float] = []
@@ -57,7 +57,7 @@ class Numbers:
 
 
 def memory_mb(run: ProcessRun) -> dict[str, float]:
-    """Unique set sizes of the stages but capture's, whose recording in memory a camera would not have."""
+    """Unique set sizes of the stages without capture, which holds the recording in memory."""
     sizes = {"main": psutil.Process().memory_full_info().uss / 2**20}
     for stage, pid in run.pids.items():
         if stage != "capture" and psutil.pid_exists(pid):

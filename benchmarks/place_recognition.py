@@ -1,11 +1,11 @@
 """Place recognition: query time against the number of keyframes, and precision and recall in identical aisles.
 
-The sequences go through every aisle of a store whose aisles hold the same products in the same order, and come back
-through the first one. "Words alone" takes the best-scored place as the answer, as the bag of words would; "words and
-geometry" adds the verification; "all" is the loop closer with odometry and agreement of successive keyframes.
+The sequences pass every aisle of a store whose aisles have the same products in the same order, and return through the
+first one. "Words alone" takes the place with the best score of the bag of words; "words and geometry" adds the
+verification; "all" is the loop closer with odometry and agreement of successive keyframes.
 
-`--cut` takes the sequences of any scene apart instead: tracking is lost at five places of each and begins anew four
-keyframes later, with odometry that knows nothing of what was before; counted is the first loop that joins the pieces.
+`--cut` simulates losses of tracking instead: at five places of each sequence tracking is lost and restarts four
+keyframes later in a new submap; the first loop that connects the submaps is counted.
 
     python benchmarks/place_recognition.py --seeds 10
     python benchmarks/place_recognition.py --cut --seeds 6 "sim:loop?size=424x400"
@@ -38,9 +38,13 @@ from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.loop.vocabulary_file import default_vocabulary
 from stereo_sfm.types import LoopResult
 
-CUTS, LEFT_OUT = (0.08, 0.15, 0.25, 0.5, 0.75), 3  # where tracking is lost, and keyframes that it loses
-FALSE_METRES, FALSE_DEGREES = 0.5, 10.0  # an accepted loop further off is false
-NEAR_METRES, NEAR_DEGREES, GAP = 1.0, 25.0, 12  # a return: so near to an older keyframe that is so many keyframes old
+CUTS, LEFT_OUT = (0.08, 0.15, 0.25, 0.5, 0.75), 3  # positions of the losses of tracking, and lost keyframes
+FALSE_METRES, FALSE_DEGREES = 0.5, 10.0  # an accepted loop with a larger error is false
+NEAR_METRES, NEAR_DEGREES, GAP = (
+    1.0,
+    25.0,
+    12,
+)  # a return: largest distance, smallest age in keyframes
 
 
 @dataclass
@@ -95,7 +99,7 @@ def query_times(vocabulary: Vocabulary, sizes: tuple[int, ...] = (100, 1000, 10_
 
 
 def returns(sequence: SparseSequence) -> set[int]:
-    """Keyframes that see an older place again."""
+    """Keyframes that revisit a place."""
     out: set[int] = set()
     for k in range(GAP, len(sequence.world_T_kf)):
         relative = se3.inverse(sequence.world_T_kf[: k - GAP + 1]) @ sequence.world_T_kf[k]
@@ -127,7 +131,7 @@ def judge(sequence: SparseSequence, results: list[LoopResult], count: Count) -> 
 
 
 def words_alone(sequence: SparseSequence, vocabulary: Vocabulary, config: LoopConfig) -> list[LoopResult]:
-    """The best-scored old keyframe of every keyframe, taken to stand exactly there, where the words say so."""
+    """For every keyframe the earlier one with the best score, with the identity as relative pose."""
     everything = dataclasses.replace(
         config, min_match_fraction=0.0, min_inliers=10**6, max_candidates=1, pause=0, enabled=True
     )
@@ -173,7 +177,7 @@ def identical_aisles(spec: str, seeds: int, vocabulary: Vocabulary, cache: Path 
 
 
 def cut_sequences(spec: str, seeds: int, vocabulary: Vocabulary, cache: Path | None) -> None:
-    """One line: how many sequences that tracking lost half-way were joined, rightly or wrongly."""
+    """One line: how many sequences with a loss of tracking were connected, correctly or wrongly."""
     answers: Counter[str] = Counter()
     for seed in range(seeds):
         sequence = _sequence(f"{spec}{'&' if '?' in spec else '?'}seed={seed}&walk={seed}", cache)
@@ -183,7 +187,7 @@ def cut_sequences(spec: str, seeds: int, vocabulary: Vocabulary, cache: Path | N
 
 
 def _joined(sequence: SparseSequence, cut: int, vocabulary: Vocabulary) -> str:
-    """How the pieces before keyframe `cut` and after the gap are joined: "right", "wrong" or "never"."""
+    """How the submaps before keyframe `cut` and after the gap are connected: "right", "wrong" or "never"."""
     closer = LoopCloser(LoopConfig(), sequence.rig, vocabulary)
     rest = sequence.keyframes[cut + LEFT_OUT :]
     begin = se3.inverse(rest[0].odom_T_cam)
@@ -198,7 +202,7 @@ def _joined(sequence: SparseSequence, cut: int, vocabulary: Vocabulary) -> str:
 
 
 def _sequence(spec: str, cache: Path | None) -> SparseSequence:
-    """Rendered, or as it was stored by an earlier run."""
+    """Render a sequence, or read it as stored by an earlier run."""
     path = cache / f"{hashlib.sha256(spec.encode()).hexdigest()[:12]}.pkl" if cache else None
     if path is not None and path.exists():
         return pickle.loads(path.read_bytes())

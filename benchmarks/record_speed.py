@@ -1,10 +1,10 @@
-"""How fast `record` writes each image format on one core, and how much; and what each PNG setting costs.
+"""Speed and size of each image format of `record` on one core, and the cost of each PNG setting.
 
     python benchmarks/record_speed.py [SOURCE ...] [--frames 150] [--encoders]
 
-The default source is the simulated T265 (2 x 848 x 800). Frames are held in memory, so that only the recording counts;
-the process is pinned to one core. "of a core" is the processor time at 30 frames a second: below 100 % it keeps up. The
-wall time is longer where other programs use the same core.
+The default source is the simulated T265 (2 x 848 x 800). Frames are held in memory, so that only the recording is
+timed; the process is pinned to one core. "of a core" is the processor time at 30 frames a second: below 100 % it is
+fast enough. The wall time is longer where other programs use the same core.
 """
 
 from __future__ import annotations

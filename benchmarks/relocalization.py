@@ -1,6 +1,6 @@
-"""Localize-only in a saved map: single stereo images from random places of a sequence, without a guess.
+"""Localize-only in a saved map: single stereo images from random places of a sequence, without a prior.
 
-The map is made by a run over the source (or taken from --map), saved, and loaded again. The questions are images from
+The map is made by a run over the source (or taken from --map), saved, and loaded again. The queries are images from
 poses between those of the sequence: shifted by up to 20 cm to the side and turned by up to 10 degrees. A second round
 does the same in the store after a fifth of the products was exchanged.
 
@@ -60,7 +60,7 @@ def make_map(spec: str, stored: Path | None) -> SavedMap:
 
 
 def alignment(saved: SavedMap, source: SimSource) -> F64:
-    """world_T_map (4, 4): the map's keyframes laid on their true poses."""
+    """world_T_map (4, 4): aligns the map's keyframes with their true poses."""
     assert source.ground_truth is not None
     truth = dict(zip(source.ground_truth.stamp_ns.tolist(), source.ground_truth.poses, strict=True))
     true = np.array([truth[s] for s in saved.snapshot.stamp_ns.tolist()])
@@ -84,7 +84,7 @@ def questions(source: SimSource, count: int, seed: int) -> Iterator[tuple[Stereo
 
 
 def ask(saved: SavedMap, world_T_map: F64, source: SimSource, count: int, seed: int) -> tuple[int, int]:
-    """Print one round; returns how many answers were good, and how many were wrong."""
+    """Print one round; returns the numbers of correct and wrong results."""
     relocalizer = Relocalizer(saved.snapshot, saved.rig, default_vocabulary(), Config().loop)
     good = wrong = found = 0
     times: list[float] = []

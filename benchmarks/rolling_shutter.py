@@ -1,8 +1,8 @@
-"""What knowing the times of the rows is worth, with cameras that expose them one after the other.
+"""Effect of the rolling-shutter model, on cameras with a rolling shutter.
 
     python benchmarks/rolling_shutter.py [SOURCE ...]
 
-Every source is run with the readout of its calibration, and as if all rows were exposed at once. ATE is the RMSE after
+Every source is run with the readout of its calibration, and with a global shutter instead. ATE is the RMSE after
 SE(3) alignment, in brackets after Sim(3) alignment.
 """
 

@@ -1,4 +1,4 @@
-"""One result whatever the scheduling: inline once, then as processes ten times with random delays in every stage.
+"""The same result with any scheduling: inline once, then as processes ten times with random delays in every stage.
 
     python -m benchmarks same_bits -- [SOURCE] [--runs 10]
 

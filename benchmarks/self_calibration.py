@@ -1,14 +1,14 @@
-"""Does a rig that is wrong correct itself, and is a true one left alone? Simulated stores, by camera and seed.
+"""Self-calibration of wrong and of true rigs in simulated stores, by camera and seed.
 
     python benchmarks/self_calibration.py                       every camera, seeds 0 to 9: minutes each
     python benchmarks/self_calibration.py --seeds 2 --size 424x400 --camera fisheye
     python benchmarks/self_calibration.py --what knock drift
 
-Each seed is another store, rendered once and tracked with each belief about the rig: the true one; right cameras turned
-about x, y and z by 0.05 to 0.3 degrees; a knock of 0.2 degrees in the middle; a slow turn of 0.1 degrees over the run.
-A row says what was left of the error in degrees, the map's ATE over that of the true rig, and when it was noticed.
-The last lines judge: errors left (0.005 degrees, 0.01 about the axis that trades with range), ATE (1.1 times that of
-the true rig, a knock 1.5), knocks noticed within 5 s, true rigs changed (none).
+Each seed is another store, rendered once and tracked with several calibrations: the true one; right cameras rotated
+about x, y and z by 0.05 to 0.3 degrees; a step of 0.2 degrees in the middle; a slow rotation of 0.1 degrees over the
+run. A row has the remaining error in degrees, the map's ATE relative to that of the true rig, and the time of the first
+correction. The last lines check: remaining errors (0.005 degrees, 0.01 about the axis that is correlated with range),
+ATE (1.1 times that of the true rig, with a step 1.5), steps detected within 5 s, true rigs changed (none).
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def turned(rig: Rig, degrees: tuple[float, float, float], share: float = 1.0) ->
 
 
 class Rendered(BaseSource):
-    """A source of images that are rendered already, with any belief about the rig."""
+    """A source of rendered images with any calibration."""
 
     def __init__(self, images: list[StereoImage], rig: Rig, ground_truth: Trajectory | None) -> None:
         self.name, self.rig, self.ground_truth = "rendered", rig, ground_truth
@@ -63,7 +63,7 @@ class Rendered(BaseSource):
 class Result:
     """One run."""
 
-    left_deg: F64  # (3,) what is still wrong of the rig that is true at the end
+    left_deg: F64  # (3,) remaining error of the rig at the end
     ate_m: float
     changes: int
     noticed_s: float  # first change
@@ -84,7 +84,7 @@ def render(camera: str, seed: int, args: argparse.Namespace, how: str) -> tuple[
 
 
 def measure(images: list[StereoImage], believed: Rig, true: Rig, truth: Trajectory, mode: str = "auto") -> Result:
-    """Run with a belief and compare with the truth."""
+    """Run with a calibration and compare with the truth."""
     config = configuration.load(None, [f"self_calibration.mode={mode}"])
     record = RunRecord.of(config)
     cv2.setRNGSeed(0)
@@ -109,7 +109,7 @@ def row(name: str, result: Result, base: float) -> None:
 
 
 def static(camera: str, seed: int, args: argparse.Namespace, bad: list[str]) -> None:
-    """The true rig, and turned ones."""
+    """The true rig, and rotated ones."""
     images, rig, truth = render(camera, seed, args, "still")
     true = measure(images, rig, rig, truth)
     row("true", true, true.ate_m)
@@ -123,7 +123,7 @@ def static(camera: str, seed: int, args: argparse.Namespace, bad: list[str]) -> 
 
 
 def moving(camera: str, seed: int, args: argparse.Namespace, how: str, bad: list[str]) -> None:
-    """A rig that changes during the run, against one that does not."""
+    """A rig that changes during the run, compared with one that does not."""
     still, rig, truth = render(camera, seed, args, "still")
     base = measure(still, rig, rig, truth).ate_m
     images, after, truth = render(camera, seed, args, how)
@@ -137,7 +137,7 @@ def moving(camera: str, seed: int, args: argparse.Namespace, how: str, bad: list
 
 
 def main() -> int:
-    """Print the table; exit code 3 when something does not hold."""
+    """Print the table; exit code 3 if a check fails."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--what", nargs="*", default=["static", "knock", "drift"])
     parser.add_argument("--camera", nargs="*", default=list(CAMERAS))

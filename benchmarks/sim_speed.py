@@ -1,8 +1,8 @@
-"""How fast the simulated store renders: stereo frames a second on one core, over frames spread along each scene.
+"""Rendering speed of the simulated store: stereo frames a second on one core, for frames spread over each scene.
 
     python benchmarks/sim_speed.py [SOURCE ...]
 
-CPU seconds of this process, single-threaded; each frame counts with the fastest of three renderings.
+CPU seconds of this process, single-threaded; for each frame the fastest of three renderings is used.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ FRAMES, REPEATS = 12, 3
 
 
 def _best(render: Callable[[int], object], frame_id: int) -> float:
-    """CPU seconds of the fastest of REPEATS: other programs that share the caches only ever add."""
+    """CPU seconds of the fastest of REPEATS: other programs on the machine only add to the time."""
     taken = list[float]()
     for _ in range(REPEATS):
         begin = time.process_time()

@@ -1,9 +1,9 @@
-"""The tracking step beside `cv2.ORB_create(1000).detectAndCompute` on both images of the same frame, one thread.
+"""The tracking step compared with `cv2.ORB_create(1000).detectAndCompute` on both images of the same frame, one thread.
 
     python benchmarks/speed.py [--frames N] [SOURCE ...]
 
 Both are timed frame by frame in one run, so that a busy machine slows both. Reading and rendering images is not timed,
-nor are the first frames, in which code is compiled. RGB-D frames have one image: it counts twice.
+nor are the first frames, in which code is compiled. RGB-D frames have one image, which is processed twice.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from stereo_sfm.tracking.factory import make_tracker
 from stereo_sfm.types import StereoImage
 
 WARM_UP = 10  # frames
-SMALL = 20  # sequences with fewer frames say nothing about speed
+SMALL = 20  # sequences with fewer frames are too short for timing
 HEADING = (
     "| sequence | image | frames | tracking step p50 | p95 | ORB on both images p50 | ratio of medians | points p50 |",
     "|---|---|---|---|---|---|---|---|",

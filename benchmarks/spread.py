@@ -1,7 +1,7 @@
-"""How far errors move when nothing that matters changes: nine runs with slightly other keyframe and corner thresholds.
+"""Random spread of the errors: nine runs with slightly different keyframe and corner thresholds.
 
-Which corner is taken and which frame becomes a keyframe is chance; a single run's error holds it. Two versions of the
-program, or odometry and map, differ where their means differ by more than this spread.
+Which corner is selected and which frame becomes a keyframe is partly chance, and so is a single run's error. Two
+versions of the program, or odometry and map, differ where their means differ by more than this spread.
 
     python benchmarks/spread.py [SEQUENCE ...]
 """

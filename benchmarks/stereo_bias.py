@@ -6,7 +6,7 @@ SOURCE: a simulated scene (default: two stores), or a folder of rendered pairs a
 (`left/ right/ range/ rig.json`). A right pixel's error is taken along its epipolar curve, positive towards nearer,
 against the range at the left pixel. New points are what `StereoMatcher.match` accepts of the corners of an image;
 followed ones are found by `follow` from distances that are off by half a percent. Per group: how many, mean and median
-in px, share beyond 0.3 px, and the mean relative error of the inverse distance, which is what bends the scale.
+in px, share beyond 0.3 px, and the mean relative error of the inverse distance, which biases the scale.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from stereo_sfm.types import F32, F64, U8, Trajectory
 SOURCES = ("sim:sparse?seed=0", "sim:sparse?seed=3&walk=3&camera=pinhole", "sim:loop?seed=0")
 WINDOW = 15  # px
 CLIP = 0.1  # of relative errors
-OFF = 0.005  # relative, of the distances that followed points are predicted with
+OFF = 0.005  # relative error of the distances with which followed points are predicted
 GROUPS: dict[str, tuple[float, ...]] = {
     "disparities in the window, px": (0, 0.5, 1, 2, 4, 99),
     "angle from the axis, deg": (0, 30, 50, 65, 76, 95),
@@ -70,7 +70,7 @@ def read_pairs(folder: Path) -> tuple[Rig, Iterator[Pair]]:
 
 
 def simulated_pairs(source: SimSource, every: int, count: int) -> Iterator[Pair]:
-    """Every so manieth frame with its range."""
+    """Every `every`-th frame with its range."""
     for frame_id in source.frame_ids[::every][:count].tolist():
         image = source.frame(frame_id)
         assert image.right is not None
@@ -78,7 +78,7 @@ def simulated_pairs(source: SimSource, every: int, count: int) -> Iterator[Pair]
 
 
 class Truth:
-    """What the ranges of one left image say about the right one."""
+    """True right pixels by the ranges of one left image."""
 
     def __init__(self, rig: Rig, metres: F32) -> None:
         assert rig.right is not None
@@ -113,7 +113,7 @@ def _nearest(image: F32, uv: F64) -> F64:
 
 
 def _bilinear(image: F32, uv: F64) -> F64:
-    """Between the pixels where they are alike, else the nearest one's value."""
+    """Interpolated between pixels of similar value, else the nearest pixel's value."""
     u, v = np.floor(uv).astype(np.int64).T
     a, b = (uv - np.floor(uv)).T
     corners = np.stack([image[v, u], image[v, u + 1], image[v + 1, u], image[v + 1, u + 1]]).astype(float)
@@ -167,7 +167,7 @@ def line(label: str, rows: F64) -> str:
 
 
 def table(name: str, found: dict[str, F64]) -> None:
-    """Print what was found on one source."""
+    """Print the results of one source."""
     print(
         f"\n{name}\n\n| points | number | mean px | median px | beyond 0.3 px | relative |\n|---|---|---|---|---|---|"
     )

@@ -1,4 +1,4 @@
-"""A simulated T265 at 30 Hz through the real driver for a minute: frames lost, and what the driver costs.
+"""A simulated T265 at 30 Hz through the real driver for a minute: frames lost, and the processor time of the driver.
 
 Run: python -m benchmarks.t265_stream [--seconds 60] [--images room] [--faults none]
 """

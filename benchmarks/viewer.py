@@ -1,11 +1,11 @@
-"""What the viewer costs: its own process, and the others beside it.
+"""Processor time of the viewer: of its own process, and of the others.
 
     python benchmarks/viewer.py [--source SPEC] [--pairs N] [--frames N]
 
-The pipeline of processes runs over the source with and without the viewer in turn. What is counted is the processor
-time of each process a frame, from the frame after the warm-up on: it does not depend on how many cores there are for
-them. The viewer writes to a file, which is what it does for a window as well, without drawing. "hub" is the main
-process, which passes the messages on and copies the pictures that are shown.
+The pipeline of processes runs over the source with and without the viewer in turn. The processor time of each process
+per frame is measured after the warm-up: it does not depend on the number of cores. The viewer writes to a file, which
+is what it does for a window as well, without drawing. "hub" is the main process, which passes the messages on and
+copies the images that are shown.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def spent_ms(process: psutil.Process) -> float:
 
 
 def measure(spec: str, frames: int, viewer: ViewerOptions | None) -> dict[str, float]:
-    """Processor milliseconds a frame of the tracker, the hub, and the viewer when there is one."""
+    """Processor milliseconds a frame of the tracker, the hub, and the viewer, if any."""
     begin: dict[str, float] = {}
     end: dict[str, float] = {}
     seen = 0
