@@ -103,8 +103,7 @@ def _print_loops(name: str, record: RunRecord, by_stamp: dict[int, F64]) -> None
         true = se3.inverse(by_stamp[a.stamp_ns]) @ by_stamp[b.stamp_ns]
         error = se3.inverse(true) @ loop.candidate_T_kf
         print(
-            f"{name}: keyframe {loop.kf_id} at {loop.candidate_kf_id}, {loop.inliers} inliers, score {loop.score:.3f},"
-            f" {1e3 * np.linalg.norm(error[:3, 3]):.1f} mm off"
+            f"{name}: keyframe {loop.kf_id} at {loop.candidate_kf_id}, {1e3 * np.linalg.norm(error[:3, 3]):.1f} mm off"
         )
     if record.loops:
         print(f"{name}: {len(record.loops)} accepted, {Counter(record.rejected).total()} candidates rejected")

@@ -52,7 +52,7 @@ def test_odometry_alone_is_the_same_odometry(recording: tuple[s.Rig, list[s.Ster
     assert all(a.odom_T_cam.tobytes() == b.odom_T_cam.tobytes() for a, b in zip(frames, run, strict=True))
 
 
-def test_a_map_is_saved_loaded_and_asked(recording: tuple[s.Rig, list[s.StereoImage]], tmp_path: Path) -> None:
+def test_a_map_is_saved_loaded_and_queried(recording: tuple[s.Rig, list[s.StereoImage]], tmp_path: Path) -> None:
     rig, images = recording
     with s.System(rig) as system:
         assert list(system.run(images))[-1] is system.frame
@@ -135,7 +135,7 @@ REFUSED: dict[str, tuple[Any, Any, Any, str]] = {
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_is_no_image_of_the_rig_is_one_line(name: str) -> None:
+def test_an_image_that_does_not_fit_the_rig_is_one_line(name: str) -> None:
     left, right, stamp_ns, message = REFUSED[name]
     for step in (s.Tracker(RIG).step, s.System(RIG).step):
         with pytest.raises(s.StereoSfmError) as error:
@@ -150,7 +150,7 @@ def test_stamps_grow() -> None:
         images.image(GREY, GREY, 5)
 
 
-def test_a_source_of_anybody_is_checked_too() -> None:
+def test_a_source_of_the_caller_is_checked_too() -> None:
     small = s.StereoImage(0, 0, GREY[:100].copy(), GREY[:100].copy())
     with pytest.raises(s.StereoSfmError, match="640x100, but the calibration is for 640x480"):
         list(s.run(MemorySource(RIG, [small])))

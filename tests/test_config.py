@@ -47,7 +47,7 @@ from stereo_sfm.tracking.features.step_scale import SCALES
         ("tracker.max_features=many", "tracker.max_features"),
     ],
 )
-def test_what_a_setting_does_not_take_is_refused(override: str, message: str) -> None:
+def test_invalid_values_of_settings_are_rejected(override: str, message: str) -> None:
     with pytest.raises(StereoSfmError) as error:
         load(overrides=[override])
     assert message in str(error.value) and "\n" not in str(error.value)
@@ -83,7 +83,7 @@ def words_of() -> dict[str, tuple[str, ...]]:
     return {name: field.metadata["words"] for name, field, _ in SETTINGS if "words" in field.metadata}
 
 
-def test_every_declared_word_is_taken() -> None:
+def test_every_declared_word_is_accepted() -> None:
     assert len(words_of()) == 10
     for name, words in words_of().items():
         section, key = name.split(".")
@@ -99,7 +99,7 @@ def test_the_words_are_those_of_the_code_that_reads_them() -> None:
     assert words["features.kind"] == set(FEATURES)
 
 
-def test_names_of_earlier_versions_are_taken(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
+def test_names_of_earlier_versions_are_accepted(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
     """From a file with a line that says the new name; from the log of a run without one."""
     logging.getLogger("stereo_sfm").propagate = True
     (tmp_path / "old.toml").write_text("[loop]\npixel_sigma = 2.5\ngate_metres = 0.7\n")
@@ -119,7 +119,7 @@ def test_every_earlier_name_leads_to_a_setting() -> None:
     assert set(RENAMED.values()) <= names and not set(RENAMED) & names
 
 
-def test_an_explained_configuration_says_every_sentence_and_is_read_back() -> None:
+def test_an_explained_configuration_has_every_sentence_and_is_read_back() -> None:
     config = load(overrides=["tracker.max_features=321", "pipeline.cpus.tracker=[0, 1]", "odometry.method=um"])
     text = explain(config)
     assert from_dict(tomllib.loads(text)) == config and from_dict(tomllib.loads(explain(Config()))) == Config()
@@ -128,6 +128,6 @@ def test_an_explained_configuration_says_every_sentence_and_is_read_back() -> No
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_presets_are_taken_and_come_back_from_their_text(name: str) -> None:
+def test_presets_are_applied_and_read_back_from_their_text(name: str) -> None:
     config = load(base=PRESETS[name])
     assert from_dict(tomllib.loads(dump(config))) == config

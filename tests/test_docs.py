@@ -43,7 +43,7 @@ def test_ci_runs_the_second_command() -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_nothing_local(page: Path) -> None:
+def test_no_local_paths(page: Path) -> None:
     assert not re.search(r"/work/|/home/|/root/|localhost|https?://[0-9]", page.read_text())
 
 

@@ -45,7 +45,7 @@ def test_missing_extra_is_one_line(
     assert len(lines) == 1 and f"needs {library}" in lines[0] and f"stereo-sfm[{extra}" in lines[0]
 
 
-def test_extras_hold_what_their_names_say() -> None:
+def test_extras_contain_what_their_names_promise() -> None:
     extras = PROJECT["optional-dependencies"]
     core = " ".join(PROJECT["dependencies"])
     libraries = {"viewer": "rerun-sdk", "t265": "pyusb", "oak": "depthai", "batch": "ray", "ros": "rosbags"}

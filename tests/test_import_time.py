@@ -30,7 +30,7 @@ def test_fast_and_without_heavy_imports(code: str) -> None:
     assert float(seconds) < LIMIT_S  # of the processor: on a busy machine the clock on the wall says nothing
 
 
-def test_help_of_every_command_needs_nothing_heavy() -> None:
+def test_help_of_every_command_imports_no_heavy_library() -> None:
     code = (
         "import sys, stereo_sfm.cli as c\n"
         "for name in c.COMMANDS:\n"
@@ -52,7 +52,7 @@ def test_every_public_name_can_be_had() -> None:
 
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])
-def test_a_reader_that_goes_away_is_no_error(unbuffered: str) -> None:
+def test_a_closed_pipe_is_not_an_error(unbuffered: str) -> None:
     """As `| head -1`, whether the output is buffered or not."""
     command = [sys.executable, "-c", "import sys, stereo_sfm.cli as c; sys.exit(c.main())", "config", "dump"]
     environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}

@@ -31,7 +31,7 @@ def test_a_tree_that_can_be_written_to_holds_its_kernels(monkeypatch: pytest.Mon
     assert choose_folder(ROOT) is None
 
 
-def test_without_tree_and_home_they_go_to_temporary_files_of_this_user_alone(read_only: Path) -> None:
+def test_without_tree_and_home_they_are_temporary_files_of_this_user(read_only: Path) -> None:
     folder = choose_folder(read_only / "tree")
     assert folder == read_only / "temporary" / f"stereo-sfm-{os.getuid()}"
     assert folder.stat().st_mode & 0o777 == 0o700
@@ -48,7 +48,7 @@ def test_a_folder_that_others_may_write_to_is_not_trusted(read_only: Path) -> No
     assert not private(read_only / "link")
 
 
-def test_what_was_compiled_at_the_installation_is_taken_along(tmp_path: Path) -> None:
+def test_code_compiled_at_the_installation_is_reused(tmp_path: Path) -> None:
     cache = tmp_path / "stereo_sfm" / "geometry" / "__pycache__"
     cache.mkdir(parents=True)
     (cache / "kernels.f-1.py311.nbi").write_bytes(b"index")
@@ -57,7 +57,7 @@ def test_what_was_compiled_at_the_installation_is_taken_along(tmp_path: Path) ->
     assert [p.read_bytes() for p in (tmp_path / "kept").rglob("*.nbi")] == [b"index"]
 
 
-def test_listening_tells_what_is_compiled() -> None:
+def test_compilations_are_reported() -> None:
     told: list[str] = []
     kernel = kernel_cache.numba.njit(lambda x: x + 1)
     with listening(told.append) as compilation:

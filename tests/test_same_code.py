@@ -39,7 +39,7 @@ def test_nothing_beyond_avx2_is_used() -> None:
     assert not [name for name, used in told(code).items() if used and name in ("X86_V4", "AVX512_ICL", "AVX512_SPR")]
 
 
-def test_what_is_set_or_loaded_is_left_alone() -> None:
+def test_existing_settings_are_kept() -> None:
     assert "Nehalem" in told(f"import stereo_sfm; {TELL}", OPENBLAS_CORETYPE="Nehalem")["blas"]
     late = f"import numpy, stereo_sfm, os, json; print(json.dumps({{k: os.environ.get(k, '') for k in {SET!r}}}))"
     assert [value for name, value in told(late).items() if name != CHOICE] == ["", "", ""]
@@ -47,7 +47,7 @@ def test_what_is_set_or_loaded_is_left_alone() -> None:
     assert told(child)["blas"] == told(f"import numpy; {TELL}")["blas"]  # a child computes as its parent does
 
 
-def test_processors_without_avx2_are_left_alone() -> None:
+def test_processors_without_avx2_are_unchanged() -> None:
     assert variables(frozenset({"sse4_2"})) == {}
     assert variables(AVX2) == {"OPENBLAS_CORETYPE": "Haswell"}
     assert "AVX512-SKX" in variables(AVX2 | {"avx512f"})["OPENCV_CPU_DISABLE"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,7 @@ REJECTIONS = {
     "not_confirmed_yet": "not enough successive keyframes agree on the loop yet",
 }
 FEW_INLIERS = 60  # median points per frame below which the pose is poorly constrained
-LEAST_LENGTH_M = 1.0  # shortest path whose length is compared
+MIN_LENGTH_M = 1.0  # shortest path whose length is compared
 BIG_SCALE_ERROR = 0.02  # Sim(3) scale error above which the baseline is suspected
 
 
@@ -55,7 +56,7 @@ def write_report(
         estimates: trajectories by name ("odometry", "map").
         reference: ground truth in its own frame, or None.
         evaluations: of the estimates, by the same names, where there is ground truth.
-        go_on: asked before each picture; the rest is left out once it says no.
+        go_on: called before each picture; when it returns False, the remaining ones are omitted.
     """
     lines = [f"# {source_name}", "", *(f"* {line}" for line in summary(stats, evaluations)), "", "## Verdict", ""]
     lines += [f"* {verdict}" for verdict in verdicts(stats, evaluations)]
@@ -79,7 +80,7 @@ def write_report(
     ]
     lines += ["the time from the arrival of an image to its pose."]
     with (folder / "report.md").open("w", encoding="utf-8") as report:
-        report.write("\n".join(lines) + "\n")
+        report.write("\n".join([*lines, "", _glossary(folder), ""]))
         for name, draw in _pictures(folder, record, stats, estimates, evaluations).items():
             report.flush()
             if not go_on():
@@ -87,6 +88,13 @@ def write_report(
                 break
             draw()
             report.write(f"\n![{name}]({name}.png)\n")
+
+
+def _glossary(folder: Path) -> str:
+    """Where the terms are explained: a link in a checkout, else the page's name in the documentation."""
+    page = Path(__file__).resolve().parents[2] / "docs" / "glossary.md"
+    link = f"[glossary]({os.path.relpath(page, folder.resolve())})" if page.is_file() else "glossary (docs/glossary.md)"
+    return f"The {link} explains the terms."
 
 
 def _rejections(counts: dict[str, int]) -> list[str]:
@@ -104,7 +112,7 @@ def _pictures(
     estimates: dict[str, Trajectory],
     evaluations: dict[str, Evaluation],
 ) -> dict[str, Callable[[], None]]:
-    """What draws each picture, by its name."""
+    """Functions that draw the plots, by name."""
     pictures: dict[str, Callable[[], None]] = {}
     aligned = {name: result.estimate for name, result in evaluations.items()}
     shown = aligned or {name: t for name, t in estimates.items() if len(t)}
@@ -163,7 +171,7 @@ def verdicts(stats: dict[str, Any], evaluations: dict[str, Evaluation]) -> list[
 def _length(name: str, result: Evaluation) -> str:
     """Whether a path is too long or too short; "" if it is too short to decide or has no scale."""
     off = 1 / result.sim3_scale - 1
-    if result.mode == "sim3" or result.length_m < LEAST_LENGTH_M or not abs(result.sim3_scale - 1) > BIG_SCALE_ERROR:
+    if result.mode == "sim3" or result.length_m < MIN_LENGTH_M or not abs(result.sim3_scale - 1) > BIG_SCALE_ERROR:
         return ""
     how = "long" if off > 0 else "short"
     return f"**WARN**: {name} is {abs(100 * off):.1f} % too {how}: check the baseline and the calibration"

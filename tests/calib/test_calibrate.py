@@ -67,7 +67,7 @@ def test_exact_corners_give_the_exact_rig(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", RIGS)
-def test_deviations_say_how_wrong_the_parameters_are(name: str) -> None:
+def test_deviations_predict_the_errors_of_the_parameters(name: str) -> None:
     rig = make_rig(name)
     scores: list[np.ndarray] = []
     for seed in range(2):
@@ -148,7 +148,7 @@ def test_aprilgrid_layout_is_kalibrs(data_root: Path) -> None:
     assert np.median(np.linalg.norm(mapped - detection.uv, axis=1)) < 4  # lens distortion only; wrong corners give 50
 
 
-def test_command_on_a_few_real_pictures(data_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_on_a_few_real_images(data_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pictures = tmp_path / "images"
     pictures.mkdir()
     for path in (data_root / "calib_aprilgrid_euroc").glob("*.jpg"):

@@ -31,7 +31,7 @@ def test_a_turn_put_into_a_real_calibration_is_found(folder: str, data_root: Pat
     assert again is not None and np.array_equal(again.rig.left_T_right, found.rig.left_T_right)
 
 
-def test_pictures_without_points_give_no_answer(data_root: Path) -> None:
+def test_images_without_points_give_no_result(data_root: Path) -> None:
     with open_source(data_root / "euroc_mh01") as source:
         blank = np.full((480, 752), 99, np.uint8)
         assert align_cameras(source.rig, [StereoImage(0, 0, blank, blank.copy())]) is None

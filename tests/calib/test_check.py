@@ -84,7 +84,7 @@ def test_a_true_rig_needs_no_correction(name: str) -> None:
 
 @pytest.mark.parametrize("name", RIGS)
 @pytest.mark.parametrize("degrees", [(0.2, 0, 0), (0, 0.2, 0), (0, -0.2, 0), (0, 0, -0.2)])
-def test_a_turned_eye_is_measured(name: str, degrees: tuple[float, float, float]) -> None:
+def test_a_turned_camera_is_measured(name: str, degrees: tuple[float, float, float]) -> None:
     wrong = turned(RIGS[name], degrees)
     correction = estimate(wrong, SEEN[name])
     np.testing.assert_allclose(np.rad2deg(correction.amount[TURN]), -np.array(degrees), atol=0.02)
@@ -107,7 +107,7 @@ def test_the_same_input_gives_the_same_bits() -> None:
     assert np.array_equal(first.vector, again.vector) and np.array_equal(first.amount, again.amount)
 
 
-def test_a_still_camera_does_not_show_the_focal_length_of_both_eyes() -> None:
+def test_a_still_camera_does_not_show_the_focal_length_of_both_cameras() -> None:
     still = windows(RIGS["pinhole"], motion=0.001, count=1)
     for factor in (1.0, 1.02, 0.98):
         rig = magnified(RIGS["pinhole"], factor, factor)
@@ -118,7 +118,7 @@ def test_a_still_camera_does_not_show_the_focal_length_of_both_eyes() -> None:
     assert finding(check(one, rectify(one), still), "focal length, right relative to left").level == 2
 
 
-def test_one_window_does_not_show_the_focal_length_of_both_eyes() -> None:
+def test_one_window_does_not_show_the_focal_length_of_both_cameras() -> None:
     rig = magnified(RIGS["pinhole"], 0.98, 0.98)
     both = [finding(check(rig, rectify(rig), SEEN["pinhole"][:n]), "focal length, both cameras") for n in (1, 2)]
     assert [(f.judged, f.level) for f in both] == [(False, 0), (True, 2)]

@@ -16,7 +16,7 @@ from stereo_sfm.geometry import se3
 from tests.synthetic import fisheye_rig
 
 
-def test_the_command_knows_every_format() -> None:
+def test_the_command_supports_every_format() -> None:
     assert tuple(FORMATS) == NAMES
 
 
@@ -38,7 +38,7 @@ def test_there_and_back(tmp_path: Path, name: str, capsys: pytest.CaptureFixture
 
 
 @pytest.mark.parametrize("name", [n for n, (*_, folder) in FORMATS.items() if not folder])
-def test_a_file_is_known_by_its_content(tmp_path: Path, name: str) -> None:
+def test_a_file_is_recognised_by_its_content(tmp_path: Path, name: str) -> None:
     rig = rectify(fisheye_rig(), "pinhole").rig if name == "kitti" else fisheye_rig()
     save_rig(rig, tmp_path / "calibration", name)
     assert recognise(tmp_path / "calibration") == name

@@ -117,13 +117,13 @@ def test_a_readout_that_a_dialect_cannot_state(tmp_path: Path, caplog: pytest.Lo
     assert load_rig(tmp_path / "rig.yaml").readout_s == 0.0
 
 
-def test_a_readout_in_milliseconds_is_told() -> None:
+def test_a_readout_in_milliseconds_is_rejected() -> None:
     with pytest.raises(StereoSfmError, match="readout of 28 s; give the seconds"):
         Rig(FISHEYE.left, readout_s=28.0)
 
 
 @pytest.mark.parametrize("name", [n for n in FORMATS if n not in ("kitti", "depthai")])
-def test_one_eye(tmp_path: Path, name: str) -> None:
+def test_one_camera(tmp_path: Path, name: str) -> None:
     rig = Rig(FISHEYE.left)
     save_rig(rig, target(tmp_path, name), name)
     back = load_rig(target(tmp_path, name), name)

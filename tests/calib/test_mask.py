@@ -49,7 +49,7 @@ def test_rig_file_keeps_masks(images: tuple[Rig, list[StereoImage]], tmp_path: P
     assert "50 % masked" in rig_lines(again)[0] and "masked" not in " ".join(rig_lines(images[0]))
 
 
-def test_rig_file_names_a_mask_file_beside_it(images: tuple[Rig, list[StereoImage]], tmp_path: Path) -> None:
+def test_a_rig_file_names_a_mask_file_in_its_folder(images: tuple[Rig, list[StereoImage]], tmp_path: Path) -> None:
     rig = images[0]
     (tmp_path / "left.png").write_bytes(encode_mask(lower_half(rig)))
     head, _, tail = rig_to_text(rig).partition("left:\n")
@@ -72,7 +72,7 @@ def test_unusable_masks_are_one_line(images: tuple[Rig, list[StereoImage]]) -> N
         replace(rig, right_mask=np.zeros((200, 320), bool))
 
 
-def test_no_detector_looks_below_a_mask(images: tuple[Rig, list[StereoImage]]) -> None:
+def test_no_detector_finds_corners_under_a_mask(images: tuple[Rig, list[StereoImage]]) -> None:
     rig, frames = images[0], images[1]
     covered = replace(rig, left_mask=lower_half(rig), right_mask=lower_half(rig))
     limit = rig.left.height / 2
@@ -135,12 +135,12 @@ def test_robot_in_view_is_found() -> None:
         assert mask[~sensor.robot.covered].mean() > 0.9  # of the world stays
 
 
-def test_world_is_not_taken_for_the_robot() -> None:
+def test_the_scene_is_not_masked() -> None:
     search, _ = searched(SCENE + "&frames=400")
     assert all(not found.fixed.any() and found.used.all() for found in search.find())
 
 
-def test_recording_without_turns_cannot_tell() -> None:
+def test_a_recording_without_turns_is_rejected() -> None:
     search, _ = searched("sim:aisle?camera=pinhole&size=320x200&rate=5&frames=60")
     assert not search.turned
     with pytest.raises(StereoSfmError, match="record a drive with a turn"):

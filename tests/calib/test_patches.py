@@ -20,7 +20,7 @@ def picture(u: F64, v: F64) -> F32:
 
 
 @pytest.mark.parametrize("gain", [1.0, 0.6])
-def test_a_stretched_and_darker_picture_is_followed(gain: float) -> None:
+def test_a_stretched_and_darker_image_is_followed(gain: float) -> None:
     v, u = np.mgrid[0:120, 0:160].astype(float)
     stretch = np.array([[1.15, 0.06], [-0.04, 1.1]])
     shift = np.array([-6.4, 3.3])
@@ -37,7 +37,7 @@ def test_a_stretched_and_darker_picture_is_followed(gain: float) -> None:
     np.testing.assert_allclose(np.median(warp.stretch[inside & good], axis=0), stretch, atol=0.01)
 
 
-def test_what_is_not_there_is_not_found() -> None:
+def test_occluded_windows_are_not_found() -> None:
     v, u = np.mgrid[0:80, 0:80].astype(float)
     uv = np.array([[30.0, 30], [45, 40], [40, 55]])
     noise = np.random.default_rng(0).uniform(0, 255, (80, 80)).astype(np.float32)

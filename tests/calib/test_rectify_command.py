@@ -33,7 +33,7 @@ def test_rendered_fisheye_rows_agree_below_a_tenth_of_a_pixel() -> None:
             assert np.mean(np.abs(matches.row_error) < 0.5) > 0.9
 
 
-def test_the_matcher_sees_a_turned_eye() -> None:
+def test_the_matcher_sees_a_turned_camera() -> None:
     from dataclasses import replace
 
     with open_source(SIM) as source:
@@ -47,7 +47,7 @@ def test_the_matcher_sees_a_turned_eye() -> None:
     assert abs(np.median(matches.row_error)) == pytest.approx(expected, abs=0.15)
 
 
-def test_command_writes_pictures_rig_and_row_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_writes_images_rig_and_row_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "rect"
     assert main(["rectify", SIM, "-o", str(out), "--frames", "2"]) == 0
     text = capsys.readouterr().out

@@ -99,7 +99,7 @@ def test_calibration_with_a_transform_that_is_not_rigid(cli: Run, tmp_path: Path
     assert_one_line(cli("run", root))
 
 
-def test_rig_file_that_is_not_there(cli: Run, tmp_path: Path) -> None:
+def test_a_missing_rig_file(cli: Run, tmp_path: Path) -> None:
     assert_one_line(cli("run", make_images(tmp_path / "data"), "--rig", "other.yaml"), "other.yaml")
 
 
@@ -211,7 +211,7 @@ def test_file_that_is_no_mcap(cli: Run, tmp_path: Path) -> None:
         (("--start", "1000"), "no frames selected"),
     ],
 )
-def test_options_that_mean_nothing(cli: Run, tmp_path: Path, args: tuple[str, ...], word: str) -> None:
+def test_invalid_options(cli: Run, tmp_path: Path, args: tuple[str, ...], word: str) -> None:
     assert_one_line(cli("run", make_images(tmp_path / "data"), *args), word)
 
 
@@ -284,7 +284,7 @@ def test_errors_that_are_not_of_a_file_keep_their_traceback(monkeypatch: pytest.
 
 
 @pytest.mark.parametrize("speed", ["0", "-1", "nan"])
-def test_a_speed_that_means_nothing(cli: Run, tmp_path: Path, speed: str) -> None:
+def test_an_invalid_speed(cli: Run, tmp_path: Path, speed: str) -> None:
     assert_one_line(cli("run", make_images(tmp_path / "data"), "--speed", speed, "--processes"), "speed", "above 0")
 
 
@@ -339,7 +339,7 @@ def test_info_warns_once_of_a_truncated_file(cli: Run, tmp_path: Path) -> None:
     assert len(cli("info", "cut.mcap")[2].splitlines()) == 1  # and each time it is asked
 
 
-def test_a_recording_of_nothing_leaves_no_file(cli: Run) -> None:
+def test_an_empty_recording_leaves_no_file(cli: Run) -> None:
     source = "sim:aisle?camera=pinhole&size=64x48&frames=2"
     assert_one_line(cli("record", source, "-o", "a.mcap", "--start", "1000"), "no frames selected")
     assert not Path("a.mcap").exists()
@@ -351,7 +351,7 @@ def test_a_map_has_no_odometry(cli: Run, tmp_path: Path) -> None:
     assert_one_line(cli("export", "map", "--format", "tum", "--which", "odom"), "not the odometry")
 
 
-def test_overwriting_a_run_leaves_nothing_of_it(cli: Run, tmp_path: Path) -> None:
+def test_overwriting_a_run_removes_all_its_files(cli: Run, tmp_path: Path) -> None:
     folder = tmp_path / "a"
     (folder / "matches").mkdir(parents=True)
     old = [folder / "export_map.tum", folder / "matches" / "000003.png", folder / "trajectory_map.kitti"]
@@ -375,7 +375,7 @@ def test_a_map_is_not_written_over_something_else(cli: Run, tmp_path: Path, comm
 
 @pytest.mark.parametrize("option", ["--max-frames", "--search", "--windows"])
 @pytest.mark.parametrize("value", [0, -3])
-def test_check_calib_of_nothing(cli: Run, option: str, value: int) -> None:
+def test_check_calib_without_images(cli: Run, option: str, value: int) -> None:
     assert_one_line(cli("check-calib", "sim:aisle?frames=3", option, value), f"{option} must be at least 1")
 
 
@@ -408,7 +408,7 @@ def test_names_of_a_batch_are_unique() -> None:
     assert names(["d1/a.mcap", "d2/a.mcap", "a_1.mcap"]) == ["a_2", "a_3", "a_1"]
 
 
-def test_export_takes_a_rig_only_for_pictures(cli: Run, tmp_path: Path) -> None:
+def test_export_takes_a_rig_only_for_images(cli: Run, tmp_path: Path) -> None:
     (tmp_path / "map").mkdir()
     assert_one_line(cli("export", "map", "--format", "colmap", "--rig", "rig.yaml"), "--rig goes with --images")
 
@@ -440,9 +440,7 @@ def test_files_are_replaced_only_when_asked(cli: Run, tmp_path: Path, args: tupl
         (("-o", "rig.yaml", "--report", "data", "--overwrite"), "it is a folder"),
     ],
 )
-def test_calibrate_knows_before_it_searches_where_it_cannot_write(
-    cli: Run, tmp_path: Path, args: tuple[str, ...], word: str
-) -> None:
+def test_calibrate_checks_its_output_files_first(cli: Run, tmp_path: Path, args: tuple[str, ...], word: str) -> None:
     make_images(tmp_path / "data")
     (tmp_path / "file").write_text("years of work")
     assert_one_line(cli("calibrate", "data", *TARGET, *args), word)
@@ -462,7 +460,7 @@ def test_rectify_with_a_wrong_calibration_replaces_nothing(cli: Run, tmp_path: P
     assert (tmp_path / "out" / "rig.yaml").read_text() == "years of work"
 
 
-def test_nothing_is_written_over_what_is_read(cli: Run, tmp_path: Path) -> None:
+def test_input_files_are_not_overwritten(cli: Run, tmp_path: Path) -> None:
     assert cli("record", "sim:aisle?size=212x200&rate=10", "--max-frames", "3", "-o", "a.mcap", "-q")[0] == 0
     before = (tmp_path / "a.mcap").read_bytes()
     Path("b.mcap").symlink_to("a.mcap")
@@ -477,7 +475,7 @@ def test_nothing_is_written_over_what_is_read(cli: Run, tmp_path: Path) -> None:
     assert (tmp_path / "r" / "run.mcap").read_bytes() == logged
 
 
-def test_a_file_in_the_place_of_the_map_is_told_before_anything_is_computed(cli: Run) -> None:
+def test_a_file_at_the_map_path_is_an_error_before_the_run(cli: Run) -> None:
     Path("m").write_text("x")
     assert_one_line(cli("run", "sim:aisle", "--map-out", "m", "--overwrite"), "m is a file: --map-out takes a folder")
 
@@ -492,7 +490,7 @@ def test_a_file_in_the_place_of_the_map_is_told_before_anything_is_computed(cli:
         ("P1: 50 0 nan -25 0 50 24 0 0 0 1 0", "calib"),
     ],
 )
-def test_a_calibration_that_cannot_be(cli: Run, tmp_path: Path, line: str, message: str) -> None:
+def test_an_impossible_calibration(cli: Run, tmp_path: Path, line: str, message: str) -> None:
     root = make_kitti(tmp_path / "k")
     (root / "sequences" / "00" / "calib.txt").write_text(f"P0: 50 0 32 0 0 50 24 0 0 0 1 0\n{line}\n")
     assert_one_line(cli("run", root), message)

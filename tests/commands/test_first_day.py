@@ -28,7 +28,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_a_run_with_exchanged_cameras_says_so(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_exchanged_cameras_are_reported(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     swapped = tmp_path / "swapped"
     swapped.mkdir()
     (swapped / "left").symlink_to(folder / "right")
@@ -43,7 +43,7 @@ def test_a_run_with_exchanged_cameras_says_so(folder: Path, tmp_path: Path, caps
     assert not (tmp_path / "out" / "tracking.png").exists()
 
 
-def test_a_run_keeps_its_map_and_knows_its_truth(
+def test_a_run_keeps_its_map_and_its_ground_truth(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = tmp_path / "run"

@@ -42,7 +42,7 @@ def test_the_bar_names_each_kernel(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().err.count("first run on this machine") == 1
 
 
-def test_the_time_until_every_stage_is_ready_is_known() -> None:
+def test_the_time_until_every_stage_is_ready_is_measured() -> None:
     with ProcessRun(MadeSource.of(SlidingWall, 3), CONFIG) as run:
         begin = time.perf_counter()
         assert run.began_s is None

@@ -101,7 +101,7 @@ class LateRig(BaseSource):
         return iter(self._source)
 
 
-def test_a_camera_tells_its_calibration_when_it_is_open() -> None:
+def test_the_calibration_of_a_camera_is_read_when_it_is_open() -> None:
     true = open_source(SPEC).rig
     late = LateRig(replace(true, left=replace(true.left, fx=1.05 * true.left.fx)))
     with rectified(late, "pinhole") as a, rectified(open_source(SPEC), "pinhole") as b:
@@ -109,7 +109,7 @@ def test_a_camera_tells_its_calibration_when_it_is_open() -> None:
         assert np.array_equal(next(iter(a)).left, next(iter(b)).left)
 
 
-def test_one_eye_cannot_be_rectified() -> None:
+def test_one_camera_cannot_be_rectified() -> None:
     true = open_source(SPEC).rig
     with pytest.raises(StereoSfmError, match="rectification needs two cameras"):
         rectified(LateRig(Rig(true.left)), "epipolar")

@@ -60,7 +60,7 @@ def test_the_user_may_stop(
     assert len((tmp_path / "c" / "trajectory_odom.tum").read_text().splitlines()) < 8
 
 
-def test_seek_alone_says_what_it_needs(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_seek_alone_is_an_error(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", str(run), "--seek", "2"]) == 2
     assert "--seek goes with --step" in capsys.readouterr().err
 
@@ -102,7 +102,7 @@ def test_the_log_of_a_killed_run_is_compared_as_far_as_it_goes(
 
 
 @pytest.mark.parametrize("options", [("--realtime",), ("--speed", "2"), ("--check", "--until", "1")])
-def test_options_that_a_replay_has_no_use_for(
+def test_options_without_effect_in_a_replay(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[str, ...]
 ) -> None:
     assert main(["replay", str(run), "-o", str(tmp_path / "c"), *options]) == 2

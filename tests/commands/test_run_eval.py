@@ -146,14 +146,16 @@ def test_eval_checks(euroc_run: Path, data_root: Path, capsys: pytest.CaptureFix
     assert "is above 1e-06 m" in capsys.readouterr().err
 
 
-def test_noise_is_not_tracked_and_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_noise_is_not_tracked_and_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root = make_images(tmp_path / "noise")
     assert main(["run", "--inline", str(root), "-o", str(tmp_path / "out")]) == 4
     assert "never initialised" in capsys.readouterr().err
     assert "**FAIL**" in (tmp_path / "out" / "report.md").read_text()
 
 
-def test_lost_frames_are_said_and_filled(data_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_lost_frames_are_reported_and_filled(
+    data_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Twenty-four frames of which three are black and one is no image."""
     folder = tmp_path / "dark"
     with stereo_sfm.open_source(data_root / "euroc_mh01") as source:

@@ -71,13 +71,13 @@ def test_the_map_holds_what_it_is_recognised_by(store: Path, capsys: pytest.Capt
     assert f"{count} corners for place recognition in {len(saved)} keyframes" in capsys.readouterr().out
 
 
-def test_another_sequence_is_placed_in_the_map(tmp_path: Path, store: Path) -> None:
+def test_another_session_is_localized_in_the_map(tmp_path: Path, store: Path) -> None:
     assert second_sequence(tmp_path, store, "--localize-only") == 0
     errors = errors_in_the_map(tmp_path / "run")
     assert len(errors) >= 30 and np.median(errors) < 0.03 and errors.max() < 0.1
 
 
-def test_another_sequence_is_joined_with_the_map(tmp_path: Path, store: Path) -> None:
+def test_another_session_is_merged_with_the_map(tmp_path: Path, store: Path) -> None:
     assert second_sequence(tmp_path, store, "--map-out", str(tmp_path / "both")) == 0
     both: SavedMap = load_map(tmp_path / "both")
     assert both.session_ids == [0, 1]
@@ -101,9 +101,7 @@ def test_without_recognition_there_is_no_place(tmp_path: Path, store: Path, caps
     assert "set loop.enabled=true" in capsys.readouterr().err
 
 
-def test_a_dark_recording_has_no_map_and_says_that_tracking_never_began(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_dark_recording_has_no_map_and_reports_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--duration", "1", "--inline", "-o", str(tmp_path / "run"), "--map-out", str(tmp_path / "map")]
     assert main(["run", "sim:aisle?size=212x200&rate=10&dark=0-20", *options]) == 4
     message = capsys.readouterr().err

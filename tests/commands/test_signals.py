@@ -49,7 +49,7 @@ def test_a_run_that_waits_for_an_image_ends_cleanly(number: signal.Signals, tmp_
     assert (tmp_path / "run" / "report.md").exists()
 
 
-def test_under_nohup_a_closed_terminal_ends_nothing() -> None:
+def test_under_nohup_a_closed_terminal_does_not_end_the_run() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with StopRequest() as stop:

@@ -62,6 +62,6 @@ def test_what_is_read_is_not_overwritten(tmp_path: Path) -> None:
         choice.refuse_to_overwrite(tmp_path)
 
 
-def test_an_unknown_way_to_rectify_is_told() -> None:
+def test_an_unknown_rectification_is_an_error() -> None:
     with pytest.raises(StereoSfmError, match="unknown rectification 'widest'"):
         SourceChoice.of(SPEC, rectify="widest")

@@ -113,7 +113,7 @@ def test_euroc_ground_truth_is_the_left_cameras(tmp_path: Path) -> None:
         assert truth.positions[2] == pytest.approx([2, 1, 3])
 
 
-def test_euroc_pairs_by_stamp_when_one_eye_lacks_frames(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_euroc_pairs_by_stamp_if_one_camera_lacks_frames(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     root = make_euroc(tmp_path)
     listing = root / "mav0" / "cam1" / "data.csv"
     lines = listing.read_text().splitlines()
@@ -125,7 +125,7 @@ def test_euroc_pairs_by_stamp_when_one_eye_lacks_frames(tmp_path: Path, caplog: 
     assert "4 left and 3 right images, the 3 pairs are used" in caplog.text
 
 
-def test_info_tells_of_inertial_samples_and_takes_a_rig(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_lists_inertial_samples_and_accepts_a_rig(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root = make_euroc(tmp_path / "euroc")
     (root / "mav0" / "imu0").mkdir()
     rows = [f"{START_NS + i * 5_000_000},0,0,0,0,0,9.8" for i in range(40)]
@@ -176,7 +176,7 @@ def test_pixels_above_the_range_of_the_sample_are_white() -> None:
     assert eight_bits(image, 10).tolist() == [[0, 255, 255, 255]]
 
 
-def test_tum_rgbd_has_depth_in_metres_and_a_virtual_eye(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_tum_rgbd_has_depth_in_metres_and_a_virtual_camera(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(make_tum_rgbd(tmp_path)) as source:
         images = list(source)
         assert [i.stamp_ns for i in images] == [100 * 10**9, 100_200_000_000]
@@ -267,7 +267,7 @@ def test_images_named_by_time_are_paired_by_time(tmp_path: Path, caplog: pytest.
 
 
 @pytest.mark.parametrize("folder", [make_euroc, None], ids=["euroc", "images"])
-def test_eyes_that_are_never_exposed_together_are_refused_with_their_skew(
+def test_cameras_that_are_never_exposed_together_are_refused_with_their_skew(
     folder: Callable[[Path], Path] | None, tmp_path: Path
 ) -> None:
     if folder is None:
@@ -331,7 +331,7 @@ def test_info_takes_what_run_takes(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "at 10.00 Hz" in capsys.readouterr().out
 
 
-def test_names_that_do_not_tell_the_pairs_are_refused(tmp_path: Path) -> None:
+def test_ambiguous_names_are_rejected(tmp_path: Path) -> None:
     make_images(tmp_path, ["a.png", "b.png", "c.png"])
     for name in "abc":
         (tmp_path / "right" / f"{name}.png").rename(tmp_path / "right" / f"r{name}.png")
@@ -393,7 +393,7 @@ def test_only_unreadable_images_are_an_error(tmp_path: Path) -> None:
         list(source)
 
 
-def test_a_size_that_contradicts_the_calibration_is_said_before_the_first_frame(tmp_path: Path) -> None:
+def test_a_size_that_contradicts_the_calibration_is_an_error_before_the_first_frame(tmp_path: Path) -> None:
     root = make_images(tmp_path)
     rig = root / "rig.yaml"
     rig.write_text(rig.read_text().replace("[64, 48]", "[640, 480]"))
@@ -428,7 +428,7 @@ def test_part_of_a_source(tmp_path: Path) -> None:
         part(start_s=0.32, duration_s=0.01)
 
 
-def test_part_of_a_source_knows_how_many_frames_it_has(tmp_path: Path) -> None:
+def test_a_part_of_a_source_has_the_right_frame_count(tmp_path: Path) -> None:
     source = open_source(make_images(tmp_path))
     assert SelectedFrames(source, frame_skip=5).frame_count == 3
     assert SelectedFrames(source, max_frames=5).frame_count == 5
@@ -464,14 +464,14 @@ def test_ground_truth_that_is_not_finite_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("text", "message"), [("nan", "not a time"), ("1e99", "too large"), ("x", "not a time")])
-def test_times_that_are_none_are_refused(text: str, message: str, tmp_path: Path) -> None:
+def test_invalid_times_are_rejected(text: str, message: str, tmp_path: Path) -> None:
     root = make_kitti(tmp_path)
     (root / "sequences" / "00" / "times.txt").write_text(f"0\n{text}\n0.2\n0.3\n")
     with pytest.raises(StereoSfmError, match=message):
         open_source(root)
 
 
-def test_files_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+def test_a_byte_order_mark_is_skipped(tmp_path: Path) -> None:
     root = make_kitti(tmp_path)
     times = root / "sequences" / "00" / "times.txt"
     times.write_text("\ufeff" + times.read_text(), encoding="utf-8")

@@ -63,7 +63,7 @@ def test_every_state_of_a_t265(oak: FakeOak, monkeypatch: pytest.MonkeyPatch) ->
     assert not any(c.boot_bytes for c in cameras)  # looking boots nothing
 
 
-def test_oaks_are_seen_and_only_probed_when_asked(oak: FakeOak, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_oaks_are_listed_and_only_probed_on_request(oak: FakeOak, monkeypatch: pytest.MonkeyPatch) -> None:
     oak.attached = 2
     found, _ = list_on(SimulatedBus([]), monkeypatch)
     assert [(d.id, d.driver, d.calibrated) for d in found] == [
@@ -78,7 +78,7 @@ def test_oaks_are_seen_and_only_probed_when_asked(oak: FakeOak, monkeypatch: pyt
     assert "another program" in found[0].note
 
 
-def test_a_driver_that_cannot_look_does_not_hide_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failing_driver_does_not_hide_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken() -> None:
         raise DeviceFault("no depthai here")
 

@@ -50,14 +50,14 @@ def test_any_losses_and_any_interleaving_are_accounted_for(data: st.DataObject) 
     assert [p.dropped_before for p in pairs[1:]] == [b - a - 1 for a, b in pairwise(expected)]
 
 
-def test_without_a_known_rate_losses_go_by_the_counter() -> None:
+def test_without_a_known_rate_losses_are_counted_by_the_counter() -> None:
     counters = Counters()
     pairer = Pairer(counters, 0)
     pairs = [p for k in (0, 1, 5) for side in (LEFT, RIGHT) if (p := pairer.push(side, camera_image(k * 3, counter=k)))]
     assert [p.dropped_before for p in pairs] == [0, 0, 3]
 
 
-def test_a_one_eyed_camera_is_noticed() -> None:
+def test_a_camera_that_sends_one_side_is_reported() -> None:
     counters = Counters()
     pairer = Pairer(counters, PERIOD)
     assert not any(pairer.push(LEFT, camera_image(k)) for k in range(40))
@@ -95,7 +95,7 @@ def test_one_time_line_over_two_segments() -> None:
     assert line.last == 701
 
 
-def test_handoff_throws_the_oldest_away_and_says_what_it_weighed() -> None:
+def test_handoff_drops_the_oldest_and_returns_its_weight() -> None:
     queue: Handoff[str] = Handoff(2)
     assert queue.get(0.001) is None
     for name, weight in (("a", 1), ("b", 3), ("c", 1), ("d", 1)):

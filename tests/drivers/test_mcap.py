@@ -144,7 +144,7 @@ def test_baseline_from_the_projection_matrices(tmp_path: Path) -> None:
         (["/a", "/b"], "/a", "/b"),
     ],
 )  # fmt: skip
-def test_the_eyes_are_found_by_name(tmp_path: Path, names: list[str], left: str, right: str) -> None:
+def test_the_cameras_are_found_by_name(tmp_path: Path, names: list[str], left: str, right: str) -> None:
     path = _write(
         tmp_path / "a.mcap", names, [], ["f"] * len(names), transforms=(), image=lambda i, e, f: _raw(i, e, f), count=1
     )
@@ -153,7 +153,7 @@ def test_the_eyes_are_found_by_name(tmp_path: Path, names: list[str], left: str,
     assert (chosen.left, chosen.right) == (left % 1 if "%d" in left else left, right % 2 if "%d" in right else right)
 
 
-def test_three_nameless_images_ask_for_the_topics(tmp_path: Path) -> None:
+def test_three_ambiguous_images_are_an_error(tmp_path: Path) -> None:
     path = _write(
         tmp_path / "a.mcap", ["/x", "/y", "/z"], ["/y/info", "/z/info"], ["f", "left_optical", "right_optical"]
     )
@@ -368,7 +368,7 @@ def test_bad_calibrations_are_one_line(tmp_path: Path, capsys: pytest.CaptureFix
     assert "64x48 but the calibration is for 32x48" in _error(_write(tmp_path / "e.mcap", edit=small), capsys)
 
 
-def test_a_given_rig_stands_in_for_a_missing_calibration(tmp_path: Path) -> None:
+def test_a_given_rig_replaces_a_missing_calibration(tmp_path: Path) -> None:
     from stereo_sfm.calib import save_rig
 
     path = _write(tmp_path / "a.mcap", calibrations=(), transforms=())
@@ -387,7 +387,7 @@ def test_our_own_file_with_a_rig_of_another_size(tmp_path: Path) -> None:
         list(source)
 
 
-def test_a_cut_off_file_of_others_is_read_as_far_as_it_goes(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_truncated_file_of_others_is_read_up_to_its_end(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = _write(tmp_path / "a.mcap", count=400)
     path.write_bytes(path.read_bytes()[:-20_000])
     with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(path) as source:
@@ -429,7 +429,7 @@ def test_info_of_a_dataset_folder(data_root: Path, capsys: pytest.CaptureFixture
     assert "images: 180 at 20.00 Hz" in text and "ground truth: 1830 poses" in text and "baseline 110.08 mm" in text
 
 
-def test_our_own_file_without_the_right_eye_says_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_our_own_file_without_right_images_is_an_error(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     images = stereo_images(40, np.random.default_rng(0))
     whole, without, some = (tmp_path / name for name in ("whole.mcap", "without.mcap", "some.mcap"))
     write_recording(whole, MemorySource(fisheye_rig(), images))
@@ -481,7 +481,7 @@ def _copy_without_right_images(source: Path, path: Path, kept: int) -> None:
         writer.finish()
 
 
-def test_a_clock_that_goes_back_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_clock_that_runs_backwards_is_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     def again(writer: ProtobufWriter) -> None:
         for i in range(3):
             for side, topic in enumerate(("/stereo/left/image_raw", "/stereo/right/image_raw")):
@@ -498,7 +498,7 @@ def test_a_clock_that_goes_back_is_said(tmp_path: Path, caplog: pytest.LogCaptur
     assert "clock" not in caplog.text
 
 
-def test_a_pipe_is_no_recording(tmp_path: Path) -> None:
+def test_a_pipe_is_not_a_recording(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.mcap")
     with pytest.raises(StereoSfmError, match="it is not a file"):
         LogReader(tmp_path / "a.mcap")

@@ -15,7 +15,7 @@ def test_images_come_as_they_are() -> None:
         assert source.frame_count == 4
 
 
-def test_a_longer_sequence_is_numbered_anew_and_turns_round_at_the_ends() -> None:
+def test_a_longer_sequence_is_renumbered_and_reversed_at_the_ends() -> None:
     images = stereo_images(3, np.random.default_rng(0))
     source = MemorySource(fisheye_rig(), images, count=8, there_and_back=True)
     sequence = list(source)

@@ -83,11 +83,11 @@ def test_no_camera_is_one_line_in_under_a_second(monkeypatch: pytest.MonkeyPatch
     assert "\n" not in str(caught.value)
 
 
-def test_an_unbooted_t265_is_no_oak() -> None:
+def test_an_unbooted_t265_is_not_an_oak() -> None:
     assert 0x2150 not in library._USB_PRODUCTS
 
 
-def test_depthai_finds_nothing_here_quickly() -> None:
+def test_depthai_finds_no_camera_quickly() -> None:
     began = time.monotonic()
     assert isinstance(library.find(dai), list)
     assert time.monotonic() - began < 2
@@ -307,7 +307,7 @@ def test_a_lost_camera_comes_back_as_a_new_segment(fake: FakeOak, caplog: pytest
     assert "OAK is back: segment 2" in caplog.text
 
 
-def test_what_cannot_work_says_so(fake: FakeOak, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_impossible_options_are_errors(fake: FakeOak, monkeypatch: pytest.MonkeyPatch) -> None:
     fake.speed = "HIGH"
     with pytest.raises(TooSlowLink, match=r"cannot carry 61 MB/s.*USB 3"):
         open_source("oak", size="1280x800")

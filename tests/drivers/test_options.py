@@ -44,7 +44,7 @@ def test_text_and_values_give_the_same_options(given: dict[str, Any]) -> None:
     assert read_options(Some, "cam", given) == Some(None, 60.0, 4, 500, True, "right", Path("b"), "", (3, 4))
 
 
-def test_what_is_not_said_is_the_default() -> None:
+def test_omitted_options_have_their_defaults() -> None:
     assert read_options(Some, "cam", {"exposure": "auto"}) == Some()
 
 
@@ -65,7 +65,7 @@ def test_what_is_not_said_is_the_default() -> None:
         ("zzz", "1", r"cam has no option 'zzz' \(it has:"),
     ],
 )
-def test_what_does_not_fit_is_one_line(name: str, value: object, message: str) -> None:
+def test_invalid_options_are_one_line(name: str, value: object, message: str) -> None:
     with pytest.raises(StereoSfmError, match=message) as caught:
         read_options(Some, "cam", {name: value})
     assert "\n" not in str(caught.value)
@@ -80,7 +80,7 @@ def test_the_declaration_is_the_documentation() -> None:
     assert (helps["flip"].default, helps["range"].default, helps["exposure"].default) == ("off", "1x2", "auto")
 
 
-def test_an_error_of_a_driver_is_not_reported_as_the_users() -> None:
+def test_an_error_of_a_driver_is_not_reported_as_a_user_error() -> None:
     def broken(value: Any) -> Any:
         raise TypeError("ours")
 

@@ -31,7 +31,7 @@ def test_ours_are_declared_where_those_of_others_are() -> None:
 
 
 @pytest.mark.parametrize("kind", registry.kinds())
-def test_a_driver_says_what_it_is(kind: str) -> None:
+def test_a_driver_describes_itself(kind: str) -> None:
     found = registry.driver(kind)
     assert found.summary and found.place.isupper()
     assert is_dataclass(found.options) and issubclass(found.options, SourceOptions) and found.options.__doc__
@@ -40,14 +40,14 @@ def test_a_driver_says_what_it_is(kind: str) -> None:
     assert found.options() == look_up(f"{kind}:{'loop' if kind == 'sim' else ''}").options
 
 
-def test_listing_the_drivers_imports_nothing_heavy() -> None:
+def test_listing_the_drivers_imports_no_heavy_library() -> None:
     heavy = ("numpy", "cv2", "numba", "depthai", "usb", "mcap", "calib")
     code = f"import sys\nfrom drivers import registry\nprint(len(list(registry.drivers())))\nprint([m for m in {heavy} if m in sys.modules])"  # noqa: E501
     lines = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split("\n")
     assert int(lines[0]) == len(registry.kinds()) and lines[1] == "[]"
 
 
-def test_a_typo_is_told_before_anything_heavy_is_loaded() -> None:
+def test_a_typo_is_an_error_before_heavy_imports() -> None:
     code = (
         "import sys\nfrom drivers import open_source\nfrom stereo_sfm.errors import StereoSfmError\n"
         "try: open_source('sim:aile')\nexcept StereoSfmError as error: print(error)\n"
@@ -102,7 +102,7 @@ def test_the_driver_that_is_surest_of_a_folder_opens_it(monkeypatch: pytest.Monk
         registry.recognise(tmp_path)
 
 
-def test_a_mistake_of_a_driver_is_not_blamed_on_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bug_of_a_driver_is_not_a_user_error(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(place: str, options: SourceOptions) -> drivers.Source:
         raise TypeError("open() takes 1 argument")
 

@@ -28,7 +28,7 @@ def _simulated() -> tuple[Source, list[StereoImage]]:
 
 
 @pytest.mark.parametrize(("kind", "packed"), [*((kind, False) for kind in KINDS), (KINDS[0], True)])
-def test_what_went_in_comes_out(kind: str, packed: bool, tmp_path: Path) -> None:
+def test_a_bag_gives_what_was_written(kind: str, packed: bool, tmp_path: Path) -> None:
     source, images = _simulated()
     path = write_bag(tmp_path, kind, source.rig, images, packed)
     assert recognise(path) == "rosbag"

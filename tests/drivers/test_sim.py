@@ -34,7 +34,7 @@ def same(a: StereoImage, b: StereoImage) -> bool:
     return bool((a.left == b.left).all() and (a.right == b.right).all()) and a.stamp_ns == b.stamp_ns
 
 
-def test_frames_alone_and_in_order_are_the_same_bits() -> None:
+def test_single_frames_and_frames_in_order_have_the_same_bits() -> None:
     in_order = list(small("people", start=40, frames=3))
     other = small("people")
     for image in reversed(in_order):
@@ -42,7 +42,7 @@ def test_frames_alone_and_in_order_are_the_same_bits() -> None:
     assert not same(in_order[0], in_order[1])
 
 
-def test_seed_session_and_effects_change_the_pictures() -> None:
+def test_seed_session_and_effects_change_the_images() -> None:
     base = small().frame(100)
     changes: list[dict[str, Any]] = [
         {"seed": 1},
@@ -56,7 +56,7 @@ def test_seed_session_and_effects_change_the_pictures() -> None:
         assert (small(**options).frame(100).left != base.left).mean() > 0.02, options
 
 
-def test_another_calibration_does_not_change_the_pictures() -> None:
+def test_another_calibration_does_not_change_the_images() -> None:
     """`--rig` says what tracking believes, not what the camera is."""
     spec = {"camera": "pinhole", "vibration": 3.0, "readout": 0.05}
     source, believed = small(**spec), small(**spec)
@@ -123,7 +123,7 @@ def small_drive(name: str, session: int):
     return Drive(route, scene.gait, np.random.default_rng([0, session, 31]), scene.length)
 
 
-def test_loop_comes_back_and_overlaps() -> None:
+def test_the_loop_returns_and_overlaps() -> None:
     drive = small_drive("loop", 0)
     poses = drive.poses(np.arange(0, drive.duration, 1 / 30))
     at, ahead = poses[:, :2, 3], poses[:, :3, 2]

@@ -62,7 +62,7 @@ def test_samples_arrive_with_the_frame_that_ends_their_interval() -> None:
 
 
 @pytest.mark.parametrize("name", ["t265", "oak"])
-def test_noise_is_the_data_sheets_and_the_calibration_takes_off_what_it_knows(name: str) -> None:
+def test_noise_is_as_in_the_data_sheet_and_the_calibration_corrects_its_part(name: str) -> None:
     drive, grade = sim().drive, GRADES[name]
     truth: list[float] = []
     for seed in range(12):
@@ -80,7 +80,7 @@ def test_noise_is_the_data_sheets_and_the_calibration_takes_off_what_it_knows(na
     assert np.sqrt(np.mean(np.square(truth))) == pytest.approx(1.0, rel=0.3)
 
 
-def test_without_an_imu_the_pictures_are_the_same_bits() -> None:
+def test_without_an_imu_the_images_are_the_same_bits() -> None:
     plain, with_imu = sim(), sim(imu="oak")
     assert plain.frame(70).imu is None and plain.rig.imu is None
     np.testing.assert_array_equal(plain.frame(70).left, with_imu.frame(70).left)

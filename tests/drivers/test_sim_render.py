@@ -127,7 +127,7 @@ def test_shelf_traversal_finds_the_same_hits_as_testing_every_box(fill: float) -
 
 
 @pytest.mark.parametrize("camera", sorted(CAMERAS))
-def test_both_eyes_see_the_same_points(camera: str) -> None:
+def test_both_cameras_see_the_same_points(camera: str) -> None:
     """A left pixel's point, projected by the exact model, is what the right camera sees there: bits of depth agree."""
     r = renderer(camera)
     left, right = r.render(POSE)

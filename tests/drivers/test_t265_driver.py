@@ -186,7 +186,7 @@ def test_never_back_is_an_error_after_the_images_so_far() -> None:
     assert len(images) == 8
 
 
-def test_gone_before_the_first_image_is_an_error() -> None:
+def test_a_disconnection_before_the_first_image_is_an_error() -> None:
     with (
         open_camera(Faults(unplug_at=0, unplugged_s=-1)) as source,
         pytest.raises(DeviceLost, match="no T265 attached"),
@@ -203,7 +203,7 @@ def test_a_stall_restarts_the_stream(caplog: pytest.LogCaptureFixture) -> None:
     assert "sent no image for 500 ms" in caplog.text
 
 
-def test_a_stall_that_survives_is_answered_with_a_reset() -> None:
+def test_a_persistent_stall_leads_to_a_reset() -> None:
     faults = Faults(stall_at=8, stall_survives_restart=True)
     with open_camera(faults, patience={"first_image_s": 0.6}) as source:
         images = take(source, 20)
@@ -212,7 +212,7 @@ def test_a_stall_that_survives_is_answered_with_a_reset() -> None:
     assert source.camera.generation == 3  # boot, reset, boot
 
 
-def test_a_slow_consumer_is_told_what_it_lost() -> None:
+def test_the_losses_of_a_slow_consumer_are_reported() -> None:
     with open_camera(queue=3, booted=True) as source:
         images: list[StereoImage] = []
         for image in source:
@@ -253,7 +253,7 @@ def test_wheel_odometry_travels_with_the_images() -> None:
         (Faults(returns_after_boot=False), BootFailed, "did not restart after loading its firmware"),
     ],
 )
-def test_what_cannot_work_says_so_in_one_line(faults: Faults, error: type[StereoSfmError], line: str) -> None:
+def test_impossible_options_are_one_line(faults: Faults, error: type[StereoSfmError], line: str) -> None:
     with pytest.raises(error, match=line) as caught:
         open_camera(faults, timing={"boot_s": 0.6, "command_ms": 200})
     assert "\n" not in str(caught.value)

@@ -91,7 +91,7 @@ def test_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     assert "--overwrite" in message.err and "is not T265 firmware" in message.err
 
 
-def test_nothing_of_the_firmware_is_in_this_repository() -> None:
+def test_no_firmware_is_in_this_repository() -> None:
     root = Path(firmware.__file__).parents[2]
     big = [p for p in (*root.glob("drivers/**/*"), *root.glob("tests/**/*")) if p.is_file() and p.stat().st_size > 5e6]
     assert not [p for p in big if p.read_bytes()[:4] == b"MA2x"]

@@ -75,7 +75,7 @@ DECODERS = {
 }
 
 
-def test_damaged_answers() -> None:
+def test_damaged_replies() -> None:
     rng, good = random.Random(1), answers()
     refused = 0
     for k in range(COUNT // 4):
@@ -190,7 +190,7 @@ def test_damaged_descriptors(monkeypatch: pytest.MonkeyPatch) -> None:
     assert opened > 100
 
 
-def test_damaged_answers_through_the_link(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_damaged_replies_through_the_link(monkeypatch: pytest.MonkeyPatch) -> None:
     """The command function with a camera that answers nonsense: an error each time, and never a hang."""
     camera = SimulatedCamera(noise_content(1))
     camera.booted = True

@@ -74,7 +74,7 @@ def test_simulated_store_through_usb() -> None:
     assert error < 0.02 * length + 0.003
 
 
-def test_pictures_of_a_real_t265_come_through_unchanged(data_root: Path) -> None:
+def test_images_of_a_real_t265_come_through_unchanged(data_root: Path) -> None:
     """Its factory calibration and its images, as the simulated camera's own."""
     content = source_content(f"kapture:{data_root / 't265_office'}", 3)
     with open_camera(content=content, booted=True) as source:

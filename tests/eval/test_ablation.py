@@ -78,7 +78,7 @@ def test_a_cell_is_run_judged_and_kept(tmp_path: Path) -> None:
     assert load_answer(tmp_path / "x.json") is None
 
 
-def test_broken_cells_are_run_again_refused_ones_are_not() -> None:
+def test_failed_cells_are_run_again_rejected_ones_are_not() -> None:
     assert not finished(None)
     assert not finished({"schema": 1, "status": "none", "reason": "internal error: x", "traceback": "..."})
     assert finished({"schema": 1, "status": "none", "reason": "weak_structure in 5 of 5 frames", "frames": 5})
@@ -170,7 +170,7 @@ def test_the_overview_has_a_column_for_each_feature_and_a_line_for_each_system()
     assert len({line.count("|") for line in lines}) == 1
 
 
-def test_ctrl_c_finishes_the_running_cell_and_begins_no_other(
+def test_ctrl_c_finishes_the_running_cell_and_starts_no_other(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun: list[Any] = []
@@ -227,7 +227,7 @@ def test_settings_are_part_of_a_cell_and_leave_the_names_of_others_alone(tmp_pat
         ([SIM, "--set", "odometry.method=um"], "use --odometry to choose the cells"),
     ],
 )
-def test_mistakes_are_told_before_any_cell_runs(
+def test_errors_are_reported_before_any_cell_runs(
     words: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["ablation", *words, "-o", str(tmp_path / "out"), "--features", "orb", "--systems", "none"]) == 2

@@ -25,7 +25,7 @@ def test_names_are_unique() -> None:
     assert batch.names(["a/x.mcap", "b/x.mcap", "y.mcap"]) == ["x_1", "x_2", "y"]
 
 
-def test_a_result_of_another_configuration_is_not_taken(tmp_path: Path) -> None:
+def test_a_result_of_another_configuration_is_not_reused(tmp_path: Path) -> None:
     task = batch.BatchTask(SMALL.format(1), str(tmp_path / "a"), load(), False)
     assert batch.finished(task) is None
     result = batch.run_one(task)
@@ -35,7 +35,7 @@ def test_a_result_of_another_configuration_is_not_taken(tmp_path: Path) -> None:
     assert batch.finished(other) is None
 
 
-def test_without_an_address_no_cluster_is_looked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_an_address_no_cluster_is_searched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ray remembers the last cluster of this machine, and waits for it for minutes when it is gone."""
     ray = pytest.importorskip("ray")
     asked: list[object] = []
@@ -92,7 +92,7 @@ def test_a_failed_recording_stops_no_other_and_the_rest_is_resumed(
 
 
 @pytest.mark.slow
-def test_two_nodes_one_killed_on_the_way(tmp_path: Path) -> None:
+def test_two_nodes_one_killed_during_the_run(tmp_path: Path) -> None:
     ray = pytest.importorskip("ray")
     from ray.cluster_utils import Cluster
 

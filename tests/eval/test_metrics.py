@@ -126,7 +126,7 @@ def test_two_poses_cannot_be_aligned_but_compared_from_the_origin() -> None:
 
 
 @pytest.mark.parametrize("delta", ["1", "0f", "1.5f", "-1m", "xm", ""])
-def test_a_delta_that_means_nothing(delta: str) -> None:
+def test_an_invalid_delta(delta: str) -> None:
     with pytest.raises(StereoSfmError, match="--delta"):
         evaluate(trajectory(straight(9, 1, 0.1)), trajectory(straight(9, 1, 0.1)), "none", delta)
 

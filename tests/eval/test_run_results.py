@@ -55,7 +55,7 @@ def results(tmp_path: Path, record: RunRecord, rig: Rig, config: Config) -> tupl
     return stats, summary(stats, evaluations), (tmp_path / "report.md").read_text()
 
 
-def test_one_eye_is_judged_after_its_scale(tmp_path: Path) -> None:
+def test_one_camera_is_evaluated_after_scale_alignment(tmp_path: Path) -> None:
     config = Config(odometry=dataclasses.replace(Config().odometry, method="pnp", monocular=True))
     assert scale_free(config, pinhole_rig())
     _, lines, report = results(tmp_path, record_of(camera_path(), 0), pinhole_rig(), config)
@@ -63,7 +63,7 @@ def test_one_eye_is_judged_after_its_scale(tmp_path: Path) -> None:
     assert not any("SE3" in line for line in lines)
 
 
-def test_a_wrong_scale_of_two_eyes_is_said(tmp_path: Path) -> None:
+def test_a_wrong_scale_of_two_cameras_is_reported(tmp_path: Path) -> None:
     assert not scale_free(Config(), pinhole_rig())
     _, lines, report = results(tmp_path, record_of(camera_path(), 0), pinhole_rig(), Config())
     assert any("SE3 aligned" in line for line in lines) and "check the baseline" in report
@@ -124,7 +124,7 @@ def test_a_saved_map_connects_all_submaps() -> None:
     assert record.unconnected_submaps() == 1
 
 
-def test_frames_go_over_from_one_keyframes_place_to_the_next(tmp_path: Path) -> None:
+def test_frames_are_interpolated_between_keyframe_corrections(tmp_path: Path) -> None:
     """The map moved the second keyframe by 9 cm after the frames between were tracked: each takes its share."""
     record, none = record_of(camera_path(), 0), np.zeros(0, np.int64)
     record.keyframes = {k: KeyframeRow(k, k * 10**8, camera_path()[k], 0.0, submap_id=0) for k in (0, 10, 20)}
@@ -158,13 +158,13 @@ def test_frames_located_by_a_keyframe_each_stay_with_it() -> None:
     np.testing.assert_array_equal(mapped.poses, camera_path()[:10])
 
 
-def test_one_pose_is_compared_with_nothing(tmp_path: Path) -> None:
+def test_one_pose_is_not_compared(tmp_path: Path) -> None:
     record = record_of(camera_path()[:1], 0)
     _, lines, report = results(tmp_path, record, pinhole_rig(), Config())
     assert not any("ground truth" in line or "nan" in line for line in lines) and "nan" not in report
 
 
-def test_a_straight_path_says_that_its_rotation_is_open(tmp_path: Path) -> None:
+def test_a_straight_path_reports_that_its_rotation_is_undetermined(tmp_path: Path) -> None:
     truth = np.tile(np.eye(4), (COUNT, 1, 1))
     truth[:, 2, 3] = np.arange(COUNT) * 0.1
     truth[:, 0, 3] = 1e-4 * np.sin(np.arange(COUNT))
@@ -174,7 +174,7 @@ def test_a_straight_path_says_that_its_rotation_is_open(tmp_path: Path) -> None:
         assert ("nearly straight" in rows["rotation"]) == message
 
 
-def test_a_loop_that_the_map_refused_is_no_accepted_one(tmp_path: Path) -> None:
+def test_a_loop_rejected_by_the_map_is_not_accepted(tmp_path: Path) -> None:
     record = record_of(camera_path(), 0)
     none = np.zeros(0, np.int64)
     pairs = none.reshape(-1, 2)
@@ -190,7 +190,7 @@ def test_a_loop_that_the_map_refused_is_no_accepted_one(tmp_path: Path) -> None:
     assert record.rejected == {"against_the_map": 1}
 
 
-def test_the_report_and_the_exit_code_know_the_same_limit(tmp_path: Path) -> None:
+def test_the_report_and_the_exit_code_have_the_same_limit(tmp_path: Path) -> None:
     record = record_of(camera_path(), 0)
     for k in range(COUNT, COUNT + 10):  # a quarter is lost
         record.put(
@@ -227,7 +227,7 @@ def test_a_disk_that_is_full_is_named(tmp_path: Path, monkeypatch: pytest.Monkey
     assert (tmp_path / "trajectory_odom.tum").exists()
 
 
-def test_what_capture_drops_has_no_pose(tmp_path: Path) -> None:
+def test_frames_dropped_by_capture_have_no_pose(tmp_path: Path) -> None:
     record = record_of(camera_path(), 0)
     for k in range(120):
         record.put(Dropped(100 + k, 1, "ring", "no free slot"))
@@ -240,7 +240,7 @@ def test_what_capture_drops_has_no_pose(tmp_path: Path) -> None:
     assert "**FAIL**: 80 % of the frames have no pose" in report and "120 frames (78.4 %) were dropped" in report
 
 
-def test_what_the_log_lacks_is_told_and_costs_nothing_else(tmp_path: Path) -> None:
+def test_images_missing_in_the_log_are_reported(tmp_path: Path) -> None:
     record = record_of(camera_path(), 0)
     record.put(Dropped(3, 1, "log", "the log is slower than the camera"))
     record.put(LogEnded("recording stopped, No space left on device"))

@@ -52,7 +52,7 @@ def test_kitti_is_relative_to_the_first_pose_and_evo_reads_it(trajectory: Trajec
     assert np.array(file_interface.read_kitti_poses_file(path).poses_se3) == pytest.approx(expected, abs=1e-8)
 
 
-def test_seconds_are_exact_both_ways() -> None:
+def test_seconds_are_exact_in_both_directions() -> None:
     for stamp in (0, 1, 1_553_180_224_360_915_899, 999_999_999, -1_500_000_000):
         assert stamp_from_seconds(seconds(stamp)) == stamp
     assert stamp_from_seconds("1.037359e-01") == 103_735_900
@@ -113,7 +113,7 @@ def test_positions_without_orientations_are_compared_as_positions(
         evaluate(moved, truth, "origin")
 
 
-def test_a_turning_trajectory_is_no_list_of_positions(trajectory: Trajectory, tmp_path: Path) -> None:
+def test_a_turning_trajectory_is_not_written_as_positions(trajectory: Trajectory, tmp_path: Path) -> None:
     write_tum(tmp_path / "t.tum", trajectory)
     assert read_trajectory(tmp_path / "t.tum").oriented
 

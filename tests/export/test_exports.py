@@ -166,7 +166,7 @@ def test_trajectories_of_a_merged_map_are_a_file_for_each_sequence(
     assert "the map has no session 2 (it has 0, 1)" in capsys.readouterr().err
 
 
-def test_a_sequence_with_two_keyframes_of_one_time_is_no_trajectory(saved: SavedMap) -> None:
+def test_two_keyframes_with_one_stamp_are_not_a_trajectory(saved: SavedMap) -> None:
     twice = dataclasses.replace(joined([saved, saved]), sessions=np.zeros(2 * len(saved), np.int64))
     with pytest.raises(StereoSfmError, match="session 0 of the map has two keyframes of the same stamp"):
         session_trajectory(twice, 0)
@@ -188,7 +188,7 @@ def test_a_trajectory_without_a_heading_is_the_cameras(tmp_path: Path) -> None:
     assert named_pose(tmp_path / "t.tum") == "world_T_cam0"
 
 
-def test_floor_plan_is_written_where_it_says_and_over_nothing(
+def test_a_floor_plan_is_written_to_its_path_and_overwrites_no_file(
     tmp_path: Path, saved: SavedMap, capsys: pytest.CaptureFixture[str]
 ) -> None:
     save_map(saved, tmp_path / "m")
@@ -210,7 +210,7 @@ def test_floor_plan_is_written_where_it_says_and_over_nothing(
 
 
 @pytest.mark.parametrize("metres", ["nan", "0", "-0.1", "inf", "1e-7"])
-def test_floor_plan_of_no_sensible_resolution(
+def test_a_floor_plan_with_an_invalid_resolution(
     tmp_path: Path, saved: SavedMap, metres: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     save_map(saved, tmp_path / "m")

@@ -23,7 +23,7 @@ time.sleep(600)
 """
 
 
-def test_overwriting_a_run_that_is_going_on_is_refused_and_touches_nothing(tmp_path: Path) -> None:
+def test_overwriting_an_active_run_is_an_error_and_changes_no_file(tmp_path: Path) -> None:
     other = subprocess.Popen([sys.executable, "-c", OTHER, str(tmp_path)], stdout=-1, text=True)
     assert other.stdout is not None and other.stdout.readline() == "mine\n"
     (tmp_path / "run.mcap").write_text("of the other")

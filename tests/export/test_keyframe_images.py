@@ -51,7 +51,7 @@ def names_in(folder: Path) -> list[str]:
     return [line.split()[9] for line in lines[::2]]
 
 
-def test_every_picture_of_a_merged_map_has_a_name_of_its_own(tmp_path: Path, saved: SavedMap) -> None:
+def test_every_image_of_a_merged_map_has_a_name_of_its_own(tmp_path: Path, saved: SavedMap) -> None:
     both = joined([saved, later(saved)])
     export_colmap(both, tmp_path)
     names = names_in(tmp_path)
@@ -62,7 +62,7 @@ def test_every_picture_of_a_merged_map_has_a_name_of_its_own(tmp_path: Path, sav
     assert pycolmap.Reconstruction(str(tmp_path)).num_images() == len(names)
 
 
-def test_each_recording_gives_the_pictures_of_its_own_sequence(tmp_path: Path, saved: SavedMap) -> None:
+def test_each_recording_gives_the_images_of_its_own_sequence(tmp_path: Path, saved: SavedMap) -> None:
     both = joined([saved, later(saved)])
     export_colmap(both, tmp_path)
     for sequence, one in enumerate((saved, later(saved))):
@@ -75,7 +75,7 @@ def test_each_recording_gives_the_pictures_of_its_own_sequence(tmp_path: Path, s
         assert picture is not None and int(picture[0, 0]) == (150 if "walk1" in name else 50)
 
 
-def test_a_recording_that_cannot_be_told_is_refused(tmp_path: Path, saved: SavedMap) -> None:
+def test_an_ambiguous_recording_is_rejected(tmp_path: Path, saved: SavedMap) -> None:
     pictures = recording(saved, 50)
     with pytest.raises(
         StereoSfmError, match=r"matches several sessions of the map \(0, 1\): choose one with --session N"
@@ -91,19 +91,19 @@ def test_a_recording_that_cannot_be_told_is_refused(tmp_path: Path, saved: Saved
 
 
 @pytest.mark.parametrize(("how", "option"), [("none", "none"), ("pinhole", "pinhole"), ("epipolar", "wide")])
-def test_pictures_are_those_that_the_maps_camera_saw(how: str, option: str) -> None:
+def test_images_are_those_of_the_maps_camera(how: str, option: str) -> None:
     rig = rectified(open_source(SPEC), how).rig
     source = open_recording(SPEC, rig)
     assert isinstance(source, RectifiedSource) == (option != "none")
     assert np.array_equal(source.rig.left.params, rig.left.params)
 
 
-def test_pictures_of_another_camera_are_refused(saved: SavedMap) -> None:
+def test_images_of_another_camera_are_refused(saved: SavedMap) -> None:
     with pytest.raises(StereoSfmError, match=r"150x140 .*is not the map's \(kannala_brandt 848x800"):
         open_recording(SPEC, saved.rig)
 
 
-def test_export_of_a_rectified_run_writes_rectified_pictures(
+def test_export_of_a_rectified_run_writes_rectified_images(
     tmp_path: Path, saved: SavedMap, capsys: pytest.CaptureFixture[str]
 ) -> None:
     seen = rectified(open_source(SPEC), "pinhole")

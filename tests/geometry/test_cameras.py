@@ -39,7 +39,7 @@ def pixel_grid(camera: Camera, step: float = 7.3) -> np.ndarray:
 
 
 @ALL
-def test_every_pixel_with_a_bearing_comes_back(camera: Camera) -> None:
+def test_every_pixel_with_a_bearing_projects_back(camera: Camera) -> None:
     uv = pixel_grid(camera)
     bearings = camera.unproject(uv)
     seen = np.isfinite(bearings[:, 0])
@@ -50,7 +50,7 @@ def test_every_pixel_with_a_bearing_comes_back(camera: Camera) -> None:
 
 
 @ALL
-def test_every_direction_in_range_comes_back(camera: Camera) -> None:
+def test_every_direction_in_range_unprojects_back(camera: Camera) -> None:
     rng = np.random.default_rng(1)
     points = rng.standard_normal((20000, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)

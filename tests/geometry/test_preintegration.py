@@ -45,7 +45,7 @@ def test_values_are_gtsams(seed: int) -> None:
     assert mine.seconds == pytest.approx(theirs.deltaTij())
 
 
-def test_a_turning_sensor_that_stays_where_it_is_does_not_drift() -> None:
+def test_a_turning_sensor_at_one_position_does_not_drift() -> None:
     """At the rate of a real sensor: what it feels is gravity alone, in axes that turn."""
     rate, n = np.array([0.4, -1.0, 0.3]), 400
     middles = se3.so3_exp((np.arange(n) + 0.5)[:, None] * DT * rate)

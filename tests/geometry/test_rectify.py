@@ -105,7 +105,7 @@ def test_epipolar_keeps_150_degrees_of_a_fisheye(rig: Rig) -> None:
     assert both.mean() > 0.75
 
 
-def test_pinhole_field_of_view_is_as_asked() -> None:
+def test_pinhole_field_of_view_is_as_requested() -> None:
     for hfov in (60.0, 90.0, 120.0):
         camera = rectify(fisheye_rig(), "pinhole", hfov, (640, 480)).rig.left
         assert camera.size == (640, 480)
@@ -200,7 +200,7 @@ def test_epipolar_angle_and_triangulation_on_exact_rays() -> None:
     np.testing.assert_allclose(epipolar_angle(left, tilted, TURNED.left_T_right), 1e-4, atol=1e-9)
 
 
-def test_pinhole_of_different_eyes_shares_one_camera() -> None:
+def test_pinhole_of_different_cameras_shares_one_camera() -> None:
     rig = Rig(
         Pinhole(640, 480, 400, 401, 310, 240),
         Pinhole(640, 480, 420, 419, 330, 236),

@@ -48,7 +48,7 @@ def test_rigid_error_falls_with_the_number_of_points() -> None:
     assert errors[1] < 0.3 * errors[0] < 0.02
 
 
-def test_weights_take_the_noisy_points_out() -> None:
+def test_weights_reduce_the_effect_of_noisy_points() -> None:
     source, target, motion = cloud(4)
     target = target.copy()
     target[:20] += 1.0

@@ -150,7 +150,7 @@ def test_pure_rotation_is_recognised_and_its_rotation_right() -> None:
 
 
 @pytest.mark.parametrize("step", [0.0, 0.05, 0.1])
-def test_a_small_step_is_told_from_a_rotation(step: float) -> None:
+def test_a_small_step_is_distinguished_from_a_rotation(step: float) -> None:
     """Points at 3 to 9 m, 0.3 px of noise: 50 mm are 3 px of parallax, of which a turn takes two thirds."""
     found: list[bool] = []
     turns: list[float] = []

@@ -22,7 +22,7 @@ def test_solves_and_inverts_as_lapack_does(size: int) -> None:
 
 
 @pytest.mark.parametrize("a", [np.zeros((3, 3)), -np.eye(3), np.ones((3, 3)), np.full((3, 3), np.nan)])
-def test_says_so_where_a_matrix_is_not_positive_definite(a: np.ndarray) -> None:
+def test_an_indefinite_matrix_is_reported(a: np.ndarray) -> None:
     x, inverse = np.full(3, 7.0), np.full((3, 3), 7.0)
     assert not solve_symmetric(a, np.ones(3), x, np.zeros((3, 3)))
     assert not invert_symmetric(a, inverse, np.zeros((3, 3)))

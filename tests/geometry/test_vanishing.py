@@ -132,7 +132,7 @@ def box_image(camera: Camera, cam_R_world: F64) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", list(CAMERAS))
-def test_orientation_from_pictures_within_a_tenth_of_a_degree(name: str) -> None:
+def test_orientation_from_images_within_a_tenth_of_a_degree(name: str) -> None:
     camera = CAMERAS[name]
     truth = se3.so3_exp(np.array([0.1, 0.5, 0.05]))
     lines = LineDetector(camera).detect(box_image(camera, truth))
@@ -143,12 +143,12 @@ def test_orientation_from_pictures_within_a_tenth_of_a_degree(name: str) -> None
         assert off_axis.max() > 65  # the faces beside the front one contribute
 
 
-def test_the_rim_of_a_fisheye_is_no_line() -> None:
+def test_the_rim_of_a_fisheye_is_not_a_line() -> None:
     plain = np.full((800, 848), 90, np.uint8)
     assert len(LineDetector(CAMERAS["fisheye"]).detect(plain)) == 0
 
 
-def test_a_picture_without_lines_is_declined() -> None:
+def test_an_image_without_lines_is_declined() -> None:
     noise = np.random.default_rng(0).integers(0, 255, (60, 80)).astype(np.uint8)
     blurred = cv2.GaussianBlur(cv2.resize(noise, (640, 480), interpolation=cv2.INTER_CUBIC), (0, 0), 3)
     with pytest.raises(Degenerate):

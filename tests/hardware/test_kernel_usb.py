@@ -17,7 +17,7 @@ from tests.hardware.usb_descriptors import configuration, device, standard_reque
 KERNEL = Path(os.environ["STEREO_SFM_GUEST_KERNEL"]) if "STEREO_SFM_GUEST_KERNEL" in os.environ else None
 
 
-def test_descriptors_say_their_own_length() -> None:
+def test_descriptors_contain_their_length() -> None:
     for booted in (False, True):
         assert len(device(booted)) == device(booted)[0] == 18
         whole = configuration(booted)

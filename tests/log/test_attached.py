@@ -48,7 +48,7 @@ def test_a_log_without_them_has_none(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("data", [b"", b"\xff\xfe\x00", b"PK\x03\x04 no archive", truth_to_bytes(
     Trajectory(np.zeros(1, np.int64), np.eye(4)[None]))[:-40]])  # fmt: skip
-def test_what_is_no_trajectory_is_left_out(data: bytes, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_invalid_trajectories_are_left_out(data: bytes, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with LogReader(log_with(tmp_path / "a.mcap", {TRUTH_FILE: data})) as reader, caplog.at_level(logging.WARNING):
         assert attached_truth(reader) is None
     assert len(caplog.messages) == 1
@@ -56,7 +56,7 @@ def test_what_is_no_trajectory_is_left_out(data: bytes, tmp_path: Path, caplog: 
 
 
 @pytest.mark.parametrize("data", [b"\xff\xfe\x00", b"[tracker\n", b"\x00"])
-def test_what_is_no_configuration_makes_no_run(data: bytes, tmp_path: Path) -> None:
+def test_an_invalid_configuration_is_an_error(data: bytes, tmp_path: Path) -> None:
     with (
         LogReader(log_with(tmp_path / "a.mcap", {CONFIG_FILE: data})) as reader,
         pytest.raises(StereoSfmError, match=r"a\.mcap is not the log of a run"),
@@ -64,7 +64,7 @@ def test_what_is_no_configuration_makes_no_run(data: bytes, tmp_path: Path) -> N
         read_run(reader)
 
 
-def test_a_configuration_of_another_version_is_said(tmp_path: Path) -> None:
+def test_a_configuration_of_another_version_is_reported(tmp_path: Path) -> None:
     path = log_with(tmp_path / "a.mcap", {CONFIG_FILE: "[tracker]\nunheard_of = 1\n"})
     with LogReader(path) as reader, pytest.raises(StereoSfmError, match="another version") as caught:
         read_run(reader)
@@ -82,7 +82,7 @@ def test_a_malformed_calibration_names_the_log(text: str, tmp_path: Path) -> Non
     assert "\n" not in str(caught.value)
 
 
-def test_info_of_a_run_whose_calibration_is_damaged_tells_the_rest(tmp_path: Path) -> None:
+def test_info_of_a_run_with_a_damaged_calibration_shows_the_rest(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with LogWriter(path) as writer:
         writer.metadata("stereo_sfm", {"image_format": "none", "source": "elsewhere"})

@@ -80,9 +80,7 @@ def test_dropped_frames_are_reported() -> None:
 
 
 @pytest.mark.parametrize("verbose", [False, True])
-def test_a_verbose_run_tells_them_on_the_screen(
-    verbose: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_verbose_run_prints_them(verbose: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = "sim:aisle?size=212x200&rate=10&dark=1-1.5"
     options = ["--duration", "2", "--inline", "--log", "none", "-o", str(tmp_path), *(["-v"] if verbose else [])]
     assert main(["run", source, *options]) in (0, 4)

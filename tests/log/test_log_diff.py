@@ -145,7 +145,7 @@ def test_the_wall_clock_topics_do_not_count(tmp_path: Path) -> None:
     assert _diff(tmp_path / "a.mcap", tmp_path / "b.mcap") == []
 
 
-def test_a_changed_configuration_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_changed_configuration_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from stereo_sfm.log.provenance import write_provenance
 
     for name, seed, count in (("a", 0, 3), ("b", 5, 2)):

@@ -54,7 +54,7 @@ def test_what_a_jpeg_log_gives_back_is_what_the_tracker_was_given(tmp_path: Path
     assert np.abs(seen[0].left.astype(float) - pairs[0].left).mean() < 4
 
 
-def test_a_jpeg_log_refuses_pixels_that_nobody_encoded(tmp_path: Path) -> None:
+def test_a_jpeg_log_rejects_pixels_that_are_not_encoded(tmp_path: Path) -> None:
     with LogWriter(tmp_path / "a.mcap") as writer, pytest.raises(ValueError, match="lossy"):
         ImageLog(writer, fisheye_rig(), image_format="jpeg").image(stereo_images(1, np.random.default_rng(3))[0])
 

@@ -84,13 +84,13 @@ def _assert_equal(a: object, b: object) -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 12), st.integers(0, 2**32 - 1))
-def test_every_message_of_a_run_comes_back_with_every_bit(n: int, seed: int) -> None:
+def test_every_message_of_a_run_is_read_back_to_the_bit(n: int, seed: int) -> None:
     for message in _messages(n, seed):
         decode = schema.decoder(type(message), schema.schema_data(type(message)))
         _assert_equal(message, decode(schema.encode(message)))
 
 
-def test_arrays_of_rows_say_their_shape() -> None:
+def test_arrays_of_rows_have_their_shape() -> None:
     """A field of rows must say their shape in its metadata, or it would come back flat."""
     for message in _messages(3, 0):
         for f in schema.fields_of(type(message)):
@@ -122,7 +122,7 @@ def test_flat_messages_round_trip() -> None:
         assert repr(decode(schema.encode(message))) == repr(message)  # repr: NaN equals itself
 
 
-def test_a_log_of_an_older_version_takes_the_defaults_of_new_fields() -> None:
+def test_a_log_of_an_older_version_has_the_defaults_of_new_fields() -> None:
     @dataclasses.dataclass
     class Dropped:  # as it may have been before `why` and `count` existed
         frame_id: int

@@ -73,7 +73,7 @@ def _read(path: Path) -> list[StereoImage]:
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(cut=st.floats(0.0, 1.0))
 @example(cut=6e-5)  # shorter than a footer
-def test_a_file_cut_off_anywhere_gives_its_whole_frames(whole: Whole, tmp_path: Path, cut: float) -> None:
+def test_a_file_truncated_anywhere_gives_its_complete_frames(whole: Whole, tmp_path: Path, cut: float) -> None:
     path, images = whole
     data = path.read_bytes()
     short = tmp_path / "short.mcap"
@@ -99,7 +99,7 @@ def test_a_file_cut_off_anywhere_gives_its_whole_frames(whole: Whole, tmp_path: 
         assert truncated.stamps(topics.LEFT_IMAGE).tolist() == stamps
 
 
-def test_a_cut_off_file_says_so(whole: Whole, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_truncated_file_is_reported(whole: Whole, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path, images = whole
     short = tmp_path / "short.mcap"
     short.write_bytes(path.read_bytes()[: path.stat().st_size * 3 // 4])
@@ -110,7 +110,7 @@ def test_a_cut_off_file_says_so(whole: Whole, tmp_path: Path, caplog: pytest.Log
     assert "truncated" in record.getMessage() and "messages recovered" in record.getMessage()
 
 
-def test_recover_tells_what_was_missing(whole: Whole, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_recover_reports_what_was_missing(whole: Whole, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path, _ = whole
     short, out = tmp_path / "short.mcap", tmp_path / "out.mcap"
     short.write_bytes(path.read_bytes()[:-3000])

@@ -203,7 +203,7 @@ def test_poses_follow_the_map_version_that_the_frame_used(run: Path) -> None:
         assert foxglove.stamp_of(message) == frame.stamp_ns
 
 
-def test_transforms_make_one_tree_from_level_to_the_right_eye(run: Path) -> None:
+def test_transforms_make_one_tree_from_level_to_the_right_camera(run: Path) -> None:
     rig = fisheye_rig()
     rows = {
         (t.parent_frame_id, t.child_frame_id): foxglove.matrix(t.translation, t.rotation)
@@ -273,7 +273,7 @@ def test_points_trajectory_and_edges_are_the_map_at_the_end(run: Path) -> None:
     assert len(lines["covisibility"]) == 2 * 9  # each keyframe shares 30 of 40 points with the one before
 
 
-def test_what_is_shown_whole_comes_less_often_as_it_grows(tmp_path: Path) -> None:
+def test_complete_clouds_are_written_less_often_as_they_grow(tmp_path: Path) -> None:
     """A run of 1,000 keyframes, three a second: the trajectory takes no more room a second at the end."""
     path, identity = tmp_path / "a.mcap", np.eye(4)
     config = from_dict({"loop": {"enabled": False}})
@@ -309,7 +309,7 @@ def test_features_are_where_the_tracker_saw_them(run: Path) -> None:
     assert (young.b, young.r) == (1.0, 0.0) and (old.b, old.r) == (0.0, 1.0)
 
 
-def test_messages_of_the_stages_come_back_whole(run: Path) -> None:
+def test_messages_of_the_stages_are_read_back_completely(run: Path) -> None:
     for topic, kind, wanted in (
         (topics.FRAME, Frame, [_frame(i) for i in range(FRAMES)]),
         (topics.KEYFRAME, Keyframe, [_keyframe(k) for k in range(10)]),
@@ -326,14 +326,14 @@ def test_messages_of_the_stages_come_back_whole(run: Path) -> None:
     assert _all(run, topics.COUNTERS, SourceCounters) == [SourceCounters(5, {"pairs": 6.0, "stalls": 1.0})]
 
 
-def test_stats_are_flat_and_keep_what_they_do_not_know(run: Path) -> None:
+def test_stats_are_flat_and_keep_unknown_fields(run: Path) -> None:
     stats: TrackStats = _all(run, topics.STATS, TrackStats)[7]
     assert repr(stats) == repr(track_stats(_frame(7)))
     assert (stats.inliers, stats.other) == (30.0, {"something_new": 1.5})
     assert np.isnan(stats.tracked) and stats.observations == 40
 
 
-def test_a_run_without_loops_or_mapping_waits_for_nothing(tmp_path: Path) -> None:
+def test_a_run_without_loops_or_mapping_does_not_wait(tmp_path: Path) -> None:
     config = from_dict({"loop": {"enabled": False}})
     log = RunLog(LogWriter(tmp_path / "a.mcap"), fisheye_rig(), config, source="t", mode="inline", image_format="none")
     for k in range(3):
@@ -345,7 +345,7 @@ def test_a_run_without_loops_or_mapping_waits_for_nothing(tmp_path: Path) -> Non
     log.close()
 
 
-def test_what_a_stage_says_is_in_the_log(tmp_path: Path) -> None:
+def test_text_of_a_stage_is_in_the_log(tmp_path: Path) -> None:
     log = RunLog(
         LogWriter(tmp_path / "a.mcap"), fisheye_rig(), Config(), source="t", mode="inline", image_format="none"
     )
@@ -368,7 +368,7 @@ def test_the_path_is_where_the_keyframes_are(run: Path) -> None:
     assert rows["rgba"].tolist() == [[70, 150, 255, 255]] * len(poses.poses)
 
 
-def test_what_a_replay_needs_comes_back(run: Path) -> None:
+def test_the_input_of_a_replay_is_read_back(run: Path) -> None:
     with LogReader(run) as reader:
         recorded = read_run(reader)
         kinds = {type(message).__name__ for _, message in messages(reader)}
@@ -387,7 +387,7 @@ def test_a_run_of_a_version_with_other_settings_is_refused(tmp_path: Path, monke
         read_run(reader)
 
 
-def test_a_recording_is_no_run_and_a_run_without_images_says_where_they_are(
+def test_a_recording_is_not_a_run_and_a_run_without_images_names_their_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     source = MemorySource(fisheye_rig(), stereo_images(2, np.random.default_rng(0)))

@@ -65,7 +65,7 @@ def test_depth_images_give_back_every_bit(tmp_path: Path) -> None:
             assert_same_image(one, other)
 
 
-def test_monocular_images_come_back_without_a_right_eye(tmp_path: Path) -> None:
+def test_monocular_images_are_read_back_without_a_right_image(tmp_path: Path) -> None:
     rig, images = depth_images(3, np.random.default_rng(3))
     from dataclasses import replace
 
@@ -142,7 +142,7 @@ def test_a_part_by_time_has_its_samples(tmp_path: Path) -> None:
         assert_same_image(one, other)
 
 
-def test_an_existing_file_stays_unless_told_otherwise(tmp_path: Path) -> None:
+def test_an_existing_file_is_not_overwritten_by_default(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     path.write_bytes(b"precious")
     with pytest.raises(StereoSfmError, match="--overwrite"):

@@ -135,7 +135,7 @@ def test_fixed_keyframes_stay_to_the_bit(rig: Rig) -> None:
     assert everything.cost < everything.initial_cost
 
 
-def test_a_pose_alone_is_found_among_outliers_and_only_they_are_left_out(rig: Rig) -> None:
+def test_a_single_pose_is_found_among_outliers_and_only_they_are_rejected(rig: Rig) -> None:
     scene = make_scene(rig, 6, 300, noise_px=0.3, outliers=0.1)
     for k in range(6):
         mine = scene.obs_kf == k
@@ -147,7 +147,7 @@ def test_a_pose_alone_is_found_among_outliers_and_only_they_are_left_out(rig: Ri
         assert inlier[~scene.outlier[mine], 0].mean() > 0.97
 
 
-def test_a_pose_alone_is_that_of_a_bundle_whose_points_are_held_fast(rig: Rig) -> None:
+def test_a_single_pose_is_that_of_a_bundle_with_fixed_points(rig: Rig) -> None:
     """Many fixed keyframes that saw the points exactly hold them where they are."""
     scene = make_scene(rig, 1, 200, noise_px=0.3)
     points, left, right = scene.points[scene.obs_pt], scene.uv_left, scene.uv_right

@@ -138,7 +138,7 @@ def test_keyframes_of_one_place_are_thinned_out() -> None:
     assert error(mapper.map.keyframes.map_T_kf, stream.world_T_kf) < 0.02
 
 
-def test_retail_papers_rule_only_knows_the_previous_keyframe() -> None:
+def test_the_retail_papers_rule_uses_the_previous_keyframe_only() -> None:
     stream = keyframe_stream(fisheye_rig(), camera_path(12))
     paper = dataclasses.replace(CONFIG, association="previous", window_keyframes=0, redundant_share=2.0)
     mapper, updates = run(stream, paper)

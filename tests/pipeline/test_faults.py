@@ -63,7 +63,7 @@ def pause(pid: int, seconds: float) -> None:
 
 
 @pytest.mark.slow
-def test_a_logger_that_stands_still_costs_images_of_the_log_and_no_pose(tmp_path: Path) -> None:
+def test_a_stopped_logger_loses_logged_images_and_no_pose(tmp_path: Path) -> None:
     path, kept, frames = tmp_path / "run.mcap", Kept(), 40
     source = MadeSource.of(SlidingWall, frames, slow_s=0.1)
     with ProcessRun(source, CONFIG, [kept], realtime=True, log=LogOptions(path, "raw")) as run:
@@ -83,7 +83,7 @@ def test_a_logger_that_stands_still_costs_images_of_the_log_and_no_pose(tmp_path
 
 
 @pytest.mark.slow
-def test_in_lockstep_the_run_waits_for_the_logger_and_says_so(
+def test_in_lockstep_the_run_waits_for_the_logger_and_reports_it(
     inline: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     with ProcessRun(MadeSource.of(SlidingWall, 80), CONFIG, log=LogOptions(tmp_path / "run.mcap", "none")) as run:
@@ -155,7 +155,7 @@ def test_the_tracker_keeps_its_slots_whatever_the_log_does() -> None:
     assert {t for t in free if t is not None} == {(k, False) for k in range(4)} and None in free
 
 
-def test_files_leave_nothing_out_of_the_log() -> None:
+def test_with_files_the_log_is_complete() -> None:
     (from_tracker, _tracker), (from_log, _log) = [multiprocessing.Pipe(duplex=False) for _ in "ab"]
     slots = FreeSlots(8, from_tracker, from_log)
     assert [slots.take(block=True) for _ in range(8)] == [(k, True) for k in range(8)]
@@ -200,7 +200,7 @@ def hanging_loop(to_main: Report, control: Connection, keyframes: Connection, to
 
 
 @pytest.mark.parametrize("second_signal", [False, True])
-def test_a_stage_that_hangs_keeps_neither_the_end_nor_the_log(
+def test_a_hanging_stage_blocks_neither_the_end_nor_the_log(
     second_signal: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(workers, "run_loop", hanging_loop)
@@ -238,7 +238,7 @@ def test_a_stop_while_the_source_is_opened_ends_the_run() -> None:
     assert time.monotonic() - begin < END_S
 
 
-def test_a_process_that_computes_is_not_silent(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_computing_process_is_responsive(monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[str] = []
     monkeypatch.setattr("stereo_sfm.pipeline.watchdog.SILENT_S", 0.2)
     context = multiprocessing.get_context("spawn")

@@ -177,14 +177,14 @@ def test_what_a_source_gave_before_it_failed_is_mapped(in_processes: bool, tmp_p
 
 
 @pytest.mark.parametrize("in_processes", [False, True])
-def test_the_error_of_the_source_is_told_though_there_is_no_map_to_save(in_processes: bool, tmp_path: Path) -> None:
+def test_the_error_of_the_source_is_reported_without_a_map_to_save(in_processes: bool, tmp_path: Path) -> None:
     source, folders = MadeSource.of(SlidingWall, 80, fail_at=0), MapFolders(map_out=tmp_path / "map")
     with pytest.raises((RuntimeError, StageDied), match="the driver broke"):
         list(wired(in_processes, source, folders))
     assert not (tmp_path / "map").exists()
 
 
-def test_a_capture_process_that_is_killed_costs_nothing_that_it_read(tmp_path: Path) -> None:
+def test_a_killed_capture_process_loses_no_image_that_it_read(tmp_path: Path) -> None:
     source, folders = MadeSource.of(SlidingWall, 5000, slow_s=0.005), MapFolders(map_out=tmp_path / "map")
     with pytest.raises(StageDied, match="the capture process was killed by SIGKILL"):  # noqa: PT012, SIM117
         with ProcessRun(source, CONFIG, folders=folders) as run:
@@ -206,7 +206,7 @@ class StalledWall(SlidingWall):
             yield image
 
 
-def test_a_stop_is_heard_though_no_image_comes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_stop_works_without_images(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("stereo_sfm.pipeline.processes.STOP_GRACE_S", 0.5)
     folders = MapFolders(map_out=tmp_path / "map")
     with ProcessRun(MadeSource.of(StalledWall, 50), CONFIG, folders=folders) as run:
@@ -219,7 +219,7 @@ def test_a_stop_is_heard_though_no_image_comes(monkeypatch: pytest.MonkeyPatch, 
     assert len(load_map(tmp_path / "map")) >= 1
 
 
-def test_a_stop_that_comes_too_late_is_no_error() -> None:
+def test_a_late_stop_is_not_an_error() -> None:
     with ProcessRun(MadeSource.of(SlidingWall, 5), CONFIG) as run:
         assert len(list(run)) == 5
     run.stop()

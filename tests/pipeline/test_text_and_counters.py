@@ -118,7 +118,7 @@ def test_warnings_and_counters_reach_the_log_and_the_sinks(
     assert "camera: 12 stereo images, stalls 1" in summary(stats)
 
 
-def test_what_a_source_says_while_it_opens_is_kept(tmp_path: Path) -> None:
+def test_text_of_a_source_while_it_opens_is_kept(tmp_path: Path) -> None:
     kept = Kept()
     with ProcessRun(
         MadeSource.of(TalkativeWall, 5), CONFIG, [kept], log=LogOptions(tmp_path / "run.mcap", "none")
@@ -134,7 +134,7 @@ def _warn(to_main: Outbox) -> None:
 
 
 @pytest.mark.parametrize("stage", ["tracker", "mapper", "loop", "logger"])
-def test_every_worker_passes_on_what_it_says(stage: str) -> None:
+def test_every_worker_forwards_its_text(stage: str) -> None:
     context = multiprocessing.get_context("spawn")
     receive, send = context.Pipe(duplex=False)
     process = context.Process(target=workers.guarded, args=(stage, _warn, send))
@@ -154,7 +154,7 @@ def _all(receive: Connection) -> list[object]:
         return out
 
 
-def test_files_count_nothing_and_the_summary_says_nothing_of_them() -> None:
+def test_files_have_no_counters_in_the_summary() -> None:
     record = RunRecord()
     for _ in run_inline(SlidingWall(3), CONFIG, [record]):
         pass

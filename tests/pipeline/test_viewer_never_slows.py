@@ -42,7 +42,7 @@ def slow_viewer(to_main: Outbox, control: Connection, messages: Connection, opti
 
 
 @pytest.mark.parametrize("body", [hanging_viewer, pytest.param(slow_viewer, marks=pytest.mark.slow)])
-def test_the_run_is_whole_whatever_the_viewer_does(
+def test_the_run_is_complete_whatever_the_viewer_does(
     body: object, inline: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(workers, "run_viewer", body)
@@ -56,7 +56,7 @@ def test_the_run_is_whole_whatever_the_viewer_does(
 
 
 @pytest.mark.slow
-def test_a_killed_viewer_is_not_missed(inline: Path, tmp_path: Path) -> None:
+def test_a_killed_viewer_does_not_stop_the_run(inline: Path, tmp_path: Path) -> None:
     log, viewer = LogOptions(tmp_path / "run.mcap", "none"), ViewerOptions("save", tmp_path / "run.rrd")
     seen = 0
     with ProcessRun(MadeSource.of(SlidingWall, FRAMES), CONFIG, log=log, viewer=viewer) as run:
@@ -68,7 +68,7 @@ def test_a_killed_viewer_is_not_missed(inline: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("closed", [False, True])
-def test_sending_to_nobody_takes_no_time_and_no_memory(closed: bool) -> None:
+def test_sending_without_a_receiver_takes_no_time_and_no_memory(closed: bool) -> None:
     receive, send = multiprocessing.Pipe(duplex=False)
     outbox = DroppingOutbox(send, limit=16)
     if closed:

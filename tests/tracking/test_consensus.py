@@ -118,7 +118,7 @@ def test_what_disagrees_in_company_is_marked_and_followed_on() -> None:
     assert not tracks.moving.any()
 
 
-def test_nothing_is_marked_where_nothing_moves() -> None:
+def test_no_point_is_marked_in_a_static_scene() -> None:
     tracks, on_person = scene(np.random.default_rng(0))
     for _ in range(3):
         tracks, _ = after_frame(tracks, ~on_person[: len(tracks)], NONE, 3, alert=False)

@@ -139,7 +139,7 @@ def test_map_updates_move_the_odometry_and_fuse_ids() -> None:
     assert old not in after.observations.point_ids
 
 
-def test_one_eye_is_refused_where_depth_is_needed() -> None:
+def test_one_camera_is_rejected_where_depth_is_needed() -> None:
     rig, _, _ = rendered()
     with pytest.raises(StereoSfmError, match="one camera"):
         make_tracker(config_for("em-r"), Rig(rig.left))
@@ -147,7 +147,7 @@ def test_one_eye_is_refused_where_depth_is_needed() -> None:
         make_tracker(config_for("eight-point"), Rig(rig.left))
 
 
-def test_one_eye_with_unit_steps_and_with_true_steps() -> None:
+def test_one_camera_with_unit_steps_and_with_true_steps() -> None:
     rig, images, poses = rendered()
     stamps = np.array([image.stamp_ns for image in images], np.int64)
     alone = [replace(image, right=None) for image in images]
@@ -190,7 +190,7 @@ def test_sparse_localization_on_tum_beats_the_paper(data_root: Path) -> None:
     assert evaluate(estimate, truth).ape_m.rmse < 0.05
 
 
-def test_the_course_system_starts_and_tracks_on_tum_with_one_eye(data_root: Path) -> None:
+def test_the_course_system_starts_and_tracks_on_tum_with_one_camera(data_root: Path) -> None:
     estimate, truth = run_preset("cpp-course", data_root / "rgbd_dataset_freiburg1_xyz", 20)
     assert len(estimate) >= 12
     assert evaluate(estimate, truth).ate_sim3_m < 0.03

@@ -32,7 +32,7 @@ def moved(image: U8) -> U8:
 
 
 @pytest.mark.parametrize("kind", list(TABLE))
-def test_matches_follow_the_picture(kind: str) -> None:
+def test_matches_follow_the_image(kind: str) -> None:
     image = texture()
     extractor = Extractor(FeaturesConfig(kind=kind))
     first, second = extractor.extract(image), extractor.extract(moved(image))
@@ -47,7 +47,7 @@ def test_matches_follow_the_picture(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", list(TABLE))
-def test_an_empty_picture_has_no_features_and_no_matches(kind: str) -> None:
+def test_an_empty_image_has_no_features_and_no_matches(kind: str) -> None:
     extractor = Extractor(FeaturesConfig(kind=kind))
     blank = extractor.extract(np.full((240, 320), 90, np.uint8))
     assert len(blank) == 0 and blank.descriptors.shape == (0, TABLE[kind].width)
@@ -98,7 +98,7 @@ def bearings_with_outliers(wide: bool) -> tuple[F64, F64, int]:
 
 
 @pytest.mark.parametrize("wide", [False, True])
-def test_epipolar_ransac_takes_outliers_out_in_pinhole_and_fisheye(wide: bool) -> None:
+def test_epipolar_ransac_rejects_outliers_in_pinhole_and_fisheye(wide: bool) -> None:
     first, second, bad = bearings_with_outliers(wide)
     inliers = epipolar_inliers(first, second, 1 / 400.0, np.random.default_rng(0))
     assert inliers[bad:].mean() > 0.97

@@ -126,7 +126,7 @@ def test_before_velocity_is_known_only_the_rotation_is_predicted() -> None:
     assert not motion.bridges(stamp)
 
 
-def test_the_time_offset_is_taken_off() -> None:
+def test_the_time_offset_is_corrected() -> None:
     assert follow(Session(offset_s=0.03), 6.0).state is not None
     state = follow(Session(offset_s=0.03), 6.0).state
     assert state is not None
@@ -203,7 +203,7 @@ def test_the_imu_is_part_of_a_rig_file(tmp_path: Path) -> None:
     assert "imu" not in (tmp_path / "without.yaml").read_text()
 
 
-def test_a_drone_goes_on_in_the_dark_and_is_found_again(data_root: Path) -> None:
+def test_a_drone_is_tracked_through_the_dark(data_root: Path) -> None:
     """EuRoC with a second of black images: no new submap, a pose for every frame."""
     with open_source(data_root / "euroc_mh01") as source:
         assert source.rig.imu is not None

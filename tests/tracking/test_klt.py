@@ -71,7 +71,7 @@ def test_affine_alignment_finds_the_deformation() -> None:
     assert np.abs(np.median(deformation[found], 0) - matrix[:, :2]).max() < 0.01
 
 
-def test_affine_alignment_forgets_where_it_began() -> None:
+def test_affine_alignment_does_not_depend_on_its_start() -> None:
     """What is left of the start is left of the motion too, when all points begin short of it."""
     image, matrix = texture(2), np.array([[1.02, 0.01, -2.4], [-0.01, 1.02, -1.8]])
     uv = grid(image)
@@ -116,7 +116,7 @@ def test_a_warped_window_is_the_bilinear_interpolation_up_to_the_border() -> Non
     assert ncc[inside].min() > 0.9999
 
 
-def test_an_unlike_window_is_refused() -> None:
+def test_a_different_window_is_rejected() -> None:
     image, other = texture(3), texture(4)
     uv = grid(image)
     status, _ = klt.track_translation(

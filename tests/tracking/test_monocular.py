@@ -104,7 +104,7 @@ def test_homographies_are_exact_on_planes_and_beyond_ninety_degrees() -> None:
     assert found.inliers.all()
 
 
-def test_planarity_tells_a_plane_from_a_room() -> None:
+def test_planarity_separates_a_plane_from_a_room() -> None:
     essential = essential_from_motion(MOTION[:3, :3], MOTION[:3, 3])
     values = []
     for planar in (False, True):

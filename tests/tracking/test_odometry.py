@@ -78,7 +78,7 @@ def test_weights_by_stereo_uncertainty_help_the_translation() -> None:
 
 @pytest.mark.parametrize("turn", [0.0, 0.05])
 @pytest.mark.parametrize("name", ["em-r", "r-um", "pnp", "eight-point"])
-def test_a_camera_that_stands_or_only_turns(name: str, turn: float) -> None:
+def test_a_static_or_rotating_camera(name: str, turn: float) -> None:
     truth = se3.exp(np.array([0, 0, 0, 0, turn, 0.0]))
     degrees, metres = errors(estimate(name, frame_pair(truth, 200, 0.3)), truth)
     assert degrees < (1.0 if name == "r-um" else 0.3)
@@ -118,14 +118,14 @@ def test_wrong_matches_alone_are_refused_however_uncertain_the_depth_is(name: st
 
 
 @pytest.mark.parametrize("name", ["em-r", "r-um", "um", "pnp", "eight-point"])
-def test_the_same_image_again_is_no_motion(name: str) -> None:
+def test_the_same_image_again_gives_no_motion(name: str) -> None:
     """Without any noise no essential matrix is determined, and the rotation is."""
     pair = frame_pair(np.eye(4), 150)
     degrees, metres = errors(estimate(name, pair), np.eye(4))
     assert degrees < 1e-3 and metres < 1e-4
 
 
-def test_an_exact_turn_is_a_turn() -> None:
+def test_an_exact_rotation_is_a_rotation() -> None:
     truth = se3.exp(np.array([0, 0, 0, 0, 0.05, 0.0]))
     for name in ("em-r", "eight-point"):
         degrees, metres = errors(estimate(name, frame_pair(truth, 150)), truth)

@@ -82,7 +82,7 @@ def test_corners_change_nothing_for_the_tracker_and_odometry_alone_has_none() ->
             assert np.array_equal(getattr(a, name), getattr(b, name), equal_nan=True)
 
 
-def test_they_are_the_image_s_whatever_tracks_in_it() -> None:
+def test_corners_do_not_depend_on_the_tracker() -> None:
     by_flow, by_descriptors = run()[0], run("odometry.method=r-um", "features.kind=orb")[0]
     for a, b in zip(dataclasses.astuple(by_flow.corners), dataclasses.astuple(by_descriptors.corners), strict=True):
         assert len(a) > 200 and np.array_equal(a, b)
@@ -94,7 +94,7 @@ def test_a_black_image_has_none(sequence: SimSource) -> None:
     assert still_keyframe(dataclasses.replace(image, left=dark, right=dark.copy()), sequence.rig) is None
 
 
-def test_an_eye_that_sees_nothing_leaves_none(sequence: SimSource) -> None:
+def test_a_black_right_image_gives_no_corners(sequence: SimSource) -> None:
     image = sequence.frame(int(sequence.frame_ids[40]))
     covered = StereoImage(0, 0, image.left, np.full_like(image.left, 90))
     keyframe = still_keyframe(covered, sequence.rig)

@@ -70,13 +70,13 @@ def test_forty_percent_outliers_do_not_matter(camera: Camera) -> None:
     assert (error[~bad] < 3).mean() > 0.98
 
 
-def test_left_eye_alone_is_enough() -> None:
+def test_the_left_image_alone_is_enough() -> None:
     pose, points, uv, uv_right = scene(CAMERAS[2], 120, 2)
     found, _, _ = solve(CAMERAS[2], points, uv, np.full_like(uv_right, np.nan))
     assert np.abs(found - pose).max() < 1e-7
 
 
-def test_covariance_is_what_noise_does() -> None:
+def test_the_covariance_predicts_the_scatter() -> None:
     """Squared Mahalanobis length of the error has mean six when pixels and distances are as noisy as stated."""
     rng = np.random.default_rng(5)
     pose, points, uv, uv_right = scene(CAMERAS[0], 150, 4)

@@ -63,14 +63,14 @@ def bent(k1: float) -> Callable[[Rig], Rig]:
 
 
 @pytest.mark.parametrize(("vibration", "seed"), [(1, 0), (4, 0), (4, 1), (4, 2)])
-def test_a_rolling_shutter_that_the_calibration_does_not_know(vibration: int, seed: int) -> None:
+def test_a_rolling_shutter_missing_in_the_calibration(vibration: int, seed: int) -> None:
     found = search(f"{AISLE}&vibration={vibration}&seed={seed}&readout=0.025", 0.0)
     assert found.differs and found.known
     assert found.best_s == pytest.approx(0.025, abs=0.004)
     assert found.sigma_s < 0.002
 
 
-def test_a_global_shutter_and_one_that_is_known() -> None:
+def test_a_global_shutter_and_a_calibrated_one() -> None:
     known = search(f"{AISLE}&vibration=4&seed=0&readout=0.025", 0.025)
     assert known.known and known.best_s == 0.025
     believed = search(f"{AISLE}&vibration=4&seed=1", 0.025)
@@ -78,7 +78,7 @@ def test_a_global_shutter_and_one_that_is_known() -> None:
 
 
 @pytest.mark.parametrize("change", [lambda rig: rig, turned(0, 0.2), turned(1, 0.2), turned(2, 0.3), bent(0.03)])
-def test_a_global_shutter_is_no_rolling_one_whatever_the_calibration_says(change: Callable[[Rig], Rig]) -> None:
+def test_a_global_shutter_is_recognised_with_any_calibration(change: Callable[[Rig], Rig]) -> None:
     found = search(f"{AISLE}&vibration=4&seed=1", 0.0, change)
     assert found.known and not found.differs and found.best_s == 0.0
     assert abs(found.measured_s) < 0.003
@@ -97,7 +97,7 @@ def test_kitti_has_a_global_shutter(yaw_deg: float, data_root: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["kitti", "euroc_mh01", "store_walk"])
-def test_global_shutters_are_known_to_be_such(name: str, data_root: Path) -> None:
+def test_global_shutters_are_recognised(name: str, data_root: Path) -> None:
     found = search(str(data_root / name), 0.0)
     assert found.known and found.best_s == 0.0
 
@@ -118,7 +118,7 @@ def test_fisheyes_in_stores(spec: str, readout_s: float, seed: int) -> None:
     assert found.measured_s == pytest.approx(readout_s, abs=0.003 + 3 * found.sigma_s)
 
 
-def test_too_few_frames_say_nothing() -> None:
+def test_too_few_frames_give_no_result() -> None:
     found = search(
         f"{AISLE}&vibration=4&frames={MIN_PAIRS + 3}", 0.0
     )  # two velocities need four images; the first has no motion
@@ -127,11 +127,11 @@ def test_too_few_frames_say_nothing() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_camera_that_glides_shows_no_readout(seed: int) -> None:
+def test_steady_motion_does_not_determine_the_readout(seed: int) -> None:
     assert not search(f"{AISLE}&vibration=0&seed={seed}&readout=0.025", 0.0).known
 
 
-def test_check_calib_tells(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_check_calib_reports_the_readout(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     source = f"{AISLE}&vibration=4&readout=0.025"
     assert main(["check-calib", source, "--correct", str(tmp_path / "corrected.yaml")]) in (0, 3)
     told = capsys.readouterr().out

@@ -75,7 +75,7 @@ def test_a_covered_camera_is_found_again_at_first_sight() -> None:
     assert frames[FREE[-1]].state == TrackState.OK
 
 
-def test_a_camera_that_comes_back_elsewhere_is_not_found() -> None:
+def test_a_camera_that_reappears_elsewhere_is_not_found() -> None:
     turned = se3.exp(np.array([0, 0, 0, 0, np.pi, 0]))  # in one frame: no robot does that
     elsewhere = [drive().image_at(drive().pose(k) @ turned, k) for k in FREE]
     images = [seen(k) for k in range(BEGIN, COVERED.start)] + [covered(k) for k in COVERED] + elsewhere
@@ -109,7 +109,7 @@ def moving(seconds: F64) -> list[F64]:
     return [se3.exp(np.array([0.0, 0.0, 1.0, 0.0, 0.2, 0.0]) * t) for t in seconds]
 
 
-def test_trusted_motion_is_the_mean_of_the_last_second_and_grows_unsure() -> None:
+def test_trusted_motion_is_the_mean_of_the_last_second_with_growing_covariance() -> None:
     motion = TrustedMotion()
     times = np.arange(0, 3, 0.1)
     for t, pose in zip(times, moving(times), strict=True):
@@ -122,7 +122,7 @@ def test_trusted_motion_is_the_mean_of_the_last_second_and_grows_unsure() -> Non
     assert late.sigmas_off(moving(np.array([5.0]))[0]) < 1
 
 
-def test_without_places_nothing_is_searched() -> None:
+def test_without_places_there_is_no_search() -> None:
     recovery = Recovery(None, None, (424, 400))
     recovery.motion.add(0, np.eye(4))
     image = covered(0)

@@ -79,7 +79,7 @@ def test_pose_and_velocity_of_exact_rows() -> None:
     assert np.abs(blind - pose).max() > 1e-3  # what rows do to a solver that does not know them
 
 
-def test_a_steady_motion_holds_the_velocity() -> None:
+def test_a_steady_motion_constrains_the_velocity() -> None:
     pose, points, uv, uv_right = scene(CAMERAS[0], 1)
     _, velocity = solve(RollingShutter(rig(CAMERAS[0])), points, uv, uv_right, pose, 1e-6)
     assert np.abs(velocity - 0.9 * VELOCITY).max() < 0.05  # no rows can pull it away from the mean since the last frame
@@ -126,7 +126,7 @@ def test_a_global_shutter_changes_nothing() -> None:
     assert shutter.corners_at_stamp(corners, VELOCITY) is corners
 
 
-def test_the_velocity_is_held_as_tightly_as_the_motion_is_steady() -> None:
+def test_the_velocity_is_constrained_by_the_steadiness_of_the_motion() -> None:
     steady, shaken = RollingShutter(rig(CAMERAS[0])), RollingShutter(rig(CAMERAS[0]))
     for k in range(200):
         steady.learn(VELOCITY, 1 / 30)
@@ -136,7 +136,7 @@ def test_the_velocity_is_held_as_tightly_as_the_motion_is_steady() -> None:
     assert shaken.velocity_sigma()[[0, 3]] == pytest.approx(0.5 * change + 0.005, rel=0.05)
 
 
-def test_nearly_equal_stamps_do_not_unsettle() -> None:
+def test_nearly_equal_stamps_do_not_disturb() -> None:
     shutter = RollingShutter(rig(CAMERAS[0]))
     shutter.learn(VELOCITY, 1 / 30)
     before = shutter.velocity_sigma()
@@ -163,7 +163,7 @@ def test_a_rendered_sequence_with_a_rolling_shutter() -> None:
     assert known < unknown / 2.5
 
 
-def test_keyframes_of_a_rendered_sequence_are_as_if_seen_at_once() -> None:
+def test_keyframes_of_a_rendered_sequence_are_those_of_a_global_shutter() -> None:
     """What the map gets: pixels where the points are at the stamp, of tracked and new points and of corners."""
     spec = "sim:aisle?camera=pinhole&size=320x200&rate=10&start=20&frames=40&vibration=4&readout=0.05"
     with open_source(spec) as source:

@@ -74,7 +74,7 @@ def test_points_of_a_plane_are_found(
 
 
 @pytest.mark.parametrize("rig", [pinhole_rig(), fisheye_rig()], ids=["pinhole", "fisheye"])
-def test_most_of_a_pattern_that_repeats_is_refused(rig: Rig) -> None:
+def test_most_of_a_repetitive_pattern_is_rejected(rig: Rig) -> None:
     stripes = np.tile(120 + 60 * np.sin(2 * np.pi * np.arange(900) / 9.0), (900, 1)).astype(np.float32)
     noise = np.random.default_rng(0).normal(0, 2.0, stripes.shape).astype(np.float32)
     _, match = matches(rig, see_plane(rig, 12 * rig.baseline, stripes + noise, 1.0, 0.0), coarse=False)

@@ -63,7 +63,7 @@ def test_slanted_windows_fit_at_their_centre(slope: float) -> None:
     assert 0.3 < np.sqrt((error**2).mean() / (sigma_px[seen] ** 2).mean()) < 3
 
 
-def test_a_window_with_a_depth_edge_stands_out() -> None:
+def test_a_window_with_a_depth_edge_has_a_large_residual() -> None:
     near, far, v, u = texture(4), texture(5), *np.mgrid[: SIZE[0], : SIZE[1]].astype(float)
     edges, apart = 188.0, 2.5  # px of the edge, and between the disparities
     left = np.where(u < edges, near, far)

@@ -60,7 +60,7 @@ def brighter(images: Iterator[StereoImage]) -> Iterator[StereoImage]:
 
 
 @pytest.mark.parametrize("change", [None, black, dropped, brighter], ids=lambda c: c.__name__ if c else "as recorded")
-def test_euroc_and_what_goes_wrong(data_root: Path, change: Change | None) -> None:
+def test_euroc_with_disturbances(data_root: Path, change: Change | None) -> None:
     source = open_source(data_root / "euroc_mh01")
     frames = track(source, 70, change)
     lost = [f for f in frames if f.state == TrackState.LOST]
@@ -129,7 +129,7 @@ def test_the_same_images_give_the_same_bits(data_root: Path) -> None:
         assert np.array_equal(x.observations.uv_right, y.observations.uv_right, equal_nan=True)
 
 
-def test_losing_track_for_long_begins_a_submap(data_root: Path) -> None:
+def test_a_long_loss_of_tracking_starts_a_submap(data_root: Path) -> None:
     def blind(images: Iterator[StereoImage]) -> Iterator[StereoImage]:
         for image in images:
             dark = np.zeros_like(image.left)
@@ -152,7 +152,7 @@ def test_covariance_grows_where_little_is_seen(data_root: Path) -> None:
     assert all(np.linalg.eigvalsh(f.covariance).min() > 0 for f in frames[1:])
 
 
-def test_one_eye_is_refused_in_one_line() -> None:
+def test_one_camera_is_rejected_in_one_line() -> None:
     from stereo_sfm.geometry.cameras import Pinhole
 
     with pytest.raises(StereoSfmError, match="needs a stereo or RGB-D source"):

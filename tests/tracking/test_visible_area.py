@@ -25,7 +25,7 @@ def half_image(camera: Camera, rim_deg: float, brightness: float, seed: int = 0)
 
 
 @pytest.mark.parametrize("rim_deg", [72.0, 80.0])
-def test_points_keep_off_the_rim(rim_deg: float) -> None:
+def test_points_avoid_the_rim(rim_deg: float) -> None:
     camera = fisheye_rig().left
     area = VisibleArea(camera, 88.0)
     before = area.mask
@@ -39,7 +39,7 @@ def test_points_keep_off_the_rim(rim_deg: float) -> None:
     assert area.inside(np.array([[camera.cx, camera.cy], [np.nan, 5.0]])).tolist() == [True, False]
 
 
-def test_a_dark_scene_hides_no_lens() -> None:
+def test_a_dark_scene_is_not_taken_for_the_rim() -> None:
     camera = fisheye_rig().left
     area = VisibleArea(camera, 88.0)
     before = area.mask

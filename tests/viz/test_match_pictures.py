@@ -41,7 +41,7 @@ def test_lines_join_the_matches() -> None:
     assert set(coloured[0]) <= set(range(25, 36))
 
 
-def test_a_picture_for_every_second_frame_after_a_keyframe(tmp_path: Path) -> None:
+def test_an_image_for_every_second_frame_after_a_keyframe(tmp_path: Path) -> None:
     sink = MatchPictures(2, tmp_path / "matches")
     for k in range(5):
         sink.put(StereoImage(k, 0, GREY))

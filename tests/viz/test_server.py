@@ -39,9 +39,7 @@ sys.stdin.read()
 @pytest.mark.parametrize(
     ("address", "who"), [("127.0.0.1", "this computer only"), ("0.0.0.0", "anyone who can reach 0.0.0.0")]
 )
-def test_a_served_viewer_listens_where_it_was_asked_to_and_says_so(
-    ports: tuple[int, int], address: str, who: str
-) -> None:
+def test_a_served_viewer_listens_on_its_address_and_reports_it(ports: tuple[int, int], address: str, who: str) -> None:
     command = [sys.executable, "-c", SERVE, *map(str, ports), address]
     parent = subprocess.Popen(command, stdin=-1, stdout=-1, text=True)
     assert parent.stdout is not None
@@ -56,7 +54,7 @@ def test_a_served_viewer_listens_where_it_was_asked_to_and_says_so(
     viewer.wait(5)
 
 
-def test_a_port_that_is_taken_is_said(ports: tuple[int, int]) -> None:
+def test_an_occupied_port_is_reported(ports: tuple[int, int]) -> None:
     for port in ports:
         with socket.socket() as taken:
             taken.bind(("127.0.0.1", port))
@@ -66,7 +64,7 @@ def test_a_port_that_is_taken_is_said(ports: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize("address", ["no such host", "192.0.2.77"])
-def test_an_address_that_is_not_ours_is_said(ports: tuple[int, int], address: str) -> None:
+def test_a_foreign_address_is_reported(ports: tuple[int, int], address: str) -> None:
     with pytest.raises(StereoSfmError, match=address):
         server.serve(address)
 

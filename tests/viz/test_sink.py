@@ -91,7 +91,7 @@ def test_the_map_is_shown(shown: Recording) -> None:
     assert len(shown.of("map/ground_truth")) == 1
 
 
-def test_the_log_has_loops_and_why_there_was_none(shown: Recording) -> None:
+def test_the_log_has_loops_and_reasons_of_rejection(shown: Recording) -> None:
     texts = [what.text.as_arrow_array().to_pylist()[0] for what in shown.of("log")]
     assert texts[-2:] == ["loop: keyframe 2 sees keyframe 0 again, 40 inliers",
                           "loop: no loop at keyframe 3, 1 rejected: too few inliers"]  # fmt: skip
@@ -139,7 +139,7 @@ def test_strips_are_what_rerun_makes_of_a_list_of_lines() -> None:
     assert len(rr.LineStrips3D(strips(np.zeros((0, 2, 3)))).strips) == 0
 
 
-def test_wire_cameras_look_along_z() -> None:
+def test_wire_cameras_face_along_z() -> None:
     pose = se3.exp(np.array([1.0, 2.0, 3.0, 0.0, np.pi / 2, 0.0]))
     (stroke,) = wire_cameras(pose[None], 2.0)
     local = se3.transform(se3.inverse(pose), stroke)
@@ -156,7 +156,7 @@ def test_colors_run_from_blue_to_red() -> None:
     assert spread_colors(np.zeros(0)).shape == (0, 3)
 
 
-def test_a_viewer_that_does_not_answer_is_a_warning(
+def test_an_unresponsive_viewer_is_a_warning(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     def gone(self: Recording, timeout_sec: float) -> None:
