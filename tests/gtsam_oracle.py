@@ -1,4 +1,4 @@
-"""The same bundles solved by GTSAM: what mapping/bundle.py is compared with, in tests and in benchmarks."""
+"""The same bundles solved by GTSAM, as a reference of mapping/bundle.py in tests and benchmarks."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def start_values(bundle: Bundle) -> Any:
 
 
 def optimize(graph: Graph, values: Any, tight: bool = True) -> Any:
-    """Levenberg-Marquardt; `tight` goes on to the bottom of the minimum."""
+    """Levenberg-Marquardt; `tight`: to full convergence."""
     params = gtsam.LevenbergMarquardtParams()
     if tight:
         params.setRelativeErrorTol(1e-12)

@@ -27,7 +27,7 @@ def fisheye_rig() -> Rig:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Truth and what was seen."""
+    """Ground truth and observations."""
 
     rig: Rig
     world_T_kf: F64  # (K, 4, 4)
@@ -40,7 +40,7 @@ class Scene:
 
 
 def camera_path(count: int, step: float = 0.25, yaw_per_step: float = 0.02) -> F64:
-    """(K, 4, 4) world_T_cam of somebody who sequences forward (world z) and slowly turns, with some sway."""
+    """(K, 4, 4) world_T_cam of a camera that moves forward (world z) and slowly turns, with some sway."""
     pose, out = np.eye(4), []
     for k in range(count):
         out.append(
@@ -136,7 +136,7 @@ def keyframe_stream(
     broken_at: int = -1,
     seed: int = 0,
 ) -> KeyframeStream:
-    """A sequence seen through tracks that break.
+    """Keyframes of a sequence with interrupted tracks.
 
     A point that stays in view is tracked for at most `track_length` keyframes and comes back later under a new id with
     the descriptor it had, a few bits changed; every new track sits up to half a pixel beside the point.

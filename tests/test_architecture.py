@@ -1,4 +1,4 @@
-"""Who may import whom, and what the core never does. Read from the source files, not from what happens to be loaded."""
+"""Allowed imports, and what is forbidden in the core; from the source files, not from loaded modules."""
 
 from __future__ import annotations
 
@@ -195,7 +195,7 @@ def test_the_rules_can_fail(tmp_path: Path) -> None:
 
 
 def test_an_argparse_namespace_ends_at_a_commands_entry() -> None:
-    """`run(args)` and the parsers of shared options take one; what does the work takes typed options."""
+    """`run(args)` and the parsers of shared options take one; all other functions take typed options."""
     for path in sorted((ROOT / "stereo_sfm").rglob("*.py")):
         if path.name == "_options.py":
             continue

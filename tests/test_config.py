@@ -1,4 +1,4 @@
-"""The configuration: what a field does not take is refused when it is loaded, in one line that says what it takes."""
+"""The configuration: invalid values are rejected on loading, in one line with the valid ones."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_every_setting_has_a_sentence_and_every_number_two_bounds(
 
 @pytest.mark.parametrize("name", [name for name, _, _ in SETTINGS])
 def test_one_rule_for_names(name: str) -> None:
-    """Units as suffixes, spelled one way."""
+    """Units as suffixes, with one spelling."""
     words = name.split(".")[-1].split("_")
     assert not set(words) & {"metres", "metre", "degrees", "degree", "seconds", "pixels", "pixel"}
     if "sigma" in words:  # a standard deviation says its unit
@@ -79,7 +79,7 @@ def test_one_rule_for_names(name: str) -> None:
 
 
 def words_of() -> dict[str, tuple[str, ...]]:
-    """Setting -> the words that it takes."""
+    """Setting -> its valid words."""
     return {name: field.metadata["words"] for name, field, _ in SETTINGS if "words" in field.metadata}
 
 
@@ -100,7 +100,7 @@ def test_the_words_are_those_of_the_code_that_reads_them() -> None:
 
 
 def test_names_of_earlier_versions_are_accepted(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
-    """From a file with a line that says the new name; from the log of a run without one."""
+    """From a file with a line that names the new one; from the log of a run without."""
     logging.getLogger("stereo_sfm").propagate = True
     (tmp_path / "old.toml").write_text("[loop]\npixel_sigma = 2.5\ngate_metres = 0.7\n")
     config = load(tmp_path / "old.toml", ["tracker.max_error=4"])

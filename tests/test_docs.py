@@ -1,4 +1,4 @@
-"""README and docs say what is so: their commands exist with their options, their Python runs, CI calls the tests."""
+"""README and docs are correct: their commands exist with their options, their Python runs, CI calls the tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an installation without the extras says: one line with what to install, and only when it is asked for."""
+"""An installation without the extras: one line that names the missing one, and only when it is used."""
 
 from __future__ import annotations
 

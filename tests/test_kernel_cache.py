@@ -84,7 +84,7 @@ print(hamming(words, 0, words + np.uint64(1), 0))
 
 
 def test_kernels_run_on_a_read_only_home(tmp_path: Path) -> None:
-    """Both numba and we ask by a temporary file whether a folder can be written to."""
+    """Both numba and we test with a temporary file whether a folder is writable."""
     environment = {k: v for k, v in os.environ.items() if k != kernel_cache.VARIABLE}
     environment |= {"HOME": str(tmp_path / "home"), "TMPDIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
     code = READ_ONLY.format(temporary=str(tmp_path / "stereo-sfm-"))

@@ -1,4 +1,4 @@
-"""The machine code does not depend on what a processor has beyond AVX2, and a log says which it was."""
+"""The machine code does not depend on features beyond AVX2, and a log records the processor's."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ AVX2 = frozenset({"sse4_2", "avx2", "fma"})
 
 
 def told(code: str, **variables: str) -> dict[str, str]:
-    """What a new process says of its machine code."""
+    """The machine code of a new process."""
     clean = {name: value for name, value in os.environ.items() if name not in SET}
     done = subprocess.run([sys.executable, "-c", code], env={**clean, **variables}, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,4 @@
-"""convert-calib: through every dialect and back, and what depthai itself reads from our file."""
+"""convert-calib: through every format and back, and our file read by depthai."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every dialect: round trips, conventions on known rigs, and one line for what is missing or malformed."""
+"""Every format: round trips, conventions on known rigs, and one line for what is missing or malformed."""
 
 from __future__ import annotations
 
@@ -304,7 +304,7 @@ def test_euroc_files_with_opencvs_header_and_matrices(tmp_path: Path) -> None:
 
 
 def test_the_three_forms_of_opencvs_files(tmp_path: Path) -> None:
-    """What OpenCV itself writes is what is read, whichever form it has."""
+    """Files written by OpenCV are read in all its forms."""
     for name in ("stereo.yml", "stereo.xml", "stereo.json"):
         save_rig(RADTAN, tmp_path / name, "opencv")
         same_rig(RADTAN, read_opencv(tmp_path / name), 1e-12, body=False)

@@ -10,7 +10,7 @@ from stereo_sfm.types import F64
 
 
 def picture(u: F64, v: F64) -> F32:
-    """A smooth texture, known between the pixels too."""
+    """A smooth texture, defined between the pixels too."""
     rng = np.random.default_rng(3)
     out = np.full(u.shape, 120.0)
     for _ in range(40):

@@ -1,4 +1,4 @@
-"""Which terms of a correction are written: only what is proven, twice."""
+"""Which terms of a correction are written: significant ones that both halves confirm."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_without_a_second_half_nothing_is_written_and_the_rig_is_the_same() -> N
 
 
 def test_terms_that_trade_with_one_that_stays_take_its_part() -> None:
-    """A turn about x and the baseline's z look alike: known together they are doubtful, each alone is certain."""
+    """A rotation about x and the baseline's z are correlated: uncertain together, significant alone."""
     covariance = np.diag(SIGMA**2)
     a, b = 0, 4
     covariance[a, a], covariance[b, b] = 25 * SIGMA[a] ** 2, 25 * SIGMA[b] ** 2

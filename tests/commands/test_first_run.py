@@ -1,4 +1,4 @@
-"""The first run on a machine says what it compiles, and its frame rate is that of the frames."""
+"""The first run on a machine reports compilation, which does not count in its frame rate."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_the_time_until_every_stage_is_ready_is_measured() -> None:
 
 @pytest.mark.slow
 def test_a_first_run_and_a_run_after_compile(tmp_path: Path) -> None:
-    """The kernels' folder is empty, then what `compile` put there is all that a run needs."""
+    """`compile` fills an empty kernel folder with everything that a run needs."""
     environment = os.environ | {kernel_cache.VARIABLE: str(tmp_path / "kernels")}
     command = [sys.executable, "-m", "stereo_sfm.cli"]
     begin = time.monotonic()

@@ -1,4 +1,4 @@
-"""The installed command, as a shell starts it: nothing that another test imported or set up is there."""
+"""The installed command, as a shell starts it: without imports and set-up of other tests."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SCRIPT = Path(sys.executable).parent / "stereo-sfm"
 
 
 def run(folder: Path, *options: str) -> dict[str, Any]:
-    """Three frames of the bundled recording; what its stats.json says."""
+    """Three frames of the bundled recording; its stats.json."""
     command = [SCRIPT, "run", "--max-frames", "3", "-o", folder, *options]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

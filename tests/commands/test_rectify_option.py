@@ -1,4 +1,4 @@
-"""`--rectify`: the run sees the rectified pair, its log says so, and a replay from the source does it again."""
+"""`--rectify`: the run uses rectified images, its log records it, and a replay from the source repeats it."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_a_replaced_calibration_is_replayed_too(tmp_path: Path) -> None:
 
 
 class LateRig(BaseSource):
-    """A camera that tells its calibration when it is open."""
+    """A camera whose calibration is read when it is open."""
 
     def __init__(self, rig: Rig) -> None:
         self._source = open_source(SPEC)

@@ -77,7 +77,7 @@ def test_trajectory_of_the_body(euroc_run: Path, data_root: Path, tmp_path: Path
 
 
 def ate(*args: object, capsys: pytest.CaptureFixture[str]) -> float:
-    """What `eval` says."""
+    """The output of `eval`."""
     assert main(["eval", *map(str, args), "--json"]) == 0
     return json.loads(capsys.readouterr().out)["ape_m"]["rmse"]
 
@@ -229,7 +229,7 @@ def test_python_api_of_the_readme(data_root: Path) -> None:
 def test_a_part_of_a_source_lasts_as_long_as_its_images(
     data_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The truth in the file goes on to the source's end."""
+    """The ground truth in the file extends to the source's end."""
     path = str(tmp_path / "part.mcap")
     assert main(["convert", str(data_root / "kitti"), "-o", path, "--max-frames", "3", "-q"]) == 0
     capsys.readouterr()

@@ -1,4 +1,4 @@
-"""Small data sets on disk for the tests of the drivers: a textured pair of images and what each layout needs."""
+"""Small data sets on disk for the tests of the drivers: a textured pair of images in each layout."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def make_kitti(root: Path, frames: int = FRAMES) -> Path:
 
 
 def make_euroc(root: Path, frames: int = FRAMES) -> Path:
-    """EuRoC folder whose body is 1 m above the camera and looks the other way."""
+    """EuRoC folder whose body is 1 m above the camera and faces backwards."""
     stamps = [START_NS + i * PERIOD_NS for i in range(frames)]
     for side in (0, 1):
         camera = root / "mav0" / f"cam{side}"
@@ -112,7 +112,7 @@ def make_kapture(root: Path) -> Path:
 
 
 def make_kitti_raw(root: Path) -> Path:
-    """A date with one drive that goes 1 m east a frame, heading east."""
+    """A date with one drive that moves 1 m east per frame, heading east."""
     drive = root / "2011_09_26_drive_0001_sync"
     for side in (0, 1):
         write_images(drive / f"image_0{side}" / "data", side, [f"{i:010d}.png" for i in range(FRAMES)])

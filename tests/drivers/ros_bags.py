@@ -85,7 +85,7 @@ class BagWriter:
         self.put("/tf_static", kind, self.make(kind, [row]), stamp_ns)
 
     def imu(self, stamp_ns: int, gyro: F64, accel: F64, topic: str = "/imu/data") -> None:
-        """NaN stands for what is not measured."""
+        """NaN: not measured."""
         kind, zeros = "sensor_msgs/msg/Imu", np.zeros(9)
         covariance = [np.r_[-1.0, np.zeros(8)] if np.isnan(v).any() else zeros for v in (gyro, accel)]
         values = [self._vector(np.nan_to_num(v)) for v in (gyro, accel)]

@@ -1,4 +1,4 @@
-"""The real sequences: what each of them is said to be, and geometry that only holds if every convention is right."""
+"""The real sequences: their documented properties, and geometry that requires correct conventions."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_matches_lie_in_the_epipolar_planes(folder: str, data_root: Path) -> Non
 
 
 def test_ground_truth_of_euroc_explains_the_motion_in_the_image(data_root: Path) -> None:
-    """Points triangulated in one frame appear in a later one where world_T_cam0 says: wrong by pixels if T_BS were."""
+    """Points triangulated in one frame reproject into a later one by world_T_cam0: off by pixels with a wrong T_BS."""
     from stereo_sfm.eval.associate import poses_at
 
     with open_source(data_root / "euroc_mh01") as source:

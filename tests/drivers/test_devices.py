@@ -1,4 +1,4 @@
-"""What `devices` and `udev` say."""
+"""The output of `devices` and `udev`."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ def camera_image(frame: int, shift_ns: int = 0, counter: int | None = None) -> C
 @settings(max_examples=60, deadline=None)
 @given(st.data())
 def test_any_losses_and_any_interleaving_are_accounted_for(data: st.DataObject) -> None:
-    """Images of each camera come in order; the cameras interleave within three frames; any of them may be lost."""
+    """Images of each camera in order, both cameras interleaved within three frames, any of them lost."""
     frames = 30
     arrivals: list[tuple[float, int, int]] = []
     alive: list[set[int]] = []

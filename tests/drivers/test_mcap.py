@@ -60,7 +60,7 @@ def _write(
     skip: Sequence[tuple[int, int]] = (),
     extra: Callable[[ProtobufWriter], None] = lambda writer: None,
 ) -> Path:
-    """A stereo recording as somebody else may write it."""
+    """A stereo recording as by another program."""
     with path.open("wb") as stream, ProtobufWriter(stream) as writer:
         for side, topic in enumerate(calibrations):
             message = foxglove.calibration(cameras[side], frames[side], 10**9)
@@ -323,7 +323,7 @@ def test_ros_2_file(tmp_path: Path) -> None:
 
 
 def _error(path: Path | str, capsys: pytest.CaptureFixture[str]) -> str:
-    """What `info` or `record` says on standard error: one line, exit code 2."""
+    """The error of `info` or `record`: one line, exit code 2."""
     out = Path(str(path)).with_name("never.mcap")
     assert main(["record", str(path), "-o", str(out)]) == 2
     lines = capsys.readouterr().err.strip().splitlines()

@@ -1,4 +1,4 @@
-"""One parser for the options of every driver: text of a query or typed keywords, and one line for what does not fit."""
+"""One parser for the options of every driver: text of a query or typed keywords, and one line for invalid ones."""
 
 from __future__ import annotations
 

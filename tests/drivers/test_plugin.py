@@ -1,4 +1,4 @@
-"""The driver of docs/drivers.md: a package outside of ours, installed and run; nothing of the core knows it."""
+"""The driver of docs/drivers.md: a package of its own, installed and run without any change of the core."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Drivers are plugins: which there are, what they say of themselves, and how a source finds its driver."""
+"""Drivers are plugins: their list, their descriptions, and the choice of a source's driver."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ def test_the_commands_take_bags(kind: str, tmp_path: Path, capsys: pytest.Captur
 
 
 def test_separate_topics_of_gyroscope_and_accelerometer(tmp_path: Path) -> None:
-    """As realsense-ros writes them: -1 in the covariance of what a message does not measure."""
+    """As from realsense-ros: -1 in the covariance of quantities that a message does not contain."""
     source, images = _simulated()
     nothing, start = np.full(3, np.nan), images[0].stamp_ns
 
@@ -124,7 +124,7 @@ def test_bad_bags_are_one_line(kind: str, tmp_path: Path, capsys: pytest.Capture
 
 
 def _error_of(path: Path) -> str:
-    """What reading a bag says, "" if it can be read."""
+    """The error of reading a bag, "" if there is none."""
     try:
         with open_source(path) as bag:
             list(bag)

@@ -57,7 +57,7 @@ def test_seed_session_and_effects_change_the_images() -> None:
 
 
 def test_another_calibration_does_not_change_the_images() -> None:
-    """`--rig` says what tracking believes, not what the camera is."""
+    """`--rig` changes the calibration of tracking, not the camera."""
     spec = {"camera": "pinhole", "vibration": 3.0, "readout": 0.05}
     source, believed = small(**spec), small(**spec)
     believed.rig = dataclasses.replace(small().rig, readout_s=0.0)
@@ -172,7 +172,7 @@ def test_default_is_the_loop() -> None:
 
 
 def test_bundled_recording_is_what_its_command_renders() -> None:
-    """The demo comes from the simulator as it is now: same rig, same truth, same images up to JPEG's loss."""
+    """The demo is from the present simulator: same rig, same ground truth, same images up to JPEG's loss."""
     recording = Path(__file__).parents[2] / "recordings" / "demo.mcap"
     script = (recording.parent / "make_demo.py").read_text()
     spec = next(line.split('"')[1] for line in script.splitlines() if line.startswith("SOURCE"))

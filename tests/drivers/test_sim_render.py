@@ -1,4 +1,4 @@
-"""The simulator's geometry, filtering and sensor against what they must be by construction."""
+"""Geometry, filtering and sensor of the simulator against their exact models."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_shelf_traversal_finds_the_same_hits_as_testing_every_box(fill: float) -
 
 @pytest.mark.parametrize("camera", sorted(CAMERAS))
 def test_both_cameras_see_the_same_points(camera: str) -> None:
-    """A left pixel's point, projected by the exact model, is what the right camera sees there: bits of depth agree."""
+    """A left pixel's point, projected by the exact model, is seen by the right camera there: depths agree."""
     r = renderer(camera)
     left, right = r.render(POSE)
     rig: Rig = r.rig
@@ -183,7 +183,7 @@ def _mean_shift(a: np.ndarray, b: np.ndarray, ids: np.ndarray, uv: F64) -> F64:
 
 
 def test_textures_do_not_crawl() -> None:
-    """The next frame, warped by the truth, is this frame: nothing on a surface moves against it."""
+    """The next frame, warped by the ground truth, is this frame: textures are fixed to surfaces."""
     r = renderer("fisheye")
     after = POSE @ se3.exp(np.array([0.004, 0.003, 0.033, 0.002, 0.006, 0.001]))
     one, two = r.view(0, POSE), r.view(0, after)

@@ -53,7 +53,7 @@ NEVER_SEND = {
 
 
 def assert_honest(source: SimulatedT265Source, images: list[StereoImage]) -> None:
-    """Every image is the one that its stamp says, and every missing one is counted where it is missing."""
+    """Every image is that of its stamp, and every missing one is counted in its place."""
     frames = [source.frame_shown(i.stamp_ns) for i in images]
     for image, frame in zip(images, frames, strict=True):
         left, right = source.camera.content.image(frame)

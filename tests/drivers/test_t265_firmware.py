@@ -1,4 +1,4 @@
-"""Taking the firmware out of files that look like librealsense's, and refusing everything else."""
+"""Extraction of the firmware from files like those of librealsense, and rejection of all others."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ def damage(data: bytes, rng: random.Random) -> bytes:
 
 
 def answers() -> dict[int, bytes]:
-    """A good answer of every command the driver reads."""
+    """A valid reply to every command of the driver."""
     camera = SimulatedCamera(noise_content(1))
     out: dict[int, bytes] = {}
     for request in (
@@ -191,7 +191,7 @@ def test_damaged_descriptors(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_damaged_replies_through_the_link(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The command function with a camera that answers nonsense: an error each time, and never a hang."""
+    """Commands to a camera with invalid replies: an error each time, and never a hang."""
     camera = SimulatedCamera(noise_content(1))
     camera.booted = True
     bus, rng = SimulatedBus([camera]), random.Random(5)

@@ -1,4 +1,4 @@
-"""Golden bytes of the requests, round trips of the responses, and what is refused."""
+"""Golden bytes of the requests, round trips of the responses, and rejected bytes."""
 
 from __future__ import annotations
 

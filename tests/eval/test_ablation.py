@@ -1,4 +1,4 @@
-"""The ablation: its grid, a cell on a rendered store, what it does with failures, resuming, the written report."""
+"""The ablation: its grid, a cell on a rendered store, failures, resuming, the report."""
 
 from __future__ import annotations
 
@@ -176,7 +176,7 @@ def test_ctrl_c_finishes_the_running_cell_and_starts_no_other(
     begun: list[Any] = []
 
     class OneThread(Executor):
-        """Computes at once, while somebody presses Ctrl-C."""
+        """Returns at once, with Ctrl-C pressed meanwhile."""
 
         def __init__(self, *_: object, **__: object) -> None: ...
 

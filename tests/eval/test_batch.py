@@ -1,4 +1,4 @@
-"""Many recordings: one table, failures stay alone, finished work is not done again, a dying node costs nothing."""
+"""Many recordings: one table, isolated failures, no repeated work, and no loss when a node dies."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_a_result_of_another_configuration_is_not_reused(tmp_path: Path) -> None
 
 
 def test_without_an_address_no_cluster_is_searched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ray remembers the last cluster of this machine, and waits for it for minutes when it is gone."""
+    """Ray stores the last cluster of this machine, and waits for minutes for one that has ended."""
     ray = pytest.importorskip("ray")
     asked: list[object] = []
 

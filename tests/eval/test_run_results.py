@@ -71,7 +71,7 @@ def test_a_wrong_scale_of_two_cameras_is_reported(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("scale", "message"), [(3.0, "is 66.7 % too short"), (0.5, "is 100.0 % too long")])
 def test_a_length_is_too_long_or_too_short(tmp_path: Path, scale: float, message: str) -> None:
-    """Of a path of some metres; one of centimetres says nothing of the scale."""
+    """Of a path of some metres; one of centimetres does not determine the scale."""
     for size, told in ((1.0, True), (0.02, False)):
         truth, estimate = camera_path(), camera_path()
         estimate[:, :3, 3] *= size
@@ -125,7 +125,7 @@ def test_a_saved_map_connects_all_submaps() -> None:
 
 
 def test_frames_are_interpolated_between_keyframe_corrections(tmp_path: Path) -> None:
-    """The map moved the second keyframe by 9 cm after the frames between were tracked: each takes its share."""
+    """The map moved the second keyframe by 9 cm after the frames between were tracked: each gets its share."""
     record, none = record_of(camera_path(), 0), np.zeros(0, np.int64)
     record.keyframes = {k: KeyframeRow(k, k * 10**8, camera_path()[k], 0.0, submap_id=0) for k in (0, 10, 20)}
     aside = np.eye(4)
@@ -145,7 +145,7 @@ def test_frames_are_interpolated_between_keyframe_corrections(tmp_path: Path) ->
 
 
 def test_frames_located_by_a_keyframe_each_stay_with_it() -> None:
-    """An estimator that refers each frame to the last keyframe knows nothing of its place to the next one."""
+    """An estimator that refers each frame to the last keyframe has no relation to the next one."""
     pnp = dataclasses.replace(Config().odometry, method="pnp")
     record = RunRecord.of(Config(odometry=pnp))
     record.frames = record_of(camera_path(), 0).frames

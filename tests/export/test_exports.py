@@ -61,7 +61,7 @@ def test_colmap_reads_the_model_and_its_own_projection_meets_the_pixels(tmp_path
 
 
 def test_classic_colmap_files_are_complete(tmp_path: Path, saved: SavedMap) -> None:
-    """Readers that know neither rigs nor frames take poses from images.txt."""
+    """Readers without rigs and frames use the poses in images.txt."""
     export_colmap(saved, tmp_path)
     lines = [x for x in (tmp_path / "images.txt").read_text().splitlines() if not x.startswith("#")]
     assert len(lines) == 2 * 2 * len(saved)

@@ -30,7 +30,7 @@ def saved() -> SavedMap:
 
 
 def later(saved: SavedMap, by_ns: int = LATER_NS) -> SavedMap:
-    """The same sequence on another day: frame ids begin anew, the clock does not."""
+    """The same sequence on another day: frame ids restart, the clock does not."""
     return dataclasses.replace(
         saved, snapshot=dataclasses.replace(saved.snapshot, stamp_ns=saved.snapshot.stamp_ns + by_ns)
     )

@@ -1,4 +1,4 @@
-"""Small files that stand for gigabytes or for minutes, and maps whose checksums are right and whose content is not."""
+"""Small files that expand to gigabytes or to minutes of work, and maps with valid checksums and invalid content."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 
 def zstd_zeros(size: int, state_size: bool = True) -> bytes:
-    """A zstd frame of zeros, made piece by piece."""
+    """A zstd frame of zeros, made chunk by chunk."""
     out = zstandard.ZstdCompressor(write_content_size=state_size).compressobj(size if state_size else -1)
     pieces = [out.compress(bytes(1 << 24)) for _ in range(size >> 24)]
     return b"".join(pieces) + out.flush()
@@ -204,7 +204,7 @@ def _aliases() -> str:
 
 
 def calibrations(folder: Path) -> list[Case]:
-    """Texts that stand for more than a calibration."""
+    """Texts that expand to more than a calibration."""
     laughs = "".join(f'<!ENTITY l{i} "{f"&l{i - 1};" * 10}">' for i in range(1, 10))
     texts = {
         "rig.yaml": "stereo_sfm_rig: 1\n" + _aliases() + "left: *n\n",
@@ -253,7 +253,7 @@ def npz(files: dict[str, bytes]) -> bytes:
 
 
 def npz_zeros(size: int) -> bytes:
-    """An npz file of zeros, made piece by piece."""
+    """An npz file of zeros, made chunk by chunk."""
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for name in ("stamp_ns", "poses"):

@@ -1,4 +1,4 @@
-"""Runs commands one after the other in a process of bounded memory and says what became of each.
+"""Runs commands one after the other in a process of bounded memory and reports their results.
 
 Reads one JSON list of arguments a line, writes one JSON object a line. "frames PATH" reads every frame of a source.
 """

@@ -98,7 +98,7 @@ def check(child: Child, case: str, argv: list[str]) -> list[str]:
 
 
 def search(count: int, case: Callable[[int], tuple[str, list[list[str]]]], child: Child) -> None:
-    """Every case of every seed; all faults are told at once."""
+    """Every case of every seed; all faults are reported together."""
     wrong: list[str] = []
     for seed in range(FIRST_SEED, FIRST_SEED + count):
         name, commands = case(seed)

@@ -46,7 +46,7 @@ def test_values_are_gtsams(seed: int) -> None:
 
 
 def test_a_turning_sensor_at_one_position_does_not_drift() -> None:
-    """At the rate of a real sensor: what it feels is gravity alone, in axes that turn."""
+    """At the rate of a real sensor, which measures gravity alone in rotating axes."""
     rate, n = np.array([0.4, -1.0, 0.3]), 400
     middles = se3.so3_exp((np.arange(n) + 0.5)[:, None] * DT * rate)
     force = np.einsum("nji,j->ni", middles, [0.0, 0.0, GRAVITY])

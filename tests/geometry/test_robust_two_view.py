@@ -1,4 +1,4 @@
-"""Two-view geometry on scenes with known answers: exact, noisy, with outliers, and the inputs that must be refused."""
+"""Two-view geometry on scenes with known truth: exact, noisy, with outliers, and inputs that must be rejected."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ def test_pure_rotation_is_recognised_and_its_rotation_right() -> None:
 
 @pytest.mark.parametrize("step", [0.0, 0.05, 0.1])
 def test_a_small_step_is_distinguished_from_a_rotation(step: float) -> None:
-    """Points at 3 to 9 m, 0.3 px of noise: 50 mm are 3 px of parallax, of which a turn takes two thirds."""
+    """Points at 3 to 9 m, 0.3 px of noise: 50 mm are 3 px of parallax, of which a rotation explains two thirds."""
     found: list[bool] = []
     turns: list[float] = []
     directions: list[float] = []

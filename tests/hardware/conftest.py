@@ -17,7 +17,7 @@ _reports: dict[str, Any] = {}
 
 @pytest.fixture(scope="session")
 def camera() -> str:
-    """What `open_source` takes: $STEREO_SFM_CAMERA, or the one that is attached. t265:simulated tries the tests."""
+    """The source of the tests: $STEREO_SFM_CAMERA, or the attached camera. t265:simulated runs without one."""
     given = os.environ.get("STEREO_SFM_CAMERA")
     if given:
         return given

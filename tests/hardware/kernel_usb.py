@@ -63,7 +63,7 @@ class Plug(threading.Thread):
 
 
 def exercise(seconds: float, faults: str, paced: bool) -> dict[str, Any]:
-    """Boot, stream, and with the fault 'unplug' come back, through the kernel."""
+    """Boot, stream, and with the fault 'unplug' reconnect, through the kernel."""
     camera = SimulatedCamera(noise_content(4), preset(faults), paced)
     server = UsbIpServer(camera)
     plug = Plug(server.port)

@@ -1,4 +1,4 @@
-"""What a person with a T265 or an OAK runs: `pytest -m hardware` (about two minutes), then pastes the report.
+"""Tests for the owner of a T265 or an OAK: `pytest -m hardware` (about two minutes), then pastes the report.
 
 $STEREO_SFM_CAMERA chooses the camera; t265:simulated runs the tests without one. $STEREO_SFM_UNPLUG=1 adds the test
 that asks for the cable to be pulled.
@@ -64,7 +64,7 @@ def test_opens_with_a_sensible_calibration(camera: str, report: dict[str, Any]) 
 
 
 def test_streams_without_loss(camera: str, report: dict[str, Any]) -> None:
-    """The stamps are regular, the cameras belong together, nothing is lost, the IMU runs."""
+    """The stamps are regular, the cameras are synchronised, no frame is lost, the IMU runs."""
     with open_camera(camera) as source:
         began, cpu = time.monotonic(), time.process_time()
         images = [
@@ -108,7 +108,7 @@ def _limited(source: LiveSource, seconds: float) -> Any:
 
 
 def test_stops_and_starts_again_at_once(camera: str, report: dict[str, Any]) -> None:
-    """Some cameras answer busy then; the driver waits for them."""
+    """Some cameras reply "busy" then; the driver waits for them."""
     seconds: list[float] = []
     retries: list[float] = []
     for _ in range(3):

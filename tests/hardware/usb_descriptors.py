@@ -37,7 +37,7 @@ def configuration(booted: bool) -> bytes:
 
 
 def bos() -> bytes:
-    """What a SuperSpeed device must say about itself."""
+    """The descriptors of a SuperSpeed device."""
     usb2 = struct.pack("<BBBI", 7, 16, 2, 2)
     usb3 = struct.pack("<BBBBHBBH", 10, 16, 3, 0, 0x0E, 3, 10, 32)
     return struct.pack("<BBHB", 5, _BOS, 5 + len(usb2) + len(usb3), 2) + usb2 + usb3

@@ -37,7 +37,7 @@ class _Urb:
 
 
 class _Endpoint(threading.Thread):
-    """Fills the requests on one IN endpoint, in order, from what the camera sends."""
+    """Fills the requests on one IN endpoint, in order, with the camera's data."""
 
     def __init__(self, session: _Session, address: int) -> None:
         super().__init__(daemon=True, name=f"usbip-{address:02x}")
@@ -81,7 +81,7 @@ class _Endpoint(threading.Thread):
         return memoryview(camera.read_events(_POLL_S, generation, m.EVENT_BUFFER) or b"")
 
     def _complete(self) -> None:
-        """Answer one request; a cancellation waits meanwhile, since the kernel takes no answer after its own."""
+        """Reply to one request; a cancellation waits meanwhile, since the kernel accepts no reply after its own."""
         with self.ready:
             if not self.waiting:
                 return  # cancelled before: the next request gets the data, as on a real bus
@@ -119,7 +119,7 @@ class _Session:
         self.close()
 
     def _watch(self) -> None:
-        """A camera that leaves the bus takes its connection with it."""
+        """A disconnected camera closes its connection."""
         while self.alive and self.camera.generation == self.generation and self.camera.present:
             threading.Event().wait(_POLL_S)
         self.close()

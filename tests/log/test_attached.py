@@ -1,4 +1,4 @@
-"""Files attached to a log come back as they were; what is no such file is one line."""
+"""Files attached to a log are read back unchanged; invalid ones are one line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`convert` of real data sets: every frame comes back as the folder's driver gives it."""
+"""`convert` of real data sets: every frame is read back as from the folder's driver."""
 
 from __future__ import annotations
 

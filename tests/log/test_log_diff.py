@@ -1,4 +1,4 @@
-"""`diff` finds the first topic, frame and field, and nothing where only the wall clock differs."""
+"""`diff` finds the first topic, frame and field, and no difference of the wall clock."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Image encodings: lossless ones to the bit, JPEG as the tracker must see it, and what other programs write."""
+"""Image encodings: lossless ones to the bit, JPEG as in the tracker, and images of other programs."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ def test_bayer_patterns_start_at_the_right_colour() -> None:
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
 def test_files_that_declare_too_many_pixels_are_never_decoded(suffix: str) -> None:
-    """The header is changed, so a decoder that believed it would need gigabytes; the error shows it was read first."""
+    """With the changed header a decoder would need gigabytes; the error shows that the header is checked first."""
     small = cv2.imencode(suffix, np.zeros((8, 8), np.uint8))[1].tobytes()
     if suffix == ".png":
         large = small[:16] + (60_000).to_bytes(4) * 2 + small[24:29]

@@ -91,7 +91,7 @@ def test_every_message_of_a_run_is_read_back_to_the_bit(n: int, seed: int) -> No
 
 
 def test_arrays_of_rows_have_their_shape() -> None:
-    """A field of rows must say their shape in its metadata, or it would come back flat."""
+    """A field of rows needs their shape in its metadata, or it would be read back flat."""
     for message in _messages(3, 0):
         for f in schema.fields_of(type(message)):
             value = getattr(message, f.name)
@@ -149,7 +149,7 @@ def test_a_log_without_a_needed_field_is_named() -> None:
 
 
 def test_a_message_of_a_run_is_one_row_of_the_table() -> None:
-    """Writer and reader take the classes from the table; every message that flows has a row."""
+    """Writer and reader use the classes of the table; every message has a row."""
     assert set(topics.OF) >= {type(m) for m in _messages(3, 0)} | {Health, StageTimes, SourceCounters}
     assert {row.schema: cls for cls, row in topics.OF.items()} == recorded.TYPES
     for cls, row in topics.OF.items():
@@ -161,7 +161,7 @@ def test_a_message_of_a_run_is_one_row_of_the_table() -> None:
 
 @dataclass(frozen=True)
 class Probe:
-    """A message that nobody knows."""
+    """A message without a row."""
 
     frame_id: int
     stamp_ns: int

@@ -1,4 +1,4 @@
-"""Files that were cut off anywhere, killed writers, full disks: what is whole is read, and it is said what is not."""
+"""Files truncated anywhere, killed writers, full disks: complete parts are read, missing ones reported."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from tests.log.recordings import (
 
 
 class Whole(tuple[Path, list[StereoImage]]):
-    """A file and what is in it, with a name that hypothesis can print."""
+    """A file and its content, with a name that hypothesis can print."""
 
     def __repr__(self) -> str:
         return "a whole recording"
@@ -256,7 +256,7 @@ def test_no_room_for_the_index_gives_up_chunks_for_it(tmp_path: Path, whole: Who
 
 
 class _Interrupted(MemorySource):
-    """Sends a signal to this process when it is asked for the tenth frame."""
+    """Sends a signal to this process at the tenth frame."""
 
     number = signal.SIGINT
 
@@ -290,7 +290,7 @@ def test_an_interrupted_recording_is_closed(
 def test_changed_bytes_give_the_right_frames_or_one_line(
     whole: Whole, tmp_path: Path, changes: list[tuple[float, int]]
 ) -> None:
-    """Checksums cover the pixels, the index, the calibration and the truth: nothing wrong gets through unseen."""
+    """Checksums cover the pixels, the index, the calibration and the ground truth: damage is always detected."""
     path, images = whole
     data = bytearray(path.read_bytes())
     for where, value in changes:  # negative: near the end, where the index is
@@ -306,7 +306,7 @@ def test_changed_bytes_give_the_right_frames_or_one_line(
 
 
 def _use(path: Path, damaged: Path, mended: Path, by_id: dict[int, StereoImage]) -> str:
-    """Read, describe and recover; what is refused, or nothing."""
+    """Read, describe and recover; returns the error, if any."""
     try:
         for image in _read(path):
             assert_same_image(by_id[image.frame_id], image)

@@ -1,4 +1,4 @@
-"""The run log: what it holds, that the order of arrival does not change it, and that other programs read it."""
+"""The run log: its content, independence of the order of arrival, and reading by other programs."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def _answers(k: int) -> tuple[MapUpdate, LoopResult]:
 
 
 def _streams() -> list[list[object]]:
-    """What capture, tracker, mapper and loop closer say, each in its own order."""
+    """Messages of capture, tracker, mapper and loop closer, each in its own order."""
     tracker: list[object] = []
     for i in range(FRAMES):
         tracker.append(_frame(i))
@@ -223,7 +223,7 @@ def test_transforms_make_one_tree_from_level_to_the_right_camera(run: Path) -> N
 
 
 def test_covariance_turns_into_the_axes_of_odom() -> None:
-    """Against sampled poses: positions of the body spread as the published covariance says."""
+    """Against sampled poses: positions of the body have the published covariance."""
     rig, frame = fisheye_rig(), _frame(17)
     rng = np.random.default_rng(0)
     root = rng.normal(size=(6, 6)) * 1e-4
@@ -274,7 +274,7 @@ def test_points_trajectory_and_edges_are_the_map_at_the_end(run: Path) -> None:
 
 
 def test_complete_clouds_are_written_less_often_as_they_grow(tmp_path: Path) -> None:
-    """A run of 1,000 keyframes, three a second: the trajectory takes no more room a second at the end."""
+    """A run of 1,000 keyframes, three a second: the trajectory's bytes a second do not grow."""
     path, identity = tmp_path / "a.mcap", np.eye(4)
     config = from_dict({"loop": {"enabled": False}})
     log = RunLog(LogWriter(path), fisheye_rig(), config, source="t", mode="inline", image_format="none")

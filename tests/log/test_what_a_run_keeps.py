@@ -48,7 +48,7 @@ def keyframe(k: int) -> Keyframe:
 
 
 def update(k: int) -> MapUpdate:
-    """Of a known place: the window moves a little, the keyframe before this one is culled, no point is new."""
+    """In a known place: the window moves a little, the previous keyframe is culled, no point is new."""
     none, window = np.zeros(0, np.int64), np.array([0, *range(-20, 0), k])
     return MapUpdate(
         version=k + 1, kf_id=k, kf_ids=window, map_T_kf=np.tile(np.eye(4), (len(window), 1, 1)), point_ids=none,

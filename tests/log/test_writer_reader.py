@@ -96,7 +96,7 @@ def test_chunks_stay_small_in_bytes_and_time(tmp_path: Path) -> None:
 
 
 def test_a_chunk_also_ends_by_the_wall_clock(tmp_path: Path) -> None:
-    """A source that is slower than its stamps say still loses no more than half a second of somebody's time."""
+    """A source slower than its stamps still loses at most half a second."""
     now = [0]
     with LogWriter(tmp_path / "a.mcap", clock=lambda: now[0]) as writer:
         for i in range(10):

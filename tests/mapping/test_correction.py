@@ -124,7 +124,7 @@ def test_a_true_loop_is_accepted_after_systematic_heading_drift(degrees_per_100m
 
 
 def test_a_loop_that_no_drift_explains_is_refused() -> None:
-    """The next aisle looks the same: 1.5 m aside after 40 m."""
+    """An identical next aisle: 1.5 m aside after 40 m."""
     map_, truth = turning_sequence(0.5, side_m=10.0)
     last = len(truth) - 1
     poses = map_.keyframes.map_T_kf.copy()

@@ -35,7 +35,7 @@ def test_culled_keyframes_follow_through_every_carrier() -> None:
 
 
 def test_an_unknown_carrier_leaves_out_what_it_carries() -> None:
-    """As in a log whose beginning is gone."""
+    """As in a log whose beginning is missing."""
     poses = KeyframePoses()
     poses.add(5, pose(1))
     poses.update(moved(culled=((5, 4, np.eye(4)),)))

@@ -35,7 +35,7 @@ END_S = 5.0  # that the end of a run may take in any state
 
 
 class Kept:
-    """A sink that keeps what is no pose."""
+    """A sink that collects all messages but poses."""
 
     def __init__(self) -> None:
         self.drops: list[Dropped] = []
@@ -97,7 +97,7 @@ def test_in_lockstep_the_run_waits_for_the_logger_and_reports_it(
 def full_disk(
     to_main: Report, control: Connection, messages: Connection, release: Connection, options: LogOptions
 ) -> None:
-    """The logger on a disk that takes 300 kB."""
+    """The logger on a disk with 300 kB."""
     resource.setrlimit(resource.RLIMIT_FSIZE, (300_000, 300_000))
     REAL_LOGGER(to_main, control, messages, release, options)
 
@@ -192,7 +192,7 @@ def test_a_stopped_process_is_named_and_the_run_ends_in_time(
 
 
 def hanging_loop(to_main: Report, control: Connection, keyframes: Connection, to_mapper: Connection) -> None:
-    """A loop closer that never answers."""
+    """A loop closer that never responds."""
     Inbox[Setup](control).take()
     to_main.send(workers.Ready("loop"))
     Inbox[object](keyframes).take()

@@ -1,4 +1,4 @@
-"""The ring has its memory or says why not, and what killed runs left behind is removed."""
+"""The ring has its memory or raises an error, and rings of killed runs are removed."""
 
 from __future__ import annotations
 

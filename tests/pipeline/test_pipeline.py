@@ -1,4 +1,4 @@
-"""Inline, processes and replay give the same bits; whoever is killed, the log stays and nobody is left behind."""
+"""Inline, processes and replay give equal bits; after any process is killed, the log stays and no process remains."""
 
 from __future__ import annotations
 
@@ -298,7 +298,7 @@ def test_trajectory_of_the_wall_is_right() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(20))
 def test_any_process_killed_at_any_time(seed: int, tmp_path: Path) -> None:
-    """At most half a second of frames is lost to the log, nobody is left behind."""
+    """The log loses at most half a second of frames, and no process remains."""
     rng = np.random.default_rng(seed)
     path, kill_at, seen = tmp_path / "run.mcap", int(rng.integers(5, 120)), 0
     run = ProcessRun(MadeSource.of(SlidingWall, 5000, slow_s=0.005), CONFIG, log=LogOptions(path, "none"))

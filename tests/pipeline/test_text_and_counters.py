@@ -1,4 +1,4 @@
-"""What stages say and what a camera counts reaches the log, the sinks and the viewer, inline and between processes."""
+"""Text of the stages and counters of a camera in the log, the sinks and the viewer, inline and with processes."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class TalkativeWall(SlidingWall):
 
 
 class Kept:
-    """A sink that keeps what it gets."""
+    """A sink that collects messages."""
 
     def __init__(self) -> None:
         self.lines: list[LogLine] = []

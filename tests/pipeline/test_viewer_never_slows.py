@@ -1,4 +1,4 @@
-"""A viewer that is slow, hangs, or was closed costs the run nothing but images."""
+"""A slow, hanging or closed viewer loses images and does not slow the run."""
 
 from __future__ import annotations
 

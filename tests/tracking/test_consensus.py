@@ -1,4 +1,4 @@
-"""Something moves before the camera: points that stood still for long decide, what moves is marked."""
+"""Moving objects: settled points determine the pose, moving points are marked."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NONE = np.zeros(0, bool)
 
 
 def scene(rng: np.random.Generator) -> tuple[Tracks, Bool]:
-    """Old points of the store and more young ones on somebody who walks ahead of the camera, as fast as it does."""
+    """Settled points of the store and more new ones on a person who walks ahead of the camera at its speed."""
     store = rng.uniform([-2.0, -1.2, 2.5], [2.0, 1.2, 7.0], (STILL, 3))
     person = rng.uniform([-0.3, -0.4, 1.0], [0.3, 0.4, 1.3], (MOVING, 3))
     before = np.concatenate([store, person])

@@ -1,4 +1,4 @@
-"""Inertial motion against exact trajectories: what it estimates, how far it goes in the dark, what it refuses."""
+"""Inertial motion against exact trajectories: estimates, accuracy in the dark, rejected sensors."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ def test_affine_alignment_finds_the_deformation() -> None:
 
 
 def test_affine_alignment_does_not_depend_on_its_start() -> None:
-    """What is left of the start is left of the motion too, when all points begin short of it."""
+    """A remaining part of the initial error would bias the motion if all points start short of it."""
     image, matrix = texture(2), np.array([[1.02, 0.01, -2.4], [-0.01, 1.02, -1.8]])
     uv = grid(image)
     truth = uv @ matrix[:, :2].T + matrix[:, 2]

@@ -1,4 +1,4 @@
-"""The rotation prior: takes drift away, needs evidence, refuses what contradicts, keeps the frames of the map."""
+"""The rotation prior: corrects drift after enough evidence, rejects contradictions, keeps the frames of the map."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def measurement(world_R_cam: F64, rng: np.random.Generator, sigma: float = 1e-3)
 
 
 def camera_path(frames: int, bias_deg: float = 0.02) -> tuple[list[F64], list[F64]]:
-    """True rotations, and what a tracker makes of them whose heading drifts by `bias_deg` a frame."""
+    """True rotations, and those of a tracker whose heading drifts by `bias_deg` a frame."""
     truth, drifted = [np.eye(3)], [np.eye(3)]
     for k in range(frames):
         step = se3.so3_exp(np.array([0.0, 0.01 * np.sin(0.05 * k), 0.0]))

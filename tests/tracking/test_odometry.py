@@ -1,4 +1,4 @@
-"""Every motion estimator on matches with known motion: exact, noisy, with outliers, on fisheye bearings, refused."""
+"""Every motion estimator on matches with known motion: exact, noisy, with outliers, on fisheye bearings, rejected."""
 
 from __future__ import annotations
 

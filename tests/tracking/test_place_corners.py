@@ -1,4 +1,4 @@
-"""Corners for place recognition: found again from another place, with depth, and none of the tracker's business."""
+"""Corners for place recognition: detected again from another pose, with depth, independent of the tracker."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def keyframe_at(sequence: SimSource, row: int) -> tuple[Keyframe, F64]:
 
 
 def share_found_again(rig: Rig, b_T_a: F64, a: Corners, uv_b: F32, descriptors_b: U8) -> float:
-    """Of those in the view of b: something within 3 px of their place there that looks alike."""
+    """Share of the corners in the view of b with a similar one within 3 px of their projection."""
     uv = rig.left.project(se3.transform(b_T_a, a.points_cam.astype(np.float64)))
     width, height = rig.left.size
     with np.errstate(invalid="ignore"):

@@ -1,4 +1,4 @@
-"""Whether a recording tells that its rows were exposed one after the other."""
+"""Measurement of the readout of a rolling shutter."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ def search(spec: str, calibrated_s: float, change: Callable[[Rig], Rig] = lambda
 
 
 def turned(axis: int, degrees: float) -> Callable[[Rig], Rig]:
-    """The right camera is believed to be turned by more than it is."""
+    """A calibration with a wrong rotation of the right camera."""
     xi = np.zeros(6)
     xi[3 + axis] = np.radians(degrees)
     return lambda rig: dataclasses.replace(rig, left_T_right=rig.left_T_right @ se3.exp(xi))
 
 
 def bent(k1: float) -> Callable[[Rig], Rig]:
-    """Both lenses are believed to be bent more than they are."""
+    """A calibration with a wrong distortion of both lenses."""
 
     def change(rig: Rig) -> Rig:
         left, right = (
@@ -85,7 +85,7 @@ def test_a_global_shutter_is_recognised_with_any_calibration(change: Callable[[R
 
 
 def test_a_steady_drive_with_a_wrong_calibration_shows_no_readout() -> None:
-    """Driving ahead, wrong disparities look like rows that are read one after the other."""
+    """In straight motion, wrong disparities have the same effect as a rolling shutter."""
     assert search(f"{AISLE}&frames=60&rate=10", 0.0, turned(1, -0.4)).best_s == 0.0
 
 

@@ -1,4 +1,4 @@
-"""A covered lens: prediction while nothing is seen, and the way back into the same odometry."""
+"""A covered lens: prediction, and relocalization in the same odometry."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def seen(frame_id: int) -> StereoImage:
 
 
 def covered(frame_id: int) -> StereoImage:
-    """A cloth before both lenses."""
+    """A cloth in front of both lenses."""
     rng = np.random.default_rng(frame_id)
     left, right = (rng.normal(90, 2, (400, 424)).astype(np.uint8) for _ in range(2))
     return StereoImage(frame_id, drive().stamp_ns(frame_id), left, right)
@@ -105,7 +105,7 @@ def test_places_are_found_with_the_corrected_rig() -> None:
 
 
 def moving(seconds: F64) -> list[F64]:
-    """A robot that goes 1 m/s ahead and turns by 0.2 rad/s."""
+    """A robot that moves at 1 m/s and turns at 0.2 rad/s."""
     return [se3.exp(np.array([0.0, 0.0, 1.0, 0.0, 0.2, 0.0]) * t) for t in seconds]
 
 

@@ -1,4 +1,4 @@
-"""Rows exposed one after the other: exact scenes, and the tracker on a rendered sequence."""
+"""Rolling shutter: exact scenes, and the tracker on a rendered sequence."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def rig(camera: Pinhole | KannalaBrandt, readout_s: float = 0.03) -> Rig:
 
 
 def scene(camera: Pinhole | KannalaBrandt, seed: int) -> tuple[F64, F64, F64, F64]:
-    """Pose at the stamp, points in the odometry frame, the pixels of both cameras as the rows see them.
+    """Pose at the stamp, points in the odometry frame, pixels of both cameras with a rolling shutter.
 
     Each row is put where the pixel of its own pose lies, by iteration to the last bit.
     """
@@ -152,7 +152,7 @@ def ate_mm(rig: Rig, images: list[StereoImage], truth: Trajectory) -> float:
 
 
 def test_a_rendered_sequence_with_a_rolling_shutter() -> None:
-    """A shaken camera whose rows take 25 ms: several times nearer to the truth than without their times."""
+    """A camera with vibration and a readout of 25 ms: several times more accurate than without the model."""
     with open_source("sim:aisle?camera=pinhole&size=320x200&start=60&frames=60&vibration=4&readout=0.025") as source:
         images, truth = list(source), source.ground_truth
         assert truth is not None and source.rig.readout_s == 0.025

@@ -44,7 +44,7 @@ def see_plane(rig: Rig, depth: float, pattern: F32, gain: float, offset: float) 
 
 
 def matches(rig: Rig, images: tuple[U8, U8], coarse: bool) -> tuple[F64, StereoMatch]:
-    """Corners around the image centre and what is found of them."""
+    """Corners around the image centre and their matches."""
     matcher = StereoMatcher(TrackerConfig(), rig)
     left, right = (klt.build_pyramid(image, 4) for image in images)
     width, height = rig.left.size

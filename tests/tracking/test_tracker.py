@@ -1,4 +1,4 @@
-"""The default tracker on real and simulated sequences, and on what goes wrong in a store."""
+"""The default tracker on real and simulated sequences, and on disturbances in a store."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The match display draws what both views carry, and nothing where there is no keyframe."""
+"""The match display draws common points, and no image before the first keyframe."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Viewers are found, listen on this computer alone unless asked, and end with the process that started them."""
+"""Viewers are found, listen on this computer only by default, and end with their process."""
 
 from __future__ import annotations
 

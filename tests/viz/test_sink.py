@@ -28,7 +28,7 @@ EVERY_FRAME = ("map/camera", "map/camera/left/features", "map/camera/left/image"
 
 
 class Recording:
-    """Stands where a rerun stream would: keeps what is logged."""
+    """Replaces a rerun stream and collects what is logged."""
 
     def __init__(self, *_: Any, **__: Any) -> None:
         self.logged: list[tuple[str, Any]] = []
