@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import re
 from pathlib import Path
 from typing import Any
 
@@ -249,3 +250,9 @@ def test_images_missing_in_the_log_are_reported(tmp_path: Path) -> None:
     message = "\n".join(summary(stats))
     assert "the log lacks 1 image:" in message and "the log is not complete: recording stopped" in message
     assert "No space left on device" in (tmp_path / "report.md").read_text()
+
+
+def test_the_report_links_the_glossary(tmp_path: Path) -> None:
+    _, _, report = results(tmp_path, record_of(camera_path(), 0), pinhole_rig(), Config())
+    link = re.search(r"\[glossary\]\((.*?)\)", report)
+    assert link and (tmp_path / link[1]).is_file()
