@@ -1,7 +1,7 @@
-"""Masks: which pixels of a camera show the world, and which the robot itself, dirt on the lens or nothing.
+"""Masks: pixels of a camera that are used, as opposed to those that show the robot itself or dirt on the lens.
 
-A mask is (H, W) bool, True where the image is used. Its file is an image of the camera's size in which black pixels (0)
-are not used and all others are, as COLMAP and OpenCV's feature detectors have it.
+A mask is (H, W) bool, True where the image is used. Its file is an image of the camera's size; black pixels
+(0) are not used, all others are, as in COLMAP and OpenCV's feature detectors.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.pixels import decode_gray
 from stereo_sfm.types import Bool
 
-INLINE = "data:image/png;base64,"  # before a mask that stands in rig.yaml itself (RFC 2397)
+INLINE = "data:image/png;base64,"  # prefix of a mask contained in rig.yaml itself (RFC 2397)
 
 
 def read_mask(path: Path) -> Bool:
@@ -48,10 +48,10 @@ def mask_from_text(text: str, folder: Path | None) -> Bool:
     """The mask (H, W) that rig.yaml names: PNG data, or a file relative to the folder of rig.yaml.
 
     Args:
-        text: value of `mask`. folder: None where files may not be named, as in a log.
+        text: value of `mask`. folder: None if files may not be named, as in a log.
 
     Raises:
-        ValueError: the data is no image, or a file is named where none may be.
+        ValueError: the data is no image, or a file is named without a folder.
         StereoSfmError: the file cannot be read.
     """
     if text.startswith(INLINE):
@@ -65,11 +65,11 @@ def mask_from_text(text: str, folder: Path | None) -> Bool:
 
 
 def half_size(mask: Bool) -> Bool:
-    """(H / 2, W / 2): the pixels of a half image whose four pixels and their neighbours are all used."""
+    """(H / 2, W / 2) mask of the half-size image: used where the four pixels and their neighbours are all used."""
     return (cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)[::2, ::2]
 
 
 def uncovered(mask: Bool, margin_px: int) -> Bool:
-    """(H, W) where a square of `margin_px` around the pixel is used; outside the image counts as used."""
+    """(H, W) where all pixels within `margin_px` (a square) are used; those outside the image count as used."""
     size = 2 * margin_px + 1
     return cv2.erode(mask.astype(np.uint8), np.ones((size, size), np.uint8)) > 0

@@ -39,7 +39,7 @@ RENAMED = {
 
 
 def estimator_names() -> tuple[str, ...]:
-    """The motion estimators beside `flow`: one file each in tracking/features/odometry/."""
+    """The motion estimators other than `flow`: one file each in tracking/features/odometry/."""
     folder = Path(__file__).parent / "tracking" / "features" / "odometry"
     return tuple(sorted(path.stem.replace("_", "-") for path in folder.glob("[a-z]*.py")))
 
@@ -61,7 +61,7 @@ class TrackerConfig:
     min_depth_baselines: float = number(4.0, 0.1, 1000, "Nearest stereo match that is searched, in baselines")
     sigma_px: float = number(0.3, 0.001, 100, "Noise of one coordinate of an observation at the start of a run")
     depth_sigma_px: float = number(
-        3.0, 0.001, 1000, "Noise of an observation that refines a depth: its errors repeat from frame to frame"
+        3.0, 0.001, 1000, "Noise of an observation that refines a depth; errors of successive frames are correlated"
     )
     max_error_sigmas: float = number(3.0, 0.1, 1000, "Residual above which an observation is an outlier")
     max_epipolar_px: float = number(1.0, 0.01, 100, "Distance of a stereo match from its epipolar curve")

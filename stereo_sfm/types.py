@@ -233,7 +233,7 @@ class RowErrors(Message):
 
 @dataclass(frozen=True, eq=False)
 class MapUpdate(Message):
-    """The mapper's answer to one keyframe (exactly one each, possibly 'nothing')."""
+    """The mapper's result for one keyframe (exactly one each, possibly empty)."""
 
     version: int
     kf_id: int  # the keyframe it answers
@@ -259,7 +259,7 @@ class MapUpdate(Message):
 
 @dataclass(frozen=True, eq=False)
 class LoopResult(Message):
-    """The loop closer's answer to one keyframe (exactly one each)."""
+    """The loop closer's result for one keyframe (exactly one each)."""
 
     kf_id: int
     candidate_kf_id: int  # -1: no loop

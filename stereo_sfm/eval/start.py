@@ -10,7 +10,7 @@ from stereo_sfm.drivers.source import Source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.eval.record import RunRecord
 
-APART = 5  # frames between two checked images
+SPACING = 5  # frames between two checked images
 IMAGES = 3
 
 
@@ -25,7 +25,7 @@ def why_not_started(opener: Callable[[], Source], record: RunRecord) -> str:
         return ""
     try:
         with opener() as source:
-            images = list(islice(source, 0, APART * (IMAGES - 1) + 1, APART))
+            images = list(islice(source, 0, SPACING * (IMAGES - 1) + 1, SPACING))
             return why_no_start(source.rig, images)
     except StereoSfmError:
         return ""

@@ -1,4 +1,4 @@
-"""Compiled versions of `se3` functions that write into given arrays, for kernels without allocation."""
+"""Compiled versions of `se3` functions for kernels without allocation."""
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false
 
@@ -38,3 +38,13 @@ def compose_into(a, b, out):
         for j in range(4):
             out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j] + (a[i, 3] if j == 3 else 0.0)
     out[3, 0], out[3, 1], out[3, 2], out[3, 3] = 0.0, 0.0, 0.0, 1.0
+
+
+@njit
+def transform_point(t, x, y, z):
+    """The three coordinates of a point after the transform t (4, 4)."""
+    return (
+        t[0, 0] * x + t[0, 1] * y + t[0, 2] * z + t[0, 3],
+        t[1, 0] * x + t[1, 1] * y + t[1, 2] * z + t[1, 3],
+        t[2, 0] * x + t[2, 1] * y + t[2, 2] * z + t[2, 3],
+    )

@@ -189,7 +189,7 @@ class RunLog:
 
     @_write.register
     def map_update(self, update: MapUpdate) -> None:
-        """The mapper's answer."""
+        """The mapper's result."""
         self._answers[0].append(update)
         self._release_answers()
         self._totals["loops accepted"] -= len(update.refused_kf_ids)
@@ -202,7 +202,7 @@ class RunLog:
 
     @_write.register
     def loop(self, result: LoopResult) -> None:
-        """The loop closer's answer."""
+        """The loop closer's result."""
         self._totals["loops accepted"] += result.candidate_kf_id >= 0
         self._totals["loop candidates rejected"] += len(result.rejected)
         self._answers[1].append(result)

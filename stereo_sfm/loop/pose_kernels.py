@@ -9,6 +9,7 @@ import math
 import numpy as np
 
 from stereo_sfm.geometry.kernels import njit, project_one
+from stereo_sfm.geometry.se3_kernels import transform_point
 
 
 @njit
@@ -30,10 +31,10 @@ def add_normal_equations(
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         if not use[i] or not math.isfinite(x) or not math.isfinite(uv[i, 0]):
             continue
-        u, v, j00, j01, j02, j10, j11, j12 = project_one(model, params, *_moved(camera_T_source, x, y, z))
+        u, v, j00, j01, j02, j10, j11, j12 = project_one(model, params, *transform_point(camera_T_source, x, y, z))
         if not math.isfinite(u):
             continue
-        b0, b1, b2 = _moved(t, x, y, z) if forward else (x, y, z)
+        b0, b1, b2 = transform_point(t, x, y, z) if forward else (x, y, z)
         for k, (a0, a1, a2) in enumerate(((j00, j01, j02), (j10, j11, j12))):
             g0 = a0 * turn[0, 0] + a1 * turn[1, 0] + a2 * turn[2, 0]
             g1 = a0 * turn[0, 1] + a1 * turn[1, 1] + a2 * turn[2, 1]
@@ -57,12 +58,3 @@ def add_normal_equations(
                 hessian[k, m] += h0 * j[0, m] + h1 * j[1, m]
         sums[0] += e0 * f0 + e1 * f1
         sums[1] += 1.0
-
-
-@njit
-def _moved(t, x, y, z):
-    return (
-        t[0, 0] * x + t[0, 1] * y + t[0, 2] * z + t[0, 3],
-        t[1, 0] * x + t[1, 1] * y + t[1, 2] * z + t[1, 3],
-        t[2, 0] * x + t[2, 1] * y + t[2, 2] * z + t[2, 3],
-    )

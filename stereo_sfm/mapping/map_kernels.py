@@ -11,6 +11,7 @@ import numpy as np
 from stereo_sfm.geometry.hamming import BITS, hamming
 from stereo_sfm.geometry.kernels import njit, project_one
 from stereo_sfm.geometry.pixel_grid import cells_near, make_grid
+from stereo_sfm.geometry.se3_kernels import transform_point
 
 
 @njit
@@ -244,19 +245,10 @@ def predict(xyz, anchors, map_T_kf, kf_T_map, right_T_left, cams, uv_left, uv_ri
         then, now = a0 * a0 + a1 * a1 + a2 * a2, b0 * b0 + b1 * b1 + b2 * b2
         if now >= 4.0 * then or then >= 4.0 * now or a0 * b0 + a1 * b1 + a2 * b2 <= 0.8 * math.sqrt(then * now):
             continue
-        p0, p1, p2 = _moved(kf_T_map, x, y, z)
+        p0, p1, p2 = transform_point(kf_T_map, x, y, z)
         uv_left[i, 0], uv_left[i, 1], _, _, _, _, _, _ = project_one(left_model, left_params, p0, p1, p2)
-        p0, p1, p2 = _moved(right_T_left, p0, p1, p2)
+        p0, p1, p2 = transform_point(right_T_left, p0, p1, p2)
         uv_right[i, 0], uv_right[i, 1], _, _, _, _, _, _ = project_one(right_model, right_params, p0, p1, p2)
-
-
-@njit
-def _moved(t, x, y, z):
-    return (
-        t[0, 0] * x + t[0, 1] * y + t[0, 2] * z + t[0, 3],
-        t[1, 0] * x + t[1, 1] * y + t[1, 2] * z + t[1, 3],
-        t[2, 0] * x + t[2, 1] * y + t[2, 2] * z + t[2, 3],
-    )
 
 
 @njit

@@ -1,4 +1,4 @@
-"""The masks of a recording's cameras: tracked for how the camera turns, compared by `calib.mask_search`."""
+"""The masks of a recording's cameras: tracking gives the rotations for `calib.mask_search`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ TRACKED = (TrackState.OK, TrackState.RECOVERED)
 
 
 class RecordedMasks:
-    """Takes the images of a recording in order; those before a loss of tracking are not compared with later ones."""
+    """Takes the images of a recording in order; images before and after a loss of tracking are not compared."""
 
     def __init__(self, rig: Rig) -> None:
         self._tracker, self._search, self._submap = make_tracker(Config(), rig), MaskSearch(), 0
@@ -37,6 +37,6 @@ class RecordedMasks:
         """The masks, one for each camera.
 
         Raises:
-            StereoSfmError: the camera has not turned enough to tell the robot from distant scenery.
+            StereoSfmError: the camera has not turned enough to distinguish the robot from distant scenery.
         """
         return self._search.find()

@@ -65,7 +65,7 @@ class MapScene:
         self._map.loop(result)
 
     def update(self, update: MapUpdate) -> None:
-        """The mapper's answer; the whole map is redrawn as it grows and after each correction."""
+        """The mapper's result; the whole map is redrawn as it grows and after each correction."""
         jumped = float(np.abs(update.map_T_odom - self._map_T_odom).max()) > 1e-3 and len(update.kf_ids) > 20
         self._map.update(update)
         self._map_T_odom = update.map_T_odom
