@@ -111,19 +111,14 @@ def quaternion_from_rotation(rotation: F64) -> F64:
     """(..., 3, 3) -> unit quaternion (..., 4) as x y z w, w >= 0. Largest-component branch, stable everywhere."""
     r = np.asarray(rotation, float)
     d0, d1, d2 = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
-    # Rows of the symmetric 4x4 matrix whose dominant eigenvector is the quaternion (Shepperd's method).
-    four_q_sq = np.stack([1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2, 1 + d0 + d1 + d2], -1)
+    xx, yy, zz, ww = 1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2, 1 + d0 + d1 + d2
     xy, xz, yz = r[..., 1, 0] + r[..., 0, 1], r[..., 0, 2] + r[..., 2, 0], r[..., 2, 1] + r[..., 1, 2]
     wx, wy, wz = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
-    rows = np.stack(
-        [
-            np.stack([four_q_sq[..., 0], xy, xz, wx], -1),
-            np.stack([xy, four_q_sq[..., 1], yz, wy], -1),
-            np.stack([xz, yz, four_q_sq[..., 2], wz], -1),
-            np.stack([wx, wy, wz, four_q_sq[..., 3]], -1),
-        ],
-        axis=-2,
-    )
+    # The symmetric 4x4 matrix whose dominant eigenvector is the quaternion (Shepperd's method), in one stack: it is
+    # called several times a frame for single matrices.
+    flat = np.stack([xx, xy, xz, wx, xy, yy, yz, wy, xz, yz, zz, wz, wx, wy, wz, ww], -1)
+    rows = flat.reshape(*flat.shape[:-1], 4, 4)
+    four_q_sq = flat[..., ::5]
     best = np.argmax(four_q_sq, axis=-1)
     q = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
