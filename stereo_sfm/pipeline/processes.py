@@ -364,10 +364,11 @@ class ProcessRun:
         """The first message of capture: what the source is, or why it cannot be opened."""
         connection = next(c for c, stage in self._reports.items() if stage == "capture")
         while True:
-            if not wait([connection], CHECK_S):
+            arrived = wait([connection], CHECK_S)
+            if self._stopped_s is not None and time.monotonic() - self._stopped_s > STOP_GRACE_S:
+                raise KeyboardInterrupt  # heartbeats go on arriving
+            if not arrived:
                 self._watchdog.silent(["capture"])
-                if self._stopped_s is not None and time.monotonic() - self._stopped_s > STOP_GRACE_S:
-                    raise KeyboardInterrupt
                 continue
             try:
                 message = connection.recv()

@@ -17,7 +17,8 @@ from typing import Self
 HEARTBEAT_S = 0.25
 SILENT_S = 3.0  # without a message from an idle process
 LONG_STEP_S = 10.0  # for one image, one keyframe, or one read from the source
-PROCESS_STATES = {"T": "stopped by a signal", "t": "held by a debugger", "D": "waiting for a disk or a device"}
+STOPPED = {"T": "stopped by a signal", "t": "held by a debugger"}
+PROCESS_STATES = {**STOPPED, "D": "waiting for a disk or a device"}
 
 
 @dataclass(frozen=True)
@@ -96,11 +97,14 @@ class Watchdog:
         return found
 
     def _silent_s(self, stage: str, now: float) -> float:
-        """Seconds of silence; a process that computes is not silent, even if a library blocks its other threads."""
+        """Seconds of silence; a process that computes is not silent, even if a library blocks its other threads.
+
+        Nor is it while one of its pages is read: what it has computed since the last look counts, not where it is now.
+        """
         if now - self._heard[stage] > self._limit_s:
             state, computed = _status(self._pids[stage])
             busy = computed > self._computed[stage] or _runnable(self._pids[stage])
-            if busy and state not in PROCESS_STATES:
+            if busy and state not in STOPPED:
                 self._computed[stage], self._heard[stage] = computed, now
         return now - self._heard[stage]
 

@@ -240,7 +240,7 @@ def test_a_stop_while_the_source_is_opened_ends_the_run() -> None:
 
 def test_a_computing_process_is_responsive(monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[str] = []
-    monkeypatch.setattr("stereo_sfm.pipeline.watchdog.SILENT_S", 1.0)
+    monkeypatch.setattr("stereo_sfm.pipeline.watchdog.SILENT_S", 0.2)
     context = multiprocessing.get_context("spawn")
     busy = context.Process(target=compute, args=(600.0,), daemon=True)
     busy.start()
@@ -253,12 +253,12 @@ def test_a_computing_process_is_responsive(monkeypatch: pytest.MonkeyPatch) -> N
         watchdog.silent(["mapper"])
     assert told == []
     os.kill(busy.pid, signal.SIGSTOP)
-    time.sleep(1.5)
+    time.sleep(0.5)
     assert watchdog.silent(["mapper"]) == ["mapper"] == watchdog.silent(["mapper"])
     (message,) = told
     assert message.startswith("the mapper has not responded") and message.endswith(": stopped by a signal")
     os.kill(busy.pid, signal.SIGCONT)
-    time.sleep(1.5)
+    time.sleep(0.5)
     assert watchdog.silent(["mapper"]) == []
     assert told[1].startswith("the mapper responds again")
     busy.kill()
