@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass, field
+from typing import get_args
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.messages import Health
@@ -129,3 +130,4 @@ class Event:
 
 
 ServiceMessage = Started | Status | PoseUpdate | MapCloud | Picture | HealthReport | Event
+EVERYTHING: frozenset[type[ServiceMessage]] = frozenset(get_args(ServiceMessage))  # for publishers that want all of it

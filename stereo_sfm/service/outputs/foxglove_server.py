@@ -24,6 +24,7 @@ from stereo_sfm.log.image_log import LEVEL_T_MAP
 from stereo_sfm.log.run_log import PATH_COLOR, age_colors
 from stereo_sfm.messages import Health
 from stereo_sfm.service.messages import (
+    EVERYTHING,
     Event,
     HealthReport,
     MapCloud,
@@ -58,9 +59,7 @@ def make(config: RobotConfig) -> FoxgloveOutput:
 class FoxgloveOutput:
     """The publisher on Foxglove's WebSocket."""
 
-    wants: frozenset[type[ServiceMessage]] = frozenset(
-        {Started, Status, PoseUpdate, MapCloud, Picture, HealthReport, Event}
-    )
+    wants = EVERYTHING
 
     def __init__(self, address: str, port: int, picture_hz: float) -> None:
         """Args: address and port, where to listen. picture_hz: images a second.

@@ -7,16 +7,7 @@ import threading
 from typing import TYPE_CHECKING, Any
 
 from stereo_sfm.errors import StereoSfmError, require
-from stereo_sfm.service.messages import (
-    Event,
-    HealthReport,
-    MapCloud,
-    Picture,
-    PoseUpdate,
-    ServiceMessage,
-    Started,
-    Status,
-)
+from stereo_sfm.service.messages import EVERYTHING, ServiceMessage
 from stereo_sfm.service.outputs.access import Access, access
 from stereo_sfm.service.outputs.settings import SecurityConfig
 from stereo_sfm.service.publisher import ServiceClient
@@ -39,9 +30,7 @@ def make(config: RobotConfig) -> PageOutput:
 class PageOutput:
     """Serves the page in a thread."""
 
-    wants: frozenset[type[ServiceMessage]] = frozenset(
-        {Started, Status, PoseUpdate, MapCloud, Picture, HealthReport, Event}
-    )
+    wants = EVERYTHING
 
     def __init__(
         self,

@@ -16,8 +16,7 @@ import math
 import numpy as np
 
 from stereo_sfm.geometry.kernels import njit
-from stereo_sfm.geometry.se3_kernels import compose_into, exp_into
-from stereo_sfm.tracking.flow.pose_solver import point_residuals
+from stereo_sfm.tracking.flow.pose_solver import row_residuals
 from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.types import F64, Bool, Corners
 
@@ -104,16 +103,9 @@ def errors_at(
     res, jac, ray = np.zeros(4), np.zeros((4, 6)), np.zeros(4)
     row, step = pose.copy(), np.zeros((4, 4))
     for k in range(len(rho)):
-        ir = 1.0 / rho[k]
-        g = -ir * ir
-        if len(row_s) > 0:
-            exp_into(velocity, row_s[k], step)
-            compose_into(pose, step, row)
-        rows = point_residuals(
-            row, origin[k, 0] + direction[k, 0] * ir, origin[k, 1] + direction[k, 1] * ir,
-            origin[k, 2] + direction[k, 2] * ir, direction[k, 0] * g, direction[k, 1] * g, direction[k, 2] * g,
-            uv_l[k], uv_r[k], cams, right_T_left, res, jac, ray,
-        )  # fmt: skip
+        rows = row_residuals(
+            k, pose, velocity, row_s, origin, direction, rho, uv_l, uv_r, cams, right_T_left, row, step, res, jac, ray
+        )
         if rows == 0:
             continue
         rr, gr, gg = 0.0, 0.0, 0.0

@@ -245,6 +245,34 @@ def optimise_pose(
 
 
 @njit
+def row_residuals(
+    k, pose, velocity, row_s, origin, direction, rho, uv_l, uv_r, cams, right_T_left, row, step, res, jac, ray
+):  # fmt: skip
+    """`point_residuals` of point k, with the camera where it was when the point's row was exposed.
+
+    `_normal_equations` has this written out: it runs several times a frame, and the call would cost it half its time.
+
+    Args:
+        pose, velocity, row_s, origin, direction, rho, uv_l, uv_r, cams, right_T_left: as of `optimise_pose`.
+        row: (4, 4) a copy of the pose; overwritten with the pose at the row. step: (4, 4) overwritten.
+        res, jac, ray: overwritten.
+
+    Returns:
+        The number of rows.
+    """
+    ir = 1.0 / rho[k]
+    g = -ir * ir
+    if len(row_s) > 0:
+        exp_into(velocity, row_s[k], step)
+        compose_into(pose, step, row)
+    return point_residuals(
+        row, origin[k, 0] + direction[k, 0] * ir, origin[k, 1] + direction[k, 1] * ir,
+        origin[k, 2] + direction[k, 2] * ir, direction[k, 0] * g, direction[k, 1] * g, direction[k, 2] * g,
+        uv_l[k], uv_r[k], cams, right_T_left, res, jac, ray,
+    )  # fmt: skip
+
+
+@njit
 def refine_depth(
     pose, velocity, row_s, origin, direction, rho, variance, uv_l, uv_r, inlier, cams, right_T_left, sigma, floor
 ):
@@ -258,16 +286,9 @@ def refine_depth(
     for k in range(len(rho)):
         if not inlier[k]:
             continue
-        ir = 1.0 / rho[k]
-        g = -ir * ir
-        if len(row_s) > 0:
-            exp_into(velocity, row_s[k], step)
-            compose_into(pose, step, row)
-        rows = point_residuals(
-            row, origin[k, 0] + direction[k, 0] * ir, origin[k, 1] + direction[k, 1] * ir,
-            origin[k, 2] + direction[k, 2] * ir, direction[k, 0] * g, direction[k, 1] * g, direction[k, 2] * g,
-            uv_l[k], uv_r[k], cams, right_T_left, res, jac, ray,
-        )  # fmt: skip
+        rows = row_residuals(
+            k, pose, velocity, row_s, origin, direction, rho, uv_l, uv_r, cams, right_T_left, row, step, res, jac, ray
+        )
         if rows == 0:
             continue
         gr, gg = 0.0, 0.0
