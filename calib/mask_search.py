@@ -15,7 +15,7 @@ import numpy as np
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.types import F32, F64, U8, Bool
+from stereo_sfm.types import F32, F64, U8, Bool, Frame, Keyframe, StereoImage, TrackState
 
 MAX_WIDTH = 640  # px: wider images are halved
 WINDOW = 5  # px, side of the compared windows; as wide as a thin rail in the image
@@ -47,9 +47,17 @@ class MaskSearch:
     def __init__(self) -> None:
         self._rotations: list[F64] = []
         self._submaps: list[int] = []
+        self._submap_id = 0  # of the last keyframe
         self._images: list[tuple[U8, ...]] = []
         self._seen, self._every = 0, 1
         self._sizes: list[tuple[int, int]] = []
+
+    def add_tracked(self, image: StereoImage, frame: Frame, keyframe: Keyframe | None) -> None:
+        """An image with what a tracker made of it; images before and after a loss of tracking are not compared."""
+        self._submap_id = self._submap_id if keyframe is None else keyframe.submap_id
+        if frame.state in (TrackState.OK, TrackState.RECOVERED):
+            images = (image.left,) if image.right is None else (image.left, image.right)
+            self.add(images, frame.odom_T_cam[:3, :3], self._submap_id)
 
     def add(self, images: tuple[U8, ...], world_R_cam: F64, submap_id: int = 0) -> None:
         """Add the images (H, W) of the cameras at one time, and the left camera's rotation (3, 3) in its submap.

@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
     from stereo_sfm.calib.check import CheckReport, Finding
+    from stereo_sfm.calib.mask_search import MaskSearch
     from stereo_sfm.calib.rig import Rig
-    from stereo_sfm.recording.masks import RecordedMasks
     from stereo_sfm.tracking.flow.readout import Readout, ReadoutSearch
     from stereo_sfm.types import StereoImage
 
@@ -60,11 +60,11 @@ def run(args: argparse.Namespace) -> int:
 
     from stereo_sfm.calib import load_rig, save_rig
     from stereo_sfm.calib.check import check
+    from stereo_sfm.calib.mask_search import MaskSearch
     from stereo_sfm.calib.rectification import rectify
     from stereo_sfm.calib.tracks import MAX_FRAMES, collect, corners_for
     from stereo_sfm.config import Config
     from stereo_sfm.drivers.source import open_source
-    from stereo_sfm.recording.masks import RecordedMasks
     from stereo_sfm.tracking.flow.readout import ReadoutSearch
 
     _check(options)
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
         gap = 0 if source.live else max(0, total // options.windows - MAX_FRAMES)
         corners = corners_for(total, options.windows)
         shutter = ReadoutSearch(Config().tracker, rig)
-        masks = RecordedMasks(rig)
+        masks = MaskSearch()
         images = _searched(itertools.islice(source, options.max_frames), shutter, masks)
         windows = collect(images, rectification, options.windows, gap, corners, options.search)
         readout = shutter.measured()
@@ -92,12 +92,11 @@ def run(args: argparse.Namespace) -> int:
     return 3 if report.verdict == "FAIL" else 0
 
 
-def _searched(images: Iterable[StereoImage], shutter: ReadoutSearch, masks: RecordedMasks) -> Iterator[StereoImage]:
-    """Pass the images on, to the search for the robot in view, and the first ones to that for a rolling shutter."""
+def _searched(images: Iterable[StereoImage], shutter: ReadoutSearch, masks: MaskSearch) -> Iterator[StereoImage]:
+    """Pass the images on, tracked once for the rolling shutter, of the first ones, and for the robot in view."""
     for number, image in enumerate(images):
-        masks.add(image)
-        if number < SHUTTER_FRAMES and image.right is not None:
-            shutter.add(image)
+        if image.right is not None:
+            masks.add_tracked(image, *shutter.add(image, number < SHUTTER_FRAMES))
         yield image
 
 
@@ -117,7 +116,7 @@ def _shutter(known: str, readout: Readout) -> Finding:
     return Finding("shutter", 1, f"{known}, but the motion shows rows read within {measured}: {what}")
 
 
-def _robot(masks: RecordedMasks, rig: Rig) -> list[Finding]:
+def _robot(masks: MaskSearch, rig: Rig) -> list[Finding]:
     """What is seen of the robot itself and not masked; nothing where the recording cannot tell."""
     from stereo_sfm.calib.check import Finding
 

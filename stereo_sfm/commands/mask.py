@@ -13,9 +13,8 @@ from stereo_sfm.commands._stop import INTERRUPTED, StopRequest
 from stereo_sfm.errors import StereoSfmError
 
 if TYPE_CHECKING:
-    from stereo_sfm.calib.mask_search import FoundMask
+    from stereo_sfm.calib.mask_search import FoundMask, MaskSearch
     from stereo_sfm.calib.rig import Rig
-    from stereo_sfm.recording.masks import RecordedMasks
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -51,13 +50,16 @@ def run(args: argparse.Namespace) -> int:
     """Track the recording, find the masks, write them."""
     options, choice = typed(MaskOptions, args), source_choice(args)
     _check(options)
-    from stereo_sfm.recording.masks import RecordedMasks
+    from stereo_sfm.calib.mask_search import MaskSearch
+    from stereo_sfm.config import TrackerConfig
+    from stereo_sfm.tracking.flow.tracker import Tracker
 
     with StopRequest() as stop, choice() as source:
-        masks = RecordedMasks(source.rig)
+        tracker, masks = Tracker(TrackerConfig(), source.rig), MaskSearch()
         with progress(source.name, source.frame_count, options.quiet) as bar:
             for image in source:
-                masks.add(image)
+                if image.right is not None or image.depth is not None:
+                    masks.add_tracked(image, *tracker.step(image))
                 bar.step("tracking")
                 if stop.asked:
                     break
@@ -73,7 +75,7 @@ def _check(options: MaskOptions) -> None:
         raise StereoSfmError(f"{existing[0]} exists: choose another name or give --overwrite")
 
 
-def _write(masks: RecordedMasks, rig: Rig, options: MaskOptions) -> None:
+def _write(masks: MaskSearch, rig: Rig, options: MaskOptions) -> None:
     from stereo_sfm.calib import save_rig
     from stereo_sfm.calib.mask import encode_mask
     from stereo_sfm.calib.mask_search import masked

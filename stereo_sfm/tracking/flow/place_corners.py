@@ -16,7 +16,7 @@ from stereo_sfm.config import Config
 from stereo_sfm.tracking.flow.corners import corner_mask
 from stereo_sfm.tracking.flow.klt import Pyramid, build_pyramid
 from stereo_sfm.tracking.flow.stereo import StereoMatcher
-from stereo_sfm.types import F32, Corners, StereoImage
+from stereo_sfm.types import F32, F64, U8, Corners, StereoImage
 
 LEVELS, SCALE = 4, 1.2  # of ORB in the half image; more levels add few matches
 FAST_THRESHOLD = 10  # grey levels
@@ -57,10 +57,19 @@ class PlaceCorners:
         if not len(keypoints):
             return Corners.none()
         uv = 2.0 * np.asarray(cv2.KeyPoint.convert(keypoints), np.float64)
-        match = self._stereo.match_coarse(left, right, uv)
-        return Corners(
-            uv[match.good].astype(np.float32),
-            match.uv_right[match.good].astype(np.float32),
-            (match.bearing[match.good] / match.rho[match.good, None]).astype(np.float32),
-            np.asarray(descriptors, np.uint8)[match.good],
-        )
+        return seen_by_both(self._stereo, left, right, uv, np.asarray(descriptors, np.uint8))
+
+
+def seen_by_both(stereo: StereoMatcher, left: Pyramid, right: Pyramid | F32, uv: F64, descriptors: U8) -> Corners:
+    """The corners (N, 2) px of the left image, with descriptors (N, 32), that have a match in the second camera.
+
+    `left`: the image's pyramid. `right`: what `StereoMatcher.prepare` makes of the second camera.
+    """
+    match = stereo.match_coarse(left, right, uv)
+    good = match.good
+    return Corners(
+        uv[good].astype(np.float32),
+        match.uv_right[good].astype(np.float32),
+        (match.bearing[good] / match.rho[good, None]).astype(np.float32),
+        descriptors[good],
+    )

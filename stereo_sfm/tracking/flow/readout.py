@@ -25,7 +25,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.tracking.flow.tracker import Tracker
-from stereo_sfm.types import F64, I64, StereoImage
+from stereo_sfm.types import F64, I64, Frame, Keyframe, StereoImage
 
 MIN_PAIRS = 20  # of images
 MIN_POINTS = 30  # in both images of a pair
@@ -81,9 +81,14 @@ class ReadoutSearch:
         self._pairs: list[tuple[float, float]] = []  # weighted sums: displacement * movement, displacement squared
         self._error_px: list[float] = []
 
-    def add(self, image: StereoImage) -> None:
-        """Track one more image."""
-        frame, _ = self._tracker.step(image)
+    def add(self, image: StereoImage, measured: bool = True) -> tuple[Frame, Keyframe | None]:
+        """Track one more image, and use it unless it is not `measured`; returns what the tracker made of it."""
+        frame, keyframe = self._tracker.step(image)
+        if measured:
+            self._measure(image, frame)
+        return frame, keyframe
+
+    def _measure(self, image: StereoImage, frame: Frame) -> None:
         seen, solution = frame.observations, self._tracker.solution
         if solution is None or solution.reason:
             self._views.clear()

@@ -19,7 +19,7 @@ from stereo_sfm.config import Config
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.dominant_direction import dominant_direction
 from stereo_sfm.tracking.flow.klt import Pyramid
-from stereo_sfm.tracking.flow.place_corners import BORDER, FAST_THRESHOLD, LEVELS, SCALE
+from stereo_sfm.tracking.flow.place_corners import BORDER, FAST_THRESHOLD, LEVELS, SCALE, seen_by_both
 from stereo_sfm.tracking.flow.stereo import StereoMatcher
 from stereo_sfm.types import F32, F64, U8, Corners
 
@@ -129,13 +129,7 @@ class SideViews:
             return Corners.none()
         xy = (np.asarray(cv2.KeyPoint.convert(keypoints), np.float64) + view.first) / self._focal
         uv = self._rig.left.project(np.column_stack([xy, np.ones(len(xy))]) @ view.camera_R_view.T)
-        match = self._stereo.match_coarse(left, right, uv)
-        return Corners(
-            uv[match.good].astype(np.float32),
-            match.uv_right[match.good].astype(np.float32),
-            (match.bearing[match.good] / match.rho[match.good, None]).astype(np.float32),
-            np.asarray(descriptors, np.uint8)[match.good],
-        )
+        return seen_by_both(self._stereo, left, right, uv, np.asarray(descriptors, np.uint8))
 
 
 def _magnified(nodes: F32) -> F32:
