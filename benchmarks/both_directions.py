@@ -152,7 +152,7 @@ def relocalized(up: Drive, spec: str, part: slice, queries: int, seed: int) -> t
 
 
 def store(options: str, seed: int, queries: int) -> tuple[bool, bool, float, int, int]:
-    """One store: joined, merged, end error, good answers and false loops or answers."""
+    """One store: joined, merged, end error, correct relocalizations, and false loops or relocalizations."""
     spec = f"sim:aisle?seed={seed}&length=40{options}"
     other = f"{spec}&walk={OTHER_SESSION}"
     there, back = halves(spec)[0], halves(other)[1]
@@ -207,7 +207,7 @@ def main() -> int:
     print(
         f"joined {joined.sum()} of {len(rows)}, merged {one.sum()} of {len(rows)}, relocalized {good.sum()} of"
         f" {len(rows) * args.queries}; end error median {1e3 * np.median(ends):.1f} mm, worst"
-        f" {1e3 * ends.max():.1f} mm; {false + wrong.sum()} false loops and answers"
+        f" {1e3 * ends.max():.1f} mm; {false + wrong.sum()} false loops and relocalizations"
     )
     passed = joined.mean() >= 0.9 and one.mean() >= 0.9 and good.mean() >= 0.8 * args.queries and ends.max() <= 0.03
     return 0 if passed and not false + wrong.sum() else 3

@@ -33,12 +33,12 @@ from tests.synthetic import disturb, make_scene, pinhole_rig
 
 def timed(function: Callable[[], Any], repeats: int = 3) -> tuple[float, Any]:
     """Best milliseconds of several calls, and the last result."""
-    best, answer = float("inf"), None
+    best, result = float("inf"), None
     for _ in range(repeats):
         start = time.perf_counter()
-        answer = function()
+        result = function()
         best = min(best, (time.perf_counter() - start) * 1e3)
-    return best, answer
+    return best, result
 
 
 def window() -> tuple[Any, Bundle]:

@@ -1,15 +1,25 @@
-"""Effect of the IMU: the EuRoC part as it is, at a third of its rate, and with three seconds of black images.
+"""Effect of IMU and wheels: on the EuRoC part, and on drives through the simulated store.
 
-    python -m benchmarks inertial
+    python benchmarks/inertial.py [--part euroc dark turn slip rest] [--seeds 3] [--size 424x400] [--rate 15]
 
-Each with the IMU and without it, in one run. ATE is the RMSE after SE(3) alignment of every frame that has a pose.
+Every row with the sensors and without them, on the same images, in one run:
+
+* euroc: as recorded, at a third of the rate, and with three seconds of black images, with the IMU and without.
+* dark: five seconds without light at about 1 m/s, without sensors, with each, and with both.
+* turn: a corner at 200 degrees a second with motion blur.
+* slip: wheels that turn 30 % too far in turns.
+* rest: a minute at rest.
+
+ATE is the RMSE after SE(3) alignment of every frame that has a pose, of the odometry and of the map; "off" is the
+error of the odometry over the time without images (of rest: its largest movement); tilt is the largest error of roll
+and pitch where gravity is known.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from _sequences import data_root, one_thread
@@ -24,59 +34,117 @@ from stereo_sfm.eval.evaluate import evaluate, length
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.geometry import se3
 from stereo_sfm.pipeline.run import run
-from stereo_sfm.types import Frame, StereoImage, Trajectory
+from stereo_sfm.tracking.inertial.inertial_motion import roll_pitch_deg
+from stereo_sfm.types import F64, Frame, StereoImage, Trajectory
 
-DARK = range(80, 140)  # frames
+DARK = range(80, 140)  # frames of EuRoC
+DARK_S = 10, 15  # of the simulated drives
+PARTS = ("euroc", "dark", "turn", "slip", "rest")
+SENSORS = {"none": (False, False), "IMU": (True, False), "wheels": (False, True), "IMU and wheels": (True, True)}
+HEADER = "| images | seed | sensors | frames with a pose | submaps | odometry | map | off | tilt |\n|" + "---|" * 9
 
 
-def darkened(images: list[StereoImage]) -> Iterator[StereoImage]:
+def darkened(images: Iterable[StereoImage]) -> Iterator[StereoImage]:
     """The same images, black while the light is off."""
     for image in images:
         black = np.zeros_like(image.left)
         yield dataclasses.replace(image, left=black, right=black) if image.frame_id in DARK else image
 
 
+def true_pose(frame: Frame, truth: Trajectory) -> F64:
+    """world_T_cam (4, 4) of a frame."""
+    return truth.poses[int(np.argmin(np.abs(truth.stamp_ns - frame.stamp_ns)))]
+
+
 def off_m(frame: Frame, before: Frame, truth: Trajectory) -> float:
-    """Error of the live odometry in metres from the last frame before the dark."""
-    at = [int(np.argmin(np.abs(truth.stamp_ns - f.stamp_ns))) for f in (before, frame)]
-    true = se3.inverse(truth.poses[at[0]]) @ truth.poses[at[1]]
+    """Error in metres of the odometry's way from one frame to another."""
+    true = se3.inverse(true_pose(before, truth)) @ true_pose(frame, truth)
     seen = se3.inverse(before.odom_T_cam) @ frame.odom_T_cam
     return float(np.linalg.norm(seen[:3, 3] - true[:3, 3]))
 
 
-def row(name: str, source: Source, inertial: bool) -> str:
-    """One line of the table."""
+def tilt_deg(frames: list[Frame], truth: Trajectory) -> float:
+    """Largest error of roll and pitch against a ground truth whose z axis is vertical; NaN if gravity is not known."""
+    errors = [float("nan")]
+    for frame in frames:
+        if "roll_deg" in frame.stats:
+            down = true_pose(frame, truth)[:3, :3].T @ np.array([0.0, 0.0, -1.0])
+            seen = np.array([frame.stats["roll_deg"], frame.stats["pitch_deg"]])
+            errors.append(float(np.abs(seen - roll_pitch_deg(down)).max()))
+    return float(np.nanmax(errors)) if len(errors) > 1 else errors[0]
+
+
+def row(name: str, seed: int, source: Source, sensors: str, without_images: range) -> str:
+    """One line of the table. `without_images`: the frames over which the error of the odometry is stated."""
+    inertial, wheels = SENSORS[sensors]
     config = Config()
-    config = dataclasses.replace(config, tracker=dataclasses.replace(config.tracker, inertial=inertial))
-    record = RunRecord.of(config)
-    frames = list(run(source, config, [record]))
+    tracker = dataclasses.replace(config.tracker, inertial=inertial, wheels=wheels)
+    record = RunRecord.of(dataclasses.replace(config, tracker=tracker))
+    frames = list(run(source, dataclasses.replace(config, tracker=tracker), [record]))
     truth = source.ground_truth
     assert truth is not None
     odometry, mapped = record.odometry(), record.mapped()
     errors = " | ".join(length(evaluate(t, truth).ape_m.rmse) if t is not None else "–" for t in (odometry, mapped))
-    dark = [f for f in frames if f.frame_id in DARK]
-    end = length(off_m(dark[-1], frames[DARK.start - 1], truth)) if name == "black" else "–"
+    off = "–"
+    if name.startswith("rest"):
+        off = length(max(float(np.linalg.norm(f.odom_T_cam[:3, 3] - frames[9].odom_T_cam[:3, 3])) for f in frames[9:]))
+    elif without_images:
+        dark = [f for f in frames if f.frame_id in without_images]
+        before = next(f for f in reversed(frames) if f.frame_id < without_images.start)
+        off = length(off_m(dark[-1], before, truth))
     submaps = 1 + max((k.submap_id for k in record.keyframes.values()), default=0)
-    who = "with" if inertial else "without"
-    return f"| {name} | {who} | {len(odometry)} of {len(frames)} | {submaps} | {errors} | {end} |"
+    tilt = tilt_deg(frames, truth)
+    level = "–" if np.isnan(tilt) else f"{tilt:.2f}°"
+    posed = f"{len(odometry)} of {len(frames)}"
+    return f"| {name} | {seed} | {sensors} | {posed} | {submaps} | {errors} | {off} | {level} |"
 
 
-def main() -> None:
-    """Print the table."""
-    argparse.ArgumentParser(description=__doc__).parse_args()
+def euroc() -> None:
+    """The rows of the real part, if it is available."""
     root = data_root()
     if root is None:
         return
     with open_source(root / "euroc_mh01") as source:
         images, rig, truth = list(source), source.rig, source.ground_truth
-    print("| images | IMU | frames with a pose | submaps | odometry | map | off at the end of the dark |")
-    print("|---|---|---|---|---|---|---|")
-    for name in ("as recorded", "every third", "black"):
-        for inertial in (True, False):
-            shown = list(darkened(images)) if name == "black" else images
+    for name in ("as recorded", "every third", "3 s black"):
+        for sensors in ("IMU", "none"):
+            shown = list(darkened(images)) if "black" in name else images
             memory = MemorySource(rig, shown, truth)
             part = SelectedFrames(memory, frame_skip=3) if name == "every third" else memory
-            print(row(name, part, inertial), flush=True)
+            print(row(name, 0, part, sensors, DARK if "black" in name else range(0)), flush=True)
+
+
+def store(part: str, seed: int, size: str, rate: int) -> None:
+    """The rows of one drive."""
+    common = f"size={size}&seed={seed}&imu=t265&wheel=differential"
+    spec, sensors, dark = {
+        "dark": (f"rate={rate}&frames={20 * rate}&dark={DARK_S[0]}-{DARK_S[1]}", list(SENSORS), range(0)),
+        "turn": (f"rate={2 * rate}&corner=0.2&start={16 * rate}&frames={16 * rate}", list(SENSORS), range(0)),
+        "slip": (f"rate={rate}&wheel_slip=0.3&frames={25 * rate}", ["none", "wheels", "IMU and wheels"], range(0)),
+        "rest": (f"rate=5&rest=70&vibration=0&frames={60 * 5}", ["none", "IMU", "IMU and wheels"], range(0)),
+    }[part]
+    if part == "dark":
+        dark = range(DARK_S[0] * rate, DARK_S[1] * rate)
+    with open_source(f"sim:loop?{common}&{spec}") as source:
+        images, rig, truth = list(source), source.rig, source.ground_truth
+    for name in sensors:
+        print(row(part, seed, MemorySource(rig, images, truth), name, dark), flush=True)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--part", nargs="*", choices=PARTS, default=PARTS)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--size", default="424x400", help="of the simulated images")
+    parser.add_argument("--rate", type=int, default=15, help="simulated images a second")
+    args = parser.parse_args()
+    print(HEADER)
+    if "euroc" in args.part:
+        euroc()
+    for part in (p for p in PARTS[1:] if p in args.part):
+        for seed in range(args.seeds):
+            store(part, seed, args.size, args.rate)
 
 
 if __name__ == "__main__":

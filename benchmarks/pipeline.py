@@ -1,16 +1,21 @@
 """The whole pipeline on a recorded fisheye sequence: frames a second, drops, latency, memory.
 
-    python -m benchmarks pipeline -- [--recording FILE.mcap] [--minutes 5]
+    python -m benchmarks pipeline -- [--recording FILE.mcap] [--minutes 5] [--memory]
 
 Without a recording, `sim:loop` (848x800, 30 Hz) is recorded first as raw images. The sequence is played forwards and
 backwards, repeatedly, so that it lasts for minutes without a jump. First as fast as the stages can, then in real
 time at 30 Hz, with mapping, loops and logging on. Memory is the sum of the unique set sizes of all processes plus the
 shared image ring.
+
+With --memory: half the image size, as fast as it goes, with a log without images. Printed are the growth of each
+process and of the log in MB a minute of camera time, once the place is known: after the first third. The exit code is 1
+if all processes together grow by more than 1 MiB a minute.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -23,11 +28,16 @@ from stereo_sfm.drivers.choice import MadeSource
 from stereo_sfm.drivers.memory import MemorySource
 from stereo_sfm.drivers.paced import PacedSource
 from stereo_sfm.drivers.source import Source, open_source
+from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.messages import Health, StageTimes
+from stereo_sfm.pipeline.logger import LogOptions
 from stereo_sfm.pipeline.processes import ProcessRun
-from stereo_sfm.pipeline.workers import LogOptions
 from stereo_sfm.recording.record import record
 from stereo_sfm.types import Dropped, LoopResult
+
+RATE = 30.0
+SAMPLE_FRAMES = 150  # between two measurements of memory
+LARGEST_GROWTH = 1.0  # MiB a minute of camera time in a known place, all processes
 
 
 def opened(path: str, frames: int, paced: bool) -> Source:
@@ -95,24 +105,57 @@ def play(path: str, frames: int, paced: bool, folder: Path) -> None:
     log.unlink()
 
 
-def main() -> None:
+def slopes(minutes: list[float], sizes: list[dict[str, float]]) -> dict[str, float]:
+    """Growth a minute after the first third, of all processes and the log."""
+    known = [k for k, at in enumerate(minutes) if at >= minutes[-1] / 3]
+    x = [minutes[k] for k in known]
+    return {name: float(np.polyfit(x, [sizes[k][name] for k in known], 1)[0]) for name in sizes[-1]}
+
+
+def growth(path: str, frames: int, folder: Path) -> int:
+    """Print how memory and log grow; 1 if it is too much."""
+    log, record = folder / "growth.mcap", RunRecord.of(Config())
+    minutes, sizes = list[float](), list[dict[str, float]]()
+    source = MadeSource.of(opened, path, frames, False)
+    with ProcessRun(source, Config(), [record], log=LogOptions(log, "none")) as run:
+        for done, _ in enumerate(run):
+            if done % SAMPLE_FRAMES == 0:
+                minutes.append(done / RATE / 60)
+                sizes.append({**memory_mb(run), "log": log.stat().st_size / 2**20})
+    print(f"{frames / RATE / 60:.1f} min of camera time, {len(record.keyframes)} keyframes, {len(record.closed)} loops")
+    for at, now in list(zip(minutes, sizes, strict=True))[:: max(len(sizes) // 10, 1)]:
+        print(f"  after {at:5.1f} min: " + ", ".join(f"{name} {mib:.0f}" for name, mib in now.items()))
+    found = slopes(minutes, sizes)
+    total = sum(slope for name, slope in found.items() if name != "log")
+    for name, slope in found.items():
+        print(f"  {name:10s}{sizes[-1][name]:8.1f} MiB {slope:+7.2f} MiB a minute")
+    print(f"  all processes {total:+.2f} MiB a minute")
+    return int(total > LARGEST_GROWTH)
+
+
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--recording", help="raw MCAP recording of sim:loop")
     parser.add_argument("--frames", type=int, default=600, help="of sim:loop to record when there is no recording")
     parser.add_argument("--minutes", type=float, default=1.0)
     parser.add_argument("--fast", action="store_true", help="only as fast as it goes, not in real time")
+    parser.add_argument("--memory", action="store_true", help="only the growth of memory and log")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         path = args.recording or str(folder / "loop.mcap")
         if args.recording is None:
-            with open_source(f"sim:loop?frames={args.frames}") as source:
+            size = "&size=424x400" if args.memory else ""
+            with open_source(f"sim:loop?frames={args.frames}{size}") as source:
                 for _ in record(source, Path(path), "raw"):
                     pass
-        frames = round(args.minutes * 60 * 30)
+        frames = round(args.minutes * 60 * RATE)
+        if args.memory:
+            return growth(path, frames, folder)
         for paced in (False, True) if not args.fast else (False,):
             play(path, frames, paced, folder)
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -178,12 +178,12 @@ def identical_aisles(spec: str, seeds: int, vocabulary: Vocabulary, cache: Path 
 
 def cut_sequences(spec: str, seeds: int, vocabulary: Vocabulary, cache: Path | None) -> None:
     """One line: how many sequences with a loss of tracking were connected, correctly or wrongly."""
-    answers: Counter[str] = Counter()
+    outcomes: Counter[str] = Counter()
     for seed in range(seeds):
         sequence = _sequence(f"{spec}{'&' if '?' in spec else '?'}seed={seed}&walk={seed}", cache)
-        answers.update(_joined(sequence, round(share * len(sequence.keyframes)), vocabulary) for share in CUTS)
+        outcomes.update(_joined(sequence, round(share * len(sequence.keyframes)), vocabulary) for share in CUTS)
     gap = f"{LEFT_OUT} keyframes left out"
-    print(f"{spec}, cut in two, {gap}: " + ", ".join(f"{answers[k]} {k}" for k in ("right", "wrong", "never")))
+    print(f"{spec}, cut in two, {gap}: " + ", ".join(f"{outcomes[k]} {k}" for k in ("right", "wrong", "never")))
 
 
 def _joined(sequence: SparseSequence, cut: int, vocabulary: Vocabulary) -> str:

@@ -19,8 +19,8 @@ from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.run_log import RunLog
 from stereo_sfm.log.writer import LogWriter
 from stereo_sfm.pipeline.inline import run_inline
+from stereo_sfm.pipeline.logger import LogOptions
 from stereo_sfm.pipeline.processes import ProcessRun
-from stereo_sfm.pipeline.workers import LogOptions
 from stereo_sfm.types import LoopResult
 
 

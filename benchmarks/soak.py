@@ -39,7 +39,7 @@ UNPLUGGED_S, DARK_FRAMES = 2.0, 60
 STAGES = ("capture", "tracker", "mapper", "loop", "optimizer", "recorder")
 SETTLE_S = 60.0  # for the service to run again after a fault
 SLOPE_MB_H = 1.0  # allowed growth of a process
-ENOUGH_MINUTES = 90  # of camera time, for a slope to mean anything
+MIN_MINUTES = 90  # of camera time, for a slope to mean anything
 
 
 class StoreCamera(BaseSource):
@@ -218,7 +218,7 @@ def judge(watch: Watch, root: Path, minutes: float) -> list[str]:
     wrong: list[str] = []
     for name, (mb, slope) in slopes(watch.rss, watch.sessions).items():
         print(f"  {name:12s} {mb:7.1f} MB  {slope:+8.2f} MB/h")
-        if minutes >= ENOUGH_MINUTES and slope > SLOPE_MB_H:
+        if minutes >= MIN_MINUTES and slope > SLOPE_MB_H:
             wrong.append(f"{name} grows by {slope:.1f} MB an hour")
     unexplained = {k: n for k, n in watch.missing.items() if not any(k <= s <= k + n + 1 for s in watch.sessions)}
     print(f"  frames missing between poses: {sum(watch.missing.values())}, unexplained: {unexplained or 'none'}")

@@ -27,7 +27,7 @@ from stereo_sfm.drivers.choice import MadeSource
 from stereo_sfm.drivers.select import SelectedFrames
 from stereo_sfm.drivers.source import Source, open_source
 from stereo_sfm.pipeline.processes import ProcessRun
-from stereo_sfm.pipeline.workers import ViewerOptions
+from stereo_sfm.pipeline.viewer import ViewerOptions
 
 WARM_UP = 20  # frames
 

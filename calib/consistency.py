@@ -8,7 +8,9 @@ eliminated by the Schur complement.
 
 A rotation and a shift of the image, or a focal length and a radial displacement, are strongly correlated. The result is
 therefore the rotation and the magnification that the complete correction amounts to at the matches (`calib.amount`);
-they are determined much better than the single parameters.
+they are determined much better than the single parameters. The rotation about y is correlated with the magnification of
+both cameras, which a recording often cannot show. Unless it is shown to be wrong, it is held in the estimate of the
+others; not with one window, whose errors are correlated: its larger covariance stands for that.
 """
 
 from __future__ import annotations
@@ -37,6 +39,9 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, Bool
 
 HALF_ITERATIONS = 10
+# The magnification of both cameras is shown by more than one window, with motion (a share of the image's width) and a
+# small standard deviation; it is wrong when it is significant as well.
+MIN_TRAVEL, MAX_FOCAL_SIGMA, FOCAL_SIGMAS = 0.04, 0.007, 2.5
 CORRELATED = 2.0  # factor on the deviation of the matches' errors, which are not independent
 # Prior standard deviations of the rig's corrections: radians, radians, ratios, seconds.
 RIG_PRIOR = (0.05, 0.05, 0.05, 0.02, 0.02, 0.05, 0.05, 0.02)
@@ -98,8 +103,7 @@ class Correction:
 
         One window is not enough: the errors of its matches are correlated, which the covariance does not contain.
         """
-        several = len(self.explained) > 1
-        return not self.rolling and several and self.travel > 0.04 and float(self.amount_sigma[FOCAL_BOTH]) < 0.007
+        return not self.rolling and _shows_focal(len(self.explained), self.travel, self.amount_sigma[FOCAL_BOTH])
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,17 +123,32 @@ def estimate(rig: Rig, windows: list[Window], iterations: int = 18) -> Correctio
     kept = sum(int((p.weight > 0).all(1).sum()) for p in problems)
     explained = tuple(_explained(w, p) for w, p in zip(windows, problems, strict=True))
     total = amounts(rig, windows)
-    amount, covariance = total @ best.vector, total @ best.covariance @ total.T
-    sigma = np.sqrt(np.diag(covariance))
-    amount[FOCAL_BOTH], sigma[FOCAL_BOTH] = _both(rig, problems, best, total[FOCAL_BOTH])
+    both, both_sigma = _both(rig, problems, best, total[FOCAL_BOTH])
     residual = float(np.sqrt(np.mean(np.concatenate(final) ** 2)))
     travel = max(_travel(w) for w in windows) / rig.left.width
     parts = [_fit(rig, half, ANY, best.vector, best.sigma, HALF_ITERATIONS) for half in _halves(problems)]
-    halves = tuple(_terms(fit, total) for fit in parts)
+    fits = [best, *parts]
+    wrong = _shows_focal(len(windows), travel, both_sigma) and abs(both) > FOCAL_SIGMAS * both_sigma
+    whole, *halves = fits if wrong or len(windows) == 1 else [_held(fit, total[FOCAL_BOTH]) for fit in fits]
+    amount, covariance = total @ whole.vector, total @ whole.covariance @ total.T
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    amount[FOCAL_BOTH], sigma[FOCAL_BOTH] = both, both_sigma
     return Correction(
-        best.vector, best.covariance, amount, sigma, best.sigma, kept, residual, travel, explained,
-        _terms(best, total), halves,
+        whole.vector, whole.covariance, amount, sigma, best.sigma, kept, residual, travel, explained,
+        _terms(whole, total), tuple(_terms(half, total) for half in halves),
     )  # fmt: skip
+
+
+def _shows_focal(windows: int, travel: float, sigma: float) -> bool:
+    return windows > 1 and travel > MIN_TRAVEL and sigma < MAX_FOCAL_SIGMA
+
+
+def _held(fit: _Fit, combination: F64) -> _Fit:
+    """The fit with a linear combination (SHARED,) of the unknowns held at zero: the conditional Gaussian."""
+    across = fit.covariance @ combination
+    gain = across / (combination @ across)
+    vector = fit.vector - gain * (combination @ fit.vector)
+    return _Fit(vector, fit.covariance - np.outer(gain, across), fit.sigma)
 
 
 def _halves(problems: list[Problem]) -> tuple[list[Problem], list[Problem]]:

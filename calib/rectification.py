@@ -109,6 +109,7 @@ def rectify(
         left_T_right=baseline,
         body_T_left=rig.body_T_left @ cam_T_rect,
         imu=rig.imu.seen_from(se3.inverse(cam_T_rect)) if rig.imu else None,
+        wheel=rig.wheel.seen_from(se3.inverse(cam_T_rect)) if rig.wheel else None,
         readout_s=rig.readout_s * _rows_read(rig.left, camera, rect_R_left),
     )
     return Rectification(new, left, right, cam_T_rect)

@@ -7,11 +7,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from stereo_sfm.calib.imu import Imu
+from stereo_sfm.calib.wheel import Wheel
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.types import F64, Bool
 
-BASELINE_RANGE_M = 1e-4, 100.0
+BASELINE_RANGE_M = 1e-4, 10.0
 MAX_PIXELS = 10**8
 MAX_READOUT_S = 0.2
 SMALLEST_SHARE = 0.05  # of an image's pixels, that a mask must leave
@@ -27,14 +28,15 @@ class Rig:
     `right` equal to `left` with a virtual baseline, and its images have `depth`.
     """
 
-    left: Camera
-    right: Camera | None = None
-    left_T_right: F64 = field(default_factory=lambda: np.eye(4))  # (4, 4)
-    body_T_left: F64 = field(default_factory=lambda: np.eye(4))  # (4, 4)
+    left: Camera  # the reference of all poses
+    right: Camera | None = None  # None: one camera
+    left_T_right: F64 = field(default_factory=lambda: np.eye(4))  # (4, 4), metres
+    body_T_left: F64 = field(default_factory=lambda: np.eye(4))  # (4, 4), metres: where the camera is on the robot
     depth: bool = False  # RGB-D: the right camera is virtual, u_right = u_left - fx * baseline / depth
-    name: str = ""
-    serial: str = ""
+    name: str = ""  # readable
+    serial: str = ""  # of the camera, "" where unknown
     imu: Imu | None = None  # calibration of its inertial sensor; None: inertial samples are not used
+    wheel: Wheel | None = None  # calibration of its wheel odometry; None: wheel samples are not used
     left_mask: Bool | None = None  # (H, W) True where the image is used (stereo_sfm.calib.mask); None: everywhere
     right_mask: Bool | None = None  # (H, W)
     readout_s: float = 0.0  # rolling shutter: seconds from the first row's exposure to the last's; 0: global shutter
@@ -58,8 +60,12 @@ class Rig:
                 f"invalid calibration: readout of {self.readout_s:g} s; give the seconds from first to last row, "
                 "0 for a global shutter"
             )
-        if self.right is not None and not BASELINE_RANGE_M[0] <= self.baseline <= BASELINE_RANGE_M[1]:
-            raise StereoSfmError(f"invalid calibration: baseline of {self.baseline:g} m; give the extrinsics in metres")
+        with np.errstate(over="ignore"):
+            baseline = self.baseline
+        if self.right is not None and not BASELINE_RANGE_M[0] <= baseline <= BASELINE_RANGE_M[1]:
+            raise StereoSfmError(
+                f"invalid calibration: baseline of {baseline:g} m; give the extrinsics in metres, not millimetres"
+            )
 
     @property
     def stereo(self) -> bool:

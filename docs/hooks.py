@@ -4,21 +4,38 @@ from __future__ import annotations
 
 import argparse
 import ast
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+PLACE = re.compile(r"<!-- on the site: (\S+) -->\n(.*?)<!-- end -->\n", re.S)
+
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Replace `{{ commands }}` and its like; pages that lie outside docs/ link into it."""
-    for name, make in MAKERS.items():
-        mark = "{{ " + name + " }}"
-        if mark in markdown:
-            markdown = markdown.replace(mark, make())
-    for outside in ("CONTRIBUTING.md", "CHANGELOG.md"):
-        mark = "{{ " + outside + " }}"
-        if mark in markdown:
-            markdown = markdown.replace(mark, Path(outside).read_text().replace("](docs/", "]("))
-    return markdown
+    """Fill the places `<!-- on the site: WHAT -->`; what a reader of the file sees there instead is left out."""
+    return PLACE.sub(lambda place: text_of(place[1]) + "\n", markdown)
+
+
+def text_of(what: str) -> str:
+    """The text of a place.
+
+    Args:
+        what: a key of MAKERS, or a file of the repository: a page as it is, a program as a block of code.
+
+    Raises:
+        FileNotFoundError: neither.
+    """
+    if what in MAKERS:
+        return MAKERS[what]()
+    text = Path(what).read_text()
+    if what.endswith(".md"):  # a page that lies outside docs/ links into it
+        return text.replace("](docs/", "](")
+    return _block(text)
+
+
+def _block(program: str) -> str:
+    return f"```python\n{program.rstrip()}\n```"
 
 
 def _commands() -> str:
@@ -70,8 +87,14 @@ def _examples() -> str:
     for path in sorted(Path("examples").glob("*.py")):
         text = path.read_text()
         title = (ast.get_docstring(ast.parse(text)) or path.stem).splitlines()[0]
-        parts += [f"## {path.name}", "", title, "", "```python", text.rstrip(), "```", ""]
+        parts += [f"## {path.name}", "", title, "", _block(text), ""]
     return "\n".join(parts)
 
 
-MAKERS = {"commands": _commands, "configuration": _configuration, "sources": _sources, "examples": _examples}
+MAKERS: dict[str, Callable[[], str]] = {
+    "commands": _commands,
+    "configuration": _configuration,
+    "sources": _sources,
+    "examples": _examples,
+    "nothing": str,
+}

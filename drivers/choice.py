@@ -41,8 +41,12 @@ class Opener(Protocol):
         ...
 
     @property
-    def opening(self) -> Opening:
-        """What a log records about it besides its name."""
+    def camera_store(self) -> Path | None:
+        """The folder of calibrations that self-calibration corrected, by camera; None: none is used and none kept."""
+        ...
+
+    def opening(self, rig: Rig) -> Opening:
+        """What a log records about it besides its name; `rig` is that of the opened source."""
         ...
 
     def __call__(self) -> Source:
@@ -61,14 +65,14 @@ class MadeSource:
     make: Callable[[], Source]
     spec: str = ""
     device: bool = False
+    camera_store: Path | None = None
 
     @staticmethod
     def of(make: Callable[P, Source], *args: P.args, **options: P.kwargs) -> MadeSource:
         """Opens the source that `make` returns for these arguments."""
         return MadeSource(functools.partial(make, *args, **options))
 
-    @property
-    def opening(self) -> Opening:
+    def opening(self, rig: Rig) -> Opening:
         from stereo_sfm.log.provenance import Opening
 
         return Opening()
@@ -91,6 +95,7 @@ class SourceChoice:
         rectify: a key of RECTIFY: none, pinhole (crops a fisheye), wide (keeps its view).
         speed: playback speed relative to the stamps; None: as fast as they are read.
         repeat: play it again and again.
+        camera_store: folder of calibrations that earlier runs corrected, by serial number (`calib.camera_store`).
     """
 
     spec: str
@@ -100,6 +105,7 @@ class SourceChoice:
     rectify: str = "none"
     speed: float | None = None
     repeat: bool = False
+    camera_store: Path | None = None
 
     @staticmethod
     def of(
@@ -108,6 +114,7 @@ class SourceChoice:
         selection: Selection | None = None,
         rectify: str = "none",
         speed: float | None = None,
+        camera_store: str | Path | None = None,
         **options: Any,
     ) -> SourceChoice:
         """From user input: paths may be relative, and the calibration may be a file.
@@ -117,11 +124,16 @@ class SourceChoice:
                 all of it before anything is opened.
         """
         one_of(rectify, RECTIFY, "rectification")
+        if camera_store is not None and rectify != "none":
+            raise StereoSfmError(
+                "a camera store holds calibrations of images that are not rectified: leave out rectify"
+            )
         look_up(source, **options)
         spec = str(source)
         if Path(spec).exists():
             spec = str(Path(spec).resolve())
-        return SourceChoice(spec, _loaded(rig), options, selection or EVERYTHING, rectify, speed)
+        store = None if camera_store is None else Path(camera_store).expanduser().resolve()
+        return SourceChoice(spec, _loaded(rig), options, selection or EVERYTHING, rectify, speed, camera_store=store)
 
     @property
     def device(self) -> bool:
@@ -132,11 +144,10 @@ class SourceChoice:
         """Frames of the source between consecutive frames passed on."""
         return self.selection.frame_skip
 
-    @property
-    def opening(self) -> Opening:
+    def opening(self, rig: Rig) -> Opening:
         from stereo_sfm.log.provenance import Opening
 
-        return Opening(self.rectify, self.rig, frame_skip=self.numbering)
+        return Opening(self.rectify, self.rig if self.camera_store is None else rig, frame_skip=self.numbering)
 
     def refuse_to_overwrite(self, output: Path | None) -> None:
         """Raises StereoSfmError when the source is the output file, or lies in the output folder."""
@@ -147,12 +158,14 @@ class SourceChoice:
             raise StereoSfmError(f"{output} is the source, or contains it: choose another -o")
 
     def __call__(self) -> Source:
+        from stereo_sfm.drivers.corrected import CorrectedSource
         from stereo_sfm.drivers.paced import PacedSource
         from stereo_sfm.drivers.rectified import rectified
         from stereo_sfm.drivers.repeated import RepeatedSource
         from stereo_sfm.drivers.select import SelectedFrames
 
         source = open_source(self.spec, self.rig, **self.options)
+        source = source if self.camera_store is None else CorrectedSource(source, self.camera_store)
         if self.selection != EVERYTHING:
             source = SelectedFrames(source, **vars(self.selection))
         source = rectified(source, RECTIFY[self.rectify])

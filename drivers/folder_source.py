@@ -101,6 +101,7 @@ class FolderSource(BaseSource):
         self.ground_truth = ground_truth
         self.frames = sorted(frames, key=lambda frame: frame.stamp_ns)
         self.depth_scale = depth_scale
+        self.assumed_hz = 0.0  # of frames whose stamps nothing tells
         self._imu = imu
         self.frame_count = len(self.frames)
         self.bits = used_bits(name, self._sample)
@@ -108,6 +109,11 @@ class FolderSource(BaseSource):
 
     def __iter__(self) -> Iterator[StereoImage]:
         dropped, read, unreadable, sampled = 0, 0, 0, 0
+        if self.assumed_hz:
+            log.warning(
+                "%s: neither names nor times.txt tell the stamps: %g images a second assumed (?fps=N)",
+                self.name, self.assumed_hz,
+            )  # fmt: skip
         for frame_id, frame in enumerate(self.frames):
             try:
                 image = self._read(frame_id, frame, dropped)
@@ -157,7 +163,7 @@ class FolderSource(BaseSource):
         skews = [abs(s.right_stamp_ns - s.stamp_ns) for s in self.frames if s.right_stamp_ns]
         skew_ms = max(skews) / 1e6 if skews else float("nan")
         others = {} if self._imu is None else {"imu0": self._imu.stamp_ns}
-        return Stamps(np.array([s.stamp_ns for s in self.frames], np.int64), skew_ms, others)
+        return Stamps(np.array([s.stamp_ns for s in self.frames], np.int64), skew_ms, others, self.assumed_hz)
 
     def _sample(self, count: int) -> Iterator[Any]:
         """The readable images of so many evenly spaced frames."""

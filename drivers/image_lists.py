@@ -22,7 +22,7 @@ log = logging.getLogger("stereo_sfm")
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
 EARLIEST_NS, LATEST_NS = 10**17, 4 * 10**18  # names that are dates are between 1973 and 2096
-LEAST_COUNT = 10**9  # smaller whole numbers are frame numbers
+MIN_STAMP = 10**9  # smaller whole numbers are frame numbers
 UNITS_NS = (1, 10**3, 10**6, 10**9)
 APART_NS = 3600 * 10**9  # images are not so far apart
 USUAL_STEP_NS = 2 * 10**6, 2 * 10**9  # between images: 500 to 0.5 Hz, which only one unit makes of any step
@@ -93,7 +93,7 @@ def _number_in(stem: str) -> str | None:
 
 def _unit_of(numbers: list[int]) -> int | None:
     """Nanoseconds of the unit in which ascending whole numbers count time; None for frame numbers."""
-    if numbers[-1] < LEAST_COUNT:
+    if numbers[-1] < MIN_STAMP:
         return None
     dated = next((unit for unit in UNITS_NS if EARLIEST_NS < numbers[-1] * unit < LATEST_NS), None)
     step = sorted(b - a for a, b in pairwise(numbers))[len(numbers) // 2 - 1] if len(numbers) > 1 else 0

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from stereo_sfm.drivers.checked_samples import wrong_imu_units
 from stereo_sfm.types import ImuSamples
 
 log = logging.getLogger("stereo_sfm")
 
-MAX_GYRO, MAX_ACCEL = 50.0, 500.0  # rad/s, m/s^2: above what sensors on robots measure
 COLUMNS = 7
 
 
@@ -46,18 +46,8 @@ def read_imu_samples(path: Path) -> ImuSamples | None:
     if not len(stamp_ns):
         return None
     values = np.array(rows)[first]
-    why = _suspicious(values)
+    why = wrong_imu_units(values[:, :3], values[:, 3:])
     if why:
         log.warning("%s: %s: the inertial samples are not used", path, why)
         return None
     return ImuSamples(stamp_ns, values[:, :3].copy(), values[:, 3:].copy())
-
-
-def _suspicious(values: np.ndarray) -> str:
-    """Why samples (N, 6) cannot be in rad/s and m/s^2; '' if they can."""
-    gyro, accel = np.linalg.norm(values[:, :3], axis=1), np.linalg.norm(values[:, 3:], axis=1)
-    if np.percentile(gyro, 99) > MAX_GYRO or np.percentile(accel, 99) > MAX_ACCEL:
-        return f"rates up to {gyro.max():.0f} and forces up to {accel.max():.0f} are not in rad/s and m/s^2 (degrees?)"
-    if 0.5 < float(np.median(accel)) < 2:
-        return f"a median force of {np.median(accel):.2f} is in g, not in m/s^2"
-    return ""

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from stereo_sfm.drivers.source import Source
 from stereo_sfm.drivers.wrapped import WrappedSource
-from stereo_sfm.types import ImuSamples, StereoImage, WheelSamples
+from stereo_sfm.types import StereoImage
 
 
 class RepeatedSource(WrappedSource):
@@ -46,6 +46,6 @@ def _shifted(image: StereoImage, frame_id: int, shift_ns: int) -> StereoImage:
         frame_id=frame_id,
         stamp_ns=image.stamp_ns + shift_ns,
         right_stamp_ns=image.right_stamp_ns + shift_ns if image.right_stamp_ns else 0,
-        imu=None if imu is None else ImuSamples(imu.stamp_ns + shift_ns, imu.gyro, imu.accel),
-        wheel=None if wheel is None else WheelSamples(wheel.stamp_ns + shift_ns, wheel.linear, wheel.angular),
+        imu=None if imu is None else imu.shifted(shift_ns),
+        wheel=None if wheel is None else wheel.shifted(shift_ns),
     )

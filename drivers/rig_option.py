@@ -34,6 +34,7 @@ def chosen_rig(option: RigOption, own: Callable[[], Rig]) -> Rig:
         given,
         body_T_left=known.body_T_left if bodiless else given.body_T_left,
         imu=given.imu or (known.imu if bodiless else None),
+        wheel=given.wheel or (known.wheel if bodiless else None),
         readout_s=given.readout_s if stated else known.readout_s,
     )
 

@@ -30,6 +30,7 @@ class Stamps:
     stamp_ns: I64  # (N,) of the left images
     skew_ms: float = float("nan")  # largest difference between left and right stamps; NaN: not known
     others: Mapping[str, I64] = field(default_factory=dict[str, "I64"])  # stamps of other recorded sensors, by name
+    assumed_hz: float = 0.0  # the rate they were made up with, where nothing tells them; 0: they are known
 
 
 class Source(Protocol):

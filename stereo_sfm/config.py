@@ -76,6 +76,7 @@ class TrackerConfig:
     inertial: bool = switch(
         True, "Use the IMU, where the source has one: prediction, and poses where images show nothing"
     )
+    wheels: bool = switch(True, "Use the wheel odometry, where the source has one, as the IMU")
     lost_frames: int = number(
         15, 0, 100_000, "Frames without a pose after which a new submap begins, whichever the tracker"
     )

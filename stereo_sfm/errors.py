@@ -19,7 +19,7 @@ class StereoSfmError(Exception):
     ``exit_code``; every other exception is an internal error and keeps its traceback.
     """
 
-    exit_code = 2
+    exit_code = 2  # of a command that ends with it
 
 
 def require(modules: tuple[str, ...], extra: str, purpose: str, error: type[StereoSfmError] = StereoSfmError) -> None:

@@ -3,12 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from pathlib import Path
+from typing import ClassVar, Protocol
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of the log; a message that has one declares it as `TOPIC`.
+
+    Attributes:
+        name: of the topic.
+        when: when it is written.
+        compare: whether `diff` compares it.
+        sequence: the field of the message that is the frame id.
+    """
+
+    name: str
+    when: str
+    compare: bool = True
+    sequence: str = "frame_id"
 
 
 @dataclass(frozen=True)
 class StageTimes:
     """Wall-clock milliseconds a frame spent in each stage; never compared by `diff`."""
+
+    TOPIC: ClassVar[Topic] = Topic("/stage_times", "every frame: milliseconds in each stage", compare=False)
 
     frame_id: int
     ms: dict[str, float]
@@ -17,6 +37,8 @@ class StageTimes:
 @dataclass(frozen=True)
 class Health:
     """How one stage keeps up; wall clock, never compared."""
+
+    TOPIC: ClassVar[Topic] = Topic("/health", "every second and stage: rate, queue, latency", compare=False)
 
     stage: str
     frame_id: int
@@ -40,6 +62,8 @@ class LogLine:
 @dataclass(frozen=True)
 class SourceCounters:
     """Counters of a live camera (stereo_sfm.drivers.live.counters) up to a frame; never compared."""
+
+    TOPIC: ClassVar[Topic] = Topic("/counters", "every few seconds: counters of a live camera", compare=False)
 
     frame_id: int
     counts: dict[str, float]
@@ -67,6 +91,14 @@ class Localized:
     """From this map update on poses are in the frame of the saved map that the run began with."""
 
     version: int
+
+
+@dataclass(frozen=True)
+class SaveMap:
+    """A request: write the session's part of the map."""
+
+    folder: Path  # replaced
+    urgent: bool = False  # the run is ending: at the priority of the stage, not below it
 
 
 @dataclass(frozen=True)

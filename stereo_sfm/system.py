@@ -47,7 +47,12 @@ class Tracker:
     """
 
     def __init__(self, rig: Rig | str | Path, config: Config | None = None) -> None:
-        """Args: rig, the calibration or its file. config: the default when omitted."""
+        """Begin before the first image.
+
+        Args:
+            rig: the calibration or its file.
+            config: the default when omitted.
+        """
         self._rig = _rig(rig)
         self._input = ImageInput(self._rig)
         self._tracker = make_tracker(config or Config(), self._rig)
@@ -71,8 +76,8 @@ class Tracker:
 class LiveMap(Message):
     """The map as it is at one moment."""
 
-    kf_ids: I64  # (K,) ascending
-    map_T_kf: F64  # (K, 4, 4)
+    kf_ids: I64  # (K,) keyframes, ascending
+    map_T_kf: F64  # (K, 4, 4) poses of the keyframes
     point_ids: I64  # (P,) ascending
     points: F64  # (P, 3) metres in the map
 
@@ -105,12 +110,14 @@ class System:
         localize_only: bool = False,
         sinks: Iterable[Sink] = (),
     ) -> None:
-        """Args:
-        rig: the calibration or its file.
-        config: what decides the result; the default when omitted.
-        map_in: folder of a saved map of this place to continue.
-        localize_only: localize the camera in `map_in` without changing the map.
-        sinks: each gets every message, in order.
+        """Begin before the first image.
+
+        Args:
+            rig: the calibration or its file.
+            config: what decides the result; the default when omitted.
+            map_in: folder of a saved map of this place to continue.
+            localize_only: localize the camera in `map_in` without changing the map.
+            sinks: each gets every message, in order.
         """
         self.rig, self.config = _rig(rig), config or Config()
         folders = MapFolders(None if map_in is None else Path(map_in).expanduser(), localize_only)
@@ -126,7 +133,7 @@ class System:
         self._open.enter_context(Listener("main", self._run.add_line))
         self._open.enter_context(limited_threads(self.config.pipeline.threads))
         self._finished = False
-        self.frame: Frame | None = None
+        self.frame: Frame | None = None  # of the newest image
 
     def _take(self, update: MapUpdate) -> None:
         self._view.update(update)
@@ -219,10 +226,12 @@ class MapLocator:
     def __init__(
         self, saved: SavedMap | str | Path, rig: Rig | str | Path | None = None, config: Config | None = None
     ) -> None:
-        """Args:
-        saved: a map, or its folder.
-        rig: of the camera to localize; the map's own when omitted.
-        config: its `loop` section is used.
+        """Prepare a map for searches.
+
+        Args:
+            saved: a map, or its folder.
+            rig: of the camera to localize; the map's own when omitted.
+            config: its `loop` section is used.
         """
         self._config = config or Config()
         saved = saved if isinstance(saved, SavedMap) else load_map(saved)

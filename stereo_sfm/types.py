@@ -10,10 +10,12 @@ from __future__ import annotations
 import enum
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+from stereo_sfm.messages import Topic
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
@@ -60,7 +62,7 @@ class TrackState(enum.IntEnum):
     RECOVERED = 2  # first good pose after LOST frames, in the same odometry frame
     LOST = 3  # pose predicted only; `Frame.reason` says why
     RESTARTED = 4  # tracking began again as a new submap at the predicted pose
-    INERTIAL = 5  # the images show nothing: pose from the IMU since the last good one, with its covariance
+    INERTIAL = 5  # the images show nothing: pose from IMU or wheels since the last good one, with its covariance
     OCCLUDED = 6  # as LOST, while something before the camera covers what it knows
 
 
@@ -68,16 +70,20 @@ class TrackState(enum.IntEnum):
 class ImuSamples(Message):
     """Inertial samples since the previous frame, in the IMU's own axes."""
 
-    stamp_ns: I64  # (N,)
+    stamp_ns: I64  # (N,) ascending, the camera's clock
     gyro: F64 = field(metadata=shape(-1, 3))  # (N, 3) rad/s, NaN rows where only the accelerometer was sampled
     accel: F64 = field(metadata=shape(-1, 3))  # (N, 3) m/s^2, NaN rows where only the gyroscope was sampled
 
     def __len__(self) -> int:
         return len(self.stamp_ns)
 
-    def part(self, rows: slice) -> ImuSamples:
-        """Some successive samples."""
+    def part(self, rows: slice | I64) -> ImuSamples:
+        """Some of the samples."""
         return ImuSamples(self.stamp_ns[rows], self.gyro[rows], self.accel[rows])
+
+    def shifted(self, shift_ns: int) -> ImuSamples:
+        """The same samples at later times."""
+        return ImuSamples(self.stamp_ns + shift_ns, self.gyro, self.accel)
 
     @staticmethod
     def joined(parts: Sequence[ImuSamples]) -> ImuSamples:
@@ -88,35 +94,60 @@ class ImuSamples(Message):
 
 @dataclass(frozen=True, eq=False)
 class WheelSamples(Message):
-    """Wheel odometry since the previous frame, body axes (x forward, y left)."""
+    """Wheel odometry since the previous frame: velocities of the robot (x forward, y left), or speeds of its wheels."""
 
-    stamp_ns: I64  # (N,)
-    linear: F64 = field(metadata=shape(-1, 3))  # (N, 3) m/s
-    angular: F64 = field(metadata=shape(-1, 3))  # (N, 3) rad/s
+    stamp_ns: I64  # (N,) ascending, the camera's clock
+    linear: F64 = field(metadata=shape(-1, 3))  # (N, 3) m/s, NaN rows where only the wheels' speeds are known
+    angular: F64 = field(metadata=shape(-1, 3))  # (N, 3) rad/s, likewise
+    speeds: F64 = field(default_factory=lambda: np.zeros((0, 0)))  # (N, W) rad/s of each wheel; (0, 0): unknown
+
+    def __len__(self) -> int:
+        return len(self.stamp_ns)
+
+    def part(self, rows: slice | I64) -> WheelSamples:
+        """Some of the samples."""
+        speeds = self.speeds[rows] if len(self.speeds) else self.speeds
+        return WheelSamples(self.stamp_ns[rows], self.linear[rows], self.angular[rows], speeds)
+
+    def shifted(self, shift_ns: int) -> WheelSamples:
+        """The same samples at later times."""
+        return WheelSamples(self.stamp_ns + shift_ns, self.linear, self.angular, self.speeds)
+
+    @staticmethod
+    def of_wheels(stamp_ns: I64, speeds: F64) -> WheelSamples:
+        """Samples of (N, W) rad/s of each wheel."""
+        unknown = np.full((len(stamp_ns), 3), np.nan)
+        return WheelSamples(stamp_ns, unknown, unknown.copy(), speeds)
+
+    @staticmethod
+    def joined(parts: Sequence[WheelSamples]) -> WheelSamples:
+        """One after the other."""
+        parts = [p for p in parts if len(p)] or list(parts[:1])
+        return WheelSamples(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(WheelSamples)))
 
 
 @dataclass(frozen=True, eq=False)
 class StereoImage(Message):
     """One synchronised pair (or a single image, or an image with depth), as a driver yields it."""
 
-    frame_id: int
+    frame_id: int  # number of the image in its source, growing
     stamp_ns: int  # sensor clock, mid-exposure, left camera
     left: U8  # (H, W)
     right: U8 | None = None  # (H, W); None for monocular and RGB-D sources
     depth: F32 | None = None  # (H, W) metres along the left optical axis, NaN where unknown (RGB-D sources)
     right_stamp_ns: int = 0  # 0: same as left
-    exposure_us: float = float("nan")
-    gain: float = float("nan")
+    exposure_us: float = float("nan")  # microseconds, NaN where unknown
+    gain: float = float("nan")  # of the sensor, NaN where unknown
     dropped_before: int = 0  # frames the sensor or the driver lost just before this one
-    imu: ImuSamples | None = None
-    wheel: WheelSamples | None = None
+    imu: ImuSamples | None = None  # since the image before
+    wheel: WheelSamples | None = None  # since the image before
 
 
 @dataclass(frozen=True, eq=False)
 class Observations(Message):
     """Points seen in one frame, one row each."""
 
-    point_ids: I64  # (N,)
+    point_ids: I64  # (N,) the same id is the same physical point in every frame of this run
     uv_left: F64 = field(metadata=shape(-1, 2))  # (N, 2) px
     uv_right: F64 = field(metadata=shape(-1, 2))  # (N, 2) px, NaN where the right camera does not see it
     age: I32  # (N,) frames since the track began
@@ -138,20 +169,30 @@ class Observations(Message):
 
 @dataclass(frozen=True, eq=False)
 class Frame(Message):
-    """The tracker's answer to one image."""
+    """The tracker's result for one image."""
 
-    frame_id: int
-    stamp_ns: int
-    odom_T_cam: F64 = field(metadata=shape(4, 4))  # (4, 4) continuous odometry pose
-    covariance: F64 = field(metadata=shape(6, 6))  # (6, 6) of odom_T_cam @ exp(xi), xi = (rho, phi) in camera axes
-    state: TrackState
-    reason: str  # "" when OK, else why (a short stable word such as "too_few_points", "dark", "no_consensus")
-    observations: Observations
-    reference_kf_id: int  # -1 before the first keyframe
+    TOPIC: ClassVar[Topic] = Topic("/frame", "every frame: the tracker's result")
+
+    frame_id: int  # of its image
+    stamp_ns: int  # of its image: sensor clock, mid-exposure, left camera
+    odom_T_cam: F64 = field(metadata=shape(4, 4))  # (4, 4) continuous odometry pose, metres
+    # (6, 6) of the pose, in the camera's axes: translation along x, y, z (m²), then rotation about x, y, z (rad²):
+    # that of xi = (rho, phi) in odom_T_cam @ exp(xi)
+    covariance: F64 = field(metadata=shape(6, 6))
+    state: TrackState  # what is known about the pose
+    # "" where the pose is good, else why not, a short stable word: "dark", "too_few_points", "no_consensus",
+    # "not_found"; the estimators of --odometry have further ones ("low_parallax", "ill_conditioned", ...)
+    reason: str
+    observations: Observations  # the points seen; empty where the pose is only predicted
+    reference_kf_id: int  # keyframe that the frame moves with in the map, -1 before the first
     kf_T_cam: F64 = field(metadata=shape(4, 4))  # (4, 4) pose in the reference keyframe, for the final trajectory
     map_version: int = 0  # last MapUpdate applied before this frame
-    is_keyframe: bool = False
-    stats: dict[str, float] = field(default_factory=dict[str, float])  # numbers worth plotting; no wall clock
+    is_keyframe: bool = False  # whether it enters the map
+    # numbers worth plotting, no wall clock, none where the pose is predicted: `tracked` points, `inliers` (in the
+    # pose), `right` (seen by both cameras), `moving` (share of the points on things that move), `error` (median
+    # residual of the inliers in standard deviations); with an IMU `roll_deg`, `pitch_deg`; other trackers:
+    # `features`, `matches`, `line_share`, `parallax_deg`, ...
+    stats: dict[str, float] = field(default_factory=dict[str, float])
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,9 +228,11 @@ class Corners(Message):
 class Keyframe(Message):
     """A frame that enters the map, with what place recognition and mapping need."""
 
-    kf_id: int  # 0, 1, 2, ...
-    frame_id: int
-    stamp_ns: int
+    TOPIC: ClassVar[Topic] = Topic("/keyframe", "every keyframe")
+
+    kf_id: int  # 0, 1, 2, ... in this run
+    frame_id: int  # of its frame
+    stamp_ns: int  # of its frame
     odom_T_cam: F64 = field(metadata=shape(4, 4))  # (4, 4) at creation
     point_ids: I64  # (N,) tracks' ids: the same id is the same physical point in every keyframe of this run
     # px; with a rolling shutter where they would be if all rows were exposed at the stamp
@@ -208,6 +251,8 @@ class CalibrationUpdate(Message):
     """The rig's terms that the mapper found: rotation of the right camera about x, y, z (3, radians), direction of the
     baseline along y and z (2, radians), logarithm of the right focal length against the left."""
 
+    TOPIC: ClassVar[Topic] = Topic("/calibration", "when self-calibration corrects the rig, or reports a correction")
+
     version: int  # of the map update that brings it
     kf_id: int
     stamp_ns: int
@@ -215,13 +260,17 @@ class CalibrationUpdate(Message):
     terms_covariance: F64 = field(metadata=shape(6, 6))
     since_kf_id: int  # first keyframe that was seen by the rig so corrected; those before stay as they were
     applied: bool  # False: only reported
-    why: str  # "significant", "step" or "refined"
+    why: str  # "significant", "step", "refined" or "drift"
     text: str  # human-readable
 
 
 @dataclass(frozen=True, eq=False)
 class RowErrors(Message):
     """How well the rig fits what is seen, after a keyframe; averages over the last ones."""
+
+    TOPIC: ClassVar[Topic] = Topic(
+        "/calibration/row_errors", "every keyframe of a stereo camera: row errors by region, and their trend"
+    )
 
     kf_id: int
     stamp_ns: int
@@ -235,15 +284,17 @@ class RowErrors(Message):
 class MapUpdate(Message):
     """The mapper's result for one keyframe (exactly one each, possibly empty)."""
 
-    version: int
-    kf_id: int  # the keyframe it answers
+    TOPIC: ClassVar[Topic] = Topic("/map/update", "every keyframe: changed keyframes and points")
+
+    version: int  # 1, 2, 3, ...
+    kf_id: int  # the keyframe whose result it is
     kf_ids: I64  # (K,) living keyframes that are new or moved
     map_T_kf: F64 = field(metadata=shape(-1, 4, 4))  # (K, 4, 4) their new poses
     point_ids: I64  # (P,) new or moved points, in track ids
-    points_map: F64 = field(metadata=shape(-1, 3))  # (P, 3)
-    culled_point_ids: I64  # (C,)
+    points_map: F64 = field(metadata=shape(-1, 3))  # (P, 3) their positions, metres in the map
+    culled_point_ids: I64  # (C,) points removed from the map
     fused_point_ids: I64 = field(metadata=shape(-1, 2))  # (D, 2) old id -> id that replaces it
-    map_T_odom: F64 = field(metadata=shape(4, 4))  # (4, 4)
+    map_T_odom: F64 = field(metadata=shape(4, 4))  # (4, 4) takes poses of the odometry into the map, from now on
     culled_kf_ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))  # (R,) keyframes removed from the map
     carrier_kf_ids: I64 = field(
         default_factory=lambda: np.zeros(0, np.int64)
@@ -261,14 +312,16 @@ class MapUpdate(Message):
 class LoopResult(Message):
     """The loop closer's result for one keyframe (exactly one each)."""
 
-    kf_id: int
+    TOPIC: ClassVar[Topic] = Topic("/loop", "every keyframe: the loop closer's result, with reasons")
+
+    kf_id: int  # the keyframe whose result it is
     candidate_kf_id: int  # -1: no loop
     candidate_T_kf: F64 = field(metadata=shape(4, 4))  # (4, 4) identity when rejected
     information: F64 = field(metadata=shape(6, 6))  # (6, 6) inverse covariance of candidate_T_kf @ exp(xi)
     # (M, 2) point ids (candidate's, this keyframe's) that are one physical point
     matches: I64 = field(metadata=shape(-1, 2))
     inliers: int  # corners of the keyframe that agree
-    score: float
+    score: float  # similarity of the bags of words, from 0 to 1
     reason: str  # "" when accepted, else why the best candidate was rejected ("no_candidate", "too_few_inliers", ...)
     rejected: tuple[tuple[int, float, str], ...] = ()  # every rejected candidate: (kf_id, score, reason)
 
@@ -276,6 +329,8 @@ class LoopResult(Message):
 @dataclass(frozen=True)
 class Dropped:
     """A frame that never reached a stage."""
+
+    TOPIC: ClassVar[Topic] = Topic("/dropped", "when frames are lost")
 
     frame_id: int
     stamp_ns: int
@@ -287,6 +342,8 @@ class Dropped:
 @dataclass(frozen=True)
 class Applied:
     """Which map update was applied just before which frame (the recorded schedule of a realtime run)."""
+
+    TOPIC: ClassVar[Topic] = Topic("/applied", "when a map update is applied", sequence="before_frame_id")
 
     version: int
     before_frame_id: int

@@ -15,6 +15,8 @@ from stereo_sfm.errors import StereoSfmError, require
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
+SERVE = ["serve", "--set", "source.spec=sim:loop", "--set"]
+
 
 def test_what_is_there_passes_and_what_is_missing_is_named() -> None:
     require(("numpy",), "viewer", "a test")
@@ -30,6 +32,9 @@ def test_what_is_there_passes_and_what_is_missing_is_named() -> None:
         (["run", "t265", "--inline"], "usb", "t265"),
         (["batch", "{demo}", "-o", "out"], "ray", "batch"),
         (["run", "rosbag:drive.bag", "--inline"], "rosbags", "ros"),
+        ([*SERVE, "page.enabled=true"], "starlette", "serve"),
+        ([*SERVE, "outputs.foxglove.enabled=true"], "foxglove", "serve"),
+        ([*SERVE, "outputs.ros2.enabled=true"], "rclpy", "ros2"),
     ],
 )
 def test_missing_extra_is_one_line(

@@ -54,6 +54,8 @@ def save_rig(rig: Rig, path: Path | str, format: str | None = None) -> None:
     write = _function(name, 2)
     if rig.readout_s and name != "rig":
         log.warning("%s cannot store the readout time of a rolling shutter (%g s): it is lost", name, rig.readout_s)
+    if rig.wheel is not None and name != "rig":
+        log.warning("%s cannot store wheel odometry: its calibration is lost", name)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write(rig, path)
@@ -69,8 +71,15 @@ def recognise(path: Path) -> str:
     """
     found = _recognise_folder(path) if path.is_dir() else _recognise_file(path)
     if found is None:
-        raise StereoSfmError(f"cannot detect the calibration format of {path}: give it ({', '.join(FORMATS)})")
+        raise StereoSfmError(f"cannot detect the calibration format of {path}: {_instead(path)}")
     return found
+
+
+def _instead(path: Path) -> str:
+    """What to do with a file whose format is not recognised."""
+    if path.name == "sensor.yaml":  # EuRoC
+        return f"it is of one camera of two, give the folder with cam0/sensor.yaml ({path.absolute().parents[1]})"
+    return f"'stereo-sfm convert-calib --from FORMAT' reads it as one of {', '.join(FORMATS)}"
 
 
 def _recognise_folder(path: Path) -> str | None:

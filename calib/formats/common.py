@@ -112,9 +112,11 @@ def numbers(values: Any, count: int | None = None) -> list[float]:
 
 def rigid(values: Any) -> F64:
     """16 (or 12) numbers row by row -> (4, 4) with the rotation orthonormalized if it was rounded in the file."""
-    flat = np.array(numbers(values))
+    ragged = isinstance(values, list) and len({len(row) if isinstance(row, list) else 0 for row in values}) > 1
+    flat = np.zeros(0) if ragged else np.array(numbers(values))
     if len(flat) not in (12, 16):
-        raise ValueError(f"a transform needs 12 or 16 numbers, found {len(flat)}")
+        found = "rows of different lengths" if ragged else f"{len(flat)}"
+        raise ValueError(f"a transform needs 4 rows of 4 numbers (or 12 or 16 in one row), found {found}")
     transform = np.eye(4)
     transform[:3] = flat[:12].reshape(3, 4)
     return exact_rotation(transform)

@@ -5,8 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from stereo_sfm.calib.formats.common import numbers, read_text, reading, rigid, rows, yaml_mapping, yaml_text
 from stereo_sfm.calib.formats.imu_files import imu_from_plain, imu_to_plain
+from stereo_sfm.calib.formats.wheel_files import wheel_from_plain, wheel_to_plain
 from stereo_sfm.calib.mask import mask_from_text, mask_to_text
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry.cameras import MODELS, Camera
@@ -32,15 +35,17 @@ def rig_from_text(text: str, where: Path | str, folder: Path | None = None) -> R
         data = yaml_mapping(text)
         if data.get(KEY) != 1:
             raise ValueError(f"{KEY} is {data.get(KEY)}, this version of the program reads 1")
+        body_T_left = rigid(data["body_T_left"]) if "body_T_left" in data else np.eye(4)
         return Rig(
             left=_camera(data["left"]),
             right=_camera(data["right"]) if data.get("right") else None,
             left_T_right=rigid(data["left_T_right"]),
-            body_T_left=rigid(data["body_T_left"]),
+            body_T_left=body_T_left,
             depth=bool(data.get("depth", False)),
             name=str(data.get("name", "")),
             serial=str(data.get("serial", "")),
             imu=imu_from_plain(data["imu"]) if data.get("imu") else None,
+            wheel=wheel_from_plain(data["wheel"], body_T_left) if data.get("wheel") else None,
             readout_s=float(data.get("readout_s") or 0.0),
             left_mask=_mask(data["left"], folder),
             right_mask=_mask(data.get("right") or {}, folder),
@@ -66,6 +71,7 @@ def rig_to_text(rig: Rig) -> str:
             "left_T_right": rows(rig.left_T_right),
             "body_T_left": rows(rig.body_T_left),
             **({"imu": imu_to_plain(rig.imu)} if rig.imu else {}),
+            **({"wheel": wheel_to_plain(rig.wheel)} if rig.wheel else {}),
         },
     )
 

@@ -6,7 +6,6 @@ given frame rate and the numbers in the file names.
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,8 +26,6 @@ from stereo_sfm.errors import StereoSfmError
 
 if TYPE_CHECKING:
     from stereo_sfm.drivers.images import ImagesOptions
-
-log = logging.getLogger("stereo_sfm")
 
 ASSUMED_FPS = 30.0
 # folder names of the two cameras; the first two are also file name prefixes in one folder
@@ -68,9 +65,7 @@ def open_images(path: str, options: ImagesOptions) -> FolderSource:
         read_trajectory(truth) if truth is not None else None,
     )
     if options.fps is None and not _stamped(folder, found[0]):
-        log.info(
-            "%s: neither names nor times.txt tell the stamps: %g images a second assumed (?fps=N)", name, ASSUMED_FPS
-        )
+        source.assumed_hz = ASSUMED_FPS
     return source
 
 

@@ -176,7 +176,7 @@ class LiveSource(BaseSource):
 
     def _shifted(self, imu: ImuSamples | None) -> ImuSamples | None:
         shift = self._time.stamp(0)
-        return imu if imu is None or shift == 0 else ImuSamples(imu.stamp_ns + shift, imu.gyro, imu.accel)
+        return imu if imu is None or shift == 0 else imu.shifted(shift)
 
     def _count(self, dropped: int, lost_here: int, imu: int, wheel: int) -> None:
         amounts = {"pairs": 1, "dropped": dropped, "dropped_by_host": lost_here, "imu_samples": imu}

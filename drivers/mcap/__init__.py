@@ -23,6 +23,8 @@ class McapOptions(SourceOptions):
     left: str = option("", "topic of the left images, if the names are ambiguous")
     right: str = option("", "topic of the right images, if the names are ambiguous")
     depth: str = option("", "topic of the depth images, if the names are ambiguous")
+    wheel: str = option("", "topic of wheel odometry: Odometry, TwistStamped or JointState")
+    joints: str = option("", "the wheels' joints of a JointState, in the order of the rig: LEFT,RIGHT")
 
 
 def _open(place: str, options: McapOptions) -> Source:

@@ -8,38 +8,45 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from stereo_sfm.calib.imu import Imu
 from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calib.wheel import Wheel
+from stereo_sfm.drivers.mcap import McapOptions
 from stereo_sfm.drivers.mcap.messages import (
     BAD_MESSAGE,
     CAMERAS,
     IMAGES,
     IMUS,
+    JOINTS,
     POSES,
     TRANSFORMS,
+    VELOCITIES,
     CameraInfo,
     ImageMessage,
     ImuReading,
     Transform,
+    WheelReading,
     schema_name,
 )
 from stereo_sfm.drivers.mcap.recording import Recording
 from stereo_sfm.drivers.mcap.rig import camera_of, chain, stereo_rig
 from stereo_sfm.drivers.mcap.topics import camera_topic, choose_topics, is_rectified
-from stereo_sfm.drivers.rig_option import RigOption, chosen_rig
+from stereo_sfm.drivers.rig_option import chosen_rig
 from stereo_sfm.drivers.source import BaseSource, Stamps
 from stereo_sfm.drivers.tum_rgbd.source import with_virtual_camera
 from stereo_sfm.drivers.used_bits import used_bits
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log.reader import Record
 from stereo_sfm.pixels import eight_bits
-from stereo_sfm.types import ImuSamples, StereoImage, Trajectory
+from stereo_sfm.types import ImuSamples, StereoImage, Trajectory, WheelSamples
 
 log = logging.getLogger("stereo_sfm")
+
+Reading = TypeVar("Reading", ImuReading, WheelReading)
 
 _STATIC_NS = 10_000_000_000  # the fixed transforms must come within the first ten seconds
 _STEP_BACK_NS = 200_000_000  # messages of several threads may be out of order by less
@@ -57,20 +64,18 @@ class _StampedImage:
 class ForeignSource(BaseSource):
     """Pairs the images of two topics by their stamps. Frames without a partner count as dropped."""
 
-    def __init__(
-        self, reader: Recording, rig: RigOption = None, left: str = "", right: str = "", depth: str = ""
-    ) -> None:
+    def __init__(self, reader: Recording, options: McapOptions) -> None:
         """Takes over the reader.
 
         Args:
             reader: the open recording.
-            rig: calibration that replaces or supplies the one in the file.
-            left: image topic of the left camera if the names are ambiguous. right, depth: likewise.
+            options: a calibration that replaces or supplies the one in the file; topics where names are ambiguous.
         """
         self.reader = reader
         self.name = str(reader.path)
-        self.topics = choose_topics(reader, left, right, depth)
-        self.rig = self._with_imu(chosen_rig(rig, self._recorded_rig))
+        self.topics = choose_topics(reader, options.left, options.right, options.depth, options.wheel)
+        self._joints = [name for name in options.joints.split(",") if name]
+        self.rig = self._with_wheel(self._with_imu(chosen_rig(options.rig, self._recorded_rig)))
         if self.topics.depth:
             self.rig = with_virtual_camera(self.rig)
         self.ground_truth = self._read_truth()
@@ -95,7 +100,9 @@ class ForeignSource(BaseSource):
 
     def stamps(self) -> Stamps:
         """Of all usable pairs."""
-        pairs = [(a.stamp_ns, b.stamp_ns if b else a.stamp_ns) for a, b in self._pairs(None, None, []) if self._used(b)]
+        pairs = [
+            (a.stamp_ns, b.stamp_ns if b else a.stamp_ns) for a, b in self._pairs(None, None, [], []) if self._used(b)
+        ]
         table = np.array(pairs, np.int64).reshape(-1, 2)
         skew = (
             float(np.abs(table[:, 1] - table[:, 0]).max()) / 1e6 if len(table) and self.topics.right else float("nan")
@@ -113,11 +120,16 @@ class ForeignSource(BaseSource):
         """
         dropped = 0
         imu: list[ImuReading] = []
-        for frame_id, (left, other) in enumerate(self._pairs(start_ns, until_ns, imu)):
+        wheel: list[WheelReading] = []
+        for frame_id, (left, other) in enumerate(self._pairs(start_ns, until_ns, imu, wheel)):
             image = self._decode(frame_id, left, other, dropped) if self._used(other) else None
             dropped = 0 if image is not None else dropped + 1
             if image is not None:
-                yield replace(image, imu=take_imu(imu, left.stamp_ns)) if self.topics.imu else image
+                yield replace(
+                    image,
+                    imu=take_imu(imu, left.stamp_ns) if self.topics.imu else None,
+                    wheel=take_wheel(wheel, left.stamp_ns, self._joints) if self.topics.wheel else None,
+                )
 
     def _other(self) -> str:
         return self.topics.right or self.topics.depth
@@ -143,16 +155,21 @@ class ForeignSource(BaseSource):
         )
 
     def _pairs(
-        self, start_ns: int | None, until_ns: int | None, imu: list[ImuReading]
+        self, start_ns: int | None, until_ns: int | None, imu: list[ImuReading], wheel: list[WheelReading]
     ) -> Iterator[tuple[_StampedImage, _StampedImage | None]]:
-        """(left, right or depth) by stamp; an unpaired left image has None. Inertial samples are put into `imu`."""
+        """(left, right or depth) by stamp; an unpaired left image has None. Samples are put into `imu` and `wheel`."""
+        samples = [*self.topics.imu, *([self.topics.wheel] if self.topics.wheel else [])]
         names = [t for t in (self.topics.left, self._other()) if t]
         lefts: deque[_StampedImage] = deque()
         others: deque[_StampedImage] = deque()
-        for record in self.reader.messages([*names, *self.topics.imu], start_ns, until_ns):
+        for record in self.reader.messages([*names, *samples], start_ns, until_ns):
             if record.topic in self.topics.imu:
                 reading = _imu_reading(record)
                 imu += [reading] if reading is not None else []
+                continue
+            if record.topic == self.topics.wheel:
+                turned = _wheel_reading(record)
+                wheel += [turned] if turned is not None else []
                 continue
             image = self._image_of(record)
             if image is None:
@@ -216,6 +233,17 @@ class ForeignSource(BaseSource):
             return rig
         return replace(rig, imu=Imu(left_T_imu))
 
+    def _with_wheel(self, rig: Rig) -> Rig:
+        """The rig with the robot's pose, where the recording has its velocities and its transforms say where it is."""
+        if rig.wheel is not None or not self.topics.wheel:
+            return rig
+        reading = next((r for m in self.reader.messages([self.topics.wheel]) if (r := _wheel_reading(m))), None)
+        left_T_wheel = chain(self._fixed_transforms(), self._left_frame(), reading.frame) if reading else None
+        if left_T_wheel is None or reading is None or reading.joints:
+            log.info("%s: %s needs the wheels' calibration (--rig FILE): it is not used", self.name, self.topics.wheel)
+            return rig
+        return replace(rig, wheel=Wheel(left_T_wheel))
+
     def _fixed_transforms(self) -> list[Transform]:
         out: list[Transform] = []
         start, _ = self.reader.time_range
@@ -263,7 +291,7 @@ class ForeignSource(BaseSource):
 
     def _check_first(self) -> None:
         """Raises StereoSfmError before the first frame if the images do not match the calibration."""
-        for left, other in self._pairs(None, None, []):
+        for left, other in self._pairs(None, None, [], []):
             if self._used(other):
                 self._decode(0, left, other, 0)
                 return
@@ -282,9 +310,32 @@ def _imu_reading(record: Record) -> ImuReading | None:
     return None
 
 
-def take_imu(buffer: list[ImuReading], until_ns: int) -> ImuSamples:
-    """Remove the samples up to a stamp from the buffer."""
+def _up_to(buffer: list[Reading], until_ns: int) -> list[Reading]:
+    """Remove the samples up to a stamp from the buffer, in their order."""
     taken = sorted((s for s in buffer if s.stamp_ns <= until_ns), key=lambda s: s.stamp_ns)
     buffer[:] = [s for s in buffer if s.stamp_ns > until_ns]
+    return taken
+
+
+def take_imu(buffer: list[ImuReading], until_ns: int) -> ImuSamples:
+    """Remove the samples up to a stamp from the buffer."""
+    taken = _up_to(buffer, until_ns)
     values = np.array([s.values for s in taken], float).reshape(-1, 6)
     return ImuSamples(np.array([s.stamp_ns for s in taken], np.int64), values[:, :3].copy(), values[:, 3:].copy())
+
+
+def _wheel_reading(record: Record) -> WheelReading | None:
+    with suppress(*BAD_MESSAGE):
+        return (VELOCITIES | JOINTS)[schema_name(record)](record.data)
+    return None
+
+
+def take_wheel(buffer: list[WheelReading], until_ns: int, joints: list[str]) -> WheelSamples:
+    """Remove the samples up to a stamp from the buffer; speeds of `joints` where those are named."""
+    taken = _up_to(buffer, until_ns)
+    if joints:
+        taken = [s for s in taken if all(name in s.joints for name in joints)]
+        speeds = np.array([[s.joints[name] for name in joints] for s in taken], float).reshape(-1, len(joints))
+        return WheelSamples.of_wheels(np.array([s.stamp_ns for s in taken], np.int64), speeds)
+    linear, angular = (np.array([getattr(s, n) for s in taken], float).reshape(-1, 3) for n in ("linear", "angular"))
+    return WheelSamples(np.array([s.stamp_ns for s in taken], np.int64), linear, angular)

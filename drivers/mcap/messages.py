@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -88,6 +88,17 @@ class ImuReading:
     stamp_ns: int
     frame: str
     values: list[float]  # (6,) rad/s and m/s^2 in the IMU's frame, NaN for what the message does not measure
+
+
+@dataclass(frozen=True)
+class WheelReading:
+    """One message of a robot's motion: velocities in its own axes, or the speeds of its joints."""
+
+    stamp_ns: int
+    frame: str  # of the robot
+    linear: tuple[float, ...] = (float("nan"),) * 3  # m/s
+    angular: tuple[float, ...] = (float("nan"),) * 3  # rad/s
+    joints: dict[str, float] = field(default_factory=dict[str, float])  # rad/s
 
 
 class _Cdr:
@@ -223,13 +234,28 @@ def _imu_ros(data: bytes) -> ImuReading:
     return ImuReading(stamp_ns, frame, [*(gyro if gyro_known else nothing), *(accel if accel_known else nothing)])
 
 
-def _velocity_ros(data: bytes) -> tuple[int, tuple[float, ...], tuple[float, ...]]:
-    """(stamp_ns, m/s, rad/s) of the body in its own axes, of an odometry."""
+def _odometry_velocity_ros(data: bytes) -> WheelReading:
     cdr = _Cdr(data)
     stamp_ns, _ = cdr.header()
-    cdr.text()
+    frame = cdr.text()
     cdr.take("d", 7 + 36)
-    return stamp_ns, cdr.take("d", 3), cdr.take("d", 3)
+    return WheelReading(stamp_ns, frame, cdr.take("d", 3), cdr.take("d", 3))
+
+
+def _twist_ros(data: bytes) -> WheelReading:
+    cdr = _Cdr(data)
+    stamp_ns, frame = cdr.header()
+    return WheelReading(stamp_ns, frame, cdr.take("d", 3), cdr.take("d", 3))
+
+
+def _joints_ros(data: bytes) -> WheelReading:
+    """Speeds of joints; without any, none."""
+    cdr = _Cdr(data)
+    stamp_ns, frame = cdr.header()
+    names = [cdr.text() for _ in range(cdr.take("I"))]
+    _, speeds = ([float(cdr.take("d")) for _ in range(cdr.take("I"))] for _ in range(2))
+    known = dict(zip(names, speeds, strict=True)) if len(speeds) == len(names) else {}
+    return WheelReading(stamp_ns, frame, joints=known)
 
 
 IMAGES: dict[str, Callable[[bytes], ImageMessage]] = {
@@ -253,9 +279,12 @@ POSES: dict[str, Callable[[bytes], Transform]] = {
     "nav_msgs/msg/Odometry": _odometry_ros,
 }
 IMUS: dict[str, Callable[[bytes], ImuReading]] = {"sensor_msgs/msg/Imu": _imu_ros}
-VELOCITIES: dict[str, Callable[[bytes], tuple[int, tuple[float, ...], tuple[float, ...]]]] = {
-    "nav_msgs/msg/Odometry": _velocity_ros
+VELOCITIES: dict[str, Callable[[bytes], WheelReading]] = {
+    "nav_msgs/msg/Odometry": _odometry_velocity_ros,
+    "geometry_msgs/msg/TwistStamped": _twist_ros,
+    "geometry_msgs/msg/TwistWithCovarianceStamped": _twist_ros,
 }
+JOINTS: dict[str, Callable[[bytes], WheelReading]] = {"sensor_msgs/msg/JointState": _joints_ros}
 ENCODINGS = ("protobuf", "cdr")
 
 

@@ -65,7 +65,7 @@ def open_mcap(path: str, options: McapOptions) -> Source:
             raise StereoSfmError(f"{path} is a run without images: they are in {about.get('source')}")
         from stereo_sfm.drivers.mcap.foreign import ForeignSource
 
-        return ForeignSource(reader, options.rig, options.left, options.right, options.depth)
+        return ForeignSource(reader, options)
     except BaseException:
         reader.close()
         raise
@@ -169,7 +169,10 @@ def _wheel(samples: list[WheelSample]) -> WheelSamples:
     linear = [(s.linear_x, s.linear_y, s.linear_z) for s in samples]
     angular = [(s.angular_x, s.angular_y, s.angular_z) for s in samples]
     stamps = np.array([s.stamp_ns for s in samples], np.int64)
-    return WheelSamples(stamps, np.array(linear, float).reshape(-1, 3), np.array(angular, float).reshape(-1, 3))
+    wheels = max((len(s.speeds) for s in samples), default=0)
+    known = wheels and all(len(s.speeds) == wheels for s in samples)
+    speeds = np.array([s.speeds for s in samples], float) if known else np.zeros((0, 0))
+    return WheelSamples(stamps, np.array(linear, float).reshape(-1, 3), np.array(angular, float).reshape(-1, 3), speeds)
 
 
 class McapSource(BaseSource):

@@ -6,7 +6,16 @@ import logging
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 
-from stereo_sfm.drivers.mcap.messages import CAMERAS, ENCODINGS, IMAGES, IMUS, POSES, TRANSFORMS
+from stereo_sfm.drivers.mcap.messages import (
+    CAMERAS,
+    ENCODINGS,
+    IMAGES,
+    IMUS,
+    JOINTS,
+    POSES,
+    TRANSFORMS,
+    VELOCITIES,
+)
 from stereo_sfm.drivers.mcap.recording import Recording
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log.reader import TopicInfo
@@ -40,16 +49,17 @@ class ChosenTopics:
     depth: str
     truth: str
     imu: tuple[str, ...]  # one, or the gyroscope's and the accelerometer's
+    wheel: str  # velocities of the robot, or speeds of its joints
     cameras: tuple[str, ...]
     transforms: tuple[str, ...]
 
 
-def choose_topics(reader: Recording, left: str = "", right: str = "", depth: str = "") -> ChosenTopics:
+def choose_topics(reader: Recording, left: str = "", right: str = "", depth: str = "", wheel: str = "") -> ChosenTopics:
     """Find the image topics.
 
     Args:
         reader: the open recording.
-        left: image topic given by the user, "" to find it. right, depth: likewise.
+        left: image topic given by the user, "" to find it. right, depth, wheel: likewise.
 
     Raises:
         StereoSfmError: no images, an unknown topic, or more than two images with ambiguous names.
@@ -74,6 +84,7 @@ def choose_topics(reader: Recording, left: str = "", right: str = "", depth: str
         "" if right else depth,
         next((t.topic for t in rows if t.schema in POSES and any(w in t.topic.lower() for w in _TRUTH)), ""),
         _imu_topics([t.topic for t in rows if t.schema in IMUS]),
+        _wheel_topic(str(reader.path), rows, wheel),
         cameras,
         tuple(t.topic for t in rows if t.schema in TRANSFORMS),
     )
@@ -86,6 +97,17 @@ def _imu_topics(topics: list[str]) -> tuple[str, ...]:
         if accel != gyro and accel in topics:
             return gyro, accel
     return tuple(topics[:1])
+
+
+def _wheel_topic(name: str, rows: list[TopicInfo], chosen: str) -> str:
+    """The topic that the user names, else one of velocities whose name says that it is of the wheels."""
+    if chosen:
+        known = [t.topic for t in rows if t.schema in VELOCITIES | JOINTS]
+        if chosen not in known:
+            raise StereoSfmError(f"{name} has no wheel odometry {chosen} (there is: {', '.join(known) or 'none'})")
+        return chosen
+    names = [t.topic for t in rows if t.schema in VELOCITIES]
+    return next((t for t in names if "wheel" in t.lower() or t.endswith("/odom")), "")
 
 
 def camera_topic(image: str, cameras: tuple[str, ...]) -> str:

@@ -20,7 +20,9 @@ class Ros2Options(SourceOptions):
     left: str = option("", "topic of the left images, raw or compressed")
     right: str = option("", "topic of the right images; without it there is one camera")
     imu: str = option("", "topic of sensor_msgs/Imu")
-    odom: str = option("", "topic of nav_msgs/Odometry: its velocities are logged as wheel odometry")
+    odom: str = option(
+        "", "topic of nav_msgs/Odometry or geometry_msgs/TwistStamped: its velocities are the wheel odometry"
+    )
     wait: float = option(10.0, "seconds to wait for topics, calibrations and images", low=0.1, high=3600)
     skew_ms: float = option(10.0, "largest difference between the stamps of a pair", low=0, high=1000)
 

@@ -52,7 +52,7 @@ log = logging.getLogger("stereo_sfm")
 
 WAITING_PAIRS = 8  # for the consumer: then the oldest is dropped
 WAITING_IMAGES = 8  # of one camera, for the other
-MOST_READINGS = 20_000
+MAX_READINGS = 20_000
 STATIC_S = 1.0  # for the fixed transforms, after everything else is there
 NEEDS = "ROS 2 needs rclpy: source ROS's setup.bash in an environment with --system-site-packages"
 
@@ -66,13 +66,13 @@ class _Pairs:
         self._stereo, self._tolerance_ns, self._counters = stereo, tolerance_ns, counters
         self._waiting: tuple[deque[ImageMessage], deque[ImageMessage]] = (deque(), deque())
 
-    def put(self, side: int, picture: ImageMessage) -> None:
+    def put(self, side: int, image: ImageMessage) -> None:
         """An image of the left (0) or right camera (1)."""
-        self.frames[side] = picture.frame
+        self.frames[side] = image.frame
         if not self._stereo:
-            self.ready.put((picture, None))
+            self.ready.put((image, None))
             return
-        self._waiting[side].append(picture)
+        self._waiting[side].append(image)
         lefts, rights = self._waiting
         while lefts and rights:
             skew = rights[0].stamp_ns - lefts[0].stamp_ns
@@ -160,7 +160,7 @@ class Ros2Source(BaseSource):
         if self._options.imu:
             self._subscribe(self._options.imu, IMUS, self._take_imu, qos_profile_sensor_data)
         if self._options.odom:
-            take = lambda v: self._wheel.add(*v)  # noqa: E731
+            take = lambda r: self._wheel.add(r.stamp_ns, r.linear, r.angular)  # noqa: E731
             self._subscribe(self._options.odom, VELOCITIES, take, qos_profile_sensor_data)
         if importlib.util.find_spec("tf2_msgs") is not None:
             self._subscribe_static()
@@ -288,7 +288,7 @@ class Ros2Source(BaseSource):
     def _take_imu(self, reading: ImuReading) -> None:
         with self._imu_lock:
             self._imu.append(reading)
-            del self._imu[:-MOST_READINGS]
+            del self._imu[:-MAX_READINGS]
 
     def __iter__(self) -> Iterator[StereoImage]:
         frame_id, last_ns, dropped = 0, -1, 0

@@ -28,11 +28,12 @@ _SUFFIX_ROS_1 = ".bag"
 
 
 class BagSource(ForeignSource):
-    """The images of a bag, with the stamps of its inertial messages listed beside them."""
+    """The images of a bag, with the stamps of its inertial and wheel messages listed beside them."""
 
     def stamps(self) -> Stamps:
         listed = super().stamps()
-        others = {t: np.array([r.log_time for r in self.reader.messages([t])], np.int64) for t in self.topics.imu}
+        names = [*self.topics.imu, *([self.topics.wheel] if self.topics.wheel else [])]
+        others = {t: np.array([r.log_time for r in self.reader.messages([t])], np.int64) for t in names}
         return replace(listed, others=others)
 
 
@@ -51,7 +52,7 @@ def open_bag(place: str, options: McapOptions) -> BagSource:
     require(("rosbags",), "ros", "reading ROS bags")
     reader = BagReader(Path(place).expanduser())
     try:
-        return BagSource(reader, options.rig, options.left, options.right, options.depth)
+        return BagSource(reader, options)
     except BaseException:
         reader.close()
         raise

@@ -51,6 +51,8 @@ class SimOptions(SourceOptions):
         "", "encounters of people with the robot, in turn: approach, stop, cover, lens, cart, beside, group; all"
     )
     speed: float = option(0.0, "metres a second, 0: the scene's own", low=0, high=5)
+    corner: float = option(0.0, "seconds over which a corner is rounded, 0: the scene's own", low=0, high=5)
+    rest: float = option(0.0, "seconds at rest before the drive, 0: the scene's own", low=0, high=10_000)
     vibration: float = option(1.0, "scales the camera's vibration", low=0, high=10)
     drop: float = option(0.0, "fraction of frames lost", low=0, high=0.9)
     noise: float = option(1.0, "scales the sensor's noise", low=0, high=20)
@@ -66,6 +68,12 @@ class SimOptions(SourceOptions):
     imu: Literal["", "ideal", "t265", "oak"] = option("", "inertial samples of an ideal sensor, a T265 or an OAK")
     imu_offset_ms: float = option(
         0.0, "clock of the inertial sensor minus the camera's; part of the calibration", low=-1000, high=1000
+    )
+    wheel: Literal["", "differential", "skid_steer", "mecanum", "twist"] = option("", "wheel odometry of a robot")
+    wheel_grade: Literal["robot", "ideal"] = option("robot", "wheels with wrong radii, noise and ticks, or without")
+    wheel_slip: float = option(0.0, "share by which wheels turn too far in turns", low=0, high=2)
+    wheel_offset_ms: float = option(
+        0.0, "clock of the wheels minus the camera's; part of the calibration", low=-1000, high=1000
     )
     effects: bool = option(True, "off: images without blur, noise and vignetting")
     realtime: bool = option(False, "deliver frames in real time")

@@ -22,11 +22,12 @@ from stereo_sfm.drivers.sim.rigs import make_rig
 from stereo_sfm.drivers.sim.robot import RobotView
 from stereo_sfm.drivers.sim.scenes import SCENES, Scene, crowd
 from stereo_sfm.drivers.sim.tables import Tables
+from stereo_sfm.drivers.sim.wheels import WheelSensor
 from stereo_sfm.drivers.sim.world import Layout, build_world
 from stereo_sfm.drivers.source import BaseSource, Stamps
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
-from stereo_sfm.types import F64, ImuSamples, StereoImage, Trajectory
+from stereo_sfm.types import F64, ImuSamples, StereoImage, Trajectory, WheelSamples
 
 _EPOCH_NS = 1_000_000_000
 
@@ -70,7 +71,11 @@ class SimSource(BaseSource):
         self.effects = _effects(scene, options)
         self._dark = options.dark
         gait = dataclasses.replace(
-            scene.gait, speed=options.speed or scene.gait.speed, vibration=scene.gait.vibration * options.vibration
+            scene.gait,
+            speed=options.speed or scene.gait.speed,
+            turn_seconds=options.corner or scene.gait.turn_seconds,
+            rest_seconds=options.rest or scene.gait.rest_seconds,
+            vibration=scene.gait.vibration * options.vibration,
         )
         route = scene.route(scene.layout, options.walk, options.returns)
         rng = np.random.default_rng([options.seed, options.walk, 31])
@@ -80,6 +85,18 @@ class SimSource(BaseSource):
             seeds = np.random.default_rng([options.seed, options.walk, 83])
             self._inertial = InertialSensor(options.imu, self.drive, seeds, options.imu_offset_ms * 1e-3)
             self.rig = self._camera = dataclasses.replace(self.rig, imu=self._inertial.imu)
+        self._wheels = None
+        if options.wheel:
+            seeds = np.random.default_rng([options.seed, options.walk, 89])
+            self._wheels = WheelSensor(
+                options.wheel,
+                options.wheel_grade,
+                options.wheel_slip,
+                self.drive,
+                seeds,
+                options.wheel_offset_ms * 1e-3,
+            )
+            self.rig = self._camera = dataclasses.replace(self.rig, wheel=self._wheels.wheel)
         count = scene.people if options.people < 0 else options.people
         self.people = crowd(scene, count, np.random.default_rng([options.seed, 47]))
         self.encounters = plan(options.encounters, self.drive, np.random.default_rng([options.seed, options.walk, 71]))
@@ -196,14 +213,14 @@ class SimSource(BaseSource):
         before, after = self.drive.poses(np.array([seconds - step, seconds + step]))
         twist = se3.log(se3.inverse(before) @ after) / (2 * step)
         image = self.image_at(self.row_poses(frame_id), frame_id, twist)
-        return dataclasses.replace(image, dropped_before=dropped_before, imu=self._sampled(frame_id, dropped_before))
+        imu, wheel = self.sampled(frame_id, dropped_before)
+        return dataclasses.replace(image, dropped_before=dropped_before, imu=imu, wheel=wheel)
 
-    def _sampled(self, frame_id: int, dropped_before: int) -> ImuSamples | None:
-        """Inertial samples since the previous frame."""
-        if self._inertial is None:
-            return None
-        begin = (frame_id - 1 - dropped_before) / self.options.rate
-        return self._inertial.samples(begin, frame_id / self.options.rate, _EPOCH_NS)
+    def sampled(self, frame_id: int, dropped_before: int = 0) -> tuple[ImuSamples | None, WheelSamples | None]:
+        """Inertial and wheel samples since the previous frame."""
+        begin, end = (frame_id - 1 - dropped_before) / self.options.rate, frame_id / self.options.rate
+        imu = None if self._inertial is None else self._inertial.samples(begin, end, _EPOCH_NS)
+        return imu, None if self._wheels is None else self._wheels.samples(begin, end, _EPOCH_NS)
 
     def stamps(self) -> Stamps:
         return Stamps(np.array([self.stamp_ns(int(k)) for k in self.frame_ids], np.int64), 0.0)

@@ -14,6 +14,7 @@ from stereo_sfm.commands._stop import INTERRUPTED, StopRequest
 from stereo_sfm.errors import StereoSfmError, from_os_error
 
 if TYPE_CHECKING:
+    from stereo_sfm.calib.rig import Rig
     from stereo_sfm.commands._step import Stepper
     from stereo_sfm.config import Config
     from stereo_sfm.drivers.choice import SourceChoice
@@ -22,11 +23,11 @@ if TYPE_CHECKING:
     from stereo_sfm.maps.folders import MapFolders
     from stereo_sfm.messages import Sink
     from stereo_sfm.pipeline.session import Session, Wiring
-    from stereo_sfm.viz.match_pictures import MatchPictures
+    from stereo_sfm.viz.match_images import MatchImages
 
 TRACKING_FAILED = 4
-INLINE_END_S = 4.0  # a run in one process waits this long for its source to stop
-LOOK_S = 3.0  # after an interruption, until which the images are looked at once more and the report gets pictures
+INLINE_END_S = 3.0  # a run in one process waits this long for its source to stop
+LOOK_S = 3.0  # after an interruption, for the full evaluation and the plots of the report
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class RunOptions:
         output: its folder; None: runs/DATE_NAME. overwrite: replace an existing run.
         frame: whose poses the trajectories hold, "cam0" or "body".
         max_lost_percent: frames without a pose above which the run counts as failed.
-        matches: frames between two pictures of the matches; None: no pictures.
+        matches: frames between two images of the matches; None: no images.
         quiet: no progress and no summary. verbose: print events.
         step_from_s: stop at every frame from this second on and wait for the user; None: do not stop.
         replayed: an earlier run whose schedule is followed.
@@ -74,15 +75,19 @@ def execute(options: RunOptions) -> tuple[int, Path]:
 
     o = options
     o.source.refuse_to_overwrite(o.output)
-    record, pictures, stepper = RunRecord.of(o.config, o.folders.localize_only), _pictures(o.matches), _stepper(o)
+    record, match_images, stepper = (
+        RunRecord.of(o.config, o.folders.localize_only),
+        _match_images(o.matches),
+        _stepper(o),
+    )
     shown, wiring = CompilationProgress(), _wiring(o)
-    sinks = [*_sinks(o, record, pictures), shown]
+    sinks = [*_sinks(o, record, match_images), shown]
     session = Session(o.source, o.config, sinks, wiring, o.folders, o.output, o.overwrite, o.replayed)
     with StopRequest(INLINE_END_S if wiring.inline else 0.0) as stop, closing(session):
         stop.then = session.stop
         with session:
-            if pictures is not None:
-                pictures.folder = session.folder / "matches"
+            if match_images is not None:
+                match_images.folder = session.folder / "matches"
             begin = time.perf_counter()
             interrupted, problem = _follow(session, record, stop, o.quiet or stepper is not None, stepper, shown)
             wall_s = time.perf_counter() - begin - session.waited_s(begin)
@@ -95,6 +100,7 @@ def execute(options: RunOptions) -> tuple[int, Path]:
             o.max_lost_percent, why_not_started(images, record) if stop.since_s < LOOK_S else "",
             lambda: stop.since_s < LOOK_S,
         )  # fmt: skip
+        _keep_correction(o.source.camera_store, info.rig, record)
         link_latest(folder)
     if not o.quiet:
         print("\n".join([*summary(stats, evaluations), f"written to {folder} (start with {folder / 'report.md'})"]))
@@ -109,6 +115,15 @@ def execute(options: RunOptions) -> tuple[int, Path]:
     return 0, folder
 
 
+def _keep_correction(store: Path | None, rig: Rig, record: RunRecord) -> None:
+    """Store what self-calibration corrected for the next run of the same camera."""
+    from stereo_sfm.calib.camera_store import CameraStore
+
+    applied = [c for c in record.calibrations if c.applied]
+    if store is not None and applied:
+        CameraStore(store).keep(rig, applied[-1].terms)
+
+
 def _wiring(options: RunOptions) -> Wiring:
     """As asked for, but in one process when stepping, or when a sink needs the images."""
     from dataclasses import replace
@@ -117,21 +132,21 @@ def _wiring(options: RunOptions) -> Wiring:
     return replace(options.wiring, inline=options.wiring.inline or needs_inline)
 
 
-def _sinks(options: RunOptions, record: RunRecord, pictures: MatchPictures | None) -> list[Sink]:
+def _sinks(options: RunOptions, record: RunRecord, match_images: MatchImages | None) -> list[Sink]:
     from stereo_sfm.log.events import EventLines
 
-    sinks: list[Sink] = [record] if pictures is None else [record, pictures]
+    sinks: list[Sink] = [record] if match_images is None else [record, match_images]
     return [*sinks, EventLines()] if options.verbose else sinks
 
 
-def _pictures(every: int | None) -> MatchPictures | None:
+def _match_images(every: int | None) -> MatchImages | None:
     if every is None:
         return None
     if every < 1:
         raise StereoSfmError("--matches must be at least 1")
-    from stereo_sfm.viz.match_pictures import MatchPictures
+    from stereo_sfm.viz.match_images import MatchImages
 
-    return MatchPictures(every)
+    return MatchImages(every)
 
 
 def _stepper(options: RunOptions) -> Stepper | None:

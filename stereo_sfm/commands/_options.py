@@ -149,7 +149,9 @@ def load_config(args: argparse.Namespace) -> Config:
     return chosen
 
 
-def source_choice(args: argparse.Namespace, realtime: bool = False, speed: float | None = None) -> SourceChoice:
+def source_choice(
+    args: argparse.Namespace, realtime: bool = False, speed: float | None = None, camera_store: Path | None = None
+) -> SourceChoice:
     """The source given by the options of `add_source_arguments`; `realtime`: recordings at their own speed."""
     from stereo_sfm.demo import demo_recording
     from stereo_sfm.drivers.choice import SourceChoice
@@ -160,7 +162,7 @@ def source_choice(args: argparse.Namespace, realtime: bool = False, speed: float
     if speed is None and realtime and not is_device(spec):
         speed = 1.0
     part = Selection(args.start, args.duration, args.frame_skip, args.max_frames)
-    return SourceChoice.of(spec, args.rig, part, args.rectify, speed)
+    return SourceChoice.of(spec, args.rig, part, args.rectify, speed, camera_store)
 
 
 def wiring_of(args: argparse.Namespace) -> Wiring:

@@ -80,25 +80,25 @@ def run(args: argparse.Namespace) -> int:
 
 def ablation(options: AblationOptions) -> int:
     """The exit code."""
-    from stereo_sfm.eval.ablation import finished, load_answer
+    from stereo_sfm.eval.ablation import finished, load_result
     from stereo_sfm.eval.ablation_report import write_report
 
     cells = _cells(options)
     folder, store = options.output, options.output / "cells"
-    missing = [cell for cell in cells if options.again or not finished(load_answer(store / cell.file_name))]
+    missing = [cell for cell in cells if options.again or not finished(load_result(store / cell.file_name))]
     _check_sources(missing)
     store.mkdir(parents=True, exist_ok=True)
     whole = not missing or _run_all(missing, store, options.jobs, options.quiet, len(cells))
-    answers = [answer for cell in cells if (answer := load_answer(store / cell.file_name)) is not None]
-    report = write_report(folder, answers)
+    results = [result for cell in cells if (result := load_result(store / cell.file_name)) is not None]
+    report = write_report(folder, results)
     if not whole:
         print(
-            f"interrupted with {len(answers)} of {len(cells)} cells; run the same command to continue: {report}",
+            f"interrupted with {len(results)} of {len(cells)} cells; run the same command to continue: {report}",
             file=sys.stderr,
         )
         return INTERRUPTED
     if not options.quiet:
-        good = sum(answer["status"] == "ok" for answer in answers)
+        good = sum(result["status"] == "ok" for result in results)
         print(f"{good} of {len(cells)} cells with a result, {len(cells) - good} without, see the reasons in {report}")
     return 0
 

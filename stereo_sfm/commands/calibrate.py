@@ -1,4 +1,4 @@
-"""`stereo-sfm calibrate`: a rig, a report and a verdict from images of a target."""
+"""`stereo-sfm calibrate`: a rig, a report and a verdict from images of a target; IMU and wheels from any recording."""
 
 from __future__ import annotations
 
@@ -22,7 +22,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "source", help="a folder of left*/right* images, a recording, a live camera, or any other source"
     )
-    parser.add_argument("--target", required=True, help="charuco, checkerboard, aprilgrid, or a target's YAML file")
+    parser.add_argument("--target", help="charuco, checkerboard, aprilgrid, or a target's YAML file")
+    parser.add_argument(
+        "--imu", action="store_true", help="time offset and rotation of the IMU from a recording with motion; no target"
+    )
+    parser.add_argument(
+        "--wheel", action="store_true", help="radii, track, direction and time offset of the wheels; no target"
+    )
+    parser.add_argument(
+        "--rig", type=Path, default=None, help="with --imu, --wheel: rig to correct (default: source's)"
+    )
+    parser.add_argument("--max-frames", type=int, default=1800, help="with --imu, --wheel: stop after N frames")
     parser.add_argument("--columns", type=int, help="inner corners (checkerboard), squares (charuco), tags (aprilgrid)")
     parser.add_argument("--rows", type=int)
     parser.add_argument("--square", type=float, metavar="M", help="side of a square or of an AprilTag in metres")
@@ -45,7 +55,11 @@ class CalibrateOptions:
     """Options of this command, as the parser names them."""
 
     source: str
-    target: str
+    target: str | None
+    imu: bool
+    wheel: bool
+    rig: Path | None
+    max_frames: int
     columns: int | None
     rows: int | None
     square: float | None
@@ -62,6 +76,8 @@ class CalibrateOptions:
 def run(args: argparse.Namespace) -> int:
     """Collect views, calibrate, judge, write."""
     options = typed(CalibrateOptions, args)
+    if options.imu or options.wheel:
+        return run_sensors(options)
     from dataclasses import replace
 
     from stereo_sfm.calib import save_rig
@@ -70,7 +86,10 @@ def run(args: argparse.Namespace) -> int:
     from stereo_sfm.calib.quality import judge
     from stereo_sfm.calib.report import write_report
     from stereo_sfm.calib.solve import align_pairs, calibrate
+    from stereo_sfm.errors import StereoSfmError
 
+    if options.target is None:
+        raise StereoSfmError("calibrate needs --target for the cameras, or --imu or --wheel")
     report: Path = options.report or options.output.with_suffix(".html")
     _check_files(options.output, report, options.overwrite)
     target = make_target(options)
@@ -92,6 +111,44 @@ def run(args: argparse.Namespace) -> int:
     return 3 if VERDICTS[quality.level] == "FAIL" else 0
 
 
+def run_sensors(options: CalibrateOptions) -> int:
+    """Track, compare with the sensors, judge, write."""
+    import itertools
+    from dataclasses import replace
+
+    from stereo_sfm.calib import save_rig
+    from stereo_sfm.calib.check import VERDICTS
+    from stereo_sfm.calib.imu_fit import precision_imu
+    from stereo_sfm.calib.wheel_fit import precision_wheel
+    from stereo_sfm.drivers.source import open_source
+    from stereo_sfm.errors import StereoSfmError
+    from stereo_sfm.eval.sensor_motion import SensorMotion
+
+    if options.target is not None:
+        raise StereoSfmError("--imu and --wheel need motion, --target needs a target: calibrate the cameras first")
+    _check_writable(options.output, options.overwrite)
+    with open_source(options.source, options.rig) as source:
+        rig, motion = source.rig, SensorMotion(source.rig)
+        for image in itertools.islice(source, options.max_frames):
+            motion.add(image)
+    findings = []
+    for wanted, samples, name in ((options.imu, motion.imu, "inertial"), (options.wheel, motion.wheel, "wheel")):
+        if wanted and not samples:
+            raise StereoSfmError(f"{options.source} has no {name} samples")
+    if options.imu:
+        imu = motion.fit_imu()
+        rig, findings = replace(rig, imu=imu.imu), precision_imu(imu)
+    if options.wheel:
+        wheel = motion.fit_wheel()
+        rig, findings = replace(rig, wheel=wheel.wheel), findings + precision_wheel(wheel)
+    save_rig(rig, options.output, options.format)
+    for finding in findings:
+        print(f"  {VERDICTS[finding.level]}  {finding.name}: {finding.text}")
+    verdict = VERDICTS[max(f.level for f in findings)]
+    print(f"verdict: {verdict}, {len(motion.stamp_ns)} frames, rig {options.output}")
+    return 3 if verdict == "FAIL" else 0
+
+
 def _check_files(rig: Path, report: Path, overwrite: bool) -> None:
     """Check before the images are searched that both files can be written without losing existing ones."""
     from stereo_sfm.errors import StereoSfmError
@@ -99,13 +156,19 @@ def _check_files(rig: Path, report: Path, overwrite: bool) -> None:
     if rig.resolve() == report.resolve():
         raise StereoSfmError(f"the report would replace the rig {rig}: name another --report")
     for path in (rig, report):
-        if path.exists() and not overwrite:
-            raise StereoSfmError(f"{path} exists: choose another file or give --overwrite")
-        folder = next(p for p in path.absolute().parents if p.exists())
-        if not folder.is_dir() or not os.access(folder, os.W_OK):
-            raise StereoSfmError(f"cannot write {path}: {folder} is not a writable folder")
+        _check_writable(path, overwrite)
     if report.is_dir():
         raise StereoSfmError(f"cannot write the report {report}: it is a folder")
+
+
+def _check_writable(path: Path, overwrite: bool) -> None:
+    from stereo_sfm.errors import StereoSfmError
+
+    if path.exists() and not overwrite:
+        raise StereoSfmError(f"{path} exists: choose another file or give --overwrite")
+    folder = next(p for p in path.absolute().parents if p.exists())
+    if not folder.is_dir() or not os.access(folder, os.W_OK):
+        raise StereoSfmError(f"cannot write {path}: {folder} is not a writable folder")
 
 
 def make_target(options: CalibrateOptions) -> Target:
@@ -113,6 +176,7 @@ def make_target(options: CalibrateOptions) -> Target:
     from stereo_sfm.calib.targets import KINDS, Target, read_target
     from stereo_sfm.errors import StereoSfmError, one_of
 
+    assert options.target is not None
     if options.target not in KINDS:
         path = Path(options.target)
         return read_target(path if path.exists() or path.suffix else Path(one_of(options.target, KINDS, "target")))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from stereo_sfm.commands._options import add_source, typed
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
     from stereo_sfm.calib.check import CheckReport, Finding
     from stereo_sfm.calib.mask_search import MaskSearch
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from stereo_sfm.types import StereoImage
 
 SHUTTER_FRAMES = 200  # looked at for a rolling shutter
+MISTAKE = "images"  # finding of swapped or upside-down images, or an inverted transform
+MISTAKE_IMAGES, MISTAKE_SPACING = 3, 5  # images that are searched for it, and frames from one to the next
 FIXED_SHARE = 0.003  # of an image, from which on the robot in view is worth a mask
 SIDES = ("left", "right")
 
@@ -59,12 +61,14 @@ def run(args: argparse.Namespace) -> int:
     from dataclasses import replace
 
     from stereo_sfm.calib import load_rig, save_rig
-    from stereo_sfm.calib.check import check
+    from stereo_sfm.calib.check import Finding, check
     from stereo_sfm.calib.mask_search import MaskSearch
     from stereo_sfm.calib.rectification import rectify
+    from stereo_sfm.calib.start import why_no_start
     from stereo_sfm.calib.tracks import MAX_FRAMES, collect, corners_for
     from stereo_sfm.config import Config
     from stereo_sfm.drivers.source import open_source
+    from stereo_sfm.eval.sensor_motion import SensorMotion
     from stereo_sfm.tracking.flow.readout import ReadoutSearch
 
     _check(options)
@@ -76,11 +80,18 @@ def run(args: argparse.Namespace) -> int:
         corners = corners_for(total, options.windows)
         shutter = ReadoutSearch(Config().tracker, rig)
         masks = MaskSearch()
-        images = _searched(itertools.islice(source, options.max_frames), shutter, masks)
+        motion = SensorMotion(rig) if rig.imu is not None or rig.wheel is not None else None
+        first: list[StereoImage] = []
+        images = _first_kept(itertools.islice(source, options.max_frames), first)
+        images = _searched(images, shutter, masks)
+        images = images if motion is None else motion.watch(images)
         windows = collect(images, rectification, options.windows, gap, corners, options.search)
         readout = shutter.measured()
-        report = check(rig, rectification, windows, rolling=readout.best_s != 0)
-        report = replace(report, findings=(*report.findings, _shutter(rig.shutter, readout), *_robot(masks, rig)))
+        mistake = why_no_start(rig, first)
+        report = _checked(lambda: check(rig, rectification, windows, rolling=readout.best_s != 0), mistake)
+        others = [Finding(MISTAKE, 2, mistake)] if mistake else []
+        others += [_shutter(rig.shutter, readout), *_robot(masks, rig), *(motion.findings() if motion else [])]
+        report = replace(report, findings=(*report.findings, *others))
     if options.correct is not None:
         save_rig(report.choice.apply(rig), options.correct)
     if options.json:
@@ -98,6 +109,26 @@ def _searched(images: Iterable[StereoImage], shutter: ReadoutSearch, masks: Mask
         if image.right is not None:
             masks.add_tracked(image, *shutter.add(image, number < SHUTTER_FRAMES))
         yield image
+
+
+def _first_kept(images: Iterable[StereoImage], first: list[StereoImage]) -> Iterator[StereoImage]:
+    """Pass the images on, and keep some of the first."""
+    for number, image in enumerate(images):
+        if number % MISTAKE_SPACING == 0 and len(first) < MISTAKE_IMAGES:
+            first.append(image)
+        yield image
+
+
+def _checked(check: Callable[[], CheckReport], mistake: str) -> CheckReport:
+    """The report; where the images cannot be matched, the mistake between images and calibration is the error."""
+    from stereo_sfm.errors import StereoSfmError
+
+    try:
+        return check()
+    except StereoSfmError as error:
+        if mistake:
+            raise StereoSfmError(mistake) from error
+        raise
 
 
 def _shutter(known: str, readout: Readout) -> Finding:
@@ -174,6 +205,8 @@ def _advice(report: CheckReport) -> str:
     what = " and ".join(names)
     if report.verdict == "WARN":
         return f" (usable; {what} could be better)"
+    if MISTAKE in names:
+        return f" ({what}): correct that first"
     return f" ({what}): calibrate again, or try 'check-calib --correct rig.yaml' and check the corrected file"
 
 

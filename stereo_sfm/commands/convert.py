@@ -22,4 +22,4 @@ def run(args: argparse.Namespace) -> int:
     with choice() as source:
         if source.live:
             raise StereoSfmError(f"{source.name} is a device: use 'stereo-sfm record {choice.spec}'")
-        return write(source, options, "convert", choice.opening)
+        return write(source, options, "convert", choice.opening(source.rig))

@@ -20,6 +20,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--to", dest="target", choices=NAMES, default=None, help="output format (default: by the file name, else rig)"
     )
     parser.add_argument("--size", default=None, metavar="WxH", help="image size, for files that do not state it")
+    parser.add_argument(
+        "--wheel", type=Path, default=None, metavar="FILE", help="the T265's calibration_odometry.json, for the output"
+    )
     parser.add_argument("--overwrite", action="store_true", help="write over an existing file or into a folder")
 
 
@@ -39,6 +42,12 @@ def run(args: argparse.Namespace) -> int:
     if options and source not in ("opencv", "kitti"):
         raise StereoSfmError(f"--size is for opencv and kitti files: a {source} file contains the size")
     rig = load_rig(args.input, source, **options)
+    if args.wheel is not None:
+        from dataclasses import replace
+
+        from stereo_sfm.calib.formats.wheel_files import read_t265_odometry
+
+        rig = replace(rig, wheel=read_t265_odometry(args.wheel, rig.left_T_right))
     save_rig(rig, args.output, args.target)
     cameras = rig.left.model if rig.right is None else f"{rig.left.model} pair, baseline {1000 * rig.baseline:.2f} mm"
     print(f"{source}: {cameras}, {rig.left.width}x{rig.left.height} px -> {args.output}")

@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--images",
         metavar="SOURCE",
-        help="with colmap: write the keyframes' pictures of this source too (rectified where the map is)",
+        help="with colmap: write the keyframes' images of this source too (rectified where the map is)",
     )
     parser.add_argument("--rig", type=Path, metavar="FILE", help="calibration of --images instead of its own")
     parser.add_argument(
@@ -102,11 +102,27 @@ def _load(folder: Path) -> SavedMap:
     for place in (folder, folder / "map"):
         if (place / "map.json").is_file():
             return load_map(place)
-    raise StereoSfmError(f"{folder} holds no map: nothing was mapped, or by an earlier version (run it again)")
+    used = _map_used(folder)
+    if used:
+        raise StereoSfmError(f"{folder} holds no map of its own: it used {used} (--map-in), export that one")
+    raise StereoSfmError(
+        f"{folder} holds no map: nothing was mapped, or the run used a saved one (export the map given to --map-in)"
+    )
+
+
+def _map_used(folder: Path) -> str:
+    """The saved map that a run began with, as its log says; "" for none."""
+    from stereo_sfm.log.reader import LogReader
+    from stereo_sfm.log.recorded import read_opening
+
+    if not (folder / "run.mcap").is_file():
+        return ""
+    with LogReader(folder / "run.mcap") as reader:
+        return read_opening(reader).map_in
 
 
 def _write_with_images(saved: SavedMap, output: Path, options: ExportOptions, images: str) -> None:
-    """COLMAP's model, and the keyframes' pictures beside it."""
+    """COLMAP's model, and the keyframes' images beside it."""
     from stereo_sfm.calib import load_rig
     from stereo_sfm.export.keyframe_images import (
         check_session,

@@ -26,12 +26,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Describe and return 0, also when problems are found and printed."""
     from stereo_sfm.drivers.registry import recognise
-    from stereo_sfm.drivers.source import path_of
+    from stereo_sfm.drivers.source import look_up, path_of
     from stereo_sfm.recording.describe import describe_dataset, describe_file
 
     path = path_of(args.source)
     if not path.exists():
-        raise StereoSfmError(f"no such file or folder: {args.source}")
+        look_up(args.source, args.rig)  # the driver's own check knows more
+        raise StereoSfmError(f"no such file or folder: {path}")
     in_one_file = path.is_file() and recognise(path) == "mcap"
     found = describe_file(path, args.rig) if in_one_file else describe_dataset(args.source, args.rig)
     print(found.as_json() if args.json else "\n".join(_lines(found)))

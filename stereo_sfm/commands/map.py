@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from stereo_sfm.maps.saved_map import SavedMap
 
 
+MOST_POINTS = (1, 99)  # percentiles along each axis: a few points are far off
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
@@ -101,7 +104,7 @@ def describe(saved: SavedMap) -> list[str]:
     s = saved.snapshot
     views = np.bincount(s.obs_pt, minlength=len(s.pt_ids))
     steps = np.linalg.norm(np.diff(s.map_T_kf[:, :3, 3], axis=0), axis=1)
-    extent = s.points.max(0) - s.points.min(0)
+    extent = np.ptp(np.percentile(s.points, MOST_POINTS, axis=0), axis=0)
     rig = saved.rig
     return [
         f"{len(s.kf_ids)} keyframes, {len(s.pt_ids)} points, {len(s.obs_kf)} observations"
@@ -109,7 +112,8 @@ def describe(saved: SavedMap) -> list[str]:
         f"{len(s.corner_kf)} corners for place recognition in {len(np.unique(s.corner_kf))} keyframes",
         f"{int(saved.sessions.max()) + 1} session(s), {len(np.unique(s.submap_ids))} submap(s),"
         f" {float(steps[s.submap_ids[1:] == s.submap_ids[:-1]].sum()):.1f} m of path along the keyframes",
-        f"points extend {extent[0]:.1f} x {extent[1]:.1f} x {extent[2]:.1f} m",
+        f"98 % of the points extend {extent[0]:.1f} m along x (right), {extent[1]:.1f} m along y (down),"
+        f" {extent[2]:.1f} m along z (forward), as the first camera stood",
         f"camera {rig.left.model} {rig.left.width}x{rig.left.height}, baseline {1000 * rig.baseline:.1f} mm",
         f"vocabulary {saved.vocabulary_id}",
     ]

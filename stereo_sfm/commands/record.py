@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     options, choice = typed(RecordOptions, args), source_choice(args)
     choice.refuse_to_overwrite(options.output)
     with choice() as source:
-        return write(source, options, "record", choice.opening)
+        return write(source, options, "record", choice.opening(source.rig))
 
 
 def write(source: Source, options: RecordOptions, mode: str, opening: Opening | None = None) -> int:

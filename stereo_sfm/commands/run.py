@@ -23,6 +23,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", type=Path, help="output folder (default: runs/DATE_NAME)")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing run in the output folder")
     add_source_arguments(parser)
+    parser.add_argument(
+        "--camera-store",
+        type=Path,
+        metavar="DIR",
+        help="start with the calibration that earlier runs corrected for this camera (by serial number), and keep this "
+        "run's corrections there",
+    )
     add_config_arguments(parser)
     add_wiring_arguments(parser)
     parser.add_argument("--map-in", type=Path, metavar="DIR", help="start from a saved map of this place")
@@ -41,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="exit with 4 if more than PERCENT of the frames have no pose",
     )
     parser.add_argument(
-        "--matches", type=int, metavar="K", help="write a picture of the matches with the last keyframe every K frames"
+        "--matches", type=int, metavar="K", help="write an image of the matches with the last keyframe every K frames"
     )
     add_verbosity_arguments(parser)
 
@@ -54,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     folders = MapFolders(args.map_in, args.localize_only, args.map_out)
     folders.check(args.overwrite)
     options = RunOptions(
-        source_choice(args, args.realtime, args.speed),
+        source_choice(args, args.realtime, args.speed, args.camera_store),
         load_config(args),
         wiring_of(args),
         folders,

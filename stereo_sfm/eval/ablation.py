@@ -1,6 +1,6 @@
 """One cell of the papers' ablation: a source, a front end, an estimator and later modules, run and evaluated.
 
-A cell is a pure function of its description, so its answer is kept as a JSON file and not computed twice.
+A cell is a pure function of its description, so its result is kept as a JSON file and not computed twice.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ def run_cell(cell: Cell) -> dict[str, Any]:
     from stereo_sfm.drivers.source import open_source
     from stereo_sfm.pipeline.run import run
 
-    answer: dict[str, Any] = {"schema": _SCHEMA, "cell": dataclasses.asdict(cell), "status": "none", "reason": ""}
+    result: dict[str, Any] = {"schema": _SCHEMA, "cell": dataclasses.asdict(cell), "status": "none", "reason": ""}
     record = RunRecord()
     begin = time.perf_counter()
     try:
@@ -129,19 +129,19 @@ def run_cell(cell: Cell) -> dict[str, Any]:
         record = RunRecord.of(config)
         source = open_source(cell.source)
         with SelectedFrames(source, max_frames=cell.frames or None) as chosen:
-            answer["opened"] = True
+            result["opened"] = True
             for _ in run(chosen, config, [record]):
                 pass
             truth = chosen.ground_truth
-            answer["source_name"] = chosen.name
-        answer |= _describe(record, time.perf_counter() - begin)
-        answer |= _judge(record, config, truth)
+            result["source_name"] = chosen.name
+        result |= _describe(record, time.perf_counter() - begin)
+        result |= _judge(record, config, truth)
     except StereoSfmError as error:
-        answer["reason"] = str(error)
+        result["reason"] = str(error)
     except Exception:  # a failed cell is a result and does not end the grid
-        answer["reason"] = "internal error: " + traceback.format_exc().strip().splitlines()[-1]
-        answer["traceback"] = traceback.format_exc()
-    return answer
+        result["reason"] = "internal error: " + traceback.format_exc().strip().splitlines()[-1]
+        result["traceback"] = traceback.format_exc()
+    return result
 
 
 def _describe(record: RunRecord, wall_s: float) -> dict[str, Any]:
@@ -172,19 +172,19 @@ def _judge(record: RunRecord, config: Config, truth: Trajectory | None) -> dict[
         return {"reason": "no map update came from the mapper"}
     if truth is None:
         return {"reason": "the source has no ground truth"}
-    result = evaluate(estimate, truth)
+    evaluation = evaluate(estimate, truth)
     shown = evaluate(estimate, truth, "sim3" if config.odometry.monocular else "origin")
     return {
         "status": "ok",
         "monocular": config.odometry.monocular,
-        "metrics": result.to_dict(),
-        "mean_error_m": float(result.errors_m().mean()),
+        "metrics": evaluation.to_dict(),
+        "mean_error_m": float(evaluation.errors_m().mean()),
         "path": np.round(shown.estimate.positions, 4).tolist(),
         "true_path": np.round(shown.reference.positions, 4).tolist(),
     }
 
 
-def load_answer(path: Path) -> dict[str, Any] | None:
+def load_result(path: Path) -> dict[str, Any] | None:
     """A finished cell's file, or None where there is none or it was cut off."""
     try:
         data = json.loads(path.read_text("utf-8-sig"))
@@ -193,16 +193,16 @@ def load_answer(path: Path) -> dict[str, Any] | None:
     return data if data.get("schema") == _SCHEMA else None
 
 
-def finished(answer: dict[str, Any] | None) -> bool:
+def finished(result: dict[str, Any] | None) -> bool:
     """Whether a cell need not be run again: it has a result or a reason for having none.
 
     Cells that crashed, or whose source could not be opened, are run again.
     """
-    return answer is not None and "traceback" not in answer and ("frames" in answer or "opened" in answer)
+    return result is not None and "traceback" not in result and ("frames" in result or "opened" in result)
 
 
-def save_answer(path: Path, answer: dict[str, Any]) -> None:
+def save_result(path: Path, result: dict[str, Any]) -> None:
     """Write whole or not at all, so that an interrupted grid can go on."""
     part = path.with_suffix(".part")
-    part.write_text(json.dumps(answer), encoding="utf-8")
+    part.write_text(json.dumps(result), encoding="utf-8")
     part.replace(path)

@@ -13,7 +13,7 @@ import numpy as np
 from stereo_sfm.eval.plots import plot_trajectory
 from stereo_sfm.types import F64, Trajectory
 
-Answer = dict[str, Any]
+CellResult = dict[str, Any]
 
 # Published numbers on the same data: (part of the source's name, system, what, value).
 PUBLISHED: tuple[tuple[str, str, str, str], ...] = (
@@ -30,25 +30,25 @@ COLUMNS = (
 )  # fmt: skip
 
 
-def row_of(answer: Answer) -> dict[str, Any]:
+def row_of(result: CellResult) -> dict[str, Any]:
     """One line of the table. Translations are metres (Table II's unit), not equation 24's squares."""
-    cell = answer["cell"]
+    cell = result["cell"]
     row: dict[str, Any] = dict.fromkeys(COLUMNS, "")
     row |= {"system": cell["system"], "features": cell["features"], "odometry": cell["method"], "stage": cell["stage"]}
-    lost = answer.get("frames", 0) - answer.get("tracked", 0)
+    lost = result.get("frames", 0) - result.get("tracked", 0)
     row |= {
-        "track [ms]": answer.get("track_ms"),
-        "frame [ms]": answer.get("frame_ms"),
-        "lost": lost if "frames" in answer else "",
-        "keyframes": answer.get("keyframes", ""),
-        "loops": answer.get("loops", ""),
-        "no result because": answer["reason"],
+        "track [ms]": result.get("track_ms"),
+        "frame [ms]": result.get("frame_ms"),
+        "lost": lost if "frames" in result else "",
+        "keyframes": result.get("keyframes", ""),
+        "loops": result.get("loops", ""),
+        "no result because": result["reason"],
     }
-    if answer["status"] != "ok":
+    if result["status"] != "ok":
         return row
-    metrics = answer["metrics"]
+    metrics = result["metrics"]
     retail, rpe, drift = metrics["retail"], metrics["rpe_m"], metrics["drift"]
-    monocular = answer["monocular"]
+    monocular = result["monocular"]
     row |= {
         "rel rot mean [rad]": retail["relative_rotation_rad_mean"],
         "rel rot std [rad]": retail["relative_rotation_rad_std"],
@@ -61,7 +61,7 @@ def row_of(answer: Answer) -> dict[str, Any]:
             "rel trans std [m]": rpe["std"],
             "abs trans [m]": math.sqrt(retail["absolute_translation_m2"]),
             "ATE [m]": metrics["ape_m"]["rmse"],
-            "mean error [m]": answer["mean_error_m"],
+            "mean error [m]": result["mean_error_m"],
             "drift [%]": drift["translation_percent"] if drift else None,
         }
     return row
@@ -75,16 +75,16 @@ def _text(value: Any) -> str:
     return str(value)
 
 
-def markdown_table(answers: Sequence[Answer]) -> str:
+def markdown_table(results: Sequence[CellResult]) -> str:
     """All columns, one line per cell."""
     lines = ["| " + " | ".join(COLUMNS) + " |", "|" + "---|" * len(COLUMNS)]
-    lines += ["| " + " | ".join(_text(row[c]) for c in COLUMNS) + " |" for row in map(row_of, answers)]
+    lines += ["| " + " | ".join(_text(row[c]) for c in COLUMNS) + " |" for row in map(row_of, results)]
     return "\n".join(lines)
 
 
-def overview(answers: Sequence[Answer]) -> str:
+def overview(results: Sequence[CellResult]) -> str:
     """The errors of one source at a glance: ATE in metres and the tracker's milliseconds, a column for each feature."""
-    grid = {_place(a): a for a in answers if a["cell"]["system"] == "grid"}
+    grid = {_place(a): a for a in results if a["cell"]["system"] == "grid"}
     kinds = list(dict.fromkeys(kind for _, _, kind in grid))
     rows = list(dict.fromkeys((method, stage) for method, stage, _ in grid))
     lines = [
@@ -94,75 +94,75 @@ def overview(answers: Sequence[Answer]) -> str:
     for method, stage in rows:
         cells = [_brief(grid.get((method, stage, kind))) for kind in kinds]
         lines.append(f"| {method} | {stage} | " + " | ".join(cells) + " |")
-    for answer in answers:
-        if answer["cell"]["system"] != "grid":
-            system, stage = answer["cell"]["system"], answer["cell"]["stage"]
-            lines.append(f"| **{system}** | {stage} | {_brief(answer)} |" + " |" * (len(kinds) - 1))
+    for result in results:
+        if result["cell"]["system"] != "grid":
+            system, stage = result["cell"]["system"], result["cell"]["stage"]
+            lines.append(f"| **{system}** | {stage} | {_brief(result)} |" + " |" * (len(kinds) - 1))
     return "\n".join(lines)
 
 
-def _place(answer: Answer) -> tuple[str, str, str]:
-    cell = answer["cell"]
+def _place(result: CellResult) -> tuple[str, str, str]:
+    cell = result["cell"]
     return cell["method"], cell["stage"], cell["features"]
 
 
-def _brief(answer: Answer | None) -> str:
-    if answer is None:
+def _brief(result: CellResult | None) -> str:
+    if result is None:
         return "-"
-    if answer["status"] != "ok":
-        return answer["reason"]
-    metrics, ms = answer["metrics"], answer["track_ms"] or 0.0
+    if result["status"] != "ok":
+        return result["reason"]
+    metrics, ms = result["metrics"], result["track_ms"] or 0.0
     sim3 = f"{metrics['ate_sim3_m']:.3g} m"
-    error = f"({sim3})" if answer["monocular"] else f"{metrics['ape_m']['rmse']:.3g} m ({sim3})"
+    error = f"({sim3})" if result["monocular"] else f"{metrics['ape_m']['rmse']:.3g} m ({sim3})"
     return f"{error}, {ms:.0f} ms"
 
 
-def write_csv(path: Path, answers: Sequence[Answer]) -> None:
+def write_csv(path: Path, results: Sequence[CellResult]) -> None:
     """Every cell of every source."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, ["source", *COLUMNS, "set"], restval="")
         writer.writeheader()
-        for answer in answers:
-            settings = " ".join(_settings(answer))
-            writer.writerow({"source": answer["cell"]["source"], **row_of(answer), "set": settings})
+        for result in results:
+            settings = " ".join(_settings(result))
+            writer.writerow({"source": result["cell"]["source"], **row_of(result), "set": settings})
 
 
-def _settings(answer: Answer) -> tuple[str, ...]:
+def _settings(result: CellResult) -> tuple[str, ...]:
     """The values given by `--set` in a cell."""
-    return tuple(answer["cell"].get("settings", ()))
+    return tuple(result["cell"].get("settings", ()))
 
 
-def _ate(answer: Answer | None) -> float:
+def _ate(result: CellResult | None) -> float:
     """Metres; infinite where there is no result, so that a failure never wins."""
-    return float(answer["metrics"]["ape_m"]["rmse"]) if answer is not None and answer["status"] == "ok" else math.inf
+    return float(result["metrics"]["ape_m"]["rmse"]) if result is not None and result["status"] == "ok" else math.inf
 
 
 def _metres(error: float) -> str:
     return f"{error:.3g} m" if math.isfinite(error) else "no result"
 
 
-def _ate_sim3(answer: Answer) -> float:
+def _ate_sim3(result: CellResult) -> float:
     """Metres, of a cell with a result: the error of the path apart from its scale."""
-    return float(answer["metrics"]["ate_sim3_m"])
+    return float(result["metrics"]["ate_sim3_m"])
 
 
-def _step(answer: Answer) -> float:
+def _step(result: CellResult) -> float:
     """Metres, of a cell that has a result: mean error of the translation between frames."""
-    return float(answer["metrics"]["rpe_m"]["mean"])
+    return float(result["metrics"]["rpe_m"]["mean"])
 
 
-def _turn(answer: Answer | None) -> float:
+def _turn(result: CellResult | None) -> float:
     """Mean relative rotation error in radians, infinite where there is no result."""
-    if answer is None or answer["status"] != "ok":
+    if result is None or result["status"] != "ok":
         return math.inf
-    return float(answer["metrics"]["retail"]["relative_rotation_rad_mean"])
+    return float(result["metrics"]["retail"]["relative_rotation_rad_mean"])
 
 
-def findings(answers: Sequence[Answer]) -> list[str]:
+def findings(results: Sequence[CellResult]) -> list[str]:
     """The papers' claims, checked on one source; each line gives the numbers that decide it."""
     cells = {
         (a["cell"]["features"], a["cell"]["method"]): a
-        for a in answers
+        for a in results
         if a["cell"]["system"] == "grid" and a["cell"]["stage"] == "tracking"
     }
     kinds = sorted({k for k, _ in cells})
@@ -189,13 +189,13 @@ def findings(answers: Sequence[Answer]) -> list[str]:
                 f"(R-Um {_metres(_ate(robust))}, Um {_metres(_ate(plain))}; "
                 f"rotation {_turn(robust):.2g} and {_turn(plain):.2g} rad per frame)"
             )
-    return lines + _against_default(answers)
+    return lines + _against_default(results)
 
 
-def _against_default(answers: Sequence[Answer]) -> list[str]:
+def _against_default(results: Sequence[CellResult]) -> list[str]:
     """Whether the default system beats every other cell in accuracy and in time."""
-    ours = [a for a in answers if a["cell"]["system"] == "default" and a["status"] == "ok"]
-    others = [a for a in answers if a["cell"]["system"] != "default" and a["status"] == "ok" and not a["monocular"]]
+    ours = [a for a in results if a["cell"]["system"] == "default" and a["status"] == "ok"]
+    others = [a for a in results if a["cell"]["system"] != "default" and a["status"] == "ok" and not a["monocular"]]
     if not ours or not others:
         return []
     lines: list[str] = []
@@ -215,8 +215,8 @@ def _against_default(answers: Sequence[Answer]) -> list[str]:
     return lines
 
 
-def _cell_name(answer: Answer) -> str:
-    cell = answer["cell"]
+def _cell_name(result: CellResult) -> str:
+    cell = result["cell"]
     parts = [cell["features"], cell["method"]] if cell["system"] == "grid" else [cell["system"]]
     return " ".join(p for p in [*parts, cell["stage"]] if p)
 
@@ -228,18 +228,18 @@ def _path(points: Any) -> Trajectory:
     return Trajectory(np.arange(len(xyz), dtype=np.int64), poses)
 
 
-def write_plots(folder: Path, slug: str, answers: Sequence[Answer]) -> list[str]:
+def write_plots(folder: Path, slug: str, results: Sequence[CellResult]) -> list[str]:
     """Figure 5 of the retail paper: estimators by features, then the modules in order. Returns the file names."""
-    good = [a for a in answers if a["status"] == "ok"]
-    groups: dict[str, list[Answer]] = {}
-    for answer in good:
-        cell = answer["cell"]
+    good = [a for a in results if a["status"] == "ok"]
+    groups: dict[str, list[CellResult]] = {}
+    for result in good:
+        cell = result["cell"]
         if cell["system"] != "grid":
-            groups.setdefault("systems", []).append(answer)
+            groups.setdefault("systems", []).append(result)
             continue
         if cell["stage"] == "tracking":
-            groups.setdefault(f"tracking-{cell['features']}", []).append(answer)
-        groups.setdefault(f"stages-{cell['features']}-{cell['method']}", []).append(answer)
+            groups.setdefault(f"tracking-{cell['features']}", []).append(result)
+        groups.setdefault(f"stages-{cell['features']}-{cell['method']}", []).append(result)
     written: list[str] = []
     for name, members in sorted(groups.items()):
         if name.startswith("stages") and len(members) < 2:
@@ -251,9 +251,9 @@ def write_plots(folder: Path, slug: str, answers: Sequence[Answer]) -> list[str]
     return written
 
 
-def write_report(folder: Path, answers: Sequence[Answer]) -> Path:
+def write_report(folder: Path, results: Sequence[CellResult]) -> Path:
     """ablation.md, ablation.csv and the plots. Returns the path of the first."""
-    write_csv(folder / "ablation.csv", answers)
+    write_csv(folder / "ablation.csv", results)
     lines = ["# Ablation", ""]
     lines += [
         "Relative errors are between consecutive frames, absolute ones of the last pose with the first poses aligned "
@@ -265,11 +265,11 @@ def write_report(folder: Path, answers: Sequence[Answer]) -> Path:
         "brackets, and the tracker's median.",
         "",
     ]
-    for settings in dict.fromkeys(map(_settings, answers)):
+    for settings in dict.fromkeys(map(_settings, results)):
         if settings:
             lines += ["Set in every cell: " + ", ".join(f"`{setting}`" for setting in settings) + ".", ""]
-    for number, source in enumerate(dict.fromkeys(a["cell"]["source"] for a in answers)):
-        own = [a for a in answers if a["cell"]["source"] == source]
+    for number, source in enumerate(dict.fromkeys(a["cell"]["source"] for a in results)):
+        own = [a for a in results if a["cell"]["source"] == source]
         name = next((a["source_name"] for a in own if "source_name" in a), source)
         length = next((a["metrics"]["length_m"] for a in own if a["status"] == "ok"), None)
         frames = max((a.get("frames", 0) for a in own), default=0)

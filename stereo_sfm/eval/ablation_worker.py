@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from stereo_sfm.eval.ablation import Cell, run_cell, save_answer
+from stereo_sfm.eval.ablation import Cell, run_cell, save_result
 
 
 def one_thread() -> None:
@@ -18,8 +18,8 @@ def one_thread() -> None:
 
 def compute(cell: Cell, path: Path) -> str:
     """Run a cell, write its file, and return a line that summarizes the result."""
-    answer = run_cell(cell)
-    save_answer(path, answer)
-    if answer["status"] != "ok":
-        return f"no result: {answer['reason']}"
-    return f"ATE {answer['metrics']['ape_m']['rmse']:.4g} m, {answer['track_ms'] or 0:.0f} ms per frame"
+    result = run_cell(cell)
+    save_result(path, result)
+    if result["status"] != "ok":
+        return f"no result: {result['reason']}"
+    return f"ATE {result['metrics']['ape_m']['rmse']:.4g} m, {result['track_ms'] or 0:.0f} ms per frame"

@@ -9,6 +9,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, I64, Trajectory
 
 MAX_DIFFERENCE_NS = 10_000_000  # nearest stamps at most 10 ms apart, as evo's default
+A_DAY_NS = 86_400 * 10**9
 MAX_GAP_NS = 250_000_000  # a reference is interpolated between poses at most this far apart
 
 
@@ -63,12 +64,21 @@ def associate(
     if not len(kept):
         raise StereoSfmError(
             f"no stamps in common: the estimate covers {_span(estimate)}, the reference {_span(reference)} (seconds)"
+            + _remedy(estimate, reference)
         )
     stamps = estimate.stamp_ns[kept]
     return (
         Trajectory(stamps, estimate.poses[kept], estimate.oriented),
         Trajectory(stamps.copy(), poses, reference.oriented),
     )
+
+
+def _remedy(estimate: Trajectory, reference: Trajectory) -> str:
+    """What to do where the stamps of one were counted from 0, as those of numbered images are."""
+    counted, true = sorted((int(estimate.stamp_ns[0]), int(reference.stamp_ns[0])))
+    if counted < A_DAY_NS <= true:
+        return ": name the images by their stamps, or put a times.txt with their seconds beside them, and run again"
+    return ""
 
 
 def _nearest(stamps: I64, wanted: I64) -> I64:

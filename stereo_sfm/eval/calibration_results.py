@@ -42,7 +42,7 @@ def row_error_stats(record: RunRecord) -> dict[str, Any] | None:
         "region_px": regions,
         "systematic_px": last.systematic_px,
         "trend_px": last.trend_px,
-        "worst_px": record.worst_rows_px,
+        "worst_px": max(px for _, px in record.row_error_px),
         "warning": last.warning,
     }
 

@@ -9,11 +9,14 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from stereo_sfm.calib.choice import NAMES, SCALES, UNITS
 from stereo_sfm.eval.evaluate import Evaluation
 from stereo_sfm.eval.record import RunRecord
-from stereo_sfm.types import F64, TrackState, Trajectory
+from stereo_sfm.recording.describe import GAP
+from stereo_sfm.types import F64, I64, TrackState, Trajectory
 
 AXES = ("x", "y", "z")
+NO_BREAKS: I64 = np.zeros(0, np.int64)
 SHOWN_STAGES = 6  # the longest ones
 MARGINS = {"left": 0.11, "right": 0.97, "bottom": 0.1, "top": 0.93}  # fixed: a constrained layout draws twice
 FLAT = {"left": 0.09, "right": 0.97, "bottom": 0.17, "top": 0.9}
@@ -31,8 +34,22 @@ def _plane(positions: F64) -> tuple[int, int]:
     return a, b
 
 
-def plot_trajectory(path: Path, estimates: dict[str, Trajectory], reference: Trajectory | None) -> None:
-    """Paths in the plane of their greatest extent, metres, the start marked."""
+def _breaks(trajectory: Trajectory) -> I64:
+    """(B,) the poses before which frames have none."""
+    steps = np.diff(trajectory.stamp_ns)
+    return np.flatnonzero(steps > GAP * np.median(steps)) + 1 if len(steps) else NO_BREAKS
+
+
+def plot_trajectory(
+    path: Path, estimates: dict[str, Trajectory], reference: Trajectory | None, every_frame: bool = False
+) -> None:
+    """Paths in the plane of their greatest extent, metres, the start marked.
+
+    Args:
+        path: of the picture.
+        estimates: by name. reference: ground truth.
+        every_frame: of a video: dashed where frames have no pose.
+    """
     figure = Figure(figsize=(7, 6))
     axes = figure.subplots(gridspec_kw=MARGINS)
     shown = reference if reference is not None else next(iter(estimates.values()))
@@ -40,7 +57,11 @@ def plot_trajectory(path: Path, estimates: dict[str, Trajectory], reference: Tra
     if reference is not None:
         axes.plot(*reference.positions[:, [a, b]].T, color="0.55", linewidth=2.5, label="ground truth")
     for name, trajectory in estimates.items():
-        axes.plot(*trajectory.positions[:, [a, b]].T, linewidth=1.2, label=name)
+        path_xy, breaks = trajectory.positions[:, [a, b]], _breaks(trajectory) if every_frame else NO_BREAKS
+        axes.plot(*np.insert(path_xy, breaks, np.nan, axis=0).T, linewidth=1.2, label=name)
+        for k in breaks.tolist():
+            label = f"{name}: no pose" if k == breaks[0] else None
+            axes.plot(*path_xy[k - 1 : k + 1].T, linewidth=1.2, linestyle="--", color="tab:red", label=label)
     axes.plot(*shown.positions[0, [a, b]], marker="o", color="black", linestyle="none", label="start")
     axes.set(xlabel=f"{AXES[a]} [m]", ylabel=f"{AXES[b]} [m]", title="trajectory")
     axes.set_aspect("equal", adjustable="datalim")
@@ -91,6 +112,31 @@ def plot_tracking(path: Path, record: RunRecord) -> None:
     axes.set_ylim(bottom=0)
     axes.grid(alpha=0.3)
     axes.legend()
+    _save(figure, path)
+
+
+def plot_calibration(path: Path, record: RunRecord) -> None:
+    """Row errors over time, and the corrections of self-calibration with their standard deviations."""
+    figure = Figure(figsize=(8, 5))
+    top, bottom = figure.subplots(2, sharex=True, gridspec_kw=MARGINS)
+    first_ns, last_ns = record.frames.stamp_ns[[0, -1]]
+    stamps, rows = np.array(record.row_error_px).reshape(-1, 2).T
+    top.plot((stamps - first_ns) / 1e9, rows, linewidth=1)
+    top.set(ylabel="row error [px]", title="calibration")
+    top.set_ylim(bottom=0)
+    changes = record.calibrations
+    seconds = (np.array([first_ns, *(c.stamp_ns for c in changes), last_ns]) - first_ns) / 1e9
+    terms = SCALES * np.array([np.zeros(len(NAMES)), *(c.terms for c in changes), changes[-1].terms])
+    variances = [np.zeros(len(NAMES)), *(np.diag(c.terms_covariance) for c in [*changes, changes[-1]])]
+    sigmas = SCALES * np.sqrt(variances)
+    for k in np.flatnonzero(terms.any(0)):
+        bottom.plot(seconds, terms[:, k], marker=".", drawstyle="steps-post", label=f"{NAMES[k]} [{UNITS[k]}]")
+        lower, upper = terms[:, k] - sigmas[:, k], terms[:, k] + sigmas[:, k]
+        bottom.fill_between(seconds, lower, upper, step="post", alpha=0.2)
+    bottom.set(xlabel="time [s]", ylabel="correction")
+    bottom.legend()
+    for axes in (top, bottom):
+        axes.grid(alpha=0.3)
     _save(figure, path)
 
 

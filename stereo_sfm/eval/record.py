@@ -18,6 +18,7 @@ from stereo_sfm.export.trajectories import fill_missing
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.keyframe_poses import KeyframePoses
 from stereo_sfm.messages import Health, LogEnded, SourceCounters, StageTimes
+from stereo_sfm.recording.describe import GAP
 from stereo_sfm.tracking.inertial.smoothing import smooth_bridges
 from stereo_sfm.types import (
     F64,
@@ -63,6 +64,16 @@ class LostInterval:
     frames: int
     seconds: float
     reason: str
+    begin_s: float  # since the first frame
+
+
+@dataclass(frozen=True)
+class StampGap:
+    """Between two successive frames of a run, where images are missing."""
+
+    begin_s: float  # the frame before, since the first one
+    seconds: float
+    missing: int  # images, estimated from the usual interval
 
 
 @dataclass
@@ -86,9 +97,10 @@ class RunRecord:
     closed: list[Closure] = field(default_factory=list[Closure])  # accepted by the loop closer
     refused_kf_ids: set[int] = field(default_factory=set[int])  # of loops that the mapper rejected
     row_errors: RowErrors | None = None  # the last
-    worst_rows_px: float = 0.0  # largest systematic row error
+    row_error_px: list[tuple[int, float]] = field(default_factory=list[tuple[int, float]])  # stamp_ns, systematic
     calibrations: list[CalibrationUpdate] = field(default_factory=list[CalibrationUpdate])  # changes of the rig
     rejections: dict[str, int] = field(default_factory=dict[str, int])
+    located_kf_id: int = -1  # first keyframe that was found in the saved map
     _path_m: float = 0.0
 
     @staticmethod
@@ -150,11 +162,13 @@ class RunRecord:
     @_take.register
     def _put_update(self, update: MapUpdate) -> None:
         self.map_T_kf.update(update)
+        if self.located_kf_id < 0 and len(update.kf_ids):
+            self.located_kf_id = update.kf_id
         if update.calibration is not None:
             self.calibrations.append(update.calibration)
         if update.row_errors is not None:
             self.row_errors = update.row_errors
-            self.worst_rows_px = max(self.worst_rows_px, update.row_errors.systematic_px)
+            self.row_error_px.append((update.row_errors.stamp_ns, update.row_errors.systematic_px))
         self.refused_kf_ids.update(update.refused_kf_ids.tolist())
         self.map_points.update(update.point_ids.tolist())
         self.map_points.difference_update(update.culled_point_ids.tolist(), update.fused_point_ids[:, 0].tolist())
@@ -283,7 +297,23 @@ class RunRecord:
         stamps = self.frames.stamp_ns
         seconds = float(stamps[min(end, len(stamps) - 1)] - stamps[begin]) / 1e9
         reason = self.frames.reasons_of(np.array([begin]))[0]
-        return LostInterval(int(self.frames.frame_id[begin]), end - begin, seconds, reason)
+        begin_s = float(stamps[begin] - stamps[0]) / 1e9
+        return LostInterval(int(self.frames.frame_id[begin]), end - begin, seconds, reason, begin_s)
+
+    def stamp_gaps(self) -> list[StampGap]:
+        """Where images are missing: intervals longer than `GAP` usual ones."""
+        stamps = self.frames.stamp_ns
+        steps = np.diff(stamps)
+        usual = max(float(np.median(steps)), 1.0) if len(steps) else 1.0
+        return [
+            StampGap(float(stamps[k] - stamps[0]) / 1e9, float(steps[k]) / 1e9, max(round(steps[k] / usual) - 1, 1))
+            for k in np.flatnonzero(steps > GAP * usual).tolist()
+        ]
+
+    def located_after_s(self) -> float | None:
+        """Seconds from the first frame to the first keyframe that was found in the saved map; None if none was."""
+        keyframe = self.keyframes.get(self.located_kf_id)
+        return None if keyframe is None else float(keyframe.stamp_ns - self.frames.stamp_ns[0]) / 1e9
 
     def unconnected_submaps(self) -> int:
         """Number of parts of the map that no loop connects, because tracking restarted after it was lost. Their

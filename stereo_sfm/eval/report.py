@@ -18,7 +18,9 @@ ADVICE = {
     "dark": "images were dark: use more light or a longer exposure",
     "too_few_points": "too few points could be tracked: check the images (blur, bare walls, a covered lens)",
     "no_consensus": "points did not agree on one motion: people or carts in view, or a wrong calibration",
+    "not_found": "the camera saw nothing that it knew: free its view, or drive back to where it was tracked",
 }
+SHOWN_ROWS = 50  # of a table
 # Why a loop candidate was rejected (`LoopResult.rejected`), as in docs/glossary.md.
 REJECTIONS = {
     "too_few_matches": "too few corners have a similar descriptor",
@@ -47,7 +49,7 @@ def write_report(
     evaluations: dict[str, Evaluation],
     go_on: Callable[[], bool] = lambda: True,
 ) -> None:
-    """Write report.md, then its pictures.
+    """Write report.md, then its plots.
 
     Args:
         folder: of the run.
@@ -56,7 +58,7 @@ def write_report(
         estimates: trajectories by name ("odometry", "map").
         reference: ground truth in its own frame, or None.
         evaluations: of the estimates, by the same names, where there is ground truth.
-        go_on: called before each picture; when it returns False, the remaining ones are omitted.
+        go_on: called before each plot; when it returns False, the remaining ones are omitted.
     """
     lines = [f"# {source_name}", "", *(f"* {line}" for line in summary(stats, evaluations)), "", "## Verdict", ""]
     lines += [f"* {verdict}" for verdict in verdicts(stats, evaluations)]
@@ -69,6 +71,7 @@ def write_report(
             "",
             "The source has no ground truth. `stereo-sfm eval RUN --ref TRUTH` compares the trajectory with one.",
         ]
+    lines += _lost_intervals(stats["lost_intervals"]) + _gaps(stats["stamp_gaps"])
     lines += _rejections(stats["loops_rejected"])
     lines += ["", "## Time per stage", "", "| stage | p50 | p95 | p99 | frames |", "|---|---|---|---|---|"]
     for stage, ms in stats["ms"].items():
@@ -78,13 +81,16 @@ def write_report(
         "",
         "`track`, `map` and `loop` are the stages and run in parallel; the other rows are steps of them. `latency` is",
     ]
-    lines += ["the time from the arrival of an image to its pose."]
+    lines += [
+        "the time from the arrival of an image to its pose. The images of a recording are read ahead and wait in the",
+        "queues, so that it says nothing about the speed there; it is not in the plot below.",
+    ]
     with (folder / "report.md").open("w", encoding="utf-8") as report:
         report.write("\n".join([*lines, "", _glossary(folder), ""]))
-        for name, draw in _pictures(folder, record, stats, estimates, evaluations).items():
+        for name, draw in _plots_by_name(folder, record, stats, estimates, evaluations).items():
             report.flush()
             if not go_on():
-                report.write("\nFurther pictures were omitted: the run was interrupted.\n")
+                report.write("\nFurther plots were omitted: the run was interrupted.\n")
                 break
             draw()
             report.write(f"\n![{name}]({name}.png)\n")
@@ -97,6 +103,30 @@ def _glossary(folder: Path) -> str:
     return f"The {link} explains the terms."
 
 
+def _lost_intervals(intervals: list[dict[str, Any]]) -> list[str]:
+    """A table of the frames without a pose; empty if there are none."""
+    rows = [
+        f"| {x['begin_s']:.2f} s | {x['begin_s'] + x['seconds']:.2f} s | {x['frames']} "
+        f"| {x['reason'].replace('_', ' ')} | {ADVICE.get(x['reason'], '')} |"
+        for x in intervals
+    ]
+    return _table("Lost intervals", "| from | to | frames | reason | advice |", rows)
+
+
+def _gaps(gaps: list[dict[str, Any]]) -> list[str]:
+    """A table of the times without images; empty if there are none."""
+    rows = [f"| {x['begin_s']:.2f} s | {x['begin_s'] + x['seconds']:.2f} s | {x['missing']} |" for x in gaps]
+    return _table("Times without images", "| from | to | images missing, about |", rows)
+
+
+def _table(title: str, head: str, rows: list[str]) -> list[str]:
+    """The first rows of a table below its title; empty without rows."""
+    if not rows:
+        return []
+    more = ["", f"{len(rows) - SHOWN_ROWS} more are in stats.json."] if len(rows) > SHOWN_ROWS else []
+    return ["", f"## {title}", "", head, "|---" * (head.count("|") - 1) + "|", *rows[:SHOWN_ROWS], *more]
+
+
 def _rejections(counts: dict[str, int]) -> list[str]:
     """A table of the reasons why loop candidates were rejected; empty if none were."""
     if not counts:
@@ -105,7 +135,7 @@ def _rejections(counts: dict[str, int]) -> list[str]:
     return ["", "## Rejected loop candidates", "", "| reason | candidates | meaning |", "|---|---|---|", *rows]
 
 
-def _pictures(
+def _plots_by_name(
     folder: Path,
     record: RunRecord,
     stats: dict[str, Any],
@@ -113,19 +143,22 @@ def _pictures(
     evaluations: dict[str, Evaluation],
 ) -> dict[str, Callable[[], None]]:
     """Functions that draw the plots, by name."""
-    pictures: dict[str, Callable[[], None]] = {}
+    drawings: dict[str, Callable[[], None]] = {}
     aligned = {name: result.estimate for name, result in evaluations.items()}
     shown = aligned or {name: t for name, t in estimates.items() if len(t)}
     if shown:
         truth = next(iter(evaluations.values())).reference if evaluations else None
-        pictures["trajectory"] = lambda: plots.plot_trajectory(folder / "trajectory.png", shown, truth)
+        drawings["trajectory"] = lambda: plots.plot_trajectory(folder / "trajectory.png", shown, truth, True)
     if evaluations:
-        pictures["errors"] = lambda: plots.plot_errors(folder / "errors.png", evaluations)
+        drawings["errors"] = lambda: plots.plot_errors(folder / "errors.png", evaluations)
     if record.tracked().any():
-        pictures["tracking"] = lambda: plots.plot_tracking(folder / "tracking.png", record)
+        drawings["tracking"] = lambda: plots.plot_tracking(folder / "tracking.png", record)
+    if record.calibrations:
+        drawings["calibration"] = lambda: plots.plot_calibration(folder / "calibration.png", record)
     if len(record.frames):
-        pictures["times"] = lambda: plots.plot_times(folder / "times.png", record, list(stats["ms"]))
-    return pictures
+        stages = [stage for stage in stats["ms"] if stage != "latency"]
+        drawings["times"] = lambda: plots.plot_times(folder / "times.png", record, stages)
+    return drawings
 
 
 def _drops(stats: dict[str, Any]) -> list[str]:

@@ -60,7 +60,7 @@ def write_results(
         step: every `step`-th frame of the source was processed.
         max_lost_percent: frames without a pose above which the run counts as failed.
         why_not_started: reason for a run without any pose, see `eval.start`.
-        go_on: whether there is time for another picture.
+        go_on: whether there is time for another plot.
 
     Returns:
         The content of stats.json, and the evaluations by trajectory name.

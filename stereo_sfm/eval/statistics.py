@@ -55,6 +55,9 @@ def statistics(record: RunRecord, wall_s: float, evaluations: dict[str, Evaluati
         "states": {TrackState(k).name: n for k, n in zip(states.tolist(), counts.tolist(), strict=True)},
         "lost_percent": 100.0 * (frames + dropped_by_capture - tracked) / max(frames + dropped_by_capture, 1),
         "lost_intervals": [dataclasses.asdict(interval) for interval in lost],
+        "stamp_gaps": [dataclasses.asdict(gap) for gap in record.stamp_gaps()],
+        "localize_only": record.localize_only,
+        "located_after_s": record.located_after_s() if record.localize_only else None,
         "pieces": record.unconnected_submaps(),
         "keyframes": len(record.keyframes),
         "points": len(record.map_points) or int(record.seen_points.sum()),
@@ -114,7 +117,9 @@ def summary(stats: dict[str, Any], evaluations: dict[str, Evaluation] | None = N
         f"tracked {thousands(stats['tracked'])}/{thousands(total)} frames ({_dropped(stats)}), "
         f"{_lost(stats)}, {stats['keyframes']} keyframes, {thousands(stats['points'])} points",
     ]
-    if stats["unplaced"]:
+    if stats["localize_only"]:
+        lines.append(_localized(stats))
+    elif stats["unplaced"]:
         lines.append(f"{thousands(stats['unplaced'])} of the tracked frames were not found in the map")
     if stats["pieces"] > 1:
         lines.append(f"{stats['pieces']} submaps that no loop connects: their relative poses are only predicted")
@@ -128,6 +133,14 @@ def summary(stats: dict[str, Any], evaluations: dict[str, Evaluation] | None = N
     for name, result in (evaluations or {}).items():
         lines.append(_against_truth(name, result))
     return lines
+
+
+def _localized(stats: dict[str, Any]) -> str:
+    """What came of the saved map."""
+    if stats["located_after_s"] is None:
+        return "localized in the saved map: never"
+    placed = f"{thousands(stats['tracked'] - stats['unplaced'])} of {thousands(stats['tracked'])} tracked frames"
+    return f"localized in the saved map: {placed}, first found after {stats['located_after_s']:.1f} s"
 
 
 def _dropped(stats: dict[str, Any]) -> str:

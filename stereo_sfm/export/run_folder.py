@@ -15,10 +15,10 @@ import numpy as np
 from stereo_sfm.errors import StereoSfmError
 
 TRAJECTORIES = ("trajectory_odom.tum", "trajectory_odom.kitti", "trajectory_map.tum", "trajectory_map.kitti")
-PICTURES = ("trajectory.png", "errors.png", "tracking.png", "times.png")
+PLOTS = ("trajectory.png", "errors.png", "tracking.png", "calibration.png", "times.png")
 NUMBERS = ("keyframes.tum", "config.toml", "rig.yaml", "stats.json", "report.md")
 KEPT_MAP = "map"  # subfolder with the run's own map
-FILES = ("run.mcap", "run.rrd", *TRAJECTORIES, *NUMBERS, *PICTURES)
+FILES = ("run.mcap", "run.rrd", *TRAJECTORIES, *NUMBERS, *PLOTS)
 
 
 def default_folder(source_name: str, now: datetime) -> Path:

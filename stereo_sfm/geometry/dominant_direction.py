@@ -11,7 +11,7 @@ import numpy as np
 from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.types import F64
 
-LEAST_POINTS = 10
+MIN_POINTS = 10
 COARSE, FINE = np.deg2rad(np.arange(-45.0, 45.0, 1.0)), np.deg2rad(np.arange(-1.0, 1.01, 0.1))
 
 
@@ -23,7 +23,7 @@ def dominant_direction(flat: F64, weights: F64 | None = None, cell: float = 0.05
     Args:
         flat: (N, 2) metres. weights: (N,), None: all alike. cell: metres, width of the histograms' cells.
     """
-    if len(flat) < LEAST_POINTS:
+    if len(flat) < MIN_POINTS:
         return 0.0
     flat = np.ascontiguousarray(flat - flat.mean(0), float)
     weights = np.ones(len(flat)) if weights is None else np.ascontiguousarray(weights, float)

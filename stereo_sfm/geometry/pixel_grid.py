@@ -10,7 +10,7 @@ import numpy as np
 
 from stereo_sfm.geometry.kernels import njit
 
-MOST_CELLS = 512  # along either axis
+MAX_CELLS = 512  # along either axis
 
 
 @njit
@@ -28,7 +28,7 @@ def make_grid(uv, radius):
             u0, u1, v0, v1 = min(u0, uv[i, 0]), max(u1, uv[i, 0]), min(v0, uv[i, 1]), max(v1, uv[i, 1])
     if u1 < u0:
         return (1.0, 0.0, 0.0), (1, 1), np.zeros(2, np.int64), np.zeros(0, np.int64)
-    size = max(radius, 1.0, (u1 - u0) / MOST_CELLS, (v1 - v0) / MOST_CELLS)
+    size = max(radius, 1.0, (u1 - u0) / MAX_CELLS, (v1 - v0) / MAX_CELLS)
     columns, rows = int((u1 - u0) / size) + 1, int((v1 - v0) / size) + 1
     cell, starts = np.full(uv.shape[0], -1), np.zeros(columns * rows + 1, np.int64)
     for i in range(uv.shape[0]):

@@ -10,6 +10,7 @@ of gravity, always to the same side.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,20 +75,50 @@ def preintegrate(
 
 
 @njit
-def _exp_and_jacobian(phi, rotation, jacobian):
+def exp_and_jacobian(phi, rotation, jacobian):
     """Rotation of a tangent (3,) and its right Jacobian, into (3, 3) arrays."""
     x, y, z = phi[0], phi[1], phi[2]
-    angle2 = x * x + y * y + z * z
-    angle = np.sqrt(angle2)
+    xx, yy, zz = x * x, y * y, z * z
+    angle2 = xx + yy + zz
+    angle = math.sqrt(angle2)
     if angle < 1e-5:
         a, b, c = 1.0 - angle2 / 6, 0.5 - angle2 / 24, 1.0 / 6 - angle2 / 120
     else:
-        a, b = np.sin(angle) / angle, (1 - np.cos(angle)) / angle2
-        c = (angle - np.sin(angle)) / (angle2 * angle)
-    k = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    kk = k @ k
-    rotation[:] = np.eye(3) + a * k + b * kk
-    jacobian[:] = np.eye(3) - b * k + c * kk
+        a, b = math.sin(angle) / angle, (1 - math.cos(angle)) / angle2
+        c = (angle - math.sin(angle)) / (angle2 * angle)
+    for out, by_k, by_kk in ((rotation, a, b), (jacobian, -b, c)):
+        out[0, 0], out[0, 1], out[0, 2] = 1.0 - by_kk * (yy + zz), by_kk * x * y - by_k * z, by_kk * x * z + by_k * y
+        out[1, 0], out[1, 1], out[1, 2] = by_kk * x * y + by_k * z, 1.0 - by_kk * (xx + zz), by_kk * y * z - by_k * x
+        out[2, 0], out[2, 1], out[2, 2] = by_kk * x * z - by_k * y, by_kk * y * z + by_k * x, 1.0 - by_kk * (xx + yy)
+
+
+@njit
+def _product(a, b, out):
+    """a @ b of (3, 3) matrices, into `out`: a library's product takes longer to begin than this to finish."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
+
+
+@njit
+def _transported(step, covariance, half_way):
+    """covariance (9, 9) becomes step @ covariance @ step.T, without the zeros of `step`."""
+    for i in range(9):
+        for j in range(9):
+            s = covariance[i, j] if i >= 3 else 0.0
+            for k in range(3):
+                s += step[i, k] * covariance[k, j]
+            if i >= 6:
+                s += step[i, i - 3] * covariance[i - 3, j]
+            half_way[i, j] = s
+    for i in range(9):
+        for j in range(9):
+            s = half_way[i, j] if j >= 3 else 0.0
+            for k in range(3):
+                s += half_way[i, k] * step[j, k]
+            if j >= 6:
+                s += half_way[i, j - 3] * step[j, j - 3]
+            covariance[i, j] = s
 
 
 @njit
@@ -96,35 +127,59 @@ def _integrate(seconds, gyro, accel, gyro_bias, accel_bias, gyro_density2, accel
     r_g, v_g, v_a = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
     p_g, p_a, covariance = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((9, 9))
     turn, right, half, half_right = np.eye(3), np.eye(3), np.eye(3), np.eye(3)
-    step = np.eye(9)
+    middle, turned_force, r_g_middle, by_gyro = np.eye(3), np.eye(3), np.eye(3), np.eye(3)
+    phi, f, a, force = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
+    skew, product = np.zeros((3, 3)), np.zeros((3, 3))
+    step, half_way = np.eye(9), np.zeros((9, 9))
     for k in range(len(seconds)):
         dt = seconds[k]
         if dt <= 0:
             continue
-        _exp_and_jacobian((gyro[k] - gyro_bias) * dt, turn, right)
-        _exp_and_jacobian((gyro[k] - gyro_bias) * (0.5 * dt), half, half_right)
-        a = half @ (accel[k] - accel_bias)
-        middle, r_g_middle = rotation @ half, r_g - half @ half_right * (0.5 * dt)
-        force = rotation @ a
-        skew = np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
-        turned_force = rotation @ skew
-        step[:3, :3] = turn.T
-        step[3:6, :3] = -turned_force * dt
-        step[6:, :3] = -0.5 * turned_force * dt * dt
-        step[6:, 3:6] = np.eye(3) * dt
-        covariance = step @ covariance @ step.T
-        covariance[:3, :3] += right @ right.T * (gyro_density2 * dt)
         for i in range(3):
+            phi[i], f[i] = (gyro[k, i] - gyro_bias[i]) * dt, accel[k, i] - accel_bias[i]
+        exp_and_jacobian(phi, turn, right)
+        for i in range(3):
+            phi[i] *= 0.5
+        exp_and_jacobian(phi, half, half_right)
+        for i in range(3):
+            a[i] = half[i, 0] * f[0] + half[i, 1] * f[1] + half[i, 2] * f[2]
+        for i in range(3):
+            force[i] = rotation[i, 0] * a[0] + rotation[i, 1] * a[1] + rotation[i, 2] * a[2]
+        _product(rotation, half, middle)
+        _product(half, half_right, product)
+        skew[0, 1], skew[0, 2], skew[1, 2] = -a[2], a[1], -a[0]
+        skew[1, 0], skew[2, 0], skew[2, 1] = a[2], -a[1], a[0]
+        _product(rotation, skew, turned_force)
+        for i in range(3):
+            for j in range(3):
+                r_g_middle[i, j] = r_g[i, j] - product[i, j] * (0.5 * dt)
+                step[i, j] = turn[j, i]
+                step[3 + i, j] = -turned_force[i, j] * dt
+                step[6 + i, j] = -0.5 * turned_force[i, j] * dt * dt
+            step[6 + i, 3 + i] = dt
+        _transported(step, covariance, half_way)
+        for i in range(3):
+            for j in range(3):
+                s = right[i, 0] * right[j, 0] + right[i, 1] * right[j, 1] + right[i, 2] * right[j, 2]
+                covariance[i, j] += s * (gyro_density2 * dt)
             covariance[3 + i, 3 + i] += accel_density2 * dt
             covariance[6 + i, 6 + i] += 0.25 * accel_density2 * dt * dt * dt
             covariance[3 + i, 6 + i] += 0.5 * accel_density2 * dt * dt
             covariance[6 + i, 3 + i] += 0.5 * accel_density2 * dt * dt
-        p_a += v_a * dt - 0.5 * middle * dt * dt
-        p_g += v_g * dt - 0.5 * turned_force @ r_g_middle * dt * dt
-        v_a -= middle * dt
-        v_g -= turned_force @ r_g_middle * dt
-        r_g = turn.T @ r_g - right * dt
-        position += velocity * dt + 0.5 * force * dt * dt
-        velocity += force * dt
-        rotation = rotation @ turn
+        _product(turned_force, r_g_middle, by_gyro)
+        for i in range(3):
+            for j in range(3):
+                p_a[i, j] += v_a[i, j] * dt - 0.5 * middle[i, j] * dt * dt
+                p_g[i, j] += v_g[i, j] * dt - 0.5 * by_gyro[i, j] * dt * dt
+                v_a[i, j] -= middle[i, j] * dt
+                v_g[i, j] -= by_gyro[i, j] * dt
+                product[i, j] = turn[j, i]
+            position[i] += velocity[i] * dt + 0.5 * force[i] * dt * dt
+            velocity[i] += force[i] * dt
+        _product(product, r_g, by_gyro)
+        _product(rotation, turn, product)
+        for i in range(3):
+            for j in range(3):
+                r_g[i, j] = by_gyro[i, j] - right[i, j] * dt
+                rotation[i, j] = product[i, j]
     return rotation, velocity, position, r_g, v_g, v_a, p_g, p_a, covariance

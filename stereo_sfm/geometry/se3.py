@@ -1,5 +1,8 @@
 """Rigid transforms as (..., 4, 4) arrays: exponential, logarithm, inverse, interpolation, alignment.
 
+Single ones are computed by compiled kernels: the tracker needs a dozen a frame, and numpy takes tens of microseconds
+for each.
+
 A tangent vector is xi = (rho, phi): translation part first, rotation vector second, both (..., 3).
 Formulas: Barfoot, State Estimation for Robotics (2017), chapter 7; Umeyama, PAMI 13 (1991), equations 40-43.
 """
@@ -8,6 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from stereo_sfm.geometry import se3_kernels as kernels
 from stereo_sfm.types import F64
 
 _SMALL = 1e-8
@@ -26,6 +30,8 @@ def skew(v: F64) -> F64:
 def so3_exp(phi: F64) -> F64:
     """Rotation vector (..., 3) -> rotation matrix (..., 3, 3), Rodrigues."""
     phi = np.asarray(phi, float)
+    if phi.ndim == 1:
+        return kernels.so3_exp_one(phi.copy())
     angle = np.linalg.norm(phi, axis=-1)[..., None, None]
     k = skew(phi)
     small = angle < _SMALL
@@ -37,6 +43,8 @@ def so3_exp(phi: F64) -> F64:
 
 def so3_log(rotation: F64) -> F64:
     """Rotation matrix (..., 3, 3) -> rotation vector (..., 3), angle in [0, pi]."""
+    if rotation.ndim == 2:
+        return kernels.so3_log_one(np.array(rotation, float))
     q = quaternion_from_rotation(rotation)
     xyz, w = q[..., :3], q[..., 3]
     norm = np.linalg.norm(xyz, axis=-1)
@@ -58,6 +66,8 @@ def _left_jacobian(phi: F64) -> F64:
 def exp(xi: F64) -> F64:
     """Tangent (..., 6) = (rho, phi) -> transform (..., 4, 4)."""
     xi = np.asarray(xi, float)
+    if xi.ndim == 1:
+        return kernels.exp_one(xi.copy())
     out = np.zeros((*xi.shape[:-1], 4, 4))
     out[..., :3, :3] = so3_exp(xi[..., 3:])
     out[..., :3, 3] = (_left_jacobian(xi[..., 3:]) @ xi[..., :3, None])[..., 0]
@@ -67,6 +77,8 @@ def exp(xi: F64) -> F64:
 
 def log(a_T_b: F64) -> F64:
     """Transform (..., 4, 4) -> tangent (..., 6) = (rho, phi)."""
+    if a_T_b.ndim == 2:
+        return kernels.log_one(np.array(a_T_b, float))
     phi = so3_log(a_T_b[..., :3, :3])
     rho = np.linalg.solve(_left_jacobian(phi), a_T_b[..., :3, 3, None])[..., 0]
     return np.concatenate([rho, phi], axis=-1).astype(np.float64, copy=False)
@@ -74,6 +86,8 @@ def log(a_T_b: F64) -> F64:
 
 def inverse(a_T_b: F64) -> F64:
     """(..., 4, 4) -> b_T_a."""
+    if a_T_b.ndim == 2:
+        return kernels.inverse_one(np.array(a_T_b, float))
     rotation = np.swapaxes(a_T_b[..., :3, :3], -1, -2)
     out = np.zeros_like(a_T_b, dtype=float)
     out[..., :3, :3] = rotation
@@ -114,8 +128,7 @@ def quaternion_from_rotation(rotation: F64) -> F64:
     xx, yy, zz, ww = 1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2, 1 + d0 + d1 + d2
     xy, xz, yz = r[..., 1, 0] + r[..., 0, 1], r[..., 0, 2] + r[..., 2, 0], r[..., 2, 1] + r[..., 1, 2]
     wx, wy, wz = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
-    # The symmetric 4x4 matrix whose dominant eigenvector is the quaternion (Shepperd's method), in one stack: it is
-    # called several times a frame for single matrices.
+    # The symmetric 4x4 matrix whose dominant eigenvector is the quaternion (Shepperd's method).
     flat = np.stack([xx, xy, xz, wx, xy, yy, yz, wy, xz, yz, zz, wz, wx, wy, wz, ww], -1)
     rows = flat.reshape(*flat.shape[:-1], 4, 4)
     four_q_sq = flat[..., ::5]
@@ -126,12 +139,21 @@ def quaternion_from_rotation(rotation: F64) -> F64:
 
 
 def rotation_from_quaternion(xyzw: F64) -> F64:
-    """Quaternion (..., 4) as x y z w (any norm > 0) -> (..., 3, 3)."""
-    q = np.asarray(xyzw, float)
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    """Quaternion (..., 4) as x y z w (any norm > 0) -> (..., 3, 3); NaN for a zero quaternion."""
+    q = _unit(np.asarray(xyzw, float))
     xyz, w = q[..., :3], q[..., 3]
     k = skew(xyz)
     return np.eye(3) + 2 * (w[..., None, None] * k + k @ k)
+
+
+def _unit(q: F64) -> F64:
+    """(..., 4) divided by its norm, also where the square of the norm overflows or vanishes."""
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        norm = np.linalg.norm(q, axis=-1, keepdims=True)
+        if not ((norm > 0) & (norm < np.inf)).all():
+            q = q / np.abs(q).max(axis=-1, keepdims=True)
+            norm = np.linalg.norm(q, axis=-1, keepdims=True)
+        return q / norm
 
 
 def orthonormalize(a_T_b: F64) -> F64:
@@ -144,6 +166,9 @@ def orthonormalize(a_T_b: F64) -> F64:
 
 def extent(a_T_b: F64) -> tuple[F64, F64]:
     """Size of a transform: (...) metres of translation and (...) radians of rotation."""
+    if a_T_b.ndim == 2:
+        size: F64 = np.array(kernels.extent_one(np.array(a_T_b, float)))
+        return size[0], size[1]
     trace = np.trace(a_T_b[..., :3, :3], axis1=-2, axis2=-1)
     return np.linalg.norm(a_T_b[..., :3, 3], axis=-1), np.arccos(np.clip((trace - 1) / 2, -1, 1))
 

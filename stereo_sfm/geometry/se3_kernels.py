@@ -1,10 +1,12 @@
 """Compiled versions of `se3` functions for kernels without allocation."""
 
-# pyright: reportUnknownParameterType=false, reportMissingParameterType=false
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportMissingTypeArgument=false
 
 from __future__ import annotations
 
 import math
+
+import numpy as np
 
 from stereo_sfm.geometry.kernels import njit
 
@@ -48,3 +50,84 @@ def transform_point(t, x, y, z):
         t[1, 0] * x + t[1, 1] * y + t[1, 2] * z + t[1, 3],
         t[2, 0] * x + t[2, 1] * y + t[2, 2] * z + t[2, 3],
     )
+
+
+@njit
+def exp_one(xi):
+    """exp of a tangent (6,) = (rho, phi): (4, 4)."""
+    out = np.empty((4, 4))
+    exp_into(xi, 1.0, out)
+    return out
+
+
+@njit
+def so3_exp_one(phi):
+    """Rotation (3, 3) of a rotation vector (3,)."""
+    xi, out = np.zeros(6), np.empty((4, 4))
+    xi[3:] = phi
+    exp_into(xi, 1.0, out)
+    return out[:3, :3].copy()
+
+
+@njit
+def quaternion_of(r):
+    """Unit quaternion x y z w, w >= 0, of a rotation (3, 3): the largest component first (Shepperd's method)."""
+    xx, yy = 1 + r[0, 0] - r[1, 1] - r[2, 2], 1 - r[0, 0] + r[1, 1] - r[2, 2]
+    zz, ww = 1 - r[0, 0] - r[1, 1] + r[2, 2], 1 + r[0, 0] + r[1, 1] + r[2, 2]
+    xy, xz, yz = r[1, 0] + r[0, 1], r[0, 2] + r[2, 0], r[2, 1] + r[1, 2]
+    wx, wy, wz = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
+    x, y, z, w = xx, xy, xz, wx
+    if yy > xx and yy >= zz and yy >= ww:
+        x, y, z, w = xy, yy, yz, wy
+    elif zz > xx and zz > yy and zz >= ww:
+        x, y, z, w = xz, yz, zz, wz
+    elif ww > xx and ww > yy and ww > zz:
+        x, y, z, w = wx, wy, wz, ww
+    norm = math.sqrt(x * x + y * y + z * z + w * w)
+    norm = -norm if w < 0 else norm
+    return x / norm, y / norm, z / norm, w / norm
+
+
+@njit
+def so3_log_one(rotation):
+    """Rotation vector (3,), angle in [0, pi], of a rotation (3, 3)."""
+    x, y, z, w = quaternion_of(rotation)
+    sine = math.sqrt(x * x + y * y + z * z)
+    factor = 2.0 / w if sine < 1e-8 else 2.0 * math.atan2(sine, w) / sine
+    return np.array([x * factor, y * factor, z * factor])
+
+
+@njit
+def log_one(t):
+    """Tangent (6,) = (rho, phi) of a transform (4, 4)."""
+    x, y, z, w = quaternion_of(t)
+    sine = math.sqrt(x * x + y * y + z * z)
+    angle = 2.0 * math.atan2(sine, w)
+    factor = 2.0 / w if sine < 1e-8 else angle / sine
+    px, py, pz = x * factor, y * factor, z * factor
+    # the inverse of the left Jacobian: 1 - k / 2 + c k k, with 1 - cot(angle / 2) * angle / 2 over the squared angle
+    c = 1.0 / 12 + angle * angle / 720 if angle < 1e-3 else (1.0 - 0.5 * angle * w / sine) / (angle * angle)
+    tx, ty, tz = t[0, 3], t[1, 3], t[2, 3]
+    kx, ky, kz = py * tz - pz * ty, pz * tx - px * tz, px * ty - py * tx
+    lx, ly, lz = py * kz - pz * ky, pz * kx - px * kz, px * ky - py * kx
+    return np.array([tx - 0.5 * kx + c * lx, ty - 0.5 * ky + c * ly, tz - 0.5 * kz + c * lz, px, py, pz])
+
+
+@njit
+def inverse_one(t):
+    """Inverse (4, 4) of a transform (4, 4)."""
+    out = np.zeros((4, 4))
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = t[j, i]
+        out[i, 3] = -(t[0, i] * t[0, 3] + t[1, i] * t[1, 3] + t[2, i] * t[2, 3])
+    out[3, 3] = 1.0
+    return out
+
+
+@njit
+def extent_one(t):
+    """Size of a transform (4, 4): metres of translation and radians of rotation."""
+    cosine = 0.5 * (t[0, 0] + t[1, 1] + t[2, 2] - 1.0)
+    metres = math.sqrt(t[0, 3] * t[0, 3] + t[1, 3] * t[1, 3] + t[2, 3] * t[2, 3])
+    return metres, math.acos(min(max(cosine, -1.0), 1.0))

@@ -182,16 +182,16 @@ def estimate(
     starts = [search(lines, rng)]
     if expected is not None:
         starts.append(expected)
-    answers: list[Manhattan] = []
+    candidates: list[Manhattan] = []
     refusal = Degenerate("weak_structure")
     for start in starts:
         try:
-            answers.append(refine(lines, start, limits))
+            candidates.append(refine(lines, start, limits))
         except Degenerate as error:
             refusal = error
-    if not answers:
+    if not candidates:
         raise refusal
-    best = max(answers, key=lambda m: m.share)
+    best = max(candidates, key=lambda m: m.share)
     turned = nearest_turn(best.cam_R_axes, np.eye(3) if expected is None else expected)
     return Manhattan(turned, best.covariance, best.share, best.lines_per_axis, best.labels)
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from google.protobuf.message import DecodeError
+from mcap.exceptions import McapError
 from mcap_protobuf.decoder import DecoderFactory
 
 from stereo_sfm.errors import StereoSfmError
@@ -39,7 +40,7 @@ class Difference:
 def compared(topic: str, a: LogReader, b: LogReader) -> bool:
     """Whether a topic is compared: by the table of topics; topics of other programs always are."""
     row = topics.BY_NAME.get(topic)
-    return row is None or row.compare or (topic not in _names(a) and topic not in _names(b))
+    return row is None or row.topic.compare or (topic not in _names(a) and topic not in _names(b))
 
 
 def _names(reader: LogReader) -> set[str]:
@@ -136,7 +137,7 @@ class _Comparison:
                 return Difference(a.topic, a.sequence, a.log_time, field, str(one), str(other))
         try:
             found = self._content(a, b)
-        except (DecodeError, ValueError, TypeError, LookupError):  # one of them is damaged
+        except (McapError, DecodeError, ValueError, TypeError, LookupError):  # one of them is damaged
             found = ("bytes", f"{len(a.data)} bytes", f"{len(b.data)} other bytes")
         return Difference(a.topic, a.sequence, a.log_time, *found) if found else None
 

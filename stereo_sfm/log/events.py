@@ -17,7 +17,7 @@ JUMP = (0.01, np.radians(0.1))  # metres, radians: smaller corrections of the ma
 STATES = {
     TrackState.INITIALIZING: "no pose yet",
     TrackState.LOST: "lost",
-    TrackState.INERTIAL: "pose from the IMU alone",
+    TrackState.INERTIAL: "pose from IMU or wheels alone",
     TrackState.RECOVERED: "tracking recovered",
     TrackState.OCCLUDED: "view covered",
     TrackState.RESTARTED: "tracking restarted in a new submap",

@@ -15,7 +15,7 @@ from stereo_sfm.log import foxglove, topics
 from stereo_sfm.log.images import LoggedImage, depth_message, encode_pair, image_message
 from stereo_sfm.log.samples import ImageInfo, ImuSample, WheelSample
 from stereo_sfm.log.writer import LogWriter
-from stereo_sfm.types import ImuSamples, StereoImage, Trajectory, WheelSamples
+from stereo_sfm.types import F64, I64, StereoImage, Trajectory
 
 RIG_FILE = "calibration.yaml"
 TRUTH_FILE = "ground_truth.npz"
@@ -143,11 +143,13 @@ class ImageLog:
 
     def _samples(self, pair: StereoImage) -> None:
         if pair.imu is not None:
-            for stamp_ns, row in _rows(pair.imu):
+            for stamp_ns, row in _rows(pair.imu.stamp_ns, pair.imu.gyro, pair.imu.accel):
                 self._writer.write(topics.IMU, ImuSample(stamp_ns, *row), stamp_ns, pair.frame_id)
         if pair.wheel is not None:
-            for stamp_ns, row in _rows(pair.wheel):
-                self._writer.write(topics.WHEEL, WheelSample(stamp_ns, *row), stamp_ns, pair.frame_id)
+            rows = _rows(pair.wheel.stamp_ns, pair.wheel.linear, pair.wheel.angular)
+            speeds = pair.wheel.speeds if len(pair.wheel.speeds) else np.zeros((len(rows), 0))
+            for (stamp_ns, row), speed in zip(rows, speeds, strict=True):
+                self._writer.write(topics.WHEEL, WheelSample(stamp_ns, *row, speeds=speed), stamp_ns, pair.frame_id)
 
     def _static(self, stamp_ns: int) -> None:
         """Calibration and transforms of the rig, at the start and every second: players need them after seeking."""
@@ -192,10 +194,6 @@ class ImageLog:
         self._truth = None
 
 
-def _rows(samples: ImuSamples | WheelSamples) -> list[tuple[int, list[float]]]:
-    """(stamp, six numbers) per sample."""
-    if isinstance(samples, ImuSamples):
-        values = np.hstack([samples.gyro, samples.accel])
-    else:
-        values = np.hstack([samples.linear, samples.angular])
-    return list(zip(samples.stamp_ns.tolist(), values.tolist(), strict=True))
+def _rows(stamp_ns: I64, first: F64, second: F64) -> list[tuple[int, list[float]]]:
+    """(stamp, six numbers) per sample of two vectors (N, 3)."""
+    return list(zip(stamp_ns.tolist(), np.hstack([first, second]).tolist(), strict=True))

@@ -34,7 +34,7 @@ class MapView:
         self._recent = [*self._recent[1 - COVISIBLE_KEYFRAMES :], (keyframe.kf_id, keyframe.point_ids)]
 
     def loop(self, result: LoopResult) -> None:
-        """An answer of the loop closer."""
+        """A result of the loop closer."""
         if result.candidate_kf_id >= 0 and not result.reason:
             self._loops.append((result.candidate_kf_id, result.kf_id))
 

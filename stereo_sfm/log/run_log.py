@@ -42,7 +42,7 @@ TRAJECTORY_SIZE = 200  # keyframes
 POINTS_NS = 5_000_000_000
 POINTS_SIZE = 50_000
 PATH_COLOR = (70, 150, 255, 255)
-KEPT_STAMPS = 10_000  # of keyframes, whose answers may still come
+KEPT_STAMPS = 10_000  # of keyframes whose messages may still come
 OLD_TRACK = 30  # frames after which a track's colour no longer changes
 
 
@@ -100,12 +100,12 @@ class RunLog:
             ImageLog, rig=rig, ground_truth=ground_truth, image_format=image_format, mapped=True
         )
         self._begin(writer)
-        self._pictured = image_format != "none"  # else there is nothing to draw the tracked points on
+        self._has_images = image_format != "none"  # else there is nothing to draw the tracked points on
         self._map = MapView()
         self._map_T_odom: dict[int, F64] = {0: np.eye(4)}  # by map version
         self._version = 0
         self._frames: deque[tuple[Frame, Pose]] = deque()  # wait for the map version they used
-        self._answers: tuple[deque[MapUpdate], deque[LoopResult]] = (deque(), deque())  # wait for their keyframe
+        self._waiting: tuple[deque[MapUpdate], deque[LoopResult]] = (deque(), deque())  # wait for their keyframe
         self._updates: deque[MapUpdate] = deque()  # wait for their keyframe and its loop result, to be shown
         self._keyframes: dict[int, Keyframe] = {}
         self._stamps: dict[int, tuple[int, int]] = {}  # kf_id -> stamp and frame id
@@ -157,14 +157,14 @@ class RunLog:
 
     @_write.register
     def frame(self, frame: Frame) -> None:
-        """The tracker's answer."""
+        """A frame of the tracker."""
         self._totals["frames"] += 1
         self._totals["lost"] += frame.state in (TrackState.LOST, TrackState.OCCLUDED)
         write, stamp, sequence = self._writer.write, frame.stamp_ns, frame.frame_id
         write(topics.FRAME, frame, stamp, sequence)
         write(topics.STATS, track_stats(frame), stamp, sequence)
         obs = frame.observations
-        if self._pictured:
+        if self._has_images:
             dots = foxglove.point_annotations(stamp, obs.uv_left, age_colors(obs.age, obs.inlier))
             write(topics.FEATURES, dots, stamp, sequence)
         odom_T_body = frame.odom_T_cam @ self._left_T_body
@@ -184,14 +184,14 @@ class RunLog:
         self._stamps[keyframe.kf_id] = (keyframe.stamp_ns, keyframe.frame_id)
         if len(self._stamps) > KEPT_STAMPS:
             del self._stamps[next(iter(self._stamps))]
-        self._release_answers()
+        self._release_waiting()
         self._release_updates()
 
     @_write.register
     def map_update(self, update: MapUpdate) -> None:
         """The mapper's result."""
-        self._answers[0].append(update)
-        self._release_answers()
+        self._waiting[0].append(update)
+        self._release_waiting()
         self._totals["loops accepted"] -= len(update.refused_kf_ids)
         self._totals["loop candidates rejected"] += len(update.refused_kf_ids)
         self._updates.append(update)
@@ -205,8 +205,8 @@ class RunLog:
         """The loop closer's result."""
         self._totals["loops accepted"] += result.candidate_kf_id >= 0
         self._totals["loop candidates rejected"] += len(result.rejected)
-        self._answers[1].append(result)
-        self._release_answers()
+        self._waiting[1].append(result)
+        self._release_waiting()
         self._results[result.kf_id] = result
         self._release_updates()
 
@@ -234,7 +234,7 @@ class RunLog:
             return
         self._closed = True
         try:
-            self._release_answers(everything=True)
+            self._release_waiting(everything=True)
             self._release_updates(everything=True)
             self._release_frames(everything=True)
             if self._whole_map:
@@ -271,17 +271,17 @@ class RunLog:
         rows = (("map", "odom", correction), ("odom", "body", odom_pose))
         self._writer.write(topics.TF, foxglove.transforms(stamp, rows), stamp, sequence)
 
-    def _release_answers(self, everything: bool = False) -> None:
+    def _release_waiting(self, everything: bool = False) -> None:
         """Write the messages of the mapper and the loop closer with the stamp of their keyframe."""
-        for topic, queue in zip((topics.MAP_UPDATE, topics.LOOP), self._answers, strict=True):
+        for topic, queue in zip((topics.MAP_UPDATE, topics.LOOP), self._waiting, strict=True):
             while queue and (everything or queue[0].kf_id in self._stamps):
-                answer = queue.popleft()
-                stamps = self._stamps.get(answer.kf_id, self._last)
-                self._writer.write(topic, answer, *stamps)
-                if isinstance(answer, MapUpdate) and answer.calibration is not None:
-                    self._writer.write(topics.CALIBRATION, answer.calibration, *stamps)
-                if isinstance(answer, MapUpdate) and answer.row_errors is not None:
-                    self._writer.write(topics.ROW_ERRORS, answer.row_errors, *stamps)
+                message = queue.popleft()
+                stamps = self._stamps.get(message.kf_id, self._last)
+                self._writer.write(topic, message, *stamps)
+                if isinstance(message, MapUpdate) and message.calibration is not None:
+                    self._writer.write(topics.CALIBRATION, message.calibration, *stamps)
+                if isinstance(message, MapUpdate) and message.row_errors is not None:
+                    self._writer.write(topics.ROW_ERRORS, message.row_errors, *stamps)
 
     def _release_updates(self, everything: bool = False) -> None:
         while self._updates:

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from stereo_sfm.messages import Topic
+from stereo_sfm.types import F64
 
 
 @dataclass(frozen=True)
 class ImageInfo:
     """What belongs to an image besides its pixels; tells the reader which messages make the frame whole."""
+
+    TOPIC: ClassVar[Topic] = Topic("/image_info", "every image, before its pixels")
 
     frame_id: int
     stamp_ns: int
@@ -25,6 +33,8 @@ class ImageInfo:
 class ImuSample:
     """One inertial sample in the unit's own axes, NaN for what was not sampled."""
 
+    TOPIC: ClassVar[Topic] = Topic("/imu", "every sample")
+
     stamp_ns: int
     gyro_x: float  # rad/s
     gyro_y: float
@@ -36,7 +46,9 @@ class ImuSample:
 
 @dataclass(frozen=True)
 class WheelSample:
-    """One wheel odometry sample, body axes."""
+    """One wheel odometry sample, wheel axes; NaN velocities where only the wheels' speeds are known."""
+
+    TOPIC: ClassVar[Topic] = Topic("/wheel", "every sample")
 
     stamp_ns: int
     linear_x: float  # m/s
@@ -45,3 +57,4 @@ class WheelSample:
     angular_x: float  # rad/s
     angular_y: float
     angular_z: float
+    speeds: F64 = field(default_factory=lambda: np.zeros(0))  # (W,) rad/s of each wheel

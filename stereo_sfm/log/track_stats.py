@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
+from typing import ClassVar
 
 import numpy as np
 
+from stereo_sfm.messages import Topic
 from stereo_sfm.types import Frame
 
 NAN = float("nan")
@@ -14,6 +16,8 @@ NAN = float("nan")
 @dataclass(frozen=True)
 class TrackStats:
     """Statistics of one frame as flat numbers, which every viewer can plot; NaN where not available."""
+
+    TOPIC: ClassVar[Topic] = Topic("/stats", "every frame: flat numbers to plot")
 
     frame_id: int
     state: int

@@ -16,7 +16,15 @@ from stereo_sfm.loop.database import PlaceDatabase
 from stereo_sfm.loop.graph import KeyframeGraph
 from stereo_sfm.loop.keyframe_store import KeyframeStore
 from stereo_sfm.loop.place_view import PlaceView, place_view_of
-from stereo_sfm.loop.sideways import LEAST, SIDE_FACTOR, TURNED, Fronts, front_of, sideways_config, with_neighbours
+from stereo_sfm.loop.sideways import (
+    MIN_CORNERS,
+    SIDE_FACTOR,
+    TURNED,
+    Fronts,
+    front_of,
+    sideways_config,
+    with_neighbours,
+)
 from stereo_sfm.loop.verification import Verdict, looks_alike, rejection, verify, within
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.timing import NoSpans
@@ -157,7 +165,7 @@ class LoopCloser:
 
     def _side_candidates(self, keyframe: Keyframe, bag: voc.Bag, excluded: set[int]) -> list[Candidate]:
         """The keyframe that should have seen the same fronts, by odometry, and those whose views look most alike."""
-        if len(keyframe.sides) < LEAST:
+        if len(keyframe.sides) < MIN_CORNERS:
             return []
         scores = self._side_database.scores(bag)
         graph_ids, cam_T_kf = self._graph.around(keyframe.kf_id)

@@ -1,4 +1,4 @@
-"""Relocalization after a short loss of tracking in the newest keyframes, by the descriptors of their corners."""
+"""Relocalization in the newest keyframes after a short loss of tracking, by the descriptors of their corners."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from stereo_sfm.loop.verification import pair
 from stereo_sfm.types import F64, Keyframe
 
 NEWEST_KEYFRAMES = 12  # searched
-CANDIDATES = 2  # of them that are matched: those whose views should be most similar
+CANDIDATES = 2  # that are matched: those whose views should be most similar
 NEIGHBOURS = 2  # keyframes whose points are added to a candidate's own
 WINDOWS = 0.05, 0.12, 0.3  # radius of the search, as shares of the image's width
 PIXEL_SIGMA = 2.0  # px, of a corner matched from a distant view
 MIN_INLIERS, MIN_INLIER_SHARE = 12, 0.5  # of the matched corners
-METRES_PER_RADIAN = 2.0  # a translation that changes the view as much as a rotation by one radian
+METRES_PER_RADIAN = 2.0  # translation that changes the view as much as a rotation by one radian
 
 
 class RecentPlaces:

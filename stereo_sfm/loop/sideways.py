@@ -13,7 +13,7 @@ import numpy as np
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.types import F64, I64, Keyframe
 
-LEAST = 20  # corners of a keyframe with which a search is worth it
+MIN_CORNERS = 20  # corners of a keyframe with which a search is worth it
 APART = 1.0  # distance of two keyframes' fronts over the distance at which they see them: nearer ones overlap
 SIDE_FACTOR = 1.5  # times `side_inliers` where no odometry speaks for it
 TURNED = np.cos(np.deg2rad(60.0))  # of the optical axes of keyframes that only views to the side can compare
@@ -39,7 +39,7 @@ def with_neighbours(scores: F64) -> F64:
 def front_of(keyframe: Keyframe) -> F64:
     """(3,) middle of what the views of a keyframe show, in its camera; NaN without views."""
     points = keyframe.sides.points_cam
-    return np.median(points, axis=0).astype(np.float64) if len(points) >= LEAST else np.full(3, np.nan)
+    return np.median(points, axis=0).astype(np.float64) if len(points) >= MIN_CORNERS else np.full(3, np.nan)
 
 
 class Fronts:

@@ -50,7 +50,7 @@ def redundant_keyframe(map_: Map, newest: int, protected: Bool, config: MapperCo
     of several with the same view whose points are seen best by others: a view keeps `crowd_keyframes` keyframes.
 
     Args:
-        protected: (K,) keyframes that must stay (the first, those of loops, the newest ones).
+        protected: (K,) keyframes that must stay (the first and the newest ones).
     """
     if config.redundant_share > 1:
         return -1
@@ -59,8 +59,25 @@ def redundant_keyframe(map_: Map, newest: int, protected: Bool, config: MapperCo
     shares = _seen_by_others(map_, neighbours)
     if (shares > config.redundant_share).any():
         return int(neighbours[np.argmax(shares > config.redundant_share)])
-    same = np.flatnonzero(_same_view(map_, newest, neighbours))
-    return int(neighbours[same[np.argmax(shares[same])]]) if len(same) > config.crowd_keyframes else -1
+    same = np.union1d(neighbours[_same_view(map_, newest, neighbours)], _earlier_visits(map_, newest, protected))
+    if len(same) <= config.crowd_keyframes:
+        return -1
+    return int(same[np.argmax(_seen_by_others(map_, same))])
+
+
+def _earlier_visits(map_: Map, newest: int, protected: Bool) -> I64:
+    """Keyframes of the newest one's view from before the camera last came there, also if they share no point with it.
+
+    A visit does not recognise all points of the earlier ones. Without these keyframes a view would keep ever more.
+    """
+    living, submap = map_.living_keyframes(), map_.keyframes.submap_id
+    living = living[submap[living] == submap[newest]]
+    same = _same_view(map_, newest, living)
+    elsewhere = np.flatnonzero(~same)
+    if not len(elsewhere):
+        return np.zeros(0, np.int64)
+    earlier = living[: elsewhere[-1]][same[: elsewhere[-1]]]
+    return earlier[~protected[earlier]]
 
 
 def _seen_by_others(map_: Map, rows: I64) -> F64:

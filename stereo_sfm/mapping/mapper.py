@@ -270,6 +270,20 @@ class Mapper:
             loop, candidate_kf_id=ids[0], kf_id=ids[1], candidate_T_kf=candidate_T_kf, matches=matches
         )
 
+    def _carry_loops(self, culled_kf_id: int) -> None:
+        """Loops that end at a culled keyframe now end at its carrier: one for each pair, none where both ends coincide.
+
+        If they kept their ends alive, a robot that goes round and round would have ever more keyframes.
+        """
+        ends = {(x.candidate_kf_id, x.kf_id) for x in self._loops}
+        for loop in [x for x in self._loops if culled_kf_id in (x.candidate_kf_id, x.kf_id)]:
+            self._loops.remove(loop)
+            carried = self._between_living(loop)
+            pair = carried.candidate_kf_id, carried.kf_id
+            if pair[0] != pair[1] and pair not in ends:
+                ends.add(pair)
+                self._loops.append(carried)
+
     def _follow_newest(self, before: F64) -> None:
         """Move the odometry frame with the newest keyframe, whose map_T_kf was `before`."""
         moved = self.map.keyframes.map_T_kf[-1] @ se3.inverse(before)
@@ -349,6 +363,7 @@ class Mapper:
         if redundant >= 0:
             seen.append(self._seen_by(redundant))
             self.map.cull_keyframe(redundant)
+            self._carry_loops(int(self.map.keyframes.kf_id[redundant]))
         rows = np.unique(np.concatenate([self._adjusted, self._thin, *seen]))
         weak = culling.weak_points(self.map, self._rig, rows, row, self._config)
         self.map.cull_points(weak)
@@ -361,9 +376,8 @@ class Mapper:
         return self.map.observations.pt[self.map.observations_of_keyframe(row)].astype(np.int64)
 
     def _protected(self) -> Bool:
-        """(K,) keyframes that must stay: the first, the newest and the ends of loops."""
-        ends = [self.map.kf_row(k) for x in self._loops for k in (x.candidate_kf_id, x.kf_id)]
+        """(K,) keyframes that must stay: the first and the newest."""
         protected = np.zeros(len(self.map.keyframes), bool)
-        protected[[0, *ends]] = True
+        protected[0] = True
         protected[-RECENT:] = True
         return protected

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class AnyMapper(Protocol):
-    """What answers keyframes with map updates: the mapper, or the localizer in a finished map."""
+    """Turns keyframes into map updates: the mapper, or the localizer in a finished map."""
 
     def step(self, keyframe: Keyframe, loop: LoopResult | None = None) -> MapUpdate: ...
 
@@ -25,7 +25,7 @@ class AnyMapper(Protocol):
 
     @property
     def job_due(self) -> bool:
-        """Whether the next step applies the answer of the job in the background."""
+        """Whether the next step applies the result of the background job."""
         ...
 
     def pending_job(self) -> Job | None:
@@ -33,7 +33,7 @@ class AnyMapper(Protocol):
         ...
 
     def finish_job(self, result: BundleResult) -> None:
-        """The answer of the job that was taken last."""
+        """The result of the job that was taken last."""
         ...
 
     @property

@@ -3,8 +3,9 @@
 Every few keyframes with motion form a window (`mapping.rig_window`); the information of the windows about the six terms
 is summed. Terms are corrected that differ from the current ones by several standard deviations, that both halves of the
 windows (even and odd ones) confirm, and that exceed the systematic error of matching (`calib.choice`). A corrected term
-is refined whenever the number of windows has doubled, and at the end. If the newest windows contradict all earlier
-ones, the rig has changed (a knock, drift): the earlier windows are discarded, and the correction applies from there on.
+is refined as long as windows come, first whenever their number has doubled. Where the windows show drift (temperature),
+the terms at the newest window are used for the keyframes since the last revision. If the newest windows contradict all
+earlier ones, the rig has changed (a knock): earlier windows are discarded, and the correction applies from there on.
 """
 
 from __future__ import annotations
@@ -26,10 +27,13 @@ MIN_KEYFRAMES = 3  # of the last window
 MIN_MOTION = 0.02  # of the image's width: median motion of common points from one keyframe of a window to the next
 MAX_COMMON = 0.6  # share of common points below which a keyframe has moved in any case
 FIRST_WINDOWS = 4  # before the first correction
+MAX_BETWEEN = 4  # windows from one revision to the next: as many as there are, but no more
 MIN_WINDOWS = 2  # at the end of a run
-MAX_WINDOWS = 40  # used
+MAX_WINDOWS = 80  # used, the newest
 RECENT = 2  # windows that must contradict all others to indicate a step
 BEFORE_STEP = 4  # earlier windows needed to detect a step
+DRIFT_WINDOWS = 8  # needed to detect drift
+RATE = np.deg2rad(0.1) / 60.0  # prior standard deviation of drift, radians (ratio) per second
 SIGMAS = 5.0  # significance of the first correction of a term
 REFINED_SIGMAS = 2.5  # significance of its refinement
 MATCHING_PX = 0.02  # systematic error of matching
@@ -43,7 +47,7 @@ class Revision:
     terms: F64  # (6,) added to the calibrated rig
     covariance: F64  # (6, 6)
     since_kf_id: int  # first keyframe of the corrected rig
-    why: str  # "significant", "step", "refined"
+    why: str  # "significant", "step", "refined", "drift"
     text: str  # readable description
 
 
@@ -57,8 +61,8 @@ class SelfCalibration:
         self._corrected = np.zeros(TERMS, bool)
         self._keyframes: list[Keyframe] = []
         self._windows: deque[RigWindow] = deque(maxlen=MAX_WINDOWS)  # since the last step
-        self._since = 0  # keyframe of the last step
-        self._due = FIRST_WINDOWS
+        self._since = 0  # first keyframe of the windows
+        self._until_due = FIRST_WINDOWS  # windows until the next revision
         self._stepped = False  # a step was detected and is not yet corrected
         half_width = 0.5 * rig.left.width
         turn = MATCHING_PX / rig.left.fx
@@ -74,8 +78,7 @@ class SelfCalibration:
         self._keyframes.append(keyframe)
         if len(self._keyframes) < KEYFRAMES or not self._close_window():
             return None
-        due = len(self._windows) >= self._due or self._stepped
-        return self._revise() if due else None
+        return self._revise() if self._until_due <= 0 or self._stepped else None
 
     @staticmethod
     def wanted(config: Config, rig: Rig) -> SelfCalibration | None:
@@ -103,28 +106,53 @@ class SelfCalibration:
         window = solve_window(self._rig, self._keyframes, self.terms)
         self._keyframes = []
         if window is not None:
+            if len(self._windows) == MAX_WINDOWS:
+                self._since = self._windows[1].first_kf_id
             self._windows.append(window)
+            self._until_due -= 1
             self._detect_step()
         return window is not None
 
     def _revise(self) -> Revision | None:
         windows = list(self._windows)
+        drifts = self._drifts(windows)
+        parts = [windows, windows[::2], windows[1::2]]
+        whole, *halves = [self._at_the_end(part, windows)[0] if drifts else self.estimate(part) for part in parts]
         sigmas = np.where(self._corrected, REFINED_SIGMAS, SIGMAS)
-        choice = choose(
-            self.estimate(windows),
-            [self.estimate(windows[half::2]) for half in (0, 1)],
-            self._rig.readout_s > 0,
-            sigmas,
-        )
-        self._due = max(self._due, 2 * len(windows))
+        choice = choose(whole, halves, self._rig.readout_s > 0, sigmas)
+        since = windows[-min(MAX_BETWEEN, len(windows))].first_kf_id if drifts else self._since
+        self._until_due = min(len(windows), MAX_BETWEEN)
         if not choice.written.any():
             return None
-        why = "step" if self._stepped else "refined" if self._corrected[choice.written].all() else "significant"
+        why = "drift" if drifts else "refined" if self._corrected[choice.written].all() else "significant"
+        why = "step" if self._stepped else why
         self.terms = self.terms + choice.value
         self._corrected |= choice.written
         self._stepped = False
-        whole = self.estimate(windows)
-        return Revision(self.terms.copy(), whole.covariance, self._since, why, _text(choice))
+        return Revision(self.terms.copy(), whole.covariance, since, why, _text(choice))
+
+    def _drifts(self, windows: Sequence[RigWindow]) -> bool:
+        """Whether the terms change steadily over the windows."""
+        if len(windows) < DRIFT_WINDOWS:
+            return False
+        whole, *halves = [self._at_the_end(part, windows)[1] for part in (windows, windows[::2], windows[1::2])]
+        return bool(choose(whole, halves, self._rig.readout_s > 0, SIGMAS).written.any())
+
+    def _at_the_end(self, windows: Sequence[RigWindow], span: Sequence[RigWindow]) -> tuple[Estimate, Estimate]:
+        """Of terms that change steadily: their change at the end of `span`, and that from its beginning to its end."""
+        seconds = (span[-1].stamp_ns - span[0].stamp_ns) * 1e-9
+        matrix = np.kron(np.diag([1.0, 0.0]), np.diag(1 / PRIOR**2))
+        matrix += np.kron(np.diag([0.0, 1.0]), np.eye(TERMS) / (RATE * seconds) ** 2)
+        vector = np.concatenate([self.terms / PRIOR**2, np.zeros(TERMS)])
+        for window in windows:
+            axis = np.array([1.0, (window.stamp_ns - span[-1].stamp_ns) * 1e-9 / seconds])
+            matrix += np.kron(np.outer(axis, axis), window.information.matrix)
+            vector += np.kron(axis, window.information.vector)
+        covariance = np.asarray(np.linalg.inv(matrix), float)
+        end, change = np.split(covariance @ vector, 2)
+        floor = np.diag(self._floor**2)
+        end_covariance, change_covariance = covariance[:TERMS, :TERMS] + floor, covariance[TERMS:, TERMS:] + 2 * floor
+        return Estimate(end - self.terms, end_covariance), Estimate(change, change_covariance)
 
     def _detect_step(self) -> None:
         windows = list(self._windows)
@@ -135,7 +163,7 @@ class SelfCalibration:
         change = [_difference(self.estimate(part), base) for part in (recent, recent[:1], recent[1:])]
         if choose(change[0], change[1:], self._rig.readout_s > 0, SIGMAS).written.any():
             self._windows = deque(recent, maxlen=MAX_WINDOWS)
-            self._since, self._due, self._stepped = recent[0].first_kf_id, FIRST_WINDOWS, True
+            self._since, self._stepped = recent[0].first_kf_id, True
 
 
 def _difference(after: Estimate, before: Estimate) -> Estimate:

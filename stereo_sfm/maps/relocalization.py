@@ -14,7 +14,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.loop.cloud import Cloud, gather
 from stereo_sfm.loop.database import PlaceDatabase
 from stereo_sfm.loop.place_view import place_view_of
-from stereo_sfm.loop.sideways import LEAST, SIDE_FACTOR, Fronts, front_of, sideways_config, with_neighbours
+from stereo_sfm.loop.sideways import MIN_CORNERS, SIDE_FACTOR, Fronts, front_of, sideways_config, with_neighbours
 from stereo_sfm.loop.verification import Verdict, verify, verify_near, within
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.mapping.map import MapSnapshot
@@ -31,10 +31,10 @@ class Location:
     """The result; `reason` is empty when the camera was found."""
 
     reason: str  # "", "no_candidate", "ambiguous", or why the best candidate failed
-    map_T_cam: F64  # (4, 4)
-    information: F64  # (6, 6) of map_T_cam @ exp(xi)
+    map_T_cam: F64  # (4, 4) pose in the map, metres; identity when not found
+    information: F64  # (6, 6) inverse covariance of map_T_cam @ exp(xi), xi = (translation, rotation): m^-2, rad^-2
     kf_id: int  # matched keyframe of the map, -1: none
-    inliers: int
+    inliers: int  # corners that agree on the pose
     pairs: I64  # (M, 2) point ids of the map and of the camera
     confident: bool = False  # far more inliers than required
 
@@ -78,7 +78,7 @@ class Relocalizer:
     def locate(self, keyframe: Keyframe) -> Location:
         """Find the camera of a keyframe (its pose is ignored) in the map, if need be from another direction."""
         ahead = self._search(keyframe, False)
-        if ahead.found or len(keyframe.sides) < LEAST:
+        if ahead.found or len(keyframe.sides) < MIN_CORNERS:
             return ahead
         beside = self._search(keyframe, True)
         return beside if beside.found else ahead
@@ -105,7 +105,7 @@ class Relocalizer:
     def locate_near(self, keyframe: Keyframe, guess: F64) -> Location:
         """As `locate`, but only around a predicted map_T_cam (4, 4)."""
         ahead = self._search_near(keyframe, guess, self._nearest(guess), False)
-        if ahead.found or len(keyframe.sides) < LEAST:
+        if ahead.found or len(keyframe.sides) < MIN_CORNERS:
             return ahead
         rows = self._fronts.turned(front_of(keyframe), se3.inverse(guess) @ self._map.map_T_kf)
         beside = self._search_near(keyframe, guess, rows[0], True) if len(rows) else ahead

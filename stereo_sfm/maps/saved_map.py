@@ -43,9 +43,9 @@ _FILES: dict[str, tuple[str, ...]] = {
 class SavedMap:
     """A map with everything needed to use it again."""
 
-    snapshot: MapSnapshot
-    rig: Rig
-    vocabulary_id: str
+    snapshot: MapSnapshot  # keyframes, points and observations
+    rig: Rig  # calibration of the camera that mapped
+    vocabulary_id: str  # of the visual words that its keyframes are found by
     sessions: I64  # (K,) session of each keyframe: 0, 1, ...
 
     def __len__(self) -> int:

@@ -16,4 +16,6 @@ def still_keyframe(
     """The keyframe of a tracker that starts at this image (pose identity); None with too few points."""
     config = config or Config()
     config = dataclasses.replace(config, tracker=dataclasses.replace(config.tracker, max_features=max_features))
-    return make_tracker(config, rig).step(image)[1]
+    tracker = make_tracker(config, rig)
+    keyframe = tracker.step(image)[1]
+    return None if keyframe is None else tracker.describe(keyframe)

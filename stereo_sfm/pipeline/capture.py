@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 
 from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.checked_samples import checked_samples
 from stereo_sfm.drivers.source import Source
 from stereo_sfm.pipeline.channels import End, Outbox
 from stereo_sfm.pipeline.health import HealthMeter
@@ -75,22 +76,22 @@ class FreeSlots:
             back: set[int] = {connection.recv()}
             self._holds[connection] -= back
         except (EOFError, OSError):
-            back = self._holds.pop(connection)  # nobody reads the slots of a dead reader any more
+            back = self._holds.pop(connection)  # a dead reader reads its slots no more
         self._free.extend(sorted(k for k in back if not any(k in held for held in self._holds.values())))
 
 
 class StopFlag:
     """Set by a thread when main sends stop or has ended."""
 
-    def __init__(self, control: Connection, asked: bool = False) -> None:
-        self.asked = asked
+    def __init__(self, control: Connection, requested: bool = False) -> None:
+        self.requested = requested
         self._control = control
         threading.Thread(target=self._wait, daemon=True).start()
 
     def _wait(self) -> None:
         with contextlib.suppress(EOFError, OSError):
             self._control.recv()
-        self.asked = True
+        self.requested = True
 
 
 @dataclass
@@ -120,7 +121,7 @@ class CaptureStage:
     def _read(self) -> None:
         meter = HealthMeter("capture", self.to_main.send)
         for image in self._images():
-            if self.stop.asked:
+            if self.stop.requested:
                 break
             begin = time.monotonic()
             drop = sensor_drop(image)
@@ -141,7 +142,7 @@ class CaptureStage:
 
     def _images(self) -> Iterator[StereoImage]:
         """The images of the source; the watchdog measures how long each takes."""
-        images = iter(self.source)
+        images = checked_samples(self.source)
         while True:
             self.pulse.begin()
             image = next(images, None)

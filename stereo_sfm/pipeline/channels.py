@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import queue
 import threading
 from collections import deque
@@ -71,17 +72,54 @@ class Outbox:
         self._connection.close()
 
     def _work(self) -> None:
-        gone = False
+        closed = False
         while (item := self._queue.get()) is not None:
-            if not gone:
+            if not closed:
                 try:
                     self._connection.send(item[0])
                 except OSError:
-                    gone = True  # the reader died: main ends the run; nobody waits for these messages
+                    closed = True  # the reader died: main ends the run, and nothing waits for these messages
 
 
-class DroppingOutbox:
-    """As `Outbox`, but `send` never blocks: when too many wait, the oldest is dropped (a slow or closed viewer)."""
+class DroppingQueue(Generic[T]):
+    """Messages for a handler in a thread of its own: `put` never blocks, the oldest are dropped when too many wait."""
+
+    def __init__(self, handle: Callable[[T], object], limit: int, name: str | None = None) -> None:
+        """Args: handle, takes one message after the other; limit, most messages that wait; name, of the thread."""
+        self._handle = handle
+        self._waiting: deque[T] = deque(maxlen=limit)
+        self._more = threading.Semaphore(0)
+        self._closing = False
+        self._thread = threading.Thread(target=self._work, name=name, daemon=True)
+        self._thread.start()
+
+    def put(self, message: T) -> None:
+        """Queue a message, which may be dropped later."""
+        self._waiting.append(message)
+        self._more.release()
+
+    def close(self) -> None:
+        """End after the messages that wait; returns at once."""
+        self._closing = True
+        self._more.release()
+
+    def join(self, timeout_s: float) -> bool:
+        """After `close`: wait for the handler; False if it is still busy, or this is its own thread."""
+        if self._thread is not threading.current_thread():
+            self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def _work(self) -> None:
+        while True:
+            self._more.acquire()
+            if self._waiting:
+                self._handle(self._waiting.popleft())
+            elif self._closing:
+                return
+
+
+class DroppingOutbox(DroppingQueue[object]):
+    """As `Outbox`, but sending never blocks: when too many messages wait, the oldest is dropped (a slow viewer)."""
 
     def __init__(
         self,
@@ -89,32 +127,17 @@ class DroppingOutbox:
         limit: int = 256,
         write: Callable[[Connection, Any], None] = Connection.send,
     ) -> None:
-        """Args: limit, most messages that wait; write, puts one into the pipe (`Connection.send_bytes` for bytes)."""
-        self._connection, self._write = connection, write
-        self._waiting: deque[object] = deque(maxlen=limit)
-        self._more = threading.Semaphore(0)
-        self._closing = False
-        self._thread = threading.Thread(target=self._work, daemon=True)
-        self._thread.start()
+        """Args: write, puts a message into the pipe (`Connection.send_bytes` for bytes); others as `DroppingQueue`."""
+        self._connection = connection
+        super().__init__(functools.partial(write, connection), limit)
 
     def send(self, message: object) -> None:
         """Queue a message, which may be dropped later."""
-        self._waiting.append(message)
-        self._more.release()
-
-    def close(self) -> None:
-        """Send what waits, then close the pipe, without waiting for it."""
-        self._closing = True
-        self._more.release()
+        self.put(message)
 
     def _work(self) -> None:
-        with contextlib.suppress(OSError):
-            while True:
-                self._more.acquire()
-                if self._waiting:
-                    self._write(self._connection, self._waiting.popleft())
-                elif self._closing:
-                    break
+        with contextlib.suppress(OSError):  # the reader has ended
+            super()._work()
         self._connection.close()
 
 
@@ -136,5 +159,5 @@ class Inbox(Generic[T]):
             raise Lost from None
 
     def ready(self) -> bool:
-        """Whether a message is there: only the realtime schedule asks."""
+        """Whether a message is there: for the realtime schedule."""
         return self.connection.poll(0)

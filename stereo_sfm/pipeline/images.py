@@ -29,7 +29,7 @@ _NO_PIXELS = np.zeros((0, 0), np.uint8)
 
 @dataclass(frozen=True)
 class ImageLayout:
-    """Where the images of a slot lie; shapes are (H, W)."""
+    """Layout of the images of a slot; shapes are (H, W)."""
 
     left: tuple[int, int]
     right: tuple[int, int] | None
@@ -56,7 +56,7 @@ def _area(shape: tuple[int, int] | None) -> int:
 
 @dataclass(frozen=True, eq=False)
 class SlotImage:
-    """A StereoImage whose pixels lie in a slot, with the time it was taken from the driver (for latency)."""
+    """A StereoImage whose pixels are in a slot, with the time it was taken from the driver (for latency)."""
 
     slot: int
     image: StereoImage  # without pixels
@@ -93,7 +93,7 @@ class ImageRing:
         except OSError as error:
             raise StereoSfmError(
                 f"{SHARED} has no room for {self.slots} images ({size / 1e6:.0f} MB): {error.strerror}; make it larger "
-                "(docker: --shm-size), take --set pipeline.ring_slots=2, or --inline"
+                "(docker: --shm-size), use --set pipeline.ring_slots=2, or --inline"
             ) from None
         return memory
 
@@ -159,7 +159,7 @@ def _allocate(memory: shared_memory.SharedMemory, descriptor: int, size: int) ->
 
 
 def remove_abandoned(folder: Path = SHARED, min_age_s: float = MIN_AGE_S) -> None:
-    """Remove the rings of runs that were killed with all their processes: nobody holds their lock any more."""
+    """Remove the rings of runs that were killed with all their processes: their lock is free."""
     for path in sorted(folder.glob(f"{PREFIX}*")):
         with contextlib.suppress(OSError):  # of another user, or in use
             if time.time() - path.stat().st_mtime < min_age_s:

@@ -6,7 +6,9 @@ import contextlib
 import queue
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any
 
 from stereo_sfm.errors import StereoSfmError
@@ -15,10 +17,18 @@ from stereo_sfm.log.run_log import LeftOut, RunLog
 from stereo_sfm.log.writer import LogWriter
 from stereo_sfm.messages import LogEnded
 from stereo_sfm.pipeline.channels import End, Inbox, Lost, Outbox
+from stereo_sfm.pipeline.child import Report, Setup, prepare
 from stereo_sfm.pipeline.images import ImageLayout, ImageRing, SlotImage
-from stereo_sfm.pipeline.workers import LogOptions, Report, Setup, prepare
 
 BACKLOG = 96  # messages, about a third of them images, that wait in this process for a slow disk
+
+
+@dataclass(frozen=True)
+class LogOptions:
+    """The file of a run's log and what it contains."""
+
+    path: Path
+    image_format: str = "png"  # png | raw | jpeg | none
 
 
 class LogSink:

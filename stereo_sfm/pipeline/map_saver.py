@@ -1,4 +1,4 @@
-"""Saves the map while the run goes on: the mapper takes a copy between two keyframes, a thread writes it."""
+"""Saves the map during the run: the mapper takes a copy between two keyframes, a thread writes it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.mapping.protocol import AnyMapper
 from stereo_sfm.maps.folders import saved_map_of
 from stereo_sfm.maps.saved_map import SavedMap
-from stereo_sfm.messages import MapSaved, Relocalize
+from stereo_sfm.messages import MapSaved, Relocalize, SaveMap
 from stereo_sfm.pipeline.channels import End, Inbox
 from stereo_sfm.types import Keyframe, LoopResult
 
@@ -21,20 +21,20 @@ NICE = 10  # of the thread that writes, where the system has priorities of threa
 
 
 class MapSaver:
-    """Answers main's requests to save the map between the mapper's steps, so that they change nothing in the map."""
+    """Handles main's requests to save the map between the mapper's steps, so that they change nothing in the map."""
 
     def __init__(self, mapper: AnyMapper, config: Config, send: Callable[[MapSaved], object]) -> None:
         self._mapper, self._config, self._send = mapper, config, send
         self._thread: threading.Thread | None = None
-        self._listening = True
+        self._requests_open = True
         self.changed = False  # since the last request
 
     def next(self, inbox: Inbox[Keyframe | End], control: Connection) -> Keyframe | End:
-        """The next keyframe; requests that arrive before it are answered."""
-        while self._listening:
+        """The next keyframe; requests that arrive before it are handled."""
+        while self._requests_open:
             ready = wait([control, inbox.connection])
             if control in ready:
-                self._answer(control)
+                self._handle(control)
             elif ready:
                 break
         return inbox.take()
@@ -42,38 +42,39 @@ class MapSaver:
     def finish(self, folder: Path | None) -> None:
         """After the last keyframe: save what changed since the last request, and wait until everything is written."""
         if folder is not None and self.changed:
-            self._save(folder)
+            self._save(SaveMap(folder, urgent=True))
         self._join()
 
     def _join(self) -> None:
         if self._thread is not None:
             self._thread.join()
 
-    def _answer(self, control: Connection) -> None:
+    def _handle(self, control: Connection) -> None:
         try:
-            request: Path | Relocalize = control.recv()
+            request: SaveMap | Relocalize = control.recv()
         except (EOFError, OSError):
-            self._listening = False
+            self._requests_open = False
             return
         if isinstance(request, Relocalize):
             self._mapper.relocalize()
         else:
             self._save(request)
 
-    def _save(self, folder: Path) -> None:
+    def _save(self, request: SaveMap) -> None:
         self._join()
         self.changed = False
         saved, place = saved_map_of(self._mapper, self._config), self._mapper.place()
         if saved is None:
-            self._send(MapSaved(str(folder), 0, "nothing is mapped yet"))
+            self._send(MapSaved(str(request.folder), 0, "nothing is mapped yet"))
             return
-        self._thread = threading.Thread(target=self._write, args=(saved, place, folder))
+        self._thread = threading.Thread(target=self._write, args=(saved, place, request))
         self._thread.start()
 
-    def _write(self, saved: SavedMap, place: LoopResult | None, folder: Path) -> None:
+    def _write(self, saved: SavedMap, place: LoopResult | None, request: SaveMap) -> None:
         from stereo_sfm.maps.unfinished import save_session
 
-        if hasattr(os, "setpriority"):
+        folder = request.folder
+        if hasattr(os, "setpriority") and not request.urgent:
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
         try:
             save_session(saved, place, folder)

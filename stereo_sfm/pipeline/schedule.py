@@ -22,7 +22,7 @@ class Schedule(Protocol):
 
 
 class Lockstep:
-    """The update of a keyframe at frame f is applied just before frame f + lag, whoever computed it and when."""
+    """The update of a keyframe at frame f is applied just before frame f + lag, wherever and whenever computed."""
 
     def __init__(self, lag_frames: int) -> None:
         self._lag = max(lag_frames, 1)

@@ -19,9 +19,10 @@ from stereo_sfm.maps.folders import MapFolders
 from stereo_sfm.messages import Compiling, LogEnded, Sink
 from stereo_sfm.pipeline.capture import SourceInfo
 from stereo_sfm.pipeline.inline import run_inline
+from stereo_sfm.pipeline.logger import LogOptions
 from stereo_sfm.pipeline.processes import ProcessRun
 from stereo_sfm.pipeline.schedule import Recorded
-from stereo_sfm.pipeline.workers import LogOptions, ViewerOptions
+from stereo_sfm.pipeline.viewer import ViewerOptions
 from stereo_sfm.types import Dropped, Frame
 from stereo_sfm.viz.server import LOOPBACK
 
@@ -37,7 +38,7 @@ class Wiring:
     """How the stages run, and what is logged and shown."""
 
     inline: bool = False
-    mode: str | None = None  # lockstep | realtime; None: as the source says
+    mode: str | None = None  # lockstep | realtime; None: by the source
     log: str | None = None  # full | lean | none; None: full for devices, lean for recordings
     image_format: str | None = None  # of a full log; None: raw for devices, else png
     viz: str = "none"  # none | spawn | serve | save
@@ -186,7 +187,7 @@ class Session:
                 LogWriter(options.path, compress=options.image_format != "raw"), source.rig, self._config,
                 source=self._opener.spec or source.name, mode="inline",
                 image_format=options.image_format, ground_truth=source.ground_truth,
-                opening=self._folders.opening(self._opener.opening),
+                opening=self._folders.opening(self._opener.opening(source.rig)),
             )  # fmt: skip
             sink = LogSink(run_log, lambda ended: self._log_ended(ended, sinks))
             stack.callback(sink.close)

@@ -59,7 +59,7 @@ def source_counters(source: Source, frame_id: int) -> SourceCounters | None:
 
 
 class AnyCloser(Protocol):
-    """What answers keyframes with loop results."""
+    """Computes the loop results of keyframes."""
 
     def step(self, keyframe: Keyframe) -> LoopResult: ...
 
@@ -72,7 +72,7 @@ class TrackStage:
         self._index = 0
 
     def step(self, image: StereoImage) -> Iterator[Applied | Frame | Keyframe]:
-        """Apply the updates that are due, then track."""
+        """Apply the updates that are due, then track; the keyframe is described after its frame was taken."""
         for update in self._take(self._schedule.due(self._index, image.frame_id)):
             self._tracker.apply(update)
             yield Applied(update.version, image.frame_id, image.stamp_ns)
@@ -82,7 +82,7 @@ class TrackStage:
         self._index += 1
         yield frame
         if keyframe is not None:
-            yield keyframe
+            yield self._tracker.describe(keyframe)
 
     def _take(self, count: int | None) -> Iterator[MapUpdate]:
         if count is None:
@@ -102,7 +102,7 @@ class MapStage:
         self._taken = self._count = 0
 
     def step(self, keyframe: Keyframe) -> MapUpdate:
-        """Answer one keyframe."""
+        """The loop result of one keyframe."""
         loop = None
         if self._loops is not None and self._count >= self._lag:
             loop = self._loops.take()

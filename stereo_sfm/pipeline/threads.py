@@ -28,7 +28,7 @@ def limited_threads(threads: int) -> Generator[None]:
 
 @contextmanager
 def thread_environment(threads: int) -> Generator[None]:
-    """Limit the threads of processes started in the `with` block, whatever the environment says."""
+    """Limit the threads of processes started in the `with` block, regardless of the environment."""
     before = {variable: os.environ.get(variable) for variable in VARIABLES}
     os.environ.update(dict.fromkeys(VARIABLES, str(threads)))
     try:

@@ -7,44 +7,64 @@ import dataclasses
 
 import numpy as np
 
+from stereo_sfm.calib.imu import Imu
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
+from stereo_sfm.geometry.preintegration import GRAVITY
 from stereo_sfm.pipeline.stages import make_closer
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.tracking.factory import make_tracker
-from stereo_sfm.types import F64, U8, Corners, Keyframe, StereoImage
+from stereo_sfm.tracking.flow.coarse_rotation import CoarseRotation
+from stereo_sfm.tracking.flow.klt import FLAT_SIZE, build_pyramid
+from stereo_sfm.tracking.flow.reappearance import find_deformed
+from stereo_sfm.tracking.inertial.inertial_motion import NODE_NS, InertialMotion
+from stereo_sfm.tracking.inertial.window import MIN_S
+from stereo_sfm.types import F64, U8, Corners, ImuSamples, Keyframe, StereoImage
 
 FRAMES, POINTS = 8, 300
 WALL = 2.0  # metres ahead
+MOVED_PX = 12.0  # of the left half of the wall in the last image
 
 
 def images(rig: Rig) -> list[StereoImage]:
-    """A stereo pair passing a wall of grey squares: enough for points, matches and keyframes in any camera."""
+    """A stereo pair passing a wall of grey squares: enough for points, matches and keyframes in any camera.
+
+    In the last image half of the wall has moved: a second motion.
+    """
     rng = np.random.default_rng(0)
     texture = np.kron(rng.integers(20, 230, (64, 64)), np.ones((8, 8))).astype(np.uint8)
+    left_rays = _rays(rig.left)
+    right_rays = None if rig.right is None or rig.depth else _rays(rig.right)
     out: list[StereoImage] = []
     for k in range(FRAMES):
         world_T_left = se3.exp(np.array([0.03 * k, 0.0, 0.02 * k, 0.0, 0.002 * k, 0.0]))
-        left = _wall(rig.left, world_T_left, texture)
+        moved = (k == FRAMES - 1) * MOVED_PX * WALL / rig.left.fx
+        left = _wall(left_rays, world_T_left, texture, moved)
         right, depth = None, None
         if rig.depth:
             depth = np.full(left.shape, WALL, np.float32)
-        elif rig.right is not None:
-            right = _wall(rig.right, world_T_left @ rig.left_T_right, texture)
+        elif right_rays is not None:
+            right = _wall(right_rays, world_T_left @ rig.left_T_right, texture, moved)
         out.append(StereoImage(k, 1 + k * 33_000_000, left, right, depth))
     return out
 
 
-def _wall(camera: Camera, world_T_cam: F64, texture: U8) -> U8:
-    """Image of the plane z = WALL covered by `texture` with one centimetre per pixel."""
+def _rays(camera: Camera) -> F64:
+    """(H, W, 3) the bearing of each pixel: some camera models take a second for an image."""
     grid = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), -1).reshape(-1, 2)
-    ray = camera.unproject(grid.astype(float)) @ world_T_cam[:3, :3].T
+    return camera.unproject(grid.astype(float)).reshape(camera.height, camera.width, 3)
+
+
+def _wall(rays: F64, world_T_cam: F64, texture: U8, moved: float = 0.0) -> U8:
+    """Image of the plane z = WALL covered by `texture` with one centimetre per pixel, its left half `moved` upwards."""
+    ray = rays.reshape(-1, 3) @ world_T_cam[:3, :3].T
     with np.errstate(invalid="ignore", divide="ignore"):
         place = world_T_cam[:3, 3] + ray * ((WALL - world_T_cam[2, 3]) / ray[:, 2:])
+        place[:, 1] += np.where(place[:, 0] < 0, moved, 0.0)
         cell = np.where(ray[:, 2:] > 0.05, place[:, :2] * 100, 0).astype(np.int64) % len(texture)
-    return np.ascontiguousarray(texture[cell[:, 1], cell[:, 0]].reshape(camera.height, camera.width))
+    return np.ascontiguousarray(texture[cell[:, 1], cell[:, 0]].reshape(rays.shape[:2]))
 
 
 def keyframes(rig: Rig) -> list[Keyframe]:
@@ -72,6 +92,28 @@ def keyframes(rig: Rig) -> list[Keyframe]:
     return out
 
 
+def warm_up_fast_motion(config: Config, rig: Rig, image: U8) -> None:
+    """What the default tracker does where a prediction fails or it is lost, and with inertial samples."""
+    if config.odometry.method != "flow":
+        return
+    pyramid = build_pyramid(image, config.tracker.pyramid_levels)
+    CoarseRotation(rig.left, config.tracker.pyramid_levels).align(pyramid, pyramid, np.eye(3))
+    uv, warps, patches = np.zeros((1, 2)), np.tile(np.eye(2), (1, 1, 1, 1)), np.zeros((1, FLAT_SIZE), np.float32)
+    find_deformed(pyramid[1], uv, warps, np.zeros(1, np.int64), patches, 1, 1, uv.copy(), warps[0].copy())
+    if rig.imu is not None and config.tracker.inertial:
+        _warm_up_inertial(rig.imu)
+
+
+def _warm_up_inertial(imu: Imu) -> None:
+    """At rest until the window is long enough for an estimate."""
+    motion, times = InertialMotion(imu), np.arange(1, 11) * (NODE_NS // 10)
+    motion.begin(0, np.eye(4))
+    for at in range(0, round(MIN_S * 1e9) + NODE_NS, NODE_NS):
+        resting = np.tile([0.0, -GRAVITY, 0.0], (len(times), 1))
+        motion.feed(ImuSamples(at + times, np.zeros((len(times), 3)), resting))
+        motion.accept(at + NODE_NS, np.eye(4))
+
+
 def warm_up_stage(stage: str, config: Config, rig: Rig) -> None:
     """Load (the first time ever: compile) what `stage` calls, on a scratch instance of it."""
     from stereo_sfm.calib.choice import TERMS
@@ -82,8 +124,12 @@ def warm_up_stage(stage: str, config: Config, rig: Rig) -> None:
 
     if stage == "tracker":
         tracker = make_tracker(config, rig)
-        for image in images(rig):
-            tracker.step(image)
+        seen = images(rig)
+        for image in seen:
+            keyframe = tracker.step(image)[1]
+            if keyframe is not None:
+                tracker.describe(keyframe)
+        warm_up_fast_motion(config, rig, seen[-1].left)
     elif stage == "mapper" and rig.stereo:
         mapper = Mapper(config.mapper, rig, NoSpans(), config.loop)
         for keyframe in keyframes(rig):

@@ -68,22 +68,22 @@ class Watchdog:
         self._pids, self._report = dict(pids), report
         self._limit_s = SILENT_S if silent_s is None else silent_s
         now = time.monotonic()
-        self._heard = dict.fromkeys(pids, now)
+        self._received_s = dict.fromkeys(pids, now)
         self._computed = dict.fromkeys(pids, 0.0)  # processor seconds
         self._reported: dict[str, float] = {}  # start of each reported silence
         self._long: set[str] = set()
 
     def received(self, stage: str, message: object) -> None:
         """Take any message of a process."""
-        if stage in self._heard:
-            self._heard[stage] = time.monotonic()
+        if stage in self._received_s:
+            self._received_s[stage] = time.monotonic()
             if isinstance(message, Heartbeat):
                 self._computed[stage] = _status(self._pids[stage])[1]
                 self._judge_step(message)
 
     def excuse(self, seconds: float) -> None:
         """Ignore a time in which main did not receive messages."""
-        self._heard = {stage: heard + seconds for stage, heard in self._heard.items()}
+        self._received_s = {stage: at + seconds for stage, at in self._received_s.items()}
 
     def silent(self, stages: Iterable[str]) -> list[str]:
         """The stages that do not respond; the beginning and the end of each silence are reported."""
@@ -99,22 +99,22 @@ class Watchdog:
     def _silent_s(self, stage: str, now: float) -> float:
         """Seconds of silence; a process that computes is not silent, even if a library blocks its other threads.
 
-        Nor is it while one of its pages is read: what it has computed since the last look counts, not where it is now.
+        Nor is it while one of its pages is read: its processor time since the last check counts, not its state now.
         """
-        if now - self._heard[stage] > self._limit_s:
+        if now - self._received_s[stage] > self._limit_s:
             state, computed = _status(self._pids[stage])
             busy = computed > self._computed[stage] or _runnable(self._pids[stage])
             if busy and state not in STOPPED:
-                self._computed[stage], self._heard[stage] = computed, now
-        return now - self._heard[stage]
+                self._computed[stage], self._received_s[stage] = computed, now
+        return now - self._received_s[stage]
 
     def _report_silence(self, stage: str, now: float) -> None:
         if stage in self._reported:
             return
-        self._reported[stage] = self._heard[stage]
+        self._reported[stage] = self._received_s[stage]
         why = PROCESS_STATES.get(_status(self._pids[stage])[0], "")
         self._report(
-            f"the {stage} has not responded for {now - self._heard[stage]:.0f} s" + (f": {why}" if why else "")
+            f"the {stage} has not responded for {now - self._received_s[stage]:.0f} s" + (f": {why}" if why else "")
         )
 
     def _judge_step(self, beat: Heartbeat) -> None:

@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 
 from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.folder_source import FolderSource
+from stereo_sfm.drivers.source import Source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
@@ -20,10 +22,15 @@ from stereo_sfm.log.attached import attached_rig
 from stereo_sfm.log.provenance import CONFIG_FILE, ENDED_EARLY, METADATA, TOTALS, config_hash
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.recorded import messages
-from stereo_sfm.types import I64
+from stereo_sfm.pixels import DARK
+from stereo_sfm.types import F64, I64, StereoImage
 
 log = logging.getLogger("stereo_sfm")
 
+SAMPLED = 9  # frames whose pixels are looked at
+NO_LIGHT = f"no pixel brighter than {DARK} grey levels: more light, a longer exposure, a covered lens?"
+NO_CONTRAST = "an image of one even grey: a covered lens?"
+LEAST_CONTRAST = 8  # grey levels between the darkest and the brightest pixel of an image that shows something
 GAP = 1.5  # periods without a frame that count as a gap
 MAX_SKEW_MS = 1.0  # between the cameras, above which tracking degrades
 MAX_JITTER = 0.2  # of the period
@@ -212,11 +219,39 @@ def _describe_source(out: Description, spec: str | Path, rig: Path | None) -> No
         out.images = rate_of(stamps)
         if listed is not None:
             out.skew_ms = listed.skew_ms if np.isnan(out.skew_ms) else out.skew_ms
+            if listed.assumed_hz:
+                out.problems.append(
+                    f"nothing tells when the images were taken: {listed.assumed_hz:g} a second are assumed "
+                    "(?fps=N, a times.txt beside the folders, or names that are stamps)"
+                )
             out.rows += [(name, "samples beside the images", rate_of(times)) for name, times in listed.others.items()]
         if out.kind != "mcap":
             out.metadata["source"] = source.name
             out.seconds = float(stamps[-1] - stamps[0]) / 1e9 if len(stamps) else 0.0
+        out.problems += _unlit(source, len(stamps))
     out.problems += _problems(out)
+
+
+def _unlit(source: Source, count: int) -> list[str]:
+    """Sampled frames in which a camera sees nothing: from all of a folder, else the first ones, if all of them."""
+    spread = isinstance(source, FolderSource)  # images between are not read
+    some = min(SAMPLED, count)
+    positions = sorted({k * (count - 1) // max(some - 1, 1) for k in range(some)}) if spread else range(some)
+    try:
+        unlit = [_shows_nothing(image) for image in source.at(positions)]
+    except StereoSfmError as error:
+        return [str(error)]
+    of, least = f"of {len(unlit)} sampled frames", 1 if spread else max(len(unlit), 1)
+    counts = ((unlit.count(what), what) for what in (NO_LIGHT, NO_CONTRAST))
+    return [f"{n} {of} have {what}" for n, what in counts if n >= least]
+
+
+def _shows_nothing(image: StereoImage) -> str:
+    """What is wrong with an image of a frame, or ""."""
+    sides = [side for side in (image.left, image.right) if side is not None]
+    if any(side.max() < DARK for side in sides):
+        return NO_LIGHT
+    return NO_CONTRAST if any(np.ptp(side) < LEAST_CONTRAST for side in sides) else ""
 
 
 def _problems(out: Description) -> list[str]:
@@ -243,12 +278,34 @@ def rig_lines(rig: Rig) -> list[str]:
     if rig.readout_s:
         lines.append(f"rolling shutter, {rig.shutter}")
     if rig.depth:
-        return [*lines, f"depth image, virtual baseline {rig.baseline * 1e3:.1f} mm"]
-    if rig.right is None:
-        return [*lines, "one camera"]
-    angle = np.degrees(se3.extent(rig.left_T_right)[1])
-    pair = f"baseline {rig.baseline * 1e3:.2f} mm, relative rotation {angle:.2f} deg"
-    return [*lines, f"right {_camera_line(rig.right)}{_mask_text(rig.masked_share[1])}", pair]
+        lines.append(f"depth image, virtual baseline {rig.baseline * 1e3:.1f} mm")
+    elif rig.right is None:
+        lines.append("one camera")
+    else:
+        angle = np.degrees(se3.extent(rig.left_T_right)[1])
+        lines.append(f"right {_camera_line(rig.right)}{_mask_text(rig.masked_share[1])}")
+        lines.append(f"baseline {rig.baseline * 1e3:.2f} mm, relative rotation {angle:.2f} deg")
+    return lines + _sensor_lines(rig)
+
+
+def _sensor_lines(rig: Rig) -> list[str]:
+    """IMU and wheels, one line each."""
+    lines: list[str] = []
+    if rig.imu is not None:
+        lines.append(
+            f"IMU   {rig.imu.rate_hz:g} Hz, {_place(rig.imu.left_T_imu)}, offset {1e3 * rig.imu.offset_s:g} ms"
+        )
+    if rig.wheel is not None:
+        radii = "/".join(f"{1e3 * r:.2f}" for r in rig.wheel.radii_m)
+        size = f", radii {radii} mm, track {1e3 * rig.wheel.track_m:.1f} mm" if radii else ""
+        where = f"{_place(rig.wheel.left_T_wheel)}, offset {1e3 * rig.wheel.offset_s:g} ms"
+        lines.append(f"wheels {rig.wheel.model}{size}, {where}")
+    return lines
+
+
+def _place(left_T_sensor: F64) -> str:
+    x, y, z = (1e3 * left_T_sensor[:3, 3]).tolist()
+    return f"at ({x:.1f}, {y:.1f}, {z:.1f}) mm of the left camera"
 
 
 def _mask_text(share: float) -> str:

@@ -1,4 +1,4 @@
-"""What is deleted when recordings take too much room, and what is not."""
+"""Which segments are deleted when the recordings exceed their quota."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def used_bytes(root: Path) -> int:
 
 
 def make_room(root: Path, quota: Quota, current: Segment | None, disk: Callable[[Path], Disk] = Disk.of) -> float:
-    """Delete the oldest segments that nobody marked until the quota is kept, and images until enough is free.
+    """Delete the oldest segments without a mark until the quota is kept, and images until enough is free.
 
     Poses are never deleted because something else has filled the disk.
 
@@ -75,7 +75,7 @@ def make_room(root: Path, quota: Quota, current: Segment | None, disk: Callable[
 
 
 def _free_images(root: Path, lacking: float, current: Segment | None) -> None:
-    """Delete the oldest images that nobody marked until so many bytes are free."""
+    """Delete the oldest images without a mark until so many bytes are free."""
     for segment in (s for folder in recordings(root) for s in segments(folder)):
         if lacking <= 0:
             return

@@ -31,7 +31,7 @@ THUMBNAIL_PX = 160
 
 @dataclass(frozen=True, eq=False)
 class Thumbnail:
-    """A picture for the file without images."""
+    """A small image for the file without images."""
 
     image: StereoImage
 
@@ -142,7 +142,7 @@ class PoseWriter(_Writer):
         self._log: RunLog | None = None
         self._closing = False
         self._unwritten: list[object] = []  # since the newest chunk that is on disk
-        self._last_chunk: list[object] = []  # given up to the index of a file that the disk refused to go on with
+        self._last_chunk: list[object] = []  # in a file that the disk refused to extend
         super().__init__(MESSAGES_WAITING)
 
     def close(self) -> None:

@@ -1,10 +1,10 @@
-"""The folders of a recording that goes on all day.
+"""The folders of a long recording in segments.
 
     ROOT/00007_2026-11-22_151400/      a recording; numbers only grow, so that a wrong clock changes no order
         recording.json                 source, mode and beginning
         00012_000720.mcap              segment 12, from second 720 on: poses, keyframes, map updates, events, thumbnails
         00012_000720.images.mcap       its images with inertial and wheel samples: a recording of its own
-        00012_000720.marked            kept whatever the quota says; a line of text for each mark
+        00012_000720.marked            kept regardless of the quota; a line of text for each mark
 
 Each file opens alone; the folder is a source that plays the images of all its segments.
 """
@@ -12,6 +12,7 @@ Each file opens alone; the folder is a source that plays the images of all its s
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import re
 import shutil
@@ -21,6 +22,9 @@ from pathlib import Path
 from typing import Any
 
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.log import topics
+from stereo_sfm.log.reader import LogReader
+from stereo_sfm.log.scan import summary_is_whole
 
 ABOUT = "recording.json"
 KIND = "stereo_sfm_recording"
@@ -79,7 +83,7 @@ class Segment:
             path.unlink(missing_ok=True)
         if not segments(self.folder):
             (self.folder / ABOUT).unlink(missing_ok=True)
-            with contextlib.suppress(OSError):  # somebody put something there
+            with contextlib.suppress(OSError):  # it holds other files
                 self.folder.rmdir()
 
 
@@ -120,12 +124,41 @@ def new_recording(root: Path, source: str, mode: str, now: datetime) -> Path:
 
 
 def about(folder: Path) -> dict[str, Any]:
-    """What recording.json says; empty where it is missing or damaged."""
+    """The content of recording.json; empty where it is missing or damaged."""
     try:
         data = json.loads((folder / ABOUT).read_text("utf-8"))
     except (OSError, ValueError):
         return {}
     return data if isinstance(data, dict) and data.get("kind") == KIND else {}
+
+
+def _seconds(folder: Path, last: Segment) -> int:
+    """Length of a recording: by the poses of its last segment, by the clock of the disk where that has no end yet."""
+    try:
+        size, written_ns = last.poses.stat().st_size, last.poses.stat().st_mtime_ns
+        length_s = _poses_s(last.poses, size, written_ns)
+        if length_s is None:
+            return max(last.second, round((written_ns - (folder / ABOUT).stat().st_mtime_ns) / 1e9))
+        return round(last.second + length_s)
+    except OSError:
+        return last.second
+
+
+@functools.lru_cache(maxsize=10_000)
+def _poses_s(path: Path, size: int, written_ns: int) -> float | None:
+    """Seconds from the first to the last pose of a closed file; None for one that is being written, or cut off.
+
+    Args: path; size and written_ns, of the file, so that each of its states is read once.
+    """
+    with path.open("rb") as stream:
+        if not summary_is_whole(stream):
+            return None
+    try:
+        with LogReader(path) as reader:
+            stamps = reader.stamps(topics.FRAME)
+    except StereoSfmError:
+        return None
+    return float(stamps[-1] - stamps[0]) / 1e9 if len(stamps) else 0.0
 
 
 def listed(folder: Path) -> dict[str, str | int | bool]:
@@ -136,7 +169,7 @@ def listed(folder: Path) -> dict[str, str | int | bool]:
         "began": str(head.get("began", "")),
         "source": str(head.get("source", "")),
         "mode": str(head.get("mode", "")),
-        "seconds": parts[-1].second if parts else 0,  # up to the beginning of its last segment
+        "seconds": _seconds(folder, parts[-1]) if parts else 0,
         "segments": len(parts),
         "with_images": sum(segment.images.exists() for segment in parts),
         "bytes": sum(segment.bytes for segment in parts),

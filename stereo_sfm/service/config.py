@@ -30,6 +30,7 @@ class SourceConfig:
 
     spec: str = line("", "A camera, recording or simulator, as `stereo-sfm run` takes it")
     rig: str = path("Calibration file to use instead of the source's own")
+    camera_store: str = path("Folder of calibrations that self-calibration corrected, by camera; empty: none is kept")
     rectify: str = word("none", ("none", "pinhole", "wide"), "Rectify the images first")
     speed: float = number(1.0, 0.01, 1000, "Speed at which a recording is played")
     repeat: bool = switch(False, "Play a recording again and again")
@@ -53,7 +54,7 @@ class MapConfig:
         MAP_MODES,
         "Continue the saved map or begin it, localize in it without changing it, begin a new one, or keep none",
     )
-    save_every_min: float = number(5.0, 0.05, 1440, "Minutes between two saves while running")
+    save_every_min: float = number(5.0, 0.05, 1440, "Minutes between two saves while running; the first is after one")
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ class RecordingConfig:
 class WatchdogConfig:
     """When a stage counts as hung."""
 
-    silent_s: float = number(1.0, 0.5, 60, "Seconds without a sign of life")
+    silent_s: float = number(1.0, 0.5, 60, "Seconds without a message from a stage")
 
 
 @dataclass(frozen=True)
@@ -121,7 +122,10 @@ class RobotConfig:
         if not s.spec:
             raise StereoSfmError('robot.toml names no source: add [source] spec = "t265:" or another')
         device = is_device(s.spec)
-        choice = SourceChoice.of(s.spec, s.rig or None, rectify=s.rectify, speed=None if device else s.speed)
+        choice = SourceChoice.of(
+            s.spec, s.rig or None, rectify=s.rectify, speed=None if device else s.speed,
+            camera_store=s.camera_store or None,
+        )  # fmt: skip
         return dataclasses.replace(choice, repeat=s.repeat and not device)
 
 
@@ -153,7 +157,9 @@ def _absolute(config: RobotConfig, folder: Path) -> RobotConfig:
 
     return dataclasses.replace(
         config,
-        source=dataclasses.replace(config.source, rig=placed(config.source.rig)),
+        source=dataclasses.replace(
+            config.source, rig=placed(config.source.rig), camera_store=placed(config.source.camera_store)
+        ),
         tracking=dataclasses.replace(config.tracking, config=placed(config.tracking.config)),
         map=dataclasses.replace(config.map, folder=placed(config.map.folder)),
         recording=dataclasses.replace(config.recording, folder=placed(config.recording.folder)),

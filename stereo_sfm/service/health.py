@@ -17,8 +17,8 @@ from stereo_sfm.types import Dropped, MapUpdate
 WINDOW = 300  # frames
 
 
-class HealthBook:
-    """Takes the messages of the pipeline; `report` sums them up."""
+class HealthCollector:
+    """Collects numbers from the messages of the pipeline; `report` summarizes them."""
 
     def __init__(self) -> None:
         self._stages: dict[str, Health] = {}

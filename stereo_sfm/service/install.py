@@ -67,7 +67,7 @@ class Place:
 
     Attributes:
         program: the `stereo-sfm` to run. user: it runs as. config: its robot.toml; made when there is none.
-        root: folder that stands for "/", to look at what would be installed, or to make an image.
+        root: folder used instead of "/", for a preview or to build an image.
     """
 
     program: Path
@@ -155,12 +155,12 @@ def uninstall(place: Place) -> list[Path]:
     _check_rights(place)
     if place.root == Path("/"):
         _call(["systemctl", "disable", "--now", UNIT_NAME], {1, 5})  # it was not installed
-    gone = [path for path in (place.at(UNIT_FILE), place.at(UDEV_FILE)) if path.exists()]
-    for path in gone:
+    removed = [path for path in (place.at(UNIT_FILE), place.at(UDEV_FILE)) if path.exists()]
+    for path in removed:
         path.unlink()
     if place.root == Path("/"):
         _call(["systemctl", "daemon-reload"], set())
-    return gone
+    return removed
 
 
 def status() -> str:
@@ -177,15 +177,15 @@ def status() -> str:
     return (
         f"{values.get('ActiveState')} ({values.get('SubState')}){text}\n"
         f"process {values.get('MainPID')}, started again {values.get('NRestarts')} times; "
-        f"journalctl -u {UNIT_NAME} shows what it said"
+        f"journalctl -u {UNIT_NAME} shows its log"
     )
 
 
 def _check_rights(place: Place) -> None:
     if place.root == Path("/") and os.geteuid() != 0:
-        raise StereoSfmError("this writes to /etc: run it with sudo, or look at it first with --dry-run")
+        raise StereoSfmError("this writes to /etc: run it with sudo, or preview it with --dry-run")
     if place.root == Path("/") and shutil.which("systemctl") is None:
-        raise StereoSfmError("there is no systemd here: run 'stereo-sfm serve' by your own means (a container)")
+        raise StereoSfmError("there is no systemd here: run 'stereo-sfm serve' in another way, such as a container")
 
 
 def _call(command: list[str], allowed: set[int]) -> str:

@@ -1,4 +1,4 @@
-"""The process of an output: a queue that drops its oldest messages towards it, commands and answers back."""
+"""The process of an output: a queue to it that drops its oldest messages, and the commands that it calls."""
 
 from __future__ import annotations
 
@@ -6,11 +6,8 @@ import contextlib
 import importlib
 import itertools
 import logging
-import multiprocessing
-import os
 import pickle
 import queue
-import signal
 import threading
 import time
 from collections.abc import Callable
@@ -23,9 +20,8 @@ from typing import Any
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.messages import LogLine
 from stereo_sfm.pipeline.channels import DroppingOutbox
-from stereo_sfm.pipeline.interrupts import STOP_SIGNALS, ignored_by_children
-from stereo_sfm.pipeline.text import LOGGER, Listener, emit
-from stereo_sfm.pipeline.threads import thread_environment
+from stereo_sfm.pipeline.text import LOGGER, emit
+from stereo_sfm.service.child import Send, pipe, run_child, start_child
 from stereo_sfm.service.config import RobotConfig
 from stereo_sfm.service.messages import ServiceMessage
 from stereo_sfm.service.outputs import OUTPUTS
@@ -34,12 +30,12 @@ from stereo_sfm.service.publisher import Publisher, Reply
 log = logging.getLogger(LOGGER)
 
 LIMIT = 256  # messages that wait for an output
-OPEN_AGAIN_S = 5.0
+REOPEN_S = 5.0
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 30.0  # before a dead output is started again
-LONG_LIFE_S = 60.0  # after which the pause is short again
+STABLE_S = 60.0  # of running, after which the pause is short again
 END_S = 1.0  # for an output to close
 
-Answer = Callable[[str, dict[str, Any]], Reply]
+CommandHandler = Callable[[str, dict[str, Any]], Reply]
 
 
 @dataclass(frozen=True)
@@ -47,7 +43,7 @@ class _Opened:
     """The output is open."""
 
     wants: frozenset[type]
-    picture_hz: float
+    preview_hz: float
 
 
 @dataclass(frozen=True)
@@ -58,7 +54,7 @@ class _Call:
 
 
 @dataclass(frozen=True)
-class _Answered:
+class _Replied:
     number: int
     reply: Reply
 
@@ -66,23 +62,23 @@ class _Answered:
 class OutputProcess:
     """One output: its process is started again when it dies."""
 
-    def __init__(self, name: str, config: RobotConfig, answer: Answer, module: str | None = None) -> None:
+    def __init__(self, name: str, config: RobotConfig, handler: CommandHandler, module: str | None = None) -> None:
         """Args:
         name: of the output. config: of the whole service.
-        answer: carries out a command, in any thread.
+        handler: carries out a command, in any thread.
         module: "package.module:make" of the publisher; the table's when omitted.
         """
-        self.name, self._config, self._answer = name, config, answer
+        self.name, self._config, self._handler = name, config, handler
         self._module = module or OUTPUTS[name]
         self._outbox: DroppingOutbox | None = None
         self._replies: DroppingOutbox | None = None
         self.wants: frozenset[type] = frozenset()
-        self.picture_hz = 0.0
+        self.preview_hz = 0.0
         self.starts = 0
         self._process: BaseProcess | None = None
         self._closing = threading.Event()
-        self._pool = ThreadPoolExecutor(4, f"answers to {name}")
-        self._thread = threading.Thread(target=self._keep, name=f"output {name}", daemon=True)
+        self._pool = ThreadPoolExecutor(4, f"commands of {name}")
+        self._thread = threading.Thread(target=self._supervise, name=f"output {name}", daemon=True)
 
     @property
     def pid(self) -> int | None:
@@ -111,30 +107,24 @@ class OutputProcess:
         self._thread.join(END_S)
         self._pool.shutdown(wait=False, cancel_futures=True)
 
-    def _keep(self) -> None:
+    def _supervise(self) -> None:
         pause = FIRST_PAUSE_S
         while not self._closing.is_set():
             began = time.monotonic()
-            self._live_once()
+            self._run_once()
             if self._closing.is_set():
                 return
-            if time.monotonic() - began > LONG_LIFE_S:
+            if time.monotonic() - began > STABLE_S:
                 pause = FIRST_PAUSE_S
             code = self._process.exitcode if self._process is not None else None
             log.warning("the output %s ended (exit code %s); it is started again in %.0f s", self.name, code, pause)
             self._closing.wait(pause)
             pause = min(2 * pause, LONGEST_PAUSE_S)
 
-    def _live_once(self) -> None:
+    def _run_once(self) -> None:
         """Start the process and listen to it until it ends."""
-        context = multiprocessing.get_context("spawn")
-        (messages, to_output), (reports, to_main), (replies, to_client) = (context.Pipe(False) for _ in range(3))
-        with ignored_by_children(), thread_environment(1):
-            arguments = (self._module, self._config, messages, to_main, replies)
-            process = context.Process(target=run_output, args=arguments, name=f"output {self.name}", daemon=True)
-            process.start()
-        for end in (messages, to_main, replies):
-            end.close()
+        (messages, to_output), (reports, to_main), (replies, to_client) = (pipe() for _ in range(3))
+        process = start_child(f"output {self.name}", run_output, self._module, self._config, messages, to_main, replies)
         self.starts += 1
         self._process, self._outbox = process, DroppingOutbox(to_output, LIMIT, Connection.send_bytes)
         self._replies = DroppingOutbox(to_client, LIMIT)
@@ -149,16 +139,16 @@ class OutputProcess:
 
     def _take(self, message: object) -> None:
         if isinstance(message, _Opened):
-            self.wants, self.picture_hz = message.wants, message.picture_hz
+            self.wants, self.preview_hz = message.wants, message.preview_hz
         elif isinstance(message, LogLine):
             emit(message)
         elif isinstance(message, _Call):
             self._pool.submit(self._carry_out, message)
 
     def _carry_out(self, call: _Call) -> None:
-        reply = self._answer(call.name, call.arguments)
+        reply = self._handler(call.name, call.arguments)
         if self._replies is not None:
-            self._replies.send(_Answered(call.number, reply))
+            self._replies.send(_Replied(call.number, reply))
 
 
 class PipeClient:
@@ -173,53 +163,58 @@ class PipeClient:
 
     def call(self, name: str, timeout_s: float = 5.0, /, **arguments: Any) -> Reply:
         """See `ServiceClient`."""
-        number, answer = next(self._numbers), queue.SimpleQueue[Reply]()
-        self._waiting[number] = answer
+        number, reply = next(self._numbers), queue.SimpleQueue[Reply]()
+        self._waiting[number] = reply
         if not self._over:
             self._send(_Call(number, name, arguments))
         try:
-            return answer.get(timeout=0.0 if self._over else timeout_s)
+            return reply.get(timeout=0.0 if self._over else timeout_s)
         except queue.Empty:
-            why = "the service has ended" if self._over else f"the service did not answer within {timeout_s:g} s"
+            why = "the service has ended" if self._over else f"the service did not reply within {timeout_s:g} s"
             return Reply(False, why)
         finally:
             self._waiting.pop(number, None)
 
     def _listen(self) -> None:
         with contextlib.suppress(EOFError, OSError):
-            while isinstance(message := self._replies.recv(), _Answered):
-                answer = self._waiting.get(message.number)
-                if answer is not None:
-                    answer.put(message.reply)
+            while isinstance(message := self._replies.recv(), _Replied):
+                reply = self._waiting.get(message.number)
+                if reply is not None:
+                    reply.put(message.reply)
         self._over = True
-        for answer in list(self._waiting.values()):
-            answer.put(Reply(False, "the service has ended"))
+        for reply in list(self._waiting.values()):
+            reply.put(Reply(False, "the service has ended"))
 
 
 def run_output(
     module: str, config: RobotConfig, messages: Connection, to_main: Connection, replies: Connection
 ) -> None:
     """Body of the process of an output."""
-    for number in STOP_SIGNALS:
-        signal.signal(number, signal.SIG_IGN)
-    lock = threading.Lock()
 
-    def send(message: object) -> None:
-        with lock, contextlib.suppress(OSError):
-            to_main.send(message)
-
-    logging.getLogger(LOGGER).setLevel(logging.INFO)
-    with Listener(f"output {module.rpartition(':')[0].rpartition('.')[2]}", send):
-        place, _, attribute = module.partition(":")
-        publisher: Publisher = getattr(importlib.import_module(place), attribute)(config)
+    def body(send: Send) -> None:
+        publisher = make_publisher(module, config)
         if not _open(publisher, PipeClient(send, replies), messages):
-            os._exit(0)
-        send(_Opened(publisher.wants, publisher.picture_hz))
+            return
+        send(_Opened(publisher.wants, publisher.preview_hz))
         with contextlib.suppress(EOFError, OSError):
             while True:
                 publisher.put(pickle.loads(messages.recv_bytes()))
         publisher.close()
-    os._exit(0)  # whatever threads a server has left
+
+    run_child(f"output {module.partition(':')[0].rpartition('.')[2]}", to_main, body)
+
+
+def make_publisher(module: str, config: RobotConfig) -> Publisher:
+    """The publisher of an output, not yet open.
+
+    Args:
+        module: "package.module:make". config: of the whole service.
+
+    Raises:
+        StereoSfmError: what it needs is not installed, or its settings are invalid.
+    """
+    place, _, attribute = module.partition(":")
+    return getattr(importlib.import_module(place), attribute)(config)
 
 
 def _open(publisher: Publisher, client: PipeClient, messages: Connection) -> bool:
@@ -229,6 +224,6 @@ def _open(publisher: Publisher, client: PipeClient, messages: Connection) -> boo
             publisher.open(client)
             return True
         except StereoSfmError as error:
-            log.warning("%s; trying again every %.0f s", error, OPEN_AGAIN_S)
-        if messages.poll(OPEN_AGAIN_S):  # nothing is sent before it is open: this is the end
+            log.warning("%s; trying again every %.0f s", error, REOPEN_S)
+        if messages.poll(REOPEN_S):  # nothing is sent before it is open: this is the end
             return False

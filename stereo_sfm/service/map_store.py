@@ -1,14 +1,14 @@
 """The saved map of the service on disk.
 
-Beside the map's folder STORE lie, while the service runs: `.STORE.base`, the map that the session began with, and
-`.STORE.session`, the session's own part as it was saved last. A process of low priority joins the two into STORE, so
-that STORE is always a whole map, whenever the power fails. What was not joined at the end is joined at the next start.
+While the service runs, two folders are beside the map's folder STORE: `.STORE.base`, the map that the session began
+with, and `.STORE.session`, the session's own part as it was saved last. A process of low priority joins the two into
+STORE, so that STORE is a complete map whenever the power fails. What was not joined at the end is joined at the next
+start.
 """
 
 from __future__ import annotations
 
 import logging
-import multiprocessing
 import os
 import shutil
 import time
@@ -21,8 +21,7 @@ from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.maps.folders import MapFolders
 from stereo_sfm.maps.unfinished import copy_map, publish
-from stereo_sfm.pipeline.interrupts import ignored_by_children
-from stereo_sfm.pipeline.threads import thread_environment
+from stereo_sfm.service.child import pipe, start_child
 
 log = logging.getLogger("stereo_sfm")
 NICE = 10
@@ -61,7 +60,7 @@ class MapStore:
         return self.folder.with_name(f".{self.folder.name}.session")
 
     def begin(self) -> MapFolders:
-        """The maps of a new session; a session that was not joined in an earlier life is joined first.
+        """The maps of a new session; a session that an earlier run did not join is joined first.
 
         Raises:
             StereoSfmError: there is no map to localize in, or it is damaged.
@@ -73,6 +72,7 @@ class MapStore:
         if self.mode == "localize":
             folders = MapFolders(map_in=self.folder, localize_only=True)
             folders.check()
+            self.saved_ns = (self.folder / "map.json").stat().st_mtime_ns
             return folders
         self.folder.parent.mkdir(parents=True, exist_ok=True)
         if self._fresh:
@@ -84,6 +84,7 @@ class MapStore:
         shutil.rmtree(base, ignore_errors=True)
         self._base = None
         if (self.folder / "map.json").exists():
+            self.saved_ns = max(self.saved_ns, (self.folder / "map.json").stat().st_mtime_ns)
             copy_map(self.folder, base)
             self._base = base
         return MapFolders(map_in=self._base, session=self.session)
@@ -100,9 +101,9 @@ class MapStore:
         before = base if (base / "map.json").exists() else None
         try:
             publish(before, self.session, self.folder, self.config)
-            log.info("the session that was not finished last time is in the saved map now")
+            log.info("the unfinished last session was added to the saved map")
         except (StereoSfmError, OSError) as error:
-            log.warning("the session of last time is not in the saved map: %s", error)
+            log.warning("the last session could not be added to the saved map: %s", error)
 
     def join(self) -> None:
         """Begin to write the saved map from the session's part: at once where it is all there is, else in a process."""
@@ -110,21 +111,21 @@ class MapStore:
         if self._base is None:
             self._done = _published(None, self.session, self.folder, self.config)
             return
-        context = multiprocessing.get_context("spawn")
-        self._result, send = context.Pipe(duplex=False)
-        arguments = (self._base, self.session, self.folder, self.config, send)
-        with ignored_by_children(), thread_environment(1):
-            self._process = context.Process(target=_publish, args=arguments, name="map saver", daemon=True)
-            self._process.start()
-        send.close()
+        self._result, send = pipe()
+        self._process = start_child("map saver", _publish, self._base, self.session, self.folder, self.config, send)
 
     @property
     def pid(self) -> int | None:
         """Of the process that joins, while there is one."""
         return None if self._process is None else self._process.pid
 
+    @property
+    def joining(self) -> bool:
+        """Whether the result of `join` has not been taken yet."""
+        return self._process is not None or self._done is not None
+
     def joined(self, timeout_s: float = 0.0) -> Joined | None:
-        """The result of `join`, once; None while it goes on."""
+        """The result of `join`, once; None while it runs."""
         result, self._done = self._done, None
         if result is None:
             if self._result is None or not self._result.poll(timeout_s):

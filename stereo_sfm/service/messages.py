@@ -1,4 +1,4 @@
-"""What the service tells its outputs and callbacks. Wall clock is `unix_ns`, the sensor's clock `stamp_ns`."""
+"""Messages of the service to its outputs and callbacks. Wall clock is `unix_ns`, the sensor's clock `stamp_ns`."""
 
 from __future__ import annotations
 
@@ -35,6 +35,7 @@ class Status:
     map_folder: str = ""
     map_saved_ns: int = 0  # Unix time; 0: not yet
     localized: bool = False  # poses are in the frame of the saved map
+    map_is_new: bool = False  # the saved map begins with this session, and so has the frame of its poses
     session: int = 0  # pipelines started so far
 
 
@@ -90,8 +91,8 @@ class MapCloud(Message):
 
 
 @dataclass(frozen=True, eq=False)
-class Picture(Message):
-    """An image, with the tracks of the newest frame before it."""
+class PreviewImage(Message):
+    """A camera image for display, with the tracks of the newest frame before it."""
 
     frame_id: int
     stamp_ns: int
@@ -121,7 +122,7 @@ class HealthReport:
 
 @dataclass(frozen=True)
 class Event:
-    """Something worth reading: a loss, a restart, a saved map, a mark, a full disk."""
+    """A line of the log: a loss, a restart, a saved map, a mark, a full disk."""
 
     unix_ns: int
     level: str  # a name of `logging`
@@ -129,5 +130,5 @@ class Event:
     text: str
 
 
-ServiceMessage = Started | Status | PoseUpdate | MapCloud | Picture | HealthReport | Event
+ServiceMessage = Started | Status | PoseUpdate | MapCloud | PreviewImage | HealthReport | Event
 EVERYTHING: frozenset[type[ServiceMessage]] = frozenset(get_args(ServiceMessage))  # for publishers that want all of it

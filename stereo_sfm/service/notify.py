@@ -16,7 +16,7 @@ class SystemdNotifier:
         given = os.environ.get("NOTIFY_SOCKET", "") if address is None else address
         self._address = f"\0{given[1:]}" if given.startswith("@") else given
         limit_us = os.environ.get("WATCHDOG_USEC", "")
-        self.watchdog_s = int(limit_us) / 2e6 if limit_us.isdigit() else 0.0  # between two signs of life; 0: none
+        self.watchdog_s = int(limit_us) / 2e6 if limit_us.isdigit() else 0.0  # between two keep-alive messages; 0: none
         self._status = ""
 
     def ready(self) -> None:
@@ -24,7 +24,7 @@ class SystemdNotifier:
         self._send("READY=1")
 
     def watchdog(self) -> None:
-        """A sign of life."""
+        """Keep-alive."""
         self._send("WATCHDOG=1")
 
     def status(self, text: str) -> None:
@@ -34,7 +34,7 @@ class SystemdNotifier:
             self._send(f"STATUS={text}")
 
     def reloading(self) -> None:
-        """Starting again with another map or configuration; `ready` follows."""
+        """Restarting with another map or configuration; `ready` follows."""
         self._send(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
 
     def stopping(self) -> None:

@@ -21,8 +21,8 @@ WINDOW = 300  # images over which the delay from exposure to this computer is es
 class HostClock:
     """The sensor's clock against this computer's clocks, from when images arrived.
 
-    The image that took least time on its way, among the newest ones, tells the offset. Steps of the wall clock change
-    nothing but the wall clock times given from then on.
+    The offset is that of the image with the shortest delay among the newest ones. A step of the wall clock changes only
+    the wall clock times computed after it.
     """
 
     def __init__(self) -> None:
@@ -46,7 +46,7 @@ class HostClock:
         return stamp_ns + offset + time.time_ns() - time.monotonic_ns()
 
 
-class PoseMaker:
+class PoseConverter:
     """The poses of one session."""
 
     def __init__(self, rig: Rig, session: int, clock: HostClock) -> None:
@@ -94,7 +94,7 @@ class PoseMaker:
         )
 
     def _known(self, version: int) -> int:
-        """The newest version told of that is not newer than this one."""
+        """The newest known version that is not newer than this one."""
         if version in self._map_T_odom:
             return version
         return max((v for v in self._map_T_odom if v <= version), default=next(iter(self._map_T_odom)))

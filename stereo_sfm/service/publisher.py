@@ -1,4 +1,4 @@
-"""An output of the service, what it may ask the service for, and the table of commands."""
+"""The interface of an output, and the commands that it may call."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MAX_TEXT = 1000  # characters of an argument
 
 @dataclass(frozen=True)
 class Reply:
-    """The answer to a command; `data` holds plain values only."""
+    """The result of a command; `data` holds plain values only."""
 
     ok: bool
     text: str = ""
@@ -38,10 +38,10 @@ COMMANDS: dict[str, Command] = {
     "save_map": Command("Write the map now; a NAME saves a copy beside the configured folder", {"name": ""}),
     "load_map": Command("Continue with another saved map beside the configured folder", {"name": ""}),
     "reset": Command("Start tracking and mapping again with the newest saved map"),
-    "relocalize": Command("Search the whole saved map for the camera's place"),
+    "relocalize": Command("Search the whole saved map for the camera's pose"),
     "start_recording": Command("Record: full, lean or black_box", {"mode": "full"}),
-    "stop_recording": Command("Record no more"),
-    "mark": Command("Keep the recording around now", {"text": ""}),
+    "stop_recording": Command("Stop recording"),
+    "mark": Command("Keep the recording around this moment", {"text": ""}),
     "recordings": Command("List the recordings"),
     "delete_recording": Command("Delete a recording", {"id": ""}),
     "recording_files": Command("The files of a recording", {"id": ""}),
@@ -68,10 +68,10 @@ def checked(name: str, arguments: dict[str, Any]) -> dict[str, Any]:
 
 
 class ServiceClient(Protocol):
-    """The service as an output reaches it. Thread-safe."""
+    """The service as an output sees it. Thread-safe."""
 
     def call(self, name: str, timeout_s: float = 5.0, /, **arguments: Any) -> Reply:
-        """Ask for a command and wait for its answer; what the service refuses is a `Reply` that is not ok."""
+        """Call a command and wait for its reply; a refused command is a `Reply` that is not ok."""
         ...
 
 
@@ -80,27 +80,27 @@ class Publisher(Protocol):
 
     Attributes:
         wants: the kinds of messages that it gets.
-        picture_hz: most pictures a second, where it wants them.
+        preview_hz: most preview images a second, where it wants them.
     """
 
     @property
     def wants(self) -> frozenset[type[ServiceMessage]]: ...
 
     @property
-    def picture_hz(self) -> float: ...
+    def preview_hz(self) -> float: ...
 
     def open(self, service: ServiceClient) -> None:
         """Bind ports.
 
         Raises:
-            StereoSfmError: it cannot; the service says so, goes on without it and tries again.
+            StereoSfmError: it cannot; the service logs that, continues without it and tries again.
         """
         ...
 
     def put(self, message: ServiceMessage) -> None:
-        """Take a message. It may block: the queue before it drops its oldest messages."""
+        """Publish a message. It may block: the queue before it drops its oldest messages."""
         ...
 
     def close(self) -> None:
-        """Let go of everything within a second."""
+        """Release all resources within a second."""
         ...

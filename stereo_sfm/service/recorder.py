@@ -1,34 +1,28 @@
-"""The recorder as a process of the service: it outlives pipelines, and they outlive it."""
+"""The recorder as a process of the service: it survives the death of a pipeline, and a pipeline survives its death."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
-import multiprocessing
-import os
-import signal
 import threading
-import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.log.provenance import Opening
 from stereo_sfm.messages import Health, LogLine, SourceCounters
 from stereo_sfm.pipeline.channels import DroppingOutbox
-from stereo_sfm.pipeline.images import ImageLayout, ImageRing, SlotImage
-from stereo_sfm.pipeline.interrupts import STOP_SIGNALS, ignored_by_children
+from stereo_sfm.pipeline.images import SlotImage
 from stereo_sfm.pipeline.processes import ProcessRun
-from stereo_sfm.pipeline.text import LOGGER, Listener, emit
-from stereo_sfm.pipeline.threads import thread_environment
-from stereo_sfm.pipeline.watchdog import Heartbeat, HeartbeatThread, Watchdog
+from stereo_sfm.pipeline.text import LOGGER, emit
+from stereo_sfm.pipeline.watchdog import Watchdog
 from stereo_sfm.recording.quota import GB, Quota
-from stereo_sfm.recording.recorder import THUMBNAIL_S, Policy, RecorderState, SegmentRecorder
+from stereo_sfm.recording.segment_recorder import THUMBNAIL_S, Policy, RecorderState
+from stereo_sfm.service.child import pipe, start_child
 from stereo_sfm.service.config import RecordingConfig
+from stereo_sfm.service.recorder_process import CLOSE_S, Begin, Finish, Mark, Read, run_recorder
 from stereo_sfm.types import Applied, Dropped, Frame, Keyframe, LoopResult, MapUpdate, Observations
 
 log = logging.getLogger(LOGGER)
@@ -47,43 +41,10 @@ RECORDED = (
 WAITING = 20_000  # messages for the recorder, beyond which the oldest are lost
 HELD = 6  # images that the recorder has not read yet
 SILENT_S = 3.0
-STATE_S = 0.5
-CLOSE_S = 2.0
-
-
-@dataclass(frozen=True, eq=False)
-class Begin:
-    """A session begins: another recording."""
-
-    policy: Policy
-    rig: Rig
-    config: Config
-    source: str
-    opening: Opening
-    ring: tuple[ImageLayout, int, str]  # layout, slots, name
-
-
-@dataclass(frozen=True)
-class Mark:
-    """Keep what lies around now."""
-
-    text: str
-
-
-@dataclass(frozen=True)
-class Finish:
-    """The session is over."""
-
-
-@dataclass(frozen=True)
-class _Read:
-    """An image was read: its slot is free."""
-
-    number: int
 
 
 def policy_of(config: RecordingConfig, mode: str) -> Policy:
-    """The settings as the recorder takes them."""
+    """The recorder's policy, from the settings."""
     c = config
     quota = Quota(c.quota_gb * GB, c.quota_percent, c.min_free_gb * GB)
     return Policy(
@@ -189,7 +150,7 @@ class Recorder:
         self._send(message)
 
     def mark(self, text: str) -> None:
-        """Keep what lies around now."""
+        """Keep the recording around this moment."""
         self._send(Mark(text))
 
     def _send(self, message: object) -> None:
@@ -200,13 +161,8 @@ class Recorder:
     # -- the process -------------------------------------------------------------------------------------------------
 
     def _start_process(self) -> None:
-        context = multiprocessing.get_context("spawn")
-        (messages, send), (reports, to_main) = context.Pipe(False), context.Pipe(False)
-        with ignored_by_children(), thread_environment(1):
-            process = context.Process(target=run_recorder, args=(messages, to_main), name="recorder", daemon=True)
-            process.start()
-        messages.close()
-        to_main.close()
+        (messages, send), (reports, to_main) = pipe(), pipe()
+        process = start_child("recorder", run_recorder, messages, to_main)
         assert process.pid is not None
         self._process, self._outbox = process, DroppingOutbox(send, WAITING)
         self._watchdog = Watchdog({"recorder": process.pid}, log.warning, SILENT_S)
@@ -235,7 +191,7 @@ class Recorder:
                 self._start_recording()
 
     def _take(self, message: object) -> None:
-        if isinstance(message, _Read):
+        if isinstance(message, Read):
             with self._lock:
                 held = self._held.pop(message.number, None)
             if held is not None:
@@ -252,7 +208,7 @@ class Recorder:
             process.kill()
 
     def close(self) -> None:
-        """Write everything, as far as the disk takes it in time."""
+        """Write everything that the disk takes in time."""
         with self._lock:
             self._closing = True
             process, outbox = self._process, self._outbox
@@ -264,98 +220,3 @@ class Recorder:
                 log.warning("the recorder did not end in time: the last seconds may be missing")
                 process.kill()
                 process.join()
-
-
-def run_recorder(messages: Connection, to_main: Connection) -> None:
-    """Body of the process."""
-    for number in STOP_SIGNALS:
-        signal.signal(number, signal.SIG_IGN)
-    lock = threading.Lock()
-
-    def send(message: object) -> None:
-        with lock, contextlib.suppress(OSError):
-            to_main.send(message)
-
-    logging.getLogger(LOGGER).setLevel(logging.INFO)
-    body = _Body(send)
-    with Listener("recorder", send), HeartbeatThread("recorder", lambda beat: body.beat(beat)):
-        with contextlib.suppress(EOFError, OSError):
-            while True:
-                body.take(messages.recv())
-        body.finish()
-    os._exit(0)  # a thread may still wait for the disk
-
-
-class _Body:
-    """What the process does with each message."""
-
-    def __init__(self, send: Callable[[object], None]) -> None:
-        self._send = send
-        self._recorder: SegmentRecorder | None = None
-        self._ring: ImageRing | None = None
-        self._next_state_s = 0.0
-        self._problem = ""
-        self._begin: Begin | None = None
-
-    def take(self, message: object) -> None:
-        """Any message from the service."""
-        if isinstance(message, tuple):
-            number, image = message  # pyright: ignore[reportUnknownVariableType]
-            self._image(number, image)  # pyright: ignore[reportUnknownArgumentType]
-        elif isinstance(message, Begin):
-            self.finish()
-            self._begin = message
-            self._open(message)
-        elif isinstance(message, Finish):
-            self.finish()
-        elif isinstance(message, Policy):
-            if self._recorder is not None:
-                self._recorder.change(message)
-        elif isinstance(message, Mark):
-            if self._recorder is not None:
-                self._recorder.mark(message.text)
-        elif self._recorder is not None:
-            self._recorder.put(message)
-
-    def _open(self, begin: Begin) -> None:
-        layout, slots, name = begin.ring
-        self._ring = ImageRing(layout, slots, name)
-        try:
-            self._recorder = SegmentRecorder(begin.policy, begin.rig, begin.config, begin.source, begin.opening)
-            self._problem = ""
-        except OSError as error:
-            self._problem = f"cannot record to {begin.policy.root}: {error.strerror}"
-
-    def _image(self, number: int, message: SlotImage) -> None:
-        image = None
-        if self._ring is not None and self._begin is not None:
-            if self._recorder is None:
-                self._open_again(self._begin)
-            if self._recorder is not None:
-                image = self._ring.read(message)
-        self._send(_Read(number))
-        if image is not None and self._recorder is not None:
-            self._recorder.image(image)
-
-    def _open_again(self, begin: Begin) -> None:
-        """The folder could not be made: another attempt, once a second."""
-        if time.monotonic() >= self._next_state_s:
-            self._open(begin)
-
-    def beat(self, beat: Heartbeat) -> None:
-        """In the heartbeat's thread: a sign of life, and the state."""
-        self._send(beat)
-        if time.monotonic() >= self._next_state_s:
-            self._next_state_s = time.monotonic() + STATE_S
-            recorder = self._recorder
-            state = RecorderState("", "", 0, 0, self._problem, bool(self._problem))
-            self._send(state if recorder is None else recorder.state())
-
-    def finish(self) -> None:
-        """Close the recording."""
-        recorder, self._recorder, self._begin = self._recorder, None, None
-        if recorder is not None:
-            recorder.close(CLOSE_S)
-        if self._ring is not None:
-            self._ring.close()
-            self._ring = None

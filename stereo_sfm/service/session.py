@@ -8,26 +8,28 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from stereo_sfm.calib.camera_store import CameraStore
 from stereo_sfm.config import Config
 from stereo_sfm.drivers.choice import Opener
+from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.maps.folders import MapFolders
 from stereo_sfm.messages import Localized, LogLine, MapSaved
 from stereo_sfm.pipeline.images import SlotImage
 from stereo_sfm.pipeline.processes import ProcessRun
-from stereo_sfm.service.health import HealthBook
+from stereo_sfm.service.health import HealthCollector
 from stereo_sfm.service.hub import Hub
-from stereo_sfm.service.map_follower import MapFollower
-from stereo_sfm.service.messages import Event, Picture, PoseUpdate, Started
-from stereo_sfm.service.poses import HostClock, PoseMaker
+from stereo_sfm.service.map_cloud import MapCloudBuilder
+from stereo_sfm.service.messages import Event, PoseUpdate, PreviewImage, Started
+from stereo_sfm.service.poses import HostClock, PoseConverter
 from stereo_sfm.service.recorder import Recorder
 from stereo_sfm.service.states import Facts
-from stereo_sfm.types import Frame, Keyframe, MapUpdate, Observations
+from stereo_sfm.types import CalibrationUpdate, Frame, Keyframe, MapUpdate, Observations
 
 log = logging.getLogger("stereo_sfm")
 
 
 class Session:
-    """Runs a pipeline and passes on what it says. `run` blocks until its end; the rest may be called in any thread."""
+    """Runs a pipeline and publishes its messages. `run` blocks until its end; the rest may be called in any thread."""
 
     def __init__(
         self,
@@ -37,7 +39,7 @@ class Session:
         folders: MapFolders,
         hub: Hub,
         facts: Facts,
-        health: HealthBook,
+        health: HealthCollector,
         silent_s: float,
         recorder: Recorder,
         map_saved: Callable[[MapSaved], None],
@@ -47,11 +49,12 @@ class Session:
         self._recorder = recorder
         self._clock = HostClock()
         self._observations = Observations.empty()  # of the newest frame
-        self._next_picture_s = 0.0
+        self._next_preview_s = 0.0
         self.serial = ""  # of the camera
         self.localized = False
         self.frames = 0
-        self._sinks: dict[type[Any], Callable[[Any], None]] = {
+        self._first_frame_s = float("inf")
+        self._handlers: dict[type[Any], Callable[[Any], None]] = {
             Frame: self._frame,
             Keyframe: self._keyframe,
             MapUpdate: self._update,
@@ -59,8 +62,8 @@ class Session:
             MapSaved: self._map_saved,
             LogLine: self._line,
         }
-        self._poses: PoseMaker | None = None
-        self._map = MapFollower(number, hub.publish)
+        self._poses: PoseConverter | None = None
+        self._map = MapCloudBuilder(number, hub.publish)
         self._run = ProcessRun(
             opener,
             config,
@@ -75,6 +78,11 @@ class Session:
         """Process ids by stage."""
         return self._run.pids
 
+    @property
+    def tracking_s(self) -> float:
+        """Seconds since the first frame, 0 before it."""
+        return max(time.monotonic() - self._first_frame_s, 0.0)
+
     def run(self) -> None:
         """Until the source ends or `stop`.
 
@@ -86,8 +94,8 @@ class Session:
             with self._run as run:
                 info = run.info
                 self.serial = info.rig.serial
-                self._poses = PoseMaker(info.rig, self.number, self._clock)
-                opening = self._folders.opening(self._opener.opening)
+                self._poses = PoseConverter(info.rig, self.number, self._clock)
+                opening = self._folders.opening(self._opener.opening(info.rig))
                 self._recorder.begin(run, self._config, self._opener.spec or info.name, opening)
                 self._hub.publish(Started(self.number, info.name, info.rig, info.live))
                 for _ in run:
@@ -102,9 +110,12 @@ class Session:
         """Finish what is in flight and end."""
         self._run.stop()
 
-    def save_map(self, folder: Path) -> None:
-        """Request that the session's part of the map is written; the service is told when that is done."""
-        self._run.save_map(folder)
+    def save_map(self, folder: Path, urgent: bool = False) -> None:
+        """Request that the session's part of the map is written; `map_saved` is called when that is done.
+
+        Args: folder, replaced. urgent: the session is about to be stopped.
+        """
+        self._run.save_map(folder, urgent)
 
     def relocalize(self) -> None:
         """Search the whole saved map with the next keyframe."""
@@ -114,9 +125,9 @@ class Session:
 
     def put(self, message: object) -> None:
         """A message of the pipeline."""
-        take = self._sinks.get(type(message))
-        if take is not None:
-            take(message)
+        handler = self._handlers.get(type(message))
+        if handler is not None:
+            handler(message)
 
     def _image(self, message: SlotImage) -> None:
         image = message.image
@@ -125,16 +136,16 @@ class Session:
         facts.image_s, facts.source_error = now, ""
         if facts.starting:
             facts.starting, facts.pose_s = "", now
-        if now >= self._next_picture_s and (rate := self._hub.picture_hz) > 0:
-            self._next_picture_s = max(self._next_picture_s + 1.0 / rate, now - 1.0 / rate)
-            self._publish_picture(message)
+        if now >= self._next_preview_s and (rate := self._hub.preview_hz) > 0:
+            self._next_preview_s = max(self._next_preview_s + 1.0 / rate, now - 1.0 / rate)
+            self._publish_preview(message)
         if not self._recorder.image(message):
             self._run.release(message)
 
-    def _publish_picture(self, message: SlotImage) -> None:
+    def _publish_preview(self, message: SlotImage) -> None:
         image, seen = self._run.pixels(message), self._observations
         self._hub.publish(
-            Picture(
+            PreviewImage(
                 image.frame_id,
                 image.stamp_ns,
                 image.left,
@@ -150,11 +161,12 @@ class Session:
             return
         pose = self._poses.frame(frame)
         self._hub.publish(pose)
-        self._judge(pose)
+        self._update_facts(pose)
         self._observations = frame.observations
+        self._first_frame_s = min(self._first_frame_s, time.monotonic())
         self.frames += 1
 
-    def _judge(self, pose: PoseUpdate) -> None:
+    def _update_facts(self, pose: PoseUpdate) -> None:
         if pose.tracked or pose.state == "INERTIAL":
             self._facts.pose_s, self._facts.lost_reason = time.monotonic(), ""
         else:
@@ -167,6 +179,16 @@ class Session:
         assert self._poses is not None
         self._poses.update(update)
         self._map.put(update)
+        if update.calibration is not None and update.calibration.applied:
+            self._keep(update.calibration)
+
+    def _keep(self, correction: CalibrationUpdate) -> None:
+        store = self._opener.camera_store
+        if store is not None:
+            try:
+                CameraStore(store).keep(self._run.info.rig, correction.terms)
+            except StereoSfmError as error:
+                log.warning("%s", error)
 
     def _localize(self, message: Localized) -> None:
         assert self._poses is not None
@@ -176,5 +198,5 @@ class Session:
         log.info("the saved map was recognised: poses are in its frame")
 
     def _line(self, line: LogLine) -> None:
-        if line.stage != "main":  # those of this process are told already
+        if line.stage != "main":  # those of this process are published already
             self._hub.publish(Event(time.time_ns(), line.level, line.stage, line.text))

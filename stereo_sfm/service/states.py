@@ -1,4 +1,4 @@
-"""From facts about the running pipeline to the state of the service. Pure: the clock is an argument."""
+"""The state of the service, derived from facts about the running pipeline. Pure: the clock is an argument."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 from stereo_sfm.service.messages import ServiceState
 
-NO_IMAGE_S = 1.0  # without an image the camera counts as gone
+NO_IMAGE_S = 1.0  # without an image the camera counts as disconnected
 LOST_S = 0.5  # without a pose tracking counts as lost
 
 REMEDIES = {
     ServiceState.LOST: "drive slowly back to where the camera has been, or where it sees shelves well lit",
-    ServiceState.CAMERA_GONE: "check the camera's cable; it is taken again as soon as it is back",
-    ServiceState.DISK_FULL: "free space on the disk, or lower recording.quota_gb; poses go on",
+    ServiceState.CAMERA_GONE: "check the camera's cable; it is reconnected automatically",
+    ServiceState.DISK_FULL: "free space on the disk, or lower recording.quota_gb; poses continue",
 }
 
 
@@ -29,8 +29,8 @@ class Facts:
     disk_problem: str = ""
 
 
-def judge(facts: Facts, now_s: float) -> tuple[ServiceState, str]:
-    """The state and its reason; what hurts the robot most comes first."""
+def derive_state(facts: Facts, now_s: float) -> tuple[ServiceState, str]:
+    """The state and its reason; of several problems, the most severe one for the robot."""
     if facts.stopping:
         return ServiceState.STOPPING, facts.stopping
     if facts.source_error:

@@ -93,6 +93,10 @@ class ManhattanTracker:
         """The map lives in the corrected odometry frame; the tracker gets it in its own."""
         self._inner.apply(replace(update, map_T_odom=update.map_T_odom @ self._outer_T_inner))
 
+    def describe(self, keyframe: Keyframe) -> Keyframe:
+        """The keyframe of the last step with its descriptors."""
+        return self._inner.describe(keyframe)
+
     def step(self, image: StereoImage) -> tuple[Frame, Keyframe | None]:
         """Track one image and correct its rotation."""
         frame, keyframe = self._inner.step(image)

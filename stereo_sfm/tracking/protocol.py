@@ -10,9 +10,14 @@ from stereo_sfm.types import F64, Frame, Keyframe, MapUpdate, StereoImage
 
 
 class AnyTracker(Protocol):
-    """One image in, one frame and perhaps a keyframe out; map updates when the schedule says so."""
+    """One image in, one frame and perhaps a keyframe out; map updates when the schedule says so.
+
+    `describe` completes the keyframe of the last step, so that the frame need not wait for its descriptors.
+    """
 
     def step(self, image: StereoImage) -> tuple[Frame, Keyframe | None]: ...
+
+    def describe(self, keyframe: Keyframe) -> Keyframe: ...
 
     def apply(self, update: MapUpdate) -> None: ...
 

@@ -34,7 +34,7 @@ from stereo_sfm.viz.shapes import age_colors, spread_colors, strips, turbo
 log = logging.getLogger("stereo_sfm")
 JPEG_QUALITY = 80
 MATCHES_DRAWN = 100  # more lines would hide the image: every k-th is drawn
-MATCHES_EVERY = 5  # pictures between two pictures of matches
+MATCHES_EVERY = 5  # images between two images of matches
 KEPT = 64  # images waiting for their frame, more than the stages can hold
 GRACE_S = 5.0  # time for a viewer to take the remaining messages
 TRUTH = (95, 200, 110)
@@ -153,7 +153,7 @@ class RerunSink:
 
     def _show_alone(self, image: StereoImage) -> None:
         """An image without a frame, as in a recording without a run."""
-        if image.frame_id <= self._last_frame:  # a keyframe whose message was dropped, or a late picture
+        if image.frame_id <= self._last_frame:  # a keyframe whose message was dropped, or a late image
             return
         self._at(image.frame_id, image.stamp_ns)
         self._scene.show_camera(0.0)

@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -20,6 +21,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.scene_model import DIRECTION, SKEW
 from stereo_sfm.calib.tracks import MAX_FRAMES, Window, collect, corners_for
 from stereo_sfm.cli import main
+from stereo_sfm.demo import demo_recording
 from stereo_sfm.drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
@@ -139,7 +141,7 @@ def judge(rig: Rig, images: list[StereoImage]) -> CheckReport:
     return check(rig, rectification, collect(images, rectification, 10, gap, corners_for(len(images), 10)))
 
 
-SLOW = [pytest.param(f, marks=pytest.mark.slow) for f in ("euroc_mh01", "t265_office", "kitti")]
+SLOW = [pytest.param(f, marks=pytest.mark.slow) for f in ("euroc_mh01", "t265_office", "kitti", "store_walk")]
 
 
 @pytest.mark.parametrize("folder", ["tum_vi_room1", *SLOW])
@@ -173,6 +175,20 @@ def test_command_verdict_exit_code_and_correction(tmp_path: Path, capsys: pytest
     assert findings["focal length, both cameras"]["judged"] is False  # three frames
     assert findings["focal length, both cameras"]["verdict"] is None
     assert load_rig(mended).baseline == pytest.approx(0.075, rel=0.01)
+
+
+def test_swapped_cameras_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name in ("left", "right"):
+        (tmp_path / name).mkdir()
+    with open_source(demo_recording()) as source:
+        save_rig(source.rig, tmp_path / "rig.yaml")
+        for number, image in zip(range(12), source, strict=False):
+            assert image.right is not None
+            cv2.imwrite(str(tmp_path / "left" / f"{number:03d}.png"), image.right)
+            cv2.imwrite(str(tmp_path / "right" / f"{number:03d}.png"), image.left)
+    code = main(["check-calib", f"images:{tmp_path}?fps=15"])
+    told = "".join(capsys.readouterr())
+    assert code in (2, 3) and "left and right are swapped" in told and "calibrate again" not in told
 
 
 def test_too_little_to_judge_and_wrong_units() -> None:

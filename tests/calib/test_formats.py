@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from stereo_sfm.calib import Rig, load_rig, save_rig
 from stereo_sfm.calib.formats import FORMATS, recognise
@@ -19,6 +20,7 @@ from stereo_sfm.calib.formats.opencv import read_opencv
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, Epipolar, KannalaBrandt, Pinhole, RadTan
+from tests.synthetic import fisheye_rig
 
 NEARLY = se3.exp(np.array([0.0639, 3e-4, -2e-4, 0.004, -0.011, 0.002]))  # left_T_right
 BODY = se3.exp(np.array([0.02, -0.04, 0.01, 1.2, -0.3, 0.9]))  # body_T_left
@@ -254,6 +256,8 @@ def test_basalt_quaternion_is_camera_to_body(tmp_path: Path) -> None:
             "camera_matrix: {data: [1, 2]}\nimage_width: 3\nimage_height: 4",
             "'distortion_model' is missing",
         ),
+        ("rig.yaml", "stereo_sfm_rig: 1\nbody_T_left: [[1, 0, 0, 0], [0, 1, 0]]", "4 rows of 4 .*different lengths"),
+        ("rig.yaml", "stereo_sfm_rig: 1\nbody_T_left: [1, 0, 0]", "4 rows of 4 numbers .*, found 3"),
         ("rig.yaml", "stereo_sfm_rig: 2", "this version of the program reads 1"),
         ("rig.yaml", "hello: 1", "cannot detect the calibration format"),
         ("calib.txt", "P0: 1 2 3\nP1: 4", "expected 12 numbers"),
@@ -268,6 +272,29 @@ def test_malformed_files_give_one_line(tmp_path: Path, name: str, content: str, 
     with pytest.raises(StereoSfmError, match=says) as caught:
         load_rig(tmp_path / name)
     assert "\n" not in str(caught.value)
+
+
+def test_one_camera_of_euroc_names_the_folder(tmp_path: Path) -> None:
+    save_rig(Rig(Pinhole(64, 48, 50, 50, 32, 24)), tmp_path / "mav0", "euroc")
+    with pytest.raises(StereoSfmError, match=r"one camera of two, give the folder .*mav0\)$"):
+        load_rig(tmp_path / "mav0" / "cam0" / "sensor.yaml")
+
+
+def test_a_rig_without_a_body_is_its_own(tmp_path: Path) -> None:
+    rig = replace(fisheye_rig(), body_T_left=np.eye(4))
+    save_rig(rig, tmp_path / "rig.yaml")
+    data = yaml.safe_load((tmp_path / "rig.yaml").read_text())
+    del data["body_T_left"]
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump(data, sort_keys=False))
+    assert np.array_equal(load_rig(tmp_path / "rig.yaml").body_T_left, np.eye(4))
+
+
+def test_extrinsics_in_millimetres_are_refused() -> None:
+    rig = fisheye_rig()
+    far = rig.left_T_right.copy()
+    far[:3, 3] *= 1000
+    with pytest.raises(StereoSfmError, match="give the extrinsics in metres, not millimetres"):
+        replace(rig, left_T_right=far)
 
 
 def test_missing_file_and_format(tmp_path: Path) -> None:

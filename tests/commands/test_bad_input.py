@@ -212,7 +212,7 @@ def test_file_that_is_no_mcap(cli: Run, tmp_path: Path) -> None:
     ],
 )
 def test_invalid_options(cli: Run, tmp_path: Path, args: tuple[str, ...], word: str) -> None:
-    assert_one_line(cli("run", make_images(tmp_path / "data"), *args), word)
+    assert_one_line(cli("run", f"{make_images(tmp_path / 'data')}?fps=30", *args), word)
 
 
 def test_configuration_that_is_not_toml(cli: Run, tmp_path: Path) -> None:

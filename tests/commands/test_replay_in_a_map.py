@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from stereo_sfm.cli import main
 from stereo_sfm.commands.replay import map_folders
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log.provenance import Opening, write_provenance
@@ -25,12 +26,14 @@ def logged(tmp_path: Path, opening: Opening) -> Opening:
 
 
 @pytest.mark.parametrize("localize_only", [False, True])
-def test_the_log_names_the_map(tmp_path: Path, localize_only: bool) -> None:
+def test_the_log_names_the_map(tmp_path: Path, localize_only: bool, capsys: pytest.CaptureFixture[str]) -> None:
     store = tmp_path / "store"
     store.mkdir()
     (store / "map.json").write_text("{}")
     opening = logged(tmp_path, Opening(map_in=str(store), map_sha256=map_sha256(store), localize_only=localize_only))
     assert map_folders(opening) == MapFolders(store, localize_only)
+    assert main(["export", str(tmp_path), "--format", "g2o"]) == 2
+    assert f"holds no map of its own: it used {store} (--map-in), export that one" in capsys.readouterr().err
     (store / "map.json").write_text("{ }")
     with pytest.raises(StereoSfmError, match="has changed since"):
         map_folders(opening)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from stereo_sfm.cli import main
+from stereo_sfm.commands.map import describe
 from stereo_sfm.drivers.ground_truth import read_tum
 from stereo_sfm.drivers.source import open_source
 from stereo_sfm.eval.associate import poses_at
@@ -71,8 +74,23 @@ def test_the_map_holds_what_it_is_recognised_by(store: Path, capsys: pytest.Capt
     assert f"{count} corners for place recognition in {len(saved)} keyframes" in capsys.readouterr().out
 
 
-def test_another_session_is_localized_in_the_map(tmp_path: Path, store: Path) -> None:
+def test_the_extent_of_a_map_leaves_out_what_is_far_off(store: Path) -> None:
+    saved = load_map(store)
+    points = saved.snapshot.points.copy()
+    points[0] = 1e4
+    said = describe(replace(saved, snapshot=replace(saved.snapshot, points=points)))
+    sizes = [float(x) for x in re.findall(r"([\d.]+) m along [xyz]", "".join(said))]
+    assert len(sizes) == 3 and max(sizes) < 100
+
+
+def test_another_session_is_localized_in_the_map(
+    tmp_path: Path, store: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert second_sequence(tmp_path, store, "--localize-only") == 0
+    said = re.compile(r"localized in the saved map: \d+ of \d+ tracked frames, first found after \d\.\d s")
+    assert said.search((tmp_path / "run" / "report.md").read_text())
+    assert main(["export", str(tmp_path / "run"), "--format", "g2o"]) == 2
+    assert "export the map given to --map-in" in capsys.readouterr().err
     errors = errors_in_the_map(tmp_path / "run")
     assert len(errors) >= 30 and np.median(errors) < 0.03 and errors.max() < 0.1
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import stopping
 from stereo_sfm.commands._stop import StopRequest
 from stereo_sfm.demo import demo_recording
 
@@ -47,6 +48,11 @@ def test_a_run_that_waits_for_an_image_ends_cleanly(number: signal.Signals, tmp_
     assert b"killed" not in err
     assert b"written to" in out
     assert (tmp_path / "run" / "report.md").exists()
+
+
+@pytest.mark.slow
+def test_a_run_ends_within_five_seconds_in_every_state() -> None:
+    assert stopping.main([]) == 0
 
 
 def test_under_nohup_a_closed_terminal_does_not_end_the_run() -> None:

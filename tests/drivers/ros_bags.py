@@ -94,6 +94,24 @@ class BagWriter:
         message = self.make(kind, header, level, zeros, values[0], covariance[0], values[1], covariance[1])
         self.put(topic, kind, message, stamp_ns)
 
+    def wheels(self, kind: str, stamp_ns: int, linear: F64, angular: F64, speeds: F64) -> None:
+        """Velocities of the robot (3,) each, or with JointState the speeds (2,) of its wheels, on /wheel_odom."""
+        twist = self.make("geometry_msgs/msg/Twist", self._vector(linear), self._vector(angular))
+        if kind == "sensor_msgs/msg/JointState":
+            names, nothing = ["arm", "left_joint", "right_joint"], np.zeros(3)
+            values = self.header(stamp_ns, ""), names, nothing, np.r_[7.0, speeds], nothing
+        elif kind == "geometry_msgs/msg/TwistStamped":
+            values = self.header(stamp_ns, "base_link"), twist
+        else:
+            point = self.make("geometry_msgs/msg/Point", 0.0, 0.0, 0.0)
+            level = self.make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
+            pose = self.make("geometry_msgs/msg/Pose", point, level)
+            unknown = np.zeros(36)
+            posed = self.make("geometry_msgs/msg/PoseWithCovariance", pose, unknown)
+            moved = self.make("geometry_msgs/msg/TwistWithCovariance", twist, unknown)
+            values = self.header(stamp_ns, "odom"), "base_link", posed, moved
+        self.put("/wheel_odom", kind, self.make(kind, *values), stamp_ns)
+
     def _vector(self, xyz: F64) -> Any:
         return self.make("geometry_msgs/msg/Vector3", *map(float, xyz))
 

@@ -14,6 +14,7 @@ from stereo_sfm.drivers import open_source
 from stereo_sfm.drivers.choice import ReplayChoice, SourceChoice
 from stereo_sfm.drivers.selection import Selection
 from stereo_sfm.errors import StereoSfmError
+from tests.synthetic import fisheye_rig
 
 SPEC = "sim:aisle?size=212x200&frames=8&effects=0"
 
@@ -23,7 +24,7 @@ def test_a_choice_opens_the_same_source_wherever_it_is_opened() -> None:
     for one in (choice, pickle.loads(pickle.dumps(choice))):
         with one() as source:
             assert [image.frame_id for image in source] == [0, 3]
-    assert choice.numbering == choice.opening.frame_skip == 3
+    assert choice.numbering == choice.opening(fisheye_rig()).frame_skip == 3
     assert not choice.device
 
 
@@ -42,7 +43,8 @@ def test_a_choice_reads_the_calibration_and_makes_paths_absolute(
     monkeypatch.chdir(tmp_path)
     choice = SourceChoice.of("rig.yaml", "rig.yaml")
     assert choice.spec == str(tmp_path / "rig.yaml")
-    assert choice.rig is not None and choice.rig.name == choice.opening.rig.name == "other"  # type: ignore[union-attr]
+    opening = choice.opening(fisheye_rig())
+    assert choice.rig is not None and opening.rig is not None and choice.rig.name == opening.rig.name == "other"
 
 
 def test_a_choice_rectifies_and_replays() -> None:
@@ -50,7 +52,8 @@ def test_a_choice_rectifies_and_replays() -> None:
     with choice() as source:
         assert source.rig.left.model != "kannala_brandt"
         assert [image.frame_id for image in source] == [1, 4, 5]
-    assert choice.opening.rectify == "wide" and choice.opening.frame_skip == 2
+    opening = choice.opening(fisheye_rig())
+    assert opening.rectify == "wide" and opening.frame_skip == 2
 
 
 def test_what_is_read_is_not_overwritten(tmp_path: Path) -> None:

@@ -331,6 +331,23 @@ def test_info_takes_what_run_takes(tmp_path: Path, capsys: pytest.CaptureFixture
     assert "at 10.00 Hz" in capsys.readouterr().out
 
 
+def test_info_sees_images_without_light(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    make_images(tmp_path)
+    for path in (tmp_path / "left").iterdir():
+        pixels = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert pixels is not None
+        cv2.imwrite(str(path), np.zeros_like(pixels))
+    assert main(["info", f"{tmp_path}?fps=10"]) == 0
+    out = capsys.readouterr().out
+    assert "problem: 9 of 9 sampled frames have no pixel brighter than 30 grey levels" in out
+    assert "no problems found" not in out
+
+
+def test_info_names_the_missing_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["info", f"images:{tmp_path / 'nix'}"]) == 2
+    assert capsys.readouterr().err.strip().endswith(f"no such file or folder: {tmp_path / 'nix'}")
+
+
 def test_ambiguous_names_are_rejected(tmp_path: Path) -> None:
     make_images(tmp_path, ["a.png", "b.png", "c.png"])
     for name in "abc":
@@ -491,8 +508,11 @@ def test_an_assumed_frame_rate_is_reported(tmp_path: Path, caplog: pytest.LogCap
         for k, path in enumerate(sorted((tmp_path / side).iterdir())):
             path.rename(path.with_name(f"frame_{k:03d}{path.suffix}"))
     (tmp_path / "times.txt").unlink(missing_ok=True)
-    with caplog.at_level(logging.INFO, "stereo_sfm"):
-        open_source(f"images:{tmp_path}")
+    problems = describe_dataset(f"images:{tmp_path}").problems
+    assert any("30 a second are assumed (?fps=N, a times.txt" in problem for problem in problems)
+    caplog.clear()
+    with caplog.at_level(logging.WARNING, "stereo_sfm"):  # shown without -v
+        next(iter(open_source(f"images:{tmp_path}")))
         assert "30 images a second assumed (?fps=N)" in caplog.text
         caplog.clear()
         source = open_source(f"images:{tmp_path}?fps=10")

@@ -14,9 +14,10 @@ from stereo_sfm.drivers import open_source
 from stereo_sfm.drivers.registry import recognise
 from stereo_sfm.drivers.source import Source
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
 from stereo_sfm.system import Tracker
-from stereo_sfm.types import F64, StereoImage
-from tests.drivers.ros_bags import KINDS, write_bag
+from stereo_sfm.types import F64, StereoImage, WheelSamples
+from tests.drivers.ros_bags import FRAMES, KINDS, BagWriter, write_bag
 
 SIMULATED = "sim:loop?size=212x200&frames=12&start=40&imu=t265"
 
@@ -47,6 +48,43 @@ def test_a_bag_gives_what_was_written(kind: str, packed: bool, tmp_path: Path) -
         both = [np.concatenate([getattr(i.imu, name) for i in some]) for some in (read, images)]
         np.testing.assert_array_equal(both[0], both[1][: len(both[0])])
         assert len(both[0]) >= len(both[1]) - 1  # a sample later than the last image has no image
+
+
+@pytest.mark.parametrize(
+    "kind", ["nav_msgs/msg/Odometry", "geometry_msgs/msg/TwistStamped", "sensor_msgs/msg/JointState"]
+)
+def test_wheels_of_a_bag(kind: str, tmp_path: Path) -> None:
+    source, images = _simulated()
+    stamps = images[0].stamp_ns - 15_000_000 + 20_000_000 * np.arange(15)
+    rng = np.random.default_rng(0)
+    linear, angular, speeds = rng.normal(size=(15, 3)), rng.normal(size=(15, 3)), rng.normal(size=(15, 2))
+    left_T_base = se3.exp(np.array([0.1, 0.7, -0.2, 1.2, -1.2, 1.2]))
+
+    def extra(bag: BagWriter) -> None:
+        bag.transform(FRAMES[0], "base_link", left_T_base, images[0].stamp_ns)
+        for k in range(15):
+            bag.wheels(kind, int(stamps[k]), linear[k], angular[k], speeds[k])
+
+    path = write_bag(tmp_path, KINDS[0], source.rig, images, extra=extra)
+    joints = kind == "sensor_msgs/msg/JointState"
+    options = {"wheel": "/wheel_odom", "joints": "left_joint,right_joint"} if joints else {}
+    with open_source(path, **options) as bag:
+        parts = [image.wheel for image in bag if image.wheel is not None]
+        wheel = bag.rig.wheel
+    found = WheelSamples.joined(parts)
+    n = len(found)
+    np.testing.assert_array_equal(found.stamp_ns, stamps[:n])
+    assert n >= 14 and found.stamp_ns[-1] <= images[-1].stamp_ns
+    if joints:
+        np.testing.assert_array_equal(found.speeds, speeds[:n])
+        assert wheel is None and np.isnan(found.linear).all()
+    else:
+        np.testing.assert_array_equal(found.linear, linear[:n])
+        np.testing.assert_array_equal(found.angular, angular[:n])
+        assert wheel is not None and wheel.model == "twist"
+        np.testing.assert_allclose(wheel.left_T_wheel, left_T_base, atol=1e-12)
+    with pytest.raises(StereoSfmError, match="has no wheel odometry /nothing"):
+        open_source(path, wheel="/nothing")
 
 
 def test_the_poses_are_those_of_the_images(tmp_path: Path) -> None:

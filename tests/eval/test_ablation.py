@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 
 from stereo_sfm.cli import main
-from stereo_sfm.eval.ablation import Cell, finished, grid, load_answer, run_cell, save_answer
+from stereo_sfm.eval.ablation import Cell, finished, grid, load_result, run_cell, save_result
 from stereo_sfm.eval.ablation_report import COLUMNS, findings, overview, row_of, write_report
 
 SIM = "sim:aisle?camera=pinhole&size=320x200&frames=5"
 CELL = Cell(SIM, "grid", "orb", "pnp", "tracking", 0)
 
 
-def answer(kind: str, method: str, ate: float, stage: str = "tracking", system: str = "grid", ms: float = 50) -> Any:
+def cell_of(kind: str, method: str, ate: float, stage: str = "tracking", system: str = "grid", ms: float = 50) -> Any:
     """A made cell."""
     cell = Cell("kitti:07", system, kind, method, stage, 0)
     path = [[0.1 * i, 0.0, 0.2 * i] for i in range(5)]
@@ -72,10 +72,10 @@ def test_a_cell_is_run_judged_and_kept(tmp_path: Path) -> None:
     assert result["metrics"]["ape_m"]["rmse"] < 0.05
     row = row_of(result)
     assert row["rel trans mean [m]"] < 0.05
-    save_answer(tmp_path / "x.json", result)
-    assert load_answer(tmp_path / "x.json") == json.loads(json.dumps(result))
+    save_result(tmp_path / "x.json", result)
+    assert load_result(tmp_path / "x.json") == json.loads(json.dumps(result))
     (tmp_path / "x.json").write_text('{"schema": 1, "cel')
-    assert load_answer(tmp_path / "x.json") is None
+    assert load_result(tmp_path / "x.json") is None
 
 
 def test_failed_cells_are_run_again_rejected_ones_are_not() -> None:
@@ -97,22 +97,26 @@ def test_failures_have_reasons() -> None:
 
 def test_findings_follow_the_numbers() -> None:
     made = [
-        answer("sift", "em-r", 1.0), answer("akaze", "em-r", 2.0), answer("orb", "em-r", 3.0),
-        answer("sift", "r-um", 2.0), answer("sift", "um", 5.0), answer("", "", 0.5, system="default", ms=10),
+        cell_of("sift", "em-r", 1.0), cell_of("akaze", "em-r", 2.0), cell_of("orb", "em-r", 3.0),
+        cell_of("sift", "r-um", 2.0), cell_of("sift", "um", 5.0), cell_of("", "", 0.5, system="default", ms=10),
     ]  # fmt: skip
     text = "\n".join(findings(made))
     assert "SIFT best and ORB worst with em-r: yes" in text
     assert "EM-R best with sift: yes" in text
     assert "RANSAC needed with sift: yes" in text
     assert "more accurate than every cell, ATE: yes" in text and "faster than every cell: yes" in text
-    worse = [answer("sift", "em-r", 3.0), answer("orb", "em-r", 1.0), answer("", "", 2.0, system="default", ms=90)]
+    worse = [
+        cell_of("sift", "em-r", 3.0),
+        cell_of("orb", "em-r", 1.0),
+        cell_of("", "", 2.0, system="default", ms=90),
+    ]
     text = "\n".join(findings(worse))
     assert "SIFT best and ORB worst with em-r: no" in text
     assert "more accurate than every cell, ATE: no" in text and "faster than every cell: no" in text
 
 
 def test_the_report_has_tables_plots_csv_and_published_figures(tmp_path: Path) -> None:
-    made = [answer("sift", "em-r", 1.0), answer("sift", "em-r", 0.5, "mapping")]
+    made = [cell_of("sift", "em-r", 1.0), cell_of("sift", "em-r", 0.5, "mapping")]
     refused = {"schema": 1, "cell": vars(Cell("kitti:07", "grid", "sift", "vp-r", "tracking", 0)), "status": "none",
                "reason": "weak_structure in 5 of 5 frames", "frames": 5, "tracked": 0}  # fmt: skip
     text = write_report(tmp_path, [*made, refused]).read_text()
@@ -132,7 +136,7 @@ def test_the_command_resumes_and_refuses_unknown_names(
     command = ["ablation", "kitti:07", "-o", str(tmp_path), *chosen]
     cell = grid(["kitti:07"], ["orb"], ["um"], ["tracking"], ())[0]
     (tmp_path / "cells").mkdir()
-    save_answer(tmp_path / "cells" / cell.file_name, answer("orb", "um", 0.25))
+    save_result(tmp_path / "cells" / cell.file_name, cell_of("orb", "um", 0.25))
 
     def never(*_: object) -> None:
         raise AssertionError("a finished cell was computed again")
@@ -160,8 +164,13 @@ def test_the_whole_command_in_two_processes(tmp_path: Path) -> None:
 
 
 def test_the_overview_has_a_column_for_each_feature_and_a_line_for_each_system() -> None:
-    refused = {**answer("orb", "em-r", 9.0), "status": "none", "reason": "weak_structure in 5 of 5 frames"}
-    made = [answer("sift", "em-r", 1.25), refused, answer("sift", "um", 2.0), answer("", "", 0.5, system="default")]
+    refused = {**cell_of("orb", "em-r", 9.0), "status": "none", "reason": "weak_structure in 5 of 5 frames"}
+    made = [
+        cell_of("sift", "em-r", 1.25),
+        refused,
+        cell_of("sift", "um", 2.0),
+        cell_of("", "", 0.5, system="default"),
+    ]
     lines = overview(made).splitlines()
     assert lines[0] == "| odometry | stage | sift | orb |"
     assert lines[2] == "| em-r | tracking | 1.25 m (1.25 m), 50 ms | weak_structure in 5 of 5 frames |"
@@ -184,7 +193,7 @@ def test_ctrl_c_finishes_the_running_cell_and_starts_no_other(
             begun.append(args[0])
             assert signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())  # a process begun now never sees it
             signal.raise_signal(signal.SIGINT)
-            save_answer(args[1], answer("orb", "um", 0.25))
+            save_result(args[1], cell_of("orb", "um", 0.25))
             done: Future[Any] = Future()
             done.set_result("ATE 0.25 m")
             return done
@@ -211,11 +220,11 @@ def test_settings_are_part_of_a_cell_and_leave_the_names_of_others_alone(tmp_pat
     assert len({CELL.file_name, plain.file_name, same.file_name}) == 3
     described = (1, (SIM, "grid", "orb", "pnp", "tracking", 0, 0), asdict(CELL.config()))
     assert hashlib.sha256(repr(described).encode()).hexdigest()[:8] in CELL.file_name  # as before there were settings
-    made = answer("orb", "um", 0.25)
+    made = cell_of("orb", "um", 0.25)
     made["cell"] = {**made["cell"], "settings": ["odometry.refine=false"]}
     assert "Set in every cell: `odometry.refine=false`." in write_report(tmp_path, [made]).read_text()
     assert (tmp_path / "ablation.csv").read_text().splitlines()[1].endswith(",odometry.refine=false")
-    assert "Set in every cell" not in write_report(tmp_path, [answer("orb", "um", 0.25)]).read_text()
+    assert "Set in every cell" not in write_report(tmp_path, [cell_of("orb", "um", 0.25)]).read_text()
 
 
 @pytest.mark.parametrize(

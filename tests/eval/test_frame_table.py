@@ -34,7 +34,7 @@ def test_many_frames_keep_their_values() -> None:
 def test_lost_intervals_begin_after_the_first_pose() -> None:
     states = [TrackState.INITIALIZING, OK, LOST, LOST, RECOVERED, OK, LOST]
     record = record_of(states, ["dark", "", "blur", "dark", "", "", "dark"])
-    assert record.lost_intervals() == [LostInterval(12, 2, 0.2, "blur"), LostInterval(16, 1, 0.0, "dark")]
+    assert record.lost_intervals() == [LostInterval(12, 2, 0.2, "blur", 0.2), LostInterval(16, 1, 0.0, "dark", 0.6)]
     assert record.tracked().tolist() == [False, True, False, False, True, True, False]
     assert record_of([LOST], ["dark"]).lost_intervals() == []
 

@@ -100,7 +100,10 @@ def test_nearest_association_keeps_the_maximum_difference() -> None:
 def test_trajectories_without_common_time_are_refused_in_one_line() -> None:
     with pytest.raises(StereoSfmError, match=r"no stamps in common.*0.000 to 0.200") as error:
         associate(trajectory(straight(3, 1.0)), trajectory(straight(3, 1.0), start_ns=10**12))
-    assert "\n" not in str(error.value)
+    assert "\n" not in str(error.value) and "times.txt" not in str(error.value)
+    for start_ns, other_ns in ((0, 10**18), (10**18, 0)):  # one was counted from 0
+        with pytest.raises(StereoSfmError, match=r"name the images by their stamps, or put a times.txt"):
+            associate(trajectory(straight(3, 1.0), start_ns=start_ns), trajectory(straight(3, 1.0), start_ns=other_ns))
 
 
 def test_alignment_modes() -> None:

@@ -20,7 +20,19 @@ from stereo_sfm.eval.run_results import scale_free, write_results
 from stereo_sfm.eval.statistics import failure, summary
 from stereo_sfm.geometry import se3
 from stereo_sfm.messages import LogEnded
-from stereo_sfm.types import F64, Dropped, Frame, Keyframe, LoopResult, MapUpdate, Observations, TrackState, Trajectory
+from stereo_sfm.types import (
+    F64,
+    CalibrationUpdate,
+    Dropped,
+    Frame,
+    Keyframe,
+    LoopResult,
+    MapUpdate,
+    Observations,
+    RowErrors,
+    TrackState,
+    Trajectory,
+)
 from tests.synthetic import pinhole_rig
 
 COUNT = 30
@@ -89,6 +101,28 @@ def test_frames_without_a_place_in_the_map_are_left_out(tmp_path: Path) -> None:
     stats, lines, _ = results(tmp_path, record, pinhole_rig(), Config())
     assert stats["unplaced"] == 10 and failure(stats) == ""
     assert any("10 of the tracked frames were not found in the map" in line for line in lines)
+
+
+def test_lost_intervals_and_gaps_are_in_the_report(tmp_path: Path) -> None:
+    record, seen = RunRecord(), Observations.empty()
+    for k, pose in enumerate(camera_path()):
+        lost = 10 <= k < 13
+        state, reason = (TrackState.LOST, "too_few_points") if lost else (TrackState.OK, "")
+        stamp_ns = (k + 5 * (k >= 20)) * 10**8
+        record.put(Frame(k, stamp_ns, pose, np.eye(6), state, reason, seen, 0, np.eye(4)))
+    stats, _, report = results(tmp_path, record, pinhole_rig(), Config())
+    assert "| 1.00 s | 1.30 s | 3 | too few points | too few points could be tracked: check the images" in report
+    assert "| 1.90 s | 2.50 s | 5 |" in report and "latency" in report
+    assert [gap["missing"] for gap in stats["stamp_gaps"]] == [5]
+
+
+def test_localizing_only_says_what_came_of_the_map(tmp_path: Path) -> None:
+    for placed_from, said in ((10, "20 of 30 tracked frames, first found after 1.0 s"), (COUNT, "never")):
+        record = record_of(camera_path(), placed_from)
+        record.localize_only = True
+        record.keyframes = {k: KeyframeRow(k, k * 10**8, np.eye(4), 0.0, submap_id=0) for k in (0, 10, 20)}
+        _, lines, report = results(tmp_path, record, pinhole_rig(), Config())
+        assert f"localized in the saved map: {said}" in lines and f"localized in the saved map: {said}" in report
 
 
 def test_never_found_in_the_map_is_a_failure(tmp_path: Path) -> None:
@@ -203,7 +237,7 @@ def test_the_report_and_the_exit_code_have_the_same_limit(tmp_path: Path) -> Non
         assert ("FAIL" in (tmp_path / "report.md").read_text()) == wrong
 
 
-def test_a_report_in_a_hurry_has_its_text_and_the_pictures_drawn_so_far(tmp_path: Path) -> None:
+def test_a_report_in_a_hurry_has_its_text_and_the_plots_drawn_so_far(tmp_path: Path) -> None:
     answers = iter([True, False])
 
     def go_on() -> bool:
@@ -213,8 +247,27 @@ def test_a_report_in_a_hurry_has_its_text_and_the_pictures_drawn_so_far(tmp_path
     write_results(tmp_path, "test", pinhole_rig(), Config(), record_of(camera_path(), 0), 1.0, go_on=go_on)
     report = (tmp_path / "report.md").read_text()
     assert "![trajectory](trajectory.png)" in report and "![tracking]" not in report
-    assert "pictures were omitted" in report
+    assert "plots were omitted" in report
     assert [path.name for path in tmp_path.glob("*.png")] == ["trajectory.png"]
+
+
+def test_corrections_of_the_rig_are_plotted_and_written(tmp_path: Path) -> None:
+    record = record_of(camera_path(), 0)
+    none = np.zeros(0, np.int64)
+    terms, covariance = np.array([0.002, 0, 0, 0, 0, 0]), np.diag(np.full(6, 1e-8))
+    for k, change in (
+        (3, None),
+        (6, CalibrationUpdate(1, 6, 6 * 10**8, terms, covariance, 0, True, "significant", "")),
+    ):
+        rows = RowErrors(k, k * 10**8, np.full(12, 0.1), 0.7 / k, 0.0, False)
+        update = MapUpdate(
+            k, k, none, np.zeros((0, 4, 4)), none, np.zeros((0, 3)), none, none.reshape(-1, 2), np.eye(4)
+        )
+        record.put(dataclasses.replace(update, calibration=change, row_errors=rows))
+    write_results(tmp_path, "test", pinhole_rig(), Config(), record, 1.0)
+    report = (tmp_path / "report.md").read_text()
+    assert "![calibration](calibration.png)" in report and "+0.115 ± 0.006" in report
+    assert (tmp_path / "calibration.png").exists() and (tmp_path / "rig_corrected.yaml").exists()
 
 
 def test_a_disk_that_is_full_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,8 @@
 """Damaged and crafted files: each is read, or one line and exit code 2; never a traceback, a hang or gigabytes.
 
 The commands run in one process whose address space is bounded. What a large search found stays found: the seeds are
-fixed. Few cases by default, many with `-m slow`; FUZZ_SEED=10000 begins with another seed.
+fixed. Few cases by default, many with `-m slow`; FUZZ_SEED=10000 begins with another seed, FUZZ_TIMES=3 takes so many
+times as many cases.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ MOST_SECONDS = 20.0  # of processor time for one file
 MOST_LINES = 40  # that one command may say
 HANGS_S = 300.0  # of wall clock
 FIRST_SEED = int(os.environ.get("FUZZ_SEED", "0"))
+TIMES = int(os.environ.get("FUZZ_TIMES", "1"))
 
 
 def own_recording(path: Path) -> Path:
@@ -97,10 +99,10 @@ def check(child: Child, case: str, argv: list[str]) -> list[str]:
     return [f"{case}: {' '.join(argv[:1])}: {text}" for text in wrong]
 
 
-def search(count: int, case: Callable[[int], tuple[str, list[list[str]]]], child: Child) -> None:
-    """Every case of every seed; all faults are reported together."""
+def search(count: int, case: Callable[[int], tuple[str, list[list[str]]]], child: Child, *found: int) -> None:
+    """Every case of every seed, and of those that a wider search found faults with; all are reported together."""
     wrong: list[str] = []
-    for seed in range(FIRST_SEED, FIRST_SEED + count):
+    for seed in (*found, *range(FIRST_SEED, FIRST_SEED + TIMES * count)):
         name, commands = case(seed)
         for argv in commands:
             wrong += check(child, f"seed {seed}, {name}", argv)
@@ -165,7 +167,7 @@ def test_recordings(count: int, recordings: list[Path], child: Child, tmp_path: 
         more = [["recover", str(path), "-o", mended], ["diff", str(path), str(source)]]
         return source.name, [*commands, more[seed % 2]]
 
-    search(count, case, child)
+    search(count, case, child, 10819, 20669)
 
 
 @few_or_many(24, 195)
@@ -189,7 +191,7 @@ def test_calibrations(count: int, child: Child, tmp_path: Path) -> None:
         chosen = ["--from", name] if rng.random() < 0.5 else []
         return f"{name} {rig}", [["convert-calib", str(path), output, "--to", "rig", "--overwrite", *chosen]]
 
-    search(count, case, child)
+    search(count, case, child, 20576)
 
 
 @pytest.fixture(scope="module")

@@ -52,6 +52,14 @@ def test_quaternions_agree_with_scipy(q: np.ndarray) -> None:
     np.testing.assert_allclose(se3.rotation_from_quaternion(back), rotation, atol=1e-12)
 
 
+@pytest.mark.parametrize("size", [1e-200, 1.0, 1e200, 1e300])
+def test_quaternions_of_any_size(size: float) -> None:
+    q = np.array([0.1, -0.2, 0.3, 0.9])
+    rotation = se3.rotation_from_quaternion(size * q)
+    np.testing.assert_allclose(rotation, se3.rotation_from_quaternion(q), atol=1e-12)
+    assert np.isnan(se3.rotation_from_quaternion(np.zeros(4))).any()
+
+
 @pytest.mark.parametrize("axis", np.vstack([np.eye(3), [[0.6, 0.8, 0], [0.1, -0.7, 0.7]]]))
 @pytest.mark.parametrize("angle", [np.pi, np.pi - 1e-9, np.pi - 1e-5])
 def test_half_turns(axis: np.ndarray, angle: float) -> None:

@@ -21,7 +21,7 @@ from stereo_sfm.log.run_log import RunLog
 from stereo_sfm.log.samples import ImageInfo, ImuSample
 from stereo_sfm.log.track_stats import TrackStats
 from stereo_sfm.log.writer import LogWriter
-from stereo_sfm.messages import Health, SourceCounters, StageTimes
+from stereo_sfm.messages import Health, SourceCounters, StageTimes, Topic
 from stereo_sfm.types import (
     F64,
     Applied,
@@ -169,7 +169,7 @@ class Probe:
 
 
 def test_a_new_message_is_one_dataclass_and_one_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    row = topics.Topic("/probe", Probe, "when asked")
+    row = topics.Row(Topic("/probe", "when asked"), Probe)
     monkeypatch.setitem(topics.OF, Probe, row)
     monkeypatch.setitem(topics.BY_NAME, row.name, row)
     monkeypatch.setitem(recorded.TYPES, row.schema, Probe)

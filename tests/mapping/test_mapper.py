@@ -287,3 +287,31 @@ def test_a_place_keeps_a_bounded_number_of_keyframes() -> None:
     assert len(every.map.living_keyframes()) == len(stream.keyframes)
     assert len(bounded.map.living_keyframes()) < 0.6 * len(stream.keyframes)
     assert error(bounded.map.keyframes.map_T_kf, stream.world_T_kf) < 0.006
+
+
+def test_ends_of_loops_are_thinned_out_too() -> None:
+    """Back and forth with a loop at every return: the loops end at other keyframes where theirs are culled."""
+    once = camera_path(12, 0.1, 0.0)
+    poses = np.concatenate([once, once[::-1]] * 4)
+    stream = keyframe_stream(pinhole_rig(), poses, points=600, drift=(0.005, 0.001), track_length=4)
+    config = dataclasses.replace(CONFIG, association="tracks", full_ba_growth=np.inf)
+    mapper, none = Mapper(config, stream.rig), np.zeros((0, 2), np.int64)
+    for k, keyframe in enumerate(stream.keyframes):
+        returned = dataclasses.replace(true_loop(stream, k - 1, k - 25), matches=none) if k >= 27 else None
+        mapper.step(keyframe, returned)
+    mapper.finish([])
+    assert len(mapper.map.living_keyframes()) < 0.85 * len(stream.keyframes)
+    assert error(mapper.map.keyframes.map_T_kf, stream.world_T_kf) < 0.02
+
+
+def test_visits_that_share_no_points_are_thinned_out_too() -> None:
+    """Back and forth, each time with new points: a view keeps a bounded number of keyframes of all visits."""
+    once = camera_path(12, 0.1, 0.0)
+    visits = 8
+    poses = np.concatenate([once if k % 2 == 0 else once[::-1] for k in range(visits)])
+    stream = keyframe_stream(pinhole_rig(), poses, points=600, track_length=4)
+    config = dataclasses.replace(CONFIG, association="tracks", full_ba_growth=np.inf)
+    every, _ = run(stream, dataclasses.replace(config, crowd_keyframes=10_000))
+    bounded, _ = run(stream, config)
+    assert len(every.map.living_keyframes()) > 0.7 * len(poses)
+    assert len(bounded.map.living_keyframes()) < 0.5 * len(poses)

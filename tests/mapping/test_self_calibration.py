@@ -85,6 +85,21 @@ def test_a_step_is_detected_and_earlier_keyframes_keep_their_rig() -> None:
     assert np.rad2deg(estimator.terms[1]) == pytest.approx(0.2, abs=0.02)
 
 
+@pytest.mark.parametrize(("name", "axis"), [("fisheye", 0), ("pinhole", 1)])
+def test_drift_is_followed(name: str, axis: int) -> None:
+    """0.1 degrees in 320 keyframes, some two minutes; a rig that does not drift stays."""
+    true, count = RIGS[name], 320
+    turns = 0.1 * np.outer(np.arange(count) / count, np.eye(3)[axis])
+    estimator, found = revisions([turned(true, tuple(turn)) for turn in turns], true, 0)
+    assert "drift" in [r.why for r in found] and found[-1].since_kf_id > 0
+    assert np.rad2deg(estimator.terms[:3]) == pytest.approx(turns[-1], abs=0.03)
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_a_true_rig_stays_for_long(name: str) -> None:
+    assert not revisions(RIGS[name], RIGS[name], 0, count=320)[1]
+
+
 def test_the_same_keyframes_give_the_same_bits() -> None:
     wrong = turned(RIGS["fisheye"], (0.0, 0.1, 0.0))
     a, b = (revisions(RIGS["fisheye"], wrong, 3)[0].terms for _ in range(2))

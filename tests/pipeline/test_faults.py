@@ -20,12 +20,14 @@ from stereo_sfm.log import topics
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.recorded import ended_early, read_run
 from stereo_sfm.messages import LogEnded
-from stereo_sfm.pipeline import logger, processes, workers
+from stereo_sfm.pipeline import child, logger, workers
 from stereo_sfm.pipeline.capture import TRACKER_SLOTS, FreeSlots
 from stereo_sfm.pipeline.channels import Inbox
+from stereo_sfm.pipeline.child import Report, Setup
+from stereo_sfm.pipeline.logger import LogOptions
 from stereo_sfm.pipeline.processes import ProcessRun
+from stereo_sfm.pipeline.stage_processes import raise_file_limit
 from stereo_sfm.pipeline.watchdog import SILENT_S, Watchdog
-from stereo_sfm.pipeline.workers import LogOptions, Report, Setup
 from stereo_sfm.types import Dropped
 from tests.pipeline.test_pipeline import CONFIG, SlidingWall, inline, same
 
@@ -194,7 +196,7 @@ def test_a_stopped_process_is_named_and_the_run_ends_in_time(
 def hanging_loop(to_main: Report, control: Connection, keyframes: Connection, to_mapper: Connection) -> None:
     """A loop closer that never responds."""
     Inbox[Setup](control).take()
-    to_main.send(workers.Ready("loop"))
+    to_main.send(child.Ready("loop"))
     Inbox[object](keyframes).take()
     time.sleep(600)
 
@@ -235,6 +237,20 @@ def test_a_stop_while_the_source_is_opened_ends_the_run() -> None:
     threading.Timer(0.2, run.stop).start()
     with pytest.raises(KeyboardInterrupt), run:
         pass
+    assert time.monotonic() - begin < END_S
+
+
+def late() -> SlidingWall:
+    """A source that takes a while to open."""
+    time.sleep(0.5)
+    return SlidingWall(5000, slow_s=0.01)
+
+
+def test_a_stop_shortly_before_the_source_is_open_ends_the_run_at_its_first_image() -> None:
+    run, begin = ProcessRun(MadeSource.of(late), CONFIG), time.monotonic()
+    threading.Timer(0.2, run.stop).start()
+    with run:
+        assert len(list(run)) <= 1
     assert time.monotonic() - begin < END_S
 
 
@@ -279,8 +295,8 @@ def test_too_few_open_files_are_raised_or_named(monkeypatch: pytest.MonkeyPatch)
     asked: list[tuple[int, int]] = []
     monkeypatch.setattr(resource, "setrlimit", lambda _, limits: asked.append(limits))
     monkeypatch.setattr(resource, "getrlimit", lambda _: (40, 4096))
-    processes._raise_file_limit(128)
+    raise_file_limit(128)
     assert asked == [(128, 4096)]
     monkeypatch.setattr(resource, "getrlimit", lambda _: (40, 40))
     with pytest.raises(StereoSfmError, match="only 40 files may be open, a run needs 128: raise 'ulimit -n'"):
-        processes._raise_file_limit(128)
+        raise_file_limit(128)

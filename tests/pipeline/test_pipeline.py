@@ -27,10 +27,10 @@ from stereo_sfm.log.writer import LogWriter
 from stereo_sfm.maps.folders import MapFolders
 from stereo_sfm.maps.saved_map import load_map
 from stereo_sfm.pipeline.inline import run_inline
+from stereo_sfm.pipeline.logger import LogOptions
 from stereo_sfm.pipeline.processes import ProcessRun, StageDied
 from stereo_sfm.pipeline.schedule import Lockstep, Recorded, Schedule
 from stereo_sfm.pipeline.threads import VARIABLES, thread_environment
-from stereo_sfm.pipeline.workers import LogOptions
 from stereo_sfm.types import Applied, Frame, StereoImage, Trajectory
 
 WIDTH, HEIGHT, BASELINE = 320, 240, 0.1
@@ -230,7 +230,7 @@ def test_a_stage_that_dies_before_it_is_set_up_is_named(tmp_path: Path) -> None:
 
     def kill() -> None:
         os.kill(run.pids["tracker"], signal.SIGKILL)
-        run._processes["tracker"].join()
+        run._stages.processes["tracker"].join()
 
     run._opened = kill
     with pytest.raises(StageDied, match="the tracker process was killed by SIGKILL"), run:

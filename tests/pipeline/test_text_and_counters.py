@@ -21,11 +21,11 @@ from stereo_sfm.log.recorded import messages
 from stereo_sfm.log.run_log import RunLog
 from stereo_sfm.log.writer import LogWriter
 from stereo_sfm.messages import LogLine, SourceCounters
-from stereo_sfm.pipeline import workers
+from stereo_sfm.pipeline import child
 from stereo_sfm.pipeline.channels import End, Outbox
 from stereo_sfm.pipeline.inline import run_inline
+from stereo_sfm.pipeline.logger import LogOptions
 from stereo_sfm.pipeline.processes import ProcessRun
-from stereo_sfm.pipeline.workers import LogOptions
 from stereo_sfm.types import StereoImage
 from tests.pipeline.test_pipeline import CONFIG, SlidingWall
 
@@ -137,7 +137,7 @@ def _warn(to_main: Outbox) -> None:
 def test_every_worker_forwards_its_text(stage: str) -> None:
     context = multiprocessing.get_context("spawn")
     receive, send = context.Pipe(duplex=False)
-    process = context.Process(target=workers.guarded, args=(stage, _warn, send))
+    process = context.Process(target=child.guarded, args=(stage, _warn, send))
     process.start()
     send.close()
     message = _all(receive)

@@ -14,10 +14,12 @@ import psutil
 import pytest
 
 from stereo_sfm.drivers.choice import MadeSource
-from stereo_sfm.pipeline import processes, workers
+from stereo_sfm.pipeline import processes
+from stereo_sfm.pipeline import viewer as viewer_process
 from stereo_sfm.pipeline.channels import DroppingOutbox, Inbox, Outbox
+from stereo_sfm.pipeline.logger import LogOptions
 from stereo_sfm.pipeline.processes import ProcessRun
-from stereo_sfm.pipeline.workers import LogOptions, ViewerOptions
+from stereo_sfm.pipeline.viewer import ViewerOptions
 from tests.pipeline.test_pipeline import CONFIG, SlidingWall, inline, same
 
 __all__ = ["inline"]  # a fixture
@@ -45,7 +47,7 @@ def slow_viewer(to_main: Outbox, control: Connection, messages: Connection, opti
 def test_the_run_is_complete_whatever_the_viewer_does(
     body: object, inline: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(workers, "run_viewer", body)
+    monkeypatch.setattr(viewer_process, "run_viewer", body)
     monkeypatch.setattr(processes, "VIEWER_GRACE_S", 0.5)
     log, viewer = LogOptions(tmp_path / "run.mcap", "none"), ViewerOptions("save", tmp_path / "run.rrd")
     with ProcessRun(MadeSource.of(SlidingWall, FRAMES), CONFIG, log=log, viewer=viewer) as run:
@@ -88,5 +90,4 @@ def test_sending_without_a_receiver_takes_no_time_and_no_memory(closed: bool) ->
         assert len(got) <= 16 + 2 and got == sorted(got)  # and one or two were in the pipe before
         receive.close()
     outbox.close()
-    outbox._thread.join(5)
-    assert not outbox._thread.is_alive()
+    assert outbox.join(5)

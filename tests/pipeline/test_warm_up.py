@@ -5,23 +5,32 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
+import pytest
 
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.geometry.cameras import Pinhole
-from stereo_sfm.pipeline.warm_up import keyframes
-
-CHILD = """
-import sys
-from numba.core.dispatcher import Dispatcher
-from stereo_sfm.drivers.source import open_source
 from stereo_sfm.config import Config
 from stereo_sfm.demo import demo_recording
+from stereo_sfm.geometry.cameras import Pinhole
+from stereo_sfm.pipeline.warm_up import images, keyframes
+from stereo_sfm.tracking.factory import make_tracker
+from stereo_sfm.tracking.flow import frame_pose
+from stereo_sfm.tracking.flow.consensus import errors_at
+from tests.calib.test_formats import RIGS
+
+CHILD = """
+import itertools, sys
+from numba.core.dispatcher import Dispatcher
+from stereo_sfm.drivers.memory import MemorySource
+from stereo_sfm.drivers.source import open_source
+from stereo_sfm.config import Config
 from stereo_sfm.pipeline.inline import run_inline
 from stereo_sfm.pipeline.warm_up import warm_up_stage
 
-with open_source(str(demo_recording())) as source:
+with open_source(sys.argv[1]) as source:
+    source = MemorySource(source.rig, list(itertools.islice(source, 300)))  # rendered or decoded
     for stage in ("tracker", "mapper", "loop"):
         warm_up_stage(stage, Config(), source.rig)
     late, load = [], Dispatcher.compile
@@ -35,12 +44,35 @@ with open_source(str(demo_recording())) as source:
         pass
 print(*sorted(set(late)))
 """
+SIMULATED = "sim:people?frames=40&size=320x200&vibration=2"
 
 
-def test_nothing_is_compiled_after_the_warm_up() -> None:
-    child = subprocess.run([sys.executable, "-c", CHILD], capture_output=True, text=True, env=dict(os.environ))
+def late_kernels(source: str) -> list[str]:
+    """What the stages load while the first images of a source are processed after the warm-up."""
+    child = subprocess.run([sys.executable, "-c", CHILD, source], capture_output=True, text=True, env=dict(os.environ))
     assert child.returncode == 0, child.stderr
-    assert child.stdout.split() == []
+    return child.stdout.split()
+
+
+@pytest.mark.parametrize("source", [str(demo_recording()), f"{SIMULATED}&camera=pinhole", f"{SIMULATED}&imu=t265"])
+def test_nothing_is_compiled_after_the_warm_up(source: str) -> None:
+    assert late_kernels(source) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["euroc_mh01", "kitti", "rgbd_dataset_freiburg1_xyz", "store_walk"])
+def test_nothing_is_compiled_after_the_warm_up_of_a_real_camera(name: str, data_root: Path) -> None:
+    assert late_kernels(str(data_root / name)) == []
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_the_last_images_of_the_warm_up_show_two_motions(rig: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[int] = []
+    monkeypatch.setattr(frame_pose, "errors_at", lambda *given: seen.append(len(given[5])) or errors_at(*given))
+    tracker = make_tracker(Config(), RIGS[rig])
+    for image in images(RIGS[rig]):
+        tracker.step(image)
+    assert seen
 
 
 def test_images_of_any_size_have_a_warm_up() -> None:

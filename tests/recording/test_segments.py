@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,11 +17,11 @@ from stereo_sfm.drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log import topics
 from stereo_sfm.log.reader import LogReader
-from stereo_sfm.recording import recorder as module
+from stereo_sfm.recording import segment_recorder as module
 from stereo_sfm.recording import segment_writers
 from stereo_sfm.recording.quota import Disk, Quota, forget_images, make_room, used_bytes
-from stereo_sfm.recording.recorder import Policy, SegmentRecorder
-from stereo_sfm.recording.segments import Segment, delete_recording, is_recording, listed, recordings, segments
+from stereo_sfm.recording.segment_recorder import Policy, SegmentRecorder
+from stereo_sfm.recording.segments import ABOUT, Segment, delete_recording, is_recording, listed, recordings, segments
 from stereo_sfm.types import Frame, ImuSamples, Observations, StereoImage, TrackState
 from tests.pipeline.test_pipeline import SlidingWall
 
@@ -92,10 +93,30 @@ def test_segments_open_alone_and_replay_as_one(tmp_path: Path) -> None:
         assert reader.truncated == "" and reader.metadata("totals")["frames"] == "30"
         assert len(list(reader.messages([topics.THUMBNAIL]))) == 1
     assert is_recording(folder) and listed(folder)["segments"] == 4
+    assert images[-1].stamp_ns - images[0].stamp_ns > 3e9
+    assert listed(folder)["seconds"] == round((images[-1].stamp_ns - images[0].stamp_ns) / 1e9)
     delete_recording(tmp_path, folder.name)
     assert recordings(tmp_path) == []
     with pytest.raises(StereoSfmError, match="no recording"):
         delete_recording(tmp_path, "../..")
+
+
+def test_the_length_of_a_short_and_of_an_unfinished_recording(tmp_path: Path) -> None:
+    recorder = start(tmp_path, segment_s=60.0)
+    (folder,) = recordings(tmp_path)
+    os.utime(folder / ABOUT, (1e9, 1e9))  # the first image may come late
+    assert recorder.state().seconds == 0
+    record(recorder, list(SlidingWall(61)))
+    assert recorder.state().seconds == 2
+    recorder.close(20.0)
+    (part,) = segments(folder)
+    assert part.second == 0 and listed(folder)["seconds"] == 2  # by its poses
+    whole = part.poses.read_bytes()
+    part.poses.write_bytes(whole[: len(whole) // 2])  # as while it is written: by the clock of the disk
+    began_s = (folder / ABOUT).stat().st_mtime
+    assert time.time() - began_s < 60
+    os.utime(part.poses, (began_s + 7, began_s + 7))
+    assert listed(folder)["seconds"] == 7
 
 
 def test_a_segment_ends_at_its_size(tmp_path: Path) -> None:
@@ -209,7 +230,7 @@ def test_a_disk_that_refuses_everything_is_tried_again(tmp_path: Path, monkeypat
     assert poses == set(range(60))
 
 
-def test_a_slow_disk_drops_images_and_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_disk_drops_images_and_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real = segment_writers.ImageLog.image
 
     def slow(self: segment_writers.ImageLog, image: object) -> None:
@@ -223,13 +244,13 @@ def test_a_slow_disk_drops_images_and_says_so(tmp_path: Path, monkeypatch: pytes
         recorder.image(image)
         recorder.put(frame(image))
     assert time.monotonic() - began < 2.0 and recorder.images_dropped > 20
-    assert recorder.state().problem == "the disk is slow: images are left out"
+    assert recorder.state().problem == "the disk is slow: images are dropped"
     recorder.close(20.0)
     poses = [r.sequence for s in segments(recorder.folder) for r in messages(s.poses, topics.FRAME)]
     assert poses == list(range(60))
 
 
-def test_a_folder_without_images_says_so(tmp_path: Path) -> None:
+def test_a_folder_without_images_is_reported(tmp_path: Path) -> None:
     recorder = start(tmp_path, mode="lean")
     record(recorder, list(SlidingWall(30)))
     recorder.close(20.0)

@@ -19,7 +19,7 @@ class Lines:
 
     path: Path
     wants: frozenset[type] = frozenset({Status, PoseUpdate})
-    picture_hz: float = 0.0
+    preview_hz: float = 0.0
     slow_s: float = 0.0
     client: ServiceClient | None = None
     lines: list[str] = field(default_factory=list)

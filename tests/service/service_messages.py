@@ -14,8 +14,8 @@ from stereo_sfm.messages import Health
 from stereo_sfm.service.messages import (
     HealthReport,
     MapCloud,
-    Picture,
     PoseUpdate,
+    PreviewImage,
     ServiceState,
     Started,
     Status,
@@ -63,12 +63,12 @@ def cloud(points: int = 500, keyframes: int = 5) -> MapCloud:
     return MapCloud(10**9, 2, 1, False, np.arange(points), xyz, np.arange(keyframes), map_T_kf)
 
 
-def picture(frame_id: int = 0, size: tuple[int, int] = (320, 240)) -> Picture:
+def picture(frame_id: int = 0, size: tuple[int, int] = (320, 240)) -> PreviewImage:
     rng = np.random.default_rng(frame_id)
     left = np.add.outer(np.arange(size[1]), np.arange(size[0])).astype(np.uint8)
     uv = rng.uniform((0, 0), size, (40, 2))
     age = rng.integers(0, 40, 40).astype(np.int32)
-    return Picture(frame_id, 10**9 + frame_id * 33_333_333, left, left.copy(), uv, age, rng.random(40) > 0.2)
+    return PreviewImage(frame_id, 10**9 + frame_id * 33_333_333, left, left.copy(), uv, age, rng.random(40) > 0.2)
 
 
 def health(**others: Any) -> HealthReport:

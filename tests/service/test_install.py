@@ -42,7 +42,7 @@ def test_a_dry_run_prints_everything_and_changes_nothing(capsys: pytest.CaptureF
     assert Path(install.UNIT_FILE).exists() == existed
 
 
-def test_without_an_installation_it_says_so(
+def test_a_missing_installation_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(install, "UNIT_FILE", str(tmp_path / "none"))

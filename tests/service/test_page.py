@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import shlex
 import threading
 import time
 from collections.abc import Iterator
@@ -11,26 +12,33 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 from stereo_sfm.cli import main
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.export.floor_plan import FREE, OCCUPIED
 from stereo_sfm.geometry import se3
+from stereo_sfm.recording.describe import describe_file
 from stereo_sfm.service.config import RobotConfig
 from stereo_sfm.service.messages import Event, ServiceState
 from stereo_sfm.service.outputs.access import Access
 from stereo_sfm.service.outputs.ports import ports
+from stereo_sfm.service.outputs.robot_axes import RobotAxes
 from stereo_sfm.service.outputs.settings import FoxgloveConfig, OutputsConfig, PageConfig, PoseSocketConfig
-from stereo_sfm.service.page import server
+from stereo_sfm.service.page import app, server
 from stereo_sfm.service.page.server import PageOutput
-from stereo_sfm.service.publisher import Reply
+from stereo_sfm.service.page.verdicts import GOOD, Verdicts, problems
+from stereo_sfm.service.publisher import COMMANDS, Reply
+from stereo_sfm.types import U8
 from tests.service.browser import CHROMIUM, Browser
 from tests.service.service_messages import FakeService, cloud, health, picture, pose_update, started, status
 
 pytest.importorskip("starlette")
 pytest.importorskip("uvicorn")
 
+DEMO = Path(__file__).parents[2] / "recordings" / "demo.mcap"
 TOKEN = "a-token-of-thirty-two-characters"
 COMMAND = {"Content-Type": "application/json", "X-Stereo-Sfm": "1"}
 
@@ -42,7 +50,7 @@ def _recordings(folder: Path) -> dict[str, Reply]:
         file.write_bytes(file.name.encode() * 1000)
     row = {
         "id": "00007 <b>&1", "began": "2026-11-22T10:00:00", "source": "t265", "mode": "full", "seconds": 75,
-        "segments": 3, "with_images": 1, "bytes": 12_000_000, "marked": True,
+        "segments": 3, "with_images": 1, "bytes": 12_000_000, "marked": True, "recording": True,
     }  # fmt: skip
     return {
         "recordings": Reply(True, "", {"recordings": [row]}),
@@ -81,6 +89,15 @@ def _show(output: PageOutput, frame: int, state: ServiceState = ServiceState.RUN
         output.put(message)
 
 
+def _plan() -> tuple[U8, float, tuple[float, float]]:
+    """A room of 6 m x 4 m with a shelf at x 2.4 ... 3.2, y 0 ... 0.5 (in axes of the floor)."""
+    image = np.full((80, 120), FREE, np.uint8)  # the last row has the least y
+    image[:3] = image[-3:] = OCCUPIED
+    image[:, :3] = image[:, -3:] = OCCUPIED
+    image[40:50, 64:80] = OCCUPIED
+    return image, 0.05, (-0.8, -1.5)
+
+
 # -- in a browser ------------------------------------------------------------------------------------------------------
 
 
@@ -90,7 +107,7 @@ def test_an_operator_sees_and_does_everything(width: int, height: int, tmp_path:
     service = FakeService(_recordings(tmp_path))
     with _serving(service) as output, Browser(width, height) as browser:
         stop = threading.Event()
-        told = {"state": ServiceState.RUNNING, "reason": "", "remedy": ""}
+        told: dict[str, Any] = {"state": ServiceState.RUNNING, "reason": "", "remedy": ""}
 
         def feed() -> None:
             frame = 0
@@ -111,21 +128,26 @@ def test_an_operator_sees_and_does_everything(width: int, height: int, tmp_path:
                 assert shown in text
             browser.until("document.getElementById('recordings').innerText.includes('00007 <b>&1 ★')")  # no markup
             assert "1:15 min, 12 MB" in text or "1:15 min, 12 MB" in browser.run("document.body.innerText")
-            assert "2 of 3 segments without images" in browser.run("document.body.innerText")
+            text = browser.run("document.body.innerText")
+            assert "2 of 3 segments without images" in text and "being recorded" in text
+            left_T_robot = np.linalg.inv(RobotAxes(started().rig).base_T_left)
+            output._state._take_plan(*_plan(), left_T_robot)  # pyright: ignore[reportPrivateUsage]
+            told.update(map_is_new=True)
+            browser.until("document.getElementById('plan').dataset.plan === 'shown' && plan !== null")
             assert "lost in <i>aisle 3</i>" in browser.run("document.getElementById('events').innerText")
             assert browser.run("document.documentElement.scrollWidth") <= width  # nothing hangs over the side
             browser.screenshot(tmp_path / "running.png")
             browser.run("document.querySelector('[data-command=save_map]').click()")
-            browser.until("document.getElementById('answer').textContent === 'the disk is full'")
+            browser.until("document.getElementById('reply').textContent === 'the disk is full'")
             browser.run("document.getElementById('record').click()")
-            browser.until("document.getElementById('answer').textContent === 'start_recording done'")
+            browser.until("document.getElementById('reply').textContent === 'start_recording done'")
             browser.run("document.querySelector('[data-command=mark]').click()")
             browser.run("window.confirm = () => true; document.querySelector('[data-command=reset]').click()")
             buttons = "[...document.querySelectorAll('#recordings button')]"
             browser.run(f"{buttons}.find(b => b.textContent === 'files').click()")
             browser.until("document.querySelectorAll('#files a').length === 2")
             browser.run(f"{buttons}.find(b => b.textContent === 'delete').click()")
-            browser.until("document.getElementById('answer').textContent === 'delete_recording done'")
+            browser.until("document.getElementById('reply').textContent === 'delete_recording done'")
             told.update(state=ServiceState.CAMERA_GONE, reason="The camera is gone.", remedy="Plug it in again.")
             browser.until("document.getElementById('remedy').textContent === 'Plug it in again.'")
             assert browser.run("document.getElementById('state').className") == "badge bad"
@@ -137,18 +159,18 @@ def test_an_operator_sees_and_does_everything(width: int, height: int, tmp_path:
         assert {"save_map", "start_recording", "mark", "reset"} <= set(names)
         assert ("delete_recording", {"id": "00007 <b>&1"}) in service.calls
         output.close()
-        browser.until("document.getElementById('state').textContent === 'no answer'")
+        browser.until("document.getElementById('state').textContent === 'no connection'")
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium")
-def test_a_token_is_asked_for_in_the_browser() -> None:
+def test_the_browser_asks_for_the_token() -> None:
     with _serving(rules=Access(TOKEN)) as output, Browser(800, 600) as browser:
         _show(output, 1)
         browser.go(f"http://127.0.0.1:{output.port}/")
         browser.until("!document.getElementById('login').hidden")
         give = "document.getElementById('token').value = '%s'; document.getElementById('login').requestSubmit()"
         browser.run(give % "wrong")
-        browser.until("document.getElementById('login-answer').textContent === 'this is not the token'")
+        browser.until("document.getElementById('login-reply').textContent === 'this is not the token'")
         browser.run(give % TOKEN)
         browser.until("document.getElementById('state').textContent === 'running'")
         assert browser.run(
@@ -190,7 +212,57 @@ def test_the_map_is_thinned_and_nothing_grows() -> None:
     assert len(json.loads(live)["events"]) == 60 and len(live) < 20_000
 
 
-def test_images_are_made_only_while_somebody_looks() -> None:
+def test_the_floor_plan_is_in_the_axes_of_the_poses() -> None:
+    with _serving() as output:
+        assert _ask(output, "GET", "/api/floor_plan.png")[0] == 204
+        output.put(started())
+        state = output._state  # pyright: ignore[reportPrivateUsage]
+        left_T_robot = np.linalg.inv(RobotAxes(started().rig).base_T_left)
+        state._take_plan(*_plan(), left_T_robot)  # pyright: ignore[reportPrivateUsage]
+        extent = json.loads(state.snapshot())["plan"]
+        code, data, headers = _ask(output, "GET", "/api/floor_plan.png")
+    assert code == 200 and headers["content-type"] == "image/png" and extent["version"] == 1
+    image = np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED))
+
+    def pixel(x: float, y: float) -> list[int]:
+        return image[int((extent["x"] - x) / 0.05), int((extent["y"] - y) / 0.05)].tolist()
+
+    assert pixel(2.8, 0.25) == [60, 50, 40, 255]  # the shelf
+    assert pixel(1.0, 0.25) == pixel(2.8, 0.75) == [255, 255, 255, 255]
+    assert image.shape[0] * 0.05 == pytest.approx(extent["along_x"])
+
+
+def test_recordings_have_the_verdict_of_info(tmp_path: Path) -> None:
+    good, bad = tmp_path / "good", tmp_path / "bad"
+    for folder in (good, bad):
+        folder.mkdir()
+    folders = {"good": good, "bad": bad, "deleted": None}
+    found = {good: [], bad: ["2 gaps between images", "no right images"]}
+    verdicts = Verdicts(folders.get, found.__getitem__)
+    rows: list[dict[str, Any]] = [
+        {"id": id, "bytes": 7, "segments": 1, "with_images": 1, "recording": False} for id in folders
+    ]
+    assert {row["verdict"] for row in verdicts.add(rows)} == {"being checked"}
+    end = time.monotonic() + 10
+    while (shown := [row["verdict"] for row in verdicts.add(rows)])[:2] != [GOOD, "; ".join(found[bad])]:
+        assert time.monotonic() < end
+        time.sleep(0.01)
+    assert shown[2] == "being checked"
+    rows[0] |= {"bytes": 8}
+    assert verdicts.add(rows)[0]["verdict"] == "being checked"  # it has grown
+    assert verdicts.add([{**rows[0], "recording": True}])[0]["verdict"] == "being recorded"
+    assert verdicts.add([{**rows[0], "with_images": 0}])[0]["verdict"] == "poses only"
+
+
+@pytest.mark.slow
+def test_the_verdict_is_what_info_prints(tmp_path: Path) -> None:
+    assert problems(DEMO) == describe_file(DEMO).problems == []
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(DEMO.read_bytes()[:-200_000])
+    assert problems(cut) == describe_file(cut).problems != []
+
+
+def test_images_are_made_only_while_a_page_is_open() -> None:
     with _serving() as output:
         output.put(picture(1))
         assert _ask(output, "GET", "/api/image.jpg")[0] == 204
@@ -221,9 +293,13 @@ def test_commands_of_other_sites_and_too_large_ones_are_refused() -> None:
         body = b'{"text": "bump"}'
         form = {"Content-Type": "text/plain"}
         assert _ask(output, "POST", "/api/command/mark", body, form)[0] == 403
-        assert _ask(output, "POST", "/api/command/mark", body, {**COMMAND, "Content-Type": "text/plain"})[0] == 400
-        assert _ask(output, "POST", "/api/command/mark", b"[" * 50, COMMAND)[0] == 400
-        assert _ask(output, "POST", "/api/command/mark", b" " * 20_000 + body, COMMAND)[0] == 400
+        for sent, headers, why in (
+            (body, {**COMMAND, "Content-Type": "text/plain"}, b"Content-Type: application/json"),
+            (b"[" * 50, COMMAND, b"not a JSON object"),
+            (b" " * 20_000 + body, COMMAND, b"larger than 16384 bytes"),
+        ):
+            code, data, _ = _ask(output, "POST", "/api/command/mark", sent, headers)
+            assert code == 400 and why in data
         assert _ask(output, "POST", "/api/command/recording_files", body, COMMAND)[0] == 404
         assert _ask(output, "GET", "/api/command/mark")[0] == 405
         assert not service.calls
@@ -233,6 +309,26 @@ def test_commands_of_other_sites_and_too_large_ones_are_refused() -> None:
         assert service.calls == [("mark", {"text": "bump"})]
         codes = [_ask(output, "POST", "/api/command/mark", body, COMMAND)[0] for _ in range(60)]
         assert 429 in codes
+
+
+def test_the_documented_request_and_commands_are_those_of_the_page() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "tasks" / "service-outputs.md").read_text()
+    table = text[text.index("| command | fields") : text.index("Without fields the object")]
+    rows = [[cell.strip() for cell in line.split("|")[1:3]] for line in table.splitlines()[2:] if line]
+    documented = {name.strip("`"): fields for name, fields in rows}
+    assert tuple(documented) == app.COMMANDS
+    for name, fields in documented.items():
+        assert all(f"`{field}`" in fields for field in COMMANDS[name].arguments) and bool(fields) == bool(
+            COMMANDS[name].arguments
+        )
+    (line,) = (line for line in text.splitlines() if line.startswith("    curl "))
+    words = shlex.split(line)
+    headers = dict(words[k + 1].split(": ") for k, word in enumerate(words) if word == "-H")
+    service = FakeService()
+    with _serving(service) as output:
+        path = words[-1].removeprefix("127.0.0.1:8080")
+        assert _ask(output, "POST", path, words[words.index("-d") + 1], headers)[0] == 200
+    assert service.calls == [("mark", {"text": "a bump"})]
 
 
 def test_only_this_computers_names_are_answered_and_headers_are_safe() -> None:
@@ -250,7 +346,7 @@ def test_only_this_computers_names_are_answered_and_headers_are_safe() -> None:
     assert "server" not in headers
 
 
-def test_nothing_is_told_without_the_token() -> None:
+def test_nothing_is_sent_without_the_token() -> None:
     with _serving(rules=Access(TOKEN)) as output:
         _show(output, 1)
         assert _ask(output, "GET", "/")[0] == 200  # the page itself says nothing
@@ -258,6 +354,7 @@ def test_nothing_is_told_without_the_token() -> None:
             "/api/live",
             "/api/map",
             "/api/image.jpg",
+            "/api/floor_plan.png",
             "/api/recordings",
             "/api/recordings/r1/0",
             "/api/settings",
@@ -307,3 +404,30 @@ def test_closing_takes_less_than_a_second_with_a_page_open() -> None:
         output.close()
         assert time.monotonic() - begin < 1.5
         connection.close()
+
+
+def test_clients_that_went_away_leave_no_traceback(capfd: pytest.CaptureFixture[str]) -> None:
+    class Slow(FakeService):
+        def call(self, name: str, timeout_s: float = 5.0, /, **arguments: Any) -> Reply:
+            super().call(name, timeout_s, **arguments)
+            ended.wait(5.0)
+            return Reply(True)
+
+    ended, service = threading.Event(), Slow()
+    with _serving(service) as output:
+        clients = [http.client.HTTPConnection("127.0.0.1", output.port, timeout=10) for _ in range(3)]
+        clients[0].request("POST", "/api/command/save_map", b"{}", COMMAND)
+        clients[1].request("POST", "/api/command/save_map", b"{}", COMMAND)
+        clients[2].request("GET", "/api/live")
+        clients[2].getresponse().readline()
+        while len(service.calls) < 2:
+            time.sleep(0.01)
+        clients[0].close()
+        begin = time.monotonic()
+        output.close()
+        assert time.monotonic() - begin < 1.5
+        ended.set()
+        assert json.loads(clients[1].getresponse().read())["text"] == "the service has ended"
+        for client in clients:
+            client.close()
+    assert not capfd.readouterr().err

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import socket
+import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +17,11 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.messages import Localized
 from stereo_sfm.service.camera import patient, same_camera
 from stereo_sfm.service.hub import Hub
-from stereo_sfm.service.map_follower import MapFollower
-from stereo_sfm.service.messages import MapCloud, ServiceState, Status
+from stereo_sfm.service.map_cloud import MapCloudBuilder
+from stereo_sfm.service.messages import Event, MapCloud, ServiceState, Status
 from stereo_sfm.service.notify import SystemdNotifier
-from stereo_sfm.service.poses import HostClock, PoseMaker
-from stereo_sfm.service.states import Facts, judge
+from stereo_sfm.service.poses import HostClock, PoseConverter
+from stereo_sfm.service.states import Facts, derive_state
 from stereo_sfm.types import F64, Frame, MapUpdate, Observations, TrackState
 from tests.pipeline.test_pipeline import SlidingWall
 from tests.synthetic import pinhole_rig
@@ -54,14 +56,14 @@ def update(version: int, map_T_odom: F64, point_ids: list[int], culled: tuple[in
         (Facts(stopping="SIGTERM", source_error="x"), ServiceState.STOPPING),
     ],
 )
-def test_what_hurts_most_is_the_state(facts: Facts, state: ServiceState) -> None:
-    judged, reason = judge(facts, 10.0)
+def test_the_most_severe_problem_is_the_state(facts: Facts, state: ServiceState) -> None:
+    judged, reason = derive_state(facts, 10.0)
     assert judged == state and bool(reason) == (state != ServiceState.RUNNING)
 
 
 def test_velocity_and_covariance_are_those_of_the_body() -> None:
     rig = dataclasses.replace(pinhole_rig(), body_T_left=se3.exp(np.array([0.3, 0.0, 0.2, 0.5, -0.5, 0.5])))
-    maker = PoseMaker(rig, 1, HostClock())
+    maker = PoseConverter(rig, 1, HostClock())
     body_twist = np.array([0.6, 0.1, 0.0, 0.0, 0.0, 0.4])  # a second
     odom_T_body = [se3.exp(body_twist * 0.033 * k) for k in range(3)]
     poses = [maker.frame(frame(k, odom_T_body[k] @ rig.body_T_left)) for k in range(3)]
@@ -80,7 +82,7 @@ def test_velocity_and_covariance_are_those_of_the_body() -> None:
 
 
 def test_poses_are_in_the_map_that_their_frame_knew() -> None:
-    maker, moved = PoseMaker(pinhole_rig(), 7, HostClock()), se3.exp(np.array([1.0, 0, 0, 0, 0, 0]))
+    maker, moved = PoseConverter(pinhole_rig(), 7, HostClock()), se3.exp(np.array([1.0, 0, 0, 0, 0, 0]))
     maker.update(update(1, np.eye(4), [1]))
     maker.localized(Localized(2))
     maker.update(update(2, moved, [1]))
@@ -106,7 +108,7 @@ def test_the_sensors_clock_is_that_of_the_fastest_image(monkeypatch: pytest.Monk
 
 def test_the_cloud_forgets_what_the_mapper_removed() -> None:
     clouds: list[MapCloud] = []
-    follower = MapFollower(1, clouds.append)
+    follower = MapCloudBuilder(1, clouds.append)
     follower.close()
     for version in range(1, 200):  # ten points at a time, those of ten versions live
         old = tuple(range(10 * (version - 10), 10 * (version - 9)))
@@ -116,7 +118,7 @@ def test_the_cloud_forgets_what_the_mapper_removed() -> None:
     assert cloud.points[-1, 0] == 199.0 and not cloud.saved
 
 
-def test_a_late_callback_gets_the_newest_state_first_and_a_failing_one_disturbs_nobody() -> None:
+def test_a_late_callback_gets_the_newest_state_first_and_a_failing_one_affects_no_other() -> None:
     hub, got = Hub(()), list[Status]()
     hub.publish(Status(ServiceState.LOST, "dark"))
     hub.on(Status, lambda status: 1 / 0)
@@ -149,7 +151,7 @@ def test_only_the_same_camera_is_taken_again() -> None:
     assert patient(SourceChoice.of("sim:loop")) == same_camera(SourceChoice.of("sim:loop"), "1")
 
 
-def test_systemd_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_systemd_is_notified(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     address = str(tmp_path / "notify")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
         systemd.bind(address)
@@ -166,3 +168,21 @@ def test_systemd_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert told[2].startswith("RELOADING=1\nMONOTONIC_USEC=")
     monkeypatch.delenv("NOTIFY_SOCKET")
     SystemdNotifier().ready()  # nothing listens: nothing happens
+
+
+def test_closing_waits_for_callbacks_but_not_for_one_that_hangs() -> None:
+    hub, taken, hang = Hub(()), list[str](), threading.Event()
+
+    def slowly(event: Event) -> None:
+        time.sleep(0.05)
+        taken.append(event.text)
+
+    hub.on(Event, slowly)
+    hub.on(Status, lambda _: hang.wait(10))
+    hub.publish(Status(ServiceState.RUNNING))
+    for text in ("first", "last"):
+        hub.publish(Event(0, "INFO", "main", text))
+    began = time.monotonic()
+    hub.close()
+    assert taken == ["first", "last"] and time.monotonic() - began < 2.0
+    hang.set()

@@ -115,7 +115,7 @@ def test_what_is_unknown_is_null() -> None:
     assert pose["twist"] == [None] * 6 and pose["reason"] == "dark" and pose["tracked"] is False
 
 
-def test_a_client_that_does_not_read_slows_nobody_and_learns_what_it_missed() -> None:
+def test_a_client_that_does_not_read_delays_no_other_and_gets_the_count_of_missed_poses() -> None:
     count = 3000
     with _listening() as output, _connect(output) as slow, _connect(output, 2) as fast:
         got: list[int] = []
@@ -142,7 +142,7 @@ def test_a_client_that_does_not_read_slows_nobody_and_learns_what_it_missed() ->
 
 
 @pytest.mark.parametrize("kind", ["json", "protobuf"])
-def test_both_formats_say_the_same(kind: str) -> None:
+def test_both_formats_have_the_same_content(kind: str) -> None:
     update = pose_update(5, se3.exp(np.array([0.1, 0.2, 0.3, 0.1, -0.2, 0.3])))
     with _listening(kind) as output, _connect(output) as client:
         output.put(update)
@@ -175,7 +175,7 @@ def test_the_proto_file_is_the_message() -> None:
     assert written == [*ours, ("sint64", "missed", MISSED_FIELD)]
 
 
-def test_a_token_is_asked_for_beyond_this_computer(tmp_path: Path) -> None:
+def test_a_token_is_required_beyond_this_computer(tmp_path: Path) -> None:
     file = tmp_path / "token"
     file.write_text(TOKEN + "\n")
     assert access(SecurityConfig(), "127.0.0.1") == access(SecurityConfig(), "::1") == Access()
@@ -190,7 +190,7 @@ def test_a_token_is_asked_for_beyond_this_computer(tmp_path: Path) -> None:
         access(SecurityConfig(str(tmp_path / "none")), "10.0.0.1")
 
 
-def test_only_who_says_the_token_gets_poses() -> None:
+def test_only_a_client_with_the_token_gets_poses() -> None:
     rules = Access(TOKEN)
     with _listening(rules=rules) as output:
         good, bad = (socket.create_connection(("127.0.0.1", output.port), 5) for _ in range(2))

@@ -43,6 +43,6 @@ def test_a_mistake_is_one_line(tmp_path: Path, text: str, why: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_without_a_source_it_says_so() -> None:
+def test_a_missing_source_is_reported() -> None:
     with pytest.raises(StereoSfmError, match="names no source"):
         RobotConfig().opener()

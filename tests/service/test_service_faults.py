@@ -77,7 +77,7 @@ def test_a_dead_or_hung_recorder_costs_no_pose(fault: signal.Signals, tmp_path: 
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="mounts a small disk")
-def test_a_disk_that_somebody_fills(tmp_path: Path) -> None:
+def test_a_disk_that_others_fill(tmp_path: Path) -> None:
     disk = tmp_path / "disk"
     disk.mkdir()
     mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=200m", "none", str(disk)], check=False)
@@ -145,7 +145,7 @@ def said(process: subprocess.Popen[str], text: str) -> str:
     raise AssertionError(f"it never said '{text}'")
 
 
-def test_kill_9_of_the_service_itself_leaves_nobody_and_loses_nothing(tmp_path: Path) -> None:
+def test_kill_9_of_the_service_leaves_no_process_and_loses_nothing(tmp_path: Path) -> None:
     process = serve(tmp_path)
     said(process, "is saved")
     said(process, "is saved")

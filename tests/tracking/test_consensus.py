@@ -8,7 +8,7 @@ import pytest
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.drivers.sim.rigs import make_rig
 from stereo_sfm.geometry import se3
-from stereo_sfm.tracking.flow.consensus import PROOF, after_frame, among_moving
+from stereo_sfm.tracking.flow.consensus import STATIC_FRAMES, after_frame, near_moving
 from stereo_sfm.tracking.flow.frame_pose import ExpectedMotion, FramePoseSolver
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
@@ -71,6 +71,20 @@ def test_settled_points_decide_against_more_young_ones(seed: int) -> None:
     assert solver.alert
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_person_followed_for_as_long_as_the_store_does_not_take_the_pose_along(seed: int) -> None:
+    """Who stood before the camera has the older points, and more of them; at the first step the camera goes on."""
+    tracks, on_person = scene(np.random.default_rng(seed))
+    tracks.age[:] = np.where(on_person, 60, 10)
+    tracks.mapped[:] = on_person
+    solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
+    expected = ExpectedMotion(MOVED @ se3.exp(np.full(6, 0.001)), se3.log(MOVED), SECONDS)
+    solution = solver.solve(tracks, expected, np.eye(4), before=len(tracks))
+    assert off(solution.pose) < 0.005
+    assert solution.moving[on_person].mean() > 0.7
+    assert not solution.moving[~on_person].any()
+
+
 def test_a_smaller_group_that_moves_is_marked_at_once() -> None:
     tracks, on_person = scene(np.random.default_rng(1))
     fewer = np.arange(len(tracks)) < STILL + 50
@@ -101,7 +115,7 @@ def test_too_little_of_an_open_view_is_no_pose() -> None:
     assert solver.solve(left, expected, np.eye(4), before=400).reason
 
 
-def test_what_disagrees_in_company_is_marked_and_followed_on() -> None:
+def test_a_group_that_disagrees_is_marked_and_tracked_further() -> None:
     tracks, on_person = scene(np.random.default_rng(0))
     for _ in range(3):
         tracks, kept = after_frame(tracks, ~on_person, NONE, 3, alert=True)
@@ -110,10 +124,10 @@ def test_what_disagrees_in_company_is_marked_and_followed_on() -> None:
     assert on_person.sum() > 0.8 * MOVING
     assert tracks.moving[on_person].all()
     assert not tracks.moving[~on_person].any()
-    begun = among_moving(tracks.uv, tracks.rho, tracks)
+    begun = near_moving(tracks.uv, tracks.rho, tracks)
     assert begun[on_person].mean() > 0.9
     assert begun[~on_person].mean() < 0.1
-    for _ in range(PROOF):
+    for _ in range(STATIC_FRAMES):
         tracks, _ = after_frame(tracks, np.ones(len(tracks), bool), NONE, 3, alert=True)
     assert not tracks.moving.any()
 

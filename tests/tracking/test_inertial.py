@@ -18,6 +18,7 @@ from stereo_sfm.geometry.cameras import Pinhole
 from stereo_sfm.geometry.preintegration import GRAVITY
 from stereo_sfm.pipeline.run import run
 from stereo_sfm.tracking.inertial.inertial_motion import InertialMotion, roll_pitch_deg
+from stereo_sfm.tracking.inertial.motion_sensors import MotionSensors
 from stereo_sfm.tracking.inertial.sample_buffer import SampleBuffer
 from stereo_sfm.tracking.inertial.smoothing import smooth_bridges
 from stereo_sfm.types import F64, ImuSamples, StereoImage, TrackState
@@ -105,13 +106,13 @@ def test_in_the_dark_the_error_stays_small_and_is_known(seed: int) -> None:
     motion = follow(session, 5.0, seed=seed)
     for seconds, limit_m in ((0.5, 0.01), (1.5, 0.04), (2.5, 0.1)):
         stamp = round((5.0 + seconds) * 1e9)
-        assert motion.bridges(stamp)
+        assert motion.bridge(stamp) is not None
         error = se3.inverse(motion.predict(stamp, np.eye(4))) @ session.pose(stamp * 1e-9)
         covariance = motion.covariance(stamp)
         assert covariance is not None
         assert np.linalg.norm(error[:3, 3]) < min(limit_m, 4 * np.sqrt(np.trace(covariance[:3, :3])))
         assert np.degrees(np.linalg.norm(se3.so3_log(error[:3, :3]))) < 0.2
-    assert not motion.bridges(round(30e9))
+    assert MotionSensors(motion, None).bridge(round(30e9)) is None
 
 
 def test_before_velocity_is_known_only_the_rotation_is_predicted() -> None:
@@ -123,7 +124,7 @@ def test_before_velocity_is_known_only_the_rotation_is_predicted() -> None:
     np.testing.assert_array_equal(predicted[:3, 3], expected[:3, 3])
     turned = predicted[:3, :3].T @ session.pose(stamp * 1e-9)[:3, :3]
     assert np.degrees(np.linalg.norm(se3.so3_log(turned))) < 0.2
-    assert not motion.bridges(stamp)
+    assert motion.bridge(stamp) is None
 
 
 def test_the_time_offset_is_corrected() -> None:

@@ -87,6 +87,9 @@ class Walker:
         frame = Frame(image.frame_id, 0, pose, np.eye(6), TrackState.OK, "", Observations.empty(), 0, np.eye(4))
         return frame, None
 
+    def describe(self, keyframe: Keyframe) -> Keyframe:
+        raise AssertionError("there are no keyframes")
+
     def apply(self, update: MapUpdate) -> None:
         self.update = update
 

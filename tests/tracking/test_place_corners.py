@@ -70,7 +70,8 @@ def test_corners_lie_all_over_the_image_and_have_depth(sequence: SimSource) -> N
 def run(*overrides: str) -> list[Keyframe]:
     with open_source(SOURCE) as source:
         tracker = make_tracker(load(overrides=overrides), source.rig)
-        return [k for image in islice(source, 40) if (k := tracker.step(image)[1]) is not None]
+        keyframes = (tracker.step(image)[1] for image in islice(source, 40))
+        return [tracker.describe(keyframe) for keyframe in keyframes if keyframe is not None]
 
 
 def test_corners_change_nothing_for_the_tracker_and_odometry_alone_has_none() -> None:

@@ -18,7 +18,11 @@ from stereo_sfm.drivers.sim.world import Layout
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.recent_places import RecentPlaces
 from stereo_sfm.pipeline.stages import make_tracker_with_places
+from stereo_sfm.tracking.flow.follower import Held
+from stereo_sfm.tracking.flow.frame_pose import PoseSolution
+from stereo_sfm.tracking.flow.pyramids import StereoPyramids
 from stereo_sfm.tracking.flow.recovery import Recovery
+from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.tracking.flow.trusted_motion import TrustedMotion
 from stereo_sfm.types import F64, Frame, Keyframe, StereoImage, TrackState
 
@@ -45,7 +49,13 @@ def covered(frame_id: int) -> StereoImage:
 
 def tracked(images: Sequence[StereoImage]) -> list[Frame]:
     tracker = make_tracker_with_places(Config(), drive().rig)
-    return [tracker.step(image)[0] for image in images]
+    frames: list[Frame] = []
+    for image in images:
+        frame, keyframe = tracker.step(image)
+        if keyframe is not None:
+            tracker.describe(keyframe)
+        frames.append(frame)
+    return frames
 
 
 def error(a: Frame, b: Frame) -> tuple[float, float]:
@@ -75,6 +85,33 @@ def test_a_covered_camera_is_found_again_at_first_sight() -> None:
     assert frames[FREE[-1]].state == TrackState.OK
 
 
+def test_a_camera_that_drove_on_while_covered_is_found_among_repeating_lamps() -> None:
+    """For 1.8 s, half of the way from lamp to lamp: the ceiling alone agrees with another place."""
+    again = range(COVERED.start + 27, COVERED.start + 32)
+    cover = [covered(k) for k in range(COVERED.start, again.start)]
+    frames = tracked([seen(k) for k in range(BEGIN, COVERED.start)] + cover + [seen(k) for k in again])
+    found = [frame for frame in frames if frame.state == TrackState.RECOVERED]
+    assert found
+    assert found[0].frame_id <= again.start + 2
+    metres, degrees = error(frames[COVERED.start - BEGIN - 1], found[0])
+    assert metres < 0.03
+    assert degrees < 0.3
+
+
+def test_a_camera_that_turned_while_covered_is_found_in_half_a_second() -> None:
+    again = range(COVERED.start + 20, COVERED.start + 27)
+    last_T_now = se3.exp(np.array([0.0, 0.0, 0.7, 0.0, 1.0, 0.0]))
+    turned = [drive().image_at(drive().pose(COVERED.start - 1) @ last_T_now, k) for k in again]
+    cover = [covered(k) for k in range(COVERED.start, again.start)]
+    frames = tracked([seen(k) for k in range(BEGIN, COVERED.start)] + cover + turned)
+    found = [frame for frame in frames if frame.state == TrackState.RECOVERED]
+    assert found
+    moved = se3.inverse(frames[COVERED.start - BEGIN - 1].odom_T_cam) @ found[0].odom_T_cam
+    metres, radians = se3.extent(se3.inverse(last_T_now) @ moved)
+    assert metres < 0.03
+    assert np.rad2deg(radians) < 0.3
+
+
 def test_a_camera_that_reappears_elsewhere_is_not_found() -> None:
     turned = se3.exp(np.array([0, 0, 0, 0, np.pi, 0]))  # in one frame: no robot does that
     elsewhere = [drive().image_at(drive().pose(k) @ turned, k) for k in FREE]
@@ -84,9 +121,10 @@ def test_a_camera_that_reappears_elsewhere_is_not_found() -> None:
 
 def keyframe(frame_id: int) -> Keyframe:
     """What a tracker that begins there makes of an image."""
-    made = make_tracker_with_places(Config(), drive().rig).step(seen(frame_id))[1]
+    tracker = make_tracker_with_places(Config(), drive().rig)
+    made = tracker.step(seen(frame_id))[1]
     assert made is not None
-    return made
+    return tracker.describe(made)
 
 
 def test_places_are_found_with_the_corrected_rig() -> None:
@@ -122,8 +160,42 @@ def test_trusted_motion_is_the_mean_of_the_last_second_with_growing_covariance()
     assert late.sigmas_off(moving(np.array([5.0]))[0]) < 1
 
 
+def test_a_turn_is_not_predicted_to_go_on_for_long() -> None:
+    motion = TrustedMotion()
+    for t, pose in zip(np.arange(0, 3, 0.1), moving(np.arange(0, 3, 0.1)), strict=True):
+        motion.add(round(t * 1e9), pose)
+    last = moving(np.array([2.9]))[0]
+    metres, radians = se3.extent(se3.inverse(last) @ motion.expect(5_900_000_000).odom_T_cam)
+    assert 1.5 < metres < 3.0
+    assert radians < 0.2  # at 0.2 rad/s
+    straight, *others = (se3.inverse(last) @ pose for pose in motion.others(5_900_000_000))
+    assert se3.extent(straight)[1] < 1e-9
+    assert min(float(se3.extent(other)[0]) for other in others) < 1e-9  # it stops
+    turns = [float(se3.log(other)[4]) for other in others]
+    assert max(turns) > 2.5  # at most a radian a second
+    assert min(turns) < -2.5
+
+
+@pytest.mark.parametrize(("recall", "seconds", "accepted"), [(0.4, 2.0, False), (0.6, 2.0, True), (0.2, 0.3, True)])
+def test_less_certain_poses_need_more_of_the_points(recall: float, seconds: float, accepted: bool) -> None:
+    """A ceiling alone is less than half of the points."""
+    recovery = Recovery(None, None, (424, 400))
+    recovery.motion.add(0, np.eye(4))
+    expected = recovery.motion.expect(round(seconds * 1e9))
+    solution = PoseSolution(np.eye(4), np.zeros(6), np.eye(6), np.zeros(100), 0.3, 3.0)
+    assert recovery.possible(expected, solution, recall) == accepted
+
+
 def test_without_places_there_is_no_search() -> None:
     recovery = Recovery(None, None, (424, 400))
     recovery.motion.add(0, np.eye(4))
     image = covered(0)
     assert list(recovery.search(image, None, recovery.motion.expect(10**8))) == []  # type: ignore[arg-type]
+
+
+def test_an_image_with_fewer_points_is_held_only_after_a_while() -> None:
+    tracks = Tracks().keep(np.zeros(0, bool))
+    tracks.point_ids = np.arange(300)
+    held = Held(0, StereoPyramids((), ()), tracks, np.eye(4))
+    assert held.worth(0) == 300
+    assert held.worth(10**9) == pytest.approx(150)

@@ -174,6 +174,7 @@ def test_keyframes_of_a_rendered_sequence_are_those_of_a_global_shutter() -> Non
             _, keyframe = tracker.step(image)
             if keyframe is None or keyframe.kf_id == 0:  # at the first the velocity is not known
                 continue
+            keyframe = tracker.describe(keyframe)
             left = rig.left.project(keyframe.points_cam)
             right_T_left = se3.inverse(rig.left_T_right)
             assert rig.right is not None

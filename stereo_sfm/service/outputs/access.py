@@ -17,14 +17,14 @@ MOST_TOKEN = 4096
 
 @dataclass(frozen=True)
 class Access:
-    """What a listening port asks of those who connect."""
+    """What a client needs to connect to a port."""
 
     token: str = ""  # "": none
     tls: ssl.SSLContext | None = None
 
-    def allows(self, said: str) -> bool:
-        """Whether somebody said the token; takes the same time for every wrong one."""
-        return not self.token or hmac.compare_digest(said.encode(), self.token.encode())
+    def allows(self, token: str) -> bool:
+        """Whether this is the token; compared in constant time."""
+        return not self.token or hmac.compare_digest(token.encode(), self.token.encode())
 
 
 def is_loopback(address: str) -> bool:

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
-import subprocess
-import sys
 import tempfile
 import threading
 from collections.abc import Callable
@@ -17,15 +14,16 @@ import cv2
 import numpy as np
 import yaml
 
+from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.floor_plan import FREE, OCCUPIED, UNKNOWN
 from stereo_sfm.geometry import se3
 from stereo_sfm.service.messages import Status
+from stereo_sfm.service.outputs.background import run_command
 from stereo_sfm.types import F64, U8
 
 log = logging.getLogger("stereo_sfm")
 
 LONGEST_S = 120.0
-NICE = 10
 CELLS: dict[int, int] = {FREE: 0, OCCUPIED: 100, UNKNOWN: -1}  # of nav_msgs/OccupancyGrid
 
 
@@ -73,32 +71,26 @@ class FloorGrids:
     def __init__(self, take: Callable[[U8, float, tuple[float, float], F64], None]) -> None:
         """Args: take, called with the arguments of `aligned`, map_T_floor in the axes of the map."""
         self._take = take
-        self._made_of = 0
+        self._made_of = ("", 0)  # folder and time of the save
         self._thread: threading.Thread | None = None
 
     def follow(self, status: Status) -> None:
         """Make the plan if the map has been saved since, and none is being made."""
         busy = self._thread is not None and self._thread.is_alive()
-        if busy or not status.map_folder or status.map_saved_ns <= self._made_of:
+        saved = status.map_folder, status.map_saved_ns
+        if busy or not all(saved) or saved == self._made_of:
             return
-        self._made_of = status.map_saved_ns
+        self._made_of = saved
         self._thread = threading.Thread(target=self._make, args=(status.map_folder,), daemon=True)
         self._thread.start()
 
     def _make(self, folder: str) -> None:
         with tempfile.TemporaryDirectory(prefix="floor") as place:
             out = Path(place) / "plan.png"
-            export = ["export", folder, "--format", "floor-plan", "-o", str(out)]
-            command = [sys.executable, "-m", "stereo_sfm.cli", *export]
             try:
-                done = subprocess.run(
-                    command, capture_output=True, text=True, timeout=LONGEST_S, preexec_fn=lambda: os.nice(NICE)
-                )
-            except subprocess.TimeoutExpired:
-                log.warning("the floor plan takes longer than %.0f s: there is none", LONGEST_S)
-                return
-            if done.returncode:
-                log.warning("no floor plan: %s", " ".join(done.stderr.split())[-200:])
+                run_command(["export", folder, "--format", "floor-plan", "-o", str(out)], LONGEST_S)
+            except StereoSfmError as error:
+                log.warning("no floor plan: %s", error)
                 return
             image = cv2.imread(str(out), cv2.IMREAD_GRAYSCALE)
             about = yaml.safe_load(out.with_suffix(".yaml").read_text())

@@ -28,8 +28,8 @@ from stereo_sfm.service.messages import (
     Event,
     HealthReport,
     MapCloud,
-    Picture,
     PoseUpdate,
+    PreviewImage,
     ServiceMessage,
     Started,
     Status,
@@ -46,12 +46,13 @@ STATUS, REPORT = "/service/status", "/service/health"
 SERVICES = ("status", "save_map", "load_map", "reset", "relocalize", "start_recording", "stop_recording", "mark")
 JPEG_QUALITY = 80
 REQUEST_BYTES = 1 << 14
-ANSWER_S = 30.0
+REPLY_S = 30.0
 BACKLOG = 256  # messages that wait for one client; the oldest is dropped
 
 
 def make(config: RobotConfig) -> FoxgloveOutput:
     """The output."""
+    require(("foxglove",), "serve", "the Foxglove output")
     section = config.outputs.foxglove
     return FoxgloveOutput(section.address, section.port, section.picture_hz)
 
@@ -61,8 +62,8 @@ class FoxgloveOutput:
 
     wants = EVERYTHING
 
-    def __init__(self, address: str, port: int, picture_hz: float) -> None:
-        """Args: address and port, where to listen. picture_hz: images a second.
+    def __init__(self, address: str, port: int, preview_hz: float) -> None:
+        """Args: address and port, where to listen. preview_hz: images a second.
 
         Raises:
             StereoSfmError: the address is not of this computer alone.
@@ -71,7 +72,7 @@ class FoxgloveOutput:
             raise StereoSfmError(
                 f"Foxglove's protocol has no token: listen on 127.0.0.1, not {address}, and put a proxy in front"
             )
-        self._address, self._port, self.picture_hz = address, port, picture_hz
+        self._address, self._port, self.preview_hz = address, port, preview_hz
         self._server: Any = None
         self._channels: dict[str, Any] = {}
         self._rig: Rig | None = None
@@ -84,7 +85,6 @@ class FoxgloveOutput:
 
     def open(self, service: ServiceClient) -> None:
         """Listen."""
-        require(("foxglove",), "serve", "the Foxglove output")
         import foxglove as sdk
         from foxglove.websocket import Capability
 
@@ -116,7 +116,7 @@ class FoxgloveOutput:
             Status: self._status,
             PoseUpdate: self._pose,
             MapCloud: self._cloud,
-            Picture: self._picture,
+            PreviewImage: self._image,
             HealthReport: self._health,
             Event: self._event,
         }
@@ -161,12 +161,12 @@ class FoxgloveOutput:
         self._log(topics.TRAJECTORY, foxglove.poses_in_frame("map", stamp, cloud.map_T_kf))
         self._log(topics.PATH, foxglove.point_cloud("map", stamp, positions, cloud.kf_ids, PATH_COLOR))
 
-    def _picture(self, picture: Picture) -> None:
-        data = cv2.imencode(".jpg", picture.left, (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))[1].tobytes()
-        image = foxglove.stamp(CompressedImage(frame_id="cam0", format="jpeg", data=data), picture.stamp_ns)
+    def _image(self, preview: PreviewImage) -> None:
+        data = cv2.imencode(".jpg", preview.left, (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))[1].tobytes()
+        image = foxglove.stamp(CompressedImage(frame_id="cam0", format="jpeg", data=data), preview.stamp_ns)
         self._log(topics.LEFT_IMAGE, image)
-        colors = age_colors(picture.age, picture.inlier)
-        self._log(topics.FEATURES, foxglove.point_annotations(picture.stamp_ns, picture.uv, colors))
+        colors = age_colors(preview.age, preview.inlier)
+        self._log(topics.FEATURES, foxglove.point_annotations(preview.stamp_ns, preview.uv, colors))
 
     def _health(self, report: HealthReport) -> None:
         for health in report.stages.values():
@@ -211,7 +211,7 @@ class FoxgloveOutput:
 
 
 def _service(name: str, service: ServiceClient) -> Any:
-    """A command as a service that takes and gives JSON objects."""
+    """A command as a service whose request and response are JSON objects."""
     from foxglove import Schema
     from foxglove.websocket import MessageSchema, Service, ServiceSchema
 
@@ -224,13 +224,13 @@ def _service(name: str, service: ServiceClient) -> Any:
         data = json.dumps({"type": "object", "title": f"{name} {what}", "properties": properties}).encode()
         return MessageSchema(encoding="json", schema=Schema(name=f"{name}_{what}", encoding="jsonschema", data=data))
 
-    answer = {"ok": {"type": "boolean"}, "text": {"type": "string"}, "data": {"type": "object"}}
-    kind = ServiceSchema(name=name, request=described("request", arguments), response=described("response", answer))
-    return Service(name=f"/{name}", schema=kind, handler=lambda request: _answer(name, service, request.payload))
+    reply = {"ok": {"type": "boolean"}, "text": {"type": "string"}, "data": {"type": "object"}}
+    kind = ServiceSchema(name=name, request=described("request", arguments), response=described("response", reply))
+    return Service(name=f"/{name}", schema=kind, handler=lambda request: _reply(name, service, request.payload))
 
 
-def _answer(name: str, service: ServiceClient, payload: bytes) -> bytes:
-    """What the service says to a request, which may be anything."""
+def _reply(name: str, service: ServiceClient, payload: bytes) -> bytes:
+    """The reply to a request, which may be anything."""
     try:
         arguments = json.loads(payload) if payload.strip() and len(payload) <= REQUEST_BYTES else {}
     except ValueError:
@@ -238,7 +238,7 @@ def _answer(name: str, service: ServiceClient, payload: bytes) -> bytes:
     if not isinstance(arguments, dict) or len(payload) > REQUEST_BYTES:
         return json.dumps({"ok": False, "text": f"{name} takes a small JSON object", "data": {}}).encode()
     try:
-        reply = service.call(name, ANSWER_S, **{str(key): value for key, value in arguments.items()})
+        reply = service.call(name, REPLY_S, **{str(key): value for key, value in arguments.items()})
     except StereoSfmError as error:
         return json.dumps({"ok": False, "text": str(error), "data": {}}).encode()
     return json.dumps({"ok": reply.ok, "text": reply.text, "data": reply.data}, default=str).encode()

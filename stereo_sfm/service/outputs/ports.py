@@ -27,7 +27,7 @@ def ports(config: RobotConfig) -> list[str]:
     if outputs.foxglove.enabled:
         rows.append(f"foxglove     ws://{outputs.foxglove.address}:{outputs.foxglove.port}  this computer only")
     if outputs.ros2.enabled:
-        rows.append("ros2         DDS, as ROS_DOMAIN_ID and ROS_LOCALHOST_ONLY say  no token: ROS 2 has none")
+        rows.append("ros2         DDS, by ROS_DOMAIN_ID and ROS_LOCALHOST_ONLY  no token: ROS 2 has none")
     return rows or [_NONE]
 
 

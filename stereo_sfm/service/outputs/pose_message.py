@@ -112,7 +112,7 @@ def _varint(value: int) -> bytes:
 
 
 def _plain(value: object) -> object:
-    """What JSON can say: it has no NaN."""
+    """As JSON values: JSON has no NaN."""
     if isinstance(value, np.ndarray):
         flat = value.ravel()
         numbers: list[float | None] = flat.tolist()

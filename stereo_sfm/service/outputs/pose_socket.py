@@ -1,6 +1,6 @@
 """Poses on a socket: one message a pose to every client that is connected.
 
-A client that does not read misses poses; nobody waits for it. What it missed is counted in its next message.
+A client that does not read misses poses and delays no other. Its next message has the number of poses it missed.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ log = logging.getLogger("stereo_sfm")
 
 MOST_CLIENTS = 32
 BUFFER_BYTES = 1 << 16  # of the system for one client: a slow one is not far behind
-HELLO_S = 5.0  # to encrypt and to say the token
-HELLO_BYTES = 4200
+HANDSHAKE_S = 5.0  # for the TLS handshake and the token
+HANDSHAKE_BYTES = 4200
 SOCKET_MODE = 0o660
 
 
@@ -84,7 +84,7 @@ class Place:
 
     def _local(self) -> socket.socket:
         assert self.path is not None
-        if self.path.exists() and stat.S_ISSOCK(self.path.stat().st_mode) and not _answers(self.path):
+        if self.path.exists() and stat.S_ISSOCK(self.path.stat().st_mode) and not _is_listening(self.path):
             self.path.unlink()  # left by a process that was killed
         server = socket.socket(socket.AF_UNIX)
         server.bind(str(self.path))
@@ -96,7 +96,7 @@ class Place:
         return str(self.path) if self.path is not None else f"tcp://{self.host}:{self.port}"
 
 
-def _answers(path: Path) -> bool:
+def _is_listening(path: Path) -> bool:
     with socket.socket(socket.AF_UNIX) as probe:
         return probe.connect_ex(str(path)) == 0
 
@@ -113,7 +113,7 @@ class _Client:
         """Give the system what waits; False where it has no room.
 
         Raises:
-            OSError: the client has gone.
+            OSError: the client has disconnected.
         """
         try:
             while self.pending:
@@ -127,14 +127,14 @@ class PoseSocket:
     """The publisher of poses on a socket."""
 
     wants: frozenset[type[ServiceMessage]] = frozenset({Started, PoseUpdate})
-    picture_hz = 0.0
+    preview_hz = 0.0
 
     def __init__(self, place: Place, form: str, rules: Access | None = None) -> None:
         """Args: place, where to listen. form: a key of FORMATS. rules: for those who connect."""
         self._place, self._format, self._rules = place, FORMATS[form](), rules or Access()
         self._server: socket.socket | None = None
         self._clients: list[_Client] = []
-        self._guests = 0  # connected, and have not said the token yet
+        self._pending_clients = 0  # connected, and have not sent the token yet
         self._lock = threading.Lock()
         self._axes: RobotAxes | None = None
 
@@ -176,9 +176,9 @@ class PoseSocket:
                 client.pending, client.missed = self._format.framed(body, client.missed), 0
                 client.flush()
             except OSError:
-                self._forget(client)
+                self._drop(client)
 
-    def _forget(self, client: _Client) -> None:
+    def _drop(self, client: _Client) -> None:
         client.connection.close()
         with self._lock:
             self._clients.remove(client)
@@ -190,18 +190,18 @@ class PoseSocket:
             except OSError:
                 return
             with self._lock:
-                full = len(self._clients) + self._guests >= MOST_CLIENTS
-                self._guests += not full
+                full = len(self._clients) + self._pending_clients >= MOST_CLIENTS
+                self._pending_clients += not full
             if full:
                 connection.close()
             else:
-                threading.Thread(target=self._welcome, args=(connection,), daemon=True).start()
+                threading.Thread(target=self._authenticate, args=(connection,), daemon=True).start()
 
-    def _welcome(self, connection: socket.socket) -> None:
-        """Encrypt and ask for the token where that is needed; then the client gets poses."""
+    def _authenticate(self, connection: socket.socket) -> None:
+        """TLS handshake and token, where they are needed; then the client gets poses."""
         client = None
         with contextlib.suppress(OSError, UnicodeError):
-            connection.settimeout(HELLO_S)
+            connection.settimeout(HANDSHAKE_S)
             if self._rules.tls is not None:
                 connection = self._rules.tls.wrap_socket(connection, server_side=True)
             if not self._rules.token or self._rules.allows(_first_line(connection)):
@@ -209,7 +209,7 @@ class PoseSocket:
         if client is None:
             connection.close()
         with self._lock:
-            self._guests -= 1
+            self._pending_clients -= 1
             self._clients += [client] if client is not None else []
 
 
@@ -224,8 +224,8 @@ def _streaming(connection: socket.socket) -> socket.socket:
 
 def _first_line(connection: socket.socket) -> str:
     data = b""
-    while not data.endswith(b"\n") and len(data) < HELLO_BYTES:
-        more = connection.recv(HELLO_BYTES - len(data))
+    while not data.endswith(b"\n") and len(data) < HANDSHAKE_BYTES:
+        more = connection.recv(HANDSHAKE_BYTES - len(data))
         if not more:
             break
         data += more

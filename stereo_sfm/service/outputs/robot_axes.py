@@ -41,7 +41,7 @@ class RobotPose:
 
 
 class RobotAxes:
-    """Converts what the service says to the robot's axes, for one rig."""
+    """Converts poses and points of the service to the robot's axes, for one rig."""
 
     def __init__(self, rig: Rig) -> None:
         own_body = not np.allclose(rig.body_T_left, np.eye(4))

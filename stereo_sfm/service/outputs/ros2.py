@@ -33,7 +33,7 @@ PARAMETERS = {
     "recording_mode": (("start_recording", "mode"),),
     "mark_text": (("mark", "text"),),
 }
-ANSWER_S = 60.0
+REPLY_S = 60.0
 LEFT_FRAME, RIGHT_FRAME = "left_optical", "right_optical"
 NEEDS = (
     "the ROS 2 output needs rclpy: source ROS's setup.bash in an environment with --system-site-packages, "
@@ -42,7 +42,13 @@ NEEDS = (
 
 
 def make(config: RobotConfig) -> Ros2Output:
-    """The output."""
+    """The output.
+
+    Raises:
+        StereoSfmError: no rclpy.
+    """
+    if importlib.util.find_spec("rclpy") is None:
+        raise StereoSfmError(NEEDS)
     return Ros2Output(config.outputs.ros2)
 
 
@@ -50,7 +56,7 @@ class Ros2Output:
     """A node of ROS 2 as a publisher."""
 
     wants: frozenset[type[ServiceMessage]] = frozenset({Started, Status, PoseUpdate, MapCloud, HealthReport})
-    picture_hz = 0.0
+    preview_hz = 0.0
 
     def __init__(self, config: Ros2Config) -> None:
         """Args: config, the names of frames and topics."""
@@ -67,10 +73,8 @@ class Ros2Output:
         """Start the node.
 
         Raises:
-            StereoSfmError: no rclpy, or a name that ROS does not take.
+            StereoSfmError: a name that ROS does not take.
         """
-        if importlib.util.find_spec("rclpy") is None:
-            raise StereoSfmError(NEEDS)
         import rclpy
         from rclpy.executors import MultiThreadedExecutor
         from rclpy.signals import SignalHandlerOptions
@@ -154,12 +158,12 @@ class Ros2Output:
         group = ReentrantCallbackGroup()
         for name in SERVICES:
 
-            def answer(_: Any, response: Any, name: str = name) -> Any:
-                reply = service.call(name, ANSWER_S, **self._arguments(name))
+            def handle(_: Any, response: Any, name: str = name) -> Any:
+                reply = service.call(name, REPLY_S, **self._arguments(name))
                 response.success, response.message = reply.ok, reply.text
                 return response
 
-            self._node.create_service(Trigger, f"~/{name}", answer, callback_group=group)
+            self._node.create_service(Trigger, f"~/{name}", handle, callback_group=group)
 
     def _arguments(self, command: str) -> dict[str, Any]:
         """Of a command, from the node's parameters."""

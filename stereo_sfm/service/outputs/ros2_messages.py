@@ -1,4 +1,4 @@
-"""What the service says as messages of ROS 2. Needs its Python packages, which a robot's ROS has."""
+"""The service's messages as messages of ROS 2. Needs its Python packages, which a robot's ROS has."""
 
 # The packages of ROS come with a robot's ROS, not from this project's environment.
 # pyright: reportMissingImports=false
@@ -16,7 +16,7 @@ from stereo_sfm.service.outputs.robot_axes import RobotPose
 from stereo_sfm.types import F64
 
 UNKNOWN_VARIANCE = 1e6  # of a velocity that is not known
-LATE_MS = 100.0  # latency that is worth a warning
+LATE_MS = 100.0  # latency that causes a warning
 
 
 def time_of(stamp_ns: int) -> Any:
@@ -116,7 +116,7 @@ def grid(stamp_ns: int, frame: str, plan: FloorGrid) -> Any:
 
 
 def _bytes(data: bytes, kind: str) -> Any:
-    """As the array type that rclpy takes without looking at each item."""
+    """As the array type that rclpy takes without checking each item."""
     import array
 
     return array.array(kind, data)

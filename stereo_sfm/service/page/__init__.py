@@ -1,1 +1,1 @@
-"""The operator's page: `server` is the output, `app` what a browser asks, `state` what it is shown."""
+"""The operator's page: `server` is the output, `app` handles its requests, `state` holds what is shown."""

@@ -1,7 +1,7 @@
-"""What a browser may ask the page's server: fixed files, the live state, commands, and recordings by their id.
+"""The requests that the page's server accepts: fixed files, the live state, commands, and recordings by their id.
 
 Nothing that a client sends becomes a path. Commands must come as JSON with a header of their own, which pages of other
-sites cannot send; on the loopback the server answers to this computer's names only (DNS rebinding).
+sites cannot send; on the loopback the server accepts this computer's names only (DNS rebinding).
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.service.outputs.access import Access
 from stereo_sfm.service.page.state import PageState
+from stereo_sfm.service.page.verdicts import Verdicts
 from stereo_sfm.service.publisher import Reply, ServiceClient
 
 FILES = {
@@ -43,7 +44,7 @@ MOST_SESSIONS = 64
 BODY_BYTES = 1 << 14
 LIVE_S = 0.2  # between two states
 MOST_VIEWERS = 16
-ANSWER_S = 60.0
+REPLY_S = 30.0  # more than the service takes for any command
 LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
 SAFE = {
     "content-security-policy": "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'; base-uri 'none'",
@@ -81,13 +82,15 @@ class Page:
         self._sessions: dict[str, float] = {}  # id -> until when
         self._logins, self._commands = Bucket(0.5, 5), Bucket(5, 20)
         self._viewers = 0
+        self._verdicts = Verdicts(self._folder_of)
 
     def app(self) -> ASGIApp:
         """The application."""
-        asked: list[tuple[str, Handler]] = [
+        guarded: list[tuple[str, Handler]] = [
             ("/api/live", self._live),
             ("/api/map", self._map),
             ("/api/image.jpg", self._image),
+            ("/api/floor_plan.png", self._floor_plan),
             ("/api/settings", self._settings),
             ("/api/recordings", self._recordings),
             ("/api/recordings/{id}", self._files),
@@ -95,33 +98,36 @@ class Page:
         ]
         routes = [Route(path, self._file) for path in FILES]
         routes += [Route("/login", self._login, methods=["POST"])]
-        routes += [Route(path, self._guarded(handler)) for path, handler in asked]
+        routes += [Route(path, self._guarded(handler)) for path, handler in guarded]
         routes += [Route("/api/command/{name}", self._guarded(self._command), methods=["POST"])]
         return _Safe(Starlette(routes=routes), not self._rules.token)
 
-    # -- who ----------------------------------------------------------------------------------------------------------
+    # -- access ------------------------------------------------------------------------------------------------------
 
     def _guarded(self, handler: Handler) -> Handler:
-        async def answer(request: Request) -> Response:
-            return await handler(request) if self._known(request) else _no(401, "the token is needed")
+        async def guarded(request: Request) -> Response:
+            return await handler(request) if self._known(request) else _refusal(401, "the token is needed")
 
-        return answer
+        return guarded
 
     def _known(self, request: Request) -> bool:
-        """Whether a request has a session, or says the token in its header."""
+        """Whether a request has a session, or the token in its header."""
         if not self._rules.token:
             return True
-        scheme, _, said = request.headers.get("authorization", "").partition(" ")
+        scheme, _, token = request.headers.get("authorization", "").partition(" ")
         if scheme.lower() == "bearer":
-            return self._rules.allows(said)
+            return self._rules.allows(token)
         return self._sessions.get(request.cookies.get(COOKIE, ""), 0.0) > time.monotonic()
 
     async def _login(self, request: Request) -> Response:
-        values = await _object(request)
-        if values is None or not self._logins.take():
-            return _no(429 if values is not None else 400, "too many attempts: wait a moment")
+        try:
+            values = await _object(request)
+        except StereoSfmError as error:
+            return _refusal(400, str(error))
+        if not self._logins.take():
+            return _refusal(429, "too many attempts: wait a moment")
         if not self._rules.allows(str(values.get("token", ""))):
-            return _no(401, "this is not the token")
+            return _refusal(401, "this is not the token")
         now = time.monotonic()
         alive = {key: until for key, until in self._sessions.items() if until > now}
         self._sessions = dict(list(alive.items())[1 - MOST_SESSIONS :])
@@ -132,7 +138,7 @@ class Page:
         response.set_cookie(COOKIE, key, int(SESSION_S), httponly=True, samesite="strict", secure=secure)
         return response
 
-    # -- what ---------------------------------------------------------------------------------------------------------
+    # -- content ----------------------------------------------------------------------------------------------------
 
     async def _file(self, request: Request) -> Response:
         name, kind = FILES[request.url.path]
@@ -141,7 +147,7 @@ class Page:
 
     async def _live(self, request: Request) -> Response:
         if self._viewers >= MOST_VIEWERS:
-            return _no(503, "too many pages are open")
+            return _refusal(503, "too many pages are open")
         return StreamingResponse(self._states(request), media_type="text/event-stream")
 
     async def _states(self, request: Request) -> AsyncIterator[str]:
@@ -160,60 +166,70 @@ class Page:
         data = self._state.jpeg()
         return Response(data, media_type="image/jpeg") if data else Response(status_code=204)
 
+    async def _floor_plan(self, request: Request) -> Response:
+        data = self._state.floor_plan()
+        return Response(data, media_type="image/png") if data else Response(status_code=204)
+
     async def _settings(self, request: Request) -> Response:
         reply = await self._call("status", {})
         return JSONResponse(reply.data.get("settings", {}))
 
     async def _recordings(self, request: Request) -> Response:
         reply = await self._call("recordings", {})
-        return JSONResponse(reply.data.get("recordings", []) if reply.ok else [])
+        return JSONResponse(self._verdicts.add(reply.data.get("recordings", [])) if reply.ok else [])
+
+    def _folder_of(self, id: str) -> Path | None:
+        """The folder of a recording, from the files that the service lists."""
+        files = self._service.call("recording_files", id=id).data.get("files", [])
+        return Path(files[0]).parent if files else None
 
     async def _files(self, request: Request) -> Response:
         """Names and sizes of a recording's files; their numbers are their places in this list."""
         reply = await self._call("recording_files", {"id": request.path_params["id"]})
         if not reply.ok:
-            return _no(404, reply.text)
+            return _refusal(404, reply.text)
         files = [Path(text) for text in reply.data.get("files", [])]
         return JSONResponse([{"name": f.name, "bytes": f.stat().st_size if f.is_file() else 0} for f in files])
 
     async def _download(self, request: Request) -> Response:
-        """One file of a recording: the service says which files those are."""
+        """One file of a recording, from the list that the service gives."""
         reply = await self._call("recording_files", {"id": request.path_params["id"]})
         files: list[str] = reply.data.get("files", [])
         number = request.path_params["number"]
         if not reply.ok or not 0 <= number < len(files):
-            return _no(404, reply.text or "no such file")
+            return _refusal(404, reply.text or "no such file")
         path = Path(files[number])
         if not path.is_file():
-            return _no(404, "the file is gone")
+            return _refusal(404, "the file no longer exists")
         return FileResponse(path, filename=f"{path.parent.name}_{path.name}", media_type="application/octet-stream")
 
     async def _command(self, request: Request) -> Response:
         name = request.path_params["name"]
         if name not in COMMANDS:
-            return _no(404, "no such command")
+            return _refusal(404, "no such command")
         if HEADER not in request.headers:
-            return _no(403, f"commands need the header {HEADER}")
-        values = await _object(request)
-        if values is None:
-            return _no(400, "a command takes a small JSON object")
+            return _refusal(403, "commands need the header X-Stereo-Sfm: 1")
+        try:
+            values = await _object(request)
+        except StereoSfmError as error:
+            return _refusal(400, str(error))
         if not self._commands.take():
-            return _no(429, "too many commands: wait a moment")
+            return _refusal(429, "too many commands: wait a moment")
         reply = await self._call(name, values)
         return JSONResponse({"ok": reply.ok, "text": reply.text})
 
     async def _call(self, name: str, values: dict[str, Any]) -> Reply:
-        def ask() -> Reply:
+        def call() -> Reply:
             try:
-                return self._service.call(name, ANSWER_S, **values)
+                return self._service.call(name, REPLY_S, **values)
             except StereoSfmError as error:
                 return Reply(False, str(error))
 
-        return await run_in_threadpool(ask)
+        return await run_in_threadpool(call)
 
 
 class _Safe:
-    """Refuses other names of this computer, and tells browsers what the page needs."""
+    """Refuses requests under other host names, adds the security headers, and ends quietly with the server."""
 
     def __init__(self, app: ASGIApp, local: bool) -> None:
         self._app, self._local = app, local
@@ -223,36 +239,51 @@ class _Safe:
             await self._app(scope, receive, send)
             return
 
+        begun: list[bool] = []
+
         async def with_headers(message: Any) -> None:
             if message["type"] == "http.response.start":
+                begun.append(True)
                 message["headers"] = [*message["headers"], *((k.encode(), v.encode()) for k, v in SAFE.items())]
             await send(message)
 
         if self._local and not _is_local(dict(scope["headers"]).get(b"host", b"").decode("latin-1")):
-            await _no(421, "ask for this computer by its own name")(scope, receive, with_headers)
+            await _refusal(421, "use localhost or 127.0.0.1 as the host name")(scope, receive, with_headers)
             return
-        await self._app(scope, receive, with_headers)
+        try:
+            await self._app(scope, receive, with_headers)
+        except asyncio.CancelledError:  # the server ends; the client may have gone away long before
+            if begun:
+                await send({"type": "http.response.body"})
+            else:
+                await _refusal(503, "the service has ended")(scope, receive, with_headers)
 
 
 def _is_local(host: str) -> bool:
     return any(host == name or host.startswith(f"{name}:") for name in LOCAL_NAMES)
 
 
-async def _object(request: Request) -> dict[str, Any] | None:
-    """The JSON object of a request, None for anything else or too much."""
+async def _object(request: Request) -> dict[str, Any]:
+    """The JSON object of a request.
+
+    Raises:
+        StereoSfmError: it is not declared as JSON, is too large, or is something else.
+    """
     if not request.headers.get("content-type", "").startswith("application/json"):
-        return None
+        raise StereoSfmError("send the header Content-Type: application/json")
     data = b""
     async for part in request.stream():
         data += part
         if len(data) > BODY_BYTES:
-            return None
+            raise StereoSfmError(f"the body is larger than {BODY_BYTES} bytes")
     try:
         values = json.loads(data)
     except (ValueError, RecursionError):
-        return None
-    return values if isinstance(values, dict) else None  # pyright: ignore[reportUnknownVariableType]
+        values = None
+    if not isinstance(values, dict):
+        raise StereoSfmError("the body is not a JSON object, such as {}")
+    return values  # pyright: ignore[reportUnknownVariableType]
 
 
-def _no(code: int, text: str) -> Response:
+def _refusal(code: int, text: str) -> Response:
     return JSONResponse({"ok": False, "text": text}, code)

@@ -36,14 +36,14 @@ class PageOutput:
         self,
         address: str,
         port: int,
-        picture_hz: float,
+        preview_hz: float,
         rules: Access | None = None,
         security: SecurityConfig | None = None,
     ) -> None:
-        """Args: address and port, where to listen. picture_hz: images a second. rules, security: for who connects."""
+        """Args: address and port, where to listen. preview_hz: images a second. rules, security: for who connects."""
         from stereo_sfm.service.page.state import PageState
 
-        self._address, self._port, self.picture_hz = address, port, picture_hz
+        self._address, self._port, self.preview_hz = address, port, preview_hz
         self._rules, self._security = rules or Access(), security or SecurityConfig()
         self._state = PageState()
         self._server: Any = None

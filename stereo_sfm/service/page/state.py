@@ -17,19 +17,20 @@ from stereo_sfm.service.messages import (
     Event,
     HealthReport,
     MapCloud,
-    Picture,
     PoseUpdate,
+    PreviewImage,
     ServiceMessage,
     Started,
     Status,
 )
+from stereo_sfm.service.outputs.floor_grid import FloorGrid, FloorGrids, aligned
 from stereo_sfm.service.outputs.robot_axes import RobotAxes
 from stereo_sfm.types import F64, U8
 
 EVENTS = 60  # lines that are kept
 WIDEST = 640  # pixels of the image
 JPEG_QUALITY = 75
-WATCHED_S = 3.0  # images are made while somebody has asked for one within so many seconds
+WATCHED_S = 3.0  # images are drawn while one was requested within so many seconds
 MOST_POINTS, MOST_KEYFRAMES = 6000, 3000  # of the map as it is shown
 CELL_M = 0.05  # points of one cell are shown as one
 
@@ -41,27 +42,32 @@ class PageState:
         self._lock = threading.Lock()
         self._axes: RobotAxes | None = None
         self._values: dict[str, Any] = {"source": "", "status": None, "pose": None, "health": None, "map_version": 0}
+        self._values["plan"] = None
         self._events: deque[dict[str, Any]] = deque(maxlen=EVENTS)
         self._map: dict[str, Any] = {"version": 0, "points": [], "path": []}
         self._jpeg = b""
-        self._watched = -WATCHED_S
+        self._plan_png = b""
+        self._plans = FloorGrids(self._take_plan)
+        self._watched = self._viewed = -WATCHED_S
 
     def put(self, message: ServiceMessage) -> None:
-        """Take a message."""
-        if isinstance(message, Picture):
-            self._picture(message)
+        """Show a message."""
+        if isinstance(message, PreviewImage):
+            self._take_image(message)
         elif isinstance(message, MapCloud):
             self._take_map(message)
         else:
             with self._lock:
-                self._take(message)
+                self._store(message)
 
-    def _take(self, message: ServiceMessage) -> None:
+    def _store(self, message: ServiceMessage) -> None:
         if isinstance(message, Started):
             self._axes = RobotAxes(message.rig)
             self._values["source"] = message.source
         elif isinstance(message, Status):
             self._values["status"] = asdict(message)
+            if time.monotonic() - self._viewed < WATCHED_S:
+                self._plans.follow(message)
         elif isinstance(message, PoseUpdate) and self._axes is not None:
             self._values["pose"] = _pose(message, self._axes)
         elif isinstance(message, HealthReport):
@@ -81,12 +87,27 @@ class PageState:
             self._values["map_version"] = version
             self._map = {"version": version, "points": _rounded(points), "path": _rounded(path[:, :2])}
 
-    def _picture(self, picture: Picture) -> None:
+    def _take_image(self, preview: PreviewImage) -> None:
         if time.monotonic() - self._watched < WATCHED_S:
-            self._jpeg = _drawn(picture)
+            self._jpeg = _drawn(preview)
+
+    def _take_plan(self, image: U8, resolution: float, origin: tuple[float, float], map_T_floor: F64) -> None:
+        """A new floor plan of the saved map, in a thread of its own."""
+        axes = self._axes
+        if axes is None:
+            return
+        grid = aligned(image, resolution, origin, axes.in_map(map_T_floor))
+        with self._lock:
+            version = self._values["plan"]["version"] + 1 if self._values["plan"] else 1
+            self._plan_png, self._values["plan"] = _plan_png(grid), {"version": version, **_plan_extent(grid)}
+
+    def floor_plan(self) -> bytes:
+        """The floor plan as PNG, x up and y to the left, where `plan` of the snapshot says; empty at first."""
+        return self._plan_png
 
     def snapshot(self) -> str:
-        """State, pose, health and events as JSON; NaN becomes null."""
+        """State, pose, health, extent of the floor plan and events as JSON; NaN becomes null."""
+        self._viewed = time.monotonic()
         with self._lock:
             text = json.dumps({**self._values, "events": list(self._events)}, default=str)
         return json.dumps(json.loads(text, parse_constant=lambda _: None), separators=(",", ":"))
@@ -121,16 +142,32 @@ def _thinned(points: F64) -> F64:
     return kept[:: 1 + len(kept) // MOST_POINTS]
 
 
+def _plan_png(grid: FloorGrid) -> bytes:
+    """Free cells white, occupied ones dark, unknown ones transparent; the first row has the largest x."""
+    cells = grid.cells.T[::-1, ::-1]
+    image = np.zeros((*cells.shape, 4), np.uint8)  # blue, green, red, opacity
+    image[cells == 0] = (255, 255, 255, 255)
+    image[cells == 100] = (60, 50, 40, 255)
+    return cv2.imencode(".png", image)[1].tobytes()
+
+
+def _plan_extent(grid: FloorGrid) -> dict[str, float]:
+    """Metres in the robot's map: largest x and y, size along x and along y."""
+    rows, columns = grid.cells.shape
+    along_x, along_y = columns * grid.resolution, rows * grid.resolution
+    return {"x": grid.origin[0] + along_x, "y": grid.origin[1] + along_y, "along_x": along_x, "along_y": along_y}
+
+
 def _rounded(values: F64) -> list[list[float]]:
     return np.round(values, 2).tolist()
 
 
-def _drawn(picture: Picture) -> bytes:
+def _drawn(preview: PreviewImage) -> bytes:
     """The left image with a dot for each track: blue when new, red when old, grey where the pose does not use it."""
-    scale = min(1.0, WIDEST / picture.left.shape[1])
-    small: U8 = cv2.resize(picture.left, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA).astype(np.uint8)
+    scale = min(1.0, WIDEST / preview.left.shape[1])
+    small: U8 = cv2.resize(preview.left, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA).astype(np.uint8)
     image = cv2.cvtColor(small, cv2.COLOR_GRAY2BGR)
-    colors = (age_colors(picture.age, picture.inlier)[:, 2::-1] * 255).astype(int)
-    for (u, v), color in zip(np.round(picture.uv * scale).astype(int).tolist(), colors.tolist(), strict=True):
+    colors = (age_colors(preview.age, preview.inlier)[:, 2::-1] * 255).astype(int)
+    for (u, v), color in zip(np.round(preview.uv * scale).astype(int).tolist(), colors.tolist(), strict=True):
         cv2.circle(image, (u, v), 2, color, -1, cv2.LINE_AA)
     return cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))[1].tobytes()

@@ -90,6 +90,10 @@ class FeatureTracker:
             kf_T_map = se3.inverse(update.map_T_kf[own[0]])
             self._keyframe = replace(self._keyframe, points=_moved(self._keyframe.points, ids, update, kf_T_map))
 
+    def describe(self, keyframe: Keyframe) -> Keyframe:
+        """The keyframe of the last step, which has its descriptors."""
+        return keyframe
+
     def step(self, image: StereoImage) -> tuple[Frame, Keyframe | None]:
         """Track one image."""
         rng = np.random.default_rng((self._config.seed, image.frame_id))

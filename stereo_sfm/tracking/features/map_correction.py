@@ -9,7 +9,7 @@ from stereo_sfm.types import F64, MapUpdate
 
 
 class KeyframePoses:
-    """Where the tracker has its keyframes whose answer is still to come (the mapper expects its answer used)."""
+    """Where the tracker has its keyframes whose update is still to come (the mapper expects its update applied)."""
 
     def __init__(self) -> None:
         self._odom_T_kf: dict[int, F64] = {}

@@ -80,6 +80,6 @@ def epipolar_inliers(bearings0: F64, bearings1: F64, threshold: float, rng: np.r
     scale = 1.0 / threshold  # image plane on which the threshold is one pixel
     flat0, flat1 = scale * bearings0[:, :2] / bearings0[:, 2:], scale * bearings1[:, :2] / bearings1[:, 2:]
     cv2.setRNGSeed(int(rng.integers(1 << 31)))
-    answer: Any = cv2.findFundamentalMat(flat0, flat1, cv2.FM_RANSAC, 1.0, 0.999)
-    mask: U8 | None = answer[1]
+    found: Any = cv2.findFundamentalMat(flat0, flat1, cv2.FM_RANSAC, 1.0, 0.999)
+    mask: U8 | None = found[1]
     return np.zeros(count, bool) if mask is None else mask.ravel().astype(bool)

@@ -75,6 +75,10 @@ class MonocularTracker:
         points = se3.transform(se3.inverse(odom_T_cam), self._local.positions(ids))
         return replace(view, ids=ids, points=points)
 
+    def describe(self, keyframe: Keyframe) -> Keyframe:
+        """The keyframe of the last step, which has its descriptors."""
+        return keyframe
+
     def step(self, image: StereoImage) -> tuple[Frame, Keyframe | None]:
         """Track one image, by its left camera only."""
         rng = np.random.default_rng((self._config.seed, image.frame_id))

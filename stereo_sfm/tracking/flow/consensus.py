@@ -1,10 +1,10 @@
 """Moving objects: points that have been static for long determine the camera's motion, others are marked as moving.
 
-While most points agree, all of them have the same say. When points in company disagree, or many are gone, a second
-motion is looked for among them, and the camera's is the one that the longest followed points agree with, within what
-its motion until now makes likely. What follows another motion, or keeps disagreeing in company, is marked as moving.
-Marked points are followed on, so that nothing new is begun on what moves, but count for nothing until they have stood
-still for a while.
+While most points agree, all have the same weight. When a group of neighbouring points disagrees, or many points are
+lost, a second motion is estimated from the points that disagree. The camera's motion is the one that is supported by
+the points tracked longest, among those that are plausible after its recent motion. Points that support another motion,
+or that disagree repeatedly as a group, are marked as moving. They are tracked further, so that no new points are added
+on a moving object, but they do not contribute to the pose until they have been static for some frames.
 """
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportMissingTypeArgument=false
@@ -20,52 +20,54 @@ from stereo_sfm.tracking.flow.pose_solver import row_residuals
 from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.types import F64, Bool, Corners
 
-FEW = 8  # points in company, fewer are no motion of their own
-LEFT = 0.65  # share of the points that were looked for from which another motion is, if fewer agree
-SETTLED_S = 0.3  # a point that was followed for so long has its full say ...
-LEAST_SAY = 0.1  # ... and a new one this
-EVIDENCE = 0.2  # of the points that agree in an open view; with fewer the camera counts as covered
-MORE = 1.05  # times the say that all together have, so that others decide
-ALERT_S = 1.0  # after that, or while points are marked as moving
-COMPANY, NEIGHBOURS = 3, 6  # a point moves if so many of its nearest neighbours disagree as well
+MIN_GROUP = 8  # points of a group; fewer do not define a motion
+AGREEING_SHARE = 0.65  # of the points that were tracked; if fewer agree, another motion is searched for
+SETTLED_S = 0.3  # a point that was tracked for so long has its full weight ...
+MIN_WEIGHT = 0.1  # ... and a new one this
+MIN_OPEN_SHARE = 0.2  # of the inliers in an unobstructed view; with fewer the camera counts as covered
+WEIGHT_RATIO = 1.05  # by which another motion must outweigh the one that all points give
+ALERT_S = 1.0  # for which other motions are searched for after one was seen
+MOVING_NEIGHBOURS, NEIGHBOURS = 3, 6  # a point moves if so many of its nearest neighbours disagree as well
 SAME_DEPTH = 0.3  # logarithm of the ratio of two distances
-PROOF = 4  # successive frames in which a moving point must agree to be used again
+STATIC_FRAMES = 4  # successive frames in which a moving point must agree before it is used again
 
 
 def after_frame(tracks: Tracks, inlier: Bool, moving: Bool, misses_allowed: int, alert: bool) -> tuple[Tracks, Bool]:
-    """Tracks with `misses` and `moving` brought up to date; what disagrees for long is dropped, in company marked.
+    """Tracks with updated `misses` and `moving`: points that disagree for long are dropped, groups of them marked.
 
     Args:
-        inlier: (N,) which points agree with the pose. moving: (N,) which have been seen to move in company; (0,): none.
+        inlier: (N,) which points agree with the pose. moving: (N,) which support another motion; (0,): none.
         misses_allowed: successive frames of disagreement.
-        alert: whether something may move; if not, nothing is marked.
+        alert: whether an object may be moving; if not, nothing is marked.
 
     Returns:
         The remaining tracks, and their rows as a mask (N,).
     """
-    still = ~tracks.moving
+    static = ~tracks.moving
     misses = np.where(inlier, 0, tracks.misses + 1)
-    proof = np.where(inlier, tracks.misses - 1, PROOF)
-    tracks.misses = np.where(still, misses, proof).astype(np.int32)
-    out = still & (tracks.misses >= misses_allowed)
+    remaining = np.where(inlier, tracks.misses - 1, STATIC_FRAMES)
+    tracks.misses = np.where(static, misses, remaining).astype(np.int32)
+    out = static & (tracks.misses >= misses_allowed)
     disagree = tracks.moving | (tracks.misses > 0)
-    joins = np.zeros(len(tracks), bool)
+    group = np.zeros(len(tracks), bool)
     rows = np.flatnonzero(out) if alert else np.zeros(0, np.int64)
-    joins[rows] = _company(tracks.uv[rows], tracks.rho[rows], tracks.uv, tracks.rho, disagree) > COMPANY
+    group[rows] = (
+        _marked_neighbours(tracks.uv[rows], tracks.rho[rows], tracks.uv, tracks.rho, disagree) > MOVING_NEIGHBOURS
+    )
     if len(moving):
-        joins |= moving & still
-    tracks.misses[joins] = PROOF
-    tracks.moving = (tracks.moving | joins) & (tracks.misses > 0)
-    kept = ~out | joins
+        group |= moving & static
+    tracks.misses[group] = STATIC_FRAMES
+    tracks.moving = (tracks.moving | group) & (tracks.misses > 0)
+    kept = ~out | group
     return tracks.keep(kept), kept
 
 
-def among_moving(uv: F64, rho: F64, tracks: Tracks) -> Bool:
+def near_moving(uv: F64, rho: F64, tracks: Tracks) -> Bool:
     """(M,) which new points, (M, 2) px and (M,) 1/m, are on moving objects."""
-    return _company(uv, rho, tracks.uv, tracks.rho, tracks.moving) >= COMPANY
+    return _marked_neighbours(uv, rho, tracks.uv, tracks.rho, tracks.moving) >= MOVING_NEIGHBOURS
 
 
-def _company(uv: F64, rho: F64, among_uv: F64, among_rho: F64, marked: Bool) -> F64:
+def _marked_neighbours(uv: F64, rho: F64, among_uv: F64, among_rho: F64, marked: Bool) -> F64:
     """(M,) number of the nearest NEIGHBOURS in the image that are marked (N,) and at about the same distance."""
     if not len(uv) or not marked.any():
         return np.zeros(len(uv))
@@ -75,11 +77,13 @@ def _company(uv: F64, rho: F64, among_uv: F64, among_rho: F64, marked: Bool) -> 
     return (marked[nearest] & same_depth).sum(1)
 
 
-def in_company(tracks: Tracks, points: Bool) -> Bool:
-    """(N,) which of some points, (N,), have such points around them at their own distance."""
+def in_group(tracks: Tracks, points: Bool) -> Bool:
+    """(N,) which of the `points` (N,) have neighbours among them at their own distance."""
     rows, out = np.flatnonzero(points), np.zeros(len(points), bool)
-    if len(rows) >= FEW:
-        out[rows] = _company(tracks.uv[rows], tracks.rho[rows], tracks.uv, tracks.rho, points) > COMPANY
+    if len(rows) >= MIN_GROUP:
+        out[rows] = (
+            _marked_neighbours(tracks.uv[rows], tracks.rho[rows], tracks.uv, tracks.rho, points) > MOVING_NEIGHBOURS
+        )
     return out
 
 
@@ -88,9 +92,9 @@ def without_moving(corners: Corners, tracks: Tracks) -> Corners:
     if not tracks.moving.any():
         return corners
     distance = np.linalg.norm(corners.points_cam, axis=1).astype(np.float64)
-    still = ~among_moving(corners.uv_left.astype(np.float64), 1.0 / np.maximum(distance, 1e-6), tracks)
+    static = ~near_moving(corners.uv_left.astype(np.float64), 1.0 / np.maximum(distance, 1e-6), tracks)
     return Corners(
-        corners.uv_left[still], corners.uv_right[still], corners.points_cam[still], corners.descriptors[still]
+        corners.uv_left[static], corners.uv_right[static], corners.points_cam[static], corners.descriptors[static]
     )
 
 

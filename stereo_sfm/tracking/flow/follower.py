@@ -1,7 +1,8 @@
-"""Tracking of points from one left image to the next: by translation, then alignment with their first appearance."""
+"""Tracking of points from one left image to the next: alignment with their first appearance, after a translation."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,33 +10,46 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.order_statistics import median_distance
 from stereo_sfm.tracking.flow import klt
 from stereo_sfm.tracking.flow.coarse_rotation import CoarseRotation
 from stereo_sfm.tracking.flow.frame_pose import ExpectedMotion
+from stereo_sfm.tracking.flow.pyramids import StereoPyramids
+from stereo_sfm.tracking.flow.reappearance import find_deformed, plane_warps
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.tracks import Patches, Tracks
 from stereo_sfm.tracking.flow.visible_area import VisibleArea
-from stereo_sfm.types import F64, I64
+from stereo_sfm.types import F64, I64, Bool
 
 WELL_PREDICTED_PX = 3.0  # median error of the predictions below which the search starts in the half image
-MAX_SCALE_CHANGE = 1.25  # of the distance to a point, within which its window still matches
+ALIGNED_PX = 1.5  # the same, below which first appearances are aligned from the predictions
+STORED = 4  # times max_features: points of the last image and of the held one, and new ones of the held one
+HALF_LIFE_S = 1.0  # after which an image with half as many points is as good to recover from
+MIN_COARSE_NCC = 0.65  # of a window found again in the half image
+SEARCH_STEPS = 14  # offsets of a search on either side
 
 
 @dataclass
 class Held:
-    """The last trusted image, from which tracking is recovered."""
+    """The trusted image from which tracking is recovered."""
 
-    pyramid: klt.Pyramid
+    stamp_ns: int
+    images: StereoPyramids
     tracks: Tracks
     pose: F64  # (4, 4) odom_T_cam
+    dense: bool = False  # whether points were added for the recovery
+
+    def worth(self, stamp_ns: int) -> float:
+        """Number of points with which another image, at a time, is as good."""
+        return len(self.tracks) * 0.5 ** ((stamp_ns - self.stamp_ns) * 1e-9 / HALF_LIFE_S)
 
 
 class Follower:
     """Tracks points from the last image, with the windows of their first appearances."""
 
     def __init__(self, config: TrackerConfig, rig: Rig, area: VisibleArea, shutter: RollingShutter) -> None:
-        self._config, self._area, self._shutter = config, area, shutter
-        self._patches = Patches(2 * config.max_features)
+        self._config, self._area, self._shutter, self._camera = config, area, shutter, rig.left
+        self._patches = Patches(STORED * config.max_features)
         self._last: klt.Pyramid | None = None
         self._held: Held | None = None
         self._coarse_rotation = CoarseRotation(rig.left, config.pyramid_levels)
@@ -50,51 +64,113 @@ class Follower:
         guess = np.where(np.isfinite(guess), guess, tracks.uv)
         return self._find(self._last, tracks, pyramid, guess, tracks.warp)
 
-    def hold(self, pyramid: klt.Pyramid, tracks: Tracks, pose: F64) -> None:
-        """Keep an image with a trusted pose (4, 4) and its points for recovery."""
-        self._held = Held(pyramid, tracks, pose)
-
-    def find_again(self, pyramid: klt.Pyramid, expected: ExpectedMotion) -> Tracks:
-        """The held points that are found from another, possibly distant pose."""
+    @property
+    def held(self) -> Held:
+        """The image from which tracking is recovered; there is one after the first trusted image."""
         assert self._held is not None
-        guess, nearer = self._from(expected.pose)
-        ahead = np.isfinite(guess[:, 0])
-        tracks, guess, nearer = self._held.tracks.keep(ahead), guess[ahead], nearer[ahead]
+        return self._held
+
+    def hold(self, stamp_ns: int, images: StereoPyramids, tracks: Tracks, trusted: Bool, pose: F64) -> None:
+        """Keep an image with a trusted pose (4, 4) and its trusted points (N,) for recovery, if it has enough.
+
+        Whatever is about to cover the camera already hides a part of the last images.
+        """
+        if self._held is None or trusted.sum() >= self._held.worth(stamp_ns):
+            self._held = Held(stamp_ns, images, tracks.keep(trusted), pose)
+
+    def forget(self) -> None:
+        """Give up the held image: a new odometry begins."""
+        self._held = None
+
+    def renewed(self, held: Held) -> Tracks:
+        """The points of the held image, with their appearance in it instead of their first one."""
+        rows, slots = self.begin(held.images.left, held.tracks.uv)
+        tracks = held.tracks.keep(_mask(rows, len(held.tracks)))
+        tracks.slot, tracks.warp = slots, np.tile(np.eye(2), (len(rows), 1, 1))
+        return tracks
+
+    def find_again(self, pyramid: klt.Pyramid, pose: F64, reach: float, most: int) -> Tracks:
+        """The held points that are found from another, possibly distant pose (4, 4).
+
+        Args:
+            reach: of the search around the predicted pixels, as a share of the image's width.
+            most: of the points that are looked for, evenly chosen.
+        """
+        tracks = self.held.tracks
+        guess, warps = self._seen_from(pose)
+        rows = np.flatnonzero(self._visible(guess, warps))
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(np.int64))]
+        tracks, warps = tracks.keep(_mask(rows, len(tracks))), np.ascontiguousarray(warps[:, rows])
+        uv, warp = guess[rows].copy(), tracks.warp.copy()
+        radius = max(round(0.5 * reach * self._camera.width), 1)
+        step = math.ceil(radius / SEARCH_STEPS)
+        ncc = find_deformed(
+            pyramid[1], guess[rows], warps @ tracks.warp, tracks.slot, self._patches.patch, radius, step, uv, warp
+        )
         self.search_widely()
-        return self._find(self._held.pyramid, tracks, pyramid, guess, tracks.warp * nearer[:, None, None])
+        return self._kept(tracks, *self._align(pyramid, uv, warp, tracks.slot, ncc > MIN_COARSE_NCC))
 
-    def expected_again(self, pose: F64) -> int:
-        """Number of held points that should be found from a pose (4, 4): visible, at a similar distance."""
-        guess, nearer = self._from(pose)
-        similar = (nearer < MAX_SCALE_CHANGE) & (nearer > 1 / MAX_SCALE_CHANGE)
-        return int((similar & self._area.inside(guess)).sum())
+    def expected_again(self, pose: F64) -> float:
+        """How many of the held points in view from a pose (4, 4) should be found: fewer where windows change much."""
+        uv, warps = self._seen_from(pose)
+        visible = self._visible(uv, warps)
+        change = np.abs(np.log(np.linalg.norm(warps[:, visible], axis=(2, 3)) / math.sqrt(2.0)))
+        return float(np.exp(-np.nanmin(change, axis=0)).sum()) if visible.any() else 0.0
 
-    def _from(self, pose: F64) -> tuple[F64, F64]:
-        """Pixels (N, 2) of the held points, NaN behind the camera, and the ratio (N,) of old to new distance."""
-        assert self._held is not None
-        tracks, points = self._held.tracks, self._held.tracks.points()
-        uv = self._shutter.project(pose, np.zeros(6), points, tracks.uv)
-        before, now = (np.linalg.norm(points - at, axis=1) for at in (self._held.pose[:3, 3], pose[:3, 3]))
-        return uv, before / np.maximum(now, 1e-6)
+    def _seen_from(self, pose: F64) -> tuple[F64, F64]:
+        """Pixels (N, 2) of the held points, NaN behind the camera, and their deformations since (3, N, 2, 2)."""
+        held = self.held
+        points = held.tracks.points()
+        uv = self._shutter.project(pose, np.zeros(6), points, held.tracks.uv)
+        held_T_odom = se3.inverse(held.pose)
+        new_T_held = se3.inverse(pose) @ held.pose
+        return uv, plane_warps(self._camera, held.tracks.uv, se3.transform(held_T_odom, points), new_T_held)
+
+    def _visible(self, uv: F64, warps: F64) -> Bool:
+        """(N,) points whose pixels (N, 2) are in the image, and one of whose deformations (3, N, 2, 2) is moderate."""
+        inside = np.isfinite(uv[:, 0])
+        inside[inside] = self._area.inside(uv[inside])
+        return inside & np.isfinite(warps).all(axis=(2, 3)).any(axis=0)
 
     def _find(self, last: klt.Pyramid, tracks: Tracks, pyramid: klt.Pyramid, guess: F64, warp: F64) -> Tracks:
-        """Find points of one image in another, starting at guesses (N, 2) px and deformations (N, 2, 2)."""
-        config = self._config
-        uv = guess.copy()
-        status, _ = klt.track_translation(
-            last, pyramid, tracks.uv, uv, self._first_level, 0, 10, config.min_contrast, config.min_ncc, klt.WEIGHTS
-        )
-        found = status == klt.TRACKED
-        self._miss_px = float(np.median(np.linalg.norm(uv - guess, axis=1)[found])) if found.any() else np.inf
-        warp = warp.copy()
-        ncc = klt.track_affine(
-            pyramid[0], uv, warp, tracks.slot, found, self._patches.patch, self._patches.gradients,
-            self._patches.inverse_normal, self._patches.contrast, 6, klt.WEIGHTS, klt.COORDINATES,
-        )  # fmt: skip
-        found &= (ncc > config.min_anchor_ncc) & self._area.inside(uv)
+        """Find points of one image in another, starting at guesses (N, 2) px and deformations (N, 2, 2).
+
+        Where the predictions are good, first appearances are aligned from there; what that misses, and all points
+        otherwise, is first followed by translation from the last image.
+        """
+        near = np.full(len(guess), self._miss_px < ALIGNED_PX)
+        uv, deformed, found = self._align(pyramid, guess, warp, tracks.slot, near)
+        missed = np.flatnonzero(~found)
+        if len(missed):
+            moved, followed = self._translate(last, tracks.uv[missed], pyramid, guess[missed])
+            aligned = self._align(pyramid, moved, warp[missed], tracks.slot[missed], followed)
+            uv[missed], deformed[missed], found[missed] = aligned
+        self._miss_px = median_distance(uv, guess, found)
+        return self._kept(tracks, uv, deformed, found)
+
+    def _kept(self, tracks: Tracks, uv: F64, warp: F64, found: Bool) -> Tracks:
+        """The tracks that are found (N,) and in view, at pixels (N, 2) with deformations (N, 2, 2)."""
+        found = found & self._area.inside(uv)
         out = tracks.keep(found)
         out.uv, out.warp = uv[found], warp[found]
         return out
+
+    def _translate(self, last: klt.Pyramid, uv: F64, pyramid: klt.Pyramid, guess: F64) -> tuple[F64, Bool]:
+        """Pixels (N, 2) of points (N, 2) px of the last image, and which of them are found."""
+        config, found = self._config, guess.copy()
+        status, _ = klt.track_translation(
+            last, pyramid, uv, found, self._first_level, 0, 10, config.min_contrast, config.min_ncc, klt.WEIGHTS
+        )
+        return found, status == klt.TRACKED
+
+    def _align(self, pyramid: klt.Pyramid, uv: F64, warp: F64, slots: I64, wanted: Bool) -> tuple[F64, F64, Bool]:
+        """Align first appearances with an image: pixels (N, 2), deformations (N, 2, 2), which are found (N,)."""
+        uv, warp, store = uv.copy(), warp.copy(), self._patches
+        ncc = klt.track_affine(
+            pyramid[0], uv, warp, slots, wanted, store.patch, store.gradients, store.inverse_normal, store.contrast,
+            6, klt.WEIGHTS, klt.COORDINATES,
+        )  # fmt: skip
+        return uv, warp, np.asarray(ncc > self._config.min_anchor_ncc)
 
     def turned(self, pyramid: klt.Pyramid, expected: ExpectedMotion, last_pose: F64) -> ExpectedMotion:
         """The expected motion with the rotation that aligns the coarsest images; the search starts at the top level."""
@@ -107,7 +183,7 @@ class Follower:
 
     def search_widely(self) -> None:
         """Start the next search at the top level, for an unreliable prediction."""
-        self._first_level = self._coarsest_level
+        self._first_level, self._miss_px = self._coarsest_level, np.inf
 
     def accept(self, pyramid: klt.Pyramid, tracks: Tracks) -> None:
         """Track the next image from this one; appearances of other points are dropped."""
@@ -129,3 +205,10 @@ class Follower:
         """Drop the first appearances of all points that are neither in `tracks` nor held."""
         held = tracks.slot if self._held is None else self._held.tracks.slot
         self._patches.keep_only(np.concatenate([tracks.slot, held]))
+
+
+def _mask(rows: I64, count: int) -> Bool:
+    """(count,) True at the rows."""
+    mask = np.zeros(count, bool)
+    mask[rows] = True
+    return mask

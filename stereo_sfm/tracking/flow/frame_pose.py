@@ -1,4 +1,4 @@
-"""The pose of one frame: prediction, motion-only optimisation, and the decision between points that disagree."""
+"""The pose of one frame: prediction, motion-only optimisation, and the choice between several motions."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ import numpy as np
 
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.order_statistics import median
 from stereo_sfm.tracking.flow import pose_solver
 from stereo_sfm.tracking.flow.consensus import (
+    AGREEING_SHARE,
     ALERT_S,
-    EVIDENCE,
-    FEW,
-    LEAST_SAY,
-    LEFT,
-    MORE,
+    MIN_GROUP,
+    MIN_OPEN_SHARE,
+    MIN_WEIGHT,
     SETTLED_S,
+    WEIGHT_RATIO,
     errors_at,
-    in_company,
+    in_group,
 )
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
@@ -34,6 +35,11 @@ MEDIAN_ERROR = 0.8  # of unit noise in the four rows of a point
 NOISE_RANGE = (0.3, 4.0)  # over config.sigma_px
 # Differences from the prediction that are possible for any robot: metres and m/s^2, radians and rad/s^2.
 MIN_LIMITS = (0.01, 4.0), (0.01, 6.0)
+# Standard deviations of a robot's differences, and root mean squares of the recent ones, if that is more. What moves
+# before the camera may have more points, and older ones, than the store; the camera goes on as before.
+USUAL_DIFFERENCES, USUAL_SIGMAS = ((0.002, 1.0), (0.002, 1.5)), 2.0
+UNLIKELY = 0.01
+NEAR = 2.0  # times the largest error of an inlier, at the predicted pose
 LIMIT_SIGMAS = 5.0  # root mean squares of the recent differences, if that is more
 MEMORY_S = 5.0  # time constant of their average
 MIN_DEPTH_SIGMA = 1e-3  # relative
@@ -64,7 +70,9 @@ class PoseSolution:
     sigma_px: float  # noise by which it is whitened
     max_error: float
     reason: str = ""  # why there is no pose
-    moving: Bool = field(default_factory=lambda: np.zeros(0, bool))  # (N,) points that move in company; (0,): none
+    moving: Bool = field(
+        default_factory=lambda: np.zeros(0, bool)
+    )  # (N,) points that support another motion; (0,): none
 
     @property
     def inlier(self) -> Bool:
@@ -92,112 +100,135 @@ class FramePoseSolver:
     def __init__(self, config: TrackerConfig, cameras: StereoCameras, shutter: RollingShutter) -> None:
         self._config, self._cameras, self._shutter = config, cameras, shutter
         self._noise = 1.0  # observed noise over config.sigma_px
-        self._alert_s = 0.0  # seconds for which something may still move
-        self.open_view = 0.0  # points that agree while nothing moves
+        self._alert_s = 0.0  # seconds for which other motions are still searched for
+        self.open_view = 0.0  # inliers of an unobstructed view
         self._difference = np.zeros(2)  # mean square of metres/s^2 and radians/s^2 between expected and found poses
 
     def use(self, cameras: StereoCameras) -> None:
         """Use other cameras."""
         self._cameras = cameras
 
+    def solve_again(self, tracks: Tracks, expected: ExpectedMotion) -> PoseSolution:
+        """Solve for the pose of a lost camera from points that were static before, starting at the expected pose."""
+        if len(tracks) < self._config.min_features:
+            return _no_pose(len(tracks), "too_few_points")
+        return self._solve_all(tracks, expected, expected.pose, np.ones(len(tracks), bool))
+
     def solve(self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, before: int = 0) -> PoseSolution:
         """Solve for the pose, starting at the prediction; at the previous pose (4, 4) if that finds no consensus.
 
-        `before`: points that stood still until now and were looked for. Where many of them disagree or are gone, other
-        motions are looked for, and that counts which the longest followed points agree with.
+        `before`: number of static points that were tracked. If many of them disagree or are lost, other motions are
+        searched for, and the one that the points tracked longest support is the camera's.
         """
-        voters = ~tracks.moving
-        if voters.sum() < self._config.min_features:
+        static = ~tracks.moving
+        if static.sum() < self._config.min_features:
             return _no_pose(len(tracks), "too_few_points")
-        best = self._by_all(tracks, expected, last_pose, voters)
-        rest = voters & ~best.inlier
-        calm = in_company(tracks, rest).sum() < FEW and best.inliers >= LEFT * before
-        if calm and not self.alert:
+        best = self._solve_all(tracks, expected, last_pose, static)
+        rest = static & ~best.inlier
+        undisturbed = in_group(tracks, rest).sum() < MIN_GROUP and best.inliers >= AGREEING_SHARE * before
+        undisturbed = undisturbed and self._likelihood(best.pose, expected) > UNLIKELY
+        if undisturbed and not self.alert:
             return best
         chosen = self._choose(tracks, expected, last_pose, best, rest)
         if not self.alert and not len(chosen.moving):
             return best
-        covered = (chosen.inlier & voters).sum() < EVIDENCE * self.open_view
+        covered = (chosen.inlier & static).sum() < MIN_OPEN_SHARE * self.open_view
         return _no_pose(len(tracks), "too_few_points") if covered else chosen
 
     def _choose(
         self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, best: PoseSolution, rest: Bool
     ) -> PoseSolution:
-        """Of the motions among the points, the camera's; `rest`: what disagrees with the best."""
-        voters = ~tracks.moving
-        other = self._by_rest(tracks, expected, last_pose, rest)
-        agreed = None if best.reason else self._grown(tracks, expected, best, best.inlier & voters, voters)
-        found = [agreed, self._by_settled(tracks, expected, voters), other]
-        likely = [s for s in found if s is not None and not s.reason and self._likely(s.pose, expected)]
-        if not likely:
+        """The camera's motion among those of the points; `rest` (N,): the points that disagree with the best."""
+        static = ~tracks.moving
+        other = self._solve_rest(tracks, expected, last_pose, rest)
+        agreed = None if best.reason else self._refit(tracks, expected, best, best.inlier & static, static)
+        by_settled, by_near = (solve(tracks, expected, static) for solve in (self._solve_settled, self._solve_near))
+        found = [agreed, by_settled, other, by_near]
+        plausible = [s for s in found if s is not None and not s.reason and self._plausible(s.pose, expected)]
+        if not plausible:
             return _no_pose(len(tracks), "no_consensus") if self.alert else best
-        say = tracks.mapped + np.minimum(tracks.age * expected.seconds, SETTLED_S) / SETTLED_S + LEAST_SAY
-        says = [float(say[s.inlier & voters].sum()) for s in likely]
-        k = int(np.argmax(says))
-        chosen = likely[0] if says[k] <= MORE * says[0] else likely[k]
-        for loser in found:
-            moving = np.zeros(len(tracks), bool) if loser is None else voters & loser.inlier & ~chosen.inlier
-            if in_company(tracks, moving).sum() >= FEW:
+        weight = tracks.mapped + np.minimum(tracks.age * expected.seconds, SETTLED_S) / SETTLED_S + MIN_WEIGHT
+        weights = [float(weight[s.inlier & static].sum()) * self._likelihood(s.pose, expected) for s in plausible]
+        k = int(np.argmax(weights))
+        chosen = plausible[0] if weights[k] <= WEIGHT_RATIO * weights[0] else plausible[k]
+        for motion in found:
+            moving = np.zeros(len(tracks), bool) if motion is None else static & motion.inlier & ~chosen.inlier
+            if in_group(tracks, moving).sum() >= MIN_GROUP:
                 chosen.moving = chosen.moving | moving if len(chosen.moving) else moving
         return chosen
 
-    def _by_all(self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, voters: Bool) -> PoseSolution:
+    def _solve_all(self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, static: Bool) -> PoseSolution:
         """Solve with all points."""
-        best = self._optimise(tracks, expected, voters)
-        if best.inliers < 0.5 * voters.sum():
+        best = self._optimise(tracks, expected, static)
+        if best.inliers < 0.5 * static.sum():
             still = ExpectedMotion(last_pose, np.zeros(6), expected.seconds)
-            best = max(best, self._optimise(tracks, still, voters), key=lambda s: s.inliers)
+            best = max(best, self._optimise(tracks, still, static), key=lambda s: s.inliers)
         if best.inliers < self._config.min_features:
             best.reason = "no_consensus"
         return best
 
-    def _by_settled(self, tracks: Tracks, expected: ExpectedMotion, voters: Bool) -> PoseSolution | None:
-        """Solve with the points that have been static for long, then with all that agree; None with too few."""
-        settled = voters & (tracks.age * expected.seconds >= SETTLED_S)
-        if settled.sum() < self._config.min_features or settled[voters].all():
+    def _solve_settled(self, tracks: Tracks, expected: ExpectedMotion, static: Bool) -> PoseSolution | None:
+        """Solve with the points that have been static for long, then with all their inliers; None with too few."""
+        settled = static & (tracks.age * expected.seconds >= SETTLED_S)
+        if settled.sum() < self._config.min_features or settled[static].all():
             return None
-        return self._grown(tracks, expected, self._optimise(tracks, expected, settled), settled, voters)
+        return self._refit(tracks, expected, self._optimise(tracks, expected, settled), settled, static)
 
-    def _by_rest(self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, rest: Bool) -> PoseSolution | None:
-        """The motion of the points that disagree with all others: of something else, or the camera's."""
-        if rest.sum() < FEW:
+    def _solve_near(self, tracks: Tracks, expected: ExpectedMotion, static: Bool) -> PoseSolution | None:
+        """Solve with the points that are about where the predicted motion takes them; None with too few."""
+        near = static & (self._errors(tracks, expected.pose, expected.velocity) < NEAR * self._config.max_error_sigmas)
+        if near.sum() < self._config.min_features or near[static].all():
+            return None
+        return self._refit(tracks, expected, self._optimise(tracks, expected, near), near, static)
+
+    def _solve_rest(self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, rest: Bool) -> PoseSolution | None:
+        """The motion of the points that disagree with all others: of another object, or the camera's."""
+        if rest.sum() < MIN_GROUP:
             return None
         still = ExpectedMotion(last_pose, np.zeros(6), expected.seconds)
         starts = [self._optimise(tracks, start, rest) for start in (still, expected)]
         best = max(starts, key=lambda s: s.inlier[rest].sum())
-        return self._grown(tracks, expected, best, rest, ~tracks.moving)
+        return self._refit(tracks, expected, best, rest, ~tracks.moving)
 
-    def _grown(
-        self, tracks: Tracks, expected: ExpectedMotion, first: PoseSolution, by: Bool, voters: Bool
+    def _refit(
+        self, tracks: Tracks, expected: ExpectedMotion, first: PoseSolution, by: Bool, static: Bool
     ) -> PoseSolution | None:
-        """The pose that some points gave, by all that agree with it; None where most of those do not."""
+        """The pose by all inliers of a pose that the points `by` gave; None if most of those are outliers."""
         if (first.inlier & by).sum() < max(self._config.min_features, 0.5 * by.sum()):
             return None
-        return self._optimise(tracks, dataclasses.replace(expected, pose=first.pose), first.inlier & voters)
+        return self._optimise(tracks, dataclasses.replace(expected, pose=first.pose), first.inlier & static)
 
     @property
     def alert(self) -> bool:
         """Whether an object moved within the last second."""
         return self._alert_s > 0
 
-    def _likely(self, pose: F64, expected: ExpectedMotion) -> bool:
-        """Whether a pose is near enough to the predicted one."""
+    def _plausible(self, pose: F64, expected: ExpectedMotion) -> bool:
+        """Whether a pose differs from the predicted one by no more than the recent accelerations explain."""
         off = np.array(se3.extent(se3.inverse(expected.pose) @ pose))
         constant, quadratic = np.array(MIN_LIMITS).T
         quadratic = np.maximum(quadratic, LIMIT_SIGMAS * np.sqrt(self._difference))
         return bool((off < constant + quadratic * expected.seconds**2).all())
 
+    def _likelihood(self, pose: F64, expected: ExpectedMotion) -> float:
+        """Of a pose by the recent accelerations and those of a robot, 1 for the predicted one, UNLIKELY at least."""
+        off = np.array(se3.extent(se3.inverse(expected.pose) @ pose))
+        constant, quadratic = np.array(USUAL_DIFFERENCES).T
+        quadratic = np.maximum(quadratic, USUAL_SIGMAS * np.sqrt(self._difference))
+        sigmas = off / (constant + quadratic * expected.seconds**2)
+        return max(math.exp(-0.5 * float(np.square(sigmas).sum())), UNLIKELY)
+
     def learn(self, tracks: Tracks, solution: PoseSolution, expected: ExpectedMotion) -> None:
-        """Follow whether something moves before the camera and, while nothing does, the noise of points and motion."""
+        """Learn whether objects move before the camera and, while none does, the noise of points and motion."""
         seconds = expected.seconds
-        moving = tracks.moving.sum() + solution.moving.sum() >= FEW
+        moving = tracks.moving.sum() + solution.moving.sum() >= MIN_GROUP
         self._alert_s = ALERT_S if moving else max(self._alert_s - seconds, 0.0)
         if self.alert:
             return
         share = 1.0 - math.exp(-seconds / MEMORY_S) if self.open_view else 1.0
         self.open_view += share * (solution.inliers - self.open_view)
-        median = float(np.median(solution.error[solution.inlier]))
-        noise = self._noise * (0.9 + 0.1 * median / MEDIAN_ERROR)
+        error = median(solution.error[solution.inlier])
+        noise = self._noise * (0.9 + 0.1 * error / MEDIAN_ERROR)
         self._noise = min(max(noise, NOISE_RANGE[0]), NOISE_RANGE[1])
         if seconds > 0:
             off = np.array(se3.extent(se3.inverse(expected.pose) @ solution.pose)) / seconds**2
@@ -211,16 +242,21 @@ class FramePoseSolver:
             self._cameras.cams, self._cameras.right_T_left, self._config.depth_sigma_px, MIN_DEPTH_SIGMA,
         )  # fmt: skip
 
-    def _optimise(self, tracks: Tracks, expected: ExpectedMotion, voters: Bool) -> PoseSolution:
-        """The pose by the points `voters` (N,), with the errors of all points."""
-        if voters.all():
+    def _optimise(self, tracks: Tracks, expected: ExpectedMotion, static: Bool) -> PoseSolution:
+        """The pose by the points `static` (N,), with the errors of all points."""
+        if static.all():
             return self._optimise_all(tracks, expected)
-        best, cameras = self._optimise_all(tracks.keep(voters), expected), self._cameras
-        best.error = errors_at(
-            best.pose, best.velocity, self._shutter.row_seconds(tracks.uv), tracks.origin, tracks.direction,
-            tracks.rho, tracks.variance, tracks.uv, tracks.uv_right, cameras.cams, cameras.right_T_left, best.sigma_px,
-        )  # fmt: skip
+        best = self._optimise_all(tracks.keep(static), expected)
+        best.error = self._errors(tracks, best.pose, best.velocity)
         return best
+
+    def _errors(self, tracks: Tracks, pose: F64, velocity: F64) -> F64:
+        """(N,) whitened errors of the points at a pose (4, 4), with a velocity (6,) during the readout."""
+        return errors_at(
+            pose, velocity, self._shutter.row_seconds(tracks.uv), tracks.origin, tracks.direction, tracks.rho,
+            tracks.variance, tracks.uv, tracks.uv_right, self._cameras.cams, self._cameras.right_T_left,
+            self._config.sigma_px * self._noise,
+        )  # fmt: skip
 
     def _optimise_all(self, tracks: Tracks, expected: ExpectedMotion) -> PoseSolution:
         sigma_px = self._config.sigma_px * self._noise

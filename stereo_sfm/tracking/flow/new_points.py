@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from stereo_sfm.config import TrackerConfig
-from stereo_sfm.tracking.flow.consensus import PROOF, among_moving
+from stereo_sfm.tracking.flow.consensus import STATIC_FRAMES, near_moving
 from stereo_sfm.tracking.flow.corners import detect_corners
 from stereo_sfm.tracking.flow.follower import Follower
 from stereo_sfm.tracking.flow.pyramids import StereoPyramids
@@ -35,21 +35,21 @@ class NewPoints:
         self._config, self._area, self._stereo, self._follower, self._shutter = config, area, stereo, follower, shutter
         self._next_point_id = 0
 
-    def add(self, tracks: Tracks, images: StereoPyramids, pose: F64, velocity: F64) -> Tracks:
-        """The tracks followed by new ones, up to max_features; pose (4, 4) and velocity (6,) of the image."""
+    def add(self, tracks: Tracks, images: StereoPyramids, pose: F64, velocity: F64, most: int) -> Tracks:
+        """The tracks followed by new ones, `most` in all; pose (4, 4) and velocity (6,) of the image."""
         config = self._config
-        missing = config.max_features - len(tracks)
+        missing = most - len(tracks)
         if missing <= 0:
             return tracks
         self._area.learn(images.left[1])
-        spacing = SPACING * math.sqrt(4.0 * self._area.mask.sum() / config.max_features)
+        spacing = SPACING * math.sqrt(4.0 * self._area.mask.sum() / most)
         corners = detect_corners(images.left[1], self._area.mask, tracks.uv, missing, spacing, config.corner_quality)
         match = self._stereo.match(images.left, images.right, corners)
         good = np.flatnonzero(match.good)
         rows, slots = self._follower.begin(images.left, match.uv_left[good])
         new, n = good[rows], len(rows)
         rho = np.maximum(match.rho[new], MIN_RHO)
-        moving = among_moving(match.uv_left[new], rho, tracks)
+        moving = near_moving(match.uv_left[new], rho, tracks)
         origin, direction = self._shutter.rays(pose, velocity, match.uv_left[new], match.bearing[new])
         tracks = tracks.append(
             Tracks(
@@ -61,7 +61,7 @@ class NewPoints:
                 rho=rho,
                 variance=match.variance[new],
                 age=np.zeros(n, np.int32),
-                misses=np.where(moving, PROOF, 0).astype(np.int32),
+                misses=np.where(moving, STATIC_FRAMES, 0).astype(np.int32),
                 moving=moving,
                 warp=np.tile(np.eye(2), (n, 1, 1)),
                 slot=slots,
@@ -69,5 +69,4 @@ class NewPoints:
             )
         )
         self._next_point_id += n
-        self._follower.keep_only(tracks)
         return tracks

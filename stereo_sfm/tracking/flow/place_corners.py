@@ -1,8 +1,8 @@
 """Corners for place recognition: ORB features of the image, tracked or not, with their stereo depth.
 
-Tracked points were corners in the image of their first observation. In the present image a detector selects other
-points, and other ones again when the place is revisited: one in eight tracked points is detected again. So place
-recognition has corners of its own. One spot may be a corner on several levels, for matching at other distances.
+Tracked points were detected in the image of their first observation; only one in eight of them is detected again when
+the place is revisited. Place recognition therefore has corners of its own, detected in every keyframe. A point may be a
+corner on several levels of the scale pyramid, for matching from other distances.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ class PlaceCorners:
     @staticmethod
     def wanted(config: Config, rig: Rig) -> PlaceCorners | None:
         """The detector of a run, None without place recognition or without depth."""
-        recognised = config.mapper.enabled or config.loop.enabled
-        return PlaceCorners(config, rig) if rig.stereo and recognised else None
+        needed = config.mapper.enabled or config.loop.enabled
+        return PlaceCorners(config, rig) if rig.stereo and needed else None
 
     def find(self, image: StereoImage) -> Corners:
         """The strongest corners of each level that both cameras see, about as many as configured."""
@@ -63,7 +63,7 @@ class PlaceCorners:
 def seen_by_both(stereo: StereoMatcher, left: Pyramid, right: Pyramid | F32, uv: F64, descriptors: U8) -> Corners:
     """The corners (N, 2) px of the left image, with descriptors (N, 32), that have a match in the second camera.
 
-    `left`: the image's pyramid. `right`: what `StereoMatcher.prepare` makes of the second camera.
+    `left`: the image's pyramid. `right`: the result of `StereoMatcher.prepare` for the second camera.
     """
     match = stereo.match_coarse(left, right, uv)
     good = match.good

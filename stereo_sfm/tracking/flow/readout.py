@@ -7,8 +7,9 @@ velocity has an effect that no calibration error has: it displaces the rows of a
 previous one by readout * (row / rows - 1/2) * J * (change of velocity), with J the derivatives of pixels by the pose.
 The readout is the coefficient of this displacement in a robust regression of the points' motion, together with the pose
 of the image and the displacement by the velocity itself. Its standard error is from the spread between images
-(cluster-robust; Liang and Zeger, Biometrika 73, 1986). With constant velocity the readout is not observable, and the
-standard error is large.
+(cluster-robust; Liang and Zeger, Biometrika 73, 1986), and from the velocities: differences of successive poses are
+smoother than the motion, so that at a low frame rate its changes are underestimated. With constant velocity the readout
+is not observable, and the standard error is large.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ from stereo_sfm.types import F64, I64, Frame, Keyframe, StereoImage
 MIN_PAIRS = 20  # of images
 MIN_POINTS = 30  # in both images of a pair
 DEVIATIONS = 4.0  # standard errors between measured and calibrated readout that make a difference significant
-DIFFERENT_S = 0.005  # smallest difference: velocities between images are accurate to a few percent only
+DIFFERENT_S = 0.005  # smallest difference
+SMOOTHING = 0.1  # share of the readout: velocities from poses 1/15 s apart, of a robot with vibration
 KNOWN_S = 0.005  # largest standard error with which a readout of 20 ms, a common one, differs from none
 CAUCHY = 2.0  # standard deviations
 ROUNDS = 4  # of reweighting
@@ -109,7 +111,8 @@ class ReadoutSearch:
         readout_s = float(product.sum()) / total
         rest = product - readout_s * square
         neighbours = float(rest[1:] @ rest[:-1])  # successive pairs share an image
-        sigma_s = math.sqrt(rest @ rest + 2 * max(neighbours, 0.0)) / total
+        spread_s = math.sqrt(rest @ rest + 2 * max(neighbours, 0.0)) / total
+        sigma_s = math.hypot(spread_s, SMOOTHING * readout_s)
         return Readout(self._rig.readout_s, readout_s, sigma_s, float(np.mean(self._error_px)))
 
     def _compare(self, first: _View, before: _View, now: _View, last: _View) -> None:

@@ -19,13 +19,18 @@ from stereo_sfm.types import F64, Corners, Keyframe, StereoImage
 REACH = 3.0  # sigmas of the prediction within which hypotheses are accepted
 NEAR = 0.4  # of the median distance of the newest keyframe's corners: nearer ones may be on an occluding object
 FADING = 0.9  # factor on the number of occupied cells from keyframe to keyframe
+UNCERTAIN_M = 0.2  # standard deviation of the predicted position from which other motions are tried
+MOTIONS_AT_ONCE = 3  # of them in an image, besides the straight one
 GRID = (8, 6)  # columns and rows of the image in which corners are counted
-SUFFICIENT_SHARE = 0.6  # of the visible points: with so many inliers the search ends
+SUFFICIENT_RECALL = 0.65  # with which the search ends
 SAME_PLACE = 0.1, 0.03  # metres, radians between two hypotheses of one place
 RIVAL = 0.6  # share of the inliers with which another place makes the result ambiguous
 MIN_INLIERS = 16
 MIN_INLIER_SHARE = 0.6  # of the points that are found
-MIN_RECALL = 0.22  # share of the visible points that are found and agree; the rest may still be covered
+# Recall that is needed, the rest may still be covered: for a pose that is certain, more for one with a standard
+# deviation, up to half a metre of it, and per standard deviation between the pose and the prediction.
+MIN_RECALL, RECALL_PER_METRE, RECALL_PER_SIGMA = 0.1, 0.7, 0.1
+MAX_SIGMA_M = 0.5
 FREE_SHARE = 0.5  # of the cells with corners in the newest keyframes, with which the view is free again
 
 
@@ -37,6 +42,7 @@ class Recovery:
         self._place_corners, self._places, self._size = place_corners, places, size
         self._near = 0.0  # metres: corners nearer to the camera than this are not counted
         self._cells = 0.0  # number of cells in which the newest keyframes had corners further away
+        self._next = 0  # of the other motions
         self.motion = TrustedMotion()
         self.free = True  # whether the last searched image has as many occupied cells as the newest keyframes
 
@@ -47,6 +53,7 @@ class Recovery:
 
     def remember(self, keyframe: Keyframe) -> None:
         """Add a keyframe for later searches."""
+        self._next = 0
         if self._places is not None:
             self._places.add(keyframe)
         if len(keyframe.corners):
@@ -59,20 +66,27 @@ class Recovery:
             return
         corners = self._place_corners.find_in(images.left, images.right)
         self.free = self._occupied(corners) >= FREE_SHARE * self._cells
+        if self.free and expected.sigma_m > UNCERTAIN_M:
+            straight, *others = self.motion.others(image.stamp_ns)
+            self._next = self._next % len(others)
+            yield from (straight, *others[self._next : self._next + MOTIONS_AT_ONCE])
+            self._next += MOTIONS_AT_ONCE
         if len(corners):
             candidates = self._places.find(_seen(image, corners), expected.odom_T_cam)
             yield from (pose for pose in candidates if expected.sigmas_off(pose) < REACH)
 
-    def possible(self, expected: Expectation, solution: PoseSolution, visible: int) -> bool:
+    def possible(self, expected: Expectation, solution: PoseSolution, recall: float) -> bool:
         """Whether a pose is within reach of the prediction and supported by the points.
 
-        Ceilings and shelves repeat: the share of inliers among the found points counts, and their share of the points
-        that are visible from there (`visible` of them).
+        Ceilings and shelves repeat: the share of inliers among the found points counts, and the `recall`, the ratio of
+        their number to that of the points that should be found from there.
         """
-        share, recall = solution.inliers / max(len(solution.error), 1), solution.inliers / max(visible, 1)
-        if solution.reason or solution.inliers < MIN_INLIERS or share < MIN_INLIER_SHARE or recall < MIN_RECALL:
+        share = solution.inliers / max(len(solution.error), 1)
+        if solution.inliers < MIN_INLIERS or share < MIN_INLIER_SHARE:
             return False
-        return expected.sigmas_off(solution.pose) < REACH
+        off = expected.sigmas_off(solution.pose)
+        needed = MIN_RECALL + RECALL_PER_METRE * min(expected.sigma_m, MAX_SIGMA_M) + RECALL_PER_SIGMA * off
+        return off < REACH and recall >= needed
 
     def best(self, found: list[tuple[Tracks, PoseSolution]]) -> tuple[Tracks, PoseSolution] | None:
         """The pose with the most inliers; None if another place has nearly as many."""

@@ -10,6 +10,7 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.order_statistics import percentile
 from stereo_sfm.tracking.depth_image import points_from_depth
 from stereo_sfm.tracking.flow import klt
 from stereo_sfm.tracking.flow.epipolar_gate import on_curve
@@ -168,7 +169,7 @@ class StereoMatcher:
             klt.WEIGHTS, klt.COORDINATES,
         )  # fmt: skip
         tested = np.isfinite(misfit)
-        typical = max(float(np.percentile(misfit[tested], TYPICAL)), MIN_MISFIT) if tested.any() else MIN_MISFIT
+        typical = max(percentile(misfit[tested], TYPICAL), MIN_MISFIT) if tested.any() else MIN_MISFIT
         with np.errstate(invalid="ignore"):
             good = np.linalg.norm(fitted - uv_right, axis=1) < self._config.max_window_disparity_px
         good &= (misfit < self._config.max_surface_misfit * typical) & (sigma_px < MAX_SIGMA_PX)

@@ -16,6 +16,7 @@ from stereo_sfm.types import I32, U8
 PATCH = 4  # half size of the search patch, in pixels of the search level
 SIZE = 2 * PATCH + 1
 AREA = SIZE * SIZE
+NODES = 4  # candidates from one that is projected to the next, between which the curve is all but straight
 
 
 def patch_sums(image: U8) -> I32:
@@ -30,6 +31,24 @@ def _cut(image, u, v, patch):
         row = image[v - PATCH + y, u - PATCH : u + PATCH + 1]
         for x in range(SIZE):
             patch[y * SIZE + x] = row[x]
+
+
+@njit
+def _curve(bx, by, bz, model, params, right_T_left, min_depth, where):
+    """Pixels (N, 2) of a left bearing in the right image, evenly in inverse distance from infinity to `min_depth`."""
+    t, last = right_T_left, len(where) - 1
+    x = t[0, 0] * bx + t[0, 1] * by + t[0, 2] * bz
+    y = t[1, 0] * bx + t[1, 1] * by + t[1, 2] * bz
+    z = t[2, 0] * bx + t[2, 1] * by + t[2, 2] * bz
+    before, u0, v0 = -1, 0.0, 0.0
+    for node in range(0, last + NODES, NODES):
+        c = min(node, last)
+        rho = c / (last * min_depth)
+        r = project_one(model, params, x + t[0, 3] * rho, y + t[1, 3] * rho, z + t[2, 3] * rho)
+        for k in range(before + 1, c + 1):
+            share = (k - before) / (c - before)
+            where[k, 0], where[k, 1] = u0 + share * (r[0] - u0), v0 + share * (r[1] - v0)
+        before, u0, v0 = c, r[0], r[1]
 
 
 @njit
@@ -71,19 +90,14 @@ def search_epipolar(
         total = np.int32(0)
         for m in range(AREA):
             total += template[m]
+        _curve(bx, by, bz, model_r, params_r, right_T_left, min_depth, where)
         best, best_index = 1e9, -1
         last_u, last_v = -10000, -10000
         for c in range(candidates):
-            rho = c / (candidates - 1.0) / min_depth
-            px = right_T_left[0, 0] * bx + right_T_left[0, 1] * by + right_T_left[0, 2] * bz + right_T_left[0, 3] * rho
-            py = right_T_left[1, 0] * bx + right_T_left[1, 1] * by + right_T_left[1, 2] * bz + right_T_left[1, 3] * rho
-            pz = right_T_left[2, 0] * bx + right_T_left[2, 1] * by + right_T_left[2, 2] * bz + right_T_left[2, 3] * rho
-            r = project_one(model_r, params_r, px, py, pz)
             cost[c] = 1e9
-            where[c, 0], where[c, 1] = r[0], r[1]
-            if math.isnan(r[0]):
+            if math.isnan(where[c, 0]):
                 continue
-            ru, rv = int(round(r[0] / scale)), int(round(r[1] / scale))
+            ru, rv = int(round(where[c, 0] / scale)), int(round(where[c, 1] / scale))
             if ru < PATCH or rv < PATCH or ru >= wr - PATCH or rv >= hr - PATCH:
                 continue
             if ru == last_u and rv == last_v:

@@ -15,11 +15,13 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64
 
 WINDOW_S = 1.0  # of motion whose mean is the velocity
-FADE_S = 4.0  # time constant with which the predicted velocity decreases
-ACCELERATION = 1.0  # m/s^2, standard deviation of a robot's acceleration
-MAX_SPEED_CHANGE = 1.0  # m/s
+FADE_S, TURN_FADE_S = 4.0, 1.0  # time constants with which the predicted speed and turn rate decrease
+ACCELERATION = 0.5  # m/s^2, standard deviation of a robot's acceleration
+MAX_SPEED_CHANGE = 0.5  # m/s
 TURN_ACCELERATION = 1.0  # rad/s^2, standard deviation
 MAX_TURN_RATE_CHANGE = 0.7  # rad/s
+MAX_TURN_RATE, TURN_STEP = 1.0, np.deg2rad(20.0)  # rad/s, radians: turns that are tried
+SLOWER = 0.5, 0.0  # shares of the last speed that are tried
 FIRST_SIGMAS = (0.01, 0.005)  # metres, radians: of the last trusted pose and its velocity
 
 
@@ -72,10 +74,30 @@ class TrustedMotion:
         return np.asarray(se3.log(se3.inverse(first) @ last)) / ((last_ns - first_ns) * 1e-9)
 
     def expect(self, stamp_ns: int) -> Expectation:
-        """The predicted pose at a time, with the last velocity decreasing exponentially."""
+        """The predicted pose at a time, with the last speed and turn rate decreasing exponentially."""
         last_ns, last = self._poses[-1]
         seconds = max((stamp_ns - last_ns) * 1e-9, 0.0)
-        moved = self.velocity() * FADE_S * -math.expm1(-seconds / FADE_S)
+        moved = self.velocity()
+        moved[:3] *= _faded(seconds, FADE_S)
+        moved[3:] *= _faded(seconds, TURN_FADE_S)
         metres = min(0.5 * ACCELERATION * seconds, MAX_SPEED_CHANGE) * seconds
         radians = min(0.5 * TURN_ACCELERATION * seconds, MAX_TURN_RATE_CHANGE) * seconds
         return Expectation(last @ se3.exp(moved), FIRST_SIGMAS[0] + metres, FIRST_SIGMAS[1] + radians)
+
+    def others(self, stamp_ns: int) -> list[F64]:
+        """Poses (4, 4) at a time after other motions that a robot is capable of, on arcs; the straight one first.
+
+        The camera is taken to be upright: a robot turns about its y axis.
+        """
+        last_ns, last = self._poses[-1]
+        seconds = max((stamp_ns - last_ns) * 1e-9, 0.0)
+        forward = self.velocity() * ([1.0] * 3 + [0.0] * 3) * _faded(seconds, FADE_S)
+        turns = np.arange(TURN_STEP, MAX_TURN_RATE * seconds + 0.5 * TURN_STEP, TURN_STEP)
+        arcs = [(1.0, side * turn) for turn in turns.tolist() for side in (1.0, -1.0)]
+        motions = [(1.0, 0.0), *((speed, 0.0) for speed in SLOWER), *arcs]
+        return [last @ se3.exp(speed * forward + [0, 0, 0, 0, turn, 0]) for speed, turn in motions]
+
+
+def _faded(seconds: float, constant: float) -> float:
+    """Seconds at the first velocity that move as far as these at one that decreases exponentially."""
+    return -constant * math.expm1(-seconds / constant)

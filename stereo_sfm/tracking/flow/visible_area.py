@@ -4,6 +4,8 @@ The image circle of a fisheye ends in a dark rim that moves with the camera: a w
 measure no motion. The rim is found from the images: beyond its angle from the axis no pixel is ever bright.
 """
 
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportMissingTypeArgument=false
+
 from __future__ import annotations
 
 import math
@@ -13,6 +15,7 @@ import numpy as np
 
 from stereo_sfm.calib.mask import half_size, uncovered
 from stereo_sfm.geometry.cameras import Camera
+from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.tracking.flow.corners import corner_mask
 from stereo_sfm.types import F64, U8, Bool
 
@@ -49,10 +52,7 @@ class VisibleArea:
         """Update the rim with an image, level 1 of its pyramid."""
         if self._degree[0, 0] < MIN_RIM_DEG:
             return
-        sparse, degree = half_image[::STEP, ::STEP], self._degree
-        lit = sparse > LIT * np.median(sparse[degree < CENTRE_DEG])
-        share = np.bincount(degree[lit], minlength=181) / np.maximum(np.bincount(degree.ravel(), minlength=181), 1)
-        self._lit = np.maximum(self._lit, share)
+        self._lit = np.maximum(self._lit, _bright_shares(half_image[::STEP, ::STEP], self._degree))
         rim = int(np.flatnonzero(self._lit >= LIT_SHARE).max(initial=0)) + 1
         if rim >= MIN_RIM_DEG and rim != self._rim_deg:
             self._rim_deg = rim
@@ -61,7 +61,35 @@ class VisibleArea:
 
     def inside(self, uv: F64) -> Bool:
         """Which pixels (N, 2) are in the image and inside the rim; False for NaN."""
-        inside = self._camera.inside(uv, 1.0)
-        u, v = np.rint(uv[inside] / 2).astype(np.int64).T
-        inside[inside] = self._shown[np.minimum(v, self._shown.shape[0] - 1), np.minimum(u, self._shown.shape[1] - 1)]
-        return inside
+        return _inside(uv, self._camera.width, self._camera.height, self._shown)
+
+
+@njit
+def _bright_shares(image, degree):
+    """(181,) share of bright pixels at each degree from the axis; image (H, W) uint8, degree (H, W)."""
+    centre, total, bright = np.zeros(256, np.int64), np.zeros(181), np.zeros(181)
+    for y in range(image.shape[0]):
+        for x in range(image.shape[1]):
+            total[degree[y, x]] += 1
+            if degree[y, x] < CENTRE_DEG:
+                centre[image[y, x]] += 1
+    limit, below, half = 0, 0, centre.sum() / 2
+    while limit < 255 and below + centre[limit] < half:
+        below += centre[limit]
+        limit += 1
+    for y in range(image.shape[0]):
+        for x in range(image.shape[1]):
+            if image[y, x] > LIT * limit:
+                bright[degree[y, x]] += 1
+    return bright / np.maximum(total, 1)
+
+
+@njit
+def _inside(uv, width, height, shown):
+    inside = np.zeros(len(uv), np.bool_)
+    for k in range(len(uv)):
+        u, v = uv[k, 0], uv[k, 1]
+        if u >= 1.0 and v >= 1.0 and u <= width - 2.0 and v <= height - 2.0:
+            x, y = int(np.rint(u / 2)), int(np.rint(v / 2))
+            inside[k] = shown[min(y, shown.shape[0] - 1), min(x, shown.shape[1] - 1)]
+    return inside

@@ -2,20 +2,36 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from stereo_sfm.calib.imu import Imu
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.preintegration import GRAVITY, Preintegrated, preintegrate
+from stereo_sfm.tracking.inertial.rest import STILL_NS
 from stereo_sfm.tracking.inertial.sample_buffer import Intervals, SampleBuffer
 from stereo_sfm.tracking.inertial.window import InertialState, InertialWindow
-from stereo_sfm.types import F64, ImuSamples
+from stereo_sfm.types import F64, I64, ImuSamples
 
 NODE_NS = 200_000_000  # between the poses of the window
-BRIDGED_S, BRIDGED_M = 10.0, 0.5  # longest time and largest standard deviation without images
 MAX_TURN_ERROR = 0.1  # rad/s between gyroscope and images, root mean square: more is another sensor's data
 JUDGED = 20  # intervals for the comparison with the images
 MAX_GRAVITY_ERROR = 1.0  # m/s^2 of its size
+STILL = np.array([0.005, 0.05])  # rad/s, m/s^2: spread of a sensor at rest ...
+STILL_NOISE = 3.0  # ... and its own noise so many times
+STILL_TURN = 0.03  # rad/s that the known bias may be off
+
+
+@dataclass(frozen=True, eq=False)
+class Turning:
+    """Angular velocity in the IMU's axes between successive times."""
+
+    edges_ns: I64  # (N + 1,)
+    rates: F64  # (N, 3) rad/s, without bias
+    left_R_imu: F64  # (3, 3)
+    bias_sigma: float  # rad/s
+    noise: float  # rad/s/sqrt(Hz)
 
 
 class InertialMotion:
@@ -103,13 +119,10 @@ class InertialMotion:
         self._gyro_bias = self._window.gyro_bias()[0] if self._state is None else self._state.gyro_bias
         self._integrated.clear()
 
-    def bridges(self, stamp_ns: int) -> bool:
-        """Whether the motion since the last pose is known well enough to go on by it."""
-        seconds = (stamp_ns - self._last_ns) * 1e-9
-        if self._state is None or self.left_out or seconds > BRIDGED_S:
-            return False
-        covariance = self.covariance(stamp_ns)
-        return covariance is not None and float(np.sqrt(np.trace(covariance[:3, :3]) / 3)) < BRIDGED_M
+    def bridge(self, stamp_ns: int) -> tuple[F64, F64] | None:
+        """Pose (4, 4) odom_T_cam at a time after the last pose, and its covariance (6, 6); None if it is unknown."""
+        covariance = None if self.left_out else self.covariance(stamp_ns)
+        return None if covariance is None else (self.predict(stamp_ns, np.eye(4)), covariance)
 
     def covariance(self, stamp_ns: int) -> F64 | None:
         """(6, 6) of the predicted pose @ exp(xi), xi = (rho, phi) in camera axes; None where samples are missing."""
@@ -126,6 +139,25 @@ class InertialMotion:
         out = np.zeros((6, 6))
         out[:3, :3], out[3:, 3:] = cam_R_odom @ position @ cam_R_odom.T, turn * np.eye(3)
         return out
+
+    def still(self, stamp_ns: int) -> bool | None:
+        """Whether the sensor was at rest for the last half second; None where samples are missing, or it is wrong."""
+        found = None if self.left_out else self._buffer.between(stamp_ns - STILL_NS, stamp_ns)
+        if found is None:
+            return None
+        noise = np.sqrt(self._imu.rate_hz) * np.array([self._imu.gyro_noise, self._imu.accel_noise])
+        limits = STILL_NOISE * noise + STILL
+        spreads = found.gyro.std(axis=0).max(), found.accel.std(axis=0).max()
+        turned = float(np.abs(found.gyro.mean(axis=0) - self._gyro_bias).max())
+        return bool(spreads[0] < limits[0] and spreads[1] < limits[1] and turned < STILL_TURN)
+
+    def turning(self, stamp_ns: int) -> Turning | None:
+        """The gyroscope since the last pose; None while its bias is unknown, or where samples are missing."""
+        found = None if self._state is None or self.left_out else self._buffer.between(self._last_ns, stamp_ns)
+        if found is None or self._state is None:
+            return None
+        rates, left_R_imu = found.gyro - self._gyro_bias, self._imu.left_T_imu[:3, :3]
+        return Turning(found.edges_ns, rates, left_R_imu, self._state.gyro_bias_sigma, self._imu.gyro_noise)
 
     def _motion(self, begin_ns: int, end_ns: int) -> Preintegrated | None:
         """From one time to another with the biases of today; each is asked for several times a frame."""

@@ -20,7 +20,7 @@ from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.geometry.preintegration import GRAVITY, Preintegrated
 from stereo_sfm.types import F64
 
-LONGEST_S = 10.0  # of the window
+MAX_SECONDS = 10.0  # of the window
 MIN_S = 1.5  # of motion before velocity and gravity are used
 POSITION_SIGMA_M = 0.0015  # of one pose against the next
 ROTATION_SIGMA = 5e-4  # rad, the same
@@ -64,7 +64,7 @@ class InertialWindow:
         self._links.append(_link(motion, self._newest, odom_T_imu))
         self._turns.append(_turn(motion, self._newest, odom_T_imu))
         self._newest = odom_T_imu
-        while self.seconds > LONGEST_S:
+        while self.seconds > MAX_SECONDS:
             del self._links[0], self._turns[0]
 
     def gyro_bias(self) -> tuple[F64, float]:

@@ -3,23 +3,24 @@ const $ = (id) => document.getElementById(id);
 const show = (id, text) => { if ($(id).textContent !== text) $(id).textContent = text; };
 const number = (value, digits = 1) => value === null || value === undefined ? "–" : Number(value).toFixed(digits);
 const STATES = { running: "good", starting: "warn", lost: "bad", camera_gone: "bad", disk_full: "warn", stopping: "warn" };
-let live = null, map = { version: 0, points: [], path: [] }, last = null, heard = 0, asked = 0;
+let plan = null, planVersion = 0;
+let live = null, map = { version: 0, points: [], path: [] }, last = null, receivedAt = 0, commands = 0;
 
-async function ask(path, options) {
-  const answer = await fetch(path, options);
-  if (answer.status === 401) login();
-  return answer;
+async function request(path, options) {
+  const response = await fetch(path, options);
+  if (response.status === 401) login();
+  return response;
 }
 
 async function command(name, values = {}) {
-  const mine = ++asked, say = (text) => mine === asked && show("answer", text);  // the newest command's answer stays
-  say("…");
+  const mine = ++commands, report = (text) => mine === commands && show("reply", text);  // of the newest command
+  report("…");
   const headers = { "Content-Type": "application/json", "X-Stereo-Sfm": "1" };
   try {
-    const answer = await ask(`api/command/${name}`, { method: "POST", headers, body: JSON.stringify(values) });
-    const reply = await answer.json();
-    say(reply.text || (reply.ok ? "done" : "refused"));
-  } catch { say("the service does not answer"); }
+    const response = await request(`api/command/${name}`, { method: "POST", headers, body: JSON.stringify(values) });
+    const reply = await response.json();
+    report(reply.text || (reply.ok ? "done" : "refused"));
+  } catch { report("the service does not respond"); }
   refresh();
 }
 
@@ -40,11 +41,11 @@ function button(text, action) {
 }
 
 function showState(state) {
-  const s = state.status, alive = Date.now() - heard < 3000;
-  const name = !alive ? "no answer" : s ? s.state : "waiting";
+  const s = state.status, alive = Date.now() - receivedAt < 3000;
+  const name = !alive ? "no connection" : s ? s.state : "waiting";
   show("state", name.replace("_", " "));
   $("state").className = `badge ${alive && s ? STATES[s.state] || "warn" : "bad"}`;
-  show("reason", alive ? (s ? s.reason : "") : "The service does not answer.");
+  show("reason", alive ? (s ? s.reason : "") : "The service does not respond.");
   show("remedy", alive ? (s ? s.remedy : "") : "Is it running? See the log of its unit.");
   show("source", state.source);
   const recording = s && s.recording !== "off";
@@ -90,17 +91,25 @@ function showEvents(state) {
 function drawPlan(state) {
   const canvas = $("plan"), g = canvas.getContext("2d"), p = state.pose;
   g.clearRect(0, 0, canvas.width, canvas.height);
+  // the plan has the frame of the saved map, which is that of the poses once they are localized in it
+  const s = state.status, extent = state.plan && s && p && (p.localized || s.map_is_new) ? state.plan : null;
+  $("plan").dataset.plan = extent ? "shown" : "";
   if (!map.points.length && !map.path.length && !p) return;
   const range = (k) => {  // without the outermost hundredth of the points, but with the whole path
     const sorted = map.points.map((v) => v[k]).sort((a, b) => a - b), cut = Math.floor(sorted.length / 100);
     const inner = sorted.length ? [sorted[cut], sorted[sorted.length - 1 - cut]] : [];
-    const values = [...inner, ...map.path.map((v) => v[k]), ...(p ? [k ? p.y : p.x] : [])];
+    const walls = !extent ? [] : k ? [extent.y - extent.along_y, extent.y] : [extent.x - extent.along_x, extent.x];
+    const values = [...inner, ...walls, ...map.path.map((v) => v[k]), ...(p ? [k ? p.y : p.x] : [])];
     return [Math.min(...values), Math.max(...values)];
   };
   const [x0, x1] = range(0), [y0, y1] = range(1), margin = 24;
   const scale = Math.min((canvas.width - 2 * margin) / Math.max(y1 - y0, 2), (canvas.height - 2 * margin) / Math.max(x1 - x0, 2));
   // x forward is up, y left is left
   const at = (x, y) => [canvas.width / 2 - (y - (y0 + y1) / 2) * scale, canvas.height / 2 - (x - (x0 + x1) / 2) * scale];
+  if (extent && plan) {
+    g.imageSmoothingEnabled = false;
+    g.drawImage(plan, ...at(extent.x, extent.y), extent.along_y * scale, extent.along_x * scale);
+  }
   for (const [x, y, z] of map.points) {
     g.fillStyle = `hsl(${Math.max(0, Math.min(240, 200 - 80 * z))} 60% 50%)`;
     g.fillRect(...at(x, y), 2, 2);
@@ -119,30 +128,38 @@ function drawPlan(state) {
   g.fillText(`${metres} m`, 12, canvas.height - 18);
 }
 
+function refreshPlan(extent) {
+  if (!extent || extent.version === planVersion) return;
+  planVersion = extent.version;
+  const loaded = new Image();
+  loaded.onload = () => { plan = loaded; };
+  loaded.src = `api/floor_plan.png?version=${extent.version}`;
+}
+
 async function refreshMap(version) {
-  if (version !== map.version) map = await (await ask("api/map")).json();
+  if (version !== map.version) map = await (await request("api/map")).json();
 }
 
 async function refresh() {
   try {
-    const rows = await (await ask("api/recordings")).json(), table = document.createElement("table");
+    const rows = await (await request("api/recordings")).json(), table = document.createElement("table");
     table.id = "recordings";
     for (const r of Array.isArray(rows) ? rows : []) {
       const open = button("files", () => listFiles(r.id)), actions = document.createElement("span");
       actions.append(open, button("delete", () => confirm(`Delete ${r.id}?`) && command("delete_recording", { id: r.id })));
       const length = `${Math.floor(r.seconds / 60)}:${String(Math.floor(r.seconds % 60)).padStart(2, "0")} min`;
       const lean = r.segments - r.with_images;
-      const verdict = lean ? `${lean} of ${r.segments} segments without images` : "complete";
-      row(table, [`${r.id}${r.marked ? " ★" : ""}`, `${length}, ${number(r.bytes / 1e6, 0)} MB, ${r.mode}`, verdict, actions]);
+      const size = `${length}, ${number(r.bytes / 1e6, 0)} MB, ${r.mode}${lean ? `, ${lean} of ${r.segments} segments without images` : ""}`;
+      row(table, [`${r.id}${r.marked ? " ★" : ""}`, size, r.verdict, actions]);
     }
     if (!table.rows.length) row(table, ["none"]);
     $("recordings").replaceWith(table);
-    if (!$("settings").contains(document.activeElement)) showSettings(await (await ask("api/settings")).json());
-  } catch { /* the next state says that the service does not answer */ }
+    if (!$("settings").contains(document.activeElement)) showSettings(await (await request("api/settings")).json());
+  } catch { /* the next state shows that the service does not respond */ }
 }
 
 async function listFiles(id) {
-  const place = `api/recordings/${encodeURIComponent(id)}`, files = await (await ask(place)).json();
+  const place = `api/recordings/${encodeURIComponent(id)}`, files = await (await request(place)).json();
   $("files").replaceChildren(...files.map((file, i) => {
     const li = document.createElement("li"), a = document.createElement("a");
     [a.href, a.textContent, a.download] = [`${place}/${i}`, `${file.name} (${number(file.bytes / 1e6)} MB)`, ""];
@@ -174,9 +191,9 @@ function login() {
 $("login").onsubmit = async (event) => {
   event.preventDefault();
   const headers = { "Content-Type": "application/json" };
-  const answer = await fetch("login", { method: "POST", headers, body: JSON.stringify({ token: $("token").value }) });
-  show("login-answer", answer.ok ? "" : (await answer.json()).text);
-  if (!answer.ok) return;
+  const response = await fetch("login", { method: "POST", headers, body: JSON.stringify({ token: $("token").value }) });
+  show("login-reply", response.ok ? "" : (await response.json()).text);
+  if (!response.ok) return;
   $("token").value = ""; $("login").hidden = true; $("all").hidden = false;
   start();
 };
@@ -184,7 +201,7 @@ $("login").onsubmit = async (event) => {
 function nextImage() {
   const img = $("image");
   if (document.hidden || !live) return;
-  fetch("api/image.jpg").then((answer) => answer.status === 200 ? answer.blob() : null).then((blob) => {
+  fetch("api/image.jpg").then((response) => response.status === 200 ? response.blob() : null).then((blob) => {
     if (!blob) return;
     const reader = new FileReader();
     reader.onload = () => { img.src = reader.result; };
@@ -193,11 +210,11 @@ function nextImage() {
 }
 
 async function start() {
-  if (live || (await ask("api/map")).status !== 200) return;
+  if (live || (await request("api/map")).status !== 200) return;
   live = new EventSource("api/live");
   live.onmessage = (event) => {
-    last = JSON.parse(event.data); heard = Date.now();
-    refreshMap(last.map_version);
+    last = JSON.parse(event.data); receivedAt = Date.now();
+    refreshMap(last.map_version); refreshPlan(last.plan);
     showState(last); showHealth(last); showEvents(last); drawPlan(last);
   };
   refresh();

@@ -37,7 +37,7 @@ def pnp_ransac(
     plane = focal * bearings[usable, :2] / bearings[usable, 2:]
     matrix = np.diag([focal, focal, 1.0])
     cv2.setRNGSeed(int(rng.integers(1 << 31)))
-    answer: Any = cv2.solvePnPRansac(
+    result: Any = cv2.solvePnPRansac(
         np.ascontiguousarray(points[usable]),
         plane,
         matrix,
@@ -47,7 +47,7 @@ def pnp_ransac(
         confidence=0.9999,
         flags=cv2.SOLVEPNP_AP3P,
     )
-    found, rvec, tvec, inliers = answer
+    found, rvec, tvec, inliers = result
     if not found or inliers is None or not (np.isfinite(rvec).all() and np.isfinite(tvec).all()):
         raise Degenerate("no_consensus", "no pose agrees with the points")
     cam_T_ref = se3.from_rotation_translation(se3.so3_exp(rvec.ravel()), tvec.ravel())

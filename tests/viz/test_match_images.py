@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from stereo_sfm.types import Frame, Keyframe, Observations, StereoImage, TrackState
-from stereo_sfm.viz.match_pictures import MatchPictures, common_rows, draw_matches
+from stereo_sfm.viz.match_images import MatchImages, common_rows, draw_matches
 
 GREY = np.full((60, 80), 100, np.uint8)
 
@@ -42,7 +42,7 @@ def test_lines_join_the_matches() -> None:
 
 
 def test_an_image_for_every_second_frame_after_a_keyframe(tmp_path: Path) -> None:
-    sink = MatchPictures(2, tmp_path / "matches")
+    sink = MatchImages(2, tmp_path / "matches")
     for k in range(5):
         sink.put(StereoImage(k, 0, GREY))
         sink.put(frame(k, [1, 2, 3]))

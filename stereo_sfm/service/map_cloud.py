@@ -15,7 +15,7 @@ from stereo_sfm.types import F32, F64, I64, Keyframe, MapUpdate
 EVERY_S = 2.0  # shortest interval between two clouds
 
 
-class MapFollower:
+class MapCloudBuilder:
     """Takes a session's map updates and sends the map, at most every `EVERY_S`; forgets what the mapper removed."""
 
     def __init__(self, session: int, send: Callable[[MapCloud], None]) -> None:
@@ -25,6 +25,7 @@ class MapFollower:
         self._points: F32 = np.zeros((0, 3), np.float32)
         self._localized_from: int | None = None
         self._queue: queue.SimpleQueue[MapUpdate | Keyframe | None] = queue.SimpleQueue()
+        self._closing = False
         self._thread = threading.Thread(target=self._work, name="map follower", daemon=True)
         self._thread.start()
 
@@ -37,13 +38,14 @@ class MapFollower:
         self._localized_from = version
 
     def close(self) -> None:
-        """End the thread."""
+        """End the thread, without the updates that wait: the next session begins at once."""
+        self._closing = True
         self._queue.put(None)
         self._thread.join()
 
     def _work(self) -> None:
         next_s, stamp_ns = 0.0, 0
-        while (message := self._queue.get()) is not None:
+        while (message := self._queue.get()) is not None and not self._closing:
             if isinstance(message, Keyframe):
                 stamp_ns = message.stamp_ns
                 continue

@@ -1,7 +1,7 @@
 """Records a run into segments without ever blocking it: a disk that is slow or full costs images, not poses.
 
 Two threads write the two files of a segment. Images wait in a short queue and are dropped when it is full, poses in a
-long one. When the disk is full, images stop first (`min_free`); poses go on in what is left, then in a reserve.
+long one. When the disk is full, images stop first (`min_free`); poses continue in what is left, then in a reserve.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from stereo_sfm.log.run_log import RunLog
 from stereo_sfm.log.writer import LogWriter
 from stereo_sfm.recording.quota import Disk, Quota, forget_images, make_room, used_bytes
 from stereo_sfm.recording.segment_writers import ImageWriter, PoseWriter, Thumbnail
-from stereo_sfm.recording.segments import Segment, new_recording
-from stereo_sfm.types import Dropped, Frame, ImuSamples, Observations, StereoImage
+from stereo_sfm.recording.segments import ABOUT, Segment, new_recording
+from stereo_sfm.types import Dropped, Frame, ImuSamples, Observations, StereoImage, WheelSamples
 
-EVERY_S = 2.0  # between two looks at the disk
+EVERY_S = 2.0  # between two checks of the disk
 SLOW_S = 5.0  # after an image was dropped the disk counts as slow
 RESERVE, RESERVE_BYTES = ".reserve", 32 << 20
 THUMBNAIL_S = 2.0
@@ -51,7 +51,7 @@ class Policy:
 
 @dataclass(frozen=True)
 class RecorderState:
-    """How a recording is doing."""
+    """State of a recording."""
 
     recording: str  # its folder's name
     segment: str
@@ -59,6 +59,7 @@ class RecorderState:
     images_dropped: int
     problem: str  # "" or one line
     full: bool = False  # the problem is a full disk
+    seconds: int = 0  # from the first to the newest image
 
 
 class SegmentRecorder:
@@ -91,21 +92,21 @@ class SegmentRecorder:
         self.images_dropped, self._dropped_s = 0, -SLOW_S
         self._used = used_bytes(policy.root)
         self._no_room, self._only_marked = "", ""
-        self._over, self._looking = threading.Event(), threading.Lock()
+        self._over, self._checking = threading.Event(), threading.Lock()
         begin = functools.partial(_begin_images, rig, source, policy.image_format, opening)
-        self._images = ImageWriter(policy.image_format, begin, self._look_now)
+        self._images = ImageWriter(policy.image_format, begin, self._check_now)
         self._poses = PoseWriter(
             functools.partial(_run_log, rig=rig, config=config, source=source, opening=opening), self._make_room_now
         )
         self._keep_reserve()
-        self._keeper = threading.Thread(target=self._keep_house, name="housekeeping", daemon=True)
+        self._keeper = threading.Thread(target=self._keep_checking, name="disk check", daemon=True)
         self._keeper.start()
 
-    # -- what comes in -----------------------------------------------------------------------------------------------
+    # -- messages -----------------------------------------------------------------------------------------------
 
     def image(self, image: StereoImage) -> bool:
         """An image with its pixels; False if it was dropped."""
-        self._turn_page(image.stamp_ns)
+        self._next_segment_if_due(image.stamp_ns)
         if image.stamp_ns >= self._next_thumbnail_ns:
             self._next_thumbnail_ns = image.stamp_ns + int(THUMBNAIL_S * 1e9)
             self._poses.put(Thumbnail(image))
@@ -124,7 +125,7 @@ class SegmentRecorder:
         self._poses.put(message)
 
     def mark(self, text: str) -> None:
-        """Keep what lies around now."""
+        """Keep the recording around this moment."""
         now_ns = self._newest_ns
         self._marked_until_ns = now_ns + int(self._policy.mark_after_s * 1e9)
         self._mark_text = text
@@ -141,18 +142,19 @@ class SegmentRecorder:
         self._policy = replace(policy, root=self._policy.root, mode=self._policy.mode)
 
     def state(self) -> RecorderState:
-        """How it is doing."""
+        """State of the recording."""
         slow = time.monotonic() - self._dropped_s < SLOW_S
         problems = [self._poses.problem, self._no_room or self._images.problem, self._only_marked]
-        problems.append("the disk is slow: images are left out" if slow else "")
+        problems.append("the disk is slow: images are dropped" if slow else "")
         problem = next(filter(None, problems), "")
         return RecorderState(
             self.folder.name, "" if self.segment is None else self.segment.name, self._used, self.images_dropped,
             problem, bool(self._poses.problem or self._no_room or self._images.problem),
+            max(round((self._newest_ns - max(self._began_ns, 0)) / 1e9), 0),
         )  # fmt: skip
 
     def close(self, patience_s: float = 2.0) -> None:
-        """Write what waits, as far as the disk takes it in this time, and close the files."""
+        """Write what waits, as far as the disk allows in this time, and close the files."""
         self._over.set()
         until = time.monotonic() + patience_s
         for writer in (self._poses, self._images):
@@ -162,10 +164,12 @@ class SegmentRecorder:
 
     # -- segments ----------------------------------------------------------------------------------------------------
 
-    def _turn_page(self, stamp_ns: int) -> None:
+    def _next_segment_if_due(self, stamp_ns: int) -> None:
         """Begin a new segment when the time or the size of one is reached."""
         if self._began_ns < 0:
             self._began_ns = stamp_ns
+            with contextlib.suppress(OSError):
+                (self.folder / ABOUT).touch()  # the beginning by the clock of the disk, for `listed`
         p, written = self._policy, self._images.bytes_written + self._poses.bytes_written
         full = stamp_ns - self._segment_ns >= p.segment_s * 1e9 or written >= p.segment_bytes
         self._newest_ns = stamp_ns
@@ -189,24 +193,29 @@ class SegmentRecorder:
         self._poses.put(Dropped(image.frame_id, image.stamp_ns, "log", why))
 
     def _with_missed(self, image: StereoImage) -> StereoImage:
-        """An image that says how many were dropped before it, with their inertial samples."""
+        """An image with the number of images dropped before it, and their inertial and wheel samples."""
         if not self._missed:
             return image
         samples = [i.imu for i in (*self._missed, image) if i.imu is not None]
-        dropped = image.dropped_before + sum(1 + i.dropped_before for i in self._missed)
-        return replace(image, dropped_before=dropped, imu=ImuSamples.joined(samples) if samples else None)
+        wheel = [i.wheel for i in (*self._missed, image) if i.wheel is not None]
+        return replace(
+            image,
+            dropped_before=image.dropped_before + sum(1 + i.dropped_before for i in self._missed),
+            imu=ImuSamples.joined(samples) if samples else None,
+            wheel=WheelSamples.joined(wheel) if wheel else None,
+        )
 
     # -- the disk ----------------------------------------------------------------------------------------------------
 
-    def _keep_house(self) -> None:
+    def _keep_checking(self) -> None:
         while not self._over.wait(EVERY_S):
-            self._look_now()
+            self._check_now()
 
-    def _look_now(self) -> None:
-        with self._looking, contextlib.suppress(OSError):  # the disk is gone: the writers say so
-            self._look_at_disk()
+    def _check_now(self) -> None:
+        with self._checking, contextlib.suppress(OSError):  # the disk has failed: the writers report it
+            self._check_disk()
 
-    def _look_at_disk(self) -> None:
+    def _check_disk(self) -> None:
         p, current = self._policy, self.segment
         if p.mode == "black_box":
             forget_images(p.root, p.black_box_s, p.segment_s, current)

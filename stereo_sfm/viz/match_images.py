@@ -13,7 +13,7 @@ import numpy as np
 from stereo_sfm.types import F64, I64, U8, Bool, Frame, Keyframe, StereoImage
 
 _UNMATCHED = (160, 160, 160)  # BGR
-_MAX_LINES = 150  # more than this cover the picture: every k-th is drawn
+_MAX_LINES = 150  # more than this cover the canvas: every k-th is drawn
 
 
 def draw_matches(left: U8, right: U8, uv_left: F64, uv_right: F64, others: F64, text: str) -> U8:
@@ -32,7 +32,7 @@ def draw_matches(left: U8, right: U8, uv_left: F64, uv_right: F64, others: F64, 
         cv2.circle(canvas, (u + width, v), 2, _UNMATCHED, 1, cv2.LINE_AA)
     step = max(1, -(-len(uv_left) // _MAX_LINES))
     a, b = np.rint(uv_left[::step]).astype(int), np.rint(uv_right[::step]).astype(int)
-    # Colour by height in the picture, so that neighbouring lines can be told apart.
+    # Colour by height in the canvas, so that neighbouring lines can be told apart.
     shade = np.clip(255 * a[:, 1:2] / max(left.shape[0], 1), 0, 255).astype(np.uint8)
     colours = cv2.applyColorMap(shade, cv2.COLORMAP_TURBO).reshape(-1, 3)
     for (u0, v0), (u1, v1), colour in zip(a.tolist(), b.tolist(), colours.tolist(), strict=True):
@@ -50,12 +50,12 @@ def common_rows(first: I64, second: I64) -> tuple[I64, I64]:
     return rows_first.astype(np.int64), rows_second.astype(np.int64)
 
 
-class MatchPictures:
+class MatchImages:
     """Writes `NNNNNN.png` for every k-th frame."""
 
     def __init__(self, every: int = 1, folder: Path | None = None) -> None:
         """Args:
-        every: frames between pictures. folder: made when the first picture is written; may be set later.
+        every: frames between images. folder: created when the first image is written; may be set later.
         """
         self.folder = folder
         self._every = max(every, 1)
@@ -86,7 +86,7 @@ class MatchPictures:
         text = (
             f"keyframe {keyframe.kf_id} (frame {keyframe.frame_id}) | frame {frame.frame_id}: {len(a)} points, {state}"
         )
-        picture = draw_matches(
+        canvas = draw_matches(
             self._images[keyframe.frame_id],
             self._images[frame.frame_id],
             keyframe.uv_left[a],
@@ -96,4 +96,4 @@ class MatchPictures:
         )
         folder = self.folder or Path("matches")
         folder.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(folder / f"{frame.frame_id:06d}.png"), picture)
+        cv2.imwrite(str(folder / f"{frame.frame_id:06d}.png"), canvas)

@@ -1,0 +1,83 @@
+"""Robust least squares with standard deviations, and the time shift between two signals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from stereo_sfm.types import F64
+
+HUBER = 2.0  # standard deviations beyond which a residual counts linearly
+ROUNDS = 4  # each with the spread that the last one left
+BLOCKS = 8  # of successive residuals: errors of neighbours are alike, those of blocks are not
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A solution and its standard deviation."""
+
+    value: F64  # (K,)
+    sigma: F64  # (K,)
+
+
+def robust_fit(residual: Callable[[F64], F64], start: F64, scales: F64) -> Fit:
+    """Minimise residuals (N, D) with a Huber loss, whose width follows from their spread.
+
+    The standard deviations are those of the solutions without one block of residuals each (a jackknife over blocks),
+    from one linear step: unlike those of independent residuals they hold for errors that last.
+
+    Args:
+        residual: of parameters (K,), rows in the order of time. start: (K,). scales: (K,) typical changes.
+    """
+    from scipy.optimize import least_squares
+
+    x = start
+    for _ in range(ROUNDS):
+        rows = residual(x)
+        spread = 1.4826 * np.median(np.abs(rows), axis=0) + 1e-12  # (D,)
+        found = least_squares(
+            lambda p, s=spread: (residual(p) / s).ravel(),
+            x,
+            x_scale=scales,
+            diff_step=1e-3,
+            loss="huber",
+            f_scale=HUBER,
+        )
+        x = np.asarray(found.x, np.float64)
+    return Fit(x, _jackknife(residual, x, scales))
+
+
+def _jackknife(residual: Callable[[F64], F64], x: F64, scales: F64) -> F64:
+    """(K,) standard deviations."""
+    rows, step = residual(x), 1e-3
+    ends = [(residual(x + h), residual(x - h)) for h in step * np.diag(scales)]
+    jacobian = np.stack([(high - low) / (2 * step) for high, low in ends], axis=-1)  # by parameters over their scales
+    spread = 1.4826 * np.median(np.abs(rows), axis=0) + 1e-12
+    weight = 1.0 / np.maximum(np.abs(rows / spread) / HUBER, 1.0) / spread**2
+    blocks = np.array_split(np.arange(len(rows)), BLOCKS)
+    normals = np.array([np.einsum("nd,ndi,ndj->ij", weight[b], jacobian[b], jacobian[b]) for b in blocks])
+    rhs = np.array([np.einsum("nd,ndi,nd->i", weight[b], jacobian[b], rows[b]) for b in blocks])
+    without = normals.sum(axis=0) - normals + 1e-9 * np.eye(len(x))
+    off = -np.linalg.solve(without, (rhs.sum(axis=0) - rhs)[..., None])[..., 0]
+    spread2 = ((off - off.mean(axis=0)) ** 2).sum(axis=0)
+    return np.asarray(np.sqrt((BLOCKS - 1) / BLOCKS * spread2) * scales, np.float64)
+
+
+def shift_between(
+    first: Callable[[F64], F64], second: F64, seconds: F64, reach_s: float, step_s: float = 0.005
+) -> float:
+    """Seconds by which a signal must be read later to resemble another one most (largest correlation).
+
+    Args:
+        first: the signal at times (N,). second: (N,) the other one at times `seconds` (N,). reach_s: largest shift.
+    """
+    shifts = np.arange(-reach_s, reach_s + step_s / 2, step_s)
+    other = second - second.mean()
+    return float(shifts[int(np.argmax([_correlation(first(seconds + s), other) for s in shifts]))])
+
+
+def _correlation(signal: F64, other: F64) -> float:
+    moved = signal - signal.mean()
+    return float(moved @ other / (np.linalg.norm(moved) * np.linalg.norm(other) + 1e-12))

@@ -1,0 +1,153 @@
+"""The processes of a run and main's pipes to them: started one by one, ended together."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import resource
+import signal
+import time
+from collections.abc import Callable, Set
+from multiprocessing.connection import Connection
+from multiprocessing.context import ForkServerContext, SpawnContext
+from multiprocessing.process import BaseProcess
+from typing import Any
+
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.pipeline import child
+from stereo_sfm.pipeline.interrupts import ignored_by_children
+from stereo_sfm.pipeline.threads import thread_environment
+
+EXIT_S = 1.0  # time for the processes to exit after their last messages
+MIN_OPEN_FILES = 128  # per process
+
+
+class StageProcesses:
+    """Processes by stage, with a pipe for the messages of each to main and one for main's requests.
+
+    Attributes:
+        processes: stage -> its process.
+        reports: where the messages of each stage arrive -> stage; without those that have ended.
+    """
+
+    def __init__(self, threads: int) -> None:
+        """Args: threads, that numeric libraries may use in each process."""
+        self._context, self._threads = _context(), threads
+        self.processes: dict[str, BaseProcess] = {}
+        self.reports: dict[Connection, str] = {}
+        self._controls: dict[str, Connection] = {}
+
+    def pipe(self) -> tuple[Connection, Connection]:
+        """(receiving end, sending end)."""
+        return self._context.Pipe(duplex=False)
+
+    def spawn(self, stage: str, body: Callable[..., None], *arguments: Any) -> None:
+        """Start a stage with `body(to_main, control, *arguments)`."""
+        report, to_main = self.pipe()
+        control, self._controls[stage] = self.pipe()
+        process = self._context.Process(
+            target=child.guarded, args=(stage, body, to_main, control, *arguments), name=f"stereo-sfm {stage}",
+            daemon=True,
+        )  # fmt: skip
+        with ignored_by_children(), thread_environment(self._threads):
+            process.start()
+        to_main.close()
+        control.close()
+        self.processes[stage] = process
+        self.reports[report] = stage
+
+    @property
+    def pids(self) -> dict[str, int]:
+        """Process ids by stage."""
+        return {stage: p.pid for stage, p in self.processes.items() if p.pid is not None}
+
+    @property
+    def waiting(self) -> set[str]:
+        """The stages that have not ended."""
+        return set(self.reports.values())
+
+    def report_of(self, stage: str) -> Connection:
+        """Where the messages of a stage arrive."""
+        return next(c for c, s in self.reports.items() if s == stage)
+
+    def request(self, stage: str, message: object) -> None:
+        """Send a stage a request; nothing where it has ended: its report gives the reason."""
+        with contextlib.suppress(OSError, KeyError):
+            self._controls[stage].send(message)
+
+    def request_all(self, message: Callable[[str], object]) -> None:
+        """Send every stage a request of its own."""
+        for stage in self._controls:
+            self.request(stage, message(stage))
+
+    def forget(self, stage: str) -> None:
+        """Receive no more messages of a stage."""
+        for connection in [c for c, s in self.reports.items() if s == stage]:
+            del self.reports[connection]
+            connection.close()
+
+    def resume(self, stage: str) -> None:
+        """Continue a process that a signal has stopped: it can neither finish nor close its file."""
+        pid = self.processes[stage].pid
+        with contextlib.suppress(OSError, AttributeError):
+            if pid is not None:
+                os.kill(pid, signal.SIGCONT)
+
+    def how_it_died(self, stage: str) -> str:
+        """What ended a process, for a message."""
+        code = self.exit_code(stage)
+        if code is not None and code < 0:
+            return f"was killed by {signal.Signals(-code).name}"
+        return f"ended with exit code {code}"
+
+    def exit_code(self, stage: str) -> int | None:
+        """The exit code of a process whose pipe has closed."""
+        process = self.processes[stage]
+        process.join(0.5)
+        return process.exitcode
+
+    def kill(self, but: Set[str] = frozenset()) -> None:
+        """Kill the processes that run, without waiting for them."""
+        for stage, process in self.processes.items():
+            if stage not in but and process.is_alive():
+                process.kill()
+
+    def close(self, ended: Set[str]) -> None:
+        """End every process and close the pipes. Args: ended, stages that are about to exit by themselves."""
+        try:
+            until = time.monotonic() + EXIT_S
+            for stage in ended & self.processes.keys():
+                self.processes[stage].join(max(until - time.monotonic(), 0.0))
+            self.kill()
+            for process in self.processes.values():
+                process.join()
+        finally:
+            for connection in (*self.reports, *self._controls.values()):
+                connection.close()
+            self.reports.clear()
+
+
+def _context() -> SpawnContext | ForkServerContext:
+    """How stages are started: forked from a process that has loaded their code and started no thread, where possible.
+
+    They share its memory, and none takes a second to load the same code.
+    """
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["stereo_sfm.pipeline.preload"])
+    return context
+
+
+def raise_file_limit(least: int) -> None:
+    """Raise the limit of open files for this process and its children.
+
+    Raises:
+        StereoSfmError: the system does not allow it.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft != resource.RLIM_INFINITY and soft < least:
+        if hard != resource.RLIM_INFINITY and hard < least:
+            raise StereoSfmError(f"only {hard} files may be open, a run needs {least}: raise 'ulimit -n', or --inline")
+        resource.setrlimit(resource.RLIMIT_NOFILE, (least, hard))

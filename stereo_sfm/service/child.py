@@ -1,0 +1,56 @@
+"""Child processes of the service: outputs and the recorder. Each has a pipe back to the service."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from typing import Any, NoReturn
+
+from stereo_sfm.pipeline.interrupts import STOP_SIGNALS, ignored_by_children
+from stereo_sfm.pipeline.text import LOGGER, Listener
+from stereo_sfm.pipeline.threads import thread_environment
+
+Send = Callable[[object], None]
+
+
+def pipe() -> tuple[Connection, Connection]:
+    """(receiving end, sending end)."""
+    return multiprocessing.get_context("spawn").Pipe(duplex=False)
+
+
+def start_child(name: str, body: Callable[..., None], *arguments: Any) -> BaseProcess:
+    """Start a process; the ends of pipes among its arguments are closed here, so that its death is an end of file."""
+    context = multiprocessing.get_context("spawn")
+    with ignored_by_children(), thread_environment(1):
+        process = context.Process(target=body, args=arguments, name=name, daemon=True)
+        process.start()
+    for argument in arguments:
+        if isinstance(argument, Connection):
+            argument.close()
+    return process
+
+
+def run_child(name: str, to_service: Connection, body: Callable[[Send], None]) -> NoReturn:
+    """In the child: run its body with a function that sends to the service, then end the process.
+
+    Stop signals are the service's to handle. Lines of the package's logger are sent as `LogLine`, with the name.
+    """
+    for number in STOP_SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
+    lock = threading.Lock()
+
+    def send(message: object) -> None:
+        with lock, contextlib.suppress(OSError):
+            to_service.send(message)
+
+    logging.getLogger(LOGGER).setLevel(logging.INFO)
+    with Listener(name, send):
+        body(send)
+    os._exit(0)  # a server's threads, or one that waits for the disk, may be left

@@ -1,0 +1,229 @@
+"""When the map of the running service is saved: every few minutes, on request, and at the end."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from pathlib import Path
+
+from stereo_sfm.config import Config
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.maps.folders import MapFolders
+from stereo_sfm.maps.unfinished import copy_map
+from stereo_sfm.messages import MapSaved
+from stereo_sfm.service.config import MapConfig
+from stereo_sfm.service.map_store import Joined, MapStore
+from stereo_sfm.service.publisher import Reply
+from stereo_sfm.service.session import Session
+
+log = logging.getLogger("stereo_sfm")
+
+SAVE_S = 25.0  # for the reply to a request to save: the save itself goes on
+ENDING = "the service is ending: the map is saved with it"
+FIRST_SAVE_MIN = 1.0  # the first save of a session comes earlier than the interval
+SETTLE_S = 20.0  # for the map of a session to be saved before a restart on request
+
+
+class MapKeeper:
+    """The saved map over the sessions of a service."""
+
+    def __init__(self, config: MapConfig, pipeline: Config) -> None:
+        """Args: config, folder, mode and interval; pipeline, of the stages."""
+        self.save_every_min = config.save_every_min
+        self._store = MapStore(Path(config.folder), config.mode, pipeline)
+        self._next_folder: Path | None = None  # the map of the next session, if another one
+        self.is_new = False  # the saved map begins with this session
+        self._next_save_s = float("inf")
+        self._began_ns = 0  # Unix time of the session's beginning
+        self._session_saved = threading.Event()  # the session's part is complete on disk
+        self._requested = False  # the session writes its part now
+        self._written = threading.Event()  # a requested save has ended
+        self._failure = ""  # why it is not saved
+        self._requests = threading.Lock()
+        self._lock = threading.Lock()  # of the store, while it changes
+        self._ending = False
+        self._awaited = False  # the last save was requested, and the session has not replied
+
+    @property
+    def mode(self) -> str:
+        """One of `config.MAP_MODES`."""
+        return self._store.mode
+
+    @property
+    def folder(self) -> Path:
+        """Of the saved map."""
+        return self._store.folder
+
+    @property
+    def saved_ns(self) -> int:
+        """Unix time of the last save, 0 before it."""
+        return self._store.saved_ns
+
+    @property
+    def exists(self) -> bool:
+        """Whether there is a saved map."""
+        return (self.folder / "map.json").exists()
+
+    @property
+    def pid(self) -> int | None:
+        """Of the process that writes the saved map, while there is one."""
+        return self._store.pid
+
+    # -- sessions, in the thread of the pipelines --------------------------------------------------------------------
+
+    def settle(self) -> None:
+        """Wait until the part of a session that has ended as requested is in the saved map; a stop ends that."""
+        until = time.monotonic() + SETTLE_S
+        while self._store.joining and not self._ending:
+            if time.monotonic() > until:
+                log.warning("the end of the last session is not in %s: saving takes too long", self.folder)
+                return
+            time.sleep(0.05)
+
+    def begin(self) -> MapFolders:
+        """The maps of a new session.
+
+        Raises:
+            StereoSfmError: there is no map to localize in, or it is damaged.
+        """
+        with self._lock:
+            if self._next_folder is not None:
+                extends = self.mode == "extend"
+                self._store = MapStore(self._next_folder, self.mode, self._store.config, _fresh=extends)
+                self._next_folder = None
+            folders = self._store.begin()
+        self.is_new = folders.map_in is None
+        self._began_ns = time.time_ns()
+        self._session_saved.clear()
+        self._requested = False
+        self._schedule(min(FIRST_SAVE_MIN, self.save_every_min))
+        return folders
+
+    def session_saved(self, message: MapSaved) -> None:
+        """The session's part is on disk, or cannot be: the saved map follows from it."""
+        self._requested = self._awaited = False
+        if message.why:
+            self._end_request(message.why)
+            log.log(logging.WARNING if message.keyframes else logging.INFO, "the map was not saved: %s", message.why)
+            return
+        with self._lock:
+            self._session_saved.set()
+            if not self._ending:
+                self._store.join()
+
+    def finish(self, until_s: float) -> None:
+        """After the last session: add its part to the saved map until this monotonic time, else at the next start."""
+        if not (self._store.saves and self._session_saved.is_set()):
+            if self._awaited:
+                self._log_lost()
+            return
+        self._store.join()
+        joined = self._store.joined(max(until_s - time.monotonic(), 0.0))
+        if joined is None:
+            self._store.cancel()
+            log.warning("the map of this session is added to %s at the next start", self.folder)
+        elif joined.why:
+            log.warning("the map of this session is not in %s: %s", self.folder, joined.why)
+        else:
+            self._store.finished()
+            _log_saved(self.folder, joined)
+
+    # -- from any thread ---------------------------------------------------------------------------------------------
+
+    def save_last(self, session: Session | None) -> None:
+        """Save a session that is about to end, if there is one; nothing else is saved from now on."""
+        with self._lock:
+            self._ending = True
+            self._end_request(ENDING)
+            if self._store.saves and session is not None:
+                self._store.cancel()
+                self._session_saved.clear()
+                self._awaited = True
+                session.save_map(self._store.session, urgent=True)
+
+    def check(self, session: Session | None) -> None:
+        """Save when it is time, and report a save that has ended; call it regularly.
+
+        Args: session, the one that runs; None while none has images.
+        """
+        if not self._lock.acquire(blocking=False):
+            return  # a session is beginning or ending: it is checked next time
+        try:
+            if self._store.saves and not self._ending:
+                self._save_when_due(session)
+                joined = self._store.joined()
+                if joined is not None:
+                    self._report_joined(joined)
+        finally:
+            self._lock.release()
+
+    def save_now(self, session: Session | None, name: str = "") -> Reply:
+        """Save and wait for it; with a name also a copy beside the saved map.
+
+        Raises:
+            StereoSfmError: the name is not a plain one.
+        """
+        if not self._store.saves or session is None:
+            return Reply(False, f"no map is saved: map.mode is {self.mode}, or no pipeline runs")
+        copy = self.beside(name) if name else None
+        with self._requests:
+            self._written.clear()
+            self._failure = ""
+            if self._ending:
+                return Reply(False, ENDING)
+            session.save_map(self._store.session)
+            if not self._written.wait(SAVE_S):
+                without = f": there is no copy {name}" if name else ""
+                return Reply(False, f"the map is still being saved after {SAVE_S:.0f} s{without}")
+            if self._failure:
+                return Reply(False, self._failure)
+            if copy is not None:
+                copy_map(self.folder, copy)
+        return Reply(True, f"saved to {copy or self.folder}")
+
+    def switch(self, folder: Path) -> None:
+        """The next session begins with this map; what the running one has mapped goes into its own."""
+        self._next_folder = folder
+
+    def beside(self, name: str) -> Path:
+        """The folder of a map next to the saved one.
+
+        Raises:
+            StereoSfmError: not a plain name.
+        """
+        if not name or name.startswith(".") or Path(name).name != name or "\\" in name:
+            raise StereoSfmError(f"'{name}' is not a plain name")
+        return self.folder.with_name(name)
+
+    def _save_when_due(self, session: Session | None) -> None:
+        """A save that takes longer than the interval is not interrupted by the next one."""
+        busy = self._requested or self._store.joining
+        if session is not None and not busy and time.monotonic() >= self._next_save_s:
+            self._schedule(self.save_every_min)
+            self._requested = True
+            session.save_map(self._store.session)
+
+    def _report_joined(self, joined: Joined) -> None:
+        self._end_request(joined.why)
+        if joined.why:
+            log.warning("the map was not saved: %s", joined.why)
+        else:
+            _log_saved(self.folder, joined)
+
+    def _schedule(self, minutes: float) -> None:
+        self._next_save_s = time.monotonic() + 60 * minutes
+
+    def _log_lost(self) -> None:
+        at = time.strftime("%H:%M:%S", time.localtime(self.saved_ns / 1e9))
+        saved = self.saved_ns > self._began_ns
+        kept = f"{self.folder} holds it as of {at}" if saved else "it had not been saved before"
+        log.error("the map of this session was NOT saved: it could not be written in time; %s", kept)
+
+    def _end_request(self, failure: str) -> None:
+        self._failure = failure
+        self._written.set()
+
+
+def _log_saved(folder: Path, joined: Joined) -> None:
+    log.info("the map %s is saved: %d keyframes", folder, joined.keyframes)

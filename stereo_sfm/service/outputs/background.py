@@ -1,0 +1,30 @@
+"""Commands of stereo-sfm as processes of low priority, for outputs that need what takes long to compute."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Sequence
+
+from stereo_sfm.errors import StereoSfmError
+
+NICE = 10
+
+
+def run_command(arguments: Sequence[str], timeout_s: float) -> str:
+    """What `stereo-sfm ARGUMENTS` prints.
+
+    Raises:
+        StereoSfmError: it failed, or took too long.
+    """
+    command = [sys.executable, "-m", "stereo_sfm.cli", *arguments]
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, timeout=timeout_s, preexec_fn=lambda: os.nice(NICE)
+        )
+    except subprocess.TimeoutExpired:
+        raise StereoSfmError(f"stereo-sfm {arguments[0]} took longer than {timeout_s:.0f} s") from None
+    if done.returncode:
+        raise StereoSfmError(" ".join(done.stderr.split())[-200:])
+    return done.stdout

@@ -1,0 +1,139 @@
+"""The process that records: reads images from shared memory and messages from the service."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.config import Config
+from stereo_sfm.log.provenance import Opening
+from stereo_sfm.pipeline.images import ImageLayout, ImageRing, SlotImage
+from stereo_sfm.pipeline.watchdog import Heartbeat, HeartbeatThread
+from stereo_sfm.recording.segment_recorder import Policy, RecorderState, SegmentRecorder
+from stereo_sfm.service.child import Send, run_child
+
+STATE_S = 0.5
+CLOSE_S = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Begin:
+    """A session begins: another recording."""
+
+    policy: Policy
+    rig: Rig
+    config: Config
+    source: str
+    opening: Opening
+    ring: tuple[ImageLayout, int, str]  # layout, slots, name
+
+
+@dataclass(frozen=True)
+class Mark:
+    """Keep the recording around this moment."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Finish:
+    """The session is over."""
+
+
+@dataclass(frozen=True)
+class Read:
+    """An image was read: its slot is free."""
+
+    number: int
+
+
+def run_recorder(messages: Connection, to_main: Connection) -> None:
+    """Body of the process."""
+
+    def work(send: Send) -> None:
+        body = _Body(send)
+        with HeartbeatThread("recorder", body.beat):
+            with contextlib.suppress(EOFError, OSError):
+                while True:
+                    body.take(messages.recv())
+            body.finish()
+
+    run_child("recorder", to_main, work)
+
+
+class _Body:
+    """What the process does with each message."""
+
+    def __init__(self, send: Send) -> None:
+        self._send = send
+        self._recorder: SegmentRecorder | None = None
+        self._ring: ImageRing | None = None
+        self._next_state_s = 0.0
+        self._problem = ""
+        self._begin: Begin | None = None
+
+    def take(self, message: object) -> None:
+        """Any message from the service."""
+        if isinstance(message, tuple):
+            number, image = message  # pyright: ignore[reportUnknownVariableType]
+            self._image(number, image)  # pyright: ignore[reportUnknownArgumentType]
+        elif isinstance(message, Begin):
+            self.finish()
+            self._begin = message
+            self._open(message)
+        elif isinstance(message, Finish):
+            self.finish()
+        elif isinstance(message, Policy):
+            if self._recorder is not None:
+                self._recorder.change(message)
+        elif isinstance(message, Mark):
+            if self._recorder is not None:
+                self._recorder.mark(message.text)
+        elif self._recorder is not None:
+            self._recorder.put(message)
+
+    def _open(self, begin: Begin) -> None:
+        layout, slots, name = begin.ring
+        self._ring = ImageRing(layout, slots, name)
+        try:
+            self._recorder = SegmentRecorder(begin.policy, begin.rig, begin.config, begin.source, begin.opening)
+            self._problem = ""
+        except OSError as error:
+            self._problem = f"cannot record to {begin.policy.root}: {error.strerror}"
+
+    def _image(self, number: int, message: SlotImage) -> None:
+        image = None
+        if self._ring is not None and self._begin is not None:
+            if self._recorder is None:
+                self._open_again(self._begin)
+            if self._recorder is not None:
+                image = self._ring.read(message)
+        self._send(Read(number))
+        if image is not None and self._recorder is not None:
+            self._recorder.image(image)
+
+    def _open_again(self, begin: Begin) -> None:
+        """The folder could not be made: another attempt, once a second."""
+        if time.monotonic() >= self._next_state_s:
+            self._open(begin)
+
+    def beat(self, beat: Heartbeat) -> None:
+        """In the heartbeat's thread: the heartbeat, and the state."""
+        self._send(beat)
+        if time.monotonic() >= self._next_state_s:
+            self._next_state_s = time.monotonic() + STATE_S
+            recorder = self._recorder
+            state = RecorderState("", "", 0, 0, self._problem, bool(self._problem))
+            self._send(state if recorder is None else recorder.state())
+
+    def finish(self) -> None:
+        """Close the recording."""
+        recorder, self._recorder, self._begin = self._recorder, None, None
+        if recorder is not None:
+            recorder.close(CLOSE_S)
+        if self._ring is not None:
+            self._ring.close()
+            self._ring = None

@@ -1,0 +1,111 @@
+"""When a frame becomes a keyframe, and what the mapper and the loop closer get of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.config import TrackerConfig
+from stereo_sfm.geometry import se3
+from stereo_sfm.tracking.descriptors import describe
+from stereo_sfm.tracking.flow.consensus import without_moving
+from stereo_sfm.tracking.flow.place_corners import PlaceCorners
+from stereo_sfm.tracking.flow.pyramids import StereoPyramids
+from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
+from stereo_sfm.tracking.flow.side_views import SideViews
+from stereo_sfm.tracking.flow.tracks import Tracks
+from stereo_sfm.types import F64, Corners, Keyframe, StereoImage
+
+
+class Keyframes:
+    """Creates keyframes, and knows the newest one, to which frames refer."""
+
+    def __init__(
+        self,
+        config: TrackerConfig,
+        shutter: RollingShutter,
+        place_corners: PlaceCorners | None,
+        side_views: SideViews | None,
+    ) -> None:
+        self._config, self._shutter = config, shutter
+        self._place_corners, self._side_views = place_corners, side_views
+        self.count = 0
+        self.points = 0  # static points of the newest keyframe
+        self._pose: F64 = np.eye(4)  # odom_T_cam of the newest keyframe
+        self._frames_since = 0
+
+    def use(self, rig: Rig) -> None:
+        """Use a corrected rig."""
+        if self._place_corners is not None:
+            self._place_corners.use(rig)
+        if self._side_views is not None:
+            self._side_views.use(rig)
+
+    def count_frame(self) -> None:
+        """A frame was tracked since the newest keyframe."""
+        self._frames_since += 1
+
+    def due(self, static_points: int) -> bool:
+        """Whether the frame should become a keyframe: new points are added at keyframes only."""
+        config = self._config
+        return self._frames_since >= config.keyframe_max_frames or static_points < config.keyframe_share * self.points
+
+    def reference(self, odom_T_cam: F64) -> tuple[int, F64]:
+        """The newest keyframe's id (-1: none yet), and kf_T_cam (4, 4) of a pose (4, 4)."""
+        return self.count - 1, se3.inverse(self._pose) @ odom_T_cam
+
+    def create(
+        self,
+        image: StereoImage,
+        tracks: Tracks,
+        odom_T_cam: F64,
+        velocity: F64,
+        submap_id: int,
+        rig_terms: F64,
+    ) -> Keyframe:
+        """A keyframe of an image, without descriptors: see `describe`.
+
+        Args:
+            tracks: its points, of which those on moving objects are left out.
+            odom_T_cam: (4, 4). velocity: (6,) tangent a second. rig_terms: (6,) current correction of the rig.
+        """
+        static = tracks.keep(~tracks.moving)
+        points_cam = se3.transform(se3.inverse(odom_T_cam), static.points())
+        uv_left, uv_right = self._shutter.at_stamp(static.uv, static.uv_right, points_cam, velocity)
+        keyframe = Keyframe(
+            kf_id=self.count,
+            frame_id=image.frame_id,
+            stamp_ns=image.stamp_ns,
+            odom_T_cam=odom_T_cam.copy(),
+            point_ids=static.point_ids.copy(),
+            uv_left=uv_left.copy(),
+            uv_right=uv_right.copy(),
+            points_cam=points_cam,
+            descriptors=np.zeros((len(static), 32), np.uint8),
+            submap_id=submap_id,
+            rig_terms=rig_terms.copy(),
+        )
+        self.count, self.points, self._pose, self._frames_since = self.count + 1, len(static), odom_T_cam.copy(), 0
+        return keyframe
+
+    def describe(self, keyframe: Keyframe, images: StereoPyramids, tracks: Tracks, velocity: F64) -> Keyframe:
+        """The keyframe with its points' descriptors and its corners; arguments as those of `create`."""
+        corners, sides = self._corners(keyframe, images, tracks)
+        return replace(
+            keyframe,
+            descriptors=describe(images.left[0], tracks.uv[~tracks.moving]),
+            corners=self._shutter.corners_at_stamp(corners, velocity),
+            sides=self._shutter.corners_at_stamp(sides, velocity),
+        )
+
+    def _corners(self, keyframe: Keyframe, images: StereoPyramids, tracks: Tracks) -> tuple[Corners, Corners]:
+        """Static corners for place recognition: of the image, and of its side views."""
+        corners = sides = Corners.none()
+        if self._place_corners is not None:
+            corners = without_moving(self._place_corners.find_in(images.left, images.right), tracks)
+        if self._side_views is not None:
+            sides = self._side_views.find(images.left, images.right, corners, keyframe.odom_T_cam, keyframe.submap_id)
+            sides = without_moving(sides, tracks)
+        return corners, sides

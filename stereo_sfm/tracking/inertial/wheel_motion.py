@@ -1,0 +1,171 @@
+"""Motion by the wheels since the last pose from images; with a gyroscope, which turns better than wheels do."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stereo_sfm.calib.wheel import Wheel
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.twist_integration import TwistMotion, integrate_twists
+from stereo_sfm.tracking.inertial.inertial_motion import Turning
+from stereo_sfm.tracking.inertial.rest import STILL_NS
+from stereo_sfm.tracking.inertial.series import Series
+from stereo_sfm.tracking.inertial.wheel_window import WheelCorrection, WheelWindow
+from stereo_sfm.types import F64, WheelSamples
+
+MAX_GAP_S = 0.25  # between samples: longer ones are not bridged
+LINK_NS = 500_000_000  # of the comparison with the images
+STILL = 1e-3  # m/s, rad/s of a robot at rest
+ACCELERATION, TURN_ACCELERATION = 3.0, 5.0  # m/s^2, rad/s^2: wheels that change faster slip or are broken
+
+
+class WheelMotion:
+    """Integrates the samples of every image; corrected by the poses from images."""
+
+    def __init__(self, wheel: Wheel) -> None:
+        self._wheel = wheel
+        self._series = Series(6, MAX_GAP_S)
+        self._window = WheelWindow(wheel.model, wheel.slip)
+        self._correction: WheelCorrection = self._window.correction()
+        self._last_ns = self._link_ns = 0
+        self._odom_T_last: F64 = np.eye(4)  # poses of the wheels
+        self._odom_T_link: F64 = np.eye(4)
+        self._last_step: tuple[float, F64] | None = None  # seconds and tangent (6,), camera axes
+        self._begun = False
+
+    @property
+    def left_out(self) -> bool:
+        """Whether they contradict the images."""
+        return self._window.left_out
+
+    def feed(self, samples: WheelSamples | None) -> None:
+        """Samples up to the image that is tracked next."""
+        if samples is None or not len(samples):
+            return
+        stamps = samples.stamp_ns - round(self._wheel.offset_s * 1e9)
+        values = np.hstack(self._wheel.velocities(samples))
+        values[:, 3:] = np.where(np.isfinite(values[:, 3:]), values[:, 3:], 0.0)  # of a sensor that only tells the way
+        known = np.isfinite(values).all(axis=1)
+        stamps, values = stamps[known], values[known]
+        rows = self._series.after_last(stamps)
+        self._series.add(stamps[rows], values[rows])
+
+    def begin(self, stamp_ns: int, odom_T_cam: F64) -> None:
+        """The odometry begins anew here: poses from before do not go with those to come."""
+        self._begun, self._last_step = True, None
+        self._window.begin()
+        self._last_ns = self._link_ns = stamp_ns
+        self._odom_T_last = self._odom_T_link = odom_T_cam @ self._wheel.left_T_wheel
+
+    def accept(self, stamp_ns: int, odom_T_cam: F64) -> None:
+        """The images gave this pose (4, 4)."""
+        if not self._begun:
+            self.begin(stamp_ns, odom_T_cam)
+            return
+        step = self._raw(self._last_ns, stamp_ns)
+        self._last_step = None if step is None else ((stamp_ns - self._last_ns) * 1e-9, self._in_camera(step))
+        self._last_ns, self._odom_T_last = stamp_ns, odom_T_cam @ self._wheel.left_T_wheel
+        if stamp_ns - self._link_ns < LINK_NS:
+            return
+        by_wheels = self._raw(self._link_ns, stamp_ns)
+        if by_wheels is not None and stamp_ns - self._link_ns < 2 * LINK_NS:
+            seen = se3.inverse(self._odom_T_link) @ self._odom_T_last
+            self._window.add((stamp_ns - self._link_ns) * 1e-9, by_wheels, seen)
+            self._correction = self._window.correction()
+        self._link_ns, self._odom_T_link = stamp_ns, self._odom_T_last
+        self._series.forget(stamp_ns)
+
+    def still(self, stamp_ns: int) -> bool | None:
+        """Whether no wheel turned in the last half second; None where samples are missing, or they are wrong."""
+        edges = None if self.left_out else self._series.edges(stamp_ns - STILL_NS, stamp_ns)
+        return None if edges is None else bool(np.abs(self._series.means(edges)).max() < STILL)
+
+    def changed(self, stamp_ns: int, step: F64) -> F64:
+        """The expected step (6,) since the last pose, camera axes, with the wheels' change of speed added."""
+        motion = None if self.left_out else self._raw(self._last_ns, stamp_ns)
+        if motion is None or self._last_step is None:
+            return step
+        seconds = (stamp_ns - self._last_ns) * 1e-9
+        change = self._in_camera(motion) - self._last_step[1] * (seconds / self._last_step[0])
+        limits = ACCELERATION * seconds**2, TURN_ACCELERATION * seconds**2
+        sizes = [float(np.linalg.norm(part)) for part in (change[:3], change[3:])]
+        parts = [min(1.0, limit / max(size, 1e-12)) for limit, size in zip(limits, sizes, strict=True)]
+        return step + change * np.repeat(np.array(parts), 3)
+
+    def predict(self, stamp_ns: int, gyro: Turning | None) -> tuple[F64, F64] | None:
+        """Pose (4, 4) odom_T_cam at a time after the last one, and its covariance (6, 6) as that of a `Frame`.
+
+        None where samples are missing, or the wheels contradict the images.
+        """
+        if self.left_out or not self._begun:
+            return None
+        motion = self._by_wheels(stamp_ns) if gyro is None else self._by_gyro(gyro)
+        if motion is None:
+            return None
+        moved = se3.from_rotation_translation(motion.rotation, motion.position)
+        covariance = self._covariance(motion, None if gyro is None else gyro.bias_sigma)
+        if gyro is not None:
+            covariance[:3, :3] += self._slipped_m(gyro) ** 2 * np.eye(3)
+        end_R_begin = np.kron(np.eye(2), motion.rotation.T)
+        end_R_begin[3:, 3:] = np.eye(3)
+        into = se3.adjoint(self._wheel.left_T_wheel) @ end_R_begin
+        odom_T_cam = self._odom_T_last @ moved @ se3.inverse(self._wheel.left_T_wheel)
+        return odom_T_cam, into @ covariance @ into.T
+
+    def _by_wheels(self, stamp_ns: int) -> TwistMotion | None:
+        edges = self._series.edges(self._last_ns, stamp_ns)
+        if edges is None:
+            return None
+        c, values = self._correction, self._series.means(edges)
+        return integrate_twists(
+            np.diff(edges) * 1e-9, values[:, 3:] * c.turn, values[:, :3] @ c.matrix.T, c.turn_noise, c.noise
+        )
+
+    def _by_gyro(self, gyro: Turning) -> TwistMotion | None:
+        edges = gyro.edges_ns
+        if self._series.edges(int(edges[0]), int(edges[-1])) is None:
+            return None
+        c = self._correction
+        wheel_R_imu = self._wheel.left_T_wheel[:3, :3].T @ gyro.left_R_imu
+        linear = self._series.means(edges)[:, :3] @ c.matrix.T
+        return integrate_twists(np.diff(edges) * 1e-9, gyro.rates @ wheel_R_imu.T, linear, gyro.noise, c.noise)
+
+    def _slipped_m(self, gyro: Turning) -> float:
+        """Way that is in doubt where the wheels turned otherwise than the gyroscope."""
+        seconds, values = np.diff(gyro.edges_ns) * 1e-9, self._series.means(gyro.edges_ns)
+        wheel_R_imu = self._wheel.left_T_wheel[:3, :3].T @ gyro.left_R_imu
+        turned = np.cumsum(np.column_stack([values[:, 5], gyro.rates @ wheel_R_imu[2]]) * seconds[:, None], axis=0)
+        before = np.searchsorted(gyro.edges_ns[1:], gyro.edges_ns[1:] - LINK_NS, side="right") - 1
+        recent = turned - np.where(before[:, None] >= 0, turned[before], 0.0)
+        share = self._window.slip_share(recent[:, 0], recent[:, 1])
+        return float((share * np.linalg.norm(values[:, :3], axis=1) * seconds).sum())
+
+    def _covariance(self, motion: TwistMotion, gyro_sigma: float | None) -> F64:
+        """(6, 6) of position (axes at the beginning) and rotation (right tangent)."""
+        c, p = self._correction, motion.position
+        lasting = np.column_stack([p, -se3.skew(p)])
+        out = motion.covariance.copy()
+        out[:3, :3] += lasting @ c.covariance @ lasting.T
+        by_rate = np.vstack([motion.position_by_rate, motion.rotation_by_rate])
+        if gyro_sigma is not None:
+            return out + gyro_sigma**2 * by_rate @ by_rate.T
+        turned = float(np.linalg.norm(se3.so3_log(motion.rotation)))
+        rate_sigma = c.turn_sigma * turned / motion.seconds
+        sway = c.heading_sigma**2
+        out[:3, :3] += sway * lasting[:, 1:] @ lasting[:, 1:].T
+        out[3:, 3:] += sway * np.eye(3)
+        return out + rate_sigma**2 * by_rate @ by_rate.T
+
+    def _raw(self, begin_ns: int, end_ns: int) -> F64 | None:
+        """(4, 4) motion by the uncorrected wheels."""
+        edges = self._series.edges(begin_ns, end_ns)
+        if edges is None:
+            return None
+        values = self._series.means(edges)
+        motion = integrate_twists(np.diff(edges) * 1e-9, values[:, 3:], values[:, :3], 0.0, 0.0)
+        return se3.from_rotation_translation(motion.rotation, motion.position)
+
+    def _in_camera(self, motion: F64) -> F64:
+        """(6,) tangent of a motion of the wheels (4, 4) as one of the camera."""
+        left_T_wheel = self._wheel.left_T_wheel
+        return np.asarray(se3.log(left_T_wheel @ motion @ se3.inverse(left_T_wheel)))

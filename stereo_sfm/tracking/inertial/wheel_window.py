@@ -1,0 +1,128 @@
+"""How the way by the wheels differs from the way by the images, over the last seconds.
+
+Unknown are the wheels' scale, the direction in which they drive as seen from the camera, and the scale of their turns:
+small numbers that calibrations get wrong and that tyres change. The rest is noise, whose size is found with them.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from stereo_sfm.geometry import se3
+from stereo_sfm.types import F64
+
+LINKS = 20  # half seconds
+DIRECTION_SIGMA = 0.03  # rad, expected of a calibration
+TURN_SIGMA = {"skid_steer": 0.3}  # expected of the scale of turns, where that is not the slip
+TURN_FREE = 0.03, 0.1  # rad and share by which turns differ without slip
+MIN_SIGMA_M, MIN_SIGMA_RAD = 0.003, 0.003  # standard deviation of a link's difference, at least
+JUDGED = 6  # links for the comparison with the images
+WRONG, RIGHT = 0.5, 0.25  # of the way: more is another motion, less is the same again
+NOTICED_M = 0.1  # of way, before anything is judged
+
+
+@dataclass(frozen=True, eq=False)
+class WheelCorrection:
+    """Corrections of the wheels' velocities: `matrix @ linear`, `turn * angular`."""
+
+    matrix: F64  # (3, 3)
+    turn: float
+    covariance: F64  # (4, 4) of logarithmic scale and direction (3,)
+    turn_sigma: float
+    noise: float  # m/sqrt(s) of a position
+    turn_noise: float  # rad/sqrt(s)
+    heading_sigma: float  # rad, of the direction at one image: how far the camera sways
+
+
+@dataclass(frozen=True, eq=False)
+class _Link:
+    """About half a second by the uncorrected wheels and by the images, in wheel axes."""
+
+    seconds: float
+    way: F64  # (3,) m by the wheels
+    seen: F64  # (3,) m by the images
+    turn: float  # rad by the wheels
+    turn_seen: float
+
+
+class WheelWindow:
+    """Motions by the wheels and by the images, oldest first."""
+
+    def __init__(self, model: str, slip: float) -> None:
+        """`slip`: standard deviation of the scale, expected of a calibration of wheels of a model."""
+        self._slip, self._turn_sigma = slip, TURN_SIGMA.get(model, slip)
+        self._rigid = model != "skid_steer"
+        self._links: deque[_Link] = deque(maxlen=LINKS)
+        self.left_out = False
+
+    def begin(self) -> None:
+        """What was before does not go with what comes."""
+        self._links.clear()
+
+    def add(self, seconds: float, by_wheels: F64, seen: F64) -> None:
+        """A motion (4, 4) by the uncorrected wheels and by the images, in wheel axes."""
+        turn, turn_seen = (float(se3.so3_log(m[:3, :3])[2]) for m in (by_wheels, seen))
+        self._links.append(_Link(seconds, by_wheels[:3, 3], seen[:3, 3], turn, turn_seen))
+        self._judge()
+
+    def _judge(self) -> None:
+        recent = list(self._links)[-JUDGED:]
+        off = sum(float(((k.way - k.seen) ** 2).sum()) for k in recent)
+        way = sum(max(float((k.way**2).sum()), float((k.seen**2).sum())) for k in recent)
+        if len(recent) == JUDGED and way > NOTICED_M**2:
+            self.left_out = off > ((RIGHT if self.left_out else WRONG) ** 2) * way
+
+    def correction(self) -> WheelCorrection:
+        """What the window says; what is expected of a calibration while it is short."""
+        x, covariance, sigma2 = self._direction()
+        turn, turn_sigma, turn_sigma2 = self._turn()
+        way2 = float(np.mean([k.way @ k.way for k in self._links])) if self._links else 0.0
+        seconds = float(np.mean([k.seconds for k in self._links])) if self._links else 0.5
+        return WheelCorrection(
+            matrix=np.exp(x[0]) * se3.so3_exp(x[1:]),
+            turn=turn,
+            covariance=covariance,
+            turn_sigma=turn_sigma,
+            noise=float(np.sqrt(sigma2 / seconds)),
+            turn_noise=float(np.sqrt(turn_sigma2 / seconds)),
+            heading_sigma=min(float(np.sqrt(sigma2 / max(way2, 1e-6))), DIRECTION_SIGMA),
+        )
+
+    def _direction(self) -> tuple[F64, F64, float]:
+        """Logarithmic scale and direction (4,), their covariance, and the variance of what is left of a link's way."""
+        prior: F64 = np.diag(1.0 / np.square([self._slip, DIRECTION_SIGMA, DIRECTION_SIGMA, DIRECTION_SIGMA]))
+        x, information, sigma2 = np.zeros(4), prior, MIN_SIGMA_M**2
+        jacobians = [np.column_stack([k.way, -se3.skew(k.way)]) for k in self._links]
+        errors = [k.seen - k.way for k in self._links]
+        slips2 = [float(k.way @ k.way) * float(self.slip_share(k.turn, k.turn_seen)) ** 2 for k in self._links]
+        for _ in range(2):  # the second time with the size of the noise
+            information, rhs = prior.copy(), np.zeros(4)
+            for jacobian, error, slip2 in zip(jacobians, errors, slips2, strict=True):
+                information += jacobian.T @ jacobian / (sigma2 + slip2)
+                rhs += jacobian.T @ error / (sigma2 + slip2)
+            x = np.linalg.solve(information, rhs)
+            left = [e - j @ x for j, e, s in zip(jacobians, errors, slips2, strict=True) if not s]
+            sigma2 = max(float(np.mean(np.square(left))) if left else 0.0, MIN_SIGMA_M**2)
+        return x.astype(np.float64), np.linalg.inv(information).astype(np.float64), sigma2
+
+    def slip_share(self, by_wheels: F64 | float, turned: F64 | float) -> F64 | float:
+        """The share of the way that wheels slipped, by turns (rad) of about half a second that they and others say.
+
+        0 for skid_steer, which slips in all turns.
+        """
+        off = np.abs(by_wheels - turned)
+        share = np.minimum(off / np.maximum(np.abs(by_wheels), TURN_FREE[0]), 1.0)
+        return np.where(self._rigid & (off > TURN_FREE[0] + TURN_FREE[1] * np.abs(turned)), share, 0.0)
+
+    def _turn(self) -> tuple[float, float, float]:
+        """Scale of turns, its standard deviation, and the variance of what is left of a link's turn."""
+        w, v = (np.array([getattr(k, name) for k in self._links], float) for name in ("turn", "turn_seen"))
+        scale, information, sigma2 = 1.0, 1.0 / self._turn_sigma**2, MIN_SIGMA_RAD**2
+        for _ in range(2):
+            information = 1.0 / self._turn_sigma**2 + float(w @ w) / sigma2
+            scale = 1.0 + float(w @ (v - w)) / sigma2 / information
+            sigma2 = max(float(np.mean(np.square(v - scale * w))) if len(w) else 0.0, MIN_SIGMA_RAD**2)
+        return scale, float(information**-0.5), sigma2

@@ -1,0 +1,196 @@
+"""Calibration of IMU and wheels against the motion of a camera: recovery of wrong values, wrong sensors, commands."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stereo_sfm.calib import load_rig, save_rig
+from stereo_sfm.calib.imu_fit import fit_imu, judge_imu, precision_imu
+from stereo_sfm.calib.robust_fit import robust_fit, shift_between
+from stereo_sfm.calib.wheel import Wheel
+from stereo_sfm.calib.wheel_fit import fit_wheel, judge_wheel, precision_wheel
+from stereo_sfm.cli import main
+from stereo_sfm.drivers.options import read_options
+from stereo_sfm.drivers.sim.options import SimOptions
+from stereo_sfm.drivers.sim.scenes import SCENES
+from stereo_sfm.drivers.sim.source import SimSource
+from stereo_sfm.drivers.source import open_source
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
+from stereo_sfm.types import F64, I64, ImuSamples, WheelSamples
+
+FRAMES = 450
+
+
+class Recording:
+    """Half a minute of a simulated drive: exact poses with half a millimetre and half a minute of arc of noise."""
+
+    def __init__(self, seed: int, **options: object) -> None:
+        given = {"size": "106x100", "rate": 15, "seed": seed, "imu": "t265", **options}
+        self.source = SimSource("loop", SCENES["loop"], read_options(SimOptions, "sim", given))
+        parts = [self.source.sampled(k) for k in range(FRAMES)]
+        self.imu = ImuSamples.joined([imu for imu, _ in parts if imu is not None])
+        self.wheel = WheelSamples.joined([w for _, w in parts if w is not None]) if options.get("wheel") else None
+        self.stamp_ns: I64 = np.array([self.source.stamp_ns(k) for k in range(FRAMES)], np.int64)
+        rng = np.random.default_rng(seed)
+        noise = rng.normal(0, 1, (FRAMES, 6)) * [5e-4, 5e-4, 5e-4, 1.5e-4, 1.5e-4, 1.5e-4]
+        start = se3.inverse(self.source.pose(0))
+        self.poses: F64 = (
+            start @ self.source.drive.poses(np.arange(FRAMES) / 15) @ np.array([se3.exp(n) for n in noise])
+        )
+
+    @property
+    def wheels(self) -> Wheel:
+        assert self.source.rig.wheel is not None
+        return self.source.rig.wheel
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_20_ms_and_3_degrees_of_an_imu_are_found(seed: int) -> None:
+    found = Recording(seed, imu_offset_ms=20)
+    true = found.source.rig.imu
+    assert true is not None
+    turn = se3.from_rotation_translation(se3.so3_exp(np.radians(3) * np.array([0.6, -0.64, 0.48])), np.zeros(3))
+    wrong = replace(true, offset_s=0.0, left_T_imu=true.left_T_imu @ turn)
+    fit = fit_imu(found.stamp_ns, found.poses, found.imu, wrong)
+    off = np.degrees(np.linalg.norm(se3.so3_log(fit.imu.left_T_imu[:3, :3].T @ true.left_T_imu[:3, :3])))
+    assert abs(fit.imu.offset_s - 0.02) < 5e-4 and off < 0.1
+    assert abs(fit.imu.offset_s - 0.02) < 4 * fit.offset_sigma_s and fit.offset_sigma_s < 5e-4
+    assert abs(np.degrees(fit.turned) - 3) < 0.1
+    assert {f.name: f.level > 0 for f in judge_imu(fit, wrong)} == {
+        "gyroscope": False, "IMU rotation": True, "IMU time offset": True, "accelerometer": False
+    }  # fmt: skip
+    again = judge_imu(fit_imu(found.stamp_ns, found.poses, found.imu, fit.imu), fit.imu)
+    assert not any(f.level for f in again)
+    assert max(f.level for f in precision_imu(fit)) <= 1
+
+
+@pytest.mark.parametrize(
+    ("change", "name", "says"),
+    [
+        (lambda s: ImuSamples(s.stamp_ns, np.degrees(s.gyro), s.accel), "gyroscope", "degrees"),
+        (lambda s: ImuSamples(s.stamp_ns, s.gyro, s.accel / 9.80665), "accelerometer", "in g"),
+        (lambda s: ImuSamples(s.stamp_ns, s.gyro[:, [2, 0, 1]].copy(), s.accel), "IMU rotation", "exchanged"),
+        (lambda s: ImuSamples(s.stamp_ns, s.gyro[::-1].copy(), s.accel), "gyroscope", "not those of the images"),
+    ],
+)
+def test_wrong_units_axes_and_sensors_fail(change: Callable[[ImuSamples], ImuSamples], name: str, says: str) -> None:
+    found = Recording(0)
+    known = found.source.rig.imu
+    assert known is not None
+    fit = fit_imu(found.stamp_ns, found.poses, change(found.imu), known)
+    failed = {f.name: f.text for f in judge_imu(fit, known) if f.level == 2}
+    assert says in failed[name]
+
+
+def test_samples_with_gaps_doubles_and_nan_are_used_as_far_as_they_go() -> None:
+    found = Recording(1)
+    known, rng = found.source.rig.imu, np.random.default_rng(0)
+    assert known is not None
+    rows = np.sort(np.concatenate([rng.permutation(len(found.imu))[: len(found.imu) * 9 // 10], np.arange(40)]))
+    gyro = found.imu.gyro[rows]
+    gyro[::50] = np.nan
+    untidy = ImuSamples(found.imu.stamp_ns[rows], gyro, found.imu.accel[rows])
+    fit = fit_imu(found.stamp_ns, found.poses, untidy, known)
+    assert not any(f.level for f in judge_imu(fit, known))
+
+
+def test_a_recording_that_shows_nothing_is_refused() -> None:
+    found = Recording(0)
+    known = found.source.rig.imu
+    assert known is not None
+    with pytest.raises(StereoSfmError, match="hardly turns"):
+        fit_imu(found.stamp_ns, np.tile(np.eye(4), (FRAMES, 1, 1)), found.imu, known)
+    with pytest.raises(StereoSfmError, match="inertial samples around"):
+        fit_imu(found.stamp_ns + 10**12, found.poses, found.imu, known)
+    wheel = Recording(0, wheel="twist")
+    assert wheel.wheel is not None
+    with pytest.raises(StereoSfmError, match=r"0\.00 m of motion"):
+        fit_wheel(wheel.stamp_ns, np.tile(np.eye(4), (FRAMES, 1, 1)), wheel.wheel, wheel.wheels)
+
+
+@pytest.mark.parametrize("model", ["differential", "mecanum", "twist"])
+@pytest.mark.parametrize("seed", range(2))
+def test_2_percent_of_the_radii_are_found(model: str, seed: int) -> None:
+    found = Recording(seed, wheel=model, wheel_grade="ideal", wheel_offset_ms=30)
+    true = found.wheels
+    wrong = replace(true, radii_m=tuple(1.02 * r for r in true.radii_m), offset_s=0.0)
+    wrong = replace(true, linear_matrix=1.02 * np.eye(3), offset_s=0.0) if model == "twist" else wrong
+    assert found.wheel is not None
+    fit = fit_wheel(found.stamp_ns, found.poses, found.wheel, wrong)
+    assert abs((1 + fit.value[0]) * 1.02 - 1) < 2e-3 and fit.sigma[0] < 4e-3
+    assert abs(fit.wheel.offset_s - 0.03) < 0.02 and fit.agreement > 0.95
+    assert abs(fit.wheel.track_m / true.track_m - 1) < 0.03
+    assert "wheels' scale" in {f.name for f in judge_wheel(fit) if f.level}
+    again = judge_wheel(fit_wheel(found.stamp_ns, found.poses, found.wheel, fit.wheel))
+    assert not any(f.level for f in again)
+    assert max(f.level for f in precision_wheel(fit)) <= 1
+
+
+def test_wheels_that_count_backwards_or_are_exchanged() -> None:
+    found = Recording(0, wheel="differential")
+    assert found.wheel is not None
+    for speeds, says in ((-found.wheel.speeds, "backwards"), (found.wheel.speeds[:, ::-1].copy(), "exchange left")):
+        fit = fit_wheel(found.stamp_ns, found.poses, replace(found.wheel, speeds=speeds), found.wheels)
+        (finding,) = judge_wheel(fit)
+        assert finding.level == 2 and says in finding.text
+    other = replace(found.wheels, model="mecanum", radii_m=(0.1,) * 4, wheelbase_m=0.3)
+    with pytest.raises(StereoSfmError, match="not those of mecanum wheels"):
+        fit_wheel(found.stamp_ns, found.poses, found.wheel, other)
+
+
+def test_a_fit_ignores_outliers_and_knows_its_error() -> None:
+    rng = np.random.default_rng(0)
+    t = np.linspace(0, 1, 400)
+    errors, said = [], []
+    for _ in range(20):
+        y = 2.0 + 3.0 * t + rng.normal(0, 0.1, 400)
+        y[rng.random(400) < 0.1] += 5.0
+        fit = robust_fit(lambda x, y=y: (y - x[0] - x[1] * t)[:, None], np.zeros(2), np.ones(2))
+        errors.append(fit.value - [2, 3])
+        said.append(fit.sigma)
+    rms = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert (rms < [0.06, 0.1]).all()
+    np.testing.assert_allclose(np.mean(said, axis=0), rms, rtol=0.8)
+
+
+def test_a_shift() -> None:
+    t = np.linspace(0, 20, 500)
+    signal = lambda s: np.sin(2 * s) + np.cos(3.3 * s)  # noqa: E731
+    assert shift_between(signal, signal(t + 0.125), t, 0.3) == pytest.approx(0.125)
+
+
+def test_the_command_needs_something_to_calibrate(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["calibrate", "sim:loop", "-o", str(tmp_path / "a.yaml")]) == 2
+    assert "needs --target for the cameras, or --imu or --wheel" in capsys.readouterr().err
+    spec = "sim:loop?size=106x100&frames=2"
+    assert main(["calibrate", spec, "--imu", "-o", str(tmp_path / "a.yaml")]) == 2
+    assert "has no inertial samples" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_wrong_sensors_of_a_recording_are_calibrated_and_checked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spec = "sim:loop?size=424x400&rate=15&frames=450&imu=t265&imu_offset_ms=20&wheel=differential&wheel_grade=ideal"
+    with open_source(spec) as source:
+        rig = source.rig
+    assert rig.imu is not None and rig.wheel is not None
+    turn = se3.from_rotation_translation(se3.so3_exp(np.radians(3) * np.array([0.6, -0.64, 0.48])), np.zeros(3))
+    imu = replace(rig.imu, offset_s=0.0, left_T_imu=rig.imu.left_T_imu @ turn)
+    wheel = replace(rig.wheel, radii_m=tuple(1.02 * r for r in rig.wheel.radii_m))
+    save_rig(replace(rig, imu=imu, wheel=wheel), tmp_path / "wrong.yaml")
+    options = ["--rig", str(tmp_path / "wrong.yaml")]
+    assert main(["calibrate", spec, "--imu", "--wheel", *options, "-o", str(tmp_path / "right.yaml")]) == 0
+    print(capsys.readouterr().out)
+    found = load_rig(tmp_path / "right.yaml")
+    assert found.imu is not None and found.wheel is not None
+    off = np.degrees(np.linalg.norm(se3.so3_log(found.imu.left_T_imu[:3, :3].T @ rig.imu.left_T_imu[:3, :3])))
+    ratio = np.mean(found.wheel.radii_m) / 0.08  # as good as the lengths by the images, at half the resolution
+    print(f"offset {1e3 * (found.imu.offset_s - 0.02):.3f} ms, rotation {off:.3f} deg, radii {100 * (ratio - 1):.3f} %")
+    assert abs(found.imu.offset_s - 0.02) < 5e-4 and off < 0.1 and abs(ratio - 1) < 6e-3

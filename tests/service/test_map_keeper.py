@@ -1,0 +1,117 @@
+"""When the service's map is saved, without a pipeline: on request, early in a session, and at the end."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from multiprocessing import Pipe
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from stereo_sfm.config import Config
+from stereo_sfm.maps import unfinished
+from stereo_sfm.messages import MapSaved, SaveMap
+from stereo_sfm.pipeline import map_saver
+from stereo_sfm.pipeline.map_saver import NICE, MapSaver
+from stereo_sfm.service import map_keeper
+from stereo_sfm.service.config import MapConfig
+from stereo_sfm.service.map_keeper import ENDING, MapKeeper
+
+
+class SlowSession:
+    """Is asked to save and never replies."""
+
+    def __init__(self) -> None:
+        self.asked: list[Path] = []
+
+    def save_map(self, folder: Path, urgent: bool = False) -> None:
+        self.asked.append(folder)
+
+
+def keeper(tmp_path: Path) -> MapKeeper:
+    made = MapKeeper(MapConfig(str(tmp_path / "store")), Config())
+    made.begin()
+    return made
+
+
+def test_a_requested_save_is_answered_in_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(map_keeper, "SAVE_S", 0.05)
+    session: Any = SlowSession()
+    reply = keeper(tmp_path).save_now(session, "copy")
+    assert not reply.ok and "still being saved" in reply.text and "no copy copy" in reply.text and session.asked
+
+
+def test_a_requested_save_is_answered_when_the_service_ends(tmp_path: Path) -> None:
+    maps, session = keeper(tmp_path), SlowSession()
+    asked: Any = session
+    with ThreadPoolExecutor(2) as pool:
+        replies = [pool.submit(maps.save_now, asked) for _ in range(2)]
+        while not session.asked:
+            time.sleep(0.01)
+        maps.save_last(asked)
+        assert {reply.result(5.0).text for reply in replies} == {ENDING}
+    assert not maps.save_now(asked).ok
+
+
+def test_a_session_is_first_saved_after_a_minute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    maps, session = keeper(tmp_path), SlowSession()
+    asked: Any = session
+    for now[0], saves in ((159.0, 0), (161.0, 1), (300.0, 1)):
+        maps.check(asked)
+        assert len(session.asked) == saves
+    maps.session_saved(MapSaved("", 0, "nothing is mapped yet"))
+    for now[0], saves in ((460.0, 1), (462.0, 2)):
+        maps.check(asked)
+        assert len(session.asked) == saves
+
+
+@pytest.mark.parametrize("earlier", [False, True])
+def test_a_map_that_could_not_be_written_is_said(earlier: bool, tmp_path: Path, caplog: Any) -> None:
+    maps, session = keeper(tmp_path), SlowSession()
+    asked: Any = session
+    if earlier:
+        maps._store.saved_ns = time.time_ns()  # pyright: ignore[reportPrivateUsage]
+    maps.save_last(asked)
+    maps.finish(time.monotonic())
+    (line,) = (record.getMessage() for record in caplog.records if record.levelname == "ERROR")
+    assert line.startswith("the map of this session was NOT saved: it could not be written in time; ")
+    assert ("holds it as of" if earlier else "had not been saved before") in line
+
+
+def test_a_session_without_a_map_is_not_a_loss(tmp_path: Path, caplog: Any) -> None:
+    maps, session = keeper(tmp_path), SlowSession()
+    asked: Any = session
+    maps.save_last(asked)
+    maps.session_saved(MapSaved("", 0, "nothing is mapped yet"))
+    maps.finish(time.monotonic())
+    assert not [record for record in caplog.records if record.levelname in ("ERROR", "WARNING")]
+
+
+@pytest.mark.skipif(not hasattr(os, "setpriority"), reason="no priorities of threads")
+@pytest.mark.parametrize("urgent", [False, True])
+def test_the_last_save_is_written_without_yielding(urgent: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    written, replies = list[int](), list[MapSaved]()
+
+    def save(saved: object, place: object, folder: Path) -> None:
+        written.append(os.getpriority(os.PRIO_PROCESS, threading.get_native_id()))
+
+    monkeypatch.setattr(unfinished, "save_session", save)
+    monkeypatch.setattr(map_saver, "saved_map_of", lambda *_: [0])
+    mapper: Any = SimpleNamespace(place=lambda: None)
+    saver = MapSaver(mapper, Config(), replies.append)
+    inbox, control = SimpleNamespace(connection=Pipe(False)[0], take=lambda: None), Pipe(False)
+    control[1].send(SaveMap(Path("x"), urgent))
+    control[1].close()
+    any_inbox: Any = inbox
+    threading.Thread(target=saver.next, args=(any_inbox, control[0])).start()
+    while not replies:
+        time.sleep(0.01)
+    nice = os.getpriority(os.PRIO_PROCESS, 0)
+    assert written == [nice if urgent else max(nice, NICE)]
