@@ -11,7 +11,7 @@ from stereo_sfm.calib.choice import with_terms
 from stereo_sfm.calib.formats.native import read_native, rig_to_text, write_native
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.types import F64
+from stereo_sfm.types import CalibrationUpdate
 
 log = logging.getLogger("stereo_sfm")
 OF_FILE_NAMES = frozenset("ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789-_")
@@ -39,21 +39,32 @@ class CameraStore:
         log.info("the calibration of camera %s is the corrected one of %s", rig.serial, path)
         return replace(rig, right=stored.right, left_T_right=stored.left_T_right)
 
-    def keep(self, start: Rig, terms: F64) -> None:
-        """Store the rig of a run's start, corrected by terms (6,) as in `CalibrationUpdate`.
+    def original(self, start: Rig) -> Rig:
+        """The calibration that the rig of a run's start corrects; the rig itself if it is not the stored one.
+
+        Raises:
+            StereoSfmError: the rig has no serial number, or its files are damaged.
+        """
+        path = self._path(start)
+        if path.exists() and rig_to_text(read_native(path)) == rig_to_text(start):
+            return read_native(self._original(path))
+        return start
+
+    def keep(self, original: Rig, corrected: Rig) -> None:
+        """Store a corrected rig and the one that it corrects.
 
         Raises:
             StereoSfmError: the rig has no serial number, or the files cannot be written.
         """
-        path = self._path(start)
+        path = self._path(original)
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            if not path.exists() or rig_to_text(read_native(path)) != rig_to_text(start):
-                _write(start, self._original(path))
-            _write(with_terms(start, terms), path)
+            path.unlink(missing_ok=True)  # never beside an original that it does not correct
+            _write(original, self._original(path))
+            _write(corrected, path)
         except OSError as error:
             raise StereoSfmError(f"the corrected calibration is not kept: {path}: {error.strerror}") from error
-        log.info("the corrected calibration of camera %s is kept in %s", start.serial, path)
+        log.info("the corrected calibration of camera %s is kept in %s", original.serial, path)
 
     def _path(self, rig: Rig) -> Path:
         if not rig.serial or not OF_FILE_NAMES.issuperset(rig.serial):
@@ -65,6 +76,32 @@ class CameraStore:
 
     def _original(self, path: Path) -> Path:
         return path.with_suffix(".original.yaml")
+
+
+class CorrectionKeeper:
+    """Keeps the corrections of one run for the next run of the same camera."""
+
+    def __init__(self, store: Path | None, start: Rig) -> None:
+        """Before the first correction.
+
+        Args:
+            store: the folder of a `CameraStore`; None: nothing is kept.
+            start: the rig at the run's start.
+
+        Raises:
+            StereoSfmError: the rig has no serial number, or its files are damaged.
+        """
+        self._store = None if store is None else CameraStore(store)
+        self._start = start
+        self._original = start if self._store is None else self._store.original(start)
+
+    def keep(self, correction: CalibrationUpdate) -> None:
+        """Keep a correction that was applied, in place of the run's earlier one; a warning if that is not possible."""
+        if self._store is not None and correction.applied:
+            try:
+                self._store.keep(self._original, with_terms(self._start, correction.terms))
+            except StereoSfmError as error:
+                log.warning("%s", error)
 
 
 def _write(rig: Rig, path: Path) -> None:

@@ -19,7 +19,8 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import U8, StereoImage
 
-MAX_PAIRS = 3
+MAX_PAIRS = 3  # of a recording that are examined
+SPACING = 5  # frames from one to the next
 CORNERS = 200  # searched in each pair
 MIN_DISPARITY_PX = -0.5  # points of smaller disparity lie behind the cameras
 MAX_ROW_ERROR_PX = 2.0

@@ -14,7 +14,6 @@ from stereo_sfm.commands._stop import INTERRUPTED, StopRequest
 from stereo_sfm.errors import StereoSfmError, from_os_error
 
 if TYPE_CHECKING:
-    from stereo_sfm.calib.rig import Rig
     from stereo_sfm.commands._step import Stepper
     from stereo_sfm.config import Config
     from stereo_sfm.drivers.choice import SourceChoice
@@ -65,6 +64,7 @@ class RunOptions:
 
 def execute(options: RunOptions) -> tuple[int, Path]:
     """Run, write the output folder, print the closing summary: the exit code and the folder."""
+    from stereo_sfm.calib.camera_store import CorrectionKeeper
     from stereo_sfm.drivers.choice import SourceChoice
     from stereo_sfm.eval.record import RunRecord
     from stereo_sfm.eval.run_results import write_results
@@ -75,11 +75,8 @@ def execute(options: RunOptions) -> tuple[int, Path]:
 
     o = options
     o.source.refuse_to_overwrite(o.output)
-    record, match_images, stepper = (
-        RunRecord.of(o.config, o.folders.localize_only),
-        _match_images(o.matches),
-        _stepper(o),
-    )
+    record = RunRecord.of(o.config, o.folders.localize_only)
+    match_images, stepper = _match_images(o.matches), _stepper(o)
     shown, wiring = CompilationProgress(), _wiring(o)
     sinks = [*_sinks(o, record, match_images), shown]
     session = Session(o.source, o.config, sinks, wiring, o.folders, o.output, o.overwrite, o.replayed)
@@ -100,7 +97,8 @@ def execute(options: RunOptions) -> tuple[int, Path]:
             o.max_lost_percent, why_not_started(images, record) if stop.since_s < LOOK_S else "",
             lambda: stop.since_s < LOOK_S,
         )  # fmt: skip
-        _keep_correction(o.source.camera_store, info.rig, record)
+        if record.calibrations:
+            CorrectionKeeper(o.source.camera_store, info.rig).keep(record.calibrations[-1])
         link_latest(folder)
     if not o.quiet:
         print("\n".join([*summary(stats, evaluations), f"written to {folder} (start with {folder / 'report.md'})"]))
@@ -113,15 +111,6 @@ def execute(options: RunOptions) -> tuple[int, Path]:
         print(f"stereo-sfm {o.command}: {failed}; see {folder / 'report.md'}", file=sys.stderr)
         return TRACKING_FAILED, folder
     return 0, folder
-
-
-def _keep_correction(store: Path | None, rig: Rig, record: RunRecord) -> None:
-    """Store what self-calibration corrected for the next run of the same camera."""
-    from stereo_sfm.calib.camera_store import CameraStore
-
-    applied = [c for c in record.calibrations if c.applied]
-    if store is not None and applied:
-        CameraStore(store).keep(rig, applied[-1].terms)
 
 
 def _wiring(options: RunOptions) -> Wiring:

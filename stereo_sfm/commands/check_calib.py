@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 SHUTTER_FRAMES = 200  # looked at for a rolling shutter
 MISTAKE = "images"  # finding of swapped or upside-down images, or an inverted transform
-MISTAKE_IMAGES, MISTAKE_SPACING = 3, 5  # images that are searched for it, and frames from one to the next
 FIXED_SHARE = 0.003  # of an image, from which on the robot in view is worth a mask
 SIDES = ("left", "right")
 
@@ -113,8 +112,10 @@ def _searched(images: Iterable[StereoImage], shutter: ReadoutSearch, masks: Mask
 
 def _first_kept(images: Iterable[StereoImage], first: list[StereoImage]) -> Iterator[StereoImage]:
     """Pass the images on, and keep some of the first."""
+    from stereo_sfm.calib.start import MAX_PAIRS, SPACING
+
     for number, image in enumerate(images):
-        if number % MISTAKE_SPACING == 0 and len(first) < MISTAKE_IMAGES:
+        if number % SPACING == 0 and len(first) < MAX_PAIRS:
             first.append(image)
         yield image
 

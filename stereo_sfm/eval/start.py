@@ -5,13 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from itertools import islice
 
-from stereo_sfm.calib.start import why_no_start
+from stereo_sfm.calib.start import MAX_PAIRS, SPACING, why_no_start
 from stereo_sfm.drivers.source import Source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.eval.record import RunRecord
-
-SPACING = 5  # frames between two checked images
-IMAGES = 3
 
 
 def why_not_started(opener: Callable[[], Source], record: RunRecord) -> str:
@@ -25,7 +22,7 @@ def why_not_started(opener: Callable[[], Source], record: RunRecord) -> str:
         return ""
     try:
         with opener() as source:
-            images = list(islice(source, 0, SPACING * (IMAGES - 1) + 1, SPACING))
+            images = list(islice(source, 0, SPACING * (MAX_PAIRS - 1) + 1, SPACING))
             return why_no_start(source.rig, images)
     except StereoSfmError:
         return ""

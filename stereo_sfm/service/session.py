@@ -8,10 +8,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from stereo_sfm.calib.camera_store import CameraStore
+from stereo_sfm.calib.camera_store import CorrectionKeeper
 from stereo_sfm.config import Config
 from stereo_sfm.drivers.choice import Opener
-from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.maps.folders import MapFolders
 from stereo_sfm.messages import Localized, LogLine, MapSaved
 from stereo_sfm.pipeline.images import SlotImage
@@ -23,7 +22,7 @@ from stereo_sfm.service.messages import Event, PoseUpdate, PreviewImage, Started
 from stereo_sfm.service.poses import HostClock, PoseConverter
 from stereo_sfm.service.recorder import Recorder
 from stereo_sfm.service.states import Facts
-from stereo_sfm.types import CalibrationUpdate, Frame, Keyframe, MapUpdate, Observations
+from stereo_sfm.types import Frame, Keyframe, MapUpdate, Observations
 
 log = logging.getLogger("stereo_sfm")
 
@@ -63,6 +62,7 @@ class Session:
             LogLine: self._line,
         }
         self._poses: PoseConverter | None = None
+        self._corrections: CorrectionKeeper | None = None
         self._map = MapCloudBuilder(number, hub.publish)
         self._run = ProcessRun(
             opener,
@@ -95,6 +95,7 @@ class Session:
                 info = run.info
                 self.serial = info.rig.serial
                 self._poses = PoseConverter(info.rig, self.number, self._clock)
+                self._corrections = CorrectionKeeper(self._opener.camera_store, info.rig)
                 opening = self._folders.opening(self._opener.opening(info.rig))
                 self._recorder.begin(run, self._config, self._opener.spec or info.name, opening)
                 self._hub.publish(Started(self.number, info.name, info.rig, info.live))
@@ -179,16 +180,9 @@ class Session:
         assert self._poses is not None
         self._poses.update(update)
         self._map.put(update)
-        if update.calibration is not None and update.calibration.applied:
-            self._keep(update.calibration)
-
-    def _keep(self, correction: CalibrationUpdate) -> None:
-        store = self._opener.camera_store
-        if store is not None:
-            try:
-                CameraStore(store).keep(self._run.info.rig, correction.terms)
-            except StereoSfmError as error:
-                log.warning("%s", error)
+        if update.calibration is not None:
+            assert self._corrections is not None
+            self._corrections.keep(update.calibration)
 
     def _localize(self, message: Localized) -> None:
         assert self._poses is not None

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from stereo_sfm.calib import load_rig, save_rig
-from stereo_sfm.calib.camera_store import CameraStore
+from stereo_sfm.calib.camera_store import CameraStore, CorrectionKeeper
 from stereo_sfm.calib.choice import with_terms
 from stereo_sfm.calib.formats.native import rig_to_text
 from stereo_sfm.calib.rig import Rig
@@ -20,6 +20,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.recorded import read_run
+from stereo_sfm.types import F64, CalibrationUpdate
 from tests.synthetic import fisheye_rig
 
 TERMS = np.array([0.002, -0.001, 0, 0, 0, 0])
@@ -31,34 +32,48 @@ def rig() -> Rig:
     return replace(fisheye_rig(), serial="0000D0C0FFEE")
 
 
+def applied(terms: F64) -> CalibrationUpdate:
+    return CalibrationUpdate(1, 0, 0, terms, np.eye(6), 0, True, "significant", "")
+
+
 def test_the_next_run_starts_with_the_correction(rig: Rig, tmp_path: Path) -> None:
     store = CameraStore(tmp_path / "cameras")
     assert store.corrected(rig) is rig
-    store.keep(rig, TERMS)
+    first = CorrectionKeeper(store.folder, rig)
+    for share in (0.5, 1.0):  # the last of a run replaces its earlier ones
+        first.keep(applied(share * TERMS))
     second = store.corrected(rig)
     assert rig_to_text(second) == rig_to_text(with_terms(rig, TERMS))
-    store.keep(second, 0.1 * TERMS)  # a run that started with the correction refines it
+    next_run = CorrectionKeeper(store.folder, second)
+    for share in (0.3, 0.1):  # a run that started with the correction refines it
+        next_run.keep(applied(share * TERMS))
     third = store.corrected(rig)
     assert rig_to_text(third) == rig_to_text(with_terms(second, 0.1 * TERMS))
-    assert sorted(p.name for p in (tmp_path / "cameras").iterdir()) == [
+    assert sorted(p.name for p in store.folder.iterdir()) == [
         "0000D0C0FFEE.original.yaml", "0000D0C0FFEE.yaml"
     ]  # fmt: skip
+
+
+def test_what_is_only_reported_or_has_no_store_is_not_kept(rig: Rig, tmp_path: Path) -> None:
+    CorrectionKeeper(tmp_path, rig).keep(replace(applied(TERMS), applied=False))
+    CorrectionKeeper(None, rig).keep(applied(TERMS))
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_camera_that_was_calibrated_anew_is_not_corrected(
     rig: Rig, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     store = CameraStore(tmp_path)
-    store.keep(rig, TERMS)
+    store.keep(rig, with_terms(rig, TERMS))
     anew = with_terms(rig, np.array([0, 0, 0.001, 0, 0, 0]))
     assert store.corrected(anew) is anew and "corrects another calibration" in caplog.text
-    store.keep(anew, TERMS)
+    CorrectionKeeper(tmp_path, anew).keep(applied(TERMS))
     assert rig_to_text(store.corrected(anew)) == rig_to_text(with_terms(anew, TERMS))
 
 
 def test_cameras_do_not_share_corrections(rig: Rig, tmp_path: Path) -> None:
     store = CameraStore(tmp_path)
-    store.keep(rig, TERMS)
+    store.keep(rig, with_terms(rig, TERMS))
     other = replace(rig, serial="OTHER")
     assert store.corrected(other) is other
 
@@ -69,16 +84,19 @@ def test_a_serial_number_that_is_no_file_name(rig: Rig, serial: str, tmp_path: P
         CameraStore(tmp_path).corrected(replace(rig, serial=serial))
 
 
-def test_a_folder_that_cannot_be_written(rig: Rig, tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_does_not_end_a_run(
+    rig: Rig, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    keeper = CorrectionKeeper(tmp_path / "file", rig)
     (tmp_path / "file").write_text("")
-    with pytest.raises(StereoSfmError, match="the corrected calibration is not kept"):
-        CameraStore(tmp_path / "file").keep(rig, TERMS)
+    keeper.keep(applied(TERMS))
+    assert "the corrected calibration is not kept" in caplog.text
 
 
 def test_a_source_has_the_corrected_rig_and_a_log_records_it(tmp_path: Path) -> None:
     with open_source(SPEC) as source:
         rig = replace(source.rig, serial="A1")
-    CameraStore(tmp_path).keep(rig, TERMS)
+    CameraStore(tmp_path).keep(rig, with_terms(rig, TERMS))
     choice = SourceChoice.of(SPEC, rig, camera_store=tmp_path)
     with choice() as source:
         assert rig_to_text(source.rig) == rig_to_text(with_terms(rig, TERMS))
