@@ -19,8 +19,8 @@ from stereo_sfm.tracking.factory import make_tracker
 from stereo_sfm.tracking.flow.coarse_rotation import CoarseRotation
 from stereo_sfm.tracking.flow.klt import FLAT_SIZE, build_pyramid
 from stereo_sfm.tracking.flow.reappearance import find_deformed
+from stereo_sfm.tracking.inertial.inertial_filter import MIN_S
 from stereo_sfm.tracking.inertial.inertial_motion import NODE_NS, InertialMotion
-from stereo_sfm.tracking.inertial.window import MIN_S
 from stereo_sfm.types import F64, U8, Corners, ImuSamples, Keyframe, StereoImage
 
 FRAMES, POINTS = 8, 300

@@ -145,6 +145,35 @@ def test_a_sensor_that_contradicts_the_images_is_left_out(wrong: str) -> None:
     np.testing.assert_array_equal(motion.predict(round(6.05e9), expected), expected)
 
 
+@pytest.mark.parametrize("wrong", ["axes", "scale"])
+def test_an_accelerometer_that_contradicts_the_images_is_left_out(wrong: str) -> None:
+    good = Session().samples()
+    accel = good.accel[:, [1, 2, 0]] if wrong == "axes" else 1.2 * good.accel
+    motion = follow(Session(), 8.0, ImuSamples(good.stamp_ns, good.gyro, accel))
+    assert motion.left_out == "accelerometer_contradicts_images" and motion.bridge(round(7.9e9)) is None
+
+
+def test_a_bias_that_was_found_in_turns_is_remembered() -> None:
+    """After the turns a level drive straight ahead: gravity stays right, though the bias is no longer to be seen."""
+    motion = InertialMotion(Imu(left_T_imu=np.eye(4), accel_walk=1e-3))
+    rng, bias, heading, position = np.random.default_rng(1), np.array([0.04, 0.0, -0.05]), 0.0, np.zeros(3)
+    for k in range(40 * 20):  # y is down
+        turning = 0.6 * np.sin(0.5 * k / 20) if k < 20 * 20 else 0.0
+        stamps = k * FRAME_NS + np.arange(RATE_NS, FRAME_NS + 1, RATE_NS)
+        accel = np.tile(np.array([0.0, -GRAVITY, 0.0]) + bias, (len(stamps), 1))
+        gyro = np.tile([0.0, turning, 0.0], (len(stamps), 1))
+        noise = rng.normal(0, 1, (len(stamps), 6)) * np.repeat([2e-3, 3e-2], 3)
+        motion.feed(ImuSamples(stamps, gyro + noise[:, :3], accel + noise[:, 3:]))
+        heading += turning * 0.05
+        turned = se3.so3_exp(np.array([0.0, heading, 0.0]) + rng.normal(0, 1e-4, 3))
+        motion.accept(round(stamps[-1]), se3.from_rotation_translation(turned, position + rng.normal(0, 5e-4, 3)))
+    state = motion.state
+    assert state is not None
+    np.testing.assert_allclose(state.accel_bias[[0, 2]], bias[[0, 2]], atol=0.01)
+    off = np.linalg.norm(state.gravity[[0, 2]]) / GRAVITY
+    assert off < np.radians(0.1) and state.tilt_sigma < np.radians(0.1)
+
+
 def test_gaps_doubles_disorder_and_separate_accelerations() -> None:
     session = Session(seconds=2.0)
     good = session.samples()

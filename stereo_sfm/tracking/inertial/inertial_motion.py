@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,12 +10,12 @@ import numpy as np
 from stereo_sfm.calib.imu import Imu
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.preintegration import GRAVITY, Preintegrated, preintegrate
+from stereo_sfm.tracking.inertial.inertial_filter import WRONG_CHI2, InertialFilter, InertialState
 from stereo_sfm.tracking.inertial.rest import STILL_NS
 from stereo_sfm.tracking.inertial.sample_buffer import Intervals, SampleBuffer
-from stereo_sfm.tracking.inertial.window import InertialState, InertialWindow
 from stereo_sfm.types import F64, I64, ImuSamples
 
-NODE_NS = 200_000_000  # between the poses of the window
+NODE_NS = 200_000_000  # between the poses of the filter
 MAX_TURN_ERROR = 0.1  # rad/s between gyroscope and images, root mean square: more is another sensor's data
 JUDGED = 20  # intervals for the comparison with the images
 MAX_GRAVITY_ERROR = 1.0  # m/s^2 of its size
@@ -40,7 +41,7 @@ class InertialMotion:
     def __init__(self, imu: Imu) -> None:
         self._imu = imu
         self._buffer = SampleBuffer(imu)
-        self._window = InertialWindow()
+        self._filter = InertialFilter(imu)
         self._state: InertialState | None = None
         self._node_ns = self._last_ns = 0
         self._odom_T_node: F64 = np.eye(4)
@@ -49,11 +50,12 @@ class InertialMotion:
         self._begun = False
         self._integrated: dict[tuple[int, int], Preintegrated | None] = {}  # by interval, since the last samples
         self._turn_errors: list[float] = []  # squared, rad/s
+        self._moves_wrong: deque[bool] = deque(maxlen=JUDGED)
         self.left_out = ""  # why the sensor is not used
 
     @property
     def state(self) -> InertialState | None:
-        """Velocity, gravity and biases at the newest pose of the window; None while they are not known."""
+        """Velocity, gravity and biases at the newest pose of the filter; None while they are not known."""
         return self._state
 
     def level(self, odom_T_cam: F64) -> tuple[float, float] | None:
@@ -77,7 +79,7 @@ class InertialMotion:
         self._restart(stamp_ns, odom_T_cam @ self._imu.left_T_imu)
 
     def _restart(self, stamp_ns: int, odom_T_imu: F64) -> None:
-        self._window.begin(odom_T_imu)
+        self._filter.begin(odom_T_imu)
         self._node_ns = self._last_ns = stamp_ns
         self._odom_T_node = self._odom_T_last = odom_T_imu
 
@@ -112,11 +114,11 @@ class InertialMotion:
             self._state = None
             self._restart(stamp_ns, odom_T_imu)
             return
-        self._window.add(motion, odom_T_imu)
+        self._moves_wrong.append(self._filter.add(motion, odom_T_imu) > WRONG_CHI2)
         self._node_ns, self._odom_T_node = stamp_ns, odom_T_imu
         self._buffer.forget(stamp_ns)
-        self._state = None if self.left_out else self._window.estimate()
-        self._gyro_bias = self._window.gyro_bias()[0] if self._state is None else self._state.gyro_bias
+        self._state = None if self.left_out else self._filter.estimate()
+        self._gyro_bias = self._filter.gyro_bias() if self._state is None else self._state.gyro_bias
         self._integrated.clear()
 
     def bridge(self, stamp_ns: int) -> tuple[F64, F64] | None:
@@ -173,7 +175,7 @@ class InertialMotion:
         )  # fmt: skip
 
     def _velocity(self) -> F64:
-        """(3,) m/s of the IMU at the last pose: the window's, taken on from its newest pose."""
+        """(3,) m/s of the IMU at the last pose: the filter's, taken on from its newest pose."""
         assert self._state is not None
         motion = self._motion(self._node_ns, self._last_ns) if self._last_ns > self._node_ns else None
         if motion is None:
@@ -190,10 +192,10 @@ class InertialMotion:
         error = float(np.linalg.norm(se3.so3_log(motion.rotation.T @ seen))) / motion.seconds
         self._turn_errors = [*self._turn_errors[1 - JUDGED :], error * error]
         wrong = len(self._turn_errors) >= JUDGED and np.sqrt(np.mean(self._turn_errors)) > MAX_TURN_ERROR
-        size = 0.0 if self._state is None else abs(float(np.linalg.norm(self._state.gravity)) - GRAVITY)
+        size = 0.0 if self._state is None else abs(self._filter.force - GRAVITY)
         if wrong:
             self.left_out = "gyro_contradicts_images"
-        elif size > MAX_GRAVITY_ERROR:
+        elif size > MAX_GRAVITY_ERROR or sum(self._moves_wrong) > JUDGED // 2:
             self.left_out = "accelerometer_contradicts_images"
         elif self.left_out and len(self._turn_errors) >= JUDGED:
             self.left_out = ""
