@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from stereo_sfm.drivers.source import Source
 
 # names of the scenes in stereo_sfm.drivers.sim.scenes, which is slow to import
-SCENES = ("aisle", "loop", "identical-aisles", "people", "dark", "blank", "demo", "big", "sparse")
+SCENES = ("aisle", "loop", "identical-aisles", "people", "dark", "blank", "demo", "big", "sparse", "market")
 DEFAULT = "loop"
 
 

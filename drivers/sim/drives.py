@@ -2,7 +2,7 @@
 
 A route is a polyline on the floor, driven at a varying speed and smoothed over time by a Gaussian, so that corners
 become curves; position and heading are then cubic splines of time (twice continuously differentiable), and a few sines
-with the frequencies of steps and wheels are added.
+with the frequencies of steps and wheels are added. The path of a real robot is smoothed in the same way.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from stereo_sfm.types import F64
 
 FORWARD = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])  # world_R_cam of a camera that looks along x, upright
 _RATE = 120.0  # samples a second of the dense route
+_PATH_RATE = 40.0  # of a recorded path
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,7 @@ class Gait:
     vibration: float = 1.0  # scale of the vibration
     turn_seconds: float = 0.65  # Gaussian width that rounds the corners
     rest_seconds: float = 1.0  # at rest before the drive
+    ahead: float = 0.0  # metres from the robot's axle to the camera
 
 
 class Drive:
@@ -39,30 +41,56 @@ class Drive:
         """`route`: (N, 2) metres, driven for `length` metres at most."""
         self.gait = gait
         t, arc = _progress(gait, rng, length, route)
-        self.duration = float(t[-1])
         corners = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(route, axis=0), axis=1))])
         sigma = gait.turn_seconds * _RATE
         xy = np.stack([np.interp(arc, corners, route[:, i]) for i in (0, 1)], -1)
         xy = gaussian_filter1d(xy, sigma, axis=0, mode="nearest")
         heading = gaussian_filter1d(_heading(xy, route), 0.4 * sigma, mode="nearest")
-        self._path = CubicSpline(t, np.column_stack([xy, heading]))
+        self._follow(t, arc, np.column_stack([xy, heading]), rng)
+
+    @classmethod
+    def along(cls, seconds: F64, course: F64, gait: Gait, rng: np.random.Generator, length: float) -> Drive:
+        """A drive along the recorded course of a robot: its times, its heading, its rests.
+
+        Args:
+            seconds: (N,) from 0, ascending. course: (N, 3) x, y (metres), heading (radians, unwrapped).
+            gait: its speed 0 keeps the recorded times, another scales them all to that mean.
+            length: metres driven at most; 0: all.
+        """
+        self = cls.__new__(cls)
+        self.gait = gait
+        driven = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(course[:, :2], axis=0), axis=1))])
+        if gait.speed > 0 and driven[-1] > 0:
+            seconds = seconds * (driven[-1] / gait.speed / seconds[-1])
+        stop = float(np.interp(length, driven, seconds)) if 0 < length < driven[-1] else float(seconds[-1])
+        t = np.arange(0, gait.rest_seconds + stop + 1 / _PATH_RATE, 1 / _PATH_RATE)
+        sampled = np.column_stack([np.interp(t - gait.rest_seconds, seconds, course[:, i]) for i in range(3)])
+        smooth = gaussian_filter1d(sampled, gait.turn_seconds * _PATH_RATE, axis=0, mode="nearest")
+        arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(smooth[:, :2], axis=0), axis=1))])
+        self._follow(t, arc, smooth, rng)
+        return self
+
+    def _follow(self, t: F64, arc: F64, course: F64, rng: np.random.Generator) -> None:
+        """Be at `course` (N, 3) after `arc` (N,) metres at the times (N,), and vibrate."""
+        self.duration = float(t[-1])
+        self._path = CubicSpline(t, course)
         self._times, self._arc = t, arc
-        self._sines = _sines(rng, gait.vibration)
+        self._sines = _sines(rng, self.gait.vibration)
 
     def distance(self, seconds: float) -> float:
-        """Metres driven along the route."""
-        return float(np.interp(seconds, self._times, self._arc))
+        """Metres along the route at which the camera is."""
+        return float(np.interp(seconds, self._times, self._arc)) + self.gait.ahead
 
     def when(self, metres: float) -> float:
-        """Seconds until so many metres are driven; the end of the drive if it is shorter."""
-        return float(np.interp(metres, self._arc, self._times))
+        """Seconds until the camera is so many metres along the route; the end of the drive if it is shorter."""
+        return float(np.interp(metres - self.gait.ahead, self._arc, self._times))
 
     def place(self, metres: float, aside: float = 0.0) -> tuple[F64, float]:
         """Position (2,) and heading in radians after some metres of the route, `aside` metres to the left of it.
 
         Before its start and beyond its end the route is extended in a straight line.
         """
-        x, y, heading = self._path(self.when(metres)).tolist()
+        x, y, heading = self._path(float(np.interp(metres, self._arc, self._times))).tolist()
         ahead, left = np.array([np.cos(heading), np.sin(heading)]), np.array([-np.sin(heading), np.cos(heading)])
         beyond = metres - float(np.clip(metres, 0.0, self._arc[-1]))
         return np.array([x, y]) + beyond * ahead + aside * left, heading
@@ -82,9 +110,10 @@ class Drive:
         return np.asarray(self._path(seconds, derivative), float)
 
     @property
-    def robot_R_cam(self) -> F64:
-        """(3, 3) from the camera without vibration to the robot's axes: x ahead, z up."""
-        return FORWARD @ se3.so3_exp(np.array([np.deg2rad(self.gait.pitch_deg), 0, 0]))
+    def robot_T_cam(self) -> F64:
+        """(4, 4) from the camera without vibration to the robot's axes: x ahead, z up, at the camera's height."""
+        rotation = FORWARD @ se3.so3_exp(np.array([np.deg2rad(self.gait.pitch_deg), 0, 0]))
+        return se3.from_rotation_translation(rotation, np.array([self.gait.ahead, 0.0, 0.0]))
 
     def steady(self, seconds: F64) -> F64:
         """`poses` without vibration."""
@@ -93,8 +122,7 @@ class Drive:
             se3.so3_exp(np.stack([0 * heading, 0 * heading, heading], -1)),
             np.stack([x, y, np.full_like(x, self.gait.height)], -1),
         )
-        robot_T_cam = se3.from_rotation_translation(self.robot_R_cam, np.zeros(3))
-        return world_T_robot @ robot_T_cam
+        return world_T_robot @ self.robot_T_cam
 
 
 def _progress(gait: Gait, rng: np.random.Generator, length: float, route: F64) -> tuple[F64, F64]:

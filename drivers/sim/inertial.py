@@ -87,9 +87,8 @@ class InertialSensor:
         world_T_imu is a rotation about the vertical and a translation on a spline, times the vibration. Derivatives of
         the first are those of the spline; those of the second, a few sines, are differences of eighth order.
         """
-        steady = se3.from_rotation_translation(self._drive.robot_R_cam, np.zeros(3))
         around = self._drive.shake(np.add.outer(seconds, _AROUND).ravel())
-        robot_T_imu = (steady @ around @ self.imu.left_T_imu).reshape(-1, len(_AROUND), 4, 4)
+        robot_T_imu = (self._drive.robot_T_cam @ around @ self.imu.left_T_imu).reshape(-1, len(_AROUND), 4, 4)
         now = robot_T_imu[:, len(_AROUND) // 2]
         speed = np.einsum("k,nkij->nij", _FIRST, robot_T_imu)
         acceleration = np.einsum("k,nki->ni", _SECOND, robot_T_imu[..., :3, 3])

@@ -9,6 +9,7 @@ import numpy as np
 
 from stereo_sfm.drivers.sim.drives import FORWARD, Gait
 from stereo_sfm.drivers.sim.effects import Effects
+from stereo_sfm.drivers.sim.market import Market
 from stereo_sfm.drivers.sim.people import Appearance, Person
 from stereo_sfm.drivers.sim.world import CLOTHES, HAIR, Layout
 from stereo_sfm.geometry import se3
@@ -21,9 +22,9 @@ Route = Callable[[Layout, int, bool], F64]  # (layout, session number, returns) 
 class Scene:
     """The part of a simulated recording that its name determines."""
 
-    layout: Layout
-    route: Route
-    length: float  # metres driven, if the route is as long
+    layout: Layout | Market
+    route: Route = lambda _layout, _session, _returns: np.zeros((0, 2))  # a market's sessions are paths
+    length: float = 0.0  # metres driven, if the route is as long
     effects: Effects = field(default_factory=Effects)
     gait: Gait = field(default_factory=Gait)
     people: int = 0
@@ -74,6 +75,7 @@ def _serpentine(layout: Layout, session: int, returns: bool) -> F64:
 _STORE = Layout()
 _DARK = Effects(exposure_s=0.012, gain=0.3, drift=0.2, read_noise=3.5, shot_noise=0.3, black_level=6.0)
 
+MARKET = "market"  # its plan depends on paths: stereo_sfm.drivers.sim.market
 SCENES: dict[str, Scene] = {
     "aisle": Scene(_STORE, _aisle, 14.0),
     "loop": Scene(_STORE, _loop, 42.0),
@@ -99,9 +101,9 @@ def random_poses(layout: Layout, count: int, rng: np.random.Generator) -> F64:
     return poses
 
 
-def crowd(scene: Scene, count: int, rng: np.random.Generator) -> list[Person]:
+def crowd(layout: Layout, count: int, rng: np.random.Generator) -> list[Person]:
     """People who walk along the aisles and across their ends."""
-    layout, out = scene.layout, list[Person]()
+    out: list[Person] = []
     a, b = _ends(layout)
     for n in range(count):
         if n % 3 == 2:

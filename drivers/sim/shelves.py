@@ -40,6 +40,19 @@ class Shop:
     order: np.random.Generator  # which facings are sold out, and how far the others are set back
     gaps: float  # fraction of facings that are sold out
     setback: float  # metres, largest setback of a product row
+    nights: int = 0  # in each of which that fraction of the rows is exchanged; 0: once
+    night_seed: tuple[int, ...] = ()
+
+
+def _shown(shop: Shop, p: Product, row: int) -> Product:
+    """The product whose textures a row of facings planned for `p` shows."""
+    if not shop.nights:
+        if shop.changes.random() < shop.exchange:
+            return shop.products[int(shop.changes.integers(len(shop.products)))]
+        return p
+    draws = np.random.default_rng([*shop.night_seed, row]).random((shop.nights, 2))  # a longer time begins the same
+    exchanged = np.flatnonzero(draws[:, 0] < shop.exchange)
+    return shop.products[int(draws[exchanged[-1], 1] * len(shop.products))] if len(exchanged) else p
 
 
 def make_products(rng: np.random.Generator, atlas: Atlas, count: int) -> list[Product]:
@@ -95,9 +108,7 @@ def _fill_level(
         count = int(plan.integers(1, 7)) if p.wide < 0.16 else int(plan.integers(1, 4))
         gap = float(plan.uniform(0.002, 0.012))
         rows = max(1, min(int((clear - 0.03) / p.high), int(plan.integers(1, 5))))
-        shown = p
-        if shop.changes.random() < shop.exchange:
-            shown = shop.products[int(shop.changes.integers(len(shop.products)))]
+        shown = _shown(shop, p, len(b.facings))
         pitch = p.wide + gap
         fits = min(count, int((end - u) / pitch))
         missing = shop.fill < 1 and plan.random() >= shop.fill

@@ -6,21 +6,25 @@ import dataclasses
 import functools
 import time
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from stereo_sfm.drivers.rig_option import chosen_rig
-from stereo_sfm.drivers.sim.drives import Drive
+from stereo_sfm.drivers.sim.drives import Drive, Gait
 from stereo_sfm.drivers.sim.effects import CLEAN, Effects, Sensor, brightness
-from stereo_sfm.drivers.sim.encounters import plan, present
+from stereo_sfm.drivers.sim.encounters import plan as plan_encounters
+from stereo_sfm.drivers.sim.encounters import present
 from stereo_sfm.drivers.sim.inertial import InertialSensor
 from stereo_sfm.drivers.sim.kernels import PERSON
+from stereo_sfm.drivers.sim.market import GAIT, Market, build_market, plan, session_path, shoppers
 from stereo_sfm.drivers.sim.options import SimOptions
+from stereo_sfm.drivers.sim.paths import RobotPath, joined, read_paths
 from stereo_sfm.drivers.sim.people import crowd_at, moving
 from stereo_sfm.drivers.sim.render import Renderer, View
 from stereo_sfm.drivers.sim.rigs import make_rig
 from stereo_sfm.drivers.sim.robot import RobotView
-from stereo_sfm.drivers.sim.scenes import SCENES, Scene, crowd
+from stereo_sfm.drivers.sim.scenes import MARKET, SCENES, Scene, crowd
 from stereo_sfm.drivers.sim.tables import Tables
 from stereo_sfm.drivers.sim.wheels import WheelSensor
 from stereo_sfm.drivers.sim.world import Layout, build_world
@@ -33,8 +37,10 @@ _EPOCH_NS = 1_000_000_000
 
 
 @functools.lru_cache(maxsize=2)
-def _world(layout: Layout, seed: int, exchange: float) -> Tables:
-    return build_world(layout, seed, exchange)
+def _world(layout: Layout | Market, seed: int, exchange: float, nights: int) -> Tables:
+    if isinstance(layout, Market):
+        return build_market(layout, seed, exchange, nights)
+    return build_world(layout, seed, exchange, nights)
 
 
 def _effects(scene: Scene, options: SimOptions) -> Effects:
@@ -58,6 +64,23 @@ def _noise_key(seed: int, frame_id: int, side: int) -> int:
     return int(np.random.SeedSequence([seed, frame_id, side]).generate_state(1, np.uint64)[0])
 
 
+def _check_inside(path: RobotPath, layout: Layout) -> None:
+    """Raises:
+    StereoSfmError: the path leads out of the store or through its gondolas.
+    """
+    at = path.course[:, :2]
+    out = ((at < 0.3) | (at > np.array(layout.room[:2]) - 0.3)).any(1)
+    x0, x1, half = layout.margin, layout.margin + layout.gondola_length, layout.gondola_depth + 0.1
+    for k in range(layout.gondolas):
+        out |= (at[:, 0] > x0) & (at[:, 0] < x1) & (np.abs(at[:, 1] - layout.gondola_y(k)) < half)
+    if out.any():
+        x, y = at[int(np.argmax(out))]
+        raise StereoSfmError(
+            f"sim: the path leads to ({x:.1f}, {y:.1f}) m, into a wall or a shelf of this {layout.room[0]:.0f} x"
+            f" {layout.room[1]:.0f} m store: move it, or let sim:market build a store around it"
+        )
+
+
 class SimSource(BaseSource):
     """A source (stereo_sfm.drivers.source.Source) that can also render single frames, with the same bits."""
 
@@ -77,9 +100,7 @@ class SimSource(BaseSource):
             rest_seconds=options.rest or scene.gait.rest_seconds,
             vibration=scene.gait.vibration * options.vibration,
         )
-        route = scene.route(scene.layout, options.walk, options.returns)
-        rng = np.random.default_rng([options.seed, options.walk, 31])
-        self.drive = Drive(route, gait, rng, options.length or scene.length)
+        self.drive = self._drive(scene, gait)
         self._inertial = None
         if options.imu:
             seeds = np.random.default_rng([options.seed, options.walk, 83])
@@ -98,12 +119,33 @@ class SimSource(BaseSource):
             )
             self.rig = self._camera = dataclasses.replace(self.rig, wheel=self._wheels.wheel)
         count = scene.people if options.people < 0 else options.people
-        self.people = crowd(scene, count, np.random.default_rng([options.seed, 47]))
-        self.encounters = plan(options.encounters, self.drive, np.random.default_rng([options.seed, options.walk, 71]))
+        people = np.random.default_rng([options.seed, 47])
+        if isinstance(scene.layout, Market):
+            self.people = shoppers(plan(options.path)[1], count, people)
+        else:
+            self.people = crowd(scene.layout, count, people)
+        self.encounters = plan_encounters(
+            options.encounters, self.drive, np.random.default_rng([options.seed, options.walk, 71])
+        )
         self._choose_frames()
         self._renderer: Renderer | None = None
         self._small_renderer: Renderer | None = None  # for `moving_share`
         self._sensors: list[Sensor] = []
+
+    def _drive(self, scene: Scene, gait: Gait) -> Drive:
+        """Along the scene's route or a recorded path."""
+        o = self.options
+        rng = np.random.default_rng([o.seed, o.walk, 31])
+        if isinstance(scene.layout, Market):
+            path = session_path(plan(o.path)[1], o.walk, o.length, rng)
+        elif o.path:
+            path = joined(read_paths(Path(o.path)))
+            _check_inside(path, scene.layout)
+            gait = dataclasses.replace(gait, speed=o.speed)
+        else:
+            route = scene.route(scene.layout, o.walk, o.returns)
+            return Drive(route, gait, rng, o.length or scene.length)
+        return Drive.along(path.seconds, path.course, gait, rng, o.length)
 
     def _choose_frames(self) -> None:
         """Select the frames that arrive, and their ground truth."""
@@ -130,7 +172,7 @@ class SimSource(BaseSource):
     @property
     def world(self) -> Tables:
         """The store, built when first needed."""
-        return _world(self.layout, self.options.seed, self.options.exchange)
+        return _world(self.layout, self.options.seed, self.options.exchange, self.options.nights)
 
     @property
     def renderer(self) -> Renderer:
@@ -247,6 +289,9 @@ def open_sim(scene: str, options: SimOptions) -> SimSource:
     Raises:
         StereoSfmError: incompatible options.
     """
-    source = SimSource(scene, SCENES[scene], options)
+    if scene == MARKET:
+        source = SimSource(scene, Scene(plan(options.path)[0], gait=GAIT), options)
+    else:
+        source = SimSource(scene, SCENES[scene], options)
     source.rig = chosen_rig(options.rig, lambda: source.rig)
     return source

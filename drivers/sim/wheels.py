@@ -48,11 +48,10 @@ class WheelSensor:
         offset_s: its clock minus the camera's.
         """
         self._drive, self._twist, count = drive, model == "twist", _WHEELS[model]
-        robot_T_cam = se3.from_rotation_translation(drive.robot_R_cam, np.zeros(3))
         below = se3.from_rotation_translation(np.eye(3), np.array([0.0, 0.0, -drive.gait.height]))
         self._driven = Wheel(
-            se3.inverse(robot_T_cam) @ below, "differential" if self._twist else model, (RADIUS_M,) * count, TRACK_M,
-            WHEELBASE_M, rate_hz=RATE_HZ, offset_s=offset_s,
+            se3.inverse(drive.robot_T_cam) @ below, "differential" if self._twist else model, (RADIUS_M,) * count,
+            TRACK_M, WHEELBASE_M, rate_hz=RATE_HZ, offset_s=offset_s,
         )  # fmt: skip
         self.wheel = replace(self._driven, model=model, radii_m=()) if self._twist else self._driven
         self._speeds = self._measured(GRADES[grade], slip, rng)

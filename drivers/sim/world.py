@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stereo_sfm.drivers.sim import textures
+from stereo_sfm.drivers.sim.atlas import Atlas
 from stereo_sfm.drivers.sim.shelves import Shop, add_shelf, board_heights, make_products
 from stereo_sfm.drivers.sim.tables import Builder, Tables, make_tables
 
@@ -44,7 +45,7 @@ class Layout:
         return self.aisle_pitch * (k + 0.5) + (0.2 if k == 0 else (-0.2 if k == self.gondolas else 0.0))
 
 
-def _shelf_pair(
+def add_shelf_pair(
     b: Builder,
     shop: Shop,
     plan: np.random.Generator,
@@ -66,14 +67,15 @@ def _shelf_pair(
         add_shelf(b, shop, plan, box, facing, heights)
 
 
-def _gondola(b: Builder, shop: Shop, seed: tuple[int, ...], k: int, layout: Layout) -> None:
-    """Two sides and two end caps."""
-    plan = np.random.default_rng([*seed, 1, 0 if layout.identical else k + 1])
-    first, y = len(b.blocks), layout.gondola_y(k)
-    x0, x1 = layout.margin, layout.margin + layout.gondola_length
+def add_gondola(
+    b: Builder, shop: Shop, plan: np.random.Generator, span: tuple[float, float], y: float, layout: Layout
+) -> None:
+    """Two sides and two end caps, from x to x around the middle y."""
+    first = len(b.blocks)
+    x0, x1 = span
     cap = 0.45
-    _shelf_pair(b, shop, plan, (x0 + cap, x1 - cap), y, FACING_MINUS_Y, layout)
-    _shelf_pair(b, shop, plan, (x0 + cap, x1 - cap), y, FACING_PLUS_Y, layout)
+    add_shelf_pair(b, shop, plan, (x0 + cap, x1 - cap), y, FACING_MINUS_Y, layout)
+    add_shelf_pair(b, shop, plan, (x0 + cap, x1 - cap), y, FACING_PLUS_Y, layout)
     half = layout.gondola_depth
     for facing, lo, hi in ((FACING_MINUS_X, x0, x0 + cap), (FACING_PLUS_X, x1 - cap, x1)):
         heights = [0.16, *board_heights(plan, 0.56, 1.6)]
@@ -87,7 +89,7 @@ def _walls(b: Builder, shop: Shop, seed: tuple[int, ...], layout: Layout) -> Non
     x1, y1, _ = layout.room
     for facing, y in ((FACING_PLUS_Y, 0.0), (FACING_MINUS_Y, y1)):
         first = len(b.blocks)
-        _shelf_pair(b, shop, plan, (1.5, x1 - 1.5), y, facing, layout)
+        add_shelf_pair(b, shop, plan, (1.5, x1 - 1.5), y, facing, layout)
         b.end_group(first)
     for x, face in ((0.0, 1), (x1, 0)):
         first, y = len(b.blocks), 0.6
@@ -131,19 +133,37 @@ def _furniture(b: Builder, shop: Shop, seed: tuple[int, ...], layout: Layout) ->
         b.end_group(first)
 
 
-def build_world(layout: Layout | None = None, seed: int = 0, exchange: float = 0.0) -> Tables:
+def build_world(layout: Layout | None = None, seed: int = 0, exchange: float = 0.0, nights: int = 0) -> Tables:
     """Build the store.
 
     Args:
         layout: its plan. seed: products, labels and stock.
         exchange: fraction of the product rows with another product than at 0.
+        nights: in each of which that fraction is exchanged; 0: once.
     """
     layout = layout or Layout()
     b, root = Builder(), (seed, 17)
     rng = np.random.default_rng([*root, 0])
+    shop = open_shop(b, rng, root, layout, (exchange, nights))
+    for k in range(layout.gondolas):
+        plan = np.random.default_rng([*root, 1, 0 if layout.identical else k + 1])
+        span = (layout.margin, layout.margin + layout.gondola_length)
+        add_gondola(b, shop, plan, span, layout.gondola_y(k), layout)
+    _walls(b, shop, root, layout)
+    _furniture(b, shop, root, layout)
+    return make_tables(b.atlas, layout.room, add_surfaces(b.atlas, rng, layout.room), b)
+
+
+def open_shop(
+    b: Builder, rng: np.random.Generator, root: tuple[int, ...], layout: Layout, changes: tuple[float, int]
+) -> Shop:
+    """The products and textures that all shelves of a store have in common; `root` seeds its generators.
+
+    `changes`: exchange and nights as of `build_world`.
+    """
     atlas = b.atlas
     products = make_products(rng, atlas, layout.products)
-    shop = Shop(
+    return Shop(
         products,
         [atlas.add(textures.price_rail(rng), (1.8, 0.04), wrap=True) for _ in range(3)],
         atlas.add(textures.board(rng), (0.4, 0.4), wrap=True),
@@ -151,23 +171,27 @@ def build_world(layout: Layout | None = None, seed: int = 0, exchange: float = 0
         atlas.add(textures.wall(rng, 256), (0.9, 0.9), wrap=True),
         np.random.default_rng([*root, 6]),
         np.random.default_rng([*root, 5]),
-        exchange,
+        changes[0],
         layout.fill,
         np.random.default_rng([*root, 8]),
         layout.gaps,
         layout.setback,
+        changes[1],
+        (*root, 9),
     )
-    for k in range(layout.gondolas):
-        _gondola(b, shop, root, k, layout)
-    _walls(b, shop, root, layout)
-    _furniture(b, shop, root, layout)
-    x1, y1, _ = layout.room
+
+
+def add_surfaces(
+    atlas: Atlas, rng: np.random.Generator, room: tuple[float, float, float], scuffs: int = 1024
+) -> list[int]:
+    """Floor, ceiling, walls, and what people wear; `scuffs`: texels along the sides of the floor's wear."""
+    x1, y1, _ = room
     surfaces = [
         atlas.add(textures.floor_tiles(rng), (2.4, 2.4), wrap=True),
-        atlas.add(textures.floor_scuffs(rng, 1024, 1024), (x1, y1), wrap=True),
+        atlas.add(textures.floor_scuffs(rng, scuffs, scuffs), (x1, y1), wrap=True),
         atlas.add(textures.ceiling(rng), (2.4, 2.4), wrap=True),
         atlas.add(textures.wall(rng), (1.2, 3.6), wrap=True),
     ]
     surfaces += [atlas.add(textures.cloth(rng), (0.25, 0.25), wrap=True) for _ in range(CLOTHES)]
     surfaces += [atlas.add(textures.plain(rng, grey), (0.25, 0.25), wrap=True) for grey in (35.0, 75.0, 165.0)]
-    return make_tables(atlas, layout.room, surfaces, b)
+    return surfaces

@@ -59,9 +59,9 @@ def test_a_typo_is_an_error_before_heavy_imports() -> None:
 
 def test_the_scenes_that_can_be_named_are_those_that_there_are() -> None:
     from stereo_sfm.drivers import sim
-    from stereo_sfm.drivers.sim.scenes import SCENES
+    from stereo_sfm.drivers.sim.scenes import MARKET, SCENES
 
-    assert set(SCENES) == set(sim.SCENES) and len(sim.SCENES) == len(SCENES)
+    assert {*SCENES, MARKET} == set(sim.SCENES) and len(sim.SCENES) == len(SCENES) + 1
 
 
 def test_text_that_names_a_source() -> None:

@@ -16,7 +16,7 @@ from stereo_sfm.drivers.sim.kernels import BLOCK, FACING, FRONT, PERSON, ROOM, T
 from stereo_sfm.drivers.sim.people import crowd_at, moving
 from stereo_sfm.drivers.sim.render import Renderer, View
 from stereo_sfm.drivers.sim.rigs import CAMERAS, make_rig
-from stereo_sfm.drivers.sim.scenes import SCENES, crowd
+from stereo_sfm.drivers.sim.scenes import crowd
 from stereo_sfm.drivers.sim.tables import Tables
 from stereo_sfm.drivers.sim.targets import FlatTarget, empty_room, move, place
 from stereo_sfm.drivers.sim.world import Layout, build_world
@@ -290,7 +290,7 @@ def test_clean_sensor_only_rounds_and_blur_follows_the_motion() -> None:
 
 
 def test_people_move_and_the_store_does_not() -> None:
-    people = crowd(dataclasses.replace(SCENES["people"], layout=SMALL), 6, np.random.default_rng(0))
+    people = crowd(SMALL, 6, np.random.default_rng(0))
     world = store()
     moved = [moving(world, crowd_at(people, t)) for t in (0.0, 1.0)]
     shift = np.linalg.norm(moved[1].persons[:, :2] - moved[0].persons[:, :2], axis=1)
