@@ -75,7 +75,8 @@ class MapSaver:
 
         folder = request.folder
         if hasattr(os, "setpriority") and not request.urgent:
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
+            thread = threading.get_native_id()
+            os.setpriority(os.PRIO_PROCESS, thread, max(os.getpriority(os.PRIO_PROCESS, thread), NICE))
         try:
             save_session(saved, place, folder)
         except (StereoSfmError, OSError) as error:

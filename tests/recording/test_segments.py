@@ -234,7 +234,7 @@ def test_a_slow_disk_drops_images_and_is_reported(tmp_path: Path, monkeypatch: p
     real = segment_writers.ImageLog.image
 
     def slow(self: segment_writers.ImageLog, image: object) -> None:
-        time.sleep(0.1)
+        time.sleep(0.3)
         real(self, image)  # pyright: ignore[reportArgumentType]
 
     monkeypatch.setattr(segment_writers.ImageLog, "image", slow)
@@ -243,7 +243,7 @@ def test_a_slow_disk_drops_images_and_is_reported(tmp_path: Path, monkeypatch: p
     for image in SlidingWall(60):
         recorder.image(image)
         recorder.put(frame(image))
-    assert time.monotonic() - began < 2.0 and recorder.images_dropped > 20
+    assert time.monotonic() - began < 10.0 and recorder.images_dropped > 20  # all would take 18
     assert recorder.state().problem == "the disk is slow: images are dropped"
     recorder.close(20.0)
     poses = [r.sequence for s in segments(recorder.folder) for r in messages(s.poses, topics.FRAME)]

@@ -184,5 +184,5 @@ def test_closing_waits_for_callbacks_but_not_for_one_that_hangs() -> None:
         hub.publish(Event(0, "INFO", "main", text))
     began = time.monotonic()
     hub.close()
-    assert taken == ["first", "last"] and time.monotonic() - began < 2.0
+    assert taken == ["first", "last"] and time.monotonic() - began < 8.0
     hang.set()
