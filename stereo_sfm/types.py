@@ -244,6 +244,8 @@ class Keyframe(Message):
     corners: Corners = field(default_factory=Corners.none)  # for place recognition
     rig_terms: F64 = field(default_factory=lambda: np.zeros(6))  # (6,) the tracker's rig, as in `CalibrationUpdate`
     sides: Corners = field(default_factory=Corners.none)  # described in views that face the shelves on both sides
+    down: F64 = field(default_factory=lambda: np.zeros(3))  # (3,) gravity's direction in this camera, zero: unknown
+    down_sigma: float = 0.0  # radians, its standard deviation about each horizontal axis; 0: unknown
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,6 +308,7 @@ class MapUpdate(Message):
     )  # (L,) whose accepted loop the mapper rejected
     calibration: CalibrationUpdate | None = None  # the rig from this update on, where that changes
     row_errors: RowErrors | None = None  # only with two cameras
+    down: F64 = field(default_factory=lambda: np.zeros(3))  # (3,) gravity's direction in the map, zero: unknown
 
 
 @dataclass(frozen=True, eq=False)

@@ -99,6 +99,8 @@ class RunRecord:
     row_errors: RowErrors | None = None  # the last
     row_error_px: list[tuple[int, float]] = field(default_factory=list[tuple[int, float]])  # stamp_ns, systematic
     calibrations: list[CalibrationUpdate] = field(default_factory=list[CalibrationUpdate])  # changes of the rig
+    down: F64 = field(default_factory=lambda: np.zeros(3))  # gravity's direction in the map, zero: unknown
+    down_information: float = 0.0  # 1/rad^2, summed over the keyframes
     rejections: dict[str, int] = field(default_factory=dict[str, int])
     located_kf_id: int = -1  # first keyframe that was found in the saved map
     _path_m: float = 0.0
@@ -129,6 +131,7 @@ class RunRecord:
         self.keyframes[keyframe.kf_id] = KeyframeRow(
             keyframe.frame_id, keyframe.stamp_ns, keyframe.odom_T_cam, self._path_m, keyframe.submap_id
         )
+        self.down_information += keyframe.down_sigma**-2 if keyframe.down_sigma > 0 else 0.0
         self._see(keyframe.point_ids)
 
     @_take.register
@@ -169,6 +172,8 @@ class RunRecord:
         if update.row_errors is not None:
             self.row_errors = update.row_errors
             self.row_error_px.append((update.row_errors.stamp_ns, update.row_errors.systematic_px))
+        if update.down.any():
+            self.down = update.down
         self.refused_kf_ids.update(update.refused_kf_ids.tolist())
         self.map_points.update(update.point_ids.tolist())
         self.map_points.difference_update(update.culled_point_ids.tolist(), update.fused_point_ids[:, 0].tolist())

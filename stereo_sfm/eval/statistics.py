@@ -13,6 +13,7 @@ from stereo_sfm.eval.calibration_results import calibration_lines, calibration_s
 from stereo_sfm.eval.evaluate import Evaluation, length
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.messages import Health
+from stereo_sfm.tracking.inertial.inertial_motion import roll_pitch_deg
 from stereo_sfm.types import F64, TrackState
 
 RING, LOG = "ring", "log"  # where images are dropped, see `Dropped`
@@ -64,6 +65,7 @@ def statistics(record: RunRecord, wall_s: float, evaluations: dict[str, Evaluati
         "inliers_median": float(np.median(record.frames.inliers)) if frames else 0.0,
         "path_m": trajectory.length if len(trajectory) > 1 else 0.0,
         "duration_s": float(stamps[-1] - stamps[0]) / 1e9 if frames else 0.0,
+        "gravity": gravity_stats(record),
         "loops_accepted": len(record.loops),
         "loops_rejected": dict(sorted(record.rejected.items(), key=lambda item: (-item[1], item[0]))),
         "closure_drift_percent_median": 100 * float(np.median(drifts)) if drifts else None,
@@ -77,6 +79,14 @@ def statistics(record: RunRecord, wall_s: float, evaluations: dict[str, Evaluati
         "fingerprint": record.fingerprint(),
         "evaluation": {name: result.to_dict() for name, result in (evaluations or {}).items()},
     }
+
+
+def gravity_stats(record: RunRecord) -> dict[str, float] | None:
+    """Roll and pitch of the map's axes (those of its first camera) against gravity, degrees; None without an IMU."""
+    if not record.down.any():
+        return None
+    roll, pitch = roll_pitch_deg(record.down)
+    return {"roll_deg": roll, "pitch_deg": pitch, "sigma_deg": float(np.degrees(record.down_information**-0.5))}
 
 
 def _health(report: Health) -> dict[str, float]:
@@ -125,6 +135,8 @@ def summary(stats: dict[str, Any], evaluations: dict[str, Evaluation] | None = N
         lines.append(f"{stats['pieces']} submaps that no loop connects: their relative poses are only predicted")
     if stats["loops_accepted"] or stats["loops_rejected"]:
         lines.append(_loops(stats))
+    if stats["gravity"]:
+        lines.append(_gravity(stats["gravity"]))
     if stats["camera"]:
         lines.append(_camera(stats["camera"]))
     lines += _log(stats)
@@ -178,6 +190,14 @@ def _lost(stats: dict[str, Any]) -> str:
     worst = max(intervals, key=lambda interval: interval["seconds"])
     noun = "interval" if len(intervals) == 1 else "intervals"
     return f"{len(intervals)} lost {noun} (max {worst['seconds']:.1f} s, {worst['reason']})"
+
+
+def _gravity(tilt: dict[str, float]) -> str:
+    """How the map's axes are tilted."""
+    return (
+        f"gravity is known to {tilt['sigma_deg']:.2f} deg: the first camera is rolled by {tilt['roll_deg']:.2f} deg "
+        f"and pitched by {tilt['pitch_deg']:.2f} deg"
+    )
 
 
 def _camera(counts: dict[str, float]) -> str:

@@ -20,8 +20,22 @@ from stereo_sfm.types import F64, I64, StereoImage, Trajectory
 RIG_FILE = "calibration.yaml"
 TRUTH_FILE = "ground_truth.npz"
 SECOND_NS = 1_000_000_000
+LOOKS_LEVEL = 0.1  # sine of the smallest angle between a camera's axis and the vertical that gives a heading
 # Viewers take z as up: a parent frame of the map, aligned with the first camera (x forward, y left, z up).
 LEVEL_T_MAP = np.array([[0.0, 0.0, 1.0, 0.0], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+def level_T_map(down: F64) -> F64:
+    """(4, 4) of a map in which gravity points along `down` (3,): z up, x where the first camera looks.
+
+    A zero vector, of a map that knows no gravity, and one along the camera's axis give LEVEL_T_MAP.
+    """
+    ahead = np.array([0.0, 0.0, 1.0]) - down[2] * down
+    if not down.any() or np.linalg.norm(ahead) < LOOKS_LEVEL:
+        return LEVEL_T_MAP
+    x = ahead / np.linalg.norm(ahead)
+    turn: F64 = np.array([x, np.cross(-down, x), -down], np.float64)
+    return se3.from_rotation_translation(turn, np.zeros(3))
 
 
 def truth_to_bytes(trajectory: Trajectory) -> bytes:
@@ -58,7 +72,8 @@ class ImageLog:
         self._writer = writer
         self._rig = rig
         self._mapped = mapped
-        self._map_rows: list[tuple[str, str, Pose]] | None = None
+        self._level_T_map = LEVEL_T_MAP
+        self._truth_row: list[tuple[str, str, Pose]] | None = None
         self._truth = ground_truth
         self._format = image_format
         self._next_static_ns: int | None = None
@@ -169,12 +184,19 @@ class ImageLog:
 
     def _above_body(self, stamp_ns: int) -> list[tuple[str, str, Pose]]:
         """The orientation of the map, and the ground truth in the map: they share the first image's pose."""
-        if self._map_rows is None:
-            self._map_rows = [("level", "map", foxglove.pose(LEVEL_T_MAP))] if self._mapped else []
-            if self._mapped and self._truth is not None and len(self._truth):
+        if not self._mapped:
+            return []
+        if self._truth_row is None:
+            self._truth_row = []
+            if self._truth is not None and len(self._truth):
                 map_T_truth = se3.inverse(self._truth.poses[self._first_truth(self._truth, stamp_ns)])
-                self._map_rows.append(("map", "truth", foxglove.pose(map_T_truth)))
-        return self._map_rows
+                self._truth_row.append(("map", "truth", foxglove.pose(map_T_truth)))
+        return [("level", "map", foxglove.pose(self._level_T_map)), *self._truth_row]
+
+    def level(self, down: F64) -> None:
+        """Gravity's direction in the map (3,), from now on; zero where it is not known."""
+        if down.any():
+            self._level_T_map = level_T_map(down)
 
     @staticmethod
     def _first_truth(truth: Trajectory, stamp_ns: int) -> int:

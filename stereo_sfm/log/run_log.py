@@ -190,6 +190,7 @@ class RunLog:
     @_write.register
     def map_update(self, update: MapUpdate) -> None:
         """The mapper's result."""
+        self._images.level(update.down)
         self._waiting[0].append(update)
         self._release_waiting()
         self._totals["loops accepted"] -= len(update.refused_kf_ids)

@@ -16,6 +16,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping import bundle_kernels as kernels
+from stereo_sfm.mapping.level import Level
 from stereo_sfm.mapping.reduced import ReducedSystem
 from stereo_sfm.types import F64, I64, Bool
 
@@ -50,6 +51,7 @@ class Bundle:
     uv_left: F64  # (M, 2) px, NaN where not observed
     uv_right: F64  # (M, 2) px, NaN where not observed; only the row NaN: u alone counts (rectified, depth)
     sigma: F64 | None = None  # (M, 2) px of (left, right); None: 1
+    level: Level | None = None  # what the keyframes measured of gravity; None: nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +131,7 @@ class _State:
         self.rot, self.pos, self.points = rot, pos, points
         self.lin: Linear
         self.prior: _Prior
+        self.level: tuple[F64, F64]  # expected directions (F, 3) and weights (F,) of gravity
         self.cost = 0.0
 
 
@@ -140,6 +143,7 @@ class _Solver:
         self.fixed = _Table(rig, bundle, config, np.flatnonzero(~moves))
         self.free = np.where(bundle.fixed, -1, np.cumsum(~bundle.fixed) - 1).astype(np.int64)
         self.moving = np.flatnonzero(~bundle.fixed)
+        self.level = bundle.level
         self.system: ReducedSystem | None = None
         n = len(bundle.points)
         self._nothing = _Prior(bundle.points, np.zeros((n, 6)), np.zeros((n, 3)), 0.0)
@@ -157,6 +161,10 @@ class _Solver:
         state.cost += state.prior.cost
         if prior is not None and prior is not self._nothing:
             state.cost += kernels.prior_cost(state.points, prior.x0, prior.h, prior.g)
+        if self.level is not None:
+            expected, weight, cost = self.level.evaluate(state.rot, self.moving)
+            state.level = expected, weight
+            state.cost += cost
         return state
 
     def begin_round(self, state: _State, judge: bool) -> None:
@@ -168,6 +176,8 @@ class _Solver:
     def _pose_system(self, state: _State, damping: float) -> tuple[F64, F64]:
         h, b = np.zeros((len(self.moving), 6, 6)), np.zeros((len(self.moving), 6))
         kernels.pose_blocks(self.table.kf, self.free, state.lin, h, b)
+        if self.level is not None:
+            self.level.add(*state.level, self.level.seen[self.moving], h, b)
         diagonal = np.arange(6)
         # A keyframe without any inlier keeps its pose: its block would be singular.
         h[:, diagonal, diagonal] += damping * h[:, diagonal, diagonal] + 1e-12

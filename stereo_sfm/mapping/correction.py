@@ -18,8 +18,9 @@ from stereo_sfm.config import LoopConfig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.averaging import average_correction
+from stereo_sfm.mapping.level import weights
 from stereo_sfm.mapping.map import Map
-from stereo_sfm.mapping.pose_graph import Edges, edges_of_poses, join, optimise
+from stereo_sfm.mapping.pose_graph import Edges, Gravity, edges_of_poses, join, optimise
 from stereo_sfm.types import F64, I64, LoopResult
 
 COVISIBLE_POINTS = 30  # shared points of keyframes that get an edge in the pose graph
@@ -141,11 +142,45 @@ def _optimised(
     start = before
     if part[a] != part[b]:  # a submap that this loop connects with the rest: move it there as a rigid body first
         start = _connected(before, loop, a, b, part)
-    fixed = _first_of_each_part(len(before), join([odometry, closed]))
-    result = optimise(start, join([odometry, closed]), fixed, config.robust)
-    if result.weights[-1] < 0.5 or _strain(result.poses, closed) > MAX_STRAIN:
-        result = optimise(start, join([_with_drift(odometry, before, a, b), closed]), fixed, config.robust)
-    return result.poses if result.weights[-1] >= 0.5 else None
+    edges = join([odometry, closed])
+    fixed, gravity = _first_of_each_part(len(before), edges), _gravity(map_, start, edges)
+    result = optimise(start, edges, fixed, config.robust, gravity)
+    strain = max(_strain(result.poses, closed), _tilt_strain(result.poses, gravity))
+    if result.weights[-1] < 0.5 or strain > MAX_STRAIN:
+        edges = join([_with_drift(odometry, before, a, b), closed])
+        result = optimise(start, edges, fixed, config.robust, gravity)
+    if result.weights[-1] < 0.5:
+        return None
+    return result.poses if gravity is None else _as_before(result.poses, start, edges, fixed)
+
+
+def _tilt_strain(poses: F64, gravity: Gravity | None) -> float:
+    """Mean squared error of roll and pitch in sigmas, on the scale of `_strain`: noise alone gives 3, twice that 6."""
+    if gravity is None:
+        return 0.0
+    off = np.cross(np.einsum("nij,nj->ni", poses[gravity.rows, :3, :3], gravity.seen), gravity.down)
+    return 3.0 * float(np.mean((off**2).sum(axis=1) / gravity.sigma**2) / 2)
+
+
+def _gravity(map_: Map, poses: F64, edges: Edges) -> Gravity | None:
+    """What the living keyframes of the graph measured of gravity: for each part of it one direction, their mean."""
+    table = map_.keyframes
+    rows = np.unique(np.concatenate([edges.i, edges.j]))
+    rows = rows[table.alive[rows] & (table.down_sigma[rows] > 0)]
+    if not len(rows):
+        return None
+    seen, sigma, part = table.down[rows], table.down_sigma[rows], _components(len(poses), edges.i, edges.j)[rows]
+    total = np.zeros((int(part.max()) + 1, 3))
+    np.add.at(total, part, np.einsum("nij,nj->ni", poses[rows, :3, :3], seen) * weights(sigma)[:, None])
+    return Gravity(rows, seen, sigma, (total / np.maximum(np.linalg.norm(total, axis=1), 1e-300)[:, None])[part])
+
+
+def _as_before(poses: F64, before: F64, edges: Edges, fixed: I64) -> F64:
+    """Each part of the graph moved as a whole, so that its fixed row is where it was: gravity may have tilted it."""
+    part = _components(len(poses), edges.i, edges.j)
+    move = np.tile(np.eye(4), (int(part.max()) + 1, 1, 1))
+    move[part[fixed]] = before[fixed] @ se3.inverse(poses[fixed])
+    return move[part] @ poses
 
 
 def _strain(poses: F64, closed: Edges) -> float:

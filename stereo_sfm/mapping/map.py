@@ -41,6 +41,8 @@ class MapSnapshot:
     stamp_ns: I64  # (K,)
     submap_ids: I64  # (K,)
     map_T_kf: F64  # (K, 4, 4)
+    down: F64  # (K, 3) see `Keyframe.down`
+    down_sigma: F64  # (K,)
     pt_ids: I64  # (P,)
     points: F64  # (P, 3)
     anchors: I64  # (P,) index into kf_ids
@@ -91,6 +93,8 @@ class MapSnapshot:
             submap_id=int(self.submap_ids[k]),
             corners=self._corners(slice(corners.start, sides)),
             sides=self._corners(slice(sides, corners.stop)),
+            down=self.down[k],
+            down_sigma=float(self.down_sigma[k]),
         )
 
 
@@ -200,6 +204,8 @@ class Map:
             submap_id=keyframe.submap_id,
             map_T_kf=map_T_kf,
             previous=row - 1 if same else -1,
+            down=keyframe.down,
+            down_sigma=keyframe.down_sigma,
             obs_first=len(self.observations),
         )
         self._kf_rows[keyframe.kf_id] = row
@@ -439,6 +445,8 @@ class Map:
             stamp_ns=k.stamp_ns[kfs],
             submap_ids=k.submap_id[kfs],
             map_T_kf=k.map_T_kf[kfs],
+            down=k.down[kfs],
+            down_sigma=k.down_sigma[kfs],
             pt_ids=p.pt_id[pts],
             points=p.xyz[pts],
             anchors=kf_index[self._anchors(pts)],

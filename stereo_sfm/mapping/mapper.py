@@ -9,6 +9,9 @@ tracker transforms them by the inverse of map_T_odom and solves the next frames 
 descriptor is fused with the older one: its track then belongs to the older point, and with it to the older, less
 drifted part of the map. In a place that the robot does not leave, the same old points bound the drift.
 
+Gravity. Keyframes that measured it are held level by it, in local windows, in the whole map and where a loop is closed;
+`down` of an update is its direction in the map.
+
 A loop that the map already contains (an earlier loop closed the same place, its two sides share points) only fuses the
 points that it pairs, so that a robot that passes the same places all day does not repeat the correction.
 
@@ -42,6 +45,7 @@ from stereo_sfm.mapping import culling, window
 from stereo_sfm.mapping.bundle import BundleConfig, BundleResult, bundle_adjust
 from stereo_sfm.mapping.correction import apply_loop, fuse_pairs, loop_is_known
 from stereo_sfm.mapping.insertion import insert_keyframe
+from stereo_sfm.mapping.level import down_of
 from stereo_sfm.mapping.map import Map, MapSnapshot
 from stereo_sfm.mapping.recalibration import recalibrate
 from stereo_sfm.mapping.row_errors import RowMonitor
@@ -195,7 +199,13 @@ class Mapper:
             refused_kf_ids=refused,
             calibration=revised,
             row_errors=row_errors,
+            down=down_of(self.map, self._of_first_submap()),
         )
+
+    def _of_first_submap(self) -> I64:
+        """Rows of the living keyframes of the submap that the map's frame belongs to."""
+        table = self.map.keyframes
+        return np.flatnonzero(table.alive & (table.submap_id == table.submap_id[0]))
 
     # -- calibration -------------------------------------------------------------------------------------------------
 

@@ -2,7 +2,8 @@
 
 The paper minimises |K_i - i_T_j K_j| over all edges with Levenberg-Marquardt; here an edge's error is the logarithm
 of the same difference, weighted by its covariance, and loops have robust weights: graduated non-convexity (Yang et al.,
-RA-L 5, 2020) keeps the edges of the odometry and drops loops that contradict them.
+RA-L 5, 2020) keeps the edges of the odometry and drops loops that contradict them. Where keyframes measured gravity,
+that holds their roll and pitch: four degrees of freedom are left to drift.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from stereo_sfm.types import F64, I64, Bool
 
 ROBUST = ("gnc", "switchable", "none")
 CHI2_6DOF_99 = 16.81
+HELD = 1e-6  # metres, radians: standard deviation of a pose that stays
+TILT = 0.05  # radians, that of its roll and pitch where gravity is known
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +35,16 @@ class Edges:
 
     def __len__(self) -> int:
         return len(self.i)
+
+
+@dataclass(frozen=True, eq=False)
+class Gravity:
+    """What keyframes measured of gravity."""
+
+    rows: I64  # (G,) keyframes
+    seen: F64  # (G, 3) unit vectors in their cameras
+    sigma: F64  # (G,) radians
+    down: F64  # (G, 3) unit vectors, the same direction in the world
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,10 +79,13 @@ def edges_of_poses(poses: F64, i: I64, j: I64, metres_per_metre: float, radians_
     return Edges(i, j, relative, sigmas, np.zeros(len(i), bool))
 
 
-def optimise(poses: F64, edges: Edges, fixed: I64, robust: str = "gnc") -> PoseGraphResult:
+def optimise(
+    poses: F64, edges: Edges, fixed: I64, robust: str = "gnc", gravity: Gravity | None = None
+) -> PoseGraphResult:
     """Poses (K, 4, 4) that agree best with the edges; the rows `fixed` stay.
 
     Args:
+        gravity: where it is given, the rows `fixed` keep their positions and headings, and tilt as it says.
         robust: "gnc" (loops are kept or dropped), "switchable" (dynamic covariance scaling, Agarwal et al., ICRA
             2013: the closed form of switchable constraints), or "none" (least squares, as the paper).
     """
@@ -81,13 +97,13 @@ def optimise(poses: F64, edges: Edges, fixed: I64, robust: str = "gnc") -> PoseG
     used = np.unique(np.concatenate([edges.i, edges.j, fixed]))
     for row in used.tolist():
         values.insert(row, gtsam.Pose3(se3.orthonormalize(poses[row])))
-    plain = _graph(gtsam, edges, fixed, values, robust=False)
+    plain = _graph(gtsam, edges, fixed, values, robust=False, gravity=gravity)
     if robust == "gnc" and edges.loop.any():
         result, weights = _graduated(gtsam, plain, values, edges)
     else:
         result, weights = _levenberg(gtsam, plain, values), np.ones(len(edges))
         if robust == "switchable" and edges.loop.any():  # start from least squares: no true loop is far off
-            result = _levenberg(gtsam, _graph(gtsam, edges, fixed, values, robust=True), result)
+            result = _levenberg(gtsam, _graph(gtsam, edges, fixed, values, robust=True, gravity=gravity), result)
             loops = np.flatnonzero(edges.loop)
             weights[loops] = [_switch(2 * plain.at(int(e)).error(result)) for e in loops]
     out = poses.copy()
@@ -96,8 +112,8 @@ def optimise(poses: F64, edges: Edges, fixed: I64, robust: str = "gnc") -> PoseG
     return PoseGraphResult(out, weights, float(plain.error(result)))
 
 
-def _graph(gtsam: Any, edges: Edges, fixed: I64, values: Any, robust: bool) -> Any:
-    """Factors in the order of the edges, then one prior for each fixed row."""
+def _graph(gtsam: Any, edges: Edges, fixed: I64, values: Any, robust: bool, gravity: Gravity | None) -> Any:
+    """Factors in the order of the edges, then one prior for each fixed row, then gravity."""
     graph = gtsam.NonlinearFactorGraph()
     for e in range(len(edges)):
         metres, radians = edges.sigmas[e]
@@ -106,10 +122,29 @@ def _graph(gtsam: Any, edges: Edges, fixed: I64, values: Any, robust: bool) -> A
             noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.DCS.Create(CHI2_6DOF_99), noise)
         measured = gtsam.Pose3(se3.orthonormalize(edges.i_T_j[e]))
         graph.add(gtsam.BetweenFactorPose3(int(edges.i[e]), int(edges.j[e]), measured, noise))
-    tight = gtsam.noiseModel.Isotropic.Sigma(6, 1e-6)
+    held = _held(fixed, values, gravity)
     for row in fixed.tolist():
-        graph.add(gtsam.PriorFactorPose3(row, values.atPose3(row), tight))
+        graph.add(gtsam.PriorFactorPose3(row, values.atPose3(row), gtsam.noiseModel.Gaussian.Covariance(held[row])))
+    if gravity is not None:
+        for row, seen, sigma, down in zip(
+            gravity.rows.tolist(), gravity.seen, gravity.sigma, gravity.down, strict=True
+        ):
+            noise = gtsam.noiseModel.Isotropic.Sigma(2, float(sigma))
+            graph.add(gtsam.AttitudeFactorPose3(row, gtsam.Unit3(down), noise, gtsam.Unit3(seen)))
     return graph
+
+
+def _held(fixed: I64, values: Any, gravity: Gravity | None) -> dict[int, F64]:
+    """Covariance (6, 6), rotation first, of the priors of fixed rows: with gravity only their tilt is free."""
+    out = dict.fromkeys(fixed.tolist(), HELD**2 * np.eye(6))
+    for row in out:
+        measured = np.zeros(0, np.int64) if gravity is None else np.flatnonzero(gravity.rows == row)
+        if gravity is not None and len(measured):
+            down = values.atPose3(row).rotation().matrix().T @ gravity.down[measured[0]]
+            tilt = np.zeros((6, 6))
+            tilt[:3, :3] = np.eye(3) - np.outer(down, down)
+            out[row] = out[row] + TILT**2 * tilt
+    return out
 
 
 def _levenberg(gtsam: Any, graph: Any, values: Any) -> Any:

@@ -23,6 +23,8 @@ class KeyframeTable(Columns):
     obs_count: I64  # observations made, of which some may have been removed since
     carrier: I64  # of a culled keyframe: the row of the one it moves with, -1 if alive
     carrier_T_kf: F64  # (K, 4, 4)
+    down: F64  # (K, 3) gravity's direction in the camera, zero: unknown
+    down_sigma: F64  # radians, 0: unknown
     alive: Bool
 
     SPEC: ClassVar[Spec] = {
@@ -36,6 +38,8 @@ class KeyframeTable(Columns):
         "obs_count": (np.int64, (), 0),
         "carrier": (np.int64, (), -1),
         "carrier_T_kf": (np.float64, (4, 4), np.eye(4)),
+        "down": (np.float64, (3,), 0.0),
+        "down_sigma": (np.float64, (), 0.0),
         "alive": (np.bool_, (), True),
     }
 

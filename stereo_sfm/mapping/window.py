@@ -15,6 +15,7 @@ from stereo_sfm.config import MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping import map_kernels
 from stereo_sfm.mapping.bundle import Bundle, BundleConfig, BundleResult
+from stereo_sfm.mapping.level import level_of
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.types import F64, I64, Bool
 
@@ -80,6 +81,7 @@ def _window(map_: Map, moving: I64, most_fixed: int | None = None) -> Window:
         table.uv_left[obs].astype(float),
         table.uv_right[obs].astype(float),
         np.repeat(table.sigma[obs].astype(float)[:, None], 2, 1),
+        level_of(map_, kfs, fixed),
     )
     return Window(bundle, kfs, len(moving), pts, obs)
 

@@ -30,6 +30,8 @@ COLUMNS: dict[str, Column] = {
     "stamp_ns": Column("keyframes", "int64"),
     "submap_ids": Column("keyframes", "int64"),
     "map_T_kf": Column("keyframes", "float64", (4, 4)),
+    "down": Column("keyframes", "float64", (3,)),
+    "down_sigma": Column("keyframes", "float64"),
     "sessions": Column("keyframes", "int64"),
     "pt_ids": Column("points", "int64", ascending=True),
     "points": Column("points", "float64", (3,)),

@@ -100,4 +100,5 @@ class Extension(Mapper):
             map_T_kf=saved_T_session @ update.map_T_kf,
             points_map=se3.transform(saved_T_session, update.points_map),
             map_T_odom=saved_T_session @ update.map_T_odom,
+            down=saved_T_session[:3, :3] @ update.down,
         )

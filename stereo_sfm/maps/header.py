@@ -9,7 +9,8 @@ from typing import Any
 
 from stereo_sfm.errors import StereoSfmError
 
-VERSION, READ, SIDES_SINCE = 3, (2, 3), 3  # 1 had no corners, 2 none in views that face the shelves
+VERSION, READ = 4, (2, 3, 4)
+SIDES_SINCE, DOWN_SINCE = 3, 4  # 1 had no corners, 2 none in views that face the shelves, 3 no gravity
 KIND = "stereo_sfm_map"
 COUNTS = ("keyframes", "points", "observations", "sessions")
 

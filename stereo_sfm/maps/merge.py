@@ -185,6 +185,8 @@ def _subset(s: MapSnapshot, keyframes: Bool, points: Bool, obs: Bool) -> MapSnap
         stamp_ns=s.stamp_ns[keyframes],
         submap_ids=s.submap_ids[keyframes],
         map_T_kf=s.map_T_kf[keyframes],
+        down=s.down[keyframes],
+        down_sigma=s.down_sigma[keyframes],
         pt_ids=s.pt_ids[points],
         points=s.points[points],
         anchors=anchors,

@@ -22,7 +22,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.mapping.map import Map, MapSnapshot
 from stereo_sfm.maps.columns import check_columns
-from stereo_sfm.maps.header import SIDES_SINCE, check_counts, checksum, damaged, read_header, write_header
+from stereo_sfm.maps.header import DOWN_SINCE, SIDES_SINCE, check_counts, checksum, damaged, read_header, write_header
 from stereo_sfm.maps.replace_folder import replaced_folder
 from stereo_sfm.types import I64, MapUpdate, Trajectory
 
@@ -32,7 +32,7 @@ log = logging.getLogger("stereo_sfm")
 SAME_TURN, SAME_SHIFT, SAME_FOCAL = 0.01, 0.02, 0.01
 
 _FILES: dict[str, tuple[str, ...]] = {
-    "keyframes": ("kf_ids", "frame_ids", "stamp_ns", "submap_ids", "map_T_kf", "sessions"),
+    "keyframes": ("kf_ids", "frame_ids", "stamp_ns", "submap_ids", "map_T_kf", "down", "down_sigma", "sessions"),
     "points": ("pt_ids", "points", "anchors", "seen", "expected"),
     "observations": ("obs_kf", "obs_pt", "uv_left", "uv_right", "descriptors"),
     "corners": ("corner_kf", "corner_uv_left", "corner_uv_right", "corner_points", "corner_descriptors", "corner_side"),
@@ -120,6 +120,8 @@ def load_map(folder: Path | str, rig: Rig | None = None) -> SavedMap:
             data = read_arrays(raw)
             if name == "corners" and head["version"] < SIDES_SINCE:
                 data["corner_side"] = np.zeros(len(data["corner_kf"]), bool)
+            if name == "keyframes" and head["version"] < DOWN_SINCE:
+                data["down"], data["down_sigma"] = np.zeros((len(data["kf_ids"]), 3)), np.zeros(len(data["kf_ids"]))
             columns.update({c: data[c] for c in wanted})
         if checksum((folder / "rig.yaml").read_bytes()) != checksums["rig"]:
             raise ValueError("rig")

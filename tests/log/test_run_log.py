@@ -28,6 +28,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.log import foxglove, schema, topics
 from stereo_sfm.log.diff import diff
+from stereo_sfm.log.image_log import LEVEL_T_MAP, level_T_map
 from stereo_sfm.log.map_view import MapView
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.recorded import messages, read_run
@@ -446,3 +447,15 @@ def test_rerun_reads_every_channel(run: Path) -> None:
     with LogReader(run) as reader:
         assert {row[3] for row in rows} == {t.topic for t in reader.topics}
     assert {row[0] for row in rows} == {"ok"}
+
+
+def test_the_level_frame_follows_measured_gravity() -> None:
+    np.testing.assert_array_equal(level_T_map(np.zeros(3)), LEVEL_T_MAP)
+    np.testing.assert_allclose(level_T_map(np.array([0.0, 1.0, 0.0])), LEVEL_T_MAP, atol=1e-12)
+    down = se3.so3_exp(np.array([0.2, 0.1, -0.3])) @ np.array([0.0, 1.0, 0.0])
+    turn = level_T_map(down)[:3, :3]
+    np.testing.assert_allclose(turn @ down, [0, 0, -1], atol=1e-12)
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
+    ahead = turn @ [0.0, 0.0, 1.0]
+    assert ahead[0] > 0.9 and abs(ahead[1]) < 1e-12
+    np.testing.assert_array_equal(level_T_map(np.array([0.0, 0.0, 1.0])), LEVEL_T_MAP)  # it looks at the floor

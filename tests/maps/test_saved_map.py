@@ -70,7 +70,7 @@ def test_each_error_has_its_line(tmp_path: Path, saved: SavedMap) -> None:
     with pytest.raises(StereoSfmError, match="another camera"):
         load_map(folder, moved)
     spoil(folder, version=7)
-    with pytest.raises(StereoSfmError, match="version 7, this program reads version 3"):
+    with pytest.raises(StereoSfmError, match="version 7, this program reads version 4"):
         load_map(folder)
     (folder / "map.json").write_text("{")
     with pytest.raises(StereoSfmError, match=r"damaged: map\.json"):
@@ -88,6 +88,25 @@ def test_maps_without_side_views_are_read(tmp_path: Path, saved: SavedMap) -> No
     (folder / "map.json").write_text(json.dumps({**head, "version": 2}))
     read = load_map(folder).snapshot
     assert not read.corner_side.any() and len(read.corner_side) == len(read.corner_kf)
+
+
+def test_gravity_is_saved_and_maps_without_it_are_read(tmp_path: Path, saved: SavedMap) -> None:
+    folder, count = tmp_path / "m", len(saved)
+    known = dataclasses.replace(
+        saved.snapshot, down=np.tile([0.0, 0.6, 0.8], (count, 1)), down_sigma=np.full(count, 1e-3)
+    )
+    save_map(dataclasses.replace(saved, snapshot=known), folder)
+    read = load_map(folder).snapshot
+    np.testing.assert_array_equal(read.down, known.down)
+    assert read.keyframes()[3].down_sigma == 1e-3
+    columns = dict(np.load(folder / "keyframes.npz"))
+    del columns["down"], columns["down_sigma"]
+    np.savez_compressed(folder / "keyframes.npz", **columns)
+    head = json.loads((folder / "map.json").read_text())
+    head["sha256"]["keyframes"] = hashlib.sha256((folder / "keyframes.npz").read_bytes()).hexdigest()
+    (folder / "map.json").write_text(json.dumps({**head, "version": 3}))
+    read = load_map(folder).snapshot
+    assert not read.down.any() and read.down_sigma.shape == (count,) and not read.down_sigma.any()
 
 
 @pytest.mark.parametrize("name", ["keyframes.npz", "points.npz", "observations.npz", "corners.npz", "rig.yaml"])

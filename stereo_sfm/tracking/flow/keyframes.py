@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,8 @@ from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.side_views import SideViews
 from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.types import F64, Corners, Keyframe, StereoImage
+
+CORRELATED_S = 5.0  # for which the error of gravity's direction stays about the same
 
 
 class Keyframes:
@@ -35,6 +38,7 @@ class Keyframes:
         self.points = 0  # static points of the newest keyframe
         self._pose: F64 = np.eye(4)  # odom_T_cam of the newest keyframe
         self._frames_since = 0
+        self._stamp_ns = 0  # of the newest keyframe
 
     def use(self, rig: Rig) -> None:
         """Use a corrected rig."""
@@ -64,12 +68,14 @@ class Keyframes:
         velocity: F64,
         submap_id: int,
         rig_terms: F64,
+        gravity: tuple[F64, float] | None = None,
     ) -> Keyframe:
         """A keyframe of an image, without descriptors: see `describe`.
 
         Args:
             tracks: its points, of which those on moving objects are left out.
             odom_T_cam: (4, 4). velocity: (6,) tangent a second. rig_terms: (6,) current correction of the rig.
+            gravity: its direction in the camera (3,), and the standard deviation in radians.
         """
         static = tracks.keep(~tracks.moving)
         points_cam = se3.transform(se3.inverse(odom_T_cam), static.points())
@@ -86,9 +92,19 @@ class Keyframes:
             descriptors=np.zeros((len(static), 32), np.uint8),
             submap_id=submap_id,
             rig_terms=rig_terms.copy(),
+            **self._down(image.stamp_ns, gravity),
         )
         self.count, self.points, self._pose, self._frames_since = self.count + 1, len(static), odom_T_cam.copy(), 0
         return keyframe
+
+    def _down(self, stamp_ns: int, gravity: tuple[F64, float] | None) -> dict[str, Any]:
+        """The fields of gravity. Its error changes slowly: keyframes share what one time of correlation tells."""
+        seconds = (stamp_ns - self._stamp_ns) * 1e-9
+        self._stamp_ns = stamp_ns
+        if gravity is None or self.count == 0:
+            return {}
+        down, sigma = gravity
+        return {"down": down, "down_sigma": sigma * np.sqrt(max(CORRELATED_S / seconds, 1.0))}
 
     def describe(self, keyframe: Keyframe, images: StereoPyramids, tracks: Tracks, velocity: F64) -> Keyframe:
         """The keyframe with its points' descriptors and its corners; arguments as those of `create`."""

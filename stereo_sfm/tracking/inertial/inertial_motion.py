@@ -67,6 +67,14 @@ class InertialMotion:
             return None
         return roll_pitch_deg(odom_T_cam[:3, :3].T @ self._state.gravity)
 
+    def gravity(self, odom_T_cam: F64) -> tuple[F64, float] | None:
+        """Its direction in the camera (4, 4), a unit vector (3,), and the standard deviation in radians about each
+        horizontal axis; None while it is not known."""
+        if self._state is None:
+            return None
+        down = odom_T_cam[:3, :3].T @ self._state.gravity
+        return down / np.linalg.norm(down), self._state.tilt_sigma
+
     def feed(self, samples: ImuSamples | None) -> None:
         """Samples up to the image that is tracked next."""
         self._integrated.clear()

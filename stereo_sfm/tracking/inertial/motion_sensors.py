@@ -95,6 +95,10 @@ class MotionSensors:
         """Roll and pitch in degrees of the camera (4, 4) against measured gravity; None while that is not known."""
         return None if self._inertial is None else self._inertial.level(odom_T_cam)
 
+    def gravity(self, odom_T_cam: F64) -> tuple[F64, float] | None:
+        """Its direction in the camera (4, 4), (3,), and how accurate that is, radians; None while it is not known."""
+        return None if self._inertial is None else self._inertial.gravity(odom_T_cam)
+
     def news(self) -> str:
         """Why a sensor is left out, once; "" otherwise."""
         reasons = ["" if self._inertial is None else self._inertial.left_out]
