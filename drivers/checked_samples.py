@@ -129,7 +129,7 @@ def _wheel_kinds(samples: WheelSamples) -> I64:
     return np.where(moved | known, 1, 0)
 
 
-class _Checker:
+class SampleChecker:
     """Checks the samples of successive images."""
 
     def __init__(self) -> None:
@@ -141,7 +141,7 @@ class _Checker:
         )
 
     def checked(self, image: StereoImage) -> StereoImage:
-        """The same object where nothing is wrong."""
+        """The image with samples that the stages can use: the same object where nothing is wrong."""
         imu, wheel = self._imu.checked(image.imu), self._wheel.checked(image.wheel)
         self._imu.note_gap(image, 0 if imu is None else len(imu))
         self._wheel.note_gap(image, 0 if wheel is None else len(wheel))
@@ -151,5 +151,5 @@ class _Checker:
 
 def checked_samples(images: Iterable[StereoImage]) -> Iterator[StereoImage]:
     """The images with samples that the stages can use; every kind of problem is said once."""
-    checker = _Checker()
+    checker = SampleChecker()
     return (checker.checked(image) for image in images)

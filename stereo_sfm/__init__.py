@@ -37,11 +37,22 @@ if TYPE_CHECKING:
     from stereo_sfm.maps.saved_map import SavedMap, load_map, save_map
     from stereo_sfm.pipeline.run import run
     from stereo_sfm.system import LiveMap, MapLocator, System, Tracker
-    from stereo_sfm.types import Frame, Keyframe, LoopResult, MapUpdate, StereoImage, TrackState, Trajectory
+    from stereo_sfm.types import (
+        Frame,
+        ImuSamples,
+        Keyframe,
+        LoopResult,
+        MapUpdate,
+        StereoImage,
+        TrackState,
+        Trajectory,
+        WheelSamples,
+    )
 
 __all__ = [
     "Config",
     "Frame",
+    "ImuSamples",
     "Keyframe",
     "LiveMap",
     "Location",
@@ -56,6 +67,7 @@ __all__ = [
     "TrackState",
     "Tracker",
     "Trajectory",
+    "WheelSamples",
     "__version__",
     "demo_recording",
     "evaluate",
@@ -79,6 +91,7 @@ same_code.choose()
 _LAZY: dict[str, tuple[str, str]] = {
     "Config": ("stereo_sfm.config", "Config"),
     "Frame": ("stereo_sfm.types", "Frame"),
+    "ImuSamples": ("stereo_sfm.types", "ImuSamples"),
     "Keyframe": ("stereo_sfm.types", "Keyframe"),
     "LiveMap": ("stereo_sfm.system", "LiveMap"),
     "Location": ("stereo_sfm.maps.relocalization", "Location"),
@@ -93,6 +106,7 @@ _LAZY: dict[str, tuple[str, str]] = {
     "TrackState": ("stereo_sfm.types", "TrackState"),
     "Tracker": ("stereo_sfm.system", "Tracker"),
     "Trajectory": ("stereo_sfm.types", "Trajectory"),
+    "WheelSamples": ("stereo_sfm.types", "WheelSamples"),
     "demo_recording": ("stereo_sfm.demo", "demo_recording"),
     "evaluate": ("stereo_sfm.eval.evaluate", "evaluate"),
     "export_map": ("stereo_sfm.export.formats", "export_map"),

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from stereo_sfm.calib.formats import load_rig
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
+from stereo_sfm.drivers.checked_samples import SampleChecker
 from stereo_sfm.drivers.memory import MemorySource
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.eval.record import RunRecord
@@ -30,7 +31,7 @@ from stereo_sfm.pipeline.inline import InlineRun
 from stereo_sfm.pipeline.text import Listener
 from stereo_sfm.pipeline.threads import limited_threads
 from stereo_sfm.tracking.factory import make_tracker
-from stereo_sfm.types import F64, I64, Frame, MapUpdate, Message, StereoImage, Trajectory
+from stereo_sfm.types import F64, I64, Frame, ImuSamples, MapUpdate, Message, StereoImage, Trajectory, WheelSamples
 
 M = TypeVar("M")
 
@@ -54,10 +55,18 @@ class Tracker:
             config: the default when omitted.
         """
         self._rig = _rig(rig)
-        self._input = ImageInput(self._rig)
+        self._input, self._samples = ImageInput(self._rig), SampleChecker()
         self._tracker = make_tracker(config or Config(), self._rig)
 
-    def step(self, left: ArrayLike, right: ArrayLike | None, stamp_ns: int, depth: ArrayLike | None = None) -> Frame:
+    def step(
+        self,
+        left: ArrayLike,
+        right: ArrayLike | None,
+        stamp_ns: int,
+        depth: ArrayLike | None = None,
+        imu: ImuSamples | None = None,
+        wheel: WheelSamples | None = None,
+    ) -> Frame:
         """Track the next image.
 
         Args:
@@ -65,11 +74,14 @@ class Tracker:
                 camera and for RGB-D.
             stamp_ns: time of the exposure, whole nanoseconds.
             depth: (H, W) metres (RGB-D).
+            imu, wheel: samples since the image before; used where the calibration has `imu` and `wheel`. What is
+                doubled, out of order, not a number or in other units is left out, each with one line.
 
         Raises:
             StereoSfmError: not an image of this rig.
         """
-        return self._tracker.step(self._input.image(left, right, stamp_ns, depth))[0]
+        image = self._input.image(left, right, stamp_ns, depth, imu, wheel)
+        return self._tracker.step(self._samples.checked(image))[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +138,7 @@ class System:
         self._callbacks = _Callbacks()
         self._map_T_odom: F64 = np.eye(4)
         self._callbacks.add(MapUpdate, self._take)
-        self._input = ImageInput(self.rig)
+        self._input, self._samples = ImageInput(self.rig), SampleChecker()
         every = (self._record, self._callbacks, *sinks)
         self._run = InlineRun(MemorySource(self.rig, []), self.config, every, folders=folders)
         self._open = ExitStack()
@@ -139,15 +151,23 @@ class System:
         self._view.update(update)
         self._map_T_odom = update.map_T_odom
 
-    def step(self, left: ArrayLike, right: ArrayLike | None, stamp_ns: int, depth: ArrayLike | None = None) -> Frame:
+    def step(
+        self,
+        left: ArrayLike,
+        right: ArrayLike | None,
+        stamp_ns: int,
+        depth: ArrayLike | None = None,
+        imu: ImuSamples | None = None,
+        wheel: WheelSamples | None = None,
+    ) -> Frame:
         """Take the next image through all stages; the arguments are those of `Tracker.step`."""
-        return self.step_image(self._input.image(left, right, stamp_ns, depth))
+        return self.step_image(self._input.image(left, right, stamp_ns, depth, imu, wheel))
 
     def step_image(self, image: StereoImage) -> Frame:
         """The same with an image of a source, which keeps its number."""
         if self._finished:
             raise StereoSfmError("this system is finished: create a new one")
-        self.frame = self._run.step(self._input.checked(image))
+        self.frame = self._run.step(self._samples.checked(self._input.checked(image)))
         return self.frame
 
     def run(self, images: Iterable[StereoImage]) -> Iterator[Frame]:

@@ -43,6 +43,28 @@ def test_a_loop_of_ones_own_gives_the_bits_of_a_run(recording: tuple[s.Rig, list
         system.step(images[0].left, images[0].right, 10**18)
 
 
+def test_samples_of_imu_and_wheels_are_handed_over_with_the_images(caplog: pytest.LogCaptureFixture) -> None:
+    spec = "sim:loop?size=212x200&rate=10&frames=20&start=60&imu=t265&wheel=differential"
+    with s.open_source(spec) as source:
+        images, rig = list(source), source.rig
+    run = list(s.run(MemorySource(rig, images)))
+    tracker, own = s.Tracker(rig), run[0]
+    with s.System(rig) as system:
+        for image, frame in zip(images, run, strict=True):
+            pixels = image.left, image.right, image.stamp_ns
+            own = system.step(*pixels, imu=image.imu, wheel=image.wheel)
+            assert own.odom_T_cam.tobytes() == frame.odom_T_cam.tobytes()
+            tracker.step(*pixels, imu=image.imu, wheel=image.wheel)
+    assert abs(own.stats["pitch_deg"] + 4) < 2 and not caplog.text  # the camera looks 4 degrees down
+    black = np.zeros_like(images[-1].left)
+    stamp = images[-1].stamp_ns + 10**8
+    assert images[-1].imu is not None
+    late = images[-1].imu.shifted(10**8)
+    assert tracker.step(black, black, stamp, imu=late).state == s.TrackState.INERTIAL
+    tracker.step(black, black, stamp + 10**8, imu=late)  # the same ones again
+    assert "doubled" in caplog.text
+
+
 def test_odometry_alone_is_the_same_odometry(recording: tuple[s.Rig, list[s.StereoImage]]) -> None:
     """Until the first map update arrives."""
     rig, images = recording

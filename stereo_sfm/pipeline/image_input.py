@@ -18,7 +18,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.pixels import eight_bits, sensor_bits
-from stereo_sfm.types import F32, U8, StereoImage
+from stereo_sfm.types import F32, U8, ImuSamples, StereoImage, WheelSamples
 
 log = logging.getLogger("stereo_sfm")
 
@@ -34,7 +34,13 @@ class ImageInput:
         self._count = 0
 
     def image(
-        self, left: ArrayLike, right: ArrayLike | None, stamp_ns: int, depth: ArrayLike | None = None
+        self,
+        left: ArrayLike,
+        right: ArrayLike | None,
+        stamp_ns: int,
+        depth: ArrayLike | None = None,
+        imu: ImuSamples | None = None,
+        wheel: WheelSamples | None = None,
     ) -> StereoImage:
         """The next image of a sequence, numbered in order.
 
@@ -42,13 +48,13 @@ class ImageInput:
             left, right: of the rig's two cameras; `right` is None for one camera and for RGB-D.
             stamp_ns: whole nanoseconds, later than the last.
             depth: (H, W) metres along the left optical axis, NaN or 0 where unknown (RGB-D).
+            imu, wheel: samples since the image before.
 
         Raises:
             StereoSfmError: not an image of this rig, or a stamp that is not later than the last.
         """
-        image = self.checked(
-            StereoImage(self._count, self._later(stamp_ns), _array(left, "left"), _optional(right), _metres(depth))
-        )
+        pixels = _array(left, "left"), _optional(right), _metres(depth)
+        image = self.checked(StereoImage(self._count, self._later(stamp_ns), *pixels, imu=imu, wheel=wheel))
         self._last_ns = image.stamp_ns
         self._count += 1
         return image
