@@ -85,6 +85,34 @@ def test_a_person_followed_for_as_long_as_the_store_does_not_take_the_pose_along
     assert not solution.moving[~on_person].any()
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_person_who_steps_aside_slowly_does_not_shift_the_pose(seed: int) -> None:
+    """The store is far away: a camera that moved aside and turned a little would see nearly the same.
+
+    The person has a third of the points, the nearest ones. All that speaks against that motion is the expected one.
+    """
+    rng = np.random.default_rng(seed)
+    tracks, on_person = scene(rng)
+    kept = np.arange(len(tracks)) < STILL + 30
+    tracks, on_person = tracks.keep(kept), on_person[kept]
+    assert RIG.right is not None
+    before = np.where(on_person[:, None], tracks.points(), [0.0, 0.0, 4.0] + 0.15 * tracks.points())
+    now = se3.transform(se3.inverse(MOVED), before + on_person[:, None] * [0.02, 0.0, 0.0])
+    distance = np.linalg.norm(before, axis=1)
+    tracks.direction, tracks.rho = before / distance[:, None], 1 / distance
+    tracks.uv = RIG.left.project(now) + rng.normal(0, 0.2, (len(now), 2))
+    tracks.uv_right = RIG.right.project(se3.transform(se3.inverse(RIG.left_T_right), now)) + rng.normal(
+        0, 0.2, (len(now), 2)
+    )
+    tracks.age[:], tracks.mapped[:] = 60, True
+    solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
+    expected = ExpectedMotion(MOVED @ se3.exp(np.full(6, 0.001)), se3.log(MOVED), SECONDS)
+    solution = solver.solve(tracks, expected, np.eye(4), before=len(tracks))
+    assert off(solution.pose) < 0.008
+    assert solution.moving[on_person].mean() > 0.7
+    assert not solution.moving[~on_person].any()
+
+
 def test_a_smaller_group_that_moves_is_marked_at_once() -> None:
     tracks, on_person = scene(np.random.default_rng(1))
     fewer = np.arange(len(tracks)) < STILL + 50

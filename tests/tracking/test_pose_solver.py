@@ -20,6 +20,7 @@ CAMERAS = [
     Epipolar(900, 800, 290, 290, 450, 400),
 ]
 SCALES = np.array([20.0, 10.0, 5.0, 3.0, 2.0, 2.0, 2.0, 2.0])
+NO_PRIOR = np.eye(4), np.full(6, np.inf)
 
 
 def rig(camera: Camera) -> Rig:
@@ -39,13 +40,21 @@ def scene(camera: Camera, count: int, seed: int) -> tuple[F64, F64, F64, F64]:
     return pose, se3.transform(pose, points_cam), uv[keep], uv_right
 
 
-def solve(camera: Camera, points: F64, uv: F64, uv_right: F64, variance: float = 1e-10) -> tuple[F64, F64, F64]:
+def solve(
+    camera: Camera,
+    points: F64,
+    uv: F64,
+    uv_right: F64,
+    variance: float = 1e-10,
+    prior: tuple[F64, F64] = NO_PRIOR,
+) -> tuple[F64, F64, F64]:
     cameras = StereoCameras.of(rig(camera))
     distance = np.linalg.norm(points, axis=1)
     n = len(points)
     pose, _, covariance, error = pose_solver.optimise_pose(
         np.eye(4), np.zeros(6), 0.1, np.ones(6), np.zeros(0), np.zeros((n, 3)), points / distance[:, None],
         1 / distance, np.full(n, variance), uv, uv_right, cameras.cams, cameras.right_T_left, 0.5, SCALES,
+        *prior,
     )  # fmt: skip
     return pose, covariance, error
 
@@ -57,6 +66,22 @@ def test_exact_pixels_give_the_exact_pose(camera: Camera) -> None:
     assert np.abs(found - pose).max() < 1e-8
     assert error.max() < 1e-6
     assert np.linalg.eigvalsh(covariance).min() > 0
+
+
+def test_a_prior_counts_by_its_covariance() -> None:
+    """Normal equations of both (Barfoot, State Estimation for Robotics, section 8.3), at the pose they give."""
+    rng = np.random.default_rng(2)
+    _, points, uv, uv_right = scene(CAMERAS[0], 120, 0)
+    noisy, noisy_right = (x + rng.normal(0, 0.02, x.shape) for x in (uv, uv_right))
+    without, covariance, _ = solve(CAMERAS[0], points, noisy, noisy_right)
+    information = np.linalg.inv(covariance)
+    sigmas = 1.0 / np.sqrt(np.diag(information))
+    off = sigmas * [1.0, -1.0, 1.0, 1.0, -1.0, 1.0]
+    found, both, _ = solve(CAMERAS[0], points, noisy, noisy_right, prior=(without @ se3.exp(off), sigmas))
+    prior = np.diag(1.0 / sigmas**2)
+    assert np.allclose(both, np.linalg.inv(information + prior), rtol=0.02, atol=1e-3 * np.diag(both).max())
+    moved = se3.log(se3.inverse(without) @ found)
+    assert np.allclose(moved, np.linalg.solve(information + prior, prior @ off), atol=0.05 * np.abs(off).max())
 
 
 @pytest.mark.parametrize("camera", CAMERAS, ids=lambda c: c.model)
@@ -135,6 +160,7 @@ def test_uncertain_distances_do_not_shorten_a_step() -> None:
         found = pose_solver.optimise_pose(
             np.eye(4), np.zeros(6), 0.1, np.ones(6), np.zeros(0), np.zeros((len(rho), 3)), bearing, noisy,
             (relative * rho) ** 2, uv, np.full_like(uv, np.nan), cameras.cams, cameras.right_T_left, 0.3, SCALES,
+            *NO_PRIOR,
         )[0]  # fmt: skip
         steps.append(found[2, 3] / 0.06)
     assert abs(np.mean(steps) - 1) < 3 * np.std(steps) / np.sqrt(len(steps)) + 1e-3

@@ -21,7 +21,8 @@ from stereo_sfm.pipeline.stages import make_tracker_with_places
 from stereo_sfm.tracking.flow.follower import Held
 from stereo_sfm.tracking.flow.frame_pose import PoseSolution
 from stereo_sfm.tracking.flow.pyramids import StereoPyramids
-from stereo_sfm.tracking.flow.recovery import Recovery
+from stereo_sfm.tracking.flow.recovery import REACH, Recovery
+from stereo_sfm.tracking.flow.tracker import Tracker
 from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.tracking.flow.trusted_motion import TrustedMotion
 from stereo_sfm.types import F64, Frame, Keyframe, StereoImage, TrackState
@@ -180,6 +181,7 @@ def test_a_turn_is_not_predicted_to_go_on_for_long() -> None:
 def test_less_certain_poses_need_more_of_the_points(recall: float, seconds: float, accepted: bool) -> None:
     """A ceiling alone is less than half of the points."""
     recovery = Recovery(None, None, (424, 400))
+    recovery.motion.add(-100_000_000, np.eye(4))
     recovery.motion.add(0, np.eye(4))
     expected = recovery.motion.expect(round(seconds * 1e9))
     solution = PoseSolution(np.eye(4), np.zeros(6), np.eye(6), np.zeros(100), 0.3, 3.0)
@@ -199,3 +201,33 @@ def test_an_image_with_fewer_points_is_held_only_after_a_while() -> None:
     held = Held(0, StereoPyramids((), ()), tracks, np.eye(4))
     assert held.worth(0) == 300
     assert held.worth(10**9) == pytest.approx(150)
+
+
+def test_a_new_submap_is_tracked_on_although_people_moved_before_it() -> None:
+    """The robot drove on unseen; what the old points did, and that it may be fast, does not bind the new ones."""
+    config = dataclasses.replace(Config().tracker, lost_frames=2)
+    tracker = make_tracker_with_places(dataclasses.replace(Config(), tracker=config), drive().rig)
+    assert isinstance(tracker, Tracker)
+    stamp, frames = drive().stamp_ns(BEGIN), list[Frame]()
+    far = [drive().frame(k) for k in range(400, 408)]  # nothing of which was seen before
+    for n, image in enumerate([seen(k) for k in range(BEGIN, BEGIN + 6)] + far):
+        tracker._solver._alert_s = 0.5 if n == 5 else tracker._solver._alert_s
+        image = dataclasses.replace(image, stamp_ns=stamp + round(n * 1e9 / RATE))
+        frame, keyframe = tracker.step(image)
+        if keyframe is not None:
+            tracker.describe(keyframe)
+        frames.append(frame)
+    states = [frame.state for frame in frames]
+    begun = states.index(TrackState.RESTARTED)
+    assert states[begun + 1 :] == [TrackState.OK] * (len(states) - begun - 1) != []
+    for a, b in zip(frames[begun:], frames[begun + 1 :], strict=False):
+        assert error(a, b)[0] < 0.01
+
+
+def test_a_robot_of_unknown_speed_may_be_anywhere_near() -> None:
+    motion = TrustedMotion()
+    motion.add(0, np.eye(4))
+    there = se3.exp(np.array([0.0, 0.0, 0.1, 0.0, 0.05, 0.0]))
+    assert motion.expect(100_000_000).sigmas_off(there) < REACH
+    motion.add(50_000_000, np.eye(4))
+    assert motion.expect(150_000_000).sigmas_off(there) > REACH

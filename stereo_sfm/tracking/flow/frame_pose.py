@@ -39,6 +39,8 @@ MIN_LIMITS = (0.01, 4.0), (0.01, 6.0)
 # before the camera may have more points, and older ones, than the store; the camera goes on as before.
 USUAL_DIFFERENCES, USUAL_SIGMAS = ((0.002, 1.0), (0.002, 1.5)), 2.0
 UNLIKELY = 0.01
+USUAL_LIKELIHOOD = 0.6  # about one standard deviation; of a pose less likely the points may be on what moves
+NO_PRIOR = np.full(6, np.inf)
 NEAR = 2.0  # times the largest error of an inlier, at the predicted pose
 LIMIT_SIGMAS = 5.0  # root mean squares of the recent differences, if that is more
 MEMORY_S = 5.0  # time constant of their average
@@ -78,6 +80,13 @@ class PoseSolution:
     def inlier(self) -> Bool:
         """(N,)"""
         return self.error < self.max_error
+
+    @property
+    def agreement(self) -> F64:
+        """(N,) 1 for a point without error, 0 for outliers (Torr & Zisserman, MLESAC, CVIU 78, 2000, section 3)."""
+        if self.reason:
+            return np.zeros(len(self.error))
+        return np.maximum(1.0 - np.square(self.error / self.max_error), 0.0)
 
     @property
     def inliers(self) -> int:
@@ -126,7 +135,7 @@ class FramePoseSolver:
         best = self._solve_all(tracks, expected, last_pose, static)
         rest = static & ~best.inlier
         undisturbed = in_group(tracks, rest).sum() < MIN_GROUP and best.inliers >= AGREEING_SHARE * before
-        undisturbed = undisturbed and self._likelihood(best.pose, expected) > UNLIKELY
+        undisturbed = undisturbed and self._likelihood(best.pose, expected) > USUAL_LIKELIHOOD
         if undisturbed and not self.alert:
             return best
         chosen = self._choose(tracks, expected, last_pose, best, rest)
@@ -148,12 +157,14 @@ class FramePoseSolver:
         if not plausible:
             return _no_pose(len(tracks), "no_consensus") if self.alert else best
         weight = tracks.mapped + np.minimum(tracks.age * expected.seconds, SETTLED_S) / SETTLED_S + MIN_WEIGHT
-        weights = [float(weight[s.inlier & static].sum()) * self._likelihood(s.pose, expected) for s in plausible]
+        weights = [float((weight * s.agreement)[static].sum()) * self._likelihood(s.pose, expected) for s in plausible]
         k = int(np.argmax(weights))
         chosen = plausible[0] if weights[k] <= WEIGHT_RATIO * weights[0] else plausible[k]
+        disagree = static & ~chosen.inlier
+        grouped = in_group(tracks, disagree)
         for motion in found:
-            moving = np.zeros(len(tracks), bool) if motion is None else static & motion.inlier & ~chosen.inlier
-            if in_group(tracks, moving).sum() >= MIN_GROUP:
+            moving = np.zeros(len(tracks), bool) if motion is None else disagree & motion.inlier
+            if (moving & grouped).sum() >= MIN_GROUP:
                 chosen.moving = chosen.moving | moving if len(chosen.moving) else moving
         return chosen
 
@@ -172,14 +183,14 @@ class FramePoseSolver:
         settled = static & (tracks.age * expected.seconds >= SETTLED_S)
         if settled.sum() < self._config.min_features or settled[static].all():
             return None
-        return self._refit(tracks, expected, self._optimise(tracks, expected, settled), settled, static)
+        return self._refit(tracks, expected, self._optimise(tracks, expected, settled, expected), settled, static)
 
     def _solve_near(self, tracks: Tracks, expected: ExpectedMotion, static: Bool) -> PoseSolution | None:
         """Solve with the points that are about where the predicted motion takes them; None with too few."""
         near = static & (self._errors(tracks, expected.pose, expected.velocity) < NEAR * self._config.max_error_sigmas)
         if near.sum() < self._config.min_features or near[static].all():
             return None
-        return self._refit(tracks, expected, self._optimise(tracks, expected, near), near, static)
+        return self._refit(tracks, expected, self._optimise(tracks, expected, near, expected), near, static)
 
     def _solve_rest(self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, rest: Bool) -> PoseSolution | None:
         """The motion of the points that disagree with all others: of another object, or the camera's."""
@@ -196,7 +207,7 @@ class FramePoseSolver:
         """The pose by all inliers of a pose that the points `by` gave; None if most of those are outliers."""
         if (first.inlier & by).sum() < max(self._config.min_features, 0.5 * by.sum()):
             return None
-        return self._optimise(tracks, dataclasses.replace(expected, pose=first.pose), first.inlier & static)
+        return self._optimise(tracks, dataclasses.replace(expected, pose=first.pose), first.inlier & static, expected)
 
     @property
     def alert(self) -> bool:
@@ -213,10 +224,13 @@ class FramePoseSolver:
     def _likelihood(self, pose: F64, expected: ExpectedMotion) -> float:
         """Of a pose by the recent accelerations and those of a robot, 1 for the predicted one, UNLIKELY at least."""
         off = np.array(se3.extent(se3.inverse(expected.pose) @ pose))
-        constant, quadratic = np.array(USUAL_DIFFERENCES).T
-        quadratic = np.maximum(quadratic, USUAL_SIGMAS * np.sqrt(self._difference))
-        sigmas = off / (constant + quadratic * expected.seconds**2)
+        sigmas = off / self._usual_sigmas(expected, USUAL_SIGMAS)
         return max(math.exp(-0.5 * float(np.square(sigmas).sum())), UNLIKELY)
+
+    def _usual_sigmas(self, expected: ExpectedMotion, factor: float) -> F64:
+        """(2,) metres and radians: of a robot's differences from the prediction, `factor` times recent ones if more."""
+        constant, quadratic = np.array(USUAL_DIFFERENCES).T
+        return constant + np.maximum(quadratic, factor * np.sqrt(self._difference)) * expected.seconds**2
 
     def learn(self, tracks: Tracks, solution: PoseSolution, expected: ExpectedMotion) -> None:
         """Learn whether objects move before the camera and, while none does, the noise of points and motion."""
@@ -234,6 +248,10 @@ class FramePoseSolver:
             off = np.array(se3.extent(se3.inverse(expected.pose) @ solution.pose)) / seconds**2
             self._difference += (1.0 - math.exp(-seconds / MEMORY_S)) * (off**2 - self._difference)
 
+    def forget(self) -> None:
+        """Forget moving objects and the open view: new points are tracked from here on."""
+        self._alert_s, self.open_view = 0.0, 0.0
+
     def refine_depth(self, tracks: Tracks, solution: PoseSolution) -> None:
         """Update the distances of inliers whose position is not from the map."""
         pose_solver.refine_depth(
@@ -242,11 +260,13 @@ class FramePoseSolver:
             self._cameras.cams, self._cameras.right_T_left, self._config.depth_sigma_px, MIN_DEPTH_SIGMA,
         )  # fmt: skip
 
-    def _optimise(self, tracks: Tracks, expected: ExpectedMotion, static: Bool) -> PoseSolution:
-        """The pose by the points `static` (N,), with the errors of all points."""
+    def _optimise(
+        self, tracks: Tracks, start: ExpectedMotion, static: Bool, prior: ExpectedMotion | None = None
+    ) -> PoseSolution:
+        """The pose by the points `static` (N,) and a prior, with the errors of all points."""
         if static.all():
-            return self._optimise_all(tracks, expected)
-        best = self._optimise_all(tracks.keep(static), expected)
+            return self._optimise_all(tracks, start, prior)
+        best = self._optimise_all(tracks.keep(static), start, prior)
         best.error = self._errors(tracks, best.pose, best.velocity)
         return best
 
@@ -258,12 +278,14 @@ class FramePoseSolver:
             self._config.sigma_px * self._noise,
         )  # fmt: skip
 
-    def _optimise_all(self, tracks: Tracks, expected: ExpectedMotion) -> PoseSolution:
+    def _optimise_all(self, tracks: Tracks, start: ExpectedMotion, prior: ExpectedMotion | None) -> PoseSolution:
         sigma_px = self._config.sigma_px * self._noise
+        sigmas = NO_PRIOR if prior is None else np.repeat(self._usual_sigmas(prior, 1.0), 3)
         pose, velocity, covariance, error = pose_solver.optimise_pose(
-            expected.pose, expected.moved, expected.seconds, self._shutter.velocity_sigma(),
+            start.pose, start.moved, start.seconds, self._shutter.velocity_sigma(),
             self._shutter.row_seconds(tracks.uv), tracks.origin, tracks.direction, tracks.rho, tracks.variance,
             tracks.uv, tracks.uv_right, self._cameras.cams, self._cameras.right_T_left, sigma_px, CAUCHY_SCALES,
+            start.pose if prior is None else prior.pose, sigmas,
         )  # fmt: skip
         return PoseSolution(pose, velocity, covariance, error, sigma_px, self._config.max_error_sigmas)
 

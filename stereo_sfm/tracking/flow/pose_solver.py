@@ -172,6 +172,21 @@ def _normal_equations(
 
 
 @njit
+def _add_prior(pose, expected, sigmas, normal, rhs):
+    """Add the prior of the pose (4, 4), to first order in its difference from it, to the normal equations."""
+    difference = np.zeros(6)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        for m in range(3):
+            difference[i] += expected[m, i] * (pose[m, 3] - expected[m, 3])
+            difference[3 + i] += 0.5 * (expected[m, k] * pose[m, j] - expected[m, j] * pose[m, k])
+    for i in range(6):
+        information = 1.0 / (sigmas[i] * sigmas[i])
+        normal[i, i] += information
+        rhs[i] += information * difference[i]
+
+
+@njit
 def _move_distances(rho, prior, variance, elimination, xi, row_s):
     """Back substitution: update every inverse distance for a step of the pose (and velocity), within limits."""
     for k in range(len(rho)):
@@ -185,7 +200,7 @@ def _move_distances(rho, prior, variance, elimination, xi, row_s):
 @njit
 def optimise_pose(
     pose, moved, seconds, velocity_sigma, row_s, origin, direction, rho, variance, uv_l, uv_r, cams, right_T_left,
-    sigma, scales,
+    sigma, scales, expected, expected_sigmas,
 ):  # fmt: skip
     """Pose of a frame.
 
@@ -197,6 +212,8 @@ def optimise_pose(
         origin, direction: (N, 3) odometry frame. rho, variance: (N,) 1/m.
         uv_l, uv_r: (N, 2) px, NaN in uv_r where unseen.
         sigma: px, noise of one coordinate. scales: (S,) Cauchy scales in sigmas, one Gauss-Newton step each.
+        expected: (4, 4) prior of the pose. expected_sigmas: (6,) its standard deviations, metres and radians along and
+            about the camera's axes; infinite: there is none.
 
     Returns:
         pose (4, 4), velocity (6,) a second, covariance (6, 6) of pose @ exp(xi), error (N,) root of the whitened
@@ -215,6 +232,8 @@ def optimise_pose(
             pose, velocity, row_s, origin, direction, prior, variance, rho, uv_l, uv_r, cams, right_T_left, sigma,
             scale, normal, rhs, error, elimination,
         )  # fmt: skip
+        if math.isfinite(expected_sigmas[0]):
+            _add_prior(pose, expected, expected_sigmas, normal, rhs)
         for i in range(n - 6):  # prior of the velocity: the mean motion since the last frame
             information = 1.0 / (velocity_sigma[i] * velocity_sigma[i])
             difference = velocity[i] - moved[i] * rate

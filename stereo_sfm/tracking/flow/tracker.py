@@ -342,7 +342,8 @@ class Tracker:
             self._covered_frames += not self._recovery.free
         if max(self._free_frames, COVERED_SHARE * self._covered_frames) > self._config.lost_frames:
             self._pose = expected.odom_T_cam
-            self._velocity = np.zeros(6)
+            self._velocity = self._recovery.motion.velocity_at(image.stamp_ns)
+            self._solver.forget()
             self._bridging = bridge is not None
             self._submap_id += not self._bridging
             self._state = TrackState.INITIALIZING

@@ -22,6 +22,7 @@ TURN_ACCELERATION = 1.0  # rad/s^2, standard deviation
 MAX_TURN_RATE_CHANGE = 0.7  # rad/s
 MAX_TURN_RATE, TURN_STEP = 1.0, np.deg2rad(20.0)  # rad/s, radians: turns that are tried
 SLOWER = 0.5, 0.0  # shares of the last speed that are tried
+UNKNOWN_SPEED, UNKNOWN_TURN_RATE = 1.0, 0.5  # m/s, rad/s, standard deviations before any motion was seen
 FIRST_SIGMAS = (0.01, 0.005)  # metres, radians: of the last trusted pose and its velocity
 
 
@@ -73,6 +74,11 @@ class TrustedMotion:
             return np.zeros(6)
         return np.asarray(se3.log(se3.inverse(first) @ last)) / ((last_ns - first_ns) * 1e-9)
 
+    def velocity_at(self, stamp_ns: int) -> F64:
+        """(6,) the velocity at a later time: the last one, decreased exponentially."""
+        seconds = max((stamp_ns - self._poses[-1][0]) * 1e-9, 0.0)
+        return self.velocity() * np.exp(-seconds / np.repeat([FADE_S, TURN_FADE_S], 3))
+
     def expect(self, stamp_ns: int) -> Expectation:
         """The predicted pose at a time, with the last speed and turn rate decreasing exponentially."""
         last_ns, last = self._poses[-1]
@@ -82,6 +88,8 @@ class TrustedMotion:
         moved[3:] *= _faded(seconds, TURN_FADE_S)
         metres = min(0.5 * ACCELERATION * seconds, MAX_SPEED_CHANGE) * seconds
         radians = min(0.5 * TURN_ACCELERATION * seconds, MAX_TURN_RATE_CHANGE) * seconds
+        if self._poses[0][0] == last_ns:
+            metres, radians = metres + UNKNOWN_SPEED * seconds, radians + UNKNOWN_TURN_RATE * seconds
         return Expectation(last @ se3.exp(moved), FIRST_SIGMAS[0] + metres, FIRST_SIGMAS[1] + radians)
 
     def others(self, stamp_ns: int) -> list[F64]:
