@@ -16,6 +16,7 @@ LINKED = ("drivers", "calib")  # folders of their own that are rooms of the pack
 ROOMS: tuple[str, ...] = (
     "stereo_sfm.same_code",
     "stereo_sfm.errors",
+    "stereo_sfm.folder_lock",
     "stereo_sfm.timing",
     "stereo_sfm.messages",
     "stereo_sfm.types",

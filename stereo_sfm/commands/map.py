@@ -1,4 +1,4 @@
-"""`stereo-sfm map`: describe, merge, prune and export saved maps."""
+"""`stereo-sfm map`: describe, merge, prune, update and export saved maps."""
 
 from __future__ import annotations
 
@@ -47,8 +47,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     prune.add_argument(
         "--unseen-sessions", type=int, default=0, metavar="N", help="remove points not seen in the newest N sessions"
     )
-    from stereo_sfm.commands import export
+    from stereo_sfm.commands import export, map_store
 
+    map_store.add_arguments(actions.add_parser)
     export.add_arguments(actions.add_parser("export", help="export a map to the formats of other programs"))
 
 
@@ -85,6 +86,10 @@ def run(args: argparse.Namespace) -> int:
         from stereo_sfm.commands import export
 
         return export.run(args)
+    from stereo_sfm.commands import map_store
+
+    if args.action in map_store.ACTIONS:
+        return map_store.run(args)
     if args.action == "info":
         return _info(args.map)
     return _merge(typed(MergeOptions, args)) if args.action == "merge" else _prune(typed(PruneOptions, args))

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
-import os
 import re
-import weakref
 from datetime import datetime
 from pathlib import Path
 
 import numpy as np
 
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.folder_lock import FolderLock
 
 TRAJECTORIES = ("trajectory_odom.tum", "trajectory_odom.kitti", "trajectory_map.tum", "trajectory_map.kitti")
 PLOTS = ("trajectory.png", "errors.png", "tracking.png", "calibration.png", "times.png")
@@ -32,28 +30,6 @@ def is_free(folder: Path) -> bool:
     return not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
 
 
-class FolderLock:
-    """Locks an output folder as long as this object exists; no file is written, a killed run leaves no lock."""
-
-    def __init__(self, folder: Path) -> None:
-        """Lock an existing folder.
-
-        Raises:
-            StereoSfmError: another run holds the lock.
-        """
-        descriptor = os.open(folder, os.O_RDONLY | os.O_CLOEXEC)
-        self.release = weakref.finalize(self, os.close, descriptor)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            self.release()
-            raise StereoSfmError(
-                f"another run is writing to {folder}: choose another -o, or wait for its end"
-            ) from None
-        except OSError:  # a network file system without locks
-            return
-
-
 def prepare_folder(folder: Path, overwrite: bool) -> FolderLock:
     """Create the folder of a new run, or take an empty one, and lock it.
 
@@ -66,7 +42,7 @@ def prepare_folder(folder: Path, overwrite: bool) -> FolderLock:
         if not (overwrite or is_free(folder)):
             raise StereoSfmError(f"{folder} exists: choose another -o, or add --overwrite")
         folder.mkdir(parents=True, exist_ok=True)
-        lock = FolderLock(folder)
+        lock = FolderLock(folder, "choose another -o, or wait for its end")
         discard_files(folder)
         return lock
     except OSError as error:

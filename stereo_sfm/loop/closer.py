@@ -101,6 +101,22 @@ class LoopCloser:
 
     def step(self, keyframe: Keyframe) -> LoopResult:
         """Look for a loop with earlier keyframes, then add the keyframe."""
+        bags = self._enter(keyframe)
+        with self._spans.span("loop_query"):
+            candidates, why_none = self._candidates(keyframe, *bags)
+        with self._spans.span("loop_verify"):
+            result = self._judge(keyframe, candidates, why_none)
+        self._keep(keyframe, bags)
+        self._cull(keyframe.kf_id)
+        self._grow(keyframe)
+        return result
+
+    def add(self, keyframe: Keyframe) -> None:
+        """Add a keyframe of a finished map, to which later ones may close loops."""
+        self._keep(keyframe, self._enter(keyframe))
+
+    def _enter(self, keyframe: Keyframe) -> tuple[voc.Bag, voc.Bag]:
+        """Its words and those of its side views; what candidates are judged by knows the keyframe from now on."""
         if not np.array_equal(keyframe.rig_terms, self._rig_terms):  # the tracker's rig was corrected
             self._rig_terms = keyframe.rig_terms
             self._rig = with_terms(self._source_rig, self._rig_terms)
@@ -108,17 +124,14 @@ class LoopCloser:
         with self._spans.span("loop_words"):
             bag, side_bag = (self._vocabulary.bag(c.descriptors) for c in (keyframe.corners, keyframe.sides))
         self._fronts.add(keyframe)
-        with self._spans.span("loop_query"):
-            candidates, why_none = self._candidates(keyframe, bag, side_bag)
-        with self._spans.span("loop_verify"):
-            result = self._judge(keyframe, candidates, why_none)
+        return bag, side_bag
+
+    def _keep(self, keyframe: Keyframe, bags: tuple[voc.Bag, voc.Bag]) -> None:
+        """The keyframe can be a candidate from now on."""
         self._row[keyframe.kf_id] = len(self._database)
-        self._database.add(keyframe.kf_id, bag)
-        self._side_database.add(keyframe.kf_id, side_bag)
+        self._database.add(keyframe.kf_id, bags[0])
+        self._side_database.add(keyframe.kf_id, bags[1])
         self._store.add(keyframe)
-        self._cull(keyframe.kf_id)
-        self._grow(keyframe)
-        return result
 
     def _cull(self, newest: int) -> None:
         """Of many keyframes of one view keep the first and the last few, which bounds memory in a known place."""

@@ -170,10 +170,10 @@ def prune(saved: SavedMap, min_views: int = 0, min_seen_share: float = 0.0, unse
     keyframes = np.bincount(s.obs_kf[obs], minlength=len(s.kf_ids)) > 0
     if not keep.any() or not keyframes.any():
         raise StereoSfmError("pruning would leave an empty map: use lower limits")
-    return dataclasses.replace(saved, snapshot=_subset(s, keyframes, keep, obs), sessions=saved.sessions[keyframes])
+    return dataclasses.replace(saved, snapshot=subset(s, keyframes, keep, obs), sessions=saved.sessions[keyframes])
 
 
-def _subset(s: MapSnapshot, keyframes: Bool, points: Bool, obs: Bool) -> MapSnapshot:
+def subset(s: MapSnapshot, keyframes: Bool, points: Bool, obs: Bool) -> MapSnapshot:
     """The rows selected by boolean masks; points anchored in a removed keyframe get another one that observes them."""
     kf_row, pt_row = np.cumsum(keyframes) - 1, np.cumsum(points) - 1
     obs_kf, obs_pt = kf_row[s.obs_kf[obs]], pt_row[s.obs_pt[obs]]

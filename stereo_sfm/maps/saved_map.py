@@ -58,6 +58,11 @@ class SavedMap:
         return np.unique(self.sessions).tolist()
 
 
+def map_files() -> frozenset[str]:
+    """The names of the files of a map."""
+    return frozenset({"map.json", "rig.yaml", *(f"{name}.npz" for name in _FILES)})
+
+
 def save_map(saved: SavedMap, folder: Path | str, beside: Mapping[str, bytes] | None = None) -> None:
     """Write a map folder atomically; other files in it stay.
 
@@ -71,8 +76,7 @@ def save_map(saved: SavedMap, folder: Path | str, beside: Mapping[str, bytes] | 
         raise StereoSfmError("the map is empty: nothing to save")
     folder = Path(folder).expanduser()
     beside = beside or {}
-    names = frozenset({"map.json", "rig.yaml", *beside, *(f"{name}.npz" for name in _FILES)})
-    with replaced_folder(folder, names) as draft:
+    with replaced_folder(folder, map_files() | beside.keys()) as draft:
         checksums: dict[str, str] = {}
         for name, columns in _FILES.items():
             path = draft / f"{name}.npz"

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, Self
 from stereo_sfm.config import Config
 from stereo_sfm.drivers.choice import Opener
 from stereo_sfm.errors import StereoSfmError, require
-from stereo_sfm.export.run_folder import KEPT_MAP, FolderLock, default_folder, discard_files, prepare_folder
+from stereo_sfm.export.run_folder import KEPT_MAP, default_folder, discard_files, prepare_folder
+from stereo_sfm.folder_lock import FolderLock
 from stereo_sfm.maps.folders import MapFolders
 from stereo_sfm.messages import Compiling, LogEnded, Sink
 from stereo_sfm.pipeline.capture import SourceInfo

@@ -1,0 +1,110 @@
+"""What a session changed in a map, in words: `aisle 4, left, 2-5 m: new`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stereo_sfm.geometry import se3
+from stereo_sfm.maps.floor import HIGH, LOW
+from stereo_sfm.maps.update import Update
+from stereo_sfm.types import F64, I64, Bool
+
+CELL = 1.0  # metres
+SEEN = 8  # points of the session in a cell that was looked at
+KNOWN = 8  # points of earlier sessions in a cell that the map knew
+CHANGED = 0.35  # of the usual share of points found again, below which a cell has changed
+SIGMAS = 2.0  # by which it must miss the usual number
+BESIDE_M = 3.0  # metres from an aisle's line to its shelves
+NEAR_M = 6.0  # metres from a keyframe; points farther away are too uncertain
+VIEWS = 3  # keyframes that see a point that counts
+NEW, OTHER = "new", "changed"
+
+
+@dataclass(frozen=True)
+class Aisle:
+    """A line along an aisle, in metres of the floor plan; left and right as one goes from its start to its end."""
+
+    name: str
+    start: tuple[float, float]
+    end: tuple[float, float]
+
+    def place(self, xy: F64) -> tuple[F64, F64]:
+        """Points (N, 2) -> metres along the aisle (N,) and to its left (N,)."""
+        begin = np.array(self.start)
+        along = np.array(self.end) - begin
+        along /= np.linalg.norm(along)
+        off = xy - begin
+        return off @ along, off @ np.array([-along[1], along[0]])
+
+    @property
+    def length(self) -> float:
+        """Metres."""
+        return float(np.linalg.norm(np.subtract(self.end, self.start)))
+
+
+def changed_cells(update: Update, map_T_floor: F64) -> list[tuple[str, float, float]]:
+    """Squares of CELL metres on the floor whose shelves are new to the map or show other things: kind, x, y (middle).
+
+    Where a session finds again far fewer of its points than it usually does, although it sees that square and the map
+    knew it, other things stand there.
+    """
+    s, sessions = update.together, update.together_sessions
+    floor_T_map = se3.inverse(map_T_floor)
+    points = se3.transform(floor_T_map, s.points)
+    centres = s.map_T_kf[:, :3, 3]
+    near = np.linalg.norm(s.points[s.obs_pt] - centres[s.obs_kf], axis=1) < NEAR_M
+    solid = (points[:, 2] > LOW) & (points[:, 2] < HIGH)
+    ours = sessions[s.obs_kf] == update.session
+    mine, before = (_often(s.obs_pt[near & by], len(s.pt_ids)) & solid for by in (ours, ~ours))
+    cell = np.floor(points[:, :2] / CELL).astype(np.int64)
+    cells, which = np.unique(cell, axis=0, return_inverse=True)
+    seen, known, again = (np.bincount(which[rows], minlength=len(cells)) for rows in (mine, before, mine & before))
+    looked = (seen >= SEEN) & (known >= KNOWN)
+    usual = float(np.median(again[looked] / seen[looked])) if looked.any() else 0.0
+    missing = usual * seen - again
+    other = looked & (again < CHANGED * usual * seen) & (missing > SIGMAS * np.sqrt(usual * seen))
+    new = (seen >= SEEN) & (known < KNOWN)
+    rows = np.flatnonzero(new | other).tolist()
+    return [(NEW if new[k] else OTHER, *((cells[k] + 0.5) * CELL).tolist()) for k in rows]
+
+
+def _often(rows: I64, count: int) -> Bool:
+    """(N,) which points are seen by several keyframes."""
+    return np.bincount(rows, minlength=count) >= VIEWS
+
+
+def describe_changes(cells: Sequence[tuple[str, float, float]], aisles: Sequence[Aisle]) -> list[str]:
+    """Lines for people; cells beside no aisle by their place on the floor plan."""
+    spans: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    for kind, x, y in cells:
+        where, begin = _where(np.array([[x, y]]), aisles)
+        spans.setdefault((where, kind), []).append((begin, begin + CELL))
+    out: list[str] = []
+    for (where, kind), parts in sorted(spans.items()):
+        for begin, end in _together(sorted(parts)):
+            out.append(f"{where}{max(begin, 0.0):.0f}-{max(end, 0.0):.0f} m: {kind}")
+    return out
+
+
+def _where(xy: F64, aisles: Sequence[Aisle]) -> tuple[str, float]:
+    """The shelf and the metres along it at which a cell begins."""
+    best, text, begin = BESIDE_M, f"y {xy[0, 1]:.1f} m, x ", float(xy[0, 0]) - 0.5 * CELL
+    for aisle in aisles:
+        along, left = (float(v[0]) for v in aisle.place(xy))
+        if -0.5 * CELL <= along <= aisle.length + 0.5 * CELL and abs(left) < best:
+            best = abs(left)
+            text, begin = f"{aisle.name}, {'left' if left > 0 else 'right'}, ", along - 0.5 * CELL
+    return text, begin
+
+
+def _together(parts: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    out: list[tuple[float, float]] = []
+    for begin, end in parts:
+        if out and begin <= out[-1][1] + 0.5 * CELL:
+            out[-1] = out[-1][0], max(end, out[-1][1])
+        else:
+            out.append((begin, end))
+    return out

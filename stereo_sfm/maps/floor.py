@@ -1,0 +1,60 @@
+"""The floor of a map: which way is up, and along which axes the aisles lie."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.dominant_direction import dominant_direction
+from stereo_sfm.mapping.map import MapSnapshot
+from stereo_sfm.types import F64, Bool
+
+LOW, HIGH = 0.15, 1.9  # height range in metres of obstacles for the robot
+
+
+def find_floor(s: MapSnapshot) -> F64:
+    """map_T_floor (4, 4): z up from the floor plane, x along the dominant direction of the structure above it."""
+    down = s.map_T_kf[:, :3, 1].mean(0)
+    if np.linalg.norm(down) < 0.3:
+        raise StereoSfmError(
+            "no floor plan: the vertical direction is unknown, since the cameras look in all directions"
+        )
+    down /= np.linalg.norm(down)
+    centre = s.map_T_kf[:, :3, 3].mean(0)
+    below = (s.points - centre) @ down
+    down, depth = _floor_plane(s.points - centre, below > 0.2, down)
+    across = np.cross(down, [1.0, 0, 0]) if abs(down[0]) < 0.9 else np.cross(down, [0, 0, 1.0])
+    x = across / np.linalg.norm(across)
+    axes = np.stack([x, np.cross(-down, x), -down], axis=1)
+    flat = (s.points - centre) @ axes[:, :2]
+    height = depth - (s.points - centre) @ down
+    yaw = dominant_direction(flat[(height > LOW) & (height < HIGH)])
+    c, n = math.cos(yaw), math.sin(yaw)
+    turned = axes @ np.array([[c, -n, 0], [n, c, 0], [0, 0, 1.0]])
+    return se3.from_rotation_translation(turned, centre + depth * down)
+
+
+def _floor_plane(points: F64, candidates: Bool, down: F64) -> tuple[F64, float]:
+    """Normal (pointing down) and depth below the origin of the lowest well-filled plane."""
+    depth = points[candidates] @ down
+    if len(depth) < 20:
+        return down, float(np.percentile(points @ down, 99)) if len(points) else 1.5
+    counts, edges = np.histogram(depth, np.arange(depth.min(), depth.max() + 0.1, 0.05))
+    smooth = np.convolve(counts, [1, 2, 1], "same")
+    full = np.flatnonzero(smooth > 0.4 * smooth.max())
+    level = float(edges[full[-1]] + 0.025)
+    near, normal = points[candidates][np.abs(depth - level) < 0.08], down
+    for _ in range(5):
+        mean = near.mean(0)
+        normal = np.linalg.svd(near - mean, full_matrices=False)[2][2]
+        normal *= np.sign(normal @ down)
+        if normal @ down < math.cos(math.radians(10)):
+            return down, level
+        distance = (points[candidates] - mean) @ normal
+        near = points[candidates][np.abs(distance) < 0.05]
+        if len(near) < 20:
+            return down, level
+    return normal, float(near.mean(0) @ normal)

@@ -1,0 +1,144 @@
+"""The map of a store over months: one map folder, its earlier versions beside it, and what people wrote about it.
+
+STORE is a map folder like any other, with `store.yaml` (floor frame, labels), `changes.txt` (what the last session
+changed) and whatever else people put there, which updates keep. STORE.versions holds earlier versions by number and is
+locked while STORE is written.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.folder_lock import FolderLock
+from stereo_sfm.maps.changes import Aisle
+from stereo_sfm.maps.floor import find_floor
+from stereo_sfm.maps.saved_map import SavedMap, load_map, map_files, save_map
+from stereo_sfm.maps.unfinished import copy_map
+from stereo_sfm.types import F64
+
+ABOUT, CHANGES = "store.yaml", "changes.txt"
+KEPT_VERSIONS = 5
+
+
+@dataclass(frozen=True, eq=False)
+class About:
+    """What is known of a store besides its map."""
+
+    version: int  # counts updates
+    map_T_floor: F64  # (4, 4) set once, so that labels and plans stay valid
+    aisles: tuple[Aisle, ...] = ()
+
+
+def versions_folder(store: Path) -> Path:
+    """Where earlier versions are."""
+    return store.with_name(f"{store.name}.versions")
+
+
+def lock(store: Path) -> FolderLock:
+    """Lock a store for writing.
+
+    Raises:
+        StereoSfmError: another process writes to it.
+    """
+    folder = versions_folder(store)
+    folder.mkdir(parents=True, exist_ok=True)
+    return FolderLock(folder, f"wait until the map {store} is written")
+
+
+def read_about(store: Path, saved: SavedMap | None = None) -> About:
+    """What `store.yaml` says; without it, the floor of the map.
+
+    Raises:
+        StereoSfmError: the file is damaged.
+    """
+    path = store / ABOUT
+    if not path.is_file():
+        return About(0, find_floor((saved or load_map(store)).snapshot))
+    try:
+        data: Any = yaml.safe_load(path.read_text("utf-8"))
+        aisles = tuple(Aisle(str(a["name"]), _pair(a["start"]), _pair(a["end"])) for a in data["aisles"])
+        pose = np.array(data["map_T_floor"], float).reshape(4, 4)
+        return About(int(data["version"]), pose, aisles)
+    except (yaml.YAMLError, KeyError, TypeError, ValueError, OSError):
+        raise StereoSfmError(f"{path} is damaged: correct it, or remove it to begin without labels") from None
+
+
+def _pair(values: Any) -> tuple[float, float]:
+    x, y = values
+    return float(x), float(y)
+
+
+def _about_text(about: About) -> bytes:
+    aisles = [{"name": a.name, "start": list(a.start), "end": list(a.end)} for a in about.aisles]
+    data = {"version": about.version, "map_T_floor": about.map_T_floor.tolist(), "aisles": aisles}
+    return yaml.safe_dump(data, sort_keys=False, allow_unicode=True).encode()
+
+
+def write_about(store: Path, about: About) -> None:
+    """Replace `store.yaml`."""
+    draft = store / f".{ABOUT}"
+    draft.write_bytes(_about_text(about))
+    draft.replace(store / ABOUT)
+
+
+def write_version(store: Path, saved: SavedMap, changes: list[str], keep: int = KEPT_VERSIONS) -> int:
+    """Make this map the newest version of a store, which the caller has locked; the version before is kept.
+
+    Returns:
+        The number of the version.
+    """
+    exists = (store / "map.json").exists()
+    about = read_about(store) if exists else About(0, find_floor(saved.snapshot))
+    if exists:
+        copy_map(store, versions_folder(store) / f"{about.version:05d}")
+        about = dataclasses.replace(about, version=about.version + 1)
+    beside = _extras(store)
+    beside[ABOUT] = _about_text(about)
+    beside[CHANGES] = "".join(f"{line}\n" for line in changes).encode()
+    save_map(saved, store, beside)
+    for number in versions(store)[: -keep or None]:
+        shutil.rmtree(versions_folder(store) / f"{number:05d}")
+    return about.version
+
+
+def _extras(store: Path) -> dict[str, bytes]:
+    """The files of a store that are not the map's."""
+    if not store.is_dir():
+        return {}
+    paths = [p for p in sorted(store.iterdir()) if p.is_file() and p.name not in map_files()]
+    return {p.name: p.read_bytes() for p in paths}
+
+
+def versions(store: Path) -> list[int]:
+    """Numbers of the kept earlier versions, ascending."""
+    folder = versions_folder(store)
+    return sorted(int(p.parent.name) for p in folder.glob("*/map.json") if p.parent.name.isdigit())
+
+
+def undo(store: Path) -> int:
+    """Bring back the version before, in a locked store; labels and what people put beside the map stay.
+
+    Returns:
+        Its number.
+
+    Raises:
+        StereoSfmError: there is none.
+    """
+    kept = [number for number in versions(store) if number < read_about(store).version]
+    if not kept:
+        raise StereoSfmError(f"no earlier version of {store} is kept")
+    folder = versions_folder(store) / f"{kept[-1]:05d}"
+    beside = _extras(store)
+    beside[ABOUT] = _about_text(dataclasses.replace(read_about(store), version=kept[-1]))
+    beside[CHANGES] = (folder / CHANGES).read_bytes() if (folder / CHANGES).is_file() else b""
+    save_map(load_map(folder), store, beside)
+    shutil.rmtree(folder)
+    return kept[-1]

@@ -1,0 +1,180 @@
+"""A session put into the map of a store, whose size stays bounded by the store however often it is driven.
+
+The session's keyframes look for loops in the map, which is rigid until then; both are adjusted together, in the frame
+of the map. A keyframe is forgotten when enough later sessions have had its view, and with it the points that none of
+them saw: products that were exchanged, shelves that are gone. So each view keeps its newest visits.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from stereo_sfm.config import LoopConfig, MapperConfig
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
+from stereo_sfm.loop.closer import LoopCloser
+from stereo_sfm.loop.vocabulary import Vocabulary
+from stereo_sfm.mapping.correction import apply_loop, fuse_pairs, loop_is_known
+from stereo_sfm.mapping.map import Map, MapSnapshot
+from stereo_sfm.maps.merge import MERGE_PAUSE, full_adjustment, share_a_session, subset
+from stereo_sfm.maps.saved_map import SavedMap, joined, restore_map
+from stereo_sfm.types import F64, I64, Bool, LoopResult
+
+log = logging.getLogger("stereo_sfm")
+
+KEPT_SESSIONS = 3  # later sessions that saw a keyframe's view before it is forgotten
+VIEW_DEPTHS = 0.25  # of the median depth of a keyframe: distance of a camera with the same view
+VIEW_METRES = 0.4, 1.5  # bounds of that distance
+VIEW_DEG = 25.0
+
+
+@dataclass(frozen=True, eq=False)
+class Update:
+    """The new map and what became of the session."""
+
+    saved: SavedMap
+    session: int  # its number in the map
+    loops: list[LoopResult]  # from the session to the map or within the session, in ids before renumbering
+    fused: int  # points of the session that the map had
+    forgotten: int  # keyframes
+    together: MapSnapshot  # map and session before anything was forgotten, in the frame of the map
+    together_sessions: I64  # (K,) of its keyframes
+
+
+def update(
+    saved: SavedMap,
+    walk: SavedMap,
+    vocabulary: Vocabulary,
+    config: LoopConfig,
+    mapper: MapperConfig,
+) -> Update:
+    """Put a session into a map; the map's frame stays where it is.
+
+    Args:
+        saved: the map. walk: the session's own map.
+        vocabulary: of the loop search. config: of the loops. mapper: of the bundle adjustment at the end.
+
+    Raises:
+        StereoSfmError: different cameras, a session that is in the map already, or that no loop joins to it.
+    """
+    if share_a_session(saved, walk):
+        raise StereoSfmError("this session is in the map already")
+    both = joined([saved, walk])
+    map_ = restore_map(both.snapshot)
+    map_.points.sigma[:] = map_.observations.sigma[:] = mapper.sigma_px
+    first_new = len(saved)
+    loops, fused = _close(map_, both, first_new, LoopCloser(_eager(config), both.rig, vocabulary), config)
+    boundary = int(both.snapshot.kf_ids[first_new])
+    if not any(loop.candidate_kf_id < boundary <= loop.kf_id for loop in loops):
+        raise StereoSfmError("the session was not found in the map: no loop joins them (are they of one store?)")
+    session_of = dict(zip(both.snapshot.kf_ids.tolist(), both.sessions.tolist(), strict=True))
+    together, sessions = _snapshot(map_, session_of)
+    kept = ~_superseded(together, sessions)
+    forgotten = int((~kept).sum())
+    if forgotten:
+        obs = kept[together.obs_kf]
+        points = np.bincount(together.obs_pt[obs], minlength=len(together.pt_ids)) > 0
+        map_ = restore_map(subset(together, kept, points, obs))
+        map_.points.sigma[:] = map_.observations.sigma[:] = mapper.sigma_px
+    full_adjustment(map_, both.rig, mapper)
+    snapshot, kept_sessions = _snapshot(map_, session_of)
+    back = _back(saved.snapshot, snapshot)
+    new = _renumbered(_moved(snapshot, back))
+    return Update(
+        SavedMap(new, saved.rig, vocabulary.id, kept_sessions),
+        int(both.sessions[first_new]),
+        loops,
+        fused,
+        forgotten,
+        together,
+        sessions,
+    )
+
+
+def _eager(config: LoopConfig) -> LoopConfig:
+    return dataclasses.replace(config, pause=MERGE_PAUSE)
+
+
+def _close(
+    map_: Map, both: SavedMap, first_new: int, closer: LoopCloser, config: LoopConfig
+) -> tuple[list[LoopResult], int]:
+    """Loops of the session's keyframes (rows from `first_new` on), applied to the map; and the points they fused."""
+    loops: list[LoopResult] = []
+    fused = 0
+    stamps = both.snapshot.stamp_ns - both.snapshot.stamp_ns[first_new]
+    chains = int(both.snapshot.submap_ids[:first_new].max()) + 1
+    for row, keyframe in enumerate(both.snapshot.keyframes()):
+        if row < first_new:  # the map is one rigid piece
+            closer.add(dataclasses.replace(keyframe, submap_id=0, stamp_ns=0))
+            continue
+        chain = keyframe.submap_id - chains + 1
+        result = closer.step(dataclasses.replace(keyframe, submap_id=chain, stamp_ns=int(stamps[row])))
+        if result.candidate_kf_id < 0:
+            continue
+        if loop_is_known(map_, result, config.connected_points):
+            fused += len(fuse_pairs(map_, result.matches, 1.0))
+            loops.append(result)
+            continue
+        done = apply_loop(map_, result, loops, config)
+        if done.applied:
+            loops.append(result)
+            fused += len(done.fused)
+    return loops, fused
+
+
+def _snapshot(map_: Map, session_of: dict[int, int]) -> tuple[MapSnapshot, I64]:
+    """The map's content and the session of each of its keyframes."""
+    snapshot = map_.snapshot()
+    return snapshot, np.array([session_of[k] for k in snapshot.kf_ids.tolist()], np.int64)
+
+
+def _superseded(s: MapSnapshot, sessions: I64) -> Bool:
+    """(K,) which keyframes have a view that at least KEPT_SESSIONS later sessions have had."""
+    centres = s.map_T_kf[:, :3, 3]
+    depth = np.linalg.norm(s.points[s.obs_pt] - centres[s.obs_kf], axis=1)
+    order = np.lexsort((depth, s.obs_kf))
+    count = np.bincount(s.obs_kf, minlength=len(s.kf_ids))
+    middle = np.minimum(np.cumsum(count) - count + count // 2, max(len(order) - 1, 0))
+    radius = np.clip(VIEW_DEPTHS * np.where(count > 0, depth[order[middle]], 0.0), *VIEW_METRES)
+    around = KDTree(centres).query_ball_point(centres, radius, return_sorted=True)
+    out = np.zeros(len(s.kf_ids), bool)
+    for row, near in enumerate(around):
+        later = np.array([k for k in near if sessions[k] > sessions[row]], np.int64)
+        if len(later):
+            turned = se3.extent(se3.inverse(s.map_T_kf[later]) @ s.map_T_kf[row])[1]
+            visits = np.unique(sessions[later[turned < np.deg2rad(VIEW_DEG)]])
+            out[row] = len(visits) >= KEPT_SESSIONS
+    return out
+
+
+def _back(before: MapSnapshot, after: MapSnapshot) -> F64:
+    """before_T_after (4, 4) that lays the keyframes of both on each other, so that the map's frame does not wander."""
+    _, i, j = np.intersect1d(before.kf_ids, after.kf_ids, return_indices=True)
+    if not len(i):
+        return np.eye(4)
+    each = before.map_T_kf[i] @ se3.inverse(after.map_T_kf[j])
+    u, _, vt = np.linalg.svd(each[:, :3, :3].mean(0))
+    rotation = u @ vt
+    shift = (before.map_T_kf[i, :3, 3] - after.map_T_kf[j, :3, 3] @ rotation.T).mean(0)
+    return se3.from_rotation_translation(rotation, shift)
+
+
+def _moved(s: MapSnapshot, new_T_old: F64) -> MapSnapshot:
+    poses = se3.orthonormalize(new_T_old @ s.map_T_kf)
+    return dataclasses.replace(s, map_T_kf=poses, points=se3.transform(new_T_old, s.points))
+
+
+def _renumbered(s: MapSnapshot) -> MapSnapshot:
+    """Ids from 0 on: tables by id do not grow with the number of sessions."""
+    submaps = np.unique(s.submap_ids, return_inverse=True)[1].astype(np.int64)
+    return dataclasses.replace(
+        s,
+        kf_ids=np.arange(len(s.kf_ids), dtype=np.int64),
+        pt_ids=np.arange(len(s.pt_ids), dtype=np.int64),
+        submap_ids=submaps,
+    )
