@@ -106,10 +106,16 @@ def play(path: str, frames: int, paced: bool, folder: Path) -> None:
 
 
 def slopes(minutes: list[float], sizes: list[dict[str, float]]) -> dict[str, float]:
-    """Growth a minute after the first third, of all processes and the log."""
+    """Growth a minute after the first third, of all processes and the log.
+
+    The median of the slopes between all pairs of samples (Theil and Sen): what a process holds while it computes, as
+    the optimizer a problem of the size of the map for a moment, is not growth.
+    """
     known = [k for k, at in enumerate(minutes) if at >= minutes[-1] / 3]
-    x = [minutes[k] for k in known]
-    return {name: float(np.polyfit(x, [sizes[k][name] for k in known], 1)[0]) for name in sizes[-1]}
+    first, second = np.triu_indices(len(known), 1)
+    x = np.take(minutes, known)
+    grown = {name: np.array([sizes[k][name] for k in known]) for name in sizes[-1]}
+    return {name: float(np.median((mib[second] - mib[first]) / (x[second] - x[first]))) for name, mib in grown.items()}
 
 
 def growth(path: str, frames: int, folder: Path) -> int:
@@ -126,10 +132,11 @@ def growth(path: str, frames: int, folder: Path) -> int:
     for at, now in list(zip(minutes, sizes, strict=True))[:: max(len(sizes) // 10, 1)]:
         print(f"  after {at:5.1f} min: " + ", ".join(f"{name} {mib:.0f}" for name, mib in now.items()))
     found = slopes(minutes, sizes)
+    peak = max(sum(mib for name, mib in now.items() if name != "log") for now in sizes)
     total = sum(slope for name, slope in found.items() if name != "log")
     for name, slope in found.items():
         print(f"  {name:10s}{sizes[-1][name]:8.1f} MiB {slope:+7.2f} MiB a minute")
-    print(f"  all processes {total:+.2f} MiB a minute")
+    print(f"  all processes {total:+.2f} MiB a minute, at most {peak:.0f} MiB")
     return int(total > LARGEST_GROWTH)
 
 

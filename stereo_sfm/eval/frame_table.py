@@ -1,4 +1,4 @@
-"""The frames of a run as columns, so that those of a day fit into memory."""
+"""The frames of a run as columns, which a run of a day does not keep in memory."""
 
 from __future__ import annotations
 
@@ -6,14 +6,15 @@ from typing import ClassVar
 
 import numpy as np
 
+from stereo_sfm.eval.spool import SpooledColumns
 from stereo_sfm.geometry import se3
-from stereo_sfm.mapping.columns import Columns, Spec
+from stereo_sfm.mapping.columns import Spec
 from stereo_sfm.types import F32, F64, I32, I64, Bool, Frame, TrackState
 
 TRACKED = (TrackState.OK, TrackState.RECOVERED, TrackState.RESTARTED, TrackState.INERTIAL)
 
 
-class FrameTable(Columns):
+class FrameTable(SpooledColumns):
     """One row per frame, without its observations."""
 
     frame_id: I64
@@ -44,8 +45,7 @@ class FrameTable(Columns):
         """Append a frame."""
         if frame.reason not in self.reasons:
             self.reasons.append(frame.reason)
-        self.append(
-            1,
+        self.append_row(
             frame_id=frame.frame_id,
             stamp_ns=frame.stamp_ns,
             odom=frame.odom_T_cam[:3],
@@ -76,7 +76,7 @@ class FrameTable(Columns):
         return [self.reasons[k] for k in self.reason_id[rows].tolist()]
 
 
-class TimeTable(Columns):
+class TimeTable(SpooledColumns):
     """One row for each stage of each frame that ran it."""
 
     frame_id: I64
@@ -92,8 +92,8 @@ class TimeTable(Columns):
     def add(self, frame_id: int, ms: dict[str, float]) -> None:
         """Append the times of the stages for a frame; a later value replaces an earlier one."""
         self.stages += [stage for stage in ms if stage not in self.stages]
-        ids = [self.stages.index(stage) for stage in ms]
-        self.append(len(ms), frame_id=frame_id, stage_id=np.array(ids, np.int32), ms=np.array([*ms.values()]))
+        for stage, value in ms.items():
+            self.append_row(frame_id=frame_id, stage_id=self.stages.index(stage), ms=value)
 
     def of_frames(self, frame_ids: I64) -> dict[str, F64]:
         """(F,) milliseconds by stage, NaN where a stage did not run; `frame_ids` (F,) ascending."""

@@ -145,7 +145,7 @@ class RunRecord:
     @_take.register
     def _put_frame(self, frame: Frame) -> None:
         if len(self.frames):
-            step = frame.odom_T_cam[:3, 3] - self.frames.odom[-1, :, 3]
+            step = frame.odom_T_cam[:3, 3] - self.frames.last("odom")[:, 3]
             self._path_m += float(np.linalg.norm(step))
         self.frames.add(frame)
 

@@ -16,7 +16,7 @@ from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.loop.vocabulary import Bag
 from stereo_sfm.types import F32, F64, I32, I64
 
-BLOCK = 64
+BLOCK = 16  # postings; a word that few keyframes have takes one block
 
 
 @njit

@@ -19,12 +19,14 @@ from stereo_sfm.errors import StereoSfmError, from_os_error
 from stereo_sfm.log.provenance import Opening
 from stereo_sfm.maps.folders import MapFolders
 from stereo_sfm.messages import Compiling
+from stereo_sfm.pipeline.allocator import return_large_blocks
 from stereo_sfm.pipeline.channels import End, Failed, Lost, Outbox
 from stereo_sfm.pipeline.interrupts import STOP_SIGNALS
 from stereo_sfm.pipeline.text import LOGGER, Listener
 from stereo_sfm.pipeline.watchdog import HeartbeatThread
 from stereo_sfm.types import Applied, Trajectory
 
+AT_CAMERA_RATE = "capture", "tracker"  # their arrays are of the same sizes with every image
 UPSTREAM_LOST = 70  # exit code of a worker that ended because another one died
 
 
@@ -104,6 +106,8 @@ def prepare(stage: str, setup: Setup) -> Callable[[], None]:
     import cv2
     from threadpoolctl import threadpool_limits
 
+    if stage not in AT_CAMERA_RATE:
+        return_large_blocks()
     cv2.setNumThreads(setup.config.pipeline.threads)
     threadpool_limits(setup.config.pipeline.threads)  # the environment: of a program's first run only
     cpus = setup.config.pipeline.cpus.get(stage)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import ctypes
 import time
 from multiprocessing.connection import Connection
 from typing import Any
@@ -11,6 +9,7 @@ from typing import Any
 from stereo_sfm.drivers.choice import Opener
 from stereo_sfm.maps.folders import make_mapper, save_result
 from stereo_sfm.messages import Localized
+from stereo_sfm.pipeline.allocator import release_memory
 from stereo_sfm.pipeline.channels import End, Inbox, Lost, Outbox
 from stereo_sfm.pipeline.child import Report, Setup, prepare, ready
 from stereo_sfm.pipeline.schedule import Lockstep, Realtime, Recorded, Schedule
@@ -186,12 +185,6 @@ def run_mapper(
     to_tracker.close()
     to_optimizer.send(End("mapper"))
     to_optimizer.close()
-
-
-def release_memory() -> None:
-    """Return freed memory to the system, where the C library supports it (glibc)."""
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL("libc.so.6").malloc_trim(0)
 
 
 def run_optimizer(to_main: Report, control: Connection, jobs: Connection, results: Connection) -> None:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import errno
+import os
+
 import numpy as np
+import pytest
 
 from stereo_sfm.eval.frame_table import FrameTable, TimeTable
 from stereo_sfm.eval.record import LostInterval, RunRecord
+from stereo_sfm.eval.spool import BLOCK
 from stereo_sfm.messages import Health
 from stereo_sfm.types import Frame, Keyframe, Observations, TrackState
 
@@ -29,6 +34,57 @@ def test_many_frames_keep_their_values() -> None:
     assert len(table) == 300 and table.frame_id.tolist() == list(range(300))
     assert (table.odom_T_cam[:, 2, 1] == np.arange(300)).all() and (table.kf_T_cam[:, 0, 0] == -np.arange(300)).all()
     assert table.reasons_of(np.array([1, 2, 3, 299])) == ["dark", "blur", "", "blur"]
+
+
+def filled(count: int) -> FrameTable:
+    table = FrameTable()
+    for k in range(count):
+        pose = np.full((4, 4), float(k))
+        table.add(Frame(k, 7 * k, pose, np.eye(6), OK, "", SEEN, k // 10, -pose))
+    return table
+
+
+def assert_complete(table: FrameTable, count: int) -> None:
+    assert len(table) == count and table.last("frame_id") == count - 1
+    assert (table.frame_id == np.arange(count)).all() and (table.stamp_ns == 7 * np.arange(count)).all()
+    assert (table.odom_T_cam[:, 0, 3] == np.arange(count)).all() and (table.kf[:, 2, 1] == -np.arange(count)).all()
+
+
+def test_the_rows_of_a_long_run_wait_in_a_file() -> None:
+    table = filled(3 * BLOCK + 5)
+    held = [value for value in vars(table).values() if isinstance(value, np.ndarray)]
+    assert [len(rows) for rows in held] == [BLOCK]
+    assert_complete(table, 3 * BLOCK + 5)
+    table.add(
+        Frame(
+            3 * BLOCK + 5,
+            7 * (3 * BLOCK + 5),
+            np.full((4, 4), 3.0 * BLOCK + 5),
+            np.eye(6),
+            OK,
+            "",
+            SEEN,
+            0,
+            np.full((4, 4), -3.0 * BLOCK - 5),
+        )
+    )
+    assert_complete(table, 3 * BLOCK + 6)
+
+
+def test_a_disk_that_refuses_loses_no_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first block is written in parts, the second only in part, the third not at all."""
+    room = [int(1.5 * BLOCK) * 228]
+
+    def pwrite(file: int, data: memoryview, at: int) -> int:
+        taken = min(100_000, room[0], len(data))
+        if not taken:
+            raise OSError(errno.ENOSPC, "no space left on device")
+        room[0] -= taken
+        return real(file, data[:taken], at)
+
+    real = os.pwrite
+    monkeypatch.setattr(os, "pwrite", pwrite)
+    assert_complete(filled(4 * BLOCK + 1), 4 * BLOCK + 1)
 
 
 def test_lost_intervals_begin_after_the_first_pose() -> None:

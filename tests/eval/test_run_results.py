@@ -183,8 +183,7 @@ def test_frames_located_by_a_keyframe_each_stay_with_it() -> None:
     """An estimator that refers each frame to the last keyframe has no relation to the next one."""
     pnp = dataclasses.replace(Config().odometry, method="pnp")
     record = RunRecord.of(Config(odometry=pnp))
-    record.frames = record_of(camera_path(), 0).frames
-    record.frames.keep(np.arange(10))
+    record.frames = record_of(camera_path()[:10], 0).frames
     record.keyframes = {k: KeyframeRow(k, k * 10**8, camera_path()[k], 0.0, submap_id=0) for k in (0, 10)}
     record.map_T_kf.add(0, camera_path()[0])
     record.map_T_kf.add(10, np.eye(4))

@@ -1,0 +1,39 @@
+"""Freed memory goes back to the system."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+import sys
+
+import pytest
+
+HELD = """
+import numpy as np, sys
+from stereo_sfm.pipeline.allocator import return_large_blocks
+if sys.argv[1] == "on":
+    return_large_blocks()
+del_me = np.ones(30 << 20, np.uint8)
+del del_me  # without the setting, blocks up to this size lie in the heap from now on
+def resident():
+    return int(open("/proc/self/statm").read().split()[1]) >> 8  # MiB of 4 KiB pages
+before, small = resident(), []
+for _ in range(20):
+    large = np.ones(4 << 20, np.uint8)
+    small += [bytes(900) for _ in range(50)]
+    larger = np.ones(6 << 20, np.uint8)
+    small += [bytes(900) for _ in range(50)]
+    small.append(large)
+large = larger = None
+small = [block for block in small if isinstance(block, bytes)]
+print(resident() - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="an allocator of glibc's")
+def test_room_between_small_blocks_is_returned() -> None:
+    def held(setting: str) -> int:
+        done = subprocess.run([sys.executable, "-c", HELD, setting], capture_output=True, text=True, check=True)
+        return int(done.stdout)
+
+    assert held("on") < 10 < 30 < held("off")
