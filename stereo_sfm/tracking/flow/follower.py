@@ -10,7 +10,7 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
-from stereo_sfm.geometry.order_statistics import median_distance
+from stereo_sfm.geometry.order_statistics import median, median_distance
 from stereo_sfm.tracking.flow import klt
 from stereo_sfm.tracking.flow.coarse_rotation import CoarseRotation
 from stereo_sfm.tracking.flow.frame_pose import ExpectedMotion
@@ -24,7 +24,9 @@ from stereo_sfm.types import F64, I64, Bool
 WELL_PREDICTED_PX = 3.0  # median error of the predictions below which the search starts in the half image
 ALIGNED_PX = 1.5  # the same, below which first appearances are aligned from the predictions
 STORED = 4  # times max_features: points of the last image and of the held one, and new ones of the held one
-HALF_LIFE_S = 1.0  # after which an image with half as many points is as good to recover from
+# After which motion an image with half as many points is as good to recover from: half of the first one's have left
+# the view. Time does not count: who comes towards the robot hides the middle of the view for seconds.
+HALF_VIEW_SHARE, HALF_VIEW_RADIANS = 0.7, 0.5  # of the median distance of its points; radians
 MIN_COARSE_NCC = 0.65  # of a window found again in the half image
 SEARCH_STEPS = 14  # offsets of a search on either side
 
@@ -33,15 +35,16 @@ SEARCH_STEPS = 14  # offsets of a search on either side
 class Held:
     """The trusted image from which tracking is recovered."""
 
-    stamp_ns: int
     images: StereoPyramids
     tracks: Tracks
     pose: F64  # (4, 4) odom_T_cam
     dense: bool = False  # whether points were added for the recovery
 
-    def worth(self, stamp_ns: int) -> float:
-        """Number of points with which another image, at a time, is as good."""
-        return len(self.tracks) * 0.5 ** ((stamp_ns - self.stamp_ns) * 1e-9 / HALF_LIFE_S)
+    def worth(self, pose: F64) -> float:
+        """Number of points with which another image, taken at a pose (4, 4), is as good."""
+        metres, radians = se3.extent(se3.inverse(self.pose) @ pose)
+        half_view = HALF_VIEW_SHARE / float(median(self.tracks.rho))
+        return len(self.tracks) * 0.5 ** (float(metres) / half_view + float(radians) / HALF_VIEW_RADIANS)
 
 
 class Follower:
@@ -70,13 +73,13 @@ class Follower:
         assert self._held is not None
         return self._held
 
-    def hold(self, stamp_ns: int, images: StereoPyramids, tracks: Tracks, trusted: Bool, pose: F64) -> None:
+    def hold(self, images: StereoPyramids, tracks: Tracks, trusted: Bool, pose: F64) -> None:
         """Keep an image with a trusted pose (4, 4) and its trusted points (N,) for recovery, if it has enough.
 
         Whatever is about to cover the camera already hides a part of the last images.
         """
-        if self._held is None or trusted.sum() >= self._held.worth(stamp_ns):
-            self._held = Held(stamp_ns, images, tracks.keep(trusted), pose)
+        if self._held is None or trusted.sum() >= self._held.worth(pose):
+            self._held = Held(images, tracks.keep(trusted), pose)
 
     def forget(self) -> None:
         """Give up the held image: a new odometry begins."""

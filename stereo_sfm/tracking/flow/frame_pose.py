@@ -31,6 +31,7 @@ from stereo_sfm.types import F64, Bool
 # In sigmas, one Gauss-Newton step each. The last are narrow: points that disagree by two or three sigmas (corners where
 # a near edge crosses a far one, people who walk along) have one-sided errors, which bias the scale.
 CAUCHY_SCALES = np.array([20.0, 10.0, 6.0, 4.0, 2.0, 1.0, 1.0])
+REAPPEARED_NOISE = 1.0  # over config.sigma_px, at least: windows that changed much are found less exactly
 MEDIAN_ERROR = 0.8  # of unit noise in the four rows of a point
 NOISE_RANGE = (0.3, 4.0)  # over config.sigma_px
 # Differences from the prediction that are possible for any robot: metres and m/s^2, radians and rad/s^2.
@@ -121,7 +122,10 @@ class FramePoseSolver:
         """Solve for the pose of a lost camera from points that were static before, starting at the expected pose."""
         if len(tracks) < self._config.min_features:
             return _no_pose(len(tracks), "too_few_points")
-        return self._solve_all(tracks, expected, expected.pose, np.ones(len(tracks), bool))
+        noise, self._noise = self._noise, max(self._noise, REAPPEARED_NOISE)
+        found = self._solve_all(tracks, expected, expected.pose, np.ones(len(tracks), bool))
+        self._noise = noise
+        return found
 
     def solve(self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, before: int = 0) -> PoseSolution:
         """Solve for the pose, starting at the prediction; at the previous pose (4, 4) if that finds no consensus.

@@ -138,7 +138,7 @@ class Tracker:
         trusted = self._trusted(tracks, solution)
         if trusted:
             self._recovery.motion.add(image.stamp_ns, solution.pose)
-            self._follower.hold(image.stamp_ns, images, tracks, solution.inlier & ~tracks.moving, solution.pose)
+            self._follower.hold(images, tracks, solution.inlier & ~tracks.moving, solution.pose)
         recovered = bool(self._lost)
         stats = _stats(tracks, solution)
         inlier = self._accept(image, images, tracks, solution, expected.seconds)
@@ -268,7 +268,7 @@ class Tracker:
         keyframe = self._create_keyframe(image, images, True)
         self._recovery.motion.add(image.stamp_ns, self._pose)
         self._follower.forget()
-        self._follower.hold(image.stamp_ns, images, self._tracks, ~self._tracks.moving, self._pose)
+        self._follower.hold(images, self._tracks, ~self._tracks.moving, self._pose)
         state = TrackState.OK if first else TrackState.RECOVERED if self._bridging else TrackState.RESTARTED
         covariance = FIRST_COVARIANCE if bridge is None else bridge[1]
         self._bridging = False
