@@ -1,6 +1,6 @@
 """The whole pipeline on a recorded fisheye sequence: frames a second, drops, latency, memory.
 
-    python -m benchmarks pipeline -- [--recording FILE.mcap] [--minutes 5] [--memory]
+    python -m benchmarks pipeline -- [--recording FILE.mcap] [--minutes 5] [--memory | --one-core]
 
 Without a recording, `sim:loop` (848x800, 30 Hz) is recorded first as raw images. The sequence is played forwards and
 backwards, repeatedly, so that it lasts for minutes without a jump. First as fast as the stages can, then in real
@@ -10,11 +10,15 @@ shared image ring.
 With --memory: half the image size, as fast as it goes, with a log without images. Printed are the growth of each
 process and of the log in MB a minute of camera time, once the place is known: after the first third. The exit code is 1
 if all processes together grow by more than 1 MiB a minute.
+
+With --one-core: in real time with all processes on one core and a log without images, so that an image that waits
+for mapping is dropped. The exit code is 1 if one was.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import tempfile
 import time
@@ -75,10 +79,13 @@ def memory_mb(run: ProcessRun) -> dict[str, float]:
     return sizes
 
 
-def play(path: str, frames: int, paced: bool, folder: Path) -> None:
+def play(path: str, frames: int, paced: bool, folder: Path, images: str = "raw") -> int:
+    """Play the sequence and print what was measured. Returns the number of images dropped."""
     numbers, memory = Numbers(), list[tuple[float, dict[str, float]]]()
     log = folder / f"{'realtime' if paced else 'fast'}.mcap"
-    with ProcessRun(MadeSource.of(opened, path, frames, paced), Config(), [numbers], log=LogOptions(log, "raw")) as run:
+    with ProcessRun(
+        MadeSource.of(opened, path, frames, paced), Config(), [numbers], log=LogOptions(log, images)
+    ) as run:
         begin = last = time.monotonic()
         first = 0.0
         done = 0
@@ -103,6 +110,7 @@ def play(path: str, frames: int, paced: bool, folder: Path) -> None:
         print(f"  memory after {seconds_in:.0f} s: {sum(sizes.values()):.0f} MiB ({stages})")
     print(f"  log {log.stat().st_size / 2**20 / max(seconds, 1e-9):.1f} MiB/s")
     log.unlink()
+    return numbers.dropped
 
 
 def slopes(minutes: list[float], sizes: list[dict[str, float]]) -> dict[str, float]:
@@ -147,6 +155,7 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=1.0)
     parser.add_argument("--fast", action="store_true", help="only as fast as it goes, not in real time")
     parser.add_argument("--memory", action="store_true", help="only the growth of memory and log")
+    parser.add_argument("--one-core", action="store_true", help="only in real time, all processes on one core")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -159,6 +168,9 @@ def main() -> int:
         frames = round(args.minutes * 60 * RATE)
         if args.memory:
             return growth(path, frames, folder)
+        if args.one_core:
+            os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # the processes of the run inherit it
+            return int(play(path, frames, True, folder, "none") > 0)
         for paced in (False, True) if not args.fast else (False,):
             play(path, frames, paced, folder)
     return 0

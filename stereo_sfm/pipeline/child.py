@@ -26,6 +26,9 @@ from stereo_sfm.pipeline.text import LOGGER, Listener
 from stereo_sfm.pipeline.watchdog import HeartbeatThread
 from stereo_sfm.types import Applied, Trajectory
 
+# Beside a live camera the pose comes first: what the others take must not delay it, if all share one core.
+NICENESS = {"logger": 2, "mapper": 4, "loop": 6, "optimizer": 8}
+LOWEST_PRIORITY = 19
 AT_CAMERA_RATE = "capture", "tracker"  # their arrays are of the same sizes with every image
 UPSTREAM_LOST = 70  # exit code of a worker that ended because another one died
 
@@ -101,11 +104,20 @@ def ready(stage: str, setup: Setup, to_main: Outbox) -> None:
     to_main.send(Ready(stage))
 
 
+def lower_priority(stage: str) -> None:
+    """Let the stages that make the pose go first (`NICENESS`)."""
+    if hasattr(os, "setpriority"):
+        own = os.getpriority(os.PRIO_PROCESS, 0)
+        os.setpriority(os.PRIO_PROCESS, 0, min(own + NICENESS.get(stage, 0), LOWEST_PRIORITY))
+
+
 def prepare(stage: str, setup: Setup) -> Callable[[], None]:
     """Threads and cores of this process; returns what injects a random delay (tests) or nothing."""
     import cv2
     from threadpoolctl import threadpool_limits
 
+    if setup.realtime:
+        lower_priority(stage)
     if stage not in AT_CAMERA_RATE:
         return_large_blocks()
     cv2.setNumThreads(setup.config.pipeline.threads)
