@@ -64,6 +64,10 @@ class Drive:
                 self.said += [news for news in [self.sensors.news()] if news]
         return self
 
+    def off_m(self) -> float:
+        """Metres by which the position of the last frame is off."""
+        return float(np.linalg.norm(self.error()[0][:3]))
+
     def error(self) -> tuple[F64, F64]:
         """(6,) error of the pose at the last frame, and its standard deviations."""
         bridge = self.sensors.bridge(self.source.stamp_ns(self.next - 1))
@@ -110,9 +114,26 @@ def test_slip_in_turns_is_noticed_by_the_gyroscope() -> None:
     """In the dark the way in turns is in doubt; the covariance says so."""
     drive = Drive({"wheel": "differential", "imu": "t265", "wheel_slip": 0.3}).until(10.0)
     error, sigma = drive.until(15.0, light=False).error()
-    assert (np.abs(error) < 4 * sigma).all()
+    assert (np.abs(error) < 4 * sigma).all() and np.linalg.norm(error[:3]) < 0.3  # of 1.2 m that the wheels add
     sure = Drive({"wheel": "differential", "imu": "t265"}).until(10.0).until(15.0, light=False).error()[1]
     assert np.linalg.norm(sigma[:3]) > 1.4 * np.linalg.norm(sure[:3])
+
+
+def test_wheels_that_slipped_in_turns_do_no_harm_on_the_straight() -> None:
+    """Turns with slip are in the window from which the wheels' scale is known."""
+    drive = Drive({"wheel": "differential", "imu": "t265", "wheel_slip": 0.3}).until(DARK_S)
+    error, sigma = drive.until(DARK_S + 5, light=False).error()
+    assert np.linalg.norm(error[:3]) < 0.09 and (np.abs(error) < 4 * sigma).all()
+
+
+def test_wheels_that_begin_to_slip_in_the_dark_are_noticed_by_the_accelerometer() -> None:
+    """On ice, straight ahead: the gyroscope sees nothing."""
+
+    def ice(samples: WheelSamples, seconds: float) -> WheelSamples:
+        return replace(samples, speeds=1.5 * samples.speeds) if seconds > DARK_S + 1 else samples
+
+    drive = Drive({"wheel": "differential", "imu": "t265"}, ice).until(DARK_S)
+    assert drive.until(DARK_S + 5, light=False).off_m() < 0.2  # not two metres
 
 
 @pytest.mark.parametrize("factor", [0.0, -1.0, 1000.0])

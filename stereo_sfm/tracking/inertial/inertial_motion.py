@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from stereo_sfm.calib.imu import Imu
+from stereo_sfm.calib.wheel import Wheel
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.preintegration import GRAVITY, Preintegrated, preintegrate
+from stereo_sfm.tracking.inertial.dead_reckoning import DeadReckoning
 from stereo_sfm.tracking.inertial.inertial_filter import WRONG_CHI2, InertialFilter, InertialState
 from stereo_sfm.tracking.inertial.rest import STILL_NS
 from stereo_sfm.tracking.inertial.sample_buffer import Intervals, SampleBuffer
@@ -30,9 +32,6 @@ class Turning:
 
     edges_ns: I64  # (N + 1,)
     rates: F64  # (N, 3) rad/s, without bias
-    left_R_imu: F64  # (3, 3)
-    bias_sigma: float  # rad/s
-    noise: float  # rad/s/sqrt(Hz)
 
 
 class InertialMotion:
@@ -57,6 +56,11 @@ class InertialMotion:
     def state(self) -> InertialState | None:
         """Velocity, gravity and biases at the newest pose of the filter; None while they are not known."""
         return self._state
+
+    @property
+    def left_R_imu(self) -> F64:
+        """(3, 3) as the calibration has it."""
+        return self._imu.left_T_imu[:3, :3]
 
     def level(self, odom_T_cam: F64) -> tuple[float, float] | None:
         """Roll and pitch in degrees of the camera (4, 4) against measured gravity; None while that is not known.
@@ -94,7 +98,7 @@ class InertialMotion:
     def predict(self, stamp_ns: int, expected: F64) -> F64:
         """(4, 4) odom_T_cam at a time after the last pose: the rotation by the gyroscope, the translation too once
         velocity and gravity are known; `expected` (4, 4) where the samples do not reach."""
-        motion = self._motion(self._last_ns, stamp_ns)
+        motion = self.motion(self._last_ns, stamp_ns)
         if motion is None or self.left_out:
             return expected
         odom_R_imu = self._odom_T_last[:3, :3] @ motion.rotation
@@ -117,7 +121,7 @@ class InertialMotion:
         self._last_ns, self._odom_T_last = stamp_ns, odom_T_imu
         if stamp_ns - self._node_ns < NODE_NS:
             return
-        motion = self._motion(self._node_ns, stamp_ns)
+        motion = self.motion(self._node_ns, stamp_ns)
         if motion is None:  # samples are missing
             self._state = None
             self._restart(stamp_ns, odom_T_imu)
@@ -136,7 +140,7 @@ class InertialMotion:
 
     def covariance(self, stamp_ns: int) -> F64 | None:
         """(6, 6) of the predicted pose @ exp(xi), xi = (rho, phi) in camera axes; None where samples are missing."""
-        motion = self._motion(self._last_ns, stamp_ns)
+        motion = self.motion(self._last_ns, stamp_ns)
         if self._state is None or motion is None:
             return None
         t, odom_R_imu = motion.seconds, self._odom_T_last[:3, :3]
@@ -161,15 +165,22 @@ class InertialMotion:
         turned = float(np.abs(found.gyro.mean(axis=0) - self._gyro_bias).max())
         return bool(spreads[0] < limits[0] and spreads[1] < limits[1] and turned < STILL_TURN)
 
-    def turning(self, stamp_ns: int) -> Turning | None:
-        """The gyroscope since the last pose; None while its bias is unknown, or where samples are missing."""
-        found = None if self._state is None or self.left_out else self._buffer.between(self._last_ns, stamp_ns)
-        if found is None or self._state is None:
-            return None
-        rates, left_R_imu = found.gyro - self._gyro_bias, self._imu.left_T_imu[:3, :3]
-        return Turning(found.edges_ns, rates, left_R_imu, self._state.gyro_bias_sigma, self._imu.gyro_noise)
+    def turning(self, begin_ns: int, end_ns: int) -> Turning | None:
+        """The gyroscope between two times; None where samples are missing."""
+        found = self._buffer.between(begin_ns, end_ns)
+        return None if found is None else Turning(found.edges_ns, found.gyro - self._gyro_bias)
 
-    def _motion(self, begin_ns: int, end_ns: int) -> Preintegrated | None:
+    def reckoning(self, wheel: Wheel, lasting: F64) -> DeadReckoning | None:
+        """From the last pose on, with wheels whose scale and direction have a covariance `lasting` (4, 4).
+
+        None where the IMU does not know its velocity, or is wrong.
+        """
+        if self._state is None or self.left_out:
+            return None
+        state = replace(self._state, velocity=self._velocity())
+        return DeadReckoning(self._imu, wheel.left_T_wheel, self._odom_T_last, state, lasting)
+
+    def motion(self, begin_ns: int, end_ns: int) -> Preintegrated | None:
         """From one time to another with the biases of today; each is asked for several times a frame."""
         if (begin_ns, end_ns) not in self._integrated:
             intervals = self._buffer.between(begin_ns, end_ns)
@@ -185,7 +196,7 @@ class InertialMotion:
     def _velocity(self) -> F64:
         """(3,) m/s of the IMU at the last pose: the filter's, taken on from its newest pose."""
         assert self._state is not None
-        motion = self._motion(self._node_ns, self._last_ns) if self._last_ns > self._node_ns else None
+        motion = self.motion(self._node_ns, self._last_ns) if self._last_ns > self._node_ns else None
         if motion is None:
             return self._state.velocity
         turned = self._odom_T_node[:3, :3] @ motion.velocity_with(self._gyro_bias, self._state.accel_bias)
@@ -193,7 +204,7 @@ class InertialMotion:
 
     def _compare(self, stamp_ns: int, odom_T_imu: F64) -> None:
         """Compare with what the images showed: a sensor that contradicts them for long is left out."""
-        motion = self._motion(self._last_ns, stamp_ns)
+        motion = self.motion(self._last_ns, stamp_ns)
         if motion is None:
             return
         seen = self._odom_T_last[:3, :3].T @ odom_T_imu[:3, :3]

@@ -7,9 +7,10 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
+from stereo_sfm.tracking.inertial.dead_reckoning import DeadReckoning
 from stereo_sfm.tracking.inertial.inertial_motion import InertialMotion
 from stereo_sfm.tracking.inertial.rest import Rest
-from stereo_sfm.tracking.inertial.wheel_motion import WheelMotion
+from stereo_sfm.tracking.inertial.wheel_motion import LINK_NS, WheelMotion
 from stereo_sfm.types import F64, StereoImage
 
 SHORT_S = 0.2  # over which the IMU alone is as good as with the wheels
@@ -24,6 +25,8 @@ class MotionSensors:
         self._inertial, self._wheels = inertial, wheels
         self._rest = Rest()
         self._last_ns = 0
+        self._reckoning: DeadReckoning | None = None  # since the last pose
+        self._reckoned_ns = 0
         self._said: set[str] = set()
 
     @staticmethod
@@ -42,7 +45,7 @@ class MotionSensors:
 
     def begin(self, stamp_ns: int, odom_T_cam: F64) -> None:
         """The odometry begins anew here: poses from before do not go with those to come."""
-        self._last_ns = stamp_ns
+        self._last_ns, self._reckoning = stamp_ns, None
         self._rest.forget()
         for sensor in (self._inertial, self._wheels):
             if sensor is not None:
@@ -50,7 +53,7 @@ class MotionSensors:
 
     def accept(self, stamp_ns: int, odom_T_cam: F64) -> None:
         """The images gave this pose (4, 4)."""
-        self._last_ns = stamp_ns
+        self._last_ns, self._reckoning = stamp_ns, None
         for sensor in (self._inertial, self._wheels):
             if sensor is not None:
                 sensor.accept(stamp_ns, odom_T_cam)
@@ -81,15 +84,33 @@ class MotionSensors:
 
     def _bridge(self, stamp_ns: int) -> tuple[F64, F64] | None:
         seconds = (stamp_ns - self._last_ns) * 1e-9
-        short = self._inertial is not None and seconds <= INERTIAL_S
-        by_imu = self._inertial.bridge(stamp_ns) if self._inertial is not None and short else None
-        by_wheels = None
+        together = self._together(stamp_ns) if seconds <= WHEEL_S else None
+        if together is not None:
+            return together
         if self._wheels is not None and seconds <= WHEEL_S:
-            gyro = None if self._inertial is None else self._inertial.turning(stamp_ns)
-            by_wheels = self._wheels.predict(stamp_ns, gyro)
-        if by_imu is None or by_wheels is None:
-            return by_imu or by_wheels
-        return fused(by_imu, by_wheels)
+            by_wheels = self._wheels.predict(stamp_ns)
+            if by_wheels is not None:
+                return by_wheels
+        return self._inertial.bridge(stamp_ns) if self._inertial is not None and seconds <= INERTIAL_S else None
+
+    def _together(self, stamp_ns: int) -> tuple[F64, F64] | None:
+        """By both sensors; None without one of them, or where samples of the IMU are missing."""
+        inertial, wheels = self._inertial, self._wheels
+        if inertial is None or wheels is None:
+            return None
+        if self._reckoning is None:
+            self._reckoning, self._reckoned_ns = inertial.reckoning(wheels.wheel, wheels.lasting), self._last_ns
+        if self._reckoning is None:
+            return None
+        while stamp_ns - self._reckoned_ns >= LINK_NS:
+            begin, end = self._reckoned_ns, self._reckoned_ns + LINK_NS
+            motion, turning = inertial.motion(begin, end), inertial.turning(begin, end)
+            if motion is None or turning is None:
+                return None
+            self._reckoning.advance(motion, wheels.step(turning, inertial.left_R_imu))
+            self._reckoned_ns = end
+        motion = inertial.motion(self._reckoned_ns, stamp_ns)
+        return None if motion is None and stamp_ns > self._reckoned_ns else self._reckoning.after(motion)
 
     def level(self, odom_T_cam: F64) -> tuple[float, float] | None:
         """Roll and pitch in degrees of the camera (4, 4) against measured gravity; None while that is not known."""
@@ -106,15 +127,3 @@ class MotionSensors:
         new = [r for r in reasons if r and r not in self._said]
         self._said.update(new)
         return new[0] if new else ""
-
-
-def fused(by_imu: tuple[F64, F64], by_wheels: tuple[F64, F64]) -> tuple[F64, F64]:
-    """The rotation of the IMU, and the position by both, each with the weight of its covariance."""
-    (pose, covariance), (other, _) = by_imu, by_wheels
-    turned = [p[:3, :3] @ c[:3, :3] @ p[:3, :3].T for p, c in (by_imu, by_wheels)]
-    gain = turned[0] @ np.linalg.inv(turned[0] + turned[1])
-    position = pose[:3, 3] + gain @ (other[:3, 3] - pose[:3, 3])
-    left = pose[:3, :3].T @ (turned[0] - gain @ turned[0]) @ pose[:3, :3]
-    out = np.zeros((6, 6))
-    out[:3, :3], out[3:, 3:] = 0.5 * (left + left.T), covariance[3:, 3:]
-    return se3.from_rotation_translation(pose[:3, :3], position), out

@@ -1,4 +1,4 @@
-"""Motion by the wheels since the last pose from images; with a gyroscope, which turns better than wheels do."""
+"""Motion by the wheels since the last pose from images."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import numpy as np
 from stereo_sfm.calib.wheel import Wheel
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.twist_integration import TwistMotion, integrate_twists
+from stereo_sfm.tracking.inertial.dead_reckoning import WheelStep
 from stereo_sfm.tracking.inertial.inertial_motion import Turning
 from stereo_sfm.tracking.inertial.rest import STILL_NS
 from stereo_sfm.tracking.inertial.series import Series
@@ -31,7 +32,14 @@ class WheelMotion:
         self._odom_T_last: F64 = np.eye(4)  # poses of the wheels
         self._odom_T_link: F64 = np.eye(4)
         self._last_step: tuple[float, F64] | None = None  # seconds and tangent (6,), camera axes
+        self._raw_of: tuple[int, int, F64 | None] = (0, 0, None)  # an interval, and the motion in it
         self._begun = False
+        self._slips = 0.0  # share of the way that is in doubt in a turn
+
+    @property
+    def wheel(self) -> Wheel:
+        """As the calibration has it."""
+        return self._wheel
 
     @property
     def left_out(self) -> bool:
@@ -40,6 +48,7 @@ class WheelMotion:
 
     def feed(self, samples: WheelSamples | None) -> None:
         """Samples up to the image that is tracked next."""
+        self._raw_of = 0, 0, None
         if samples is None or not len(samples):
             return
         stamps = samples.stamp_ns - round(self._wheel.offset_s * 1e9)
@@ -92,20 +101,37 @@ class WheelMotion:
         parts = [min(1.0, limit / max(size, 1e-12)) for limit, size in zip(limits, sizes, strict=True)]
         return step + change * np.repeat(np.array(parts), 3)
 
-    def predict(self, stamp_ns: int, gyro: Turning | None) -> tuple[F64, F64] | None:
+    @property
+    def lasting(self) -> F64:
+        """(4, 4) covariance of what is not known of the logarithmic scale and the direction (3,)."""
+        return self._correction.covariance
+
+    def step(self, gyro: Turning, left_R_imu: F64) -> WheelStep | None:
+        """The way over some time, turned as the gyroscope says; None where samples are missing or wrong.
+
+        Where the wheels turn otherwise than the gyroscope they slip, and their way is in doubt.
+        """
+        edges, c = gyro.edges_ns, self._correction
+        if self.left_out or self._series.edges(int(edges[0]), int(edges[-1])) is None:
+            return None
+        seconds, values = np.diff(edges) * 1e-9, self._series.means(edges)
+        rates = gyro.rates @ (self._wheel.left_T_wheel[:3, :3].T @ left_R_imu).T
+        motion = integrate_twists(seconds, rates, values[:, :3] @ c.matrix.T, 0.0, c.noise)
+        by_wheels, turned = float(values[:, 5] @ seconds), float(rates[:, 2] @ seconds)
+        doubt = self._window.doubt(motion.seconds, by_wheels, turned)
+        self._slips = max(self._slips, doubt) if doubt else 0.0  # a slip that was seen in a turn may last to its end
+        return WheelStep(motion.position, float(np.hypot(c.noise * np.sqrt(motion.seconds), self._slips * motion.way)))
+
+    def predict(self, stamp_ns: int) -> tuple[F64, F64] | None:
         """Pose (4, 4) odom_T_cam at a time after the last one, and its covariance (6, 6) as that of a `Frame`.
 
         None where samples are missing, or the wheels contradict the images.
         """
-        if self.left_out or not self._begun:
-            return None
-        motion = self._by_wheels(stamp_ns) if gyro is None else self._by_gyro(gyro)
+        motion = None if self.left_out or not self._begun else self._by_wheels(stamp_ns)
         if motion is None:
             return None
         moved = se3.from_rotation_translation(motion.rotation, motion.position)
-        covariance = self._covariance(motion, None if gyro is None else gyro.bias_sigma)
-        if gyro is not None:
-            covariance[:3, :3] += self._slipped_m(gyro) ** 2 * np.eye(3)
+        covariance = self._covariance(motion)
         end_R_begin = np.kron(np.eye(2), motion.rotation.T)
         end_R_begin[3:, 3:] = np.eye(3)
         into = se3.adjoint(self._wheel.left_T_wheel) @ end_R_begin
@@ -121,34 +147,13 @@ class WheelMotion:
             np.diff(edges) * 1e-9, values[:, 3:] * c.turn, values[:, :3] @ c.matrix.T, c.turn_noise, c.noise
         )
 
-    def _by_gyro(self, gyro: Turning) -> TwistMotion | None:
-        edges = gyro.edges_ns
-        if self._series.edges(int(edges[0]), int(edges[-1])) is None:
-            return None
-        c = self._correction
-        wheel_R_imu = self._wheel.left_T_wheel[:3, :3].T @ gyro.left_R_imu
-        linear = self._series.means(edges)[:, :3] @ c.matrix.T
-        return integrate_twists(np.diff(edges) * 1e-9, gyro.rates @ wheel_R_imu.T, linear, gyro.noise, c.noise)
-
-    def _slipped_m(self, gyro: Turning) -> float:
-        """Way that is in doubt where the wheels turned otherwise than the gyroscope."""
-        seconds, values = np.diff(gyro.edges_ns) * 1e-9, self._series.means(gyro.edges_ns)
-        wheel_R_imu = self._wheel.left_T_wheel[:3, :3].T @ gyro.left_R_imu
-        turned = np.cumsum(np.column_stack([values[:, 5], gyro.rates @ wheel_R_imu[2]]) * seconds[:, None], axis=0)
-        before = np.searchsorted(gyro.edges_ns[1:], gyro.edges_ns[1:] - LINK_NS, side="right") - 1
-        recent = turned - np.where(before[:, None] >= 0, turned[before], 0.0)
-        share = self._window.slip_share(recent[:, 0], recent[:, 1])
-        return float((share * np.linalg.norm(values[:, :3], axis=1) * seconds).sum())
-
-    def _covariance(self, motion: TwistMotion, gyro_sigma: float | None) -> F64:
+    def _covariance(self, motion: TwistMotion) -> F64:
         """(6, 6) of position (axes at the beginning) and rotation (right tangent)."""
         c, p = self._correction, motion.position
         lasting = np.column_stack([p, -se3.skew(p)])
         out = motion.covariance.copy()
         out[:3, :3] += lasting @ c.covariance @ lasting.T
         by_rate = np.vstack([motion.position_by_rate, motion.rotation_by_rate])
-        if gyro_sigma is not None:
-            return out + gyro_sigma**2 * by_rate @ by_rate.T
         turned = float(np.linalg.norm(se3.so3_log(motion.rotation)))
         rate_sigma = c.turn_sigma * turned / motion.seconds
         sway = c.heading_sigma**2
@@ -157,7 +162,12 @@ class WheelMotion:
         return out + rate_sigma**2 * by_rate @ by_rate.T
 
     def _raw(self, begin_ns: int, end_ns: int) -> F64 | None:
-        """(4, 4) motion by the uncorrected wheels."""
+        """(4, 4) motion by the uncorrected wheels; the last one is asked for several times a frame."""
+        if self._raw_of[:2] != (begin_ns, end_ns):
+            self._raw_of = begin_ns, end_ns, self._integrated(begin_ns, end_ns)
+        return self._raw_of[2]
+
+    def _integrated(self, begin_ns: int, end_ns: int) -> F64 | None:
         edges = self._series.edges(begin_ns, end_ns)
         if edges is None:
             return None

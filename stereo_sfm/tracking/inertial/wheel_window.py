@@ -17,6 +17,7 @@ from stereo_sfm.types import F64
 LINKS = 20  # half seconds
 DIRECTION_SIGMA = 0.03  # rad, expected of a calibration
 TURN_SIGMA = {"skid_steer": 0.3}  # expected of the scale of turns, where that is not the slip
+STRAIGHT = 0.05  # rad/s of a robot that does not turn
 TURN_FREE = 0.03, 0.1  # rad and share by which turns differ without slip
 MIN_SIGMA_M, MIN_SIGMA_RAD = 0.003, 0.003  # standard deviation of a link's difference, at least
 JUDGED = 6  # links for the comparison with the images
@@ -97,16 +98,24 @@ class WheelWindow:
         x, information, sigma2 = np.zeros(4), prior, MIN_SIGMA_M**2
         jacobians = [np.column_stack([k.way, -se3.skew(k.way)]) for k in self._links]
         errors = [k.seen - k.way for k in self._links]
-        slips2 = [float(k.way @ k.way) * float(self.slip_share(k.turn, k.turn_seen)) ** 2 for k in self._links]
+        shares = [self.doubt(k.seconds, k.turn, k.turn_seen) for k in self._links]
+        slips2 = [float(k.way @ k.way) * share**2 for k, share in zip(self._links, shares, strict=True)]
         for _ in range(2):  # the second time with the size of the noise
             information, rhs = prior.copy(), np.zeros(4)
             for jacobian, error, slip2 in zip(jacobians, errors, slips2, strict=True):
                 information += jacobian.T @ jacobian / (sigma2 + slip2)
                 rhs += jacobian.T @ error / (sigma2 + slip2)
             x = np.linalg.solve(information, rhs)
-            left = [e - j @ x for j, e, s in zip(jacobians, errors, slips2, strict=True) if not s]
+            left = [e - j @ x for j, e, s in zip(jacobians, errors, shares, strict=True) if s <= self._slip]
             sigma2 = max(float(np.mean(np.square(left))) if left else 0.0, MIN_SIGMA_M**2)
         return x.astype(np.float64), np.linalg.inv(information).astype(np.float64), sigma2
+
+    def doubt(self, seconds: float, by_wheels: float, turned: float) -> float:
+        """The share of the way that is in doubt: what is expected of a calibration while the robot turns, more where
+        wheels turn (rad) otherwise than others say."""
+        if abs(turned) < STRAIGHT * seconds:
+            return 0.0
+        return max(self._slip, float(self.slip_share(by_wheels, turned)))
 
     def slip_share(self, by_wheels: F64 | float, turned: F64 | float) -> F64 | float:
         """The share of the way that wheels slipped, by turns (rad) of about half a second that they and others say.
