@@ -1,4 +1,4 @@
-"""`stereo-sfm map update|undo|versions|label`: the map of a store over months."""
+"""`stereo-sfm map update|undo|versions|label|plan`: the map of a store over months."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from stereo_sfm.config import Config
     from stereo_sfm.maps.saved_map import SavedMap
 
-ACTIONS = ("update", "undo", "versions", "label")
+PLAN, FRONTS = "floor_plan.pgm", "shelf_fronts.yaml"
+ACTIONS = ("update", "undo", "versions", "label", "plan")
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,9 @@ def add_arguments(add_action: Callable[..., argparse.ArgumentParser]) -> None:
     label.add_argument("start", nargs="?", type=_point, metavar="X,Y", help="metres of the floor plan")
     label.add_argument("end", nargs="?", type=_point, metavar="X,Y", help="the other end")
     label.add_argument("--remove", action="store_true", help="forget this name")
+    plan = add_action("plan", help="write the floor plan for robots, with shelf fronts and keep-out zones")
+    plan.add_argument("store", type=Path, metavar="STORE", help="map folder; the files are written into it")
+    plan.add_argument("--resolution", type=float, default=0.05, metavar="M", help="metres a pixel (default: 0.05)")
 
 
 def _point(text: str) -> tuple[float, float]:
@@ -66,6 +70,8 @@ def run(args: argparse.Namespace) -> int:
         return _undo(args.store)
     if args.action == "versions":
         return _versions(args.store)
+    if args.action == "plan":
+        return _plan(args.store, args.resolution)
     return _label(LabelOptions(args.store, args.name, args.start, args.end, args.remove))
 
 
@@ -166,6 +172,34 @@ def _label(options: LabelOptions) -> int:
         aisle = Aisle(options.name, options.start, options.end)
         write_about(options.store, dataclasses.replace(about, aisles=(*others, aisle)))
     held.release()
+    return 0
+
+
+def _plan(store: Path, resolution: float) -> int:
+    """Floor plan, keep-out mask and drawing, shelf fronts."""
+    import yaml
+
+    from stereo_sfm.export.floor_plan import make_floor_plan, write_floor_plan
+    from stereo_sfm.export.keep_out import read_zones, write_zones
+    from stereo_sfm.export.shelf_fronts import shelf_fronts
+    from stereo_sfm.maps.saved_map import load_map
+    from stereo_sfm.maps.store import lock, read_about, write_about
+
+    _check_store(store)
+    held = lock(store)
+    saved = load_map(store)
+    about = read_about(store, saved)
+    write_about(store, about)  # the frame of the drawing
+    plan = make_floor_plan(saved.snapshot, resolution, about.map_T_floor)
+    zones = read_zones(store, plan)
+    write_floor_plan(plan, store / PLAN)
+    write_zones(store, plan, zones)
+    fronts = shelf_fronts(plan, about.aisles)
+    rows = [{"label": f.label, "start": list(f.start), "end": list(f.end), "faces": list(f.faces)} for f in fronts]
+    (store / FRONTS).write_text(yaml.safe_dump(rows, sort_keys=False, allow_unicode=True), encoding="utf-8")
+    held.release()
+    square = float(zones.sum()) * resolution**2
+    print(f"{store / PLAN}, {len(fronts)} shelf fronts in {FRONTS}, {square:.1f} m2 of keep-out zones in keepout.png")
     return 0
 
 

@@ -1,6 +1,6 @@
 """A floor plan of the store: occupancy from map points, free space from their rays, aligned with the aisles.
 
-Written in the format of ROS's map_server: a grey PNG (white free, black occupied, grey unknown) and a YAML file.
+Written in the format of ROS's map_server: a grey image (white free, black occupied, grey unknown) and a YAML file.
 """
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportMissingTypeArgument=false
@@ -38,8 +38,8 @@ class FloorPlan:
     map_T_floor: F64  # (4, 4) floor frame: x and y along the aisles and across, z up, z = 0 on the floor
 
 
-def make_floor_plan(s: MapSnapshot, resolution: float = 0.05) -> FloorPlan:
-    """Find the floor and the aisles' direction, then count hits and passing rays per cell.
+def make_floor_plan(s: MapSnapshot, resolution: float = 0.05, map_T_floor: F64 | None = None) -> FloorPlan:
+    """Find the floor and the aisles' direction, where not given, then count hits and passing rays per cell.
 
     Raises:
         StereoSfmError: too few points, or an invalid resolution.
@@ -48,7 +48,7 @@ def make_floor_plan(s: MapSnapshot, resolution: float = 0.05) -> FloorPlan:
         raise StereoSfmError(f"the resolution of a floor plan must be above 0 metres, not {resolution}")
     if len(s.points) < 50:
         raise StereoSfmError("the map holds too few points for a floor plan")
-    map_T_floor = find_floor(s)
+    map_T_floor = find_floor(s) if map_T_floor is None else map_T_floor
     points = se3.transform(se3.inverse(map_T_floor), s.points)
     cameras = se3.transform(se3.inverse(map_T_floor), s.map_T_kf[:, :3, 3])
     near = np.linalg.norm(points[s.obs_pt] - cameras[s.obs_kf], axis=1) < MAX_RANGE
@@ -105,22 +105,18 @@ def _trace(start, end, low, resolution, passed):
 
 
 def plan_files(path: Path) -> tuple[Path, Path]:
-    """PATH.png and PATH.yaml; `path` may have either suffix, any other dot is part of the name."""
-    name = path.name.removesuffix(".png").removesuffix(".yaml")
-    return path.with_name(f"{name}.png"), path.with_name(f"{name}.yaml")
+    """PATH.png and PATH.yaml, or PATH.pgm; `path` may have a suffix, any other dot is part of the name."""
+    ending = ".pgm" if path.suffix == ".pgm" else ".png"
+    name = path.name.removesuffix(ending).removesuffix(".yaml")
+    return path.with_name(f"{name}{ending}"), path.with_name(f"{name}.yaml")
 
 
-def export_floor_plan(saved: SavedMap, path: Path, resolution: float = 0.05) -> FloorPlan:
-    """Write the two `plan_files` of a path."""
-    import cv2
+def description(plan: FloorPlan, image: str) -> str:
+    """The YAML of map_server for an image of a plan's size."""
     import yaml
 
-    plan = make_floor_plan(saved.snapshot, resolution)
-    image, about = plan_files(path)
-    if not cv2.imwrite(str(image), plan.image):
-        raise StereoSfmError(f"cannot write {image}")
-    description = {
-        "image": image.name,
+    fields = {
+        "image": image,
         "resolution": plan.resolution,
         "origin": [plan.origin[0], plan.origin[1], 0.0],
         "negate": 0,
@@ -129,5 +125,21 @@ def export_floor_plan(saved: SavedMap, path: Path, resolution: float = 0.05) -> 
         "mode": "trinary",
         "map_T_floor": plan.map_T_floor.tolist(),
     }
-    about.write_text(yaml.safe_dump(description, sort_keys=False), encoding="utf-8")
+    return yaml.safe_dump(fields, sort_keys=False)
+
+
+def write_floor_plan(plan: FloorPlan, path: Path) -> None:
+    """Write the two `plan_files` of a path."""
+    import cv2
+
+    image, about = plan_files(path)
+    if not cv2.imwrite(str(image), plan.image):
+        raise StereoSfmError(f"cannot write {image}")
+    about.write_text(description(plan, image.name), encoding="utf-8")
+
+
+def export_floor_plan(saved: SavedMap, path: Path, resolution: float = 0.05) -> FloorPlan:
+    """Make the floor plan of a map and write it."""
+    plan = make_floor_plan(saved.snapshot, resolution)
+    write_floor_plan(plan, path)
     return plan

@@ -17,7 +17,8 @@ LOW, HIGH = 0.15, 1.9  # height range in metres of obstacles for the robot
 
 def find_floor(s: MapSnapshot) -> F64:
     """map_T_floor (4, 4): z up from the floor plane, x along the dominant direction of the structure above it."""
-    down = s.map_T_kf[:, :3, 1].mean(0)
+    felt = s.down_sigma > 0  # gravity, where an IMU told it
+    down = (s.map_T_kf[felt, :3, :3] @ s.down[felt, :, None])[..., 0].mean(0) if felt.any() else _upright(s)
     if np.linalg.norm(down) < 0.3:
         raise StereoSfmError(
             "no floor plan: the vertical direction is unknown, since the cameras look in all directions"
@@ -35,6 +36,11 @@ def find_floor(s: MapSnapshot) -> F64:
     c, n = math.cos(yaw), math.sin(yaw)
     turned = axes @ np.array([[c, -n, 0], [n, c, 0], [0, 0, 1.0]])
     return se3.from_rotation_translation(turned, centre + depth * down)
+
+
+def _upright(s: MapSnapshot) -> F64:
+    """(3,) mean direction down of cameras that stand upright, though they may look up or down while driving around."""
+    return s.map_T_kf[:, :3, 1].mean(0)
 
 
 def _floor_plane(points: F64, candidates: Bool, down: F64) -> tuple[F64, float]:
