@@ -8,33 +8,60 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
+COMPLETE = ".complete"  # in a folder that is kept: the new files, all written
+
 
 @contextmanager
 def replaced_folder(folder: Path, names: frozenset[str]) -> Generator[Path]:
     """An empty folder to write into; it replaces `folder` at the end of the block.
 
-    Until then `folder` is unchanged, also if the block raises or the process is killed (between the two renames at the
-    end it is called .NAME.old). A folder with files other than `names`, or one that cannot be renamed (a mount, the
-    working directory), is kept and gets the new files one by one.
+    Until then `folder` is unchanged, also if the block raises or the process is killed; what a process killed at the
+    end leaves, `recover` puts right. A folder with files other than `names`, or one that cannot be renamed (a mount,
+    the working directory), is kept and gets the new files one by one.
     """
     folder = folder.resolve()
     folder.parent.mkdir(parents=True, exist_ok=True)
+    recover(folder)
     keep = folder.exists() and (_cannot_move(folder) or any(path.name not in names for path in folder.iterdir()))
-    draft = folder / ".partial" if keep else folder.with_name(f".{folder.name}.partial")
-    _remove(draft)  # of a killed process
+    draft = folder / ".partial" if keep else _beside(folder, "partial")
     draft.mkdir()
     try:
         yield draft
         for path in draft.iterdir():
             _sync(path)
         if keep:
-            for path in sorted(draft.iterdir()):
-                path.replace(folder / path.name)
+            draft.rename(folder / COMPLETE)
+            _sync(folder)
+            _take_complete(folder)
         else:
             _swap(draft, folder)
         _sync(folder.parent)
     finally:
         _remove(draft)
+
+
+def recover(folder: Path) -> None:
+    """After a process was killed while it replaced a folder: the folder is the new one if that was complete, else the
+    old one, and nothing else is left. Only for the program that replaces it, while nobody else does."""
+    folder = folder.resolve()
+    draft, old = _beside(folder, "partial"), _beside(folder, "old")
+    if old.exists() and not folder.exists():  # killed between two renames: the new one was complete
+        (draft if draft.exists() else old).rename(folder)
+    if (folder / COMPLETE).is_dir():
+        _take_complete(folder)
+    for left in (draft, old, folder / ".partial"):
+        _remove(left)
+
+
+def _beside(folder: Path, ending: str) -> Path:
+    return folder.with_name(f".{folder.name}.{ending}")
+
+
+def _take_complete(folder: Path) -> None:
+    complete = folder / COMPLETE
+    for path in sorted(complete.iterdir()):
+        path.replace(folder / path.name)
+    complete.rmdir()
 
 
 def _sync(path: Path) -> None:
@@ -58,8 +85,7 @@ def _swap(draft: Path, folder: Path) -> None:
         draft.rename(folder)
         return
     shutil.copymode(folder, draft)
-    old = folder.with_name(f".{folder.name}.old")
-    _remove(old)
+    old = _beside(folder, "old")
     folder.rename(old)
     try:
         draft.rename(folder)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import cv2
 import numpy as np
 
 from stereo_sfm.calib.imu import Imu
@@ -21,7 +22,7 @@ from stereo_sfm.tracking.flow.klt import FLAT_SIZE, build_pyramid
 from stereo_sfm.tracking.flow.reappearance import find_deformed
 from stereo_sfm.tracking.inertial.inertial_filter import MIN_S
 from stereo_sfm.tracking.inertial.inertial_motion import NODE_NS, InertialMotion
-from stereo_sfm.types import F64, U8, Corners, ImuSamples, Keyframe, StereoImage
+from stereo_sfm.types import F32, F64, U8, Corners, ImuSamples, Keyframe, StereoImage
 
 FRAMES, POINTS = 8, 300
 WALL = 2.0  # metres ahead
@@ -51,20 +52,20 @@ def images(rig: Rig) -> list[StereoImage]:
     return out
 
 
-def _rays(camera: Camera) -> F64:
+def _rays(camera: Camera) -> F32:
     """(H, W, 3) the bearing of each pixel: some camera models take a second for an image."""
     grid = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), -1).reshape(-1, 2)
-    return camera.unproject(grid.astype(float)).reshape(camera.height, camera.width, 3)
+    return camera.unproject(grid.astype(float)).reshape(camera.height, camera.width, 3).astype(np.float32)
 
 
-def _wall(rays: F64, world_T_cam: F64, texture: U8, moved: float = 0.0) -> U8:
+def _wall(rays: F32, world_T_cam: F64, texture: U8, moved: float = 0.0) -> U8:
     """Image of the plane z = WALL covered by `texture` with one centimetre per pixel, its left half `moved` upwards."""
-    ray = rays.reshape(-1, 3) @ world_T_cam[:3, :3].T
+    at = world_T_cam[:3, 3].tolist()
+    x, y, z = (np.ascontiguousarray(c) for c in np.moveaxis(rays @ world_T_cam[:3, :3].T.astype(np.float32), -1, 0))
     with np.errstate(invalid="ignore", divide="ignore"):
-        place = world_T_cam[:3, 3] + ray * ((WALL - world_T_cam[2, 3]) / ray[:, 2:])
-        place[:, 1] += np.where(place[:, 0] < 0, moved, 0.0)
-        cell = np.where(ray[:, 2:] > 0.05, place[:, :2] * 100, 0).astype(np.int64) % len(texture)
-    return np.ascontiguousarray(texture[cell[:, 1], cell[:, 0]].reshape(rays.shape[:2]))
+        u, v = (np.where(z > 0.05, a + c * ((WALL - at[2]) / z), 0) for a, c in zip(at, (x, y), strict=False))
+        v += np.float32(moved) * (u < 0)
+    return np.asarray(cv2.remap(texture, u * 100, v * 100, cv2.INTER_NEAREST, borderMode=cv2.BORDER_WRAP), np.uint8)
 
 
 def keyframes(rig: Rig) -> list[Keyframe]:

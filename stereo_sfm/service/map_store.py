@@ -20,6 +20,7 @@ from pathlib import Path
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.maps.folders import MapFolders
+from stereo_sfm.maps.replace_folder import recover
 from stereo_sfm.maps.unfinished import copy_map, publish
 from stereo_sfm.service.child import pipe, start_child
 
@@ -69,6 +70,8 @@ class MapStore:
         base = self.folder.with_name(f".{self.folder.name}.base")
         if self.mode == "none":
             return MapFolders()
+        for replaced in (self.folder, self.session, base):
+            recover(replaced)
         if self.mode == "localize":
             folders = MapFolders(map_in=self.folder, localize_only=True)
             folders.check()

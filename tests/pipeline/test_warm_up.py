@@ -44,7 +44,24 @@ with open_source(sys.argv[1]) as source:
         pass
 print(*sorted(set(late)))
 """
+FORKED = """
+import sys
+import stereo_sfm.pipeline.preload
+from stereo_sfm.config import Config
+from stereo_sfm.pipeline.warm_up import warm_up_stage
+from tests.calib.test_formats import RIGS
+
+loaded = set(sys.modules)
+warm_up_stage("loop", Config(), RIGS["ideal"])
+print(*sorted(m for m in set(sys.modules) - loaded if m.startswith(("numba.cpython.", "numba.np."))))
+"""
 SIMULATED = "sim:people?frames=40&size=320x200&vibration=2"
+
+
+def test_what_numba_needs_for_kernels_is_loaded_before_stages_are_forked() -> None:
+    child = subprocess.run([sys.executable, "-c", FORKED], capture_output=True, text=True, env=dict(os.environ))
+    assert child.returncode == 0, child.stderr
+    assert child.stdout.split() == []
 
 
 def late_kernels(source: str) -> list[str]:

@@ -1,0 +1,73 @@
+"""A folder is replaced as a whole, whenever the process that does it is killed."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from stereo_sfm.maps.replace_folder import recover, replaced_folder
+
+KILLED = """
+import os, pathlib, signal, sys
+from stereo_sfm.maps.replace_folder import replaced_folder
+left = int(sys.argv[2])
+
+def counted(name):
+    original = getattr(pathlib.Path, name)
+    def call(*arguments, **named):
+        global left
+        left -= 1
+        if left < 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return original(*arguments, **named)
+    setattr(pathlib.Path, name, call)
+
+for name in ("mkdir", "rename", "replace", "rmdir"):
+    counted(name)
+with replaced_folder(pathlib.Path(sys.argv[1]), frozenset("ab")) as draft:
+    for file in "ab":
+        (draft / file).write_text("new")
+"""
+
+
+def texts(folder: Path) -> dict[str, str]:
+    return {path.name: path.read_text() if path.is_file() else "a folder" for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize("foreign", [{}, {"notes.txt": "mine"}])
+def test_a_folder_is_the_old_or_the_new_one_wherever_its_writer_is_killed(
+    foreign: dict[str, str], tmp_path: Path
+) -> None:
+    seen: set[str] = set()
+    for step in range(20):
+        folder = tmp_path / str(step) / "map"
+        folder.mkdir(parents=True)
+        for name, text in {"a": "old", "b": "old", **foreign}.items():
+            (folder / name).write_text(text)
+        child = subprocess.run([sys.executable, "-c", KILLED, str(folder), str(step)], env=dict(os.environ))
+        recover(folder)
+        found = texts(folder)
+        assert {name: found.pop(name) for name in foreign} == foreign
+        assert found in ({"a": "old", "b": "old"}, {"a": "new", "b": "new"})
+        assert [path.name for path in folder.parent.iterdir()] == ["map"]
+        seen.add(found["a"])
+        if child.returncode == 0:
+            break
+        assert child.returncode == -9
+    else:
+        pytest.fail("it was killed at every step")
+    assert seen == {"old", "new"} and step >= 3
+
+
+def test_the_next_replacement_begins_with_what_a_killed_one_completed(tmp_path: Path) -> None:
+    folder = tmp_path / "map"
+    for name in (".map.old", ".map.partial"):  # killed between the two renames
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "a").write_text(name)
+    with pytest.raises(RuntimeError), replaced_folder(folder, frozenset("a")):
+        raise RuntimeError
+    assert texts(folder) == {"a": ".map.partial"} and [path.name for path in tmp_path.iterdir()] == ["map"]
