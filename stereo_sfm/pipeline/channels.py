@@ -161,3 +161,39 @@ class Inbox(Generic[T]):
     def ready(self) -> bool:
         """Whether a message is there: for the realtime schedule."""
         return self.connection.poll(0)
+
+
+class PrefetchingInbox(Generic[T]):
+    """As `Inbox`, but a thread receives: `take` after `ready` does not wait for the rest of a long message.
+
+    A pipe holds 64 KiB. The sender's thread fills it again only when its process lets it run, which one that computes
+    does every few milliseconds at best.
+    """
+
+    def __init__(self, connection: Connection) -> None:
+        self._inbox: Inbox[T] = Inbox(connection)
+        self._arrived: queue.SimpleQueue[T | Lost] = queue.SimpleQueue()
+        threading.Thread(target=self._work, daemon=True).start()
+
+    def take(self) -> T:
+        """The next message.
+
+        Raises:
+            Lost: the sender has ended.
+        """
+        message = self._arrived.get()
+        if isinstance(message, Lost):
+            self._arrived.put(message)
+            raise message
+        return message
+
+    def ready(self) -> bool:
+        """Whether a whole message is there."""
+        return not self._arrived.empty()
+
+    def _work(self) -> None:
+        try:
+            while True:
+                self._arrived.put(self._inbox.take())
+        except Lost as lost:
+            self._arrived.put(lost)

@@ -10,7 +10,7 @@ from stereo_sfm.drivers.choice import Opener
 from stereo_sfm.maps.folders import make_mapper, save_result
 from stereo_sfm.messages import Localized
 from stereo_sfm.pipeline.allocator import release_memory
-from stereo_sfm.pipeline.channels import End, Inbox, Lost, Outbox
+from stereo_sfm.pipeline.channels import End, Inbox, Lost, Outbox, PrefetchingInbox
 from stereo_sfm.pipeline.child import Report, Setup, prepare, ready
 from stereo_sfm.pipeline.schedule import Lockstep, Realtime, Recorded, Schedule
 from stereo_sfm.types import Frame, Keyframe, LoopResult, MapUpdate
@@ -87,7 +87,7 @@ def run_tracker(
     spans = Spans()
     ring = ImageRing(ImageLayout.of(setup.rig), setup.config.pipeline.ring_slots, setup.ring_name)
     tracker = make_tracker_with_places(setup.config, setup.rig, spans, setup.ground_truth)
-    stage = TrackStage(tracker, _schedule(setup), Inbox[MapUpdate](updates))
+    stage = TrackStage(tracker, _schedule(setup), PrefetchingInbox[MapUpdate](updates))
     inbox = Inbox[SlotImage | End](images)
     free, keyframes = Outbox(release), (Outbox(to_mapper), Outbox(to_loop))
     ready("tracker", setup, to_main)

@@ -1,0 +1,40 @@
+"""Messages between two processes."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import struct
+
+import numpy as np
+import pytest
+
+from stereo_sfm.pipeline.channels import Inbox, Lost, PrefetchingInbox
+
+
+def test_half_a_message_makes_nobody_wait() -> None:
+    """A long message whose sender is computing: it is there when its last byte is."""
+    receive, send = multiprocessing.Pipe(duplex=False)
+    update = np.arange(1000.0)
+    data = pickle.dumps(update)
+    data = struct.pack("!i", len(data)) + data  # as `Connection.send` writes it
+    inbox = PrefetchingInbox[np.ndarray](receive)
+    os.write(send.fileno(), data[:2000])
+    assert not inbox.ready()
+    os.write(send.fileno(), data[2000:])
+    assert (inbox.take() == update).all()
+    assert not inbox.ready()
+
+
+@pytest.mark.parametrize("kind", [Inbox, PrefetchingInbox])
+def test_messages_come_before_the_loss_of_their_sender(kind: type[Inbox[int] | PrefetchingInbox[int]]) -> None:
+    receive, send = multiprocessing.Pipe(duplex=False)
+    inbox = kind(receive)
+    send.send(1)
+    send.send(2)
+    send.close()
+    assert [inbox.take(), inbox.take()] == [1, 2]
+    for _ in range(2):
+        with pytest.raises(Lost):
+            inbox.take()
