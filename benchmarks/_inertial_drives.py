@@ -1,0 +1,117 @@
+"""What must hold of IMU and wheels on drives that are not rendered: exact poses with noise instead of images."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from dead_reckoning import NOTHING, RATE, SENSORS, dark, feed, opened, rest
+
+from stereo_sfm.calib.imu_fit import fit_imu
+from stereo_sfm.calib.wheel_fit import fit_wheel
+from stereo_sfm.geometry import se3
+from stereo_sfm.tracking.inertial.inertial_motion import roll_pitch_deg
+from stereo_sfm.types import F64, I64, ImuSamples, StereoImage, WheelSamples
+
+NOISE = np.array([5e-4, 5e-4, 5e-4, 1e-4, 1e-4, 1e-4])  # of a pose: metres, radians
+DRIFT, WANDER = 2e-5, 5e-5  # of the odometry's rotation: rad/s, rad/sqrt(s)
+CORNER = 1.0  # radians by which the robot has turned when it has rounded a corner
+AISLE_S, CORNERS_S = 22.0, 10.0  # when the light goes out
+Row = tuple[str, str, str, bool]  # sentence, wanted, measured, holds
+
+
+def tilt_deg(seed: int) -> F64:
+    """(N, 2) over a lap with a T265's IMU: whether a corner was rounded, degrees of roll or pitch that are wrong."""
+    source, sensors, poses = opened(seed, imu="t265")
+    world, rng = source.drive.poses(source.frame_ids / RATE), np.random.default_rng(seed)
+    drift, turned, out = rng.normal(0, DRIFT, 3), np.zeros(3), list[tuple[bool, float]]()
+    rounded = np.maximum.accumulate(world[:, :3, 2] @ world[0, :3, 2] < np.cos(CORNER))
+    for k, pose in enumerate(poses):
+        stamp = feed(source, sensors, k)
+        turned = turned + drift / RATE + rng.normal(0, WANDER / RATE**0.5, 3)
+        seen = se3.from_rotation_translation(se3.so3_exp(turned) @ pose[:3, :3], pose[:3, 3])
+        sensors.accept(stamp, seen @ se3.exp(rng.normal(0, 1, 6) * NOISE))
+        level = sensors.level(seen)
+        if level is not None:
+            true = roll_pitch_deg(world[k][:3, :3].T @ np.array([0.0, 0.0, -1.0]))
+            out.append((bool(rounded[k]), float(np.abs(np.array(level) - true).max())))
+    return np.array(out)
+
+
+def drives(seeds: int) -> Iterator[Row]:
+    """Tilt, darkness, slip."""
+    laps = [tilt_deg(seed) for seed in range(seeds)]
+    worst = [[float(part[:, 1].max()) for part in np.array_split(e[e[:, 0] > 0], 2)] for e in laps]
+    first, second = np.array(worst).max(axis=0)
+    before = max(float(e[e[:, 0] == 0, 1].max()) for e in laps)
+    text = f"{before:.2f}° before the first corner, then {first:.2f}°, in the second half {second:.2f}°"
+    yield "2 roll and pitch, T265", "0.1°, not growing", text, max(before, first, second) <= 0.1
+    ways = {
+        name: [dark(seed, AISLE_S, SENSORS[name]) for seed in range(seeds)]
+        for name in ("IMU (T265)", "IMU and wheels", "IMU and wheels, 30 % slip")
+    }
+    most = {name: [100 * way[0] if way is not None else np.inf for way in found] for name, found in ways.items()}
+    alone, both, slip = (np.array(v) for v in most.values())
+    text = f"{both.max():.1f} cm (median {np.median(both):.1f}); IMU alone {alone.max():.1f} ({np.median(alone):.1f})"
+    yield "2 five seconds of darkness, aisle", "10 cm with IMU and wheels", text, both.max() <= 10
+    text = f"{slip.max():.1f} cm (median {np.median(slip):.1f})"
+    yield "2 slip of 30 % in turns", "no worse than without wheels", text, np.median(slip) <= np.median(alone)
+    names = "IMU and wheels, 30 % slip", "IMU (T265)"
+    corners = [[dark(seed, CORNERS_S, SENSORS[name]) for seed in range(seeds)] for name in names]
+    slip, alone = (np.array([np.inf if way is None else 100 * way[0] for way in found]) for found in corners)
+    text = f"{np.median(slip):.0f} cm, {slip.max():.0f} at most; a pose with IMU alone {np.isfinite(alone).sum()} times"
+    yield "2 the same round two corners", "no worse than without wheels", text, bool((slip <= alone).all())
+
+
+def standing(minutes: int) -> Iterator[Row]:
+    """At rest."""
+    metres, degrees = rest(0, 60 * minutes, SENSORS["IMU and wheels"], hold=True)
+    holds = metres <= 2e-3 and degrees <= 0.02
+    yield f"2 {minutes} minutes at rest", "2 mm, 0.02°", f"{1e3 * metres:.2f} mm, {degrees:.4f}°", holds
+
+
+def recovery(seeds: int) -> Iterator[Row]:
+    """Wrong calibrations, from half a minute each."""
+    offsets, turns, radii = list[float](), list[float](), list[float]()
+    for seed in range(seeds):
+        source, _, poses = opened(seed, imu="t265", wheel="differential", wheel_grade="ideal", imu_offset_ms=20)
+        count, imu, wheel = 30 * RATE, source.rig.imu, source.rig.wheel
+        assert imu is not None and wheel is not None
+        parts = [source.sampled(k) for k in range(count)]
+        rng = np.random.default_rng(seed)
+        seen = poses[:count] @ np.array([se3.exp(n) for n in rng.normal(0, 1, (count, 6)) * NOISE])
+        stamps: I64 = np.array([source.stamp_ns(k) for k in range(count)], np.int64)
+        turn = se3.from_rotation_translation(se3.so3_exp(np.radians(3) * np.array([0.6, -0.64, 0.48])), np.zeros(3))
+        wrong = replace(imu, offset_s=0.0, left_T_imu=imu.left_T_imu @ turn)
+        samples = ImuSamples.joined([i for i, _ in parts if i is not None])
+        found = fit_imu(stamps, seen, samples, wrong).imu
+        offsets.append(1e3 * abs(found.offset_s - imu.offset_s))
+        off = se3.so3_log(found.left_T_imu[:3, :3].T @ imu.left_T_imu[:3, :3])
+        turns.append(float(np.degrees(np.linalg.norm(off))))
+        speeds = WheelSamples.joined([w for _, w in parts if w is not None])
+        fit = fit_wheel(stamps, seen, speeds, replace(wheel, radii_m=tuple(1.02 * r for r in wheel.radii_m)))
+        radii.append(100 * abs((1 + fit.value[0]) * 1.02 - 1))
+    yield "3 time offset of 20 ms", "0.5 ms", f"{max(offsets):.2f} ms at most", max(offsets) <= 0.5
+    yield "3 rotation of 3°", "0.1°", f"{max(turns):.3f}° at most", max(turns) <= 0.1
+    yield "3 radius wrong by 2 %", "0.2 %", f"{max(radii):.2f} % at most", max(radii) <= 0.2
+
+
+def cost() -> Iterator[Row]:
+    """Processor time of the sensors a frame, 15 images and 200 samples a second."""
+    for name, limit in (("IMU (T265)", 0.5), ("IMU and wheels", 0.5)):
+        source, sensors, poses = opened(0, **SENSORS[name])
+        rng, took, last = np.random.default_rng(0), list[float](), np.eye(4)
+        for k in range(20 * RATE):
+            seen = poses[k] @ se3.exp(rng.normal(0, 1, 6) * NOISE)
+            (imu, wheel), stamp = source.sampled(k), source.stamp_ns(k)
+            image = StereoImage(k, stamp, NOTHING, imu=imu, wheel=wheel)
+            begin = time.process_time()
+            sensors.feed(image)
+            sensors.predict(stamp, last, np.zeros(6))
+            last = sensors.settled(stamp, seen)
+            sensors.accept(stamp, last)
+            took.append(time.process_time() - begin)
+        ms = 1e3 * float(np.mean(took[2 * RATE :]))
+        yield f"4 cost a frame, {name}", f"{limit} ms", f"{ms:.2f} ms", ms <= limit
