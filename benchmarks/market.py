@@ -1,0 +1,146 @@
+"""A supermarket: sessions along a real robot's paths, their common map, and growth over long drives.
+
+    python benchmarks/market.py --size 424x400 --rate 15
+    python benchmarks/market.py --parts map --length 40 --size 212x200 --rate 10 --queries 10
+    python benchmarks/market.py --parts growth --length 5000 --size 424x400 --rate 10
+
+Parts: `map` puts the sessions of `sim:market` into one map (`map update`) and prints ATE after alignment (keyframes of
+all sessions together, also as a share of the metres driven), size, and times; then single images of a further session,
+driven a bit aside, are asked in it. `growth` drives on from session to session in one run and prints, for each stretch,
+processor time a frame (without rendering), resident memory, keyframes and points; it fails where the last stretch
+needs more than 1.2 times the time of the one around 600 m, or 1.5 times the memory.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+
+from _sequences import one_thread
+
+one_thread()
+
+import numpy as np
+import psutil
+from both_directions import aligned, drive
+from sessions import Truth, asked, on_disk, truth_of
+
+from stereo_sfm.config import Config
+from stereo_sfm.drivers.sim.source import SimSource
+from stereo_sfm.drivers.source import open_source
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.export.floor_plan import make_floor_plan
+from stereo_sfm.loop.vocabulary_file import default_vocabulary
+from stereo_sfm.mapping.mapper import Mapper
+from stereo_sfm.maps.saved_map import SavedMap
+from stereo_sfm.maps.update import update
+from stereo_sfm.pipeline.inline import InlineRun
+
+ATE_SHARE, GOOD_SHARE, QUERY_S = 0.0005, 0.96, 0.3  # required of the map of three sessions
+FROM_M, TIME_RATIO, MEMORY_RATIO = 600.0, 1.2, 1.5  # required of the growth
+
+
+def one_map(options: str, sessions: int, queries: int, seed: int) -> bool:
+    """Sessions in one map; whether it is as exact as required."""
+    saved: SavedMap | None = None
+    truth: Truth = {}
+    metres = 0.0
+    for n in range(sessions):
+        spec = f"sim:market?seed={seed}&walk={n}{options}"
+        begin = time.perf_counter()
+        walk = drive(spec)
+        drove, begin, loops, session = time.perf_counter() - begin, time.perf_counter(), 0, 0
+        metres += float(np.linalg.norm(np.diff(walk.truth[:, :3, 3], axis=0), axis=1).sum())
+        if saved is None:
+            saved = walk.saved
+        else:
+            try:
+                done = update(saved, walk.saved, default_vocabulary(), Config().loop, Config().mapper)
+            except StereoSfmError as error:
+                print(f"session {n + 1}: NOT joined ({error})", flush=True)
+                continue
+            saved, loops, session = done.saved, len(done.loops), done.session
+        took = time.perf_counter() - begin
+        s = walk.saved.snapshot
+        truth |= {
+            (session, stamp): walk.true_kf[k] for k, stamp in zip(s.kf_ids.tolist(), s.stamp_ns.tolist(), strict=True)
+        }
+        print(
+            f"session {n + 1}: {len(walk.saved)} keyframes, driven in {drove:.0f} s with rendering; {loops} loops to"
+            f" the map, put in in {took:.1f} s: {len(saved)} keyframes, {len(saved.snapshot.pt_ids)} points",
+            flush=True,
+        )
+    assert saved is not None
+    true = truth_of(saved, truth)
+    off = (aligned(saved.snapshot.map_T_kf, true) @ saved.snapshot.map_T_kf - true)[:, :3, 3]
+    ate = float(np.sqrt((off**2).sum(1).mean()))
+    megabytes, opening = on_disk(saved)
+    begin = time.perf_counter()
+    plan = make_floor_plan(saved.snapshot)
+    planned = time.perf_counter() - begin
+    good, wrong, seconds = asked(saved, truth, f"sim:market?seed={seed}&walk={sessions}{options}", queries, seed)
+    joined = len(saved.session_ids)
+    print(
+        f"{joined} of {sessions} sessions in one map, {metres:.0f} m, ATE {1e3 * ate:.1f} mm"
+        f" ({100 * ate / metres:.3f} %); {megabytes:.1f} MB, opened in {opening:.2f} s; floor plan"
+        f" {plan.image.shape[1]}x{plan.image.shape[0]} in {planned:.1f} s; {good} of {queries} images found, {wrong}"
+        f" wrong, {1e3 * seconds:.0f} ms each"
+    )
+    exact = ate <= ATE_SHARE * metres and good >= GOOD_SHARE * queries and not wrong and seconds <= QUERY_S
+    return exact and joined == sessions
+
+
+def growth(spec: str, stretch: float) -> bool:
+    """One long run; whether time and memory stay as flat as required."""
+    process, rows = psutil.Process(), list[tuple[float, float, float]]()
+    with open_source(spec) as source:
+        assert isinstance(source, SimSource) and source.ground_truth is not None
+        steps = np.linalg.norm(np.diff(source.ground_truth.poses[:, :3, 3], axis=0), axis=1)
+        driven = np.concatenate([[0.0], np.cumsum(steps)])
+        run = InlineRun(source, Config(), [], None)
+        begun, spent, until = 0, 0.0, stretch
+        for k, image in enumerate(source):
+            start = time.process_time()
+            run.step(image)
+            spent += time.process_time() - start
+            if driven[k] < until and k + 1 < len(driven):
+                continue
+            memory = process.memory_info().rss / 2**20
+            rows.append((float(driven[k]), 1e3 * spent / (k + 1 - begun), memory))
+            begun, spent, until = k + 1, 0.0, until + stretch
+            mapper = run.map_stage.mapper
+            assert isinstance(mapper, Mapper)
+            print(
+                f"{driven[k]:7.0f} m: {rows[-1][1]:6.1f} ms a frame, {memory:6.0f} MiB,"
+                f" {len(mapper.map.living_keyframes())} keyframes, {len(mapper.map.living_points())} points",
+                flush=True,
+            )
+    early = min(rows, key=lambda row: abs(row[0] - FROM_M))
+    return rows[-1][1] <= TIME_RATIO * early[1] and rows[-1][2] <= MEMORY_RATIO * early[2]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--parts", default="map,growth", help="of map, growth")
+    parser.add_argument("--sessions", type=int, default=3)
+    parser.add_argument("--queries", type=int, default=50)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--size", default="", help="WIDTHxHEIGHT, the camera's own without")
+    parser.add_argument("--rate", type=float, default=30.0)
+    parser.add_argument("--length", type=float, default=0.0, help="metres of a session or of the long drive")
+    parser.add_argument("--stretch", type=float, default=100.0, help="metres between two lines of the growth")
+    args = parser.parse_args()
+    size = f"&size={args.size}" if args.size else ""
+    passed = True
+    if "map" in args.parts.split(","):
+        options = f"&rate={args.rate}&length={args.length}{size}"
+        passed &= one_map(options, args.sessions, args.queries, args.seed)
+    if "growth" in args.parts.split(","):
+        length = args.length or 2 * FROM_M
+        passed &= growth(f"sim:market?seed={args.seed}&rate={args.rate}&length={length}{size}", args.stretch)
+    return 0 if passed else 3
+
+
+if __name__ == "__main__":
+    sys.exit(main())
