@@ -15,11 +15,14 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.order_statistics import median
 from stereo_sfm.mapping import bundle_kernels as kernels
 from stereo_sfm.mapping.level import Level
 from stereo_sfm.mapping.reduced import ReducedSystem
 from stereo_sfm.types import F64, I64, Bool
 
+TO_SIGMA = 1.4826  # from the median of absolute values, for normally distributed ones
+MIN_DISPARITY_SIGMA = 1e-2  # of normalised mean disparity errors
 Linear = tuple[F64, F64, F64, F64]  # A (M, 6), g (M, 3), p (M, 3), chi2 (M, 2)
 
 
@@ -31,6 +34,7 @@ class BundleConfig:
     iterations: int = 10  # maximum of accepted steps of a round
     huber: float = 2.0  # sigmas where the loss becomes linear; 0 means least squares
     cauchy: float = 0.0  # sigmas, the scale of a redescending loss in all rounds but the first; 0: Huber's throughout
+    disparity_sigmas: float = 0.0  # mean disparity error of a point beyond which its depth counts less; 0: never
     joint_loss: bool = False  # one loss over both images of an observation instead of one each
     outlier_chi2: float = 9.21  # squared normalised residual in one image that makes an outlier (99 % of 2 dof)
     tolerance: float = 1e-5  # relative decrease of the cost that ends a round
@@ -90,7 +94,8 @@ class _Table:
         self._right = np.ascontiguousarray(bundle.uv_right[rows], float)
         seen = np.stack([np.isfinite(self._left).all(1), np.isfinite(self._right[:, 0]) & rig.stereo], 1)
         sigma = np.ones(seen.shape) if bundle.sigma is None else bundle.sigma[rows]
-        self._weights = np.where(seen, 1.0 / sigma, 0.0)
+        self._full_weights = np.where(seen, 1.0 / sigma, 0.0)
+        self._weights = self._full_weights.copy()  # (M, 2)
         self.use = seen.copy()  # (M, 2) images that count
         right = rig.right if rig.right is not None else rig.left
         right_T_left = se3.inverse(rig.left_T_right)
@@ -112,6 +117,17 @@ class _Table:
         )
         self.limit = 0.0
         return out, float(cost)
+
+    def add_disparity_errors(self, state: _State, total: F64, information: F64) -> None:
+        """Add the weighted disparity errors of the points' observations, and their weights, to (P,) and (P,)."""
+        kernels.add_disparity_errors(
+            *(state.rot, state.pos, state.points, self.kf, self.pt, self._left, self._right, self._full_weights),
+            *(self.use, self._cams, *self._right_T_left, total, information),
+        )
+
+    def weigh_right(self, weight: F64) -> None:
+        """Multiply the weights of the right images by (P,)."""
+        self._weights[:, 1] = self._full_weights[:, 1] * weight[self.pt]
 
     def sum_up(self, rot: F64, lin: Linear) -> tuple[F64, F64]:
         """(P, 6) and (P, 3): the quadratic models of the points, in world axes."""
@@ -167,8 +183,19 @@ class _Solver:
             state.cost += cost
         return state
 
+    def _weigh_disparities(self, state: _State) -> None:
+        """Give less weight to the disparities of points whose mean error is large, see `_disparity_weights`."""
+        total, information = np.zeros(len(state.points)), np.zeros(len(state.points))
+        for table in (self.table, self.fixed):
+            table.add_disparity_errors(state, total, information)
+        weight = _disparity_weights(total, information, self.config.disparity_sigmas)
+        for table in (self.table, self.fixed):
+            table.weigh_right(weight)
+
     def begin_round(self, state: _State, judge: bool) -> None:
         """Linearise anew without outliers; `judge`: determine outliers, in all rounds but the first."""
+        if judge and self.config.disparity_sigmas > 0:  # not at the start, where wrong poses make all points disagree
+            self._weigh_disparities(state)
         self.table.limit = self.fixed.limit = self.config.outlier_chi2 if judge else 0.0
         self.table.redescends = self.fixed.redescends = judge and self.config.cauchy > 0
         self.evaluate(state)
@@ -232,6 +259,27 @@ class _Solver:
             if decrease <= c.tolerance * state.cost:
                 return state, accepted, True
         return state, accepted, False
+
+
+def _disparity_weights(total: F64, information: F64, sigmas: float) -> F64:
+    """(P,) weights of the points' disparities, 1 up to so many sigmas of the mean error, then redescending.
+
+    The disparity of a point near a depth edge is wrong in the same way in all its observations, mostly towards nearer:
+    each error is small, and no loss of single observations reduces its weight, but their mean is significant, and many
+    of them make the path too short. What all points have in common is the error of the path so far: it is left out.
+    Sigma is the robust standard deviation of the points' normalised means.
+
+    Args:
+        total, information: (P,) of the points' disparity errors, see `bundle_kernels.add_disparity_errors`.
+    """
+    weight, seen = np.ones(len(total)), information > 0
+    if not seen.any():
+        return weight
+    mean = total[seen] / information[seen]
+    mean = np.abs(mean - median(mean)) * np.sqrt(information[seen])
+    limit = sigmas * max(TO_SIGMA * median(mean), MIN_DISPARITY_SIGMA)
+    weight[seen] = np.square(limit / np.maximum(mean, limit))
+    return weight
 
 
 def bundle_adjust(rig: Rig, bundle: Bundle, config: BundleConfig | None = None) -> BundleResult:

@@ -153,6 +153,47 @@ def linearize(
 
 
 @njit
+def add_disparity_errors(
+    rot, pos, points, obs_kf, obs_pt, uv_left, uv_right, weights, use, cams, right_r, right_t, total, information
+):
+    """Add, by point, the weighted disparity errors of its observations in both images.
+
+    The error is the right pixel's residual less the left one's, along the epipolar curve, positive towards nearer.
+
+    Args:
+        rot, pos, points, obs_kf, obs_pt, uv_left, uv_right, weights, use, cams, right_r, right_t: as of `linearize`.
+        total (P,), information (P,): the sums of weight^2 times error, and of weight^2, are added.
+    """
+    left_model, left_params, right_model, right_params = cams
+    for o in range(obs_kf.shape[0]):
+        if not (use[o, 0] and use[o, 1]):
+            continue
+        k, i = obs_kf[o], obs_pt[o]
+        d0, d1, d2 = points[i, 0] - pos[k, 0], points[i, 1] - pos[k, 1], points[i, 2] - pos[k, 2]
+        p0 = rot[k, 0, 0] * d0 + rot[k, 1, 0] * d1 + rot[k, 2, 0] * d2
+        p1 = rot[k, 0, 1] * d0 + rot[k, 1, 1] * d1 + rot[k, 2, 1] * d2
+        p2 = rot[k, 0, 2] * d0 + rot[k, 1, 2] * d1 + rot[k, 2, 2] * d2
+        left = project_one(left_model, left_params, p0, p1, p2)
+        q0 = right_r[0, 0] * p0 + right_r[0, 1] * p1 + right_r[0, 2] * p2 + right_t[0]
+        q1 = right_r[1, 0] * p0 + right_r[1, 1] * p1 + right_r[1, 2] * p2 + right_t[1]
+        q2 = right_r[2, 0] * p0 + right_r[2, 1] * p1 + right_r[2, 2] * p2 + right_t[2]
+        right = project_one(right_model, right_params, q0, q1, q2)
+        if not (math.isfinite(left[0]) and math.isfinite(right[0])):
+            continue
+        du = right[2] * right_t[0] + right[3] * right_t[1] + right[4] * right_t[2]
+        error = du * (uv_right[o, 0] - right[0] - uv_left[o, 0] + left[0])
+        square = du * du
+        if math.isfinite(uv_right[o, 1]):
+            dv = right[5] * right_t[0] + right[6] * right_t[1] + right[7] * right_t[2]
+            error += dv * (uv_right[o, 1] - right[1] - uv_left[o, 1] + left[1])
+            square += dv * dv
+        if square > 0:
+            w = weights[o, 1] * weights[o, 1]
+            total[i] += w * error / math.sqrt(square)
+            information[i] += w
+
+
+@njit
 def pose_blocks(obs_kf, free, lin, h, b):
     """Adds G^T A G and -G^T g of every observation of a free keyframe to h (F, 6, 6) and b (F, 6)."""
     a_all, g_all, p_all, _ = lin

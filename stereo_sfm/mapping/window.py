@@ -35,7 +35,10 @@ class Window:
 
 def bundle_config(config: MapperConfig) -> BundleConfig:
     """The mapper's settings of bundle adjustment."""
-    return BundleConfig(config.rounds, config.iterations, config.huber_sigmas, config.cauchy_sigmas, fixed_once=True)
+    return BundleConfig(
+        config.rounds, config.iterations, config.huber_sigmas, config.cauchy_sigmas, config.disparity_sigmas,
+        fixed_once=True,
+    )  # fmt: skip
 
 
 def covisible_window(map_: Map, row: int, config: MapperConfig) -> Window:

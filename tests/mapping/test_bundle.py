@@ -258,3 +258,23 @@ def test_a_redescending_loss_is_not_biased_by_one_sided_errors(rig: Rig) -> None
         found = np.linalg.norm(np.diff(result.world_T_kf[:, :3, 3], axis=0), axis=1).sum()
         errors.append(abs(found / spread - 1))
     assert errors[1] < 0.9 * errors[0]
+
+
+@pytest.mark.parametrize("biased", [0.0, 0.25])
+def test_points_whose_disparity_always_errs_to_one_side_do_not_shorten_the_path(rig: Rig, biased: float) -> None:
+    """Small errors, alike in all observations of a point, as at depth edges; without them nothing changes."""
+    rng = np.random.default_rng(3)
+    scene = make_scene(rig, 6, 300, noise_px=0.2)
+    error = np.where(rng.random(len(scene.points)) < biased, 0.4, 0.0)
+    right = scene.uv_right.copy()
+    right[:, 0] -= error[scene.obs_pt]  # nearer
+    scene = dataclasses.replace(scene, uv_right=right)
+    truth = np.linalg.norm(np.diff(scene.world_T_kf[:, :3, 3], axis=0), axis=1).sum()
+    config, errors = BundleConfig(rounds=2, huber=2.0, cauchy=1.0, iterations=30), list[float]()
+    for sigmas in (0.0, 1.5):
+        result = bundle_adjust(rig, bundle_of(scene), dataclasses.replace(config, disparity_sigmas=sigmas))
+        errors.append(np.linalg.norm(np.diff(result.world_T_kf[:, :3, 3], axis=0), axis=1).sum() / truth - 1)
+    if biased:
+        assert errors[0] < -2e-3 and abs(errors[1]) < 0.6 * abs(errors[0])
+    else:
+        assert max(np.abs(errors)) < 2e-3
