@@ -3,20 +3,24 @@
     python benchmarks/outputs.py [--source SPEC] [--frames N] [--rate HZ]
 
 The tracker takes images by the clock, as of a camera; each pose goes to every output, in its own process behind its
-queue, as the service does it. Clients of this process read them: lines of the pose socket, the WebSocket of Foxglove,
-and the topic `odom` where rclpy is installed; one more client of the pose socket never reads. Printed is, for each
-output, the time from the image to the pose at the client beside the tracker's own.
+queue, as the service does it. Clients, processes of their own, read them: lines of the pose socket, the WebSocket of
+Foxglove, and the topic `odom` where rclpy is installed; one more client of the pose socket never reads. Printed is, for
+each output, the time from the image to the pose at the client beside the tracker's own.
 
 Then a whole service runs with every output, a page that is viewed, and that same client: what its tracker's process
 spends a frame (processor time of all its threads) while messages are published, and while none is, in turns over the
 same images.
 """
 
+# The packages of ROS come with a robot's ROS, not from this project's environment.
+# pyright: reportMissingImports=false
+
 from __future__ import annotations
 
 import argparse
 import importlib.util
 import json
+import multiprocessing
 import pickle
 import socket
 import struct
@@ -26,6 +30,7 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import replace
+from multiprocessing.connection import Connection
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -99,6 +104,38 @@ def read_ros2(arrivals: Arrivals) -> None:
     rclpy.spin(node)
 
 
+READERS: dict[str, Callable[[Arrivals], None]] = {
+    "pose_socket": read_socket,
+    "foxglove": read_foxglove,
+    "ros2": read_ros2,
+}
+
+
+def run_reader(name: str, end: Connection) -> None:
+    """Body of a client's process: read until asked for what has arrived."""
+    arrivals = Arrivals()
+    threading.Thread(target=READERS[name], args=(arrivals,), daemon=True).start()
+    end.recv()
+    end.send(dict(arrivals))
+
+
+class Reader:
+    """A client of an output in a process of its own: it takes no time from the interpreter of the tracker."""
+
+    def __init__(self, name: str) -> None:
+        spawn = multiprocessing.get_context("spawn")
+        self._end, other = spawn.Pipe()
+        self._process = spawn.Process(target=run_reader, args=(name, other), daemon=True)
+        self._process.start()
+
+    def arrivals(self) -> Arrivals:
+        """Ends it."""
+        self._end.send("end")
+        found = self._end.recv()
+        self._process.kill()
+        return found
+
+
 def waits(port: int) -> bool:
     """Whether somebody listens."""
     with socket.socket() as probe:
@@ -126,23 +163,16 @@ class Outputs:
     def __init__(self, started: Started) -> None:
         config, names = everything(), installed()
         self.processes = [OutputProcess(name, config, lambda *_: Reply(True)) for name in names]
-        readers: dict[str, Callable[[Arrivals], None]] = {
-            "pose_socket": read_socket,
-            "foxglove": read_foxglove,
-            "ros2": read_ros2,
-        }
-        self.arrivals: dict[str, Arrivals] = {name: {} for name in names if name in readers}
         for process in self.processes:
             process.start()
         while not all(process.wants for process in self.processes) or not waits(SOCKET_PORT):
             time.sleep(0.05)
-        for name, arrivals in self.arrivals.items():
-            threading.Thread(target=readers[name], args=(arrivals,), daemon=True).start()
+        self.readers = {name: Reader(name) for name in names if name in READERS}
         self._silent = socket.create_connection(("127.0.0.1", SOCKET_PORT))
         self._silent.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         self.offer(started)
         self.offer(Status(ServiceState.RUNNING))
-        time.sleep(2.0)  # for the readers to be there
+        time.sleep(5.0)  # for the readers to be there
 
     def offer(self, message: Any) -> None:
         """To every output that wants it."""
@@ -269,11 +299,12 @@ def print_latencies(args: argparse.Namespace) -> None:
         for k in range(args.rounds):
             drive(tracker, images, (k + 1) * len(images), args.rate, outputs, captured, done)
         time.sleep(0.5)
+        found = {output: reader.arrivals() for output, reader in outputs.readers.items()}
     own = np.array([done[s] - captured[s] for s in done]) * 1e3
     print(f"| output | image to pose, median | 95 % | added, median | 95 % | poses |\n|{'---|' * 6}")
     print(f"| tracker | {np.median(own):.1f} ms | {np.percentile(own, 95):.1f} ms | | | {len(own)} |")
     sent = args.rounds * len(images)
-    for output, arrivals in outputs.arrivals.items():
+    for output, arrivals in found.items():
         whole = np.array([at - captured[s] for s, at in arrivals.items() if s in captured]) * 1e3
         added = np.array([at - done[s] for s, at in arrivals.items() if s in done]) * 1e3
         if not len(whole):

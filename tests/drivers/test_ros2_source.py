@@ -138,6 +138,7 @@ def _camera(packed: bool = False) -> Iterator[Camera]:
         camera.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("packed", [False, True])
 def test_two_topics_at_30_hz_are_tracked_without_loss(packed: bool) -> None:
     tail = "/compressed" if packed else ""
@@ -165,6 +166,7 @@ def test_two_topics_at_30_hz_are_tracked_without_loss(packed: bool) -> None:
     assert len(samples) > 2.9 * (COUNT - 5) and (np.diff(samples) > 0).all()
 
 
+@pytest.mark.slow
 def test_what_is_missing_is_named() -> None:
     with _camera() as camera:
         for spec, why in (
@@ -184,6 +186,7 @@ def test_what_is_missing_is_named() -> None:
             next(iter(source))
 
 
+@pytest.mark.slow
 def test_a_camera_that_ends_is_lost() -> None:
     with _camera() as camera, open_source("ros2:?left=/cam/left/image_raw&wait=6") as source:
         images = iter(source)

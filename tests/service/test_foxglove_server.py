@@ -19,7 +19,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log import topics
 from stereo_sfm.messages import Health
 from stereo_sfm.service.messages import Event
-from stereo_sfm.service.outputs.foxglove_server import REPORT, SERVICES, STATUS, FoxgloveOutput
+from stereo_sfm.service.outputs.foxglove_server import KINDS, REPORT, SERVICES, STATUS, FoxgloveOutput
 from stereo_sfm.service.publisher import Reply
 from tests.service.service_messages import FakeService, cloud, health, picture, pose_update, started, status
 
@@ -60,10 +60,23 @@ def _channels(client: Any, count: int) -> dict[str, dict[str, Any]]:
     return known
 
 
+def _subscribe(client: Any, channels: dict[int, int]) -> None:
+    """Args: channels, number of the subscription -> of the channel. What is sent after it returns, comes."""
+    rows = [{"id": number, "channelId": channel} for number, channel in channels.items()]
+    client.send(json.dumps({"op": "subscribe", "subscriptions": rows}))
+    client.send(json.dumps({"op": "getParameters", "parameterNames": [], "id": "x"}))
+    _wait(client, lambda said: True if isinstance(said, dict) and said["op"] == "parameterValues" else None)
+
+
 def _everything(output: FoxgloveOutput) -> None:
     for message in (started(), pose_update(1), status(), cloud(), picture(), health()):
         output.put(message)
     output.put(Event(0, "warning", "tracker", "lost in aisle 3"))
+
+
+def test_every_topic_is_there_before_the_first_message() -> None:
+    with _serving() as (_, client):
+        assert _channels(client, len(KINDS) + 3).keys() == {*KINDS, topics.HEALTH, STATUS, REPORT}
 
 
 def test_the_topics_are_those_of_the_log() -> None:
@@ -74,10 +87,7 @@ def test_the_topics_are_those_of_the_log() -> None:
         assert names <= set(topics.BY_NAME) and {topics.TF, topics.POINTS, topics.LEFT_IMAGE, topics.LOG} <= names
         assert all(known[name]["schemaName"] in topics.BY_NAME[name].schema.split("|") for name in names)
         wanted = {1: topics.ODOMETRY, 2: topics.LEFT_IMAGE, 3: topics.POINTS, 4: STATUS}
-        rows = [{"id": i, "channelId": known[topic]["id"]} for i, topic in wanted.items()]
-        client.send(json.dumps({"op": "subscribe", "subscriptions": rows}))
-        client.send(json.dumps({"op": "getParameters", "parameterNames": [], "id": "x"}))
-        _wait(client, lambda said: True if isinstance(said, dict) and said["op"] == "parameterValues" else None)
+        _subscribe(client, {i: known[topic]["id"] for i, topic in wanted.items()})
         _everything(output)
         got: dict[int, bytes] = {}
 
@@ -146,5 +156,15 @@ def test_it_stays_on_this_computer() -> None:
 
 def test_health_is_one_message_a_stage() -> None:
     with _serving() as (output, client):
+        known = _channels(client, len(KINDS) + 3)
+        _subscribe(client, {1: known[topics.HEALTH]["id"], 2: known[REPORT]["id"]})
         output.put(health(stages={n: Health(n, 1, 30.0, 0, 1.0, 2.0, 3.0, 0) for n in ("tracker", "mapper")}))
-        assert set(_channels(client, 2)) == {topics.HEALTH, REPORT}
+        got: list[int] = []
+
+        def take(said: Any) -> bool | None:
+            if isinstance(said, bytes) and said[0] == 1:
+                got.append(struct.unpack_from("<I", said, 1)[0])
+            return True if 2 in got else None
+
+        _wait(client, take)
+    assert got == [1, 1, 2]

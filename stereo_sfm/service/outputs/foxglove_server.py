@@ -15,7 +15,15 @@ from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.Odometry_pb2 import Odometry
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError, require
@@ -47,6 +55,21 @@ SERVICES = ("status", "save_map", "load_map", "reset", "relocalize", "start_reco
 JPEG_QUALITY = 80
 REQUEST_BYTES = 1 << 14
 REPLY_S = 30.0
+KINDS: dict[str, Any] = {
+    topics.LEFT_CALIBRATION: CameraCalibration,
+    topics.RIGHT_CALIBRATION: CameraCalibration,
+    topics.TF: FrameTransforms,
+    topics.TF_STATIC: FrameTransforms,
+    topics.ODOMETRY: Odometry,
+    topics.ODOM_POSE: PoseInFrame,
+    topics.MAP_POSE: PoseInFrame,
+    topics.POINTS: PointCloud,
+    topics.TRAJECTORY: PosesInFrame,
+    topics.PATH: PointCloud,
+    topics.LEFT_IMAGE: CompressedImage,
+    topics.FEATURES: ImageAnnotations,
+    topics.LOG: Log,
+}
 BACKLOG = 256  # messages that wait for one client; the oldest is dropped
 
 
@@ -89,6 +112,7 @@ class FoxgloveOutput:
         from foxglove.websocket import Capability
 
         self._context = sdk.Context()
+        self._advertise()
         try:
             self._server = sdk.start_server(
                 name="stereo-sfm",
@@ -170,7 +194,7 @@ class FoxgloveOutput:
 
     def _health(self, report: HealthReport) -> None:
         for health in report.stages.values():
-            self._own(topics.HEALTH, Health, health)
+            self._channels[topics.HEALTH].log(schema.encode(health), log_time=self._stamp_ns)
         self._json(REPORT, {name: value for name, value in asdict(report).items() if name != "stages"})
 
     def _event(self, event: Event) -> None:
@@ -178,30 +202,28 @@ class FoxgloveOutput:
 
     # -- channels -----------------------------------------------------------------------------------------------------
 
-    def _log(self, topic: str, message: Any) -> None:
-        """A message of Foxglove's schemas."""
-        if topic not in self._channels:
-            from mcap_protobuf.schema import build_file_descriptor_set
-
-            data = build_file_descriptor_set(type(message)).SerializeToString()
-            self._channels[topic] = self._channel(topic, message.DESCRIPTOR.full_name, data)
-        self._channels[topic].log(message.SerializeToString(), log_time=self._stamp_ns)
-
-    def _own(self, topic: str, kind: type[Any], message: Any) -> None:
-        """A message of ours."""
-        if topic not in self._channels:
-            self._channels[topic] = self._channel(topic, schema.full_name(kind), schema.schema_data(kind))
-        self._channels[topic].log(schema.encode(message), log_time=self._stamp_ns)
-
-    def _json(self, topic: str, values: dict[str, Any]) -> None:
+    def _advertise(self) -> None:
+        """Every topic, before there is a client: one that subscribes at once is refused a topic that is just new."""
         from foxglove import Channel
+        from mcap_protobuf.schema import build_file_descriptor_set
 
-        if topic not in self._channels:
+        for topic, kind in KINDS.items():
+            data = build_file_descriptor_set(kind).SerializeToString()
+            self._channels[topic] = self._channel(topic, kind.DESCRIPTOR.full_name, data)
+        self._channels[topics.HEALTH] = self._channel(
+            topics.HEALTH, schema.full_name(Health), schema.schema_data(Health)
+        )
+        for topic in (STATUS, REPORT):
             kind = {"type": "object", "title": topic}
             self._channels[topic] = Channel(topic, schema=kind, context=self._context)
-        self._channels[topic].log(
-            json.loads(json.dumps(values), parse_constant=lambda _: None), log_time=self._stamp_ns
-        )
+
+    def _log(self, topic: str, message: Any) -> None:
+        """A message of Foxglove's schemas."""
+        self._channels[topic].log(message.SerializeToString(), log_time=self._stamp_ns)
+
+    def _json(self, topic: str, values: dict[str, Any]) -> None:
+        plain = json.loads(json.dumps(values), parse_constant=lambda _: None)
+        self._channels[topic].log(plain, log_time=self._stamp_ns)
 
     def _channel(self, topic: str, name: str, data: bytes) -> Any:
         from foxglove import Channel, Schema
