@@ -19,6 +19,7 @@ SAME_METRES, SAME_RADIANS = 0.3, 0.25  # between keyframes of the same view
 GAP_METRES = 0.3  # constant part of the tolerance after a gap in tracking
 GAP_SHARE = 0.75  # part of the tolerance proportional to the distance at the speed before the gap
 MIN_SPEED = 0.5  # metres a second, lower bound of that speed
+SPEED_NS = 1_000_000_000  # time before a gap over which it is measured
 HOP_METRES = 1e-6  # added to each edge, so that of equally long paths the one with fewer edges is chosen
 
 
@@ -173,12 +174,18 @@ class KeyframeGraph:
         return GapMotion(deviation, tolerance, before.metres + after.metres)
 
     def _velocity(self, row: int) -> F64 | None:
-        """(3,) metres a second before a keyframe, in its camera frame; None for the first of a chain."""
+        """(3,) metres a second before a keyframe, in its camera frame; None for the first of a chain.
+
+        Over a second at least, if the chain is as long: what covers a camera disturbs its last few poses.
+        """
         nodes = self._nodes
-        if row == 0 or nodes.chain[row - 1] != nodes.chain[row] or nodes.stamp_ns[row] <= nodes.stamp_ns[row - 1]:
+        chain = np.flatnonzero(nodes.chain[:row] == nodes.chain[row])
+        early = chain[nodes.stamp_ns[chain] <= nodes.stamp_ns[row] - SPEED_NS]
+        before = int(early[-1]) if len(early) else int(chain[0]) if len(chain) else row
+        if nodes.stamp_ns[row] <= nodes.stamp_ns[before]:
             return None
-        step = se3.inverse(nodes.odom_T_cam[row]) @ nodes.odom_T_cam[row - 1]
-        return -step[:3, 3] / (1e-9 * float(nodes.stamp_ns[row] - nodes.stamp_ns[row - 1]))
+        step = se3.inverse(nodes.odom_T_cam[row]) @ nodes.odom_T_cam[before]
+        return -step[:3, 3] / (1e-9 * float(nodes.stamp_ns[row] - nodes.stamp_ns[before]))
 
     def path(self, a: int, b: int) -> GraphPath | None:
         """The shortest path (Dijkstra), None if neither odometry nor loops connect the keyframes."""

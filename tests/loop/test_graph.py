@@ -113,6 +113,19 @@ def test_the_gap_is_symmetric() -> None:
     )
 
 
+def test_the_speed_before_a_gap_is_not_that_of_the_last_disturbed_poses() -> None:
+    """What comes before the camera makes keyframes in a row, and may take the last pose along."""
+    graph = KeyframeGraph()
+    for k in range(6):
+        graph.add(k, at(float(k)), 0, k * 10**9)
+    graph.add(6, at(5.3), 0, 5_067_000_000)  # 4.5 m/s
+    graph.add(7, np.eye(4), 1, 7_067_000_000)
+    gap_motion = graph.gap_motion(6, 7, at(1.0))
+    assert gap_motion is not None
+    assert gap_motion.tolerance == pytest.approx(0.3 + 0.75 * 2.0 * 1.3 / 1.067, rel=1e-6)
+    assert gap_motion.deviation == pytest.approx(abs(1.0 - 1.3 / 1.067), rel=1e-6)
+
+
 def test_no_prediction_over_a_gap_without_time_or_speed() -> None:
     assert broken(-3.0).gap_motion(3, 6, at(2.0)) is None  # another clock
     graph = KeyframeGraph()

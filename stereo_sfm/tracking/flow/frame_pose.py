@@ -139,14 +139,16 @@ class FramePoseSolver:
         best = self._solve_all(tracks, expected, last_pose, static)
         rest = static & ~best.inlier
         undisturbed = in_group(tracks, rest).sum() < MIN_GROUP and best.inliers >= AGREEING_SHARE * before
-        undisturbed = undisturbed and self._likelihood(best.pose, expected) > USUAL_LIKELIHOOD
-        if undisturbed and not self.alert:
+        usual = self._likelihood(best.pose, expected) > USUAL_LIKELIHOOD
+        if undisturbed and usual and not self.alert:
             return best
         chosen = self._choose(tracks, expected, last_pose, best, rest)
         if not self.alert and not len(chosen.moving):
-            return best
-        covered = (chosen.inlier & static).sum() < MIN_OPEN_SHARE * self.open_view
-        return _no_pose(len(tracks), "too_few_points") if covered else chosen
+            chosen = best
+        else:
+            usual = False
+        few = (chosen.inlier & static).sum() < MIN_OPEN_SHARE * self.open_view
+        return _no_pose(len(tracks), "too_few_points") if few and not usual else chosen
 
     def _choose(
         self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, best: PoseSolution, rest: Bool
