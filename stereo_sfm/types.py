@@ -59,7 +59,7 @@ class TrackState(enum.IntEnum):
 
     INITIALIZING = 0  # no pose yet (monocular start, first black frames)
     OK = 1  # pose from enough inliers
-    RECOVERED = 2  # first good pose after LOST frames, in the same odometry frame
+    RECOVERED = 2  # first good pose after LOST frames, in the same odometry frame, or one that corrects it
     LOST = 3  # pose predicted only; `Frame.reason` says why
     RESTARTED = 4  # tracking began again as a new submap at the predicted pose
     INERTIAL = 5  # the images show nothing: pose from IMU or wheels since the last good one, with its covariance

@@ -143,6 +143,31 @@ def test_too_little_of_an_open_view_is_no_pose() -> None:
     assert solver.solve(left, expected, np.eye(4), before=400).reason
 
 
+@pytest.mark.parametrize(("metres", "found"), [(0.0, True), (0.05, False)])
+def test_few_points_of_an_open_view_are_believed_only_for_a_usual_motion(metres: float, found: bool) -> None:
+    tracks, on_person = scene(np.random.default_rng(3))
+    few = tracks.keep(~on_person & (np.arange(len(tracks)) < 25))
+    solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
+    solver.open_view = 200.0
+    expected = ExpectedMotion(MOVED @ se3.exp(np.array([metres, 0.0, 0.0, 0.0, 0.0, 0.0])), np.zeros(6), SECONDS)
+    assert (not solver.solve(few, expected, np.eye(4), before=len(few)).reason) == found
+
+
+def test_points_that_a_map_update_moves_together_are_not_lost() -> None:
+    """Something moved a moment ago; then the map moves by 5 cm, which no robot does in a frame."""
+    tracks, on_person = scene(np.random.default_rng(4))
+    solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
+    expected = ExpectedMotion(MOVED, np.zeros(6), SECONDS)
+    store = tracks.keep(~on_person)
+    solver.learn(store, solver.solve(store, expected, np.eye(4), before=STILL), expected)
+    solver.learn(tracks, solver.solve(tracks, expected, np.eye(4), before=400), expected)
+    assert solver.alert
+    store.origin, store.mapped = store.origin + np.array([0.05, 0.0, 0.0]), np.ones(STILL, bool)
+    solution = solver.solve(store, expected, np.eye(4), before=STILL)
+    assert not solution.reason
+    assert float(se3.extent(se3.inverse(se3.exp(np.array([0.05, 0, 0, 0, 0, 0])) @ MOVED) @ solution.pose)[0]) < 0.01
+
+
 def test_a_group_that_disagrees_is_marked_and_tracked_further() -> None:
     tracks, on_person = scene(np.random.default_rng(0))
     for _ in range(3):

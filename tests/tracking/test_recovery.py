@@ -20,6 +20,7 @@ from stereo_sfm.loop.recent_places import RecentPlaces
 from stereo_sfm.pipeline.stages import make_tracker_with_places
 from stereo_sfm.tracking.flow.follower import Held
 from stereo_sfm.tracking.flow.frame_pose import PoseSolution
+from stereo_sfm.tracking.flow.partial_view import PartialView
 from stereo_sfm.tracking.flow.pyramids import StereoPyramids
 from stereo_sfm.tracking.flow.recovery import REACH, Recovery
 from stereo_sfm.tracking.flow.tracker import Tracker
@@ -203,6 +204,22 @@ def test_an_image_with_fewer_points_is_held_once_the_view_has_changed() -> None:
     assert held.worth(np.eye(4)) == 300
     assert held.worth(se3.exp(np.array([0.0, 0.0, 2.8, 0.0, 0.0, 0.0]))) == pytest.approx(150)
     assert held.worth(se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.5, 0.0]))) == pytest.approx(150)
+
+
+def test_a_pose_from_a_part_of_the_view_is_found_anew_once_more_is_free() -> None:
+    held, other = (Held(StereoPyramids((), ()), Tracks(), np.eye(4)) for _ in range(2))
+    part = PartialView()
+    assert not part.wanted(held, 0)
+    part.begin(held, 0.4, 0)
+    assert part.wanted(held, 10**9)
+    assert not part.wanted(held, 10**9 + 1)
+    assert not part.wanted(other, 0)  # which was held since, and has the error
+    near, far = (se3.exp(np.array([metres, 0.0, 0.0, 0.0, 0.0, 0.0])) for metres in (0.05, 0.5))
+    assert part.improved(np.eye(4), near, 0.6)
+    assert not part.improved(np.eye(4), near, 0.5)
+    assert not part.improved(np.eye(4), far, 0.9)
+    part.begin(held, 0.7, 0)
+    assert not part.wanted(held, 0)
 
 
 def test_a_new_submap_is_tracked_on_although_people_moved_before_it() -> None:

@@ -41,6 +41,9 @@ MIN_LIMITS = (0.01, 4.0), (0.01, 6.0)
 USUAL_DIFFERENCES, USUAL_SIGMAS = ((0.002, 1.0), (0.002, 1.5)), 2.0
 UNLIKELY = 0.01
 USUAL_LIKELIHOOD = 0.6  # about one standard deviation; of a pose less likely the points may be on what moves
+# A map update moves its points together, and the pose with them: so many points of the map that agree, of those that
+# are static and of an unobstructed view, are believed whatever the motion.
+UNDIVIDED_SHARE, UNDIVIDED_OPEN = 0.8, 0.3
 NO_PRIOR = np.full(6, np.inf)
 NEAR = 2.0  # times the largest error of an inlier, at the predicted pose
 LIMIT_SIGMAS = 5.0  # root mean squares of the recent differences, if that is more
@@ -161,7 +164,9 @@ class FramePoseSolver:
         found = [agreed, by_settled, other, by_near]
         plausible = [s for s in found if s is not None and not s.reason and self._plausible(s.pose, expected)]
         if not plausible:
-            return _no_pose(len(tracks), "no_consensus") if self.alert else best
+            agree = int((best.inlier & static & tracks.mapped).sum())
+            undivided = agree >= max(UNDIVIDED_SHARE * int(static.sum()), UNDIVIDED_OPEN * self.open_view)
+            return best if undivided or not self.alert else _no_pose(len(tracks), "no_consensus")
         weight = tracks.mapped + np.minimum(tracks.age * expected.seconds, SETTLED_S) / SETTLED_S + MIN_WEIGHT
         weights = [float((weight * s.agreement)[static].sum()) * self._likelihood(s.pose, expected) for s in plausible]
         k = int(np.argmax(weights))

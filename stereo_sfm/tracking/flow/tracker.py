@@ -27,6 +27,7 @@ from stereo_sfm.tracking.flow.frame_pose import ExpectedMotion, FramePoseSolver,
 from stereo_sfm.tracking.flow.keyframes import Keyframes
 from stereo_sfm.tracking.flow.map_points import take_update
 from stereo_sfm.tracking.flow.new_points import NewPoints
+from stereo_sfm.tracking.flow.partial_view import PartialView
 from stereo_sfm.tracking.flow.place_corners import PlaceCorners
 from stereo_sfm.tracking.flow.pyramids import StereoPyramids
 from stereo_sfm.tracking.flow.recovery import SUFFICIENT_RECALL, Recovery, within
@@ -95,6 +96,7 @@ class Tracker:
         self._lost = 0  # successive frames
         self._free_frames = 0  # of these, the last ones whose view is free
         self._covered_frames = 0  # and those whose view is covered
+        self._part = PartialView()
         self._bridging = False  # tracking restarts at the pose by IMU or wheels, in the same submap
         self._submap_id = 0
         self._map_version = 0
@@ -129,19 +131,21 @@ class Tracker:
         tracks, solution = NOT_FOUND if blind else self._follow(images, expected)
         if solution.reason:
             tracks, solution = self._search(image, images)
+        recovered = bool(self._lost)
+        if not (recovered or solution.reason) and (more := self._find_more(image, images, solution.pose)) is not None:
+            (tracks, solution), recovered = more, True
         self.solution = solution
         if solution.reason:
             return self._lose(image, solution.reason)
         if self._sensors is not None:
             solution.pose = self._sensors.settled(image.stamp_ns, solution.pose)
-        self._refine(tracks, solution, expected)
+        self._refine(tracks, solution, expected, recovered)
         trusted = self._trusted(tracks, solution)
         if trusted:
             self._recovery.motion.add(image.stamp_ns, solution.pose)
             self._follower.hold(images, tracks, solution.inlier & ~tracks.moving, solution.pose)
-        recovered = bool(self._lost)
         stats = _stats(tracks, solution)
-        inlier = self._accept(image, images, tracks, solution, expected.seconds)
+        inlier = self._accept(image, images, tracks, solution, expected.seconds, recovered)
         keyframe = None
         if recovered or self._keyframes.due(self._static_count()):
             with self._spans.span("keyframe"):
@@ -207,9 +211,10 @@ class Tracker:
         with self._spans.span("pose"):
             return tracks, self._solver.solve(tracks, expected, self._pose, self._static_count())
 
-    def _refine(self, tracks: Tracks, solution: PoseSolution, expected: ExpectedMotion) -> None:
-        """Learn the noise of points and motion, and refine the distances of the inliers."""
-        self._solver.learn(tracks, solution, expected)
+    def _refine(self, tracks: Tracks, solution: PoseSolution, expected: ExpectedMotion, recovered: bool) -> None:
+        """Unless the pose was just recovered, learn the noise of points and motion; refine the inliers' distances."""
+        if not recovered:
+            self._solver.learn(tracks, solution, expected)
         self._solver.refine_depth(tracks, solution)
 
     def _trusted(self, tracks: Tracks, solution: PoseSolution) -> bool:
@@ -219,14 +224,20 @@ class Tracker:
         return agree >= max(TRUSTED_SHARE * float((~tracks.moving).sum()), enough)
 
     def _accept(
-        self, image: StereoImage, images: StereoPyramids, tracks: Tracks, solution: PoseSolution, seconds: float
+        self,
+        image: StereoImage,
+        images: StereoPyramids,
+        tracks: Tracks,
+        solution: PoseSolution,
+        seconds: float,
+        recovered: bool,
     ) -> Bool:
         """Update the state with the image's pose; returns which of the remaining points (N,) are inliers."""
         if seconds > 0:
             mean = se3.log(se3.inverse(self._pose) @ solution.pose) / seconds
             self._shutter.learn(mean, seconds)
             self._velocity = solution.velocity if self._shutter.active else mean
-        if self._lost:
+        if recovered:
             self._velocity = self._recovery.motion.velocity()
         inlier = solution.inlier & ~tracks.moving
         tracks.age = tracks.age + np.int32(1)
@@ -300,12 +311,30 @@ class Tracker:
                 tracks, solution = self._track_from(pose, images, seconds)
                 if solution.reason:
                     continue
-                recall = solution.inliers / max(self._follower.expected_again(solution.pose), 1.0)
+                recall = self._recall(solution)
                 if self._recovery.possible(expected, solution, recall):
                     found.append((tracks, solution))
                     if recall >= SUFFICIENT_RECALL:
                         break
-        return self._recovery.best(found) or NOT_FOUND
+        best = self._recovery.best(found)
+        if best is None:
+            return NOT_FOUND
+        self._part.begin(self._follower.held, self._recall(best[1]), image.stamp_ns)
+        return best
+
+    def _find_more(self, image: StereoImage, images: StereoPyramids, pose: F64) -> tuple[Tracks, PoseSolution] | None:
+        """Relocalize again, near a pose (4, 4) from a part of the view, once more is free; None if no more is found."""
+        if not self._part.wanted(self._follower.held, image.stamp_ns):
+            return None
+        tracks, solution = self._track_from(pose, images, (image.stamp_ns - self._stamp_ns) * 1e-9)
+        if solution.reason or not self._part.improved(pose, solution.pose, self._recall(solution)):
+            return None
+        self._part.begin(self._follower.held, self._recall(solution), image.stamp_ns)
+        return tracks, solution
+
+    def _recall(self, solution: PoseSolution) -> float:
+        """Inliers of a pose over the held points that should be found from there."""
+        return solution.inliers / max(self._follower.expected_again(solution.pose), 1.0)
 
     def _track_from(self, pose: F64, images: StereoPyramids, seconds: float) -> tuple[Tracks, PoseSolution]:
         """Find the points of the held image from an approximate pose (4, 4), and again from the results."""

@@ -1,0 +1,37 @@
+"""Poses found while a part of the view was covered, to be found anew once more of it is free.
+
+What is left of a view may be one wall, before which a turn and a shift look alike: errors of some centimetres and half
+a degree. New points inherit them. The held image, from before the cover, does not have them.
+"""
+
+from __future__ import annotations
+
+from stereo_sfm.tracking.flow.follower import Held
+from stereo_sfm.tracking.flow.recovery import SUFFICIENT_RECALL, within
+from stereo_sfm.types import F64
+
+MORE_RECALL = 0.15  # by which more of the held points must be found than before
+LASTS_NS = 1_000_000_000
+SAME_PLACE = 0.2, 0.07  # metres, radians between the poses
+
+
+class PartialView:
+    """The last pose from a part of the view."""
+
+    def __init__(self) -> None:
+        self._held: Held | None = None
+        self._recall = 1.0
+        self._until_ns = 0
+
+    def begin(self, held: Held, recall: float, stamp_ns: int) -> None:
+        """A pose was found at a time, with that share of the held points; with a sufficient one it stays."""
+        self._held = held if recall < SUFFICIENT_RECALL else None
+        self._recall, self._until_ns = recall, stamp_ns + LASTS_NS
+
+    def wanted(self, held: Held, stamp_ns: int) -> bool:
+        """Whether to look for more points: not for long, and not in an image that was held since."""
+        return held is self._held and stamp_ns <= self._until_ns
+
+    def improved(self, before: F64, after: F64, recall: float) -> bool:
+        """Whether a pose (4, 4) by a share of the held points replaces the one that it was looked for from."""
+        return recall >= self._recall + MORE_RECALL and within(before, after, *SAME_PLACE)
