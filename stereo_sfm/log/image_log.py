@@ -72,7 +72,6 @@ class ImageLog:
         self._writer = writer
         self._rig = rig
         self._mapped = mapped
-        self._level_T_map = LEVEL_T_MAP
         self._truth_row: list[tuple[str, str, Pose]] | None = None
         self._truth = ground_truth
         self._format = image_format
@@ -191,12 +190,8 @@ class ImageLog:
             if self._truth is not None and len(self._truth):
                 map_T_truth = se3.inverse(self._truth.poses[self._first_truth(self._truth, stamp_ns)])
                 self._truth_row.append(("map", "truth", foxglove.pose(map_T_truth)))
-        return [("level", "map", foxglove.pose(self._level_T_map)), *self._truth_row]
-
-    def level(self, down: F64) -> None:
-        """Gravity's direction in the map (3,), from now on; zero where it is not known."""
-        if down.any():
-            self._level_T_map = level_T_map(down)
+        fixed = [("level", "map", foxglove.pose(LEVEL_T_MAP))] if self._rig.imu is None else []
+        return fixed + self._truth_row
 
     @staticmethod
     def _first_truth(truth: Trajectory, stamp_ns: int) -> int:

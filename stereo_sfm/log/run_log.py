@@ -15,7 +15,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.geometry import se3
 from stereo_sfm.log import foxglove, topics
-from stereo_sfm.log.image_log import ImageLog
+from stereo_sfm.log.image_log import LEVEL_T_MAP, ImageLog, level_T_map
 from stereo_sfm.log.images import LoggedImage
 from stereo_sfm.log.map_view import MapView
 from stereo_sfm.log.provenance import ENDED_EARLY, METADATA, TOTALS, Opening, write_provenance
@@ -102,7 +102,8 @@ class RunLog:
         self._begin(writer)
         self._has_images = image_format != "none"  # else there is nothing to draw the tracked points on
         self._map = MapView()
-        self._map_T_odom: dict[int, F64] = {0: np.eye(4)}  # by map version
+        self._levels = rig.imu is not None  # the map's level may change: it comes with every frame
+        self._map_frames: dict[int, tuple[F64, F64]] = {0: (np.eye(4), LEVEL_T_MAP)}  # map_T_odom, level_T_map
         self._version = 0
         self._frames: deque[tuple[Frame, Pose]] = deque()  # wait for the map version they used
         self._waiting: tuple[deque[MapUpdate], deque[LoopResult]] = (deque(), deque())  # wait for their keyframe
@@ -190,13 +191,12 @@ class RunLog:
     @_write.register
     def map_update(self, update: MapUpdate) -> None:
         """The mapper's result."""
-        self._images.level(update.down)
         self._waiting[0].append(update)
         self._release_waiting()
         self._totals["loops accepted"] -= len(update.refused_kf_ids)
         self._totals["loop candidates rejected"] += len(update.refused_kf_ids)
         self._updates.append(update)
-        self._map_T_odom[update.version] = update.map_T_odom
+        self._map_frames[update.version] = update.map_T_odom, level_T_map(update.down)
         self._version = update.version
         self._release_updates()
         self._release_frames()
@@ -261,15 +261,17 @@ class RunLog:
 
     def _show_frame(self, frame: Frame, odom_pose: Pose) -> None:
         """The pose of the body in the version of the map that the frame used."""
-        older = sorted(v for v in self._map_T_odom if v <= frame.map_version)
+        frames = self._map_frames
+        older = sorted(v for v in frames if v <= frame.map_version)
         for version in older[:-1]:
-            del self._map_T_odom[version]
-        map_T_odom = self._map_T_odom[older[-1] if older else min(self._map_T_odom)]  # none: a frame written again
+            del frames[version]
+        map_T_odom, level = frames[older[-1] if older else min(frames)]  # none: a frame written again
         map_T_body = map_T_odom @ frame.odom_T_cam @ self._left_T_body
         stamp, sequence = frame.stamp_ns, frame.frame_id
         map_pose, correction = foxglove.poses(np.stack([map_T_body, map_T_odom]))
         self._writer.write(topics.MAP_POSE, foxglove.pose_in_frame("map", stamp, map_pose), stamp, sequence)
-        rows = (("map", "odom", correction), ("odom", "body", odom_pose))
+        rows = [("map", "odom", correction), ("odom", "body", odom_pose)]
+        rows += [("level", "map", foxglove.pose(level))] if self._levels else []
         self._writer.write(topics.TF, foxglove.transforms(stamp, rows), stamp, sequence)
 
     def _release_waiting(self, everything: bool = False) -> None:

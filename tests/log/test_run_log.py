@@ -21,6 +21,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
 
+from stereo_sfm.calib.imu import Imu
 from stereo_sfm.cli import main
 from stereo_sfm.config import Config, from_dict
 from stereo_sfm.drivers import open_source
@@ -62,6 +63,9 @@ from tests.log.recordings import (
 FRAMES = 60
 KEYFRAME_EVERY = 6
 LAG = 3  # frames after which an update is applied
+
+
+DOWN = np.array([0.0, 0.96, 0.28])  # gravity in the map
 
 
 def _map_T_odom(version: int) -> F64:
@@ -116,7 +120,7 @@ def _answers(k: int) -> tuple[MapUpdate, LoopResult]:
         k + 1, k, np.array([k]), (map_T_odom @ keyframe.odom_T_cam)[None], keyframe.point_ids.copy(),
         np.random.default_rng(k + 99).normal(size=(len(keyframe.point_ids), 3)), np.array([10 * k]),
         np.zeros((0, 2), np.int64), map_T_odom, calibration=_calibration(k) if k == 6 else None,
-        row_errors=_row_errors(k),
+        row_errors=_row_errors(k), down=DOWN,
     )  # fmt: skip
     accepted = k in (5, 8)
     loop = LoopResult(
@@ -137,9 +141,10 @@ def _streams() -> list[list[object]]:
     return [tracker, [u for u, _ in answers], [r for _, r in answers]]
 
 
-def _write(path: Path, order: np.random.Generator | None) -> None:
+def _write(path: Path, order: np.random.Generator | None, imu: Imu | None = None) -> None:
     """Without `order` each stream after the other's cause; with it, at random."""
-    log = RunLog(LogWriter(path, clock=lambda: 0), fisheye_rig(), Config(), source="test", mode="inline",
+    rig = replace(fisheye_rig(), imu=imu)
+    log = RunLog(LogWriter(path, clock=lambda: 0), rig, Config(), source="test", mode="inline",
                  ground_truth=sequence_truth(30, np.random.default_rng(0)))  # fmt: skip
     log.image(stereo_images(1, np.random.default_rng(0))[0])
     streams = [list(reversed(s)) for s in _streams()]
@@ -190,6 +195,21 @@ def test_the_order_of_arrival_changes_nothing(run: Path, tmp_path: Path, seed: i
             if isinstance(record, Message):
                 assert record.log_time >= times.get(record.channel_id, 0)
                 times[record.channel_id] = record.log_time
+
+
+def test_with_an_imu_the_level_comes_with_the_frames_whatever_the_order(tmp_path: Path) -> None:
+    found = []
+    for name, order in (("a.mcap", None), ("b.mcap", np.random.default_rng(1))):
+        _write(tmp_path / name, order, Imu())
+        tf = _all(tmp_path / name, topics.TF, FrameTransforms)
+        found.append([t.SerializeToString() for t in tf])
+        rows = [t for message in tf for t in message.transforms if t.parent_frame_id == "level"]
+        first, last = (foxglove.matrix(t.translation, t.rotation) for t in (rows[0], rows[-1]))
+        np.testing.assert_allclose(first, LEVEL_T_MAP, atol=1e-9)
+        np.testing.assert_allclose(last[:3, :3] @ DOWN, [0, 0, -1], atol=1e-9)
+        static = _all(tmp_path / name, topics.TF_STATIC, FrameTransforms)
+        assert "level" not in {t.parent_frame_id for message in static for t in message.transforms}
+    assert found[0] == found[1]
 
 
 def test_poses_follow_the_map_version_that_the_frame_used(run: Path) -> None:
