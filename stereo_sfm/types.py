@@ -36,8 +36,7 @@ def shape(*axes: int) -> dict[str, tuple[int, ...]]:
 
 
 def _freeze(obj: Any) -> None:
-    for f in fields(obj):
-        value = getattr(obj, f.name)
+    for value in vars(obj).values():
         if isinstance(value, np.ndarray):
             value.flags.writeable = False
 
