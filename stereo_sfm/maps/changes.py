@@ -80,24 +80,25 @@ def describe_changes(cells: Sequence[tuple[str, float, float]], aisles: Sequence
     """Lines for people; cells beside no aisle by their place on the floor plan."""
     spans: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for kind, x, y in cells:
-        where, begin = _where(np.array([[x, y]]), aisles)
-        spans.setdefault((where, kind), []).append((begin, begin + CELL))
+        where, begin, end = _where(np.array([[x, y]]), aisles)
+        spans.setdefault((where, kind), []).append((begin, end))
     out: list[str] = []
     for (where, kind), parts in sorted(spans.items()):
         for begin, end in _together(sorted(parts)):
-            out.append(f"{where}{max(begin, 0.0):.0f}-{max(end, 0.0):.0f} m: {kind}")
+            to = " to " if begin < 0 else "-"
+            out.append(f"{where}{begin:.0f}{to}{end:.0f} m: {kind}")
     return out
 
 
-def _where(xy: F64, aisles: Sequence[Aisle]) -> tuple[str, float]:
-    """The shelf and the metres along it at which a cell begins."""
-    best, text, begin = BESIDE_M, f"y {xy[0, 1]:.1f} m, x ", float(xy[0, 0]) - 0.5 * CELL
+def _where(xy: F64, aisles: Sequence[Aisle]) -> tuple[str, float, float]:
+    """The shelf, and the metres along it at which a cell begins and ends."""
+    best, text, middle, least = BESIDE_M, f"y {xy[0, 1]:.1f} m, x ", float(xy[0, 0]), -np.inf
     for aisle in aisles:
         along, left = (float(v[0]) for v in aisle.place(xy))
         if -0.5 * CELL <= along <= aisle.length + 0.5 * CELL and abs(left) < best:
             best = abs(left)
-            text, begin = f"{aisle.name}, {'left' if left > 0 else 'right'}, ", along - 0.5 * CELL
-    return text, begin
+            text, middle, least = f"{aisle.name}, {'left' if left > 0 else 'right'}, ", along, 0.0
+    return text, max(middle - 0.5 * CELL, least), max(middle + 0.5 * CELL, least)
 
 
 def _together(parts: list[tuple[float, float]]) -> list[tuple[float, float]]:

@@ -140,12 +140,12 @@ def test_changes_are_named(updates: list[Update]) -> None:
 
 def test_cells_become_lines_of_text() -> None:
     aisles = [Aisle("aisle 4", (0.0, 0.0), (0.0, 12.0)), Aisle("back wall", (0.0, 20.0), (9.0, 20.0))]
-    cells = [("new", -0.5, 2.5), ("new", -0.5, 3.5), ("new", 1.5, 3.5), ("changed", 4.5, 20.5), ("new", 30.5, 40.5)]
+    cells = [("new", -0.5, 2.5), ("new", -0.5, 3.5), ("new", 1.5, 3.5), ("changed", 4.5, 20.5), ("new", -30.5, 40.5)]
     assert describe_changes(cells, aisles) == [
         "aisle 4, left, 2-4 m: new",
         "aisle 4, right, 3-4 m: new",
         "back wall, left, 4-5 m: changed",
-        "y 40.5 m, x 30-31 m: new",
+        "y 40.5 m, x -31 to -30 m: new",
     ]
 
 
