@@ -85,11 +85,9 @@ class ArmRoot:
 
 
 def built_wheel(work: Path) -> Path:
-    """The wheel of this checkout, from its source archive as for a release: links in a checkout name files twice."""
-    archive = [sys.executable, "-m", "hatchling", "build", "-t", "sdist", "-d", str(work)]
-    subprocess.run(archive, check=True, cwd=TOP, stdout=subprocess.DEVNULL)
-    wheel = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", str(work)]
-    subprocess.run([*wheel, str(next(work.glob("*.tar.gz")))], check=True)
+    """The wheel of this checkout."""
+    command = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", str(work)]
+    subprocess.run([*command, str(TOP)], check=True)
     return next(work.glob("*.whl"))
 
 
