@@ -12,7 +12,7 @@ from stereo_sfm.calib.camera_store import CorrectionKeeper
 from stereo_sfm.config import Config
 from stereo_sfm.drivers.choice import Opener
 from stereo_sfm.maps.folders import MapFolders
-from stereo_sfm.messages import Localized, LogLine, MapSaved
+from stereo_sfm.messages import Compiling, Localized, LogLine, MapSaved
 from stereo_sfm.pipeline.images import SlotImage
 from stereo_sfm.pipeline.processes import ProcessRun
 from stereo_sfm.service.health import HealthCollector
@@ -25,6 +25,8 @@ from stereo_sfm.service.states import Facts
 from stereo_sfm.types import Frame, Keyframe, MapUpdate, Observations
 
 log = logging.getLogger("stereo_sfm")
+
+COMPILING = "numerical kernels are being compiled, once after an installation"
 
 
 class Session:
@@ -60,6 +62,7 @@ class Session:
             Localized: self._localize,
             MapSaved: self._map_saved,
             LogLine: self._line,
+            Compiling: self._compiling,
         }
         self._poses: PoseConverter | None = None
         self._corrections: CorrectionKeeper | None = None
@@ -190,6 +193,12 @@ class Session:
         self._poses.localized(message)
         self._map.localized(message.version)
         log.info("the saved map was recognised: poses are in its frame")
+
+    def _compiling(self, _: Compiling) -> None:
+        """The first start after an installation takes up to minutes: a person is told why."""
+        if self._facts.starting and self._facts.starting != COMPILING:
+            self._facts.starting = COMPILING
+            log.info("%s", COMPILING)
 
     def _line(self, line: LogLine) -> None:
         if line.stage != "main":  # those of this process are published already

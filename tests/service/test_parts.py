@@ -11,16 +11,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stereo_sfm.config import Config
 from stereo_sfm.drivers.choice import SourceChoice
 from stereo_sfm.drivers.repeated import RepeatedSource
 from stereo_sfm.geometry import se3
-from stereo_sfm.messages import Localized
+from stereo_sfm.maps.folders import MapFolders
+from stereo_sfm.messages import Compiling, Localized
 from stereo_sfm.service.camera import patient, same_camera
+from stereo_sfm.service.config import RecordingConfig
+from stereo_sfm.service.health import HealthCollector
 from stereo_sfm.service.hub import Hub
 from stereo_sfm.service.map_cloud import MapCloudBuilder
 from stereo_sfm.service.messages import Event, MapCloud, ServiceState, Status
 from stereo_sfm.service.notify import SystemdNotifier
 from stereo_sfm.service.poses import HostClock, PoseConverter
+from stereo_sfm.service.recorder import Recorder
+from stereo_sfm.service.session import COMPILING, Session
 from stereo_sfm.service.states import Facts, derive_state
 from stereo_sfm.types import F64, Frame, MapUpdate, Observations, TrackState
 from tests.pipeline.test_pipeline import SlidingWall
@@ -186,3 +192,16 @@ def test_closing_waits_for_callbacks_but_not_for_one_that_hangs() -> None:
     hub.close()
     assert taken == ["first", "last"] and time.monotonic() - began < 8.0
     hang.set()
+
+
+def test_the_first_start_says_that_kernels_are_compiled() -> None:
+    facts = Facts()
+    session = Session(
+        1, lambda: RepeatedSource(SlidingWall(2)), Config(), MapFolders(), Hub([]), facts, HealthCollector(), 1.0,
+        Recorder(RecordingConfig()), lambda saved: None,
+    )  # fmt: skip
+    session.put(Compiling("tracker", "track"))
+    assert derive_state(facts, 0.0) == (ServiceState.STARTING, COMPILING)
+    facts.starting = ""  # images come: another kernel is no reason to say that it starts
+    session.put(Compiling("mapper", "solve"))
+    assert facts.starting == ""
