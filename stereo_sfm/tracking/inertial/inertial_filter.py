@@ -30,6 +30,7 @@ GYRO_BIAS_SIGMA, ACCEL_BIAS_SIGMA = 0.05, 0.3  # rad/s and m/s^2, what is expect
 DRIFT_SIGMA, DRIFT_S = 2e-4, 10.0  # rad/s of the odometry's rotation, and seconds for which it stays the same
 ROTATION_WALK = 1e-4  # rad/sqrt(s) of the odometry's rotation
 KNOWN = 1.0  # m/s^2, standard deviation of gravity from which its size counts
+FIRST_DRIFT_SIGMA = 1e-3  # rad/s, before the rotations have shown the gyroscope's bias better
 SPEED_SIGMA = 10.0  # m/s, before anything is known
 WRONG_CHI2 = 25.0  # of a motion's three positions: it counts less, as far as that is exceeded
 FORCE_S = 5.0  # over which the mean force is taken
@@ -70,7 +71,7 @@ class InertialFilter:
 
     def _forget(self) -> None:
         """Keep the biases alone."""
-        sigmas = np.repeat([SPEED_SIGMA, 2 * GRAVITY, ACCEL_BIAS_SIGMA, DRIFT_SIGMA], 3)
+        sigmas = np.repeat([SPEED_SIGMA, 2 * GRAVITY, ACCEL_BIAS_SIGMA, FIRST_DRIFT_SIGMA], 3)
         known = self._p[6:9, 6:9].copy() if self._seconds else np.eye(3) * ACCEL_BIAS_SIGMA**2
         self._p = np.diag(sigmas**2)
         self._p[6:9, 6:9] = known
