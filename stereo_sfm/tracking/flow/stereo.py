@@ -22,7 +22,7 @@ from stereo_sfm.types import F32, F64, Bool, StereoImage
 
 SEARCH_LEVEL = 1
 BEHIND_SIGMAS = 4.0  # by which noise may put a far point behind the camera
-MIN_SIGMA_PX, MAX_SIGMA_PX = 0.15, 0.3  # of a disparity: lower bound, and limit of acceptance
+MIN_SIGMA_PX, MAX_SIGMA_PX = 0.07, 0.3  # of a disparity: least noise, and limit of acceptance
 TYPICAL = 25  # percentile of the points' misfits that is typical of windows on one surface
 MIN_MISFIT = 0.5  # lower bound of the typical misfit, in squares of the expected noise
 
