@@ -169,7 +169,7 @@ class MapperConfig:
     )
     cauchy_sigmas: float = number(1.0, 0, 1000, "Scale of the redescending loss in the rounds after the first; 0: none")
     disparity_sigmas: float = number(
-        1.5, 0, 1000, "Mean disparity error of a point beyond which its depth counts less (depth edges); 0: never"
+        1.5, 0, 1000, "Mean error of a point's stereo matches beyond which they count less (depth edges); 0: never"
     )
     rounds: int = number(2, 1, 100, "Rounds of bundle adjustment, with outliers removed between them")
     iterations: int = number(5, 1, 1000, "Iterations of a round")

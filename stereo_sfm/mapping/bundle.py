@@ -34,7 +34,7 @@ class BundleConfig:
     iterations: int = 10  # maximum of accepted steps of a round
     huber: float = 2.0  # sigmas where the loss becomes linear; 0 means least squares
     cauchy: float = 0.0  # sigmas, the scale of a redescending loss in all rounds but the first; 0: Huber's throughout
-    disparity_sigmas: float = 0.0  # mean disparity error of a point beyond which its depth counts less; 0: never
+    disparity_sigmas: float = 0.0  # mean error of a point's stereo matches beyond which they count less; 0: never
     joint_loss: bool = False  # one loss over both images of an observation instead of one each
     outlier_chi2: float = 9.21  # squared normalised residual in one image that makes an outlier (99 % of 2 dof)
     tolerance: float = 1e-5  # relative decrease of the cost that ends a round
@@ -154,6 +154,7 @@ class _State:
 class _Solver:
     def __init__(self, rig: Rig, bundle: Bundle, config: BundleConfig) -> None:
         self.config = config
+        self._weighs_disparities = config.disparity_sigmas > 0 and rig.stereo and not rig.depth
         moves = ~bundle.fixed[bundle.obs_kf]
         self.table = _Table(rig, bundle, config, np.flatnonzero(moves))
         self.fixed = _Table(rig, bundle, config, np.flatnonzero(~moves))
@@ -194,7 +195,7 @@ class _Solver:
 
     def begin_round(self, state: _State, judge: bool) -> None:
         """Linearise anew without outliers; `judge`: determine outliers, in all rounds but the first."""
-        if judge and self.config.disparity_sigmas > 0:  # not at the start, where wrong poses make all points disagree
+        if judge and self._weighs_disparities:  # not at the start, where wrong poses make all points disagree
             self._weigh_disparities(state)
         self.table.limit = self.fixed.limit = self.config.outlier_chi2 if judge else 0.0
         self.table.redescends = self.fixed.redescends = judge and self.config.cauchy > 0

@@ -153,6 +153,25 @@ def test_few_points_of_an_open_view_are_believed_only_for_a_usual_motion(metres:
     assert (not solver.solve(few, expected, np.eye(4), before=len(few)).reason) == found
 
 
+@pytest.mark.parametrize("mapped", [False, True])
+def test_an_unusual_motion_that_the_map_confirms_is_better_than_no_pose(mapped: bool) -> None:
+    """A hand-held camera that accelerates a moment after something moved."""
+    tracks, on_person = scene(np.random.default_rng(3))
+    solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
+    expected = ExpectedMotion(MOVED, np.zeros(6), SECONDS)
+    solver.learn(tracks, solver.solve(tracks, expected, np.eye(4), before=400), expected)
+    assert solver.alert
+    store = tracks.keep(~on_person)
+    store.mapped = np.full(len(store), mapped)
+    jump = ExpectedMotion(MOVED @ se3.exp(np.array([0.09, 0, 0, 0, 0, 0])), np.zeros(6), SECONDS)
+    static = np.ones(len(store), bool)
+    best = solver._solve_all(store, jump, np.eye(4), static)  # pyright: ignore[reportPrivateUsage]
+    assert solver._confirmed(store, best, static) == mapped  # pyright: ignore[reportPrivateUsage]
+    if mapped:
+        solution = solver.solve(store, jump, np.eye(4), before=len(store))
+        assert off(solution.pose) < 0.005 and not len(solution.moving) and solution.inlier.mean() > 0.9
+
+
 def test_points_that_a_map_update_moves_together_are_not_lost() -> None:
     """Something moved a moment ago; then the map moves by 5 cm, which no robot does in a frame."""
     tracks, on_person = scene(np.random.default_rng(4))

@@ -63,7 +63,7 @@ def matched(a: Corners, b: Corners, pose_a: F64, pose_b: F64) -> tuple[int, floa
     rows_b, rows_a, _ = binary.match_descriptors(b.descriptors, a.descriptors, None, 60, 0.9)
     at_a = se3.transform(pose_a, a.points_cam[rows_a].astype(float))
     at_b = se3.transform(pose_b, b.points_cam[rows_b].astype(float))
-    return len(rows_b), float((np.linalg.norm(at_a - at_b, axis=1) < 0.3).mean())
+    return len(rows_b), float((np.linalg.norm(at_a - at_b, axis=1) < 0.3).sum()) / max(len(rows_b), 1)
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, 12.0])

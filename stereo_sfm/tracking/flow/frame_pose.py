@@ -45,6 +45,7 @@ USUAL_LIKELIHOOD = 0.6  # about one standard deviation; of a pose less likely th
 # are static and of an unobstructed view, are believed whatever the motion.
 UNDIVIDED_SHARE, UNDIVIDED_OPEN = 0.8, 0.3
 NO_PRIOR = np.full(6, np.inf)
+CONFIRMED_SHARE = 0.75  # of the points of the map that are in view
 NEAR = 2.0  # times the largest error of an inlier, at the predicted pose
 LIMIT_SIGMAS = 5.0  # root mean squares of the recent differences, if that is more
 MEMORY_S = 5.0  # time constant of their average
@@ -151,7 +152,17 @@ class FramePoseSolver:
         else:
             usual = False
         few = (chosen.inlier & static).sum() < MIN_OPEN_SHARE * self.open_view
-        return _no_pose(len(tracks), "too_few_points") if few and not usual else chosen
+        if not few or usual:
+            return chosen
+        if undisturbed and self._confirmed(tracks, best, static):
+            return best
+        return _no_pose(len(tracks), "too_few_points")
+
+    def _confirmed(self, tracks: Tracks, best: PoseSolution, static: Bool) -> bool:
+        """Whether most points of the map agree with a pose: it is better than none, however unusual the motion."""
+        mapped = static & tracks.mapped
+        agree = (best.inlier & mapped).sum()
+        return bool(agree >= max(2 * self._config.min_features, CONFIRMED_SHARE * mapped.sum()))
 
     def _choose(
         self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, best: PoseSolution, rest: Bool
