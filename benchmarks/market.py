@@ -24,17 +24,15 @@ one_thread()
 import numpy as np
 import psutil
 from both_directions import aligned, drive
-from sessions import Truth, asked, on_disk, truth_of
+from sessions import Truth, asked, on_disk, put_in, truth_of
 
 from stereo_sfm.config import Config
 from stereo_sfm.drivers.sim.source import SimSource
 from stereo_sfm.drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.floor_plan import make_floor_plan
-from stereo_sfm.loop.vocabulary_file import default_vocabulary
 from stereo_sfm.mapping.mapper import Mapper
 from stereo_sfm.maps.saved_map import SavedMap
-from stereo_sfm.maps.update import update
 from stereo_sfm.pipeline.inline import InlineRun
 
 ATE_SHARE, GOOD_SHARE, QUERY_S = 0.0005, 0.96, 0.3  # required of the map of three sessions
@@ -50,17 +48,13 @@ def one_map(options: str, sessions: int, queries: int, seed: int) -> bool:
         spec = f"sim:market?seed={seed}&walk={n}{options}"
         begin = time.perf_counter()
         walk = drive(spec)
-        drove, begin, loops, session = time.perf_counter() - begin, time.perf_counter(), 0, 0
+        drove, begin = time.perf_counter() - begin, time.perf_counter()
         metres += float(np.linalg.norm(np.diff(walk.truth[:, :3, 3], axis=0), axis=1).sum())
-        if saved is None:
-            saved = walk.saved
-        else:
-            try:
-                done = update(saved, walk.saved, default_vocabulary(), Config().loop, Config().mapper)
-            except StereoSfmError as error:
-                print(f"session {n + 1}: NOT joined ({error})", flush=True)
-                continue
-            saved, loops, session = done.saved, len(done.loops), done.session
+        try:
+            saved, session, loops, _ = put_in(saved, walk.saved)
+        except StereoSfmError as error:
+            print(f"session {n + 1}: NOT joined ({error})", flush=True)
+            continue
         took = time.perf_counter() - begin
         s = walk.saved.snapshot
         truth |= {

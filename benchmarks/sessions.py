@@ -90,6 +90,18 @@ def on_disk(saved: SavedMap) -> tuple[float, float]:
         return size / 1e6, time.perf_counter() - begin
 
 
+def put_in(saved: SavedMap | None, walk: SavedMap) -> tuple[SavedMap, int, int, int]:
+    """The map with a session, the session's number in it, loops, and keyframes forgotten; the first begins the map.
+
+    Raises:
+        StereoSfmError: no loop joins the session to the map.
+    """
+    if saved is None:
+        return walk, 0, 0, 0
+    done = update(saved, walk, default_vocabulary(), Config().loop, Config().mapper)
+    return done.saved, done.session, len(done.loops), done.forgotten
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", default="aisle")
@@ -114,16 +126,12 @@ def main() -> int:
         found = asked(saved, truth, spec, args.queries, n) if saved is not None and told else (0, 0, 0.0)
         walk = drive(spec)
         stamps = dict(zip(walk.saved.snapshot.kf_ids.tolist(), walk.saved.snapshot.stamp_ns.tolist(), strict=True))
-        begin, session, joined, forgotten = time.perf_counter(), 0, 0, 0
-        if saved is None:
-            saved = walk.saved
-        else:
-            try:
-                done = update(saved, walk.saved, default_vocabulary(), Config().loop, Config().mapper)
-            except StereoSfmError as error:
-                print(f"session {n}: NOT joined ({error})", flush=True)
-                continue
-            saved, session, joined, forgotten = done.saved, done.session, len(done.loops), done.forgotten
+        begin = time.perf_counter()
+        try:
+            saved, session, joined, forgotten = put_in(saved, walk.saved)
+        except StereoSfmError as error:
+            print(f"session {n}: NOT joined ({error})", flush=True)
+            continue
         took = time.perf_counter() - begin
         truth |= {(session, stamps[k]): pose for k, pose in walk.true_kf.items() if k in stamps}
         if not told:

@@ -6,12 +6,17 @@ import fcntl
 import os
 import weakref
 from pathlib import Path
+from types import TracebackType
+from typing import Self
 
 from stereo_sfm.errors import StereoSfmError
 
 
 class FolderLock:
-    """Locks a folder as long as this object exists; no file is written, a killed process leaves no lock."""
+    """Locks a folder as long as this object exists, or until the end of its `with` block.
+
+    No file is written, a killed process leaves no lock.
+    """
 
     def __init__(self, folder: Path, remedy: str) -> None:
         """Lock an existing folder; `remedy` ends the message of the error.
@@ -28,3 +33,11 @@ class FolderLock:
             raise StereoSfmError(f"another run is writing to {folder}: {remedy}") from None
         except OSError:  # a network file system without locks
             return
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.release()

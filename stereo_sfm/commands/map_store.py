@@ -83,25 +83,24 @@ def _update(store: Path, walks: list[str], config: Config, keep: int) -> int:
     from stereo_sfm.maps.store import lock, read_about, write_version
     from stereo_sfm.maps.update import update
 
-    held = lock(store)
-    for name in walks:
-        walk = _mapped(name, config)
-        if not (store / "map.json").exists():
-            write_version(store, walk, ["the first session"], keep)
-            print(f"{store}: begun with {name}, {len(walk)} keyframes")
-            continue
-        saved = load_map(store, walk.rig)
-        result = update(saved, walk, configured_vocabulary(config.loop), config.loop, config.mapper)
-        about = read_about(store, saved)
-        changes = describe_changes(changed_cells(result, about.map_T_floor), about.aisles)
-        number = write_version(store, result.saved, changes, keep)
-        print(
-            f"{store} version {number}: {name}, {len(result.loops)} loops, {result.fused} points found again,"
-            f" {len(saved)} + {len(walk)} - {result.forgotten} -> {len(result.saved)} keyframes,"
-            f" {len(result.saved.snapshot.pt_ids)} points"
-        )
-        print("\n".join(f"  {line}" for line in changes or ["no shelf changed"]))
-    held.release()
+    with lock(store):
+        for name in walks:
+            walk = _mapped(name, config)
+            if not (store / "map.json").exists():
+                write_version(store, walk, ["the first session"], keep)
+                print(f"{store}: begun with {name}, {len(walk)} keyframes")
+                continue
+            saved = load_map(store, walk.rig)
+            result = update(saved, walk, configured_vocabulary(config.loop), config.loop, config.mapper)
+            about = read_about(store, saved)
+            changes = describe_changes(changed_cells(result, about.map_T_floor), about.aisles)
+            number = write_version(store, result.saved, changes, keep)
+            print(
+                f"{store} version {number}: {name}, {len(result.loops)} loops, {result.fused} points found again,"
+                f" {len(saved)} + {len(walk)} - {result.forgotten} -> {len(result.saved)} keyframes,"
+                f" {len(result.saved.snapshot.pt_ids)} points"
+            )
+            print("\n".join(f"  {line}" for line in changes or ["no shelf changed"]))
     return 0
 
 
@@ -130,9 +129,8 @@ def _undo(store: Path) -> int:
     from stereo_sfm.maps.store import lock, undo
 
     _check_store(store)
-    held = lock(store)
-    print(f"{store} is version {undo(store)} again")
-    held.release()
+    with lock(store):
+        print(f"{store} is version {undo(store)} again")
     return 0
 
 
@@ -159,19 +157,18 @@ def _label(options: LabelOptions) -> int:
     from stereo_sfm.maps.store import lock, read_about, write_about
 
     _check_store(options.store)
-    held = lock(options.store)
-    about = read_about(options.store)
-    others = tuple(a for a in about.aisles if a.name != options.name)
-    if options.remove:
-        if len(others) == len(about.aisles):
+    with lock(options.store):
+        about = read_about(options.store)
+        aisles = tuple(a for a in about.aisles if a.name != options.name)
+        if options.remove and len(aisles) == len(about.aisles):
             raise StereoSfmError(f"{options.store} has no label '{options.name}'")
-        write_about(options.store, dataclasses.replace(about, aisles=others))
-    else:
-        if options.start is None or options.end is None or options.start == options.end:
-            raise StereoSfmError("a label needs two different points, as in: map label STORE 'aisle 4' 1.5,3 13.5,3")
-        aisle = Aisle(options.name, options.start, options.end)
-        write_about(options.store, dataclasses.replace(about, aisles=(*others, aisle)))
-    held.release()
+        if not options.remove:
+            if options.start is None or options.end is None or options.start == options.end:
+                raise StereoSfmError(
+                    "a label needs two different points, as in: map label STORE 'aisle 4' 1.5,3 13.5,3"
+                )
+            aisles = (*aisles, Aisle(options.name, options.start, options.end))
+        write_about(options.store, dataclasses.replace(about, aisles=aisles))
     return 0
 
 
@@ -186,18 +183,17 @@ def _plan(store: Path, resolution: float) -> int:
     from stereo_sfm.maps.store import lock, read_about, write_about
 
     _check_store(store)
-    held = lock(store)
-    saved = load_map(store)
-    about = read_about(store, saved)
-    write_about(store, about)  # the frame of the drawing
-    plan = make_floor_plan(saved.snapshot, resolution, about.map_T_floor)
-    zones = read_zones(store, plan)
-    write_floor_plan(plan, store / PLAN)
-    write_zones(store, plan, zones)
-    fronts = shelf_fronts(plan, about.aisles)
-    rows = [{"label": f.label, "start": list(f.start), "end": list(f.end), "faces": list(f.faces)} for f in fronts]
-    (store / FRONTS).write_text(yaml.safe_dump(rows, sort_keys=False, allow_unicode=True), encoding="utf-8")
-    held.release()
+    with lock(store):
+        saved = load_map(store)
+        about = read_about(store, saved)
+        write_about(store, about)  # the frame of the drawing
+        plan = make_floor_plan(saved.snapshot, resolution, about.map_T_floor)
+        zones = read_zones(store, plan)
+        write_floor_plan(plan, store / PLAN)
+        write_zones(store, plan, zones)
+        fronts = shelf_fronts(plan, about.aisles)
+        rows = [{"label": f.label, "start": list(f.start), "end": list(f.end), "faces": list(f.faces)} for f in fronts]
+        (store / FRONTS).write_text(yaml.safe_dump(rows, sort_keys=False, allow_unicode=True), encoding="utf-8")
     square = float(zones.sum()) * resolution**2
     print(f"{store / PLAN}, {len(fronts)} shelf fronts in {FRONTS}, {square:.1f} m2 of keep-out zones in keepout.png")
     return 0

@@ -61,23 +61,22 @@ class SpooledColumns:
 
     def _put_away(self) -> None:
         """Write the block, which is full, or keep it."""
-        try:
-            if not self._kept:
-                self._file = self._file or tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  # closed with this table
-                self._write(memoryview(self._block.tobytes()))
-                self._written += BLOCK
-                self._count = 0
-                return
-        except OSError:  # the disk is full, or no folder can be written to
-            pass
-        self._kept.append(self._block.copy())
         self._count = 0
+        if self._kept or not self._write(memoryview(self._block.tobytes())):
+            self._kept.append(self._block.copy())
 
-    def _write(self, data: memoryview) -> None:
+    def _write(self, data: memoryview) -> bool:
+        """Whether the file took the block; not if the disk is full, or no folder can be written to."""
         at = self._written * self._dtype.itemsize
-        while data:
-            done = os.pwrite(self._file.fileno(), data, at)
-            data, at = data[done:], at + done
+        try:
+            self._file = self._file or tempfile.TemporaryFile(buffering=0)  # noqa: SIM115  # closed with this table
+            while data:
+                done = os.pwrite(self._file.fileno(), data, at)
+                data, at = data[done:], at + done
+        except OSError:
+            return False
+        self._written += BLOCK
+        return True
 
     def _rows(self) -> NDArray[Any]:
         """All rows."""

@@ -56,9 +56,8 @@ def merge(
         StereoSfmError: different cameras, or a map that no loop joins to the others.
     """
     side_by_side = joined(list(maps))
-    map_ = restore_map(side_by_side.snapshot)
-    map_.points.sigma[:] = map_.observations.sigma[:] = mapper.sigma_px  # points fused from now on count less
-    closer = LoopCloser(dataclasses.replace(config, pause=MERGE_PAUSE), side_by_side.rig, vocabulary)
+    map_ = restore_for_merging(side_by_side.snapshot, mapper)
+    closer = session_closer(config, side_by_side.rig, vocabulary)
     sessions, stamps = side_by_side.sessions, side_by_side.snapshot.stamp_ns
     begins = {k: int(stamps[sessions == k].min()) for k in side_by_side.session_ids}  # sessions have unrelated clocks
     loops: list[LoopResult] = []
@@ -85,6 +84,18 @@ def merge(
     session_of = dict(zip(side_by_side.snapshot.kf_ids.tolist(), sessions.tolist(), strict=True))
     merged = np.array([session_of[k] for k in snapshot.kf_ids.tolist()], np.int64)
     return Merge(SavedMap(snapshot, side_by_side.rig, vocabulary.id, merged), loops, fused)
+
+
+def restore_for_merging(snapshot: MapSnapshot, mapper: MapperConfig) -> Map:
+    """A map whose points all have the noise of tracked ones: those fused from now on count less."""
+    map_ = restore_map(snapshot)
+    map_.points.sigma[:] = map_.observations.sigma[:] = mapper.sigma_px
+    return map_
+
+
+def session_closer(config: LoopConfig, rig: Rig, vocabulary: Vocabulary) -> LoopCloser:
+    """A loop closer that looks for every link between sessions."""
+    return LoopCloser(dataclasses.replace(config, pause=MERGE_PAUSE), rig, vocabulary)
 
 
 def share_a_session(a: SavedMap, b: SavedMap) -> bool:

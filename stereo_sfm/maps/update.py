@@ -21,8 +21,8 @@ from stereo_sfm.loop.closer import LoopCloser
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.mapping.correction import apply_loop, fuse_pairs, loop_is_known
 from stereo_sfm.mapping.map import Map, MapSnapshot
-from stereo_sfm.maps.merge import MERGE_PAUSE, full_adjustment, share_a_session, subset
-from stereo_sfm.maps.saved_map import SavedMap, joined, restore_map
+from stereo_sfm.maps.merge import full_adjustment, restore_for_merging, session_closer, share_a_session, subset
+from stereo_sfm.maps.saved_map import SavedMap, joined
 from stereo_sfm.types import F64, I64, Bool, LoopResult
 
 log = logging.getLogger("stereo_sfm")
@@ -65,10 +65,9 @@ def update(
     if share_a_session(saved, walk):
         raise StereoSfmError("this session is in the map already")
     both = joined([saved, walk])
-    map_ = restore_map(both.snapshot)
-    map_.points.sigma[:] = map_.observations.sigma[:] = mapper.sigma_px
+    map_ = restore_for_merging(both.snapshot, mapper)
     first_new = len(saved)
-    loops, fused = _close(map_, both, first_new, LoopCloser(_eager(config), both.rig, vocabulary), config)
+    loops, fused = _close(map_, both, first_new, session_closer(config, both.rig, vocabulary), config)
     boundary = int(both.snapshot.kf_ids[first_new])
     if not any(loop.candidate_kf_id < boundary <= loop.kf_id for loop in loops):
         raise StereoSfmError("the session was not found in the map: no loop joins them (are they of one store?)")
@@ -79,8 +78,7 @@ def update(
     if forgotten:
         obs = kept[together.obs_kf]
         points = np.bincount(together.obs_pt[obs], minlength=len(together.pt_ids)) > 0
-        map_ = restore_map(subset(together, kept, points, obs))
-        map_.points.sigma[:] = map_.observations.sigma[:] = mapper.sigma_px
+        map_ = restore_for_merging(subset(together, kept, points, obs), mapper)
     full_adjustment(map_, both.rig, mapper)
     snapshot, kept_sessions = _snapshot(map_, session_of)
     back = _back(saved.snapshot, snapshot)
@@ -94,10 +92,6 @@ def update(
         together,
         sessions,
     )
-
-
-def _eager(config: LoopConfig) -> LoopConfig:
-    return dataclasses.replace(config, pause=MERGE_PAUSE)
 
 
 def _close(

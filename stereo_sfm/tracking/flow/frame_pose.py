@@ -147,12 +147,10 @@ class FramePoseSolver:
         if undisturbed and usual and not self.alert:
             return best
         chosen = self._choose(tracks, expected, last_pose, best, rest)
-        if not self.alert and not len(chosen.moving):
-            chosen = best
-        else:
-            usual = False
+        disturbed = self.alert or len(chosen.moving) > 0
+        chosen = chosen if disturbed else best
         few = (chosen.inlier & static).sum() < MIN_OPEN_SHARE * self.open_view
-        if not few or usual:
+        if not few or (usual and not disturbed):
             return chosen
         if undisturbed and self._confirmed(tracks, best, static):
             return best
