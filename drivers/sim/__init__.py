@@ -12,7 +12,21 @@ if TYPE_CHECKING:
     from stereo_sfm.drivers.source import Source
 
 # names of the scenes in stereo_sfm.drivers.sim.scenes, which is slow to import
-SCENES = ("aisle", "loop", "identical-aisles", "people", "dark", "blank", "demo", "big", "sparse", "market")
+SCENES = (
+    "aisle",
+    "loop",
+    "identical-aisles",
+    "people",
+    "dark",
+    "blank",
+    "demo",
+    "big",
+    "sparse",
+    "fridges",
+    "glossy",
+    "clutter",
+    "market",
+)
 DEFAULT = "loop"
 
 

@@ -3,6 +3,8 @@
 A shelf block is an axis-aligned box seen from its front: u runs to the viewer's right, w goes into the shelf, z up. Its
 levels are open slots between boards; each slot is a row of facings, traversed like a one-dimensional grid.
 
+A facing holds a row of cartons, one behind the other as one box; or bodies of revolution; or bags that hang from above.
+
 A hit is (t, id); `id` packs index << 12 | part << 7 | kind << 4 | face, so that two pixels show the same flat surface
 exactly when their ids agree. The tables that all kernels take are described in tables.Tables.
 """
@@ -21,7 +23,10 @@ SHELF, SOLID = 0, 1  # kinds of block
 BIN = 0.05  # metres of a level per lookup bin
 ROOM, BLOCK, FACING, PERSON, TARGET = 0, 1, 2, 3, 4  # kinds of hit
 RAIL, BOARD, BACK, END, UNDER, INNER_END = 0, 1, 2, 3, 4, 5  # faces of a shelf
-FRONT, SIDE, LID, UPPER = 0, 1, 2, 4  # faces of a product; the upper box adds 4
+FRONT, SIDE, LID, ROUND, UPPER = 0, 1, 2, 3, 4  # faces of a product; the upper box adds 4
+CARTON, CAN, BOTTLE, HUNG = 0, 1, 2, 3  # forms of products
+# A bottle's body ends at the first height, its shoulder at the second; and the neck's radius: fractions of its own.
+SHOULDER, NECK, NARROW = 0.6, 0.78, 0.35
 FAR = 1e30
 
 # Inlined by force and without reference counts: passing the world's many arrays through calls costs five times as much.
@@ -49,6 +54,21 @@ def inverse(d):
 
 
 @njit_finite
+def ray(r, grid, du, dv, p, x, y):
+    """Direction in the world of the ray (x, y) px from the centre of pixel p."""
+    a, b, c = grid[p, 0], grid[p, 1], grid[p, 2]
+    if x != 0 or y != 0:
+        a += x * du[p, 0] + y * dv[p, 0]
+        b += x * du[p, 1] + y * dv[p, 1]
+        c += x * du[p, 2] + y * dv[p, 2]
+    return (
+        r[0, 0] * a + r[0, 1] * b + r[0, 2] * c,
+        r[1, 0] * a + r[1, 1] * b + r[1, 2] * c,
+        r[2, 0] * a + r[2, 1] * b + r[2, 2] * c,
+    )
+
+
+@njit_finite
 def slab(lo0, lo1, lo2, hi0, hi1, hi2, o0, o1, o2, i0, i1, i2):
     """Ray (origin, inverse direction) against a box -> (t_in, t_out, axis of entry)."""
     a, b = (lo0 - o0) * i0, (hi0 - o0) * i0
@@ -67,10 +87,83 @@ def slab(lo0, lo1, lo2, hi0, hi1, hi2, o0, o1, o2, i0, i1, i2):
 
 
 @njit_finite
-def _product(facings, c, base, ou, ow, oz, iu, iw, iz, depth, limit):
-    """Nearest hit of the lower and the upper box of facing c -> (t, face), face -1 for none."""
+def profile(form, part, low, high, radius):
+    """Part of a can (0) or a bottle (0 body, 1 shoulder, 2 neck) -> (z from, z to, radius at from, radius at to)."""
+    if form == CAN:
+        return low, high, radius, radius
+    first, second = low + SHOULDER * (high - low), low + NECK * (high - low)
+    if part == 0:
+        return low, first, radius, radius
+    if part == 1:
+        return first, second, radius, NARROW * radius
+    return second, high, NARROW * radius, NARROW * radius
+
+
+@njit_finite
+def _frustum(pu, pw, oz, du, dw, dz, low, high, a, b):
+    """Where a ray enters a cone about z, radius a at `low` and b at `high`, from its side -> t, FAR for nowhere.
+
+    (pu, pw): the ray's origin from the axis.
+    """
+    slope = (b - a) / (high - low)
+    r, s = a + slope * (oz - low), slope * dz
+    qa, qb, qc = du * du + dw * dw - s * s, pu * du + pw * dw - r * s, pu * pu + pw * pw - r * r
+    root = qb * qb - qa * qc
+    if root <= 0:
+        return FAR
+    root = math.sqrt(root)
+    t = qc / (root - qb) if qb < 0 else (-(qb + root) / qa if qa != 0 else FAR)
+    z = oz + t * dz
+    return t if t > 0 and low <= z < high else FAR
+
+
+@njit_finite
+def _round(form, pu, pw, oz, du, dw, dz, iz, low, high, radius, limit):
+    """One can or bottle -> (t, face), face -1 for none."""
     best, face = limit, -1
+    for part in range(3 if form == BOTTLE else 1):
+        z0, z1, a, b = profile(form, part, low, high, radius)
+        t = _frustum(pu, pw, oz, du, dw, dz, z0, z1, a, b)
+        if t < best:
+            best, face = t, ROUND
+    edge = radius if dz > 0 or form == CAN else NARROW * radius  # of its bottom, or its lid
+    t = ((low if dz > 0 else high) - oz) * iz
+    if 0 < t < best and (pu + t * du) ** 2 + (pw + t * dw) ** 2 < edge * edge:
+        best, face = t, LID
+    return best, face
+
+
+@njit_finite
+def _rounds(form, u0, u1, front, low, high, ou, ow, oz, du, dw, dz, iu, iw, iz, depth, limit):
+    """A row of cans or bottles, one behind the other -> (t, face), face -1 for none."""
+    t0, t1, _axis = slab(u0, front, low, u1, depth, high, ou, ow, oz, iu, iw, iz)
+    best, face = limit, -1
+    if t0 >= t1 or t1 <= 0 or t0 >= limit:
+        return best, face
+    radius = 0.5 * (u1 - u0)
+    for k in range(max(1, int((depth - front) / (u1 - u0)))):
+        pu, pw = ou - u0 - radius, ow - front - (2 * k + 1) * radius
+        t, found = _round(form, pu, pw, oz, du, dw, dz, iz, low, high, radius, best)
+        if found >= 0:
+            best, face = t, found
+    return best, face
+
+
+@njit_finite
+def _product(facings, facings_i, c, base, ou, ow, oz, du, dw, dz, iu, iw, iz, depth, limit):
+    """Nearest hit of the lower and the upper box of facing c -> (t, face), face -1 for none."""
+    best, face, form = limit, -1, facings_i[c, 5]
     u0, u1, low, high = facings[c, 2], facings[c, 3], facings[c, 5], facings[c, 7]
+    if form in (CAN, BOTTLE):
+        if low > base:
+            best, face = _rounds(
+                form, u0, u1, facings[c, 4], base, low, ou, ow, oz, du, dw, dz, iu, iw, iz, depth, best
+            )
+        if high > low:
+            t, found = _rounds(form, u0, u1, facings[c, 6], low, high, ou, ow, oz, du, dw, dz, iu, iw, iz, depth, best)
+            if found >= 0:
+                best, face = t, UPPER + found
+        return best, face
     if low > base:
         t0, t1, axis = slab(u0, facings[c, 4], base, u1, depth, low, ou, ow, oz, iu, iw, iz)
         if t0 < t1 and 0 < t0 < best:
@@ -86,7 +179,7 @@ def _product(facings, c, base, ou, ow, oz, iu, iw, iz, depth, limit):
 
 
 @njit_finite
-def _slot(levels_i, facings, bins, k, base, ou, ow, oz, du, iu, iw, iz, t_in, t_out, depth):
+def _slot(levels_i, facings, facings_i, bins, k, base, ou, ow, oz, du, dw, dz, iu, iw, iz, t_in, t_out, depth):
     """Traverse the facings of level k from t_in to t_out -> (t, facing, face), facing -1 for none."""
     first, last, offset = levels_i[k, 0], levels_i[k, 1], levels_i[k, 2]
     if last <= first:
@@ -98,7 +191,7 @@ def _slot(levels_i, facings, bins, k, base, ou, ow, oz, du, iu, iw, iz, t_in, t_
     while c > first and facings[c, 0] > u:
         c -= 1
     while True:
-        t, face = _product(facings, c, base, ou, ow, oz, iu, iw, iz, depth, t_out)
+        t, face = _product(facings, facings_i, c, base, ou, ow, oz, du, dw, dz, iu, iw, iz, depth, t_out)
         if face >= 0:
             return t, c, face
         if du > 0:
@@ -133,6 +226,27 @@ def turn_to_shelf(facing, dx, dy):
     if facing == 2:
         return -dy, dx
     return dy, -dx
+
+
+@njit_finite
+def turn_from_shelf(facing, du, dw):
+    """(u, w) -> horizontal direction of the world."""
+    if facing == 0:
+        return du, dw
+    if facing == 1:
+        return -du, -dw
+    if facing == 2:
+        return dw, -du
+    return -dw, du
+
+
+@njit_finite
+def from_axis(w, c, face, u, deep):
+    """Position (u, w) from the axis of the can or bottle of facing c that has a point."""
+    f = w.facings
+    radius, front = 0.5 * (f[c, 3] - f[c, 2]), f[c, 6 if face & UPPER else 4]
+    k = math.floor((deep - front) / (2 * radius))
+    return u - f[c, 2] - radius, deep - front - (2 * k + 1) * radius
 
 
 @njit_finite
@@ -176,6 +290,7 @@ def _shelf(w, b, ox, oy, oz, dx, dy, dz, ix, iy, iz, t_in, axis, limit):
     t, c, side = _slot(
         levels_i,
         w.facings,
+        w.facings_i,
         w.bins,
         k,
         levels[k, 1],
@@ -183,6 +298,8 @@ def _shelf(w, b, ox, oy, oz, dx, dy, dz, ix, iy, iz, t_in, axis, limit):
         ow,
         oz,
         du,
+        dw,
+        dz,
         iu,
         iw,
         iz,
@@ -194,6 +311,9 @@ def _shelf(w, b, ox, oy, oz, dx, dy, dz, ix, iy, iz, t_in, axis, limit):
         part = 0
         if side & 3 == SIDE or side & 3 == LID:
             part = int((ow + t * dw) * w.facings[c, 9])
+        elif side & 3 == ROUND:
+            behind = int((ow + t * dw - w.facings[c, 6 if side & UPPER else 4]) * w.facings[c, 9])
+            part = 5 * behind + int((oz + t * dz - levels[k, 1]) * w.facings[c, 8])
         else:
             part = int((oz + t * dz - levels[k, 1]) * w.facings[c, 8])
         return t, pack(FACING, c, part, side)
@@ -226,8 +346,8 @@ def _person(persons_i, ellipsoids, q, ox, oy, oz, dx, dy, dz, limit):
 
 
 @njit_finite
-def trace(w, near, moving, ox, oy, oz, dx, dy, dz):
-    """Nearest surface along a ray -> (t, id)."""
+def trace(w, near, moving, gone, ox, oy, oz, dx, dy, dz):
+    """Nearest surface along a ray -> (t, id); `gone`: metres at most from where `near` was made to the ray's origin."""
     room, groups, groups_i, blocks, blocks_i = (
         w.room,
         w.groups,
@@ -246,7 +366,7 @@ def trace(w, near, moving, ox, oy, oz, dx, dy, dz):
         best, hit = t, pack(ROOM, 0, 0, 5 if dy > 0 else 4)
     for n in range(near.groups.shape[0]):
         g = near.groups[n]
-        if near.group_gaps[n] >= best:
+        if near.group_gaps[n] - gone >= best:
             break
         t0, t1, axis = slab(
             groups[g, 0],
@@ -265,7 +385,7 @@ def trace(w, near, moving, ox, oy, oz, dx, dy, dz):
         if t0 >= t1 or t1 <= 0 or t0 >= best:
             continue
         for m in range(groups_i[g, 0], groups_i[g, 1]):
-            if near.block_gaps[m] >= best:
+            if near.block_gaps[m] - gone >= best:
                 break
             b = near.blocks[m]
             t0, t1, axis = slab(

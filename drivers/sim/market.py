@@ -337,6 +337,7 @@ def _fridge(
     y0, y1 = min(front, front + sign * 0.04), max(front, front + sign * 0.04)
     for x in np.linspace(span[0], span[1], max(2, round((span[1] - span[0]) / FRIDGE_DOOR) + 1)).tolist():
         b.solid((x - 0.03, y0, 0.1), (x + 0.03, y1, 2.0), [shop.steel] * 6)
+    b.panes.append([span[0], 0.5 * (y0 + y1), 0.1, span[1], 0.5 * (y0 + y1), 2.0])
     head = b.atlas.add(textures.poster(plan, 64, 1024))
     b.solid(
         (span[0], min(back, front), 2.0),

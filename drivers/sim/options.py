@@ -48,6 +48,17 @@ class SimOptions(SourceOptions):
     exchange: float = option(0.0, "fraction of product rows with another product than at 0", low=0, high=1)
     nights: int = option(0, "so many nights exchange that fraction of the rows, each others", low=0, high=1000)
     returns: bool = option(True, "whether the camera returns to earlier places")
+    fill: float = option(-1, "fraction of product rows that are present, -1: the scene's own; so below", low=-1, high=1)
+    gaps: float = option(-1, "fraction of the facings that are sold out", low=-1, high=1)
+    setback: float = option(-1, "metres, largest setback of a product row", low=-1, high=1)
+    round: float = option(-1, "share of the products that are cans and bottles", low=-1, high=1)
+    hanging: float = option(-1, "share that hangs from hooks", low=-1, high=1)
+    glossy: float = option(-1, "share that is varnished or of foil", low=-1, high=1)
+    clear: float = option(-1, "share of the round ones that is transparent", low=-1, high=1)
+    glass: float = option(-1, "share of the shelves' length behind glass doors", low=-1, high=1)
+    bare: float = option(-1, "share of the shelves' length that is a white wall", low=-1, high=0.9)
+    polish: float = option(-1, "of the floor, which mirrors lamps and shelves", low=-1, high=1)
+    carts: int = option(-1, "shopping carts in the aisles; none in sim:market", low=-1, high=200)
     people: int = option(-1, "how many, -1: the scene's own", low=-1, high=60)
     encounters: str = option(
         "", "encounters of people with the robot, in turn: approach, stop, cover, lens, cart, beside, group; all"
@@ -59,6 +70,10 @@ class SimOptions(SourceOptions):
     drop: float = option(0.0, "fraction of frames lost", low=0, high=0.9)
     noise: float = option(1.0, "scales the sensor's noise", low=0, high=20)
     blur: float = option(1.0, "scales the exposure time", low=0, high=10)
+    shutter: int = option(
+        0, "images rendered during an exposure, whose mean is exact motion blur; 0: pixels blur along their motion",
+        low=0, high=64,
+    )  # fmt: skip
     robot: bool = option(False, "the robot's own edge and a hand rail are in view")
     dirt: float = option(0.0, "spots on the lenses", low=0, high=1)
     flicker: float = option(0.0, "swing of the lamps' brightness, 100 times a second", low=0, high=1)

@@ -101,7 +101,8 @@ class Renderer:
     def __init__(self, world: Tables, rig: Rig) -> None:
         self.world, self.rig = world, rig
         self.cameras = [CameraRays(c) for c in (rig.left, rig.right) if c is not None]
-        self._ts, self._hits = np.empty(SCRATCH), np.empty(SCRATCH, np.int64)
+        whole, real = (np.empty((2, SCRATCH), dtype) for dtype in (np.int64, np.float64))
+        self._scratch = real[0], whole[0], real[1], whole[1]
 
     def render(self, world_T_cam: F64, moving: Moving = NO_OBJECTS) -> tuple[View, View]:
         """Views of both cameras; of a single camera the first twice.
@@ -119,10 +120,11 @@ class Renderer:
             np.full(shape, np.nan, np.float32),
             np.full(shape, -1, np.int32),
         )
-        self._cast(rays, world_T_cam, moving, rays.valid, _CENTRE, 0, view)
+        marks = np.full(shape, -1, np.int32) if len(self.world.materials) else view.ids
+        self._cast(rays, world_T_cam, moving, rays.valid, _CENTRE, 0, view, marks)
         found = np.empty(view.ids.size, np.int64)
-        edges = found[: find_edges(view.image, view.ids, rays.inner, EDGE_CONTRAST, found)]
-        self._cast(rays, world_T_cam, moving, edges, EDGE_RAYS, 1, view)
+        edges = found[: find_edges(view.image, marks, rays.inner, EDGE_CONTRAST, found)]
+        self._cast(rays, world_T_cam, moving, edges, EDGE_RAYS, 1, view, marks)
         if len(moving.targets):
             shown = ((view.ids >> 4) & 7 == TARGET) & (view.ids >= 0)
             near = cv2.dilate(shown.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
@@ -134,6 +136,7 @@ class Renderer:
                 TARGET_RAYS,
                 0,
                 view,
+                marks,
             )
         return view
 
@@ -146,14 +149,18 @@ class Renderer:
         offsets: F64,
         keep: int,
         view: View,
+        marks: I32,
     ) -> None:
-        """Write flat `pixels` of the view: the mean over rays at `offsets` (K, 2) px and `keep` times the old value."""
+        """Write flat `pixels` of the view: the mean over rays at `offsets` (K, 2) px and `keep` times the old value.
+
+        `marks`: (H, W) written as well: differ where a mirror image or what is seen through glass changes.
+        """
         poses = np.ascontiguousarray(world_T_cam, float).reshape(-1, 4, 4)  # one, or one for each row
         origins = poses[:, :3, 3]
         middle = origins[len(origins) // 2]
         near = _near(self.world, middle, float(np.linalg.norm(origins - middle, axis=1).max()))
         flat = [a.reshape(-1, 3) for a in (rays.grid, rays.du, rays.dv)]
-        out = [a.reshape(-1) for a in (view.image, view.depth, view.ids)]
+        out = [a.reshape(-1) for a in (view.image, view.depth, view.ids, marks)]
         height, width = view.image.shape
         rows = np.searchsorted(pixels, width * np.arange(height + 1)) if len(poses) > 1 else (0, len(pixels))
         for pose, first, last in zip(poses, rows[:-1], rows[1:], strict=True):
@@ -168,6 +175,5 @@ class Renderer:
                 *flat,
                 rays.angles.ravel(),
                 *out,
-                self._ts,
-                self._hits,
+                *self._scratch,
             )

@@ -11,6 +11,7 @@ from stereo_sfm.drivers.sim.drives import FORWARD, Gait
 from stereo_sfm.drivers.sim.effects import Effects
 from stereo_sfm.drivers.sim.market import Market
 from stereo_sfm.drivers.sim.people import Appearance, Person
+from stereo_sfm.drivers.sim.shelves import Mix
 from stereo_sfm.drivers.sim.world import CLOTHES, HAIR, Layout
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64
@@ -84,6 +85,22 @@ SCENES: dict[str, Scene] = {
     "dark": Scene(_STORE, _loop, 42.0, _DARK),
     "blank": Scene(Layout(fill=0.06), _loop, 42.0),
     "sparse": Scene(Layout(fill=0.7, gaps=0.3, setback=0.3), _loop, 42.0),
+    "fridges": Scene(Layout(gaps=0.1, mix=Mix(round=0.5, glossy=0.3, clear=0.3), glass=0.7, polish=0.5), _loop, 42.0),
+    "glossy": Scene(Layout(gaps=0.1, mix=Mix(round=0.3, hanging=0.1, glossy=0.8, clear=0.2), polish=1.0), _loop, 42.0),
+    "clutter": Scene(
+        Layout(
+            fill=0.85,
+            gaps=0.2,
+            setback=0.25,
+            mix=Mix(round=0.35, hanging=0.25, glossy=0.25, clear=0.15),
+            glass=0.15,
+            bare=0.15,
+            polish=0.3,
+            carts=12,
+        ),
+        _loop,
+        42.0,
+    ),
     "demo": Scene(Layout(gondolas=2, gondola_length=3.6, products=120), _loop, 21.0, gait=Gait(speed=1.05)),
     "big": Scene(Layout(gondolas=9, gondola_length=18.0, products=420), _serpentine, 1000.0),
 }

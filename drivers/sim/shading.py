@@ -15,9 +15,11 @@ from stereo_sfm.drivers.sim.kernels import (
     END,
     FACING,
     FRONT,
+    HUNG,
     PERSON,
     RAIL,
     ROOM,
+    ROUND,
     SIDE,
     SOLID,
     njit_finite,
@@ -118,6 +120,8 @@ def _product(w, c, face, part, x, y, z, dx, dy, dz, size):
     base, roof = w.levels[k, 1], w.levels[k, 2]
     across = (u - w.facings[c, 2]) * w.facings[c, 10]
     per_u, per_z, per_w = w.facings[c, 10], w.facings[c, 8], w.facings[c, 9]
+    if w.facings_i[c, 5] == HUNG:
+        base = w.facings[c, 5]
     row = (z - base) * per_z
     row = 1 - (row - math.floor(row))
     column = deep * per_w
@@ -150,6 +154,14 @@ def _product(w, c, face, part, x, y, z, dx, dy, dz, size):
         if du > 0:
             s = 1 - s
         light *= 0.6
+    elif side == ROUND:
+        pu, pw = kernels.from_axis(w, c, face, u, deep)
+        angle, radius = math.atan2(pu, -pw), math.sqrt(pu * pu + pw * pw) + 1e-9
+        s, per_s = 0.5 + angle / math.pi, 1 / (math.pi * radius)
+        s = 2 - s if s > 1 else abs(s)  # the label once more, mirrored, on the back
+        k, t, dt, per_t = w.facings_i[c, 0], row, dz, per_z
+        ds, cos = (-du * pw + dw * pu) / radius, (du * pu + dw * pw) / radius
+        light *= 0.7 - 0.3 * pw / radius
     else:
         k, s, t, ds, dt, cos, per_s, per_t = (
             w.facings_i[c, 2],

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from stereo_sfm.drivers.sim import labels
 from stereo_sfm.drivers.sim.atlas import Atlas
-from stereo_sfm.drivers.sim.kernels import BIN, SHELF
+from stereo_sfm.drivers.sim.kernels import BIN, BOTTLE, CAN, CARTON, HUNG, SHELF
+from stereo_sfm.drivers.sim.optics import CLEAR, FOIL, GLOSSY, MATT
 from stereo_sfm.drivers.sim.tables import Builder
 
 
 @dataclass(frozen=True)
 class Product:
-    """A carton: its size in metres and its textures."""
+    """Its size in metres and its textures."""
 
     wide: float
     high: float
@@ -22,6 +23,33 @@ class Product:
     front: int
     side: int
     top: int
+    form: int = CARTON
+    material: int = MATT
+
+
+@dataclass(frozen=True)
+class Mix:
+    """Shares of a store's products."""
+
+    round: float = 0.0  # cans and bottles
+    hanging: float = 0.0  # bags on hooks
+    glossy: float = 0.0  # varnished, or of foil
+    clear: float = 0.0  # of the round ones
+
+    def applied(self, products: list[Product], rng: np.random.Generator) -> list[Product]:
+        """The products, so many of them in other forms and materials."""
+        draws = rng.random((len(products), 3))
+        return [self._changed(p, *d) for p, d in zip(products, draws.tolist(), strict=True)]
+
+    def _changed(self, p: Product, form: float, material: float, kind: float) -> Product:
+        if form < self.round:
+            wide = 0.055 + 0.3 * (p.wide - 0.06)
+            form_of = BOTTLE if p.high > 2 * wide else CAN
+            shine = CLEAR if material < self.clear else (GLOSSY if kind < self.glossy else MATT)
+            return replace(p, wide=wide, deep=wide, form=form_of, material=shine)
+        if form < self.round + self.hanging:
+            return replace(p, deep=0.06, form=HUNG, material=FOIL if material < self.glossy else MATT)
+        return replace(p, material=(FOIL if kind < 0.3 else GLOSSY) if material < self.glossy else MATT)
 
 
 @dataclass(frozen=True)
@@ -33,6 +61,7 @@ class Shop:
     steel: int
     back: int
     end: int
+    plain: int
     stock: np.random.Generator  # how full the shelves are
     changes: np.random.Generator  # which product rows are exchanged
     exchange: float  # fraction of product rows
@@ -81,6 +110,12 @@ def _facing(shop: Shop, p: Product, rows: int, deep: float, floor: float) -> lis
     return [front, low_top, up_front, low_top + upper * p.high, 1 / p.high, 1 / p.deep, 1 / p.wide]
 
 
+def _hung(p: Product, boxes: list[float], deep: float, top: float) -> list[float]:
+    """The boxes of a facing whose goods hang from `top`: nothing, and above it the front of the bags."""
+    front, *_, x, y, z = boxes
+    return [deep, top - p.high, front, top, x, y, z]
+
+
 def _disorder(shop: Shop, boxes: list[float], back: float, deep: float, floor: float) -> list[float]:
     """The boxes of a facing, sold out or set back by about `back` metres."""
     sold_out, shift = shop.order.random(2)
@@ -108,6 +143,7 @@ def _fill_level(
         count = int(plan.integers(1, 7)) if p.wide < 0.16 else int(plan.integers(1, 4))
         gap = float(plan.uniform(0.002, 0.012))
         rows = max(1, min(int((clear - 0.03) / p.high), int(plan.integers(1, 5))))
+        rows = 1 if p.form in (BOTTLE, HUNG) else rows
         shown = _shown(shop, p, len(b.facings))
         pitch = p.wide + gap
         fits = min(count, int((end - u) / pitch))
@@ -117,10 +153,13 @@ def _fill_level(
             u0 = u + k * pitch
             cell = [u0, u0 + pitch, u0 + 0.5 * gap, u0 + 0.5 * gap + p.wide]
             boxes = _facing(shop, p, rows, deep, floor)
+            if p.form == HUNG:
+                boxes = _hung(p, boxes, deep, floor + clear - 0.015)
             if shop.gaps > 0 or back > 0:
                 boxes = _disorder(shop, boxes, back, deep, floor)
             b.facings.append([*cell, *boxes])
-            b.facings_i.append([shown.front, shown.side, shown.top, len(b.blocks) - 1, len(b.levels)])
+            places = [len(b.blocks) - 1, len(b.levels)]
+            b.facings_i.append([shown.front, shown.side, shown.top, *places, p.form, p.material])
         u += fits * pitch
         if fits < count:
             break

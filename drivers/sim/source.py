@@ -43,6 +43,19 @@ def _world(layout: Layout | Market, seed: int, exchange: float, nights: int) -> 
     return build_world(layout, seed, exchange, nights)
 
 
+STOCK = ("fill", "gaps", "setback", "round", "hanging", "glossy", "clear", "glass", "bare", "polish", "carts")
+
+
+def _stocked(layout: Layout | Market, options: SimOptions) -> Layout | Market:
+    """The layout with the densities that are given."""
+    given = {name: value for name in STOCK if (value := getattr(options, name)) >= 0}
+    if not given:
+        return layout
+    if isinstance(layout, Market):
+        return dataclasses.replace(layout, style=layout.style.with_stock(given))
+    return layout.with_stock(given)
+
+
 def _effects(scene: Scene, options: SimOptions) -> Effects:
     if not options.effects:
         return dataclasses.replace(CLEAN, drop=options.drop)
@@ -90,7 +103,7 @@ class SimSource(BaseSource):
         self.live = options.realtime
         self.rig = dataclasses.replace(make_rig(options.camera, options.size), readout_s=options.readout)
         self._camera = self.rig  # the true rig, also if another calibration is used
-        self.layout = scene.layout
+        self.layout = _stocked(scene.layout, options)
         self.effects = _effects(scene, options)
         self._dark = options.dark
         gait = dataclasses.replace(
@@ -216,6 +229,19 @@ class SimSource(BaseSource):
         things = crowd_at(self.people, seconds) + present(self.encounters, seconds)
         return self.renderer.render(world_T_cam, moving(self.world, things))
 
+    def _exposed(self, world_T_cam: F64, seconds: float, twist: F64) -> tuple[View, View]:
+        """Mean brightness of `shutter` views while the shutter is open; depth and surfaces at its middle."""
+        views, count = self.view(world_T_cam, seconds), self.options.shutter
+        if count == 0:
+            return views
+        total = [np.zeros_like(view.image) for view in views]
+        for after in (np.arange(count) + 0.5) / count * self.effects.exposure_s - 0.5 * self.effects.exposure_s:
+            moved = self.view(world_T_cam @ se3.exp(after * twist), seconds + after)
+            for image, view in zip(total, moved, strict=True):
+                image += view.image / count
+        left, right = (dataclasses.replace(view, image=image) for view, image in zip(views, total, strict=True))
+        return left, right
+
     def moving_share(self, frame_id: int) -> F64:
         """Ground truth: the share (2,) of each camera's image that people and their things cover in a frame."""
         if self._small_renderer is None:
@@ -241,7 +267,9 @@ class SimSource(BaseSource):
         twists = [twist, se3.adjoint(se3.inverse(self._camera.left_T_right)) @ twist]
         dark = self._dark[0] <= seconds < self._dark[1]
         level = 0.0 if dark else brightness(self.effects, seconds, o.seed)
-        views = self.view(world_T_cam, seconds)  # first: it creates the sensors
+        views = self._exposed(world_T_cam, seconds, twist)  # first: it creates the sensors
+        if o.shutter:
+            twists = [np.zeros(6)] * 2
         left, right = (
             sensor.expose(view, twists[k], level, _noise_key(o.seed, frame_id, k))
             for k, (sensor, view) in enumerate(zip(self._sensors, views, strict=True))

@@ -24,11 +24,15 @@ class Tables(NamedTuple):
     levels_i: I64  # (L, 5) first and last + 1 facing, offset into bins, open above, number of bins
     # (F, 11) cell u0 u1, box u0 u1, lower box's front w and top z, upper box's, 1 / unit height, 1 / depth, 1 / width
     facings: F64
-    facings_i: I64  # (F, 5) textures front, side, top; block; level
+    facings_i: I64  # (F, 7) textures front, side, top; block; level; form; material
     bins: I64  # (N,) first facing whose cell reaches into a bin of BIN metres
     texels: U8  # (M,)
     textures: I64  # (T, 4) offset, log2 width, log2 height, wraps
     texture_sizes: F64  # (T, 2) metres, (0, 0) for images that stretch
+    # (M, 5) reflectance straight on, factor of reflection, roughness (radians), slope of ripples, share let through; in
+    # the order of stereo_sfm.drivers.sim.optics; empty where nothing shines
+    materials: F64
+    panes: F64  # (P, 6) lo xyz, hi xyz of panes of glass, flat in x or y
     surfaces: I64  # (4 + SKIN + 1,) textures of floor, floor wear, ceiling, walls, then people's clothes, hair, skin
 
 
@@ -46,6 +50,8 @@ class Builder:
     facings: list[list[float]] = field(default_factory=list[list[float]])
     facings_i: list[list[int]] = field(default_factory=list[list[int]])
     bins: list[int] = field(default_factory=list[int])
+    materials: list[list[float]] = field(default_factory=list[list[float]])
+    panes: list[list[float]] = field(default_factory=list[list[float]])
 
     def end_group(self, first: int) -> None:
         """Blocks from `first` on become a group."""
@@ -74,10 +80,12 @@ def make_tables(
         np.array(b.levels, float).reshape(-1, 3),
         np.array(b.levels_i, np.int64).reshape(-1, 5),
         np.array(b.facings, float).reshape(-1, 11),
-        np.array(b.facings_i, np.int64).reshape(-1, 5),
+        np.array(b.facings_i, np.int64).reshape(-1, 7),
         np.array(b.bins, np.int64),
         texels,
         table,
         sizes,
+        np.array(b.materials, float).reshape(-1, 5),
+        np.array(b.panes, float).reshape(-1, 6),
         np.array(surfaces, np.int64),
     )

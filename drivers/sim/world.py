@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 
 from stereo_sfm.drivers.sim import textures
 from stereo_sfm.drivers.sim.atlas import Atlas
-from stereo_sfm.drivers.sim.shelves import Shop, add_shelf, board_heights, make_products
+from stereo_sfm.drivers.sim.fittings import add_cart, add_doors, materials
+from stereo_sfm.drivers.sim.shelves import Mix, Shop, add_shelf, board_heights, make_products
 from stereo_sfm.drivers.sim.tables import Builder, Tables, make_tables
 
 CLOTHES, HAIR, SKIN = 8, 8, 10  # of the textures that people wear: patterned cloths, then two of hair, then skin
@@ -31,6 +33,17 @@ class Layout:
     fill: float = 1.0  # fraction of product rows that are present
     gaps: float = 0.0  # fraction of the single facings that are sold out
     setback: float = 0.0  # metres, largest setback of a product row from the shelf's edge
+    mix: Mix = field(default_factory=Mix)
+    glass: float = 0.0  # share of the shelves' length behind glass doors
+    bare: float = 0.0  # share of the shelves' length that is a white wall instead
+    polish: float = 0.0  # of the floor, 0: matt, 1: wet
+    carts: int = 0  # shopping carts that stand in the aisles of `build_world`
+
+    def with_stock(self, densities: dict[str, float]) -> Layout:
+        """With other values of those fields, of the layout or its mix."""
+        mix = {f.name: densities[f.name] for f in fields(Mix) if f.name in densities}
+        own: dict[str, Any] = {name: value for name, value in densities.items() if name not in mix}
+        return replace(self, mix=replace(self.mix, **mix), **own)
 
     @property
     def room(self) -> tuple[float, float, float]:
@@ -54,10 +67,20 @@ def add_shelf_pair(
     facing: int,
     layout: Layout,
 ) -> None:
-    """One side of a gondola: a deeper base shelf and, set back, the upper shelves. `y` is its back."""
+    """One side of a gondola: a deeper base shelf and, set back, the upper shelves. `y` is its back.
+
+    Of its length, a share at one end is a bare wall, and one at the other end has glass doors.
+    """
     depth, toe = layout.gondola_depth, 0.1
     sign = -1 if facing == FACING_MINUS_Y else 1
     base, top = 0.52, layout.shelf_top + float(plan.choice([0.0, 0.2]))
+    ends = (y, y + sign * depth)
+    if layout.bare > 0:
+        cut = span[1] - layout.bare * (span[1] - span[0])
+        b.solid((cut, min(ends), 0.0), (span[1], max(ends), top + 0.1), [shop.plain] * 6)
+        span = (span[0], cut)
+    if layout.glass > 0:
+        add_doors(b, shop, (span[0], span[0] + layout.glass * (span[1] - span[0])), (y, ends[1] + sign * toe), top)
     for deep, z0, z1, heights in (
         (depth + toe, 0.0, base, [0.14]),
         (depth, base, top, [z + 0.04 for z in board_heights(plan, base, top)]),
@@ -133,6 +156,15 @@ def _furniture(b: Builder, shop: Shop, seed: tuple[int, ...], layout: Layout) ->
         b.end_group(first)
 
 
+def _carts(b: Builder, shop: Shop, seed: tuple[int, ...], layout: Layout) -> None:
+    """Shopping carts along the gondolas, on one side of each inner aisle."""
+    plan = np.random.default_rng([*seed, 12])
+    for n in range(layout.carts):
+        y = layout.gondola_y(n % max(layout.gondolas - 1, 1)) + layout.gondola_depth + 0.42
+        x = layout.margin + float(plan.uniform(0.3, layout.gondola_length - 0.3))
+        add_cart(b, shop, plan, x, y)
+
+
 def build_world(layout: Layout | None = None, seed: int = 0, exchange: float = 0.0, nights: int = 0) -> Tables:
     """Build the store.
 
@@ -151,6 +183,7 @@ def build_world(layout: Layout | None = None, seed: int = 0, exchange: float = 0
         add_gondola(b, shop, plan, span, layout.gondola_y(k), layout)
     _walls(b, shop, root, layout)
     _furniture(b, shop, root, layout)
+    _carts(b, shop, root, layout)
     return make_tables(b.atlas, layout.room, add_surfaces(b.atlas, rng, layout.room), b)
 
 
@@ -163,12 +196,16 @@ def open_shop(
     """
     atlas = b.atlas
     products = make_products(rng, atlas, layout.products)
+    b.materials = materials(layout.polish, layout.glass > 0 or layout.mix != Mix())
     return Shop(
-        products,
+        products if layout.mix == Mix() else layout.mix.applied(products, np.random.default_rng([*root, 10])),
         [atlas.add(textures.price_rail(rng), (1.8, 0.04), wrap=True) for _ in range(3)],
         atlas.add(textures.board(rng), (0.4, 0.4), wrap=True),
         atlas.add(textures.back_panel(rng), (0.4, 0.4), wrap=True),
         atlas.add(textures.wall(rng, 256), (0.9, 0.9), wrap=True),
+        atlas.add(textures.plain(np.random.default_rng([*root, 11]), 215.0), (0.25, 0.25), wrap=True)
+        if layout.bare > 0
+        else -1,
         np.random.default_rng([*root, 6]),
         np.random.default_rng([*root, 5]),
         changes[0],

@@ -24,7 +24,7 @@ SMALL = Layout(gondolas=2, gondola_length=5.0, products=40)
 
 
 def small(name: str = "loop", **options: object) -> SimSource:
-    """A named scene in a store that is quick to build, small images."""
+    """A named scene's drive in a store that is quick to build, small images."""
     scene = dataclasses.replace(SCENES[name], layout=SMALL)
     return SimSource(name, scene, read_options(SimOptions, "sim", {"size": "212x200", **options}))
 
@@ -34,12 +34,25 @@ def same(a: StereoImage, b: StereoImage) -> bool:
     return bool((a.left == b.left).all() and (a.right == b.right).all()) and a.stamp_ns == b.stamp_ns
 
 
-def test_single_frames_and_frames_in_order_have_the_same_bits() -> None:
-    in_order = list(small("people", start=40, frames=3))
-    other = small("people")
+@pytest.mark.parametrize(
+    "options", [{"name": "people"}, {"round": 0.5, "glossy": 0.5, "glass": 0.5, "polish": 1, "carts": 3, "shutter": 3}]
+)
+def test_single_frames_and_frames_in_order_have_the_same_bits(options: dict[str, Any]) -> None:
+    in_order = list(small(**options, start=40, frames=3))
+    other = small(**options)
     for image in reversed(in_order):
         assert same(image, other.frame(image.frame_id))
     assert not same(in_order[0], in_order[1])
+
+
+def test_an_exposure_is_the_mean_of_what_is_seen_during_it() -> None:
+    """Rendered so, it agrees with blur along the pixels' motion, but where something is hidden and appears."""
+    options = {"noise": 0, "blur": 5, "size": "424x400", "speed": 1.0}
+    exact, along, sharp = (
+        small(**{**options, **more}).frame(200).left.astype(float) for more in ({"shutter": 9}, {}, {"blur": 0.0})
+    )
+    assert np.abs(along - exact).mean() < 0.5 * np.abs(sharp - exact).mean()
+    assert np.abs(along - exact).max() > 8
 
 
 def test_seed_session_and_effects_change_the_images() -> None:
@@ -51,6 +64,11 @@ def test_seed_session_and_effects_change_the_images() -> None:
         {"exchange": 0.5},
         {"noise": 0.5},
         {"blur": 9},
+        {"gaps": 0.5},
+        {"round": 0.5},
+        {"hanging": 0.5},
+        {"polish": 1},
+        {"bare": 0.5},
     ]
     for options in changes:
         assert (small(**options).frame(100).left != base.left).mean() > 0.02, options

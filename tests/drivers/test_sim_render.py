@@ -94,7 +94,7 @@ def test_hits_lie_on_the_surfaces_they_name(camera: str) -> None:
 def product_boxes(world: Tables) -> F64:
     """(2 F, 6) lower and upper boxes of every facing in world axes, lo xyz, hi xyz; empty ones have hi below lo."""
     out = np.empty((2, len(world.facings), 6))
-    for c, (f, (*_, b, k)) in enumerate(zip(world.facings, world.facings_i, strict=True)):
+    for c, (f, (_, _, _, b, k, *_)) in enumerate(zip(world.facings, world.facings_i, strict=True)):
         lo, hi, facing, base = world.blocks[b, :3], world.blocks[b, 3:], world.blocks_i[b, 1], world.levels[k, 1]
         deep = (hi - lo)[1 if facing < 2 else 0]
         for n, (front, bottom, top) in enumerate(((f[4], base, f[5]), (f[6], f[5], f[7]))):
