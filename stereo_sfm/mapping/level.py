@@ -70,8 +70,17 @@ def weights(sigma: F64) -> F64:
 
 def down_of(map_: Map, rows: I64) -> F64:
     """(3,) direction of gravity in the map as keyframes measured it: a unit vector, or zero where none did."""
-    rows = rows[map_.keyframes.down_sigma[rows] > 0]
-    total = (weights(map_.keyframes.down_sigma[rows])[:, None] * _in_map(map_, rows)).sum(axis=0)
+    table = map_.keyframes
+    return mean_down(table.map_T_kf[rows], table.down[rows], table.down_sigma[rows])
+
+
+def mean_down(map_T_kf: F64, down: F64, sigma: F64) -> F64:
+    """(3,) direction of gravity in the map: a unit vector, or zero where no keyframe measured it.
+
+    Args:
+        map_T_kf: (K, 4, 4). down, sigma: (K, 3) and (K,), see `Keyframe.down`.
+    """
+    total = (weights(sigma)[:, None] * np.einsum("nij,nj->ni", map_T_kf[:, :3, :3], down)).sum(axis=0)
     size = float(np.linalg.norm(total))
     return total / size if size > 0 else total
 

@@ -11,6 +11,7 @@ from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.verification import within
 from stereo_sfm.loop.vocabulary import Vocabulary
+from stereo_sfm.mapping.level import mean_down
 from stereo_sfm.mapping.map import MapSnapshot
 from stereo_sfm.mapping.protocol import WithoutJobs
 from stereo_sfm.maps.relocalization import Location, Relocalizer, not_found
@@ -20,17 +21,19 @@ LOST_AFTER = 5  # keyframes not found near the prediction before the whole map i
 
 
 class Localizer(WithoutJobs):
-    """For each keyframe, a `MapUpdate` that changes only `map_T_odom`.
+    """For each keyframe, a `MapUpdate` that changes only `map_T_odom`, with the direction of gravity.
 
     The first location needs no prediction; if it has few inliers, a second keyframe must confirm it. Later keyframes
     are searched around the prediction; after some failures, or when tracking restarted in another submap, the whole
     map is searched again. `found` is False until the first location.
-    Keyframes before the first location of their submap are placed with it, by odometry.
+    Keyframes before the first location of their submap are placed with it, by odometry. Gravity is that of the saved
+    map once the camera is located in it; before, and in a map without, what the newest keyframe measured.
     """
 
     def __init__(self, snapshot: MapSnapshot, rig: Rig, vocabulary: Vocabulary, config: LoopConfig) -> None:
         self.rig, self.saved = rig, snapshot
         self._relocalizer = Relocalizer(snapshot, rig, vocabulary, config)
+        self._saved_down = mean_down(snapshot.map_T_kf, snapshot.down, snapshot.down_sigma)
         self._config = config
         self._map_T_odom: F64 = np.eye(4)
         self._version = 0
@@ -64,6 +67,7 @@ class Localizer(WithoutJobs):
             culled_point_ids=np.zeros(0, np.int64),
             fused_point_ids=np.zeros((0, 2), np.int64),
             map_T_odom=self._map_T_odom.copy(),
+            down=self._down(keyframe),
         )
 
     def finish(self, loops: Sequence[LoopResult]) -> MapUpdate | None:
@@ -81,6 +85,12 @@ class Localizer(WithoutJobs):
     def place(self) -> None:
         """No map is built that could be placed."""
         return
+
+    def _down(self, keyframe: Keyframe) -> F64:
+        """(3,) direction of gravity in the map, zero where it is not known."""
+        if self.found and self._saved_down.any():
+            return self._saved_down
+        return self._map_T_odom[:3, :3] @ keyframe.odom_T_cam[:3, :3] @ keyframe.down
 
     def _placed(self, keyframe: Keyframe) -> list[tuple[int, F64]]:
         """The keyframes (id, odom_T_cam) whose locations become known with this one."""

@@ -69,6 +69,7 @@ class PoseUpdate(Message):
     session: int
     localized: bool
     tracked: bool  # the pose comes from this image
+    down: F64  # (3,) gravity's direction in the map, zero: unknown
 
     @property
     def map_T_body(self) -> F64:

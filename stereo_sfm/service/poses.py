@@ -53,7 +53,7 @@ class PoseConverter:
         self._left_T_body = se3.inverse(rig.body_T_left)
         self._adjoint = se3.adjoint(rig.body_T_left)
         self._session, self._clock = session, clock
-        self._map_T_odom: dict[int, F64] = {0: np.eye(4)}
+        self._map_frames: dict[int, tuple[F64, F64]] = {0: (np.eye(4), np.zeros(3))}  # map_T_odom, gravity in the map
         self._localized_from: int | None = None
         self._before: tuple[int, F64, F64] | None = None  # stamp, odom_T_body, covariance in body axes
 
@@ -63,13 +63,14 @@ class PoseConverter:
 
     def update(self, update: MapUpdate) -> None:
         """A version of the map."""
-        self._map_T_odom[update.version] = update.map_T_odom
-        if len(self._map_T_odom) > KEPT_VERSIONS:
-            del self._map_T_odom[next(iter(self._map_T_odom))]
+        self._map_frames[update.version] = update.map_T_odom, update.down
+        if len(self._map_frames) > KEPT_VERSIONS:
+            del self._map_frames[next(iter(self._map_frames))]
 
     def frame(self, frame: Frame) -> PoseUpdate:
         """The pose at a frame, in the map as the frame knew it."""
         version = self._known(frame.map_version)
+        map_T_odom, down = self._map_frames[version]
         odom_T_body = frame.odom_T_cam @ self._left_T_body
         in_body = self._adjoint @ frame.covariance @ self._adjoint.T
         tracked = frame.state in TRACKED
@@ -82,7 +83,7 @@ class PoseConverter:
             captured_s=self._clock.captured_s(frame.frame_id),
             state=frame.state.name,
             reason=frame.reason,
-            map_T_odom=self._map_T_odom[version].copy(),
+            map_T_odom=map_T_odom.copy(),
             odom_T_body=odom_T_body,
             covariance=turn @ in_body @ turn.T,
             twist=twist,
@@ -91,13 +92,14 @@ class PoseConverter:
             session=self._session,
             localized=self._localized_from is not None and version >= self._localized_from,
             tracked=tracked,
+            down=down.copy(),
         )
 
     def _known(self, version: int) -> int:
         """The newest known version that is not newer than this one."""
-        if version in self._map_T_odom:
+        if version in self._map_frames:
             return version
-        return max((v for v in self._map_T_odom if v <= version), default=next(iter(self._map_T_odom)))
+        return max((v for v in self._map_frames if v <= version), default=next(iter(self._map_frames)))
 
     def _twist(self, stamp_ns: int, odom_T_body: F64, covariance: F64, tracked: bool) -> tuple[F64, F64]:
         """Mean velocity since the frame before, body axes, with its covariance; NaN where either has no pose."""

@@ -134,6 +134,25 @@ def test_localizer_before_it_is_found(sequence: StoreSequence, vocabulary: voc.V
     assert localizer.last is not None and localizer.last.reason
 
 
+def test_gravity_is_that_of_the_saved_map(sequence: StoreSequence, vocabulary: voc.Vocabulary, first_pass: int) -> None:
+    part, down = sequence.first(first_pass), np.array([0.6, 0.8, 0.0])
+    saved = map_of_sequence(part).snapshot
+    seen = np.einsum("nji,j->ni", saved.map_T_kf[:, :3, :3], down)
+    level = dataclasses.replace(saved, down=seen, down_sigma=np.full(len(seen), 0.01))
+    felt = np.array([0.0, 0.0, 1.0])
+    keyframe = dataclasses.replace(sequence.keyframes[first_pass + 8], kf_id=0, down=felt, down_sigma=0.1)
+    stranger = dataclasses.replace(make_sequence([0], seed=77).keyframes[4], down=felt, down_sigma=0.1)
+    for map_, told in ((level, down), (saved, None)):  # a map without: as the keyframe says
+        localizer = Localizer(map_, sequence.rig, vocabulary, LoopConfig())
+        before = localizer.step(stranger)
+        assert not localizer.found
+        np.testing.assert_allclose(before.down, stranger.odom_T_cam[:3, 2])
+        found = localizer.step(keyframe)
+        assert localizer.found
+        in_map = found.map_T_odom[:3, :3] @ keyframe.odom_T_cam[:3, 2]
+        np.testing.assert_allclose(found.down, in_map if told is None else told, atol=1e-9)
+
+
 def test_same_keyframe_same_bits(sequence: StoreSequence, first_pass: int, relocalizer: Relocalizer) -> None:
     answers = [relocalizer.locate(sequence.keyframes[first_pass + 10]) for _ in range(2)]
     assert answers[0].map_T_cam.tobytes() == answers[1].map_T_cam.tobytes()

@@ -48,6 +48,7 @@ def pose_update(frame_id: int = 0, odom_T_body: F64 | None = None, **others: Any
         "session": 1,
         "localized": False,
         "tracked": True,
+        "down": np.zeros(3),
     }
     return PoseUpdate(**(values | others))
 

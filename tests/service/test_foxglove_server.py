@@ -6,22 +6,27 @@ import json
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.Odometry_pb2 import Odometry
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 
+from stereo_sfm.calib.imu import Imu
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
 from stereo_sfm.log import topics
 from stereo_sfm.messages import Health
 from stereo_sfm.service.messages import Event
 from stereo_sfm.service.outputs.foxglove_server import KINDS, REPORT, SERVICES, STATUS, FoxgloveOutput
 from stereo_sfm.service.publisher import Reply
 from tests.service.service_messages import FakeService, cloud, health, picture, pose_update, started, status
+from tests.synthetic import pinhole_rig
 
 connect = pytest.importorskip("websockets.sync.client").connect
 pytest.importorskip("foxglove")
@@ -105,6 +110,28 @@ def test_the_topics_are_those_of_the_log() -> None:
     points = PointCloud.FromString(got[3])
     assert len(points.data) // points.point_stride == len(cloud().points)
     assert json.loads(got[4])["state"] == "running"
+
+
+def test_the_level_is_the_measured_one_where_there_is_an_imu() -> None:
+    imu = Imu(np.eye(4), gyro_noise=1e-3, accel_noise=1e-2)
+    down = np.array([0.0, np.cos(0.2), np.sin(0.2)])  # the first camera looks 0.2 rad down
+    with _serving() as (output, client):
+        known = _channels(client, len(KINDS) + 3)
+        for rig, topic in ((pinhole_rig(), topics.TF_STATIC), (replace(pinhole_rig(), imu=imu), topics.TF)):
+            _subscribe(client, {known[topic]["id"]: known[topic]["id"]})
+            output.put(started(rig))
+            output.put(pose_update(1, down=down))
+
+            def take(said: Any) -> Any:
+                if not isinstance(said, bytes) or said[0] != 1:
+                    return None
+                rows = FrameTransforms.FromString(said[13:]).transforms
+                return next((row.rotation for row in rows if row.parent_frame_id == "level"), None)
+
+            turn = _wait(client, take)
+            level_R_map = se3.rotation_from_quaternion(np.array([turn.x, turn.y, turn.z, turn.w]))
+            expected = down if topic == topics.TF else np.array([0.0, 1.0, 0.0])
+            np.testing.assert_allclose(level_R_map @ expected, [0, 0, -1], atol=1e-9)
 
 
 def _call(client: Any, number: int, payload: bytes) -> dict[str, Any]:

@@ -91,9 +91,10 @@ def test_poses_are_in_the_map_that_their_frame_knew() -> None:
     maker, moved = PoseConverter(pinhole_rig(), 7, HostClock()), se3.exp(np.array([1.0, 0, 0, 0, 0, 0]))
     maker.update(update(1, np.eye(4), [1]))
     maker.localized(Localized(2))
-    maker.update(update(2, moved, [1]))
+    maker.update(dataclasses.replace(update(2, moved, [1]), down=np.array([0.0, 1.0, 0.0])))
     before, after = maker.frame(frame(0, np.eye(4), 1)), maker.frame(frame(1, np.eye(4), 2))
     assert not before.localized and after.localized and after.session == 7
+    assert not before.down.any() and after.down.tolist() == [0.0, 1.0, 0.0]
     assert before.map_T_body[0, 3] == 0.0 and after.map_T_body[0, 3] == 1.0
     for version in range(3, 1000):
         maker.update(update(version, moved, [1]))

@@ -28,7 +28,7 @@ from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError, require
 from stereo_sfm.log import foxglove, schema, topics
-from stereo_sfm.log.image_log import LEVEL_T_MAP
+from stereo_sfm.log.image_log import LEVEL_T_MAP, level_T_map
 from stereo_sfm.log.run_log import PATH_COLOR, age_colors
 from stereo_sfm.messages import Health
 from stereo_sfm.service.messages import (
@@ -157,7 +157,8 @@ class FoxgloveOutput:
         if self._rig is None:
             return
         rig, stamp = self._rig, self._stamp_ns
-        rows = [("level", "map", foxglove.pose(LEVEL_T_MAP)), ("body", "cam0", foxglove.pose(rig.body_T_left))]
+        rows = [("body", "cam0", foxglove.pose(rig.body_T_left))]
+        rows += [("level", "map", foxglove.pose(LEVEL_T_MAP))] if rig.imu is None else []
         self._log(topics.LEFT_CALIBRATION, foxglove.calibration(rig.left, "cam0", stamp))
         if rig.right is not None and not rig.depth:
             rows.append(("cam0", "cam1", foxglove.pose(rig.left_T_right)))
@@ -176,7 +177,9 @@ class FoxgloveOutput:
         self._log(topics.ODOMETRY, foxglove.odometry(stamp, in_odom, update.covariance))
         self._log(topics.ODOM_POSE, foxglove.pose_in_frame("odom", stamp, in_odom))
         self._log(topics.MAP_POSE, foxglove.pose_in_frame("map", stamp, in_map))
-        rows = (("map", "odom", correction), ("odom", "body", in_odom))
+        rows = [("map", "odom", correction), ("odom", "body", in_odom)]
+        if self._rig is not None and self._rig.imu is not None:  # the map's level may change: it comes with every pose
+            rows.append(("level", "map", foxglove.pose(level_T_map(update.down))))
         self._log(topics.TF, foxglove.transforms(stamp, rows))
 
     def _cloud(self, cloud: MapCloud) -> None:
