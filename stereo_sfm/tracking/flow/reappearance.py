@@ -24,6 +24,9 @@ GRAZING = 0.15  # cosine between a surface's normal and the ray, below which the
 DELTA_PX = 1.0  # for differences
 MAX_STRETCH = 3.0  # of a window, in any direction
 COARSE = SIZE // 2  # samples of a window in the half image, along each side
+SAMPLES = COARSE * COARSE
+MIN_VARIANCE = 1e-3  # of a window, grey levels squared
+LANES = 8  # numbers of a vector instruction
 
 
 def plane_warps(camera: Camera, uv: F64, points: F64, new_T_old: F64) -> F64:
@@ -64,75 +67,102 @@ def find_deformed(half_image, uv, warps, slots, patch, radius, step, uv_out, war
     Returns:
         (N,) normalised correlation of the best, 0 where nothing was searched.
     """
-    n = uv.shape[0]
     height, width = half_image.shape
-    best = np.zeros(n)
-    small = np.zeros(COARSE * COARSE)
-    at_u, at_v = np.zeros(COARSE * COARSE), np.zeros(COARSE * COARSE)
-    whole_u, whole_v = np.zeros(COARSE * COARSE, np.int64), np.zeros(COARSE * COARSE, np.int64)
-    weight = np.zeros((4, COARSE * COARSE))
-    for k in range(n):
+    pixels = half_image.ravel()
+    best = np.zeros(uv.shape[0])
+    small = np.zeros(SAMPLES, np.float32)
+    corner, weight = np.zeros((SAMPLES, 2), np.int64), np.zeros((4, SAMPLES), np.float32)
+    size = 2 * radius + 1 + LANES
+    sums, squares, cross = np.zeros(size, np.float32), np.zeros(size, np.float32), np.zeros(size, np.float32)
+    for k in range(uv.shape[0]):
         if not (math.isfinite(uv[k, 0]) and math.isfinite(uv[k, 1])):
             continue
-        mean, power = 0.0, 0.0
-        for i in range(COARSE):
-            for j in range(COARSE):
-                first = 2 * i * STRIDE + 2 * j
-                value = 0.25 * (
-                    patch[slots[k], first]
-                    + patch[slots[k], first + 1]
-                    + patch[slots[k], first + STRIDE]
-                    + patch[slots[k], first + STRIDE + 1]
-                )
-                small[i * COARSE + j] = value
-                mean += value
-        mean /= small.size
-        for m in range(small.size):
-            small[m] -= mean
-            power += small[m] * small[m]
-        if power < 1e-3:
+        power = _halved_window(patch[slots[k]], small)
+        if power < MIN_VARIANCE:
             continue
         for w in range(warps.shape[0]):
-            a, b, c, d = warps[w, k, 0, 0], warps[w, k, 0, 1], warps[w, k, 1, 0], warps[w, k, 1, 1]
-            if not math.isfinite(a + b + c + d):
+            warp = warps[w, k]
+            if not math.isfinite(warp.sum()):
                 continue
-            low_u, high_u, low_v, high_v = 1e9, -1e9, 1e9, -1e9
-            for i in range(COARSE):
-                y = 2 * i + 0.5 - HALF
-                for j in range(COARSE):
-                    x, m = 2 * j + 0.5 - HALF, i * COARSE + j
-                    at_u[m] = 0.5 * (uv[k, 0] + a * x + b * y)
-                    at_v[m] = 0.5 * (uv[k, 1] + c * x + d * y)
-                    low_u, high_u = min(low_u, at_u[m]), max(high_u, at_u[m])
-                    low_v, high_v = min(low_v, at_v[m]), max(high_v, at_v[m])
-                    whole_u[m], whole_v[m] = int(math.floor(at_u[m])), int(math.floor(at_v[m]))
-                    fu, fv = at_u[m] - whole_u[m], at_v[m] - whole_v[m]
-                    weight[0, m], weight[1, m] = (1 - fu) * (1 - fv), fu * (1 - fv)
-                    weight[2, m], weight[3, m] = (1 - fu) * fv, fu * fv
+            left, right, top, bottom = _sample_places(uv[k], warp, corner, weight)
+            first, last = -radius, radius  # columns of the search whose samples are in the image
+            while first <= last and left + first < 0:
+                first += step
+            while last >= first and right + last >= width - 1:
+                last -= 1
+            count = last - first + 1
             for dv in range(-radius, radius + 1, step):
-                if low_v + dv < 0 or high_v + dv >= height - 1:
+                if count <= 0 or top + dv < 0 or bottom + dv >= height - 1:
                     continue
-                for du in range(-radius, radius + 1, step):
-                    if low_u + du < 0 or high_u + du >= width - 1:
+                _products(pixels, width, corner, weight, small, first, dv, count, sums, squares, cross)
+                for x in range(0, count, step):
+                    variance = squares[x] - sums[x] * sums[x] / SAMPLES
+                    if variance < MIN_VARIANCE:
                         continue
-                    sums, squares, cross = 0.0, 0.0, 0.0
-                    for m in range(small.size):
-                        iu, iv = whole_u[m] + du, whole_v[m] + dv
-                        value = (
-                            weight[0, m] * half_image[iv, iu]
-                            + weight[1, m] * half_image[iv, iu + 1]
-                            + weight[2, m] * half_image[iv + 1, iu]
-                            + weight[3, m] * half_image[iv + 1, iu + 1]
-                        )
-                        sums += value
-                        squares += value * value
-                        cross += value * small[m]
-                    variance = squares - sums * sums / small.size
-                    if variance < 1e-3:
-                        continue
-                    ncc = cross / math.sqrt(variance * power)
+                    ncc = cross[x] / math.sqrt(variance * power)
                     if ncc > best[k]:
                         best[k] = ncc
-                        uv_out[k, 0], uv_out[k, 1] = uv[k, 0] + 2 * du, uv[k, 1] + 2 * dv
-                        warp_out[k, 0, 0], warp_out[k, 0, 1], warp_out[k, 1, 0], warp_out[k, 1, 1] = a, b, c, d
+                        uv_out[k, 0], uv_out[k, 1] = uv[k, 0] + 2 * (first + x), uv[k, 1] + 2 * dv
+                        warp_out[k] = warp
     return best
+
+
+@njit
+def _halved_window(window, small):
+    """Write the samples of a window (FLAT_SIZE,) in the half image, less their mean; returns the sum of squares."""
+    mean, power = 0.0, 0.0
+    for i in range(COARSE):
+        for j in range(COARSE):
+            at = 2 * i * STRIDE + 2 * j
+            value = 0.25 * (window[at] + window[at + 1] + window[at + STRIDE] + window[at + STRIDE + 1])
+            small[i * COARSE + j] = value
+            mean += value
+    for m in range(SAMPLES):
+        small[m] -= mean / SAMPLES
+        power += small[m] * small[m]
+    return power
+
+
+@njit
+def _sample_places(uv, warp, corner, weight):
+    """Pixels (SAMPLES, 2) and bilinear weights (4, SAMPLES) of a deformed window; its left, right, top and bottom."""
+    left, right, top, bottom = 1e9, -1e9, 1e9, -1e9
+    for i in range(COARSE):
+        y = 2 * i + 0.5 - HALF
+        for j in range(COARSE):
+            x, m = 2 * j + 0.5 - HALF, i * COARSE + j
+            u = 0.5 * (uv[0] + warp[0, 0] * x + warp[0, 1] * y)
+            v = 0.5 * (uv[1] + warp[1, 0] * x + warp[1, 1] * y)
+            left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
+            corner[m, 0], corner[m, 1] = int(math.floor(u)), int(math.floor(v))
+            fu, fv = u - corner[m, 0], v - corner[m, 1]
+            weight[0, m], weight[1, m] = (1 - fu) * (1 - fv), fu * (1 - fv)
+            weight[2, m], weight[3, m] = (1 - fu) * fv, fu * fv
+    return left, right, top, bottom
+
+
+@njit
+def _products(pixels, width, corner, weight, small, first, dv, count, sums, squares, cross):
+    """Sums (count,) of the samples, their squares and their products with a window, for columns from `first` on.
+
+    Whole vectors are computed where the image has so many pixels; the surplus columns mean nothing. Unsigned numbers
+    spare the compiler the test for negative indices.
+    """
+    sums[:], squares[:], cross[:] = 0.0, 0.0, 0.0
+    one, row = np.uintp(1), np.uintp(width)
+    whole = (count + LANES - 1) // LANES * LANES
+    for m in range(SAMPLES):
+        start = np.uintp((corner[m, 1] + dv) * width + corner[m, 0] + first)
+        columns = np.uintp(whole if start + row + whole < len(pixels) else count)
+        below = start + row
+        a, b, c, d, s = weight[0, m], weight[1, m], weight[2, m], weight[3, m], small[m]
+        for x in range(columns):
+            value = (
+                a * np.float32(pixels[start + x])
+                + b * np.float32(pixels[start + x + one])
+                + c * np.float32(pixels[below + x])
+                + d * np.float32(pixels[below + x + one])
+            )
+            sums[x] += value
+            squares[x] += value * value
+            cross[x] += value * s
