@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,6 +36,7 @@ PLACE_RADIUS = 3  # candidates at most so many keyframes apart are one place: on
 KEPT_NEWEST = 30  # newest keyframes, none of which is removed
 MAX_SAME_VIEW = 5  # keyframes of one view; of more, one is removed
 DRIFT_PER_METRE = 0.003  # of the odometry on both sides of a gap
+STRONG = 3.0, 0.4  # times min_inliers, share of inliers: one keyframe joins two submaps if the gap's motion allows it
 RIVAL = 0.5  # share of a loop's inliers above which another place makes it ambiguous
 CONTRADICTED = "against_odometry", "out_of_reach"  # reasons of impossible hypotheses, which are no rivals
 SIDE_CANDIDATES = 1, 3  # across directions: besides the one by odometry, and without one
@@ -60,6 +62,7 @@ class _Hypothesis:
     inliers: int
     against: str  # reason to reject it by odometry, "" if there is none
     unconnected: bool  # no path of odometry and loops connects its ends: only appearance supports it
+    votes: int  # keyframes that must agree on it
 
 
 class LoopCloser:
@@ -153,7 +156,7 @@ class LoopCloser:
         config = self._config
         if not config.enabled:
             return [], "disabled"
-        if keyframe.kf_id - self._last_loop <= config.pause:
+        if keyframe.kf_id - self._last_loop <= config.pause and self._graph.unbroken(self._last_loop, keyframe.kf_id):
             return [], "paused"
         connected = self._store.connected(keyframe.point_ids, config.connected_points)
         scores = self._database.scores(bag)
@@ -247,9 +250,13 @@ class LoopCloser:
         return verdict
 
     def _hypothesis(self, kf_id: int, of: Candidate, verdict: Verdict) -> _Hypothesis:
-        """A verified candidate, compared with the odometry between its ends."""
+        """A verified candidate, compared with the odometry between its ends.
+
+        Across a gap there is none. What the robot can have moved meanwhile bounds where it is; within that, strong
+        geometric evidence is believed at once, less or more distant evidence when another keyframe agrees.
+        """
         config, candidate_T_kf = self._config, se3.inverse(verdict.b_T_a)
-        candidate = of.kf_id
+        candidate, votes = of.kf_id, self._config.consistent
         path = self._graph.path(candidate, kf_id)
         if path is not None:
             metres = config.gate_m + config.gate_m_per_m * path.metres
@@ -258,14 +265,17 @@ class LoopCloser:
             against = "" if near else "against_odometry"
         else:
             gap = self._graph.gap_motion(candidate, kf_id, candidate_T_kf)
-            reached = gap is None or gap.deviation <= gap.tolerance + DRIFT_PER_METRE * gap.distance
+            off = math.nan if gap is None else gap.deviation - DRIFT_PER_METRE * gap.distance
             if of.sideways:
                 enough = verdict.inliers >= SIDE_FACTOR * config.side_inliers
             else:
                 least = 2 * config.min_inliers
                 enough = verdict.inliers >= least and verdict.share >= config.min_inlier_share_after_gap
+                strong = verdict.inliers >= STRONG[0] * config.min_inliers and verdict.share >= STRONG[1]
+                votes = 1 if strong and gap is not None and off <= gap.tolerance else votes
+            reached = gap is None or off <= gap.disturbed
             against = "out_of_reach" if not reached else "" if enough else "too_few_inliers"
-        return _Hypothesis(kf_id, candidate, candidate_T_kf, verdict.inliers, against, path is None)
+        return _Hypothesis(kf_id, candidate, candidate_T_kf, verdict.inliers, against, path is None, votes)
 
     def _objection(self, loop: _Hypothesis, best_inliers: int) -> str:
         """Why a loop that odometry allows is not accepted, '' if it is.
@@ -282,7 +292,7 @@ class LoopCloser:
     def _confirmed(self, new: _Hypothesis) -> bool:
         """Whether enough keyframes found the same loop."""
         votes = {h.kf_id for h in self._pending if not h.against and (h is new or self._same_loop(h, new))}
-        return len(votes) >= self._config.consistent
+        return len(votes) >= new.votes
 
     def _same_loop(self, earlier: _Hypothesis, new: _Hypothesis) -> bool | None:
         """Whether two loops agree; None if no path connects them."""

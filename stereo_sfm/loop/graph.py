@@ -37,6 +37,7 @@ class GapMotion:
 
     deviation: float  # metres between the implied and the predicted position after the gap
     tolerance: float  # metres, largest deviation of a robot that stops, turns or accelerates
+    disturbed: float  # metres, the same if what covers the camera took its poses along in the second before
     distance: float  # metres of odometry between the gap and the loop's two ends
 
 
@@ -170,8 +171,10 @@ class KeyframeGraph:
         assert before is not None and after is not None
         moved = before.a_T_b @ a_T_b @ after.a_T_b
         deviation = float(np.linalg.norm(moved[:3, 3] - 0.5e-9 * ns * velocity))
-        tolerance = GAP_METRES + GAP_SHARE * 1e-9 * ns * max(float(np.linalg.norm(velocity)), MIN_SPEED)
-        return GapMotion(deviation, tolerance, before.metres + after.metres)
+        speed = max(float(np.linalg.norm(velocity)), MIN_SPEED)
+        tolerance = GAP_METRES + GAP_SHARE * 1e-9 * ns * speed
+        disturbed = tolerance + GAP_SHARE * 1e-9 * SPEED_NS * speed
+        return GapMotion(deviation, tolerance, disturbed, before.metres + after.metres)
 
     def _velocity(self, row: int) -> F64 | None:
         """(3,) metres a second before a keyframe, in its camera frame; None for the first of a chain.

@@ -143,6 +143,15 @@ def test_pause_after_a_loop(vocabulary: voc.Vocabulary) -> None:
     assert all(results[accepted[0] + i].reason == "paused" for i in range(1, 8))
 
 
+def test_a_new_submap_is_searched_although_a_loop_was_just_closed(vocabulary: voc.Vocabulary) -> None:
+    sequence = make_sequence([0, 0], seed=5)
+    loop = next(r.kf_id for r in close(sequence, vocabulary) if r.candidate_kf_id >= 0)
+    first = sequence.first(loop + 4)
+    anew = [dataclasses.replace(k, submap_id=int(k.kf_id > loop + 1)) for k in first.keyframes]
+    reasons = [r.reason for r in close(dataclasses.replace(first, keyframes=anew), vocabulary)[loop:]]
+    assert reasons[:2] == ["", "paused"] and "paused" not in reasons[2:]
+
+
 def test_disabled_gives_no_loop_for_every_keyframe(vocabulary: voc.Vocabulary) -> None:
     results = close(make_sequence([0], seed=5), vocabulary, dataclasses.replace(LoopConfig(), enabled=False))
     assert {r.reason for r in results} == {"disabled"}
@@ -195,6 +204,42 @@ def test_a_new_submap_is_connected_at_once_with_the_place_just_left(vocabulary: 
     loops = [r for r in close(dataclasses.replace(sequence, keyframes=keyframes), vocabulary) if r.candidate_kf_id >= 0]
     assert loops and loops[0].candidate_kf_id < break_at <= loops[0].kf_id < break_at + 5
     assert all(error_of(sequence, loop) < 0.05 for loop in loops)
+
+
+@pytest.mark.parametrize(
+    ("inliers", "rival", "astray", "reason"),
+    [
+        (200, 0, 0.0, ""),  # one keyframe joins
+        (100, 0, 0.0, "not_confirmed_yet"),  # a share of a third, by chance perhaps
+        (200, 130, 0.0, "ambiguous"),  # another place looks nearly alike
+        (200, 0, 0.9, "not_confirmed_yet"),  # possible if the poses before the gap were disturbed
+        (200, 0, 3.0, "out_of_reach"),
+    ],
+)
+def test_one_keyframe_joins_a_new_submap_if_its_evidence_is_strong(
+    vocabulary: voc.Vocabulary,
+    monkeypatch: pytest.MonkeyPatch,
+    inliers: int,
+    rival: int,
+    astray: float,
+    reason: str,
+) -> None:
+    """Half a second of darkness; the views of the place just left agree at once, or 0.9 or 3 m beside."""
+    sequence = make_sequence([0], seed=3)
+    anew = [
+        dataclasses.replace(k, submap_id=int(k.kf_id >= 20), stamp_ns=k.kf_id * 10**9 // 2) for k in sequence.keyframes
+    ]
+    beside = se3.exp(np.array([astray, 0, 0, 0, 0, 0]))
+    answers = {(21, 15): (inliers, beside)}
+    answers |= {(21, 10): (rival, se3.exp(np.array([0, 0, -0.5, 0, 0, 0])))} if rival else {}
+    monkeypatch.setattr(LoopCloser, "_verify", scripted(sequence, answers))
+    candidates = [Candidate(c, 0.5) for _, c in answers]
+    monkeypatch.setattr(
+        LoopCloser, "_candidates", lambda self, k, *_: (candidates if k.kf_id == 21 else [], "no_candidate")
+    )
+    result = close(dataclasses.replace(sequence, keyframes=anew), vocabulary)[21]
+    assert result.reason == reason
+    assert result.candidate_kf_id == (-1 if reason else 15)
 
 
 def test_a_new_submap_in_a_twin_aisle_is_not_connected_with_the_first_aisle(vocabulary: voc.Vocabulary) -> None:

@@ -96,6 +96,11 @@ def broken(seconds: float) -> KeyframeGraph:
     return graph
 
 
+def test_a_second_before_the_gap_may_be_disturbed() -> None:
+    gap_motion = broken(1.0).gap_motion(3, 6, at(2.0))
+    assert gap_motion is not None and gap_motion.disturbed == pytest.approx(gap_motion.tolerance + 0.75)
+
+
 @pytest.mark.parametrize(("moved", "possible"), [(0.0, True), (1.0, True), (1.5, True), (-1.4, False), (3.4, False)])
 def test_tolerance_of_the_motion_over_a_gap(moved: float, possible: bool) -> None:
     gap_motion = broken(1.0).gap_motion(3, 6, at(2.0 + moved))
