@@ -8,20 +8,28 @@ steps that are wrong by more than 10 mm or 0.2 degrees while the state says OK, 
 compared with the same drive without people. Below the table: for each kind, camera and rate, and for all kinds
 together, how often each requirement was met.
 
+Then the same in recordings with exact poses, into which people and bags are painted (`_occluders.py`): as recorded, and
+as a pinhole camera would have seen what a fisheye saw.
+
     python benchmarks/people.py [--count 30] [--kinds approach,cover] [--cameras fisheye] [--rates 15] [--full-size]
+    python benchmarks/people.py --cameras "" --recordings store_walk,store_walk:pinhole,euroc_mh01
 """
 
 from __future__ import annotations
 
 import argparse
 from dataclasses import dataclass, field, fields
+from itertools import count
+from pathlib import Path
 
-from _sequences import one_thread
+from _sequences import data_root, one_thread
 
 one_thread()
 
 import cv2
 import numpy as np
+from _occluders import KINDS as PAINTED_KINDS
+from _occluders import Painted, PaintedEncounter, PinholeView
 
 from stereo_sfm.config import Config
 from stereo_sfm.drivers.sim.encounters import KINDS, Encounter
@@ -97,24 +105,42 @@ def _of(values: list[float], scale: float) -> str:
     return f"{scale * np.median(values):.2g} ({scale * max(values):.2g})" if values else "–"
 
 
+Drive = SimSource | Painted
+
+
 def drive(spec: str) -> tuple[SimSource, list[Frame]]:
-    """The frames of one drive, with mapping and loops."""
+    """The frames of one simulated drive, with mapping and loops."""
     cv2.setRNGSeed(0)
     with open_source(spec) as source:
         assert isinstance(source, SimSource)
         return source, list(run(source, Config()))
 
 
-def motion_error(source: SimSource, a: Frame, b: Frame) -> tuple[float, float]:
+def painted(recording: str, kind: str, seed: int) -> tuple[Painted, list[Frame]]:
+    """The frames of a recording (FOLDER or FOLDER:pinhole) with encounters painted in; without any if `kind` is ""."""
+    folder, _, view = recording.partition(":")
+    root = data_root()
+    inner = open_source(str((root or Path()) / folder))
+    cv2.setRNGSeed(0)
+    with Painted(PinholeView(inner) if view else inner, kind, seed) as source:
+        return source, list(run(source, Config()))
+
+
+def rate_of(source: Drive) -> float:
+    """Images a second."""
+    return source.options.rate if isinstance(source, SimSource) else source.rate
+
+
+def motion_error(source: Drive, a: Frame, b: Frame) -> tuple[float, float]:
     """Metres and degrees by which the motion from frame a to b is wrong."""
     true = se3.inverse(source.pose(a.frame_id)) @ source.pose(b.frame_id)
     metres, radians = se3.extent(se3.inverse(true) @ se3.inverse(a.odom_T_cam) @ b.odom_T_cam)
     return float(metres), float(np.rad2deg(radians))
 
 
-def judge(source: SimSource, frames: list[Frame], encounter: Encounter, numbers: Numbers) -> None:
+def judge(source: Drive, frames: list[Frame], encounter: Encounter | PaintedEncounter, numbers: Numbers) -> None:
     """Add one encounter."""
-    rate = source.options.rate
+    rate = rate_of(source)
     first, last = (int(np.clip(s * rate, 1, len(frames) - 1)) for s in (encounter.begin, encounter.end))
     shares = np.array([source.moving_share(k).max() for k in range(first, last + 1)])
     if shares.max() > COVERING:
@@ -132,9 +158,9 @@ def judge(source: SimSource, frames: list[Frame], encounter: Encounter, numbers:
     numbers.right += numbers.steps == steps
 
 
-def _covered(source: SimSource, frames: list[Frame], begin: int, end: int, numbers: Numbers) -> None:
+def _covered(source: Drive, frames: list[Frame], begin: int, end: int, numbers: Numbers) -> None:
     """An encounter that takes (nearly) all of the view; people are there from frame `begin` to `end`."""
-    soon = frames[begin : min(end + 1 + round(SOON_S * source.options.rate), len(frames) - 1) + 1]
+    soon = frames[begin : min(end + 1 + round(SOON_S * rate_of(source)), len(frames) - 1) + 1]
     numbers.covering += 1
     found = soon[-1].state in TRACKED and all(frame.state != TrackState.RESTARTED for frame in soon)
     if not found:
@@ -148,7 +174,7 @@ def _covered(source: SimSource, frames: list[Frame], begin: int, end: int, numbe
     numbers.degrees.append(degrees)
 
 
-def position_error(source: SimSource, frames: list[Frame]) -> float:
+def position_error(source: Drive, frames: list[Frame]) -> float:
     """RMSE of the positions of a drive's frame poses, aligned."""
     stamps = np.array([frame.stamp_ns for frame in frames], np.int64)
     poses: F64 = np.array([frame.odom_T_cam for frame in frames])
@@ -171,6 +197,19 @@ def encounters(kind: str, camera: str, rate: int, count: int, size: str) -> Numb
     return numbers
 
 
+def painted_encounters(recording: str, kind: str, wanted: int, alone: float) -> Numbers:
+    """Encounters in a recording; `alone`: its error without people."""
+    numbers = Numbers()
+    for seed in count():
+        source, frames = painted(recording, kind, seed)
+        for encounter in source.encounters[: wanted - numbers.count]:
+            judge(source, frames, encounter, numbers)
+        numbers.errors.append((position_error(source, frames), alone))
+        if numbers.count >= wanted:
+            return numbers
+    raise AssertionError
+
+
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -179,6 +218,7 @@ def main() -> None:
     parser.add_argument("--cameras", default="fisheye,pinhole")
     parser.add_argument("--rates", default="30,15")
     parser.add_argument("--full-size", action="store_true")
+    parser.add_argument("--recordings", default="store_walk,store_walk:pinhole,euroc_mh01")
     args = parser.parse_args()
     print(
         "| encounters | found again | mm: median (most) | deg | wrong place | partly | lost frames | wrong steps"
@@ -186,7 +226,7 @@ def main() -> None:
     )
     print("|---|---|---|---|---|---|---|---|---|---|")
     held: list[str] = []
-    for camera in args.cameras.split(","):
+    for camera in filter(None, args.cameras.split(",")):
         size = "" if args.full_size else f"&size={HALF[camera]}"
         for rate in map(int, args.rates.split(",")):
             together = Numbers()
@@ -196,6 +236,12 @@ def main() -> None:
                 held.append(f"{kind}, {camera}, {rate} Hz: {numbers.held()}")
                 together.add(numbers)
             held.append(f"all, {camera}, {rate} Hz: {together.held()}")
+    for recording in filter(None, args.recordings.split(",")):
+        alone = position_error(*painted(recording, "", 0))
+        for kind in (kind for kind in PAINTED_KINDS if kind in args.kinds.split(",")):
+            numbers = painted_encounters(recording, kind, args.count, alone)
+            print(numbers.row(f"{kind}, {recording}"), flush=True)
+            held.append(f"{kind}, {recording}: {numbers.held()}")
     print("\n" + "\n".join(held))
 
 
