@@ -278,7 +278,7 @@ def _seen(cutout: Cutout, cam_T_cutout: F64, rays: F64) -> tuple[F64, F64]:
     texel = np.nan_to_num((where + cutout.half) * TEXELS, nan=-9.0).clip(-9, 1e5).astype(np.float32)
     small = cv2.GaussianBlur(cutout.texture, (0, 0), 1.0)
     colour, alpha = (
-        cv2.remap(layer, texel[..., 0], texel[..., 1], cv2.INTER_LINEAR, borderValue=0.0)
+        np.asarray(cv2.remap(layer, texel[..., 0], texel[..., 1], cv2.INTER_LINEAR, borderValue=0.0), np.float64)
         for layer in (small, cutout.alpha)
     )
     return colour, alpha
