@@ -3,7 +3,8 @@
     python benchmarks/accuracy.py [--odometry] [--max-frames N] [SEQUENCE ...]
 
 Real sequences are looked for in STEREO_SFM_DATA; `sim:` scenes are rendered. ATE is the RMSE after alignment,
-"rotation" that of the orientations. `--set manhattan.enabled=true` enables the rotation prior.
+"scale" how much too long the path is, "rotation" the RMSE of the orientations. `--set manhattan.enabled=true` enables
+the rotation prior.
 """
 
 from __future__ import annotations
@@ -26,8 +27,9 @@ from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.pipeline.run import run
 
 HEADING = (
-    "| sequence | frames | lost | path | trajectory | ATE SE(3) | % | ATE Sim(3) | rotation | drift | deg/m | points |",
-    "|---|---|---|---|---|---|---|---|---|---|---|---|",
+    "| sequence | frames | lost | path | trajectory | ATE SE(3) | % | ATE Sim(3) | scale "
+    "| rotation | drift | deg/m | points |",
+    "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
 )
 ODOMETRY_ONLY = ("mapper.enabled=false", "loop.enabled=false")
 
@@ -52,7 +54,7 @@ def rows_of(name: str, spec: str, config: configuration.Config, max_frames: int 
             result = None if reference is None else evaluate(trajectory, reference)
         except StereoSfmError:
             result = None
-        cells = "| – | – | – | – | – | – | – " if result is None else ""
+        cells = "| – | – | – | – | – | – | – | – " if result is None else ""
         rows.append(start + (f"| – | {kind} {cells}" if result is None else _errors(kind, result)) + f"| {inliers} |")
     return rows + peer_rows(name, max_frames)
 
@@ -67,7 +69,8 @@ def _errors(kind: str, result: Evaluation) -> str:
     turn = "–" if drift is None else f"{drift.rotation_deg_per_m:.4f}"
     return (
         f"| {length(result.length_m)} | {kind} | {length(result.ape_m.rmse)} | {result.ate_percent:.3f} "
-        f"| {length(result.ate_sim3_m)} | {result.ape_deg.rmse:.3f} deg | {over} | {turn} "
+        f"| {length(result.ate_sim3_m)} | {100 * (1 / result.sim3_scale - 1):+.3f} % "
+        f"| {result.ape_deg.rmse:.3f} deg | {over} | {turn} "
     )
 
 
@@ -76,7 +79,7 @@ def peer_rows(name: str, max_frames: int | None) -> list[str]:
     if max_frames is not None:
         return []
     return [
-        f"| {name} | | | | {system} | {length(se3)} | | {length(sim3)} | | | | |"
+        f"| {name} | | | | {system} | {length(se3)} | | {length(sim3)} | | | | | |"
         for system, (se3, sim3) in PEERS.get(name, {}).items()
     ]
 
