@@ -1,21 +1,23 @@
 """What must hold of IMU and wheels, each sentence with what is wanted and what is measured.
 
     python benchmarks/inertial.py [--part euroc drives rest calibration cost] [--seeds 3]
-    python benchmarks/inertial.py --part dark turn slip standing [--size 424x400] [--rate 15]
+    python benchmarks/inertial.py --part dark turn slip standing slow [--size 424x400] [--rate 15]
 
 Each part by itself:
 
-* euroc: as recorded, at a third of the rate, and with three seconds of black images, with the IMU and without; the
-  seeds vary the keyframe threshold by 3 %, and medians are compared.
+* euroc: as recorded, backwards in time, at a third of the rate, and with three seconds of black images, with the IMU
+  and without; the seeds vary the thresholds for keyframes and corners by a few per cent. With and without are compared
+  by the means of both directions and their standard error, all else by medians. A step is the motion between two
+  images. The ground truth's orientation rests on the same gyroscope: turns agree better than they are.
 * drives: roll and pitch, darkness and slip on simulated drives with exact poses and noise instead of images.
 * rest: twenty minutes at rest, likewise. calibration: wrong offset, rotation and radius. cost: a frame.
-* dark, turn, slip, standing: rendered drives, every row with the sensors and without them on the same images: five
-  seconds without light at about 1 m/s; a corner at 200 degrees a second with motion blur; wheels that turn 30 % too far
-  in turns; a minute at rest. Minutes each.
+* dark, turn, slip, standing, slow: rendered drives, every row with the sensors and without them on the same images:
+  five seconds without light at about 1 m/s; a corner at 200 degrees a second with motion blur; wheels that turn 30 %
+  too far in turns; a minute at rest; 5 m at 0.02 m/s. Minutes each.
 
 ATE is the RMSE after SE(3) alignment of every frame that has a pose, of the odometry and of the map; "off" is the
-error of the odometry over the time without images (standing: its largest movement); tilt is the largest error of roll
-and pitch where gravity is known.
+error of the odometry over the time without images (standing: its largest movement; slow: of the way from the first to
+the last image, in per cent); tilt is the largest error of roll and pitch where gravity is known.
 """
 
 from __future__ import annotations
@@ -40,14 +42,23 @@ from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.geometry import se3
 from stereo_sfm.pipeline.run import run
 from stereo_sfm.tracking.inertial.inertial_motion import roll_pitch_deg
-from stereo_sfm.types import F64, Frame, StereoImage, Trajectory
+from stereo_sfm.types import F64, Frame, ImuSamples, StereoImage, Trajectory
 
 DARK = range(80, 140)  # frames of EuRoC
 DARK_S = 10, 15  # of the simulated drives
-RENDERED = ("dark", "turn", "slip", "standing")
+SLOW_M = 5.0  # at 0.02 m/s
+RENDERED = ("dark", "turn", "slip", "standing", "slow")
 SENTENCES = ("euroc", "drives", "rest", "calibration", "cost")
 THIRD = "every third", "IMU"
-SHARES = 1.0, 0.97, 1.03  # of the keyframe threshold, by seed
+MEASURES = (  # what is compared with and without IMU: field of a result, unit
+    ("odometry", "odometry_m", "mm", 1e3),
+    ("map", "map_m", "mm", 1e3),
+    ("step", "step_m", "mm", 1e3),
+    ("turn of a step", "step_deg", "°", 1.0),
+)
+BOTH_WAYS = "as recorded", "backwards"
+SHARES = 1.0, 0.97, 1.03, 0.985, 1.015  # of the keyframe threshold, by seed
+QUALITIES = 1.0, 1.1, 0.9  # of the corner threshold, after that many seeds
 SENSORS = {"none": (False, False), "IMU": (True, False), "wheels": (False, True), "IMU and wheels": (True, True)}
 HEADER = "| images | seed | sensors | frames with a pose | submaps | odometry | map | off | tilt |\n|" + "---|" * 9
 
@@ -57,6 +68,19 @@ def darkened(images: Iterable[StereoImage]) -> Iterator[StereoImage]:
     for image in images:
         black = np.zeros_like(image.left)
         yield dataclasses.replace(image, left=black, right=black) if image.frame_id in DARK else image
+
+
+def backwards(images: list[StereoImage], truth: Trajectory) -> tuple[list[StereoImage], Trajectory]:
+    """The same flight with time reversed: it turns the other way, and is pushed alike."""
+    end = images[0].stamp_ns + images[-1].stamp_ns
+    samples = ImuSamples.joined([image.imu for image in images if image.imu is not None])
+    samples = ImuSamples((end - samples.stamp_ns)[::-1].copy(), -samples.gyro[::-1], samples.accel[::-1].copy())
+    edges = np.searchsorted(samples.stamp_ns, [end - image.stamp_ns for image in images[::-1]], side="right").tolist()
+    out = [
+        dataclasses.replace(image, frame_id=k, stamp_ns=end - image.stamp_ns, imu=samples.part(slice(first, last)))
+        for k, (image, first, last) in enumerate(zip(images[::-1], [0, *edges], edges, strict=False))
+    ]
+    return out, Trajectory((end - truth.stamp_ns)[::-1].copy(), truth.poses[::-1].copy())
 
 
 def true_pose(frame: Frame, truth: Trajectory) -> F64:
@@ -91,18 +115,28 @@ class Result:
     submaps: int
     odometry_m: float  # ATE
     map_m: float
+    step_m: float  # RMSE of the odometry's motion between two images
+    step_deg: float
     off_m: float  # at the end of the time without images; NaN without one
     back_m: float  # the same a second later
     tilt_deg: float  # of the frames, largest; NaN if gravity is not known
     gravity_deg: float  # error of its direction in the map; NaN likewise
 
 
-def result(source: Source, sensors: str, without_images: range, share: float = 1.0) -> Result:
-    """Run on a source; `without_images`: the frames over which the error of the odometry is measured."""
+def result(source: Source, sensors: str, without_images: range, seed: int = 0) -> Result:
+    """Run on a source; `without_images`: the frames over which the error of the odometry is measured.
+
+    `seed`: of the thresholds.
+    """
     inertial, wheels = SENSORS[sensors]
     tracker = Config().tracker
+    share, quality = SHARES[seed % len(SHARES)], QUALITIES[seed // len(SHARES) % len(QUALITIES)]
     tracker = dataclasses.replace(
-        tracker, inertial=inertial, wheels=wheels, keyframe_share=share * tracker.keyframe_share
+        tracker,
+        inertial=inertial,
+        wheels=wheels,
+        keyframe_share=share * tracker.keyframe_share,
+        corner_quality=quality * tracker.corner_quality,
     )
     config = dataclasses.replace(Config(), tracker=tracker)
     record = RunRecord.of(config)
@@ -116,13 +150,14 @@ def result(source: Source, sensors: str, without_images: range, share: float = 1
         before = next(f for f in reversed(frames) if f.frame_id < without_images.start)
         off = off_m(next(f for f in reversed(frames) if f.frame_id in without_images), before, truth)
         later = [f for f in frames if f.frame_id >= without_images.stop]
-        again = [f for f in later if f.stamp_ns <= later[0].stamp_ns + 1_000_000_000]
-        back = off_m(again[-1], before, truth)
+        if later:
+            again = [f for f in later if f.stamp_ns <= later[0].stamp_ns + 1_000_000_000]
+            back = off_m(again[-1], before, truth)
     submaps = 1 + max((k.submap_id for k in record.keyframes.values()), default=0)
-    gravity = gravity_deg(record, mapped, truth)
+    live = evaluate(odometry, truth)
     return Result(
-        frames, len(odometry), submaps, evaluate(odometry, truth).ape_m.rmse, map_m, off, back,
-        tilt_deg(frames, truth), gravity,
+        frames, len(odometry), submaps, live.ape_m.rmse, map_m, live.rpe_m.rmse, live.rpe_deg.rmse, off, back,
+        tilt_deg(frames, truth), gravity_deg(record, mapped, truth),
     )  # fmt: skip
 
 
@@ -142,6 +177,8 @@ def row(name: str, seed: int, sensors: str, found: Result) -> str:
     if name.startswith("standing"):
         still = found.frames[9:]
         off = length(max(float(np.linalg.norm(f.odom_T_cam[:3, 3] - still[0].odom_T_cam[:3, 3])) for f in still))
+    if name == "slow":
+        off = f"{100 * found.off_m / SLOW_M:.2f} %"
     level = "–" if np.isnan(found.tilt_deg) else f"{found.tilt_deg:.2f}°"
     errors = f"{length(found.odometry_m)} | {length(found.map_m)}"
     posed = f"{found.posed} of {len(found.frames)}"
@@ -155,24 +192,29 @@ def euroc(seeds: int) -> Iterator[Row]:
         return
     with open_source(root / "euroc_mh01") as source:
         images, rig, truth = list(source), source.rig, source.ground_truth
+    assert truth is not None
     found: dict[tuple[str, str], list[Result]] = {}
     print(HEADER)
-    for name in ("as recorded", "every third", "3 s black"):
+    for name in (*BOTH_WAYS, "every third", "3 s black"):
+        way, true = backwards(images, truth) if name == "backwards" else (images, truth)
+        memory = MemorySource(rig, list(darkened(way)) if "black" in name else way, true)
+        part = SelectedFrames(memory, frame_skip=3) if name == "every third" else memory
         for sensors in ("IMU", "none"):
-            for seed, share in enumerate(SHARES[:seeds]):
-                memory = MemorySource(rig, list(darkened(images)) if "black" in name else images, truth)
-                part = SelectedFrames(memory, frame_skip=3) if name == "every third" else memory
-                one = result(part, sensors, DARK if "black" in name else range(0), share)
+            for seed in range(seeds):
+                one = result(part, sensors, DARK if "black" in name else range(0), seed)
                 found.setdefault((name, sensors), []).append(one)
                 print(row(name, seed, sensors, one), flush=True)
 
     def mm(name: str, sensors: str, of: str) -> float:
         return 1e3 * float(np.median([getattr(one, of) for one in found[name, sensors]]))
 
-    full, plain, third = (mm(*key, "map_m") for key in (("as recorded", "IMU"), ("as recorded", "none"), THIRD))
-    live, live_plain = mm("as recorded", "IMU", "odometry_m"), mm("as recorded", "none", "odometry_m")
-    text = f"odometry {live:.2f} and {live_plain:.2f} mm, map {full:.2f} and {plain:.2f} mm"
-    yield "1 EuRoC with and without IMU", "not worse by more than the spread, 0.07 mm", text, full <= plain + 0.07
+    for what, of, unit, factor in MEASURES:
+        runs = [[factor * getattr(one, of) for way in BOTH_WAYS for one in found[way, s]] for s in ("IMU", "none")]
+        with_imu, without = (np.array(r).reshape(len(BOTH_WAYS), -1) for r in runs)
+        error = float(np.sqrt((with_imu.var(axis=1) + without.var(axis=1)).sum() / max(seeds - 1, 1)) / len(BOTH_WAYS))
+        text = f"{with_imu.mean():.4g} and {without.mean():.4g} {unit}, standard error {error:.2g}"
+        yield f"1 EuRoC with and without IMU, {what}", "not worse", text, with_imu.mean() <= without.mean() + 2 * error
+    full, third = mm("as recorded", "IMU", "map_m"), mm(*THIRD, "map_m")
     gravity = max(one.gravity_deg for one in found["as recorded", "IMU"])
     yield "1 direction of gravity", "0.3°", f"{gravity:.2f}° at most", gravity <= 0.3
     yield "1 every third frame", f"1.5 x {full:.2f} mm", f"{third:.2f} mm", third <= 1.5 * full
@@ -191,18 +233,21 @@ def euroc(seeds: int) -> Iterator[Row]:
 def store(part: str, seed: int, size: str, rate: int) -> None:
     """The rows of one drive."""
     common = f"size={size}&seed={seed}&imu=t265&wheel=differential"
-    spec, sensors, dark = {
+    spec, sensors, span = {
         "dark": (f"rate={rate}&frames={20 * rate}&dark={DARK_S[0]}-{DARK_S[1]}", list(SENSORS), range(0)),
         "turn": (f"rate={2 * rate}&corner=0.2&start={16 * rate}&frames={16 * rate}", list(SENSORS), range(0)),
         "slip": (f"rate={rate}&wheel_slip=0.3&frames={25 * rate}", ["none", "wheels", "IMU and wheels"], range(0)),
         "standing": (f"rate=5&rest=70&vibration=0&frames={60 * 5}", ["none", "IMU", "IMU and wheels"], range(0)),
+        "slow": (f"rate=4&speed=0.02&length={SLOW_M}", ["none", "IMU", "IMU and wheels"], range(0)),
     }[part]
     if part == "dark":
-        dark = range(DARK_S[0] * rate, DARK_S[1] * rate)
+        span = range(DARK_S[0] * rate, DARK_S[1] * rate)
     with open_source(f"sim:loop?{common}&{spec}") as source:
         images, rig, truth = list(source), source.rig, source.ground_truth
+    if part == "slow":  # from the first image to the last
+        span = range(1, len(images))
     for name in sensors:
-        print(row(part, seed, name, result(MemorySource(rig, images, truth), name, dark)), flush=True)
+        print(row(part, seed, name, result(MemorySource(rig, images, truth), name, span)), flush=True)
 
 
 def main() -> None:

@@ -138,7 +138,7 @@ class Tracker:
         if solution.reason:
             return self._lose(image, solution.reason)
         if self._sensors is not None:
-            solution.pose = self._sensors.settled(image.stamp_ns, solution.pose)
+            solution.pose = self._sensors.corrected(image.stamp_ns, solution.pose, solution.covariance)
         self._refine(tracks, solution, expected, recovered)
         trusted = self._trusted(tracks, solution)
         if trusted:

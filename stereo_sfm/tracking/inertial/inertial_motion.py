@@ -14,6 +14,7 @@ from stereo_sfm.geometry.preintegration import GRAVITY, Preintegrated, preintegr
 from stereo_sfm.tracking.inertial.dead_reckoning import DeadReckoning
 from stereo_sfm.tracking.inertial.inertial_filter import WRONG_CHI2, InertialFilter, InertialState
 from stereo_sfm.tracking.inertial.rest import STILL_NS
+from stereo_sfm.tracking.inertial.rotation_filter import RotationFilter
 from stereo_sfm.tracking.inertial.sample_buffer import Intervals, SampleBuffer
 from stereo_sfm.types import F64, I64, ImuSamples
 
@@ -24,6 +25,7 @@ MAX_GRAVITY_ERROR = 1.0  # m/s^2 of its size
 STILL = np.array([0.005, 0.05])  # rad/s, m/s^2: spread of a sensor at rest ...
 STILL_NOISE = 3.0  # ... and its own noise so many times
 STILL_TURN = 0.03  # rad/s that the known bias may be off
+TURN_SHARE = 2e-3  # of a turn: error of a calibrated gyroscope's scale and axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +43,7 @@ class InertialMotion:
         self._imu = imu
         self._buffer = SampleBuffer(imu)
         self._filter = InertialFilter(imu)
+        self._rotation = RotationFilter()
         self._state: InertialState | None = None
         self._node_ns = self._last_ns = 0
         self._odom_T_node: F64 = np.eye(4)
@@ -92,6 +95,7 @@ class InertialMotion:
 
     def _restart(self, stamp_ns: int, odom_T_imu: F64) -> None:
         self._filter.begin(odom_T_imu)
+        self._rotation.restart()
         self._node_ns = self._last_ns = stamp_ns
         self._odom_T_node = self._odom_T_last = odom_T_imu
 
@@ -110,6 +114,20 @@ class InertialMotion:
         position = self._odom_T_last[:3, 3] + velocity * t + 0.5 * self._state.gravity * t * t
         position = position + self._odom_T_last[:3, :3] @ motion.position_with(self._gyro_bias, accel_bias)
         return se3.from_rotation_translation(odom_R_imu, position) @ se3.inverse(self._imu.left_T_imu)
+
+    def fused(self, stamp_ns: int, seen: F64, covariance: F64) -> F64:
+        """The pose (4, 4) that an image gave, with its covariance (6, 6), corrected by the rotation since the last."""
+        motion = self.motion(self._last_ns, stamp_ns)
+        if self._state is None or motion is None or self.left_out:
+            self._rotation.restart()
+            return seen
+        cam_R_imu = self._imu.left_T_imu[:3, :3]
+        predicted = self._odom_T_last[:3, :3] @ motion.rotation @ cam_R_imu.T
+        turn = cam_R_imu @ motion.rotation @ cam_R_imu.T
+        share = TURN_SHARE * float(np.linalg.norm(se3.so3_log(turn)))
+        common = (self._state.gyro_bias_sigma * motion.seconds) ** 2 + share**2
+        noise = cam_R_imu @ motion.covariance[:3, :3] @ cam_R_imu.T + common * np.eye(3)
+        return self._rotation.fused(predicted, turn, noise, seen, covariance)
 
     def accept(self, stamp_ns: int, odom_T_cam: F64) -> None:
         """The images gave this pose (4, 4)."""

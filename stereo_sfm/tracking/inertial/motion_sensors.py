@@ -58,6 +58,12 @@ class MotionSensors:
             if sensor is not None:
                 sensor.accept(stamp_ns, odom_T_cam)
 
+    def corrected(self, stamp_ns: int, odom_T_cam: F64, covariance: F64) -> F64:
+        """The pose (4, 4) that the images gave, with its covariance (6, 6), corrected by the gyroscope and at rest."""
+        if self._inertial is not None:
+            odom_T_cam = self._inertial.fused(stamp_ns, odom_T_cam, covariance)
+        return self.settled(stamp_ns, odom_T_cam)
+
     def settled(self, stamp_ns: int, odom_T_cam: F64) -> F64:
         """The pose (4, 4) that the images gave, or the one that is held while the robot stands."""
         answers = [s.still(stamp_ns) for s in (self._inertial, self._wheels) if s is not None]
