@@ -95,7 +95,18 @@ class Choice:
 
 
 def choose(whole: Estimate, halves: Sequence[Estimate], rolling: bool = False, sigmas: float | F64 = SIGMAS) -> Choice:
-    """Drop the weakest insignificant term until all remaining terms are significant.
+    """The significant terms of `whole`, with what speaks for and against each; arguments as those of `significant`."""
+    needed, kept = np.broadcast_to(sigmas, TERMS), significant(whole, halves, rolling, sigmas)
+    final = whole.without(kept)
+    terms = tuple(_term(i, whole, halves, kept, rolling, needed[i]) for i in range(TERMS))
+    alone = np.array([t.sigma for t in terms]) / SCALES
+    return Choice(terms, final.value, np.where(kept, final.sigma, alone), kept)
+
+
+def significant(
+    whole: Estimate, halves: Sequence[Estimate], rolling: bool = False, sigmas: float | F64 = SIGMAS
+) -> Bool:
+    """(6,) terms that remain when the weakest insignificant one is dropped until there is none.
 
     Args:
         whole: estimated from all matches. halves: each from one part of them.
@@ -110,10 +121,7 @@ def choose(whole: Estimate, halves: Sequence[Estimate], rolling: bool = False, s
         if not weak.any():
             break
         kept[np.argmin(np.where(weak, strength, np.inf))] = False
-    final = whole.without(kept)
-    terms = tuple(_term(i, whole, halves, kept, rolling, needed[i]) for i in range(TERMS))
-    alone = np.array([t.sigma for t in terms]) / SCALES
-    return Choice(terms, final.value, np.where(kept, final.sigma, alone), kept)
+    return kept
 
 
 def _evidence(whole: Estimate, halves: Sequence[Estimate], kept: Bool) -> tuple[F64, Bool]:

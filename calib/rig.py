@@ -94,7 +94,9 @@ class Rig:
         range^2 * angle of `disparity_sigma` pixels / baseline across the ray; NaN where a point is.
         """
         distance = np.linalg.norm(points, axis=1)
-        across = np.linalg.norm(np.cross(points, self.left_T_right[:3, 3]), axis=1) / np.maximum(distance, 1e-9)
+        (x, y, z), (tx, ty, tz) = points.T, self.left_T_right[:3, 3]
+        twice_area = np.sqrt((y * tz - z * ty) ** 2 + (z * tx - x * tz) ** 2 + (x * ty - y * tx) ** 2)
+        across = twice_area / np.maximum(distance, 1e-9)
         return distance**2 * disparity_sigma * self.pixel_angle / np.maximum(across, 1e-3 * self.baseline + 1e-12)
 
     @property

@@ -246,6 +246,11 @@ class Keyframe(Message):
     down: F64 = field(default_factory=lambda: np.zeros(3))  # (3,) gravity's direction in this camera, zero: unknown
     down_sigma: float = 0.0  # radians, its standard deviation about each horizontal axis; 0: unknown
 
+    @property
+    def described(self) -> bool:
+        """Whether it has corners, by which its place can be recognised."""
+        return len(self.corners) + len(self.sides) > 0
+
 
 @dataclass(frozen=True, eq=False)
 class CalibrationUpdate(Message):

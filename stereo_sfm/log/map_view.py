@@ -28,9 +28,11 @@ class MapView:
     def keyframe(self, keyframe: Keyframe, map_T_odom: F64) -> None:
         """A new keyframe, at its odometry pose until the mapper moves it."""
         self._poses.add(keyframe.kf_id, map_T_odom @ keyframe.odom_T_cam)
-        for kf_id, point_ids in self._recent:
-            if np.isin(keyframe.point_ids, point_ids, assume_unique=True).sum() >= COVISIBLE_POINTS:
-                self._covisible.append((kf_id, keyframe.kf_id))
+        if self._recent:
+            ids, points = zip(*self._recent, strict=True)
+            seen = np.isin(np.concatenate(points), keyframe.point_ids)
+            shared = np.bincount(np.repeat(np.arange(len(ids)), [len(p) for p in points]), seen, len(ids))
+            self._covisible += [(ids[k], keyframe.kf_id) for k in np.flatnonzero(shared >= COVISIBLE_POINTS).tolist()]
         self._recent = [*self._recent[1 - COVISIBLE_KEYFRAMES :], (keyframe.kf_id, keyframe.point_ids)]
 
     def loop(self, result: LoopResult) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -90,6 +91,7 @@ class LoopCloser:
         self._store = KeyframeStore()
         self._graph = KeyframeGraph()
         self._pending: list[_Hypothesis] = []
+        self._described: deque[int] = deque(maxlen=config.consistent_window)  # newest keyframes with corners
         self._last_loop = -(10**9)
 
     @property
@@ -105,14 +107,18 @@ class LoopCloser:
     def step(self, keyframe: Keyframe) -> LoopResult:
         """Look for a loop with earlier keyframes, then add the keyframe."""
         bags = self._enter(keyframe)
-        with self._spans.span("loop_query"):
-            candidates, why_none = self._candidates(keyframe, *bags)
-        with self._spans.span("loop_verify"):
-            result = self._judge(keyframe, candidates, why_none)
+        result = self._search(keyframe, bags) if keyframe.described else _no_loop(keyframe.kf_id, "not_described")
         self._keep(keyframe, bags)
         self._cull(keyframe.kf_id)
         self._grow(keyframe)
         return result
+
+    def _search(self, keyframe: Keyframe, bags: tuple[voc.Bag, voc.Bag]) -> LoopResult:
+        self._described.append(keyframe.kf_id)
+        with self._spans.span("loop_query"):
+            candidates, why_none = self._candidates(keyframe, *bags)
+        with self._spans.span("loop_verify"):
+            return self._judge(keyframe, candidates, why_none)
 
     def add(self, keyframe: Keyframe) -> None:
         """Add a keyframe of a finished map, to which later ones may close loops."""
@@ -130,7 +136,10 @@ class LoopCloser:
         return bag, side_bag
 
     def _keep(self, keyframe: Keyframe, bags: tuple[voc.Bag, voc.Bag]) -> None:
-        """The keyframe can be a candidate from now on."""
+        """The keyframe can be a candidate from now on, if it has corners."""
+        if not keyframe.described:
+            self._graph.exclude(keyframe.kf_id)
+            return
         self._row[keyframe.kf_id] = len(self._database)
         self._database.add(keyframe.kf_id, bags[0])
         self._side_database.add(keyframe.kf_id, bags[1])
@@ -218,11 +227,11 @@ class LoopCloser:
             if not verdicts[k].reason:
                 loops[k] = self._hypothesis(keyframe.kf_id, candidate, verdicts[k])
         if not candidates:
-            return _no_loop(keyframe.kf_id, why_none, 0.0, ())
+            return _no_loop(keyframe.kf_id, why_none)
         candidates = candidates[: len(verdicts)]
         reasons = [verdict.reason for verdict in verdicts]
         best_inliers = max((loop.inliers for loop in loops.values() if not loop.against), default=0)
-        self._pending = [h for h in self._pending if keyframe.kf_id - h.kf_id < self._config.consistent_window]
+        self._pending = [h for h in self._pending if h.kf_id in self._described]
         self._pending += [h for h in loops.values() if h.against or h.inliers >= RIVAL * best_inliers]
         accepted = -1
         for k in sorted(loops, key=lambda k: -loops[k].inliers):
@@ -334,7 +343,9 @@ class LoopCloser:
             self._vocabulary = voc.grow(self._vocabulary, np.concatenate(recent))
 
 
-def _no_loop(kf_id: int, reason: str, score: float, rejected: tuple[tuple[int, float, str], ...]) -> LoopResult:
+def _no_loop(
+    kf_id: int, reason: str, score: float = 0.0, rejected: tuple[tuple[int, float, str], ...] = ()
+) -> LoopResult:
     return LoopResult(
         kf_id=kf_id,
         candidate_kf_id=-1,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,8 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.loop import binary
 from stereo_sfm.types import F64, I64, U8, Bool, Keyframe
+
+KEPT = 64  # newest results: the same keyframes are candidates again and again
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,6 +27,7 @@ class PlaceView:
     corner: Bool  # (N,) of `Keyframe.corners` or `Keyframe.sides`; False: a point
 
 
+@functools.lru_cache(maxsize=KEPT)
 def place_view_of(keyframe: Keyframe, rig: Rig, disparity_sigma: float, sideways: bool = False) -> PlaceView:
     """Corners of a keyframe (`sideways`: those of the views that face the shelves), then its points."""
     c = keyframe.sides if sideways else keyframe.corners

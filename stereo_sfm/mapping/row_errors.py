@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from stereo_sfm.calib.rig import Rig
+from stereo_sfm.geometry.order_statistics import median
 from stereo_sfm.geometry.stereo import epipolar_angle
 from stereo_sfm.types import F64, Keyframe, RowErrors
 
@@ -55,7 +56,7 @@ class RowMonitor:
         for k in range(len(out)):
             here = error[region == k]
             if len(here) >= MIN_MATCHES:
-                out[k] = np.median(here)
+                out[k] = median(here)
         return out.reshape(GRID)
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stereo_sfm.calib.choice import NAMES, SCALES, TERMS, UNITS, Choice, Estimate, choose
+from stereo_sfm.calib.choice import NAMES, SCALES, TERMS, UNITS, Choice, Estimate, choose, significant
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.mapping.rig_window import PRIOR, RigInformation, RigWindow, solve_window
@@ -119,11 +119,12 @@ class SelfCalibration:
         parts = [windows, windows[::2], windows[1::2]]
         whole, *halves = [self._at_the_end(part, windows)[0] if drifts else self.estimate(part) for part in parts]
         sigmas = np.where(self._corrected, REFINED_SIGMAS, SIGMAS)
-        choice = choose(whole, halves, self._rig.readout_s > 0, sigmas)
+        rolling = self._rig.readout_s > 0
         since = windows[-min(MAX_BETWEEN, len(windows))].first_kf_id if drifts else self._since
         self._until_due = min(len(windows), MAX_BETWEEN)
-        if not choice.written.any():
+        if not significant(whole, halves, rolling, sigmas).any():
             return None
+        choice = choose(whole, halves, rolling, sigmas)
         why = "drift" if drifts else "refined" if self._corrected[choice.written].all() else "significant"
         why = "step" if self._stepped else why
         self.terms = self.terms + choice.value
@@ -136,7 +137,7 @@ class SelfCalibration:
         if len(windows) < DRIFT_WINDOWS:
             return False
         whole, *halves = [self._at_the_end(part, windows)[1] for part in (windows, windows[::2], windows[1::2])]
-        return bool(choose(whole, halves, self._rig.readout_s > 0, SIGMAS).written.any())
+        return bool(significant(whole, halves, self._rig.readout_s > 0, SIGMAS).any())
 
     def _at_the_end(self, windows: Sequence[RigWindow], span: Sequence[RigWindow]) -> tuple[Estimate, Estimate]:
         """Of terms that change steadily: their change at the end of `span`, and that from its beginning to its end."""
@@ -161,7 +162,7 @@ class SelfCalibration:
             return
         base = self.estimate(before)
         change = [_difference(self.estimate(part), base) for part in (recent, recent[:1], recent[1:])]
-        if choose(change[0], change[1:], self._rig.readout_s > 0, SIGMAS).written.any():
+        if significant(change[0], change[1:], self._rig.readout_s > 0, SIGMAS).any():
             self._windows = deque(recent, maxlen=MAX_WINDOWS)
             self._since, self._stepped = recent[0].first_kf_id, True
 

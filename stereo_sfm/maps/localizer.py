@@ -50,11 +50,11 @@ class Localizer(WithoutJobs):
         if keyframe.submap_id != self._submap:
             self._submap, self._failures, self._waiting = keyframe.submap_id, LOST_AFTER, []
             self._unconfirmed = None
-        self.last = self._locate(keyframe)
+        self.last = self._locate(keyframe) if keyframe.described else not_found("not_described")
         if self.last.found:
             self._map_T_odom = se3.orthonormalize(self.last.map_T_cam @ se3.inverse(keyframe.odom_T_cam))
             self.found, self._failures = True, 0
-        else:
+        elif keyframe.described:
             self._failures += 1
         placed = self._placed(keyframe)
         return MapUpdate(

@@ -54,6 +54,7 @@ class Relocalizer:
     def __init__(self, snapshot: MapSnapshot, rig: Rig, vocabulary: Vocabulary, config: LoopConfig) -> None:
         self._map, self._rig, self._vocabulary = snapshot, rig, vocabulary
         self._keyframes = snapshot.keyframes()
+        self._described = np.flatnonzero([k.described for k in self._keyframes])
         self._near_share = config.min_inlier_share
         self._config = dataclasses.replace(
             config,
@@ -124,6 +125,7 @@ class Relocalizer:
         """The points of a keyframe row and its neighbours, in its camera frame."""
         shared = (self._sees @ self._sees[[row]].T).toarray()[:, 0]
         shared[row] = shared.max() + 1
+        shared[np.setdiff1d(np.arange(len(shared)), np.append(self._described, row))] = 0
         order = np.lexsort((np.arange(len(shared)), -shared))[: self._config.relocalize_keyframes]
         order = order[shared[order] > 0]
         centre, *others = (self._keyframes[k] for k in order.tolist())
@@ -136,7 +138,8 @@ class Relocalizer:
 
     def _places(self, scores: F64) -> list[int]:
         """The best rows, each of another place; the score of a place includes its temporal neighbours."""
-        together = with_neighbours(scores)
+        together = np.zeros(len(scores))
+        together[self._described] = with_neighbours(scores[self._described])
         chosen: list[int] = []
         for row in np.lexsort((np.arange(len(scores)), -together)).tolist():
             if len(chosen) == self._config.relocalize_candidates or scores[row] <= 0:
@@ -146,8 +149,9 @@ class Relocalizer:
         return chosen
 
     def _nearest(self, guess: F64) -> int:
-        metres, radians = se3.extent(se3.inverse(self._map.map_T_kf) @ guess)
-        return int(np.argmin(metres + radians))
+        rows = self._described if len(self._described) else np.arange(len(self._keyframes))
+        metres, radians = se3.extent(se3.inverse(self._map.map_T_kf[rows]) @ guess)
+        return int(rows[np.argmin(metres + radians)])
 
     def _location(self, row: int, verdict: Verdict, share: float, sideways: bool) -> Location:
         """The location of a verification; `share`: of the camera's corners, required but from another direction."""

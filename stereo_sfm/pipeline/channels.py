@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import queue
+import selectors
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -139,6 +140,24 @@ class DroppingOutbox(DroppingQueue[object]):
         with contextlib.suppress(OSError):  # the reader has ended
             super()._work()
         self._connection.close()
+
+
+class Arrivals:
+    """As `multiprocessing.connection.wait`, which registers all connections in each call, but they stay registered."""
+
+    def __init__(self) -> None:
+        self._connections: list[Connection] = []
+        self._selector = selectors.PollSelector()
+
+    def wait(self, connections: list[Connection], timeout_s: float) -> list[Connection]:
+        """Those of the connections that have a message or have ended, after at most so many seconds."""
+        if connections != self._connections:
+            self._selector.close()
+            self._selector = selectors.PollSelector()
+            for connection in connections:
+                self._selector.register(connection, selectors.EVENT_READ)
+            self._connections = connections
+        return [key.fileobj for key, _ in self._selector.select(timeout_s)]  # pyright: ignore[reportReturnType]
 
 
 class Inbox(Generic[T]):

@@ -17,7 +17,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.maps.folders import MapFolders
 from stereo_sfm.messages import Compiling, Localized, LogEnded, LogLine, MapSaved, Relocalize, SaveMap, Sink
 from stereo_sfm.pipeline.capture import SourceInfo
-from stereo_sfm.pipeline.channels import End, Failed
+from stereo_sfm.pipeline.channels import Arrivals, End, Failed
 from stereo_sfm.pipeline.child import UPSTREAM_LOST, Ready, Setup
 from stereo_sfm.pipeline.images import ImageLayout, ImageRing, SlotImage
 from stereo_sfm.pipeline.logger import LogOptions
@@ -150,11 +150,11 @@ class ProcessRun:
 
     def _frames(self) -> Iterator[Frame]:
         reports = self._stages.reports
+        arrivals = Arrivals()
         while reports:
-            ready = wait([*reports, self._woken], CHECK_S)
+            ready = arrivals.wait([*reports, self._woken], CHECK_S)
             self._check_stages()
             for connection in ready:
-                assert isinstance(connection, Connection)
                 try:
                     message = connection.recv()
                     if connection is self._woken:

@@ -14,7 +14,7 @@ from stereo_sfm.loop import vocabulary as voc
 from stereo_sfm.loop.closer import KEPT_NEWEST, Candidate, LoopCloser
 from stereo_sfm.loop.place_view import PlaceView
 from stereo_sfm.loop.verification import Verdict, rejection
-from stereo_sfm.types import F64, Keyframe, LoopResult
+from stereo_sfm.types import F64, Corners, Keyframe, LoopResult
 from tests.loop.store_sequence import StoreSequence, make_sequence
 
 
@@ -175,6 +175,20 @@ def test_vocabulary_grows_online(vocabulary: voc.Vocabulary) -> None:
     assert any(r.candidate_kf_id >= 0 and error_of(sequence, r) < 0.05 for r in results)
 
 
+def test_keyframes_without_corners_are_no_places(vocabulary: voc.Vocabulary) -> None:
+    """Every second keyframe is not described: loops are found by the others, and only to the others."""
+    sequence = make_sequence([0, 0], seed=6)
+    closer = LoopCloser(LoopConfig(), sequence.rig, vocabulary)
+    none = Corners.none()
+    results = [
+        closer.step(dataclasses.replace(k, corners=none, sides=none) if k.kf_id % 2 else k) for k in sequence.keyframes
+    ]
+    loops = [r for r in results if r.candidate_kf_id >= 0]
+    assert loops
+    assert all(r.candidate_kf_id % 2 == 0 and r.kf_id % 2 == 0 and error_of(sequence, r) < 0.05 for r in loops)
+    assert {r.reason for r in results if r.kf_id % 2} == {"not_described"}
+
+
 def test_of_a_view_seen_every_lap_a_few_keyframes_are_kept_and_loops_still_found(vocabulary: voc.Vocabulary) -> None:
     sequence = make_sequence([0, 1] * 7, seed=3)
     closer = LoopCloser(LoopConfig(), sequence.rig, vocabulary)
@@ -183,7 +197,8 @@ def test_of_a_view_seen_every_lap_a_few_keyframes_are_kept_and_loops_still_found
         results.append(closer.step(keyframe))
         keyframe_count.append(closer.keyframe_count)
     lap = len(sequence.keyframes) // 7
-    assert keyframe_count[lap] == lap + 1  # nothing is forgotten on the first lap
+    described = sum(keyframe.described for keyframe in sequence.keyframes[: lap + 1])
+    assert keyframe_count[lap] == described  # nothing is forgotten on the first lap
     assert keyframe_count[-1] - keyframe_count[-1 - lap] < 0.3 * lap  # hardly anything is added on the last
     assert len(closer._database) <= 2 * closer.keyframe_count + KEPT_NEWEST + 1  # what is forgotten takes no room
     assert any(r.candidate_kf_id >= 0 for r in results[-lap:])

@@ -10,7 +10,7 @@ import struct
 import numpy as np
 import pytest
 
-from stereo_sfm.pipeline.channels import Inbox, Lost, PrefetchingInbox
+from stereo_sfm.pipeline.channels import Arrivals, Inbox, Lost, PrefetchingInbox
 
 
 def test_half_a_message_makes_nobody_wait() -> None:
@@ -38,3 +38,15 @@ def test_messages_come_before_the_loss_of_their_sender(kind: type[Inbox[int] | P
     for _ in range(2):
         with pytest.raises(Lost):
             inbox.take()
+
+
+def test_arrivals_follow_the_connections_that_are_left() -> None:
+    (a, to_a), (b, to_b) = multiprocessing.Pipe(duplex=False), multiprocessing.Pipe(duplex=False)
+    arrivals = Arrivals()
+    assert arrivals.wait([a, b], 0.0) == []
+    to_b.send(1)
+    assert arrivals.wait([a, b], 10.0) == [b]
+    b.close()
+    to_a.close()
+    assert arrivals.wait([a], 10.0) == [a]  # its end is an arrival too
+    to_b.close()

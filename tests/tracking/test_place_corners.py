@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from itertools import islice
+from itertools import islice, pairwise
 
 import numpy as np
 import pytest
@@ -16,6 +16,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.loop.verification import occupied_cells
 from stereo_sfm.maps.single_image import still_keyframe
 from stereo_sfm.tracking.factory import make_tracker
+from stereo_sfm.tracking.flow.keyframes import SPACING
 from stereo_sfm.types import F32, F64, U8, Corners, Keyframe, StereoImage
 
 SOURCE = "sim:loop?size=424x400&rate=10"
@@ -100,3 +101,21 @@ def test_a_black_right_image_gives_no_corners(sequence: SimSource) -> None:
     covered = StereoImage(0, 0, image.left, np.full_like(image.left, 90))
     keyframe = still_keyframe(covered, sequence.rig)
     assert keyframe is None or len(keyframe.corners) < 10
+
+
+def test_places_are_described_where_the_view_has_changed(sequence: SimSource) -> None:
+    """Every frame is made a keyframe: some of them share one description, and none is far from one."""
+    config = load()
+    config = dataclasses.replace(config, tracker=dataclasses.replace(config.tracker, keyframe_max_frames=1))
+    tracker, keyframes = make_tracker(config, sequence.rig), list[Keyframe]()
+    for image in islice(sequence, 40):
+        _, keyframe = tracker.step(image)
+        assert keyframe is not None
+        keyframes.append(tracker.describe(keyframe))
+    described = [k for k in keyframes if k.described]
+    assert keyframes[0].described and 4 < len(described) < 20
+    for a, b in pairwise(described):
+        metres, radians = se3.extent(se3.inverse(a.odom_T_cam) @ b.odom_T_cam)
+        distance = np.median(np.linalg.norm(a.corners.points_cam, axis=1))
+        assert metres >= SPACING[0] * distance or radians >= SPACING[1]
+        assert metres < SPACING[0] * distance + 0.2

@@ -10,15 +10,17 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.order_statistics import median
 from stereo_sfm.tracking.descriptors import describe
 from stereo_sfm.tracking.flow.consensus import without_moving
-from stereo_sfm.tracking.flow.place_corners import PlaceCorners
+from stereo_sfm.tracking.flow.place_corners import SCALE, PlaceCorners
 from stereo_sfm.tracking.flow.pyramids import StereoPyramids
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.side_views import SideViews
 from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.types import F64, Corners, Keyframe, StereoImage
 
+SPACING = 1.0 - 1.0 / SCALE, 0.1  # between described places: share of their distance (one level of scale), radians
 CORRELATED_S = 5.0  # for which the error of gravity's direction stays about the same
 
 
@@ -34,6 +36,7 @@ class Keyframes:
     ) -> None:
         self._config, self._shutter = config, shutter
         self._place_corners, self._side_views = place_corners, side_views
+        self._described: tuple[Keyframe, float] | None = None  # newest with corners, their median distance in metres
         self.count = 0
         self.points = 0  # static points of the newest keyframe
         self._pose: F64 = np.eye(4)  # odom_T_cam of the newest keyframe
@@ -117,11 +120,23 @@ class Keyframes:
         )
 
     def _corners(self, keyframe: Keyframe, images: StereoPyramids, tracks: Tracks) -> tuple[Corners, Corners]:
-        """Static corners for place recognition: of the image, and of its side views."""
+        """Static corners for place recognition: of the image, and of its side views; none near the last described."""
         corners = sides = Corners.none()
+        if not self._place_due(keyframe):
+            return corners, sides
         if self._place_corners is not None:
             corners = without_moving(self._place_corners.find_in(images.left, images.right), tracks)
+            distances = np.linalg.norm(corners.points_cam, axis=1).astype(np.float64)
+            self._described = keyframe, median(distances) if len(distances) else 0.0
         if self._side_views is not None:
             sides = self._side_views.find(images.left, images.right, corners, keyframe.odom_T_cam, keyframe.submap_id)
             sides = without_moving(sides, tracks)
         return corners, sides
+
+    def _place_due(self, keyframe: Keyframe) -> bool:
+        """Whether the view differs from the newest described one by more than place recognition bridges anyway."""
+        if self._described is None or self._described[0].submap_id != keyframe.submap_id:
+            return True
+        newest, distance = self._described
+        metres, radians = se3.extent(se3.inverse(newest.odom_T_cam) @ keyframe.odom_T_cam)
+        return bool(metres >= SPACING[0] * distance or radians >= SPACING[1])

@@ -52,8 +52,10 @@ class Recovery:
             self._places.use(rig)
 
     def remember(self, keyframe: Keyframe) -> None:
-        """Add a keyframe for later searches."""
+        """Add a keyframe for later searches, if it has corners."""
         self._next = 0
+        if not keyframe.described:
+            return
         if self._places is not None:
             self._places.add(keyframe)
         if len(keyframe.corners):

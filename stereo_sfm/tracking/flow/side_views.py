@@ -7,8 +7,11 @@ axes are perpendicular to the shelf fronts, and are stored with their pixels in 
 view that they have.
 """
 
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false
+
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -18,6 +21,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.dominant_direction import dominant_direction
+from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.tracking.flow.klt import Pyramid
 from stereo_sfm.tracking.flow.place_corners import BORDER, FAST_THRESHOLD, LEVELS, SCALE, seen_by_both
 from stereo_sfm.tracking.flow.stereo import StereoMatcher
@@ -26,6 +30,7 @@ from stereo_sfm.types import F32, F64, U8, Corners
 FOCAL = 0.7  # focal length of a view over the camera's: about the resolution of the image
 HALF_ANGLES = 2.14, 1.0  # tangents of half the field of view, horizontal and vertical: 65 and 45 degrees
 NODE_SPACING = 16  # px of a view between exactly projected pixels; the map is interpolated between them
+OUTSIDE = np.float32(-1e3)  # px: no pixel of the image
 MIN_NODES = 3  # of these in both directions; with fewer there is no view
 HEIGHT_BAND, MAX_SIGMA = (
     1.1,
@@ -120,13 +125,11 @@ class SideViews:
             return None
         cut = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
         nodes = np.where(seen[..., None], uv, np.nan)[cut].astype(np.float32)
-        maps = _interpolated(nodes[..., 0]), _interpolated(nodes[..., 1])
-        mask = np.isfinite(maps[0] + maps[1]).astype(np.uint8)
-        maps = np.nan_to_num(maps[0], nan=-1e3), np.nan_to_num(maps[1], nan=-1e3)
+        *maps, mask = _interpolated(nodes)
         if self._left_mask is not None:
             mask &= np.asarray(cv2.remap(self._left_mask, maps[0], maps[1], cv2.INTER_NEAREST), np.uint8)
         mask = np.asarray(cv2.erode(mask, np.ones((2 * BORDER + 1, 2 * BORDER + 1), np.uint8)), np.uint8)
-        return _View(camera_R_view, np.array([x[columns[0]], y[rows[0]]]), maps, mask)
+        return _View(camera_R_view, np.array([x[columns[0]], y[rows[0]]]), (maps[0], maps[1]), mask)
 
     def _corners(self, left: Pyramid, right: Pyramid | F32, view: _View) -> Corners:
         image = cv2.remap(left[0], view.maps[0], view.maps[1], cv2.INTER_LINEAR)
@@ -138,13 +141,33 @@ class SideViews:
         return seen_by_both(self._stereo, left, right, uv, np.asarray(descriptors, np.uint8))
 
 
-def _interpolated(nodes: F32) -> F32:
-    """Nodes (H, W) NODE_SPACING px apart, interpolated for all pixels; NaN beside a node that is NaN."""
-    size = (nodes.shape[1] - 1) * NODE_SPACING, (nodes.shape[0] - 1) * NODE_SPACING
-    scale = np.array([[NODE_SPACING, 0, 0], [0, NODE_SPACING, 0]], np.float64)
-    return np.asarray(
-        cv2.warpAffine(nodes, scale, size, flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float32
-    )
+@njit
+def _interpolated(nodes):
+    """Pixels (H, W, 2) at nodes NODE_SPACING px apart, bilinear for all pixels of the view.
+
+    Returns:
+        Two (H', W') float32, columns and rows of the image, and (H', W') uint8, 0 beside a node that is NaN.
+    """
+    step = NODE_SPACING
+    h, w = (nodes.shape[0] - 1) * step, (nodes.shape[1] - 1) * step
+    columns, rows = np.full((h, w), OUTSIDE, np.float32), np.full((h, w), OUTSIDE, np.float32)
+    seen = np.zeros((h, w), np.uint8)
+    for i in range(nodes.shape[0] - 1):
+        for j in range(nodes.shape[1] - 1):
+            if math.isnan(nodes[i, j, 0] + nodes[i, j + 1, 0] + nodes[i + 1, j, 0] + nodes[i + 1, j + 1, 0]):
+                continue
+            for y in range(step):
+                down = np.float32(y / step)
+                u0 = nodes[i, j, 0] + down * (nodes[i + 1, j, 0] - nodes[i, j, 0])
+                u1 = nodes[i, j + 1, 0] + down * (nodes[i + 1, j + 1, 0] - nodes[i, j + 1, 0])
+                v0 = nodes[i, j, 1] + down * (nodes[i + 1, j, 1] - nodes[i, j, 1])
+                v1 = nodes[i, j + 1, 1] + down * (nodes[i + 1, j + 1, 1] - nodes[i, j + 1, 1])
+                for x in range(step):
+                    across = np.float32(x / step)
+                    columns[i * step + y, j * step + x] = u0 + across * (u1 - u0)
+                    rows[i * step + y, j * step + x] = v0 + across * (v1 - v0)
+                    seen[i * step + y, j * step + x] = 1
+    return columns, rows, seen
 
 
 def _lateral_distance(points: F64) -> float:
