@@ -32,6 +32,7 @@ PACKAGES = "python3,python3-venv"
 NEEDED = "debootstrap", "qemu-aarch64-static"
 HANDLER = Path("/proc/sys/fs/binfmt_misc/qemu-aarch64")  # the kernel's, for programs of the other processor
 CERTIFICATES = Path("/etc/ssl/certs/ca-certificates.crt")  # with those that this machine trusts besides
+CHROOT = shutil.which("chroot") or "/usr/sbin/chroot"  # not on the path of the other system's programs
 LARGEST_M = 1e-6  # between the positions of a frame on the two processors
 RUN = ["--inline", "--log", "none", "-q", "--overwrite"]
 
@@ -71,7 +72,7 @@ class ArmRoot:
     def run(self, *command: str) -> None:
         """Run a program of the system to its end."""
         environment = {"PATH": "/usr/bin:/bin", "HOME": "/root", "PIP_CERT": str(CERTIFICATES)}
-        subprocess.run(["chroot", str(self.folder), *command], check=True, env=environment)
+        subprocess.run([CHROOT, str(self.folder), *command], check=True, env=environment)
 
     def install(self, wheel: Path) -> None:
         """Install the package from its wheel; everything that it needs must have a wheel too."""

@@ -13,6 +13,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
+from stereo_sfm.geometry.dominant_direction import MIN_POINTS, dominant_direction
 from stereo_sfm.geometry.preintegration import GRAVITY
 from stereo_sfm.pipeline.stages import make_closer
 from stereo_sfm.timing import NoSpans
@@ -130,6 +131,7 @@ def warm_up_stage(stage: str, config: Config, rig: Rig) -> None:
             keyframe = tracker.step(image)[1]
             if keyframe is not None:
                 tracker.describe(keyframe)
+        dominant_direction(np.eye(MIN_POINTS, 2))  # of shelves, which the wall may be too far away to be
         warm_up_fast_motion(config, rig, seen[-1].left)
     elif stage == "mapper" and rig.stereo:
         mapper = Mapper(config.mapper, rig, NoSpans(), config.loop)

@@ -1,9 +1,9 @@
 """Corners for place recognition: ORB features of the image, tracked or not, with their stereo depth.
 
 Tracked points were detected in the image of their first observation; only one in eight of them is detected again when
-the place is revisited. Place recognition therefore has corners of its own, detected in
-keyframes whose view differs enough from the last with corners (`Keyframes`). A point may be a
-corner on several levels of the scale pyramid, for matching from other distances.
+the place is revisited. Place recognition therefore has corners of its own, detected in keyframes whose view differs
+enough from the newest one with corners (`Keyframes`). A point may be a corner on several levels of the scale pyramid,
+for matching from other distances.
 """
 
 from __future__ import annotations
