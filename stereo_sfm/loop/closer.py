@@ -114,6 +114,7 @@ class LoopCloser:
         return result
 
     def _search(self, keyframe: Keyframe, bags: tuple[voc.Bag, voc.Bag]) -> LoopResult:
+        """Look for a loop with a keyframe that has corners."""
         self._described.append(keyframe.kf_id)
         with self._spans.span("loop_query"):
             candidates, why_none = self._candidates(keyframe, *bags)

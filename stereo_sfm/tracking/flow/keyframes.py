@@ -21,6 +21,7 @@ from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.types import F64, Corners, Keyframe, StereoImage
 
 SPACING = 1.0 - 1.0 / SCALE, 0.1  # between described places: share of their distance (one level of scale), radians
+FIRST = 4  # keyframes of a submap that are described in any case: by them it joins the others
 CORRELATED_S = 5.0  # for which the error of gravity's direction stays about the same
 
 
@@ -37,6 +38,7 @@ class Keyframes:
         self._config, self._shutter = config, shutter
         self._place_corners, self._side_views = place_corners, side_views
         self._described: tuple[Keyframe, float] | None = None  # newest with corners, their median distance in metres
+        self._begun = -1, 0  # newest submap, and its first keyframe
         self.count = 0
         self.points = 0  # static points of the newest keyframe
         self._pose: F64 = np.eye(4)  # odom_T_cam of the newest keyframe
@@ -135,7 +137,9 @@ class Keyframes:
 
     def _place_due(self, keyframe: Keyframe) -> bool:
         """Whether the view differs from the newest described one by more than place recognition bridges anyway."""
-        if self._described is None or self._described[0].submap_id != keyframe.submap_id:
+        if keyframe.submap_id != self._begun[0]:
+            self._begun = keyframe.submap_id, keyframe.kf_id
+        if self._described is None or keyframe.kf_id < self._begun[1] + FIRST:
             return True
         newest, distance = self._described
         metres, radians = se3.extent(se3.inverse(newest.odom_T_cam) @ keyframe.odom_T_cam)
