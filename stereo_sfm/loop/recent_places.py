@@ -31,16 +31,19 @@ class RecentPlaces:
     def __init__(self, config: LoopConfig, rig: Rig) -> None:
         self._config, self._rig = config, rig
         self._keyframes: deque[Keyframe] = deque(maxlen=NEWEST_KEYFRAMES)
+        self._clouds: dict[int, Cloud] = {}  # by keyframe id: those that were needed since the newest keyframe
 
     def use(self, rig: Rig) -> None:
         """Use a corrected rig."""
         self._rig = rig
+        self._clouds.clear()
 
     def add(self, keyframe: Keyframe) -> None:
         """Add the newest keyframe; a new submap discards the earlier ones."""
         if self._keyframes and self._keyframes[-1].submap_id != keyframe.submap_id:
             self._keyframes.clear()
         self._keyframes.append(keyframe)
+        self._clouds.clear()
 
     def find(self, keyframe: Keyframe, expected: F64) -> Iterator[F64]:
         """Hypotheses odom_T_cam (4, 4) of the camera's pose, most likely first, not verified.
@@ -60,8 +63,10 @@ class RecentPlaces:
                     yield se3.orthonormalize(centre.odom_T_cam @ se3.inverse(b_T_a))
 
     def _around(self, centre: Keyframe) -> Cloud:
-        others = sorted(self._keyframes, key=lambda k: (abs(k.kf_id - centre.kf_id), k.kf_id))[1 : 1 + NEIGHBOURS]
-        return gather(centre, others, self._rig, self._config.disparity_sigma_px)
+        if centre.kf_id not in self._clouds:
+            others = sorted(self._keyframes, key=lambda k: (abs(k.kf_id - centre.kf_id), k.kf_id))[1 : 1 + NEIGHBOURS]
+            self._clouds[centre.kf_id] = gather(centre, others, self._rig, self._config.disparity_sigma_px)
+        return self._clouds[centre.kf_id]
 
     def _match(self, b_T_a: F64, view: PlaceView, cloud: Cloud, share: float, rng: np.random.Generator) -> F64 | None:
         """b_T_a from corners within a share of the image's width of their projections; None if too few agree."""
