@@ -110,7 +110,7 @@ def cost() -> Iterator[Row]:
             begin = time.process_time()
             sensors.feed(image)
             sensors.predict(stamp, last, np.zeros(6))
-            last = sensors.settled(stamp, seen)
+            last = sensors.corrected(stamp, seen, np.diag(NOISE**2))
             sensors.accept(stamp, last)
             took.append(time.process_time() - begin)
         ms = 1e3 * float(np.mean(took[2 * RATE :]))

@@ -39,9 +39,8 @@ class RotationFilter:
             return seen
         expected = turn.T @ self._covariance @ turn + noise
         off = se3.so3_log(seen[:3, :3].T @ predicted)
-        s = covariance[3:, 3:] + expected
-        self.chi2 = float(off @ np.linalg.solve(s, off))
-        s = s * max(self.chi2 / DOUBTED_CHI2, 1.0)
-        gain = covariance[:, 3:] @ np.linalg.inv(s)
-        self._covariance = covariance[3:, 3:] - gain[3:] @ s @ gain[3:].T
-        return se3.orthonormalize(seen @ se3.exp(gain @ off))
+        information = np.linalg.inv(covariance[3:, 3:] + expected)
+        self.chi2 = float(off @ information @ off)
+        gain = covariance[:, 3:] @ (information * (DOUBTED_CHI2 / max(self.chi2, DOUBTED_CHI2)))
+        self._covariance = covariance[3:, 3:] - gain[3:] @ covariance[3:, 3:]
+        return seen @ se3.exp(gain @ off)
