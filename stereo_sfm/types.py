@@ -331,6 +331,8 @@ class LoopResult(Message):
     score: float  # similarity of the bags of words, from 0 to 1
     reason: str  # "" when accepted, else why the best candidate was rejected ("no_candidate", "too_few_inliers", ...)
     rejected: tuple[tuple[int, float, str], ...] = ()  # every rejected candidate: (kf_id, score, reason)
+    # (S, 3) corners of side views that the loop matched: number of the corner, keyframe, row in its `sides`
+    sightings: I64 = field(default_factory=lambda: np.zeros((0, 3), np.int64), metadata=shape(-1, 3))
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections import deque
 from dataclasses import dataclass
@@ -257,7 +258,11 @@ class LoopCloser:
         verdict = verify(view, cloud, self._rig, config, rng, move_points=not candidate.sideways)
         if candidate.sideways and verdict.b_T_a[2, 2] >= TURNED and not verdict.reason:
             return rejection("same_direction", verdict.inliers)  # other corners show it more precisely
-        return verdict
+        if not candidate.sideways:  # its points are shared
+            return dataclasses.replace(verdict, sightings=np.zeros((0, 3), np.int64))
+        sightings = verdict.sightings.copy()
+        sightings[:, 1] = np.array([k.kf_id for k in (centre, *around, keyframe)])[sightings[:, 1]]
+        return dataclasses.replace(verdict, sightings=sightings)
 
     def _hypothesis(self, kf_id: int, of: Candidate, verdict: Verdict) -> _Hypothesis:
         """A verified candidate, compared with the odometry between its ends.
@@ -335,6 +340,7 @@ class LoopCloser:
             score=candidate.score,
             reason="",
             rejected=rejected,
+            sightings=verdict.sightings,
         )
 
     def _grow(self, keyframe: Keyframe) -> None:

@@ -33,7 +33,8 @@ class Cloud:
     descriptors: U8  # (M, 32)
     uv_left: F64  # (M, 2) px in the image of the row's own keyframe
     uv_right: F64  # (M, 2)
-    corner: Bool  # (M,) of `Keyframe.corners`; False: a point
+    corner: Bool  # (M,) of `Keyframe.corners` or `Keyframe.sides`; False: a point
+    rows: I64  # (M,) of a corner: its row there
     view: I64  # (M,) the row's own keyframe: row of centre_T_kf
     centre_T_kf: F64  # (V, 4, 4); row 0 is the centre
 
@@ -77,7 +78,7 @@ def gather(
         deep = np.flatnonzero(np.isfinite(view.points[:, 2]))
         new = cloud.part(slice(count, count + len(deep)))
         new.ids[:], new.view[:], new.points[:] = ids[deep], k, se3.transform(centre_T_kf[k], view.points[deep])
-        for name in ("sigmas", "descriptors", "uv_left", "uv_right", "corner"):
+        for name in ("sigmas", "descriptors", "uv_left", "uv_right", "corner", "rows"):
             getattr(new, name)[:] = getattr(view, name)[deep]
         count += len(deep)
     return cloud.part(slice(count))
@@ -88,7 +89,7 @@ def _room(count: int, centre_T_kf: F64) -> Cloud:
     three, two, one = (np.empty((count, n)) for n in (3, 2, 1))
     return Cloud(
         np.empty(count, np.int64), three, one[:, 0], np.empty((count, 32), np.uint8), two, two.copy(),
-        np.empty(count, bool), np.empty(count, np.int64), centre_T_kf,
+        np.empty(count, bool), np.empty(count, np.int64), np.empty(count, np.int64), centre_T_kf,
     )  # fmt: skip
 
 

@@ -25,6 +25,7 @@ class PlaceView:
     sigmas: F64  # (N,) metres along the ray
     descriptors: U8  # (N, 32), none of them zero
     corner: Bool  # (N,) of `Keyframe.corners` or `Keyframe.sides`; False: a point
+    rows: I64  # (N,) of a corner: its row there
 
 
 @functools.lru_cache(maxsize=KEPT)
@@ -46,4 +47,5 @@ def place_view_of(keyframe: Keyframe, rig: Rig, disparity_sigma: float, sideways
         rig.range_sigmas(points[rows], disparity_sigma),
         descriptors[rows],
         corner[rows],
+        rows,
     )

@@ -6,7 +6,7 @@ candidate are then projected with that pose to find the matches that the first m
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -36,6 +36,8 @@ class Verdict:
     pairs: I64  # (M, 2) point ids: candidate's, camera's; corners that are not map points are left out
     inliers: int  # corners that agree with the pose
     share: float  # of the camera's corners that are inliers
+    # (S, 3) of the inliers among the corners: number of the corner, keyframe of the cloud (-1: camera), row there
+    sightings: I64 = field(default_factory=lambda: np.zeros((0, 3), np.int64))
 
 
 def rejection(reason: str, inliers: int = 0) -> Verdict:
@@ -105,7 +107,18 @@ def verify_near(
     if move_points:
         b_T_a = refine_with_points(b_T_a, view, cloud, rows_b, rows_a, rig, config)
     pairs = np.stack([cloud.ids[rows_a], view.ids[rows_b]], axis=1)
-    return Verdict("", b_T_a, pose.information, pairs[(pairs >= 0).all(axis=1)], inliers, share)
+    pairs = pairs[(pairs >= 0).all(axis=1)]
+    return Verdict("", b_T_a, pose.information, pairs, inliers, share, corner_sightings(view, cloud, rows_b, rows_a))
+
+
+def corner_sightings(view: PlaceView, cloud: Cloud, rows_b: I64, rows_a: I64) -> I64:
+    """(S, 3) where matched corners are seen, as in `Verdict`: by the camera and by all keyframes of the cloud."""
+    corner = view.corner[rows_b]
+    ids, first = np.unique(cloud.ids[rows_a[corner]], return_index=True)
+    camera = np.stack([np.arange(len(ids)), np.full(len(ids), -1), view.rows[rows_b[corner][first]]], axis=1)
+    seen = np.flatnonzero(np.isin(cloud.ids, ids))
+    around = np.stack([np.searchsorted(ids, cloud.ids[seen]), cloud.view[seen], cloud.rows[seen]], axis=1)
+    return np.concatenate([camera, around])
 
 
 def refine_with_points(

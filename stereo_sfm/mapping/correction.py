@@ -21,6 +21,7 @@ from stereo_sfm.mapping.averaging import average_correction
 from stereo_sfm.mapping.level import weights
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.mapping.pose_graph import Edges, Gravity, edges_of_poses, join, optimise
+from stereo_sfm.mapping.side_points import join_corners
 from stereo_sfm.types import F64, I64, LoopResult
 
 COVISIBLE_POINTS = 30  # shared points of keyframes that get an edge in the pose graph
@@ -67,7 +68,7 @@ def apply_loop(
     rows = map_.living_keyframes()
     map_.move_keyframes(rows, after[rows])
     map_.carry_points(before, after)
-    return Correction(True, fuse_pairs(map_, loop.matches, match_sigma_px))
+    return Correction(True, fuse_sides(map_, loop, match_sigma_px))
 
 
 def loop_is_known(map_: Map, loop: LoopResult, connected_points: int) -> bool:
@@ -80,6 +81,16 @@ def loop_is_known(map_: Map, loop: LoopResult, connected_points: int) -> bool:
     error = se3.log(se3.inverse(loop.candidate_T_kf) @ se3.inverse(poses[a]) @ poses[b])
     metres, radians = loop_sigmas(loop.information)
     return bool(np.linalg.norm(error[:3]) < metres and np.linalg.norm(error[3:]) < radians)
+
+
+def fuse_sides(map_: Map, loop: LoopResult, match_sigma_px: float) -> list[tuple[int, int]]:
+    """Make one of what both sides of a loop see: its pairs of points, and its corners, which become points.
+
+    Returns:
+        Point rows (removed, kept).
+    """
+    fused = fuse_pairs(map_, loop.matches, match_sigma_px)
+    return fused + join_corners(map_, loop.sightings, match_sigma_px)
 
 
 def fuse_pairs(map_: Map, pairs: I64, match_sigma_px: float) -> list[tuple[int, int]]:

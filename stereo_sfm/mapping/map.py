@@ -4,7 +4,8 @@ Ids are never reused: a culled keyframe or point keeps its row and loses `alive`
 of the point that replaced it. Keyframe rows are permanent; point and observation rows stay until `compact` frees those
 of removed ones, so that a day in the same aisles fits into memory. The observations of a keyframe are
 one run of rows; those of a point a linked list through the table, so that the cost of inserting a keyframe
-depends on its observations, not on the size of the map.
+depends on its observations, not on the size of the map. Points that a loop made of corners belong to no track: the
+tracker never hears of them.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ class MapDelta:
     map_T_kf: F64  # (K, 4, 4)
     culled_kf: I64  # (R, 2) rows: a culled keyframe, the keyframe that carries it
     carrier_T_kf: F64  # (R, 4, 4) its pose relative to the carrier
-    pt_rows: I64  # (P,) new or moved living points, ascending
+    pt_rows: I64  # (P,) new or moved living points that have tracks, ascending
     xyz: F64  # (P, 3)
 
 
@@ -228,10 +229,14 @@ class Map:
         self._changed_pt.append(rows)
         return rows
 
+    def add_untracked(self, xyz: F64, anchor: int, sigma: float) -> int:
+        """Add a point (3,) that no track belongs to, see `MapDelta`. Returns its row."""
+        return self.points.append(1, xyz=xyz, anchor=anchor, last_seen=anchor, sigma=sigma).start
+
     def observe(self, kf: int, pt_rows: I64, uv_left: F64, uv_right: F64, descriptors: U8) -> I64:
-        """Observations of the newest keyframe, one a point. Returns their rows."""
-        if kf != len(self.keyframes) - 1:
-            raise StereoSfmError("observations are added to the newest keyframe only")
+        """Further observations of a keyframe, one a point. Returns their rows."""
+        if self.keyframes.obs_first[kf] + self.keyframes.obs_count[kf] != len(self.observations):
+            self._move_to_end(kf)
         rows = self.observations.append(
             len(pt_rows),
             kf=kf,
@@ -245,11 +250,22 @@ class Map:
         self.keyframes.obs_count[kf] += len(pt_rows)
         self.points.obs_count[pt_rows] += 1
         self.points.seen[pt_rows] += 1
-        self.points.last_seen[pt_rows] = kf
+        self.points.last_seen[pt_rows] = np.maximum(self.points.last_seen[pt_rows], kf)
         made = np.arange(rows.start, rows.stop)
         described = descriptors.any(axis=1)
         self.points.descriptor_obs[pt_rows[described]] = made[described]
         return made
+
+    def _move_to_end(self, kf: int) -> None:
+        """Move the observations of a keyframe to the end of the table, where more can follow."""
+        table, rows = self.observations, self.observations_of_keyframe(kf)
+        columns = {name: getattr(table, name)[rows] for name in table.SPEC if name != "following"}
+        standing = self.points.descriptor_obs[columns["pt"]] == rows
+        map_kernels.unlink(rows, self.points.head, table.following, table.pt)
+        made = table.append(len(rows), **columns)
+        map_kernels.link(made.start, self.points.head, table.following, table.pt)
+        self.points.descriptor_obs[columns["pt"][standing]] = np.arange(made.start, made.stop)[standing]
+        self.keyframes.obs_first[kf], self.keyframes.obs_count[kf] = made.start, len(rows)
 
     # -- changing ----------------------------------------------------------------------------------------------------
 
@@ -421,7 +437,7 @@ class Map:
         gone = np.array(self._culled_kf, np.int64)
         culled = np.stack([gone, self.keyframes.carrier[gone]], 1), self.keyframes.carrier_T_kf[gone]
         pt = np.unique(np.concatenate([np.zeros(0, np.int64), *self._changed_pt]))
-        pt = pt[self.points.alive[pt] & np.isfinite(self.points.xyz[pt, 0])]
+        pt = pt[self.points.alive[pt] & np.isfinite(self.points.xyz[pt, 0]) & (self.points.pt_id[pt] >= 0)]
         self._changed_kf.clear()
         self._changed_pt.clear()
         self._culled_kf.clear()
@@ -430,12 +446,16 @@ class Map:
     def snapshot(self) -> MapSnapshot:
         """Copy of the living keyframes, points and observations."""
         kfs, pts, table = self.living_keyframes(), self.living_points(), self.observations
-        pts = pts[np.argsort(self.points.pt_id[pts])]
+        ids = self.points.pt_id[pts]
+        ids[ids < 0] = ids.max(initial=-1) + 1 + np.arange(np.count_nonzero(ids < 0))
+        order = np.argsort(ids)
+        ids, pts = ids[order], pts[order]
         kf_index = np.full(len(self.keyframes), -1, np.int64)
         kf_index[kfs] = np.arange(len(kfs))
         pt_index = np.full(len(self.points) + 1, -1, np.int64)
         pt_index[pts] = np.arange(len(pts))
         obs = np.flatnonzero((table.pt >= 0) & (kf_index[table.kf] >= 0) & (pt_index[table.pt] >= 0))
+        obs = obs[np.argsort(table.kf[obs], kind="stable")]
         k, p = self.keyframes, self.points
         counts = np.array([[len(c) for c in self.corners[row]] for row in kfs.tolist()], np.int64).reshape(-1, 2)
         corners = Corners.joined([c for row in kfs.tolist() for c in self.corners[row]])
@@ -447,7 +467,7 @@ class Map:
             map_T_kf=k.map_T_kf[kfs],
             down=k.down[kfs],
             down_sigma=k.down_sigma[kfs],
-            pt_ids=p.pt_id[pts],
+            pt_ids=ids,
             points=p.xyz[pts],
             anchors=kf_index[self._anchors(pts)],
             seen=p.seen[pts].astype(np.int64),

@@ -43,7 +43,7 @@ from stereo_sfm.config import LoopConfig, MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping import culling, window
 from stereo_sfm.mapping.bundle import BundleConfig, BundleResult, bundle_adjust
-from stereo_sfm.mapping.correction import apply_loop, fuse_pairs, loop_is_known
+from stereo_sfm.mapping.correction import apply_loop, fuse_sides, loop_is_known
 from stereo_sfm.mapping.insertion import insert_keyframe
 from stereo_sfm.mapping.level import down_of
 from stereo_sfm.mapping.map import Map, MapSnapshot
@@ -177,7 +177,7 @@ class Mapper:
 
     def _update(self, kf_id: int) -> MapUpdate:
         delta = self.map.take_delta()
-        culled = np.unique(np.concatenate([np.zeros(0, np.int64), *self._culled]))
+        culled = self.map.points.pt_id[np.unique(np.concatenate([np.zeros(0, np.int64), *self._culled]))]
         fused = self.map.points.pt_id[np.array(self._fused, np.int64).reshape(-1, 2)]
         refused = np.array(self._refused, np.int64)
         self._culled, self._fused, self._refused = [], [], []
@@ -190,8 +190,8 @@ class Mapper:
             map_T_kf=delta.map_T_kf,
             point_ids=self.map.points.pt_id[delta.pt_rows],
             points_map=delta.xyz,
-            culled_point_ids=self.map.points.pt_id[culled],
-            fused_point_ids=fused,
+            culled_point_ids=culled[culled >= 0],
+            fused_point_ids=fused[(fused >= 0).all(axis=1)],
             map_T_odom=self._map_T_odom.copy(),
             culled_kf_ids=self.map.keyframes.kf_id[delta.culled_kf[:, 0]],
             carrier_kf_ids=self.map.keyframes.kf_id[delta.culled_kf[:, 1]],
@@ -238,7 +238,7 @@ class Mapper:
         """Correct the map for a loop that the pose graph accepts, and start a full bundle adjustment."""
         received, loop = loop, self._between_living(loop)
         if loop.candidate_kf_id == loop.kf_id or loop_is_known(self.map, loop, self._config.connected_points):
-            self._fused += fuse_pairs(self.map, loop.matches, self._config.match_sigma_px)
+            self._fused += fuse_sides(self.map, loop, self._config.match_sigma_px)
             self._bundle_when_grown(GROWTH_AT_KNOWN_LOOP)
             return
         before = self.map.keyframes.map_T_kf[-1].copy()

@@ -19,7 +19,7 @@ class KeyframeTable(Columns):
     submap_id: I64
     map_T_kf: F64  # (K, 4, 4)
     previous: I64  # row of the keyframe before it in the same submap, -1: none
-    obs_first: I64  # first row of its observations
+    obs_first: I64  # first row of its observations, which follow each other
     obs_count: I64  # observations made, of which some may have been removed since
     carrier: I64  # of a culled keyframe: the row of the one it moves with, -1 if alive
     carrier_T_kf: F64  # (K, 4, 4)
@@ -47,7 +47,7 @@ class KeyframeTable(Columns):
 class PointTable(Columns):
     """One row for each physical point."""
 
-    pt_id: I64
+    pt_id: I64  # of its track, -1: it has none
     xyz: F64  # (P, 3) map frame, NaN until it is triangulated
     anchor: I32  # keyframe row that carries the point when keyframes are corrected
     head: I32  # newest observation, -1: none

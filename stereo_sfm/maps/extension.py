@@ -85,6 +85,7 @@ class Extension(Mapper):
 
     def _with_everything(self, update: MapUpdate) -> MapUpdate:
         keyframes, points = self.map.living_keyframes(), self.map.living_points()
+        points = points[self.map.points.pt_id[points] >= 0]
         return dataclasses.replace(
             update,
             kf_ids=self.map.keyframes.kf_id[keyframes],

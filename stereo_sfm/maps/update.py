@@ -19,7 +19,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.closer import LoopCloser
 from stereo_sfm.loop.vocabulary import Vocabulary
-from stereo_sfm.mapping.correction import apply_loop, fuse_pairs, loop_is_known
+from stereo_sfm.mapping.correction import apply_loop, fuse_sides, loop_is_known
 from stereo_sfm.mapping.map import Map, MapSnapshot
 from stereo_sfm.maps.merge import full_adjustment, restore_for_merging, session_closer, share_a_session, subset
 from stereo_sfm.maps.saved_map import SavedMap, joined
@@ -111,7 +111,7 @@ def _close(
         if result.candidate_kf_id < 0:
             continue
         if loop_is_known(map_, result, config.connected_points):
-            fused += len(fuse_pairs(map_, result.matches, 1.0))
+            fused += len(fuse_sides(map_, result, 1.0))
             loops.append(result)
             continue
         done = apply_loop(map_, result, loops, config)
