@@ -87,7 +87,7 @@ class LoopCloser:
         self._vocabulary = vocabulary
         self._database = PlaceDatabase(len(vocabulary))
         self._side_database = PlaceDatabase(len(vocabulary))  # with the same rows
-        self._fronts = Fronts()
+        self._fronts = Fronts(rig.left)
         self._row: dict[int, int] = {}  # keyframe id -> row in the database
         self._store = KeyframeStore()
         self._graph = KeyframeGraph()
@@ -167,8 +167,8 @@ class LoopCloser:
         config = self._config
         if not config.enabled:
             return [], "disabled"
-        if keyframe.kf_id - self._last_loop <= config.pause and self._graph.unbroken(self._last_loop, keyframe.kf_id):
-            return [], "paused"
+        if self._paused(keyframe.kf_id):
+            return self._turned_candidate(keyframe, side_bag), "paused"
         connected = self._store.connected(keyframe.point_ids, config.connected_points)
         scores = self._database.scores(bag)
         pick = max if config.reference == "best" else min
@@ -190,6 +190,10 @@ class LoopCloser:
         found = [Candidate(k, float(scores[self._row[k]])) for k in places]
         return found + self._side_candidates(keyframe, side_bag, excluded), "no_candidate"
 
+    def _paused(self, kf_id: int) -> bool:
+        """Whether the last loop was so shortly before that only the way back along it is looked for."""
+        return kf_id - self._last_loop <= self._config.pause and self._graph.unbroken(self._last_loop, kf_id)
+
     def _side_candidates(self, keyframe: Keyframe, bag: voc.Bag, excluded: set[int]) -> list[Candidate]:
         """The keyframe that should have seen the same fronts, by odometry, and those whose views look most alike."""
         if len(keyframe.sides) < MIN_CORNERS:
@@ -209,6 +213,15 @@ class LoopCloser:
             if free and all(abs(kf_id - other) > PLACE_RADIUS for other in places):
                 places.append(kf_id)
         return [Candidate(k, float(scores[self._row[k]]), True) for k in places]
+
+    def _turned_candidate(self, keyframe: Keyframe, bag: voc.Bag) -> list[Candidate]:
+        """While the search pauses: the keyframe that should have seen the same fronts from another direction."""
+        if len(keyframe.sides) < MIN_CORNERS:
+            return []
+        graph_ids, cam_T_kf = self._graph.around(keyframe.kf_id)
+        turned = graph_ids[self._fronts.turned(front_of(keyframe), cam_T_kf)].tolist()
+        scores = self._side_database.scores(bag)
+        return [Candidate(k, float(scores[self._row[k]]), True) for k in turned if k in self._store][:1]
 
     def _near(self, kf_id: int, connected: list[int]) -> set[int]:
         """Keyframes that cannot be candidates: connected to this one, or shortly before it in the same submap."""
@@ -328,7 +341,8 @@ class LoopCloser:
         candidate_T_kf = se3.inverse(verdict.b_T_a)
         self._graph.add_loop(candidate.kf_id, keyframe.kf_id, candidate_T_kf)
         self._store.merge(verdict.pairs)
-        self._last_loop = keyframe.kf_id
+        if not self._paused(keyframe.kf_id):
+            self._last_loop = keyframe.kf_id
         self._pending.clear()
         return LoopResult(
             kf_id=keyframe.kf_id,

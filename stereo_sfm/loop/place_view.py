@@ -38,7 +38,7 @@ def place_view_of(keyframe: Keyframe, rig: Rig, disparity_sigma: float, sideways
     descriptors = np.concatenate([c.descriptors, keyframe.descriptors])
     ids = np.concatenate([np.full(len(c), -1, np.int64), keyframe.point_ids])
     corner = np.arange(len(ids)) < len(c)
-    rows = binary.present(descriptors)
+    rows = np.flatnonzero(binary.present(descriptors))
     return PlaceView(
         ids[rows],
         uv_left[rows],

@@ -11,10 +11,14 @@ import dataclasses
 import numpy as np
 
 from stereo_sfm.config import LoopConfig
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.types import F64, I64, Keyframe
 
 MIN_CORNERS = 20  # corners of a keyframe with which a search is worth it
-APART = 1.0  # distance of two keyframes' fronts over the distance at which they see them: nearer ones overlap
+SAMPLES = 24  # corners of a keyframe that stand for what its views show
+REACH = 2.0  # of a camera whose views may show the same fronts: in median distances of what its own show
+MIN_OVERLAP = 0.2  # of two keyframes' views, of at most 1
 SIDE_FACTOR = 1.5  # times `side_inliers` where no odometry speaks for it
 TURNED = np.cos(np.deg2rad(60.0))  # of the optical axes of keyframes that only views to the side can compare
 
@@ -37,33 +41,47 @@ def with_neighbours(scores: F64) -> F64:
 
 
 def front_of(keyframe: Keyframe) -> F64:
-    """(3,) middle of what the views of a keyframe show, in its camera; NaN without views."""
+    """(SAMPLES, 3) corners of a keyframe's views, in its camera; NaN without views."""
     points = keyframe.sides.points_cam
-    return np.median(points, axis=0).astype(np.float64) if len(points) >= MIN_CORNERS else np.full(3, np.nan)
+    if len(points) < MIN_CORNERS:
+        return np.full((SAMPLES, 3), np.nan)
+    return points[np.linspace(0, len(points) - 1, SAMPLES).astype(int)].astype(np.float64)
 
 
 class Fronts:
-    """Where keyframes see the fronts beside them, one row each."""
+    """What the views of keyframes show, one row each."""
 
-    def __init__(self) -> None:
-        self._middles: F64 = np.empty((64, 3))  # in the keyframe's camera; NaN without views
+    def __init__(self, camera: Camera) -> None:
+        self._camera = camera
+        self._points: F64 = np.empty((64, SAMPLES, 3))  # in the keyframe's camera; NaN without views
         self._count = 0
 
     def add(self, keyframe: Keyframe) -> None:
         """Remember the newest keyframe."""
-        if self._count == len(self._middles):
-            self._middles = np.concatenate([self._middles, np.empty_like(self._middles)])
-        self._middles[self._count] = front_of(keyframe)
+        if self._count == len(self._points):
+            self._points = np.concatenate([self._points, np.empty_like(self._points)])
+        self._points[self._count] = front_of(keyframe)
         self._count += 1
 
-    def turned(self, middle: F64, cam_T_kf: F64) -> I64:
-        """Rows that saw the fronts around a middle (3,) from another direction, the nearest first.
+    def turned(self, front: F64, cam_T_kf: F64) -> I64:
+        """Rows whose views overlap with a camera's from another direction, those that should look most alike first.
 
         Args:
-            middle: of a camera's fronts, see `front_of`. cam_T_kf: (K, 4, 4) poses of all keyframes in that camera, NaN
-                where unknown.
+            front: what the camera's views show, see `front_of`. cam_T_kf: (K, 4, 4) poses of all keyframes in that
+                camera, NaN where unknown.
         """
-        there = (cam_T_kf[:, :3, :3] @ self._middles[: self._count, :, None])[..., 0] + cam_T_kf[:, :3, 3]
-        apart = np.linalg.norm(there - middle, axis=1)
-        rows = np.flatnonzero((cam_T_kf[:, 2, 2] < TURNED) & (apart < APART * np.linalg.norm(middle)))
-        return rows[np.lexsort((rows, apart[rows]))].astype(np.int64)
+        apart = np.linalg.norm(cam_T_kf[:, :3, 3], axis=1)
+        reach = REACH * float(np.median(np.linalg.norm(front, axis=1)))
+        rows = np.flatnonzero((cam_T_kf[:, 2, 2] < TURNED) & (apart < reach))
+        there, here = self._points[rows], np.broadcast_to(front, (len(rows), SAMPLES, 3))
+        back = se3.inverse(cam_T_kf[rows])
+        overlap = (self._alike(cam_T_kf[rows], there) + self._alike(back, here)) / 2
+        order = np.lexsort((rows, -overlap))
+        return rows[order[overlap[order] > MIN_OVERLAP]].astype(np.int64)
+
+    def _alike(self, b_T_a: F64, points: F64) -> F64:
+        """(R,) mean over points (R, SAMPLES, 3) in a: the ratio of their distances from a and b, 0 where b is blind."""
+        moved = np.einsum("rij,rsj->rsi", b_T_a[:, :3, :3], points) + b_T_a[:, None, :3, 3]
+        seen = self._camera.inside(self._camera.project(moved), 1.0)
+        ratio = np.linalg.norm(moved, axis=2) / np.linalg.norm(points, axis=2)
+        return np.where(seen, np.minimum(ratio, 1 / ratio), 0.0).mean(axis=1)

@@ -70,7 +70,7 @@ class Relocalizer:
         self._sees = scipy.sparse.csr_array((ones, (snapshot.obs_kf, snapshot.obs_pt)), shape=shape)
         self._views = np.maximum(np.bincount(snapshot.obs_pt, minlength=shape[1]), 1)
         self._database, self._side_database = PlaceDatabase(len(vocabulary)), PlaceDatabase(len(vocabulary))
-        self._fronts = Fronts()
+        self._fronts = Fronts(rig.left)
         for k, keyframe in enumerate(self._keyframes):
             self._database.add(k, vocabulary.bag(keyframe.corners.descriptors))
             self._side_database.add(k, vocabulary.bag(keyframe.sides.descriptors))
