@@ -35,9 +35,15 @@ def sideways_config(config: LoopConfig) -> LoopConfig:
 
 
 def with_neighbours(scores: F64) -> F64:
-    """(K,) scores of successive keyframes, each with those beside it: together they tell more."""
-    padded = np.pad(scores, 1)
-    return scores + padded[:-2] + padded[2:]
+    """(K,) scores of successive keyframes, each with those beside it: together they tell more.
+
+    Keyframes without a score, as those without views to the side, are passed over.
+    """
+    scored = scores > 0
+    padded = np.pad(scores[scored], 1)
+    together = np.zeros_like(scores)
+    together[scored] = padded[1:-1] + padded[:-2] + padded[2:]
+    return together
 
 
 def front_of(keyframe: Keyframe) -> F64:
