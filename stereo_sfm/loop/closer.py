@@ -65,6 +65,7 @@ class _Hypothesis:
     against: str  # reason to reject it by odometry, "" if there is none
     unconnected: bool  # no path of odometry and loops connects its ends: only appearance supports it
     votes: int  # keyframes that must agree on it
+    sideways: bool  # by views to the side
 
 
 class LoopCloser:
@@ -303,7 +304,8 @@ class LoopCloser:
                 votes = 1 if strong and gap is not None and off <= gap.tolerance else votes
             reached = gap is None or off <= gap.disturbed
             against = "out_of_reach" if not reached else "" if enough else "too_few_inliers"
-        return _Hypothesis(kf_id, candidate, candidate_T_kf, verdict.inliers, against, path is None, votes)
+        unconnected = path is None
+        return _Hypothesis(kf_id, candidate, candidate_T_kf, verdict.inliers, against, unconnected, votes, of.sideways)
 
     def _objection(self, loop: _Hypothesis, best_inliers: int) -> str:
         """Why a loop that odometry allows is not accepted, '' if it is.
@@ -312,10 +314,18 @@ class LoopCloser:
         """
         if loop.inliers < RIVAL * best_inliers:
             return "better_elsewhere"
-        rivals = [h for h in self._pending if h.against not in CONTRADICTED and h.inliers > RIVAL * loop.inliers]
-        if loop.unconnected and any(self._same_loop(h, loop) is False for h in rivals):
+        if loop.unconnected and any(self._rivals(h, loop) for h in self._pending):
             return "ambiguous"
         return "" if self._confirmed(loop) else "not_confirmed_yet"
+
+    def _rivals(self, other: _Hypothesis, loop: _Hypothesis) -> bool:
+        """Whether another place is so similar that only appearance cannot tell which one it is.
+
+        Along an aisle both directions look somewhat alike: what corners ahead and corners beside show is comparable
+        only if there are enough of both.
+        """
+        possible = not other.against or (other.against not in CONTRADICTED and other.sideways == loop.sideways)
+        return possible and other.inliers > RIVAL * loop.inliers and self._same_loop(other, loop) is False
 
     def _confirmed(self, new: _Hypothesis) -> bool:
         """Whether enough keyframes found the same loop."""
