@@ -14,6 +14,7 @@ import pytest
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.closer import LoopCloser
+from stereo_sfm.loop.sideways import Fronts, front_of, with_neighbours
 from stereo_sfm.loop.vocabulary_file import default_vocabulary
 from stereo_sfm.types import F64, I64, U8, Corners, Keyframe, LoopResult
 from tests.synthetic import fisheye_rig, see
@@ -111,3 +112,26 @@ def test_the_same_bits_again() -> None:
     first, second = results(keyframes), results(keyframes)
     for a, b in zip(first, second, strict=True):
         assert a.rejected == b.rejected and np.array_equal(a.candidate_T_kf, b.candidate_T_kf)
+
+
+def test_keyframes_without_views_do_not_hide_the_places_between_them() -> None:
+    scores = np.array([0.5, 0.0, 0.4, 0.0, 0.0, 0.1])
+    assert np.allclose(with_neighbours(scores), [0.9, 0, 1.0, 0, 0, 0.5])
+
+
+def test_the_keyframe_whose_views_overlap_most_is_the_first() -> None:
+    rng, poses = np.random.default_rng(0), path(0)
+    points, looks = shelves(1, False, rng)
+    keyframes = drive(poses, points, looks, rng)
+    fronts = Fronts(RIG.left)
+    for keyframe in keyframes:
+        fronts.add(keyframe)
+    newest = next(k for k in range(len(poses)) if poses[k, 2, 2] < -0.99 and poses[k, 2, 3] < 6)
+    rows = fronts.turned(front_of(keyframes[newest]), se3.inverse(poses[newest]) @ poses)
+    assert len(rows) and (poses[rows, 2, 2] > 0.5).all()
+    back = poses[newest, 2, 3] - poses[rows[0], 2, 3]
+    assert 0.4 < back < 2.5  # behind it, as its views show what it approaches and those of the way there too
+    unknown = np.full_like(poses, np.nan)
+    assert not len(fronts.turned(front_of(keyframes[newest]), unknown))
+    none = dataclasses.replace(keyframes[newest], sides=Corners.none())
+    assert not len(fronts.turned(front_of(none), se3.inverse(poses[newest]) @ poses))
