@@ -44,8 +44,9 @@ def join_corners(map_: Map, sightings: I64, sigma_px: float) -> list[tuple[int, 
         before = set(map_.observations.pt[map_.observations_of_keyframe(kf)].tolist())
         new = {point: row for point, row in wanted[kf].items() if point not in before}
         sides, rows = map_.corners[kf][1], np.array(list(new.values()), np.int64)
+        uv_left, uv_right = (uv[rows].astype(np.float64) for uv in (sides.uv_left, sides.uv_right))
         nothing = np.zeros((len(rows), 32), np.uint8)
-        map_.observe(kf, np.array(list(new), np.int64), sides.uv_left[rows], sides.uv_right[rows], nothing)
+        map_.observe(kf, np.array(list(new), np.int64), uv_left, uv_right, nothing)
     return fused
 
 
