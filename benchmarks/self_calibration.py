@@ -27,8 +27,9 @@ import cv2
 import numpy as np
 
 from stereo_sfm import config as configuration
-from stereo_sfm.calib.choice import with_terms
+from stereo_sfm.calib.choice import TERMS, with_terms
 from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.sim.source import SimSource
 from stereo_sfm.drivers.source import BaseSource, open_source
 from stereo_sfm.eval.evaluate import evaluate
 from stereo_sfm.eval.record import RunRecord
@@ -74,6 +75,7 @@ def render(camera: str, seed: int, args: argparse.Namespace, how: str) -> tuple[
     size = f"&size={args.size}" if args.size else ""
     spec = f"sim:loop?camera={camera}&seed={seed}&frames={args.frames}&rate=15{size}"
     with open_source(spec) as source:
+        assert isinstance(source, SimSource) and source.ground_truth is not None
         rig, ids = source.rig, list(source.frame_ids)
         images: list[StereoImage] = []
         for k, frame_id in enumerate(ids):
@@ -90,7 +92,7 @@ def measure(images: list[StereoImage], believed: Rig, true: Rig, truth: Trajecto
     cv2.setRNGSeed(0)
     for _ in run(Rendered(images, believed, truth), config, [record]):
         pass
-    last = record.calibrations[-1].terms if record.calibrations else np.zeros(6)
+    last = record.calibrations[-1].terms if record.calibrations else np.zeros(TERMS)
     mended = with_terms(believed, last)
     left = np.rad2deg(se3.log(se3.inverse(mended.left_T_right) @ true.left_T_right)[3:])
     noticed = (record.calibrations[0].stamp_ns - images[0].stamp_ns) * 1e-9 if record.calibrations else np.inf

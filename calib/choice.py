@@ -10,44 +10,45 @@ from dataclasses import dataclass
 import numpy as np
 
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.calib.scene_model import DIRECTION, FOCAL_RIGHT, ROTATION, SHARED, moved
+from stereo_sfm.calib.scene_model import DIRECTION, FOCAL_RIGHT, ROTATION, SHARED, decentered, moved
 from stereo_sfm.types import F64, Bool
 
-TERMS = (
-    6  # rotation of the right camera (3), direction of the baseline (2), focal length of the right relative to the left
-)
+# Rotation of the right camera (3), direction of the baseline (2), focal length of the right relative to the left,
+# decentering of the right lens relative to the left (2).
+TERMS = 8
 NAMES = (
     *(f"rotation of the right camera about {axis}" for axis in "xyz"),
     *(f"baseline direction, {axis}" for axis in "yz"),
     "focal length, right relative to left",
+    *(f"decentering of the right lens along {axis}" for axis in "xy"),
 )
-UNITS = (*["degrees"] * 5, "%")
-SCALES = np.array([*[np.rad2deg(1.0)] * 5, 100.0])  # from radians and ratios to UNITS
+UNITS = (*["degrees"] * 5, "%", *["degrees"] * 2)
+SCALES = np.array([*[np.rad2deg(1.0)] * 5, 100.0, *[np.rad2deg(1.0)] * 2])  # from radians and ratios to UNITS
 ROLLING_SHUTTER_MIMICS = np.array(
-    [False, True, False, True, True, False]
+    [False, True, False, True, True, False, True, True]
 )  # terms that motion with a rolling shutter can mimic
 SIGMAS = 4.0  # standard deviations from zero that make a term significant
 MIN_SHARE_IN_HALVES = 0.5  # of a term's value that each half of the recording must show, with the same sign
 
 
 def with_terms(rig: Rig, value: F64) -> Rig:
-    """The rig with the terms (6,) added; the same object when they are zero."""
+    """The rig with the terms (8,) added; the same object when they are zero."""
     if not value.any():
         return rig
     vector = np.zeros(SHARED)
     vector[ROTATION], vector[DIRECTION], vector[FOCAL_RIGHT] = value[:3], value[3:5], value[5]
-    return moved(rig, vector)
+    return decentered(moved(rig, vector), float(value[6]), float(value[7]))
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
     """The terms estimated from one set of matches."""
 
-    value: F64  # (6,) radians; the focal length's is a ratio
-    covariance: F64  # (6, 6)
+    value: F64  # (8,) radians; the focal length's is a ratio
+    covariance: F64  # (8, 8)
 
     def without(self, kept: Bool) -> Estimate:
-        """The estimate with the terms that are not `kept` (6,) held at zero: the conditional Gaussian."""
+        """The estimate with the terms that are not `kept` (8,) held at zero: the conditional Gaussian."""
         value, covariance = np.zeros(TERMS), np.zeros((TERMS, TERMS))
         inside, across = np.ix_(kept, kept), np.ix_(kept, ~kept)
         gain = self.covariance[across] @ np.linalg.pinv(self.covariance[np.ix_(~kept, ~kept)])
@@ -57,7 +58,7 @@ class Estimate:
 
     @property
     def sigma(self) -> F64:
-        """(6,) standard deviations."""
+        """(8,) standard deviations."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
 
@@ -85,9 +86,9 @@ class Choice:
     """The significant terms."""
 
     terms: tuple[Term, ...]
-    value: F64  # (6,) zero where nothing is written
-    sigma: F64  # (6,) standard deviations of all terms, written or not
-    written: Bool  # (6,)
+    value: F64  # (8,) zero where nothing is written
+    sigma: F64  # (8,) standard deviations of all terms, written or not
+    written: Bool  # (8,)
 
     def apply(self, rig: Rig) -> Rig:
         """The corrected rig; the same object when nothing is written."""
@@ -110,7 +111,7 @@ def significant(
 
     Args:
         whole: estimated from all matches. halves: each from one part of them.
-        sigmas: standard deviations from zero that make a term significant; one number, or (6,).
+        sigmas: standard deviations from zero that make a term significant; one number, or (8,).
         rolling: rolling shutter; terms that motion can mimic are not written.
     """
     needed = np.broadcast_to(sigmas, TERMS)
@@ -125,7 +126,7 @@ def significant(
 
 
 def _evidence(whole: Estimate, halves: Sequence[Estimate], kept: Bool) -> tuple[F64, Bool]:
-    """(6,) values in standard deviations, and (6,) whether every half confirms them."""
+    """(8,) values in standard deviations, and (8,) whether every half confirms them."""
     here = whole.without(kept)
     parts = np.array([half.without(kept).value for half in halves]).reshape(-1, TERMS)
     strength = np.abs(here.value) / np.maximum(here.sigma, 1e-12)

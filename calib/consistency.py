@@ -163,7 +163,8 @@ def _terms(fit: _Fit, total: F64) -> Estimate:
     by_vector = np.zeros((TERMS, SHARED))
     by_vector[:3], by_vector[5] = total[TURN], total[FOCAL_RATIO]
     by_vector[3:5, DIRECTION] = np.eye(2)
-    return Estimate(by_vector @ fit.vector, by_vector @ fit.covariance @ by_vector.T)
+    unknown = np.diag([*[0.0] * 6, 0.01**2, 0.01**2])  # decentering: the displacements stand for it
+    return Estimate(by_vector @ fit.vector, by_vector @ fit.covariance @ by_vector.T + unknown)
 
 
 def _explained(window: Window, problem: Problem) -> Bool:

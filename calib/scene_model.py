@@ -12,7 +12,7 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.tracks import Window
 from stereo_sfm.geometry import se3
-from stereo_sfm.geometry.cameras import Camera
+from stereo_sfm.geometry.cameras import Camera, Pinhole, RadTan
 from stereo_sfm.geometry.stereo import rectifying_rotations
 from stereo_sfm.types import F64, Bool
 
@@ -45,6 +45,28 @@ def moved(rig: Rig, vector: F64) -> Rig:
     left = _focal(rig.left, float(np.exp(vector[FOCAL])))
     right = _focal(rig.right, float(np.exp(vector[FOCAL] + vector[FOCAL_RIGHT])))
     return replace(rig, left=left, right=right, left_T_right=transform)
+
+
+def decentered(rig: Rig, along_x: float, along_y: float) -> Rig:
+    """The rig with the right lens decentered relative to the left: tangential distortion p2 = -along_x, p1 = along_y.
+
+    Tangential distortion is mostly a rotation and a shift (Brown, Photogrammetric Engineering 32, 1966). Both are
+    removed, so that what is left shifts a pixel at (x, y) times the focal length from the principal point by
+    along_x (-y^2, x y) + along_y (-x y, x^2), of which stereo sees the vertical part. The rotation's second order is
+    removed by focal lengths and radial distortion. Fisheye models have no such terms and stay.
+    """
+    right = rig.right
+    if not (along_x or along_y) or not isinstance(right, Pinhole | RadTan):
+        return rig
+    about_x, about_y = -3.0 * along_y, -3.0 * along_x
+    k1, k2, p1, p2, *rest = (*right.distortion, 0.0, 0.0, 0.0, 0.0)[: max(4, len(right.distortion))]
+    second = about_x**2, about_y**2
+    distortion = (k1 + sum(second), k2, p1 + along_y, p2 - along_x, *rest)
+    fx, fy = right.fx * (1 + second[1]), right.fy * (1 + second[0])
+    cx, cy = right.cx + right.fx * about_y, right.cy - right.fy * about_x
+    transform = rig.left_T_right.copy()
+    transform[:3, :3] = transform[:3, :3] @ se3.so3_exp(np.array([about_x, about_y, 0.0]))
+    return replace(rig, right=RadTan(right.width, right.height, fx, fy, cx, cy, distortion), left_T_right=transform)
 
 
 def _focal(camera: Camera, factor: float) -> Camera:

@@ -241,7 +241,7 @@ class Keyframe(Message):
     descriptors: U8 = field(metadata=shape(-1, 32))  # binary (oriented BRIEF), zero rows where none could be computed
     submap_id: int = 0  # grows when tracking restarts after it was lost
     corners: Corners = field(default_factory=Corners.none)  # for place recognition
-    rig_terms: F64 = field(default_factory=lambda: np.zeros(6))  # (6,) the tracker's rig, as in `CalibrationUpdate`
+    rig_terms: F64 = field(default_factory=lambda: np.zeros(8))  # (8,) the tracker's rig, as in `CalibrationUpdate`
     sides: Corners = field(default_factory=Corners.none)  # described in views that face the shelves on both sides
     down: F64 = field(default_factory=lambda: np.zeros(3))  # (3,) gravity's direction in this camera, zero: unknown
     down_sigma: float = 0.0  # radians, its standard deviation about each horizontal axis; 0: unknown
@@ -255,15 +255,16 @@ class Keyframe(Message):
 @dataclass(frozen=True, eq=False)
 class CalibrationUpdate(Message):
     """The rig's terms that the mapper found: rotation of the right camera about x, y, z (3, radians), direction of the
-    baseline along y and z (2, radians), logarithm of the right focal length against the left."""
+    baseline along y and z (2, radians), logarithm of the right focal length against the left, decentering of the right
+    lens against the left along x and y (2, radians)."""
 
     TOPIC: ClassVar[Topic] = Topic("/calibration", "when self-calibration corrects the rig, or reports a correction")
 
     version: int  # of the map update that brings it
     kf_id: int
     stamp_ns: int
-    terms: F64  # (6,) added to the rig as its calibration says
-    terms_covariance: F64 = field(metadata=shape(6, 6))
+    terms: F64  # (8,) added to the rig as its calibration says
+    terms_covariance: F64 = field(metadata=shape(8, 8))
     since_kf_id: int  # first keyframe that was seen by the rig so corrected; those before stay as they were
     applied: bool  # False: only reported
     why: str  # "significant", "step", "refined" or "drift"

@@ -69,7 +69,7 @@ def write_corrected_rig(folder: Path, rig: Rig, record: RunRecord) -> None:
     path = folder / CORRECTED
     save_rig(with_terms(rig, last.terms), path)
     sigma = np.sqrt(np.diag(last.terms_covariance))
-    lines = ["", "# What self-calibration added to the source's calibration, and the covariance of these six numbers:"]
+    lines = ["", "# What self-calibration added to the source's calibration, and the covariance of these numbers:"]
     lines += [
         f"# {name}: {value:+.5f} +- {deviation:.5f} {unit}"
         for name, value, deviation, unit in zip(NAMES, SCALES * last.terms, SCALES * sigma, UNITS, strict=True)

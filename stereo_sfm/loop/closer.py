@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stereo_sfm.calib.choice import with_terms
+from stereo_sfm.calib.choice import TERMS, with_terms
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
@@ -84,7 +84,7 @@ class LoopCloser:
             vocabulary = configured_vocabulary(config)
         self._config, self._rig, self._spans = config, rig, spans or NoSpans()
         self._side_config = sideways_config(config)
-        self._source_rig, self._rig_terms = rig, np.zeros(6)
+        self._source_rig, self._rig_terms = rig, np.zeros(TERMS)
         self._vocabulary = vocabulary
         self._database = PlaceDatabase(len(vocabulary))
         self._side_database = PlaceDatabase(len(vocabulary))  # with the same rows

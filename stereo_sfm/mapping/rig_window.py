@@ -1,10 +1,10 @@
 """Information about the rig from a few consecutive keyframes.
 
 A separate bundle adjustment of the window's keyframes, the points that its first keyframe sees with both cameras, and
-six terms of the rig (`calib.choice`): rotation of the right camera, direction of the baseline, focal length of the
-right camera relative to the left. Points and motion are unknowns too, so errors of disparity, which are correlated with
-the motion, are estimated as well. The result is the information about the terms with points and motion eliminated; that
-of several windows is summed.
+eight terms of the rig (`calib.choice`): rotation of the right camera, direction of the baseline, focal length of the
+right camera relative to the left, decentering of the right lens relative to the left. Points and motion are unknowns
+too, so errors of disparity, which are correlated with the motion, are estimated as well. The result is the information
+about the terms with points and motion eliminated; that of several windows is summed.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ MAX_POINTS = 160
 STEPS = 4  # of Gauss-Newton
 INFLATION = 2.0  # factor on the deviation of the matches' errors, which are correlated, as in `calib.consistency`
 NOISE_PX = 0.05, 5.0  # limits of the estimated noise of one coordinate
-# Prior standard deviations of the terms: radians, radians, ratio.
-PRIOR = np.array([0.01, 0.01, 0.01, 0.005, 0.005, 0.005])
+# Prior standard deviations of the terms: radians, radians, ratio, radians.
+PRIOR = np.array([0.01, 0.01, 0.01, 0.005, 0.005, 0.005, 0.01, 0.01])
 
 # Apparent change of the terms by errors of the lens model, in radians and ratio per radian that the camera turns.
-LENS_ERROR_PER_RADIAN = np.array([0.0, 0.003, 0.0, 0.0, 0.0, 0.0015])
+LENS_ERROR_PER_RADIAN = np.array([0.0, 0.003, 0.0, 0.0, 0.0, 0.0015, 0.0, 0.0])
 # Prior standard deviations of `_shapes`, px at the image's border.
 LENS_PRIOR = np.array([6.0, 2.0, 2.0, 2.0, *[0.5] * 6])
 
@@ -41,8 +41,8 @@ LENS_PRIOR = np.array([6.0, 2.0, 2.0, 2.0, *[0.5] * 6])
 class RigInformation:
     """Information about the terms: of one window, or the sum of several."""
 
-    matrix: F64  # (6, 6)
-    vector: F64  # (6,) matrix @ (the terms that fit best)
+    matrix: F64  # (8, 8)
+    vector: F64  # (8,) matrix @ (the terms that fit best)
 
     def __add__(self, other: RigInformation) -> RigInformation:
         return RigInformation(self.matrix + other.matrix, self.vector + other.vector)
@@ -84,7 +84,7 @@ def solve_window(rig: Rig, keyframes: Sequence[Keyframe], terms: F64) -> RigWind
     """The information of a window, or None if its keyframes have too few common points.
 
     Args:
-        rig: the calibrated rig. keyframes: in order of time. terms: (6,) initial corrections.
+        rig: the calibrated rig. keyframes: in order of time. terms: (8,) initial corrections.
     """
     problem = _problem(with_terms(rig, terms), keyframes)
     if problem is None:
@@ -185,7 +185,7 @@ class _System:
         )
 
     def step(self, problem: _Problem, terms: F64) -> F64:
-        """(6,) step of the terms, back-substituted into the window's lens, motion and points."""
+        """(8,) step of the terms, back-substituted into the window's lens, motion and points."""
         prior = np.concatenate([PRIOR, LENS_PRIOR]) ** -2
         delta = -np.linalg.solve(
             self.matrix + np.diag(prior), self.gradient + prior * np.concatenate([terms, problem.lens])

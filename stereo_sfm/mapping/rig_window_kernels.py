@@ -1,9 +1,10 @@
 """Compiled inner loop of `mapping.rig_window`: normal equations of one window with its points eliminated.
 
-Unknown are six terms of the rig (rotation of the right camera, direction of the baseline, focal ratio), what both
-lenses share, six numbers of every moment after the first, and of each point its bearing (2) and inverse distance in the
-first left camera. One row touches what is shared, its own moment and its point, so the work a point is small; the Schur
-complement over the points is Triggs et al., Bundle adjustment: a modern synthesis (2000), section 6.1.
+Unknown are eight terms of the rig (rotation of the right camera, direction of the baseline, focal ratio, decentering of
+the right lens), what both lenses share, six numbers of every moment after the first, and of each point its bearing (2)
+and inverse distance in the first left camera. One row touches what is shared, its own moment and its point, so the work
+a point is small; the Schur complement over the points is Triggs et al., Bundle adjustment: a modern synthesis (2000),
+section 6.1.
 """
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false
@@ -16,7 +17,7 @@ import numpy as np
 
 from stereo_sfm.geometry.kernels import njit, project_one
 
-TERMS = 6  # of the rig
+TERMS = 8  # of the rig
 
 
 @njit
@@ -63,7 +64,7 @@ def accumulate(
         right_r: (3, 3) rotation of right_T_left. baseline: (3,) right camera in the left one.
         by_direction: (3, 2) derivative of rho-scaled right coordinates by the baseline's direction.
         sigma: px. hard: drop what is beyond six sigmas. inflation: of the deviations.
-        h: (R, R), g: (R,), R = 6 + L + 6 (F - 1), overwritten. gain: (N, 3, R), gradient: (N, 3), overwritten.
+        h: (R, R), g: (R,), R = 8 + L + 6 (F - 1), overwritten. gain: (N, 3, R), gradient: (N, 3), overwritten.
         size: (N,) sum of squared residuals. rows: (N,) how many.
     """
     frames, count = uv_left.shape[0], uv_left.shape[1]
@@ -131,6 +132,12 @@ def accumulate(
                                 j0 * by_direction[0, c] + j1 * by_direction[1, c] + j2 * by_direction[2, c]
                             )
                         j_rig[2 + k, 5] = out[k] - params_r[2 + k]
+                    if model_r == 0 or model_r == 1:
+                        a, b = q[0] / q[2], q[1] / q[2]
+                        j_rig[2, 6], j_rig[3, 6] = -params_r[0] * b * b, params_r[1] * a * b
+                        j_rig[2, 7], j_rig[3, 7] = -params_r[0] * a * b, params_r[1] * a * a
+                    for k in range(2):
+                        j0, j1, j2 = out[2 + 3 * k], out[3 + 3 * k], out[4 + 3 * k]
                         for i in range(3):
                             row[i] = j0 * right_r[0, i] + j1 * right_r[1, i] + j2 * right_r[2, i]
                         _pose_row(row[0], row[1], row[2], p, rho[n], j_pose[2 + k])

@@ -1,6 +1,6 @@
 """Self-calibration: corrections of the rig estimated from the keyframes during mapping.
 
-Every few keyframes with motion form a window (`mapping.rig_window`); the information of the windows about the six terms
+Every few keyframes with motion form a window (`mapping.rig_window`); the information of the windows about the terms
 is summed. Terms are corrected that differ from the current ones by several standard deviations, that both halves of the
 windows (even and odd ones) confirm, and that exceed the systematic error of matching (`calib.choice`). A corrected term
 is refined as long as windows come, first whenever their number has doubled. Where the windows show drift (temperature),
@@ -44,8 +44,8 @@ DIRECTION = np.deg2rad(0.15)  # systematic error of the baseline's direction: ma
 class Revision:
     """New terms from a keyframe on."""
 
-    terms: F64  # (6,) added to the calibrated rig
-    covariance: F64  # (6, 6)
+    terms: F64  # (8,) added to the calibrated rig
+    covariance: F64  # (8, 8)
     since_kf_id: int  # first keyframe of the corrected rig
     why: str  # "significant", "step", "refined", "drift"
     text: str  # readable description
@@ -67,7 +67,8 @@ class SelfCalibration:
         half_width = 0.5 * rig.left.width
         turn = MATCHING_PX / rig.left.fx
         roll = ratio = MATCHING_PX / (0.5 * half_width)
-        self._floor = np.array([turn, turn, roll, DIRECTION, DIRECTION, ratio])
+        decentering = roll * rig.left.fx / half_width
+        self._floor = np.array([turn, turn, roll, DIRECTION, DIRECTION, ratio, decentering, decentering])
 
     def add(self, keyframe: Keyframe) -> Revision | None:
         """Add a keyframe; returns a revision when one becomes significant."""

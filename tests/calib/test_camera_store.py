@@ -23,7 +23,7 @@ from stereo_sfm.log.recorded import read_run
 from stereo_sfm.types import F64, CalibrationUpdate
 from tests.synthetic import fisheye_rig
 
-TERMS = np.array([0.002, -0.001, 0, 0, 0, 0])
+TERMS = np.array([0.002, -0.001, 0, 0, 0, 0, 0, 0])
 SPEC = "sim:aisle?size=212x200&frames=4&effects=0"
 
 
@@ -33,7 +33,7 @@ def rig() -> Rig:
 
 
 def applied(terms: F64) -> CalibrationUpdate:
-    return CalibrationUpdate(1, 0, 0, terms, np.eye(6), 0, True, "significant", "")
+    return CalibrationUpdate(1, 0, 0, terms, np.eye(8), 0, True, "significant", "")
 
 
 def test_the_next_run_starts_with_the_correction(rig: Rig, tmp_path: Path) -> None:
@@ -65,7 +65,7 @@ def test_a_camera_that_was_calibrated_anew_is_not_corrected(
 ) -> None:
     store = CameraStore(tmp_path)
     store.keep(rig, with_terms(rig, TERMS))
-    anew = with_terms(rig, np.array([0, 0, 0.001, 0, 0, 0]))
+    anew = with_terms(rig, np.array([0, 0, 0.001, 0, 0, 0, 0, 0]))
     assert store.corrected(anew) is anew and "corrects another calibration" in caplog.text
     CorrectionKeeper(tmp_path, anew).keep(applied(TERMS))
     assert rig_to_text(store.corrected(anew)) == rig_to_text(with_terms(anew, TERMS))

@@ -13,17 +13,18 @@ from stereo_sfm.geometry import se3
 from tests.calib.test_check import RIGS, SEEN, magnified, turned, windows
 from tests.synthetic import pinhole_rig
 
-SIGMA = np.array([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-4])
+SIGMA = np.array([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-4, 1e-4, 1e-4])
 
 
 def estimated(*values: float) -> Estimate:
-    return Estimate(SIGMA * np.array(values), np.diag(SIGMA**2))
+    value = np.array([*values, *[0.0] * (TERMS - len(values))])
+    return Estimate(SIGMA * value, np.diag(SIGMA**2))
 
 
 def test_a_term_needs_several_sigmas_and_both_halves() -> None:
     halves = estimated(8, 3, 8, 0, 0, -9), estimated(12, 3, -1, 0, 0, -6)
     choice = choose(estimated(10, 3, 9, 0, 0, -7), halves)
-    assert choice.written.tolist() == [True, False, False, False, False, True]
+    assert choice.written.tolist() == [True, False, False, False, False, True, False, False]
     assert "10 sigmas" in choice.terms[0].why and "at least 4 required" in choice.terms[1].why
     assert "but the halves" in choice.terms[2].why
     assert choice.value[1] == choice.value[2] == 0.0
@@ -66,7 +67,7 @@ def test_only_the_faulty_term_is_written_and_the_common_focal_length_never() -> 
 
 def test_a_rolling_shutter_may_pretend_what_motion_shows() -> None:
     choice = choose(estimated(10, 10, 10, 10, 10, 10), (estimated(10, 10, 10, 10, 10, 10),) * 2, rolling=True)
-    assert choice.written.tolist() == [True, False, True, False, False, True]
+    assert choice.written.tolist() == [True, False, True, False, False, True, False, False]
 
 
 def test_consequences_of_a_disparity_error() -> None:

@@ -253,7 +253,7 @@ def test_a_report_in_a_hurry_has_its_text_and_the_plots_drawn_so_far(tmp_path: P
 def test_corrections_of_the_rig_are_plotted_and_written(tmp_path: Path) -> None:
     record = record_of(camera_path(), 0)
     none = np.zeros(0, np.int64)
-    terms, covariance = np.array([0.002, 0, 0, 0, 0, 0]), np.diag(np.full(6, 1e-8))
+    terms, covariance = np.array([0.002, *[0.0] * 7]), np.diag(np.full(8, 1e-8))
     for k, change in (
         (3, None),
         (6, CalibrationUpdate(1, 6, 6 * 10**8, terms, covariance, 0, True, "significant", "")),

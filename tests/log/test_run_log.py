@@ -105,7 +105,7 @@ def _keyframe(k: int) -> Keyframe:
 
 
 def _calibration(k: int) -> CalibrationUpdate:
-    terms = np.arange(6) * 1e-3
+    terms = np.arange(8) * 1e-3
     return CalibrationUpdate(k + 1, k, START_NS, terms, np.diag(terms**2), 2, True, "step", "turned")
 
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stereo_sfm.calib.choice import with_terms
+from stereo_sfm.calib.choice import TERMS, with_terms
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config, MapperConfig, SelfCalibrationConfig
 from stereo_sfm.geometry import se3
@@ -77,6 +77,22 @@ def test_a_turned_camera_is_found(name: str, degrees: tuple[float, float, float]
     assert np.abs(left[[0, 2]]).max() < 0.012 and abs(left[1]) < 0.015
 
 
+@pytest.mark.parametrize("kind", [6, 7])
+def test_a_decentered_lens_is_found(kind: int) -> None:
+    """1 px in the corners, as in KITTI's rectified images; the rotations stay within their errors."""
+    believed = RIGS["pinhole"]
+    terms = np.zeros(TERMS)
+    terms[kind] = 0.004
+    estimator, found = revisions(with_terms(believed, terms), believed, 0)
+    assert found and estimator.terms[kind] == pytest.approx(0.004, abs=0.0013)  # three sigmas
+    assert np.abs(np.rad2deg(estimator.terms[:3])).max() < 0.015
+
+
+def test_a_fisheye_has_no_decentering() -> None:
+    estimator, _ = revisions(RIGS["fisheye"], turned(RIGS["fisheye"], (0.1, 0.0, 0.0)), 0)
+    assert not estimator.terms[6:].any()
+
+
 def test_a_step_is_detected_and_earlier_keyframes_keep_their_rig() -> None:
     true = RIGS["pinhole"]
     knocked = turned(true, (0.0, 0.2, 0.0))
@@ -109,7 +125,7 @@ def test_the_same_keyframes_give_the_same_bits() -> None:
 def test_a_turning_window_has_less_information_about_disparity() -> None:
     from stereo_sfm.mapping.rig_window import solve_window
 
-    window = solve_window(RIGS["pinhole"], list(keyframes([RIGS["pinhole"]] * 4, RIGS["pinhole"], 0)), np.zeros(6))
+    window = solve_window(RIGS["pinhole"], list(keyframes([RIGS["pinhole"]] * 4, RIGS["pinhole"], 0)), np.zeros(TERMS))
     assert window is not None
     little, much = (np.diag(np.linalg.inv(window.information.with_lens_error(a).matrix)) for a in (0.01, 1.0))
     assert much[1] > 4 * little[1] and much[0] == pytest.approx(little[0], rel=0.3)

@@ -79,7 +79,7 @@ class Keyframes:
 
         Args:
             tracks: its points, of which those on moving objects are left out.
-            odom_T_cam: (4, 4). velocity: (6,) tangent a second. rig_terms: (6,) current correction of the rig.
+            odom_T_cam: (4, 4). velocity: (6,) tangent a second. rig_terms: (8,) current correction of the rig.
             gravity: its direction in the camera (3,), and the standard deviation in radians.
         """
         static = tracks.keep(~tracks.moving)

@@ -13,7 +13,7 @@ from itertools import chain
 
 import numpy as np
 
-from stereo_sfm.calib.choice import with_terms
+from stereo_sfm.calib.choice import TERMS, with_terms
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
@@ -77,7 +77,7 @@ class Tracker:
         side_views: views for place recognition in the opposite direction; None: keyframes have none.
         """
         self._config, self._rig = config, rig
-        self._rig_terms: F64 = np.zeros(6)  # current correction of the rig
+        self._rig_terms: F64 = np.zeros(TERMS)  # current correction of the rig
         self._spans = spans or NoSpans()
         self._stereo = StereoMatcher(config, rig)
         self._shutter = RollingShutter(rig)
