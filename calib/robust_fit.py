@@ -11,6 +11,7 @@ from stereo_sfm.types import F64
 
 HUBER = 2.0  # standard deviations beyond which a residual counts linearly
 ROUNDS = 4  # each with the spread that the last one left
+STEP = 1e-3  # of a typical change, for derivatives
 BLOCKS = 8  # of successive residuals: errors of neighbours are alike, those of blocks are not
 
 
@@ -35,25 +36,27 @@ def robust_fit(residual: Callable[[F64], F64], start: F64, scales: F64) -> Fit:
 
     x = start
     for _ in range(ROUNDS):
-        rows = residual(x)
-        spread = 1.4826 * np.median(np.abs(rows), axis=0) + 1e-12  # (D,)
-        found = least_squares(
-            lambda p, s=spread: (residual(p) / s).ravel(),
-            x,
-            x_scale=scales,
-            diff_step=1e-3,
+        spread = 1.4826 * np.median(np.abs(residual(x)), axis=0) + 1e-12  # (D,)
+        found = least_squares(  # from zero: the first step may be as long as the start, however near zero that is
+            lambda u, x=x, s=spread: (residual(x + u * scales) / s).ravel(),
+            np.zeros(len(x)),
+            lambda u, x=x, s=spread: (_derivatives(residual, x + u * scales, scales) / s[:, None]).reshape(-1, len(x)),
             loss="huber",
             f_scale=HUBER,
         )
-        x = np.asarray(found.x, np.float64)
+        x = x + scales * np.asarray(found.x, np.float64)
     return Fit(x, _jackknife(residual, x, scales))
+
+
+def _derivatives(residual: Callable[[F64], F64], x: F64, scales: F64) -> F64:
+    """(N, D, K) by parameters over their scales. A step relative to a parameter would be none where it is nearly 0."""
+    ends = [(residual(x + h), residual(x - h)) for h in STEP * np.diag(scales)]
+    return np.stack([(high - low) / (2 * STEP) for high, low in ends], axis=-1)
 
 
 def _jackknife(residual: Callable[[F64], F64], x: F64, scales: F64) -> F64:
     """(K,) standard deviations."""
-    rows, step = residual(x), 1e-3
-    ends = [(residual(x + h), residual(x - h)) for h in step * np.diag(scales)]
-    jacobian = np.stack([(high - low) / (2 * step) for high, low in ends], axis=-1)  # by parameters over their scales
+    rows, jacobian = residual(x), _derivatives(residual, x, scales)
     spread = 1.4826 * np.median(np.abs(rows), axis=0) + 1e-12
     weight = 1.0 / np.maximum(np.abs(rows / spread) / HUBER, 1.0) / spread**2
     blocks = np.array_split(np.arange(len(rows)), BLOCKS)

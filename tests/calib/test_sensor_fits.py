@@ -159,6 +159,14 @@ def test_a_fit_ignores_outliers_and_knows_its_error() -> None:
     np.testing.assert_allclose(np.mean(said, axis=0), rms, rtol=0.8)
 
 
+@pytest.mark.parametrize("start", [0.0, 1e-16, -0.3])
+def test_a_fit_leaves_a_start_that_is_nearly_zero(start: float) -> None:
+    t = np.linspace(0, 1, 400)
+    fit = robust_fit(lambda x: (0.02 * np.sin(9 * t) - x[0] - x[1] * t)[:, None], np.array([0.0, start]), np.ones(2))
+    expected = np.polyfit(t, 0.02 * np.sin(9 * t), 1)[::-1]
+    np.testing.assert_allclose(fit.value, expected, atol=1e-3)
+
+
 def test_a_shift() -> None:
     t = np.linspace(0, 20, 500)
     signal = lambda s: np.sin(2 * s) + np.cos(3.3 * s)  # noqa: E731
