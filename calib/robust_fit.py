@@ -40,7 +40,7 @@ def robust_fit(residual: Callable[[F64], F64], start: F64, scales: F64) -> Fit:
         found = least_squares(  # from zero: the first step may be as long as the start, however near zero that is
             lambda u, x=x, s=spread: (residual(x + u * scales) / s).ravel(),
             np.zeros(len(x)),
-            lambda u, x=x, s=spread: (_derivatives(residual, x + u * scales, scales) / s[:, None]).reshape(-1, len(x)),
+            lambda u, x=x, s=spread: (_derivatives(residual, x + u * scales, scales) / s[:, None]).reshape(-1, len(x)),  # pyright: ignore[reportArgumentType]
             loss="huber",
             f_scale=HUBER,
         )
