@@ -167,7 +167,9 @@ class MapperConfig:
     huber_sigmas: float = number(
         0.75, 0, 1000, "Residual where the loss becomes linear; small because depths at edges are biased"
     )
-    cauchy_sigmas: float = number(1.0, 0, 1000, "Scale of the redescending loss in the rounds after the first; 0: none")
+    cauchy_medians: float = number(
+        0.58, 0, 1000, "Scale of the redescending loss in rounds after the first, in median residuals; 0: none"
+    )
     disparity_sigmas: float = number(
         1.5, 0, 1000, "Mean error of a point's stereo matches beyond which they count less (depth edges); 0: never"
     )

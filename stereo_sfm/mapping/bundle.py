@@ -22,6 +22,7 @@ from stereo_sfm.mapping.reduced import ReducedSystem
 from stereo_sfm.types import F64, I64, Bool
 
 TO_SIGMA = 1.4826  # from the median of absolute values, for normally distributed ones
+MIN_RESIDUAL = 0.05  # sigmas, lower bound of the median residual
 MIN_DISPARITY_SIGMA = 1e-2  # of normalised mean disparity errors
 Linear = tuple[F64, F64, F64, F64]  # A (M, 6), g (M, 3), p (M, 3), chi2 (M, 2)
 
@@ -33,7 +34,7 @@ class BundleConfig:
     rounds: int = 2  # after each round but the last, outliers are determined anew
     iterations: int = 10  # maximum of accepted steps of a round
     huber: float = 2.0  # sigmas where the loss becomes linear; 0 means least squares
-    cauchy: float = 0.0  # sigmas, the scale of a redescending loss in all rounds but the first; 0: Huber's throughout
+    cauchy: float = 0.0  # median residuals, the scale of Cauchy's loss in all rounds but the first; 0: Huber's
     disparity_sigmas: float = 0.0  # mean error of a point's stereo matches beyond which they count less; 0: never
     joint_loss: bool = False  # one loss over both images of an observation instead of one each
     outlier_chi2: float = 9.21  # squared normalised residual in one image that makes an outlier (99 % of 2 dof)
@@ -94,26 +95,26 @@ class _Table:
         self._right = np.ascontiguousarray(bundle.uv_right[rows], float)
         seen = np.stack([np.isfinite(self._left).all(1), np.isfinite(self._right[:, 0]) & rig.stereo], 1)
         sigma = np.ones(seen.shape) if bundle.sigma is None else bundle.sigma[rows]
-        self._full_weights = np.where(seen, 1.0 / sigma, 0.0)
-        self._weights = self._full_weights.copy()  # (M, 2)
+        self._weights = np.where(seen, 1.0 / sigma, 0.0)  # (M, 2)
+        self.trust = np.ones(len(bundle.points))  # (P,) factor of the loss of the points' disparities
         self.use = seen.copy()  # (M, 2) images that count
         right = rig.right if rig.right is not None else rig.left
         right_T_left = se3.inverse(rig.left_T_right)
         self._cams = (rig.left.model_id, rig.left.params, right.model_id, right.params)
         self._right_T_left = np.ascontiguousarray(right_T_left[:3, :3]), right_T_left[:3, 3].copy()
         self._config = config
-        self.redescends = False  # the next `linearize` uses Cauchy's loss
+        self.cauchy = 0.0  # above 0: `linearize` uses Cauchy's loss of this scale in sigmas
         self.limit = 0.0  # above 0: the next `linearize` determines which images count
 
     def linearize(self, state: _State) -> tuple[Linear, float]:
         """Quadratic models of the observations at a state, and their robust cost."""
         n = len(self.kf)
         out: Linear = (np.empty((n, 6)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 2)))
-        scale = float(self._config.cauchy if self.redescends else self._config.huber)
+        scale, redescends = self.cauchy or float(self._config.huber), self.cauchy > 0
         cost = kernels.linearize(
             *(state.rot, state.pos, state.points, self.kf, self.pt, self._left, self._right, self._weights),
-            *(self.use, self.limit, self._cams, *self._right_T_left, scale),
-            *(self.redescends, self._config.joint_loss, out),
+            *(self.trust, self.use, self.limit, self._cams, *self._right_T_left, scale),
+            *(redescends, self._config.joint_loss, out),
         )
         self.limit = 0.0
         return out, float(cost)
@@ -121,13 +122,9 @@ class _Table:
     def add_disparity_errors(self, state: _State, total: F64, information: F64) -> None:
         """Add the weighted disparity errors of the points' observations, and their weights, to (P,) and (P,)."""
         kernels.add_disparity_errors(
-            *(state.rot, state.pos, state.points, self.kf, self.pt, self._left, self._right, self._full_weights),
+            *(state.rot, state.pos, state.points, self.kf, self.pt, self._left, self._right, self._weights),
             *(self.use, self._cams, *self._right_T_left, total, information),
         )
-
-    def weigh_right(self, weight: F64) -> None:
-        """Multiply the weights of the right images by (P,)."""
-        self._weights[:, 1] = self._full_weights[:, 1] * weight[self.pt]
 
     def sum_up(self, rot: F64, lin: Linear) -> tuple[F64, F64]:
         """(P, 6) and (P, 3): the quadratic models of the points, in world axes."""
@@ -189,16 +186,16 @@ class _Solver:
         total, information = np.zeros(len(state.points)), np.zeros(len(state.points))
         for table in (self.table, self.fixed):
             table.add_disparity_errors(state, total, information)
-        weight = _disparity_weights(total, information, self.config.disparity_sigmas)
-        for table in (self.table, self.fixed):
-            table.weigh_right(weight)
+        self.table.trust = self.fixed.trust = _disparity_weights(total, information, self.config.disparity_sigmas)
 
     def begin_round(self, state: _State, judge: bool) -> None:
         """Linearise anew without outliers; `judge`: determine outliers, in all rounds but the first."""
         if judge and self._weighs_disparities:  # not at the start, where wrong poses make all points disagree
             self._weigh_disparities(state)
         self.table.limit = self.fixed.limit = self.config.outlier_chi2 if judge else 0.0
-        self.table.redescends = self.fixed.redescends = judge and self.config.cauchy > 0
+        if judge and self.config.cauchy > 0:
+            residual = np.sqrt(median(state.lin[3][self.table.use])) if self.table.use.any() else 0.0
+            self.table.cauchy = self.fixed.cauchy = self.config.cauchy * max(float(residual), MIN_RESIDUAL)
         self.evaluate(state)
 
     def _pose_system(self, state: _State, damping: float) -> tuple[F64, F64]:
@@ -279,7 +276,7 @@ def _disparity_weights(total: F64, information: F64, sigmas: float) -> F64:
     mean = total[seen] / information[seen]
     mean = np.abs(mean - median(mean)) * np.sqrt(information[seen])
     limit = sigmas * max(TO_SIGMA * median(mean), MIN_DISPARITY_SIGMA)
-    weight[seen] = np.square(limit / np.maximum(mean, limit))
+    weight[seen] = (limit / np.maximum(mean, limit)) ** 4
     return weight
 
 

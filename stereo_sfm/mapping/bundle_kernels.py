@@ -78,6 +78,7 @@ def linearize(
     uv_left,
     uv_right,
     weights,
+    trust,
     use,
     limit,
     cams,
@@ -93,6 +94,7 @@ def linearize(
     Args:
         rot, pos: (K, 3, 3), (K, 3) of world_T_kf. points: (P, 3) world.
         obs_kf, obs_pt: (M,). uv_left, uv_right: (M, 2) px. weights: (M, 2) 1/px of either image, 0 where not observed.
+        trust: (P,) factor of the loss of a point's right images, unless joint.
         use: (M, 2) images that count. limit: if above 0, `use` is set here to those whose chi2 is not above it.
         cams: (left model, left params, right model, right params). right_r, right_t: right_T_left.
         scale, redescends: of the loss, see `_loss`. joint: one loss over both images instead of one each.
@@ -138,7 +140,8 @@ def linearize(
         else:
             rho_l, s_l = _loss(chi_l, scale, redescends)
             rho_r, s_r = _loss(chi_r, scale, redescends)
-            cost += rho_l + rho_r
+            s_r *= trust[i]
+            cost += rho_l + trust[i] * rho_r
         s_l, s_r = s_l if use[o, 0] else 0.0, s_r if use[o, 1] else 0.0
         a[o, 0] = s_l * (x0 * x0 + y0 * y0) + s_r * (u0 * u0 + v0 * v0)
         a[o, 1] = s_l * (x0 * x1 + y0 * y1) + s_r * (u0 * u1 + v0 * v1)

@@ -36,7 +36,7 @@ class Window:
 def bundle_config(config: MapperConfig) -> BundleConfig:
     """The mapper's settings of bundle adjustment."""
     return BundleConfig(
-        config.rounds, config.iterations, config.huber_sigmas, config.cauchy_sigmas, config.disparity_sigmas,
+        config.rounds, config.iterations, config.huber_sigmas, config.cauchy_medians, config.disparity_sigmas,
         fixed_once=True,
     )  # fmt: skip
 

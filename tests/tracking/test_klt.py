@@ -157,6 +157,20 @@ def test_corners_keep_their_distance_and_the_mask() -> None:
     assert distance.min() > 18.0
 
 
+def test_corners_are_not_on_edges() -> None:
+    """A tilted bright patch with noise: its four ends are corners, no place along its sides is."""
+    ends = np.array([[60, 70], [250, 84], [246, 170], [56, 156]])
+    image = cv2.fillPoly(np.full((240, 320), 60, np.uint8), [ends], (220,), cv2.LINE_AA)
+    noisy = np.clip(image + np.random.default_rng(8).normal(0, 3, image.shape), 0, 255).astype(np.uint8)
+    pyramid = klt.build_pyramid(noisy, 2)
+    corners = detect_corners(pyramid[1], np.ones((120, 160), bool), np.zeros((0, 2)), 100, 16.0, 0.01)
+    to_end = np.linalg.norm(corners[:, None] - ends[None], axis=-1)
+    assert (to_end.min(axis=0) < 7).all()
+    outline = ends.astype(np.float32)
+    to_side = np.abs([cv2.pointPolygonTest(outline, (float(u), float(v)), measureDist=True) for u, v in corners])
+    assert not ((to_side < 6) & (to_end.min(axis=1) > 10)).any()
+
+
 def test_rotation_of_a_whole_fisheye_image() -> None:
     camera = KannalaBrandt(320, 300, 110.0, 110.0, 160.0, 150.0, (-0.004, 0.037, -0.035, 0.006))
     world = cv2.GaussianBlur(texture(7, 900, 1800), (0, 0), 20)

@@ -14,6 +14,7 @@ from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.types import F64, U8, Bool
 
 BORDER = 12  # px of the half image, without corners
+MIN_SHARE = 0.1  # of the smaller eigenvalue in the larger one: below, the corner lies somewhere along an edge
 
 
 @njit
@@ -26,8 +27,21 @@ def _block(blocked, u, v, radius):
 
 
 @njit
-def _cell_maxima(score, blocked, cell, floor):
-    """Best unblocked pixel of every cell: (M, 2) integer u v and (M,) score, in row order."""
+def _lies_on_edge(image, u, v):
+    """Whether the structure tensor of the 5x5 pixels has one small eigenvalue (Lowe, IJCV 2004, section 4.1)."""
+    a, b, c = 0.0, 0.0, 0.0
+    for y in range(v - 2, v + 3):
+        for x in range(u - 2, u + 3):
+            gx, gy = float(image[y, x + 1]) - float(image[y, x - 1]), float(image[y + 1, x]) - float(image[y - 1, x])
+            a += gx * gx
+            b += gx * gy
+            c += gy * gy
+    return (a * c - b * b) * (1 + MIN_SHARE) ** 2 < MIN_SHARE * (a + c) ** 2
+
+
+@njit
+def _cell_maxima(image, score, blocked, cell, floor):
+    """Best unblocked pixel of every cell that is not on an edge: (M, 2) integer u v and (M,) score, in row order."""
     h, w = score.shape
     found = np.empty((((h + cell - 1) // cell) * ((w + cell - 1) // cell), 2), np.int64)
     best = np.empty(len(found))
@@ -37,7 +51,7 @@ def _cell_maxima(score, blocked, cell, floor):
             s, bu, bv = floor, -1, -1
             for y in range(top, min(top + cell, h)):
                 for x in range(left, min(left + cell, w)):
-                    if score[y, x] > s and not blocked[y, x]:
+                    if score[y, x] > s and not blocked[y, x] and not _lies_on_edge(image, x, y):
                         s, bu, bv = score[y, x], x, y
             if bu >= 0:
                 found[n, 0], found[n, 1], best[n] = bu, bv, s
@@ -92,7 +106,7 @@ def detect_corners(half_image: U8, mask: Bool, taken: F64, count: int, spacing: 
     radius = max(int(spacing / 2), 1)
     inside = (np.rint(taken / 2)).astype(np.int64)
     _block_all(blocked, inside, radius)
-    found, best = _cell_maxima(score, blocked, max(radius, 4), 1e-7)
+    found, best = _cell_maxima(half_image, score, blocked, max(radius, 4), 1e-7)
     if len(found) == 0:
         return np.zeros((0, 2))
     strong = best > quality * np.percentile(best, 95)

@@ -1,0 +1,88 @@
+"""Errors of the scale, and of the position relative to the path, in ten simulated stores of different kinds.
+
+    python benchmarks/scale.py [--odometry] [--max-frames N] [SEQUENCE ...]
+
+Ten stores differ in density, seed, route, speed and camera; beside them the rendered store walk of the data root. The
+scale error is that of the Sim(3) alignment, below 0 where the estimated path is too short; ATE is the RMSE after SE(3)
+alignment in percent of the path. "odometry alone" runs without mapping and loop closing; "odometry" are the live poses
+with both, "map" the final ones. The last rows are the mean of the scale errors' amounts and the largest one.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from _sequences import data_root, one_thread
+
+one_thread()
+
+import cv2
+import numpy as np
+
+from stereo_sfm import config as configuration
+from stereo_sfm.drivers.select import SelectedFrames
+from stereo_sfm.drivers.source import open_source
+from stereo_sfm.eval.evaluate import evaluate
+from stereo_sfm.eval.record import RunRecord
+from stereo_sfm.pipeline.run import run
+
+STORES = (
+    "sim:sparse?seed=0&rate=10",
+    "sim:sparse?seed=3&rate=10&walk=1",
+    "sim:sparse?seed=7&rate=15&walk=2&speed=1.5",
+    "sim:aisle?seed=1&rate=10",
+    "sim:loop?seed=2&rate=10",
+    "sim:blank?seed=4&rate=10",
+    "sim:people?seed=5&rate=10",
+    "sim:sparse?seed=0&rate=10&camera=pinhole",
+    "sim:sparse?seed=5&rate=10&walk=3&camera=pinhole",
+    "sim:loop?seed=6&rate=10&camera=pinhole",
+)
+FRAMES = 150
+ALONE = ("mapper.enabled=false", "loop.enabled=false")
+Row = tuple[str, float, float, float]  # trajectory, scale error in percent, ATE in percent, path in metres
+
+
+def rows_of(spec: str, settings: tuple[str, ...], max_frames: int) -> list[Row]:
+    """Run on one sequence; a row for each of its trajectories."""
+    config = configuration.load(None, list(settings))
+    record = RunRecord.of(config)
+    cv2.setRNGSeed(0)
+    with SelectedFrames(open_source(spec), max_frames=max_frames) as source:
+        for _ in run(source, config, [record]):
+            pass
+        reference = source.ground_truth
+    assert reference is not None
+    trajectories = {"odometry alone": record.odometry()}
+    if not settings:
+        trajectories = {"odometry": record.odometry(), "map": record.mapped()}
+    rows: list[Row] = []
+    for name, trajectory in trajectories.items():
+        result = evaluate(trajectory, reference)
+        rows.append((name, 100 * (1 / result.sim3_scale - 1), result.ate_percent, result.length_m))
+    return rows
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("sequence", nargs="*", help="sources; default: the ten stores and the store walk")
+    parser.add_argument("--odometry", action="store_true", help="only without mapping and loop closing")
+    parser.add_argument("--max-frames", type=int, default=FRAMES)
+    args = parser.parse_args()
+    root = data_root()
+    walk = [str(root / "store_walk")] if root is not None and (root / "store_walk").is_dir() else []
+    found: dict[str, list[float]] = {}
+    print("| store | trajectory | path | scale error | ATE SE(3) |\n|---|---|---|---|---|")
+    for spec in args.sequence or [*STORES, *walk]:
+        rows = rows_of(spec, ALONE, args.max_frames)
+        rows += [] if args.odometry else rows_of(spec, (), args.max_frames)
+        for name, scale, ate, path in rows:
+            found.setdefault(name, []).append(abs(scale))
+            print(f"| {spec} | {name} | {path:.1f} m | {scale:+.3f} % | {ate:.3f} % |", flush=True)
+    for name, scales in found.items():
+        print(f"| mean, largest | {name} | | {np.mean(scales):.3f} %, {np.max(scales):.3f} % | |")
+
+
+if __name__ == "__main__":
+    main()
