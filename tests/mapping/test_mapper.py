@@ -230,7 +230,7 @@ def test_a_loop_moves_the_map_and_not_the_odometry() -> None:
     before, after = updates[closing - 1], updates[closing]
     closed, opened = mapper.map.keyframes.map_T_kf, without.map.keyframes.map_T_kf
     assert error(closed, stream.world_T_kf) < 0.8 * error(opened, stream.world_T_kf)
-    assert error(closed[-8:], stream.world_T_kf[-8:]) < 0.8 * error(opened[-8:], stream.world_T_kf[-8:])
+    assert error(closed[-8:], stream.world_T_kf[-8:]) < 0.9 * error(opened[-8:], stream.world_T_kf[-8:])
     # The newest keyframe before the loop stays where it was in the odometry frame.
     newest = int(before.kf_id)
     old = {int(k): p for u in updates[:closing] for k, p in zip(u.kf_ids, u.map_T_kf, strict=True)}[newest]
