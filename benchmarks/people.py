@@ -204,7 +204,8 @@ def painted_encounters(recording: str, kind: str, wanted: int, alone: float) -> 
         source, frames = painted(recording, kind, seed)
         for encounter in source.encounters[: wanted - numbers.count]:
             judge(source, frames, encounter, numbers)
-        numbers.errors.append((position_error(source, frames), alone))
+        if source.encounters:
+            numbers.errors.append((position_error(source, frames), alone))
         if numbers.count >= wanted:
             return numbers
     raise AssertionError

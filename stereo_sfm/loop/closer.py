@@ -72,8 +72,8 @@ class LoopCloser:
     """Finds loops; owns the place database.
 
     Candidates by appearance (bag of words) are verified geometrically (`verify`). A loop must not contradict odometry
-    by more than drift can explain, and successive keyframes must agree on it. Across a gap in tracking one keyframe with
-    strong evidence is enough, if the motion that it implies is possible.
+    by more than drift can explain, and successive keyframes must agree on it. Across a gap in tracking one keyframe
+    with strong evidence is enough, if the motion that it implies is possible.
     """
 
     def __init__(
