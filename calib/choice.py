@@ -11,11 +11,11 @@ import numpy as np
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.scene_model import DIRECTION, FOCAL_RIGHT, ROTATION, SHARED, decentered, moved
-from stereo_sfm.types import F64, Bool
+from stereo_sfm.types import F64, RIG_TERMS, Bool
 
 # Rotation of the right camera (3), direction of the baseline (2), focal length of the right relative to the left,
 # decentering of the right lens relative to the left (2).
-TERMS = 8
+TERMS = RIG_TERMS
 NAMES = (
     *(f"rotation of the right camera about {axis}" for axis in "xyz"),
     *(f"baseline direction, {axis}" for axis in "yz"),

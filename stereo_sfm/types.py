@@ -26,6 +26,9 @@ U16 = NDArray[np.uint16]
 Bool = NDArray[np.bool_]
 
 
+RIG_TERMS = 8  # of `CalibrationUpdate`
+
+
 def shape(*axes: int) -> dict[str, tuple[int, ...]]:
     """Metadata of an array field with more than one axis, so that its shape can be restored from a log.
 
@@ -241,7 +244,7 @@ class Keyframe(Message):
     descriptors: U8 = field(metadata=shape(-1, 32))  # binary (oriented BRIEF), zero rows where none could be computed
     submap_id: int = 0  # grows when tracking restarts after it was lost
     corners: Corners = field(default_factory=Corners.none)  # for place recognition
-    rig_terms: F64 = field(default_factory=lambda: np.zeros(8))  # (8,) the tracker's rig, as in `CalibrationUpdate`
+    rig_terms: F64 = field(default_factory=lambda: np.zeros(RIG_TERMS))  # (8,) as in `CalibrationUpdate`
     sides: Corners = field(default_factory=Corners.none)  # described in views that face the shelves on both sides
     down: F64 = field(default_factory=lambda: np.zeros(3))  # (3,) gravity's direction in this camera, zero: unknown
     down_sigma: float = 0.0  # radians, its standard deviation about each horizontal axis; 0: unknown
@@ -264,11 +267,20 @@ class CalibrationUpdate(Message):
     kf_id: int
     stamp_ns: int
     terms: F64  # (8,) added to the rig as its calibration says
-    terms_covariance: F64 = field(metadata=shape(8, 8))
+    terms_covariance: F64  # (8, 8)
     since_kf_id: int  # first keyframe that was seen by the rig so corrected; those before stay as they were
     applied: bool  # False: only reported
     why: str  # "significant", "step", "refined" or "drift"
     text: str  # human-readable
+
+    def __post_init__(self) -> None:
+        """Restore the covariance's shape; logs from before the decentering was a term have six, the others were 0."""
+        known = len(self.terms)
+        terms, covariance = np.zeros(RIG_TERMS), np.zeros((RIG_TERMS, RIG_TERMS))
+        terms[:known], covariance[:known, :known] = self.terms, self.terms_covariance.reshape(known, known)
+        object.__setattr__(self, "terms", terms)
+        object.__setattr__(self, "terms_covariance", covariance)
+        super().__post_init__()
 
 
 @dataclass(frozen=True, eq=False)

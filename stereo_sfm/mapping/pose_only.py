@@ -28,8 +28,8 @@ def _model(pose, points, kf, pt, uv_left, uv_right, weights, use, limit, cams, r
         for k in range(3):
             rot[0, i, k] = pose[i, k]
     return linearize(
-        rot, pos, points, kf, pt, uv_left, uv_right, weights, use, limit, cams, right_r, right_t, huber, False, False,
-        lin,
+        rot, pos, points, kf, pt, uv_left, uv_right, weights, np.ones(points.shape[0]), use, limit, cams, right_r,
+        right_t, huber, False, False, lin,
     )  # fmt: skip
 
 

@@ -68,7 +68,8 @@ def second_sequence(tmp_path: Path, store: Path, *options: str) -> int:
 
 def test_the_map_holds_what_it_is_recognised_by(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
     saved = load_map(store)
-    assert len(np.unique(saved.snapshot.corner_kf)) == len(saved) >= 10
+    described = len(np.unique(saved.snapshot.corner_kf))  # not where the view had hardly changed
+    assert 7 <= described <= len(saved) >= 10
     assert main(["map", "info", str(store)]) == 0
     count = len(saved.snapshot.corner_kf)
     assert f"{count} corners for place recognition in {len(saved)} keyframes" in capsys.readouterr().out

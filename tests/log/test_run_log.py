@@ -175,6 +175,17 @@ def _all(path: Path, topic: str, kind: type) -> list:
         return [schema.decoder(kind, r.schema.data)(r.data) for r in reader.messages([topic]) if r.schema]
 
 
+def test_a_correction_of_six_terms_from_an_older_log_is_read() -> None:
+    new, terms = _calibration(3), np.arange(6) * 1e-3
+    old = replace(new)
+    object.__setattr__(old, "terms", terms)
+    object.__setattr__(old, "terms_covariance", np.diag(terms**2))
+    read = schema.decoder(CalibrationUpdate, schema.schema_data(CalibrationUpdate))(schema.encode(old))
+    assert np.array_equal(read.terms, np.concatenate([terms, np.zeros(2)]))
+    assert np.array_equal(np.diag(read.terms_covariance), np.concatenate([terms**2, np.zeros(2)]))
+    assert read.terms_covariance.shape == (8, 8)
+
+
 def test_every_topic_of_the_table_that_a_run_has_is_there(run: Path) -> None:
     with LogReader(run) as reader:
         present = {t.topic: t.schema for t in reader.topics}

@@ -132,7 +132,7 @@ def keyframe(frame_id: int) -> Keyframe:
 def test_places_are_found_with_the_corrected_rig() -> None:
     before, after = 71, FREE.start
     expected = se3.inverse(drive().pose(before)) @ drive().pose(after)
-    wrong = with_terms(drive().rig, np.array([0.0, 0.02, 0.0, 0.0, 0.0, 0.0]))
+    wrong = with_terms(drive().rig, np.array([0.0, 0.02, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
     found: list[list[F64]] = []
     for rigs in ([wrong], [wrong, drive().rig], [drive().rig]):
         places = RecentPlaces(Config().loop, rigs[0])

@@ -40,8 +40,8 @@ def _lies_on_edge(image, u, v):
 
 
 @njit
-def _cell_maxima(image, score, blocked, cell, floor):
-    """Best unblocked pixel of every cell that is not on an edge: (M, 2) integer u v and (M,) score, in row order."""
+def _cell_maxima(image, score, blocked, cell, floor, edges):
+    """Best unblocked pixel of every cell, on an edge only with `edges`: (M, 2) integer u v and (M,) score, by rows."""
     h, w = score.shape
     found = np.empty((((h + cell - 1) // cell) * ((w + cell - 1) // cell), 2), np.int64)
     best = np.empty(len(found))
@@ -51,7 +51,7 @@ def _cell_maxima(image, score, blocked, cell, floor):
             s, bu, bv = floor, -1, -1
             for y in range(top, min(top + cell, h)):
                 for x in range(left, min(left + cell, w)):
-                    if score[y, x] > s and not blocked[y, x] and not _lies_on_edge(image, x, y):
+                    if score[y, x] > s and not blocked[y, x] and (edges or not _lies_on_edge(image, x, y)):
                         s, bu, bv = score[y, x], x, y
             if bu >= 0:
                 found[n, 0], found[n, 1], best[n] = bu, bv, s
@@ -89,7 +89,9 @@ def corner_mask(camera: Camera, max_angle_deg: float) -> Bool:
     return half
 
 
-def detect_corners(half_image: U8, mask: Bool, taken: F64, count: int, spacing: float, quality: float) -> F64:
+def detect_corners(
+    half_image: U8, mask: Bool, taken: F64, count: int, spacing: float, quality: float, edges: bool = False
+) -> F64:
     """New corners in areas without points.
 
     Args:
@@ -97,6 +99,7 @@ def detect_corners(half_image: U8, mask: Bool, taken: F64, count: int, spacing: 
         mask: (H/2, W/2) where corners may lie. taken: (N, 2) px of the full image, existing points.
         count: maximum number. spacing: minimum distance in px of the full image.
         quality: minimum response, as a fraction of the 95th percentile of the cells' best.
+        edges: also places along edges, which are no use for stereo matching: along the epipolar curve they look alike.
 
     Returns:
         (M, 2) float64 px of the full image, strongest first.
@@ -106,7 +109,7 @@ def detect_corners(half_image: U8, mask: Bool, taken: F64, count: int, spacing: 
     radius = max(int(spacing / 2), 1)
     inside = (np.rint(taken / 2)).astype(np.int64)
     _block_all(blocked, inside, radius)
-    found, best = _cell_maxima(half_image, score, blocked, max(radius, 4), 1e-7)
+    found, best = _cell_maxima(half_image, score, blocked, max(radius, 4), 1e-7, edges)
     if len(found) == 0:
         return np.zeros((0, 2))
     strong = best > quality * np.percentile(best, 95)

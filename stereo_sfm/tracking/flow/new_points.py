@@ -43,7 +43,10 @@ class NewPoints:
             return tracks
         self._area.learn(images.left[1])
         spacing = SPACING * math.sqrt(4.0 * self._area.mask.sum() / most)
-        corners = detect_corners(images.left[1], self._area.mask, tracks.uv, missing, spacing, config.corner_quality)
+        corners = detect_corners(
+            images.left[1], self._area.mask, tracks.uv, missing, spacing, config.corner_quality,
+            edges=not isinstance(images.right, tuple),
+        )  # fmt: skip
         match = self._stereo.match(images.left, images.right, corners)
         good = np.flatnonzero(match.good)
         rows, slots = self._follower.begin(images.left, match.uv_left[good])
