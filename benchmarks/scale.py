@@ -53,11 +53,11 @@ def rows_of(spec: str, settings: tuple[str, ...], max_frames: int) -> list[Row]:
             pass
         reference = source.ground_truth
     assert reference is not None
-    trajectories = {"odometry alone": record.odometry()}
-    if not settings:
-        trajectories = {"odometry": record.odometry(), "map": record.mapped()}
+    mapped = None if settings else record.mapped()
     rows: list[Row] = []
-    for name, trajectory in trajectories.items():
+    for name, trajectory in (("odometry" if mapped else "odometry alone", record.odometry()), ("map", mapped)):
+        if trajectory is None:
+            continue
         result = evaluate(trajectory, reference)
         rows.append((name, 100 * (1 / result.sim3_scale - 1), result.ate_percent, result.length_m))
     return rows
