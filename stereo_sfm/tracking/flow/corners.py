@@ -40,6 +40,18 @@ def _lies_on_edge(image, u, v):
 
 
 @njit
+def _cell_best(image, score, blocked, top, left, cell, floor, off_edges):
+    """Best unblocked pixel of a cell, with `off_edges` the best that is not on an edge: u, v; -1, -1 if none."""
+    h, w = score.shape
+    s, bu, bv = floor, -1, -1
+    for y in range(top, min(top + cell, h)):
+        for x in range(left, min(left + cell, w)):
+            if score[y, x] > s and not blocked[y, x] and not (off_edges and _lies_on_edge(image, x, y)):
+                s, bu, bv = score[y, x], x, y
+    return bu, bv
+
+
+@njit
 def _cell_maxima(image, score, blocked, cell, floor, edges):
     """Best unblocked pixel of every cell, on an edge only with `edges`: (M, 2) integer u v and (M,) score, by rows."""
     h, w = score.shape
@@ -48,13 +60,11 @@ def _cell_maxima(image, score, blocked, cell, floor, edges):
     n = 0
     for top in range(0, h, cell):
         for left in range(0, w, cell):
-            s, bu, bv = floor, -1, -1
-            for y in range(top, min(top + cell, h)):
-                for x in range(left, min(left + cell, w)):
-                    if score[y, x] > s and not blocked[y, x] and (edges or not _lies_on_edge(image, x, y)):
-                        s, bu, bv = score[y, x], x, y
-            if bu >= 0:
-                found[n, 0], found[n, 1], best[n] = bu, bv, s
+            u, v = _cell_best(image, score, blocked, top, left, cell, floor, False)
+            if u >= 0 and not edges and _lies_on_edge(image, u, v):
+                u, v = _cell_best(image, score, blocked, top, left, cell, floor, True)
+            if u >= 0:
+                found[n, 0], found[n, 1], best[n] = u, v, score[v, u]
                 n += 1
     return found[:n], best[:n]
 
