@@ -21,6 +21,7 @@ MAX_CORES = 1024  # of a machine
 
 # Names of earlier versions, in files and in the logs of old runs -> the current name.
 RENAMED = {
+    "mapper.cauchy_sigmas": "mapper.cauchy_medians",  # a sigma is about two medians
     "tracker.max_error": "tracker.max_error_sigmas",
     "manhattan.model_deg": "manhattan.model_sigma_deg",
     "manhattan.drift_deg_per_frame": "manhattan.drift_sigma_deg_per_frame",
