@@ -29,7 +29,7 @@ from stereo_sfm.types import F64
 TOP = Path(__file__).parents[1]
 SUITE = "bookworm"
 PACKAGES = "python3,python3-venv"
-NEEDED = "debootstrap", "qemu-aarch64-static"
+NEEDED = "debootstrap", "qemu-aarch64-static", "unshare", "mount"
 HANDLER = Path("/proc/sys/fs/binfmt_misc/qemu-aarch64")  # the kernel's, for programs of the other processor
 CERTIFICATES = Path("/etc/ssl/certs/ca-certificates.crt")  # with those that this machine trusts besides
 CHROOT = shutil.which("chroot") or "/usr/sbin/chroot"  # not on the path of the other system's programs
@@ -70,9 +70,10 @@ class ArmRoot:
         shutil.copy("/etc/resolv.conf", self.folder / "etc/resolv.conf")
 
     def run(self, *command: str) -> None:
-        """Run a program of the system to its end."""
+        """Run a program of the system to its end, with a /proc that is gone when it ends."""
         environment = {"PATH": "/usr/bin:/bin", "HOME": "/root", "PIP_CERT": str(CERTIFICATES)}
-        subprocess.run([CHROOT, str(self.folder), *command], check=True, env=environment)
+        with_proc = ["unshare", "--mount", "sh", "-c", 'mount -t proc proc "$0/proc" && exec "$@"', str(self.folder)]
+        subprocess.run([*with_proc, CHROOT, str(self.folder), *command], check=True, env=environment)
 
     def install(self, wheel: Path) -> None:
         """Install the package from its wheel; everything that it needs must have a wheel too."""

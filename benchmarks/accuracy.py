@@ -15,33 +15,23 @@ from _sequences import PEERS, one_thread, sequences
 
 one_thread()
 
-import cv2
 import numpy as np
+from _runs import ODOMETRY_ONLY, recorded_of
 
 from stereo_sfm import config as configuration
-from stereo_sfm.drivers.select import SelectedFrames
-from stereo_sfm.drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.eval.evaluate import Evaluation, evaluate, length
-from stereo_sfm.eval.record import RunRecord
-from stereo_sfm.pipeline.run import run
 
 HEADING = (
     "| sequence | frames | lost | path | trajectory | ATE SE(3) | % | ATE Sim(3) | scale "
     "| rotation | drift | deg/m | points |",
     "|---|---|---|---|---|---|---|---|---|---|---|---|---|",
 )
-ODOMETRY_ONLY = ("mapper.enabled=false", "loop.enabled=false")
 
 
 def rows_of(name: str, spec: str, config: configuration.Config, max_frames: int | None) -> list[str]:
     """Run on one sequence; a table row for each trajectory of it."""
-    record = RunRecord.of(config)
-    cv2.setRNGSeed(0)
-    with SelectedFrames(open_source(spec), max_frames=max_frames) as source:
-        for _ in run(source, config, [record]):
-            pass
-        reference = source.ground_truth
+    record, reference = recorded_of(spec, config, max_frames)
     lost = len(record.frames) - int(record.tracked().sum())
     inliers = int(np.median(record.frames.inliers))
     rows: list[str] = []

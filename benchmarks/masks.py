@@ -24,16 +24,14 @@ from _sequences import one_thread
 
 one_thread()
 
-import cv2
 import numpy as np
+from _runs import recorded
 
 from stereo_sfm import config as configuration
 from stereo_sfm.calib.mask_search import MaskSearch, masked
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.drivers.source import BaseSource, open_source
 from stereo_sfm.eval.evaluate import evaluate, length
-from stereo_sfm.eval.record import RunRecord
-from stereo_sfm.pipeline.run import run
 from stereo_sfm.tracking.factory import make_tracker
 from stereo_sfm.types import F64, Bool, StereoImage, Trajectory
 
@@ -88,10 +86,7 @@ def automatically_masked(source: Rendered) -> Rig:
 def errors(source: Rendered, settings: tuple[str, ...] = ()) -> tuple[float, float, int, float]:
     """ATE of odometry and map in metres, lost frames, median number of points."""
     config = configuration.load(None, list(settings))
-    record = RunRecord.of(config)
-    cv2.setRNGSeed(0)
-    for _ in run(source, config, [record]):
-        pass
+    record = recorded(source, config)
     odometry, mapped = record.odometry(), record.mapped()
     assert source.ground_truth is not None and odometry is not None and mapped is not None
     alone, together = (evaluate(t, source.ground_truth).ape_m.rmse for t in (odometry, mapped))

@@ -15,11 +15,11 @@ from _sequences import one_thread, sequences
 
 one_thread()
 
+from _runs import recorded
+
 from stereo_sfm.config import Config
 from stereo_sfm.drivers.source import open_source
 from stereo_sfm.eval.evaluate import evaluate, length
-from stereo_sfm.eval.record import RunRecord
-from stereo_sfm.pipeline.run import run
 
 SOURCES = (
     "rgbd_dataset_freiburg1_xyz",
@@ -30,13 +30,11 @@ SOURCES = (
 
 def row(name: str, spec: str, known: bool) -> str:
     """One line of the table."""
-    record = RunRecord.of(Config())
     with open_source(spec) as source:
         readout_s = source.rig.readout_s
         if not known:
             source.rig = dataclasses.replace(source.rig, readout_s=0.0)  # pyright: ignore[reportAttributeAccessIssue]
-        for _ in run(source, Config(), [record]):
-            pass
+        record = recorded(source, Config())
         truth = source.ground_truth
     if truth is None:
         return f"| {name} | – |"

@@ -16,15 +16,11 @@ from _sequences import data_root, one_thread
 
 one_thread()
 
-import cv2
 import numpy as np
+from _runs import ODOMETRY_ONLY, recorded_of
 
 from stereo_sfm import config as configuration
-from stereo_sfm.drivers.select import SelectedFrames
-from stereo_sfm.drivers.source import open_source
 from stereo_sfm.eval.evaluate import evaluate
-from stereo_sfm.eval.record import RunRecord
-from stereo_sfm.pipeline.run import run
 
 STORES = (
     "sim:sparse?seed=0&rate=10",
@@ -39,23 +35,17 @@ STORES = (
     "sim:loop?seed=6&rate=10&camera=pinhole",
 )
 FRAMES = 150
-ALONE = ("mapper.enabled=false", "loop.enabled=false")
 Row = tuple[str, float, float, float]  # trajectory, scale error in percent, ATE in percent, path in metres
 
 
 def rows_of(spec: str, settings: tuple[str, ...], max_frames: int) -> list[Row]:
     """Run on one sequence; a row for each of its trajectories."""
-    config = configuration.load(None, list(settings))
-    record = RunRecord.of(config)
-    cv2.setRNGSeed(0)
-    with SelectedFrames(open_source(spec), max_frames=max_frames) as source:
-        for _ in run(source, config, [record]):
-            pass
-        reference = source.ground_truth
+    record, reference = recorded_of(spec, configuration.load(None, list(settings)), max_frames)
     assert reference is not None
     mapped = None if settings else record.mapped()
     rows: list[Row] = []
-    for name, trajectory in (("odometry" if mapped else "odometry alone", record.odometry()), ("map", mapped)):
+    live = "odometry" if mapped is not None else "odometry alone"
+    for name, trajectory in ((live, record.odometry()), ("map", mapped)):
         if trajectory is None:
             continue
         result = evaluate(trajectory, reference)
@@ -75,7 +65,7 @@ def main() -> None:
     found: dict[str, list[float]] = {}
     print("| store | trajectory | path | scale error | ATE SE(3) |\n|---|---|---|---|---|")
     for spec in args.sequence or [*STORES, *walk]:
-        rows = rows_of(spec, ALONE, args.max_frames)
+        rows = rows_of(spec, ODOMETRY_ONLY, args.max_frames)
         rows += [] if args.odometry else rows_of(spec, (), args.max_frames)
         for name, scale, ate, path in rows:
             found.setdefault(name, []).append(abs(scale))

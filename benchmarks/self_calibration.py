@@ -23,19 +23,17 @@ from _sequences import one_thread
 
 one_thread()
 
-import cv2
 import numpy as np
+from _runs import recorded
 
 from stereo_sfm import config as configuration
-from stereo_sfm.calib.choice import TERMS, with_terms
+from stereo_sfm.calib.choice import with_terms
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.drivers.sim.source import SimSource
 from stereo_sfm.drivers.source import BaseSource, open_source
 from stereo_sfm.eval.evaluate import evaluate
-from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.geometry import se3
-from stereo_sfm.pipeline.run import run
-from stereo_sfm.types import F64, StereoImage, Trajectory
+from stereo_sfm.types import F64, RIG_TERMS, StereoImage, Trajectory
 
 CAMERAS = ("fisheye", "pinhole")
 TURNS = ((0.05, 0, 0), (0, 0.05, 0), (0, 0, 0.05), (0, 0.1, 0), (0.2, 0, 0), (0, -0.3, 0), (0, 0, -0.3))
@@ -88,11 +86,8 @@ def render(camera: str, seed: int, args: argparse.Namespace, how: str) -> tuple[
 def measure(images: list[StereoImage], believed: Rig, true: Rig, truth: Trajectory, mode: str = "auto") -> Result:
     """Run with a calibration and compare with the truth."""
     config = configuration.load(None, [f"self_calibration.mode={mode}"])
-    record = RunRecord.of(config)
-    cv2.setRNGSeed(0)
-    for _ in run(Rendered(images, believed, truth), config, [record]):
-        pass
-    last = record.calibrations[-1].terms if record.calibrations else np.zeros(TERMS)
+    record = recorded(Rendered(images, believed, truth), config)
+    last = record.calibrations[-1].terms if record.calibrations else np.zeros(RIG_TERMS)
     mended = with_terms(believed, last)
     left = np.rad2deg(se3.log(se3.inverse(mended.left_T_right) @ true.left_T_right)[3:])
     noticed = (record.calibrations[0].stamp_ns - images[0].stamp_ns) * 1e-9 if record.calibrations else np.inf

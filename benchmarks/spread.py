@@ -15,20 +15,16 @@ from _sequences import one_thread, sequences
 
 one_thread()
 
-import cv2
 import numpy as np
+from _runs import ODOMETRY_ONLY, recorded_of
 
 from stereo_sfm import config as configuration
-from stereo_sfm.drivers.source import open_source
 from stereo_sfm.eval.evaluate import evaluate, length
-from stereo_sfm.eval.record import RunRecord
-from stereo_sfm.pipeline.run import run
 from stereo_sfm.types import F64
 
 SEQUENCES = ("kitti", "euroc_mh01", "rgbd_dataset_freiburg1_xyz")
 KEYFRAME_SHARES = (0.97, 1.0, 1.03)  # of the default
 CORNER_QUALITIES = (0.9, 1.0, 1.1)
-ODOMETRY_ONLY = ("mapper.enabled=false", "loop.enabled=false")
 
 
 def errors(spec: str, settings: tuple[str, ...]) -> F64:
@@ -40,13 +36,7 @@ def errors(spec: str, settings: tuple[str, ...]) -> F64:
             f"tracker.keyframe_share={share * default.keyframe_share:.4f}",
             f"tracker.corner_quality={quality * default.corner_quality:.5f}",
         )
-        config = configuration.load(None, [*varied, *settings])
-        record = RunRecord.of(config)
-        cv2.setRNGSeed(0)
-        with open_source(spec) as source:
-            for _ in run(source, config, [record]):
-                pass
-            reference = source.ground_truth
+        record, reference = recorded_of(spec, configuration.load(None, [*varied, *settings]))
         assert reference is not None
         found = evaluate(record.odometry() if settings else record.mapped(), reference)
         out.append((found.ape_m.rmse, found.ate_sim3_m))

@@ -15,7 +15,6 @@ from stereo_sfm.types import F64, RIG_TERMS, Bool
 
 # Rotation of the right camera (3), direction of the baseline (2), focal length of the right relative to the left,
 # decentering of the right lens relative to the left (2).
-TERMS = RIG_TERMS
 NAMES = (
     *(f"rotation of the right camera about {axis}" for axis in "xyz"),
     *(f"baseline direction, {axis}" for axis in "yz"),
@@ -49,7 +48,7 @@ class Estimate:
 
     def without(self, kept: Bool) -> Estimate:
         """The estimate with the terms that are not `kept` (8,) held at zero: the conditional Gaussian."""
-        value, covariance = np.zeros(TERMS), np.zeros((TERMS, TERMS))
+        value, covariance = np.zeros(RIG_TERMS), np.zeros((RIG_TERMS, RIG_TERMS))
         inside, across = np.ix_(kept, kept), np.ix_(kept, ~kept)
         gain = self.covariance[across] @ np.linalg.pinv(self.covariance[np.ix_(~kept, ~kept)])
         value[kept] = self.value[kept] - gain @ self.value[~kept]
@@ -97,9 +96,9 @@ class Choice:
 
 def choose(whole: Estimate, halves: Sequence[Estimate], rolling: bool = False, sigmas: float | F64 = SIGMAS) -> Choice:
     """The significant terms of `whole`, with what speaks for and against each; arguments as those of `significant`."""
-    needed, kept = np.broadcast_to(sigmas, TERMS), significant(whole, halves, rolling, sigmas)
+    needed, kept = np.broadcast_to(sigmas, RIG_TERMS), significant(whole, halves, rolling, sigmas)
     final = whole.without(kept)
-    terms = tuple(_term(i, whole, halves, kept, rolling, needed[i]) for i in range(TERMS))
+    terms = tuple(_term(i, whole, halves, kept, rolling, needed[i]) for i in range(RIG_TERMS))
     alone = np.array([t.sigma for t in terms]) / SCALES
     return Choice(terms, final.value, np.where(kept, final.sigma, alone), kept)
 
@@ -114,8 +113,8 @@ def significant(
         sigmas: standard deviations from zero that make a term significant; one number, or (8,).
         rolling: rolling shutter; terms that motion can mimic are not written.
     """
-    needed = np.broadcast_to(sigmas, TERMS)
-    kept = ~ROLLING_SHUTTER_MIMICS if rolling else np.ones(TERMS, bool)
+    needed = np.broadcast_to(sigmas, RIG_TERMS)
+    kept = ~ROLLING_SHUTTER_MIMICS if rolling else np.ones(RIG_TERMS, bool)
     while kept.any():
         strength, agreed = _evidence(whole, halves, kept)
         weak = kept & ((strength < needed) | ~agreed)
@@ -128,10 +127,10 @@ def significant(
 def _evidence(whole: Estimate, halves: Sequence[Estimate], kept: Bool) -> tuple[F64, Bool]:
     """(8,) values in standard deviations, and (8,) whether every half confirms them."""
     here = whole.without(kept)
-    parts = np.array([half.without(kept).value for half in halves]).reshape(-1, TERMS)
+    parts = np.array([half.without(kept).value for half in halves]).reshape(-1, RIG_TERMS)
     strength = np.abs(here.value) / np.maximum(here.sigma, 1e-12)
     shown = parts * np.sign(here.value) >= MIN_SHARE_IN_HALVES * np.abs(here.value)
-    return strength, np.asarray(shown.all(0) if len(parts) else np.zeros(TERMS, bool))
+    return strength, np.asarray(shown.all(0) if len(parts) else np.zeros(RIG_TERMS, bool))
 
 
 def _term(i: int, whole: Estimate, halves: Sequence[Estimate], kept: Bool, rolling: bool, needed: float) -> Term:

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stereo_sfm.calib.amount import FOCAL_BOTH, FOCAL_RATIO, TURN, amounts
-from stereo_sfm.calib.choice import TERMS, Estimate
+from stereo_sfm.calib.choice import Estimate
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.scene_model import (
     DIRECTION,
@@ -36,7 +36,7 @@ from stereo_sfm.calib.scene_model import (
 )
 from stereo_sfm.calib.tracks import Window
 from stereo_sfm.geometry import se3
-from stereo_sfm.types import F64, Bool
+from stereo_sfm.types import F64, RIG_TERMS, Bool
 
 HALF_ITERATIONS = 10
 # The magnification of both cameras is shown by more than one window, with motion (a share of the image's width) and a
@@ -160,7 +160,7 @@ def _halves(problems: list[Problem]) -> tuple[list[Problem], list[Problem]]:
 
 def _terms(fit: _Fit, total: F64) -> Estimate:
     """The terms from which `stereo_sfm.calib.choice` selects."""
-    by_vector = np.zeros((TERMS, SHARED))
+    by_vector = np.zeros((RIG_TERMS, SHARED))
     by_vector[:3], by_vector[5] = total[TURN], total[FOCAL_RATIO]
     by_vector[3:5, DIRECTION] = np.eye(2)
     unknown = np.diag([*[0.0] * 6, 0.01**2, 0.01**2])  # decentering: the displacements stand for it

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stereo_sfm.calib.choice import TERMS, with_terms
+from stereo_sfm.calib.choice import with_terms
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
@@ -31,7 +31,7 @@ from stereo_sfm.loop.sideways import (
 from stereo_sfm.loop.verification import Verdict, looks_alike, rejection, verify, within
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.timing import NoSpans
-from stereo_sfm.types import F64, Keyframe, LoopResult
+from stereo_sfm.types import F64, RIG_TERMS, Keyframe, LoopResult
 
 CLOUD_KEYFRAMES = 4  # connected keyframes whose points are added to a candidate's own
 PLACE_RADIUS = 3  # candidates at most so many keyframes apart are one place: only the best of them is verified
@@ -85,7 +85,7 @@ class LoopCloser:
             vocabulary = configured_vocabulary(config)
         self._config, self._rig, self._spans = config, rig, spans or NoSpans()
         self._side_config = sideways_config(config)
-        self._source_rig, self._rig_terms = rig, np.zeros(TERMS)
+        self._source_rig, self._rig_terms = rig, np.zeros(RIG_TERMS)
         self._vocabulary = vocabulary
         self._database = PlaceDatabase(len(vocabulary))
         self._side_database = PlaceDatabase(len(vocabulary))  # with the same rows

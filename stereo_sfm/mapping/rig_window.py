@@ -14,14 +14,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stereo_sfm.calib.choice import TERMS, with_terms
+from stereo_sfm.calib.choice import with_terms
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.scene_model import inverse_distances, tangents
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.stereo import rectifying_rotations
 from stereo_sfm.mapping import rig_window_kernels
-from stereo_sfm.types import F64, I64, Keyframe
+from stereo_sfm.types import F64, I64, RIG_TERMS, Keyframe
 
 MIN_POINTS = 20
 MAX_POINTS = 160
@@ -159,7 +159,7 @@ class _System:
         """The system at the problem's present state."""
         assert rig.right is not None
         count, frames = len(problem.rho), len(problem.frame_T_first)
-        shared = TERMS + len(problem.lens)
+        shared = RIG_TERMS + len(problem.lens)
         size = shared + 6 * (frames - 1)
         h, g = np.zeros((size, size)), np.zeros(size)
         gain, gradient = np.zeros((count, 3, size)), np.zeros((count, 3))
@@ -190,21 +190,21 @@ class _System:
         delta = -np.linalg.solve(
             self.matrix + np.diag(prior), self.gradient + prior * np.concatenate([terms, problem.lens])
         )
-        problem.lens = problem.lens + delta[TERMS:]
+        problem.lens = problem.lens + delta[RIG_TERMS:]
         pose = -(self.pose_gradient + self.pose_gain @ delta)
         step = -(self.point_gradient + self.point_gain @ np.concatenate([delta, pose]))
         turned = problem.bearing + (tangents(problem.bearing) @ step[:, :2, None])[..., 0]
         problem.bearing = turned / np.linalg.norm(turned, axis=1, keepdims=True)
         problem.rho = problem.rho + step[:, 2]
         problem.frame_T_first[1:] = se3.exp(pose.reshape(-1, 6)) @ problem.frame_T_first[1:]
-        return np.asarray(delta[:TERMS], float)
+        return np.asarray(delta[:RIG_TERMS], float)
 
     def information(self, problem: _Problem, terms: F64) -> RigInformation:
         """About the rig's terms alone, whatever the lens is."""
-        own = self.matrix[TERMS:, TERMS:] + np.diag(LENS_PRIOR**-2)
-        gain = np.linalg.solve(own, self.matrix[TERMS:, :TERMS]).T
-        matrix = self.matrix[:TERMS, :TERMS] - gain @ self.matrix[TERMS:, :TERMS]
-        gradient = self.gradient[:TERMS] - gain @ (self.gradient[TERMS:] + problem.lens / LENS_PRIOR**2)
+        own = self.matrix[RIG_TERMS:, RIG_TERMS:] + np.diag(LENS_PRIOR**-2)
+        gain = np.linalg.solve(own, self.matrix[RIG_TERMS:, :RIG_TERMS]).T
+        matrix = self.matrix[:RIG_TERMS, :RIG_TERMS] - gain @ self.matrix[RIG_TERMS:, :RIG_TERMS]
+        gradient = self.gradient[:RIG_TERMS] - gain @ (self.gradient[RIG_TERMS:] + problem.lens / LENS_PRIOR**2)
         return RigInformation(matrix, matrix @ terms - gradient)
 
 

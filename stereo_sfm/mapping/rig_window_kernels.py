@@ -16,8 +16,7 @@ import math
 import numpy as np
 
 from stereo_sfm.geometry.kernels import njit, project_one
-
-TERMS = 8  # of the rig
+from stereo_sfm.types import RIG_TERMS
 
 
 @njit
@@ -45,7 +44,7 @@ def _lens_rows(shape, lens, j_rig, residual, at):
     """What the lens's terms do to one image's rows."""
     for i in range(2):
         for k in range(lens.shape[0]):
-            j_rig[at + i, TERMS + k] = shape[i, k]
+            j_rig[at + i, RIG_TERMS + k] = shape[i, k]
             residual[at + i] -= shape[i, k] * lens[k]
 
 
@@ -69,7 +68,7 @@ def accumulate(
     """
     frames, count = uv_left.shape[0], uv_left.shape[1]
     model_l, params_l, model_r, params_r = cams
-    shared = TERMS + lens.shape[0]
+    shared = RIG_TERMS + lens.shape[0]
     r_size = shared + 6 * (frames - 1)
     h[:] = 0.0
     g[:] = 0.0

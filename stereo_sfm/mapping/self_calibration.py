@@ -16,11 +16,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stereo_sfm.calib.choice import NAMES, SCALES, TERMS, UNITS, Choice, Estimate, choose, significant
+from stereo_sfm.calib.choice import NAMES, SCALES, UNITS, Choice, Estimate, choose, significant
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.mapping.rig_window import PRIOR, RigInformation, RigWindow, solve_window
-from stereo_sfm.types import F64, Keyframe
+from stereo_sfm.types import F64, RIG_TERMS, Keyframe
 
 KEYFRAMES = 4  # of one window
 MIN_KEYFRAMES = 3  # of the last window
@@ -57,8 +57,8 @@ class SelfCalibration:
     def __init__(self, rig: Rig, applies: bool = True) -> None:
         """`rig`: the calibrated rig, two cameras. `applies`: revisions change the rig of the run."""
         self._rig, self.applies = rig, applies
-        self.terms: F64 = np.zeros(TERMS)  # current corrections
-        self._corrected = np.zeros(TERMS, bool)
+        self.terms: F64 = np.zeros(RIG_TERMS)  # current corrections
+        self._corrected = np.zeros(RIG_TERMS, bool)
         self._keyframes: list[Keyframe] = []
         self._windows: deque[RigWindow] = deque(maxlen=MAX_WINDOWS)  # since the last step
         self._since = 0  # first keyframe of the windows
@@ -144,8 +144,8 @@ class SelfCalibration:
         """Of terms that change steadily: their change at the end of `span`, and that from its beginning to its end."""
         seconds = (span[-1].stamp_ns - span[0].stamp_ns) * 1e-9
         matrix = np.kron(np.diag([1.0, 0.0]), np.diag(1 / PRIOR**2))
-        matrix += np.kron(np.diag([0.0, 1.0]), np.eye(TERMS) / (RATE * seconds) ** 2)
-        vector = np.concatenate([self.terms / PRIOR**2, np.zeros(TERMS)])
+        matrix += np.kron(np.diag([0.0, 1.0]), np.eye(RIG_TERMS) / (RATE * seconds) ** 2)
+        vector = np.concatenate([self.terms / PRIOR**2, np.zeros(RIG_TERMS)])
         for window in windows:
             axis = np.array([1.0, (window.stamp_ns - span[-1].stamp_ns) * 1e-9 / seconds])
             matrix += np.kron(np.outer(axis, axis), window.information.matrix)
@@ -153,7 +153,10 @@ class SelfCalibration:
         covariance = np.asarray(np.linalg.inv(matrix), float)
         end, change = np.split(covariance @ vector, 2)
         floor = np.diag(self._floor**2)
-        end_covariance, change_covariance = covariance[:TERMS, :TERMS] + floor, covariance[TERMS:, TERMS:] + 2 * floor
+        end_covariance, change_covariance = (
+            covariance[:RIG_TERMS, :RIG_TERMS] + floor,
+            covariance[RIG_TERMS:, RIG_TERMS:] + 2 * floor,
+        )
         return Estimate(end - self.terms, end_covariance), Estimate(change, change_covariance)
 
     def _detect_step(self) -> None:

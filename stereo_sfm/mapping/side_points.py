@@ -36,8 +36,8 @@ def join_corners(map_: Map, sightings: I64, sigma_px: float) -> list[tuple[int, 
                 fused.append((other, known[0]))
     wanted: dict[int, dict[int, int]] = {}  # keyframe row -> point row -> row in its `sides`
     for corner in corners:
-        point = [*_points(map_, corner), -1][0]
-        point = point if point >= 0 else _new_point(map_, corner, sigma_px)
+        known = _points(map_, corner)
+        point = known[0] if known else _new_point(map_, corner, sigma_px)
         for kf, row in corner:
             wanted.setdefault(kf, {}).setdefault(point, row)
     for kf in sorted(wanted):

@@ -23,7 +23,7 @@ from stereo_sfm.tracking.flow.klt import FLAT_SIZE, build_pyramid
 from stereo_sfm.tracking.flow.reappearance import find_deformed
 from stereo_sfm.tracking.inertial.inertial_filter import MIN_S
 from stereo_sfm.tracking.inertial.inertial_motion import NODE_NS, InertialMotion
-from stereo_sfm.types import F32, F64, U8, Corners, ImuSamples, Keyframe, StereoImage
+from stereo_sfm.types import F32, F64, RIG_TERMS, U8, Corners, ImuSamples, Keyframe, StereoImage
 
 FRAMES, POINTS = 8, 300
 WALL = 2.0  # metres ahead
@@ -118,7 +118,6 @@ def _warm_up_inertial(imu: Imu) -> None:
 
 def warm_up_stage(stage: str, config: Config, rig: Rig) -> None:
     """Load (the first time ever: compile) what `stage` calls, on a scratch instance of it."""
-    from stereo_sfm.calib.choice import TERMS
     from stereo_sfm.loop.database import PlaceDatabase
     from stereo_sfm.mapping.mapper import Mapper
     from stereo_sfm.mapping.rig_window import solve_window
@@ -139,7 +138,7 @@ def warm_up_stage(stage: str, config: Config, rig: Rig) -> None:
             mapper.step(keyframe)
         mapper.finish([])
         if SelfCalibration.wanted(config, rig) is not None:
-            solve_window(rig, keyframes(rig)[:: FRAMES // 4], np.zeros(TERMS))
+            solve_window(rig, keyframes(rig)[:: FRAMES // 4], np.zeros(RIG_TERMS))
     elif stage == "loop":
         eager = dataclasses.replace(config.loop, min_gap=1, min_score=0.0, pause=0)
         closer = make_closer(dataclasses.replace(config, loop=eager), rig)

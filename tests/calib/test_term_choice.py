@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereo_sfm.calib.choice import TERMS, Estimate, choose
+from stereo_sfm.calib.choice import Estimate, choose
 from stereo_sfm.calib.consequences import consequences
 from stereo_sfm.calib.consistency import estimate
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
+from stereo_sfm.types import RIG_TERMS
 from tests.calib.test_check import RIGS, SEEN, magnified, turned, windows
 from tests.synthetic import pinhole_rig
 
@@ -17,7 +18,7 @@ SIGMA = np.array([1e-4, 1e-4, 1e-4, 1e-3, 1e-3, 1e-4, 1e-4, 1e-4])
 
 
 def estimated(*values: float) -> Estimate:
-    value = np.array([*values, *[0.0] * (TERMS - len(values))])
+    value = np.array([*values, *[0.0] * (RIG_TERMS - len(values))])
     return Estimate(SIGMA * value, np.diag(SIGMA**2))
 
 
@@ -42,7 +43,7 @@ def test_terms_that_trade_with_one_that_stays_take_its_part() -> None:
     a, b = 0, 4
     covariance[a, a], covariance[b, b] = 25 * SIGMA[a] ** 2, 25 * SIGMA[b] ** 2
     covariance[a, b] = covariance[b, a] = 24.5 * SIGMA[a] * SIGMA[b]
-    value = np.zeros(TERMS)
+    value = np.zeros(RIG_TERMS)
     value[a], value[b] = 12 * SIGMA[a], 3 * SIGMA[b]
     both = Estimate(value, covariance)
     choice = choose(both, (both, both))

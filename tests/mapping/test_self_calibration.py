@@ -8,14 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stereo_sfm.calib.choice import TERMS, with_terms
+from stereo_sfm.calib.choice import with_terms
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config, MapperConfig, SelfCalibrationConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.mapper import Mapper
 from stereo_sfm.mapping.row_errors import RowMonitor
 from stereo_sfm.mapping.self_calibration import Revision, SelfCalibration
-from stereo_sfm.types import Keyframe
+from stereo_sfm.types import RIG_TERMS, Keyframe
 from tests.synthetic import camera_path, fisheye_rig, pinhole_rig, points_around
 
 RIGS = {"fisheye": fisheye_rig(), "pinhole": pinhole_rig()}
@@ -81,7 +81,7 @@ def test_a_turned_camera_is_found(name: str, degrees: tuple[float, float, float]
 def test_a_decentered_lens_is_found(kind: int) -> None:
     """1 px in the corners, as in KITTI's rectified images; the rotations stay within their errors."""
     believed = RIGS["pinhole"]
-    terms = np.zeros(TERMS)
+    terms = np.zeros(RIG_TERMS)
     terms[kind] = 0.004
     estimator, found = revisions(with_terms(believed, terms), believed, 0)
     assert found and estimator.terms[kind] == pytest.approx(0.004, abs=0.0013)  # three sigmas
@@ -125,7 +125,9 @@ def test_the_same_keyframes_give_the_same_bits() -> None:
 def test_a_turning_window_has_less_information_about_disparity() -> None:
     from stereo_sfm.mapping.rig_window import solve_window
 
-    window = solve_window(RIGS["pinhole"], list(keyframes([RIGS["pinhole"]] * 4, RIGS["pinhole"], 0)), np.zeros(TERMS))
+    window = solve_window(
+        RIGS["pinhole"], list(keyframes([RIGS["pinhole"]] * 4, RIGS["pinhole"], 0)), np.zeros(RIG_TERMS)
+    )
     assert window is not None
     little, much = (np.diag(np.linalg.inv(window.information.with_lens_error(a).matrix)) for a in (0.01, 1.0))
     assert much[1] > 4 * little[1] and much[0] == pytest.approx(little[0], rel=0.3)

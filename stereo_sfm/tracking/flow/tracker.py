@@ -13,7 +13,7 @@ from itertools import chain
 
 import numpy as np
 
-from stereo_sfm.calib.choice import TERMS, with_terms
+from stereo_sfm.calib.choice import with_terms
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
@@ -41,7 +41,7 @@ from stereo_sfm.tracking.flow.trusted_motion import Expectation
 from stereo_sfm.tracking.flow.visible_area import VisibleArea
 from stereo_sfm.tracking.inertial.motion_sensors import MotionSensors
 from stereo_sfm.tracking.protocol import Places
-from stereo_sfm.types import F64, Bool, Frame, Keyframe, MapUpdate, Observations, StereoImage, TrackState
+from stereo_sfm.types import F64, RIG_TERMS, Bool, Frame, Keyframe, MapUpdate, Observations, StereoImage, TrackState
 
 NOT_FOUND = (
     Tracks(),
@@ -77,7 +77,7 @@ class Tracker:
         side_views: views for place recognition in the opposite direction; None: keyframes have none.
         """
         self._config, self._rig = config, rig
-        self._rig_terms: F64 = np.zeros(TERMS)  # current correction of the rig
+        self._rig_terms: F64 = np.zeros(RIG_TERMS)  # current correction of the rig
         self._spans = spans or NoSpans()
         self._stereo = StereoMatcher(config, rig)
         self._shutter = RollingShutter(rig)
