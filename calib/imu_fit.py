@@ -1,4 +1,4 @@
-"""Time offset and rotation of an IMU, from the gyroscope's samples and the rotations that a camera saw."""
+"""Time offset and rotation of an IMU, from its samples and the motion that a camera saw."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from stereo_sfm.calib.check import Finding
+from stereo_sfm.calib.force_fit import Forces
 from stereo_sfm.calib.imu import Imu
-from stereo_sfm.calib.robust_fit import robust_fit, shift_between
+from stereo_sfm.calib.robust_fit import Whitening, robust_fit, shift_between
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.procrustes import rotation_between
@@ -16,6 +17,7 @@ from stereo_sfm.types import F64, I64, ImuSamples
 
 REACH_S = 0.3  # of the search for the time offset
 MIN_FRAMES = 60
+CLIP = 3.0  # standard deviations of an error
 MIN_TURN = 0.03  # rad/s, root mean square, below which a rotation shows nothing
 OFFSET_MS, ROTATION_DEG = (0.5, 3.0), (0.1, 1.0)  # standard deviations: known well, known at all
 WRONG_OFFSET_MS, WRONG_ROTATION_DEG = (3.0, 20.0), (1.0, 5.0)  # differences that warn and fail
@@ -50,28 +52,55 @@ def fit_imu(stamp_ns: I64, poses: F64, samples: ImuSamples, imu: Imu) -> ImuFit:
     start = rotation_between(rates.turned(offset), rates.turns)
     scale = float(np.linalg.norm(rates.turned(offset)) / np.linalg.norm(rates.turns))
 
-    def residual(x: F64) -> F64:
-        seen = (rates.turned(x[3]) / scale - x[4:7] * rates.seconds) @ (se3.so3_exp(x[:3]) @ start).T
+    def turns(x: F64) -> F64:
+        seen = (rates.turned(x[3]) / (scale * (1 + x[7])) - x[4:7] * rates.seconds) @ (se3.so3_exp(x[:3]) @ start).T
         return rates.turns - seen
 
-    scales = np.array([0.01, 0.01, 0.01, 0.001, 0.01, 0.01, 0.01])
-    fit = robust_fit(residual, np.array([0, 0, 0, offset, 0, 0, 0]), scales)
+    scales = np.array([0.01, 0.01, 0.01, 0.001, 0.01, 0.01, 0.01, 0.01])
+    fit = robust_fit(turns, np.array([0, 0, 0, offset, 0, 0, 0, 0]), scales)
+    pose_sigma = rotation_sigma(turns(fit.value))
+    white_turns = _turn_whitening(turns(fit.value), pose_sigma)
+    forces = rates.forces(float(fit.value[3]))
+    if forces is None:
+        fit = robust_fit(lambda x: white_turns(turns(x)), fit.value, scales)
+    else:
+
+        def pushes(x: F64) -> F64:
+            return forces.residual(se3.so3_exp(x[:3]) @ start, x[8:11], x[11:])
+
+        begin = np.concatenate([fit.value, np.zeros(3), imu.left_T_imu[:3, 3]])
+        scales = np.concatenate([scales, [0.1, 0.1, 0.1, 0.05, 0.05, 0.05]])
+        white_pushes = forces.whitening(pushes(begin), imu, pose_sigma)
+        fit = robust_fit(
+            lambda x: np.column_stack([white_turns(turns(x))[1:-1], white_pushes(pushes(x))]), begin, scales
+        )
     left_R_imu = se3.so3_exp(fit.value[:3]) @ start
     left_T_imu = se3.from_rotation_translation(left_R_imu, imu.left_T_imu[:3, 3])
     change = se3.so3_log(imu.left_T_imu[:3, :3].T @ left_R_imu)
-    accel = imu.correct(samples.gyro, samples.accel)[1]
-    force = np.linalg.norm(np.nanmean(accel, axis=0)) if np.isfinite(accel).any() else np.nan
-    unexplained = np.median(residual(fit.value) ** 2) / np.median(rates.turns**2)
+    unexplained = np.median(turns(fit.value) ** 2) / np.median(rates.turns**2)
     return ImuFit(
         imu=replace(imu, left_T_imu=left_T_imu, offset_s=float(fit.value[3])),
         offset_sigma_s=float(fit.sigma[3]),
         rotation_sigma=fit.sigma[:3],
         turned=float(np.linalg.norm(change)),
-        scale=scale,
+        scale=scale * float(1 + fit.value[7]),
         gyro_bias=fit.value[4:7],
         agreement=float(np.sqrt(max(0.0, 1 - unexplained))),
-        gravity=float(force),
+        gravity=rates.gravity,
     )
+
+
+def rotation_sigma(steps: F64) -> float:
+    """Radians by which a pose is off by itself: an error of a step (N, 3) that returns, negated, in the next one."""
+    limit = CLIP * 1.4826 * np.median(np.abs(steps), axis=0)
+    clipped = np.clip(steps, -limit, limit)
+    return float(np.sqrt(max(-np.mean(clipped[1:] * clipped[:-1]), 0.0)))
+
+
+def _turn_whitening(steps: F64, pose_sigma: float) -> Whitening:
+    variance = float(np.mean((1.4826 * np.median(np.abs(steps), axis=0)) ** 2))
+    shared = min(pose_sigma**2, 0.48 * variance)
+    return Whitening(np.array([variance, -shared]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,15 +112,17 @@ class _Rates:
     times: F64  # (M,) of the samples, ascending
     gyro: F64  # (M, 3) rad/s
     total: F64  # (M, 3) rad, its integral
+    poses: F64  # (N, 4, 4) odom_T_cam
+    force_times: F64  # (L,) of the accelerometer's samples, ascending
+    force: F64  # (L, 3) m/s^2
 
     @staticmethod
     def of(stamp_ns: I64, poses: F64, samples: ImuSamples, imu: Imu) -> _Rates:
         """Raises StereoSfmError as `fit_imu`."""
-        gyro = imu.correct(samples.gyro, samples.accel)[0]
-        good = np.flatnonzero(np.isfinite(gyro).all(axis=1))
-        stamps, order = np.unique(samples.stamp_ns[good], return_index=True)
-        times, at = ((s - int(stamp_ns[0])).astype(np.float64) * 1e-9 for s in (stamps, stamp_ns))
-        gyro = gyro[good[order]]
+        (times, gyro), (force_times, force) = (
+            _ordered(samples.stamp_ns - stamp_ns[0], values) for values in imu.correct(samples.gyro, samples.accel)
+        )
+        at = (stamp_ns - stamp_ns[0]).astype(np.float64) * 1e-9
         inside = (at > times[0] + REACH_S) & (at < times[-1] - REACH_S) if len(times) else np.zeros(len(at), bool)
         if inside.sum() < MIN_FRAMES:
             raise StereoSfmError(f"{int(inside.sum())} images with inertial samples around: {MIN_FRAMES} are needed")
@@ -100,7 +131,8 @@ class _Rates:
         if np.sqrt(np.mean((turns / np.diff(at)[:, None]) ** 2)) < MIN_TURN / 3**0.5:
             raise StereoSfmError("the camera hardly turns in this recording: turn it about all axes")
         steps = 0.5 * (gyro[1:] + gyro[:-1]) * np.diff(times)[:, None]
-        return _Rates(at, turns, times, gyro, np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)]))
+        total = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+        return _Rates(at, turns, times, gyro, total, poses, force_times, force)
 
     @property
     def seconds(self) -> F64:
@@ -116,6 +148,24 @@ class _Rates:
         size, seen = np.linalg.norm(self.gyro, axis=1), np.linalg.norm(self.turns / self.seconds, axis=1)
         middle = 0.5 * (self.at[1:] + self.at[:-1])
         return shift_between(lambda t: np.interp(t, self.times, size), seen, middle, REACH_S)
+
+    def forces(self, offset: float) -> Forces | None:
+        """What the accelerometer says, with a time offset; None if it is none, or says too little."""
+        if not GRAVITY_RANGE[0] < self.gravity < GRAVITY_RANGE[1]:
+            return None
+        return Forces.of(self.at, self.poses, self.force_times - offset, self.force)
+
+    @property
+    def gravity(self) -> float:
+        """m/s^2, mean force; NaN without samples."""
+        return float(np.linalg.norm(self.force.mean(axis=0))) if len(self.force) else float("nan")
+
+
+def _ordered(stamp_ns: I64, values: F64) -> tuple[F64, F64]:
+    """Seconds (M,), ascending, and finite values (M, 3) of samples."""
+    good = np.flatnonzero(np.isfinite(values).all(axis=1))
+    stamps, order = np.unique(stamp_ns[good], return_index=True)
+    return stamps.astype(np.float64) * 1e-9, values[good[order]]
 
 
 def judge_imu(found: ImuFit, known: Imu) -> list[Finding]:

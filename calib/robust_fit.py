@@ -84,3 +84,21 @@ def shift_between(
 def _correlation(signal: F64, other: F64) -> float:
     moved = signal - signal.mean()
     return float(moved @ other / (np.linalg.norm(moved) * np.linalg.norm(other) + 1e-12))
+
+
+class Whitening:
+    """Makes successive errors with covariances between near ones independent, by the Cholesky factor of those."""
+
+    def __init__(self, covariances: F64) -> None:
+        """`covariances`: (B,) of an error with itself, the next one, and so on; none further apart."""
+        self._covariances = covariances
+        self._factor: F64 = np.zeros((0, 0))
+
+    def __call__(self, errors: F64) -> F64:
+        """(N, D) -> (N, D)."""
+        from scipy.linalg import cholesky_banded, solve_banded
+
+        if self._factor.shape[1] != len(errors):
+            bands = np.repeat(self._covariances[:, None], len(errors), axis=1)
+            self._factor = np.asarray(cholesky_banded(bands, lower=True), np.float64)
+        return np.asarray(solve_banded((len(self._factor) - 1, 0), self._factor, errors), np.float64)

@@ -11,7 +11,7 @@ import pytest
 
 from stereo_sfm.calib import load_rig, save_rig
 from stereo_sfm.calib.imu_fit import fit_imu, judge_imu, precision_imu
-from stereo_sfm.calib.robust_fit import robust_fit, shift_between
+from stereo_sfm.calib.robust_fit import Whitening, robust_fit, shift_between
 from stereo_sfm.calib.wheel import Wheel
 from stereo_sfm.calib.wheel_fit import fit_wheel, judge_wheel, precision_wheel
 from stereo_sfm.cli import main
@@ -68,6 +68,26 @@ def test_20_ms_and_3_degrees_of_an_imu_are_found(seed: int) -> None:
     again = judge_imu(fit_imu(found.stamp_ns, found.poses, found.imu, fit.imu), fit.imu)
     assert not any(f.level for f in again)
     assert max(f.level for f in precision_imu(fit)) <= 1
+
+
+def test_accelerations_show_a_rotation_about_the_only_axis_of_turns() -> None:
+    found = Recording(0, vibration=0.0)
+    true = found.source.rig.imu
+    assert true is not None
+    up = true.left_T_imu[:3, :3].T @ found.source.drive.robot_T_cam[:3, :3].T @ np.array([0.0, 0.0, 1.0])
+    wrong = replace(
+        true, left_T_imu=true.left_T_imu @ se3.from_rotation_translation(se3.so3_exp(0.05 * up), np.zeros(3))
+    )
+
+    def off_deg(samples: ImuSamples) -> tuple[float, float]:
+        fit = fit_imu(found.stamp_ns, found.poses, samples, wrong)
+        off = se3.so3_log(fit.imu.left_T_imu[:3, :3].T @ true.left_T_imu[:3, :3])
+        return float(np.degrees(np.linalg.norm(off))), float(np.degrees(fit.rotation_sigma.max()))
+
+    both, sigma = off_deg(found.imu)
+    alone = ImuSamples(found.imu.stamp_ns, found.imu.gyro, np.full_like(found.imu.accel, np.nan))
+    assert both < 0.3 and sigma < 0.3
+    assert off_deg(alone)[1] > 3 * sigma
 
 
 @pytest.mark.parametrize(
@@ -202,3 +222,9 @@ def test_wrong_sensors_of_a_recording_are_calibrated_and_checked(
     ratio = np.mean(found.wheel.radii_m) / 0.08  # as good as the lengths by the images, at half the resolution
     print(f"offset {1e3 * (found.imu.offset_s - 0.02):.3f} ms, rotation {off:.3f} deg, radii {100 * (ratio - 1):.3f} %")
     assert abs(found.imu.offset_s - 0.02) < 5e-4 and off < 0.1 and abs(ratio - 1) < 6e-3
+
+
+def test_whitened_errors_are_independent() -> None:
+    poses = np.random.default_rng(0).normal(0, 0.5, (20001, 1))
+    new = Whitening(np.array([0.5, -0.25]))(np.diff(poses, axis=0))
+    assert abs(new.std() - 1) < 0.03 and abs(np.corrcoef(new[1:, 0], new[:-1, 0])[0, 1]) < 0.03
