@@ -1,6 +1,8 @@
-"""One recorded run of the system on a source, as most benchmarks need it."""
+"""Recorded runs of the system on a source, as most benchmarks need them."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import cv2
 
@@ -8,6 +10,7 @@ from stereo_sfm.config import Config
 from stereo_sfm.drivers.select import SelectedFrames
 from stereo_sfm.drivers.source import Source, open_source
 from stereo_sfm.eval.record import RunRecord
+from stereo_sfm.pipeline.inline import InlineRun
 from stereo_sfm.pipeline.run import run
 from stereo_sfm.types import Trajectory
 
@@ -27,3 +30,16 @@ def recorded_of(spec: str, config: Config, max_frames: int | None = None) -> tup
     """The same of a source by its name, and its ground truth."""
     with SelectedFrames(open_source(spec), max_frames=max_frames) as source:
         return recorded(source, config), source.ground_truth
+
+
+def recorded_together(source: Source, configs: Sequence[Config]) -> list[RunRecord]:
+    """The same of several runs on each image in turn: a simulated source is rendered once."""
+    records = [RunRecord.of(config) for config in configs]
+    runs = [InlineRun(source, config, [record]) for config, record in zip(configs, records, strict=True)]
+    cv2.setRNGSeed(0)
+    for image in source:
+        for one in runs:
+            one.step(image)
+    for one in runs:
+        one.finish()
+    return records

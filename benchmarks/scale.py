@@ -17,9 +17,11 @@ from _sequences import data_root, one_thread
 one_thread()
 
 import numpy as np
-from _runs import ODOMETRY_ONLY, recorded_of
+from _runs import ODOMETRY_ONLY, recorded_together
 
 from stereo_sfm import config as configuration
+from stereo_sfm.drivers.select import SelectedFrames
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.eval.evaluate import evaluate
 
 STORES = (
@@ -38,16 +40,19 @@ FRAMES = 150
 Row = tuple[str, float, float, float]  # trajectory, scale error in percent, ATE in percent, path in metres
 
 
-def rows_of(spec: str, settings: tuple[str, ...], max_frames: int) -> list[Row]:
+def rows_of(spec: str, odometry_only: bool, max_frames: int) -> list[Row]:
     """Run on one sequence; a row for each of its trajectories."""
-    record, reference = recorded_of(spec, configuration.load(None, list(settings)), max_frames)
+    configs = [configuration.load(None, settings) for settings in (list(ODOMETRY_ONLY), [])]
+    with SelectedFrames(open_source(spec), max_frames=max_frames) as source:
+        records = recorded_together(source, configs[:1] if odometry_only else configs)
+        reference = source.ground_truth
     assert reference is not None
-    mapped = None if settings else record.mapped()
+    found = [("odometry alone", records[0].odometry())]
+    for record in records[1:]:
+        found += [("odometry", record.odometry()), ("map", record.mapped())]
     rows: list[Row] = []
-    live = "odometry" if mapped is not None else "odometry alone"
-    for name, trajectory in ((live, record.odometry()), ("map", mapped)):
-        if trajectory is None:
-            continue
+    for name, trajectory in found:
+        assert trajectory is not None
         result = evaluate(trajectory, reference)
         rows.append((name, 100 * (1 / result.sim3_scale - 1), result.ate_percent, result.length_m))
     return rows
@@ -65,9 +70,7 @@ def main() -> None:
     found: dict[str, list[float]] = {}
     print("| store | trajectory | path | scale error | ATE SE(3) |\n|---|---|---|---|---|")
     for spec in args.sequence or [*STORES, *walk]:
-        rows = rows_of(spec, ODOMETRY_ONLY, args.max_frames)
-        rows += [] if args.odometry else rows_of(spec, (), args.max_frames)
-        for name, scale, ate, path in rows:
+        for name, scale, ate, path in rows_of(spec, args.odometry, args.max_frames):
             found.setdefault(name, []).append(abs(scale))
             print(f"| {spec} | {name} | {path:.1f} m | {scale:+.3f} % | {ate:.3f} % |", flush=True)
     for name, scales in found.items():
