@@ -31,7 +31,7 @@ import numpy as np
 from _occluders import KINDS as PAINTED_KINDS
 from _occluders import Painted, PaintedEncounter, PinholeView
 
-from stereo_sfm.config import Config
+from stereo_sfm.config import load
 from stereo_sfm.drivers.sim.encounters import KINDS, Encounter
 from stereo_sfm.drivers.sim.source import SimSource
 from stereo_sfm.drivers.source import open_source
@@ -40,6 +40,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.pipeline.run import run
 from stereo_sfm.types import F64, Frame, TrackState, Trajectory
 
+VISION = load(None, ["tracker.inertial=false"])
 HALF = {"fisheye": "424x400", "pinhole": "320x200"}
 SCENES = {"beside": "sim:loop?length=24"}  # 20 s need a longer route than an aisle
 FREE, COVERING = 0.05, 0.6  # share of the view
@@ -113,7 +114,7 @@ def drive(spec: str) -> tuple[SimSource, list[Frame]]:
     cv2.setRNGSeed(0)
     with open_source(spec) as source:
         assert isinstance(source, SimSource)
-        return source, list(run(source, Config()))
+        return source, list(run(source, VISION))
 
 
 def painted(recording: str, kind: str, seed: int) -> tuple[Painted, list[Frame]]:
@@ -123,7 +124,7 @@ def painted(recording: str, kind: str, seed: int) -> tuple[Painted, list[Frame]]
     inner = open_source(str((root or Path()) / folder))
     cv2.setRNGSeed(0)
     with Painted(PinholeView(inner) if view else inner, kind, seed) as source:
-        return source, list(run(source, Config()))
+        return source, list(run(source, VISION))
 
 
 def rate_of(source: Drive) -> float:
