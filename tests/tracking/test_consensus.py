@@ -8,7 +8,7 @@ import pytest
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.drivers.sim.rigs import make_rig
 from stereo_sfm.geometry import se3
-from stereo_sfm.tracking.flow.consensus import STATIC_FRAMES, after_frame, near_moving
+from stereo_sfm.tracking.flow.consensus import STATIC_FRAMES, Movers, after_frame
 from stereo_sfm.tracking.flow.frame_pose import ExpectedMotion, FramePoseSolver
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
@@ -166,7 +166,7 @@ def test_an_unusual_motion_that_the_map_confirms_is_better_than_no_pose(mapped: 
     jump = ExpectedMotion(MOVED @ se3.exp(np.array([0.09, 0, 0, 0, 0, 0])), np.zeros(6), SECONDS)
     static = np.ones(len(store), bool)
     best = solver._solve_all(store, jump, np.eye(4), static)  # pyright: ignore[reportPrivateUsage]
-    assert solver._confirmed(store, best, static) == mapped  # pyright: ignore[reportPrivateUsage]
+    assert solver._confirmed(best, store.mapped, 30) == mapped  # pyright: ignore[reportPrivateUsage]
     if mapped:
         solution = solver.solve(store, jump, np.eye(4), before=len(store))
         assert off(solution.pose) < 0.005 and not len(solution.moving) and solution.inlier.mean() > 0.9
@@ -196,7 +196,7 @@ def test_a_group_that_disagrees_is_marked_and_tracked_further() -> None:
     assert on_person.sum() > 0.8 * MOVING
     assert tracks.moving[on_person].all()
     assert not tracks.moving[~on_person].any()
-    begun = near_moving(tracks.uv, tracks.rho, tracks)
+    begun = Movers().near(tracks.uv, tracks.rho, tracks)
     assert begun[on_person].mean() > 0.9
     assert begun[~on_person].mean() < 0.1
     for _ in range(STATIC_FRAMES):
@@ -210,3 +210,70 @@ def test_no_point_is_marked_in_a_static_scene() -> None:
         tracks, _ = after_frame(tracks, ~on_person[: len(tracks)], NONE, 3, alert=False)
     assert len(tracks) == STILL
     assert not tracks.moving.any()
+
+
+def test_new_points_where_a_nearer_object_lost_its_points_are_suspect_for_a_second() -> None:
+    """Who walks towards the camera: no point on him is tracked for long, and he is nearer in every image."""
+    tracks, on_person = scene(np.random.default_rng(0))
+    tracks.moving, tracks.misses = on_person.copy(), np.where(on_person, STATIC_FRAMES, 0).astype(np.int32)
+    movers = Movers()
+    store = tracks.keep(~on_person)
+    movers.update(tracks, store, 0)
+    near, far = (movers.near(tracks.uv[on_person], factor * tracks.rho[on_person], store) for factor in (2.0, 0.5))
+    assert near.mean() > 0.9
+    assert far.mean() < 0.1
+    assert movers.near(store.uv, store.rho, store).mean() < 0.1
+    movers.update(store, store, 1_100_000_000)
+    assert not movers.near(tracks.uv[on_person], tracks.rho[on_person], store).any()
+
+
+def test_points_that_were_only_suspect_do_not_make_others_suspect() -> None:
+    tracks, on_person = scene(np.random.default_rng(0))
+    tracks.moving, tracks.misses = on_person.copy(), np.where(on_person, STATIC_FRAMES, 0).astype(np.int32)
+    tracks.age[on_person] = 0
+    movers = Movers()
+    movers.update(tracks, tracks.keep(~on_person), 0)
+    assert not movers.near(tracks.uv[on_person], tracks.rho[on_person], tracks.keep(~on_person)).any()
+
+
+def test_an_alert_lasts_while_a_group_disagrees() -> None:
+    """Points on a near object are new in every image: none is followed for long enough to be marked."""
+    tracks, on_person = scene(np.random.default_rng(1))
+    solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
+    expected = ExpectedMotion(MOVED, np.zeros(6), SECONDS)
+    disagree = solver.solve(tracks, expected, np.eye(4), before=400)
+    solver.learn(tracks, disagree, expected)
+    disagree.moving = NONE
+    for _ in range(30):
+        solver.learn(tracks, disagree, expected)
+    assert solver.alert
+    store = tracks.keep(~on_person)
+    for _ in range(30):
+        solver.learn(store, solver.solve(store, expected, np.eye(4), before=STILL), expected)
+    assert not solver.alert
+
+
+@pytest.mark.parametrize("settled", [True, False])
+def test_little_of_an_open_view_is_enough_while_what_was_known_before_agrees(settled: bool) -> None:
+    tracks, on_person = scene(np.random.default_rng(2))
+    solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
+    expected = ExpectedMotion(MOVED, se3.log(MOVED), SECONDS)
+    solver.learn(tracks, solver.solve(tracks, expected, np.eye(4), before=400), expected)
+    assert solver.alert
+    solver.open_view = 200.0
+    left = tracks.keep(~on_person & (np.arange(len(tracks)) < 25))
+    left.age[:] = 20 if settled else 1
+    assert (not solver.solve(left, expected, np.eye(4), before=len(left)).reason) == settled
+
+
+def test_of_two_results_for_an_image_the_expected_one_is_taken_while_objects_move() -> None:
+    tracks, on_person = scene(np.random.default_rng(0))
+    solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
+    expected = ExpectedMotion(MOVED, se3.log(MOVED), SECONDS)
+    camera = solver.solve(tracks, expected, np.eye(4), before=400)
+    person = solver.solve_again(tracks.keep(on_person), ExpectedMotion(np.eye(4), np.zeros(6), SECONDS))
+    results = [(tracks, camera), (tracks.keep(on_person), person)]
+    assert person.inliers > camera.inliers
+    assert solver.better(results, expected)[1] is person
+    solver.learn(tracks, camera, expected)
+    assert solver.better(results, expected)[1] is camera

@@ -4,7 +4,8 @@ While most points agree, all have the same weight. When a group of neighbouring 
 lost, a second motion is estimated from the points that disagree. The camera's motion is the one that is supported by
 the points tracked longest, among those that are plausible after its recent motion. Points that support another motion,
 or that disagree repeatedly as a group, are marked as moving. They are tracked further, so that no new points are added
-on a moving object, but they do not contribute to the pose until they have been static for some frames.
+on a moving object, but they do not contribute to the pose until they have been static for some frames. Nor do new
+points beside them, or where such points were lost: neither the pose nor the map takes them before they agreed.
 """
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportMissingTypeArgument=false
@@ -18,7 +19,7 @@ import numpy as np
 from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.tracking.flow.pose_solver import row_residuals
 from stereo_sfm.tracking.flow.tracks import Tracks
-from stereo_sfm.types import F64, Bool, Corners
+from stereo_sfm.types import F64, I64, Bool, Corners
 
 MIN_GROUP = 8  # points of a group; fewer do not define a motion
 AGREEING_SHARE = 0.65  # of the points that were tracked; if fewer agree, another motion is searched for
@@ -30,6 +31,7 @@ ALERT_S = 1.0  # for which other motions are searched for after one was seen
 MOVING_NEIGHBOURS, NEIGHBOURS = 3, 6  # a point moves if so many of its nearest neighbours disagree as well
 SAME_DEPTH = 0.3  # logarithm of the ratio of two distances
 STATIC_FRAMES = 4  # successive frames in which a moving point must agree before it is used again
+SUSPECT_FRAMES = 2  # the same for a new point beside moving ones
 
 
 def after_frame(tracks: Tracks, inlier: Bool, moving: Bool, misses_allowed: int, alert: bool) -> tuple[Tracks, Bool]:
@@ -62,18 +64,52 @@ def after_frame(tracks: Tracks, inlier: Bool, moving: Bool, misses_allowed: int,
     return tracks.keep(kept), kept
 
 
-def near_moving(uv: F64, rho: F64, tracks: Tracks) -> Bool:
-    """(M,) which new points, (M, 2) px and (M,) 1/m, are on moving objects."""
-    return _marked_neighbours(uv, rho, tracks.uv, tracks.rho, tracks.moving) >= MOVING_NEIGHBOURS
+class Movers:
+    """Where something moves in the image: the points on it, and the places where it lost them within the last second.
+
+    What comes near changes so much from image to image that no point on it is tracked for long.
+    """
+
+    def __init__(self) -> None:
+        self._uv: F64 = np.zeros((0, 2))  # px, where points were lost
+        self._rho: F64 = np.zeros(0)  # 1/m
+        self._stamp_ns: I64 = np.zeros(0, np.int64)
+
+    def update(self, before: Tracks, after: Tracks, stamp_ns: int) -> None:
+        """Remember the points that moved in the last image and are not in the tracks `after` it."""
+        if not (len(self._rho) or before.moving.any()):
+            return
+        moved = before.moving & (before.misses == STATIC_FRAMES) & (before.age > 0)
+        lost = moved & ~np.isin(before.point_ids, after.point_ids)
+        recent = self._stamp_ns > stamp_ns - int(ALERT_S * 1e9)
+        self._uv = np.concatenate([self._uv[recent], before.uv[lost]])
+        self._rho = np.concatenate([self._rho[recent], before.rho[lost]])
+        self._stamp_ns = np.concatenate([self._stamp_ns[recent], np.full(lost.sum(), stamp_ns)])
+
+    def near(self, uv: F64, rho: F64, tracks: Tracks) -> Bool:
+        """(M,) which new points, (M, 2) px and (M,) 1/m, are on moving objects, or nearer where one lost its points."""
+        if not (len(self._rho) or tracks.moving.any()):
+            return np.zeros(len(uv), bool)
+        among_uv, among_rho = np.concatenate([tracks.uv, self._uv]), np.concatenate([tracks.rho, self._rho])
+        marked = np.concatenate([tracks.moving, np.ones(len(self._rho), bool)])
+        return _marked_neighbours(uv, rho, among_uv, among_rho, marked, len(tracks)) >= MOVING_NEIGHBOURS
 
 
-def _marked_neighbours(uv: F64, rho: F64, among_uv: F64, among_rho: F64, marked: Bool) -> F64:
-    """(M,) number of the nearest NEIGHBOURS in the image that are marked (N,) and at about the same distance."""
+def _marked_neighbours(
+    uv: F64, rho: F64, among_uv: F64, among_rho: F64, marked: Bool, tracked: int | None = None
+) -> F64:
+    """(M,) number of the nearest NEIGHBOURS in the image that are marked (N,) and at about the same distance.
+
+    `tracked`: how many of the N are tracked; of the others farther ones count too, for what moved has come nearer.
+    """
     if not len(uv) or not marked.any():
         return np.zeros(len(uv))
     squared = np.square(uv[:, :1] - among_uv[:, 0]) + np.square(uv[:, 1:] - among_uv[:, 1])
     nearest = squared.argpartition(min(NEIGHBOURS, len(among_uv)) - 1, axis=1)[:, :NEIGHBOURS]
-    same_depth = np.abs(np.log(among_rho[nearest] / rho[:, None])) < SAME_DEPTH
+    nearer = np.log(among_rho[nearest] / rho[:, None])  # than the new point
+    same_depth = np.abs(nearer) < SAME_DEPTH
+    if tracked is not None:
+        same_depth |= (nearest >= tracked) & (nearer < 0.0)
     return (marked[nearest] & same_depth).sum(1)
 
 
@@ -87,12 +123,10 @@ def in_group(tracks: Tracks, points: Bool) -> Bool:
     return out
 
 
-def without_moving(corners: Corners, tracks: Tracks) -> Corners:
+def without_moving(corners: Corners, tracks: Tracks, movers: Movers) -> Corners:
     """The corners that are not on moving objects."""
-    if not tracks.moving.any():
-        return corners
     distance = np.linalg.norm(corners.points_cam, axis=1).astype(np.float64)
-    static = ~near_moving(corners.uv_left.astype(np.float64), 1.0 / np.maximum(distance, 1e-6), tracks)
+    static = ~movers.near(corners.uv_left.astype(np.float64), 1.0 / np.maximum(distance, 1e-6), tracks)
     return Corners(
         corners.uv_left[static], corners.uv_right[static], corners.points_cam[static], corners.descriptors[static]
     )

@@ -152,15 +152,18 @@ class FramePoseSolver:
         few = (chosen.inlier & static).sum() < MIN_OPEN_SHARE * self.open_view
         if not few or (usual and not disturbed):
             return chosen
-        if undisturbed and self._confirmed(tracks, best, static):
+        if undisturbed and self._confirmed(best, static & tracks.mapped, 2 * self._config.min_features):
             return best
+        known = static & (tracks.mapped | (tracks.age * expected.seconds >= SETTLED_S))
+        usual = self._likelihood(chosen.pose, expected) > USUAL_LIKELIHOOD
+        if usual and self._confirmed(chosen, known, MIN_GROUP):
+            return chosen
         return _no_pose(len(tracks), "too_few_points")
 
-    def _confirmed(self, tracks: Tracks, best: PoseSolution, static: Bool) -> bool:
-        """Whether most points of the map agree with a pose: it is better than none, however unusual the motion."""
-        mapped = static & tracks.mapped
-        agree = (best.inlier & mapped).sum()
-        return bool(agree >= max(2 * self._config.min_features, CONFIRMED_SHARE * mapped.sum()))
+    def _confirmed(self, solution: PoseSolution, known: Bool, least: int) -> bool:
+        """Whether most of the points known before (N,), and at least so many, agree with a pose."""
+        agree = (solution.inlier & known).sum()
+        return bool(agree >= max(least, CONFIRMED_SHARE * known.sum()))
 
     def _choose(
         self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, best: PoseSolution, rest: Bool
@@ -176,8 +179,7 @@ class FramePoseSolver:
             agree = int((best.inlier & static & tracks.mapped).sum())
             undivided = agree >= max(UNDIVIDED_SHARE * int(static.sum()), UNDIVIDED_OPEN * self.open_view)
             return best if undivided or not self.alert else _no_pose(len(tracks), "no_consensus")
-        weight = tracks.mapped + np.minimum(tracks.age * expected.seconds, SETTLED_S) / SETTLED_S + MIN_WEIGHT
-        weights = [float((weight * s.agreement)[static].sum()) * self._likelihood(s.pose, expected) for s in plausible]
+        weights = [self._support(tracks, s, expected) for s in plausible]
         k = int(np.argmax(weights))
         chosen = plausible[0] if weights[k] <= WEIGHT_RATIO * weights[0] else plausible[k]
         disagree = static & ~chosen.inlier
@@ -187,6 +189,18 @@ class FramePoseSolver:
             if (moving & grouped).sum() >= MIN_GROUP:
                 chosen.moving = chosen.moving | moving if len(chosen.moving) else moving
         return chosen
+
+    def _support(self, tracks: Tracks, solution: PoseSolution, expected: ExpectedMotion) -> float:
+        """Of a pose, by the static points that agree, those tracked longest most, and by the expected motion."""
+        if solution.reason:
+            return 0.0
+        weight = tracks.mapped + np.minimum(tracks.age * expected.seconds, SETTLED_S) / SETTLED_S + MIN_WEIGHT
+        agree = float((weight * solution.agreement)[~tracks.moving].sum())
+        return agree * self._likelihood(solution.pose, expected)
+
+    def better(self, found: list[tuple[Tracks, PoseSolution]], expected: ExpectedMotion) -> tuple[Tracks, PoseSolution]:
+        """Of several results for one image the one with more inliers; with more support while objects move."""
+        return max(found, key=lambda x: self._support(*x, expected) if self.alert else x[1].inliers)
 
     def _solve_all(self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, static: Bool) -> PoseSolution:
         """Solve with all points."""
@@ -229,6 +243,10 @@ class FramePoseSolver:
             return None
         return self._optimise(tracks, dataclasses.replace(expected, pose=first.pose), first.inlier & static, expected)
 
+    def crowded(self, static_points: int) -> bool:
+        """Whether objects that move hide so much of an open view that new points are needed in every image."""
+        return self.alert and static_points < AGREEING_SHARE * self.open_view
+
     @property
     def alert(self) -> bool:
         """Whether an object moved within the last second."""
@@ -256,6 +274,8 @@ class FramePoseSolver:
         """Learn whether objects move before the camera and, while none does, the noise of points and motion."""
         seconds = expected.seconds
         moving = tracks.moving.sum() + solution.moving.sum() >= MIN_GROUP
+        if self.alert and not moving:  # still there, with new points
+            moving = in_group(tracks, ~tracks.moving & ~solution.inlier).sum() >= MIN_GROUP
         self._alert_s = ALERT_S if moving else max(self._alert_s - seconds, 0.0)
         if self.alert:
             return

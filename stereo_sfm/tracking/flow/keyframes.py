@@ -12,7 +12,7 @@ from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.order_statistics import median
 from stereo_sfm.tracking.descriptors import describe
-from stereo_sfm.tracking.flow.consensus import without_moving
+from stereo_sfm.tracking.flow.consensus import Movers, without_moving
 from stereo_sfm.tracking.flow.place_corners import SCALE, PlaceCorners
 from stereo_sfm.tracking.flow.pyramids import StereoPyramids
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
@@ -34,8 +34,9 @@ class Keyframes:
         shutter: RollingShutter,
         place_corners: PlaceCorners | None,
         side_views: SideViews | None,
+        movers: Movers,
     ) -> None:
-        self._config, self._shutter = config, shutter
+        self._config, self._shutter, self._movers = config, shutter, movers
         self._place_corners, self._side_views = place_corners, side_views
         self._described: tuple[Keyframe, float] | None = None  # newest with corners, their median distance in metres
         self._begun = -1, 0  # newest submap, and its first keyframe
@@ -56,10 +57,11 @@ class Keyframes:
         """A frame was tracked since the newest keyframe."""
         self._frames_since += 1
 
-    def due(self, static_points: int) -> bool:
-        """Whether the frame should become a keyframe: new points are added at keyframes only."""
+    def due(self, tracks: Tracks) -> bool:
+        """Whether the frame should become a keyframe: few of the newest one's static points are left."""
         config = self._config
-        return self._frames_since >= config.keyframe_max_frames or static_points < config.keyframe_share * self.points
+        left = int((~tracks.moving & (tracks.age >= self._frames_since)).sum())
+        return self._frames_since >= config.keyframe_max_frames or left < config.keyframe_share * self.points
 
     def reference(self, odom_T_cam: F64) -> tuple[int, F64]:
         """The newest keyframe's id (-1: none yet), and kf_T_cam (4, 4) of a pose (4, 4)."""
@@ -127,12 +129,12 @@ class Keyframes:
         if not self._place_due(keyframe):
             return corners, sides
         if self._place_corners is not None:
-            corners = without_moving(self._place_corners.find_in(images.left, images.right), tracks)
+            corners = without_moving(self._place_corners.find_in(images.left, images.right), tracks, self._movers)
             distances = np.linalg.norm(corners.points_cam, axis=1).astype(np.float64)
             self._described = keyframe, median(distances) if len(distances) else 0.0
         if self._side_views is not None:
             sides = self._side_views.find(images.left, images.right, corners, keyframe.odom_T_cam, keyframe.submap_id)
-            sides = without_moving(sides, tracks)
+            sides = without_moving(sides, tracks, self._movers)
         return corners, sides
 
     def _place_due(self, keyframe: Keyframe) -> bool:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from stereo_sfm.config import TrackerConfig
-from stereo_sfm.tracking.flow.consensus import STATIC_FRAMES, near_moving
+from stereo_sfm.tracking.flow.consensus import SUSPECT_FRAMES, Movers
 from stereo_sfm.tracking.flow.corners import detect_corners
 from stereo_sfm.tracking.flow.follower import Follower
 from stereo_sfm.tracking.flow.pyramids import StereoPyramids
@@ -31,8 +31,10 @@ class NewPoints:
         stereo: StereoMatcher,
         follower: Follower,
         shutter: RollingShutter,
+        movers: Movers,
     ) -> None:
         self._config, self._area, self._stereo, self._follower, self._shutter = config, area, stereo, follower, shutter
+        self._movers = movers
         self._next_point_id = 0
 
     def add(self, tracks: Tracks, images: StereoPyramids, pose: F64, velocity: F64, most: int) -> Tracks:
@@ -52,7 +54,7 @@ class NewPoints:
         rows, slots = self._follower.begin(images.left, match.uv_left[good])
         new, n = good[rows], len(rows)
         rho = np.maximum(match.rho[new], MIN_RHO)
-        moving = near_moving(match.uv_left[new], rho, tracks)
+        moving = self._movers.near(match.uv_left[new], rho, tracks)
         origin, direction = self._shutter.rays(pose, velocity, match.uv_left[new], match.bearing[new])
         tracks = tracks.append(
             Tracks(
@@ -64,7 +66,7 @@ class NewPoints:
                 rho=rho,
                 variance=match.variance[new],
                 age=np.zeros(n, np.int32),
-                misses=np.where(moving, STATIC_FRAMES, 0).astype(np.int32),
+                misses=np.where(moving, SUSPECT_FRAMES, 0).astype(np.int32),
                 moving=moving,
                 warp=np.tile(np.eye(2), (n, 1, 1)),
                 slot=slots,

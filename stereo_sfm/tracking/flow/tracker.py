@@ -21,7 +21,7 @@ from stereo_sfm.geometry.order_statistics import median
 from stereo_sfm.pixels import DARK
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.tracking.flow import klt
-from stereo_sfm.tracking.flow.consensus import after_frame
+from stereo_sfm.tracking.flow.consensus import Movers, after_frame
 from stereo_sfm.tracking.flow.follower import Follower
 from stereo_sfm.tracking.flow.frame_pose import ExpectedMotion, FramePoseSolver, PoseSolution
 from stereo_sfm.tracking.flow.keyframes import Keyframes
@@ -84,8 +84,9 @@ class Tracker:
         area = VisibleArea(rig.left, config.max_angle_deg, rig.left_mask)
         self._follower = Follower(config, rig, area, self._shutter)
         self._solver = FramePoseSolver(config, StereoCameras.of(rig), self._shutter)
-        self._new_points = NewPoints(config, area, self._stereo, self._follower, self._shutter)
-        self._keyframes = Keyframes(config, self._shutter, place_corners, side_views)
+        self._movers = Movers()
+        self._new_points = NewPoints(config, area, self._stereo, self._follower, self._shutter, self._movers)
+        self._keyframes = Keyframes(config, self._shutter, place_corners, side_views, self._movers)
         self._sensors = MotionSensors.of(config, rig)
         self._recovery = Recovery(place_corners, places, rig.left.size)
         self._tracks = Tracks()
@@ -147,10 +148,12 @@ class Tracker:
         stats = _stats(tracks, solution)
         inlier = self._accept(image, images, tracks, solution, expected.seconds, recovered)
         keyframe = None
-        if recovered or self._keyframes.due(self._static_count()):
+        if recovered or self._keyframes.due(self._tracks):
             with self._spans.span("keyframe"):
                 inlier = self._add_points(images, inlier)
                 keyframe = self._create_keyframe(image, images, trusted)
+        elif self._solver.crowded(self._static_count()):
+            inlier = self._add_points(images, inlier)
         state = TrackState.RECOVERED if recovered else TrackState.OK
         stats |= self._level()
         reason = "" if self._sensors is None else self._sensors.news()
@@ -200,7 +203,7 @@ class Tracker:
         if solution.good(self._config, self._static_count()):
             return tracks, solution
         turned = self._follower.turned(images.left, expected, self._pose)
-        return max((tracks, solution), self._track(images, turned), key=lambda found: found[1].inliers)
+        return self._solver.better([(tracks, solution), self._track(images, turned)], expected)
 
     def _track(self, images: StereoPyramids, expected: ExpectedMotion) -> tuple[Tracks, PoseSolution]:
         """Track all points from their predictions, match them in the right image and solve for the pose."""
@@ -242,6 +245,7 @@ class Tracker:
         inlier = solution.inlier & ~tracks.moving
         tracks.age = tracks.age + np.int32(1)
         tracks, kept = after_frame(tracks, solution.inlier, solution.moving, MAX_MISSES, self._solver.alert)
+        self._movers.update(self._tracks, tracks, image.stamp_ns)
         self._continue(image, images, solution.pose, tracks)
         if self._sensors is not None:
             self._sensors.accept(image.stamp_ns, solution.pose)
