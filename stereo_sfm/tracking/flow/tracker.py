@@ -54,7 +54,7 @@ TRUSTED_OPEN = 0.3  # ... and so many of those that agree in an open view
 COVERED_SHARE = 0.1  # of the covered frames: as many free ones in a row, and a new submap begins
 SAME_START = 0.05, 0.01  # metres, radians between poses from which the same is found
 ROUNDS = (0.066, 160), (0.03, 1000), (0.015, 1000)  # of a search: reach as a share of the width, most points
-HELD_POINTS = 2  # times max_features, of the image from which a camera is found again
+HELD_POINTS = 8  # times max_features, of the image to recover from: after two metres little of it is still in view
 FIRST_COVARIANCE = np.eye(6) * 1e-12  # of the first pose, which is the odometry frame
 UNKNOWN_COVARIANCE = np.eye(6)
 
