@@ -107,28 +107,32 @@ def save_result(mapper: AnyMapper, config: Config, folders: MapFolders) -> None:
     A run that continues a saved map without `map_out` saves nothing: its part alone is in the saved map's frame.
 
     Raises:
-        StereoSfmError: it cannot be merged, and the session's own map was written instead (next to `map_out` where that
-            is the map to merge with).
+        StereoSfmError: it cannot be merged, or another process writes to the map, and the session's own map was written
+            instead (next to `map_out` where that is the map to merge with).
         OSError: the map cannot be written.
     """
     from stereo_sfm.maps.saved_map import save_map
+    from stereo_sfm.maps.store import lock_versioned
 
     kept = folders.kept if folders.map_in is None or folders.map_out is not None else None
     if folders.map_out is None and kept is None:
         return
-    saved, out, failure = saved_map_of(mapper, config), folders.map_out, ""
+    saved, out, failure, held = saved_map_of(mapper, config), folders.map_out, "", None
     if saved is None:
         if out is not None and not folders.localize_only:
             log.warning("nothing was mapped: no map is written to %s", out)
         return
     if folders.map_in is not None and out is not None:
         try:
+            held = lock_versioned(out)
             saved = _merged(mapper, saved, folders.map_in, config)
         except StereoSfmError as error:
             out = _unused_name(out) if out.resolve() == folders.map_in.resolve() else out
             failure = f"not merged with {folders.map_in}: {error}; {out} contains this session alone"
     for folder in dict.fromkeys(place.absolute() for place in (out, kept) if place is not None):
         save_map(saved, folder)
+    if held is not None:
+        held.release()
     if failure:
         raise StereoSfmError(failure)
 

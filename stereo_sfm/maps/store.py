@@ -50,7 +50,16 @@ def lock(store: Path) -> FolderLock:
     """
     folder = versions_folder(store)
     folder.mkdir(parents=True, exist_ok=True)
-    return FolderLock(folder, f"wait until the map {store} is written")
+    return FolderLock(folder, f"wait until the map {store} is written, or stop the service that extends it")
+
+
+def lock_versioned(folder: Path) -> FolderLock | None:
+    """The same of a map folder that is a store; None for any other.
+
+    Raises:
+        StereoSfmError: another process writes to it.
+    """
+    return lock(folder) if versions_folder(folder).is_dir() else None
 
 
 def read_about(store: Path, saved: SavedMap | None = None) -> About:

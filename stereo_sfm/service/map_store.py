@@ -3,7 +3,7 @@
 While the service runs, two folders are beside the map's folder STORE: `.STORE.base`, the map that the session began
 with, and `.STORE.session`, the session's own part as it was saved last. A process of low priority joins the two into
 STORE, so that STORE is a complete map whenever the power fails. What was not joined at the end is joined at the next
-start.
+start. A service that changes STORE holds its lock as long as it runs: `map update` and the like have to wait.
 """
 
 from __future__ import annotations
@@ -19,8 +19,10 @@ from pathlib import Path
 
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.folder_lock import FolderLock
 from stereo_sfm.maps.folders import MapFolders
 from stereo_sfm.maps.replace_folder import recover
+from stereo_sfm.maps.store import lock
 from stereo_sfm.maps.unfinished import copy_map, publish
 from stereo_sfm.service.child import pipe, start_child
 
@@ -49,6 +51,7 @@ class MapStore:
     _result: Connection | None = None
     _done: Joined | None = None
     _fresh: bool = field(default=True)  # no session has begun yet
+    _lock: FolderLock | None = None  # of the saved map, from the first session on
 
     @property
     def saves(self) -> bool:
@@ -64,12 +67,14 @@ class MapStore:
         """The maps of a new session; a session that an earlier run did not join is joined first.
 
         Raises:
-            StereoSfmError: there is no map to localize in, or it is damaged.
+            StereoSfmError: there is no map to localize in, it is damaged, or another process writes to it.
         """
         self.cancel()
         base = self.folder.with_name(f".{self.folder.name}.base")
         if self.mode == "none":
             return MapFolders()
+        if self.saves and self._lock is None:
+            self._lock = lock(self.folder)
         for replaced in (self.folder, self.session, base):
             recover(replaced)
         if self.mode == "localize":

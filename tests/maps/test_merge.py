@@ -17,6 +17,7 @@ from stereo_sfm.mapping.mapper import Mapper
 from stereo_sfm.maps.folders import MapFolders, save_result
 from stereo_sfm.maps.merge import full_adjustment, merge, prune, share_a_session
 from stereo_sfm.maps.saved_map import SavedMap, joined, load_map, restore_map, save_map
+from stereo_sfm.maps.store import lock
 from stereo_sfm.types import LoopResult
 from tests.loop.store_sequence import StoreSequence, make_sequence
 from tests.maps.maps import map_of_sequence, same
@@ -246,3 +247,19 @@ def test_a_failed_merge_keeps_the_maps(
     assert len(load_map(tmp_path / "store_walk1" if in_place else out, drives[0].rig)) == len(
         mapper.map.living_keyframes()
     )
+
+
+def test_a_session_is_not_merged_into_a_store_that_another_process_writes(
+    tmp_path: Path, drives: list[StoreSequence], maps: list[SavedMap]
+) -> None:
+    save_map(maps[0], tmp_path / "store")
+    mapper = Mapper(MapperConfig(), drives[1].rig)
+    for k, keyframe in enumerate(drives[1].keyframes[:5]):
+        mapper.step(dataclasses.replace(keyframe, kf_id=k))
+    with (
+        lock(tmp_path / "store"),
+        pytest.raises(StereoSfmError, match=r"another run is writing to .* contains this session alone"),
+    ):
+        save_result(mapper, Config(), MapFolders(tmp_path / "store", map_out=tmp_path / "store"))
+    assert len(load_map(tmp_path / "store", drives[0].rig)) == len(maps[0])
+    assert len(load_map(tmp_path / "store_walk1", drives[0].rig)) == len(mapper.map.living_keyframes())

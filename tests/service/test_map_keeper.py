@@ -14,7 +14,9 @@ from typing import Any
 import pytest
 
 from stereo_sfm.config import Config
+from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.maps import unfinished
+from stereo_sfm.maps.store import lock
 from stereo_sfm.messages import MapSaved, SaveMap
 from stereo_sfm.pipeline import map_saver
 from stereo_sfm.pipeline.map_saver import NICE, MapSaver
@@ -37,6 +39,19 @@ def keeper(tmp_path: Path) -> MapKeeper:
     made = MapKeeper(MapConfig(str(tmp_path / "store")), Config())
     made.begin()
     return made
+
+
+def test_the_service_is_the_only_writer_of_the_map_that_it_extends(tmp_path: Path) -> None:
+    maps = keeper(tmp_path)
+    with pytest.raises(StereoSfmError, match="stop the service"):
+        lock(maps.folder)
+    with pytest.raises(StereoSfmError, match="another run is writing"):
+        MapKeeper(MapConfig(str(maps.folder)), Config()).begin()
+    maps.switch(tmp_path / "other")
+    maps.begin()
+    lock(tmp_path / "store").release()
+    with pytest.raises(StereoSfmError, match="stop the service"):
+        lock(tmp_path / "other")
 
 
 def test_a_requested_save_is_answered_in_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
