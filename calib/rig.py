@@ -13,6 +13,7 @@ from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.types import F64, Bool
 
 BASELINE_RANGE_M = 1e-4, 10.0
+MAX_SKEW = 1e-4  # of a rotation: largest deviation of its product with its transpose from the identity
 MAX_PIXELS = 10**8
 MAX_READOUT_S = 0.2
 SMALLEST_SHARE = 0.05  # of an image's pixels, that a mask must leave
@@ -43,9 +44,8 @@ class Rig:
 
     def __post_init__(self) -> None:
         for transform in (self.left_T_right, self.body_T_left):
-            if transform.shape != (4, 4) or not np.allclose(
-                transform[:3, :3] @ transform[:3, :3].T, np.eye(3), atol=1e-4
-            ):
+            rotation = transform[:3, :3]
+            if transform.shape != (4, 4) or not np.abs(rotation @ rotation.T - np.eye(3)).max() <= MAX_SKEW:
                 raise StereoSfmError("invalid calibration: a transform is not rigid; check the extrinsics")
             transform.flags.writeable = False
             if not np.isfinite(transform).all():

@@ -111,6 +111,8 @@ class RadTan(Camera):
 
     def _limit(self, params: F64) -> float:
         """Largest squared normalised radius up to which the radial part grows, 0 if it always does (up to 20)."""
+        if min(params[[4, 5, 8]]) >= 0 and not params[9:12].any():
+            return 0.0
         r = np.linspace(0, 20, 40001)[1:]
         r2 = r * r
         k1, k2, _, _, k3, k4, k5, k6 = params[4:12]
