@@ -64,7 +64,7 @@ def exp_one(xi):
 def so3_exp_one(phi):
     """Rotation (3, 3) of a rotation vector (3,)."""
     xi, out = np.zeros(6), np.empty((4, 4))
-    xi[3:] = phi
+    xi[3], xi[4], xi[5] = phi[0], phi[1], phi[2]
     exp_into(xi, 1.0, out)
     return out[:3, :3].copy()
 

@@ -103,7 +103,8 @@ def find_deformed(half_image, uv, warps, slots, patch, radius, step, uv_out, war
                     if ncc > best[k]:
                         best[k] = ncc
                         uv_out[k, 0], uv_out[k, 1] = uv[k, 0] + 2 * (first + x), uv[k, 1] + 2 * dv
-                        warp_out[k] = warp
+                        warp_out[k, 0, 0], warp_out[k, 0, 1] = warp[0, 0], warp[0, 1]
+                        warp_out[k, 1, 0], warp_out[k, 1, 1] = warp[1, 0], warp[1, 1]
     return best
 
 

@@ -70,7 +70,7 @@ class StereoMatcher:
             assert image.depth is not None
             return image.depth
         assert image.right is not None
-        return klt.build_pyramid(image.right, 2)
+        return klt.build_pyramid(image.right, self._config.pyramid_levels)
 
     def follow(self, left: klt.Pyramid, right: klt.Pyramid | F32, uv: F64, points: F64, predicted: F64) -> F64:
         """Right pixels (N, 2) of tracked points (N, 3) whose left pixels are `uv`, NaN where not found."""
