@@ -2,10 +2,10 @@
 
     python benchmarks/speed.py [--frames N] [SOURCE ...]
 
-A step ends with the frame's pose. At keyframes descriptors follow, for the mapper and the loop closer, while the next
-image is awaited: the last column. Both are timed frame by frame in one run, so that a busy machine slows both. Reading
-and rendering images is not timed, nor are the first frames, in which code is compiled. RGB-D frames have one image,
-which is processed twice.
+A step ends with the frame's pose. At keyframes new points and descriptors follow, for the next frames, the mapper and
+the loop closer, while the next image is awaited: the last column. Both are timed frame by frame in one run, so that a
+busy machine slows both. Reading and rendering images is not timed, nor are the first frames, in which code is compiled.
+RGB-D frames have one image, which is processed twice.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ WARM_UP = 10  # frames
 SMALL = 20  # sequences with fewer frames are too short for timing
 HEADING = (
     "| sequence | image | frames | tracking step p50 | p95 | ORB on both images p50 | ratio of medians | of p95 "
-    "| points p50 | a keyframe's descriptors |",
+    "| points p50 | a keyframe's points and descriptors |",
     "|---|---|---|---|---|---|---|---|---|---|",
 )
 

@@ -12,7 +12,7 @@ from stereo_sfm.types import F64, Frame, Keyframe, MapUpdate, StereoImage
 class AnyTracker(Protocol):
     """One image in, one frame and perhaps a keyframe out; map updates when the schedule says so.
 
-    `describe` completes the keyframe of the last step, so that the frame need not wait for its descriptors.
+    `describe` completes the keyframe of the last step: the frame does not wait for its new points and descriptors.
     """
 
     def step(self, image: StereoImage) -> tuple[Frame, Keyframe | None]: ...

@@ -88,13 +88,13 @@ def test_accuracy_of_odometry_alone(data_root: Path, folder: str, limit_percent:
 def test_fisheyes_that_hardly_move(data_root: Path, folder: str) -> None:
     source = open_source(data_root / folder)
     with source:
-        tracker = Tracker(CONFIG, source.rig)
-        answers = [tracker.step(image) for image in source]
-    assert all(f.state == TrackState.OK for f, _ in answers)
-    assert np.abs(answers[-1][0].odom_T_cam[:3, 3]).max() < 0.1
-    keyframe = answers[0][1]
-    assert keyframe is not None
-    depth = np.linalg.norm(keyframe.points_cam, axis=1)
+        tracker, images = Tracker(CONFIG, source.rig), iter(source)
+        _, keyframe = tracker.step(next(images))
+        assert keyframe is not None
+        depth = np.linalg.norm(tracker.describe(keyframe).points_cam, axis=1)
+        frames = [tracker.step(image)[0] for image in images]
+    assert all(f.state == TrackState.OK for f in frames)
+    assert np.abs(frames[-1].odom_T_cam[:3, 3]).max() < 0.1
     assert len(depth) > 40
     assert 0.3 < np.percentile(depth, 5) < np.median(depth) < 8  # an office and a room
 
@@ -120,6 +120,22 @@ def test_people_crossing() -> None:
     frames = track(source)
     assert all(f.state == TrackState.OK for f in frames)
     assert ate_mm(frames, source.ground_truth) < 0.002 * 1e3 * 7
+
+
+def test_new_points_come_after_the_pose_of_their_keyframe(data_root: Path) -> None:
+    """Described or not, a keyframe gets them before the next image is tracked."""
+    with open_source(data_root / "euroc_mh01") as source:
+        images = list(islice(source, 30))
+        described, odometry_alone = Tracker(CONFIG, source.rig), Tracker(CONFIG, source.rig)
+    more = 0
+    for image in images:
+        frame, keyframe = described.step(image)
+        if keyframe is not None:
+            complete = described.describe(keyframe)
+            more += len(np.setdiff1d(complete.point_ids, frame.observations.point_ids))
+        assert np.array_equal(odometry_alone.step(image)[0].odom_T_cam, frame.odom_T_cam)
+    assert more > 20
+    assert np.array_equal(odometry_alone.points, described.points)
 
 
 def test_the_same_images_give_the_same_bits(data_root: Path) -> None:

@@ -41,7 +41,7 @@ class Keyframes:
         self._described: tuple[Keyframe, float] | None = None  # newest with corners, their median distance in metres
         self._begun = -1, 0  # newest submap, and its first keyframe
         self.count = 0
-        self.points = 0  # static points of the newest keyframe
+        self.points = 0  # static points of the newest keyframe, with new ones
         self._pose: F64 = np.eye(4)  # odom_T_cam of the newest keyframe
         self._frames_since = 0
         self._stamp_ns = 0  # of the newest keyframe
@@ -70,38 +70,32 @@ class Keyframes:
     def create(
         self,
         image: StereoImage,
-        tracks: Tracks,
         odom_T_cam: F64,
-        velocity: F64,
         submap_id: int,
         rig_terms: F64,
         gravity: tuple[F64, float] | None = None,
     ) -> Keyframe:
-        """A keyframe of an image, without descriptors: see `describe`.
+        """A keyframe of an image, without points: see `describe`.
 
         Args:
-            tracks: its points, of which those on moving objects are left out.
-            odom_T_cam: (4, 4). velocity: (6,) tangent a second. rig_terms: (8,) current correction of the rig.
+            odom_T_cam: (4, 4). rig_terms: (8,) current correction of the rig.
             gravity: its direction in the camera (3,), and the standard deviation in radians.
         """
-        static = tracks.keep(~tracks.moving)
-        points_cam = se3.transform(se3.inverse(odom_T_cam), static.points())
-        uv_left, uv_right = self._shutter.at_stamp(static.uv, static.uv_right, points_cam, velocity)
         keyframe = Keyframe(
             kf_id=self.count,
             frame_id=image.frame_id,
             stamp_ns=image.stamp_ns,
             odom_T_cam=odom_T_cam.copy(),
-            point_ids=static.point_ids.copy(),
-            uv_left=uv_left.copy(),
-            uv_right=uv_right.copy(),
-            points_cam=points_cam,
-            descriptors=np.zeros((len(static), 32), np.uint8),
+            point_ids=np.zeros(0, np.int64),
+            uv_left=np.zeros((0, 2)),
+            uv_right=np.zeros((0, 2)),
+            points_cam=np.zeros((0, 3)),
+            descriptors=np.zeros((0, 32), np.uint8),
             submap_id=submap_id,
             rig_terms=rig_terms.copy(),
             **self._down(image.stamp_ns, gravity),
         )
-        self.count, self.points, self._pose, self._frames_since = self.count + 1, len(static), odom_T_cam.copy(), 0
+        self.count, self._pose, self._frames_since = self.count + 1, odom_T_cam.copy(), 0
         return keyframe
 
     def _down(self, stamp_ns: int, gravity: tuple[F64, float] | None) -> dict[str, Any]:
@@ -114,11 +108,22 @@ class Keyframes:
         return {"down": down, "down_sigma": sigma * np.sqrt(max(CORRELATED_S / seconds, 1.0))}
 
     def describe(self, keyframe: Keyframe, images: StereoPyramids, tracks: Tracks, velocity: F64) -> Keyframe:
-        """The keyframe with its points' descriptors and its corners; arguments as those of `create`."""
+        """The keyframe with its points, but those on moving objects, their descriptors and its corners.
+
+        Args:
+            tracks: its points. velocity: (6,) tangent a second.
+        """
         corners, sides = self._corners(keyframe, images, tracks)
+        static = tracks.keep(~tracks.moving)
+        points_cam = se3.transform(se3.inverse(keyframe.odom_T_cam), static.points())
+        uv_left, uv_right = self._shutter.at_stamp(static.uv, static.uv_right, points_cam, velocity)
         return replace(
             keyframe,
-            descriptors=describe(images.left[0], tracks.uv[~tracks.moving]),
+            point_ids=static.point_ids.copy(),
+            uv_left=uv_left.copy(),
+            uv_right=uv_right.copy(),
+            points_cam=points_cam,
+            descriptors=describe(images.left[0], static.uv),
             corners=self._shutter.corners_at_stamp(corners, velocity),
             sides=self._shutter.corners_at_stamp(sides, velocity),
         )

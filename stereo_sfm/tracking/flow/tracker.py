@@ -2,8 +2,8 @@
 
 Per frame: predict the pose (constant velocity), predict every point's pixel, follow it by translation, align it with
 its first appearance, match it in the right image, solve for the pose robustly, refine the points' distances. At
-keyframes: new corners where points are missing, stereo matches for them, descriptors for the mapper; corners of the
-whole image for the loop closer.
+keyframes, after their pose: new corners where points are missing, stereo matches for them, descriptors for the mapper;
+corners of the whole image for the loop closer.
 """
 
 from __future__ import annotations
@@ -102,6 +102,7 @@ class Tracker:
         self._submap_id = 0
         self._map_version = 0
         self._undescribed: tuple[Keyframe, StereoPyramids, bool] | None = None  # the newest keyframe, and if trusted
+        self._sparse: StereoPyramids | None = None  # images of the newest frame if it needs new points
         self.solution: PoseSolution | None = None  # of the last image; None for a first image
 
     @property
@@ -118,7 +119,8 @@ class Tracker:
         self._tracks = take_update(self._tracks, update)
 
     def step(self, image: StereoImage) -> tuple[Frame, Keyframe | None]:
-        """The pose of one image, and the keyframe if this frame becomes one, without descriptors: see `describe`."""
+        """The pose of one image, and the keyframe if this frame becomes one, still without points: see `describe`."""
+        self._complete()
         self._undescribed = None
         with self._spans.span("pyramid"):
             images = self._prepare(image)
@@ -149,22 +151,21 @@ class Tracker:
         inlier = self._accept(image, images, tracks, solution, expected.seconds, recovered)
         keyframe = None
         if recovered or self._keyframes.due(self._tracks):
-            with self._spans.span("keyframe"):
-                inlier = self._add_points(images, inlier)
-                keyframe = self._create_keyframe(image, images, trusted)
-        elif self._solver.crowded(self._static_count()):
-            inlier = self._add_points(images, inlier)
+            keyframe = self._create_keyframe(image, images, trusted)
+        if keyframe is not None or self._solver.crowded(self._static_count()):
+            self._sparse = images
         state = TrackState.RECOVERED if recovered else TrackState.OK
         stats |= self._level()
         reason = "" if self._sensors is None else self._sensors.news()
         return self._frame(image, self._pose, solution.covariance, state, reason, inlier, keyframe, stats), keyframe
 
     def describe(self, keyframe: Keyframe) -> Keyframe:
-        """The keyframe of the last step with descriptors and corners, as the mapper and the loop closer need it.
+        """The keyframe of the last step with its points, descriptors and corners, for the mapper and the loop closer.
 
         This takes as long as several steps, and the pose does not wait for it. A keyframe that is not described is not
         searched after a loss of tracking.
         """
+        self._complete()
         assert self._undescribed is not None
         own, images, trusted = self._undescribed
         self._undescribed = None
@@ -172,7 +173,16 @@ class Tracker:
             own = self._keyframes.describe(own, images, self._tracks, self._velocity)
             if trusted:
                 self._recovery.remember(own)
-        return replace(keyframe, descriptors=own.descriptors, corners=own.corners, sides=own.sides)
+        return replace(own, odom_T_cam=keyframe.odom_T_cam)
+
+    def _complete(self) -> None:
+        """Add new points to the newest frame if it needs them, and has not got them."""
+        if self._sparse is not None:
+            with self._spans.span("keyframe"):
+                self._add_points(self._sparse)
+            self._sparse = None
+            if self._undescribed is not None:
+                self._keyframes.points = self._static_count()
 
     def _use(self, rig: Rig) -> None:
         """Use a corrected rig: the tracked points are triangulated anew."""
@@ -271,7 +281,7 @@ class Tracker:
         if bridge is not None:
             self._pose = bridge[0]
         self._continue(image, images, self._pose, Tracks())
-        inlier = self._add_points(images, np.zeros(0, bool))
+        self._add_points(images)
         if len(self._tracks) < 2 * self._config.min_features:
             self._tracks = Tracks()
             self._state = TrackState.INITIALIZING
@@ -289,6 +299,7 @@ class Tracker:
         self._bridging = False
         if self._sensors is not None:
             self._sensors.begin(image.stamp_ns, self._pose)
+        inlier = ~self._tracks.moving
         n = float(len(inlier))
         stats = {"tracked": n, "inliers": n, "right": n, "error": 0.0}
         return self._frame(image, self._pose, covariance, state, "", inlier, keyframe, stats), keyframe
@@ -388,12 +399,11 @@ class Tracker:
         covariance = expected.covariance if bridge is None else bridge[1]
         return self._frame(image, expected.odom_T_cam, covariance, state, reason), None
 
-    def _add_points(self, images: StereoPyramids, inlier: Bool) -> Bool:
-        """Add new points after the tracked ones, of which `inlier` (N,) are inliers; returns the mask of all."""
+    def _add_points(self, images: StereoPyramids) -> None:
+        """Add new points after the tracked ones."""
         most = self._config.max_features
         self._tracks = self._new_points.add(self._tracks, images, self._pose, self._velocity, most)
         self._follower.keep_only(self._tracks)
-        return np.concatenate([inlier, ~self._tracks.moving[len(inlier) :]])
 
     # -- messages --------------------------------------------------------------------------------------------------
 
@@ -402,10 +412,9 @@ class Tracker:
         return int((~self._tracks.moving).sum())
 
     def _create_keyframe(self, image: StereoImage, images: StereoPyramids, trusted: bool) -> Keyframe:
-        """A keyframe of the image whose pose and points have just been found."""
-        keyframe = self._keyframes.create(
-            image, self._tracks, self._pose, self._velocity, self._submap_id, self._rig_terms, self._gravity()
-        )
+        """A keyframe of the image whose pose has just been found."""
+        keyframe = self._keyframes.create(image, self._pose, self._submap_id, self._rig_terms, self._gravity())
+        self._keyframes.points = self._static_count()
         self._undescribed = keyframe, images, trusted
         return keyframe
 
