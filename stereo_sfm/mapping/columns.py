@@ -13,8 +13,7 @@ Spec = dict[str, tuple[DTypeLike, tuple[int, ...], Any]]
 class Columns:
     """Rows in arrays. A subclass names its columns in SPEC, (dtype, shape of one value, value of a new row).
 
-    Reading `table.name` gives a view (rows, ...) of the column that may be written to; it is valid until rows are
-    appended.
+    `table.name` is a view (rows, ...) of the column that may be written to; it is valid until rows are appended.
     """
 
     SPEC: ClassVar[Spec] = {}
@@ -22,15 +21,14 @@ class Columns:
     def __init__(self, capacity: int = 64) -> None:
         self._count = 0
         self._data = {name: np.empty((capacity, *shape), dtype) for name, (dtype, shape, _) in self.SPEC.items()}
+        self._show()
 
     def __len__(self) -> int:
         return self._count
 
-    def __getattr__(self, name: str) -> Any:
-        data = self.__dict__.get("_data", {})
-        if name not in data:
-            raise AttributeError(name)
-        return data[name][: self._count]
+    def _show(self) -> None:
+        """Make the columns attributes."""
+        self.__dict__.update({name: data[: self._count] for name, data in self._data.items()})
 
     def append(self, count: int, **values: Any) -> slice:
         """New rows at the end; columns that are not given take their default. Returns the rows."""
@@ -44,6 +42,7 @@ class Columns:
         if values:
             raise TypeError(f"no such columns: {', '.join(values)}")
         self._count = last
+        self._show()
         return slice(first, last)
 
     def keep(self, rows: NDArray[np.int64]) -> None:
@@ -53,6 +52,7 @@ class Columns:
             kept[: len(rows)] = data[rows]
             self._data[name] = kept
         self._count = len(rows)
+        self._show()
 
     @property
     def nbytes(self) -> int:

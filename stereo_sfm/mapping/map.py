@@ -316,12 +316,10 @@ class Map:
 
     def _renew_descriptors(self, points: I64) -> None:
         """Points whose standing observation is gone take the newest that has a descriptor."""
-        obs = self.points.descriptor_obs[points]
-        lost = points[(obs >= 0) & (self.observations.pt[np.maximum(obs, 0)] != points)]
-        for point in lost.tolist():
-            rows = self.observations_of_points(np.array([point]))
-            described = rows[self.observations.descriptor[rows].any(axis=1)]
-            self.points.descriptor_obs[point] = described[-1] if len(described) else -1
+        head, table = self.points.head, self.observations
+        map_kernels.renew_standing(
+            points, head, table.following, table.pt, table.descriptor, self.points.descriptor_obs
+        )
 
     def cull_points(self, rows: I64) -> None:
         """Cull points with all their observations."""

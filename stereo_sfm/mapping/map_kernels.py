@@ -48,6 +48,20 @@ def list_observations(points, head, following, out):
 
 
 @njit
+def renew_standing(points, head, following, obs_pt, descriptor, standing):
+    """For points whose `standing` observation (P,) is another point's or removed: the newest that has a descriptor."""
+    for p in points:
+        if standing[p] < 0 or obs_pt[standing[p]] == p:
+            continue
+        standing[p] = -1
+        o = head[p]
+        while o >= 0:
+            if o > standing[p] and descriptor[o].any():
+                standing[p] = o
+            o = following[o]
+
+
+@njit
 def count_by_keyframe(points, head, following, obs_kf, counts):
     """Adds to counts (K,) how many of these points every keyframe sees."""
     for i in range(points.shape[0]):

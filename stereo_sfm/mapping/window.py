@@ -8,8 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.sparse
-from scipy.sparse.csgraph import connected_components
 
 from stereo_sfm.config import MapperConfig
 from stereo_sfm.geometry import se3
@@ -90,19 +88,25 @@ def _window(map_: Map, moving: I64, most_fixed: int | None = None) -> Window:
 
 
 def _floating(map_: Map, kfs: I64, fixed: Bool) -> I64:
-    """The oldest keyframe (index) of every part that too few shared points connect with a fixed keyframe."""
+    """The oldest keyframe (index) of every part that too few shared points connect with a fixed keyframe.
+
+    A part is followed no further than to the first keyframe that is held: few keyframes' neighbours are counted.
+    """
     index = np.full(len(map_.keyframes), -1, np.int64)
     index[kfs] = np.arange(len(kfs))
-    free = np.flatnonzero(~fixed)
-    linked = [index[map_.neighbours(int(kfs[i]), MIN_SHARED_POINTS)[0]] for i in free]
-    i, j = np.repeat(free, [len(others) for others in linked]), np.concatenate([np.zeros(0, np.int64), *linked])
-    i, j = i[j >= 0], j[j >= 0]
-    edges = scipy.sparse.csr_array((np.ones(len(i), np.int8), (i, j)), shape=(len(kfs),) * 2)
-    label = connected_components(edges, directed=False)[1]
-    floating = np.flatnonzero(~np.isin(label, label[fixed]))
-    oldest = floating[np.lexsort((kfs[floating], label[floating]))]
-    _, first = np.unique(label[oldest], return_index=True)
-    return oldest[first]
+    held, oldest = fixed.copy(), list[int]()
+    for first in np.flatnonzero(~fixed)[::-1].tolist():
+        part, ends, loose = {first}, [first], not held[first]
+        while loose and ends:
+            linked = index[map_.neighbours(int(kfs[ends.pop()]), MIN_SHARED_POINTS)[0]]
+            linked = linked[linked >= 0]
+            loose = not held[linked].any()
+            ends += [i for i in linked.tolist() if i not in part]
+            part.update(linked.tolist())
+        held[list(part)] = True
+        if loose:
+            oldest.append(min(part, key=lambda i: int(kfs[i])))
+    return np.array(oldest, np.int64)
 
 
 def write_back(map_: Map, part: Window, result: BundleResult) -> None:
