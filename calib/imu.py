@@ -28,6 +28,8 @@ class Imu:
     accel_noise: float = 3e-3  # m/s^2/sqrt(Hz)
     gyro_walk: float = 3e-5  # rad/s^2/sqrt(Hz), of the bias
     accel_walk: float = 3e-3  # m/s^3/sqrt(Hz)
+    gyro_bias_sigma: float = 0.05  # rad/s, what the calibration leaves of the bias when the sensor is switched on
+    accel_bias_sigma: float = 0.3  # m/s^2, the same
     rate_hz: float = 200.0
     offset_s: float = 0.0  # IMU stamp minus camera stamp of the same instant (Kalibr's timeshift_cam_imu)
 
@@ -38,7 +40,10 @@ class Imu:
         arrays = (self.left_T_imu, self.gyro_matrix, self.gyro_bias, self.accel_matrix, self.accel_bias)
         for array in arrays:
             array.flags.writeable = False
-        noise = (self.gyro_noise, self.accel_noise, self.gyro_walk, self.accel_walk, self.rate_hz)
+        noise = (
+            self.gyro_noise, self.accel_noise, self.gyro_walk, self.accel_walk, self.gyro_bias_sigma,
+            self.accel_bias_sigma, self.rate_hz,
+        )  # fmt: skip
         if not all(np.isfinite(a).all() for a in arrays) or not all(np.isfinite(n) and n > 0 for n in noise):
             raise StereoSfmError("invalid calibration of the IMU: a number is not finite, or a noise is not positive")
         if not abs(self.offset_s) <= MAX_OFFSET_S:

@@ -192,8 +192,8 @@ class Frame(Message):
     is_keyframe: bool = False  # whether it enters the map
     # numbers worth plotting, no wall clock, none where the pose is predicted: `tracked` points, `inliers` (in the
     # pose), `right` (seen by both cameras), `moving` (share of the points on things that move), `error` (median
-    # residual of the inliers in standard deviations); with an IMU `roll_deg`, `pitch_deg`; other trackers:
-    # `features`, `matches`, `line_share`, `parallax_deg`, ...
+    # residual of the inliers in standard deviations); with an IMU `roll_deg`, `pitch_deg` and the standard deviation
+    # of each, `tilt_sigma_deg`; other trackers: `features`, `matches`, `line_share`, `parallax_deg`, ...
     stats: dict[str, float] = field(default_factory=dict[str, float])
 
 

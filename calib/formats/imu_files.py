@@ -17,6 +17,7 @@ _NOISE = {  # ours -> EuRoC's and Kalibr's
     "gyro_walk": "gyroscope_random_walk",
     "accel_walk": "accelerometer_random_walk",
 }
+_OTHERS = "gyro_bias_sigma", "accel_bias_sigma", "rate_hz", "offset_s"
 
 
 def imu_to_plain(imu: Imu) -> dict[str, Any]:
@@ -27,7 +28,7 @@ def imu_to_plain(imu: Imu) -> dict[str, Any]:
         "gyro_bias": imu.gyro_bias.tolist(),
         "accel_matrix": rows(imu.accel_matrix),
         "accel_bias": imu.accel_bias.tolist(),
-        **{name: float(getattr(imu, name)) for name in (*_NOISE, "rate_hz", "offset_s")},
+        **{name: float(getattr(imu, name)) for name in (*_NOISE, *_OTHERS)},
     }
 
 
@@ -37,7 +38,7 @@ def imu_from_plain(data: dict[str, Any]) -> Imu:
     for name, shape in (("gyro_matrix", (3, 3)), ("gyro_bias", (3,)), ("accel_matrix", (3, 3)), ("accel_bias", (3,))):
         if name in data:
             known[name] = np.array(numbers(data[name], int(np.prod(shape)))).reshape(shape)
-    known |= {name: float(data[name]) for name in (*_NOISE, "rate_hz", "offset_s") if name in data}
+    known |= {name: float(data[name]) for name in (*_NOISE, *_OTHERS) if name in data}
     unknown = set(data) - set(known)
     if unknown:
         raise ValueError(f"unknown IMU key: {', '.join(sorted(unknown))}")

@@ -65,7 +65,9 @@ class InertialSensor:
             left_T_imu=left_T_imu, gyro_matrix=gyro_matrix, accel_matrix=accel_matrix,
             accel_bias=rng.normal(0, grade.calibrated_bias, 3), gyro_noise=grade.gyro_noise or default.gyro_noise,
             accel_noise=grade.accel_noise or default.accel_noise, gyro_walk=grade.gyro_walk or default.gyro_walk,
-            accel_walk=grade.accel_walk or default.accel_walk, rate_hz=RATE_HZ, offset_s=offset_s,
+            accel_walk=grade.accel_walk or default.accel_walk,
+            gyro_bias_sigma=grade.gyro_bias or default.gyro_bias_sigma,
+            accel_bias_sigma=grade.accel_bias or default.accel_bias_sigma, rate_hz=RATE_HZ, offset_s=offset_s,
         )  # fmt: skip
         self._gyro_error, self._accel_error = self._errors(grade, rng)
 

@@ -95,9 +95,28 @@ def test_roll_and_pitch_against_gravity() -> None:
     np.testing.assert_allclose(roll_pitch_deg(tilted.T @ [0.0, GRAVITY, 0.0]), (10, 20), atol=1e-9)
     session = Session()
     pose = session.pose(6.0)
-    level = follow(session, 6.0).level(pose)
-    assert level is not None and follow(session, 1.0).level(pose) is None
-    np.testing.assert_allclose(level, roll_pitch_deg(pose[:3, :3].T @ [0.0, GRAVITY, 0.0]), atol=0.2)
+    level = MotionSensors(follow(session, 6.0), None).level(pose)
+    assert not MotionSensors(follow(session, 1.0), None).level(pose)
+    true = roll_pitch_deg(pose[:3, :3].T @ [0.0, GRAVITY, 0.0])
+    np.testing.assert_allclose((level["roll_deg"], level["pitch_deg"]), true, atol=0.2)
+    assert 0.0 < level["tilt_sigma_deg"] < 0.2
+
+
+def test_a_turn_that_only_the_images_see_does_not_tilt_gravity() -> None:
+    session, rng = Session(), np.random.default_rng(0)
+    samples, motion, at = session.samples(0), InertialMotion(session.imu), 0
+    slip = np.radians(1.0) * np.array([0.6, 0.0, 0.8])  # of the odometry, between the fifth and the sixth second
+    for stamp in range(0, round(6.2e9), FRAME_NS):
+        until = int(np.searchsorted(samples.stamp_ns, stamp, side="right"))
+        motion.feed(samples.part(slice(at, until)))
+        at = until
+        turn = se3.so3_exp(np.clip(stamp * 1e-9 - 5.0, 0.0, 1.0) * slip)
+        noise = np.concatenate([rng.normal(0, 5e-4, 3), rng.normal(0, 1.5e-4, 3)])
+        exact = session.pose(stamp * 1e-9)
+        motion.accept(stamp, se3.from_rotation_translation(turn @ exact[:3, :3], exact[:3, 3]) @ se3.exp(noise))
+    assert motion.state is not None
+    down = turn @ np.array([0.0, 1.0, 0.0])
+    assert np.degrees(np.linalg.norm(np.cross(motion.state.gravity / GRAVITY, down))) < 0.25
 
 
 @pytest.mark.parametrize("seed", range(3))

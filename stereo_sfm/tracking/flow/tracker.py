@@ -264,8 +264,7 @@ class Tracker:
 
     def _level(self) -> dict[str, float]:
         """Roll and pitch if gravity is known."""
-        level = None if self._sensors is None else self._sensors.level(self._pose)
-        return {} if level is None else {"roll_deg": level[0], "pitch_deg": level[1]}
+        return {} if self._sensors is None else self._sensors.level(self._pose)
 
     def _continue(self, image: StereoImage, images: StereoPyramids, pose: F64, tracks: Tracks) -> None:
         self._pose, self._stamp_ns, self._tracks = pose, image.stamp_ns, tracks

@@ -2,8 +2,9 @@
 
 Stereo knows the size of the motion, so that everything but the rotation is linear: the equations of Qin and Shen
 (Robust Initialization of Monocular Visual-Inertial Estimation, IROS 2017) without the scale, one motion after the
-other. The rotation of the odometry drifts a little, and with it the direction of gravity in the odometry frame; a bias
-of the accelerometer turns with the robot. So they come apart where the robot turns, and stay known afterwards.
+other. The rotation of the odometry drifts, and with it the direction of gravity in the odometry frame: the gyroscope
+carries it on. A bias of the accelerometer turns with the robot. So the two come apart where the robot turns, and stay
+known afterwards; before, gravity is as exact as that bias was known when the sensor was switched on.
 The gyroscope's bias is found from the rotations of the odometry, and corrected by the drift that gravity shows.
 """
 
@@ -23,12 +24,12 @@ from stereo_sfm.geometry.preintegration import GRAVITY, Preintegrated
 from stereo_sfm.types import F64
 
 MIN_S = 1.5  # of motion before velocity and gravity are used
-POSITION_SIGMA_M = 0.0015  # of one pose against the next
-ROTATION_SIGMA = 5e-4  # rad, the same
+POSITION_SIGMA_M, ROTATION_SIGMA = 0.0015, 5e-4  # m and rad of one pose
+POSITION_WALK = 0.0015  # m/sqrt(s) of the odometry
 GRAVITY_SIGMA = 0.02  # m/s^2 of its size, which varies over the earth
-GYRO_BIAS_SIGMA, ACCEL_BIAS_SIGMA = 0.05, 0.3  # rad/s and m/s^2, what is expected of a sensor
 DRIFT_SIGMA, DRIFT_S = 2e-4, 10.0  # rad/s of the odometry's rotation, and seconds for which it stays the same
-ROTATION_WALK = 1e-4  # rad/sqrt(s) of the odometry's rotation
+ROTATION_WALK = 1e-4  # rad/sqrt(s) of the odometry's rotation, at least
+TURN_SHARE = 2e-3  # of a turn: error of a calibrated gyroscope's scale and axes
 KNOWN = 1.0  # m/s^2, standard deviation of gravity from which its size counts
 FIRST_DRIFT_SIGMA = 1e-3  # rad/s, before the rotations have shown the gyroscope's bias better
 SPEED_SIGMA = 10.0  # m/s, before anything is known
@@ -62,20 +63,22 @@ class InertialFilter:
         self._imu = imu
         self._newest: F64 = np.eye(4)
         self._seconds = 0.0
-        self._x: F64 = np.zeros(12)  # velocity, gravity, accelerometer bias, drift of the odometry's rotation (rad/s)
-        self._p: F64 = np.zeros((12, 12))
+        # Velocity, gravity, accelerometer bias, drift of the odometry's rotation (rad/s), error of the newest position.
+        self._x: F64 = np.zeros(15)
+        self._p: F64 = np.zeros((15, 15))
         self._bias: F64 = np.zeros(3)  # of the gyroscope, by the rotations of the odometry
-        self._bias_p: F64 = np.eye(3) * GYRO_BIAS_SIGMA**2
+        self._bias_p: F64 = np.eye(3) * imu.gyro_bias_sigma**2
         self._force: F64 = np.zeros(3)  # mean, odometry frame
         self._forget()
 
     def _forget(self) -> None:
         """Keep the biases alone."""
-        sigmas = np.repeat([SPEED_SIGMA, 2 * GRAVITY, ACCEL_BIAS_SIGMA, FIRST_DRIFT_SIGMA], 3)
-        known = self._p[6:9, 6:9].copy() if self._seconds else np.eye(3) * ACCEL_BIAS_SIGMA**2
+        bias = self._imu.accel_bias_sigma
+        sigmas = np.repeat([SPEED_SIGMA, 2 * GRAVITY, bias, FIRST_DRIFT_SIGMA, POSITION_SIGMA_M], 3)
+        known = self._p[6:9, 6:9].copy() if self._seconds else np.eye(3) * bias**2
         self._p = np.diag(sigmas**2)
         self._p[6:9, 6:9] = known
-        self._x = np.concatenate([np.zeros(6), self._x[6:9], np.zeros(3)])
+        self._x = np.concatenate([np.zeros(6), self._x[6:9], np.zeros(6)])
         self._seconds, self._force = 0.0, np.zeros(3)
 
     def begin(self, odom_T_imu: F64) -> None:
@@ -97,11 +100,27 @@ class InertialFilter:
         if not self._seconds:
             self._x[3:6], self._force = -acceleration, acceleration
         self._force = self._force + t / min(self._seconds + t, FORCE_S) * (acceleration - self._force)
-        walk = np.array([ROTATION_WALK * GRAVITY, imu.accel_walk]) ** 2 * t
-        self._x, self._p, chi2 = _advance(self._x, self._p, t, np.ascontiguousarray(self._newest[:3, :3]), *link, walk)
+        rotation = np.ascontiguousarray(self._newest[:3, :3])
+        self._x, self._p, chi2 = _advance(self._x, self._p, t, rotation, *link, imu.accel_walk**2 * t)
+        self._carry(motion, odom_T_imu)
         self._newest = odom_T_imu
         self._seconds += t
         return float(chi2)
+
+    def _carry(self, m: Preintegrated, odom_T_imu: F64) -> None:
+        """Turn the state with the odometry frame, which turns where the images see another rotation than the gyroscope:
+        as far as this one is more accurate."""
+        t, turn = m.seconds, m.rotation_with(self._bias)
+        off = se3.so3_log(odom_T_imu[:3, :3] @ (self._newest[:3, :3] @ turn).T)
+        by_images = ROTATION_WALK**2 * t + float(off @ off) / 3
+        share = TURN_SHARE * float(np.linalg.norm(se3.so3_log(turn)))
+        by_gyro = self._imu.gyro_noise**2 * t + share**2 + float(np.trace(self._bias_p)) / 3 * t * t
+        trust = by_images / (by_images + by_gyro)
+        rotation = np.eye(15)
+        for k in (0, 3, 9, 12):
+            rotation[k : k + 3, k : k + 3] = se3.so3_exp(trust * off)
+        self._x, self._p = rotation @ self._x, rotation @ self._p @ rotation.T
+        self._p[3:6, 3:6] += trust * by_gyro * GRAVITY**2 * np.eye(3)
 
     def _turn(self, m: Preintegrated, odom_T_imu: F64) -> None:
         """Learn the gyroscope's bias from a rotation."""
@@ -122,8 +141,8 @@ class InertialFilter:
         """None before enough is seen."""
         if self._seconds < MIN_S:
             return None
-        x, drift = self._x, self._newest[:3, :3].T @ self._x[9:]
-        variance = np.trace(self._bias_p) / 3 + np.trace(self._p[9:, 9:]) / 3
+        x, drift = self._x, self._newest[:3, :3].T @ self._x[9:12]
+        variance = np.trace(self._bias_p) / 3 + np.trace(self._p[9:12, 9:12]) / 3
         return InertialState(
             velocity=x[:3].copy(),
             gravity=x[3:6].copy(),
@@ -140,7 +159,7 @@ def _link(m: Preintegrated, i: F64, j: F64, gyro_bias: F64) -> tuple[F64, F64, F
     i_R_odom, t, zero = i[:3, :3].T, m.seconds, np.zeros(3)
     order = [3, 4, 5, 0, 1, 2]
     covariance = m.covariance[3:, 3:][np.ix_(order, order)].copy()
-    covariance[:3, :3] += 2 * POSITION_SIGMA_M**2 * np.eye(3)
+    covariance[:3, :3] += (POSITION_WALK**2 * t + POSITION_SIGMA_M**2) * np.eye(3)
     # A pose that is turned by an error turns the force with it.
     covariance[3:, 3:] += (ROTATION_SIGMA * GRAVITY * t) ** 2 * np.eye(3)
     moved = i_R_odom @ (j[:3, 3] - i[:3, 3])
@@ -150,11 +169,11 @@ def _link(m: Preintegrated, i: F64, j: F64, gyro_bias: F64) -> tuple[F64, F64, F
 
 @njit
 def _advance(x, p, t, rotation, moved, integrated, by_bias, covariance, walk):
-    """State (12,) and covariance (12, 12) at the next pose, and chi-squared of the move (3,) against what was expected.
+    """State (15,) and covariance (15, 15) at the next pose, and chi-squared of the move (3,) against what was expected.
 
     The noise of the integrated position is part of that of the integrated velocity: the gain contains both.
     """
-    f, h, into = np.eye(12), np.zeros((3, 12)), np.zeros((12, 3))
+    f, h, into = np.eye(15), np.zeros((3, 15)), np.zeros((15, 3))
     f[:3, 3:6] = t * np.eye(3)
     f[:3, 6:9] = rotation @ np.ascontiguousarray(by_bias[3:])
     g = x[3:6].copy()
@@ -163,12 +182,16 @@ def _advance(x, p, t, rotation, moved, integrated, by_bias, covariance, walk):
     keep = math.exp(-t / DRIFT_S)
     turned = np.ascontiguousarray(rotation.T)
     h[:, :3], h[:, 3:6], h[:, 6:9] = t * turned, 0.5 * t * t * turned, by_bias[:3]
+    h[:, 12:] = -turned
     into[:3] = rotation
     expected = h @ x + integrated[:3]
     off = moved - expected
     ph = p @ h.T
     wv = into @ np.ascontiguousarray(covariance[3:, :3])
     s = h @ ph + covariance[:3, :3]
+    for i in range(3):
+        f[12 + i, 12 + i] = 0.0
+        wv[12 + i] = POSITION_SIGMA_M**2 * rotation[i]
     chi2 = off @ np.linalg.solve(s, off)
     s *= max(chi2 / WRONG_CHI2, 1.0)
     x = f @ x
@@ -178,8 +201,8 @@ def _advance(x, p, t, rotation, moved, integrated, by_bias, covariance, walk):
         p[9 + i] *= keep
         p[:, 9 + i] *= keep
         x[9 + i] *= keep
-        p[3 + i, 3 + i] += walk[0]
-        p[6 + i, 6 + i] += walk[1]
+        p[6 + i, 6 + i] += walk
+        p[12 + i, 12 + i] += POSITION_SIGMA_M**2
         p[9 + i, 9 + i] += (1.0 - keep * keep) * DRIFT_SIGMA**2
     m = f @ ph + wv
     for i in range(3):

@@ -65,15 +65,6 @@ class InertialMotion:
         """(3, 3) as the calibration has it."""
         return self._imu.left_T_imu[:3, :3]
 
-    def level(self, odom_T_cam: F64) -> tuple[float, float] | None:
-        """Roll and pitch in degrees of the camera (4, 4) against measured gravity; None while that is not known.
-
-        Roll is positive to the right, pitch upwards.
-        """
-        if self._state is None:
-            return None
-        return roll_pitch_deg(odom_T_cam[:3, :3].T @ self._state.gravity)
-
     def gravity(self, odom_T_cam: F64) -> tuple[F64, float] | None:
         """Its direction in the camera (4, 4), a unit vector (3,), and the standard deviation in radians about each
         horizontal axis; None while it is not known."""

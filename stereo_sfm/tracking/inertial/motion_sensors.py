@@ -8,7 +8,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.tracking.inertial.dead_reckoning import DeadReckoning
-from stereo_sfm.tracking.inertial.inertial_motion import InertialMotion
+from stereo_sfm.tracking.inertial.inertial_motion import InertialMotion, roll_pitch_deg
 from stereo_sfm.tracking.inertial.rest import Rest
 from stereo_sfm.tracking.inertial.wheel_motion import LINK_NS, WheelMotion
 from stereo_sfm.types import F64, StereoImage
@@ -118,9 +118,14 @@ class MotionSensors:
         motion = inertial.motion(self._reckoned_ns, stamp_ns)
         return None if motion is None and stamp_ns > self._reckoned_ns else self._reckoning.after(motion)
 
-    def level(self, odom_T_cam: F64) -> tuple[float, float] | None:
-        """Roll and pitch in degrees of the camera (4, 4) against measured gravity; None while that is not known."""
-        return None if self._inertial is None else self._inertial.level(odom_T_cam)
+    def level(self, odom_T_cam: F64) -> dict[str, float]:
+        """Of the camera (4, 4) against measured gravity: `roll_deg`, positive to the right, `pitch_deg`, upwards, and
+        `tilt_sigma_deg`, the standard deviation of each; {} while gravity is not known."""
+        gravity = self.gravity(odom_T_cam)
+        if gravity is None:
+            return {}
+        roll, pitch = roll_pitch_deg(gravity[0])
+        return {"roll_deg": roll, "pitch_deg": pitch, "tilt_sigma_deg": float(np.degrees(gravity[1]))}
 
     def gravity(self, odom_T_cam: F64) -> tuple[F64, float] | None:
         """Its direction in the camera (4, 4), (3,), and how accurate that is, radians; None while it is not known."""
