@@ -26,9 +26,9 @@ KEYFRAMES = 4  # of one window
 MIN_KEYFRAMES = 3  # of the last window
 MIN_MOTION = 0.02  # of the image's width: median motion of common points from one keyframe of a window to the next
 MAX_COMMON = 0.6  # share of common points below which a keyframe has moved in any case
-FIRST_WINDOWS = 4  # before the first correction
+MIN_WINDOWS = 2  # before the first correction
+ENOUGH_WINDOWS = 4  # with fewer, a correction must be more significant: errors of a window's keyframes are alike
 MAX_BETWEEN = 4  # windows from one revision to the next: as many as there are, but no more
-MIN_WINDOWS = 2  # at the end of a run
 MAX_WINDOWS = 80  # used, the newest
 RECENT = 2  # windows that must contradict all others to indicate a step
 BEFORE_STEP = 4  # earlier windows needed to detect a step
@@ -60,9 +60,9 @@ class SelfCalibration:
         self.terms: F64 = np.zeros(RIG_TERMS)  # current corrections
         self._corrected = np.zeros(RIG_TERMS, bool)
         self._keyframes: list[Keyframe] = []
-        self._windows: deque[RigWindow] = deque(maxlen=MAX_WINDOWS)  # since the last step
+        self.windows: deque[RigWindow] = deque(maxlen=MAX_WINDOWS)  # since the last step
         self._since = 0  # first keyframe of the windows
-        self._until_due = FIRST_WINDOWS  # windows until the next revision
+        self._until_due = MIN_WINDOWS  # windows until the next revision
         self._stepped = False  # a step was detected and is not yet corrected
         half_width = 0.5 * rig.left.width
         turn = MATCHING_PX / rig.left.fx
@@ -79,7 +79,9 @@ class SelfCalibration:
         self._keyframes.append(keyframe)
         if len(self._keyframes) < KEYFRAMES or not self._close_window():
             return None
-        return self._revise() if self._until_due <= 0 or self._stepped else None
+        if self._until_due > 0 and not self._stepped:
+            return None
+        return self._revise(SIGMAS * np.sqrt(max(1.0, ENOUGH_WINDOWS / len(self.windows))))
 
     @staticmethod
     def wanted(config: Config, rig: Rig) -> SelfCalibration | None:
@@ -93,7 +95,7 @@ class SelfCalibration:
         """After the last keyframe: a last revision from all windows."""
         if len(self._keyframes) >= MIN_KEYFRAMES:
             self._close_window()
-        return self._revise() if len(self._windows) >= MIN_WINDOWS else None
+        return self._revise(SIGMAS) if len(self.windows) >= MIN_WINDOWS else None
 
     def estimate(self, windows: Sequence[RigWindow]) -> Estimate:
         """Change of the current terms estimated from windows; its covariance includes systematic matching errors."""
@@ -107,22 +109,24 @@ class SelfCalibration:
         window = solve_window(self._rig, self._keyframes, self.terms)
         self._keyframes = []
         if window is not None:
-            if len(self._windows) == MAX_WINDOWS:
-                self._since = self._windows[1].first_kf_id
-            self._windows.append(window)
+            if len(self.windows) == MAX_WINDOWS:
+                self._since = self.windows[1].first_kf_id
+            self.windows.append(window)
             self._until_due -= 1
             self._detect_step()
         return window is not None
 
-    def _revise(self) -> Revision | None:
-        windows = list(self._windows)
+    def _revise(self, first_sigmas: float) -> Revision | None:
+        """`first_sigmas`: significance of the first correction of a term."""
+        windows = list(self.windows)
         drifts = self._drifts(windows)
         parts = [windows, windows[::2], windows[1::2]]
         whole, *halves = [self._at_the_end(part, windows)[0] if drifts else self.estimate(part) for part in parts]
-        sigmas = np.where(self._corrected, REFINED_SIGMAS, SIGMAS)
+        sigmas = np.where(self._corrected, REFINED_SIGMAS, first_sigmas)
         rolling = self._rig.readout_s > 0
         since = windows[-min(MAX_BETWEEN, len(windows))].first_kf_id if drifts else self._since
-        self._until_due = min(len(windows), MAX_BETWEEN)
+        corrected = bool(self._corrected.any())
+        self._until_due = min(len(windows), MAX_BETWEEN) if corrected or len(windows) >= ENOUGH_WINDOWS else 1
         if not significant(whole, halves, rolling, sigmas).any():
             return None
         choice = choose(whole, halves, rolling, sigmas)
@@ -160,14 +164,14 @@ class SelfCalibration:
         return Estimate(end - self.terms, end_covariance), Estimate(change, change_covariance)
 
     def _detect_step(self) -> None:
-        windows = list(self._windows)
+        windows = list(self.windows)
         before, recent = windows[:-RECENT], windows[-RECENT:]
         if len(before) < BEFORE_STEP:
             return
         base = self.estimate(before)
         change = [_difference(self.estimate(part), base) for part in (recent, recent[:1], recent[1:])]
         if significant(change[0], change[1:], self._rig.readout_s > 0, SIGMAS).any():
-            self._windows = deque(recent, maxlen=MAX_WINDOWS)
+            self.windows = deque(recent, maxlen=MAX_WINDOWS)
             self._since, self._stepped = recent[0].first_kf_id, True
 
 

@@ -14,7 +14,7 @@ from stereo_sfm.config import Config, MapperConfig, SelfCalibrationConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.mapper import Mapper
 from stereo_sfm.mapping.row_errors import RowMonitor
-from stereo_sfm.mapping.self_calibration import Revision, SelfCalibration
+from stereo_sfm.mapping.self_calibration import MIN_WINDOWS, Revision, SelfCalibration
 from stereo_sfm.types import RIG_TERMS, Keyframe
 from tests.synthetic import camera_path, fisheye_rig, pinhole_rig, points_around
 
@@ -75,6 +75,19 @@ def test_a_turned_camera_is_found(name: str, degrees: tuple[float, float, float]
     mended = with_terms(wrong, estimator.terms)
     left = np.rad2deg(se3.log(se3.inverse(mended.left_T_right) @ true.left_T_right)[3:])
     assert np.abs(left[[0, 2]]).max() < 0.012 and abs(left[1]) < 0.015
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_the_more_significant_the_sooner(name: str) -> None:
+    """0.3 degrees about x are corrected with the second window, 0.1 degrees about y (less exact) later."""
+    true = RIGS[name]
+    windows: list[int] = []
+    for degrees in ((0.3, 0.0, 0.0), (0.0, 0.1, 0.0)):
+        believed = turned(true, degrees)
+        estimator = SelfCalibration(believed)
+        next(k for k in keyframes([true] * 64, believed, 0) if estimator.add(k) is not None)
+        windows.append(len(estimator.windows))
+    assert windows[0] == MIN_WINDOWS < windows[1]
 
 
 @pytest.mark.parametrize("kind", [6, 7])
@@ -173,3 +186,16 @@ def test_the_map_is_corrected_with_the_rig(mode: bool) -> None:
     path = camera_path(24)[[0, -1], :3, 3]
     ratio = np.linalg.norm(ends[1] - ends[0]) / np.linalg.norm(path[1] - path[0])
     assert (abs(ratio - 1) < 0.01) == mode
+
+
+def test_a_small_map_is_right_with_the_update_that_corrects_the_rig() -> None:
+    """The tracker must not solve for poses with points of the corrected rig at keyframes of the wrong one."""
+    true = RIGS["pinhole"]
+    wrong = turned(true, (0.0, -0.3, 0.0))
+    mapper = Mapper(MapperConfig(association="tracks"), wrong, calibration=SelfCalibration(wrong))
+    frames = keyframes([true] * 24, wrong, 0)
+    count = 1 + next(n for n, k in enumerate(frames) if mapper.step(k).calibration is not None)
+    at = mapper.map.keyframes.map_T_kf[:count, :3, 3]
+    steps = np.linalg.norm(np.diff(at, axis=0), axis=1)
+    true_steps = np.linalg.norm(np.diff(camera_path(24)[:count, :3, 3], axis=0), axis=1)
+    assert steps.sum() / true_steps.sum() == pytest.approx(1.0, abs=0.015)
