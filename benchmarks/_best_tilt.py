@@ -88,15 +88,15 @@ class TiltGraph:
 
     def _link(self, begin_ns: int, end_ns: int, k: int) -> None:
         intervals = self._buffer.between(begin_ns, end_ns)
-        x, v, b = ([gtsam.symbol(c, n) for n in (k - 1, k)] for c in "xvb")
+        (x, v, b), (next_x, next_v, next_b) = ([gtsam.symbol(c, n) for c in "xvb"] for n in (k - 1, k))
         if intervals is None:  # before the first sample
-            self._graph.add(gtsam.BetweenFactorConstantBias(*b, NO_BIAS, _diagonal(np.full(6, 1e-3))))
+            self._graph.add(gtsam.BetweenFactorConstantBias(b, next_b, NO_BIAS, _diagonal(np.full(6, 1e-3))))
             return
         motion = gtsam.PreintegratedCombinedMeasurements(self._params, NO_BIAS)
         for seconds, gyro, accel in zip(intervals.seconds, intervals.gyro, intervals.accel, strict=True):
             middle = se3.so3_exp(0.5 * seconds * gyro)  # theirs acts in the axes at the beginning of an interval
             motion.integrateMeasurement(middle @ accel, gyro, seconds)
-        self._graph.add(gtsam.CombinedImuFactor(x[0], v[0], x[1], v[1], *b, motion))
+        self._graph.add(gtsam.CombinedImuFactor(x, v, next_x, next_v, b, next_b, motion))
 
     def best(self, world_T_cam: F64) -> BestTilt:
         """At the newest image, whose true pose is (4, 4)."""
