@@ -41,6 +41,8 @@ class Lost(Exception):
 class Outbox:
     """Sends in a thread, so that two stages that write to each other never wait for one another's pipe.
 
+    A message of bytes is one that is pickled already.
+
     At most `limit` messages wait; then `send` blocks, which is the back-pressure of the pipeline. 0: any number.
     """
 
@@ -77,7 +79,7 @@ class Outbox:
         while (item := self._queue.get()) is not None:
             if not closed:
                 try:
-                    self._connection.send(item[0])
+                    (self._connection.send_bytes if isinstance(item[0], bytes) else self._connection.send)(item[0])
                 except OSError:
                     closed = True  # the reader died: main ends the run, and nothing waits for these messages
 

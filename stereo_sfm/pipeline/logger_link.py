@@ -39,7 +39,10 @@ class LoggerLink:
         return self._outbox is not None
 
     def put(self, message: object) -> bool:
-        """Send a message without waiting; False if too many wait. The slots that the logger holds make a run wait."""
+        """Send a message, or one that is pickled, without waiting; False if too many wait.
+
+        The slots that the logger holds make a run wait.
+        """
         return self._outbox is not None and self._outbox.offer(message, 0.0)
 
     def omitted(self, image: StereoImage) -> Dropped | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import pickle
 import time
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
@@ -156,7 +157,7 @@ class ProcessRun:
             self._check_stages()
             for connection in ready:
                 try:
-                    message = connection.recv()
+                    data = connection.recv_bytes()
                     if connection is self._woken:
                         continue
                 except (EOFError, OSError):
@@ -164,12 +165,13 @@ class ProcessRun:
                         self._died(connection)
                     continue
                 if connection in reports:  # else it was closed meanwhile
-                    frame = self._take(connection, message)
+                    frame = self._take(connection, data)
                     if frame is not None:
                         yield frame
 
-    def _take(self, connection: Connection, message: object) -> Frame | None:
-        """One message of a stage; returned when it is a frame."""
+    def _take(self, connection: Connection, data: bytes) -> Frame | None:
+        """One pickled message of a stage; returned when it is a frame."""
+        message = pickle.loads(data)
         self._watchdog.received(self._stages.reports[connection], message)
         if isinstance(message, Heartbeat):
             return None
@@ -183,7 +185,7 @@ class ProcessRun:
         else:
             if isinstance(message, LogLine):
                 emit(message)
-            self._dispatch(message)
+            self._dispatch(message, data)
         return message if isinstance(message, Frame) else None
 
     # -- unresponsive stages -----------------------------------------------------------------------------------------
@@ -313,7 +315,8 @@ class ProcessRun:
         else:
             self._dispatch(message)
 
-    def _dispatch(self, message: object) -> None:
+    def _dispatch(self, message: object, data: bytes | None = None) -> None:
+        """Pass a message on; `data`: the same, pickled."""
         if isinstance(message, Compiling | Localized | MapSaved):
             self._saving_at_end &= not isinstance(message, MapSaved)
             for sink in self._sinks:
@@ -331,7 +334,7 @@ class ProcessRun:
         if self._outer.viewer is not None and self._ring is not None:
             self._outer.viewer.put(message, self._ring)
         if self._outer.logger is not None and self._outer.logger.is_open:
-            if not self._outer.logger.put(message):
+            if not self._outer.logger.put(message if data is None else data):
                 self._give_up_log(f"the logger has not taken the last {BACKLOG} messages")
         elif isinstance(message, SlotImage) and message.logged:
             (self._images or self.release)(message)

@@ -10,7 +10,7 @@ import struct
 import numpy as np
 import pytest
 
-from stereo_sfm.pipeline.channels import Arrivals, Inbox, Lost, PrefetchingInbox
+from stereo_sfm.pipeline.channels import Arrivals, Inbox, Lost, Outbox, PrefetchingInbox
 
 
 def test_half_a_message_makes_nobody_wait() -> None:
@@ -38,6 +38,15 @@ def test_messages_come_before_the_loss_of_their_sender(kind: type[Inbox[int] | P
     for _ in range(2):
         with pytest.raises(Lost):
             inbox.take()
+
+
+def test_a_pickled_message_is_passed_on_as_it_is() -> None:
+    receive, send = multiprocessing.Pipe(duplex=False)
+    outbox, inbox = Outbox(send), Inbox[dict[str, int]](receive)
+    outbox.send({"a": 1})
+    outbox.send(pickle.dumps({"b": 2}))
+    assert [inbox.take(), inbox.take()] == [{"a": 1}, {"b": 2}]
+    outbox.close()
 
 
 def test_arrivals_follow_the_connections_that_are_left() -> None:
