@@ -48,6 +48,8 @@ class Estimate:
 
     def without(self, kept: Bool) -> Estimate:
         """The estimate with the terms that are not `kept` (8,) held at zero: the conditional Gaussian."""
+        if kept.all():
+            return self
         value, covariance = np.zeros(RIG_TERMS), np.zeros((RIG_TERMS, RIG_TERMS))
         inside, across = np.ix_(kept, kept), np.ix_(kept, ~kept)
         gain = self.covariance[across] @ np.linalg.pinv(self.covariance[np.ix_(~kept, ~kept)])

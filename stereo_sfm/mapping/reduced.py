@@ -12,6 +12,7 @@ import scipy.linalg
 import scipy.sparse
 import scipy.sparse.csgraph
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dposv  # pyright: ignore[reportAttributeAccessIssue, reportUnknownVariableType]
 
 from stereo_sfm.mapping import bundle_kernels
 from stereo_sfm.types import F64, I64
@@ -74,11 +75,11 @@ class ReducedSystem:
         except scipy.linalg.LinAlgError:
             return None
 
-    def _solve_dense(self, blocks: F64, b: F64) -> F64:
+    def _solve_dense(self, blocks: F64, b: F64) -> F64 | None:
         n = self.size
         matrix = blocks.reshape(n, n, 6, 6).transpose(0, 2, 1, 3).reshape(6 * n, 6 * n)
-        factor = scipy.linalg.cho_factor(matrix, lower=True, overwrite_a=True, check_finite=False)
-        return scipy.linalg.cho_solve(factor, b.ravel(), check_finite=False).reshape(n, 6)
+        _, step, failed = dposv(matrix, b.ravel(), lower=1)
+        return None if failed else step.reshape(n, 6)
 
     def _solve_banded(self, blocks: F64, b: F64) -> F64:
         n, place = self.size, self._place
