@@ -1,12 +1,14 @@
 """KITTI raw data: `DATE_drive_NNNN_sync/image_00/data`, calibration files of the date, poses from `oxts` (GPS/IMU).
 
 Geiger et al., IJRR 2013. The oxts packets become poses as in the raw data's development kit: a Mercator projection
-scaled at the first latitude, and rotation Rz(yaw) Ry(pitch) Rx(roll).
+scaled at the first latitude, and rotation Rz(yaw) Ry(pitch) Rx(roll). Their rates and forces (x ahead, y left, z up)
+are inertial samples: a hundred a second in `DATE_drive_NNNN_extract` beside the drive, else one for each image.
 """
 
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,13 +16,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from stereo_sfm.calib.formats.kitti import read_kitti as read_rig
+from stereo_sfm.calib.imu import Imu
 from stereo_sfm.drivers.folder_source import FolderSource, FrameFiles, folder_of, need
 from stereo_sfm.drivers.ground_truth import moved
 from stereo_sfm.drivers.image_lists import lines_of, list_images, pair_files
 from stereo_sfm.drivers.rig_option import chosen_rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
-from stereo_sfm.types import F64, Trajectory
+from stereo_sfm.types import F64, I64, ImuSamples, Trajectory
 
 if TYPE_CHECKING:
     from stereo_sfm.drivers.kitti_raw import KittiRawOptions
@@ -29,6 +32,7 @@ log = logging.getLogger("stereo_sfm")
 
 EARTH_RADIUS = 6378137.0  # metres, as the development kit
 CALIBRATION = "calib_cam_to_cam.txt"
+FORCE, RATE = slice(11, 14), slice(17, 20)  # of a packet's numbers: ax ay az, wx wy wz
 
 
 def open_kitti_raw(path: str, options: KittiRawOptions) -> FolderSource:
@@ -57,7 +61,14 @@ def open_kitti_raw(path: str, options: KittiRawOptions) -> FolderSource:
         for left, right in pair_files(name, lefts, rights)
         if left in line
     ]
-    return FolderSource(name, own, frames, _ground_truth(folder, date, stamps, own.body_T_left))
+    imu_T_left = _imu_T_left(date, own.body_T_left)
+    truth = None if imu_T_left is None else _ground_truth(folder, stamps, imu_T_left)
+    samples = _inertial(folder)
+    if imu_T_left is None or samples is None:
+        return FolderSource(name, own, frames, truth)
+    rate = 1e9 / float(np.median(np.diff(samples.stamp_ns)))
+    imu = own.imu or Imu(left_T_imu=se3.inverse(imu_T_left), rate_hz=rate)
+    return FolderSource(name, replace(own, imu=imu), frames, truth, imu=samples)
 
 
 def _drive_folder(folder: Path, drive: str) -> Path:
@@ -85,22 +96,50 @@ def _read_times(path: Path) -> list[int]:
     return stamps
 
 
-def _ground_truth(folder: Path, date: Path, stamps: list[int], cam0_T_left: F64) -> Trajectory | None:
-    """world_T_cam0 with the first IMU pose as the world, or None without oxts or its calibration."""
+def _imu_T_left(date: Path, cam0_T_left: F64) -> F64 | None:
+    """(4, 4), or None without the calibration of the oxts."""
     files = [date / "calib_imu_to_velo.txt", date / "calib_velo_to_cam.txt", date / CALIBRATION]
-    packets = sorted((folder / "oxts" / "data").glob("*.txt"))
-    if not packets or not all(f.is_file() for f in files):
+    if not all(f.is_file() for f in files):
         return None
     velo_T_imu, cam_T_velo = (_read_rigid(f) for f in files[:2])
     rectified_T_cam = np.eye(4)
     rectified_T_cam[:3, :3] = _read_entries(files[2])["R_rect_00"].reshape(3, 3)
-    imu_T_cam0 = se3.inverse(rectified_T_cam @ cam_T_velo @ velo_T_imu)
-    count = min(len(packets), len(stamps))
+    return se3.inverse(rectified_T_cam @ cam_T_velo @ velo_T_imu) @ cam0_T_left
+
+
+def _ground_truth(folder: Path, stamps: list[int], imu_T_left: F64) -> Trajectory | None:
+    """world_T_left with the first IMU pose as the world, or None without oxts."""
+    packets = _packets(folder)[: len(stamps)]
+    if not len(packets):
+        return None
+    return moved(Trajectory(np.array(stamps[: len(packets)], np.int64), poses_from_oxts(packets[:, :6])), imu_T_left)
+
+
+def _inertial(folder: Path) -> ImuSamples | None:
+    """None without oxts and their stamps."""
+    everything = folder.with_name(folder.name.removesuffix("_sync") + "_extract")
+    place = everything if (everything / "oxts" / "timestamps.txt").is_file() else folder
+    times = place / "oxts" / "timestamps.txt"
+    packets = _packets(place) if times.is_file() else np.zeros((0, 0))
+    if len(packets) < 2 or packets.shape[1] < RATE.stop:
+        return None
+    stamp_ns: I64 = np.array(_read_times(times), np.int64)
+    if len(stamp_ns) != len(packets):
+        raise StereoSfmError(f"{times}: {len(stamp_ns)} time stamps for {len(packets)} packets")
+    order = np.argsort(stamp_ns, kind="stable")
+    packets = packets[order]
+    return ImuSamples(stamp_ns[order], packets[:, RATE].copy(), packets[:, FORCE].copy())
+
+
+def _packets(folder: Path) -> F64:
+    """(N, K) numbers of the oxts; (0, 0) without them."""
+    files = sorted((folder / "oxts" / "data").glob("*.txt"))
+    if not files:
+        return np.zeros((0, 0))
     try:
-        world_T_imu = poses_from_oxts(np.array([p.read_text("utf-8-sig").split()[:6] for p in packets[:count]], float))
+        return np.array([p.read_text("utf-8-sig").split() for p in files], float)
     except ValueError as error:
         raise StereoSfmError(f"{folder / 'oxts'}: {error}") from None
-    return moved(Trajectory(np.array(stamps[:count], np.int64), world_T_imu), imu_T_cam0 @ cam0_T_left)
 
 
 def poses_from_oxts(packets: F64) -> F64:

@@ -85,6 +85,37 @@ def test_kitti_raw_drive_with_poses_from_gps(tmp_path: Path) -> None:
             assert truth.poses[0][:3, 2] == pytest.approx([1, 0, 0])
 
 
+def test_kitti_raw_inertial_samples(tmp_path: Path) -> None:
+    root = make_kitti_raw(tmp_path)
+    drive = root / "2011_09_26_drive_0001_sync"
+
+    def write(folder: Path, count: int, step_ms: int) -> None:
+        (folder / "oxts" / "data").mkdir(parents=True, exist_ok=True)
+        times = [f"2011-09-26 13:02:{25 + k * step_ms / 1000:012.9f}\n" for k in range(count)]
+        (folder / "oxts" / "timestamps.txt").write_text("".join(times))
+        for k in range(count):
+            values = [49.0, 8.4, 100.0, *[0.0] * 8, 0.1, 0.2, 9.8, *[0.0] * 3, 0.01, 0.02, 0.1 * k, *[0.0] * 10]
+            (folder / "oxts" / "data" / f"{k:010d}.txt").write_text(" ".join(map(str, values)))
+
+    with open_source(root) as source:  # packets without stamps
+        assert source.rig.imu is None and next(iter(source)).imu is None
+    write(drive, 4, 100)
+    with open_source(root) as source:
+        parts = [image.imu for image in source]
+        assert [len(part) for part in parts if part is not None] == [1, 1, 1, 1]
+        assert source.rig.imu is not None and source.rig.imu.rate_hz == pytest.approx(10)
+        # The camera looks along the IMU's x axis: x right is -y, y down is -z.
+        assert np.allclose(source.rig.imu.left_T_imu[:3, :3], [[0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    write(root / "2011_09_26_drive_0001_extract", 32, 10)
+    with open_source(drive) as source:
+        parts = [image.imu for image in source]
+        assert [len(part) for part in parts if part is not None] == [1, 10, 10, 10]
+        part = parts[1]
+        assert part is not None and source.rig.imu is not None
+        assert source.rig.imu.rate_hz == pytest.approx(100)
+        assert part.gyro[0] == pytest.approx([0.01, 0.02, 0.1]) and part.accel[0] == pytest.approx([0.1, 0.2, 9.8])
+
+
 def test_kapture_records(tmp_path: Path) -> None:
     with open_source(make_kapture(tmp_path)) as source:
         images = list(source)
