@@ -28,6 +28,9 @@ STORED = 4  # times max_features: points of the last image and of the held one, 
 # the view. Time does not count: who comes towards the robot hides the middle of the view for seconds.
 HALF_VIEW_SHARE, HALF_VIEW_RADIANS = 0.7, 0.5  # of the median distance of its points; radians
 MIN_COARSE_NCC = 0.65  # of a window found again in the half image
+GRID = 8, 6  # columns and rows of the image
+CELL_POINTS = 4.0  # with which a cell counts fully
+NEARER = 0.6  # of the distance of what should be in a cell: what is nearer covers it
 SEARCH_STEPS = 14  # offsets of a search on either side
 
 
@@ -113,12 +116,38 @@ class Follower:
         self.search_widely()
         return self._kept(tracks, *self._align(pyramid, uv, warp, tracks.slot, ncc > MIN_COARSE_NCC))
 
-    def expected_again(self, pose: F64) -> float:
-        """How many of the held points in view from a pose (4, 4) should be found: fewer where windows change much."""
+    def recall(self, found: F64, pose: F64, seen: F64 | None = None, cells_needed: float = 1.0) -> float:
+        """The share of the view from a pose (4, 4) in which as many held points are `found` (N, 2) px as should be.
+
+        Fewer should be where their windows change much. Every cell of the image counts, not every point: a ceiling has
+        many, and looks the same from lamp to lamp.
+
+        Args:
+            seen: (M, 3) metres in the camera, corners of the image: cells in which none of them is as far away as what
+                should be there are covered, and do not count.
+            cells_needed: number of cells of the image in which all points must be found for a recall of 1, at least.
+        """
         uv, warps = self._seen_from(pose)
         visible = self._visible(uv, warps)
+        cell, cells = self._cells(uv[visible]), math.prod(GRID)
         change = np.abs(np.log(np.linalg.norm(warps[:, visible], axis=(2, 3)) / math.sqrt(2.0)))
-        return float(np.exp(-np.nanmin(change, axis=0)).sum()) if visible.any() else 0.0
+        wanted = np.bincount(cell, np.exp(-np.nanmin(change, axis=0)), cells)
+        if seen is not None:
+            distance = np.linalg.norm(se3.transform(se3.inverse(pose), self.held.tracks.points()[visible]), axis=1)
+            nearest = np.full(cells, np.inf)
+            np.minimum.at(nearest, cell, distance)
+            at = self._cells(self._camera.project(seen))
+            open_view = np.linalg.norm(seen, axis=1) >= NEARER * nearest[at]
+            wanted[np.bincount(at[open_view], minlength=cells) == 0] = 0.0
+        again = np.minimum(np.bincount(self._cells(found), minlength=cells), wanted)
+        weight = 1.0 / np.maximum(wanted, CELL_POINTS)  # a cell with more points than these counts no more
+        return float((weight * again).sum() / max((weight * wanted).sum(), cells_needed))
+
+    def _cells(self, uv: F64) -> I64:
+        """(N,) the cells of the grid over the image that pixels (N, 2) are in."""
+        size = self._camera.width, self._camera.height
+        column, row = (np.clip(uv[:, k] * GRID[k] / size[k], 0, GRID[k] - 1).astype(np.int64) for k in (0, 1))
+        return np.asarray(row * GRID[0] + column)
 
     def _seen_from(self, pose: F64) -> tuple[F64, F64]:
         """Pixels (N, 2) of the held points, NaN behind the camera, and their deformations since (3, N, 2, 2)."""

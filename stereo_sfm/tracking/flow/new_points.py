@@ -12,7 +12,7 @@ from stereo_sfm.tracking.flow.corners import detect_corners
 from stereo_sfm.tracking.flow.follower import Follower
 from stereo_sfm.tracking.flow.pyramids import StereoPyramids
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
-from stereo_sfm.tracking.flow.stereo import StereoMatcher
+from stereo_sfm.tracking.flow.stereo import StereoMatch, StereoMatcher
 from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.tracking.flow.visible_area import VisibleArea
 from stereo_sfm.types import F64
@@ -39,17 +39,11 @@ class NewPoints:
 
     def add(self, tracks: Tracks, images: StereoPyramids, pose: F64, velocity: F64, most: int) -> Tracks:
         """The tracks followed by new ones, `most` in all; pose (4, 4) and velocity (6,) of the image."""
-        config = self._config
         missing = most - len(tracks)
         if missing <= 0:
             return tracks
         self._area.learn(images.left[1])
-        spacing = SPACING * math.sqrt(4.0 * self._area.mask.sum() / most)
-        corners = detect_corners(
-            images.left[1], self._area.mask, tracks.uv, missing, spacing, config.corner_quality,
-            edges=not isinstance(images.right, tuple),
-        )  # fmt: skip
-        match = self._stereo.match(images.left, images.right, corners)
+        match = self._match(images, tracks.uv, missing, most)
         good = np.flatnonzero(match.good)
         rows, slots = self._follower.begin(images.left, match.uv_left[good])
         new, n = good[rows], len(rows)
@@ -75,3 +69,18 @@ class NewPoints:
         )
         self._next_point_id += n
         return tracks
+
+    def seen(self, images: StereoPyramids) -> F64:
+        """(M, 3) metres in the camera: corners spread over the image, as many as are tracked."""
+        most = self._config.max_features
+        match = self._match(images, np.zeros((0, 2)), most, most)
+        return match.bearing[match.good] / match.rho[match.good, None]
+
+    def _match(self, images: StereoPyramids, taken: F64, count: int, most: int) -> StereoMatch:
+        """At most `count` corners away from pixels (N, 2), spread as if there were `most` in all, and their matches."""
+        spacing = SPACING * math.sqrt(4.0 * self._area.mask.sum() / most)
+        corners = detect_corners(
+            images.left[1], self._area.mask, taken, count, spacing, self._config.corner_quality,
+            edges=not isinstance(images.right, tuple),
+        )  # fmt: skip
+        return self._stereo.match(images.left, images.right, corners)

@@ -24,13 +24,14 @@ MOTIONS_AT_ONCE = 3  # of them in an image, besides the straight one
 GRID = (8, 6)  # columns and rows of the image in which corners are counted
 SUFFICIENT_RECALL = 0.65  # with which the search ends
 SAME_PLACE = 0.1, 0.03  # metres, radians between two hypotheses of one place
-RIVAL = 0.6  # share of the inliers with which another place makes the result ambiguous
+RIVAL = 0.75  # share of the best recall with which another place makes the result ambiguous
 MIN_INLIERS = 16
 MIN_INLIER_SHARE = 0.6  # of the points that are found
 # Recall that is needed, the rest may still be covered: for a pose that is certain, more for one with a standard
-# deviation, up to half a metre of it, and per standard deviation between the pose and the prediction.
+# deviation, up to the largest, and per standard deviation between the pose and the prediction. Ceiling and floor alone,
+# where lamps are taken for the next ones, have less than 0.6.
 MIN_RECALL, RECALL_PER_METRE, RECALL_PER_SIGMA = 0.1, 0.7, 0.1
-MAX_SIGMA_M = 0.5
+MAX_SIGMA_M = 0.7
 FREE_SHARE = 0.5  # of the cells with corners in the newest keyframes, with which the view is free again
 
 
@@ -80,8 +81,8 @@ class Recovery:
     def possible(self, expected: Expectation, solution: PoseSolution, recall: float) -> bool:
         """Whether a pose is within reach of the prediction and supported by the points.
 
-        Ceilings and shelves repeat: the share of inliers among the found points counts, and the `recall`, the ratio of
-        their number to that of the points that should be found from there.
+        Ceilings and shelves repeat: the share of inliers among the found points counts, and the `recall`, the share of
+        the view in which the points are found that should be.
         """
         share = solution.inliers / max(len(solution.error), 1)
         if solution.inliers < MIN_INLIERS or share < MIN_INLIER_SHARE:
@@ -90,13 +91,13 @@ class Recovery:
         needed = MIN_RECALL + RECALL_PER_METRE * min(expected.sigma_m, MAX_SIGMA_M) + RECALL_PER_SIGMA * off
         return off < REACH and recall >= needed
 
-    def best(self, found: list[tuple[Tracks, PoseSolution]]) -> tuple[Tracks, PoseSolution] | None:
-        """The pose with the most inliers; None if another place has nearly as many."""
+    def best(self, found: list[tuple[Tracks, PoseSolution, float]]) -> tuple[Tracks, PoseSolution, float] | None:
+        """The pose with the highest recall, which is the third of each; None if another place has nearly as much."""
         if not found:
             return None
-        best = max(found, key=lambda x: x[1].inliers)
-        rivals = [s for _, s in found if not within(s.pose, best[1].pose, *SAME_PLACE)]
-        return None if any(s.inliers > RIVAL * best[1].inliers for s in rivals) else best
+        best = max(found, key=lambda x: x[2])
+        rivals = [recall for _, s, recall in found if not within(s.pose, best[1].pose, *SAME_PLACE)]
+        return None if any(recall > RIVAL * best[2] for recall in rivals) else best
 
     def _occupied(self, corners: Corners) -> int:
         """Number of cells of the image with a corner that is not on an object close to the camera."""

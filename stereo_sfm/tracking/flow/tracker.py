@@ -54,6 +54,7 @@ TRUSTED_OPEN = 0.3  # ... and so many of those that agree in an open view
 COVERED_SHARE = 0.1  # of the covered frames: as many free ones in a row, and a new submap begins
 SAME_START = 0.05, 0.01  # metres, radians between poses from which the same is found
 ROUNDS = (0.066, 160), (0.03, 1000), (0.015, 1000)  # of a search: reach as a share of the width, most points
+CELLS_PER_METRE = 3.0  # of the image that must agree, per metre of standard deviation of the prediction
 HELD_POINTS = 8  # times max_features, of the image to recover from: after two metres little of it is still in view
 FIRST_COVARIANCE = np.eye(6) * 1e-12  # of the first pose, which is the odometry frame
 UNKNOWN_COVARIANCE = np.eye(6)
@@ -317,38 +318,44 @@ class Tracker:
         self._hold_more()
         expected = self._expect(image.stamp_ns)
         seconds = (image.stamp_ns - self._stamp_ns) * 1e-9
-        tried: list[F64] = []
-        found: list[tuple[Tracks, PoseSolution]] = []
+        tried, seen = list[F64](), None
+        found: list[tuple[Tracks, PoseSolution, float]] = []
         for pose in chain([expected.odom_T_cam], self._recovery.search(image, images, expected)):
             if not any(within(pose, other, *SAME_START) for other in tried):
                 tried.append(pose)
                 tracks, solution = self._track_from(pose, images, seconds)
                 if solution.reason:
                     continue
-                recall = self._recall(solution)
-                if self._recovery.possible(expected, solution, recall):
-                    found.append((tracks, solution))
+                seen = self._new_points.seen(images) if seen is None else seen
+                found_again, recall = tracks.uv[solution.inlier], self._recall(tracks, solution)
+                uncovered = self._follower.recall(found_again, solution.pose, seen, CELLS_PER_METRE * expected.sigma_m)
+                if self._recovery.possible(expected, solution, uncovered):
+                    found.append((tracks, solution, recall))
                     if recall >= SUFFICIENT_RECALL:
                         break
         best = self._recovery.best(found)
         if best is None:
             return NOT_FOUND
-        self._part.begin(self._follower.held, self._recall(best[1]), image.stamp_ns)
-        return best
+        tracks, solution, recall = best
+        self._part.begin(self._follower.held, recall, image.stamp_ns)
+        return tracks, solution
 
     def _find_more(self, image: StereoImage, images: StereoPyramids, pose: F64) -> tuple[Tracks, PoseSolution] | None:
         """Relocalize again, near a pose (4, 4) from a part of the view, once more is free; None if no more is found."""
         if not self._part.wanted(self._follower.held, image.stamp_ns):
             return None
         tracks, solution = self._track_from(pose, images, (image.stamp_ns - self._stamp_ns) * 1e-9)
-        if solution.reason or not self._part.improved(pose, solution.pose, self._recall(solution)):
+        if solution.reason:
             return None
-        self._part.begin(self._follower.held, self._recall(solution), image.stamp_ns)
+        recall = self._recall(tracks, solution)
+        if not self._part.improved(pose, solution.pose, recall):
+            return None
+        self._part.begin(self._follower.held, recall, image.stamp_ns)
         return tracks, solution
 
-    def _recall(self, solution: PoseSolution) -> float:
-        """Inliers of a pose over the held points that should be found from there."""
-        return solution.inliers / max(self._follower.expected_again(solution.pose), 1.0)
+    def _recall(self, tracks: Tracks, solution: PoseSolution) -> float:
+        """`Follower.recall` of the points that agree with a pose."""
+        return self._follower.recall(tracks.uv[solution.inlier], solution.pose)
 
     def _track_from(self, pose: F64, images: StereoPyramids, seconds: float) -> tuple[Tracks, PoseSolution]:
         """Find the points of the held image from an approximate pose (4, 4), and again from the results."""

@@ -99,10 +99,12 @@ class TrustedMotion:
         """
         last_ns, last = self._poses[-1]
         seconds = max((stamp_ns - last_ns) * 1e-9, 0.0)
-        forward = self.velocity() * ([1.0] * 3 + [0.0] * 3) * _faded(seconds, FADE_S)
+        fade = _faded(seconds, FADE_S)
+        forward = self.velocity() * ([1.0] * 3 + [0.0] * 3) * fade
         turns = np.arange(TURN_STEP, MAX_TURN_RATE * seconds + 0.5 * TURN_STEP, TURN_STEP)
         arcs = [(1.0, side * turn) for turn in turns.tolist() for side in (1.0, -1.0)]
-        motions = [(1.0, 0.0), *((speed, 0.0) for speed in SLOWER), *arcs]
+        steady = seconds / fade if fade > 0 else 1.0
+        motions = [(1.0, 0.0), *((speed, 0.0) for speed in (steady, *SLOWER)), *arcs]
         return [last @ se3.exp(speed * forward + [0, 0, 0, 0, turn, 0]) for speed, turn in motions]
 
 
