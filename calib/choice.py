@@ -27,6 +27,7 @@ ROLLING_SHUTTER_MIMICS = np.array(
     [False, True, False, True, True, False, True, True]
 )  # terms that motion with a rolling shutter can mimic
 SIGMAS = 4.0  # standard deviations from zero that make a term significant
+NONE = np.zeros(RIG_TERMS, bool)
 MIN_SHARE_IN_HALVES = 0.5  # of a term's value that each half of the recording must show, with the same sign
 
 
@@ -96,9 +97,15 @@ class Choice:
         return with_terms(rig, self.value)
 
 
-def choose(whole: Estimate, halves: Sequence[Estimate], rolling: bool = False, sigmas: float | F64 = SIGMAS) -> Choice:
+def choose(
+    whole: Estimate,
+    halves: Sequence[Estimate],
+    rolling: bool = False,
+    sigmas: float | F64 = SIGMAS,
+    confirmed: Bool = NONE,
+) -> Choice:
     """The significant terms of `whole`, with what speaks for and against each; arguments as those of `significant`."""
-    needed, kept = np.broadcast_to(sigmas, RIG_TERMS), significant(whole, halves, rolling, sigmas)
+    needed, kept = np.broadcast_to(sigmas, RIG_TERMS), significant(whole, halves, rolling, sigmas, confirmed)
     final = whole.without(kept)
     terms = tuple(_term(i, whole, halves, kept, rolling, needed[i]) for i in range(RIG_TERMS))
     alone = np.array([t.sigma for t in terms]) / SCALES
@@ -106,7 +113,11 @@ def choose(whole: Estimate, halves: Sequence[Estimate], rolling: bool = False, s
 
 
 def significant(
-    whole: Estimate, halves: Sequence[Estimate], rolling: bool = False, sigmas: float | F64 = SIGMAS
+    whole: Estimate,
+    halves: Sequence[Estimate],
+    rolling: bool = False,
+    sigmas: float | F64 = SIGMAS,
+    confirmed: Bool = NONE,
 ) -> Bool:
     """(6,) terms that remain when the weakest insignificant one is dropped until there is none.
 
@@ -114,12 +125,13 @@ def significant(
         whole: estimated from all matches. halves: each from one part of them.
         sigmas: standard deviations from zero that make a term significant; one number, or (8,).
         rolling: rolling shutter; terms that motion can mimic are not written.
+        confirmed: (8,) terms that the halves need not confirm.
     """
     needed = np.broadcast_to(sigmas, RIG_TERMS)
     kept = ~ROLLING_SHUTTER_MIMICS if rolling else np.ones(RIG_TERMS, bool)
     while kept.any():
         strength, agreed = _evidence(whole, halves, kept)
-        weak = kept & ((strength < needed) | ~agreed)
+        weak = kept & ((strength < needed) | ~(agreed | confirmed))
         if not weak.any():
             break
         kept[np.argmin(np.where(weak, strength, np.inf))] = False

@@ -57,7 +57,7 @@ from stereo_sfm.types import F64, I64, Bool, CalibrationUpdate, Keyframe, LoopRe
 MAX_TRIANGULATED = 4  # observations up to which a point is triangulated anew before each adjustment
 FIRST_FULL_BUNDLE = 8  # keyframes of the first full bundle adjustment
 GROWTH_AT_KNOWN_LOOP = 1.1  # growth of the map after which a known loop starts a full bundle adjustment
-FEW_KEYFRAMES = 40  # with no more, the bundle adjustment after a correction of the rig is done at once
+MOST_AT_ONCE = 40  # keyframes adjusted with a correction of the rig, before all are
 LAG_SHARE = 0.1  # of the living keyframes: a large bundle gets more time before its result is due
 RECENT = 3  # newest keyframes, whose points are checked and which are never redundant
 
@@ -228,12 +228,19 @@ class Mapper:
         )  # fmt: skip
         if applied:
             before, self._rig = self._rig, with_terms(self._source_rig, revision.terms)
-            recalibrate(self.map, before, self._rig, self.map.kf_row(revision.since_kf_id))
+            first = self.map.kf_row(revision.since_kf_id)
+            recalibrate(self.map, before, self._rig, first)
+            self._adjust_since(first)
             self._start_full_bundle()
-            if len(self.map.living_keyframes()) <= FEW_KEYFRAMES:
-                self._apply_job()
             if self._rows is not None:
                 self._rows.use(self._rig)
+
+    def _adjust_since(self, first: int) -> None:
+        """Adjust the keyframes from a row on at once: the tracker's next poses are solved with their points."""
+        before = self.map.keyframes.map_T_kf[-1].copy()
+        part = window.newest(self.map, first, MOST_AT_ONCE, self._config.most_fixed)
+        window.write_back(self.map, part, bundle_adjust(self._rig, part.bundle, window.bundle_config(self._config)))
+        self._follow_newest(before)
 
     # -- loops -------------------------------------------------------------------------------------------------------
 

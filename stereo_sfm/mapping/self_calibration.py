@@ -30,12 +30,12 @@ MIN_WINDOWS = 2  # before the first correction
 ENOUGH_WINDOWS = 4  # with fewer, a correction must be more significant: errors of a window's keyframes are alike
 MAX_BETWEEN = 4  # windows from one revision to the next: as many as there are, but no more
 MAX_WINDOWS = 80  # used, the newest
-RECENT = 2  # windows that must contradict all others to indicate a step
+AFTER_STEP = range(2, 7)  # newest windows that must contradict all others to indicate a step
 BEFORE_STEP = 4  # earlier windows needed to detect a step
 DRIFT_WINDOWS = 8  # needed to detect drift
 RATE = np.deg2rad(0.1) / 60.0  # prior standard deviation of drift, radians (ratio) per second
 SIGMAS = 5.0  # significance of the first correction of a term
-REFINED_SIGMAS = 2.5  # significance of its refinement
+REFINED_SIGMAS = 1.0  # its refinement: below, a change is not worth the bundle adjustment
 MATCHING_PX = 0.02  # systematic error of matching
 DIRECTION = np.deg2rad(0.15)  # systematic error of the baseline's direction: matching errors that depend on distance
 
@@ -81,7 +81,8 @@ class SelfCalibration:
             return None
         if self._until_due > 0 and not self._stepped:
             return None
-        return self._revise(SIGMAS * np.sqrt(max(1.0, ENOUGH_WINDOWS / len(self.windows))))
+        known = self._stepped or len(self.windows) >= ENOUGH_WINDOWS
+        return self._revise(SIGMAS if known else SIGMAS * np.sqrt(ENOUGH_WINDOWS / len(self.windows)))
 
     @staticmethod
     def wanted(config: Config, rig: Rig) -> SelfCalibration | None:
@@ -127,9 +128,9 @@ class SelfCalibration:
         since = windows[-min(MAX_BETWEEN, len(windows))].first_kf_id if drifts else self._since
         corrected = bool(self._corrected.any())
         self._until_due = min(len(windows), MAX_BETWEEN) if corrected or len(windows) >= ENOUGH_WINDOWS else 1
-        if not significant(whole, halves, rolling, sigmas).any():
+        choice = choose(whole, halves, rolling, sigmas, self._corrected)
+        if not choice.written.any():
             return None
-        choice = choose(whole, halves, rolling, sigmas)
         why = "drift" if drifts else "refined" if self._corrected[choice.written].all() else "significant"
         why = "step" if self._stepped else why
         self.terms = self.terms + choice.value
@@ -165,14 +166,16 @@ class SelfCalibration:
 
     def _detect_step(self) -> None:
         windows = list(self.windows)
-        before, recent = windows[:-RECENT], windows[-RECENT:]
-        if len(before) < BEFORE_STEP:
-            return
-        base = self.estimate(before)
-        change = [_difference(self.estimate(part), base) for part in (recent, recent[:1], recent[1:])]
-        if significant(change[0], change[1:], self._rig.readout_s > 0, SIGMAS).any():
-            self.windows = deque(recent, maxlen=MAX_WINDOWS)
-            self._since, self._stepped = recent[0].first_kf_id, True
+        for count in AFTER_STEP:
+            before, after = windows[:-count], windows[-count:]
+            if len(before) < BEFORE_STEP:
+                return
+            base = self.estimate(before)
+            change = [_difference(self.estimate(part), base) for part in (after, after[::2], after[1::2])]
+            if significant(change[0], change[1:], self._rig.readout_s > 0, SIGMAS).any():
+                self.windows = deque(after, maxlen=MAX_WINDOWS)
+                self._since, self._stepped = after[0].first_kf_id, True
+                return
 
 
 def _difference(after: Estimate, before: Estimate) -> Estimate:

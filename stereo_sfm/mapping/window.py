@@ -50,6 +50,12 @@ def covisible_window(map_: Map, row: int, config: MapperConfig) -> Window:
     return _window(map_, np.concatenate([[row], others])[: config.most_keyframes].astype(np.int64), config.most_fixed)
 
 
+def newest(map_: Map, first_row: int, most: int, most_fixed: int | None) -> Window:
+    """The newest living keyframes, `most` of them and none before a row, and all their points; others are fixed."""
+    rows = map_.living_keyframes()
+    return _window(map_, rows[rows >= first_row][-most:], most_fixed)
+
+
 def whole_map(map_: Map) -> Window:
     """Every living keyframe and point; of each unconnected part the oldest keyframe is fixed."""
     return _window(map_, map_.living_keyframes())

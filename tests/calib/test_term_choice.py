@@ -31,6 +31,14 @@ def test_a_term_needs_several_sigmas_and_both_halves() -> None:
     assert choice.value[1] == choice.value[2] == 0.0
 
 
+def test_a_term_confirmed_before_needs_no_halves() -> None:
+    halves = estimated(-1, 5), estimated(9, 5)
+    confirmed = np.arange(RIG_TERMS) == 0
+    choice = choose(estimated(4, 5), halves, sigmas=np.where(confirmed, 1.0, 5.0), confirmed=confirmed)
+    assert choice.written[:2].tolist() == [True, True]
+    assert not choose(estimated(4, 5), halves, sigmas=np.where(confirmed, 1.0, 5.0)).written[0]
+
+
 def test_without_a_second_half_nothing_is_written_and_the_rig_is_the_same() -> None:
     choice = choose(estimated(10, 10, 10, 10, 10, 10), ())
     assert not choice.written.any()

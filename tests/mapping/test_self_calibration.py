@@ -114,6 +114,27 @@ def test_a_step_is_detected_and_earlier_keyframes_keep_their_rig() -> None:
     assert np.rad2deg(estimator.terms[1]) == pytest.approx(0.2, abs=0.02)
 
 
+def test_a_small_step_is_detected_when_more_windows_show_it() -> None:
+    """Not mistaken for a smaller error of the whole run."""
+    true = RIGS["pinhole"]
+    estimator, found = revisions([true] * 32 + [turned(true, (0.0, 0.1, 0.0))] * 40, true, 0)
+    assert found[0].why == "step" and 28 <= found[0].since_kf_id <= 36
+    assert np.rad2deg(estimator.terms[1]) == pytest.approx(0.1, abs=0.015)
+
+
+def test_the_map_is_right_before_and_after_a_step() -> None:
+    true = RIGS["pinhole"]
+    rigs = [true] * 28 + [turned(true, (0.0, 0.2, 0.0))] * 24
+    mapper = Mapper(MapperConfig(association="tracks"), true, calibration=SelfCalibration(true))
+    for keyframe in keyframes(rigs, true, 1, noise_px=0.05):
+        mapper.step(keyframe)
+    mapper.finish([])
+    at, path = mapper.map.keyframes.map_T_kf[:, :3, 3], camera_path(len(rigs))[:, :3, 3]
+    for part in (slice(0, 28), slice(28, None)):
+        length, true_length = (np.linalg.norm(np.diff(x[part], axis=0), axis=1).sum() for x in (at, path))
+        assert length / true_length == pytest.approx(1.0, abs=0.015)
+
+
 @pytest.mark.parametrize(("name", "axis"), [("fisheye", 0), ("pinhole", 1)])
 def test_drift_is_followed(name: str, axis: int) -> None:
     """0.1 degrees in 320 keyframes, some two minutes; a rig that does not drift stays."""
