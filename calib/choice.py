@@ -4,6 +4,7 @@ are estimated with the others held."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -62,6 +63,11 @@ class Estimate:
     def sigma(self) -> F64:
         """(8,) standard deviations."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+    @functools.cached_property
+    def strength(self) -> F64:
+        """(8,) values in standard deviations."""
+        return np.abs(self.value) / np.maximum(self.sigma, 1e-12)
 
 
 @dataclass(frozen=True)
@@ -130,29 +136,30 @@ def significant(
     needed = np.broadcast_to(sigmas, RIG_TERMS)
     kept = ~ROLLING_SHUTTER_MIMICS if rolling else np.ones(RIG_TERMS, bool)
     while kept.any():
-        strength, agreed = _evidence(whole, halves, kept)
-        weak = kept & ((strength < needed) | ~(agreed | confirmed))
-        if not weak.any():
-            break
-        kept[np.argmin(np.where(weak, strength, np.inf))] = False
+        here = whole.without(kept)
+        weakest = np.argmin(np.where(kept, here.strength, np.inf))
+        if here.strength[weakest] >= needed[weakest]:  # else it is dropped, whatever the halves say
+            weak = kept & ((here.strength < needed) | ~(_agreed(here, halves, kept) | confirmed))
+            if not weak.any():
+                break
+            weakest = np.argmin(np.where(weak, here.strength, np.inf))
+        kept[weakest] = False
     return kept
 
 
-def _evidence(whole: Estimate, halves: Sequence[Estimate], kept: Bool) -> tuple[F64, Bool]:
-    """(8,) values in standard deviations, and (8,) whether every half confirms them."""
-    here = whole.without(kept)
+def _agreed(here: Estimate, halves: Sequence[Estimate], kept: Bool) -> Bool:
+    """(8,) values of `here`, which has the terms that are not `kept` held at zero, that every half confirms."""
     parts = np.array([half.without(kept).value for half in halves]).reshape(-1, RIG_TERMS)
-    strength = np.abs(here.value) / np.maximum(here.sigma, 1e-12)
     shown = parts * np.sign(here.value) >= MIN_SHARE_IN_HALVES * np.abs(here.value)
-    return strength, np.asarray(shown.all(0) if len(parts) else np.zeros(RIG_TERMS, bool))
+    return np.asarray(shown.all(0) if len(parts) else np.zeros(RIG_TERMS, bool))
 
 
 def _term(i: int, whole: Estimate, halves: Sequence[Estimate], kept: Bool, rolling: bool, needed: float) -> Term:
     """A term that is not written is reported with the value it would have if it were the next to be written."""
     with_it = kept.copy()
     with_it[i] = True
-    strength, _ = _evidence(whole, halves, with_it)
     here, parts = whole.without(with_it), [h.without(with_it) for h in halves]
+    strength = here.strength
     values = tuple(float(SCALES[i] * h.value[i]) for h in parts)
     shown = " and ".join(f"{v:+.3f}" for v in values)
     if kept[i]:
