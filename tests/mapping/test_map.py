@@ -261,3 +261,16 @@ def test_a_window_holds_only_the_fixed_keyframes_that_share_most_points() -> Non
     assert np.array_equal(m.observations.kf[part.obs_rows], part.kf_rows[part.bundle.obs_kf])
     everything = window.covisible_window(m, 29, MapperConfig(window_keyframes=3, fixed_keyframes=0, connected_points=5))
     assert len(everything.kf_rows) == 30
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_in_each_unconnected_part_of_the_map_the_oldest_keyframe_is_fixed(seed: int) -> None:
+    rng, m, count = np.random.default_rng(seed), Map(), 24
+    part_of = rng.integers(0, 4, count)
+    part_of[0] = 0
+    for k in range(count):  # keyframes of a part share ten points with the one before them, others at most nine
+        at = 1000 * part_of[k] + 10 * int((part_of[:k] == part_of[k]).sum())
+        insert(m, keyframe(k, np.concatenate([at + np.arange(20), 9000 + np.arange(9)])))
+    fixed = window.whole_map(m).bundle.fixed
+    oldest = [int(np.flatnonzero(part_of == p)[0]) for p in np.unique(part_of)]
+    assert np.flatnonzero(fixed).tolist() == sorted(oldest)
