@@ -69,6 +69,12 @@ def test_what_something_nearer_covers_does_not_count() -> None:
     assert follower.recall(uv[ceiling], np.eye(4), corners(uv, DISTANCE)) < 0.6
 
 
+def test_with_one_lens_covered_the_whole_view_counts() -> None:
+    follower, uv, ceiling = view()
+    assert follower.recall(uv, np.eye(4), np.zeros((0, 3))) == pytest.approx(1.0)
+    assert follower.recall(uv[ceiling], np.eye(4), np.zeros((0, 3))) < 0.6
+
+
 def test_a_small_part_of_the_view_is_little_evidence() -> None:
     follower, uv, _ = view()
     cell = uv // [WIDTH / 8, HEIGHT / 6]

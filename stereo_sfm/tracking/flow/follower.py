@@ -124,24 +124,24 @@ class Follower:
 
         Args:
             seen: (M, 3) metres in the camera, corners of the image: cells in which none of them is as far away as what
-                should be there are covered, and do not count.
+                should be there are covered, and do not count; if that leaves no less.
             cells_needed: number of cells of the image in which all points must be found for a recall of 1, at least.
         """
         uv, warps = self._seen_from(pose)
         visible = self._visible(uv, warps)
         cell, cells = self._cells(uv[visible]), math.prod(GRID)
         change = np.abs(np.log(np.linalg.norm(warps[:, visible], axis=(2, 3)) / math.sqrt(2.0)))
-        wanted = np.bincount(cell, np.exp(-np.nanmin(change, axis=0)), cells)
+        wanted: F64 = np.asarray(np.bincount(cell, np.exp(-np.nanmin(change, axis=0)), cells), np.float64)
+        views = [wanted]
         if seen is not None:
             distance = np.linalg.norm(se3.transform(se3.inverse(pose), self.held.tracks.points()[visible]), axis=1)
             nearest = np.full(cells, np.inf)
             np.minimum.at(nearest, cell, distance)
             at = self._cells(self._camera.project(seen))
             open_view = np.linalg.norm(seen, axis=1) >= NEARER * nearest[at]
-            wanted[np.bincount(at[open_view], minlength=cells) == 0] = 0.0
-        again = np.minimum(np.bincount(self._cells(found), minlength=cells), wanted)
-        weight = 1.0 / np.maximum(wanted, CELL_POINTS)  # a cell with more points than these counts no more
-        return float((weight * again).sum() / max((weight * wanted).sum(), cells_needed))
+            views.append(np.where(np.bincount(at[open_view], minlength=cells) > 0, wanted, 0.0))
+        again: F64 = np.asarray(np.bincount(self._cells(found), minlength=cells), np.float64)
+        return max(_agreement(again, view, cells_needed) for view in views)
 
     def _cells(self, uv: F64) -> I64:
         """(N,) the cells of the grid over the image that pixels (N, 2) are in."""
@@ -237,6 +237,12 @@ class Follower:
         """Drop the first appearances of all points that are neither in `tracks` nor held."""
         held = tracks.slot if self._held is None else self._held.tracks.slot
         self._patches.keep_only(np.concatenate([tracks.slot, held]))
+
+
+def _agreement(found: F64, wanted: F64, cells_needed: float) -> float:
+    """The share of the cells (N,) in which as many points are found as wanted; one with many counts no more."""
+    weight = 1.0 / np.maximum(wanted, CELL_POINTS)
+    return float((weight * np.minimum(found, wanted)).sum() / max((weight * wanted).sum(), cells_needed))
 
 
 def _mask(rows: I64, count: int) -> Bool:

@@ -29,9 +29,9 @@ MIN_INLIERS = 16
 MIN_INLIER_SHARE = 0.6  # of the points that are found
 # Recall that is needed, the rest may still be covered: for a pose that is certain, more for one with a standard
 # deviation, up to the largest, and per standard deviation between the pose and the prediction. Ceiling and floor alone,
-# where lamps are taken for the next ones, have less than 0.6.
+# where lamps are taken for the next ones, have 0.43 to 0.64; right poses after 3 to 4 m without sight 0.69 to 0.84.
 MIN_RECALL, RECALL_PER_METRE, RECALL_PER_SIGMA = 0.1, 0.7, 0.1
-MAX_SIGMA_M = 0.7
+MAX_SIGMA_M = 0.8
 FREE_SHARE = 0.5  # of the cells with corners in the newest keyframes, with which the view is free again
 
 
