@@ -119,6 +119,30 @@ def test_a_turn_that_only_the_images_see_does_not_tilt_gravity() -> None:
     assert np.degrees(np.linalg.norm(np.cross(motion.state.gravity / GRAVITY, down))) < 0.25
 
 
+class Turns(Session):
+    """Turns that begin and end within a third of a second."""
+
+    def pose(self, t: float) -> F64:
+        turn = np.array([0.05 * np.sin(1.3 * t), 0.6 * np.tanh(3 * np.sin(t)), 0.03 * np.cos(1.1 * t)])
+        return se3.from_rotation_translation(se3.so3_exp(turn), super().pose(t)[:3, 3])
+
+
+@pytest.mark.parametrize("offset_s", [0.005, 0.02])
+def test_a_wrong_time_offset_hardly_turns_the_pose_of_the_images(offset_s: float) -> None:
+    session, sigma = Turns(seconds=7.5), 1e-4
+    imu, samples, rng, at = Turns().imu, replace(session, offset_s=offset_s).samples(), np.random.default_rng(0), 0
+    motion, errors = InertialMotion(imu), list[float]()
+    covariance = np.diag([1e-6, 1e-6, 1e-6, sigma**2, sigma**2, sigma**2])
+    for stamp in range(0, round(session.seconds * 1e9), FRAME_NS):
+        until = int(np.searchsorted(samples.stamp_ns, stamp + round(offset_s * 1e9), side="right"))
+        motion.feed(samples.part(slice(at, until)))
+        at, exact = until, session.pose(stamp * 1e-9)
+        pose = motion.fused(stamp, exact @ se3.exp(rng.normal(0, 1, 6) * np.sqrt(np.diag(covariance))), covariance)
+        motion.accept(stamp, pose)
+        errors.append(float(np.linalg.norm(se3.so3_log(exact[:3, :3].T @ pose[:3, :3]))))
+    assert max(errors[50:]) < np.radians(0.1)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_in_the_dark_the_error_stays_small_and_is_known(seed: int) -> None:
     session = Session()
