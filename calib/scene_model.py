@@ -197,7 +197,9 @@ def linearised(rig: Rig, problem: Problem, vector: F64) -> tuple[F64, F64, F64]:
 
 def tangents(bearing: F64) -> F64:
     """(N, 3, 2) two unit vectors perpendicular to each bearing."""
-    helper = np.where(np.abs(bearing[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    first = np.cross(bearing, helper)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.asarray(np.stack([first, np.cross(bearing, first)], -1), float)
+    x, y, z = np.moveaxis(bearing, -1, 0)
+    none = np.zeros_like(x)
+    aside = np.abs(x) < 0.9
+    u, v, w = np.where(aside, none, -z), np.where(aside, z, none), np.where(aside, -y, x)  # bearing x (an axis)
+    u, v, w = np.stack([u, v, w]) / np.sqrt(u * u + v * v + w * w)
+    return np.stack([np.stack([u, v, w], -1), np.stack([y * w - z * v, z * u - x * w, x * v - y * u], -1)], -1)

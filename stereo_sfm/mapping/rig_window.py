@@ -153,6 +153,7 @@ class _System:
     pose_gradient: F64
     point_gain: F64  # (N, 3, R)
     point_gradient: F64  # (N, 3)
+    tangent: F64  # (N, 3, 2) of the points' bearings
 
     @staticmethod
     def of(rig: Rig, problem: _Problem, sigma: float, hard: bool) -> _System:
@@ -164,10 +165,10 @@ class _System:
         h, g = np.zeros((size, size)), np.zeros(size)
         gain, gradient = np.zeros((count, 3, size)), np.zeros((count, 3))
         squares, rows = np.zeros(count), np.zeros(count, np.int64)
-        rotation = rig.left_T_right[:3, :3]
+        tangent, rotation = tangents(problem.bearing), rig.left_T_right[:3, :3]
         rect_R_left, _ = rectifying_rotations(rig.left_T_right)
         rig_window_kernels.accumulate(
-            problem.uv_left, problem.uv_right, problem.bearing, tangents(problem.bearing), problem.rho,
+            problem.uv_left, problem.uv_right, problem.bearing, tangent, problem.rho,
             np.ascontiguousarray(problem.frame_T_first[:, :3, :3]),
             np.ascontiguousarray(problem.frame_T_first[:, :3, 3]), problem.shapes, problem.lens,
             (rig.left.model_id, rig.left.params, rig.right.model_id, rig.right.params),
@@ -181,7 +182,7 @@ class _System:
         across = h[:shared, shared:]
         matrix, reduced = h[:shared, :shared] - across @ pose_gain, g[:shared] - across @ pose_gradient
         return _System(
-            0.5 * (matrix + matrix.T), reduced, _noise(squares, rows), pose_gain, pose_gradient, gain, gradient
+            0.5 * (matrix + matrix.T), reduced, _noise(squares, rows), pose_gain, pose_gradient, gain, gradient, tangent
         )
 
     def step(self, problem: _Problem, terms: F64) -> F64:
@@ -193,7 +194,7 @@ class _System:
         problem.lens = problem.lens + delta[RIG_TERMS:]
         pose = -(self.pose_gradient + self.pose_gain @ delta)
         step = -(self.point_gradient + self.point_gain @ np.concatenate([delta, pose]))
-        turned = problem.bearing + (tangents(problem.bearing) @ step[:, :2, None])[..., 0]
+        turned = problem.bearing + (self.tangent @ step[:, :2, None])[..., 0]
         problem.bearing = turned / np.linalg.norm(turned, axis=1, keepdims=True)
         problem.rho = problem.rho + step[:, 2]
         problem.frame_T_first[1:] = se3.exp(pose.reshape(-1, 6)) @ problem.frame_T_first[1:]

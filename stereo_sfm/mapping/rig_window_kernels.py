@@ -165,7 +165,7 @@ def accumulate(
                 for a in range(shared):
                     wa = w * j_rig[i, a]
                     g[a] -= wa * r
-                    for b in range(shared):
+                    for b in range(a, shared):
                         h[a, b] += wa * j_rig[i, b]
                     if f > 0:
                         for b in range(6):
@@ -174,17 +174,20 @@ def accumulate(
                     for a in range(6):
                         wa = w * j_pose[i, a]
                         g[o + a] -= wa * r
-                        for b in range(6):
+                        for b in range(a, 6):
                             h[o + a, o + b] += wa * j_pose[i, b]
         _eliminate(hpp, gp, hpr, h, g, r_size)
-    for a in range(shared):
-        for b in range(shared, r_size):
-            h[b, a] = h[a, b]
+    for a in range(r_size):
+        for b in range(a):
+            h[a, b] = h[b, a]
 
 
 @njit
 def _eliminate(hpp, gp, hpr, h, g, r_size):
-    """Schur complement of one point; gp and hpr become hpp^-1 gp and hpp^-1 hpr. A point nothing is known of stays."""
+    """Schur complement of one point, upper triangle; gp and hpr become hpp^-1 gp and hpp^-1 hpr.
+
+    A point nothing is known of stays.
+    """
     a, b, c = hpp[0, 0], hpp[0, 1], hpp[0, 2]
     d, e, f = hpp[1, 1], hpp[1, 2], hpp[2, 2]
     damping = 1e-9 * (a + d + f)
@@ -205,7 +208,7 @@ def _eliminate(hpp, gp, hpr, h, g, r_size):
         x1 = (c01 * y[0] + c11 * y[1] + c12 * y[2]) / det
         x2 = (c02 * y[0] + c12 * y[1] + c22 * y[2]) / det
         g[j] -= x0 * gp[0] + x1 * gp[1] + x2 * gp[2]
-        for i in range(r_size):
+        for i in range(j + 1):
             h[i, j] -= x0 * hpr[0, i] + x1 * hpr[1, i] + x2 * hpr[2, i]
     for j in range(r_size):
         y[0], y[1], y[2] = hpr[0, j], hpr[1, j], hpr[2, j]
