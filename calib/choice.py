@@ -48,15 +48,21 @@ class Estimate:
     value: F64  # (8,) radians; the focal length's is a ratio
     covariance: F64  # (8, 8)
 
+    @functools.cached_property
+    def information(self) -> tuple[F64, F64]:
+        """(8, 8) inverse of the covariance, and (8,) its product with the value."""
+        matrix = np.asarray(np.linalg.pinv(self.covariance, hermitian=True), float)
+        return matrix, matrix @ self.value
+
     def without(self, kept: Bool) -> Estimate:
         """The estimate with the terms that are not `kept` (8,) held at zero: the conditional Gaussian."""
         if kept.all():
             return self
+        matrix, vector = self.information
+        at = np.flatnonzero(kept)
+        inside = np.linalg.inv(matrix[at][:, at])
         value, covariance = np.zeros(RIG_TERMS), np.zeros((RIG_TERMS, RIG_TERMS))
-        inside, across = np.ix_(kept, kept), np.ix_(kept, ~kept)
-        gain = self.covariance[across] @ np.linalg.pinv(self.covariance[np.ix_(~kept, ~kept)])
-        value[kept] = self.value[kept] - gain @ self.value[~kept]
-        covariance[inside] = self.covariance[inside] - gain @ self.covariance[across].T
+        value[at], covariance[at[:, None], at] = inside @ vector[at], inside
         return Estimate(value, covariance)
 
     @property
