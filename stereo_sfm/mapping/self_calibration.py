@@ -31,6 +31,7 @@ ENOUGH_WINDOWS = 4  # with fewer, a correction must be more significant: errors 
 MAX_BETWEEN = 4  # windows from one revision to the next: as many as there are, but no more
 MAX_WINDOWS = 80  # used, the newest
 AFTER_STEP = range(2, 7)  # newest windows that must contradict all others to indicate a step
+STRADDLING_SIGMAS = 2.0  # by which a window during which the rig changed differs from those afterwards
 BEFORE_STEP = 4  # earlier windows needed to detect a step
 DRIFT_WINDOWS = 8  # needed to detect drift
 RATE = np.deg2rad(0.1) / 60.0  # prior standard deviation of drift, radians (ratio) per second
@@ -64,6 +65,7 @@ class SelfCalibration:
         self._since = 0  # first keyframe of the windows
         self._until_due = MIN_WINDOWS  # windows until the next revision
         self._stepped = False  # a step was detected and is not yet corrected
+        self._straddling = False  # it may have happened during the first window
         half_width = 0.5 * rig.left.width
         turn = MATCHING_PX / rig.left.fx
         roll = ratio = MATCHING_PX / (0.5 * half_width)
@@ -115,13 +117,14 @@ class SelfCalibration:
             self.windows.append(window)
             self._until_due -= 1
             self._detect_step()
+            self._drop_straddling()
         return window is not None
 
     def _revise(self, first_sigmas: float) -> Revision | None:
         """`first_sigmas`: significance of the first correction of a term."""
         windows = list(self.windows)
         drifts = self._drifts(windows)
-        parts = [windows, windows[::2], windows[1::2]]
+        parts = [windows, windows[::2], windows[1::2] or windows]  # one window: what a step has left
         whole, *halves = [self._at_the_end(part, windows)[0] if drifts else self.estimate(part) for part in parts]
         sigmas = np.where(self._corrected, REFINED_SIGMAS, first_sigmas)
         rolling = self._rig.readout_s > 0
@@ -174,8 +177,18 @@ class SelfCalibration:
             change = [_difference(self.estimate(part), base) for part in (after, after[::2], after[1::2])]
             if significant(change[0], change[1:], self._rig.readout_s > 0, SIGMAS).any():
                 self.windows = deque(after, maxlen=MAX_WINDOWS)
-                self._since, self._stepped = after[0].first_kf_id, True
+                self._since, self._stepped, self._straddling = after[0].first_kf_id, True, True
                 return
+
+    def _drop_straddling(self) -> None:
+        """After a step, discard the first window if it contradicts the others: the rig changed during it."""
+        first, *others = self.windows
+        if not self._straddling or not others:
+            return
+        change = _difference(self.estimate(others), self.estimate([first]))
+        if significant(change, [change], self._rig.readout_s > 0, STRADDLING_SIGMAS).any():
+            self.windows.popleft()
+            self._straddling = False
 
 
 def _difference(after: Estimate, before: Estimate) -> Estimate:

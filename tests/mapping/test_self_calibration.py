@@ -122,6 +122,13 @@ def test_a_small_step_is_detected_when_more_windows_show_it() -> None:
     assert np.rad2deg(estimator.terms[1]) == pytest.approx(0.1, abs=0.015)
 
 
+def test_a_step_within_a_window_is_estimated_from_the_windows_after_it() -> None:
+    true = RIGS["pinhole"]
+    _, found = revisions([true] * 29 + [turned(true, (0.0, 0.2, 0.0))] * 40, true, 0)
+    assert found[0].why == "step" and 27 <= found[0].since_kf_id <= 31
+    assert np.rad2deg(found[0].terms[1]) == pytest.approx(0.2, abs=0.015)
+
+
 def test_the_map_is_right_before_and_after_a_step() -> None:
     true = RIGS["pinhole"]
     rigs = [true] * 28 + [turned(true, (0.0, 0.2, 0.0))] * 24
