@@ -201,6 +201,9 @@ class MapperConfig:
     full_ba_lag_keyframes: int = number(
         5, 1, 10_000, "Keyframes until its result is applied (in large maps a tenth of their keyframes)"
     )
+    final_iterations: int = number(
+        60, 0, 10_000, "Iterations of a round of the full bundle adjustment at the end of a run; 0: none"
+    )
 
     @property
     def most_keyframes(self) -> int | None:

@@ -94,7 +94,7 @@ def linearize(
     Args:
         rot, pos: (K, 3, 3), (K, 3) of world_T_kf. points: (P, 3) world.
         obs_kf, obs_pt: (M,). uv_left, uv_right: (M, 2) px. weights: (M, 2) 1/px of either image, 0 where not observed.
-        trust: (P,) factor of the loss of a point's right images, unless joint.
+        trust: (P,) factor of the loss of a point's right images, if joint of both.
         use: (M, 2) images that count. limit: if above 0, `use` is set here to those whose chi2 is not above it.
         cams: (left model, left params, right model, right params). right_r, right_t: right_T_left.
         scale, redescends: of the loss, see `_loss`. joint: one loss over both images instead of one each.
@@ -135,8 +135,9 @@ def linearize(
         chi_l, chi_r = chi_l if use[o, 0] else 0.0, chi_r if use[o, 1] else 0.0
         if joint:
             rho, s_l = _loss(chi_l + chi_r, scale, redescends)
+            s_l *= trust[i]
             s_r = s_l
-            cost += rho
+            cost += trust[i] * rho
         else:
             rho_l, s_l = _loss(chi_l, scale, redescends)
             rho_r, s_r = _loss(chi_r, scale, redescends)

@@ -167,6 +167,9 @@ class Mapper:
             self._revise(self._calibration.finish())
             if self._job is not None:
                 self._apply_job()
+        if self._config.final_iterations:
+            self._start_full_bundle(window.final_bundle_config(self._config))
+            self._apply_job()
         return self._update(int(self.map.keyframes.kf_id[-1]))
 
     def _without_mapping(self, keyframe: Keyframe) -> MapUpdate:
@@ -266,9 +269,10 @@ class Mapper:
         if self._job is None and len(self.map.living_keyframes()) >= factor * self._size_at_full_bundle:
             self._start_full_bundle()
 
-    def _start_full_bundle(self) -> None:
+    def _start_full_bundle(self, config: BundleConfig | None = None) -> None:
         part = window.whole_map(self.map)
-        self._job = Job(self._rig, window.bundle_config(self._config), part, len(self.map.keyframes) - 1)
+        config = config or window.bundle_config(self._config)
+        self._job = Job(self._rig, config, part, len(self.map.keyframes) - 1)
         self._job_taken, self._result = False, None
         lag = max(self._config.full_ba_lag_keyframes, round(LAG_SHARE * len(self.map.living_keyframes())))
         self._job_due = len(self.map.keyframes) + lag

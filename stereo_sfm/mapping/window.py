@@ -5,6 +5,7 @@ A point that only one keyframe observes constrains no pose: it is left out of th
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ from stereo_sfm.mapping.level import level_of
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.types import F64, I64, Bool
 
+FINAL_ROUNDS, FINAL_TOLERANCE = 4, 1e-6  # of the last full bundle adjustment, see `BundleConfig`
 MIN_SHARED_POINTS = 10  # that connect two keyframes
 
 
@@ -36,6 +38,19 @@ def bundle_config(config: MapperConfig) -> BundleConfig:
     return BundleConfig(
         config.rounds, config.iterations, config.huber_sigmas, config.cauchy_medians, config.disparity_sigmas,
         fixed_once=True,
+    )  # fmt: skip
+
+
+def final_bundle_config(config: MapperConfig) -> BundleConfig:
+    """Those of the last full bundle adjustment.
+
+    It converges, also in the weights and in the scale, which is slow. With one loss over both images: where a match
+    disagrees, because its window shows two surfaces, the pixel of the left image is no better. (During the run the
+    right images may all disagree for a while, after a knock, and the left ones hold the map together.)
+    """
+    return dataclasses.replace(
+        bundle_config(config), rounds=FINAL_ROUNDS, iterations=config.final_iterations, tolerance=FINAL_TOLERANCE,
+        joint_loss=True,
     )  # fmt: skip
 
 
