@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import cv2
 
@@ -12,7 +12,7 @@ from stereo_sfm.drivers.source import Source, open_source
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.pipeline.inline import InlineRun
 from stereo_sfm.pipeline.run import run
-from stereo_sfm.types import Trajectory
+from stereo_sfm.types import StereoImage, Trajectory
 
 ODOMETRY_ONLY = ("mapper.enabled=false", "loop.enabled=false")  # settings
 
@@ -32,12 +32,17 @@ def recorded_of(spec: str, config: Config, max_frames: int | None = None) -> tup
         return recorded(source, config), source.ground_truth
 
 
-def recorded_together(source: Source, configs: Sequence[Config]) -> list[RunRecord]:
-    """The same of several runs on each image in turn: a simulated source is rendered once."""
+def recorded_together(
+    source: Source, configs: Sequence[Config], images: Iterable[StereoImage] | None = None
+) -> list[RunRecord]:
+    """The same of several runs on each image in turn: a simulated source is rendered once.
+
+    `images`: those to run on instead of all images of the source.
+    """
     records = [RunRecord.of(config) for config in configs]
     runs = [InlineRun(source, config, [record]) for config, record in zip(configs, records, strict=True)]
     cv2.setRNGSeed(0)
-    for image in source:
+    for image in source if images is None else images:
         for one in runs:
             one.step(image)
     for one in runs:

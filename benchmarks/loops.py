@@ -22,13 +22,13 @@ from _sequences import one_thread
 one_thread()
 
 import numpy as np
+from _runs import recorded_together
 
 from stereo_sfm.config import Config
 from stereo_sfm.drivers.source import Source, open_source
 from stereo_sfm.eval.evaluate import evaluate
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.geometry import se3
-from stereo_sfm.pipeline.inline import InlineRun
 from stereo_sfm.types import F64, StereoImage
 
 
@@ -64,14 +64,9 @@ def measure(spec: str, frames: int, stored: Path | None, only: str) -> None:
         truth = source.ground_truth
         assert truth is not None
         configs = configurations(only)
-        records = {name: RunRecord.of(config) for name, config in configs.items()}
-        runs = {name: InlineRun(source, config, [records[name]], None) for name, config in configs.items()}
         begin = time.perf_counter()
-        for image in images(source, frames, stored):
-            for run in runs.values():
-                run.step(image)
-        for run in runs.values():
-            run.finish()
+        together = recorded_together(source, list(configs.values()), images(source, frames, stored))
+        records = dict(zip(configs, together, strict=True))
         by_stamp = dict(zip(truth.stamp_ns.tolist(), truth.poses, strict=True))
         print(f"\n{spec}: {len(next(iter(records.values())).frames)} frames in {time.perf_counter() - begin:.0f} s")
         print("run         ATE mm  % of path  Sim(3) mm  end mm  keyframes  loops  rejected")

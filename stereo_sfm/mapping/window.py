@@ -36,9 +36,13 @@ class Window:
 def bundle_config(config: MapperConfig) -> BundleConfig:
     """The mapper's settings of bundle adjustment."""
     return BundleConfig(
-        config.rounds, config.iterations, config.huber_sigmas, config.cauchy_medians, config.disparity_sigmas,
+        rounds=config.rounds,
+        iterations=config.iterations,
+        huber=config.huber_sigmas,
+        cauchy=config.cauchy_medians,
+        disparity_sigmas=config.disparity_sigmas,
         fixed_once=True,
-    )  # fmt: skip
+    )
 
 
 def final_bundle_config(config: MapperConfig) -> BundleConfig:

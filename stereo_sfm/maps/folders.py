@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import logging
 import os
@@ -117,22 +118,21 @@ def save_result(mapper: AnyMapper, config: Config, folders: MapFolders) -> None:
     kept = folders.kept if folders.map_in is None or folders.map_out is not None else None
     if folders.map_out is None and kept is None:
         return
-    saved, out, failure, held = saved_map_of(mapper, config), folders.map_out, "", None
+    saved, out, failure = saved_map_of(mapper, config), folders.map_out, ""
     if saved is None:
         if out is not None and not folders.localize_only:
             log.warning("nothing was mapped: no map is written to %s", out)
         return
-    if folders.map_in is not None and out is not None:
-        try:
-            held = lock_versioned(out)
-            saved = _merged(mapper, saved, folders.map_in, config)
-        except StereoSfmError as error:
-            out = _unused_name(out) if out.resolve() == folders.map_in.resolve() else out
-            failure = f"not merged with {folders.map_in}: {error}; {out} contains this session alone"
-    for folder in dict.fromkeys(place.absolute() for place in (out, kept) if place is not None):
-        save_map(saved, folder)
-    if held is not None:
-        held.release()
+    with contextlib.ExitStack() as held:
+        if folders.map_in is not None and out is not None:
+            try:
+                held.enter_context(lock_versioned(out))
+                saved = _merged(mapper, saved, folders.map_in, config)
+            except StereoSfmError as error:
+                out = _unused_name(out) if out.resolve() == folders.map_in.resolve() else out
+                failure = f"not merged with {folders.map_in}: {error}; {out} contains this session alone"
+        for folder in dict.fromkeys(place.absolute() for place in (out, kept) if place is not None):
+            save_map(saved, folder)
     if failure:
         raise StereoSfmError(failure)
 

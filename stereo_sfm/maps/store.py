@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -53,13 +54,13 @@ def lock(store: Path) -> FolderLock:
     return FolderLock(folder, f"wait until the map {store} is written, or stop the service that extends it")
 
 
-def lock_versioned(folder: Path) -> FolderLock | None:
-    """The same of a map folder that is a store; None for any other.
+def lock_versioned(folder: Path) -> AbstractContextManager[object]:
+    """The same of a map folder that is a store; any other is not locked.
 
     Raises:
         StereoSfmError: another process writes to it.
     """
-    return lock(folder) if versions_folder(folder).is_dir() else None
+    return lock(folder) if versions_folder(folder).is_dir() else nullcontext()
 
 
 def read_about(store: Path, saved: SavedMap | None = None) -> About:
