@@ -9,7 +9,7 @@ import pytest
 from stereo_sfm.drivers.sim.rigs import make_rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.tracking.flow import klt
-from stereo_sfm.tracking.flow.reappearance import find_deformed, plane_warps
+from stereo_sfm.tracking.flow.reappearance import find_deformed, plane_warps, surfaces_around
 from stereo_sfm.types import F64
 
 CAMERA = make_rig("fisheye", (424, 400)).left
@@ -29,7 +29,7 @@ def test_the_deformation_of_a_plane_is_that_of_its_images(axis: int, at: float, 
     middle = np.array([uv])
     offsets = np.array([[3.0, 0.0], [0.0, 3.0], [-2.0, 2.0]])
     new_T_old = se3.inverse(MOVED)
-    warp = plane_warps(CAMERA, middle, on_plane(middle, axis, at), new_T_old)[axis, 0]
+    warp = plane_warps(CAMERA, surfaces_around(CAMERA, middle, on_plane(middle, axis, at)), new_T_old)[axis, 0]
     seen = CAMERA.project(se3.transform(new_T_old, on_plane(middle + offsets, axis, at)))
     centre = CAMERA.project(se3.transform(new_T_old, on_plane(middle, axis, at)))
     assert np.abs(seen - centre - offsets @ warp.T).max() < 0.35  # of 4 to 9 px
@@ -39,11 +39,12 @@ def test_the_deformation_of_a_plane_is_that_of_its_images(axis: int, at: float, 
 def test_surfaces_seen_too_obliquely_and_too_large_changes_are_left_out() -> None:
     ahead = np.array([[CAMERA.cx + 5.0, CAMERA.cy]])
     points = 4.0 * CAMERA.unproject(ahead)
-    warps = plane_warps(CAMERA, ahead, points, np.eye(4))
+    around = surfaces_around(CAMERA, ahead, points)
+    warps = plane_warps(CAMERA, around, np.eye(4))
     assert np.isnan(warps[:2]).all()
     assert warps[2, 0] == pytest.approx(np.eye(2), abs=1e-3)
     near = se3.from_rotation_translation(np.eye(3), np.array([0.0, 0.0, -3.2]))  # five times as near
-    assert np.isnan(plane_warps(CAMERA, ahead, points, near)).all()
+    assert np.isnan(plane_warps(CAMERA, around, near)).all()
 
 
 def test_a_magnified_window_is_found_far_from_where_it_is_predicted() -> None:

@@ -7,12 +7,16 @@ import pytest
 
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.drivers.sim.rigs import make_rig
+from stereo_sfm.tracking.flow.consensus import Movers
 from stereo_sfm.tracking.flow.follower import Follower
+from stereo_sfm.tracking.flow.klt import Pyramid, build_pyramid
+from stereo_sfm.tracking.flow.new_points import NewPoints
 from stereo_sfm.tracking.flow.pyramids import StereoPyramids
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
+from stereo_sfm.tracking.flow.stereo import StereoMatch, StereoMatcher
 from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.tracking.flow.visible_area import VisibleArea
-from stereo_sfm.types import F64, Bool
+from stereo_sfm.types import F32, F64, Bool
 
 RIG = make_rig("pinhole")
 WIDTH, HEIGHT = RIG.left.size
@@ -82,3 +86,22 @@ def test_a_small_part_of_the_view_is_little_evidence() -> None:
     hidden = np.where(few, DISTANCE, 0.4)[:, None] * RIG.left.unproject(uv)
     assert follower.recall(uv[few], np.eye(4), hidden) > 0.9
     assert follower.recall(uv[few], np.eye(4), hidden, 12.0) < 0.5
+
+
+class TooFar(StereoMatcher):
+    """Noise puts all points behind the camera."""
+
+    def match(self, left: Pyramid, right: Pyramid | F32, uv: F64) -> StereoMatch:
+        n = len(uv)
+        return StereoMatch(uv, uv, RIG.left.unproject(uv), np.full(n, -1e-6), np.ones(n), np.ones(n, bool))
+
+
+def test_corners_that_noise_puts_behind_the_camera_are_far_away() -> None:
+    follower, uv, _ = view()
+    config, shutter = TrackerConfig(), RollingShutter(RIG)
+    area = VisibleArea(RIG.left, config.max_angle_deg, None)
+    new_points = NewPoints(config, area, TooFar(config, RIG), follower, shutter, Movers())
+    image = build_pyramid(np.random.default_rng(1).integers(0, 255, (HEIGHT, WIDTH)).astype(np.uint8), 4)
+    seen = new_points.seen(StereoPyramids(image, image))
+    assert len(seen) > 100
+    assert follower.recall(uv, np.eye(4), seen) == pytest.approx(1.0)

@@ -10,12 +10,13 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.order_statistics import median, median_distance
 from stereo_sfm.tracking.flow import klt
 from stereo_sfm.tracking.flow.coarse_rotation import CoarseRotation
 from stereo_sfm.tracking.flow.frame_pose import ExpectedMotion
 from stereo_sfm.tracking.flow.pyramids import StereoPyramids
-from stereo_sfm.tracking.flow.reappearance import find_deformed, plane_warps
+from stereo_sfm.tracking.flow.reappearance import find_deformed, plane_warps, surfaces_around
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.tracks import Patches, Tracks
 from stereo_sfm.tracking.flow.visible_area import VisibleArea
@@ -42,6 +43,18 @@ class Held:
     tracks: Tracks
     pose: F64  # (4, 4) odom_T_cam
     dense: bool = False  # whether points were added for the recovery
+    _surfaces: F64 | None = None
+
+    def surfaces(self, camera: Camera) -> F64:
+        """`surfaces_around` the points, in the camera at the pose."""
+        if self._surfaces is None:
+            points = se3.transform(se3.inverse(self.pose), self.tracks.points())
+            self._surfaces = surfaces_around(camera, self.tracks.uv, points)
+        return self._surfaces
+
+    def add(self, tracks: Tracks) -> None:
+        """Replace the points by more, for the recovery."""
+        self.tracks, self.dense, self._surfaces = tracks, True, None
 
     def worth(self, pose: F64) -> float:
         """Number of points with which another image, taken at a pose (4, 4), is as good."""
@@ -58,6 +71,7 @@ class Follower:
         self._patches = Patches(STORED * config.max_features)
         self._last: klt.Pyramid | None = None
         self._held: Held | None = None
+        self._view: tuple[Tracks, F64, F64, F64] | None = None  # the last result of `_seen_from`: points, pose, result
         self._coarse_rotation = CoarseRotation(rig.left, config.pyramid_levels)
         self._coarsest_level = config.pyramid_levels - 1
         self._first_level = self._coarsest_level  # of the pyramid, at which the search starts
@@ -151,12 +165,12 @@ class Follower:
 
     def _seen_from(self, pose: F64) -> tuple[F64, F64]:
         """Pixels (N, 2) of the held points, NaN behind the camera, and their deformations since (3, N, 2, 2)."""
-        held = self.held
-        points = held.tracks.points()
-        uv = self._shutter.project(pose, np.zeros(6), points, held.tracks.uv)
-        held_T_odom = se3.inverse(held.pose)
-        new_T_held = se3.inverse(pose) @ held.pose
-        return uv, plane_warps(self._camera, held.tracks.uv, se3.transform(held_T_odom, points), new_T_held)
+        held, tracks = self.held, self.held.tracks
+        if self._view is None or self._view[0] is not tracks or not np.array_equal(self._view[1], pose):
+            uv = self._shutter.project(pose, np.zeros(6), tracks.points(), tracks.uv)
+            warps = plane_warps(self._camera, held.surfaces(self._camera), se3.inverse(pose) @ held.pose)
+            self._view = tracks, pose, uv, warps
+        return self._view[2:]
 
     def _visible(self, uv: F64, warps: F64) -> Bool:
         """(N,) points whose pixels (N, 2) are in the image, and one of whose deformations (3, N, 2, 2) is moderate."""

@@ -71,10 +71,10 @@ class NewPoints:
         return tracks
 
     def seen(self, images: StereoPyramids) -> F64:
-        """(M, 3) metres in the camera: corners spread over the image, as many as are tracked."""
+        """(M, 3) metres in the camera, none behind it: corners spread over the image, as many as are tracked."""
         most = self._config.max_features
         match = self._match(images, np.zeros((0, 2)), most, most)
-        return match.bearing[match.good] / match.rho[match.good, None]
+        return match.bearing[match.good] / np.maximum(match.rho[match.good, None], MIN_RHO)
 
     def _match(self, images: StereoPyramids, taken: F64, count: int, most: int) -> StereoMatch:
         """At most `count` corners away from pixels (N, 2), spread as if there were `most` in all, and their matches."""

@@ -14,11 +14,10 @@ import math
 
 import numpy as np
 
-from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
-from stereo_sfm.geometry.kernels import njit
+from stereo_sfm.geometry.kernels import njit, project_one
 from stereo_sfm.tracking.flow.klt import HALF, SIZE, STRIDE
-from stereo_sfm.types import F64
+from stereo_sfm.types import F32, F64, I64, U8
 
 GRAZING = 0.15  # cosine between a surface's normal and the ray, below which the surface shows nothing
 DELTA_PX = 1.0  # for differences
@@ -26,36 +25,69 @@ MAX_STRETCH = 3.0  # of a window, in any direction
 COARSE = SIZE // 2  # samples of a window in the half image, along each side
 SAMPLES = COARSE * COARSE
 MIN_VARIANCE = 1e-3  # of a window, grey levels squared
-LANES = 8  # numbers of a vector instruction
+LARGEST = 40  # px of the half image, of a window with MAX_STRETCH along both sides
 
 
-def plane_warps(camera: Camera, uv: F64, points: F64, new_T_old: F64) -> F64:
-    """(3, N, 2, 2) deformation of the image around points by a motion of the camera, for three orientations of surface.
+def surfaces_around(camera: Camera, uv: F64, points: F64) -> F64:
+    """(3, 4, N, 3) metres: surfaces that face the camera's x, y and z axis, right, left, below and above of points.
+
+    They do not depend on the view from which the points are looked for. NaN where seen too obliquely.
 
     Args:
-        uv: (N, 2) px in the old image. points: (N, 3) metres in the old camera. new_T_old: (4, 4).
-
-    Returns:
-        Surfaces that face the old camera's x, y and z axis; NaN where the surface is seen too obliquely.
+        uv: (N, 2) px. points: (N, 3) metres in the camera.
     """
-    out = np.full((3, len(uv), 2, 2), np.nan)
+    out = np.full((3, 4, len(uv), 3), np.nan)
     bearings = points / np.linalg.norm(points, axis=1)[:, None]
-    ends = [[camera.unproject(uv + sign * step) for sign in (1.0, -1.0)] for step in DELTA_PX * np.eye(2)]
+    rays = [camera.unproject(uv + sign * step) for step in DELTA_PX * np.eye(2) for sign in (1.0, -1.0)]
     for axis in range(3):
         facing = np.flatnonzero(np.abs(bearings[:, axis]) >= GRAZING)
         depth = points[facing, axis]
-        for k, rays in enumerate(ends):
-            on_plane = [ray[facing] * (depth / ray[facing, axis])[:, None] for ray in rays]
-            first, last = (camera.project(se3.transform(new_T_old, p)) for p in on_plane)
-            out[axis, facing, :, k] = (first - last) / (2 * DELTA_PX)
-    stretch = np.linalg.norm(out, axis=(2, 3)) / math.sqrt(2.0)
-    with np.errstate(invalid="ignore"):
-        out[(stretch > MAX_STRETCH) | (stretch < 1 / MAX_STRETCH)] = np.nan
+        for k, ray in enumerate(rays):
+            out[axis, k, facing] = ray[facing] * (depth / ray[facing, axis])[:, None]
     return out
 
 
+def plane_warps(camera: Camera, surfaces: F64, new_T_old: F64) -> F64:
+    """(3, N, 2, 2) deformation of the image around points by a motion (4, 4) of the camera.
+
+    `surfaces`: from `surfaces_around`, of the old image. NaN where there is none, or where it changes too much.
+    """
+    return _warps(camera.model_id, camera.params, surfaces, new_T_old)
+
+
 @njit
-def find_deformed(half_image, uv, warps, slots, patch, radius, step, uv_out, warp_out):
+def _warps(model, params, surfaces, new_T_old):
+    count = surfaces.shape[2]
+    out, ends, t = np.full((3, count, 2, 2), np.nan), np.zeros((4, 2)), new_T_old
+    for axis in range(3):
+        for n in range(count):
+            if math.isnan(surfaces[axis, 0, n, 0]):
+                continue
+            for k in range(4):
+                x, y, z = surfaces[axis, k, n, 0], surfaces[axis, k, n, 1], surfaces[axis, k, n, 2]
+                seen = project_one(
+                    model,
+                    params,
+                    t[0, 0] * x + t[0, 1] * y + t[0, 2] * z + t[0, 3],
+                    t[1, 0] * x + t[1, 1] * y + t[1, 2] * z + t[1, 3],
+                    t[2, 0] * x + t[2, 1] * y + t[2, 2] * z + t[2, 3],
+                )
+                ends[k, 0], ends[k, 1] = seen[0], seen[1]
+            squared = 0.0
+            for i in range(2):
+                for k in range(2):
+                    value = (ends[2 * k, i] - ends[2 * k + 1, i]) / (2 * DELTA_PX)
+                    out[axis, n, i, k] = value
+                    squared += value * value
+            stretch = math.sqrt(0.5 * squared)
+            if not 1 / MAX_STRETCH <= stretch <= MAX_STRETCH:
+                out[axis, n] = np.nan
+    return out
+
+
+def find_deformed(
+    half_image: U8, uv: F64, warps: F64, slots: I64, patch: F32, radius: int, step: int, uv_out: F64, warp_out: F64
+) -> F64:
     """Where the windows of points, deformed, look most alike around predicted pixels.
 
     Args:
@@ -68,12 +100,34 @@ def find_deformed(half_image, uv, warps, slots, patch, radius, step, uv_out, war
         (N,) normalised correlation of the best, 0 where nothing was searched.
     """
     height, width = half_image.shape
-    pixels = half_image.ravel()
+    phases = _phases(half_image, step)
+    return _find_deformed(phases, height, width, uv, warps, slots, patch, radius, step, uv_out, warp_out)
+
+
+def _phases(image: U8, step: int) -> F32:
+    """(step, step, H / step, W / step): every step-th pixel of an image (H, W), from each of the first ones on.
+
+    What a search by steps looks at lies side by side in them.
+    """
+    height, width = image.shape
+    out = np.zeros((step, step, -(-height // step), -(-width // step)), np.float32)
+    for i in range(step):
+        for j in range(step):
+            part = image[i::step, j::step]
+            out[i, j, : part.shape[0], : part.shape[1]] = part
+    return out
+
+
+@njit
+def _find_deformed(phases, height, width, uv, warps, slots, patch, radius, step, uv_out, warp_out):
     best = np.zeros(uv.shape[0])
     small = np.zeros(SAMPLES, np.float32)
     corner, weight = np.zeros((SAMPLES, 2), np.int64), np.zeros((4, SAMPLES), np.float32)
-    size = 2 * radius + 1 + LANES
-    sums, squares, cross = np.zeros(size, np.float32), np.zeros(size, np.float32), np.zeros(size, np.float32)
+    start = np.zeros((4, SAMPLES), np.int64)
+    side = (2 * radius + LARGEST) // step + 3
+    area = np.zeros(step * step * side * side, np.float32)
+    sums, squares = np.zeros(side * side, np.float32), np.zeros(side * side, np.float32)
+    cross = np.zeros(side * side, np.float32)
     for k in range(uv.shape[0]):
         if not (math.isfinite(uv[k, 0]) and math.isfinite(uv[k, 1])):
             continue
@@ -85,27 +139,75 @@ def find_deformed(half_image, uv, warps, slots, patch, radius, step, uv_out, war
             if not math.isfinite(warp.sum()):
                 continue
             left, right, top, bottom = _sample_places(uv[k], warp, corner, weight)
-            first, last = -radius, radius  # columns of the search whose samples are in the image
-            while first <= last and left + first < 0:
-                first += step
-            while last >= first and right + last >= width - 1:
-                last -= 1
-            count = last - first + 1
-            for dv in range(-radius, radius + 1, step):
-                if count <= 0 or top + dv < 0 or bottom + dv >= height - 1:
+            u0, columns = _offsets(left, right, width, radius, step)
+            v0, rows = _offsets(top, bottom, height, radius, step)
+            if columns <= 0 or rows <= 0:
+                continue
+            c0, r0 = (int(math.floor(left)) + u0) // step, (int(math.floor(top)) + v0) // step
+            wide = (int(math.floor(right)) + 1 + u0) // step + columns - c0
+            high = (int(math.floor(bottom)) + 1 + v0) // step + rows - r0
+            if step * step * wide * high > len(area):  # a window larger than any that is moderately deformed
+                continue
+            _copy(phases, step, c0, r0, wide, high, area)
+            for m in range(SAMPLES):
+                row, below = divmod(corner[m, 1] + v0, step), divmod(corner[m, 1] + v0 + 1, step)
+                column, beside = divmod(corner[m, 0] + u0, step), divmod(corner[m, 0] + u0 + 1, step)
+                upper, lower = (row[0] - r0) * wide - c0, (below[0] - r0) * wide - c0
+                start[0, m] = (row[1] * step + column[1]) * high * wide + upper + column[0]
+                start[1, m] = (row[1] * step + beside[1]) * high * wide + upper + beside[0]
+                start[2, m] = (below[1] * step + column[1]) * high * wide + lower + column[0]
+                start[3, m] = (below[1] * step + beside[1]) * high * wide + lower + beside[0]
+            _products(area, start, weight, small, (rows - 1) * wide + columns, sums, squares, cross)
+            for y in range(rows):
+                row_of = slice(y * wide, y * wide + columns)
+                if not _promising(sums[row_of], squares[row_of], cross[row_of], best[k] * best[k] * power):
                     continue
-                _products(pixels, width, corner, weight, small, first, dv, count, sums, squares, cross)
-                for x in range(0, count, step):
-                    variance = squares[x] - sums[x] * sums[x] / SAMPLES
+                for x in range(columns):
+                    n = y * wide + x
+                    variance = squares[n] - sums[n] * sums[n] / SAMPLES
                     if variance < MIN_VARIANCE:
                         continue
-                    ncc = cross[x] / math.sqrt(variance * power)
+                    ncc = cross[n] / math.sqrt(variance * power)
                     if ncc > best[k]:
                         best[k] = ncc
-                        uv_out[k, 0], uv_out[k, 1] = uv[k, 0] + 2 * (first + x), uv[k, 1] + 2 * dv
+                        uv_out[k, 0], uv_out[k, 1] = uv[k, 0] + 2 * (u0 + step * x), uv[k, 1] + 2 * (v0 + step * y)
                         warp_out[k, 0, 0], warp_out[k, 0, 1] = warp[0, 0], warp[0, 1]
                         warp_out[k, 1, 0], warp_out[k, 1, 1] = warp[1, 0], warp[1, 1]
     return best
+
+
+@njit
+def _offsets(low, high, size, radius, step):
+    """First offset and number of offsets of a search with which samples from `low` to `high` stay in the image."""
+    first, last = -radius, radius
+    while first <= last and low + first < 0:
+        first += step
+    while last >= first and high + last >= size - 1:
+        last -= 1
+    return first, (last - first) // step + 1
+
+
+@njit
+def _copy(phases, step, c0, r0, wide, high, area):
+    """Write the part of all phases from column c0 and row r0 on into a flat array."""
+    columns = min(wide, phases.shape[3] - c0)
+    for i in range(step):
+        for j in range(step):
+            for r in range(min(high, phases.shape[2] - r0)):
+                line = phases[i, j, r0 + r, c0 : c0 + columns]
+                to = area[((i * step + j) * high + r) * wide :]
+                for c in range(columns):
+                    to[c] = line[c]
+
+
+@njit
+def _promising(sums, squares, cross, least):
+    """Whether the square of any correlation may exceed `least` times its variance."""
+    count = 0
+    for n in range(len(sums)):
+        variance = squares[n] - sums[n] * sums[n] * np.float32(1 / SAMPLES)
+        count += cross[n] > 0 and cross[n] * cross[n] >= np.float32(0.999 * least) * variance
+    return count > 0
 
 
 @njit
@@ -143,27 +245,22 @@ def _sample_places(uv, warp, corner, weight):
 
 
 @njit
-def _products(pixels, width, corner, weight, small, first, dv, count, sums, squares, cross):
-    """Sums (count,) of the samples, their squares and their products with a window, for columns from `first` on.
+def _products(area, start, weight, small, count, sums, squares, cross):
+    """Sums (count,) of the samples, their squares and their products with a window, at successive places of an area.
 
-    Whole vectors are computed where the image has so many pixels; the surplus columns mean nothing. Unsigned numbers
-    spare the compiler the test for negative indices.
+    The places run on from the end of one row to the next: those between the rows mean nothing. Long loops over two
+    samples at once are what makes this fast.
     """
-    sums[:], squares[:], cross[:] = 0.0, 0.0, 0.0
-    one, row = np.uintp(1), np.uintp(width)
-    whole = (count + LANES - 1) // LANES * LANES
-    for m in range(SAMPLES):
-        start = np.uintp((corner[m, 1] + dv) * width + corner[m, 0] + first)
-        columns = np.uintp(whole if start + row + whole < len(pixels) else count)
-        below = start + row
-        a, b, c, d, s = weight[0, m], weight[1, m], weight[2, m], weight[3, m], small[m]
-        for x in range(columns):
-            value = (
-                a * np.float32(pixels[start + x])
-                + b * np.float32(pixels[start + x + one])
-                + c * np.float32(pixels[below + x])
-                + d * np.float32(pixels[below + x + one])
-            )
-            sums[x] += value
-            squares[x] += value * value
-            cross[x] += value * s
+    sums[:count], squares[:count], cross[:count] = 0.0, 0.0, 0.0
+    for m in range(0, SAMPLES, 2):
+        n = m + 1
+        a0, b0, c0, d0, e0 = weight[0, m], weight[1, m], weight[2, m], weight[3, m], small[m]
+        a1, b1, c1, d1, e1 = weight[0, n], weight[1, n], weight[2, n], weight[3, n], small[n]
+        p0, p1, p2, p3 = area[start[0, m] :], area[start[1, m] :], area[start[2, m] :], area[start[3, m] :]
+        q0, q1, q2, q3 = area[start[0, n] :], area[start[1, n] :], area[start[2, n] :], area[start[3, n] :]
+        for x in range(np.uintp(count)):  # unsigned: no test for negative indices
+            p = a0 * p0[x] + b0 * p1[x] + c0 * p2[x] + d0 * p3[x]
+            q = a1 * q0[x] + b1 * q1[x] + c1 * q2[x] + d1 * q3[x]
+            sums[x] = sums[x] + p + q
+            squares[x] = squares[x] + p * p + q * q
+            cross[x] = cross[x] + p * e0 + q * e1

@@ -8,6 +8,7 @@ corners of the whole image for the loop closer.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import chain
 
@@ -30,7 +31,7 @@ from stereo_sfm.tracking.flow.new_points import NewPoints
 from stereo_sfm.tracking.flow.partial_view import PartialView
 from stereo_sfm.tracking.flow.place_corners import PlaceCorners
 from stereo_sfm.tracking.flow.pyramids import StereoPyramids
-from stereo_sfm.tracking.flow.recovery import SUFFICIENT_RECALL, Recovery, within
+from stereo_sfm.tracking.flow.recovery import SAME_PLACE, SUFFICIENT_RECALL, Recovery, within
 from stereo_sfm.tracking.flow.rig_change import triangulate_tracks
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.side_views import SideViews
@@ -53,7 +54,7 @@ TRUSTED_LEFT = 0.5  # ... if so many of the newest keyframe's points are left ..
 TRUSTED_OPEN = 0.3  # ... and so many of those that agree in an open view
 COVERED_SHARE = 0.1  # of the covered frames: as many free ones in a row, and a new submap begins
 SAME_START = 0.05, 0.01  # metres, radians between poses from which the same is found
-ROUNDS = (0.066, 160), (0.03, 1000), (0.015, 1000)  # of a search: reach as a share of the width, most points
+ROUNDS = (0.066, 160), (0.03, 400), (0.015, 1000)  # of a search: reach as a share of the width, most points
 CELLS_PER_METRE = 3.0  # of the image that must agree, per metre of standard deviation of the prediction
 HELD_POINTS = 8  # times max_features, of the image to recover from: after two metres little of it is still in view
 FIRST_COVARIANCE = np.eye(6) * 1e-12  # of the first pose, which is the odometry frame
@@ -318,14 +319,15 @@ class Tracker:
         self._hold_more()
         expected = self._expect(image.stamp_ns)
         seconds = (image.stamp_ns - self._stamp_ns) * 1e-9
-        tried, seen = list[F64](), None
+        tried, refined, seen = list[F64](), list[F64](), None
         found: list[tuple[Tracks, PoseSolution, float]] = []
         for pose in chain([expected.odom_T_cam], self._recovery.search(image, images, expected)):
             if not any(within(pose, other, *SAME_START) for other in tried):
                 tried.append(pose)
-                tracks, solution = self._track_from(pose, images, seconds)
+                tracks, solution = self._track_from(pose, images, seconds, refined)
                 if solution.reason:
                     continue
+                refined.append(solution.pose)
                 seen = self._new_points.seen(images) if seen is None else seen
                 found_again, recall = tracks.uv[solution.inlier], self._recall(tracks, solution)
                 uncovered = self._follower.recall(found_again, solution.pose, seen, CELLS_PER_METRE * expected.sigma_m)
@@ -357,17 +359,22 @@ class Tracker:
         """`Follower.recall` of the points that agree with a pose."""
         return self._follower.recall(tracks.uv[solution.inlier], solution.pose)
 
-    def _track_from(self, pose: F64, images: StereoPyramids, seconds: float) -> tuple[Tracks, PoseSolution]:
-        """Find the points of the held image from an approximate pose (4, 4), and again from the results."""
+    def _track_from(
+        self, pose: F64, images: StereoPyramids, seconds: float, known: Sequence[F64] = ()
+    ) -> tuple[Tracks, PoseSolution]:
+        """Find the points of the held image from an approximate pose (4, 4), and again from the results.
+
+        No pose is found where the first result is near a `known` one (4, 4), to which the others would lead again.
+        """
         tracks, solution = NOT_FOUND
         for reach, most in ROUNDS:
             motion = ExpectedMotion(pose, se3.log(se3.inverse(self._pose) @ pose), seconds)
             tracks = self._follower.find_again(images.left, pose, reach, most)
             tracks.uv_right = self._stereo.follow(images.left, images.right, tracks.uv, tracks.points(), pose)
             solution = self._solver.solve_again(tracks, motion)
-            if solution.reason:
-                break
-            pose = solution.pose
+            if solution.reason or any(within(solution.pose, other, *SAME_PLACE) for other in known):
+                return NOT_FOUND
+            pose, known = solution.pose, ()
         return tracks, solution
 
     def _hold_more(self) -> None:
@@ -377,7 +384,7 @@ class Tracker:
             most = HELD_POINTS * self._config.max_features
             tracks = self._follower.renewed(held)
             tracks = self._new_points.add(tracks, held.images, held.pose, np.zeros(6), most)
-            held.tracks, held.dense = tracks.keep(~tracks.moving), True
+            held.add(tracks.keep(~tracks.moving))
             self._follower.keep_only(self._tracks)
 
     def _lose(self, image: StereoImage, reason: str) -> tuple[Frame, None]:
