@@ -51,12 +51,12 @@ def aligned(image: U8, seen: U8, uv: F64, start: F64) -> tuple[F64, F64, Bool]:
     """First appearances at `uv` of one image found in another: pixels, deformations, and which were found."""
     n, slots = len(uv), np.arange(len(uv))[::-1].copy()
     patch, gradients = np.zeros((n, klt.FLAT_SIZE), np.float32), np.zeros((n, 2, klt.FLAT_SIZE), np.float32)
-    inverse, contrast = np.zeros((n, 6, 6)), np.zeros(n)
-    store = (patch, gradients, inverse, contrast)
+    store = (patch, gradients, np.zeros((n, 6, 6)), np.zeros(n), np.zeros((n, 6, 6)))
     good = klt.make_patches(klt.build_pyramid(image, 1), uv, slots, klt.WEIGHTS, klt.COORDINATES, *store)
     out, deformation = start.copy(), np.tile(np.eye(2), (n, 1, 1))
     pixels = klt.build_pyramid(seen, 1)[0]
-    ncc = klt.track_affine(pixels, out, deformation, slots, good, *store, 15, klt.WEIGHTS, klt.COORDINATES)
+    flat = np.zeros((n, 6))
+    ncc = klt.track_affine(pixels, out, deformation, flat, slots, good, *store, 15, klt.WEIGHTS, klt.COORDINATES)
     return out, deformation, good & (ncc > 0.95)
 
 
@@ -109,8 +109,8 @@ def test_a_warped_window_is_the_bilinear_interpolation_up_to_the_border() -> Non
     contrast = np.sqrt(windows**2 @ weights)
     still = np.zeros((n, 2, klt.FLAT_SIZE), np.float32), np.zeros((n, 6, 6))  # no gradients: a step of zero
     ncc = klt.track_affine(
-        klt.build_pyramid(image, 1)[0], centre.copy(), warps.copy(), np.arange(n), np.ones(n, bool),
-        patch.reshape(n, -1), *still, contrast, 1, klt.WEIGHTS, klt.COORDINATES,
+        klt.build_pyramid(image, 1)[0], centre.copy(), warps.copy(), np.zeros((n, 6)), np.arange(n), np.ones(n, bool),
+        patch.reshape(n, -1), *still, contrast, np.zeros((n, 6, 6)), 1, klt.WEIGHTS, klt.COORDINATES,
     )  # fmt: skip
     assert (ncc[~inside] == 0).all()
     assert ncc[inside].min() > 0.9999

@@ -77,7 +77,8 @@ def run(*overrides: str) -> list[Keyframe]:
 
 def test_corners_change_nothing_for_the_tracker_and_odometry_alone_has_none() -> None:
     with_corners, without = run(), run("mapper.enabled=false", "loop.enabled=false")
-    assert len(with_corners) >= 3 and all(len(k.corners) > 200 for k in with_corners)
+    described = [k for k in with_corners if len(k.corners)]  # others look like the keyframe before
+    assert len(described) >= 3 and all(len(k.corners) > 200 for k in described)
     for a, b in zip(with_corners, without, strict=True):
         assert not len(b.corners)
         for name in ("odom_T_cam", "point_ids", "uv_left", "uv_right", "points_cam", "descriptors"):

@@ -57,8 +57,9 @@ def test_a_magnified_window_is_found_far_from_where_it_is_predicted() -> None:
     seen = klt.build_pyramid(np.asarray(cv2.warpAffine(texture, matrix, (200, 200)), np.uint8), 4)
     uv = rng.uniform(70, 120, (12, 2))
     patch, gradients = np.zeros((12, klt.FLAT_SIZE), np.float32), np.zeros((12, 2, klt.FLAT_SIZE), np.float32)
+    normal, contrast, bending = np.zeros((12, 6, 6)), np.zeros(12), np.zeros((12, 6, 6))
     klt.make_patches(
-        pyramid, uv, np.arange(12), klt.WEIGHTS, klt.COORDINATES, patch, gradients, np.zeros((12, 6, 6)), np.zeros(12)
+        pyramid, uv, np.arange(12), klt.WEIGHTS, klt.COORDINATES, patch, gradients, normal, contrast, bending
     )
     true = uv * scale + shift
     guess = true + rng.uniform(-20, 20, (12, 2))

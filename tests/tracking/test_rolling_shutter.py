@@ -153,14 +153,17 @@ def ate_mm(rig: Rig, images: list[StereoImage], truth: Trajectory) -> float:
 
 def test_a_rendered_sequence_with_a_rolling_shutter() -> None:
     """A camera with vibration and a readout of 25 ms: much more accurate than without the model."""
-    with open_source("sim:aisle?camera=pinhole&size=320x200&start=60&frames=60&vibration=4&readout=0.025") as source:
-        images, truth = list(source), source.ground_truth
-        assert truth is not None and source.rig.readout_s == 0.025
-        known = ate_mm(source.rig, images, truth)
-        unknown = ate_mm(dataclasses.replace(source.rig, readout_s=0.0), images, truth)
-    print(f"{known:.2f} mm, without the times of the rows {unknown:.2f} mm")
-    assert known < 3.0
-    assert known < unknown / 1.5
+    known, unknown = list[float](), list[float]()
+    for seed in range(3):
+        spec = f"sim:aisle?camera=pinhole&size=320x200&start=60&frames=60&vibration=4&readout=0.025&seed={seed}"
+        with open_source(spec) as source:
+            images, truth = list(source), source.ground_truth
+            assert truth is not None and source.rig.readout_s == 0.025
+            known.append(ate_mm(source.rig, images, truth))
+            unknown.append(ate_mm(dataclasses.replace(source.rig, readout_s=0.0), images, truth))
+    print(f"{known} mm, without the times of the rows {unknown} mm")
+    assert max(known) < 3.5
+    assert np.mean(known) < np.mean(unknown) / 2
 
 
 def test_keyframes_of_a_rendered_sequence_are_those_of_a_global_shutter() -> None:

@@ -20,6 +20,7 @@ from stereo_sfm.tracking.flow.reappearance import find_deformed, plane_warps, su
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.tracks import Patches, Tracks
 from stereo_sfm.tracking.flow.visible_area import VisibleArea
+from stereo_sfm.tracking.flow.window_curvature import window_curvatures, window_rays
 from stereo_sfm.types import F64, I64, Bool
 
 WELL_PREDICTED_PX = 3.0  # median error of the predictions below which the search starts in the half image
@@ -82,7 +83,7 @@ class Follower:
         assert self._last is not None
         guess = self._shutter.project(expected.pose, expected.velocity, tracks.points(), tracks.uv)
         guess = np.where(np.isfinite(guess), guess, tracks.uv)
-        return self._find(self._last, tracks, pyramid, guess, tracks.warp)
+        return self._find(self._last, tracks, pyramid, expected.pose, guess)
 
     @property
     def held(self) -> Held:
@@ -104,7 +105,7 @@ class Follower:
 
     def renewed(self, held: Held) -> Tracks:
         """The points of the held image, with their appearance in it instead of their first one."""
-        rows, slots = self.begin(held.images.left, held.tracks.uv)
+        rows, slots = self.begin(held.images.left, held.tracks.uv, held.pose)
         tracks = held.tracks.keep(_mask(rows, len(held.tracks)))
         tracks.slot, tracks.warp = slots, np.tile(np.eye(2), (len(rows), 1, 1))
         return tracks
@@ -128,7 +129,8 @@ class Follower:
             pyramid[1], guess[rows], warps @ tracks.warp, tracks.slot, self._patches.patch, radius, step, uv, warp
         )
         self.search_widely()
-        return self._kept(tracks, *self._align(pyramid, uv, warp, tracks.slot, ncc > MIN_COARSE_NCC))
+        curvature = self._curvatures(tracks, warp, pose)
+        return self._kept(tracks, *self._align(pyramid, uv, warp, curvature, tracks.slot, ncc > MIN_COARSE_NCC))
 
     def recall(self, found: F64, pose: F64, seen: F64 | None = None, cells_needed: float = 1.0) -> float:
         """The share of the view from a pose (4, 4) in which as many held points are `found` (N, 2) px as should be.
@@ -178,18 +180,19 @@ class Follower:
         inside[inside] = self._area.inside(uv[inside])
         return inside & np.isfinite(warps).all(axis=(2, 3)).any(axis=0)
 
-    def _find(self, last: klt.Pyramid, tracks: Tracks, pyramid: klt.Pyramid, guess: F64, warp: F64) -> Tracks:
-        """Find points of one image in another, starting at guesses (N, 2) px and deformations (N, 2, 2).
+    def _find(self, last: klt.Pyramid, tracks: Tracks, pyramid: klt.Pyramid, pose: F64, guess: F64) -> Tracks:
+        """Find points of one image in another, taken at about a pose (4, 4), starting at guesses (N, 2) px.
 
         Where the predictions are good, first appearances are aligned from there; what that misses, and all points
         otherwise, is first followed by translation from the last image.
         """
         near = np.full(len(guess), self._miss_px < ALIGNED_PX)
-        uv, deformed, found = self._align(pyramid, guess, warp, tracks.slot, near)
+        warp, curvature = tracks.warp, self._curvatures(tracks, tracks.warp, pose)
+        uv, deformed, found = self._align(pyramid, guess, warp, curvature, tracks.slot, near)
         missed = np.flatnonzero(~found)
         if len(missed):
             moved, followed = self._translate(last, tracks.uv[missed], pyramid, guess[missed])
-            aligned = self._align(pyramid, moved, warp[missed], tracks.slot[missed], followed)
+            aligned = self._align(pyramid, moved, warp[missed], curvature[missed], tracks.slot[missed], followed)
             uv[missed], deformed[missed], found[missed] = aligned
         self._miss_px = median_distance(uv, guess, found)
         return self._kept(tracks, uv, deformed, found)
@@ -209,12 +212,23 @@ class Follower:
         )
         return found, status == klt.TRACKED
 
-    def _align(self, pyramid: klt.Pyramid, uv: F64, warp: F64, slots: I64, wanted: Bool) -> tuple[F64, F64, Bool]:
+    def _curvatures(self, tracks: Tracks, warp: F64, pose: F64) -> F64:
+        """(N, 6) the quadratic parts of the deformations (N, 2, 2) in an image at a pose (4, 4)."""
+        out, store = np.empty((len(tracks), 6)), self._patches
+        window_curvatures(
+            tracks.slot, store.rays, store.origin, tracks.points(), warp, np.ascontiguousarray(pose[:3, :3].T),
+            pose[:3, 3].copy(), self._camera.model_id, self._camera.params, out,
+        )  # fmt: skip
+        return out
+
+    def _align(
+        self, pyramid: klt.Pyramid, uv: F64, warp: F64, curvature: F64, slots: I64, wanted: Bool
+    ) -> tuple[F64, F64, Bool]:
         """Align first appearances with an image: pixels (N, 2), deformations (N, 2, 2), which are found (N,)."""
         uv, warp, store = uv.copy(), warp.copy(), self._patches
         ncc = klt.track_affine(
-            pyramid[0], uv, warp, slots, wanted, store.patch, store.gradients, store.inverse_normal, store.contrast,
-            6, klt.WEIGHTS, klt.COORDINATES,
+            pyramid[0], uv, warp, curvature, slots, wanted, store.patch, store.gradients, store.inverse_normal,
+            store.contrast, store.bending, 6, klt.WEIGHTS, klt.COORDINATES,
         )  # fmt: skip
         return uv, warp, np.asarray(ncc > self._config.min_anchor_ncc)
 
@@ -237,14 +251,19 @@ class Follower:
         self._first_level = 1 if self._miss_px < WELL_PREDICTED_PX else self._coarsest_level
         self.keep_only(tracks)
 
-    def begin(self, pyramid: klt.Pyramid, uv: F64) -> tuple[I64, I64]:
-        """Store the appearance of new points (N, 2) px: rows (M,) of those with texture and a slot, their slots."""
+    def begin(self, pyramid: klt.Pyramid, uv: F64, pose: F64) -> tuple[I64, I64]:
+        """Store the appearance of new points (N, 2) px in an image at a pose (4, 4).
+
+        Returns rows (M,) of those with texture and a slot, and their slots.
+        """
         store = self._patches
         slots = store.take(len(uv))
         textured = klt.make_patches(
             pyramid, uv[: len(slots)], slots, klt.WEIGHTS, klt.COORDINATES, store.patch, store.gradients,
-            store.inverse_normal, store.contrast,
+            store.inverse_normal, store.contrast, store.bending,
         )  # fmt: skip
+        store.rays[slots] = window_rays(self._camera, uv[: len(slots)], pose[:3, :3])
+        store.origin[slots] = pose[:3, 3]
         return np.flatnonzero(textured), slots[textured]
 
     def keep_only(self, tracks: Tracks) -> None:

@@ -125,8 +125,8 @@ def _sample_wide(image, u, v, raw, out):
 def _template(image, u, v, weights, raw, wide, tmp, patch, gx, gy):
     """Patch around (u, v), centred, and its weighted, centred gradients by central differences.
 
-    Returns mean, contrast, and the 2x2 normal matrix (hxx, hxy, hyy). `gx`, `gy` are left multiplied by the weights:
-    their dot product with a window is the right-hand side, whatever the window's mean.
+    Returns mean, contrast, the 2x2 normal matrix (hxx, hxy, hyy), and the mean gradients. `gx`, `gy` are left
+    multiplied by the weights: their dot product with a window is the right-hand side, whatever the window's mean.
     """
     half = np.float32(0.5)
     _sample_wide(image, u - HALF, v - HALF, raw, wide)
@@ -150,7 +150,7 @@ def _template(image, u, v, weights, raw, wide, tmp, patch, gx, gy):
         gy[m] = raw[m]
         raw[m] = patch[m] * weights[m]
     contrast = math.sqrt(max(_dot(raw, patch, tmp), 1e-6))
-    return mean, contrast, hxx, hxy, hyy
+    return mean, contrast, hxx, hxy, hyy, mx, my
 
 
 @njit
@@ -202,7 +202,7 @@ def track_translation(prev, cur, uv_prev, uv_cur, first_level, last_level, itera
             if not (_inside(image, pu, pv, HALF + 1.5) and _inside(target, cu, cv, HALF + 0.5)):
                 state = OUTSIDE
                 continue
-            _, contrast, hxx, hxy, hyy = _template(image, pu, pv, weights, raw, wide, tmp, patch, gx, gy)
+            _, contrast, hxx, hxy, hyy, _, _ = _template(image, pu, pv, weights, raw, wide, tmp, patch, gx, gy)
             det = hxx * hyy - hxy * hxy
             if contrast < min_contrast or det < 1e-3 * (hxx + hyy) * (hxx + hyy):
                 state = FLAT
@@ -250,13 +250,14 @@ def track_translation(prev, cur, uv_prev, uv_cur, first_level, last_level, itera
 
 
 @njit
-def make_patches(pyramid, uv, slots, weights, coordinates, patch, gradients, inverse_normal, contrast):
+def make_patches(pyramid, uv, slots, weights, coordinates, patch, gradients, inverse_normal, contrast, bending):
     """Store the appearance of points for `track_affine`.
 
     Args:
         pyramid: of the image in which the points are first observed. uv: (N, 2) px. coordinates: COORDINATES.
         slots: (N,) rows of the store that follows: patch (M, FLAT_SIZE), gradients (M, 2, FLAT_SIZE), inverse_normal
-            (M, 6, 6), contrast (M,); these rows are filled in.
+            (M, 6, 6), contrast (M,), bending (M, 6, 6); these rows are filled in. `bending` is what the quadratic part
+            of a deformation contributes to the right-hand side, by its six coefficients.
 
     Returns:
         (N,) bool, False where the window leaves the image or has no texture.
@@ -267,6 +268,7 @@ def make_patches(pyramid, uv, slots, weights, coordinates, patch, gradients, inv
     wide = np.zeros(WIDE_SIZE + STRIDE, np.float32)
     tmp = np.zeros(FLAT_SIZE, np.float32)
     jac = np.zeros((6, FLAT_SIZE), np.float32)
+    unweighted = np.zeros(FLAT_SIZE, np.float32)
     normal, factor = np.zeros((6, 6)), np.zeros((6, 6))
     for row in range(n):
         if not _inside(pyramid[0], uv[row, 0], uv[row, 1], HALF + 1.5):
@@ -300,6 +302,20 @@ def make_patches(pyramid, uv, slots, weights, coordinates, patch, gradients, inv
         if normal[2, 2] * normal[5, 5] - normal[2, 5] ** 2 < 1e-3 * (normal[2, 2] + normal[5, 5]) ** 2:
             continue
         good[row] = invert_symmetric(normal, inverse_normal[k], factor)
+        for a in range(2):
+            mean_gradient = np.float32(result[5] if a == 0 else result[6])
+            for m in range(FLAT_SIZE):
+                unweighted[m] = gradients[k, a, m] * raw[m] + mean_gradient
+            for c in range(3):
+                x, y = coordinates[1 if c == 2 else 0], coordinates[0 if c == 0 else 1]
+                half = np.float32(1.0 if c == 1 else 0.5)
+                for m in range(FLAT_SIZE):
+                    wide[m] = half * x[m] * y[m] * unweighted[m]
+                mean = _dot(weights, wide, tmp)
+                for m in range(FLAT_SIZE):
+                    wide[m] -= mean
+                for b in range(6):
+                    bending[k, b, 3 * a + c] = _dot(jac[b], wide, tmp)
     return good
 
 
@@ -359,14 +375,28 @@ def _sample_affine(image, warp, cu, cv, scratch, out):
 
 @njit
 def track_affine(
-    image, uv, warp, slots, wanted, patch, gradients, inverse_normal, contrast, iterations, weights, coordinates
+    image,
+    uv,
+    warp,
+    curvature,
+    slots,
+    wanted,
+    patch,
+    gradients,
+    inverse_normal,
+    contrast,
+    bending,
+    iterations,
+    weights,
+    coordinates,
 ):
     """Align the first appearance of points with an image.
 
     Args:
         image: (H, W) uint8. uv: (N, 2) px and warp: (N, 2, 2), the positions and affine deformations to start from;
-            overwritten. slots: (N,) rows of the points in the store (patch, gradients, inverse_normal, contrast) that
-            `make_patches` filled. wanted: (N,) bool, others are skipped.
+            overwritten. curvature: (N, 6) the deformations' quadratic parts, see `window_curvatures`. slots: (N,) rows
+            of the points in the store (patch, gradients, inverse_normal, contrast, bending) that `make_patches` filled.
+            wanted: (N,) bool, others are skipped.
 
     Returns:
         ncc (N,) float32 normalised correlation after alignment, 0 where the window left the image or did not converge.
@@ -409,6 +439,9 @@ def track_affine(
                 b[3 * axis] = _dot(bx, coordinates[0], tmp)
                 b[3 * axis + 1] = _dot(bx, coordinates[1], tmp)
                 b[3 * axis + 2] = _dot(bx, coordinates[2], tmp)
+            for i in range(6):
+                for j in range(6):
+                    b[i] += bending[k, i, j] * curvature[row, j]
             for i in range(6):
                 s = 0.0
                 for j in range(6):

@@ -45,7 +45,7 @@ class NewPoints:
         self._area.learn(images.left[1])
         match = self._match(images, tracks.uv, missing, most)
         good = np.flatnonzero(match.good)
-        rows, slots = self._follower.begin(images.left, match.uv_left[good])
+        rows, slots = self._follower.begin(images.left, match.uv_left[good], pose)
         new, n = good[rows], len(rows)
         rho = np.maximum(match.rho[new], MIN_RHO)
         moving = self._movers.near(match.uv_left[new], rho, tracks)
