@@ -71,6 +71,15 @@ def test_settled_points_decide_against_more_young_ones(seed: int) -> None:
     assert solver.alert
 
 
+def test_the_motion_to_another_pose_begins_at_the_same_one() -> None:
+    """Else the velocity of a rolling shutter stays that of the prediction."""
+    last = se3.exp(np.array([0.3, -0.1, 2.0, 0.2, 0.4, -0.1]))
+    predicted = np.array([0.0, 0.01, 0.1, 0.02, -0.03, 0.0])
+    motion = ExpectedMotion(last @ se3.exp(predicted), predicted, 0.1).to(last @ MOVED)
+    assert motion.pose == pytest.approx(last @ MOVED)
+    assert motion.velocity == pytest.approx(se3.log(MOVED) / 0.1)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_a_person_followed_for_as_long_as_the_store_does_not_take_the_pose_along(seed: int) -> None:
     """Who stood before the camera has the older points, and more of them; at the first step the camera goes on."""

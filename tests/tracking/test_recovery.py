@@ -189,6 +189,20 @@ def test_less_certain_poses_need_more_of_the_view(recall: float, seconds: float,
     assert recovery.possible(expected, solution, recall) == accepted
 
 
+@pytest.mark.parametrize(("metres", "accepted"), [(0.1, True), (1.2, False), (-1.2, False)])
+def test_where_a_steady_motion_ends_less_of_the_view_is_enough(metres: float, accepted: bool) -> None:
+    """A ceiling repeats after 1.2 m."""
+    recovery = Recovery(None, None, (424, 400))
+    for t in (-1.0, 0.0):
+        recovery.motion.add(round(t * 1e9), se3.exp(np.array([0.0, 0.0, 0.8 * t, 0.0, 0.0, 0.0])))
+    stamp = 2_000_000_000
+    expected, steady = recovery.motion.expect(stamp), recovery.motion.steady(stamp)
+    there = se3.exp(np.array([0.0, 0.0, 1.6 + metres, 0.0, 0.0, 0.0]))
+    solution = PoseSolution(there, np.zeros(6), np.eye(6), np.zeros(100), 0.3, 3.0)
+    assert recovery.possible(expected, solution, 0.5, steady) == accepted
+    assert not recovery.possible(expected, solution, 0.5)
+
+
 def test_without_places_there_is_no_search() -> None:
     recovery = Recovery(None, None, (424, 400))
     recovery.motion.add(0, np.eye(4))
@@ -210,15 +224,17 @@ def test_a_pose_from_a_part_of_the_view_is_found_anew_once_more_is_free() -> Non
     held, other = (Held(StereoPyramids((), ()), Tracks(), np.eye(4)) for _ in range(2))
     part = PartialView()
     assert not part.wanted(held, 0)
-    part.begin(held, 0.4, 0)
+    few, more = 2e-4 * np.eye(6), 1e-4 * np.eye(6)
+    part.begin(held, 0.4, few, 0)
     assert part.wanted(held, 10**9)
     assert not part.wanted(held, 10**9 + 1)
     assert not part.wanted(other, 0)  # which was held since, and has the error
     near, far = (se3.exp(np.array([metres, 0.0, 0.0, 0.0, 0.0, 0.0])) for metres in (0.05, 0.5))
-    assert part.improved(np.eye(4), near, 0.6)
-    assert not part.improved(np.eye(4), near, 0.5)
-    assert not part.improved(np.eye(4), far, 0.9)
-    part.begin(held, 0.7, 0)
+    assert part.improved(np.eye(4), near, 0.6, more)
+    assert not part.improved(np.eye(4), near, 0.6, few)
+    assert not part.improved(np.eye(4), near, 0.5, more)
+    assert not part.improved(np.eye(4), far, 0.9, more)
+    part.begin(held, 0.7, more, 0)
     assert not part.wanted(held, 0)
 
 

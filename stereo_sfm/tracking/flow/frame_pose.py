@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass, field
 
@@ -64,6 +63,11 @@ class ExpectedMotion:
     def velocity(self) -> F64:
         """(6,) tangent a second."""
         return self.moved / self.seconds if self.seconds > 0 else np.zeros(6)
+
+    def to(self, pose: F64) -> ExpectedMotion:
+        """The motion from the last frame's pose to another pose (4, 4) than the expected one."""
+        moved = se3.log(se3.exp(self.moved) @ se3.inverse(self.pose) @ pose)
+        return ExpectedMotion(pose, moved, self.seconds)
 
 
 @dataclass
@@ -241,7 +245,7 @@ class FramePoseSolver:
         """The pose by all inliers of a pose that the points `by` gave; None if most of those are outliers."""
         if (first.inlier & by).sum() < max(self._config.min_features, 0.5 * by.sum()):
             return None
-        return self._optimise(tracks, dataclasses.replace(expected, pose=first.pose), first.inlier & static, expected)
+        return self._optimise(tracks, expected.to(first.pose), first.inlier & static, expected)
 
     def crowded(self, static_points: int) -> bool:
         """Whether objects that move hide so much of an open view that new points are needed in every image."""

@@ -6,6 +6,10 @@ a degree. New points inherit them. The held image, from before the cover, does n
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
+
 from stereo_sfm.tracking.flow.follower import Held
 from stereo_sfm.tracking.flow.recovery import SUFFICIENT_RECALL, within
 from stereo_sfm.types import F64
@@ -20,18 +24,30 @@ class PartialView:
 
     def __init__(self) -> None:
         self._held: Held | None = None
-        self._recall = 1.0
+        self._recall, self._sigma_m = 1.0, 0.0
         self._until_ns = 0
 
-    def begin(self, held: Held, recall: float, stamp_ns: int) -> None:
-        """A pose was found at a time, with that share of the held points; with a sufficient one it stays."""
+    def begin(self, held: Held, recall: float, covariance: F64, stamp_ns: int) -> None:
+        """A pose was found at a time, with that share of the held points; with a sufficient one it stays.
+
+        `covariance`: (6, 6) of the pose.
+        """
         self._held = held if recall < SUFFICIENT_RECALL else None
-        self._recall, self._until_ns = recall, stamp_ns + LASTS_NS
+        self._recall, self._sigma_m, self._until_ns = recall, _sigma_m(covariance), stamp_ns + LASTS_NS
 
     def wanted(self, held: Held, stamp_ns: int) -> bool:
         """Whether to look for more points: not for long, and not in an image that was held since."""
         return held is self._held and stamp_ns <= self._until_ns
 
-    def improved(self, before: F64, after: F64, recall: float) -> bool:
-        """Whether a pose (4, 4) by a share of the held points replaces the one that it was looked for from."""
-        return recall >= self._recall + MORE_RECALL and within(before, after, *SAME_PLACE)
+    def improved(self, before: F64, after: F64, recall: float, covariance: F64) -> bool:
+        """Whether a pose (4, 4) by a share of the held points replaces the one that it was looked for from.
+
+        More of a view that the camera drives out of may be fewer points: their pose (`covariance` (6, 6)) is no better.
+        """
+        better = recall >= self._recall + MORE_RECALL and _sigma_m(covariance) < self._sigma_m
+        return better and within(before, after, *SAME_PLACE)
+
+
+def _sigma_m(covariance: F64) -> float:
+    """Standard deviation of the position of a pose with covariance (6, 6)."""
+    return math.sqrt(np.trace(covariance[:3, :3]))

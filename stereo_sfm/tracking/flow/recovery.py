@@ -20,7 +20,7 @@ REACH = 3.0  # sigmas of the prediction within which hypotheses are accepted
 NEAR = 0.4  # of the median distance of the newest keyframe's corners: nearer ones may be on an occluding object
 FADING = 0.9  # factor on the number of occupied cells from keyframe to keyframe
 UNCERTAIN_M = 0.2  # standard deviation of the predicted position from which other motions are tried
-MOTIONS_AT_ONCE = 3  # of them in an image, besides the straight one
+MOTIONS_AT_ONCE = 2  # of them in an image, besides the straight ones
 GRID = (8, 6)  # columns and rows of the image in which corners are counted
 SUFFICIENT_RECALL = 0.65  # with which the search ends
 SAME_PLACE = 0.1, 0.03  # metres, radians between two hypotheses of one place
@@ -71,25 +71,28 @@ class Recovery:
         self.free = self._occupied(corners) >= FREE_SHARE * self._cells
         if self.free and expected.sigma_m > UNCERTAIN_M:
             straight, *others = self.motion.others(image.stamp_ns)
-            self._next = self._next % len(others)
-            yield from (straight, *others[self._next : self._next + MOTIONS_AT_ONCE])
+            yield from (self.motion.steady(image.stamp_ns).odom_T_cam, straight)
+            yield from (others[(self._next + k) % len(others)] for k in range(MOTIONS_AT_ONCE))
             self._next += MOTIONS_AT_ONCE
         if len(corners):
             candidates = self._places.find(_seen(image, corners), expected.odom_T_cam)
             yield from (pose for pose in candidates if expected.sigmas_off(pose) < REACH)
 
-    def possible(self, expected: Expectation, solution: PoseSolution, recall: float) -> bool:
+    def possible(
+        self, expected: Expectation, solution: PoseSolution, recall: float, steady: Expectation | None = None
+    ) -> bool:
         """Whether a pose is within reach of the prediction and supported by the points.
 
         Ceilings and shelves repeat: the share of inliers among the found points counts, and the `recall`, the share of
-        the view in which the points are found that should be.
+        the view in which the points are found that should be. Where a `steady` motion ends, a repeated ceiling is
+        seen by chance only.
         """
         share = solution.inliers / max(len(solution.error), 1)
         if solution.inliers < MIN_INLIERS or share < MIN_INLIER_SHARE:
             return False
-        off = expected.sigmas_off(solution.pose)
-        needed = MIN_RECALL + RECALL_PER_METRE * min(expected.sigma_m, MAX_SIGMA_M) + RECALL_PER_SIGMA * off
-        return off < REACH and recall >= needed
+        predictions = [expected] if steady is None or steady.sigmas_off(solution.pose) > REACH else [expected, steady]
+        needed = min(_recall_needed(prediction, solution.pose) for prediction in predictions)
+        return expected.sigmas_off(solution.pose) < REACH and recall >= needed
 
     def best(self, found: list[tuple[Tracks, PoseSolution, float]]) -> tuple[Tracks, PoseSolution, float] | None:
         """The pose with the highest recall, which is the third of each; None if another place has nearly as much."""
@@ -104,6 +107,12 @@ class Recovery:
         uv = corners.uv_left[np.linalg.norm(corners.points_cam, axis=1) > self._near]
         column, row = (np.clip(uv[:, k] * GRID[k] / self._size[k], 0, GRID[k] - 1).astype(np.int64) for k in (0, 1))
         return len(np.unique(row * GRID[0] + column))
+
+
+def _recall_needed(prediction: Expectation, pose: F64) -> float:
+    """The least recall of a pose (4, 4)."""
+    off = RECALL_PER_SIGMA * prediction.sigmas_off(pose)
+    return MIN_RECALL + RECALL_PER_METRE * min(prediction.sigma_m, MAX_SIGMA_M) + off
 
 
 def within(a: F64, b: F64, metres: float, radians: float) -> bool:

@@ -318,6 +318,7 @@ class Tracker:
         """Relocalize a lost camera with the points of the last trusted image, from several hypotheses of its pose."""
         self._hold_more()
         expected = self._expect(image.stamp_ns)
+        steady = self._recovery.motion.steady(image.stamp_ns) if self._sensors is None else None
         seconds = (image.stamp_ns - self._stamp_ns) * 1e-9
         tried, refined, seen = list[F64](), list[F64](), None
         found: list[tuple[Tracks, PoseSolution, float]] = []
@@ -331,7 +332,7 @@ class Tracker:
                 seen = self._new_points.seen(images) if seen is None else seen
                 found_again, recall = tracks.uv[solution.inlier], self._recall(tracks, solution)
                 uncovered = self._follower.recall(found_again, solution.pose, seen, CELLS_PER_METRE * expected.sigma_m)
-                if self._recovery.possible(expected, solution, uncovered):
+                if self._recovery.possible(expected, solution, uncovered, steady):
                     found.append((tracks, solution, recall))
                     if recall >= SUFFICIENT_RECALL:
                         break
@@ -339,7 +340,7 @@ class Tracker:
         if best is None:
             return NOT_FOUND
         tracks, solution, recall = best
-        self._part.begin(self._follower.held, recall, image.stamp_ns)
+        self._part.begin(self._follower.held, recall, solution.covariance, image.stamp_ns)
         return tracks, solution
 
     def _find_more(self, image: StereoImage, images: StereoPyramids, pose: F64) -> tuple[Tracks, PoseSolution] | None:
@@ -350,9 +351,9 @@ class Tracker:
         if solution.reason:
             return None
         recall = self._recall(tracks, solution)
-        if not self._part.improved(pose, solution.pose, recall):
+        if not self._part.improved(pose, solution.pose, recall, solution.covariance):
             return None
-        self._part.begin(self._follower.held, recall, image.stamp_ns)
+        self._part.begin(self._follower.held, recall, solution.covariance, image.stamp_ns)
         return tracks, solution
 
     def _recall(self, tracks: Tracks, solution: PoseSolution) -> float:

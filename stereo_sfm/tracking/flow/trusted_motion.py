@@ -21,6 +21,7 @@ MAX_SPEED_CHANGE = 0.5  # m/s
 TURN_ACCELERATION = 1.0  # rad/s^2, standard deviation
 MAX_TURN_RATE_CHANGE = 0.7  # rad/s
 MAX_TURN_RATE, TURN_STEP = 1.0, np.deg2rad(20.0)  # rad/s, radians: turns that are tried
+STEADY_SPEED, STEADY_TURN_RATE = 0.05, 0.05  # m/s, rad/s, standard deviations of a motion that goes on as before
 SLOWER = 0.5, 0.0  # shares of the last speed that are tried
 UNKNOWN_SPEED, UNKNOWN_TURN_RATE = 1.0, 0.5  # m/s, rad/s, standard deviations before any motion was seen
 FIRST_SIGMAS = (0.01, 0.005)  # metres, radians: of the last trusted pose and its velocity
@@ -92,8 +93,18 @@ class TrustedMotion:
             metres, radians = metres + UNKNOWN_SPEED * seconds, radians + UNKNOWN_TURN_RATE * seconds
         return Expectation(last @ se3.exp(moved), FIRST_SIGMAS[0] + metres, FIRST_SIGMAS[1] + radians)
 
+    def steady(self, stamp_ns: int) -> Expectation:
+        """The pose at a time if the robot goes on straight at its speed, which most do most of the time."""
+        last_ns, last = self._poses[-1]
+        seconds = max((stamp_ns - last_ns) * 1e-9, 0.0)
+        forward = self.velocity() * ([1.0] * 3 + [0.0] * 3) * seconds
+        sigmas = FIRST_SIGMAS[0] + STEADY_SPEED * seconds, FIRST_SIGMAS[1] + STEADY_TURN_RATE * seconds
+        return Expectation(last @ se3.exp(forward), *sigmas)
+
     def others(self, stamp_ns: int) -> list[F64]:
         """Poses (4, 4) at a time after other motions that a robot is capable of, on arcs; the straight one first.
+
+        All of them begin at the last speed, which decreases exponentially.
 
         The camera is taken to be upright: a robot turns about its y axis.
         """
@@ -103,8 +114,7 @@ class TrustedMotion:
         forward = self.velocity() * ([1.0] * 3 + [0.0] * 3) * fade
         turns = np.arange(TURN_STEP, MAX_TURN_RATE * seconds + 0.5 * TURN_STEP, TURN_STEP)
         arcs = [(1.0, side * turn) for turn in turns.tolist() for side in (1.0, -1.0)]
-        steady = seconds / fade if fade > 0 else 1.0
-        motions = [(1.0, 0.0), *((speed, 0.0) for speed in (steady, *SLOWER)), *arcs]
+        motions = [(1.0, 0.0), *((speed, 0.0) for speed in SLOWER), *arcs]
         return [last @ se3.exp(speed * forward + [0, 0, 0, 0, turn, 0]) for speed, turn in motions]
 
 
