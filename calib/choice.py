@@ -65,6 +65,10 @@ class Estimate:
         value[at], covariance[at[:, None], at] = inside @ vector[at], inside
         return Estimate(value, covariance)
 
+    def by(self, basis: F64) -> Estimate:
+        """The estimate of `basis` (8, 8) times the terms."""
+        return Estimate(basis @ self.value, basis @ self.covariance @ basis.T)
+
     @property
     def sigma(self) -> F64:
         """(8,) standard deviations."""

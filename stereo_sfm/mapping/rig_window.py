@@ -26,6 +26,7 @@ from stereo_sfm.types import F64, I64, RIG_TERMS, Keyframe
 MIN_POINTS = 20
 MAX_POINTS = 160
 STEPS = 4  # of Gauss-Newton
+DERIVATIVE = 1e-5  # radians or ratio: step of numerical derivatives
 INFLATION = 2.0  # factor on the deviation of the matches' errors, which are correlated, as in `calib.consistency`
 NOISE_PX = 0.05, 5.0  # limits of the estimated noise of one coordinate
 # Prior standard deviations of the terms: radians, radians, ratio, radians.
@@ -65,6 +66,7 @@ class RigWindow:
     stamp_ns: int  # of the last keyframe
     information: RigInformation
     noise_px: float
+    length: F64  # (8,) relative change of lengths by each term, per radian or ratio
 
 
 @dataclass(eq=False)
@@ -100,7 +102,21 @@ def solve_window(rig: Rig, keyframes: Sequence[Keyframe], terms: F64) -> RigWind
     sigma = float(np.clip(system.noise_px, *NOISE_PX))
     information = system.information(problem, terms).with_lens_error(_turned(keyframes))
     last = keyframes[-1]
-    return RigWindow(keyframes[0].kf_id, last.kf_id, last.stamp_ns, information, sigma)
+    length = _length_by_terms(rig, problem.uv_left[0], problem.uv_right[0])
+    return RigWindow(keyframes[0].kf_id, last.kf_id, last.stamp_ns, information, sigma, length)
+
+
+def _length_by_terms(rig: Rig, uv_left: F64, uv_right: F64) -> F64:
+    """(8,) relative change by each term of the motion that the rig measures with these points (N, 2), least squares.
+
+    Points move in the image by the step times their inverse distance rho: step ~ sum(rho flow) / sum(rho^2).
+    """
+    rho = inverse_distances(rig, uv_left, uv_right)
+    used = np.isfinite(rho)
+    steps: F64 = DERIVATIVE * np.eye(RIG_TERMS)
+    by_terms = [inverse_distances(with_terms(rig, step), uv_left, uv_right) - rho for step in steps]
+    change = np.array([(rho * d)[used & np.isfinite(d)].sum() for d in by_terms])
+    return -change / (DERIVATIVE * max(float((rho[used] ** 2).sum()), 1e-12))
 
 
 def _problem(rig: Rig, keyframes: Sequence[Keyframe]) -> _Problem | None:

@@ -1,11 +1,13 @@
 """Self-calibration: corrections of the rig estimated from the keyframes during mapping.
 
 Every few keyframes with motion form a window (`mapping.rig_window`); the information of the windows about the terms
-is summed. Terms are corrected that differ from the current ones by several standard deviations, that both halves of the
-windows (even and odd ones) confirm, and that exceed the systematic error of matching (`calib.choice`). A corrected term
-is refined as long as windows come, first whenever their number has doubled. Where the windows show drift (temperature),
-the terms at the newest window are used for the keyframes since the last revision. If the newest windows contradict all
-earlier ones, the rig has changed (a knock): earlier windows are discarded, and the correction applies from there on.
+is summed. Terms are corrected that differ from the current ones by several standard deviations, that both halves of
+the windows (even and odd ones) confirm, and that exceed the systematic error of matching (`calib.choice`). Once one is,
+others follow that are worth their variance. The rows show terms of lenses, which change lengths by what the lens model
+says of disparities: lengths stay unless there is evidence about them. A corrected term is refined as long as windows
+come, first whenever their number has doubled. Where the windows show drift (temperature), the terms at the newest
+window are used for the keyframes since the last revision. If the newest windows contradict all earlier ones, the rig
+has changed (a knock): earlier windows are discarded, and the correction applies from there on.
 """
 
 from __future__ import annotations
@@ -16,12 +18,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stereo_sfm.calib.choice import NAMES, SCALES, UNITS, Choice, Estimate, choose, significant
+from stereo_sfm.calib.choice import NAMES, SCALES, UNITS, Estimate, choose, significant
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.mapping.rig_window import PRIOR, RigInformation, RigWindow, solve_window
 from stereo_sfm.types import F64, RIG_TERMS, Keyframe
 
+OF_LENSES = slice(5, 8)  # focal ratio and decentering
 KEYFRAMES = 4  # of one window
 MIN_KEYFRAMES = 3  # of the last window
 MIN_MOTION = 0.02  # of the image's width: median motion of common points from one keyframe of a window to the next
@@ -35,7 +38,8 @@ STRADDLING_SIGMAS = 2.0  # by which a window during which the rig changed differ
 BEFORE_STEP = 4  # earlier windows needed to detect a step
 DRIFT_WINDOWS = 8  # needed to detect drift
 RATE = np.deg2rad(0.1) / 60.0  # prior standard deviation of drift, radians (ratio) per second
-SIGMAS = 5.0  # significance of the first correction of a term
+SIGMAS = 5.0  # significance of the first term that is corrected
+FURTHER_SIGMAS = np.sqrt(2.0)  # of others, once the calibration is known to be wrong (Akaike's criterion)
 REFINED_SIGMAS = 1.0  # its refinement: below, a change is not worth the bundle adjustment
 MATCHING_PX = 0.02  # systematic error of matching
 DIRECTION = np.deg2rad(0.15)  # systematic error of the baseline's direction: matching errors that depend on distance
@@ -126,20 +130,34 @@ class SelfCalibration:
         drifts = self._drifts(windows)
         parts = [windows, windows[::2], windows[1::2] or windows]  # one window: what a step has left
         whole, *halves = [self._at_the_end(part, windows)[0] if drifts else self.estimate(part) for part in parts]
-        sigmas = np.where(self._corrected, REFINED_SIGMAS, first_sigmas)
+        others = FURTHER_SIGMAS if self._corrected.any() else first_sigmas
+        sigmas = np.where(self._corrected, REFINED_SIGMAS, others)
         rolling = self._rig.readout_s > 0
         since = windows[-min(MAX_BETWEEN, len(windows))].first_kf_id if drifts else self._since
         corrected = bool(self._corrected.any())
         self._until_due = min(len(windows), MAX_BETWEEN) if corrected or len(windows) >= ENOUGH_WINDOWS else 1
-        choice = choose(whole, halves, rolling, sigmas, self._corrected)
+        basis = self._basis(windows)
+        choice = choose(whole.by(basis), [h.by(basis) for h in halves], rolling, sigmas, self._corrected)
         if not choice.written.any():
             return None
         why = "drift" if drifts else "refined" if self._corrected[choice.written].all() else "significant"
         why = "step" if self._stepped else why
-        self.terms = self.terms + choice.value
+        change: F64 = np.asarray(np.linalg.solve(basis, choice.value), float)
+        self.terms = self.terms + change
         self._corrected |= choice.written
         self._stepped = False
-        return Revision(self.terms.copy(), whole.covariance, since, why, _text(choice))
+        return Revision(self.terms.copy(), whole.covariance, since, why, _text(change, choice.sigma))
+
+    def _basis(self, windows: Sequence[RigWindow]) -> F64:
+        """(8, 8) from the terms to those that are chosen: instead of the rotation about y, the one that changes lengths
+        as much as it and the terms of lenses together, so that they stay where it is held. With a rolling shutter
+        motion can mimic it (`calib.choice`), and the terms are chosen as they are.
+        """
+        basis = np.eye(RIG_TERMS)
+        length = np.mean([w.length for w in windows], axis=0)
+        if self._rig.readout_s == 0 and abs(length[1]) > 1e-9:
+            basis[1, OF_LENSES] = length[OF_LENSES] / length[1]
+        return basis
 
     def _drifts(self, windows: Sequence[RigWindow]) -> bool:
         """Whether the terms change steadily over the windows."""
@@ -203,9 +221,9 @@ def _moved(a: Keyframe, b: Keyframe, min_px: float) -> bool:
     return bool(np.median(np.linalg.norm(a.uv_left[at] - b.uv_left[of], axis=1)) > min_px)
 
 
-def _text(choice: Choice) -> str:
+def _text(change: F64, sigma: F64) -> str:
     parts = [
-        f"{NAMES[i]} {SCALES[i] * choice.value[i]:+.3f} +- {SCALES[i] * choice.sigma[i]:.3f} {UNITS[i]}"
-        for i in np.flatnonzero(choice.written)
+        f"{NAMES[i]} {SCALES[i] * change[i]:+.3f} +- {SCALES[i] * sigma[i]:.3f} {UNITS[i]}"
+        for i in np.flatnonzero(change)
     ]
     return "; ".join(parts)
