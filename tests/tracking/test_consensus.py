@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -69,6 +71,19 @@ def test_settled_points_decide_against_more_young_ones(seed: int) -> None:
     assert np.sqrt(np.trace(solution.covariance[:3, :3])) < 0.01
     solver.learn(tracks, solution, expected)
     assert solver.alert
+
+
+def test_a_pose_that_more_points_support_is_taken_without_a_second_motion(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Among people the solution with all points may end at a pose that is neither theirs nor the camera's."""
+    tracks, on_person = scene(np.random.default_rng(0))
+    tracks = tracks.keep(~on_person)
+    solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
+    expected = ExpectedMotion(MOVED @ se3.exp(np.full(6, 0.002)), np.zeros(6), SECONDS)
+    right = solver.solve(tracks, expected, np.eye(4))
+    between = dataclasses.replace(right, error=np.where(np.arange(len(tracks)) < 0.6 * STILL, right.error, np.inf))
+    between.pose = MOVED @ se3.exp(np.array([0.0, 0.0, -0.03, 0.0, 0.0, 0.0]))
+    monkeypatch.setattr(solver, "_solve_all", lambda *_: between)  # pyright: ignore[reportUnknownLambdaType]
+    assert off(solver.solve(tracks, expected, np.eye(4), before=STILL).pose) < 0.005
 
 
 def test_the_motion_to_another_pose_begins_at_the_same_one() -> None:

@@ -152,7 +152,8 @@ class FramePoseSolver:
             return best
         chosen = self._choose(tracks, expected, last_pose, best, rest)
         disturbed = self.alert or len(chosen.moving) > 0
-        chosen = chosen if disturbed else best
+        if not disturbed and chosen.inlier[static].sum() <= WEIGHT_RATIO * best.inlier[static].sum():
+            chosen = best
         few = (chosen.inlier & static).sum() < MIN_OPEN_SHARE * self.open_view
         if not few or (usual and not disturbed):
             return chosen
