@@ -17,6 +17,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+os.environ.setdefault("NUMBA_DISABLE_ERROR_MESSAGE_HIGHLIGHTING", "1")  # of errors while types are tried: 2 % of time
+
 import numba
 from numba.core import config, event
 from numba.core.caching import UserProvidedCacheLocator
@@ -86,8 +88,18 @@ _KEPT = _prepare()
 
 
 def jit(**options: Any) -> Any:
-    """`numba.njit` with the options, its results kept where there is a place for them."""
-    return numba.njit(cache=_KEPT, **options)
+    """`numba.njit` with the options, its results kept where there is a place for them.
+
+    Nothing calls kernels by the address that C would need: making it would take 4 % of the compilation.
+    """
+    options |= {"cache": _KEPT, "no_cfunc_wrapper": True}
+    return numba.njit(**options)
+
+
+def compiled(kernel: Any) -> bool:
+    """Whether an earlier process has kept the code of a kernel."""
+    name = kernel.py_func.__qualname__
+    return any(Path(kernel.stats.cache_path).glob(f"{Path(kernel.py_func.__code__.co_filename).stem}.{name}-*.nbi"))
 
 
 class Compilation(event.Listener):

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from stereo_sfm import kernel_cache
@@ -55,6 +56,16 @@ def test_code_compiled_at_the_installation_is_reused(tmp_path: Path) -> None:
     copy_compiled(tmp_path, tmp_path / "kept")
     copy_compiled(tmp_path, tmp_path / "kept")
     assert [p.read_bytes() for p in (tmp_path / "kept").rglob("*.nbi")] == [b"index"]
+
+
+def test_whether_a_kernel_is_compiled_is_seen_in_its_folder() -> None:
+    from stereo_sfm.geometry.hamming import hamming
+
+    words = np.array([[0, 1, 2, 3]], np.uint64)
+    hamming(words, 0, words, 0)
+    assert kernel_cache.compiled(hamming)
+    never = kernel_cache.jit()(lambda x: x + 1)
+    assert not kernel_cache.compiled(never)
 
 
 def test_compilations_are_reported() -> None:

@@ -64,6 +64,11 @@ class RunOptions:
 
 def execute(options: RunOptions) -> tuple[int, Path]:
     """Run, write the output folder, print the closing summary: the exit code and the folder."""
+    wiring = _wiring(options)
+    if not wiring.inline:
+        from stereo_sfm.pipeline.fork_server import start_context
+
+        start_context(options.config.pipeline.threads)  # loads code while this process does
     from stereo_sfm.calib.camera_store import CorrectionKeeper
     from stereo_sfm.drivers.choice import SourceChoice
     from stereo_sfm.eval.record import RunRecord
@@ -77,7 +82,7 @@ def execute(options: RunOptions) -> tuple[int, Path]:
     o.source.refuse_to_overwrite(o.output)
     record = RunRecord.of(o.config, o.folders.localize_only)
     match_images, stepper = _match_images(o.matches), _stepper(o)
-    shown, wiring = CompilationProgress(), _wiring(o)
+    shown = CompilationProgress()
     sinks = [*_sinks(o, record, match_images), shown]
     session = Session(o.source, o.config, sinks, wiring, o.folders, o.output, o.overwrite, o.replayed)
     with StopRequest(INLINE_END_S if wiring.inline else 0.0) as stop, closing(session):

@@ -12,8 +12,35 @@ from stereo_sfm.types import F64
 
 @njit
 def median(values):
-    """Median of values (N,), N > 0."""
-    return np.median(values)
+    """Median of values (N,), N > 0. Numba's takes five times as long to compile.
+
+    By Hoare's selection (Algorithm 65, CACM 4, 1961) in Wirth's form.
+    """
+    rest = np.empty(len(values))
+    for i in range(len(values)):
+        rest[i] = values[i]
+    half, low, high = len(values) // 2, 0, len(values) - 1
+    while low < high:  # nothing before `low` is larger, nothing behind `high` smaller than what is between them
+        pivot, i, j = rest[half], low, high
+        while i <= j:
+            while rest[i] < pivot:
+                i += 1
+            while pivot < rest[j]:
+                j -= 1
+            if i <= j:
+                rest[i], rest[j] = rest[j], rest[i]
+                i += 1
+                j -= 1
+        if j < half:
+            low = i
+        if half < i:
+            high = j
+    if len(values) % 2:
+        return rest[half]
+    below = rest[0]
+    for i in range(1, half):
+        below = max(below, rest[i])
+    return (below + rest[half]) / 2
 
 
 def percentile(values: F64, percent: float) -> float:
@@ -33,4 +60,4 @@ def median_distance(a, b, counted):
         if counted[k]:
             distance[n] = np.sqrt((a[k, 0] - b[k, 0]) ** 2 + (a[k, 1] - b[k, 1]) ** 2)
             n += 1
-    return np.median(distance[:n]) if n else np.inf
+    return median(distance[:n]) if n else np.inf

@@ -30,6 +30,7 @@ from stereo_sfm.types import Applied, Trajectory
 NICENESS = {"logger": 2, "mapper": 4, "loop": 6, "optimizer": 8}
 LOWEST_PRIORITY = 19
 AT_CAMERA_RATE = "capture", "tracker"  # their arrays are of the same sizes with every image
+HELPER = "loop"  # compiles a part of what the tracker needs in a first run, before its own kernels
 UPSTREAM_LOST = 70  # exit code of a worker that ended because another one died
 
 
@@ -95,12 +96,15 @@ class Ready:
 
 
 def ready(stage: str, setup: Setup, to_main: Outbox) -> None:
-    """Load the stage's code and send `Ready`."""
+    """Load the stage's code and send `Ready`; one helps the tracker first."""
     from stereo_sfm.kernel_cache import listening
+    from stereo_sfm.pipeline.first_kernels import help_tracker
     from stereo_sfm.pipeline.warm_up import warm_up_stage
 
     with listening(lambda kernel: to_main.send(Compiling(stage, kernel))):
-        warm_up_stage(stage, setup.config, setup.rig)
+        if stage == HELPER:
+            help_tracker(setup.config, setup.rig)
+        warm_up_stage(stage, setup.config, setup.rig, patient=not setup.realtime)
     to_main.send(Ready(stage))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import pickle
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -94,6 +95,9 @@ class ProcessRun:
         self._ended: set[str] = set()
         self._early_messages: list[object] | None = []  # while the source was opened
         self._not_ready = {"tracker", "mapper", "loop"}
+        self._capturing = False
+        self._ready_s = math.inf  # when the last of them was ready
+        self._held: dict[str, list[object]] = {}  # requests to a stage that begins later than others
         self._set_up_sent = False  # before it, capture takes no other message
         self._saving_at_end = False  # an urgent save was requested, and is not done
         self._stopped_s: float | None = None  # when a stop was requested
@@ -172,6 +176,9 @@ class ProcessRun:
     def _take(self, connection: Connection, data: bytes) -> Frame | None:
         """One pickled message of a stage; returned when it is a frame."""
         message = pickle.loads(data)
+        if isinstance(message, Heartbeat):  # a step that waits for code which another stage compiles is not long
+            since_ready_s = max(time.monotonic() - self._ready_s, 0.0)
+            message = Heartbeat(message.stage, min(message.step_s, since_ready_s))
         self._watchdog.received(self._stages.reports[connection], message)
         if isinstance(message, Heartbeat):
             return None
@@ -225,10 +232,10 @@ class ProcessRun:
         if waited_s > STOP_GRACE_S and "capture" in self._stages.waiting:
             self._stages.processes["capture"].kill()  # it is waiting for an image
             return
-        hurry = bool(silent) or self._folders.map_out is None
+        hurry = bool(silent) or self._folders.map_out is None or bool(self._not_ready)
         if self._saving_at_end and not silent and waited_s <= SAVE_END_S:
             return
-        if waited_s > END_S and hurry and (self._live or now - self._progress_s > END_S):
+        if waited_s > END_S and hurry and (self._live or self._not_ready or now - self._progress_s > END_S):
             self._end_now()
 
     def _end_now(self) -> None:
@@ -270,17 +277,37 @@ class ProcessRun:
             opening=self._folders.opening(self._opener.opening(info.rig)),
         )
         jpeg = self._log is not None and self._log.image_format == "jpeg"
-        self._stages.request_all(lambda stage: (setup, jpeg) if stage == "capture" else setup)
+        if not self._live:
+            self._held["mapper"] = [setup]
+        for stage in self._stages.processes.keys() - self._held.keys():
+            self._stages.request(stage, (setup, jpeg) if stage == "capture" else setup)
         self._set_up_sent = True
         if self._stopped_s is not None:
             self._stages.request("capture", "stop")  # requested while the source was being opened
 
     def _begin(self, stage: str) -> None:
-        """Start capture when the last of the other stages is ready."""
+        """Start capture when the tracker is ready, of a live camera when every stage is: its images do not wait.
+
+        Until the tracker is ready, the mapper leaves it the processor.
+        """
         self._not_ready.discard(stage)
         if not self._not_ready:
-            self.began_s = time.perf_counter()
+            self.began_s, self._ready_s = time.perf_counter(), time.monotonic()
+        if "tracker" not in self._not_ready:
+            for held, requests in self._held.items():
+                for request in requests:
+                    self._stages.request(held, request)
+            self._held.clear()
+        if not self._capturing and not (self._not_ready if self._live else {"tracker"} & self._not_ready):
+            self._capturing = True
             self._stages.request("capture", "go")
+
+    def _request(self, stage: str, message: object) -> None:
+        """Send a stage a request, after its set-up."""
+        if stage in self._held:
+            self._held[stage].append(message)
+        else:
+            self._stages.request(stage, message)
 
     def _first_report(self) -> SourceInfo:
         """The first message of capture: what the source is, or why it cannot be opened."""
@@ -361,11 +388,11 @@ class ProcessRun:
         Args: folder, replaced. urgent: the run is about to be stopped, which then waits for it up to `SAVE_END_S`.
         """
         self._saving_at_end |= urgent
-        self._stages.request("mapper", SaveMap(folder, urgent))
+        self._request("mapper", SaveMap(folder, urgent))
 
     def relocalize(self) -> None:
         """Request that the whole saved map is searched for the camera with the next keyframe."""
-        self._stages.request("mapper", Relocalize())
+        self._request("mapper", Relocalize())
 
     def _end(self, connection: Connection, stage: str) -> None:
         self._ended.add(stage)
@@ -388,7 +415,7 @@ class ProcessRun:
         if stage == "logger" and self._live:
             self._give_up_log(f"the {stage} process {self._stages.how_it_died(stage)}")
             return
-        if stage == "capture" and (self._stopped_s is not None or not self._not_ready):
+        if stage == "capture" and (self._stopped_s is not None or self._capturing):
             if self._stopped_s is None:
                 died = self._stages.how_it_died(stage)
                 self._failure = StageDied(f"the {stage} process {died}; {self._what_remains(stage)}")
@@ -414,7 +441,7 @@ class ProcessRun:
             self._stages.reports.pop(connection)
             self._give_up_log(f"the logger failed: {failed.message.strip().splitlines()[-1]}")
             return
-        if failed.stage == "capture" and not self._not_ready:
+        if failed.stage == "capture" and self._capturing:
             self._failure = _error(failed)
             self._end(connection, failed.stage)
             return

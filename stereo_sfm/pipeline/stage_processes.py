@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-import multiprocessing
 import os
 import resource
 import signal
 import time
 from collections.abc import Callable, Set
 from multiprocessing.connection import Connection
-from multiprocessing.context import ForkServerContext, SpawnContext
 from multiprocessing.process import BaseProcess
 from typing import Any
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.pipeline import child
+from stereo_sfm.pipeline.fork_server import start_context
 from stereo_sfm.pipeline.interrupts import ignored_by_children
 from stereo_sfm.pipeline.threads import thread_environment
 
@@ -33,7 +32,7 @@ class StageProcesses:
 
     def __init__(self, threads: int) -> None:
         """Args: threads, that numeric libraries may use in each process."""
-        self._context, self._threads = _context(), threads
+        self._context, self._threads = start_context(threads), threads
         self.processes: dict[str, BaseProcess] = {}
         self.reports: dict[Connection, str] = {}
         self._controls: dict[str, Connection] = {}
@@ -75,11 +74,6 @@ class StageProcesses:
         """Send a stage a request; nothing where it has ended: its report gives the reason."""
         with contextlib.suppress(OSError, KeyError):
             self._controls[stage].send(message)
-
-    def request_all(self, message: Callable[[str], object]) -> None:
-        """Send every stage a request of its own."""
-        for stage in self._controls:
-            self.request(stage, message(stage))
 
     def forget(self, stage: str) -> None:
         """Receive no more messages of a stage."""
@@ -126,18 +120,6 @@ class StageProcesses:
             for connection in (*self.reports, *self._controls.values()):
                 connection.close()
             self.reports.clear()
-
-
-def _context() -> SpawnContext | ForkServerContext:
-    """How stages are started: forked from a process that has loaded their code and started no thread, where possible.
-
-    They share its memory, and none takes a second to load the same code.
-    """
-    if "forkserver" not in multiprocessing.get_all_start_methods():
-        return multiprocessing.get_context("spawn")
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["stereo_sfm.pipeline.preload"])
-    return context
 
 
 def raise_file_limit(least: int) -> None:

@@ -116,8 +116,11 @@ def _warm_up_inertial(imu: Imu) -> None:
         motion.accept(at + NODE_NS, np.eye(4))
 
 
-def warm_up_stage(stage: str, config: Config, rig: Rig) -> None:
-    """Load (the first time ever: compile) what `stage` calls, on a scratch instance of it."""
+def warm_up_stage(stage: str, config: Config, rig: Rig, patient: bool = False) -> None:
+    """Load (the first time ever: compile) what `stage` calls, on a scratch instance of it.
+
+    Args: patient, images may wait for what is rarely called, until it is.
+    """
     from stereo_sfm.loop.database import PlaceDatabase
     from stereo_sfm.mapping.mapper import Mapper
     from stereo_sfm.mapping.rig_window import solve_window
@@ -131,7 +134,8 @@ def warm_up_stage(stage: str, config: Config, rig: Rig) -> None:
             if keyframe is not None:
                 tracker.describe(keyframe)
         dominant_direction(np.eye(MIN_POINTS, 2))  # of shelves, which the wall may be too far away to be
-        warm_up_fast_motion(config, rig, seen[-1].left)
+        if not patient:
+            warm_up_fast_motion(config, rig, seen[-1].left)
     elif stage == "mapper" and rig.stereo:
         mapper = Mapper(config.mapper, rig, NoSpans(), config.loop)
         for keyframe in keyframes(rig):

@@ -55,6 +55,20 @@ loaded = set(sys.modules)
 warm_up_stage("loop", Config(), RIGS["ideal"])
 print(*sorted(m for m in set(sys.modules) - loaded if m.startswith(("numba.cpython.", "numba.np."))))
 """
+SHARED = """
+import sys
+from numba.core.dispatcher import Dispatcher
+from stereo_sfm.config import Config
+from stereo_sfm.pipeline.first_kernels import compile_share
+from stereo_sfm.pipeline.warm_up import warm_up_stage
+from tests.calib.test_formats import RIGS
+
+warm_up_stage("tracker", Config(), RIGS[sys.argv[1]])
+late, load = [], Dispatcher.compile
+Dispatcher.compile = lambda self, signature: late.append(self.py_func.__name__) or load(self, signature)
+compile_share(Config(), RIGS[sys.argv[1]])
+print(*sorted(set(late)))
+"""
 SIMULATED = "sim:people?frames=40&size=320x200&vibration=2"
 
 
@@ -80,6 +94,13 @@ def test_nothing_is_compiled_after_the_warm_up(source: str) -> None:
 @pytest.mark.parametrize("name", ["euroc_mh01", "kitti", "rgbd_dataset_freiburg1_xyz", "store_walk"])
 def test_nothing_is_compiled_after_the_warm_up_of_a_real_camera(name: str, data_root: Path) -> None:
     assert late_kernels(str(data_root / name)) == []
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_a_helper_compiles_only_what_the_tracker_needs(rig: str) -> None:
+    child = subprocess.run([sys.executable, "-c", SHARED, rig], capture_output=True, text=True, env=dict(os.environ))
+    assert child.returncode == 0, child.stderr
+    assert child.stdout.split() == []
 
 
 @pytest.mark.parametrize("rig", RIGS)
