@@ -71,7 +71,7 @@ def _compile_flow(config: Config, rig: Rig, pyramid: Pyramid) -> None:
     area = VisibleArea(rig.left, config.tracker.max_angle_deg)
     follower = Follower(config.tracker, rig, area, RollingShutter(rig))
     tracks = _tracks(rig)
-    rows, slots = follower.begin(pyramid, tracks.uv)
+    rows, slots = follower.begin(pyramid, tracks.uv, np.eye(4))
     tracks = replace(tracks.keep(np.isin(np.arange(len(tracks)), rows)), slot=slots)
     follower.accept(pyramid, tracks)
     expected = ExpectedMotion(np.eye(4), np.zeros(6), SECONDS)
