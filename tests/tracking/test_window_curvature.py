@@ -43,8 +43,7 @@ def curvatures(camera: Camera, uv: F64, warp: F64) -> F64:
     odom_T_new = se3.inverse(NEW_T_OLD)
     window_curvatures(
         np.arange(len(uv)), window_rays(camera, uv, np.eye(3)), np.zeros((len(uv), 3)),
-        rays / (rays @ FLOOR)[:, None], warp, odom_T_new[:3, :3].T.copy(), odom_T_new[:3, 3].copy(), camera.model_id,
-        camera.params, out,
+        rays / (rays @ FLOOR)[:, None], warp, odom_T_new, odom_T_new, camera.model_id, camera.params, out,
     )  # fmt: skip
     return out
 

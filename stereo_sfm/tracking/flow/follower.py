@@ -78,12 +78,11 @@ class Follower:
         self._first_level = self._coarsest_level  # of the pyramid, at which the search starts
         self._miss_px = np.inf  # median error of the predictions
 
-    def follow(self, tracks: Tracks, pyramid: klt.Pyramid, expected: ExpectedMotion) -> Tracks:
-        """The tracks found in the new left image, at their new pixels."""
-        assert self._last is not None
+    def follow(self, tracks: Tracks, last_pose: F64, pyramid: klt.Pyramid, expected: ExpectedMotion) -> Tracks:
+        """The tracks of the last image, which has a pose (4, 4), found in the new left image, at their new pixels."""
         guess = self._shutter.project(expected.pose, expected.velocity, tracks.points(), tracks.uv)
         guess = np.where(np.isfinite(guess), guess, tracks.uv)
-        return self._find(self._last, tracks, pyramid, expected.pose, guess)
+        return self._find(tracks, last_pose, pyramid, expected.pose, guess)
 
     @property
     def held(self) -> Held:
@@ -129,7 +128,7 @@ class Follower:
             pyramid[1], guess[rows], warps @ tracks.warp, tracks.slot, self._patches.patch, radius, step, uv, warp
         )
         self.search_widely()
-        curvature = self._curvatures(tracks, warp, pose)
+        curvature = self._curvatures(tracks, self.held.pose, pose)
         return self._kept(tracks, *self._align(pyramid, uv, warp, curvature, tracks.slot, ncc > MIN_COARSE_NCC))
 
     def recall(self, found: F64, pose: F64, seen: F64 | None = None, cells_needed: float = 1.0) -> float:
@@ -180,18 +179,18 @@ class Follower:
         inside[inside] = self._area.inside(uv[inside])
         return inside & np.isfinite(warps).all(axis=(2, 3)).any(axis=0)
 
-    def _find(self, last: klt.Pyramid, tracks: Tracks, pyramid: klt.Pyramid, pose: F64, guess: F64) -> Tracks:
-        """Find points of one image in another, taken at about a pose (4, 4), starting at guesses (N, 2) px.
+    def _find(self, tracks: Tracks, last_pose: F64, pyramid: klt.Pyramid, pose: F64, guess: F64) -> Tracks:
+        """Find points of the last image in another, taken at about a pose (4, 4), starting at guesses (N, 2) px.
 
         Where the predictions are good, first appearances are aligned from there; what that misses, and all points
         otherwise, is first followed by translation from the last image.
         """
         near = np.full(len(guess), self._miss_px < ALIGNED_PX)
-        warp, curvature = tracks.warp, self._curvatures(tracks, tracks.warp, pose)
+        warp, curvature = tracks.warp, self._curvatures(tracks, last_pose, pose)
         uv, deformed, found = self._align(pyramid, guess, warp, curvature, tracks.slot, near)
         missed = np.flatnonzero(~found)
         if len(missed):
-            moved, followed = self._translate(last, tracks.uv[missed], pyramid, guess[missed])
+            moved, followed = self._translate(tracks.uv[missed], pyramid, guess[missed])
             aligned = self._align(pyramid, moved, warp[missed], curvature[missed], tracks.slot[missed], followed)
             uv[missed], deformed[missed], found[missed] = aligned
         self._miss_px = median_distance(uv, guess, found)
@@ -204,20 +203,21 @@ class Follower:
         out.uv, out.warp = uv[found], warp[found]
         return out
 
-    def _translate(self, last: klt.Pyramid, uv: F64, pyramid: klt.Pyramid, guess: F64) -> tuple[F64, Bool]:
+    def _translate(self, uv: F64, pyramid: klt.Pyramid, guess: F64) -> tuple[F64, Bool]:
         """Pixels (N, 2) of points (N, 2) px of the last image, and which of them are found."""
+        assert self._last is not None
         config, found = self._config, guess.copy()
         status, _ = klt.track_translation(
-            last, pyramid, uv, found, self._first_level, 0, 10, config.min_contrast, config.min_ncc, klt.WEIGHTS
+            self._last, pyramid, uv, found, self._first_level, 0, 10, config.min_contrast, config.min_ncc, klt.WEIGHTS
         )
         return found, status == klt.TRACKED
 
-    def _curvatures(self, tracks: Tracks, warp: F64, pose: F64) -> F64:
-        """(N, 6) the quadratic parts of the deformations (N, 2, 2) in an image at a pose (4, 4)."""
+    def _curvatures(self, tracks: Tracks, last_pose: F64, pose: F64) -> F64:
+        """(N, 6) the quadratic parts of the deformations in an image at a pose (4, 4); warps are of the last."""
         out, store = np.empty((len(tracks), 6)), self._patches
         window_curvatures(
-            tracks.slot, store.rays, store.origin, tracks.points(), warp, np.ascontiguousarray(pose[:3, :3].T),
-            pose[:3, 3].copy(), self._camera.model_id, self._camera.params, out,
+            tracks.slot, store.rays, store.origin, tracks.points(), tracks.warp, last_pose, pose, self._camera.model_id,
+            self._camera.params, out,
         )  # fmt: skip
         return out
 

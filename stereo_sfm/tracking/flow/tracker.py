@@ -220,7 +220,7 @@ class Tracker:
     def _track(self, images: StereoPyramids, expected: ExpectedMotion) -> tuple[Tracks, PoseSolution]:
         """Track all points from their predictions, match them in the right image and solve for the pose."""
         with self._spans.span("flow"):
-            tracks = self._follower.follow(self._tracks, images.left, expected)
+            tracks = self._follower.follow(self._tracks, self._pose, images.left, expected)
         with self._spans.span("stereo"):
             tracks.uv_right = self._stereo.follow(images.left, images.right, tracks.uv, tracks.points(), expected.pose)
         with self._spans.span("pose"):

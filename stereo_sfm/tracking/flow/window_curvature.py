@@ -23,9 +23,14 @@ MAX_CURVATURE = 0.1  # 1/px, sum of the coefficients of a moderate deformation
 
 
 def window_rays(camera: Camera, uv: F64, odom_R_cam: F64) -> F64:
-    """(N, 7, 3) unit rays at the centres (N, 2) px of windows and around them, in odometry axes; NaN out of view."""
-    around = camera.unproject((uv[:, None] + OFFSETS).reshape(-1, 2))
-    return (around @ odom_R_cam.T).reshape(-1, len(OFFSETS), 3)
+    """(N, 9, 3) unit rays of windows (N, 2) px at OFFSETS, and their changes per pixel along x and y; odometry axes.
+
+    NaN out of view.
+    """
+    rays = camera.unproject((uv[:, None] + OFFSETS).reshape(-1, 2)) @ odom_R_cam.T
+    rays = rays.reshape(-1, len(OFFSETS), 3)
+    along = [(rays[:, last] - rays[:, first]) / (2 * STEP) for last, first in ((RIGHT, LEFT), (DOWN, UP))]
+    return np.concatenate([rays, np.stack(along, axis=1)], axis=1)
 
 
 @njit
@@ -34,68 +39,80 @@ def _dot(a, b):
 
 
 @njit
-def _plane(ray, base, rho, warp, model, params, normal):
+def _plane(rays, base, rho, warp, cam_R_odom, model, params, normal):
     """The plane n X = 1, `normal` (3,), whose image a camera's motion deforms by a warp (2, 2).
 
     Args:
-        ray: (9, 3) of its window, and its differences along x and y per pixel; rho: 1/m along the first; base: (3,) m
-            from the new camera to the old one; in the new camera's axes.
+        rays: (9, 3) of its window; rho: 1/m along the first; base: (3,) m from the camera in which it is deformed to
+            the one where it is not; in odometry axes. cam_R_odom: (3, 3) of the former.
     """
-    p = project_one(model, params, ray[0, 0] + rho * base[0], ray[0, 1] + rho * base[1], ray[0, 2] + rho * base[2])
-    dx, dy = ray[ALONG_X], ray[ALONG_Y]
-    mu, mv = _dot(p[2:5], base), _dot(p[5:8], base)  # px by which a pixel moves for a change of rho
+    x, y, z = rays[0, 0] + rho * base[0], rays[0, 1] + rho * base[1], rays[0, 2] + rho * base[2]
+    r, du, dv = cam_R_odom, np.zeros(3), np.zeros(3)
+    p = project_one(
+        model, params, r[0, 0] * x + r[0, 1] * y + r[0, 2] * z, r[1, 0] * x + r[1, 1] * y + r[1, 2] * z,
+        r[2, 0] * x + r[2, 1] * y + r[2, 2] * z,
+    )  # fmt: skip
+    for i in range(3):
+        du[i] = p[2] * r[0, i] + p[3] * r[1, i] + p[4] * r[2, i]
+        dv[i] = p[5] * r[0, i] + p[6] * r[1, i] + p[7] * r[2, i]
+    dx, dy = rays[ALONG_X], rays[ALONG_Y]
+    mu, mv = _dot(du, base), _dot(dv, base)  # px by which a pixel moves for a change of rho
     power = mu * mu + mv * mv + 1 / (rho * rho)  # with less parallax than a pixel the plane faces the camera
-    x = (mu * (warp[0, 0] - _dot(p[2:5], dx)) + mv * (warp[1, 0] - _dot(p[5:8], dx))) / power
-    y = (mu * (warp[0, 1] - _dot(p[2:5], dy)) + mv * (warp[1, 1] - _dot(p[5:8], dy))) / power
+    slope_x = (mu * (warp[0, 0] - _dot(du, dx)) + mv * (warp[1, 0] - _dot(dv, dx))) / power
+    slope_y = (mu * (warp[0, 1] - _dot(du, dy)) + mv * (warp[1, 1] - _dot(dv, dy))) / power
     xx, xy, yy = _dot(dx, dx), _dot(dx, dy), _dot(dy, dy)
     det = xx * yy - xy * xy
-    x, y = (yy * x - xy * y) / det, (xx * y - xy * x) / det
+    slope_x, slope_y = (yy * slope_x - xy * slope_y) / det, (xx * slope_y - xy * slope_x) / det
     for i in range(3):
-        normal[i] = rho * ray[0, i] + x * dx[i] + y * dy[i]
+        normal[i] = rho * rays[0, i] + slope_x * dx[i] + slope_y * dy[i]
 
 
 @njit
-def window_curvatures(slots, rays, origin, points, warp, cam_R_odom, position, model, params, out):
-    """The quadratic parts of the maps from first appearances to an image, in pixels of the first appearance.
+def window_curvatures(slots, rays, origin, points, warp, last, new, model, params, out):
+    """The quadratic parts of the maps from first appearances to a new image, in pixels of the first appearance.
 
-    What was at (x, y) from the centre is seen at centre + warp ((x, y) + c) with c_k = q_k0 x^2 / 2 + q_k1 x y +
-    q_k2 y^2 / 2.
+    What was at (x, y) from the centre is seen at centre + W ((x, y) + c) with the affine part W and
+    c_k = q_k0 x^2 / 2 + q_k1 x y + q_k2 y^2 / 2.
 
     Args:
-        slots: (N,) rows of rays (M, 7, 3), see `window_rays`, and origin (M, 3): cameras' positions, odometry frame.
-        points: (N, 3), odometry frame. warp: (N, 2, 2). cam_R_odom: (3, 3) and position (3,) of the camera.
-        model, params: of its lens. out: (N, 6) 1/px, q; zero where it is not known.
+        slots: (N,) rows of rays (M, 9, 3), see `window_rays`, and origin (M, 3): cameras' positions, odometry frame.
+        points: (N, 3), odometry frame. warp: (N, 2, 2) of an earlier image. last, new: (4, 4) odom_T_cam of that image
+            and of the new one. model, params: of the lens. out: (N, 6) 1/px, q; zero where it is not known.
     """
-    ray, base, normal, at, second = np.zeros((9, 3)), np.zeros(3), np.zeros(3), np.zeros((2, 7)), np.zeros((2, 3))
+    base, normal, at, second = np.zeros(3), np.zeros(3), np.zeros((2, 7)), np.zeros((2, 3))
+    last_R, new_R = last[:3, :3].T.copy(), new[:3, :3].T.copy()
     for row in range(slots.shape[0]):
-        k, q, w = slots[row], out[row], warp[row]
+        k, q = slots[row], out[row]
+        r = rays[k]
         q[:] = 0.0
         distance = 0.0
         for i in range(3):
-            distance += (points[row, i] - origin[k, i]) * rays[k, 0, i]
-            base[i] = 0.0
-            for j in range(3):
-                base[i] += cam_R_odom[i, j] * (origin[k, j] - position[j])
-            for n in range(7):
-                ray[n, i] = _dot(cam_R_odom[i], rays[k, n])
-            ray[ALONG_X, i] = (ray[RIGHT, i] - ray[LEFT, i]) / (2 * STEP)
-            ray[ALONG_Y, i] = (ray[DOWN, i] - ray[UP, i]) / (2 * STEP)
+            distance += (points[row, i] - origin[k, i]) * r[0, i]
+            base[i] = origin[k, i] - last[i, 3]
         if not distance > 0:
             continue
-        _plane(ray, base, 1.0 / distance, w, model, params, normal)
+        _plane(r, base, 1.0 / distance, warp[row], last_R, model, params, normal)
+        for i in range(3):
+            base[i] = origin[k, i] - new[i, 3]
         for n in range(7):
-            rho = _dot(ray[n], normal)
-            x, y, z = ray[n, 0] + rho * base[0], ray[n, 1] + rho * base[1], ray[n, 2] + rho * base[2]
-            p = project_one(model, params, x, y, z)
+            rho = _dot(r[n], normal)
+            x, y, z = r[n, 0] + rho * base[0], r[n, 1] + rho * base[1], r[n, 2] + rho * base[2]
+            p = project_one(
+                model, params, new_R[0, 0] * x + new_R[0, 1] * y + new_R[0, 2] * z,
+                new_R[1, 0] * x + new_R[1, 1] * y + new_R[1, 2] * z,
+                new_R[2, 0] * x + new_R[2, 1] * y + new_R[2, 2] * z,
+            )  # fmt: skip
             at[0, n], at[1, n] = p[0], p[1]
         for i in range(2):
             across, along = at[i, RIGHT] + at[i, LEFT], at[i, DOWN] + at[i, UP]
             second[i, 0], second[i, 2] = across - 2 * at[i, 0], along - 2 * at[i, 0]
             second[i, 1] = 0.5 * (at[i, BOTH] + at[i, NEITHER] + 2 * at[i, 0] - across - along)
-        det, largest = (w[0, 0] * w[1, 1] - w[0, 1] * w[1, 0]) * STEP * STEP, 0.0
+        a, b = at[0, RIGHT] - at[0, LEFT], at[0, DOWN] - at[0, UP]  # the affine part, times 2 STEP
+        c, d = at[1, RIGHT] - at[1, LEFT], at[1, DOWN] - at[1, UP]
+        scale, largest = 2 / ((a * d - b * c) * STEP), 0.0
         for n in range(3):
-            q[n] = (w[1, 1] * second[0, n] - w[0, 1] * second[1, n]) / det
-            q[3 + n] = (w[0, 0] * second[1, n] - w[1, 0] * second[0, n]) / det
+            q[n] = scale * (d * second[0, n] - b * second[1, n])
+            q[3 + n] = scale * (a * second[1, n] - c * second[0, n])
             largest += abs(q[n]) + abs(q[3 + n])
         if not largest < MAX_CURVATURE:  # also when anything is NaN
             q[:] = 0.0
