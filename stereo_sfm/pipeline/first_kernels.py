@@ -76,7 +76,7 @@ def _compile_flow(config: Config, rig: Rig, pyramid: Pyramid) -> None:
     follower.accept(pyramid, tracks)
     expected = ExpectedMotion(np.eye(4), np.zeros(6), SECONDS)
     for _ in range(2):  # by translation at first, from the prediction then
-        tracks = follower.follow(tracks, pyramid, expected)
+        tracks = follower.follow(tracks, expected.pose, pyramid, expected)
 
 
 def _tracks(rig: Rig) -> Tracks:

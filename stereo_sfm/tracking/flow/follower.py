@@ -215,6 +215,7 @@ class Follower:
     def _curvatures(self, tracks: Tracks, last_pose: F64, pose: F64) -> F64:
         """(N, 6) the quadratic parts of the deformations in an image at a pose (4, 4); warps are of the last."""
         out, store = np.empty((len(tracks), 6)), self._patches
+        last_pose, pose = np.ascontiguousarray(last_pose), np.ascontiguousarray(pose)
         window_curvatures(
             tracks.slot, store.rays, store.origin, tracks.points(), tracks.warp, last_pose, pose, self._camera.model_id,
             self._camera.params, out,
