@@ -135,7 +135,7 @@ def significant(
     sigmas: float | F64 = SIGMAS,
     confirmed: Bool = NONE,
 ) -> Bool:
-    """(6,) terms that remain when the weakest insignificant one is dropped until there is none.
+    """(8,) terms that remain when the weakest insignificant one is dropped until there is none.
 
     Args:
         whole: estimated from all matches. halves: each from one part of them.
