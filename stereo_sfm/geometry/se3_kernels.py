@@ -43,6 +43,12 @@ def compose_into(a, b, out):
 
 
 @njit
+def dot(a, b):
+    """Product of two vectors of three coordinates."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit
 def transform_point(t, x, y, z):
     """The three coordinates of a point after the transform t (4, 4)."""
     return (

@@ -10,6 +10,7 @@ import math
 import numpy as np
 
 from stereo_sfm.geometry.kernels import njit, project_one
+from stereo_sfm.geometry.se3_kernels import dot
 
 
 @njit
@@ -43,11 +44,6 @@ def _cross(a, b):
 
 
 @njit
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@njit
 def _eigenvector(m, value):
     """Unit null vector of the symmetric 3x3 matrix m - value I: the largest cross product of two of its rows."""
     n = m.copy()
@@ -65,7 +61,7 @@ def _eigenvector(m, value):
 
 @njit
 def _det3(m):
-    return _dot(m[0], _cross(m[1], m[2]))
+    return dot(m[0], _cross(m[1], m[2]))
 
 
 @njit
@@ -91,12 +87,12 @@ def _polish(l1, l2, l3, a12, a13, a23, b12, b13, b23):
         c2 = (2 * (l2 - b12 * l1), 0.0, 2 * (l2 - b23 * l3))
         c3 = (0.0, 2 * (l3 - b13 * l1), 2 * (l3 - b23 * l2))
         r = (r1, r2, r3)
-        det = _dot(c1, _cross(c2, c3))
+        det = dot(c1, _cross(c2, c3))
         if abs(det) < 1e-18:
             break
-        l1 -= _dot(r, _cross(c2, c3)) / det
-        l2 -= _dot(c1, _cross(r, c3)) / det
-        l3 -= _dot(c1, _cross(c2, r)) / det
+        l1 -= dot(r, _cross(c2, c3)) / det
+        l2 -= dot(c1, _cross(r, c3)) / det
+        l3 -= dot(c1, _cross(c2, r)) / det
     return l1, l2, l3
 
 
@@ -108,11 +104,11 @@ def p3p(points, bearings):
     count = 0
     x12, x13 = points[0] - points[1], points[0] - points[2]
     x23 = points[1] - points[2]
-    a12, a13, a23 = _dot(x12, x12), _dot(x13, x13), _dot(x23, x23)
-    b12, b13 = _dot(bearings[0], bearings[1]), _dot(bearings[0], bearings[2])
-    b23 = _dot(bearings[1], bearings[2])
+    a12, a13, a23 = dot(x12, x12), dot(x13, x13), dot(x23, x23)
+    b12, b13 = dot(bearings[0], bearings[1]), dot(bearings[0], bearings[2])
+    b23 = dot(bearings[1], bearings[2])
     normal = _cross(x12, x13)
-    area = _dot(normal, normal)
+    area = dot(normal, normal)
     if area < 1e-12 * a12 * a13 or min(a12, a13, a23) < 1e-12:
         return out, 0
     d1 = np.array([[a23, -a23 * b12, 0.0], [-a23 * b12, a23 - a12, a12 * b23], [0.0, a12 * b23, -a12]])
@@ -162,7 +158,7 @@ def p3p(points, bearings):
             for i in range(3):
                 for k in range(3):
                     out[count, i, k] = (y12[i] * dual12[k] + y13[i] * dual13[k] + up[i] * normal[k]) / area
-                out[count, i, 3] = m1 * bearings[0, i] - _dot(out[count, i], points[0])
+                out[count, i, 3] = m1 * bearings[0, i] - dot(out[count, i], points[0])
             count += 1
     return out, count
 

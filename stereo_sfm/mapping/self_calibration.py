@@ -130,11 +130,10 @@ class SelfCalibration:
         drifts = self._drifts(windows)
         parts = [windows, windows[::2], windows[1::2] or windows]  # one window: what a step has left
         whole, *halves = [self._at_the_end(part, windows)[0] if drifts else self.estimate(part) for part in parts]
-        others = FURTHER_SIGMAS if self._corrected.any() else first_sigmas
-        sigmas = np.where(self._corrected, REFINED_SIGMAS, others)
+        corrected = bool(self._corrected.any())
+        sigmas = np.where(self._corrected, REFINED_SIGMAS, FURTHER_SIGMAS if corrected else first_sigmas)
         rolling = self._rig.readout_s > 0
         since = windows[-min(MAX_BETWEEN, len(windows))].first_kf_id if drifts else self._since
-        corrected = bool(self._corrected.any())
         self._until_due = min(len(windows), MAX_BETWEEN) if corrected or len(windows) >= ENOUGH_WINDOWS else 1
         basis = self._basis(windows)
         choice = choose(whole.by(basis), [h.by(basis) for h in halves], rolling, sigmas, self._corrected)

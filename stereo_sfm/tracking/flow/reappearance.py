@@ -16,6 +16,7 @@ import numpy as np
 
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.kernels import njit, project_one
+from stereo_sfm.geometry.se3_kernels import transform_point
 from stereo_sfm.tracking.flow.klt import HALF, SIZE, STRIDE
 from stereo_sfm.types import F32, F64, I64, U8
 
@@ -58,20 +59,15 @@ def plane_warps(camera: Camera, surfaces: F64, new_T_old: F64) -> F64:
 @njit
 def _warps(model, params, surfaces, new_T_old):
     count = surfaces.shape[2]
-    out, ends, t = np.full((3, count, 2, 2), np.nan), np.zeros((4, 2)), new_T_old
+    out, ends = np.full((3, count, 2, 2), np.nan), np.zeros((4, 2))
     for axis in range(3):
         for n in range(count):
             if math.isnan(surfaces[axis, 0, n, 0]):
                 continue
             for k in range(4):
                 x, y, z = surfaces[axis, k, n, 0], surfaces[axis, k, n, 1], surfaces[axis, k, n, 2]
-                seen = project_one(
-                    model,
-                    params,
-                    t[0, 0] * x + t[0, 1] * y + t[0, 2] * z + t[0, 3],
-                    t[1, 0] * x + t[1, 1] * y + t[1, 2] * z + t[1, 3],
-                    t[2, 0] * x + t[2, 1] * y + t[2, 2] * z + t[2, 3],
-                )
+                x, y, z = transform_point(new_T_old, x, y, z)
+                seen = project_one(model, params, x, y, z)
                 ends[k, 0], ends[k, 1] = seen[0], seen[1]
             squared = 0.0
             for i in range(2):

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields
 import numpy as np
 
 from stereo_sfm.tracking.flow import klt
-from stereo_sfm.tracking.flow.window_curvature import OFFSETS
+from stereo_sfm.tracking.flow.window_curvature import RAYS
 from stereo_sfm.types import F32, F64, I32, I64, Bool
 
 
@@ -54,7 +54,7 @@ class Patches:
         self.inverse_normal: F64 = np.zeros((capacity, 6, 6))
         self.contrast: F64 = np.zeros(capacity)
         self.bending: F64 = np.zeros((capacity, 6, 6))
-        self.rays: F64 = np.zeros((capacity, len(OFFSETS) + 2, 3))  # odometry axes
+        self.rays: F64 = np.zeros((capacity, RAYS, 3))  # odometry axes
         self.origin: F64 = np.zeros((capacity, 3))  # of the camera, odometry frame
         self._free = np.ones(capacity, bool)
 

@@ -14,11 +14,13 @@ import numpy as np
 
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.kernels import njit, project_one
+from stereo_sfm.geometry.se3_kernels import dot, transform_point
 from stereo_sfm.types import F64
 
 STEP = 5.0  # px of the differences
 RIGHT, LEFT, DOWN, UP, BOTH, NEITHER, ALONG_X, ALONG_Y = range(1, 9)  # rays beside the centre's, and differences
 OFFSETS = STEP * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1)], float)
+RAYS = len(OFFSETS) + 2  # with the differences
 MAX_CURVATURE = 0.1  # 1/px, sum of the coefficients of a moderate deformation
 
 
@@ -34,33 +36,25 @@ def window_rays(camera: Camera, uv: F64, odom_R_cam: F64) -> F64:
 
 
 @njit
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@njit
-def _plane(rays, base, rho, warp, cam_R_odom, model, params, normal):
+def _plane(rays, base, rho, warp, turn, model, params, normal):
     """The plane n X = 1, `normal` (3,), whose image a camera's motion deforms by a warp (2, 2).
 
     Args:
         rays: (9, 3) of its window; rho: 1/m along the first; base: (3,) m from the camera in which it is deformed to
-            the one where it is not; in odometry axes. cam_R_odom: (3, 3) of the former.
+            the one where it is not; in odometry axes. turn: (4, 4) from these to the axes of the former.
     """
     x, y, z = rays[0, 0] + rho * base[0], rays[0, 1] + rho * base[1], rays[0, 2] + rho * base[2]
-    r, du, dv = cam_R_odom, np.zeros(3), np.zeros(3)
-    p = project_one(
-        model, params, r[0, 0] * x + r[0, 1] * y + r[0, 2] * z, r[1, 0] * x + r[1, 1] * y + r[1, 2] * z,
-        r[2, 0] * x + r[2, 1] * y + r[2, 2] * z,
-    )  # fmt: skip
+    x, y, z = transform_point(turn, x, y, z)
+    p, du, dv = project_one(model, params, x, y, z), np.zeros(3), np.zeros(3)
     for i in range(3):
-        du[i] = p[2] * r[0, i] + p[3] * r[1, i] + p[4] * r[2, i]
-        dv[i] = p[5] * r[0, i] + p[6] * r[1, i] + p[7] * r[2, i]
+        du[i] = p[2] * turn[0, i] + p[3] * turn[1, i] + p[4] * turn[2, i]
+        dv[i] = p[5] * turn[0, i] + p[6] * turn[1, i] + p[7] * turn[2, i]
     dx, dy = rays[ALONG_X], rays[ALONG_Y]
-    mu, mv = _dot(du, base), _dot(dv, base)  # px by which a pixel moves for a change of rho
+    mu, mv = dot(du, base), dot(dv, base)  # px by which a pixel moves for a change of rho
     power = mu * mu + mv * mv + 1 / (rho * rho)  # with less parallax than a pixel the plane faces the camera
-    slope_x = (mu * (warp[0, 0] - _dot(du, dx)) + mv * (warp[1, 0] - _dot(dv, dx))) / power
-    slope_y = (mu * (warp[0, 1] - _dot(du, dy)) + mv * (warp[1, 1] - _dot(dv, dy))) / power
-    xx, xy, yy = _dot(dx, dx), _dot(dx, dy), _dot(dy, dy)
+    slope_x = (mu * (warp[0, 0] - dot(du, dx)) + mv * (warp[1, 0] - dot(dv, dx))) / power
+    slope_y = (mu * (warp[0, 1] - dot(du, dy)) + mv * (warp[1, 1] - dot(dv, dy))) / power
+    xx, xy, yy = dot(dx, dx), dot(dx, dy), dot(dy, dy)
     det = xx * yy - xy * xy
     slope_x, slope_y = (yy * slope_x - xy * slope_y) / det, (xx * slope_y - xy * slope_x) / det
     for i in range(3):
@@ -80,7 +74,7 @@ def window_curvatures(slots, rays, origin, points, warp, last, new, model, param
             and of the new one. model, params: of the lens. out: (N, 6) 1/px, q; zero where it is not known.
     """
     base, normal, at, second = np.zeros(3), np.zeros(3), np.zeros((2, 7)), np.zeros((2, 3))
-    last_R, new_R = last[:3, :3].T.copy(), new[:3, :3].T.copy()
+    to_last, to_new = last.T.copy(), new.T.copy()  # the first three rows turn odometry axes, and move nothing
     for row in range(slots.shape[0]):
         k, q = slots[row], out[row]
         r = rays[k]
@@ -91,17 +85,14 @@ def window_curvatures(slots, rays, origin, points, warp, last, new, model, param
             base[i] = origin[k, i] - last[i, 3]
         if not distance > 0:
             continue
-        _plane(r, base, 1.0 / distance, warp[row], last_R, model, params, normal)
+        _plane(r, base, 1.0 / distance, warp[row], to_last, model, params, normal)
         for i in range(3):
             base[i] = origin[k, i] - new[i, 3]
         for n in range(7):
-            rho = _dot(r[n], normal)
+            rho = dot(r[n], normal)
             x, y, z = r[n, 0] + rho * base[0], r[n, 1] + rho * base[1], r[n, 2] + rho * base[2]
-            p = project_one(
-                model, params, new_R[0, 0] * x + new_R[0, 1] * y + new_R[0, 2] * z,
-                new_R[1, 0] * x + new_R[1, 1] * y + new_R[1, 2] * z,
-                new_R[2, 0] * x + new_R[2, 1] * y + new_R[2, 2] * z,
-            )  # fmt: skip
+            x, y, z = transform_point(to_new, x, y, z)
+            p = project_one(model, params, x, y, z)
             at[0, n], at[1, n] = p[0], p[1]
         for i in range(2):
             across, along = at[i, RIGHT] + at[i, LEFT], at[i, DOWN] + at[i, UP]
