@@ -1,24 +1,31 @@
 """The service for hours of camera time, with everything that goes wrong on a robot: what grows, what recovers.
 
-    python -m benchmarks soak -- [--minutes 240] [--source sim:loop?size=424x400] [--distinct 600] [--work DIR]
+    python -m benchmarks soak -- [--minutes 240] [--realtime 30] [--most MINUTES] [--source SPEC] [--work DIR]
 
-Images come from memory as fast as the pipeline takes them, there and back along a path again and again. Over the time
-the camera is unplugged, the lights go out, the disk fills up (by its limits), and each stage is killed or stopped.
-Printed: the resident memory of each process with its slope per hour of camera time after the first third, every fault
-and how long it took, missing poses, recordings against their quota. The exit code is 1 if anything is wrong.
+Images come from memory, a lap through the store there and back again and again: first at 30 Hz by the clock, for an
+eighth of the time, then as fast as the pipeline takes them. The camera is unplugged, the lights go out, the disk fills
+up (by its limits), each stage is killed or stopped; the last part is left alone. All outputs that are installed are on
+but ROS 2, and a client reads the pose socket. Printed: the resident memory of each process with its slope per hour of
+camera time (without the first half hour after its start), every fault and how long it took, missing poses, dropped
+images, delays in the part by the clock, recordings against their quota. The exit code is 1 if anything is wrong.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import itertools
+import json
+import multiprocessing
 import os
 import signal
+import socket
 import sys
 import tempfile
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -28,18 +35,28 @@ import numpy as np
 from stereo_sfm.calib.formats.native import read_native, write_native
 from stereo_sfm.drivers.choice import MadeSource
 from stereo_sfm.drivers.source import BaseSource, open_source
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.log.reader import LogReader
 from stereo_sfm.recording.segments import recordings, segments
 from stereo_sfm.service.config import MapConfig, RecordingConfig, RobotConfig
 from stereo_sfm.service.messages import HealthReport, PoseUpdate, Started, Status
+from stereo_sfm.service.outputs import OUTPUTS
+from stereo_sfm.service.outputs.settings import FoxgloveConfig, OutputsConfig, PageConfig, PoseSocketConfig
 from stereo_sfm.service.service import Service
 from stereo_sfm.types import StereoImage
 
 RATE = 30.0
+PAUSE_S = 0.5  # between two images: a fault, not the rate
 UNPLUGGED_S, DARK_FRAMES = 2.0, 60
 STAGES = ("capture", "tracker", "mapper", "loop", "optimizer", "recorder")
 SETTLE_S = 60.0  # for the service to run again after a fault
 SLOPE_MB_H = 1.0  # allowed growth of a process
-MIN_MINUTES = 90  # of camera time, for a slope to mean anything
+EVERY_S = {"restart": 100.0, "other": 200.0}  # of camera time between two faults, at most
+WARM_MIN = 30.0  # minutes of camera time after the start of a process that its slope leaves out
+MIN_MINUTES = 30.0  # of camera time that a slope must cover to mean anything
+QUOTA_GB, SEGMENT_MIN = 0.4, 0.1
+FOUND_FRAMES = 300  # for a pose after the lights are on again
+SOCKET_PORT, FOXGLOVE_PORT, PAGE_PORT = 17100, 18865, 18180
 
 
 class StoreCamera(BaseSource):
@@ -47,18 +64,27 @@ class StoreCamera(BaseSource):
 
     name = "soak"
 
-    def __init__(self, folder: Path, count: int, unplugged: tuple[int, ...], dark: tuple[int, ...]) -> None:
+    def __init__(
+        self, folder: Path, count: int, unplugged: tuple[int, ...], dark: tuple[int, ...], by_clock: int = 0
+    ) -> None:
+        """Args: by_clock, that many of the first frames come at 30 Hz."""
         self.rig = read_native(folder / "rig.yaml")
         self._left, self._right = (np.load(folder / f"{side}.npy", mmap_mode="r") for side in ("left", "right"))
         self._at = np.memmap(folder / "at", np.int64, "r+", shape=(1,))
         self._count, self._unplugged, self._dark = count, set(unplugged), dark
+        self._by_clock = by_clock
 
     def __iter__(self) -> Iterator[StereoImage]:
         n = len(self._left)
+        due = time.monotonic()
         for k in range(int(self._at[0]), self._count):
             self._at[0] = k + 1
             if k in self._unplugged:
                 time.sleep(UNPLUGGED_S)
+                due = time.monotonic()
+            if k < self._by_clock:
+                time.sleep(max(0.0, due - time.monotonic()))
+                due += 1.0 / RATE
             at = k % (2 * n - 2)
             at = at if at < n else 2 * n - 2 - at
             left, right = np.array(self._left[at]), np.array(self._right[at])
@@ -77,35 +103,56 @@ def store(spec: str, distinct: int, folder: Path) -> None:
     np.zeros(1, np.int64).tofile(folder / "at")
 
 
+@dataclass(frozen=True)
+class Sizes:
+    """The processes at one time."""
+
+    frame: int
+    bytes: dict[str, int]
+    pids: dict[str, int]
+
+
 @dataclass
 class Watch:
     """What the service says."""
 
     frame: int = -1
+    by_clock: int = 0  # that many of the first frames
     poses: int = 0
     untracked: int = 0
+    losses: list[list[int]] = field(default_factory=list[list[int]])  # first and last frame without a pose
+    arrived: list[tuple[float, float]] = field(
+        default_factory=list[tuple[float, float]]
+    )  # captured, pose: by the clock
     missing: dict[int, int] = field(default_factory=dict[int, int])  # first missing frame -> how many
     states: list[tuple[int, str, str]] = field(default_factory=list[tuple[int, str, str]])
     sessions: list[int] = field(default_factory=list[int])  # frames at which they began
-    rss: list[tuple[int, dict[str, int]]] = field(default_factory=list[tuple[int, dict[str, int]]])
+    rss: list[Sizes] = field(default_factory=list["Sizes"])
     health: HealthReport | None = None
+    segment: int = 0  # bytes of the largest one
     over_quota: float = 0.0
     tracked: bool = False
 
     def pose(self, pose: PoseUpdate) -> None:
         if pose.frame_id > self.frame + 1:
             self.missing[self.frame + 1] = pose.frame_id - self.frame - 1
+        if not pose.tracked:
+            if self.tracked or not self.losses:
+                self.losses.append([pose.frame_id, pose.frame_id])
+            self.losses[-1][1] = pose.frame_id
         self.frame, self.tracked = pose.frame_id, pose.tracked
         self.poses += 1
         self.untracked += not pose.tracked
+        if pose.frame_id < self.by_clock:
+            self.arrived.append((pose.captured_s, time.monotonic()))
 
     def status(self, status: Status) -> None:
         if not self.states or self.states[-1][1] != status.state:
             self.states.append((self.frame, str(status.state), status.reason))
 
-    def report(self, report: HealthReport) -> None:
+    def report(self, report: HealthReport, pids: dict[str, int]) -> None:
         self.health = report
-        self.rss.append((self.frame, {**report.rss, "service": own_rss()}))
+        self.rss.append(Sizes(self.frame, {**report.rss, "service": own_rss()}, {**pids, "service": os.getpid()}))
 
 
 def own_rss() -> int:
@@ -114,15 +161,19 @@ def own_rss() -> int:
 
 def plan(count: int, times: int, kills: int) -> tuple[list[tuple[int, str]], tuple[int, ...], tuple[int, ...]]:
     """(frame, fault) in order, and the frames of unplugging and darkness; nothing in the first and last tenth."""
-    faults = [f"kill {stage}" for _ in range(kills) for stage in STAGES]
-    faults += ["stop tracker", "stop mapper", "disk full", "disk full"]
-    kinds = [*faults, *["unplug"] * times, *["dark"] * times]
-    np.random.default_rng(1).shuffle(kinds)
-    frames = np.linspace(0.1 * count, 0.9 * count, len(kinds)).astype(int).tolist()
-    events = list(zip(frames, kinds, strict=True))
+    kinds = {
+        "restart": [f"kill {stage}" for _ in range(kills) for stage in STAGES] + ["stop tracker", "stop mapper"],
+        "other": [*["disk full"] * 2, *["unplug"] * times, *["dark"] * times],
+    }
+    rng, begin, events = np.random.default_rng(1), min(0.1 * count, 600 * RATE), list[tuple[int, str]]()
+    for kind, faults in kinds.items():
+        rng.shuffle(faults)
+        end = min(0.9 * count, begin + len(faults) * EVERY_S[kind] * RATE)
+        events += zip(np.linspace(begin, end, len(faults)).astype(int).tolist(), faults, strict=True)
+        begin *= 1.02  # not two at once
     unplugged = tuple(f for f, kind in events if kind == "unplug")
     dark = tuple(f for f, kind in events if kind == "dark")
-    return [e for e in events if e[1] not in ("unplug", "dark")], unplugged, dark
+    return sorted(e for e in events if e[1] not in ("unplug", "dark")), unplugged, dark
 
 
 def cause(service: Service, watch: Watch, fault: str) -> float:
@@ -154,95 +205,217 @@ def wait_for(what: Any) -> None:
         time.sleep(0.02)
 
 
-def slopes(rss: list[tuple[int, dict[str, int]]], restarts: list[int]) -> dict[str, tuple[float, float]]:
-    """Process -> (MB at the end, slope in MB an hour of camera time since its last start and the first third)."""
-    out: dict[str, tuple[float, float]] = {}
-    for name in sorted({name for _, sizes in rss for name in sizes}):
-        since = max([rss[-1][0] / 3, *(r for r in restarts if name != "service")], default=0.0)
-        rows = [(k / RATE / 3600, sizes[name] / 1e6) for k, sizes in rss if name in sizes and k >= since]
-        if rows:
-            x, y = np.array(rows).T
-            slope = float(np.polyfit(x, y, 1)[0]) if len(rows) > 10 and np.ptp(x) > 0 else float("nan")
-            out[name] = (float(y[-1]), slope)
+@dataclass(frozen=True)
+class Slope:
+    """Of one process."""
+
+    mb: float  # at the end
+    mb_h: float  # an hour of camera time
+    hours: float  # that it was measured over
+
+
+def slopes(rss: list[Sizes]) -> dict[str, Slope]:
+    """Process -> growth of its last life without the first half hour of it, in camera time."""
+    out: dict[str, Slope] = {}
+    for name in sorted({name for sizes in rss for name, size in sizes.bytes.items() if size and name in sizes.pids}):
+        seen = [sizes for sizes in rss if sizes.bytes.get(name) and name in sizes.pids]
+        life = [sizes for sizes in seen if sizes.pids[name] == seen[-1].pids[name]]
+        warm = [sizes for sizes in life if sizes.frame >= life[0].frame + WARM_MIN * 60 * RATE]
+        x = np.array([sizes.frame / RATE / 3600 for sizes in warm])
+        hours = float(np.ptp(x)) if len(x) else 0.0
+        mb = np.array([sizes.bytes[name] / 1e6 for sizes in warm])
+        slope = float(np.polyfit(x, mb, 1)[0]) if hours > 0 else float("nan")
+        out[name] = Slope(life[-1].bytes[name] / 1e6, slope, hours)
     return out
 
 
-def run(minutes: float, spec: str, distinct: int, work: Path, times: int, kills: int) -> list[str]:
+def connected(until_s: float) -> socket.socket:
+    """To the pose socket, as soon as it listens."""
+    while True:
+        try:
+            return socket.create_connection(("127.0.0.1", SOCKET_PORT))
+        except ConnectionRefusedError:
+            if time.monotonic() > until_s:
+                raise
+        time.sleep(0.1)
+
+
+def read_poses(send: Any) -> None:
+    """Body of a client of the pose socket: poses, how many it missed as stated, and (frame, count) of other gaps."""
+    seen, missed, gaps, last = 0, 0, list[tuple[int, int]](), (-1, -1)
+    with suppress(OSError):
+        connection = connected(time.monotonic() + SETTLE_S)
+        for line in connection.makefile():
+            pose = json.loads(line)
+            now, stated = (pose["session"], pose["frame_id"]), pose["missed"]
+            seen, missed = seen + 1, missed + stated
+            if now[0] == last[0] and now[1] - last[1] - 1 > stated:
+                gaps.append((last[1] + 1, now[1] - last[1] - 1 - stated))
+            last = now
+    send.send((seen, missed, gaps))
+
+
+def run(o: argparse.Namespace, work: Path) -> list[str]:
     """One soak; what is not as it must be."""
-    count = int(minutes * 60 * RATE)
-    store(spec, distinct, work)
-    events, unplugged, dark = plan(count, times, kills)
-    config = RobotConfig(
-        map=MapConfig(str(work / "store"), "extend", 5.0),
-        recording=RecordingConfig(
-            folder=str(work / "recordings"), mode="black_box", image_format="raw", segment_min=0.1, mark_losses=False,
-            quota_gb=0.4, min_free_gb=0.05, black_box_min=1.0,
-        ),
-    )  # fmt: skip
-    watch, wrong, took = Watch(), list[str](), list[tuple[int, str, float]]()
-    source = MadeSource.of(StoreCamera, work, count, unplugged, dark)
+    count = int(o.minutes * 60 * RATE)
+    by_clock = int((o.minutes / 8 if o.realtime is None else o.realtime) * 60 * RATE)
+    store(o.source, o.distinct, work)
+    events, unplugged, dark = plan(count, o.times, o.kills)
+    watch, wrong, took = Watch(by_clock=by_clock), list[str](), list[tuple[int, str, float]]()
+    source = MadeSource.of(StoreCamera, work, count, unplugged, dark, by_clock)
+    spawn = multiprocessing.get_context("spawn")
+    receive, send = spawn.Pipe(False)
+    client = spawn.Process(target=read_poses, args=(send,), daemon=True)
     began = time.monotonic()
-    with Service(config, source) as service:
+    installed = {n: m for n, m in OUTPUTS.items() if n in outputs_here()}
+    with Service(configuration(work), source, outputs=installed) as service:
+        client.start()
         service.on(PoseUpdate, watch.pose)
         service.on(Status, watch.status)
-        service.on(HealthReport, watch.report)
+        service.on(HealthReport, lambda report: watch.report(report, service.pids))
         service.on(Started, lambda started: watch.sessions.append(watch.frame + 1))
-        over = threading.Thread(target=watch_quota, args=(service, work / "recordings", watch, 0.4e9), daemon=True)
-        over.start()
+        observing = threading.Thread(target=observe, args=(service, work / "recordings", watch, count), daemon=True)
+        observing.start()
         for frame, fault in events:
             while watch.frame < frame and not service.wait(0.05):
                 pass
             try:
                 took.append((frame, fault, cause(service, watch, fault)))
+                print(f"  frame {frame:7d}  {fault:16s} {took[-1][2]:5.1f} s", flush=True)
             except TimeoutError as error:
                 wrong.append(f"frame {frame}, {fault}: {error}")
-        service.wait()
+        while not service.wait(1.0):
+            if o.most is not None and time.monotonic() - began > 60 * o.most:
+                break
         stop_s = time.monotonic()
-    print(f"{count} frames, {minutes:g} min of camera time in {(time.monotonic() - began) / 60:.1f} min")
+    print(f"{watch.frame + 1} frames, {watch.frame / RATE / 60:.0f} of {o.minutes:g} min of camera time "
+          f"in {(time.monotonic() - began) / 60:.1f} min")  # fmt: skip
     print(f"poses {watch.poses}, without a pose {watch.untracked}, sessions {len(watch.sessions)}; "
           f"ended in {time.monotonic() - stop_s:.1f} s")  # fmt: skip
-    for frame, fault, seconds in took:
-        print(f"  frame {frame:7d}  {fault:16s} {seconds:5.1f} s")
-    wrong += judge(watch, work / "recordings", minutes)
+    socket_seen = receive.recv() if receive.poll(10.0) else None
+    wrong += judge_memory(watch) + judge_poses(watch, dark, socket_seen) + judge_faults(watch, o.times)
+    return wrong + judge_recordings(watch, work / "recordings") + judge_clock(watch)
+
+
+def outputs_here() -> set[str]:
+    """Outputs whose libraries are installed; a node of ROS 2 would be seen by others."""
+    needs = {"foxglove": "foxglove", "page": "uvicorn", "pose_socket": "socket"}
+    return {name for name, module in needs.items() if importlib.util.find_spec(module) is not None}
+
+
+def configuration(work: Path) -> RobotConfig:
+    """A map that is saved, a black box with a small quota, and outputs."""
+    here = outputs_here()
+    return RobotConfig(
+        map=MapConfig(str(work / "store"), "extend", 5.0),
+        recording=RecordingConfig(
+            folder=str(work / "recordings"), mode="black_box", image_format="raw", segment_min=SEGMENT_MIN,
+            mark_losses=False, quota_gb=QUOTA_GB, min_free_gb=0.05, black_box_min=1.0,
+        ),
+        outputs=OutputsConfig(
+            PoseSocketConfig(True, f"tcp://127.0.0.1:{SOCKET_PORT}"),
+            FoxgloveConfig("foxglove" in here, port=FOXGLOVE_PORT),
+        ),
+        page=PageConfig("page" in here, port=PAGE_PORT),
+    )  # fmt: skip
+
+
+def observe(service: Service, root: Path, watch: Watch, count: int) -> None:
+    """Compare recordings with their quota, and print how far it is."""
+    began = time.monotonic()
+    for k in itertools.count(1):
+        if service.wait(1.0):
+            return
+        sizes = [segment.bytes for folder in recordings(root) for segment in segments(folder)]
+        watch.segment = max(watch.segment, *sizes, 0)
+        watch.over_quota = max(watch.over_quota, sum(sizes) - QUOTA_GB * 1e9)
+        if k % 60 == 0:
+            now = watch.rss[-1].bytes if watch.rss else {}
+            listed = ", ".join(f"{name} {size / 1e6:.0f}" for name, size in sorted(now.items()))
+            seconds = time.monotonic() - began
+            print(f"  {seconds / 60:5.1f} min: frame {watch.frame} of {count}; MB: {listed}", flush=True)
+
+
+def judge_memory(watch: Watch) -> list[str]:
+    """Print the sizes of the processes; those that grow."""
+    wrong: list[str] = []
+    for name, slope in slopes(watch.rss).items():
+        print(f"  {name:12s} {slope.mb:7.1f} MB  {slope.mb_h:+8.2f} MB/h over {slope.hours:.2f} h")
+        if slope.hours * 60 >= MIN_MINUTES and slope.mb_h > SLOPE_MB_H:
+            wrong.append(f"{name} grows by {slope.mb_h:.1f} MB an hour")
     return wrong
 
 
-def watch_quota(service: Service, root: Path, watch: Watch, limit: float) -> None:
-    while not service.wait(1.0):
-        used = sum(segment.bytes for folder in recordings(root) for segment in segments(folder))
-        watch.over_quota = max(watch.over_quota, used - limit)
-
-
-def judge(watch: Watch, root: Path, minutes: float) -> list[str]:
-    """Print the rest; what is not as it must be."""
-    wrong: list[str] = []
-    for name, (mb, slope) in slopes(watch.rss, watch.sessions).items():
-        print(f"  {name:12s} {mb:7.1f} MB  {slope:+8.2f} MB/h")
-        if minutes >= MIN_MINUTES and slope > SLOPE_MB_H:
-            wrong.append(f"{name} grows by {slope:.1f} MB an hour")
+def judge_poses(watch: Watch, dark: tuple[int, ...], read: tuple[int, int, list[tuple[int, int]]] | None) -> list[str]:
+    """Print what is missing in callbacks and at the pose socket, and losses; what nothing explains."""
     unexplained = {k: n for k, n in watch.missing.items() if not any(k <= s <= k + n + 1 for s in watch.sessions)}
     print(f"  frames missing between poses: {sum(watch.missing.values())}, unexplained: {unexplained or 'none'}")
-    wrong += [f"{n} frames missing from {k}" for k, n in unexplained.items()]
-    kept, images = 0, 0
+    wrong = [f"{n} frames missing from {k}" for k, n in unexplained.items()]
+    if read is None:
+        return [*wrong, "the client of the pose socket did not end"]
+    print(f"  pose socket: {read[0]} poses read, {read[1]} stated as missed, gaps not stated: {read[2] or 'none'}")
+    wrong += [f"pose socket: {n} poses missing from {k}, not stated" for k, n in read[2]]
+    lit = [(begin, end) for begin, end in watch.losses if end - begin >= FOUND_FRAMES + DARK_FRAMES]
+    in_dark = sum(any(d <= begin < d + DARK_FRAMES for begin, _ in watch.losses) for d in dark)
+    longest = max((end - begin + 1 for begin, end in watch.losses), default=0)
+    print(f"  losses: {len(watch.losses)}, {in_dark} of {len(dark)} in the dark, the longest {longest} frames")
+    wrong += [f"lost from frame {begin} to {end}" for begin, end in lit]
+    return wrong if watch.tracked else [*wrong, "tracking was lost at the end"]
+
+
+def judge_faults(watch: Watch, times: int) -> list[str]:
+    """Print states and dropped images; what should have been seen, and drops in the part without a clock."""
+    states = [state for _, state, _ in watch.states]
+    print("  states: " + ", ".join(f"{name} {states.count(name)}" for name in sorted(set(states))))
+    dropped = {} if watch.health is None else watch.health.dropped
+    print(f"  dropped images: {dropped or 'none'}")
+    wrong = [f"dropped at {where}: {n} images" for where, n in dropped.items() if n]
+    if states.count("camera_gone") < times:
+        wrong.append(f"camera_gone {states.count('camera_gone')} of {times} times")
+    return wrong
+
+
+def judge_recordings(watch: Watch, root: Path) -> list[str]:
+    """Open each file alone and each recording as a source; what cannot be read, or is too much."""
+    wrong, files, images = list[str](), 0, 0
     for folder in recordings(root):
-        with_images = [s for s in segments(folder) if s.images.exists()]
-        kept += len(segments(folder))
-        if with_images:
+        for path in (path for s in segments(folder) for path in (s.poses, s.images) if path.exists()):
+            files += 1
+            try:
+                with LogReader(path) as reader:
+                    if not sum(1 for _ in reader.messages()):
+                        wrong.append(f"{path.name} is empty")
+            except StereoSfmError as error:
+                wrong.append(str(error))
+        if any(s.images.exists() for s in segments(folder)):
             with open_source(folder) as source:
                 images += sum(1 for _ in source)
-    print(f"  recordings: {kept} segments, {images} images replayed, quota exceeded by {watch.over_quota / 1e6:.0f} MB")
-    if watch.over_quota > 0.2e9:
+    print(f"  recordings: {files} files read, {images} images replayed, the largest segment "
+          f"{watch.segment / 1e6:.0f} MB, quota exceeded by {max(watch.over_quota, 0) / 1e6:.0f} MB")  # fmt: skip
+    if watch.over_quota > watch.segment:
         wrong.append(f"the quota was exceeded by {watch.over_quota / 1e6:.0f} MB")
-    if not watch.tracked:
-        wrong.append("tracking was lost at the end")
     return wrong
+
+
+def judge_clock(watch: Watch) -> list[str]:
+    """Print rate and latency of the part by the clock; whether it kept up."""
+    if len(watch.arrived) < 2:
+        return []
+    captured, posed = np.array(watch.arrived).T
+    steps, delay = np.diff(captured), (posed - captured) * 1e3
+    rate = 1 / steps[steps < PAUSE_S].mean()
+    print(f"  by the clock: {len(captured)} poses at {rate:.2f} Hz, image to pose at a callback "
+          f"{np.median(delay):.0f} ms, 95 % {np.percentile(delay, 95):.0f} ms")  # fmt: skip
+    return [f"{rate:.2f} poses a second instead of {RATE:g}"] if rate < 0.99 * RATE else []
 
 
 def main(args: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=240.0, help="of camera time")
     parser.add_argument("--source", default="sim:loop?size=424x400")
-    parser.add_argument("--distinct", type=int, default=600, help="images in memory")
+    parser.add_argument("--realtime", type=float, help="minutes at the beginning that come by the clock")
+    parser.add_argument("--most", type=float, help="minutes by the clock after which it ends, whatever is left")
+    parser.add_argument("--distinct", type=int, default=1260, help="images in memory: one lap")
     parser.add_argument("--times", type=int, default=10, help="unplugged and dark so often")
     parser.add_argument("--kills", type=int, default=3, help="of each stage")
     parser.add_argument("--work", type=Path, help="folder, kept")
@@ -250,7 +423,7 @@ def main(args: list[str] | None = None) -> int:
     with tempfile.TemporaryDirectory() as temporary:
         work = o.work or Path(temporary)
         work.mkdir(parents=True, exist_ok=True)
-        wrong = run(o.minutes, o.source, o.distinct, work, o.times, o.kills)
+        wrong = run(o, work)
     print("\n".join(f"WRONG: {line}" for line in wrong) or "all as it must be")
     return bool(wrong)
 
