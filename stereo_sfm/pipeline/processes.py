@@ -390,6 +390,10 @@ class ProcessRun:
         self._saving_at_end |= urgent
         self._request("mapper", SaveMap(folder, urgent))
 
+    def has_ended(self, stage: str) -> bool:
+        """Whether a stage came to its end by itself."""
+        return stage in self._ended
+
     def relocalize(self) -> None:
         """Request that the whole saved map is searched for the camera with the next keyframe."""
         self._request("mapper", Relocalize())

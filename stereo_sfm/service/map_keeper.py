@@ -112,11 +112,15 @@ class MapKeeper:
             if not self._ending:
                 self._store.join()
 
-    def finish(self, until_s: float) -> None:
-        """After the last session: add its part to the saved map until this monotonic time, else at the next start."""
+    def finish(self, until_s: float, complete: bool) -> None:
+        """After the last session: add its part to the saved map until this monotonic time, else at the next start.
+
+        Args: complete, the session's mapper came to its end: it has written what there was, whether asked or not.
+        """
+        if self._awaited and not complete:
+            self._log_lost()
+            return
         if not (self._store.saves and self._session_saved.is_set()):
-            if self._awaited:
-                self._log_lost()
             return
         self._store.join()
         joined = self._store.joined(max(until_s - time.monotonic(), 0.0))
@@ -132,13 +136,12 @@ class MapKeeper:
     # -- from any thread ---------------------------------------------------------------------------------------------
 
     def save_last(self, session: Session | None) -> None:
-        """Save a session that is about to end, if there is one; nothing else is saved from now on."""
+        """Save a session that is about to end, if there is one with images; nothing else is saved from now on."""
         with self._lock:
             self._ending = True
             self._end_request(ENDING)
             if self._store.saves and session is not None:
                 self._store.cancel()
-                self._session_saved.clear()
                 self._awaited = True
                 session.save_map(self._store.session, urgent=True)
 

@@ -52,6 +52,7 @@ class Pipelines:
         self._failures = 0  # starts in a row that failed
         self.stopping = threading.Event()
         self.stopped_s = 0.0  # monotonic time of the stop
+        self.map_complete = False  # the last session's mapper came to its end
 
     @property
     def tracking_session(self) -> Session | None:
@@ -84,7 +85,7 @@ class Pipelines:
         self.stopped_s = time.monotonic()
         self.stopping.set()
         session = self.session
-        self._maps.save_last(session)
+        self._maps.save_last(session if session is not None and session.frames else None)
         if session is not None:
             session.stop()
 
@@ -125,7 +126,7 @@ class Pipelines:
             self._source_failed(error, session)
             return False
         finally:
-            self.session = None
+            self.session, self.map_complete = None, session.map_complete
             if isinstance(self._opener, SourceChoice):
                 self._opener = same_camera(self._opener, session.serial)
 

@@ -138,7 +138,7 @@ class Service(Commands):
         finally:
             closing = threading.Thread(target=self._recorder.close)
             closing.start()
-            self._maps.finish(self._pipelines.stopped_s + END_S)
+            self._maps.finish(self._pipelines.stopped_s + END_S, self._pipelines.map_complete)
             closing.join()
             self._ended.set()
 

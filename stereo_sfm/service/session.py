@@ -82,6 +82,11 @@ class Session:
         return self._run.pids
 
     @property
+    def map_complete(self) -> bool:
+        """Whether the mapper came to its end: what it saves then is on disk."""
+        return self._run.has_ended("mapper")
+
+    @property
     def tracking_s(self) -> float:
         """Seconds since the first frame, 0 before it."""
         return max(time.monotonic() - self._first_frame_s, 0.0)

@@ -23,6 +23,7 @@ from stereo_sfm.pipeline.map_saver import NICE, MapSaver
 from stereo_sfm.service import map_keeper
 from stereo_sfm.service.config import MapConfig
 from stereo_sfm.service.map_keeper import ENDING, MapKeeper
+from stereo_sfm.service.map_store import Joined
 
 
 class SlowSession:
@@ -94,7 +95,7 @@ def test_a_map_that_could_not_be_written_is_said(earlier: bool, tmp_path: Path, 
     if earlier:
         maps._store.saved_ns = time.time_ns()  # pyright: ignore[reportPrivateUsage]
     maps.save_last(asked)
-    maps.finish(time.monotonic())
+    maps.finish(time.monotonic(), complete=False)
     (line,) = (record.getMessage() for record in caplog.records if record.levelname == "ERROR")
     assert line.startswith("the map of this session was NOT saved: it could not be written in time; ")
     assert ("holds it as of" if earlier else "had not been saved before") in line
@@ -105,8 +106,22 @@ def test_a_session_without_a_map_is_not_a_loss(tmp_path: Path, caplog: Any) -> N
     asked: Any = session
     maps.save_last(asked)
     maps.session_saved(MapSaved("", 0, "nothing is mapped yet"))
-    maps.finish(time.monotonic())
+    maps.finish(time.monotonic(), complete=True)
     assert not [record for record in caplog.records if record.levelname in ("ERROR", "WARNING")]
+
+
+def test_a_stop_while_the_session_ends_by_itself_is_not_a_loss(tmp_path: Path, caplog: Any) -> None:
+    """Its mapper has written everything, and does not reply to the request that comes after it."""
+    maps, session = keeper(tmp_path), SlowSession()
+    asked: Any = session
+    maps._store.join = lambda: None  # pyright: ignore[reportPrivateUsage]
+    maps._store.joined = lambda timeout_s=0.0: Joined(7)  # pyright: ignore[reportPrivateUsage]
+    maps.session_saved(MapSaved("", 7))
+    maps.save_last(asked)
+    with caplog.at_level("INFO"):
+        maps.finish(time.monotonic(), complete=True)
+    said = [record.getMessage() for record in caplog.records]
+    assert not any("NOT saved" in line for line in said) and any("is saved: 7 keyframes" in line for line in said)
 
 
 @pytest.mark.skipif(not hasattr(os, "setpriority"), reason="no priorities of threads")
