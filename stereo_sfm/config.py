@@ -49,7 +49,7 @@ def estimator_names() -> tuple[str, ...]:
 class TrackerConfig:
     """The default tracker (tracking/flow/)."""
 
-    max_features: int = number(400, 1, 20_000, "Points followed at once")
+    max_features: int = number(420, 1, 20_000, "Points followed at once")
     min_features: int = number(15, 3, 10_000, "Inliers below which a frame is lost")
     pyramid_levels: int = number(4, 2, 10, "Levels of the image pyramid, each half as large")
     min_contrast: float = number(

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -59,7 +60,16 @@ def brighter(images: Iterator[StereoImage]) -> Iterator[StereoImage]:
         yield dataclasses.replace(image, left=cameras[0], right=cameras[1])
 
 
-@pytest.mark.parametrize("change", [None, black, dropped, brighter], ids=lambda c: c.__name__ if c else "as recorded")
+def blurred(images: Iterator[StereoImage]) -> Iterator[StereoImage]:
+    """One frame is blurred along a diagonal of nine pixels."""
+    for image in images:
+        cameras = [cv2.filter2D(e, -1, np.eye(9) / 9) if image.frame_id == 30 else e for e in (image.left, image.right)]
+        yield dataclasses.replace(image, left=cameras[0], right=cameras[1])
+
+
+@pytest.mark.parametrize(
+    "change", [None, black, dropped, brighter, blurred], ids=lambda c: c.__name__ if c else "as recorded"
+)
 def test_euroc_with_disturbances(data_root: Path, change: Change | None) -> None:
     source = open_source(data_root / "euroc_mh01")
     frames = track(source, 70, change)

@@ -78,11 +78,16 @@ class Follower:
         self._first_level = self._coarsest_level  # of the pyramid, at which the search starts
         self._miss_px = np.inf  # median error of the predictions
 
-    def follow(self, tracks: Tracks, last_pose: F64, pyramid: klt.Pyramid, expected: ExpectedMotion) -> Tracks:
-        """The tracks of the last image, which has a pose (4, 4), found in the new left image, at their new pixels."""
+    def follow(
+        self, tracks: Tracks, last_pose: F64, pyramid: klt.Pyramid, expected: ExpectedMotion, blurred: bool = False
+    ) -> Tracks:
+        """The tracks of the last image, which has a pose (4, 4), found in the new left image, at their new pixels.
+
+        `blurred`: points whose first appearance cannot be aligned stay where a translation from the last image ends.
+        """
         guess = self._shutter.project(expected.pose, expected.velocity, tracks.points(), tracks.uv)
         guess = np.where(np.isfinite(guess), guess, tracks.uv)
-        return self._find(tracks, last_pose, pyramid, expected.pose, guess)
+        return self._find(tracks, last_pose, pyramid, expected.pose, guess, blurred)
 
     @property
     def held(self) -> Held:
@@ -179,7 +184,9 @@ class Follower:
         inside[inside] = self._area.inside(uv[inside])
         return inside & np.isfinite(warps).all(axis=(2, 3)).any(axis=0)
 
-    def _find(self, tracks: Tracks, last_pose: F64, pyramid: klt.Pyramid, pose: F64, guess: F64) -> Tracks:
+    def _find(
+        self, tracks: Tracks, last_pose: F64, pyramid: klt.Pyramid, pose: F64, guess: F64, blurred: bool
+    ) -> Tracks:
         """Find points of the last image in another, taken at about a pose (4, 4), starting at guesses (N, 2) px.
 
         Where the predictions are good, first appearances are aligned from there; what that misses, and all points
@@ -193,6 +200,9 @@ class Follower:
             moved, followed = self._translate(tracks.uv[missed], pyramid, guess[missed])
             aligned = self._align(pyramid, moved, warp[missed], curvature[missed], tracks.slot[missed], followed)
             uv[missed], deformed[missed], found[missed] = aligned
+            if blurred:
+                lost = missed[followed & ~found[missed]]
+                uv[lost], deformed[lost], found[lost] = moved[followed & ~aligned[2]], warp[lost], True
         self._miss_px = median_distance(uv, guess, found)
         return self._kept(tracks, uv, deformed, found)
 

@@ -31,6 +31,7 @@ from stereo_sfm.types import F64, Bool
 # a near edge crosses a far one, people who walk along) have one-sided errors, which bias the scale.
 CAUCHY_SCALES = np.array([20.0, 10.0, 6.0, 4.0, 2.0, 1.0, 1.0])
 REAPPEARED_NOISE = 1.0  # over config.sigma_px, at least: windows that changed much are found less exactly
+BLURRED_NOISE = 2.0  # the same of windows in a blurred image
 MEDIAN_ERROR = 0.8  # of unit noise in the four rows of a point
 NOISE_RANGE = (0.3, 4.0)  # over config.sigma_px
 # Differences from the prediction that are possible for any robot: metres and m/s^2, radians and rad/s^2.
@@ -81,6 +82,7 @@ class PoseSolution:
     sigma_px: float  # noise by which it is whitened
     max_error: float
     reason: str = ""  # why there is no pose
+    blurred: bool = False  # whether the image is blurred, so that its points are good for a pose only
     moving: Bool = field(
         default_factory=lambda: np.zeros(0, bool)
     )  # (N,) points that support another motion; (0,): none
@@ -106,6 +108,11 @@ class PoseSolution:
     def residual_px(self) -> float:
         """Median over the points; NaN without a pose."""
         return math.nan if self.reason else self.sigma_px * float(np.median(self.error[np.isfinite(self.error)]))
+
+    @property
+    def undivided(self) -> bool:
+        """Whether most of the points that were found agree."""
+        return self.inliers >= AGREEING_SHARE * len(self.error)
 
     def good(self, config: TrackerConfig, before: int) -> bool:
         """Whether enough of the `before` tracked points are inliers."""
@@ -135,12 +142,19 @@ class FramePoseSolver:
         self._noise = noise
         return found
 
-    def solve(self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, before: int = 0) -> PoseSolution:
+    def solve(
+        self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, before: int = 0, blurred: bool = False
+    ) -> PoseSolution:
         """Solve for the pose, starting at the prediction; at the previous pose (4, 4) if that finds no consensus.
 
         `before`: number of static points that were tracked. If many of them disagree or are lost, other motions are
-        searched for, and the one that the points tracked longest support is the camera's.
+        searched for, and the one that the points tracked longest support is the camera's. `blurred`: the image is.
         """
+        if blurred:
+            noise, self._noise = self._noise, max(self._noise, BLURRED_NOISE)
+            found = self.solve(tracks, expected, last_pose, before)
+            self._noise, found.blurred = noise, True
+            return found
         static = ~tracks.moving
         if static.sum() < self._config.min_features:
             return _no_pose(len(tracks), "too_few_points")

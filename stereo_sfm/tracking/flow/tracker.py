@@ -210,30 +210,51 @@ class Tracker:
         return ExpectedMotion(pose, se3.log(se3.inverse(self._pose) @ pose), seconds)
 
     def _follow(self, images: StereoPyramids, expected: ExpectedMotion) -> tuple[Tracks, PoseSolution]:
-        """Track the points of the last image, from the prediction or from the rotation of the whole image."""
+        """Track the points of the last image, from the prediction or from the rotation of the whole image.
+
+        If both fail and most points are still found by translation, then the image is blurred.
+        """
         tracks, solution = self._track(images, expected)
         if solution.good(self._config, self._static_count()):
             return tracks, solution
         turned = self._follower.turned(images.left, expected, self._pose)
-        return self._solver.better([(tracks, solution), self._track(images, turned)], expected)
+        tracks, solution = self._solver.better([(tracks, solution), self._track(images, turned)], expected)
+        if solution.good(self._config, self._static_count()):
+            return tracks, solution
+        self._follower.search_widely()
+        blurred = self._track(images, turned, blurred=True)
+        undivided = blurred[1].good(self._config, self._static_count()) and blurred[1].undivided
+        return blurred if undivided else (tracks, solution)
 
-    def _track(self, images: StereoPyramids, expected: ExpectedMotion) -> tuple[Tracks, PoseSolution]:
-        """Track all points from their predictions, match them in the right image and solve for the pose."""
+    def _track(
+        self, images: StereoPyramids, expected: ExpectedMotion, blurred: bool = False
+    ) -> tuple[Tracks, PoseSolution]:
+        """Track all points from their predictions, match them in the right image and solve for the pose.
+
+        `blurred`: see `Follower.follow`.
+        """
         with self._spans.span("flow"):
-            tracks = self._follower.follow(self._tracks, self._pose, images.left, expected)
+            tracks = self._follower.follow(self._tracks, self._pose, images.left, expected, blurred)
         with self._spans.span("stereo"):
             tracks.uv_right = self._stereo.follow(images.left, images.right, tracks.uv, tracks.points(), expected.pose)
         with self._spans.span("pose"):
-            return tracks, self._solver.solve(tracks, expected, self._pose, self._static_count())
+            return tracks, self._solver.solve(tracks, expected, self._pose, self._static_count(), blurred)
 
     def _refine(self, tracks: Tracks, solution: PoseSolution, expected: ExpectedMotion, recovered: bool) -> None:
-        """Unless the pose was just recovered, learn the noise of points and motion; refine the inliers' distances."""
+        """Unless the pose was just recovered, learn the noise of points and motion; refine the inliers' distances.
+
+        Points of a blurred image are good for a pose only.
+        """
+        if solution.blurred:
+            return
         if not recovered:
             self._solver.learn(tracks, solution, expected)
         self._solver.refine_depth(tracks, solution)
 
     def _trusted(self, tracks: Tracks, solution: PoseSolution) -> bool:
-        """Whether so many points agree with a pose that it is beyond doubt."""
+        """Whether so many points of a sharp image agree with a pose that it is beyond doubt."""
+        if solution.blurred:
+            return False
         agree = int((solution.inlier & ~tracks.moving).sum())
         enough = max(TRUSTED_LEFT * self._keyframes.points, TRUSTED_OPEN * self._solver.open_view)
         return agree >= max(TRUSTED_SHARE * float((~tracks.moving).sum()), enough)
