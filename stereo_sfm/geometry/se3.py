@@ -9,6 +9,8 @@ Formulas: Barfoot, State Estimation for Robotics (2017), chapter 7; Umeyama, PAM
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from stereo_sfm.geometry import se3_kernels as kernels
@@ -124,6 +126,8 @@ def from_rotation_translation(rotation: F64, translation: F64) -> F64:
 def quaternion_from_rotation(rotation: F64) -> F64:
     """(..., 3, 3) -> unit quaternion (..., 4) as x y z w, w >= 0. Largest-component branch, stable everywhere."""
     r = np.asarray(rotation, float)
+    if r.ndim == 2:
+        return np.array(_quaternion(r.ravel().tolist()))
     d0, d1, d2 = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
     xx, yy, zz, ww = 1 + d0 - d1 - d2, 1 - d0 + d1 - d2, 1 - d0 - d1 + d2, 1 + d0 + d1 + d2
     xy, xz, yz = r[..., 1, 0] + r[..., 0, 1], r[..., 0, 2] + r[..., 2, 0], r[..., 2, 1] + r[..., 1, 2]
@@ -136,6 +140,19 @@ def quaternion_from_rotation(rotation: F64) -> F64:
     q = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     return np.where(q[..., 3:] < 0, -q, q)
+
+
+def _quaternion(rotation: list[float]) -> list[float]:
+    """As `quaternion_from_rotation`, with the same bits, of one matrix row by row."""
+    r00, r01, r02, r10, r11, r12, r20, r21, r22 = rotation
+    xx, yy, zz, ww = 1 + r00 - r11 - r22, 1 - r00 + r11 - r22, 1 - r00 - r11 + r22, 1 + r00 + r11 + r22
+    xy, xz, yz = r10 + r01, r02 + r20, r21 + r12
+    wx, wy, wz = r21 - r12, r02 - r20, r10 - r01
+    rows = (xx, xy, xz, wx), (xy, yy, yz, wy), (xz, yz, zz, wz), (wx, wy, wz, ww)
+    best = max(range(4), key=lambda k: rows[k][k])
+    x, y, z, w = rows[best]
+    norm = math.sqrt(x * x + y * y + z * z + w * w) * (-1.0 if w < 0 else 1.0)
+    return [x / norm, y / norm, z / norm, w / norm]
 
 
 def rotation_from_quaternion(xyzw: F64) -> F64:

@@ -24,6 +24,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.types import F32, F64, I64
 
+FEW = 8  # poses that are converted one by one in less time than together
 LEVELS = {"DEBUG": 1, "INFO": 2, "WARNING": 3, "ERROR": 4, "CRITICAL": 5}
 
 
@@ -40,13 +41,15 @@ def stamp_of(message: Any) -> int:
 
 def poses(a_T_b: F64) -> list[Pose]:
     """(N, 4, 4) -> positions and quaternions."""
+    if len(a_T_b) <= FEW:
+        return [pose(one) for one in a_T_b]
     quaternions = se3.quaternion_from_rotation(a_T_b[:, :3, :3]).tolist()
     return [_pose(t, q) for t, q in zip(a_T_b[:, :3, 3].tolist(), quaternions, strict=True)]
 
 
 def pose(a_T_b: F64) -> Pose:
     """(4, 4) -> position and quaternion."""
-    return poses(a_T_b[None])[0]
+    return _pose(a_T_b[:3, 3].tolist(), se3.quaternion_from_rotation(a_T_b[:3, :3]).tolist())
 
 
 def _pose(position: list[float], quaternion: list[float]) -> Pose:

@@ -336,7 +336,9 @@ class RunLog:
 
     def _odometry_covariance(self, covariance: F64, odom_T_body: F64) -> F64:
         """From xi in camera axes to the body's position and rotation in the axes of `odom`, as Odometry has it."""
-        turn = np.kron(np.eye(2), odom_T_body[:3, :3]) @ self._body_adjoint
+        turn = np.zeros((6, 6))
+        turn[:3, :3] = turn[3:, 3:] = odom_T_body[:3, :3]
+        turn = turn @ self._body_adjoint
         return turn @ covariance @ turn.T
 
 

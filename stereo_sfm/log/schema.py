@@ -47,6 +47,7 @@ class _Field:
     kind: str  # "array", "scalar", "enum", "message", "numbers" (dict), "rows" (tuple of tuples)
     proto: int  # type of the scalar or of the array's items
     dtype: str = ""
+    stored: Any = None  # dtype of the array in the file
     shape: tuple[int, ...] = (-1,)  # of the array: `stereo_sfm.types.shape` in the field's metadata
     convert: Any = None  # enum class, nested dataclass, or the types of a row's items
     optional: bool = False  # a nested dataclass that may be None
@@ -67,7 +68,8 @@ def _describe(field: dataclasses.Field[Any], annotation: Any) -> _Field:
         annotation = next(a for a in annotation.__args__ if a is not type(None))
     dtype = _array_dtype(annotation)
     if dtype is not None:
-        return _Field(name, "array", _ARRAYS[dtype], dtype, field.metadata.get("shape", (-1,)))
+        stored = np.dtype(dtype).newbyteorder("<")
+        return _Field(name, "array", _ARRAYS[dtype], dtype, stored, field.metadata.get("shape", (-1,)))
     if annotation in _SCALARS:
         return _Field(name, "scalar", _SCALARS[annotation])
     origin = typing.get_origin(annotation)
@@ -156,7 +158,7 @@ def _write(message: Any, obj: Any) -> None:
         if value is None:
             continue
         if f.kind == "array":
-            setattr(message, f.name, np.ascontiguousarray(value, np.dtype(f.dtype).newbyteorder("<")).tobytes())
+            setattr(message, f.name, np.asarray(value, f.stored).tobytes())
         elif f.kind == "scalar":
             setattr(message, f.name, value)
         elif f.kind == "enum":
@@ -179,7 +181,7 @@ def encode(obj: Any) -> bytes:
 
 
 def _read_array(data: bytes, f: _Field) -> np.ndarray[Any, Any]:
-    flat = np.frombuffer(data, np.dtype(f.dtype).newbyteorder("<")).astype(f.dtype)
+    flat = np.frombuffer(data, f.stored).astype(f.dtype)
     return flat.reshape(f.shape)
 
 

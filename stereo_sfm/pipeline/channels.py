@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import functools
+import os
 import queue
 import selectors
+import struct
 import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from multiprocessing.reduction import ForkingPickler
 from typing import Any, Generic, TypeVar
 
 T = TypeVar("T")
+
+PIPE_BYTES = 1 << 18  # of a pipe: several keyframes; the default is less than one
 
 
 @dataclass(frozen=True)
@@ -39,30 +45,42 @@ class Lost(Exception):
 
 
 class Outbox:
-    """Sends in a thread, so that two stages that write to each other never wait for one another's pipe.
+    """Sends without waiting for the reader, so that two stages that write to each other never wait for one another.
 
-    A message of bytes is one that is pickled already.
+    A message goes into the pipe at once where there is room for it, else a thread sends it: to wake a thread for every
+    message, which takes the interpreter from the one that computes, would cost more than to send it. A message of bytes
+    is one that is pickled already.
 
     At most `limit` messages wait; then `send` blocks, which is the back-pressure of the pipeline. 0: any number.
     """
 
     def __init__(self, connection: Connection, limit: int = 64) -> None:
-        self._connection = connection
-        self._queue: queue.Queue[Any] = queue.Queue(limit)
+        self._connection, self._descriptor = connection, connection.fileno()
+        os.set_blocking(self._descriptor, False)
+        _enlarge(self._descriptor)
+        self._sending = threading.Lock()  # one message after the other
+        self._queue: queue.Queue[memoryview | None] = queue.Queue(limit)
+        self._closed = False  # the reader died: main ends the run, and nothing waits for these messages
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
     def send(self, message: object) -> None:
-        """Queue a message."""
-        self._queue.put((message,))
+        """Send a message, or queue it."""
+        with self._sending:
+            rest = self._attempt(_framed(message))
+            if rest:
+                self._queue.put(rest)
 
     def offer(self, message: object, patience_s: float) -> bool:
-        """Queue a message; False if there was no room for it within so many seconds."""
-        try:
-            self._queue.put((message,), timeout=patience_s)
-        except queue.Full:
-            return False
-        return True
+        """Send or queue a message; False if there was no room for it within so many seconds."""
+        with self._sending:
+            rest = self._attempt(_framed(message))
+            try:
+                if rest:
+                    self._queue.put(rest, timeout=patience_s)
+            except queue.Full:
+                return False
+            return True
 
     def waiting(self) -> int:
         """Messages not yet in the pipe."""
@@ -74,14 +92,42 @@ class Outbox:
         self._thread.join()
         self._connection.close()
 
+    def _attempt(self, data: memoryview) -> memoryview:
+        """Put as much of a message into the pipe as there is room for, unless others wait; returns the rest."""
+        return data if self._queue.unfinished_tasks else self._write(data)
+
+    def _write(self, data: memoryview) -> memoryview:
+        """Returns what did not fit."""
+        try:
+            return data[0:0] if self._closed else data[os.write(self._descriptor, data) :]
+        except BlockingIOError:
+            return data
+        except OSError:
+            self._closed = True
+            return data[0:0]
+
     def _work(self) -> None:
-        closed = False
-        while (item := self._queue.get()) is not None:
-            if not closed:
-                try:
-                    (self._connection.send_bytes if isinstance(item[0], bytes) else self._connection.send)(item[0])
-                except OSError:
-                    closed = True  # the reader died: main ends the run, and nothing waits for these messages
+        room = selectors.PollSelector()
+        room.register(self._descriptor, selectors.EVENT_WRITE)
+        while (rest := self._queue.get()) is not None:
+            while rest := self._write(rest):
+                room.select()
+            self._queue.task_done()
+        room.close()
+
+
+def _framed(message: object) -> memoryview:
+    """A message as `Connection.recv` expects it (multiprocessing.connection, `_send_bytes`)."""
+    data = message if isinstance(message, bytes) else ForkingPickler.dumps(message)
+    size = len(data)
+    header = struct.pack("!i", size) if size < 1 << 31 else struct.pack("!iQ", -1, size)
+    return memoryview(b"".join((header, data)))
+
+
+def _enlarge(descriptor: int) -> None:
+    """Give a pipe room for some messages, where the system allows it."""
+    with contextlib.suppress(OSError, AttributeError):
+        fcntl.fcntl(descriptor, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
 
 
 class DroppingQueue(Generic[T]):

@@ -95,8 +95,8 @@ class Ready:
     stage: str
 
 
-def ready(stage: str, setup: Setup, to_main: Outbox) -> None:
-    """Load the stage's code and send `Ready`; one helps the tracker first."""
+def ready(stage: str, setup: Setup, to_main: Outbox, then: Callable[[], None] = lambda: None) -> None:
+    """Load the stage's code and send `Ready`; one helps the tracker first. Args: then, called between the two."""
     from stereo_sfm.kernel_cache import listening
     from stereo_sfm.pipeline.first_kernels import help_tracker
     from stereo_sfm.pipeline.warm_up import warm_up_stage
@@ -105,6 +105,7 @@ def ready(stage: str, setup: Setup, to_main: Outbox) -> None:
         if stage == HELPER:
             help_tracker(setup.config, setup.rig)
         warm_up_stage(stage, setup.config, setup.rig, patient=not setup.realtime)
+    then()
     to_main.send(Ready(stage))
 
 

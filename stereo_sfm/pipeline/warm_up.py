@@ -15,6 +15,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.dominant_direction import MIN_POINTS, dominant_direction
 from stereo_sfm.geometry.preintegration import GRAVITY
+from stereo_sfm.mapping.mapper import Job, Mapper
 from stereo_sfm.pipeline.stages import make_closer
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.tracking.factory import make_tracker
@@ -116,13 +117,23 @@ def _warm_up_inertial(imu: Imu) -> None:
         motion.accept(at + NODE_NS, np.eye(4))
 
 
+def scratch_job(config: Config, rig: Rig) -> Job | None:
+    """A small full bundle adjustment, which loads the optimizer's code; None where it will never have one."""
+    if not (rig.stereo and config.mapper.enabled):
+        return None
+    eager = dataclasses.replace(config.mapper, full_ba_growth=0.0, full_ba_lag_keyframes=1)
+    mapper = Mapper(eager, rig, NoSpans(), config.loop)
+    for keyframe in keyframes(rig):
+        mapper.step(keyframe)
+    return mapper.pending_job()
+
+
 def warm_up_stage(stage: str, config: Config, rig: Rig, patient: bool = False) -> None:
     """Load (the first time ever: compile) what `stage` calls, on a scratch instance of it.
 
     Args: patient, images may wait for what is rarely called, until it is.
     """
     from stereo_sfm.loop.database import PlaceDatabase
-    from stereo_sfm.mapping.mapper import Mapper
     from stereo_sfm.mapping.rig_window import solve_window
     from stereo_sfm.mapping.self_calibration import SelfCalibration
 

@@ -146,7 +146,7 @@ def run_mapper(
     to_tracker, to_optimizer = Outbox(updates), Outbox(jobs)
     finished_jobs = Inbox[Any](results)
     saver = MapSaver(mapper, setup.config, to_main.send)
-    ready("mapper", setup, to_main)
+    ready("mapper", setup, to_main, lambda: _load_optimizer(setup, to_optimizer, finished_jobs))
     meter = HealthMeter("mapper", to_main.send)
     frame_id, busy, found = -1, False, False
     while isinstance(keyframe := saver.next(inbox, control), Keyframe):
@@ -185,6 +185,16 @@ def run_mapper(
     to_tracker.close()
     to_optimizer.send(End("mapper"))
     to_optimizer.close()
+
+
+def _load_optimizer(setup: Setup, jobs: Outbox, results: Inbox[Any]) -> None:
+    """Let the optimizer load its code, once what a first run has to compile is compiled."""
+    from stereo_sfm.pipeline.warm_up import scratch_job
+
+    job = scratch_job(setup.config, setup.rig)
+    if job is not None:
+        jobs.send(job)
+        results.take()
 
 
 def run_optimizer(to_main: Report, control: Connection, jobs: Connection, results: Connection) -> None:

@@ -52,6 +52,12 @@ def test_quaternions_agree_with_scipy(q: np.ndarray) -> None:
     np.testing.assert_allclose(se3.rotation_from_quaternion(back), rotation, atol=1e-12)
 
 
+def test_quaternions_are_the_same_one_by_one() -> None:
+    rotations = se3.so3_exp(np.random.default_rng(0).normal(size=(500, 3)) * 2.0)
+    single = np.array([se3.quaternion_from_rotation(r) for r in rotations])
+    np.testing.assert_array_equal(single, se3.quaternion_from_rotation(rotations))
+
+
 @pytest.mark.parametrize("size", [1e-200, 1.0, 1e200, 1e300])
 def test_quaternions_of_any_size(size: float) -> None:
     q = np.array([0.1, -0.2, 0.3, 0.9])

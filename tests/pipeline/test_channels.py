@@ -49,6 +49,39 @@ def test_a_pickled_message_is_passed_on_as_it_is() -> None:
     outbox.close()
 
 
+def test_messages_that_the_pipe_has_no_room_for_come_in_order() -> None:
+    receive, send = multiprocessing.Pipe(duplex=False)
+    outbox, inbox = Outbox(send, 100), Inbox[np.ndarray](receive)
+    sent = [np.full(size, k) for k, size in enumerate((10, 200_000, 10, 50_000, 1, 300_000, 2))]
+    for message in sent:
+        outbox.send(message)
+    assert outbox.waiting() > 0
+    for message in sent:
+        assert (inbox.take() == message).all()
+    outbox.send(np.zeros(1))
+    assert len(inbox.take()) == 1
+    outbox.close()
+    with pytest.raises(Lost):
+        inbox.take()
+
+
+def test_an_outbox_takes_no_more_than_its_limit() -> None:
+    receive, send = multiprocessing.Pipe(duplex=False)
+    outbox, inbox = Outbox(send, 2), Inbox[bytes](receive)
+    message = pickle.dumps(bytes(1 << 20))
+    taken = 0
+    while outbox.offer(message, 0.1):
+        taken += 1
+    assert 2 <= taken <= 4
+    for _ in range(taken):
+        inbox.take()
+    assert outbox.offer(message, 10.0)
+    assert len(inbox.take()) == 1 << 20
+    receive.close()
+    outbox.send(1)  # nobody reads: it is dropped
+    outbox.close()
+
+
 def test_arrivals_follow_the_connections_that_are_left() -> None:
     (a, to_a), (b, to_b) = multiprocessing.Pipe(duplex=False), multiprocessing.Pipe(duplex=False)
     arrivals = Arrivals()

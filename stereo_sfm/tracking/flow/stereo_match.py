@@ -16,6 +16,7 @@ from stereo_sfm.types import I32, U8
 PATCH = 4  # half size of the search patch, in pixels of the search level
 SIZE = 2 * PATCH + 1
 AREA = SIZE * SIZE
+SHORT = 8  # pixels side by side, of which fewer are compared one by one
 NODES = 4  # candidates from one that is projected to the next, between which the curve is all but straight
 
 
@@ -52,6 +53,77 @@ def _curve(bx, by, bz, model, params, right_T_left, min_depth, where):
 
 
 @njit
+def _difference(right, ru, rv, template, brighter, patch):
+    """AREA times the sum of differences to the patch around a pixel: a whole number, and those are summed at once."""
+    _cut(right, ru, rv, patch)
+    total = np.int32(0)
+    for m in range(AREA):
+        total += abs(np.int32(AREA) * (patch[m] - template[m]) - brighter)
+    return total
+
+
+@njit
+def _differences_along(right, right_sums, ru, rv, template, total, weighted, columns):
+    """As `_difference`, around successive pixels of a row from `ru` on: (C,), written to `columns`."""
+    n = len(columns)
+    columns[:] = 0
+    sums = right_sums[rv, ru : ru + n]
+    for y in range(SIZE):
+        row = right[rv - PATCH + y, ru - PATCH : ru + n + PATCH]
+        for x in range(n + SIZE - 1):
+            weighted[x] = np.int32(AREA) * np.int32(row[x])
+        for x in range(SIZE):
+            away = np.int32(AREA) * template[y * SIZE + x] - total
+            shifted = weighted[x : x + n]
+            for c in range(n):
+                columns[c] += abs(shifted[c] - sums[c] - away)
+
+
+@njit
+def _pixels(where, scale, shape, pixels):
+    """Write the pixel (C, 2) of each position (C, 2) in the full image; -1 where the patch leaves the image."""
+    h, w = shape
+    for c in range(len(where)):
+        pixels[c, 0] = pixels[c, 1] = -1
+        if not math.isnan(where[c, 0]):
+            u, v = int(round(where[c, 0] / scale)), int(round(where[c, 1] / scale))
+            if u >= PATCH and v >= PATCH and u < w - PATCH and v < h - PATCH:
+                pixels[c, 0], pixels[c, 1] = u, v
+
+
+@njit
+def _differences(right, right_sums, pixels, template, total, patch, columns, weighted, cost):
+    """Mean difference (C,) of the patches around pixels (C, 2), 1e9 where they are -1; written to `cost`.
+
+    Successive ones lie mostly side by side in a row: those are compared together.
+    """
+    begin = 0
+    while begin < len(pixels):
+        low = high = last = pixels[begin, 0]
+        v, end = pixels[begin, 1], begin + 1
+        while end < len(pixels) and pixels[end, 1] == v and abs(pixels[end, 0] - last) <= 1:
+            last = pixels[end, 0]
+            low, high = min(low, last), max(high, last)
+            end += 1
+        span = high - low + 1
+        if v < 0:
+            cost[begin:end] = 1e9
+        elif span < SHORT:
+            for c in range(begin, end):
+                u = pixels[c, 0]
+                if c > begin and u == pixels[c - 1, 0]:
+                    cost[c] = cost[c - 1]
+                else:
+                    brighter = np.int32(right_sums[v, u] - total)
+                    cost[c] = _difference(right, u, v, template, brighter, patch) / (AREA * AREA)
+        else:
+            _differences_along(right, right_sums, low, v, template, total, weighted, columns[:span])
+            for c in range(begin, end):
+                cost[c] = columns[pixels[c, 0] - low] / (AREA * AREA)
+        begin = end
+
+
+@njit
 def search_epipolar(
     left, right, right_sums, uv, scale, model_l, params_l, model_r, params_r, right_T_left, min_depth, candidates,
     max_cost, ratio,
@@ -73,11 +145,12 @@ def search_epipolar(
     n = uv.shape[0]
     out = np.full((n, 2), np.nan)
     h, w = left.shape
-    hr, wr = right.shape
     cost = np.empty(candidates)
     where = np.empty((candidates, 2))
     template = np.empty(AREA, np.int32)
+    pixels = np.empty((candidates, 2), np.int64)
     patch = np.empty(AREA, np.int32)
+    columns, weighted = np.empty(candidates, np.int32), np.empty(candidates + SIZE, np.int32)
     for k in range(n):
         iu, iv = int(round(uv[k, 0] / scale)), int(round(uv[k, 1] / scale))
         if iu < PATCH or iv < PATCH or iu >= w - PATCH or iv >= h - PATCH:
@@ -91,25 +164,10 @@ def search_epipolar(
         for m in range(AREA):
             total += template[m]
         _curve(bx, by, bz, model_r, params_r, right_T_left, min_depth, where)
+        _pixels(where, scale, right.shape, pixels)
+        _differences(right, right_sums, pixels, template, total, patch, columns, weighted, cost)
         best, best_index = 1e9, -1
-        last_u, last_v = -10000, -10000
         for c in range(candidates):
-            cost[c] = 1e9
-            if math.isnan(where[c, 0]):
-                continue
-            ru, rv = int(round(where[c, 0] / scale)), int(round(where[c, 1] / scale))
-            if ru < PATCH or rv < PATCH or ru >= wr - PATCH or rv >= hr - PATCH:
-                continue
-            if ru == last_u and rv == last_v:
-                cost[c] = cost[c - 1]
-                continue
-            last_u, last_v = ru, rv
-            _cut(right, ru, rv, patch)
-            brighter = np.int32(right_sums[rv, ru] - total)
-            difference = np.int32(0)  # AREA times too large, so that it is a whole number: those are summed at once
-            for m in range(AREA):
-                difference += abs(np.int32(AREA) * (patch[m] - template[m]) - brighter)
-            cost[c] = difference / (AREA * AREA)
             if cost[c] < best:
                 best, best_index = cost[c], c
         if best_index < 0 or best > max_cost:
