@@ -423,6 +423,8 @@ class ProcessRun:
             if self._stopped_s is None:
                 died = self._stages.how_it_died(stage)
                 self._failure = StageDied(f"the {stage} process {died}; {self._what_remains(stage)}")
+                if self._folders.session is not None:  # of a service, which begins again: the rest ends as at a stop
+                    self._stopped_s, self._saving_at_end = time.monotonic(), True
             self._end(connection, stage)
             return
         consequence = self._stages.exit_code(stage) == UPSTREAM_LOST

@@ -102,12 +102,13 @@ class RobotConfig:
         return self.page if output == "page" else getattr(self.outputs, output)
 
     def pipeline(self) -> Config:
-        """The configuration of the stages.
+        """The configuration of the stages: without the bundle adjustment after a session, which nobody waits for.
 
         Raises:
             StereoSfmError: its file is invalid.
         """
-        return load_config(self.tracking.config or None, (), preset(self.tracking.preset))
+        config = load_config(self.tracking.config or None, (), preset(self.tracking.preset))
+        return dataclasses.replace(config, mapper=dataclasses.replace(config.mapper, final_iterations=0))
 
     def opener(self) -> SourceChoice:
         """The source, not yet opened.

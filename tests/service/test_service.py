@@ -66,7 +66,9 @@ def test_a_session_its_map_and_the_next_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("what", "stage"), [(signal.SIGKILL, "tracker"), (signal.SIGSTOP, "mapper")])
+@pytest.mark.parametrize(
+    ("what", "stage"), [(signal.SIGKILL, "tracker"), (signal.SIGKILL, "capture"), (signal.SIGSTOP, "mapper")]
+)
 def test_a_dead_or_hung_stage_costs_seconds(what: signal.Signals, stage: str, tmp_path: Path) -> None:
     poses, sessions = list[PoseUpdate](), list[Started]()
     with Service(config(tmp_path), MadeSource.of(endless_wall)) as service:

@@ -13,7 +13,7 @@ def test_the_plan_has_every_fault_and_leaves_the_ends_alone() -> None:
     events, unplugged, dark = plan(9000, times=2, kills=1)
     assert len(unplugged) == len(dark) == 2 and {fault for _, fault in events} >= {"kill tracker", "stop mapper"}
     frames = [frame for frame, _ in events]
-    assert frames == sorted(frames) and min(frames) >= 900 and max(frames) <= 8100
+    assert frames == sorted(frames) and min(frames) >= 375 and max(frames) <= 8100
 
 
 @pytest.mark.slow
