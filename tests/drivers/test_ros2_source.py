@@ -39,7 +39,8 @@ def test_without_rclpy_it_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> No
 class Camera:
     """A node that publishes what a simulated camera sees."""
 
-    def __init__(self, packed: bool = False) -> None:
+    def __init__(self, packed: bool = False, left_x_right: float | None = None) -> None:
+        """Args: packed, as compressed images. left_x_right: publish this transform between the cameras, metres."""
         import rclpy
         from rclpy.qos import DurabilityPolicy, QoSProfile
         from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
@@ -58,6 +59,8 @@ class Camera:
         self.imu = self.node.create_publisher(Imu, "/imu", 100)
         with open_source(SIMULATED) as source:
             self.rig, self.shots = source.rig, list(source)
+        if left_x_right is not None:
+            self._publish_transform(left_x_right, latched)
         self._stop = threading.Event()
         self.sent: list[int] = []
         self._thread = threading.Thread(target=self._publish)
@@ -68,6 +71,15 @@ class Camera:
         from std_msgs.msg import Header
 
         return Header(stamp=Time(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9), frame_id=frame)
+
+    def _publish_transform(self, left_x_right: float, latched: Any) -> None:
+        from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
+        from tf2_msgs.msg import TFMessage
+
+        moved = Transform(translation=Vector3(x=left_x_right), rotation=Quaternion(w=1.0))
+        row = TransformStamped(header=self._header(0, "left"), child_frame_id="right", transform=moved)
+        self.transforms = self.node.create_publisher(TFMessage, "/tf_static", latched)
+        self.transforms.publish(TFMessage(transforms=[row]))
 
     def _info(self, side: int, stamp_ns: int) -> Any:
         from sensor_msgs.msg import CameraInfo
@@ -129,9 +141,9 @@ class Camera:
 
 
 @contextmanager
-def _camera(packed: bool = False) -> Iterator[Camera]:
+def _camera(packed: bool = False, left_x_right: float | None = None) -> Iterator[Camera]:
     pytest.importorskip("rclpy")
-    camera = Camera(packed)
+    camera = Camera(packed, left_x_right)
     try:
         yield camera
     finally:
@@ -164,6 +176,15 @@ def test_two_topics_at_30_hz_are_tracked_without_loss(packed: bool) -> None:
     assert all(i.left.tobytes() in seen for i in images)
     samples = np.concatenate([i.imu.stamp_ns for i in images[5:] if i.imu is not None])
     assert len(samples) > 2.9 * (COUNT - 5) and (np.diff(samples) > 0).all()
+
+
+@pytest.mark.slow
+def test_the_cameras_are_where_tf_static_says() -> None:
+    pytest.importorskip("tf2_msgs.msg")
+    spec = "ros2:?left=/cam/left/image_raw&right=/cam/right/image_raw"
+    with _camera(left_x_right=0.25) as camera, open_source(spec) as source:
+        assert abs(source.rig.baseline - 0.25) < 1e-9 and abs(camera.rig.baseline - 0.25) > 0.01
+        assert next(iter(source)).right is not None
 
 
 @pytest.mark.slow
