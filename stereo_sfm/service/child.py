@@ -37,6 +37,18 @@ def start_child(name: str, body: Callable[..., None], *arguments: Any) -> BasePr
     return process
 
 
+def end_with_service() -> None:
+    """In a child that reads no pipe: end the process when the service ends, however that happens."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def follow() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=follow, daemon=True).start()
+
+
 def run_child(name: str, to_service: Connection, body: Callable[[Send], None]) -> NoReturn:
     """In the child: run its body with a function that sends to the service, then end the process.
 

@@ -24,7 +24,7 @@ from stereo_sfm.maps.folders import MapFolders
 from stereo_sfm.maps.replace_folder import recover
 from stereo_sfm.maps.store import lock
 from stereo_sfm.maps.unfinished import copy_map, publish
-from stereo_sfm.service.child import pipe, start_child
+from stereo_sfm.service.child import end_with_service, pipe, start_child
 
 log = logging.getLogger("stereo_sfm")
 NICE = 10
@@ -164,6 +164,7 @@ class MapStore:
 
 
 def _publish(base: Path | None, session: Path, out: Path, config: Config, send: Connection) -> None:
+    end_with_service()
     os.nice(NICE)
     send.send(_published(base, session, out, config))
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+import signal
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -11,6 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import psutil
 import pytest
 
 from stereo_sfm.config import Config
@@ -21,6 +24,7 @@ from stereo_sfm.messages import MapSaved, SaveMap
 from stereo_sfm.pipeline import map_saver
 from stereo_sfm.pipeline.map_saver import NICE, MapSaver
 from stereo_sfm.service import map_keeper
+from stereo_sfm.service.child import end_with_service, start_child
 from stereo_sfm.service.config import MapConfig
 from stereo_sfm.service.map_keeper import ENDING, MapKeeper
 from stereo_sfm.service.map_store import Joined
@@ -122,6 +126,27 @@ def test_a_stop_while_the_session_ends_by_itself_is_not_a_loss(tmp_path: Path, c
         maps.finish(time.monotonic(), complete=True)
     said = [record.getMessage() for record in caplog.records]
     assert not any("NOT saved" in line for line in said) and any("is saved: 7 keyframes" in line for line in said)
+
+
+def _service_that_dies(send: Any) -> None:
+    child = start_child("map saver", _work)
+    send.send(child.pid)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _work() -> None:
+    end_with_service()
+    time.sleep(60.0)
+
+
+def test_the_process_that_saves_ends_with_the_service() -> None:
+    context = multiprocessing.get_context("spawn")
+    receive, send = context.Pipe(False)
+    service = context.Process(target=_service_that_dies, args=(send,))
+    service.start()
+    saver = psutil.Process(receive.recv())
+    service.join()
+    assert saver.wait(20.0) is None
 
 
 @pytest.mark.skipif(not hasattr(os, "setpriority"), reason="no priorities of threads")

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import os
+import resource
 import signal
+import socket
 import subprocess
 import sys
+import threading
 import time
+import urllib.error
+import urllib.request
 from collections.abc import Generator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +27,8 @@ from stereo_sfm.log.reader import LogReader
 from stereo_sfm.maps.saved_map import load_map
 from stereo_sfm.recording.segments import recordings, segments
 from stereo_sfm.service.config import MapConfig, RecordingConfig, RobotConfig
-from stereo_sfm.service.messages import PoseUpdate, ServiceState, Status
+from stereo_sfm.service.messages import PoseUpdate, ServiceState, Started, Status
+from stereo_sfm.service.outputs.settings import OutputsConfig, PageConfig, PoseSocketConfig
 from stereo_sfm.service.service import Service
 from tests.service.endless import endless_wall
 from tests.service.test_service import STOP_S, wait_for
@@ -76,14 +82,87 @@ def test_a_dead_or_hung_recorder_costs_no_pose(fault: signal.Signals, tmp_path: 
             assert sum(1 for _ in source) > 5
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="mounts a small disk")
-def test_a_disk_that_others_fill(tmp_path: Path) -> None:
+def test_a_stage_that_gets_no_memory_is_started_again(tmp_path: Path) -> None:
+    with running(config(tmp_path)) as watched:
+        sessions = list[Started]()
+        watched.service.on(Started, sessions.append)
+        wait_for(lambda: sessions)
+        resource.prlimit(watched.service.pids["mapper"], resource.RLIMIT_AS, (1 << 20, 1 << 20))  # less than it has
+        wait_for(lambda: len(sessions) == 2 and watched.poses[-1].session == 2)
+        assert watched.service.status().data["health"]["restarts"] == 1
+
+
+@contextmanager
+def small_disk(tmp_path: Path) -> Generator[Path]:
     disk = tmp_path / "disk"
     disk.mkdir()
     mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=200m", "none", str(disk)], check=False)
     if mounted.returncode:
         pytest.skip("cannot mount here")
     try:
+        yield disk
+    finally:
+        subprocess.run(["umount", "-l", str(disk)], check=False)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="mounts a small disk")
+def test_a_disk_that_is_read_only_at_first(tmp_path: Path) -> None:
+    with small_disk(tmp_path) as disk:
+        subprocess.run(["mount", "-o", "remount,ro", str(disk)], check=True)
+        with running(config(tmp_path, disk / "recordings")) as watched:
+            wait_for(lambda: "Read-only" in watched.states[-1].recording_problem)
+            watched.more_poses(60)
+            subprocess.run(["mount", "-o", "remount,rw", str(disk)], check=True)
+            wait_for(lambda: not watched.states[-1].recording_problem)
+            watched.more_poses(60)
+            assert watched.no_pose_is_missing()
+        assert len(segments(recordings(disk / "recordings")[0])) > 0
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def test_clients_that_flood_cost_no_pose(tmp_path: Path) -> None:
+    pytest.importorskip("uvicorn")
+    poses, page, over = free_port(), free_port(), threading.Event()
+    outputs = OutputsConfig(pose_socket=PoseSocketConfig(True, f"tcp://127.0.0.1:{poses}"))
+    settings = replace(config(tmp_path), outputs=outputs, page=PageConfig(True, port=page))
+    answers = list[int]()
+
+    def command() -> None:
+        headers = {"Content-Type": "application/json", "X-Stereo-Sfm": "1"}
+        asked = urllib.request.Request(f"http://127.0.0.1:{page}/api/command/mark", b"{}", headers)
+        while not over.wait(0.002):
+            try:
+                answers.append(urllib.request.urlopen(asked, timeout=5).status)
+            except urllib.error.HTTPError as error:
+                answers.append(error.code)
+            except OSError:
+                pass
+
+    with running(settings) as watched, ExitStack() as connections:
+        threads = [threading.Thread(target=command) for _ in range(4)]
+        for thread in threads:
+            thread.start()
+        wait_for(lambda: len(answers) > 20)
+        for _ in range(100):  # none reads
+            with suppress(OSError):
+                connections.enter_context(socket.create_connection(("127.0.0.1", poses), 1.0))
+        watched.more_poses(150)
+        over.set()
+        for thread in threads:
+            thread.join()
+        assert watched.no_pose_is_missing() and watched.states[-1].state == ServiceState.RUNNING
+        assert watched.service.status().data["health"]["restarts"] == 0
+    assert answers.count(429) > answers.count(200) > 0
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="mounts a small disk")
+def test_a_disk_that_others_fill(tmp_path: Path) -> None:
+    with small_disk(tmp_path) as disk:
         settings = config(tmp_path, disk / "recordings")
         settings = replace(settings, recording=replace(settings.recording, min_free_gb=0.02))
         with running(settings) as watched:
@@ -101,8 +180,6 @@ def test_a_disk_that_others_fill(tmp_path: Path) -> None:
             with LogReader(segment.poses) as reader:
                 logged |= {record.sequence for record in reader.messages([topics.FRAME])}
         assert set(range(1, len(watched.poses) - 1)) - logged == set()
-    finally:
-        subprocess.run(["umount", "-l", str(disk)], check=False)
 
 
 def fill(path: Path) -> None:
