@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError
+from numpy.typing import NDArray
 
 from stereo_sfm.errors import StereoSfmError
 
@@ -55,9 +56,13 @@ class _Field:
 
 def _array_dtype(annotation: Any) -> str | None:
     """Name of the dtype of an NDArray annotation, None for anything else."""
-    if typing.get_origin(annotation) is not np.ndarray:
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is np.ndarray:  # up to numpy 2.4
+        (dtype,) = typing.get_args(arguments[1])
+    elif origin is NDArray:  # an alias with a name of its own
+        (dtype,) = arguments
+    else:
         return None
-    (dtype,) = typing.get_args(typing.get_args(annotation)[1])
     return np.dtype(dtype).name
 
 

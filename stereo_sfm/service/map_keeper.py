@@ -44,6 +44,7 @@ class MapKeeper:
         self._lock = threading.Lock()  # of the store, while it changes
         self._ending = False
         self._awaited = False  # the last save was requested, and the session has not replied
+        self._awaited_ns = 0  # Unix time of that request
 
     @property
     def mode(self) -> str:
@@ -117,10 +118,11 @@ class MapKeeper:
 
         Args: complete, the session's mapper came to its end: it has written what there was, whether asked or not.
         """
-        if self._awaited and not complete:
+        written = self._awaited and self._store.written_since(self._awaited_ns)  # though its message came too late
+        if self._awaited and not (complete or written):
             self._log_lost()
             return
-        if not (self._store.saves and self._session_saved.is_set()):
+        if not (self._store.saves and (written or self._session_saved.is_set())):
             return
         self._store.join()
         joined = self._store.joined(max(until_s - time.monotonic(), 0.0))
@@ -142,7 +144,7 @@ class MapKeeper:
             self._end_request(ENDING)
             if self._store.saves and session is not None:
                 self._store.cancel()
-                self._awaited = True
+                self._awaited, self._awaited_ns = True, time.time_ns()
                 session.save_map(self._store.session, urgent=True)
 
     def check(self, session: Session | None) -> None:

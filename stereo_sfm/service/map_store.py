@@ -63,6 +63,13 @@ class MapStore:
         """The session's own part."""
         return self.folder.with_name(f".{self.folder.name}.session")
 
+    def written_since(self, unix_ns: int) -> bool:
+        """Whether the session's own part was completely written after this time."""
+        try:
+            return (self.session / "map.json").stat().st_mtime_ns >= unix_ns
+        except OSError:
+            return False
+
     def begin(self) -> MapFolders:
         """The maps of a new session; a session that an earlier run did not join is joined first.
 

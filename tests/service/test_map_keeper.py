@@ -114,16 +114,23 @@ def test_a_session_without_a_map_is_not_a_loss(tmp_path: Path, caplog: Any) -> N
     assert not [record for record in caplog.records if record.levelname in ("ERROR", "WARNING")]
 
 
-def test_a_stop_while_the_session_ends_by_itself_is_not_a_loss(tmp_path: Path, caplog: Any) -> None:
-    """Its mapper has written everything, and does not reply to the request that comes after it."""
+@pytest.mark.parametrize("complete", [True, False])
+def test_a_session_that_was_written_but_did_not_reply_is_not_a_loss(
+    complete: bool, tmp_path: Path, caplog: Any
+) -> None:
+    """Its mapper has come to its end before the request, or its reply comes too late."""
     maps, session = keeper(tmp_path), SlowSession()
     asked: Any = session
-    maps._store.join = lambda: None  # pyright: ignore[reportPrivateUsage]
-    maps._store.joined = lambda timeout_s=0.0: Joined(7)  # pyright: ignore[reportPrivateUsage]
-    maps.session_saved(MapSaved("", 7))
+    store = maps._store  # pyright: ignore[reportPrivateUsage]
+    store.join, store.joined = lambda: None, lambda timeout_s=0.0: Joined(7)
+    if complete:
+        maps.session_saved(MapSaved("", 7))
     maps.save_last(asked)
+    if not complete:
+        store.session.mkdir()
+        (store.session / "map.json").touch()
     with caplog.at_level("INFO"):
-        maps.finish(time.monotonic(), complete=True)
+        maps.finish(time.monotonic(), complete=complete)
     said = [record.getMessage() for record in caplog.records]
     assert not any("NOT saved" in line for line in said) and any("is saved: 7 keyframes" in line for line in said)
 
@@ -136,7 +143,7 @@ def _service_that_dies(send: Any) -> None:
 
 def _work() -> None:
     end_with_service()
-    time.sleep(60.0)
+    time.sleep(600.0)
 
 
 def test_the_process_that_saves_ends_with_the_service() -> None:
@@ -146,7 +153,7 @@ def test_the_process_that_saves_ends_with_the_service() -> None:
     service.start()
     saver = psutil.Process(receive.recv())
     service.join()
-    assert saver.wait(20.0) is None
+    assert saver.wait(120.0) is None
 
 
 @pytest.mark.skipif(not hasattr(os, "setpriority"), reason="no priorities of threads")
