@@ -419,12 +419,12 @@ class ProcessRun:
         if stage == "logger" and self._live:
             self._give_up_log(f"the {stage} process {self._stages.how_it_died(stage)}")
             return
-        if stage == "capture" and (self._stopped_s is not None or self._capturing):
+        # What came before is processed; a service does not wait for that: it begins again.
+        goes_on = self._capturing and self._folders.session is None
+        if stage == "capture" and (self._stopped_s is not None or goes_on):
             if self._stopped_s is None:
                 died = self._stages.how_it_died(stage)
                 self._failure = StageDied(f"the {stage} process {died}; {self._what_remains(stage)}")
-                if self._folders.session is not None:  # of a service, which begins again: the rest ends as at a stop
-                    self._stopped_s, self._saving_at_end = time.monotonic(), True
             self._end(connection, stage)
             return
         consequence = self._stages.exit_code(stage) == UPSTREAM_LOST
