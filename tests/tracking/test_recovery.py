@@ -234,8 +234,12 @@ def test_a_pose_from_a_part_of_the_view_is_found_anew_once_more_is_free() -> Non
     assert not part.improved(np.eye(4), near, 0.6, few)
     assert not part.improved(np.eye(4), near, 0.5, more)
     assert not part.improved(np.eye(4), far, 0.9, more)
+    assert not part.uncertain(held, more, 0)  # 17 mm
+    assert part.uncertain(held, 4 * more, 0)
+    assert not part.uncertain(other, 4 * more, 0)
     part.begin(held, 0.7, more, 0)
     assert not part.wanted(held, 0)
+    assert not part.uncertain(held, 4 * more, 0)
 
 
 def test_a_new_submap_is_tracked_on_although_people_moved_before_it() -> None:

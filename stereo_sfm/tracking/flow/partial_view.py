@@ -16,6 +16,7 @@ from stereo_sfm.types import F64
 
 MORE_RECALL = 0.15  # by which more of the held points must be found than before
 LASTS_NS = 1_000_000_000
+UNCERTAIN_M = 0.02  # standard deviation of a position that new points should not inherit
 SAME_PLACE = 0.2, 0.07  # metres, radians between the poses
 
 
@@ -38,6 +39,10 @@ class PartialView:
     def wanted(self, held: Held, stamp_ns: int) -> bool:
         """Whether to look for more points: not for long, and not in an image that was held since."""
         return held is self._held and stamp_ns <= self._until_ns
+
+    def uncertain(self, held: Held, covariance: F64, stamp_ns: int) -> bool:
+        """Whether a pose with covariance (6, 6) still depends on that part, and is too uncertain for new points."""
+        return self.wanted(held, stamp_ns) and _sigma_m(covariance) > UNCERTAIN_M
 
     def improved(self, before: F64, after: F64, recall: float, covariance: F64) -> bool:
         """Whether a pose (4, 4) by a share of the held points replaces the one that it was looked for from.

@@ -152,12 +152,14 @@ class Tracker:
         stats = _stats(tracks, solution)
         inlier = self._accept(image, images, tracks, solution, expected.seconds, recovered)
         keyframe = None
-        if recovered or self._keyframes.due(self._tracks):
-            keyframe = self._create_keyframe(image, images, trusted)
-        if keyframe is not None or self._solver.crowded(self._static_count()):
-            self._sparse = images
+        uncertain = self._part.uncertain(self._follower.held, solution.covariance, image.stamp_ns)
+        if self._recovery.free or not uncertain:
+            if recovered or self._keyframes.due(self._tracks):
+                keyframe = self._create_keyframe(image, images, trusted)
+            if keyframe is not None or self._solver.crowded(self._static_count()):
+                self._sparse = images
         state = TrackState.RECOVERED if recovered else TrackState.OK
-        stats |= self._level()
+        stats |= {} if self._sensors is None else self._sensors.level(self._pose)
         reason = "" if self._sensors is None else self._sensors.news()
         return self._frame(image, self._pose, solution.covariance, state, reason, inlier, keyframe, stats), keyframe
 
@@ -284,10 +286,6 @@ class Tracker:
             self._sensors.accept(image.stamp_ns, solution.pose)
         self._keyframes.count_frame()
         return inlier[kept]
-
-    def _level(self) -> dict[str, float]:
-        """Roll and pitch if gravity is known."""
-        return {} if self._sensors is None else self._sensors.level(self._pose)
 
     def _continue(self, image: StereoImage, images: StereoPyramids, pose: F64, tracks: Tracks) -> None:
         self._pose, self._stamp_ns, self._tracks = pose, image.stamp_ns, tracks
