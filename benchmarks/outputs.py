@@ -62,7 +62,7 @@ def update_of(frame: Frame, captured_s: float) -> PoseUpdate:
     """A frame of the tracker as the service sends it."""
     return PoseUpdate(
         frame.frame_id, frame.stamp_ns, frame.stamp_ns, captured_s, frame.state.name, frame.reason, np.eye(4),
-        frame.odom_T_cam, frame.covariance, np.zeros(6), np.eye(6), frame.map_version, 1, False, True,
+        frame.odom_T_cam, frame.covariance, np.zeros(6), np.eye(6), frame.map_version, 1, False, True, np.zeros(3),
     )  # fmt: skip
 
 

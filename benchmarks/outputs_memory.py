@@ -51,7 +51,7 @@ def messages(frame: int, rate: float, image: Any, rng: np.random.Generator) -> l
     second = frame % round(rate) == 0
     out: list[Any] = [
         PoseUpdate(frame, stamp, stamp, time.monotonic(), "OK", "", np.eye(4), np.eye(4), np.eye(6) * 1e-4, np.zeros(6),
-                   np.eye(6) * 1e-4, frame, 1, False, True)
+                   np.eye(6) * 1e-4, frame, 1, False, True, np.zeros(3))
     ]  # fmt: skip
     if frame % 6 == 0:
         uv = rng.uniform(0, min(image.shape), (TRACKS, 2))

@@ -31,7 +31,7 @@ from stereo_sfm.service.messages import PoseUpdate, ServiceState, Started, Statu
 from stereo_sfm.service.outputs.settings import OutputsConfig, PageConfig, PoseSocketConfig
 from stereo_sfm.service.service import Service
 from tests.service.endless import endless_wall
-from tests.service.test_service import STOP_S, wait_for
+from tests.service.test_service import PATIENCE_S, STOP_S, wait_for
 
 pytestmark = pytest.mark.slow
 DEMO = Path(__file__).parents[2] / "recordings" / "demo.mcap"
@@ -243,6 +243,26 @@ def test_kill_9_of_the_service_leaves_no_process_and_loses_nothing(tmp_path: Pat
     said(again, "SIGTERM received")
     assert again.wait(STOP_S + 1.0) == 0 and time.monotonic() - began < STOP_S
     load_map(tmp_path / "store")
+
+
+def test_a_computer_that_was_suspended_goes_on(tmp_path: Path) -> None:
+    """Every process stands still for a while; the watchdogs do not take that for a hung stage."""
+    process = serve(tmp_path)
+    said(process, "is saved")
+    everything = [psutil.Process(process.pid), *psutil.Process(process.pid).children(recursive=True)]
+    for other in everything:
+        other.suspend()
+    time.sleep(5.0)
+    for other in everything:
+        other.resume()
+    lines = list[str]()
+    assert process.stderr is not None
+    while sum("is saved" in line for line in lines) < 2:
+        lines.append(process.stderr.readline())
+    process.send_signal(signal.SIGTERM)
+    lines += process.stderr.readlines()
+    assert process.wait(PATIENCE_S) == 0
+    assert not [line for line in lines if "started again" in line or "does not respond" in line]
 
 
 def test_a_mistake_is_one_line(tmp_path: Path) -> None:
