@@ -38,11 +38,15 @@ class Tracks:
 
     def keep(self, mask: Bool) -> Tracks:
         """The rows where `mask` is True."""
-        return Tracks(**{f.name: getattr(self, f.name)[mask] for f in fields(self)})
+        rows = np.flatnonzero(mask)  # once: numpy would look for them in each column, in four times the time
+        return Tracks(*(getattr(self, name).take(rows, axis=0) for name in _NAMES))
 
     def append(self, other: Tracks) -> Tracks:
         """These rows, then the other's."""
-        return Tracks(**{f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)})
+        return Tracks(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in _NAMES))
+
+
+_NAMES = tuple(f.name for f in fields(Tracks))
 
 
 class Patches:
