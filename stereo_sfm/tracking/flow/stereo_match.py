@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from stereo_sfm.geometry.kernels import njit, project_one, unproject_one
-from stereo_sfm.types import I32, U8
+from stereo_sfm.types import F64, I32, U8
 
 PATCH = 4  # half size of the search patch, in pixels of the search level
 SIZE = 2 * PATCH + 1
@@ -53,81 +53,131 @@ def _curve(bx, by, bz, model, params, right_T_left, min_depth, where):
 
 
 @njit
-def _difference(right, ru, rv, template, brighter, patch):
-    """AREA times the sum of differences to the patch around a pixel: a whole number, and those are summed at once."""
-    _cut(right, ru, rv, patch)
-    total = np.int32(0)
-    for m in range(AREA):
-        total += abs(np.int32(AREA) * (patch[m] - template[m]) - brighter)
-    return total
+def _candidates(
+    left, shape, uv, scale, model_l, params_l, model_r, params_r, right_T_left, min_depth, where, pixels, templates
+):
+    """The candidates' positions (N, C, 2) in the full right image, `shape` of the level, see `search_epipolar`.
 
-
-@njit
-def _differences_along(right, right_sums, ru, rv, template, total, weighted, columns):
-    """As `_difference`, around successive pixels of a row from `ru` on: (C,), written to `columns`."""
-    n = len(columns)
-    columns[:] = 0
-    sums = right_sums[rv, ru : ru + n]
-    for y in range(SIZE):
-        row = right[rv - PATCH + y, ru - PATCH : ru + n + PATCH]
-        for x in range(n + SIZE - 1):
-            weighted[x] = np.int32(AREA) * np.int32(row[x])
-        for x in range(SIZE):
-            away = np.int32(AREA) * template[y * SIZE + x] - total
-            shifted = weighted[x : x + n]
-            for c in range(n):
-                columns[c] += abs(shifted[c] - sums[c] - away)
-
-
-@njit
-def _pixels(where, scale, shape, pixels):
-    """Write the pixel (C, 2) of each position (C, 2) in the full image; -1 where the patch leaves the image."""
-    h, w = shape
-    for c in range(len(where)):
-        pixels[c, 0] = pixels[c, 1] = -1
-        if not math.isnan(where[c, 0]):
-            u, v = int(round(where[c, 0] / scale)), int(round(where[c, 1] / scale))
-            if u >= PATCH and v >= PATCH and u < w - PATCH and v < h - PATCH:
-                pixels[c, 0], pixels[c, 1] = u, v
-
-
-@njit
-def _differences(right, right_sums, pixels, template, total, patch, columns, weighted, cost):
-    """Mean difference (C,) of the patches around pixels (C, 2), 1e9 where they are -1; written to `cost`.
-
-    Successive ones lie mostly side by side in a row: those are compared together.
+    Written too: their pixels (N, C, 2) of the level, -1 where the patch leaves the image, and templates (N, AREA).
     """
-    begin = 0
-    while begin < len(pixels):
-        low = high = last = pixels[begin, 0]
-        v, end = pixels[begin, 1], begin + 1
-        while end < len(pixels) and pixels[end, 1] == v and abs(pixels[end, 0] - last) <= 1:
-            last = pixels[end, 0]
-            low, high = min(low, last), max(high, last)
-            end += 1
-        span = high - low + 1
-        if v < 0:
-            cost[begin:end] = 1e9
-        elif span < SHORT:
-            for c in range(begin, end):
-                u = pixels[c, 0]
-                if c > begin and u == pixels[c - 1, 0]:
-                    cost[c] = cost[c - 1]
-                else:
-                    brighter = np.int32(right_sums[v, u] - total)
-                    cost[c] = _difference(right, u, v, template, brighter, patch) / (AREA * AREA)
-        else:
-            _differences_along(right, right_sums, low, v, template, total, weighted, columns[:span])
-            for c in range(begin, end):
-                cost[c] = columns[pixels[c, 0] - low] / (AREA * AREA)
-        begin = end
+    h, w = left.shape
+    for k in range(len(uv)):
+        for c in range(pixels.shape[1]):
+            pixels[k, c, 0] = pixels[k, c, 1] = -1
+        iu, iv = int(round(uv[k, 0] / scale)), int(round(uv[k, 1] / scale))
+        if iu < PATCH or iv < PATCH or iu >= w - PATCH or iv >= h - PATCH:
+            continue
+        # the patch is cut at whole pixels: search for that pixel's own bearing
+        bx, by, bz = unproject_one(model_l, params_l, iu * scale, iv * scale)
+        if math.isnan(bx):
+            continue
+        _cut(left, iu, iv, templates[k])
+        _curve(bx, by, bz, model_r, params_r, right_T_left, min_depth, where[k])
+        for c in range(pixels.shape[1]):
+            if not math.isnan(where[k, c, 0]):
+                u, v = int(round(where[k, c, 0] / scale)), int(round(where[k, c, 1] / scale))
+                if u >= PATCH and v >= PATCH and u < shape[1] - PATCH and v < shape[0] - PATCH:
+                    pixels[k, c, 0], pixels[k, c, 1] = u, v
 
 
 @njit
+def _costs(right, right_sums, pixels, templates, cost):
+    """Mean-free mean differences (N, C) of patches around pixels (N, C, 2) to templates (N, AREA), 1e9 without pixel.
+
+    Differences are summed AREA times too large, so that they are whole numbers. Successive pixels lie mostly side by
+    side in a row: those are compared together.
+    """
+    count = pixels.shape[1]
+    patch = np.empty(AREA, np.int32)
+    columns, weighted = np.empty(count, np.int32), np.empty(count + SIZE, np.int32)
+    for k in range(len(pixels)):
+        template = templates[k]
+        total = np.int32(0)
+        for m in range(AREA):
+            total = np.int32(total + template[m])
+        begin = 0
+        while begin < count:
+            low = high = last = pixels[k, begin, 0]
+            v, end = pixels[k, begin, 1], begin + 1
+            while end < count and pixels[k, end, 1] == v and abs(pixels[k, end, 0] - last) <= 1:
+                last = pixels[k, end, 0]
+                if last < low:
+                    low = last
+                if last > high:
+                    high = last
+                end += 1
+            n = high - low + 1
+            if v < 0:
+                for c in range(begin, end):
+                    cost[k, c] = 1e9
+            elif n < SHORT:
+                for c in range(begin, end):
+                    u = pixels[k, c, 0]
+                    if c > begin and u == pixels[k, c - 1, 0]:
+                        cost[k, c] = cost[k, c - 1]
+                        continue
+                    _cut(right, u, v, patch)
+                    brighter, difference = np.int32(right_sums[v, u] - total), np.int32(0)
+                    for m in range(AREA):
+                        off = np.int32(AREA * (patch[m] - template[m]) - brighter)
+                        difference = np.int32(difference + abs(off))
+                    cost[k, c] = difference / (AREA * AREA)
+            else:
+                sums = right_sums[v, low : low + n]
+                for c in range(n):
+                    columns[c] = 0
+                for y in range(SIZE):
+                    row = right[v - PATCH + y, low - PATCH : low + n + PATCH]
+                    for x in range(n + SIZE - 1):
+                        weighted[x] = AREA * row[x]
+                    for x in range(SIZE):
+                        away, shifted = np.int32(AREA * template[y * SIZE + x] - total), weighted[x : x + n]
+                        for c in range(n):
+                            columns[c] = np.int32(columns[c] + abs(np.int32(shifted[c] - sums[c] - away)))
+                for c in range(begin, end):
+                    cost[k, c] = columns[pixels[k, c, 0] - low] / (AREA * AREA)
+            begin = end
+
+
+@njit
+def _clear_best(where, cost, uv, scale, max_cost, ratio, out):
+    """Write the position (N, 2) with the least cost where the second best, away from it, is clearly worse."""
+    for k in range(len(uv)):
+        best, best_index = 1e9, -1
+        for c in range(cost.shape[1]):
+            if cost[k, c] < best:
+                best, best_index = cost[k, c], c
+        if best_index < 0 or best > max_cost:
+            continue
+        bu, bv = where[k, best_index, 0], where[k, best_index, 1]
+        second = 1e9
+        for c in range(cost.shape[1]):
+            if cost[k, c] < second:
+                du, dv = where[k, c, 0] - bu, where[k, c, 1] - bv
+                if du * du + dv * dv > (3.0 * scale) ** 2:
+                    second = cost[k, c]
+        if second < ratio * best + 0.5:
+            continue
+        out[k, 0] = bu + uv[k, 0] - int(round(uv[k, 0] / scale)) * scale
+        out[k, 1] = bv + uv[k, 1] - int(round(uv[k, 1] / scale)) * scale
+
+
 def search_epipolar(
-    left, right, right_sums, uv, scale, model_l, params_l, model_r, params_r, right_T_left, min_depth, candidates,
-    max_cost, ratio,
-):  # fmt: skip
+    left: U8,
+    right: U8,
+    right_sums: I32,
+    uv: F64,
+    scale: float,
+    model_l: int,
+    params_l: F64,
+    model_r: int,
+    params_r: F64,
+    right_T_left: F64,
+    min_depth: float,
+    candidates: int,
+    max_cost: float,
+    ratio: float,
+) -> F64:
     """Coarse position in the right image of points of the left one.
 
     Mean-free absolute differences of patches along the epipolar curve, sampled evenly in inverse distance.
@@ -142,47 +192,15 @@ def search_epipolar(
     Returns:
         (N, 2) px of the full right image, NaN without a clear best.
     """
-    n = uv.shape[0]
-    out = np.full((n, 2), np.nan)
-    h, w = left.shape
-    cost = np.empty(candidates)
-    where = np.empty((candidates, 2))
-    template = np.empty(AREA, np.int32)
-    pixels = np.empty((candidates, 2), np.int64)
-    patch = np.empty(AREA, np.int32)
-    columns, weighted = np.empty(candidates, np.int32), np.empty(candidates + SIZE, np.int32)
-    for k in range(n):
-        iu, iv = int(round(uv[k, 0] / scale)), int(round(uv[k, 1] / scale))
-        if iu < PATCH or iv < PATCH or iu >= w - PATCH or iv >= h - PATCH:
-            continue
-        # the patch is cut at whole pixels: search for that pixel's own bearing
-        bx, by, bz = unproject_one(model_l, params_l, iu * scale, iv * scale)
-        if math.isnan(bx):
-            continue
-        _cut(left, iu, iv, template)
-        total = np.int32(0)
-        for m in range(AREA):
-            total += template[m]
-        _curve(bx, by, bz, model_r, params_r, right_T_left, min_depth, where)
-        _pixels(where, scale, right.shape, pixels)
-        _differences(right, right_sums, pixels, template, total, patch, columns, weighted, cost)
-        best, best_index = 1e9, -1
-        for c in range(candidates):
-            if cost[c] < best:
-                best, best_index = cost[c], c
-        if best_index < 0 or best > max_cost:
-            continue
-        bu, bv = where[best_index, 0], where[best_index, 1]
-        second = 1e9
-        for c in range(candidates):
-            if cost[c] < second:
-                du, dv = where[c, 0] - bu, where[c, 1] - bv
-                if du * du + dv * dv > (3.0 * scale) ** 2:
-                    second = cost[c]
-        if second < ratio * best + 0.5:
-            continue
-        out[k, 0] = bu + uv[k, 0] - iu * scale
-        out[k, 1] = bv + uv[k, 1] - iv * scale
+    n, out = len(uv), np.full((len(uv), 2), np.nan)
+    where, cost = np.empty((n, candidates, 2)), np.empty((n, candidates))
+    pixels, templates = np.empty((n, candidates, 2), np.int64), np.empty((n, AREA), np.int32)
+    _candidates(
+        left, right.shape, uv, scale, model_l, params_l, model_r, params_r, right_T_left, min_depth, where, pixels,
+        templates,
+    )  # fmt: skip
+    _costs(right, right_sums, pixels, templates, cost)
+    _clear_best(where, cost, uv, scale, max_cost, ratio, out)
     return out
 
 
