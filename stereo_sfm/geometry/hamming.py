@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stereo_sfm.geometry.kernels import njit
+from stereo_sfm.geometry.kernels import inner, njit
 from stereo_sfm.types import U8
 
 U64 = NDArray[np.uint64]
@@ -19,7 +19,7 @@ def as_words(descriptors: U8) -> U64:
     return np.ascontiguousarray(descriptors, np.uint8).reshape(-1, 32).view(np.uint64)
 
 
-@njit
+@inner
 def _popcount(x):
     x = x - ((x >> np.uint64(1)) & np.uint64(0x5555555555555555))
     x = (x & np.uint64(0x3333333333333333)) + ((x >> np.uint64(2)) & np.uint64(0x3333333333333333))

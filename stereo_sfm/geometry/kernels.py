@@ -23,9 +23,11 @@ PARAMS = 16
 LIMIT = 12
 
 njit: Any = jit(nogil=True, error_model="numpy")
+# For kernels that only kernels call: less to compile, but Python, which finds nothing to call, would crash.
+inner: Any = jit(nogil=True, error_model="numpy", no_cpython_wrapper=True)
 
 
-@njit
+@inner
 def _radtan_distort(p, x, y):
     """Normalised (x, y) -> distorted, with the 2x2 Jacobian. OpenCV's rational model: k1 k2 p1 p2 k3 k4 k5 k6."""
     k1, k2, p1, p2, k3, k4, k5, k6 = p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11]
@@ -42,7 +44,7 @@ def _radtan_distort(p, x, y):
     return xd, yd, jxx, jxy, jyy
 
 
-@njit
+@inner
 def project_one(model, p, x, y, z):
     """Point in the camera -> (u, v, J00, J01, J02, J10, J11, J12), NaN outside the model's range."""
     nan = math.nan
@@ -129,7 +131,7 @@ def project_one(model, p, x, y, z):
     )
 
 
-@njit
+@inner
 def unproject_one(model, p, u, v):
     """Pixel -> unit bearing, NaN where the model is not invertible."""
     nan = math.nan
@@ -157,7 +159,7 @@ def unproject_one(model, p, u, v):
     return math.sin(mx), ca * math.sin(my), ca * math.cos(my)
 
 
-@njit
+@inner
 def _kb_theta(p, d):
     """Solve theta * (1 + k1 theta^2 + ...) = d on [0, limit] by Newton steps kept inside a shrinking bracket.
 
@@ -186,7 +188,7 @@ def _kb_theta(p, d):
     return theta
 
 
-@njit
+@inner
 def _radtan_undistort(p, mx, my):
     """Newton on the 2-D distortion, started from the fixed-point iterate; NaN beyond the monotonic radius."""
     x, y = mx, my

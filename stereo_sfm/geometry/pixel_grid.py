@@ -8,12 +8,12 @@ import math
 
 import numpy as np
 
-from stereo_sfm.geometry.kernels import njit
+from stereo_sfm.geometry.kernels import inner
 
 MAX_CELLS = 512  # along either axis
 
 
-@njit
+@inner
 def make_grid(uv, radius):
     """Square cells of at least `radius` px over pixels (N, 2); those with NaN are in none.
 
@@ -45,7 +45,7 @@ def make_grid(uv, radius):
     return (size, u0, v0), (columns, rows), starts, members
 
 
-@njit
+@inner
 def cells_near(u, v, frame, shape):
     """Columns and rows (first, behind the last) of the cells in which all pixels within the radius lie; maybe none."""
     size, u0, v0 = frame

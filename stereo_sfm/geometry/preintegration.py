@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stereo_sfm.geometry import se3
-from stereo_sfm.geometry.kernels import njit
+from stereo_sfm.geometry.kernels import inner, njit
 from stereo_sfm.types import F64
 
 GRAVITY = 9.80665  # m/s^2
@@ -74,7 +74,7 @@ def preintegrate(
     )
 
 
-@njit
+@inner
 def exp_and_jacobian(phi, rotation, jacobian):
     """Rotation of a tangent (3,) and its right Jacobian, into (3, 3) arrays."""
     x, y, z = phi[0], phi[1], phi[2]
@@ -100,7 +100,7 @@ def _product(a, b, out):
             out[i, j] = a[i, 0] * b[0, j] + a[i, 1] * b[1, j] + a[i, 2] * b[2, j]
 
 
-@njit
+@inner
 def _transported(step, covariance, half_way):
     """covariance (9, 9) becomes step @ covariance @ step.T, without the zeros of `step`."""
     for i in range(9):

@@ -8,10 +8,10 @@ import math
 
 import numpy as np
 
-from stereo_sfm.geometry.kernels import njit
+from stereo_sfm.geometry.kernels import inner, njit
 
 
-@njit
+@inner
 def exp_into(xi, seconds, out):
     """exp(seconds * xi) of a tangent (6,) = (rho, phi) per second, into `out` (4, 4)."""
     rx, ry, rz = xi[0] * seconds, xi[1] * seconds, xi[2] * seconds
@@ -33,7 +33,7 @@ def exp_into(xi, seconds, out):
     out[3, 0], out[3, 1], out[3, 2], out[3, 3] = 0.0, 0.0, 0.0, 1.0
 
 
-@njit
+@inner
 def compose_into(a, b, out):
     """a @ b of two (4, 4) transforms, into `out`."""
     for i in range(3):
@@ -42,13 +42,13 @@ def compose_into(a, b, out):
     out[3, 0], out[3, 1], out[3, 2], out[3, 3] = 0.0, 0.0, 0.0, 1.0
 
 
-@njit
+@inner
 def dot(a, b):
     """Product of two vectors of three coordinates."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit
+@inner
 def transform_point(t, x, y, z):
     """The three coordinates of a point after the transform t (4, 4)."""
     return (
@@ -75,7 +75,7 @@ def so3_exp_one(phi):
     return out[:3, :3].copy()
 
 
-@njit
+@inner
 def quaternion_of(r):
     """Unit quaternion x y z w, w >= 0, of a rotation (3, 3): the largest component first (Shepperd's method)."""
     xx, yy = 1 + r[0, 0] - r[1, 1] - r[2, 2], 1 - r[0, 0] + r[1, 1] - r[2, 2]

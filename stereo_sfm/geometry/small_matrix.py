@@ -12,10 +12,10 @@ import math
 
 import numpy as np
 
-from stereo_sfm.geometry.kernels import njit
+from stereo_sfm.geometry.kernels import inner, njit
 
 
-@njit
+@inner
 def cholesky(a, factor):
     """Lower triangular `factor` (n, n) with factor @ factor.T = a; False where `a` is not positive definite."""
     n = a.shape[0]
@@ -33,7 +33,7 @@ def cholesky(a, factor):
     return True
 
 
-@njit
+@inner
 def cholesky_solve(factor, b, x):
     """x (n,) with a @ x = b, given `cholesky` of a."""
     n = factor.shape[0]

@@ -9,11 +9,11 @@ import math
 
 import numpy as np
 
-from stereo_sfm.geometry.kernels import njit, project_one
+from stereo_sfm.geometry.kernels import inner, njit, project_one
 from stereo_sfm.geometry.se3_kernels import dot
 
 
-@njit
+@inner
 def _cubic_root(c3, c2, c1, c0):
     """One real root of c3 x^3 + c2 x^2 + c1 x + c0, the one where the polynomial is steepest, polished by Newton."""
     if abs(c3) < 1e-14 * (abs(c2) + abs(c1) + abs(c0)):
@@ -43,7 +43,7 @@ def _cross(a, b):
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
-@njit
+@inner
 def _eigenvector(m, value):
     """Unit null vector of the symmetric 3x3 matrix m - value I: the largest cross product of two of its rows."""
     n = m.copy()
@@ -59,12 +59,12 @@ def _eigenvector(m, value):
     return x * scale, y * scale, z * scale
 
 
-@njit
+@inner
 def _det3(m):
     return dot(m[0], _cross(m[1], m[2]))
 
 
-@njit
+@inner
 def _adjugate_trace(a, b):
     """trace(adj(a) b) for symmetric a."""
     total = 0.0
@@ -75,7 +75,7 @@ def _adjugate_trace(a, b):
     return total
 
 
-@njit
+@inner
 def _polish(l1, l2, l3, a12, a13, a23, b12, b13, b23):
     """Newton steps on the three distance equations."""
     for _ in range(3):
@@ -163,7 +163,7 @@ def p3p(points, bearings):
     return out, count
 
 
-@njit
+@inner
 def squared_error(t, point, range_sigma, uv, model, params, pixel_sigma):
     """Squared reprojection error over its variance: pixel noise and the point's own range uncertainty along its ray.
 
@@ -200,7 +200,7 @@ def errors(t, points, sigmas, uv, model, params, pixel_sigma):
     return out
 
 
-@njit
+@inner
 def inverse34(t):
     """Inverse of a rigid (3, 4) transform."""
     out = np.empty((3, 4))
@@ -211,7 +211,7 @@ def inverse34(t):
     return out
 
 
-@njit
+@inner
 def _cost(t, points, sigmas, uv_b, points_b, sigmas_b, uv_a, model, params, pixel_sigma, limit, worst):
     """Truncated cost over both directions (MSAC); stops early once it is no better than `worst`."""
     back = inverse34(t)

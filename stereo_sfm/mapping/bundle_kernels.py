@@ -26,13 +26,13 @@ import math
 
 import numpy as np
 
-from stereo_sfm.geometry.kernels import njit, project_one
+from stereo_sfm.geometry.kernels import inner, njit, project_one
 from stereo_sfm.geometry.se3_kernels import compose_into, exp_into
 
 UNPROJECTABLE = 1e6  # chi2 of a point outside the camera's field of view: without gradient, so such steps are rejected
 
 
-@njit
+@inner
 def _huber(chi2, delta):
     """(cost, weight) of Huber's loss on a squared, normalised residual; delta <= 0 means squares."""
     if delta <= 0.0 or chi2 <= delta * delta:
@@ -41,7 +41,7 @@ def _huber(chi2, delta):
     return delta * (e - 0.5 * delta), delta / e
 
 
-@njit
+@inner
 def _loss(chi2, scale, redescends):
     """(cost, weight) of Cauchy's loss of a scale in sigmas if it redescends, else of Huber's with that threshold."""
     if not redescends:
@@ -261,12 +261,12 @@ def move_poses(rows, xi, rot, pos):
             rot[k, r, 0], rot[k, r, 1], rot[k, r, 2], pos[k, r] = after[r, 0], after[r, 1], after[r, 2], after[r, 3]
 
 
-@njit
+@inner
 def _row_times_skew(row, p0, p1, p2):
     return row[1] * p2 - row[2] * p1, row[2] * p0 - row[0] * p2, row[0] * p1 - row[1] * p0
 
 
-@njit
+@inner
 def _world_model(a, r, o, k):
     """R A R^T of observation o in keyframe k, upper triangle."""
     a0, a1, a2, a3, a4, a5 = a[o, 0], a[o, 1], a[o, 2], a[o, 3], a[o, 4], a[o, 5]
@@ -388,7 +388,7 @@ def list_pairs(starts, obs_kf, free, keys):
                     i += 1
 
 
-@njit
+@inner
 def _cross_block(a, p, r, o, k, w, n):
     """W^T = (G^T A R^T)^T of observation o in keyframe k into w[n] (18,): column by column, six entries each."""
     a0, a1, a2, a3, a4, a5 = a[o, 0], a[o, 1], a[o, 2], a[o, 3], a[o, 4], a[o, 5]

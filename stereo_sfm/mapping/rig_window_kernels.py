@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 
-from stereo_sfm.geometry.kernels import njit, project_one
+from stereo_sfm.geometry.kernels import inner, njit, project_one
 from stereo_sfm.types import RIG_TERMS
 
 
@@ -30,7 +30,7 @@ def _rows(cam, params, p, dp, uv, j_point, residual, at):
     return u, v, j00, j01, j02, j10, j11, j12
 
 
-@njit
+@inner
 def _pose_row(j0, j1, j2, p, rho, out):
     """A row (j) of the projection by a left perturbation (rho, phi) of the moment's pose, p scaled by `rho`."""
     out[0], out[1], out[2] = rho * j0, rho * j1, rho * j2
@@ -39,7 +39,7 @@ def _pose_row(j0, j1, j2, p, rho, out):
     out[5] = j1 * p[0] - j0 * p[1]
 
 
-@njit
+@inner
 def _lens_rows(shape, lens, j_rig, residual, at):
     """What the lens's terms do to one image's rows."""
     for i in range(2):
@@ -182,7 +182,7 @@ def accumulate(
             h[a, b] = h[b, a]
 
 
-@njit
+@inner
 def _eliminate(hpp, gp, hpr, h, g, r_size):
     """Schur complement of one point, upper triangle; gp and hpr become hpp^-1 gp and hpp^-1 hpr.
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
-from stereo_sfm.geometry.kernels import njit, project_one
+from stereo_sfm.geometry.kernels import inner, njit, project_one
 from stereo_sfm.geometry.small_matrix import solve_symmetric
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.types import F64, I64
@@ -47,7 +47,7 @@ def _accumulate(cam, params, p0, p1, p2, u_obs, v_obs, inv_sigma, m, h, b):
     return 2.0 * math.log1p(chi2 / 4.0)
 
 
-@njit
+@inner
 def _cost(x, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, h, b):
     left_model, left_params, right_model, right_params = cams
     h[:] = 0.0
@@ -76,7 +76,7 @@ def _cost(x, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, righ
     return cost
 
 
-@njit
+@inner
 def _copy(source, target):
     """Element by element: a slice assignment would take seconds to compile for the text of its error message."""
     for i in range(source.size):

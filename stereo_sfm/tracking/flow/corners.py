@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from stereo_sfm.geometry.cameras import Camera
-from stereo_sfm.geometry.kernels import njit
+from stereo_sfm.geometry.kernels import inner, njit
 from stereo_sfm.types import F64, U8, Bool
 
 BORDER = 12  # px of the half image, without corners
@@ -26,7 +26,7 @@ def _block(blocked, u, v, radius):
                 blocked[y, x] = True
 
 
-@njit
+@inner
 def _lies_on_edge(image, u, v):
     """Whether the structure tensor of the 5x5 pixels has one small eigenvalue (Lowe, IJCV 2004, section 4.1)."""
     a, b, c = 0.0, 0.0, 0.0
@@ -39,7 +39,7 @@ def _lies_on_edge(image, u, v):
     return (a * c - b * b) * (1 + MIN_SHARE) ** 2 < MIN_SHARE * (a + c) ** 2
 
 
-@njit
+@inner
 def _cell_best(image, score, blocked, top, left, cell, floor, off_edges):
     """Best unblocked pixel of a cell, with `off_edges` the best that is not on an edge: u, v; -1, -1 if none."""
     h, w = score.shape

@@ -20,7 +20,7 @@ import math
 import cv2
 import numpy as np
 
-from stereo_sfm.geometry.kernels import njit
+from stereo_sfm.geometry.kernels import inner, njit
 from stereo_sfm.geometry.small_matrix import invert_symmetric
 from stereo_sfm.types import U8
 
@@ -76,7 +76,7 @@ def _inside(image, u, v, margin):
     return u >= margin and v >= margin and u < w - 1 - margin and v < h - 1 - margin
 
 
-@njit
+@inner
 def _dot(a, b, tmp):
     """Sum of a * b over a flat window."""
     for m in range(32):
@@ -105,7 +105,7 @@ def _sample(image, u, v, raw, out):
         out[m] = w00 * raw[m] + w01 * raw[m + 1] + w10 * raw[m + STRIDE] + w11 * raw[m + STRIDE + 1]
 
 
-@njit
+@inner
 def _sample_wide(image, u, v, raw, out):
     """As `_sample`, with one sample more on each side: first sample at (u - 1, v - 1), SIZE + 2 rows."""
     u, v = u - 1, v - 1
@@ -121,7 +121,7 @@ def _sample_wide(image, u, v, raw, out):
         out[m] = w00 * raw[m] + w01 * raw[m + 1] + w10 * raw[m + STRIDE] + w11 * raw[m + STRIDE + 1]
 
 
-@njit
+@inner
 def _template(image, u, v, weights, raw, wide, tmp, patch, gx, gy):
     """Patch around (u, v), centred, and its weighted, centred gradients by central differences.
 
@@ -319,7 +319,7 @@ def make_patches(pyramid, uv, slots, weights, coordinates, patch, gradients, inv
     return good
 
 
-@njit
+@inner
 def _sample_affine(image, warp, cu, cv, scratch, out):
     """Window at warp @ (x, y) + (cu, cv); False when it leaves the image.
 

@@ -22,7 +22,7 @@ import math
 
 import numpy as np
 
-from stereo_sfm.geometry.kernels import njit, project_one
+from stereo_sfm.geometry.kernels import inner, njit, project_one
 from stereo_sfm.geometry.se3_kernels import compose_into, exp_into
 from stereo_sfm.geometry.small_matrix import invert_symmetric, solve_symmetric
 
@@ -30,7 +30,7 @@ MAX_SIGMAS = 4.0  # change of an inverse distance while a pose is solved
 MIN_RHO = 1e-4  # 1/m
 
 
-@njit
+@inner
 def point_residuals(pose, px, py, pz, dx, dy, dz, uv_l, uv_r, cams, right_T_left, res, jac, ray):
     """Residuals of one point in both images.
 
@@ -171,7 +171,7 @@ def _normal_equations(
     return used
 
 
-@njit
+@inner
 def _add_prior(pose, expected, sigmas, normal, rhs):
     """Add the prior of the pose (4, 4), to first order in its difference from it, to the normal equations."""
     difference = np.zeros(6)
@@ -186,7 +186,7 @@ def _add_prior(pose, expected, sigmas, normal, rhs):
         rhs[i] += information * difference[i]
 
 
-@njit
+@inner
 def _move_distances(rho, prior, variance, elimination, xi, row_s):
     """Back substitution: update every inverse distance for a step of the pose (and velocity), within limits."""
     for k in range(len(rho)):
@@ -263,7 +263,7 @@ def optimise_pose(
     return pose, velocity, inverse[:6, :6].copy(), error
 
 
-@njit
+@inner
 def row_residuals(
     k, pose, velocity, row_s, origin, direction, rho, uv_l, uv_r, cams, right_T_left, row, step, res, jac, ray
 ):  # fmt: skip

@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from stereo_sfm.geometry.cameras import Camera
-from stereo_sfm.geometry.kernels import njit, project_one
+from stereo_sfm.geometry.kernels import inner, njit, project_one
 from stereo_sfm.geometry.se3_kernels import transform_point
 from stereo_sfm.tracking.flow.klt import HALF, SIZE, STRIDE
 from stereo_sfm.types import F32, F64, I64, U8
@@ -183,7 +183,7 @@ def _offsets(low, high, size, radius, step):
     return first, (last - first) // step + 1
 
 
-@njit
+@inner
 def _copy(phases, step, c0, r0, wide, high, area):
     """Write the part of all phases from column c0 and row r0 on into a flat array."""
     columns = min(wide, phases.shape[3] - c0)
@@ -196,7 +196,7 @@ def _copy(phases, step, c0, r0, wide, high, area):
                     to[c] = line[c]
 
 
-@njit
+@inner
 def _promising(sums, squares, cross, least):
     """Whether the square of any correlation may exceed `least` times its variance."""
     count = 0
@@ -206,7 +206,7 @@ def _promising(sums, squares, cross, least):
     return count > 0
 
 
-@njit
+@inner
 def _halved_window(window, small):
     """Write the samples of a window (FLAT_SIZE,) in the half image, less their mean; returns the sum of squares."""
     mean, power = 0.0, 0.0
@@ -222,7 +222,7 @@ def _halved_window(window, small):
     return power
 
 
-@njit
+@inner
 def _sample_places(uv, warp, corner, weight):
     """Pixels (SAMPLES, 2) and bilinear weights (4, SAMPLES) of a deformed window; its left, right, top and bottom."""
     left, right, top, bottom = 1e9, -1e9, 1e9, -1e9
@@ -240,7 +240,7 @@ def _sample_places(uv, warp, corner, weight):
     return left, right, top, bottom
 
 
-@njit
+@inner
 def _products(area, start, weight, small, count, sums, squares, cross):
     """Sums (count,) of the samples, their squares and their products with a window, at successive places of an area.
 

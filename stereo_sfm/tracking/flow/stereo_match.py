@@ -10,7 +10,7 @@ import math
 import cv2
 import numpy as np
 
-from stereo_sfm.geometry.kernels import njit, project_one, unproject_one
+from stereo_sfm.geometry.kernels import inner, njit, project_one, unproject_one
 from stereo_sfm.types import F64, I32, U8
 
 PATCH = 4  # half size of the search patch, in pixels of the search level
@@ -25,7 +25,7 @@ def patch_sums(image: U8) -> I32:
     return cv2.boxFilter(image, cv2.CV_32S, (SIZE, SIZE), normalize=False).astype(np.int32, copy=False)
 
 
-@njit
+@inner
 def _cut(image, u, v, patch):
     """Write the patch around a pixel into a flat array."""
     for y in range(SIZE):
@@ -34,7 +34,7 @@ def _cut(image, u, v, patch):
             patch[y * SIZE + x] = row[x]
 
 
-@njit
+@inner
 def _curve(bx, by, bz, model, params, right_T_left, min_depth, where):
     """Pixels (N, 2) of a left bearing in the right image, evenly in inverse distance from infinity to `min_depth`."""
     t, last = right_T_left, len(where) - 1

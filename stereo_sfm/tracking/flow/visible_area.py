@@ -73,7 +73,9 @@ def _bright_shares(image, degree):
             total[degree[y, x]] += 1
             if degree[y, x] < CENTRE_DEG:
                 centre[image[y, x]] += 1
-    limit, below, half = 0, 0, centre.sum() / 2
+    limit, below, half = 0, 0, 0.0
+    for value in range(256):
+        half += centre[value] / 2
     while limit < 255 and below + centre[limit] < half:
         below += centre[limit]
         limit += 1
@@ -81,7 +83,9 @@ def _bright_shares(image, degree):
         for x in range(image.shape[1]):
             if image[y, x] > LIT * limit:
                 bright[degree[y, x]] += 1
-    return bright / np.maximum(total, 1)
+    for k in range(181):
+        bright[k] /= max(total[k], 1.0)
+    return bright
 
 
 @njit

@@ -19,7 +19,7 @@ import numpy as np
 
 from stereo_sfm.calib.imu import Imu
 from stereo_sfm.geometry import se3
-from stereo_sfm.geometry.kernels import njit
+from stereo_sfm.geometry.kernels import inner, njit
 from stereo_sfm.geometry.preintegration import GRAVITY, Preintegrated
 from stereo_sfm.types import F64
 
@@ -213,7 +213,7 @@ def _advance(x, p, t, rotation, moved, integrated, by_bias, covariance, walk):
     return x, 0.5 * (p + p.T), chi2
 
 
-@njit
+@inner
 def _sized(x, p):
     """Use the size of gravity, once its direction is known well enough to linearise it."""
     if p[3, 3] + p[4, 4] + p[5, 5] > KNOWN**2:
