@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
-import functools
 import os
 import queue
 import selectors
@@ -15,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import ForkingPickler
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 T = TypeVar("T")
 
@@ -170,24 +169,53 @@ class DroppingQueue(Generic[T]):
 class DroppingOutbox(DroppingQueue[object]):
     """As `Outbox`, but sending never blocks: when too many messages wait, the oldest is dropped (a slow viewer)."""
 
-    def __init__(
-        self,
-        connection: Connection,
-        limit: int = 256,
-        write: Callable[[Connection, Any], None] = Connection.send,
-    ) -> None:
-        """Args: write, puts a message into the pipe (`Connection.send_bytes` for bytes); others as `DroppingQueue`."""
-        self._connection = connection
-        super().__init__(functools.partial(write, connection), limit)
+    def __init__(self, connection: Connection, limit: int = 256) -> None:
+        self._connection, self._descriptor = connection, connection.fileno()
+        os.set_blocking(self._descriptor, False)
+        self._writing = threading.Lock()
+        self._rest = memoryview(b"")  # of a message that is partly in the pipe
+        super().__init__(_framed, limit)
 
     def send(self, message: object) -> None:
-        """Queue a message, which may be dropped later."""
-        self.put(message)
+        """Send a message where there is room and none waits, else queue it: it may be dropped later."""
+        with self._writing:
+            at_once = not self._waiting and not self._rest
+            if at_once:
+                self._attempt(_framed(message))
+        if not at_once:
+            self.put(message)
+        elif self._rest:
+            self._more.release()  # the thread sends what is left of it
+
+    def _attempt(self, data: memoryview) -> None:
+        """Put what there is room for into the pipe, and keep the rest."""
+        try:
+            self._rest = data[os.write(self._descriptor, data) :]
+        except BlockingIOError:
+            self._rest = data
+        except OSError:  # the reader has ended: nothing waits for this message
+            self._rest = data[0:0]
 
     def _work(self) -> None:
-        with contextlib.suppress(OSError):  # the reader has ended
-            super()._work()
-        self._connection.close()
+        room = selectors.PollSelector()
+        room.register(self._descriptor, selectors.EVENT_WRITE)
+        while not self._closing or self._waiting or self._rest:
+            self._more.acquire()
+            while self._next():
+                room.select()
+        room.close()
+        with self._writing:
+            self._descriptor = -1  # the number may be another file's soon
+            self._connection.close()
+
+    def _next(self) -> bool:
+        """Write what waits as long as there is room; whether some is left."""
+        with self._writing:
+            while self._rest or self._waiting:
+                self._attempt(self._rest or _framed(self._waiting.popleft()))
+                if self._rest:
+                    return True
+        return False
 
 
 class Arrivals:

@@ -126,7 +126,7 @@ class OutputProcess:
         (messages, to_output), (reports, to_main), (replies, to_client) = (pipe() for _ in range(3))
         process = start_child(f"output {self.name}", run_output, self._module, self._config, messages, to_main, replies)
         self.starts += 1
-        self._process, self._outbox = process, DroppingOutbox(to_output, LIMIT, Connection.send_bytes)
+        self._process, self._outbox = process, DroppingOutbox(to_output, LIMIT)
         self._replies = DroppingOutbox(to_client, LIMIT)
         with contextlib.suppress(EOFError, OSError):
             while True:
