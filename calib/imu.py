@@ -7,13 +7,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.types import F64
+from stereo_sfm.types import F64, ReadOnly
 
 MAX_OFFSET_S = 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class Imu:
+class Imu(ReadOnly):
     """A gyroscope and an accelerometer in one frame. Corrected samples are `matrix @ raw - bias`.
 
     The default noise is that of a consumer sensor.

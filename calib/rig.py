@@ -10,7 +10,7 @@ from stereo_sfm.calib.imu import Imu
 from stereo_sfm.calib.wheel import Wheel
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry.cameras import Camera
-from stereo_sfm.types import F64, Bool
+from stereo_sfm.types import F64, Bool, ReadOnly
 
 BASELINE_RANGE_M = 1e-4, 10.0
 MAX_SKEW = 1e-4  # of a rotation: largest deviation of its product with its transpose from the identity
@@ -21,7 +21,7 @@ MAX_DISTORTION = 1e6  # rational models of real lenses have some hundred
 
 
 @dataclass(frozen=True, eq=False)
-class Rig:
+class Rig(ReadOnly):
     """One camera, or a stereo pair.
 
     `left_T_right` maps points of the right camera to the left one: its translation is the position of the right camera

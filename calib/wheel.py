@@ -8,13 +8,13 @@ import numpy as np
 
 from stereo_sfm.calib.imu import MAX_OFFSET_S
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.types import F64, WheelSamples
+from stereo_sfm.types import F64, ReadOnly, WheelSamples
 
 WHEELS = {"twist": (0,), "differential": (2,), "skid_steer": (2, 4), "mecanum": (4,)}  # number of wheels by model
 
 
 @dataclass(frozen=True, eq=False)
-class Wheel:
+class Wheel(ReadOnly):
     """Wheel odometry of a robot on the floor, in wheel axes: x forward, y left, z up, origin amid the driven wheels.
 
     With model "twist" the samples are velocities, corrected by `linear_matrix` and `angular_scale`. With the others

@@ -38,22 +38,25 @@ def shape(*axes: int) -> dict[str, tuple[int, ...]]:
     return {"shape": axes}
 
 
-def _freeze(obj: Any) -> None:
-    for value in vars(obj).values():
-        if isinstance(value, np.ndarray):
-            value.flags.writeable = False
-
-
-class Message:
-    """Base of everything that flows: arrays become read-only when the message is made."""
+class ReadOnly:
+    """Base of what has read-only arrays."""
 
     def __post_init__(self) -> None:
-        _freeze(self)
+        self._freeze()
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Arrays stay read-only on the way through a pipe: compiled kernels see the same types in every process."""
         self.__dict__.update(state)
-        _freeze(self)
+        self._freeze()
+
+    def _freeze(self) -> None:
+        for value in vars(self).values():
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+
+
+class Message(ReadOnly):
+    """Base of everything that flows."""
 
 
 class TrackState(enum.IntEnum):

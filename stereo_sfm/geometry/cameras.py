@@ -13,11 +13,11 @@ from typing import ClassVar
 import numpy as np
 
 from stereo_sfm.geometry import kernels
-from stereo_sfm.types import F64, Bool
+from stereo_sfm.types import F64, Bool, ReadOnly
 
 
 @dataclass(frozen=True, eq=False)
-class Camera:
+class Camera(ReadOnly):
     """One camera: image size in pixels, focal lengths and principal point in pixels, distortion coefficients."""
 
     width: int

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -70,6 +71,17 @@ compile_share(Config(), RIGS[sys.argv[1]])
 print(*sorted(set(late)))
 """
 SIMULATED = "sim:people?frames=40&size=320x200&vibration=2"
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_a_rig_sent_to_a_stage_needs_no_other_kernels(name: str) -> None:
+    """Kernels are compiled for read-only arrays or for others: `stereo-sfm compile` has the rig itself."""
+    rig = RIGS[name]
+    received = pickle.loads(pickle.dumps(rig))
+    for before, after in ((rig, received), (rig.left, received.left), (rig.imu, received.imu)):
+        arrays = {k: v.flags.writeable for k, v in vars(before or rig).items() if isinstance(v, np.ndarray)}
+        assert arrays == {k: v.flags.writeable for k, v in vars(after or received).items() if isinstance(v, np.ndarray)}
+        assert not any(arrays.values())
 
 
 def test_what_numba_needs_for_kernels_is_loaded_before_stages_are_forked() -> None:
