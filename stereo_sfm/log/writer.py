@@ -23,7 +23,6 @@ from mcap_protobuf.schema import build_file_descriptor_set
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log import repair, schema
-from stereo_sfm.log.chunk_builder import Chunk
 from stereo_sfm.log.topics import BY_NAME
 
 log = logging.getLogger("stereo_sfm")
@@ -111,7 +110,6 @@ class LogWriter:
         compression = CompressionType.ZSTD if compress else CompressionType.NONE
         self._mcap = Writer(self._file, chunk_size=2 * CHUNK_BYTES, compression=compression)  # pyright: ignore[reportArgumentType]
         setattr(self._mcap, "_Writer__chunk_indices", _ChunkIndex())  # noqa: B010  # no name that is checked
-        setattr(self._mcap, "_Writer__chunk_builder", Chunk())  # noqa: B010
         self._channels: dict[str, int] = {}
         self._pending_bytes = 0
         self._pending_since: tuple[int, int] = (0, 0)  # log and publish time of the oldest message not yet written
