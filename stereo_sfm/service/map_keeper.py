@@ -44,7 +44,7 @@ class MapKeeper:
         self._lock = threading.Lock()  # of the store, while it changes
         self._ending = False
         self._awaited = False  # the last save was requested, and the session has not replied
-        self._awaited_ns = 0  # Unix time of that request
+        self._before: tuple[int, int] | None = None  # what was written at that request
 
     @property
     def mode(self) -> str:
@@ -118,7 +118,7 @@ class MapKeeper:
 
         Args: complete, the session's mapper came to its end: it has written what there was, whether asked or not.
         """
-        written = self._awaited and self._store.written_since(self._awaited_ns)  # though its message came too late
+        written = self._awaited and self._store.written() not in (None, self._before)  # its message came too late
         if self._awaited and not (complete or written):
             self._log_lost()
             return
@@ -144,7 +144,7 @@ class MapKeeper:
             self._end_request(ENDING)
             if self._store.saves and session is not None:
                 self._store.cancel()
-                self._awaited, self._awaited_ns = True, time.time_ns()
+                self._awaited, self._before = True, self._store.written()
                 session.save_map(self._store.session, urgent=True)
 
     def check(self, session: Session | None) -> None:

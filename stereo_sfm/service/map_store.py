@@ -63,12 +63,13 @@ class MapStore:
         """The session's own part."""
         return self.folder.with_name(f".{self.folder.name}.session")
 
-    def written_since(self, unix_ns: int) -> bool:
-        """Whether the session's own part was completely written after this time."""
+    def written(self) -> tuple[int, int] | None:
+        """Tells the session's own part, as it was completely written last, from others; None if there is none."""
         try:
-            return (self.session / "map.json").stat().st_mtime_ns >= unix_ns
+            file = (self.session / "map.json").stat()
         except OSError:
-            return False
+            return None
+        return file.st_ino, file.st_mtime_ns
 
     def begin(self) -> MapFolders:
         """The maps of a new session; a session that an earlier run did not join is joined first.
