@@ -201,8 +201,9 @@ class Follower:
             aligned = self._align(pyramid, moved, warp[missed], curvature[missed], tracks.slot[missed], followed)
             uv[missed], deformed[missed], found[missed] = aligned
             if blurred:
-                lost = missed[followed & ~found[missed]]
-                uv[lost], deformed[lost], found[lost] = moved[followed & ~aligned[2]], warp[lost], True
+                kept = followed & ~aligned[2]
+                rows = missed[kept]
+                uv[rows], deformed[rows], found[rows] = moved[kept], warp[rows], True
         self._miss_px = median_distance(uv, guess, found)
         return self._kept(tracks, uv, deformed, found)
 

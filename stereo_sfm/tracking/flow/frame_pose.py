@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from collections.abc import Generator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -137,10 +139,8 @@ class FramePoseSolver:
         """Solve for the pose of a lost camera from points that were static before, starting at the expected pose."""
         if len(tracks) < self._config.min_features:
             return _no_pose(len(tracks), "too_few_points")
-        noise, self._noise = self._noise, max(self._noise, REAPPEARED_NOISE)
-        found = self._solve_all(tracks, expected, expected.pose, np.ones(len(tracks), bool))
-        self._noise = noise
-        return found
+        with self._noise_of_at_least(REAPPEARED_NOISE):
+            return self._solve_all(tracks, expected, expected.pose, np.ones(len(tracks), bool))
 
     def solve(
         self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, before: int = 0, blurred: bool = False
@@ -151,10 +151,8 @@ class FramePoseSolver:
         searched for, and the one that the points tracked longest support is the camera's. `blurred`: the image is.
         """
         if blurred:
-            noise, self._noise = self._noise, max(self._noise, BLURRED_NOISE)
-            found = self.solve(tracks, expected, last_pose, before)
-            self._noise, found.blurred = noise, True
-            return found
+            with self._noise_of_at_least(BLURRED_NOISE):
+                return replace(self.solve(tracks, expected, last_pose, before), blurred=True)
         static = ~tracks.moving
         if static.sum() < self._config.min_features:
             return _no_pose(len(tracks), "too_few_points")
@@ -178,6 +176,13 @@ class FramePoseSolver:
         if usual and self._confirmed(chosen, known, MIN_GROUP):
             return chosen
         return _no_pose(len(tracks), "too_few_points")
+
+    @contextmanager
+    def _noise_of_at_least(self, noise: float) -> Generator[None]:
+        """For points that are found less exactly; over config.sigma_px."""
+        usual, self._noise = self._noise, max(self._noise, noise)
+        yield
+        self._noise = usual
 
     def _confirmed(self, solution: PoseSolution, known: Bool, least: int) -> bool:
         """Whether most of the points known before (N,), and at least so many, agree with a pose."""
