@@ -2,7 +2,9 @@
 
 Pairs of images whose headings differ so much that even distant scenery moves by many pixels are compared at the same
 pixels, by normalised correlation of small windows. What correlates in nearly all pairs is fixed to the camera: the
-robot's edge, a rail, dirt. Translation alone is not enough: along an aisle, distant scenery stays in place.
+robot's edge, a rail, dirt. Translation alone is not enough: along an aisle, distant scenery stays in place. The windows
+of a part that is plain, or thinner than they are, do not correlate, but its pixels keep their values: each part found
+grows over the adjacent pixels that do.
 """
 
 from __future__ import annotations
@@ -29,7 +31,10 @@ TEXTURE = 4.0  # grey levels, standard deviation in a window: well above a senso
 PLAIN_SHARE = 0.9  # of the images, in which a plain part of the robot has no texture
 DARK, DARK_QUANTILE = 0.12, 0.95  # of the median brightness; share of the images in which a dark pixel is below it
 MIN_PART = 0.0005  # of the image; smaller parts are ignored as chance
-MARGIN_PX = 3  # added around the parts found: half a window
+STILL = 0.25  # of the view's median spread of a pixel's values; what is fixed to the camera varies less
+STILL_QUANTILES = 0.1, 0.9  # between them lies a pixel's spread: a hand on the robot now and then is no change
+CONTOUR_PX = 1  # added around the parts found: pixels that show both the part and the scene
+PENUMBRA_PX = 3  # added around what is dark: an image circle ends softly
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,10 +143,15 @@ def _found(images: list[U8], pairs: list[tuple[int, int]], size: tuple[int, int]
     plain = np.mean([deviation < TEXTURE for _, _, deviation in moments], axis=0) > PLAIN_SHARE
     means = np.array([mean for _, mean, _ in moments])
     dark = np.quantile(means, DARK_QUANTILE, axis=0) < DARK * np.median(means)
-    rim = cv2.dilate(dark.astype(np.uint8), np.ones((2 * WINDOW + 1,) * 2, np.uint8)) > 0
+    rim = _dilated(dark, WINDOW)
     part = _closed(fixed & ~rim, plain & ~dark)
-    hidden = cv2.dilate((part | dark).astype(np.uint8), np.ones((2 * MARGIN_PX + 1,) * 2, np.uint8)) > 0
+    part = _grown(part, _still(images, ~rim))
+    hidden = _dilated(part, CONTOUR_PX) | _dilated(dark, PENUMBRA_PX)
     return FoundMask(~_enlarged(hidden, size), _enlarged(part, size), _enlarged(dark, size))
+
+
+def _dilated(mask: Bool, radius_px: int) -> Bool:
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * radius_px + 1,) * 2, np.uint8)) > 0
 
 
 def _enlarged(mask: Bool, size: tuple[int, int]) -> Bool:
@@ -159,6 +169,21 @@ def _fixed(moments: list[tuple[F32, F32, F32]], pairs: list[tuple[int, int]]) ->
         votes += textured
         matching += textured & (covariance > MIN_CORRELATION * deviation_a * deviation_b)
     return (votes >= MIN_VOTES) & (matching > MIN_SHARE * votes)
+
+
+def _still(images: list[U8], lit: Bool) -> Bool:
+    """(H, W) lit pixels whose values in the images (H, W), at equal exposure, vary much less than the view's do."""
+    exposure = np.array([max(float(np.median(image[lit])), 1.0) for image in images], np.float32)
+    values = np.array(images, np.float32) * (np.median(exposure) / exposure)[:, None, None]
+    low, high = np.quantile(values, STILL_QUANTILES, axis=0)
+    spread = high - low
+    return lit & (spread < STILL * np.median(spread[lit]))
+
+
+def _grown(part: Bool, still: Bool) -> Bool:
+    """The part with the still pixels that are connected to it."""
+    labels = cv2.connectedComponents((part | still).astype(np.uint8), connectivity=4)[1]
+    return np.isin(labels, np.unique(labels[part]))
 
 
 def _closed(fixed: Bool, plain: Bool) -> Bool:
