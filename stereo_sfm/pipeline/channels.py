@@ -59,7 +59,6 @@ class Outbox:
         _enlarge(self._descriptor)
         self._sending = threading.Lock()  # one message after the other
         self._queue: queue.Queue[memoryview | None] = queue.Queue(limit)
-        self._closed = False  # the reader died: main ends the run, and nothing waits for these messages
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
 
@@ -93,23 +92,13 @@ class Outbox:
 
     def _attempt(self, data: memoryview) -> memoryview:
         """Put as much of a message into the pipe as there is room for, unless others wait; returns the rest."""
-        return data if self._queue.unfinished_tasks else self._write(data)
-
-    def _write(self, data: memoryview) -> memoryview:
-        """Returns what did not fit."""
-        try:
-            return data[0:0] if self._closed else data[os.write(self._descriptor, data) :]
-        except BlockingIOError:
-            return data
-        except OSError:
-            self._closed = True
-            return data[0:0]
+        return data if self._queue.unfinished_tasks else _put(self._descriptor, data)
 
     def _work(self) -> None:
         room = selectors.PollSelector()
         room.register(self._descriptor, selectors.EVENT_WRITE)
         while (rest := self._queue.get()) is not None:
-            while rest := self._write(rest):
+            while rest := _put(self._descriptor, rest):
                 room.select()
             self._queue.task_done()
         room.close()
@@ -121,6 +110,16 @@ def _framed(message: object) -> memoryview:
     size = len(data)
     header = struct.pack("!i", size) if size < 1 << 31 else struct.pack("!iQ", -1, size)
     return memoryview(b"".join((header, data)))
+
+
+def _put(descriptor: int, data: memoryview) -> memoryview:
+    """Put as much into a pipe as there is room for; returns the rest, which is empty if nobody reads any more."""
+    try:
+        return data[os.write(descriptor, data) :]
+    except BlockingIOError:
+        return data
+    except OSError:  # the reader died, which its watcher handles
+        return data[0:0]
 
 
 def _enlarge(descriptor: int) -> None:
@@ -181,20 +180,11 @@ class DroppingOutbox(DroppingQueue[object]):
         with self._writing:
             at_once = not self._waiting and not self._rest
             if at_once:
-                self._attempt(_framed(message))
+                self._rest = _put(self._descriptor, _framed(message))
         if not at_once:
             self.put(message)
         elif self._rest:
             self._more.release()  # the thread sends what is left of it
-
-    def _attempt(self, data: memoryview) -> None:
-        """Put what there is room for into the pipe, and keep the rest."""
-        try:
-            self._rest = data[os.write(self._descriptor, data) :]
-        except BlockingIOError:
-            self._rest = data
-        except OSError:  # the reader has ended: nothing waits for this message
-            self._rest = data[0:0]
 
     def _work(self) -> None:
         room = selectors.PollSelector()
@@ -212,7 +202,7 @@ class DroppingOutbox(DroppingQueue[object]):
         """Write what waits as long as there is room; whether some is left."""
         with self._writing:
             while self._rest or self._waiting:
-                self._attempt(self._rest or _framed(self._waiting.popleft()))
+                self._rest = _put(self._descriptor, self._rest or _framed(self._waiting.popleft()))
                 if self._rest:
                     return True
         return False
