@@ -1,8 +1,7 @@
-"""The kernels of the first pose, compiled by two processes at once where there is nothing compiled yet.
+"""The kernels of the first poses, compiled by two processes at once where there is nothing compiled yet.
 
-The tracker compiles what the first image needs, and goes on with the next ones. Meanwhile another process compiles what
-the next images need, in an order that begins with what the first image does not share; each finds what the other has
-compiled on disk.
+The tracker compiles what the first image needs, from the beginning; another process does from the end, and goes on with
+what the next images need. Each finds what the other has compiled on disk.
 """
 
 from __future__ import annotations
@@ -15,9 +14,10 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.dominant_direction import MIN_POINTS, dominant_direction
 from stereo_sfm.kernel_cache import compiled
-from stereo_sfm.pipeline.warm_up import images, warm_up_fast_motion
+from stereo_sfm.pipeline.warm_up import warm_up_fast_motion
 from stereo_sfm.tracking.descriptors import describe
 from stereo_sfm.tracking.flow.follower import Follower
 from stereo_sfm.tracking.flow.frame_pose import ExpectedMotion, FramePoseSolver
@@ -28,10 +28,12 @@ from stereo_sfm.tracking.flow.stereo import StereoMatcher
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.tracking.flow.visible_area import VisibleArea
+from stereo_sfm.types import U8
 
 COLUMNS, REACH = 24, 0.8  # of the grid of points, and tangent of its half angle
 BORDER_PX = 20.0
 DISTANCE = 2.0  # metres
+SQUARE_PX = 8
 SECONDS = 0.03  # between images
 
 
@@ -43,14 +45,23 @@ def help_tracker(config: Config, rig: Rig) -> None:
 
 def compile_share(config: Config, rig: Rig) -> None:
     """The share of the process that helps the default tracker's."""
-    _compile_pose(config, rig)
-    seen, tracks = images(rig), _tracks(rig)
-    StereoMatcher(config.tracker, rig).placed(tracks.uv, tracks.uv_right)
-    pyramid = build_pyramid(seen[0].left, config.tracker.pyramid_levels)
+    tracks, pyramid = _tracks(rig), build_pyramid(_squares(rig.left), config.tracker.pyramid_levels)
     describe(pyramid[0], tracks.uv)
+    matcher = StereoMatcher(config.tracker, rig)
+    uv_right = matcher.follow(pyramid, pyramid, tracks.uv, tracks.points(), np.eye(4))
+    matcher.placed(tracks.uv, uv_right)
+    follower = Follower(config.tracker, rig, VisibleArea(rig.left, config.tracker.max_angle_deg), RollingShutter(rig))
+    rows, slots = follower.begin(pyramid, tracks.uv, np.eye(4))
+    _compile_pose(config, rig)
     dominant_direction(np.eye(MIN_POINTS, 2))
-    _compile_flow(config, rig, pyramid)
-    warm_up_fast_motion(config, rig, seen[-1].left)
+    _compile_flow(follower, replace(tracks.keep(np.isin(np.arange(len(tracks)), rows)), slot=slots), pyramid)
+    warm_up_fast_motion(config, rig, pyramid[0])
+
+
+def _squares(camera: Camera) -> U8:
+    """(H, W) an image of grey squares, as large as the camera's."""
+    grey = np.random.default_rng(0).integers(20, 230, (camera.height // SQUARE_PX + 1, camera.width // SQUARE_PX + 1))
+    return np.kron(grey, np.ones((SQUARE_PX, SQUARE_PX)))[: camera.height, : camera.width].astype(np.uint8)
 
 
 def _compile_pose(config: Config, rig: Rig) -> None:
@@ -66,13 +77,8 @@ def _compile_pose(config: Config, rig: Rig) -> None:
     se3.log(np.eye(4))
 
 
-def _compile_flow(config: Config, rig: Rig, pyramid: Pyramid) -> None:
+def _compile_flow(follower: Follower, tracks: Tracks, pyramid: Pyramid) -> None:
     """What follows points from one image to the next."""
-    area = VisibleArea(rig.left, config.tracker.max_angle_deg)
-    follower = Follower(config.tracker, rig, area, RollingShutter(rig))
-    tracks = _tracks(rig)
-    rows, slots = follower.begin(pyramid, tracks.uv, np.eye(4))
-    tracks = replace(tracks.keep(np.isin(np.arange(len(tracks)), rows)), slot=slots)
     follower.accept(pyramid, tracks)
     expected = ExpectedMotion(np.eye(4), np.zeros(6), SECONDS)
     for _ in range(2):  # by translation at first, from the prediction then

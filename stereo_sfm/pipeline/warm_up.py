@@ -131,7 +131,7 @@ def scratch_job(config: Config, rig: Rig) -> Job | None:
 def warm_up_stage(stage: str, config: Config, rig: Rig, patient: bool = False) -> None:
     """Load (the first time ever: compile) what `stage` calls, on a scratch instance of it.
 
-    Args: patient, images may wait for what is rarely called, until it is.
+    Args: patient, images may wait for code: only that of the first one is loaded, the rest when it is called.
     """
     from stereo_sfm.loop.database import PlaceDatabase
     from stereo_sfm.mapping.rig_window import solve_window
@@ -140,12 +140,12 @@ def warm_up_stage(stage: str, config: Config, rig: Rig, patient: bool = False) -
     if stage == "tracker":
         tracker = make_tracker(config, rig)
         seen = images(rig)
-        for image in seen:
+        for image in seen[:1] if patient else seen:
             keyframe = tracker.step(image)[1]
             if keyframe is not None:
                 tracker.describe(keyframe)
-        dominant_direction(np.eye(MIN_POINTS, 2))  # of shelves, which the wall may be too far away to be
         if not patient:
+            dominant_direction(np.eye(MIN_POINTS, 2))  # of shelves, which the wall may be too far away to be
             warm_up_fast_motion(config, rig, seen[-1].left)
     elif stage == "mapper" and rig.stereo:
         mapper = Mapper(config.mapper, rig, NoSpans(), config.loop)
