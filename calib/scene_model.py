@@ -70,7 +70,7 @@ def decentered(rig: Rig, along_x: float, along_y: float) -> Rig:
 
 
 def _focal(camera: Camera, factor: float) -> Camera:
-    return replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
+    return camera if factor == 1.0 else replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
 
 
 def in_both(window: Window) -> Bool:

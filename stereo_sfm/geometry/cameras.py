@@ -7,6 +7,7 @@ outside the range where a model is monotonic.
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -14,6 +15,8 @@ import numpy as np
 
 from stereo_sfm.geometry import kernels
 from stereo_sfm.types import F64, Bool, ReadOnly
+
+LIMITS = 16  # kept ranges of models: corrections of a rig make cameras whose lenses differ in nothing but focal length
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,12 +43,12 @@ class Camera(ReadOnly):
         p[:4] = self.fx, self.fy, self.cx, self.cy
         p[4 : 4 + len(self.distortion)] = self.distortion
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # coefficients that no lens has
-            p[kernels.LIMIT] = self._limit(p)
+            p[kernels.LIMIT] = self._limit(tuple(p[4:12].tolist()))
         p.flags.writeable = False
         object.__setattr__(self, "distortion", tuple(float(d) for d in self.distortion))
         object.__setattr__(self, "params", p)
 
-    def _limit(self, params: F64) -> float:
+    def _limit(self, coefficients: tuple[float, ...]) -> float:
         return 0.0
 
     @property
@@ -93,6 +96,30 @@ class Camera(ReadOnly):
         return np.nan_to_num(z, nan=-2.0) >= np.cos(max_angle)
 
 
+@functools.lru_cache(LIMITS)
+def _growing_radius(coefficients: tuple[float, ...]) -> float:
+    """Largest squared normalised radius up to which the radial part grows, 0 if it always does (up to 20)."""
+    k1, k2, _, _, k3, k4, k5, k6 = coefficients
+    if min(k1, k2, k3) >= 0 and not (k4 or k5 or k6):
+        return 0.0
+    r = np.linspace(0, 20, 40001)[1:]
+    r2 = r * r
+    distorted = r * (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    falling = np.flatnonzero(np.diff(distorted, prepend=0.0) <= 0)
+    return float(r2[max(falling[0] - 1, 0)]) if len(falling) else 0.0
+
+
+@functools.lru_cache(LIMITS)
+def _growing_angle(coefficients: tuple[float, ...]) -> float:
+    """Largest angle from the axis up to which the radius grows."""
+    theta = np.linspace(0, np.pi, 20001)
+    t2 = theta * theta
+    k1, k2, k3, k4, *_ = coefficients
+    slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+    falling = np.flatnonzero(slope <= 1e-6)
+    return float(theta[max(falling[0] - 1, 0)]) if len(falling) else float(np.pi)
+
+
 @dataclass(frozen=True, eq=False)
 class Pinhole(Camera):
     """Ideal pinhole."""
@@ -109,16 +136,8 @@ class RadTan(Camera):
     model_id: ClassVar[int] = kernels.RADTAN
     max_coefficients: ClassVar[int] = 8
 
-    def _limit(self, params: F64) -> float:
-        """Largest squared normalised radius up to which the radial part grows, 0 if it always does (up to 20)."""
-        if min(params[[4, 5, 8]]) >= 0 and not params[9:12].any():
-            return 0.0
-        r = np.linspace(0, 20, 40001)[1:]
-        r2 = r * r
-        k1, k2, _, _, k3, k4, k5, k6 = params[4:12]
-        distorted = r * (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-        falling = np.flatnonzero(np.diff(distorted, prepend=0.0) <= 0)
-        return float(r2[max(falling[0] - 1, 0)]) if len(falling) else 0.0
+    def _limit(self, coefficients: tuple[float, ...]) -> float:
+        return _growing_radius(coefficients)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,14 +148,8 @@ class KannalaBrandt(Camera):
     model_id: ClassVar[int] = kernels.KANNALA_BRANDT
     max_coefficients: ClassVar[int] = 4
 
-    def _limit(self, params: F64) -> float:
-        """Largest angle from the axis up to which the radius grows."""
-        theta = np.linspace(0, np.pi, 20001)
-        t2 = theta * theta
-        k1, k2, k3, k4 = params[4:8]
-        slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
-        falling = np.flatnonzero(slope <= 1e-6)
-        return float(theta[max(falling[0] - 1, 0)]) if len(falling) else float(np.pi)
+    def _limit(self, coefficients: tuple[float, ...]) -> float:
+        return _growing_angle(coefficients)
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,6 +29,7 @@ STEPS = 4  # of Gauss-Newton
 DERIVATIVE = 1e-5  # radians or ratio: step of numerical derivatives
 INFLATION = 2.0  # factor on the deviation of the matches' errors, which are correlated, as in `calib.consistency`
 NOISE_PX = 0.05, 5.0  # limits of the estimated noise of one coordinate
+LENGTHENING = 1, 5, 6, 7  # terms that trade lengths with one another: rotation about y, those of lenses
 # Prior standard deviations of the terms: radians, radians, ratio, radians.
 PRIOR = np.array([0.01, 0.01, 0.01, 0.005, 0.005, 0.005, 0.01, 0.01])
 
@@ -66,7 +67,7 @@ class RigWindow:
     stamp_ns: int  # of the last keyframe
     information: RigInformation
     noise_px: float
-    length: F64  # (8,) relative change of lengths by each term, per radian or ratio
+    length: F64  # (8,) relative change of lengths by each of the LENGTHENING terms, per radian or ratio; others zero
 
 
 @dataclass(eq=False)
@@ -107,16 +108,17 @@ def solve_window(rig: Rig, keyframes: Sequence[Keyframe], terms: F64) -> RigWind
 
 
 def _length_by_terms(rig: Rig, uv_left: F64, uv_right: F64) -> F64:
-    """(8,) relative change by each term of the motion that the rig measures with these points (N, 2), least squares.
+    """(8,) relative change by LENGTHENING terms of the motion that the rig measures with points (N, 2), least squares.
 
     Points move in the image by the step times their inverse distance rho: step ~ sum(rho flow) / sum(rho^2).
     """
     rho = inverse_distances(rig, uv_left, uv_right)
     used = np.isfinite(rho)
-    steps: F64 = DERIVATIVE * np.eye(RIG_TERMS)
-    by_terms = [inverse_distances(with_terms(rig, step), uv_left, uv_right) - rho for step in steps]
-    change = np.array([(rho * d)[used & np.isfinite(d)].sum() for d in by_terms])
-    return -change / (DERIVATIVE * max(float((rho[used] ** 2).sum()), 1e-12))
+    out, steps = np.zeros(RIG_TERMS), DERIVATIVE * np.eye(RIG_TERMS)
+    for k in LENGTHENING:
+        change = inverse_distances(with_terms(rig, steps[k]), uv_left, uv_right) - rho
+        out[k] = (rho * change)[used & np.isfinite(change)].sum()
+    return -out / (DERIVATIVE * max(float((rho[used] ** 2).sum()), 1e-12))
 
 
 def _problem(rig: Rig, keyframes: Sequence[Keyframe]) -> _Problem | None:
