@@ -85,10 +85,12 @@ class Outbox:
         return self._queue.qsize()
 
     def close(self) -> None:
-        """Send what waits, then close the pipe."""
+        """Send what waits, then close the pipe; what is sent later is dropped."""
         self._queue.put(None)
         self._thread.join()
-        self._connection.close()
+        with self._sending:
+            self._descriptor = -1  # the number may be another file's soon
+            self._connection.close()
 
     def _attempt(self, data: memoryview) -> memoryview:
         """Put as much of a message into the pipe as there is room for, unless others wait; returns the rest."""
@@ -101,6 +103,7 @@ class Outbox:
             while rest := _put(self._descriptor, rest):
                 room.select()
             self._queue.task_done()
+        self._queue.task_done()
         room.close()
 
 

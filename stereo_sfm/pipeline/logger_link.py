@@ -72,10 +72,17 @@ class LoggerLink:
 
     def give_up(self, why: str) -> str:
         """End the logger while the run continues; returns what to report."""
-        self._outbox = None
         self._stages.forget(STAGE)
         self._close_file()
+        self.close()
         return f"{why}: {self._options.path} ends here"
+
+    def close(self) -> None:
+        """Close the pipe to the logger, which has ended."""
+        if self._outbox is not None:
+            self._outbox.close()
+            self._outbox = None
+        self._connection.close()
 
     def remains(self, died: str) -> str:
         """What is left of the log after a stage has died."""

@@ -477,6 +477,7 @@ class ProcessRun:
         try:
             self._stages.close(self._ended)
         finally:
+            self._outer.close()
             for connection in (self._woken, self._wake):
                 connection.close()
             if self._ring is not None:

@@ -33,6 +33,12 @@ class OuterEnds:
     viewer: ViewerLink | None = None
     release: Outbox | None = None  # of images that main reads in place of a logger
 
+    def close(self) -> None:
+        """Close the pipes, whose readers have ended, and end the threads that write into them."""
+        for end in (self.logger, self.viewer, self.release):
+            if end is not None:
+                end.close()
+
 
 def start_stages(
     stages: StageProcesses, opener: Opener, log: LogOptions | None, viewer_options: ViewerOptions | None

@@ -58,3 +58,7 @@ class ViewerLink:
         """After the last message of the run."""
         self._outbox.send(End("main"))
         self._outbox.close()
+
+    def close(self) -> None:
+        """Close the pipe to the viewer."""
+        self._outbox.close()

@@ -6,6 +6,7 @@ import os
 import signal
 import threading
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from multiprocessing import shared_memory
 from pathlib import Path
 
@@ -127,6 +128,19 @@ def test_a_realtime_run_is_replayed_by_its_recorded_schedule(tmp_path: Path) -> 
     inline_log(tmp_path / "again.mcap", Tracked(60), schedule=Recorded(run.applied))
     different = [d for d in same(tmp_path / "live.mcap", tmp_path / "again.mcap") if "/dropped" not in d]
     assert different == []
+
+
+@pytest.mark.parametrize("logged", [True, False])
+@pytest.mark.parametrize("killed", [True, False])
+def test_a_run_leaves_no_thread(logged: bool, killed: bool, tmp_path: Path) -> None:
+    """A service begins again after every fault."""
+    before = threading.active_count()
+    log = LogOptions(tmp_path / "run.mcap", "none") if logged else None
+    with suppress(StageDied), ProcessRun(MadeSource.of(SlidingWall, 30), CONFIG, log=log) as run:
+        for k, _ in enumerate(run):
+            if k == 10 and killed:
+                os.kill(run.pids["mapper"], signal.SIGKILL)
+    assert threading.active_count() == before
 
 
 def frames_in(path: Path) -> int:
