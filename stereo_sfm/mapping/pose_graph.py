@@ -115,13 +115,13 @@ def optimise(
 def _graph(gtsam: Any, edges: Edges, fixed: I64, values: Any, robust: bool, gravity: Gravity | None) -> Any:
     """Factors in the order of the edges, then one prior for each fixed row, then gravity."""
     graph = gtsam.NonlinearFactorGraph()
+    measured = se3.orthonormalize(edges.i_T_j)
     for e in range(len(edges)):
         metres, radians = edges.sigmas[e]
         noise: Any = gtsam.noiseModel.Diagonal.Sigmas(np.array([radians] * 3 + [metres] * 3))
         if edges.loop[e] and robust:
             noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.DCS.Create(CHI2_6DOF_99), noise)
-        measured = gtsam.Pose3(se3.orthonormalize(edges.i_T_j[e]))
-        graph.add(gtsam.BetweenFactorPose3(int(edges.i[e]), int(edges.j[e]), measured, noise))
+        graph.add(gtsam.BetweenFactorPose3(int(edges.i[e]), int(edges.j[e]), gtsam.Pose3(measured[e]), noise))
     held = _held(fixed, values, gravity)
     for row in fixed.tolist():
         graph.add(gtsam.PriorFactorPose3(row, values.atPose3(row), gtsam.noiseModel.Gaussian.Covariance(held[row])))

@@ -16,7 +16,7 @@ from stereo_sfm.loop.closer import LoopCloser
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.mapping import window
 from stereo_sfm.mapping.bundle import bundle_adjust
-from stereo_sfm.mapping.correction import apply_loop
+from stereo_sfm.mapping.correction import apply_loop, fuse_sides, loop_is_known
 from stereo_sfm.mapping.map import Map, MapSnapshot
 from stereo_sfm.maps.saved_map import SavedMap, joined, restore_map
 from stereo_sfm.types import I64, Bool, LoopResult
@@ -63,27 +63,40 @@ def merge(
     loops: list[LoopResult] = []
     fused = 0
     if place is not None:
-        raised = np.array([0, _ends(maps, "pt_ids")[0]])
-        known = dataclasses.replace(
-            place, kf_id=place.kf_id + int(_ends(maps, "kf_ids")[0]), matches=place.matches + raised
-        )
-        done = apply_loop(map_, known, [], config)
+        known = in_joined_ids(place, maps[0])
+        done = apply_loop(map_, known, [], config, mapper.match_sigma_px)
         if done.applied:
             loops.append(known)
             fused += len(done.fused)
+    others_begin = int(_ends(maps, "kf_ids")[0])
     for keyframe, k in zip(side_by_side.snapshot.keyframes(), sessions.tolist(), strict=True):
-        result = closer.step(dataclasses.replace(keyframe, stamp_ns=keyframe.stamp_ns - begins[k]))
-        if result.candidate_kf_id >= 0:
-            done = apply_loop(map_, result, loops, config)
-            if done.applied:
-                loops.append(result)
-                fused += len(done.fused)
+        keyframe = dataclasses.replace(keyframe, stamp_ns=keyframe.stamp_ns - begins[k])
+        if keyframe.kf_id < others_begin:
+            closer.add(keyframe)
+            continue
+        result = closer.step(keyframe)
+        if result.candidate_kf_id < 0:
+            continue
+        if loop_is_known(map_, result, mapper.connected_points):
+            fused += len(fuse_sides(map_, result, mapper.match_sigma_px))
+            continue
+        done = apply_loop(map_, result, loops, config, mapper.match_sigma_px)
+        if done.applied:
+            loops.append(result)
+            fused += len(done.fused)
     _check_joined(maps, loops)
     full_adjustment(map_, side_by_side.rig, mapper)
     snapshot = map_.snapshot()
     session_of = dict(zip(side_by_side.snapshot.kf_ids.tolist(), sessions.tolist(), strict=True))
     merged = np.array([session_of[k] for k in snapshot.kf_ids.tolist()], np.int64)
     return Merge(SavedMap(snapshot, side_by_side.rig, vocabulary.id, merged), loops, fused)
+
+
+def in_joined_ids(place: LoopResult, first: SavedMap) -> LoopResult:
+    """A loop from the first of two maps to the second, in the ids of each, in the numbering of `joined`."""
+    raised = np.array([0, _ends([first], "pt_ids")[0]])
+    kf_id = place.kf_id + int(_ends([first], "kf_ids")[0])
+    return dataclasses.replace(place, kf_id=kf_id, matches=place.matches + raised)
 
 
 def restore_for_merging(snapshot: MapSnapshot, mapper: MapperConfig) -> Map:

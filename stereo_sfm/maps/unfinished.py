@@ -15,9 +15,9 @@ from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.loop.vocabulary_file import configured_vocabulary
 from stereo_sfm.maps.header import read_header
-from stereo_sfm.maps.merge import merge
 from stereo_sfm.maps.replace_folder import replaced_folder
 from stereo_sfm.maps.saved_map import SavedMap, load_map, save_map
+from stereo_sfm.maps.update import update
 from stereo_sfm.types import LoopResult
 
 PLACE = "place.npz"
@@ -58,7 +58,7 @@ def load_place(folder: Path) -> LoopResult | None:
 
 
 def publish(base: Path | None, session: Path, out: Path, config: Config) -> int:
-    """Write the saved map that a session makes of the one it continues.
+    """Write the saved map that a session makes of the one it continues (`maps.update`), however often that happens.
 
     Args:
         base: the saved map that the session began with, None for none. session: of `save_session`.
@@ -79,7 +79,7 @@ def publish(base: Path | None, session: Path, out: Path, config: Config) -> int:
     if place is None:
         raise StereoSfmError(f"the session was not found in the saved map {base} yet")
     vocabulary = configured_vocabulary(config.loop)
-    saved = merge([load_map(base, part.rig), part], vocabulary, config.loop, config.mapper, place).saved
+    saved = update(load_map(base, part.rig), part, vocabulary, config.loop, config.mapper, place).saved
     save_map(saved, out)
     return len(saved)
 

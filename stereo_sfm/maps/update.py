@@ -21,7 +21,14 @@ from stereo_sfm.loop.closer import LoopCloser
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.mapping.correction import apply_loop, fuse_sides, loop_is_known
 from stereo_sfm.mapping.map import Map, MapSnapshot
-from stereo_sfm.maps.merge import full_adjustment, restore_for_merging, session_closer, share_a_session, subset
+from stereo_sfm.maps.merge import (
+    full_adjustment,
+    in_joined_ids,
+    restore_for_merging,
+    session_closer,
+    share_a_session,
+    subset,
+)
 from stereo_sfm.maps.saved_map import SavedMap, joined
 from stereo_sfm.types import F64, I64, Bool, LoopResult
 
@@ -52,12 +59,14 @@ def update(
     vocabulary: Vocabulary,
     config: LoopConfig,
     mapper: MapperConfig,
+    place: LoopResult | None = None,
 ) -> Update:
     """Put a session into a map; the map's frame stays where it is.
 
     Args:
         saved: the map. walk: the session's own map.
         vocabulary: of the loop search. config: of the loops. mapper: of the bundle adjustment at the end.
+        place: a known loop from the map to the session, in the ids of each.
 
     Raises:
         StereoSfmError: different cameras, a session that is in the map already, or that no loop joins to it.
@@ -67,7 +76,8 @@ def update(
     both = joined([saved, walk])
     map_ = restore_for_merging(both.snapshot, mapper)
     first_new = len(saved)
-    loops, fused = _close(map_, both, first_new, session_closer(config, both.rig, vocabulary), config)
+    known = None if place is None else in_joined_ids(place, saved)
+    loops, fused = _close(map_, both, first_new, session_closer(config, both.rig, vocabulary), config, known)
     boundary = int(both.snapshot.kf_ids[first_new])
     if not any(loop.candidate_kf_id < boundary <= loop.kf_id for loop in loops):
         raise StereoSfmError("the session was not found in the map: no loop joins them (are they of one store?)")
@@ -95,11 +105,17 @@ def update(
 
 
 def _close(
-    map_: Map, both: SavedMap, first_new: int, closer: LoopCloser, config: LoopConfig
+    map_: Map, both: SavedMap, first_new: int, closer: LoopCloser, config: LoopConfig, known: LoopResult | None
 ) -> tuple[list[LoopResult], int]:
-    """Loops of the session's keyframes (rows from `first_new` on), applied to the map; and the points they fused."""
+    """Loops of the session's keyframes (rows from `first_new` on), applied to the map; and the points they fused.
+
+    `known`: the first of them.
+    """
     loops: list[LoopResult] = []
     fused = 0
+    if known is not None and (done := apply_loop(map_, known, loops, config)).applied:
+        loops.append(known)
+        fused += len(done.fused)
     stamps = both.snapshot.stamp_ns - both.snapshot.stamp_ns[first_new]
     chains = int(both.snapshot.submap_ids[:first_new].max()) + 1
     for row, keyframe in enumerate(both.snapshot.keyframes()):

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 
 from stereo_sfm.cli import main
-from stereo_sfm.config import LoopConfig, MapperConfig
+from stereo_sfm.config import Config, LoopConfig, MapperConfig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
 from stereo_sfm.maps.changes import Aisle, changed_cells, describe_changes
 from stereo_sfm.maps.saved_map import SavedMap, load_map, save_map
 from stereo_sfm.maps.store import lock, read_about, versions, write_version
+from stereo_sfm.maps.unfinished import publish, save_session
 from stereo_sfm.maps.update import KEPT_SESSIONS, Update, update
 from stereo_sfm.types import F64, U8, Keyframe
 from tests.loop.store_sequence import StoreSequence, make_sequence
@@ -87,6 +88,28 @@ def test_a_session_is_put_into_the_frame_of_the_map(walks: list[StoreSequence], 
     poses = np.concatenate([walk.world_T_kf for walk in walks[:2]])
     metres, radians = se3.extent(se3.inverse(se3.inverse(poses[0]) @ poses) @ s.map_T_kf)
     assert metres.max() < 0.02 and np.degrees(radians).max() < 0.3
+
+
+def test_the_session_of_a_service_is_put_into_the_map_that_it_continues(
+    walks: list[StoreSequence], vocabulary: voc.Vocabulary, tmp_path: Path
+) -> None:
+    """Where its first relocalization says, in any number of sessions: old ones are forgotten as by `map update`."""
+    saved, walk = (map_of_sequence(w) for w in walks[:2])
+    begins, points = (int(ids.max()) + 1 for ids in (saved.snapshot.kf_ids, saved.snapshot.pt_ids))
+    found = update(saved, walk, vocabulary, LoopConfig(), MapperConfig()).loops
+    loop = next(one for one in found if one.candidate_kf_id < begins <= one.kf_id)
+    place = dataclasses.replace(loop, kf_id=loop.kf_id - begins, matches=loop.matches - np.array([0, points]))
+    base, session, out = (tmp_path / name for name in ("base", "session", "out"))
+    save_map(saved, base)
+    save_session(walk, None, session)
+    with pytest.raises(StereoSfmError, match="was not found in the saved map"):
+        publish(base, session, out, Config())
+    save_session(walk, place, session)
+    assert publish(base, session, out, Config()) == len(saved) + len(walk)
+    s = load_map(out).snapshot
+    poses = np.concatenate([one.world_T_kf for one in walks[:2]])
+    metres, radians = se3.extent(se3.inverse(se3.inverse(poses[0]) @ poses) @ s.map_T_kf)
+    assert metres.max() < 0.03 and np.degrees(radians).max() < 0.3
 
 
 @pytest.mark.slow
