@@ -32,7 +32,7 @@ class Merge:
     """The merged map and statistics of the merge."""
 
     saved: SavedMap
-    loops: list[LoopResult]  # applied, in ids of the merged map
+    loops: list[LoopResult]  # accepted, in ids of the merged map
     fused: int  # points fused with another one
 
 
@@ -63,33 +63,40 @@ def merge(
     loops: list[LoopResult] = []
     fused = 0
     if place is not None:
-        known = in_joined_ids(place, maps[0])
-        done = apply_loop(map_, known, [], config, mapper.match_sigma_px)
-        if done.applied:
-            loops.append(known)
-            fused += len(done.fused)
+        fused += close_loop(map_, in_joined_ids(place, maps[0]), loops, config, mapper)
     others_begin = int(_ends(maps, "kf_ids")[0])
     for keyframe, k in zip(side_by_side.snapshot.keyframes(), sessions.tolist(), strict=True):
         keyframe = dataclasses.replace(keyframe, stamp_ns=keyframe.stamp_ns - begins[k])
-        if keyframe.kf_id < others_begin:
+        if keyframe.kf_id < others_begin:  # its own loops are in the map
             closer.add(keyframe)
             continue
         result = closer.step(keyframe)
-        if result.candidate_kf_id < 0:
-            continue
-        if loop_is_known(map_, result, mapper.connected_points):
-            fused += len(fuse_sides(map_, result, mapper.match_sigma_px))
-            continue
-        done = apply_loop(map_, result, loops, config, mapper.match_sigma_px)
-        if done.applied:
-            loops.append(result)
-            fused += len(done.fused)
+        if result.candidate_kf_id >= 0:
+            fused += close_loop(map_, result, loops, config, mapper)
     _check_joined(maps, loops)
     full_adjustment(map_, side_by_side.rig, mapper)
     snapshot = map_.snapshot()
     session_of = dict(zip(side_by_side.snapshot.kf_ids.tolist(), sessions.tolist(), strict=True))
     merged = np.array([session_of[k] for k in snapshot.kf_ids.tolist()], np.int64)
     return Merge(SavedMap(snapshot, side_by_side.rig, vocabulary.id, merged), loops, fused)
+
+
+def close_loop(map_: Map, loop: LoopResult, loops: list[LoopResult], config: LoopConfig, mapper: MapperConfig) -> int:
+    """Join what both sides of a loop see, after a correction of the map unless it agrees with the loop.
+
+    Args:
+        loops: those before; this one is appended unless the pose graph rejects it.
+
+    Returns:
+        How many points were fused with another one.
+    """
+    if loop_is_known(map_, loop, config.connected_points):
+        loops.append(loop)
+        return len(fuse_sides(map_, loop, mapper.match_sigma_px))
+    done = apply_loop(map_, loop, loops, config, mapper.match_sigma_px)
+    if done.applied:
+        loops.append(loop)
+    return len(done.fused)
 
 
 def in_joined_ids(place: LoopResult, first: SavedMap) -> LoopResult:

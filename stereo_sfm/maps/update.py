@@ -19,9 +19,9 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.closer import LoopCloser
 from stereo_sfm.loop.vocabulary import Vocabulary
-from stereo_sfm.mapping.correction import apply_loop, fuse_sides, loop_is_known
 from stereo_sfm.mapping.map import Map, MapSnapshot
 from stereo_sfm.maps.merge import (
+    close_loop,
     full_adjustment,
     in_joined_ids,
     restore_for_merging,
@@ -76,8 +76,9 @@ def update(
     both = joined([saved, walk])
     map_ = restore_for_merging(both.snapshot, mapper)
     first_new = len(saved)
-    known = None if place is None else in_joined_ids(place, saved)
-    loops, fused = _close(map_, both, first_new, session_closer(config, both.rig, vocabulary), config, known)
+    loops: list[LoopResult] = []
+    fused = 0 if place is None else close_loop(map_, in_joined_ids(place, saved), loops, config, mapper)
+    fused += _close(map_, both, first_new, session_closer(config, both.rig, vocabulary), loops, config, mapper)
     boundary = int(both.snapshot.kf_ids[first_new])
     if not any(loop.candidate_kf_id < boundary <= loop.kf_id for loop in loops):
         raise StereoSfmError("the session was not found in the map: no loop joins them (are they of one store?)")
@@ -105,17 +106,16 @@ def update(
 
 
 def _close(
-    map_: Map, both: SavedMap, first_new: int, closer: LoopCloser, config: LoopConfig, known: LoopResult | None
-) -> tuple[list[LoopResult], int]:
-    """Loops of the session's keyframes (rows from `first_new` on), applied to the map; and the points they fused.
-
-    `known`: the first of them.
-    """
-    loops: list[LoopResult] = []
+    map_: Map,
+    both: SavedMap,
+    first_new: int,
+    closer: LoopCloser,
+    loops: list[LoopResult],
+    config: LoopConfig,
+    mapper: MapperConfig,
+) -> int:
+    """Put loops of the session's keyframes (rows from `first_new` on) into map and `loops`; how many points fused."""
     fused = 0
-    if known is not None and (done := apply_loop(map_, known, loops, config)).applied:
-        loops.append(known)
-        fused += len(done.fused)
     stamps = both.snapshot.stamp_ns - both.snapshot.stamp_ns[first_new]
     chains = int(both.snapshot.submap_ids[:first_new].max()) + 1
     for row, keyframe in enumerate(both.snapshot.keyframes()):
@@ -124,17 +124,9 @@ def _close(
             continue
         chain = keyframe.submap_id - chains + 1
         result = closer.step(dataclasses.replace(keyframe, submap_id=chain, stamp_ns=int(stamps[row])))
-        if result.candidate_kf_id < 0:
-            continue
-        if loop_is_known(map_, result, config.connected_points):
-            fused += len(fuse_sides(map_, result, 1.0))
-            loops.append(result)
-            continue
-        done = apply_loop(map_, result, loops, config)
-        if done.applied:
-            loops.append(result)
-            fused += len(done.fused)
-    return loops, fused
+        if result.candidate_kf_id >= 0:
+            fused += close_loop(map_, result, loops, config, mapper)
+    return fused
 
 
 def _snapshot(map_: Map, session_of: dict[int, int]) -> tuple[MapSnapshot, I64]:
