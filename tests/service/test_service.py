@@ -55,7 +55,7 @@ def test_a_session_its_map_and_the_next_one(tmp_path: Path) -> None:
     assert [p.frame_id for p in poses] == list(range(len(poses))) and not any(p.localized for p in poses)
     assert states[-1].state == ServiceState.STOPPING and service.error is None
     first, copy = load_map(tmp_path / "store"), load_map(tmp_path / "copy")
-    assert len(first) >= len(copy) > 0 and {p.name for p in tmp_path.iterdir()} == {"store", "copy"}
+    assert len(first) >= len(copy) > 0 and {p.name for p in tmp_path.iterdir()} == {"store", "store.versions", "copy"}
 
     poses.clear()
     with Service(config(tmp_path), MadeSource.of(endless_wall)) as service:
