@@ -71,7 +71,7 @@ def update(
     Raises:
         StereoSfmError: different cameras, a session that is in the map already, or that no loop joins to it.
     """
-    if share_a_session(saved, walk):
+    if place is None and share_a_session(saved, walk):  # with a place it was driven just now
         raise StereoSfmError("this session is in the map already")
     both = joined([saved, walk])
     map_ = restore_for_merging(both.snapshot, mapper)

@@ -91,6 +91,7 @@ class MapKeeper:
         with self._lock:
             if self._next_folder is not None:
                 extends = self.mode == "extend"
+                self._store.release()
                 self._store = MapStore(self._next_folder, self.mode, self._store.config, _fresh=extends)
                 self._next_folder = None
             folders = self._store.begin()
@@ -116,8 +117,16 @@ class MapKeeper:
     def finish(self, until_s: float, complete: bool) -> None:
         """After the last session: add its part to the saved map until this monotonic time, else at the next start.
 
+        Others may write to the saved map then.
+
         Args: complete, the session's mapper came to its end: it has written what there was, whether asked or not.
         """
+        try:
+            self._finish(until_s, complete)
+        finally:
+            self._store.release()
+
+    def _finish(self, until_s: float, complete: bool) -> None:
         written = self._awaited and self._store.written() not in (None, self._before)  # its message came too late
         if self._awaited and not (complete or written):
             self._log_lost()

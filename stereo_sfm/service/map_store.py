@@ -165,6 +165,12 @@ class MapStore:
             self._result.close()
         self._process = self._result = None
 
+    def release(self) -> None:
+        """Let others write to the saved map."""
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
+
     def finished(self) -> None:
         """The session is in the saved map: nothing is left to do at the next start."""
         for folder in (self.session, self.folder.with_name(f".{self.folder.name}.base")):

@@ -57,6 +57,8 @@ def test_the_service_is_the_only_writer_of_the_map_that_it_extends(tmp_path: Pat
     lock(tmp_path / "store").release()
     with pytest.raises(StereoSfmError, match="stop the service"):
         lock(tmp_path / "other")
+    maps.finish(time.monotonic(), True)
+    lock(tmp_path / "other").release()
 
 
 def test_a_requested_save_is_answered_in_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
