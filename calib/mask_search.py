@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from stereo_sfm.calib.mask import uncovered
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import F32, F64, U8, Bool, Frame, Keyframe, StereoImage, TrackState
@@ -143,15 +144,11 @@ def _found(images: list[U8], pairs: list[tuple[int, int]], size: tuple[int, int]
     plain = np.mean([deviation < TEXTURE for _, _, deviation in moments], axis=0) > PLAIN_SHARE
     means = np.array([mean for _, mean, _ in moments])
     dark = np.quantile(means, DARK_QUANTILE, axis=0) < DARK * np.median(means)
-    rim = _dilated(dark, WINDOW)
+    rim = ~uncovered(~dark, WINDOW)
     part = _closed(fixed & ~rim, plain & ~dark)
     part = _grown(part, _still(images, ~rim))
-    hidden = _dilated(part, CONTOUR_PX) | _dilated(dark, PENUMBRA_PX)
-    return FoundMask(~_enlarged(hidden, size), _enlarged(part, size), _enlarged(dark, size))
-
-
-def _dilated(mask: Bool, radius_px: int) -> Bool:
-    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * radius_px + 1,) * 2, np.uint8)) > 0
+    used = uncovered(~part, CONTOUR_PX) & uncovered(~dark, PENUMBRA_PX)
+    return FoundMask(_enlarged(used, size), _enlarged(part, size), _enlarged(dark, size))
 
 
 def _enlarged(mask: Bool, size: tuple[int, int]) -> Bool:
