@@ -14,10 +14,9 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.geometry import se3
-from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.dominant_direction import MIN_POINTS, dominant_direction
 from stereo_sfm.kernel_cache import compiled
-from stereo_sfm.pipeline.warm_up import warm_up_fast_motion
+from stereo_sfm.pipeline.warm_up import squares, warm_up_fast_motion
 from stereo_sfm.tracking.descriptors import describe
 from stereo_sfm.tracking.flow.follower import Follower
 from stereo_sfm.tracking.flow.frame_pose import ExpectedMotion, FramePoseSolver
@@ -28,12 +27,10 @@ from stereo_sfm.tracking.flow.stereo import StereoMatcher
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.tracking.flow.visible_area import VisibleArea
-from stereo_sfm.types import U8
 
 COLUMNS, REACH = 24, 0.8  # of the grid of points, and tangent of its half angle
 BORDER_PX = 20.0
 DISTANCE = 2.0  # metres
-SQUARE_PX = 8
 SECONDS = 0.03  # between images
 
 
@@ -45,7 +42,7 @@ def help_tracker(config: Config, rig: Rig) -> None:
 
 def compile_share(config: Config, rig: Rig) -> None:
     """The share of the process that helps the default tracker's."""
-    tracks, pyramid = _tracks(rig), build_pyramid(_squares(rig.left), config.tracker.pyramid_levels)
+    tracks, pyramid = _tracks(rig), build_pyramid(squares(*rig.left.size[::-1]), config.tracker.pyramid_levels)
     describe(pyramid[0], tracks.uv)
     matcher = StereoMatcher(config.tracker, rig)
     uv_right = matcher.follow(pyramid, pyramid, tracks.uv, tracks.points(), np.eye(4))
@@ -56,12 +53,6 @@ def compile_share(config: Config, rig: Rig) -> None:
     dominant_direction(np.eye(MIN_POINTS, 2))
     _compile_flow(follower, replace(tracks.keep(np.isin(np.arange(len(tracks)), rows)), slot=slots), pyramid)
     warm_up_fast_motion(config, rig, pyramid[0])
-
-
-def _squares(camera: Camera) -> U8:
-    """(H, W) an image of grey squares, as large as the camera's."""
-    grey = np.random.default_rng(0).integers(20, 230, (camera.height // SQUARE_PX + 1, camera.width // SQUARE_PX + 1))
-    return np.kron(grey, np.ones((SQUARE_PX, SQUARE_PX)))[: camera.height, : camera.width].astype(np.uint8)
 
 
 def _compile_pose(config: Config, rig: Rig) -> None:

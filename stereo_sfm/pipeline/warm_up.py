@@ -28,20 +28,20 @@ from stereo_sfm.types import F32, F64, RIG_TERMS, U8, Corners, ImuSamples, Keyfr
 
 FRAMES, POINTS = 8, 300
 WALL = 2.0  # metres ahead
+TEXTURE_PX, SQUARE_PX = 512, 8  # of its texture
 MOVED_PX = 12.0  # of the left half of the wall in the last image
 
 
-def images(rig: Rig) -> list[StereoImage]:
+def images(rig: Rig, count: int = FRAMES) -> list[StereoImage]:
     """A stereo pair passing a wall of grey squares: enough for points, matches and keyframes in any camera.
 
-    In the last image half of the wall has moved: a second motion.
+    The first `count`. In the last of all half of the wall has moved: a second motion.
     """
-    rng = np.random.default_rng(0)
-    texture = np.kron(rng.integers(20, 230, (64, 64)), np.ones((8, 8))).astype(np.uint8)
+    texture = squares(TEXTURE_PX, TEXTURE_PX)
     left_rays = _rays(rig.left)
     right_rays = None if rig.right is None or rig.depth else _rays(rig.right)
     out: list[StereoImage] = []
-    for k in range(FRAMES):
+    for k in range(count):
         world_T_left = se3.exp(np.array([0.03 * k, 0.0, 0.02 * k, 0.0, 0.002 * k, 0.0]))
         moved = (k == FRAMES - 1) * MOVED_PX * WALL / rig.left.fx
         left = _wall(left_rays, world_T_left, texture, moved)
@@ -52,6 +52,12 @@ def images(rig: Rig) -> list[StereoImage]:
             right = _wall(right_rays, world_T_left @ rig.left_T_right, texture, moved)
         out.append(StereoImage(k, 1 + k * 33_000_000, left, right, depth))
     return out
+
+
+def squares(height: int, width: int) -> U8:
+    """(H, W) an image of grey squares."""
+    grey = np.random.default_rng(0).integers(20, 230, (-(-height // SQUARE_PX), -(-width // SQUARE_PX)))
+    return np.kron(grey, np.ones((SQUARE_PX, SQUARE_PX)))[:height, :width].astype(np.uint8)
 
 
 def _rays(camera: Camera) -> F32:
@@ -139,8 +145,8 @@ def warm_up_stage(stage: str, config: Config, rig: Rig, patient: bool = False) -
 
     if stage == "tracker":
         tracker = make_tracker(config, rig)
-        seen = images(rig)
-        for image in seen[:1] if patient else seen:
+        seen = images(rig, 1 if patient else FRAMES)
+        for image in seen:
             keyframe = tracker.step(image)[1]
             if keyframe is not None:
                 tracker.describe(keyframe)
