@@ -17,6 +17,7 @@ from stereo_sfm.geometry import kernels
 from stereo_sfm.types import F64, Bool, ReadOnly
 
 LIMITS = 16  # kept ranges of models: corrections of a rig make cameras whose lenses differ in nothing but focal length
+RADII, RADII_AT_ONCE = np.linspace(0, 20, 40001), 2000  # normalised radii tried, and so many before looking
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,11 +103,14 @@ def _growing_radius(coefficients: tuple[float, ...]) -> float:
     k1, k2, _, _, k3, k4, k5, k6 = coefficients
     if min(k1, k2, k3) >= 0 and not (k4 or k5 or k6):
         return 0.0
-    r = np.linspace(0, 20, 40001)[1:]
-    r2 = r * r
-    distorted = r * (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    falling = np.flatnonzero(np.diff(distorted, prepend=0.0) <= 0)
-    return float(r2[max(falling[0] - 1, 0)]) if len(falling) else 0.0
+    for first in range(0, len(RADII) - 1, RADII_AT_ONCE):
+        r = RADII[first : first + RADII_AT_ONCE + 1]
+        r2 = r * r
+        distorted = r * (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        falling = np.flatnonzero(np.diff(distorted) <= 0)
+        if len(falling):
+            return float(RADII[max(first + falling[0], 1)] ** 2)
+    return 0.0
 
 
 @functools.lru_cache(LIMITS)

@@ -29,6 +29,7 @@ from stereo_sfm.types import F32, F64, U8, Corners
 
 FOCAL = 0.7  # focal length of a view over the camera's: about the resolution of the image
 HALF_ANGLES = 2.14, 1.0  # tangents of half the field of view, horizontal and vertical: 65 and 45 degrees
+MAX_FOCAL_PX = 320.0  # finer views take longer and find no more
 NODE_SPACING = 16  # px of a view between exactly projected pixels; the map is interpolated between them
 OUTSIDE = np.float32(-1e3)  # px: no pixel of the image
 MIN_NODES = 3  # of these in both directions; with fewer there is no view
@@ -58,7 +59,7 @@ class SideViews:
         self._rig, self._stereo = rig, StereoMatcher(config.tracker, rig)
         self._disparity_sigma = config.loop.disparity_sigma_px
         self._min_z = np.cos(np.deg2rad(config.tracker.max_angle_deg))
-        self._focal = FOCAL * rig.left.fx
+        self._focal = min(FOCAL * rig.left.fx, MAX_FOCAL_PX)
         self._left_mask = None if rig.left_mask is None else rig.left_mask.astype(np.uint8)
         half = config.loop.side_corners // 2
         self._orb = cv2.ORB.create(half, SCALE, LEVELS, edgeThreshold=BORDER, fastThreshold=FAST_THRESHOLD)
