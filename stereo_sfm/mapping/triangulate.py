@@ -48,13 +48,16 @@ def _accumulate(cam, params, p0, p1, p2, u_obs, v_obs, inv_sigma, m, h, b):
 
 
 @inner
-def _cost(x, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, h, b):
+def _cost(x, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, limit, h, b):
+    """Cauchy cost of a point, and its normal equations; not completed, and no less than `limit`, above that."""
     left_model, left_params, right_model, right_params = cams
     h[:] = 0.0
     b[:] = 0.0
     cost = 0.0
     m = np.zeros((3, 3))
     for o in range(first, last):
+        if cost >= limit:
+            break
         r, t = rot[obs_kf[o]], pos[obs_kf[o]]
         d0, d1, d2 = x[0] - t[0], x[1] - t[1], x[2] - t[2]
         p0 = r[0, 0] * d0 + r[1, 0] * d1 + r[2, 0] * d2
@@ -105,12 +108,14 @@ def refine_points(
                 y[j] = points[i, j] if k == 0 else origins[i, j] + rays[i, j] * trials[k - 1]
             if not math.isfinite(y[0]):
                 continue
-            cost = _cost(y, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, h, b)
+            cost = _cost(
+                y, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, lowest, h, b
+            )
             if cost < lowest:
                 lowest = cost
                 _copy(y, x)
         damping = 1e-3
-        cost = _cost(x, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, h, b)
+        cost = _cost(x, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, math.inf, h, b)
         for _ in range(steps):
             _copy(h, damped)
             for j in range(3):
@@ -119,7 +124,9 @@ def refine_points(
                 break
             for j in range(3):
                 y[j] += x[j]
-            new = _cost(y, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, h2, b2)
+            new = _cost(
+                y, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, cost, h2, b2
+            )
             if new < cost:
                 done = cost - new < 1e-4 * cost
                 cost, damping = new, damping * 0.1
