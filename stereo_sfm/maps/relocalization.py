@@ -79,10 +79,25 @@ class Relocalizer:
     def locate(self, keyframe: Keyframe) -> Location:
         """Find the camera of a keyframe (its pose is ignored) in the map, if need be from another direction."""
         ahead = self._search(keyframe, False)
-        if ahead.found or len(keyframe.sides) < MIN_CORNERS:
+        if len(keyframe.sides) < MIN_CORNERS:
+            return ahead
+        if ahead.found and not self._confirmed(keyframe, ahead):
+            ahead = not_found("ambiguous", ahead.inliers)
+        if ahead.found:
             return ahead
         beside = self._search(keyframe, True)
         return beside if beside.found else ahead
+
+    def _confirmed(self, keyframe: Keyframe, ahead: Location) -> bool:
+        """Whether the shelves beside do not contradict what is ahead: rows of lamps look alike from both directions."""
+        row = int(np.flatnonzero(self._map.kf_ids == ahead.kf_id)[0])
+        cloud = self.cloud(row, sideways=True)
+        if ahead.confident or cloud.corner.sum() < MIN_CORNERS:
+            return True
+        view = place_view_of(keyframe, self._rig, self._side_config.disparity_sigma_px, sideways=True)
+        start = se3.inverse(ahead.map_T_cam) @ self._map.map_T_kf[row]
+        verdict = verify_near(start, view, cloud, self._rig, self._side_config)
+        return verdict.inliers >= self._config.side_inliers
 
     def _search(self, keyframe: Keyframe, sideways: bool) -> Location:
         """Find it by its corners, or by those of the views that face the shelves."""
