@@ -191,7 +191,7 @@ def main() -> int:
     parser.add_argument("--stores", type=int, default=10, help="of sim:aisle")
     parser.add_argument("--identical", type=int, default=-1, help="of sim:identical-aisles; -1: as many")
     parser.add_argument("--first", type=int, default=0, help="seed of the first store")
-    parser.add_argument("--queries", type=int, default=5, help="images relocalized in each store")
+    parser.add_argument("--queries", type=int, default=20, help="images relocalized in each store")
     parser.add_argument("--camera", default="fisheye")
     parser.add_argument("--size", default="", help="WIDTHxHEIGHT of the images, the camera's own without")
     parser.add_argument("--rate", type=float, default=30.0, help="frames a second")

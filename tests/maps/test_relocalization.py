@@ -90,6 +90,26 @@ def test_a_fifth_of_the_products_exchanged(sequence: StoreSequence, first_pass: 
     assert found >= 0.8 * len(asked)
 
 
+def test_shelves_beside_contradict_a_view_that_looks_alike(
+    sequence: StoreSequence, first_pass: int, vocabulary: voc.Vocabulary
+) -> None:
+    """Rows of lamps look alike in other places too: what is beside tells them apart, whatever the rest."""
+    keyframes = [dataclasses.replace(k, sides=k.corners) for k in sequence.keyframes]
+    part = dataclasses.replace(sequence, keyframes=keyframes).first(first_pass)
+    relocalizer = Relocalizer(map_of_sequence(part).snapshot, sequence.rig, vocabulary, LoopConfig())
+    described = [k for k in range(first_pass + 8, len(keyframes)) if keyframes[k].described]
+    other = keyframes[60]  # in the second aisle
+    for k in described[::4]:
+        half = np.random.default_rng(k).random((len(keyframes[k].corners), 1)) < 0.55
+        looks = np.where(half, 255 - keyframes[k].corners.descriptors, keyframes[k].corners.descriptors)
+        unsure = dataclasses.replace(keyframes[k], corners=dataclasses.replace(keyframes[k].corners, descriptors=looks))
+        location = relocalizer.locate(unsure)
+        assert location.found and not location.confident
+        moved = relocalizer.locate(dataclasses.replace(unsure, sides=other.sides))
+        assert not moved.found or np.linalg.norm((moved.map_T_cam - location.map_T_cam)[:3, 3]) > 1.0
+        assert relocalizer.locate(dataclasses.replace(unsure, sides=Corners.none())).found
+
+
 def test_a_share_of_zero_is_allowed(sequence: StoreSequence, first_pass: int, vocabulary: voc.Vocabulary) -> None:
     part = sequence.first(first_pass)
     config = dataclasses.replace(LoopConfig(), relocalize_share=0.0, min_inlier_share=0.0)
