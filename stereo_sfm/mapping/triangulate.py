@@ -49,7 +49,7 @@ def _accumulate(cam, params, p0, p1, p2, u_obs, v_obs, inv_sigma, m, h, b):
 
 @inner
 def _cost(x, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, limit, h, b):
-    """Cauchy cost of a point, and its normal equations; not completed, and no less than `limit`, above that."""
+    """Cauchy cost of a point, and its normal equations; both end where the cost reaches `limit`."""
     left_model, left_params, right_model, right_params = cams
     h[:] = 0.0
     b[:] = 0.0

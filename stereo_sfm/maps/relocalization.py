@@ -79,20 +79,20 @@ class Relocalizer:
     def locate(self, keyframe: Keyframe) -> Location:
         """Find the camera of a keyframe (its pose is ignored) in the map, if need be from another direction."""
         ahead = self._search(keyframe, False)
-        if len(keyframe.sides) < MIN_CORNERS:
-            return ahead
-        if ahead.found and not self._confirmed(keyframe, ahead):
-            ahead = not_found("ambiguous", ahead.inliers)
-        if ahead.found:
+        if len(keyframe.sides) < MIN_CORNERS or (ahead.found and self._confirmed(keyframe, ahead)):
             return ahead
         beside = self._search(keyframe, True)
-        return beside if beside.found else ahead
+        if beside.found:
+            return beside
+        return not_found("ambiguous", ahead.inliers) if ahead.found else ahead
 
     def _confirmed(self, keyframe: Keyframe, ahead: Location) -> bool:
         """Whether the shelves beside do not contradict what is ahead: rows of lamps look alike from both directions."""
+        if ahead.confident:
+            return True
         row = int(np.flatnonzero(self._map.kf_ids == ahead.kf_id)[0])
         cloud = self.cloud(row, sideways=True)
-        if ahead.confident or cloud.corner.sum() < MIN_CORNERS:
+        if cloud.corner.sum() < MIN_CORNERS:
             return True
         view = place_view_of(keyframe, self._rig, self._side_config.disparity_sigma_px, sideways=True)
         start = se3.inverse(ahead.map_T_cam) @ self._map.map_T_kf[row]
