@@ -94,10 +94,7 @@ class Relocalizer:
         cloud = self.cloud(row, sideways=True)
         if cloud.corner.sum() < MIN_CORNERS:
             return True
-        view = place_view_of(keyframe, self._rig, self._side_config.disparity_sigma_px, sideways=True)
-        start = se3.inverse(ahead.map_T_cam) @ self._map.map_T_kf[row]
-        verdict = verify_near(start, view, cloud, self._rig, self._side_config)
-        return verdict.inliers >= self._config.side_inliers
+        return self._verify_near(keyframe, ahead.map_T_cam, row, cloud, True).inliers >= self._config.side_inliers
 
     def _search(self, keyframe: Keyframe, sideways: bool) -> Location:
         """Find it by its corners, or by those of the views that face the shelves."""
@@ -128,13 +125,16 @@ class Relocalizer:
         return beside if beside.found else ahead
 
     def _search_near(self, keyframe: Keyframe, guess: F64, row: int, sideways: bool) -> Location:
-        config = self._side_config if sideways else self._config
-        view = place_view_of(keyframe, self._rig, config.disparity_sigma_px, sideways)
-        start = se3.inverse(guess) @ self._map.map_T_kf[row]
-        verdict = verify_near(start, view, self.cloud(row, sideways), self._rig, config)
+        verdict = self._verify_near(keyframe, guess, row, self.cloud(row, sideways), sideways)
         if verdict.reason:
             return not_found(verdict.reason, verdict.inliers)
         return self._choose([self._location(row, verdict, self._near_share, sideways)])
+
+    def _verify_near(self, keyframe: Keyframe, guess: F64, row: int, cloud: Cloud, sideways: bool) -> Verdict:
+        """Match a keyframe with a row's cloud around a predicted map_T_cam (4, 4)."""
+        config = self._side_config if sideways else self._config
+        view = place_view_of(keyframe, self._rig, config.disparity_sigma_px, sideways)
+        return verify_near(se3.inverse(guess) @ self._map.map_T_kf[row], view, cloud, self._rig, config)
 
     def cloud(self, row: int, sideways: bool = False) -> Cloud:
         """The points of a keyframe row and its neighbours, in its camera frame."""
