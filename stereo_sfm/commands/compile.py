@@ -17,7 +17,8 @@ def run(args: argparse.Namespace) -> int:
     from stereo_sfm.demo import demo_recording
     from stereo_sfm.drivers.source import open_source
     from stereo_sfm.kernel_cache import listening
-    from stereo_sfm.pipeline.warm_up import warm_up_stage
+    from stereo_sfm.mapping.mapper import run_job
+    from stereo_sfm.pipeline.warm_up import scratch_job, warm_up_stage
 
     def report(kernel: str) -> None:
         if not args.quiet:
@@ -26,6 +27,9 @@ def run(args: argparse.Namespace) -> int:
     with listening(report) as compilation, open_source(str(demo_recording())) as source:
         for stage in ("tracker", "mapper", "loop"):
             warm_up_stage(stage, Config(), source.rig)
+        job = scratch_job(Config(), source.rig)
+        if job is not None:
+            run_job(job)
     if not args.quiet:
         print(f"{compilation.kernels} kernels compiled in {compilation.seconds:.0f} s; later runs start at once")
     return 0

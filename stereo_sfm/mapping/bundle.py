@@ -21,6 +21,7 @@ from stereo_sfm.mapping.level import Level
 from stereo_sfm.mapping.reduced import ReducedSystem
 from stereo_sfm.types import F64, I64, Bool
 
+LONGEST_STEP = 32.0  # of those that `BundleConfig.extend` tries, in steps of Gauss-Newton
 TO_SIGMA = 1.4826  # from the median of absolute values, for normally distributed ones
 MIN_RESIDUAL = 0.05  # sigmas, lower bound of the median residual
 MIN_DISPARITY_SIGMA = 1e-2  # of normalised mean disparity errors
@@ -41,6 +42,7 @@ class BundleConfig:
     tolerance: float = 1e-5  # relative decrease of the cost that ends a round
     damping: float = 1e-4  # first damping, relative to the diagonal
     fixed_once: bool = False  # observations of fixed keyframes are linearised once a round, not after every step
+    extend: bool = False  # take steps longer than Gauss and Newton's while the cost decreases
     dense: bool | None = None  # the solver of the reduced system; None: by size
 
 
@@ -242,6 +244,23 @@ class _Solver:
         kernels.point_steps(table.starts, table.kf, self.free, state.rot, state.lin, *blocks, xi, state.points, points)
         return self.evaluate(_State(rot, pos, points), state.prior if self.config.fixed_once else None)
 
+    def _extended(self, state: _State, trial: _State) -> _State:
+        """The best of ever longer steps from one state towards another, which has a lower cost.
+
+        The weights of a redescending loss follow a step only afterwards, so that where keyframes move together each step
+        is a small share of what is left. A longer one needs no new system.
+        """
+        turn, prior = se3.so3_log(state.rot.mT @ trial.rot), state.prior if self.config.fixed_once else None
+        best, factor = trial, 2.0
+        while factor <= LONGEST_STEP:
+            rot = np.ascontiguousarray(state.rot @ se3.so3_exp(factor * turn))
+            pos, points = (a + factor * (b - a) for a, b in ((state.pos, trial.pos), (state.points, trial.points)))
+            further = self.evaluate(_State(rot, pos, points), prior)
+            if not further.cost < best.cost:
+                break
+            best, factor = further, 2.0 * factor
+        return best
+
     def descend(self, state: _State) -> tuple[_State, int, bool]:
         """Levenberg-Marquardt from one state: the best state, accepted steps, whether it converged."""
         damping, accepted, c = self.config.damping, 0, self.config
@@ -252,6 +271,8 @@ class _Solver:
                 if damping > 1e6 or (trial is not None and trial.cost - state.cost <= c.tolerance * 0.1 * state.cost):
                     return state, accepted, True
                 continue
+            if c.extend:
+                trial = self._extended(state, trial)
             decrease = state.cost - trial.cost
             state, damping, accepted = trial, max(damping * 0.1, 1e-9), accepted + 1
             if decrease <= c.tolerance * state.cost:

@@ -83,13 +83,8 @@ class ReducedSystem:
 
     def _solve_banded(self, blocks: F64, b: F64) -> F64:
         n, place = self.size, self._place
-        band = np.zeros((6 * n, self._band))  # row j: the entries (j, j), (j + 1, j), ... of column j
-        for i in range(6):
-            for j in range(6):
-                value = np.where(self._swap, blocks[:, j, i], blocks[:, i, j])
-                offset = 6 * (self._high - self._low) + i - j
-                lower = offset >= 0
-                band[6 * self._low[lower] + j, offset[lower]] = value[lower]
+        band = np.zeros((6 * n, self._band))
+        bundle_kernels.fill_band(blocks, self._high, self._low, self._swap, band)
         factor = scipy.linalg.cholesky_banded(band.T, overwrite_ab=True, lower=True, check_finite=False)
         right = np.empty((n, 6))
         right[place] = b

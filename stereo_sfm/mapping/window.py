@@ -18,7 +18,7 @@ from stereo_sfm.mapping.level import level_of
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.types import F64, I64, Bool
 
-FINAL_ROUNDS, FINAL_TOLERANCE = 4, 1e-6  # of the last full bundle adjustment, see `BundleConfig`
+FINAL_ROUNDS, FINAL_TOLERANCE = 4, 1e-5  # of the last full bundle adjustment, see `BundleConfig`
 MIN_SHARED_POINTS = 10  # that connect two keyframes
 
 
@@ -54,7 +54,7 @@ def final_bundle_config(config: MapperConfig) -> BundleConfig:
     """
     return dataclasses.replace(
         bundle_config(config), rounds=FINAL_ROUNDS, iterations=config.final_iterations, tolerance=FINAL_TOLERANCE,
-        joint_loss=True,
+        joint_loss=True, extend=True,
     )  # fmt: skip
 
 

@@ -124,14 +124,16 @@ def _warm_up_inertial(imu: Imu) -> None:
 
 
 def scratch_job(config: Config, rig: Rig) -> Job | None:
-    """A small full bundle adjustment, which loads the optimizer's code; None where it will never have one."""
+    """A small full bundle adjustment with the solver of large ones, which loads the optimizer's code; None where it will
+    never have one."""
     if not (rig.stereo and config.mapper.enabled):
         return None
     eager = dataclasses.replace(config.mapper, full_ba_growth=0.0, full_ba_lag_keyframes=1)
     mapper = Mapper(eager, rig, NoSpans(), config.loop)
     for keyframe in keyframes(rig):
         mapper.step(keyframe)
-    return mapper.pending_job()
+    job = mapper.pending_job()
+    return job and dataclasses.replace(job, config=dataclasses.replace(job.config, dense=False))
 
 
 def warm_up_stage(stage: str, config: Config, rig: Rig, patient: bool = False) -> None:

@@ -94,6 +94,16 @@ def test_sparse_and_dense_solvers_agree(rig: Rig) -> None:
     np.testing.assert_allclose(sparse.world_T_kf, dense.world_T_kf, atol=1e-6)
 
 
+def test_longer_steps_converge_in_fewer(rig: Rig) -> None:
+    bundle = bundle_of(make_scene(rig, 20, 400, noise_px=0.5, outliers=0.1))
+    config = BundleConfig(rounds=2, iterations=200, cauchy=0.58, tolerance=1e-9, outlier_chi2=100.0)
+    short, long = (bundle_adjust(rig, bundle, dataclasses.replace(config, extend=extend)) for extend in (False, True))
+    assert short.converged and long.converged
+    assert long.iterations <= 0.7 * short.iterations
+    assert long.cost <= short.cost * (1 + 1e-5)
+    np.testing.assert_allclose(long.world_T_kf, short.world_T_kf, atol=1e-4)
+
+
 def test_outliers_are_rejected_and_do_not_bias(rig: Rig) -> None:
     scene = make_scene(rig, 10, 600, noise_px=0.5, outliers=0.1)
     clean = make_scene(rig, 10, 600, noise_px=0.5)
