@@ -2,20 +2,24 @@
 
     python benchmarks/market.py --size 424x400 --rate 15
     python benchmarks/market.py --parts map --length 40 --size 212x200 --rate 10 --queries 10
-    python benchmarks/market.py --parts growth --length 5000 --size 424x400 --rate 10
+    python benchmarks/market.py --parts growth --length 20000 --distinct 600 --size 424x400 --rate 10
 
 Parts: `map` puts the sessions of `sim:market` into one map (`map update`) and prints ATE after alignment (keyframes of
 all sessions together, also as a share of the metres driven), size, and times; then single images of a further session,
 driven a bit aside, are asked in it. `growth` drives on from session to session in one run and prints, for each stretch,
 processor time a frame (without rendering), resident memory, keyframes and points; it fails where the last stretch
-needs more than 1.2 times the time of the one around 600 m, or 1.5 times the memory.
+needs more than 1.2 times the time of the one around 600 m, or 1.5 times the memory. With `--distinct` so many metres
+are rendered into a file and driven there and back again and again, so that all after them is known.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+import tempfile
 import time
+from collections.abc import Iterator
+from typing import BinaryIO
 
 from _sequences import one_thread
 
@@ -28,12 +32,13 @@ from sessions import Truth, asked, on_disk, put_in, truth_of
 
 from stereo_sfm.config import Config
 from stereo_sfm.drivers.sim.source import SimSource
-from stereo_sfm.drivers.source import open_source
+from stereo_sfm.drivers.source import BaseSource, open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.floor_plan import make_floor_plan
 from stereo_sfm.mapping.mapper import Mapper
 from stereo_sfm.maps.saved_map import SavedMap
 from stereo_sfm.pipeline.inline import InlineRun
+from stereo_sfm.types import StereoImage
 
 ATE_SHARE, GOOD_SHARE, QUERY_S = 0.0005, 0.96, 0.3  # required of the map of three sessions
 FROM_M, TIME_RATIO, MEMORY_RATIO = 600.0, 1.2, 1.5  # required of the growth
@@ -85,13 +90,44 @@ def one_map(options: str, sessions: int, queries: int, seed: int) -> bool:
     return exact and joined == sessions
 
 
-def growth(spec: str, stretch: float) -> bool:
+class RenderedDrive(BaseSource):
+    """A simulated drive from a file of its images, there and back until a length is reached."""
+
+    name = "rendered"
+
+    def __init__(self, source: SimSource, length: float, file: BinaryIO) -> None:
+        assert source.ground_truth is not None
+        self.rig, self._file = source.rig, file
+        self._shape = (2, source.rig.left.height, source.rig.left.width)
+        for image in source:
+            assert image.right is not None
+            file.write(image.left.tobytes() + image.right.tobytes())
+        true = source.ground_truth
+        self._interval_ns = int(true.stamp_ns[1] - true.stamp_ns[0])
+        steps = np.linalg.norm(np.diff(true.poses[:, :3, 3], axis=0), axis=1)
+        laps = int(np.ceil(length / steps.sum()))
+        there = np.arange(len(steps) + 1)
+        self._order = np.concatenate([there[:1], *((there[1:], there[-2::-1])[lap % 2] for lap in range(laps))])
+        driven = np.concatenate(
+            [[0.0], np.cumsum(np.concatenate([steps[:: 1 - 2 * (lap % 2)] for lap in range(laps)]))]
+        )
+        self.driven = driven[driven <= length]
+
+    def __iter__(self) -> Iterator[StereoImage]:
+        size = int(np.prod(self._shape))
+        for k, row in enumerate(self._order[: len(self.driven)].tolist()):
+            self._file.seek(row * size)
+            left, right = np.frombuffer(self._file.read(size), np.uint8).reshape(self._shape)
+            yield StereoImage(k, 1_000_000_000 + k * self._interval_ns, left, right)
+
+
+def growth(spec: str, length: float, stretch: float) -> bool:
     """One long run; whether time and memory stay as flat as required."""
     process, rows = psutil.Process(), list[tuple[float, float, float]]()
-    with open_source(spec) as source:
-        assert isinstance(source, SimSource) and source.ground_truth is not None
-        steps = np.linalg.norm(np.diff(source.ground_truth.poses[:, :3, 3], axis=0), axis=1)
-        driven = np.concatenate([[0.0], np.cumsum(steps)])
+    with open_source(spec) as rendered, tempfile.TemporaryFile() as file:
+        assert isinstance(rendered, SimSource)
+        source = RenderedDrive(rendered, length, file)
+        driven = source.driven
         run = InlineRun(source, Config(), [], None)
         begun, spent, until = 0, 0.0, stretch
         for k, image in enumerate(source):
@@ -123,6 +159,7 @@ def main() -> int:
     parser.add_argument("--size", default="", help="WIDTHxHEIGHT, the camera's own without")
     parser.add_argument("--rate", type=float, default=30.0)
     parser.add_argument("--length", type=float, default=0.0, help="metres of a session or of the long drive")
+    parser.add_argument("--distinct", type=float, default=0.0, help="rendered metres of the long drive, 0: all")
     parser.add_argument("--stretch", type=float, default=100.0, help="metres between two lines of the growth")
     args = parser.parse_args()
     size = f"&size={args.size}" if args.size else ""
@@ -132,7 +169,9 @@ def main() -> int:
         passed &= one_map(options, args.sessions, args.queries, args.seed)
     if "growth" in args.parts.split(","):
         length = args.length or 2 * FROM_M
-        passed &= growth(f"sim:market?seed={args.seed}&rate={args.rate}&length={length}{size}", args.stretch)
+        distinct = min(args.distinct or length, length)
+        spec = f"sim:market?seed={args.seed}&rate={args.rate}&length={distinct}{size}"
+        passed &= growth(spec, length, args.stretch)
     return 0 if passed else 3
 
 

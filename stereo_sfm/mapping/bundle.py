@@ -247,8 +247,8 @@ class _Solver:
     def _extended(self, state: _State, trial: _State) -> _State:
         """The best of ever longer steps from one state towards another, which has a lower cost.
 
-        The weights of a redescending loss follow a step only afterwards, so that where keyframes move together each step
-        is a small share of what is left. A longer one needs no new system.
+        The weights of a redescending loss follow a step only afterwards, so that where keyframes move together each
+        step is a small share of what is left. A longer one needs no new system.
         """
         turn, prior = se3.so3_log(state.rot.mT @ trial.rot), state.prior if self.config.fixed_once else None
         best, factor = trial, 2.0
