@@ -18,6 +18,7 @@ from stereo_sfm.log.events import Events
 from stereo_sfm.messages import Health, LogLine, StageTimes
 from stereo_sfm.types import (
     U8,
+    Bool,
     Dropped,
     Frame,
     Keyframe,
@@ -38,6 +39,9 @@ MATCHES_EVERY = 5  # images between two images of matches
 KEPT = 64  # images waiting for their frame, more than the stages can hold
 GRACE_S = 5.0  # time for a viewer to take the remaining messages
 TRUTH = (95, 200, 110)
+MASKED = (230, 60, 90)
+MASK_OPACITY = 0.45
+MASK_ORDER = 1.0  # over images (-10) and under points (30)
 SERIES: Mapping[str, tuple[int, int, int]] = {
     "points/tracked": (90, 170, 255),
     "points/inliers": (120, 220, 130),
@@ -89,6 +93,9 @@ class RerunSink:
         self._dropped = 0
         for entity, color in SERIES.items():
             self._rec.log(entity, rr.SeriesLines(colors=[color], names=entity.split("/")[1]), static=True)
+        for entity, used in (("map/camera/left/mask", rig.left_mask), ("right/mask", rig.right_mask)):
+            if used is not None:
+                self._show_mask(entity, used)
         if ground_truth is not None and len(ground_truth):
             world = se3.inverse(ground_truth.poses[0]) @ ground_truth.poses
             line = rr.LineStrips3D([world[:, :3, 3]], colors=[TRUTH], radii=rr.Radius.ui_points(0.8))
@@ -143,6 +150,12 @@ class RerunSink:
     @_show.register
     def _text(self, line: LogLine) -> None:
         self._rec.log("log", rr.TextLog(f"{line.stage}: {line.text}", level=line.level.replace("WARNING", "WARN")))
+
+    def _show_mask(self, entity: str, used: Bool) -> None:
+        """What is masked of an image, in colour over all images that come."""
+        self._rec.log(entity, rr.AnnotationContext([(1, "masked", MASKED)]), static=True)
+        masked = rr.SegmentationImage((~used).astype(np.uint8), opacity=MASK_OPACITY, draw_order=MASK_ORDER)
+        self._rec.log(entity, masked, static=True)
 
     # -- frames ------------------------------------------------------------------------------------------------------
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import subprocess
 import sys
@@ -77,6 +78,20 @@ def test_every_frame_is_shown_with_its_tracks(shown: Recording) -> None:
     count = Counter(entity for entity, _ in shown.logged)
     series = {"points/tracked", "points/inliers", "ms/track"}  # their colours come once
     assert {entity: count[entity] - (entity in series) for entity in EVERY_FRAME} == dict.fromkeys(EVERY_FRAME, FRAMES)
+
+
+def test_masks_lie_over_the_images(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(sink.rr, "RecordingStream", Recording)
+    rig = SlidingWall(1).rig
+    used = np.ones((rig.left.height, rig.left.width), bool)
+    used[-20:] = False
+    viewer = sink.RerunSink(dataclasses.replace(rig, left_mask=used), "wall", "save", tmp_path / "unused.rrd")
+    recording: Any = viewer._rec
+    colors, shown = recording.of("map/camera/left/mask")
+    assert isinstance(colors, rr.AnnotationContext)
+    classes = np.array(shown.buffer.as_arrow_array().to_pylist()[0], np.uint8)
+    np.testing.assert_array_equal(classes.reshape(used.shape), ~used)
+    assert not recording.of("right/mask")
 
 
 def test_the_map_is_shown(shown: Recording) -> None:
