@@ -28,7 +28,7 @@ from stereo_sfm.loop.sideways import (
     sideways_config,
     with_neighbours,
 )
-from stereo_sfm.loop.verification import Verdict, looks_alike, rejection, verify, within
+from stereo_sfm.loop.verification import Verdict, looks_alike, rejection, verify, verify_near, within
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.types import F64, RIG_TERMS, Keyframe, LoopResult
@@ -39,7 +39,11 @@ KEPT_NEWEST = 30  # newest keyframes, none of which is removed
 MAX_SAME_VIEW = 5  # keyframes of one view; of more, one is removed
 DRIFT_PER_METRE = 0.003  # of the odometry on both sides of a gap
 STRONG = 3.0, 0.4  # times min_inliers, share of inliers: one keyframe joins two submaps if the gap's motion allows it
-RIVAL = 0.5  # share of a loop's inliers above which another place makes it ambiguous
+RIVAL = 0.5  # share of a loop's inliers, or of its support, above which another place makes it ambiguous
+TWIN = 0.85  # the same of the share of corners of its best keyframe, where several found it
+GAP_WINDOW = 12  # newest keyframes with corners that support a loop across a gap, or contradict it
+CHANCE = 0.25  # share of corners, ahead and beside, that agree where a place only looks alike
+MIN_SUPPORT = 0.3  # sum of what the shares of keyframes exceed that by: two with 0.4, or three with 0.35
 CONTRADICTED = "against_odometry", "out_of_reach"  # reasons of impossible hypotheses, which are no rivals
 SIDE_CANDIDATES = 1, 3  # across directions: besides the one by odometry, and without one
 AGREE_METRES, AGREE_DEGREES = 0.15, 2.0  # largest difference of two keyframes' estimates of one loop
@@ -66,6 +70,7 @@ class _Hypothesis:
     unconnected: bool  # no path of odometry and loops connects its ends: only appearance supports it
     votes: int  # keyframes that must agree on it
     sideways: bool  # by views to the side
+    share: float  # of the keyframe's corners, ahead and beside, that agree with it
 
 
 class LoopCloser:
@@ -94,8 +99,9 @@ class LoopCloser:
         self._store = KeyframeStore()
         self._graph = KeyframeGraph()
         self._pending: list[_Hypothesis] = []
-        self._described: deque[int] = deque(maxlen=config.consistent_window)  # newest keyframes with corners
+        self._described: deque[int] = deque(maxlen=GAP_WINDOW)  # newest keyframes with corners
         self._last_loop = -(10**9)
+        self._sees_sides = False  # some keyframe had views that face shelves
 
     @property
     def vocabulary(self) -> Vocabulary:
@@ -137,6 +143,7 @@ class LoopCloser:
         with self._spans.span("loop_words"):
             bag, side_bag = (self._vocabulary.bag(c.descriptors) for c in (keyframe.corners, keyframe.sides))
         self._fronts.add(keyframe)
+        self._sees_sides |= len(keyframe.sides) >= MIN_CORNERS
         return bag, side_bag
 
     def _keep(self, keyframe: Keyframe, bags: tuple[voc.Bag, voc.Bag]) -> None:
@@ -242,7 +249,7 @@ class LoopCloser:
                 views[candidate.sideways] = place_view_of(keyframe, self._rig, sigma, candidate.sideways)
             verdicts.append(self._verify(keyframe, views[candidate.sideways], candidate))
             if not verdicts[k].reason:
-                loops[k] = self._hypothesis(keyframe.kf_id, candidate, verdicts[k])
+                loops[k] = self._hypothesis(keyframe, candidate, verdicts[k])
         if not candidates:
             return _no_loop(keyframe.kf_id, why_none)
         candidates = candidates[: len(verdicts)]
@@ -266,8 +273,7 @@ class LoopCloser:
         centre = self._store[candidate.kf_id]
         if not candidate.sideways and not looks_alike(view, centre, config):
             return rejection("too_few_matches")
-        around = [self._store[k] for k in self._store.best_connected(candidate.kf_id, CLOUD_KEYFRAMES)]
-        around = [k for k in around if k.submap_id == centre.submap_id]
+        around = self._around(centre)
         cloud = gather(centre, around, self._rig, config.disparity_sigma_px, candidate.sideways)
         rng = np.random.default_rng([config.seed, keyframe.kf_id, candidate.kf_id])
         verdict = verify(view, cloud, self._rig, config, rng, move_points=not candidate.sideways)
@@ -279,14 +285,36 @@ class LoopCloser:
         sightings[:, 1] = np.array([k.kf_id for k in (centre, *around, keyframe)])[sightings[:, 1]]
         return dataclasses.replace(verdict, sightings=sightings)
 
-    def _hypothesis(self, kf_id: int, of: Candidate, verdict: Verdict) -> _Hypothesis:
+    def _around(self, centre: Keyframe) -> list[Keyframe]:
+        """The connected keyframes whose points are added to a candidate's own."""
+        around = [self._store[k] for k in self._store.best_connected(centre.kf_id, CLOUD_KEYFRAMES)]
+        return [k for k in around if k.submap_id == centre.submap_id]
+
+    def _agreeing_share(self, keyframe: Keyframe, candidate: int, verdict: Verdict) -> float:
+        """Share of a keyframe's corners, ahead and beside, that agree with a pose found by those ahead.
+
+        Rows of lamps look alike one lamp further on, in the next aisle and from the other side. Shelves do not: where
+        others have views that face them, a keyframe without says little.
+        """
+        corners, inliers = len(keyframe.corners), verdict.inliers
+        if self._sees_sides:
+            corners += max(len(keyframe.sides), self._config.side_corners)
+        if len(keyframe.sides) >= MIN_CORNERS:
+            centre, config = self._store[candidate], self._side_config
+            cloud = gather(centre, self._around(centre), self._rig, config.disparity_sigma_px, True)
+            if cloud.corner.sum() >= MIN_CORNERS:
+                view = place_view_of(keyframe, self._rig, config.disparity_sigma_px, True)
+                inliers += verify_near(verdict.b_T_a, view, cloud, self._rig, config).inliers
+        return inliers / max(corners, 1)
+
+    def _hypothesis(self, keyframe: Keyframe, of: Candidate, verdict: Verdict) -> _Hypothesis:
         """A verified candidate, compared with the odometry between its ends.
 
         Across a gap there is none. What the robot can have moved meanwhile bounds where it is; within that, strong
         geometric evidence is believed at once, less or more distant evidence when another keyframe agrees.
         """
         config, candidate_T_kf = self._config, se3.inverse(verdict.b_T_a)
-        candidate, votes = of.kf_id, self._config.consistent
+        kf_id, candidate, votes, share = keyframe.kf_id, of.kf_id, self._config.consistent, verdict.share
         path = self._graph.path(candidate, kf_id)
         if path is not None:
             metres = config.gate_m + config.gate_m_per_m * path.metres
@@ -301,12 +329,14 @@ class LoopCloser:
             else:
                 least = 2 * config.min_inliers
                 enough = verdict.inliers >= least and verdict.share >= config.min_inlier_share_after_gap
-                strong = verdict.inliers >= STRONG[0] * config.min_inliers and verdict.share >= STRONG[1]
+                share = self._agreeing_share(keyframe, candidate, verdict)
+                strong = verdict.inliers >= STRONG[0] * config.min_inliers and min(verdict.share, share) >= STRONG[1]
                 votes = 1 if strong and gap is not None and off <= gap.tolerance else votes
             reached = gap is None or off <= gap.disturbed
             against = "out_of_reach" if not reached else "" if enough else "too_few_inliers"
         unconnected = path is None
-        return _Hypothesis(kf_id, candidate, candidate_T_kf, verdict.inliers, against, unconnected, votes, of.sideways)
+        inliers, sideways = verdict.inliers, of.sideways
+        return _Hypothesis(kf_id, candidate, candidate_T_kf, inliers, against, unconnected, votes, sideways, share)
 
     def _objection(self, loop: _Hypothesis, best_inliers: int) -> str:
         """Why a loop that odometry allows is not accepted, '' if it is.
@@ -315,23 +345,35 @@ class LoopCloser:
         """
         if loop.inliers < RIVAL * best_inliers:
             return "better_elsewhere"
-        if loop.unconnected and any(self._rivals(h, loop) for h in self._pending):
+        if not loop.unconnected:
+            return "" if len(self._support(loop, self._config.consistent_window)) >= loop.votes else "not_confirmed_yet"
+        support = self._support(loop, GAP_WINDOW)
+        if any(self._rivals(h, loop, support) for h in self._pending):
             return "ambiguous"
-        return "" if self._confirmed(loop) else "not_confirmed_yet"
+        enough = loop.votes == 1 or loop.sideways or _total(support) >= MIN_SUPPORT
+        return "" if len(support) >= loop.votes and enough else "not_confirmed_yet"
 
-    def _rivals(self, other: _Hypothesis, loop: _Hypothesis) -> bool:
-        """Whether another place is so similar that only appearance cannot tell which one it is.
+    def _rivals(self, other: _Hypothesis, loop: _Hypothesis, support: dict[int, float]) -> bool:
+        """Whether so much speaks for another place that appearance cannot tell which one it is.
 
         Along an aisle both directions look somewhat alike: what corners ahead and corners beside show is comparable
         only if there are enough of both.
         """
         possible = not other.against or (other.against not in CONTRADICTED and other.sideways == loop.sideways)
-        return possible and other.inliers > RIVAL * loop.inliers and self._same_loop(other, loop) is False
+        if not possible or self._same_loop(other, loop) is not False:
+            return False
+        others = self._support(other, GAP_WINDOW)
+        alike = RIVAL if len(support) == 1 else TWIN
+        return _total(others) > RIVAL * _total(support) or max(others.values()) > alike * max(support.values())
 
-    def _confirmed(self, new: _Hypothesis) -> bool:
-        """Whether enough keyframes found the same loop."""
-        votes = {h.kf_id for h in self._pending if not h.against and (h is new or self._same_loop(h, new))}
-        return len(votes) >= new.votes
+    def _support(self, loop: _Hypothesis, window: int) -> dict[int, float]:
+        """The keyframes among the newest that found a loop, and the share of the corners of each that agree with it."""
+        newest = list(self._described)[-window:]
+        shares: dict[int, float] = {}
+        for h in self._pending:
+            if h.kf_id in newest and (h is loop or (not h.against and self._same_loop(h, loop))):
+                shares[h.kf_id] = max(h.share, shares.get(h.kf_id, 0.0))
+        return shares
 
     def _same_loop(self, earlier: _Hypothesis, new: _Hypothesis) -> bool | None:
         """Whether two loops agree; None if no path connects them."""
@@ -373,6 +415,11 @@ class LoopCloser:
         if every and keyframe.kf_id % every == every - 1:
             recent = [self._store[k].corners.descriptors for k in self._store.ids[-every:]]
             self._vocabulary = voc.grow(self._vocabulary, np.concatenate(recent))
+
+
+def _total(support: dict[int, float]) -> float:
+    """What speaks for a loop: by how much the shares of the keyframes that found it exceed those of chance."""
+    return sum(max(share - CHANCE, 0.0) for share in support.values())
 
 
 def _no_loop(

@@ -135,6 +135,18 @@ def test_two_places_without_a_path_between_them_are_ambiguous(
     assert both[26].candidate_kf_id == -1 and [why for _, _, why in both[26].rejected] == ["ambiguous"] * 2
 
 
+@pytest.mark.parametrize(("share", "accepted"), [(0.3, False), (0.5, True)])
+def test_lamps_that_agree_join_no_submaps_where_the_shelves_beside_do_not(
+    vocabulary: voc.Vocabulary, monkeypatch: pytest.MonkeyPatch, share: float, accepted: bool
+) -> None:
+    sequence = make_sequence([0], seed=3)
+    anew = [dataclasses.replace(k, submap_id=int(k.kf_id >= 20), stamp_ns=0) for k in sequence.keyframes]
+    monkeypatch.setattr(LoopCloser, "_agreeing_share", lambda *_: share)
+    results = answers_of(sequence, vocabulary, monkeypatch, {(25, 5): 200, (26, 6): 210}, set(), anew)
+    assert (results[26].candidate_kf_id == 6) == accepted
+    assert results[26].reason == ("" if accepted else "not_confirmed_yet")
+
+
 def test_pause_after_a_loop(vocabulary: voc.Vocabulary) -> None:
     results = close(make_sequence([0, 0], seed=5), vocabulary, dataclasses.replace(LoopConfig(), pause=7))
     accepted = [r.kf_id for r in results if r.candidate_kf_id >= 0]
