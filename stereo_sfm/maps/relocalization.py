@@ -21,8 +21,9 @@ from stereo_sfm.mapping.map import MapSnapshot
 from stereo_sfm.types import F64, I64, Keyframe
 
 SAME_PLACE_M, SAME_PLACE_DEG = 0.2, 5.0  # closer results are the same place
-AMBIGUITY_RATIO = 0.85  # a result is ambiguous if another place has this share of its inliers
+AMBIGUITY_RATIO = 0.75  # a result is ambiguous if another place has this share of its inliers
 CONFIDENCE_FACTOR = 2.0  # times the required inliers: no further candidates or confirmation needed
+CONFIDENT_SHARE = 0.4  # of the corners ahead and beside; places that only look alike have 0.3 at most
 MIN_RANGE_SIGMA_M = 0.003
 
 
@@ -37,11 +38,17 @@ class Location:
     inliers: int  # corners that agree on the pose
     pairs: I64  # (M, 2) point ids of the map and of the camera
     confident: bool = False  # far more inliers than required
+    beside: int = -1  # corners of the views to the side that agree with a pose found ahead, -1: there are none
 
     @property
     def found(self) -> bool:
         """Whether the pose is valid."""
         return not self.reason
+
+    @property
+    def agreeing(self) -> int:
+        """Corners ahead and beside."""
+        return self.inliers + max(self.beside, 0)
 
 
 def not_found(reason: str, inliers: int = 0) -> Location:
@@ -71,6 +78,7 @@ class Relocalizer:
         self._views = np.maximum(np.bincount(snapshot.obs_pt, minlength=shape[1]), 1)
         self._database, self._side_database = PlaceDatabase(len(vocabulary)), PlaceDatabase(len(vocabulary))
         self._fronts = Fronts(rig.left)
+        self._has_sides = any(len(k.sides) >= MIN_CORNERS for k in self._keyframes)
         for k, keyframe in enumerate(self._keyframes):
             self._database.add(k, vocabulary.bag(keyframe.corners.descriptors))
             self._side_database.add(k, vocabulary.bag(keyframe.sides.descriptors))
@@ -90,11 +98,18 @@ class Relocalizer:
         """Whether the shelves beside do not contradict what is ahead: rows of lamps look alike from both directions."""
         if ahead.confident:
             return True
-        row = int(np.flatnonzero(self._map.kf_ids == ahead.kf_id)[0])
+        return ahead.beside < 0 or ahead.beside >= self._config.side_inliers
+
+    def _with_beside(self, keyframe: Keyframe, row: int, ahead: Location) -> Location:
+        """What the shelves beside say to a pose found ahead: rows of lamps look alike one lamp further on, too."""
+        if len(keyframe.sides) < MIN_CORNERS:
+            return dataclasses.replace(ahead, confident=ahead.confident and not self._has_sides)
         cloud = self.cloud(row, sideways=True)
         if cloud.corner.sum() < MIN_CORNERS:
-            return True
-        return self._verify_near(keyframe, ahead.map_T_cam, row, cloud, True).inliers >= self._config.side_inliers
+            return ahead
+        beside = self._verify_near(keyframe, ahead.map_T_cam, row, cloud, True).inliers
+        share = (ahead.inliers + beside) / (len(keyframe.corners) + len(keyframe.sides))
+        return dataclasses.replace(ahead, beside=beside, confident=ahead.confident and share >= CONFIDENT_SHARE)
 
     def _search(self, keyframe: Keyframe, sideways: bool) -> Location:
         """Find it by its corners, or by those of the views that face the shelves."""
@@ -110,7 +125,8 @@ class Relocalizer:
             if verdict.reason:
                 reason = verdict.reason if reason == "no_candidate" else reason
                 continue
-            found.append(self._location(row, verdict, config.relocalize_share, sideways))
+            place = self._location(row, verdict, config.relocalize_share, sideways)
+            found.append(place if sideways else self._with_beside(keyframe, row, place))
             if found[-1].confident:
                 break
         return self._choose(found) if found else not_found(reason)
@@ -182,11 +198,11 @@ class Relocalizer:
 
     def _choose(self, found: list[Location]) -> Location:
         """The location with most inliers, if they suffice and no other place is comparable."""
-        best = max(found, key=lambda x: x.inliers)
+        best = max(found, key=lambda x: x.agreeing)
         if best.reason:
             return not_found(best.reason, best.inliers)
         for other in found:
             distinct = not within(se3.inverse(best.map_T_cam) @ other.map_T_cam, SAME_PLACE_M, SAME_PLACE_DEG)
-            if distinct and other.inliers > AMBIGUITY_RATIO * best.inliers:
+            if distinct and other.agreeing > AMBIGUITY_RATIO * best.agreeing:
                 return not_found("ambiguous", best.inliers)
         return best
