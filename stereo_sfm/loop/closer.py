@@ -99,7 +99,8 @@ class LoopCloser:
         self._store = KeyframeStore()
         self._graph = KeyframeGraph()
         self._pending: list[_Hypothesis] = []
-        self._described: deque[int] = deque(maxlen=GAP_WINDOW)  # newest keyframes with corners
+        # newest keyframes with corners
+        self._described: deque[int] = deque(maxlen=max(GAP_WINDOW, config.consistent_window))
         self._last_loop = -(10**9)
         self._sees_sides = False  # some keyframe had views that face shelves
 

@@ -21,7 +21,7 @@ from stereo_sfm.mapping.map import MapSnapshot
 from stereo_sfm.types import F64, I64, Keyframe
 
 SAME_PLACE_M, SAME_PLACE_DEG = 0.2, 5.0  # closer results are the same place
-AMBIGUITY_RATIO = 0.75  # a result is ambiguous if another place has this share of its inliers
+AMBIGUITY_RATIO = 0.75  # a result is ambiguous if another place has this share of its agreeing corners
 CONFIDENCE_FACTOR = 2.0  # times the required inliers: no further candidates or confirmation needed
 CONFIDENT_SHARE = 0.4  # of the corners ahead and beside; places that only look alike have 0.3 at most
 MIN_RANGE_SIGMA_M = 0.003
@@ -87,18 +87,16 @@ class Relocalizer:
     def locate(self, keyframe: Keyframe) -> Location:
         """Find the camera of a keyframe (its pose is ignored) in the map, if need be from another direction."""
         ahead = self._search(keyframe, False)
-        if len(keyframe.sides) < MIN_CORNERS or (ahead.found and self._confirmed(keyframe, ahead)):
+        if len(keyframe.sides) < MIN_CORNERS or (ahead.found and self._confirmed(ahead)):
             return ahead
         beside = self._search(keyframe, True)
         if beside.found:
             return beside
         return not_found("ambiguous", ahead.inliers) if ahead.found else ahead
 
-    def _confirmed(self, keyframe: Keyframe, ahead: Location) -> bool:
+    def _confirmed(self, ahead: Location) -> bool:
         """Whether the shelves beside do not contradict what is ahead: rows of lamps look alike from both directions."""
-        if ahead.confident:
-            return True
-        return ahead.beside < 0 or ahead.beside >= self._config.side_inliers
+        return ahead.confident or ahead.beside < 0 or ahead.beside >= self._config.side_inliers
 
     def _with_beside(self, keyframe: Keyframe, row: int, ahead: Location) -> Location:
         """What the shelves beside say to a pose found ahead: rows of lamps look alike one lamp further on, too."""
@@ -197,7 +195,7 @@ class Relocalizer:
         return Location(reason, map_T_cam, verdict.information, kf_id, verdict.inliers, verdict.pairs, confident)
 
     def _choose(self, found: list[Location]) -> Location:
-        """The location with most inliers, if they suffice and no other place is comparable."""
+        """The location with most agreeing corners, if they suffice and no other place is comparable."""
         best = max(found, key=lambda x: x.agreeing)
         if best.reason:
             return not_found(best.reason, best.inliers)
