@@ -60,6 +60,17 @@ def aligned(image: U8, seen: U8, uv: F64, start: F64) -> tuple[F64, F64, Bool]:
     return out, deformation, good & (ncc > 0.95)
 
 
+def test_in_a_darker_image_every_window_is_aligned() -> None:
+    """Each window's contrast is raised to that of its first appearance: nothing may add up from window to window."""
+    image = texture(1)
+    uv = np.repeat(grid(image, 12), 4, axis=0)
+    darker = np.clip(0.4 * image.astype(float), 0, 255).astype(np.uint8)
+    out, _, found = aligned(image, darker, uv, uv + (0.6, -0.4))
+    assert len(uv) > 800
+    assert found.all()
+    assert np.linalg.norm(out - uv, axis=1).max() < 0.2
+
+
 def test_affine_alignment_finds_the_deformation() -> None:
     image, matrix = texture(2), np.array([[1.04, 0.05, -4.0], [-0.03, 0.97, 3.0]])
     uv = grid(image)

@@ -403,7 +403,8 @@ def track_affine(
     """
     n = uv.shape[0]
     ncc = np.zeros(n, np.float32)
-    window = np.zeros(FLAT_SIZE, np.float32)
+    window = np.zeros(FLAT_SIZE, np.float32)  # zero beyond the samples, always
+    error = np.zeros(FLAT_SIZE, np.float32)
     raw = np.zeros(RAW_SIZE, np.float32)
     tmp = np.zeros(FLAT_SIZE, np.float32)
     bx = np.zeros(FLAT_SIZE, np.float32)
@@ -432,10 +433,10 @@ def track_affine(
             gain = np.float32(min(max(contrast[k] / contrast_c, 0.3), 3.0))
             ncc[row] = cross / (contrast[k] * contrast_c)
             for m in range(FLAT_SIZE):
-                window[m] = gain * (window[m] - mean) - patch[k, m]
+                error[m] = gain * (window[m] - mean) - patch[k, m]
             for axis in range(2):
                 for m in range(FLAT_SIZE):
-                    bx[m] = gradients[k, axis, m] * window[m]
+                    bx[m] = gradients[k, axis, m] * error[m]
                 b[3 * axis] = _dot(bx, coordinates[0], tmp)
                 b[3 * axis + 1] = _dot(bx, coordinates[1], tmp)
                 b[3 * axis + 2] = _dot(bx, coordinates[2], tmp)
