@@ -197,6 +197,9 @@ class MapperConfig:
         0.9, 0, 10, "A keyframe is removed when three others see this share of its points; above 1: never"
     )
     crowd_keyframes: int = number(5, 1, 10_000, "Keyframes kept of one view")
+    repeated_keyframes: int = number(
+        300, 0, 1_000_000, "Keyframes added to views of earlier visits; then one goes for each that comes"
+    )
     full_ba_growth: float = number(1.15, 1, 1e6, "Full bundle adjustment when the map has grown by this factor")
     full_ba_lag_keyframes: int = number(
         5, 1, 10_000, "Keyframes until its result is applied (in large maps a tenth of their keyframes)"

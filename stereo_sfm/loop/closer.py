@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from bisect import bisect
 from collections import deque
 from dataclasses import dataclass
 
@@ -37,6 +38,7 @@ CLOUD_KEYFRAMES = 4  # connected keyframes whose points are added to a candidate
 PLACE_RADIUS = 3  # candidates at most so many keyframes apart are one place: only the best of them is verified
 KEPT_NEWEST = 30  # newest keyframes, none of which is removed
 MAX_SAME_VIEW = 5  # keyframes of one view; of more, one is removed
+MAX_REPEATED = 300  # keyframes added to views of earlier visits; then one goes for each that comes
 DRIFT_PER_METRE = 0.003  # of the odometry on both sides of a gap
 STRONG = 3.0, 0.4  # times min_inliers, share of inliers: one keyframe joins two submaps if the gap's motion allows it
 RIVAL = 0.5  # share of a loop's inliers, or of its support, above which another place makes it ambiguous
@@ -99,8 +101,10 @@ class LoopCloser:
         self._store = KeyframeStore()
         self._graph = KeyframeGraph()
         self._pending: list[_Hypothesis] = []
+        self._same: dict[tuple[_Hypothesis, _Hypothesis], bool | None] = {}  # of pending ones, see `_same_loop`
         # newest keyframes with corners
         self._described: deque[int] = deque(maxlen=max(GAP_WINDOW, config.consistent_window))
+        self._repeated = 0  # keyframes added to views of earlier visits, less those removed there
         self._last_loop = -(10**9)
         self._sees_sides = False  # some keyframe had views that face shelves
 
@@ -163,9 +167,16 @@ class LoopCloser:
         if settled not in self._store:
             return
         same_view = [k for k in self._graph.same_view(settled) if k <= settled]
-        if len(same_view) > MAX_SAME_VIEW:
+        before = self._store.ids[: bisect(self._store.ids, settled)]
+        came_back = same_view[0] < max(set(before).difference(same_view), default=-1)
+        self._repeated += came_back
+        kept = 1 if came_back and self._repeated > MAX_REPEATED else MAX_SAME_VIEW
+        if len(same_view) > kept:
+            self._repeated -= came_back
             self._graph.exclude(same_view[1])
             self._store.remove(same_view[1])
+        if (rows := self._graph.forget()) is not None:
+            self._fronts.keep(rows)
         if 2 * len(self._store) < len(self._database) - KEPT_NEWEST:
             self._row = {k: row for row, k in enumerate(self._store.ids)}
             kept = np.flatnonzero(np.isin(self._database.kf_ids, self._store.ids))
@@ -257,6 +268,7 @@ class LoopCloser:
         reasons = [verdict.reason for verdict in verdicts]
         best_inliers = max((loop.inliers for loop in loops.values() if not loop.against), default=0)
         self._pending = [h for h in self._pending if h.kf_id in self._described]
+        self._same = {pair: same for pair, same in self._same.items() if all(h.kf_id in self._described for h in pair)}
         self._pending += [h for h in loops.values() if h.against or h.inliers >= RIVAL * best_inliers]
         accepted = -1
         for k in sorted(loops, key=lambda k: -loops[k].inliers):
@@ -378,6 +390,11 @@ class LoopCloser:
 
     def _same_loop(self, earlier: _Hypothesis, new: _Hypothesis) -> bool | None:
         """Whether two loops agree; None if no path connects them."""
+        if (earlier, new) not in self._same:
+            self._same[earlier, new] = self._agree(earlier, new)
+        return self._same[earlier, new]
+
+    def _agree(self, earlier: _Hypothesis, new: _Hypothesis) -> bool | None:
         back = self._graph.path(earlier.candidate_kf_id, new.candidate_kf_id)
         ahead = self._graph.path(new.kf_id, earlier.kf_id)
         if back is None or ahead is None:
@@ -398,6 +415,7 @@ class LoopCloser:
         if not self._paused(keyframe.kf_id):
             self._last_loop = keyframe.kf_id
         self._pending.clear()
+        self._same.clear()
         return LoopResult(
             kf_id=keyframe.kf_id,
             candidate_kf_id=candidate.kf_id,

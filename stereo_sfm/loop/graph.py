@@ -20,6 +20,10 @@ GAP_METRES = 0.3  # constant part of the tolerance after a gap in tracking
 GAP_SHARE = 0.75  # part of the tolerance proportional to the distance at the speed before the gap
 MIN_SPEED = 0.5  # metres a second, lower bound of that speed
 SPEED_NS = 1_000_000_000  # time before a gap over which it is measured
+KNOWN_PATHS = 4096  # that are remembered
+FIRST_FORGOTTEN = 1024  # keyframes, at which some are forgotten for the first time
+NEWEST_KEYFRAMES, NEWEST_LOOPS = 128, 256  # that stay, candidates or not
+AROUND_A_GAP = 10  # keyframes before a gap in tracking that stay, for the velocity there
 HOP_METRES = 1e-6  # added to each edge, so that of equally long paths the one with fewer edges is chosen
 
 
@@ -80,6 +84,8 @@ class KeyframeGraph:
     def __init__(self) -> None:
         self._nodes, self._loops = _Nodes(), _Loops()
         self._joined: dict[int, int] = {}  # chain -> number of the group of chains that loops connect
+        self._forget_at = FIRST_FORGOTTEN
+        self._known: dict[tuple[int, int], GraphPath | None] = {}  # paths since the last loop, by ids of their ends
 
     def _row(self, kf_id: int) -> int:
         return int(np.searchsorted(self._nodes.kf_id, kf_id))
@@ -101,6 +107,34 @@ class KeyframeGraph:
     def exclude(self, kf_id: int) -> None:
         """Remove a keyframe from the candidates; paths over it stay."""
         self._nodes.kept[self._row(kf_id)] = False
+
+    def forget(self) -> I64 | None:
+        """Forget keyframes that are no candidates, when there are many: a robot may go round all day.
+
+        The ends of loops stay, and with them what connects the candidates: of loops to keyframes that are no candidates
+        any more the newest, and those between parts of the odometry.
+
+        Returns:
+            Rows that stay, of all so far; None: all of them.
+        """
+        nodes, loops = self._nodes, self._loops
+        count = len(nodes)
+        if count < self._forget_at:
+            return None
+        a, b = loops.ends.T
+        needed = (nodes.kept[a] & nodes.kept[b]) | (nodes.chain[a] != nodes.chain[b])
+        needed |= np.arange(len(loops)) >= len(loops) - NEWEST_LOOPS
+        stay = nodes.kept | (np.arange(count) >= count - NEWEST_KEYFRAMES)
+        stay[loops.ends[needed].ravel()] = True
+        for row in np.flatnonzero(nodes.chain[1:] != nodes.chain[:-1]).tolist():
+            stay[max(row + 1 - AROUND_A_GAP, 0) : row + 2] = True
+        rows = np.flatnonzero(stay)
+        loops.keep(np.flatnonzero(needed))
+        loops.ends[:] = np.searchsorted(rows, loops.ends)
+        nodes.keep(rows)
+        self._known.clear()
+        self._forget_at = 2 * len(rows) + FIRST_FORGOTTEN
+        return rows
 
     def unbroken(self, a: int, b: int) -> bool:
         """Whether odometry connects two keyframes without interruption."""
@@ -139,6 +173,7 @@ class KeyframeGraph:
 
     def add_loop(self, a: int, b: int, a_T_b: F64) -> None:
         """Link two keyframes whose relative pose was verified."""
+        self._known.clear()
         nodes, row_a, row_b = self._nodes, self._row(a), self._row(b)
         self._loops.append(1, ends=(row_a, row_b), a_T_b=a_T_b)
         nodes.anchored[row_b], nodes.frame[row_b] = nodes.anchored[row_a] @ a_T_b, nodes.frame[row_a]
@@ -192,6 +227,13 @@ class KeyframeGraph:
 
     def path(self, a: int, b: int) -> GraphPath | None:
         """The shortest path (Dijkstra), None if neither odometry nor loops connect the keyframes."""
+        if (a, b) not in self._known:
+            if len(self._known) >= KNOWN_PATHS:
+                self._known.clear()
+            self._known[a, b] = self._find_path(a, b)
+        return self._known[a, b]
+
+    def _find_path(self, a: int, b: int) -> GraphPath | None:
         nodes, loops = self._nodes, self._loops.ends
         rows = np.unique(np.append(loops.ravel(), (self._row(a), self._row(b))))
         linked = np.flatnonzero(nodes.chain[rows[:-1]] == nodes.chain[rows[1:]])

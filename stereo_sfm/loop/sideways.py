@@ -65,9 +65,13 @@ class Fronts:
     def add(self, keyframe: Keyframe) -> None:
         """Remember the newest keyframe."""
         if self._count == len(self._points):
-            self._points = np.concatenate([self._points, np.empty_like(self._points)])
+            self._points = np.concatenate([self._points, np.empty((max(self._count, 64), SAMPLES, 3))])
         self._points[self._count] = front_of(keyframe)
         self._count += 1
+
+    def keep(self, rows: I64) -> None:
+        """Only these rows stay, in this order."""
+        self._points, self._count = self._points[rows], len(rows)
 
     def turned(self, front: F64, cam_T_kf: F64) -> I64:
         """Rows whose views overlap with a camera's from another direction, those that should look most alike first.

@@ -27,6 +27,7 @@ from stereo_sfm.types import F64, I64, LoopResult
 COVISIBLE_POINTS = 30  # shared points of keyframes that get an edge in the pose graph
 ODOMETRY = 0.004, 0.0006  # standard deviation of an odometry edge: metres and radians per metre
 MAX_STRAIN = 6.0  # squared error in sigmas that a loop may keep: chi-squared of six degrees of freedom has this mean
+MAX_NOISE = 12.6  # squared error in sigmas that noise exceeds in one of twenty loops
 DRIFT = 0.003, 0.0003  # systematic drift of scale and heading: metres and radians per metre of the path
 LOOP_SIGMAS = 0.01, 0.003  # smallest standard deviation of a loop: metres, radians
 
@@ -37,6 +38,7 @@ class Correction:
 
     applied: bool  # False: the pose graph rejected the loop, nothing moved
     fused: list[tuple[int, int]]  # point rows (removed, kept)
+    bent: bool = False  # the map had contradicted the loop by more than the loop's noise explains
 
 
 def apply_loop(
@@ -56,6 +58,7 @@ def apply_loop(
     if not (map_.keyframes.alive[a] and map_.keyframes.alive[b]):
         return Correction(False, [])
     before = map_.keyframe_poses()
+    bent = _strain(before, loop_edges(map_, [loop])) > MAX_NOISE
     if config.correction == "averaging":
         after = _averaged(map_, before, loop, earlier)
     elif config.correction == "pose_graph":
@@ -68,7 +71,7 @@ def apply_loop(
     rows = map_.living_keyframes()
     map_.move_keyframes(rows, after[rows])
     map_.carry_points(before, after)
-    return Correction(True, fuse_sides(map_, loop, match_sigma_px))
+    return Correction(True, fuse_sides(map_, loop, match_sigma_px), bent)
 
 
 def loop_is_known(map_: Map, loop: LoopResult, connected_points: int) -> bool:

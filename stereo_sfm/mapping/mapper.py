@@ -17,7 +17,8 @@ points that it pairs, so that a robot that passes the same places all day does n
 
 Time. A window contains the keyframes nearest to the newest and, as fixed ones, those that share most points with them:
 a limited number of each, and with them of points and observations. Of views that are seen again and again a few are
-kept (`culling`). So a keyframe costs the same after hours in the same aisles.
+kept (`culling`), and of all views together a limited number: then one goes for each that comes. So a keyframe costs
+the same after hours in the same aisles.
 
 Local windows propagate a small error of scale from one to the next that only all keyframes together correct. So a full
 bundle adjustment runs concurrently with mapping after a loop, and whenever the map has grown by a share. It is a job of
@@ -107,6 +108,7 @@ class Mapper:
         self._fused: list[tuple[int, int]] = []  # rows (removed, kept)
         self._adjusted: I64 = np.zeros(0, np.int64)  # point rows of the last window
         self._thin: I64 = np.zeros(0, np.int64)  # point rows with too few observations that may still get more
+        self._repeated = 0  # keyframes added to views that had some from earlier visits, less those culled there
         self._loops: list[LoopResult] = []
         self._refused: list[int] = []  # kf_ids whose loops contradict the rest of the map
         self._job: Job | None = None
@@ -262,7 +264,10 @@ class Mapper:
         self._loops.append(loop)
         self._fused += correction.fused
         self._follow_newest(before)
-        self._start_full_bundle()
+        if correction.bent:
+            self._start_full_bundle()
+        else:
+            self._bundle_when_grown(GROWTH_AT_KNOWN_LOOP)
 
     def _bundle_when_grown(self, factor: float) -> None:
         """Start a full bundle adjustment if the map has grown by a factor since the last."""
@@ -383,8 +388,14 @@ class Mapper:
     def _cull(self, row: int) -> None:
         recent = range(max(0, row - RECENT), row + 1)
         seen = [self._seen_by(k) for k in recent]
-        redundant = culling.redundant_keyframe(self.map, row, self._protected(), self._config)
+        protected = self._protected()
+        earlier = culling.earlier_visits(self.map, row, protected)
+        self._repeated += len(earlier) > 0
+        full = len(earlier) > 0 and self._repeated > self._config.repeated_keyframes
+        kept = 0 if full else self._config.crowd_keyframes
+        redundant = culling.redundant_keyframe(self.map, row, protected, earlier, kept, self._config)
         if redundant >= 0:
+            self._repeated -= len(earlier) > 0
             seen.append(self._seen_by(redundant))
             self.map.cull_keyframe(redundant)
             self._carry_loops(int(self.map.keyframes.kf_id[redundant]))

@@ -124,7 +124,7 @@ def _warm_up_inertial(imu: Imu) -> None:
 
 
 def scratch_job(config: Config, rig: Rig) -> Job | None:
-    """A small full bundle adjustment with the solver of large ones, which loads the optimizer's code; None without one."""
+    """A small full bundle adjustment with the solver of large ones, which loads that code; None without a mapper."""
     if not (rig.stereo and config.mapper.enabled):
         return None
     eager = dataclasses.replace(config.mapper, full_ba_growth=0.0, full_ba_lag_keyframes=1)

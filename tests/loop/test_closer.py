@@ -217,6 +217,23 @@ def test_of_a_view_seen_every_lap_a_few_keyframes_are_kept_and_loops_still_found
     assert all(error_of(sequence, r) < 0.1 for r in results if r.candidate_kf_id >= 0)
 
 
+def test_of_many_views_seen_every_lap_a_limited_number_is_kept_besides_the_first(
+    vocabulary: voc.Vocabulary, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("stereo_sfm.loop.closer.MAX_REPEATED", 5)
+    sequence = make_sequence([0, 1] * 7, seed=3)
+    closer = LoopCloser(LoopConfig(), sequence.rig, vocabulary)
+    results, keyframe_count = list[LoopResult](), list[int]()
+    for keyframe in sequence.keyframes:
+        results.append(closer.step(keyframe))
+        keyframe_count.append(closer.keyframe_count)
+    lap = len(sequence.keyframes) // 7
+    assert keyframe_count[lap] == sum(keyframe.described for keyframe in sequence.keyframes[: lap + 1])
+    assert keyframe_count[-1] < 1.2 * keyframe_count[lap] + 5 + KEPT_NEWEST  # three times as many without
+    assert any(r.candidate_kf_id >= 0 for r in results[-lap:])
+    assert all(error_of(sequence, r) < 0.1 for r in results if r.candidate_kf_id >= 0)
+
+
 def test_a_new_submap_is_connected_at_once_with_the_place_just_left(vocabulary: voc.Vocabulary) -> None:
     """After a moment of darkness the new submap is connected at once, not only after another lap."""
     sequence = make_sequence([0], seed=3)

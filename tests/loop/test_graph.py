@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stereo_sfm.geometry import se3
-from stereo_sfm.loop.graph import KeyframeGraph
+from stereo_sfm.loop.graph import FIRST_FORGOTTEN, KeyframeGraph
 from stereo_sfm.types import F64
 
 
@@ -107,6 +107,29 @@ def test_tolerance_of_the_motion_over_a_gap(moved: float, possible: bool) -> Non
     assert gap_motion is not None
     assert gap_motion.deviation == pytest.approx(abs(moved - 0.5)) and gap_motion.distance == pytest.approx(2.0)
     assert (gap_motion.deviation < gap_motion.tolerance) == possible
+
+
+def test_keyframes_that_are_no_candidates_are_forgotten_and_paths_between_the_others_stay() -> None:
+    """Round and round a place of 40 keyframes: those of the first lap stay candidates, each lap closes two loops."""
+    graph, whole, lap = KeyframeGraph(), KeyframeGraph(), 40
+    poses = [at(0.5 * (k % lap), 2 * np.pi * (k % lap) / lap) for k in range(60 * lap)]
+    for k, pose in enumerate(poses):
+        for g in (graph, whole):
+            g.add(k, pose, k >= 30 * lap, 10**8 * k)
+            if k >= lap and k % 20 == 0:
+                g.add_loop(k % lap, k, at(0.0))
+        if k >= lap:
+            graph.exclude(k)
+        graph.forget()
+    assert len(whole.around(k)[0]) == 60 * lap
+    ids, _ = graph.around(k)
+    assert len(ids) < FIRST_FORGOTTEN + 200
+    assert np.isin(np.arange(lap), ids).all()
+    for other in (5, 33, k - 7):
+        path, expected = graph.path(other, k), whole.path(other, k)
+        assert path is not None and expected is not None and path.metres == pytest.approx(expected.metres)
+        np.testing.assert_allclose(path.a_T_b, expected.a_T_b, atol=1e-9)
+    assert graph.unbroken(k - 50, k) and not graph.unbroken(3, k)
 
 
 def test_the_gap_is_symmetric() -> None:

@@ -349,3 +349,14 @@ def test_visits_that_share_no_points_are_thinned_out_too() -> None:
     bounded, _ = run(stream, config)
     assert len(every.map.living_keyframes()) > 0.7 * len(poses)
     assert len(bounded.map.living_keyframes()) < 0.5 * len(poses)
+
+
+def test_of_many_views_seen_again_a_limited_number_is_kept_besides_the_first() -> None:
+    once = camera_path(12, 0.1, 0.0)
+    poses = np.concatenate([once if k % 2 == 0 else once[::-1] for k in range(8)])
+    stream = keyframe_stream(pinhole_rig(), poses, points=600, track_length=4)
+    config = dataclasses.replace(CONFIG, association="tracks", full_ba_growth=np.inf, crowd_keyframes=10_000)
+    every, few = (run(stream, dataclasses.replace(config, repeated_keyframes=n))[0] for n in (10_000, 10))
+    assert len(every.map.living_keyframes()) > 0.7 * len(poses)
+    assert len(few.map.living_keyframes()) < 0.5 * len(poses)
+    assert error(few.map.keyframes.map_T_kf, stream.world_T_kf) < 0.02

@@ -65,7 +65,7 @@ def test_in_a_darker_image_every_window_is_aligned() -> None:
     image = texture(1)
     uv = np.repeat(grid(image, 12), 4, axis=0)
     darker = np.clip(0.4 * image.astype(float), 0, 255).astype(np.uint8)
-    out, _, found = aligned(image, darker, uv, uv + (0.6, -0.4))
+    out, _, found = aligned(image, darker, uv, uv + np.array([0.6, -0.4]))
     assert len(uv) > 800
     assert found.all()
     assert np.linalg.norm(out - uv, axis=1).max() < 0.2
