@@ -198,7 +198,7 @@ class MapperConfig:
     )
     crowd_keyframes: int = number(5, 1, 10_000, "Keyframes kept of one view")
     repeated_keyframes: int = number(
-        300, 0, 1_000_000, "Keyframes added to views of earlier visits; then one goes for each that comes"
+        300, 0, 1_000_000, "Keyframes kept of views of earlier visits, besides those; others go when passed"
     )
     full_ba_growth: float = number(1.15, 1, 1e6, "Full bundle adjustment when the map has grown by this factor")
     full_ba_lag_keyframes: int = number(

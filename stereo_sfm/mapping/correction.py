@@ -75,15 +75,15 @@ def apply_loop(
 
 
 def loop_is_known(map_: Map, loop: LoopResult, connected_points: int) -> bool:
-    """Whether the map already agrees with a loop: its two sides share points, and their relative pose is the loop's."""
+    """Whether the map already agrees with a loop: its two sides share points, and their relative pose is the loop's.
+
+    It is as exact as the loop then, and more: a pose graph would make it follow the loop's noise.
+    """
     a, b = map_.kf_row(loop.candidate_kf_id), map_.kf_row(loop.kf_id)
     around_a, around_b = (map_.neighbours(row, connected_points)[0] for row in (a, b))
     if not len(np.intersect1d(np.append(around_a, a), around_b)):
         return False
-    poses = map_.keyframes.map_T_kf
-    error = se3.log(se3.inverse(loop.candidate_T_kf) @ se3.inverse(poses[a]) @ poses[b])
-    metres, radians = loop_sigmas(loop.information)
-    return bool(np.linalg.norm(error[:3]) < metres and np.linalg.norm(error[3:]) < radians)
+    return _strain(map_.keyframes.map_T_kf, loop_edges(map_, [loop])) <= MAX_STRAIN
 
 
 def fuse_sides(map_: Map, loop: LoopResult, match_sigma_px: float) -> list[tuple[int, int]]:

@@ -43,15 +43,14 @@ def _quality(map_: Map, rig: Rig, rows: I64) -> tuple[F64, F64]:
     return out[:, 0], out[:, 1]
 
 
-def redundant_keyframe(map_: Map, newest: int, protected: Bool, earlier: I64, kept: int, config: MapperConfig) -> int:
+def redundant_keyframe(map_: Map, newest: int, protected: Bool, earlier: I64, config: MapperConfig) -> int:
     """A redundant neighbour of the newest keyframe, -1: none.
 
     The oldest one whose points are seen well enough by others; else, in a place that the robot visits often, the one
-    of several with the same view whose points are seen best by others.
+    of several with the same view whose points are seen best by others: a view keeps `crowd_keyframes` keyframes.
 
     Args:
-        protected: (K,) keyframes that must stay (the first and the newest ones).
-        earlier: see `earlier_visits`. kept: keyframes that a view keeps.
+        protected: (K,) keyframes that must stay (the first and the newest ones). earlier: see `earlier_visits`.
     """
     if config.redundant_share > 1:
         return -1
@@ -61,7 +60,7 @@ def redundant_keyframe(map_: Map, newest: int, protected: Bool, earlier: I64, ke
     if (shares > config.redundant_share).any():
         return int(neighbours[np.argmax(shares > config.redundant_share)])
     same = np.union1d(neighbours[_same_view(map_, newest, neighbours)], earlier)
-    if len(same) <= kept:
+    if len(same) <= config.crowd_keyframes:
         return -1
     return int(same[np.argmax(_seen_by_others(map_, same))])
 

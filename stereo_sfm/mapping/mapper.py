@@ -17,8 +17,8 @@ points that it pairs, so that a robot that passes the same places all day does n
 
 Time. A window contains the keyframes nearest to the newest and, as fixed ones, those that share most points with them:
 a limited number of each, and with them of points and observations. Of views that are seen again and again a few are
-kept (`culling`), and of all views together a limited number: then one goes for each that comes. So a keyframe costs
-the same after hours in the same aisles.
+kept (`culling`), and of all views together a limited number; more are removed when the robot has passed. So a keyframe
+costs the same after hours in the same aisles.
 
 Local windows propagate a small error of scale from one to the next that only all keyframes together correct. So a full
 bundle adjustment runs concurrently with mapping after a loop, and whenever the map has grown by a share. It is a job of
@@ -60,6 +60,7 @@ FIRST_FULL_BUNDLE = 8  # keyframes of the first full bundle adjustment
 GROWTH_AT_KNOWN_LOOP = 1.1  # growth of the map after which a known loop starts a full bundle adjustment
 MOST_AT_ONCE = 40  # keyframes adjusted with a correction of the rig, before all are
 LAG_SHARE = 0.1  # of the living keyframes: a large bundle gets more time before its result is due
+PASSED = 30  # keyframes after which one that repeats an earlier visit's view is not needed any more
 RECENT = 3  # newest keyframes, whose points are checked and which are never redundant
 
 
@@ -108,7 +109,7 @@ class Mapper:
         self._fused: list[tuple[int, int]] = []  # rows (removed, kept)
         self._adjusted: I64 = np.zeros(0, np.int64)  # point rows of the last window
         self._thin: I64 = np.zeros(0, np.int64)  # point rows with too few observations that may still get more
-        self._repeated = 0  # keyframes added to views that had some from earlier visits, less those culled there
+        self._repeated: list[int] = []  # rows of keyframes added to views that had some from earlier visits
         self._loops: list[LoopResult] = []
         self._refused: list[int] = []  # kf_ids whose loops contradict the rest of the map
         self._job: Job | None = None
@@ -390,12 +391,12 @@ class Mapper:
         seen = [self._seen_by(k) for k in recent]
         protected = self._protected()
         earlier = culling.earlier_visits(self.map, row, protected)
-        self._repeated += len(earlier) > 0
-        full = len(earlier) > 0 and self._repeated > self._config.repeated_keyframes
-        kept = 0 if full else self._config.crowd_keyframes
-        redundant = culling.redundant_keyframe(self.map, row, protected, earlier, kept, self._config)
+        redundant = culling.redundant_keyframe(self.map, row, protected, earlier, self._config)
+        if len(earlier):
+            self._repeated.append(row)
+        if redundant < 0:
+            redundant = self._one_too_many()
         if redundant >= 0:
-            self._repeated -= len(earlier) > 0
             seen.append(self._seen_by(redundant))
             self.map.cull_keyframe(redundant)
             self._carry_loops(int(self.map.keyframes.kf_id[redundant]))
@@ -405,6 +406,15 @@ class Mapper:
         self._culled.append(weak)
         points = self.map.points
         self._thin = rows[points.alive[rows] & (points.obs_count[rows] < self._config.min_observations)]
+
+    def _one_too_many(self) -> int:
+        """A keyframe of a view of earlier visits that has been passed, if there are too many such; else -1.
+
+        The newest goes, not the earlier ones: they are connected with the whole map, and hold it together.
+        """
+        self._repeated = [row for row in self._repeated if self.map.keyframes.alive[row]]
+        passed = self._repeated[self._config.repeated_keyframes : -PASSED]
+        return passed[0] if passed else -1
 
     def _seen_by(self, row: int) -> I64:
         """Point rows that a keyframe observes."""

@@ -14,7 +14,15 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.loop.cloud import Cloud, gather
 from stereo_sfm.loop.database import PlaceDatabase
 from stereo_sfm.loop.place_view import place_view_of
-from stereo_sfm.loop.sideways import MIN_CORNERS, SIDE_FACTOR, Fronts, front_of, sideways_config, with_neighbours
+from stereo_sfm.loop.sideways import (
+    MIN_CORNERS,
+    SIDE_FACTOR,
+    TURNED,
+    Fronts,
+    front_of,
+    sideways_config,
+    with_neighbours,
+)
 from stereo_sfm.loop.verification import Verdict, verify, verify_near, within
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.mapping.map import MapSnapshot
@@ -38,7 +46,8 @@ class Location:
     inliers: int  # corners that agree on the pose
     pairs: I64  # (M, 2) point ids of the map and of the camera
     confident: bool = False  # far more inliers than required
-    beside: int = -1  # corners of the views to the side that agree with a pose found ahead, -1: there are none
+    # other corners that agree, beside for a pose found ahead, ahead for one found beside; -1: not compared
+    others: int = -1
 
     @property
     def found(self) -> bool:
@@ -48,7 +57,7 @@ class Location:
     @property
     def agreeing(self) -> int:
         """Corners ahead and beside."""
-        return self.inliers + max(self.beside, 0)
+        return self.inliers + max(self.others, 0)
 
 
 def not_found(reason: str, inliers: int = 0) -> Location:
@@ -86,17 +95,37 @@ class Relocalizer:
 
     def locate(self, keyframe: Keyframe) -> Location:
         """Find the camera of a keyframe (its pose is ignored) in the map, if need be from another direction."""
-        ahead = self._search(keyframe, False)
+        found_ahead, reason = self._search(keyframe, False)
+        ahead = self._choose(found_ahead, reason)
         if len(keyframe.sides) < MIN_CORNERS or (ahead.found and self._confirmed(ahead)):
             return ahead
-        beside = self._search(keyframe, True)
-        if beside.found:
+        beside = self._choose(*self._search(keyframe, True))
+        if not beside.found:
+            return not_found("ambiguous", ahead.inliers) if ahead.found else ahead
+        if self._is_turned(beside):
             return beside
-        return not_found("ambiguous", ahead.inliers) if ahead.found else ahead
+        beside = self._with_ahead(keyframe, beside)
+        known = self._choose([beside, *found_ahead], "") is beside
+        return beside if known else not_found("ambiguous", beside.inliers)
 
     def _confirmed(self, ahead: Location) -> bool:
         """Whether the shelves beside do not contradict what is ahead: rows of lamps look alike from both directions."""
-        return ahead.confident or ahead.beside < 0 or ahead.beside >= self._config.side_inliers
+        return ahead.confident or ahead.others < 0 or ahead.others >= self._config.side_inliers
+
+    def _row(self, place: Location) -> int:
+        """Of the keyframe that a location was found with."""
+        return int(np.searchsorted(self._map.kf_ids, place.kf_id))
+
+    def _is_turned(self, place: Location) -> bool:
+        """Whether the camera looks another way than the keyframe, so that only views to the side can be compared."""
+        kf_T_cam = se3.inverse(self._map.map_T_kf[self._row(place)]) @ place.map_T_cam
+        return bool(kf_T_cam[2, 2] < TURNED)
+
+    def _with_ahead(self, keyframe: Keyframe, beside: Location) -> Location:
+        """What is ahead says to a pose found by the shelves beside."""
+        row = self._row(beside)
+        ahead = self._verify_near(keyframe, beside.map_T_cam, row, self.cloud(row), False).inliers
+        return dataclasses.replace(beside, others=ahead)
 
     def _with_beside(self, keyframe: Keyframe, row: int, ahead: Location) -> Location:
         """What the shelves beside say to a pose found ahead: rows of lamps look alike one lamp further on, too."""
@@ -107,10 +136,10 @@ class Relocalizer:
             return ahead
         beside = self._verify_near(keyframe, ahead.map_T_cam, row, cloud, True).inliers
         share = (ahead.inliers + beside) / (len(keyframe.corners) + len(keyframe.sides))
-        return dataclasses.replace(ahead, beside=beside, confident=ahead.confident and share >= CONFIDENT_SHARE)
+        return dataclasses.replace(ahead, others=beside, confident=ahead.confident and share >= CONFIDENT_SHARE)
 
-    def _search(self, keyframe: Keyframe, sideways: bool) -> Location:
-        """Find it by its corners, or by those of the views that face the shelves."""
+    def _search(self, keyframe: Keyframe, sideways: bool) -> tuple[list[Location], str]:
+        """Places by its corners, or by those of the views that face the shelves; and why there are none."""
         config = self._side_config if sideways else self._config
         database = self._side_database if sideways else self._database
         view = place_view_of(keyframe, self._rig, config.disparity_sigma_px, sideways)
@@ -127,7 +156,7 @@ class Relocalizer:
             found.append(place if sideways else self._with_beside(keyframe, row, place))
             if found[-1].confident:
                 break
-        return self._choose(found) if found else not_found(reason)
+        return found, reason
 
     def locate_near(self, keyframe: Keyframe, guess: F64) -> Location:
         """As `locate`, but only around a predicted map_T_cam (4, 4)."""
@@ -142,7 +171,7 @@ class Relocalizer:
         verdict = self._verify_near(keyframe, guess, row, self.cloud(row, sideways), sideways)
         if verdict.reason:
             return not_found(verdict.reason, verdict.inliers)
-        return self._choose([self._location(row, verdict, self._near_share, sideways)])
+        return self._choose([self._location(row, verdict, self._near_share, sideways)], "")
 
     def _verify_near(self, keyframe: Keyframe, guess: F64, row: int, cloud: Cloud, sideways: bool) -> Verdict:
         """Match a keyframe with a row's cloud around a predicted map_T_cam (4, 4)."""
@@ -194,8 +223,13 @@ class Relocalizer:
         reason = "" if enough else "too_few_inliers"
         return Location(reason, map_T_cam, verdict.information, kf_id, verdict.inliers, verdict.pairs, confident)
 
-    def _choose(self, found: list[Location]) -> Location:
-        """The location with most agreeing corners, if they suffice and no other place is comparable."""
+    def _choose(self, found: list[Location], reason: str) -> Location:
+        """The location with most agreeing corners, if they suffice and no other place is comparable.
+
+        `reason`: why there is none.
+        """
+        if not found:
+            return not_found(reason)
         best = max(found, key=lambda x: x.agreeing)
         if best.reason:
             return not_found(best.reason, best.inliers)

@@ -351,7 +351,8 @@ def test_visits_that_share_no_points_are_thinned_out_too() -> None:
     assert len(bounded.map.living_keyframes()) < 0.5 * len(poses)
 
 
-def test_of_many_views_seen_again_a_limited_number_is_kept_besides_the_first() -> None:
+def test_of_many_views_seen_again_a_limited_number_is_kept_besides_the_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("stereo_sfm.mapping.mapper.PASSED", 5)
     once = camera_path(12, 0.1, 0.0)
     poses = np.concatenate([once if k % 2 == 0 else once[::-1] for k in range(8)])
     stream = keyframe_stream(pinhole_rig(), poses, points=600, track_length=4)

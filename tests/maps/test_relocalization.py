@@ -14,7 +14,7 @@ from stereo_sfm.mapping.keyframe_poses import KeyframePoses
 from stereo_sfm.maps.extension import Extension
 from stereo_sfm.maps.localizer import Localizer
 from stereo_sfm.maps.relocalization import Relocalizer
-from stereo_sfm.types import F64, U8, Corners
+from stereo_sfm.types import F64, U8, Corners, Keyframe
 from tests.loop.store_sequence import StoreSequence, make_sequence
 from tests.maps.maps import map_of_sequence
 
@@ -90,6 +90,13 @@ def test_a_fifth_of_the_products_exchanged(sequence: StoreSequence, first_pass: 
     assert found >= 0.8 * len(asked)
 
 
+def _half_changed(keyframe: Keyframe) -> Keyframe:
+    """A keyframe that recognises less than half of its corners ahead."""
+    half = np.random.default_rng(keyframe.kf_id).random((len(keyframe.corners), 1)) < 0.55
+    looks = np.where(half, 255 - keyframe.corners.descriptors, keyframe.corners.descriptors)
+    return dataclasses.replace(keyframe, corners=dataclasses.replace(keyframe.corners, descriptors=looks))
+
+
 def test_shelves_beside_contradict_a_view_that_looks_alike(
     sequence: StoreSequence, first_pass: int, vocabulary: voc.Vocabulary
 ) -> None:
@@ -100,14 +107,38 @@ def test_shelves_beside_contradict_a_view_that_looks_alike(
     described = [k for k in range(first_pass + 8, len(keyframes)) if keyframes[k].described]
     other = keyframes[60]  # in the second aisle
     for k in described[::4]:
-        half = np.random.default_rng(k).random((len(keyframes[k].corners), 1)) < 0.55
-        looks = np.where(half, 255 - keyframes[k].corners.descriptors, keyframes[k].corners.descriptors)
-        unsure = dataclasses.replace(keyframes[k], corners=dataclasses.replace(keyframes[k].corners, descriptors=looks))
+        unsure = _half_changed(keyframes[k])
         location = relocalizer.locate(unsure)
         assert location.found and not location.confident
         moved = relocalizer.locate(dataclasses.replace(unsure, sides=other.sides))
         assert not moved.found or np.linalg.norm((moved.map_T_cam - location.map_T_cam)[:3, 3]) > 1.0
         assert relocalizer.locate(dataclasses.replace(unsure, sides=Corners.none())).found
+
+
+def test_what_is_ahead_contradicts_shelves_that_look_alike(
+    sequence: StoreSequence, first_pass: int, vocabulary: voc.Vocabulary
+) -> None:
+    """A place found by the shelves beside, from the same direction, must not have less support than one ahead."""
+    keyframes = [dataclasses.replace(k, sides=k.corners) for k in sequence.keyframes]
+    part = dataclasses.replace(sequence, keyframes=keyframes).first(first_pass)
+    relocalizer = Relocalizer(map_of_sequence(part).snapshot, sequence.rig, vocabulary, LoopConfig())
+    k = next(k for k in range(first_pass + 8, len(keyframes)) if keyframes[k].described)
+    other = keyframes[60].sides  # in the second aisle
+    beside = relocalizer.locate(dataclasses.replace(keyframes[k], corners=Corners.none(), sides=other))
+    unsure = dataclasses.replace(_half_changed(keyframes[k]), sides=Corners.none())
+    ahead = relocalizer.locate(unsure)
+    assert beside.found and ahead.found
+    for times, known in ((1.0, False), (2.0, True)):
+        sides = _part(other, times * ahead.inliers / beside.inliers)
+        assert relocalizer.locate(dataclasses.replace(unsure, corners=Corners.none(), sides=sides)).found
+        location = relocalizer.locate(dataclasses.replace(unsure, sides=sides))
+        assert abs(location.kf_id - beside.kf_id) < 2 if known else location.reason == "ambiguous"
+
+
+def _part(corners: Corners, share: float) -> Corners:
+    """A share of corners, evenly chosen."""
+    rows = np.linspace(0, len(corners) - 1, round(share * len(corners))).astype(int)
+    return Corners(*(getattr(corners, f.name)[rows] for f in dataclasses.fields(corners)))
 
 
 def test_a_share_of_zero_is_allowed(sequence: StoreSequence, first_pass: int, vocabulary: voc.Vocabulary) -> None:
