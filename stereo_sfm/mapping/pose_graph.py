@@ -95,8 +95,8 @@ def optimise(
 
     values = gtsam.Values()
     used = np.unique(np.concatenate([edges.i, edges.j, fixed]))
-    for row in used.tolist():
-        values.insert(row, gtsam.Pose3(se3.orthonormalize(poses[row])))
+    for row, pose in zip(used.tolist(), se3.orthonormalize(poses[used]), strict=True):
+        values.insert(row, gtsam.Pose3(pose))
     plain = _graph(gtsam, edges, fixed, values, robust=False, gravity=gravity)
     if robust == "gnc" and edges.loop.any():
         result, weights = _graduated(gtsam, plain, values, edges)
