@@ -305,11 +305,11 @@ class Mapper:
 
         If they kept their ends alive, a robot that goes round and round would have ever more keyframes.
         """
-        ends = {(x.candidate_kf_id, x.kf_id) for x in self._loops}
-        for loop in [x for x in self._loops if culled_kf_id in (x.candidate_kf_id, x.kf_id)]:
+        ends = {_ends(x) for x in self._loops}
+        for loop in [x for x in self._loops if culled_kf_id in _ends(x)]:
             self._loops.remove(loop)
             carried = self._between_living(loop)
-            pair = carried.candidate_kf_id, carried.kf_id
+            pair = _ends(carried)
             if pair[0] != pair[1] and pair not in ends:
                 ends.add(pair)
                 self._loops.append(carried)
@@ -394,12 +394,14 @@ class Mapper:
         redundant = culling.redundant_keyframe(self.map, row, protected, earlier, self._config)
         if len(earlier):
             self._repeated.append(row)
-        if redundant < 0:
-            redundant = self._one_too_many()
-        if redundant >= 0:
-            seen.append(self._seen_by(redundant))
-            self.map.cull_keyframe(redundant)
-            self._carry_loops(int(self.map.keyframes.kf_id[redundant]))
+        passed = self._one_too_many() if redundant < 0 else -1
+        if (gone := max(redundant, passed)) >= 0:
+            seen.append(self._seen_by(gone))
+            self.map.cull_keyframe(gone)
+            if redundant >= 0:
+                self._carry_loops(int(self.map.keyframes.kf_id[gone]))
+            else:
+                self._loops = [x for x in self._loops if int(self.map.keyframes.kf_id[gone]) not in _ends(x)]
         rows = np.unique(np.concatenate([self._adjusted, self._thin, *seen]))
         weak = culling.weak_points(self.map, self._rig, rows, row, self._config)
         self.map.cull_points(weak)
@@ -410,11 +412,19 @@ class Mapper:
     def _one_too_many(self) -> int:
         """A keyframe of a view of earlier visits that has been passed, if there are too many such; else -1.
 
-        The newest goes, not the earlier ones: they are connected with the whole map, and hold it together.
+        The newest goes, not the earlier ones: they are connected with the whole map, and hold it together. Its loops go
+        with it: they have joined points, and carried on from keyframe to keyframe they would follow the robot.
         """
         self._repeated = [row for row in self._repeated if self.map.keyframes.alive[row]]
         passed = self._repeated[self._config.repeated_keyframes : -PASSED]
-        return passed[0] if passed else -1
+        return next((row for row in passed if not self._joins_submaps(row)), -1)
+
+    def _joins_submaps(self, row: int) -> bool:
+        """Whether a keyframe has the only loop between two submaps."""
+        table, kf_id = self.map.keyframes, int(self.map.keyframes.kf_id[row])
+        submaps = [frozenset(int(table.submap_id[self.map.kf_row(k)]) for k in _ends(x)) for x in self._loops]
+        own = [s for s, x in zip(submaps, self._loops, strict=True) if len(s) == 2 and kf_id in _ends(x)]
+        return any(submaps.count(s) == 1 for s in own)
 
     def _seen_by(self, row: int) -> I64:
         """Point rows that a keyframe observes."""
@@ -426,3 +436,8 @@ class Mapper:
         protected[0] = True
         protected[-RECENT:] = True
         return protected
+
+
+def _ends(loop: LoopResult) -> tuple[int, int]:
+    """Ids of the two keyframes of a loop."""
+    return loop.candidate_kf_id, loop.kf_id
