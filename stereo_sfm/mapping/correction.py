@@ -74,16 +74,16 @@ def apply_loop(
     return Correction(True, fuse_sides(map_, loop, match_sigma_px), bent)
 
 
-def loop_is_known(map_: Map, loop: LoopResult, connected_points: int) -> bool:
-    """Whether the map already agrees with a loop: its two sides share points, and their relative pose is the loop's.
+def loop_is_known(map_: Map, loop: LoopResult) -> bool:
+    """Whether the map already agrees with a loop within its noise, which a pose graph would make it follow."""
+    return _strain(map_.keyframes.map_T_kf, loop_edges(map_, [loop])) <= MAX_STRAIN
 
-    It is as exact as the loop then, and more: a pose graph would make it follow the loop's noise.
-    """
+
+def sides_share_points(map_: Map, loop: LoopResult, connected_points: int) -> bool:
+    """Whether some keyframe that shares points with one end of a loop shares some with the other."""
     a, b = map_.kf_row(loop.candidate_kf_id), map_.kf_row(loop.kf_id)
     around_a, around_b = (map_.neighbours(row, connected_points)[0] for row in (a, b))
-    if not len(np.intersect1d(np.append(around_a, a), around_b)):
-        return False
-    return _strain(map_.keyframes.map_T_kf, loop_edges(map_, [loop])) <= MAX_STRAIN
+    return len(np.intersect1d(np.append(around_a, a), around_b)) > 0
 
 
 def fuse_sides(map_: Map, loop: LoopResult, match_sigma_px: float) -> list[tuple[int, int]]:

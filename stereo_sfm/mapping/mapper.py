@@ -12,8 +12,8 @@ drifted part of the map. In a place that the robot does not leave, the same old 
 Gravity. Keyframes that measured it are held level by it, in local windows, in the whole map and where a loop is closed;
 `down` of an update is its direction in the map.
 
-A loop that the map already contains (an earlier loop closed the same place, its two sides share points) only fuses the
-points that it pairs, so that a robot that passes the same places all day does not repeat the correction.
+A loop that the map agrees with, within the loop's noise, only fuses the points that it pairs, so that a robot that
+passes the same places all day does not repeat the correction.
 
 Time. A window contains the keyframes nearest to the newest and, as fixed ones, those that share most points with them:
 a limited number of each, and with them of points and observations. Of views that are seen again and again a few are
@@ -44,7 +44,7 @@ from stereo_sfm.config import LoopConfig, MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping import culling, window
 from stereo_sfm.mapping.bundle import BundleConfig, BundleResult, bundle_adjust
-from stereo_sfm.mapping.correction import apply_loop, fuse_sides, loop_is_known
+from stereo_sfm.mapping.correction import apply_loop, fuse_sides, loop_is_known, sides_share_points
 from stereo_sfm.mapping.insertion import insert_keyframe
 from stereo_sfm.mapping.level import down_of
 from stereo_sfm.mapping.map import Map, MapSnapshot
@@ -253,7 +253,10 @@ class Mapper:
     def _close(self, loop: LoopResult) -> None:
         """Correct the map for a loop that the pose graph accepts, and start a full bundle adjustment."""
         received, loop = loop, self._between_living(loop)
-        if loop.candidate_kf_id == loop.kf_id or loop_is_known(self.map, loop, self._config.connected_points):
+        same = loop.candidate_kf_id == loop.kf_id
+        if same or loop_is_known(self.map, loop):
+            if not (same or sides_share_points(self.map, loop, self._config.connected_points)):
+                self._loops.append(loop)
             self._fused += fuse_sides(self.map, loop, self._config.match_sigma_px)
             self._bundle_when_grown(GROWTH_AT_KNOWN_LOOP)
             return

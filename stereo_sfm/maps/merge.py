@@ -90,7 +90,7 @@ def close_loop(map_: Map, loop: LoopResult, loops: list[LoopResult], config: Loo
     Returns:
         How many points were fused with another one.
     """
-    if loop_is_known(map_, loop, config.connected_points):
+    if loop_is_known(map_, loop):
         loops.append(loop)
         return len(fuse_sides(map_, loop, mapper.match_sigma_px))
     done = apply_loop(map_, loop, loops, config, mapper.match_sigma_px)

@@ -286,11 +286,11 @@ def test_a_known_loop_only_fuses_points(monkeypatch: pytest.MonkeyPatch) -> None
     mapper, _ = sequence_with_loop(stream)
     mapper.finish([])
     again = true_loop(stream, len(stream.keyframes) - 8, 2)
-    assert loop_is_known(mapper.map, again, CONFIG.connected_points)
+    assert loop_is_known(mapper.map, again)
     monkeypatch.setattr("stereo_sfm.mapping.mapper.apply_loop", lambda *_: pytest.fail("the pose graph ran"))
     assert mapper.finish([again]) is not None
     wrong = dataclasses.replace(again, candidate_T_kf=again.candidate_T_kf @ se3.exp(np.array([0.1, 0, 0, 0, 0, 0])))
-    assert not loop_is_known(mapper.map, wrong, CONFIG.connected_points)
+    assert not loop_is_known(mapper.map, wrong)
 
 
 def test_a_loop_that_contradicts_the_map_is_rejected_and_reported() -> None:
