@@ -170,8 +170,8 @@ class LoopCloser:
         before = self._store.ids[: bisect(self._store.ids, settled)]
         came_back = same_view[0] < max(set(before).difference(same_view), default=-1)
         self._repeated += came_back
-        kept = 1 if came_back and self._repeated > MAX_REPEATED else MAX_SAME_VIEW
-        if len(same_view) > kept:
+        most = 1 if came_back and self._repeated > MAX_REPEATED else MAX_SAME_VIEW
+        if len(same_view) > most:
             self._repeated -= came_back
             self._graph.exclude(same_view[1])
             self._store.remove(same_view[1])

@@ -23,7 +23,7 @@ costs the same after hours in the same aisles.
 Local windows propagate a small error of scale from one to the next that only all keyframes together correct. So a full
 bundle adjustment runs concurrently with mapping after a loop, and whenever the map has grown by a share. It is a job of
 arrays (`pending_job`) whose result (`finish_job`) is applied a fixed number of keyframes later, wherever it was
-computed; without a result by then, the mapper computes it. Keyframes added in between move with the one before them.
+computed; without a result by then, the mapper computes it. Keyframes added in between move with the nearest in it.
 
 The retail paper's mapping (section IV-B) is configuration: association = "previous" (a point is known if the previous
 keyframe saw it, else it is new), window_keyframes = 0 (all connected keyframes move), redundant_share = 2 (no keyframe
@@ -251,7 +251,7 @@ class Mapper:
     # -- loops -------------------------------------------------------------------------------------------------------
 
     def _close(self, loop: LoopResult) -> None:
-        """Correct the map for a loop that the pose graph accepts, and start a full bundle adjustment."""
+        """Correct the map for a loop that the pose graph accepts; a full bundle adjustment follows if that bends it."""
         received, loop = loop, self._between_living(loop)
         same = loop.candidate_kf_id == loop.kf_id
         if same or loop_is_known(self.map, loop):
@@ -358,11 +358,12 @@ class Mapper:
         assert self._job is not None
         job, result = self._job, self._result or run_job(self._job)
         self._job, self._result = None, None
-        after = self.map.keyframes.map_T_kf.copy()
-        newest = after[job.newest].copy()
-        after[job.window.kf_rows] = result.world_T_kf
-        later = np.arange(job.newest + 1, len(after))
-        after[later] = after[job.newest] @ se3.inverse(newest) @ after[later]
+        rows, poses = job.window.kf_rows, self.map.keyframe_poses()  # some of the job may have been culled since
+        later = np.arange(job.newest + 1, len(poses))
+        apart = poses[later, :3, 3][:, None] - poses[rows, :3, 3]
+        nearest, after = np.argmin(np.linalg.norm(apart, axis=2), axis=1), poses.copy()
+        after[rows] = result.world_T_kf
+        after[later] = after[rows[nearest]] @ se3.inverse(poses[rows[nearest]]) @ poses[later]
         before = self.map.keyframes.map_T_kf.copy()
         self.map.move_keyframes(np.arange(len(after)), after)
         self.map.carry_points(before, self.map.keyframes.map_T_kf)
@@ -397,7 +398,7 @@ class Mapper:
         redundant = culling.redundant_keyframe(self.map, row, protected, earlier, self._config)
         if len(earlier):
             self._repeated.append(row)
-        passed = self._one_too_many() if redundant < 0 else -1
+        passed = self._one_too_many() if redundant < 0 and self._config.redundant_share <= 1 else -1
         if (gone := max(redundant, passed)) >= 0:
             seen.append(self._seen_by(gone))
             self.map.cull_keyframe(gone)
