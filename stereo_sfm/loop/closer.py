@@ -38,6 +38,7 @@ CLOUD_KEYFRAMES = 4  # connected keyframes whose points are added to a candidate
 PLACE_RADIUS = 3  # candidates at most so many keyframes apart are one place: only the best of them is verified
 KEPT_NEWEST = 30  # newest keyframes, none of which is removed
 MAX_SAME_VIEW = 5  # keyframes of one view; of more, one is removed
+KNOWN_VIEWS = 2.0  # times as far apart as keyframes of one view: of such keyframes one is as good as the other
 MAX_REPEATED = 300  # keyframes added to views of earlier visits; then one goes for each that comes
 DRIFT_PER_METRE = 0.003  # of the odometry on both sides of a gap
 STRONG = 3.0, 0.4  # times min_inliers, share of inliers: one keyframe joins two submaps if the gap's motion allows it
@@ -166,15 +167,17 @@ class LoopCloser:
         settled = newest - KEPT_NEWEST
         if settled not in self._store:
             return
-        same_view = [k for k in self._graph.same_view(settled) if k <= settled]
         before = self._store.ids[: bisect(self._store.ids, settled)]
-        came_back = same_view[0] < max(set(before).difference(same_view), default=-1)
-        self._repeated += came_back
-        most = 1 if came_back and self._repeated > MAX_REPEATED else MAX_SAME_VIEW
-        if len(same_view) > most:
-            self._repeated -= came_back
-            self._graph.exclude(same_view[1])
-            self._store.remove(same_view[1])
+        known = [k for k in self._graph.same_view(settled, KNOWN_VIEWS) if k <= settled]
+        came_back = known[0] < max(set(before).difference(known), default=-1)
+        same_view = [k for k in self._graph.same_view(settled) if k <= settled]
+        gone = same_view[1] if len(same_view) > MAX_SAME_VIEW else -1
+        if came_back and self._repeated >= MAX_REPEATED:
+            gone = settled
+        if gone >= 0:
+            self._graph.exclude(gone)
+            self._store.remove(gone)
+        self._repeated += came_back and gone < 0
         if (rows := self._graph.forget()) is not None:
             self._fronts.keep(rows)
         if 2 * len(self._store) < len(self._database) - KEPT_NEWEST:

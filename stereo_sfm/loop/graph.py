@@ -142,10 +142,10 @@ class KeyframeGraph:
         known = row_a < len(nodes) and nodes.kf_id[row_a] == a
         return bool(known and nodes.chain[row_a] == nodes.chain[row_b])
 
-    def same_view(self, kf_id: int) -> list[int]:
-        """Keyframes with about the same pose, this one included, oldest first."""
+    def same_view(self, kf_id: int, factor: float = 1.0) -> list[int]:
+        """Keyframes with about the same pose, this one included, oldest first; within `factor` times the distance."""
         nodes, row = self._nodes, self._row(kf_id)
-        rows, _, radians = self._around(nodes.anchored, row, nodes.frame, SAME_METRES)
+        rows, _, radians = self._around(nodes.anchored, row, nodes.frame, factor * SAME_METRES)
         return nodes.kf_id[rows[radians < SAME_RADIANS]].tolist()
 
     def around(self, kf_id: int) -> tuple[I64, F64]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from stereo_sfm.mapping import map_kernels
 from stereo_sfm.mapping.columns import Columns, Spec
+from stereo_sfm.mapping.id_rows import IdRows
 from stereo_sfm.types import I32, I64, Keyframe
 
 
@@ -15,10 +16,19 @@ class _Sightings(Columns):
     """One row for each point of each keyframe; those of a point are a linked list, as in the map."""
 
     kf: I32  # id
-    point: I32  # representative id of the point, -1: removed
+    point: I32  # row of the point, -1: removed
     following: I32  # next older row of the same point, -1: last
 
     SPEC: ClassVar[Spec] = {"kf": (np.int32, (), -1), "point": (np.int32, (), -1), "following": (np.int32, (), -1)}
+
+
+class _Points(Columns):
+    """One row for each point."""
+
+    head: I32  # newest sighting, -1: none
+    merged_into: I32  # row of the same physical point, -1: none
+
+    SPEC: ClassVar[Spec] = {"head": (np.int32, (), -1), "merged_into": (np.int32, (), -1)}
 
 
 class KeyframeStore:
@@ -28,8 +38,8 @@ class KeyframeStore:
         self._keyframes: dict[int, Keyframe] = {}
         self._rows: dict[int, tuple[int, int]] = {}  # keyframe id -> its first sighting, number of them
         self._sightings = _Sightings()
-        self._head: I32 = np.zeros(0, np.int32)  # by point id: newest row
-        self._merged_into: I32 = np.zeros(0, np.int32)  # by point id: another id, -1: none
+        self._points = _Points()
+        self._point_rows = IdRows()
         self.ids: list[int] = []
 
     def __getitem__(self, kf_id: int) -> Keyframe:
@@ -46,27 +56,32 @@ class KeyframeStore:
         """Rows in use, including those of removed keyframes until the next compaction."""
         return len(self._sightings)
 
-    def _points(self, point_ids: I64) -> I64:
-        """(N,) representative ids of points."""
-        self._reserve(int(point_ids.max(initial=-1)) + 1)
-        points = point_ids.copy()
-        map_kernels.follow(points, self._merged_into)
-        return points
+    @property
+    def known_points(self) -> int:
+        """Ids of points that the kept keyframes see, and of others until the next compaction."""
+        return len(self._point_rows)
 
-    def _reserve(self, size: int) -> None:
-        """Allocate point ids below `size`."""
-        if size > len(self._head):
-            more = np.full(max(size, 2 * len(self._head)) - len(self._head), -1, np.int32)
-            self._head, self._merged_into = (np.concatenate([a, more]) for a in (self._head, self._merged_into))
+    def _find(self, point_ids: I64) -> I64:
+        """(N,) row of each point after merges, -1 where it is unknown."""
+        rows = self._point_rows.find(point_ids)
+        map_kernels.follow(rows, self._points.merged_into)
+        return rows
+
+    def _know(self, point_ids: I64) -> I64:
+        """(N,) row of each point after merges; unknown ones are added."""
+        new = np.unique(point_ids[self._point_rows.find(point_ids) < 0])
+        added = self._points.append(len(new))
+        self._point_rows.add(new, np.arange(added.start, added.stop))
+        return self._find(point_ids)
 
     def add(self, keyframe: Keyframe) -> None:
         """Add a keyframe."""
         self._keyframes[keyframe.kf_id] = keyframe
         self.ids.append(keyframe.kf_id)
-        points = np.unique(self._points(keyframe.point_ids))
+        points = np.unique(self._know(np.asarray(keyframe.point_ids)))
         rows = self._sightings.append(len(points), kf=keyframe.kf_id, point=points)
         self._rows[keyframe.kf_id] = rows.start, len(points)
-        map_kernels.link(rows.start, self._head, self._sightings.following, self._sightings.point)
+        map_kernels.link(rows.start, self._points.head, self._sightings.following, self._sightings.point)
 
     def remove(self, kf_id: int) -> None:
         """Remove a keyframe."""
@@ -74,40 +89,55 @@ class KeyframeStore:
         del self._keyframes[kf_id]
         first, count = self._rows.pop(kf_id)
         rows, table = np.arange(first, first + count), self._sightings
-        map_kernels.unlink(rows[table.point[rows] >= 0], self._head, table.following, table.point)
+        map_kernels.unlink(rows[table.point[rows] >= 0], self._points.head, table.following, table.point)
         if len(table) > 2 * sum(count for _, count in self._rows.values()) + 4096:
             self._compact()
 
     def _compact(self) -> None:
-        """Free the rows of removed keyframes."""
+        """Free the rows of removed keyframes, and of points that none of the others sees."""
         table, firsts = self._sightings, np.array([first for first, _ in self._rows.values()], np.int64)
         kept = np.concatenate([np.arange(first, first + count) for first, count in self._rows.values()])
         place = np.full(len(table) + 1, -1, np.int32)  # the last entry is for -1: none
         place[kept] = np.arange(len(kept))
-        self._head[:] = place[self._head]
+        self._points.head[:] = place[self._points.head]
         table.keep(kept)
         table.following[:] = place[table.following]
         counts = [count for _, count in self._rows.values()]
         self._rows = dict(zip(self._rows, zip(place[firsts].tolist(), counts, strict=True), strict=True))
+        self._forget_points()
+
+    def _forget_points(self) -> None:
+        """Points stay known by the ids that the keyframes have for them; the newest ones are still followed."""
+        known, table, points = self._point_rows, self._sightings, self._points
+        known.keep(np.isin(known.ids, np.concatenate([k.point_ids for k in self._keyframes.values()])))
+        known.rows[:] = self._find(known.ids)
+        kept = np.unique(known.rows).astype(np.int64)
+        place = np.full(len(points) + 1, -1, np.int32)  # the last entry is for -1: none
+        place[kept] = np.arange(len(kept))
+        known.rows[:] = place[known.rows]
+        table.point[:] = place[table.point]
+        points.keep(kept)
 
     def merge(self, pairs: I64) -> None:
         """(M, 2) point ids: the second is the same physical point as the first."""
         table = self._sightings
         for k in range(len(pairs)):
-            root, merged_root = self._points(pairs[k]).tolist()
+            root, merged_root = self._know(pairs[k]).tolist()
             if root == merged_root:
                 continue
+            points = self._points
             both = np.empty(len(self.ids), np.int64)  # a keyframe with both ids counts once
-            count = map_kernels.seen_together(merged_root, root, self._head, table.following, table.kf, both)
-            map_kernels.unlink(both[:count], self._head, table.following, table.point)
-            map_kernels.hand_over(merged_root, root, self._head, table.following, table.point)
-            self._head[merged_root], self._merged_into[merged_root] = -1, root
+            count = map_kernels.seen_together(merged_root, root, points.head, table.following, table.kf, both)
+            map_kernels.unlink(both[:count], points.head, table.following, table.point)
+            map_kernels.hand_over(merged_root, root, points.head, table.following, table.point)
+            points.head[merged_root], points.merged_into[merged_root] = -1, root
 
     def _shared(self, point_ids: I64) -> tuple[I64, I64]:
         """(K,) ids of the keyframes that see some of these points, ascending, and (K,) how many."""
-        points, table = np.unique(self._points(point_ids)), self._sightings
+        points, table = np.unique(self._find(point_ids)), self._sightings
+        points = points[points >= 0]
         counts = np.zeros(max(self.ids, default=-1) + 1, np.int64)
-        map_kernels.count_by_keyframe(points, self._head, table.following, table.kf, counts)
+        map_kernels.count_by_keyframe(points, self._points.head, table.following, table.kf, counts)
         seeing = np.flatnonzero(counts)
         return seeing, counts[seeing]
 

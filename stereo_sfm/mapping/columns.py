@@ -35,7 +35,7 @@ class Columns:
         first, last = self._count, self._count + count
         for name, data in self._data.items():
             if last > len(data):
-                grown = np.empty((max(last, 2 * len(data)), *data.shape[1:]), data.dtype)
+                grown = np.empty((max(last, len(data) * 3 // 2), *data.shape[1:]), data.dtype)
                 grown[:first] = data[:first]
                 self._data[name] = data = grown
             data[first:last] = values.pop(name) if name in values else self.SPEC[name][2]

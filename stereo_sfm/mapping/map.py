@@ -17,6 +17,7 @@ import numpy as np
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping import map_kernels
+from stereo_sfm.mapping.id_rows import IdRows
 from stereo_sfm.mapping.tables import KeyframeTable, ObservationTable, PointTable
 from stereo_sfm.types import F32, F64, I64, U8, Bool, Corners, Keyframe
 
@@ -108,7 +109,7 @@ class Map:
         self.observations = ObservationTable(4096)
         self.corners: dict[int, tuple[Corners, Corners]] = {}  # of living keyframes, by row: `corners`, `sides`
         self._kf_rows: dict[int, int] = {}
-        self._pt_rows = np.full(1024, -1, np.int32)  # by id
+        self._pt_rows = IdRows()
         self._changed_kf: set[int] = set()
         self._culled_kf: list[int] = []
         self._changed_pt: list[I64] = []
@@ -128,8 +129,7 @@ class Map:
 
     def point_rows(self, pt_ids: I64) -> I64:
         """(N,) row of each point id after fusions; -1 for an unknown id. Rows of culled points are not alive."""
-        known = (pt_ids >= 0) & (pt_ids < len(self._pt_rows))
-        rows = np.where(known, self._pt_rows[np.where(known, pt_ids, 0)], -1).astype(np.int64)
+        rows = self._pt_rows.find(pt_ids)
         map_kernels.follow(rows, self.points.fused_into)
         return rows
 
@@ -220,12 +220,7 @@ class Map:
             raise StereoSfmError("a point id is in the map already: ids are never used twice")
         rows = np.arange(len(self.points), len(self.points) + len(pt_ids))
         self.points.append(len(pt_ids), pt_id=pt_ids, xyz=xyz, anchor=anchor, last_seen=anchor, sigma=sigma)
-        highest = int(pt_ids.max(initial=-1))
-        if highest >= len(self._pt_rows):
-            grown = np.full(max(highest + 1, 2 * len(self._pt_rows)), -1, np.int32)
-            grown[: len(self._pt_rows)] = self._pt_rows
-            self._pt_rows = grown
-        self._pt_rows[pt_ids] = rows
+        self._pt_rows.add(pt_ids, rows)
         self._changed_pt.append(rows)
         return rows
 
@@ -392,10 +387,14 @@ class Map:
         seen = int(self.points.obs_count[living].sum())
         return len(living) > max(2 * int(living.sum()), 1024) or len(self.observations) > max(2 * seen, 4096)
 
-    def compact(self) -> I64:
+    def compact(self, followed: I64 | None = None) -> I64:
         """Free the rows of removed points and observations; the order of the others stays.
 
-        The ids of culled points, which must stay known, share one row from then on.
+        The ids of culled points that may come again share one row from then on.
+
+        Args:
+            followed: (N,) ids of points that the tracker follows: other culled ones are forgotten. None: they all may
+                come again.
 
         Returns:
             (P,) the new row of each point row.
@@ -421,8 +420,10 @@ class Map:
         points.fused_into[:] = -1
         points.head[:] = np.where(points.alive, obs_row[points.head], -1)
         points.descriptor_obs[:] = np.where(points.alive, obs_row[points.descriptor_obs], -1)
-        known = self._pt_rows >= 0
-        self._pt_rows[known] = pt_row[self._pt_rows[known]]
+        known = self._pt_rows
+        known.rows[:] = pt_row[known.rows]
+        if followed is not None:
+            known.keep(points.alive[known.rows] | np.isin(known.ids, followed))
         self._changed_pt = [pt_row[rows] for rows in self._changed_pt]
         return pt_row
 

@@ -149,7 +149,7 @@ class Mapper:
         self._bundle_when_grown(self._config.full_ba_growth)
         update = self._update(keyframe.kf_id)
         if self._job is None and self.map.mostly_removed:
-            self._thin = np.unique(self.map.compact()[self._thin])
+            self._thin = np.unique(self.map.compact(keyframe.point_ids)[self._thin])
         return update
 
     def finish(self, loops: Sequence[LoopResult]) -> MapUpdate | None:

@@ -154,6 +154,17 @@ def test_rows_are_freed_when_most_are_removed() -> None:
     assert m.nbytes < before / 2
 
 
+def test_ids_of_culled_points_are_forgotten_unless_they_are_still_followed() -> None:
+    m = Map()
+    insert(m, keyframe(0, np.arange(9)))
+    m.cull_points(np.array([2, 5]))
+    m.compact(np.array([1, 5]))
+    assert m.point_rows(np.array([2])).tolist() == [-1]
+    assert m.point_rows(np.array([5]))[0] >= 0 and not m.points.alive[m.point_rows(np.array([5]))].any()
+    living = np.array([0, 1, 3, 4, 6, 7, 8])
+    assert m.points.pt_id[m.point_rows(living)].tolist() == living.tolist()
+
+
 def test_ids_are_never_used_twice() -> None:
     m = Map()
     insert(m, keyframe(0, np.arange(5)))
