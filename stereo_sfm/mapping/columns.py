@@ -10,6 +10,9 @@ from numpy.typing import DTypeLike, NDArray
 Spec = dict[str, tuple[DTypeLike, tuple[int, ...], Any]]
 
 
+SPARE = 4  # one spare row for so many in use: rows are copied four times on the way, and little memory is unused
+
+
 class Columns:
     """Rows in arrays. A subclass names its columns in SPEC, (dtype, shape of one value, value of a new row).
 
@@ -35,7 +38,7 @@ class Columns:
         first, last = self._count, self._count + count
         for name, data in self._data.items():
             if last > len(data):
-                grown = np.empty((max(last, len(data) * 3 // 2), *data.shape[1:]), data.dtype)
+                grown = np.empty((max(last, first + first // SPARE, 64), *data.shape[1:]), data.dtype)
                 grown[:first] = data[:first]
                 self._data[name] = data = grown
             data[first:last] = values.pop(name) if name in values else self.SPEC[name][2]
@@ -46,9 +49,9 @@ class Columns:
         return slice(first, last)
 
     def keep(self, rows: NDArray[np.int64]) -> None:
-        """Only these rows stay, in this order, in arrays with room for half as many more."""
+        """Only these rows stay, in this order."""
         for name, data in self._data.items():
-            kept = np.empty((max(len(rows) * 3 // 2, 64), *data.shape[1:]), data.dtype)
+            kept = np.empty((max(len(rows) + len(rows) // SPARE, 64), *data.shape[1:]), data.dtype)
             kept[: len(rows)] = data[rows]
             self._data[name] = kept
         self._count = len(rows)

@@ -381,11 +381,11 @@ class Map:
     # -- memory ------------------------------------------------------------------------------------------------------
 
     @property
-    def mostly_removed(self) -> bool:
-        """Whether more than half of the rows of points or observations are unused."""
+    def much_removed(self) -> bool:
+        """Whether a fifth of the rows of points or observations, and not only a few, are unused."""
         living = self.points.alive
         seen = int(self.points.obs_count[living].sum())
-        return len(living) > max(2 * int(living.sum()), 1024) or len(self.observations) > max(2 * seen, 4096)
+        return len(living) > 1.25 * int(living.sum()) + 512 or len(self.observations) > 1.25 * seen + 4096
 
     def compact(self, followed: I64 | None = None) -> I64:
         """Free the rows of removed points and observations; the order of the others stays.

@@ -148,7 +148,7 @@ class Mapper:
             self._cull(row)
         self._bundle_when_grown(self._config.full_ba_growth)
         update = self._update(keyframe.kf_id)
-        if self._job is None and self.map.mostly_removed:
+        if self._job is None and self.map.much_removed:
             self._thin = np.unique(self.map.compact(keyframe.point_ids)[self._thin])
         return update
 

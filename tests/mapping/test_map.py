@@ -147,10 +147,10 @@ def test_rows_are_freed_when_most_are_removed() -> None:
     for k in range(40):
         insert(m, keyframe(k, np.arange(200 * k, 200 * k + 200)))
         m.cull_points(m.point_rows(np.arange(200 * k, 200 * k + 150)))
-    assert m.mostly_removed
+    assert m.much_removed
     before = m.nbytes
     m.compact()
-    assert not m.mostly_removed
+    assert not m.much_removed
     assert m.nbytes < before / 2
 
 

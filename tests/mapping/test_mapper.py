@@ -168,7 +168,7 @@ def test_same_keyframes_same_bits() -> None:
 def test_compaction_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = place(30)
     plain = run(stream)[1]
-    monkeypatch.setattr(Map, "mostly_removed", True)
+    monkeypatch.setattr(Map, "much_removed", True)
     compacted, updates = run(stream)
     assert (~compacted.map.points.alive).sum() == 1  # the row that stands for all culled points
     for first, second in zip(plain, updates, strict=True):
