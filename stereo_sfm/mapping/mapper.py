@@ -279,6 +279,7 @@ class Mapper:
             self._start_full_bundle()
 
     def _start_full_bundle(self, config: BundleConfig | None = None) -> None:
+        self._cull_loose()
         part = window.whole_map(self.map)
         config = config or window.bundle_config(self._config)
         self._job = Job(self._rig, config, part, len(self.map.keyframes) - 1)
@@ -412,6 +413,17 @@ class Mapper:
         self._culled.append(weak)
         points = self.map.points
         self._thin = rows[points.alive[rows] & (points.obs_count[rows] < self._config.min_observations)]
+
+    def _cull_loose(self) -> None:
+        """Cull the keyframes of earlier times that hardly anything holds."""
+        if self._config.redundant_share > 1:
+            return
+        settled = np.arange(len(self.map.keyframes)) < len(self.map.keyframes) - PASSED
+        self._repeated = [row for row in self._repeated if self.map.keyframes.alive[row]]
+        for row in culling.loose_keyframes(self.map, settled, np.array(self._repeated, int), self._config).tolist():
+            self._thin = np.union1d(self._thin, self._seen_by(row))
+            self.map.cull_keyframe(row)
+            self._carry_loops(int(self.map.keyframes.kf_id[row]))
 
     def _one_too_many(self) -> int:
         """A keyframe of a view of earlier visits that has been passed, if there are too many such; else -1.

@@ -361,3 +361,20 @@ def test_of_many_views_seen_again_a_limited_number_is_kept_besides_the_first(mon
     assert len(every.map.living_keyframes()) > 0.7 * len(poses)
     assert len(few.map.living_keyframes()) < 0.5 * len(poses)
     assert error(few.map.keyframes.map_T_kf, stream.world_T_kf) < 0.02
+
+
+def test_a_keyframe_that_lost_its_points_is_not_adjusted_but_goes() -> None:
+    """A few wrong points would pull it metres away; its pose stays as it was beside its neighbours."""
+    stream = keyframe_stream(pinhole_rig(), camera_path(50, 0.1, 0.0), points=600)
+    mapper, _ = run(stream, dataclasses.replace(CONFIG, full_ba_growth=np.inf, final_iterations=0, redundant_share=1.0))
+    map_ = mapper.map
+    row = int(map_.living_keyframes()[8])
+    seen = map_.observations_of_keyframe(row)
+    pose, left = map_.keyframes.map_T_kf[row].copy(), seen[:5]
+    map_.remove_observations(seen[5:])
+    map_.move_points(map_.observations.pt[left].astype(np.int64), map_.points.xyz[map_.observations.pt[left]] + 0.5)
+    living = len(map_.living_keyframes())
+    mapper._start_full_bundle()
+    mapper.finish([])
+    assert not map_.keyframes.alive[row] and len(map_.living_keyframes()) == living - 1
+    assert np.linalg.norm((map_.keyframe_poses()[row] - pose)[:3, 3]) < 0.01
