@@ -37,6 +37,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.floor_plan import make_floor_plan
 from stereo_sfm.mapping.mapper import Mapper
 from stereo_sfm.maps.saved_map import SavedMap
+from stereo_sfm.pipeline.allocator import return_large_blocks
 from stereo_sfm.pipeline.inline import InlineRun
 from stereo_sfm.types import StereoImage
 
@@ -123,6 +124,7 @@ class RenderedDrive(BaseSource):
 
 def growth(spec: str, length: float, stretch: float) -> bool:
     """One long run; whether time and memory stay as flat as required."""
+    return_large_blocks()  # as the processes of a pipeline do
     process, rows = psutil.Process(), list[tuple[float, float, float]]()
     with open_source(spec) as rendered, tempfile.TemporaryFile() as file:
         assert isinstance(rendered, SimSource)
