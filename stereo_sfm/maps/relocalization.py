@@ -83,7 +83,8 @@ class Relocalizer:
         self._side_config = dataclasses.replace(side, min_inliers=config.side_inliers // 2)
         shape = (len(snapshot.kf_ids), len(snapshot.pt_ids))
         ones = np.ones(len(snapshot.obs_kf), np.int32)
-        self._sees = scipy.sparse.csr_array((ones, (snapshot.obs_kf, snapshot.obs_pt)), shape=shape)
+        self._seen = scipy.sparse.csr_array((ones, (snapshot.obs_kf, snapshot.obs_pt)), shape=shape)
+        self._sees = self._seen.tocsc()
         self._views = np.maximum(np.bincount(snapshot.obs_pt, minlength=shape[1]), 1)
         self._database, self._side_database = PlaceDatabase(len(vocabulary)), PlaceDatabase(len(vocabulary))
         self._fronts = Fronts(rig.left)
@@ -181,7 +182,7 @@ class Relocalizer:
 
     def cloud(self, row: int, sideways: bool = False) -> Cloud:
         """The points of a keyframe row and its neighbours, in its camera frame."""
-        shared = (self._sees @ self._sees[[row]].T).toarray()[:, 0]
+        shared = self._sees[:, self._seen.indices[self._seen.indptr[row] : self._seen.indptr[row + 1]]].sum(axis=1)
         shared[row] = shared.max() + 1
         shared[np.setdiff1d(np.arange(len(shared)), np.append(self._described, row))] = 0
         order = np.lexsort((np.arange(len(shared)), -shared))[: self._config.relocalize_keyframes]
