@@ -7,8 +7,9 @@
 Parts: `map` puts the sessions of `sim:market` into one map (`map update`) and prints ATE after alignment (keyframes of
 all sessions together, also as a share of the metres driven), size, and times; then single images of a further session,
 driven a bit aside, are asked in it. `growth` drives on from session to session in one run and prints, for each stretch,
-processor time a frame (without rendering), resident memory, keyframes and points; it fails where the last stretch
-needs more than 1.2 times the time of the one around 600 m, or 1.5 times the memory. With `--distinct` so many metres
+processor time a frame (without rendering; also in units of ORB on both images, for a busy machine slows both),
+resident memory, keyframes and points; it fails where the last stretch needs more than 1.2 times the ORBs of the one
+around 600 m, or 1.5 times the memory. With `--distinct` so many metres
 are rendered into a file and driven there and back again and again, so that all after them is known.
 """
 
@@ -25,6 +26,7 @@ from _sequences import one_thread
 
 one_thread()
 
+import cv2
 import numpy as np
 import psutil
 from both_directions import aligned, drive
@@ -42,6 +44,7 @@ from stereo_sfm.pipeline.inline import InlineRun
 from stereo_sfm.types import StereoImage
 
 ATE_SHARE, GOOD_SHARE, QUERY_S = 0.0005, 0.96, 0.3  # required of the map of three sessions
+ORB_EVERY = 100  # frames
 FROM_M, TIME_RATIO, MEMORY_RATIO = 600.0, 1.2, 1.5  # required of the growth
 
 
@@ -122,29 +125,42 @@ class RenderedDrive(BaseSource):
             yield StereoImage(k, 1_000_000_000 + k * self._interval_ns, left, right)
 
 
+def orb_seconds(orb: cv2.ORB, image: StereoImage) -> float:
+    """Processor time of ORB on both images."""
+    assert image.right is not None
+    start = time.process_time()
+    for eye in (image.left, image.right):
+        orb.detectAndCompute(eye, None)
+    return time.process_time() - start
+
+
 def growth(spec: str, length: float, stretch: float) -> bool:
     """One long run; whether time and memory stay as flat as required."""
     return_large_blocks()  # as the processes of a pipeline do
-    process, rows = psutil.Process(), list[tuple[float, float, float]]()
+    process, orb = psutil.Process(), cv2.ORB.create(1000)
+    rows = list[tuple[float, float, float]]()  # metres, ORBs a frame, MiB
     with open_source(spec) as rendered, tempfile.TemporaryFile() as file:
         assert isinstance(rendered, SimSource)
         source = RenderedDrive(rendered, length, file)
         driven = source.driven
         run = InlineRun(source, Config(), [], None)
-        begun, spent, until = 0, 0.0, stretch
+        begun, spent, orbs, until = 0, 0.0, list[float](), stretch
         for k, image in enumerate(source):
             start = time.process_time()
             run.step(image)
             spent += time.process_time() - start
+            if k % ORB_EVERY == 0:
+                orbs.append(orb_seconds(orb, image))
             if driven[k] < until and k + 1 < len(driven):
                 continue
             memory = process.memory_info().rss / 2**20
-            rows.append((float(driven[k]), 1e3 * spent / (k + 1 - begun), memory))
-            begun, spent, until = k + 1, 0.0, until + stretch
+            frame_s = spent / (k + 1 - begun)
+            rows.append((float(driven[k]), frame_s / float(np.median(orbs)), memory))
+            begun, spent, orbs, until = k + 1, 0.0, [], until + stretch
             mapper = run.map_stage.mapper
             assert isinstance(mapper, Mapper)
             print(
-                f"{driven[k]:7.0f} m: {rows[-1][1]:6.1f} ms a frame, {memory:6.0f} MiB,"
+                f"{driven[k]:7.0f} m: {1e3 * frame_s:6.1f} ms a frame, {rows[-1][1]:.2f} x ORB, {memory:6.0f} MiB,"
                 f" {len(mapper.map.living_keyframes())} keyframes, {len(mapper.map.living_points())} points",
                 flush=True,
             )
