@@ -86,3 +86,8 @@ def optimize(graph: Graph, values: Any, tight: bool = True) -> Any:
 def poses(values: Any, keyframes: int) -> F64:
     """(K, 4, 4)"""
     return np.array([values.atPose3(gtsam.symbol("x", k)).matrix() for k in range(keyframes)])
+
+
+def points(values: Any, count: int) -> F64:
+    """(P, 3)"""
+    return np.array([values.atPoint3(gtsam.symbol("l", p)) for p in range(count)])
