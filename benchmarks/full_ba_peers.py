@@ -2,12 +2,12 @@
 
     python benchmarks/full_ba_peers.py MAP... [--without gtsam]
 
-The maps are of fisheye pairs, of different sizes for the growth with the map. Every keyframe and point is disturbed (10 mm
-and 0.2°, 30 mm), then all systems minimise the same cost: Huber's of 1 px in each image, the first keyframe fixed, until a
-step decreases it by less than 1e-5. Printed: processor time of the minimisation (without building the graph) in all and
-for a keyframe, the cost that each ends with, evaluated by the same function, and how far its keyframes are from ours.
-GTSAM runs Levenberg-Marquardt, Ceres (by pycolmap) its sparse Schur solver. The exit code is 1 where another system is
-faster, or finds a cost lower by more than 0.1 %.
+The maps are of fisheye pairs, of different sizes for the growth with the map. Every keyframe and point is disturbed
+(10 mm and 0.2°, 30 mm), then all systems minimise the same cost: Huber's of 1 px in each image, the first keyframe
+fixed, until a step decreases it by less than 1e-5. Printed: processor time of the minimisation (without building the
+graph) in all and for a keyframe, the cost that each ends with, evaluated by the same function, and how far its
+keyframes are from ours. GTSAM runs Levenberg-Marquardt, Ceres (by pycolmap) its sparse Schur solver. The exit code is 1
+where another system is faster, or finds a cost lower by more than 0.1 %.
 """
 
 from __future__ import annotations
@@ -138,8 +138,8 @@ def main() -> int:
             off = np.sqrt(((poses - reference)[:, :3, 3] ** 2).sum(1).mean())
             rows.append((seconds, cost(saved, bundle, poses, points)))
             print(
-                f"  {name:>5}: {seconds:7.1f} s, {1e3 * seconds / len(poses):6.1f} ms a keyframe, cost {rows[-1][1]:.1f},"
-                f" {1e3 * off:.2f} mm from ours",
+                f"  {name:>5}: {seconds:7.1f} s, {1e3 * seconds / len(poses):6.1f} ms a keyframe,"
+                f" cost {rows[-1][1]:.1f}, {1e3 * off:.2f} mm from ours",
                 flush=True,
             )
         passed &= all(rows[0][0] <= seconds and rows[0][1] <= 1.001 * value for seconds, value in rows)
