@@ -349,6 +349,7 @@ class LoopResult(Message):
     rejected: tuple[tuple[int, float, str], ...] = ()  # every rejected candidate: (kf_id, score, reason)
     # (S, 3) corners of side views that the loop matched: number of the corner, keyframe, row in its `sides`
     sightings: I64 = field(default_factory=lambda: np.zeros((0, 3), np.int64), metadata=shape(-1, 3))
+    forgotten_kf_ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))  # (F,) that no later result names
 
 
 @dataclass(frozen=True)

@@ -124,9 +124,9 @@ class LoopCloser:
         bags = self._enter(keyframe)
         result = self._search(keyframe, bags) if keyframe.described else _no_loop(keyframe.kf_id, "not_described")
         self._keep(keyframe, bags)
-        self._cull(keyframe.kf_id)
+        gone = self._cull(keyframe.kf_id)
         self._grow(keyframe)
-        return result
+        return dataclasses.replace(result, forgotten_kf_ids=np.array(gone, np.int64)) if gone else result
 
     def _search(self, keyframe: Keyframe, bags: tuple[voc.Bag, voc.Bag]) -> LoopResult:
         """Look for a loop with a keyframe that has corners."""
@@ -162,11 +162,15 @@ class LoopCloser:
         self._side_database.add(keyframe.kf_id, bags[1])
         self._store.add(keyframe)
 
-    def _cull(self, newest: int) -> None:
-        """Of many keyframes of one view keep the first and the last few, which bounds memory in a known place."""
+    def _cull(self, newest: int) -> list[int]:
+        """Of many keyframes of one view keep the first and the last few, which bounds memory in a known place.
+
+        Returns:
+            Keyframes that are no candidates any more, or never were.
+        """
         settled = newest - KEPT_NEWEST
         if settled not in self._store:
-            return
+            return [settled] if settled >= 0 else []
         before = self._store.ids[: bisect(self._store.ids, settled)]
         known = [k for k in self._graph.same_view(settled, KNOWN_VIEWS) if k <= settled]
         came_back = known[0] < max(set(before).difference(known), default=-1)
@@ -185,6 +189,7 @@ class LoopCloser:
             kept = np.flatnonzero(np.isin(self._database.kf_ids, self._store.ids))
             self._database.keep(kept)
             self._side_database.keep(kept)
+        return [gone] if gone >= 0 else []
 
     def _candidates(self, keyframe: Keyframe, bag: voc.Bag, side_bag: voc.Bag) -> tuple[list[Candidate], str]:
         """Places to verify, best first, those across directions at the end, and the reason when there are none."""

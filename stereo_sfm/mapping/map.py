@@ -1,9 +1,9 @@
 """The map: columns for keyframes and points and one observation table. Owned by the mapper alone.
 
 Ids are never reused: a culled keyframe or point keeps its row and loses `alive`, a fused point keeps its id as an alias
-of the point that replaced it. Keyframe rows are permanent; point and observation rows stay until `compact` frees those
-of removed ones, so that a day in the same aisles fits into memory. The observations of a keyframe are
-one run of rows; those of a point a linked list through the table, so that the cost of inserting a keyframe
+of the point that replaced it. Rows of removed points and observations stay until `compact` frees them, those of culled
+keyframes until loops name them no more (`forget`) and `free_keyframes` is called, so that a day in the same aisles fits
+into memory. The observations of a keyframe are one run of rows; those of a point a linked list through the table, so that the cost of inserting a keyframe
 depends on its observations, not on the size of the map. Points that a loop made of corners belong to no track: the
 tracker never hears of them.
 """
@@ -20,6 +20,9 @@ from stereo_sfm.mapping import map_kernels
 from stereo_sfm.mapping.id_rows import IdRows
 from stereo_sfm.mapping.tables import KeyframeTable, ObservationTable, PointTable
 from stereo_sfm.types import F32, F64, I64, U8, Bool, Corners, Keyframe
+
+
+FEW_KEYFRAMES = 256  # forgotten ones whose rows are not worth to be freed
 
 
 @dataclass(frozen=True, eq=False)
@@ -379,6 +382,38 @@ class Map:
         return map_kernels.seen_together(first, second, points.head, table.following, table.kf, both) > 0
 
     # -- memory ------------------------------------------------------------------------------------------------------
+
+    def forget(self, kf_ids: I64) -> None:
+        """No loop will name these keyframes any more; unknown ones are passed over."""
+        self.keyframes.named[[self._kf_rows[k] for k in kf_ids.tolist() if k in self._kf_rows]] = False
+
+    @property
+    def many_forgotten(self) -> bool:
+        """Whether a fifth of the rows of keyframes, and not only a few, are of culled ones that nothing names."""
+        table = self.keyframes
+        return int((table.alive | table.named).sum()) < 0.8 * len(table) - FEW_KEYFRAMES
+
+    def free_keyframes(self) -> I64:
+        """Free the rows of culled keyframes that nothing names; the order of the others stays.
+
+        Only between updates: see `take_delta`.
+
+        Returns:
+            (K,) the new row of each keyframe row, -1 of those that were freed.
+        """
+        table, points = self.keyframes, self.points
+        stay = table.alive | table.named
+        before = np.cumsum(stay) - 1  # (K,) the row itself, or the one before it that stays
+        now = np.where(stay, before, -1)
+        points.anchor[:] = now[self._anchors(np.arange(len(points)))]
+        points.last_seen[:] = np.where(points.last_seen >= 0, before[points.last_seen], -1)
+        self.observations.kf[:] = now[self.observations.kf]
+        for column in (table.previous, table.carrier):
+            column[:] = np.where(column >= 0, now[column], -1)
+        table.keep(np.flatnonzero(stay))
+        self._kf_rows = {kf_id: row for row, kf_id in enumerate(table.kf_id.tolist())}
+        self.corners = {int(now[row]): corners for row, corners in self.corners.items()}
+        return now
 
     @property
     def much_removed(self) -> bool:

@@ -17,8 +17,9 @@ passes the same places all day does not repeat the correction.
 
 Time. A window contains the keyframes nearest to the newest and, as fixed ones, those that share most points with them:
 a limited number of each, and with them of points and observations. Of views that are seen again and again a few are
-kept (`culling`), and of all views together a limited number; more are removed when the robot has passed. So a keyframe
-costs the same after hours in the same aisles.
+kept (`culling`), and of all views together a limited number; more are removed when the robot has passed. What was
+removed leaves nothing behind once the loop closer names it no more. So a keyframe costs the same after hours in the
+same aisles.
 
 Local windows propagate a small error of scale from one to the next that only all keyframes together correct. So a full
 bundle adjustment runs concurrently with mapping after a loop, and whenever the map has grown by a share. It is a job of
@@ -129,12 +130,17 @@ class Mapper:
         self._version += 1
         if not self._config.enabled:
             return self._without_mapping(keyframe)
+        if self._job is None and self.map.many_forgotten:
+            now = self.map.free_keyframes()
+            self._repeated = [row for row in now[self._repeated].tolist() if row >= 0]
         if self.job_due:
             with self._spans.span("full_ba"):
                 self._apply_job()
         if loop is not None and loop.candidate_kf_id >= 0:
             with self._spans.span("close_loop"):
                 self._close(loop)
+        if loop is not None:
+            self.map.forget(loop.forgotten_kf_ids)
         with self._spans.span("associate"):
             row = self._insert(keyframe)
         if self._calibration is not None:

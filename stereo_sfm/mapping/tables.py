@@ -26,6 +26,7 @@ class KeyframeTable(Columns):
     down: F64  # (K, 3) gravity's direction in the camera, zero: unknown
     down_sigma: F64  # radians, 0: unknown
     alive: Bool
+    named: Bool  # whether loops may still name it
 
     SPEC: ClassVar[Spec] = {
         "kf_id": (np.int64, (), -1),
@@ -41,6 +42,7 @@ class KeyframeTable(Columns):
         "down": (np.float64, (3,), 0.0),
         "down_sigma": (np.float64, (), 0.0),
         "alive": (np.bool_, (), True),
+        "named": (np.bool_, (), True),
     }
 
 

@@ -31,24 +31,27 @@ class Extension(Mapper):
         super().__init__(config, rig, spans, loop_config)
         self._localizer = localizer
         self._saved_T_session: F64 | None = None
-        self._found: tuple[int, Location] | None = None  # the first relocalized keyframe, and its location
+        self._found: Location | None = None  # of the first relocalized keyframe
+        self._found_kf: tuple[int, F64] = -1, np.eye(4)  # a living keyframe, and the relocalized one's pose in it
 
     def step(self, keyframe: Keyframe, loop: LoopResult | None = None) -> MapUpdate:
         """As the mapper's, in the saved map's frame once it is known."""
         update = super().step(keyframe, loop)
+        self._follow_found()
         if self._saved_T_session is not None:
             return self._in_saved_map(update, self._saved_T_session)
         place = self._localizer.step(keyframe)
         if not self._localizer.found:
             return update
         assert self._localizer.last is not None
-        self._found = keyframe.kf_id, self._localizer.last
+        self._found, self._found_kf = self._localizer.last, (keyframe.kf_id, np.eye(4))
         self._saved_T_session = se3.orthonormalize(place.map_T_odom @ se3.inverse(update.map_T_odom))
         return self._in_saved_map(self._with_everything(update), self._saved_T_session)
 
     def finish(self, loops: Sequence[LoopResult]) -> MapUpdate | None:
         """As the mapper's."""
         update = super().finish(loops)
+        self._follow_found()
         if update is None or self._saved_T_session is None:
             return update
         return self._in_saved_map(update, self._saved_T_session)
@@ -65,23 +68,27 @@ class Extension(Mapper):
         """
         if self._found is None:
             return None
-        kf_id, where = self._found
-        table, row = self.map.keyframes, self.map.kf_row(kf_id)
-        alive = bool(table.alive[row])
-        living = kf_id if alive else int(table.kf_id[table.carrier[row]])
-        kf_T_living = np.eye(4) if alive else se3.inverse(table.carrier_T_kf[row])
+        where, (living, living_T_kf) = self._found, self._found_kf
         saved = self._localizer.saved
         candidate = saved.map_T_kf[int(np.searchsorted(saved.kf_ids, where.kf_id))]
         return LoopResult(
             kf_id=living,
             candidate_kf_id=where.kf_id,
-            candidate_T_kf=se3.inverse(candidate) @ where.map_T_cam @ kf_T_living,
+            candidate_T_kf=se3.inverse(candidate) @ where.map_T_cam @ se3.inverse(living_T_kf),
             information=where.information,
             matches=where.pairs,
             inliers=where.inliers,
             score=0.0,
             reason="",
         )
+
+    def _follow_found(self) -> None:
+        """Where the relocalized keyframe was culled, the keyframe that carries it stands for it."""
+        kf_id, living_T_kf = self._found_kf
+        if kf_id < 0 or self.map.keyframes.alive[row := self.map.kf_row(kf_id)]:
+            return
+        table = self.map.keyframes
+        self._found_kf = int(table.kf_id[table.carrier[row]]), table.carrier_T_kf[row] @ living_T_kf
 
     def _with_everything(self, update: MapUpdate) -> MapUpdate:
         keyframes, points = self.map.living_keyframes(), self.map.living_points()

@@ -201,6 +201,18 @@ def test_keyframes_without_corners_are_no_places(vocabulary: voc.Vocabulary) -> 
     assert {r.reason for r in results if r.kf_id % 2} == {"not_described"}
 
 
+def check_forgotten(closer: LoopCloser, results: list[LoopResult]) -> None:
+    """Every keyframe is a candidate, among the newest, or forgotten once, and no later result names it then."""
+    forgotten = list[int]()
+    for r in results:
+        named = {r.kf_id, r.candidate_kf_id, *(k for k, *_ in r.rejected), *r.sightings[:, 1].tolist()}
+        assert not named & set(forgotten)
+        forgotten += r.forgotten_kf_ids.tolist()
+    assert len(set(forgotten)) == len(forgotten) > 0
+    newest = range(len(results) - KEPT_NEWEST, len(results))
+    assert {*forgotten, *closer._store.ids, *newest} == set(range(len(results)))
+
+
 def test_of_a_view_seen_every_lap_a_few_keyframes_are_kept_and_loops_still_found(vocabulary: voc.Vocabulary) -> None:
     sequence = make_sequence([0, 1] * 7, seed=3)
     closer = LoopCloser(LoopConfig(), sequence.rig, vocabulary)
@@ -213,6 +225,7 @@ def test_of_a_view_seen_every_lap_a_few_keyframes_are_kept_and_loops_still_found
     assert keyframe_count[lap] == described  # nothing is forgotten on the first lap
     assert keyframe_count[-1] - keyframe_count[-1 - lap] < 0.3 * lap  # hardly anything is added on the last
     assert len(closer._database) <= 2 * closer.keyframe_count + KEPT_NEWEST + 1  # what is forgotten takes no room
+    check_forgotten(closer, results)
     assert any(r.candidate_kf_id >= 0 for r in results[-lap:])
     assert all(error_of(sequence, r) < 0.1 for r in results if r.candidate_kf_id >= 0)
 

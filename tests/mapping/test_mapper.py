@@ -176,6 +176,30 @@ def test_compaction_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
             assert bits(getattr(first, field.name)) == bits(getattr(second, field.name)), field.name
 
 
+def test_rows_of_keyframes_that_loops_name_no_more_are_freed_and_no_bit_changes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("stereo_sfm.mapping.map.FEW_KEYFRAMES", 4)
+    stream = keyframe_stream(
+        fisheye_rig(), to_and_fro(40, reach=4, step=0.05), points=200, track_length=8, per_keyframe=80
+    )
+
+    def updates_of(lag: int) -> tuple[Mapper, list[MapUpdate]]:
+        mapper, updates = Mapper(CONFIG, stream.rig), list[MapUpdate]()
+        for k in stream.keyframes:
+            forgotten = np.array([k.kf_id - lag] if k.kf_id > lag else [], np.int64)
+            mapped = dataclasses.replace(true_loop(stream, 9, 2), candidate_kf_id=-1, forgotten_kf_ids=forgotten)
+            updates.append(mapper.step(k, mapped))
+        return mapper, updates
+
+    (every, plain), (some, updates) = updates_of(1000), updates_of(8)
+    assert len(every.map.keyframes) == 40
+    assert len(some.map.keyframes) < 40 - 8 and some.map.keyframes.kf_id[0] == 0
+    for first, second in zip(plain, updates, strict=True):
+        for field in dataclasses.fields(MapUpdate):
+            assert bits(getattr(first, field.name)) == bits(getattr(second, field.name)), field.name
+
+
 def test_disabled_mapping_repeats_odometry() -> None:
     stream = keyframe_stream(pinhole_rig(), camera_path(5))
     mapper, updates = run(stream, dataclasses.replace(CONFIG, enabled=False))
