@@ -3,9 +3,9 @@
 Ids are never reused: a culled keyframe or point keeps its row and loses `alive`, a fused point keeps its id as an alias
 of the point that replaced it. Rows of removed points and observations stay until `compact` frees them, those of culled
 keyframes until loops name them no more (`forget`) and `free_keyframes` is called, so that a day in the same aisles fits
-into memory. The observations of a keyframe are one run of rows; those of a point a linked list through the table, so that the cost of inserting a keyframe
-depends on its observations, not on the size of the map. Points that a loop made of corners belong to no track: the
-tracker never hears of them.
+into memory. The observations of a keyframe are one run of rows; those of a point a linked list through the table, so
+that the cost of inserting a keyframe depends on its observations, not on the size of the map. Points that a loop made
+of corners belong to no track: the tracker never hears of them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ from stereo_sfm.mapping import map_kernels
 from stereo_sfm.mapping.id_rows import IdRows
 from stereo_sfm.mapping.tables import KeyframeTable, ObservationTable, PointTable
 from stereo_sfm.types import F32, F64, I64, U8, Bool, Corners, Keyframe
-
 
 FEW_KEYFRAMES = 256  # forgotten ones whose rows are not worth to be freed
 
