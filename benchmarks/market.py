@@ -16,11 +16,13 @@ are rendered into a file and driven there and back again and again, so that all 
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from typing import BinaryIO
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
 
 from _sequences import one_thread
 
@@ -32,8 +34,8 @@ import psutil
 from both_directions import aligned, drive
 from sessions import Truth, asked, on_disk, put_in, truth_of
 
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
-from stereo_sfm.drivers.sim.source import SimSource
 from stereo_sfm.drivers.source import BaseSource, open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.floor_plan import make_floor_plan
@@ -41,10 +43,10 @@ from stereo_sfm.mapping.mapper import Mapper
 from stereo_sfm.maps.saved_map import SavedMap
 from stereo_sfm.pipeline.allocator import return_large_blocks
 from stereo_sfm.pipeline.inline import InlineRun
-from stereo_sfm.types import StereoImage
+from stereo_sfm.types import StereoImage, Trajectory
 
 ATE_SHARE, GOOD_SHARE, QUERY_S = 0.0005, 0.96, 0.3  # required of the map of three sessions
-ORB_EVERY = 100  # frames
+ORB_EVERY = 20  # frames
 FROM_M, TIME_RATIO, MEMORY_RATIO = 600.0, 1.2, 1.5  # required of the growth
 
 
@@ -94,19 +96,28 @@ def one_map(options: str, sessions: int, queries: int, seed: int) -> bool:
     return exact and joined == sessions
 
 
-class RenderedDrive(BaseSource):
-    """A simulated drive from a file of its images, there and back until a length is reached."""
-
-    name = "rendered"
-
-    def __init__(self, source: SimSource, length: float, file: BinaryIO) -> None:
+def render(spec: str, path: Path) -> tuple[Rig, Trajectory]:
+    """Write the images of a simulated drive into a file, left and right in turn."""
+    with open_source(spec) as source, path.open("wb") as file:
         assert source.ground_truth is not None
-        self.rig, self._file = source.rig, file
-        self._shape = (2, source.rig.left.height, source.rig.left.width)
         for image in source:
             assert image.right is not None
             file.write(image.left.tobytes() + image.right.tobytes())
-        true = source.ground_truth
+        return source.rig, source.ground_truth
+
+
+class RenderedDrive(BaseSource):
+    """A simulated drive from a file of its images, there and back until a length is reached.
+
+    Another process renders them: its memory is not that of the run.
+    """
+
+    name = "rendered"
+
+    def __init__(self, spec: str, length: float, path: Path) -> None:
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+            self.rig, true = pool.submit(render, spec, path).result()
+        self._path, self._shape = path, (2, self.rig.left.height, self.rig.left.width)
         self._interval_ns = int(true.stamp_ns[1] - true.stamp_ns[0])
         steps = np.linalg.norm(np.diff(true.poses[:, :3, 3], axis=0), axis=1)
         laps = int(np.ceil(length / steps.sum()))
@@ -119,10 +130,11 @@ class RenderedDrive(BaseSource):
 
     def __iter__(self) -> Iterator[StereoImage]:
         size = int(np.prod(self._shape))
-        for k, row in enumerate(self._order[: len(self.driven)].tolist()):
-            self._file.seek(row * size)
-            left, right = np.frombuffer(self._file.read(size), np.uint8).reshape(self._shape)
-            yield StereoImage(k, 1_000_000_000 + k * self._interval_ns, left, right)
+        with self._path.open("rb") as file:
+            for k, row in enumerate(self._order[: len(self.driven)].tolist()):
+                file.seek(row * size)
+                left, right = np.frombuffer(file.read(size), np.uint8).reshape(self._shape)
+                yield StereoImage(k, 1_000_000_000 + k * self._interval_ns, left, right)
 
 
 def orb_seconds(orb: cv2.ORB, image: StereoImage) -> float:
@@ -139,9 +151,8 @@ def growth(spec: str, length: float, stretch: float) -> bool:
     return_large_blocks()  # as the processes of a pipeline do
     process, orb = psutil.Process(), cv2.ORB.create(1000)
     rows = list[tuple[float, float, float]]()  # metres, ORBs a frame, MiB
-    with open_source(spec) as rendered, tempfile.TemporaryFile() as file:
-        assert isinstance(rendered, SimSource)
-        source = RenderedDrive(rendered, length, file)
+    with tempfile.TemporaryDirectory() as folder:
+        source = RenderedDrive(spec, length, Path(folder) / "images")
         driven = source.driven
         run = InlineRun(source, Config(), [], None)
         begun, spent, orbs, until = 0, 0.0, list[float](), stretch
