@@ -8,9 +8,10 @@ Parts: `map` puts the sessions of `sim:market` into one map (`map update`) and p
 all sessions together, also as a share of the metres driven), size, and times; then single images of a further session,
 driven a bit aside, are asked in it. `growth` drives on from session to session in one run and prints, for each stretch,
 processor time a frame (without rendering; also in units of ORB on both images, for a busy machine slows both),
-resident memory, keyframes and points; it fails where the last stretch needs more than 1.2 times the ORBs of the one
-around 600 m, or 1.5 times the memory. With `--distinct` so many metres
-are rendered into a file and driven there and back again and again, so that all after them is known.
+resident memory, keyframes and points, and medians of the time of a keyframe; at some places also the size of the map
+and the time to open it. It fails where the last stretch needs more than 1.2 times the ORBs of the one around 600 m, or
+1.5 times the memory. With `--distinct` so many metres are rendered into a file and driven there and back again and
+again, so that all after them is known.
 """
 
 from __future__ import annotations
@@ -40,13 +41,16 @@ from stereo_sfm.drivers.source import BaseSource, open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.floor_plan import make_floor_plan
 from stereo_sfm.mapping.mapper import Mapper
+from stereo_sfm.maps.folders import saved_map_of
 from stereo_sfm.maps.saved_map import SavedMap
+from stereo_sfm.messages import StageTimes
 from stereo_sfm.pipeline.allocator import return_large_blocks
 from stereo_sfm.pipeline.inline import InlineRun
 from stereo_sfm.types import StereoImage, Trajectory
 
 ATE_SHARE, GOOD_SHARE, QUERY_S = 0.0005, 0.96, 0.3  # required of the map of three sessions
 ORB_EVERY = 20  # frames
+DESCRIBED_M = 100.0, 600.0, 5000.0  # where the map is saved and opened, besides the end
 FROM_M, TIME_RATIO, MEMORY_RATIO = 600.0, 1.2, 1.5  # required of the growth
 
 
@@ -146,6 +150,25 @@ def orb_seconds(orb: cv2.ORB, image: StereoImage) -> float:
     return time.process_time() - start
 
 
+class StretchTimes:
+    """A sink: milliseconds of each keyframe in mapper and loop closer since the last line."""
+
+    def __init__(self) -> None:
+        self._ms: dict[str, list[float]] = {"map": [], "loop": []}
+
+    def put(self, message: object) -> None:
+        if isinstance(message, StageTimes):
+            for stage, values in self._ms.items():
+                if stage in message.ms:
+                    values.append(message.ms[stage])
+
+    def take(self) -> str:
+        """Medians, and forget them."""
+        text = ", ".join(f"{stage} {np.median(ms) if ms else np.nan:.0f} ms" for stage, ms in self._ms.items())
+        self._ms = {stage: [] for stage in self._ms}
+        return text
+
+
 def growth(spec: str, length: float, stretch: float) -> bool:
     """One long run; whether time and memory stay as flat as required."""
     return_large_blocks()  # as the processes of a pipeline do
@@ -153,8 +176,10 @@ def growth(spec: str, length: float, stretch: float) -> bool:
     rows = list[tuple[float, float, float]]()  # metres, ORBs a frame, MiB
     with tempfile.TemporaryDirectory() as folder:
         source = RenderedDrive(spec, length, Path(folder) / "images")
-        driven = source.driven
-        run = InlineRun(source, Config(), [], None)
+        driven, times = source.driven, StretchTimes()
+        run = InlineRun(source, Config(), [times], None)
+        mapper = run.map_stage.mapper
+        assert isinstance(mapper, Mapper)
         begun, spent, orbs, until = 0, 0.0, list[float](), stretch
         for k, image in enumerate(source):
             start = time.process_time()
@@ -167,16 +192,31 @@ def growth(spec: str, length: float, stretch: float) -> bool:
             memory = process.memory_info().rss / 2**20
             frame_s = spent / (k + 1 - begun)
             rows.append((float(driven[k]), frame_s / float(np.median(orbs)), memory))
-            begun, spent, orbs, until = k + 1, 0.0, [], until + stretch
-            mapper = run.map_stage.mapper
-            assert isinstance(mapper, Mapper)
             print(
                 f"{driven[k]:7.0f} m: {1e3 * frame_s:6.1f} ms a frame, {rows[-1][1]:.2f} x ORB, {memory:6.0f} MiB,"
-                f" {len(mapper.map.living_keyframes())} keyframes, {len(mapper.map.living_points())} points",
+                f" {len(mapper.map.living_keyframes())} keyframes, {len(mapper.map.living_points())} points;"
+                f" a keyframe: {times.take()}",
                 flush=True,
             )
+            if any(until <= metres < until + stretch for metres in DESCRIBED_M) or k + 1 == len(driven):
+                describe(mapper)
+            begun, spent, orbs, until = k + 1, 0.0, [], until + stretch
     early = min(rows, key=lambda row: abs(row[0] - FROM_M))
     return rows[-1][1] <= TIME_RATIO * early[1] and rows[-1][2] <= MEMORY_RATIO * early[2]
+
+
+def describe(mapper: Mapper) -> None:
+    """Print the size of the map on disk, the time to open it, and its floor plan."""
+    saved = saved_map_of(mapper, Config())
+    assert saved is not None
+    megabytes, opening = on_disk(saved)
+    begin = time.perf_counter()
+    plan = make_floor_plan(saved.snapshot)
+    print(
+        f"           map: {megabytes:.1f} MB, opened in {opening:.2f} s; floor plan"
+        f" {plan.image.shape[1]}x{plan.image.shape[0]} in {time.perf_counter() - begin:.1f} s",
+        flush=True,
+    )
 
 
 def main() -> int:
