@@ -44,6 +44,7 @@ DRIFT_PER_METRE = 0.003  # of the odometry on both sides of a gap
 STRONG = 3.0, 0.4  # times min_inliers, share of inliers: one keyframe joins two submaps if the gap's motion allows it
 RIVAL = 0.5  # share of a loop's inliers, or of its support, above which another place makes it ambiguous
 TWIN = 0.85  # the same of the share of corners of its best keyframe, where several found it
+LOOKALIKES = 3000  # hypotheses between sessions that are remembered
 GAP_WINDOW = 12  # newest keyframes with corners that support a loop across a gap, or contradict it
 CHANCE = 0.25  # share of corners, ahead and beside, that agree where a place only looks alike
 MIN_SUPPORT = 0.3  # sum of what the shares of keyframes exceed that by: two with 0.4, or three with 0.35
@@ -71,6 +72,7 @@ class _Hypothesis:
     inliers: int
     against: str  # reason to reject it by odometry, "" if there is none
     unconnected: bool  # no path of odometry and loops connects its ends: only appearance supports it
+    anywhere: bool  # neither does a gap bound the motion between them: they are of two sessions
     votes: int  # keyframes that must agree on it
     sideways: bool  # by views to the side
     share: float  # of the keyframe's corners, ahead and beside, that agree with it
@@ -102,6 +104,7 @@ class LoopCloser:
         self._store = KeyframeStore()
         self._graph = KeyframeGraph()
         self._pending: list[_Hypothesis] = []
+        self._alike: deque[_Hypothesis] = deque(maxlen=LOOKALIKES)  # between sessions, since the last loop
         self._same: dict[tuple[_Hypothesis, _Hypothesis], bool | None] = {}  # of pending ones, see `_same_loop`
         # newest keyframes with corners
         self._described: deque[int] = deque(maxlen=max(GAP_WINDOW, config.consistent_window))
@@ -278,6 +281,7 @@ class LoopCloser:
         self._pending = [h for h in self._pending if h.kf_id in self._described]
         self._same = {pair: same for pair, same in self._same.items() if all(h.kf_id in self._described for h in pair)}
         self._pending += [h for h in loops.values() if h.against or h.inliers >= RIVAL * best_inliers]
+        self._alike.extend(h for h in loops.values() if h.anywhere and not h.sideways)
         accepted = -1
         for k in sorted(loops, key=lambda k: -loops[k].inliers):
             reasons[k] = loops[k].against or self._objection(loops[k], best_inliers)
@@ -336,7 +340,7 @@ class LoopCloser:
         """
         config, candidate_T_kf = self._config, se3.inverse(verdict.b_T_a)
         kf_id, candidate, votes, share = keyframe.kf_id, of.kf_id, self._config.consistent, verdict.share
-        path = self._graph.path(candidate, kf_id)
+        path, anywhere = self._graph.path(candidate, kf_id), False
         if path is not None:
             metres = config.gate_m + config.gate_m_per_m * path.metres
             degrees = config.gate_deg + config.gate_deg_per_m * path.metres
@@ -344,6 +348,7 @@ class LoopCloser:
             against = "" if near else "against_odometry"
         else:
             gap = self._graph.gap_motion(candidate, kf_id, candidate_T_kf)
+            anywhere = gap is None
             off = math.nan if gap is None else gap.deviation - DRIFT_PER_METRE * gap.distance
             if of.sideways:
                 enough = verdict.inliers >= SIDE_FACTOR * config.side_inliers
@@ -355,9 +360,10 @@ class LoopCloser:
                 votes = 1 if strong and gap is not None and off <= gap.tolerance else votes
             reached = gap is None or off <= gap.disturbed
             against = "out_of_reach" if not reached else "" if enough else "too_few_inliers"
-        unconnected = path is None
-        inliers, sideways = verdict.inliers, of.sideways
-        return _Hypothesis(kf_id, candidate, candidate_T_kf, inliers, against, unconnected, votes, sideways, share)
+        inliers, sideways, unconnected = verdict.inliers, of.sideways, path is None
+        return _Hypothesis(
+            kf_id, candidate, candidate_T_kf, inliers, against, unconnected, anywhere, votes, sideways, share
+        )
 
     def _objection(self, loop: _Hypothesis, best_inliers: int) -> str:
         """Why a loop that odometry allows is not accepted, '' if it is.
@@ -370,6 +376,8 @@ class LoopCloser:
             return "" if len(self._support(loop, self._config.consistent_window)) >= loop.votes else "not_confirmed_yet"
         support = self._support(loop, GAP_WINDOW)
         if any(self._rivals(h, loop, support) for h in self._pending):
+            return "ambiguous"
+        if loop.anywhere and not loop.sideways and self._looked_alike(loop, max(support.values())):
             return "ambiguous"
         enough = loop.votes == 1 or loop.sideways or _total(support) >= MIN_SUPPORT
         return "" if len(support) >= loop.votes and enough else "not_confirmed_yet"
@@ -386,6 +394,14 @@ class LoopCloser:
         others = self._support(other, GAP_WINDOW)
         alike = RIVAL if len(support) == 1 else TWIN
         return _total(others) > RIVAL * _total(support) or max(others.values()) > alike * max(support.values())
+
+    def _looked_alike(self, loop: _Hypothesis, share: float) -> bool:
+        """Whether some other place looked about as much like a keyframe of this session as this one does.
+
+        Lamps at equal distances and shelves with equal products: how much alike wrong places look depends on the store,
+        and that successive keyframes agree on one says little where they all are displaced by the same lamps.
+        """
+        return any(h.share > TWIN * share and self._same_loop(h, loop) is False for h in self._alike)
 
     def _support(self, loop: _Hypothesis, window: int) -> dict[int, float]:
         """The keyframes among the newest that found a loop, and the share of the corners of each that agree with it."""
@@ -423,6 +439,7 @@ class LoopCloser:
         if not self._paused(keyframe.kf_id):
             self._last_loop = keyframe.kf_id
         self._pending.clear()
+        self._alike.clear()
         self._same.clear()
         return LoopResult(
             kf_id=keyframe.kf_id,

@@ -11,7 +11,7 @@ import pytest
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
-from stereo_sfm.loop.closer import KEPT_NEWEST, Candidate, LoopCloser
+from stereo_sfm.loop.closer import GAP_WINDOW, KEPT_NEWEST, Candidate, LoopCloser
 from stereo_sfm.loop.place_view import PlaceView
 from stereo_sfm.loop.verification import Verdict, rejection
 from stereo_sfm.types import F64, Corners, Keyframe, LoopResult
@@ -145,6 +145,23 @@ def test_lamps_that_agree_join_no_submaps_where_the_shelves_beside_do_not(
     results = answers_of(sequence, vocabulary, monkeypatch, {(25, 5): 200, (26, 6): 210}, set(), anew)
     assert (results[26].candidate_kf_id == 6) == accepted
     assert results[26].reason == ("" if accepted else "not_confirmed_yet")
+
+
+@pytest.mark.parametrize(("share", "accepted"), [(0.48, False), (0.6, True)])
+def test_a_place_of_another_session_must_look_more_alike_than_wrong_ones_did(
+    vocabulary: voc.Vocabulary, monkeypatch: pytest.MonkeyPatch, share: float, accepted: bool
+) -> None:
+    """A place that is 5 m off, long before, had 45 % of a keyframe's corners."""
+    sequence = make_sequence([0, 1], seed=3)
+    anew = [dataclasses.replace(k, submap_id=int(k.kf_id >= 20), stamp_ns=0) for k in sequence.keyframes]
+    monkeypatch.setattr(
+        LoopCloser, "_agreeing_share", lambda self, keyframe, candidate, _: 0.45 if candidate == 12 else share
+    )
+    one, other = [k.kf_id for k in anew if k.kf_id > 25 and k.described][GAP_WINDOW : GAP_WINDOW + 2]
+    script = {(25, 12): 205, (one, 5): 200, (other, 6): 210}
+    results = answers_of(sequence, vocabulary, monkeypatch, script, {12}, anew)
+    assert results[25].reason == "not_confirmed_yet"
+    assert results[other].reason == ("" if accepted else "ambiguous")
 
 
 def test_pause_after_a_loop(vocabulary: voc.Vocabulary) -> None:
