@@ -7,7 +7,8 @@ others follow that are worth their variance. The rows show terms of lenses, whic
 says of disparities: lengths stay unless there is evidence about them. A corrected term is refined as long as windows
 come, first whenever their number has doubled. Where the windows show drift (temperature), the terms at the newest
 window are used for the keyframes since the last revision. If the newest windows contradict all earlier ones, the rig
-has changed (a knock): earlier windows are discarded, and the correction applies from there on.
+has changed (a knock): earlier windows are discarded, and the correction applies from the first keyframe on that was
+seen by the changed rig (`mapping.rig_change`).
 """
 
 from __future__ import annotations
@@ -18,9 +19,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stereo_sfm.calib.choice import NAMES, SCALES, UNITS, Estimate, choose, significant
+from stereo_sfm.calib.choice import NAMES, SCALES, UNITS, Estimate, choose, significant, with_terms
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
+from stereo_sfm.mapping.rig_change import SeenPoints, first_changed
 from stereo_sfm.mapping.rig_window import PRIOR, RigInformation, RigWindow, solve_window
 from stereo_sfm.types import F64, RIG_TERMS, Keyframe
 
@@ -36,6 +38,8 @@ MAX_WINDOWS = 80  # used, the newest
 AFTER_STEP = range(2, 7)  # newest windows that must contradict all others to indicate a step
 STRADDLING_SIGMAS = 2.0  # by which a window during which the rig changed differs from those afterwards
 BEFORE_STEP = 4  # earlier windows needed to detect a step
+STEP_REACH = 2  # windows before and after the likeliest pair of windows in which it may have happened
+RECENT_KEYFRAMES = 64  # among which the first after a step is looked for
 DRIFT_WINDOWS = 8  # needed to detect drift
 RATE = np.deg2rad(0.1) / 60.0  # prior standard deviation of drift, radians (ratio) per second
 SIGMAS = 5.0  # significance of the first term that is corrected
@@ -70,6 +74,8 @@ class SelfCalibration:
         self._until_due = MIN_WINDOWS  # windows until the next revision
         self._stepped = False  # a step was detected and is not yet corrected
         self._straddling = False  # it may have happened during the first window
+        self._step_between = 0, 0  # keyframes between which it happened
+        self._recent: deque[SeenPoints] = deque(maxlen=RECENT_KEYFRAMES)
         half_width = 0.5 * rig.left.width
         turn = MATCHING_PX / rig.left.fx
         roll = ratio = MATCHING_PX / (0.5 * half_width)
@@ -78,6 +84,7 @@ class SelfCalibration:
 
     def add(self, keyframe: Keyframe) -> Revision | None:
         """Add a keyframe; returns a revision when one becomes significant."""
+        self._recent.append(SeenPoints.of(keyframe))
         if self._keyframes and keyframe.submap_id != self._keyframes[0].submap_id:
             self._keyframes = []
         if self._keyframes and not _moved(self._keyframes[-1], keyframe, MIN_MOTION * self._rig.left.width):
@@ -142,6 +149,8 @@ class SelfCalibration:
         why = "drift" if drifts else "refined" if self._corrected[choice.written].all() else "significant"
         why = "step" if self._stepped else why
         change: F64 = np.asarray(np.linalg.solve(basis, choice.value), float)
+        if self._stepped:
+            since = self._since = self._first_after_step(self.terms + change)
         self.terms = self.terms + change
         self._corrected |= choice.written
         self._stepped = False
@@ -186,16 +195,34 @@ class SelfCalibration:
 
     def _detect_step(self) -> None:
         windows = list(self.windows)
-        for count in AFTER_STEP:
-            before, after = windows[:-count], windows[-count:]
-            if len(before) < BEFORE_STEP:
-                return
-            base = self.estimate(before)
-            change = [_difference(self.estimate(part), base) for part in (after, after[::2], after[1::2])]
-            if significant(change[0], change[1:], self._rig.readout_s > 0, SIGMAS).any():
-                self.windows = deque(after, maxlen=MAX_WINDOWS)
-                self._since, self._stepped, self._straddling = after[0].first_kf_id, True, True
-                return
+        splits = range(len(windows) - AFTER_STEP.start, max(BEFORE_STEP, len(windows) - AFTER_STEP.stop + 1) - 1, -1)
+        if not any(self._differ(windows[:k], windows[k:]) for k in splits):
+            return
+        split = max(splits, key=lambda k: self._fit(windows[:k]) + self._fit(windows[k:]))
+        first = windows[split]
+        self.windows = deque(windows[split:], maxlen=MAX_WINDOWS)
+        self._since, self._stepped, self._straddling = first.first_kf_id, True, True
+        self._step_between = windows[split - STEP_REACH].first_kf_id, windows[split:][:STEP_REACH][-1].last_kf_id
+
+    def _differ(self, before: Sequence[RigWindow], after: Sequence[RigWindow]) -> bool:
+        """Whether the newest windows contradict all earlier ones."""
+        base = self.estimate(before)
+        change = [_difference(self.estimate(part), base) for part in (after, after[::2], after[1::2])]
+        return bool(significant(change[0], change[1:], self._rig.readout_s > 0, SIGMAS).any())
+
+    def _fit(self, windows: Sequence[RigWindow]) -> float:
+        """How well one rig explains windows: their log-likelihood but for a constant of each window."""
+        matrix, vector = np.diag(1 / PRIOR**2), self.terms / PRIOR**2
+        for window in windows:
+            matrix, vector = matrix + window.information.matrix, vector + window.information.vector
+        return 0.5 * float(vector @ np.linalg.solve(matrix, vector))
+
+    def _first_after_step(self, terms: F64) -> int:
+        """Id of the first keyframe that the rig with these terms saw, else of the first window after the step."""
+        first, last = self._step_between
+        seen = [k for k in self._recent if first <= k.kf_id <= last]
+        found = first_changed(seen, with_terms(self._rig, self.terms), with_terms(self._rig, terms))
+        return self._since if found is None else found
 
     def _drop_straddling(self) -> None:
         """After a step, discard the first window if it contradicts the others: the rig changed during it."""

@@ -1,0 +1,80 @@
+"""Which keyframe was the first after a sudden change of the rig (a knock)."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calib.scene_model import inverse_distances
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.motion_only import refine_pose
+from stereo_sfm.geometry.robust import Degenerate
+from stereo_sfm.types import F64, I64, Keyframe
+
+MIN_POINTS = 20  # seen by both eyes in two successive keyframes
+MATCH_PX = 0.3  # scale of the loss
+FAR = 1e-3  # 1/m, of points without a measured distance
+
+
+@dataclass(frozen=True, eq=False)
+class SeenPoints:
+    """What is compared of a keyframe."""
+
+    kf_id: int
+    odom_T_cam: F64  # (4, 4)
+    point_ids: I64  # (N,)
+    uv_left: F64  # (N, 2) px
+    uv_right: F64  # (N, 2) px, NaN where not seen
+
+    @staticmethod
+    def of(keyframe: Keyframe) -> SeenPoints:
+        return SeenPoints(keyframe.kf_id, keyframe.odom_T_cam, keyframe.point_ids, keyframe.uv_left, keyframe.uv_right)
+
+
+def first_changed(seen: Sequence[SeenPoints], before: Rig, after: Rig) -> int | None:
+    """Id of the first keyframe of the rig `after`; None where one rig explains all of them as well.
+
+    Between two keyframes of one rig, the points' distances in the first, as this rig measures them, predict the right
+    pixels in the second. Where the rig changed in between, they do so with both rigs only.
+    """
+    if len(seen) < 2:
+        return None
+    pairs = list(itertools.pairwise(seen))
+    misfit = np.nan_to_num(
+        [[_misfit(a, b, *rigs) for rigs in ((before, before), (before, after), (after, after))] for a, b in pairs]
+    )
+    same, across, changed = misfit.T
+    total = np.cumsum(same) - same + across + changed.sum() - np.cumsum(changed)
+    best = int(np.argmin(total))
+    return pairs[best][1].kf_id if total[best] < min(same.sum(), changed.sum()) else None
+
+
+def _misfit(a: SeenPoints, b: SeenPoints, rig_a: Rig, rig_b: Rig) -> float:
+    """Mean loss of the right pixels that two keyframes share, the distances measured in the first; NaN without many.
+
+    The motion between them is solved with these distances: that of the odometry was measured with either rig.
+    """
+    assert rig_b.right is not None
+    _, i, j = np.intersect1d(a.point_ids, b.point_ids, return_indices=True)
+    rho = inverse_distances(rig_a, a.uv_left[i], a.uv_right[i])
+    good = np.isfinite(rho) & (rho > FAR) & np.isfinite(b.uv_right[j]).all(1)
+    if good.sum() < MIN_POINTS:
+        return np.nan
+    i, j, rho = i[good], j[good], rho[good]
+    points = rig_a.left.unproject(a.uv_left[i]) / rho[:, None]
+    try:
+        moved = refine_pose(
+            points,
+            rig_b.left.unproject(b.uv_left[j]),
+            se3.inverse(b.odom_T_cam) @ a.odom_T_cam,
+            MATCH_PX / rig_b.left.fx,
+        )
+    except Degenerate:
+        return np.nan
+    in_b = se3.transform(moved.cam_T_ref, points)
+    off = rig_b.right.project(se3.transform(se3.inverse(rig_b.left_T_right), in_b)) - b.uv_right[j]
+    return float(np.nanmean(np.log1p((off**2).sum(1) / MATCH_PX**2)))
