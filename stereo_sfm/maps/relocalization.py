@@ -71,6 +71,7 @@ class Relocalizer:
         self._map, self._rig, self._vocabulary = snapshot, rig, vocabulary
         self._keyframes = snapshot.keyframes()
         self._described = np.flatnonzero([k.described for k in self._keyframes])
+        self._undescribed = np.flatnonzero([not k.described for k in self._keyframes])
         self._near_share = config.min_inlier_share
         self._config = dataclasses.replace(
             config,
@@ -182,10 +183,10 @@ class Relocalizer:
 
     def cloud(self, row: int, sideways: bool = False) -> Cloud:
         """The points of a keyframe row and its neighbours, in its camera frame."""
-        shared = self._sees[:, self._seen.indices[self._seen.indptr[row] : self._seen.indptr[row + 1]]].sum(axis=1)
+        shared = self._shared(row)
+        shared[self._undescribed] = 0
         shared[row] = shared.max() + 1
-        shared[np.setdiff1d(np.arange(len(shared)), np.append(self._described, row))] = 0
-        order = np.lexsort((np.arange(len(shared)), -shared))[: self._config.relocalize_keyframes]
+        order = np.argsort(-shared, kind="stable")[: self._config.relocalize_keyframes]
         order = order[shared[order] > 0]
         centre, *others = (self._keyframes[k] for k in order.tolist())
         cloud = gather(centre, others, self._rig, self._config.disparity_sigma_px, sideways)
@@ -194,6 +195,14 @@ class Relocalizer:
         sigmas = cloud.sigmas.copy()
         sigmas[mapped] = np.maximum(sigmas[mapped] / np.sqrt(self._views[at]), MIN_RANGE_SIGMA_M)
         return dataclasses.replace(cloud, sigmas=sigmas)
+
+    def _shared(self, row: int) -> I64:
+        """(K,) points that each keyframe shares with that of a row."""
+        seen, sees = self._seen, self._sees
+        points = seen.indices[seen.indptr[row] : seen.indptr[row + 1]]
+        first, count = sees.indptr[points], sees.indptr[points + 1] - sees.indptr[points]
+        at = np.arange(count.sum()) + np.repeat(first - np.cumsum(count) + count, count)
+        return np.bincount(sees.indices[at], minlength=len(self._keyframes))
 
     def _places(self, scores: F64) -> list[int]:
         """The best rows, each of another place; the score of a place includes its temporal neighbours."""
