@@ -58,16 +58,19 @@ def gather(
     keyframes = [centre, *others]
     centre_T_kf = np.stack([se3.inverse(centre.odom_T_cam) @ k.odom_T_cam for k in keyframes])
     views = [place_view_of(keyframe, rig, disparity_sigma, sideways) for keyframe in keyframes]
-    deep = [np.flatnonzero(np.isfinite(view.points[:, 2])) for view in views]
+    points = np.concatenate([view.points for view in views])
+    deep = np.flatnonzero(np.isfinite(points[:, 2]))
 
     def joined(name: str) -> Any:
-        return np.concatenate([getattr(view, name)[rows] for view, rows in zip(views, deep, strict=True)])
+        return np.concatenate([getattr(view, name) for view in views]).take(deep, axis=0)
 
-    points = [se3.transform(t, view.points[rows]) for t, view, rows in zip(centre_T_kf, views, deep, strict=True)]
+    view = np.repeat(np.arange(len(views)), [len(view.ids) for view in views]).take(deep)
+    points, ends = points.take(deep, axis=0), np.searchsorted(view, np.arange(len(views) + 1))
+    for t, first, end in zip(centre_T_kf, ends[:-1], ends[1:], strict=True):
+        points[first:end] = se3.transform(t, points[first:end])
     cloud = Cloud(
-        joined("ids"), np.concatenate(points), joined("sigmas"), joined("descriptors"), joined("uv_left"),
-        joined("uv_right"), joined("corner"), joined("rows"), np.repeat(np.arange(len(views)), [len(d) for d in deep]),
-        centre_T_kf,
+        joined("ids"), points, joined("sigmas"), joined("descriptors"), joined("uv_left"), joined("uv_right"),
+        joined("corner"), joined("rows"), view, centre_T_kf,
     )  # fmt: skip
     cloud.ids[cloud.corner] = _name_corners(views, cloud, rig)
     return cloud
