@@ -15,6 +15,7 @@ import argparse
 import sys
 import tempfile
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 from _sequences import one_thread
@@ -48,8 +49,22 @@ def truth_of(saved: SavedMap, truth: Truth) -> F64:
     return np.array([truth[key] for key in keys])
 
 
-def asked(saved: SavedMap, truth: Truth, spec: str, queries: int, seed: int) -> tuple[int, int, float]:
-    """Single images of a session in the map: good, wrong, and seconds each."""
+@dataclass(frozen=True)
+class Asked:
+    """How single images of a session were found in a map."""
+
+    good: int = 0
+    wrong: int = 0
+    median_s: float = 0.0  # processor time of a query
+    most_s: float = 0.0
+
+    def __str__(self) -> str:
+        times = f"{1e3 * self.median_s:.0f} ms each in the median, {1e3 * self.most_s:.0f} at most"
+        return f"{self.good} images found, {self.wrong} wrong, {times}"
+
+
+def asked(saved: SavedMap, truth: Truth, spec: str, queries: int, seed: int) -> Asked:
+    """Single images of a session in the map."""
     s = saved.snapshot
     world_T_map = aligned(s.map_T_kf, truth_of(saved, truth))
     relocalizer = Relocalizer(s, saved.rig, default_vocabulary(), Config().loop)
@@ -60,16 +75,16 @@ def asked(saved: SavedMap, truth: Truth, spec: str, queries: int, seed: int) -> 
         frames = np.random.default_rng(seed).choice(len(source.frame_ids), queries, replace=False)
         for k in np.sort(frames).tolist():
             keyframe = still_keyframe(next(source.at([k])), saved.rig)
-            begin = time.perf_counter()
+            begin = time.process_time()
             place = None if keyframe is None else relocalizer.locate(keyframe)
-            seconds.append(time.perf_counter() - begin)
+            seconds.append(time.process_time() - begin)
             if place is None or not place.found:
                 continue
             error = se3.inverse(source.ground_truth.poses[k]) @ world_T_map @ place.map_T_cam
             metres, radians = (float(x) for x in se3.extent(error))
             good += metres <= GOOD_M and np.degrees(radians) <= GOOD_DEG
             wrong += metres > FALSE_M
-    return good, wrong, float(np.median(seconds))
+    return Asked(good, wrong, float(np.median(seconds)), max(seconds))
 
 
 def session_error(saved: SavedMap, truth: Truth, session: int) -> float:
@@ -123,7 +138,7 @@ def main() -> int:
             f"&walk={n * WALKS.get(args.scene, 1)}&nights={n}&exchange={args.exchange}"
         )
         told = n in (1, args.sessions - 1) or n % args.every == 0
-        found = asked(saved, truth, spec, args.queries, n) if saved is not None and told else (0, 0, 0.0)
+        found = asked(saved, truth, spec, args.queries, n) if saved is not None and told else Asked()
         walk = drive(spec)
         stamps = dict(zip(walk.saved.snapshot.kf_ids.tolist(), walk.saved.snapshot.stamp_ns.tolist(), strict=True))
         begin = time.perf_counter()
@@ -136,13 +151,12 @@ def main() -> int:
         truth |= {(session, stamps[k]): pose for k, pose in walk.true_kf.items() if k in stamps}
         if not told:
             continue
-        first_good = found[0] if n == 1 else first_good
-        last_good = found[0]
+        first_good = found.good if n == 1 else first_good
+        last_good = found.good
         megabytes, opening = on_disk(saved)
         print(
-            f"session {n}: {found[0]} of {args.queries} images found in the map before, {found[1]} wrong"
-            f" ({1e3 * found[2]:.0f} ms each); {joined} loops, {forgotten} keyframes forgotten;"
-            f" {1e3 * session_error(saved, truth, session):.1f} mm off; {len(saved)} keyframes,"
+            f"session {n}: in the map before, of {args.queries}: {found}; {joined} loops, {forgotten} keyframes"
+            f" forgotten; {1e3 * session_error(saved, truth, session):.1f} mm off; {len(saved)} keyframes,"
             f" {len(saved.snapshot.pt_ids)} points, {megabytes:.1f} MB, opened in {opening:.2f} s; update {took:.1f} s",
             flush=True,
         )

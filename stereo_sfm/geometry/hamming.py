@@ -36,3 +36,19 @@ def hamming(a, i, b, j):
         + _popcount(a[i, 2] ^ b[j, 2])
         + _popcount(a[i, 3] ^ b[j, 3])
     )
+
+
+@inner
+def hamming_to_all(a, i, columns, out):
+    """Number of bits in which row i of a (N, 4) and each column of `columns` (4, M) differ: out (M,) int16.
+
+    Words in columns let the processor count those of several descriptors at once.
+    """
+    a0, a1, a2, a3 = a[i, 0], a[i, 1], a[i, 2], a[i, 3]
+    for j in range(columns.shape[1]):
+        out[j] = (
+            _popcount(a0 ^ columns[0, j])
+            + _popcount(a1 ^ columns[1, j])
+            + _popcount(a2 ^ columns[2, j])
+            + _popcount(a3 ^ columns[3, j])
+        )

@@ -17,6 +17,7 @@ from stereo_sfm.loop import p3p, pose_kernels
 from stereo_sfm.types import F64, I64, Bool
 
 CHI2_2DOF_95 = 5.991
+IDENTITY, DAMPING = np.eye(4), 1e-9 * np.eye(6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,13 +89,11 @@ def _distinct_triples(rng: np.random.Generator, n: int, count: int) -> I64:
 
 def consistent(b_T_a: F64, matches: Matches, rig: Rig, pixel_sigma: float) -> Bool:
     """(N,): the error is within the 95 % bound from a to b, and from b to a where b has the point."""
-    ahead = _errors(b_T_a, matches.points_a, matches.sigmas_a, matches.uv_left_b, rig.left, pixel_sigma)
-    back = _errors(se3.inverse(b_T_a), matches.points_b, matches.sigmas_b, matches.uv_left_a, rig.left, pixel_sigma)
-    return (ahead < CHI2_2DOF_95) & ~(back >= CHI2_2DOF_95)
-
-
-def _errors(t: F64, points: F64, sigmas: F64, uv: F64, camera: Camera, pixel_sigma: float) -> F64:
-    return p3p.errors(np.ascontiguousarray(t[:3]), points, sigmas, uv, camera.model_id, camera.params, pixel_sigma)
+    m, camera = matches, rig.left
+    return pose_kernels.consistent(
+        b_T_a, se3.inverse(b_T_a), m.points_a, m.sigmas_a, m.uv_left_b, m.points_b, m.sigmas_b, m.uv_left_a,
+        camera.model_id, camera.params, pixel_sigma, CHI2_2DOF_95,
+    )  # fmt: skip
 
 
 def refine_pose(b_T_a: F64, matches: Matches, rig: Rig, pixel_sigma: float, iterations: int = 10) -> Pose:
@@ -102,10 +101,11 @@ def refine_pose(b_T_a: F64, matches: Matches, rig: Rig, pixel_sigma: float, iter
     t = b_T_a
     inlier = consistent(t, matches, rig, pixel_sigma)
     hessian, rms = np.zeros((6, 6)), float("inf")
+    right_T_left = None if rig.right is None else se3.inverse(rig.left_T_right)
     for _ in range(iterations):
-        hessian, gradient, rms = _normal_equations(t, matches, rig, pixel_sigma, inlier)
+        hessian, gradient, rms = _normal_equations(t, matches, rig, right_T_left, pixel_sigma, inlier)
         try:
-            step: F64 = -np.asarray(np.linalg.solve(hessian + 1e-9 * np.eye(6), gradient), np.float64)
+            step: F64 = -np.asarray(np.linalg.solve(hessian + DAMPING, gradient), np.float64)
         except np.linalg.LinAlgError:
             break
         t = se3.exp(step) @ t
@@ -116,20 +116,19 @@ def refine_pose(b_T_a: F64, matches: Matches, rig: Rig, pixel_sigma: float, iter
     return Pose(se3.orthonormalize(t), hessian, inlier, rms)
 
 
-def _normal_equations(t: F64, m: Matches, rig: Rig, pixel_sigma: float, inlier: Bool) -> tuple[F64, F64, float]:
+def _normal_equations(
+    t: F64, m: Matches, rig: Rig, right_T_left: F64 | None, pixel_sigma: float, inlier: Bool
+) -> tuple[F64, F64, float]:
     hessian, gradient, sums = np.zeros((6, 6)), np.zeros(6), np.zeros(2)
     back = se3.inverse(t)
-    cameras: list[tuple[Camera, F64]] = [(rig.left, np.eye(4))]
-    if rig.right is not None:
-        cameras.append((rig.right, se3.inverse(rig.left_T_right)))
-    for side, (camera, cam_T_left) in enumerate(cameras):
-        for points, sigmas, uv, pose, forward in (
-            (m.points_a, m.sigmas_a, (m.uv_left_b, m.uv_right_b)[side], t, True),
-            (m.points_b, m.sigmas_b, (m.uv_left_a, m.uv_right_a)[side], back, False),
-        ):
-            turn = cam_T_left[:3, :3] if forward else -(cam_T_left @ back)[:3, :3]
-            pose_kernels.add_normal_equations(
-                t, cam_T_left @ pose, np.ascontiguousarray(turn), forward, points, sigmas, uv, inlier,
-                camera.model_id, camera.params, pixel_sigma, hessian, gradient, sums,
-            )  # fmt: skip
+
+    def add(camera: Camera, camera_T_left: F64, ahead: F64, behind: F64, uv_b: F64, uv_a: F64) -> None:
+        pose_kernels.add_normal_equations(
+            t, camera_T_left, ahead, behind, m.points_a, m.sigmas_a, uv_b, m.points_b, m.sigmas_b, uv_a,
+            inlier, camera.model_id, camera.params, pixel_sigma, hessian, gradient, sums,
+        )  # fmt: skip
+
+    add(rig.left, IDENTITY, t, back, m.uv_left_b, m.uv_left_a)
+    if rig.right is not None and right_T_left is not None:
+        add(rig.right, right_T_left, right_T_left @ t, right_T_left @ back, m.uv_right_b, m.uv_right_a)
     return hessian, gradient, float(np.sqrt(sums[0] / max(2 * sums[1], 1)))

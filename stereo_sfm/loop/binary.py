@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereo_sfm.geometry.hamming import BITS, U64, as_words, hamming
+from stereo_sfm.geometry.hamming import BITS, U64, as_words, hamming, hamming_to_all
 from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.types import F32, I32, I64, U8, Bool
 
@@ -29,16 +29,21 @@ def _two_nearest(a, b, group):
     best = np.full(a.shape[0], -1, np.int32)
     first = np.full(a.shape[0], BITS + 1, np.int32)
     second = np.full(a.shape[0], BITS + 1, np.int32)
+    columns, distances = np.ascontiguousarray(b.T), np.empty(b.shape[0], np.int16)
     for i in range(a.shape[0]):
+        hamming_to_all(a, i, columns, distances)
+        at, low, rival = -1, BITS + 1, BITS + 1
         for j in range(b.shape[0]):
-            d = hamming(a, i, b, j)
-            if d < first[i]:
-                if best[i] >= 0 and group[best[i]] != group[j]:
-                    second[i] = first[i]
-                first[i] = d
-                best[i] = j
-            elif d < second[i] and group[j] != group[best[i]]:
-                second[i] = d
+            d = distances[j]
+            if d >= rival:
+                continue
+            if d < low:
+                if at >= 0 and group[at] != group[j]:
+                    rival = low
+                low, at = d, j
+            elif group[j] != group[at]:
+                rival = d
+        best[i], first[i], second[i] = at, low, rival
     return best, first, second
 
 

@@ -29,7 +29,7 @@ from stereo_sfm.loop.sideways import (
     sideways_config,
     with_neighbours,
 )
-from stereo_sfm.loop.verification import Verdict, looks_alike, rejection, verify, verify_near, within
+from stereo_sfm.loop.verification import Verdict, corner_sightings, looks_alike, rejection, verify, verify_near, within
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.types import F64, RIG_TERMS, Keyframe, LoopResult
@@ -302,11 +302,11 @@ class LoopCloser:
         cloud = gather(centre, around, self._rig, config.disparity_sigma_px, candidate.sideways)
         rng = np.random.default_rng([config.seed, keyframe.kf_id, candidate.kf_id])
         verdict = verify(view, cloud, self._rig, config, rng, move_points=not candidate.sideways)
-        if candidate.sideways and verdict.b_T_a[2, 2] >= TURNED and not verdict.reason:
+        if verdict.reason or not candidate.sideways:  # points of views ahead are shared, not corners
+            return verdict
+        if verdict.b_T_a[2, 2] >= TURNED:
             return rejection("same_direction", verdict.inliers)  # other corners show it more precisely
-        if not candidate.sideways:  # its points are shared
-            return dataclasses.replace(verdict, sightings=np.zeros((0, 3), np.int64))
-        sightings = verdict.sightings.copy()
+        sightings = corner_sightings(view, cloud, verdict.rows)
         sightings[:, 1] = np.array([k.kf_id for k in (centre, *around, keyframe)])[sightings[:, 1]]
         return dataclasses.replace(verdict, sightings=sightings)
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -41,12 +41,6 @@ class Cloud:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def part(self, rows: slice) -> Cloud:
-        """Some of its rows, not copied."""
-        columns: dict[str, Any] = {f.name: getattr(self, f.name)[rows] for f in fields(self)}
-        columns["centre_T_kf"] = self.centre_T_kf
-        return Cloud(**columns)
-
     def seen_by_centre(self, rows: I64) -> tuple[F64, F64]:
         """Left and right pixels (N, 2) of these rows in the centre's image, NaN for views of other keyframes."""
         own = (self.view[rows] == 0)[:, None]
@@ -64,33 +58,44 @@ def gather(
     keyframes = [centre, *others]
     centre_T_kf = np.stack([se3.inverse(centre.odom_T_cam) @ k.odom_T_cam for k in keyframes])
     views = [place_view_of(keyframe, rig, disparity_sigma, sideways) for keyframe in keyframes]
-    cloud, count = _room(sum(len(view.ids) for view in views), centre_T_kf), 0
-    for k, view in enumerate(views):
-        ids = view.ids.copy()
-        nameless = np.flatnonzero(ids < 0)
-        ids[nameless] = -1 - k * CORNERS - nameless
-        if k and len(nameless):
-            so_far = cloud.part(slice(count))
-            rows, at = match_guided(se3.inverse(centre_T_kf[k]), view, so_far, rig, SAME_CORNER_BITS, SAME_CORNER_PX)
-            corner = view.corner[rows]
-            known, first = np.unique(so_far.ids[at[corner]], return_index=True)
-            ids[rows[corner][first]] = known
-        deep = np.flatnonzero(np.isfinite(view.points[:, 2]))
-        new = cloud.part(slice(count, count + len(deep)))
-        new.ids[:], new.view[:], new.points[:] = ids[deep], k, se3.transform(centre_T_kf[k], view.points[deep])
-        for name in ("sigmas", "descriptors", "uv_left", "uv_right", "corner", "rows"):
-            getattr(new, name)[:] = getattr(view, name)[deep]
-        count += len(deep)
-    return cloud.part(slice(count))
+    points = np.concatenate([view.points for view in views])
+    deep = np.flatnonzero(np.isfinite(points[:, 2]))
 
+    def joined(name: str) -> Any:
+        return np.concatenate([getattr(view, name) for view in views]).take(deep, axis=0)
 
-def _room(count: int, centre_T_kf: F64) -> Cloud:
-    """A cloud of so many rows to be filled in."""
-    three, two, one = (np.empty((count, n)) for n in (3, 2, 1))
-    return Cloud(
-        np.empty(count, np.int64), three, one[:, 0], np.empty((count, 32), np.uint8), two, two.copy(),
-        np.empty(count, bool), np.empty(count, np.int64), np.empty(count, np.int64), centre_T_kf,
+    view = np.repeat(np.arange(len(views)), [len(view.ids) for view in views]).take(deep)
+    points, ends = points.take(deep, axis=0), np.searchsorted(view, np.arange(len(views) + 1))
+    for t, first, end in zip(centre_T_kf, ends[:-1], ends[1:], strict=True):
+        points[first:end] = se3.transform(t, points[first:end])
+    cloud = Cloud(
+        joined("ids"), points, joined("sigmas"), joined("descriptors"), joined("uv_left"), joined("uv_right"),
+        joined("corner"), joined("rows"), view, centre_T_kf,
     )  # fmt: skip
+    cloud.ids[cloud.corner] = _name_corners(views, cloud, rig)
+    return cloud
+
+
+def _name_corners(views: Sequence[PlaceView], cloud: Cloud, rig: Rig) -> I64:
+    """Negative ids of a cloud's corners: a keyframe's corner that matches one before it has that one's."""
+    rows = np.flatnonzero(cloud.corner)
+    ends = np.searchsorted(cloud.view[rows], np.arange(len(views)), side="right")
+    points, words, kinds = cloud.points[rows], as_words(cloud.descriptors[rows]), np.ones(len(rows), bool)
+    ids = np.empty(len(rows), np.int64)
+    for k, view in enumerate(views):
+        count = int(view.corner.sum())  # they come first
+        names, before = -1 - k * CORNERS - np.arange(count), ends[k - 1] if k else 0
+        if before:
+            uv = rig.left.project(se3.transform(se3.inverse(cloud.centre_T_kf[k]), points[:before]))
+            best = _nearest_within(
+                view.uv_left[:count], as_words(view.descriptors[:count]), view.corner[:count],
+                uv, words[:before], kinds[:before], SAME_CORNER_PX, SAME_CORNER_BITS,
+            )  # fmt: skip
+            matched = np.flatnonzero(best >= 0)
+            known, first = np.unique(ids[best[matched]], return_index=True)
+            names[matched[first]] = known
+        ids[before : ends[k]] = names[np.isfinite(view.points[:count, 2])]
+    return ids
 
 
 def match_guided(
@@ -126,11 +131,11 @@ def _nearest_within(uv_b, words_b, kind_b, uv_a, words_a, kind_a, radius, max_di
         for line in range(top, bottom if left < right else top):
             for at in range(starts[line * shape[0] + left], starts[line * shape[0] + right]):
                 i = members[at]
+                d = hamming(words_b, i, words_a, j)  # first: that hardly any passes is foreseen
+                if d > max_distance or kind_b[i] != kind_a[j]:
+                    continue
                 if abs(uv_b[i, 0] - uv_a[j, 0]) > radius or abs(uv_b[i, 1] - uv_a[j, 1]) > radius:
                     continue
-                if kind_b[i] != kind_a[j]:
-                    continue
-                d = hamming(words_b, i, words_a, j)
                 if d < low[i]:
                     low[i] = d
                     best[i] = j

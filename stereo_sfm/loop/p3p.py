@@ -188,18 +188,6 @@ def squared_error(t, point, range_sigma, uv, model, params, pixel_sigma):
     return (ru * ru + rv * rv - along * along / (s2 + du * du + dv * dv)) / s2
 
 
-@njit
-def errors(t, points, sigmas, uv, model, params, pixel_sigma):
-    """`squared_error` of every row; NaN where the row has no point or no observation."""
-    out = np.empty(points.shape[0])
-    for i in range(points.shape[0]):
-        if math.isfinite(points[i, 0]) and math.isfinite(uv[i, 0]):
-            out[i] = squared_error(t, points[i], sigmas[i], uv[i], model, params, pixel_sigma)
-        else:
-            out[i] = math.nan
-    return out
-
-
 @inner
 def inverse34(t):
     """Inverse of a rigid (3, 4) transform."""

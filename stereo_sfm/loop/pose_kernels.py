@@ -1,4 +1,4 @@
-"""Compiled normal equations of a relative pose (loop/absolute_pose.py)."""
+"""Compiled normal equations and inliers of a relative pose (loop/absolute_pose.py)."""
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false
 
@@ -8,22 +8,56 @@ import math
 
 import numpy as np
 
-from stereo_sfm.geometry.kernels import njit, project_one
+from stereo_sfm.geometry.kernels import inner, njit, project_one
 from stereo_sfm.geometry.se3_kernels import transform_point
+from stereo_sfm.loop.p3p import squared_error
+
+
+@njit
+def consistent(t, back, points_a, sigmas_a, uv_b, points_b, sigmas_b, uv_a, model, params, pixel_sigma, limit):
+    """(N,): the squared error over its variance is below `limit` from a to b, and from b to a where that is known.
+
+    Args:
+        t, back: (4, 4) b_T_a and its inverse. The other columns as in `absolute_pose.Matches`, of the left images.
+    """
+    out = np.zeros(points_a.shape[0], np.bool_)
+    for i in range(points_a.shape[0]):
+        if math.isfinite(points_a[i, 0]) and math.isfinite(uv_b[i, 0]):
+            out[i] = squared_error(t, points_a[i], sigmas_a[i], uv_b[i], model, params, pixel_sigma) < limit
+        if out[i] and math.isfinite(points_b[i, 0]) and math.isfinite(uv_a[i, 0]):
+            out[i] = not squared_error(back, points_b[i], sigmas_b[i], uv_a[i], model, params, pixel_sigma) >= limit
+    return out
 
 
 @njit
 def add_normal_equations(
-    t, camera_T_source, turn, forward, points, sigmas, uv, use, model, params, pixel_sigma, hessian, gradient, sums
-):
-    """Adds the information of points seen in one image about exp(xi) @ t to hessian (6, 6), gradient (6,) and sums.
+    t, camera_T_left, ahead, behind, points_a, sigmas_a, uv_b, points_b, sigmas_b, uv_a,
+    use, model, params, pixel_sigma, hessian, gradient, sums,
+):  # fmt: skip
+    """Adds what one camera's images of a and b tell about exp(xi) @ t to hessian (6, 6), gradient (6,) and sums (2,).
 
     Args:
-        t: (4, 4) b_T_a. camera_T_source: (4, 4) from the points' frame into the camera.
-        turn: (3, 3) derivative of the point in the camera by the point in b.
+        t: (4, 4) b_T_a. camera_T_left: (4, 4). ahead, behind: camera_T_left @ t, and @ inverse(t).
+        The columns up to `use` (N,) as in `absolute_pose.Matches`, the pixels of this camera.
+        sums: squared normalised errors, and the number of points.
+    """
+    _add(t, ahead, camera_T_left, True, points_a, sigmas_a, uv_b, use, model, params, pixel_sigma,
+         hessian, gradient, sums)  # fmt: skip
+    _add(t, behind, -behind, False, points_b, sigmas_b, uv_a, use, model, params, pixel_sigma,
+         hessian, gradient, sums)  # fmt: skip
+
+
+@inner
+def _add(
+    t, camera_T_source, turn, forward, points, sigmas, uv, use, model, params, pixel_sigma, hessian, gradient, sums
+):
+    """As `add_normal_equations`, from points seen in one image.
+
+    Args:
+        camera_T_source: (4, 4) from the points' frame into the camera.
+        turn: its upper left (3, 3) are the derivative of the point in the camera by the point in b.
         forward: the points are in a, and t takes them to b; else they are in b.
         points, sigmas, uv, use: (N, 3), (N,) metres along the ray, (N, 2) px, (N,); NaN where unknown.
-        sums: (2,) squared normalised errors, and the number of points.
     """
     s2 = pixel_sigma * pixel_sigma
     j = np.empty((2, 6))

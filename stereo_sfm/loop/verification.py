@@ -36,8 +36,8 @@ class Verdict:
     pairs: I64  # (M, 2) point ids: candidate's, camera's; corners that are not map points are left out
     inliers: int  # corners that agree with the pose
     share: float  # of the camera's corners that are inliers
-    # (S, 3) of the inliers among the corners: number of the corner, keyframe of the cloud (-1: camera), row there
-    sightings: I64 = field(default_factory=lambda: np.zeros((0, 3), np.int64))
+    rows: I64 = field(default_factory=lambda: np.zeros((0, 2), np.int64))  # (I, 2) of the inliers: of cloud and view
+    sightings: I64 = field(default_factory=lambda: np.zeros((0, 3), np.int64))  # see `corner_sightings`; if asked for
 
 
 def rejection(reason: str, inliers: int = 0) -> Verdict:
@@ -108,11 +108,16 @@ def verify_near(
         b_T_a = refine_with_points(b_T_a, view, cloud, rows_b, rows_a, rig, config)
     pairs = np.stack([cloud.ids[rows_a], view.ids[rows_b]], axis=1)
     pairs = pairs[(pairs >= 0).all(axis=1)]
-    return Verdict("", b_T_a, pose.information, pairs, inliers, share, corner_sightings(view, cloud, rows_b, rows_a))
+    return Verdict("", b_T_a, pose.information, pairs, inliers, share, np.stack([rows_a, rows_b], axis=1))
 
 
-def corner_sightings(view: PlaceView, cloud: Cloud, rows_b: I64, rows_a: I64) -> I64:
-    """(S, 3) where matched corners are seen, as in `Verdict`: by the camera and by all keyframes of the cloud."""
+def corner_sightings(view: PlaceView, cloud: Cloud, rows: I64) -> I64:
+    """Where the corners among the inliers (I, 2) are seen, by the camera and by all keyframes of the cloud.
+
+    Returns:
+        (S, 3) number of the corner, keyframe of the cloud (-1: camera), row there.
+    """
+    rows_a, rows_b = rows.T
     corner = view.corner[rows_b]
     ids, first = np.unique(cloud.ids[rows_a[corner]], return_index=True)
     camera = np.stack([np.arange(len(ids)), np.full(len(ids), -1), view.rows[rows_b[corner][first]]], axis=1)

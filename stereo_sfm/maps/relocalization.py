@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,6 +34,7 @@ AMBIGUITY_RATIO = 0.75  # a result is ambiguous if another place has this share 
 CONFIDENCE_FACTOR = 2.0  # times the required inliers: no further candidates or confirmation needed
 CONFIDENT_SHARE = 0.4  # of the corners ahead and beside; places that only look alike have 0.3 at most
 MIN_RANGE_SIGMA_M = 0.003
+KEPT = 64  # newest clouds: a place found ahead is a candidate beside, and cameras ask from near where they were
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +73,7 @@ class Relocalizer:
         self._map, self._rig, self._vocabulary = snapshot, rig, vocabulary
         self._keyframes = snapshot.keyframes()
         self._described = np.flatnonzero([k.described for k in self._keyframes])
+        self._undescribed = np.flatnonzero([not k.described for k in self._keyframes])
         self._near_share = config.min_inlier_share
         self._config = dataclasses.replace(
             config,
@@ -86,6 +89,7 @@ class Relocalizer:
         self._seen = scipy.sparse.csr_array((ones, (snapshot.obs_kf, snapshot.obs_pt)), shape=shape)
         self._sees = self._seen.tocsc()
         self._views = np.maximum(np.bincount(snapshot.obs_pt, minlength=shape[1]), 1)
+        self._cloud = functools.lru_cache(maxsize=KEPT)(self._gather)
         self._database, self._side_database = PlaceDatabase(len(vocabulary)), PlaceDatabase(len(vocabulary))
         self._fronts = Fronts(rig.left)
         self._has_sides = any(len(k.sides) >= MIN_CORNERS for k in self._keyframes)
@@ -125,14 +129,14 @@ class Relocalizer:
     def _with_ahead(self, keyframe: Keyframe, beside: Location) -> Location:
         """What is ahead says to a pose found by the shelves beside."""
         row = self._row(beside)
-        ahead = self._verify_near(keyframe, beside.map_T_cam, row, self.cloud(row), False).inliers
+        ahead = self._verify_near(keyframe, beside.map_T_cam, row, self._cloud(row, False), False).inliers
         return dataclasses.replace(beside, others=ahead)
 
     def _with_beside(self, keyframe: Keyframe, row: int, ahead: Location) -> Location:
         """What the shelves beside say to a pose found ahead: rows of lamps look alike one lamp further on, too."""
         if len(keyframe.sides) < MIN_CORNERS:
             return dataclasses.replace(ahead, confident=ahead.confident and not self._has_sides)
-        cloud = self.cloud(row, sideways=True)
+        cloud = self._cloud(row, True)
         if cloud.corner.sum() < MIN_CORNERS:
             return ahead
         beside = self._verify_near(keyframe, ahead.map_T_cam, row, cloud, True).inliers
@@ -149,7 +153,7 @@ class Relocalizer:
         reason = "no_candidate"
         for row in self._places(database.scores(bag)):
             rng = np.random.default_rng([config.seed, row])
-            verdict = verify(view, self.cloud(row, sideways), self._rig, config, rng, move_points=False)
+            verdict = verify(view, self._cloud(row, sideways), self._rig, config, rng, move_points=False)
             if verdict.reason:
                 reason = verdict.reason if reason == "no_candidate" else reason
                 continue
@@ -169,7 +173,7 @@ class Relocalizer:
         return beside if beside.found else ahead
 
     def _search_near(self, keyframe: Keyframe, guess: F64, row: int, sideways: bool) -> Location:
-        verdict = self._verify_near(keyframe, guess, row, self.cloud(row, sideways), sideways)
+        verdict = self._verify_near(keyframe, guess, row, self._cloud(row, sideways), sideways)
         if verdict.reason:
             return not_found(verdict.reason, verdict.inliers)
         return self._choose([self._location(row, verdict, self._near_share, sideways)], "")
@@ -180,12 +184,12 @@ class Relocalizer:
         view = place_view_of(keyframe, self._rig, config.disparity_sigma_px, sideways)
         return verify_near(se3.inverse(guess) @ self._map.map_T_kf[row], view, cloud, self._rig, config)
 
-    def cloud(self, row: int, sideways: bool = False) -> Cloud:
+    def _gather(self, row: int, sideways: bool) -> Cloud:
         """The points of a keyframe row and its neighbours, in its camera frame."""
-        shared = self._sees[:, self._seen.indices[self._seen.indptr[row] : self._seen.indptr[row + 1]]].sum(axis=1)
+        shared = self._shared(row)
+        shared[self._undescribed] = 0
         shared[row] = shared.max() + 1
-        shared[np.setdiff1d(np.arange(len(shared)), np.append(self._described, row))] = 0
-        order = np.lexsort((np.arange(len(shared)), -shared))[: self._config.relocalize_keyframes]
+        order = np.argsort(-shared, kind="stable")[: self._config.relocalize_keyframes]
         order = order[shared[order] > 0]
         centre, *others = (self._keyframes[k] for k in order.tolist())
         cloud = gather(centre, others, self._rig, self._config.disparity_sigma_px, sideways)
@@ -194,6 +198,14 @@ class Relocalizer:
         sigmas = cloud.sigmas.copy()
         sigmas[mapped] = np.maximum(sigmas[mapped] / np.sqrt(self._views[at]), MIN_RANGE_SIGMA_M)
         return dataclasses.replace(cloud, sigmas=sigmas)
+
+    def _shared(self, row: int) -> I64:
+        """(K,) points that each keyframe shares with that of a row."""
+        seen, sees = self._seen, self._sees
+        points = seen.indices[seen.indptr[row] : seen.indptr[row + 1]]
+        first, count = sees.indptr[points], sees.indptr[points + 1] - sees.indptr[points]
+        at = np.arange(count.sum()) + np.repeat(first - np.cumsum(count) + count, count)
+        return np.bincount(sees.indices[at], minlength=len(self._keyframes))
 
     def _places(self, scores: F64) -> list[int]:
         """The best rows, each of another place; the score of a place includes its temporal neighbours."""
