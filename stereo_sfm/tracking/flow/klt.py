@@ -22,14 +22,10 @@ import numpy as np
 
 from stereo_sfm.geometry.kernels import inner, njit
 from stereo_sfm.geometry.small_matrix import invert_symmetric
+from stereo_sfm.tracking.flow.bilinear import FLAT_SIZE, SIZE, STRIDE, WIDE_SIZE, sample, sample_wide
 from stereo_sfm.types import U8
 
-SIZE = 16
 HALF = 7.5  # from the centre of a window to its first sample
-STRIDE = SIZE + 4
-FLAT_SIZE = SIZE * STRIDE
-WIDE_SIZE = (SIZE + 2) * STRIDE
-RAW_SIZE = (SIZE + 4) * STRIDE
 FINE, COARSE = 0.01, 0.1  # px, last step of a translation: in the image itself, and where a finer level follows
 MAX_REACH = 60.0  # px from the centre of a warped window
 TRACKED, OUTSIDE, FLAT, DIVERGED, UNLIKE = 0, 1, 2, 3, 4  # result for a point
@@ -90,37 +86,6 @@ def _dot(a, b, tmp):
     return ((tmp[0] + tmp[4]) + (tmp[2] + tmp[6])) + ((tmp[1] + tmp[5]) + (tmp[3] + tmp[7]))
 
 
-@njit
-def _sample(image, u, v, raw, out):
-    """Bilinear window whose first sample is at (u, v); the caller has checked that it lies inside."""
-    iu, iv = int(math.floor(u)), int(math.floor(v))
-    fu, fv = u - iu, v - iv
-    w00, w01 = np.float32((1 - fu) * (1 - fv)), np.float32(fu * (1 - fv))
-    w10, w11 = np.float32((1 - fu) * fv), np.float32(fu * fv)
-    for i in range(SIZE + 1):
-        row = image[iv + i, iu : iu + SIZE + 1]
-        for j in range(SIZE + 1):
-            raw[i * STRIDE + j] = np.float32(row[j])
-    for m in range(FLAT_SIZE):
-        out[m] = w00 * raw[m] + w01 * raw[m + 1] + w10 * raw[m + STRIDE] + w11 * raw[m + STRIDE + 1]
-
-
-@inner
-def _sample_wide(image, u, v, raw, out):
-    """As `_sample`, with one sample more on each side: first sample at (u - 1, v - 1), SIZE + 2 rows."""
-    u, v = u - 1, v - 1
-    iu, iv = int(math.floor(u)), int(math.floor(v))
-    fu, fv = u - iu, v - iv
-    w00, w01 = np.float32((1 - fu) * (1 - fv)), np.float32(fu * (1 - fv))
-    w10, w11 = np.float32((1 - fu) * fv), np.float32(fu * fv)
-    for i in range(SIZE + 3):
-        row = image[iv + i, iu : iu + SIZE + 3]
-        for j in range(SIZE + 3):
-            raw[i * STRIDE + j] = np.float32(row[j])
-    for m in range(WIDE_SIZE):
-        out[m] = w00 * raw[m] + w01 * raw[m + 1] + w10 * raw[m + STRIDE] + w11 * raw[m + STRIDE + 1]
-
-
 @inner
 def _template(image, u, v, weights, raw, wide, tmp, patch, gx, gy):
     """Patch around (u, v), centred, and its weighted, centred gradients by central differences.
@@ -129,7 +94,7 @@ def _template(image, u, v, weights, raw, wide, tmp, patch, gx, gy):
     multiplied by the weights: their dot product with a window is the right-hand side, whatever the window's mean.
     """
     half = np.float32(0.5)
-    _sample_wide(image, u - HALF, v - HALF, raw, wide)
+    sample_wide(image, u - HALF, v - HALF, wide)
     for m in range(FLAT_SIZE):
         patch[m] = wide[m + STRIDE + 1]
         gx[m] = half * (wide[m + STRIDE + 2] - wide[m + STRIDE])
@@ -181,7 +146,7 @@ def track_translation(prev, cur, uv_prev, uv_cur, first_level, last_level, itera
     n = uv_prev.shape[0]
     status = np.zeros(n, np.int8)
     ncc = np.zeros(n, np.float32)
-    raw = np.zeros(RAW_SIZE, np.float32)
+    raw = np.zeros(FLAT_SIZE, np.float32)
     tmp = np.zeros(FLAT_SIZE, np.float32)
     patch = np.zeros(FLAT_SIZE, np.float32)
     gx = np.zeros(FLAT_SIZE, np.float32)
@@ -215,7 +180,7 @@ def track_translation(prev, cur, uv_prev, uv_cur, first_level, last_level, itera
                 if not _inside(target, cu, cv, HALF + 0.5):
                     state = OUTSIDE
                     break
-                _sample(target, cu - HALF, cv - HALF, raw, window)
+                sample(target, cu - HALF, cv - HALF, window)
                 if iteration == 0 or iteration == 2:
                     _, contrast_c, _ = _compare(window, patch, weights, raw, tmp)
                     gain = min(max(contrast / contrast_c, 0.4), 2.5)
@@ -234,7 +199,7 @@ def track_translation(prev, cur, uv_prev, uv_cur, first_level, last_level, itera
                 state = DIVERGED
             if state == TRACKED and level == last_level:
                 if _inside(target, cu, cv, HALF + 0.5):
-                    _sample(target, cu - HALF, cv - HALF, raw, window)
+                    sample(target, cu - HALF, cv - HALF, window)
                     _, contrast_c, cross = _compare(window, patch, weights, raw, tmp)
                     ncc[k] = cross / (contrast * contrast_c)
                     if ncc[k] < min_ncc:
@@ -264,7 +229,7 @@ def make_patches(pyramid, uv, slots, weights, coordinates, patch, gradients, inv
     """
     n = uv.shape[0]
     good = np.zeros(n, np.bool_)
-    raw = np.zeros(RAW_SIZE, np.float32)
+    raw = np.zeros(FLAT_SIZE, np.float32)
     wide = np.zeros(WIDE_SIZE + STRIDE, np.float32)
     tmp = np.zeros(FLAT_SIZE, np.float32)
     jac = np.zeros((6, FLAT_SIZE), np.float32)
@@ -405,7 +370,7 @@ def track_affine(
     ncc = np.zeros(n, np.float32)
     window = np.zeros(FLAT_SIZE, np.float32)  # zero beyond the samples, always
     error = np.zeros(FLAT_SIZE, np.float32)
-    raw = np.zeros(RAW_SIZE, np.float32)
+    raw = np.zeros(FLAT_SIZE, np.float32)
     tmp = np.zeros(FLAT_SIZE, np.float32)
     bx = np.zeros(FLAT_SIZE, np.float32)
     b = np.zeros(6)

@@ -18,18 +18,8 @@ import numpy as np
 
 from stereo_sfm.geometry.kernels import njit, project_one, unproject_one
 from stereo_sfm.geometry.small_matrix import solve_symmetric
-from stereo_sfm.tracking.flow.klt import (
-    FLAT_SIZE,
-    HALF,
-    RAW_SIZE,
-    SIZE,
-    STRIDE,
-    WIDE_SIZE,
-    _dot,
-    _inside,
-    _sample,
-    _sample_wide,
-)
+from stereo_sfm.tracking.flow.bilinear import FLAT_SIZE, SIZE, STRIDE, WIDE_SIZE, sample, sample_wide
+from stereo_sfm.tracking.flow.klt import HALF, _dot, _inside
 
 CELL = 4  # px, side of the cells whose residuals are tested
 CELLS = SIZE // CELL
@@ -71,7 +61,7 @@ def fit_planes(left, right, uv, uv_right, model_r, params_r, right_T_left, weigh
     n = uv.shape[0]
     out = uv_right.copy()
     misfit, sigma = np.full(n, np.inf), np.full(n, np.inf)
-    raw, tmp = np.zeros(RAW_SIZE, np.float32), np.zeros(FLAT_SIZE, np.float32)
+    tmp = np.zeros(FLAT_SIZE, np.float32)
     wide, window = np.zeros(WIDE_SIZE + STRIDE, np.float32), np.zeros(FLAT_SIZE, np.float32)
     patch, gradient2 = np.zeros(FLAT_SIZE, np.float32), np.zeros(FLAT_SIZE, np.float32)
     jac, weighted = np.zeros((4, FLAT_SIZE), np.float32), np.zeros(FLAT_SIZE, np.float32)
@@ -84,8 +74,8 @@ def fit_planes(left, right, uv, uv_right, model_r, params_r, right_T_left, weigh
         eu, ev = _epipolar(model_r, params_r, right_T_left, ur, vr)
         if math.isnan(eu):
             continue
-        _sample_wide(left, u - HALF, v - HALF, raw, wide)
-        _sample(right, ur - HALF, vr - HALF, raw, window)
+        sample_wide(left, u - HALF, v - HALF, wide)
+        sample(right, ur - HALF, vr - HALF, window)
         a, b = np.float32(eu), np.float32(ev)
         for m in range(FLAT_SIZE):
             patch[m] = wide[m + STRIDE + 1]

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 
-from stereo_sfm.tracking.flow import klt
+from stereo_sfm.tracking.flow.bilinear import FLAT_SIZE
 from stereo_sfm.tracking.flow.window_curvature import RAYS
 from stereo_sfm.types import F32, F64, I32, I64, Bool
 
@@ -53,8 +53,8 @@ class Patches:
     """First appearances of points, in reusable slots."""
 
     def __init__(self, capacity: int) -> None:
-        self.patch: F32 = np.zeros((capacity, klt.FLAT_SIZE), np.float32)
-        self.gradients: F32 = np.zeros((capacity, 2, klt.FLAT_SIZE), np.float32)
+        self.patch: F32 = np.zeros((capacity, FLAT_SIZE), np.float32)
+        self.gradients: F32 = np.zeros((capacity, 2, FLAT_SIZE), np.float32)
         self.inverse_normal: F64 = np.zeros((capacity, 6, 6))
         self.contrast: F64 = np.zeros(capacity)
         self.bending: F64 = np.zeros((capacity, 6, 6))
