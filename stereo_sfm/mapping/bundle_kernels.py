@@ -18,7 +18,7 @@ Inner loops index arrays directly, and rows that are read together are adjacent:
 arithmetic on it.
 """
 
-# pyright: reportUnknownParameterType=false, reportMissingParameterType=false
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportCallIssue=false
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ import numpy as np
 
 from stereo_sfm.geometry.kernels import inner, njit, project_one
 from stereo_sfm.geometry.se3_kernels import compose_into, exp_into
+from stereo_sfm.mapping.block_product import subtract_product
 
 UNPROJECTABLE = 1e6  # chi2 of a point outside the camera's field of view: without gradient, so such steps are rejected
 
@@ -414,7 +415,7 @@ def reduce(starts, obs_kf, free, rot, lin, h_inv, b_point, most, blocks, slots, 
     a_all, _, p_all, _ = lin
     w = np.zeros((max(most, 1), 18))
     row = np.zeros(max(most, 1), np.int64)
-    y = np.zeros(18)
+    y = np.zeros((1, 18))
     i = 0
     for pt in range(starts.shape[0] - 1):
         n = 0
@@ -433,21 +434,14 @@ def reduce(starts, obs_kf, free, rot, lin, h_inv, b_point, most, blocks, slots, 
             for k in range(6):
                 w0, w1, w2 = w[m, k], w[m, 6 + k], w[m, 12 + k]
                 y0, y1, y2 = w0 * h0 + w1 * h1 + w2 * h2, w0 * h1 + w1 * h3 + w2 * h4, w0 * h2 + w1 * h4 + w2 * h5
-                y[3 * k], y[3 * k + 1], y[3 * k + 2] = y0, y1, y2
+                y[0, k], y[0, 6 + k], y[0, 12 + k] = y0, y1, y2
                 b[c, k] -= y0 * b0 + y1 * b1 + y2 * b2
             for q in range(m + 1):
-                slot = slots[i]
-                i += 1
                 if c >= row[q]:
-                    for k in range(6):
-                        y0, y1, y2 = y[3 * k], y[3 * k + 1], y[3 * k + 2]
-                        for j in range(6):
-                            blocks[slot, k, j] -= y0 * w[q, j] + y1 * w[q, 6 + j] + y2 * w[q, 12 + j]
+                    subtract_product(y, 0, w, q, blocks, slots[i])
                 if c < row[q] or (c == row[q] and m != q):  # transposed; both where one keyframe sees the point twice
-                    for k in range(6):
-                        y0, y1, y2 = y[3 * k], y[3 * k + 1], y[3 * k + 2]
-                        for j in range(6):
-                            blocks[slot, j, k] -= y0 * w[q, j] + y1 * w[q, 6 + j] + y2 * w[q, 12 + j]
+                    subtract_product(w, q, y, 0, blocks, slots[i])
+                i += 1
 
 
 @njit
