@@ -4,13 +4,9 @@ Shi & Tomasi, Good Features to Track (CVPR 1994): translation follows a feature 
 against its first appearance removes the drift, and its dissimilarity detects windows that no longer show one surface
 (an occlusion, or a depth discontinuity inside the window). Both are inverse compositional (Baker & Matthews, IJCV 56,
 2004). The brightness of a window is normalised by its mean and contrast, so that exposure jumps do not matter.
-
-Windows are SIZE x SIZE pixels around the point, stored flat with STRIDE samples a row; the extra columns make
-interpolation and central differences contiguous loops and have weight zero. Sums add halves to halves in a fixed order:
-compiled to vector instructions, yet the same bits on every run and every machine.
 """
 
-# pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportPrivateUsage=false
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportPrivateUsage=false, reportCallIssue=false
 # pyright: reportConstantRedefinition=false, reportMissingTypeArgument=false
 
 from __future__ import annotations
@@ -22,7 +18,7 @@ import numpy as np
 
 from stereo_sfm.geometry.kernels import inner, njit
 from stereo_sfm.geometry.small_matrix import invert_symmetric
-from stereo_sfm.tracking.flow.bilinear import FLAT_SIZE, SIZE, STRIDE, WIDE_SIZE, sample, sample_wide
+from stereo_sfm.tracking.flow.windows import FLAT_SIZE, SIZE, STRIDE, WIDE_SIZE, dot, sample, sample_wide
 from stereo_sfm.types import U8
 
 HALF = 7.5  # from the centre of a window to its first sample
@@ -73,21 +69,7 @@ def _inside(image, u, v, margin):
 
 
 @inner
-def _dot(a, b, tmp):
-    """Sum of a * b over a flat window."""
-    for m in range(32):
-        even = (a[m] * b[m] + a[m + 64] * b[m + 64]) + (a[m + 128] * b[m + 128] + a[m + 192] * b[m + 192])
-        odd = (a[m + 32] * b[m + 32] + a[m + 96] * b[m + 96]) + (a[m + 160] * b[m + 160] + a[m + 224] * b[m + 224])
-        tmp[m] = (even + odd) + (a[m + 256] * b[m + 256] + a[m + 288] * b[m + 288])
-    for m in range(16):
-        tmp[m] += tmp[m + 16]
-    for m in range(8):
-        tmp[m] += tmp[m + 8]
-    return ((tmp[0] + tmp[4]) + (tmp[2] + tmp[6])) + ((tmp[1] + tmp[5]) + (tmp[3] + tmp[7]))
-
-
-@inner
-def _template(image, u, v, weights, raw, wide, tmp, patch, gx, gy):
+def _template(image, u, v, weights, raw, wide, patch, gx, gy):
     """Patch around (u, v), centred, and its weighted, centred gradients by central differences.
 
     Returns mean, contrast, the 2x2 normal matrix (hxx, hxy, hyy), and the mean gradients. `gx`, `gy` are left
@@ -99,33 +81,33 @@ def _template(image, u, v, weights, raw, wide, tmp, patch, gx, gy):
         patch[m] = wide[m + STRIDE + 1]
         gx[m] = half * (wide[m + STRIDE + 2] - wide[m + STRIDE])
         gy[m] = half * (wide[m + 2 * STRIDE + 1] - wide[m + 1])
-    mean = _dot(patch, weights, tmp)
-    mx = _dot(gx, weights, tmp)
-    my = _dot(gy, weights, tmp)
+    mean = dot(patch, weights)
+    mx = dot(gx, weights)
+    my = dot(gy, weights)
     for m in range(FLAT_SIZE):
         patch[m] -= mean
         raw[m] = (gx[m] - mx) * weights[m]
-    hxx = _dot(raw, gx, tmp)
-    hxy = _dot(raw, gy, tmp)
+    hxx = dot(raw, gx)
+    hxy = dot(raw, gy)
     for m in range(FLAT_SIZE):
         gx[m] = raw[m]
         raw[m] = (gy[m] - my) * weights[m]
-    hyy = _dot(raw, gy, tmp)
+    hyy = dot(raw, gy)
     for m in range(FLAT_SIZE):
         gy[m] = raw[m]
         raw[m] = patch[m] * weights[m]
-    contrast = math.sqrt(max(_dot(raw, patch, tmp), 1e-6))
+    contrast = math.sqrt(max(dot(raw, patch), 1e-6))
     return mean, contrast, hxx, hxy, hyy, mx, my
 
 
 @njit
-def _compare(window, patch, weights, raw, tmp):
+def _compare(window, patch, weights, raw):
     """Mean and contrast of a window, and its normalised correlation times contrast with a centred patch."""
-    mean = _dot(window, weights, tmp)
+    mean = dot(window, weights)
     for m in range(FLAT_SIZE):
         raw[m] = (window[m] - mean) * weights[m]
-    cross = _dot(raw, patch, tmp)
-    variance = _dot(raw, window, tmp)
+    cross = dot(raw, patch)
+    variance = dot(raw, window)
     return mean, math.sqrt(max(variance, 1e-6)), cross
 
 
@@ -147,7 +129,6 @@ def track_translation(prev, cur, uv_prev, uv_cur, first_level, last_level, itera
     status = np.zeros(n, np.int8)
     ncc = np.zeros(n, np.float32)
     raw = np.zeros(FLAT_SIZE, np.float32)
-    tmp = np.zeros(FLAT_SIZE, np.float32)
     patch = np.zeros(FLAT_SIZE, np.float32)
     gx = np.zeros(FLAT_SIZE, np.float32)
     gy = np.zeros(FLAT_SIZE, np.float32)
@@ -167,14 +148,14 @@ def track_translation(prev, cur, uv_prev, uv_cur, first_level, last_level, itera
             if not (_inside(image, pu, pv, HALF + 1.5) and _inside(target, cu, cv, HALF + 0.5)):
                 state = OUTSIDE
                 continue
-            _, contrast, hxx, hxy, hyy, _, _ = _template(image, pu, pv, weights, raw, wide, tmp, patch, gx, gy)
+            _, contrast, hxx, hxy, hyy, _, _ = _template(image, pu, pv, weights, raw, wide, patch, gx, gy)
             det = hxx * hyy - hxy * hxy
             if contrast < min_contrast or det < 1e-3 * (hxx + hyy) * (hxx + hyy):
                 state = FLAT
                 continue
             state = TRACKED
             start_u, start_v = cu, cv
-            tx, ty = _dot(gx, patch, tmp), _dot(gy, patch, tmp)
+            tx, ty = dot(gx, patch), dot(gy, patch)
             gain = 1.0
             for iteration in range(iterations):
                 if not _inside(target, cu, cv, HALF + 0.5):
@@ -182,10 +163,10 @@ def track_translation(prev, cur, uv_prev, uv_cur, first_level, last_level, itera
                     break
                 sample(target, cu - HALF, cv - HALF, window)
                 if iteration == 0 or iteration == 2:
-                    _, contrast_c, _ = _compare(window, patch, weights, raw, tmp)
+                    _, contrast_c, _ = _compare(window, patch, weights, raw)
                     gain = min(max(contrast / contrast_c, 0.4), 2.5)
-                bx = gain * _dot(gx, window, tmp) - tx
-                by = gain * _dot(gy, window, tmp) - ty
+                bx = gain * dot(gx, window) - tx
+                by = gain * dot(gy, window) - ty
                 du = (hyy * bx - hxy * by) / det
                 dv = (hxx * by - hxy * bx) / det
                 length = math.sqrt(du * du + dv * dv)
@@ -200,7 +181,7 @@ def track_translation(prev, cur, uv_prev, uv_cur, first_level, last_level, itera
             if state == TRACKED and level == last_level:
                 if _inside(target, cu, cv, HALF + 0.5):
                     sample(target, cu - HALF, cv - HALF, window)
-                    _, contrast_c, cross = _compare(window, patch, weights, raw, tmp)
+                    _, contrast_c, cross = _compare(window, patch, weights, raw)
                     ncc[k] = cross / (contrast * contrast_c)
                     if ncc[k] < min_ncc:
                         state = UNLIKE
@@ -231,7 +212,6 @@ def make_patches(pyramid, uv, slots, weights, coordinates, patch, gradients, inv
     good = np.zeros(n, np.bool_)
     raw = np.zeros(FLAT_SIZE, np.float32)
     wide = np.zeros(WIDE_SIZE + STRIDE, np.float32)
-    tmp = np.zeros(FLAT_SIZE, np.float32)
     jac = np.zeros((6, FLAT_SIZE), np.float32)
     unweighted = np.zeros(FLAT_SIZE, np.float32)
     normal, factor = np.zeros((6, 6)), np.zeros((6, 6))
@@ -240,7 +220,7 @@ def make_patches(pyramid, uv, slots, weights, coordinates, patch, gradients, inv
             continue
         k = slots[row]
         gx, gy = gradients[k, 0], gradients[k, 1]
-        result = _template(pyramid[0], uv[row, 0], uv[row, 1], weights, raw, wide, tmp, patch[k], gx, gy)
+        result = _template(pyramid[0], uv[row, 0], uv[row, 1], weights, raw, wide, patch[k], gx, gy)
         contrast[k] = result[1]
         if contrast[k] < 1.0:
             continue
@@ -258,7 +238,7 @@ def make_patches(pyramid, uv, slots, weights, coordinates, patch, gradients, inv
             for m in range(FLAT_SIZE):
                 wide[m] = jac[a, m] * raw[m]
             for b in range(a, 6):
-                normal[a, b] = _dot(jac[b], wide, tmp)
+                normal[a, b] = dot(jac[b], wide)
                 normal[b, a] = normal[a, b]
         # The affine part is a small departure from what it was: damped by what one grey-level-noise step may do.
         damping = 0.02 * (normal[2, 2] + normal[5, 5])
@@ -276,11 +256,11 @@ def make_patches(pyramid, uv, slots, weights, coordinates, patch, gradients, inv
                 half = np.float32(1.0 if c == 1 else 0.5)
                 for m in range(FLAT_SIZE):
                     wide[m] = half * x[m] * y[m] * unweighted[m]
-                mean = _dot(weights, wide, tmp)
+                mean = dot(weights, wide)
                 for m in range(FLAT_SIZE):
                     wide[m] -= mean
                 for b in range(6):
-                    bending[k, b, 3 * a + c] = _dot(jac[b], wide, tmp)
+                    bending[k, b, 3 * a + c] = dot(jac[b], wide)
     return good
 
 
@@ -371,7 +351,6 @@ def track_affine(
     window = np.zeros(FLAT_SIZE, np.float32)  # zero beyond the samples, always
     error = np.zeros(FLAT_SIZE, np.float32)
     raw = np.zeros(FLAT_SIZE, np.float32)
-    tmp = np.zeros(FLAT_SIZE, np.float32)
     bx = np.zeros(FLAT_SIZE, np.float32)
     b = np.zeros(6)
     step = np.zeros(6)
@@ -394,7 +373,7 @@ def track_affine(
             if not _sample_affine(image, w2, cu, cv, scratch, window):
                 ok = False
                 break
-            mean, contrast_c, cross = _compare(window, patch[k], weights, raw, tmp)
+            mean, contrast_c, cross = _compare(window, patch[k], weights, raw)
             gain = np.float32(min(max(contrast[k] / contrast_c, 0.3), 3.0))
             ncc[row] = cross / (contrast[k] * contrast_c)
             for m in range(FLAT_SIZE):
@@ -402,9 +381,9 @@ def track_affine(
             for axis in range(2):
                 for m in range(FLAT_SIZE):
                     bx[m] = gradients[k, axis, m] * error[m]
-                b[3 * axis] = _dot(bx, coordinates[0], tmp)
-                b[3 * axis + 1] = _dot(bx, coordinates[1], tmp)
-                b[3 * axis + 2] = _dot(bx, coordinates[2], tmp)
+                b[3 * axis] = dot(bx, coordinates[0])
+                b[3 * axis + 1] = dot(bx, coordinates[1])
+                b[3 * axis + 2] = dot(bx, coordinates[2])
             for i in range(6):
                 for j in range(6):
                     b[i] += bending[k, i, j] * curvature[row, j]

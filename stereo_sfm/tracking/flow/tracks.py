@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 
-from stereo_sfm.tracking.flow.bilinear import FLAT_SIZE
 from stereo_sfm.tracking.flow.window_curvature import RAYS
+from stereo_sfm.tracking.flow.windows import FLAT_SIZE
 from stereo_sfm.types import F32, F64, I32, I64, Bool
 
 

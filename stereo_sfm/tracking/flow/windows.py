@@ -1,7 +1,9 @@
-"""Windows of an image between its pixels, SIZE samples a row at once.
+"""Windows of an image between its pixels, and sums over windows, SIZE samples at once.
 
-Windows are stored flat with STRIDE samples a row. Left to itself, the compiler converts the 17 pixels of a row one by
-one, which takes longer than everything else that is done with a window.
+Windows are SIZE x SIZE pixels around a point, stored flat with STRIDE samples a row; the extra columns make differences
+between neighbours contiguous loops and have weight zero. Left to itself, the compiler converts the 17 pixels of a row
+one by one and keeps partial sums in memory, which takes longer than everything else that is done with a window. Sums
+add halves to halves in a fixed order: the same bits on every run and every machine.
 """
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportCallIssue=false
@@ -22,7 +24,12 @@ STRIDE = SIZE + 4
 FLAT_SIZE = SIZE * STRIDE
 WIDE_SIZE = (SIZE + 2) * STRIDE
 INDEX = ir.IntType(64)
-BYTES, FLOATS, FIRST = (ir.VectorType(kind, SIZE) for kind in (ir.IntType(8), ir.FloatType(), ir.IntType(32)))
+BYTES, FLOATS = ir.VectorType(ir.IntType(8), SIZE), ir.VectorType(ir.FloatType(), SIZE)
+
+
+def _lanes(numbers):
+    """Of a vector, for `shuffle_vector`."""
+    return ir.VectorType(ir.IntType(32), len(numbers))(numbers)
 
 
 @intrinsic
@@ -43,13 +50,46 @@ def _interpolate(_, image, upper, lower, weights, out, to):
             pixels = builder.gep(source, [builder.add(row, INDEX(k % 2))])
             pixels = builder.load(builder.bitcast(pixels, BYTES.as_pointer()), align=1)
             weight = builder.insert_element(FLOATS(ir.Undefined), builder.extract_value(four, k), INDEX(0))
-            weight = builder.shuffle_vector(weight, FLOATS(ir.Undefined), FIRST([0] * SIZE))
+            weight = builder.shuffle_vector(weight, FLOATS(ir.Undefined), _lanes([0] * SIZE))
             product = builder.fmul(weight, builder.uitofp(pixels, FLOATS))
             total = product if total is None else builder.fadd(total, product)
         builder.store(total, builder.bitcast(builder.gep(target, [first]), FLOATS.as_pointer()), align=4)
         return context.get_dummy_value()
 
     return types.void(image, types.intp, types.intp, weights, out, types.intp), generate
+
+
+@intrinsic
+def dot(_, a, b):
+    """Sum of a * b over two flat windows, float32."""
+
+    def generate(context, builder, signature, arguments):
+        first, second = (
+            context.make_array(kind)(context, builder, array).data
+            for kind, array in zip(signature.args, arguments, strict=True)
+        )
+
+        def part(at):
+            places = (builder.gep(data, [INDEX(at)]) for data in (first, second))
+            return builder.fmul(*(builder.load(builder.bitcast(p, FLOATS.as_pointer()), align=4) for p in places))
+
+        def tree(parts):
+            while len(parts) > 1:
+                parts = [builder.fadd(*pair) for pair in zip(parts[::2], parts[1::2], strict=True)]
+            return parts[0]
+
+        def column(at):  # of samples 32 apart
+            last = builder.fadd(part(at + 256), part(at + 288))
+            return builder.fadd(tree([part(at + 64 * k + odd) for odd in (0, 32) for k in range(4)]), last)
+
+        total, size = builder.fadd(column(0), column(SIZE)), SIZE
+        while size > 1:
+            size //= 2
+            halves = (_lanes(list(range(k, k + size))) for k in (0, size))
+            total = builder.fadd(*(builder.shuffle_vector(total, total, half) for half in halves))
+        return builder.extract_element(total, INDEX(0))
+
+    return types.float32(a, b), generate
 
 
 @inner
