@@ -26,14 +26,14 @@ import math
 
 import numpy as np
 
-from stereo_sfm.geometry.kernels import inner, njit, project_one
+from stereo_sfm.geometry.kernels import inlined, inner, njit, project_one
 from stereo_sfm.geometry.se3_kernels import compose_into, exp_into
 from stereo_sfm.mapping.block_product import subtract_product
 
 UNPROJECTABLE = 1e6  # chi2 of a point outside the camera's field of view: without gradient, so such steps are rejected
 
 
-@inner
+@inlined
 def _huber(chi2, delta):
     """(cost, weight) of Huber's loss on a squared, normalised residual; delta <= 0 means squares."""
     if delta <= 0.0 or chi2 <= delta * delta:
@@ -42,7 +42,7 @@ def _huber(chi2, delta):
     return delta * (e - 0.5 * delta), delta / e
 
 
-@inner
+@inlined
 def _loss(chi2, scale, redescends):
     """(cost, weight) of Cauchy's loss of a scale in sigmas if it redescends, else of Huber's with that threshold."""
     if not redescends:
@@ -51,7 +51,7 @@ def _loss(chi2, scale, redescends):
     return 0.5 * scale2 * math.log(1.0 + chi2 / scale2), 1.0 / (1.0 + chi2 / scale2)
 
 
-@njit
+@inlined
 def _project(model, params, x, y, z, u_obs, v_obs, w):
     """Derivatives (u by x y z, v by x y z) and residuals ru, rv of one image, scaled by w, and chi2; zeros if w is 0.
 
