@@ -267,7 +267,7 @@ def _row_times_skew(row, p0, p1, p2):
     return row[1] * p2 - row[2] * p1, row[2] * p0 - row[0] * p2, row[0] * p1 - row[1] * p0
 
 
-@inner
+@inlined
 def _world_model(a, r, o, k):
     """R A R^T of observation o in keyframe k, upper triangle."""
     a0, a1, a2, a3, a4, a5 = a[o, 0], a[o, 1], a[o, 2], a[o, 3], a[o, 4], a[o, 5]
@@ -389,7 +389,7 @@ def list_pairs(starts, obs_kf, free, keys):
                     i += 1
 
 
-@inner
+@inlined
 def _cross_block(a, p, r, o, k, w, n):
     """W^T = (G^T A R^T)^T of observation o in keyframe k into w[n] (18,): column by column, six entries each."""
     a0, a1, a2, a3, a4, a5 = a[o, 0], a[o, 1], a[o, 2], a[o, 3], a[o, 4], a[o, 5]

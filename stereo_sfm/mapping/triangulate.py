@@ -15,7 +15,7 @@ import numpy as np
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
-from stereo_sfm.geometry.kernels import inner, njit, project_one
+from stereo_sfm.geometry.kernels import inlined, inner, njit, project_one
 from stereo_sfm.geometry.small_matrix import solve_symmetric
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.types import F64, I64
@@ -25,7 +25,7 @@ NEAREST, FARTHEST = 4.0, 4000.0  # baselines (a rig with one camera: of 5 cm)
 STEPS = 8
 
 
-@inner
+@inlined
 def _accumulate(seen, u_obs, v_obs, inv_sigma, m, derive, h, b):
     """Cauchy cost of a point in one image, `seen` as `project_one` returns it.
 

@@ -22,7 +22,7 @@ import math
 
 import numpy as np
 
-from stereo_sfm.geometry.kernels import inner, njit, project_one
+from stereo_sfm.geometry.kernels import inlined, inner, njit, project_one
 from stereo_sfm.geometry.se3_kernels import compose_into, exp_into
 from stereo_sfm.geometry.small_matrix import invert_symmetric, solve_symmetric
 
@@ -30,7 +30,7 @@ MAX_SIGMAS = 4.0  # change of an inverse distance while a pose is solved
 MIN_RHO = 1e-4  # 1/m
 
 
-@inner
+@inlined
 def point_residuals(pose, px, py, pz, dx, dy, dz, uv_l, uv_r, cams, right_T_left, res, jac, ray):
     """Residuals of one point in both images.
 
