@@ -18,12 +18,11 @@ import numpy as np
 
 from stereo_sfm.geometry.kernels import inner, njit
 from stereo_sfm.geometry.small_matrix import invert_symmetric
+from stereo_sfm.tracking.flow.warped_windows import HALF, sample_affine
 from stereo_sfm.tracking.flow.windows import FLAT_SIZE, SIZE, STRIDE, WIDE_SIZE, dot, sample, sample_wide
 from stereo_sfm.types import U8
 
-HALF = 7.5  # from the centre of a window to its first sample
 FINE, COARSE = 0.01, 0.1  # px, last step of a translation: in the image itself, and where a finer level follows
-MAX_REACH = 60.0  # px from the centre of a warped window
 TRACKED, OUTSIDE, FLAT, DIVERGED, UNLIKE = 0, 1, 2, 3, 4  # result for a point
 
 Pyramid = tuple[U8, ...]
@@ -264,60 +263,6 @@ def make_patches(pyramid, uv, slots, weights, coordinates, patch, gradients, inv
     return good
 
 
-@inner
-def _sample_affine(image, warp, cu, cv, scratch, out):
-    """Window at warp @ (x, y) + (cu, cv); False when it leaves the image.
-
-    In three loops of one kind each, which is what makes them fast: where the samples lie, what lies there (each pixel
-    with its right, lower and lower right neighbour in one word), and the interpolation.
-    """
-    h, w = image.shape
-    reach_u = (abs(warp[0, 0]) + abs(warp[0, 1])) * HALF
-    reach_v = (abs(warp[1, 0]) + abs(warp[1, 1])) * HALF
-    inside = cu - reach_u >= 0 and cv - reach_v >= 0 and cu + reach_u < w - 1.001 and cv + reach_v < h - 1.001
-    if not (inside and reach_u < MAX_REACH and reach_v < MAX_REACH):  # also when anything is NaN
-        return False
-    words, index, offset, quads = scratch
-    left, top = max(int(cu - reach_u - 0.01), 0), max(int(cv - reach_v - 0.01), 0)
-    columns = min(int(cu + reach_u + 0.01), w - 2) - left + 1
-    rows = min(int(cv + reach_v + 0.01), h - 2) - top + 1
-    for i in range(rows):
-        upper, lower = image[top + i, left : left + columns + 1], image[top + i + 1, left : left + columns + 1]
-        row = words[i * columns : (i + 1) * columns]
-        for j in range(columns):
-            row[j] = (
-                np.uint32(upper[j])
-                | np.uint32(upper[j + 1]) << np.uint32(8)
-                | np.uint32(lower[j]) << np.uint32(16)
-                | np.uint32(lower[j + 1]) << np.uint32(24)
-            )
-    a, b, c, d = np.float32(warp[0, 0]), np.float32(warp[0, 1]), np.float32(warp[1, 0]), np.float32(warp[1, 1])
-    du, dv = np.float32(cu - left), np.float32(cv - top)
-    stride = np.int32(columns)
-    for i in range(SIZE):
-        y = np.float32(i - HALF)
-        row_u, row_v = b * y + du, d * y + dv
-        for j in range(SIZE):
-            x = np.float32(j) - np.float32(HALF)
-            u, v = a * x + row_u, c * x + row_v
-            iu, iv = np.int32(u), np.int32(v)
-            index[i * SIZE + j] = iv * stride + iu
-            offset[0, i * SIZE + j], offset[1, i * SIZE + j] = u - np.float32(iu), v - np.float32(iv)
-    for m in range(SIZE * SIZE):
-        quads[m] = words[np.uint32(index[m])]  # unsigned: no check for negative indices
-    byte = np.uint32(255)
-    for i in range(SIZE):
-        for j in range(SIZE):
-            m = i * SIZE + j
-            quad, fu, fv = quads[m], offset[0, m], offset[1, m]
-            i00, i01 = np.float32(np.int32(quad & byte)), np.float32(np.int32(quad >> np.uint32(8) & byte))
-            i10, i11 = np.float32(np.int32(quad >> np.uint32(16) & byte)), np.float32(np.int32(quad >> np.uint32(24)))
-            upper_value = i00 + fu * (i01 - i00)
-            lower_value = i10 + fu * (i11 - i10)
-            out[i * STRIDE + j] = upper_value + fv * (lower_value - upper_value)
-    return True
-
-
 @njit
 def track_affine(
     image,
@@ -354,12 +299,6 @@ def track_affine(
     bx = np.zeros(FLAT_SIZE, np.float32)
     b = np.zeros(6)
     step = np.zeros(6)
-    scratch = (
-        np.zeros(int(2 * MAX_REACH + 3) ** 2, np.uint32),
-        np.zeros(SIZE * SIZE, np.int32),
-        np.zeros((2, SIZE * SIZE), np.float32),
-        np.zeros(SIZE * SIZE, np.uint32),
-    )
     for row in range(n):
         if not wanted[row]:
             continue
@@ -370,7 +309,7 @@ def track_affine(
         ok = True
         for _ in range(iterations):
             w2[0, 0], w2[0, 1], w2[1, 0], w2[1, 1] = a00, a01, a10, a11
-            if not _sample_affine(image, w2, cu, cv, scratch, window):
+            if not sample_affine(image, w2, cu, cv, window):
                 ok = False
                 break
             mean, contrast_c, cross = _compare(window, patch[k], weights, raw)

@@ -27,7 +27,7 @@ INDEX = ir.IntType(64)
 BYTES, FLOATS = ir.VectorType(ir.IntType(8), SIZE), ir.VectorType(ir.FloatType(), SIZE)
 
 
-def _lanes(numbers):
+def lanes(numbers):
     """Of a vector, for `shuffle_vector`."""
     return ir.VectorType(ir.IntType(32), len(numbers))(numbers)
 
@@ -50,7 +50,7 @@ def _interpolate(_, image, upper, lower, weights, out, to):
             pixels = builder.gep(source, [builder.add(row, INDEX(k % 2))])
             pixels = builder.load(builder.bitcast(pixels, BYTES.as_pointer()), align=1)
             weight = builder.insert_element(FLOATS(ir.Undefined), builder.extract_value(four, k), INDEX(0))
-            weight = builder.shuffle_vector(weight, FLOATS(ir.Undefined), _lanes([0] * SIZE))
+            weight = builder.shuffle_vector(weight, FLOATS(ir.Undefined), lanes([0] * SIZE))
             product = builder.fmul(weight, builder.uitofp(pixels, FLOATS))
             total = product if total is None else builder.fadd(total, product)
         builder.store(total, builder.bitcast(builder.gep(target, [first]), FLOATS.as_pointer()), align=4)
@@ -85,7 +85,7 @@ def dot(_, a, b):
         total, size = builder.fadd(column(0), column(SIZE)), SIZE
         while size > 1:
             size //= 2
-            halves = (_lanes(list(range(k, k + size))) for k in (0, size))
+            halves = (lanes(list(range(k, k + size))) for k in (0, size))
             total = builder.fadd(*(builder.shuffle_vector(total, total, half) for half in halves))
         return builder.extract_element(total, INDEX(0))
 
