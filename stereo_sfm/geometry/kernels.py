@@ -25,6 +25,8 @@ LIMIT = 12
 njit: Any = jit(nogil=True, error_model="numpy")
 # For kernels that only kernels call: less to compile, but Python, which finds nothing to call, would crash.
 inner: Any = jit(nogil=True, error_model="numpy", no_cpython_wrapper=True)
+# For small ones that are called for every point: a call, whose results pass through memory, takes longer than they do.
+inlined: Any = jit(nogil=True, error_model="numpy", no_cpython_wrapper=True, forceinline=True)
 
 
 @inner
@@ -44,7 +46,7 @@ def _radtan_distort(p, x, y):
     return xd, yd, jxx, jxy, jyy
 
 
-@inner
+@inlined
 def project_one(model, p, x, y, z):
     """Point in the camera -> (u, v, J00, J01, J02, J10, J11, J12), NaN outside the model's range."""
     nan = math.nan

@@ -95,7 +95,8 @@ class _Table:
         self.starts = np.searchsorted(self.pt, np.arange(len(bundle.points) + 1))
         self._left = np.ascontiguousarray(bundle.uv_left[rows], float)
         self._right = np.ascontiguousarray(bundle.uv_right[rows], float)
-        seen = np.stack([np.isfinite(self._left).all(1), np.isfinite(self._right[:, 0]) & rig.stereo], 1)
+        finite = np.isfinite(self._left)  # by columns: numpy takes ten times as long to reduce rows of two
+        seen = np.stack([finite[:, 0] & finite[:, 1], np.isfinite(self._right[:, 0]) & rig.stereo], 1)
         sigma = np.ones(seen.shape) if bundle.sigma is None else bundle.sigma[rows]
         self._weights = np.where(seen, 1.0 / sigma, 0.0)  # (M, 2)
         self.trust = np.ones(len(bundle.points))  # (P,) factor of the loss of the points' disparities
@@ -205,9 +206,9 @@ class _Solver:
         kernels.pose_blocks(self.table.kf, self.free, state.lin, h, b)
         if self.level is not None:
             self.level.add(*state.level, self.level.seen[self.moving], h, b)
-        diagonal = np.arange(6)
+        diagonal = h.reshape(-1, 36)[:, ::7]
         # A keyframe without any inlier keeps its pose: its block would be singular.
-        h[:, diagonal, diagonal] += damping * h[:, diagonal, diagonal] + 1e-12
+        diagonal += damping * diagonal + 1e-12
         return h, b
 
     def _solve_poses(self, state: _State, damping: float, blocks: tuple[F64, F64]) -> F64 | None:

@@ -18,7 +18,7 @@ Inner loops index arrays directly, and rows that are read together are adjacent:
 arithmetic on it.
 """
 
-# pyright: reportUnknownParameterType=false, reportMissingParameterType=false
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportCallIssue=false
 
 from __future__ import annotations
 
@@ -26,13 +26,14 @@ import math
 
 import numpy as np
 
-from stereo_sfm.geometry.kernels import inner, njit, project_one
+from stereo_sfm.geometry.kernels import inlined, inner, njit, project_one
 from stereo_sfm.geometry.se3_kernels import compose_into, exp_into
+from stereo_sfm.mapping.block_product import subtract_product
 
 UNPROJECTABLE = 1e6  # chi2 of a point outside the camera's field of view: without gradient, so such steps are rejected
 
 
-@inner
+@inlined
 def _huber(chi2, delta):
     """(cost, weight) of Huber's loss on a squared, normalised residual; delta <= 0 means squares."""
     if delta <= 0.0 or chi2 <= delta * delta:
@@ -41,7 +42,7 @@ def _huber(chi2, delta):
     return delta * (e - 0.5 * delta), delta / e
 
 
-@inner
+@inlined
 def _loss(chi2, scale, redescends):
     """(cost, weight) of Cauchy's loss of a scale in sigmas if it redescends, else of Huber's with that threshold."""
     if not redescends:
@@ -50,7 +51,7 @@ def _loss(chi2, scale, redescends):
     return 0.5 * scale2 * math.log(1.0 + chi2 / scale2), 1.0 / (1.0 + chi2 / scale2)
 
 
-@njit
+@inlined
 def _project(model, params, x, y, z, u_obs, v_obs, w):
     """Derivatives (u by x y z, v by x y z) and residuals ru, rv of one image, scaled by w, and chi2; zeros if w is 0.
 
@@ -266,7 +267,7 @@ def _row_times_skew(row, p0, p1, p2):
     return row[1] * p2 - row[2] * p1, row[2] * p0 - row[0] * p2, row[0] * p1 - row[1] * p0
 
 
-@inner
+@inlined
 def _world_model(a, r, o, k):
     """R A R^T of observation o in keyframe k, upper triangle."""
     a0, a1, a2, a3, a4, a5 = a[o, 0], a[o, 1], a[o, 2], a[o, 3], a[o, 4], a[o, 5]
@@ -388,7 +389,7 @@ def list_pairs(starts, obs_kf, free, keys):
                     i += 1
 
 
-@inner
+@inlined
 def _cross_block(a, p, r, o, k, w, n):
     """W^T = (G^T A R^T)^T of observation o in keyframe k into w[n] (18,): column by column, six entries each."""
     a0, a1, a2, a3, a4, a5 = a[o, 0], a[o, 1], a[o, 2], a[o, 3], a[o, 4], a[o, 5]
@@ -414,7 +415,7 @@ def reduce(starts, obs_kf, free, rot, lin, h_inv, b_point, most, blocks, slots, 
     a_all, _, p_all, _ = lin
     w = np.zeros((max(most, 1), 18))
     row = np.zeros(max(most, 1), np.int64)
-    y = np.zeros(18)
+    y = np.zeros((1, 18))
     i = 0
     for pt in range(starts.shape[0] - 1):
         n = 0
@@ -433,21 +434,14 @@ def reduce(starts, obs_kf, free, rot, lin, h_inv, b_point, most, blocks, slots, 
             for k in range(6):
                 w0, w1, w2 = w[m, k], w[m, 6 + k], w[m, 12 + k]
                 y0, y1, y2 = w0 * h0 + w1 * h1 + w2 * h2, w0 * h1 + w1 * h3 + w2 * h4, w0 * h2 + w1 * h4 + w2 * h5
-                y[3 * k], y[3 * k + 1], y[3 * k + 2] = y0, y1, y2
+                y[0, k], y[0, 6 + k], y[0, 12 + k] = y0, y1, y2
                 b[c, k] -= y0 * b0 + y1 * b1 + y2 * b2
             for q in range(m + 1):
-                slot = slots[i]
-                i += 1
                 if c >= row[q]:
-                    for k in range(6):
-                        y0, y1, y2 = y[3 * k], y[3 * k + 1], y[3 * k + 2]
-                        for j in range(6):
-                            blocks[slot, k, j] -= y0 * w[q, j] + y1 * w[q, 6 + j] + y2 * w[q, 12 + j]
+                    subtract_product(y, 0, w, q, blocks, slots[i])
                 if c < row[q] or (c == row[q] and m != q):  # transposed; both where one keyframe sees the point twice
-                    for k in range(6):
-                        y0, y1, y2 = y[3 * k], y[3 * k + 1], y[3 * k + 2]
-                        for j in range(6):
-                            blocks[slot, j, k] -= y0 * w[q, j] + y1 * w[q, 6 + j] + y2 * w[q, 12 + j]
+                    subtract_product(w, q, y, 0, blocks, slots[i])
+                i += 1
 
 
 @njit

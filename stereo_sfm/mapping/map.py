@@ -168,10 +168,10 @@ class Map:
         """(N,) rows of the keyframes that share points with one, and (N,) how many: most first, then oldest first."""
         keyframes, table = self.keyframes, self.observations
         rows, counts = map_kernels.shared(
-            row, keyframes.obs_first, keyframes.obs_count, self.points.head, table.following, table.pt, table.kf
-        )
-        rows, counts = rows[counts >= at_least], counts[counts >= at_least]
-        order = np.lexsort((rows, -counts))
+            row, at_least, keyframes.obs_first, keyframes.obs_count, self.points.head, table.following, table.pt,
+            table.kf,
+        )  # fmt: skip
+        order = np.argsort(rows - counts * len(keyframes))
         return rows[order], counts[order]
 
     def observations_of_points(self, rows: I64) -> I64:

@@ -72,8 +72,8 @@ def count_by_keyframe(points, head, following, obs_kf, counts):
 
 
 @njit
-def shared(row, first, count, head, following, obs_pt, obs_kf):
-    """(N,) keyframes that share points with keyframe `row`, unordered, and (N,) the number of points."""
+def shared(row, at_least, first, count, head, following, obs_pt, obs_kf):
+    """(N,) keyframes that share so many points with keyframe `row`, unordered, and (N,) the number of points."""
     counts, found = np.zeros(first.shape[0], np.int64), np.empty(first.shape[0], np.int64)
     n = 0
     for o in range(first[row], first[row] + count[row]):
@@ -86,7 +86,12 @@ def shared(row, first, count, head, following, obs_pt, obs_kf):
                     n += 1
                 counts[k] += 1
             q = following[q]
-    return found[:n], counts[found[:n]]
+    kept = 0
+    for i in range(n):
+        if counts[found[i]] >= at_least:
+            found[kept] = found[i]
+            kept += 1
+    return found[:kept], counts[found[:kept]]
 
 
 @njit

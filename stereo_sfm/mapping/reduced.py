@@ -77,8 +77,8 @@ class ReducedSystem:
 
     def _solve_dense(self, blocks: F64, b: F64) -> F64 | None:
         n = self.size
-        matrix = blocks.reshape(n, n, 6, 6).transpose(0, 2, 1, 3).reshape(6 * n, 6 * n)
-        _, step, failed = dposv(matrix, b.ravel(), lower=1)
+        columns = blocks.reshape(n, n, 6, 6).transpose(1, 3, 0, 2).reshape(6 * n, 6 * n)  # as LAPACK has them
+        _, step, failed = dposv(columns.T, b.ravel(), lower=1, overwrite_a=1)
         return None if failed else step.reshape(n, 6)
 
     def _solve_banded(self, blocks: F64, b: F64) -> F64:

@@ -9,6 +9,7 @@ about the terms with points and motion eliminated; that of several windows is su
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -89,17 +90,19 @@ def solve_window(rig: Rig, keyframes: Sequence[Keyframe], terms: F64) -> RigWind
     Args:
         rig: the calibrated rig. keyframes: in order of time. terms: (8,) initial corrections.
     """
-    problem = _problem(with_terms(rig, terms), keyframes)
+    corrected = with_terms(rig, terms)
+    problem = _problem(corrected, keyframes)
     if problem is None:
         return None
     sigma = 1.0
     for step in range(STEPS):
-        system = _System.of(with_terms(rig, terms), problem, sigma, hard=step >= 2)
+        system = _System.of(corrected, problem, sigma, hard=step >= 2)
         sigma = float(np.clip(system.noise_px, *NOISE_PX))
         terms = terms + system.step(problem, terms)
         if not np.isfinite(terms).all():
             return None
-    system = _System.of(with_terms(rig, terms), problem, sigma, hard=True)
+        corrected = with_terms(rig, terms)
+    system = _System.of(corrected, problem, sigma, hard=True)
     sigma = float(np.clip(system.noise_px, *NOISE_PX))
     information = system.information(problem, terms).with_lens_error(_turned(keyframes))
     last = keyframes[-1]
@@ -113,12 +116,18 @@ def _length_by_terms(rig: Rig, uv_left: F64, uv_right: F64) -> F64:
     Points move in the image by the step times their inverse distance rho: step ~ sum(rho flow) / sum(rho^2).
     """
     rho = inverse_distances(rig, uv_left, uv_right)
-    used = np.isfinite(rho)
-    out, steps = np.zeros(RIG_TERMS), DERIVATIVE * np.eye(RIG_TERMS)
-    for k in LENGTHENING:
-        change = inverse_distances(with_terms(rig, steps[k]), uv_left, uv_right) - rho
+    used, out = np.isfinite(rho), np.zeros(RIG_TERMS)
+    for k, changed in zip(LENGTHENING, _lengthened(rig), strict=True):
+        change = inverse_distances(changed, uv_left, uv_right) - rho
         out[k] = (rho * change)[used & np.isfinite(change)].sum()
     return -out / (DERIVATIVE * max(float((rho[used] ** 2).sum()), 1e-12))
+
+
+@functools.lru_cache(maxsize=1)
+def _lengthened(rig: Rig) -> tuple[Rig, ...]:
+    """The rig, which is the same for all windows of a run, with a little more of each of the LENGTHENING terms."""
+    steps = DERIVATIVE * np.eye(RIG_TERMS)
+    return tuple(with_terms(rig, steps[k]) for k in LENGTHENING)
 
 
 def _problem(rig: Rig, keyframes: Sequence[Keyframe]) -> _Problem | None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
-from stereo_sfm.geometry.kernels import inner, njit, project_one
+from stereo_sfm.geometry.kernels import inlined, inner, njit, project_one
 from stereo_sfm.geometry.small_matrix import solve_symmetric
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.types import F64, I64
@@ -25,57 +25,69 @@ NEAREST, FARTHEST = 4.0, 4000.0  # baselines (a rig with one camera: of 5 cm)
 STEPS = 8
 
 
-@njit
-def _accumulate(cam, params, p0, p1, p2, u_obs, v_obs, inv_sigma, m, h, b):
-    """Adds one image's normal equations in the axes of m (3, 3) = world -> camera. Returns its Cauchy cost."""
-    u, v, j00, j01, j02, j10, j11, j12 = project_one(cam, params, p0, p1, p2)
+@inlined
+def _accumulate(seen, u_obs, v_obs, inv_sigma, m, derive, h, b):
+    """Cauchy cost of a point in one image, `seen` as `project_one` returns it.
+
+    If `derive`, its normal equations are added in the axes of m (3, 3) = world -> camera.
+    """
+    u, v, j00, j01, j02, j10, j11, j12 = seen
     if not (math.isfinite(u) and math.isfinite(v)):
         return 10.0
     ru, rv = (u - u_obs) * inv_sigma, (v - v_obs) * inv_sigma
     if not math.isfinite(rv):  # only u was seen
         rv, j10, j11, j12 = 0.0, 0.0, 0.0, 0.0
     chi2 = ru * ru + rv * rv
-    w = inv_sigma / (1.0 + chi2 / 4.0)
-    for i in range(3):
-        gu = j00 * m[0, i] + j01 * m[1, i] + j02 * m[2, i]
-        gv = j10 * m[0, i] + j11 * m[1, i] + j12 * m[2, i]
-        b[i] -= w * (gu * ru + gv * rv)
-        for k in range(3):
-            hu = j00 * m[0, k] + j01 * m[1, k] + j02 * m[2, k]
-            hv = j10 * m[0, k] + j11 * m[1, k] + j12 * m[2, k]
-            h[i, k] += w * inv_sigma * (gu * hu + gv * hv)
+    if derive:
+        w = inv_sigma / (1.0 + chi2 / 4.0)
+        for i in range(3):
+            gu = j00 * m[0, i] + j01 * m[1, i] + j02 * m[2, i]
+            gv = j10 * m[0, i] + j11 * m[1, i] + j12 * m[2, i]
+            b[i] -= w * (gu * ru + gv * rv)
+            for k in range(i + 1):
+                hu = j00 * m[0, k] + j01 * m[1, k] + j02 * m[2, k]
+                hv = j10 * m[0, k] + j11 * m[1, k] + j12 * m[2, k]
+                h[i, k] += w * inv_sigma * (gu * hu + gv * hv)
     return 2.0 * math.log1p(chi2 / 4.0)
 
 
 @inner
-def _cost(x, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, limit, h, b):
-    """Cauchy cost of a point, and its normal equations; both end where the cost reaches `limit`."""
+def _cost(x, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, limit, derive, m, h, b):
+    """Cauchy cost of a point, and if `derive` its normal equations, lower triangle; both end at a cost of `limit`.
+
+    m: (3, 3) scratch.
+    """
     left_model, left_params, right_model, right_params = cams
-    h[:] = 0.0
-    b[:] = 0.0
+    if derive:
+        h[:] = 0.0
+        b[:] = 0.0
     cost = 0.0
-    m = np.zeros((3, 3))
     for o in range(first, last):
         if cost >= limit:
             break
-        r, t = rot[obs_kf[o]], pos[obs_kf[o]]
-        d0, d1, d2 = x[0] - t[0], x[1] - t[1], x[2] - t[2]
-        p0 = r[0, 0] * d0 + r[1, 0] * d1 + r[2, 0] * d2
-        p1 = r[0, 1] * d0 + r[1, 1] * d1 + r[2, 1] * d2
-        p2 = r[0, 2] * d0 + r[1, 2] * d1 + r[2, 2] * d2
-        for i in range(3):
-            for k in range(3):
-                m[i, k] = r[k, i]
+        k = obs_kf[o]
+        d0, d1, d2 = x[0] - pos[k, 0], x[1] - pos[k, 1], x[2] - pos[k, 2]
+        p0 = rot[k, 0, 0] * d0 + rot[k, 1, 0] * d1 + rot[k, 2, 0] * d2
+        p1 = rot[k, 0, 1] * d0 + rot[k, 1, 1] * d1 + rot[k, 2, 1] * d2
+        p2 = rot[k, 0, 2] * d0 + rot[k, 1, 2] * d1 + rot[k, 2, 2] * d2
+        if derive:
+            for i in range(3):
+                m[i, 0], m[i, 1], m[i, 2] = rot[k, 0, i], rot[k, 1, i], rot[k, 2, i]
         s = 1.0 / sigma[o]
-        cost += _accumulate(left_model, left_params, p0, p1, p2, uv_left[o, 0], uv_left[o, 1], s, m, h, b)
+        seen = project_one(left_model, left_params, p0, p1, p2)
+        cost += _accumulate(seen, uv_left[o, 0], uv_left[o, 1], s, m, derive, h, b)
         if math.isfinite(uv_right[o, 0]):
             q0 = right_r[0, 0] * p0 + right_r[0, 1] * p1 + right_r[0, 2] * p2 + right_t[0]
             q1 = right_r[1, 0] * p0 + right_r[1, 1] * p1 + right_r[1, 2] * p2 + right_t[1]
             q2 = right_r[2, 0] * p0 + right_r[2, 1] * p1 + right_r[2, 2] * p2 + right_t[2]
-            for i in range(3):
-                for k in range(3):
-                    m[i, k] = right_r[i, 0] * r[k, 0] + right_r[i, 1] * r[k, 1] + right_r[i, 2] * r[k, 2]
-            cost += _accumulate(right_model, right_params, q0, q1, q2, uv_right[o, 0], uv_right[o, 1], s, m, h, b)
+            if derive:
+                for i in range(3):
+                    for c in range(3):
+                        m[i, c] = (
+                            right_r[i, 0] * rot[k, c, 0] + right_r[i, 1] * rot[k, c, 1] + right_r[i, 2] * rot[k, c, 2]
+                        )
+            seen = project_one(right_model, right_params, q0, q1, q2)
+            cost += _accumulate(seen, uv_right[o, 0], uv_right[o, 1], s, m, derive, h, b)
     return cost
 
 
@@ -98,7 +110,7 @@ def refine_points(
         (M, ...) sorted by point. cams, right_r, right_t: as in bundle_kernels.linearize.
     """
     h, b = np.zeros((3, 3)), np.zeros(3)
-    h2, b2 = np.zeros((3, 3)), np.zeros(3)
+    h2, b2, m = np.zeros((3, 3)), np.zeros(3), np.zeros((3, 3))
     x, y, damped, factor = np.zeros(3), np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
     for i in range(points.shape[0]):
         first, last = starts[i], starts[i + 1]
@@ -109,13 +121,16 @@ def refine_points(
             if not math.isfinite(y[0]):
                 continue
             cost = _cost(
-                y, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, lowest, h, b
-            )
+                y, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, lowest, False, m,
+                h, b,
+            )  # fmt: skip
             if cost < lowest:
                 lowest = cost
                 _copy(y, x)
         damping = 1e-3
-        cost = _cost(x, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, math.inf, h, b)
+        cost = _cost(
+            x, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, math.inf, True, m, h, b
+        )
         for _ in range(steps):
             _copy(h, damped)
             for j in range(3):
@@ -125,8 +140,9 @@ def refine_points(
             for j in range(3):
                 y[j] += x[j]
             new = _cost(
-                y, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, cost, h2, b2
-            )
+                y, first, last, rot, pos, obs_kf, uv_left, uv_right, sigma, cams, right_r, right_t, cost, True, m, h2,
+                b2,
+            )  # fmt: skip
             if new < cost:
                 done = cost - new < 1e-4 * cost
                 cost, damping = new, damping * 0.1

@@ -13,7 +13,7 @@ from multiprocessing.connection import Connection, wait
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.drivers.checked_samples import checked_samples
 from stereo_sfm.drivers.source import Source
-from stereo_sfm.pipeline.channels import End, Outbox
+from stereo_sfm.pipeline.channels import End, Outbox, pickled
 from stereo_sfm.pipeline.health import HealthMeter
 from stereo_sfm.pipeline.images import ImageRing, SlotImage
 from stereo_sfm.pipeline.stages import sensor_drop, source_counters
@@ -132,7 +132,7 @@ class CaptureStage:
                 meter.dropped += 1
                 self.to_main.send(Dropped(image.frame_id, image.stamp_ns, "ring", "no free slot: a stage is too slow"))
                 continue
-            message = self._put(*free, image, begin)
+            message = pickled(self._put(*free, image, begin))
             self.to_tracker.send(message)
             self.to_main.send(message)
             self._last = image.frame_id

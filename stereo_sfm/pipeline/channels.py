@@ -107,6 +107,11 @@ class Outbox:
         room.close()
 
 
+def pickled(message: object) -> bytes:
+    """A message that goes to several readers, as `Outbox.send` takes it."""
+    return bytes(ForkingPickler.dumps(message))
+
+
 def _framed(message: object) -> memoryview:
     """A message as `Connection.recv` expects it (multiprocessing.connection, `_send_bytes`)."""
     data = message if isinstance(message, bytes) else ForkingPickler.dumps(message)

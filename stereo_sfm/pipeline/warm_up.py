@@ -20,8 +20,9 @@ from stereo_sfm.pipeline.stages import make_closer
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.tracking.factory import make_tracker
 from stereo_sfm.tracking.flow.coarse_rotation import CoarseRotation
-from stereo_sfm.tracking.flow.klt import FLAT_SIZE, build_pyramid
+from stereo_sfm.tracking.flow.klt import build_pyramid
 from stereo_sfm.tracking.flow.reappearance import find_deformed
+from stereo_sfm.tracking.flow.windows import FLAT_SIZE
 from stereo_sfm.tracking.inertial.inertial_filter import MIN_S
 from stereo_sfm.tracking.inertial.inertial_motion import NODE_NS, InertialMotion
 from stereo_sfm.types import F32, F64, RIG_TERMS, U8, Corners, ImuSamples, Keyframe, StereoImage

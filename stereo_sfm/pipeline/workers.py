@@ -10,7 +10,7 @@ from stereo_sfm.drivers.choice import Opener
 from stereo_sfm.maps.folders import make_mapper, save_result
 from stereo_sfm.messages import Localized
 from stereo_sfm.pipeline.allocator import release_memory
-from stereo_sfm.pipeline.channels import End, Inbox, Lost, Outbox, PrefetchingInbox
+from stereo_sfm.pipeline.channels import End, Inbox, Lost, Outbox, PrefetchingInbox, pickled
 from stereo_sfm.pipeline.child import Report, Setup, prepare, ready
 from stereo_sfm.pipeline.schedule import Lockstep, Realtime, Recorded, Schedule
 from stereo_sfm.types import Frame, Keyframe, LoopResult, MapUpdate
@@ -102,12 +102,13 @@ def run_tracker(
         answered = begin
         with spans.span("track"):
             for output in stage.step(image):
-                to_main.send(output)
+                data = pickled(output)
+                to_main.send(data)
                 if isinstance(output, Frame):
                     answered = time.monotonic()
                 if isinstance(output, Keyframe):
                     for outbox in keyframes:
-                        outbox.send(output)
+                        outbox.send(data)
         frame_id = image.frame_id
         to_main.send(StageTimes(frame_id, {**spans.take(), "latency": (answered - message.captured_s) * 1e3}))
         meter.add(frame_id, (time.monotonic() - begin) * 1e3, to_main.waiting())
@@ -161,8 +162,9 @@ def run_mapper(
         if mapper.found and not found:
             found = True
             to_main.send(Localized(update.version))
-        to_main.send(update)
-        to_tracker.send(update)
+        data = pickled(update)
+        to_main.send(data)
+        to_tracker.send(data)
         if (job := mapper.pending_job()) is not None:
             if busy:
                 finished_jobs.take()  # a newer loop made the result of this job obsolete
@@ -236,8 +238,9 @@ def run_loop(to_main: Report, control: Connection, keyframes: Connection, to_map
         delay()
         begin = time.monotonic()
         result = closer.step(keyframe)
-        to_main.send(result)
-        outbox.send(result)
+        data = pickled(result)
+        to_main.send(data)
+        outbox.send(data)
         frame_id, ms = keyframe.frame_id, (time.monotonic() - begin) * 1e3
         to_main.send(StageTimes(frame_id, {**spans.take(), "loop": ms}))
         meter.add(frame_id, ms)

@@ -27,7 +27,7 @@ def on_curve(rig: Rig, uv_left: F64, uv_right: F64, distance_px: F64, usual_px: 
     """
     with np.errstate(invalid="ignore"):
         near = distance_px < usual_px
-    if not np.isfinite(usual_px) or candidates.sum() < MIN_MATCHES or near[candidates].mean() >= MIN_SHARE:
+    if not np.isfinite(usual_px) or np.count_nonzero(candidates) < MIN_MATCHES or near[candidates].mean() >= MIN_SHARE:
         return near
     assert rig.right is not None
     signed = np.full(len(near), np.nan)

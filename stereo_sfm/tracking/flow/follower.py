@@ -100,7 +100,7 @@ class Follower:
 
         Whatever is about to cover the camera already hides a part of the last images.
         """
-        if self._held is None or trusted.sum() >= self._held.worth(pose):
+        if self._held is None or np.count_nonzero(trusted) >= self._held.worth(pose):
             self._held = Held(images, tracks.keep(trusted), pose)
 
     def forget(self) -> None:

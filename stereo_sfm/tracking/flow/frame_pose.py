@@ -104,7 +104,7 @@ class PoseSolution:
     @property
     def inliers(self) -> int:
         """Number of inliers."""
-        return int(self.inlier.sum())
+        return int(np.count_nonzero(self.inlier))
 
     @property
     def residual_px(self) -> float:
@@ -154,11 +154,11 @@ class FramePoseSolver:
             with self._noise_of_at_least(BLURRED_NOISE):
                 return replace(self.solve(tracks, expected, last_pose, before), blurred=True)
         static = ~tracks.moving
-        if static.sum() < self._config.min_features:
+        if np.count_nonzero(static) < self._config.min_features:
             return _no_pose(len(tracks), "too_few_points")
         best = self._solve_all(tracks, expected, last_pose, static)
         rest = static & ~best.inlier
-        undisturbed = in_group(tracks, rest).sum() < MIN_GROUP and best.inliers >= AGREEING_SHARE * before
+        undisturbed = np.count_nonzero(in_group(tracks, rest)) < MIN_GROUP and best.inliers >= AGREEING_SHARE * before
         usual = self._likelihood(best.pose, expected) > USUAL_LIKELIHOOD
         if undisturbed and usual and not self.alert:
             return best
@@ -166,7 +166,7 @@ class FramePoseSolver:
         disturbed = self.alert or len(chosen.moving) > 0
         if not disturbed and chosen.inlier[static].sum() <= WEIGHT_RATIO * best.inlier[static].sum():
             chosen = best
-        few = (chosen.inlier & static).sum() < MIN_OPEN_SHARE * self.open_view
+        few = np.count_nonzero(chosen.inlier & static) < MIN_OPEN_SHARE * self.open_view
         if not few or (usual and not disturbed):
             return chosen
         if undisturbed and self._confirmed(best, static & tracks.mapped, 2 * self._config.min_features):
@@ -229,7 +229,7 @@ class FramePoseSolver:
     def _solve_all(self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, static: Bool) -> PoseSolution:
         """Solve with all points."""
         best = self._optimise(tracks, expected, static)
-        if best.inliers < 0.5 * static.sum():
+        if best.inliers < 0.5 * np.count_nonzero(static):
             still = ExpectedMotion(last_pose, np.zeros(6), expected.seconds)
             best = max(best, self._optimise(tracks, still, static), key=lambda s: s.inliers)
         if best.inliers < self._config.min_features:
@@ -297,7 +297,7 @@ class FramePoseSolver:
     def learn(self, tracks: Tracks, solution: PoseSolution, expected: ExpectedMotion) -> None:
         """Learn whether objects move before the camera and, while none does, the noise of points and motion."""
         seconds = expected.seconds
-        moving = tracks.moving.sum() + solution.moving.sum() >= MIN_GROUP
+        moving = np.count_nonzero(tracks.moving) + np.count_nonzero(solution.moving) >= MIN_GROUP
         if self.alert and not moving:  # still there, with new points
             moving = in_group(tracks, ~tracks.moving & ~solution.inlier).sum() >= MIN_GROUP
         self._alert_s = ALERT_S if moving else max(self._alert_s - seconds, 0.0)

@@ -60,7 +60,7 @@ class Keyframes:
     def due(self, tracks: Tracks) -> bool:
         """Whether the frame should become a keyframe: few of the newest one's static points are left."""
         config = self._config
-        left = int((~tracks.moving & (tracks.age >= self._frames_since)).sum())
+        left = int(np.count_nonzero(~tracks.moving & (tracks.age >= self._frames_since)))
         return self._frames_since >= config.keyframe_max_frames or left < config.keyframe_share * self.points
 
     def reference(self, odom_T_cam: F64) -> tuple[int, F64]:

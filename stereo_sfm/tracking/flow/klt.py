@@ -4,13 +4,9 @@ Shi & Tomasi, Good Features to Track (CVPR 1994): translation follows a feature 
 against its first appearance removes the drift, and its dissimilarity detects windows that no longer show one surface
 (an occlusion, or a depth discontinuity inside the window). Both are inverse compositional (Baker & Matthews, IJCV 56,
 2004). The brightness of a window is normalised by its mean and contrast, so that exposure jumps do not matter.
-
-Windows are SIZE x SIZE pixels around the point, stored flat with STRIDE samples a row; the extra columns make
-interpolation and central differences contiguous loops and have weight zero. Sums add halves to halves in a fixed order:
-compiled to vector instructions, yet the same bits on every run and every machine.
 """
 
-# pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportPrivateUsage=false
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportPrivateUsage=false, reportCallIssue=false
 # pyright: reportConstantRedefinition=false, reportMissingTypeArgument=false
 
 from __future__ import annotations
@@ -22,16 +18,11 @@ import numpy as np
 
 from stereo_sfm.geometry.kernels import inner, njit
 from stereo_sfm.geometry.small_matrix import invert_symmetric
+from stereo_sfm.tracking.flow.warped_windows import HALF, sample_affine
+from stereo_sfm.tracking.flow.windows import FLAT_SIZE, SIZE, STRIDE, WIDE_SIZE, dot, sample, sample_wide
 from stereo_sfm.types import U8
 
-SIZE = 16
-HALF = 7.5  # from the centre of a window to its first sample
-STRIDE = SIZE + 4
-FLAT_SIZE = SIZE * STRIDE
-WIDE_SIZE = (SIZE + 2) * STRIDE
-RAW_SIZE = (SIZE + 4) * STRIDE
 FINE, COARSE = 0.01, 0.1  # px, last step of a translation: in the image itself, and where a finer level follows
-MAX_REACH = 60.0  # px from the centre of a warped window
 TRACKED, OUTSIDE, FLAT, DIVERGED, UNLIKE = 0, 1, 2, 3, 4  # result for a point
 
 Pyramid = tuple[U8, ...]
@@ -77,90 +68,45 @@ def _inside(image, u, v, margin):
 
 
 @inner
-def _dot(a, b, tmp):
-    """Sum of a * b over a flat window."""
-    for m in range(32):
-        even = (a[m] * b[m] + a[m + 64] * b[m + 64]) + (a[m + 128] * b[m + 128] + a[m + 192] * b[m + 192])
-        odd = (a[m + 32] * b[m + 32] + a[m + 96] * b[m + 96]) + (a[m + 160] * b[m + 160] + a[m + 224] * b[m + 224])
-        tmp[m] = (even + odd) + (a[m + 256] * b[m + 256] + a[m + 288] * b[m + 288])
-    for m in range(16):
-        tmp[m] += tmp[m + 16]
-    for m in range(8):
-        tmp[m] += tmp[m + 8]
-    return ((tmp[0] + tmp[4]) + (tmp[2] + tmp[6])) + ((tmp[1] + tmp[5]) + (tmp[3] + tmp[7]))
-
-
-@njit
-def _sample(image, u, v, raw, out):
-    """Bilinear window whose first sample is at (u, v); the caller has checked that it lies inside."""
-    iu, iv = int(math.floor(u)), int(math.floor(v))
-    fu, fv = u - iu, v - iv
-    w00, w01 = np.float32((1 - fu) * (1 - fv)), np.float32(fu * (1 - fv))
-    w10, w11 = np.float32((1 - fu) * fv), np.float32(fu * fv)
-    for i in range(SIZE + 1):
-        row = image[iv + i, iu : iu + SIZE + 1]
-        for j in range(SIZE + 1):
-            raw[i * STRIDE + j] = np.float32(row[j])
-    for m in range(FLAT_SIZE):
-        out[m] = w00 * raw[m] + w01 * raw[m + 1] + w10 * raw[m + STRIDE] + w11 * raw[m + STRIDE + 1]
-
-
-@inner
-def _sample_wide(image, u, v, raw, out):
-    """As `_sample`, with one sample more on each side: first sample at (u - 1, v - 1), SIZE + 2 rows."""
-    u, v = u - 1, v - 1
-    iu, iv = int(math.floor(u)), int(math.floor(v))
-    fu, fv = u - iu, v - iv
-    w00, w01 = np.float32((1 - fu) * (1 - fv)), np.float32(fu * (1 - fv))
-    w10, w11 = np.float32((1 - fu) * fv), np.float32(fu * fv)
-    for i in range(SIZE + 3):
-        row = image[iv + i, iu : iu + SIZE + 3]
-        for j in range(SIZE + 3):
-            raw[i * STRIDE + j] = np.float32(row[j])
-    for m in range(WIDE_SIZE):
-        out[m] = w00 * raw[m] + w01 * raw[m + 1] + w10 * raw[m + STRIDE] + w11 * raw[m + STRIDE + 1]
-
-
-@inner
-def _template(image, u, v, weights, raw, wide, tmp, patch, gx, gy):
+def _template(image, u, v, weights, raw, wide, patch, gx, gy):
     """Patch around (u, v), centred, and its weighted, centred gradients by central differences.
 
     Returns mean, contrast, the 2x2 normal matrix (hxx, hxy, hyy), and the mean gradients. `gx`, `gy` are left
     multiplied by the weights: their dot product with a window is the right-hand side, whatever the window's mean.
     """
     half = np.float32(0.5)
-    _sample_wide(image, u - HALF, v - HALF, raw, wide)
+    sample_wide(image, u - HALF, v - HALF, wide)
     for m in range(FLAT_SIZE):
         patch[m] = wide[m + STRIDE + 1]
         gx[m] = half * (wide[m + STRIDE + 2] - wide[m + STRIDE])
         gy[m] = half * (wide[m + 2 * STRIDE + 1] - wide[m + 1])
-    mean = _dot(patch, weights, tmp)
-    mx = _dot(gx, weights, tmp)
-    my = _dot(gy, weights, tmp)
+    mean = dot(patch, weights)
+    mx = dot(gx, weights)
+    my = dot(gy, weights)
     for m in range(FLAT_SIZE):
         patch[m] -= mean
         raw[m] = (gx[m] - mx) * weights[m]
-    hxx = _dot(raw, gx, tmp)
-    hxy = _dot(raw, gy, tmp)
+    hxx = dot(raw, gx)
+    hxy = dot(raw, gy)
     for m in range(FLAT_SIZE):
         gx[m] = raw[m]
         raw[m] = (gy[m] - my) * weights[m]
-    hyy = _dot(raw, gy, tmp)
+    hyy = dot(raw, gy)
     for m in range(FLAT_SIZE):
         gy[m] = raw[m]
         raw[m] = patch[m] * weights[m]
-    contrast = math.sqrt(max(_dot(raw, patch, tmp), 1e-6))
+    contrast = math.sqrt(max(dot(raw, patch), 1e-6))
     return mean, contrast, hxx, hxy, hyy, mx, my
 
 
 @njit
-def _compare(window, patch, weights, raw, tmp):
+def _compare(window, patch, weights, raw):
     """Mean and contrast of a window, and its normalised correlation times contrast with a centred patch."""
-    mean = _dot(window, weights, tmp)
+    mean = dot(window, weights)
     for m in range(FLAT_SIZE):
         raw[m] = (window[m] - mean) * weights[m]
-    cross = _dot(raw, patch, tmp)
-    variance = _dot(raw, window, tmp)
+    cross = dot(raw, patch)
+    variance = dot(raw, window)
     return mean, math.sqrt(max(variance, 1e-6)), cross
 
 
@@ -181,8 +127,7 @@ def track_translation(prev, cur, uv_prev, uv_cur, first_level, last_level, itera
     n = uv_prev.shape[0]
     status = np.zeros(n, np.int8)
     ncc = np.zeros(n, np.float32)
-    raw = np.zeros(RAW_SIZE, np.float32)
-    tmp = np.zeros(FLAT_SIZE, np.float32)
+    raw = np.zeros(FLAT_SIZE, np.float32)
     patch = np.zeros(FLAT_SIZE, np.float32)
     gx = np.zeros(FLAT_SIZE, np.float32)
     gy = np.zeros(FLAT_SIZE, np.float32)
@@ -202,25 +147,25 @@ def track_translation(prev, cur, uv_prev, uv_cur, first_level, last_level, itera
             if not (_inside(image, pu, pv, HALF + 1.5) and _inside(target, cu, cv, HALF + 0.5)):
                 state = OUTSIDE
                 continue
-            _, contrast, hxx, hxy, hyy, _, _ = _template(image, pu, pv, weights, raw, wide, tmp, patch, gx, gy)
+            _, contrast, hxx, hxy, hyy, _, _ = _template(image, pu, pv, weights, raw, wide, patch, gx, gy)
             det = hxx * hyy - hxy * hxy
             if contrast < min_contrast or det < 1e-3 * (hxx + hyy) * (hxx + hyy):
                 state = FLAT
                 continue
             state = TRACKED
             start_u, start_v = cu, cv
-            tx, ty = _dot(gx, patch, tmp), _dot(gy, patch, tmp)
+            tx, ty = dot(gx, patch), dot(gy, patch)
             gain = 1.0
             for iteration in range(iterations):
                 if not _inside(target, cu, cv, HALF + 0.5):
                     state = OUTSIDE
                     break
-                _sample(target, cu - HALF, cv - HALF, raw, window)
+                sample(target, cu - HALF, cv - HALF, window)
                 if iteration == 0 or iteration == 2:
-                    _, contrast_c, _ = _compare(window, patch, weights, raw, tmp)
+                    _, contrast_c, _ = _compare(window, patch, weights, raw)
                     gain = min(max(contrast / contrast_c, 0.4), 2.5)
-                bx = gain * _dot(gx, window, tmp) - tx
-                by = gain * _dot(gy, window, tmp) - ty
+                bx = gain * dot(gx, window) - tx
+                by = gain * dot(gy, window) - ty
                 du = (hyy * bx - hxy * by) / det
                 dv = (hxx * by - hxy * bx) / det
                 length = math.sqrt(du * du + dv * dv)
@@ -234,8 +179,8 @@ def track_translation(prev, cur, uv_prev, uv_cur, first_level, last_level, itera
                 state = DIVERGED
             if state == TRACKED and level == last_level:
                 if _inside(target, cu, cv, HALF + 0.5):
-                    _sample(target, cu - HALF, cv - HALF, raw, window)
-                    _, contrast_c, cross = _compare(window, patch, weights, raw, tmp)
+                    sample(target, cu - HALF, cv - HALF, window)
+                    _, contrast_c, cross = _compare(window, patch, weights, raw)
                     ncc[k] = cross / (contrast * contrast_c)
                     if ncc[k] < min_ncc:
                         state = UNLIKE
@@ -264,9 +209,8 @@ def make_patches(pyramid, uv, slots, weights, coordinates, patch, gradients, inv
     """
     n = uv.shape[0]
     good = np.zeros(n, np.bool_)
-    raw = np.zeros(RAW_SIZE, np.float32)
+    raw = np.zeros(FLAT_SIZE, np.float32)
     wide = np.zeros(WIDE_SIZE + STRIDE, np.float32)
-    tmp = np.zeros(FLAT_SIZE, np.float32)
     jac = np.zeros((6, FLAT_SIZE), np.float32)
     unweighted = np.zeros(FLAT_SIZE, np.float32)
     normal, factor = np.zeros((6, 6)), np.zeros((6, 6))
@@ -275,7 +219,7 @@ def make_patches(pyramid, uv, slots, weights, coordinates, patch, gradients, inv
             continue
         k = slots[row]
         gx, gy = gradients[k, 0], gradients[k, 1]
-        result = _template(pyramid[0], uv[row, 0], uv[row, 1], weights, raw, wide, tmp, patch[k], gx, gy)
+        result = _template(pyramid[0], uv[row, 0], uv[row, 1], weights, raw, wide, patch[k], gx, gy)
         contrast[k] = result[1]
         if contrast[k] < 1.0:
             continue
@@ -293,7 +237,7 @@ def make_patches(pyramid, uv, slots, weights, coordinates, patch, gradients, inv
             for m in range(FLAT_SIZE):
                 wide[m] = jac[a, m] * raw[m]
             for b in range(a, 6):
-                normal[a, b] = _dot(jac[b], wide, tmp)
+                normal[a, b] = dot(jac[b], wide)
                 normal[b, a] = normal[a, b]
         # The affine part is a small departure from what it was: damped by what one grey-level-noise step may do.
         damping = 0.02 * (normal[2, 2] + normal[5, 5])
@@ -311,66 +255,12 @@ def make_patches(pyramid, uv, slots, weights, coordinates, patch, gradients, inv
                 half = np.float32(1.0 if c == 1 else 0.5)
                 for m in range(FLAT_SIZE):
                     wide[m] = half * x[m] * y[m] * unweighted[m]
-                mean = _dot(weights, wide, tmp)
+                mean = dot(weights, wide)
                 for m in range(FLAT_SIZE):
                     wide[m] -= mean
                 for b in range(6):
-                    bending[k, b, 3 * a + c] = _dot(jac[b], wide, tmp)
+                    bending[k, b, 3 * a + c] = dot(jac[b], wide)
     return good
-
-
-@inner
-def _sample_affine(image, warp, cu, cv, scratch, out):
-    """Window at warp @ (x, y) + (cu, cv); False when it leaves the image.
-
-    In three loops of one kind each, which is what makes them fast: where the samples lie, what lies there (each pixel
-    with its right, lower and lower right neighbour in one word), and the interpolation.
-    """
-    h, w = image.shape
-    reach_u = (abs(warp[0, 0]) + abs(warp[0, 1])) * HALF
-    reach_v = (abs(warp[1, 0]) + abs(warp[1, 1])) * HALF
-    inside = cu - reach_u >= 0 and cv - reach_v >= 0 and cu + reach_u < w - 1.001 and cv + reach_v < h - 1.001
-    if not (inside and reach_u < MAX_REACH and reach_v < MAX_REACH):  # also when anything is NaN
-        return False
-    words, index, offset, quads = scratch
-    left, top = max(int(cu - reach_u - 0.01), 0), max(int(cv - reach_v - 0.01), 0)
-    columns = min(int(cu + reach_u + 0.01), w - 2) - left + 1
-    rows = min(int(cv + reach_v + 0.01), h - 2) - top + 1
-    for i in range(rows):
-        upper, lower = image[top + i, left : left + columns + 1], image[top + i + 1, left : left + columns + 1]
-        row = words[i * columns : (i + 1) * columns]
-        for j in range(columns):
-            row[j] = (
-                np.uint32(upper[j])
-                | np.uint32(upper[j + 1]) << np.uint32(8)
-                | np.uint32(lower[j]) << np.uint32(16)
-                | np.uint32(lower[j + 1]) << np.uint32(24)
-            )
-    a, b, c, d = np.float32(warp[0, 0]), np.float32(warp[0, 1]), np.float32(warp[1, 0]), np.float32(warp[1, 1])
-    du, dv = np.float32(cu - left), np.float32(cv - top)
-    stride = np.int32(columns)
-    for i in range(SIZE):
-        y = np.float32(i - HALF)
-        row_u, row_v = b * y + du, d * y + dv
-        for j in range(SIZE):
-            x = np.float32(j) - np.float32(HALF)
-            u, v = a * x + row_u, c * x + row_v
-            iu, iv = np.int32(u), np.int32(v)
-            index[i * SIZE + j] = iv * stride + iu
-            offset[0, i * SIZE + j], offset[1, i * SIZE + j] = u - np.float32(iu), v - np.float32(iv)
-    for m in range(SIZE * SIZE):
-        quads[m] = words[np.uint32(index[m])]  # unsigned: no check for negative indices
-    byte = np.uint32(255)
-    for i in range(SIZE):
-        for j in range(SIZE):
-            m = i * SIZE + j
-            quad, fu, fv = quads[m], offset[0, m], offset[1, m]
-            i00, i01 = np.float32(np.int32(quad & byte)), np.float32(np.int32(quad >> np.uint32(8) & byte))
-            i10, i11 = np.float32(np.int32(quad >> np.uint32(16) & byte)), np.float32(np.int32(quad >> np.uint32(24)))
-            upper_value = i00 + fu * (i01 - i00)
-            lower_value = i10 + fu * (i11 - i10)
-            out[i * STRIDE + j] = upper_value + fv * (lower_value - upper_value)
-    return True
 
 
 @njit
@@ -405,17 +295,10 @@ def track_affine(
     ncc = np.zeros(n, np.float32)
     window = np.zeros(FLAT_SIZE, np.float32)  # zero beyond the samples, always
     error = np.zeros(FLAT_SIZE, np.float32)
-    raw = np.zeros(RAW_SIZE, np.float32)
-    tmp = np.zeros(FLAT_SIZE, np.float32)
+    raw = np.zeros(FLAT_SIZE, np.float32)
     bx = np.zeros(FLAT_SIZE, np.float32)
     b = np.zeros(6)
     step = np.zeros(6)
-    scratch = (
-        np.zeros(int(2 * MAX_REACH + 3) ** 2, np.uint32),
-        np.zeros(SIZE * SIZE, np.int32),
-        np.zeros((2, SIZE * SIZE), np.float32),
-        np.zeros(SIZE * SIZE, np.uint32),
-    )
     for row in range(n):
         if not wanted[row]:
             continue
@@ -426,10 +309,10 @@ def track_affine(
         ok = True
         for _ in range(iterations):
             w2[0, 0], w2[0, 1], w2[1, 0], w2[1, 1] = a00, a01, a10, a11
-            if not _sample_affine(image, w2, cu, cv, scratch, window):
+            if not sample_affine(image, w2, cu, cv, window):
                 ok = False
                 break
-            mean, contrast_c, cross = _compare(window, patch[k], weights, raw, tmp)
+            mean, contrast_c, cross = _compare(window, patch[k], weights, raw)
             gain = np.float32(min(max(contrast[k] / contrast_c, 0.3), 3.0))
             ncc[row] = cross / (contrast[k] * contrast_c)
             for m in range(FLAT_SIZE):
@@ -437,9 +320,9 @@ def track_affine(
             for axis in range(2):
                 for m in range(FLAT_SIZE):
                     bx[m] = gradients[k, axis, m] * error[m]
-                b[3 * axis] = _dot(bx, coordinates[0], tmp)
-                b[3 * axis + 1] = _dot(bx, coordinates[1], tmp)
-                b[3 * axis + 2] = _dot(bx, coordinates[2], tmp)
+                b[3 * axis] = dot(bx, coordinates[0])
+                b[3 * axis + 1] = dot(bx, coordinates[1])
+                b[3 * axis + 2] = dot(bx, coordinates[2])
             for i in range(6):
                 for j in range(6):
                     b[i] += bending[k, i, j] * curvature[row, j]

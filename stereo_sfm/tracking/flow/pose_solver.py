@@ -22,7 +22,7 @@ import math
 
 import numpy as np
 
-from stereo_sfm.geometry.kernels import inner, njit, project_one
+from stereo_sfm.geometry.kernels import inlined, inner, njit, project_one
 from stereo_sfm.geometry.se3_kernels import compose_into, exp_into
 from stereo_sfm.geometry.small_matrix import invert_symmetric, solve_symmetric
 
@@ -30,7 +30,7 @@ MAX_SIGMAS = 4.0  # change of an inverse distance while a pose is solved
 MIN_RHO = 1e-4  # 1/m
 
 
-@inner
+@inlined
 def point_residuals(pose, px, py, pz, dx, dy, dz, uv_l, uv_r, cams, right_T_left, res, jac, ray):
     """Residuals of one point in both images.
 
@@ -134,23 +134,22 @@ def _normal_equations(
         w = 1.0 / (1.0 + chi2 / (rows * scale * scale))
         wi = w * inv_s2
         used += w
+        if rows == 2:
+            for m in range(2, 4):
+                res[m] = ray[m] = 0.0
+                jac[m] = 0.0
+        r0, r1, r2, r3 = res[0], res[1], res[2], res[3]
+        y0, y1, y2, y3 = ray[0], ray[1], ray[2], ray[3]
         for i in range(6):
-            s = 0.0
-            for m in range(rows):
-                s += jac[m, i] * ray[m]
-            jr[i] = s
-            elimination[k, i] = c * s
+            jr[i] = jac[0, i] * y0 + jac[1, i] * y1 + jac[2, i] * y2 + jac[3, i] * y3
+            elimination[k, i] = c * jr[i]
         for i in range(6):
-            s = 0.0
-            for m in range(rows):
-                s += jac[m, i] * res[m]
-            gradient[i] = wi * (s - c * jr[i] * gr)
+            a0, a1, a2, a3, ci = jac[0, i], jac[1, i], jac[2, i], jac[3, i], c * jr[i]
+            gradient[i] = wi * (a0 * r0 + a1 * r1 + a2 * r2 + a3 * r3 - ci * gr)
             rhs[i] += gradient[i]
             for j in range(i, 6):
-                s = 0.0
-                for m in range(rows):
-                    s += jac[m, i] * jac[m, j]
-                block[i, j] = wi * (s - c * jr[i] * jr[j])
+                s = a0 * jac[0, j] + a1 * jac[1, j] + a2 * jac[2, j] + a3 * jac[3, j]
+                block[i, j] = wi * (s - ci * jr[j])
                 normal[i, j] += block[i, j]
         if rolling:  # a row's pose follows the velocity by the row's seconds
             for i in range(6):

@@ -17,7 +17,8 @@ import numpy as np
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.kernels import inner, njit, project_one
 from stereo_sfm.geometry.se3_kernels import transform_point
-from stereo_sfm.tracking.flow.klt import HALF, SIZE, STRIDE
+from stereo_sfm.tracking.flow.klt import HALF
+from stereo_sfm.tracking.flow.windows import SIZE, STRIDE
 from stereo_sfm.types import F32, F64, I64, U8
 
 GRAZING = 0.15  # cosine between a surface's normal and the ray, below which the surface shows nothing

@@ -61,6 +61,7 @@ def _candidates(
     Written too: their pixels (N, C, 2) of the level, -1 where the patch leaves the image, and templates (N, AREA).
     """
     h, w = left.shape
+    share = 1.0 / scale  # a power of two: products with it are exact
     for k in range(len(uv)):
         for c in range(pixels.shape[1]):
             pixels[k, c, 0] = pixels[k, c, 1] = -1
@@ -75,7 +76,7 @@ def _candidates(
         _curve(bx, by, bz, model_r, params_r, right_T_left, min_depth, where[k])
         for c in range(pixels.shape[1]):
             if not math.isnan(where[k, c, 0]):
-                u, v = int(round(where[k, c, 0] / scale)), int(round(where[k, c, 1] / scale))
+                u, v = int(round(where[k, c, 0] * share)), int(round(where[k, c, 1] * share))
                 if u >= PATCH and v >= PATCH and u < shape[1] - PATCH and v < shape[0] - PATCH:
                     pixels[k, c, 0], pixels[k, c, 1] = u, v
 
@@ -88,7 +89,7 @@ def _costs(right, right_sums, pixels, templates, cost):
     side in a row: those are compared together.
     """
     count = pixels.shape[1]
-    patch = np.empty(AREA, np.int32)
+    patch, away = np.empty(AREA, np.int32), np.empty(SIZE, np.int32)
     columns, weighted = np.empty(count, np.int32), np.empty(count + SIZE, np.int32)
     for k in range(len(pixels)):
         template = templates[k]
@@ -131,9 +132,12 @@ def _costs(right, right_sums, pixels, templates, cost):
                     for x in range(n + SIZE - 1):
                         weighted[x] = AREA * row[x]
                     for x in range(SIZE):
-                        away, shifted = np.int32(AREA * template[y * SIZE + x] - total), weighted[x : x + n]
-                        for c in range(n):
-                            columns[c] = np.int32(columns[c] + abs(np.int32(shifted[c] - sums[c] - away)))
+                        away[x] = AREA * template[y * SIZE + x] - total
+                    for c in range(np.uintp(n)):  # unsigned: no test for negative indices
+                        difference = columns[c]
+                        for x in range(np.uintp(SIZE)):
+                            difference += abs(np.int32(weighted[c + x] - sums[c] - away[x]))
+                        columns[c] = difference
                 for c in range(begin, end):
                     cost[k, c] = columns[pixels[k, c, 0] - low] / (AREA * AREA)
             begin = end

@@ -7,7 +7,7 @@ in one camera, and no plane explains those pixels. Such a match is a mixture of 
 physical point.
 """
 
-# pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportPrivateUsage=false
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportPrivateUsage=false, reportCallIssue=false
 # pyright: reportMissingTypeArgument=false
 
 from __future__ import annotations
@@ -18,18 +18,8 @@ import numpy as np
 
 from stereo_sfm.geometry.kernels import njit, project_one, unproject_one
 from stereo_sfm.geometry.small_matrix import solve_symmetric
-from stereo_sfm.tracking.flow.klt import (
-    FLAT_SIZE,
-    HALF,
-    RAW_SIZE,
-    SIZE,
-    STRIDE,
-    WIDE_SIZE,
-    _dot,
-    _inside,
-    _sample,
-    _sample_wide,
-)
+from stereo_sfm.tracking.flow.klt import HALF, _inside
+from stereo_sfm.tracking.flow.windows import FLAT_SIZE, SIZE, STRIDE, WIDE_SIZE, dot, sample, sample_wide
 
 CELL = 4  # px, side of the cells whose residuals are tested
 CELLS = SIZE // CELL
@@ -71,7 +61,7 @@ def fit_planes(left, right, uv, uv_right, model_r, params_r, right_T_left, weigh
     n = uv.shape[0]
     out = uv_right.copy()
     misfit, sigma = np.full(n, np.inf), np.full(n, np.inf)
-    raw, tmp = np.zeros(RAW_SIZE, np.float32), np.zeros(FLAT_SIZE, np.float32)
+    tmp = np.zeros(FLAT_SIZE, np.float32)
     wide, window = np.zeros(WIDE_SIZE + STRIDE, np.float32), np.zeros(FLAT_SIZE, np.float32)
     patch, gradient2 = np.zeros(FLAT_SIZE, np.float32), np.zeros(FLAT_SIZE, np.float32)
     jac, weighted = np.zeros((4, FLAT_SIZE), np.float32), np.zeros(FLAT_SIZE, np.float32)
@@ -84,8 +74,8 @@ def fit_planes(left, right, uv, uv_right, model_r, params_r, right_T_left, weigh
         eu, ev = _epipolar(model_r, params_r, right_T_left, ur, vr)
         if math.isnan(eu):
             continue
-        _sample_wide(left, u - HALF, v - HALF, raw, wide)
-        _sample(right, ur - HALF, vr - HALF, raw, window)
+        sample_wide(left, u - HALF, v - HALF, wide)
+        sample(right, ur - HALF, vr - HALF, window)
         a, b = np.float32(eu), np.float32(ev)
         for m in range(FLAT_SIZE):
             patch[m] = wide[m + STRIDE + 1]
@@ -97,26 +87,26 @@ def fit_planes(left, right, uv, uv_right, model_r, params_r, right_T_left, weigh
             jac[2, m] = along * coordinates[1, m] * eighth
             jac[3, m] = a * gy - b * gx
             gradient2[m] = gx * gx + gy * gy
-        mean_l, mean_r = _dot(patch, weights, tmp), _dot(window, weights, tmp)
+        mean_l, mean_r = dot(patch, weights), dot(window, weights)
         for m in range(FLAT_SIZE):
             patch[m] -= mean_l
             window[m] -= mean_r
             weighted[m] = patch[m] * weights[m]
-        contrast_l = math.sqrt(max(_dot(weighted, patch, tmp), 1e-6))
+        contrast_l = math.sqrt(max(dot(weighted, patch), 1e-6))
         for m in range(FLAT_SIZE):
             weighted[m] = window[m] * weights[m]
-        contrast_r = math.sqrt(max(_dot(weighted, window, tmp), 1e-6))
+        contrast_r = math.sqrt(max(dot(weighted, window), 1e-6))
         gain = np.float32(min(max(contrast_l / contrast_r, 0.4), 2.5))
         for m in range(FLAT_SIZE):
             window[m] = gain * window[m] - patch[m]
         for i in range(4):
-            mean = _dot(jac[i], weights, tmp)
+            mean = dot(jac[i], weights)
             for m in range(FLAT_SIZE):
                 jac[i, m] -= mean
                 weighted[m] = jac[i, m] * weights[m]
-            rhs[i] = _dot(weighted, window, tmp)
+            rhs[i] = dot(weighted, window)
             for j in range(i + 1):
-                normal[i, j] = _dot(weighted, jac[j], tmp)
+                normal[i, j] = dot(weighted, jac[j])
                 normal[j, i] = normal[i, j]
         known = normal[0, 0]
         normal[1, 1] += DAMPING * known
@@ -141,7 +131,7 @@ def fit_planes(left, right, uv, uv_right, model_r, params_r, right_T_left, weigh
                 worst = max(worst, total / (CELL * CELL))
         misfit[k] = worst
         information = known - normal[3, 0] * normal[3, 0] / normal[3, 3]  # with a shift across the curve eliminated
-        sigma[k] = SPREAD * math.sqrt(_dot(window, weights, tmp) / max(information, 1e-6))
+        sigma[k] = SPREAD * math.sqrt(dot(window, weights) / max(information, 1e-6))
         out[k, 0] = ur - (x[0] * eu - x[3] * ev)
         out[k, 1] = vr - (x[0] * ev + x[3] * eu)
     return out, misfit, sigma

@@ -257,9 +257,9 @@ class Tracker:
         """Whether so many points of a sharp image agree with a pose that it is beyond doubt."""
         if solution.blurred:
             return False
-        agree = int((solution.inlier & ~tracks.moving).sum())
+        agree = int(np.count_nonzero(solution.inlier & ~tracks.moving))
         enough = max(TRUSTED_LEFT * self._keyframes.points, TRUSTED_OPEN * self._solver.open_view)
-        return agree >= max(TRUSTED_SHARE * float((~tracks.moving).sum()), enough)
+        return agree >= max(TRUSTED_SHARE * int(np.count_nonzero(~tracks.moving)), enough)
 
     def _accept(
         self,
@@ -442,7 +442,7 @@ class Tracker:
 
     def _static_count(self) -> int:
         """Number of tracked points that are not on moving objects."""
-        return int((~self._tracks.moving).sum())
+        return int(np.count_nonzero(~self._tracks.moving))
 
     def _create_keyframe(self, image: StereoImage, images: StereoPyramids, trusted: bool) -> Keyframe:
         """A keyframe of the image whose pose has just been found."""
@@ -493,8 +493,8 @@ def _stats(tracks: Tracks, solution: PoseSolution) -> dict[str, float]:
     """Statistics of a frame for plots."""
     return {
         "tracked": float(len(tracks)),
-        "inliers": float((solution.inlier & ~tracks.moving).sum()),
+        "inliers": float(np.count_nonzero(solution.inlier & ~tracks.moving)),
         "moving": float(tracks.moving.mean()) if len(tracks) else 0.0,
-        "right": float(np.isfinite(tracks.uv_right[:, 0]).sum()),
+        "right": float(np.count_nonzero(np.isfinite(tracks.uv_right[:, 0]))),
         "error": median(solution.error[solution.inlier]),
     }

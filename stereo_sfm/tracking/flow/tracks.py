@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
+from operator import attrgetter
 
 import numpy as np
 
-from stereo_sfm.tracking.flow import klt
 from stereo_sfm.tracking.flow.window_curvature import RAYS
+from stereo_sfm.tracking.flow.windows import FLAT_SIZE
 from stereo_sfm.types import F32, F64, I32, I64, Bool
 
 
@@ -39,22 +40,22 @@ class Tracks:
     def keep(self, mask: Bool) -> Tracks:
         """The rows where `mask` is True."""
         rows = np.flatnonzero(mask)  # once: numpy would look for them in each column, in four times the time
-        return Tracks(*(getattr(self, name).take(rows, axis=0) for name in _NAMES))
+        return Tracks(*[column.take(rows, 0) for column in _columns(self)])
 
     def append(self, other: Tracks) -> Tracks:
         """These rows, then the other's."""
-        return Tracks(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in _NAMES))
+        return Tracks(*map(np.concatenate, zip(_columns(self), _columns(other), strict=True)))
 
 
-_NAMES = tuple(f.name for f in fields(Tracks))
+_columns = attrgetter(*(f.name for f in fields(Tracks)))
 
 
 class Patches:
     """First appearances of points, in reusable slots."""
 
     def __init__(self, capacity: int) -> None:
-        self.patch: F32 = np.zeros((capacity, klt.FLAT_SIZE), np.float32)
-        self.gradients: F32 = np.zeros((capacity, 2, klt.FLAT_SIZE), np.float32)
+        self.patch: F32 = np.zeros((capacity, FLAT_SIZE), np.float32)
+        self.gradients: F32 = np.zeros((capacity, 2, FLAT_SIZE), np.float32)
         self.inverse_normal: F64 = np.zeros((capacity, 6, 6))
         self.contrast: F64 = np.zeros(capacity)
         self.bending: F64 = np.zeros((capacity, 6, 6))

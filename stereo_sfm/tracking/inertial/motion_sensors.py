@@ -66,9 +66,12 @@ class MotionSensors:
 
     def settled(self, stamp_ns: int, odom_T_cam: F64) -> F64:
         """The pose (4, 4) that the images gave, or the one that is held while the robot stands."""
+        return self._rest.settled(stamp_ns, odom_T_cam, lambda: self._still(stamp_ns))
+
+    def _still(self, stamp_ns: int) -> bool:
+        """Whether the sensors say so."""
         answers = [s.still(stamp_ns) for s in (self._inertial, self._wheels) if s is not None]
-        still = True in answers and False not in answers
-        return self._rest.settled(stamp_ns, odom_T_cam, still)
+        return True in answers and False not in answers
 
     def predict(self, stamp_ns: int, odom_T_last: F64, step: F64) -> F64:
         """(4, 4) odom_T_cam at a time after the last pose (4, 4); `step` (6,) where the sensors do not reach."""

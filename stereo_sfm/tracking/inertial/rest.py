@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 
 import numpy as np
 
@@ -23,14 +24,17 @@ class Rest:
         self._held: F64 | None = None
         self._count = 0
 
-    def settled(self, stamp_ns: int, odom_T_cam: F64, sensors_still: bool) -> F64:
-        """The pose (4, 4) of an image: the held one while nothing moves, else as the images say."""
+    def settled(self, stamp_ns: int, odom_T_cam: F64, sensors_still: Callable[[], bool]) -> F64:
+        """The pose (4, 4) of an image: the held one while nothing moves, else as the images say.
+
+        `sensors_still`: asked only where the images say that nothing moves.
+        """
         self._seen.append((stamp_ns, odom_T_cam))
         while len(self._seen) > 2 and self._seen[1][0] <= stamp_ns - STILL_NS:
             self._seen.popleft()
         held = self._held
         still = self._images_still(stamp_ns) if held is None else _within(held, odom_T_cam, HELD)
-        if not sensors_still or not still:
+        if not still or not sensors_still():
             self._held, self._count = None, 0
             return odom_T_cam
         if held is None:

@@ -54,6 +54,8 @@ class RotationFilter:
             gain = covariance[:, 3:] @ information / excess
             self._covariance = covariance[3:, 3:] - gain[3:] @ covariance[3:, 3:]
         else:
-            gain = covariance[:, 3:] @ np.linalg.inv(covariance[3:, 3:] + expected / excess)
+            if excess > 1.0:
+                information = np.linalg.inv(covariance[3:, 3:] + expected / excess)
+            gain = covariance[:, 3:] @ information
             self._covariance = gain[3:] @ expected
         return seen @ se3.exp(gain @ off)

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereo_sfm.geometry.kernels import njit
+from stereo_sfm.geometry.kernels import inner, njit
 from stereo_sfm.types import F64, I64
 
 MEMORY_S = 2.0  # how far back intervals may begin, besides the time since the last pose
@@ -42,30 +42,46 @@ class Series:
 
     def edges(self, begin_ns: int, end_ns: int) -> I64 | None:
         """(N + 1,) times from one to a later one, those of the samples between; None where samples are missing."""
-        stamps = self.stamp_ns[self._rows(begin_ns, end_ns)]
-        if end_ns <= begin_ns or not len(stamps):
-            return None
-        before = stamps[0] <= begin_ns
-        nearest = np.concatenate([stamps, [end_ns]] if before else [[begin_ns], stamps, [end_ns]])
-        if np.diff(nearest).max() > self._max_gap_ns:
-            return None
-        return np.concatenate([[begin_ns], stamps[(stamps > begin_ns) & (stamps < end_ns)], [end_ns]])
+        found = _edges(self.stamp_ns, begin_ns, end_ns, self._max_gap_ns)
+        return found if len(found) else None
 
     def means(self, edges_ns: I64) -> F64:
         """(N, K) mean values between successive times (N + 1,), by the trapezoidal rule."""
-        rows = self._rows(int(edges_ns[0]), int(edges_ns[-1]))
-        return _means(self.stamp_ns[rows], self._values[rows], edges_ns)
+        return _means(self.stamp_ns, self._values, edges_ns)
 
-    def _rows(self, begin_ns: int, end_ns: int) -> slice:
-        """The samples from the last one before an interval to the first one after it."""
-        first = int(np.searchsorted(self.stamp_ns, begin_ns, side="right")) - 1
-        last = int(np.searchsorted(self.stamp_ns, end_ns, side="left"))
-        return slice(max(first, 0), last + 1)
+
+@inner
+def _rows(stamp_ns, begin_ns, end_ns):
+    """From the last sample before an interval to the one after the first behind it."""
+    first = max(np.searchsorted(stamp_ns, begin_ns, side="right") - 1, 0)
+    return first, min(np.searchsorted(stamp_ns, end_ns, side="left") + 1, len(stamp_ns))
+
+
+@njit
+def _edges(stamp_ns, begin_ns, end_ns, max_gap_ns):
+    """As `Series.edges`; (0,) where samples (M,) are missing."""
+    first, last = _rows(stamp_ns, begin_ns, end_ns)
+    out, n = np.empty(max(last - first, 0) + 2, np.int64), 1
+    if end_ns <= begin_ns or last <= first:
+        return out[:0]
+    before = min(begin_ns, stamp_ns[first])
+    out[0] = begin_ns
+    for k in range(first, last):
+        if stamp_ns[k] - before > max_gap_ns:
+            return out[:0]
+        before = stamp_ns[k]
+        if begin_ns < before < end_ns:
+            out[n] = before
+            n += 1
+    out[n] = end_ns
+    return out[: n + 1] if end_ns - before <= max_gap_ns else out[:0]
 
 
 @njit
 def _means(stamp_ns, values, edges_ns):
     """Means (N, K) between times (N + 1,) of values (M, K) at stamps (M,): linear between them, constant beyond."""
+    first, last = _rows(stamp_ns, edges_ns[0], edges_ns[-1])
+    stamp_ns, values = stamp_ns[first:last], values[first:last]
     at = np.empty((len(edges_ns), values.shape[1]))
     for n in range(len(edges_ns)):
         k = min(max(np.searchsorted(stamp_ns, edges_ns[n], side="right") - 1, 0), max(len(stamp_ns) - 2, 0))
