@@ -9,8 +9,9 @@ import math
 
 import numpy as np
 
-from stereo_sfm.geometry.kernels import inner, njit, project_one
+from stereo_sfm.geometry.kernels import KANNALA_BRANDT, inner, njit, project_one
 from stereo_sfm.geometry.se3_kernels import dot
+from stereo_sfm.loop.cost_bound import SLACK, fisheye_bound, make_columns
 
 
 @inner
@@ -222,6 +223,7 @@ def ransac(
     Returns:
         (3, 4) transform, its cost (infinite when there is none).
     """
+    ahead, back = make_columns(points, sigmas, uv_b), make_columns(points_b, sigmas_b, uv_a)
     best = np.zeros((3, 4))
     three, rays = np.empty((3, 3)), np.empty((3, 3))
     lowest = math.inf
@@ -235,6 +237,10 @@ def ransac(
         solutions, count = p3p(three, rays)
         for k in range(count):
             t = solutions[k]
+            if model == KANNALA_BRANDT:
+                bound = fisheye_bound(t, ahead, params, pixel_sigma, limit)
+                if bound + fisheye_bound(inverse34(t), back, params, pixel_sigma, limit) > lowest + SLACK:
+                    continue
             cost = _cost(t, points, sigmas, uv_b, points_b, sigmas_b, uv_a, model, params, pixel_sigma, limit, lowest)
             if cost < lowest:
                 lowest = cost

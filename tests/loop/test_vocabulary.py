@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry.hamming import as_words
 from stereo_sfm.loop import vocabulary as voc
-from stereo_sfm.loop.binary import match_descriptors
+from stereo_sfm.loop.binary import _two_nearest, match_descriptors
 from stereo_sfm.loop.database import PlaceDatabase
 from stereo_sfm.loop.vocabulary_file import default_vocabulary, load_vocabulary, save_vocabulary
 from stereo_sfm.types import U8
@@ -134,6 +135,19 @@ def test_matching_finds_the_true_pairs_and_the_ratio_test_ignores_views_of_one_p
     assert len(q) > 95
     assert (t // 2 == q).all()
     assert len(match_descriptors(query, train, None, ratio=0.8)[0]) < 60  # each view is the other's rival
+
+
+def test_the_two_nearest_are_those_of_the_whole_table() -> None:
+    rng = np.random.default_rng(8)
+    a, b = (picture(rng, rng.integers(0, 40, n), 0.2) for n in (90, 300))
+    group = rng.integers(0, 60, 300)
+    best, first, second = _two_nearest(as_words(a), as_words(b), group)
+    bits = np.unpackbits(a[:, None] ^ b[None], axis=2).sum(axis=2, dtype=np.int64)
+    assert np.array_equal(best, bits.argmin(axis=1)) and np.array_equal(first, bits.min(axis=1))
+    rivals = np.where(group == group[best][:, None], 257, bits)
+    assert (second <= rivals.min(axis=1)).all() and (second >= first).all()
+    assert np.mean(second == rivals.min(axis=1)) > 0.9
+    assert _two_nearest(as_words(a), as_words(b[:0]), group[:0])[0].max() == -1
 
 
 def test_package_vocabulary_loads() -> None:
