@@ -1,9 +1,9 @@
-"""Full bundle adjustment of a large map, one core: time, memory, and the size from which the banded solver is faster.
+"""Full bundle adjustment of a large map, one core: time, memory, and the size from which fronts are faster.
 
     python benchmarks/full_ba.py            1,000 keyframes, 100,000 points, 600,000 observations
     python benchmarks/full_ba.py --solvers  one step of either solver at growing numbers of keyframes
 
-The camera passes the same 125 m circuit twice, so that the reduced camera system has loops and not just a band.
+The camera passes the same 125 m circuit twice, so that the reduced camera system has loops.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def solvers() -> None:
             start = time.perf_counter()
             bundle_adjust(rig, bundle, config)
             times.append((time.perf_counter() - start) * 1e3)
-        print(f"{keyframes:5d} keyframes: dense {times[0]:8.1f} ms, banded {times[1]:8.1f} ms")
+        print(f"{keyframes:5d} keyframes: dense {times[0]:8.1f} ms, by fronts {times[1]:8.1f} ms")
 
 
 if __name__ == "__main__":

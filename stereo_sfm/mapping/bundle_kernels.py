@@ -445,21 +445,6 @@ def reduce(starts, obs_kf, free, rot, lin, h_inv, b_point, most, blocks, slots, 
 
 
 @njit
-def fill_band(blocks, rows, cols, transposed, band):
-    """Blocks (B, 6, 6) at places (rows, cols) of the lower triangle, into a band (6 F, width) of zeros.
-
-    band[j] holds the entries (j, j), (j + 1, j), ... of column j. A transposed block belongs to (cols, rows).
-    """
-    for n in range(rows.shape[0]):
-        first = 6 * (rows[n] - cols[n])
-        for j in range(6):
-            column = band[6 * cols[n] + j]
-            for i in range(6):
-                if first + i - j >= 0:
-                    column[first + i - j] = blocks[n, j, i] if transposed[n] else blocks[n, i, j]
-
-
-@njit
 def point_steps(starts, obs_kf, free, rot, lin, h_inv, b_point, step, points, out):
     """Back substitution: out = points + H_point^-1 (b_point - W^T step) with step (F, 6)."""
     a, _, p, _ = lin
