@@ -1,4 +1,4 @@
-"""Kernels without a Python wrapper (`inner`) are named in kernels only: a call from Python would crash the process."""
+"""Kernels without a Python wrapper (`inner`, `inlined`) are named in kernels only: a call from Python would crash the process."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import ast
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-KERNELS = {"njit", "inner"}
+INNER = {"inner", "inlined"}
+KERNELS = {"njit", *INNER}
 
 
 def _decorators(node: ast.AST) -> set[str]:
@@ -47,7 +48,7 @@ def _known_as(tree: ast.Module, inner: set[str]) -> dict[str, str]:
 def test_python_names_no_inner_kernel() -> None:
     paths = [p for folder in ("stereo_sfm", "tests", "benchmarks", "examples") for p in (ROOT / folder).rglob("*.py")]
     trees = {_module(p): ast.parse(p.read_text()) for p in paths}
-    defined = {(m, n.name) for m, tree in trees.items() for n in tree.body if "inner" in _decorators(n)}  # type: ignore[attr-defined]
+    defined = {(m, n.name) for m, tree in trees.items() for n in tree.body if INNER & _decorators(n)}  # type: ignore[attr-defined]
     inner = {f"{module}.{name}" for module, name in defined}
     assert len(inner) > 20
     wrong = [
