@@ -1,4 +1,4 @@
-"""Kernels without a Python wrapper (`inner`, `inlined`) are named in kernels only: a call from Python would crash the process."""
+"""Kernels without a Python wrapper (`inner`, `inlined`) are named in kernels only: Python would crash with them."""
 
 from __future__ import annotations
 
