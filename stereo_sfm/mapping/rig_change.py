@@ -44,9 +44,9 @@ def first_changed(seen: Sequence[SeenPoints], before: Rig, after: Rig) -> int | 
     if len(seen) < 2:
         return None
     pairs = list(itertools.pairwise(seen))
-    misfit = np.nan_to_num(
-        [[_misfit(a, b, *rigs) for rigs in ((before, before), (before, after), (after, after))] for a, b in pairs]
-    )
+    each = [[_misfit(a, b, *rigs) for rigs in ((before, before), (before, after), (after, after))] for a, b in pairs]
+    misfit = np.array(each)
+    misfit[np.isnan(misfit).any(1)] = 0.0  # says nothing
     same, across, changed = misfit.T
     total = np.cumsum(same) - same + across + changed.sum() - np.cumsum(changed)
     best = int(np.argmin(total))
