@@ -161,7 +161,7 @@ class MapperConfig:
         12, 0, 10_000, "Keyframes optimized by local bundle adjustment, the new one included; 0: all connected"
     )
     fixed_keyframes: int = number(
-        40, 0, 10_000, "Older keyframes that hold those in place, the ones that share most points with them; 0: all"
+        28, 0, 10_000, "Older keyframes that hold those in place, the ones that share most points with them; 0: all"
     )
     connected_points: int = number(15, 1, 100_000, "Shared points that make two keyframes neighbours")
     sigma_px: float = number(0.4, 0.001, 100, "Noise of one coordinate of a tracked point")
