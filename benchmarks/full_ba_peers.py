@@ -112,9 +112,11 @@ def ceres(saved: SavedMap, bundle: Bundle) -> tuple[F64, F64, float]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("maps", nargs="+", metavar="MAP")
+    parser.add_argument("maps", nargs="*", metavar="MAP", help="maps of fisheye pairs, as `run --map-out` saves them")
     parser.add_argument("--without", default="", help="of gtsam, ceres")
     args = parser.parse_args()
+    if not args.maps:
+        print("not compared, this needs saved maps of fisheye pairs: stereo-sfm run SOURCE --map-out MAP")
     systems: dict[str, System] = {"ours": ours, "gtsam": gtsam, "ceres": ceres}
     for name in filter(None, args.without.split(",")):
         del systems[name]

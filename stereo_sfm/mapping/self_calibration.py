@@ -113,10 +113,14 @@ class SelfCalibration:
 
     def estimate(self, windows: Sequence[RigWindow]) -> Estimate:
         """Change of the current terms estimated from windows; its covariance includes systematic matching errors."""
-        none = RigInformation(np.diag(1 / PRIOR**2), self.terms / PRIOR**2)
-        total = sum((w.information for w in windows), none)
+        total = self._information(windows)
         covariance = np.asarray(np.linalg.inv(total.matrix), float)
         return Estimate(covariance @ total.vector - self.terms, covariance + np.diag(self._floor**2))
+
+    def _information(self, windows: Sequence[RigWindow]) -> RigInformation:
+        """That of windows, and of the prior around the current terms."""
+        none = RigInformation(np.diag(1 / PRIOR**2), self.terms / PRIOR**2)
+        return sum((w.information for w in windows), none)
 
     def _close_window(self) -> bool:
         """Add a window of the collected keyframes; False if they do not determine one."""
@@ -212,10 +216,8 @@ class SelfCalibration:
 
     def _fit(self, windows: Sequence[RigWindow]) -> float:
         """How well one rig explains windows: their log-likelihood but for a constant of each window."""
-        matrix, vector = np.diag(1 / PRIOR**2), self.terms / PRIOR**2
-        for window in windows:
-            matrix, vector = matrix + window.information.matrix, vector + window.information.vector
-        return 0.5 * float(vector @ np.linalg.solve(matrix, vector))
+        total = self._information(windows)
+        return 0.5 * float(total.vector @ np.linalg.solve(total.matrix, total.vector))
 
     def _first_after_step(self, terms: F64) -> int:
         """Id of the first keyframe that the rig with these terms saw, else of the first window after the step."""
