@@ -25,6 +25,7 @@ SCENES = (
     "fridges",
     "glossy",
     "clutter",
+    "stockroom",
     "market",
 )
 DEFAULT = "loop"

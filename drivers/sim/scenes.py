@@ -58,6 +58,16 @@ def _loop(layout: Layout, session: int, returns: bool) -> F64:
     return np.array([(x, y0), *(lap * (12 if returns else 1)), (x, y0)])
 
 
+def _stockroom(layout: Layout, _session: int, returns: bool) -> F64:
+    """Down an aisle, through the doorway at its end, once around in the stockroom; and back when it returns."""
+    a, _ = _ends(layout)
+    (x, _), _ = layout.doorway
+    y = layout.aisle_y(1)
+    near, far = x + 1.3, x + layout.stockroom - 1.4
+    route = [(a, y), (far, y), (far, y + 2.6), (near, y + 2.6), (near, y)]
+    return np.array([*route, (near, y - 0.01), (a, y - 0.01)] if returns else route)
+
+
 def _serpentine(layout: Layout, session: int, returns: bool) -> F64:
     """Along every inner aisle in turn; then along the first two again when it returns."""
     a, b = _ends(layout)
@@ -101,6 +111,7 @@ SCENES: dict[str, Scene] = {
         _loop,
         42.0,
     ),
+    "stockroom": Scene(Layout(gondolas=3, gondola_length=6.0, stockroom=5.0), _stockroom, 1000.0),
     "demo": Scene(Layout(gondolas=2, gondola_length=3.6, products=120), _loop, 21.0, gait=Gait(speed=1.05)),
     "big": Scene(Layout(gondolas=9, gondola_length=18.0, products=420), _serpentine, 1000.0),
 }

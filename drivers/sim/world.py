@@ -15,6 +15,8 @@ from stereo_sfm.drivers.sim.tables import Builder, Tables, make_tables
 
 CLOTHES, HAIR, SKIN = 8, 8, 10  # of the textures that people wear: patterned cloths, then two of hair, then skin
 FACING_MINUS_Y, FACING_PLUS_Y, FACING_MINUS_X, FACING_PLUS_X = 0, 1, 2, 3
+DOORWAY = (1.1, 2.1)  # metres wide and high
+PARTITION = 0.15  # metres, thickness of the wall of a stockroom
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,7 @@ class Layout:
     bare: float = 0.0  # share of the shelves' length that is a white wall instead
     polish: float = 0.0  # of the floor, 0: matt, 1: wet
     carts: int = 0  # shopping carts that stand in the aisles of `build_world`
+    stockroom: float = 0.0  # metres of a room behind a wall with a doorway, at the end of the aisles
 
     def with_stock(self, densities: dict[str, float]) -> Layout:
         """With other values of those fields, of the layout or its mix."""
@@ -47,7 +50,18 @@ class Layout:
 
     @property
     def room(self) -> tuple[float, float, float]:
-        return self.gondola_length + 2 * self.margin, self.aisle_pitch * (self.gondolas + 1), self.height
+        return self.shop_length + self.stockroom, self.aisle_pitch * (self.gondolas + 1), self.height
+
+    @property
+    def shop_length(self) -> float:
+        """Metres from wall to wall along the gondolas, without the stockroom."""
+        return self.gondola_length + 2 * self.margin
+
+    @property
+    def doorway(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Both ends of the stockroom's doorway on the floor, in the middle of its wall; it continues aisle 1."""
+        x, y = self.shop_length + 0.5 * PARTITION, self.aisle_y(1)
+        return (x, y - 0.5 * DOORWAY[0]), (x, y + 0.5 * DOORWAY[0])
 
     def gondola_y(self, k: int) -> float:
         """Middle of gondola k."""
@@ -109,7 +123,7 @@ def add_gondola(
 def _walls(b: Builder, shop: Shop, seed: tuple[int, ...], layout: Layout) -> None:
     """Shelves along the long walls; posters and doors on the short ones."""
     plan = np.random.default_rng([*seed, 2])
-    x1, y1, _ = layout.room
+    x1, y1 = layout.shop_length, layout.room[1]
     for facing, y in ((FACING_PLUS_Y, 0.0), (FACING_MINUS_Y, y1)):
         first = len(b.blocks)
         add_shelf_pair(b, shop, plan, (1.5, x1 - 1.5), y, facing, layout)
@@ -123,15 +137,42 @@ def _walls(b: Builder, shop: Shop, seed: tuple[int, ...], layout: Layout) -> Non
             z = 0.0 if is_door else float(plan.uniform(0.7, 1.4))
             image = textures.door(plan) if is_door else textures.poster(plan, int(high * 260), int(wide * 260))
             k = b.atlas.add(image)
-            b.solid((min(x, x + inside), y, z), (max(x, x + inside), y + wide, z + high), [k] * 6)
+            (_, y_low), (_, y_high) = layout.doorway
+            if not (layout.stockroom and x > 0 and y < y_high and y + wide > y_low):
+                b.solid((min(x, x + inside), y, z), (max(x, x + inside), y + wide, z + high), [k] * 6)
             y += wide + float(plan.uniform(0.15, 0.7))
         b.end_group(first)
+
+
+def _stockroom(b: Builder, shop: Shop, seed: tuple[int, ...], layout: Layout) -> None:
+    """The wall between shop and stockroom with its doorway and posters, and shelves along the wall behind."""
+    plan = np.random.default_rng([*seed, 13])
+    (middle, y_low), (_, y_high) = layout.doorway
+    x0, x1 = middle - 0.5 * PARTITION, middle + 0.5 * PARTITION
+    far, y1, z1 = layout.room
+    panel = b.atlas.add(textures.wall(plan, 256), (1.2, 1.2), wrap=True)
+    first = len(b.blocks)
+    for lo, hi in (((0.0, 0.0), (y_low, z1)), ((y_high, 0.0), (y1, z1)), ((y_low, DOORWAY[1]), (y_high, z1))):
+        b.solid((x0, lo[0], lo[1]), (x1, hi[0], hi[1]), [panel] * 6)
+    b.end_group(first)
+    first, y = len(b.blocks), 0.4
+    while y < y1 - 1.6:
+        wide, high, z = (float(plan.uniform(*span)) for span in ((0.7, 1.5), (0.8, 1.5), (0.5, 1.3)))
+        k = b.atlas.add(textures.poster(plan, int(high * 260), int(wide * 260)))
+        if y > y_high or y + wide < y_low:
+            b.solid((x1, y, z), (x1 + 0.03, y + wide, z + high), [k] * 6)
+        y += wide + float(plan.uniform(0.15, 0.5))
+    b.end_group(first)
+    first, deep = len(b.blocks), layout.gondola_depth
+    heights = [0.14, *board_heights(plan, 0.5, layout.shelf_top)]
+    add_shelf(b, shop, plan, ((far - deep, 0.3, 0.0), (far, y1 - 0.3, layout.shelf_top)), FACING_MINUS_X, heights)
+    b.end_group(first)
 
 
 def _furniture(b: Builder, shop: Shop, seed: tuple[int, ...], layout: Layout) -> None:
     """Aisle signs under the ceiling, pillars and promotion stacks in the cross aisles."""
     plan = np.random.default_rng([*seed, 3])
-    x1, _, z1 = layout.room
+    x1, z1 = layout.shop_length, layout.height
     pillar = b.atlas.add(textures.wall(plan, 256), (1.2, 1.2), wrap=True)
     first = len(b.blocks)
     for k in range(layout.gondolas + 1):
@@ -184,6 +225,8 @@ def build_world(layout: Layout | None = None, seed: int = 0, exchange: float = 0
     _walls(b, shop, root, layout)
     _furniture(b, shop, root, layout)
     _carts(b, shop, root, layout)
+    if layout.stockroom:
+        _stockroom(b, shop, root, layout)
     return make_tables(b.atlas, layout.room, add_surfaces(b.atlas, rng, layout.room), b)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from stereo_sfm.config import Config
     from stereo_sfm.maps.saved_map import SavedMap
 
-PLAN, FRONTS = "floor_plan.pgm", "shelf_fronts.yaml"
+PLAN, FRONTS, DOORS = "floor_plan.pgm", "shelf_fronts.yaml", "doors.yaml"
 ACTIONS = ("update", "undo", "versions", "label", "plan")
 
 
@@ -28,6 +28,7 @@ class LabelOptions:
     name: str
     start: tuple[float, float] | None
     end: tuple[float, float] | None
+    door: bool
     remove: bool
 
 
@@ -44,13 +45,14 @@ def add_arguments(add_action: Callable[..., argparse.ArgumentParser]) -> None:
     undo.add_argument("store", type=Path, metavar="STORE", help="map folder")
     versions = add_action("versions", help="list the versions of a store and what changed last")
     versions.add_argument("store", type=Path, metavar="STORE", help="map folder")
-    label = add_action("label", help="name an aisle by a line on the floor plan")
+    label = add_action("label", help="name an aisle, or a door, by a line on the floor plan")
     label.add_argument("store", type=Path, metavar="STORE", help="map folder")
-    label.add_argument("name", help="such as 'aisle 4'")
+    label.add_argument("name", help="such as 'aisle 4' or, with --door, 'stockroom'")
     label.add_argument("start", nargs="?", type=_point, metavar="X,Y", help="metres of the floor plan")
     label.add_argument("end", nargs="?", type=_point, metavar="X,Y", help="the other end")
+    label.add_argument("--door", action="store_true", help="the line is across a door, not along an aisle")
     label.add_argument("--remove", action="store_true", help="forget this name")
-    plan = add_action("plan", help="write the floor plan for robots, with shelf fronts and keep-out zones")
+    plan = add_action("plan", help="write the floor plan for robots, with shelf fronts, doors, keep-out zones")
     plan.add_argument("store", type=Path, metavar="STORE", help="map folder; the files are written into it")
     plan.add_argument("--resolution", type=float, default=0.05, metavar="M", help="metres a pixel (default: 0.05)")
 
@@ -72,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
         return _versions(args.store)
     if args.action == "plan":
         return _plan(args.store, args.resolution)
-    return _label(LabelOptions(args.store, args.name, args.start, args.end, args.remove))
+    return _label(LabelOptions(args.store, args.name, args.start, args.end, args.door, args.remove))
 
 
 def _update(store: Path, walks: list[str], config: Config, keep: int) -> int:
@@ -154,28 +156,31 @@ def _label(options: LabelOptions) -> int:
     import dataclasses
 
     from stereo_sfm.maps.changes import Aisle
-    from stereo_sfm.maps.store import lock, read_about, write_about
+    from stereo_sfm.maps.store import Door, lock, read_about, write_about
 
     _check_store(options.store)
     with lock(options.store):
         about = read_about(options.store)
         aisles = tuple(a for a in about.aisles if a.name != options.name)
-        if options.remove and len(aisles) == len(about.aisles):
+        doors = tuple(d for d in about.doors if d.name != options.name)
+        if options.remove and (aisles, doors) == (about.aisles, about.doors):
             raise StereoSfmError(f"{options.store} has no label '{options.name}'")
         if not options.remove:
             if options.start is None or options.end is None or options.start == options.end:
                 raise StereoSfmError(
                     "a label needs two different points, as in: map label STORE 'aisle 4' 1.5,3 13.5,3"
                 )
-            aisles = (*aisles, Aisle(options.name, options.start, options.end))
-        write_about(options.store, dataclasses.replace(about, aisles=aisles))
+            if options.door:
+                doors = (*doors, Door(options.name, options.start, options.end))
+            else:
+                aisles = (*aisles, Aisle(options.name, options.start, options.end))
+        write_about(options.store, dataclasses.replace(about, aisles=aisles, doors=doors))
     return 0
 
 
 def _plan(store: Path, resolution: float) -> int:
-    """Floor plan, keep-out mask and drawing, shelf fronts."""
-    import yaml
-
+    """Floor plan, keep-out mask and drawing, shelf fronts, doors."""
+    from stereo_sfm.export.doors import plan_doors
     from stereo_sfm.export.floor_plan import make_floor_plan, write_floor_plan
     from stereo_sfm.export.keep_out import read_zones, write_zones
     from stereo_sfm.export.shelf_fronts import shelf_fronts
@@ -192,11 +197,31 @@ def _plan(store: Path, resolution: float) -> int:
         write_floor_plan(plan, store / PLAN)
         write_zones(store, plan, zones)
         fronts = shelf_fronts(plan, about.aisles)
-        rows = [{"label": f.label, "start": list(f.start), "end": list(f.end), "faces": list(f.faces)} for f in fronts]
-        (store / FRONTS).write_text(yaml.safe_dump(rows, sort_keys=False, allow_unicode=True), encoding="utf-8")
+        doors = plan_doors(plan, about.doors)
+        _write_rows(
+            store / FRONTS,
+            [{"label": f.label, "start": list(f.start), "end": list(f.end), "faces": list(f.faces)} for f in fronts],
+        )
+        _write_rows(
+            store / DOORS,
+            [
+                {"label": d.door.name, "start": list(d.door.start), "end": list(d.door.end)}
+                | {"width": round(d.width, 3), "seen_open": d.seen_open}
+                for d in doors
+            ],
+        )
     square = float(zones.sum()) * resolution**2
-    print(f"{store / PLAN}, {len(fronts)} shelf fronts in {FRONTS}, {square:.1f} m2 of keep-out zones in keepout.png")
+    print(
+        f"{store / PLAN}, {len(fronts)} shelf fronts in {FRONTS}, {len(doors)} doors in {DOORS},"
+        f" {square:.1f} m2 of keep-out zones in keepout.png"
+    )
     return 0
+
+
+def _write_rows(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
+    import yaml
+
+    path.write_text(yaml.safe_dump([dict(row) for row in rows], sort_keys=False, allow_unicode=True), encoding="utf-8")
 
 
 def _check_store(store: Path) -> None:

@@ -29,6 +29,20 @@ ABOUT, CHANGES = "store.yaml", "changes.txt"
 KEPT_VERSIONS = 5
 
 
+@dataclass(frozen=True)
+class Door:
+    """A line across a door, in metres of the floor plan."""
+
+    name: str
+    start: tuple[float, float]
+    end: tuple[float, float]
+
+    @property
+    def middle(self) -> F64:
+        """(2,) metres."""
+        return np.add(self.start, self.end) / 2
+
+
 @dataclass(frozen=True, eq=False)
 class About:
     """What is known of a store besides its map."""
@@ -36,6 +50,7 @@ class About:
     version: int  # counts updates
     map_T_floor: F64  # (4, 4) set once, so that labels and plans stay valid
     aisles: tuple[Aisle, ...] = ()
+    doors: tuple[Door, ...] = ()
 
 
 def versions_folder(store: Path) -> Path:
@@ -74,21 +89,25 @@ def read_about(store: Path, saved: SavedMap | None = None) -> About:
         return About(0, find_floor((saved or load_map(store)).snapshot))
     try:
         data: Any = yaml.safe_load(path.read_text("utf-8"))
-        aisles = tuple(Aisle(str(a["name"]), _pair(a["start"]), _pair(a["end"])) for a in data["aisles"])
+        aisles = tuple(Aisle(*_line(line)) for line in data["aisles"])
+        doors = tuple(Door(*_line(line)) for line in data.get("doors", ()))
         pose = np.array(data["map_T_floor"], float).reshape(4, 4)
-        return About(int(data["version"]), pose, aisles)
-    except (yaml.YAMLError, KeyError, TypeError, ValueError, OSError):
+        return About(int(data["version"]), pose, aisles, doors)
+    except (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError, OSError):
         raise StereoSfmError(f"{path} is damaged: correct it, or remove it to begin without labels") from None
 
 
-def _pair(values: Any) -> tuple[float, float]:
-    x, y = values
-    return float(x), float(y)
+def _line(data: Any) -> tuple[str, tuple[float, float], tuple[float, float]]:
+    (x0, y0), (x1, y1) = data["start"], data["end"]
+    return str(data["name"]), (float(x0), float(y0)), (float(x1), float(y1))
 
 
 def _about_text(about: About) -> bytes:
-    aisles = [{"name": a.name, "start": list(a.start), "end": list(a.end)} for a in about.aisles]
-    data = {"version": about.version, "map_T_floor": about.map_T_floor.tolist(), "aisles": aisles}
+    aisles, doors = (
+        [{"name": line.name, "start": list(line.start), "end": list(line.end)} for line in lines]
+        for lines in (about.aisles, about.doors)
+    )
+    data = {"version": about.version, "map_T_floor": about.map_T_floor.tolist(), "aisles": aisles, "doors": doors}
     return yaml.safe_dump(data, sort_keys=False, allow_unicode=True).encode()
 
 

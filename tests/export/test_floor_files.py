@@ -12,28 +12,13 @@ import yaml
 
 from stereo_sfm.cli import main
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.export.floor_plan import FREE, OCCUPIED, UNKNOWN, FloorPlan
+from stereo_sfm.export.floor_plan import FREE, OCCUPIED, UNKNOWN
 from stereo_sfm.export.keep_out import ABOUT, DRAWING, read_zones, write_zones
 from stereo_sfm.export.shelf_fronts import shelf_fronts
 from stereo_sfm.maps.changes import Aisle
 from stereo_sfm.maps.saved_map import save_map
+from tests.export.plans import fill, plan_of
 from tests.maps.maps import small_map
-
-
-def plan_of(width: float, height: float, origin: tuple[float, float], resolution: float = 0.05) -> FloorPlan:
-    """A free floor."""
-    image = np.full((round(height / resolution), round(width / resolution)), FREE, np.uint8)
-    return FloorPlan(image, resolution, origin, np.eye(4))
-
-
-def fill(plan: FloorPlan, x0: float, y0: float, x1: float, y1: float, value: int) -> None:
-    """A rectangle in metres."""
-    rising = plan.image[::-1]
-    (a, b), (c, d) = (
-        (round((x - plan.origin[0]) / plan.resolution), round((y - plan.origin[1]) / plan.resolution))
-        for x, y in ((x0, y0), (x1, y1))
-    )
-    rising[b:d, a:c] = value
 
 
 def test_zones_drawn_by_hand_stay_where_they_are_when_the_plan_grows(tmp_path: Path) -> None:
