@@ -19,10 +19,11 @@ ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
-def help_of(command: str) -> str:
+def help_of(*words: str) -> str:
+    """Of a command, or of an action of it."""
     out = io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
-        main([command, "--help"])
+        main([*words, "--help"])
     return out.getvalue()
 
 
@@ -31,6 +32,8 @@ def test_commands_exist_with_their_options(page: Path) -> None:
     for name, rest in re.findall(r"stereo-sfm ([a-z][a-z0-9-]*)([^\n`|]*)", page.read_text()):
         assert name in COMMANDS, f"{page.name} calls 'stereo-sfm {name}'"
         text = help_of(name)
+        if "ACTION" in text and (action := re.match(r" ([a-z]+) ", rest)):
+            text += help_of(name, action[1])
         for option in re.findall(r"(?<!\w)--[a-z][a-z-]+", rest):
             assert option in text, f"{page.name} gives '{name}' the option {option}"
 
