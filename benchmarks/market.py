@@ -9,7 +9,8 @@ all sessions together, also as a share of the metres driven), size, and times; t
 driven a bit aside, are asked in it; it fails where one of them takes more than 0.3 s of processor time. `growth` drives
 on from session to session in one run and prints, for each stretch, processor time a frame (without rendering; also in
 units of ORB on both images, for a busy machine slows both), resident memory, keyframes and points, and medians of the
-time of a keyframe; at some places also the size of the map and the time to open it. It fails where the last tenth
+time of a keyframe; at some places also the size of the map and the time to open it, and the size of the log (lean, as
+runs on recordings write it; in a pipeline another process does). It fails where the last tenth
 needs more than 1.2 times the ORBs of the stretch around 600 m (medians), or 1.5 times the memory. With `--distinct` so
 many metres are rendered into a file and driven there and back again and again, so that all after them is known.
 """
@@ -40,6 +41,8 @@ from stereo_sfm.config import Config
 from stereo_sfm.drivers.source import BaseSource, open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.floor_plan import make_floor_plan
+from stereo_sfm.log.run_log import RunLog
+from stereo_sfm.log.writer import LogWriter
 from stereo_sfm.mapping.mapper import Mapper
 from stereo_sfm.maps.folders import saved_map_of
 from stereo_sfm.maps.saved_map import SavedMap
@@ -150,6 +153,19 @@ def orb_seconds(orb: cv2.ORB, image: StereoImage) -> float:
     return time.process_time() - start
 
 
+class Logged:
+    """A sink: a run's log, with the processor time that it takes."""
+
+    def __init__(self, path: Path, source: RenderedDrive) -> None:
+        self.path, self.seconds = path, 0.0
+        self._log = RunLog(LogWriter(path), source.rig, Config(), source="market", mode="inline", image_format="none")
+
+    def put(self, message: object) -> None:
+        start = time.process_time()
+        self._log.put(message)
+        self.seconds += time.process_time() - start
+
+
 class StretchTimes:
     """A sink: milliseconds of each keyframe in mapper and loop closer since the last line."""
 
@@ -177,14 +193,15 @@ def growth(spec: str, length: float, stretch: float) -> bool:
     with tempfile.TemporaryDirectory() as folder:
         source = RenderedDrive(spec, length, Path(folder) / "images")
         driven, times = source.driven, StretchTimes()
-        run = InlineRun(source, Config(), [times], None)
+        log = Logged(Path(folder) / "run.mcap", source)
+        run = InlineRun(source, Config(), [times, log], None)
         mapper = run.map_stage.mapper
         assert isinstance(mapper, Mapper)
         begun, spent, orbs, until = 0, 0.0, list[float](), stretch
         for k, image in enumerate(source):
-            start = time.process_time()
+            start, logging = time.process_time(), log.seconds
             run.step(image)
-            spent += time.process_time() - start
+            spent += time.process_time() - start - (log.seconds - logging)
             if k % ORB_EVERY == 0:
                 orbs.append(orb_seconds(orb, image))
             if driven[k] < until and k + 1 < len(driven):
@@ -199,15 +216,15 @@ def growth(spec: str, length: float, stretch: float) -> bool:
                 flush=True,
             )
             if any(until <= metres < until + stretch for metres in DESCRIBED_M) or k + 1 == len(driven):
-                describe(mapper)
+                describe(mapper, log.path)
             begun, spent, orbs, until = k + 1, 0.0, [], until + stretch
     early = min(rows, key=lambda row: abs(row[0] - FROM_M))
     late = np.median(rows[-max(len(rows) // 10, 1) :], axis=0)
     return bool(late[1] <= TIME_RATIO * early[1] and late[2] <= MEMORY_RATIO * early[2])
 
 
-def describe(mapper: Mapper) -> None:
-    """Print the size of the map on disk, the time to open it, and its floor plan."""
+def describe(mapper: Mapper, log: Path) -> None:
+    """Print the size of the map on disk, the time to open it, its floor plan, and the size of the log."""
     saved = saved_map_of(mapper, Config())
     assert saved is not None
     megabytes, opening = on_disk(saved)
@@ -215,7 +232,8 @@ def describe(mapper: Mapper) -> None:
     plan = make_floor_plan(saved.snapshot)
     print(
         f"           map: {megabytes:.1f} MB, opened in {opening:.2f} s; floor plan"
-        f" {plan.image.shape[1]}x{plan.image.shape[0]} in {time.perf_counter() - begin:.1f} s",
+        f" {plan.image.shape[1]}x{plan.image.shape[0]} in {time.perf_counter() - begin:.1f} s;"
+        f" log {log.stat().st_size / 1e6:.1f} MB",
         flush=True,
     )
 
