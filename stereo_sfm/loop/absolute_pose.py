@@ -6,7 +6,8 @@ stereo points too, they are projected into a. The uncertainty of a point's range
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -35,6 +36,11 @@ class Matches:
 
     def __len__(self) -> int:
         return len(self.points_a)
+
+
+def joined(parts: Sequence[Matches]) -> Matches:
+    """All matches of several lists."""
+    return Matches(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Matches)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,7 @@ A word is a leaf. Word ids never change: growing splits leaves and appends new i
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,7 +14,7 @@ import numpy as np
 
 from stereo_sfm.geometry.hamming import U64, as_words
 from stereo_sfm.loop import binary
-from stereo_sfm.types import F32, I32, U8
+from stereo_sfm.types import F32, I32, I64, U8
 
 MIN_DISTANCE_NEW_WORD = 40  # bits from its word above which a descriptor is new to the vocabulary
 
@@ -110,11 +111,25 @@ def train(images: Sequence[U8], branching: int = 10, depth: int = 4, seed: int =
 
 
 def _idf(tree: Vocabulary, images: Sequence[U8]) -> F32:
+    return np.log(np.maximum(len(images), 2) / np.maximum(_seen(tree, images), 1)).astype(np.float32)
+
+
+def _seen(tree: Vocabulary, images: Sequence[U8]) -> I64:
+    """(W,) images with each word."""
     seen = np.zeros(len(tree), np.int64)
     for descriptors in images:
         ids, _ = tree.look_up(descriptors)
         seen[np.unique(ids[ids >= 0])] += 1
-    return np.log(np.maximum(len(images), 2) / np.maximum(seen, 1)).astype(np.float32)
+    return seen
+
+
+def counted(vocabulary: Vocabulary, images: Sequence[U8]) -> Vocabulary:
+    """The same words with the idf of other images, (N, 32) each: of a map, where lamps and floor tiles are everywhere.
+
+    Words of all images keep a little weight, so that the smallest map has some.
+    """
+    seen = _seen(vocabulary, images)
+    return dataclasses.replace(vocabulary, idf=np.log((len(images) + 1) / np.maximum(seen, 1)).astype(np.float32))
 
 
 def grow(

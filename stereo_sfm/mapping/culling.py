@@ -47,7 +47,8 @@ def redundant_keyframe(map_: Map, newest: int, protected: Bool, earlier: I64, co
     """A redundant neighbour of the newest keyframe, -1: none.
 
     The oldest one whose points are seen well enough by others; else, in a place that the robot visits often, the one
-    of several with the same view whose points are seen best by others: a view keeps `crowd_keyframes` keyframes.
+    of several with the same view whose points are seen best by others: a view keeps `crowd_keyframes` keyframes. Of
+    each view one by which places are recognised stays.
 
     Args:
         protected: (K,) keyframes that must stay (the first and the newest ones). earlier: see `earlier_visits`.
@@ -57,12 +58,28 @@ def redundant_keyframe(map_: Map, newest: int, protected: Bool, earlier: I64, co
     neighbours, _ = map_.neighbours(newest, config.connected_points)
     neighbours = np.sort(neighbours[~protected[neighbours]])
     shares = _seen_by_others(map_, neighbours)
-    if (shares > config.redundant_share).any():
-        return int(neighbours[np.argmax(shares > config.redundant_share)])
+    for row in neighbours[shares > config.redundant_share].tolist():
+        if not _alone_described(map_, row, config):
+            return row
     same = np.union1d(neighbours[_same_view(map_, newest, neighbours)], earlier)
     if len(same) <= config.crowd_keyframes:
         return -1
+    plain = same[~_described(map_, same)]
+    same = plain if len(plain) else same
     return int(same[np.argmax(_seen_by_others(map_, same))])
+
+
+def _described(map_: Map, rows: I64) -> Bool:
+    """(N,) which keyframes have corners for place recognition: about one of two in an aisle."""
+    return np.array([len(map_.corners[row][0]) > 0 for row in rows.tolist()], bool)
+
+
+def _alone_described(map_: Map, row: int, config: MapperConfig) -> bool:
+    """Whether a camera would not be found in a keyframe's view without it: it has corners, and none like it has."""
+    if not len(map_.corners[row][0]):
+        return False
+    others, _ = map_.neighbours(row, config.connected_points)
+    return not _described(map_, others[_same_view(map_, row, others)]).any()
 
 
 def earlier_visits(map_: Map, newest: int, protected: Bool) -> I64:

@@ -12,9 +12,10 @@ import scipy.sparse
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
+from stereo_sfm.loop.absolute_pose import joined, refine_pose
 from stereo_sfm.loop.cloud import Cloud, gather
 from stereo_sfm.loop.database import PlaceDatabase
-from stereo_sfm.loop.place_view import place_view_of
+from stereo_sfm.loop.place_view import PlaceView, place_view_of
 from stereo_sfm.loop.sideways import (
     MIN_CORNERS,
     SIDE_FACTOR,
@@ -24,8 +25,8 @@ from stereo_sfm.loop.sideways import (
     sideways_config,
     with_neighbours,
 )
-from stereo_sfm.loop.verification import Verdict, verify, verify_near, within
-from stereo_sfm.loop.vocabulary import Vocabulary
+from stereo_sfm.loop.verification import Verdict, pair, verify, verify_near, within
+from stereo_sfm.loop.vocabulary import Vocabulary, counted
 from stereo_sfm.mapping.map import MapSnapshot
 from stereo_sfm.types import F64, I64, Keyframe
 
@@ -34,6 +35,8 @@ AMBIGUITY_RATIO = 0.75  # a result is ambiguous if another place has this share 
 CONFIDENCE_FACTOR = 2.0  # times the required inliers: no further candidates or confirmation needed
 CONFIDENT_SHARE = 0.4  # of the corners ahead and beside; places that only look alike have 0.3 at most
 MIN_RANGE_SIGMA_M = 0.003
+CLOSER_PLACES, CLOSER_VIEWS = 4, 3  # ambiguous places that are compared again, from so many keyframes around each
+CLOSER_SHARE = 0.2  # of the weight of all corners; other stores with the same products have less in nine of ten
 KEPT = 64  # newest clouds: a place found ahead is a candidate beside, and cameras ask from near where they were
 
 
@@ -66,11 +69,16 @@ def not_found(reason: str, inliers: int = 0) -> Location:
     return Location(reason, np.eye(4), np.zeros((6, 6)), -1, inliers, np.zeros((0, 2), np.int64))
 
 
+def _distinct(a: Location, b: Location) -> bool:
+    """Whether they are different places."""
+    return not within(se3.inverse(a.map_T_cam) @ b.map_T_cam, SAME_PLACE_M, SAME_PLACE_DEG)
+
+
 class Relocalizer:
     """Finds cameras in a map. Results depend on the map, the configuration and the view only."""
 
     def __init__(self, snapshot: MapSnapshot, rig: Rig, vocabulary: Vocabulary, config: LoopConfig) -> None:
-        self._map, self._rig, self._vocabulary = snapshot, rig, vocabulary
+        self._map, self._rig = snapshot, rig
         self._keyframes = snapshot.keyframes()
         self._described = np.flatnonzero([k.described for k in self._keyframes])
         self._undescribed = np.flatnonzero([not k.described for k in self._keyframes])
@@ -90,28 +98,107 @@ class Relocalizer:
         self._sees = self._seen.tocsc()
         self._views = np.maximum(np.bincount(snapshot.obs_pt, minlength=shape[1]), 1)
         self._cloud = functools.lru_cache(maxsize=KEPT)(self._gather)
-        self._database, self._side_database = PlaceDatabase(len(vocabulary)), PlaceDatabase(len(vocabulary))
+        ahead, beside = ([k.corners for k in self._keyframes], [k.sides for k in self._keyframes])
+        self._vocabularies = tuple(
+            counted(vocabulary, [c.descriptors for c in corners if len(c)]) for corners in (ahead, beside)
+        )
+        self._databases = PlaceDatabase(len(vocabulary)), PlaceDatabase(len(vocabulary))
         self._fronts = Fronts(rig.left)
         self._has_sides = any(len(k.sides) >= MIN_CORNERS for k in self._keyframes)
         for k, keyframe in enumerate(self._keyframes):
-            self._database.add(k, vocabulary.bag(keyframe.corners.descriptors))
-            self._side_database.add(k, vocabulary.bag(keyframe.sides.descriptors))
+            for words, database, corners in zip(
+                self._vocabularies, self._databases, (keyframe.corners, keyframe.sides), strict=True
+            ):
+                database.add(k, words.bag(corners.descriptors))
             self._fronts.add(keyframe)
 
     def locate(self, keyframe: Keyframe) -> Location:
         """Find the camera of a keyframe (its pose is ignored) in the map, if need be from another direction."""
+        place = self._find(keyframe)
+        return self._refined(keyframe, place) if place.found else place
+
+    def _find(self, keyframe: Keyframe) -> Location:
+        """`locate`, with the pose of the first keyframe of the map that showed the place."""
         found_ahead, reason = self._search(keyframe, False)
         ahead = self._choose(found_ahead, reason)
         if len(keyframe.sides) < MIN_CORNERS or (ahead.found and self._confirmed(ahead)):
             return ahead
-        beside = self._choose(*self._search(keyframe, True))
-        if not beside.found:
-            return not_found("ambiguous", ahead.inliers) if ahead.found else ahead
-        if self._is_turned(beside):
+        found_beside, reason = self._search(keyframe, True)
+        beside = self._choose(found_beside, reason)
+        if beside.found and self._is_turned(beside):
             return beside
-        beside = self._with_ahead(keyframe, beside)
-        known = self._choose([beside, *found_ahead], "") is beside
-        return beside if known else not_found("ambiguous", beside.inliers)
+        if beside.found:
+            beside = self._with_ahead(keyframe, beside)
+            found_beside = [beside]
+            if self._choose([beside, *found_ahead], "") is beside:
+                return beside
+        if ahead.reason in ("", "ambiguous") or beside.reason in ("", "ambiguous"):
+            return self._look_closer(keyframe, [*found_ahead, *found_beside])
+        return ahead
+
+    def _look_closer(self, keyframe: Keyframe, found: list[Location]) -> Location:
+        """Compare places again, each as seen by all keyframes around it, and by what is not everywhere in the map.
+
+        A search counts corners that agree with one keyframe, of which one may lie nearer to a false place than another
+        to the true one, and most of which may be lamps and floor tiles. A corner's weight is the square of its word's
+        idf in this map, as in a scalar product of tf-idf vectors (Sivic and Zisserman, ICCV 2003).
+        """
+        places: list[Location] = []
+        for place in sorted((x for x in found if x.found), key=lambda x: -x.agreeing):
+            if len(places) < CLOSER_PLACES and all(_distinct(place, other) for other in places):
+                places.append(place)
+        views = self._views_of(keyframe)
+        weights = [
+            np.where(view.corner, words.idf[np.maximum(words.look_up(view.descriptors)[0], 0)] ** 2, 0.0)
+            for words, view in zip(self._vocabularies, views, strict=True)
+        ]
+        evidence = [self._evidence(views, weights, place) for place in places]
+        order = np.argsort(-np.array(evidence), kind="stable").tolist()
+        if len(order) > 1 and evidence[order[1]] > AMBIGUITY_RATIO * evidence[order[0]]:
+            return not_found("ambiguous", places[order[0]].inliers)
+        if not order or evidence[order[0]] < CLOSER_SHARE * sum(float(w.sum()) for w in weights):
+            return not_found("ambiguous")
+        return places[order[0]]
+
+    def _evidence(self, views: list[PlaceView], weights: list[F64], place: Location) -> float:
+        """Weight of the corners ahead and beside that agree with a place, from any of the keyframes around it."""
+        agreeing = [np.zeros(len(weight), bool) for weight in weights]
+        for row in self._nearest(place.map_T_cam, CLOSER_VIEWS).tolist():
+            for agrees, verdict in zip(agreeing, self._agreeing(views, place.map_T_cam, row), strict=True):
+                agrees[verdict.rows[:, 1]] = True
+        return sum(float(weight[agrees].sum()) for weight, agrees in zip(weights, agreeing, strict=True))
+
+    def _views_of(self, keyframe: Keyframe) -> list[PlaceView]:
+        """Ahead and beside."""
+        sigma = self._config.disparity_sigma_px
+        return [place_view_of(keyframe, self._rig, sigma, sideways) for sideways in (False, True)]
+
+    def _agreeing(self, views: list[PlaceView], map_T_cam: F64, row: int) -> list[Verdict]:
+        """What a keyframe of the map says to a pose, ahead and beside."""
+        kf_T_cam = se3.inverse(map_T_cam) @ self._map.map_T_kf[row]
+        return [
+            verify_near(kf_T_cam, view, self._cloud(row, sideways), self._rig, config)
+            for sideways, view, config in zip((False, True), views, (self._config, self._side_config), strict=True)
+        ]
+
+    def _refined(self, keyframe: Keyframe, place: Location) -> Location:
+        """The pose from all that agrees with it ahead and beside, as the nearest keyframe of the map sees it."""
+        views, row = self._views_of(keyframe), int(self._nearest(place.map_T_cam, 1)[0])
+        matches = [
+            pair(view, self._cloud(row, sideways), verdict.rows[:, 1], verdict.rows[:, 0])
+            for sideways, view, verdict in zip(
+                (False, True), views, self._agreeing(views, place.map_T_cam, row), strict=True
+            )
+        ]
+        together = joined(matches)
+        if len(together) < self._config.min_inliers:
+            return place
+        b_T_a = se3.inverse(place.map_T_cam) @ self._map.map_T_kf[row]
+        pose = refine_pose(b_T_a, together, self._rig, self._config.sigma_px)
+        map_T_cam = self._map.map_T_kf[row] @ se3.inverse(pose.b_T_a)
+        if not within(se3.inverse(place.map_T_cam) @ map_T_cam, SAME_PLACE_M, SAME_PLACE_DEG):
+            return place
+        return dataclasses.replace(place, map_T_cam=map_T_cam, information=pose.information)
 
     def _confirmed(self, ahead: Location) -> bool:
         """Whether the shelves beside do not contradict what is ahead: rows of lamps look alike from both directions."""
@@ -146,12 +233,11 @@ class Relocalizer:
     def _search(self, keyframe: Keyframe, sideways: bool) -> tuple[list[Location], str]:
         """Places by its corners, or by those of the views that face the shelves; and why there are none."""
         config = self._side_config if sideways else self._config
-        database = self._side_database if sideways else self._database
         view = place_view_of(keyframe, self._rig, config.disparity_sigma_px, sideways)
-        bag = self._vocabulary.bag((keyframe.sides if sideways else keyframe.corners).descriptors)
+        bag = self._vocabularies[sideways].bag((keyframe.sides if sideways else keyframe.corners).descriptors)
         found: list[Location] = []
         reason = "no_candidate"
-        for row in self._places(database.scores(bag)):
+        for row in self._places(self._databases[sideways].scores(bag)):
             rng = np.random.default_rng([config.seed, row])
             verdict = verify(view, self._cloud(row, sideways), self._rig, config, rng, move_points=False)
             if verdict.reason:
@@ -159,13 +245,13 @@ class Relocalizer:
                 continue
             place = self._location(row, verdict, config.relocalize_share, sideways)
             found.append(place if sideways else self._with_beside(keyframe, row, place))
-            if found[-1].confident:
+            if found[-1].confident and not sideways:
                 break
         return found, reason
 
     def locate_near(self, keyframe: Keyframe, guess: F64) -> Location:
         """As `locate`, but only around a predicted map_T_cam (4, 4)."""
-        ahead = self._search_near(keyframe, guess, self._nearest(guess), False)
+        ahead = self._search_near(keyframe, guess, int(self._nearest(guess, 1)[0]), False)
         if ahead.found or len(keyframe.sides) < MIN_CORNERS:
             return ahead
         rows = self._fronts.turned(front_of(keyframe), se3.inverse(guess) @ self._map.map_T_kf)
@@ -219,10 +305,11 @@ class Relocalizer:
                 chosen.append(row)
         return chosen
 
-    def _nearest(self, guess: F64) -> int:
+    def _nearest(self, guess: F64, count: int) -> I64:
+        """Rows of the nearest keyframes, nearest first."""
         rows = self._described if len(self._described) else np.arange(len(self._keyframes))
         metres, radians = se3.extent(se3.inverse(self._map.map_T_kf[rows]) @ guess)
-        return int(rows[np.argmin(metres + radians)])
+        return rows[np.argsort(metres + radians, kind="stable")[:count]]
 
     def _location(self, row: int, verdict: Verdict, share: float, sideways: bool) -> Location:
         """The location of a verification; `share`: of the camera's corners, required but from another direction."""
@@ -247,7 +334,6 @@ class Relocalizer:
         if best.reason:
             return not_found(best.reason, best.inliers)
         for other in found:
-            distinct = not within(se3.inverse(best.map_T_cam) @ other.map_T_cam, SAME_PLACE_M, SAME_PLACE_DEG)
-            if distinct and other.agreeing > AMBIGUITY_RATIO * best.agreeing:
+            if _distinct(best, other) and other.agreeing > AMBIGUITY_RATIO * best.agreeing:
                 return not_found("ambiguous", best.inliers)
         return best
