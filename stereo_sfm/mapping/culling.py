@@ -75,10 +75,14 @@ def _described(map_: Map, rows: I64) -> Bool:
 
 
 def _alone_described(map_: Map, row: int, config: MapperConfig) -> bool:
-    """Whether a camera would not be found in a keyframe's view without it: it has corners, and none like it has."""
+    """Whether a camera would not be found in a keyframe's view without it: it has corners, and no older one like it has.
+
+    Were a newer one enough, that would go for one that is newer still, and so on to the end of an aisle.
+    """
     if not len(map_.corners[row][0]):
         return False
     others, _ = map_.neighbours(row, config.connected_points)
+    others = others[others < row]
     return not _described(map_, others[_same_view(map_, row, others)]).any()
 
 

@@ -14,7 +14,7 @@ from stereo_sfm.mapping.correction import loop_is_known
 from stereo_sfm.mapping.keyframe_poses import KeyframePoses
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.mapping.mapper import Mapper, run_job
-from stereo_sfm.types import F64, LoopResult, MapUpdate
+from stereo_sfm.types import F64, Corners, LoopResult, MapUpdate
 from tests.synthetic import KeyframeStream, camera_path, fisheye_rig, keyframe_stream, pinhole_rig
 
 CONFIG = MapperConfig()
@@ -345,6 +345,27 @@ def test_a_place_keeps_a_bounded_number_of_keyframes() -> None:
     assert len(every.map.living_keyframes()) == len(stream.keyframes)
     assert len(bounded.map.living_keyframes()) < 0.6 * len(stream.keyframes)
     assert error(bounded.map.keyframes.map_T_kf, stream.world_T_kf) < 0.006
+
+
+def test_of_each_view_a_keyframe_by_which_places_are_recognised_stays() -> None:
+    """Slowly along a wall: of all keyframes every fourth has corners, and all but a few are redundant."""
+    stream = keyframe_stream(pinhole_rig(), camera_path(60, 0.03, 0.0), points=600)
+    marks = dataclasses.replace(
+        Corners.none(),
+        uv_left=np.full((1, 2), 50, np.float32), uv_right=np.full((1, 2), 40, np.float32),
+        points_cam=np.ones((1, 3), np.float32), descriptors=np.ones((1, 32), np.uint8),
+    )  # fmt: skip
+    keyframes = [dataclasses.replace(k, corners=marks) if n % 4 == 2 else k for n, k in enumerate(stream.keyframes)]
+    map_ = run(dataclasses.replace(stream, keyframes=keyframes), dataclasses.replace(CONFIG, redundant_share=0.5))[
+        0
+    ].map
+    living = map_.living_keyframes()
+    described = [row for row in living.tolist() if len(map_.corners[row][0])]
+    assert len(living) < 35
+    marked = list(range(2, 50, 4))
+    at = stream.world_T_kf[:, :3, 3]
+    away = np.linalg.norm(at[marked, None] - at[None, described], axis=2).min(1)
+    assert away.max() < 0.5
 
 
 def test_ends_of_loops_are_thinned_out_too() -> None:

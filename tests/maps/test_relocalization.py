@@ -141,6 +141,39 @@ def _part(corners: Corners, share: float) -> Corners:
     return Corners(*(getattr(corners, f.name)[rows] for f in dataclasses.fields(corners)))
 
 
+def test_poses_are_refined_by_what_is_beside_too(
+    sequence: StoreSequence, first_pass: int, vocabulary: voc.Vocabulary
+) -> None:
+    """Corners of two sets of random halves: together they say more than those ahead alone."""
+    rng = np.random.default_rng(4)
+    halves = [
+        dataclasses.replace(k, corners=_part(k.corners, 0.5), sides=_part(k.corners, 1.0)) if k.described else k
+        for k in sequence.keyframes
+    ]
+    part = dataclasses.replace(sequence, keyframes=halves).first(first_pass)
+    relocalizer = Relocalizer(map_of_sequence(part).snapshot, sequence.rig, vocabulary, LoopConfig())
+    alone, together = list[float](), list[float]()
+    for k in range(first_pass + 8, len(halves), 2):
+        if not halves[k].described:
+            continue
+        noisy = dataclasses.replace(
+            halves[k],
+            corners=_shaken(halves[k].corners, rng),
+            sides=_shaken(halves[k].sides, rng),
+        )
+        found = relocalizer.locate(noisy), relocalizer._find(noisy)
+        if all(x.found for x in found):
+            for errors, place in zip((together, alone), found, strict=True):
+                errors.append(float(np.linalg.norm((se3.inverse(true_pose(sequence, k)) @ place.map_T_cam)[:3, 3])))
+    assert len(alone) > 5 and np.mean(together) < 0.95 * np.mean(alone)
+
+
+def _shaken(corners: Corners, rng: np.random.Generator) -> Corners:
+    """With half a pixel of noise in both images."""
+    left, right = (uv + rng.normal(0, 0.5, uv.shape).astype(np.float32) for uv in (corners.uv_left, corners.uv_right))
+    return dataclasses.replace(corners, uv_left=left, uv_right=right)
+
+
 def test_a_share_of_zero_is_allowed(sequence: StoreSequence, first_pass: int, vocabulary: voc.Vocabulary) -> None:
     part = sequence.first(first_pass)
     config = dataclasses.replace(LoopConfig(), relocalize_share=0.0, min_inlier_share=0.0)
