@@ -75,7 +75,7 @@ def _described(map_: Map, rows: I64) -> Bool:
 
 
 def _alone_described(map_: Map, row: int, config: MapperConfig) -> bool:
-    """Whether a camera would not be found in a keyframe's view without it: it has corners, and no older one like it has.
+    """Whether a camera might not be found in a keyframe's view without it: it has corners, and no older one there has.
 
     Were a newer one enough, that would go for one that is newer still, and so on to the end of an aisle.
     """

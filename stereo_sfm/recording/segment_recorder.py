@@ -28,7 +28,7 @@ from stereo_sfm.recording.segment_writers import ImageWriter, PoseWriter, Thumbn
 from stereo_sfm.recording.segments import ABOUT, Segment, new_recording
 from stereo_sfm.types import Dropped, Frame, ImuSamples, Observations, StereoImage, WheelSamples
 
-EVERY_S = 2.0  # between two checks of the disk
+EVERY_S = 2.0  # between two checks of the disk, besides those at the beginning of a segment
 SLOW_S = 5.0  # after an image was dropped the disk counts as slow
 RESERVE, RESERVE_BYTES = ".reserve", 32 << 20
 THUMBNAIL_S = 2.0
@@ -92,13 +92,13 @@ class SegmentRecorder:
         self.images_dropped, self._dropped_s = 0, -SLOW_S
         self._used = used_bytes(policy.root)
         self._no_room, self._only_marked = "", ""
-        self._over, self._checking = threading.Event(), threading.Lock()
+        self._over, self._due, self._checking = False, threading.Event(), threading.Lock()
         begin = functools.partial(_begin_images, rig, source, policy.image_format, opening)
         self._images = ImageWriter(policy.image_format, begin, self._check_now)
         self._poses = PoseWriter(
             functools.partial(_run_log, rig=rig, config=config, source=source, opening=opening), self._make_room_now
         )
-        self._keep_reserve()
+        self._check_now()  # a recorder that was killed may have left more than the quota
         self._keeper = threading.Thread(target=self._keep_checking, name="disk check", daemon=True)
         self._keeper.start()
 
@@ -155,7 +155,8 @@ class SegmentRecorder:
 
     def close(self, patience_s: float = 2.0) -> None:
         """Write what waits, as far as the disk allows in this time, and close the files."""
-        self._over.set()
+        self._over = True
+        self._due.set()
         until = time.monotonic() + patience_s
         for writer in (self._poses, self._images):
             writer.close()
@@ -177,6 +178,7 @@ class SegmentRecorder:
             return
         self.segment = Segment.of(self.folder, self._number, max(round((stamp_ns - self._began_ns) / 1e9), 0))
         self._number, self._segment_ns = self._number + 1, stamp_ns
+        self._due.set()  # the quota is never exceeded by more than a segment, however fast they follow each other
         self._history.append((self.segment, stamp_ns))
         for writer in (self._images, self._poses):
             writer.turn(self.segment)
@@ -208,7 +210,9 @@ class SegmentRecorder:
     # -- the disk ----------------------------------------------------------------------------------------------------
 
     def _keep_checking(self) -> None:
-        while not self._over.wait(EVERY_S):
+        while not self._over:
+            self._due.wait(EVERY_S)
+            self._due.clear()
             self._check_now()
 
     def _check_now(self) -> None:

@@ -173,6 +173,22 @@ def test_marks_keep_what_lies_around(tmp_path: Path) -> None:
     assert marked == [3, 4, 5, 6]
 
 
+def test_the_quota_is_kept_to_a_segment_however_fast_they_follow(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "EVERY_S", 3600.0)
+    images = list(SlidingWall(120))
+    size = images[0].left.nbytes + images[0].right.nbytes  # type: ignore[union-attr]
+    fake(tmp_path, [0, 1, 2, 3], 10 * size)  # of a recorder that was killed
+    recorder = start(tmp_path, image_format="raw", segment_s=0.33, quota=Quota(25 * size))
+    assert used_bytes(tmp_path) <= 25 * size
+    for begin in range(0, 120, 10):
+        record(recorder, images[begin : begin + 10])
+        wait_for(lambda: used_bytes(tmp_path) <= 25 * size + 11 * size)
+    recorder.close(20.0)
+    assert used_bytes(tmp_path) > 10 * size and len(segments(recorder.folder)) < 6
+
+
 def test_a_full_disk_costs_images_and_no_pose(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "EVERY_S", 0.02)
     free = [int(90 * GB)]
