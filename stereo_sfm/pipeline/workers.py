@@ -15,6 +15,8 @@ from stereo_sfm.pipeline.child import Report, Setup, prepare, ready
 from stereo_sfm.pipeline.schedule import Lockstep, Realtime, Recorded, Schedule
 from stereo_sfm.types import Frame, Keyframe, LoopResult, MapUpdate
 
+RELEASE_EVERY = 200  # keyframes, after which the loop closer returns what is free between its blocks
+
 
 def run_capture(
     to_main: Report,
@@ -230,13 +232,13 @@ def run_loop(to_main: Report, control: Connection, keyframes: Connection, to_map
     inbox, outbox = Inbox[Keyframe | End](keyframes), Outbox(to_mapper)
     ready("loop", setup, to_main)
     meter = HealthMeter("loop", to_main.send)
-    frame_id = -1
+    frame_id, count = -1, 0
     while isinstance(keyframe := inbox.take(), Keyframe):
         if closer is None:
             continue
         to_main.pulse.begin()
         delay()
-        begin = time.monotonic()
+        begin, count = time.monotonic(), count + 1
         result = closer.step(keyframe)
         data = pickled(result)
         to_main.send(data)
@@ -244,6 +246,8 @@ def run_loop(to_main: Report, control: Connection, keyframes: Connection, to_map
         frame_id, ms = keyframe.frame_id, (time.monotonic() - begin) * 1e3
         to_main.send(StageTimes(frame_id, {**spans.take(), "loop": ms}))
         meter.add(frame_id, ms)
+        if count % RELEASE_EVERY == 0:
+            release_memory()
         to_main.pulse.end()
     meter.report()
     outbox.close()
