@@ -133,7 +133,7 @@ class Relocalizer:
             if self._choose([beside, *found_ahead], "") is beside:
                 return beside
         if ahead.reason in ("", "ambiguous") or beside.reason in ("", "ambiguous"):
-            return self._look_closer(keyframe, [*found_ahead, *found_beside])
+            return self._look_closer(keyframe, [*filter(self._confirmed, found_ahead), *found_beside])
         return ahead
 
     def _look_closer(self, keyframe: Keyframe, found: list[Location]) -> Location:
