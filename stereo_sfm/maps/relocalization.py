@@ -133,7 +133,9 @@ class Relocalizer:
             if self._choose([beside, *found_ahead], "") is beside:
                 return beside
         if ahead.reason in ("", "ambiguous") or beside.reason in ("", "ambiguous"):
-            return self._look_closer(keyframe, [*filter(self._confirmed, found_ahead), *found_beside])
+            closer = self._look_closer(keyframe, [*found_ahead, *found_beside])
+            contradicted = any(closer is x for x in found_ahead) and not self._confirmed(closer)
+            return not_found("ambiguous", closer.inliers) if contradicted else closer
         return ahead
 
     def _look_closer(self, keyframe: Keyframe, found: list[Location]) -> Location:
