@@ -35,6 +35,7 @@ AMBIGUITY_RATIO = 0.75  # a result is ambiguous if another place has this share 
 CONFIDENCE_FACTOR = 2.0  # times the required inliers: no further candidates or confirmation needed
 CONFIDENT_SHARE = 0.4  # of the corners ahead and beside; places that only look alike have 0.3 at most
 MIN_RANGE_SIGMA_M = 0.003
+SIDE_PLACES = 12  # of `relocalize_candidates` that are verified beside: no confident one ends that search
 CLOSER_PLACES, CLOSER_VIEWS = 4, 3  # ambiguous places that are compared again, from so many keyframes around each
 CLOSER_SHARE = 0.2  # of the weight of all corners; other stores with the same products have less in nine of ten
 KEPT = 64  # newest clouds: a place found ahead is a candidate beside, and cameras ask from near where they were
@@ -239,7 +240,7 @@ class Relocalizer:
         bag = self._vocabularies[sideways].bag((keyframe.sides if sideways else keyframe.corners).descriptors)
         found: list[Location] = []
         reason = "no_candidate"
-        for row in self._places(self._databases[sideways].scores(bag)):
+        for row in self._places(self._databases[sideways].scores(bag))[: SIDE_PLACES if sideways else None]:
             rng = np.random.default_rng([config.seed, row])
             verdict = verify(view, self._cloud(row, sideways), self._rig, config, rng, move_points=False)
             if verdict.reason:
