@@ -9,8 +9,8 @@ all sessions together, also as a share of the metres driven), size, and times; t
 driven a bit aside, are asked in it; it fails where one of them takes more than 0.3 s of processor time. `growth` drives
 on from session to session in one run and prints, for each stretch, processor time a frame (without rendering; also in
 units of ORB on both images, for a busy machine slows both), resident memory, keyframes and points, and medians of the
-time of a keyframe; at some places also the size of the map and the time to open it, and the size of the log (lean, as
-runs on recordings write it; in a pipeline another process does). It fails where the last tenth
+time of a keyframe; at some places also the size of the map and the time to open it, and the size of the log (lean and
+without views of the whole map, as the service writes it). It fails where the last tenth
 needs more than 1.2 times the ORBs of the stretch around 600 m (medians), or 1.5 times the memory. With `--distinct` so
 many metres are rendered into a file and driven there and back again and again, so that all after them is known.
 """
@@ -158,7 +158,10 @@ class Logged:
 
     def __init__(self, path: Path, source: RenderedDrive) -> None:
         self.path, self.seconds = path, 0.0
-        self._log = RunLog(LogWriter(path), source.rig, Config(), source="market", mode="inline", image_format="none")
+        self._log = RunLog(
+            LogWriter(path), source.rig, Config(),
+            source="market", mode="inline", image_format="none", whole_map=False,
+        )  # fmt: skip
 
     def put(self, message: object) -> None:
         start = time.process_time()
