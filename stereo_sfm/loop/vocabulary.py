@@ -54,10 +54,18 @@ class Vocabulary:
         node, distance = binary.descend(as_words(descriptors), self.centroids, self.first_child, self.child_count)
         return np.where(binary.present(descriptors), self.word[node], -1).astype(np.int32), distance
 
-    def bag(self, descriptors: U8) -> Bag:
-        """Term frequency times inverse document frequency, scaled to sum one; empty without known words."""
+    def words(self, descriptors: U8) -> tuple[I32, I64]:
+        """(N, 32) of an image -> its words (W,), ascending, and how often it has each (W,)."""
         ids, _ = self.look_up(descriptors)
         words, counts = np.unique(ids[ids >= 0], return_counts=True)
+        return words, counts
+
+    def bag(self, descriptors: U8) -> Bag:
+        """Term frequency times inverse document frequency, scaled to sum one; empty without known words."""
+        return self.weighed(*self.words(descriptors))
+
+    def weighed(self, words: I32, counts: I64) -> Bag:
+        """The bag of an image with these `words`."""
         weights = counts * self.idf[words]
         total = float(weights.sum())
         keep = weights > 0
@@ -111,24 +119,27 @@ def train(images: Sequence[U8], branching: int = 10, depth: int = 4, seed: int =
 
 
 def _idf(tree: Vocabulary, images: Sequence[U8]) -> F32:
-    return np.log(np.maximum(len(images), 2) / np.maximum(_seen(tree, images), 1)).astype(np.float32)
+    seen = _images_with(len(tree), [tree.words(descriptors)[0] for descriptors in images])
+    return np.log(np.maximum(len(images), 2) / np.maximum(seen, 1)).astype(np.float32)
 
 
-def _seen(tree: Vocabulary, images: Sequence[U8]) -> I64:
-    """(W,) images with each word."""
-    seen = np.zeros(len(tree), np.int64)
-    for descriptors in images:
-        ids, _ = tree.look_up(descriptors)
-        seen[np.unique(ids[ids >= 0])] += 1
+def _images_with(count: int, images: Sequence[I32]) -> I64:
+    """(W,) in how many images each of `count` words is; of each image its words."""
+    seen = np.zeros(count, np.int64)
+    for words in images:
+        seen[words] += 1
     return seen
 
 
-def counted(vocabulary: Vocabulary, images: Sequence[U8]) -> Vocabulary:
-    """The same words with the idf of other images, (N, 32) each: of a map, where lamps and floor tiles are everywhere.
+def counted(vocabulary: Vocabulary, images: Sequence[I32]) -> Vocabulary:
+    """The same words with the idf of other images: of a map, where lamps and floor tiles are everywhere.
 
     Words of all images keep a little weight, so that the smallest map has some.
+
+    Args:
+        images: the `words` of each.
     """
-    seen = _seen(vocabulary, images)
+    seen = _images_with(len(vocabulary), images)
     return dataclasses.replace(vocabulary, idf=np.log((len(images) + 1) / np.maximum(seen, 1)).astype(np.float32))
 
 

@@ -12,7 +12,7 @@ import scipy.sparse
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
-from stereo_sfm.loop.absolute_pose import joined, refine_pose
+from stereo_sfm.loop.absolute_pose import Matches, joined, refine_pose
 from stereo_sfm.loop.cloud import Cloud, gather
 from stereo_sfm.loop.database import PlaceDatabase
 from stereo_sfm.loop.place_view import PlaceView, place_view_of
@@ -99,18 +99,18 @@ class Relocalizer:
         self._sees = self._seen.tocsc()
         self._views = np.maximum(np.bincount(snapshot.obs_pt, minlength=shape[1]), 1)
         self._cloud = functools.lru_cache(maxsize=KEPT)(self._gather)
-        ahead, beside = ([k.corners for k in self._keyframes], [k.sides for k in self._keyframes])
-        self._vocabularies = tuple(
-            counted(vocabulary, [c.descriptors for c in corners if len(c)]) for corners in (ahead, beside)
-        )
-        self._databases = PlaceDatabase(len(vocabulary)), PlaceDatabase(len(vocabulary))
+        self._vocabularies: list[Vocabulary] = []  # ahead and beside, with the idf of this map
+        self._databases: list[PlaceDatabase] = []
+        for corners in ([k.corners for k in self._keyframes], [k.sides for k in self._keyframes]):
+            words = [vocabulary.words(c.descriptors) for c in corners]
+            own, database = counted(vocabulary, [w for w, _ in words if len(w)]), PlaceDatabase(len(vocabulary))
+            for k, (found, counts) in enumerate(words):
+                database.add(k, own.weighed(found, counts))
+            self._vocabularies.append(own)
+            self._databases.append(database)
         self._fronts = Fronts(rig.left)
         self._has_sides = any(len(k.sides) >= MIN_CORNERS for k in self._keyframes)
-        for k, keyframe in enumerate(self._keyframes):
-            for words, database, corners in zip(
-                self._vocabularies, self._databases, (keyframe.corners, keyframe.sides), strict=True
-            ):
-                database.add(k, words.bag(corners.descriptors))
+        for keyframe in self._keyframes:
             self._fronts.add(keyframe)
 
     def locate(self, keyframe: Keyframe) -> Location:
@@ -150,12 +150,8 @@ class Relocalizer:
         for place in sorted((x for x in found if x.found), key=lambda x: -x.agreeing):
             if len(places) < CLOSER_PLACES and all(_distinct(place, other) for other in places):
                 places.append(place)
-        views = self._views_of(keyframe)
-        weights = [
-            np.where(view.corner, words.idf[np.maximum(words.look_up(view.descriptors)[0], 0)] ** 2, 0.0)
-            for words, view in zip(self._vocabularies, views, strict=True)
-        ]
-        evidence = [self._evidence(views, weights, place) for place in places]
+        weights = [self._weights(keyframe, sideways) for sideways in (False, True)]
+        evidence = [self._evidence(keyframe, weights, place) for place in places]
         order = np.argsort(-np.array(evidence), kind="stable").tolist()
         if len(order) > 1 and evidence[order[1]] > AMBIGUITY_RATIO * evidence[order[0]]:
             return not_found("ambiguous", places[order[0]].inliers)
@@ -163,37 +159,24 @@ class Relocalizer:
             return not_found("ambiguous")
         return places[order[0]]
 
-    def _evidence(self, views: list[PlaceView], weights: list[F64], place: Location) -> float:
+    def _weights(self, keyframe: Keyframe, sideways: bool) -> F64:
+        """(N,) of each row of a view: of corners by how rare their words are, of points zero."""
+        view, words = self._view(keyframe, sideways), self._vocabularies[sideways]
+        word, _ = words.look_up(view.descriptors)
+        return np.where(view.corner, words.idf[word] ** 2, 0.0)
+
+    def _evidence(self, keyframe: Keyframe, weights: list[F64], place: Location) -> float:
         """Weight of the corners ahead and beside that agree with a place, from any of the keyframes around it."""
         agreeing = [np.zeros(len(weight), bool) for weight in weights]
         for row in self._nearest(place.map_T_cam, CLOSER_VIEWS).tolist():
-            for agrees, verdict in zip(agreeing, self._agreeing(views, place.map_T_cam, row), strict=True):
-                agrees[verdict.rows[:, 1]] = True
+            for agrees, sideways in zip(agreeing, (False, True), strict=True):
+                agrees[self._verify_near(keyframe, place.map_T_cam, row, sideways).rows[:, 1]] = True
         return sum(float(weight[agrees].sum()) for weight, agrees in zip(weights, agreeing, strict=True))
-
-    def _views_of(self, keyframe: Keyframe) -> list[PlaceView]:
-        """Ahead and beside."""
-        sigma = self._config.disparity_sigma_px
-        return [place_view_of(keyframe, self._rig, sigma, sideways) for sideways in (False, True)]
-
-    def _agreeing(self, views: list[PlaceView], map_T_cam: F64, row: int) -> list[Verdict]:
-        """What a keyframe of the map says to a pose, ahead and beside."""
-        kf_T_cam = se3.inverse(map_T_cam) @ self._map.map_T_kf[row]
-        return [
-            verify_near(kf_T_cam, view, self._cloud(row, sideways), self._rig, config)
-            for sideways, view, config in zip((False, True), views, (self._config, self._side_config), strict=True)
-        ]
 
     def _refined(self, keyframe: Keyframe, place: Location) -> Location:
         """The pose from all that agrees with it ahead and beside, as the nearest keyframe of the map sees it."""
-        views, row = self._views_of(keyframe), int(self._nearest(place.map_T_cam, 1)[0])
-        matches = [
-            pair(view, self._cloud(row, sideways), verdict.rows[:, 1], verdict.rows[:, 0])
-            for sideways, view, verdict in zip(
-                (False, True), views, self._agreeing(views, place.map_T_cam, row), strict=True
-            )
-        ]
-        together = joined(matches)
+        row = int(self._nearest(place.map_T_cam, 1)[0])
+        together = joined([self._matches(keyframe, place.map_T_cam, row, sideways) for sideways in (False, True)])
         if len(together) < self._config.min_inliers:
             return place
         b_T_a = se3.inverse(place.map_T_cam) @ self._map.map_T_kf[row]
@@ -202,6 +185,11 @@ class Relocalizer:
         if not within(se3.inverse(place.map_T_cam) @ map_T_cam, SAME_PLACE_M, SAME_PLACE_DEG):
             return place
         return dataclasses.replace(place, map_T_cam=map_T_cam, information=pose.information)
+
+    def _matches(self, keyframe: Keyframe, map_T_cam: F64, row: int, sideways: bool) -> Matches:
+        """What agrees with a pose."""
+        rows_a, rows_b = self._verify_near(keyframe, map_T_cam, row, sideways).rows.T
+        return pair(self._view(keyframe, sideways), self._cloud(row, sideways), rows_b, rows_a)
 
     def _confirmed(self, ahead: Location) -> bool:
         """Whether the shelves beside do not contradict what is ahead: rows of lamps look alike from both directions."""
@@ -219,7 +207,7 @@ class Relocalizer:
     def _with_ahead(self, keyframe: Keyframe, beside: Location) -> Location:
         """What is ahead says to a pose found by the shelves beside."""
         row = self._row(beside)
-        ahead = self._verify_near(keyframe, beside.map_T_cam, row, self._cloud(row, False), False).inliers
+        ahead = self._verify_near(keyframe, beside.map_T_cam, row, False).inliers
         return dataclasses.replace(beside, others=ahead)
 
     def _with_beside(self, keyframe: Keyframe, row: int, ahead: Location) -> Location:
@@ -229,14 +217,13 @@ class Relocalizer:
         cloud = self._cloud(row, True)
         if cloud.corner.sum() < MIN_CORNERS:
             return ahead
-        beside = self._verify_near(keyframe, ahead.map_T_cam, row, cloud, True).inliers
+        beside = self._verify_near(keyframe, ahead.map_T_cam, row, True).inliers
         share = (ahead.inliers + beside) / (len(keyframe.corners) + len(keyframe.sides))
         return dataclasses.replace(ahead, others=beside, confident=ahead.confident and share >= CONFIDENT_SHARE)
 
     def _search(self, keyframe: Keyframe, sideways: bool) -> tuple[list[Location], str]:
         """Places by its corners, or by those of the views that face the shelves; and why there are none."""
-        config = self._side_config if sideways else self._config
-        view = place_view_of(keyframe, self._rig, config.disparity_sigma_px, sideways)
+        config, view = self._config_of(sideways), self._view(keyframe, sideways)
         bag = self._vocabularies[sideways].bag((keyframe.sides if sideways else keyframe.corners).descriptors)
         found: list[Location] = []
         reason = "no_candidate"
@@ -262,16 +249,21 @@ class Relocalizer:
         return beside if beside.found else ahead
 
     def _search_near(self, keyframe: Keyframe, guess: F64, row: int, sideways: bool) -> Location:
-        verdict = self._verify_near(keyframe, guess, row, self._cloud(row, sideways), sideways)
+        verdict = self._verify_near(keyframe, guess, row, sideways)
         if verdict.reason:
             return not_found(verdict.reason, verdict.inliers)
         return self._choose([self._location(row, verdict, self._near_share, sideways)], "")
 
-    def _verify_near(self, keyframe: Keyframe, guess: F64, row: int, cloud: Cloud, sideways: bool) -> Verdict:
+    def _verify_near(self, keyframe: Keyframe, guess: F64, row: int, sideways: bool) -> Verdict:
         """Match a keyframe with a row's cloud around a predicted map_T_cam (4, 4)."""
-        config = self._side_config if sideways else self._config
-        view = place_view_of(keyframe, self._rig, config.disparity_sigma_px, sideways)
-        return verify_near(se3.inverse(guess) @ self._map.map_T_kf[row], view, cloud, self._rig, config)
+        kf_T_cam, view = se3.inverse(guess) @ self._map.map_T_kf[row], self._view(keyframe, sideways)
+        return verify_near(kf_T_cam, view, self._cloud(row, sideways), self._rig, self._config_of(sideways))
+
+    def _view(self, keyframe: Keyframe, sideways: bool) -> PlaceView:
+        return place_view_of(keyframe, self._rig, self._config.disparity_sigma_px, sideways)
+
+    def _config_of(self, sideways: bool) -> LoopConfig:
+        return self._side_config if sideways else self._config
 
     def _gather(self, row: int, sideways: bool) -> Cloud:
         """The points of a keyframe row and its neighbours, in its camera frame."""
