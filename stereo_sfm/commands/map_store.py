@@ -155,8 +155,8 @@ def _versions(store: Path) -> int:
 def _label(options: LabelOptions) -> int:
     import dataclasses
 
-    from stereo_sfm.maps.changes import Aisle
-    from stereo_sfm.maps.store import Door, lock, read_about, write_about
+    from stereo_sfm.maps.labels import Aisle, Door
+    from stereo_sfm.maps.store import lock, read_about, write_about
 
     _check_store(options.store)
     with lock(options.store):
@@ -206,7 +206,7 @@ def _plan(store: Path, resolution: float) -> int:
             store / DOORS,
             [
                 {"label": d.door.name, "start": list(d.door.start), "end": list(d.door.end)}
-                | {"width": round(d.width, 3), "seen_open": d.seen_open}
+                | {"width": round(d.door.length, 3), "seen_open": d.seen_open}
                 for d in doors
             ],
         )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,7 +10,7 @@ import cv2
 import numpy as np
 
 from stereo_sfm.export.floor_plan import FREE, OCCUPIED, FloorPlan
-from stereo_sfm.maps.store import Door
+from stereo_sfm.maps.labels import Door
 from stereo_sfm.types import U8, Bool
 
 NARROW_M, WIDE_M = 0.7, 1.6  # of a doorway: wheelchairs pass, and carts; cross aisles are wider
@@ -31,7 +30,6 @@ class PlannedDoor:
     """A door on a floor plan."""
 
     door: Door
-    width: float  # metres
     seen_open: bool  # the plan shows a doorway there
 
 
@@ -48,8 +46,8 @@ def plan_doors(plan: FloorPlan, doors: Sequence[Door] = ()) -> list[PlannedDoor]
         near = [d for d in doors if d.name not in named and np.linalg.norm(d.middle - middle) < SAME_M]
         name = min(near, key=lambda d: float(np.linalg.norm(d.middle - middle))).name if near else ""
         named |= {name} - {""}
-        out.append(PlannedDoor(Door(name, start, end), math.dist(start, end), True))
-    out += [PlannedDoor(d, math.dist(d.start, d.end), False) for d in doors if d.name not in named]
+        out.append(PlannedDoor(Door(name, start, end), True))
+    out += [PlannedDoor(d, False) for d in doors if d.name not in named]
     return out
 
 

@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 
 from stereo_sfm.export.floor_plan import FREE, OCCUPIED, FloorPlan
-from stereo_sfm.maps.changes import BESIDE_M, Aisle
+from stereo_sfm.maps.changes import BESIDE_M
+from stereo_sfm.maps.labels import Aisle
 from stereo_sfm.types import U8
 
 LONG_M = 1.0  # least length of a front

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from stereo_sfm.geometry import se3
 from stereo_sfm.maps.floor import HIGH, LOW
+from stereo_sfm.maps.labels import Aisle
 from stereo_sfm.maps.update import Update
 from stereo_sfm.types import F64, I64, Bool
 
@@ -21,28 +21,6 @@ BESIDE_M = 3.0  # metres from an aisle's line to its shelves
 NEAR_M = 6.0  # metres from a keyframe; points farther away are too uncertain
 VIEWS = 3  # keyframes that see a point that counts
 NEW, OTHER = "new", "changed"
-
-
-@dataclass(frozen=True)
-class Aisle:
-    """A line along an aisle, in metres of the floor plan; left and right as one goes from its start to its end."""
-
-    name: str
-    start: tuple[float, float]
-    end: tuple[float, float]
-
-    def place(self, xy: F64) -> tuple[F64, F64]:
-        """Points (N, 2) -> metres along the aisle (N,) and to its left (N,)."""
-        begin = np.array(self.start)
-        along = np.array(self.end) - begin
-        along /= np.linalg.norm(along)
-        off = xy - begin
-        return off @ along, off @ np.array([-along[1], along[0]])
-
-    @property
-    def length(self) -> float:
-        """Metres."""
-        return float(np.linalg.norm(np.subtract(self.end, self.start)))
 
 
 def changed_cells(update: Update, map_T_floor: F64) -> list[tuple[str, float, float]]:

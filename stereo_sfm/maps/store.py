@@ -19,28 +19,14 @@ import yaml
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.folder_lock import FolderLock
-from stereo_sfm.maps.changes import Aisle
 from stereo_sfm.maps.floor import find_floor
+from stereo_sfm.maps.labels import Aisle, Door
 from stereo_sfm.maps.saved_map import SavedMap, load_map, map_files, save_map
 from stereo_sfm.maps.unfinished import copy_map
 from stereo_sfm.types import F64
 
 ABOUT, CHANGES = "store.yaml", "changes.txt"
 KEPT_VERSIONS = 5
-
-
-@dataclass(frozen=True)
-class Door:
-    """A line across a door, in metres of the floor plan."""
-
-    name: str
-    start: tuple[float, float]
-    end: tuple[float, float]
-
-    @property
-    def middle(self) -> F64:
-        """(2,) metres."""
-        return np.add(self.start, self.end) / 2
 
 
 @dataclass(frozen=True, eq=False)

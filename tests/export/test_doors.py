@@ -9,10 +9,15 @@ import pytest
 import yaml
 
 from stereo_sfm.cli import main
+from stereo_sfm.drivers.sim.scenes import SCENES
+from stereo_sfm.drivers.sim.world import DOORWAY, Layout
+from stereo_sfm.drivers.source import open_source
 from stereo_sfm.export.doors import PlannedDoor, plan_doors
-from stereo_sfm.export.floor_plan import OCCUPIED, UNKNOWN, FloorPlan
-from stereo_sfm.maps.saved_map import save_map
-from stereo_sfm.maps.store import Door, read_about
+from stereo_sfm.export.floor_plan import OCCUPIED, UNKNOWN, FloorPlan, make_floor_plan
+from stereo_sfm.geometry import se3
+from stereo_sfm.maps.labels import Door
+from stereo_sfm.maps.saved_map import load_map, save_map
+from stereo_sfm.maps.store import read_about
 from tests.export.plans import fill, plan_of
 from tests.maps.maps import small_map
 
@@ -42,7 +47,7 @@ def ends(door: PlannedDoor) -> tuple[float, ...]:
 def test_a_doorway_is_found_where_it_is_in_walls_along_both_axes() -> None:
     (door,) = plan_doors(room())
     assert ends(door) == pytest.approx((3.0, 2.0, 4.0, 2.0), abs=0.06)
-    assert door.width == pytest.approx(1.0, abs=0.06) and door.seen_open and door.door.name == ""
+    assert door.door.length == pytest.approx(1.0, abs=0.06) and door.seen_open and door.door.name == ""
     (door,) = plan_doors(turned(room()))
     assert ends(door) == pytest.approx((2.0, 3.0, 2.0, 4.0), abs=0.06)
 
@@ -72,7 +77,7 @@ def test_a_door_set_by_hand_names_the_doorway_near_it_or_stands_for_itself() -> 
     found = plan_doors(room(), doors)
     assert [(d.door.name, d.seen_open) for d in found] == [("stockroom", True), ("staff", False)]
     assert ends(found[0]) == pytest.approx((3.0, 2.0, 4.0, 2.0), abs=0.06)
-    assert found[1].door == doors[0] and found[1].width == pytest.approx(1.0)
+    assert found[1].door == doors[0] and found[1].door.length == pytest.approx(1.0)
 
 
 def test_doors_are_set_written_and_removed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -92,27 +97,18 @@ def test_doors_are_set_written_and_removed(tmp_path: Path, capsys: pytest.Captur
 
 @pytest.mark.slow
 def test_the_doorway_of_a_driven_store(tmp_path: Path) -> None:
-    from stereo_sfm.drivers.sim.scenes import SCENES
-    from stereo_sfm.drivers.sim.world import DOORWAY, Layout
-    from stereo_sfm.export.floor_plan import make_floor_plan
-    from stereo_sfm.geometry import se3
-    from stereo_sfm.maps.saved_map import load_map
-
     run, spec = tmp_path / "run", "sim:stockroom?size=424x400&rate=10"
     assert main(["run", spec, "--out", str(run), "--quiet"]) == 0
-    saved = load_map(run / "map")
-    (door,) = plan_doors(make_floor_plan(saved.snapshot))
-    assert door.width == pytest.approx(DOORWAY[0], abs=0.15)
+    s = load_map(run / "map").snapshot
+    plan = make_floor_plan(s)
+    (door,) = plan_doors(plan)
+    assert door.door.length == pytest.approx(DOORWAY[0], abs=0.15)
     layout = SCENES["stockroom"].layout
     assert isinstance(layout, Layout)
-    from stereo_sfm.drivers.source import open_source
-
     with open_source(spec) as source:
         truth = source.ground_truth
     assert truth is not None
-    plan = make_floor_plan(saved.snapshot)
     at = plan.map_T_floor @ np.array([*door.door.middle, 0.0, 1.0])
-    row = int(np.searchsorted(truth.stamp_ns, saved.snapshot.stamp_ns[0]))
-    world_T_map = truth.poses[row] @ se3.inverse(saved.snapshot.map_T_kf[0])
-    true = np.mean(layout.doorway, axis=0)
-    assert (world_T_map @ at)[:2] == pytest.approx(true, abs=0.1)
+    row = int(np.searchsorted(truth.stamp_ns, s.stamp_ns[0]))
+    world_T_map = truth.poses[row] @ se3.inverse(s.map_T_kf[0])
+    assert (world_T_map @ at)[:2] == pytest.approx(np.mean(layout.doorway, axis=0), abs=0.1)

@@ -15,7 +15,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.floor_plan import FREE, OCCUPIED, UNKNOWN
 from stereo_sfm.export.keep_out import ABOUT, DRAWING, read_zones, write_zones
 from stereo_sfm.export.shelf_fronts import shelf_fronts
-from stereo_sfm.maps.changes import Aisle
+from stereo_sfm.maps.labels import Aisle
 from stereo_sfm.maps.saved_map import save_map
 from tests.export.plans import fill, plan_of
 from tests.maps.maps import small_map

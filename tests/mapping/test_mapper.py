@@ -356,9 +356,9 @@ def test_of_each_view_a_keyframe_by_which_places_are_recognised_stays() -> None:
         points_cam=np.ones((1, 3), np.float32), descriptors=np.ones((1, 32), np.uint8),
     )  # fmt: skip
     keyframes = [dataclasses.replace(k, corners=marks) if n % 4 == 2 else k for n, k in enumerate(stream.keyframes)]
-    map_ = run(dataclasses.replace(stream, keyframes=keyframes), dataclasses.replace(CONFIG, redundant_share=0.5))[
-        0
-    ].map
+    stream = dataclasses.replace(stream, keyframes=keyframes)
+    mapper, _ = run(stream, dataclasses.replace(CONFIG, redundant_share=0.5))
+    map_ = mapper.map
     living = map_.living_keyframes()
     described = [row for row in living.tolist() if len(map_.corners[row][0])]
     assert len(living) < 35

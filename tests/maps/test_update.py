@@ -13,7 +13,8 @@ from stereo_sfm.config import Config, LoopConfig, MapperConfig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
-from stereo_sfm.maps.changes import Aisle, changed_cells, describe_changes
+from stereo_sfm.maps.changes import changed_cells, describe_changes
+from stereo_sfm.maps.labels import Aisle
 from stereo_sfm.maps.saved_map import SavedMap, load_map, save_map
 from stereo_sfm.maps.store import lock, read_about, versions, write_version
 from stereo_sfm.maps.unfinished import publish, save_session
