@@ -128,20 +128,30 @@ def _walls(b: Builder, shop: Shop, seed: tuple[int, ...], layout: Layout) -> Non
         first = len(b.blocks)
         add_shelf_pair(b, shop, plan, (1.5, x1 - 1.5), y, facing, layout)
         b.end_group(first)
-    for x, face in ((0.0, 1), (x1, 0)):
-        first, y = len(b.blocks), 0.6
-        inside = 0.03 if face else -0.03
-        while y < y1 - 1.6:
-            is_door = plan.random() < 0.2
-            wide, high = (0.95, 2.1) if is_door else (float(plan.uniform(0.7, 1.5)), float(plan.uniform(0.8, 1.5)))
-            z = 0.0 if is_door else float(plan.uniform(0.7, 1.4))
-            image = textures.door(plan) if is_door else textures.poster(plan, int(high * 260), int(wide * 260))
-            k = b.atlas.add(image)
-            (_, y_low), (_, y_high) = layout.doorway
-            if not (layout.stockroom and x > 0 and y < y_high and y + wide > y_low):
-                b.solid((min(x, x + inside), y, z), (max(x, x + inside), y + wide, z + high), [k] * 6)
-            y += wide + float(plan.uniform(0.15, 0.7))
-        b.end_group(first)
+    for x, deep in ((0.0, 0.03), (x1, -0.03)):
+        _hang(b, plan, (x, deep), y1, layout.doorway if layout.stockroom and x > 0 else None)
+
+
+def _hang(
+    b: Builder,
+    plan: np.random.Generator,
+    face: tuple[float, float],
+    y1: float,
+    doorway: tuple[tuple[float, float], tuple[float, float]] | None,
+) -> None:
+    """Posters and doors along a wall. `face`: x of the wall, and how far they stand out; none where a doorway is."""
+    first, y = len(b.blocks), 0.6
+    x, deep = face
+    while y < y1 - 1.6:
+        is_door = plan.random() < 0.2
+        wide, high = (0.95, 2.1) if is_door else (float(plan.uniform(0.7, 1.5)), float(plan.uniform(0.8, 1.5)))
+        z = 0.0 if is_door else float(plan.uniform(0.7, 1.4))
+        image = textures.door(plan) if is_door else textures.poster(plan, int(high * 260), int(wide * 260))
+        k = b.atlas.add(image)
+        if doorway is None or y >= doorway[1][1] or y + wide <= doorway[0][1]:
+            b.solid((min(x, x + deep), y, z), (max(x, x + deep), y + wide, z + high), [k] * 6)
+        y += wide + float(plan.uniform(0.15, 0.7))
+    b.end_group(first)
 
 
 def _stockroom(b: Builder, shop: Shop, seed: tuple[int, ...], layout: Layout) -> None:
@@ -155,14 +165,7 @@ def _stockroom(b: Builder, shop: Shop, seed: tuple[int, ...], layout: Layout) ->
     for lo, hi in (((0.0, 0.0), (y_low, z1)), ((y_high, 0.0), (y1, z1)), ((y_low, DOORWAY[1]), (y_high, z1))):
         b.solid((x0, lo[0], lo[1]), (x1, hi[0], hi[1]), [panel] * 6)
     b.end_group(first)
-    first, y = len(b.blocks), 0.4
-    while y < y1 - 1.6:
-        wide, high, z = (float(plan.uniform(*span)) for span in ((0.7, 1.5), (0.8, 1.5), (0.5, 1.3)))
-        k = b.atlas.add(textures.poster(plan, int(high * 260), int(wide * 260)))
-        if y > y_high or y + wide < y_low:
-            b.solid((x1, y, z), (x1 + 0.03, y + wide, z + high), [k] * 6)
-        y += wide + float(plan.uniform(0.15, 0.5))
-    b.end_group(first)
+    _hang(b, plan, (x1, 0.03), y1, layout.doorway)
     first, deep = len(b.blocks), layout.gondola_depth
     heights = [0.14, *board_heights(plan, 0.5, layout.shelf_top)]
     add_shelf(b, shop, plan, ((far - deep, 0.3, 0.0), (far, y1 - 0.3, layout.shelf_top)), FACING_MINUS_X, heights)
