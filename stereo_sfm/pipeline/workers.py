@@ -9,13 +9,14 @@ from typing import Any
 from stereo_sfm.drivers.choice import Opener
 from stereo_sfm.maps.folders import make_mapper, save_result
 from stereo_sfm.messages import Localized
-from stereo_sfm.pipeline.allocator import release_memory
+from stereo_sfm.pipeline.allocator import Release, release_memory
 from stereo_sfm.pipeline.channels import End, Inbox, Lost, Outbox, PrefetchingInbox, pickled
 from stereo_sfm.pipeline.child import Report, Setup, prepare, ready
 from stereo_sfm.pipeline.schedule import Lockstep, Realtime, Recorded, Schedule
 from stereo_sfm.types import Frame, Keyframe, LoopResult, MapUpdate
 
-RELEASE_EVERY = 200  # keyframes, after which the loop closer returns what is free between its blocks
+RELEASE_KEYFRAMES = 200  # after which the loop closer returns what is free between its blocks
+RELEASE_IMAGES = 6000  # after which the tracker does
 
 
 def run_capture(
@@ -93,7 +94,7 @@ def run_tracker(
     inbox = Inbox[SlotImage | End](images)
     free, keyframes = Outbox(release), (Outbox(to_mapper), Outbox(to_loop))
     ready("tracker", setup, to_main)
-    meter = HealthMeter("tracker", to_main.send)
+    meter, tidy = HealthMeter("tracker", to_main.send), Release(RELEASE_IMAGES)
     frame_id = -1
     while isinstance(message := _next_image(inbox), SlotImage):
         to_main.pulse.begin()
@@ -114,6 +115,7 @@ def run_tracker(
         frame_id = image.frame_id
         to_main.send(StageTimes(frame_id, {**spans.take(), "latency": (answered - message.captured_s) * 1e3}))
         meter.add(frame_id, (time.monotonic() - begin) * 1e3, to_main.waiting())
+        tidy.step()
         to_main.pulse.end()
     meter.report()
     for outbox in keyframes:
@@ -231,14 +233,14 @@ def run_loop(to_main: Report, control: Connection, keyframes: Connection, to_map
     closer = make_closer(setup.config, setup.rig, spans, setup.folders.localize_only)
     inbox, outbox = Inbox[Keyframe | End](keyframes), Outbox(to_mapper)
     ready("loop", setup, to_main)
-    meter = HealthMeter("loop", to_main.send)
-    frame_id, count = -1, 0
+    meter, tidy = HealthMeter("loop", to_main.send), Release(RELEASE_KEYFRAMES)
+    frame_id = -1
     while isinstance(keyframe := inbox.take(), Keyframe):
         if closer is None:
             continue
         to_main.pulse.begin()
         delay()
-        begin, count = time.monotonic(), count + 1
+        begin = time.monotonic()
         result = closer.step(keyframe)
         data = pickled(result)
         to_main.send(data)
@@ -246,8 +248,7 @@ def run_loop(to_main: Report, control: Connection, keyframes: Connection, to_map
         frame_id, ms = keyframe.frame_id, (time.monotonic() - begin) * 1e3
         to_main.send(StageTimes(frame_id, {**spans.take(), "loop": ms}))
         meter.add(frame_id, ms)
-        if count % RELEASE_EVERY == 0:
-            release_memory()
+        tidy.step()
         to_main.pulse.end()
     meter.report()
     outbox.close()

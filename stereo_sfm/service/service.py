@@ -13,7 +13,7 @@ from typing import Self, TypeVar
 from stereo_sfm.drivers.choice import Opener
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.messages import LogLine
-from stereo_sfm.pipeline.allocator import return_large_blocks
+from stereo_sfm.pipeline.allocator import Release, return_large_blocks
 from stereo_sfm.pipeline.text import Listener
 from stereo_sfm.service.camera import patient
 from stereo_sfm.service.commands import Commands
@@ -33,6 +33,7 @@ from stereo_sfm.service.status_reporter import StatusReporter
 M = TypeVar("M", bound=ServiceMessage)
 
 CHECK_S = 0.1  # between two checks of state, map and recorder
+RELEASE_CHECKS = 3000  # checks after which memory that lies free is returned
 END_S = 4.5  # for everything to be written after a stop
 
 
@@ -145,8 +146,10 @@ class Service(Commands):
             self._ended.set()
 
     def _keep_checking(self) -> None:
+        tidy = Release(RELEASE_CHECKS)
         while not self._ended.wait(CHECK_S):
             self._check()
+            tidy.step()
         self._check()  # once more: the outputs get the final state
 
     def _check(self) -> None:

@@ -37,3 +37,27 @@ def test_room_between_small_blocks_is_returned() -> None:
         return int(done.stdout)
 
     assert held("on") < 10 < 30 < held("off")
+
+
+STEPS = """
+import sys
+from stereo_sfm.pipeline.allocator import Release
+small = [bytes(5000) for _ in range(20_000)]
+del small[1::2], small[1::2], small[1::2]  # what is kept lies between what is free
+def resident():
+    return int(open("/proc/self/statm").read().split()[1]) >> 8
+tidy, before = Release(3), resident()
+for _ in range(int(sys.argv[1])):
+    tidy.step()
+print(before - resident())
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="an allocator of glibc's")
+def test_free_pages_are_returned_every_so_many_steps() -> None:
+    def returned(steps: int) -> int:
+        done = subprocess.run([sys.executable, "-c", STEPS, str(steps)], capture_output=True, text=True, check=True)
+        return int(done.stdout)
+
+    assert returned(2) == 0
+    assert returned(3) > 20
