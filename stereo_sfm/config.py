@@ -174,6 +174,7 @@ class MapperConfig:
     disparity_sigmas: float = number(
         1.5, 0, 1000, "Mean error of a point's stereo matches beyond which they count less (depth edges); 0: never"
     )
+    sensors: bool = switch(True, "Local bundle adjustment uses what IMU and wheels measured between keyframes")
     rounds: int = number(2, 1, 100, "Rounds of bundle adjustment, with outliers removed between them")
     iterations: int = number(5, 1, 1000, "Iterations of a round")
     association: str = word(

@@ -230,6 +230,25 @@ class Corners(Message):
 
 
 @dataclass(frozen=True, eq=False)
+class InertialLink(Message):
+    """What the IMU measured since the keyframe before, and what the tracker knows of its state at this one."""
+
+    stamp_ns: I64  # (N + 1,) edges of the N intervals, from the stamp of the keyframe before to this one's; or none
+    gyro: F64 = field(metadata=shape(-1, 3))  # (N, 3) rad/s in each, corrected by the calibration
+    accel: F64 = field(metadata=shape(-1, 3))  # (N, 3) m/s^2, likewise
+    state: F64  # (12,) velocity, gravity (m/s^2, downwards), biases of accelerometer and gyroscope: the IMU's axes
+    covariance: F64 = field(metadata=shape(12, 12))  # (12, 12) of it; zero while it is not known
+
+
+@dataclass(frozen=True, eq=False)
+class WheelLink(Message):
+    """What the wheels measured since the keyframe before."""
+
+    last_T_cam: F64 = field(metadata=shape(4, 4))  # (4, 4) motion of the left camera
+    covariance: F64 = field(metadata=shape(6, 6))  # (6, 6) of last_T_cam @ exp(xi), xi = (rho, phi)
+
+
+@dataclass(frozen=True, eq=False)
 class Keyframe(Message):
     """A frame that enters the map, with what place recognition and mapping need."""
 
@@ -251,6 +270,8 @@ class Keyframe(Message):
     sides: Corners = field(default_factory=Corners.none)  # described in views that face the shelves on both sides
     down: F64 = field(default_factory=lambda: np.zeros(3))  # (3,) gravity's direction in this camera, zero: unknown
     down_sigma: float = 0.0  # radians, its standard deviation about each horizontal axis; 0: unknown
+    inertial: InertialLink | None = None  # None: no IMU, or one that is left out
+    wheels: WheelLink | None = None  # None: no wheels, samples are missing, or no keyframe before in this submap
 
     @property
     def described(self) -> bool:

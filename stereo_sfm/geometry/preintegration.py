@@ -53,6 +53,39 @@ class Preintegrated:
         gyro, accel = gyro_bias - self.gyro_bias, accel_bias - self.accel_bias
         return self.position + self.position_by_gyro @ gyro + self.position_by_accel @ accel
 
+    def then(self, following: Preintegrated) -> Preintegrated:
+        """The motion over both intervals, the following one with the biases of this one, to first order."""
+        r, v, p, t = self.rotation, self.velocity, self.position, following.seconds
+        biases = self.gyro_bias, self.accel_bias
+        turn, pushed = following.rotation_with(self.gyro_bias), following.velocity_with(*biases)
+        moved = following.position_with(*biases)
+        by_rotation = np.eye(9)  # the error at the end by that at the middle ...
+        by_rotation[:3, :3] = turn.T
+        by_rotation[3:6, :3], by_rotation[6:, :3] = -r @ se3.skew(pushed), -r @ se3.skew(moved)
+        by_rotation[6:, 3:6] = t * np.eye(3)
+        by_following = np.eye(9)  # ... and by that of the following motion
+        by_following[3:6, 3:6] = by_following[6:, 6:] = r
+        return Preintegrated(
+            seconds=self.seconds + t,
+            rotation=r @ turn,
+            velocity=v + r @ pushed,
+            position=p + v * t + r @ moved,
+            gyro_bias=self.gyro_bias,
+            accel_bias=self.accel_bias,
+            rotation_by_gyro=turn.T @ self.rotation_by_gyro + following.rotation_by_gyro,
+            velocity_by_gyro=self.velocity_by_gyro
+            + by_rotation[3:6, :3] @ self.rotation_by_gyro
+            + r @ following.velocity_by_gyro,
+            velocity_by_accel=self.velocity_by_accel + r @ following.velocity_by_accel,
+            position_by_gyro=self.position_by_gyro
+            + self.velocity_by_gyro * t
+            + by_rotation[6:, :3] @ self.rotation_by_gyro
+            + r @ following.position_by_gyro,
+            position_by_accel=self.position_by_accel + self.velocity_by_accel * t + r @ following.position_by_accel,
+            covariance=by_rotation @ self.covariance @ by_rotation.T
+            + by_following @ following.covariance @ by_following.T,
+        )
+
 
 def preintegrate(
     seconds: F64, gyro: F64, accel: F64, gyro_bias: F64, accel_bias: F64, gyro_noise: float, accel_noise: float

@@ -8,9 +8,11 @@ The retail paper's equations 19-21 (local and full optimisation).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import exp1  # pyright: ignore[reportAttributeAccessIssue, reportUnknownVariableType]
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
@@ -18,10 +20,13 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.order_statistics import median
 from stereo_sfm.mapping import bundle_kernels as kernels
 from stereo_sfm.mapping.level import Level
+from stereo_sfm.mapping.motion_factors import MotionFactors, MotionModel
 from stereo_sfm.mapping.reduced import ReducedSystem
 from stereo_sfm.types import F64, I64, Bool
 
 LONGEST_STEP = 32.0  # of those that `BundleConfig.extend` tries, in steps of Gauss-Newton
+LEAST_SQUARES = 100.0  # scale of Cauchy's loss, over the variance, from which all weights are one
+MEDIAN_CHI2 = 2.0 * float(np.log(2.0))  # of two dimensions
 TO_SIGMA = 1.4826  # from the median of absolute values, for normally distributed ones
 MIN_RESIDUAL = 0.05  # sigmas, lower bound of the median residual
 MIN_DISPARITY_SIGMA = 1e-2  # of normalised mean disparity errors
@@ -59,6 +64,7 @@ class Bundle:
     uv_right: F64  # (M, 2) px, NaN where not observed; only the row NaN: u alone counts (rectified, depth)
     sigma: F64 | None = None  # (M, 2) px of (left, right); None: 1
     level: Level | None = None  # what the keyframes measured of gravity; None: nothing
+    motions: MotionFactors | None = None  # what IMU and wheels measured between them; None: nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +79,7 @@ class BundleResult:
     initial_cost: float  # the same function at the start of the last round
     iterations: int  # accepted steps
     converged: bool
+    states: F64 | None = None  # (N, 9) of the nodes of the motions: see `States.after`; None: no IMU
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,6 +155,7 @@ class _State:
         self.lin: Linear
         self.prior: _Prior
         self.level: tuple[F64, F64]  # expected directions (F, 3) and weights (F,) of gravity
+        self.pull: F64  # (6 F,) gradient of the motions' costs
         self.cost = 0.0
 
 
@@ -161,6 +169,9 @@ class _Solver:
         self.free = np.where(bundle.fixed, -1, np.cumsum(~bundle.fixed) - 1).astype(np.int64)
         self.moving = np.flatnonzero(~bundle.fixed)
         self.level = bundle.level
+        self.motions = bundle.motions
+        self.model: MotionModel | None = None  # of the round
+        self.share = 1.0  # of the information of gravity and motions that counts in the round
         self.system: ReducedSystem | None = None
         n = len(bundle.points)
         self._nothing = _Prior(bundle.points, np.zeros((n, 6)), np.zeros((n, 3)), 0.0)
@@ -173,16 +184,26 @@ class _Solver:
 
     def evaluate(self, state: _State, prior: _Prior | None = None) -> _State:
         """Fill in the model and the cost; `prior`: model of the fixed keyframes from an earlier state, to reuse it."""
+        self._evaluate_images(state, prior)
+        self._evaluate_sensors(state)
+        return state
+
+    def _evaluate_images(self, state: _State, prior: _Prior | None = None) -> None:
         state.lin, state.cost = self.table.linearize(state)
         state.prior = prior or self._prior(state)
         state.cost += state.prior.cost
         if prior is not None and prior is not self._nothing:
             state.cost += kernels.prior_cost(state.points, prior.x0, prior.h, prior.g)
+
+    def _evaluate_sensors(self, state: _State) -> None:
+        """Add gravity and motions."""
         if self.level is not None:
             expected, weight, cost = self.level.evaluate(state.rot, self.moving)
-            state.level = expected, weight
+            state.level = expected, self.share * weight
+            state.cost += self.share * cost
+        if self.model is not None:
+            state.pull, cost = self.model.evaluate(state.rot[self.moving], state.pos[self.moving])
             state.cost += cost
-        return state
 
     def _weigh_disparities(self, state: _State) -> None:
         """Give less weight to the disparities of points whose mean error is large, see `_disparity_weights`."""
@@ -199,13 +220,23 @@ class _Solver:
         if judge and self.config.cauchy > 0:
             residual = np.sqrt(median(state.lin[3][self.table.use])) if self.table.use.any() else 0.0
             self.table.cauchy = self.fixed.cauchy = self.config.cauchy * max(float(residual), MIN_RESIDUAL)
-        self.evaluate(state)
+        self._evaluate_images(state)
+        if self.level is not None or self.motions is not None:
+            chi2, config = state.lin[3][self.table.use], self.config
+            if len(chi2):
+                self.share = counted_information(float(median(chi2)), self.table.cauchy, config.joint_loss)
+            if self.motions is not None:
+                self.model = self.motions.linearized(state.rot, state.pos, self.free, judge).scaled(self.share)
+            self._evaluate_sensors(state)
 
     def _pose_system(self, state: _State, damping: float) -> tuple[F64, F64]:
         h, b = np.zeros((len(self.moving), 6, 6)), np.zeros((len(self.moving), 6))
         kernels.pose_blocks(self.table.kf, self.free, state.lin, h, b)
         if self.level is not None:
             self.level.add(*state.level, self.level.seen[self.moving], h, b)
+        if self.model is not None:
+            h += self.model.blocks[np.arange(len(h)), np.arange(len(h))]
+            b -= state.pull.reshape(-1, 6)
         diagonal = h.reshape(-1, 36)[:, ::7]
         # A keyframe without any inlier keeps its pose: its block would be singular.
         diagonal += damping * diagonal + 1e-12
@@ -215,8 +246,12 @@ class _Solver:
         h, b = self._pose_system(state, damping)
         table = self.table
         if self.system is None:
-            self.system = ReducedSystem(table.starts, table.kf, self.free, self.config.dense)
+            dense = self.config.dense if self.model is None else True  # which motions couple as well
+            self.system = ReducedSystem(table.starts, table.kf, self.free, dense)
         matrix = self.system.new_blocks(h)
+        if self.model is not None:
+            rows, others = np.tril_indices(len(h), -1)
+            matrix[rows * len(h) + others] = self.model.blocks[rows, others]
         kernels.reduce(
             *(table.starts, table.kf, self.free, state.rot, state.lin, *blocks),
             *(self.system.most, matrix, self.system.slots, b),
@@ -281,6 +316,35 @@ class _Solver:
         return state, accepted, False
 
 
+def counted_information(chi2: float, cauchy: float = 0.0, joint: bool = False) -> float:
+    """What a cost of pixels counts, over the information about the poses that these pixels have.
+
+    The loss compares observations with each other, whatever their noise is; what else knows the poses, gravity and
+    motions with covariances of their own, enters the same cost with this factor. Where coordinates have the standard
+    deviation s, an estimate by a loss with weights w counts E[w] and has the variance E[psi^2] / E[psi']^2 (Huber,
+    Robust Statistics, 1981, section 4.2). Of Cauchy's weights c^2 / (c^2 + r^2), with a = c^2 / 2 s^2, E[w] is
+    v = a e^a E1(a) in two dimensions and a (1 - v) in four, E[w^2] is a (1 - v) and a v - a^2 (1 - v). Without them all
+    weights are taken as one, as of residuals that are small for Huber's loss.
+
+    Args:
+        chi2: median squared residual of an image, sigmas^2. cauchy: scale c in sigmas, 0: another loss.
+        joint: one loss over both images.
+    """
+    variance = max(chi2 / MEDIAN_CHI2, MIN_RESIDUAL**2)
+    a = cauchy**2 / (2.0 * variance)
+    if cauchy <= 0 or a > LEAST_SQUARES:
+        return min(variance, 1.0)
+    v = a * float(exp1(a)) * math.exp(a)
+    if not joint:
+        weight = v
+        square = slope = a * (1.0 - v)
+        psi2 = a * variance * (weight - square)
+    else:
+        weight, square = a * (1.0 - v), a * v - a * a * (1.0 - v)
+        slope, psi2 = 0.5 * (weight + square), 0.5 * a * variance * (weight - square)
+    return weight * psi2 / slope**2
+
+
 def _disparity_weights(total: F64, information: F64, sigmas: float) -> F64:
     """(P,) weights of the points' disparities, 1 up to so many sigmas of the mean error, then redescending.
 
@@ -337,7 +401,10 @@ def _result(
     poses = bundle.world_T_kf.astype(float, copy=True)
     moved = se3.from_rotation_translation(state.rot, state.pos)[solver.moving]
     poses[solver.moving] = se3.orthonormalize(moved) if len(moved) else moved
-    return BundleResult(poses, state.points, inlier, chi2, state.cost, initial, iterations, converged)
+    states = None
+    if (model := solver.model) is not None and model.states is not None:
+        states = model.states.after(model.step_to(state.rot[solver.moving], state.pos[solver.moving]))
+    return BundleResult(poses, state.points, inlier, chi2, state.cost, initial, iterations, converged, states)
 
 
 def _check(bundle: Bundle) -> None:

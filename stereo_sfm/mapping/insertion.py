@@ -11,6 +11,7 @@ from stereo_sfm.config import MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping import association
 from stereo_sfm.mapping.map import Map
+from stereo_sfm.mapping.motions import Motion
 from stereo_sfm.mapping.pose_only import adjust_pose
 from stereo_sfm.types import F64, I64, Bool, Keyframe
 
@@ -33,7 +34,7 @@ def insert_keyframe(map_: Map, rig: Rig, keyframe: Keyframe, guess: F64, config:
     """
     rows, usable = _identify(map_, keyframe, config)
     pose = _solve_pose(map_, rig, keyframe, rows, usable & (rows >= 0), guess, config)
-    row = map_.add_keyframe(keyframe, pose)
+    row = map_.add_keyframe(keyframe, pose, Motion.of(keyframe, rig.imu) if config.sensors else None)
     matches = np.zeros((0, 2), np.int64)
     if config.association == "map":
         matches = _find_again(map_, rig, keyframe, rows, usable, pose, config)

@@ -18,6 +18,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping import map_kernels
 from stereo_sfm.mapping.id_rows import IdRows
+from stereo_sfm.mapping.motions import Motion
 from stereo_sfm.mapping.tables import KeyframeTable, ObservationTable, PointTable
 from stereo_sfm.types import F32, F64, I64, U8, Bool, Corners, Keyframe
 
@@ -110,6 +111,8 @@ class Map:
         self.points = PointTable(1024)
         self.observations = ObservationTable(4096)
         self.corners: dict[int, tuple[Corners, Corners]] = {}  # of living keyframes, by row: `corners`, `sides`
+        self.motions: dict[int, Motion] = {}  # by row of the later keyframe: from `previous` to it
+        self.known_states: dict[int, tuple[F64, F64]] = {}  # by row: (12,) and (12, 12), see `InertialLink.state`
         self._kf_rows: dict[int, int] = {}
         self._pt_rows = IdRows()
         self._changed_kf: set[int] = set()
@@ -189,8 +192,8 @@ class Map:
 
     # -- growing -----------------------------------------------------------------------------------------------------
 
-    def add_keyframe(self, keyframe: Keyframe, map_T_kf: F64) -> int:
-        """A keyframe without observations yet. Returns its row.
+    def add_keyframe(self, keyframe: Keyframe, map_T_kf: F64, motion: Motion | None = None) -> int:
+        """A keyframe without observations yet, and the motion from the one before. Returns its row.
 
         Raises:
             StereoSfmError: its id was used before.
@@ -209,10 +212,15 @@ class Map:
             previous=row - 1 if same else -1,
             down=keyframe.down,
             down_sigma=keyframe.down_sigma,
+            **_inertial_state(keyframe),
             obs_first=len(self.observations),
         )
         self._kf_rows[keyframe.kf_id] = row
         self.corners[row] = keyframe.corners, keyframe.sides
+        if same and motion is not None:
+            self.motions[row] = motion
+        if keyframe.inertial is not None and keyframe.inertial.covariance.any():
+            self.known_states[row] = keyframe.inertial.state, keyframe.inertial.covariance
         self._changed_kf.add(row)
         return row
 
@@ -337,9 +345,20 @@ class Map:
         self.remove_observations(rows)
         self.keyframes.alive[row] = False
         del self.corners[row]
+        self._join_motions(row)
         self.keyframes.previous[self.keyframes.previous == row] = self.keyframes.previous[row]
         table, orphans = self.observations, points[self.points.anchor[points] == row]
         map_kernels.anchor_anew(orphans, self.points.head, table.following, table.kf, self.points.anchor)
+
+    def _join_motions(self, row: int) -> None:
+        """The motions to a keyframe and from it become one."""
+        self.known_states.pop(row, None)
+        first = self.motions.pop(row, None)
+        for later in np.flatnonzero(self.keyframes.previous == row).tolist():
+            second = self.motions.pop(later, None)
+            joined = None if first is None or second is None else first.then(second)
+            if joined is not None:
+                self.motions[later] = joined
 
     def _carry(self, row: int) -> None:
         """Make another keyframe the carrier of a keyframe and of those that it carries."""
@@ -412,6 +431,8 @@ class Map:
         table.keep(np.flatnonzero(stay))
         self._kf_rows = {kf_id: row for row, kf_id in enumerate(table.kf_id.tolist())}
         self.corners = {int(now[row]): corners for row, corners in self.corners.items()}
+        self.motions = {int(now[row]): motion for row, motion in self.motions.items()}
+        self.known_states = {int(now[row]): state for row, state in self.known_states.items()}
         return now
 
     @property
@@ -524,3 +545,11 @@ class Map:
         tables = (self.keyframes, self.points, self.observations)
         corners = sum(c.nbytes for both in self.corners.values() for c in both)
         return sum(table.nbytes for table in tables) + self._pt_rows.nbytes + corners
+
+
+def _inertial_state(keyframe: Keyframe) -> dict[str, F64]:
+    """The columns of velocity and biases."""
+    if keyframe.inertial is None:
+        return {}
+    velocity, _, accel_bias, gyro_bias = keyframe.inertial.state.reshape(4, 3)
+    return {"velocity": velocity, "accel_bias": accel_bias, "gyro_bias": gyro_bias}

@@ -392,7 +392,7 @@ class Mapper:
         count = self.map.points.obs_count[seen]
         recent = seen[(count > 1) & (count <= MAX_TRIANGULATED)]
         self.map.move_points(recent, triangulate(self.map, self._rig, recent))
-        part = window.covisible_window(self.map, row, self._config)
+        part = window.covisible_window(self.map, row, self._config, self._rig.imu)
         self._adjusted = part.pt_rows
         result = bundle_adjust(self._rig, part.bundle, window.bundle_config(self._config))
         window.write_back(self.map, part, result)

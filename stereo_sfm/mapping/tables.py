@@ -25,6 +25,9 @@ class KeyframeTable(Columns):
     carrier_T_kf: F64  # (K, 4, 4)
     down: F64  # (K, 3) gravity's direction in the camera, zero: unknown
     down_sigma: F64  # radians, 0: unknown
+    velocity: F64  # (K, 3) m/s in the IMU's axes
+    accel_bias: F64  # (K, 3) m/s^2
+    gyro_bias: F64  # (K, 3) rad/s
     alive: Bool
     named: Bool  # whether loops may still name it
 
@@ -41,6 +44,9 @@ class KeyframeTable(Columns):
         "carrier_T_kf": (np.float64, (4, 4), np.eye(4)),
         "down": (np.float64, (3,), 0.0),
         "down_sigma": (np.float64, (), 0.0),
+        "velocity": (np.float64, (3,), 0.0),
+        "accel_bias": (np.float64, (3,), 0.0),
+        "gyro_bias": (np.float64, (3,), 0.0),
         "alive": (np.bool_, (), True),
         "named": (np.bool_, (), True),
     }

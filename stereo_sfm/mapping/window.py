@@ -10,12 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stereo_sfm.calib.imu import Imu
 from stereo_sfm.config import MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping import map_kernels
 from stereo_sfm.mapping.bundle import Bundle, BundleConfig, BundleResult
 from stereo_sfm.mapping.level import level_of
 from stereo_sfm.mapping.map import Map
+from stereo_sfm.mapping.motion_factors import motion_factors
 from stereo_sfm.types import F64, I64, Bool
 
 FINAL_ROUNDS, FINAL_TOLERANCE = 4, 1e-5  # of the last full bundle adjustment, see `BundleConfig`
@@ -58,15 +60,20 @@ def final_bundle_config(config: MapperConfig) -> BundleConfig:
     )  # fmt: skip
 
 
-def covisible_window(map_: Map, row: int, config: MapperConfig) -> Window:
+def covisible_window(map_: Map, row: int, config: MapperConfig, imu: Imu | None = None) -> Window:
     """The keyframe, those that share most points with it, and all their points; other keyframes are fixed.
 
     The map's first keyframe is fixed, and so is the oldest keyframe of a part that no fixed keyframe is connected to.
+    Where `config.sensors` is set, the bundle has what IMU and wheels measured between the keyframes.
     """
     others, _ = map_.neighbours(row, config.connected_points)
     if not len(others):
         others, _ = map_.neighbours(row)
-    return _window(map_, np.concatenate([[row], others])[: config.most_keyframes].astype(np.int64), config.most_fixed)
+    part = _window(map_, np.concatenate([[row], others])[: config.most_keyframes].astype(np.int64), config.most_fixed)
+    if not config.sensors:
+        return part
+    motions = motion_factors(map_, part.kf_rows, part.bundle.fixed, imu)
+    return dataclasses.replace(part, bundle=dataclasses.replace(part.bundle, motions=motions))
 
 
 def newest(map_: Map, first_row: int, most: int, most_fixed: int | None) -> Window:
@@ -139,6 +146,11 @@ def write_back(map_: Map, part: Window, result: BundleResult) -> None:
     moved = np.flatnonzero(~part.bundle.fixed & map_.keyframes.alive[part.kf_rows])
     _carry_single_points(map_, part.kf_rows[moved], result.world_T_kf[moved])
     map_.move_keyframes(part.kf_rows[moved], result.world_T_kf[moved])
+    if part.bundle.motions is not None and result.states is not None:
+        inside = part.bundle.motions.rows
+        own = np.flatnonzero((inside >= 0) & ~part.bundle.fixed[inside])
+        rows, table = part.kf_rows[inside[own]], map_.keyframes
+        table.velocity[rows], table.accel_bias[rows], table.gyro_bias[rows] = np.hsplit(result.states[own], 3)
     sane = np.isfinite(result.points).all(axis=1) & map_.points.alive[part.pt_rows]
     map_.move_points(part.pt_rows[sane], result.points[sane])
     table, obs = map_.observations, part.obs_rows

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import dataclasses
+
 import gtsam
 import numpy as np
 import pytest
@@ -70,6 +72,21 @@ def test_bias_jacobians_are_the_differences(seed: int) -> None:
         assert np.allclose((by_gyro.position - base.position) / step, base.position_by_gyro[:, axis], atol=1e-5)
         assert np.allclose((by_accel.velocity - base.velocity) / step, base.velocity_by_accel[:, axis], atol=1e-6)
         assert np.allclose((by_accel.position - base.position) / step, base.position_by_accel[:, axis], atol=1e-6)
+
+
+@pytest.mark.parametrize("biased", [False, True])
+def test_two_motions_make_one(biased: bool) -> None:
+    """As integrated at once, derivatives and covariance too; biases of the second are corrected to first order."""
+    gyro_bias, accel_bias = np.array([0.01, -0.02, 0.03]), np.array([0.1, -0.05, 0.02])
+    other = (gyro_bias + 1e-4, accel_bias - 1e-3) if biased else (gyro_bias, accel_bias)
+    seconds, gyro, accel = samples(2)
+    parts = [(slice(0, 15), gyro_bias, accel_bias), (slice(15, None), *other)]
+    first, second = (preintegrate(seconds[k], gyro[k], accel[k], g, a, GYRO_NOISE, ACCEL_NOISE) for k, g, a in parts)
+    joined, whole = first.then(second), ours(2, gyro_bias, accel_bias)
+    for field in dataclasses.fields(Preintegrated):
+        found, true = np.asarray(getattr(joined, field.name)), np.asarray(getattr(whole, field.name))
+        np.testing.assert_allclose(found, true, atol=(1e-3 if biased else 1e-9) * max(float(np.abs(true).max()), 1e-9))
+    assert np.abs(joined.position - whole.position).max() < 1e-8
 
 
 def test_covariance_is_that_of_many_noisy_integrations() -> None:

@@ -18,6 +18,7 @@ from stereo_sfm.tracking.flow.pyramids import StereoPyramids
 from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.side_views import SideViews
 from stereo_sfm.tracking.flow.tracks import Tracks
+from stereo_sfm.tracking.inertial.motion_sensors import MotionSensors
 from stereo_sfm.types import F64, Corners, Keyframe, StereoImage
 
 SPACING = 1.0 - 1.0 / SCALE, 0.1  # between described places: share of their distance (one level of scale), radians
@@ -44,7 +45,7 @@ class Keyframes:
         self.points = 0  # static points of the newest keyframe, with new ones
         self._pose: F64 = np.eye(4)  # odom_T_cam of the newest keyframe
         self._frames_since = 0
-        self._stamp_ns = 0  # of the newest keyframe
+        self._stamp_ns, self._submap_id = 0, -1  # of the newest keyframe
 
     def use(self, rig: Rig) -> None:
         """Use a corrected rig."""
@@ -73,13 +74,12 @@ class Keyframes:
         odom_T_cam: F64,
         submap_id: int,
         rig_terms: F64,
-        gravity: tuple[F64, float] | None = None,
+        sensors: MotionSensors | None = None,
     ) -> Keyframe:
         """A keyframe of an image, without points: see `describe`.
 
         Args:
-            odom_T_cam: (4, 4). rig_terms: (8,) current correction of the rig.
-            gravity: its direction in the camera (3,), and the standard deviation in radians.
+            odom_T_cam: (4, 4), which the sensors have accepted. rig_terms: (8,) current correction of the rig.
         """
         keyframe = Keyframe(
             kf_id=self.count,
@@ -93,19 +93,24 @@ class Keyframes:
             descriptors=np.zeros((0, 32), np.uint8),
             submap_id=submap_id,
             rig_terms=rig_terms.copy(),
-            **self._down(image.stamp_ns, gravity),
+            **({} if sensors is None else self._measured(sensors, image.stamp_ns, odom_T_cam, submap_id)),
         )
+        self._stamp_ns, self._submap_id = image.stamp_ns, submap_id
         self.count, self._pose, self._frames_since = self.count + 1, odom_T_cam.copy(), 0
         return keyframe
 
-    def _down(self, stamp_ns: int, gravity: tuple[F64, float] | None) -> dict[str, Any]:
-        """The fields of gravity. Its error changes slowly: keyframes share what one time of correlation tells."""
-        seconds = (stamp_ns - self._stamp_ns) * 1e-9
-        self._stamp_ns = stamp_ns
-        if gravity is None or self.count == 0:
-            return {}
-        down, sigma = gravity
-        return {"down": down, "down_sigma": sigma * np.sqrt(max(CORRELATED_S / seconds, 1.0))}
+    def _measured(self, sensors: MotionSensors, stamp_ns: int, odom_T_cam: F64, submap_id: int) -> dict[str, Any]:
+        """The fields of gravity and of what the sensors measured since the keyframe before.
+
+        Gravity's error changes slowly: keyframes share what one time of correlation tells.
+        """
+        inertial, wheels = sensors.links(self._stamp_ns if submap_id == self._submap_id else stamp_ns, stamp_ns)
+        fields: dict[str, Any] = {"inertial": inertial, "wheels": wheels}
+        gravity = sensors.gravity(odom_T_cam)
+        if gravity is not None and self.count > 0:
+            seconds = (stamp_ns - self._stamp_ns) * 1e-9
+            fields["down"], fields["down_sigma"] = gravity[0], gravity[1] * np.sqrt(max(CORRELATED_S / seconds, 1.0))
+        return fields
 
     def describe(self, keyframe: Keyframe, images: StereoPyramids, tracks: Tracks, velocity: F64) -> Keyframe:
         """The keyframe with its points, but those on moving objects, their descriptors and its corners.

@@ -446,14 +446,10 @@ class Tracker:
 
     def _create_keyframe(self, image: StereoImage, images: StereoPyramids, trusted: bool) -> Keyframe:
         """A keyframe of the image whose pose has just been found."""
-        keyframe = self._keyframes.create(image, self._pose, self._submap_id, self._rig_terms, self._gravity())
+        keyframe = self._keyframes.create(image, self._pose, self._submap_id, self._rig_terms, self._sensors)
         self._keyframes.points = self._static_count()
         self._undescribed = keyframe, images, trusted
         return keyframe
-
-    def _gravity(self) -> tuple[F64, float] | None:
-        """Its direction in the camera (3,), and its standard deviation; None while it is not known."""
-        return None if self._sensors is None else self._sensors.gravity(self._pose)
 
     def _frame(
         self,

@@ -16,7 +16,7 @@ from stereo_sfm.tracking.inertial.inertial_filter import WRONG_CHI2, InertialFil
 from stereo_sfm.tracking.inertial.rest import STILL_NS
 from stereo_sfm.tracking.inertial.rotation_filter import RotationFilter
 from stereo_sfm.tracking.inertial.sample_buffer import Intervals, SampleBuffer
-from stereo_sfm.types import F64, I64, ImuSamples
+from stereo_sfm.types import F64, I64, ImuSamples, InertialLink
 
 NODE_NS = 200_000_000  # between the poses of the filter
 MAX_TURN_ERROR = 0.1  # rad/s between gyroscope and images, root mean square: more is another sensor's data
@@ -178,6 +178,25 @@ class InertialMotion:
         """The gyroscope between two times; None where samples are missing."""
         found = self._buffer.between(begin_ns, end_ns)
         return None if found is None else Turning(found.edges_ns, found.gyro - self._gyro_bias)
+
+    def link(self, begin_ns: int, stamp_ns: int) -> InertialLink | None:
+        """From the stamp of the keyframe before to that of a keyframe; None where the IMU is left out.
+
+        The state is that of the newest pose, and not given where the keyframe has another."""
+        if self.left_out:
+            return None
+        found = self._buffer.between(begin_ns, stamp_ns) if stamp_ns > begin_ns else None
+        edges, gyro, accel = np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3))
+        if found is not None:
+            edges, gyro, accel = found.edges_ns, found.gyro, found.accel
+        state, covariance = np.zeros(12), np.zeros((12, 12))
+        if (s := self._state) is not None and stamp_ns == self._last_ns:
+            turn, into = self._odom_T_last[:3, :3].T, np.eye(9)
+            into[:3, :3] = into[3:6, 3:6] = turn
+            state = np.concatenate([turn @ self._velocity(), turn @ s.gravity, s.accel_bias, self._gyro_bias])
+            covariance[:9, :9] = into @ s.covariance @ into.T
+            covariance[9:, 9:] = s.gyro_bias_sigma**2 * np.eye(3)
+        return InertialLink(edges, gyro, accel, state, covariance)
 
     def reckoning(self, wheel: Wheel, lasting: F64) -> DeadReckoning | None:
         """From the last pose on, with wheels whose scale and direction have a covariance `lasting` (4, 4).

@@ -9,7 +9,7 @@ import numpy as np
 from stereo_sfm.geometry.kernels import inner, njit
 from stereo_sfm.types import F64, I64
 
-MEMORY_S = 2.0  # how far back intervals may begin, besides the time since the last pose
+MEMORY_S = 4.0  # how far back intervals may begin, besides the time since the last pose
 
 
 class Series:

@@ -12,7 +12,7 @@ from stereo_sfm.tracking.inertial.inertial_motion import Turning
 from stereo_sfm.tracking.inertial.rest import STILL_NS
 from stereo_sfm.tracking.inertial.series import Series
 from stereo_sfm.tracking.inertial.wheel_window import WheelCorrection, WheelWindow
-from stereo_sfm.types import F64, WheelSamples
+from stereo_sfm.types import F64, WheelLink, WheelSamples
 
 MAX_GAP_S = 0.25  # between samples: longer ones are not bridged
 LINK_NS = 500_000_000  # of the comparison with the images
@@ -127,19 +127,28 @@ class WheelMotion:
 
         None where samples are missing, or the wheels contradict the images.
         """
-        motion = None if self.left_out or not self._begun else self._by_wheels(stamp_ns)
+        link = self.link(self._last_ns, stamp_ns) if self._begun else None
+        if link is None:
+            return None
+        left_T_wheel = self._wheel.left_T_wheel
+        return self._odom_T_last @ se3.inverse(left_T_wheel) @ link.last_T_cam, link.covariance
+
+    def link(self, begin_ns: int, stamp_ns: int) -> WheelLink | None:
+        """The motion of the camera from one time to another; None where samples are missing, or the wheels contradict
+        the images."""
+        motion = None if self.left_out else self._by_wheels(begin_ns, stamp_ns)
         if motion is None:
             return None
         moved = se3.from_rotation_translation(motion.rotation, motion.position)
         covariance = self._covariance(motion)
         end_R_begin = np.kron(np.eye(2), motion.rotation.T)
         end_R_begin[3:, 3:] = np.eye(3)
-        into = se3.adjoint(self._wheel.left_T_wheel) @ end_R_begin
-        odom_T_cam = self._odom_T_last @ moved @ se3.inverse(self._wheel.left_T_wheel)
-        return odom_T_cam, into @ covariance @ into.T
+        left_T_wheel = self._wheel.left_T_wheel
+        into = se3.adjoint(left_T_wheel) @ end_R_begin
+        return WheelLink(left_T_wheel @ moved @ se3.inverse(left_T_wheel), into @ covariance @ into.T)
 
-    def _by_wheels(self, stamp_ns: int) -> TwistMotion | None:
-        edges = self._series.edges(self._last_ns, stamp_ns)
+    def _by_wheels(self, begin_ns: int, stamp_ns: int) -> TwistMotion | None:
+        edges = self._series.edges(begin_ns, stamp_ns)
         if edges is None:
             return None
         c, values = self._correction, self._series.means(edges)
