@@ -10,6 +10,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import F64, ReadOnly
 
 MAX_OFFSET_S = 1.0
+TURN_SHARE = 2e-3  # of a turn: error of a calibrated gyroscope's scale and axes
 
 
 @dataclass(frozen=True, eq=False)

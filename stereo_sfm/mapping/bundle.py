@@ -12,7 +12,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import exp1  # pyright: ignore[reportAttributeAccessIssue, reportUnknownVariableType]
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
@@ -334,6 +333,8 @@ def counted_information(chi2: float, cauchy: float = 0.0, joint: bool = False) -
     a = cauchy**2 / (2.0 * variance)
     if cauchy <= 0 or a > LEAST_SQUARES:
         return min(variance, 1.0)
+    from scipy.special import exp1  # here, as only runs with sensors need it: it takes 20 ms to load
+
     v = a * float(exp1(a)) * math.exp(a)
     if not joint:
         weight = v

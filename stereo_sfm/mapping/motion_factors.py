@@ -17,13 +17,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve  # pyright: ignore[reportUnknownVariableType]
 
-from stereo_sfm.calib.imu import Imu
+from stereo_sfm.calib.imu import TURN_SHARE, Imu
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.preintegration import GRAVITY, Preintegrated
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.types import F64, I64, Bool, WheelLink
 
-TURN_SHARE = 2e-3  # of a turn: error of a calibrated gyroscope's scale and axes
 INERTIAL_CHI2, WHEEL_CHI2 = 21.7, 16.8  # of nine and six: a motion beyond (1 % of right ones) counts less
 FIRST_ROUND = 10.0  # times as much is allowed before the poses are adjusted
 SPEED_SIGMA = 10.0  # m/s, where the tracker does not know the velocity
@@ -86,6 +85,8 @@ def motion_factors(map_: Map, rows: I64, fixed: Bool, imu: Imu | None) -> Motion
     Args:
         rows: (K,) of the bundle in the map. fixed: (K,). imu: None: wheels alone.
     """
+    if not map_.motions:
+        return None
     table, moving = map_.keyframes, rows[~fixed]
     later = np.union1d(moving, np.flatnonzero(table.alive & np.isin(table.previous, moving)))
     later = np.array([row for row in later.tolist() if row in map_.motions], np.int64)
@@ -128,7 +129,7 @@ class States:
     def after(self, step: F64) -> F64:
         """(N, 9) velocity in the IMU's axes and biases, after a step (6 F,) of the poses."""
         states = (self.at.ravel() + self.by_step @ step).reshape(-1, STATE)
-        states[:, :3] = np.einsum("nji,nj->ni", self.rotation, states[:, :3])
+        states[:, :3] = _times(self.rotation.mT, states[:, :3])
         return states
 
 
@@ -155,7 +156,7 @@ class MotionModel:
 
     def step_to(self, rot: F64, pos: F64) -> F64:
         """(6 F,) from the model's poses to others (F, 3, 3), (F, 3), to first order."""
-        moved = np.einsum("nji,nj->ni", self.rot, pos - self.pos)
+        moved = _times(self.rot.mT, pos - self.pos)
         return np.hstack([moved, se3.so3_log(self.rot.mT @ rot)]).ravel()
 
     def evaluate(self, rot: F64, pos: F64) -> tuple[F64, float]:
@@ -163,6 +164,11 @@ class MotionModel:
         step = self.step_to(rot, pos)
         change = self.h @ step
         return self.g + change, float(self.cost + self.g @ step + 0.5 * step @ change)
+
+
+def _times(matrices: F64, vectors: F64) -> F64:
+    """(L, R) of (L, R, C) and (L, C)."""
+    return np.einsum("lrc,lc->lr", matrices, vectors)
 
 
 def _relative_weights(chi2: F64, limit: float) -> F64:
@@ -195,7 +201,7 @@ def _add_wheels(factors: WheelFactors, rot: F64, pos: F64, column: I64, limit: f
     root = _roots(np.stack([m.covariance for m in factors.motions]))
     jacobian = np.zeros((len(i), 6, 12))
     jacobian[:, :, :6], jacobian[:, :, 6:] = -se3.adjoint(se3.inverse(seen)), np.eye(6)
-    jacobian, residual = root @ jacobian, np.einsum("lij,lj->li", root, residual)
+    jacobian, residual = root @ jacobian, _times(root, residual)
     weight = np.sqrt(_relative_weights((residual**2).sum(axis=1), limit))
     jacobian, residual = weight[:, None, None] * jacobian, weight[:, None] * residual
     columns = _pose_columns(column[factors.links]).reshape(len(i), 12)
@@ -245,7 +251,7 @@ def _add_inertial(
     rot, pos = rot @ left_T_imu[:3, :3], pos + rot @ left_T_imu[:3, 3]  # of the IMU
     by_camera = se3.adjoint(se3.inverse(left_T_imu))  # a step of the IMU's pose by one of the camera's
     states = factors.states.copy()
-    states[:, :3] = np.einsum("nij,nj->ni", rot, states[:, :3])
+    states[:, :3] = _times(rot, states[:, :3])
     begins = list(zip(factors.first.tolist(), factors.known, strict=True))
     gravity = np.mean([rot[n] @ known[0][3:6] for n, known in begins if known is not None], axis=0)
     gravity *= GRAVITY / np.linalg.norm(gravity)
@@ -264,7 +270,7 @@ def _add_inertial(
     system = at_begin.plus(jacobian, residual, columns)
     eliminated = system.eliminated()
     step = np.concatenate([np.zeros(size), -eliminated[:, 0], [0.0]])
-    left = residual + np.einsum("lrc,lc->lr", jacobian, step[columns])
+    left = residual + _times(jacobian, step[columns])
     weight = _relative_weights((left[:, :STATE] ** 2).sum(axis=1), limit)
     if (weight < 1.0).any():
         scale = np.sqrt(weight)[:, None]
@@ -325,11 +331,6 @@ def _motion_rows(factors: InertialFactors, rot: F64, pos: F64, z: F64, gravity: 
     root = _roots(covariance)
     a[:, :STATE], residual[:, :STATE] = root @ a[:, :STATE], _times(root, residual[:, :STATE])
     return a, residual
-
-
-def _times(matrices: F64, vectors: F64) -> F64:
-    """(L, R, C) of (L, C): (L, R)."""
-    return np.einsum("lij,lj->li", matrices, vectors)
 
 
 def _known_rows(imu: Imu, known: tuple[F64, F64] | None, rot: F64, state: F64, gravity: F64) -> tuple[F64, F64]:

@@ -203,29 +203,19 @@ def test_a_motion_that_the_poses_contradict_counts_less() -> None:
     assert pull(0.02) == pytest.approx(2 * pull(0.01))
 
 
-def test_the_counted_information_is_that_of_many_estimates() -> None:
-    """The mean of 200 pixels by iteratively reweighted least squares, two thousand times."""
-    rng, s, c = np.random.default_rng(2), 0.3, 0.2
-    r = rng.normal(0, s, (2000, 200, 2))
-    estimate, w = np.zeros((2000, 1, 2)), np.ones((2000, 200, 1))
+@pytest.mark.parametrize("joint", [False, True])
+def test_the_counted_information_is_that_of_many_estimates(joint: bool) -> None:
+    """The mean of 200 pixels, or pairs of them, by iteratively reweighted least squares, two thousand times."""
+    rng, s, c, dimensions = np.random.default_rng(2), 0.3, 0.2, 4 if joint else 2
+    r = rng.normal(0, s, (2000, 200, dimensions))
+    estimate, w = np.zeros((2000, 1, dimensions)), np.ones((2000, 200, 1))
     for _ in range(30):
         w = c**2 / (c**2 + ((r - estimate) ** 2).sum(axis=2, keepdims=True))
         estimate = (w * r).sum(axis=1, keepdims=True) / w.sum(axis=1, keepdims=True)
     counted, true = float(w.sum(axis=1).mean()), 1.0 / float(estimate.var())
-    assert counted_information(2 * np.log(2) * s**2, c) == pytest.approx(counted / true, rel=0.1)
-    assert counted_information(2 * np.log(2) * s**2, 0.0) == pytest.approx(s**2)
-    assert counted_information(2 * np.log(2) * s**2, 1e3) == pytest.approx(s**2)
-
-
-def test_the_counted_information_of_joint_losses() -> None:
-    rng, s, c = np.random.default_rng(2), 0.3, 0.2
-    r = rng.normal(0, s, (2000, 200, 4))
-    estimate, w = np.zeros((2000, 1, 4)), np.ones((2000, 200, 1))
-    for _ in range(30):
-        w = c**2 / (c**2 + ((r - estimate) ** 2).sum(axis=2, keepdims=True))
-        estimate = (w * r).sum(axis=1, keepdims=True) / w.sum(axis=1, keepdims=True)
-    counted, true = float(w.sum(axis=1).mean()), 1.0 / float(estimate.var())
-    assert counted_information(2 * np.log(2) * s**2, c, joint=True) == pytest.approx(counted / true, rel=0.1)
+    assert counted_information(2 * np.log(2) * s**2, c, joint) == pytest.approx(counted / true, rel=0.1)
+    assert counted_information(2 * np.log(2) * s**2, 0.0, joint) == pytest.approx(s**2)
+    assert counted_information(2 * np.log(2) * s**2, 1e3, joint) == pytest.approx(s**2)
 
 
 def test_bundle_adjustment_gains_by_the_imu() -> None:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stereo_sfm.calib.imu import Imu
+from stereo_sfm.calib.imu import TURN_SHARE, Imu
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.kernels import inner, njit
 from stereo_sfm.geometry.preintegration import GRAVITY, Preintegrated
@@ -29,7 +29,6 @@ POSITION_WALK = 0.0015  # m/sqrt(s) of the odometry
 GRAVITY_SIGMA = 0.02  # m/s^2 of its size, which varies over the earth
 DRIFT_SIGMA, DRIFT_S = 2e-4, 10.0  # rad/s of the odometry's rotation, and seconds for which it stays the same
 ROTATION_WALK = 1e-4  # rad/sqrt(s) of the odometry's rotation, at least
-TURN_SHARE = 2e-3  # of a turn: error of a calibrated gyroscope's scale and axes
 KNOWN = 1.0  # m/s^2, standard deviation of gravity from which its size counts
 FIRST_DRIFT_SIGMA = 1e-3  # rad/s, before the rotations have shown the gyroscope's bias better
 SPEED_SIGMA = 10.0  # m/s, before anything is known

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stereo_sfm.calib.imu import Imu
+from stereo_sfm.calib.imu import TURN_SHARE, Imu
 from stereo_sfm.calib.wheel import Wheel
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.preintegration import GRAVITY, Preintegrated, preintegrate
@@ -25,7 +25,6 @@ MAX_GRAVITY_ERROR = 1.0  # m/s^2 of its size
 STILL = np.array([0.005, 0.05])  # rad/s, m/s^2: spread of a sensor at rest ...
 STILL_NOISE = 3.0  # ... and its own noise so many times
 STILL_TURN = 0.03  # rad/s that the known bias may be off
-TURN_SHARE = 2e-3  # of a turn: error of a calibrated gyroscope's scale and axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +181,8 @@ class InertialMotion:
     def link(self, begin_ns: int, stamp_ns: int) -> InertialLink | None:
         """From the stamp of the keyframe before to that of a keyframe; None where the IMU is left out.
 
-        The state is that of the newest pose, and not given where the keyframe has another."""
+        The state is that of the newest pose, and not given where the keyframe has another.
+        """
         if self.left_out:
             return None
         found = self._buffer.between(begin_ns, stamp_ns) if stamp_ns > begin_ns else None
