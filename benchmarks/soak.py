@@ -44,7 +44,7 @@ from stereo_sfm.service.messages import HealthReport, PoseUpdate, Started, Statu
 from stereo_sfm.service.outputs import OUTPUTS
 from stereo_sfm.service.outputs.settings import FoxgloveConfig, OutputsConfig, PageConfig, PoseSocketConfig
 from stereo_sfm.service.service import Service
-from stereo_sfm.types import StereoImage
+from stereo_sfm.types import F64, StereoImage
 
 RATE = 30.0
 PAUSE_S = 0.5  # between two images: a fault, not the rate
@@ -56,7 +56,7 @@ LONG_MIN = 60.0  # minutes of camera time from which growth can be measured
 WARM_MIN = 30.0  # minutes of camera time after the start of a process that its slope leaves out
 MIN_MINUTES = 20.0  # of camera time that a slope must cover to mean anything
 QUOTA_GB, SEGMENT_MIN = 0.4, 0.1
-SIZES_EVERY = 20  # reports, each of a second: what is kept of them grows, too
+SIZES_EVERY = 60  # reports, each of a second: what is kept of them grows, too
 RESTART_S = 5.0  # from the death of a stage to the next pose
 FOUND_FRAMES = 300  # for a pose after the lights are on again
 SOCKET_PORT, FOXGLOVE_PORT, PAGE_PORT = 17100, 18865, 18180
@@ -110,10 +110,11 @@ def store(spec: str, distinct: int, folder: Path) -> None:
 
 @dataclass(frozen=True)
 class Sizes:
-    """The processes at one time."""
+    """The processes over a minute by the clock."""
 
     frame: int
-    bytes: dict[str, int]
+    least: dict[str, int]  # resident bytes
+    most: dict[str, int]
     pids: dict[str, int]
 
 
@@ -130,8 +131,10 @@ class Watch:
     missing: dict[int, int] = field(default_factory=dict[int, int])  # first missing frame -> how many
     states: list[tuple[int, str, str]] = field(default_factory=list[tuple[int, str, str]])
     sessions: list[int] = field(default_factory=list[int])  # frames at which they began
-    reports: int = 0
     rss: list[Sizes] = field(default_factory=list["Sizes"])
+    minute: list[tuple[dict[str, int], dict[str, int]]] = field(
+        default_factory=list[tuple[dict[str, int], dict[str, int]]]
+    )  # sizes and process ids so far
     health: HealthReport | None = None
     segment: int = 0  # bytes of the largest one
     over_quota: float = 0.0
@@ -156,10 +159,13 @@ class Watch:
 
     def report(self, report: HealthReport, pids: dict[str, int]) -> None:
         self.health = report
-        self.reports += 1
-        if self.reports % SIZES_EVERY == 0:
-            sizes = Sizes(self.frame, {**report.rss, "service": own_rss()}, {**pids, "service": os.getpid()})
-            self.rss.append(sizes)
+        self.minute.append(({**report.rss, "service": own_rss()}, {**pids, "service": os.getpid()}))
+        if len(self.minute) == SIZES_EVERY:
+            pids = self.minute[-1][1]
+            seen = {n: [sizes[n] for sizes, of in self.minute if sizes.get(n) and of.get(n) == pids[n]] for n in pids}
+            least, most = ({n: of(sizes) for n, sizes in seen.items() if sizes} for of in (min, max))
+            self.rss.append(Sizes(self.frame, least, most, pids))
+            self.minute.clear()
 
 
 def own_rss() -> int:
@@ -216,26 +222,29 @@ def wait_for(what: Any) -> None:
 
 
 @dataclass(frozen=True)
-class Slope:
-    """Of one process."""
+class Growth:
+    """Of one process: its least or its largest size of every minute."""
 
-    mb: float  # at the end
+    mb: float  # of the last minute
     mb_h: float  # an hour of camera time
-    hours: float  # that it was measured over
 
 
-def slopes(rss: list[Sizes]) -> dict[str, Slope]:
-    """Process -> growth of its last life without the first half hour of it, in camera time."""
-    out: dict[str, Slope] = {}
-    for name in sorted({name for sizes in rss for name, size in sizes.bytes.items() if size and name in sizes.pids}):
-        seen = [sizes for sizes in rss if sizes.bytes.get(name) and name in sizes.pids]
+def slope(hours: F64, sizes: list[int]) -> float:
+    """MB an hour; NaN if there are no two sizes."""
+    return float(np.polyfit(hours, np.array(sizes) / 1e6, 1)[0]) if len(sizes) > 1 else float("nan")
+
+
+def growth(rss: list[Sizes]) -> dict[str, tuple[Growth, Growth, float]]:
+    """Process -> least size, largest size, and hours of its last life without the first half hour, in camera time."""
+    out: dict[str, tuple[Growth, Growth, float]] = {}
+    for name in sorted({name for sizes in rss for name in sizes.least}):
+        seen = [sizes for sizes in rss if name in sizes.least]
         life = [sizes for sizes in seen if sizes.pids[name] == seen[-1].pids[name]]
         warm = [sizes for sizes in life if sizes.frame >= life[0].frame + WARM_MIN * 60 * RATE]
         x = np.array([sizes.frame / RATE / 3600 for sizes in warm])
-        hours = float(np.ptp(x)) if len(x) else 0.0
-        mb = np.array([sizes.bytes[name] / 1e6 for sizes in warm])
-        slope = float(np.polyfit(x, mb, 1)[0]) if hours > 0 else float("nan")
-        out[name] = Slope(life[-1].bytes[name] / 1e6, slope, hours)
+        least = Growth(life[-1].least[name] / 1e6, slope(x, [sizes.least[name] for sizes in warm]))
+        most = Growth(life[-1].most[name] / 1e6, slope(x, [sizes.most[name] for sizes in warm]))
+        out[name] = least, most, float(np.ptp(x)) if len(x) else 0.0
     return out
 
 
@@ -342,7 +351,7 @@ def observe(service: Service, root: Path, watch: Watch, count: int) -> None:
         watch.segment = max(watch.segment, *sizes, 0)
         watch.over_quota = max(watch.over_quota, sum(sizes) - QUOTA_GB * 1e9)
         if k % 60 == 0:
-            now = watch.rss[-1].bytes if watch.rss else {}
+            now = watch.rss[-1].least if watch.rss else {}
             listed = ", ".join(f"{name} {size / 1e6:.0f}" for name, size in sorted(now.items()))
             seconds = time.monotonic() - began
             print(f"  {seconds / 60:5.1f} min: frame {watch.frame} of {count}; MB: {listed}", flush=True)
@@ -351,10 +360,11 @@ def observe(service: Service, root: Path, watch: Watch, count: int) -> None:
 def judge_memory(watch: Watch) -> list[str]:
     """Print the sizes of the processes; those that grow."""
     wrong: list[str] = []
-    for name, slope in slopes(watch.rss).items():
-        print(f"  {name:12s} {slope.mb:7.1f} MB  {slope.mb_h:+8.2f} MB/h over {slope.hours:.2f} h")
-        if slope.hours * 60 >= MIN_MINUTES and slope.mb_h > SLOPE_MB_H:
-            wrong.append(f"{name} grows by {slope.mb_h:.1f} MB an hour")
+    for name, (least, most, hours) in growth(watch.rss).items():
+        sizes = [f"{size.mb:7.1f} MB {size.mb_h:+6.2f} MB/h" for size in (least, most)]
+        print(f"  {name:12s} {', at most '.join(sizes)}, over {hours:.2f} h")
+        if hours * 60 >= MIN_MINUTES and least.mb_h > SLOPE_MB_H:
+            wrong.append(f"{name} grows by {least.mb_h:.1f} MB an hour")
     return wrong
 
 

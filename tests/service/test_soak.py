@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.soak import main, plan
+from benchmarks.soak import RATE, Sizes, Watch, growth, judge_memory, main, plan
 
 
 def test_the_plan_has_every_fault_and_leaves_the_ends_alone() -> None:
@@ -14,6 +14,21 @@ def test_the_plan_has_every_fault_and_leaves_the_ends_alone() -> None:
     assert len(unplugged) == len(dark) == 2 and {fault for _, fault in events} >= {"kill tracker", "stop mapper"}
     frames = [frame for frame, _ in events]
     assert frames == sorted(frames) and min(frames) >= 375 and max(frames) <= 8100
+
+
+def test_what_a_process_keeps_is_told_from_what_its_jobs_need() -> None:
+    """Restarted after half an hour; then 100 MB and 3 MB an hour more, and now and then a job of 80 MB."""
+    watch = Watch()
+    for minute in range(0, 240, 2):
+        hours = minute / 60
+        kept = {"grows": int(100e6 + 3e6 * hours), "works": 100_000_000}
+        most = {"grows": kept["grows"], "works": 100_000_000 + 80_000_000 * (minute % 14 == 0)}
+        pids = {"grows": 1 + (minute > 30), "works": 3}
+        watch.rss.append(Sizes(int(minute * 60 * RATE), kept, most, pids))
+    found = growth(watch.rss)
+    assert found["grows"][0].mb_h == pytest.approx(3.0, abs=1e-3) and found["grows"][2] == pytest.approx(2.93, abs=0.05)
+    assert found["works"][0].mb_h == pytest.approx(0.0, abs=1e-9) and found["works"][1].mb >= 100.0
+    assert judge_memory(watch) == ["grows grows by 3.0 MB an hour"]
 
 
 @pytest.mark.slow
