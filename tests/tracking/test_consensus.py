@@ -120,7 +120,7 @@ def test_a_person_who_steps_aside_slowly_does_not_shift_the_pose(seed: int) -> N
     kept = np.arange(len(tracks)) < STILL + 30
     tracks, on_person = tracks.keep(kept), on_person[kept]
     assert RIG.right is not None
-    before = np.where(on_person[:, None], tracks.points(), [0.0, 0.0, 4.0] + 0.15 * tracks.points())
+    before: F64 = np.where(on_person[:, None], tracks.points(), [0.0, 0.0, 4.0] + 0.15 * tracks.points())
     now = se3.transform(se3.inverse(MOVED), before + on_person[:, None] * [0.02, 0.0, 0.0])
     distance = np.linalg.norm(before, axis=1)
     tracks.direction, tracks.rho = before / distance[:, None], 1 / distance
@@ -135,6 +135,77 @@ def test_a_person_who_steps_aside_slowly_does_not_shift_the_pose(seed: int) -> N
     assert off(solution.pose) < 0.008
     assert solution.moving[on_person].mean() > 0.7
     assert not solution.moving[~on_person].any()
+
+
+def few_points(rng: np.random.Generator, moved: F64) -> Tracks:
+    """14 distant points in a part of the view; the first of four near ones is found 60 px from where it is."""
+    before = rng.uniform([-4.0, -1.0, 5.0], [-2.0, 0.5, 8.0], (18, 3))
+    before[14:] = rng.uniform([0.0, -0.1, 0.6], [0.3, 0.2, 0.9], (4, 3))
+    now, distance = se3.transform(se3.inverse(moved), before), np.linalg.norm(before, axis=1)
+    assert RIG.right is not None
+    tracks = scene(rng)[0].keep(np.arange(STILL + MOVING) < 18)
+    tracks.direction, tracks.rho = before / distance[:, None], 1 / distance
+    tracks.variance, tracks.age = np.square(0.01 / distance), np.ones(18, np.int32)
+    tracks.uv = RIG.left.project(now) + rng.normal(0, 0.2, (18, 2))
+    tracks.uv_right = RIG.right.project(se3.transform(se3.inverse(RIG.left_T_right), now)) + rng.normal(0, 0.2, (18, 2))
+    tracks.uv_right[14:] = np.nan
+    tracks.uv[14] += 60.0 * se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, rng.uniform(0.0, 6.3)]))[:2, 0]
+    return tracks
+
+
+def test_a_near_point_at_a_wrong_pixel_does_not_take_the_pose_along(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few points far away leave the position so free that a near one with less than a pixel of error is believed."""
+    taken_along = 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        moved = MOVED @ se3.exp(rng.normal(0.0, 0.005, 6))
+        tracks = few_points(rng, moved)
+        solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
+        expected = ExpectedMotion(MOVED, se3.log(MOVED), SECONDS)
+        wrong = solver._optimise(tracks, expected, np.arange(18) < 15)  # pyright: ignore[reportPrivateUsage]
+        if not wrong.inlier[14]:
+            continue
+        taken_along += 1
+        assert float(se3.extent(se3.inverse(moved) @ wrong.pose)[0]) > 0.05
+        monkeypatch.setattr(solver, "_solve_all", lambda *_, wrong=wrong: wrong)  # pyright: ignore
+        solution = solver.solve(tracks, expected, np.eye(4), before=60)
+        assert float(se3.extent(se3.inverse(moved) @ solution.pose)[0]) < 0.01
+        assert not solution.inlier[14] and solution.inlier.sum() >= 16
+    assert taken_along >= 15
+
+
+def test_a_near_point_that_the_others_allow_keeps_its_say() -> None:
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        tracks = few_points(rng, MOVED).keep(~np.isin(np.arange(18), (14, 16, 17)))
+        solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
+        solution = solver.solve(tracks, ExpectedMotion(MOVED, se3.log(MOVED), SECONDS), np.eye(4), before=60)
+        assert solution.inlier[14] and off(solution.pose) < 0.01
+
+
+def test_the_degrees_of_freedom_of_a_pose_are_shared_by_its_points() -> None:
+    solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
+    tracks = scene(np.random.default_rng(0))[0].keep(np.arange(STILL + MOVING) < STILL)
+    solution = solver.solve(tracks, ExpectedMotion(MOVED, se3.log(MOVED), SECONDS), np.eye(4))
+    freedoms = solver._influence(tracks, solution)[0]  # pyright: ignore[reportPrivateUsage]
+    assert freedoms.sum() == pytest.approx(6.0, rel=0.1) and freedoms.max() < 0.5
+    assert freedoms.argmax() in np.argsort(tracks.rho)[-10:]
+
+
+def test_errors_at_a_pose_by_others_are_as_large_as_expected() -> None:
+    """With noise as assumed of pixels and distances, of points near and far."""
+    squared, config = list[float](), TrackerConfig()
+    solver = FramePoseSolver(config, StereoCameras.of(RIG), RollingShutter(RIG))
+    for seed in range(300):
+        rng = np.random.default_rng(seed)
+        tracks = few_points(rng, MOVED).keep(np.arange(18) != 14)
+        extra = np.sqrt(config.sigma_px**2 - 0.2**2)
+        tracks.uv, tracks.uv_right = (uv + rng.normal(0, extra, (17, 2)) for uv in (tracks.uv, tracks.uv_right))
+        tracks.rho = tracks.rho * (1 + rng.normal(0, 0.01, 17))
+        start = ExpectedMotion(MOVED, se3.log(MOVED), SECONDS)
+        solution = solver._optimise(tracks, start, np.arange(17) < 14)  # pyright: ignore[reportPrivateUsage]
+        squared += np.square(solver._influence(tracks, solution)[1][14:]).tolist()  # pyright: ignore
+    assert 0.4 < np.mean(squared) < 1.2
 
 
 def test_a_smaller_group_that_moves_is_marked_at_once() -> None:

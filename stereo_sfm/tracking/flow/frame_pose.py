@@ -48,6 +48,7 @@ USUAL_LIKELIHOOD = 0.6  # about one standard deviation; of a pose less likely th
 UNDIVIDED_SHARE, UNDIVIDED_OPEN = 0.8, 0.3
 NO_PRIOR = np.full(6, np.inf)
 CONFIRMED_SHARE = 0.75  # of the points of the map that are in view
+MOST_FREEDOMS = 1.0  # of the six of a pose that may rest on one point
 NEAR = 2.0  # times the largest error of an inlier, at the predicted pose
 LIMIT_SIGMAS = 5.0  # root mean squares of the recent differences, if that is more
 MEMORY_S = 5.0  # time constant of their average
@@ -162,6 +163,9 @@ class FramePoseSolver:
         usual = self._likelihood(best.pose, expected) > USUAL_LIKELIHOOD
         if undisturbed and usual and not self.alert:
             return best
+        if not best.reason:
+            best = self._without_contradicted(tracks, expected, static, best)
+            rest = static & ~best.inlier
         chosen = self._choose(tracks, expected, last_pose, best, rest)
         disturbed = self.alert or len(chosen.moving) > 0
         if not disturbed and chosen.inlier[static].sum() <= WEIGHT_RATIO * best.inlier[static].sum():
@@ -249,6 +253,23 @@ class FramePoseSolver:
         if near.sum() < self._config.min_features or near[static].all():
             return None
         return self._refit(tracks, expected, self._optimise(tracks, expected, near, expected), near, static)
+
+    def _without_contradicted(
+        self, tracks: Tracks, expected: ExpectedMotion, static: Bool, pose: PoseSolution
+    ) -> PoseSolution:
+        """A pose without the points that it rests on alone, if the others contradict them.
+
+        A near point at a wrong pixel takes the pose of few others, far away, along, and then has no error.
+        """
+        agree = pose.inlier & static
+        alone = np.zeros(len(tracks), bool)
+        alone[agree] = self._influence(tracks.keep(agree), pose)[0] > MOST_FREEDOMS
+        if not alone.any() or np.count_nonzero(agree & ~alone) < MIN_GROUP:
+            return pose
+        by_others = self._optimise(tracks, expected.to(pose.pose), agree & ~alone)
+        if (self._influence(tracks.keep(alone), by_others)[1] < self._config.max_error_sigmas).all():
+            return pose
+        return self._optimise(tracks, expected.to(by_others.pose), static & ~alone)
 
     def _solve_rest(self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, rest: Bool) -> PoseSolution | None:
         """The motion of the points that disagree with all others: of another object, or the camera's."""
@@ -340,6 +361,14 @@ class FramePoseSolver:
             pose, velocity, self._shutter.row_seconds(tracks.uv), tracks.origin, tracks.direction, tracks.rho,
             tracks.variance, tracks.uv, tracks.uv_right, self._cameras.cams, self._cameras.right_T_left,
             self._config.sigma_px * self._noise,
+        )  # fmt: skip
+
+    def _influence(self, tracks: Tracks, solution: PoseSolution) -> tuple[F64, F64]:
+        """`pose_solver.influence` of points on a pose."""
+        return pose_solver.influence(
+            solution.pose, solution.velocity, solution.covariance, self._shutter.row_seconds(tracks.uv), tracks.origin,
+            tracks.direction, tracks.rho, tracks.variance, tracks.uv, tracks.uv_right, self._cameras.cams,
+            self._cameras.right_T_left, solution.sigma_px, CAUCHY_SCALES[-1],
         )  # fmt: skip
 
     def _optimise_all(self, tracks: Tracks, start: ExpectedMotion, prior: ExpectedMotion | None) -> PoseSolution:

@@ -291,6 +291,56 @@ def row_residuals(
 
 
 @njit
+def influence(
+    pose, velocity, covariance, row_s, origin, direction, rho, variance, uv_l, uv_r, cams, right_T_left, sigma, scale
+):  # fmt: skip
+    """What points say about a pose beside its covariance (6, 6), whether it was solved from them or from others.
+
+    A point on which much of a pose rests has a small error there whatever it shows. At a pose by the others it has not
+    (Cook & Weisberg, Residuals and Influence in Regression, 1982, section 2.2, leverage and deleted residuals).
+    Arguments as of `optimise_pose`, the last Cauchy scale.
+
+    Returns:
+        (N,) degrees of freedom of the pose that rest on each point if it was solved from them: of all points 6.
+        (N,) errors, whitened by the noise of the point and of the pose if it was solved from others; inf for points
+        that are not visible.
+    """
+    res, jac, ray, seen = np.zeros(4), np.zeros((4, 6)), np.zeros(4), np.zeros((4, 4))
+    row, step = pose.copy(), np.zeros((4, 4))
+    freedoms, errors = np.zeros(len(rho)), np.full(len(rho), np.inf)
+    spread, left, factor, white = np.zeros((4, 4)), np.zeros((4, 4)), np.zeros((4, 4)), np.zeros(4)
+    for k in range(len(rho)):
+        rows = row_residuals(
+            k, pose, velocity, row_s, origin, direction, rho, uv_l, uv_r, cams, right_T_left, row, step, res, jac, ray
+        )
+        if rows == 0:
+            continue
+        for i in range(rows, 4):
+            res[i], ray[i], jac[i] = 0.0, 0.0, 0.0
+        for a in range(4):
+            for b in range(4):
+                seen[a, b] = 0.0  # of the pose's covariance in rows a and b
+                for i in range(6):
+                    for j in range(6):
+                        seen[a, b] += jac[a, i] * covariance[i, j] * jac[b, j]
+                spread[a, b] = variance[k] * ray[a] * ray[b] + (sigma * sigma if a == b else 0.0)
+        invert_symmetric(spread, left, factor)
+        chi2 = 0.0
+        for a in range(4):
+            for b in range(4):
+                chi2 += left[a, b] * res[a] * res[b]
+                freedoms[k] += left[a, b] * seen[a, b]
+                spread[a, b] += seen[a, b]
+        freedoms[k] /= 1.0 + chi2 / (rows * scale * scale)
+        if solve_symmetric(spread, res, white, factor):
+            total = 0.0
+            for a in range(4):
+                total += res[a] * white[a]
+            errors[k] = math.sqrt(max(total, 0.0) / rows)
+    return freedoms, errors
+
+
+@njit
 def refine_depth(
     pose, velocity, row_s, origin, direction, rho, variance, uv_l, uv_r, inlier, cams, right_T_left, sigma, floor
 ):
