@@ -15,7 +15,7 @@ from stereo_sfm.types import I32, I64, Keyframe
 class _Sightings(Columns):
     """One row for each point of each keyframe; those of a point are a linked list, as in the map."""
 
-    kf: I32  # id
+    kf: I32  # its number, see `KeyframeStore`
     point: I32  # row of the point, -1: removed
     following: I32  # next older row of the same point, -1: last
 
@@ -37,6 +37,10 @@ class KeyframeStore:
     def __init__(self) -> None:
         self._keyframes: dict[int, Keyframe] = {}
         self._rows: dict[int, tuple[int, int]] = {}  # keyframe id -> its first sighting, number of them
+        # Each keyframe has a number below the most that there ever were at a time: ids grow for ever.
+        self._numbers: dict[int, int] = {}
+        self._numbered: list[int] = []  # ids by number
+        self._free: list[int] = []  # numbers
         self._sightings = _Sightings()
         self._points = _Points()
         self._point_rows = IdRows()
@@ -78,8 +82,11 @@ class KeyframeStore:
         """Add a keyframe."""
         self._keyframes[keyframe.kf_id] = keyframe
         self.ids.append(keyframe.kf_id)
+        number = self._free.pop() if self._free else len(self._numbered)
+        self._numbered[number : number + 1] = [keyframe.kf_id]
+        self._numbers[keyframe.kf_id] = number
         points = np.unique(self._know(np.asarray(keyframe.point_ids)))
-        rows = self._sightings.append(len(points), kf=keyframe.kf_id, point=points)
+        rows = self._sightings.append(len(points), kf=number, point=points)
         self._rows[keyframe.kf_id] = rows.start, len(points)
         map_kernels.link(rows.start, self._points.head, self._sightings.following, self._sightings.point)
 
@@ -87,6 +94,7 @@ class KeyframeStore:
         """Remove a keyframe."""
         self.ids.remove(kf_id)
         del self._keyframes[kf_id]
+        self._free.append(self._numbers.pop(kf_id))
         first, count = self._rows.pop(kf_id)
         rows, table = np.arange(first, first + count), self._sightings
         map_kernels.unlink(rows[table.point[rows] >= 0], self._points.head, table.following, table.point)
@@ -136,10 +144,12 @@ class KeyframeStore:
         """(K,) ids of the keyframes that see some of these points, ascending, and (K,) how many."""
         points, table = np.unique(self._find(point_ids)), self._sightings
         points = points[points >= 0]
-        counts = np.zeros(max(self.ids, default=-1) + 1, np.int64)
+        counts = np.zeros(len(self._numbered), np.int64)
         map_kernels.count_by_keyframe(points, self._points.head, table.following, table.kf, counts)
         seeing = np.flatnonzero(counts)
-        return seeing, counts[seeing]
+        ids = np.array(self._numbered, np.int64)[seeing]
+        order = np.argsort(ids)
+        return ids[order], counts[seeing[order]]
 
     def connected(self, point_ids: I64, min_points: int) -> list[int]:
         """Keyframes that share at least `min_points` of these points, ascending."""
