@@ -40,6 +40,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.recording.segments import recordings, segments
 from stereo_sfm.service.config import MapConfig, RecordingConfig, RobotConfig
+from stereo_sfm.service.health import rss
 from stereo_sfm.service.messages import HealthReport, PoseUpdate, Started, Status
 from stereo_sfm.service.outputs import OUTPUTS
 from stereo_sfm.service.outputs.settings import FoxgloveConfig, OutputsConfig, PageConfig, PoseSocketConfig
@@ -159,17 +160,13 @@ class Watch:
 
     def report(self, report: HealthReport, pids: dict[str, int]) -> None:
         self.health = report
-        self.minute.append(({**report.rss, "service": own_rss()}, {**pids, "service": os.getpid()}))
+        self.minute.append(({**report.rss, "service": rss(os.getpid())}, {**pids, "service": os.getpid()}))
         if len(self.minute) == SIZES_EVERY:
             pids = self.minute[-1][1]
             seen = {n: [sizes[n] for sizes, of in self.minute if sizes.get(n) and of.get(n) == pids[n]] for n in pids}
             least, most = ({n: of(sizes) for n, sizes in seen.items() if sizes} for of in (min, max))
             self.rss.append(Sizes(self.frame, least, most, pids))
             self.minute.clear()
-
-
-def own_rss() -> int:
-    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
 
 
 def plan(count: int, times: int, kills: int) -> tuple[list[tuple[int, str]], tuple[int, ...], tuple[int, ...]]:

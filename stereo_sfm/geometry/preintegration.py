@@ -196,7 +196,7 @@ def _integrate(seconds, gyro, accel, gyro_bias, accel_bias, gyro_density2, accel
                 s = right[i, 0] * right[j, 0] + right[i, 1] * right[j, 1] + right[i, 2] * right[j, 2]
                 covariance[i, j] += s * (gyro_density2 * dt)
             covariance[3 + i, 3 + i] += accel_density2 * dt
-            covariance[6 + i, 6 + i] += 0.25 * accel_density2 * dt * dt * dt
+            covariance[6 + i, 6 + i] += accel_density2 * dt * dt * dt / 3
             covariance[3 + i, 6 + i] += 0.5 * accel_density2 * dt * dt
             covariance[6 + i, 3 + i] += 0.5 * accel_density2 * dt * dt
         _product(turned_force, r_g_middle, by_gyro)

@@ -59,7 +59,7 @@ class StageProcesses:
     @property
     def pids(self) -> dict[str, int]:
         """Process ids by stage."""
-        return {stage: p.pid for stage, p in self.processes.items() if p.pid is not None}
+        return {stage: p.pid for stage, p in list(self.processes.items()) if p.pid is not None}
 
     @property
     def waiting(self) -> set[str]:

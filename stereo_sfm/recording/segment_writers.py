@@ -41,7 +41,9 @@ class _Writer:
 
     def __init__(self, limit: int) -> None:
         self._queue: queue.Queue[Any] = queue.Queue(limit)
-        self.bytes_written = 0
+        self.bytes_written = 0  # of the newest segment
+        self._newest: Segment | None = None
+        self._segment: Segment | None = None  # that is being written: others may wait before the newest
         self.problem = ""
         self._again_s = 0.0
         self._thread = threading.Thread(target=self._work, name=type(self).__name__, daemon=True)
@@ -57,8 +59,13 @@ class _Writer:
 
     def turn(self, segment: Segment) -> None:
         """What is queued from now on belongs to another segment."""
-        self.bytes_written = 0
+        self._newest, self.bytes_written = segment, 0
         self.put(segment)
+
+    def _count(self, written: int) -> None:
+        """So many bytes are in the file of the segment that is being written."""
+        if self._segment is self._newest:
+            self.bytes_written = written
 
     def close(self) -> None:
         """Nothing more comes."""
@@ -101,7 +108,6 @@ class ImageWriter(_Writer):
 
     def __init__(self, image_format: str, begin: Callable[[LogWriter], ImageLog], refused: Callable[[], None]) -> None:
         self._format, self._begin_log, self._refused = image_format, begin, refused
-        self._segment: Segment | None = None
         self._file: LogWriter | None = None
         self._log: ImageLog | None = None
         super().__init__(IMAGES_WAITING)
@@ -118,7 +124,7 @@ class ImageWriter(_Writer):
             self._log = self._begin_log(self._file)
         assert self._file is not None
         self._log.image(encode_pair(item, self._format, decode=False))
-        self.bytes_written = self._file.bytes_written
+        self._count(self._file.bytes_written)
         self.problem = ""
 
     def _failed(self, item: Any) -> None:
@@ -137,7 +143,6 @@ class PoseWriter(_Writer):
 
     def __init__(self, begin: Callable[[LogWriter], RunLog], make_room: Callable[[], None]) -> None:
         self._begin_log, self._make_room = begin, make_room
-        self._segment: Segment | None = None
         self._file: LogWriter | None = None
         self._log: RunLog | None = None
         self._closing = False
@@ -167,8 +172,8 @@ class PoseWriter(_Writer):
             self._thumbnail(item.image)
         else:
             self._log.put(item)
-        self.bytes_written = self._file.bytes_written
-        if self.bytes_written != before:
+        self._count(self._file.bytes_written)
+        if self._file.bytes_written != before:
             self._last_chunk, self._unwritten = self._unwritten, []
         self._unwritten.append(item)
 

@@ -119,7 +119,11 @@ def new_recording(root: Path, source: str, mode: str, now: datetime) -> Path:
     folder = root / f"{number:05d}_{now:%Y-%m-%d_%H%M%S}"
     folder.mkdir()
     about = {"kind": KIND, "version": 1, "source": source, "mode": mode, "began": now.isoformat(timespec="seconds")}
-    (folder / ABOUT).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+    try:
+        (folder / ABOUT).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+    except OSError:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
     return folder
 
 

@@ -78,6 +78,8 @@ class Commands:
 
     def load_map(self, name: str) -> Reply:
         """Continue with another saved map beside the configured folder."""
+        if self._maps.mode == "none":
+            return Reply(False, "no map is loaded: map.mode is none")
         folder = self._maps.beside(name)
         if not (folder / "map.json").exists():
             return Reply(False, f"there is no map {name}")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
 import shutil
 import time
 from collections import Counter, deque
@@ -69,14 +71,16 @@ class HealthCollector:
 
 
 def free_bytes(folder: Path) -> int:
-    """Free space of the disk of a folder, which need not exist yet."""
-    place = next(p for p in (folder, *folder.absolute().parents) if p.exists())
-    return shutil.disk_usage(place).free
+    """Free space of the disk of a folder, which need not exist yet; 0 where that is not known."""
+    for place in (folder, *folder.absolute().parents):
+        with contextlib.suppress(OSError):  # it does not exist, or others may not search it
+            return shutil.disk_usage(place).free
+    return 0
 
 
 def rss(pid: int) -> int:
     """Resident bytes of a process; 0 where that is not known."""
     try:
-        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * 4096
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, IndexError, ValueError):
         return 0

@@ -37,8 +37,10 @@ class MapKeeper:
         self._next_save_s = float("inf")
         self._began_ns = 0  # Unix time of the session's beginning
         self._session_saved = threading.Event()  # the session's part is complete on disk
-        self._requested = False  # the session writes its part now
-        self._written = threading.Event()  # a requested save has ended
+        self._asked = self._answered = 0  # requests to the session to write its part, and its replies, in order
+        self._joining = 0  # the reply whose part is being added to the saved map
+        self._wanted = 0  # the request that a caller waits for
+        self._written = threading.Event()  # which has ended
         self._failure = ""  # why it is not saved
         self._requests = threading.Lock()
         self._lock = threading.Lock()  # of the store, while it changes
@@ -95,24 +97,26 @@ class MapKeeper:
                 self._store = MapStore(self._next_folder, self.mode, self._store.config, _fresh=extends)
                 self._next_folder = None
             folders = self._store.begin()
+            self._asked = self._answered = self._joining = self._wanted = 0
         self.is_new = folders.map_in is None
         self._began_ns = time.time_ns()
         self._session_saved.clear()
-        self._requested = False
         self._schedule(min(FIRST_SAVE_MIN, self.save_every_min))
         return folders
 
     def session_saved(self, message: MapSaved) -> None:
         """The session's part is on disk, or cannot be: the saved map follows from it."""
-        self._requested = self._awaited = False
-        if message.why:
-            self._end_request(message.why)
-            log.log(logging.WARNING if message.keyframes else logging.INFO, "the map was not saved: %s", message.why)
-            return
+        self._awaited = False
         with self._lock:
-            self._session_saved.set()
-            if not self._ending:
-                self._store.join()
+            self._answered += 1
+            if not message.why:
+                self._session_saved.set()
+                if not self._ending:
+                    self._store.join()
+                    self._joining = self._answered
+                return
+            self._end_request(message.why, self._answered)
+        log.log(logging.WARNING if message.keyframes else logging.INFO, "the map was not saved: %s", message.why)
 
     def finish(self, until_s: float, complete: bool) -> None:
         """After the last session: add its part to the saved map until this monotonic time, else at the next start.
@@ -154,7 +158,7 @@ class MapKeeper:
             if self._store.saves and session is not None:
                 self._store.cancel()
                 self._awaited, self._before = True, self._store.written()
-                session.save_map(self._store.session, urgent=True)
+                self._ask(session, urgent=True)
 
     def check(self, session: Session | None) -> None:
         """Save when it is time, and report a save that has ended; call it regularly.
@@ -182,11 +186,13 @@ class MapKeeper:
             return Reply(False, f"no map is saved: map.mode is {self.mode}, or no pipeline runs")
         copy = self.beside(name) if name else None
         with self._requests:
-            self._written.clear()
-            self._failure = ""
-            if self._ending:
-                return Reply(False, ENDING)
-            session.save_map(self._store.session)
+            with self._lock:
+                if self._ending:
+                    return Reply(False, ENDING)
+                self._written.clear()
+                self._failure = ""
+                self._ask(session)
+                self._wanted = self._asked
             if not self._written.wait(SAVE_S):
                 without = f": there is no copy {name}" if name else ""
                 return Reply(False, f"the map is still being saved after {SAVE_S:.0f} s{without}")
@@ -212,14 +218,17 @@ class MapKeeper:
 
     def _save_when_due(self, session: Session | None) -> None:
         """A save that takes longer than the interval is not interrupted by the next one."""
-        busy = self._requested or self._store.joining
+        busy = self._answered < self._asked or self._store.joining
         if session is not None and not busy and time.monotonic() >= self._next_save_s:
             self._schedule(self.save_every_min)
-            self._requested = True
-            session.save_map(self._store.session)
+            self._ask(session)
+
+    def _ask(self, session: Session, urgent: bool = False) -> None:
+        self._asked += 1
+        session.save_map(self._store.session, urgent)
 
     def _report_joined(self, joined: Joined) -> None:
-        self._end_request(joined.why)
+        self._end_request(joined.why, self._joining)
         if joined.why:
             log.warning("the map was not saved: %s", joined.why)
         else:
@@ -234,9 +243,11 @@ class MapKeeper:
         kept = f"{self.folder} holds it as of {at}" if saved else "it had not been saved before"
         log.error("the map of this session was NOT saved: it could not be written in time; %s", kept)
 
-    def _end_request(self, failure: str) -> None:
-        self._failure = failure
-        self._written.set()
+    def _end_request(self, failure: str, number: int | None = None) -> None:
+        """Let a caller go on, if the end of request `number` is what it waits for; None: in any case."""
+        if number is None or number >= self._wanted:
+            self._failure = failure
+            self._written.set()
 
 
 def _log_saved(folder: Path, joined: Joined) -> None:

@@ -75,9 +75,16 @@ class MapStore:
         """The maps of a new session; a session that an earlier run did not join is joined first.
 
         Raises:
-            StereoSfmError: there is no map to localize in, it is damaged, or another process writes to it.
+            StereoSfmError: there is no map to localize in, it is damaged, another process writes to it, or its folder
+                cannot be used.
         """
         self.cancel()
+        try:
+            return self._begin()
+        except OSError as error:
+            raise StereoSfmError(f"cannot use map.folder {self.folder}: {error.strerror or error}") from None
+
+    def _begin(self) -> MapFolders:
         base = self.folder.with_name(f".{self.folder.name}.base")
         if self.mode == "none":
             return MapFolders()
@@ -133,7 +140,8 @@ class MapStore:
     @property
     def pid(self) -> int | None:
         """Of the process that joins, while there is one."""
-        return None if self._process is None else self._process.pid
+        process = self._process  # which another thread may set to None
+        return None if process is None else process.pid
 
     @property
     def joining(self) -> bool:

@@ -105,8 +105,17 @@ class Pipelines:
         """
         self.count += 1
         self._facts.starting = self._facts.starting or "the pipeline is starting"
+        try:
+            folders = self._maps.begin()
+        except StereoSfmError as error:
+            if self.count == 1:
+                raise
+            self._failures += 1
+            self._facts.starting = str(error)
+            log.error("%s; the pipeline is not started yet", error)
+            return False
         session = self.session = Session(
-            self.count, self._opener, self._config, self._maps.begin(), self._hub, self._facts, self._health,
+            self.count, self._opener, self._config, folders, self._hub, self._facts, self._health,
             self._silent_s, self._recorder, self._maps.session_saved,
         )  # fmt: skip
         if self.stopping.is_set():

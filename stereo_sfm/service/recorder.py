@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
+import time
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -22,6 +23,7 @@ from stereo_sfm.recording.quota import GB, Quota
 from stereo_sfm.recording.segment_recorder import THUMBNAIL_S, Policy, RecorderState
 from stereo_sfm.service.child import pipe, start_child
 from stereo_sfm.service.config import RecordingConfig
+from stereo_sfm.service.link import FIRST_PAUSE_S, LONGEST_PAUSE_S, STABLE_S
 from stereo_sfm.service.recorder_process import CLOSE_S, Begin, Finish, Mark, Read, run_recorder
 from stereo_sfm.types import Applied, Dropped, Frame, Keyframe, LoopResult, MapUpdate, Observations
 
@@ -69,11 +71,14 @@ class Recorder:
         self._outbox: DroppingOutbox | None = None
         self._watchdog: Watchdog | None = None
         self._closing = False
+        self._over = threading.Event()
+        self._started_s = self._pause_s = 0.0  # when the process was started; before it is started again
 
     @property
     def pid(self) -> int | None:
         """Of the process, where there is one."""
-        return None if self._process is None else self._process.pid
+        process = self._process  # which another thread may set to None
+        return None if process is None else process.pid
 
     def start(self) -> None:
         """Start the process before the first pipeline is up, so that no image is missed."""
@@ -86,7 +91,7 @@ class Recorder:
     def begin(self, run: ProcessRun, config: Config, source: str, opening: Opening) -> None:
         """A pipeline is up."""
         with self._lock:
-            self._run = run
+            self._run, self._next_image_ns = run, 0  # another camera's time may begin anew
             policy = policy_of(self._config, self.mode)
             self._begin = Begin(policy, run.info.rig, config, source, opening, run.ring)
             self._start_recording()
@@ -164,7 +169,7 @@ class Recorder:
         (messages, send), (reports, to_main) = pipe(), pipe()
         process = start_child("recorder", run_recorder, messages, to_main)
         assert process.pid is not None
-        self._process, self._outbox = process, DroppingOutbox(send, WAITING)
+        self._process, self._outbox, self._started_s = process, DroppingOutbox(send, WAITING), time.monotonic()
         self._watchdog = Watchdog({"recorder": process.pid}, log.warning, SILENT_S)
         threading.Thread(target=self._listen, args=(process, reports), name="recorder", daemon=True).start()
 
@@ -183,11 +188,19 @@ class Recorder:
             for run, image in self._held.values():
                 run.release(image)
             self._held.clear()
+            if self._outbox is not None:
+                self._outbox.close()
             self._process = self._outbox = self._watchdog = None
             if self._closing:
                 return
-            log.error("the recorder ended (exit code %s): a new recording begins", process.exitcode)
-            if self._begin is not None:
+            lived = time.monotonic() - self._started_s
+            self._pause_s = 0.0 if lived > STABLE_S else min(max(2 * self._pause_s, FIRST_PAUSE_S), LONGEST_PAUSE_S)
+            when = "now" if self._pause_s == 0.0 else f"in {self._pause_s:.0f} s"
+            log.error("the recorder ended (exit code %s): a new recording begins %s", process.exitcode, when)
+        if self._over.wait(self._pause_s):
+            return
+        with self._lock:
+            if self._process is None and self._begin is not None:
                 self._start_recording()
 
     def _take(self, message: object) -> None:
@@ -211,6 +224,7 @@ class Recorder:
         """Write everything that the disk takes in time."""
         with self._lock:
             self._closing = True
+            self._over.set()
             process, outbox = self._process, self._outbox
         if outbox is not None:
             outbox.close()

@@ -13,6 +13,7 @@ from stereo_sfm.log.provenance import Opening
 from stereo_sfm.pipeline.images import ImageLayout, ImageRing, SlotImage
 from stereo_sfm.pipeline.watchdog import Heartbeat, HeartbeatThread
 from stereo_sfm.recording.segment_recorder import Policy, RecorderState, SegmentRecorder
+from stereo_sfm.recording.segment_writers import AGAIN_S
 from stereo_sfm.service.child import Send, run_child
 
 STATE_S = 0.5
@@ -71,7 +72,7 @@ class _Body:
         self._send = send
         self._recorder: SegmentRecorder | None = None
         self._ring: ImageRing | None = None
-        self._next_state_s = 0.0
+        self._next_state_s = self._next_open_s = 0.0
         self._problem = ""
         self._begin: Begin | None = None
 
@@ -96,8 +97,10 @@ class _Body:
             self._recorder.put(message)
 
     def _open(self, begin: Begin) -> None:
-        layout, slots, name = begin.ring
-        self._ring = ImageRing(layout, slots, name)
+        self._next_open_s = time.monotonic() + AGAIN_S
+        if self._ring is None:
+            layout, slots, name = begin.ring
+            self._ring = ImageRing(layout, slots, name)
         try:
             self._recorder = SegmentRecorder(begin.policy, begin.rig, begin.config, begin.source, begin.opening)
             self._problem = ""
@@ -117,7 +120,7 @@ class _Body:
 
     def _open_again(self, begin: Begin) -> None:
         """The folder could not be made: another attempt, once a second."""
-        if time.monotonic() >= self._next_state_s:
+        if time.monotonic() >= self._next_open_s:
             self._open(begin)
 
     def beat(self, beat: Heartbeat) -> None:

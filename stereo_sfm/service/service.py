@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 import traceback
@@ -14,7 +15,7 @@ from stereo_sfm.drivers.choice import Opener
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.messages import LogLine
 from stereo_sfm.pipeline.allocator import Release, return_large_blocks
-from stereo_sfm.pipeline.text import Listener
+from stereo_sfm.pipeline.text import LOGGER, Listener
 from stereo_sfm.service.camera import patient
 from stereo_sfm.service.commands import Commands
 from stereo_sfm.service.config import RobotConfig, load
@@ -31,6 +32,8 @@ from stereo_sfm.service.states import Facts
 from stereo_sfm.service.status_reporter import StatusReporter
 
 M = TypeVar("M", bound=ServiceMessage)
+
+log = logging.getLogger(LOGGER)
 
 CHECK_S = 0.1  # between two checks of state, map and recorder
 RELEASE_CHECKS = 3000  # checks after which memory that lies free is returned
@@ -84,6 +87,7 @@ class Service(Commands):
         self._listener = Listener("service", self._publish_line)
         self._ended = threading.Event()
         self.error: StereoSfmError | None = None  # why it ended by itself
+        self._failure = ""  # of the last check that failed
         self._threads = [
             threading.Thread(target=self._run_pipelines, name="pipelines", daemon=True),
             threading.Thread(target=self._keep_checking, name="state", daemon=True),
@@ -153,9 +157,18 @@ class Service(Commands):
         self._check()  # once more: the outputs get the final state
 
     def _check(self) -> None:
+        """Each on its own: the state, the watchdogs and the saved map depend on the thread that does this."""
+        for check in (self._check_maps, self._recorder.check, self._reporter.report):
+            try:
+                check()
+            except Exception:
+                failure = traceback.format_exc()
+                if failure != self._failure:
+                    log.error("a check of the service failed; it is repeated:\n%s", failure)
+                self._failure = failure
+
+    def _check_maps(self) -> None:
         self._maps.check(self._pipelines.tracking_session)
-        self._recorder.check()
-        self._reporter.report()
 
     def _publish_line(self, line: LogLine) -> None:
         self._hub.publish(Event(time.time_ns(), line.level, line.stage, line.text))

@@ -103,3 +103,13 @@ def test_covariance_is_that_of_many_noisy_integrations() -> None:
         errors.append(np.concatenate([turned, noisy.velocity - clean.velocity, noisy.position - clean.position]))
     found = np.sqrt(np.diag(np.cov(np.array(errors).T)))
     assert np.allclose(found, np.sqrt(np.diag(clean.covariance)), rtol=0.1)
+
+
+@pytest.mark.parametrize("pieces", [(0.02,), (0.02 - 1e-7, 1e-7), tuple(np.full(40, 0.0005))])
+def test_the_covariance_does_not_depend_on_how_an_interval_is_cut(pieces: tuple[float, ...]) -> None:
+    """Of one interval it is not singular: velocity and position are not wrong by the same noise."""
+    n, zero = len(pieces), np.zeros(3)
+    motion = preintegrate(np.array(pieces), np.zeros((n, 3)), np.zeros((n, 3)), zero, zero, GYRO_NOISE, ACCEL_NOISE)
+    t, both = 0.02, motion.covariance[[[3, 3], [6, 6]], [[3, 6], [3, 6]]]
+    assert np.allclose(both, ACCEL_NOISE**2 * np.array([[t, t**2 / 2], [t**2 / 2, t**3 / 3]]), rtol=1e-6, atol=0)
+    assert np.linalg.cholesky(motion.covariance)[6, 6] > 0.2 * np.sqrt(both[1, 1])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -125,6 +126,40 @@ def test_a_segment_ends_at_its_size(tmp_path: Path) -> None:
     recorder.close(20.0)
     sizes = [segment.images.stat().st_size for segment in segments(recorder.folder)]
     assert len(sizes) >= 3 and max(sizes) < 8e6  # a chunk and what waits beyond the limit
+
+
+def test_images_that_wait_for_a_full_segment_do_not_end_the_next_one(tmp_path: Path) -> None:
+    recorder = start(tmp_path, segment_s=1e9, segment_bytes=2e6, image_format="raw")
+    writer = recorder._images  # pyright: ignore[reportPrivateUsage]
+    write, waits = writer._write, threading.Event()  # pyright: ignore[reportPrivateUsage]
+    writer._write = lambda item: (waits.wait(), write(item))[1]  # pyright: ignore
+    images = list(SlidingWall(30))
+    for image in images[:8]:
+        recorder.image(image)
+    writer.bytes_written = 3_000_000  # as if they were written: the next image begins a segment
+    recorder.image(images[8])
+    waits.set()
+    wait_for(lambda: not writer._queue.qsize())  # pyright: ignore[reportPrivateUsage]
+    for image in images[9:12]:
+        recorder.image(image)
+        wait_for(lambda: not writer._queue.qsize())  # pyright: ignore[reportPrivateUsage]
+    recorder.close(20.0)
+    counts = []
+    for segment in segments(recorder.folder):
+        with open_source(segment.images) as alone:
+            counts.append(sum(1 for _ in alone))
+    assert counts[:2] == [8, 4], counts
+
+
+def test_a_folder_that_cannot_be_described_is_not_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    for _ in range(3):
+        with pytest.raises(OSError, match="No space"):
+            module.new_recording(tmp_path, "fake", "full", datetime(2026, 1, 2))
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_oldest_unmarked_goes_first(tmp_path: Path) -> None:

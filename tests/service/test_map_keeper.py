@@ -80,6 +80,35 @@ def test_a_requested_save_is_answered_when_the_service_ends(tmp_path: Path) -> N
     assert not maps.save_now(asked).ok
 
 
+def test_a_requested_save_is_not_answered_by_an_earlier_one(tmp_path: Path) -> None:
+    maps, session = keeper(tmp_path), SlowSession()
+    asked: Any = session
+    store, joined = maps._store, list[Joined]()  # pyright: ignore[reportPrivateUsage]
+    store.join, store.joined = lambda: None, lambda timeout_s=0.0: joined.pop() if joined else None
+    maps._next_save_s = 0.0  # pyright: ignore[reportPrivateUsage]
+    maps.check(asked)
+    maps.session_saved(MapSaved("", 1))
+    assert len(session.asked) == 1
+    with ThreadPoolExecutor(1) as pool:
+        reply = pool.submit(maps.save_now, asked)
+        while len(session.asked) < 2:
+            time.sleep(0.01)
+        joined.append(Joined(1))  # of the periodic save
+        maps.check(None)
+        assert not joined
+        with pytest.raises(TimeoutError):
+            reply.result(0.2)
+        maps.session_saved(MapSaved("", 2))
+        joined.append(Joined(2))
+        maps.check(None)
+        assert reply.result(5.0).ok
+
+
+def test_a_folder_that_cannot_be_used_is_said_in_a_line() -> None:
+    with pytest.raises(StereoSfmError, match=r"^cannot use map.folder /dev/null/store: Not a directory$"):
+        MapKeeper(MapConfig("/dev/null/store"), Config()).begin()
+
+
 def test_a_session_is_first_saved_after_a_minute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])

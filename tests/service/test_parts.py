@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import os
+import shutil
 import socket
 import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -15,11 +19,14 @@ from stereo_sfm.config import Config
 from stereo_sfm.drivers.choice import SourceChoice
 from stereo_sfm.drivers.repeated import RepeatedSource
 from stereo_sfm.geometry import se3
+from stereo_sfm.log.provenance import Opening
 from stereo_sfm.maps.folders import MapFolders
 from stereo_sfm.messages import Compiling, Localized
+from stereo_sfm.pipeline.images import SlotImage
+from stereo_sfm.service import recorder as service_recorder
 from stereo_sfm.service.camera import patient, same_camera
 from stereo_sfm.service.config import RecordingConfig
-from stereo_sfm.service.health import HealthCollector
+from stereo_sfm.service.health import HealthCollector, free_bytes
 from stereo_sfm.service.hub import Hub
 from stereo_sfm.service.map_cloud import MapCloudBuilder
 from stereo_sfm.service.messages import Event, MapCloud, ServiceState, Status
@@ -28,7 +35,7 @@ from stereo_sfm.service.poses import HostClock, PoseConverter
 from stereo_sfm.service.recorder import Recorder
 from stereo_sfm.service.session import COMPILING, Session
 from stereo_sfm.service.states import Facts, derive_state
-from stereo_sfm.types import F64, Frame, MapUpdate, Observations, TrackState
+from stereo_sfm.types import F64, Frame, MapUpdate, Observations, StereoImage, TrackState
 from tests.pipeline.test_pipeline import SlidingWall
 from tests.synthetic import pinhole_rig
 
@@ -206,3 +213,65 @@ def test_the_first_start_says_that_kernels_are_compiled() -> None:
     facts.starting = ""  # images come: another kernel is no reason to say that it starts
     session.put(Compiling("mapper", "solve"))
     assert facts.starting == ""
+
+
+def test_free_space_behind_a_folder_that_others_may_not_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usage, asked = shutil.disk_usage, list[Path]()
+
+    def refused(place: Path) -> Any:
+        asked.append(place)
+        if place != tmp_path:
+            raise PermissionError(13, "Permission denied")
+        return usage(place)
+
+    monkeypatch.setattr(shutil, "disk_usage", refused)
+    assert free_bytes(tmp_path / "closed" / "recordings") > 0 and len(asked) == 3
+    assert free_bytes(Path("/elsewhere")) == 0
+
+
+class Images:
+    """What a recorder sends to its process."""
+
+    def __init__(self) -> None:
+        self.sent = list[object]()
+
+    def send(self, message: object) -> None:
+        self.sent.append(message)
+
+    def images(self) -> int:
+        return sum(isinstance(message, tuple) for message in self.sent)
+
+
+def test_a_lean_recording_goes_on_where_the_sources_time_begins_anew() -> None:
+    recorder, outbox = Recorder(RecordingConfig(mode="lean")), Images()
+    recorder._process, recorder._outbox = (cast(Any, x) for x in (object(), outbox))  # pyright: ignore
+    run: Any = SimpleNamespace(info=SimpleNamespace(rig=pinhole_rig()), ring=None, release=lambda _: None)
+    for session in range(2):
+        recorder.begin(run, Config(), "wall", Opening())
+        for k in range(10):
+            image = StereoImage(k, round((100.0 * (1 - session) + 2.0 * k) * 1e9), np.zeros((2, 2), np.uint8))
+            recorder.image(SlotImage(0, image, False, False, 0.0))
+            recorder._held.clear()  # pyright: ignore[reportPrivateUsage]
+        recorder.end()
+    assert outbox.images() == 20
+
+
+def test_a_recorder_that_dies_at_its_start_is_not_started_all_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    started = list[float]()
+
+    def dies(_: str, __: Any, *pipes: Any) -> Any:
+        started.append(time.monotonic())
+        for end in pipes:
+            end.close()
+        return SimpleNamespace(pid=os.getpid(), join=lambda *_: None, exitcode=1, kill=lambda: None, is_alive=bool)
+
+    monkeypatch.setattr(service_recorder, "start_child", dies)
+    monkeypatch.setattr(service_recorder, "FIRST_PAUSE_S", 0.1)
+    recorder, before = Recorder(RecordingConfig(mode="full")), threading.active_count()
+    run: Any = SimpleNamespace(info=SimpleNamespace(rig=pinhole_rig()), ring=None, release=lambda _: None)
+    recorder.begin(run, Config(), "wall", Opening())
+    time.sleep(1.0)
+    recorder.close()
+    time.sleep(0.2)
+    assert 3 <= len(started) <= 5  # at 0, 0.1, 0.3 and 0.7 s
+    assert threading.active_count() <= before + 1
