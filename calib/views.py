@@ -9,15 +9,15 @@ from pathlib import Path
 from stereo_sfm.calib.coverage import is_new
 from stereo_sfm.calib.targets import Detection, Target
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.pixels import SUFFIXES
 from stereo_sfm.types import U8, StereoImage
 
-_IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".tif", ".tiff")
 _SIDES = ((r"left", "right"), (r"cam0", "cam1"), (r"_0(?=\.)", "_1"), (r"_l(?=\.)", "_r"))
 
 
 def find_pairs(folder: Path) -> list[tuple[Path, Path]]:
     """left*/right*, cam0/cam1 or *_0/*_1 images of a folder, in the order of the numbers in their names."""
-    files = {str(p.relative_to(folder)): p for p in folder.rglob("*") if p.suffix.lower() in _IMAGES}
+    files = {str(p.relative_to(folder)): p for p in folder.rglob("*") if p.suffix.lower() in SUFFIXES}
     for left, right in _SIDES:
         pairs: list[tuple[Path, Path]] = []
         for name, path in files.items():

@@ -17,10 +17,10 @@ import numpy as np
 
 from stereo_sfm.drivers.ground_truth import stamp_from_seconds
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.pixels import SUFFIXES
 
 log = logging.getLogger("stereo_sfm")
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
 EARLIEST_NS, LATEST_NS = 10**17, 4 * 10**18  # names that are dates are between 1973 and 2096
 MIN_STAMP = 10**9  # smaller whole numbers are frame numbers
 UNITS_NS = (1, 10**3, 10**6, 10**9)
@@ -34,7 +34,7 @@ def list_images(folder: Path) -> list[Path]:
     """The image files of a folder in the order of their numbers (image2 before image10)."""
     if not folder.is_dir():
         raise StereoSfmError(f"no image folder {folder}")
-    files = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES]
+    files = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES]
     if not files:
         raise StereoSfmError(f"no images in {folder}")
     return sorted(files, key=natural_key)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from stereo_sfm.drivers.checked_samples import wrong_imu_units
+from stereo_sfm.drivers.text_file import read_text
 from stereo_sfm.types import ImuSamples
 
 log = logging.getLogger("stereo_sfm")
@@ -25,20 +26,19 @@ def read_imu_samples(path: Path) -> ImuSamples | None:
     rows: list[list[float]] = []
     stamps: list[int] = []
     bad = 0
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        for row in csv.reader(file):
-            if not row or row[0].lstrip().startswith("#"):
-                continue
-            try:
-                stamp, values = int(row[0]), [float(v) for v in row[1:COLUMNS]]
-            except ValueError:
-                bad += 1
-                continue
-            if len(values) < COLUMNS - 1 or not np.isfinite(values).all() or not 0 <= stamp < 1 << 63:
-                bad += 1
-                continue
-            stamps.append(stamp)
-            rows.append(values)
+    for row in csv.reader(read_text(path).splitlines()):
+        if not row or row[0].lstrip().startswith("#"):
+            continue
+        try:
+            stamp, values = int(row[0]), [float(v) for v in row[1:COLUMNS]]
+        except ValueError:
+            bad += 1
+            continue
+        if len(values) < COLUMNS - 1 or not np.isfinite(values).all() or not 0 <= stamp < 1 << 63:
+            bad += 1
+            continue
+        stamps.append(stamp)
+        rows.append(values)
     stamp_ns, first = np.unique(np.array(stamps, np.int64), return_index=True)
     bad += len(stamps) - len(stamp_ns)
     if bad:

@@ -180,7 +180,7 @@ class MapperConfig:
     association: str = word(
         "map",
         ("map", "tracks", "previous"),
-        "Points are joined by tracks only, also by descriptors in the map, or with the previous keyframe",
+        "Points are joined by tracks and by descriptors in the map, by tracks only, or with the previous keyframe",
     )
     match_radius_px: float = number(10.0, 0, 10_000, "Search radius around the predicted pixel, in both images")
     match_distance_bits: int = number(50, 0, 256, "Largest distance of descriptors")

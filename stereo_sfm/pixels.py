@@ -16,6 +16,7 @@ import numpy as np
 
 from stereo_sfm.types import U8, U16
 
+SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")  # of image files
 MAX_PIXELS = 10**8  # of one image, more than any camera of a rig has
 DARK = 30  # grey level; an image without a brighter pixel is dark
 LEFT_ALIGNED = 0xF  # bits that are always zero when a sensor of at most twelve bits fills the upper part of sixteen

@@ -21,6 +21,7 @@ from stereo_sfm.drivers.image_lists import Listing, pair_listings
 from stereo_sfm.drivers.imu_table import read_imu_samples
 from stereo_sfm.drivers.options import SourceOptions
 from stereo_sfm.drivers.rig_option import chosen_rig
+from stereo_sfm.drivers.text_file import read_text
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import ImuSamples, Trajectory
 
@@ -68,14 +69,13 @@ def _read_listing(camera: Path) -> Listing:
     """(stamp_ns, file) of every line of data.csv."""
     path = need(camera / "data.csv", "image list")
     images: Listing = []
-    with path.open(newline="") as file:
-        for number, row in enumerate(csv.reader(file), 1):
-            if not row or row[0].lstrip().startswith("#"):
-                continue
-            try:
-                images.append((int(row[0]), camera / "data" / row[1].strip()))
-            except (ValueError, IndexError):
-                raise StereoSfmError(f"{path} line {number} is not 'stamp_ns,file'") from None
+    for number, row in enumerate(csv.reader(read_text(path).splitlines()), 1):
+        if not row or row[0].lstrip().startswith("#"):
+            continue
+        try:
+            images.append((int(row[0]), camera / "data" / row[1].strip()))
+        except (ValueError, IndexError):
+            raise StereoSfmError(f"{path} line {number} is not 'stamp_ns,file'") from None
     return images
 
 
@@ -89,7 +89,7 @@ def _read_exposures(path: Path) -> dict[str, float]:
     """TUM VI: file stem -> exposure time in microseconds."""
     if not path.is_file():
         return {}
-    rows = [line.split() for line in path.read_text("utf-8-sig").splitlines() if not line.startswith("#")]
+    rows = [line.split() for line in read_text(path).splitlines() if not line.startswith("#")]
     try:
         return {row[0]: float(row[2]) * 1e3 for row in rows if len(row) >= 3}
     except ValueError as error:

@@ -13,7 +13,6 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.drivers.folder_source import FolderSource, FrameFiles, folder_of
 from stereo_sfm.drivers.ground_truth import read_trajectory
 from stereo_sfm.drivers.image_lists import (
-    IMAGE_SUFFIXES,
     frame_numbers,
     lines_of,
     list_images,
@@ -22,7 +21,9 @@ from stereo_sfm.drivers.image_lists import (
     stamps_of,
 )
 from stereo_sfm.drivers.rig_option import chosen_rig
+from stereo_sfm.drivers.text_file import read_text
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.pixels import SUFFIXES
 
 if TYPE_CHECKING:
     from stereo_sfm.drivers.images import ImagesOptions
@@ -92,7 +93,7 @@ def _is_numbered(stem: str, prefix: str) -> bool:
 
 
 def _has_images(folder: Path) -> bool:
-    return folder.is_dir() and any(p.suffix.lower() in IMAGE_SUFFIXES for p in folder.iterdir())
+    return folder.is_dir() and any(p.suffix.lower() in SUFFIXES for p in folder.iterdir())
 
 
 def _own_rig(folder: Path) -> Rig:
@@ -109,7 +110,7 @@ def _stamps(name: str, folder: Path, files: list[Path], fps: float | None) -> di
     """Nanoseconds of the left images."""
     times = folder / "times.txt"
     if times.is_file():
-        stamps = [stamp_from_text(line) for line in times.read_text("utf-8-sig").split()]
+        stamps = [stamp_from_text(line) for line in read_text(times).split()]
         if None in stamps:
             raise StereoSfmError(f"{times} must have one time in seconds for each of the {len(files)} frames")
         lines = lines_of(name, files, len(stamps), times.name)

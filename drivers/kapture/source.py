@@ -18,6 +18,7 @@ from stereo_sfm.drivers.image_lists import Listing, list_images, pair_listings
 from stereo_sfm.drivers.options import SourceOptions
 from stereo_sfm.drivers.rig_option import chosen_rig
 from stereo_sfm.drivers.select import SelectedFrames
+from stereo_sfm.drivers.text_file import read_text
 from stereo_sfm.errors import StereoSfmError
 
 log = logging.getLogger("stereo_sfm")
@@ -92,7 +93,7 @@ def _listings(folder: Path) -> tuple[Listing, Listing]:
     cameras: dict[str, Listing] = {i: [] for i in list(read_kapture_cameras(_sensors(folder)))[:2]}
     if len(cameras) < 2:
         raise StereoSfmError(f"{folder} has one camera, two are needed")
-    for line in records.read_text("utf-8-sig").splitlines():
+    for line in read_text(records).splitlines():
         fields = [f.strip() for f in line.split(",")]
         if len(fields) == 3 and fields[1] in cameras:
             cameras[fields[1]].append((_stamp(fields[0]), folder / "sensors" / "records_data" / fields[2]))

@@ -17,6 +17,7 @@ from stereo_sfm.drivers.folder_source import FolderSource, FrameFiles, folder_of
 from stereo_sfm.drivers.ground_truth import moved, read_kitti, stamp_from_seconds
 from stereo_sfm.drivers.image_lists import lines_of, list_images, pair_files
 from stereo_sfm.drivers.rig_option import chosen_rig
+from stereo_sfm.drivers.text_file import read_text
 from stereo_sfm.errors import StereoSfmError
 
 if TYPE_CHECKING:
@@ -73,6 +74,6 @@ def _read_times(path: Path, name: str, count: int) -> list[int]:
         log.warning("%s: no times.txt, frames are stamped at 10 Hz", name)
         return [i * PERIOD_NS for i in range(count)]
     try:
-        return [stamp_from_seconds(line) for line in path.read_text("utf-8-sig").split()]
+        return [stamp_from_seconds(line) for line in read_text(path).split()]
     except ValueError as error:
         raise StereoSfmError(f"{path}: {error}") from None

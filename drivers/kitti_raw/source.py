@@ -21,6 +21,7 @@ from stereo_sfm.drivers.folder_source import FolderSource, FrameFiles, folder_of
 from stereo_sfm.drivers.ground_truth import moved
 from stereo_sfm.drivers.image_lists import lines_of, list_images, pair_files
 from stereo_sfm.drivers.rig_option import chosen_rig
+from stereo_sfm.drivers.text_file import read_text
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, I64, ImuSamples, Trajectory
@@ -84,7 +85,7 @@ def _drive_folder(folder: Path, drive: str) -> Path:
 def _read_times(path: Path) -> list[int]:
     """Nanoseconds from lines such as 2011-09-26 13:02:25.964389445."""
     stamps: list[int] = []
-    for line in path.read_text("utf-8-sig").splitlines():
+    for line in read_text(path).splitlines():
         if not line.strip():
             continue
         whole, _, fraction = line.strip().partition(".")
@@ -101,9 +102,12 @@ def _imu_T_left(date: Path, cam0_T_left: F64) -> F64 | None:
     files = [date / "calib_imu_to_velo.txt", date / "calib_velo_to_cam.txt", date / CALIBRATION]
     if not all(f.is_file() for f in files):
         return None
+    entries = _read_entries(files[2])
+    if "R_rect_00" not in entries:
+        raise StereoSfmError(f"{files[2]} has no R_rect_00")
     velo_T_imu, cam_T_velo = (_read_rigid(f) for f in files[:2])
     rectified_T_cam = np.eye(4)
-    rectified_T_cam[:3, :3] = _read_entries(files[2])["R_rect_00"].reshape(3, 3)
+    rectified_T_cam[:3, :3] = entries["R_rect_00"].reshape(3, 3)
     return se3.inverse(rectified_T_cam @ cam_T_velo @ velo_T_imu) @ cam0_T_left
 
 
@@ -137,7 +141,7 @@ def _packets(folder: Path) -> F64:
     if not files:
         return np.zeros((0, 0))
     try:
-        return np.array([p.read_text("utf-8-sig").split() for p in files], float)
+        return np.array([read_text(p).split() for p in files], float)
     except ValueError as error:
         raise StereoSfmError(f"{folder / 'oxts'}: {error}") from None
 
@@ -161,7 +165,7 @@ def poses_from_oxts(packets: F64) -> F64:
 def _read_entries(path: Path) -> dict[str, F64]:
     """`KEY: numbers` lines."""
     entries: dict[str, F64] = {}
-    for line in path.read_text("utf-8-sig").splitlines():
+    for line in read_text(path).splitlines():
         key, _, values = line.partition(":")
         try:
             entries[key.strip()] = np.array(values.split(), float)

@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from stereo_sfm.drivers.source import Source
 
 
-RECORDING = "recording.json"  # in a folder of segments
+# of a folder of segments, as `stereo_sfm.recording` writes it
+RECORDING, IMAGES = "recording.json", ".images.mcap"
 
 
 @dataclass(frozen=True)

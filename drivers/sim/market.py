@@ -55,8 +55,6 @@ FRIDGE_DOOR = 0.75  # metres from one frame to the next
 STROLL = 5.0  # metres that a customer walks before turning
 ASIDE = 0.15  # metres, standard deviation of a later round's offset from the path
 
-Box = tuple[float, float, float, float]  # x0, y0, x1, y1
-
 
 @dataclass(frozen=True)
 class Market:

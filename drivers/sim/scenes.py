@@ -7,13 +7,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from stereo_sfm.drivers.sim.drives import FORWARD, Gait
+from stereo_sfm.drivers.sim.drives import Gait
 from stereo_sfm.drivers.sim.effects import Effects
 from stereo_sfm.drivers.sim.market import Market
 from stereo_sfm.drivers.sim.people import Appearance, Person
 from stereo_sfm.drivers.sim.shelves import Mix
 from stereo_sfm.drivers.sim.world import CLOTHES, HAIR, Layout
-from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64
 
 Route = Callable[[Layout, int, bool], F64]  # (layout, session number, returns) -> polyline (N, 2) metres
@@ -115,18 +114,6 @@ SCENES: dict[str, Scene] = {
     "demo": Scene(Layout(gondolas=2, gondola_length=3.6, products=120), _loop, 21.0, gait=Gait(speed=1.05)),
     "big": Scene(Layout(gondolas=9, gondola_length=18.0, products=420), _serpentine, 1000.0),
 }
-
-
-def random_poses(layout: Layout, count: int, rng: np.random.Generator) -> F64:
-    """(count, 4, 4) world_T_cam somewhere in the aisles, looking anywhere about the horizon."""
-    a, b = _ends(layout)
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    for pose in poses:
-        k = int(rng.integers(layout.gondolas + 1))
-        pose[:3, 3] = rng.uniform(a, b), layout.aisle_y(k) + rng.uniform(-0.4, 0.4), rng.uniform(1.0, 1.6)
-        pose[:3, :3] = se3.so3_exp(np.array([0, 0, rng.uniform(-np.pi, np.pi)])) @ FORWARD
-        pose[:3, :3] = pose[:3, :3] @ se3.so3_exp(rng.normal(0, 0.08, 3))
-    return poses
 
 
 def crowd(layout: Layout, count: int, rng: np.random.Generator) -> list[Person]:

@@ -83,7 +83,6 @@ class Sensor(enum.IntEnum):
 
 
 PIXEL_FORMAT_Y8 = 9
-PIXEL_FORMAT_ANY = 0
 KANNALA_BRANDT_4 = 4
 
 

@@ -18,6 +18,7 @@ from stereo_sfm.drivers.ground_truth import read_tum, stamp_from_seconds
 from stereo_sfm.drivers.image_lists import pair_by_stamp
 from stereo_sfm.drivers.options import SourceOptions
 from stereo_sfm.drivers.rig_option import chosen_rig
+from stereo_sfm.drivers.text_file import read_text
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry.cameras import RadTan
 
@@ -79,7 +80,7 @@ def _own_rig(folder: Path, label: str) -> Rig:
 def _read_listing(path: Path) -> list[tuple[int, Path]]:
     """(stamp_ns, file) of every line."""
     images: list[tuple[int, Path]] = []
-    for number, line in enumerate(path.read_text("utf-8-sig").splitlines(), 1):
+    for number, line in enumerate(read_text(path).splitlines(), 1):
         fields = line.split()
         if not fields or fields[0].startswith("#"):
             continue

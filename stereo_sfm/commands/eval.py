@@ -191,9 +191,12 @@ def _pose_frame(path: Path) -> str:
     if named:
         return named
     stats = path.parent / "stats.json"
-    return (
-        json.loads(stats.read_text("utf-8-sig")).get("frame", "") if path.suffix == ".kitti" and stats.is_file() else ""
-    )
+    if path.suffix != ".kitti" or not stats.is_file():
+        return ""
+    try:
+        return json.loads(stats.read_text("utf-8-sig")).get("frame", "")
+    except (ValueError, AttributeError):  # damaged
+        return ""
 
 
 def _in_cam0(bodies: Trajectory, path: Path) -> Trajectory:

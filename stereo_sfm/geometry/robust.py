@@ -29,7 +29,6 @@ class Consensus:
     model: F64
     inliers: Bool  # (N,)
     residuals: F64  # (N,) in the unit of the threshold
-    hypotheses: int  # models tried
 
 
 def sample_indices(rng: np.random.Generator, batch: int, count: int, size: int) -> I64:
@@ -103,4 +102,4 @@ def ransac(
     inliers: Bool = np.asarray(best_residuals <= 1.0) if best_model is not None else np.zeros(count, bool)
     if best_model is None or inliers.sum() < max(min_inliers, min_ratio * count):
         raise Degenerate("no_consensus", f"{int(inliers.sum())} of {count} agree")
-    return Consensus(best_model, inliers, best_residuals * limit, tried)
+    return Consensus(best_model, inliers, best_residuals * limit)

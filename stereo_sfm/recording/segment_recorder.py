@@ -25,7 +25,7 @@ from stereo_sfm.log.run_log import RunLog
 from stereo_sfm.log.writer import LogWriter
 from stereo_sfm.recording.quota import Disk, Quota, forget_images, make_room, used_bytes
 from stereo_sfm.recording.segment_writers import ImageWriter, PoseWriter, Thumbnail
-from stereo_sfm.recording.segments import ABOUT, Segment, new_recording
+from stereo_sfm.recording.segments import RECORDING, Segment, new_recording
 from stereo_sfm.types import Dropped, Frame, ImuSamples, Observations, StereoImage, WheelSamples
 
 EVERY_S = 2.0  # between two checks of the disk, besides those at the beginning of a segment
@@ -170,7 +170,7 @@ class SegmentRecorder:
         if self._began_ns < 0:
             self._began_ns = stamp_ns
             with contextlib.suppress(OSError):
-                (self.folder / ABOUT).touch()  # the beginning by the clock of the disk, for `listed`
+                (self.folder / RECORDING).touch()  # the beginning by the clock of the disk, for `listed`
         p, written = self._policy, self._images.bytes_written + self._poses.bytes_written
         full = stamp_ns - self._segment_ns >= p.segment_s * 1e9 or written >= p.segment_bytes
         self._newest_ns = stamp_ns

@@ -21,14 +21,14 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from stereo_sfm.drivers.mcap import IMAGES, RECORDING
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log import topics
 from stereo_sfm.log.reader import LogReader
 from stereo_sfm.log.scan import summary_is_whole
 
-ABOUT = "recording.json"
 KIND = "stereo_sfm_recording"
-IMAGES, POSES, MARKED = ".images.mcap", ".mcap", ".marked"
+POSES, MARKED = ".mcap", ".marked"
 _FOLDER = re.compile(r"(\d{5,})_[\d_-]+")
 _SEGMENT = re.compile(r"(\d{5,})_(\d{6,})[a-z]?")  # a letter: begun again after the disk refused a file
 
@@ -82,7 +82,7 @@ class Segment:
         for path in (self.images, self.poses, self.mark_file):
             path.unlink(missing_ok=True)
         if not segments(self.folder):
-            (self.folder / ABOUT).unlink(missing_ok=True)
+            (self.folder / RECORDING).unlink(missing_ok=True)
             with contextlib.suppress(OSError):  # it holds other files
                 self.folder.rmdir()
 
@@ -120,7 +120,7 @@ def new_recording(root: Path, source: str, mode: str, now: datetime) -> Path:
     folder.mkdir()
     about = {"kind": KIND, "version": 1, "source": source, "mode": mode, "began": now.isoformat(timespec="seconds")}
     try:
-        (folder / ABOUT).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
+        (folder / RECORDING).write_text(json.dumps(about, indent=1) + "\n", encoding="utf-8")
     except OSError:
         shutil.rmtree(folder, ignore_errors=True)
         raise
@@ -130,7 +130,7 @@ def new_recording(root: Path, source: str, mode: str, now: datetime) -> Path:
 def about(folder: Path) -> dict[str, Any]:
     """The content of recording.json; empty where it is missing or damaged."""
     try:
-        data = json.loads((folder / ABOUT).read_text("utf-8"))
+        data = json.loads((folder / RECORDING).read_text("utf-8"))
     except (OSError, ValueError):
         return {}
     return data if isinstance(data, dict) and data.get("kind") == KIND else {}
@@ -142,7 +142,7 @@ def _seconds(folder: Path, last: Segment) -> int:
         size, written_ns = last.poses.stat().st_size, last.poses.stat().st_mtime_ns
         length_s = _poses_s(last.poses, size, written_ns)
         if length_s is None:
-            return max(last.second, round((written_ns - (folder / ABOUT).stat().st_mtime_ns) / 1e9))
+            return max(last.second, round((written_ns - (folder / RECORDING).stat().st_mtime_ns) / 1e9))
         return round(last.second + length_s)
     except OSError:
         return last.second
@@ -179,11 +179,6 @@ def listed(folder: Path) -> dict[str, str | int | bool]:
         "bytes": sum(segment.bytes for segment in parts),
         "marked": any(segment.marked for segment in parts),
     }
-
-
-def is_recording(path: Path) -> bool:
-    """Whether a folder holds the segments of a recording."""
-    return path.is_dir() and (path / ABOUT).is_file() and bool(about(path))
 
 
 def delete_recording(root: Path, name: str) -> None:

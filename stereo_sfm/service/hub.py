@@ -59,14 +59,6 @@ class Hub:
 
         return remove
 
-    def newest(self, kind: type[M]) -> M | None:
-        """The newest message of a repeated kind."""
-        return self._newest.get(kind)
-
-    def wants(self, kind: type[ServiceMessage]) -> bool:
-        """Whether any receiver wants a kind of message."""
-        return any(kind in o.wants for o in self.outputs) or any(c.kind is kind for c in self._callbacks)
-
     @property
     def preview_hz(self) -> float:
         """Most preview images a second that a receiver wants."""

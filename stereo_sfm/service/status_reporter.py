@@ -20,6 +20,7 @@ from stereo_sfm.service.states import REMEDIES, Facts, derive_state
 log = logging.getLogger("stereo_sfm")
 
 EVERY_S = 1.0  # between two reports without a change
+_BETWEEN = ServiceState.STARTING, ServiceState.STOPPING
 
 
 class StatusReporter:
@@ -55,6 +56,8 @@ class StatusReporter:
         changed = _urgent(status) != _urgent(self.status)
         if status.state != self.status.state:
             self._log_change(status)
+        elif status.session != self.status.session and status.state not in _BETWEEN:
+            self._notifier.ready()  # a reload has ended, though the camera is still not there
         due = now >= self._next_report_s
         self.status = status
         if changed or due:
@@ -94,7 +97,7 @@ class StatusReporter:
         log.log(logging.WARNING if status.state in REMEDIES else logging.INFO, "%s", _line(status))
         if status.state == ServiceState.STOPPING:
             self._notifier.stopping()
-        elif status.state != ServiceState.STARTING:
+        elif status.state not in _BETWEEN:
             self._notifier.ready()  # also where the camera is not there yet: the service is
         if status.state == ServiceState.LOST and self.config.mark_losses and self._recorder.mode != "off":
             self._recorder.mark(f"lost: {status.reason}")

@@ -22,7 +22,7 @@ from stereo_sfm.recording import segment_recorder as module
 from stereo_sfm.recording import segment_writers
 from stereo_sfm.recording.quota import Disk, Quota, forget_images, make_room, used_bytes
 from stereo_sfm.recording.segment_recorder import Policy, SegmentRecorder
-from stereo_sfm.recording.segments import ABOUT, Segment, delete_recording, is_recording, listed, recordings, segments
+from stereo_sfm.recording.segments import RECORDING, Segment, delete_recording, listed, recordings, segments
 from stereo_sfm.types import Frame, ImuSamples, Observations, StereoImage, TrackState
 from tests.pipeline.test_pipeline import SlidingWall
 
@@ -93,7 +93,7 @@ def test_segments_open_alone_and_replay_as_one(tmp_path: Path) -> None:
     with LogReader(parts[2].poses) as reader:
         assert reader.truncated == "" and reader.metadata("totals")["frames"] == "30"
         assert len(list(reader.messages([topics.THUMBNAIL]))) == 1
-    assert is_recording(folder) and listed(folder)["segments"] == 4
+    assert listed(folder)["segments"] == 4
     assert images[-1].stamp_ns - images[0].stamp_ns > 3e9
     assert listed(folder)["seconds"] == round((images[-1].stamp_ns - images[0].stamp_ns) / 1e9)
     delete_recording(tmp_path, folder.name)
@@ -105,7 +105,7 @@ def test_segments_open_alone_and_replay_as_one(tmp_path: Path) -> None:
 def test_the_length_of_a_short_and_of_an_unfinished_recording(tmp_path: Path) -> None:
     recorder = start(tmp_path, segment_s=60.0)
     (folder,) = recordings(tmp_path)
-    os.utime(folder / ABOUT, (1e9, 1e9))  # the first image may come late
+    os.utime(folder / RECORDING, (1e9, 1e9))  # the first image may come late
     assert recorder.state().seconds == 0
     record(recorder, list(SlidingWall(61)))
     assert recorder.state().seconds == 2
@@ -114,7 +114,7 @@ def test_the_length_of_a_short_and_of_an_unfinished_recording(tmp_path: Path) ->
     assert part.second == 0 and listed(folder)["seconds"] == 2  # by its poses
     whole = part.poses.read_bytes()
     part.poses.write_bytes(whole[: len(whole) // 2])  # as while it is written: by the clock of the disk
-    began_s = (folder / ABOUT).stat().st_mtime
+    began_s = (folder / RECORDING).stat().st_mtime
     assert time.time() - began_s < 60
     os.utime(part.poses, (began_s + 7, began_s + 7))
     assert listed(folder)["seconds"] == 7

@@ -39,14 +39,7 @@ class PoseMessage(Message):
     latency_ms: float  # from the image's arrival to this message
 
 
-@dataclass(frozen=True)
-class Missed:
-    """What a client has missed; its field follows those of `PoseMessage`."""
-
-    missed: int  # poses before this one that the client was too slow for
-
-
-MISSED_FIELD = len(fields(PoseMessage)) + 1
+MISSED_FIELD = len(fields(PoseMessage)) + 1  # poses before this one that the client was too slow for
 
 
 def pose_message(update: PoseUpdate, axes: RobotAxes) -> PoseMessage:
