@@ -379,6 +379,14 @@ def test_check_calib_without_images(cli: Run, option: str, value: int) -> None:
     assert_one_line(cli("check-calib", "sim:aisle?frames=3", option, value), f"{option} must be at least 1")
 
 
+@pytest.mark.parametrize("option", ["--max-frames", "--views"])
+def test_calibrate_without_images(cli: Run, option: str) -> None:
+    assert_one_line(
+        cli("calibrate", "sim:aisle?frames=3", option, -1, "--imu", "-o", "rig.yaml"),
+        f"{option} must be at least 1, not -1",
+    )
+
+
 @pytest.mark.parametrize("frames", [1, 2])
 def test_check_calib_of_hardly_anything(cli: Run, frames: int) -> None:
     assert cli("check-calib", "sim:aisle?frames=3&size=300x280", "--max-frames", frames)[0] in (0, 3)

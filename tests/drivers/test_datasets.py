@@ -527,6 +527,15 @@ def test_a_byte_order_mark_is_skipped(tmp_path: Path) -> None:
         assert len(list(source)) == 4
 
 
+def test_text_in_another_encoding_is_refused_in_a_line(tmp_path: Path) -> None:
+    root = make_kitti(tmp_path)
+    for file in (root / "sequences" / "00" / "times.txt", make_images(tmp_path / "images", ["a.png"]) / "times.txt"):
+        text = file.read_text() if file.exists() else "0.0\n"
+        file.write_text(text, encoding="utf-16")
+        with pytest.raises(StereoSfmError, match=r"times\.txt is not text in UTF-8"):
+            open_source(root if "sequences" in file.parts else file.parent)
+
+
 @pytest.mark.parametrize(("start", "duration"), [(math.nan, 1.0), (math.inf, 1.0), (1e300, 1.0), (0.0, math.nan)])
 def test_a_part_that_cannot_be_is_refused(start: float, duration: float, tmp_path: Path) -> None:
     with open_source(make_kitti(tmp_path)) as source, pytest.raises(StereoSfmError, match="part of a source"):
