@@ -29,6 +29,13 @@ def typed(kind: type[T], args: argparse.Namespace) -> T:
     return kind(**{name: getattr(args, name) for name in names})
 
 
+def check_counts(options: dict[str, int]) -> None:
+    """Raises StereoSfmError where one of the options, by their names on the command line, is less than 1."""
+    for option, value in options.items():
+        if value < 1:
+            raise StereoSfmError(f"{option} must be at least 1, not {value}")
+
+
 def add_source(parser: argparse.ArgumentParser, default: str = "", metavar: str | None = None) -> None:
     """The argument that names the source; `default` describes what is used without it."""
     from stereo_sfm.drivers.registry import kinds

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stereo_sfm.commands._options import typed
+from stereo_sfm.commands._options import check_counts, typed
 from stereo_sfm.commands.convert_calib import NAMES
 
 if TYPE_CHECKING:
@@ -75,12 +75,8 @@ class CalibrateOptions:
 
 def run(args: argparse.Namespace) -> int:
     """Collect views, calibrate, judge, write."""
-    from stereo_sfm.errors import StereoSfmError
-
     options = typed(CalibrateOptions, args)
-    for option, value in (("--views", options.views), ("--max-frames", options.max_frames)):
-        if value < 1:
-            raise StereoSfmError(f"{option} must be at least 1, not {value}")
+    check_counts({"--views": options.views, "--max-frames": options.max_frames})
     if options.imu or options.wheel:
         return run_sensors(options)
     from dataclasses import replace
@@ -91,6 +87,7 @@ def run(args: argparse.Namespace) -> int:
     from stereo_sfm.calib.quality import judge
     from stereo_sfm.calib.report import write_report
     from stereo_sfm.calib.solve import align_pairs, calibrate
+    from stereo_sfm.errors import StereoSfmError
 
     if options.target is None:
         raise StereoSfmError("calibrate needs --target for the cameras, or --imu or --wheel")

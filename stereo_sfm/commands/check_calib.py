@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stereo_sfm.commands._options import add_source, typed
+from stereo_sfm.commands._options import add_source, check_counts, typed
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -169,13 +169,7 @@ def _robot(masks: MaskSearch, rig: Rig) -> list[Finding]:
 def _check(options: CheckOptions) -> None:
     from stereo_sfm.errors import StereoSfmError
 
-    for option, value in (
-        ("--windows", options.windows),
-        ("--max-frames", options.max_frames),
-        ("--search", options.search),
-    ):
-        if value < 1:
-            raise StereoSfmError(f"{option} must be at least 1, not {value}")
+    check_counts({"--windows": options.windows, "--max-frames": options.max_frames, "--search": options.search})
     if options.correct is not None and options.correct.exists() and not options.overwrite:
         raise StereoSfmError(f"{options.correct} exists: choose another name or give --overwrite")
 

@@ -38,7 +38,6 @@ class KeyframeStore:
         self._keyframes: dict[int, Keyframe] = {}
         self._rows: dict[int, tuple[int, int]] = {}  # keyframe id -> its first sighting, number of them
         # Each keyframe has a number below the most that there ever were at a time: ids grow for ever.
-        self._numbers: dict[int, int] = {}
         self._numbered: list[int] = []  # ids by number
         self._free: list[int] = []  # numbers
         self._sightings = _Sightings()
@@ -84,7 +83,6 @@ class KeyframeStore:
         self.ids.append(keyframe.kf_id)
         number = self._free.pop() if self._free else len(self._numbered)
         self._numbered[number : number + 1] = [keyframe.kf_id]
-        self._numbers[keyframe.kf_id] = number
         points = np.unique(self._know(np.asarray(keyframe.point_ids)))
         rows = self._sightings.append(len(points), kf=number, point=points)
         self._rows[keyframe.kf_id] = rows.start, len(points)
@@ -94,7 +92,7 @@ class KeyframeStore:
         """Remove a keyframe."""
         self.ids.remove(kf_id)
         del self._keyframes[kf_id]
-        self._free.append(self._numbers.pop(kf_id))
+        self._free.append(self._numbered.index(kf_id))
         first, count = self._rows.pop(kf_id)
         rows, table = np.arange(first, first + count), self._sightings
         map_kernels.unlink(rows[table.point[rows] >= 0], self._points.head, table.following, table.point)
