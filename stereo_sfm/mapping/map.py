@@ -541,10 +541,12 @@ class Map:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all columns."""
+        """Bytes of all columns, of corners and of what IMU and wheels measured."""
         tables = (self.keyframes, self.points, self.observations)
         corners = sum(c.nbytes for both in self.corners.values() for c in both)
-        return sum(table.nbytes for table in tables) + self._pt_rows.nbytes + corners
+        sensors = sum(motion.nbytes for motion in self.motions.values())
+        sensors += sum(array.nbytes for state in self.known_states.values() for array in state)
+        return sum(table.nbytes for table in tables) + self._pt_rows.nbytes + corners + sensors
 
 
 def _inertial_state(keyframe: Keyframe) -> dict[str, F64]:

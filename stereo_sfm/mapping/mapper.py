@@ -250,7 +250,7 @@ class Mapper:
     def _adjust_since(self, first: int) -> None:
         """Adjust the keyframes from a row on at once: the tracker's next poses are solved with their points."""
         before = self.map.keyframes.map_T_kf[-1].copy()
-        part = window.newest(self.map, first, MOST_AT_ONCE, self._config.most_fixed)
+        part = window.newest(self.map, first, MOST_AT_ONCE, self._config, self._rig.imu)
         window.write_back(self.map, part, bundle_adjust(self._rig, part.bundle, window.bundle_config(self._config)))
         self._follow_newest(before)
 

@@ -36,6 +36,12 @@ class Motion:
             )  # fmt: skip
         return None if inertial is None and keyframe.wheels is None else Motion(inertial, keyframe.wheels)
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of its arrays."""
+        parts = [vars(part).values() for part in (self.inertial, self.wheels) if part is not None]
+        return sum(value.nbytes for values in parts for value in values if isinstance(value, np.ndarray))
+
     def then(self, following: Motion) -> Motion | None:
         """Over both; None if one of them or the whole says nothing."""
         first, second = self.inertial, following.inertial

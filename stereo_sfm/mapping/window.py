@@ -70,21 +70,29 @@ def covisible_window(map_: Map, row: int, config: MapperConfig, imu: Imu | None 
     if not len(others):
         others, _ = map_.neighbours(row)
     part = _window(map_, np.concatenate([[row], others])[: config.most_keyframes].astype(np.int64), config.most_fixed)
-    if not config.sensors:
-        return part
-    motions = motion_factors(map_, part.kf_rows, part.bundle.fixed, imu)
-    return dataclasses.replace(part, bundle=dataclasses.replace(part.bundle, motions=motions))
+    return _with_motions(part, map_, config, imu)
 
 
-def newest(map_: Map, first_row: int, most: int, most_fixed: int | None) -> Window:
-    """The newest living keyframes, `most` of them and none before a row, and all their points; others are fixed."""
+def newest(map_: Map, first_row: int, most: int, config: MapperConfig, imu: Imu | None = None) -> Window:
+    """The newest living keyframes, `most` of them and none before a row, and all their points; others are fixed.
+
+    With sensors as `covisible_window`.
+    """
     rows = map_.living_keyframes()
-    return _window(map_, rows[rows >= first_row][-most:], most_fixed)
+    return _with_motions(_window(map_, rows[rows >= first_row][-most:], config.most_fixed), map_, config, imu)
 
 
 def whole_map(map_: Map) -> Window:
     """Every living keyframe and point; of each unconnected part the oldest keyframe is fixed."""
     return _window(map_, map_.living_keyframes())
+
+
+def _with_motions(part: Window, map_: Map, config: MapperConfig, imu: Imu | None) -> Window:
+    """What IMU and wheels measured between its keyframes."""
+    if not config.sensors:
+        return part
+    motions = motion_factors(map_, part.kf_rows, part.bundle.fixed, imu)
+    return dataclasses.replace(part, bundle=dataclasses.replace(part.bundle, motions=motions))
 
 
 def _window(map_: Map, moving: I64, most_fixed: int | None = None) -> Window:

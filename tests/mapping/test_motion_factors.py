@@ -16,6 +16,7 @@ from stereo_sfm.config import MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.preintegration import GRAVITY
 from stereo_sfm.mapping import motion_factors as mf
+from stereo_sfm.mapping import window
 from stereo_sfm.mapping.bundle import BundleConfig, bundle_adjust, counted_information
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.mapping.mapper import Mapper
@@ -256,7 +257,9 @@ def test_motions_of_a_culled_keyframe_are_joined() -> None:
     times = [1.0, 1.3, 1.7, 2.0]
     map_ = chain(times)
     assert sorted(map_.motions) == [1, 2, 3]  # nothing is before the first
+    before = map_.nbytes
     map_.cull_keyframe(1)
+    assert before - map_.nbytes > 8 * (9 * 9 + 5 * 9 + 4 * 4 + 6 * 6)  # one motion of two sensors
     whole = Motion.of(keyframe(2, 1.7, link(1.0, 1.7)), IMU)
     joined = map_.motions[2]
     assert sorted(map_.motions) == [2, 3] and 1 not in map_.known_states
@@ -304,13 +307,19 @@ def test_the_mapper_uses_what_the_keyframes_bring() -> None:
 
     def turn_error(sensors: bool) -> float:
         stream = drive(1.0, 1)
-        mapper = Mapper(MapperConfig(sensors=sensors, final_iterations=0, full_ba_growth=1e3), stream.rig)
+        config = MapperConfig(sensors=sensors, final_iterations=0, full_ba_growth=1e3)
+        mapper = Mapper(config, stream.rig)
         for k in stream.keyframes:
             mapper.step(k)
         rows = mapper.map.living_keyframes()
         found, true = mapper.map.keyframes.map_T_kf[rows], stream.world_T_kf[mapper.map.keyframes.kf_id[rows]]
         turns = [se3.inverse(x[:-1]) @ x[1:] for x in (found, true)]
         assert sensors == bool(mapper.map.motions)
+        for part in (
+            window.covisible_window(mapper.map, int(rows[-1]), config, IMU),
+            window.newest(mapper.map, int(rows[4]), 8, config, IMU),
+        ):
+            assert sensors == (part.bundle.motions is not None)
         if sensors:
             speed = mapper.map.keyframes.velocity[rows[-1]]
             at = float(mapper.map.keyframes.stamp_ns[rows[-1]]) * 1e-9
