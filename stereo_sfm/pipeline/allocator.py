@@ -10,7 +10,7 @@ from typing import TypeVar
 
 T = TypeVar("T")
 
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # malloc.h
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_ARENA_MAX = -1, -3, -8  # malloc.h
 LARGE_BYTES = 256 << 10  # blocks from this size on are mapped on their own
 ALIGNED = 16  # bytes, as malloc aligns
 KEPT_BYTES = 4 << 20  # free memory at the end of the heap that is kept for the next blocks
@@ -21,12 +21,14 @@ def return_large_blocks() -> None:
 
     Left to itself, glibc raises the size from which a block is mapped on its own up to 32 MiB with every larger one
     that is freed. The next large arrays then lie in the heap, and where a small block follows one, its room stays with
-    the process: a stage whose arrays grow and shrink holds up to twice what it needs.
+    the process: a stage whose arrays grow and shrink holds up to twice what it needs. And all threads share one heap:
+    else each gets another, up to eight for every core, and what a thread leaves behind there no other one uses.
     """
     with contextlib.suppress(OSError, AttributeError):
         libc = ctypes.CDLL("libc.so.6")
         libc.mallopt(M_MMAP_THRESHOLD, LARGE_BYTES)
         libc.mallopt(M_TRIM_THRESHOLD, KEPT_BYTES)
+        libc.mallopt(M_ARENA_MAX, 1)
 
 
 def release_memory() -> None:

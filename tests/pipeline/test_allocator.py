@@ -44,6 +44,37 @@ def test_room_between_small_blocks_is_returned() -> None:
     assert held("on") < 10 < 30 < held("off")
 
 
+THREADS = """
+import sys, threading
+from stereo_sfm.pipeline.allocator import return_large_blocks
+if sys.argv[1] == "on":
+    return_large_blocks()
+together = threading.Barrier(6)
+def work():
+    together.wait()
+    kept.append([bytes(5000) for _ in range(200)])
+    together.wait()
+kept, threads = [], [threading.Thread(target=work) for _ in range(6)]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+lines = [line.split() for line in open("/proc/self/maps")]
+starts = [int(line[0].partition("-")[0], 16) for line in lines if len(line) == 5]
+print(sum(start % (64 << 20) == 0 for start in starts))  # where glibc puts the heaps of threads
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="an allocator of glibc's")
+def test_threads_share_one_heap() -> None:
+    def heaps(setting: str) -> int:
+        done = subprocess.run([sys.executable, "-c", THREADS, setting], capture_output=True, text=True, check=True)
+        return int(done.stdout)
+
+    assert heaps("on") == 0
+    assert heaps("off") > 2
+
+
 STEPS = """
 import sys
 from stereo_sfm.pipeline.allocator import Release
