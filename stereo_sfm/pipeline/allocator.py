@@ -21,14 +21,21 @@ def return_large_blocks() -> None:
 
     Left to itself, glibc raises the size from which a block is mapped on its own up to 32 MiB with every larger one
     that is freed. The next large arrays then lie in the heap, and where a small block follows one, its room stays with
-    the process: a stage whose arrays grow and shrink holds up to twice what it needs. And all threads share one heap:
-    else each gets another, up to eight for every core, and what a thread leaves behind there no other one uses.
+    the process: a stage whose arrays grow and shrink holds up to twice what it needs.
     """
     with contextlib.suppress(OSError, AttributeError):
         libc = ctypes.CDLL("libc.so.6")
         libc.mallopt(M_MMAP_THRESHOLD, LARGE_BYTES)
         libc.mallopt(M_TRIM_THRESHOLD, KEPT_BYTES)
-        libc.mallopt(M_ARENA_MAX, 1)
+
+
+def share_one_heap() -> None:
+    """Let all threads allocate in one heap, where some end and others begin all day.
+
+    Else each gets another, up to eight for every core, and what one leaves behind there no other one uses.
+    """
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL("libc.so.6").mallopt(M_ARENA_MAX, 1)
 
 
 def release_memory() -> None:

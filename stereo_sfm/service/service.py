@@ -14,7 +14,7 @@ from typing import Self, TypeVar
 from stereo_sfm.drivers.choice import Opener
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.messages import LogLine
-from stereo_sfm.pipeline.allocator import Release, return_large_blocks
+from stereo_sfm.pipeline.allocator import Release, return_large_blocks, share_one_heap
 from stereo_sfm.pipeline.text import LOGGER, Listener
 from stereo_sfm.service.camera import patient
 from stereo_sfm.service.commands import Commands
@@ -95,6 +95,7 @@ class Service(Commands):
 
     def __enter__(self) -> Self:
         return_large_blocks()
+        share_one_heap()
         self._listener.__enter__()
         self._recorder.start()
         for output in self._hub.outputs:

@@ -46,9 +46,9 @@ def test_room_between_small_blocks_is_returned() -> None:
 
 THREADS = """
 import sys, threading
-from stereo_sfm.pipeline.allocator import return_large_blocks
+from stereo_sfm.pipeline.allocator import share_one_heap
 if sys.argv[1] == "on":
-    return_large_blocks()
+    share_one_heap()
 together = threading.Barrier(6)
 def work():
     together.wait()
