@@ -9,7 +9,7 @@ from typing import Any
 from stereo_sfm.drivers.choice import Opener
 from stereo_sfm.maps.folders import make_mapper, save_result
 from stereo_sfm.messages import Localized
-from stereo_sfm.pipeline.allocator import Release, in_own_pages, release_memory
+from stereo_sfm.pipeline.allocator import Release, release_memory
 from stereo_sfm.pipeline.channels import End, Inbox, Lost, Outbox, PrefetchingInbox, pickled
 from stereo_sfm.pipeline.child import Report, Setup, prepare, ready
 from stereo_sfm.pipeline.schedule import Lockstep, Realtime, Recorded, Schedule
@@ -241,7 +241,7 @@ def run_loop(to_main: Report, control: Connection, keyframes: Connection, to_map
         to_main.pulse.begin()
         delay()
         begin = time.monotonic()
-        result = closer.step(in_own_pages(keyframe))
+        result = closer.step(keyframe)
         data = pickled(result)
         to_main.send(data)
         outbox.send(data)

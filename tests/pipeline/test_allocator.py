@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import pickle
 import platform
 import subprocess
 import sys
 
-import numpy as np
 import pytest
-
-from stereo_sfm.pipeline.allocator import in_own_pages
-from stereo_sfm.types import Keyframe
 
 HELD = """
 import numpy as np, sys
@@ -97,53 +92,3 @@ def test_free_pages_are_returned_every_so_many_steps() -> None:
 
     assert returned(2) == 0
     assert returned(3) > 20
-
-
-KEPT = """
-import sys
-import numpy as np
-from stereo_sfm.pipeline.allocator import in_own_pages
-def resident():
-    return int(open("/proc/self/statm").read().split()[1]) * 4096
-kept = []
-for k in range(200):
-    came = [np.full(size, k) for size in range(100, 1000, 20)]
-    kept.append(in_own_pages(came) if sys.argv[1] == "on" else came)
-before = resident()
-dropped = sum(array.nbytes for message in kept[1::2] for array in message)
-del kept[1::2]
-print((before - resident()) / dropped)
-"""
-
-
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="an allocator of glibc's")
-def test_a_message_in_its_own_pages_leaves_no_room_behind() -> None:
-    def returned(setting: str) -> float:
-        done = subprocess.run([sys.executable, "-c", KEPT, setting], capture_output=True, text=True, check=True)
-        return float(done.stdout)
-
-    assert returned("on") > 0.95
-    assert returned("off") < 0.05
-
-
-def test_a_message_in_its_own_pages_is_the_same() -> None:
-    keyframe = Keyframe(
-        kf_id=3,
-        frame_id=7,
-        stamp_ns=11,
-        odom_T_cam=np.eye(4),
-        point_ids=np.arange(5),
-        uv_left=np.random.default_rng(0).normal(size=(5, 2)),
-        uv_right=np.full((5, 2), np.nan),
-        points_cam=np.zeros((5, 3)),
-        descriptors=np.arange(160, dtype=np.uint8).reshape(5, 32),
-    )
-    kept = in_own_pages(keyframe)
-    assert pickle.dumps(kept) == pickle.dumps(keyframe)
-    for name in ("odom_T_cam", "point_ids", "uv_left", "descriptors"):
-        array, before = getattr(kept, name), getattr(keyframe, name)
-        assert array.dtype == before.dtype
-        assert not array.flags.writeable
-        assert array.flags.aligned
-        assert not np.shares_memory(array, before)
-    assert in_own_pages("no array") == "no array"
