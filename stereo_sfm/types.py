@@ -241,8 +241,8 @@ class InertialLink(Message):
 
 
 @dataclass(frozen=True, eq=False)
-class WheelLink(Message):
-    """What the wheels measured since the keyframe before."""
+class MotionLink(Message):
+    """The motion since the keyframe before, by the wheels or by the images between."""
 
     last_T_cam: F64 = field(metadata=shape(4, 4))  # (4, 4) motion of the left camera
     covariance: F64 = field(metadata=shape(6, 6))  # (6, 6) of last_T_cam @ exp(xi), xi = (rho, phi)
@@ -271,7 +271,8 @@ class Keyframe(Message):
     down: F64 = field(default_factory=lambda: np.zeros(3))  # (3,) gravity's direction in this camera, zero: unknown
     down_sigma: float = 0.0  # radians, its standard deviation about each horizontal axis; 0: unknown
     inertial: InertialLink | None = None  # None: no IMU, or one that is left out
-    wheels: WheelLink | None = None  # None: no wheels, samples are missing, or no keyframe before in this submap
+    wheels: MotionLink | None = None  # None: no wheels, samples are missing, or no keyframe before in this submap
+    odometry: MotionLink | None = None  # by the images; None: no keyframe before in this submap
 
     @property
     def described(self) -> bool:

@@ -16,6 +16,8 @@ from stereo_sfm.mapping.pose_only import adjust_pose
 from stereo_sfm.types import F64, I64, Bool, Keyframe
 
 MIN_POSE_POINTS = 10  # known points from which a keyframe's pose is solved before insertion
+# With fewer that agree with it, odometry, which has all tracked points, knows the pose better than the map.
+FEW_POINTS = 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +35,10 @@ def insert_keyframe(map_: Map, rig: Rig, keyframe: Keyframe, guess: F64, config:
         guess: (4, 4) map_T_kf by odometry.
     """
     rows, usable = _identify(map_, keyframe, config)
-    pose = _solve_pose(map_, rig, keyframe, rows, usable & (rows >= 0), guess, config)
-    row = map_.add_keyframe(keyframe, pose, Motion.of(keyframe, rig.imu) if config.sensors else None)
+    pose, agreeing = _solve_pose(map_, rig, keyframe, rows, usable & (rows >= 0), guess, config)
+    few = keyframe.odometry is not None and agreeing < FEW_POINTS
+    pose = guess if few else pose
+    row = map_.add_keyframe(keyframe, pose, Motion.of(keyframe, rig.imu, config.sensors, few))
     matches = np.zeros((0, 2), np.int64)
     if config.association == "map":
         matches = _find_again(map_, rig, keyframe, rows, usable, pose, config)
@@ -67,18 +71,20 @@ def _identify(map_: Map, keyframe: Keyframe, config: MapperConfig) -> tuple[I64,
 
 def _solve_pose(
     map_: Map, rig: Rig, keyframe: Keyframe, rows: I64, known: Bool, guess: F64, config: MapperConfig
-) -> F64:
-    """(4, 4) map_T_kf from the known points; the guess if there are too few."""
+) -> tuple[F64, int]:
+    """(4, 4) map_T_kf from the known points, and how many agree; the guess and 0 if there are too few."""
     known = known.copy()
     known[known] = np.isfinite(map_.points.xyz[rows[known], 0])
     count = int(known.sum())
     if count < MIN_POSE_POINTS:
-        return guess
+        return guess, 0
     rows = rows[known]
     points, uv_left, uv_right = map_.points, keyframe.uv_left[known], keyframe.uv_right[known]
     sigma = points.sigma[rows].astype(float)
     pose, inlier = adjust_pose(rig, guess, points.xyz[rows], uv_left, uv_right, sigma, config.huber_sigmas)
-    return pose if inlier[:, 0].sum() >= max(MIN_POSE_POINTS, count // 2) else guess
+    if inlier[:, 0].sum() < max(MIN_POSE_POINTS, count // 2):
+        return guess, 0
+    return pose, int(np.count_nonzero(inlier[:, 0] & (inlier[:, 1] | ~np.isfinite(uv_right[:, 0]))))
 
 
 def _find_again(

@@ -1,9 +1,9 @@
-"""IMU and wheels in local bundle adjustment: factors between successive keyframes.
+"""Motions in local bundle adjustment, by IMU, wheels and odometry: factors between successive keyframes.
 
 The residuals of preintegrated motions (Forster et al., On-Manifold Preintegration for Real-Time Visual-Inertial
 Odometry, TRO 2017, equation 45), random walks of the biases between them, and at the first keyframe of every chain what
-the tracker's filter knew of velocity, gravity and biases: all earlier samples, marginalised. The wheels' motions are
-relative poses.
+the tracker's filter knew of velocity, gravity and biases: all earlier samples, marginalised. The motions by wheels and
+by odometry are relative poses.
 
 Stereo gives the size of the motion, so velocities, biases and gravity enter linearly. They are eliminated: what is left
 is a quadratic model of the poses, made once a round, as the poses move by millimetres. A motion that the map
@@ -21,9 +21,9 @@ from stereo_sfm.calib.imu import TURN_SHARE, Imu
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.preintegration import GRAVITY, Preintegrated
 from stereo_sfm.mapping.map import Map
-from stereo_sfm.types import F64, I64, Bool, WheelLink
+from stereo_sfm.types import F64, I64, Bool, MotionLink
 
-INERTIAL_CHI2, WHEEL_CHI2 = 21.7, 16.8  # of nine and six: a motion beyond (1 % of right ones) counts less
+INERTIAL_CHI2, POSE_CHI2 = 21.7, 16.8  # of nine and six: a motion beyond (1 % of right ones) counts less
 FIRST_ROUND = 10.0  # times as much is allowed before the poses are adjusted
 SPEED_SIGMA = 10.0  # m/s, where the tracker does not know the velocity
 STATE = 9  # velocity in the map, biases of accelerometer and gyroscope
@@ -42,11 +42,11 @@ class InertialFactors:
 
 
 @dataclass(frozen=True, eq=False)
-class WheelFactors:
-    """Motions by the wheels between nodes."""
+class PoseFactors:
+    """Motions by wheels and by odometry between nodes."""
 
     links: I64  # (L, 2) nodes
-    motions: list[WheelLink]  # (L,)
+    motions: list[MotionLink]  # (L,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +56,7 @@ class MotionFactors:
     rows: I64  # (N,) of each node in the bundle, -1: outside
     world_T_kf: F64  # (N, 4, 4) of the nodes; counts for those outside
     inertial: InertialFactors | None
-    wheels: WheelFactors | None
+    poses: PoseFactors | None
 
     def linearized(self, rot: F64, pos: F64, free: I64, judged: bool) -> MotionModel:
         """The quadratic model at poses (K, 3, 3), (K, 3).
@@ -72,18 +72,18 @@ class MotionFactors:
         slack = 1.0 if judged else FIRST_ROUND
         moving = np.flatnonzero(free >= 0)
         model = MotionModel(rot[moving].copy(), pos[moving].copy(), np.zeros((6 * size,) * 2), np.zeros(6 * size))
-        if self.wheels is not None:
-            _add_wheels(self.wheels, node_rot, node_pos, column, slack * WHEEL_CHI2, model)
+        if self.poses is not None:
+            _add_poses(self.poses, node_rot, node_pos, column, slack * POSE_CHI2, model)
         if self.inertial is not None:
             model.states = _add_inertial(self.inertial, node_rot, node_pos, column, slack * INERTIAL_CHI2, model)
         return model
 
 
 def motion_factors(map_: Map, rows: I64, fixed: Bool, imu: Imu | None) -> MotionFactors | None:
-    """What IMU and wheels measured between the keyframes of a bundle that move and those before and after them.
+    """What is known of the motions between the keyframes of a bundle that move and those before and after them.
 
     Args:
-        rows: (K,) of the bundle in the map. fixed: (K,). imu: None: wheels alone.
+        rows: (K,) of the bundle in the map. fixed: (K,). imu: None: without it.
     """
     if not map_.motions:
         return None
@@ -95,13 +95,13 @@ def motion_factors(map_: Map, rows: I64, fixed: Bool, imu: Imu | None) -> Motion
     nodes, links = np.unique(np.stack([table.previous[later], later], 1), return_inverse=True)
     links, motions = links.reshape(-1, 2), [map_.motions[row] for row in later.tolist()]
     inertial = None if imu is None else _inertial_factors(map_, nodes, links, [m.inertial for m in motions], imu)
-    turning = [k for k, motion in enumerate(motions) if motion.wheels is not None]
-    wheels = WheelFactors(links[turning], [w for m in motions if (w := m.wheels) is not None]) if turning else None
-    if inertial is None and wheels is None:
+    moved = [(k, link) for k, m in enumerate(motions) for link in (m.wheels, m.odometry) if link is not None]
+    poses = PoseFactors(links[[k for k, _ in moved]], [link for _, link in moved]) if moved else None
+    if inertial is None and poses is None:
         return None
     index = np.full(len(table), -1, np.int64)
     index[rows] = np.arange(len(rows))
-    return MotionFactors(index[nodes], table.map_T_kf[nodes], inertial, wheels)
+    return MotionFactors(index[nodes], table.map_T_kf[nodes], inertial, poses)
 
 
 def _inertial_factors(
@@ -192,7 +192,7 @@ def _pose_columns(column: I64) -> I64:
     return np.where(column[..., None] < 0, -1, 6 * column[..., None] + np.arange(6))
 
 
-def _add_wheels(factors: WheelFactors, rot: F64, pos: F64, column: I64, limit: float, model: MotionModel) -> None:
+def _add_poses(factors: PoseFactors, rot: F64, pos: F64, column: I64, limit: float, model: MotionModel) -> None:
     i, j = factors.links.T
     poses = se3.from_rotation_translation(rot, pos)
     seen = se3.inverse(poses[i]) @ poses[j]

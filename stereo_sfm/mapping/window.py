@@ -64,22 +64,22 @@ def covisible_window(map_: Map, row: int, config: MapperConfig, imu: Imu | None 
     """The keyframe, those that share most points with it, and all their points; other keyframes are fixed.
 
     The map's first keyframe is fixed, and so is the oldest keyframe of a part that no fixed keyframe is connected to.
-    Where `config.sensors` is set, the bundle has what IMU and wheels measured between the keyframes.
+    The bundle has what the map knows of the motions between the keyframes (`motions.Motion`).
     """
     others, _ = map_.neighbours(row, config.connected_points)
     if not len(others):
         others, _ = map_.neighbours(row)
     part = _window(map_, np.concatenate([[row], others])[: config.most_keyframes].astype(np.int64), config.most_fixed)
-    return _with_motions(part, map_, config, imu)
+    return _with_motions(part, map_, imu)
 
 
 def newest(map_: Map, first_row: int, most: int, config: MapperConfig, imu: Imu | None = None) -> Window:
     """The newest living keyframes, `most` of them and none before a row, and all their points; others are fixed.
 
-    With sensors as `covisible_window`.
+    With motions as `covisible_window`.
     """
     rows = map_.living_keyframes()
-    return _with_motions(_window(map_, rows[rows >= first_row][-most:], config.most_fixed), map_, config, imu)
+    return _with_motions(_window(map_, rows[rows >= first_row][-most:], config.most_fixed), map_, imu)
 
 
 def whole_map(map_: Map) -> Window:
@@ -87,10 +87,8 @@ def whole_map(map_: Map) -> Window:
     return _window(map_, map_.living_keyframes())
 
 
-def _with_motions(part: Window, map_: Map, config: MapperConfig, imu: Imu | None) -> Window:
-    """What IMU and wheels measured between its keyframes."""
-    if not config.sensors:
-        return part
+def _with_motions(part: Window, map_: Map, imu: Imu | None) -> Window:
+    """The motions between its keyframes."""
     motions = motion_factors(map_, part.kf_rows, part.bundle.fixed, imu)
     return dataclasses.replace(part, bundle=dataclasses.replace(part.bundle, motions=motions))
 

@@ -1,4 +1,4 @@
-"""IMU and wheels between keyframes: GTSAM's factors, joined by the map, a gain for bundle adjustment."""
+"""IMU, wheels and odometry between keyframes: GTSAM's factors, joined by the map, a gain for bundle adjustment."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from stereo_sfm.mapping import window
 from stereo_sfm.mapping.bundle import BundleConfig, bundle_adjust, counted_information
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.mapping.mapper import Mapper
-from stereo_sfm.mapping.motion_factors import InertialFactors, MotionFactors, WheelFactors, motion_factors
+from stereo_sfm.mapping.motion_factors import InertialFactors, MotionFactors, PoseFactors, motion_factors
 from stereo_sfm.mapping.motions import Motion
-from stereo_sfm.types import F64, InertialLink, Keyframe, WheelLink
+from stereo_sfm.types import F64, InertialLink, Keyframe, MotionLink
 from tests.mapping.test_bundle import bundle_of
 from tests.synthetic import KeyframeStream, keyframe_stream, make_scene, pinhole_rig
 
@@ -71,7 +71,7 @@ def link(begin_s: float, end_s: float, noise: np.random.Generator | None = None,
     return InertialLink(np.round(edges * 1e9).astype(np.int64), gyro, accel, state, covariance)
 
 
-def keyframe(k: int, stamp_s: float, inertial: InertialLink | None, wheels: WheelLink | None = None) -> Keyframe:
+def keyframe(k: int, stamp_s: float, inertial: InertialLink | None, wheels: MotionLink | None = None) -> Keyframe:
     none = np.zeros((0, 2))
     pose = imu_pose(stamp_s) @ se3.inverse(IMU.left_T_imu)
     return Keyframe(
@@ -176,8 +176,8 @@ def test_gradient_and_cost_are_those_at_other_poses(kind: str) -> None:
     mine, at = factors(times, rng), poses(times)
     if kind == "wheels":
         moved = se3.inverse(at[:-1]) @ at[1:] @ se3.exp(rng.normal(0, 1e-3, (2, 6)))
-        wheels = [WheelLink(m, np.diag(np.repeat([1e-2, 2e-3], 3) ** 2)) for m in moved]
-        mine = dataclasses.replace(mine, inertial=None, wheels=WheelFactors(np.array([[0, 1], [1, 2]]), wheels))
+        wheels = [MotionLink(m, np.diag(np.repeat([1e-2, 2e-3], 3) ** 2)) for m in moved]
+        mine = dataclasses.replace(mine, inertial=None, poses=PoseFactors(np.array([[0, 1], [1, 2]]), wheels))
     free, step = np.array([-1, 0, 1]), rng.normal(0, 1, (2, 6)) * np.repeat([1e-4, 1e-5], 3)
     there = at.copy()
     there[1:] = at[1:] @ se3.exp(step)
@@ -195,7 +195,7 @@ def test_a_motion_that_the_poses_contradict_counts_less() -> None:
 
     def pull(slip_m: float) -> float:
         moved = true @ se3.exp(np.array([slip_m, 0, 0, 0, 0, 0]))
-        wheels = WheelFactors(np.array([[0, 1]]), [WheelLink(moved, np.diag(np.repeat([1e-2, 1e-2], 3) ** 2))])
+        wheels = PoseFactors(np.array([[0, 1]]), [MotionLink(moved, np.diag(np.repeat([1e-2, 1e-2], 3) ** 2))])
         factors = MotionFactors(np.arange(2), at, None, wheels)
         model = factors.linearized(at[:, :3, :3], at[:, :3, 3], np.array([-1, 0]), True)
         return float(np.linalg.norm(model.g))
@@ -247,7 +247,7 @@ def chain(times: list[float], wheels: bool = True) -> Map:
         turned = None
         if k and wheels:
             before = imu_pose(times[k - 1]) @ se3.inverse(IMU.left_T_imu)
-            turned = WheelLink(se3.inverse(before) @ pose, 1e-4 * np.eye(6))
+            turned = MotionLink(se3.inverse(before) @ pose, 1e-4 * np.eye(6))
         frame = keyframe(k, t, link(times[max(k - 1, 0)] - (0.1 if k == 0 else 0.0), t), turned)
         out.add_keyframe(frame, pose, Motion.of(frame, IMU))
     return out
@@ -275,12 +275,12 @@ def test_a_window_gets_the_motions_to_its_neighbours() -> None:
     map_ = chain([1.0, 1.3, 1.7, 2.0, 2.2])
     rows = np.array([2, 3])
     found = motion_factors(map_, rows, np.array([False, False]), IMU)
-    assert found is not None and found.inertial is not None and found.wheels is not None
+    assert found is not None and found.inertial is not None and found.poses is not None
     assert found.rows.tolist() == [-1, 0, 1, -1]  # the keyframes before and after are outside
     assert found.inertial.links.tolist() == [[0, 1], [1, 2], [2, 3]]
     assert found.inertial.first.tolist() == [0]
     alone = motion_factors(map_, rows, np.array([False, False]), None)
-    assert alone is not None and alone.inertial is None and alone.wheels is not None
+    assert alone is not None and alone.inertial is None and alone.poses is not None
     assert motion_factors(map_, rows, np.array([True, True]), IMU) is None
     assert motion_factors(Map(), np.zeros(0, np.int64), np.zeros(0, bool), IMU) is None
     map_.known_states.clear()
@@ -328,3 +328,43 @@ def test_the_mapper_uses_what_the_keyframes_bring() -> None:
         return float(np.degrees(np.linalg.norm(off, axis=1)).mean())
 
     assert turn_error(True) < 0.5 * turn_error(False)
+
+
+def test_odometry_holds_a_keyframe_that_shares_few_points_with_the_map() -> None:
+    """After a view was covered: the tracker knows the way, of the points of before the map has twelve, with noise."""
+    stamps = [1.0 + 0.25 * k for k in range(8)]
+    sigmas = np.repeat([0.003, 0.002], 3)
+
+    def error(seed: int, odometry: bool) -> float:
+        rng = np.random.default_rng(seed)
+        stream = keyframe_stream(pinhole_rig(), poses(stamps), noise_px=1.0, per_keyframe=120, seed=seed)
+        mapper = Mapper(MapperConfig(final_iterations=0, full_ba_growth=1e3), stream.rig)
+        odom_T_cam = stream.world_T_kf[0]
+        for k, frame in enumerate(stream.keyframes):
+            ids = np.asarray(frame.point_ids).copy()
+            if k >= 4:
+                known = np.flatnonzero(np.isin(ids, stream.keyframes[3].point_ids))
+                ids[np.setdiff1d(np.arange(len(ids)), known[:12])] += 1_000_000
+            moved = None
+            if k:
+                moved = se3.inverse(stream.world_T_kf[k - 1]) @ stream.world_T_kf[k] @ se3.exp(rng.normal(0, sigmas))
+                odom_T_cam = odom_T_cam @ moved
+            link = None if moved is None or not odometry else MotionLink(moved, np.diag(sigmas**2))
+            mapper.step(dataclasses.replace(frame, point_ids=ids, odom_T_cam=odom_T_cam, odometry=link))
+        assert bool(mapper.map.motions) == odometry
+        row = {int(mapper.map.keyframes.kf_id[row]): row for row in mapper.map.living_keyframes()}
+        found = mapper.map.keyframes.map_T_kf[[row[3], row[4]]]
+        true = se3.inverse(stream.world_T_kf[3]) @ stream.world_T_kf[4]
+        return float(se3.extent(se3.inverse(true) @ se3.inverse(found[0]) @ found[1])[0])
+
+    errors = np.array([[error(seed, odometry) for odometry in (True, False)] for seed in range(5)])
+    assert errors[:, 0].mean() < 0.4 * errors[:, 1].mean()
+    assert errors[:, 0].max() < 0.012
+
+
+def test_a_map_that_shares_many_points_needs_no_odometry() -> None:
+    stream = keyframe_stream(pinhole_rig(), poses([1.0 + 0.25 * k for k in range(6)]), noise_px=0.4, per_keyframe=120)
+    mapper = Mapper(MapperConfig(final_iterations=0, full_ba_growth=1e3), stream.rig)
+    for frame in stream.keyframes:
+        mapper.step(dataclasses.replace(frame, odometry=MotionLink(np.eye(4), 1e-6 * np.eye(6))))
+    assert not mapper.map.motions

@@ -4,8 +4,9 @@ While most points agree, all have the same weight. When a group of neighbouring 
 lost, a second motion is estimated from the points that disagree. The camera's motion is the one that is supported by
 the points tracked longest, among those that are plausible after its recent motion. Points that support another motion,
 or that disagree repeatedly as a group, are marked as moving. They are tracked further, so that no new points are added
-on a moving object, but they do not contribute to the pose until they have been static for some frames. Nor do new
-points beside them, or where such points were lost: neither the pose nor the map takes them before they agreed.
+on a moving object, but they do not contribute to the pose until they have been static for a second: somebody who sways
+stands still for a moment, too. Nor do new points beside them, or where such points were lost: neither the pose nor the
+map takes them before they agreed for so long.
 """
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportMissingTypeArgument=false
@@ -30,26 +31,32 @@ WEIGHT_RATIO = 1.05  # by which another motion must outweigh the one that all po
 ALERT_S = 1.0  # for which other motions are searched for after one was seen
 MOVING_NEIGHBOURS, NEIGHBOURS = 3, 6  # a point moves if so many of its nearest neighbours disagree as well
 SAME_DEPTH = 0.3  # logarithm of the ratio of two distances
-STATIC_FRAMES = 4  # successive frames in which a moving point must agree before it is used again
-SUSPECT_FRAMES = 2  # the same for a new point beside moving ones
+STATIC_S, MIN_STATIC_FRAMES = 1.0, 4  # for which a moving point, or a new one beside, must agree before it is used
 
 
-def after_frame(tracks: Tracks, inlier: Bool, moving: Bool, misses_allowed: int, alert: bool) -> tuple[Tracks, Bool]:
+def static_frames(seconds: float) -> int:
+    """Successive frames in which a moving point must agree before it is used, at `seconds` between them."""
+    return max(round(STATIC_S / seconds), MIN_STATIC_FRAMES) if seconds > 0 else MIN_STATIC_FRAMES
+
+
+def after_frame(
+    tracks: Tracks, inlier: Bool, moving: Bool, misses_allowed: int, alert: bool, static: int
+) -> tuple[Tracks, Bool]:
     """Tracks with updated `misses` and `moving`: points that disagree for long are dropped, groups of them marked.
 
     Args:
         inlier: (N,) which points agree with the pose. moving: (N,) which support another motion; (0,): none.
         misses_allowed: successive frames of disagreement.
         alert: whether an object may be moving; if not, nothing is marked.
+        static: frames in which a moving point must agree before it is used again.
 
     Returns:
         The remaining tracks, and their rows as a mask (N,).
     """
-    static = ~tracks.moving
     misses = np.where(inlier, 0, tracks.misses + 1)
-    remaining = np.where(inlier, tracks.misses - 1, STATIC_FRAMES)
-    tracks.misses = np.where(static, misses, remaining).astype(np.int32)
-    out = static & (tracks.misses >= misses_allowed)
+    remaining = np.where(inlier, tracks.misses - 1, static)
+    tracks.misses = np.where(tracks.moving, remaining, misses).astype(np.int32)
+    out = ~tracks.moving & (tracks.misses >= misses_allowed)
     disagree = tracks.moving | (tracks.misses > 0)
     group = np.zeros(len(tracks), bool)
     rows = np.flatnonzero(out) if alert else np.zeros(0, np.int64)
@@ -57,8 +64,8 @@ def after_frame(tracks: Tracks, inlier: Bool, moving: Bool, misses_allowed: int,
         _marked_neighbours(tracks.uv[rows], tracks.rho[rows], tracks.uv, tracks.rho, disagree) > MOVING_NEIGHBOURS
     )
     if len(moving):
-        group |= moving & static
-    tracks.misses[group] = STATIC_FRAMES
+        group |= moving & ~tracks.moving
+    tracks.misses[group] = static
     tracks.moving = (tracks.moving | group) & (tracks.misses > 0)
     kept = ~out | group
     return tracks.keep(kept), kept
@@ -74,12 +81,17 @@ class Movers:
         self._uv: F64 = np.zeros((0, 2))  # px, where points were lost
         self._rho: F64 = np.zeros(0)  # 1/m
         self._stamp_ns: I64 = np.zeros(0, np.int64)
+        self.static = MIN_STATIC_FRAMES  # frames in which a point beside must agree before it is used
 
-    def update(self, before: Tracks, after: Tracks, stamp_ns: int) -> None:
-        """Remember the points that moved in the last image and are not in the tracks `after` it."""
+    def update(self, before: Tracks, after: Tracks, stamp_ns: int, static: int) -> None:
+        """Remember the points that moved in the last image and are not in the tracks `after` it.
+
+        `static`: frames in which moving points must agree before they are used.
+        """
+        self.static = static
         if not (len(self._rho) or before.moving.any()):
             return
-        moved = before.moving & (before.misses == STATIC_FRAMES) & (before.age > 0)
+        moved = before.moving & (before.misses == static) & (before.age > 0)
         lost = moved & ~np.isin(before.point_ids, after.point_ids)
         recent = self._stamp_ns > stamp_ns - int(ALERT_S * 1e9)
         self._uv = np.concatenate([self._uv[recent], before.uv[lost]])

@@ -46,6 +46,10 @@ USUAL_LIKELIHOOD = 0.6  # about one standard deviation; of a pose less likely th
 # A map update moves its points together, and the pose with them: so many points of the map that agree, of those that
 # are static and of an unobstructed view, are believed whatever the motion.
 UNDIVIDED_SHARE, UNDIVIDED_OPEN = 0.8, 0.3
+# New points on somebody near who hardly moves take a pose along before any is an outlier. Where so many of the six
+# degrees of freedom rest on new points, or so many with errors above this are beside each other, they are compared with
+# the pose by the settled points alone.
+YOUNG_FREEDOMS, SUSPECT_ERROR, SUSPECTS = 2.0, 1.5, MIN_GROUP // 2
 NO_PRIOR = np.full(6, np.inf)
 CONFIRMED_SHARE = 0.75  # of the points of the map that are in view
 MOST_FREEDOMS = 1.0  # of the six of a pose that may rest on one point
@@ -158,6 +162,42 @@ class FramePoseSolver:
         if np.count_nonzero(static) < self._config.min_features:
             return _no_pose(len(tracks), "too_few_points")
         best = self._solve_all(tracks, expected, last_pose, static)
+        contradicted = self._contradicted(tracks, expected, best)
+        if contradicted is None:
+            return self._judge(tracks, expected, last_pose, best, before)
+        best, group = contradicted
+        solution = self._judge(tracks, expected, last_pose, best, before)
+        group &= ~solution.inlier
+        return replace(solution, moving=solution.moving | group if len(solution.moving) else group)
+
+    def _contradicted(
+        self, tracks: Tracks, expected: ExpectedMotion, best: PoseSolution
+    ) -> tuple[PoseSolution, Bool] | None:
+        """The pose without new points that the settled ones contradict, and (N,) the groups of these; None: none."""
+        static = ~tracks.moving
+        settled = static & (tracks.age * expected.seconds >= SETTLED_S)
+        young = static & ~settled
+        if best.reason or young.sum() < MIN_GROUP or settled.sum() < 2 * self._config.min_features:
+            return None
+        if np.count_nonzero(in_group(tracks, young & (best.error > SUSPECT_ERROR))) < SUSPECTS:
+            agree = young & best.inlier
+            if self._influence(tracks.keep(agree), best)[0].sum() < YOUNG_FREEDOMS:
+                return None
+        by_settled = self._optimise(tracks, expected.to(best.pose), settled)
+        if by_settled.inlier[settled].sum() < AGREEING_SHARE * settled.sum():
+            return None
+        wrong = np.zeros(len(tracks), bool)
+        wrong[young] = self._influence(tracks.keep(young), by_settled)[1] > self._config.max_error_sigmas
+        group = in_group(tracks, wrong)
+        if np.count_nonzero(group) < SUSPECTS:
+            return None
+        return self._optimise(tracks, expected.to(by_settled.pose), static & ~wrong), group
+
+    def _judge(
+        self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, best: PoseSolution, before: int
+    ) -> PoseSolution:
+        """The pose by all points, or the motion that is the camera's if objects move; none if too few show it."""
+        static = ~tracks.moving
         rest = static & ~best.inlier
         undisturbed = np.count_nonzero(in_group(tracks, rest)) < MIN_GROUP and best.inliers >= AGREEING_SHARE * before
         usual = self._likelihood(best.pose, expected) > USUAL_LIKELIHOOD

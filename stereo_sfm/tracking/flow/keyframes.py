@@ -19,11 +19,14 @@ from stereo_sfm.tracking.flow.rolling_shutter import RollingShutter
 from stereo_sfm.tracking.flow.side_views import SideViews
 from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.tracking.inertial.motion_sensors import MotionSensors
-from stereo_sfm.types import F64, Corners, Keyframe, StereoImage
+from stereo_sfm.types import F64, Corners, Keyframe, MotionLink, StereoImage
 
 SPACING = 1.0 - 1.0 / SCALE, 0.1  # between described places: share of their distance (one level of scale), radians
 FIRST = 4  # keyframes of a submap that are described in any case: by them it joins the others
 CORRELATED_S = 5.0  # for which the error of gravity's direction stays about the same
+# Odometry between keyframes: pixels err together, so that poses are less certain than their points say, and points that
+# are no longer seen took their errors along: metres and radians, at least.
+ODOMETRY_SIGMAS, MIN_ODOMETRY_SIGMAS = 2.0, (0.003, 0.002)
 
 
 class Keyframes:
@@ -44,6 +47,7 @@ class Keyframes:
         self.count = 0
         self.points = 0  # static points of the newest keyframe, with new ones
         self._pose: F64 = np.eye(4)  # odom_T_cam of the newest keyframe
+        self._covariance: F64 = np.zeros((6, 6))  # of it
         self._frames_since = 0
         self._stamp_ns, self._submap_id = 0, -1  # of the newest keyframe
 
@@ -72,6 +76,7 @@ class Keyframes:
         self,
         image: StereoImage,
         odom_T_cam: F64,
+        covariance: F64,
         submap_id: int,
         rig_terms: F64,
         sensors: MotionSensors | None = None,
@@ -79,7 +84,8 @@ class Keyframes:
         """A keyframe of an image, without points: see `describe`.
 
         Args:
-            odom_T_cam: (4, 4), which the sensors have accepted. rig_terms: (8,) current correction of the rig.
+            odom_T_cam: (4, 4), which the sensors have accepted. covariance: (6, 6) of it. rig_terms: (8,) current
+                correction of the rig.
         """
         keyframe = Keyframe(
             kf_id=self.count,
@@ -93,11 +99,20 @@ class Keyframes:
             descriptors=np.zeros((0, 32), np.uint8),
             submap_id=submap_id,
             rig_terms=rig_terms.copy(),
+            odometry=self._moved(odom_T_cam, covariance) if submap_id == self._submap_id else None,
             **({} if sensors is None else self._measured(sensors, image.stamp_ns, odom_T_cam, submap_id)),
         )
         self._stamp_ns, self._submap_id = image.stamp_ns, submap_id
-        self.count, self._pose, self._frames_since = self.count + 1, odom_T_cam.copy(), 0
+        self.count, self._frames_since = self.count + 1, 0
+        self._pose, self._covariance = odom_T_cam.copy(), covariance.copy()
         return keyframe
+
+    def _moved(self, odom_T_cam: F64, covariance: F64) -> MotionLink:
+        """The motion from the newest keyframe to a pose (4, 4) with covariance (6, 6)."""
+        last_T_cam = se3.inverse(self._pose) @ odom_T_cam
+        into = se3.adjoint(se3.inverse(last_T_cam))
+        least = np.diag(np.repeat(np.square(MIN_ODOMETRY_SIGMAS), 3))
+        return MotionLink(last_T_cam, ODOMETRY_SIGMAS**2 * (into @ self._covariance @ into.T + covariance) + least)
 
     def _measured(self, sensors: MotionSensors, stamp_ns: int, odom_T_cam: F64, submap_id: int) -> dict[str, Any]:
         """The fields of gravity and of what the sensors measured since the keyframe before.

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from stereo_sfm.config import TrackerConfig
-from stereo_sfm.tracking.flow.consensus import SUSPECT_FRAMES, Movers
+from stereo_sfm.tracking.flow.consensus import Movers
 from stereo_sfm.tracking.flow.corners import detect_corners
 from stereo_sfm.tracking.flow.follower import Follower
 from stereo_sfm.tracking.flow.pyramids import StereoPyramids
@@ -60,7 +60,7 @@ class NewPoints:
                 rho=rho,
                 variance=match.variance[new],
                 age=np.zeros(n, np.int32),
-                misses=np.where(moving, SUSPECT_FRAMES, 0).astype(np.int32),
+                misses=np.where(moving, self._movers.static, 0).astype(np.int32),
                 moving=moving,
                 warp=np.tile(np.eye(2), (n, 1, 1)),
                 slot=slots,

@@ -22,7 +22,7 @@ from stereo_sfm.geometry.order_statistics import median
 from stereo_sfm.pixels import DARK
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.tracking.flow import klt
-from stereo_sfm.tracking.flow.consensus import Movers, after_frame
+from stereo_sfm.tracking.flow.consensus import Movers, after_frame, static_frames
 from stereo_sfm.tracking.flow.follower import Follower
 from stereo_sfm.tracking.flow.frame_pose import ExpectedMotion, FramePoseSolver, PoseSolution
 from stereo_sfm.tracking.flow.keyframes import Keyframes
@@ -155,7 +155,7 @@ class Tracker:
         uncertain = self._part.uncertain(self._follower.held, solution.covariance, image.stamp_ns)
         if self._recovery.free or not uncertain:
             if recovered or self._keyframes.due(self._tracks):
-                keyframe = self._create_keyframe(image, images, trusted)
+                keyframe = self._create_keyframe(image, images, solution.covariance, trusted)
             if keyframe is not None or self._solver.crowded(self._static_count()):
                 self._sparse = images
         state = TrackState.RECOVERED if recovered else TrackState.OK
@@ -279,8 +279,9 @@ class Tracker:
             self._velocity = self._recovery.motion.velocity()
         inlier = solution.inlier & ~tracks.moving
         tracks.age = tracks.age + np.int32(1)
-        tracks, kept = after_frame(tracks, solution.inlier, solution.moving, MAX_MISSES, self._solver.alert)
-        self._movers.update(self._tracks, tracks, image.stamp_ns)
+        static = static_frames(seconds)
+        tracks, kept = after_frame(tracks, solution.inlier, solution.moving, MAX_MISSES, self._solver.alert, static)
+        self._movers.update(self._tracks, tracks, image.stamp_ns, static)
         self._continue(image, images, solution.pose, tracks)
         if self._sensors is not None:
             self._sensors.accept(image.stamp_ns, solution.pose)
@@ -310,7 +311,7 @@ class Tracker:
             state, covariance = (state, UNKNOWN_COVARIANCE) if bridge is None else (TrackState.INERTIAL, bridge[1])
             return self._frame(image, self._pose, covariance, state, "too_few_points"), None
         first = self._keyframes.count == 0
-        keyframe = self._create_keyframe(image, images, True)
+        keyframe = self._create_keyframe(image, images, FIRST_COVARIANCE if bridge is None else bridge[1], True)
         self._recovery.motion.add(image.stamp_ns, self._pose)
         self._follower.forget()
         self._follower.hold(images, self._tracks, ~self._tracks.moving, self._pose)
@@ -444,9 +445,11 @@ class Tracker:
         """Number of tracked points that are not on moving objects."""
         return int(np.count_nonzero(~self._tracks.moving))
 
-    def _create_keyframe(self, image: StereoImage, images: StereoPyramids, trusted: bool) -> Keyframe:
-        """A keyframe of the image whose pose has just been found."""
-        keyframe = self._keyframes.create(image, self._pose, self._submap_id, self._rig_terms, self._sensors)
+    def _create_keyframe(self, image: StereoImage, images: StereoPyramids, covariance: F64, trusted: bool) -> Keyframe:
+        """A keyframe of the image whose pose, with covariance (6, 6), has just been found."""
+        keyframe = self._keyframes.create(
+            image, self._pose, covariance, self._submap_id, self._rig_terms, self._sensors
+        )
         self._keyframes.points = self._static_count()
         self._undescribed = keyframe, images, trusted
         return keyframe

@@ -11,7 +11,7 @@ from stereo_sfm.tracking.inertial.dead_reckoning import DeadReckoning
 from stereo_sfm.tracking.inertial.inertial_motion import InertialMotion, roll_pitch_deg
 from stereo_sfm.tracking.inertial.rest import Rest
 from stereo_sfm.tracking.inertial.wheel_motion import LINK_NS, WheelMotion
-from stereo_sfm.types import F64, InertialLink, StereoImage, WheelLink
+from stereo_sfm.types import F64, InertialLink, MotionLink, StereoImage
 
 SHORT_S = 0.2  # over which the IMU alone is as good as with the wheels
 INERTIAL_S, WHEEL_S = 10.0, 30.0  # longest time without images, by the IMU alone and with wheels
@@ -134,7 +134,7 @@ class MotionSensors:
         """Its direction in the camera (4, 4), (3,), and how accurate that is, radians; None while it is not known."""
         return None if self._inertial is None else self._inertial.gravity(odom_T_cam)
 
-    def links(self, begin_ns: int, stamp_ns: int) -> tuple[InertialLink | None, WheelLink | None]:
+    def links(self, begin_ns: int, stamp_ns: int) -> tuple[InertialLink | None, MotionLink | None]:
         """What they measured between the stamps of two keyframes, of which the later has the newest pose; the same
         stamp twice where there is none before in the submap."""
         inertial, wheels = self._inertial, self._wheels

@@ -12,7 +12,7 @@ from stereo_sfm.tracking.inertial.inertial_motion import Turning
 from stereo_sfm.tracking.inertial.rest import STILL_NS
 from stereo_sfm.tracking.inertial.series import Series
 from stereo_sfm.tracking.inertial.wheel_window import WheelCorrection, WheelWindow
-from stereo_sfm.types import F64, WheelLink, WheelSamples
+from stereo_sfm.types import F64, MotionLink, WheelSamples
 
 MAX_GAP_S = 0.25  # between samples: longer ones are not bridged
 LINK_NS = 500_000_000  # of the comparison with the images
@@ -133,7 +133,7 @@ class WheelMotion:
         left_T_wheel = self._wheel.left_T_wheel
         return self._odom_T_last @ se3.inverse(left_T_wheel) @ link.last_T_cam, link.covariance
 
-    def link(self, begin_ns: int, stamp_ns: int) -> WheelLink | None:
+    def link(self, begin_ns: int, stamp_ns: int) -> MotionLink | None:
         """The motion of the camera from one time to another; None where samples are missing, or the wheels contradict
         the images."""
         motion = None if self.left_out else self._by_wheels(begin_ns, stamp_ns)
@@ -145,7 +145,7 @@ class WheelMotion:
         end_R_begin[3:, 3:] = np.eye(3)
         left_T_wheel = self._wheel.left_T_wheel
         into = se3.adjoint(left_T_wheel) @ end_R_begin
-        return WheelLink(left_T_wheel @ moved @ se3.inverse(left_T_wheel), into @ covariance @ into.T)
+        return MotionLink(left_T_wheel @ moved @ se3.inverse(left_T_wheel), into @ covariance @ into.T)
 
     def _by_wheels(self, begin_ns: int, stamp_ns: int) -> TwistMotion | None:
         edges = self._series.edges(begin_ns, stamp_ns)
