@@ -23,6 +23,7 @@ SPEED_NS = 1_000_000_000  # time before a gap over which it is measured
 KNOWN_PATHS = 4096  # that are remembered
 FIRST_FORGOTTEN = 1024  # keyframes, at which some are forgotten for the first time
 NEWEST_KEYFRAMES, NEWEST_LOOPS = 128, 256  # that stay, candidates or not
+BETWEEN_CHAINS = 64  # newest loops between two chains that stay
 AROUND_A_GAP = 10  # keyframes before a gap in tracking that stay, for the velocity there
 HOP_METRES = 1e-6  # added to each edge, so that of equally long paths the one with fewer edges is chosen
 
@@ -112,7 +113,7 @@ class KeyframeGraph:
         """Forget keyframes that are no candidates, when there are many: a robot may go round all day.
 
         The ends of loops stay, and with them what connects the candidates: of loops to keyframes that are no candidates
-        any more the newest, and those between parts of the odometry.
+        any more the newest, and the newest between any two parts of the odometry.
 
         Returns:
             Rows that stay, of all so far; None: all of them.
@@ -122,7 +123,7 @@ class KeyframeGraph:
         if count < self._forget_at:
             return None
         a, b = loops.ends.T
-        needed = (nodes.kept[a] & nodes.kept[b]) | (nodes.chain[a] != nodes.chain[b])
+        needed = (nodes.kept[a] & nodes.kept[b]) | _newest_between(nodes.chain[a], nodes.chain[b])
         needed |= np.arange(len(loops)) >= len(loops) - NEWEST_LOOPS
         stay = nodes.kept | (np.arange(count) >= count - NEWEST_KEYFRAMES)
         stay[loops.ends[needed].ravel()] = True
@@ -254,6 +255,15 @@ class KeyframeGraph:
             a_T_b = a_T_b @ (p_T_q if forward else se3.inverse(p_T_q))
             total += float(metres[k])
         return GraphPath(a_T_b, total)
+
+
+def _newest_between(a: I64, b: I64) -> Bool:
+    """(L,) which of loops between chains (L,) and (L,), in order of time, are the newest between two different ones."""
+    _, pair = np.unique(np.stack([np.minimum(a, b), np.maximum(a, b)], 1), axis=0, return_inverse=True)
+    order = np.argsort(pair.ravel(), kind="stable")
+    later = np.empty(len(a), np.int64)  # loops between the same two that came later
+    later[order] = np.cumsum(np.bincount(pair.ravel()))[pair.ravel()[order]] - 1 - np.arange(len(a))
+    return (a != b) & (later < BETWEEN_CHAINS)
 
 
 def _shortest_of_each_pair(ends: I64, metres: F64) -> I64:

@@ -132,6 +132,26 @@ def test_keyframes_that_are_no_candidates_are_forgotten_and_paths_between_the_ot
     assert graph.unbroken(k - 50, k) and not graph.unbroken(3, k)
 
 
+def test_a_day_of_loops_to_an_earlier_part_of_the_odometry_needs_no_more_room() -> None:
+    """A saved map, and round and round in it: every loop joins two parts of the odometry."""
+    graph, lap = KeyframeGraph(), 40
+    rows = list[int]()
+    for k in range(250 * lap):
+        graph.add(k, at(0.5 * (k % lap), 2 * np.pi * (k % lap) / lap), k >= lap, 10**8 * k)
+        if k >= lap:
+            graph.exclude(k)
+            if k % 4 == 0:
+                graph.add_loop(k % lap, k, at(0.0))
+        graph.forget()
+        rows.append(len(graph.around(k)[0]))
+    assert max(rows[len(rows) // 2 :]) <= max(rows[: len(rows) // 2]) < 2 * FIRST_FORGOTTEN
+    path = graph.path(5, k)
+    assert path is not None
+    np.testing.assert_allclose(
+        path.a_T_b, se3.inverse(at(2.5, 2 * np.pi * 5 / lap)) @ at(19.5, 2 * np.pi * 39 / lap), atol=1e-9
+    )
+
+
 def test_the_gap_is_symmetric() -> None:
     graph = broken(1.0)
     there, back = graph.gap_motion(3, 6, at(2.7)), graph.gap_motion(6, 3, at(-2.7))
