@@ -46,10 +46,10 @@ USUAL_LIKELIHOOD = 0.6  # about one standard deviation; of a pose less likely th
 # A map update moves its points together, and the pose with them: so many points of the map that agree, of those that
 # are static and of an unobstructed view, are believed whatever the motion.
 UNDIVIDED_SHARE, UNDIVIDED_OPEN = 0.8, 0.3
-# New points on somebody near who hardly moves take a pose along before any is an outlier. Where so many of the six
-# degrees of freedom rest on new points, or so many with errors above this are beside each other, they are compared with
-# the pose by the settled points alone.
-YOUNG_FREEDOMS, SUSPECT_ERROR, SUSPECTS = 2.0, 1.5, MIN_GROUP // 2
+# New points on somebody near who hardly moves take a pose along before any is an outlier. Where those that are nearer
+# than the settled ones by this factor pull it away by so many squared sigmas (1 % of six degrees of freedom), they are
+# compared with the pose by the settled ones alone.
+NEARER, PULL_CHI2, FEWEST_WRONG = 1.5, 16.8, MIN_GROUP // 2
 NO_PRIOR = np.full(6, np.inf)
 CONFIRMED_SHARE = 0.75  # of the points of the map that are in view
 MOST_FREEDOMS = 1.0  # of the six of a pose that may rest on one point
@@ -173,23 +173,21 @@ class FramePoseSolver:
     def _contradicted(
         self, tracks: Tracks, expected: ExpectedMotion, best: PoseSolution
     ) -> tuple[PoseSolution, Bool] | None:
-        """The pose without new points that the settled ones contradict, and (N,) the groups of these; None: none."""
+        """The pose without near new points that the settled ones contradict, and (N,) their groups; None: none."""
         static = ~tracks.moving
         settled = static & (tracks.age * expected.seconds >= SETTLED_S)
-        young = static & ~settled
-        if best.reason or young.sum() < MIN_GROUP or settled.sum() < 2 * self._config.min_features:
+        if best.reason or np.count_nonzero(settled) < 2 * self._config.min_features:
             return None
-        if np.count_nonzero(in_group(tracks, young & (best.error > SUSPECT_ERROR))) < SUSPECTS:
-            agree = young & best.inlier
-            if self._influence(tracks.keep(agree), best)[0].sum() < YOUNG_FREEDOMS:
-                return None
+        near = static & ~settled & (tracks.age > 0) & (tracks.rho > NEARER * median(tracks.rho[settled]))
+        if np.count_nonzero(near) < MIN_GROUP or self._pull(tracks.keep(near), best) < PULL_CHI2:
+            return None
         by_settled = self._optimise(tracks, expected.to(best.pose), settled)
         if by_settled.inlier[settled].sum() < AGREEING_SHARE * settled.sum():
             return None
         wrong = np.zeros(len(tracks), bool)
-        wrong[young] = self._influence(tracks.keep(young), by_settled)[1] > self._config.max_error_sigmas
+        wrong[near] = self._influence(tracks.keep(near), by_settled)[1] > self._config.max_error_sigmas
         group = in_group(tracks, wrong)
-        if np.count_nonzero(group) < SUSPECTS:
+        if np.count_nonzero(group) < FEWEST_WRONG:
             return None
         return self._optimise(tracks, expected.to(by_settled.pose), static & ~wrong), group
 
@@ -410,6 +408,23 @@ class FramePoseSolver:
             tracks.direction, tracks.rho, tracks.variance, tracks.uv, tracks.uv_right, self._cameras.cams,
             self._cameras.right_T_left, solution.sigma_px, CAUCHY_SCALES[-1],
         )  # fmt: skip
+
+    def _pull(self, tracks: Tracks, solution: PoseSolution) -> float:
+        """How far from a pose the other points alone would have it, in squared sigmas; inf if it rests on these.
+
+        To first order: at a pose by all, the gradients of these and of the others cancel each other.
+        """
+        rows = self._shutter.row_seconds(tracks.uv)
+        size, n = 12 if len(rows) else 6, len(tracks)
+        normal, rhs = np.zeros((size, size)), np.zeros(size)
+        pose_solver.normal_equations(
+            solution.pose, solution.velocity, rows, tracks.origin, tracks.direction, tracks.rho, tracks.variance,
+            tracks.rho, tracks.uv, tracks.uv_right, self._cameras.cams, self._cameras.right_T_left, solution.sigma_px,
+            CAUCHY_SCALES[-1], normal, rhs, np.empty(n), np.empty((n, 7)),
+        )  # fmt: skip
+        rest = np.linalg.inv(solution.covariance) - normal[:6, :6]
+        pull = float(rhs[:6] @ np.linalg.solve(rest, rhs[:6])) if np.linalg.det(rest) > 0.0 else math.inf
+        return pull if pull >= 0.0 else math.inf
 
     def _optimise_all(self, tracks: Tracks, start: ExpectedMotion, prior: ExpectedMotion | None) -> PoseSolution:
         sigma_px = self._config.sigma_px * self._noise

@@ -81,7 +81,7 @@ def point_residuals(pose, px, py, pz, dx, dy, dz, uv_l, uv_r, cams, right_T_left
 
 
 @njit
-def _normal_equations(
+def normal_equations(
     pose, velocity, row_s, origin, direction, prior, variance, rho, uv_l, uv_r, cams, right_T_left, sigma, scale,
     normal, rhs, error, elimination,
 ):  # fmt: skip
@@ -227,7 +227,7 @@ def optimise_pose(
     prior, rho, elimination = rho, rho.copy(), np.zeros((len(rho), 7))
     for step in range(len(scales) + 1):  # the last pass is for errors and covariance
         scale = scales[min(step, len(scales) - 1)]
-        used = _normal_equations(
+        used = normal_equations(
             pose, velocity, row_s, origin, direction, prior, variance, rho, uv_l, uv_r, cams, right_T_left, sigma,
             scale, normal, rhs, error, elimination,
         )  # fmt: skip
@@ -268,7 +268,7 @@ def row_residuals(
 ):  # fmt: skip
     """`point_residuals` of point k, with the camera where it was when the point's row was exposed.
 
-    `_normal_equations` has this written out: it runs several times a frame, and the call would cost it half its time.
+    `normal_equations` has this written out: it runs several times a frame, and the call would cost it half its time.
 
     Args:
         pose, velocity, row_s, origin, direction, rho, uv_l, uv_r, cams, right_T_left: as of `optimise_pose`.
