@@ -179,7 +179,7 @@ class FramePoseSolver:
         if best.reason or np.count_nonzero(settled) < 2 * self._config.min_features:
             return None
         near = static & ~settled & (tracks.age > 0) & (tracks.rho > NEARER * median(tracks.rho[settled]))
-        if np.count_nonzero(near) < MIN_GROUP or self._pull(tracks.keep(near), best) < PULL_CHI2:
+        if np.count_nonzero(near) < MIN_GROUP or self.pull(tracks.keep(near), best) < PULL_CHI2:
             return None
         by_settled = self._optimise(tracks, expected.to(best.pose), settled)
         if by_settled.inlier[settled].sum() < AGREEING_SHARE * settled.sum():
@@ -409,7 +409,7 @@ class FramePoseSolver:
             self._cameras.right_T_left, solution.sigma_px, CAUCHY_SCALES[-1],
         )  # fmt: skip
 
-    def _pull(self, tracks: Tracks, solution: PoseSolution) -> float:
+    def pull(self, tracks: Tracks, solution: PoseSolution) -> float:
         """How far from a pose the other points alone would have it, in squared sigmas; inf if it rests on these.
 
         To first order: at a pose by all, the gradients of these and of the others cancel each other.
