@@ -414,6 +414,8 @@ class FramePoseSolver:
 
         To first order: at a pose by all, the gradients of these and of the others cancel each other.
         """
+        if not np.isfinite(solution.covariance).all():
+            return math.inf
         rows = self._shutter.row_seconds(tracks.uv)
         size, n = 12 if len(rows) else 6, len(tracks)
         normal, rhs = np.zeros((size, size)), np.zeros(size)
