@@ -260,9 +260,10 @@ class KeyframeGraph:
 def _newest_between(a: I64, b: I64) -> Bool:
     """(L,) which of loops between chains (L,) and (L,), in order of time, are the newest between two different ones."""
     _, pair = np.unique(np.stack([np.minimum(a, b), np.maximum(a, b)], 1), axis=0, return_inverse=True)
-    order = np.argsort(pair.ravel(), kind="stable")
+    pair = pair.ravel()
+    order = np.argsort(pair, kind="stable")
     later = np.empty(len(a), np.int64)  # loops between the same two that came later
-    later[order] = np.cumsum(np.bincount(pair.ravel()))[pair.ravel()[order]] - 1 - np.arange(len(a))
+    later[order] = np.cumsum(np.bincount(pair))[pair[order]] - 1 - np.arange(len(a))
     return (a != b) & (later < BETWEEN_CHAINS)
 
 

@@ -311,12 +311,12 @@ class Tracker:
             state, covariance = (state, UNKNOWN_COVARIANCE) if bridge is None else (TrackState.INERTIAL, bridge[1])
             return self._frame(image, self._pose, covariance, state, "too_few_points"), None
         first = self._keyframes.count == 0
-        keyframe = self._create_keyframe(image, images, FIRST_COVARIANCE if bridge is None else bridge[1], True)
+        covariance = FIRST_COVARIANCE if bridge is None else bridge[1]
+        keyframe = self._create_keyframe(image, images, covariance, True)
         self._recovery.motion.add(image.stamp_ns, self._pose)
         self._follower.forget()
         self._follower.hold(images, self._tracks, ~self._tracks.moving, self._pose)
         state = TrackState.OK if first else TrackState.RECOVERED if self._bridging else TrackState.RESTARTED
-        covariance = FIRST_COVARIANCE if bridge is None else bridge[1]
         self._bridging = False
         if self._sensors is not None:
             self._sensors.begin(image.stamp_ns, self._pose)
