@@ -138,8 +138,11 @@ def test_a_person_who_steps_aside_slowly_does_not_shift_the_pose(seed: int) -> N
     assert not solution.moving[~on_person].any()
 
 
-def before_one_wall(rng: np.random.Generator) -> tuple[Tracks, Bool]:
-    """Points of a wall, before which a turn looks like a shift, and new ones on somebody near who sways: 8 mm."""
+def before_one_wall(rng: np.random.Generator, age: int = 1) -> tuple[Tracks, Bool]:
+    """Points of a wall, before which a turn looks like a shift, and newer ones on somebody near who sways: 8 mm.
+
+    `age`: frames for which these were tracked.
+    """
     store = rng.uniform([-1.6, -1.0, 2.2], [1.6, 1.0, 3.6], (220, 3))
     store = store[(np.abs(store[:, :2] / store[:, 2:]) > [0.22, 0.32]).any(axis=1)][:170]  # not hidden
     person = rng.uniform([-0.2, -0.3, 0.9], [0.2, 0.3, 1.0], (17, 3))
@@ -153,18 +156,19 @@ def before_one_wall(rng: np.random.Generator) -> tuple[Tracks, Bool]:
     tracks.direction, tracks.rho = before / distance[:, None], 1 / distance
     tracks.variance = np.square(0.002 / distance)
     young = on_person | (np.arange(len(before)) < 40)
-    tracks.age, tracks.mapped = np.where(young, 1, 20).astype(np.int32), ~young
+    tracks.age, tracks.mapped = np.where(young, age, 20).astype(np.int32), ~young
     tracks.uv = RIG.left.project(now) + rng.normal(0, 0.25, (len(now), 2))
     right = RIG.right.project(se3.transform(se3.inverse(RIG.left_T_right), now))
     tracks.uv_right = right + rng.normal(0, 0.25, (len(now), 2))
     return tracks, on_person
 
 
-def test_new_points_on_somebody_who_sways_do_not_take_the_pose_along(monkeypatch: pytest.MonkeyPatch) -> None:
-    """None of them is an outlier at the pose that they have shifted."""
+@pytest.mark.parametrize("age", [1, 10])
+def test_new_points_on_somebody_who_sways_do_not_take_the_pose_along(monkeypatch: pytest.MonkeyPatch, age: int) -> None:
+    """None of them is an outlier at the pose that they have shifted, for less than a second."""
     errors = list[tuple[float, float]]()
     for seed in range(40):
-        tracks, on_person = before_one_wall(np.random.default_rng(seed))
+        tracks, on_person = before_one_wall(np.random.default_rng(seed), age)
         solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
         expected = ExpectedMotion(MOVED @ se3.exp(np.full(6, 0.001)), se3.log(MOVED), SECONDS)
         solution = solver.solve(tracks, expected, np.eye(4), before=len(tracks))
@@ -175,6 +179,20 @@ def test_new_points_on_somebody_who_sways_do_not_take_the_pose_along(monkeypatch
     found, taken_along = np.array(errors).T
     assert np.count_nonzero(taken_along > 0.003) >= 5
     assert found.max() < 0.003
+
+
+def test_new_points_among_moving_ones_are_not_believed_where_the_pose_rests_on_them() -> None:
+    """Too few for a group: on somebody near, all of whose other points are marked."""
+    mended = 0
+    for seed in range(10):
+        tracks, on_person = before_one_wall(np.random.default_rng(seed))
+        tracks.moving = on_person & (np.arange(len(tracks)) < len(tracks) - 6)
+        solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
+        start = ExpectedMotion(MOVED @ se3.exp(np.full(6, 0.001)), se3.log(MOVED), SECONDS)
+        taken_along = solver._solve_all(tracks, start, np.eye(4), ~tracks.moving)  # pyright: ignore[reportPrivateUsage]
+        assert off(taken_along.pose) > 0.003
+        mended += off(solver.solve(tracks, start, np.eye(4), before=len(tracks)).pose) < 0.003
+    assert mended >= 6
 
 
 def few_points(rng: np.random.Generator, moved: F64) -> Tracks:
@@ -334,6 +352,8 @@ def test_a_group_that_disagrees_is_marked_and_tracked_further() -> None:
     begun = Movers().near(tracks.uv, tracks.rho, tracks)
     assert begun[on_person].mean() > 0.9
     assert begun[~on_person].mean() < 0.1
+    assert Movers().near(tracks.uv, tracks.rho, tracks, 1)[begun].all()
+    assert not Movers().near(tracks.uv, tracks.rho, tracks, 7).any()  # of six neighbours
     for _ in range(STATIC):
         tracks, _ = after_frame(tracks, np.ones(len(tracks), bool), NONE, 3, alert=True, static=STATIC)
     assert not tracks.moving.any()

@@ -233,10 +233,15 @@ def test_a_pose_from_a_part_of_the_view_is_found_anew_once_more_is_free() -> Non
     assert part.improved(np.eye(4), near, 0.6, more)
     assert not part.improved(np.eye(4), near, 0.6, few)
     assert not part.improved(np.eye(4), near, 0.5, more)
-    assert not part.improved(np.eye(4), far, 0.9, more)
+    assert part.improved(np.eye(4), far, 0.6, few)  # one of the two is wrong: the one by less of the view
+    assert not part.improved(np.eye(4), far, 0.5, more)
     assert not part.uncertain(held, more, 0)  # 17 mm
     assert part.uncertain(held, 4 * more, 0)
     assert not part.uncertain(other, 4 * more, 0)
+    part.end(0.6)
+    assert part.wanted(held, 0)
+    part.end(0.7)
+    assert not part.wanted(held, 0)
     part.begin(held, 0.7, more, 0)
     assert not part.wanted(held, 0)
     assert not part.uncertain(held, 4 * more, 0)

@@ -98,13 +98,16 @@ class Movers:
         self._rho = np.concatenate([self._rho[recent], before.rho[lost]])
         self._stamp_ns = np.concatenate([self._stamp_ns[recent], np.full(lost.sum(), stamp_ns)])
 
-    def near(self, uv: F64, rho: F64, tracks: Tracks) -> Bool:
-        """(M,) which new points, (M, 2) px and (M,) 1/m, are on moving objects, or nearer where one lost its points."""
+    def near(self, uv: F64, rho: F64, tracks: Tracks, least: int = MOVING_NEIGHBOURS) -> Bool:
+        """(M,) which new points, (M, 2) px and (M,) 1/m, are on moving objects, or nearer where one lost its points.
+
+        They are if `least` of their nearest neighbours are.
+        """
         if not (len(self._rho) or tracks.moving.any()):
             return np.zeros(len(uv), bool)
         among_uv, among_rho = np.concatenate([tracks.uv, self._uv]), np.concatenate([tracks.rho, self._rho])
         marked = np.concatenate([tracks.moving, np.ones(len(self._rho), bool)])
-        return _marked_neighbours(uv, rho, among_uv, among_rho, marked, len(tracks)) >= MOVING_NEIGHBOURS
+        return _marked_neighbours(uv, rho, among_uv, among_rho, marked, len(tracks)) >= least
 
 
 def _marked_neighbours(
@@ -132,6 +135,13 @@ def in_group(tracks: Tracks, points: Bool) -> Bool:
         out[rows] = (
             _marked_neighbours(tracks.uv[rows], tracks.rho[rows], tracks.uv, tracks.rho, points) > MOVING_NEIGHBOURS
         )
+    return out
+
+
+def beside_moving(tracks: Tracks) -> Bool:
+    """(N,) which static points have a moving one among their nearest neighbours, at about their distance."""
+    out, rows = np.zeros(len(tracks), bool), np.flatnonzero(~tracks.moving)
+    out[rows] = _marked_neighbours(tracks.uv[rows], tracks.rho[rows], tracks.uv, tracks.rho, tracks.moving) > 0
     return out
 
 

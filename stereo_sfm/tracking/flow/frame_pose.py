@@ -20,7 +20,9 @@ from stereo_sfm.tracking.flow.consensus import (
     MIN_OPEN_SHARE,
     MIN_WEIGHT,
     SETTLED_S,
+    STATIC_S,
     WEIGHT_RATIO,
+    beside_moving,
     errors_at,
     in_group,
 )
@@ -46,10 +48,11 @@ USUAL_LIKELIHOOD = 0.6  # about one standard deviation; of a pose less likely th
 # A map update moves its points together, and the pose with them: so many points of the map that agree, of those that
 # are static and of an unobstructed view, are believed whatever the motion.
 UNDIVIDED_SHARE, UNDIVIDED_OPEN = 0.8, 0.3
-# New points on somebody near who hardly moves take a pose along before any is an outlier. Where those that are nearer
-# than the settled ones by this factor pull it away by so many squared sigmas (1 % of six degrees of freedom), they are
-# compared with the pose by the settled ones alone.
-NEARER, PULL_CHI2, FEWEST_WRONG = 1.5, 16.8, MIN_GROUP // 2
+# New points on somebody near who hardly moves take a pose along before any is an outlier. Those that are nearer than
+# the points known for long by this factor, or beside moving ones, are asked by how many squared sigmas they pull it
+# away (in an empty store by 9 at most, in 300 images). If by so many, they are compared with the pose by the known
+# ones: a point is wrong from so many sigmas on.
+NEARER, PULL_CHI2, WRONG_SIGMAS = 1.25, 12.0, 2.0
 NO_PRIOR = np.full(6, np.inf)
 CONFIRMED_SHARE = 0.75  # of the points of the map that are in view
 MOST_FREEDOMS = 1.0  # of the six of a pose that may rest on one point
@@ -165,31 +168,52 @@ class FramePoseSolver:
         contradicted = self._contradicted(tracks, expected, best)
         if contradicted is None:
             return self._judge(tracks, expected, last_pose, best, before)
-        best, group = contradicted
-        solution = self._judge(tracks, expected, last_pose, best, before)
-        group &= ~solution.inlier
+        best, wrong, group = contradicted
+        others = replace(tracks, moving=tracks.moving | wrong)
+        solution = self._judge(others, expected, last_pose, best, before)
         return replace(solution, moving=solution.moving | group if len(solution.moving) else group)
 
     def _contradicted(
         self, tracks: Tracks, expected: ExpectedMotion, best: PoseSolution
-    ) -> tuple[PoseSolution, Bool] | None:
-        """The pose without near new points that the settled ones contradict, and (N,) their groups; None: none."""
-        static = ~tracks.moving
-        settled = static & (tracks.age * expected.seconds >= SETTLED_S)
-        if best.reason or np.count_nonzero(settled) < 2 * self._config.min_features:
+    ) -> tuple[PoseSolution, Bool, Bool] | None:
+        """The pose without points that those known for long contradict; None: there are none.
+
+        Suspected are new points that are nearer, and all beside a moving one. Returns also which are left out (N,), and
+        which of them move (N,).
+        """
+        static, doubtful = ~tracks.moving, beside_moving(tracks)
+        known = self._known(tracks, static & ~doubtful, expected.seconds)
+        if best.reason or known is None:
             return None
-        near = static & ~settled & (tracks.age > 0) & (tracks.rho > NEARER * median(tracks.rho[settled]))
-        if np.count_nonzero(near) < MIN_GROUP or self.pull(tracks.keep(near), best) < PULL_CHI2:
+        near = static & ~known & (tracks.age > 0) & (tracks.rho > NEARER * median(tracks.rho[known]))
+        near = self._pulling(tracks, near, MIN_GROUP, best)
+        doubtful = self._pulling(tracks, doubtful, 1, best)
+        suspected = near | doubtful
+        if not suspected.any():
             return None
-        by_settled = self._optimise(tracks, expected.to(best.pose), settled)
-        if by_settled.inlier[settled].sum() < AGREEING_SHARE * settled.sum():
+        by_known = self._optimise(tracks, expected.to(best.pose), known)
+        if by_known.inlier[known].sum() < AGREEING_SHARE * known.sum():
             return None
-        wrong = np.zeros(len(tracks), bool)
-        wrong[near] = self._influence(tracks.keep(near), by_settled)[1] > self._config.max_error_sigmas
-        group = in_group(tracks, wrong)
-        if np.count_nonzero(group) < FEWEST_WRONG:
+        off = np.zeros(len(tracks), bool)
+        off[suspected] = self._influence(tracks.keep(suspected), by_known)[1] > WRONG_SIGMAS
+        wrong = doubtful | off if in_group(tracks, off & near).any() else doubtful
+        if not wrong.any():
             return None
-        return self._optimise(tracks, expected.to(by_settled.pose), static & ~wrong), group
+        best = self._optimise(tracks, expected.to(by_known.pose), static & ~wrong)
+        return best, wrong, in_group(tracks, wrong & off)
+
+    def _known(self, tracks: Tracks, static: Bool, seconds: float) -> Bool | None:
+        """(N,) the `static` points (N,) that were tracked longest; None: too few."""
+        for least_s in (STATIC_S, SETTLED_S):
+            known = static & (tracks.age * seconds >= least_s)
+            if np.count_nonzero(known) >= 2 * self._config.min_features:
+                return known
+        return None
+
+    def _pulling(self, tracks: Tracks, points: Bool, least: int, best: PoseSolution) -> Bool:
+        """(N,) the `points` (N,), if they are so many and pull a pose away from where all others have it; else none."""
+        pulling = np.count_nonzero(points) >= least and self.pull(tracks.keep(points), best) >= PULL_CHI2
+        return points & pulling
 
     def _judge(
         self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, best: PoseSolution, before: int

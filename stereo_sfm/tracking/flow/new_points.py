@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from stereo_sfm.config import TrackerConfig
-from stereo_sfm.tracking.flow.consensus import Movers
+from stereo_sfm.tracking.flow.consensus import MOVING_NEIGHBOURS, Movers
 from stereo_sfm.tracking.flow.corners import detect_corners
 from stereo_sfm.tracking.flow.follower import Follower
 from stereo_sfm.tracking.flow.pyramids import StereoPyramids
@@ -37,8 +37,19 @@ class NewPoints:
         self._movers = movers
         self._next_point_id = 0
 
-    def add(self, tracks: Tracks, images: StereoPyramids, pose: F64, velocity: F64, most: int) -> Tracks:
-        """The tracks followed by new ones, `most` in all; pose (4, 4) and velocity (6,) of the image."""
+    def add(
+        self,
+        tracks: Tracks,
+        images: StereoPyramids,
+        pose: F64,
+        velocity: F64,
+        most: int,
+        moving_neighbours: int = MOVING_NEIGHBOURS,
+    ) -> Tracks:
+        """The tracks followed by new ones, `most` in all; pose (4, 4) and velocity (6,) of the image.
+
+        `moving_neighbours`: of a new point that counts as moving.
+        """
         missing = most - len(tracks)
         if missing <= 0:
             return tracks
@@ -48,7 +59,7 @@ class NewPoints:
         rows, slots = self._follower.begin(images.left, match.uv_left[good], pose)
         new, n = good[rows], len(rows)
         rho = np.maximum(match.rho[new], MIN_RHO)
-        moving = self._movers.near(match.uv_left[new], rho, tracks)
+        moving = self._movers.near(match.uv_left[new], rho, tracks, moving_neighbours)
         origin, direction = self._shutter.rays(pose, velocity, match.uv_left[new], match.bearing[new])
         tracks = tracks.append(
             Tracks(

@@ -17,7 +17,7 @@ from stereo_sfm.types import F64
 MORE_RECALL = 0.15  # by which more of the held points must be found than before
 LASTS_NS = 1_000_000_000
 UNCERTAIN_M = 0.02  # standard deviation of a position that new points should not inherit
-SAME_PLACE = 0.2, 0.07  # metres, radians between the poses
+CONTRADICTED_SIGMAS = 3.0  # between two positions of which one must be wrong
 
 
 class PartialView:
@@ -49,8 +49,16 @@ class PartialView:
 
         More of a view that the camera drives out of may be fewer points: their pose (`covariance` (6, 6)) is no better.
         """
-        better = recall >= self._recall + MORE_RECALL and _sigma_m(covariance) < self._sigma_m
-        return better and within(before, after, *SAME_PLACE)
+        if recall < self._recall + MORE_RECALL:
+            return False
+        sigma_m = _sigma_m(covariance)
+        contradicted = not within(before, after, CONTRADICTED_SIGMAS * math.hypot(sigma_m, self._sigma_m), math.inf)
+        return contradicted or sigma_m < self._sigma_m
+
+    def end(self, recall: float) -> None:
+        """Nothing more is to be found once a sufficient share of the held points was."""
+        if recall >= SUFFICIENT_RECALL:
+            self._held = None
 
 
 def _sigma_m(covariance: F64) -> float:

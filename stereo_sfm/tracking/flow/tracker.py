@@ -372,6 +372,7 @@ class Tracker:
             return None
         recall = self._recall(tracks, solution)
         if not self._part.improved(pose, solution.pose, recall, solution.covariance):
+            self._part.end(recall)
             return None
         self._part.begin(self._follower.held, recall, solution.covariance, image.stamp_ns)
         return tracks, solution
@@ -404,7 +405,7 @@ class Tracker:
         if not held.dense:
             most = HELD_POINTS * self._config.max_features
             tracks = self._follower.renewed(held)
-            tracks = self._new_points.add(tracks, held.images, held.pose, np.zeros(6), most)
+            tracks = self._new_points.add(tracks, held.images, held.pose, np.zeros(6), most, moving_neighbours=1)
             held.add(tracks.keep(~tracks.moving))
             self._follower.keep_only(self._tracks)
 
