@@ -182,9 +182,9 @@ def test_new_points_on_somebody_who_sways_do_not_take_the_pose_along(monkeypatch
 
 
 def test_new_points_among_moving_ones_are_not_believed_where_the_pose_rests_on_them() -> None:
-    """Too few for a group: on somebody near, all of whose other points are marked."""
+    """Too few for a group, on somebody near, all of whose other points are marked. Some pull too little to be told."""
     mended = 0
-    for seed in range(10):
+    for seed in range(20):
         tracks, on_person = before_one_wall(np.random.default_rng(seed))
         tracks.moving = on_person & (np.arange(len(tracks)) < len(tracks) - 6)
         solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
@@ -192,7 +192,7 @@ def test_new_points_among_moving_ones_are_not_believed_where_the_pose_rests_on_t
         taken_along = solver._solve_all(tracks, start, np.eye(4), ~tracks.moving)  # pyright: ignore[reportPrivateUsage]
         assert off(taken_along.pose) > 0.003
         mended += off(solver.solve(tracks, start, np.eye(4), before=len(tracks)).pose) < 0.003
-    assert mended >= 6
+    assert mended >= 10
 
 
 def few_points(rng: np.random.Generator, moved: F64) -> Tracks:

@@ -50,9 +50,9 @@ USUAL_LIKELIHOOD = 0.6  # about one standard deviation; of a pose less likely th
 UNDIVIDED_SHARE, UNDIVIDED_OPEN = 0.8, 0.3
 # New points on somebody near who hardly moves take a pose along before any is an outlier. Those that are nearer than
 # the points known for long by this factor, or beside moving ones, are asked by how many squared sigmas they pull it
-# away (in an empty store by 9 at most, in 300 images). If by so many, they are compared with the pose by the known
-# ones: a point is wrong from so many sigmas on.
-NEARER, PULL_CHI2, WRONG_SIGMAS = 1.25, 12.0, 2.0
+# away: by 14 at most in 700 images of stores without people and of EuRoC. If by more than has 1 % of six degrees of
+# freedom, they are compared with the pose by the known ones: a point is wrong from so many sigmas on.
+NEARER, PULL_CHI2, WRONG_SIGMAS = 1.25, 16.8, 2.0
 NO_PRIOR = np.full(6, np.inf)
 CONFIRMED_SHARE = 0.75  # of the points of the map that are in view
 MOST_FREEDOMS = 1.0  # of the six of a pose that may rest on one point
