@@ -140,7 +140,10 @@ def in_group(tracks: Tracks, points: Bool) -> Bool:
 
 def beside_moving(tracks: Tracks) -> Bool:
     """(N,) which static points have a moving one among their nearest neighbours, at about their distance."""
-    out, rows = np.zeros(len(tracks), bool), np.flatnonzero(~tracks.moving)
+    out = np.zeros(len(tracks), bool)
+    if not tracks.moving.any():
+        return out
+    rows = np.flatnonzero(~tracks.moving)
     out[rows] = _marked_neighbours(tracks.uv[rows], tracks.rho[rows], tracks.uv, tracks.rho, tracks.moving) > 0
     return out
 
