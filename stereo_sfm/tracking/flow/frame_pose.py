@@ -181,9 +181,11 @@ class FramePoseSolver:
         Suspected are new points that are nearer, and all beside a moving one. Returns also which are left out (N,), and
         which of them move (N,).
         """
+        if best.reason:
+            return None
         static, doubtful = ~tracks.moving, beside_moving(tracks)
         known = self._known(tracks, static & ~doubtful, expected.seconds)
-        if best.reason or known is None:
+        if known is None:
             return None
         near = static & ~known & (tracks.age > 0) & (tracks.rho > NEARER * median(tracks.rho[known]))
         near = self._pulling(tracks, near, MIN_GROUP, best)

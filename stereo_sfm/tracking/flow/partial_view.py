@@ -33,8 +33,9 @@ class PartialView:
 
         `covariance`: (6, 6) of the pose.
         """
-        self._held = held if recall < SUFFICIENT_RECALL else None
+        self._held = held
         self._recall, self._sigma_m, self._until_ns = recall, _sigma_m(covariance), stamp_ns + LASTS_NS
+        self.end(recall)
 
     def wanted(self, held: Held, stamp_ns: int) -> bool:
         """Whether to look for more points: not for long, and not in an image that was held since."""
