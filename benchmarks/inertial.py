@@ -1,7 +1,7 @@
 """What must hold of IMU and wheels, each sentence with what is wanted and what is measured.
 
     python benchmarks/inertial.py [--part euroc drives rest calibration cost] [--seeds 3]
-    python benchmarks/inertial.py --part dark turn slip standing slow [--size 424x400] [--rate 15]
+    python benchmarks/inertial.py --part level dark turn slip standing slow [--size 424x400] [--rate 15]
 
 Each part by itself:
 
@@ -11,13 +11,15 @@ Each part by itself:
   images. The ground truth's orientation rests on the same gyroscope: turns agree better than they are.
 * drives: roll and pitch, darkness and slip on simulated drives with exact poses and noise instead of images.
 * rest: twenty minutes at rest, likewise. calibration: wrong offset, rotation and radius. cost: a frame.
-* dark, turn, slip, standing, slow: rendered drives, every row with the sensors and without them on the same images:
-  five seconds without light at about 1 m/s; a corner at 200 degrees a second with motion blur; wheels that turn 30 %
-  too far in turns; a minute at rest; 5 m at 0.02 m/s. Minutes each.
+* level, dark, turn, slip, standing, slow: rendered drives, every row with the sensors and without them on the same
+  images: a lap; five seconds without light at about 1 m/s; a corner at 200 degrees a second with motion blur; a lap
+  with wheels that turn 30 % too far in turns; a minute at rest; 5 m at 0.02 m/s. Minutes each.
 
 ATE is the RMSE after SE(3) alignment of every frame that has a pose, of the odometry and of the map; "off" is the
 error of the odometry over the time without images (standing: its largest movement; slow: of the distance between the
-first and the last image, in per cent); tilt is the largest error of roll and pitch where gravity is known.
+first and the last image, in per cent); tilt is the largest error of roll and pitch where gravity is known, of the
+live poses and of those of the map, which are level by what was measured until the end; yaw the RMSE of the map's
+heading.
 """
 
 from __future__ import annotations
@@ -47,7 +49,7 @@ from stereo_sfm.types import F64, Frame, ImuSamples, StereoImage, Trajectory
 DARK = range(80, 140)  # frames of EuRoC
 DARK_S = 10, 15  # of the simulated drives
 SLOW_M = 5.0  # at 0.02 m/s
-RENDERED = ("dark", "turn", "slip", "standing", "slow")
+RENDERED = ("level", "dark", "turn", "slip", "standing", "slow")
 SENTENCES = ("euroc", "drives", "rest", "calibration", "cost")
 THIRD = "every third", "IMU"
 MEASURES = (  # what is compared with and without IMU: field of a result, unit
@@ -60,7 +62,10 @@ BOTH_WAYS = "as recorded", "backwards"
 SHARES = 1.0, 0.97, 1.03, 0.985, 1.015  # of the keyframe threshold, by seed
 QUALITIES = 1.0, 1.1, 0.9  # of the corner threshold, after that many seeds
 SENSORS = {"none": (False, False), "IMU": (True, False), "wheels": (False, True), "IMU and wheels": (True, True)}
-HEADER = "| images | seed | sensors | frames with a pose | submaps | odometry | map | off | tilt |\n|" + "---|" * 9
+HEADER = (
+    "| images | seed | sensors | frames with a pose | submaps | odometry | map | off | tilt | map's tilt | yaw |\n|"
+)
+HEADER += "---|" * 11
 
 
 def darkened(images: Iterable[StereoImage]) -> Iterator[StereoImage]:
@@ -129,7 +134,9 @@ class Result:
     back_m: float  # the same a second later
     distance_m: float  # error of the distance between the first and the last frame
     tilt_deg: float  # of the frames, largest; NaN if gravity is not known
-    gravity_deg: float  # error of its direction in the map; NaN likewise
+    gravity_deg: float  # error of its direction in the map, mean over all frames; NaN likewise
+    map_tilt_deg: F64  # (N, 2) errors of roll and pitch of the map's poses; NaN likewise
+    yaw_deg: float  # RMSE of the heading in the map
 
 
 def result(source: Source, sensors: str, without_images: range, seed: int = 0) -> Result:
@@ -165,32 +172,48 @@ def result(source: Source, sensors: str, without_images: range, seed: int = 0) -
     live = evaluate(odometry, truth)
     return Result(
         frames, len(odometry), submaps, live.ape_m.rmse, map_m, live.rpe_m.rmse, live.rpe_deg.rmse, off, back,
-        distance_off_m(frames, truth), tilt_deg(frames, truth), gravity_deg(record, mapped, truth),
+        distance_off_m(frames, truth), tilt_deg(frames, truth), *in_map(record, mapped, truth),
     )  # fmt: skip
 
 
-def gravity_deg(record: RunRecord, mapped: Trajectory | None, truth: Trajectory) -> float:
-    """Error in degrees of gravity's direction in the map, against the mean over all frames; NaN if it is not known."""
-    if mapped is None or not record.down.any():
-        return float("nan")
+def in_map(record: RunRecord, mapped: Trajectory | None, truth: Trajectory) -> tuple[float, F64, float]:
+    """Of the map's poses, in degrees: the error of gravity's direction, against the mean over all frames; errors of
+    roll and pitch, (N, 2); the RMSE of the heading. NaN without a map; the first two if gravity is not known."""
+    nothing = np.full((1, 2), np.nan)
+    if mapped is None:
+        return float("nan"), nothing, float("nan")
     nearest = np.abs(truth.stamp_ns[:, None] - mapped.stamp_ns).argmin(axis=0)
-    down = -np.einsum("nij,nj->ni", mapped.poses[:, :3, :3], truth.poses[nearest, 2, :3])
+    true, seen = truth.poses[nearest, :3, :3], mapped.poses[:, :3, :3]
+    down = -np.einsum("nij,nj->ni", seen, true[:, 2])
     mean = down.mean(axis=0) / np.linalg.norm(down.mean(axis=0))
-    return float(np.degrees(np.linalg.norm(np.cross(mean, record.down))))
+    map_R_world = np.einsum("nij,nkj->nik", seen, true)
+    yaw = np.array([se3.so3_log(map_R_world[0].T @ r)[2] for r in map_R_world])
+    yaw_deg = float(np.degrees(yaw.std()))
+    if not record.down.any():
+        return float("nan"), nothing, yaw_deg
+    tilts = [[roll_pitch_deg(down) for down in downs] for downs in (record.down @ seen, -true[:, 2])]
+    return float(np.degrees(np.linalg.norm(np.cross(mean, record.down)))), np.subtract(*tilts), yaw_deg
+
+
+def movement(frames: list[Frame]) -> float:
+    """Metres, the largest from the tenth image on."""
+    still = frames[9:]
+    return max(float(np.linalg.norm(f.odom_T_cam[:3, 3] - still[0].odom_T_cam[:3, 3])) for f in still)
 
 
 def row(name: str, seed: int, sensors: str, found: Result) -> str:
     """One line of the table."""
     off = "–" if np.isnan(found.off_m) else length(found.off_m)
-    if name.startswith("standing"):
-        still = found.frames[9:]
-        off = length(max(float(np.linalg.norm(f.odom_T_cam[:3, 3] - still[0].odom_T_cam[:3, 3])) for f in still))
+    if name == "standing":
+        off = length(movement(found.frames))
     if name == "slow":
         off = f"{100 * found.distance_m / SLOW_M:.2f} %"
-    level = "–" if np.isnan(found.tilt_deg) else f"{found.tilt_deg:.2f}°"
+    tilts = (found.tilt_deg, float(np.abs(found.map_tilt_deg).max()))
+    live, mapped = ("–" if np.isnan(tilt) else f"{tilt:.2f}°" for tilt in tilts)
     errors = f"{length(found.odometry_m)} | {length(found.map_m)}"
     posed = f"{found.posed} of {len(found.frames)}"
-    return f"| {name} | {seed} | {sensors} | {posed} | {found.submaps} | {errors} | {off} | {level} |"
+    yaw = f"{found.yaw_deg:.3f}°"
+    return f"| {name} | {seed} | {sensors} | {posed} | {found.submaps} | {errors} | {off} | {live} | {mapped} | {yaw} |"
 
 
 def euroc(seeds: int) -> Iterator[Row]:
@@ -238,13 +261,14 @@ def euroc(seeds: int) -> Iterator[Row]:
     yield "1 the map's trajectory", f"2 x {full:.2f} mm", f"{smoothed:.2f} mm", smoothed <= 2 * full
 
 
-def store(part: str, seed: int, size: str, rate: int) -> None:
-    """The rows of one drive."""
+def store(part: str, seed: int, size: str, rate: int) -> dict[str, Result]:
+    """The rows of one drive, by sensors."""
     common = f"size={size}&seed={seed}&imu=t265&wheel=differential"
     spec, sensors, span = {
+        "level": (f"rate={rate}", ["none", "IMU"], range(0)),
         "dark": (f"rate={rate}&frames={20 * rate}&dark={DARK_S[0]}-{DARK_S[1]}", list(SENSORS), range(0)),
         "turn": (f"rate={2 * rate}&corner=0.2&start={16 * rate}&frames={16 * rate}", list(SENSORS), range(0)),
-        "slip": (f"rate={rate}&wheel_slip=0.3&frames={25 * rate}", ["none", "wheels", "IMU and wheels"], range(0)),
+        "slip": (f"rate={rate}&wheel_slip=0.3", ["none", "IMU", "wheels", "IMU and wheels"], range(0)),
         "standing": (f"rate=5&rest=70&vibration=0&frames={60 * 5}", ["none", "IMU", "IMU and wheels"], range(0)),
         "slow": (f"rate=2&speed=0.02&length={SLOW_M}", ["none", "IMU", "IMU and wheels"], range(0)),
     }[part]
@@ -252,8 +276,55 @@ def store(part: str, seed: int, size: str, rate: int) -> None:
         span = range(DARK_S[0] * rate, DARK_S[1] * rate)
     with open_source(f"sim:loop?{common}&{spec}") as source:
         images, rig, truth = list(source), source.rig, source.ground_truth
+    found = dict[str, Result]()
     for name in sensors:
-        print(row(part, seed, name, result(MemorySource(rig, images, truth), name, span)), flush=True)
+        found[name] = result(MemorySource(rig, images, truth), name, span)
+        print(row(part, seed, name, found[name]), flush=True)
+    return found
+
+
+def rendered(part: str, drives: list[dict[str, Result]]) -> Iterator[Row]:
+    """The sentences of a rendered part, of one drive a seed."""
+
+    def of(name: str, sensors: str) -> F64:
+        return np.array([getattr(drive[sensors], name) for drive in drives])
+
+    def against(name: str, a: str, b: str, unit: str, factor: float) -> tuple[str, bool]:
+        one, other = factor * of(name, a), factor * of(name, b)
+        error = float((one - other).std(ddof=1) / len(one) ** 0.5) if len(one) > 1 else 0.0
+        text = (
+            f"{a} {one.mean():.3g} {unit}, {b} {other.mean():.3g}, difference {(one - other).mean():+.2g} ± {error:.2g}"
+        )
+        return text, bool((one - other).mean() <= 2 * error)
+
+    if part == "level":
+        tilts = [np.abs(drive["IMU"].map_tilt_deg) for drive in drives]
+        most = max(float(t.max()) for t in tilts)
+        halves = [max(float(np.array_split(t, 2)[half].max()) for t in tilts) for half in (0, 1)]
+        live = of("tilt_deg", "IMU").max()
+        text = f"{most:.3f}° at most; first half {halves[0]:.3f}°, second {halves[1]:.3f}°; live {live:.2f}°"
+        yield "2 roll and pitch of the map's poses, T265", "0.1°, not growing", text, most <= 0.1
+        kinds = ("yaw", "yaw_deg", "°", 1), ("odometry", "odometry_m", "mm", 1e3), ("map", "map_m", "mm", 1e3)
+        for what, name, unit, factor in kinds:
+            yield f"2 {what}", "not worse than vision alone", *against(name, "IMU", "none", unit, factor)
+    if part == "dark":
+        off, alone = (100 * of("off_m", sensors) for sensors in ("IMU and wheels", "IMU"))
+        most = [f"{x.max():.1f} cm at most (median {np.median(x):.1f})" for x in (off, alone)]
+        text = f"{most[0]}; IMU alone {most[1]}"
+        yield "2 five seconds of darkness, rendered", "10 cm with IMU and wheels", text, bool(off.max() <= 10)
+    if part == "turn":
+        posed = [drive["IMU"].posed == len(drive["IMU"].frames) and drive["IMU"].submaps == 1 for drive in drives]
+        yield "2 a turn of 200°/s", "never lost", f"{sum(posed)} of {len(posed)} drives", all(posed)
+    if part == "standing":
+        moved = [max(movement(drive[s].frames) for drive in drives) for s in ("IMU", "IMU and wheels")]
+        text = ", ".join(f"{1e3 * m:.2f} mm" for m in moved)
+        yield "2 a minute at rest, rendered", "2 mm, with the IMU and with both", text, max(moved) <= 2e-3
+    if part == "slow":
+        off = 100 * of("distance_m", "IMU") / SLOW_M
+        yield "2 5 m at 0.02 m/s", "0.3 %", f"{off.max():.2f} % at most", bool(off.max() <= 0.3)
+    if part == "slip":
+        for what, name in (("odometry", "odometry_m"), ("map", "map_m")):
+            yield f"2 slip of 30 % in turns, {what}", "no worse", *against(name, "IMU and wheels", "IMU", "mm", 1e3)
 
 
 def main() -> None:
@@ -273,15 +344,13 @@ def main() -> None:
         "cost": cost,
     }
     rows = [found for part in SENTENCES if part in args.part for found in of[part]()]
-    if rows:
-        print("\n| sentence | wanted | measured | holds |\n|---|---|---|---|")
-    for sentence, wanted, measured, holds in rows:
-        print(f"| {sentence} | {wanted} | {measured} | {'yes' if holds else 'no'} |")
     if any(part in args.part for part in RENDERED):
         print(HEADER)
     for part in (p for p in RENDERED if p in args.part):
-        for seed in range(args.seeds):
-            store(part, seed, args.size, args.rate)
+        rows += rendered(part, [store(part, seed, args.size, args.rate) for seed in range(args.seeds)])
+    print("\n| sentence | wanted | measured | holds |\n|---|---|---|---|")
+    for sentence, wanted, measured, holds in rows:
+        print(f"| {sentence} | {wanted} | {measured} | {'yes' if holds else 'no'} |")
 
 
 if __name__ == "__main__":

@@ -273,6 +273,9 @@ class Keyframe(Message):
     inertial: InertialLink | None = None  # None: no IMU, or one that is left out
     wheels: MotionLink | None = None  # None: no wheels, samples are missing, or no keyframe before in this submap
     odometry: MotionLink | None = None  # by the images; None: no keyframe before in this submap
+    right_turn: F64 = field(
+        default_factory=lambda: np.zeros(3)
+    )  # (3,) radians by which the right camera turned suddenly since the rig was corrected
 
     @property
     def described(self) -> bool:

@@ -54,7 +54,7 @@ from stereo_sfm.mapping.row_errors import RowMonitor
 from stereo_sfm.mapping.self_calibration import Revision, SelfCalibration
 from stereo_sfm.mapping.triangulate import triangulate
 from stereo_sfm.timing import NoSpans
-from stereo_sfm.types import F64, I64, Bool, CalibrationUpdate, Keyframe, LoopResult, MapUpdate, RowErrors
+from stereo_sfm.types import F64, I64, RIG_TERMS, Bool, CalibrationUpdate, Keyframe, LoopResult, MapUpdate, RowErrors
 
 MAX_TRIANGULATED = 4  # observations up to which a point is triangulated anew before each adjustment
 FIRST_FULL_BUNDLE = 8  # keyframes of the first full bundle adjustment
@@ -105,6 +105,7 @@ class Mapper:
         self._loop_config = loop_config or LoopConfig()
         self.map = Map()
         self._map_T_odom: F64 = np.eye(4)
+        self._rig_terms: F64 = np.zeros(RIG_TERMS)  # with which the newest keyframe was tracked
         self._version = 0
         self._culled: list[I64] = []
         self._fused: list[tuple[int, int]] = []  # rows (removed, kept)
@@ -383,6 +384,9 @@ class Mapper:
         guess = self._map_T_odom @ keyframe.odom_T_cam
         insertion = insert_keyframe(self.map, self._rig, keyframe, guess, self._config)
         self._fused += insertion.fused
+        if not np.array_equal(keyframe.rig_terms, self._rig_terms):
+            self._follow_newest(guess)  # what the rig before it measured since the last keyframe is wrong
+            self._rig_terms = keyframe.rig_terms
         return insertion.row
 
     def _adjust(self, row: int) -> None:

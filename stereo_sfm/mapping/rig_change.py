@@ -22,9 +22,11 @@ FAR = 1e-3  # 1/m, of points without a measured distance
 
 @dataclass(frozen=True, eq=False)
 class SeenPoints:
-    """What is compared of a keyframe."""
+    """What is known of a keyframe without its images."""
 
     kf_id: int
+    stamp_ns: int
+    submap_id: int
     odom_T_cam: F64  # (4, 4)
     point_ids: I64  # (N,)
     uv_left: F64  # (N, 2) px
@@ -32,7 +34,8 @@ class SeenPoints:
 
     @staticmethod
     def of(keyframe: Keyframe) -> SeenPoints:
-        return SeenPoints(keyframe.kf_id, keyframe.odom_T_cam, keyframe.point_ids, keyframe.uv_left, keyframe.uv_right)
+        k = keyframe
+        return SeenPoints(k.kf_id, k.stamp_ns, k.submap_id, k.odom_T_cam, k.point_ids, k.uv_left, k.uv_right)
 
 
 def first_changed(seen: Sequence[SeenPoints], before: Rig, after: Rig) -> int | None:

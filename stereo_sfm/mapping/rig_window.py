@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,7 +22,8 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.geometry.stereo import rectifying_rotations
 from stereo_sfm.mapping import rig_window_kernels
-from stereo_sfm.types import F64, I64, RIG_TERMS, Keyframe
+from stereo_sfm.mapping.rig_change import SeenPoints
+from stereo_sfm.types import F64, I64, RIG_TERMS, Bool
 
 MIN_POINTS = 20
 MAX_POINTS = 160
@@ -71,40 +72,75 @@ class RigWindow:
     length: F64  # (8,) relative change of lengths by each of the LENGTHENING terms, per radian or ratio; others zero
 
 
+@dataclass(frozen=True, eq=False)
+class Known:
+    """The rig of the first keyframes of a window, with its corrections."""
+
+    rig: Rig
+    keyframes: int
+
+
 @dataclass(eq=False)
 class _Problem:
     """One window's measurements and its own unknowns."""
 
     uv_left: F64  # (F, N, 2) px
     uv_right: F64  # (F, N, 2) px
+    known: Bool  # (F,) seen by a known rig
     bearing: F64  # (N, 3) unit, first left camera
     rho: F64  # (N,) 1/m
     frame_T_first: F64  # (F, 4, 4)
     shapes: F64  # (2, F, N, 2, L) px
     lens: F64  # (L,)
 
+    def seen_by(self, rig: Rig, before: Known | None) -> _Problem:
+        """With the right pixels that `rig` would have seen instead of the rig `before` it."""
+        if before is None:
+            return self
+        assert rig.right is not None and before.rig.right is not None
+        uv_right = self.uv_right.copy()
+        for f in np.flatnonzero(self.known):
+            pose = self.frame_T_first[f]
+            points = self.bearing @ pose[:3, :3].T + self.rho[:, None] * pose[:3, 3]
+            now, was = (
+                r.right.project((points - self.rho[:, None] * r.left_T_right[:3, 3]) @ r.left_T_right[:3, :3])
+                for r in (rig, before.rig)
+                if r.right is not None
+            )
+            uv_right[f] += now - was
+        return replace(self, uv_right=uv_right)
 
-def solve_window(rig: Rig, keyframes: Sequence[Keyframe], terms: F64) -> RigWindow | None:
+
+def solve_window(
+    rig: Rig, keyframes: Sequence[SeenPoints], terms: F64, before: Known | None = None
+) -> RigWindow | None:
     """The information of a window, or None if its keyframes have too few common points.
 
     Args:
-        rig: the calibrated rig. keyframes: in order of time. terms: (8,) initial corrections.
+        rig: the calibrated rig. keyframes: in order of time, the newest of another rig first. terms: (8,) initial
+            corrections.
+        before: the rig of the first keyframes, where it changed (a knock). What it measured of the points is what the
+            changed one is measured with.
     """
     corrected = with_terms(rig, terms)
-    problem = _problem(corrected, keyframes)
+    problem = _problem(
+        corrected if before is None else before.rig, keyframes, 0 if before is None else before.keyframes
+    )
     if problem is None:
         return None
     sigma = 1.0
     for step in range(STEPS):
-        system = _System.of(corrected, problem, sigma, hard=step >= 2)
+        system = _System.of(corrected, problem.seen_by(corrected, before), sigma, hard=step >= 2)
         sigma = float(np.clip(system.noise_px, *NOISE_PX))
         terms = terms + system.step(problem, terms)
         if not np.isfinite(terms).all():
             return None
         corrected = with_terms(rig, terms)
-    system = _System.of(corrected, problem, sigma, hard=True)
+    system = _System.of(corrected, problem.seen_by(corrected, before), sigma, hard=True)
     sigma = float(np.clip(system.noise_px, *NOISE_PX))
-    information = system.information(problem, terms).with_lens_error(_turned(keyframes))
+    information = system.information(problem, terms)
+    if before is None:
+        information = information.with_lens_error(_turned(keyframes))
     last = keyframes[-1]
     length = _length_by_terms(rig, problem.uv_left[0], problem.uv_right[0])
     return RigWindow(keyframes[0].kf_id, last.kf_id, last.stamp_ns, information, sigma, length)
@@ -130,12 +166,14 @@ def _lengthened(rig: Rig) -> tuple[Rig, ...]:
     return tuple(with_terms(rig, steps[k]) for k in LENGTHENING)
 
 
-def _problem(rig: Rig, keyframes: Sequence[Keyframe]) -> _Problem | None:
+def _problem(rig: Rig, keyframes: Sequence[SeenPoints], known: int) -> _Problem | None:
+    """`rig`: of the first keyframe. `known`: keyframes of a rig whose terms are known."""
     first = keyframes[0]
     both = np.isfinite(first.uv_left).all(1) & np.isfinite(first.uv_right).all(1)
-    later = np.unique(np.concatenate([k.point_ids for k in keyframes[1:]]))
+    later = np.unique(np.concatenate([k.point_ids for k in keyframes[max(known, 1) :]]))
     ids = first.point_ids[both & np.isin(first.point_ids, later)]
-    ids = ids[:: max(1, -(-len(ids) // MAX_POINTS))]
+    if not known:
+        ids = ids[:: max(1, -(-len(ids) // MAX_POINTS))]
     if len(ids) < MIN_POINTS:
         return None
     uv_left, uv_right = np.full((2, len(keyframes), len(ids), 2), np.nan)
@@ -147,10 +185,13 @@ def _problem(rig: Rig, keyframes: Sequence[Keyframe]) -> _Problem | None:
     frames = np.array([se3.inverse(k.odom_T_cam) @ first.odom_T_cam for k in keyframes])
     uv_left, uv_right = uv_left[:, good].copy(), uv_right[:, good].copy()
     shapes = np.stack([_shapes(rig.left, uv_left), _shapes(rig.left, uv_right)])
-    return _Problem(uv_left, uv_right, bearing[good], rho[good], frames, shapes, np.zeros(len(LENS_PRIOR)))
+    if known:  # the same lenses saw what the changed rig is measured with
+        shapes[:] = 0.0
+    of_known = np.arange(len(keyframes)) < known
+    return _Problem(uv_left, uv_right, of_known, bearing[good], rho[good], frames, shapes, np.zeros(len(LENS_PRIOR)))
 
 
-def _turned(keyframes: Sequence[Keyframe]) -> float:
+def _turned(keyframes: Sequence[SeenPoints]) -> float:
     """Sum of the rotations from keyframe to keyframe in radians."""
     poses = np.array([k.odom_T_cam for k in keyframes])
     return float(np.linalg.norm(se3.log(se3.inverse(poses[:-1]) @ poses[1:])[:, 3:], axis=1).sum())
@@ -201,7 +242,7 @@ class _System:
             (rig.left.model_id, rig.left.params, rig.right.model_id, rig.right.params),
             np.ascontiguousarray(rotation.T), rig.left_T_right[:3, 3].copy(),
             np.ascontiguousarray(-rig.baseline * (rotation.T @ rect_R_left[1:].T)), sigma, hard, INFLATION,
-            h, g, gain, gradient, squares, rows,
+            problem.known, h, g, gain, gradient, squares, rows,
         )  # fmt: skip
         own = h[shared:, shared:] + 1e-6 * np.eye(size - shared)
         pose_gain = np.asarray(np.linalg.solve(own, h[shared:, :shared]), float)

@@ -6,9 +6,12 @@ the windows (even and odd ones) confirm, and that exceed the systematic error of
 others follow that are worth their variance. The rows show terms of lenses, which change lengths by what the lens model
 says of disparities: lengths stay unless there is evidence about them. A corrected term is refined as long as windows
 come, first whenever their number has doubled. Where the windows show drift (temperature), the terms at the newest
-window are used for the keyframes since the last revision. If the newest windows contradict all earlier ones, the rig
-has changed (a knock): earlier windows are discarded, and the correction applies from the first keyframe on that was
-seen by the changed rig (`mapping.rig_change`).
+window are used for the keyframes since the last revision.
+
+After a sudden change of the rig (a knock) earlier windows are discarded, and the correction applies from the first
+keyframe on that was seen by the changed rig. What the rig before it measured of the points that are seen before and
+after it is what the changed rig is measured with, besides the windows since. The tracker notices a rotation at once
+(`tracking.flow.knock`); other changes, and small ones, show where the newest windows contradict all earlier ones.
 """
 
 from __future__ import annotations
@@ -23,8 +26,8 @@ from stereo_sfm.calib.choice import NAMES, SCALES, UNITS, Estimate, choose, sign
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.mapping.rig_change import SeenPoints, first_changed
-from stereo_sfm.mapping.rig_window import PRIOR, RigInformation, RigWindow, solve_window
-from stereo_sfm.types import F64, RIG_TERMS, Keyframe
+from stereo_sfm.mapping.rig_window import PRIOR, Known, RigInformation, RigWindow, solve_window
+from stereo_sfm.types import F64, RIG_TERMS, Bool, Keyframe
 
 OF_LENSES = slice(5, 8)  # focal ratio and decentering
 KEYFRAMES = 4  # of one window
@@ -40,6 +43,8 @@ STRADDLING_SIGMAS = 2.0  # by which a window during which the rig changed differ
 BEFORE_STEP = 4  # earlier windows needed to detect a step
 STEP_REACH = 2  # windows before and after the likeliest pair of windows in which it may have happened
 RECENT_KEYFRAMES = 64  # among which the first after a step is looked for
+ACROSS_STEP = 6, 4  # keyframes before and after it from which the changed rig is measured
+KNOCK_KEYFRAMES = 2  # after a rotation that the tracker noticed, from which the changed rig is first measured
 DRIFT_WINDOWS = 8  # needed to detect drift
 RATE = np.deg2rad(0.1) / 60.0  # prior standard deviation of drift, radians (ratio) per second
 SIGMAS = 5.0  # significance of the first term that is corrected
@@ -68,7 +73,7 @@ class SelfCalibration:
         self._rig, self.applies = rig, applies
         self.terms: F64 = np.zeros(RIG_TERMS)  # current corrections
         self._corrected = np.zeros(RIG_TERMS, bool)
-        self._keyframes: list[Keyframe] = []
+        self._keyframes: list[SeenPoints] = []
         self.windows: deque[RigWindow] = deque(maxlen=MAX_WINDOWS)  # since the last step
         self._since = 0  # first keyframe of the windows
         self._until_due = MIN_WINDOWS  # windows until the next revision
@@ -76,6 +81,8 @@ class SelfCalibration:
         self._straddling = False  # it may have happened during the first window
         self._step_between = 0, 0  # keyframes between which it happened
         self._recent: deque[SeenPoints] = deque(maxlen=RECENT_KEYFRAMES)
+        self._turn: F64 = np.zeros(3)  # that the tracker noticed
+        self._turned_kf_id = -1  # first keyframe since; -1: the rig has been measured
         half_width = 0.5 * rig.left.width
         turn = MATCHING_PX / rig.left.fx
         roll = ratio = MATCHING_PX / (0.5 * half_width)
@@ -84,12 +91,16 @@ class SelfCalibration:
 
     def add(self, keyframe: Keyframe) -> Revision | None:
         """Add a keyframe; returns a revision when one becomes significant."""
-        self._recent.append(SeenPoints.of(keyframe))
-        if self._keyframes and keyframe.submap_id != self._keyframes[0].submap_id:
+        seen = SeenPoints.of(keyframe)
+        self._recent.append(seen)
+        knock = self._knock(keyframe)
+        if knock is not None:
+            return knock
+        if self._keyframes and seen.submap_id != self._keyframes[0].submap_id:
             self._keyframes = []
-        if self._keyframes and not _moved(self._keyframes[-1], keyframe, MIN_MOTION * self._rig.left.width):
+        if self._keyframes and not _moved(self._keyframes[-1], seen, MIN_MOTION * self._rig.left.width):
             return None
-        self._keyframes.append(keyframe)
+        self._keyframes.append(seen)
         if len(self._keyframes) < KEYFRAMES or not self._close_window():
             return None
         if self._until_due > 0 and not self._stepped:
@@ -139,26 +150,78 @@ class SelfCalibration:
         """`first_sigmas`: significance of the first correction of a term."""
         windows = list(self.windows)
         drifts = self._drifts(windows)
+        enough = self._corrected.any() or len(windows) >= ENOUGH_WINDOWS
+        self._until_due = min(len(windows), MAX_BETWEEN) if enough else 1
+        since = windows[-min(MAX_BETWEEN, len(windows))].first_kf_id if drifts else self._since
+        found = self._change(windows, drifts, first_sigmas)
+        if found is None:
+            return None
+        why = "drift" if drifts else "refined" if self._corrected[found.written].all() else "significant"
+        if self._stepped:
+            why, since = "step", self._first_after_step(self.terms + found.value)
+            found = self._measured_across(since, found, first_sigmas)
+            self._since, self._stepped = since, False
+        return self._revision(found, why, since)
+
+    def _change(self, windows: Sequence[RigWindow], drifts: bool, first_sigmas: float) -> _Change | None:
+        """What windows show to be wrong; None if nothing is."""
         parts = [windows, windows[::2], windows[1::2] or windows]  # one window: what a step has left
         whole, *halves = [self._at_the_end(part, windows)[0] if drifts else self.estimate(part) for part in parts]
-        corrected = bool(self._corrected.any())
-        sigmas = np.where(self._corrected, REFINED_SIGMAS, FURTHER_SIGMAS if corrected else first_sigmas)
-        rolling = self._rig.readout_s > 0
-        since = windows[-min(MAX_BETWEEN, len(windows))].first_kf_id if drifts else self._since
-        self._until_due = min(len(windows), MAX_BETWEEN) if corrected or len(windows) >= ENOUGH_WINDOWS else 1
-        basis = self._basis(windows)
+        further = FURTHER_SIGMAS if self._corrected.any() else first_sigmas
+        sigmas = np.where(self._corrected, REFINED_SIGMAS, further)
+        basis, rolling = self._basis(windows), self._rig.readout_s > 0
         choice = choose(whole.by(basis), [h.by(basis) for h in halves], rolling, sigmas, self._corrected)
         if not choice.written.any():
             return None
-        why = "drift" if drifts else "refined" if self._corrected[choice.written].all() else "significant"
-        why = "step" if self._stepped else why
-        change: F64 = np.asarray(np.linalg.solve(basis, choice.value), float)
-        if self._stepped:
-            since = self._since = self._first_after_step(self.terms + change)
-        self.terms = self.terms + change
-        self._corrected |= choice.written
-        self._stepped = False
-        return Revision(self.terms.copy(), whole.covariance, since, why, _text(change, choice.sigma))
+        value = np.asarray(np.linalg.solve(basis, choice.value), float)
+        return _Change(value, choice.sigma, whole.covariance, choice.written)
+
+    def _knock(self, keyframe: Keyframe) -> Revision | None:
+        """The revision of a rotation that the tracker noticed, once a few keyframes confirm it."""
+        turn = keyframe.right_turn
+        if not np.array_equal(turn, self._turn):
+            self._turn, self._turned_kf_id = turn, keyframe.kf_id
+        after = sum(k.kf_id >= self._turned_kf_id for k in self._recent)
+        if not turn.any() or self._turned_kf_id < 0 or not KNOCK_KEYFRAMES <= after <= ACROSS_STEP[1]:
+            return None
+        initial = self.terms.copy()
+        initial[:3] += turn
+        across = self._across(len(self._recent) - after, initial)
+        found = None if across is None else self._change([across], False, SIGMAS)
+        if across is None or found is None:
+            return None
+        self.windows = deque([across], maxlen=MAX_WINDOWS)
+        self._keyframes = list(self._recent)[-after:]
+        self._since, self._stepped, self._straddling = self._turned_kf_id, False, False
+        self._turned_kf_id, self._until_due = -1, MIN_WINDOWS
+        return self._revision(found, "step", self._since)
+
+    def _revision(self, change: _Change, why: str, since_kf_id: int) -> Revision:
+        self.terms = self.terms + change.value
+        self._corrected |= change.written
+        return Revision(self.terms.copy(), change.covariance, since_kf_id, why, _text(change.value, change.sigma))
+
+    def _across(self, at: int, terms: F64) -> RigWindow | None:
+        """Of the newest keyframes, those from `at` on, measured with what the rig before them knew of their points.
+
+        `terms`: initial ones.
+        """
+        recent = list(self._recent)
+        before, after = recent[max(at - ACROSS_STEP[0], 0) : at], recent[at : at + ACROSS_STEP[1]]
+        if not before or any(k.submap_id != before[0].submap_id for k in (*before, *after)):
+            return None
+        known = Known(with_terms(self._rig, self.terms), len(before))
+        return solve_window(self._rig, [*before[::-1], *after], terms, known)
+
+    def _measured_across(self, since_kf_id: int, found: _Change, first_sigmas: float) -> _Change:
+        """A step's change, measured with what the rig before it knew of the points."""
+        at = next((i for i, k in enumerate(self._recent) if k.kf_id == since_kf_id), 0)
+        across = self._across(at, self.terms + found.value)
+        if across is None:
+            return found
+        self.windows.appendleft(across)
+        self._straddling = False
+        return self._change(list(self.windows), False, first_sigmas) or found
 
     def _basis(self, windows: Sequence[RigWindow]) -> F64:
         """(8, 8) from the terms to those that are chosen: instead of the rotation about y, the one that changes lengths
@@ -237,11 +300,21 @@ class SelfCalibration:
             self._straddling = False
 
 
+@dataclass(frozen=True, eq=False)
+class _Change:
+    """Of the current terms."""
+
+    value: F64  # (8,)
+    sigma: F64  # (8,) of those of the basis
+    covariance: F64  # (8, 8)
+    written: Bool  # (8,)
+
+
 def _difference(after: Estimate, before: Estimate) -> Estimate:
     return Estimate(after.value - before.value, after.covariance + before.covariance)
 
 
-def _moved(a: Keyframe, b: Keyframe, min_px: float) -> bool:
+def _moved(a: SeenPoints, b: SeenPoints, min_px: float) -> bool:
     """Whether common points moved by `min_px` (median), or many points were lost (the remaining ones are far)."""
     _, at, of = np.intersect1d(a.point_ids, b.point_ids, return_indices=True)
     if len(at) < MAX_COMMON * len(a.point_ids):

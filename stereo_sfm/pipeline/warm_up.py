@@ -148,6 +148,7 @@ def warm_up_stage(stage: str, config: Config, rig: Rig, patient: bool = False) -
     Args: patient, images may wait for code: only that of the first one is loaded, the rest when it is called.
     """
     from stereo_sfm.loop.database import PlaceDatabase
+    from stereo_sfm.mapping.rig_change import SeenPoints
     from stereo_sfm.mapping.rig_window import solve_window
     from stereo_sfm.mapping.self_calibration import SelfCalibration
 
@@ -167,7 +168,7 @@ def warm_up_stage(stage: str, config: Config, rig: Rig, patient: bool = False) -
             mapper.step(keyframe)
         mapper.finish([])
         if SelfCalibration.wanted(config, rig) is not None:
-            solve_window(rig, keyframes(rig)[:: FRAMES // 4], np.zeros(RIG_TERMS))
+            solve_window(rig, [SeenPoints.of(k) for k in keyframes(rig)[:: FRAMES // 4]], np.zeros(RIG_TERMS))
     elif stage == "loop":
         eager = dataclasses.replace(config.loop, min_gap=1, min_score=0.0, pause=0)
         closer = make_closer(dataclasses.replace(config, loop=eager), rig)

@@ -127,6 +127,22 @@ def test_a_step_is_detected_and_earlier_keyframes_keep_their_rig() -> None:
 
 
 @pytest.mark.parametrize("name", RIGS)
+@pytest.mark.parametrize("degrees", [(0.0, 0.1, 0.0), (0.0, -0.2, 0.0), (0.0, 0.0, 0.4)])
+def test_a_knock_is_measured_at_once_with_the_points_known_before(
+    name: str, degrees: tuple[float, float, float]
+) -> None:
+    true = RIGS[name]
+    for seed in range(3):
+        estimator = SelfCalibration(true)
+        seen = keyframes([true] * 12 + [turned(true, degrees)] * 2, true, seed)
+        noticed = np.deg2rad(degrees) + 3e-4
+        found = [estimator.add(replace(k, right_turn=noticed) if k.kf_id >= 12 else k) for k in seen]
+        knock = found[-1]
+        assert not any(found[:-1]) and knock is not None and (knock.why, knock.since_kf_id) == ("step", 12)
+        assert np.rad2deg(knock.terms[:3]) == pytest.approx(degrees, abs=0.008)
+
+
+@pytest.mark.parametrize("name", RIGS)
 @pytest.mark.parametrize("degrees", [(0.0, 0.2, 0.0), (0.1, 0.0, 0.0), (0.0, 0.0, -0.3)])
 def test_the_first_keyframe_after_a_step_is_found(name: str, degrees: tuple[float, float, float]) -> None:
     true = RIGS[name]
@@ -189,9 +205,8 @@ def test_the_same_keyframes_give_the_same_bits() -> None:
 def test_a_turning_window_has_less_information_about_disparity() -> None:
     from stereo_sfm.mapping.rig_window import solve_window
 
-    window = solve_window(
-        RIGS["pinhole"], list(keyframes([RIGS["pinhole"]] * 4, RIGS["pinhole"], 0)), np.zeros(RIG_TERMS)
-    )
+    seen = [SeenPoints.of(k) for k in keyframes([RIGS["pinhole"]] * 4, RIGS["pinhole"], 0)]
+    window = solve_window(RIGS["pinhole"], seen, np.zeros(RIG_TERMS))
     assert window is not None
     little, much = (np.diag(np.linalg.inv(window.information.with_lens_error(a).matrix)) for a in (0.01, 1.0))
     assert much[1] > 4 * little[1] and much[0] == pytest.approx(little[0], rel=0.3)

@@ -133,7 +133,8 @@ class FramePoseSolver:
     """Solves for the pose of each frame with the noise of the previous frames."""
 
     def __init__(self, config: TrackerConfig, cameras: StereoCameras, shutter: RollingShutter) -> None:
-        self._config, self._cameras, self._shutter = config, cameras, shutter
+        self.cameras = cameras  # current ones
+        self._config, self._shutter = config, shutter
         self._noise = 1.0  # observed noise over config.sigma_px
         self._alert_s = 0.0  # seconds for which other motions are still searched for
         self.open_view = 0.0  # inliers of an unobstructed view
@@ -141,7 +142,7 @@ class FramePoseSolver:
 
     def use(self, cameras: StereoCameras) -> None:
         """Use other cameras."""
-        self._cameras = cameras
+        self.cameras = cameras
 
     def solve_again(self, tracks: Tracks, expected: ExpectedMotion) -> PoseSolution:
         """Solve for the pose of a lost camera from points that were static before, starting at the expected pose."""
@@ -406,7 +407,7 @@ class FramePoseSolver:
         pose_solver.refine_depth(
             solution.pose, solution.velocity, self._shutter.row_seconds(tracks.uv), tracks.origin, tracks.direction,
             tracks.rho, tracks.variance, tracks.uv, tracks.uv_right, solution.inlier & ~tracks.mapped,
-            self._cameras.cams, self._cameras.right_T_left, self._config.depth_sigma_px, MIN_DEPTH_SIGMA,
+            self.cameras.cams, self.cameras.right_T_left, self._config.depth_sigma_px, MIN_DEPTH_SIGMA,
         )  # fmt: skip
 
     def _optimise(
@@ -423,7 +424,7 @@ class FramePoseSolver:
         """(N,) whitened errors of the points at a pose (4, 4), with a velocity (6,) during the readout."""
         return errors_at(
             pose, velocity, self._shutter.row_seconds(tracks.uv), tracks.origin, tracks.direction, tracks.rho,
-            tracks.variance, tracks.uv, tracks.uv_right, self._cameras.cams, self._cameras.right_T_left,
+            tracks.variance, tracks.uv, tracks.uv_right, self.cameras.cams, self.cameras.right_T_left,
             self._config.sigma_px * self._noise,
         )  # fmt: skip
 
@@ -431,8 +432,8 @@ class FramePoseSolver:
         """`pose_solver.influence` of points on a pose."""
         return pose_solver.influence(
             solution.pose, solution.velocity, solution.covariance, self._shutter.row_seconds(tracks.uv), tracks.origin,
-            tracks.direction, tracks.rho, tracks.variance, tracks.uv, tracks.uv_right, self._cameras.cams,
-            self._cameras.right_T_left, solution.sigma_px, CAUCHY_SCALES[-1],
+            tracks.direction, tracks.rho, tracks.variance, tracks.uv, tracks.uv_right, self.cameras.cams,
+            self.cameras.right_T_left, solution.sigma_px, CAUCHY_SCALES[-1],
         )  # fmt: skip
 
     def pull(self, tracks: Tracks, solution: PoseSolution) -> float:
@@ -447,7 +448,7 @@ class FramePoseSolver:
         normal, rhs = np.zeros((size, size)), np.zeros(size)
         pose_solver.normal_equations(
             solution.pose, solution.velocity, rows, tracks.origin, tracks.direction, tracks.rho, tracks.variance,
-            tracks.rho, tracks.uv, tracks.uv_right, self._cameras.cams, self._cameras.right_T_left, solution.sigma_px,
+            tracks.rho, tracks.uv, tracks.uv_right, self.cameras.cams, self.cameras.right_T_left, solution.sigma_px,
             CAUCHY_SCALES[-1], normal, rhs, np.empty(n), np.empty((n, 7)),
         )  # fmt: skip
         rest = np.linalg.inv(solution.covariance) - normal[:6, :6]
@@ -460,7 +461,7 @@ class FramePoseSolver:
         pose, velocity, covariance, error = pose_solver.optimise_pose(
             start.pose, start.moved, start.seconds, self._shutter.velocity_sigma(),
             self._shutter.row_seconds(tracks.uv), tracks.origin, tracks.direction, tracks.rho, tracks.variance,
-            tracks.uv, tracks.uv_right, self._cameras.cams, self._cameras.right_T_left, sigma_px, CAUCHY_SCALES,
+            tracks.uv, tracks.uv_right, self.cameras.cams, self.cameras.right_T_left, sigma_px, CAUCHY_SCALES,
             start.pose if prior is None else prior.pose, sigmas,
         )  # fmt: skip
         return PoseSolution(pose, velocity, covariance, error, sigma_px, self._config.max_error_sigmas)

@@ -50,9 +50,11 @@ class Keyframes:
         self._covariance: F64 = np.zeros((6, 6))  # of it
         self._frames_since = 0
         self._stamp_ns, self._submap_id = 0, -1  # of the newest keyframe
+        self._first_of_rig = 0  # id of the first keyframe of the current rig
 
     def use(self, rig: Rig) -> None:
-        """Use a corrected rig."""
+        """Use a corrected rig: the next frame becomes a keyframe."""
+        self._first_of_rig = self.count
         if self._place_corners is not None:
             self._place_corners.use(rig)
         if self._side_views is not None:
@@ -63,10 +65,17 @@ class Keyframes:
         self._frames_since += 1
 
     def due(self, tracks: Tracks) -> bool:
-        """Whether the frame should become a keyframe: few of the newest one's static points are left."""
+        """Whether the frame should become a keyframe: few of the newest one's static points are left, or the rig was
+        corrected since."""
         config = self._config
+        if self.count == self._first_of_rig:
+            return True
         left = int(np.count_nonzero(~tracks.moving & (tracks.age >= self._frames_since)))
         return self._frames_since >= config.keyframe_max_frames or left < config.keyframe_share * self.points
+
+    def resumed(self, kf_id: int) -> bool:
+        """Whether a keyframe is one of the current rig."""
+        return kf_id >= self._first_of_rig
 
     def reference(self, odom_T_cam: F64) -> tuple[int, F64]:
         """The newest keyframe's id (-1: none yet), and kf_T_cam (4, 4) of a pose (4, 4)."""
@@ -79,13 +88,14 @@ class Keyframes:
         covariance: F64,
         submap_id: int,
         rig_terms: F64,
+        right_turn: F64,
         sensors: MotionSensors | None = None,
     ) -> Keyframe:
         """A keyframe of an image, without points: see `describe`.
 
         Args:
             odom_T_cam: (4, 4), which the sensors have accepted. covariance: (6, 6) of it. rig_terms: (8,) current
-                correction of the rig.
+                correction of the rig. right_turn: (3,) rotation of the right camera besides.
         """
         keyframe = Keyframe(
             kf_id=self.count,
@@ -99,6 +109,7 @@ class Keyframes:
             descriptors=np.zeros((0, 32), np.uint8),
             submap_id=submap_id,
             rig_terms=rig_terms.copy(),
+            right_turn=right_turn.copy(),
             odometry=self._moved(odom_T_cam, covariance) if submap_id == self._submap_id else None,
             **({} if sensors is None else self._measured(sensors, image.stamp_ns, odom_T_cam, submap_id)),
         )

@@ -11,12 +11,16 @@ from stereo_sfm.types import F64, I64, Bool, MapUpdate
 NEAREST_M = 1e-6
 
 
-def take_update(tracks: Tracks, update: MapUpdate) -> Tracks:
-    """The tracks with fused points under one id, without culled ones, at their positions in the map."""
+def take_update(tracks: Tracks, update: MapUpdate, resumed_T_odom: F64) -> Tracks:
+    """The tracks with fused points under one id, without culled ones, at their positions in the map.
+
+    `resumed_T_odom`: (4, 4) moves these besides.
+    """
     tracks = _without_culled(_fused(tracks, update.fused_point_ids), update.culled_point_ids)
     rows, found = _rows_of(update.point_ids, tracks.point_ids)
     if len(found):
-        _place(tracks, rows, se3.transform(se3.inverse(update.map_T_odom), update.points_map[found]))
+        to_odom = resumed_T_odom @ se3.inverse(update.map_T_odom)
+        _place(tracks, rows, se3.transform(to_odom, update.points_map[found]))
     return tracks
 
 

@@ -15,7 +15,8 @@ MIN_RHO = 1e-4  # 1/m
 def triangulate_tracks(
     tracks: Tracks, stereo: StereoMatcher, shutter: RollingShutter, pose: F64, velocity: F64
 ) -> Tracks:
-    """Tracks with distances by the matcher's rig, from the pose of the last image.
+    """Tracks with distances by the matcher's rig, from the pose of the last image. None is taken for moving: what
+    contradicted another rig need not contradict this one.
 
     Args:
         tracks: of the last image. stereo: with the corrected rig.
@@ -31,4 +32,5 @@ def triangulate_tracks(
     tracks.rho[seen] = np.maximum(match.rho[seen], MIN_RHO)
     tracks.variance[seen] = match.variance[seen]
     tracks.mapped[seen] = False
+    tracks.moving[:], tracks.misses[:] = False, 0
     return tracks

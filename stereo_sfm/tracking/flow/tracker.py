@@ -26,6 +26,7 @@ from stereo_sfm.tracking.flow.consensus import Movers, after_frame, static_frame
 from stereo_sfm.tracking.flow.follower import Follower
 from stereo_sfm.tracking.flow.frame_pose import ExpectedMotion, FramePoseSolver, PoseSolution
 from stereo_sfm.tracking.flow.keyframes import Keyframes
+from stereo_sfm.tracking.flow.knock import KnockDetector
 from stereo_sfm.tracking.flow.map_points import take_update
 from stereo_sfm.tracking.flow.new_points import NewPoints
 from stereo_sfm.tracking.flow.partial_view import PartialView
@@ -72,14 +73,17 @@ class Tracker:
         place_corners: PlaceCorners | None = None,
         places: Places | None = None,
         side_views: SideViews | None = None,
+        knock: KnockDetector | None = None,
     ) -> None:
         """Args:
         place_corners: detector of the corners for place recognition; None: keyframes have none.
         places: relocalization after a loss of tracking; None: there is none.
         side_views: views for place recognition in the opposite direction; None: keyframes have none.
+        knock: None: the mapper does not correct the rig.
         """
         self._config, self._rig = config, rig
         self._rig_terms: F64 = np.zeros(RIG_TERMS)  # current correction of the rig
+        self._knock = knock
         self._spans = spans or NoSpans()
         self._stereo = StereoMatcher(config, rig)
         self._shutter = RollingShutter(rig)
@@ -103,6 +107,7 @@ class Tracker:
         self._bridging = False  # tracking restarts at the pose by IMU or wheels, in the same submap
         self._submap_id = 0
         self._map_version = 0
+        self._resumed_T_odom: F64 = np.eye(4)  # for points of the map, since the rig was corrected: see `_resume`
         self._undescribed: tuple[Keyframe, StereoPyramids, bool] | None = None  # the newest keyframe, and if trusted
         self._sparse: StereoPyramids | None = None  # images of the newest frame if it needs new points
         self.solution: PoseSolution | None = None  # of the last image; None for a first image
@@ -115,10 +120,20 @@ class Tracker:
     def apply(self, update: MapUpdate) -> None:
         """Apply the mapper's positions of points, and its correction of the rig."""
         self._map_version = update.version
-        if update.calibration is not None and update.calibration.applied:
+        if self._keyframes.resumed(update.kf_id):
+            self._resumed_T_odom = np.eye(4)
+        corrected = update.calibration is not None and update.calibration.applied
+        if update.calibration is not None and corrected:
             self._rig_terms = update.calibration.terms
-            self._use(with_terms(self._rig, self._rig_terms))
-        self._tracks = take_update(self._tracks, update)
+            if self._knock is not None and update.calibration.why == "step":
+                self._knock.confirmed()
+            self._use_rig()
+            self._tracks = triangulate_tracks(self._tracks, self._stereo, self._shutter, self._pose, self._velocity)
+        elif self._turn.any():  # the map does not know it yet
+            update = replace(update, point_ids=update.point_ids[:0], points_map=update.points_map[:0])
+        self._tracks = take_update(self._tracks, update, self._resumed_T_odom)
+        if corrected and not self._lost:
+            self._resume(update)
 
     def step(self, image: StereoImage) -> tuple[Frame, Keyframe | None]:
         """The pose of one image, and the keyframe if this frame becomes one, still without points: see `describe`."""
@@ -131,6 +146,8 @@ class Tracker:
             self._sensors.feed(image)
         if self._state == TrackState.INITIALIZING:
             return self._begin(image, images)
+        if self._knock is not None and self._knock.given_up(image.stamp_ns):
+            self._use_rig()
         expected = self._predict(image.stamp_ns)
         blind = self._lost and self._sensors is None
         tracks, solution = NOT_FOUND if blind else self._follow(images, expected)
@@ -139,9 +156,9 @@ class Tracker:
         recovered = bool(self._lost)
         if not (recovered or solution.reason) and (more := self._find_more(image, images, solution.pose)) is not None:
             (tracks, solution), recovered = more, True
-        self.solution = solution
         if solution.reason:
             return self._lose(image, solution.reason)
+        self.solution = solution
         if self._sensors is not None:
             solution.pose = self._sensors.corrected(image.stamp_ns, solution.pose, solution.covariance)
         self._refine(tracks, solution, expected, recovered)
@@ -188,13 +205,55 @@ class Tracker:
             if self._undescribed is not None:
                 self._keyframes.points = self._static_count()
 
-    def _use(self, rig: Rig) -> None:
-        """Use a corrected rig: the tracked points are triangulated anew."""
+    @property
+    def _turn(self) -> F64:
+        """(3,) by which the right camera has turned suddenly, which the rig's correction does not contain."""
+        return np.zeros(3) if self._knock is None else self._knock.turn
+
+    def _use_rig(self) -> None:
+        """Use the rig as it is now known."""
+        terms = self._rig_terms.copy()
+        terms[:3] += self._turn
+        rig = with_terms(self._rig, terms)
         self._stereo.use(rig)
         self._solver.use(StereoCameras.of(rig))
         self._recovery.use(rig)
         self._keyframes.use(rig)
-        self._tracks = triangulate_tracks(self._tracks, self._stereo, self._shutter, self._pose, self._velocity)
+
+    def _resume(self, update: MapUpdate) -> None:
+        """Go on from the last pose with the points of an update that corrects the rig.
+
+        The motion since the newest keyframe was measured with another rig: points triangulated from the last pose
+        contradict those of the map. The odometry does not jump; the map's points move to where the last image saw them
+        from its pose, until the map has a keyframe that knows.
+        """
+        placed = self._tracks.keep(self._tracks.mapped)
+        solution = self._solver.solve_again(placed, ExpectedMotion(self._pose, np.zeros(6), 0.0))
+        if not solution.reason and solution.undivided:
+            self._resumed_T_odom = self._pose @ se3.inverse(solution.pose) @ self._resumed_T_odom
+            self._tracks = take_update(self._tracks, update, self._resumed_T_odom)
+
+    def _after_knock(
+        self, tracks: Tracks, solution: PoseSolution, images: StereoPyramids, expected: ExpectedMotion
+    ) -> tuple[Tracks, PoseSolution] | None:
+        """The pose of an image in which the right camera has turned suddenly; None if it has not.
+
+        `tracks`, `solution`: without that. If they are not good, the pose is one from the left image alone.
+        """
+        stamp_ns = self._stamp_ns + round(1e9 * expected.seconds)
+        if self._knock is None or not self._knock.watches(stamp_ns):
+            return None
+        if not solution.good(self._config, self._static_count()):
+            by_left = replace(tracks, uv_right=np.full_like(tracks.uv_right, np.nan))
+            solution = self._solver.solve(by_left, expected, self._pose, self._static_count())
+            if not solution.good(self._config, self._static_count()):
+                return None
+        turn = self._knock.seen(tracks, solution, self._solver.cameras, expected.seconds)
+        if turn is None:
+            return None
+        self._knock.add(turn, stamp_ns)
+        self._use_rig()
+        return self._track(images, expected)
 
     # -- stages ----------------------------------------------------------------------------------------------------
 
@@ -217,6 +276,9 @@ class Tracker:
         If both fail and most points are still found by translation, then the image is blurred.
         """
         tracks, solution = self._track(images, expected)
+        knocked = self._after_knock(tracks, solution, images, expected)
+        if knocked is not None:
+            return knocked
         if solution.good(self._config, self._static_count()):
             return tracks, solution
         turned = self._follower.turned(images.left, expected, self._pose)
@@ -449,7 +511,7 @@ class Tracker:
     def _create_keyframe(self, image: StereoImage, images: StereoPyramids, covariance: F64, trusted: bool) -> Keyframe:
         """A keyframe of the image whose pose, with covariance (6, 6), has just been found."""
         keyframe = self._keyframes.create(
-            image, self._pose, covariance, self._submap_id, self._rig_terms, self._sensors
+            image, self._pose, covariance, self._submap_id, self._rig_terms, self._turn, self._sensors
         )
         self._keyframes.points = self._static_count()
         self._undescribed = keyframe, images, trusted
