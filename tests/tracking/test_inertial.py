@@ -262,6 +262,21 @@ def test_smoothing_brings_a_bridge_to_both_ends() -> None:
     np.testing.assert_array_equal(smooth_bridges(stamps, drifted, open_end), drifted)
 
 
+def test_smoothing_does_not_believe_the_velocity_of_poses_that_wheels_correct() -> None:
+    """Each half second they jump by some centimetres: the map's way stays as near to the truth as the odometry."""
+    session, n = Session(), 120
+    stamps = np.arange(n, dtype=np.int64) * FRAME_NS
+    truth = np.array([session.pose(s * 1e-9) for s in stamps])
+    inertial = np.zeros(n, bool)
+    inertial[20:100] = True
+    jumping = truth.copy()
+    since = stamps[20:100] % 500_000_000 * 1e-9
+    jumping[20:100, :3, 3] += np.outer(0.2 * since, [1.0, -0.5, 0.0])
+    smooth = smooth_bridges(stamps, jumping, inertial)
+    off = [np.linalg.norm(poses[:, :3, 3] - truth[:, :3, 3], axis=1).max() for poses in (jumping, smooth)]
+    assert off[1] < 1.1 * off[0]
+
+
 def test_the_imu_is_part_of_a_rig_file(tmp_path: Path) -> None:
     camera = Pinhole(64, 48, 50.0, 50.0, 32.0, 24.0)
     right = se3.from_rotation_translation(np.eye(3), np.array([0.1, 0, 0]))

@@ -236,9 +236,9 @@ class InertialMotion:
         if motion is None:
             return
         seen = self._odom_T_last[:3, :3].T @ odom_T_imu[:3, :3]
-        error = float(np.linalg.norm(se3.so3_log(motion.rotation.T @ seen))) / motion.seconds
-        self._turn_errors = [*self._turn_errors[1 - JUDGED :], error * error]
-        wrong = len(self._turn_errors) >= JUDGED and np.sqrt(np.mean(self._turn_errors)) > MAX_TURN_ERROR
+        off = se3.so3_log(motion.rotation.T @ seen)
+        self._turn_errors = [*self._turn_errors[1 - JUDGED :], float(off @ off) / motion.seconds**2]
+        wrong = len(self._turn_errors) >= JUDGED and sum(self._turn_errors) > JUDGED * MAX_TURN_ERROR**2
         size = 0.0 if self._state is None else abs(self._filter.force - GRAVITY)
         if wrong:
             self.left_out = "gyro_contradicts_images"

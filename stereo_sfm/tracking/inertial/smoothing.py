@@ -1,7 +1,8 @@
 """Smoothing of poses from the IMU alone, by the images before and after such an interval.
 
 From the last good pose on, an error of the velocity grows with time and one of the acceleration (gravity's direction,
-bias) with its square; position and velocity where the images come back determine both.
+bias) with its square; position and velocity where the images come back determine both. Wheels correct the position
+now and then: the velocity of such poses says nothing, and contradicts the rest.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from stereo_sfm.types import F64, I64, Bool
 VELOCITY_S = 0.2  # over which the velocity is measured where the images come back
 START_SPEED_SIGMA, ACCEL_SIGMA = 0.008, 0.03  # m/s and m/s^2, what is expected of the errors
 END_SIGMA, END_SPEED_SIGMA = 0.002, 0.02  # m and m/s, of what is measured where the images come back
+SPEED_CHI2 = 16.8  # of six: beyond (1 % of right ones) the velocity is left out
 
 
 def smooth_bridges(stamp_ns: I64, poses: F64, inertial: Bool) -> F64:
@@ -44,7 +46,10 @@ def _corrected(stamp_ns: I64, poses: F64, first: int, end: int) -> F64:
     enough = len(after) >= 3 and end - first >= 2
     sigmas = np.array([START_SPEED_SIGMA, ACCEL_SIGMA, END_SIGMA, END_SPEED_SIGMA if enough else np.inf])[:, None]
     seen = np.stack([np.zeros(3), np.zeros(3), error, error_speed])
-    velocity, acceleration = np.linalg.lstsq(rows / sigmas, seen / sigmas)[0]
+    found, chi2, *_ = np.linalg.lstsq(rows / sigmas, seen / sigmas)
+    if enough and chi2.sum() > SPEED_CHI2:
+        found = np.linalg.lstsq(rows[:3] / sigmas[:3], seen[:3] / sigmas[:3])[0]
+    velocity, acceleration = found
     t = seconds[first:end, None]
     out = poses[first:end].copy()
     out[:, :3, 3] += velocity * t + 0.5 * acceleration * t * t

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from stereo_sfm.calib.wheel import Wheel
@@ -24,10 +26,10 @@ class WheelMotion:
     """Integrates the samples of every image; corrected by the poses from images."""
 
     def __init__(self, wheel: Wheel) -> None:
-        self._wheel = wheel
+        self._wheel, self._wheel_T_left = wheel, se3.inverse(wheel.left_T_wheel)
         self._series = Series(6, MAX_GAP_S)
         self._window = WheelWindow(wheel.model, wheel.slip)
-        self._correction: WheelCorrection = self._window.correction()
+        self._known: WheelCorrection | None = None  # what the window says, once asked for
         self._last_ns = self._link_ns = 0
         self._odom_T_last: F64 = np.eye(4)  # poses of the wheels
         self._odom_T_link: F64 = np.eye(4)
@@ -35,6 +37,12 @@ class WheelMotion:
         self._raw_of: tuple[int, int, F64 | None] = (0, 0, None)  # an interval, and the motion in it
         self._begun = False
         self._slips = 0.0  # share of the way that is in doubt in a turn
+
+    @property
+    def _correction(self) -> WheelCorrection:
+        if self._known is None:
+            self._known = self._window.correction()
+        return self._known
 
     @property
     def wheel(self) -> Wheel:
@@ -53,15 +61,17 @@ class WheelMotion:
             return
         stamps = samples.stamp_ns - round(self._wheel.offset_s * 1e9)
         values = np.hstack(self._wheel.velocities(samples))
-        values[:, 3:] = np.where(np.isfinite(values[:, 3:]), values[:, 3:], 0.0)  # of a sensor that only tells the way
-        known = np.isfinite(values).all(axis=1)
-        stamps, values = stamps[known], values[known]
+        if not np.isfinite(values).all():
+            values[:, 3:] = np.where(np.isfinite(values[:, 3:]), values[:, 3:], 0.0)  # of a sensor that tells the way
+            known = np.isfinite(values).all(axis=1)
+            stamps, values = stamps[known], values[known]
         rows = self._series.after_last(stamps)
         self._series.add(stamps[rows], values[rows])
 
     def begin(self, stamp_ns: int, odom_T_cam: F64) -> None:
         """The odometry begins anew here: poses from before do not go with those to come."""
         self._begun, self._last_step = True, None
+        self._known = self._correction
         self._window.begin()
         self._last_ns = self._link_ns = stamp_ns
         self._odom_T_last = self._odom_T_link = odom_T_cam @ self._wheel.left_T_wheel
@@ -80,7 +90,7 @@ class WheelMotion:
         if by_wheels is not None and stamp_ns - self._link_ns < 2 * LINK_NS:
             seen = se3.inverse(self._odom_T_link) @ self._odom_T_last
             self._window.add((stamp_ns - self._link_ns) * 1e-9, by_wheels, seen)
-            self._correction = self._window.correction()
+            self._known = None
         self._link_ns, self._odom_T_link = stamp_ns, self._odom_T_last
         self._series.forget(stamp_ns)
 
@@ -97,9 +107,9 @@ class WheelMotion:
         seconds = (stamp_ns - self._last_ns) * 1e-9
         change = self._in_camera(motion) - self._last_step[1] * (seconds / self._last_step[0])
         limits = ACCELERATION * seconds**2, TURN_ACCELERATION * seconds**2
-        sizes = [float(np.linalg.norm(part)) for part in (change[:3], change[3:])]
-        parts = [min(1.0, limit / max(size, 1e-12)) for limit, size in zip(limits, sizes, strict=True)]
-        return step + change * np.repeat(np.array(parts), 3)
+        for part, limit in zip((change[:3], change[3:]), limits, strict=True):
+            part *= min(1.0, limit / max(math.sqrt(float(part @ part)), 1e-12))
+        return step + change
 
     @property
     def lasting(self) -> F64:
@@ -186,5 +196,4 @@ class WheelMotion:
 
     def _in_camera(self, motion: F64) -> F64:
         """(6,) tangent of a motion of the wheels (4, 4) as one of the camera."""
-        left_T_wheel = self._wheel.left_T_wheel
-        return np.asarray(se3.log(left_T_wheel @ motion @ se3.inverse(left_T_wheel)))
+        return np.asarray(se3.log(self._wheel.left_T_wheel @ motion @ self._wheel_T_left))

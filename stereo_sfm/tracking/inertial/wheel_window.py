@@ -96,18 +96,18 @@ class WheelWindow:
         """Logarithmic scale and direction (4,), their covariance, and the variance of what is left of a link's way."""
         prior: F64 = np.diag(1.0 / np.square([self._slip, DIRECTION_SIGMA, DIRECTION_SIGMA, DIRECTION_SIGMA]))
         x, information, sigma2 = np.zeros(4), prior, MIN_SIGMA_M**2
-        jacobians = [np.column_stack([k.way, -se3.skew(k.way)]) for k in self._links]
-        errors = [k.seen - k.way for k in self._links]
-        shares = [self.doubt(k.seconds, k.turn, k.turn_seen) for k in self._links]
-        slips2 = [float(k.way @ k.way) * share**2 for k, share in zip(self._links, shares, strict=True)]
+        if not self._links:
+            return x, np.linalg.inv(information), sigma2
+        way, seen = np.stack([k.way for k in self._links]), np.stack([k.seen for k in self._links])
+        jacobian, error = np.concatenate([way[:, :, None], -se3.skew(way)], axis=2), seen - way
+        share = np.array([self.doubt(k.seconds, k.turn, k.turn_seen) for k in self._links])
+        slip2, usual = (way**2).sum(axis=1) * share**2, share <= self._slip
         for _ in range(2):  # the second time with the size of the noise
-            information, rhs = prior.copy(), np.zeros(4)
-            for jacobian, error, slip2 in zip(jacobians, errors, slips2, strict=True):
-                information += jacobian.T @ jacobian / (sigma2 + slip2)
-                rhs += jacobian.T @ error / (sigma2 + slip2)
-            x = np.linalg.solve(information, rhs)
-            left = [e - j @ x for j, e, s in zip(jacobians, errors, shares, strict=True) if s <= self._slip]
-            sigma2 = max(float(np.mean(np.square(left))) if left else 0.0, MIN_SIGMA_M**2)
+            weighted = jacobian / (sigma2 + slip2)[:, None, None]
+            information = prior + np.einsum("nij,nik->jk", weighted, jacobian)
+            x = np.linalg.solve(information, np.einsum("nij,ni->j", weighted, error))
+            left = (error - jacobian @ x)[usual]
+            sigma2 = max(float(np.mean(left**2)) if len(left) else 0.0, MIN_SIGMA_M**2)
         return x.astype(np.float64), np.linalg.inv(information).astype(np.float64), sigma2
 
     def doubt(self, seconds: float, by_wheels: float, turned: float) -> float:
