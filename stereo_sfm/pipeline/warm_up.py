@@ -115,7 +115,8 @@ def warm_up_fast_motion(config: Config, rig: Rig, image: U8) -> None:
     uv, warps, patches = np.zeros((1, 2)), np.tile(np.eye(2), (1, 1, 1, 1)), np.zeros((1, FLAT_SIZE), np.float32)
     find_deformed(pyramid[1], uv, warps, np.zeros(1, np.int64), patches, 1, 1, uv.copy(), warps[0].copy())
     solver = FramePoseSolver(config.tracker, StereoCameras.of(rig), RollingShutter(rig))
-    solver.pull(Tracks(), PoseSolution(np.eye(4), np.zeros(6), np.eye(6), np.zeros(0), config.tracker.sigma_px, 1.0))
+    solution = PoseSolution(np.eye(4), np.zeros(6), np.eye(6), np.zeros(0), config.tracker.sigma_px, 1.0)
+    solver.pull(Tracks(), np.zeros(0, bool), solution)
     if rig.imu is not None and config.tracker.inertial:
         _warm_up_inertial(rig.imu)
 

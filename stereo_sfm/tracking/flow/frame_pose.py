@@ -215,7 +215,7 @@ class FramePoseSolver:
 
     def _pulling(self, tracks: Tracks, points: Bool, least: int, best: PoseSolution) -> Bool:
         """(N,) the `points` (N,), if they are so many and pull a pose away from where all others have it; else none."""
-        pulling = np.count_nonzero(points) >= least and self.pull(tracks.keep(points), best) >= PULL_CHI2
+        pulling = np.count_nonzero(points) >= least and self.pull(tracks, points, best) >= PULL_CHI2
         return points & pulling
 
     def _judge(
@@ -436,24 +436,13 @@ class FramePoseSolver:
             self.cameras.right_T_left, solution.sigma_px, CAUCHY_SCALES[-1],
         )  # fmt: skip
 
-    def pull(self, tracks: Tracks, solution: PoseSolution) -> float:
-        """How far from a pose the other points alone would have it, in squared sigmas; inf if it rests on these.
-
-        To first order: at a pose by all, the gradients of these and of the others cancel each other.
-        """
-        if not np.isfinite(solution.covariance).all():
-            return math.inf
-        rows = self._shutter.row_seconds(tracks.uv)
-        size, n = 12 if len(rows) else 6, len(tracks)
-        normal, rhs = np.zeros((size, size)), np.zeros(size)
-        pose_solver.normal_equations(
-            solution.pose, solution.velocity, rows, tracks.origin, tracks.direction, tracks.rho, tracks.variance,
-            tracks.rho, tracks.uv, tracks.uv_right, self.cameras.cams, self.cameras.right_T_left, solution.sigma_px,
-            CAUCHY_SCALES[-1], normal, rhs, np.empty(n), np.empty((n, 7)),
+    def pull(self, tracks: Tracks, points: Bool, solution: PoseSolution) -> float:
+        """`pose_solver.pull` of some points (N,)."""
+        return pose_solver.pull(
+            solution.pose, solution.velocity, solution.covariance, self._shutter.row_seconds(tracks.uv), tracks.origin,
+            tracks.direction, tracks.rho, tracks.variance, tracks.uv, tracks.uv_right, self.cameras.cams,
+            self.cameras.right_T_left, solution.sigma_px, CAUCHY_SCALES[-1], points,
         )  # fmt: skip
-        rest = np.linalg.inv(solution.covariance) - normal[:6, :6]
-        pull = float(rhs[:6] @ np.linalg.solve(rest, rhs[:6])) if np.linalg.det(rest) > 0.0 else math.inf
-        return pull if pull >= 0.0 else math.inf
 
     def _optimise_all(self, tracks: Tracks, start: ExpectedMotion, prior: ExpectedMotion | None) -> PoseSolution:
         sigma_px = self._config.sigma_px * self._noise

@@ -341,6 +341,39 @@ def influence(
 
 
 @njit
+def pull(
+    pose, velocity, covariance, row_s, origin, direction, rho, variance, uv_l, uv_r, cams, right_T_left, sigma, scale,
+    points,
+):  # fmt: skip
+    """How far from a pose, with covariance (6, 6), the others alone would have it than some `points` (N,), in squared
+    sigmas; inf if it rests on these.
+
+    To first order: at a pose by all, the gradients of these and of the others cancel each other. Arguments as of
+    `optimise_pose`, the last Cauchy scale.
+    """
+    rows = np.flatnonzero(points)
+    n = 12 if len(row_s) > 0 else 6
+    normal, rhs, inverse, factor = np.zeros((n, n)), np.zeros(n), np.full((6, 6), np.inf), np.zeros((6, 6))
+    x = np.zeros(6)
+    normal_equations(
+        pose, velocity, row_s[rows] if len(row_s) > 0 else row_s, origin[rows], direction[rows], rho[rows],
+        variance[rows], rho[rows], uv_l[rows], uv_r[rows], cams, right_T_left, sigma, scale, normal, rhs,
+        np.empty(len(rows)), np.empty((len(rows), 7)),
+    )  # fmt: skip
+    if not invert_symmetric(covariance, inverse, factor):
+        return math.inf
+    for i in range(6):
+        for j in range(6):
+            inverse[i, j] -= normal[i, j]
+    if not solve_symmetric(inverse, rhs[:6].copy(), x, factor):
+        return math.inf
+    total = 0.0
+    for i in range(6):
+        total += rhs[i] * x[i]
+    return total
+
+
+@njit
 def refine_depth(
     pose, velocity, row_s, origin, direction, rho, variance, uv_l, uv_r, inlier, cams, right_T_left, sigma, floor
 ):
