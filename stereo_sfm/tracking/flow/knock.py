@@ -22,14 +22,12 @@ from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.types import F64
 
 KNOWN_S = 1.0  # for which a point must have been tracked
-MIN_POINTS, MIN_AGREEING = 30, 0.5  # that are known, seen by both cameras; share of them that must agree
-MIN_SHIFT_PX = 0.25  # root mean square over the points
-MIN_SHARE = 0.6  # of the squared residuals that one rotation must explain
+MIN_POINTS, MIN_AGREEING = 35, 0.5  # that are known, seen by both cameras; share of them that must agree
+MIN_SHIFT_PX = 0.3  # root mean square over the points
+MIN_SHARE = 0.8  # of the squared residuals that one rotation must explain
 STEPS, SCALE = 3, 3.0  # of the robust estimate; its scale over the rest that the rotation leaves
-UNCONFIRMED_S, PAUSE_S = (
-    5.0,
-    60.0,
-)  # a rotation that the map does not confirm for so long is given up; none is looked for
+UNCONFIRMED_S = 5.0  # after which a rotation that the map does not confirm is given up ...
+PAUSE_S = 60.0  # ... and none is looked for
 
 
 class KnockDetector:

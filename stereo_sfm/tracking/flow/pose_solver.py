@@ -362,6 +362,17 @@ def pull(
     )  # fmt: skip
     if not invert_symmetric(covariance, inverse, factor):
         return math.inf
+    if n == 12:  # the velocity is unknown
+        y, own = np.zeros(6), np.ascontiguousarray(normal[6:, 6:]) + 1e-9 * np.eye(6)
+        for i in range(7):
+            column = rhs[6:].copy() if i == 6 else normal[6:, i].copy()
+            if not solve_symmetric(own, column, y, factor):
+                return math.inf
+            for j in range(6):
+                if i == 6:
+                    rhs[j] -= (normal[j, 6:] * y).sum()
+                else:
+                    normal[j, i] -= (normal[j, 6:] * y).sum()
     for i in range(6):
         for j in range(6):
             inverse[i, j] -= normal[i, j]
