@@ -73,8 +73,8 @@ class RigWindow:
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
-    """The rig of the first keyframes of a window, with its corrections."""
+class EarlierRig:
+    """With its corrections, that of the first keyframes of a window during which the rig changed."""
 
     rig: Rig
     keyframes: int
@@ -93,7 +93,7 @@ class _Problem:
     shapes: F64  # (2, F, N, 2, L) px
     lens: F64  # (L,)
 
-    def seen_by(self, rig: Rig, before: Known | None) -> _Problem:
+    def seen_by(self, rig: Rig, before: EarlierRig | None) -> _Problem:
         """With the right pixels that `rig` would have seen instead of the rig `before` it."""
         if before is None:
             return self
@@ -112,7 +112,7 @@ class _Problem:
 
 
 def solve_window(
-    rig: Rig, keyframes: Sequence[SeenPoints], terms: F64, before: Known | None = None
+    rig: Rig, keyframes: Sequence[SeenPoints], terms: F64, before: EarlierRig | None = None
 ) -> RigWindow | None:
     """The information of a window, or None if its keyframes have too few common points.
 

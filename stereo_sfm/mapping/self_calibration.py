@@ -26,7 +26,7 @@ from stereo_sfm.calib.choice import NAMES, SCALES, UNITS, Estimate, choose, sign
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.mapping.rig_change import SeenPoints, first_changed
-from stereo_sfm.mapping.rig_window import PRIOR, Known, RigInformation, RigWindow, solve_window
+from stereo_sfm.mapping.rig_window import PRIOR, EarlierRig, RigInformation, RigWindow, solve_window
 from stereo_sfm.types import F64, RIG_TERMS, Bool, Keyframe
 
 OF_LENSES = slice(5, 8)  # focal ratio and decentering
@@ -185,8 +185,9 @@ class SelfCalibration:
     def _knock(self, keyframe: Keyframe) -> Revision | None:
         """The revision of a rotation that the tracker noticed, once a few keyframes confirm it."""
         turn = keyframe.right_turn
-        if not np.array_equal(turn, self._turn):
-            self._turn, self._turned_kf_id = turn, keyframe.kf_id
+        if turn.any() and (not self._turn.any() or (self._turned_kf_id < 0 and not np.array_equal(turn, self._turn))):
+            self._turned_kf_id = keyframe.kf_id
+        self._turn = turn
         after = sum(k.kf_id >= self._turned_kf_id for k in self._recent)
         if not turn.any() or self._turned_kf_id < 0 or not KNOCK_KEYFRAMES <= after <= ACROSS_STEP[1]:
             return None
@@ -216,7 +217,7 @@ class SelfCalibration:
         before, after = recent[max(at - ACROSS_STEP[0], 0) : at], recent[at : at + ACROSS_STEP[1]]
         if not before or any(k.submap_id != before[0].submap_id for k in (*before, *after)):
             return None
-        known = Known(with_terms(self._rig, self.terms), len(before))
+        known = EarlierRig(with_terms(self._rig, self.terms), len(before))
         return solve_window(self._rig, [*before[::-1], *after], terms, known)
 
     def _measured_across(self, since_kf_id: int, found: _Change, first_sigmas: float) -> _Change:

@@ -50,21 +50,17 @@ class KnockDetector:
         Args:
             tracks: with the pixels of the image. solution: its pose. seconds: since the image before.
         """
-        known = (
-            solution.inlier & ~tracks.moving & (tracks.age * seconds >= KNOWN_S) & np.isfinite(tracks.uv_right[:, 0])
-        )
-        least = max(MIN_POINTS, MIN_AGREEING * np.count_nonzero(known))
+        known = solution.inlier & ~tracks.moving & (tracks.age * seconds >= KNOWN_S)
+        enough = max(MIN_POINTS, MIN_AGREEING * np.count_nonzero(known & np.isfinite(tracks.uv_right[:, 0])))
         turn, scale = np.zeros(3), math.inf
         for _ in range(1 + STEPS):
             count, squares, left = _turn(
                 solution.pose, known, tracks.origin, tracks.direction, tracks.rho, tracks.uv, tracks.uv_right,
                 cameras.cams, cameras.right_T_left, scale, turn,
             )  # fmt: skip
-            if count < (least if scale == math.inf else MIN_AGREEING * least) or squares - left < max(
-                MIN_SHARE * squares, MIN_SHIFT_PX**2 * count
-            ):
+            if count < enough or squares - left < max(MIN_SHARE * squares, MIN_SHIFT_PX**2 * count):
                 return None
-            scale = SCALE * math.sqrt(left / count)
+            scale, enough = SCALE * math.sqrt(left / count), MIN_AGREEING * count
         return turn
 
     def watches(self, stamp_ns: int) -> bool:

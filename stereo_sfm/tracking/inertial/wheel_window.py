@@ -97,7 +97,7 @@ class WheelWindow:
         prior: F64 = np.diag(1.0 / np.square([self._slip, DIRECTION_SIGMA, DIRECTION_SIGMA, DIRECTION_SIGMA]))
         x, information, sigma2 = np.zeros(4), prior, MIN_SIGMA_M**2
         if not self._links:
-            return x, np.linalg.inv(information), sigma2
+            return x, np.linalg.inv(information).astype(np.float64), sigma2
         way, seen = np.stack([k.way for k in self._links]), np.stack([k.seen for k in self._links])
         jacobian, error = np.concatenate([way[:, :, None], -se3.skew(way)], axis=2), seen - way
         share = np.array([self.doubt(k.seconds, k.turn, k.turn_seen) for k in self._links])
