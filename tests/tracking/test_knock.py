@@ -1,4 +1,7 @@
-"""A sudden rotation of the right camera: noticed in its image, measured by the map, given up if that sees none."""
+"""A sudden rotation of the right camera: noticed in its image, measured by the map, given up if that sees none.
+
+And what the tracker does when the map corrects its rig.
+"""
 
 from __future__ import annotations
 
@@ -133,3 +136,18 @@ def test_the_map_corrects_the_rig_within_a_second(knocked: tuple[Rig, list[Stere
             assert step.why == "step" and step.stamp_ns - images[AT].stamp_ns < 1_000_000_000
             assert np.rad2deg(record.calibrations[-1].terms[1]) == pytest.approx(0.2, abs=0.02)
     assert ates[0] < 0.25 * ates[1]
+
+
+def test_the_odometry_does_not_jump_when_the_rig_is_corrected() -> None:
+    """From a calibration that is wrong by 0.2 degrees: a tenth of every step is missing, and then nothing is."""
+    with open_source("sim:loop?camera=pinhole&size=320x200&rate=15&frames=120&start=20") as source:
+        images, truth = list(source), source.ground_truth
+        wrong = turned(source.rig, KNOCK_DEG)
+    assert truth is not None
+    record = RunRecord.of(Config())
+    frames = list(run(MemorySource(wrong, images, truth), Config(), [record]))
+    off = wrong_steps([frame.odom_T_cam for frame in frames], truth)
+    corrected = next(k for k, frame in enumerate(frames) if frame.map_version >= record.calibrations[0].version)
+    assert all(frame.state == TrackState.OK for frame in frames) and corrected < 100
+    assert off[corrected - 1] < 0.012 and off[corrected:].max() < 0.012
+    assert np.median(off[corrected:]) < 0.25 * np.median(off[30:corrected])
