@@ -197,6 +197,15 @@ class SelfCalibration:
         found = None if across is None else self._change([across], False, SIGMAS)
         if across is None or found is None:
             return None
+        earlier = list(self._recent)[-after - STEP_REACH :]
+        first = first_changed(
+            earlier, with_terms(self._rig, self.terms), with_terms(self._rig, self.terms + found.value)
+        )
+        if first is not None and first < self._turned_kf_id:  # it was noticed some images late
+            self._turned_kf_id, after = first, sum(k.kf_id >= first for k in self._recent)
+            again = self._across(len(self._recent) - after, self.terms + found.value)
+            across = across if again is None else again
+            found = self._change([across], False, SIGMAS) or found
         self.windows = deque([across], maxlen=MAX_WINDOWS)
         self._keyframes = list(self._recent)[-after:]
         self._since, self._stepped, self._straddling = self._turned_kf_id, False, False

@@ -143,6 +143,19 @@ def test_a_knock_is_measured_at_once_with_the_points_known_before(
 
 
 @pytest.mark.parametrize("name", RIGS)
+def test_a_knock_that_is_noticed_a_keyframe_late_is_measured_from_its_first(name: str) -> None:
+    true, knocked = RIGS[name], turned(RIGS[name], (0.0, 0.2, 0.0))
+    for seed in range(3):
+        estimator = SelfCalibration(true)
+        noticed = np.deg2rad([0.0, 0.19, 0.0])
+        seen = keyframes([true] * 12 + [knocked] * 3, true, seed)
+        found = [estimator.add(replace(k, right_turn=noticed) if k.kf_id >= 13 else k) for k in seen]
+        knock = found[-1]
+        assert knock is not None and (knock.why, knock.since_kf_id) == ("step", 12)
+        assert np.rad2deg(knock.terms[1]) == pytest.approx(0.2, abs=0.008)
+
+
+@pytest.mark.parametrize("name", RIGS)
 @pytest.mark.parametrize("degrees", [(0.0, 0.2, 0.0), (0.1, 0.0, 0.0), (0.0, 0.0, -0.3)])
 def test_the_first_keyframe_after_a_step_is_found(name: str, degrees: tuple[float, float, float]) -> None:
     true = RIGS[name]

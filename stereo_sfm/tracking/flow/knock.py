@@ -23,9 +23,10 @@ from stereo_sfm.types import F64
 
 KNOWN_S = 1.0  # for which a point must have been tracked
 MIN_POINTS, MIN_AGREEING = 35, 0.5  # that are known, seen by both cameras; share of them that must agree
+UNDIVIDED = 0.6  # share of them that agree with a pose; where fewer do, the others are used, too
 MIN_SHIFT_PX = 0.3  # root mean square over the points
 MIN_SHARE = 0.8  # of the squared residuals that one rotation must explain
-STEPS, SCALE = 3, 3.0  # of the robust estimate; its scale over the rest that the rotation leaves
+FIRST_SCALE_PX, STEPS, SCALE = 3.0, 4, 3.0  # of the robust estimate; its scale over the rest that the rotation leaves
 UNCONFIRMED_S = 5.0  # after which a rotation that the map does not confirm is given up ...
 PAUSE_S = 60.0  # ... and none is looked for
 
@@ -50,15 +51,19 @@ class KnockDetector:
         Args:
             tracks: with the pixels of the image. solution: its pose. seconds: since the image before.
         """
-        known = solution.inlier & ~tracks.moving & (tracks.age * seconds >= KNOWN_S)
-        enough = max(MIN_POINTS, MIN_AGREEING * np.count_nonzero(known & np.isfinite(tracks.uv_right[:, 0])))
-        turn, scale = np.zeros(3), math.inf
-        for _ in range(1 + STEPS):
+        known = ~tracks.moving & (tracks.age * seconds >= KNOWN_S) & np.isfinite(tracks.uv_right[:, 0])
+        agree = known & solution.inlier
+        divided = np.count_nonzero(agree) < UNDIVIDED * np.count_nonzero(known)
+        used = known if divided else agree
+        enough = max(MIN_POINTS, MIN_AGREEING * np.count_nonzero(used))
+        turn, scale = np.zeros(3), FIRST_SCALE_PX
+        for step in range(STEPS):
             count, squares, left = _turn(
-                solution.pose, known, tracks.origin, tracks.direction, tracks.rho, tracks.uv, tracks.uv_right,
+                solution.pose, used, tracks.origin, tracks.direction, tracks.rho, tracks.uv, tracks.uv_right,
                 cameras.cams, cameras.right_T_left, scale, turn,
             )  # fmt: skip
-            if count < enough or squares - left < max(MIN_SHARE * squares, MIN_SHIFT_PX**2 * count):
+            wrong = squares - left < max(MIN_SHARE * squares, MIN_SHIFT_PX**2 * count)
+            if count < enough or (wrong and (not divided or step == STEPS - 1)):
                 return None
             scale, enough = SCALE * math.sqrt(left / count), MIN_AGREEING * count
         return turn
