@@ -1,6 +1,6 @@
 """Self-calibration: corrections of the rig estimated from the keyframes during mapping.
 
-A few keyframes with motion form a window (`mapping.rig_window`); the information of the windows about the terms
+Every few keyframes with motion form a window (`mapping.rig_window`); the information of the windows about the terms
 is summed. Terms are corrected that differ from the current ones by several standard deviations, that both halves of
 the windows (even and odd ones) confirm, and that exceed the systematic error of matching (`calib.choice`). Once one is,
 others follow that are worth their variance. The rows show terms of lenses, which change lengths by what the lens model
@@ -38,7 +38,6 @@ MIN_WINDOWS = 2  # before the first correction
 ENOUGH_WINDOWS = 4  # with fewer, a correction must be more significant: errors of a window's keyframes are alike
 MAX_BETWEEN = 4  # windows from one revision to the next: as many as there are, but no more
 MAX_WINDOWS = 80  # used, the newest
-DENSE_WINDOWS, PAUSE_KEYFRAMES = 16, 8  # from so many on, so many keyframes are left out before the next window
 AFTER_STEP = range(2, 7)  # newest windows that must contradict all others to indicate a step
 STRADDLING_SIGMAS = 2.0  # by which a window during which the rig changed differs from those afterwards
 BEFORE_STEP = 4  # earlier windows needed to detect a step
@@ -77,7 +76,6 @@ class SelfCalibration:
         self._keyframes: list[SeenPoints] = []
         self.windows: deque[RigWindow] = deque(maxlen=MAX_WINDOWS)  # since the last step
         self._since = 0  # first keyframe of the windows
-        self._pause = 0  # keyframes to leave out
         self._until_due = MIN_WINDOWS  # windows until the next revision
         self._stepped = False  # a step was detected and is not yet corrected
         self._straddling = False  # it may have happened during the first window
@@ -100,9 +98,6 @@ class SelfCalibration:
             return knock
         if self._keyframes and seen.submap_id != self._keyframes[0].submap_id:
             self._keyframes = []
-        if self._pause > 0:
-            self._pause -= 1
-            return None
         if self._keyframes and not _moved(self._keyframes[-1], seen, MIN_MOTION * self._rig.left.width):
             return None
         self._keyframes.append(seen)
@@ -147,7 +142,6 @@ class SelfCalibration:
                 self._since = self.windows[1].first_kf_id
             self.windows.append(window)
             self._until_due -= 1
-            self._pause = PAUSE_KEYFRAMES if len(self.windows) >= DENSE_WINDOWS else 0
             self._detect_step()
             self._drop_straddling()
         return window is not None
