@@ -62,10 +62,8 @@ BOTH_WAYS = "as recorded", "backwards"
 SHARES = 1.0, 0.97, 1.03, 0.985, 1.015  # of the keyframe threshold, by seed
 QUALITIES = 1.0, 1.1, 0.9  # of the corner threshold, after that many seeds
 SENSORS = {"none": (False, False), "IMU": (True, False), "wheels": (False, True), "IMU and wheels": (True, True)}
-HEADER = (
-    "| images | seed | sensors | frames with a pose | submaps | odometry | map | off | tilt | map's tilt | yaw |\n|"
-)
-HEADER += "---|" * 11
+COLUMNS = "| images | seed | sensors | frames with a pose | submaps | odometry | map | off | tilt | map's tilt | yaw |"
+HEADER = f"{COLUMNS}\n|{'---|' * 11}"
 
 
 def darkened(images: Iterable[StereoImage]) -> Iterator[StereoImage]:

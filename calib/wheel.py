@@ -77,9 +77,7 @@ class Wheel(ReadOnly):
         if samples.speeds.shape[1] != len(self.radii_m):
             return linear + np.nan, angular + np.nan
         ahead = samples.speeds * np.array(self.radii_m)  # (N, W) m/s of each wheel's rim
-        left, right = ahead[:, 0], ahead[:, 1]
-        if ahead.shape[1] == 4:
-            left, right = 0.5 * (left + ahead[:, 2]), 0.5 * (right + ahead[:, 3])
+        left, right = ahead[:, ::2].mean(axis=1), ahead[:, 1::2].mean(axis=1)
         linear[:, 0] = 0.5 * (left + right)
         angular[:, 2] = (right - left) / self._width
         if self.model == "mecanum":

@@ -275,7 +275,7 @@ class Keyframe(Message):
     odometry: MotionLink | None = None  # by the images; None: no keyframe before in this submap
     right_turn: F64 = field(
         default_factory=lambda: np.zeros(3)
-    )  # (3,) radians by which the right camera turned suddenly since the rig was corrected
+    )  # (3,) rad, of the right camera besides `rig_terms`
 
     @property
     def described(self) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -37,6 +37,11 @@ class Scene:
     uv_left: F64  # (M, 2)
     uv_right: F64  # (M, 2)
     outlier: Bool  # (M,)
+
+
+def turned(rig: Rig, degrees: tuple[float, float, float]) -> Rig:
+    """The right camera rotated about its own axes."""
+    return replace(rig, left_T_right=rig.left_T_right @ se3.exp(np.array([0, 0, 0, *np.deg2rad(degrees)])))
 
 
 def camera_path(count: int, step: float = 0.25, yaw_per_step: float = 0.02) -> F64:

@@ -97,18 +97,18 @@ class _Problem:
         """With the right pixels that `rig` would have seen instead of the rig `before` it."""
         if before is None:
             return self
-        assert rig.right is not None and before.rig.right is not None
         uv_right = self.uv_right.copy()
         for f in np.flatnonzero(self.known):
             pose = self.frame_T_first[f]
             points = self.bearing @ pose[:3, :3].T + self.rho[:, None] * pose[:3, 3]
-            now, was = (
-                r.right.project((points - self.rho[:, None] * r.left_T_right[:3, 3]) @ r.left_T_right[:3, :3])
-                for r in (rig, before.rig)
-                if r.right is not None
-            )
-            uv_right[f] += now - was
+            uv_right[f] += _right_pixels(rig, points, self.rho) - _right_pixels(before.rig, points, self.rho)
         return replace(self, uv_right=uv_right)
+
+
+def _right_pixels(rig: Rig, points: F64, rho: F64) -> F64:
+    """(N, 2) px of points (N, 3), left camera, scaled by their inverse distances (N,)."""
+    assert rig.right is not None
+    return rig.right.project((points - rho[:, None] * rig.left_T_right[:3, 3]) @ rig.left_T_right[:3, :3])
 
 
 def solve_window(
@@ -123,9 +123,7 @@ def solve_window(
             changed one is measured with.
     """
     corrected = with_terms(rig, terms)
-    problem = _problem(
-        corrected if before is None else before.rig, keyframes, 0 if before is None else before.keyframes
-    )
+    problem = _problem(corrected, keyframes, 0) if before is None else _problem(before.rig, keyframes, before.keyframes)
     if problem is None:
         return None
     sigma = 1.0

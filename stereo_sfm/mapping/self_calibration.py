@@ -191,18 +191,16 @@ class SelfCalibration:
         found = None if across is None else self._change([across], False, SIGMAS)
         if across is None or found is None:
             return None
-        earlier = list(self._recent)[-after - STEP_REACH :]
-        first = first_changed(
-            earlier, with_terms(self._rig, self.terms), with_terms(self._rig, self.terms + found.value)
-        )
-        if first is not None and first < self._turned_kf_id:  # it was noticed some images late
-            self._turned_kf_id, after = first, sum(k.kf_id >= first for k in self._recent)
+        self._since, self._step_between = self._turned_kf_id, (self._turned_kf_id - STEP_REACH, keyframe.kf_id)
+        first = self._first_after_step(self.terms + found.value)
+        if first < self._since:  # it was noticed some images late
+            self._since, after = first, sum(k.kf_id >= first for k in self._recent)
             again = self._across(len(self._recent) - after, self.terms + found.value)
             across = across if again is None else again
             found = self._change([across], False, SIGMAS) or found
         self.windows = deque([across], maxlen=MAX_WINDOWS)
         self._keyframes = list(self._recent)[-after:]
-        self._since, self._stepped, self._straddling = self._turned_kf_id, False, False
+        self._stepped = self._straddling = False
         self._turned_kf_id, self._until_due = -1, MIN_WINDOWS
         return self._revision(found, "step", self._since)
 
@@ -220,8 +218,8 @@ class SelfCalibration:
         before, after = recent[max(at - ACROSS_STEP[0], 0) : at], recent[at : at + ACROSS_STEP[1]]
         if not before or any(k.submap_id != before[0].submap_id for k in (*before, *after)):
             return None
-        known = EarlierRig(with_terms(self._rig, self.terms), len(before))
-        return solve_window(self._rig, [*before[::-1], *after], terms, known)
+        earlier = EarlierRig(with_terms(self._rig, self.terms), len(before))
+        return solve_window(self._rig, [*before[::-1], *after], terms, earlier)
 
     def _measured_across(self, since_kf_id: int, found: _Change, first_sigmas: float) -> _Change:
         """A step's change, measured with what the rig before it knew of the points."""

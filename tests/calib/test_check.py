@@ -27,11 +27,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.types import StereoImage
-from tests.synthetic import fisheye_rig, pinhole_rig
-
-
-def turned(rig: Rig, degrees: tuple[float, float, float]) -> Rig:
-    return replace(rig, left_T_right=rig.left_T_right @ se3.exp(np.array([0, 0, 0, *np.deg2rad(degrees)])))
+from tests.synthetic import fisheye_rig, pinhole_rig, turned
 
 
 def scaled(camera: Camera | None, factor: float) -> Camera:

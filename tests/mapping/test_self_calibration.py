@@ -17,14 +17,10 @@ from stereo_sfm.mapping.rig_change import SeenPoints, first_changed
 from stereo_sfm.mapping.row_errors import RowMonitor
 from stereo_sfm.mapping.self_calibration import MIN_WINDOWS, Revision, SelfCalibration
 from stereo_sfm.types import RIG_TERMS, Keyframe
-from tests.synthetic import camera_path, fisheye_rig, pinhole_rig, points_around
+from tests.synthetic import camera_path, fisheye_rig, pinhole_rig, points_around, turned
 
 RIGS = {"fisheye": fisheye_rig(), "pinhole": pinhole_rig()}
 NOISE_PX = 0.15
-
-
-def turned(rig: Rig, degrees: tuple[float, float, float]) -> Rig:
-    return replace(rig, left_T_right=rig.left_T_right @ se3.exp(np.array([0, 0, 0, *np.deg2rad(degrees)])))
 
 
 def keyframes(rigs: list[Rig], believed: Rig, seed: int, noise_px: float = NOISE_PX) -> Iterator[Keyframe]:

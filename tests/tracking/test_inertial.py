@@ -21,7 +21,7 @@ from stereo_sfm.tracking.inertial.inertial_motion import InertialMotion, roll_pi
 from stereo_sfm.tracking.inertial.motion_sensors import MotionSensors
 from stereo_sfm.tracking.inertial.sample_buffer import SampleBuffer
 from stereo_sfm.tracking.inertial.smoothing import smooth_bridges
-from stereo_sfm.types import F64, ImuSamples, StereoImage, TrackState
+from stereo_sfm.types import F64, I64, Bool, ImuSamples, StereoImage, TrackState
 
 RATE_NS, FRAME_NS = 5_000_000, 50_000_000
 GYRO_BIAS, ACCEL_BIAS = np.array([0.01, -0.02, 0.015]), np.array([0.05, -0.08, 0.1])
@@ -243,12 +243,15 @@ def test_gaps_doubles_disorder_and_separate_accelerations() -> None:
     assert found is not None and np.abs(found.accel.mean(0) - reference.accel.mean(0)).max() < 0.02
 
 
-def test_smoothing_brings_a_bridge_to_both_ends() -> None:
-    session, n = Session(), 120
-    stamps = np.arange(n, dtype=np.int64) * FRAME_NS
+def bridged(first: int, end: int) -> tuple[I64, F64, Bool]:
+    """Stamps and poses of 120 frames, and which of them the IMU gave."""
+    session, stamps = Session(), np.arange(120, dtype=np.int64) * FRAME_NS
     truth = np.array([session.pose(s * 1e-9) for s in stamps])
-    inertial = np.zeros(n, bool)
-    inertial[40:90] = True
+    return stamps, truth, (np.arange(120) >= first) & (np.arange(120) < end)
+
+
+def test_smoothing_brings_a_bridge_to_both_ends() -> None:
+    stamps, truth, inertial = bridged(40, 90)
     drifted = truth.copy()
     t = (stamps[40:90] - stamps[39])[:, None] * 1e-9
     drifted[40:90, :3, 3] += t * [0.004, -0.003, 0.002] + 0.5 * t**2 * [0.02, 0.03, -0.02]
@@ -257,18 +260,13 @@ def test_smoothing_brings_a_bridge_to_both_ends() -> None:
     after = np.linalg.norm(smooth[:, :3, 3] - truth[:, :3, 3], axis=1).max()
     assert before > 0.1 and after < 0.006
     np.testing.assert_array_equal(smooth[~inertial], truth[~inertial])
-    open_end = np.zeros(n, bool)
-    open_end[100:] = True
+    open_end = bridged(100, 120)[2]
     np.testing.assert_array_equal(smooth_bridges(stamps, drifted, open_end), drifted)
 
 
 def test_smoothing_does_not_believe_the_velocity_of_poses_that_wheels_correct() -> None:
     """Each half second they jump by some centimetres: the map's way stays as near to the truth as the odometry."""
-    session, n = Session(), 120
-    stamps = np.arange(n, dtype=np.int64) * FRAME_NS
-    truth = np.array([session.pose(s * 1e-9) for s in stamps])
-    inertial = np.zeros(n, bool)
-    inertial[20:100] = True
+    stamps, truth, inertial = bridged(20, 100)
     jumping = truth.copy()
     since = stamps[20:100] % 500_000_000 * 1e-9
     jumping[20:100, :3, 3] += np.outer(0.2 * since, [1.0, -0.5, 0.0])

@@ -25,15 +25,11 @@ from stereo_sfm.tracking.flow.knock import PAUSE_S, UNCONFIRMED_S, KnockDetector
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.types import F64, StereoImage, TrackState, Trajectory
-from tests.synthetic import fisheye_rig, pinhole_rig
+from tests.synthetic import fisheye_rig, pinhole_rig, turned
 
 RIGS = {"fisheye": fisheye_rig(), "pinhole": pinhole_rig()}
 KNOCK_DEG = (0.0, 0.2, 0.0)
 FRAMES, AT = 64, 40
-
-
-def turned(rig: Rig, degrees: tuple[float, float, float]) -> Rig:
-    return replace(rig, left_T_right=rig.left_T_right @ se3.exp(np.array([0, 0, 0, *np.deg2rad(degrees)])))
 
 
 def known_points(rig: Rig, seen_by: Rig, noise_px: float, count: int = 200) -> tuple[Tracks, PoseSolution]:

@@ -16,12 +16,12 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.geometry.kernels import njit, project_one
 from stereo_sfm.geometry.small_matrix import solve_symmetric
+from stereo_sfm.tracking.flow.consensus import STATIC_S
 from stereo_sfm.tracking.flow.frame_pose import PoseSolution
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.types import F64
 
-KNOWN_S = 1.0  # for which a point must have been tracked
 MIN_POINTS, MIN_AGREEING = 35, 0.5  # that are known, seen by both cameras; share of them that must agree
 UNDIVIDED = 0.6  # share of them that agree with a pose; where fewer do, the others are used, too
 MIN_SHIFT_PX = 0.3  # root mean square over the points
@@ -51,7 +51,7 @@ class KnockDetector:
         Args:
             tracks: with the pixels of the image. solution: its pose. seconds: since the image before.
         """
-        known = ~tracks.moving & (tracks.age * seconds >= KNOWN_S) & np.isfinite(tracks.uv_right[:, 0])
+        known = ~tracks.moving & (tracks.age * seconds >= STATIC_S) & np.isfinite(tracks.uv_right[:, 0])
         agree = known & solution.inlier
         divided = np.count_nonzero(agree) < UNDIVIDED * np.count_nonzero(known)
         used = known if divided else agree

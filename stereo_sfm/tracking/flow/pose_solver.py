@@ -364,15 +364,12 @@ def pull(
         return math.inf
     if n == 12:  # the velocity is unknown
         y, own = np.zeros(6), np.ascontiguousarray(normal[6:, 6:]) + 1e-9 * np.eye(6)
-        for i in range(7):
-            column = rhs[6:].copy() if i == 6 else normal[6:, i].copy()
-            if not solve_symmetric(own, column, y, factor):
+        for i in range(6):
+            if not solve_symmetric(own, normal[6:, i].copy(), y, factor):
                 return math.inf
+            rhs[i] -= (y * rhs[6:]).sum()
             for j in range(6):
-                if i == 6:
-                    rhs[j] -= (normal[j, 6:] * y).sum()
-                else:
-                    normal[j, i] -= (normal[j, 6:] * y).sum()
+                normal[j, i] -= (normal[j, 6:] * y).sum()
     for i in range(6):
         for j in range(6):
             inverse[i, j] -= normal[i, j]

@@ -234,16 +234,16 @@ class Tracker:
             self._tracks = take_update(self._tracks, update, self._resumed_T_odom)
 
     def _after_knock(
-        self, tracks: Tracks, solution: PoseSolution, images: StereoPyramids, expected: ExpectedMotion
+        self, tracks: Tracks, solution: PoseSolution | None, images: StereoPyramids, expected: ExpectedMotion
     ) -> tuple[Tracks, PoseSolution] | None:
         """The pose of an image in which the right camera has turned suddenly; None if it has not.
 
-        `tracks`, `solution`: without that. If they are not good, the pose is one from the left image alone.
+        `tracks`, `solution`: without that; None where it is not good, and one from the left image alone is tried.
         """
         stamp_ns = self._stamp_ns + round(1e9 * expected.seconds)
         if self._knock is None or not self._knock.watches(stamp_ns):
             return None
-        if not solution.good(self._config, self._static_count()):
+        if solution is None:
             by_left = replace(tracks, uv_right=np.full_like(tracks.uv_right, np.nan))
             solution = self._solver.solve(by_left, expected, self._pose, self._static_count())
             if not solution.good(self._config, self._static_count()):
@@ -276,10 +276,11 @@ class Tracker:
         If both fail and most points are still found by translation, then the image is blurred.
         """
         tracks, solution = self._track(images, expected)
-        knocked = self._after_knock(tracks, solution, images, expected)
+        good = solution.good(self._config, self._static_count())
+        knocked = self._after_knock(tracks, solution if good else None, images, expected)
         if knocked is not None:
             return knocked
-        if solution.good(self._config, self._static_count()):
+        if good:
             return tracks, solution
         turned = self._follower.turned(images.left, expected, self._pose)
         tracks, solution = self._solver.better([(tracks, solution), self._track(images, turned)], expected)
