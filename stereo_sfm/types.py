@@ -273,9 +273,7 @@ class Keyframe(Message):
     inertial: InertialLink | None = None  # None: no IMU, or one that is left out
     wheels: MotionLink | None = None  # None: no wheels, samples are missing, or no keyframe before in this submap
     odometry: MotionLink | None = None  # by the images; None: no keyframe before in this submap
-    right_turn: F64 = field(
-        default_factory=lambda: np.zeros(3)
-    )  # (3,) rad, of the right camera besides `rig_terms`
+    right_turn: F64 = field(default_factory=lambda: np.zeros(3))  # (3,) rad, of the right camera besides `rig_terms`
 
     @property
     def described(self) -> bool:
