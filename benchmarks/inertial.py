@@ -1,7 +1,7 @@
 """What must hold of IMU and wheels, each sentence with what is wanted and what is measured.
 
     python benchmarks/inertial.py [--part euroc drives rest calibration cost] [--seeds 3]
-    python benchmarks/inertial.py --part level dark turn slip standing slow [--size 424x400] [--rate 15]
+    python benchmarks/inertial.py --part level dark turn slip bumps pushed spot standing slow [--size 424x400] [--rate 15]
 
 Each part by itself:
 
@@ -11,9 +11,10 @@ Each part by itself:
   images. The ground truth's orientation rests on the same gyroscope: turns agree better than they are.
 * drives: roll and pitch, darkness and slip on simulated drives with exact poses and noise instead of images.
 * rest: twenty minutes at rest, likewise. calibration: wrong offset, rotation and radius. cost: a frame.
-* level, dark, turn, slip, standing, slow: rendered drives, every row with the sensors and without them on the same
-  images: a lap; five seconds without light at about 1 m/s; a corner at 200 degrees a second with motion blur; a lap
-  with wheels that turn 30 % too far in turns; a minute at rest; 5 m at 0.02 m/s. Minutes each.
+* level, dark, turn, slip, bumps, pushed, spot, standing, slow: rendered drives, every row with the sensors and without
+  them on the same images: a lap; five seconds without light at about 1 m/s; a corner at 200 degrees a second with
+  motion blur; a lap with wheels that turn 30 % too far in turns; over thresholds and ramps, on which they do, too;
+  pushed by hand; with turns on the spot; a minute at rest; 5 m at 0.02 m/s. Minutes each.
 
 ATE is the RMSE after SE(3) alignment of every frame that has a pose, of the odometry and of the map; "off" is the
 error of the odometry over the time without images (standing: its largest movement; slow: of the distance between the
@@ -49,7 +50,8 @@ from stereo_sfm.types import F64, Frame, ImuSamples, StereoImage, Trajectory
 DARK = range(80, 140)  # frames of EuRoC
 DARK_S = 10, 15  # of the simulated drives
 SLOW_M = 5.0  # at 0.02 m/s
-RENDERED = ("level", "dark", "turn", "slip", "standing", "slow")
+RENDERED = ("level", "dark", "turn", "slip", "bumps", "pushed", "spot", "standing", "slow")
+WAYS = {"slip": "slip of 30 % in turns", "bumps": "over bumps", "pushed": "pushed by hand", "spot": "turns on the spot"}
 SENTENCES = ("euroc", "drives", "rest", "calibration", "cost")
 THIRD = "every third", "IMU"
 MEASURES = (  # what is compared with and without IMU: field of a result, unit
@@ -266,7 +268,10 @@ def store(part: str, seed: int, size: str, rate: int) -> dict[str, Result]:
         "level": (f"rate={rate}", ["none", "IMU"], range(0)),
         "dark": (f"rate={rate}&frames={20 * rate}&dark={DARK_S[0]}-{DARK_S[1]}", list(SENSORS), range(0)),
         "turn": (f"rate={2 * rate}&corner=0.2&start={16 * rate}&frames={16 * rate}", list(SENSORS), range(0)),
-        "slip": (f"rate={rate}&wheel_slip=0.3", ["none", "IMU", "wheels", "IMU and wheels"], range(0)),
+        "slip": (f"rate={rate}&wheel_slip=0.3", list(SENSORS), range(0)),
+        "bumps": (f"rate={rate}&wheel_slip=0.3&thresholds=20&ramps=3", list(SENSORS), range(0)),
+        "pushed": (f"rate={rate}&pushed=8-24", list(SENSORS), range(0)),
+        "spot": (f"rate={rate}&spot_turns=on", list(SENSORS), range(0)),
         "standing": (f"rate=5&rest=70&vibration=0&frames={60 * 5}", ["none", "IMU", "IMU and wheels"], range(0)),
         "slow": (f"rate=2&speed=0.02&length={SLOW_M}", ["none", "IMU", "IMU and wheels"], range(0)),
     }[part]
@@ -320,9 +325,10 @@ def rendered(part: str, drives: list[dict[str, Result]]) -> Iterator[Row]:
     if part == "slow":
         off = 100 * of("distance_m", "IMU") / SLOW_M
         yield "2 5 m at 0.02 m/s", "0.3 %", f"{off.max():.2f} % at most", bool(off.max() <= 0.3)
-    if part == "slip":
+    if part in WAYS:
+        without = "IMU" if part == "slip" else "none"
         for what, name in (("odometry", "odometry_m"), ("map", "map_m")):
-            yield f"2 slip of 30 % in turns, {what}", "no worse", *against(name, "IMU and wheels", "IMU", "mm", 1e3)
+            yield f"2 {WAYS[part]}, {what}", "no worse", *against(name, "IMU and wheels", without, "mm", 1e3)
 
 
 def main() -> None:

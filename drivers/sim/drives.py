@@ -2,7 +2,8 @@
 
 A route is a polyline on the floor, driven at a varying speed and smoothed over time by a Gaussian, so that corners
 become curves; position and heading are then cubic splines of time (twice continuously differentiable), and a few sines
-with the frequencies of steps and wheels are added. The path of a real robot is smoothed in the same way.
+with the frequencies of steps and wheels are added. The path of a real robot is smoothed in the same way. Thresholds and
+ramps lift and tilt the robot, and somebody may push it by hand for a while: jerkily, sideways too, turning it.
 """
 
 from __future__ import annotations
@@ -12,13 +13,17 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
+from scipy.special import erf
 
+from stereo_sfm.drivers.sim.floor import Floor
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64
 
 FORWARD = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])  # world_R_cam of a camera that looks along x, upright
 _RATE = 120.0  # samples a second of the dense route
 _PATH_RATE = 40.0  # of a recorded path
+_PUSHES = np.array([[0.02, 0.07, 0.10], [1.8, 0.45, 0.5]])  # by hand: metres ahead and to the left, radians; and Hz
+_GRIP_S = 0.4  # in which a hand takes hold
 
 
 @dataclass(frozen=True)
@@ -32,6 +37,9 @@ class Gait:
     turn_seconds: float = 0.65  # Gaussian width that rounds the corners
     rest_seconds: float = 1.0  # at rest before the drive
     ahead: float = 0.0  # metres from the robot's axle to the camera
+    thresholds: int = 0  # that it drives over
+    ramps: int = 0  # the same
+    pushed: tuple[float, float] = (0.0, 0.0)  # seconds from, to: pushed by hand
 
 
 class Drive:
@@ -72,10 +80,15 @@ class Drive:
 
     def _follow(self, t: F64, arc: F64, course: F64, rng: np.random.Generator) -> None:
         """Be at `course` (N, 3) after `arc` (N,) metres at the times (N,), and vibrate."""
+        gait = self.gait
         self.duration = float(t[-1])
-        self._path = CubicSpline(t, course)
         self._times, self._arc = t, arc
-        self._sines = _sines(rng, self.gait.vibration)
+        self._sines = _sines(rng, gait.vibration)
+        self._metres = CubicSpline(t, arc)
+        self.floor = Floor(gait.thresholds, gait.ramps, float(arc[-1]), rng) if gait.thresholds + gait.ramps else None
+        if gait.pushed[1] > gait.pushed[0]:
+            course = course + _pushes(t, course[:, 2], gait.pushed, rng)
+        self._path = CubicSpline(t, course)
 
     def distance(self, seconds: float) -> float:
         """Metres along the route at which the camera is."""
@@ -109,6 +122,16 @@ class Drive:
         """Times (N,) -> x, y (metres) and heading (rad) of the robot (N, 3), or their derivatives by time."""
         return np.asarray(self._path(seconds, derivative), float)
 
+    def metres(self, seconds: F64, derivative: int = 0) -> F64:
+        """Times (N,) -> metres driven (N,), or their derivatives by time."""
+        return np.asarray(self._metres(seconds, derivative), float)
+
+    def standing(self, seconds: F64) -> F64:
+        """Times (N,) -> (N, 4, 4) from the robot on its thresholds and ramps to where it is on a flat floor."""
+        if self.floor is None:
+            return np.broadcast_to(np.eye(4), (len(seconds), 4, 4))
+        return self.floor.standing(self.metres(seconds), self.gait.height)
+
     @property
     def robot_T_cam(self) -> F64:
         """(4, 4) from the camera without vibration to the robot's axes: x ahead, z up, at the camera's height."""
@@ -122,7 +145,7 @@ class Drive:
             se3.so3_exp(np.stack([0 * heading, 0 * heading, heading], -1)),
             np.stack([x, y, np.full_like(x, self.gait.height)], -1),
         )
-        return world_T_robot @ self.robot_T_cam
+        return world_T_robot @ self.standing(seconds) @ self.robot_T_cam
 
 
 def _progress(gait: Gait, rng: np.random.Generator, length: float, route: F64) -> tuple[F64, F64]:
@@ -136,6 +159,15 @@ def _progress(gait: Gait, rng: np.random.Generator, length: float, route: F64) -
     arc = np.concatenate([[0.0], np.cumsum(speed[:-1]) / _RATE])
     n = int(np.searchsorted(arc, length)) + 1
     return t[:n], arc[:n]
+
+
+def _pushes(t: F64, heading: F64, interval: tuple[float, float], rng: np.random.Generator) -> F64:
+    """(N, 3) metres and radians that a hand adds to a course at the times (N,), robot axes turned by `heading` (N,)."""
+    size, frequency = _PUSHES * rng.uniform(0.7, 1.3, (2, 3))
+    held = 0.5 * (erf((t - interval[0]) / _GRIP_S) - erf((t - interval[1]) / _GRIP_S))
+    ahead, left, turn = (held[:, None] * size * np.sin(2 * np.pi * frequency * t[:, None] + rng.uniform(0, 6.3, 3))).T
+    c, s = np.cos(heading), np.sin(heading)
+    return np.column_stack([c * ahead - s * left, s * ahead + c * left, turn])
 
 
 def _heading(xy: F64, route: F64) -> F64:

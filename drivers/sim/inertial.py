@@ -2,7 +2,9 @@
 
 The T265 (BMI055) reports its own noise: variances 5.15e-6 (rad/s)^2 of a gyroscope sample at 200 Hz, 6.7e-5 (m/s^2)^2
 of an accelerometer sample at 62.5 Hz, 5e-7 and 1e-4 of the biases, taken as their drift in 100 s. The OAK's BMI270
-has the noise densities of its data sheet, 0.007 degrees/s and 160 micro-g per root hertz.
+has the noise densities of its data sheet, 0.007 degrees/s and 160 micro-g per root hertz. The sensors in the BNO086 of
+other OAKs have 0.014 degrees/s and 150 micro-g per root hertz and 1 degree/s of offset; its firmware calibrates the
+accelerometer to 0.3 m/s^2 (data sheet of the BNO08X).
 """
 
 from __future__ import annotations
@@ -43,11 +45,13 @@ GRADES = {
     "ideal": Grade(),
     "t265": Grade(1.6e-4, 1.04e-3, 7e-5, 1e-3, 0.004, 0.03, scale=0.01, calibrated_bias=0.15),
     "oak": Grade(1.22e-4, 1.57e-3, 2e-5, 3e-4, 0.008, 0.08),
+    "bno086": Grade(2.44e-4, 1.47e-3, 4e-5, 5e-4, 0.017, 0.15),
 }
 _MOUNTS = {  # left_R_imu up to a few degrees, and metres
     "ideal": (np.diag([-1.0, -1.0, 1.0]), (0.032, 0.004, -0.006)),
     "t265": (np.diag([-1.0, -1.0, 1.0]), (0.032, 0.004, -0.006)),
     "oak": (np.array([[0, 1.0, 0], [1.0, 0, 0], [0, 0, -1.0]]), (0.038, -0.011, -0.009)),
+    "bno086": (np.array([[0, -1.0, 0], [-1.0, 0, 0], [0, 0, -1.0]]), (0.038, -0.011, -0.009)),
 }
 
 
@@ -86,11 +90,13 @@ class InertialSensor:
     def exact(self, seconds: F64) -> tuple[F64, F64]:
         """Angular velocity (N, 3) rad/s and specific force (N, 3) m/s^2 in the sensor's axes at times (N,) in seconds.
 
-        world_T_imu is a rotation about the vertical and a translation on a spline, times the vibration. Derivatives of
-        the first are those of the spline; those of the second, a few sines, are differences of eighth order.
+        world_T_imu is a rotation about the vertical and a translation on a spline, times how the robot stands on the
+        floor and the vibration. Derivatives of the first are those of the spline; those of the others, a few sines and
+        error functions, are differences of eighth order.
         """
-        around = self._drive.shake(np.add.outer(seconds, _AROUND).ravel())
-        robot_T_imu = (self._drive.robot_T_cam @ around @ self.imu.left_T_imu).reshape(-1, len(_AROUND), 4, 4)
+        around = np.add.outer(seconds, _AROUND).ravel()
+        robot_T_imu = self._drive.robot_T_cam @ self._drive.shake(around) @ self.imu.left_T_imu
+        robot_T_imu = (self._drive.standing(around) @ robot_T_imu).reshape(-1, len(_AROUND), 4, 4)
         now = robot_T_imu[:, len(_AROUND) // 2]
         speed = np.einsum("k,nkij->nij", _FIRST, robot_T_imu)
         acceleration = np.einsum("k,nki->ni", _SECOND, robot_T_imu[..., :3, 3])

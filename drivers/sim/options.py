@@ -65,6 +65,12 @@ class SimOptions(SourceOptions):
     )
     speed: float = option(0.0, "metres a second, 0: the scene's own", low=0, high=5)
     corner: float = option(0.0, "seconds over which a corner is rounded, 0: the scene's own", low=0, high=5)
+    spot_turns: bool = option(False, "the robot stops at corners and turns on the spot")
+    thresholds: int = option(0, "so many low edges across the way that the robot drives over", low=0, high=1000)
+    ramps: int = option(0, "so many ramps, up and down again; the drawn floor stays flat", low=0, high=100)
+    pushed: tuple[float, float] = option(
+        (0.0, 0.0), "FROM-TO in seconds: interval in which the robot is pushed by hand", read=_interval
+    )
     rest: float = option(0.0, "seconds at rest before the drive, 0: the scene's own", low=0, high=10_000)
     vibration: float = option(1.0, "scales the camera's vibration", low=0, high=10)
     drop: float = option(0.0, "fraction of frames lost", low=0, high=0.9)
@@ -82,13 +88,15 @@ class SimOptions(SourceOptions):
         0.0, "rolling shutter: seconds from the exposure of the first row to that of the last", low=0, high=0.1
     )
     dark: tuple[float, float] = option((0.0, 0.0), "FROM-TO in seconds: interval with the lights off", read=_interval)
-    imu: Literal["", "ideal", "t265", "oak"] = option("", "inertial samples of an ideal sensor, a T265 or an OAK")
+    imu: Literal["", "ideal", "t265", "oak", "bno086"] = option(
+        "", "inertial samples of an ideal sensor, a T265 (BMI055), an OAK with a BMI270 or one with a BNO086"
+    )
     imu_offset_ms: float = option(
         0.0, "clock of the inertial sensor minus the camera's; part of the calibration", low=-1000, high=1000
     )
     wheel: Literal["", "differential", "skid_steer", "mecanum", "twist"] = option("", "wheel odometry of a robot")
     wheel_grade: Literal["robot", "ideal"] = option("robot", "wheels with wrong radii, noise and ticks, or without")
-    wheel_slip: float = option(0.0, "share by which wheels turn too far in turns", low=0, high=2)
+    wheel_slip: float = option(0.0, "share by which wheels turn too far in turns and on thresholds", low=0, high=2)
     wheel_offset_ms: float = option(
         0.0, "clock of the wheels minus the camera's; part of the calibration", low=-1000, high=1000
     )

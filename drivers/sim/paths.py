@@ -113,3 +113,15 @@ def joined(paths: list[RobotPath]) -> RobotPath:
         seconds = np.concatenate([seconds, seconds[-1] + pause + path.seconds])
         course = np.concatenate([course, new])
     return RobotPath(seconds, course)
+
+
+def with_spot_turns(route: F64, speed: float, rest_s: float) -> RobotPath:
+    """Along a polyline (N, 2) at `speed` (m/s), turning on the spot at its corners, at rest for `rest_s` before and
+    afterwards."""
+    steps = np.diff(route, axis=0)
+    legs: list[RobotPath] = []
+    for start, end, step in zip(route[:-1], route[1:], steps, strict=True):
+        drive_s, heading = float(np.linalg.norm(step)) / speed, np.arctan2(step[1], step[0])
+        seconds = np.cumsum([0.0, rest_s, drive_s, rest_s])
+        legs.append(RobotPath(seconds, np.column_stack([[start, start, end, end], np.full(4, heading)])))
+    return joined(legs)

@@ -19,7 +19,7 @@ from stereo_sfm.drivers.sim.inertial import InertialSensor
 from stereo_sfm.drivers.sim.kernels import PERSON
 from stereo_sfm.drivers.sim.market import GAIT, Market, build_market, plan, session_path, shoppers
 from stereo_sfm.drivers.sim.options import SimOptions
-from stereo_sfm.drivers.sim.paths import RobotPath, joined, read_paths
+from stereo_sfm.drivers.sim.paths import RobotPath, joined, read_paths, with_spot_turns
 from stereo_sfm.drivers.sim.people import crowd_at, moving
 from stereo_sfm.drivers.sim.render import Renderer, View
 from stereo_sfm.drivers.sim.rigs import make_rig
@@ -34,6 +34,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, ImuSamples, StereoImage, Trajectory, WheelSamples
 
 _EPOCH_NS = 1_000_000_000
+PAUSES = 3.0  # widths of the smoothing for which a robot rests before it turns on the spot, and afterwards
 
 
 @functools.lru_cache(maxsize=2)
@@ -112,6 +113,9 @@ class SimSource(BaseSource):
             turn_seconds=options.corner or scene.gait.turn_seconds,
             rest_seconds=options.rest or scene.gait.rest_seconds,
             vibration=scene.gait.vibration * options.vibration,
+            thresholds=options.thresholds,
+            ramps=options.ramps,
+            pushed=options.pushed,
         )
         self.drive = self._drive(scene, gait)
         self._inertial = None
@@ -149,6 +153,10 @@ class SimSource(BaseSource):
         """Along the scene's route or a recorded path."""
         o = self.options
         rng = np.random.default_rng([o.seed, o.walk, 31])
+        routed = not (isinstance(scene.layout, Market) or o.path)
+        if o.spot_turns and not routed:
+            raise StereoSfmError("sim: a recorded path has its own turns: leave spot_turns away")
+        length = o.length or scene.length
         if isinstance(scene.layout, Market):
             path = session_path(plan(o.path)[1], o.walk, o.length, rng)
         elif o.path:
@@ -157,8 +165,11 @@ class SimSource(BaseSource):
             gait = dataclasses.replace(gait, speed=o.speed)
         else:
             route = scene.route(scene.layout, o.walk, o.returns)
-            return Drive(route, gait, rng, o.length or scene.length)
-        return Drive.along(path.seconds, path.course, gait, rng, o.length)
+            if not o.spot_turns:
+                return Drive(route, gait, rng, length)
+            path = with_spot_turns(route, gait.speed, PAUSES * gait.turn_seconds)
+            gait = dataclasses.replace(gait, speed=0.0)
+        return Drive.along(path.seconds, path.course, gait, rng, length)
 
     def _choose_frames(self) -> None:
         """Select the frames that arrive, and their ground truth."""

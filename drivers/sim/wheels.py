@@ -1,7 +1,8 @@
-"""The simulated wheel odometry: exact wheel speeds along a drive, with wrong radii, slip in turns, noise and ticks.
+"""The simulated wheel odometry: exact wheel speeds along a drive, with wrong radii, slip, noise and ticks.
 
 The axle is below the camera, where the drive's curve is; the heading of a drive is its tangent smoothed over a quarter
-of a second, so that a robot with two wheels drifts sideways by millimetres in turns, as real ones do.
+of a second, so that a robot with two wheels drifts sideways by millimetres in turns, as real ones do. Wheels slip in
+turns and where they climb thresholds and ramps; somebody who pushes the robot sideways drags them.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class WheelSensor:
         self, model: str, grade: str, slip: float, drive: Drive, rng: np.random.Generator, offset_s: float = 0.0
     ) -> None:
         """Args:
-        model: of `Wheel`. grade: of GRADES. slip: share by which wheels turn too far in turns.
+        model: of `Wheel`. grade: of GRADES. slip: share by which wheels turn too far in turns and on thresholds.
         offset_s: its clock minus the camera's.
         """
         self._drive, self._twist, count = drive, model == "twist", _WHEELS[model]
@@ -66,6 +67,8 @@ class WheelSensor:
         linear, angular = self.exact(seconds)
         slow, fast = TURNING
         slipping = np.clip((np.abs(angular[:, 2:]) - slow) / (fast - slow), 0, 1)
+        if self._drive.floor is not None:
+            slipping = np.maximum(slipping, self._drive.floor.slipping(self._drive.metres(seconds))[:, None])
         rims = true.speeds(linear, angular) * (1 + slip * slipping) * RADIUS_M
         rims += rng.normal(0, grade.noise, rims.shape) * (np.abs(rims) > grade.threshold)
         rims[np.abs(rims) < grade.threshold] = 0.0
@@ -82,6 +85,11 @@ class WheelSensor:
         linear[:, 0] = speed[:, 0] * ahead + speed[:, 1] * left
         linear[:, 1] = speed[:, 1] * ahead - speed[:, 0] * left
         angular[:, 2] = speed[:, 2]
+        floor, metres = self._drive.floor, self._drive.metres(seconds)
+        if floor is not None:  # along the slope, and turning about an axis that leans with the robot
+            rise, tilt = floor.climb(metres) * self._drive.metres(seconds, 1), floor.tilt(metres)
+            linear[:, 0] = linear[:, 0] * np.cos(tilt) + rise * np.sin(tilt)
+            angular[:, 2] *= np.cos(tilt)
         return linear, angular
 
     def samples(self, begin: float, end: float, epoch_ns: int) -> WheelSamples:

@@ -61,6 +61,22 @@ def test_errors_of_a_robot() -> None:
     assert ratio.min() == 1.0 and ratio.max() == pytest.approx(1.3)
 
 
+def test_wheels_roll_up_and_down_and_slip_there() -> None:
+    way = {"wheel": "differential", "wheel_grade": "ideal", "vibration": 0, "seed": 1, "thresholds": 20, "ramps": 12}
+    source, slipping = sim(**way), sim(**way, wheel_slip=0.3)
+    wheel, samples = source.rig.wheel, sampled(source, range(20, 300))
+    assert wheel is not None
+    begin, end = samples.stamp_ns[[0, -1]] * 1e-9 - 1
+    seconds = np.linspace(begin, end, 20_000)
+    path = (source.drive.poses(seconds) @ wheel.left_T_wheel)[:, :3, 3]
+    rolled = float(wheel.velocities(samples)[0][:-1, 0].sum()) / RATE_HZ
+    assert np.ptp(path[:, 2]) > 0.03
+    assert rolled == pytest.approx(np.linalg.norm(np.diff(path, axis=0), axis=1).sum(), rel=2e-3)
+    ratio = sampled(slipping, range(300)).speeds / np.maximum(sampled(source, range(300)).speeds, 0.1)
+    straight = np.abs(np.diff(sampled(source, range(300)).speeds, axis=1)[:, 0]) < 0.1
+    assert 1.1 < ratio[straight].max() < 1.31 and np.median(ratio[straight]) < 1.01
+
+
 def test_a_recording_keeps_them(tmp_path: Path) -> None:
     source = sim(wheel="skid_steer", frames=4, start=60, effects=False)
     expected = [source.sampled(int(k))[1] for k in source.frame_ids]
