@@ -1,7 +1,7 @@
 """What must hold of IMU and wheels, each sentence with what is wanted and what is measured.
 
     python benchmarks/inertial.py [--part euroc drives rest calibration cost] [--seeds 3]
-    python benchmarks/inertial.py --part level dark turn slip bumps pushed spot standing slow [--size 424x400] [--rate 15]
+    python benchmarks/inertial.py --part level dark turn slip bumps pushed spot standing slow [--size 424x400]
 
 Each part by itself:
 
