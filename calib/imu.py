@@ -54,6 +54,16 @@ class Imu(ReadOnly):
         """The same sensor relative to another left camera frame, (4, 4)."""
         return replace(self, left_T_imu=new_T_left @ self.left_T_imu)
 
+    def in_axes(self, left_R_imu: F64) -> Imu:
+        """The same sensor with samples that are corrected into axes of another rotation (3, 3)."""
+        turn = left_R_imu.T @ self.left_T_imu[:3, :3]
+        left_T_imu = self.left_T_imu.copy()
+        left_T_imu[:3, :3] = left_R_imu
+        return replace(
+            self, left_T_imu=left_T_imu, gyro_matrix=turn @ self.gyro_matrix, gyro_bias=turn @ self.gyro_bias,
+            accel_matrix=turn @ self.accel_matrix, accel_bias=turn @ self.accel_bias,
+        )  # fmt: skip
+
     def correct(self, gyro: F64, accel: F64) -> tuple[F64, F64]:
         """Raw samples (N, 3) rad/s and (N, 3) m/s^2 without scale errors, misalignment and known bias."""
         return gyro @ self.gyro_matrix.T - self.gyro_bias, accel @ self.accel_matrix.T - self.accel_bias

@@ -90,6 +90,18 @@ def fit_imu(stamp_ns: I64, poses: F64, samples: ImuSamples, imu: Imu) -> ImuFit:
     )
 
 
+def imu_terms(found: ImuFit, known: Imu) -> F64:
+    """(4,) by which a calibration differs from what was found: rotation about the IMU's axes (radians), offset (s)."""
+    turn = se3.so3_log(known.left_T_imu[:3, :3].T @ found.imu.left_T_imu[:3, :3])
+    return np.append(turn, found.imu.offset_s - known.offset_s)
+
+
+def with_imu_terms(imu: Imu, terms: F64) -> Imu:
+    """A calibration corrected by `imu_terms` (4,)."""
+    turn = se3.from_rotation_translation(se3.so3_exp(terms[:3]), np.zeros(3))
+    return replace(imu, left_T_imu=imu.left_T_imu @ turn, offset_s=imu.offset_s + float(terms[3]))
+
+
 def rotation_sigma(steps: F64) -> float:
     """Radians by which a pose is off by itself: an error of a step (N, 3) that returns, negated, in the next one."""
     limit = CLIP * 1.4826 * np.median(np.abs(steps), axis=0)

@@ -67,9 +67,8 @@ def fit_wheel(stamp_ns: I64, poses: F64, samples: WheelSamples, wheel: Wheel) ->
     value[free], sigma[free] = fit.value, fit.sigma
     left = np.linalg.norm(residual(fit.value)[:, :3], axis=1)
     agreement = 1 - float(np.median(left) / np.median(np.linalg.norm(seen[:, :3], axis=1)))
-    new = _turned(replace(corrected(wheel, value), offset_s=float(value[5])), value)
     value[5] -= wheel.offset_s
-    return WheelFit(new, value, sigma, drive.way_m, agreement, sign, turn_sign)
+    return WheelFit(with_wheel_terms(wheel, value), value, sigma, drive.way_m, agreement, sign, turn_sign)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,12 +122,12 @@ class _Drive:
         turn = se3.so3_exp(np.array([0.0, x[4], x[3]]))
         values = np.hstack([linear @ turn.T, np.nan_to_num(angular)])
         ends = self.at[links] + x[5]
+        edges = np.sort(np.concatenate([ends, self.times[(self.times > ends[0]) & (self.times < ends[-1])]]))
+        at = np.stack([np.interp(edges, self.times, column) for column in values.T], axis=1)
+        mean, seconds = 0.5 * (at[1:] + at[:-1]), np.diff(edges)
         out = np.zeros((len(links) - 1, 4))
-        for k, (begin, end) in enumerate(itertools.pairwise(ends.tolist())):
-            edges = np.concatenate([[begin], self.times[(self.times > begin) & (self.times < end)], [end]])
-            at = np.stack([np.interp(edges, self.times, column) for column in values.T], axis=1)
-            mean = 0.5 * (at[1:] + at[:-1])
-            moved = integrate_twists(np.diff(edges), mean[:, 3:], mean[:, :3], 0.0, 0.0)
+        for k, (begin, end) in enumerate(itertools.pairwise(np.searchsorted(edges, ends).tolist())):
+            moved = integrate_twists(seconds[begin:end], mean[begin:end, 3:], mean[begin:end, :3], 0.0, 0.0)
             out[k, :3], out[k, 3] = moved.position, se3.so3_log(moved.rotation)[2]
         return out
 
@@ -144,10 +143,10 @@ def corrected(wheel: Wheel, x: F64) -> Wheel:
     return replace(wheel, radii_m=radii, track_m=wheel.track_m / (1 + x[2]), wheelbase_m=wheel.wheelbase_m / (1 + x[2]))
 
 
-def _turned(wheel: Wheel, x: F64) -> Wheel:
-    """Wheels that drive in another direction of the camera."""
+def with_wheel_terms(wheel: Wheel, x: F64) -> Wheel:
+    """A calibration corrected by terms (6,) of NAMES."""
     turn = se3.from_rotation_translation(se3.so3_exp(np.array([0.0, x[4], x[3]])), np.zeros(3))
-    return replace(wheel, left_T_wheel=wheel.left_T_wheel @ turn)
+    return replace(corrected(wheel, x), left_T_wheel=wheel.left_T_wheel @ turn, offset_s=wheel.offset_s + float(x[5]))
 
 
 def _sign(a: F64, b: F64) -> float:

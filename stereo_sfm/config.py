@@ -78,6 +78,10 @@ class TrackerConfig:
         True, "Use the IMU, where the source has one: prediction, and poses where images show nothing"
     )
     wheels: bool = switch(True, "Use the wheel odometry, where the source has one, as the IMU")
+    calibrate_sensors: bool = switch(
+        False,
+        "Estimate time offset and rotation of the IMU, and radii, track and direction of the wheels, while driving",
+    )
     lost_frames: int = number(
         15, 0, 100_000, "Frames without a pose after which a new submap begins, whichever the tracker"
     )

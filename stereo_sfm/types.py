@@ -249,6 +249,16 @@ class MotionLink(Message):
 
 
 @dataclass(frozen=True, eq=False)
+class SensorSamples(Message):
+    """What calibrates IMU and wheels: poses that the images gave since the keyframe before, and the samples."""
+
+    stamp_ns: I64  # (N,) of the images
+    odom_T_cam: F64 = field(metadata=shape(-1, 4, 4))  # (N, 4, 4) without the sensors' corrections
+    imu: ImuSamples | None  # uncorrected
+    wheel: WheelSamples | None  # likewise
+
+
+@dataclass(frozen=True, eq=False)
 class Keyframe(Message):
     """A frame that enters the map, with what place recognition and mapping need."""
 
@@ -274,6 +284,7 @@ class Keyframe(Message):
     wheels: MotionLink | None = None  # None: no wheels, samples are missing, or no keyframe before in this submap
     odometry: MotionLink | None = None  # by the images; None: no keyframe before in this submap
     right_turn: F64 = field(default_factory=lambda: np.zeros(3))  # (3,) rad, of the right camera besides `rig_terms`
+    samples: SensorSamples | None = None  # where the sensors are calibrated
 
     @property
     def described(self) -> bool:
@@ -307,6 +318,24 @@ class CalibrationUpdate(Message):
         object.__setattr__(self, "terms", terms)
         object.__setattr__(self, "terms_covariance", covariance)
         super().__post_init__()
+
+
+@dataclass(frozen=True, eq=False)
+class SensorUpdate(Message):
+    """The terms that the mapper found of the calibration of IMU and wheels; of a sensor without evidence they are 0."""
+
+    TOPIC: ClassVar[Topic] = Topic(
+        "/calibration/sensors", "when the calibration of IMU or wheels is corrected, or confirmed"
+    )
+
+    version: int  # of the map update that brings it
+    kf_id: int
+    stamp_ns: int
+    imu: F64  # (4,) rotation about the IMU's axes (3, radians), seconds of time offset, added to the calibration
+    imu_sigma: F64  # (4,) standard deviations; infinite while it is not known
+    wheel: F64  # (6,) scale, difference of the sides, turns (shares), direction, pitch (radians), time offset (seconds)
+    wheel_sigma: F64  # (6,) likewise
+    text: str  # human-readable
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,6 +380,7 @@ class MapUpdate(Message):
     )  # (L,) whose accepted loop the mapper rejected
     calibration: CalibrationUpdate | None = None  # the rig from this update on, where that changes
     row_errors: RowErrors | None = None  # only with two cameras
+    sensors: SensorUpdate | None = None  # the calibration of IMU and wheels from this update on, where that changes
     down: F64 = field(default_factory=lambda: np.zeros(3))  # (3,) gravity's direction in the map, zero: unknown
 
 

@@ -78,6 +78,11 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("auto", "off", "only-report"),
         help="correct the rotation of the right camera from what is seen, where the evidence is there (default: auto)",
     )
+    parser.add_argument(
+        "--calibrate-sensors",
+        action="store_true",
+        help="estimate time offset and rotation of the IMU, radii, track and direction of the wheels, and use them",
+    )
     parser.add_argument("--seed", type=int, help="random seed (sets seed and loop.seed)")
 
 
@@ -145,6 +150,7 @@ def load_config(args: argparse.Namespace) -> Config:
     overrides = [f"odometry.method={args.odometry}"] if args.odometry is not None else []
     overrides += [f"features.kind={args.features}"] if args.features is not None else []
     overrides += [f"self_calibration.mode={args.self_calibrate}"] if args.self_calibrate is not None else []
+    overrides += ["tracker.calibrate_sensors=true"] if args.calibrate_sensors else []
     overrides += list(args.set) + ([f"seed={args.seed}", f"loop.seed={args.seed}"] if args.seed is not None else [])
     chosen = config.load(args.config, overrides, preset(args.preset))
     if args.features is not None and chosen.odometry.method == "flow":

@@ -9,7 +9,10 @@ import numpy as np
 
 from stereo_sfm.calib.choice import NAMES, SCALES, UNITS, with_terms
 from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calib.sensor_terms import with_sensor_terms
+from stereo_sfm.calib.wheel_fit import NAMES as WHEEL_NAMES
 from stereo_sfm.eval.record import RunRecord
+from stereo_sfm.types import CalibrationUpdate, SensorUpdate
 
 CORRECTED = "rig_corrected.yaml"
 
@@ -29,6 +32,36 @@ def calibration_stats(record: RunRecord) -> list[dict[str, Any]]:
             "covariance": (SCALES[:, None] * c.terms_covariance * SCALES).tolist(),
         }
         for c in record.calibrations
+    ]
+
+
+def sensor_stats(record: RunRecord) -> list[dict[str, Any]]:
+    """Every word about the calibration of IMU and wheels; terms in degrees, ms and per cent; no sigma: unknown."""
+    first_ns = int(record.frames.stamp_ns[0]) if len(record.frames) else 0
+    return [
+        {
+            "kf_id": u.kf_id,
+            "seconds": (u.stamp_ns - first_ns) / 1e9,
+            "text": u.text,
+            "terms": {
+                name: [value, sigma if np.isfinite(sigma) else None] for name, value, sigma, _ in _sensor_terms(u)
+            },
+        }
+        for u in record.sensor_updates
+    ]
+
+
+def _sensor_terms(update: SensorUpdate) -> list[tuple[str, float, float, str]]:
+    """Name, value, standard deviation and unit of each."""
+    degrees, ms, percent = (float(np.degrees(1.0)), "°"), (1e3, "ms"), (100.0, "%")
+    imu = ("IMU rotation x", "IMU rotation y", "IMU rotation z", "IMU time offset")
+    units = [degrees, degrees, degrees, ms, percent, percent, percent, degrees, degrees, ms]
+    values, sigmas = np.append(update.imu, update.wheel), np.append(update.imu_sigma, update.wheel_sigma)
+    return [
+        (name, scale * value, scale * sigma, unit)
+        for name, value, sigma, (scale, unit) in zip(
+            (*imu, *(f"wheels' {n}" for n in WHEEL_NAMES)), values.tolist(), sigmas.tolist(), units, strict=True
+        )
     ]
 
 
@@ -53,21 +86,43 @@ def calibration_lines(stats: dict[str, Any]) -> list[str]:
     off = [] if rows is None else [f"row error {rows['systematic_px']:.2f} px (worst {rows['worst_px']:.2f} px)"]
     if rows is not None and rows["warning"]:
         off[0] += ": the calibration does not fit (see check-calib)"
-    return off + [
+    lines = off + [
         f"calibration {'corrected' if c['applied'] else 'doubtful'} at {c['seconds']:.1f} s ({c['why']}): {c['text']}"
         for c in stats["calibration"]
     ]
+    compared = stats["sensor_calibration"]
+    return lines + [f"sensors compared with the images at {c['seconds']:.1f} s: {c['text']}" for c in compared]
 
 
 def write_corrected_rig(folder: Path, rig: Rig, record: RunRecord) -> None:
-    """`rig_corrected.yaml` of the last change, its terms and their covariance in comments; nothing without one."""
+    """`rig_corrected.yaml` of the last changes, their terms and covariance in comments; nothing without one."""
     from stereo_sfm.calib import save_rig
 
-    if not record.calibrations:
+    sensors = record.sensor_updates[-1] if record.sensor_updates else None
+    changed = sensors is not None and bool(sensors.imu.any() or sensors.wheel.any())
+    if not record.calibrations and not changed:
         return
-    last = record.calibrations[-1]
     path = folder / CORRECTED
-    save_rig(with_terms(rig, last.terms), path)
+    corrected = rig if sensors is None else with_sensor_terms(rig, sensors)
+    if record.calibrations:
+        corrected = with_terms(corrected, record.calibrations[-1].terms)
+    save_rig(corrected, path)
+    lines = _camera_comments(record.calibrations[-1]) if record.calibrations else []
+    if sensors is not None:
+        lines += [
+            "",
+            "# What was added to the source's calibration of IMU and wheels; nothing where a term is not known:",
+        ]
+        lines += [
+            f"# {name}: {value:+.4f} +- {sigma:.4f} {unit}"
+            for name, value, sigma, unit in _sensor_terms(sensors)
+            if np.isfinite(sigma)
+        ]
+    path.write_text(path.read_text("utf-8").rstrip() + "\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _camera_comments(last: CalibrationUpdate) -> list[str]:
+    """The terms of a correction and their covariance."""
     sigma = np.sqrt(np.diag(last.terms_covariance))
     lines = ["", "# What self-calibration added to the source's calibration, and the covariance of these numbers:"]
     lines += [
@@ -75,8 +130,7 @@ def write_corrected_rig(folder: Path, rig: Rig, record: RunRecord) -> None:
         for name, value, deviation, unit in zip(NAMES, SCALES * last.terms, SCALES * sigma, UNITS, strict=True)
     ]
     scaled = SCALES[:, None] * last.terms_covariance * SCALES
-    lines += ["# " + " ".join(f"{value:.4e}" for value in row) for row in scaled]
-    path.write_text(path.read_text("utf-8").rstrip() + "\n".join(lines) + "\n", encoding="utf-8")
+    return lines + ["# " + " ".join(f"{value:.4e}" for value in row) for row in scaled]
 
 
 def calibration_table(stats: dict[str, Any]) -> list[str]:

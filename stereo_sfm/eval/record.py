@@ -31,6 +31,7 @@ from stereo_sfm.types import (
     LoopResult,
     MapUpdate,
     RowErrors,
+    SensorUpdate,
     TrackState,
     Trajectory,
 )
@@ -99,6 +100,7 @@ class RunRecord:
     row_errors: RowErrors | None = None  # the last
     row_error_px: list[tuple[int, float]] = field(default_factory=list[tuple[int, float]])  # stamp_ns, systematic
     calibrations: list[CalibrationUpdate] = field(default_factory=list[CalibrationUpdate])  # changes of the rig
+    sensor_updates: list[SensorUpdate] = field(default_factory=list[SensorUpdate])  # of IMU and wheels
     down: F64 = field(default_factory=lambda: np.zeros(3))  # gravity's direction in the map, zero: unknown
     down_information: float = 0.0  # 1/rad^2, summed over the keyframes
     rejections: dict[str, int] = field(default_factory=dict[str, int])
@@ -169,6 +171,8 @@ class RunRecord:
             self.located_kf_id = update.kf_id
         if update.calibration is not None:
             self.calibrations.append(update.calibration)
+        if update.sensors is not None:
+            self.sensor_updates.append(update.sensors)
         if update.row_errors is not None:
             self.row_errors = update.row_errors
             self.row_error_px.append((update.row_errors.stamp_ns, update.row_errors.systematic_px))

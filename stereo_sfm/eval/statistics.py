@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from stereo_sfm.drivers.live.counters import LOSSES
-from stereo_sfm.eval.calibration_results import calibration_lines, calibration_stats, row_error_stats
+from stereo_sfm.eval.calibration_results import calibration_lines, calibration_stats, row_error_stats, sensor_stats
 from stereo_sfm.eval.evaluate import Evaluation, length
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.messages import Health
@@ -75,6 +75,7 @@ def statistics(record: RunRecord, wall_s: float, evaluations: dict[str, Evaluati
         "health": {stage: _health(report) for stage, report in sorted(record.health.items())},
         "camera": record.source_counts,
         "calibration": calibration_stats(record),
+        "sensor_calibration": sensor_stats(record),
         "row_errors": row_error_stats(record),
         "fingerprint": record.fingerprint(),
         "evaluation": {name: result.to_dict() for name, result in (evaluations or {}).items()},

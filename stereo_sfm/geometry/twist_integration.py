@@ -47,7 +47,7 @@ def _integrate(seconds, angular, linear, angular_density2, linear_density2):
     rotation, position = np.eye(3), np.zeros(3)
     by_rate, moved_by_rate, covariance = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((6, 6))
     turn, right, half, half_right = np.eye(3), np.eye(3), np.eye(3), np.eye(3)
-    step = np.eye(6)
+    step, noisy = np.eye(6), angular_density2 > 0.0 or linear_density2 > 0.0
     for k in range(len(seconds)):
         dt = seconds[k]
         if dt <= 0:
@@ -60,12 +60,13 @@ def _integrate(seconds, angular, linear, angular_density2, linear_density2):
         moved = middle @ skew
         by_rate_middle = half.T @ by_rate + half_right * (0.5 * dt)
         moved_by_rate -= moved @ by_rate_middle * dt
-        step[:3, 3:] = -moved @ half.T * dt
-        step[3:, 3:] = turn.T
-        covariance = step @ covariance @ step.T
-        covariance[3:, 3:] += right @ right.T * (angular_density2 * dt)
-        for i in range(3):
-            covariance[i, i] += linear_density2 * dt
+        if noisy:
+            step[:3, 3:] = -moved @ half.T * dt
+            step[3:, 3:] = turn.T
+            covariance = step @ covariance @ step.T
+            covariance[3:, 3:] += right @ right.T * (angular_density2 * dt)
+            for i in range(3):
+                covariance[i, i] += linear_density2 * dt
         by_rate = turn.T @ by_rate + right * dt
         position += middle @ v * dt
         rotation = rotation @ turn

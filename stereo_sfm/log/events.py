@@ -77,6 +77,8 @@ class Events:
             verdict = "corrected" if update.calibration.applied else "seems wrong"
             where = f"at keyframe {update.kf_id} ({update.calibration.why})"
             return LogLine("mapper", "WARNING", f"calibration {verdict} {where}: {update.calibration.text}")
+        if update.sensors is not None:
+            return LogLine("mapper", "INFO", f"calibration at keyframe {update.kf_id}: {update.sensors.text}")
         if update.row_errors is not None and update.row_errors.warning != self._rows_warned:
             self._rows_warned = update.row_errors.warning
             rows = f"{update.row_errors.systematic_px:.2f} px off the epipolar curves at keyframe {update.kf_id}"

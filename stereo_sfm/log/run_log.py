@@ -285,6 +285,8 @@ class RunLog:
                     self._writer.write(topics.CALIBRATION, message.calibration, *stamps)
                 if isinstance(message, MapUpdate) and message.row_errors is not None:
                     self._writer.write(topics.ROW_ERRORS, message.row_errors, *stamps)
+                if isinstance(message, MapUpdate) and message.sensors is not None:
+                    self._writer.write(topics.SENSORS, message.sensors, *stamps)
 
     def _release_updates(self, everything: bool = False) -> None:
         while self._updates:

@@ -24,6 +24,7 @@ from stereo_sfm.types import (
     LoopResult,
     MapUpdate,
     RowErrors,
+    SensorUpdate,
 )
 
 SCHEMA_VERSION = "1"
@@ -52,6 +53,7 @@ KEYFRAME = Keyframe.TOPIC.name
 MAP_UPDATE = MapUpdate.TOPIC.name
 CALIBRATION = CalibrationUpdate.TOPIC.name
 ROW_ERRORS = RowErrors.TOPIC.name
+SENSORS = SensorUpdate.TOPIC.name
 LOOP = LoopResult.TOPIC.name
 POINTS = "/map/points"
 TRAJECTORY = "/map/trajectory"
@@ -130,6 +132,7 @@ TABLE: tuple[Row, ...] = (
     _ours(MapUpdate),
     _ours(CalibrationUpdate),
     _ours(RowErrors),
+    _ours(SensorUpdate),
     _ours(LoopResult),
     _foxglove(POINTS, "PointCloud", "the whole map, at most every few seconds and at the end"),
     _foxglove(TRAJECTORY, "PosesInFrame", "all keyframes, at most every second and at the end"),

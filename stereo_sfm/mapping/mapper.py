@@ -52,9 +52,21 @@ from stereo_sfm.mapping.map import Map, MapSnapshot
 from stereo_sfm.mapping.recalibration import recalibrate
 from stereo_sfm.mapping.row_errors import RowMonitor
 from stereo_sfm.mapping.self_calibration import Revision, SelfCalibration
+from stereo_sfm.mapping.sensor_calibration import SensorCalibration
 from stereo_sfm.mapping.triangulate import triangulate
 from stereo_sfm.timing import NoSpans
-from stereo_sfm.types import F64, I64, RIG_TERMS, Bool, CalibrationUpdate, Keyframe, LoopResult, MapUpdate, RowErrors
+from stereo_sfm.types import (
+    F64,
+    I64,
+    RIG_TERMS,
+    Bool,
+    CalibrationUpdate,
+    Keyframe,
+    LoopResult,
+    MapUpdate,
+    RowErrors,
+    SensorUpdate,
+)
 
 MAX_TRIANGULATED = 4  # observations up to which a point is triangulated anew before each adjustment
 FIRST_FULL_BUNDLE = 8  # keyframes of the first full bundle adjustment
@@ -90,16 +102,20 @@ class Mapper:
         spans: NoSpans | None = None,
         loop_config: LoopConfig | None = None,
         calibration: SelfCalibration | None = None,
+        sensors: SensorCalibration | None = None,
     ) -> None:
         """Empty map.
 
         Args:
             loop_config: how an accepted loop is distributed over the keyframes.
             calibration: estimates corrections of the rig; None: the rig stays.
+            sensors: estimates those of IMU and wheels; None: they stay.
         """
         self._config, self._rig, self._spans = config, rig, spans or NoSpans()
         self._source_rig, self._calibration = rig, calibration
         self._revised: CalibrationUpdate | None = None  # for the next update
+        self._sensors = sensors
+        self._sensor_update: SensorUpdate | None = None  # of this step
         self._rows = RowMonitor(rig) if rig.stereo and not rig.depth else None
         self._row_errors: RowErrors | None = None  # for the next update
         self._loop_config = loop_config or LoopConfig()
@@ -129,6 +145,7 @@ class Mapper:
             keyframe: the newest. loop: the loop closer's result for an earlier keyframe, or none.
         """
         self._version += 1
+        self._calibrate_sensors(keyframe)
         if not self._config.enabled:
             return self._without_mapping(keyframe)
         if self._job is None and self.map.many_forgotten:
@@ -173,6 +190,7 @@ class Mapper:
             if loop is not None and loop.candidate_kf_id >= 0:
                 self._close(loop)
         self._version += 1
+        self._sensor_update = None
         if self._calibration is not None:
             self._revise(self._calibration.finish())
             if self._job is not None:
@@ -186,7 +204,7 @@ class Mapper:
         none = np.zeros(0, np.int64)
         return MapUpdate(
             self._version, keyframe.kf_id, np.array([keyframe.kf_id]), np.array([keyframe.odom_T_cam]), none,
-            np.zeros((0, 3)), none, np.zeros((0, 2), np.int64), np.eye(4),
+            np.zeros((0, 3)), none, np.zeros((0, 2), np.int64), np.eye(4), sensors=self._sensor_update,
         )  # fmt: skip
 
     def _update(self, kf_id: int) -> MapUpdate:
@@ -213,6 +231,7 @@ class Mapper:
             refused_kf_ids=refused,
             calibration=revised,
             row_errors=row_errors,
+            sensors=self._sensor_update,
             down=down_of(self.map, self._of_first_submap()),
         )
 
@@ -227,6 +246,12 @@ class Mapper:
     def rig(self) -> Rig:
         """The rig of the map, with the corrections estimated so far."""
         return self._rig
+
+    def _calibrate_sensors(self, keyframe: Keyframe) -> None:
+        """Compare IMU and wheels with the poses by the images, where that is asked for."""
+        if self._sensors is not None:
+            with self._spans.span("calibrate_sensors"):
+                self._sensor_update = self._sensors.add(keyframe, self._version)
 
     def _revise(self, revision: Revision | None) -> None:
         """Correct the rig: points move to their positions with the new rig, and a full bundle adjustment follows."""

@@ -79,9 +79,11 @@ def make_mapper(config: Config, rig: Rig, spans: NoSpans, folders: MapFolders) -
         raise StereoSfmError("--localize-only needs place recognition: set loop.enabled=true")
     from stereo_sfm.mapping.mapper import Mapper
     from stereo_sfm.mapping.self_calibration import SelfCalibration
+    from stereo_sfm.mapping.sensor_calibration import SensorCalibration
 
     if folders.map_in is None:
-        return Mapper(config.mapper, rig, spans, config.loop, SelfCalibration.wanted(config, rig))
+        calibrations = SelfCalibration.wanted(config, rig), SensorCalibration.wanted(config, rig)
+        return Mapper(config.mapper, rig, spans, config.loop, *calibrations)
     from stereo_sfm.maps.extension import Extension
     from stereo_sfm.maps.localizer import Localizer
     from stereo_sfm.maps.saved_map import load_map

@@ -12,47 +12,18 @@ import pytest
 from stereo_sfm.calib import load_rig, save_rig
 from stereo_sfm.calib.imu_fit import fit_imu, judge_imu, precision_imu
 from stereo_sfm.calib.robust_fit import Whitening, robust_fit, shift_between
-from stereo_sfm.calib.wheel import Wheel
 from stereo_sfm.calib.wheel_fit import fit_wheel, judge_wheel, precision_wheel
 from stereo_sfm.cli import main
-from stereo_sfm.drivers.options import read_options
-from stereo_sfm.drivers.sim.options import SimOptions
-from stereo_sfm.drivers.sim.scenes import SCENES
-from stereo_sfm.drivers.sim.source import SimSource
 from stereo_sfm.drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
-from stereo_sfm.types import F64, I64, ImuSamples, WheelSamples
-
-FRAMES = 450
-
-
-class Recording:
-    """Half a minute of a simulated drive: exact poses with half a millimetre and half a minute of arc of noise."""
-
-    def __init__(self, seed: int, **options: object) -> None:
-        given = {"size": "106x100", "rate": 15, "seed": seed, "imu": "t265", **options}
-        self.source = SimSource("loop", SCENES["loop"], read_options(SimOptions, "sim", given))
-        parts = [self.source.sampled(k) for k in range(FRAMES)]
-        self.imu = ImuSamples.joined([imu for imu, _ in parts if imu is not None])
-        self.wheel = WheelSamples.joined([w for _, w in parts if w is not None]) if options.get("wheel") else None
-        self.stamp_ns: I64 = np.array([self.source.stamp_ns(k) for k in range(FRAMES)], np.int64)
-        rng = np.random.default_rng(seed)
-        noise = rng.normal(0, 1, (FRAMES, 6)) * [5e-4, 5e-4, 5e-4, 1.5e-4, 1.5e-4, 1.5e-4]
-        start = se3.inverse(self.source.pose(0))
-        self.poses: F64 = (
-            start @ self.source.drive.poses(np.arange(FRAMES) / 15) @ np.array([se3.exp(n) for n in noise])
-        )
-
-    @property
-    def wheels(self) -> Wheel:
-        assert self.source.rig.wheel is not None
-        return self.source.rig.wheel
+from stereo_sfm.types import ImuSamples
+from tests.sensor_drive import FRAMES, SensorDrive
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_20_ms_and_3_degrees_of_an_imu_are_found(seed: int) -> None:
-    found = Recording(seed, imu_offset_ms=20)
+    found = SensorDrive(seed, imu_offset_ms=20)
     true = found.source.rig.imu
     assert true is not None
     turn = se3.from_rotation_translation(se3.so3_exp(np.radians(3) * np.array([0.6, -0.64, 0.48])), np.zeros(3))
@@ -71,7 +42,7 @@ def test_20_ms_and_3_degrees_of_an_imu_are_found(seed: int) -> None:
 
 
 def test_accelerations_show_a_rotation_about_the_only_axis_of_turns() -> None:
-    found = Recording(0, vibration=0.0)
+    found = SensorDrive(0, vibration=0.0)
     true = found.source.rig.imu
     assert true is not None
     up = true.left_T_imu[:3, :3].T @ found.source.drive.robot_T_cam[:3, :3].T @ np.array([0.0, 0.0, 1.0])
@@ -100,7 +71,7 @@ def test_accelerations_show_a_rotation_about_the_only_axis_of_turns() -> None:
     ],
 )
 def test_wrong_units_axes_and_sensors_fail(change: Callable[[ImuSamples], ImuSamples], name: str, says: str) -> None:
-    found = Recording(0)
+    found = SensorDrive(0)
     known = found.source.rig.imu
     assert known is not None
     fit = fit_imu(found.stamp_ns, found.poses, change(found.imu), known)
@@ -109,7 +80,7 @@ def test_wrong_units_axes_and_sensors_fail(change: Callable[[ImuSamples], ImuSam
 
 
 def test_samples_with_gaps_doubles_and_nan_are_used_as_far_as_they_go() -> None:
-    found = Recording(1)
+    found = SensorDrive(1)
     known, rng = found.source.rig.imu, np.random.default_rng(0)
     assert known is not None
     rows = np.sort(np.concatenate([rng.permutation(len(found.imu))[: len(found.imu) * 9 // 10], np.arange(40)]))
@@ -121,14 +92,14 @@ def test_samples_with_gaps_doubles_and_nan_are_used_as_far_as_they_go() -> None:
 
 
 def test_a_recording_that_shows_nothing_is_refused() -> None:
-    found = Recording(0)
+    found = SensorDrive(0)
     known = found.source.rig.imu
     assert known is not None
     with pytest.raises(StereoSfmError, match="hardly turns"):
         fit_imu(found.stamp_ns, np.tile(np.eye(4), (FRAMES, 1, 1)), found.imu, known)
     with pytest.raises(StereoSfmError, match="inertial samples around"):
         fit_imu(found.stamp_ns + 10**12, found.poses, found.imu, known)
-    wheel = Recording(0, wheel="twist")
+    wheel = SensorDrive(0, wheel="twist")
     assert wheel.wheel is not None
     with pytest.raises(StereoSfmError, match=r"0\.00 m of motion"):
         fit_wheel(wheel.stamp_ns, np.tile(np.eye(4), (FRAMES, 1, 1)), wheel.wheel, wheel.wheels)
@@ -137,7 +108,7 @@ def test_a_recording_that_shows_nothing_is_refused() -> None:
 @pytest.mark.parametrize("model", ["differential", "mecanum", "twist"])
 @pytest.mark.parametrize("seed", range(2))
 def test_2_percent_of_the_radii_are_found(model: str, seed: int) -> None:
-    found = Recording(seed, wheel=model, wheel_grade="ideal", wheel_offset_ms=30)
+    found = SensorDrive(seed, wheel=model, wheel_grade="ideal", wheel_offset_ms=30)
     true = found.wheels
     wrong = replace(true, radii_m=tuple(1.02 * r for r in true.radii_m), offset_s=0.0)
     wrong = replace(true, linear_matrix=1.02 * np.eye(3), offset_s=0.0) if model == "twist" else wrong
@@ -153,7 +124,7 @@ def test_2_percent_of_the_radii_are_found(model: str, seed: int) -> None:
 
 
 def test_wheels_that_count_backwards_or_are_exchanged() -> None:
-    found = Recording(0, wheel="differential")
+    found = SensorDrive(0, wheel="differential")
     assert found.wheel is not None
     for speeds, says in ((-found.wheel.speeds, "backwards"), (found.wheel.speeds[:, ::-1].copy(), "exchange left")):
         fit = fit_wheel(found.stamp_ns, found.poses, replace(found.wheel, speeds=speeds), found.wheels)

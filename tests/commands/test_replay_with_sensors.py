@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from stereo_sfm.calib import load_rig, save_rig
 from stereo_sfm.cli import main
+from stereo_sfm.drivers.source import open_source
 
 SPEC = "sim:loop?size=212x200&rate=10&start=60&frames=32&imu=t265&wheel=differential&dark=8-8.5"
 
@@ -22,3 +26,23 @@ def test_a_run_over_processes_is_replayed_inline(
     assert "identical" in capsys.readouterr().out
     states = json.loads((tmp_path / "run" / "stats.json").read_text())["states"]
     assert live or states["INERTIAL"] == 5  # the dark is bridged
+
+
+def test_a_wrong_calibration_of_the_sensors_is_corrected_while_driving(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spec = "sim:loop?size=212x200&rate=6&frames=140&imu=t265&wheel=differential&wheel_grade=ideal&imu_offset_ms=30"
+    with open_source(spec) as source:
+        true = source.rig
+    assert true.imu is not None and true.wheel is not None
+    wheel = replace(true.wheel, radii_m=tuple(1.04 * r for r in true.wheel.radii_m))
+    save_rig(replace(true, imu=replace(true.imu, offset_s=0.0), wheel=wheel), tmp_path / "wrong.yaml")
+    args = ["run", spec, "--rig", str(tmp_path / "wrong.yaml"), "-o", str(tmp_path / "run"), "--calibrate-sensors"]
+    assert main(args) == 0
+    assert "IMU time offset: offset +" in capsys.readouterr().out.replace("\n", " ")
+    found = load_rig(tmp_path / "run" / "rig_corrected.yaml")
+    assert found.imu is not None and found.wheel is not None
+    assert found.imu.offset_s == pytest.approx(0.03, abs=1.5e-3)
+    assert np.mean(found.wheel.radii_m) == pytest.approx(np.mean(true.wheel.radii_m), rel=1e-2)
+    assert main(["replay", str(tmp_path / "run"), "-o", str(tmp_path / "again"), "--check", "--inline", "-q"]) == 0
+    assert "identical" in capsys.readouterr().out

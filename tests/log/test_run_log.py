@@ -48,6 +48,7 @@ from stereo_sfm.types import (
     MapUpdate,
     Observations,
     RowErrors,
+    SensorUpdate,
     TrackState,
 )
 from tests.log.recordings import (
@@ -109,6 +110,12 @@ def _calibration(k: int) -> CalibrationUpdate:
     return CalibrationUpdate(k + 1, k, START_NS, terms, np.diag(terms**2), 2, True, "step", "turned")
 
 
+def _sensors(k: int) -> SensorUpdate:
+    return SensorUpdate(
+        k + 1, k, START_NS, np.arange(4) * 1e-3, np.full(4, np.inf), np.arange(6) * 1e-3, np.ones(6), "wheels' scale"
+    )
+
+
 def _row_errors(k: int) -> RowErrors:
     return RowErrors(k, START_NS, np.linspace(-0.1, 0.1, 12), 0.1, -0.01, False)
 
@@ -120,7 +127,7 @@ def _answers(k: int) -> tuple[MapUpdate, LoopResult]:
         k + 1, k, np.array([k]), (map_T_odom @ keyframe.odom_T_cam)[None], keyframe.point_ids.copy(),
         np.random.default_rng(k + 99).normal(size=(len(keyframe.point_ids), 3)), np.array([10 * k]),
         np.zeros((0, 2), np.int64), map_T_odom, calibration=_calibration(k) if k == 6 else None,
-        row_errors=_row_errors(k), down=DOWN,
+        row_errors=_row_errors(k), sensors=_sensors(k) if k == 7 else None, down=DOWN,
     )  # fmt: skip
     accepted = k in (5, 8)
     loop = LoopResult(
@@ -348,6 +355,7 @@ def test_messages_of_the_stages_are_read_back_completely(run: Path) -> None:
         (topics.MAP_UPDATE, MapUpdate, [_answers(k)[0] for k in range(10)]),
         (topics.LOOP, LoopResult, [_answers(k)[1] for k in range(10)]),
         (topics.CALIBRATION, CalibrationUpdate, [_calibration(6)]),
+        (topics.SENSORS, SensorUpdate, [_sensors(7)]),
         (topics.ROW_ERRORS, RowErrors, [_row_errors(k) for k in range(10)]),
     ):
         back = _all(run, topic, kind)

@@ -131,7 +131,7 @@ class Keyframes:
         Gravity's error changes slowly: keyframes share what one time of correlation tells.
         """
         inertial, wheels = sensors.links(self._stamp_ns if submap_id == self._submap_id else stamp_ns, stamp_ns)
-        fields: dict[str, Any] = {"inertial": inertial, "wheels": wheels}
+        fields: dict[str, Any] = {"inertial": inertial, "wheels": wheels, "samples": sensors.samples()}
         gravity = sensors.gravity(odom_T_cam)
         if gravity is not None and self.count > 0:
             seconds = (stamp_ns - self._stamp_ns) * 1e-9

@@ -16,6 +16,7 @@ import numpy as np
 
 from stereo_sfm.calib.choice import with_terms
 from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calib.sensor_terms import with_sensor_terms
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.order_statistics import median
@@ -122,6 +123,8 @@ class Tracker:
         self._map_version = update.version
         if self._keyframes.resumed(update.kf_id):
             self._resumed_T_odom = np.eye(4)
+        if self._sensors is not None and update.sensors is not None:
+            self._sensors.use(update.sensors, with_sensor_terms(self._rig, update.sensors))
         corrected = update.calibration is not None and update.calibration.applied
         if update.calibration is not None and corrected:
             self._rig_terms = update.calibration.terms

@@ -7,11 +7,12 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
+from stereo_sfm.tracking.inertial.collected_samples import CollectedSamples
 from stereo_sfm.tracking.inertial.dead_reckoning import DeadReckoning
 from stereo_sfm.tracking.inertial.inertial_motion import InertialMotion, roll_pitch_deg
 from stereo_sfm.tracking.inertial.rest import Rest
 from stereo_sfm.tracking.inertial.wheel_motion import LINK_NS, WheelMotion
-from stereo_sfm.types import F64, InertialLink, MotionLink, StereoImage
+from stereo_sfm.types import F64, InertialLink, MotionLink, SensorSamples, SensorUpdate, StereoImage
 
 SHORT_S = 0.2  # over which the IMU alone is as good as with the wheels
 INERTIAL_S, WHEEL_S = 10.0, 30.0  # longest time without images, by the IMU alone and with wheels
@@ -21,23 +22,43 @@ BRIDGED_M = 0.5  # largest standard deviation of a position without images
 class MotionSensors:
     """The IMU, the wheels, or both."""
 
-    def __init__(self, inertial: InertialMotion | None, wheels: WheelMotion | None) -> None:
-        self._inertial, self._wheels = inertial, wheels
+    def __init__(
+        self, inertial: InertialMotion | None, wheels: WheelMotion | None, collected: CollectedSamples | None = None
+    ) -> None:
+        """`collected`: None: they are not calibrated."""
+        self._inertial, self._wheels, self._collected = inertial, wheels, collected
         self._rest = Rest()
         self._last_ns = 0
         self._reckoning: DeadReckoning | None = None  # since the last pose
         self._reckoned_ns = 0
         self._said: set[str] = set()
+        self._terms: tuple[F64, F64] = np.zeros(4), np.zeros(6)  # by which the calibrations are corrected
+        # With other terms, to be used from the next pose by images on.
+        self._renewed: tuple[InertialMotion | None, WheelMotion | None] = None, None
 
     @staticmethod
     def of(config: TrackerConfig, rig: Rig) -> MotionSensors | None:
         """Those of a rig that are to be used; None if there are none."""
         inertial = InertialMotion(rig.imu) if rig.imu is not None and config.inertial else None
         wheels = WheelMotion(rig.wheel) if rig.wheel is not None and config.wheels else None
-        return None if inertial is None and wheels is None else MotionSensors(inertial, wheels)
+        collected = CollectedSamples() if config.calibrate_sensors else None
+        return None if inertial is None and wheels is None else MotionSensors(inertial, wheels, collected)
+
+    def use(self, update: SensorUpdate, rig: Rig) -> None:
+        """Use the calibration of an update, which `rig` contains, from the next pose by images on.
+
+        The axes of the IMU stay those of the first calibration, which the map uses: samples are turned into them.
+        """
+        if self._inertial is not None and rig.imu is not None and not np.array_equal(update.imu, self._terms[0]):
+            self._renewed = InertialMotion(rig.imu.in_axes(self._inertial.left_R_imu)), self._renewed[1]
+        if self._wheels is not None and rig.wheel is not None and not np.array_equal(update.wheel, self._terms[1]):
+            self._renewed = self._renewed[0], WheelMotion(rig.wheel)
+        self._terms = update.imu, update.wheel
 
     def feed(self, image: StereoImage) -> None:
         """The samples up to the image that is tracked next."""
+        if self._collected is not None:
+            self._collected.feed(image)
         if self._inertial is not None:
             self._inertial.feed(image.imu)
         if self._wheels is not None:
@@ -47,6 +68,8 @@ class MotionSensors:
         """The odometry begins anew here: poses from before do not go with those to come."""
         self._last_ns, self._reckoning = stamp_ns, None
         self._rest.forget()
+        if self._collected is not None:
+            self._collected.begin()
         for sensor in (self._inertial, self._wheels):
             if sensor is not None:
                 sensor.begin(stamp_ns, odom_T_cam)
@@ -54,12 +77,17 @@ class MotionSensors:
     def accept(self, stamp_ns: int, odom_T_cam: F64) -> None:
         """The images gave this pose (4, 4)."""
         self._last_ns, self._reckoning = stamp_ns, None
+        inertial, wheels = self._renewed
+        self._inertial, self._wheels = inertial or self._inertial, wheels or self._wheels
+        self._renewed = None, None
         for sensor in (self._inertial, self._wheels):
             if sensor is not None:
                 sensor.accept(stamp_ns, odom_T_cam)
 
     def corrected(self, stamp_ns: int, odom_T_cam: F64, covariance: F64) -> F64:
         """The pose (4, 4) that the images gave, with its covariance (6, 6), corrected by the gyroscope and at rest."""
+        if self._collected is not None:
+            self._collected.accept(stamp_ns, odom_T_cam)
         if self._inertial is not None:
             odom_T_cam = self._inertial.fused(stamp_ns, odom_T_cam, covariance)
         return self.settled(stamp_ns, odom_T_cam)
@@ -143,6 +171,10 @@ class MotionSensors:
             None if inertial is None else inertial.link(begin_ns, stamp_ns),
             wheels.link(begin_ns, stamp_ns) if moved and wheels is not None else None,
         )
+
+    def samples(self) -> SensorSamples | None:
+        """What calibrates them, since the keyframe before; None where that is not asked for."""
+        return None if self._collected is None else self._collected.take()
 
     def news(self) -> str:
         """Why a sensor is left out, once; "" otherwise."""
