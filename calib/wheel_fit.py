@@ -1,4 +1,4 @@
-"""Radii, track, direction and time offset of wheel odometry, from its samples and the motion that a camera saw."""
+"""Radii, track, pose and time offset of wheel odometry, from its samples and the motion that a camera saw."""
 
 from __future__ import annotations
 
@@ -19,9 +19,17 @@ REACH_S = 0.3  # of the search for the time offset
 LINK_S = 2.0  # between the compared poses: the camera's sway is then small against the way
 MIN_WAY_M, MIN_TURN = 2.0, 0.5  # m, rad of the whole recording, below which nothing is found
 SCALE_PERCENT, TURN_PERCENT, DIRECTION_DEG, OFFSET_MS = (0.2, 1.0), (0.5, 3.0), (0.2, 1.0), (3.0, 20.0)  # known
-WRONG = {"scale": (0.5, 5.0), "turns": (2.0, 20.0), "direction": (1.0, 5.0), "time offset": (15.0, 60.0)}  # warn, fail
+POSITION_CM = 2.0, 10.0  # the same
+WRONG = {  # warn, fail
+    "scale": (0.5, 5.0),
+    "turns": (2.0, 20.0),
+    "direction": (1.0, 5.0),
+    "time offset": (15.0, 60.0),
+    "position ahead": (5.0, 30.0),
+    "position to the left": (5.0, 30.0),
+}
 REVERSED = -0.5  # correlation of rates
-NAMES = ("scale", "difference of the sides", "turns", "direction", "pitch", "time offset")
+NAMES = ("scale", "difference of the sides", "turns", "direction", "pitch", "time offset", "ahead", "left")
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,8 +37,8 @@ class WheelFit:
     """What the images say of the wheels' calibration."""
 
     wheel: Wheel  # corrected
-    value: F64  # (6,) of NAMES: shares, radians and seconds by which the calibration is off
-    sigma: F64  # (6,)
+    value: F64  # (8,) of NAMES: shares, radians, seconds and metres by which the calibration is off
+    sigma: F64  # (8,)
     way_m: float  # by the images
     agreement: float  # share of the way that both agree on, after the correction; 1 at best
     sign: float  # correlation of the ways ahead, negative if the wheels count backwards
@@ -54,15 +62,16 @@ def fit_wheel(stamp_ns: I64, poses: F64, samples: WheelSamples, wheel: Wheel) ->
     links = np.searchsorted(drive.at, np.arange(drive.at[0], drive.at[-1], LINK_S))
     motions = se3.inverse(drive.seen[links[:-1]]) @ drive.seen[links[1:]]
     seen = np.column_stack([motions[:, :3, 3], se3.so3_log(motions[:, :3, :3])[:, 2]])
-    free = np.array([True, wheel.model != "twist", np.abs(seen[:, 3]).sum() > MIN_TURN, True, True, True])
+    turning = bool(np.abs(seen[:, 3]).sum() > MIN_TURN)
+    free = np.array([True, wheel.model != "twist", turning, True, True, True, turning, turning])
 
     def residual(p: F64) -> F64:
         x = np.zeros(len(NAMES))
         x[free] = p
         return seen - drive.predicted(links, x)
 
-    start = np.array([0, 0, 0, 0, 0, offset])
-    fit = robust_fit(residual, start[free], np.array([0.01, 0.01, 0.01, 0.01, 0.01, 0.005])[free])
+    start = np.array([0, 0, 0, 0, 0, offset, 0, 0])
+    fit = robust_fit(residual, start[free], np.array([0.01, 0.01, 0.01, 0.01, 0.01, 0.005, 0.01, 0.01])[free])
     value, sigma = np.zeros(len(NAMES)), np.full(len(NAMES), np.inf)
     value[free], sigma[free] = fit.value, fit.sigma
     left = np.linalg.norm(residual(fit.value)[:, :3], axis=1)
@@ -117,9 +126,9 @@ class _Drive:
         return offset, signs[0], signs[1]
 
     def predicted(self, links: I64, x: F64) -> F64:
-        """(L, 4) position and turn between images (L + 1,) by the wheels, corrected by x (6,) of NAMES."""
+        """(L, 4) position and turn between images (L + 1,) by the wheels, corrected by x (8,) of NAMES."""
         linear, angular = corrected(self.wheel, x).velocities(self.samples)
-        turn = se3.so3_exp(np.array([0.0, x[4], x[3]]))
+        turn, place = se3.so3_exp(np.array([0.0, x[4], x[3]])), np.array([x[6], x[7], 0.0])
         values = np.hstack([linear @ turn.T, np.nan_to_num(angular)])
         ends = self.at[links] + x[5]
         edges = np.sort(np.concatenate([ends, self.times[(self.times > ends[0]) & (self.times < ends[-1])]]))
@@ -128,7 +137,8 @@ class _Drive:
         out = np.zeros((len(links) - 1, 4))
         for k, (begin, end) in enumerate(itertools.pairwise(np.searchsorted(edges, ends).tolist())):
             moved = integrate_twists(seconds[begin:end], mean[begin:end, 3:], mean[begin:end, :3], 0.0, 0.0)
-            out[k, :3], out[k, 3] = moved.position, se3.so3_log(moved.rotation)[2]
+            out[k, :3] = moved.position + place - moved.rotation @ place
+            out[k, 3] = se3.so3_log(moved.rotation)[2]
         return out
 
 
@@ -144,8 +154,9 @@ def corrected(wheel: Wheel, x: F64) -> Wheel:
 
 
 def with_wheel_terms(wheel: Wheel, x: F64) -> Wheel:
-    """A calibration corrected by terms (6,) of NAMES."""
-    turn = se3.from_rotation_translation(se3.so3_exp(np.array([0.0, x[4], x[3]])), np.zeros(3))
+    """A calibration corrected by terms (8,) of NAMES."""
+    place = np.array([x[6], x[7], 0.0])
+    turn = se3.from_rotation_translation(se3.so3_exp(np.array([0.0, x[4], x[3]])), place)
     return replace(corrected(wheel, x), left_T_wheel=wheel.left_T_wheel @ turn, offset_s=wheel.offset_s + float(x[5]))
 
 
@@ -165,6 +176,8 @@ def judge_wheel(found: WheelFit) -> list[Finding]:
         ("turns", 2, percent, "%", TURN_PERCENT),
         ("direction", 3, degrees, "°", DIRECTION_DEG),
         ("time offset", 5, ms, " ms", OFFSET_MS),
+        ("position ahead", 6, percent, " cm", POSITION_CM),
+        ("position to the left", 7, percent, " cm", POSITION_CM),
     )
     level = 0 if found.agreement > 0.9 else 1 if found.agreement > 0.7 else 2
     out = [
@@ -197,5 +210,9 @@ def precision_wheel(found: WheelFit) -> list[Finding]:
         ("direction", degrees, DIRECTION_DEG, f"{np.degrees(found.value[3]):+.2f} ± {degrees:.2f}°"),
         ("time offset", ms, OFFSET_MS, f"{1e3 * wheel.offset_s:+.1f} ± {ms:.1f} ms"),
     )
+    for name, k in (("position ahead", 6), ("position to the left", 7)):
+        value, sigma = float(100 * found.value[k]), float(100 * found.sigma[k])
+        text = f"{value:+.1f} ± {sigma:.1f} cm" if np.isfinite(sigma) else "not shown by the motion"
+        rows = (*rows, (name, sigma, POSITION_CM, text))
     levels = [sum(not sigma <= limit for limit in known) for _, sigma, known, _ in rows]
     return [Finding(f"wheels' {row[0]}", min(level, 1), row[3]) for row, level in zip(rows, levels, strict=True)]

@@ -80,7 +80,7 @@ class TrackerConfig:
     wheels: bool = switch(True, "Use the wheel odometry, where the source has one, as the IMU")
     calibrate_sensors: bool = switch(
         False,
-        "Estimate time offset and rotation of the IMU, and radii, track and direction of the wheels, while driving",
+        "Estimate time offset and rotation of the IMU, and radii, track and pose of the wheels, while driving",
     )
     lost_frames: int = number(
         15, 0, 100_000, "Frames without a pose after which a new submap begins, whichever the tracker"

@@ -333,8 +333,10 @@ class SensorUpdate(Message):
     stamp_ns: int
     imu: F64  # (4,) rotation about the IMU's axes (3, radians), seconds of time offset, added to the calibration
     imu_sigma: F64  # (4,) standard deviations; infinite while it is not known
-    wheel: F64  # (6,) scale, difference of the sides, turns (shares), direction, pitch (radians), time offset (seconds)
-    wheel_sigma: F64  # (6,) likewise
+    # (8,) scale, difference of the sides, turns (shares), direction, pitch (radians), time offset (seconds), position
+    # ahead and to the left (metres)
+    wheel: F64
+    wheel_sigma: F64  # (8,) likewise
     text: str  # human-readable
 
 

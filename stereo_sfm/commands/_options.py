@@ -81,7 +81,7 @@ def add_config_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--calibrate-sensors",
         action="store_true",
-        help="estimate time offset and rotation of the IMU, radii, track and direction of the wheels, and use them",
+        help="estimate time offset and rotation of the IMU, radii, track and pose of the wheels, and use them",
     )
     parser.add_argument("--seed", type=int, help="random seed (sets seed and loop.seed)")
 

@@ -36,7 +36,7 @@ def calibration_stats(record: RunRecord) -> list[dict[str, Any]]:
 
 
 def sensor_stats(record: RunRecord) -> list[dict[str, Any]]:
-    """Every word about the calibration of IMU and wheels; terms in degrees, ms and per cent; no sigma: unknown."""
+    """Every word about the calibration of IMU and wheels; terms in degrees, ms, per cent, mm; no sigma: unknown."""
     first_ns = int(record.frames.stamp_ns[0]) if len(record.frames) else 0
     return [
         {
@@ -55,7 +55,7 @@ def _sensor_terms(update: SensorUpdate) -> list[tuple[str, float, float, str]]:
     """Name, value, standard deviation and unit of each."""
     degrees, ms, percent = (float(np.degrees(1.0)), "°"), (1e3, "ms"), (100.0, "%")
     imu = ("IMU rotation x", "IMU rotation y", "IMU rotation z", "IMU time offset")
-    units = [degrees, degrees, degrees, ms, percent, percent, percent, degrees, degrees, ms]
+    units = [degrees, degrees, degrees, ms, percent, percent, percent, degrees, degrees, ms, (1e3, "mm"), (1e3, "mm")]
     values, sigmas = np.append(update.imu, update.wheel), np.append(update.imu_sigma, update.wheel_sigma)
     return [
         (name, scale * value, scale * sigma, unit)

@@ -1,4 +1,4 @@
-"""Calibration of IMU and wheels while driving: time offset and rotation, radii, track and direction.
+"""Calibration of IMU and wheels while driving: time offset and rotation; radii, track and pose.
 
 Keyframes bring the poses that the images alone gave, and the samples (`Keyframe.samples`). Every few seconds those of
 the last minute are compared as `calibrate --imu` and `calibrate --wheel` do. A term is corrected once it is known well
@@ -29,8 +29,8 @@ BETTER = 0.7  # times the standard deviation of a corrected term: it is replaced
 IMU_KNOWN = np.append(np.full(3, np.radians(0.3)), 1e-3)
 IMU_LEFT = np.append(np.full(3, np.radians(0.3)), 1e-3)
 # Of `wheel_fit.NAMES`; their time offset stays: how a robot slides in turns looks like one of 15 ms.
-WHEEL_KNOWN = np.array([3e-3, 3e-3, 1e-2, np.radians(0.3), np.radians(0.3), 0.0])
-WHEEL_LEFT = np.array([5e-3, 5e-3, 3e-2, np.radians(1.0), np.radians(1.0), 0.0])
+WHEEL_KNOWN = np.array([3e-3, 3e-3, 1e-2, np.radians(0.3), np.radians(0.3), 0.0, 0.03, 0.03])
+WHEEL_LEFT = np.array([5e-3, 5e-3, 3e-2, np.radians(1.0), np.radians(1.0), 0.0, 0.05, 0.05])
 AGREEMENT = 0.7  # of both with the images: less is another sensor's data, or slip
 WRONG_SCALE = 0.05  # of the rates: other units
 

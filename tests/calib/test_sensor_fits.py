@@ -123,6 +123,23 @@ def test_2_percent_of_the_radii_are_found(model: str, seed: int) -> None:
     assert max(f.level for f in precision_wheel(fit)) <= 1
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_where_the_wheels_are_shows_in_turns(seed: int) -> None:
+    found = SensorDrive(seed, wheel="differential", spot_turns=True)
+    moved = se3.from_rotation_translation(np.eye(3), np.array([-0.2, 0.1, 0.0]))
+    wrong = replace(found.wheels, left_T_wheel=found.wheels.left_T_wheel @ moved)
+    assert found.wheel is not None
+    fit = fit_wheel(found.stamp_ns, found.poses, found.wheel, wrong)
+    np.testing.assert_allclose(fit.value[6:], [0.2, -0.1], atol=0.02)
+    np.testing.assert_allclose(fit.wheel.left_T_wheel[:3, 3], found.wheels.left_T_wheel[:3, 3], atol=0.02)
+    assert {f.name for f in judge_wheel(fit) if "position" in f.name and f.level == 1} == {
+        "wheels' position ahead", "wheels' position to the left"
+    }  # fmt: skip
+    before_the_turn = slice(0, 150)
+    straight = fit_wheel(found.stamp_ns[before_the_turn], found.poses[before_the_turn], found.wheel, wrong)
+    assert not np.isfinite(straight.sigma[6:]).any() and not straight.value[6:].any()
+
+
 def test_wheels_that_count_backwards_or_are_exchanged() -> None:
     found = SensorDrive(0, wheel="differential")
     assert found.wheel is not None

@@ -112,7 +112,7 @@ def _calibration(k: int) -> CalibrationUpdate:
 
 def _sensors(k: int) -> SensorUpdate:
     return SensorUpdate(
-        k + 1, k, START_NS, np.arange(4) * 1e-3, np.full(4, np.inf), np.arange(6) * 1e-3, np.ones(6), "wheels' scale"
+        k + 1, k, START_NS, np.arange(4) * 1e-3, np.full(4, np.inf), np.arange(8) * 1e-3, np.ones(8), "wheels' scale"
     )
 
 

@@ -27,9 +27,9 @@ def wrong(rig: Rig) -> Rig:
 
 
 def correction() -> SensorUpdate:
-    wheel = np.array([1 / (1 + RADIUS) - 1, 0, 0, 0, 0, 0])
+    wheel = np.array([1 / (1 + RADIUS) - 1, 0, 0, 0, 0, 0, 0, 0])
     imu = np.append(-TURN, OFFSET_S)
-    return SensorUpdate(1, 0, 0, imu, np.full(4, 1e-3), wheel, np.full(6, 1e-3), "")
+    return SensorUpdate(1, 0, 0, imu, np.full(4, 1e-3), wheel, np.full(8, 1e-3), "")
 
 
 def step(of: SensorDrive, sensors: MotionSensors, k: int, seen: bool = True) -> None:

@@ -32,7 +32,7 @@ class MotionSensors:
         self._reckoning: DeadReckoning | None = None  # since the last pose
         self._reckoned_ns = 0
         self._said: set[str] = set()
-        self._terms: tuple[F64, F64] = np.zeros(4), np.zeros(6)  # by which the calibrations are corrected
+        self._terms: tuple[F64, F64] = np.zeros(4), np.zeros(8)  # by which the calibrations are corrected
         # With other terms, to be used from the next pose by images on.
         self._renewed: tuple[InertialMotion | None, WheelMotion | None] = None, None
 
