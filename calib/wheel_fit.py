@@ -13,7 +13,7 @@ from stereo_sfm.calib.wheel import Wheel
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.twist_integration import integrate_twists
-from stereo_sfm.types import F64, I64, WheelSamples
+from stereo_sfm.types import F64, I64, Bool, WheelSamples
 
 REACH_S = 0.3  # of the search for the time offset
 LINK_S = 2.0  # between the compared poses: the camera's sway is then small against the way
@@ -30,6 +30,9 @@ WRONG = {  # warn, fail
 }
 REVERSED = -0.5  # correlation of rates
 NAMES = ("scale", "difference of the sides", "turns", "direction", "pitch", "time offset", "ahead", "left")
+POSITION = slice(6, 8)  # of these
+SCALES = np.array([0.01, 0.01, 0.01, 0.01, 0.01, 0.005, 0.01, 0.01])  # typical changes of these
+PLACED_SIGMAS = 3.0  # from the calibration's position, below which that is kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,16 +68,30 @@ def fit_wheel(stamp_ns: I64, poses: F64, samples: WheelSamples, wheel: Wheel) ->
     turning = bool(np.abs(seen[:, 3]).sum() > MIN_TURN)
     free = np.array([True, wheel.model != "twist", turning, True, True, True, turning, turning])
 
-    def residual(p: F64) -> F64:
-        x = np.zeros(len(NAMES))
-        x[free] = p
+    def residual(x: F64) -> F64:
         return seen - drive.predicted(links, x)
 
-    start = np.array([0, 0, 0, 0, 0, offset, 0, 0])
-    fit = robust_fit(residual, start[free], np.array([0.01, 0.01, 0.01, 0.01, 0.01, 0.005, 0.01, 0.01])[free])
-    value, sigma = np.zeros(len(NAMES)), np.full(len(NAMES), np.inf)
-    value[free], sigma[free] = fit.value, fit.sigma
-    left = np.linalg.norm(residual(fit.value)[:, :3], axis=1)
+    def fitted(free: Bool, start: F64) -> tuple[F64, F64]:
+        """Values and standard deviations; 0 and infinity where a term is not free."""
+
+        def whole(p: F64) -> F64:
+            x = np.zeros(len(NAMES))
+            x[free] = p
+            return x
+
+        fit = robust_fit(lambda p: residual(whole(p)), start[free], SCALES[free])
+        sigma = np.full(len(NAMES), np.inf)
+        sigma[free] = fit.sigma
+        return whole(fit.value), sigma
+
+    value, sigma = fitted(free, np.array([0, 0, 0, 0, 0, offset, 0, 0]))
+    if (
+        turning and (np.abs(value[POSITION]) < PLACED_SIGMAS * sigma[POSITION]).all()
+    ):  # it is where the calibration says
+        free[POSITION] = False
+        value, others = fitted(free, value)
+        sigma[free] = others[free]
+    left = np.linalg.norm(residual(value)[:, :3], axis=1)
     agreement = 1 - float(np.median(left) / np.median(np.linalg.norm(seen[:, :3], axis=1)))
     value[5] -= wheel.offset_s
     return WheelFit(with_wheel_terms(wheel, value), value, sigma, drive.way_m, agreement, sign, turn_sign)
