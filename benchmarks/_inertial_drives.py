@@ -11,6 +11,7 @@ from _best_tilt import BestTilt, TiltGraph, true_tilt_deg
 from dead_reckoning import NOTHING, RATE, SENSORS, dark, feed, opened, rest
 
 from stereo_sfm.calib.imu_fit import fit_imu
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.wheel_fit import fit_wheel
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, I64, ImuSamples, StereoImage, WheelSamples
@@ -108,6 +109,25 @@ def standing(minutes: int) -> Iterator[Row]:
     yield f"2 {minutes} minutes at rest", "2 mm, 0.02°", f"{1e3 * metres:.2f} mm, {degrees:.4f}°", holds
 
 
+TURN = se3.from_rotation_translation(se3.so3_exp(np.radians(3) * np.array([0.6, -0.64, 0.48])), np.zeros(3))
+
+
+def miscalibrated(rig: Rig) -> Rig:
+    """3 degrees and 2 % off, and without the IMU's time offset."""
+    assert rig.imu is not None and rig.wheel is not None
+    imu = replace(rig.imu, offset_s=0.0, left_T_imu=rig.imu.left_T_imu @ TURN)
+    return replace(rig, imu=imu, wheel=replace(rig.wheel, radii_m=tuple(1.02 * r for r in rig.wheel.radii_m)))
+
+
+def miscalibration(found: Rig, true: Rig) -> tuple[float, float, float]:
+    """Degrees, milliseconds and per cent that are left."""
+    assert found.imu is not None and true.imu is not None and found.wheel is not None and true.wheel is not None
+    off = se3.so3_log(found.imu.left_T_imu[:3, :3].T @ true.imu.left_T_imu[:3, :3])
+    radius = float(np.mean(found.wheel.radii_m) / np.mean(true.wheel.radii_m))
+    offset_s = found.imu.offset_s - true.imu.offset_s
+    return float(np.degrees(np.linalg.norm(off))), 1e3 * abs(offset_s), 100 * abs(radius - 1)
+
+
 def recovery(seeds: int) -> Iterator[Row]:
     """Wrong calibrations, from half a minute each."""
     offsets, turns, radii = list[float](), list[float](), list[float]()
@@ -119,16 +139,17 @@ def recovery(seeds: int) -> Iterator[Row]:
         rng = np.random.default_rng(seed)
         seen = poses[:count] @ np.array([se3.exp(n) for n in rng.normal(0, 1, (count, 6)) * NOISE])
         stamps: I64 = np.array([source.stamp_ns(k) for k in range(count)], np.int64)
-        turn = se3.from_rotation_translation(se3.so3_exp(np.radians(3) * np.array([0.6, -0.64, 0.48])), np.zeros(3))
-        wrong = replace(imu, offset_s=0.0, left_T_imu=imu.left_T_imu @ turn)
+        wrong = miscalibrated(source.rig)
         samples = ImuSamples.joined([i for i, _ in parts if i is not None])
-        found = fit_imu(stamps, seen, samples, wrong).imu
-        offsets.append(1e3 * abs(found.offset_s - imu.offset_s))
-        off = se3.so3_log(found.left_T_imu[:3, :3].T @ imu.left_T_imu[:3, :3])
-        turns.append(float(np.degrees(np.linalg.norm(off))))
         speeds = WheelSamples.joined([w for _, w in parts if w is not None])
-        fit = fit_wheel(stamps, seen, speeds, replace(wheel, radii_m=tuple(1.02 * r for r in wheel.radii_m)))
-        radii.append(100 * abs((1 + fit.value[0]) * 1.02 - 1))
+        assert wrong.imu is not None and wrong.wheel is not None
+        new_imu, new_wheel = (
+            fit_imu(stamps, seen, samples, wrong.imu).imu,
+            fit_wheel(stamps, seen, speeds, wrong.wheel).wheel,
+        )
+        left = miscalibration(replace(wrong, imu=new_imu, wheel=new_wheel), source.rig)
+        for values, value in zip((turns, offsets, radii), left, strict=True):
+            values.append(value)
     yield "3 time offset of 20 ms", "0.5 ms", f"{max(offsets):.2f} ms at most", max(offsets) <= 0.5
     yield "3 rotation of 3°", "0.1°", f"{max(turns):.3f}° at most", max(turns) <= 0.1
     yield "3 radius wrong by 2 %", "0.2 %", f"{max(radii):.2f} % at most", max(radii) <= 0.2
