@@ -30,6 +30,9 @@ FORMATS: dict[str, tuple[str, str, str, bool]] = {
 }
 
 
+WITH_IMU = "rig", "kalibr", "euroc", "basalt", "depthai"
+
+
 def load_rig(path: Path | str, format: str | None = None, **options: Any) -> Rig:
     """Read a calibration of any format.
 
@@ -54,6 +57,8 @@ def save_rig(rig: Rig, path: Path | str, format: str | None = None) -> None:
     write = _function(name, 2)
     if rig.readout_s and name != "rig":
         log.warning("%s cannot store the readout time of a rolling shutter (%g s): it is lost", name, rig.readout_s)
+    if rig.imu is not None and name not in WITH_IMU:
+        log.warning("%s cannot store an IMU: its calibration is lost", name)
     if rig.wheel is not None and name != "rig":
         log.warning("%s cannot store wheel odometry: its calibration is lost", name)
     try:

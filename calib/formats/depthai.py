@@ -18,6 +18,8 @@ from stereo_sfm.calib.formats.common import (
     stereo_only,
     unsupported,
 )
+from stereo_sfm.calib.formats.imu_files import warn_of_lost
+from stereo_sfm.calib.imu import Imu
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, KannalaBrandt
@@ -25,6 +27,8 @@ from stereo_sfm.types import F64
 
 _PERSPECTIVE, _FISHEYE = 0, 1
 _CENTIMETRE = 0.01
+_IMU = "imuCalibrationParams"
+_SENSORS = {"accelerometer": "accel", "gyroscope": "gyro"}  # -> ours
 _NO_RECTIFICATION: dict[str, Any] = {"rectifiedRotationLeft": [], "rectifiedRotationRight": []}
 
 
@@ -39,12 +43,16 @@ def read_depthai(path: Path | str, left_socket: int | None = None, right_socket:
         right = _socket(right_socket, stereo.get("rightCameraSocket", -1), 2)
         name, serial = str(data.get("boardName", "")), str(data.get("batchName", ""))
         right_T_left = _chain(cameras, left, right)
-        return Rig(_camera(cameras[left]), _camera(cameras[right]), se3.inverse(right_T_left), name=name, serial=serial)
+        pair = _camera(cameras[left]), _camera(cameras[right])
+        imu = _imu(data, cameras, left)
+        return Rig(*pair, se3.inverse(right_T_left), name=name, serial=serial, imu=imu)
 
 
 def write_depthai(rig: Rig, path: Path) -> None:
-    """Sockets 1 and 2. The body's pose is not stored."""
+    """Sockets 1 and 2. The IMU is stored but for its time offset, the body's pose is not."""
     right = stereo_only(rig.right, "depthai")
+    if rig.imu is not None:
+        warn_of_lost(rig.imu, "depthai", affine=True)
     right_T_left = se3.inverse(rig.left_T_right)
     data = {
         "batchName": rig.serial,
@@ -52,7 +60,7 @@ def write_depthai(rig: Rig, path: Path) -> None:
         "version": 7,
         "cameraData": [[1, _plain(rig.left, right_T_left, 2)], [2, _plain(right, np.eye(4), -1)]],
         "stereoRectificationData": {"leftCameraSocket": 1, "rightCameraSocket": 2} | _NO_RECTIFICATION,
-    }
+    } | ({} if rig.imu is None else {"imuExtrinsics": _extrinsics(rig.imu.left_T_imu, 1), _IMU: _plain_imu(rig.imu)})
     path.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
 
 
@@ -66,10 +74,7 @@ def _chain(cameras: dict[int, Any], start: int, end: int) -> F64:
     for socket, camera in cameras.items():
         extrinsics = camera["extrinsics"]
         if int(extrinsics["toCameraSocket"]) >= 0:
-            step = np.eye(4)
-            step[:3, :3] = np.array(numbers(extrinsics["rotationMatrix"], 9)).reshape(3, 3)
-            step[:3, 3] = [_CENTIMETRE * float(extrinsics["translation"][k]) for k in "xyz"]
-            towards[socket] = int(extrinsics["toCameraSocket"]), exact_rotation(step)
+            towards[socket] = int(extrinsics["toCameraSocket"]), _pose(extrinsics)
     return se3.inverse(_to_root(towards, end)) @ _to_root(towards, start)
 
 
@@ -82,6 +87,52 @@ def _to_root(towards: dict[int, tuple[int, F64]], socket: int) -> F64:
             raise ValueError("the extrinsics form a cycle")
         seen.add(socket)
         out = step @ out
+    return out
+
+
+def _pose(extrinsics: dict[str, Any]) -> F64:
+    """(4, 4) destination_T_source, metres."""
+    step = np.eye(4)
+    step[:3, :3] = np.array(numbers(extrinsics["rotationMatrix"], 9)).reshape(3, 3)
+    step[:3, 3] = [_CENTIMETRE * float(extrinsics["translation"][k]) for k in "xyz"]
+    return exact_rotation(step)
+
+
+def _imu(data: dict[str, Any], cameras: dict[int, Any], left: int) -> Imu | None:
+    """None where the board does not know its pose."""
+    extrinsics = data.get("imuExtrinsics")
+    socket = -1 if extrinsics is None else int(extrinsics.get("toCameraSocket", -1))
+    if extrinsics is None or socket not in cameras:
+        return None
+    return imu_at(_chain(cameras, socket, left) @ _pose(extrinsics), data.get(_IMU))
+
+
+def imu_at(left_T_imu: F64, parameters: dict[str, Any] | None) -> Imu:
+    """An IMU at a pose (4, 4) with the EEPROM's `imuCalibrationParams`: affine maps [Q | b] of its samples, and noise.
+
+    Noise that is 0, and parameters that older boards do not have, are the defaults.
+    """
+    if not parameters:
+        return Imu(left_T_imu)
+    known: dict[str, Any] = {}
+    for name, ours in _SENSORS.items():
+        affine = np.array([numbers(row, 4) for row in parameters[name]]).reshape(3, 4)
+        known |= {f"{ours}_matrix": affine[:, :3].copy(), f"{ours}_bias": -affine[:, 3]}
+        axes = parameters["noise"][name].values()
+        for key, theirs in (("noise", "noiseDensity"), ("walk", "randomWalk")):
+            mean = float(np.mean([axis[theirs] for axis in axes]))
+            known |= {f"{ours}_{key}": mean} if mean > 0 else {}
+    return Imu(left_T_imu, **known)
+
+
+def _plain_imu(imu: Imu) -> dict[str, Any]:
+    noise: dict[str, Any] = {"name": ""}
+    out: dict[str, Any] = {"noise": noise}
+    for name, ours in _SENSORS.items():
+        matrix, bias = getattr(imu, f"{ours}_matrix"), getattr(imu, f"{ours}_bias")
+        out[name] = np.column_stack([matrix, -bias]).tolist()
+        axis = {"noiseDensity": float(getattr(imu, f"{ours}_noise")), "randomWalk": float(getattr(imu, f"{ours}_walk"))}
+        noise[name] = {k: axis | {"biasStability": 0.0} for k in "xyz"}
     return out
 
 
@@ -99,7 +150,6 @@ def _camera(data: dict[str, Any]) -> Camera:
 def _plain(camera: Camera, next_T_this: F64, next_socket: int) -> dict[str, Any]:
     if camera.model == "epipolar":
         raise unsupported(camera, "depthai")
-    x, y, z = (float(v) / _CENTIMETRE for v in next_T_this[:3, 3])
     return {
         "cameraType": _FISHEYE if camera.model == "kannala_brandt" else _PERSPECTIVE,
         "width": camera.width,
@@ -108,10 +158,16 @@ def _plain(camera: Camera, next_T_this: F64, next_socket: int) -> dict[str, Any]
         "distortionCoeff": padded(camera, 14),
         "lensPosition": 0,
         "specHfovDeg": float(np.rad2deg(2 * np.arctan(0.5 * camera.width / camera.fx))),
-        "extrinsics": {
-            "rotationMatrix": [[float(v) for v in row] for row in next_T_this[:3, :3]],
-            "translation": {"x": x, "y": y, "z": z},
-            "specTranslation": {"x": x, "y": y, "z": z},
-            "toCameraSocket": next_socket,
-        },
+        "extrinsics": _extrinsics(next_T_this, next_socket),
+    }
+
+
+def _extrinsics(next_T_this: F64, next_socket: int) -> dict[str, Any]:
+    """To a socket; -1: to none."""
+    x, y, z = (float(v) / _CENTIMETRE for v in next_T_this[:3, 3])
+    return {
+        "rotationMatrix": [[float(v) for v in row] for row in next_T_this[:3, :3]],
+        "translation": {"x": x, "y": y, "z": z},
+        "specTranslation": {"x": x, "y": y, "z": z},
+        "toCameraSocket": next_socket,
     }

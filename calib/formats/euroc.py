@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from stereo_sfm.calib.formats.common import brown, numbers, padded, read_yaml, reading, rigid, unsupported, write_yaml
-from stereo_sfm.calib.formats.imu_files import read_imu
+from stereo_sfm.calib.formats.imu_files import read_imu, write_euroc_imu
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
@@ -19,16 +19,16 @@ def read_euroc(folder: Path | str) -> Rig:
     folder = Path(folder)
     root = folder / "mav0" if (folder / "mav0").is_dir() else folder
     left, body_T_left = _sensor(root / "cam0" / "sensor.yaml")
-    if not (root / "cam1" / "sensor.yaml").is_file():
-        return Rig(left, body_T_left=body_T_left, name=folder.name)
-    right, body_T_right = _sensor(root / "cam1" / "sensor.yaml")
     left_T_body, file = se3.inverse(body_T_left), root / "imu0" / "sensor.yaml"
     imu = read_imu(file, left_T_body) if file.is_file() else None
+    if not (root / "cam1" / "sensor.yaml").is_file():
+        return Rig(left, body_T_left=body_T_left, imu=imu, name=folder.name)
+    right, body_T_right = _sensor(root / "cam1" / "sensor.yaml")
     return Rig(left, right, left_T_body @ body_T_right, body_T_left, imu=imu, name=folder.name)
 
 
 def write_euroc(rig: Rig, folder: Path) -> None:
-    """`folder/cam0/sensor.yaml` and `cam1`."""
+    """`folder/cam0/sensor.yaml`, `cam1` and `imu0`."""
     cameras = [(rig.left, rig.body_T_left)]
     if rig.right is not None:
         cameras.append((rig.right, rig.body_T_left @ rig.left_T_right))
@@ -36,6 +36,9 @@ def write_euroc(rig: Rig, folder: Path) -> None:
         target = folder / f"cam{i}" / "sensor.yaml"
         target.parent.mkdir(parents=True, exist_ok=True)
         write_yaml(target, _plain(camera, body_T_cam, i))
+    if rig.imu is not None:
+        (folder / "imu0").mkdir(exist_ok=True)
+        write_euroc_imu(rig.imu, rig.body_T_left @ rig.imu.left_T_imu, folder / "imu0" / "sensor.yaml")
 
 
 def _sensor(path: Path) -> tuple[Camera, F64]:

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from stereo_sfm.calib.formats.common import numbers, read_yaml, reading, rigid, rows
+from stereo_sfm.calib.formats.common import numbers, read_yaml, reading, rigid, rows, write_yaml
 from stereo_sfm.calib.imu import Imu
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64
+
+log = logging.getLogger("stereo_sfm")
 
 _NOISE = {  # ours -> EuRoC's and Kalibr's
     "gyro_noise": "gyroscope_noise_density",
@@ -61,3 +66,45 @@ def read_imu(path: Path, left_T_body: F64, offset_s: float = 0.0) -> Imu:
         known: dict[str, Any] = {ours: float(data[theirs]) for ours, theirs in _NOISE.items() if theirs in data}
         rate = data.get("rate_hz", data.get("update_rate", 200.0))
         return Imu(left_T_imu=left_T_body @ body_T_imu, rate_hz=float(rate), offset_s=offset_s, **known)
+
+
+def imu_T_left(rig: Rig, format: str) -> F64:
+    """(4, 4) for formats whose body is the IMU; body_T_left without one. A warning if another body is lost."""
+    if rig.imu is None:
+        return rig.body_T_left
+    found = se3.inverse(rig.imu.left_T_imu)
+    if not (np.allclose(rig.body_T_left, found, atol=1e-9) or np.array_equal(rig.body_T_left, np.eye(4))):
+        log.warning("the body is the IMU in %s: body_T_left of the rig is lost", format)
+    return found
+
+
+def warn_of_lost(imu: Imu, format: str, offset: bool = False, affine: bool = False) -> None:
+    """About what a format that stores pose and noise has no place for; `offset`: it stores the time offset, `affine`:
+    scale, misalignment and biases."""
+    lost: list[str] = []
+    if not affine and not (np.array_equal(imu.gyro_matrix, np.eye(3)) and np.array_equal(imu.accel_matrix, np.eye(3))):
+        lost.append("scale and misalignment")
+    if not affine and (imu.gyro_bias.any() or imu.accel_bias.any()):
+        lost.append("biases")
+    if imu.offset_s and not offset:
+        lost.append("time offset")
+    if lost:
+        log.warning("%s cannot store %s of an IMU: lost", format, " and ".join(lost))
+
+
+def _noise(imu: Imu) -> dict[str, float]:
+    return {theirs: float(getattr(imu, ours)) for ours, theirs in _NOISE.items()}
+
+
+def write_kalibr_imu(imu: Imu, path: Path) -> None:
+    """imu.yaml."""
+    warn_of_lost(imu, "kalibr", offset=True)
+    write_yaml(path, _noise(imu) | {"rostopic": "/imu0", "update_rate": float(imu.rate_hz)})
+
+
+def write_euroc_imu(imu: Imu, body_T_imu: F64, path: Path) -> None:
+    """imu0/sensor.yaml."""
+    warn_of_lost(imu, "euroc")
+    pose = {"cols": 4, "rows": 4, "data": [float(v) for v in body_T_imu.ravel()]}
+    head = {"sensor_type": "imu", "comment": "imu0", "T_BS": pose, "rate_hz": float(imu.rate_hz)}
+    write_yaml(path, head | _noise(imu))

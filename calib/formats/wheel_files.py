@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 
 from stereo_sfm.calib.formats.common import numbers, read_json, reading, rigid, rows
 from stereo_sfm.calib.wheel import Wheel
+from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64
 
@@ -48,6 +50,30 @@ def wheel_from_plain(data: dict[str, Any], body_T_left: F64) -> Wheel:
     return Wheel(left_T_wheel, str(data.get("model", "twist")), radii, **known)
 
 
+def write_t265_odometry(wheel: Wheel, left_T_right: F64, path: Path) -> None:
+    """The inverse of `read_t265_odometry`, for velocities that are sent to the camera; (4, 4) of the rig.
+
+    Raises:
+        StereoSfmError: the file cannot be written.
+    """
+    tracker_T_wheel = se3.inverse(_left_T_tracker(left_T_right)) @ wheel.left_T_wheel
+    turn, place = se3.so3_log(tracker_T_wheel[:3, :3]), tracker_T_wheel[:3, 3]
+    meter = {
+        "scale_and_alignment": [float(v) for v in wheel.linear_matrix.ravel()],
+        "noise_variance": wheel.speed_noise**2 * wheel.rate_hz,
+        "extrinsics": {"T": place.tolist(), "T_variance": [1e-4] * 3, "W": turn.tolist(), "W_variance": [1e-4] * 3},
+    }
+    try:
+        path.write_text(json.dumps({_VELOCIMETERS: [meter]}, indent=2) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise StereoSfmError(f"cannot write {path}: {error.strerror}") from None
+
+
+def _left_T_tracker(left_T_right: F64) -> F64:
+    """(4, 4): amid the cameras, x right, y up, z backwards."""
+    return se3.from_rotation_translation(np.diag([1.0, -1.0, -1.0]), 0.5 * left_T_right[:3, 3])
+
+
 def read_t265_odometry(path: Path, left_T_right: F64) -> Wheel:
     """The first velocimeter of the T265's calibration_odometry.json (librealsense, doc/t265.md).
 
@@ -62,8 +88,7 @@ def read_t265_odometry(path: Path, left_T_right: F64) -> Wheel:
     with reading(path, "T265 odometry"):
         meter = read_json(path)[_VELOCIMETERS][0]
         turn, place = (np.array(numbers(meter["extrinsics"][key], 3)) for key in ("W", "T"))
-        left_T_tracker = se3.from_rotation_translation(np.diag([1.0, -1.0, -1.0]), 0.5 * left_T_right[:3, 3])
-        left_T_wheel = left_T_tracker @ se3.from_rotation_translation(se3.so3_exp(turn), place)
+        left_T_wheel = _left_T_tracker(left_T_right) @ se3.from_rotation_translation(se3.so3_exp(turn), place)
         matrix = np.array(numbers(meter["scale_and_alignment"], 9)).reshape(3, 3)
         noise = float(np.sqrt(float(meter["noise_variance"]) / Wheel().rate_hz))  # of a sample, at the default rate
         return Wheel(left_T_wheel, linear_matrix=matrix, speed_noise=noise)

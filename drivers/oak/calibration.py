@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from stereo_sfm.calib.imu import Imu
+from stereo_sfm.calib.formats.depthai import imu_at
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.drivers.live.errors import DeviceFault
 from stereo_sfm.geometry import se3
@@ -36,7 +36,7 @@ def read_calibration(dai: Any, handler: Any, size: tuple[int, int], name: str, s
         raise DeviceFault(f"OAK {serial} is not calibrated ({str(error).splitlines()[0]})") from None
     _check(left_T_right, serial)
     left_T_imu = _imu(dai, handler, left)
-    imu = None if left_T_imu is None else Imu(left_T_imu)
+    imu = None if left_T_imu is None else imu_at(left_T_imu, handler.eepromToJson().get("imuCalibrationParams"))
     return Rig(cameras[0], cameras[1], left_T_right, imu=imu, name=name, serial=serial)
 
 

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from stereo_sfm.calib import Rig
 
 # Kept here so that `--help` needs no import; stereo_sfm.calib.formats.FORMATS is the table (a test compares them).
 NAMES = ("rig", "kalibr", "ros", "opencv", "euroc", "kitti", "basalt", "colmap", "foxglove", "kapture", "depthai")
@@ -22,6 +26,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", default=None, metavar="WxH", help="image size, for files that do not state it")
     parser.add_argument(
         "--wheel", type=Path, default=None, metavar="FILE", help="the T265's calibration_odometry.json, for the output"
+    )
+    parser.add_argument(
+        "--wheel-output",
+        type=Path,
+        default=None,
+        metavar="FILE",
+        help="write the wheels as calibration_odometry.json, too",
     )
     parser.add_argument("--overwrite", action="store_true", help="write over an existing file or into a folder")
 
@@ -48,7 +59,20 @@ def run(args: argparse.Namespace) -> int:
         from stereo_sfm.calib.formats.wheel_files import read_t265_odometry
 
         rig = replace(rig, wheel=read_t265_odometry(args.wheel, rig.left_T_right))
+    if args.wheel_output is not None:
+        _write_wheel(rig, args.wheel_output, args.overwrite)
     save_rig(rig, args.output, args.target)
     cameras = rig.left.model if rig.right is None else f"{rig.left.model} pair, baseline {1000 * rig.baseline:.2f} mm"
     print(f"{source}: {cameras}, {rig.left.width}x{rig.left.height} px -> {args.output}")
     return 0
+
+
+def _write_wheel(rig: Rig, path: Path, overwrite: bool) -> None:
+    from stereo_sfm.calib.formats.wheel_files import write_t265_odometry
+    from stereo_sfm.errors import StereoSfmError
+
+    if rig.wheel is None:
+        raise StereoSfmError(f"the rig says nothing about wheels: {path} would be empty")
+    if path.exists() and not overwrite:
+        raise StereoSfmError(f"{path} exists: choose another name or give --overwrite")
+    write_t265_odometry(rig.wheel, rig.left_T_right, path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from stereo_sfm.calib import Rig, load_rig, save_rig
 from stereo_sfm.calib.formats import FORMATS, recognise
+from stereo_sfm.calib.imu import Imu
 from stereo_sfm.calib.rectification import rectify
 from stereo_sfm.cli import main
 from stereo_sfm.commands.convert_calib import NAMES
@@ -57,6 +59,31 @@ def test_depthai_reads_our_file_in_centimetres(tmp_path: Path) -> None:
     assert theirs[0, 3] < -6  # left to right: the right camera lies on the right
     back = load_rig(tmp_path / "oak.json")
     np.testing.assert_allclose(back.left_T_right, rig.left_T_right, atol=1e-12)
+    assert back.imu is None
+
+
+def test_depthai_reads_the_imu_of_our_file(tmp_path: Path) -> None:
+    dai = pytest.importorskip("depthai")
+    imu = Imu(se3.exp(np.array([0.038, -0.011, -0.009, 1.2, 0.4, -2.0])))
+    save_rig(replace(fisheye_rig(), imu=imu), tmp_path / "oak.json", "depthai")
+    handler = dai.CalibrationHandler(str(tmp_path / "oak.json"))
+    for k, socket in enumerate((dai.CameraBoardSocket.CAM_B, dai.CameraBoardSocket.CAM_C)):
+        theirs = np.array(handler.getImuToCameraExtrinsics(socket, False, dai.LengthUnit.METER))
+        expected = imu.left_T_imu if k == 0 else se3.inverse(fisheye_rig().left_T_right) @ imu.left_T_imu
+        np.testing.assert_allclose(theirs, expected, atol=1e-5)
+    back = load_rig(tmp_path / "oak.json")
+    assert back.imu is not None
+    np.testing.assert_allclose(back.imu.left_T_imu, imu.left_T_imu, atol=1e-12)
+
+
+def test_the_imu_of_a_board_is_where_the_driver_finds_it() -> None:
+    dai = pytest.importorskip("depthai")
+    path = Path(__file__).parents[1] / "drivers" / "fixtures" / "oak_d.json"
+    handler = dai.CalibrationHandler(str(path))
+    rig = load_rig(path)
+    assert rig.imu is not None
+    theirs = np.array(handler.getImuToCameraExtrinsics(dai.CameraBoardSocket.CAM_B, False, dai.LengthUnit.METER))
+    np.testing.assert_allclose(rig.imu.left_T_imu, theirs, atol=1e-5)
 
 
 def test_kitti_needs_a_rectified_pair_and_files_are_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from stereo_sfm.calib.imu import Imu
 from stereo_sfm.drivers.live.counters import Counters
 from stereo_sfm.drivers.live.errors import (
     Busy,
@@ -132,6 +133,21 @@ def test_factory_calibration_in_metres_and_our_directions() -> None:
     )
     assert rig.imu is not None
     assert np.linalg.norm(rig.imu.left_T_imu[:3, 3]) == pytest.approx(0.0863, abs=1e-3)
+
+
+def test_the_factory_calibration_of_the_imu() -> None:
+    data = json.loads((FIXTURES / "oak_d.json").read_text())
+    affine = [[1.01, 0.0, 0.002, 0.05], [0.0, 0.99, 0.0, -0.1], [0.001, 0.0, 1.0, 0.2]]  # [Q | b]
+    data["imuCalibrationParams"]["accelerometer"] = affine
+    data["imuCalibrationParams"]["noise"]["gyroscope"] = {
+        k: {"noiseDensity": 2e-4, "randomWalk": 3e-5, "biasStability": 0.0} for k in "xyz"
+    }
+    imu = read_calibration(dai, dai.CalibrationHandler.fromJson(data), (1280, 800), "OAK-D", "1").imu
+    assert imu is not None
+    raw = np.array([[1.0, -9.0, 2.0]])
+    np.testing.assert_allclose(imu.correct(raw, raw)[1][0], np.array(affine) @ [1.0, -9.0, 2.0, 1.0], atol=1e-6)
+    assert (imu.gyro_noise, imu.gyro_walk) == pytest.approx((2e-4, 3e-5))
+    assert imu.accel_noise == Imu().accel_noise  # the board does not know it
 
 
 def test_calibration_of_another_image_size() -> None:
