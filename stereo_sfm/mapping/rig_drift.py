@@ -1,27 +1,51 @@
 """Terms of the rig that change steadily (temperature), estimated from windows of keyframes.
 
-Every window sees another scene, with a systematic error of matching of its own. How large the errors of windows are is
-not assumed but seen: from their scatter around the change. An error that all windows share does not show there; it is
-added to the terms at the end, not to their change.
+Every window sees another scene, with a systematic error of matching of its own. How large the errors of the change are
+is not assumed but seen: from the windows' scatter around it. An error that all windows share does not show there; it is
+one of the terms, not of their change.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from stereo_sfm.calib.choice import Estimate
 from stereo_sfm.mapping.rig_window import PRIOR, RigWindow
-from stereo_sfm.types import F64, RIG_TERMS
+from stereo_sfm.types import F64, RIG_TERMS, Bool
 
 RATE = np.deg2rad(0.1) / 60.0  # prior standard deviation of drift, radians (ratio) per second
 
 
+@dataclass(frozen=True, eq=False)
+class SteadyChange:
+    """Of the terms, over a time."""
+
+    end: F64  # (8,) difference from the current terms at the end
+    change: F64  # (8,) from beginning to end
+    covariance: F64  # (16, 16) of both, from what windows state
+    scatter: float  # of the windows around the change, over that
+    systematic: F64  # (8,) standard deviations of errors that all windows share
+
+    @property
+    def estimate(self) -> Estimate:
+        """The change."""
+        return Estimate(self.change, self.scatter * self.covariance[RIG_TERMS:, RIG_TERMS:])
+
+    def at_the_end(self, changing: Bool) -> Estimate:
+        """The difference at the end if only the terms `changing` (8,) change."""
+        still = RIG_TERMS + np.flatnonzero(~changing)
+        gain = np.linalg.solve(self.covariance[still][:, still], self.covariance[still, :RIG_TERMS]).T
+        covariance = self.covariance[:RIG_TERMS, :RIG_TERMS] - gain @ self.covariance[still, :RIG_TERMS]
+        return Estimate(self.end - gain @ self.change[~changing], covariance + np.diag(self.systematic**2))
+
+
 def steady_change(
     windows: Sequence[RigWindow], span: Sequence[RigWindow], current: F64, systematic: F64
-) -> tuple[Estimate, Estimate]:
-    """How the terms at the end of `span` differ from the current ones, and their change from its beginning to its end.
+) -> SteadyChange:
+    """The change over `span`.
 
     Args:
         windows: three at least, within `span`. current: (8,) terms, the prior's.
@@ -37,10 +61,9 @@ def steady_change(
     total = np.diag(prior) + np.einsum("ni,nj,nab->iajb", axes, axes, matrices).reshape(2 * [2 * RIG_TERMS])
     vector = (axes.T @ vectors).ravel() + prior * np.concatenate([current, np.zeros(RIG_TERMS)])
     covariance = np.asarray(np.linalg.inv(total), float)
-    end, change = (covariance @ vector).reshape(2, RIG_TERMS)
-    covariance *= _misfit(matrices, vectors, axes @ np.stack([end, change])) / (len(windows) - 2)
-    at_end = covariance[:RIG_TERMS, :RIG_TERMS] + np.diag(systematic**2)
-    return Estimate(end - current, at_end), Estimate(change, covariance[RIG_TERMS:, RIG_TERMS:])
+    line = (covariance @ vector).reshape(2, RIG_TERMS)
+    scatter = _misfit(matrices, vectors, axes @ line) / (len(windows) - 2)
+    return SteadyChange(line[0] - current, line[1], covariance, scatter, systematic)
 
 
 def _misfit(matrices: F64, vectors: F64, terms: F64) -> float:

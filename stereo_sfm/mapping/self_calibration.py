@@ -22,7 +22,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stereo_sfm.calib.choice import NAMES, SCALES, UNITS, Estimate, choose, significant, with_terms
+from stereo_sfm.calib.choice import NAMES, NONE, SCALES, UNITS, Estimate, choose, significant, with_terms
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.mapping.rig_change import SeenPoints, first_changed
@@ -151,16 +151,16 @@ class SelfCalibration:
     def _revise(self, first_sigmas: float) -> Revision | None:
         """`first_sigmas`: significance of the first correction of a term."""
         windows = list(self.windows)
-        at_the_end = self._at_the_end(windows)
+        drift = self._drift(windows)
         enough = self._corrected.any() or len(windows) >= ENOUGH_WINDOWS
         self._until_due = min(len(windows), MAX_BETWEEN) if enough else 1
-        found = self._change(windows, first_sigmas, at_the_end)
+        found = self._change(windows, first_sigmas, drift)
         if found is None:
             return None
         if self._stepped:
             self._since, self._stepped = self._first_after_step(self.terms + found.value), False
             return self._revision(self._measured_across(self._since, found, first_sigmas), "step", self._since)
-        if at_the_end:
+        if drift is not None:
             return self._revision(found, "drift", windows[-1].first_kf_id, self._on_the_way(found.value))
         why = "refined" if self._corrected[found.written].all() else "significant"
         return self._revision(found, why, self._since)
@@ -171,13 +171,12 @@ class SelfCalibration:
         between = [w for w in self.windows if begin < w.stamp_ns < end]
         return tuple((w.first_kf_id, self.terms + (w.stamp_ns - begin) / (end - begin) * change) for w in between)
 
-    def _change(
-        self, windows: Sequence[RigWindow], first_sigmas: float, at_the_end: Sequence[Estimate] = ()
-    ) -> _Change | None:
-        """What windows show to be wrong, of terms that change `at_the_end`; None if nothing is."""
+    def _change(self, windows: Sequence[RigWindow], first_sigmas: float, drift: _Drift | None = None) -> _Change | None:
+        """What windows show to be wrong; None if nothing is."""
         parts = [windows, windows[::2], windows[1::2] or windows]  # one window: what a step has left
-        whole, *halves = at_the_end or [self.estimate(part) for part in parts]
-        further = FURTHER_SIGMAS if at_the_end or self._corrected.any() else first_sigmas
+        whole, *halves = drift.at_the_end if drift is not None else [self.estimate(part) for part in parts]
+        drifting = NONE if drift is None else drift.terms
+        further = FURTHER_SIGMAS if self._corrected.any() else np.where(drifting, FURTHER_SIGMAS, first_sigmas)
         sigmas = np.where(self._corrected, REFINED_SIGMAS, further)
         basis, rolling = self._basis(windows), self._rig.readout_s > 0
         choice = choose(whole.by(basis), [h.by(basis) for h in halves], rolling, sigmas, self._corrected)
@@ -256,15 +255,14 @@ class SelfCalibration:
             basis[1, OF_LENSES] = length[OF_LENSES] / length[1]
         return basis
 
-    def _at_the_end(self, windows: Sequence[RigWindow]) -> list[Estimate]:
-        """If the terms change steadily over the windows: those at the end, of all windows and of halves; else none."""
+    def _drift(self, windows: Sequence[RigWindow]) -> _Drift | None:
+        """What windows show of terms that change steadily; None if none does."""
         if len(windows) < DRIFT_WINDOWS:
-            return []
+            return None
         parts = windows, windows[::2], windows[1::2]
-        ends, (whole, *halves) = zip(
-            *[steady_change(part, windows, self.terms, self._floor) for part in parts], strict=True
-        )
-        return list(ends) if significant(whole, halves, self._rig.readout_s > 0, SIGMAS).any() else []
+        whole, *halves = fits = [steady_change(part, windows, self.terms, self._floor) for part in parts]
+        terms = significant(whole.estimate, [h.estimate for h in halves], self._rig.readout_s > 0, SIGMAS)
+        return _Drift(terms, [fit.at_the_end(terms) for fit in fits]) if terms.any() else None
 
     def _detect_step(self) -> None:
         windows = list(self.windows)
@@ -304,6 +302,14 @@ class SelfCalibration:
         if significant(change, [change], self._rig.readout_s > 0, STRADDLING_SIGMAS).any():
             self.windows.popleft()
             self._straddling = False
+
+
+@dataclass(frozen=True, eq=False)
+class _Drift:
+    """Of terms that change steadily."""
+
+    terms: Bool  # (8,) those that do
+    at_the_end: list[Estimate]  # change of the current terms, from all windows and from both halves
 
 
 @dataclass(frozen=True, eq=False)
