@@ -305,7 +305,7 @@ class CalibrationUpdate(Message):
     stamp_ns: int
     terms: F64  # (8,) added to the rig as its calibration says
     terms_covariance: F64  # (8, 8)
-    since_kf_id: int  # first keyframe that was seen by the rig so corrected; those before stay as they were
+    since_kf_id: int  # first keyframe that was seen by the rig so corrected; those before stay, or drift towards it
     applied: bool  # False: only reported
     why: str  # "significant", "step", "refined" or "drift"
     text: str  # human-readable

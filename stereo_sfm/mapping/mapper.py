@@ -265,10 +265,11 @@ class Mapper:
             revision.why, revision.text,
         )  # fmt: skip
         if applied:
-            before, self._rig = self._rig, with_terms(self._source_rig, revision.terms)
-            first = self.map.kf_row(revision.since_kf_id)
-            recalibrate(self.map, before, self._rig, first)
-            self._adjust_since(first)
+            changes = [*revision.on_the_way, (revision.since_kf_id, revision.terms)]
+            rigs = [(self.map.kf_row(since), with_terms(self._source_rig, terms)) for since, terms in changes]
+            recalibrate(self.map, [(0, self._rig), *rigs])
+            self._rig = rigs[-1][1]
+            self._adjust_since(rigs[0][0])
             self._start_full_bundle()
             if self._rows is not None:
                 self._rows.use(self._rig)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
+
 import numpy as np
 
 from stereo_sfm.calib.rig import Rig
@@ -11,17 +14,17 @@ from stereo_sfm.mapping.triangulate import triangulate
 from stereo_sfm.types import I64
 
 
-def recalibrate(map_: Map, before: Rig, after: Rig, since_row: int) -> None:
-    """Move points to their positions with the rig `after`; poses stay for the bundle adjustment that must follow.
+def recalibrate(map_: Map, rigs: Sequence[tuple[int, Rig]]) -> None:
+    """Move points to their positions with the last rig; poses stay for the bundle adjustment that must follow.
 
     Args:
         map_: changed in place.
-        before, after: the rig until now and from now on.
-        since_row: first keyframe row of the rig `after`. Observations of earlier keyframes are rewritten as `after`
-            would have made them, so that one rig is valid for the whole map.
+        rigs: first keyframe rows, ascending, and the rig from each of them on. Observations of earlier ones are
+            rewritten as the last one would have made them, so that one rig is valid for the whole map.
     """
-    if since_row > 0:
-        _rewrite(map_, before, after, since_row)
+    after = rigs[-1][1]
+    for (first, before), (until, _) in pairwise(rigs):
+        _rewrite(map_, before, after, first, until)
     rows = map_.living_points()
     rows = rows[map_.points.obs_count[rows] > 0]
     old = map_.points.xyz[rows].copy()
@@ -30,11 +33,12 @@ def recalibrate(map_: Map, before: Rig, after: Rig, since_row: int) -> None:
     map_.move_points(rows[good], np.where(good[:, None], new, old)[good])
 
 
-def _rewrite(map_: Map, before: Rig, after: Rig, since_row: int) -> None:
-    """Move right pixels of older keyframes to their projections by the other rig; residuals stay."""
+def _rewrite(map_: Map, before: Rig, after: Rig, first: int, until: int) -> None:
+    """Move right pixels of the keyframes in these rows to their projections by the other rig; residuals stay."""
     assert before.right is not None and after.right is not None
     table = map_.observations
-    obs: I64 = np.flatnonzero((table.pt >= 0) & (table.kf < since_row) & np.isfinite(table.uv_right[:, 0]))
+    inside = (table.kf >= first) & (table.kf < until)
+    obs: I64 = np.flatnonzero((table.pt >= 0) & inside & np.isfinite(table.uv_right[:, 0]))
     poses = se3.inverse(map_.keyframes.map_T_kf[table.kf[obs]])
     points = map_.points.xyz[table.pt[obs]]
     in_left = (poses[:, :3, :3] @ points[..., None])[..., 0] + poses[:, :3, 3]

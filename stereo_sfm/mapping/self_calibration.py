@@ -5,8 +5,8 @@ is summed. Terms are corrected that differ from the current ones by several stan
 the windows (even and odd ones) confirm, and that exceed the systematic error of matching (`calib.choice`). Once one is,
 others follow that are worth their variance. The rows show terms of lenses, which change lengths by what the lens model
 says of disparities: lengths stay unless there is evidence about them. A corrected term is refined as long as windows
-come, first whenever their number has doubled. Where the windows show drift (temperature), the terms at the newest
-window are used for the keyframes since the last revision.
+come, first whenever their number has doubled. Where the windows show drift (temperature), the rig is known to be wrong:
+the terms at the newest window are used from it on, and the windows since the last revision are on the way there.
 
 After a sudden change of the rig (a knock) earlier windows are discarded, and the correction applies from the first
 keyframe on that was seen by the changed rig. What the rig before it measured of the points that are seen before and
@@ -22,10 +22,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stereo_sfm.calib.choice import NAMES, SCALES, UNITS, Estimate, choose, significant, with_terms
+from stereo_sfm.calib.choice import NAMES, NONE, SCALES, UNITS, Estimate, choose, significant, with_terms
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.mapping.rig_change import SeenPoints, first_changed
+from stereo_sfm.mapping.rig_drift import steady_change
 from stereo_sfm.mapping.rig_window import PRIOR, EarlierRig, RigInformation, RigWindow, solve_window
 from stereo_sfm.types import F64, RIG_TERMS, Bool, Keyframe
 
@@ -46,7 +47,6 @@ RECENT_KEYFRAMES = 64  # among which the first after a step is looked for
 ACROSS_STEP = 6, 4  # keyframes before and after it from which the changed rig is measured
 KNOCK_KEYFRAMES = 2  # after a rotation that the tracker noticed, from which the changed rig is first measured
 DRIFT_WINDOWS = 8  # needed to detect drift
-RATE = np.deg2rad(0.1) / 60.0  # prior standard deviation of drift, radians (ratio) per second
 SIGMAS = 5.0  # significance of the first term that is corrected
 FURTHER_SIGMAS = np.sqrt(2.0)  # of others, once the calibration is known to be wrong (Akaike's criterion)
 REFINED_SIGMAS = 1.0  # its refinement: below, a change is not worth the bundle adjustment
@@ -63,6 +63,7 @@ class Revision:
     since_kf_id: int  # first keyframe of the corrected rig
     why: str  # "significant", "step", "refined", "drift"
     text: str  # readable description
+    on_the_way: tuple[tuple[int, F64], ...] = ()  # of a drift: earlier keyframes and the terms from each of them on
 
 
 class SelfCalibration:
@@ -76,6 +77,7 @@ class SelfCalibration:
         self._keyframes: list[SeenPoints] = []
         self.windows: deque[RigWindow] = deque(maxlen=MAX_WINDOWS)  # since the last step
         self._since = 0  # first keyframe of the windows
+        self._revised_ns = 0  # newest window of the last revision
         self._until_due = MIN_WINDOWS  # windows until the next revision
         self._stepped = False  # a step was detected and is not yet corrected
         self._straddling = False  # it may have happened during the first window
@@ -149,25 +151,32 @@ class SelfCalibration:
     def _revise(self, first_sigmas: float) -> Revision | None:
         """`first_sigmas`: significance of the first correction of a term."""
         windows = list(self.windows)
-        drifts = self._drifts(windows)
+        drift = self._drift(windows)
         enough = self._corrected.any() or len(windows) >= ENOUGH_WINDOWS
         self._until_due = min(len(windows), MAX_BETWEEN) if enough else 1
-        since = windows[-min(MAX_BETWEEN, len(windows))].first_kf_id if drifts else self._since
-        found = self._change(windows, drifts, first_sigmas)
+        found = self._change(windows, first_sigmas, drift)
         if found is None:
             return None
-        why = "drift" if drifts else "refined" if self._corrected[found.written].all() else "significant"
         if self._stepped:
-            why, since = "step", self._first_after_step(self.terms + found.value)
-            found = self._measured_across(since, found, first_sigmas)
-            self._since, self._stepped = since, False
-        return self._revision(found, why, since)
+            self._since, self._stepped = self._first_after_step(self.terms + found.value), False
+            return self._revision(self._measured_across(self._since, found, first_sigmas), "step", self._since)
+        if drift is not None:
+            return self._revision(found, "drift", windows[-1].first_kf_id, self._on_the_way(found.value))
+        why = "refined" if self._corrected[found.written].all() else "significant"
+        return self._revision(found, why, self._since)
 
-    def _change(self, windows: Sequence[RigWindow], drifts: bool, first_sigmas: float) -> _Change | None:
+    def _on_the_way(self, change: F64) -> tuple[tuple[int, F64], ...]:
+        """The windows between the last revision and the newest: first keyframes, and terms that change steadily."""
+        begin, end = max(self._revised_ns, self.windows[0].stamp_ns), self.windows[-1].stamp_ns
+        between = [w for w in self.windows if begin < w.stamp_ns < end]
+        return tuple((w.first_kf_id, self.terms + (w.stamp_ns - begin) / (end - begin) * change) for w in between)
+
+    def _change(self, windows: Sequence[RigWindow], first_sigmas: float, drift: _Drift | None = None) -> _Change | None:
         """What windows show to be wrong; None if nothing is."""
         parts = [windows, windows[::2], windows[1::2] or windows]  # one window: what a step has left
-        whole, *halves = [self._at_the_end(part, windows)[0] if drifts else self.estimate(part) for part in parts]
-        further = FURTHER_SIGMAS if self._corrected.any() else first_sigmas
+        whole, *halves = drift.at_the_end if drift is not None else [self.estimate(part) for part in parts]
+        drifting = NONE if drift is None else drift.terms
+        further = FURTHER_SIGMAS if self._corrected.any() else np.where(drifting, FURTHER_SIGMAS, first_sigmas)
         sigmas = np.where(self._corrected, REFINED_SIGMAS, further)
         basis, rolling = self._basis(windows), self._rig.readout_s > 0
         choice = choose(whole.by(basis), [h.by(basis) for h in halves], rolling, sigmas, self._corrected)
@@ -188,7 +197,7 @@ class SelfCalibration:
         initial = self.terms.copy()
         initial[:3] += turn
         across = self._across(len(self._recent) - after, initial)
-        found = None if across is None else self._change([across], False, SIGMAS)
+        found = None if across is None else self._change([across], SIGMAS)
         if across is None or found is None:
             return None
         self._since, self._step_between = self._turned_kf_id, (self._turned_kf_id - STEP_REACH, keyframe.kf_id)
@@ -197,17 +206,21 @@ class SelfCalibration:
             self._since, after = first, sum(k.kf_id >= first for k in self._recent)
             again = self._across(len(self._recent) - after, self.terms + found.value)
             across = across if again is None else again
-            found = self._change([across], False, SIGMAS) or found
+            found = self._change([across], SIGMAS) or found
         self.windows = deque([across], maxlen=MAX_WINDOWS)
         self._keyframes = list(self._recent)[-after:]
         self._stepped = self._straddling = False
         self._turned_kf_id, self._until_due = -1, MIN_WINDOWS
         return self._revision(found, "step", self._since)
 
-    def _revision(self, change: _Change, why: str, since_kf_id: int) -> Revision:
+    def _revision(
+        self, change: _Change, why: str, since_kf_id: int, on_the_way: tuple[tuple[int, F64], ...] = ()
+    ) -> Revision:
         self.terms = self.terms + change.value
         self._corrected |= change.written
-        return Revision(self.terms.copy(), change.covariance, since_kf_id, why, _text(change.value, change.sigma))
+        self._revised_ns = self.windows[-1].stamp_ns
+        text = _text(change.value, change.sigma)
+        return Revision(self.terms.copy(), change.covariance, since_kf_id, why, text, on_the_way)
 
     def _across(self, at: int, terms: F64) -> RigWindow | None:
         """Of the newest keyframes, those from `at` on, measured with what the rig before them knew of their points.
@@ -229,7 +242,7 @@ class SelfCalibration:
             return found
         self.windows.appendleft(across)
         self._straddling = False
-        return self._change(list(self.windows), False, first_sigmas) or found
+        return self._change(list(self.windows), first_sigmas) or found
 
     def _basis(self, windows: Sequence[RigWindow]) -> F64:
         """(8, 8) from the terms to those that are chosen: instead of the rotation about y, the one that changes lengths
@@ -242,31 +255,14 @@ class SelfCalibration:
             basis[1, OF_LENSES] = length[OF_LENSES] / length[1]
         return basis
 
-    def _drifts(self, windows: Sequence[RigWindow]) -> bool:
-        """Whether the terms change steadily over the windows."""
+    def _drift(self, windows: Sequence[RigWindow]) -> _Drift | None:
+        """What windows show of terms that change steadily; None if none does."""
         if len(windows) < DRIFT_WINDOWS:
-            return False
-        whole, *halves = [self._at_the_end(part, windows)[1] for part in (windows, windows[::2], windows[1::2])]
-        return bool(significant(whole, halves, self._rig.readout_s > 0, SIGMAS).any())
-
-    def _at_the_end(self, windows: Sequence[RigWindow], span: Sequence[RigWindow]) -> tuple[Estimate, Estimate]:
-        """Of terms that change steadily: their change at the end of `span`, and that from its beginning to its end."""
-        seconds = (span[-1].stamp_ns - span[0].stamp_ns) * 1e-9
-        matrix = np.kron(np.diag([1.0, 0.0]), np.diag(1 / PRIOR**2))
-        matrix += np.kron(np.diag([0.0, 1.0]), np.eye(RIG_TERMS) / (RATE * seconds) ** 2)
-        vector = np.concatenate([self.terms / PRIOR**2, np.zeros(RIG_TERMS)])
-        for window in windows:
-            axis = np.array([1.0, (window.stamp_ns - span[-1].stamp_ns) * 1e-9 / seconds])
-            matrix += np.kron(np.outer(axis, axis), window.information.matrix)
-            vector += np.kron(axis, window.information.vector)
-        covariance = np.asarray(np.linalg.inv(matrix), float)
-        end, change = np.split(covariance @ vector, 2)
-        floor = np.diag(self._floor**2)
-        end_covariance, change_covariance = (
-            covariance[:RIG_TERMS, :RIG_TERMS] + floor,
-            covariance[RIG_TERMS:, RIG_TERMS:] + 2 * floor,
-        )
-        return Estimate(end - self.terms, end_covariance), Estimate(change, change_covariance)
+            return None
+        parts = windows, windows[::2], windows[1::2]
+        whole, *halves = fits = [steady_change(part, windows, self.terms, self._floor) for part in parts]
+        terms = significant(whole.estimate, [h.estimate for h in halves], self._rig.readout_s > 0, SIGMAS)
+        return _Drift(terms, [fit.at_the_end(terms) for fit in fits]) if terms.any() else None
 
     def _detect_step(self) -> None:
         windows = list(self.windows)
@@ -306,6 +302,14 @@ class SelfCalibration:
         if significant(change, [change], self._rig.readout_s > 0, STRADDLING_SIGMAS).any():
             self.windows.popleft()
             self._straddling = False
+
+
+@dataclass(frozen=True, eq=False)
+class _Drift:
+    """Of terms that change steadily."""
+
+    terms: Bool  # (8,) those that do
+    at_the_end: list[Estimate]  # change of the current terms, from all windows and from both halves
 
 
 @dataclass(frozen=True, eq=False)
