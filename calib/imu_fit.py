@@ -10,6 +10,7 @@ from stereo_sfm.calib.check import Finding
 from stereo_sfm.calib.force_fit import Forces
 from stereo_sfm.calib.imu import Imu
 from stereo_sfm.calib.robust_fit import Whitening, robust_fit, shift_between
+from stereo_sfm.calib.sample_noise import judge_noise, noise_at_rest
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.procrustes import rotation_between
@@ -36,6 +37,7 @@ class ImuFit:
     gyro_bias: F64  # (3,) rad/s, subtracted from corrected samples
     agreement: float  # correlation of the rates, 1 at best
     gravity: float  # m/s^2, mean force over the recording
+    noise: F64  # (2,) densities while the camera stood, see `noise_at_rest`
 
 
 def fit_imu(stamp_ns: I64, poses: F64, samples: ImuSamples, imu: Imu) -> ImuFit:
@@ -87,6 +89,7 @@ def fit_imu(stamp_ns: I64, poses: F64, samples: ImuSamples, imu: Imu) -> ImuFit:
         gyro_bias=fit.value[4:7],
         agreement=float(np.sqrt(max(0.0, 1 - unexplained))),
         gravity=rates.gravity,
+        noise=noise_at_rest(stamp_ns, poses, samples),
     )
 
 
@@ -206,7 +209,7 @@ def judge_imu(found: ImuFit, known: Imu) -> list[Finding]:
         units = " (in g?)" if 0.5 < found.gravity < 2 else ""
         level = 0 if low < found.gravity < high else 2
         out.append(Finding("accelerometer", level, f"mean force {found.gravity:.2f} m/s^2{units}"))
-    return out
+    return [*out, judge_noise(found.noise, known)]
 
 
 def precision_imu(found: ImuFit) -> list[Finding]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from stereo_sfm.calib.check import Finding
 from stereo_sfm.calib.robust_fit import robust_fit, shift_between
+from stereo_sfm.calib.sample_noise import judge_wheel_noise, noise_of_speeds
 from stereo_sfm.calib.wheel import Wheel
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
@@ -46,6 +47,7 @@ class WheelFit:
     agreement: float  # share of the way that both agree on, after the correction; 1 at best
     sign: float  # correlation of the ways ahead, negative if the wheels count backwards
     turn_sign: float  # of the turns
+    noise: float = float("nan")  # m/s/sqrt(Hz) of the speed ahead
 
 
 def fit_wheel(stamp_ns: I64, poses: F64, samples: WheelSamples, wheel: Wheel) -> WheelFit:
@@ -94,7 +96,7 @@ def fit_wheel(stamp_ns: I64, poses: F64, samples: WheelSamples, wheel: Wheel) ->
     left = np.linalg.norm(residual(value)[:, :3], axis=1)
     agreement = 1 - float(np.median(left) / np.median(np.linalg.norm(seen[:, :3], axis=1)))
     value[5] -= wheel.offset_s
-    return WheelFit(with_wheel_terms(wheel, value), value, sigma, drive.way_m, agreement, sign, turn_sign)
+    return WheelFit(with_wheel_terms(wheel, value), value, sigma, drive.way_m, agreement, sign, turn_sign, drive.noise)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +129,13 @@ class _Drive:
     def way_m(self) -> float:
         """Length of the path by the images."""
         return float(np.linalg.norm(np.diff(self.seen[::5, :3, 3], axis=0), axis=1).sum())
+
+    @property
+    def noise(self) -> float:
+        """Density of the speed ahead, m/s/sqrt(Hz)."""
+        return noise_of_speeds(
+            np.round(self.times * 1e9).astype(np.int64), self.wheel.velocities(self.samples)[0][:, 0]
+        )
 
     def compared_rates(self) -> tuple[float, float, float]:
         """Time offset in seconds, and the correlations of the speeds ahead and of the turns."""
@@ -181,7 +190,7 @@ def _sign(a: F64, b: F64) -> float:
     return float(a @ b / (np.linalg.norm(a) * np.linalg.norm(b) + 1e-12))
 
 
-def judge_wheel(found: WheelFit) -> list[Finding]:
+def judge_wheel(found: WheelFit, known: Wheel) -> list[Finding]:
     """Whether a calibration agrees with what the images say, and what to correct."""
     if found.sign < REVERSED:
         return [Finding("wheels", 2, "they count backwards: reverse their sign")]
@@ -200,7 +209,7 @@ def judge_wheel(found: WheelFit) -> list[Finding]:
     out = [
         Finding("wheels", level, f"agree with the images in {100 * found.agreement:.1f} % of the way after correction")
     ]
-    for name, k, unit, text, known in rows:
+    for name, k, unit, text, sure in rows:
         value, sigma = float(found.value[k] * unit), float(found.sigma[k] * unit)
         level = sum(abs(value) > max(limit, 3 * sigma) for limit in WRONG[name])
         what = (
@@ -208,14 +217,14 @@ def judge_wheel(found: WheelFit) -> list[Finding]:
             if np.isfinite(sigma)
             else "not shown by the motion"
         )
-        out.append(Finding(f"wheels' {name}", level, what, sigma < known[1], (value,), (sigma,)))
-    return out
+        out.append(Finding(f"wheels' {name}", level, what, sigma < sure[1], (value,), (sigma,)))
+    return [*out, judge_wheel_noise(found.noise, known)]
 
 
 def precision_wheel(found: WheelFit) -> list[Finding]:
     """How well a recording determined the calibration."""
     if found.sign < REVERSED or found.turn_sign < REVERSED:
-        return judge_wheel(found)
+        return judge_wheel(found, found.wheel)
     wheel, percent = found.wheel, 100 * found.sigma[:3]
     radii = ", ".join(f"{1e3 * r:.2f}" for r in wheel.radii_m)
     size = f"radii {radii} mm" if radii else f"velocities times {np.linalg.norm(wheel.linear_matrix, 2):.4f}"

@@ -97,7 +97,8 @@ class SensorMotion:
             imu = self.rig.imu
             out += _judged("gyroscope", lambda: judge_imu(self.fit_imu(), imu))
         if self.rig.wheel is not None and self.wheel:
-            out += _judged("wheels", lambda: judge_wheel(self.fit_wheel()))
+            wheel = self.rig.wheel
+            out += _judged("wheels", lambda: judge_wheel(self.fit_wheel(), wheel))
         return out
 
 

@@ -146,7 +146,7 @@ class SensorCalibration:
             return []
         if not self._wheel.take(found.value, found.sigma):
             return []
-        return [f for f in judge_wheel(found) if f.name != "wheels' time offset"]
+        return [f for f in judge_wheel(found, wheel) if f.name != "wheels' time offset"]
 
     def _seen(self) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], F64]:
         """Stamps (N,) and poses (N, 4, 4) by the images."""

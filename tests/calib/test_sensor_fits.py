@@ -12,8 +12,10 @@ import pytest
 from stereo_sfm.calib import load_rig, save_rig
 from stereo_sfm.calib.imu_fit import fit_imu, judge_imu, precision_imu
 from stereo_sfm.calib.robust_fit import Whitening, robust_fit, shift_between
+from stereo_sfm.calib.sample_noise import judge_noise, judge_wheel_noise, noise_at_rest, noise_of_speeds
 from stereo_sfm.calib.wheel_fit import fit_wheel, judge_wheel, precision_wheel
 from stereo_sfm.cli import main
+from stereo_sfm.drivers.sim.inertial import GRADES
 from stereo_sfm.drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
@@ -34,11 +36,28 @@ def test_20_ms_and_3_degrees_of_an_imu_are_found(seed: int) -> None:
     assert abs(fit.imu.offset_s - 0.02) < 4 * fit.offset_sigma_s and fit.offset_sigma_s < 5e-4
     assert abs(np.degrees(fit.turned) - 3) < 0.1
     assert {f.name: f.level > 0 for f in judge_imu(fit, wrong)} == {
-        "gyroscope": False, "IMU rotation": True, "IMU time offset": True, "accelerometer": False
+        "gyroscope": False, "IMU rotation": True, "IMU time offset": True, "accelerometer": False, "IMU noise": False
     }  # fmt: skip
     again = judge_imu(fit_imu(found.stamp_ns, found.poses, found.imu, fit.imu), fit.imu)
     assert not any(f.level for f in again)
     assert max(f.level for f in precision_imu(fit)) <= 1
+
+
+@pytest.mark.parametrize("imu", ["t265", "oak", "bno086"])
+def test_noise_shows_while_the_camera_stands(imu: str) -> None:
+    found = SensorDrive(0, imu=imu, rest=12, vibration=0)
+    known, grade = found.source.rig.imu, GRADES[imu]
+    assert known is not None
+    noise = noise_at_rest(found.stamp_ns, found.poses, found.imu)
+    np.testing.assert_allclose(noise, [grade.gyro_noise, grade.accel_noise], rtol=0.15)
+    optimistic = replace(known, accel_noise=known.accel_noise / 5)
+    levels = [judge_noise(noise, k).level for k in (known, optimistic, replace(known, gyro_noise=1e-6))]
+    assert levels == [0, 1, 2]
+    fit = fit_imu(found.stamp_ns, found.poses, found.imu, optimistic)
+    assert {f.name for f in judge_imu(fit, optimistic) if f.level} == {"IMU noise"}
+    moving = SensorDrive(0, imu=imu)
+    said = judge_noise(noise_at_rest(moving.stamp_ns, moving.poses, moving.imu), known)
+    assert not said.judged and "does not stand" in said.text
 
 
 def test_accelerations_show_a_rotation_about_the_only_axis_of_turns() -> None:
@@ -117,10 +136,24 @@ def test_2_percent_of_the_radii_are_found(model: str, seed: int) -> None:
     assert abs((1 + fit.value[0]) * 1.02 - 1) < 2e-3 and fit.sigma[0] < 4e-3
     assert abs(fit.wheel.offset_s - 0.03) < 0.02 and fit.agreement > 0.95
     assert abs(fit.wheel.track_m / true.track_m - 1) < 0.03
-    assert "wheels' scale" in {f.name for f in judge_wheel(fit) if f.level}
-    again = judge_wheel(fit_wheel(found.stamp_ns, found.poses, found.wheel, fit.wheel))
+    assert "wheels' scale" in {f.name for f in judge_wheel(fit, wrong) if f.level}
+    again = judge_wheel(fit_wheel(found.stamp_ns, found.poses, found.wheel, fit.wheel), fit.wheel)
     assert not any(f.level for f in again)
     assert max(f.level for f in precision_wheel(fit)) <= 1
+
+
+def test_noise_of_wheels() -> None:
+    found = SensorDrive(0, wheel="differential")  # ticks of 1 mm, 5 mm/s of a sample
+    assert found.wheel is not None
+    known = replace(found.wheels, speed_noise=0.001)
+    fit = fit_wheel(found.stamp_ns, found.poses, found.wheel, known)
+    assert 0.5 < fit.noise / np.hypot(5e-3 / np.sqrt(2 * 50), 1e-3 * np.sqrt(5 / 36 * 50)) < 1.5
+    assert judge_wheel_noise(fit.noise, known).level == 0
+    rng = np.random.default_rng(0)
+    noisy = replace(found.wheel, speeds=found.wheel.speeds + rng.normal(0, 1.5, found.wheel.speeds.shape))
+    worse = fit_wheel(found.stamp_ns, found.poses, noisy, known)
+    assert {f.name for f in judge_wheel(worse, known) if f.level} == {"wheels' noise"}
+    assert not judge_wheel_noise(noise_of_speeds(found.wheel.stamp_ns, np.zeros(len(found.wheel))), known).judged
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -132,7 +165,7 @@ def test_where_the_wheels_are_shows_in_turns(seed: int) -> None:
     fit = fit_wheel(found.stamp_ns, found.poses, found.wheel, wrong)
     np.testing.assert_allclose(fit.value[6:], [0.2, -0.1], atol=0.02)
     np.testing.assert_allclose(fit.wheel.left_T_wheel[:3, 3], found.wheels.left_T_wheel[:3, 3], atol=0.02)
-    assert {f.name for f in judge_wheel(fit) if "position" in f.name and f.level == 1} == {
+    assert {f.name for f in judge_wheel(fit, wrong) if "position" in f.name and f.level == 1} == {
         "wheels' position ahead", "wheels' position to the left"
     }  # fmt: skip
     before_the_turn = slice(0, 150)
@@ -145,7 +178,7 @@ def test_wheels_that_count_backwards_or_are_exchanged() -> None:
     assert found.wheel is not None
     for speeds, says in ((-found.wheel.speeds, "backwards"), (found.wheel.speeds[:, ::-1].copy(), "exchange left")):
         fit = fit_wheel(found.stamp_ns, found.poses, replace(found.wheel, speeds=speeds), found.wheels)
-        (finding,) = judge_wheel(fit)
+        (finding,) = judge_wheel(fit, found.wheels)
         assert finding.level == 2 and says in finding.text
     other = replace(found.wheels, model="mecanum", radii_m=(0.1,) * 4, wheelbase_m=0.3)
     with pytest.raises(StereoSfmError, match="not those of mecanum wheels"):
