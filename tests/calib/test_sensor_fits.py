@@ -150,9 +150,9 @@ def test_noise_of_wheels() -> None:
     assert 0.5 < fit.noise / np.hypot(5e-3 / np.sqrt(2 * 50), 1e-3 * np.sqrt(5 / 36 * 50)) < 1.5
     assert judge_wheel_noise(fit.noise, known).level == 0
     rng = np.random.default_rng(0)
-    noisy = replace(found.wheel, speeds=found.wheel.speeds + rng.normal(0, 1.5, found.wheel.speeds.shape))
+    noisy = replace(found.wheel, speeds=found.wheel.speeds + rng.normal(0, 4.0, found.wheel.speeds.shape))
     worse = fit_wheel(found.stamp_ns, found.poses, noisy, known)
-    assert {f.name for f in judge_wheel(worse, known) if f.level} == {"wheels' noise"}
+    assert [f.level for f in judge_wheel(worse, known) if f.name == "wheels' noise"] == [1]
     assert not judge_wheel_noise(noise_of_speeds(found.wheel.stamp_ns, np.zeros(len(found.wheel))), known).judged
 
 
