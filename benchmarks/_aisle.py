@@ -151,7 +151,7 @@ class SimulatedTracker:
         rig = self._rig
         assert rig.right is not None
         local = se3.transform(se3.inverse(world_T_cam), self._aisle.points)
-        left, right = rig.left.project(local), rig.right.project(se3.transform(se3.inverse(rig.left_T_right), local))
+        left, right = rig.left.project(local), rig.project_right(local)
         return self._aisle.visible(world_T_cam) & rig.left.inside(left, 5) & rig.right.inside(right, 5), left, right
 
     def _follow(self, seen: Bool) -> None:

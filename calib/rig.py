@@ -9,6 +9,7 @@ import numpy as np
 from stereo_sfm.calib.imu import Imu
 from stereo_sfm.calib.wheel import Wheel
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.types import F64, Bool, ReadOnly
 
@@ -87,6 +88,16 @@ class Rig(ReadOnly):
     def pixel_angle(self) -> float:
         """Radians per pixel at the centre of the left image."""
         return 1.0 / (0.5 * (self.left.fx + self.left.fy))
+
+    def project_right(self, points: F64) -> F64:
+        """Points (N, 3) in the left camera -> pixels (N, 2) of the right one, NaN where it cannot see them.
+
+        Raises:
+            StereoSfmError: one camera.
+        """
+        if self.right is None:
+            raise StereoSfmError("this rig has one camera: no right image")
+        return self.right.project(se3.transform(se3.inverse(self.left_T_right), points))
 
     def range_sigmas(self, points: F64, disparity_sigma: float) -> F64:
         """Standard deviation (N,) in metres of the ranges of stereo points (N, 3) in the left camera.

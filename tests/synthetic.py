@@ -68,7 +68,7 @@ def see(rig: Rig, world_T_cam: F64, points: F64, max_depth: float = 10.0) -> tup
     cam = se3.transform(se3.inverse(world_T_cam), points)
     assert rig.right is not None
     left = rig.left.project(cam)
-    right = rig.right.project(se3.transform(se3.inverse(rig.left_T_right), cam))
+    right = rig.project_right(cam)
     seen = rig.left.inside(left, 5) & (np.linalg.norm(cam, axis=1) < max_depth)
     right[~rig.right.inside(right, 5)] = np.nan
     return seen, left, right

@@ -35,13 +35,12 @@ def recalibrate(map_: Map, rigs: Sequence[tuple[int, Rig]]) -> None:
 
 def _rewrite(map_: Map, before: Rig, after: Rig, first: int, until: int) -> None:
     """Move right pixels of the keyframes in these rows to their projections by the other rig; residuals stay."""
-    assert before.right is not None and after.right is not None
     table = map_.observations
     inside = (table.kf >= first) & (table.kf < until)
     obs: I64 = np.flatnonzero((table.pt >= 0) & inside & np.isfinite(table.uv_right[:, 0]))
     poses = se3.inverse(map_.keyframes.map_T_kf[table.kf[obs]])
     points = map_.points.xyz[table.pt[obs]]
     in_left = (poses[:, :3, :3] @ points[..., None])[..., 0] + poses[:, :3, 3]
-    was = before.right.project(se3.transform(se3.inverse(before.left_T_right), in_left))
-    now = after.right.project(se3.transform(se3.inverse(after.left_T_right), in_left))
+    was = before.project_right(in_left)
+    now = after.project_right(in_left)
     table.uv_right[obs] = (table.uv_right[obs] + (now - was)).astype(table.uv_right.dtype)

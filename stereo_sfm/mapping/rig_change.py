@@ -61,7 +61,6 @@ def _misfit(a: SeenPoints, b: SeenPoints, rig_a: Rig, rig_b: Rig) -> float:
 
     The motion between them is solved with these distances: that of the odometry was measured with either rig.
     """
-    assert rig_b.right is not None
     _, i, j = np.intersect1d(a.point_ids, b.point_ids, return_indices=True)
     rho = inverse_distances(rig_a, a.uv_left[i], a.uv_right[i])
     good = np.isfinite(rho) & (rho > FAR) & np.isfinite(b.uv_right[j]).all(1)
@@ -79,5 +78,5 @@ def _misfit(a: SeenPoints, b: SeenPoints, rig_a: Rig, rig_b: Rig) -> float:
     except Degenerate:
         return np.nan
     in_b = se3.transform(moved.cam_T_ref, points)
-    off = rig_b.right.project(se3.transform(se3.inverse(rig_b.left_T_right), in_b)) - b.uv_right[j]
+    off = rig_b.project_right(in_b) - b.uv_right[j]
     return float(np.nanmean(np.log1p((off**2).sum(1) / MATCH_PX**2)))

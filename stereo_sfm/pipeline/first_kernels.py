@@ -78,11 +78,10 @@ def _compile_flow(follower: Follower, tracks: Tracks, pyramid: Pyramid) -> None:
 
 def _tracks(rig: Rig) -> Tracks:
     """Points of a wall, all over the view."""
-    assert rig.right is not None
     x, y = np.meshgrid(np.linspace(-REACH, REACH, COLUMNS), np.linspace(-REACH, REACH, COLUMNS))
     direction = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3)
     uv = rig.left.project(DISTANCE * direction)
-    uv_right = rig.right.project(se3.transform(se3.inverse(rig.left_T_right), DISTANCE * direction))
+    uv_right = rig.project_right(DISTANCE * direction)
     seen = rig.left.inside(uv, BORDER_PX) & np.isfinite(uv_right[:, 0])
     n, none = len(uv), Tracks()
     zeros: dict[str, Any] = {

@@ -96,7 +96,7 @@ def keyframes(rig: Rig) -> list[Keyframe]:
         points_cam = se3.transform(se3.inverse(odom_T_cam), points)
         right = np.full((len(points), 2), np.nan)
         if rig.right is not None:
-            right = rig.right.project(se3.transform(se3.inverse(rig.left_T_right), points_cam))
+            right = rig.project_right(points_cam)
         ids = np.arange(len(points)) + (k % 2) * 20 + (k >= FRAMES // 2) * 10_000
         uv_left = rig.left.project(points_cam)
         small = [a.astype(np.float32) for a in (uv_left, right, points_cam)]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.geometry import se3
 from stereo_sfm.types import F32, F64
 
 DEPTH_STEP = 0.04  # relative depth difference around a pixel that counts as an edge
@@ -30,6 +29,5 @@ def points_from_depth(rig: Rig, depth: F32, uv: F64) -> tuple[F64, F64]:
     bearing = rig.left.unproject(uv[good])
     points, uv_right = np.full((len(uv), 3), np.nan), np.full(uv.shape, np.nan)
     points[good] = bearing / bearing[:, 2:] * around.mean(0)[good, None]
-    assert rig.right is not None
-    uv_right[good] = rig.right.project(se3.transform(se3.inverse(rig.left_T_right), points[good]))
+    uv_right[good] = rig.project_right(points[good])
     return points, uv_right

@@ -36,7 +36,7 @@ def keyframes(rigs: list[Rig], believed: Rig, seed: int, noise_px: float = NOISE
         in_left = se3.transform(se3.inverse(pose), points)
         near = np.flatnonzero((in_left[:, 2] > 0.3) & (np.linalg.norm(in_left, axis=1) < 8))
         uv_left = rig.left.project(in_left[near])
-        uv_right = rig.right.project(se3.transform(se3.inverse(rig.left_T_right), in_left[near]))
+        uv_right = rig.project_right(in_left[near])
         seen = rig.left.inside(uv_left) & rig.right.inside(uv_right)
         seen &= np.cumsum(seen) <= 200
         ids, uv_left, uv_right = near[seen], uv_left[seen], uv_right[seen]

@@ -35,7 +35,7 @@ def scene(rng: np.random.Generator) -> tuple[Tracks, Bool]:
     distance = np.linalg.norm(before, axis=1)
     assert RIG.right is not None
     uv = RIG.left.project(now) + rng.normal(0, 0.2, (n, 2))
-    uv_right = RIG.right.project(se3.transform(se3.inverse(RIG.left_T_right), now)) + rng.normal(0, 0.2, (n, 2))
+    uv_right = RIG.project_right(now) + rng.normal(0, 0.2, (n, 2))
     on_person = np.arange(n) >= STILL
     tracks = Tracks(
         point_ids=np.arange(n, dtype=np.int64),
@@ -126,9 +126,7 @@ def test_a_person_who_steps_aside_slowly_does_not_shift_the_pose(seed: int) -> N
     distance = np.linalg.norm(before, axis=1)
     tracks.direction, tracks.rho = before / distance[:, None], 1 / distance
     tracks.uv = RIG.left.project(now) + rng.normal(0, 0.2, (len(now), 2))
-    tracks.uv_right = RIG.right.project(se3.transform(se3.inverse(RIG.left_T_right), now)) + rng.normal(
-        0, 0.2, (len(now), 2)
-    )
+    tracks.uv_right = RIG.project_right(now) + rng.normal(0, 0.2, (len(now), 2))
     tracks.age[:], tracks.mapped[:] = 60, True
     solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
     expected = ExpectedMotion(MOVED @ se3.exp(np.full(6, 0.001)), se3.log(MOVED), SECONDS)
@@ -158,7 +156,7 @@ def before_one_wall(rng: np.random.Generator, age: int = 1) -> tuple[Tracks, Boo
     young = on_person | (np.arange(len(before)) < 40)
     tracks.age, tracks.mapped = np.where(young, age, 20).astype(np.int32), ~young
     tracks.uv = RIG.left.project(now) + rng.normal(0, 0.25, (len(now), 2))
-    right = RIG.right.project(se3.transform(se3.inverse(RIG.left_T_right), now))
+    right = RIG.project_right(now)
     tracks.uv_right = right + rng.normal(0, 0.25, (len(now), 2))
     return tracks, on_person
 
@@ -205,7 +203,7 @@ def few_points(rng: np.random.Generator, moved: F64) -> Tracks:
     tracks.direction, tracks.rho = before / distance[:, None], 1 / distance
     tracks.variance, tracks.age = np.square(0.01 / distance), np.ones(18, np.int32)
     tracks.uv = RIG.left.project(now) + rng.normal(0, 0.2, (18, 2))
-    tracks.uv_right = RIG.right.project(se3.transform(se3.inverse(RIG.left_T_right), now)) + rng.normal(0, 0.2, (18, 2))
+    tracks.uv_right = RIG.project_right(now) + rng.normal(0, 0.2, (18, 2))
     tracks.uv_right[14:] = np.nan
     tracks.uv[14] += 60.0 * se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, rng.uniform(0.0, 6.3)]))[:2, 0]
     return tracks

@@ -37,8 +37,7 @@ def known_points(rig: Rig, seen_by: Rig, noise_px: float, count: int = 200) -> t
     rng = np.random.default_rng(0)
     uv = rng.uniform([0.2, 0.2], [0.8, 0.8], (count, 2)) * rig.left.size
     direction, depth = rig.left.unproject(uv), rng.uniform(1, 6, count)
-    assert seen_by.right is not None
-    uv_right = seen_by.right.project(se3.transform(se3.inverse(seen_by.left_T_right), direction * depth[:, None]))
+    uv_right = seen_by.project_right(direction * depth[:, None])
     tracks = Tracks(
         np.arange(count), uv + rng.normal(0, noise_px, uv.shape), uv_right + rng.normal(0, noise_px, uv.shape),
         np.zeros((count, 3)), direction, 1 / depth, np.full(count, 1e-6), np.full(count, 100, np.int32),

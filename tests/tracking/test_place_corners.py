@@ -64,7 +64,7 @@ def test_corners_lie_all_over_the_image_and_have_depth(sequence: SimSource) -> N
     assert occupied_cells(corners.uv_left.astype(np.float64), sequence.rig.left.size) > 20
     assert np.isfinite(corners.points_cam).all() and np.isfinite(corners.uv_right).all()
     assert sequence.rig.right is not None
-    right = sequence.rig.right.project(se3.transform(se3.inverse(sequence.rig.left_T_right), corners.points_cam))
+    right = sequence.rig.project_right(corners.points_cam)
     assert np.percentile(np.linalg.norm(right - corners.uv_right, axis=1), 90) < 1.0
 
 

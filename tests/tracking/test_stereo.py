@@ -8,7 +8,6 @@ import pytest
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import TrackerConfig
-from stereo_sfm.geometry import se3
 from stereo_sfm.tracking.flow import klt
 from stereo_sfm.tracking.flow.stereo import StereoMatch, StereoMatcher
 from stereo_sfm.types import F32, F64, U8
@@ -64,8 +63,7 @@ def test_points_of_a_plane_are_found(
     uv, match = matches(rig, see_plane(rig, depth, texture(), gain, offset), coarse)
     assert match.good.mean() > 0.8
     bearing = rig.left.unproject(uv)
-    assert rig.right is not None
-    truth = rig.right.project(se3.transform(se3.inverse(rig.left_T_right), bearing / bearing[:, 2:] * depth))
+    truth = rig.project_right(bearing / bearing[:, 2:] * depth)
     error = np.linalg.norm(match.uv_right - truth, axis=1)[match.good]
     assert np.median(error) < most_px
     assert np.percentile(error, 95) < 3 * most_px
