@@ -155,6 +155,8 @@ def load_config(args: argparse.Namespace) -> Config:
     chosen = config.load(args.config, overrides, preset(args.preset))
     if args.features is not None and chosen.odometry.method == "flow":
         raise StereoSfmError("--features needs an estimator that uses descriptors: add --odometry em-r (or another)")
+    if chosen.tracker.calibrate_sensors and chosen.odometry.method != "flow":
+        raise StereoSfmError("--calibrate-sensors is for the default tracker: leave --odometry away")
     if chosen.odometry.scale != "stereo" and chosen.odometry.method == "flow":
         logging.getLogger("stereo_sfm").warning(
             "odometry.scale has no effect on the default tracker, which knows the scale: it is for --odometry"

@@ -35,8 +35,11 @@ def calibration_stats(record: RunRecord) -> list[dict[str, Any]]:
     ]
 
 
-def sensor_stats(record: RunRecord) -> list[dict[str, Any]]:
-    """Every word about the calibration of IMU and wheels; terms in degrees, ms, per cent, mm; no sigma: unknown."""
+def sensor_stats(record: RunRecord) -> list[dict[str, Any]] | None:
+    """Every word about the calibration of IMU and wheels; terms in degrees, ms, per cent, mm; no sigma: unknown. None
+    where it was not asked for."""
+    if not record.calibrates_sensors:
+        return None
     first_ns = int(record.frames.stamp_ns[0]) if len(record.frames) else 0
     return [
         {
@@ -91,6 +94,13 @@ def calibration_lines(stats: dict[str, Any]) -> list[str]:
         for c in stats["calibration"]
     ]
     compared = stats["sensor_calibration"]
+    if compared is None:
+        return lines
+    if not compared:
+        return [
+            *lines,
+            "IMU and wheels are not calibrated: the source has none, or moved for less than 15 s or too little",
+        ]
     return lines + [f"sensors compared with the images at {c['seconds']:.1f} s: {c['text']}" for c in compared]
 
 

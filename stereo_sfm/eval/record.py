@@ -100,6 +100,7 @@ class RunRecord:
     row_errors: RowErrors | None = None  # the last
     row_error_px: list[tuple[int, float]] = field(default_factory=list[tuple[int, float]])  # stamp_ns, systematic
     calibrations: list[CalibrationUpdate] = field(default_factory=list[CalibrationUpdate])  # changes of the rig
+    calibrates_sensors: bool = False  # asked for
     sensor_updates: list[SensorUpdate] = field(default_factory=list[SensorUpdate])  # of IMU and wheels
     down: F64 = field(default_factory=lambda: np.zeros(3))  # gravity's direction in the map, zero: unknown
     down_information: float = 0.0  # 1/rad^2, summed over the keyframes
@@ -110,7 +111,8 @@ class RunRecord:
     @staticmethod
     def of(config: Config, localize_only: bool = False) -> RunRecord:
         """For a run with this configuration."""
-        return RunRecord(localize_only, followed=config.odometry.method == "flow")
+        flow = config.odometry.method == "flow"
+        return RunRecord(localize_only, followed=flow, calibrates_sensors=config.tracker.calibrate_sensors)
 
     def put(self, message: object) -> None:
         """Take one message of the run."""

@@ -18,7 +18,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.wheel_fit import fit_wheel, judge_wheel
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.types import F64, ImuSamples, Keyframe, SensorSamples, SensorUpdate, WheelSamples
+from stereo_sfm.types import F64, I64, ImuSamples, Keyframe, SensorSamples, SensorUpdate, WheelSamples
 
 WINDOW_S = 60.0  # compared, the last
 FIRST_S, EVERY_S = 15.0, 10.0  # of the first comparison and from one to the next
@@ -103,19 +103,11 @@ class SensorCalibration:
         if not said:
             return None
         right = ", ".join(f.name for f in said if f.judged and not f.level)
-        parts = [f"{f.name}: {f.text}" for f in said if f.judged and f.level] + (
-            [f"confirmed: {right}"] if right else []
-        )
+        parts = [f"{f.name}: {f.text}" for f in said if f.judged and f.level]
+        text = "; ".join([*parts, f"confirmed: {right}"] if right else parts)
         imu, wheel = self._imu, self._wheel
         return SensorUpdate(
-            version,
-            kf_id,
-            stamp_ns,
-            imu.value.copy(),
-            imu.sigma.copy(),
-            wheel.value.copy(),
-            wheel.sigma.copy(),
-            "; ".join(parts),
+            version, kf_id, stamp_ns, imu.value.copy(), imu.sigma.copy(), wheel.value.copy(), wheel.sigma.copy(), text
         )
 
     def _compared_imu(self) -> list[Finding]:
@@ -148,7 +140,7 @@ class SensorCalibration:
             return []
         return [f for f in judge_wheel(found, wheel) if f.name != "wheels' time offset"]
 
-    def _seen(self) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], F64]:
+    def _seen(self) -> tuple[I64, F64]:
         """Stamps (N,) and poses (N, 4, 4) by the images."""
         parts = list(self._parts)
         return np.concatenate([p.stamp_ns for p in parts]), np.concatenate([p.odom_T_cam for p in parts])

@@ -28,6 +28,14 @@ def test_a_run_over_processes_is_replayed_inline(
     assert live or states["INERTIAL"] == 5  # the dark is bridged
 
 
+def test_asking_for_a_calibration_that_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    spec = "sim:loop?size=212x200&rate=6&frames=12"
+    assert main(["run", spec, "-o", str(tmp_path / "a"), "--calibrate-sensors", "--inline"]) == 0
+    assert "IMU and wheels are not calibrated: the source has none" in capsys.readouterr().out
+    assert main(["run", spec, "-o", str(tmp_path / "b"), "--calibrate-sensors", "--odometry", "em-r"]) == 2
+    assert "for the default tracker" in capsys.readouterr().err
+
+
 def test_a_wrong_calibration_of_the_sensors_is_corrected_while_driving(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
