@@ -20,6 +20,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.scene_model import inverse_distances, tangents
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
+from stereo_sfm.geometry.order_statistics import median
 from stereo_sfm.geometry.stereo import rectifying_rotations
 from stereo_sfm.mapping import rig_window_kernels
 from stereo_sfm.mapping.rig_change import SeenPoints
@@ -48,8 +49,10 @@ class RigInformation:
     matrix: F64  # (8, 8)
     vector: F64  # (8,) matrix @ (the terms that fit best)
 
-    def __add__(self, other: RigInformation) -> RigInformation:
-        return RigInformation(self.matrix + other.matrix, self.vector + other.vector)
+    @staticmethod
+    def summed(parts: Sequence[RigInformation]) -> RigInformation:
+        """That of all parts together."""
+        return RigInformation(np.sum([p.matrix for p in parts], axis=0), np.sum([p.vector for p in parts], axis=0))
 
     def with_lens_error(self, angle: float) -> RigInformation:
         """Less information, for errors of the lens model while the camera turns by `angle` radians."""
@@ -168,7 +171,7 @@ def _problem(rig: Rig, keyframes: Sequence[SeenPoints], known: int) -> _Problem 
     """`rig`: of the first keyframe. `known`: keyframes of a rig whose terms are known."""
     first = keyframes[0]
     both = np.isfinite(first.uv_left).all(1) & np.isfinite(first.uv_right).all(1)
-    later = np.unique(np.concatenate([k.point_ids for k in keyframes[max(known, 1) :]]))
+    later = np.concatenate([k.point_ids for k in keyframes[max(known, 1) :]])
     ids = first.point_ids[both & np.isin(first.point_ids, later)]
     if not known:
         ids = ids[:: max(1, -(-len(ids) // MAX_POINTS))]
@@ -176,7 +179,7 @@ def _problem(rig: Rig, keyframes: Sequence[SeenPoints], known: int) -> _Problem 
         return None
     uv_left, uv_right = np.full((2, len(keyframes), len(ids), 2), np.nan)
     for f, keyframe in enumerate(keyframes):
-        _, at, of = np.intersect1d(ids, keyframe.point_ids, return_indices=True)
+        _, at, of = np.intersect1d(ids, keyframe.point_ids, assume_unique=True, return_indices=True)
         uv_left[f, at], uv_right[f, at] = keyframe.uv_left[of], keyframe.uv_right[of]
     bearing, rho = rig.left.unproject(uv_left[0]), inverse_distances(rig, uv_left[0], uv_right[0])
     good = np.isfinite(bearing).all(1) & np.isfinite(rho)
@@ -285,4 +288,4 @@ def _noise(squares: F64, rows: I64) -> float:
     if not usable.any():
         return NOISE_PX[1]
     free = rows[usable] - 3
-    return float(np.median(np.sqrt(squares[usable] / free) / (1 - 2 / (9 * free)) ** 1.5))
+    return float(median(np.sqrt(squares[usable] / free) / (1 - 2 / (9 * free)) ** 1.5))

@@ -133,7 +133,7 @@ class SelfCalibration:
     def _information(self, windows: Sequence[RigWindow]) -> RigInformation:
         """That of windows, and of the prior around the current terms."""
         none = RigInformation(np.diag(1 / PRIOR**2), self.terms / PRIOR**2)
-        return sum((w.information for w in windows), none)
+        return RigInformation.summed([none, *(w.information for w in windows)])
 
     def _close_window(self) -> bool:
         """Add a window of the collected keyframes; False if they do not determine one."""
@@ -336,7 +336,7 @@ def _difference(after: Estimate, before: Estimate) -> Estimate:
 
 def _moved(a: SeenPoints, b: SeenPoints, min_px: float) -> bool:
     """Whether common points moved by `min_px` (median), or many points were lost (the remaining ones are far)."""
-    _, at, of = np.intersect1d(a.point_ids, b.point_ids, return_indices=True)
+    _, at, of = np.intersect1d(a.point_ids, b.point_ids, assume_unique=True, return_indices=True)
     if len(at) < MAX_COMMON * len(a.point_ids):
         return True
     return bool(np.median(np.linalg.norm(a.uv_left[at] - b.uv_left[of], axis=1)) > min_px)
