@@ -79,6 +79,14 @@ class Estimate:
         """(8,) values in standard deviations."""
         return np.abs(self.value) / np.maximum(self.sigma, 1e-12)
 
+    @property
+    def reach(self) -> float:
+        """Mahalanobis distance from zero. No term's strength exceeds it, whichever of the others are held.
+
+        The covariance must be definite.
+        """
+        return float(np.sqrt(self.value @ np.linalg.solve(self.covariance, self.value))) if self.value.any() else 0.0
+
 
 @dataclass(frozen=True)
 class Term:

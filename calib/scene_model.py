@@ -3,8 +3,11 @@
 The unknowns of extrinsics and lenses form one vector, shared by all windows; see `calib.consistency`.
 """
 
+# pyright: reportUnknownParameterType=false, reportMissingParameterType=false
+
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +16,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.tracks import Window
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera, Pinhole, RadTan
+from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.geometry.stereo import rectifying_rotations
 from stereo_sfm.types import F64, Bool
 
@@ -86,8 +90,21 @@ def inverse_distances(rig: Rig, left: F64, right: F64) -> F64:
     assert rig.right is not None
     bearing, in_right = rig.left.unproject(left), rig.right.unproject(right)
     rotation, t = rig.left_T_right[:3, :3], rig.left_T_right[:3, 3]
-    a, c = np.cross(in_right, bearing @ rotation), np.cross(in_right, t @ rotation)
-    return np.asarray((a * c).sum(1) / np.maximum((c * c).sum(1), 1e-12), float)
+    return _inverse_distances(bearing @ rotation, in_right, t @ rotation)
+
+
+@njit
+def _inverse_distances(bearing, in_right, t):
+    """(N,) 1/m, all in the right camera's axes; bearings (N, 3) of both cameras, t (3,)."""
+    out = np.empty(len(bearing))
+    t0, t1, t2 = t
+    for i in range(len(bearing)):
+        b0, b1, b2 = bearing[i]
+        r0, r1, r2 = in_right[i]
+        a0, a1, a2 = r1 * b2 - r2 * b1, r2 * b0 - r0 * b2, r0 * b1 - r1 * b0
+        c0, c1, c2 = r1 * t2 - r2 * t1, r2 * t0 - r0 * t2, r0 * t1 - r1 * t0
+        out[i] = (a0 * c0 + a1 * c1 + a2 * c2) / max(c0 * c0 + c1 * c1 + c2 * c2, 1e-12)
+    return out
 
 
 def make_problem(rig: Rig, window: Window) -> Problem:
@@ -195,11 +212,15 @@ def linearised(rig: Rig, problem: Problem, vector: F64) -> tuple[F64, F64, F64]:
     return residual, by_point, by_rest
 
 
-def tangents(bearing: F64) -> F64:
-    """(N, 3, 2) two unit vectors perpendicular to each bearing."""
-    x, y, z = np.moveaxis(bearing, -1, 0)
-    none = np.zeros_like(x)
-    aside = np.abs(x) < 0.9
-    u, v, w = np.where(aside, none, -z), np.where(aside, z, none), np.where(aside, -y, x)  # bearing x (an axis)
-    u, v, w = np.stack([u, v, w]) / np.sqrt(u * u + v * v + w * w)
-    return np.stack([np.stack([u, v, w], -1), np.stack([y * w - z * v, z * u - x * w, x * v - y * u], -1)], -1)
+@njit
+def tangents(bearing):
+    """(N, 3, 2) two unit vectors perpendicular to each bearing (N, 3)."""
+    out = np.empty((len(bearing), 3, 2))
+    for i in range(len(bearing)):
+        x, y, z = bearing[i]
+        u, v, w = (0.0, z, -y) if abs(x) < 0.9 else (-z, 0.0, x)  # bearing x (an axis)
+        size = math.sqrt(u * u + v * v + w * w)
+        u, v, w = u / size, v / size, w / size
+        out[i, 0, 0], out[i, 1, 0], out[i, 2, 0] = u, v, w
+        out[i, 0, 1], out[i, 1, 1], out[i, 2, 1] = y * w - z * v, z * u - x * w, x * v - y * u
+    return out

@@ -61,7 +61,7 @@ def _misfit(a: SeenPoints, b: SeenPoints, rig_a: Rig, rig_b: Rig) -> float:
 
     The motion between them is solved with these distances: that of the odometry was measured with either rig.
     """
-    _, i, j = np.intersect1d(a.point_ids, b.point_ids, return_indices=True)
+    _, i, j = np.intersect1d(a.point_ids, b.point_ids, assume_unique=True, return_indices=True)
     rho = inverse_distances(rig_a, a.uv_left[i], a.uv_right[i])
     good = np.isfinite(rho) & (rho > FAR) & np.isfinite(b.uv_right[j]).all(1)
     if good.sum() < MIN_POINTS:

@@ -20,6 +20,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.scene_model import inverse_distances, tangents
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
+from stereo_sfm.geometry.order_statistics import median
 from stereo_sfm.geometry.stereo import rectifying_rotations
 from stereo_sfm.mapping import rig_window_kernels
 from stereo_sfm.mapping.rig_change import SeenPoints
@@ -39,6 +40,7 @@ PRIOR = np.array([0.01, 0.01, 0.01, 0.005, 0.005, 0.005, 0.01, 0.01])
 LENS_ERROR_PER_RADIAN = np.array([0.0, 0.003, 0.0, 0.0, 0.0, 0.0015, 0.0, 0.0])
 # Prior standard deviations of `_shapes`, px at the image's border.
 LENS_PRIOR = np.array([6.0, 2.0, 2.0, 2.0, *[0.5] * 6])
+SHARED_PRIOR = np.concatenate([PRIOR, LENS_PRIOR]) ** -2  # information
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +50,10 @@ class RigInformation:
     matrix: F64  # (8, 8)
     vector: F64  # (8,) matrix @ (the terms that fit best)
 
-    def __add__(self, other: RigInformation) -> RigInformation:
-        return RigInformation(self.matrix + other.matrix, self.vector + other.vector)
+    @staticmethod
+    def summed(parts: Sequence[RigInformation]) -> RigInformation:
+        """That of all parts together."""
+        return RigInformation(np.sum([p.matrix for p in parts], axis=0), np.sum([p.vector for p in parts], axis=0))
 
     def with_lens_error(self, angle: float) -> RigInformation:
         """Less information, for errors of the lens model while the camera turns by `angle` radians."""
@@ -129,19 +133,18 @@ def solve_window(
     sigma = 1.0
     for step in range(STEPS):
         system = _System.of(corrected, problem.seen_by(corrected, before), sigma, hard=step >= 2)
-        sigma = float(np.clip(system.noise_px, *NOISE_PX))
+        sigma = system.noise_px
         terms = terms + system.step(problem, terms)
         if not np.isfinite(terms).all():
             return None
         corrected = with_terms(rig, terms)
     system = _System.of(corrected, problem.seen_by(corrected, before), sigma, hard=True)
-    sigma = float(np.clip(system.noise_px, *NOISE_PX))
     information = system.information(problem, terms)
     if before is None:
         information = information.with_lens_error(_turned(keyframes))
     last = keyframes[-1]
     length = _length_by_terms(rig, problem.uv_left[0], problem.uv_right[0])
-    return RigWindow(keyframes[0].kf_id, last.kf_id, last.stamp_ns, information, sigma, length)
+    return RigWindow(keyframes[0].kf_id, last.kf_id, last.stamp_ns, information, system.noise_px, length)
 
 
 def _length_by_terms(rig: Rig, uv_left: F64, uv_right: F64) -> F64:
@@ -168,25 +171,25 @@ def _problem(rig: Rig, keyframes: Sequence[SeenPoints], known: int) -> _Problem 
     """`rig`: of the first keyframe. `known`: keyframes of a rig whose terms are known."""
     first = keyframes[0]
     both = np.isfinite(first.uv_left).all(1) & np.isfinite(first.uv_right).all(1)
-    later = np.unique(np.concatenate([k.point_ids for k in keyframes[max(known, 1) :]]))
+    later = np.concatenate([k.point_ids for k in keyframes[max(known, 1) :]])
     ids = first.point_ids[both & np.isin(first.point_ids, later)]
     if not known:
         ids = ids[:: max(1, -(-len(ids) // MAX_POINTS))]
     if len(ids) < MIN_POINTS:
         return None
-    uv_left, uv_right = np.full((2, len(keyframes), len(ids), 2), np.nan)
+    uv = np.full((2, len(keyframes), len(ids), 2), np.nan)
     for f, keyframe in enumerate(keyframes):
-        _, at, of = np.intersect1d(ids, keyframe.point_ids, return_indices=True)
-        uv_left[f, at], uv_right[f, at] = keyframe.uv_left[of], keyframe.uv_right[of]
-    bearing, rho = rig.left.unproject(uv_left[0]), inverse_distances(rig, uv_left[0], uv_right[0])
+        _, at, of = np.intersect1d(ids, keyframe.point_ids, assume_unique=True, return_indices=True)
+        uv[0, f, at], uv[1, f, at] = keyframe.uv_left[of], keyframe.uv_right[of]
+    bearing, rho = rig.left.unproject(uv[0, 0]), inverse_distances(rig, uv[0, 0], uv[1, 0])
     good = np.isfinite(bearing).all(1) & np.isfinite(rho)
     frames = np.array([se3.inverse(k.odom_T_cam) @ first.odom_T_cam for k in keyframes])
-    uv_left, uv_right = uv_left[:, good].copy(), uv_right[:, good].copy()
-    shapes = np.stack([_shapes(rig.left, uv_left), _shapes(rig.left, uv_right)])
+    uv = np.ascontiguousarray(uv[:, :, good])
+    shapes = _shapes(rig.left, uv)
     if known:  # the same lenses saw what the changed rig is measured with
         shapes[:] = 0.0
     of_known = np.arange(len(keyframes)) < known
-    return _Problem(uv_left, uv_right, of_known, bearing[good], rho[good], frames, shapes, np.zeros(len(LENS_PRIOR)))
+    return _Problem(uv[0], uv[1], of_known, bearing[good], rho[good], frames, shapes, np.zeros(len(LENS_PRIOR)))
 
 
 def _turned(keyframes: Sequence[SeenPoints]) -> float:
@@ -214,7 +217,7 @@ class _System:
 
     matrix: F64  # (S, S) of the rig's terms and the lens's
     gradient: F64  # (S,)
-    noise_px: float
+    noise_px: float  # within NOISE_PX
     pose_gain: F64  # (6 (F - 1), S)
     pose_gradient: F64
     point_gain: F64  # (N, 3, R)
@@ -253,10 +256,8 @@ class _System:
 
     def step(self, problem: _Problem, terms: F64) -> F64:
         """(8,) step of the terms, back-substituted into the window's lens, motion and points."""
-        prior = np.concatenate([PRIOR, LENS_PRIOR]) ** -2
-        delta = -np.linalg.solve(
-            self.matrix + np.diag(prior), self.gradient + prior * np.concatenate([terms, problem.lens])
-        )
+        pulled = self.gradient + SHARED_PRIOR * np.concatenate([terms, problem.lens])
+        delta = -np.linalg.solve(self.matrix + np.diag(SHARED_PRIOR), pulled)
         problem.lens = problem.lens + delta[RIG_TERMS:]
         pose = -(self.pose_gradient + self.pose_gain @ delta)
         step = -(self.point_gradient + self.point_gain @ np.concatenate([delta, pose]))
@@ -285,4 +286,5 @@ def _noise(squares: F64, rows: I64) -> float:
     if not usable.any():
         return NOISE_PX[1]
     free = rows[usable] - 3
-    return float(np.median(np.sqrt(squares[usable] / free) / (1 - 2 / (9 * free)) ** 1.5))
+    noise = median(np.sqrt(squares[usable] / free) / (1 - 2 / (9 * free)) ** 1.5)
+    return min(max(NOISE_PX[0], noise), NOISE_PX[1])

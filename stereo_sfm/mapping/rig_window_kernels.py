@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 
-from stereo_sfm.geometry.kernels import inner, njit, project_one
+from stereo_sfm.geometry.kernels import inlined, inner, njit, project_one
 from stereo_sfm.types import RIG_TERMS
 
 
@@ -153,36 +153,42 @@ def accumulate(
             if w == 0.0:
                 continue
             o = shared + 6 * (f - 1)
-            for i in range(used):
-                r = residual[i]
-                for a in range(3):
-                    wa = w * j_point[i, a]
-                    gp[a] -= wa * r
-                    for b in range(3):
-                        hpp[a, b] += wa * j_point[i, b]
-                    for b in range(shared):
-                        hpr[a, b] += wa * j_rig[i, b]
-                    if f > 0:
-                        for b in range(6):
-                            hpr[a, o + b] += wa * j_pose[i, b]
-                for a in range(shared):
-                    wa = w * j_rig[i, a]
-                    g[a] -= wa * r
-                    for b in range(a, shared):
-                        h[a, b] += wa * j_rig[i, b]
-                    if f > 0:
-                        for b in range(6):
-                            h[a, o + b] += wa * j_pose[i, b]
+            if used == 2:
+                residual[2:], j_point[2:], j_rig[2:], j_pose[2:] = 0.0, 0.0, 0.0, 0.0
+            for a in range(3):
+                w0, w1, w2, w3 = w * j_point[0, a], w * j_point[1, a], w * j_point[2, a], w * j_point[3, a]
+                gp[a] = gp[a] - w0 * residual[0] - w1 * residual[1] - w2 * residual[2] - w3 * residual[3]
+                for b in range(3):
+                    hpp[a, b] = _plus(hpp[a, b], w0, w1, w2, w3, j_point, b)
+                for b in range(shared):
+                    hpr[a, b] = _plus(hpr[a, b], w0, w1, w2, w3, j_rig, b)
                 if f > 0:
-                    for a in range(6):
-                        wa = w * j_pose[i, a]
-                        g[o + a] -= wa * r
-                        for b in range(a, 6):
-                            h[o + a, o + b] += wa * j_pose[i, b]
+                    for b in range(6):
+                        hpr[a, o + b] = _plus(hpr[a, o + b], w0, w1, w2, w3, j_pose, b)
+            for a in range(shared):
+                w0, w1, w2, w3 = w * j_rig[0, a], w * j_rig[1, a], w * j_rig[2, a], w * j_rig[3, a]
+                g[a] = g[a] - w0 * residual[0] - w1 * residual[1] - w2 * residual[2] - w3 * residual[3]
+                for b in range(a, shared):
+                    h[a, b] = _plus(h[a, b], w0, w1, w2, w3, j_rig, b)
+                if f > 0:
+                    for b in range(6):
+                        h[a, o + b] = _plus(h[a, o + b], w0, w1, w2, w3, j_pose, b)
+            if f > 0:
+                for a in range(6):
+                    w0, w1, w2, w3 = w * j_pose[0, a], w * j_pose[1, a], w * j_pose[2, a], w * j_pose[3, a]
+                    g[o + a] = g[o + a] - w0 * residual[0] - w1 * residual[1] - w2 * residual[2] - w3 * residual[3]
+                    for b in range(a, 6):
+                        h[o + a, o + b] = _plus(h[o + a, o + b], w0, w1, w2, w3, j_pose, b)
         _eliminate(hpp, gp, hpr, h, g, r_size)
     for a in range(r_size):
         for b in range(a):
             h[a, b] = h[b, a]
+
+
+@inlined
+def _plus(x, w0, w1, w2, w3, j, b):
+    """x and the weighted column b of four rows."""
+    return x + w0 * j[0, b] + w1 * j[1, b] + w2 * j[2, b] + w3 * j[3, b]
 
 
 @inner
@@ -202,22 +208,18 @@ def _eliminate(hpp, gp, hpr, h, g, r_size):
         hpr[:] = 0.0
         return
     c11, c12, c22 = a * f - c * c, b * c - a * e, a * d - b * b
-    y = np.empty(3)
+    x = np.empty((3, r_size))
     for j in range(r_size):
-        y[0], y[1], y[2] = hpr[0, j], hpr[1, j], hpr[2, j]
-        if y[0] == 0.0 and y[1] == 0.0 and y[2] == 0.0:
-            continue
-        x0 = (c00 * y[0] + c01 * y[1] + c02 * y[2]) / det
-        x1 = (c01 * y[0] + c11 * y[1] + c12 * y[2]) / det
-        x2 = (c02 * y[0] + c12 * y[1] + c22 * y[2]) / det
-        g[j] -= x0 * gp[0] + x1 * gp[1] + x2 * gp[2]
-        for i in range(j + 1):
-            h[i, j] -= x0 * hpr[0, i] + x1 * hpr[1, i] + x2 * hpr[2, i]
-    for j in range(r_size):
-        y[0], y[1], y[2] = hpr[0, j], hpr[1, j], hpr[2, j]
-        hpr[0, j] = (c00 * y[0] + c01 * y[1] + c02 * y[2]) / det
-        hpr[1, j] = (c01 * y[0] + c11 * y[1] + c12 * y[2]) / det
-        hpr[2, j] = (c02 * y[0] + c12 * y[1] + c22 * y[2]) / det
+        y0, y1, y2 = hpr[0, j], hpr[1, j], hpr[2, j]
+        x[0, j] = (c00 * y0 + c01 * y1 + c02 * y2) / det
+        x[1, j] = (c01 * y0 + c11 * y1 + c12 * y2) / det
+        x[2, j] = (c02 * y0 + c12 * y1 + c22 * y2) / det
+        g[j] -= x[0, j] * gp[0] + x[1, j] * gp[1] + x[2, j] * gp[2]
+    for i in range(r_size):
+        y0, y1, y2 = hpr[0, i], hpr[1, i], hpr[2, i]
+        for j in range(i, r_size):
+            h[i, j] -= x[0, j] * y0 + x[1, j] * y1 + x[2, j] * y2
+    hpr[:] = x
     g0, g1, g2 = gp[0], gp[1], gp[2]
     gp[0] = (c00 * g0 + c01 * g1 + c02 * g2) / det
     gp[1] = (c01 * g0 + c11 * g1 + c12 * g2) / det

@@ -133,7 +133,7 @@ class SelfCalibration:
     def _information(self, windows: Sequence[RigWindow]) -> RigInformation:
         """That of windows, and of the prior around the current terms."""
         none = RigInformation(np.diag(1 / PRIOR**2), self.terms / PRIOR**2)
-        return sum((w.information for w in windows), none)
+        return RigInformation.summed([none, *(w.information for w in windows)])
 
     def _close_window(self) -> bool:
         """Add a window of the collected keyframes; False if they do not determine one."""
@@ -173,11 +173,14 @@ class SelfCalibration:
 
     def _change(self, windows: Sequence[RigWindow], first_sigmas: float, drift: _Drift | None = None) -> _Change | None:
         """What windows show to be wrong; None if nothing is."""
-        parts = [windows, windows[::2], windows[1::2] or windows]  # one window: what a step has left
-        whole, *halves = drift.at_the_end if drift is not None else [self.estimate(part) for part in parts]
+        whole = self.estimate(windows) if drift is None else drift.at_the_end[0]
         drifting = NONE if drift is None else drift.terms
         further = FURTHER_SIGMAS if self._corrected.any() else np.where(drifting, FURTHER_SIGMAS, first_sigmas)
         sigmas = np.where(self._corrected, REFINED_SIGMAS, further)
+        if whole.reach < sigmas.min():
+            return None
+        parts = windows[::2], windows[1::2] or windows  # one window: what a step has left
+        halves = [self.estimate(part) for part in parts] if drift is None else drift.at_the_end[1:]
         basis, rolling = self._basis(windows), self._rig.readout_s > 0
         choice = choose(whole.by(basis), [h.by(basis) for h in halves], rolling, sigmas, self._corrected)
         if not choice.written.any():
@@ -259,10 +262,12 @@ class SelfCalibration:
         """What windows show of terms that change steadily; None if none does."""
         if len(windows) < DRIFT_WINDOWS:
             return None
-        parts = windows, windows[::2], windows[1::2]
-        whole, *halves = fits = [steady_change(part, windows, self.terms, self._floor) for part in parts]
+        whole = steady_change(windows, windows, self.terms, self._floor)
+        if whole.estimate.reach < SIGMAS:
+            return None
+        halves = [steady_change(part, windows, self.terms, self._floor) for part in (windows[::2], windows[1::2])]
         terms = significant(whole.estimate, [h.estimate for h in halves], self._rig.readout_s > 0, SIGMAS)
-        return _Drift(terms, [fit.at_the_end(terms) for fit in fits]) if terms.any() else None
+        return _Drift(terms, [fit.at_the_end(terms) for fit in (whole, *halves)]) if terms.any() else None
 
     def _detect_step(self) -> None:
         windows = list(self.windows)
@@ -278,8 +283,11 @@ class SelfCalibration:
     def _differ(self, before: Sequence[RigWindow], after: Sequence[RigWindow]) -> bool:
         """Whether the newest windows contradict all earlier ones."""
         base = self.estimate(before)
-        change = [_difference(self.estimate(part), base) for part in (after, after[::2], after[1::2])]
-        return bool(significant(change[0], change[1:], self._rig.readout_s > 0, SIGMAS).any())
+        change = _difference(self.estimate(after), base)
+        if change.reach < SIGMAS:
+            return False
+        halves = [_difference(self.estimate(part), base) for part in (after[::2], after[1::2])]
+        return bool(significant(change, halves, self._rig.readout_s > 0, SIGMAS).any())
 
     def _fit(self, windows: Sequence[RigWindow]) -> float:
         """How well one rig explains windows: their log-likelihood but for a constant of each window."""
@@ -328,7 +336,7 @@ def _difference(after: Estimate, before: Estimate) -> Estimate:
 
 def _moved(a: SeenPoints, b: SeenPoints, min_px: float) -> bool:
     """Whether common points moved by `min_px` (median), or many points were lost (the remaining ones are far)."""
-    _, at, of = np.intersect1d(a.point_ids, b.point_ids, return_indices=True)
+    _, at, of = np.intersect1d(a.point_ids, b.point_ids, assume_unique=True, return_indices=True)
     if len(at) < MAX_COMMON * len(a.point_ids):
         return True
     return bool(np.median(np.linalg.norm(a.uv_left[at] - b.uv_left[of], axis=1)) > min_px)

@@ -45,6 +45,16 @@ def test_without_a_second_half_nothing_is_written_and_the_rig_is_the_same() -> N
     assert choice.apply(RIGS["pinhole"]) is RIGS["pinhole"]
 
 
+def test_no_term_is_stronger_than_the_estimate_reaches() -> None:
+    rng = np.random.default_rng(0)
+    for kept in rng.integers(0, 2, (50, RIG_TERMS)).astype(bool):
+        root = rng.normal(size=(RIG_TERMS, RIG_TERMS))
+        whole = Estimate(rng.normal(size=RIG_TERMS), root @ root.T)
+        assert whole.without(kept | (np.arange(RIG_TERMS) == 0)).strength.max() <= whole.reach * (1 + 1e-9)
+    assert estimated(3, 4).reach == pytest.approx(5)
+    assert Estimate(np.zeros(RIG_TERMS), np.zeros((RIG_TERMS, RIG_TERMS))).reach == 0
+
+
 def test_terms_that_trade_with_one_that_stays_take_its_part() -> None:
     """A rotation about x and the baseline's z are correlated: uncertain together, significant alone."""
     covariance = np.diag(SIGMA**2)
