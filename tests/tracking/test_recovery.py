@@ -26,7 +26,7 @@ from stereo_sfm.tracking.flow.recovery import REACH, Recovery
 from stereo_sfm.tracking.flow.tracker import Tracker
 from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.tracking.flow.trusted_motion import TrustedMotion
-from stereo_sfm.types import F64, Frame, Keyframe, StereoImage, TrackState
+from stereo_sfm.types import F64, Corners, Frame, Keyframe, StereoImage, TrackState
 
 RATE, BEGIN, COVERED, FREE = 15, 60, range(72, 82), range(82, 90)  # frames: 0.67 s without sight
 
@@ -208,6 +208,47 @@ def test_without_places_there_is_no_search() -> None:
     recovery.motion.add(0, np.eye(4))
     image = covered(0)
     assert list(recovery.search(image, None, recovery.motion.expect(10**8))) == []  # type: ignore[arg-type]
+
+
+class Places:
+    """Corners that a detector found, and no known place."""
+
+    def __init__(self, corners: Corners) -> None:
+        self.corners = corners
+
+    def find_in(self, *_: object) -> Corners:
+        return self.corners
+
+    def add(self, keyframe: Keyframe) -> None: ...
+
+    def find(self, *_: object) -> list[F64]:
+        return []
+
+
+def test_a_rim_beside_a_cover_is_not_a_free_view() -> None:
+    """A fisheye of 848x800 px: as many corners as without the cover, all beyond 70 degrees."""
+    rng = np.random.default_rng(0)
+    radius, angle = 400 * np.sqrt(rng.uniform(0, 1, 400)), rng.uniform(0, 2 * np.pi, 400)
+
+    def corners(radii: F64, angles: F64) -> Corners:
+        around = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        uv = ([424.0, 400.0] + radii[:, None] * around).astype(np.float32)
+        points = np.tile(np.array([0, 0, 2], np.float32), (len(uv), 1))
+        return Corners(uv, uv.copy(), points, np.zeros((len(uv), 32), np.uint8))
+
+    rim, part = 345 + 50 * radius / 400, angle < 1.5 * np.pi
+    for now, free in (
+        (corners(radius, angle), True),
+        (corners(radius[part], angle[part]), True),
+        (corners(rim, angle), False),
+    ):
+        places = Places(now)
+        recovery = Recovery(places, places, (848, 800))  # type: ignore[arg-type]
+        recovery.remember(dataclasses.replace(keyframe(BEGIN), corners=corners(radius, angle)))
+        recovery.motion.add(0, np.eye(4))
+        pyramids = StereoPyramids([], np.zeros((1, 1), np.float32))
+        list(recovery.search(covered(0), pyramids, recovery.motion.expect(10**8)))
+        assert recovery.free == free
 
 
 def test_an_image_with_fewer_points_is_held_once_the_view_has_changed() -> None:
