@@ -15,6 +15,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.wheel_fit import fit_wheel
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, I64, ImuSamples, StereoImage, WheelSamples
+from tests.sensor_drive import THREE_DEGREES, miscalibrated
 
 NOISE = np.array([5e-4, 5e-4, 5e-4, 1e-4, 1e-4, 1e-4])  # of a pose: metres, radians
 DRIFT, WANDER = 2e-5, 5e-5  # of the odometry's rotation: rad/s, rad/sqrt(s)
@@ -109,14 +110,9 @@ def standing(minutes: int) -> Iterator[Row]:
     yield f"2 {minutes} minutes at rest", "2 mm, 0.02°", f"{1e3 * metres:.2f} mm, {degrees:.4f}°", holds
 
 
-TURN = se3.from_rotation_translation(se3.so3_exp(np.radians(3) * np.array([0.6, -0.64, 0.48])), np.zeros(3))
-
-
-def miscalibrated(rig: Rig) -> Rig:
+def wrong(rig: Rig) -> Rig:
     """3 degrees and 2 % off, and without the IMU's time offset."""
-    assert rig.imu is not None and rig.wheel is not None
-    imu = replace(rig.imu, offset_s=0.0, left_T_imu=rig.imu.left_T_imu @ TURN)
-    return replace(rig, imu=imu, wheel=replace(rig.wheel, radii_m=tuple(1.02 * r for r in rig.wheel.radii_m)))
+    return miscalibrated(rig, THREE_DEGREES, 0.0, 0.02)
 
 
 def miscalibration(found: Rig, true: Rig) -> tuple[float, float, float]:
@@ -139,15 +135,15 @@ def recovery(seeds: int) -> Iterator[Row]:
         rng = np.random.default_rng(seed)
         seen = poses[:count] @ np.array([se3.exp(n) for n in rng.normal(0, 1, (count, 6)) * NOISE])
         stamps: I64 = np.array([source.stamp_ns(k) for k in range(count)], np.int64)
-        wrong = miscalibrated(source.rig)
+        rig = wrong(source.rig)
         samples = ImuSamples.joined([i for i, _ in parts if i is not None])
         speeds = WheelSamples.joined([w for _, w in parts if w is not None])
-        assert wrong.imu is not None and wrong.wheel is not None
+        assert rig.imu is not None and rig.wheel is not None
         new_imu, new_wheel = (
-            fit_imu(stamps, seen, samples, wrong.imu).imu,
-            fit_wheel(stamps, seen, speeds, wrong.wheel).wheel,
+            fit_imu(stamps, seen, samples, rig.imu).imu,
+            fit_wheel(stamps, seen, speeds, rig.wheel).wheel,
         )
-        left = miscalibration(replace(wrong, imu=new_imu, wheel=new_wheel), source.rig)
+        left = miscalibration(replace(rig, imu=new_imu, wheel=new_wheel), source.rig)
         for values, value in zip((turns, offsets, radii), left, strict=True):
             values.append(value)
     yield "3 time offset of 20 ms", "0.5 ms", f"{max(offsets):.2f} ms at most", max(offsets) <= 0.5

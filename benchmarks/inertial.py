@@ -35,7 +35,7 @@ from _sequences import data_root, one_thread
 
 one_thread()
 
-from _inertial_drives import Row, cost, drives, miscalibrated, miscalibration, recovery, standing
+from _inertial_drives import Row, cost, drives, miscalibration, recovery, standing, wrong
 
 from stereo_sfm.calib.sensor_terms import with_sensor_terms
 from stereo_sfm.config import Config
@@ -342,7 +342,7 @@ def online(seeds: int, size: str, rate: int) -> Iterator[Row]:
         spec = f"sim:loop?size={size}&rate={rate}&seed={seed}&imu=t265&imu_offset_ms=20&wheel=differential"
         with open_source(f"{spec}&wheel_grade=ideal") as source:
             images, true, truth = list(source), source.rig, source.ground_truth
-        for rig in (miscalibrated(true), true):
+        for rig in (wrong(true), true):
             record = RunRecord.of(config)
             list(run(MemorySource(rig, images, truth), config, [record]))
             found = with_sensor_terms(rig, record.sensor_updates[-1]) if record.sensor_updates else rig

@@ -57,18 +57,19 @@ def _lower_quartile(values: F64) -> float:
 def _rests(stamp_ns: I64, poses: F64) -> list[tuple[int, int]]:
     """Stamps between which the camera stands, a second each."""
     out: list[tuple[int, int]] = []
-    first = 0
-    while first < len(stamp_ns):
-        last = int(np.searchsorted(stamp_ns, stamp_ns[first] + round(REST_S * 1e9), "right")) - 1
-        if stamp_ns[last] - stamp_ns[first] < 0.8 * REST_S * 1e9:
-            first += 1
+    lasts = np.searchsorted(stamp_ns, stamp_ns + round(REST_S * 1e9), "right") - 1
+    near = np.linalg.norm(poses[lasts, :3, 3] - poses[:, :3, 3], axis=1) < REST_M
+    possible = near & (stamp_ns[lasts] - stamp_ns >= 0.8 * REST_S * 1e9)  # most of a drive is not
+    until = 0
+    for first in np.flatnonzero(possible).tolist():
+        last = int(lasts[first])
+        if first < until:
             continue
         moved = se3.inverse(poses[first]) @ poses[first : last + 1]
         metres, radians = np.linalg.norm(moved[:, :3, 3], axis=1), np.linalg.norm(se3.so3_log(moved[:, :3, :3]), axis=1)
         if metres.max() < REST_M and radians.max() < REST_RAD:
             out.append((int(stamp_ns[first]), int(stamp_ns[last])))
-            first = last
-        first += 1
+            until = last + 1
     return out
 
 

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
+from stereo_sfm.calib.imu_fit import with_imu_terms
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.wheel import Wheel
 from stereo_sfm.drivers.options import read_options
 from stereo_sfm.drivers.sim.options import SimOptions
@@ -13,6 +17,14 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, I64, ImuSamples, WheelSamples
 
 FRAMES = 450
+THREE_DEGREES = np.radians(3) * np.array([0.6, -0.64, 0.48])
+
+
+def miscalibrated(rig: Rig, turn: F64, offset_s: float, radius: float) -> Rig:
+    """The IMU turned by (3,) radians and with this time offset, the wheels' radii wrong by a share."""
+    assert rig.imu is not None and rig.wheel is not None
+    imu = with_imu_terms(rig.imu, np.append(turn, offset_s - rig.imu.offset_s))
+    return replace(rig, imu=imu, wheel=replace(rig.wheel, radii_m=tuple((1 + radius) * r for r in rig.wheel.radii_m)))
 
 
 class SensorDrive:

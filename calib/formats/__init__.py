@@ -29,8 +29,7 @@ FORMATS: dict[str, tuple[str, str, str, bool]] = {
     "depthai": ("depthai", "read_depthai", "write_depthai", False),
 }
 
-
-WITH_IMU = "rig", "kalibr", "euroc", "basalt", "depthai"
+WITH_IMU = "rig", "kalibr", "euroc", "basalt", "depthai"  # formats that store one
 
 
 def load_rig(path: Path | str, format: str | None = None, **options: Any) -> Rig:

@@ -85,8 +85,8 @@ class WheelSensor:
         linear[:, 0] = speed[:, 0] * ahead + speed[:, 1] * left
         linear[:, 1] = speed[:, 1] * ahead - speed[:, 0] * left
         angular[:, 2] = speed[:, 2]
-        floor, metres = self._drive.floor, self._drive.metres(seconds)
-        if floor is not None:  # along the slope, and turning about an axis that leans with the robot
+        if (floor := self._drive.floor) is not None:  # along the slope, turning about an axis that leans with the robot
+            metres = self._drive.metres(seconds)
             rise, tilt = floor.climb(metres) * self._drive.metres(seconds, 1), floor.tilt(metres)
             linear[:, 0] = linear[:, 0] * np.cos(tilt) + rise * np.sin(tilt)
             angular[:, 2] *= np.cos(tilt)

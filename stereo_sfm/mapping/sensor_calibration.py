@@ -73,7 +73,7 @@ class SensorCalibration:
         self._parts: deque[SensorSamples] = deque()
         self._submap_id = 0
         self._imu, self._wheel = _Terms.of(3, IMU_KNOWN, IMU_LEFT), _Terms.of(1, WHEEL_KNOWN, WHEEL_LEFT)
-        self._due_ns: int | None = None
+        self._due_ns = 0
 
     @staticmethod
     def wanted(config: Config, rig: Rig) -> SensorCalibration | None:
@@ -93,7 +93,7 @@ class SensorCalibration:
         self._parts.append(keyframe.samples)
         while keyframe.stamp_ns - int(self._parts[0].stamp_ns[0]) > WINDOW_S * 1e9:
             self._parts.popleft()
-        if self._due_ns is None or keyframe.stamp_ns < self._due_ns:
+        if keyframe.stamp_ns < self._due_ns:
             return None
         self._due_ns = keyframe.stamp_ns + round(EVERY_S * 1e9)
         return self._compared(keyframe.kf_id, keyframe.stamp_ns, version)

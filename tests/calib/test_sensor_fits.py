@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from stereo_sfm.calib import load_rig, save_rig
-from stereo_sfm.calib.imu_fit import fit_imu, judge_imu, precision_imu
+from stereo_sfm.calib.imu_fit import fit_imu, judge_imu, precision_imu, with_imu_terms
 from stereo_sfm.calib.robust_fit import Whitening, robust_fit, shift_between
 from stereo_sfm.calib.sample_noise import judge_noise, judge_wheel_noise, noise_at_rest, noise_of_speeds
 from stereo_sfm.calib.wheel_fit import fit_wheel, judge_wheel, precision_wheel
@@ -20,7 +20,7 @@ from stereo_sfm.drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import ImuSamples
-from tests.sensor_drive import FRAMES, SensorDrive
+from tests.sensor_drive import FRAMES, THREE_DEGREES, SensorDrive, miscalibrated
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -28,8 +28,7 @@ def test_20_ms_and_3_degrees_of_an_imu_are_found(seed: int) -> None:
     found = SensorDrive(seed, imu_offset_ms=20)
     true = found.source.rig.imu
     assert true is not None
-    turn = se3.from_rotation_translation(se3.so3_exp(np.radians(3) * np.array([0.6, -0.64, 0.48])), np.zeros(3))
-    wrong = replace(true, offset_s=0.0, left_T_imu=true.left_T_imu @ turn)
+    wrong = with_imu_terms(true, np.append(THREE_DEGREES, -true.offset_s))
     fit = fit_imu(found.stamp_ns, found.poses, found.imu, wrong)
     off = np.degrees(np.linalg.norm(se3.so3_log(fit.imu.left_T_imu[:3, :3].T @ true.left_T_imu[:3, :3])))
     assert abs(fit.imu.offset_s - 0.02) < 5e-4 and off < 0.1
@@ -230,10 +229,7 @@ def test_wrong_sensors_of_a_recording_are_calibrated_and_checked(
     with open_source(spec) as source:
         rig = source.rig
     assert rig.imu is not None and rig.wheel is not None
-    turn = se3.from_rotation_translation(se3.so3_exp(np.radians(3) * np.array([0.6, -0.64, 0.48])), np.zeros(3))
-    imu = replace(rig.imu, offset_s=0.0, left_T_imu=rig.imu.left_T_imu @ turn)
-    wheel = replace(rig.wheel, radii_m=tuple(1.02 * r for r in rig.wheel.radii_m))
-    save_rig(replace(rig, imu=imu, wheel=wheel), tmp_path / "wrong.yaml")
+    save_rig(miscalibrated(rig, THREE_DEGREES, 0.0, 0.02), tmp_path / "wrong.yaml")
     options = ["--rig", str(tmp_path / "wrong.yaml")]
     assert main(["calibrate", spec, "--imu", "--wheel", *options, "-o", str(tmp_path / "right.yaml")]) == 0
     print(capsys.readouterr().out)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ import pytest
 from stereo_sfm.calib import load_rig, save_rig
 from stereo_sfm.cli import main
 from stereo_sfm.drivers.source import open_source
+from tests.sensor_drive import miscalibrated
 
 SPEC = "sim:loop?size=212x200&rate=10&start=60&frames=32&imu=t265&wheel=differential&dark=8-8.5"
 
@@ -43,8 +43,7 @@ def test_a_wrong_calibration_of_the_sensors_is_corrected_while_driving(
     with open_source(spec) as source:
         true = source.rig
     assert true.imu is not None and true.wheel is not None
-    wheel = replace(true.wheel, radii_m=tuple(1.04 * r for r in true.wheel.radii_m))
-    save_rig(replace(true, imu=replace(true.imu, offset_s=0.0), wheel=wheel), tmp_path / "wrong.yaml")
+    save_rig(miscalibrated(true, np.zeros(3), 0.0, 0.04), tmp_path / "wrong.yaml")
     args = ["run", spec, "--rig", str(tmp_path / "wrong.yaml"), "-o", str(tmp_path / "run"), "--calibrate-sensors"]
     assert main(args) == 0
     assert "IMU time offset: offset +" in capsys.readouterr().out.replace("\n", " ")

@@ -14,10 +14,9 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.mapper import Mapper
 from stereo_sfm.mapping.sensor_calibration import SensorCalibration
 from stereo_sfm.types import F64, Keyframe, SensorSamples, SensorUpdate
-from tests.sensor_drive import FRAMES, SensorDrive
+from tests.sensor_drive import FRAMES, THREE_DEGREES, SensorDrive, miscalibrated
 
 EVERY = 15  # images from one keyframe to the next
-TURN = se3.from_rotation_translation(se3.so3_exp(np.radians(3) * np.array([0.6, -0.64, 0.48])), np.zeros(3))
 
 
 def drive(seed: int) -> SensorDrive:
@@ -26,9 +25,7 @@ def drive(seed: int) -> SensorDrive:
 
 def wrong(rig: Rig) -> Rig:
     """20 ms, 3 degrees and 2 % off."""
-    assert rig.imu is not None and rig.wheel is not None
-    imu = replace(rig.imu, offset_s=0.0, left_T_imu=rig.imu.left_T_imu @ TURN)
-    return replace(rig, imu=imu, wheel=replace(rig.wheel, radii_m=tuple(1.02 * r for r in rig.wheel.radii_m)))
+    return miscalibrated(rig, THREE_DEGREES, 0.0, 0.02)
 
 
 def keyframe(kf_id: int, stamp_ns: int, pose: F64, samples: SensorSamples | None, submap_id: int = 0) -> Keyframe:

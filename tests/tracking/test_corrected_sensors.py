@@ -6,24 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from stereo_sfm.calib.imu_fit import with_imu_terms
-from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.sensor_terms import with_sensor_terms
 from stereo_sfm.config import Config
 from stereo_sfm.geometry import se3
 from stereo_sfm.tracking.inertial.motion_sensors import MotionSensors
 from stereo_sfm.types import SensorUpdate, StereoImage
-from tests.sensor_drive import SensorDrive
+from tests.sensor_drive import SensorDrive, miscalibrated
 
 NOTHING = np.zeros((1, 1), np.uint8)
 SMALL = np.diag(np.full(6, 1e-8))
 TURN, OFFSET_S, RADIUS = np.radians([2.0, -1.5, 1.0]), 0.02, 0.03
-
-
-def wrong(rig: Rig) -> Rig:
-    assert rig.imu is not None and rig.wheel is not None
-    imu = with_imu_terms(rig.imu, np.append(TURN, -OFFSET_S))
-    return replace(rig, imu=imu, wheel=replace(rig.wheel, radii_m=tuple(r * (1 + RADIUS) for r in rig.wheel.radii_m)))
 
 
 def correction() -> SensorUpdate:
@@ -51,7 +43,7 @@ def off_mm(of: SensorDrive, sensors: MotionSensors, first: int, last: int) -> fl
 
 def test_sensors_go_on_with_a_corrected_calibration() -> None:
     of = SensorDrive(0, wheel="differential", wheel_grade="ideal")
-    true, start = of.source.rig, wrong(of.source.rig)
+    true, start = of.source.rig, miscalibrated(of.source.rig, TURN, -OFFSET_S, RADIUS)
     config = Config().tracker
     errors: dict[str, float] = {}
     for name, rig in (("true", true), ("wrong", start), ("corrected", start)):

@@ -32,10 +32,8 @@ class CollectedSamples:
         self._stamp_ns.append(stamp_ns)
         self._poses.append(odom_T_cam.copy())
 
-    def take(self) -> SensorSamples:
-        """What was collected, which is then forgotten."""
+    def joined(self) -> SensorSamples:
+        """What was collected."""
         imu = ImuSamples.joined(self._imu) if self._imu else None
         wheel = WheelSamples.joined(self._wheel) if self._wheel else None
-        taken = SensorSamples(np.array(self._stamp_ns, np.int64), np.array(self._poses).reshape(-1, 4, 4), imu, wheel)
-        self.__init__()
-        return taken
+        return SensorSamples(np.array(self._stamp_ns, np.int64), np.array(self._poses).reshape(-1, 4, 4), imu, wheel)

@@ -174,7 +174,11 @@ class MotionSensors:
 
     def samples(self) -> SensorSamples | None:
         """What calibrates them, since the keyframe before; None where that is not asked for."""
-        return None if self._collected is None else self._collected.take()
+        collected = self._collected
+        if collected is None:
+            return None
+        self._collected = CollectedSamples()
+        return collected.joined()
 
     def news(self) -> str:
         """Why a sensor is left out, once; "" otherwise."""
