@@ -87,9 +87,8 @@ def fit_wheel(stamp_ns: I64, poses: F64, samples: WheelSamples, wheel: Wheel) ->
         return whole(fit.value), sigma
 
     value, sigma = fitted(free, np.array([0, 0, 0, 0, 0, offset, 0, 0]))
-    if (
-        turning and (np.abs(value[POSITION]) < PLACED_SIGMAS * sigma[POSITION]).all()
-    ):  # it is where the calibration says
+    as_calibrated = bool((np.abs(value[POSITION]) < PLACED_SIGMAS * sigma[POSITION]).all())
+    if turning and as_calibrated:
         free[POSITION] = False
         value, others = fitted(free, value)
         sigma[free] = others[free]
