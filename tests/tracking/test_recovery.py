@@ -252,13 +252,29 @@ def test_a_rim_beside_a_cover_is_not_a_free_view() -> None:
 
 
 def test_an_image_with_fewer_points_is_held_once_the_view_has_changed() -> None:
-    """Of points 4 m away half are out of view after 2.8 m; a robot that stands keeps the image with the most."""
-    tracks = Tracks().keep(np.zeros(0, bool))
-    tracks.point_ids, tracks.rho = np.arange(300), np.full(300, 0.25)
-    held = Held(StereoPyramids((), ()), tracks, np.eye(4))
-    assert held.worth(np.eye(4)) == 300
-    assert held.worth(se3.exp(np.array([0.0, 0.0, 2.8, 0.0, 0.0, 0.0]))) == pytest.approx(150)
-    assert held.worth(se3.exp(np.array([0.0, 0.0, 0.0, 0.0, 0.5, 0.0]))) == pytest.approx(150)
+    """Half the points are held while a robot stands before a wall, not after it drove on, nor when it drove past.
+
+    What was added to the held image after a loss does not make it better than a new one.
+    """
+    camera = drive().rig.left
+    tracker = make_tracker_with_places(Config(), drive().rig)
+    assert isinstance(tracker, Tracker)
+    follower = tracker._follower  # pyright: ignore[reportPrivateUsage]
+    uv = np.stack(np.meshgrid(np.linspace(150, 270, 12), np.linspace(140, 260, 12)), -1).reshape(-1, 2)
+    bearing = camera.unproject(uv)
+    n = len(uv)
+    tracks = Tracks(
+        np.arange(n), uv, uv, np.zeros((n, 3)), bearing, bearing[:, 2] / 4.0, np.ones(n), np.ones(n, np.int32),
+        np.zeros(n, np.int32), np.zeros((n, 2, 2)), np.arange(n), np.zeros(n, bool), np.zeros(n, bool),
+    )  # fmt: skip
+    half, pyramids = np.arange(n) % 2 == 0, StereoPyramids((), ())
+    for metres, held_anew in ((0.0, False), (0.5, False), (2.5, True), (4.5, True)):
+        follower.forget()
+        follower.hold(pyramids, tracks, np.ones(n, bool), np.eye(4))
+        first = follower.held
+        first.add(tracks.append(tracks).append(tracks))
+        follower.hold(pyramids, tracks, half, se3.exp(np.array([0.0, 0.0, metres, 0.0, 0.0, 0.0])))
+        assert (follower.held is not first) == held_anew
 
 
 def test_a_pose_from_a_part_of_the_view_is_found_anew_once_more_is_free() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
-from stereo_sfm.geometry.order_statistics import median, median_distance
+from stereo_sfm.geometry.order_statistics import median_distance
 from stereo_sfm.tracking.flow import klt
 from stereo_sfm.tracking.flow.coarse_rotation import CoarseRotation
 from stereo_sfm.tracking.flow.frame_pose import ExpectedMotion
@@ -26,9 +26,6 @@ from stereo_sfm.types import F64, I64, Bool
 WELL_PREDICTED_PX = 3.0  # median error of the predictions below which the search starts in the half image
 ALIGNED_PX = 1.5  # the same, below which first appearances are aligned from the predictions
 STORED = 4  # times max_features: points of the last image and of the held one, and new ones of the held one
-# After which motion an image with half as many points is as good to recover from: half of the first one's have left
-# the view. Time does not count: who comes towards the robot hides the middle of the view for seconds.
-HALF_VIEW_SHARE, HALF_VIEW_RADIANS = 0.7, 0.5  # of the median distance of its points; radians
 MIN_COARSE_NCC = 0.65  # of a window found again in the half image
 GRID = 8, 6  # columns and rows of the image
 CELL_POINTS = 4.0  # with which a cell counts fully
@@ -45,6 +42,10 @@ class Held:
     pose: F64  # (4, 4) odom_T_cam
     dense: bool = False  # whether points were added for the recovery
     _surfaces: F64 | None = None
+    tracked: F64 = field(init=False)  # (N, 3) metres, the points without those added for the recovery
+
+    def __post_init__(self) -> None:
+        self.tracked = self.tracks.points()
 
     def surfaces(self, camera: Camera) -> F64:
         """`surfaces_around` the points, in the camera at the pose."""
@@ -56,12 +57,6 @@ class Held:
     def add(self, tracks: Tracks) -> None:
         """Replace the points by more, for the recovery."""
         self.tracks, self.dense, self._surfaces = tracks, True, None
-
-    def worth(self, pose: F64) -> float:
-        """Number of points with which another image, taken at a pose (4, 4), is as good."""
-        metres, radians = se3.extent(se3.inverse(self.pose) @ pose)
-        half_view = HALF_VIEW_SHARE / float(median(self.tracks.rho))
-        return len(self.tracks) * 0.5 ** (float(metres) / half_view + float(radians) / HALF_VIEW_RADIANS)
 
 
 class Follower:
@@ -98,10 +93,24 @@ class Follower:
     def hold(self, images: StereoPyramids, tracks: Tracks, trusted: Bool, pose: F64) -> None:
         """Keep an image with a trusted pose (4, 4) and its trusted points (N,) for recovery, if it has enough.
 
-        Whatever is about to cover the camera already hides a part of the last images.
+        Whatever is about to cover the camera already hides a part of the last images. Time does not count: who comes
+        towards the robot hides the middle of the view for seconds.
         """
-        if self._held is None or np.count_nonzero(trusted) >= self._held.worth(pose):
+        if self._held is None or np.count_nonzero(trusted) >= self._worth(self._held, pose):
             self._held = Held(images, tracks.keep(trusted), pose)
+
+    def _worth(self, held: Held, pose: F64) -> float:
+        """Number of points with which an image taken at a pose (4, 4) is as good to recover from as the held one.
+
+        Of the held points those count that are still in view, by how similar they look: by the ratio of their distances
+        and the cosine between their directions.
+        """
+        points = held.tracked
+        in_view = self._area.inside(self._camera.project(se3.transform(se3.inverse(pose), points)))
+        before, now = points[in_view] - held.pose[:3, 3], points[in_view] - pose[:3, 3]
+        squared = [np.einsum("ni,ni->n", rays, rays) for rays in (before, now)]
+        similarity = np.einsum("ni,ni->n", before, now) / np.maximum(*squared)
+        return float(np.maximum(similarity, 0.0).sum())
 
     def forget(self) -> None:
         """Give up the held image: a new odometry begins."""

@@ -168,7 +168,8 @@ class Tracker:
         trusted = self._trusted(tracks, solution)
         if trusted:
             self._recovery.motion.add(image.stamp_ns, solution.pose)
-            self._follower.hold(images, tracks, solution.inlier & ~tracks.moving, solution.pose)
+            if not self._part.wanted(self._follower.held, image.stamp_ns):
+                self._follower.hold(images, tracks, solution.inlier & ~tracks.moving, solution.pose)
         stats = _stats(tracks, solution)
         inlier = self._accept(image, images, tracks, solution, expected.seconds, recovered)
         keyframe = None
