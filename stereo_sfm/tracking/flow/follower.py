@@ -42,10 +42,10 @@ class Held:
     pose: F64  # (4, 4) odom_T_cam
     dense: bool = False  # whether points were added for the recovery
     _surfaces: F64 | None = None
-    tracked: F64 = field(init=False)  # (N, 3) metres, the points without those added for the recovery
+    rays: F64 = field(init=False)  # (N, 3) metres from the camera to the points tracked in it, odometry axes
 
     def __post_init__(self) -> None:
-        self.tracked = self.tracks.points()
+        self.rays = self.tracks.points() - self.pose[:3, 3]
 
     def surfaces(self, camera: Camera) -> F64:
         """`surfaces_around` the points, in the camera at the pose."""
@@ -102,15 +102,14 @@ class Follower:
     def _worth(self, held: Held, pose: F64) -> float:
         """Number of points with which an image taken at a pose (4, 4) is as good to recover from as the held one.
 
-        Of the held points those count that are still in view, by how similar they look: by the ratio of their distances
-        and the cosine between their directions.
+        Of the points tracked in it those count that are still in view, by how similar they look: by the ratio of their
+        distances and the cosine between their directions.
         """
-        points = held.tracked
-        in_view = self._area.inside(self._camera.project(se3.transform(se3.inverse(pose), points)))
-        before, now = points[in_view] - held.pose[:3, 3], points[in_view] - pose[:3, 3]
-        squared = [np.einsum("ni,ni->n", rays, rays) for rays in (before, now)]
-        similarity = np.einsum("ni,ni->n", before, now) / np.maximum(*squared)
-        return float(np.maximum(similarity, 0.0).sum())
+        before, now = held.rays, held.rays + (held.pose[:3, 3] - pose[:3, 3])
+        in_view = self._area.inside(self._camera.project(now @ pose[:3, :3]))
+        longer = np.maximum(np.einsum("ni,ni->n", before, before), np.einsum("ni,ni->n", now, now))
+        similarity = np.einsum("ni,ni->n", before, now) / longer
+        return float(np.maximum(similarity[in_view], 0.0).sum())
 
     def forget(self) -> None:
         """Give up the held image: a new odometry begins."""
