@@ -148,8 +148,8 @@ def accumulate(
                 worst = max(worst, abs(residual[i]))
                 size[n] += residual[i] * residual[i]
             rows[n] += used
-            ratio = worst / (3.0 * sigma)
-            w = 0.0 if hard and ratio > 2.0 else 1.0 / ((1.0 + ratio * ratio) * (inflation * sigma) ** 2)
+            ratio = worst / sigma  # Cauchy's scale: tracks' errors have long tails, and lean to one side there
+            w = 0.0 if hard and ratio > 6.0 else 1.0 / ((1.0 + ratio * ratio) * (inflation * sigma) ** 2)
             if w == 0.0:
                 continue
             o = shared + 6 * (f - 1)

@@ -5,8 +5,10 @@ is summed. Terms are corrected that differ from the current ones by several stan
 the windows (even and odd ones) confirm, and that exceed the systematic error of matching (`calib.choice`). Once one is,
 others follow that are worth their variance. The rows show terms of lenses, which change lengths by what the lens model
 says of disparities: lengths stay unless there is evidence about them. A corrected term is refined as long as windows
-come, first whenever their number has doubled. Where the windows show drift (temperature), the rig is known to be wrong:
-the terms at the newest window are used from it on, and the windows since the last revision are on the way there.
+come, first whenever their number has doubled. Points are tracked where a wrong rig expects them, and agree with it a
+little: once there are enough windows since a large correction, those before it are discarded. Where the windows show
+drift (temperature), the rig is known to be wrong: the terms at the newest window are used from it on, and the windows
+since the last revision are on the way there.
 
 After a sudden change of the rig (a knock) earlier windows are discarded, and the correction applies from the first
 keyframe on that was seen by the changed rig. What the rig before it measured of the points that are seen before and
@@ -49,7 +51,8 @@ KNOCK_KEYFRAMES = 2  # after a rotation that the tracker noticed, from which the
 DRIFT_WINDOWS = 8  # needed to detect drift
 SIGMAS = 5.0  # significance of the first term that is corrected
 FURTHER_SIGMAS = np.sqrt(2.0)  # of others, once the calibration is known to be wrong (Akaike's criterion)
-REFINED_SIGMAS = 1.0  # its refinement: below, a change is not worth the bundle adjustment
+REFINED_SIGMAS = 0.3  # its refinement: below, a change is not worth the bundle adjustment
+MISLED_SHARE = 0.1  # of a rig's error that remains in what is estimated from points tracked with it
 MATCHING_PX = 0.02  # systematic error of matching
 DIRECTION = np.deg2rad(0.15)  # systematic error of the baseline's direction: matching errors that depend on distance
 
@@ -79,6 +82,7 @@ class SelfCalibration:
         self._since = 0  # first keyframe of the windows
         self._revised_ns = 0  # newest window of the last revision
         self._until_due = MIN_WINDOWS  # windows until the next revision
+        self._misled_kf_id = -1  # last keyframe tracked with a rig that a large correction has shown to be wrong
         self._stepped = False  # a step was detected and is not yet corrected
         self._straddling = False  # it may have happened during the first window
         self._step_between = 0, 0  # keyframes between which it happened
@@ -122,7 +126,7 @@ class SelfCalibration:
         """After the last keyframe: a last revision from all windows."""
         if len(self._keyframes) >= MIN_KEYFRAMES:
             self._close_window()
-        return self._revise(SIGMAS) if len(self.windows) >= MIN_WINDOWS else None
+        return self._revise(SIGMAS, refined_sigmas=0.0) if len(self.windows) >= MIN_WINDOWS else None
 
     def estimate(self, windows: Sequence[RigWindow]) -> Estimate:
         """Change of the current terms estimated from windows; its covariance includes systematic matching errors."""
@@ -144,17 +148,23 @@ class SelfCalibration:
                 self._since = self.windows[1].first_kf_id
             self.windows.append(window)
             self._until_due -= 1
+            self._drop_misled()
             self._detect_step()
             self._drop_straddling()
         return window is not None
 
-    def _revise(self, first_sigmas: float) -> Revision | None:
-        """`first_sigmas`: significance of the first correction of a term."""
+    def _drop_misled(self) -> None:
+        later = [w for w in self.windows if w.first_kf_id > self._misled_kf_id]
+        if ENOUGH_WINDOWS <= len(later) < len(self.windows):
+            self.windows = deque(later, maxlen=MAX_WINDOWS)
+
+    def _revise(self, first_sigmas: float, refined_sigmas: float = REFINED_SIGMAS) -> Revision | None:
+        """`first_sigmas`, `refined_sigmas`: significance of the first correction of a term, and of further ones."""
         windows = list(self.windows)
         drift = self._drift(windows)
         enough = self._corrected.any() or len(windows) >= ENOUGH_WINDOWS
         self._until_due = min(len(windows), MAX_BETWEEN) if enough else 1
-        found = self._change(windows, first_sigmas, drift)
+        found = self._change(windows, first_sigmas, drift, refined_sigmas)
         if found is None:
             return None
         if self._stepped:
@@ -163,6 +173,8 @@ class SelfCalibration:
         if drift is not None:
             return self._revision(found, "drift", windows[-1].first_kf_id, self._on_the_way(found.value))
         why = "refined" if self._corrected[found.written].all() else "significant"
+        if (MISLED_SHARE * np.abs(found.value) > self._floor).any():
+            self._misled_kf_id = windows[-1].last_kf_id
         return self._revision(found, why, self._since)
 
     def _on_the_way(self, change: F64) -> tuple[tuple[int, F64], ...]:
@@ -171,12 +183,18 @@ class SelfCalibration:
         between = [w for w in self.windows if begin < w.stamp_ns < end]
         return tuple((w.first_kf_id, self.terms + (w.stamp_ns - begin) / (end - begin) * change) for w in between)
 
-    def _change(self, windows: Sequence[RigWindow], first_sigmas: float, drift: _Drift | None = None) -> _Change | None:
+    def _change(
+        self,
+        windows: Sequence[RigWindow],
+        first_sigmas: float,
+        drift: _Drift | None = None,
+        refined_sigmas: float = REFINED_SIGMAS,
+    ) -> _Change | None:
         """What windows show to be wrong; None if nothing is."""
         whole = self.estimate(windows) if drift is None else drift.at_the_end[0]
         drifting = NONE if drift is None else drift.terms
         further = FURTHER_SIGMAS if self._corrected.any() else np.where(drifting, FURTHER_SIGMAS, first_sigmas)
-        sigmas = np.where(self._corrected, REFINED_SIGMAS, further)
+        sigmas = np.where(self._corrected, refined_sigmas, further)
         if whole.reach < sigmas.min():
             return None
         parts = windows[::2], windows[1::2] or windows  # one window: what a step has left
