@@ -98,6 +98,30 @@ def test_a_decentered_lens_is_found(kind: int) -> None:
     assert np.abs(np.rad2deg(estimator.terms[:3])).max() < 0.015
 
 
+@pytest.mark.parametrize("name", RIGS)
+def test_points_tracked_with_a_wrong_rig_are_forgotten(name: str) -> None:
+    """They agree with it by a twentieth of its error, and so would the correction."""
+    true = RIGS[name]
+    wrong, misled = turned(true, (0.0, 0.2, 0.0)), turned(true, (0.0, 0.01, 0.0))
+    estimator = SelfCalibration(wrong)
+    tracked = [*([misled] * 12), *([true] * 60)]
+    found = [r for k in keyframes(tracked, wrong, 1, noise_px=0.03) if (r := estimator.add(k)) is not None]
+    assert found and found[0].why == "significant"
+    assert min(w.first_kf_id for w in estimator.windows) > 0
+    last = estimator.finish()
+    assert last is not None and last.why == "refined"
+    assert np.rad2deg(abs(last.terms[1] + np.deg2rad(0.2))) < 0.003
+
+
+def test_all_windows_count_at_the_end() -> None:
+    """A change that is not worth a bundle adjustment while mapping is made after the last keyframe."""
+    true = RIGS["pinhole"]
+    estimator, found = revisions(true, turned(true, (0.0, 0.1, 0.0)), 3, count=40)
+    left = estimator.estimate(list(estimator.windows)).without(np.arange(RIG_TERMS) == 1)
+    assert found[-1].why == "refined"
+    assert left.strength[1] < 0.05
+
+
 def test_lengths_stay_without_evidence_about_them() -> None:
     """Decentering, known from rows, shifts disparities as well; a rotation about y balances it."""
     believed = RIGS["pinhole"]
