@@ -90,14 +90,14 @@ def rectify(
     Raises:
         StereoSfmError: one camera, depth camera, unknown projection, or geometry that cannot be rectified.
     """
-    if rig.right is None or rig.depth:
+    if (second := rig.second_camera) is None:
         raise StereoSfmError("rectification needs two cameras: this source has one")
     one_of(projection, ("pinhole", "epipolar"), "projection")
     rect_R_left, rect_R_right = rectifying_rotations(rig.left_T_right)
     choose = pinhole_camera if projection == "pinhole" else epipolar_camera
-    camera = choose(rig.left, rig.right, rect_R_left, rect_R_right, hfov_deg, size)
+    camera = choose(rig.left, second, rect_R_left, rect_R_right, hfov_deg, size)
     left = _rectified(rig.left, rig.left_mask, camera, rect_R_left)
-    right = _rectified(rig.right, rig.right_mask, camera, rect_R_right)
+    right = _rectified(second, rig.right_mask, camera, rect_R_right)
     cam_T_rect = se3.from_rotation_translation(rect_R_left.T, np.zeros(3))
     baseline = se3.from_rotation_translation(np.eye(3), np.array([rig.baseline, 0.0, 0.0]))
     new = replace(

@@ -74,6 +74,11 @@ class Rig(ReadOnly):
         return self.right is not None
 
     @property
+    def second_camera(self) -> Camera | None:
+        """The right camera; None where there is one camera, or one with depth, whose right camera is virtual."""
+        return None if self.depth else self.right
+
+    @property
     def masked_share(self) -> tuple[float, float]:
         """Share of the left and right image's pixels that are not used."""
         left, right = (0.0 if mask is None else 1.0 - float(mask.mean()) for mask in (self.left_mask, self.right_mask))

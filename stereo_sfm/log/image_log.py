@@ -174,9 +174,9 @@ class ImageLog:
         rows = [*self._above_body(stamp_ns), ("body", "cam0", foxglove.pose(rig.body_T_left))]
         left = foxglove.calibration(rig.left, "cam0", stamp_ns)
         self._writer.write(topics.LEFT_CALIBRATION, left, stamp_ns)
-        if rig.right is not None and not rig.depth:
-            tx = -rig.right.fx * rig.baseline if np.allclose(rig.left_T_right[:3, :3], np.eye(3), atol=1e-9) else 0.0
-            right = foxglove.calibration(rig.right, "cam1", stamp_ns, tx)
+        if (second := rig.second_camera) is not None:
+            tx = -second.fx * rig.baseline if np.allclose(rig.left_T_right[:3, :3], np.eye(3), atol=1e-9) else 0.0
+            right = foxglove.calibration(second, "cam1", stamp_ns, tx)
             self._writer.write(topics.RIGHT_CALIBRATION, right, stamp_ns)
             rows.append(("cam0", "cam1", foxglove.pose(rig.left_T_right)))
         self._writer.write(topics.TF_STATIC, foxglove.transforms(stamp_ns, rows), stamp_ns)

@@ -118,7 +118,7 @@ class SelfCalibration:
     def wanted(config: Config, rig: Rig) -> SelfCalibration | None:
         """The self-calibration of a run, None if it is off or the rig has one camera."""
         mode, flow = config.self_calibration.mode, config.odometry.method == "flow"
-        if mode == "off" or not flow or rig.right is None or rig.depth:
+        if mode == "off" or not flow or rig.second_camera is None:
             return None
         return SelfCalibration(rig, mode == "auto")
 

@@ -66,8 +66,7 @@ class ImageInput:
             StereoSfmError: not an image of this rig.
         """
         rig = self._rig
-        two = rig.right is not None and not rig.depth
-        if two and image.right is None:
+        if rig.second_camera is not None and image.right is None:
             raise StereoSfmError(f"frame {image.frame_id} has no right image, but the calibration is for two cameras")
         if rig.depth and image.depth is None:
             raise StereoSfmError(

@@ -38,10 +38,8 @@ class ImageLayout:
     @staticmethod
     def of(rig: Rig) -> ImageLayout:
         """What this rig's images need."""
-        left = (rig.left.height, rig.left.width)
-        stereo = rig.right is not None and not rig.depth
-        assert rig.right is not None or not stereo
-        right = (rig.right.height, rig.right.width) if stereo and rig.right is not None else None
+        left, second = (rig.left.height, rig.left.width), rig.second_camera
+        right = None if second is None else (second.height, second.width)
         return ImageLayout(left, right, left if rig.depth else None)
 
     @property

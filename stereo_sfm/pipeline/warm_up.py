@@ -44,7 +44,7 @@ def images(rig: Rig, count: int = FRAMES) -> list[StereoImage]:
     """
     texture = squares(TEXTURE_PX, TEXTURE_PX)
     left_rays = _rays(rig.left)
-    right_rays = None if rig.right is None or rig.depth else _rays(rig.right)
+    right_rays = None if rig.second_camera is None else _rays(rig.second_camera)
     out: list[StereoImage] = []
     for k in range(count):
         world_T_left = se3.exp(np.array([0.03 * k, 0.0, 0.02 * k, 0.0, 0.002 * k, 0.0]))

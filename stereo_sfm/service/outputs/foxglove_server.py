@@ -160,9 +160,9 @@ class FoxgloveOutput:
         rows = [("body", "cam0", foxglove.pose(rig.body_T_left))]
         rows += [("level", "map", foxglove.pose(LEVEL_T_MAP))] if rig.imu is None else []
         self._log(topics.LEFT_CALIBRATION, foxglove.calibration(rig.left, "cam0", stamp))
-        if rig.right is not None and not rig.depth:
+        if rig.second_camera is not None:
             rows.append(("cam0", "cam1", foxglove.pose(rig.left_T_right)))
-            self._log(topics.RIGHT_CALIBRATION, foxglove.calibration(rig.right, "cam1", stamp))
+            self._log(topics.RIGHT_CALIBRATION, foxglove.calibration(rig.second_camera, "cam1", stamp))
         self._log(topics.TF_STATIC, foxglove.transforms(stamp, rows))
 
     def _status(self, status: Status) -> None:

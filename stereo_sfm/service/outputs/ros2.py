@@ -186,7 +186,7 @@ class Ros2Output:
 
         now, base = time.time_ns(), self._config.base_frame
         rows = [ros.transform(now, base, LEFT_FRAME, self._axes.base_T_left)]
-        if started.rig.right is not None and not started.rig.depth:
+        if started.rig.second_camera is not None:
             rows.append(ros.transform(now, LEFT_FRAME, RIGHT_FRAME, started.rig.left_T_right))
         self._topics["/tf_static"].publish(TFMessage(transforms=rows))
 

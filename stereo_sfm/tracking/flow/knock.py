@@ -43,7 +43,7 @@ class KnockDetector:
     def wanted(config: Config, rig: Rig) -> KnockDetector | None:
         """That of a run; None where the mapper does not correct the rig."""
         corrects = config.self_calibration.mode == "auto" and config.mapper.enabled
-        return KnockDetector() if corrects and rig.right is not None and not rig.depth else None
+        return KnockDetector() if corrects and rig.second_camera is not None else None
 
     def seen(self, tracks: Tracks, solution: PoseSolution, cameras: StereoCameras, seconds: float) -> F64 | None:
         """(3,) by which the right camera has turned; None: it has not.
