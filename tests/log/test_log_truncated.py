@@ -214,6 +214,7 @@ def test_a_killed_recording_loses_less_than_half_a_second(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("limit", [20_000, 70_001, 150_003, 400_007])
+@pytest.mark.usefixtures("whole")  # what is compiled for a recording is on the disk already
 def test_a_full_disk_stops_with_one_line_and_leaves_a_closed_file(tmp_path: Path, limit: int) -> None:
     images = stereo_images(60, np.random.default_rng(8))
     path = tmp_path / "full.mcap"
