@@ -18,7 +18,7 @@ from stereo_sfm.drivers.sim.world import Layout
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.recent_places import RecentPlaces
 from stereo_sfm.pipeline.stages import make_tracker_with_places
-from stereo_sfm.tracking.flow.follower import Held
+from stereo_sfm.tracking.flow.follower import Follower, Held
 from stereo_sfm.tracking.flow.frame_pose import PoseSolution
 from stereo_sfm.tracking.flow.partial_view import PartialView
 from stereo_sfm.tracking.flow.pyramids import StereoPyramids
@@ -27,6 +27,7 @@ from stereo_sfm.tracking.flow.tracker import Tracker
 from stereo_sfm.tracking.flow.tracks import Tracks
 from stereo_sfm.tracking.flow.trusted_motion import TrustedMotion
 from stereo_sfm.types import F64, Corners, Frame, Keyframe, StereoImage, TrackState
+from tests.synthetic import pinhole_rig
 
 RATE, BEGIN, COVERED, FREE = 15, 60, range(72, 82), range(82, 90)  # frames: 0.67 s without sight
 
@@ -251,30 +252,51 @@ def test_a_rim_beside_a_cover_is_not_a_free_view() -> None:
         assert recovery.free == free
 
 
-def test_an_image_with_fewer_points_is_held_once_the_view_has_changed() -> None:
-    """Half the points are held while a robot stands before a wall, not after it drove on, nor when it drove past.
-
-    What was added to the held image after a loss does not make it better than a new one.
-    """
-    camera = drive().rig.left
-    tracker = make_tracker_with_places(Config(), drive().rig)
-    assert isinstance(tracker, Tracker)
-    follower = tracker._follower  # pyright: ignore[reportPrivateUsage]
-    uv = np.stack(np.meshgrid(np.linspace(150, 270, 12), np.linspace(140, 260, 12)), -1).reshape(-1, 2)
-    bearing = camera.unproject(uv)
-    n = len(uv)
-    tracks = Tracks(
-        np.arange(n), uv, uv, np.zeros((n, 3)), bearing, bearing[:, 2] / 4.0, np.ones(n), np.ones(n, np.int32),
-        np.zeros(n, np.int32), np.zeros((n, 2, 2)), np.arange(n), np.zeros(n, bool), np.zeros(n, bool),
+def wall(uv: F64, at: float = 0.0) -> Tracks:
+    """Points (N, 2) px of a wall 4 m ahead of the odometry's origin, seen by a pinhole camera driven `at` metres."""
+    bearing, n = pinhole_rig().left.unproject(uv), len(uv)
+    return Tracks(
+        np.arange(n), uv, uv, np.tile([0.0, 0.0, at], (n, 1)), bearing, bearing[:, 2] / (4.0 - at), np.ones(n),
+        np.ones(n, np.int32), np.zeros(n, np.int32), np.zeros((n, 2, 2)), np.arange(n), np.zeros(n, bool),
+        np.zeros(n, bool),
     )  # fmt: skip
-    half, pyramids = np.arange(n) % 2 == 0, StereoPyramids((), ())
-    for metres, held_anew in ((0.0, False), (0.5, False), (2.5, True), (4.5, True)):
-        follower.forget()
-        follower.hold(pyramids, tracks, np.ones(n, bool), np.eye(4))
-        first = follower.held
-        first.add(tracks.append(tracks).append(tracks))
-        follower.hold(pyramids, tracks, half, se3.exp(np.array([0.0, 0.0, metres, 0.0, 0.0, 0.0])))
-        assert (follower.held is not first) == held_anew
+
+
+def along(metres: float) -> F64:
+    return se3.exp(np.array([0.0, 0.0, metres, 0.0, 0.0, 0.0]))
+
+
+def follower() -> Follower:
+    tracker = make_tracker_with_places(Config(), pinhole_rig())
+    assert isinstance(tracker, Tracker)
+    return tracker._follower  # pyright: ignore[reportPrivateUsage]
+
+
+WIDTH, HEIGHT = pinhole_rig().left.size
+EVERYWHERE = np.stack(np.meshgrid(np.linspace(5, WIDTH - 6, 24), np.linspace(5, HEIGHT - 6, 18)), -1).reshape(-1, 2)
+MIDDLE = (np.abs(EVERYWHERE / [WIDTH, HEIGHT] - 0.5) < 0.25).all(1)
+PYRAMIDS = StereoPyramids((), ())
+
+
+@pytest.mark.parametrize(("metres", "held_anew"), [(0.0, False), (0.5, False), (2.5, True)])
+def test_half_the_view_is_held_once_little_of_a_whole_one_is_left(metres: float, held_anew: bool) -> None:
+    """A robot that stands keeps the image of the whole view; points added to it after a loss change nothing."""
+    kept, tracks = follower(), wall(EVERYWHERE)
+    kept.hold(PYRAMIDS, tracks, np.ones(len(tracks), bool), np.eye(4), np.eye(4))
+    first = kept.held
+    first.add(tracks.append(tracks).append(tracks))
+    kept.hold(PYRAMIDS, wall(EVERYWHERE, metres), EVERYWHERE[:, 0] < WIDTH / 2, along(metres), along(metres))
+    assert (kept.held is not first) == held_anew
+
+
+@pytest.mark.parametrize(("metres", "middle_is_better"), [(0.0, False), (2.0, True)])
+def test_what_will_be_in_view_is_held(metres: float, middle_is_better: bool) -> None:
+    """What a robot drives towards is still in view after it went on unseen, what is beside that is not."""
+    kept, tracks = follower(), wall(EVERYWHERE)
+    kept.hold(PYRAMIDS, tracks, MIDDLE, np.eye(4), along(metres))
+    first = kept.held
+    kept.hold(PYRAMIDS, tracks, ~MIDDLE, np.eye(4), along(metres))
+    assert (kept.held is first) == middle_is_better
 
 
 def test_a_pose_from_a_part_of_the_view_is_found_anew_once_more_is_free() -> None:

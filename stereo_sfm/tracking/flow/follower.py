@@ -90,26 +90,35 @@ class Follower:
         assert self._held is not None
         return self._held
 
-    def hold(self, images: StereoPyramids, tracks: Tracks, trusted: Bool, pose: F64) -> None:
-        """Keep an image with a trusted pose (4, 4) and its trusted points (N,) for recovery, if it has enough.
+    def hold(self, images: StereoPyramids, tracks: Tracks, trusted: Bool, pose: F64, later: F64) -> None:
+        """Keep an image with a trusted pose (4, 4) and its trusted points (N,) for recovery, if it is the better one.
 
-        Whatever is about to cover the camera already hides a part of the last images. Time does not count: who comes
-        towards the robot hides the middle of the view for seconds.
+        Whatever is about to cover the camera already hides a part of the last images. The better image is the one that
+        shows more of what would be in view from the pose `later` (4, 4), if the robot went on unseen. Time does not
+        count: who comes towards the robot hides the middle of the view for seconds.
         """
-        if self._held is None or np.count_nonzero(trusted) >= self._worth(self._held, pose):
+        if self._held is None:
+            self._held = Held(images, tracks.keep(trusted), pose)
+            return
+        rays = tracks.points()[trusted] - pose[:3, 3]
+        if self._in_view(rays, pose, later) >= self._in_view(self._held.rays, self._held.pose, later):
             self._held = Held(images, tracks.keep(trusted), pose)
 
-    def _worth(self, held: Held, pose: F64) -> float:
-        """Number of points with which an image taken at a pose (4, 4) is as good to recover from as the held one.
+    def _in_view(self, rays: F64, seen_from: F64, pose: F64) -> float:
+        """How many points would be in view from a pose (4, 4), and in each part of it no more than make it count fully.
 
-        Of the points tracked in it those count that are still in view, by how similar they look: by the ratio of their
-        distances and the cosine between their directions.
+        They count by how similar they look: by the ratio of their distances and the cosine between their directions.
+
+        Args:
+            rays: (N, 3) metres, odometry axes, to the points from the pose `seen_from` (4, 4).
         """
-        before, now = held.rays, held.rays + (held.pose[:3, 3] - pose[:3, 3])
-        in_view = self._area.inside(self._camera.project(now @ pose[:3, :3]))
-        longer = np.maximum(np.einsum("ni,ni->n", before, before), np.einsum("ni,ni->n", now, now))
-        similarity = np.einsum("ni,ni->n", before, now) / longer
-        return float(np.maximum(similarity[in_view], 0.0).sum())
+        now = rays + (seen_from[:3, 3] - pose[:3, 3])
+        uv = self._camera.project(now @ pose[:3, :3])
+        longer = np.maximum(np.einsum("ni,ni->n", rays, rays), np.einsum("ni,ni->n", now, now))
+        similarity = np.maximum(np.einsum("ni,ni->n", rays, now) / longer, 0.0)
+        inside = self._area.inside(uv)
+        cells = np.bincount(self._cells(uv[inside]), similarity[inside], math.prod(GRID))
+        return float(np.minimum(cells, CELL_POINTS).sum())
 
     def forget(self) -> None:
         """Give up the held image: a new odometry begins."""

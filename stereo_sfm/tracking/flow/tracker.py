@@ -56,6 +56,8 @@ TRUSTED_LEFT = 0.5  # ... if so many of the newest keyframe's points are left ..
 TRUSTED_OPEN = 0.3  # ... and so many of those that agree in an open view
 COVERED_SHARE = 0.1  # of the covered frames: as many free ones in a row, and a new submap begins
 SAME_START = 0.05, 0.01  # metres, radians between poses from which the same is found
+UNSEEN_S = 2.0  # for which a camera may be covered while the robot drives on: an image is held for after that
+HOLD_NS = 200_000_000  # from one image that may be held to the next
 ROUNDS = (0.066, 160), (0.03, 400), (0.015, 1000)  # of a search: reach as a share of the width, most points
 CELLS_PER_METRE = 3.0  # of the image that must agree, per metre of standard deviation of the prediction
 HELD_POINTS = 8  # times max_features, of the image to recover from: after two metres little of it is still in view
@@ -95,6 +97,7 @@ class Tracker:
         self._new_points = NewPoints(config, area, self._stereo, self._follower, self._shutter, self._movers)
         self._keyframes = Keyframes(config, self._shutter, place_corners, side_views, self._movers)
         self._sensors = MotionSensors.of(config, rig)
+        self._held_ns = -HOLD_NS  # the last image that might have been held
         self._recovery = Recovery(place_corners, places, rig.left.size)
         self._tracks = Tracks()
         self._state = TrackState.INITIALIZING
@@ -168,8 +171,7 @@ class Tracker:
         trusted = self._trusted(tracks, solution)
         if trusted:
             self._recovery.motion.add(image.stamp_ns, solution.pose)
-            if not self._part.wanted(self._follower.held, image.stamp_ns):
-                self._follower.hold(images, tracks, solution.inlier & ~tracks.moving, solution.pose)
+            self._hold(image, images, tracks, solution)
         stats = _stats(tracks, solution)
         inlier = self._accept(image, images, tracks, solution, expected.seconds, recovered)
         keyframe = None
@@ -382,7 +384,8 @@ class Tracker:
         keyframe = self._create_keyframe(image, images, covariance, True)
         self._recovery.motion.add(image.stamp_ns, self._pose)
         self._follower.forget()
-        self._follower.hold(images, self._tracks, ~self._tracks.moving, self._pose)
+        self._follower.hold(images, self._tracks, ~self._tracks.moving, self._pose, self._pose)
+        self._held_ns = image.stamp_ns
         state = TrackState.OK if first else TrackState.RECOVERED if self._bridging else TrackState.RESTARTED
         self._bridging = False
         if self._sensors is not None:
@@ -465,6 +468,13 @@ class Tracker:
                 return NOT_FOUND
             pose, known = solution.pose, ()
         return tracks, solution
+
+    def _hold(self, image: StereoImage, images: StereoPyramids, tracks: Tracks, solution: PoseSolution) -> None:
+        """Keep an image to recover from, if it is better than the one before; asked of few images, which takes time."""
+        if image.stamp_ns - self._held_ns >= HOLD_NS and not self._part.wanted(self._follower.held, image.stamp_ns):
+            self._held_ns = image.stamp_ns
+            later = self._recovery.motion.straight_on(solution.pose, UNSEEN_S)
+            self._follower.hold(images, tracks, solution.inlier & ~tracks.moving, solution.pose, later)
 
     def _hold_more(self) -> None:
         """Add points to the held image: from far away most of those that were tracked are out of view."""
