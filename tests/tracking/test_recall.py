@@ -49,7 +49,7 @@ def view() -> tuple[Follower, F64, Bool]:
     )
     config, shutter = TrackerConfig(), RollingShutter(RIG)
     follower = Follower(config, RIG, VisibleArea(RIG.left, config.max_angle_deg, None), shutter)
-    follower.hold(StereoPyramids((), ()), tracks, np.ones(n, bool), np.eye(4))
+    follower.hold(StereoPyramids((), ()), tracks, np.ones(n, bool), np.eye(4), np.eye(4))
     return follower, uv, uv[:, 1] <= middle
 
 
