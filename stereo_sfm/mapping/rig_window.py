@@ -30,7 +30,8 @@ MIN_POINTS = 20
 MAX_POINTS = 160
 STEPS = 4  # of Gauss-Newton
 DERIVATIVE = 1e-5  # radians or ratio: step of numerical derivatives
-INFLATION = 1.9  # factor on the deviation of the matches' errors, which are correlated, as in `calib.consistency`
+# Factor on the deviation of the matches' errors, which are correlated: 2, less what Cauchy's weights overstate it by.
+INFLATION = 1.9
 NOISE_PX = 0.05, 5.0  # limits of the estimated noise of one coordinate
 LENGTHENING = 1, 5, 6, 7  # terms that trade lengths with one another: rotation about y, those of lenses
 # Prior standard deviations of the terms: radians, radians, ratio, radians.

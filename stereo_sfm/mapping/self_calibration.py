@@ -154,6 +154,7 @@ class SelfCalibration:
         return window is not None
 
     def _drop_misled(self) -> None:
+        """Discard the windows tracked with a rig that was far off, once there are enough others."""
         later = [w for w in self.windows if w.first_kf_id > self._misled_kf_id]
         if ENOUGH_WINDOWS <= len(later) < len(self.windows):
             self.windows = deque(later, maxlen=MAX_WINDOWS)

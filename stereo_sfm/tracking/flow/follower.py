@@ -97,22 +97,16 @@ class Follower:
         shows more of what would be in view from the pose `later` (4, 4), if the robot went on unseen. Time does not
         count: who comes towards the robot hides the middle of the view for seconds.
         """
-        if self._held is None:
-            self._held = Held(images, tracks.keep(trusted), pose)
-            return
-        rays = tracks.points()[trusted] - pose[:3, 3]
-        if self._in_view(rays, pose, later) >= self._in_view(self._held.rays, self._held.pose, later):
-            self._held = Held(images, tracks.keep(trusted), pose)
+        image = Held(images, tracks.keep(trusted), pose)
+        if self._held is None or self._in_view(image, later) >= self._in_view(self._held, later):
+            self._held = image
 
-    def _in_view(self, rays: F64, seen_from: F64, pose: F64) -> float:
-        """How many points would be in view from a pose (4, 4), and in each part of it no more than make it count fully.
+    def _in_view(self, image: Held, pose: F64) -> float:
+        """How many points tracked in an image would be in view from a pose (4, 4), in no part more than make it count.
 
         They count by how similar they look: by the ratio of their distances and the cosine between their directions.
-
-        Args:
-            rays: (N, 3) metres, odometry axes, to the points from the pose `seen_from` (4, 4).
         """
-        now = rays + (seen_from[:3, 3] - pose[:3, 3])
+        rays, now = image.rays, image.rays + (image.pose[:3, 3] - pose[:3, 3])
         uv = self._camera.project(now @ pose[:3, :3])
         longer = np.maximum(np.einsum("ni,ni->n", rays, rays), np.einsum("ni,ni->n", now, now))
         similarity = np.maximum(np.einsum("ni,ni->n", rays, now) / longer, 0.0)

@@ -56,7 +56,7 @@ TRUSTED_LEFT = 0.5  # ... if so many of the newest keyframe's points are left ..
 TRUSTED_OPEN = 0.3  # ... and so many of those that agree in an open view
 COVERED_SHARE = 0.1  # of the covered frames: as many free ones in a row, and a new submap begins
 SAME_START = 0.05, 0.01  # metres, radians between poses from which the same is found
-UNSEEN_S = 2.0  # for which a camera may be covered while the robot drives on: an image is held for after that
+UNSEEN_NS = 2_000_000_000  # for which a camera may be covered while the robot drives on; an image is held for then
 HOLD_NS = 200_000_000  # from one image that may be held to the next
 ROUNDS = (0.066, 160), (0.03, 400), (0.015, 1000)  # of a search: reach as a share of the width, most points
 CELLS_PER_METRE = 3.0  # of the image that must agree, per metre of standard deviation of the prediction
@@ -473,7 +473,7 @@ class Tracker:
         """Keep an image to recover from, if it is better than the one before; asked of few images, which takes time."""
         if image.stamp_ns - self._held_ns >= HOLD_NS and not self._part.wanted(self._follower.held, image.stamp_ns):
             self._held_ns = image.stamp_ns
-            later = self._recovery.motion.straight_on(solution.pose, UNSEEN_S)
+            later = self._recovery.motion.steady(image.stamp_ns + UNSEEN_NS).odom_T_cam
             self._follower.hold(images, tracks, solution.inlier & ~tracks.moving, solution.pose, later)
 
     def _hold_more(self) -> None:

@@ -75,10 +75,6 @@ class TrustedMotion:
             return np.zeros(6)
         return np.asarray(se3.log(se3.inverse(first) @ last)) / ((last_ns - first_ns) * 1e-9)
 
-    def straight_on(self, pose: F64, seconds: float) -> F64:
-        """(4, 4) a pose (4, 4) after some seconds with the last speed, without turning."""
-        return pose @ se3.exp(np.concatenate([seconds * self.velocity()[:3], np.zeros(3)]))
-
     def velocity_at(self, stamp_ns: int) -> F64:
         """(6,) the velocity at a later time: the last one, decreased exponentially."""
         seconds = max((stamp_ns - self._poses[-1][0]) * 1e-9, 0.0)
