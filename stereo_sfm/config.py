@@ -82,8 +82,8 @@ class TrackerConfig:
         False,
         "Estimate time offset and rotation of the IMU, and radii, track and pose of the wheels, while driving",
     )
-    lost_frames: int = number(
-        15, 0, 100_000, "Frames without a pose after which a new submap begins, whichever the tracker"
+    lost_s: float = number(
+        1.0, 0.0, 1e5, "Seconds without a pose after which a new submap begins, whichever the tracker"
     )
 
 

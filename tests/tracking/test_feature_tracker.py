@@ -107,8 +107,10 @@ def test_a_dark_gap_is_lost_and_recovered() -> None:
 
 def test_after_long_darkness_a_new_submap_begins() -> None:
     _, images, _ = rendered()
-    dark = replace(images[0], left=np.zeros_like(images[0].left), right=np.zeros_like(images[0].left))
-    sequence = (images[0], images[1], *[dark] * (Config().tracker.lost_frames + 1), images[-1])
+    black, lost_ns = np.zeros_like(images[0].left), round(1e9 * Config().tracker.lost_s)
+    dark = [replace(images[1], left=black, right=black, stamp_ns=images[1].stamp_ns + k * lost_ns) for k in (1, 2)]
+    last = replace(images[-1], stamp_ns=images[1].stamp_ns + 3 * lost_ns)
+    sequence = (images[0], images[1], *dark, last)
     answers = list(track(config_for("pnp"), sequence))
     frame, keyframe = answers[-1]
     assert frame.state in (TrackState.RESTARTED, TrackState.RECOVERED)

@@ -152,10 +152,11 @@ class FeatureTracker:
         return motion, self._ids.give_new(view)
 
     def _lose(self, image: StereoImage, view: FeatureView, reason: str) -> tuple[Frame, Keyframe | None]:
-        """No motion: continue with the last velocity; after several such frames start a new submap there."""
+        """No motion: continue with the last velocity; after some time without start a new submap there."""
         self._lost += 1
+        seconds = (image.stamp_ns - self._last_stamp) * 1e-9
         self._odom_T_cam = self._odom_T_cam @ self._velocity
-        if self._lost <= self._config.tracker.lost_frames or len(view) < self._odometry.min_inliers:
+        if seconds <= self._config.tracker.lost_s or len(view) < self._odometry.min_inliers:
             return self._frame(image, view, None, TrackState.LOST, reason, False), None
         self._lost = 0
         self._submap += 1

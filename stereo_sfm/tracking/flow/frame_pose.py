@@ -55,7 +55,9 @@ UNDIVIDED_SHARE, UNDIVIDED_OPEN = 0.8, 0.3
 NEARER, PULL_CHI2, WRONG_SIGMAS = 1.25, 16.8, 2.0
 NO_PRIOR = np.full(6, np.inf)
 CONFIRMED_SHARE = 0.75  # of the points of the map that are in view
-MOST_FREEDOMS = 1.0  # of the six of a pose that may rest on one point
+NEAR_WEIGHT = 0.05  # of all points: so near is one on which more than a freedom may rest
+MOST_FREEDOMS = 1.0  # of the six of a pose that may rest on one point ...
+KNOWN_M = 0.01  # ... that is new, if the others have the position with this standard deviation
 NEAR = 2.0  # times the largest error of an inlier, at the predicted pose
 LIMIT_SIGMAS = 5.0  # root mean squares of the recent differences, if that is more
 MEMORY_S = 5.0  # time constant of their average
@@ -225,12 +227,12 @@ class FramePoseSolver:
         static = ~tracks.moving
         rest = static & ~best.inlier
         undisturbed = np.count_nonzero(in_group(tracks, rest)) < MIN_GROUP and best.inliers >= AGREEING_SHARE * before
+        if not best.reason:
+            best = self._without_lever(tracks, expected, static, best)
+            rest = static & ~best.inlier
         usual = self._likelihood(best.pose, expected) > USUAL_LIKELIHOOD
         if undisturbed and usual and not self.alert:
             return best
-        if not best.reason:
-            best = self._without_contradicted(tracks, expected, static, best)
-            rest = static & ~best.inlier
         chosen = self._choose(tracks, expected, last_pose, best, rest)
         disturbed = self.alert or len(chosen.moving) > 0
         if not disturbed and chosen.inlier[static].sum() <= WEIGHT_RATIO * best.inlier[static].sum():
@@ -319,22 +321,32 @@ class FramePoseSolver:
             return None
         return self._refit(tracks, expected, self._optimise(tracks, expected, near, expected), near, static)
 
-    def _without_contradicted(
+    def _without_lever(
         self, tracks: Tracks, expected: ExpectedMotion, static: Bool, pose: PoseSolution
     ) -> PoseSolution:
-        """A pose without the points that it rests on alone, if the others contradict them.
+        """A pose without the points that it rests on alone, if the others contradict them, or know it without new ones.
 
-        A near point at a wrong pixel takes the pose of few others, far away, along, and then has no error.
+        A near point at a wrong pixel, or on somebody near, takes the pose of few others, far away, along, and then has
+        no error.
         """
         agree = pose.inlier & static
+        weight = np.square(tracks.rho)  # of a point for the position
+        near = agree & (weight > NEAR_WEIGHT * weight[agree].sum())
+        if not near.any():
+            return pose
         alone = np.zeros(len(tracks), bool)
-        alone[agree] = self._influence(tracks.keep(agree), pose)[0] > MOST_FREEDOMS
+        alone[near] = self._influence(tracks.keep(near), pose)[0] > MOST_FREEDOMS
         if not alone.any() or np.count_nonzero(agree & ~alone) < MIN_GROUP:
             return pose
         by_others = self._optimise(tracks, expected.to(pose.pose), agree & ~alone)
-        if (self._influence(tracks.keep(alone), by_others)[1] < self._config.max_error_sigmas).all():
+        wrong = alone.copy()
+        wrong[alone] = self._influence(tracks.keep(alone), by_others)[1] >= self._config.max_error_sigmas
+        if wrong.any():
+            return self._optimise(tracks, expected.to(by_others.pose), static & ~alone)
+        new = alone & (tracks.age * expected.seconds < SETTLED_S)
+        if not new.any() or math.sqrt(np.trace(by_others.covariance[:3, :3])) > KNOWN_M:
             return pose
-        return self._optimise(tracks, expected.to(by_others.pose), static & ~alone)
+        return self._optimise(tracks, expected.to(by_others.pose), agree & ~new)
 
     def _solve_rest(self, tracks: Tracks, expected: ExpectedMotion, last_pose: F64, rest: Bool) -> PoseSolution | None:
         """The motion of the points that disagree with all others: of another object, or the camera's."""

@@ -54,7 +54,7 @@ MAX_MISSES = 3  # successive frames after which a point that disagrees is given 
 TRUSTED_SHARE = 0.8  # of the points that are followed: a pose that so many agree with is beyond doubt ...
 TRUSTED_LEFT = 0.5  # ... if so many of the newest keyframe's points are left ...
 TRUSTED_OPEN = 0.3  # ... and so many of those that agree in an open view
-COVERED_SHARE = 0.1  # of the covered frames: as many free ones in a row, and a new submap begins
+COVERED_SHARE = 0.1  # of the time that the view is covered: counts as time with a free view, and a new submap begins
 SAME_START = 0.05, 0.01  # metres, radians between poses from which the same is found
 UNSEEN_NS = 2_000_000_000  # for which a camera may be covered while the robot drives on; an image is held for then
 HOLD_NS = 200_000_000  # from one image that may be held to the next
@@ -105,8 +105,9 @@ class Tracker:
         self._velocity: F64 = np.zeros(6)  # tangent per second
         self._stamp_ns = 0
         self._lost = 0  # successive frames
-        self._free_frames = 0  # of these, the last ones whose view is free
-        self._covered_frames = 0  # and those whose view is covered
+        self._lost_ns = 0  # the last of them
+        self._free_s = 0.0  # for which the view has been free without a pose
+        self._covered_s = 0.0  # and covered
         self._part = PartialView()
         self._bridging = False  # tracking restarts at the pose by IMU or wheels, in the same submap
         self._submap_id = 0
@@ -359,7 +360,7 @@ class Tracker:
 
     def _continue(self, image: StereoImage, images: StereoPyramids, pose: F64, tracks: Tracks) -> None:
         self._pose, self._stamp_ns, self._tracks = pose, image.stamp_ns, tracks
-        self._state, self._lost, self._free_frames, self._covered_frames = TrackState.OK, 0, 0, 0
+        self._state, self._lost, self._free_s, self._covered_s = TrackState.OK, 0, 0.0, 0.0
         self._follower.accept(images.left, tracks)
 
     def _begin(self, image: StereoImage, images: StereoPyramids) -> tuple[Frame, Keyframe | None]:
@@ -487,16 +488,18 @@ class Tracker:
             self._follower.keep_only(self._tracks)
 
     def _lose(self, image: StereoImage, reason: str) -> tuple[Frame, None]:
-        """Predict the pose; after some frames with a free view start a new submap."""
+        """Predict the pose; after some time with a free view start a new submap."""
         expected = self._expect(image.stamp_ns)
         self._lost += 1
         self._follower.search_widely()
         bridge = self._bridge(image.stamp_ns)
         seen = bridge is None or image.left.max() >= DARK
         if seen:
-            self._free_frames = self._free_frames + 1 if self._recovery.free else 0
-            self._covered_frames += not self._recovery.free
-        if max(self._free_frames, COVERED_SHARE * self._covered_frames) > self._config.lost_frames:
+            seconds = (image.stamp_ns - max(self._stamp_ns, self._lost_ns)) * 1e-9
+            self._free_s = self._free_s + seconds if self._recovery.free else 0.0
+            self._covered_s += 0.0 if self._recovery.free else seconds
+        self._lost_ns = image.stamp_ns
+        if max(self._free_s, COVERED_SHARE * self._covered_s) > self._config.lost_s:
             self._pose = expected.odom_T_cam
             self._velocity = self._recovery.motion.velocity_at(image.stamp_ns)
             self._solver.forget()
