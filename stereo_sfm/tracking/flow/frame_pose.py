@@ -228,7 +228,7 @@ class FramePoseSolver:
         rest = static & ~best.inlier
         undisturbed = np.count_nonzero(in_group(tracks, rest)) < MIN_GROUP and best.inliers >= AGREEING_SHARE * before
         if not best.reason:
-            best = self._without_lever(tracks, expected, static, best)
+            best = self._without_leverage_points(tracks, expected, static, best)
             rest = static & ~best.inlier
         usual = self._likelihood(best.pose, expected) > USUAL_LIKELIHOOD
         if undisturbed and usual and not self.alert:
@@ -321,7 +321,7 @@ class FramePoseSolver:
             return None
         return self._refit(tracks, expected, self._optimise(tracks, expected, near, expected), near, static)
 
-    def _without_lever(
+    def _without_leverage_points(
         self, tracks: Tracks, expected: ExpectedMotion, static: Bool, pose: PoseSolution
     ) -> PoseSolution:
         """A pose without the points that it rests on alone, if the others contradict them, or know it without new ones.
@@ -339,9 +339,7 @@ class FramePoseSolver:
         if not alone.any() or np.count_nonzero(agree & ~alone) < MIN_GROUP:
             return pose
         by_others = self._optimise(tracks, expected.to(pose.pose), agree & ~alone)
-        wrong = alone.copy()
-        wrong[alone] = self._influence(tracks.keep(alone), by_others)[1] >= self._config.max_error_sigmas
-        if wrong.any():
+        if (self._influence(tracks.keep(alone), by_others)[1] >= self._config.max_error_sigmas).any():
             return self._optimise(tracks, expected.to(by_others.pose), static & ~alone)
         new = alone & (tracks.age * expected.seconds < SETTLED_S)
         if not new.any() or math.sqrt(np.trace(by_others.covariance[:3, :3])) > KNOWN_M:

@@ -18,10 +18,10 @@ from stereo_sfm.types import F64, Corners, Keyframe, StereoImage
 
 REACH = 3.0  # sigmas of the prediction within which hypotheses are accepted
 NEAR = 0.4  # of the median distance of the newest keyframe's corners: nearer ones may be on an occluding object
-GRID = (16, 12)  # columns and rows of the image in which corners are counted: fine against the rim beside a cover
 FADING = 0.9  # factor on the number of occupied cells from keyframe to keyframe
 UNCERTAIN_M = 0.2  # standard deviation of the predicted position from which other motions are tried
 MOTIONS_AT_ONCE = 2  # of them in an image, besides the straight ones
+GRID = (16, 12)  # columns and rows of the image in which corners are counted: fine against the rim beside a cover
 SUFFICIENT_RECALL = 0.65  # with which the search ends
 SAME_PLACE = 0.1, 0.03  # metres, radians between two hypotheses of one place
 RIVAL = 0.75  # share of the best recall with which another place makes the result ambiguous
@@ -48,9 +48,7 @@ class Recovery:
         self._cells = 0.0  # number of them in one keyframe
         self._next = 0  # of the other motions
         self.motion = TrustedMotion()
-        self.free = (
-            True  # whether the last searched image has occupied cells in the rows where the newest keyframes have them
-        )
+        self.free = True  # whether the last searched image has corners in most of the cells of each row
 
     def use(self, rig: Rig) -> None:
         """Use a corrected rig."""
