@@ -70,6 +70,18 @@ def test_noise_a_wrong_pose_and_what_moves_are_no_rotation(name: str) -> None:
     assert KnockDetector().seen(tracks, solution, cameras, 1 / 15) is None
 
 
+@pytest.mark.parametrize("name", RIGS)
+def test_a_rig_that_is_wrong_from_the_start_is_no_knock(name: str) -> None:
+    """Points get to know it over seconds, until one rotation explains nearly all; a knock after that is one."""
+    rig, detector = RIGS[name], KnockDetector()
+    cameras = StereoCameras.of(rig)
+    for share in np.linspace(0.01, 1.0, 90):
+        tracks, solution = known_points(rig, turned(rig, (0.0, 0.0, 0.25 * share)), 0.1)
+        assert detector.seen(tracks, solution, cameras, 1 / 15) is None
+    tracks, solution = known_points(rig, turned(rig, (0.0, 0.25, 0.25)), 0.1)
+    assert detector.seen(tracks, solution, cameras, 1 / 15) is not None
+
+
 def test_what_the_map_does_not_confirm_is_given_up_for_a_while() -> None:
     detector = KnockDetector()
     detector.add(np.array([0.0, 0.003, 0.0]), 0)

@@ -16,7 +16,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.geometry.kernels import njit, project_one
 from stereo_sfm.geometry.small_matrix import solve_symmetric
-from stereo_sfm.tracking.flow.consensus import STATIC_S
+from stereo_sfm.tracking.flow.consensus import SETTLED_S, STATIC_S
 from stereo_sfm.tracking.flow.frame_pose import PoseSolution
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.tracking.flow.tracks import Tracks
@@ -27,6 +27,7 @@ UNDIVIDED = 0.6  # share of them that agree with a pose; where fewer do, the oth
 MIN_SHIFT_PX = 0.3  # root mean square over the points
 MIN_SHARE = 0.8  # of the squared residuals that one rotation must explain
 FIRST_SCALE_PX, STEPS, SCALE = 3.0, 4, 3.0  # of the robust estimate; its scale over the rest that the rotation leaves
+SUDDEN = 0.5  # share of a rotation that the last images did not show yet: a rig may be wrong from the start
 UNCONFIRMED_S = 5.0  # after which a rotation that the map does not confirm is given up ...
 PAUSE_S = 60.0  # ... and none is looked for
 
@@ -36,6 +37,7 @@ class KnockDetector:
 
     def __init__(self) -> None:
         self.turn: F64 = np.zeros(3)  # rad about the right camera's axes, since the rig was corrected last
+        self._usual: F64 = np.zeros(3)  # rad, mean over the last images: what the rig is wrong by, without a knock
         self._since_ns = 0
         self._until_ns = 0  # no rotation is looked for before
 
@@ -56,17 +58,21 @@ class KnockDetector:
         divided = np.count_nonzero(agree) < UNDIVIDED * np.count_nonzero(known)
         used = known if divided else agree
         enough = max(MIN_POINTS, MIN_AGREEING * np.count_nonzero(used))
-        turn, scale = np.zeros(3), FIRST_SCALE_PX
+        turn, usual, scale = np.zeros(3), np.zeros(3), FIRST_SCALE_PX
         for step in range(STEPS):
             count, squares, left = _turn(
                 solution.pose, used, tracks.origin, tracks.direction, tracks.rho, tracks.uv, tracks.uv_right,
                 cameras.cams, cameras.right_T_left, scale, turn,
             )  # fmt: skip
+            if step == 0:
+                usual = self._usual.copy()
+                share = 1.0 - math.exp(-seconds / SETTLED_S) if count >= enough else 0.0
+                self._usual += share * (turn - self._usual)
             wrong = squares - left < max(MIN_SHARE * squares, MIN_SHIFT_PX**2 * count)
             if count < enough or (wrong and (not divided or step == STEPS - 1)):
                 return None
             scale, enough = SCALE * math.sqrt(left / count), MIN_AGREEING * count
-        return turn
+        return turn if np.linalg.norm(turn - usual) > SUDDEN * np.linalg.norm(turn) else None
 
     def watches(self, stamp_ns: int) -> bool:
         """Whether a rotation is looked for in the image of a time."""
@@ -75,6 +81,7 @@ class KnockDetector:
     def add(self, turn: F64, stamp_ns: int) -> None:
         """The right camera has turned."""
         self.turn, self._since_ns = self.turn + turn, stamp_ns
+        self._usual = np.zeros(3)
 
     def confirmed(self) -> None:
         """The rig has been corrected."""
