@@ -36,6 +36,8 @@ from stereo_sfm.types import (
     Trajectory,
 )
 
+SLOWEST = 1e-3  # m/s: a way's length grows by that at rest
+
 
 @dataclass(slots=True)
 class KeyframeRow:
@@ -222,7 +224,7 @@ class RunRecord:
 
         A frame moves with its reference keyframe. Where points are tracked from frame to frame, the next
         keyframe contributes too, the more the nearer it is: the map has moved both since the frame was tracked, by
-        different amounts.
+        different amounts. Near is what is a short way by odometry, whose errors grow with the way, not with time.
         """
         if not len(self.map_T_kf):
             return None
@@ -239,7 +241,8 @@ class RunRecord:
             end = np.array([self.keyframes[kf_id].stamp_ns for kf_id in ends])
             odom_T_end = np.array([self.keyframes[kf_id].odom_T_cam for kf_id in ends])
             end_T_cam = se3.inverse(odom_T_end) @ odom_T_cam[rows[between]]
-            share = np.clip((stamps[between] - begin) / (end - begin), 0.0, 1.0)
+            behind = _way(kf_T_cam[rows[between]], stamps[between] - begin)
+            share = behind / (behind + _way(end_T_cam, end - stamps[between]))
             there = np.array([known[kf_id] for kf_id in ends]) @ end_T_cam
             poses[between] = se3.interpolate(poses[between], there, share)
         return Trajectory(stamps, poses)
@@ -361,3 +364,8 @@ class RunRecord:
         if mapped is not None:
             digest.update(mapped.poses.tobytes())
         return digest.hexdigest()[:8]
+
+
+def _way(a_T_b: F64, nanoseconds: I64) -> F64:
+    """(N,) metres of ways that lead along transforms (N, 4, 4) and last for so long; a radian counts as a metre."""
+    return sum(se3.extent(a_T_b), start=SLOWEST * 1e-9 * np.maximum(nanoseconds, 1))
