@@ -117,6 +117,7 @@ def warm_up_fast_motion(config: Config, rig: Rig, image: U8) -> None:
     solver = FramePoseSolver(config.tracker, StereoCameras.of(rig), RollingShutter(rig))
     solution = PoseSolution(np.eye(4), np.zeros(6), np.eye(6), np.zeros(0), config.tracker.sigma_px, 1.0)
     solver.pull(Tracks(), np.zeros(0, bool), solution)
+    solver.influence(Tracks(), solution)
     if rig.imu is not None and config.tracker.inertial:
         _warm_up_inertial(rig.imu)
 

@@ -243,7 +243,7 @@ def test_the_degrees_of_freedom_of_a_pose_are_shared_by_its_points() -> None:
     solver = FramePoseSolver(TrackerConfig(), StereoCameras.of(RIG), RollingShutter(RIG))
     tracks = scene(np.random.default_rng(0))[0].keep(np.arange(STILL + MOVING) < STILL)
     solution = solver.solve(tracks, ExpectedMotion(MOVED, se3.log(MOVED), SECONDS), np.eye(4))
-    freedoms = solver._influence(tracks, solution)[0]  # pyright: ignore[reportPrivateUsage]
+    freedoms = solver.influence(tracks, solution)[0]
     assert freedoms.sum() == pytest.approx(6.0, rel=0.1) and freedoms.max() < 0.5
     assert freedoms.argmax() in np.argsort(tracks.rho)[-10:]
 
@@ -260,7 +260,7 @@ def test_errors_at_a_pose_by_others_are_as_large_as_expected() -> None:
         tracks.rho = tracks.rho * (1 + rng.normal(0, 0.01, 17))
         start = ExpectedMotion(MOVED, se3.log(MOVED), SECONDS)
         solution = solver._optimise(tracks, start, np.arange(17) < 14)  # pyright: ignore[reportPrivateUsage]
-        squared += np.square(solver._influence(tracks, solution)[1][14:]).tolist()  # pyright: ignore
+        squared += np.square(solver.influence(tracks, solution)[1][14:]).tolist()
     assert 0.4 < np.mean(squared) < 1.2
 
 

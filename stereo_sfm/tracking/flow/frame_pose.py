@@ -200,7 +200,7 @@ class FramePoseSolver:
         if by_known.inlier[known].sum() < AGREEING_SHARE * known.sum():
             return None
         off = np.zeros(len(tracks), bool)
-        off[suspected] = self._influence(tracks.keep(suspected), by_known)[1] > WRONG_SIGMAS
+        off[suspected] = self.influence(tracks.keep(suspected), by_known)[1] > WRONG_SIGMAS
         wrong = doubtful | off if in_group(tracks, off & near).any() else doubtful
         if not wrong.any():
             return None
@@ -335,11 +335,11 @@ class FramePoseSolver:
         if not near.any():
             return pose
         alone = np.zeros(len(tracks), bool)
-        alone[near] = self._influence(tracks.keep(near), pose)[0] > MOST_FREEDOMS
+        alone[near] = self.influence(tracks.keep(near), pose)[0] > MOST_FREEDOMS
         if not alone.any() or np.count_nonzero(agree & ~alone) < MIN_GROUP:
             return pose
         by_others = self._optimise(tracks, expected.to(pose.pose), agree & ~alone)
-        if (self._influence(tracks.keep(alone), by_others)[1] >= self._config.max_error_sigmas).any():
+        if (self.influence(tracks.keep(alone), by_others)[1] >= self._config.max_error_sigmas).any():
             return self._optimise(tracks, expected.to(by_others.pose), static & ~alone)
         new = alone & (tracks.age * expected.seconds < SETTLED_S)
         if not new.any() or math.sqrt(np.trace(by_others.covariance[:3, :3])) > KNOWN_M:
@@ -438,7 +438,7 @@ class FramePoseSolver:
             self._config.sigma_px * self._noise,
         )  # fmt: skip
 
-    def _influence(self, tracks: Tracks, solution: PoseSolution) -> tuple[F64, F64]:
+    def influence(self, tracks: Tracks, solution: PoseSolution) -> tuple[F64, F64]:
         """`pose_solver.influence` of points on a pose."""
         return pose_solver.influence(
             solution.pose, solution.velocity, solution.covariance, self._shutter.row_seconds(tracks.uv), tracks.origin,
