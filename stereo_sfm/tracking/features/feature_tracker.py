@@ -68,6 +68,7 @@ class FeatureTracker:
         self._kf_poses = KeyframePoses()
         self._frames_since_kf = 0
         self._lost = 0
+        self._lost_ns = 0  # the first of these frames
         self._submap = 0
         self._map_version = 0
 
@@ -153,8 +154,9 @@ class FeatureTracker:
 
     def _lose(self, image: StereoImage, view: FeatureView, reason: str) -> tuple[Frame, Keyframe | None]:
         """No motion: continue with the last velocity; after some time without start a new submap there."""
+        self._lost_ns = self._lost_ns if self._lost else image.stamp_ns
         self._lost += 1
-        seconds = (image.stamp_ns - self._last_stamp) * 1e-9
+        seconds = (image.stamp_ns - self._lost_ns) * 1e-9
         self._odom_T_cam = self._odom_T_cam @ self._velocity
         if seconds <= self._config.tracker.lost_s or len(view) < self._odometry.min_inliers:
             return self._frame(image, view, None, TrackState.LOST, reason, False), None

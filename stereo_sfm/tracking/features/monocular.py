@@ -56,7 +56,7 @@ class MonocularTracker:
         self._kf_poses = KeyframePoses()
         self._velocity = np.eye(4)
         self._frames_since_kf = self._lost = self._map_version = 0
-        self._tracked_ns = 0  # the last frame with a pose
+        self._lost_ns = 0  # the first frame without a pose
         self._force_keyframe = False
 
     def apply(self, update: MapUpdate) -> None:
@@ -113,7 +113,7 @@ class MonocularTracker:
         self._odom_T_cam = self._odom_T_cam @ start.first_T_second
         self._keyframe = self._ids.inherit(view, first, rows)
         self._keyframe = self._with_positions(self._keyframe, self._odom_T_cam)
-        self._odom_T_kf, self._tracked_ns = self._odom_T_cam, image.stamp_ns
+        self._odom_T_kf = self._odom_T_cam
         self._force_keyframe = True  # the second view of the map follows with the next frame
         state = TrackState.OK if self._submap == 0 else TrackState.RESTARTED
         return self._frame(image, self._keyframe, len(rows), state, "", True, np.eye(6)), keyframe
@@ -139,7 +139,7 @@ class MonocularTracker:
         except Degenerate as refusal:
             return self._lose(image, view, refusal.reason)
         state = TrackState.RECOVERED if self._lost else TrackState.OK
-        self._lost, self._tracked_ns = 0, image.stamp_ns
+        self._lost = 0
         self._velocity = se3.inverse(self._odom_T_cam) @ pose
         self._odom_T_cam = se3.orthonormalize(pose)
         self._frames_since_kf += 1
@@ -215,10 +215,11 @@ class MonocularTracker:
 
     def _lose(self, image: StereoImage, view: FeatureView, reason: str) -> tuple[Frame, None]:
         """Stay where the motion was going and look for the keyframe again; after a while begin a new map."""
+        self._lost_ns = self._lost_ns if self._lost else image.stamp_ns
         self._lost += 1
         if self._lost <= 3:
             self._odom_T_cam = self._odom_T_cam @ self._velocity
-        if (image.stamp_ns - self._tracked_ns) * 1e-9 > self._config.tracker.lost_s:
+        if (image.stamp_ns - self._lost_ns) * 1e-9 > self._config.tracker.lost_s:
             self._submap += 1
             self._lost = 0
             self._keyframe = None

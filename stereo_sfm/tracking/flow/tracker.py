@@ -495,7 +495,7 @@ class Tracker:
         bridge = self._bridge(image.stamp_ns)
         seen = bridge is None or image.left.max() >= DARK
         if seen:
-            seconds = (image.stamp_ns - max(self._stamp_ns, self._lost_ns)) * 1e-9
+            seconds = (image.stamp_ns - self._lost_ns) * 1e-9 if self._lost > 1 else 0.0
             self._free_s = self._free_s + seconds if self._recovery.free else 0.0
             self._covered_s += 0.0 if self._recovery.free else seconds
         self._lost_ns = image.stamp_ns
