@@ -361,3 +361,16 @@ def test_a_robot_of_unknown_speed_may_be_anywhere_near() -> None:
     assert motion.expect(100_000_000).sigmas_off(there) < REACH
     motion.add(50_000_000, np.eye(4))
     assert motion.expect(150_000_000).sigmas_off(there) > REACH
+
+
+def test_one_image_without_a_pose_after_a_gap_begins_no_new_submap() -> None:
+    """The camera was unplugged for longer than `lost_s`, and its first image shows another place."""
+    stamp, gap_ns = drive().stamp_ns(BEGIN), round(2e9 * Config().tracker.lost_s)
+    images = [seen(k) for k in range(BEGIN, BEGIN + 6)] + [drive().frame(400), seen(BEGIN + 6)]
+    images = [
+        dataclasses.replace(image, stamp_ns=stamp + round(n * 1e9 / RATE) + gap_ns * (n > 5))
+        for n, image in enumerate(images)
+    ]
+    *_, other, again = tracked(images)
+    assert other.state == TrackState.LOST
+    assert again.state in (TrackState.LOST, TrackState.RECOVERED)
