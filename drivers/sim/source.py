@@ -202,7 +202,7 @@ class SimSource(BaseSource):
     def renderer(self) -> Renderer:
         """Created when first needed."""
         if self._renderer is None:
-            self._renderer = Renderer(self.world, self._camera)
+            self._renderer = Renderer(self.world, self._camera, self.options.rays)
             self._sensors = self._make_sensors(self._renderer)
         return self._renderer
 

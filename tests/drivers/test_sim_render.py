@@ -306,3 +306,38 @@ def test_people_move_and_the_store_does_not() -> None:
     assert (points > at[:3] - 1e-6).all() and (points < at[3:] + 1e-6).all()
     far = cv2.dilate(shown.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
     assert (with_one.image == without.image)[far].all()
+
+
+def test_more_rays_through_a_pixel_come_near_to_exact_images() -> None:
+    rig = make_rig("pinhole", (320, 200))
+    one, four, exact = (Renderer(store(), rig, rays).view(0, POSE) for rays in (1, 4, 6))
+    assert np.array_equal(one.depth, four.depth) and np.array_equal(one.ids, four.ids)
+    shown = exact.ids >= 0
+    error = [float(np.abs(view.image - exact.image)[shown].mean()) for view in (one, four)]
+    assert error[0] > 2 and error[1] < 0.3 * error[0]
+    assert abs(float((one.image - exact.image)[shown].mean())) < 1  # nothing is brighter or darker for it
+
+
+def test_with_more_rays_an_edge_inside_a_texture_lies_where_it_is() -> None:
+    """Texture windows of a shelf's front against their exact places: by least squares of brightness."""
+    rig = make_rig("pinhole", (320, 200))
+    one, four, exact = (Renderer(store(), rig, rays).view(0, POSE).image for rays in (1, 4, 8))
+    corners = cv2.goodFeaturesToTrack(np.clip(exact, 0, 255).astype(np.uint8), 300, 0.01, 6)[:, 0]
+    shifts = [_shifts(image, exact, corners) for image in (one, four)]
+    rms = [float(np.sqrt(np.mean(np.square(shift)))) for shift in shifts]
+    assert rms[0] > 0.03 and rms[1] < 0.5 * rms[0]
+
+
+def _shifts(image: F64, exact: F64, corners: F64) -> F64:
+    """(N, 2) px by which windows around corners (N, 2) px are displaced."""
+    smooth, true = (cv2.GaussianBlur(a.astype(np.float32), (0, 0), 0.7) for a in (image, exact))
+    dy, dx = np.gradient(true)
+    out = list[F64]()
+    for u, v in corners.astype(int):
+        rows, columns = slice(v - 6, v + 7), slice(u - 6, u + 7)
+        if min(u, v) < 6 or v > true.shape[0] - 8 or u > true.shape[1] - 8:
+            continue
+        a, b, x, y = (part[rows, columns].ravel() for part in (true, smooth, dx, dy))
+        solution = np.linalg.lstsq(np.column_stack([x, y, np.ones(len(a)), a]), a - b, rcond=None)[0]
+        out.append(np.clip(solution[:2], -0.5, 0.5))
+    return np.array(out)
