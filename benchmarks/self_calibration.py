@@ -75,9 +75,9 @@ class Result:
 class Store:
     """One store: its images by how the right camera moves, rendered when first needed."""
 
-    def __init__(self, camera: str, seed: int, frames: int, size: str) -> None:
-        sized = f"&size={size}" if size else ""
-        source = open_source(f"sim:loop?camera={camera}&seed={seed}&frames={frames}&rate={RATE_HZ}{sized}")
+    def __init__(self, camera: str, seed: int, frames: int, size: str, rays: int = 1) -> None:
+        spec = f"sim:loop?camera={camera}&seed={seed}&frames={frames}&rate={RATE_HZ}&size={size}&rays={rays}"
+        source = open_source(spec)
         assert isinstance(source, SimSource) and source.ground_truth is not None
         self._source, self.rig, self.truth = source, source.rig, source.ground_truth
         self._still: list[StereoImage] = []
@@ -162,11 +162,14 @@ def main() -> int:
     parser.add_argument("--frames", type=int, default=300)
     parser.add_argument("--every", type=int, default=1, help="of the turns, every so many")
     parser.add_argument("--size", default="", metavar="WxH")
+    parser.add_argument(
+        "--rays", type=int, default=1, help="of a pixel, squared: 4 are exact to 0.02 px, in nine times the time"
+    )
     args = parser.parse_args()
     bad: list[str] = []
     for camera in args.camera:
         for seed in range(args.first_seed, args.first_seed + args.seeds):
-            name, store = f"{camera} {seed}", Store(camera, seed, args.frames, args.size)
+            name, store = f"{camera} {seed}", Store(camera, seed, args.frames, args.size, args.rays)
             print(f"{camera}, store {seed}", flush=True)
             if "static" in args.what:
                 base = static(name, store, args.every, bad).ate_m

@@ -81,7 +81,7 @@ class SimOptions(SourceOptions):
         low=0, high=64,
     )  # fmt: skip
     rays: int = option(
-        1, "of a pixel, squared: 1 places content to 0.06 px, 4 to 0.02 px in eight times the time", low=1, high=8
+        1, "of a pixel, squared: 1 places content to 0.06 px, 4 to 0.02 px in nine times the time", low=1, high=8
     )
     robot: bool = option(False, "the robot's own edge and a hand rail are in view")
     dirt: float = option(0.0, "spots on the lenses", low=0, high=1)

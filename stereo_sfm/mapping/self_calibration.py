@@ -6,9 +6,10 @@ the windows (even and odd ones) confirm, and that exceed the systematic error of
 others follow that are worth their variance. The rows show terms of lenses, which change lengths by what the lens model
 says of disparities: lengths stay unless there is evidence about them. A corrected term is refined as long as windows
 come, first whenever their number has doubled. Points are tracked where a wrong rig expects them, and agree with it a
-little: once there are enough windows since a large correction, those before it are discarded. Where the windows show
-drift (temperature), the rig is known to be wrong: the terms at the newest window are used from it on, and the windows
-since the last revision are on the way there.
+little: a first error that is so large that two keyframes show it is corrected at the third, and once there are enough
+windows since a large correction, those before it are discarded. Where the windows show drift (temperature), the rig is
+known to be wrong: the terms at the newest window are used from it on, and the windows since the last revision are on
+the way there.
 
 After a sudden change of the rig (a knock) earlier windows are discarded, and the correction applies from the first
 keyframe on that was seen by the changed rig. What the rig before it measured of the points that are seen before and
@@ -21,6 +22,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -38,6 +40,8 @@ MIN_KEYFRAMES = 3  # of the last window
 MIN_MOTION = 0.02  # of the image's width: median motion of common points from one keyframe of a window to the next
 MAX_COMMON = 0.6  # share of common points below which a keyframe has moved in any case
 MIN_WINDOWS = 2  # before the first correction
+FIRST_KEYFRAMES = 3  # from which a first error is corrected that both pairs of them show ...
+FIRST_SIGMAS = 20.0  # ... so significantly: before, lens errors and those of tracking may look like it
 ENOUGH_WINDOWS = 4  # with fewer, a correction must be more significant: errors of a window's keyframes are alike
 MAX_BETWEEN = 4  # windows from one revision to the next: as many as there are, but no more
 MAX_WINDOWS = 80  # used, the newest
@@ -80,7 +84,7 @@ class SelfCalibration:
         self._keyframes: list[SeenPoints] = []
         self.windows: deque[RigWindow] = deque(maxlen=MAX_WINDOWS)  # since the last step
         self._since = 0  # first keyframe of the windows
-        self._revised_ns = 0  # newest window of the last revision
+        self._revised_ns = 0  # newest keyframe of the last revision
         self._until_due = MIN_WINDOWS  # windows until the next revision
         self._misled_kf_id = -1  # last keyframe tracked with a rig that a large correction has shown to be wrong
         self._stepped = False  # a step was detected and is not yet corrected
@@ -107,6 +111,8 @@ class SelfCalibration:
         if self._keyframes and not _moved(self._keyframes[-1], seen, MIN_MOTION * self._rig.left.width):
             return None
         self._keyframes.append(seen)
+        if len(self._keyframes) == FIRST_KEYFRAMES and not (self.windows or self._corrected.any()):
+            return self._at_first_sight()
         if len(self._keyframes) < KEYFRAMES or not self._close_window():
             return None
         if self._until_due > 0 and not self._stepped:
@@ -178,6 +184,16 @@ class SelfCalibration:
             self._misled_kf_id = windows[-1].last_kf_id
         return self._revision(found, why, self._since)
 
+    def _at_first_sight(self) -> Revision | None:
+        """A correction of an error that is so large that two keyframes show it."""
+        pairs = [solve_window(self._rig, pair, self.terms) for pair in pairwise(self._keyframes)]
+        windows = [w for w in pairs if w is not None]
+        found = self._change(windows, FIRST_SIGMAS) if len(windows) == len(pairs) else None
+        if found is None:
+            return None
+        self._misled_kf_id = self._keyframes[-1].kf_id
+        return self._revision(found, "significant", self._since)
+
     def _on_the_way(self, change: F64) -> tuple[tuple[int, F64], ...]:
         """The windows between the last revision and the newest: first keyframes, and terms that change steadily."""
         begin, end = max(self._revised_ns, self.windows[0].stamp_ns), self.windows[-1].stamp_ns
@@ -240,7 +256,7 @@ class SelfCalibration:
     ) -> Revision:
         self.terms = self.terms + change.value
         self._corrected |= change.written
-        self._revised_ns = self.windows[-1].stamp_ns
+        self._revised_ns = self._recent[-1].stamp_ns
         text = _text(change.value, change.sigma)
         return Revision(self.terms.copy(), change.covariance, since_kf_id, why, text, on_the_way)
 

@@ -37,7 +37,8 @@ class KnockDetector:
 
     def __init__(self) -> None:
         self.turn: F64 = np.zeros(3)  # rad about the right camera's axes, since the rig was corrected last
-        self._usual: F64 = np.zeros(3)  # rad, mean over the last images: what the rig is wrong by, without a knock
+        # rad, mean over the last images: what the rig is wrong by, without a knock; None before the first
+        self._usual: F64 | None = None
         self._since_ns = 0
         self._until_ns = 0  # no rotation is looked for before
 
@@ -64,10 +65,9 @@ class KnockDetector:
                 solution.pose, used, tracks.origin, tracks.direction, tracks.rho, tracks.uv, tracks.uv_right,
                 cameras.cams, cameras.right_T_left, scale, turn,
             )  # fmt: skip
-            if step == 0:
-                usual = self._usual.copy()
-                share = 1.0 - math.exp(-seconds / SETTLED_S) if count >= enough else 0.0
-                self._usual += share * (turn - self._usual)
+            if step == 0 and count >= enough:
+                usual = turn.copy() if self._usual is None else self._usual
+                self._usual = usual + (1.0 - math.exp(-seconds / SETTLED_S)) * (turn - usual)
             wrong = squares - left < max(MIN_SHARE * squares, MIN_SHIFT_PX**2 * count)
             if count < enough or (wrong and (not divided or step == STEPS - 1)):
                 return None
