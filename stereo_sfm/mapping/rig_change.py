@@ -37,6 +37,12 @@ class SeenPoints:
         k = keyframe
         return SeenPoints(k.kf_id, k.stamp_ns, k.submap_id, k.odom_T_cam, k.point_ids, k.uv_left, k.uv_right)
 
+    def every(self, step: int, first: int) -> SeenPoints:
+        """One in `step` of the points, by their ids, which begin with `first`."""
+        rows = np.flatnonzero(self.point_ids % step == first)
+        points = self.point_ids[rows], self.uv_left[rows], self.uv_right[rows]
+        return SeenPoints(self.kf_id, self.stamp_ns, self.submap_id, self.odom_T_cam, *points)
+
 
 def first_changed(seen: Sequence[SeenPoints], before: Rig, after: Rig) -> int | None:
     """Id of the first keyframe of the rig `after`; None where one rig explains all of them as well.

@@ -6,7 +6,7 @@ the windows (even and odd ones) confirm, and that exceed the systematic error of
 others follow that are worth their variance. The rows show terms of lenses, which change lengths by what the lens model
 says of disparities: lengths stay unless there is evidence about them. A corrected term is refined as long as windows
 come, first whenever their number has doubled. Points are tracked where a wrong rig expects them, and agree with it a
-little: a first error that is so large that two keyframes show it is corrected at the third, and once there are enough
+little: a first error that is so large that two keyframes show it is corrected at once, and once there are enough
 windows since a large correction, those before it are discarded. Where the windows show drift (temperature), the rig is
 known to be wrong: the terms at the newest window are used from it on, and the windows since the last revision are on
 the way there.
@@ -22,7 +22,6 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -40,7 +39,7 @@ MIN_KEYFRAMES = 3  # of the last window
 MIN_MOTION = 0.02  # of the image's width: median motion of common points from one keyframe of a window to the next
 MAX_COMMON = 0.6  # share of common points below which a keyframe has moved in any case
 MIN_WINDOWS = 2  # before the first correction
-FIRST_KEYFRAMES = 3  # from which a first error is corrected that both pairs of them show ...
+FIRST_KEYFRAMES = 2  # from which a first error is corrected that both halves of their points show ...
 FIRST_SIGMAS = 20.0  # ... so significantly: before, lens errors and those of tracking may look like it
 ENOUGH_WINDOWS = 4  # with fewer, a correction must be more significant: errors of a window's keyframes are alike
 MAX_BETWEEN = 4  # windows from one revision to the next: as many as there are, but no more
@@ -185,10 +184,10 @@ class SelfCalibration:
         return self._revision(found, why, self._since)
 
     def _at_first_sight(self) -> Revision | None:
-        """A correction of an error that is so large that two keyframes show it."""
-        pairs = [solve_window(self._rig, pair, self.terms) for pair in pairwise(self._keyframes)]
-        windows = [w for w in pairs if w is not None]
-        found = self._change(windows, FIRST_SIGMAS) if len(windows) == len(pairs) else None
+        """A correction of an error that is so large that each half of the points of two keyframes shows it."""
+        halves = [[k.every(2, first) for k in self._keyframes] for first in (0, 1)]
+        windows = [w for half in halves if (w := solve_window(self._rig, half, self.terms)) is not None]
+        found = self._change(windows, FIRST_SIGMAS) if len(windows) == len(halves) else None
         if found is None:
             return None
         self._misled_kf_id = self._keyframes[-1].kf_id

@@ -89,8 +89,8 @@ def test_the_more_significant_the_sooner(name: str) -> None:
 
 @pytest.mark.parametrize("name", RIGS)
 @pytest.mark.parametrize("degrees", [(0.3, 0.0, 0.0), (0.0, 0.0, -0.3), (0.2, 0.0, 0.3)])
-def test_a_large_error_is_corrected_with_the_third_keyframe(name: str, degrees: tuple[float, float, float]) -> None:
-    """The third with motion, before there is a window."""
+def test_a_large_error_is_corrected_with_the_second_keyframe(name: str, degrees: tuple[float, float, float]) -> None:
+    """The second with motion, before there is a window."""
     true = RIGS[name]
     believed = turned(true, degrees)
     estimator = SelfCalibration(believed)
