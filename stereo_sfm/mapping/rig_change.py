@@ -38,7 +38,7 @@ class SeenPoints:
         return SeenPoints(k.kf_id, k.stamp_ns, k.submap_id, k.odom_T_cam, k.point_ids, k.uv_left, k.uv_right)
 
     def every(self, step: int, first: int) -> SeenPoints:
-        """One in `step` of the points, by their ids, which begin with `first`."""
+        """With one in `step` of the points: those whose id is `first` modulo `step`."""
         rows = np.flatnonzero(self.point_ids % step == first)
         points = self.point_ids[rows], self.uv_left[rows], self.uv_right[rows]
         return SeenPoints(self.kf_id, self.stamp_ns, self.submap_id, self.odom_T_cam, *points)
