@@ -112,7 +112,7 @@ class Renderer:
         edges inside a texture are some hundredths of a pixel from where they should be.
         """
         self.world, self.rig = world, rig
-        self._whole = _grid(rays) if rays > 1 else None
+        self._pixel_rays = _grid(rays) if rays > 1 else None
         self.cameras = [CameraRays(c) for c in (rig.left, rig.right) if c is not None]
         whole, real = (np.empty((2, SCRATCH), dtype) for dtype in (np.int64, np.float64))
         self._scratch = real[0], whole[0], real[1], whole[1]
@@ -135,8 +135,8 @@ class Renderer:
         )
         marks = np.full(shape, -1, np.int32) if len(self.world.materials) else view.ids
         self._cast(rays, world_T_cam, moving, rays.valid, _CENTRE, 0, view, marks)
-        if self._whole is not None:
-            self._cast(rays, world_T_cam, moving, np.flatnonzero(rays.inner), self._whole, 0, view, marks)
+        if self._pixel_rays is not None:
+            self._cast(rays, world_T_cam, moving, np.flatnonzero(rays.inner), self._pixel_rays, 0, view, marks)
         else:
             found = np.empty(view.ids.size, np.int64)
             edges = found[: find_edges(view.image, marks, rays.inner, EDGE_CONTRAST, found)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -39,9 +39,8 @@ class SeenPoints:
 
     def every(self, step: int, first: int) -> SeenPoints:
         """With one in `step` of the points: those whose id is `first` modulo `step`."""
-        rows = np.flatnonzero(self.point_ids % step == first)
-        points = self.point_ids[rows], self.uv_left[rows], self.uv_right[rows]
-        return SeenPoints(self.kf_id, self.stamp_ns, self.submap_id, self.odom_T_cam, *points)
+        kept = self.point_ids % step == first
+        return replace(self, point_ids=self.point_ids[kept], uv_left=self.uv_left[kept], uv_right=self.uv_right[kept])
 
 
 def first_changed(seen: Sequence[SeenPoints], before: Rig, after: Rig) -> int | None:
