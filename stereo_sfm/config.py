@@ -38,6 +38,9 @@ RENAMED = {
     "loop.gate_degrees_per_metre": "loop.gate_deg_per_m",
 }
 
+# Settings of earlier versions that decide nothing any more -> what does.
+REMOVED = {"tracker.max_window_disparity_px": "tracker.max_window_difference_sigmas"}
+
 
 def estimator_names() -> tuple[str, ...]:
     """The motion estimators other than `flow`: one file each in tracking/features/odometry/."""
@@ -65,9 +68,17 @@ class TrackerConfig:
         3.0, 0.001, 1000, "Noise of an observation that refines a depth; errors of successive frames are correlated"
     )
     max_error_sigmas: float = number(3.0, 0.1, 1000, "Residual above which an observation is an outlier")
-    max_epipolar_px: float = number(1.0, 0.01, 100, "Distance of a stereo match from its epipolar curve")
-    max_window_disparity_px: float = number(
-        0.2, 0, 100, "Difference of two supports' disparities (a narrow window, a plane): more is an edge in depth"
+    max_epipolar_px: float = number(
+        1.0,
+        0.01,
+        100,
+        "Distance of a stereo match from its epipolar curve, before the sequence has shown its own scatter",
+    )
+    max_window_difference_sigmas: float = number(
+        1.5, 0, 1000, "Difference of two windows' disparities over the typical noise of one: more is an edge in depth"
+    )
+    max_window_sigmas: float = number(
+        1.8, 0, 1000, "Noise of a window's disparity over the typical one: more is an edge in depth"
     )
     max_surface_misfit: float = number(
         8.0, 1, 1000, "Difference of matched windows over the typical one: more is an edge in depth"
@@ -338,6 +349,12 @@ def renamed(data: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
             del moved[old_key]
             out[section] = moved
             met.append(old)
+    for old in REMOVED:
+        section, key = old.split(".")
+        inside = out.get(section)
+        if isinstance(inside, dict) and key in inside:
+            out[section] = {k: v for k, v in inside.items() if k != key}  # pyright: ignore[reportUnknownVariableType]
+            met.append(old)
     return out, met
 
 
@@ -345,7 +362,8 @@ def _with_current_names(data: dict[str, Any]) -> dict[str, Any]:
     """One layer of values under current names; logs a warning for each old name."""
     out, met = renamed(data)
     for old in met:
-        logging.getLogger("stereo_sfm").warning("configuration: %s is called %s now", old, RENAMED[old])
+        what, now = ("is called", RENAMED[old]) if old in RENAMED else ("is ignored: see", REMOVED[old])
+        logging.getLogger("stereo_sfm").warning("configuration: %s %s %s now", old, what, now)
     return out
 
 

@@ -43,6 +43,22 @@ def compose_into(a, b, out):
 
 
 @inner
+def rectify_rotation(t):
+    """Make the rotation of a transform (4, 4) one again, in place: a product of many is only nearly orthogonal.
+
+    One step of Newton's iteration for the polar decomposition, R (3 - R'R) / 2, whose error is the square of R's
+    (Higham, Computing the polar decomposition, SIAM J. Sci. Stat. Comput. 7, 1986).
+    """
+    r = t[:3, :3].copy()
+    for i in range(3):
+        for j in range(3):
+            product = 0.0
+            for k in range(3):
+                product += r[i, k] * (r[0, k] * r[0, j] + r[1, k] * r[1, j] + r[2, k] * r[2, j])
+            t[i, j] = 1.5 * r[i, j] - 0.5 * product
+
+
+@inner
 def dot(a, b):
     """Product of two vectors of three coordinates."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

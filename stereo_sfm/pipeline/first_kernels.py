@@ -45,7 +45,7 @@ def compile_share(config: Config, rig: Rig) -> None:
     tracks, pyramid = _tracks(rig), build_pyramid(squares(*rig.left.size[::-1]), config.tracker.pyramid_levels)
     describe(pyramid[0], tracks.uv)
     matcher = StereoMatcher(config.tracker, rig)
-    uv_right = matcher.follow(pyramid, pyramid, tracks.uv, tracks.points(), np.eye(4))
+    uv_right = matcher.follow(pyramid, pyramid, tracks.uv, tracks.points(), np.eye(4), tracks.right_offset)
     matcher.placed(tracks.uv, uv_right)
     follower = Follower(config.tracker, rig, VisibleArea(rig.left, config.tracker.max_angle_deg), RollingShutter(rig))
     rows, slots = follower.begin(pyramid, tracks.uv, np.eye(4))

@@ -41,6 +41,7 @@ def scene(rng: np.random.Generator) -> tuple[Tracks, Bool]:
         point_ids=np.arange(n, dtype=np.int64),
         uv=uv,
         uv_right=uv_right,
+        right_offset=np.zeros((n, 2)),
         origin=np.zeros((n, 3)),
         direction=before / distance[:, None],
         rho=1 / distance,
@@ -348,13 +349,36 @@ def test_a_group_that_disagrees_is_marked_and_tracked_further() -> None:
     assert tracks.moving[on_person].all()
     assert not tracks.moving[~on_person].any()
     begun = Movers().near(tracks.uv, tracks.rho, tracks)
-    assert begun[on_person].mean() > 0.9
-    assert begun[~on_person].mean() < 0.1
-    assert Movers().near(tracks.uv, tracks.rho, tracks, 1)[begun].all()
+    marked = begun > 0
+    assert marked[on_person].mean() > 0.9
+    assert marked[~on_person].mean() < 0.1
+    assert (begun[marked] == STATIC).all()
+    assert (Movers().near(tracks.uv, tracks.rho, tracks, 1)[marked] > 0).all()
     assert not Movers().near(tracks.uv, tracks.rho, tracks, 7).any()  # of six neighbours
     for _ in range(STATIC):
         tracks, _ = after_frame(tracks, np.ones(len(tracks), bool), NONE, 3, alert=True, static=STATIC)
     assert not tracks.moving.any()
+
+
+def test_marks_fade_where_points_mostly_agree() -> None:
+    """A still point of a noisy sequence disagrees now and then; new points beside it take over what is left."""
+    tracks, on_person = scene(np.random.default_rng(0))
+    tracks.moving, tracks.misses = on_person.copy(), np.where(on_person, STATIC, 0).astype(np.int32)
+    for frame in range(4 * STATIC):
+        agrees = np.full(len(tracks), frame % 5 != 0) | ~tracks.moving
+        tracks, _ = after_frame(tracks, agrees, NONE, 3, alert=True, static=STATIC)
+        begun = Movers().near(tracks.uv, tracks.rho, tracks)
+        assert begun.max(initial=0) <= tracks.misses.max()
+    assert not tracks.moving.any() and not begun.any()
+
+
+def test_a_mark_stays_where_points_mostly_disagree() -> None:
+    tracks, on_person = scene(np.random.default_rng(0))
+    tracks.moving, tracks.misses = on_person.copy(), np.where(on_person, STATIC, 0).astype(np.int32)
+    for frame in range(4 * STATIC):
+        agrees = np.full(len(tracks), frame % 2 == 0) | ~on_person
+        tracks, _ = after_frame(tracks, agrees, NONE, 3, alert=True, static=STATIC)
+    assert (tracks.moving == on_person).all()
 
 
 def test_no_point_is_marked_in_a_static_scene() -> None:

@@ -42,7 +42,7 @@ def known_points(rig: Rig, seen_by: Rig, noise_px: float, count: int = 200) -> t
         np.arange(count), uv + rng.normal(0, noise_px, uv.shape), uv_right + rng.normal(0, noise_px, uv.shape),
         np.zeros((count, 3)), direction, 1 / depth, np.full(count, 1e-6), np.full(count, 100, np.int32),
         np.zeros(count, np.int32), np.tile(np.eye(2), (count, 1, 1)), np.arange(count), np.zeros(count, bool),
-        np.zeros(count, bool),
+        np.zeros(count, bool), np.zeros((count, 2)),
     )  # fmt: skip
     return tracks, PoseSolution(np.eye(4), np.zeros(6), np.eye(6), np.zeros(count), 0.1, 3.0)
 

@@ -36,6 +36,7 @@ def view() -> tuple[Follower, F64, Bool]:
         point_ids=np.arange(n),
         uv=uv,
         uv_right=np.full((n, 2), np.nan),
+        right_offset=np.zeros((n, 2)),
         origin=np.zeros((n, 3)),
         direction=RIG.left.unproject(uv),
         rho=np.full(n, 1 / DISTANCE),
@@ -91,9 +92,11 @@ def test_a_small_part_of_the_view_is_little_evidence() -> None:
 class TooFar(StereoMatcher):
     """Noise puts all points behind the camera."""
 
-    def match(self, left: Pyramid, right: Pyramid | F32, uv: F64) -> StereoMatch:
+    def match(self, left: Pyramid, right: Pyramid | F32, uv: F64, needed: int = 0) -> StereoMatch:
         n = len(uv)
-        return StereoMatch(uv, uv, RIG.left.unproject(uv), np.full(n, -1e-6), np.ones(n), np.ones(n, bool))
+        return StereoMatch(
+            uv, uv, RIG.left.unproject(uv), np.full(n, -1e-6), np.ones(n), np.zeros((n, 2)), np.ones(n, bool)
+        )
 
 
 def test_corners_that_noise_puts_behind_the_camera_are_far_away() -> None:

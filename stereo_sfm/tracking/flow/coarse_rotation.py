@@ -20,6 +20,9 @@ from stereo_sfm.types import F64
 
 ITERATIONS = 12
 STEP = 0.1  # pixels of the level below which a step ends its iterations
+SEARCHED = 0.25  # of the field of view: rotations to either side that are tried where no prediction holds
+SPACING_PX = 2  # of the smallest level, from one of them to the next: the alignment reaches as far
+COMPARED = 1000  # pixels of the smallest level by which they are compared
 
 
 @njit
@@ -73,6 +76,46 @@ def _normal_equations(prev, cur, bearings, stride, model, params, scale, rotatio
     return normal, rhs, total / max(count, 1), count
 
 
+@njit
+def _similarities(prev, cur, bearings, stride, model, params, scale, rotations):
+    """(M,) correlation of two images' brightness where both are seen, at rotations (M, 3, 3); -1 if that is too little.
+
+    `bearings`: (h, w, 3) of the pixels of a level of the previous image; every `stride`-th is used.
+    """
+    h, w = bearings.shape[:2]
+    hc, wc = cur.shape
+    out = np.full(len(rotations), -1.0)
+    for m in range(len(rotations)):
+        r = rotations[m]
+        total, n, sa, sb, saa, sbb, sab = 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for v in range(0, h, stride):
+            for u in range(0, w, stride):
+                b = bearings[v, u]
+                if math.isnan(b[0]):
+                    continue
+                total += 1
+                x = r[0, 0] * b[0] + r[0, 1] * b[1] + r[0, 2] * b[2]
+                y = r[1, 0] * b[0] + r[1, 1] * b[1] + r[1, 2] * b[2]
+                z = r[2, 0] * b[0] + r[2, 1] * b[1] + r[2, 2] * b[2]
+                p = project_one(model, params, x, y, z)
+                if math.isnan(p[0]):
+                    continue
+                cu, cv = int(round(p[0] / scale)), int(round(p[1] / scale))
+                if cu < 0 or cv < 0 or cu >= wc or cv >= hc:
+                    continue
+                before, now = float(prev[v, u]), float(cur[cv, cu])
+                n += 1
+                sa += before
+                sb += now
+                saa += before * before
+                sbb += now * now
+                sab += before * now
+        if n > SEARCHED * total:
+            spread = (saa - sa * sa / n) * (sbb - sb * sb / n)
+            out[m] = (sab - sa * sb / n) / math.sqrt(spread) if spread > 0 else -1.0
+    return out
+
+
 class CoarseRotation:
     """Rotation of the camera between two pyramids."""
 
@@ -82,6 +125,26 @@ class CoarseRotation:
         u, v = np.arange(0, camera.width, spacing), np.arange(0, camera.height, spacing)
         self._bearings = camera.unproject(np.stack(np.meshgrid(u, v), -1).astype(np.float64))
         self._strides = {levels - 1: 1, levels - 2: 2}
+        self._top = levels - 1
+        self._stride = max(round(math.sqrt(u.size * v.size / COMPARED)), 1)
+        self._step_rad = SPACING_PX * spacing / camera.fx
+
+    def search(self, prev: Pyramid, cur: Pyramid) -> F64:
+        """The rotation (3, 3) that takes bearings of `prev` into `cur`, whatever the prediction: the best of a grid."""
+        rotations = self._grid()
+        found = _similarities(
+            prev[self._top], cur[self._top], self._bearings, self._stride, self._camera.model_id, self._camera.params,
+            float(2**self._top), rotations,
+        )  # fmt: skip
+        return self.align(prev, cur, rotations[int(np.argmax(found))])
+
+    def _grid(self) -> F64:
+        """(M, 3, 3) rotations about the image's axes, by which the camera may have turned."""
+        b = self._bearings
+        angles = [np.arctan2(b[..., k], b[..., 2]) for k in (1, 0)]  # about x, about y
+        most = [math.floor(SEARCHED * float(np.nanmax(a) - np.nanmin(a)) / self._step_rad) for a in angles]
+        x, y = np.meshgrid(*(self._step_rad * np.arange(-n, n + 1) for n in most), indexing="ij")
+        return se3.so3_exp(np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3))
 
     def align(self, prev: Pyramid, cur: Pyramid, cur_R_prev: F64) -> F64:
         """Improve the rotation (3, 3) that takes bearings of `prev` into `cur`."""

@@ -5,8 +5,8 @@ lost, a second motion is estimated from the points that disagree. The camera's m
 the points tracked longest, among those that are plausible after its recent motion. Points that support another motion,
 or that disagree repeatedly as a group, are marked as moving. They are tracked further, so that no new points are added
 on a moving object, but they do not contribute to the pose until they have been static for a second: somebody who sways
-stands still for a moment, too. Nor do new points beside them, or where such points were lost: neither the pose nor the
-map takes them before they agreed for so long.
+stands still for a moment, too. A mark is evidence that moves both ways: agreement takes from it, disagreement adds to
+it. New points beside marked ones start with as much as these have, never with more: marks in a still room fade.
 """
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportMissingTypeArgument=false
@@ -20,7 +20,7 @@ import numpy as np
 from stereo_sfm.geometry.kernels import njit
 from stereo_sfm.tracking.flow.pose_solver import row_residuals
 from stereo_sfm.tracking.flow.tracks import Tracks
-from stereo_sfm.types import F64, I64, Bool, Corners
+from stereo_sfm.types import F64, I32, I64, Bool, Corners
 
 MIN_GROUP = 8  # points of a group; fewer do not define a motion
 AGREEING_SHARE = 0.65  # of the points that were tracked; if fewer agree, another motion is searched for
@@ -31,7 +31,8 @@ WEIGHT_RATIO = 1.05  # by which another motion must outweigh the one that all po
 ALERT_S = 1.0  # for which other motions are searched for after one was seen
 MOVING_NEIGHBOURS, NEIGHBOURS = 3, 6  # a point moves if so many of its nearest neighbours disagree as well
 SAME_DEPTH = 0.3  # logarithm of the ratio of two distances
-STATIC_S, MIN_STATIC_FRAMES = 1.0, 4  # for which a moving point, or a new one beside, must agree before it is used
+STATIC_S, MIN_STATIC_FRAMES = 1.0, 4  # for which a moving point must agree before it is used
+DISAGREES = 2  # frames of agreement that one of disagreement outweighs
 
 
 def static_frames(seconds: float) -> int:
@@ -54,7 +55,7 @@ def after_frame(
         The remaining tracks, and their rows as a mask (N,).
     """
     misses = np.where(inlier, 0, tracks.misses + 1)
-    remaining = np.where(inlier, tracks.misses - 1, static)
+    remaining = np.where(inlier, tracks.misses - 1, np.minimum(tracks.misses + DISAGREES, static))
     tracks.misses = np.where(tracks.moving, remaining, misses).astype(np.int32)
     out = ~tracks.moving & (tracks.misses >= misses_allowed)
     disagree = tracks.moving | (tracks.misses > 0)
@@ -83,6 +84,10 @@ class Movers:
         self._stamp_ns: I64 = np.zeros(0, np.int64)
         self.static = MIN_STATIC_FRAMES  # frames in which a point beside must agree before it is used
 
+    def forget(self) -> None:
+        """Nothing is known to move: tracking begins anew."""
+        self._uv, self._rho, self._stamp_ns = np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.int64)
+
     def update(self, before: Tracks, after: Tracks, stamp_ns: int, static: int) -> None:
         """Remember the points that moved in the last image and are not in the tracks `after` it.
 
@@ -91,41 +96,48 @@ class Movers:
         self.static = static
         if not (len(self._rho) or before.moving.any()):
             return
-        moved = before.moving & (before.misses == static) & (before.age > 0)
+        moved = before.moving & (before.misses >= static) & (before.age > 0)
         lost = moved & ~np.isin(before.point_ids, after.point_ids)
         recent = self._stamp_ns > stamp_ns - int(ALERT_S * 1e9)
         self._uv = np.concatenate([self._uv[recent], before.uv[lost]])
         self._rho = np.concatenate([self._rho[recent], before.rho[lost]])
         self._stamp_ns = np.concatenate([self._stamp_ns[recent], np.full(lost.sum(), stamp_ns)])
 
-    def near(self, uv: F64, rho: F64, tracks: Tracks, least: int = MOVING_NEIGHBOURS) -> Bool:
-        """(M,) which new points, (M, 2) px and (M,) 1/m, are on moving objects, or nearer where one lost its points.
+    def near(self, uv: F64, rho: F64, tracks: Tracks, least: int = MOVING_NEIGHBOURS) -> I32:
+        """(M,) frames in which new points, (M, 2) px and (M,) 1/m, must agree before they are used.
 
-        They are if `least` of their nearest neighbours are.
+        0 where fewer than `least` of their nearest neighbours move, or lost their points while they came nearer; else
+        those neighbours' mean.
         """
         if not (len(self._rho) or tracks.moving.any()):
-            return np.zeros(len(uv), bool)
+            return np.zeros(len(uv), np.int32)
         among_uv, among_rho = np.concatenate([tracks.uv, self._uv]), np.concatenate([tracks.rho, self._rho])
-        marked = np.concatenate([tracks.moving, np.ones(len(self._rho), bool)])
-        return _marked_neighbours(uv, rho, among_uv, among_rho, marked, len(tracks)) >= least
+        frames = np.where(tracks.moving, tracks.misses, 0)
+        frames = np.concatenate([frames, np.full(len(self._rho), self.static)])
+        near, alike = _neighbours(uv, rho, among_uv, among_rho, len(tracks))
+        marked = alike & (frames[near] > 0)
+        count = marked.sum(1)
+        mean = np.where(marked, frames[near], 0).sum(1) / np.maximum(count, 1)
+        return np.where(count >= least, np.ceil(mean), 0).astype(np.int32)
 
 
-def _marked_neighbours(
-    uv: F64, rho: F64, among_uv: F64, among_rho: F64, marked: Bool, tracked: int | None = None
-) -> F64:
-    """(M,) number of the nearest NEIGHBOURS in the image that are marked (N,) and at about the same distance.
+def _marked_neighbours(uv: F64, rho: F64, among_uv: F64, among_rho: F64, marked: Bool) -> F64:
+    """(M,) number of the nearest NEIGHBOURS in the image that are marked (N,) and at about the same distance."""
+    if not len(uv) or not marked.any():
+        return np.zeros(len(uv))
+    near, alike = _neighbours(uv, rho, among_uv, among_rho, len(among_uv))
+    return (marked[near] & alike).sum(1)
+
+
+def _neighbours(uv: F64, rho: F64, among_uv: F64, among_rho: F64, tracked: int) -> tuple[I64, Bool]:
+    """(M, K) rows of the nearest NEIGHBOURS in the image, and which of them are at about the same distance.
 
     `tracked`: how many of the N are tracked; of the others farther ones count too, for what moved has come nearer.
     """
-    if not len(uv) or not marked.any():
-        return np.zeros(len(uv))
     squared = np.square(uv[:, :1] - among_uv[:, 0]) + np.square(uv[:, 1:] - among_uv[:, 1])
     nearest = squared.argpartition(min(NEIGHBOURS, len(among_uv)) - 1, axis=1)[:, :NEIGHBOURS]
     nearer = np.log(among_rho[nearest] / rho[:, None])  # than the new point
-    same_depth = np.abs(nearer) < SAME_DEPTH
-    if tracked is not None:
-        same_depth |= (nearest >= tracked) & (nearer < 0.0)
-    return (marked[nearest] & same_depth).sum(1)
+    return nearest, (np.abs(nearer) < SAME_DEPTH) | ((nearest >= tracked) & (nearer < 0.0))
 
 
 def in_group(tracks: Tracks, points: Bool) -> Bool:
@@ -151,7 +163,7 @@ def beside_moving(tracks: Tracks) -> Bool:
 def without_moving(corners: Corners, tracks: Tracks, movers: Movers) -> Corners:
     """The corners that are not on moving objects."""
     distance = np.linalg.norm(corners.points_cam, axis=1).astype(np.float64)
-    static = ~movers.near(corners.uv_left.astype(np.float64), 1.0 / np.maximum(distance, 1e-6), tracks)
+    static = movers.near(corners.uv_left.astype(np.float64), 1.0 / np.maximum(distance, 1e-6), tracks) == 0
     return Corners(
         corners.uv_left[static], corners.uv_right[static], corners.points_cam[static], corners.descriptors[static]
     )

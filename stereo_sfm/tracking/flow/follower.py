@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -255,14 +255,23 @@ class Follower:
         )  # fmt: skip
         return uv, warp, np.asarray(ncc > self._config.min_anchor_ncc)
 
-    def turned(self, pyramid: klt.Pyramid, expected: ExpectedMotion, last_pose: F64) -> ExpectedMotion:
-        """The expected motion with the rotation that aligns the coarsest images; the search starts at the top level."""
+    def turned(
+        self, pyramid: klt.Pyramid, expected: ExpectedMotion, last_pose: F64, anywhere: bool = False
+    ) -> ExpectedMotion:
+        """The expected motion with the rotation that aligns the coarsest images; the search starts at the top level.
+
+        `anywhere`: the best of all rotations, not the one near the expected.
+        """
         assert self._last is not None
-        cur_R_prev = expected.pose[:3, :3].T @ last_pose[:3, :3]
-        cur_R_prev = self._coarse_rotation.align(self._last, pyramid, cur_R_prev)
+        if anywhere:
+            cur_R_prev = self._coarse_rotation.search(self._last, pyramid)
+        else:
+            expected_R = expected.pose[:3, :3].T @ last_pose[:3, :3]
+            cur_R_prev = self._coarse_rotation.align(self._last, pyramid, expected_R)
         self.search_widely()
         pose = se3.from_rotation_translation(last_pose[:3, :3] @ cur_R_prev.T, expected.pose[:3, 3])
-        return ExpectedMotion(pose, se3.log(se3.inverse(last_pose) @ pose), expected.seconds)
+        pose = se3.orthonormalize(pose)
+        return replace(expected, pose=pose, moved=se3.log(se3.inverse(last_pose) @ pose))
 
     def search_widely(self) -> None:
         """Start the next search at the top level, for an unreliable prediction."""

@@ -80,7 +80,7 @@ class ExpectedMotion:
     def to(self, pose: F64) -> ExpectedMotion:
         """The motion from the last frame's pose to another pose (4, 4) than the expected one."""
         moved = se3.log(se3.exp(self.moved) @ se3.inverse(self.pose) @ pose)
-        return ExpectedMotion(pose, moved, self.seconds)
+        return replace(self, pose=pose, moved=moved)
 
 
 @dataclass
@@ -397,16 +397,27 @@ class FramePoseSolver:
         if self.alert and not moving:  # still there, with new points
             moving = in_group(tracks, ~tracks.moving & ~solution.inlier).sum() >= MIN_GROUP
         self._alert_s = ALERT_S if moving else max(self._alert_s - seconds, 0.0)
+        self._learn_noise(tracks, solution, seconds)
         if self.alert:
             return
         share = 1.0 - math.exp(-seconds / MEMORY_S) if self.open_view else 1.0
         self.open_view += share * (solution.inliers - self.open_view)
-        error = median(solution.error[solution.inlier])
-        noise = self._noise * (0.9 + 0.1 * error / MEDIAN_ERROR)
-        self._noise = min(max(noise, NOISE_RANGE[0]), NOISE_RANGE[1])
         if seconds > 0:
             off = np.array(se3.extent(se3.inverse(expected.pose) @ solution.pose)) / seconds**2
             self._difference += (1.0 - math.exp(-seconds / MEMORY_S)) * (off**2 - self._difference)
+
+    def _learn_noise(self, tracks: Tracks, solution: PoseSolution, seconds: float) -> None:
+        """From the points that have been static for long, outliers or not: what they show is noise.
+
+        While none is known for so long, from the inliers, unless objects move.
+        """
+        settled = ~tracks.moving & (tracks.age * seconds >= SETTLED_S) & np.isfinite(solution.error)
+        if np.count_nonzero(settled) < 2 * self._config.min_features:
+            settled = solution.inlier
+            if self.alert:
+                return
+        noise = self._noise * (0.9 + 0.1 * median(solution.error[settled]) / MEDIAN_ERROR)
+        self._noise = min(max(noise, NOISE_RANGE[0]), NOISE_RANGE[1])
 
     def forget(self) -> None:
         """Forget moving objects and the open view: new points are tracked from here on."""
@@ -416,7 +427,7 @@ class FramePoseSolver:
         """Update the distances of inliers whose position is not from the map."""
         pose_solver.refine_depth(
             solution.pose, solution.velocity, self._shutter.row_seconds(tracks.uv), tracks.origin, tracks.direction,
-            tracks.rho, tracks.variance, tracks.uv, tracks.uv_right, solution.inlier & ~tracks.mapped,
+            tracks.rho, tracks.variance, tracks.uv, tracks.right_on_curve(), solution.inlier & ~tracks.mapped,
             self.cameras.cams, self.cameras.right_T_left, self._config.depth_sigma_px, MIN_DEPTH_SIGMA,
         )  # fmt: skip
 
@@ -434,7 +445,7 @@ class FramePoseSolver:
         """(N,) whitened errors of the points at a pose (4, 4), with a velocity (6,) during the readout."""
         return errors_at(
             pose, velocity, self._shutter.row_seconds(tracks.uv), tracks.origin, tracks.direction, tracks.rho,
-            tracks.variance, tracks.uv, tracks.uv_right, self.cameras.cams, self.cameras.right_T_left,
+            tracks.variance, tracks.uv, tracks.right_on_curve(), self.cameras.cams, self.cameras.right_T_left,
             self._config.sigma_px * self._noise,
         )  # fmt: skip
 
@@ -442,7 +453,7 @@ class FramePoseSolver:
         """`pose_solver.influence` of points on a pose."""
         return pose_solver.influence(
             solution.pose, solution.velocity, solution.covariance, self._shutter.row_seconds(tracks.uv), tracks.origin,
-            tracks.direction, tracks.rho, tracks.variance, tracks.uv, tracks.uv_right, self.cameras.cams,
+            tracks.direction, tracks.rho, tracks.variance, tracks.uv, tracks.right_on_curve(), self.cameras.cams,
             self.cameras.right_T_left, solution.sigma_px, CAUCHY_SCALES[-1],
         )  # fmt: skip
 
@@ -450,7 +461,7 @@ class FramePoseSolver:
         """`pose_solver.pull` of some points (N,)."""
         return pose_solver.pull(
             solution.pose, solution.velocity, solution.covariance, self._shutter.row_seconds(tracks.uv), tracks.origin,
-            tracks.direction, tracks.rho, tracks.variance, tracks.uv, tracks.uv_right, self.cameras.cams,
+            tracks.direction, tracks.rho, tracks.variance, tracks.uv, tracks.right_on_curve(), self.cameras.cams,
             self.cameras.right_T_left, solution.sigma_px, CAUCHY_SCALES[-1], points,
         )  # fmt: skip
 
@@ -460,7 +471,7 @@ class FramePoseSolver:
         pose, velocity, covariance, error = pose_solver.optimise_pose(
             start.pose, start.moved, start.seconds, self._shutter.velocity_sigma(),
             self._shutter.row_seconds(tracks.uv), tracks.origin, tracks.direction, tracks.rho, tracks.variance,
-            tracks.uv, tracks.uv_right, self.cameras.cams, self.cameras.right_T_left, sigma_px, CAUCHY_SCALES,
+            tracks.uv, tracks.right_on_curve(), self.cameras.cams, self.cameras.right_T_left, sigma_px, CAUCHY_SCALES,
             start.pose if prior is None else prior.pose, sigmas,
         )  # fmt: skip
         return PoseSolution(pose, velocity, covariance, error, sigma_px, self._config.max_error_sigmas)

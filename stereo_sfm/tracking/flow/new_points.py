@@ -18,6 +18,7 @@ from stereo_sfm.tracking.flow.visible_area import VisibleArea
 from stereo_sfm.types import F64
 
 MIN_RHO = 1e-4  # 1/m
+FEW = 0.25  # share of the points wanted, below which the tests of their windows give way
 SPACING = 0.75  # of the side of the square per point if points were evenly spread
 
 
@@ -54,25 +55,26 @@ class NewPoints:
         if missing <= 0:
             return tracks
         self._area.learn(images.left[1])
-        match = self._match(images, tracks.uv, missing, most)
+        match = self._match(images, tracks.uv, missing, most, math.ceil(FEW * most) - len(tracks))
         good = np.flatnonzero(match.good)
         rows, slots = self._follower.begin(images.left, match.uv_left[good], pose)
         new, n = good[rows], len(rows)
         rho = np.maximum(match.rho[new], MIN_RHO)
-        moving = self._movers.near(match.uv_left[new], rho, tracks, moving_neighbours)
+        marked = self._movers.near(match.uv_left[new], rho, tracks, moving_neighbours)
         origin, direction = self._shutter.rays(pose, velocity, match.uv_left[new], match.bearing[new])
         tracks = tracks.append(
             Tracks(
                 point_ids=self._next_point_id + np.arange(n, dtype=np.int64),
                 uv=match.uv_left[new],
                 uv_right=match.uv_right[new],
+                right_offset=match.offset[new],
                 origin=origin,
                 direction=direction,
                 rho=rho,
                 variance=match.variance[new],
                 age=np.zeros(n, np.int32),
-                misses=np.where(moving, self._movers.static, 0).astype(np.int32),
-                moving=moving,
+                misses=marked,
+                moving=marked > 0,
                 warp=np.tile(np.eye(2), (n, 1, 1)),
                 slot=slots,
                 mapped=np.zeros(n, bool),
@@ -87,11 +89,14 @@ class NewPoints:
         match = self._match(images, np.zeros((0, 2)), most, most)
         return match.bearing[match.good] / np.maximum(match.rho[match.good, None], MIN_RHO)
 
-    def _match(self, images: StereoPyramids, taken: F64, count: int, most: int) -> StereoMatch:
-        """At most `count` corners away from pixels (N, 2), spread as if there were `most` in all, and their matches."""
+    def _match(self, images: StereoPyramids, taken: F64, count: int, most: int, needed: int = 0) -> StereoMatch:
+        """At most `count` corners away from pixels (N, 2), spread as if there were `most` in all, and their matches.
+
+        `needed`: see `StereoMatcher.match`.
+        """
         spacing = SPACING * math.sqrt(4.0 * self._area.mask.sum() / most)
         corners = detect_corners(
             images.left[1], self._area.mask, taken, count, spacing, self._config.corner_quality,
             edges=not isinstance(images.right, tuple),
         )  # fmt: skip
-        return self._stereo.match(images.left, images.right, corners)
+        return self._stereo.match(images.left, images.right, corners, needed)

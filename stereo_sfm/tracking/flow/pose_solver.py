@@ -23,7 +23,7 @@ import math
 import numpy as np
 
 from stereo_sfm.geometry.kernels import inlined, inner, njit, project_one
-from stereo_sfm.geometry.se3_kernels import compose_into, exp_into
+from stereo_sfm.geometry.se3_kernels import compose_into, exp_into, rectify_rotation
 from stereo_sfm.geometry.small_matrix import invert_symmetric, solve_symmetric
 
 MAX_SIGMAS = 4.0  # change of an inverse distance while a pose is solved
@@ -251,6 +251,7 @@ def optimise_pose(
             break
         exp_into(xi, 1.0, move)
         compose_into(pose.copy(), move, pose)
+        rectify_rotation(pose)
         _move_distances(rho, prior, variance, elimination, xi, row_s)
         for i in range(n - 6):
             moved[i] += xi[i]

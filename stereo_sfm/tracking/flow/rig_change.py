@@ -30,7 +30,7 @@ def triangulate_tracks(
     origin, direction = shutter.rays(pose, velocity, tracks.uv[seen], match.bearing[seen])
     tracks.origin[seen], tracks.direction[seen] = origin, direction
     tracks.rho[seen] = np.maximum(match.rho[seen], MIN_RHO)
-    tracks.variance[seen] = match.variance[seen]
+    tracks.variance[seen], tracks.right_offset[seen] = match.variance[seen], match.offset[seen]
     tracks.mapped[seen] = False
     tracks.moving[:], tracks.misses[:] = False, 0
     return tracks

@@ -10,21 +10,23 @@ import numpy as np
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import TrackerConfig
 from stereo_sfm.geometry import se3
-from stereo_sfm.geometry.order_statistics import percentile
+from stereo_sfm.geometry.order_statistics import median, percentile
 from stereo_sfm.tracking.depth_image import points_from_depth
 from stereo_sfm.tracking.flow import klt
-from stereo_sfm.tracking.flow.epipolar_gate import on_curve
+from stereo_sfm.tracking.flow.epipolar_gate import EpipolarGate
 from stereo_sfm.tracking.flow.stereo_cameras import StereoCameras
 from stereo_sfm.tracking.flow.stereo_match import patch_sums, search_epipolar, triangulate
-from stereo_sfm.tracking.flow.surface import fit_planes
+from stereo_sfm.tracking.flow.surface import INTERPOLATION, fit_planes
 from stereo_sfm.tracking.flow.visible_area import VisibleArea
 from stereo_sfm.types import F32, F64, Bool, StereoImage
 
 SEARCH_LEVEL = 1
 BEHIND_SIGMAS = 4.0  # by which noise may put a far point behind the camera
-MIN_SIGMA_PX, MAX_SIGMA_PX = 0.07, 0.3  # of a disparity: least noise, and limit of acceptance
+MIN_SIGMA_PX = 0.07  # of a disparity: least noise
 TYPICAL = 25  # percentile of the points' misfits that is typical of windows on one surface
 MIN_MISFIT = 0.5  # lower bound of the typical misfit, in squares of the expected noise
+MOST_FAILED = 3.0  # times the limits of the windows' tests, where matches are few
+LEARNED = 200.0  # matches that the typical noise counts for at most: those of some keyframes
 
 
 @dataclass
@@ -36,6 +38,7 @@ class StereoMatch:
     bearing: F64  # (N, 3) unit, left camera
     rho: F64  # (N,) 1/m along the bearing
     variance: F64  # (N,)
+    offset: F64  # (N, 2) px from the epipolar curve to the right pixel
     good: Bool  # (N,)
 
 
@@ -46,6 +49,8 @@ class StereoMatcher:
         self._config = config
         self._rig = rig
         self._cameras = StereoCameras.of(rig)
+        self._gate = EpipolarGate(config.max_epipolar_px / config.max_error_sigmas, config.max_error_sigmas)
+        self._sigma_px, self._matches = INTERPOLATION, 0.0  # noise that is typical of the sequence; of how many matches
         assert rig.right is not None
         self._right_area = VisibleArea(rig.right, config.max_angle_deg, rig.right_mask)
         self._min_depth = config.min_depth_baselines * rig.baseline
@@ -57,12 +62,13 @@ class StereoMatcher:
     def use(self, rig: Rig) -> None:
         """Use another rig, whose left camera and baseline are about the same."""
         self._rig, self._cameras = rig, StereoCameras.of(rig)
+        self._gate.forget()
 
     def placed(self, uv: F64, uv_right: F64) -> StereoMatch:
         """Triangulate matched pixels (N, 2), NaN where unmatched, with the present rig."""
         seen = np.asarray(np.isfinite(uv_right).all(1))
         uv, uv_right = np.ascontiguousarray(uv), np.ascontiguousarray(uv_right)
-        return self._triangulated(uv, uv_right, self._usual_sigma(uv), seen, np.inf, -BEHIND_SIGMAS)
+        return self._triangulated(uv, uv_right, self._usual_sigma(uv), seen, -BEHIND_SIGMAS, gated=False)
 
     def prepare(self, image: StereoImage) -> klt.Pyramid | F32:
         """The second camera's input of `follow` and `match`: a pyramid, or the depth image."""
@@ -72,18 +78,32 @@ class StereoMatcher:
         assert image.right is not None
         return klt.build_pyramid(image.right, self._config.pyramid_levels)
 
-    def follow(self, left: klt.Pyramid, right: klt.Pyramid | F32, uv: F64, points: F64, predicted: F64) -> F64:
-        """Right pixels (N, 2) of tracked points (N, 3) whose left pixels are `uv`, NaN where not found."""
+    def follow(
+        self, left: klt.Pyramid, right: klt.Pyramid | F32, uv: F64, points: F64, predicted: F64, offset: F64
+    ) -> F64:
+        """Right pixels (N, 2) of tracked points (N, 3) whose left pixels are `uv`, NaN where not found.
+
+        Args:
+            predicted: (4, 4) odom_T_cam. offset: (N, 2) px, see `Tracks.right_offset`.
+        """
         if not isinstance(right, tuple):
             return self._from_depth(right, uv)[0]
         points_cam = se3.transform(se3.inverse(predicted), points)
         guess_left = self._rig.left.project(points_cam)
         assert self._rig.right is not None
-        guess = self._rig.right.project(se3.transform(self._cameras.right_T_left, points_cam)) + uv - guess_left
-        return self._on_one_surface(left, right, uv, self._refine(left, right, uv, guess, 0))[0]
+        guess = self._rig.right.project(se3.transform(self._cameras.right_T_left, points_cam))
+        guess += uv - guess_left + offset
+        fitted, _, failed = self._on_one_surface(left, right, uv, self._refine(left, right, uv, guess, 0))
+        fitted[failed >= 1.0] = np.nan
+        return fitted
 
-    def match(self, left: klt.Pyramid, right: klt.Pyramid | F32, uv: F64) -> StereoMatch:
-        """Stereo matches of new corners (N, 2) px."""
+    def match(self, left: klt.Pyramid, right: klt.Pyramid | F32, uv: F64, needed: int = 0) -> StereoMatch:
+        """Stereo matches of new corners (N, 2) px.
+
+        The tests of the windows (the match back, a narrower window, a disparity plane, noise) compare with what is
+        typical of the sequence. Where fewer than `needed` matches pass, they give way: the next best follow, with
+        standard deviations that are larger by as much as they fail. The epipolar curves do not.
+        """
         config = self._config
         uv = np.ascontiguousarray(uv)
         if isinstance(right, tuple):
@@ -94,14 +114,22 @@ class StereoMatcher:
                 right, left, np.nan_to_num(uv_right, nan=-1e3), back, 0, 0, 10, config.min_contrast, config.min_ncc,
                 klt.WEIGHTS,
             )  # fmt: skip
-            good = (status == klt.TRACKED) & (np.linalg.norm(back - uv, axis=1) < 0.5)
-            good &= self._narrow_agrees(left, right, uv, uv_right)
-            uv_right, sigma_px = self._on_one_surface(left, right, uv, uv_right)
-            good &= np.isfinite(uv_right[:, 0])
+            off = np.maximum(np.linalg.norm(back - uv, axis=1), self._narrow_differs(left, right, uv, uv_right))
+            off[status != klt.TRACKED] = np.inf
+            uv_right, sigma_px, failed = self._on_one_surface(left, right, uv, uv_right, off)
+            good = failed < self._gives_way(failed, needed)
+            sigma_px = sigma_px * np.clip(failed, 1.0, None)
         else:
             uv_right, good = self._from_depth(right, uv)
             sigma_px = self._usual_sigma(uv)
-        return self._triangulated(uv, uv_right, sigma_px, good, config.max_epipolar_px, -BEHIND_SIGMAS)
+        return self._triangulated(uv, uv_right, sigma_px, good, -BEHIND_SIGMAS)
+
+    @staticmethod
+    def _gives_way(failed: F64, needed: int) -> float:
+        """The limit of the tests: 1, or what lets `needed` matches pass that `failed` by (N,), up to MOST_FAILED."""
+        ordered = np.sort(failed)
+        at = min(needed, len(ordered)) - 1
+        return float(np.clip(np.nextafter(ordered[at], np.inf), 1.0, MOST_FAILED)) if at >= 0 else 1.0
 
     def match_coarse(self, left: klt.Pyramid, right: klt.Pyramid | F32, uv: F64) -> StereoMatch:
         """As `match`, in half the time: accurate to half a pixel, without the test for depth edges."""
@@ -114,7 +142,7 @@ class StereoMatcher:
             klt.WEIGHTS,
         )  # fmt: skip
         sigma_px, good = self._usual_sigma(uv), status == klt.TRACKED
-        return self._triangulated(uv, uv_right, sigma_px, good, 2 * self._config.max_epipolar_px, 0.0)
+        return self._triangulated(uv, uv_right, sigma_px, good, 0.0, learns=False)
 
     def _search(self, left: klt.Pyramid, right: klt.Pyramid, uv: F64) -> F64:
         """Right pixels (N, 2), accurate to a pixel of the search level, NaN without a match."""
@@ -128,18 +156,26 @@ class StereoMatcher:
         return np.full(len(uv), math.sqrt(2) * self._config.sigma_px)
 
     def _triangulated(
-        self, uv: F64, uv_right: F64, sigma_px: F64, good: Bool, max_epipolar_px: float, min_rho_sigmas: float
+        self,
+        uv: F64,
+        uv_right: F64,
+        sigma_px: F64,
+        good: Bool,
+        min_rho_sigmas: float,
+        gated: bool = True,
+        learns: bool = True,
     ) -> StereoMatch:
-        """`min_rho_sigmas`: smallest inverse distance in its standard deviations; noise may make it negative."""
-        bearing, rho, variance, epipolar = triangulate(
+        """`min_rho_sigmas`: smallest inverse distance in its standard deviations; noise may make it negative. `gated`:
+        whether the matches must be near their epipolar curves, about which the gate `learns` from them.
+        """
+        bearing, rho, variance, offset = triangulate(
             uv, uv_right, *self._cameras.cams, self._cameras.left_T_right, sigma_px
         )
         with np.errstate(invalid="ignore"):
-            good &= on_curve(self._rig, uv, uv_right, epipolar, max_epipolar_px, good) & (
-                rho > min_rho_sigmas * np.sqrt(variance)
-            )
-            good &= rho < 1.0 / (0.5 * self._min_depth)
-        return StereoMatch(uv, uv_right, bearing, rho, variance, good)
+            good = good & (rho > min_rho_sigmas * np.sqrt(variance)) & (rho < 1.0 / (0.5 * self._min_depth))
+        if gated:
+            good = self._gate.passed(self._rig, uv, uv_right, good, learns)
+        return StereoMatch(uv, uv_right, bearing, rho, variance, offset, good)
 
     def _refine(self, left: klt.Pyramid, right: klt.Pyramid, uv: F64, guess: F64, level: int) -> F64:
         out = np.ascontiguousarray(guess)
@@ -150,32 +186,44 @@ class StereoMatcher:
         out[status != klt.TRACKED] = np.nan
         return out
 
-    def _narrow_agrees(self, left: klt.Pyramid, right: klt.Pyramid, uv: F64, uv_right: F64) -> Bool:
-        """Whether a narrower window gives the same disparity."""
+    def _narrow_differs(self, left: klt.Pyramid, right: klt.Pyramid, uv: F64, uv_right: F64) -> F64:
+        """(N,) px by which a narrower window gives another disparity; inf where it gives none."""
         narrow = np.nan_to_num(uv_right, nan=-1e3)
         status, _ = klt.track_translation(left, right, uv, narrow, 0, 0, 10, 0.5, 0.3, self._narrow)
-        with np.errstate(invalid="ignore"):
-            near = np.linalg.norm(narrow - uv_right, axis=1) < self._config.max_window_disparity_px
-        return (status == klt.TRACKED) & near
+        return np.where(status == klt.TRACKED, np.linalg.norm(narrow - uv_right, axis=1), np.inf)
 
-    def _on_one_surface(self, left: klt.Pyramid, right: klt.Pyramid, uv: F64, uv_right: F64) -> tuple[F64, F64]:
-        """Matches by their disparity planes, and their standard deviations in px.
+    def _on_one_surface(
+        self, left: klt.Pyramid, right: klt.Pyramid, uv: F64, uv_right: F64, off: F64 | None = None
+    ) -> tuple[F64, F64, F64]:
+        """Matches by their disparity planes, their standard deviations in px, and by how much they fail the tests: 1 is
+        the limit, inf where there is no plane.
 
-        NaN where a window's residual is much larger than typical, where the match by the plane differs from that of the
-        window, or where its standard deviation is too large.
+        A match fails by its difference from the match by the plane and by its standard deviation, over the noise that
+        is typical of the sequence, and by its window's residual over the typical one: an edge in depth has larger ones.
+        `off`: (N,) px, more differences; of new matches, from which is learned.
         """
         fitted, misfit, sigma_px = fit_planes(
             left[0], right[0], np.ascontiguousarray(uv), uv_right, *self._cameras.cams[2:], self._cameras.right_T_left,
             klt.WEIGHTS, klt.COORDINATES,
         )  # fmt: skip
         tested = np.isfinite(misfit)
+        if off is not None and tested.any():
+            self._learn(sigma_px[tested])
         typical = max(percentile(misfit[tested], TYPICAL), MIN_MISFIT) if tested.any() else MIN_MISFIT
-        with np.errstate(invalid="ignore"):
-            good = np.linalg.norm(fitted - uv_right, axis=1) < self._config.max_window_disparity_px
-        good &= (misfit < self._config.max_surface_misfit * typical) & (sigma_px < MAX_SIGMA_PX)
-        good &= self._right_area.inside(uv_right)
-        fitted[~good] = np.nan
-        return fitted, np.maximum(sigma_px, MIN_SIGMA_PX)
+        off = np.fmax(0.0 if off is None else off, np.linalg.norm(fitted - uv_right, axis=1))
+        config = self._config
+        failed = (
+            np.maximum(off / config.max_window_difference_sigmas, sigma_px / config.max_window_sigmas) / self._sigma_px
+        )
+        failed = np.maximum(failed, misfit / (config.max_surface_misfit * typical))
+        failed[~(tested & self._right_area.inside(uv_right) & np.isfinite(failed))] = np.inf
+        return fitted, np.maximum(sigma_px, MIN_SIGMA_PX), failed
+
+    def _learn(self, sigma_px: F64) -> None:
+        """The noise that is typical of new matches (N,)."""
+        total = self._matches + len(sigma_px)
+        self._sigma_px += len(sigma_px) / total * (max(median(sigma_px), INTERPOLATION) - self._sigma_px)
+        self._matches = min(total, LEARNED)
 
     def _from_depth(self, depth: F32, uv: F64) -> tuple[F64, Bool]:
         """Virtual right pixels from a depth image, NaN at holes and edges, and where they are finite."""

@@ -214,13 +214,13 @@ def triangulate(uv_left, uv_right, model_l, params_l, model_r, params_r, left_T_
 
     Returns:
         bearing (N, 3) unit, left camera; rho (N,) inverse distance 1/m; variance (N,) of rho for noise of `sigma` (N,)
-        px along the epipolar curve; epipolar (N,) px distance of the right observation from it. NaN where impossible.
+        px along the epipolar curve; offset (N, 2) px from it to the right observation. NaN where impossible.
     """
     n = uv_left.shape[0]
     bearing = np.full((n, 3), np.nan)
     rho = np.full(n, np.nan)
     variance = np.full(n, np.nan)
-    epipolar = np.full(n, np.nan)
+    offset = np.full((n, 2), np.nan)
     right_T_left = np.zeros((3, 4))
     for i in range(3):
         for j in range(3):
@@ -268,6 +268,6 @@ def triangulate(uv_left, uv_right, model_l, params_l, model_r, params_r, left_T_
         rho[k] = r
         jj = ju * ju + jv * jv
         variance[k] = sigma[k] * sigma[k] / jj
-        along = (ju * eu + jv * ev) / math.sqrt(jj)
-        epipolar[k] = math.sqrt(max(eu * eu + ev * ev - along * along, 0.0))
-    return bearing, rho, variance, epipolar
+        along = (ju * eu + jv * ev) / jj
+        offset[k, 0], offset[k, 1] = along * ju - eu, along * jv - ev
+    return bearing, rho, variance, offset

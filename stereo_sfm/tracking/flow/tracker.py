@@ -104,6 +104,7 @@ class Tracker:
         self._pose: F64 = np.eye(4)
         self._velocity: F64 = np.zeros(6)  # tangent per second
         self._stamp_ns = 0
+        self._begun_ns = 0  # the first image of this submap
         self._lost = 0  # successive frames
         self._lost_ns = 0  # the last of them
         self._free_s = 0.0  # for which the view has been free without a pose
@@ -289,10 +290,11 @@ class Tracker:
             return knocked
         if good:
             return tracks, solution
-        turned = self._follower.turned(images.left, expected, self._pose)
-        tracks, solution = self._solver.better([(tracks, solution), self._track(images, turned)], expected)
-        if solution.good(self._config, self._static_count()):
-            return tracks, solution
+        for anywhere in (False, True):
+            turned = self._follower.turned(images.left, expected, self._pose, anywhere)
+            tracks, solution = self._solver.better([(tracks, solution), self._track(images, turned)], expected)
+            if solution.good(self._config, self._static_count()):
+                return tracks, solution
         self._follower.search_widely()
         blurred = self._track(images, turned, blurred=True)
         undivided = blurred[1].good(self._config, self._static_count()) and blurred[1].undivided
@@ -308,7 +310,9 @@ class Tracker:
         with self._spans.span("flow"):
             tracks = self._follower.follow(self._tracks, self._pose, images.left, expected, blurred)
         with self._spans.span("stereo"):
-            tracks.uv_right = self._stereo.follow(images.left, images.right, tracks.uv, tracks.points(), expected.pose)
+            tracks.uv_right = self._stereo.follow(
+                images.left, images.right, tracks.uv, tracks.points(), expected.pose, tracks.right_offset
+            )
         with self._spans.span("pose"):
             return tracks, self._solver.solve(tracks, expected, self._pose, self._static_count(), blurred)
 
@@ -386,7 +390,7 @@ class Tracker:
         self._recovery.motion.add(image.stamp_ns, self._pose)
         self._follower.forget()
         self._follower.hold(images, self._tracks, ~self._tracks.moving, self._pose, self._pose)
-        self._held_ns = image.stamp_ns
+        self._held_ns = self._begun_ns = image.stamp_ns
         state = TrackState.OK if first else TrackState.RECOVERED if self._bridging else TrackState.RESTARTED
         self._bridging = False
         if self._sensors is not None:
@@ -463,7 +467,9 @@ class Tracker:
         for reach, most in ROUNDS:
             motion = ExpectedMotion(pose, se3.log(se3.inverse(self._pose) @ pose), seconds)
             tracks = self._follower.find_again(images.left, pose, reach, most)
-            tracks.uv_right = self._stereo.follow(images.left, images.right, tracks.uv, tracks.points(), pose)
+            tracks.uv_right = self._stereo.follow(
+                images.left, images.right, tracks.uv, tracks.points(), pose, tracks.right_offset
+            )
             solution = self._solver.solve_again(tracks, motion)
             if solution.reason or any(within(solution.pose, other, *SAME_PLACE) for other in known):
                 return NOT_FOUND
@@ -499,10 +505,12 @@ class Tracker:
             self._free_s = self._free_s + seconds if self._recovery.free else 0.0
             self._covered_s += 0.0 if self._recovery.free else seconds
         self._lost_ns = image.stamp_ns
-        if max(self._free_s, COVERED_SHARE * self._covered_s) > self._config.lost_s:
+        begun = self._stamp_ns == self._begun_ns  # one image is nothing to wait for
+        if begun or max(self._free_s, COVERED_SHARE * self._covered_s) > self._config.lost_s:
             self._pose = expected.odom_T_cam
             self._velocity = self._recovery.motion.velocity_at(image.stamp_ns)
             self._solver.forget()
+            self._movers.forget()
             self._bridging = bridge is not None
             self._submap_id += not self._bridging
             self._state = TrackState.INITIALIZING

@@ -14,7 +14,11 @@ from stereo_sfm.types import F32, F64, I32, I64, Bool
 
 @dataclass
 class Tracks:
-    """Columns of N points. A point is P = origin + direction / rho in the odometry frame."""
+    """Columns of N points. A point is P = origin + direction / rho in the odometry frame.
+
+    `right_offset` is how far from its epipolar curve a point's first stereo match was. An error of the rig or of a lens
+    stays about the same while the point is tracked: the pose is solved from right pixels without it.
+    """
 
     point_ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
     uv: F64 = field(default_factory=lambda: np.zeros((0, 2)))  # (N, 2) px in the last tracked frame
@@ -29,9 +33,14 @@ class Tracks:
     slot: I64 = field(default_factory=lambda: np.zeros(0, np.int64))  # row in the `Patches`
     moving: Bool = field(default_factory=lambda: np.zeros(0, bool))  # on something that moves: counts for nothing
     mapped: Bool = field(default_factory=lambda: np.zeros(0, bool))  # position given by the map
+    right_offset: F64 = field(default_factory=lambda: np.zeros((0, 2)))  # (N, 2) px from the epipolar curve, see below
 
     def __len__(self) -> int:
         return len(self.point_ids)
+
+    def right_on_curve(self) -> F64:
+        """(N, 2) px in the right image, without the offset from the epipolar curve."""
+        return self.uv_right - self.right_offset
 
     def points(self) -> F64:
         """(N, 3) metres, odometry frame."""
