@@ -183,11 +183,13 @@ def test_corners_are_not_on_edges() -> None:
     assert not ((to_side < 6) & (to_end.min(axis=1) > 10)).any()
 
 
-def test_rotation_of_a_whole_fisheye_image() -> None:
+@pytest.mark.parametrize(("rotation", "predicted"), [((0.05, -0.12, 0.04), True), ((0.1, -0.5, 0.05), False)])
+def test_rotation_of_a_whole_fisheye_image(rotation: tuple[float, float, float], predicted: bool) -> None:
+    """A small one from a prediction; one of 29 degrees from none: it is searched for."""
     camera = KannalaBrandt(320, 300, 110.0, 110.0, 160.0, 150.0, (-0.004, 0.037, -0.035, 0.006))
     world = cv2.GaussianBlur(texture(7, 900, 1800), (0, 0), 20)
     world = cv2.normalize(world, None, 0, 255, cv2.NORM_MINMAX)
-    truth = se3.so3_exp(np.array([0.05, -0.12, 0.04]))
+    truth = se3.so3_exp(np.array(rotation))
 
     def view(rotation: F64) -> U8:
         b = camera.bearing_grid() @ rotation
@@ -196,5 +198,6 @@ def test_rotation_of_a_whole_fisheye_image() -> None:
         return cv2.remap(world, np.nan_to_num(u).astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
 
     before, after = klt.build_pyramid(view(np.eye(3)), 4), klt.build_pyramid(view(truth), 4)
-    found = CoarseRotation(camera, 4).align(before, after, np.eye(3))
+    coarse = CoarseRotation(camera, 4)
+    found = coarse.align(before, after, np.eye(3)) if predicted else coarse.search(before, after)
     assert np.degrees(np.linalg.norm(se3.so3_log(found @ truth.T))) < 0.3

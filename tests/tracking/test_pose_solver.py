@@ -165,3 +165,20 @@ def test_uncertain_distances_do_not_shorten_a_step() -> None:
         steps.append(found[2, 3] / 0.06)
     assert abs(np.mean(steps) - 1) < 3 * np.std(steps) / np.sqrt(len(steps)) + 1e-3
     assert np.std(steps) / np.sqrt(len(steps)) < 0.002
+
+
+def test_poses_that_are_products_of_many_stay_rotations() -> None:
+    """Each pose is solved from the one before, which has an error: of a thousand images, no rotation is 1e-12 off."""
+    camera = CAMERAS[0]
+    cameras = StereoCameras.of(rig(camera))
+    _, points, uv, uv_right = scene(camera, 60, 2)
+    distance = np.linalg.norm(points, axis=1)
+    pose = np.eye(4)
+    pose[:3, :3] += np.random.default_rng(0).normal(0, 1e-6, (3, 3))
+    for _ in range(1000):
+        pose, *_ = pose_solver.optimise_pose(
+            pose, np.zeros(6), 0.1, np.ones(6), np.zeros(0), np.zeros_like(points), points / distance[:, None],
+            1 / distance, np.full(len(points), 1e-10), uv, uv_right, cameras.cams, cameras.right_T_left, 0.5,
+            SCALES, *NO_PRIOR,
+        )  # fmt: skip
+    assert np.abs(pose[:3, :3].T @ pose[:3, :3] - np.eye(3)).max() < 1e-12

@@ -60,7 +60,8 @@ MOST_FREEDOMS = 1.0  # of the six of a pose that may rest on one point ...
 KNOWN_M = 0.005  # ... that is new, if the others have the position with this standard deviation
 NEAR = 2.0  # times the largest error of an inlier, at the predicted pose
 LIMIT_SIGMAS = 5.0  # root mean squares of the recent differences, if that is more
-MEMORY_S = 5.0  # time constant of their average
+MEMORY_S = 5.0  # time constant of their average ...
+FIRST_IMAGES = 15  # ... and what a robot's usual ones count for at the start: stamps may be wrong by any factor
 MIN_DEPTH_SIGMA = 1e-3  # relative
 
 
@@ -141,6 +142,7 @@ class FramePoseSolver:
         self._alert_s = 0.0  # seconds for which other motions are still searched for
         self.open_view = 0.0  # inliers of an unobstructed view
         self._difference = np.zeros(2)  # mean square of metres/s^2 and radians/s^2 between expected and found poses
+        self._differences = FIRST_IMAGES  # images that it is the mean of
 
     def use(self, cameras: StereoCameras) -> None:
         """Use other cameras."""
@@ -404,7 +406,9 @@ class FramePoseSolver:
         self.open_view += share * (solution.inliers - self.open_view)
         if seconds > 0:
             off = np.array(se3.extent(se3.inverse(expected.pose) @ solution.pose)) / seconds**2
-            self._difference += (1.0 - math.exp(-seconds / MEMORY_S)) * (off**2 - self._difference)
+            self._differences += 1
+            share = max(1.0 / self._differences, 1.0 - math.exp(-seconds / MEMORY_S))
+            self._difference += share * (off**2 - self._difference)
 
     def _learn_noise(self, tracks: Tracks, solution: PoseSolution, seconds: float) -> None:
         """From the points that have been static for long, outliers or not: what they show is noise.
@@ -414,7 +418,7 @@ class FramePoseSolver:
         settled = ~tracks.moving & (tracks.age * seconds >= SETTLED_S) & np.isfinite(solution.error)
         if np.count_nonzero(settled) < 2 * self._config.min_features:
             settled = solution.inlier
-            if self.alert:
+            if self.alert or not settled.any():
                 return
         noise = self._noise * (0.9 + 0.1 * median(solution.error[settled]) / MEDIAN_ERROR)
         self._noise = min(max(noise, NOISE_RANGE[0]), NOISE_RANGE[1])
