@@ -164,16 +164,18 @@ def perform(job: Job, store: Path, real: Path | None) -> dict[str, Any]:
     return result
 
 
-def jobs_of(code: Code, sequences: list[Sequence], switches: list[str], starts: int | None) -> list[Job]:
-    """What is to be run: every sequence with default first."""
-    return [
-        Job(code, sequence, switch, begin_s)
+def jobs_of(codes: list[Code], sequences: list[Sequence], switches: list[str], starts: int | None) -> list[Job]:
+    """What is to be run: the first start of everything, then the second."""
+    wanted = [
+        (k, Job(code, sequence, switch, begin_s))
         for sequence in sequences
         for switch in switches
         if not (switch == "inertial" and sequence.kind != "inertial")
         and not (switch in STEREO_ONLY and sequence.kind == "depth")
-        for begin_s in sequence.begins(starts)
+        for k, begin_s in enumerate(sequence.begins(starts))
+        for code in codes
     ]
+    return [job for _, job in sorted(wanted, key=lambda x: x[0])]
 
 
 def machine() -> dict[str, Any]:
@@ -209,12 +211,7 @@ def main() -> int:
         print(f"not all sequences are at hand: set {FOLDER} and STEREO_SFM_DATA", file=sys.stderr)
     with tempfile.TemporaryDirectory(prefix="stereo_sfm_code_") as folder:
         codes = [code_here()] + ([code_of(args.against, Path(folder))] if args.against else [])
-        jobs = [
-            job
-            for s in sequences
-            for code in codes
-            for job in jobs_of(code, [s], args.switch or list(OPTIONS), args.starts)
-        ]
+        jobs = jobs_of(codes, sequences, args.switch or list(OPTIONS), args.starts)
         missing = [job for job in jobs if not job.stored(args.store).is_file()]
         if not args.table:
             for code in {job.code.key: job.code for job in missing}.values():
