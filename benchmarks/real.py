@@ -40,7 +40,10 @@ from _real_run import NO_SWITCH, OPTIONS
 from _real_sequences import FOLDER, SEQUENCES, Sequence, real_root
 from _real_table import markdown
 
-PACKAGES = ("stereo_sfm", "drivers", "calib")  # what decides a result
+from stereo_sfm.same_code import CHOICE
+
+PACKAGES, SIMULATOR = ("stereo_sfm", "drivers", "calib"), "drivers/sim"
+DECIDING = (*PACKAGES, f":!{SIMULATOR}")  # files that decide the results of real sequences
 RUNNER = Path(__file__).with_name("_real_run.py")
 LONGEST_S = 3600.0  # of a run: then it hangs
 STEREO_ONLY = ("self-calibration", "steps", "side views")
@@ -77,8 +80,8 @@ def git(*args: str, root: Path = ROOT) -> str:
 def code_here() -> Code:
     """The package of this checkout, with what is not committed."""
     commit = git("rev-parse", "--short", "HEAD")
-    changed = git("diff", "HEAD", "--", *PACKAGES)
-    for name in git("ls-files", "--others", "--exclude-standard", "--", *PACKAGES).splitlines():
+    changed = git("diff", "HEAD", "--", *DECIDING)
+    for name in git("ls-files", "--others", "--exclude-standard", "--", *DECIDING).splitlines():
         changed += name + hashlib.sha256((ROOT / name).read_bytes()).hexdigest()
     return Code(ROOT, _key("HEAD", changed), commit + ("+changes" if changed else ""))
 
@@ -94,13 +97,16 @@ def code_of(commit: str, folder: Path) -> Code:
 
 
 def _key(commit: str, changed: str = "") -> str:
-    trees = git("rev-parse", *(f"{commit}:{name}" for name in PACKAGES))
-    return hashlib.sha256((trees + changed).encode()).hexdigest()[:12]
+    files = "\n".join(
+        line for line in git("ls-tree", "-r", commit, "--", *PACKAGES).splitlines() if f"\t{SIMULATOR}/" not in line
+    )
+    return hashlib.sha256((files + changed).encode()).hexdigest()[:12]
 
 
 def environment(code: Code) -> dict[str, str]:
-    """For a process that runs this code, on one thread."""
-    return {**os.environ, "PYTHONPATH": str(code.root), "PYTHONHASHSEED": "0"}
+    """For a process that runs this code, on one thread, with the machine code that it chooses itself."""
+    inherited = {name: value for name, value in os.environ.items() if name != CHOICE}
+    return {**inherited, "PYTHONPATH": str(code.root)}
 
 
 def compile_kernels(code: Code) -> None:
