@@ -86,14 +86,18 @@ def code_here() -> Code:
     return Code(ROOT, _key("HEAD", changed), commit + ("+changes" if changed else ""))
 
 
-def code_of(commit: str, folder: Path) -> Code:
-    """The package of a commit, unpacked in a folder."""
-    code = Code(folder, _key(commit), git("rev-parse", "--short", commit))
-    archive = subprocess.run(
-        ["git", "-C", str(ROOT), "archive", commit, *PACKAGES, "recordings"], check=True, capture_output=True
-    )
-    subprocess.run(["tar", "x", "-C", str(folder)], input=archive.stdout, check=True)
-    return code
+def code_of(commit: str, store: Path) -> Code:
+    """The package of a commit, unpacked in the store, where it keeps its compiled kernels."""
+    key = _key(commit)
+    folder = store.resolve() / key / "code"
+    if not folder.is_dir():
+        part = folder.with_suffix(f".{os.getpid()}.part")
+        part.mkdir(parents=True)
+        command = ["git", "-C", str(ROOT), "archive", commit, *PACKAGES, "recordings"]
+        archive = subprocess.run(command, check=True, capture_output=True)
+        subprocess.run(["tar", "x", "-C", str(part)], input=archive.stdout, check=True)
+        part.replace(folder)
+    return Code(folder, key, git("rev-parse", "--short", commit))
 
 
 def _key(commit: str, changed: str = "") -> str:
@@ -215,16 +219,15 @@ def main() -> int:
         return 2
     if data_root() is None or real is None:
         print(f"not all sequences are at hand: set {FOLDER} and STEREO_SFM_DATA", file=sys.stderr)
-    with tempfile.TemporaryDirectory(prefix="stereo_sfm_code_") as folder:
-        codes = [code_here()] + ([code_of(args.against, Path(folder))] if args.against else [])
-        jobs = jobs_of(codes, sequences, args.switch or list(OPTIONS), args.starts)
-        missing = [job for job in jobs if not job.stored(args.store).is_file()]
-        if not args.table:
-            for code in {job.code.key: job.code for job in missing}.values():
-                compile_kernels(code)
-            with concurrent.futures.ThreadPoolExecutor(args.jobs) as pool:
-                for job, result in zip(missing, pool.map(lambda j: perform(j, args.store, real), missing), strict=True):
-                    print(_line(job, result), file=sys.stderr, flush=True)
+    codes = [code_here()] + ([code_of(args.against, args.store)] if args.against else [])
+    jobs = jobs_of(codes, sequences, args.switch or list(OPTIONS), args.starts)
+    missing = [job for job in jobs if not job.stored(args.store).is_file()]
+    if not args.table:
+        for code in {job.code.key: job.code for job in missing}.values():
+            compile_kernels(code)
+        with concurrent.futures.ThreadPoolExecutor(args.jobs) as pool:
+            for job, result in zip(missing, pool.map(lambda j: perform(j, args.store, real), missing), strict=True):
+                print(_line(job, result), file=sys.stderr, flush=True)
     results = [(job, perform(job, args.store, real)) for job in jobs if job.stored(args.store).is_file()]
     report = {
         "codes": [{"label": c.label, "key": c.key} for c in codes],
