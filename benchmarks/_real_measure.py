@@ -28,19 +28,20 @@ def truth_of(path: Path, rig: Path | None) -> Trajectory | None:
 def measured(folder: Path, sequence: Sequence, truth: Trajectory | None) -> dict[str, Any]:
     """The numbers of a run; without the errors where it has no pose."""
     stats = json.loads((folder / "stats.json").read_text("utf-8"))
-    changes = [c for c in stats["calibration"] if c["applied"]]
+    told = stats.get("calibration", [])  # earlier versions had none
+    changes = [c for c in told if c["applied"]]
     out: dict[str, Any] = {
         "frames": stats["frames"],
         "lost": stats["frames"] - stats["tracked"],
         "losses": len(stats["lost_intervals"]),
-        "submaps": stats["pieces"],
+        "submaps": stats.get("pieces"),
         "keyframes": stats["keyframes"],
         "loops": stats["loops_accepted"],
         "corrections": sum(c["why"] != "step" for c in changes),
         "steps": sum(c["why"] == "step" for c in changes),
-        "changes": [f"{c['seconds']:.1f} s ({c['why']}): {c['text']}" for c in stats["calibration"]],
+        "changes": [f"{c['seconds']:.1f} s ({c['why']}): {c['text']}" for c in told],
         "path_m": stats["path_m"],
-        "fingerprint": stats["fingerprint"],
+        "fingerprint": stats.get("fingerprint"),
     }
     estimate = _trajectory(folder / "trajectory_map.tum")
     if estimate is None:

@@ -116,7 +116,7 @@ def environment(code: Code) -> dict[str, str]:
 def compile_kernels(code: Code) -> None:
     """So that no run's processor time has it."""
     command = [sys.executable, "-m", "stereo_sfm.cli", "compile", "-q"]
-    subprocess.run(command, env=environment(code), cwd=code.root, check=False)
+    subprocess.run(command, env=environment(code), cwd=code.root, capture_output=True, check=False)  # if it has that
 
 
 def result_of(job: Job, place: Path, rig: Path | None) -> dict[str, Any]:
