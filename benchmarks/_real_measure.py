@@ -17,6 +17,8 @@ from stereo_sfm.eval.evaluate import evaluate
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, Trajectory
 
+KEPT = ("seconds", "why", "applied", "text", "terms", "covariance")  # of a change of the calibration
+
 
 @functools.cache
 def truth_of(path: Path, rig: Path | None) -> Trajectory | None:
@@ -39,7 +41,8 @@ def measured(folder: Path, sequence: Sequence, truth: Trajectory | None) -> dict
         "loops": stats["loops_accepted"],
         "corrections": sum(c["why"] != "step" for c in changes),
         "steps": sum(c["why"] == "step" for c in changes),
-        "changes": [f"{c['seconds']:.1f} s ({c['why']}): {c['text']}" for c in told],
+        "changes": [{name: c[name] for name in KEPT} for c in told],
+        "duration_s": stats["duration_s"],
         "path_m": stats["path_m"],
         "fingerprint": stats.get("fingerprint"),
     }

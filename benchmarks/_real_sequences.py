@@ -44,6 +44,7 @@ class Sequence:
     kind: str = "stereo"  # stereo, depth, inertial
     rest: bool = False  # the camera stands still: the ATE is the RMS of its motion
     deg_per_s: float = 0.0  # a turn of known speed
+    long: bool = False  # and of two cameras: enough images before and after a step
     closed: bool = False  # ends about where it starts
     best_cpp: str = ""  # of the C++ systems, ATE
 
@@ -60,21 +61,22 @@ class Sequence:
 
 SEQUENCES = (
     Sequence(
-        "karlsruhe_0019", "karlsruhe_0019", Limits(ate_m=1.2, uncalibrated_ate_m=1.9), rate_hz=9.5, best_cpp="1.41 m"
+        "karlsruhe_0019", "karlsruhe_0019", Limits(ate_m=1.2, uncalibrated_ate_m=1.9), rate_hz=9.5, best_cpp="1.41 m",
+        long=True,
     ),
-    Sequence("kitti_extract", "kitti_extract", Limits(ate_m=0.34)),
+    Sequence("kitti_extract", "kitti_extract", Limits(ate_m=0.34), long=True),
     Sequence("kitti_01", "kitti/sequences/01", Limits(ate_m=0.12), rate_hz=9.65, best_cpp="0.91 m"),
     Sequence("kitti_06", "kitti/sequences/06", Limits(ate_m=0.06), rate_hz=9.65, best_cpp="0.041 m"),
-    Sequence("library_walk", "library_walk", Limits(loops=1), rate_hz=12.0, shared=True, closed=True),
+    Sequence("library_walk", "library_walk", Limits(loops=1), rate_hz=12.0, shared=True, closed=True, long=True),
     Sequence(
         "moon_yard", "moon_yard", Limits(lost=3, like=("moon_yard_fixed", 1.3)), rate_hz=1.0
     ),
-    Sequence("moon_yard_fixed", "moon_yard_fixed", Limits(ate_m=0.037, lost=None), rate_hz=1.0),
+    Sequence("moon_yard_fixed", "moon_yard_fixed", Limits(ate_m=0.037, lost=None), rate_hz=1.0, long=True),
     Sequence("medical_rotation", "medical_rotation", Limits(angle_error_deg=0.02), deg_per_s=10.0),
     Sequence(
         "fr1_xyz", "rgbd_dataset_freiburg1_xyz", Limits(ate_m=0.007), rate_hz=30.0, kind="depth"
     ),
-    Sequence("zed_conveyor", "zed_conveyor", Limits(ate_m=0.0012), rate_hz=30.0, rest=True),
+    Sequence("zed_conveyor", "zed_conveyor", Limits(ate_m=0.0012), rate_hz=30.0, rest=True, long=True),
     Sequence(
         "bonn_crowd", "rgbd_bonn_crowd", Limits(ate_m=0.018, lost=22), rate_hz=30.0, kind="depth", rig="bonn_rig.yaml",
         best_cpp="1.85 m (pyorbslam3)",
@@ -84,10 +86,10 @@ SEQUENCES = (
         starts_s=BONN_STARTS_S, duration_s=8.0, kind="depth", rig="bonn_rig.yaml",
     ),
     Sequence("karlsruhe_part", "karlsruhe_part", rate_hz=9.5, shared=True),
-    Sequence("kitti_00_part", "kitti", rate_hz=9.65, shared=True, best_cpp="0.319 m"),
-    Sequence("euroc_mh01_part", "euroc_mh01", rate_hz=20.0, shared=True, kind="inertial", best_cpp="0.0046 m"),
+    Sequence("kitti_00_part", "kitti", rate_hz=9.65, shared=True, best_cpp="0.319 m", long=True),
+    Sequence("euroc_mh01_part", "euroc_mh01", rate_hz=20.0, shared=True, kind="inertial", best_cpp="4.6 mm", long=True),
     Sequence("fr1_xyz_part", "rgbd_dataset_freiburg1_xyz", rate_hz=7.5, shared=True, kind="depth"),
-    Sequence("store_walk", "store_walk", rate_hz=15.0, shared=True),
+    Sequence("store_walk", "store_walk", rate_hz=15.0, shared=True, long=True),
     Sequence("tum_vi_room1_part", "tum_vi_room1", rate_hz=20.0, starts=1, shared=True),
     Sequence("t265_office_part", "t265_office", rate_hz=30.0, starts=1, shared=True),
 )  # fmt: skip

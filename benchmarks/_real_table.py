@@ -14,6 +14,7 @@ from stereo_sfm.types import F64
 Run = dict[str, Any]
 CLEARLY, SIGMAS = 0.05, 2.0  # a switch beats default by more than this share and so many standard errors
 CLEARLY_LOST = 0.01  # the same of lost frames, as a share of all
+STEPS_FOUND = 0.9  # share that must be
 BETTER = "BETTER THAN DEFAULT"
 
 HEADING = (
@@ -30,10 +31,28 @@ def markdown(sequences: Sequence[RealSequence], codes: Sequence[str], labels: Se
         lines += [f"## {label}", "", *HEADING]
         for sequence in sequences:
             lines += _rows(sequence, [r for r in runs if r["code"] == key])
-        lines.append("")
+        lines += ["", *_steps([r for r in runs if r["code"] == key and "found" in r]), ""]
     if len(codes) == 2:
         lines += _against(sequences, codes, labels, runs)
     return "\n".join(lines)
+
+
+def _steps(runs: list[Run]) -> list[str]:
+    """Which steps that were put into sequences were found, and how many others were told."""
+    if not runs:
+        return []
+    names = list(dict.fromkeys(r["switch"] for r in runs))
+    lines = ["| steps found (others told) | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
+    for sequence in dict.fromkeys(r["sequence"] for r in runs):
+        some = [_of(runs, sequence, name) for name in names]
+        cells = [f"{sum(r['found'] for r in s)}/{len(s)} ({sum(r['steps'] - r['found'] for r in s)})" for s in some]
+        lines.append(f"| {sequence} | " + " | ".join(cells) + " |")
+    share = sum(r["found"] for r in runs) / len(runs)
+    return [
+        *lines,
+        "",
+        f"{'yes' if share >= STEPS_FOUND else '**NO**'}: {100 * share:.0f} % of {len(runs)} steps found",
+    ]
 
 
 def _of(runs: list[Run], sequence: str, switch: str) -> list[Run]:
@@ -43,7 +62,7 @@ def _of(runs: list[Run], sequence: str, switch: str) -> list[Run]:
 def _rows(sequence: RealSequence, runs: list[Run]) -> list[str]:
     """A row for each switch."""
     own = [r for r in runs if r["sequence"] == sequence.name]
-    switches = list(dict.fromkeys(r["switch"] for r in own))
+    switches = list(dict.fromkeys(r["switch"] for r in own if "injected_s" not in r))
     default = _of(own, sequence.name, "default")
     rows: list[str] = []
     for switch in switches:

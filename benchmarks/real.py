@@ -12,7 +12,9 @@ folder that several checkouts may share.
 
 The sequences, what must hold of them and how they are laid out is in `_real_sequences.py`. A start is the sequence from
 some frame on; `--starts N` takes the first N of each. Switches: default, self-calibration, steps (sudden changes of the
-rig), people (motions other than the camera's), inertial, side views, recovery, loops.
+rig), people (motions other than the camera's), inertial, side views, recovery, loops. `--steps` also runs sequences
+whose right camera turns by 0.1 to 0.5 degrees in the middle (right images warped), so that nothing is won by not
+looking.
 """
 
 from __future__ import annotations
@@ -35,8 +37,9 @@ from _sequences import ROOT, data_root, one_thread
 
 one_thread()
 
+from _real_inject import found
 from _real_measure import first_stamp, measured, still_m, truth_of
-from _real_run import NO_SWITCH, OPTIONS
+from _real_run import NO_SWITCH, OPTIONS, STEPS
 from _real_sequences import FOLDER, SEQUENCES, Sequence, real_root
 from _real_table import markdown
 
@@ -157,6 +160,8 @@ def result_of(job: Job, place: Path, rig: Path | None) -> dict[str, Any]:
             out |= measured(folder, job.sequence, truth)
         if usage.is_file():
             out |= json.loads(usage.read_text("utf-8"))
+        if "injected_s" in out and "changes" in out:
+            out["found"] = found(job.switch, out["changes"], out["injected_s"] - job.begin_s, out["duration_s"])
         return out
 
 
@@ -181,6 +186,7 @@ def jobs_of(codes: list[Code], sequences: list[Sequence], switches: list[str], s
         for sequence in sequences
         for switch in switches
         if not (switch == "inertial" and sequence.kind != "inertial")
+        and not (switch in STEPS and not sequence.long)
         and not (switch in STEREO_ONLY and sequence.kind == "depth")
         for k, begin_s in enumerate(sequence.begins(starts))
         for code in codes
@@ -205,6 +211,7 @@ def main() -> int:
     parser.add_argument("--store", type=Path, default=ROOT / "runs" / "real", help="results (default: runs/real)")
     parser.add_argument("--only", action="append", default=[], metavar="NAME", help="sequences that begin so; repeat")
     parser.add_argument("--switch", action="append", choices=list(OPTIONS), help="only these; repeat")
+    parser.add_argument("--steps", action="store_true", help="besides, turn right cameras: is that noticed?")
     parser.add_argument("--starts", type=int, help="at most so many of each sequence")
     parser.add_argument("--against", metavar="COMMIT", help="an earlier commit, run beside this one")
     parser.add_argument("--jobs", type=int, default=1, help="runs at once")
@@ -220,7 +227,8 @@ def main() -> int:
     if data_root() is None or real is None:
         print(f"not all sequences are at hand: set {FOLDER} and STEREO_SFM_DATA", file=sys.stderr)
     codes = [code_here()] + ([code_of(args.against, args.store)] if args.against else [])
-    jobs = jobs_of(codes, sequences, args.switch or list(OPTIONS), args.starts)
+    switches = [*(args.switch or OPTIONS), *(STEPS if args.steps else ())]
+    jobs = jobs_of(codes, sequences, switches, args.starts)
     missing = [job for job in jobs if not job.stored(args.store).is_file()]
     if not args.table:
         for code in {job.code.key: job.code for job in missing}.values():

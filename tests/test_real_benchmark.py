@@ -9,9 +9,14 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
 from stereo_sfm import config as configuration
+from stereo_sfm.calib.choice import with_terms
+from stereo_sfm.drivers.sim.rigs import make_rig
+from stereo_sfm.geometry import se3
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 
@@ -19,7 +24,9 @@ BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 @pytest.fixture
 def modules(monkeypatch: pytest.MonkeyPatch) -> dict[str, ModuleType]:
     monkeypatch.setattr(sys, "path", [str(BENCHMARKS), *sys.path])
-    return {name: importlib.import_module(name) for name in ("_real_run", "_real_sequences", "_real_table")}
+    return {
+        name: importlib.import_module(name) for name in ("_real_run", "_real_sequences", "_real_table", "_real_inject")
+    }
 
 
 def run(begin_s: float, ate_m: float | None, switch: str = "default", **more: Any) -> dict[str, Any]:
@@ -58,6 +65,36 @@ def test_a_run_without_a_pose_is_as_bad_as_a_camera_that_stands_still(modules: d
     default = [run(k, None, lost=100) for k in range(5)]
     said = comparison(default, [run(k, 0.1) for k in range(5)])
     assert said.count(better) == 2 and "error +90" in said and "lost +100.0" in said
+
+
+def test_a_turned_right_camera_sees_what_its_calibration_would_expect(modules: dict[str, ModuleType]) -> None:
+    """Points of a scene project to the warped pixels with the right camera turned, as `with_terms` turns it."""
+    inject, rig = modules["_real_inject"], make_rig("distorted", (160, 100))
+    assert tuple(inject.STEPS) == modules["_real_run"].STEPS
+    for step, (axis, degrees) in inject.STEPS.items():
+        turned = with_terms(rig, np.deg2rad(degrees) * np.eye(8)[axis])
+        assert rig.right is not None
+        points = rig.left_T_right[:3, 3] + 5.0 * rig.right.bearing_grid()[20:80, 30:130] @ rig.left_T_right[:3, :3].T
+        before, after = (
+            r.right.project(se3.transform(se3.inverse(r.left_T_right), points.reshape(-1, 3))) for r in (rig, turned)
+        )
+        at = after.astype(np.float32)[None]
+        seen = np.stack([cv2.remap(m, at[..., 0], at[..., 1], cv2.INTER_LINEAR)[0] for m in inject.warp(rig, step)], -1)
+        assert np.abs(seen - before).max() < 0.02  # OpenCV interpolates in steps of 1/32 px
+
+
+def test_a_step_is_found_in_time_and_by_its_amount(modules: dict[str, ModuleType]) -> None:
+    found = modules["_real_inject"].found
+
+    def told(*changes: tuple[float, str, float]) -> list[dict[str, Any]]:
+        return [{"seconds": s, "why": w, "terms": [0, y, 0, 0, 0, 0, 0, 0], "applied": True} for s, w, y in changes]
+
+    before = (2.0, "significant", 0.2)
+    assert found("step 0.3 y", told(before, (11.0, "step", 0.45)), 10.0, 20.0)
+    assert not found("step 0.3 y", told(before, (11.0, "step", 0.3)), 10.0, 20.0)  # by 0.1
+    assert not found("step 0.3 y", told(before, (9.0, "step", 0.5)), 10.0, 20.0)
+    assert not found("step 0.3 y", told(before, (17.0, "step", 0.5)), 10.0, 20.0)
+    assert not found("step 0.3 y", told(before, (11.0, "refined", 0.5)), 10.0, 20.0)
 
 
 def test_a_verdict_counts_the_starts_that_hold(modules: dict[str, ModuleType]) -> None:
