@@ -23,7 +23,6 @@ STEPS = {
     "step 0.3 y": (1, 0.3),
     "step 0.5 y": (1, -0.5),
 }
-TIME_S, TIME_SHARE = 5.0, 0.3  # within which a step must be corrected: seconds, or that share of the sequence if more
 RIGHT_AMOUNT = 0.5, 1.5  # of the step, about its axis
 
 
@@ -55,15 +54,13 @@ def warp(rig: Rig, step: str) -> tuple[F32, F32]:
     return np.ascontiguousarray(uv[..., 0]), np.ascontiguousarray(uv[..., 1])
 
 
-def found(step: str, changes: list[dict[str, Any]], at_s: float, duration_s: float) -> bool:
-    """Whether the changes of a run's calibration (`stats.json`) have the step, in time and by about its amount."""
+def found_after_s(step: str, changes: list[dict[str, Any]], at_s: float) -> float | None:
+    """After how many seconds the changes of a run's calibration (`stats.json`) have the step, by about its amount."""
     axis, degrees = STEPS[step]
     before = 0.0
     for change in (c for c in changes if c["applied"]):
-        by = (change["terms"][axis] - before) / degrees
+        by, late = (change["terms"][axis] - before) / degrees, change["seconds"] - at_s
         before = change["terms"][axis]
-        late = change["seconds"] - at_s
-        in_time = 0 <= late <= max(TIME_S, TIME_SHARE * duration_s)
-        if change["why"] == "step" and in_time and RIGHT_AMOUNT[0] <= by <= RIGHT_AMOUNT[1]:
-            return True
-    return False
+        if change["why"] == "step" and late >= 0 and RIGHT_AMOUNT[0] <= by <= RIGHT_AMOUNT[1]:
+            return late
+    return None

@@ -31,28 +31,34 @@ def markdown(sequences: Sequence[RealSequence], codes: Sequence[str], labels: Se
         lines += [f"## {label}", "", *HEADING]
         for sequence in sequences:
             lines += _rows(sequence, [r for r in runs if r["code"] == key])
-        lines += ["", *_steps([r for r in runs if r["code"] == key and "found" in r]), ""]
+        lines += ["", *_steps([r for r in runs if r["code"] == key and "injected_s" in r]), ""]
     if len(codes) == 2:
         lines += _against(sequences, codes, labels, runs)
     return "\n".join(lines)
 
 
 def _steps(runs: list[Run]) -> list[str]:
-    """Which steps that were put into sequences were found, and how many others were told."""
+    """Which steps that were put into sequences were found, how late, and how many others were told."""
     if not runs:
         return []
     names = list(dict.fromkeys(r["switch"] for r in runs))
-    lines = ["| steps found (others told) | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
+    heading = "| steps found (others told), s later | "
+    lines = [heading + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
     for sequence in dict.fromkeys(r["sequence"] for r in runs):
-        some = [_of(runs, sequence, name) for name in names]
-        cells = [f"{sum(r['found'] for r in s)}/{len(s)} ({sum(r['steps'] - r['found'] for r in s)})" for s in some]
+        cells = [_found(_of(runs, sequence, name)) for name in names]
         lines.append(f"| {sequence} | " + " | ".join(cells) + " |")
-    share = sum(r["found"] for r in runs) / len(runs)
+    share = len(values(runs, "found_after_s")) / len(runs)
     return [
         *lines,
         "",
         f"{'yes' if share >= STEPS_FOUND else '**NO**'}: {100 * share:.0f} % of {len(runs)} steps found",
     ]
+
+
+def _found(runs: list[Run]) -> str:
+    late = values(runs, "found_after_s")
+    others = sum(int(r.get("steps", 0)) for r in runs) - len(late)
+    return f"{len(late)}/{len(runs)} ({others})" + (f", {np.mean(late):.1f}" if late else "")
 
 
 def _of(runs: list[Run], sequence: str, switch: str) -> list[Run]:

@@ -37,7 +37,7 @@ from _sequences import ROOT, data_root, one_thread
 
 one_thread()
 
-from _real_inject import found
+from _real_inject import found_after_s
 from _real_measure import first_stamp, measured, still_m, truth_of
 from _real_run import NO_SWITCH, OPTIONS, STEPS
 from _real_sequences import FOLDER, SEQUENCES, Sequence, real_root
@@ -161,7 +161,7 @@ def result_of(job: Job, place: Path, rig: Path | None) -> dict[str, Any]:
         if usage.is_file():
             out |= json.loads(usage.read_text("utf-8"))
         if "injected_s" in out and "changes" in out:
-            out["found"] = found(job.switch, out["changes"], out["injected_s"] - job.begin_s, out["duration_s"])
+            out["found_after_s"] = found_after_s(job.switch, out["changes"], out["injected_s"] - job.begin_s)
         return out
 
 

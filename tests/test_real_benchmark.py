@@ -83,18 +83,17 @@ def test_a_turned_right_camera_sees_what_its_calibration_would_expect(modules: d
         assert np.abs(seen - before).max() < 0.02  # OpenCV interpolates in steps of 1/32 px
 
 
-def test_a_step_is_found_in_time_and_by_its_amount(modules: dict[str, ModuleType]) -> None:
-    found = modules["_real_inject"].found
+def test_a_step_is_found_by_its_amount(modules: dict[str, ModuleType]) -> None:
+    late = modules["_real_inject"].found_after_s
 
     def told(*changes: tuple[float, str, float]) -> list[dict[str, Any]]:
         return [{"seconds": s, "why": w, "terms": [0, y, 0, 0, 0, 0, 0, 0], "applied": True} for s, w, y in changes]
 
     before = (2.0, "significant", 0.2)
-    assert found("step 0.3 y", told(before, (11.0, "step", 0.45)), 10.0, 20.0)
-    assert not found("step 0.3 y", told(before, (11.0, "step", 0.3)), 10.0, 20.0)  # by 0.1
-    assert not found("step 0.3 y", told(before, (9.0, "step", 0.5)), 10.0, 20.0)
-    assert not found("step 0.3 y", told(before, (17.0, "step", 0.5)), 10.0, 20.0)
-    assert not found("step 0.3 y", told(before, (11.0, "refined", 0.5)), 10.0, 20.0)
+    assert late("step 0.3 y", told(before, (11.0, "step", 0.45)), 10.0) == 1.0
+    assert late("step 0.3 y", told(before, (11.0, "step", 0.3)), 10.0) is None  # by 0.1
+    assert late("step 0.3 y", told(before, (9.0, "step", 0.5)), 10.0) is None  # earlier
+    assert late("step 0.3 y", told(before, (11.0, "refined", 0.5)), 10.0) is None
 
 
 def test_a_verdict_counts_the_starts_that_hold(modules: dict[str, ModuleType]) -> None:
