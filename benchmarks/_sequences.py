@@ -11,6 +11,22 @@ sys.path.insert(0, str(ROOT))
 
 FOLDERS = ("kitti", "euroc_mh01", "tum_vi_room1", "t265_office", "rgbd_dataset_freiburg1_xyz")
 SIMULATED = ("sim:loop",)
+# Cameras as they are in the world: lenses that differ from their calibration, unequal ones, few and coarse pixels,
+# slow ones, stamps that are not true.
+IMPERFECT = tuple(
+    f"sim:loop?{options}"
+    for options in (
+        "rate=15&frames=300",  # for comparison
+        "rate=15&frames=300&residual=0.5",
+        "camera=pinhole&rate=15&frames=300&rows=0.5",
+        "camera=distorted&rate=15&frames=300&decentered=0.5&tilted=0.5",
+        "rate=15&frames=300&right_exposure=0.6&right_blur=1",
+        "camera=pinhole&size=320x240&rate=12&frames=240&jpeg=25&rows=0.5",
+        "rate=2&frames=80",
+        "rate=1&frames=40&speed=0.5",
+        "rate=10&frames=200&stamped=30&stamp_jitter_ms=5",
+    )
+)
 
 # ATE in metres after SE(3) alignment and, in the second place, after Sim(3) alignment, of the C++ systems with their
 # bundle adjustment and loop closing, measured with the same parts of the sequences.

@@ -2,16 +2,16 @@
 
     python benchmarks/accuracy.py [--odometry] [--max-frames N] [SEQUENCE ...]
 
-Real sequences are looked for in STEREO_SFM_DATA; `sim:` scenes are rendered. ATE is the RMSE after alignment,
-"scale" how much too long the path is, "rotation" the RMSE of the orientations. `--set manhattan.enabled=true` enables
-the rotation prior.
+Real sequences are looked for in STEREO_SFM_DATA; `sim:` scenes are rendered, `--imperfect` with cameras whose
+calibration, exposure, focus or stamps are wrong. ATE is the RMSE after alignment, "scale" how much too long the path
+is, "rotation" the RMSE of the orientations. `--set manhattan.enabled=true` enables the rotation prior.
 """
 
 from __future__ import annotations
 
 import argparse
 
-from _sequences import PEERS, one_thread, sequences
+from _sequences import IMPERFECT, PEERS, one_thread, sequences
 
 one_thread()
 
@@ -79,12 +79,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("sequence", nargs="*", help="folder names of the data root, or sources")
     parser.add_argument("--odometry", action="store_true", help="without mapping and loop closing")
+    parser.add_argument("--imperfect", action="store_true", help="simulated cameras that are as imperfect as real ones")
     parser.add_argument("--max-frames", type=int)
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     args = parser.parse_args()
     config = configuration.load(None, [*(ODOMETRY_ONLY if args.odometry else ()), *args.set])
     print("\n".join(HEADING))
-    for name, spec in sequences(args.sequence):
+    named = [*args.sequence, *(IMPERFECT if args.imperfect else ())]
+    for name, spec in sequences(named):
         print("\n".join(rows_of(name, spec, config, args.max_frames)), flush=True)
 
 

@@ -33,6 +33,7 @@ class Effects:
     flicker: float = 0.0  # swing of the lamps' brightness at twice the mains frequency
     jpeg: int = 0  # quality of a lossy link; 0: none
     drop: float = 0.0  # fraction of frames that never arrive
+    defocus_px: float = 0.0  # standard deviation of what a lens out of focus adds to its point spread
 
 
 CLEAN = Effects(0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -79,6 +80,8 @@ class Sensor:
         image = image if self.robot is None else self.robot.over(image)
         if effects.lens_blur_px > 0:
             image = np.asarray(cv2.GaussianBlur(image, (5, 5), effects.lens_blur_px), np.float32)
+        if effects.defocus_px > 0:
+            image = np.asarray(cv2.GaussianBlur(image, (0, 0), effects.defocus_px), np.float32)
         image = image if self._dirt is None else self._dirt.over(image)
         out = np.empty(image.shape, np.uint8)
         read, shot = effects.read_noise**2, effects.shot_noise

@@ -87,6 +87,20 @@ class SimOptions(SourceOptions):
     dirt: float = option(0.0, "spots on the lenses", low=0, high=1)
     flicker: float = option(0.0, "swing of the lamps' brightness, 100 times a second", low=0, high=1)
     jpeg: int = option(0, "quality of a lossy link, 0: none", low=0, high=100)
+    residual: float = option(0.0, "px rms of distortion that no term of the calibration describes", low=0, high=10)
+    decentered: float = option(
+        0.0, "px rms by which lenses are decentered, of which the calibration does not know", low=0, high=10
+    )
+    tilted: float = option(0.0, "px rms of lenses or sensors that are tilted, the same", low=0, high=10)
+    rows: float = option(
+        0.0, "px rms by which rows of the right image are off, differently over the image", low=0, high=10
+    )
+    right_exposure: float = option(1.0, "brightness of the right image over that of the left", low=0.05, high=20)
+    right_blur: float = option(0.0, "px, standard deviation: the right lens is out of focus", low=0, high=20)
+    stamp_jitter_ms: float = option(0.0, "random errors of the images' stamps, standard deviation", low=0, high=1000)
+    stamped: float = option(
+        0.0, "images a second by their stamps, 0: the rate; wrong as where a folder has no stamps", low=0, high=1000
+    )
     readout: float = option(
         0.0, "rolling shutter: seconds from the exposure of the first row to that of the last", low=0, high=0.1
     )

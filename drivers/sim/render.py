@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -61,12 +62,18 @@ class View:
     ids: I32  # (H, W) surface of the pixel's centre, -1 outside the field of view
 
 
+def pixel_grid(camera: Camera) -> F64:
+    """(H, W, 2) px."""
+    return np.stack(np.meshgrid(np.arange(float(camera.width)), np.arange(float(camera.height))), -1)
+
+
 class CameraRays:
     """The rays of a camera's pixels."""
 
-    def __init__(self, camera: Camera, max_angle_deg: float = 93.0) -> None:
+    def __init__(self, camera: Camera, max_angle_deg: float = 93.0, displaced: F64 | None = None) -> None:
+        """`displaced`: (H, W, 2) px from a pixel to where the camera's model expects what it shows."""
         self.camera = camera
-        grid = camera.bearing_grid()
+        grid = camera.bearing_grid() if displaced is None else camera.unproject(pixel_grid(camera) + displaced)
         grid[np.nan_to_num(grid[..., 2], nan=-2.0) < np.cos(np.deg2rad(max_angle_deg))] = np.nan
         self.grid = grid  # (H, W, 3) unit bearings, NaN outside the field of view
         self.du, self.dv = (
@@ -105,15 +112,18 @@ def _near(world: Tables, origin: F64, reach: float) -> Near:
 class Renderer:
     """Renders one world for one rig."""
 
-    def __init__(self, world: Tables, rig: Rig, rays: int = 1) -> None:
-        """`rays`: squared, how many go through a pixel; 1: one, and a few more where surfaces meet.
+    def __init__(self, world: Tables, rig: Rig, rays: int = 1, displaced: Sequence[F64 | None] = (None, None)) -> None:
+        """Args:
+            rays: squared, how many go through a pixel; 1: one, and a few more where surfaces meet.
+            displaced: of each camera's pixels, see `CameraRays`.
 
         With one ray the texture's filter stands for the pixel. It is not what the pixel sees of a slanted surface, and
         edges inside a texture are some hundredths of a pixel from where they should be.
         """
         self.world, self.rig = world, rig
         self._pixel_rays = _grid(rays) if rays > 1 else None
-        self.cameras = [CameraRays(c) for c in (rig.left, rig.right) if c is not None]
+        lenses = [c for c in (rig.left, rig.right) if c is not None]
+        self.cameras = [CameraRays(c, displaced=d) for c, d in zip(lenses, displaced, strict=False)]
         whole, real = (np.empty((2, SCRATCH), dtype) for dtype in (np.int64, np.float64))
         self._scratch = real[0], whole[0], real[1], whole[1]
 

@@ -17,6 +17,7 @@ from stereo_sfm.drivers.sim.encounters import plan as plan_encounters
 from stereo_sfm.drivers.sim.encounters import present
 from stereo_sfm.drivers.sim.inertial import InertialSensor
 from stereo_sfm.drivers.sim.kernels import PERSON
+from stereo_sfm.drivers.sim.lens_errors import LensErrors
 from stereo_sfm.drivers.sim.market import GAIT, Market, build_market, plan, session_path, shoppers
 from stereo_sfm.drivers.sim.options import SimOptions
 from stereo_sfm.drivers.sim.paths import RobotPath, joined, read_paths, with_spot_turns
@@ -34,6 +35,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.types import F64, ImuSamples, StereoImage, Trajectory, WheelSamples
 
 _EPOCH_NS = 1_000_000_000
+LATE = 0.4  # of the interval between images, at most: stamps stay in order
 PAUSES = 3.0  # widths of the smoothing for which a robot rests before it turns on the spot, and afterwards
 
 
@@ -118,6 +120,8 @@ class SimSource(BaseSource):
             pushed=options.pushed,
         )
         self.drive = self._drive(scene, gait)
+        if options.stamped not in (0.0, options.rate) and (options.imu or options.wheel):
+            raise StereoSfmError("sim: an IMU and wheels have the true time: leave stamped away")
         self._inertial = None
         if options.imu:
             seeds = np.random.default_rng([options.seed, options.walk, 83])
@@ -190,8 +194,13 @@ class SimSource(BaseSource):
         )
 
     def stamp_ns(self, frame_id: int) -> int:
-        """Mid-exposure, on the simulated sensor's clock."""
-        return _EPOCH_NS + round(frame_id * 1e9 / self.options.rate)
+        """Mid-exposure, on the simulated sensor's clock, with the errors that stamps may have."""
+        o = self.options
+        interval_s, late_s = 1.0 / (o.stamped or o.rate), 0.0
+        if o.stamp_jitter_ms > 0:
+            late_s = 1e-3 * o.stamp_jitter_ms * np.random.default_rng([o.seed, frame_id, 127]).normal()
+            late_s = float(np.clip(late_s, -LATE * interval_s, LATE * interval_s))
+        return _EPOCH_NS + round(frame_id * 1e9 / (o.stamped or o.rate)) + round(1e9 * late_s)
 
     @property
     def world(self) -> Tables:
@@ -202,7 +211,9 @@ class SimSource(BaseSource):
     def renderer(self) -> Renderer:
         """Created when first needed."""
         if self._renderer is None:
-            self._renderer = Renderer(self.world, self._camera, self.options.rays)
+            o = self.options
+            errors = LensErrors(o.residual, o.decentered, o.tilted, o.rows)
+            self._renderer = Renderer(self.world, self._camera, o.rays, errors.displacements(self._camera, o.seed))
             self._sensors = self._make_sensors(self._renderer)
         return self._renderer
 
@@ -213,7 +224,7 @@ class SimSource(BaseSource):
         return [
             Sensor(
                 rays,
-                self.effects,
+                dataclasses.replace(self.effects, defocus_px=self.options.right_blur) if k else self.effects,
                 RobotView(rays, poses[k], (down, side)) if self.options.robot else None,
                 np.random.default_rng([self.options.seed, k, 101]),
             )
@@ -282,7 +293,7 @@ class SimSource(BaseSource):
         if o.shutter:
             twists = [np.zeros(6)] * 2
         left, right = (
-            sensor.expose(view, twists[k], level, _noise_key(o.seed, frame_id, k))
+            sensor.expose(view, twists[k], level * (o.right_exposure if k else 1.0), _noise_key(o.seed, frame_id, k))
             for k, (sensor, view) in enumerate(zip(self._sensors, views, strict=True))
         )
         exposure_us = self.effects.exposure_s * 1e6
