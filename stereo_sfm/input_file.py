@@ -9,7 +9,8 @@ from typing import BinaryIO
 
 from stereo_sfm.errors import StereoSfmError
 
-MOST_TEXT = 64 << 20  # bytes of a text: a calibration has some KB, a trajectory of a day at 30 Hz some 200 MB
+MOST_TEXT = 1 << 30  # bytes of a text: a trajectory of a day at 30 Hz has some 200 MB
+MOST_BYTES = 2 << 30  # of any file that is read as a whole
 
 
 def open_regular(path: Path, most: int | None = None) -> BinaryIO:
@@ -33,6 +34,17 @@ def open_regular(path: Path, most: int | None = None) -> BinaryIO:
     return os.fdopen(descriptor, "rb")
 
 
+def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
+    """The bytes of a file.
+
+    Raises:
+        StereoSfmError: it is no regular file, or is larger than this many bytes.
+        OSError: it cannot be read.
+    """
+    with open_regular(path, most) as file:
+        return file.read()
+
+
 def read_text(path: Path, most: int = MOST_TEXT, encoding: str = "utf-8-sig") -> str:
     """The text of a file.
 
@@ -43,5 +55,4 @@ def read_text(path: Path, most: int = MOST_TEXT, encoding: str = "utf-8-sig") ->
         StereoSfmError: it is no regular file, or is larger.
         OSError: it cannot be read. UnicodeError: it is something else.
     """
-    with open_regular(path, most) as file:
-        return file.read().decode(encoding)
+    return read_bytes(path, most).decode(encoding)

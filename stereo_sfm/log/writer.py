@@ -150,7 +150,7 @@ class LogWriter:
                 f"a stamp of {log_time / 1e9:g} s cannot be logged: MCAP allows times from 0 to the year 2262"
             )
         data: bytes = schema.encode(message) if is_dataclass(message) else message.SerializeToString()
-        now = self._clock()
+        now = max(self._clock(), 0)  # a clock may stand before 1970: MCAP has no such times
         if self._pending_bytes and self._due(len(data), log_time, now):
             self.flush()
         if not self._pending_bytes:
