@@ -5,6 +5,7 @@ Each file of this folder is a program of its own; arguments after `--` are passe
 
 from __future__ import annotations
 
+import ast
 import subprocess
 import sys
 from pathlib import Path
@@ -15,6 +16,12 @@ FOLDER = Path(__file__).parent
 def main(args: list[str]) -> int:
     """Run the named benchmarks one after the other; the number of failed ones."""
     known = sorted(p.stem for p in FOLDER.glob("*.py") if not p.stem.startswith("_"))
+    if args and args[0] in ("-h", "--help"):
+        print(__doc__)
+        for name in known:
+            text = ast.get_docstring(ast.parse((FOLDER / f"{name}.py").read_text("utf-8"))) or ""
+            print(f"  {name:20} {text.partition(chr(10))[0]}")
+        return 0
     split = args.index("--") if "--" in args else len(args)
     names, passed_on = args[:split] or known, args[split + 1 :]
     unknown = [name for name in names if name not in known]

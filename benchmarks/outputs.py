@@ -48,7 +48,14 @@ from stereo_sfm.service.config import MapConfig, RecordingConfig, RobotConfig
 from stereo_sfm.service.link import OutputProcess
 from stereo_sfm.service.messages import PoseUpdate, PreviewImage, ServiceState, Started, Status
 from stereo_sfm.service.outputs import OUTPUTS
-from stereo_sfm.service.outputs.settings import FoxgloveConfig, OutputsConfig, PageConfig, PoseSocketConfig, Ros2Config
+from stereo_sfm.service.outputs.settings import (
+    FoxgloveConfig,
+    OutputsConfig,
+    PageConfig,
+    PoseSocketConfig,
+    Ros2Config,
+    SecurityConfig,
+)
 from stereo_sfm.service.publisher import Reply
 from stereo_sfm.service.service import Service
 from stereo_sfm.system import Tracker
@@ -154,7 +161,8 @@ def everything() -> RobotConfig:
         FoxgloveConfig(True, port=FOXGLOVE_PORT),
         Ros2Config(True),
     )
-    return RobotConfig(outputs=sections, page=PageConfig(True, port=PAGE_PORT))
+    security = SecurityConfig(auth="none")
+    return RobotConfig(outputs=sections, page=PageConfig(True, port=PAGE_PORT), security=security)
 
 
 class Outputs:

@@ -43,7 +43,13 @@ from stereo_sfm.service.config import MapConfig, RecordingConfig, RobotConfig
 from stereo_sfm.service.health import rss
 from stereo_sfm.service.messages import HealthReport, PoseUpdate, Started, Status
 from stereo_sfm.service.outputs import OUTPUTS
-from stereo_sfm.service.outputs.settings import FoxgloveConfig, OutputsConfig, PageConfig, PoseSocketConfig
+from stereo_sfm.service.outputs.settings import (
+    FoxgloveConfig,
+    OutputsConfig,
+    PageConfig,
+    PoseSocketConfig,
+    SecurityConfig,
+)
 from stereo_sfm.service.service import Service
 from stereo_sfm.types import F64, StereoImage
 
@@ -317,7 +323,7 @@ def run(o: argparse.Namespace, work: Path) -> list[str]:
 
 def outputs_here() -> set[str]:
     """Outputs whose libraries are installed; a node of ROS 2 would be seen by others."""
-    needs = {"foxglove": "foxglove", "page": "uvicorn", "pose_socket": "socket"}
+    needs = {"foxglove": "websockets", "page": "uvicorn", "pose_socket": "socket"}
     return {name for name, module in needs.items() if importlib.util.find_spec(module) is not None}
 
 
@@ -335,6 +341,7 @@ def configuration(work: Path) -> RobotConfig:
             FoxgloveConfig("foxglove" in here, port=FOXGLOVE_PORT),
         ),
         page=PageConfig("page" in here, port=PAGE_PORT),
+        security=SecurityConfig(auth="none"),
     )  # fmt: skip
 
 

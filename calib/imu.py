@@ -10,6 +10,7 @@ from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import F64, ReadOnly
 
 MAX_OFFSET_S = 1.0
+MOST = 1e9  # of any number, and of the inverse of a noise, in its unit: no sensor comes near
 TURN_SHARE = 2e-3  # of a turn: error of a calibrated gyroscope's scale and axes
 
 
@@ -45,8 +46,8 @@ class Imu(ReadOnly):
             self.gyro_noise, self.accel_noise, self.gyro_walk, self.accel_walk, self.gyro_bias_sigma,
             self.accel_bias_sigma, self.rate_hz,
         )  # fmt: skip
-        if not all(np.isfinite(a).all() for a in arrays) or not all(np.isfinite(n) and n > 0 for n in noise):
-            raise StereoSfmError("invalid calibration of the IMU: a number is not finite, or a noise is not positive")
+        if not all((np.abs(a) <= MOST).all() for a in arrays) or not all(1 / MOST <= n <= MOST for n in noise):
+            raise StereoSfmError("invalid calibration of the IMU: a number is out of range, or a noise is not positive")
         if not abs(self.offset_s) <= MAX_OFFSET_S:
             raise StereoSfmError(f"invalid calibration: time offset of {self.offset_s:g} s between camera and IMU")
 

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from stereo_sfm.drivers.ground_truth import stamp_from_seconds
+from stereo_sfm.drivers.text_file import LAST_NS
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.pixels import SUFFIXES
 
@@ -105,7 +106,7 @@ def _unit_of(numbers: list[int]) -> int | None:
 
 def stamp_from_text(text: str) -> int | None:
     """Nanoseconds from '1403636579763555584' or '1305031102.175304'; None if it is neither."""
-    if text.isdecimal() and 15 <= len(text) <= 19:
+    if text.isdecimal() and 15 <= len(text) <= 19 and int(text) <= LAST_NS:
         return int(text)
     try:
         return stamp_from_seconds(text)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, Any, Protocol, Self
@@ -20,6 +22,8 @@ if TYPE_CHECKING:
     from stereo_sfm.drivers.rig_option import RigOption
     from stereo_sfm.types import I64, StereoImage, Trajectory
 
+SURE, LIKELY = 0.7, 0.6  # likeness of a word to a kind of source: of one that may be a folder, of one before a colon
+MOST_BESIDE = 1000  # names in a folder among which a mistyped one is looked for
 _NO_COUNTERS: Mapping[str, float] = MappingProxyType({})
 
 
@@ -187,8 +191,13 @@ def path_of(spec: str) -> Path:
 
 def _kind(text: str) -> str | None:
     """The kind at the beginning of a text, None if it is a path."""
-    kind = text.partition("?")[0].partition(":")[0]
-    return kind if kind in registry.kinds() else None
+    head = text.partition("?")[0]
+    kind, colon, _ = head.partition(":")
+    if kind not in registry.kinds():
+        return None
+    if not colon and Path(kind).exists() and registry.driver(kind).place.startswith(("FOLDER", "FILE")):
+        return None  # a dataset of this kind needs a place: the folder of its name is meant
+    return kind
 
 
 def _split(text: str) -> tuple[str, str, str]:
@@ -207,8 +216,21 @@ def _split(text: str) -> tuple[str, str, str]:
 
 def _unknown(text: str) -> StereoSfmError:
     kind, colon, _ = text.partition(":")
-    known = registry.kinds()
-    hint = did_you_mean(kind, known)
-    is_path = ("/" in text or "." in text) and not (colon and hint)
-    what = f"no such file or folder: {text}" if is_path else f"unknown source '{text}'{hint}"
-    return StereoSfmError(f"{what} (sources: {', '.join(known)}, a dataset folder, or an .mcap file)")
+    near = get_close_matches(kind.lower(), registry.kinds(), 1, SURE if not colon else LIKELY)
+    path = Path(text).expanduser()
+    beside = _near_paths(path)
+    if not near or (not colon and (beside or "/" in text or "." in text)):
+        return StereoSfmError(f"no such file or folder: {text}{beside} ('stereo-sfm sources' lists other sources)")
+    return StereoSfmError(
+        f"unknown source '{text}', did you mean {near[0]}? ('stereo-sfm sources' lists all; "
+        "there is no file or folder of this name)"
+    )
+
+
+def _near_paths(path: Path) -> str:
+    """ ", did you mean NAME?" with a file or folder beside a path that does not exist."""
+    try:
+        names = [other.name for other in itertools.islice(path.parent.iterdir(), MOST_BESIDE)]
+    except OSError:
+        return ""
+    return did_you_mean(path.name, names)

@@ -4,7 +4,22 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from stereo_sfm import input_file
 from stereo_sfm.errors import StereoSfmError
+
+LAST_NS = (1 << 63) - 1  # of stamps: in the year 2262
+
+
+def stamp_ns(text: str) -> int:
+    """A stamp in nanoseconds, as a whole number.
+
+    Raises:
+        ValueError: it is none, or none that a clock can have.
+    """
+    stamp = int(text)
+    if not 0 <= stamp <= LAST_NS:
+        raise ValueError(f"{text} is no time in nanoseconds")
+    return stamp
 
 
 def read_text(path: Path) -> str:
@@ -12,9 +27,9 @@ def read_text(path: Path) -> str:
 
     Raises:
         OSError: it cannot be read.
-        StereoSfmError: it is in another encoding.
+        StereoSfmError: it is in another encoding, no regular file, or larger than any text.
     """
     try:
-        return path.read_text("utf-8-sig")
+        return input_file.read_text(path)
     except UnicodeDecodeError:
         raise StereoSfmError(f"{path} is not text in UTF-8: save it in that encoding") from None

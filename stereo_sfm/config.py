@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.input_file import read_text
 from stereo_sfm.settings import explained, merge, number, path, read, switch, word
 
 MAX_LINE, MAX_TEXT = 4096, 1 << 20  # characters of a configuration file
@@ -419,7 +420,7 @@ def read_toml(path: Path) -> dict[str, Any]:
         StereoSfmError: it cannot be read, or is not TOML.
     """
     try:
-        return parse_toml(path.read_text("utf-8-sig"))
+        return parse_toml(read_text(path, MAX_TEXT))
     except FileNotFoundError:
         raise StereoSfmError(f"no configuration file at {path}") from None
     except OSError as error:

@@ -70,12 +70,13 @@ class Tracker:
         """Track the next image.
 
         Args:
-            left, right: (H, W) 8-bit grey, or what `stereo_sfm.pipeline.image_input` accepts; no right image for one
-                camera and for RGB-D.
+            left: (H, W) 8-bit grey, or what `stereo_sfm.pipeline.image_input` accepts.
+            right: the same; none for one camera and for RGB-D.
             stamp_ns: time of the exposure, whole nanoseconds.
             depth: (H, W) metres (RGB-D).
-            imu, wheel: samples since the image before; used where the calibration has `imu` and `wheel`. What is
-                doubled, out of order, not a number or in other units is left out, each with one line.
+            imu: samples since the image before; used where the calibration has `imu`. What is doubled, out of order,
+                not a number or in other units is left out, each with one line.
+            wheel: the same of wheels.
 
         Raises:
             StereoSfmError: not an image of this rig.
@@ -263,7 +264,8 @@ class MapLocator:
         """Localize an image pair: `map_T_cam`, its information matrix, and `reason`, empty when found.
 
         Args:
-            left, right: as `Tracker.step` takes them.
+            left: as `Tracker.step` takes it.
+            right: the same.
             near: (4, 4) map_T_cam to search around only; None searches the whole map.
         """
         image = ImageInput(self._rig).image(left, right, 0)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import atexit
 import os
+import shutil
+import tempfile
 from pathlib import Path
 
 import stereo_sfm  # noqa: F401  # before the libraries, which read its choice of machine code when they are loaded
@@ -13,6 +16,10 @@ import pytest
 from hypothesis import settings
 
 cv2.setNumThreads(1)
+
+# A service that is tested makes its token here, not in the user's own folder.
+os.environ["XDG_STATE_HOME"] = _STATE = tempfile.mkdtemp(prefix="stereo-sfm-state")
+atexit.register(shutil.rmtree, _STATE, ignore_errors=True)
 
 # The same examples in every run; HYPOTHESIS_PROFILE=search looks for new ones.
 settings.register_profile("same", derandomize=True)

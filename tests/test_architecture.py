@@ -17,6 +17,7 @@ ROOMS: tuple[str, ...] = (
     "stereo_sfm.same_code",
     "stereo_sfm.errors",
     "stereo_sfm.folder_lock",
+    "stereo_sfm.input_file",
     "stereo_sfm.timing",
     "stereo_sfm.messages",
     "stereo_sfm.types",

@@ -33,7 +33,7 @@ def test_what_is_there_passes_and_what_is_missing_is_named() -> None:
         (["batch", "{demo}", "-o", "out"], "ray", "batch"),
         (["run", "rosbag:drive.bag", "--inline"], "rosbags", "ros"),
         ([*SERVE, "page.enabled=true"], "starlette", "serve"),
-        ([*SERVE, "outputs.foxglove.enabled=true"], "foxglove", "serve"),
+        ([*SERVE, "outputs.foxglove.enabled=true"], "websockets", "serve"),
         ([*SERVE, "outputs.ros2.enabled=true"], "rclpy", "ros2"),
     ],
 )

@@ -21,7 +21,7 @@ from stereo_sfm.drivers.image_lists import Listing, pair_listings
 from stereo_sfm.drivers.imu_table import read_imu_samples
 from stereo_sfm.drivers.options import SourceOptions
 from stereo_sfm.drivers.rig_option import chosen_rig
-from stereo_sfm.drivers.text_file import read_text
+from stereo_sfm.drivers.text_file import read_text, stamp_ns
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.types import ImuSamples, Trajectory
 
@@ -73,7 +73,7 @@ def _read_listing(camera: Path) -> Listing:
         if not row or row[0].lstrip().startswith("#"):
             continue
         try:
-            images.append((int(row[0]), camera / "data" / row[1].strip()))
+            images.append((stamp_ns(row[0]), camera / "data" / row[1].strip()))
         except (ValueError, IndexError):
             raise StereoSfmError(f"{path} line {number} is not 'stamp_ns,file'") from None
     return images

@@ -81,9 +81,12 @@ class BagReader:
         try:
             reader = rosbag1.Reader(self.path) if self._ros_1 else rosbag2.Reader(self.path)
             reader.open()
+            numbers: list[Any] = [reader.start_time, reader.end_time, *(c.msgcount for c in reader.connections)]
+            if not all(isinstance(n, int) and abs(n) < 1 << 63 for n in numbers):
+                raise ValueError("a count or a time of its metadata is not a number")
         except FileNotFoundError:
             raise StereoSfmError(f"no bag at {self.path}") from None
-        except self._damage as error:
+        except (*self._damage, TypeError, AttributeError) as error:
             raise StereoSfmError(f"{self.path} cannot be read as a ROS bag: {_said(error)}") from None
         return reader
 

@@ -1,12 +1,19 @@
-"""Prints the poses of a running service: client.py [PORT | SOCKET]."""
+"""Prints the poses of a running service: client.py [PORT | SOCKET] [TOKEN_FILE]."""
 
 import json
 import socket
 import sys
+from pathlib import Path
 
 place = sys.argv[1] if len(sys.argv) > 1 else "7000"
+token = Path(sys.argv[2]) if len(sys.argv) > 2 else Path.home() / ".local/state/stereo-sfm/token"
 connection = socket.socket(socket.AF_INET if place.isdigit() else socket.AF_UNIX)
-connection.connect(("127.0.0.1", int(place)) if place.isdigit() else place)
+try:
+    connection.connect(("127.0.0.1", int(place)) if place.isdigit() else place)
+except OSError as error:
+    sys.exit(f"no service at {place}: {error.strerror}")
+if token.exists():
+    connection.sendall(token.read_bytes())
 for line in connection.makefile():
     pose = json.loads(line)
     print(pose["unix_ns"], pose["state"], *(f"{v:.3f}" for v in pose["map_position"]), f"{pose['latency_ms']:.1f} ms")

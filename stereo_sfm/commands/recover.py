@@ -20,12 +20,10 @@ def run(args: argparse.Namespace) -> int:
     from stereo_sfm.log.repair import recover
 
     source, target = args.input, args.output
-    if target.exists() and not args.overwrite:
-        raise StereoSfmError(f"{target} exists: choose another name or use --overwrite")
     if target.exists() and target.samefile(source):
         raise StereoSfmError("the repaired copy needs another name: the original is kept")
     try:
-        found = recover(source, target)
+        found = recover(source, target, args.overwrite)
     except OSError as error:
         raise StereoSfmError(f"cannot recover {source} to {target}: {error.strerror}") from None
     first, last = found.time_range

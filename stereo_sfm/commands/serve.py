@@ -3,41 +3,58 @@
 from __future__ import annotations
 
 import argparse
+import json
+import os
 import signal
 import sys
 from pathlib import Path
 from types import FrameType
 
+OTHERS = 0o027  # images show people: files that the service writes are not for other users
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of this command."""
+    parser.add_argument("source", nargs="?", metavar="SOURCE", help="instead of robot.toml's: as `run` takes it")
     parser.add_argument("-c", "--config", type=Path, metavar="FILE", help="robot.toml")
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="set one value, as in source.spec=t265:"
     )
     parser.add_argument("--pose-socket", metavar="ADDRESS", help="send poses on tcp://ADDRESS:PORT or a local socket")
     parser.add_argument("--print-ports", action="store_true", help="print what would listen, and who can reach it")
+    parser.add_argument("--print-link", action="store_true", help="print a link to the page of a running service")
     parser.add_argument("--print-config", action="store_true", help="print every setting with its description")
     parser.add_argument("-q", "--quiet", action="store_true", help="print errors only")
     parser.add_argument("-v", "--verbose", action="store_true", help="print what goes well, too")
 
 
+def override(name: str, text: str) -> str:
+    """A setting with a text of the command line, whatever is in it."""
+    return f"{name}={json.dumps(text, ensure_ascii=False)}"  # a string of JSON is one of TOML
+
+
 def run(args: argparse.Namespace) -> int:
     """Serve until the source ends, SIGTERM or Ctrl-C."""
     from stereo_sfm.service.config import explain, load
+    from stereo_sfm.service.outputs.access import page_link
     from stereo_sfm.service.service import Service
 
     socket = "outputs.pose_socket"
-    poses = [f"{socket}.enabled=true", f'{socket}.address="{args.pose_socket}"'] if args.pose_socket else []
-    config = load(args.config, [*args.set, *poses])
+    poses = [f"{socket}.enabled=true", override(f"{socket}.address", args.pose_socket)] if args.pose_socket else []
+    source = [override("source.spec", args.source)] if args.source else []
+    config = load(args.config, [*source, *args.set, *poses])
     if args.print_ports:
         from stereo_sfm.service.outputs.ports import ports
 
         print("\n".join(ports(config)))
         return 0
+    if args.print_link:
+        print(page_link(config))
+        return 0
     if args.print_config:
         print(explain(config), end="")
         return 0
+    os.umask(os.umask(0) | OTHERS)
     service = Service(config)
 
     def stop(number: int, frame: FrameType | None) -> None:
@@ -47,6 +64,8 @@ def run(args: argparse.Namespace) -> int:
         if (number, signal.getsignal(number)) != (signal.SIGHUP, signal.SIG_IGN):
             signal.signal(number, stop)
     with service:
+        if config.page.enabled and not args.quiet:
+            print(f"the page: {page_link(config)}", flush=True)
         while not service.wait(1.0):  # a short wait lets signals through
             pass
     if service.error is not None:

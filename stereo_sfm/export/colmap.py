@@ -20,6 +20,8 @@ from stereo_sfm.types import F64
 
 HALF_PIXEL = 0.5
 GREY = "128 128 128"
+LEAST_VIEWS = 2  # of a point
+NO_POINT = -1  # of a pixel
 
 
 def image_name(frame_id: int, side: str, session: int | None = None) -> str:
@@ -36,7 +38,7 @@ def image_names(saved: SavedMap, side: str) -> list[str]:
 
 
 def export_colmap(saved: SavedMap, folder: Path) -> None:
-    """cameras, rigs, frames, images and points3D as text."""
+    """cameras, rigs, frames, images and points3D as text, without points that are seen once: COLMAP refuses those."""
     rig, s = _without_virtual_camera(saved.rig), saved.snapshot
     write_colmap(rig, folder)
     cameras = [("left", rig.left, np.eye(4), s.uv_left)]
@@ -76,15 +78,17 @@ def _write_images(
     lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
     bounds = np.searchsorted(s.obs_kf, np.arange(len(s.kf_ids) + 1)).tolist()
     tracks: list[list[str]] = [[] for _ in range(len(s.pt_ids))]
+    views = sum(np.bincount(s.obs_pt[np.isfinite(uv[:, 0])], minlength=len(s.pt_ids)) for *_, uv in cameras)
+    ids = np.where(views >= LEAST_VIEWS, np.arange(1, len(s.pt_ids) + 1), NO_POINT)
     for k, left_T_map in enumerate(se3.inverse(s.map_T_kf)):
         for e, (_, _, cam_T_left, uv) in enumerate(cameras):
             image_id = k * len(cameras) + e + 1
             rows = np.arange(bounds[k], bounds[k + 1])
             rows = rows[np.isfinite(uv[rows, 0])]
             lines.append(f"{image_id} {_pose(cam_T_left @ left_T_map)} {e + 1} {names[e][k]}")
-            pixels, points = (uv[rows] + HALF_PIXEL).tolist(), s.obs_pt[rows].tolist()
-            lines.append(" ".join(f"{u!r} {v!r} {p + 1}" for (u, v), p in zip(pixels, points, strict=True)))
-            for n, point in enumerate(points):
+            pixels, points = (uv[rows] + HALF_PIXEL).tolist(), ids[s.obs_pt[rows]].tolist()
+            lines.append(" ".join(f"{u!r} {v!r} {p}" for (u, v), p in zip(pixels, points, strict=True)))
+            for n, point in enumerate(s.obs_pt[rows].tolist()):
                 tracks[point].append(f"{image_id} {n}")
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return tracks
@@ -107,6 +111,8 @@ def _reprojection_errors(s: MapSnapshot, cameras: list[tuple[str, Camera, F64, F
 def _write_points(s: MapSnapshot, tracks: list[list[str]], errors: F64, path: Path) -> None:
     lines = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"]
     for p, (xyz, error, track) in enumerate(zip(s.points.tolist(), errors.tolist(), tracks, strict=True)):
+        if len(track) < LEAST_VIEWS:
+            continue
         x, y, z = xyz
         lines.append(f"{p + 1} {x!r} {y!r} {z!r} {GREY} {error!r} {' '.join(track)}")
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")

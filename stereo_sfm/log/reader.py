@@ -20,6 +20,7 @@ from mcap.records import Attachment, Channel, Chunk, ChunkIndex, Message, Schema
 from mcap.summary import Summary
 
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.input_file import open_regular
 from stereo_sfm.log import chunks, scan
 from stereo_sfm.log.chunks import PREFIX
 from stereo_sfm.log.index import tail
@@ -84,10 +85,8 @@ class LogReader:
             StereoSfmError: no such file, or not an MCAP file.
         """
         self.path = path
-        if path.exists() and not path.is_file():
-            raise StereoSfmError(f"cannot read {path}: it is not a file")
         try:
-            self._stream: IO[bytes] = path.open("rb")
+            self._stream: IO[bytes] = open_regular(path)
         except OSError as error:
             raise StereoSfmError(f"cannot read {path}: {error.strerror}") from None
         self.truncated = ""

@@ -14,8 +14,10 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.writer import MCAP0_MAGIC
 
+from stereo_sfm.input_file import open_regular
 from stereo_sfm.log.index import Index, Span, tail
 from stereo_sfm.log.scan import build_index, check_magic, spans
+from stereo_sfm.log.whole_file import WholeFile
 
 
 def finish_in_place(path: Path, metadata: tuple[str, dict[str, str]] | None = None) -> int:
@@ -60,29 +62,39 @@ def _declarations(index: Index) -> bytes:
     return builder.end()
 
 
-def recover(source: Path, target: Path) -> Index:
+def recover(source: Path, target: Path, overwrite: bool = False) -> Index:
     """Copy the complete records and append the index.
 
     Raises:
-        StereoSfmError: not an MCAP file, or an empty one.
+        StereoSfmError: not an MCAP file, or an empty one; the target exists, cannot be made, or is being written.
     """
-    with source.open("rb") as stream:
+    with open_regular(source) as stream:
         check_magic(stream, source)
         found = build_index(stream)
-        bad = {span.offset for span in found.bad_chunks}
-        with target.open("wb") as out:
-            out.write(MCAP0_MAGIC)
-            skipping = False
-            for span in spans(stream):
-                if span.offset >= found.end:
-                    break
-                if span.offset in bad and not skipping:
-                    out.write(_declarations(found))
-                skipping = span.offset in bad or (skipping and span.opcode == Opcode.MESSAGE_INDEX)
-                if not skipping:
-                    out.write(_read_span(stream, span))
-    finish_in_place(target)
+        file = WholeFile(target, overwrite)
+        try:
+            _copy(stream, found, file.place)
+            finish_in_place(file.place)
+        except BaseException:
+            file.discard()
+            raise
+        file.finish()
     return found
+
+
+def _copy(stream: IO[bytes], found: Index, target: Path) -> None:
+    bad = {span.offset for span in found.bad_chunks}
+    with target.open("r+b") as out:
+        out.write(MCAP0_MAGIC)
+        skipping = False
+        for span in spans(stream):
+            if span.offset >= found.end:
+                break
+            if span.offset in bad and not skipping:
+                out.write(_declarations(found))
+            skipping = span.offset in bad or (skipping and span.opcode == Opcode.MESSAGE_INDEX)
+            if not skipping:
+                out.write(_read_span(stream, span))
 
 
 def _read_span(stream: IO[bytes], span: Span) -> bytes:

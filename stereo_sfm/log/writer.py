@@ -1,7 +1,7 @@
 """`LogWriter` writes an MCAP file in chunks of at most 4 MiB or 0.4 s, each written at once.
 
 So `kill -9` loses less than half a second, and a full disk leaves a properly closed file up to the last chunk
-that fitted.
+that fitted. The file is locked meanwhile; one that replaces another is written beside it.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log import repair, schema
 from stereo_sfm.log.topics import BY_NAME
+from stereo_sfm.log.whole_file import WholeFile
 
 log = logging.getLogger("stereo_sfm")
 
@@ -34,8 +35,8 @@ CHUNK_NS = 400_000_000
 class _File:
     """An unbuffered file: what `write` has returned from survives the death of this process."""
 
-    def __init__(self, path: Path) -> None:
-        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o644)
+    def __init__(self, file: WholeFile) -> None:
+        self._file, self._fd = file, file.fd
         self._position = 0
 
     def write(self, data: bytes) -> int:
@@ -53,7 +54,7 @@ class _File:
         """Nothing is buffered."""
 
     def close(self) -> None:
-        os.close(self._fd)
+        self._file.finish()
 
 
 class _ChunkIndex:
@@ -91,21 +92,15 @@ class LogWriter:
 
         Args:
             path: the .mcap file; its folder is made.
-            overwrite: replace an existing file.
+            overwrite: replace an existing file, when this one is whole.
             compress: zstd on every chunk; pointless for raw images of a real camera when speed matters.
             clock: wall clock in nanoseconds, for `publish_time` only.
 
         Raises:
-            StereoSfmError: the file exists or cannot be created.
+            StereoSfmError: the file exists, cannot be created, or another process is writing it.
         """
-        if path.exists() and not overwrite:
-            raise StereoSfmError(f"{path} exists: choose another name or use --overwrite")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = _File(path)
-        except OSError as error:
-            raise StereoSfmError(f"cannot write {path}: {error.strerror}") from None
-        self.path = path
+        self._whole = WholeFile(path, overwrite)
+        self._file, self.path = _File(self._whole), path
         self._clock = clock
         compression = CompressionType.ZSTD if compress else CompressionType.NONE
         self._mcap = Writer(self._file, chunk_size=2 * CHUNK_BYTES, compression=compression)  # pyright: ignore[reportArgumentType]
@@ -155,7 +150,7 @@ class LogWriter:
                 f"a stamp of {log_time / 1e9:g} s cannot be logged: MCAP allows times from 0 to the year 2262"
             )
         data: bytes = schema.encode(message) if is_dataclass(message) else message.SerializeToString()
-        now = self._clock()
+        now = max(self._clock(), 0)  # a clock may stand before 1970: MCAP has no such times
         if self._pending_bytes and self._due(len(data), log_time, now):
             self.flush()
         if not self._pending_bytes:
@@ -176,6 +171,12 @@ class LogWriter:
         self._guarded(self._mcap.finish)
         self.closed = True
         self._file.close()
+
+    def discard(self) -> None:
+        """Remove it; an older file of its name stays."""
+        if not self.closed:
+            self.closed = True
+            self._whole.discard()
 
     def __enter__(self) -> Self:
         return self
@@ -212,8 +213,8 @@ class LogWriter:
             action()
         except OSError as error:
             self.closed = True
+            messages = repair.finish_in_place(self._whole.place)
             self._file.close()
-            messages = repair.finish_in_place(self.path)
             self._failure = StereoSfmError(
                 f"recording stopped, {error.strerror or error}: {self.path} is closed and readable up to that point "
                 f"({messages} messages, {self.path.stat().st_size / 1e6:.1f} MB)"

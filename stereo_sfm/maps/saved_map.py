@@ -20,6 +20,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
+from stereo_sfm.input_file import read_bytes
 from stereo_sfm.mapping.map import Map, MapSnapshot
 from stereo_sfm.maps.columns import check_columns
 from stereo_sfm.maps.header import DOWN_SINCE, SIDES_SINCE, check_counts, checksum, damaged, read_header, write_header
@@ -118,7 +119,7 @@ def load_map(folder: Path | str, rig: Rig | None = None) -> SavedMap:
     columns: dict[str, Any] = {}
     try:
         for name, wanted in _FILES.items():
-            raw = (folder / f"{name}.npz").read_bytes()
+            raw = read_bytes(folder / f"{name}.npz")
             if checksum(raw) != checksums[name]:
                 raise ValueError(name)
             data = read_arrays(raw)

@@ -19,6 +19,7 @@ import yaml
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.folder_lock import FolderLock
+from stereo_sfm.input_file import read_text
 from stereo_sfm.maps.floor import find_floor
 from stereo_sfm.maps.labels import Aisle, Door
 from stereo_sfm.maps.saved_map import SavedMap, load_map, map_files, save_map
@@ -26,6 +27,7 @@ from stereo_sfm.maps.unfinished import copy_map
 from stereo_sfm.types import F64
 
 ABOUT, CHANGES = "store.yaml", "changes.txt"
+MOST_ABOUT = 1 << 20  # bytes: ten thousand labels
 KEPT_VERSIONS = 5
 
 
@@ -74,12 +76,12 @@ def read_about(store: Path, saved: SavedMap | None = None) -> About:
     if not path.is_file():
         return About(0, find_floor((saved or load_map(store)).snapshot))
     try:
-        data: Any = yaml.safe_load(path.read_text("utf-8"))
+        data: Any = yaml.safe_load(read_text(path, MOST_ABOUT))
         aisles = tuple(Aisle(*_line(line)) for line in data["aisles"])
         doors = tuple(Door(*_line(line)) for line in data.get("doors", ()))
         pose = np.array(data["map_T_floor"], float).reshape(4, 4)
         return About(int(data["version"]), pose, aisles, doors)
-    except (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError, OSError):
+    except (yaml.YAMLError, AttributeError, KeyError, TypeError, ValueError, OSError, RecursionError):
         raise StereoSfmError(f"{path} is damaged: correct it, or remove it to begin without labels") from None
 
 

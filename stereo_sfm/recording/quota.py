@@ -10,6 +10,7 @@ from pathlib import Path
 from stereo_sfm.recording.segments import Segment, recordings, segments
 
 GB = 1_000_000_000
+AUTOMATIC_SHARE = 0.5  # of the quota: as much for what the service marked as for everything else
 
 
 @dataclass(frozen=True)
@@ -33,9 +34,13 @@ class Quota:
     percent: float = 100.0  # of the disk
     min_free: float = 0.0  # bytes
 
+    def most(self, disk: Disk) -> float:
+        """Bytes that recordings may have."""
+        return min(self.bytes, disk.total * self.percent / 100.0)
+
     def excess(self, used: int, disk: Disk) -> float:
         """Bytes of recordings that are too many."""
-        return max(used - min(self.bytes, disk.total * self.percent / 100.0), 0.0)
+        return max(used - self.most(disk), 0.0)
 
     def lacking(self, disk: Disk) -> float:
         """Bytes that should be free and are not."""
@@ -48,38 +53,49 @@ def used_bytes(root: Path) -> int:
 
 
 def make_room(root: Path, quota: Quota, current: Segment | None, disk: Callable[[Path], Disk] = Disk.of) -> float:
-    """Delete the oldest segments without a mark until the quota is kept, and images until enough is free.
+    """Delete segments until the quota is kept, and images until enough is free; the oldest first.
 
-    Poses are never deleted because something else has filled the disk.
+    Segments that a person marked stay. Those that the service marked itself count as marked while they are the newest
+    ones in a part of the quota, and go after the unmarked ones: however many losses there are, there is room for what
+    comes. Poses are never deleted because something else has filled the disk.
 
     Args:
         root: of the recordings. current: being written, never deleted. disk: how full the disk is.
 
     Returns:
-        Bytes by which the quota is still exceeded: everything else is marked.
+        Bytes by which the quota is still exceeded: everything else was marked by a person.
     """
     excess = quota.excess(used_bytes(root), disk(root))
-    for folder in recordings(root) if excess > 0 else ():
-        for segment in segments(folder):
-            if segment == current or segment.marked:
-                continue
-            size = segment.bytes
-            segment.delete()
-            excess -= size
-            if excess <= 0:
-                break
+    share = AUTOMATIC_SHARE * quota.most(disk(root))
+    for segment in _in_order(root, share, current) if excess > 0 else ():
+        excess -= segment.bytes
+        segment.delete()
         if excess <= 0:
             break
-    _free_images(root, quota.lacking(disk(root)), current)
+    _free_images(_in_order(root, share, current), quota.lacking(disk(root)))
     return max(excess, 0.0)
 
 
-def _free_images(root: Path, lacking: float, current: Segment | None) -> None:
-    """Delete the oldest images without a mark until so many bytes are free."""
-    for segment in (s for folder in recordings(root) for s in segments(folder)):
+def _in_order(root: Path, share: float, current: Segment | None) -> list[Segment]:
+    """The segments that may be deleted, first those that go first.
+
+    Args: share, bytes of the newest segments with automatic marks that go last.
+    """
+    first, last = list[Segment](), list[Segment]()
+    for segment in (s for folder in reversed(recordings(root)) for s in reversed(segments(folder))):
+        if segment == current or segment.marked_by_hand:
+            continue
+        share -= segment.bytes if segment.marked else 0
+        (last if segment.marked and share >= 0 else first).append(segment)
+    return [*reversed(first), *reversed(last)]
+
+
+def _free_images(candidates: list[Segment], lacking: float) -> None:
+    """Delete images in this order until so many bytes are free."""
+    for segment in candidates:
         if lacking <= 0:
             return
-        if segment != current and not segment.marked and segment.images.exists():
+        if segment.images.exists():
             lacking -= segment.images.stat().st_size
             segment.images.unlink()
 

@@ -68,7 +68,6 @@ def record(
                 counted = {name: f"{value:g}" for name, value in source.counters.items() if value}
                 writer.metadata(TOTALS, counted | images.totals)
             if not frames:
-                writer.close()
-                path.unlink()  # it contains only a calibration
+                writer.discard()  # it contains only a calibration
     if not frames:
         raise StereoSfmError(f"{source.name} yielded no image: nothing was recorded")

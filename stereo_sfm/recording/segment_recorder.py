@@ -229,7 +229,7 @@ class SegmentRecorder:
         if disk.free < p.quota.min_free:
             self._no_room = f"disk full: {disk.free / 1e6:.0f} MB free, images need {p.quota.min_free / 1e6:.0f} MB"
         elif excess > (0 if current is None else current.bytes):
-            self._no_room = "the quota is taken by marked recordings: delete some of them; images are not recorded"
+            self._no_room = "recordings that you marked fill the quota: delete some of them; images are not recorded"
         else:
             self._no_room = ""
             if not self._poses.problem:

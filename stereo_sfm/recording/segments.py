@@ -4,7 +4,7 @@
         recording.json                 source, mode and beginning
         00012_000720.mcap              segment 12, from second 720 on: poses, keyframes, map updates, events, thumbnails
         00012_000720.images.mcap       its images with inertial and wheel samples: a recording of its own
-        00012_000720.marked            kept regardless of the quota; a line of text for each mark
+        00012_000720.marked            kept beyond the quota; a line for each mark, "lost: ..." of the service's own
 
 Each file opens alone; the folder is a source that plays the images of all its segments.
 """
@@ -29,6 +29,7 @@ from stereo_sfm.log.scan import summary_is_whole
 
 KIND = "stereo_sfm_recording"
 POSES, MARKED = ".mcap", ".marked"
+AUTOMATIC = "lost: "  # a mark that begins like this is the service's own
 _FOLDER = re.compile(r"(\d{5,})_[\d_-]+")
 _SEGMENT = re.compile(r"(\d{5,})_(\d{6,})[a-z]?")  # a letter: begun again after the disk refused a file
 
@@ -64,8 +65,19 @@ class Segment:
 
     @property
     def marked(self) -> bool:
-        """Whether it is kept."""
+        """Whether it is kept, by a person or by the service itself."""
         return self.mark_file.exists()
+
+    @property
+    def marked_by_hand(self) -> bool:
+        """Whether a person marked it."""
+        try:
+            lines = self.mark_file.read_text("utf-8", "replace").splitlines()
+        except FileNotFoundError:
+            return False
+        except OSError:
+            return True
+        return not lines or not all(line.startswith(AUTOMATIC) for line in lines)
 
     @property
     def bytes(self) -> int:
@@ -73,7 +85,9 @@ class Segment:
         return _size(self.poses) + _size(self.images)
 
     def mark(self, text: str) -> None:
-        """Keep it."""
+        """Keep it. The service's own mark is written once: more of them say nothing more."""
+        if text.startswith(AUTOMATIC) and self.marked:
+            return
         with self.mark_file.open("a", encoding="utf-8") as file:
             file.write(f"{text}\n")
 

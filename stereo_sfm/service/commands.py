@@ -74,6 +74,8 @@ class Commands:
 
     def save_map(self, name: str = "") -> Reply:
         """Write the map now; with a name also a copy beside the configured folder."""
+        if name and self._maps.beside(name).resolve() == self._recordings_folder.resolve():
+            return Reply(False, f"{name} is the folder of the recordings: choose another name")
         return self._maps.save_now(self._pipelines.session, name)
 
     def load_map(self, name: str) -> Reply:

@@ -41,6 +41,7 @@ SupplementaryGroups=plugdev video
 StateDirectory=stereo-sfm
 CacheDirectory=stereo-sfm
 RuntimeDirectory=stereo-sfm
+UMask=0027
 Environment=HOME={state} NUMBA_CACHE_DIR=/var/cache/stereo-sfm MPLCONFIGDIR=/var/cache/stereo-sfm
 LimitNOFILE=4096
 OOMPolicy=continue

@@ -185,6 +185,8 @@ class MapKeeper:
         if not self._store.saves or session is None:
             return Reply(False, f"no map is saved: map.mode is {self.mode}, or no pipeline runs")
         copy = self.beside(name) if name else None
+        if copy is not None and copy.exists() and not (copy / "map.json").exists():
+            return Reply(False, f"{copy} is no map: choose another name")
         with self._requests:
             with self._lock:
                 if self._ending:

@@ -141,10 +141,8 @@ class Session:
     def _image(self, message: SlotImage) -> None:
         image = message.image
         self._clock.image(image.frame_id, image.stamp_ns, message.captured_s)
-        facts, now = self._facts, time.monotonic()
-        facts.image_s, facts.source_error = now, ""
-        if facts.starting:
-            facts.starting, facts.pose_s = "", now
+        now = time.monotonic()
+        self._facts.image(now)
         if now >= self._next_preview_s and (rate := self._hub.preview_hz) > 0:
             self._next_preview_s = max(self._next_preview_s + 1.0 / rate, now - 1.0 / rate)
             self._publish_preview(message)
@@ -176,10 +174,7 @@ class Session:
         self.frames += 1
 
     def _update_facts(self, pose: PoseUpdate) -> None:
-        if pose.tracked or pose.state == "INERTIAL":
-            self._facts.pose_s, self._facts.lost_reason = time.monotonic(), ""
-        else:
-            self._facts.lost_reason = pose.reason
+        self._facts.frame(pose.stamp_ns, pose.tracked or pose.state == "INERTIAL", pose.reason)
 
     def _keyframe(self, keyframe: Keyframe) -> None:
         self._map.put(keyframe)

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from stereo_sfm.recording.segments import AUTOMATIC
 from stereo_sfm.service.config import RecordingConfig
 from stereo_sfm.service.health import HealthCollector
 from stereo_sfm.service.hub import Hub
@@ -100,7 +101,7 @@ class StatusReporter:
         elif status.state not in _BETWEEN:
             self._notifier.ready()  # also where the camera is not there yet: the service is
         if status.state == ServiceState.LOST and self.config.mark_losses and self._recorder.mode != "off":
-            self._recorder.mark(f"lost: {status.reason}")
+            self._recorder.mark(f"{AUTOMATIC}{status.reason}")
 
 
 def _line(status: Status) -> str:

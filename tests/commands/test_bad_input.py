@@ -56,7 +56,19 @@ def test_missing_folder(cli: Run) -> None:
 
 
 def test_unknown_source_name(cli: Run) -> None:
-    assert_one_line(cli("run", "t256"), "unknown source 't256'", "t265", "sim", "mcap")
+    assert_one_line(cli("run", "t256"), "unknown source 't256', did you mean t265?")
+
+
+def test_a_mistyped_folder_is_no_camera(cli: Run, tmp_path: Path) -> None:
+    (tmp_path / "pairs").mkdir()
+    assert_one_line(cli("run", "pairs2"), "no such file or folder: pairs2, did you mean pairs?")
+    assert_one_line(cli("run", "ros3x4"), "no such file or folder: ros3x4 (")
+
+
+def test_a_folder_named_like_a_kind_is_the_folder(cli: Run, tmp_path: Path) -> None:
+    (tmp_path / "euroc").mkdir()
+    assert_one_line(cli("info", "euroc"), "euroc is not a known kind of dataset")
+    assert_one_line(cli("info", "kitti"), "folder")
 
 
 def test_folder_of_something_else(cli: Run, tmp_path: Path) -> None:

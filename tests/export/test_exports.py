@@ -60,6 +60,27 @@ def test_colmap_reads_the_model_and_its_own_projection_meets_the_pixels(tmp_path
     assert len(track) == (s.obs_pt == 0).sum() + np.isfinite(s.uv_right[s.obs_pt == 0, 0]).sum()
 
 
+def test_a_point_that_is_seen_once_is_left_out(tmp_path: Path, saved: SavedMap) -> None:
+    """COLMAP reads no map with one, and the pixel stays without a point."""
+    pycolmap = pytest.importorskip("pycolmap")
+    s = saved.snapshot
+    uv_right = s.uv_right.copy()
+    first = np.flatnonzero(s.obs_pt == 3)
+    kept = np.setdiff1d(np.arange(len(s.obs_pt)), first[1:])
+    uv_right[first[0]] = np.nan
+    columns = {
+        "obs_kf": s.obs_kf[kept],
+        "obs_pt": s.obs_pt[kept],
+        "uv_left": s.uv_left[kept],
+        "uv_right": uv_right[kept],
+    }
+    once = dataclasses.replace(saved, snapshot=dataclasses.replace(s, **columns))
+    export_colmap(once, tmp_path)
+    model = pycolmap.Reconstruction(str(tmp_path))
+    assert model.num_points3D() == len(s.pt_ids) - 1 and 4 not in model.points3D
+    assert sum(not p.has_point3D() for image in model.images.values() for p in image.points2D) == 1
+
+
 def test_classic_colmap_files_are_complete(tmp_path: Path, saved: SavedMap) -> None:
     """Readers without rigs and frames use the poses in images.txt."""
     export_colmap(saved, tmp_path)

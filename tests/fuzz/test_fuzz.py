@@ -28,8 +28,11 @@ from stereo_sfm.calib.formats import FORMATS
 from stereo_sfm.config import Config, dump
 from stereo_sfm.drivers.memory import MemorySource
 from stereo_sfm.maps.saved_map import save_map
+from stereo_sfm.service.config import RobotConfig, explain
+from stereo_sfm.service.outputs.settings import OutputsConfig, PageConfig, PoseSocketConfig
 from stereo_sfm.types import Trajectory
 from tests.calib.test_formats import CANNOT, RIGS, target
+from tests.drivers import dataset_folders
 from tests.drivers.test_mcap import _write as write_foreign
 from tests.fuzz import bombs
 from tests.fuzz.mutate import damaged, damaged_text
@@ -231,6 +234,33 @@ def test_configurations(count: int, child: Child, tmp_path: Path) -> None:
         else:
             path.write_bytes(damaged(text.encode(), rng))
         return "toml", [["config", "dump", "-c", str(path)]]
+
+    search(count, case, child)
+
+
+@few_or_many(14, 280)
+def test_dataset_folders(count: int, child: Child, tmp_path: Path) -> None:
+    makers = [getattr(dataset_folders, name) for name in sorted(vars(dataset_folders)) if name.startswith("make_")]
+
+    def case(seed: int) -> tuple[str, list[list[str]]]:
+        rng = random.Random(seed)
+        folder = makers[seed % len(makers)](tmp_path / str(seed))
+        texts = [p for p in sorted(folder.rglob("*")) if p.suffix in (".csv", ".txt", ".yaml") and p.is_file()]
+        for victim in rng.sample(texts, min(len(texts), 2)):
+            victim.write_text(damaged_text(victim.read_text(), rng))
+        return folder.name, [["frames", str(folder)], ["info", str(folder)]]
+
+    search(count, case, child)
+
+
+@few_or_many(8, 160)
+def test_robots(count: int, child: Child, tmp_path: Path) -> None:
+    text = explain(RobotConfig(page=PageConfig(True), outputs=OutputsConfig(PoseSocketConfig(True))))
+
+    def case(seed: int) -> tuple[str, list[list[str]]]:
+        path = tmp_path / f"{seed}.toml"
+        path.write_text(damaged_text(text, random.Random(seed)))
+        return "robot.toml", [["serve", "-c", str(path), "--print-ports"]]
 
     search(count, case, child)
 

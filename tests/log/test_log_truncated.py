@@ -86,7 +86,7 @@ def test_a_file_truncated_anywhere_gives_its_complete_frames(whole: Whole, tmp_p
     for one, other in zip(images, back, strict=False):
         assert_same_image(one, other)
     mended = tmp_path / "mended.mcap"
-    repair.recover(short, mended)
+    repair.recover(short, mended, overwrite=True)
     assert len(_read(mended)) == len(back)
     with mended.open("rb") as stream:  # every other reader of the format finds the same in the mended file
         reader = make_reader(stream, validate_crcs=True)

@@ -175,6 +175,25 @@ def test_the_oldest_unmarked_goes_first(tmp_path: Path) -> None:
     assert recordings(tmp_path) == [new[0].folder]
 
 
+def test_marks_of_the_service_age_and_leave_room(tmp_path: Path) -> None:
+    """Many losses: the newest stay as long as they fit into half of the quota, and what comes is recorded."""
+    old, new = fake(tmp_path, list(range(0, 600, 60))), fake(tmp_path, [0, 60, 120])
+    for segment in (*old, new[0]):
+        for _ in range(5):
+            segment.mark("lost: dark")
+    assert old[0].mark_file.read_text() == "lost: dark\n" and not old[0].marked_by_hand
+    old[2].mark("2026-01-02T10:00:00 a bump")
+    assert old[2].marked_by_hand and old[2].marked
+    assert make_room(tmp_path, Quota(bytes=6 * 1100), new[-1], lambda _: ROOMY) == 0
+    left = [s for folder in recordings(tmp_path) for s in segments(folder)]
+    assert left == [old[2], old[8], old[9], *new]  # those of the person, the newest losses, the unmarked newest
+    make_room(tmp_path, Quota(bytes=3 * 1100), new[-1], lambda _: ROOMY)
+    assert [s for folder in recordings(tmp_path) for s in segments(folder)] == [old[2], new[0], new[2]]
+    assert make_room(tmp_path, Quota(bytes=1100), new[-1], lambda _: ROOMY) == 1100  # only the person's is too many
+    make_room(tmp_path, Quota(1e9, min_free=50), None, lambda _: Disk(10**9, 0))
+    assert old[2].images.exists() and not new[2].images.exists()
+
+
 def test_percent_and_free_space_count_as_well() -> None:
     disk = Disk(1000, 100)
     assert Quota(bytes=1e9, percent=50).excess(600, disk) == 100

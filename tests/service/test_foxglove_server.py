@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -23,18 +24,23 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.log import topics
 from stereo_sfm.messages import Health
 from stereo_sfm.service.messages import Event
-from stereo_sfm.service.outputs.foxglove_server import KINDS, REPORT, SERVICES, STATUS, FoxgloveOutput
+from stereo_sfm.service.outputs.access import Access
+from stereo_sfm.service.outputs.foxglove_clients import SERVICES
+from stereo_sfm.service.outputs.foxglove_server import KINDS, REPORT, STATUS, FoxgloveOutput
+from stereo_sfm.service.outputs.settings import FoxgloveConfig
 from stereo_sfm.service.publisher import Reply
 from tests.service.service_messages import FakeService, cloud, health, picture, pose_update, started, status
 from tests.synthetic import pinhole_rig
 
 connect = pytest.importorskip("websockets.sync.client").connect
-pytest.importorskip("foxglove")
+pytest.importorskip("uvicorn")
+
+TOKEN = "a-token-of-thirty-two-characters"
 
 
 @contextmanager
 def _serving(service: FakeService | None = None) -> Iterator[tuple[FoxgloveOutput, Any]]:
-    output = FoxgloveOutput("127.0.0.1", 0, 5.0)
+    output = FoxgloveOutput(FoxgloveConfig(port=0))
     output.open(service or FakeService())
     try:
         with connect(f"ws://127.0.0.1:{output.port}", subprotocols=["foxglove.sdk.v1"]) as client:
@@ -174,11 +180,71 @@ def test_settings_are_parameters() -> None:
     assert ("set_setting", {"name": "recording.mode", "value": "full"}) in service.calls
 
 
-def test_it_stays_on_this_computer() -> None:
-    with pytest.raises(StereoSfmError, match="no token"):
-        FoxgloveOutput("0.0.0.0", 8765, 5.0)
+def _refused(output: FoxgloveOutput, path: str = "", **headers: str) -> int:
+    """The status of a handshake, 101 where it succeeds."""
+    more = {name.replace("_", "-"): value for name, value in headers.items()}
+    protocol = more.pop("protocol", "foxglove.sdk.v1")
+    lines = [
+        f"GET /{path} HTTP/1.1",
+        f"Host: {more.pop('Host', f'127.0.0.1:{output.port}')}",
+        "Upgrade: websocket",
+        "Connection: Upgrade",
+        "Sec-WebSocket-Version: 13",
+        "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==",
+        f"Sec-WebSocket-Protocol: {protocol}",
+        *(f"{name}: {value}" for name, value in more.items()),
+    ]
+    with socket.create_connection(("127.0.0.1", output.port), 5) as client:
+        client.sendall("\r\n".join([*lines, "", ""]).encode())
+        return int(client.recv(1000).split()[1])
+
+
+@pytest.mark.parametrize("rules", [Access(), Access(TOKEN)])
+def test_pages_of_other_sites_are_refused(rules: Access) -> None:
+    """A page in a browser on the robot reaches this port: its Origin and Host say whose page it is."""
+    output = FoxgloveOutput(FoxgloveConfig(port=0), rules)
+    output.open(FakeService())
+    good = {"Authorization": f"Bearer {TOKEN}"}
+    try:
+        assert _refused(output, **good) == _refused(output, Origin="https://app.foxglove.dev", **good) == 101
+        assert _refused(output, Origin=f"http://127.0.0.1:{output.port}", **good) == 101
+        assert _refused(output, protocol="foxglove.websocket.v1", **good) == 101
+        for origin in ("https://evil.example", "null", "https://app.foxglove.dev.evil.example", "http://127.0.0.1"):
+            assert _refused(output, Origin=origin, **good) == 403, origin
+        for host in ("evil.example", f"evil.example:{output.port}", "127.0.0.1.evil.example", ""):
+            assert _refused(output, Host=host, Origin=f"http://{host}", **good) == 421, host
+        assert _refused(output, protocol="chat", **good) == 400
+    finally:
+        output.close()
+
+
+def test_nobody_without_the_token_is_served() -> None:
+    output = FoxgloveOutput(FoxgloveConfig(port=0), Access(TOKEN))
+    output.open(FakeService())
+    try:
+        assert _refused(output) == _refused(output, "?token=wrong") == _refused(output, Authorization="Bearer x") == 401
+        assert _refused(output, f"?token={TOKEN}", Origin="https://app.foxglove.dev") == 101  # as Foxglove can
+    finally:
+        output.close()
+
+
+def test_a_client_that_does_not_read_delays_no_other() -> None:
+    with _serving() as (output, client):
+        known = _channels(client, len(KINDS) + 3)
+        with connect(f"ws://127.0.0.1:{output.port}", subprotocols=["foxglove.sdk.v1"], max_queue=1) as slow:
+            for one in (slow, client):
+                _subscribe(one, {1: known[topics.POINTS]["id"]})
+            output.put(started())
+            for _ in range(300):
+                output.put(cloud(20_000))
+            assert len(_wait(client, lambda said: said if isinstance(said, bytes) and said[0] == 1 else None)) > 10_000
+            for one in (slow, client):  # with a handshake for the end they would wait for what was not read
+                one.socket.shutdown(socket.SHUT_RDWR)
+
+
+def test_a_port_that_is_taken_is_one_line() -> None:
     with _serving() as (output, _), pytest.raises(StereoSfmError, match="cannot listen"):
-        FoxgloveOutput("127.0.0.1", output.port, 5.0).open(FakeService())
+        FoxgloveOutput(FoxgloveConfig(port=output.port)).open(FakeService())
 
 
 def test_health_is_one_message_a_stage() -> None:

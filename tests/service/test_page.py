@@ -23,10 +23,17 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.recording.describe import describe_file
 from stereo_sfm.service.config import RobotConfig
 from stereo_sfm.service.messages import Event, ServiceState
-from stereo_sfm.service.outputs.access import Access
+from stereo_sfm.service.outputs.access import Access, Links
 from stereo_sfm.service.outputs.ports import ports
 from stereo_sfm.service.outputs.robot_axes import RobotAxes
-from stereo_sfm.service.outputs.settings import FoxgloveConfig, OutputsConfig, PageConfig, PoseSocketConfig
+from stereo_sfm.service.outputs.settings import (
+    FoxgloveConfig,
+    OutputsConfig,
+    PageConfig,
+    PoseSocketConfig,
+    Ros2Config,
+    SecurityConfig,
+)
 from stereo_sfm.service.page import app, server
 from stereo_sfm.service.page.server import PageOutput
 from stereo_sfm.service.page.verdicts import GOOD, Verdicts, problems
@@ -341,6 +348,8 @@ def test_only_this_computers_names_are_answered_and_headers_are_safe() -> None:
             ("127.0.0.1.evil.example", 421),
         ):
             assert _ask(output, "GET", "/", None, {"Host": host})[0] == code, host
+        for origin, code in (("https://evil.example", 403), ("null", 403), (f"http://127.0.0.1:{output.port}", 200)):
+            assert _ask(output, "POST", "/api/command/mark", b"{}", {**COMMAND, "Origin": origin})[0] == code, origin
         headers = _ask(output, "GET", "/")[2]
     assert "default-src 'self'" in headers["content-security-policy"] and headers["x-content-type-options"] == "nosniff"
     assert "server" not in headers
@@ -372,19 +381,34 @@ def test_nothing_is_sent_without_the_token() -> None:
         assert codes[0] == 401 and codes[-1] == 429
 
 
-def test_a_port_that_is_taken_and_a_missing_token_are_one_line() -> None:
+def test_a_link_logs_in_once() -> None:
+    with _serving(rules=Access(TOKEN)) as output:
+        code = json.dumps({"token": Links(TOKEN).new()})
+        answers = [_ask(output, "POST", "/login", code, COMMAND) for _ in range(2)]
+        assert [answer[0] for answer in answers] == [200, 401]
+        cookie = answers[0][2]["set-cookie"].split(";")[0]
+        assert _ask(output, "GET", "/api/map", None, {"Cookie": cookie})[0] == 200
+
+
+def test_a_port_that_is_taken_and_one_open_to_all_are_one_line() -> None:
     with _serving() as output, pytest.raises(StereoSfmError, match=f"cannot listen on 127.0.0.1:{output.port}"):
         PageOutput("127.0.0.1", output.port, 4.0).open(FakeService())
-    with pytest.raises(StereoSfmError, match=r"security\.token_file"):
-        server.make(RobotConfig(page=PageConfig(True, "0.0.0.0")))
+    with pytest.raises(StereoSfmError, match=r"others could connect to 0\.0\.0\.0"):
+        server.make(RobotConfig(page=PageConfig(True, "0.0.0.0"), security=SecurityConfig(auth="none")))
 
 
 def test_what_is_open_is_listed() -> None:
     assert ports(RobotConfig()) == ["nothing listens: no output and no page is enabled"]
-    outputs = OutputsConfig(PoseSocketConfig(True, "tcp://0.0.0.0:7000"), FoxgloveConfig(True))
-    lines = ports(RobotConfig(outputs=outputs, page=PageConfig(True)))
-    assert len(lines) == 3 and "http://127.0.0.1:8080  this computer only" in lines[0]
-    assert "anyone who can reach 0.0.0.0 and has the token" in lines[1] and "ws://127.0.0.1:8765" in lines[2]
+    outputs = OutputsConfig(PoseSocketConfig(True, "tcp://0.0.0.0:7000"), FoxgloveConfig(True), Ros2Config(True))
+    security = SecurityConfig(token_file="/etc/token", tls_cert="cert.pem")
+    page, poses, foxglove, *dds = ports(RobotConfig(outputs=outputs, page=PageConfig(True), security=security))
+    assert "http://127.0.0.1:8080  anyone on this computer with the token in /etc/token" in page
+    assert "anyone who can reach 0.0.0.0 with the token in" in poses and "ws://127.0.0.1:8765" in foxglove
+    assert "every network" in dds[0] and any("ROS_LOCALHOST_ONLY=1 hides it" in line for line in dds)
+    file = next(line for line in dds if "FASTRTPS_DEFAULT_PROFILES_FILE" in line).partition("=")[2].partition(",")[0]
+    assert (Path(__file__).parents[2] / file).is_file()
+    assert ports(RobotConfig(page=PageConfig(True), security=SecurityConfig(auth="none")))[0].endswith("this computer")
+    assert "https://0.0.0.0:8080" in ports(RobotConfig(page=PageConfig(True, "0.0.0.0"), security=security))[0]
 
 
 def test_serve_prints_its_ports(capsys: pytest.CaptureFixture[str]) -> None:
@@ -392,7 +416,14 @@ def test_serve_prints_its_ports(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().out == "nothing listens: no output and no page is enabled\n"
     assert main(["serve", "--pose-socket", "tcp://127.0.0.1:7001", "--set", "page.enabled=true", "--print-ports"]) == 0
     page, poses = capsys.readouterr().out.splitlines()
-    assert "127.0.0.1:8080" in page and "tcp://127.0.0.1:7001  this computer only" in poses
+    assert "127.0.0.1:8080" in page and "tcp://127.0.0.1:7001  anyone on this computer with the token" in poses
+    assert main(["serve", "--print-link"]) == 0
+    assert "http://127.0.0.1:8080/#once-" in capsys.readouterr().out
+
+
+def test_a_source_is_an_argument_of_serve(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["serve", "sim:loop?seed='3'", "--print-config"]) == 0
+    assert "spec = \"sim:loop?seed='3'\"" in capsys.readouterr().out
 
 
 def test_closing_does_not_wait_for_an_open_page() -> None:

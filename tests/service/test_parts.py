@@ -60,18 +60,43 @@ def update(version: int, map_T_odom: F64, point_ids: list[int], culled: tuple[in
     ("facts", "state"),
     [
         (Facts(), ServiceState.STARTING),
-        (Facts(starting="", image_s=9.9, pose_s=9.9), ServiceState.RUNNING),
-        (Facts(starting="", image_s=9.9, pose_s=9.0), ServiceState.LOST),
-        (Facts(starting="", image_s=8.0, pose_s=8.0), ServiceState.CAMERA_GONE),
+        (Facts(starting="", image_s=9.9), ServiceState.RUNNING),
+        (Facts(starting="", image_s=9.9, lost_ns=600 * MS), ServiceState.LOST),
+        (Facts(starting="", image_s=8.0, interval_s=0.033), ServiceState.CAMERA_GONE),
+        (Facts(starting="", image_s=8.0), ServiceState.RUNNING),  # it may be a source of 1 Hz
+        (Facts(starting="", image_s=4.0), ServiceState.CAMERA_GONE),
         (Facts(source_error="no T265 found"), ServiceState.CAMERA_GONE),
-        (Facts(starting="", image_s=9.9, pose_s=9.9, disk_problem="full"), ServiceState.DISK_FULL),
-        (Facts(starting="", image_s=9.9, pose_s=9.0, disk_problem="full"), ServiceState.LOST),
+        (Facts(starting="", image_s=9.9, disk_problem="full"), ServiceState.DISK_FULL),
+        (Facts(starting="", image_s=9.9, lost_ns=600 * MS, disk_problem="full"), ServiceState.LOST),
         (Facts(stopping="SIGTERM", source_error="x"), ServiceState.STOPPING),
     ],
 )
 def test_the_most_severe_problem_is_the_state(facts: Facts, state: ServiceState) -> None:
     judged, reason = derive_state(facts, 10.0)
     assert judged == state and bool(reason) == (state != ServiceState.RUNNING)
+
+
+@pytest.mark.parametrize("interval_s", [1 / 30, 1.0, 3.0])
+def test_a_slow_source_and_a_busy_computer_are_no_loss(interval_s: float) -> None:
+    """Losses are the tracker's to tell: neither the source's rate nor the computer's load makes one."""
+    facts, now, states = Facts(), 100.0, list[ServiceState]()
+    for k in range(40):
+        now += interval_s * (1.9 if k % 7 == 3 else 1.0)  # late, as on a busy computer
+        facts.image(now)
+        facts.frame(k * int(interval_s * 1e9), True, "")
+        states.append(derive_state(facts, now + 0.9 * interval_s)[0])  # the pose comes late, too
+    assert set(states) == {ServiceState.RUNNING}
+    for k in range(40, 40 + int(0.4 / interval_s)):  # a moment without a pose
+        facts.frame(k * int(interval_s * 1e9), False, "dark")
+        assert derive_state(facts, now)[0] == ServiceState.RUNNING
+    facts.frame(60 * int(interval_s * 1e9), False, "dark")
+    assert derive_state(facts, now) == (ServiceState.LOST, "dark")
+    facts.frame(61 * int(interval_s * 1e9), True, "")
+    assert derive_state(facts, now)[0] == ServiceState.RUNNING
+    assert derive_state(facts, now + max(1.0, 6 * interval_s) + 0.1)[0] == ServiceState.CAMERA_GONE
+    facts.frame(5, False, "dark")  # another source, whose clock begins anew
+    facts.image(now)
+    assert derive_state(facts, now)[0] == ServiceState.RUNNING
 
 
 def test_velocity_and_covariance_are_those_of_the_body() -> None:

@@ -28,7 +28,7 @@ from stereo_sfm.maps.saved_map import load_map
 from stereo_sfm.recording.segments import recordings, segments
 from stereo_sfm.service.config import MapConfig, RecordingConfig, RobotConfig
 from stereo_sfm.service.messages import PoseUpdate, ServiceState, Started, Status
-from stereo_sfm.service.outputs.settings import OutputsConfig, PageConfig, PoseSocketConfig
+from stereo_sfm.service.outputs.settings import OutputsConfig, PageConfig, PoseSocketConfig, SecurityConfig
 from stereo_sfm.service.service import Service
 from tests.service.endless import endless_wall
 from tests.service.test_service import PATIENCE_S, STOP_S, wait_for
@@ -129,7 +129,8 @@ def test_clients_that_flood_cost_no_pose(tmp_path: Path) -> None:
     pytest.importorskip("uvicorn")
     poses, page, over = free_port(), free_port(), threading.Event()
     outputs = OutputsConfig(pose_socket=PoseSocketConfig(True, f"tcp://127.0.0.1:{poses}"))
-    settings = replace(config(tmp_path), outputs=outputs, page=PageConfig(True, port=page))
+    security = SecurityConfig(auth="none")
+    settings = replace(config(tmp_path), outputs=outputs, page=PageConfig(True, port=page), security=security)
     answers = list[int]()
 
     def command() -> None:

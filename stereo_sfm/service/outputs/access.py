@@ -1,30 +1,144 @@
-"""Who may connect: this computer only, or others with a token and, where there is a certificate, encrypted."""
+"""Who may use a port: whoever has the token; everyone on this computer only where the configuration says so."""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import hmac
 import ipaddress
+import os
+import secrets
 import ssl
-from dataclasses import dataclass
+import stat
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.service.outputs.settings import SecurityConfig
 
+if TYPE_CHECKING:
+    from stereo_sfm.service.config import RobotConfig
+
 LEAST_TOKEN = 16  # characters
 MOST_TOKEN = 4096
+WRONG_A_SECOND, WRONG_AT_ONCE = 0.5, 5  # wrong tokens of one peer before it has to wait
+MOST_PEERS = 1024  # whose wrong tokens are remembered
+LINK_S = 600.0  # that a link may wait for its log-in
+
+
+class TooManyAttempts(StereoSfmError):
+    """A peer has sent too many wrong tokens and has to wait."""
+
+
+class Bucket:
+    """Lets `rate` a second through, and `burst` at once."""
+
+    def __init__(self, rate: float, burst: int, clock: Callable[[], float] = time.monotonic) -> None:
+        self._rate, self._burst, self._clock = rate, burst, clock
+        self._left, self._at = float(burst), clock()
+
+    @property
+    def left(self) -> float:
+        """How many may pass now."""
+        now = self._clock()
+        self._left, self._at = min(self._burst, self._left + (now - self._at) * self._rate), now
+        return self._left
+
+    def take(self) -> bool:
+        """Whether one more may pass now."""
+        if self.left < 1:
+            return False
+        self._left -= 1
+        return True
+
+
+class Attempts:
+    """Wrong tokens by peer: one that guesses makes itself wait, and no other."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._buckets: OrderedDict[str, Bucket] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def check(self, peer: str, right: Callable[[], bool]) -> bool:
+        """Whether a token is right.
+
+        Args: peer, who sent it. right: compares it.
+
+        Raises:
+            TooManyAttempts: the peer has to wait; its token is not looked at.
+        """
+        with self._lock:
+            bucket = self._buckets.get(peer)
+            if bucket is not None and bucket.left < 1:
+                raise TooManyAttempts("too many attempts: wait a moment")
+            if right():
+                return True
+            self._buckets.setdefault(peer, Bucket(WRONG_A_SECOND, WRONG_AT_ONCE, self._clock)).take()
+            self._buckets.move_to_end(peer)
+            while len(self._buckets) > MOST_PEERS:
+                self._buckets.popitem(last=False)
+        return False
 
 
 @dataclass(frozen=True)
 class Access:
-    """What a client needs to connect to a port."""
+    """What a client needs to use a port."""
 
-    token: str = ""  # "": none
+    token: str = ""  # "": nothing
     tls: ssl.SSLContext | None = None
+    _attempts: Attempts = field(default_factory=Attempts, compare=False, repr=False)
 
-    def allows(self, token: str) -> bool:
-        """Whether this is the token; compared in constant time."""
-        return not self.token or hmac.compare_digest(token.encode(), self.token.encode())
+    def allows(self, token: str, peer: str) -> bool:
+        """Whether this is the token; compared in constant time.
+
+        Args: token, any text that a client sent. peer: who sent it.
+
+        Raises:
+            TooManyAttempts: this peer has to wait.
+        """
+        if not self.token or not token:  # who sends none does not guess
+            return not self.token
+        sent = token.encode("utf-8", "surrogatepass")
+        return self._attempts.check(peer, lambda: hmac.compare_digest(sent, self.token.encode()))
+
+
+class Links:
+    """Codes in links to the page, made from the token: each allows one log-in, within ten minutes."""
+
+    def __init__(self, token: str, clock: Callable[[], float] = time.time) -> None:
+        """Args: clock, Unix time: another process makes the codes."""
+        self._key, self._clock = token.encode(), clock
+        self._used: dict[str, float] = {}  # until when they would be valid
+
+    def new(self) -> str:
+        """Another code."""
+        until, name = f"{int(self._clock() + LINK_S):x}", secrets.token_hex(8)
+        return f"once-{until}-{name}-{self._signature(until, name)}"
+
+    def take(self, code: str) -> bool:
+        """Whether a code is valid; it is not, the next time."""
+        parts = code.split("-")
+        if len(parts) != 4 or parts[0] != "once":
+            return False
+        signature = self._signature(parts[1], parts[2])
+        if not hmac.compare_digest(parts[3].encode("utf-8", "surrogatepass"), signature.encode()):
+            return False
+        now, until = self._clock(), float(int(parts[1], 16))
+        self._used = {name: end for name, end in self._used.items() if end > now}
+        if until <= now or parts[2] in self._used:
+            return False
+        self._used[parts[2]] = until
+        return True
+
+    def _signature(self, until: str, name: str) -> str:
+        text = f"once-{until}-{name}".encode("utf-8", "surrogatepass")
+        return hmac.new(self._key, text, hashlib.sha256).hexdigest()
 
 
 def is_loopback(address: str) -> bool:
@@ -36,27 +150,84 @@ def is_loopback(address: str) -> bool:
 
 
 def access(security: SecurityConfig, address: str) -> Access:
-    """The rules for a port on an address: nothing on the loopback, a token beyond it.
+    """The rules for a port on an address. The token is made where none is configured.
 
     Raises:
-        StereoSfmError: no token for an address beyond this computer, or a token or certificate that cannot be read.
+        StereoSfmError: no token although others could connect, or a token or certificate that cannot be used.
     """
-    if is_loopback(address):
+    if security.auth == "none":
+        if not is_loopback(address):
+            raise StereoSfmError(f'others could connect to {address}: security.auth = "none" is for 127.0.0.1 only')
         return Access()
-    if not security.token_file:
-        raise StereoSfmError(f"others could connect to {address}: name a file with a token (security.token_file)")
-    return Access(_token(Path(security.token_file)), _tls(security))
+    return Access(token(security), None if is_loopback(address) else _tls(security))
 
 
-def _token(path: Path) -> str:
+def token(security: SecurityConfig) -> str:
+    """The token that clients must send.
+
+    Raises:
+        StereoSfmError: it cannot be read or made, others can read it, or it is too short.
+    """
+    if security.token_file:
+        return _read(Path(security.token_file))
+    path = token_file(security)
+    if not path.exists():
+        _make(path)
+    return _read(path)
+
+
+def token_file(security: SecurityConfig) -> Path:
+    """Where the token is: as configured, else in the folder for the state of the service or of its user."""
+    if security.token_file:
+        return Path(security.token_file)
+    own = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]  # set by systemd
+    if own:
+        return Path(own) / "token"
+    return Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "stereo-sfm" / "token"
+
+
+def page_link(config: RobotConfig) -> str:
+    """The address of the page, with a code for one log-in.
+
+    Raises:
+        StereoSfmError: as `access`.
+    """
+    page, rules = config.page, access(config.security, config.page.address)
+    host = "127.0.0.1" if page.address in ("0.0.0.0", "::") else page.address
+    host = f"[{host}]" if ":" in host else host
+    code = f"#{Links(rules.token).new()}" if rules.token else ""
+    return f"http{'s' if rules.tls is not None else ''}://{host}:{page.port}/{code}"
+
+
+def _make(path: Path) -> None:
+    """A new token, for this user's eyes only. Of two processes that do this at once, one wins."""
+    part = path.with_name(f"{path.name}.{secrets.token_hex(4)}")
     try:
-        with path.open(encoding="ascii") as file:
-            token = file.read(MOST_TOKEN + 1).strip()
+        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+            file.write(secrets.token_urlsafe(32) + "\n")
+        with contextlib.suppress(FileExistsError):
+            os.link(part, path)
+    except OSError as error:
+        raise StereoSfmError(
+            f"cannot make a token in {path}: {error.strerror}; name another file (security.token_file)"
+        ) from None
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _read(path: Path) -> str:
+    try:
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK), encoding="ascii") as file:
+            mode = os.fstat(file.fileno()).st_mode
+            text = file.read(MOST_TOKEN + 1).strip() if stat.S_ISREG(mode) else ""
     except (OSError, ValueError):
         raise StereoSfmError(f"cannot read the token in {path}") from None
-    if not LEAST_TOKEN <= len(token) <= MOST_TOKEN or not token.isprintable():
+    if mode & stat.S_IRWXO:
+        raise StereoSfmError(f"{path}: everyone on this computer can use this token: chmod 640 {path}")
+    if not LEAST_TOKEN <= len(text) <= MOST_TOKEN or not text.isprintable():
         raise StereoSfmError(f"{path}: a token is one line of at least {LEAST_TOKEN} characters")
-    return token
+    return text
 
 
 def _tls(security: SecurityConfig) -> ssl.SSLContext | None:

@@ -1,15 +1,13 @@
 """The topics of the log, live, on Foxglove's WebSocket, with the commands of the service.
 
 Topics, schemas and frames are those of the log (`stereo_sfm.log.topics`), so that one layout shows both; two are
-added, `/service/status` and `/service/health`. The protocol has no client authentication: it is served to this computer
-alone.
+added, `/service/status` and `/service/health`.
 """
 
 from __future__ import annotations
 
 import json
-import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +24,7 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.errors import StereoSfmError, require
+from stereo_sfm.errors import require
 from stereo_sfm.log import foxglove, schema, topics
 from stereo_sfm.log.image_log import LEVEL_T_MAP, level_T_map
 from stereo_sfm.log.run_log import PATH_COLOR, age_colors
@@ -42,19 +40,19 @@ from stereo_sfm.service.messages import (
     Started,
     Status,
 )
-from stereo_sfm.service.outputs.access import is_loopback
-from stereo_sfm.service.publisher import COMMANDS, ServiceClient
+from stereo_sfm.service.outputs.access import Access, access
+from stereo_sfm.service.outputs.foxglove_protocol import Channel
+from stereo_sfm.service.outputs.settings import FoxgloveConfig, SecurityConfig
+from stereo_sfm.service.outputs.web_server import WebServer
+from stereo_sfm.service.publisher import ServiceClient
 
 if TYPE_CHECKING:
     from stereo_sfm.service.config import RobotConfig
-
-log = logging.getLogger("stereo_sfm")
+    from stereo_sfm.service.outputs.foxglove_clients import FoxgloveClients
+    from stereo_sfm.service.outputs.guard import Guard
 
 STATUS, REPORT = "/service/status", "/service/health"
-SERVICES = ("status", "save_map", "load_map", "reset", "relocalize", "start_recording", "stop_recording", "mark")
 JPEG_QUALITY = 80
-REQUEST_BYTES = 1 << 14
-REPLY_S = 30.0
 KINDS: dict[str, Any] = {
     topics.LEFT_CALIBRATION: CameraCalibration,
     topics.RIGHT_CALIBRATION: CameraCalibration,
@@ -70,14 +68,13 @@ KINDS: dict[str, Any] = {
     topics.FEATURES: ImageAnnotations,
     topics.LOG: Log,
 }
-BACKLOG = 256  # messages that wait for one client; the oldest is dropped
 
 
 def make(config: RobotConfig) -> FoxgloveOutput:
     """The output."""
-    require(("foxglove",), "serve", "the Foxglove output")
+    require(("starlette", "uvicorn", "websockets"), "serve", "the Foxglove output")
     section = config.outputs.foxglove
-    return FoxgloveOutput(section.address, section.port, section.picture_hz)
+    return FoxgloveOutput(section, access(config.security, section.address), config.security)
 
 
 class FoxgloveOutput:
@@ -85,53 +82,41 @@ class FoxgloveOutput:
 
     wants = EVERYTHING
 
-    def __init__(self, address: str, port: int, preview_hz: float) -> None:
-        """Args: address and port, where to listen. preview_hz: images a second.
-
-        Raises:
-            StereoSfmError: the address is not of this computer alone.
-        """
-        if not is_loopback(address):
-            raise StereoSfmError(
-                f"Foxglove's protocol has no token: listen on 127.0.0.1, not {address}, and put a proxy in front"
-            )
-        self._address, self._port, self.preview_hz = address, port, preview_hz
-        self._server: Any = None
-        self._channels: dict[str, Any] = {}
+    def __init__(
+        self, section: FoxgloveConfig, rules: Access | None = None, security: SecurityConfig | None = None
+    ) -> None:
+        """Args: section, where to listen, and for whom. rules, security: for who connects."""
+        self.preview_hz, self._origins = section.picture_hz, section.origins.split()
+        self._web = WebServer(
+            "Foxglove", section.address, section.port, rules or Access(), security or SecurityConfig()
+        )
+        self._clients: FoxgloveClients | None = None
+        self._channels = {channel.topic: channel for channel in _channels()}
         self._rig: Rig | None = None
         self._stamp_ns = 0  # of the newest pose: for messages without a stamp of the sensor
 
     @property
     def port(self) -> int:
         """The port that it listens on."""
-        return 0 if self._server is None else self._server.port
+        return self._web.port
 
     def open(self, service: ServiceClient) -> None:
-        """Listen."""
-        import foxglove as sdk
-        from foxglove.websocket import Capability
+        """Listen.
 
-        self._context = sdk.Context()
-        self._advertise()
-        try:
-            self._server = sdk.start_server(
-                name="stereo-sfm",
-                host=self._address,
-                port=self._port,
-                capabilities=[Capability.Services, Capability.Parameters],
-                supported_encodings=["json"],
-                services=[_service(name, service) for name in SERVICES],
-                server_listener=_settings(service),
-                context=self._context,
-                message_backlog_size=BACKLOG,
-            )
-        except Exception as error:  # the library has no exception of its own for a port that is taken
-            raise StereoSfmError(f"Foxglove: cannot listen on {self._address}:{self._port}: {error}") from None
+        Raises:
+            StereoSfmError: the port is taken, or the address is not of this computer.
+        """
+        from stereo_sfm.service.outputs.foxglove_clients import FoxgloveClients
+
+        def make(guard: Guard) -> FoxgloveClients:
+            self._clients = FoxgloveClients(list(self._channels.values()), service, guard)
+            return self._clients
+
+        self._web.open(make, self._origins)
 
     def close(self) -> None:
         """Stop listening."""
-        if self._server is not None:
-            self._server.stop()
+        self._web.close()
 
     def put(self, message: ServiceMessage) -> None:
         """Publish a message under its topics."""
@@ -189,15 +174,16 @@ class FoxgloveOutput:
         self._log(topics.PATH, foxglove.point_cloud("map", stamp, positions, cloud.kf_ids, PATH_COLOR))
 
     def _image(self, preview: PreviewImage) -> None:
-        data = cv2.imencode(".jpg", preview.left, (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))[1].tobytes()
-        image = foxglove.stamp(CompressedImage(frame_id="cam0", format="jpeg", data=data), preview.stamp_ns)
-        self._log(topics.LEFT_IMAGE, image)
+        if self._wanted(topics.LEFT_IMAGE):
+            data = cv2.imencode(".jpg", preview.left, (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))[1].tobytes()
+            image = foxglove.stamp(CompressedImage(frame_id="cam0", format="jpeg", data=data), preview.stamp_ns)
+            self._log(topics.LEFT_IMAGE, image)
         colors = age_colors(preview.age, preview.inlier)
         self._log(topics.FEATURES, foxglove.point_annotations(preview.stamp_ns, preview.uv, colors))
 
     def _health(self, report: HealthReport) -> None:
         for health in report.stages.values():
-            self._channels[topics.HEALTH].log(schema.encode(health), log_time=self._stamp_ns)
+            self._publish(topics.HEALTH, schema.encode(health))
         self._json(REPORT, {name: value for name, value in asdict(report).items() if name != "stages"})
 
     def _event(self, event: Event) -> None:
@@ -205,87 +191,30 @@ class FoxgloveOutput:
 
     # -- channels -----------------------------------------------------------------------------------------------------
 
-    def _advertise(self) -> None:
-        """Every topic, before there is a client: one that subscribes at once is refused a topic that is just new."""
-        from foxglove import Channel
-        from mcap_protobuf.schema import build_file_descriptor_set
-
-        for topic, kind in KINDS.items():
-            data = build_file_descriptor_set(kind).SerializeToString()
-            self._channels[topic] = self._channel(topic, kind.DESCRIPTOR.full_name, data)
-        self._channels[topics.HEALTH] = self._channel(
-            topics.HEALTH, schema.full_name(Health), schema.schema_data(Health)
-        )
-        for topic in (STATUS, REPORT):
-            kind = {"type": "object", "title": topic}
-            self._channels[topic] = Channel(topic, schema=kind, context=self._context)
-
     def _log(self, topic: str, message: Any) -> None:
         """A message of Foxglove's schemas."""
-        self._channels[topic].log(message.SerializeToString(), log_time=self._stamp_ns)
+        self._publish(topic, message.SerializeToString())
 
     def _json(self, topic: str, values: dict[str, Any]) -> None:
         plain = json.loads(json.dumps(values), parse_constant=lambda _: None)
-        self._channels[topic].log(plain, log_time=self._stamp_ns)
+        self._publish(topic, json.dumps(plain).encode())
 
-    def _channel(self, topic: str, name: str, data: bytes) -> Any:
-        from foxglove import Channel, Schema
+    def _publish(self, topic: str, data: bytes) -> None:
+        if self._clients is not None:
+            self._clients.publish(self._channels[topic].id, self._stamp_ns, data)
 
-        kind = Schema(name=name, encoding="protobuf", data=data)
-        return Channel(topic, schema=kind, message_encoding="protobuf", context=self._context)
-
-
-def _service(name: str, service: ServiceClient) -> Any:
-    """A command as a service whose request and response are JSON objects."""
-    from foxglove import Schema
-    from foxglove.websocket import MessageSchema, Service, ServiceSchema
-
-    arguments = {
-        key: {"type": "string" if isinstance(value, str) else "number", "default": value}
-        for key, value in COMMANDS[name].arguments.items()
-    }
-
-    def described(what: str, properties: dict[str, Any]) -> MessageSchema:
-        data = json.dumps({"type": "object", "title": f"{name} {what}", "properties": properties}).encode()
-        return MessageSchema(encoding="json", schema=Schema(name=f"{name}_{what}", encoding="jsonschema", data=data))
-
-    reply = {"ok": {"type": "boolean"}, "text": {"type": "string"}, "data": {"type": "object"}}
-    kind = ServiceSchema(name=name, request=described("request", arguments), response=described("response", reply))
-    return Service(name=f"/{name}", schema=kind, handler=lambda request: _reply(name, service, request.payload))
+    def _wanted(self, topic: str) -> bool:
+        return self._clients is not None and self._clients.wanted(self._channels[topic].id)
 
 
-def _reply(name: str, service: ServiceClient, payload: bytes) -> bytes:
-    """The reply to a request, which may be anything."""
-    try:
-        arguments = json.loads(payload) if payload.strip() and len(payload) <= REQUEST_BYTES else {}
-    except ValueError:
-        arguments = None
-    if not isinstance(arguments, dict) or len(payload) > REQUEST_BYTES:
-        return json.dumps({"ok": False, "text": f"{name} takes a small JSON object", "data": {}}).encode()
-    try:
-        reply = service.call(name, REPLY_S, **{str(key): value for key, value in arguments.items()})
-    except StereoSfmError as error:
-        return json.dumps({"ok": False, "text": str(error), "data": {}}).encode()
-    return json.dumps({"ok": reply.ok, "text": reply.text, "data": reply.data}, default=str).encode()
+def _channels() -> Iterator[Channel]:
+    """Every topic, in the order of its number."""
+    from mcap_protobuf.schema import build_file_descriptor_set
 
-
-def _settings(service: ServiceClient) -> Any:
-    """The settings that may change while running, as parameters."""
-    from foxglove.websocket import Parameter, ServerListener
-
-    def known(names: list[str]) -> list[Parameter]:
-        settings: dict[str, Any] = service.call("status").data.get("settings", {})
-        return [Parameter(name, value=value) for name, value in settings.items() if not names or name in names]
-
-    class Listener(ServerListener):
-        def on_get_parameters(self, client: Any, param_names: list[str], request_id: str | None = None) -> list[Any]:
-            return known(param_names)
-
-        def on_set_parameters(self, client: Any, parameters: list[Any], request_id: str | None = None) -> list[Any]:
-            for parameter in parameters:
-                reply = service.call("set_setting", name=parameter.name, value=str(parameter.get_value()))
-                if not reply.ok:
-                    log.warning("%s is not set: %s", parameter.name, reply.text)
-            return known([parameter.name for parameter in parameters])
-
-    return Listener()
+    for id, (topic, kind) in enumerate(KINDS.items(), 1):
+        descriptors = build_file_descriptor_set(kind).SerializeToString()
+        yield Channel.protobuf(id, topic, kind.DESCRIPTOR.full_name, descriptors)
+    id = len(KINDS) + 1
+    yield Channel.protobuf(id, topics.HEALTH, schema.full_name(Health), schema.schema_data(Health))
+    for topic in (STATUS, REPORT):
+        yield Channel.json(id := id + 1, topic)

@@ -1,6 +1,7 @@
 """Poses on a socket: one message a pose to every client that is connected.
 
-A client that does not read misses poses and delays no other. Its next message has the number of poses it missed.
+A client that does not read misses poses and delays no other. Its next message has the number of poses it missed. One
+that reads nothing for ten seconds is dropped.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import logging
 import socket
 import stat
 import threading
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from ssl import SSLWantReadError, SSLWantWriteError
@@ -17,7 +19,8 @@ from typing import TYPE_CHECKING
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.service.messages import PoseUpdate, ServiceMessage, Started
-from stereo_sfm.service.outputs.access import Access, access
+from stereo_sfm.service.outputs.access import Access, TooManyAttempts, access
+from stereo_sfm.service.outputs.door import UNREAD_S, Door, Visit
 from stereo_sfm.service.outputs.pose_message import FORMATS, pose_message
 from stereo_sfm.service.outputs.robot_axes import RobotAxes
 from stereo_sfm.service.publisher import ServiceClient
@@ -28,8 +31,8 @@ if TYPE_CHECKING:
 log = logging.getLogger("stereo_sfm")
 
 MOST_CLIENTS = 32
+BACKLOG = 128  # connections that the system holds until they are accepted
 BUFFER_BYTES = 1 << 16  # of the system for one client: a slow one is not far behind
-HANDSHAKE_S = 5.0  # for the TLS handshake and the token
 HANDSHAKE_BYTES = 4200
 SOCKET_MODE = 0o660
 
@@ -80,7 +83,7 @@ class Place:
 
     def _tcp(self) -> socket.socket:
         family = socket.AF_INET6 if ":" in self.host else socket.AF_INET
-        return socket.create_server((self.host, self.port), family=family, backlog=MOST_CLIENTS)
+        return socket.create_server((self.host, self.port), family=family, backlog=BACKLOG)
 
     def _local(self) -> socket.socket:
         assert self.path is not None
@@ -89,7 +92,7 @@ class Place:
         server = socket.socket(socket.AF_UNIX)
         server.bind(str(self.path))
         self.path.chmod(SOCKET_MODE)
-        server.listen(MOST_CLIENTS)
+        server.listen(BACKLOG)
         return server
 
     def __str__(self) -> str:
@@ -104,21 +107,25 @@ def _is_listening(path: Path) -> bool:
 class _Client:
     """One connection: what the system has not taken yet, and how many poses were left out because of that."""
 
-    def __init__(self, connection: socket.socket) -> None:
-        self.connection = connection
+    def __init__(self, visit: Visit) -> None:
+        self.visit, self.connection = visit, visit.socket
         self.pending = b""
         self.missed = 0
+        self._read_s = time.monotonic()  # when the system last took something
 
     def flush(self) -> bool:
         """Give the system what waits; False where it has no room.
 
         Raises:
-            OSError: the client has disconnected.
+            OSError: the client has disconnected, or has read nothing for too long.
         """
         try:
             while self.pending:
                 self.pending = self.pending[self.connection.send(self.pending) :]
+                self._read_s = time.monotonic()
         except (BlockingIOError, InterruptedError, SSLWantReadError, SSLWantWriteError):
+            if time.monotonic() - self._read_s > UNREAD_S:
+                raise TimeoutError("the client does not read") from None
             return False
         return True
 
@@ -132,9 +139,8 @@ class PoseSocket:
     def __init__(self, place: Place, form: str, rules: Access | None = None) -> None:
         """Args: place, where to listen. form: a key of FORMATS. rules: for those who connect."""
         self._place, self._format, self._rules = place, FORMATS[form](), rules or Access()
-        self._server: socket.socket | None = None
+        self._server: Door | None = None
         self._clients: list[_Client] = []
-        self._pending_clients = 0  # connected, and have not sent the token yet
         self._lock = threading.Lock()
         self._axes: RobotAxes | None = None
 
@@ -145,7 +151,7 @@ class PoseSocket:
 
     def open(self, service: ServiceClient) -> None:
         """Listen."""
-        self._server = self._place.listen()
+        self._server = Door.of(self._place.listen(), MOST_CLIENTS)
         threading.Thread(target=self._accept, args=(self._server,), daemon=True).start()
 
     def put(self, message: ServiceMessage) -> None:
@@ -179,47 +185,49 @@ class PoseSocket:
                 self._drop(client)
 
     def _drop(self, client: _Client) -> None:
-        client.connection.close()
+        self._leave(client.visit)
         with self._lock:
             self._clients.remove(client)
 
-    def _accept(self, server: socket.socket) -> None:
+    def _leave(self, visit: Visit) -> None:
+        visit.socket.close()
+        if self._server is not None:
+            self._server.leave(visit)
+
+    def _accept(self, door: Door) -> None:
         while True:
             try:
-                connection, _ = server.accept()
+                visit = door.visitor()
             except OSError:
                 return
-            with self._lock:
-                full = len(self._clients) + self._pending_clients >= MOST_CLIENTS
-                self._pending_clients += not full
-            if full:
-                connection.close()
-            else:
-                threading.Thread(target=self._authenticate, args=(connection,), daemon=True).start()
+            threading.Thread(target=self._authenticate, args=(door, visit), daemon=True).start()
 
-    def _authenticate(self, connection: socket.socket) -> None:
+    def _authenticate(self, door: Door, visit: Visit) -> None:
         """TLS handshake and token, where they are needed; then the client gets poses."""
-        client = None
-        with contextlib.suppress(OSError, UnicodeError):
-            connection.settimeout(HANDSHAKE_S)
+        known = False
+        with contextlib.suppress(OSError, UnicodeError, TooManyAttempts):
             if self._rules.tls is not None:
-                connection = self._rules.tls.wrap_socket(connection, server_side=True)
-            if not self._rules.token or self._rules.allows(_first_line(connection)):
-                client = _Client(_streaming(connection))
-        if client is None:
-            connection.close()
+                visit.socket = tls = self._rules.tls.wrap_socket(
+                    visit.socket, server_side=True, do_handshake_on_connect=False
+                )
+                tls.do_handshake()
+            known = not self._rules.token or self._rules.allows(_first_line(visit.socket), visit.peer)
+            known = known and door.welcome(visit)
+            if known:
+                _make_streaming(visit.socket)
+        if not known:
+            self._leave(visit)
+            return
         with self._lock:
-            self._pending_clients -= 1
-            self._clients += [client] if client is not None else []
+            self._clients.append(_Client(visit))
 
 
-def _streaming(connection: socket.socket) -> socket.socket:
+def _make_streaming(connection: socket.socket) -> None:
     """A connection that never blocks and does not keep old poses."""
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, BUFFER_BYTES)
     if connection.family != socket.AF_UNIX:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     connection.setblocking(False)
-    return connection
 
 
 def _first_line(connection: socket.socket) -> str:

@@ -6,6 +6,9 @@ from dataclasses import dataclass, field
 
 from stereo_sfm.settings import line, number, path, switch, word
 
+# Foxglove's own application in a browser, under both of its names, and on the desktop
+FOXGLOVE_ORIGINS = "https://app.foxglove.dev https://studio.foxglove.dev file://"
+
 
 @dataclass(frozen=True)
 class PoseSocketConfig:
@@ -24,6 +27,7 @@ class FoxgloveConfig:
     address: str = line("127.0.0.1", "Address to listen on")
     port: int = number(8765, 1, 65535, "Port to listen on")
     picture_hz: float = number(5.0, 0, 60, "Images a second")
+    origins: str = line(FOXGLOVE_ORIGINS, "Web applications that may connect, by the origin that a browser sends")
 
 
 @dataclass(frozen=True)
@@ -51,11 +55,12 @@ class PageConfig:
 
 @dataclass(frozen=True)
 class SecurityConfig:
-    """Who may connect from other computers."""
+    """Who may connect."""
 
-    token_file: str = path("File with the token that others must send; needed to listen beyond this computer")
+    token_file: str = path("File with the token; empty: one is made, for this user's eyes only")
     tls_cert: str = path("Certificate (PEM), for encrypted connections")
     tls_key: str = path("Its key")
+    auth: str = word("token", ("token", "none"), "What clients need; none lets in every user of this computer")
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """The requests that the page's server accepts: fixed files, the live state, commands, and recordings by their id.
 
 Nothing that a client sends becomes a path. Commands must come as JSON with a header of their own, which pages of other
-sites cannot send; on the loopback the server accepts this computer's names only (DNS rebinding).
+sites cannot send. The guard before it checks the rest.
 """
 
 from __future__ import annotations
@@ -15,15 +15,16 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
-from starlette.routing import Route
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.routing import Route, Router
+from starlette.types import ASGIApp
 
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.service.outputs.access import Access
+from stereo_sfm.service.outputs.access import Access, Bucket, Links, TooManyAttempts
+from stereo_sfm.service.outputs.door import HANDSHAKE_S
+from stereo_sfm.service.outputs.guard import Guard, refusal
 from stereo_sfm.service.page.state import PageState
 from stereo_sfm.service.page.verdicts import Verdicts
 from stereo_sfm.service.publisher import Reply, ServiceClient
@@ -45,42 +46,19 @@ BODY_BYTES = 1 << 14
 LIVE_S = 0.2  # between two states
 MOST_VIEWERS = 16
 REPLY_S = 30.0  # more than the service takes for any command
-LOCAL_NAMES = ("127.0.0.1", "localhost", "[::1]")
-SAFE = {
-    "content-security-policy": "default-src 'self'; img-src 'self' data:; frame-ancestors 'none'; base-uri 'none'",
-    "x-content-type-options": "nosniff",
-    "referrer-policy": "no-referrer",
-    "cache-control": "no-store",
-}
 
 Handler = Callable[[Request], Awaitable[Response]]
-
-
-class Bucket:
-    """Lets `rate` a second through, and `burst` at once."""
-
-    def __init__(self, rate: float, burst: int) -> None:
-        self._rate, self._burst = rate, burst
-        self._left, self._at = float(burst), time.monotonic()
-
-    def take(self) -> bool:
-        """Whether one more may pass now."""
-        now = time.monotonic()
-        self._left, self._at = min(self._burst, self._left + (now - self._at) * self._rate), now
-        if self._left < 1:
-            return False
-        self._left -= 1
-        return True
 
 
 class Page:
     """The handlers of the page."""
 
-    def __init__(self, state: PageState, service: ServiceClient, rules: Access) -> None:
-        """Args: state, what is shown. service: carries out commands. rules: who may connect."""
-        self._state, self._service, self._rules = state, service, rules
+    def __init__(self, state: PageState, service: ServiceClient, rules: Access, guard: Guard) -> None:
+        """Args: state, what is shown. service: carries out commands. rules: who may connect. guard: before it."""
+        self._state, self._service, self._rules, self._guard = state, service, rules, guard
+        self._links = Links(rules.token) if rules.token else None
         self._sessions: dict[str, float] = {}  # id -> until when
-        self._logins, self._commands = Bucket(0.5, 5), Bucket(5, 20)
+        self._commands = Bucket(5, 20)
         self._viewers = 0
         self._verdicts = Verdicts(self._folder_of)
 
@@ -100,34 +78,32 @@ class Page:
         routes += [Route("/login", self._login, methods=["POST"])]
         routes += [Route(path, self._guarded(handler)) for path, handler in guarded]
         routes += [Route("/api/command/{name}", self._guarded(self._command), methods=["POST"])]
-        return _Safe(Starlette(routes=routes), not self._rules.token)
+        return Router(routes)
 
     # -- access ------------------------------------------------------------------------------------------------------
 
     def _guarded(self, handler: Handler) -> Handler:
         async def guarded(request: Request) -> Response:
-            return await handler(request) if self._known(request) else _refusal(401, "the token is needed")
+            refused = self._guard.admit(request.scope, self._has_session(request))
+            return await handler(request) if refused is None else refused
 
         return guarded
 
-    def _known(self, request: Request) -> bool:
-        """Whether a request has a session, or the token in its header."""
-        if not self._rules.token:
-            return True
-        scheme, _, token = request.headers.get("authorization", "").partition(" ")
-        if scheme.lower() == "bearer":
-            return self._rules.allows(token)
+    def _has_session(self, request: Request) -> bool:
         return self._sessions.get(request.cookies.get(COOKIE, ""), 0.0) > time.monotonic()
 
     async def _login(self, request: Request) -> Response:
+        """A session for the token, or for the code of a link."""
         try:
             values = await _object(request)
+            sent = str(values.get("token", ""))
+            by_link = self._links is not None and self._links.take(sent)
+            if not by_link and not self._rules.allows(sent, self._guard.peer(request.scope)):
+                return refusal(401, "this is not the token")
+        except TooManyAttempts as error:
+            return refusal(429, str(error))
         except StereoSfmError as error:
-            return _refusal(400, str(error))
-        if not self._logins.take():
-            return _refusal(429, "too many attempts: wait a moment")
-        if not self._rules.allows(str(values.get("token", ""))):
-            return _refusal(401, "this is not the token")
+            return refusal(400, str(error))
         now = time.monotonic()
         alive = {key: until for key, until in self._sessions.items() if until > now}
         self._sessions = dict(list(alive.items())[1 - MOST_SESSIONS :])
@@ -147,7 +123,7 @@ class Page:
 
     async def _live(self, request: Request) -> Response:
         if self._viewers >= MOST_VIEWERS:
-            return _refusal(503, "too many pages are open")
+            return refusal(503, "too many pages are open")
         return StreamingResponse(self._states(request), media_type="text/event-stream")
 
     async def _states(self, request: Request) -> AsyncIterator[str]:
@@ -187,7 +163,7 @@ class Page:
         """Names and sizes of a recording's files; their numbers are their places in this list."""
         reply = await self._call("recording_files", {"id": request.path_params["id"]})
         if not reply.ok:
-            return _refusal(404, reply.text)
+            return refusal(404, reply.text)
         files = [Path(text) for text in reply.data.get("files", [])]
         return JSONResponse([{"name": f.name, "bytes": f.stat().st_size if f.is_file() else 0} for f in files])
 
@@ -197,24 +173,24 @@ class Page:
         files: list[str] = reply.data.get("files", [])
         number = request.path_params["number"]
         if not reply.ok or not 0 <= number < len(files):
-            return _refusal(404, reply.text or "no such file")
+            return refusal(404, reply.text or "no such file")
         path = Path(files[number])
         if not path.is_file():
-            return _refusal(404, "the file no longer exists")
+            return refusal(404, "the file no longer exists")
         return FileResponse(path, filename=f"{path.parent.name}_{path.name}", media_type="application/octet-stream")
 
     async def _command(self, request: Request) -> Response:
         name = request.path_params["name"]
         if name not in COMMANDS:
-            return _refusal(404, "no such command")
+            return refusal(404, "no such command")
         if HEADER not in request.headers:
-            return _refusal(403, "commands need the header X-Stereo-Sfm: 1")
+            return refusal(403, "commands need the header X-Stereo-Sfm: 1")
         try:
             values = await _object(request)
         except StereoSfmError as error:
-            return _refusal(400, str(error))
+            return refusal(400, str(error))
         if not self._commands.take():
-            return _refusal(429, "too many commands: wait a moment")
+            return refusal(429, "too many commands: wait a moment")
         reply = await self._call(name, values)
         return JSONResponse({"ok": reply.ok, "text": reply.text})
 
@@ -228,41 +204,6 @@ class Page:
         return await run_in_threadpool(call)
 
 
-class _Safe:
-    """Refuses requests under other host names, adds the security headers, and ends quietly with the server."""
-
-    def __init__(self, app: ASGIApp, local: bool) -> None:
-        self._app, self._local = app, local
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
-
-        begun: list[bool] = []
-
-        async def with_headers(message: Any) -> None:
-            if message["type"] == "http.response.start":
-                begun.append(True)
-                message["headers"] = [*message["headers"], *((k.encode(), v.encode()) for k, v in SAFE.items())]
-            await send(message)
-
-        if self._local and not _is_local(dict(scope["headers"]).get(b"host", b"").decode("latin-1")):
-            await _refusal(421, "use localhost or 127.0.0.1 as the host name")(scope, receive, with_headers)
-            return
-        try:
-            await self._app(scope, receive, with_headers)
-        except asyncio.CancelledError:  # the server ends; the client may have gone away long before
-            if begun:
-                await send({"type": "http.response.body"})
-            else:
-                await _refusal(503, "the service has ended")(scope, receive, with_headers)
-
-
-def _is_local(host: str) -> bool:
-    return any(host == name or host.startswith(f"{name}:") for name in LOCAL_NAMES)
-
-
 async def _object(request: Request) -> dict[str, Any]:
     """The JSON object of a request.
 
@@ -272,10 +213,11 @@ async def _object(request: Request) -> dict[str, Any]:
     if not request.headers.get("content-type", "").startswith("application/json"):
         raise StereoSfmError("send the header Content-Type: application/json")
     data = b""
-    async for part in request.stream():
-        data += part
-        if len(data) > BODY_BYTES:
-            raise StereoSfmError(f"the body is larger than {BODY_BYTES} bytes")
+    async with asyncio.timeout(HANDSHAKE_S):
+        async for part in request.stream():
+            data += part
+            if len(data) > BODY_BYTES:
+                raise StereoSfmError(f"the body is larger than {BODY_BYTES} bytes")
     try:
         values = json.loads(data)
     except (ValueError, RecursionError):
@@ -283,7 +225,3 @@ async def _object(request: Request) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise StereoSfmError("the body is not a JSON object, such as {}")
     return values  # pyright: ignore[reportUnknownVariableType]
-
-
-def _refusal(code: int, text: str) -> Response:
-    return JSONResponse({"ok": False, "text": text}, code)

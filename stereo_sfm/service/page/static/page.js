@@ -188,12 +188,16 @@ function login() {
   if (live) { live.close(); live = null; }
 }
 
+async function logInWith(token) {
+  const headers = { "Content-Type": "application/json" };
+  const response = await fetch("login", { method: "POST", headers, body: JSON.stringify({ token }) });
+  show("login-reply", response.ok ? "" : (await response.json()).text);
+  return response.ok;
+}
+
 $("login").onsubmit = async (event) => {
   event.preventDefault();
-  const headers = { "Content-Type": "application/json" };
-  const response = await fetch("login", { method: "POST", headers, body: JSON.stringify({ token: $("token").value }) });
-  show("login-reply", response.ok ? "" : (await response.json()).text);
-  if (!response.ok) return;
+  if (!await logInWith($("token").value)) return;
   $("token").value = ""; $("login").hidden = true; $("all").hidden = false;
   start();
 };
@@ -226,4 +230,10 @@ for (const made of document.querySelectorAll("[data-command]")) {
 setInterval(nextImage, 300);
 setInterval(refresh, 10000);
 setInterval(() => { if (last) showState(last); if (!live && $("login").hidden) start().catch(() => {}); }, 2000);
-start().catch(() => {});
+async function begin() {  // a link may hold the code for one log-in
+  const code = location.hash.slice(1);
+  if (code) history.replaceState(null, "", location.pathname);
+  if (code.startsWith("once-")) await logInWith(code);
+  await start();
+}
+begin().catch(() => {});
