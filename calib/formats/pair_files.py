@@ -2,38 +2,21 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
-# Words of the left and the right camera. A number pairs with the next one, whatever stands before it (cam0, infra1).
-_WORDS = (("left", "right"), ("l", "r"))
-_WORD = re.compile(r"[A-Za-z]+|\d+")
+from stereo_sfm.calib.side_names import side_pairs
 
 
 def partner(left: Path) -> Path | None:
     """The right camera's file of a left camera's, None where there is none."""
-    return next((file for name in right_names(left.name) if (file := left.with_name(name)).is_file()), None)
-
-
-def right_names(name: str) -> list[str]:
-    """What the right camera's file may be called: one word or number of the left one's name exchanged.
-
-    Whole words of letters, so that the l of "calib" is none, then the last number: 0 and 1, 1 and 2, a pair's both ways
-    of counting.
-    """
-    found: list[str] = []
-    matches = list(_WORD.finditer(Path(name).stem))
-    for match in matches:
-        for one, other in _WORDS:
-            if match[0].lower() == one:
-                new = other.upper() if match[0].isupper() else other.capitalize() if match[0][0].isupper() else other
-                found.append(name[: match.start()] + new + name[match.end() :])
-    for match in reversed(matches):
-        if match[0].isdigit() and int(match[0]) <= 1:
-            found.append(name[: match.start()] + f"{int(match[0]) + 1:0{len(match[0])}d}" + name[match.end() :])
-    return found
+    return next((right for first, right in _pairs(left.parent, left.suffix) if first.name == left.name), None)
 
 
 def left_files(folder: Path, *suffixes: str) -> list[Path]:
-    """Files of a folder that have a partner, in the order of their names."""
-    return [p for p in sorted(folder.iterdir()) if p.suffix in suffixes and p.is_file() and partner(p) is not None]
+    """Files of a folder that have a partner, the most certain first."""
+    return [left for suffix in suffixes for left, _ in _pairs(folder, suffix)]
+
+
+def _pairs(folder: Path, suffix: str) -> list[tuple[Path, Path]]:
+    files = {p.stem: p for p in sorted(folder.iterdir()) if p.suffix == suffix and p.is_file()}
+    return [(files[a], files[b]) for a, b in side_pairs(list(files))]

@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
-from stereo_sfm.calib.formats.camera_info import CameraInfo, info_from_rows, info_rows, infos_from_rig, rig_from_infos
+from stereo_sfm.calib.formats.camera_info import (
+    CameraInfo,
+    extrinsics,
+    info_from_rows,
+    info_rows,
+    infos_from_rig,
+    rig_from_infos,
+)
 from stereo_sfm.calib.formats.common import read_yaml, reading, write_yaml
 from stereo_sfm.calib.formats.pair_files import left_files, partner
 from stereo_sfm.calib.rig import Rig
+
+log = logging.getLogger("stereo_sfm")
 
 
 def read_ros(path: Path | str, lens: str = "", unit: float = 1.0) -> Rig:
@@ -20,8 +30,12 @@ def read_ros(path: Path | str, lens: str = "", unit: float = 1.0) -> Rig:
     with reading(left, "ROS camera_info"):
         if left.is_dir():
             left = next(iter(left_files(left, ".yaml", ".yml") or sorted(left.glob("*.yaml"))), left / "left.yaml")
-        right = partner(left)
-        return rig_from_infos(_info(left), _info(right) if right else None, left.parent.name, lens, unit)
+        info, other = _info(left), partner(left)
+        right = _info(other) if other else None
+        if right is not None and "right" not in str(other) and extrinsics(info, right) is None:
+            log.warning("%s and %s are no pair (P of the second has no Tx): only the first is read", left, other)
+            right = None
+        return rig_from_infos(info, right, left.parent.name, lens, unit)
 
 
 def write_ros(rig: Rig, folder: Path) -> None:
