@@ -130,6 +130,7 @@ def _check_camera(side: str, camera: Camera) -> None:
     numbers = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
     wrong = [f"{name} {value:g}" for name, value in numbers.items() if not np.isfinite(value)]
     wrong += [f"distortion {value:g}" for value in camera.distortion if not abs(value) <= MAX_DISTORTION]
+    wrong += [camera.impossible()] if not wrong and camera.impossible() else []
     wrong += [f"{name} {numbers[name]:g}" for name in ("fx", "fy") if numbers[name] <= 0]
     wrong += [f"cx {camera.cx:g}"] if abs(camera.cx) > 2 * camera.width else []
     wrong += [f"cy {camera.cy:g}"] if abs(camera.cy) > 2 * camera.height else []

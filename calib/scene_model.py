@@ -70,7 +70,8 @@ def decentered(rig: Rig, along_x: float, along_y: float) -> Rig:
     cx, cy = right.cx + right.fx * about_y, right.cy - right.fy * about_x
     transform = rig.left_T_right.copy()
     transform[:3, :3] = transform[:3, :3] @ se3.so3_exp(np.array([about_x, about_y, 0.0]))
-    return replace(rig, right=RadTan(right.width, right.height, fx, fy, cx, cy, distortion), left_T_right=transform)
+    lens = type(right) if isinstance(right, RadTan) else RadTan
+    return replace(rig, right=lens(right.width, right.height, fx, fy, cx, cy, distortion), left_T_right=transform)
 
 
 def _focal(camera: Camera, factor: float) -> Camera:

@@ -222,9 +222,7 @@ def _robust(state: _State, observed: Observed, n_cameras: int) -> Calibration:
 
 
 def _names(state: _State, n_cameras: int) -> tuple[str, ...]:
-    coefficient = {"kannala_brandt": ("k1", "k2", "k3", "k4")}.get(
-        state.cameras[0].model, ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-    )
+    coefficient = state.cameras[0].coefficients
     names: list[str] = []
     for side in ("left", "right")[:n_cameras]:
         own = ("fx", "fy", "cx", "cy", *coefficient[: len(state.cameras[0].distortion)])

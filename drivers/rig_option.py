@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from stereo_sfm.calib.lens_doubts import doubts
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
+
+log = logging.getLogger("stereo_sfm")
 
 RigOption = str | Path | Rig | None
 
@@ -18,8 +22,15 @@ def chosen_rig(option: RigOption, own: Callable[[], Rig]) -> Rig:
     """The rig given by the user, as a `Rig` or a file of any supported format, else the dataset's own.
 
     A given rig without a body pose takes the dataset's, so that ground truth of the body stays usable; likewise the
-    readout, if the file format cannot store it.
+    readout, if the file format cannot store it. A warning says what is unusual about the rig's sizes.
     """
+    rig = _chosen(option, own)
+    for doubt in doubts(rig):
+        log.warning("%s: %s", rig.name or "calibration", doubt)
+    return rig
+
+
+def _chosen(option: RigOption, own: Callable[[], Rig]) -> Rig:
     if option is None or option == "":
         return own()
     given, stated = (option, True) if isinstance(option, Rig) else _load(Path(option))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from stereo_sfm.calib.formats.common import read_text
+from stereo_sfm.calib.formats.pair_files import left_files
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError, one_of
 
@@ -29,6 +31,15 @@ FORMATS: dict[str, tuple[str, str, str, bool]] = {
     "depthai": ("depthai", "read_depthai", "write_depthai", False),
 }
 
+# Settings of other systems: name -> (module, reader). Nothing writes them.
+SETTINGS: dict[str, tuple[str, str]] = {
+    "orbslam": ("orbslam", "read_orbslam"),
+    "stella": ("stella", "read_stella"),
+    "vins": ("vins", "read_vins"),
+    "openvins": ("openvins", "read_openvins"),
+}
+
+OPTIONS = "size", "pair", "lens", "unit"  # of readers
 WITH_IMU = "rig", "kalibr", "euroc", "basalt", "depthai"  # formats that store one
 
 
@@ -37,16 +48,25 @@ def load_rig(path: Path | str, format: str | None = None, **options: Any) -> Rig
 
     Args:
         path: a file, or a folder for formats with one file per camera.
-        format: a name of `FORMATS`; None detects it from the content.
-        **options: options of the format's reader, such as `size=(width, height)` for OpenCV and KITTI.
+        format: a name of `FORMATS` or `SETTINGS`; None detects it from the content.
+        **options: options of the format's reader: `size=(width, height)` where files state none, `pair=(0, 2)` where
+            they have more than two cameras, `unit=0.01` and `lens="fisheye"` where they name neither.
 
     Raises:
-        StereoSfmError: missing, malformed or unrecognised.
+        StereoSfmError: missing, malformed or unrecognised, or the format has no such option.
     """
     path = Path(path).expanduser()
     if not path.exists():
         raise StereoSfmError(f"no calibration at {path}")
-    return _function(format or recognise(path), 1)(path, **options)
+    name = format or recognise(path)
+    read = _function(name, 1)
+    known = [key for key in inspect.signature(read).parameters if key in OPTIONS]
+    for key in options:
+        if key not in known:
+            raise StereoSfmError(
+                f"a calibration of the format {name} is read with {', '.join(known) or 'no options'}, not with {key}"
+            )
+    return read(path, **options)
 
 
 def save_rig(rig: Rig, path: Path | str, format: str | None = None) -> None:
@@ -83,7 +103,7 @@ def _instead(path: Path) -> str:
     """What to do with a file whose format is not recognised."""
     if path.name == "sensor.yaml":  # EuRoC
         return f"it is of one camera of two, give the folder with cam0/sensor.yaml ({path.absolute().parents[1]})"
-    return f"'stereo-sfm convert-calib --from FORMAT' reads it as one of {', '.join(FORMATS)}"
+    return f"'stereo-sfm convert-calib --from FORMAT' reads it as one of {', '.join([*FORMATS, *SETTINGS])}"
 
 
 def _recognise_folder(path: Path) -> str | None:
@@ -92,9 +112,13 @@ def _recognise_folder(path: Path) -> str | None:
         "kitti": ("calib.txt", "calib_cam_to_cam.txt"),
         "colmap": ("cameras.txt",),
         "kapture": ("sensors.txt", "sensors/sensors.txt"),
-        "ros": ("left.yaml", "cam0.yaml", "camera0.yaml", "fisheye1.yaml"),
     }
-    return next((name for name, files in marks.items() if any((path / f).is_file() for f in files)), None)
+    found = next((name for name, files in marks.items() if any((path / f).is_file() for f in files)), None)
+    if found is None:  # a file for each camera
+        files = left_files(path, ".yaml", ".yml") or sorted(path.glob("*.yaml"))
+        found = _recognise_file(files[0]) if files else None
+        return found if found == "ros" else None
+    return found
 
 
 def _recognise_file(path: Path) -> str | None:
@@ -111,8 +135,12 @@ def _recognise_file(path: Path) -> str | None:
         marks = {"kitti": "P_rect_"} | marks if "P_rect_" in text else marks
     else:
         marks = {
-            "opencv": "opencv-matrix" if "opencv-matrix" in text else "<opencv_storage>",
             "rig": "stereo_sfm_rig:",
+            "openvins": "relative_config_imucam:",
+            "vins": "cam0_calib:" if "cam0_calib:" in text else "model_type:",
+            "stella": "Camera.model:" if "Camera.model:" in text else "\nCamera:",
+            "orbslam": "Camera1.fx:" if "Camera1.fx:" in text else "Camera.fx:",
+            "opencv": "opencv-matrix" if "opencv-matrix" in text else "<opencv_storage>",
             "ros": "camera_matrix:",
             "kalibr": "cam0:",
             "kitti": "P0:",
@@ -121,5 +149,6 @@ def _recognise_file(path: Path) -> str | None:
 
 
 def _function(name: str, which: int) -> Callable[..., Any]:
-    one_of(name, FORMATS, "calibration format")
-    return getattr(importlib.import_module(f"stereo_sfm.calib.formats.{FORMATS[name][0]}"), str(FORMATS[name][which]))
+    known: dict[str, tuple[Any, ...]] = {**FORMATS, **SETTINGS} if which == 1 else {**FORMATS}
+    one_of(name, known, "calibration format")
+    return getattr(importlib.import_module(f"stereo_sfm.calib.formats.{known[name][0]}"), str(known[name][which]))

@@ -18,7 +18,7 @@ from stereo_sfm.calib.formats.imu_files import imu_T_left
 from stereo_sfm.calib.imu import Imu
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
-from stereo_sfm.geometry.cameras import Camera, KannalaBrandt
+from stereo_sfm.geometry.cameras import Camera, DoubleSphere, Eucm, KannalaBrandt
 from stereo_sfm.types import F64
 
 _LOWER = (np.array([0, 1, 2, 1, 2, 2]), np.array([0, 0, 0, 1, 1, 2]))  # of a matrix, by columns
@@ -28,20 +28,26 @@ _NOISE = {  # ours -> Basalt's, densities, the same for three axes
     "accel_walk": "accel_bias_std",
     "gyro_walk": "gyro_bias_std",
 }
+_SPHERES: dict[str, tuple[type[Camera], tuple[str, ...]]] = {  # the ucm has no beta, which is 1
+    "ds": (DoubleSphere, DoubleSphere.coefficients),
+    "eucm": (Eucm, Eucm.coefficients),
+    "ucm": (Eucm, Eucm.coefficients),
+}
 _RADTAN8 = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 
-def read_basalt(path: Path | str) -> Rig:
-    """The first one or two cameras."""
+def read_basalt(path: Path | str, pair: tuple[int, int] = (0, 1)) -> Rig:
+    """The two cameras of `pair`, or the only one."""
     path = Path(path)
     with reading(path, "Basalt"):
         data = read_json(path)["value0"]
         poses = [_pose(p) for p in data["T_imu_cam"]]
         cameras = [_camera(c, r) for c, r in zip(data["intrinsics"], data["resolution"], strict=True)]
-        imu = _imu(data, se3.inverse(poses[0])) if "imu_update_rate" in data else None
+        a, b = pair if len(cameras) > 1 else (0, 0)
+        imu = _imu(data, se3.inverse(poses[a])) if "imu_update_rate" in data else None
         if len(cameras) < 2:
-            return Rig(cameras[0], body_T_left=poses[0], imu=imu, name=path.stem)
-        return Rig(cameras[0], cameras[1], se3.inverse(poses[0]) @ poses[1], poses[0], imu=imu, name=path.stem)
+            return Rig(cameras[a], body_T_left=poses[a], imu=imu, name=path.stem)
+        return Rig(cameras[a], cameras[b], se3.inverse(poses[a]) @ poses[b], poses[a], imu=imu, name=path.stem)
 
 
 def write_basalt(rig: Rig, path: Path) -> None:
@@ -108,7 +114,12 @@ def _camera(data: dict[str, Any], resolution: Any) -> Camera:
     if kind in ("pinhole", "pinhole-radtan8"):
         coefficients = [] if kind == "pinhole" else numbers([p[k] for k in _RADTAN8])
         return brown((width, height), (fx, fy), (cx, cy), coefficients)
-    raise ValueError(f"camera type '{kind}' is not supported (supported: kb4, pinhole, pinhole-radtan8)")
+    if kind in _SPHERES:
+        model, names = _SPHERES[kind]
+        return model(width, height, fx, fy, cx, cy, tuple(numbers([p.get(k, 1.0) for k in names])))
+    raise ValueError(
+        f"camera type '{kind}' is not supported (supported: kb4, pinhole, pinhole-radtan8, {', '.join(_SPHERES)})"
+    )
 
 
 def _plain(camera: Camera) -> dict[str, Any]:
@@ -122,5 +133,9 @@ def _plain(camera: Camera) -> dict[str, Any]:
     elif camera.model == "pinhole":
         kind = "pinhole"
     else:
-        raise unsupported(camera, "Basalt")
+        found = [(name, names) for name, (model, names) in _SPHERES.items() if isinstance(camera, model)]
+        if not found:
+            raise unsupported(camera, "Basalt")
+        kind, names = found[0]
+        p |= dict(zip(names, padded(camera, len(names)), strict=True))
     return {"camera_type": kind, "intrinsics": p}

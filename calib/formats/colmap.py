@@ -14,7 +14,7 @@ from stereo_sfm.calib.formats.common import brown, numbers, padded, read_text, r
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
-from stereo_sfm.geometry.cameras import Camera, KannalaBrandt
+from stereo_sfm.geometry.cameras import Camera, Fov, KannalaBrandt
 from stereo_sfm.types import F64
 
 # model -> (number of focal lengths, names of the coefficients in OpenCV's order, None where COLMAP has none)
@@ -33,9 +33,12 @@ def colmap_camera(model: str, width: int, height: int, params: list[float], shif
     if model == "OPENCV_FISHEYE":
         fx, fy, cx, cy, *k = numbers(params, 8)
         return KannalaBrandt(width, height, fx, fy, cx - shift, cy - shift, tuple(k))
+    if model == "FOV":
+        fx, fy, cx, cy, w = numbers(params, 5)
+        return Fov(width, height, fx, fy, cx - shift, cy - shift, (w,))
     if model not in _BROWN_MODELS:
         raise ValueError(
-            f"camera model '{model}' is not supported (supported: {', '.join(_BROWN_MODELS)}, OPENCV_FISHEYE)"
+            f"camera model '{model}' is not supported (supported: {', '.join(_BROWN_MODELS)}, OPENCV_FISHEYE, FOV)"
         )
     focals, slots = _BROWN_MODELS[model]
     values = numbers(params, focals + 2 + len(slots))
@@ -54,6 +57,8 @@ def colmap_params(camera: Camera, shift: float = 0.5) -> tuple[str, list[float]]
     if camera.model == "radtan":
         small = len(camera.distortion) <= 4
         return ("OPENCV", base + padded(camera, 4)) if small else ("FULL_OPENCV", base + padded(camera, 8))
+    if camera.model == "fov":
+        return "FOV", base + padded(camera, 1)
     raise unsupported(camera, "COLMAP")
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
-from stereo_sfm.geometry.cameras import Camera, Pinhole, RadTan
+from stereo_sfm.geometry.cameras import Camera, Pinhole, RadTan, Tilted
 from stereo_sfm.types import F64
 
 MAX_FILE_BYTES = 4 << 20
@@ -136,14 +136,13 @@ def brown(
 ) -> Camera:
     """Pinhole with OpenCV's coefficients k1 k2 p1 p2 [k3 [k4 k5 k6 [s1..s4 [tx ty]]]]; all zero is an ideal pinhole."""
     d = list(coefficients)
-    if any(d[8:]):
-        raise ValueError(
-            "thin-prism and tilt coefficients are not supported: calibrate with at most eight coefficients"
-        )
     while d and d[-1] == 0:
         d.pop()
+    if len(d) > 14:
+        raise ValueError(f"{len(d)} distortion coefficients: OpenCV has at most 14")
     args = int(size[0]), int(size[1]), float(focal[0]), float(focal[1]), float(centre[0]), float(centre[1])
-    return RadTan(*args, tuple(d[:8])) if d else Pinhole(*args)
+    lens = Tilted if len(d) > 8 else RadTan
+    return lens(*args, tuple(d)) if d else Pinhole(*args)
 
 
 def padded(camera: Camera, count: int) -> list[float]:

@@ -22,7 +22,7 @@ from stereo_sfm.calib.formats.imu_files import warn_of_lost
 from stereo_sfm.calib.imu import Imu
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
-from stereo_sfm.geometry.cameras import Camera, KannalaBrandt
+from stereo_sfm.geometry.cameras import Camera, KannalaBrandt, Pinhole, RadTan
 from stereo_sfm.types import F64
 
 _PERSPECTIVE, _FISHEYE = 0, 1
@@ -32,20 +32,20 @@ _SENSORS = {"accelerometer": "accel", "gyroscope": "gyro"}  # -> ours
 _NO_RECTIFICATION: dict[str, Any] = {"rectifiedRotationLeft": [], "rectifiedRotationRight": []}
 
 
-def read_depthai(path: Path | str, left_socket: int | None = None, right_socket: int | None = None) -> Rig:
-    """The stereo pair named in the file, else sockets 1 and 2 (CAM_B left, CAM_C right)."""
+def read_depthai(path: Path | str, pair: tuple[int, int] | None = None) -> Rig:
+    """The sockets of `pair`, else the stereo pair named in the file, else sockets 1 and 2 (CAM_B left, CAM_C right)."""
     path = Path(path)
     with reading(path, "depthai"):
         data = read_json(path)
         cameras = {int(socket): camera for socket, camera in data["cameraData"]}
         stereo = data.get("stereoRectificationData", {})
-        left = _socket(left_socket, stereo.get("leftCameraSocket", -1), 1)
-        right = _socket(right_socket, stereo.get("rightCameraSocket", -1), 2)
+        stated = (stereo.get("leftCameraSocket", -1), stereo.get("rightCameraSocket", -1))
+        left, right = pair or (socket if socket >= 0 else usual for socket, usual in zip(stated, (1, 2), strict=True))
         name, serial = str(data.get("boardName", "")), str(data.get("batchName", ""))
         right_T_left = _chain(cameras, left, right)
-        pair = _camera(cameras[left]), _camera(cameras[right])
+        lenses = _camera(cameras[left]), _camera(cameras[right])
         imu = _imu(data, cameras, left)
-        return Rig(*pair, se3.inverse(right_T_left), name=name, serial=serial, imu=imu)
+        return Rig(lenses[0], lenses[1], se3.inverse(right_T_left), name=name, serial=serial, imu=imu)
 
 
 def write_depthai(rig: Rig, path: Path) -> None:
@@ -62,10 +62,6 @@ def write_depthai(rig: Rig, path: Path) -> None:
         "stereoRectificationData": {"leftCameraSocket": 1, "rightCameraSocket": 2} | _NO_RECTIFICATION,
     } | ({} if rig.imu is None else {"imuExtrinsics": _extrinsics(rig.imu.left_T_imu, 1), _IMU: _plain_imu(rig.imu)})
     path.write_text(json.dumps(data, indent=2) + "\n", encoding="utf-8")
-
-
-def _socket(asked: int | None, stated: int, usual: int) -> int:
-    return asked if asked is not None else stated if stated >= 0 else usual
 
 
 def _chain(cameras: dict[int, Any], start: int, end: int) -> F64:
@@ -148,7 +144,7 @@ def _camera(data: dict[str, Any]) -> Camera:
 
 
 def _plain(camera: Camera, next_T_this: F64, next_socket: int) -> dict[str, Any]:
-    if camera.model == "epipolar":
+    if not isinstance(camera, Pinhole | RadTan | KannalaBrandt):
         raise unsupported(camera, "depthai")
     return {
         "cameraType": _FISHEYE if camera.model == "kannala_brandt" else _PERSPECTIVE,

@@ -10,7 +10,7 @@ from stereo_sfm.calib.formats.imu_files import read_imu, write_euroc_imu
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
-from stereo_sfm.geometry.cameras import Camera, KannalaBrandt
+from stereo_sfm.geometry.cameras import Camera, KannalaBrandt, Pinhole, RadTan
 from stereo_sfm.types import F64
 
 
@@ -59,7 +59,7 @@ def _sensor(path: Path) -> tuple[Camera, F64]:
 
 
 def _plain(camera: Camera, body_T_cam: F64, index: int) -> dict[str, Any]:
-    if camera.model == "epipolar":
+    if not isinstance(camera, Pinhole | RadTan | KannalaBrandt):
         raise unsupported(camera, "EuRoC")
     if len(camera.distortion) > 4:
         raise StereoSfmError(

@@ -18,14 +18,14 @@ from stereo_sfm.calib.formats.common import read_json, reading
 from stereo_sfm.calib.rig import Rig
 
 
-def read_foxglove(path: Path | str) -> Rig:
-    """One rig from one file."""
+def read_foxglove(path: Path | str, lens: str = "", unit: float = 1.0) -> Rig:
+    """One rig from one file; `lens` and `unit` as for `read_ros`."""
     path = Path(path)
     with reading(path, "Foxglove"):
         data = read_json(path)
         messages = data if isinstance(data, list) else [data]
         left, right = check_pair([_info(m) for m in messages], str(path))
-        return rig_from_infos(left, right, path.stem)
+        return rig_from_infos(left, right, path.stem, lens, unit)
 
 
 def write_foxglove(rig: Rig, path: Path) -> None:

@@ -9,9 +9,10 @@ import numpy as np
 
 from stereo_sfm.calib.formats.common import brown, exact_rotation, numbers, padded, reading, unsupported
 from stereo_sfm.calib.formats.file_storage import matrix, read_storage
+from stereo_sfm.calib.lens_doubts import believable
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
-from stereo_sfm.geometry.cameras import Camera, KannalaBrandt
+from stereo_sfm.geometry.cameras import Camera, KannalaBrandt, Pinhole, RadTan
 from stereo_sfm.types import F64
 
 _NAMES = {  # our name -> common spellings
@@ -24,10 +25,14 @@ _NAMES = {  # our name -> common spellings
 }
 
 
-def read_opencv(path: Path | str, size: tuple[int, int] | None = None) -> Rig:
+def read_opencv(path: Path | str, size: tuple[int, int] | None = None, lens: str = "", unit: float = 1.0) -> Rig:
     """One file, or `intrinsics.yml` with `extrinsics.yml` next to it as written by OpenCV's stereo sample.
 
     Four coefficients with `distortion_model: fisheye` (or equidistant) are Kannala-Brandt, all others Brown's.
+
+    Args:
+        path: the file. size: (width, height) px where it states none.
+        lens: the lens model's name instead of the file's. unit: of T, in metres (the squares' size of a target).
     """
     path = Path(path)
     with reading(path, "OpenCV"):
@@ -36,16 +41,24 @@ def read_opencv(path: Path | str, size: tuple[int, int] | None = None) -> Rig:
         if "R" not in data and extrinsics != path and extrinsics.is_file():
             data |= {k: v for k, v in _matrices(extrinsics).items() if k in ("R", "T")}
         if size is None and "size" not in data:
-            raise ValueError("no image size stated (image_width, image_height): give the size")
+            raise ValueError(
+                "no image size stated (image_width, image_height): give it, as convert-calib's --size WxH does"
+            )
         width, height = size or numbers(data["size"], 2)
-        fisheye = data.get("model") in ("fisheye", "equidistant", "kannala_brandt")
-        left = _camera(data["M1"], data.get("D1", []), (int(width), int(height)), fisheye)
-        if "M2" not in data:
-            return Rig(left, name=path.stem)
-        right = _camera(data["M2"], data.get("D2", []), (int(width), int(height)), fisheye)
+        named = lens or data.get("model") or ""
+        fisheye = named in ("fisheye", "equidistant", "kannala_brandt")
+        sides = [side for side in "12" if f"M{side}" in data] or ["1"]
+        cameras = [
+            _camera(data[f"M{side}"], data.get(f"D{side}", []), (int(width), int(height)), fisheye) for side in sides
+        ]
+        if not named:
+            cameras = believable(cameras, str(path))
+        if len(cameras) == 1:
+            return Rig(cameras[0], name=path.stem)
+        left, right = cameras
         right_T_left = np.eye(4)
         right_T_left[:3, :3] = np.array(numbers(data["R"], 9)).reshape(3, 3)
-        right_T_left[:3, 3] = numbers(data.get("T", []), 3)
+        right_T_left[:3, 3] = unit * np.array(numbers(data.get("T", []), 3))
         return Rig(left, right, se3.inverse(exact_rotation(right_T_left)), name=path.stem)
 
 
@@ -64,7 +77,7 @@ def write_opencv(rig: Rig, path: Path) -> None:
         storage.write("image_height", rig.left.height)
         storage.write("distortion_model", _model(rig.left))
         for i, camera in enumerate(cameras, 1):
-            count = 4 if camera.model == "kannala_brandt" or len(camera.distortion) <= 4 else 8
+            count = next(n for n in (4, 8, 14) if n >= len(camera.distortion))
             storage.write(f"M{i}", camera.matrix)
             storage.write(f"D{i}", np.array([padded(camera, count)]))
         if rig.right is not None:
@@ -76,9 +89,11 @@ def write_opencv(rig: Rig, path: Path) -> None:
 
 
 def _model(camera: Camera) -> str:
-    if camera.model == "epipolar":
+    if camera.model == "kannala_brandt":
+        return "fisheye"
+    if not isinstance(camera, Pinhole | RadTan):
         raise unsupported(camera, "OpenCV")
-    return "fisheye" if camera.model == "kannala_brandt" else "plumb_bob"
+    return "plumb_bob"
 
 
 def _matrices(path: Path) -> dict[str, Any]:

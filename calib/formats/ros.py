@@ -2,25 +2,40 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
-from stereo_sfm.calib.formats.camera_info import CameraInfo, info_from_rows, info_rows, infos_from_rig, rig_from_infos
+from stereo_sfm.calib.formats.camera_info import (
+    CameraInfo,
+    extrinsics,
+    info_from_rows,
+    info_rows,
+    infos_from_rig,
+    rig_from_infos,
+)
 from stereo_sfm.calib.formats.common import read_yaml, reading, write_yaml
+from stereo_sfm.calib.formats.pair_files import left_files, partner
 from stereo_sfm.calib.rig import Rig
 
-_PARTNERS = (("left", "right"), ("cam0", "cam1"), ("camera0", "camera1"), ("fisheye1", "fisheye2"))
+log = logging.getLogger("stereo_sfm")
 
 
-def read_ros(path: Path | str) -> Rig:
-    """A folder with left.yaml and right.yaml, or the left file; without a right file the rig has one camera."""
+def read_ros(path: Path | str, lens: str = "", unit: float = 1.0) -> Rig:
+    """A folder with left.yaml and right.yaml, or the left file; without a right file the rig has one camera.
+
+    Args:
+        path: the folder or file. lens: the lens model's name instead of the files'. unit: of P's lengths, in metres.
+    """
     left = Path(path)
     with reading(left, "ROS camera_info"):
         if left.is_dir():
-            left = next(
-                (left / f"{a}.yaml" for a, _ in _PARTNERS if (left / f"{a}.yaml").is_file()), left / "left.yaml"
-            )
-        right = _partner(left)
-        return rig_from_infos(_info(left), _info(right) if right else None, left.parent.name)
+            left = next(iter(left_files(left, ".yaml", ".yml") or sorted(left.glob("*.yaml"))), left / "left.yaml")
+        info, other = _info(left), partner(left)
+        right = _info(other) if other else None
+        if right is not None and "right" not in str(other) and extrinsics(info, right) is None:
+            log.warning("%s and %s are no pair (P of the second has no Tx): only the first is read", left, other)
+            right = None
+        return rig_from_infos(info, right, left.parent.name, lens, unit)
 
 
 def write_ros(rig: Rig, folder: Path) -> None:
@@ -43,23 +58,15 @@ def write_ros(rig: Rig, folder: Path) -> None:
         )
 
 
-def _partner(left: Path) -> Path | None:
-    for a, b in _PARTNERS:
-        other = left.with_name(left.name.replace(a, b))
-        if a in left.name and other.is_file():
-            return other
-    return None
-
-
 def _info(path: Path) -> CameraInfo:
     with reading(path, "ROS camera_info"):
         data = read_yaml(path)
         return info_from_rows(
             data["image_width"],
             data["image_height"],
-            data["distortion_model"],
+            data.get("distortion_model"),
             data["camera_matrix"]["data"],
-            data["distortion_coefficients"]["data"],
+            data.get("distortion_coefficients", {}).get("data"),
             data.get("rectification_matrix", {}).get("data"),
             data.get("projection_matrix", {}).get("data"),
         )

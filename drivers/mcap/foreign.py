@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from stereo_sfm.calib.formats.camera_info import CameraInfo
 from stereo_sfm.calib.imu import Imu
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.wheel import Wheel
@@ -25,7 +26,6 @@ from stereo_sfm.drivers.mcap.messages import (
     POSES,
     TRANSFORMS,
     VELOCITIES,
-    CameraInfo,
     ImageMessage,
     ImuReading,
     Transform,

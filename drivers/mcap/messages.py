@@ -20,6 +20,7 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
 
+from stereo_sfm.calib.formats.camera_info import CameraInfo, info_from_rows
 from stereo_sfm.geometry import se3
 from stereo_sfm.log import foxglove, images
 from stereo_sfm.log.reader import Record
@@ -55,20 +56,6 @@ class ImageMessage:
         if self.compressed:
             return images.decode_depth_file(self.data)
         return images.decode_depth(self.data, self.width, self.height, self.step, self.encoding)
-
-
-@dataclass(frozen=True)
-class CameraInfo:
-    """The calibration of one camera as in ROS and Foxglove."""
-
-    frame: str
-    width: int
-    height: int
-    model: str
-    d: list[float]
-    k: F64  # (3, 3)
-    r: F64  # (3, 3) rotates camera points into the rectified frame
-    p: F64  # (3, 4) projection of rectified points; p[0, 3] = -fx * baseline in the right camera
 
 
 @dataclass(frozen=True)
@@ -173,7 +160,7 @@ def _image_ros_compressed(data: bytes) -> ImageMessage:
 
 def _camera_foxglove(data: bytes) -> CameraInfo:
     m = CameraCalibration.FromString(data)
-    return _camera(m.frame_id, m.width, m.height, m.distortion_model, list(m.D), list(m.K), list(m.R), list(m.P))
+    return info_from_rows(m.width, m.height, m.distortion_model, list(m.K), list(m.D), list(m.R), list(m.P), m.frame_id)
 
 
 def _camera_ros(data: bytes) -> CameraInfo:
@@ -181,14 +168,7 @@ def _camera_ros(data: bytes) -> CameraInfo:
     _, frame = cdr.header()
     height, width, model = cdr.take("I"), cdr.take("I"), cdr.text()
     d = [cdr.take("d") for _ in range(cdr.take("I"))]
-    return _camera(frame, width, height, model, d, cdr.take("d", 9), cdr.take("d", 9), cdr.take("d", 12))
-
-
-def _camera(frame: str, width: int, height: int, model: str, d: list[float], k: Any, r: Any, p: Any) -> CameraInfo:
-    rotation = np.reshape(r, (3, 3)) if np.any(r) else np.eye(3)
-    projection = np.reshape(p, (3, 4)) if np.any(p) else np.zeros((3, 4))
-    intrinsics = np.reshape(k, (3, 3)) if len(k) == 9 else np.zeros((3, 3))
-    return CameraInfo(frame, width, height, model, d, intrinsics, rotation, projection)
+    return info_from_rows(width, height, model, cdr.take("d", 9), d, cdr.take("d", 9), cdr.take("d", 12), frame)
 
 
 def _transform(m: FrameTransform) -> Transform:

@@ -2,21 +2,37 @@
 
 from __future__ import annotations
 
+import logging
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Generator, Iterable
+from contextlib import contextmanager
+from itertools import permutations
 
 import numpy as np
 
-from stereo_sfm.calib.formats.common import brown
+from stereo_sfm.calib.formats.camera_info import CameraInfo, extrinsics
+from stereo_sfm.calib.lens_doubts import believable
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.drivers.mcap.messages import CameraInfo, Transform
+from stereo_sfm.drivers.mcap.messages import Transform
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
-from stereo_sfm.geometry.cameras import Camera, KannalaBrandt, Pinhole
+from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.types import F64
 
-_BROWN = ("", "none", "pinhole", "plumb_bob", "radtan", "rational_polynomial")
-_FISHEYE = ("kannala_brandt", "equidistant", "fisheye")
+log = logging.getLogger("stereo_sfm")
+
+_OTHERWISE = "give a calibration with --rig FILE"
+_SAME_LENGTH = 0.02  # share by which P's baseline and that of the transforms may differ, both being rounded
+_PARALLEL_DEG = 45.0  # cameras of a pair see the same; axes of a camera's body are turned by 90 from its optical ones
+
+
+@contextmanager
+def _said_of(topic: str) -> Generator[None]:
+    """A problem of a calibration message as one line that names its topic."""
+    try:
+        yield
+    except ValueError as error:
+        raise StereoSfmError(f"the calibration on {topic} cannot be used: {error}: {_OTHERWISE}") from None
 
 
 def camera_of(info: CameraInfo, topic: str, rectified: bool) -> Camera:
@@ -28,24 +44,10 @@ def camera_of(info: CameraInfo, topic: str, rectified: bool) -> Camera:
         rectified: the images are rectified, so that the pinhole of P holds.
 
     Raises:
-        StereoSfmError: uncalibrated, or an unsupported lens model.
+        StereoSfmError: uncalibrated, damaged, or an unsupported lens model.
     """
-    size = (info.width, info.height)
-    if rectified and info.p[0, 0] > 0:
-        return Pinhole(*size, info.p[0, 0], info.p[1, 1], info.p[0, 2], info.p[1, 2])
-    k = info.k
-    if k[0, 0] <= 0:
-        raise StereoSfmError(f"the camera of {topic} is not calibrated: give a calibration with --rig FILE")
-    focal, centre = (k[0, 0], k[1, 1]), (k[0, 2], k[1, 2])
-    model = info.model.lower()
-    if model in _FISHEYE:
-        return KannalaBrandt(*size, *focal, *centre, tuple([*info.d, 0.0, 0.0, 0.0, 0.0][:4]))
-    if model not in _BROWN:
-        raise StereoSfmError(f"{topic}: lens model '{info.model}' is not supported: give a calibration with --rig FILE")
-    try:
-        return brown(size, focal, centre, info.d)
-    except ValueError as error:
-        raise StereoSfmError(f"{topic}: {error}") from None
+    with _said_of(topic):
+        return believable([info.camera(rectified)], topic)[0]
 
 
 def stereo_rig(
@@ -53,19 +55,72 @@ def stereo_rig(
 ) -> Rig:
     """The rig of both cameras with the extrinsics.
 
+    The transforms between the cameras' frames go before R and P of raw images, after P of rectified ones.
+
     Raises:
-        StereoSfmError: extrinsics neither in the transforms nor in P.
+        StereoSfmError: a damaged message, or extrinsics neither in the transforms nor in P.
     """
-    cameras = tuple(camera_of(info, topic, rectified) for info, topic in zip((left, right), topics, strict=True))
-    left_T_right = chain(list(transforms), left.frame, right.frame) if not rectified else None
-    if left_T_right is None:
-        left_T_right = _from_projections(left, right, rectified)
-    if left_T_right is None:
-        raise StereoSfmError(
-            f"no transform from '{left.frame}' to '{right.frame}' and no baseline in {topics[1]}: "
-            "give a calibration with --rig FILE"
+    cameras: list[Camera] = []
+    for info, topic in zip((left, right), topics, strict=True):
+        with _said_of(topic):
+            cameras.append(info.camera(rectified))
+    cameras = believable(cameras, topics[0])
+    with _said_of(topics[1]):
+        stated = extrinsics(left, right, rectified)
+    known = list(transforms)
+    measured = chain(known, left.frame, right.frame)
+    if measured is not None and (stated is None or not rectified):
+        return Rig(cameras[0], cameras[1], measured)
+    if stated is None:
+        raise StereoSfmError(_missing(left, right, topics, known))
+    if not rectified and any(camera.distortion for camera in cameras):
+        stated = _with_rotation(left, right, topics, stated, known)
+    return Rig(cameras[0], cameras[1], stated)
+
+
+def _missing(left: CameraInfo, right: CameraInfo, topics: tuple[str, str], transforms: list[Transform]) -> str:
+    frames = sorted({name for t in transforms for name in (t.parent, t.child)})
+    there = f"the transforms are of {', '.join(frames[:12])}" if frames else "there are no transforms"
+    if left.frame == right.frame:
+        return (
+            f"both cameras name the frame '{left.frame}', so that no transform tells where they are, and P of "
+            f"{topics[1]} has no baseline ({there}): {_OTHERWISE}"
         )
-    return Rig(cameras[0], cameras[1], left_T_right)
+    return f"no transform from '{left.frame}' to '{right.frame}' ({there}) and no baseline in {topics[1]}: {_OTHERWISE}"
+
+
+def _with_rotation(
+    left: CameraInfo, right: CameraInfo, topics: tuple[str, str], stated: F64, transforms: list[Transform]
+) -> F64:
+    """What R and P state of raw images; with no rotation in R, that of two other frames as far apart as P says.
+
+    A calibration of two real lenses has a rotation: an R that is exactly the identity was never filled in.
+    """
+    if (left.checked().r != np.eye(3)).any() or (right.checked().r != np.eye(3)).any():
+        return stated
+    found = _pairs_apart(transforms, float(np.linalg.norm(stated[:3, 3])))
+    if len(found) == 1:
+        (names, transform), *_ = found.items()
+        log.warning("%s and %s have no rotation in R: it is taken from the transform of %s to %s", *topics, *names)
+        return transform
+    log.warning(
+        "%s and %s have no rotation in R, and no transform tells it: 'stereo-sfm check-calib' measures it", *topics
+    )
+    return stated
+
+
+def _pairs_apart(transforms: list[Transform], baseline: float) -> dict[tuple[str, str], F64]:
+    """Pairs of frames of which the second is a camera to the right of the first, so far away."""
+    frames = sorted({name for t in transforms for name in (t.parent, t.child)})
+    out: dict[tuple[str, str], F64] = {}
+    for a, b in permutations(frames, 2):
+        step = chain(transforms, a, b)
+        if step is None or step[0, 3] < np.cos(np.deg2rad(_PARALLEL_DEG)) * baseline:
+            continue
+        apart, turned = se3.extent(step)
+        if abs(apart - baseline) < _SAME_LENGTH * baseline and turned < np.deg2rad(_PARALLEL_DEG):
+            out[a, b] = step
+    return out
 
 
 def chain(transforms: list[Transform], parent: str, child: str) -> F64 | None:
@@ -83,16 +138,3 @@ def chain(transforms: list[Transform], parent: str, child: str) -> F64 | None:
                 found[there] = found[here] @ matrix
                 queue.append(there)
     return found.get(child) if parent != child else None
-
-
-def _from_projections(left: CameraInfo, right: CameraInfo, rectified: bool) -> F64 | None:
-    """From the right camera's P: p_rect_left = p_rect_right + (baseline, 0, 0), and R rotates into it."""
-    if right.p[0, 3] == 0 or right.p[0, 0] <= 0:
-        return None
-    shift = np.eye(4)
-    shift[0, 3] = -right.p[0, 3] / right.p[0, 0]
-    if rectified:
-        return shift
-    zero = np.zeros(3)
-    left_T_rect = se3.from_rotation_translation(left.r.T, zero)
-    return se3.orthonormalize(left_T_rect @ shift @ se3.from_rotation_translation(right.r, zero))

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from stereo_sfm.calib.formats.common import brown
 from stereo_sfm.calib.formats.depthai import imu_at
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.drivers.live.errors import DeviceFault
 from stereo_sfm.geometry import se3
-from stereo_sfm.geometry.cameras import Camera, KannalaBrandt, RadTan
+from stereo_sfm.geometry.cameras import Camera, KannalaBrandt
 from stereo_sfm.types import F64
 
 _MAX_TILT_DEG = 5.0
@@ -51,11 +52,10 @@ def _camera(dai: Any, handler: Any, socket: Any, size: tuple[int, int]) -> Camer
         return KannalaBrandt(*size, fx, fy, cx, cy, tuple(coefficients[:4]))
     if model != dai.CameraModel.Perspective:
         raise DeviceFault(f"unsupported lens model {model} of the OAK: calibrate it with 'stereo-sfm calibrate'")
-    if any(coefficients[8:]):
-        raise DeviceFault(
-            "the OAK's calibration has unsupported thin-prism or tilt terms: calibrate it with 'stereo-sfm calibrate'"
-        )
-    return RadTan(*size, fx, fy, cx, cy, tuple(coefficients[:8]))
+    try:
+        return brown(size, (fx, fy), (cx, cy), coefficients)
+    except ValueError as error:
+        raise DeviceFault(f"invalid factory calibration of the OAK: {error}") from None
 
 
 def _scaled(matrix: F64, at: tuple[int, int], size: tuple[int, int]) -> tuple[float, float, float, float]:

@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from stereo_sfm.calib.formats.camera_info import CameraInfo
 from stereo_sfm.calib.imu import Imu
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.drivers.live.buffers import Handoff, WheelBuffer
@@ -32,7 +33,6 @@ from stereo_sfm.drivers.mcap.messages import (
     IMUS,
     TRANSFORMS,
     VELOCITIES,
-    CameraInfo,
     ImageMessage,
     ImuReading,
     Transform,

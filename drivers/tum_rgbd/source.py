@@ -16,15 +16,15 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.drivers.folder_source import FolderSource, FrameFiles, folder_of, need
 from stereo_sfm.drivers.ground_truth import read_tum, stamp_from_seconds
 from stereo_sfm.drivers.image_lists import pair_by_stamp
-from stereo_sfm.drivers.options import SourceOptions
 from stereo_sfm.drivers.rig_option import chosen_rig
 from stereo_sfm.drivers.text_file import read_text
+from stereo_sfm.drivers.tum_rgbd import TumRgbdOptions
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry.cameras import RadTan
 
 log = logging.getLogger("stereo_sfm")
 
-DEPTH_SCALE = 5000.0  # stored units per metre
+NEAREST_M = 0.2  # depth cameras see nothing nearer, and hold on to a few stray pixels
 MAX_SKEW_NS = 20_000_000  # colour and depth within 20 ms, as in the benchmark's tools
 READOUT_S = 0.028  # of these cameras' rolling shutter, as Kerl et al. (ICCV 2015) model it
 VIRTUAL_BASELINE = 0.08  # metres, close to the structured-light baseline of the sensor
@@ -37,7 +37,7 @@ INTRINSICS: dict[str, tuple[float, ...]] = {
 }
 
 
-def open_tum_rgbd(path: str, options: SourceOptions) -> FolderSource:
+def open_tum_rgbd(path: str, options: TumRgbdOptions) -> FolderSource:
     """Open a TUM RGB-D folder; its name determines which of the three cameras it is from, else a rig file is needed."""
     folder = folder_of("tum_rgbd", path)
     label = folder.resolve().name
@@ -50,13 +50,29 @@ def open_tum_rgbd(path: str, options: SourceOptions) -> FolderSource:
         )
     frames = [FrameFiles(colour[i][0], colour[i][1], depth=depth[j][1]) for i, j in pairs]
     truth = folder / "groundtruth.txt"
-    return FolderSource(
+    source = FolderSource(
         f"tum_rgbd:{label}",
         with_virtual_camera(chosen_rig(options.rig, lambda: _own_rig(folder, label))),
         frames,
         read_tum(truth) if truth.is_file() else None,
-        DEPTH_SCALE,
+        options.depth_scale,
     )
+    _check_unit(source)
+    return source
+
+
+def _check_unit(source: FolderSource) -> None:
+    """A warning where the first depths are nearer than such a camera sees: most likely they are millimetres."""
+    depth = next((image.depth for image in source.at([0]) if image.depth is not None), None)
+    known = depth[np.isfinite(depth) & (depth > 0)] if depth is not None else np.zeros(0)
+    nearest = float(np.quantile(known, 0.02)) if len(known) else NEAREST_M
+    if nearest < NEAREST_M:
+        log.warning(
+            "%s: depths from %.2f m on are nearer than depth cameras see: give the unit of its images, "
+            "'?depth_scale=1000' for millimetres",
+            source.name,
+            nearest,
+        )
 
 
 def with_virtual_camera(rig: Rig) -> Rig:

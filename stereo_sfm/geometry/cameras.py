@@ -1,8 +1,8 @@
 """Camera models: `project(points) -> pixels` and `unproject(pixels) -> unit bearings`, vectorised over (..., 3).
 
-Pinhole with radial-tangential or rational distortion as in OpenCV, Kannala-Brandt with four coefficients (PAMI 28,
-2006, equation 6; the same as cv2.fisheye), and the epipolar-aligned wide projection that rectification produces. NaN
-outside the range where a model is monotonic.
+Pinhole with radial-tangential, rational or tilted distortion as in OpenCV, Kannala-Brandt with four coefficients (PAMI
+28, 2006, equation 6; the same as cv2.fisheye), the wide models of `lens_kernels`, and the epipolar-aligned wide
+projection that rectification produces. NaN outside the range where a model is monotonic.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from stereo_sfm.geometry import kernels
+from stereo_sfm.geometry import kernels, lens_kernels
+from stereo_sfm.geometry.lens_kernels import MORE, PARAMS, TILT
 from stereo_sfm.types import F64, Bool, ReadOnly
 
 LIMITS = 16  # kept ranges of models: corrections of a rig make cameras whose lenses differ in nothing but focal length
@@ -31,18 +32,20 @@ class Camera(ReadOnly):
     cx: float
     cy: float
     distortion: tuple[float, ...] = ()
-    params: F64 = field(init=False, repr=False)  # (16,) in the layout of geometry.kernels
+    params: F64 = field(init=False, repr=False)  # (PARAMS,) in the layout of geometry.kernels
 
     model: ClassVar[str] = ""
     model_id: ClassVar[int] = -1
-    max_coefficients: ClassVar[int] = 0
+    coefficients: ClassVar[tuple[str, ...]] = ()  # names of the distortion's
+    slots: ClassVar[tuple[int, ...]] = tuple(range(4, 12))  # where they are in the parameters
 
     def __post_init__(self) -> None:
-        if len(self.distortion) > self.max_coefficients:
-            raise ValueError(f"{self.model} has at most {self.max_coefficients} distortion coefficients")
-        p = np.zeros(kernels.PARAMS)
+        if len(self.distortion) > len(self.coefficients):
+            raise ValueError(f"{self.model} has at most {len(self.coefficients)} distortion coefficients")
+        p = np.zeros(PARAMS)
         p[:4] = self.fx, self.fy, self.cx, self.cy
-        p[4 : 4 + len(self.distortion)] = self.distortion
+        p[list(self.slots[: len(self.distortion)])] = self.distortion
+        self._derive(p)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # coefficients that no lens has
             p[kernels.LIMIT] = self._limit(tuple(p[4:12].tolist()))
         p.flags.writeable = False
@@ -51,6 +54,13 @@ class Camera(ReadOnly):
 
     def _limit(self, coefficients: tuple[float, ...]) -> float:
         return 0.0
+
+    def _derive(self, p: F64) -> None:
+        """Fill in parameters that follow from the coefficients."""
+
+    def impossible(self) -> str:
+        """The coefficient that no lens of this model has, "" where all may be."""
+        return ""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -138,7 +148,7 @@ class RadTan(Camera):
 
     model: ClassVar[str] = "radtan"
     model_id: ClassVar[int] = kernels.RADTAN
-    max_coefficients: ClassVar[int] = 8
+    coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
     def _limit(self, coefficients: tuple[float, ...]) -> float:
         return _growing_radius(coefficients)
@@ -150,7 +160,7 @@ class KannalaBrandt(Camera):
 
     model: ClassVar[str] = "kannala_brandt"
     model_id: ClassVar[int] = kernels.KANNALA_BRANDT
-    max_coefficients: ClassVar[int] = 4
+    coefficients: ClassVar[tuple[str, ...]] = ("k1", "k2", "k3", "k4")
 
     def _limit(self, coefficients: tuple[float, ...]) -> float:
         return _growing_angle(coefficients)
@@ -168,4 +178,85 @@ class Epipolar(Camera):
     model_id: ClassVar[int] = kernels.EPIPOLAR
 
 
-MODELS: dict[str, type[Camera]] = {c.model: c for c in (Pinhole, RadTan, KannalaBrandt, Epipolar)}
+@dataclass(frozen=True, eq=False)
+class Tilted(RadTan):
+    """OpenCV's 14 coefficients: the rational model, a thin prism's s1 s2 s3 s4, and the sensor's tilt in radians."""
+
+    model: ClassVar[str] = "tilted"
+    model_id: ClassVar[int] = lens_kernels.TILTED
+    coefficients: ClassVar[tuple[str, ...]] = (*RadTan.coefficients, "s1", "s2", "s3", "s4", "tau_x", "tau_y")
+    slots: ClassVar[tuple[int, ...]] = (*RadTan.slots, *range(MORE, MORE + 6))
+
+    def _derive(self, p: F64) -> None:
+        p[TILT : TILT + 9] = _tilt(*p[MORE + 4 : MORE + 6].tolist()).ravel()
+
+    def impossible(self) -> str:
+        return "".join(f"tilt {tau:g}" for tau in self.distortion[12:] if not abs(tau) < 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Fov(Camera):
+    """One coefficient: radius = atan(2 r tan(w / 2)) / w of the pinhole's r (Kalibr's fov, COLMAP's FOV)."""
+
+    model: ClassVar[str] = "fov"
+    model_id: ClassVar[int] = lens_kernels.FOV
+    coefficients: ClassVar[tuple[str, ...]] = ("w",)
+    slots: ClassVar[tuple[int, ...]] = (MORE,)
+
+    def impossible(self) -> str:
+        return "" if 0 < self.params[MORE] < np.pi else f"w {self.params[MORE]:g}"
+
+
+@dataclass(frozen=True, eq=False)
+class Mei(Camera):
+    """Unified sphere with xi, then k1 k2 p1 p2 (Kalibr's omni, VINS's MEI, cv2.omnidir)."""
+
+    model: ClassVar[str] = "mei"
+    model_id: ClassVar[int] = lens_kernels.MEI
+    coefficients: ClassVar[tuple[str, ...]] = ("xi", "k1", "k2", "p1", "p2")
+    slots: ClassVar[tuple[int, ...]] = (MORE, 4, 5, 6, 7)
+
+    def _limit(self, coefficients: tuple[float, ...]) -> float:
+        return _growing_radius(coefficients)
+
+    def impossible(self) -> str:
+        return "" if self.params[MORE] > -1 else f"xi {self.params[MORE]:g}"
+
+
+@dataclass(frozen=True, eq=False)
+class DoubleSphere(Camera):
+    """Two spheres: xi alpha (Kalibr's and Basalt's ds)."""
+
+    model: ClassVar[str] = "double_sphere"
+    model_id: ClassVar[int] = lens_kernels.DOUBLE_SPHERE
+    coefficients: ClassVar[tuple[str, ...]] = ("xi", "alpha")
+    slots: ClassVar[tuple[int, ...]] = (MORE, MORE + 1)
+
+    def impossible(self) -> str:
+        xi, alpha = self.params[MORE : MORE + 2].tolist()
+        return "" if -1 < xi <= 1 and 0 <= alpha < 1 else f"xi {xi:g}, alpha {alpha:g}"
+
+
+@dataclass(frozen=True, eq=False)
+class Eucm(Camera):
+    """Extended unified camera model: alpha beta (Kalibr's and Basalt's eucm; Basalt's ucm has beta 1)."""
+
+    model: ClassVar[str] = "eucm"
+    model_id: ClassVar[int] = lens_kernels.EUCM
+    coefficients: ClassVar[tuple[str, ...]] = ("alpha", "beta")
+    slots: ClassVar[tuple[int, ...]] = (MORE, MORE + 1)
+
+    def impossible(self) -> str:
+        alpha, beta = self.params[MORE : MORE + 2].tolist()
+        return "" if 0 <= alpha < 1 and beta > 0 else f"alpha {alpha:g}, beta {beta:g}"
+
+
+def _tilt(tau_x: float, tau_y: float) -> F64:
+    """(3, 3) from the lens's plane to the tilted sensor's, as OpenCV's computeTiltProjectionMatrix."""
+    (cx, sx), (cy, sy) = ((np.cos(tau), np.sin(tau)) for tau in (tau_x, tau_y))
+    turn = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]]) @ np.array([[1, 0, 0], [0, cx, sx], [0, -sx, cx]])
+    return np.array([[turn[2, 2], 0, -turn[0, 2]], [0, turn[2, 2], -turn[1, 2]], [0, 0, 1]]) @ turn
+
+
+_ALL = (Pinhole, RadTan, KannalaBrandt, Epipolar, Tilted, Fov, Mei, DoubleSphere, Eucm)
+MODELS: dict[str, type[Camera]] = {c.model: c for c in _ALL}

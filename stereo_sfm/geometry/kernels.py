@@ -1,9 +1,9 @@
 """Compiled scalar camera kernels. One function per model; `project_one` and `unproject_one` dispatch on its id.
 
 Everything that projects (cameras, motion-only optimisation, bundle adjustment, the simulator) uses these: each model
-has one implementation. `params` is always a (16,) float64 array: fx fy cx cy, eight distortion
-coefficients, then the limit of validity at index 12 (pinhole: largest squared normalised radius; Kannala-Brandt:
-largest angle from the axis; 0 means none).
+has one implementation, the rarer ones in `lens_kernels`. `params` is always a float64 array of one length: fx fy cx
+cy, eight distortion coefficients, then the limit of validity at index 12 (pinhole: largest squared normalised radius;
+Kannala-Brandt: largest angle from the axis; 0 means none), then what only the rarer models have.
 """
 
 # pyright: reportUnknownParameterType=false, reportMissingParameterType=false, reportPrivateUsage=false
@@ -16,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
+from stereo_sfm.geometry.lens_kernels import project_lens, radtan_distort, radtan_undistort, unproject_lens
 from stereo_sfm.kernel_cache import jit
 
-PINHOLE, RADTAN, KANNALA_BRANDT, EPIPOLAR = 0, 1, 2, 3
-PARAMS = 16
+PINHOLE, RADTAN, KANNALA_BRANDT, EPIPOLAR = 0, 1, 2, 3  # above: lens_kernels
 LIMIT = 12
 
 njit: Any = jit(nogil=True, error_model="numpy")
@@ -27,23 +27,6 @@ njit: Any = jit(nogil=True, error_model="numpy")
 inner: Any = jit(nogil=True, error_model="numpy", no_cpython_wrapper=True)
 # For small ones that are called for every point: a call, whose results pass through memory, takes longer than they do.
 inlined: Any = jit(nogil=True, error_model="numpy", no_cpython_wrapper=True, forceinline=True)
-
-
-@inner
-def _radtan_distort(p, x, y):
-    """Normalised (x, y) -> distorted, with the 2x2 Jacobian. OpenCV's rational model: k1 k2 p1 p2 k3 k4 k5 k6."""
-    k1, k2, p1, p2, k3, k4, k5, k6 = p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[11]
-    r2 = x * x + y * y
-    num = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    den = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
-    g = num / den
-    dg = ((k1 + r2 * (2 * k2 + r2 * 3 * k3)) - g * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / den  # dg / d(r2)
-    xd = x * g + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    yd = y * g + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    jxx = g + 2 * x * x * dg + 2 * p1 * y + 6 * p2 * x
-    jxy = 2 * x * y * dg + 2 * p1 * x + 2 * p2 * y
-    jyy = g + 2 * y * y * dg + 6 * p1 * y + 2 * p2 * x
-    return xd, yd, jxx, jxy, jyy
 
 
 @inlined
@@ -60,7 +43,7 @@ def project_one(model, p, x, y, z):
             return fx * a + cx, fy * b + cy, fx * iz, 0.0, -fx * a * iz, 0.0, fy * iz, -fy * b * iz
         if p[12] > 0 and a * a + b * b > p[12]:
             return nan, nan, nan, nan, nan, nan, nan, nan
-        xd, yd, jxx, jxy, jyy = _radtan_distort(p, a, b)
+        xd, yd, jxx, jxy, jyy = radtan_distort(p, a, b)
         return (
             fx * xd + cx,
             fy * yd + cy,
@@ -111,6 +94,8 @@ def project_one(model, p, x, y, z):
             fy * (s + y * ds_r * w),
             fy * y * ds_z,
         )
+    if model > 3:
+        return project_lens(model, p, x, y, z)
     # Epipolar-aligned (longitude along the baseline's plane, latitude = angle of that plane): rows are epipolar lines.
     q2 = y * y + z * z
     q = math.sqrt(q2)
@@ -144,7 +129,7 @@ def unproject_one(model, p, u, v):
     if model == 0 or model == 1:
         x, y = mx, my
         if model == 1:
-            x, y = _radtan_undistort(p, mx, my)
+            x, y = radtan_undistort(p, mx, my)
         n = 1.0 / math.sqrt(x * x + y * y + 1)
         return x * n, y * n, n
     if model == 2:
@@ -155,6 +140,8 @@ def unproject_one(model, p, u, v):
         theta = _kb_theta(p, d)
         s = math.sin(theta) / d
         return mx * s, my * s, math.cos(theta)
+    if model > 3:
+        return unproject_lens(model, p, mx, my)
     if abs(mx) >= 0.5 * math.pi or abs(my) > math.pi:
         return nan, nan, nan
     ca = math.cos(mx)
@@ -188,37 +175,6 @@ def _kb_theta(p, d):
             return new
         theta = new
     return theta
-
-
-@inner
-def _radtan_undistort(p, mx, my):
-    """Newton on the 2-D distortion, started from the fixed-point iterate; NaN beyond the monotonic radius."""
-    x, y = mx, my
-    for _ in range(8):  # fixed-point steps into Newton's region of convergence
-        r2 = x * x + y * y
-        num = 1 + r2 * (p[4] + r2 * (p[5] + r2 * p[8]))
-        den = 1 + r2 * (p[9] + r2 * (p[10] + r2 * p[11]))
-        g = num / den
-        if g <= 0.2:
-            break
-        x = (mx - 2 * p[6] * x * y - p[7] * (r2 + 2 * x * x)) / g
-        y = (my - p[6] * (r2 + 2 * y * y) - 2 * p[7] * x * y) / g
-    for _ in range(30):
-        xd, yd, jxx, jxy, jyy = _radtan_distort(p, x, y)
-        ex, ey = xd - mx, yd - my
-        det = jxx * jyy - jxy * jxy
-        if abs(det) < 1e-12:
-            return math.nan, math.nan
-        sx = (jyy * ex - jxy * ey) / det
-        sy = (jxx * ey - jxy * ex) / det
-        x -= sx
-        y -= sy
-        if abs(sx) + abs(sy) < 1e-15:
-            break
-    xd, yd, jxx, jxy, jyy = _radtan_distort(p, x, y)
-    if not (abs(xd - mx) + abs(yd - my) < 1e-10) or (p[12] > 0 and x * x + y * y > p[12]):
-        return math.nan, math.nan
-    return x, y
 
 
 @njit

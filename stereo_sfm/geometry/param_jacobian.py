@@ -7,6 +7,8 @@ import numpy as np
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.types import F64
 
+STEP = 1e-6  # of a coefficient: rounding and the cubic term are both about 1e-10 of the derivative
+
 
 def parameter_vector(camera: Camera) -> F64:
     """(4 + n,) fx fy cx cy and the n distortion coefficients of the camera."""
@@ -50,7 +52,17 @@ def _distorted(camera: Camera, points: F64) -> tuple[F64, F64]:
         return distorted, direction[:, :, None] * powers[:, None, :]
     if camera.model == "radtan":
         return distorted, _brown(camera, points)
-    return distorted, np.zeros((len(points), 2, 0))
+    return distorted, _differences(camera, points)
+
+
+def _differences(camera: Camera, points: F64) -> F64:
+    """(N, 2, n) by central differences, for models that are read from files and not calibrated here."""
+    columns = np.zeros((len(points), 2, len(camera.distortion)))
+    vector, focal = parameter_vector(camera), [camera.fx, camera.fy]
+    for i, step in enumerate(STEP * np.eye(len(vector))[4:]):
+        ahead, behind = (with_parameters(camera, vector + s * step).project(points) for s in (1, -1))
+        columns[:, :, i] = (ahead - behind) / (2 * STEP * np.array(focal))
+    return columns
 
 
 def _brown(camera: Camera, points: F64) -> F64:

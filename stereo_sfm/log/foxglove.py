@@ -97,7 +97,7 @@ def calibration(camera: Camera, frame: str, stamp_ns: int, projection_tx: float 
     """One camera. A model unknown to Foxglove is published as uncalibrated (K[0] is 0), as its schema specifies."""
     out = CameraCalibration(frame_id=frame, width=camera.width, height=camera.height)
     names = {"pinhole": ("plumb_bob", 5), "radtan": ("plumb_bob", 5), "kannala_brandt": ("kannala_brandt", 4)}
-    name, count = names.get(camera.model, ("", 0))
+    name, count = names.get(camera.model, ("", len(camera.distortion)))
     if len(camera.distortion) > count:
         name, count = "rational_polynomial", 8
     k = camera.matrix if name else np.zeros((3, 3))

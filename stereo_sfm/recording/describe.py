@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from stereo_sfm.calib.lens_doubts import doubts
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.drivers.folder_source import FolderSource
 from stereo_sfm.drivers.source import Source
@@ -213,6 +214,7 @@ def _describe_source(out: Description, spec: str | Path, rig: Path | None) -> No
         return
     with source:
         out.calibration = rig_lines(source.rig)
+        out.problems += doubts(source.rig)
         out.ground_truth = 0 if source.ground_truth is None else len(source.ground_truth)
         listed = source.stamps()
         stamps = np.array([image.stamp_ns for image in source], np.int64) if listed is None else listed.stamp_ns

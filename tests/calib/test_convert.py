@@ -8,18 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stereo_sfm.calib import Rig, load_rig, save_rig
+from stereo_sfm.calib import Rig, formats, load_rig, save_rig
 from stereo_sfm.calib.formats import FORMATS, recognise
 from stereo_sfm.calib.imu import Imu
 from stereo_sfm.calib.rectification import rectify
 from stereo_sfm.cli import main
-from stereo_sfm.commands.convert_calib import NAMES
+from stereo_sfm.commands.convert_calib import NAMES, SETTINGS
 from stereo_sfm.geometry import se3
 from tests.synthetic import fisheye_rig
 
 
 def test_the_command_supports_every_format() -> None:
     assert tuple(FORMATS) == NAMES
+    assert tuple(formats.SETTINGS) == SETTINGS
 
 
 @pytest.mark.parametrize("name", [n for n in FORMATS if n != "kitti"])

@@ -361,7 +361,7 @@ def test_bad_calibrations_are_one_line(tmp_path: Path, capsys: pytest.CaptureFix
     missing = _write(tmp_path / "a.mcap", calibrations=())
     assert "has no calibration of its images: give one with --rig FILE" in _error(missing, capsys)
     assert "not calibrated" in _error(_write(tmp_path / "b.mcap", edit=uncalibrated), capsys)
-    assert "lens model 'fisheye62' is not supported" in _error(_write(tmp_path / "c.mcap", edit=strange), capsys)
+    assert "distortion model 'fisheye62' is not supported" in _error(_write(tmp_path / "c.mcap", edit=strange), capsys)
     assert "no transform from 'left_optical' to 'right_optical'" in _error(
         _write(tmp_path / "d.mcap", transforms=()), capsys
     )

@@ -10,7 +10,18 @@ from hypothesis import strategies as st
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.geometry.cameras import Camera, Epipolar, KannalaBrandt, Pinhole, RadTan
+from stereo_sfm.geometry.cameras import (
+    Camera,
+    DoubleSphere,
+    Epipolar,
+    Eucm,
+    Fov,
+    KannalaBrandt,
+    Mei,
+    Pinhole,
+    RadTan,
+    Tilted,
+)
 from stereo_sfm.geometry.param_jacobian import parameter_jacobian, parameter_vector, with_parameters
 
 PINHOLE = Pinhole(640, 480, 400.0, 402.0, 319.5, 239.5)
@@ -20,7 +31,23 @@ RATIONAL = RadTan(1280, 800, 799.7, 799.1, 640.5, 402.2, (8.1, -3.2, 1e-4, -2e-4
 T265 = KannalaBrandt(848, 800, 286.2216, 287.4801, 419.467, 386.9751, (-0.004348, 0.037126, -0.035539, 0.005773))
 TUM_VI = KannalaBrandt(1024, 1024, 380.81, 380.81, 510.29, 514.33, (0.01017, -0.010816, 0.0059428, -0.00166228))
 WIDE = Epipolar(900, 800, 290.0, 291.0, 449.5, 399.5)
+OAK = (0.32, -0.06, -3.7e-05, 7.6e-05, -0.0023, 0.654, -0.034, -0.009, 0.0011, -0.0004, 0.0007, 0.0002, 0.003, -0.001)
+TILTED = Tilted(1280, 800, 577.8, 577.9, 627.2, 410.3, OAK)
+FOV = Fov(640, 480, 330.0, 332.0, 320.5, 238.0, (0.93,))
+# Kalibr's omni and its kin on TUM VI and T265 (Usenko et al., 3DV 2018, tables)
+MEI = Mei(752, 480, 900.0, 899.0, 370.0, 240.0, (0.95, -0.13, 0.07, 1e-3, -5e-4))
+MEI_WIDE = Mei(1024, 1024, 760.0, 761.0, 510.0, 514.0, (1.8, -0.02, 0.03, 2e-4, 1e-4))
+DS = DoubleSphere(1024, 1024, 313.2, 313.2, 638.7, 514.4, (-0.1735, 0.5929))
+DS_NARROW = DoubleSphere(640, 480, 320.0, 321.0, 320.0, 240.0, (0.3, 0.4))
+EUCM = Eucm(1024, 1024, 380.0, 380.0, 510.3, 514.3, (0.63, 1.04))
 CAMERAS = {
+    "tilted": TILTED,
+    "fov": FOV,
+    "mei": MEI,
+    "mei_wide": MEI_WIDE,
+    "double_sphere": DS,
+    "double_sphere_narrow": DS_NARROW,
+    "eucm": EUCM,
     "pinhole": PINHOLE,
     "euroc": EUROC,
     "desk": DESK,
@@ -43,7 +70,7 @@ def test_every_pixel_with_a_bearing_projects_back(camera: Camera) -> None:
     uv = pixel_grid(camera)
     bearings = camera.unproject(uv)
     seen = np.isfinite(bearings[:, 0])
-    assert seen.mean() > (0.75 if camera is T265 else 0.97)
+    assert seen.mean() > (0.75 if camera in (T265, TILTED, MEI_WIDE, DS) else 0.97)
     np.testing.assert_allclose(np.linalg.norm(bearings[seen], axis=1), 1.0, atol=1e-14)
     depth = np.linspace(0.2, 40, seen.sum())[:, None]
     np.testing.assert_allclose(camera.project(bearings[seen] * depth), uv[seen], rtol=0, atol=1e-9)
@@ -58,6 +85,8 @@ def test_every_direction_in_range_unprojects_back(camera: Camera) -> None:
     seen = camera.inside(uv)
     if isinstance(camera, KannalaBrandt):  # at the very end of the range the radius is flat and holds no angle
         seen &= np.arccos(points[:, 2]) < camera.params[12] - 1e-3
+    if camera is TILTED:
+        seen &= np.hypot(*points[:, :2].T) < (np.sqrt(camera.params[12]) - 1e-2) * points[:, 2]
     assert seen.sum() > 300
     back = camera.unproject(uv[seen])
     np.testing.assert_allclose(back, points[seen], rtol=0, atol=1e-9)
@@ -133,6 +162,91 @@ def test_radtan_agrees_with_opencv(d: tuple[float, ...], count: int, seed: int) 
     np.testing.assert_allclose(ours, theirs[:, 0], atol=1e-8)
     back = camera.unproject(ours)
     np.testing.assert_allclose(back[:, :2] / back[:, 2:], xy, atol=1e-9)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.tuples(
+        *[st.floats(-0.3, 0.3)] * 2, *[st.floats(-0.01, 0.01)] * 2, *[st.floats(-0.2, 0.2)] * 4,
+        *[st.floats(-0.01, 0.01)] * 4, *[st.floats(-0.1, 0.1)] * 2,
+    ),
+    st.sampled_from([12, 14]),
+    st.integers(0, 2**31),
+)  # fmt: skip
+def test_fourteen_coefficients_agree_with_opencv(d: tuple[float, ...], count: int, seed: int) -> None:
+    camera = Tilted(640, 480, 420.0, 421.0, 318.0, 242.0, d[:count])
+    edge = np.sqrt(camera.params[12]) if camera.params[12] > 0 else 9.0
+    xy = np.random.default_rng(seed).uniform(-1, 1, (80, 2)) * min(0.6 * edge, 1.0) / np.sqrt(2)
+    points = np.column_stack([xy, np.ones(80)]) * 3.0
+    zero = np.zeros(3)
+    theirs, _ = cv2.projectPoints(points, zero, zero, camera.matrix, np.array(d[:count]))
+    ours = camera.project(points)
+    np.testing.assert_allclose(ours, theirs[:, 0], rtol=0, atol=1e-9)
+    back = camera.unproject(ours)
+    np.testing.assert_allclose(back[:, :2] / back[:, 2:], xy, atol=1e-9)
+
+
+def wide_rays(camera: Camera) -> np.ndarray:
+    """(N, 3) rays up to 110 degrees from the axis that the camera sees."""
+    theta, phi = np.meshgrid(np.linspace(0.01, 1.92, 60), np.linspace(-3, 3, 25))
+    rays = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1).reshape(-1, 3)
+    return rays[np.isfinite(camera.project(rays)[:, 0])]
+
+
+def plane(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """(N, 2) pixels without focal length and principal point."""
+    return (camera.project(points) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+
+
+def test_wide_models_are_the_published_formulas() -> None:
+    for camera in (MEI, MEI_WIDE):  # cv::omnidir::projectPoints, Kalibr's OmniProjection
+        xi, k1, k2, p1, p2 = camera.distortion
+        points = wide_rays(camera) * 2.5
+        x, y = (points[:, :2] / (points[:, 2:] + xi * np.linalg.norm(points, axis=1)[:, None])).T
+        r2 = x * x + y * y
+        gain = 1 + k1 * r2 + k2 * r2**2
+        theirs = [x * gain + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * gain + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)]
+        np.testing.assert_allclose(plane(camera, points), np.array(theirs).T, atol=1e-12)
+    for camera in (DS, DS_NARROW):  # equations 40 to 42
+        xi, alpha = camera.distortion
+        x, y, z = (points := wide_rays(camera) * 2.5).T
+        d1 = np.sqrt(x * x + y * y + z * z)
+        d2 = np.sqrt(x * x + y * y + (xi * d1 + z) ** 2)
+        depth = alpha * d2 + (1 - alpha) * (xi * d1 + z)
+        np.testing.assert_allclose(plane(camera, points), np.stack([x, y], -1) / depth[:, None], atol=1e-12)
+    alpha, beta = EUCM.distortion
+    x, y, z = (points := wide_rays(EUCM) * 2.5).T
+    depth = alpha * np.sqrt(beta * (x * x + y * y) + z * z) + (1 - alpha) * z
+    np.testing.assert_allclose(plane(EUCM, points), np.stack([x, y], -1) / depth[:, None], atol=1e-12)
+    x, y, z = (points := wide_rays(FOV) * 2.5).T  # Kalibr's FovDistortion
+    (w,), r = FOV.distortion, np.hypot(x, y) / z
+    gain = np.arctan(2 * np.tan(w / 2) * r) / (r * w)
+    np.testing.assert_allclose(plane(FOV, points), np.stack([x / z, y / z], -1) * gain[:, None], atol=1e-12)
+
+
+def test_wide_models_see_beyond_ninety_degrees_and_end_where_they_fold() -> None:
+    for camera in (MEI, MEI_WIDE, DS, EUCM):
+        angles = np.linspace(0, np.pi - 1e-3, 2000)
+        u = camera.project(np.stack([np.sin(angles), 0 * angles, np.cos(angles)], -1))[:, 0]
+        seen = np.isfinite(u)
+        assert angles[seen].max() > np.deg2rad(95)
+        assert not seen[np.argmin(seen) :].any() or seen.all()  # one range
+        assert (np.diff(u[seen]) > 0).all()
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        DoubleSphere(64, 48, 50, 50, 32, 24, (0.1, 1.2)),
+        Eucm(64, 48, 50, 50, 32, 24, (0.5, -1.0)),
+        Fov(64, 48, 50, 50, 32, 24, (4.0,)),
+        Mei(64, 48, 50, 50, 32, 24, (-1.5,)),
+        Tilted(64, 48, 50, 50, 32, 24, (0.0,) * 12 + (1.5, 0.0)),
+    ],
+)
+def test_coefficients_outside_their_range_are_refused(camera: Camera) -> None:
+    with pytest.raises(StereoSfmError, match=r"invalid calibration of the left camera: (alpha|w|xi|tilt)"):
+        Rig(camera)
 
 
 def test_nothing_behind_a_pinhole() -> None:

@@ -1,0 +1,67 @@
+"""What numbers of a calibration say about themselves: a fisheye under another name, lengths in other units.
+
+A fisheye's four coefficients k1 k2 k3 k4 under the name of the radial-tangential model are taken for k1 k2 p1 p2. As
+tangential distortion, k3 and k4 would be a lens that is tilted by several degrees: no factory mounts one like that.
+"""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.geometry.cameras import Camera, KannalaBrandt
+
+log = logging.getLogger("stereo_sfm")
+
+# Against its sensor. Lens mounts keep within half a degree; the calibration of a cheap camera's may say one.
+MOST_TILTED_DEG = 2.0
+NEAREST_M = 1.0  # a stereo camera for a robot or a car shows half of its view to both cameras at this distance
+LEAST_FAR_M = 1.0  # and can tell this distance from infinity, by a pixel
+
+
+def tilt_deg(camera: Camera) -> float:
+    """The tilt of the lens that tangential distortion stands for.
+
+    A sensor tilted by a small angle t moves x by t x^2, tangential distortion by 3 p x^2.
+    """
+    p1, p2 = (*camera.distortion, 0.0, 0.0, 0.0, 0.0)[2:4]
+    return float(np.rad2deg(3 * np.hypot(p1, p2)))
+
+
+def fisheye_in_disguise(camera: Camera) -> bool:
+    """Whether a radial-tangential lens is none, and its four coefficients are those of a fisheye."""
+    wide = 2 * camera.fx < camera.width  # more than 90 degrees across
+    return camera.model == "radtan" and len(camera.distortion) <= 4 and wide and tilt_deg(camera) > MOST_TILTED_DEG
+
+
+def believable(cameras: list[Camera], where: str) -> list[Camera]:
+    """The cameras of one rig, as fisheyes if one of them cannot be what it is said to be; with a warning."""
+    worst = max(cameras, key=lambda camera: tilt_deg(camera) if fisheye_in_disguise(camera) else 0.0)
+    if not fisheye_in_disguise(worst):
+        return cameras
+    log.warning(
+        "%s: as radial-tangential distortion these coefficients are a lens tilted by %.0f degrees: they are read as a "
+        "fisheye's (Kannala-Brandt); if they are not, 'stereo-sfm convert-calib --lens plumb_bob' says so",
+        where, tilt_deg(worst),
+    )  # fmt: skip
+    return [KannalaBrandt(*c.size, c.fx, c.fy, c.cx, c.cy, c.distortion[:4]) for c in cameras]
+
+
+def doubts(rig: Rig) -> list[str]:
+    """Sizes that are unusual for a stereo camera of these lenses, one line each: a unit that is not metres?"""
+    if rig.second_camera is None:
+        return []
+    reach = rig.left.fx * rig.baseline  # metres times pixels of disparity
+    millimetres = f"a baseline of {1e3 * rig.baseline:.6g} mm is unusual for"
+    remedy = "is its unit the metre? 'stereo-sfm convert-calib --unit' gives another"
+    found: list[str] = []
+    if reach > 0.5 * rig.left.width * NEAREST_M:
+        nearest = 2 * reach / rig.left.width
+        found.append(f"{millimetres} lenses whose views overlap by half only from {nearest:.1f} m on: {remedy}")
+    if reach < LEAST_FAR_M:
+        found.append(f"{millimetres} lenses that then see depth up to {reach:.2g} m: {remedy}")
+    if rig.left_T_right[0, 3] < -0.5 * rig.baseline:
+        found.append("the right camera is to the left of the left one: are the two exchanged, or the sign of Tx?")
+    return found
