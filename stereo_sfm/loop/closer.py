@@ -125,7 +125,8 @@ class LoopCloser:
     def step(self, keyframe: Keyframe) -> LoopResult:
         """Look for a loop with earlier keyframes, then add the keyframe."""
         bags = self._enter(keyframe)
-        result = self._search(keyframe, bags) if keyframe.described else _no_loop(keyframe.kf_id, "not_described")
+        unseen = LoopResult.without_loop(keyframe.kf_id, "not_described")
+        result = self._search(keyframe, bags) if keyframe.described else unseen
         self._keep(keyframe, bags)
         gone = self._cull(keyframe.kf_id)
         self._grow(keyframe)
@@ -142,6 +143,11 @@ class LoopCloser:
     def add(self, keyframe: Keyframe) -> None:
         """Add a keyframe of a finished map, to which later ones may close loops."""
         self._keep(keyframe, self._enter(keyframe))
+
+    def add_loop(self, loop: LoopResult) -> None:
+        """Add a loop between added keyframes that was accepted before."""
+        self._graph.add_loop(loop.candidate_kf_id, loop.kf_id, loop.candidate_T_kf)
+        self._store.merge(loop.matches)
 
     def _enter(self, keyframe: Keyframe) -> tuple[voc.Bag, voc.Bag]:
         """Its words and those of its side views; what candidates are judged by knows the keyframe from now on."""
@@ -274,7 +280,7 @@ class LoopCloser:
             if not verdicts[k].reason:
                 loops[k] = self._hypothesis(keyframe, candidate, verdicts[k])
         if not candidates:
-            return _no_loop(keyframe.kf_id, why_none)
+            return LoopResult.without_loop(keyframe.kf_id, why_none)
         candidates = candidates[: len(verdicts)]
         reasons = [verdict.reason for verdict in verdicts]
         best_inliers = max((loop.inliers for loop in loops.values() if not loop.against), default=0)
@@ -291,7 +297,7 @@ class LoopCloser:
         rejected = tuple((c.kf_id, c.score, why) for c, why in zip(candidates, reasons, strict=True) if why)
         if accepted >= 0:
             return self._accept(keyframe, candidates[accepted], verdicts[accepted], rejected)
-        return _no_loop(keyframe.kf_id, reasons[0], candidates[0].score, rejected)
+        return LoopResult.without_loop(keyframe.kf_id, reasons[0], candidates[0].score, rejected)
 
     def _verify(self, keyframe: Keyframe, view: PlaceView, candidate: Candidate) -> Verdict:
         config = self._side_config if candidate.sideways else self._config
@@ -464,19 +470,3 @@ class LoopCloser:
 def _total(support: dict[int, float]) -> float:
     """What speaks for a loop: by how much the shares of the keyframes that found it exceed those of chance."""
     return sum(max(share - CHANCE, 0.0) for share in support.values())
-
-
-def _no_loop(
-    kf_id: int, reason: str, score: float = 0.0, rejected: tuple[tuple[int, float, str], ...] = ()
-) -> LoopResult:
-    return LoopResult(
-        kf_id=kf_id,
-        candidate_kf_id=-1,
-        candidate_T_kf=np.eye(4),
-        information=np.zeros((6, 6)),
-        matches=np.zeros((0, 2), np.int64),
-        inliers=0,
-        score=score,
-        reason=reason,
-        rejected=rejected,
-    )
