@@ -15,7 +15,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
-from stereo_sfm.loop.cloud import gather
+from stereo_sfm.loop.cloud import Cloud, gather
 from stereo_sfm.loop.database import PlaceDatabase
 from stereo_sfm.loop.graph import KeyframeGraph
 from stereo_sfm.loop.keyframe_store import KeyframeStore
@@ -96,6 +96,7 @@ class LoopCloser:
         self._config, self._rig, self._spans = config, rig, spans or NoSpans()
         self._side_config = sideways_config(config)
         self._source_rig, self._rig_terms = rig, np.zeros(RIG_TERMS)
+        self._own: dict[int, Rig] = {}  # of keyframes of other rigs
         self._vocabulary = vocabulary
         self._database = PlaceDatabase(len(vocabulary))
         self._side_database = PlaceDatabase(len(vocabulary))  # with the same rows
@@ -122,8 +123,12 @@ class LoopCloser:
         """Number of keyframes that can be candidates."""
         return len(self._store)
 
-    def step(self, keyframe: Keyframe) -> LoopResult:
-        """Look for a loop with earlier keyframes, then add the keyframe."""
+    def step(self, keyframe: Keyframe, own: Rig | None = None) -> LoopResult:
+        """Look for a loop with earlier keyframes, then add the keyframe.
+
+        Args: own, the rig that took it; None: the closer's.
+        """
+        self._know(keyframe, own)
         bags = self._enter(keyframe)
         unseen = LoopResult.without_loop(keyframe.kf_id, "not_described")
         result = self._search(keyframe, bags) if keyframe.described else unseen
@@ -140,14 +145,27 @@ class LoopCloser:
         with self._spans.span("loop_verify"):
             return self._judge(keyframe, candidates, why_none)
 
-    def add(self, keyframe: Keyframe) -> None:
-        """Add a keyframe of a finished map, to which later ones may close loops."""
+    def add(self, keyframe: Keyframe, own: Rig | None = None) -> None:
+        """Add a keyframe of a finished map, to which later ones may close loops. Args: own, as of `step`."""
+        self._know(keyframe, own)
         self._keep(keyframe, self._enter(keyframe))
 
     def add_loop(self, loop: LoopResult) -> None:
         """Add a loop between added keyframes that was accepted before."""
         self._graph.add_loop(loop.candidate_kf_id, loop.kf_id, loop.candidate_T_kf)
         self._store.merge(loop.matches)
+
+    def _know(self, keyframe: Keyframe, own: Rig | None) -> None:
+        if own is not None and own is not self._rig:
+            self._own[keyframe.kf_id] = own
+
+    def _view(self, keyframe: Keyframe, sideways: bool) -> PlaceView:
+        sigma, own = self._config.disparity_sigma_px, self._own.get(keyframe.kf_id)
+        return place_view_of(keyframe, self._rig, sigma, sideways, own)
+
+    def _cloud(self, centre: Keyframe, around: list[Keyframe], sideways: bool) -> Cloud:
+        own = [self._own.get(k.kf_id, self._rig) for k in (centre, *around)] if self._own else []
+        return gather(centre, around, self._rig, self._config.disparity_sigma_px, sideways, own)
 
     def _enter(self, keyframe: Keyframe) -> tuple[voc.Bag, voc.Bag]:
         """Its words and those of its side views; what candidates are judged by knows the keyframe from now on."""
@@ -190,6 +208,7 @@ class LoopCloser:
         if gone >= 0:
             self._graph.exclude(gone)
             self._store.remove(gone)
+            self._own.pop(gone, None)
         self._repeated += came_back and gone < 0
         if (rows := self._graph.forget()) is not None:
             self._fronts.keep(rows)
@@ -274,8 +293,7 @@ class LoopCloser:
             if candidate.sideways and any(not loop.against for loop in loops.values()):
                 break
             if candidate.sideways not in views:
-                sigma = self._config.disparity_sigma_px
-                views[candidate.sideways] = place_view_of(keyframe, self._rig, sigma, candidate.sideways)
+                views[candidate.sideways] = self._view(keyframe, candidate.sideways)
             verdicts.append(self._verify(keyframe, views[candidate.sideways], candidate))
             if not verdicts[k].reason:
                 loops[k] = self._hypothesis(keyframe, candidate, verdicts[k])
@@ -305,7 +323,7 @@ class LoopCloser:
         if not candidate.sideways and not looks_alike(view, centre, config):
             return rejection("too_few_matches")
         around = self._around(centre)
-        cloud = gather(centre, around, self._rig, config.disparity_sigma_px, candidate.sideways)
+        cloud = self._cloud(centre, around, candidate.sideways)
         rng = np.random.default_rng([config.seed, keyframe.kf_id, candidate.kf_id])
         verdict = verify(view, cloud, self._rig, config, rng, move_points=not candidate.sideways)
         if verdict.reason or not candidate.sideways:  # points of views ahead are shared, not corners
@@ -332,10 +350,9 @@ class LoopCloser:
             corners += max(len(keyframe.sides), self._config.side_corners)
         if len(keyframe.sides) >= MIN_CORNERS:
             centre, config = self._store[candidate], self._side_config
-            cloud = gather(centre, self._around(centre), self._rig, config.disparity_sigma_px, True)
+            cloud = self._cloud(centre, self._around(centre), True)
             if cloud.corner.sum() >= MIN_CORNERS:
-                view = place_view_of(keyframe, self._rig, config.disparity_sigma_px, True)
-                inliers += verify_near(verdict.b_T_a, view, cloud, self._rig, config).inliers
+                inliers += verify_near(verdict.b_T_a, self._view(keyframe, True), cloud, self._rig, config).inliers
         return inliers / max(corners, 1)
 
     def _hypothesis(self, keyframe: Keyframe, of: Candidate, verdict: Verdict) -> _Hypothesis:
