@@ -30,6 +30,7 @@ from stereo_sfm.eval.record import Closure, RunRecord
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.vocabulary_file import default_vocabulary
 from stereo_sfm.mapping.mapper import Mapper
+from stereo_sfm.maps.cameras import MapCamera
 from stereo_sfm.maps.merge import merge
 from stereo_sfm.maps.relocalization import Relocalizer
 from stereo_sfm.maps.saved_map import SavedMap
@@ -74,7 +75,7 @@ def drive(spec: str, part: slice = slice(None)) -> Drive:
     snapshot, trajectory = mapper.map.snapshot(), record.mapped()
     assert trajectory is not None
     by_stamp = dict(zip(truth.stamp_ns.tolist(), truth.poses, strict=True))
-    saved = SavedMap(snapshot, rig, default_vocabulary().id, np.zeros(len(snapshot.kf_ids), np.int64))
+    saved = SavedMap.of_session(snapshot, MapCamera(rig), default_vocabulary().id)
     return Drive(
         saved,
         record.loops,

@@ -31,6 +31,7 @@ from stereo_sfm.drivers.source import open_source
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop.vocabulary_file import default_vocabulary
 from stereo_sfm.mapping.mapper import Mapper
+from stereo_sfm.maps.cameras import MapCamera
 from stereo_sfm.maps.relocalization import Relocalizer
 from stereo_sfm.maps.saved_map import SavedMap, load_map, save_map
 from stereo_sfm.maps.single_image import still_keyframe
@@ -56,7 +57,7 @@ def make_map(spec: str, stored: Path | None) -> SavedMap:
         assert isinstance(mapper, Mapper)
         snapshot = mapper.map.snapshot()
         rig = source.rig
-    return SavedMap(snapshot, rig, default_vocabulary().id, np.zeros(len(snapshot.kf_ids), np.int64))
+    return SavedMap.of_session(snapshot, MapCamera(rig), default_vocabulary().id)
 
 
 def alignment(saved: SavedMap, source: SimSource) -> F64:

@@ -258,7 +258,8 @@ class MapLocator:
         saved = saved if isinstance(saved, SavedMap) else load_map(saved)
         self._rig = saved.rig if rig is None else _rig(rig)
         vocabulary = configured_vocabulary(self._config.loop)
-        self._relocalizer = Relocalizer(saved.snapshot, self._rig, vocabulary, self._config.loop)
+        own = saved.keyframe_rigs([self._rig])
+        self._relocalizer = Relocalizer(saved.snapshot, self._rig, vocabulary, self._config.loop, own)
 
     def locate(self, left: ArrayLike, right: ArrayLike | None, near: F64 | None = None) -> Location:
         """Localize an image pair: `map_T_cam`, its information matrix, and `reason`, empty when found.

@@ -27,6 +27,7 @@ Bool = NDArray[np.bool_]
 
 
 RIG_TERMS = 8  # of `CalibrationUpdate`
+FAILED = "error: "  # begins the reason of a `LoopResult` where the loop closer failed
 
 
 def shape(*axes: int) -> dict[str, tuple[int, ...]]:
@@ -400,11 +401,25 @@ class LoopResult(Message):
     matches: I64 = field(metadata=shape(-1, 2))
     inliers: int  # corners of the keyframe that agree
     score: float  # similarity of the bags of words, from 0 to 1
-    reason: str  # "" when accepted, else why the best candidate was rejected ("no_candidate", "too_few_inliers", ...)
+    # "" when accepted, else why the best candidate was rejected ("no_candidate", "too_few_inliers", ...), or the error
+    reason: str
     rejected: tuple[tuple[int, float, str], ...] = ()  # every rejected candidate: (kf_id, score, reason)
     # (S, 3) corners of side views that the loop matched: number of the corner, keyframe, row in its `sides`
     sightings: I64 = field(default_factory=lambda: np.zeros((0, 3), np.int64), metadata=shape(-1, 3))
     forgotten_kf_ids: I64 = field(default_factory=lambda: np.zeros(0, np.int64))  # (F,) that no later result names
+
+    @property
+    def failed(self) -> bool:
+        """Whether the loop closer failed at this keyframe."""
+        return self.reason.startswith(FAILED)
+
+    @staticmethod
+    def without_loop(
+        kf_id: int, reason: str, score: float = 0.0, rejected: tuple[tuple[int, float, str], ...] = ()
+    ) -> LoopResult:
+        """The result for a keyframe that closes no loop."""
+        none = np.zeros((0, 2), np.int64)
+        return LoopResult(kf_id, -1, np.eye(4), np.zeros((6, 6)), none, 0, score, reason, rejected)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ COLMAP puts the centre of the first pixel at (0.5, 0.5), so its principal point 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -83,20 +84,30 @@ def read_colmap(path: Path | str) -> Rig:
 
 def write_colmap(rig: Rig, folder: Path) -> None:
     """`cameras.txt` and `rigs.txt`. The body's pose is not stored."""
+    write_colmap_rigs([rig], folder)
+
+
+def write_colmap_rigs(rigs: Sequence[Rig], folder: Path) -> None:
+    """The same of several rigs, numbered from 1 in this order; their cameras follow each other, left before right."""
     folder.mkdir(parents=True, exist_ok=True)
-    lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
-    for i, camera in enumerate([rig.left] if rig.right is None else [rig.left, rig.right], 1):
-        model, params = colmap_params(camera)
-        lines.append(f"{i} {model} {camera.width} {camera.height} " + " ".join(map(repr, params)))
-    (folder / "cameras.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    entry = "1 1 CAMERA 1"
-    if rig.right is not None:
+    cameras: list[Camera] = []
+    entries = ["# RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID, SENSORS[] as (TYPE, ID, HAS_POSE, [QW..TZ])"]
+    for number, rig in enumerate(rigs, 1):
+        left = len(cameras) + 1
+        cameras += [rig.left] if rig.right is None else [rig.left, rig.right]
+        if rig.right is None:
+            entries.append(f"{number} 1 CAMERA {left}")
+            continue
         right_T_left = se3.inverse(rig.left_T_right)
         x, y, z, w = se3.quaternion_from_rotation(right_T_left[:3, :3])
         pose = " ".join(repr(float(v)) for v in (w, x, y, z, *right_T_left[:3, 3]))
-        entry = f"1 2 CAMERA 1 CAMERA 2 1 {pose}"
-    header = "# RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID, SENSORS[] as (TYPE, ID, HAS_POSE, [QW..TZ])"
-    (folder / "rigs.txt").write_text(f"{header}\n{entry}\n", encoding="utf-8")
+        entries.append(f"{number} 2 CAMERA {left} CAMERA {left + 1} 1 {pose}")
+    lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
+    for i, camera in enumerate(cameras, 1):
+        model, params = colmap_params(camera)
+        lines.append(f"{i} {model} {camera.width} {camera.height} " + " ".join(map(repr, params)))
+    (folder / "cameras.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    (folder / "rigs.txt").write_text("\n".join(entries) + "\n", encoding="utf-8")
 
 
 def _lines(path: Path) -> list[list[str]]:

@@ -32,24 +32,33 @@ def rig_from_text(text: str, where: Path | str, folder: Path | None = None) -> R
         text: YAML. where: its origin, for error messages. folder: of the mask files that it names; None: it may not.
     """
     with reading(where, "rig"):
-        data = yaml_mapping(text)
-        if data.get(KEY) != 1:
-            raise ValueError(f"{KEY} is {data.get(KEY)}, this version of the program reads 1")
-        body_T_left = rigid(data["body_T_left"]) if "body_T_left" in data else np.eye(4)
-        return Rig(
-            left=_camera(data["left"]),
-            right=_camera(data["right"]) if data.get("right") else None,
-            left_T_right=rigid(data["left_T_right"]),
-            body_T_left=body_T_left,
-            depth=bool(data.get("depth", False)),
-            name=str(data.get("name", "")),
-            serial=str(data.get("serial", "")),
-            imu=imu_from_plain(data["imu"]) if data.get("imu") else None,
-            wheel=wheel_from_plain(data["wheel"], body_T_left) if data.get("wheel") else None,
-            readout_s=float(data.get("readout_s") or 0.0),
-            left_mask=_mask(data["left"], folder),
-            right_mask=_mask(data.get("right") or {}, folder),
-        )
+        return rig_from_plain(yaml_mapping(text), folder)
+
+
+def rig_from_plain(data: dict[str, Any], folder: Path | None = None) -> Rig:
+    """The inverse of `rig_to_plain`; `folder` as of `rig_from_text`.
+
+    Raises:
+        KeyError, TypeError, ValueError: not a rig.
+        StereoSfmError: one that cannot be.
+    """
+    if data.get(KEY) != 1:
+        raise ValueError(f"{KEY} is {data.get(KEY)}, this version of the program reads 1")
+    body_T_left = rigid(data["body_T_left"]) if "body_T_left" in data else np.eye(4)
+    return Rig(
+        left=_camera(data["left"]),
+        right=_camera(data["right"]) if data.get("right") else None,
+        left_T_right=rigid(data["left_T_right"]),
+        body_T_left=body_T_left,
+        depth=bool(data.get("depth", False)),
+        name=str(data.get("name", "")),
+        serial=str(data.get("serial", "")),
+        imu=imu_from_plain(data["imu"]) if data.get("imu") else None,
+        wheel=wheel_from_plain(data["wheel"], body_T_left) if data.get("wheel") else None,
+        readout_s=float(data.get("readout_s") or 0.0),
+        left_mask=_mask(data["left"], folder),
+        right_mask=_mask(data.get("right") or {}, folder),
+    )
 
 
 def write_native(rig: Rig, path: Path) -> None:
@@ -59,21 +68,24 @@ def write_native(rig: Rig, path: Path) -> None:
 
 def rig_to_text(rig: Rig) -> str:
     """The rig as YAML, lossless."""
-    return yaml_text(
-        {
-            KEY: 1,
-            "name": rig.name,
-            "serial": rig.serial,
-            "depth": rig.depth,
-            "readout_s": float(rig.readout_s),
-            "left": _plain(rig.left, rig.left_mask),
-            "right": _plain(rig.right, rig.right_mask) if rig.right else None,
-            "left_T_right": rows(rig.left_T_right),
-            "body_T_left": rows(rig.body_T_left),
-            **({"imu": imu_to_plain(rig.imu)} if rig.imu else {}),
-            **({"wheel": wheel_to_plain(rig.wheel)} if rig.wheel else {}),
-        },
-    )
+    return yaml_text(rig_to_plain(rig))
+
+
+def rig_to_plain(rig: Rig) -> dict[str, Any]:
+    """The rig as plain values, lossless."""
+    return {
+        KEY: 1,
+        "name": rig.name,
+        "serial": rig.serial,
+        "depth": rig.depth,
+        "readout_s": float(rig.readout_s),
+        "left": _plain(rig.left, rig.left_mask),
+        "right": _plain(rig.right, rig.right_mask) if rig.right else None,
+        "left_T_right": rows(rig.left_T_right),
+        "body_T_left": rows(rig.body_T_left),
+        **({"imu": imu_to_plain(rig.imu)} if rig.imu else {}),
+        **({"wheel": wheel_to_plain(rig.wheel)} if rig.wheel else {}),
+    }
 
 
 def _camera(data: dict[str, Any]) -> Camera:

@@ -98,6 +98,7 @@ class RunRecord:
     map_points: set[int] = field(default_factory=set[int])
     seen_points: Bool = field(default_factory=lambda: np.zeros(1024, bool))  # by id: whether a keyframe had it
     closed: list[Closure] = field(default_factory=list[Closure])  # accepted by the loop closer
+    failed_kf_ids: list[int] = field(default_factory=list[int])  # at which the loop closer failed
     refused_kf_ids: set[int] = field(default_factory=set[int])  # of loops that the mapper rejected
     row_errors: RowErrors | None = None  # the last
     row_error_px: list[tuple[int, float]] = field(default_factory=list[tuple[int, float]])  # stamp_ns, systematic
@@ -190,6 +191,8 @@ class RunRecord:
     def _put_loop(self, loop: LoopResult) -> None:
         if loop.candidate_kf_id >= 0 and not loop.reason:
             self.closed.append(Closure(loop.kf_id, loop.candidate_kf_id, loop.candidate_T_kf))
+        if loop.failed:
+            self.failed_kf_ids.append(loop.kf_id)
         for _, _, reason in loop.rejected:
             self.rejections[reason] = self.rejections.get(reason, 0) + 1
 

@@ -11,7 +11,7 @@ from stereo_sfm.eval import plots
 from stereo_sfm.eval.calibration_results import calibration_table
 from stereo_sfm.eval.evaluate import Evaluation, table
 from stereo_sfm.eval.record import RunRecord
-from stereo_sfm.eval.statistics import failure, summary, thousands
+from stereo_sfm.eval.statistics import failure, loop_errors, summary, thousands
 from stereo_sfm.types import Trajectory
 
 ADVICE = {
@@ -192,6 +192,8 @@ def verdicts(stats: dict[str, Any], evaluations: dict[str, Evaluation]) -> list[
             f"**WARN**: the map is in {stats['pieces']} unconnected submaps: tracking restarted, and no place of one "
             "was recognised in another; drive again through a place that was seen before tracking was lost"
         )
+    if stats["loop_errors_at"]:
+        out.append(f"**WARN**: {loop_errors(stats)}")
     out += _drops(stats)
     if stats["tracked"] and stats["inliers_median"] < FEW_INLIERS:
         out.append(

@@ -19,6 +19,7 @@ from stereo_sfm.types import F64, TrackState
 RING, LOG = "ring", "log"  # where images are dropped, see `Dropped`
 # Part of frames without a pose above which the run counts as failed.
 MAX_LOST_PERCENT = 20.0
+SHOWN_ERRORS = 5  # keyframes that one line names
 
 
 def percentiles(values: Sequence[float] | F64) -> dict[str, float]:
@@ -68,6 +69,7 @@ def statistics(record: RunRecord, wall_s: float, evaluations: dict[str, Evaluati
         "gravity": gravity_stats(record),
         "loops_accepted": len(record.loops),
         "loops_rejected": dict(sorted(record.rejected.items(), key=lambda item: (-item[1], item[0]))),
+        "loop_errors_at": record.failed_kf_ids,  # keyframes at which the loop closer failed
         "closure_drift_percent_median": 100 * float(np.median(drifts)) if drifts else None,
         "wall_s": wall_s,
         "frames_per_s": frames / wall_s if wall_s > 0 else 0.0,
@@ -136,6 +138,8 @@ def summary(stats: dict[str, Any], evaluations: dict[str, Evaluation] | None = N
         lines.append(f"{stats['pieces']} submaps that no loop connects: their relative poses are only predicted")
     if stats["loops_accepted"] or stats["loops_rejected"]:
         lines.append(_loops(stats))
+    if stats["loop_errors_at"]:
+        lines.append(loop_errors(stats))
     if stats["gravity"]:
         lines.append(_gravity(stats["gravity"]))
     if stats["camera"]:
@@ -216,6 +220,14 @@ def _loops(stats: dict[str, Any]) -> str:
     )
     drift = stats["closure_drift_percent_median"]
     return text if drift is None else f"{text} · odometry drift at loops {drift:.2f} % of the path (median)"
+
+
+def loop_errors(stats: dict[str, Any]) -> str:
+    """At which keyframes the loop closer failed."""
+    at: list[int] = stats["loop_errors_at"]
+    some = ", ".join(map(str, at[:SHOWN_ERRORS])) + (", ..." if len(at) > SHOWN_ERRORS else "")
+    noun = "keyframe" if len(at) == 1 else "keyframes"
+    return f"the loop closer failed at {len(at)} {noun} ({some}) and started again: please report the log's traceback"
 
 
 def _times(stats: dict[str, Any]) -> str:

@@ -6,17 +6,20 @@ COLMAP's poses are cam_from_world, quaternions w first, and the centre of the to
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
-from stereo_sfm.calib.formats.colmap import write_colmap
+from stereo_sfm.calib.formats.colmap import write_colmap_rigs
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.mapping.map import MapSnapshot
 from stereo_sfm.maps.saved_map import SavedMap
-from stereo_sfm.types import F64
+from stereo_sfm.types import F64, I64
 
 HALF_PIXEL = 0.5
 GREY = "128 128 128"
@@ -37,18 +40,29 @@ def image_names(saved: SavedMap, side: str) -> list[str]:
     ]
 
 
+@dataclass(frozen=True, eq=False)
+class _Image:
+    """One image of the model."""
+
+    image_id: int
+    camera_id: int
+    name: str
+    camera: Camera
+    cam_T_map: F64  # (4, 4)
+    rows: I64  # of the observations in it
+    uv: F64  # (N, 2) px of those
+
+
 def export_colmap(saved: SavedMap, folder: Path) -> None:
     """cameras, rigs, frames, images and points3D as text, without points that are seen once: COLMAP refuses those."""
-    rig, s = _without_virtual_camera(saved.rig), saved.snapshot
-    write_colmap(rig, folder)
-    cameras = [("left", rig.left, np.eye(4), s.uv_left)]
-    if rig.right is not None:
-        cameras.append(("right", rig.right, se3.inverse(rig.left_T_right), s.uv_right))
-    _write_frames(s, len(cameras), folder / "frames.txt")
-    names = [image_names(saved, side) for side, *_ in cameras]
-    tracks = _write_images(s, cameras, names, folder / "images.txt")
-    errors = _reprojection_errors(s, cameras)
-    _write_points(s, tracks, errors, folder / "points3D.txt")
+    taken, s = saved.keyframe_rigs(), saved.snapshot
+    number = {rig: i for i, rig in enumerate(dict.fromkeys(taken))}
+    rigs = [_without_virtual_camera(rig) for rig in number]
+    write_colmap_rigs(rigs, folder)
+    images = _images(saved, rigs, [number[rig] for rig in taken])
+    _write_frames(s, [number[rig] + 1 for rig in taken], images, folder / "frames.txt")
+    tracks = _write_images(s, images, folder / "images.txt")
+    _write_points(s, tracks, _reprojection_errors(s, images), folder / "points3D.txt")
 
 
 def _without_virtual_camera(rig: Rig) -> Rig:
@@ -56,55 +70,70 @@ def _without_virtual_camera(rig: Rig) -> Rig:
     return Rig(rig.left, name=rig.name) if rig.depth else rig
 
 
+def _images(saved: SavedMap, rigs: Sequence[Rig], which: Sequence[int]) -> list[list[_Image]]:
+    """The images of each keyframe; `which`: the rig of each."""
+    s, names = saved.snapshot, [image_names(saved, side) for side in ("left", "right")]
+    bounds = np.searchsorted(s.obs_kf, np.arange(len(s.kf_ids) + 1)).tolist()
+    first_camera = np.cumsum([0, *(1 + (rig.right is not None) for rig in rigs)]).tolist()
+    out: list[list[_Image]] = []
+    image_id = 0
+    for k, left_T_map in enumerate(se3.inverse(s.map_T_kf)):
+        rig, seen = rigs[which[k]], np.arange(bounds[k], bounds[k + 1])
+        cameras = [(rig.left, np.eye(4), s.uv_left)]
+        if rig.right is not None:
+            cameras.append((rig.right, se3.inverse(rig.left_T_right), s.uv_right))
+        out.append([])
+        for e, (camera, cam_T_left, uv) in enumerate(cameras):
+            image_id += 1
+            rows, camera_id = seen[np.isfinite(uv[seen, 0])], first_camera[which[k]] + e + 1
+            out[k].append(_Image(image_id, camera_id, names[e][k], camera, cam_T_left @ left_T_map, rows, uv[rows]))
+    return out
+
+
 def _pose(cam_T_map: F64) -> str:
     x, y, z, w = se3.quaternion_from_rotation(cam_T_map[:3, :3]).tolist()
     return " ".join(repr(float(v)) for v in (w, x, y, z, *cam_T_map[:3, 3]))
 
 
-def _write_frames(s: MapSnapshot, cameras: int, path: Path) -> None:
+def _write_frames(s: MapSnapshot, rig_ids: Sequence[int], images: Sequence[Sequence[_Image]], path: Path) -> None:
     lines = [
         "# FRAME_ID, RIG_ID, RIG_FROM_WORLD[QW..TZ], NUM_DATA_IDS, DATA_IDS[] as (SENSOR_TYPE, SENSOR_ID, DATA_ID)"
     ]
-    for k, pose in enumerate(se3.inverse(s.map_T_kf)):
-        data = " ".join(f"CAMERA {e + 1} {k * cameras + e + 1}" for e in range(cameras))
-        lines.append(f"{k + 1} 1 {_pose(pose)} {cameras} {data}")
+    for k, (pose, rig_id, own) in enumerate(zip(se3.inverse(s.map_T_kf), rig_ids, images, strict=True)):
+        data = " ".join(f"CAMERA {image.camera_id} {image.image_id}" for image in own)
+        lines.append(f"{k + 1} {rig_id} {_pose(pose)} {len(own)} {data}")
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _write_images(
-    s: MapSnapshot, cameras: list[tuple[str, Camera, F64, F64]], names: list[list[str]], path: Path
-) -> list[list[str]]:
+def _write_images(s: MapSnapshot, images: Sequence[Sequence[_Image]], path: Path) -> list[list[str]]:
     """Write all images; returns for each point its track as 'IMAGE_ID INDEX' entries."""
     lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
-    bounds = np.searchsorted(s.obs_kf, np.arange(len(s.kf_ids) + 1)).tolist()
     tracks: list[list[str]] = [[] for _ in range(len(s.pt_ids))]
-    views = sum(np.bincount(s.obs_pt[np.isfinite(uv[:, 0])], minlength=len(s.pt_ids)) for *_, uv in cameras)
+    views = np.zeros(len(s.pt_ids), np.int64)
+    for image in chain.from_iterable(images):
+        views += np.bincount(s.obs_pt[image.rows], minlength=len(s.pt_ids))
     ids = np.where(views >= LEAST_VIEWS, np.arange(1, len(s.pt_ids) + 1), NO_POINT)
-    for k, left_T_map in enumerate(se3.inverse(s.map_T_kf)):
-        for e, (_, _, cam_T_left, uv) in enumerate(cameras):
-            image_id = k * len(cameras) + e + 1
-            rows = np.arange(bounds[k], bounds[k + 1])
-            rows = rows[np.isfinite(uv[rows, 0])]
-            lines.append(f"{image_id} {_pose(cam_T_left @ left_T_map)} {e + 1} {names[e][k]}")
-            pixels, points = (uv[rows] + HALF_PIXEL).tolist(), ids[s.obs_pt[rows]].tolist()
-            lines.append(" ".join(f"{u!r} {v!r} {p}" for (u, v), p in zip(pixels, points, strict=True)))
-            for n, point in enumerate(s.obs_pt[rows].tolist()):
-                tracks[point].append(f"{image_id} {n}")
+    for image in chain.from_iterable(images):
+        lines.append(f"{image.image_id} {_pose(image.cam_T_map)} {image.camera_id} {image.name}")
+        points = s.obs_pt[image.rows]
+        pixels = (image.uv + HALF_PIXEL).tolist()
+        lines.append(" ".join(f"{u!r} {v!r} {p}" for (u, v), p in zip(pixels, ids[points].tolist(), strict=True)))
+        for n, point in enumerate(points.tolist()):
+            tracks[point].append(f"{image.image_id} {n}")
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return tracks
 
 
-def _reprojection_errors(s: MapSnapshot, cameras: list[tuple[str, Camera, F64, F64]]) -> F64:
+def _reprojection_errors(s: MapSnapshot, images: Sequence[Sequence[_Image]]) -> F64:
     """(P,) mean reprojection error of each point in px."""
     total, count = np.zeros(len(s.pt_ids)), np.zeros(len(s.pt_ids))
-    kf_T_map = se3.inverse(s.map_T_kf)
-    for _, camera, cam_T_left, uv in cameras:
-        pose = cam_T_left @ kf_T_map[s.obs_kf]
-        seen = np.einsum("nij,nj->ni", pose[:, :3, :3], s.points[s.obs_pt]) + pose[:, :3, 3]
-        distance = np.linalg.norm(camera.project(seen) - uv, axis=1)
+    for image in chain.from_iterable(images):
+        points = s.obs_pt[image.rows]
+        seen = image.camera.project(se3.transform(image.cam_T_map, s.points[points]))
+        distance = np.linalg.norm(seen - image.uv, axis=1)
         ok = np.isfinite(distance)
-        np.add.at(total, s.obs_pt[ok], distance[ok])
-        np.add.at(count, s.obs_pt[ok], 1)
+        np.add.at(total, points[ok], distance[ok])
+        np.add.at(count, points[ok], 1)
     return total / np.maximum(count, 1)
 
 

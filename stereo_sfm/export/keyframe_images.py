@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from stereo_sfm.calib.rectification import PROJECTIONS
@@ -11,18 +11,19 @@ from stereo_sfm.drivers.rectified import rectified
 from stereo_sfm.drivers.source import Source, open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.colmap import image_names
-from stereo_sfm.maps.saved_map import SavedMap, describe_rig, same_rig
+from stereo_sfm.maps.cameras import difference
+from stereo_sfm.maps.saved_map import SavedMap
 from stereo_sfm.types import U8, StereoImage
 
 Key = tuple[int, int]  # frame id, stamp in ns
 
 
-def open_recording(spec: str, map_rig: Rig, own_rig: Rig | None = None) -> Source:
-    """A recording, not yet entered, as seen by the map's camera: unchanged, or rectified as in the run.
+def open_recording(spec: str, map_rigs: Sequence[Rig], own_rig: Rig | None = None) -> Source:
+    """A recording, not yet entered, as seen by a camera of the map: unchanged, or rectified as in the run.
 
     Args:
         spec: the recording.
-        map_rig: the map's camera.
+        map_rigs: the cameras of the map.
         own_rig: calibration that replaces the recording's own.
 
     Raises:
@@ -34,11 +35,11 @@ def open_recording(spec: str, map_rig: Rig, own_rig: Rig | None = None) -> Sourc
             seen = rectified(source, how)
         except StereoSfmError:  # one camera, or two that cannot be rectified this way
             continue
-        if same_rig(seen.rig, map_rig):
+        if not all(difference(rig, seen.rig, corrected=True) for rig in map_rigs):
             return seen
     raise StereoSfmError(
-        f"the camera of {spec} ({describe_rig(source.rig)}) is not the map's ({describe_rig(map_rig)}), rectified or"
-        " not: give the recording of this map, and the --rig of its run if any"
+        f"the camera of {spec} is not the map's, rectified or not (it has {difference(map_rigs[-1], source.rig)}): give"
+        " the recording of this map, and the --rig of its run if any"
     )
 
 

@@ -63,6 +63,9 @@ class Events:
         if result.candidate_kf_id >= 0:
             seen = f"keyframe {result.kf_id} sees keyframe {result.candidate_kf_id} again"
             return LogLine("loop", "INFO", f"{seen}, {result.inliers} inliers")
+        if result.failed:
+            what = f"the loop closer failed at keyframe {result.kf_id} ({result.reason}) and started again"
+            return LogLine("loop", "WARNING", what)
         if not result.rejected:
             return None
         refused = f"{len(result.rejected)} rejected: {_words(result.reason)}"

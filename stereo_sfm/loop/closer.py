@@ -15,7 +15,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
-from stereo_sfm.loop.cloud import gather
+from stereo_sfm.loop.cloud import Cloud, gather
 from stereo_sfm.loop.database import PlaceDatabase
 from stereo_sfm.loop.graph import KeyframeGraph
 from stereo_sfm.loop.keyframe_store import KeyframeStore
@@ -96,6 +96,7 @@ class LoopCloser:
         self._config, self._rig, self._spans = config, rig, spans or NoSpans()
         self._side_config = sideways_config(config)
         self._source_rig, self._rig_terms = rig, np.zeros(RIG_TERMS)
+        self._own: dict[int, Rig] = {}  # of keyframes of other rigs
         self._vocabulary = vocabulary
         self._database = PlaceDatabase(len(vocabulary))
         self._side_database = PlaceDatabase(len(vocabulary))  # with the same rows
@@ -122,10 +123,15 @@ class LoopCloser:
         """Number of keyframes that can be candidates."""
         return len(self._store)
 
-    def step(self, keyframe: Keyframe) -> LoopResult:
-        """Look for a loop with earlier keyframes, then add the keyframe."""
+    def step(self, keyframe: Keyframe, own: Rig | None = None) -> LoopResult:
+        """Look for a loop with earlier keyframes, then add the keyframe.
+
+        Args: own, the rig that took it; None: the closer's.
+        """
+        self._know(keyframe, own)
         bags = self._enter(keyframe)
-        result = self._search(keyframe, bags) if keyframe.described else _no_loop(keyframe.kf_id, "not_described")
+        unseen = LoopResult.without_loop(keyframe.kf_id, "not_described")
+        result = self._search(keyframe, bags) if keyframe.described else unseen
         self._keep(keyframe, bags)
         gone = self._cull(keyframe.kf_id)
         self._grow(keyframe)
@@ -139,9 +145,27 @@ class LoopCloser:
         with self._spans.span("loop_verify"):
             return self._judge(keyframe, candidates, why_none)
 
-    def add(self, keyframe: Keyframe) -> None:
-        """Add a keyframe of a finished map, to which later ones may close loops."""
+    def add(self, keyframe: Keyframe, own: Rig | None = None) -> None:
+        """Add a keyframe of a finished map, to which later ones may close loops. Args: own, as of `step`."""
+        self._know(keyframe, own)
         self._keep(keyframe, self._enter(keyframe))
+
+    def add_loop(self, loop: LoopResult) -> None:
+        """Add a loop between added keyframes that was accepted before."""
+        self._graph.add_loop(loop.candidate_kf_id, loop.kf_id, loop.candidate_T_kf)
+        self._store.merge(loop.matches)
+
+    def _know(self, keyframe: Keyframe, own: Rig | None) -> None:
+        if own is not None and own is not self._rig:
+            self._own[keyframe.kf_id] = own
+
+    def _view(self, keyframe: Keyframe, sideways: bool) -> PlaceView:
+        sigma, own = self._config.disparity_sigma_px, self._own.get(keyframe.kf_id)
+        return place_view_of(keyframe, self._rig, sigma, sideways, own)
+
+    def _cloud(self, centre: Keyframe, around: list[Keyframe], sideways: bool) -> Cloud:
+        own = [self._own.get(k.kf_id, self._rig) for k in (centre, *around)] if self._own else []
+        return gather(centre, around, self._rig, self._config.disparity_sigma_px, sideways, own)
 
     def _enter(self, keyframe: Keyframe) -> tuple[voc.Bag, voc.Bag]:
         """Its words and those of its side views; what candidates are judged by knows the keyframe from now on."""
@@ -184,6 +208,7 @@ class LoopCloser:
         if gone >= 0:
             self._graph.exclude(gone)
             self._store.remove(gone)
+            self._own.pop(gone, None)
         self._repeated += came_back and gone < 0
         if (rows := self._graph.forget()) is not None:
             self._fronts.keep(rows)
@@ -268,13 +293,12 @@ class LoopCloser:
             if candidate.sideways and any(not loop.against for loop in loops.values()):
                 break
             if candidate.sideways not in views:
-                sigma = self._config.disparity_sigma_px
-                views[candidate.sideways] = place_view_of(keyframe, self._rig, sigma, candidate.sideways)
+                views[candidate.sideways] = self._view(keyframe, candidate.sideways)
             verdicts.append(self._verify(keyframe, views[candidate.sideways], candidate))
             if not verdicts[k].reason:
                 loops[k] = self._hypothesis(keyframe, candidate, verdicts[k])
         if not candidates:
-            return _no_loop(keyframe.kf_id, why_none)
+            return LoopResult.without_loop(keyframe.kf_id, why_none)
         candidates = candidates[: len(verdicts)]
         reasons = [verdict.reason for verdict in verdicts]
         best_inliers = max((loop.inliers for loop in loops.values() if not loop.against), default=0)
@@ -291,7 +315,7 @@ class LoopCloser:
         rejected = tuple((c.kf_id, c.score, why) for c, why in zip(candidates, reasons, strict=True) if why)
         if accepted >= 0:
             return self._accept(keyframe, candidates[accepted], verdicts[accepted], rejected)
-        return _no_loop(keyframe.kf_id, reasons[0], candidates[0].score, rejected)
+        return LoopResult.without_loop(keyframe.kf_id, reasons[0], candidates[0].score, rejected)
 
     def _verify(self, keyframe: Keyframe, view: PlaceView, candidate: Candidate) -> Verdict:
         config = self._side_config if candidate.sideways else self._config
@@ -299,7 +323,7 @@ class LoopCloser:
         if not candidate.sideways and not looks_alike(view, centre, config):
             return rejection("too_few_matches")
         around = self._around(centre)
-        cloud = gather(centre, around, self._rig, config.disparity_sigma_px, candidate.sideways)
+        cloud = self._cloud(centre, around, candidate.sideways)
         rng = np.random.default_rng([config.seed, keyframe.kf_id, candidate.kf_id])
         verdict = verify(view, cloud, self._rig, config, rng, move_points=not candidate.sideways)
         if verdict.reason or not candidate.sideways:  # points of views ahead are shared, not corners
@@ -326,10 +350,9 @@ class LoopCloser:
             corners += max(len(keyframe.sides), self._config.side_corners)
         if len(keyframe.sides) >= MIN_CORNERS:
             centre, config = self._store[candidate], self._side_config
-            cloud = gather(centre, self._around(centre), self._rig, config.disparity_sigma_px, True)
+            cloud = self._cloud(centre, self._around(centre), True)
             if cloud.corner.sum() >= MIN_CORNERS:
-                view = place_view_of(keyframe, self._rig, config.disparity_sigma_px, True)
-                inliers += verify_near(verdict.b_T_a, view, cloud, self._rig, config).inliers
+                inliers += verify_near(verdict.b_T_a, self._view(keyframe, True), cloud, self._rig, config).inliers
         return inliers / max(corners, 1)
 
     def _hypothesis(self, keyframe: Keyframe, of: Candidate, verdict: Verdict) -> _Hypothesis:
@@ -464,19 +487,3 @@ class LoopCloser:
 def _total(support: dict[int, float]) -> float:
     """What speaks for a loop: by how much the shares of the keyframes that found it exceed those of chance."""
     return sum(max(share - CHANCE, 0.0) for share in support.values())
-
-
-def _no_loop(
-    kf_id: int, reason: str, score: float = 0.0, rejected: tuple[tuple[int, float, str], ...] = ()
-) -> LoopResult:
-    return LoopResult(
-        kf_id=kf_id,
-        candidate_kf_id=-1,
-        candidate_T_kf=np.eye(4),
-        information=np.zeros((6, 6)),
-        matches=np.zeros((0, 2), np.int64),
-        inliers=0,
-        score=score,
-        reason=reason,
-        rejected=rejected,
-    )

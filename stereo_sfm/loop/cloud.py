@@ -48,16 +48,23 @@ class Cloud:
 
 
 def gather(
-    centre: Keyframe, others: Sequence[Keyframe], rig: Rig, disparity_sigma: float, sideways: bool = False
+    centre: Keyframe,
+    others: Sequence[Keyframe],
+    rig: Rig,
+    disparity_sigma: float,
+    sideways: bool = False,
+    own: Sequence[Rig] = (),
 ) -> Cloud:
     """Corners and points of the centre, then of `others` (near in time), transformed into its camera by odometry.
 
     Rows without depth are left out. `sideways`: the corners are those of the views that face the shelves.
-    Corners of several keyframes with about the same position and descriptor share an id.
+    Corners of several keyframes with about the same position and descriptor share an id. Pixels are those of `rig`;
+    `own`: the rigs of the centre and of the others, where they have other ones.
     """
     keyframes = [centre, *others]
     centre_T_kf = np.stack([se3.inverse(centre.odom_T_cam) @ k.odom_T_cam for k in keyframes])
-    views = [place_view_of(keyframe, rig, disparity_sigma, sideways) for keyframe in keyframes]
+    rigs = own or [rig] * len(keyframes)
+    views = [place_view_of(k, rig, disparity_sigma, sideways, o) for k, o in zip(keyframes, rigs, strict=True)]
     points = np.concatenate([view.points for view in views])
     deep = np.flatnonzero(np.isfinite(points[:, 2]))
 

@@ -147,7 +147,7 @@ class KeyframeGraph:
         """Keyframes with about the same pose, this one included, oldest first; within `factor` times the distance."""
         nodes, row = self._nodes, self._row(kf_id)
         rows, _, radians = self._around(nodes.anchored, row, nodes.frame, factor * SAME_METRES)
-        return nodes.kf_id[rows[radians < SAME_RADIANS]].tolist()
+        return nodes.kf_id[rows[(radians < SAME_RADIANS) | (rows == row)]].tolist()
 
     def around(self, kf_id: int) -> tuple[I64, F64]:
         """Ids (K,) of all keyframes and their poses (K, 4, 4) in the camera of one, NaN where nothing leads there."""

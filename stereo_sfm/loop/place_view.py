@@ -9,6 +9,7 @@ import numpy as np
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.loop import binary
+from stereo_sfm.loop.other_camera import seen_by
 from stereo_sfm.types import F64, I64, U8, Bool, Keyframe
 
 KEPT = 64  # newest results: the same keyframes are candidates again and again
@@ -29,8 +30,15 @@ class PlaceView:
 
 
 @functools.lru_cache(maxsize=KEPT)
-def place_view_of(keyframe: Keyframe, rig: Rig, disparity_sigma: float, sideways: bool = False) -> PlaceView:
-    """Corners of a keyframe (`sideways`: those of the views that face the shelves), then its points."""
+def place_view_of(
+    keyframe: Keyframe, rig: Rig, disparity_sigma: float, sideways: bool = False, own: Rig | None = None
+) -> PlaceView:
+    """Corners of a keyframe (`sideways`: those of the views that face the shelves), then its points.
+
+    Args:
+        rig: whose pixels the view has. own: of the keyframe, None: the same. What `rig` could not see is left out.
+    """
+    own = own or rig
     c = keyframe.sides if sideways else keyframe.corners
     uv_left = np.concatenate([c.uv_left, keyframe.uv_left], dtype=np.float64)
     uv_right = np.concatenate([c.uv_right, keyframe.uv_right], dtype=np.float64)
@@ -38,13 +46,14 @@ def place_view_of(keyframe: Keyframe, rig: Rig, disparity_sigma: float, sideways
     descriptors = np.concatenate([c.descriptors, keyframe.descriptors])
     ids = np.concatenate([np.full(len(c), -1, np.int64), keyframe.point_ids])
     corner = np.arange(len(ids)) < len(c)
-    rows = np.flatnonzero(binary.present(descriptors))
+    uv_left, uv_right = seen_by(rig, own, uv_left, uv_right, points)
+    rows = np.flatnonzero(binary.present(descriptors) & (own is rig or rig.left.inside(uv_left)))
     return PlaceView(
         ids[rows],
         uv_left[rows],
         uv_right[rows],
         points[rows],
-        rig.range_sigmas(points[rows], disparity_sigma),
+        own.range_sigmas(points[rows], disparity_sigma),
         descriptors[rows],
         corner[rows],
         rows,

@@ -9,6 +9,7 @@ The retail paper's equations 19-21 (local and full optimisation).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,6 +65,7 @@ class Bundle:
     sigma: F64 | None = None  # (M, 2) px of (left, right); None: 1
     level: Level | None = None  # what the keyframes measured of gravity; None: nothing
     motions: MotionFactors | None = None  # what IMU and wheels measured between them; None: nothing
+    kf_rig: I64 | None = None  # (K,) which of several rigs took a keyframe; None: there is one
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,49 +93,71 @@ class _Prior:
     cost: float
 
 
+class _OneRig:
+    """A rig for the kernels, and the rows of a table that it took."""
+
+    def __init__(self, rig: Rig, rows: I64 | slice) -> None:
+        right = rig.right if rig.right is not None else rig.left
+        right_T_left = se3.inverse(rig.left_T_right)
+        self.rows, self.stereo = rows, rig.stereo
+        self.cams = (rig.left.model_id, rig.left.params, right.model_id, right.params)
+        self.right_T_left = np.ascontiguousarray(right_T_left[:3, :3]), right_T_left[:3, 3].copy()
+
+
 class _Table:
     """Observations of the moving or of the fixed keyframes, sorted by point, in columns for the kernels."""
 
-    def __init__(self, rig: Rig, bundle: Bundle, config: BundleConfig, rows: I64) -> None:
+    def __init__(self, rigs: Sequence[Rig], bundle: Bundle, config: BundleConfig, rows: I64) -> None:
         self.rows = rows = rows[np.argsort(bundle.obs_pt[rows], kind="stable")]
         self.kf = np.ascontiguousarray(bundle.obs_kf[rows], np.int64)
         self.pt = np.ascontiguousarray(bundle.obs_pt[rows], np.int64)
         self.starts = np.searchsorted(self.pt, np.arange(len(bundle.points) + 1))
         self._left = np.ascontiguousarray(bundle.uv_left[rows], float)
         self._right = np.ascontiguousarray(bundle.uv_right[rows], float)
+        which = None if bundle.kf_rig is None else bundle.kf_rig[self.kf]
+        self._rigs = [_OneRig(rig, slice(None) if which is None else which == i) for i, rig in enumerate(rigs)]
         finite = np.isfinite(self._left)  # by columns: numpy takes ten times as long to reduce rows of two
-        seen = np.stack([finite[:, 0] & finite[:, 1], np.isfinite(self._right[:, 0]) & rig.stereo], 1)
+        seen = np.stack([finite[:, 0] & finite[:, 1], np.isfinite(self._right[:, 0])], 1)
+        for rig in self._rigs:
+            seen[rig.rows, 1] &= rig.stereo
         sigma = np.ones(seen.shape) if bundle.sigma is None else bundle.sigma[rows]
         self._weights = np.where(seen, 1.0 / sigma, 0.0)  # (M, 2)
         self.trust = np.ones(len(bundle.points))  # (P,) factor of the loss of the points' disparities
         self.use = seen.copy()  # (M, 2) images that count
-        right = rig.right if rig.right is not None else rig.left
-        right_T_left = se3.inverse(rig.left_T_right)
-        self._cams = (rig.left.model_id, rig.left.params, right.model_id, right.params)
-        self._right_T_left = np.ascontiguousarray(right_T_left[:3, :3]), right_T_left[:3, 3].copy()
         self._config = config
         self.cauchy = 0.0  # above 0: `linearize` uses Cauchy's loss of this scale in sigmas
         self.limit = 0.0  # above 0: the next `linearize` determines which images count
 
     def linearize(self, state: _State) -> tuple[Linear, float]:
         """Quadratic models of the observations at a state, and their robust cost."""
-        n = len(self.kf)
+        n, cost = len(self.kf), 0.0
         out: Linear = (np.empty((n, 6)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 2)))
         scale, redescends = self.cauchy or float(self._config.huber), self.cauchy > 0
-        cost = kernels.linearize(
-            *(state.rot, state.pos, state.points, self.kf, self.pt, self._left, self._right, self._weights),
-            *(self.trust, self.use, self.limit, self._cams, *self._right_T_left, scale),
-            *(redescends, self._config.joint_loss, out),
-        )
+        for rig in self._rigs:
+            use, of_rig = self.use[rig.rows], tuple(column[rig.rows] for column in out)
+            cost += kernels.linearize(
+                *(state.rot, state.pos, state.points, *self._columns(rig)),
+                *(self.trust, use, self.limit, rig.cams, *rig.right_T_left, scale),
+                *(redescends, self._config.joint_loss, of_rig),
+            )
+            self.use[rig.rows] = use  # of several rigs, the rows are copies
+            for column, part in zip(out, of_rig, strict=True):
+                column[rig.rows] = part
         self.limit = 0.0
         return out, float(cost)
 
+    def _columns(self, rig: _OneRig) -> tuple[I64, I64, F64, F64, F64]:
+        """Keyframes, points, left and right pixels, weights of a rig's rows."""
+        rows = rig.rows
+        return self.kf[rows], self.pt[rows], self._left[rows], self._right[rows], self._weights[rows]
+
     def add_disparity_errors(self, state: _State, total: F64, information: F64) -> None:
         """Add the weighted disparity errors of the points' observations, and their weights, to (P,) and (P,)."""
-        kernels.add_disparity_errors(
-            *(state.rot, state.pos, state.points, self.kf, self.pt, self._left, self._right, self._weights),
-            *(self.use, self._cams, *self._right_T_left, total, information),
-        )
+        for rig in self._rigs:
+            kernels.add_disparity_errors(
+                *(state.rot, state.pos, state.points, *self._columns(rig)),
+                *(self.use[rig.rows], rig.cams, *rig.right_T_left, total, information),
+            )
 
     def sum_up(self, rot: F64, lin: Linear) -> tuple[F64, F64]:
         """(P, 6) and (P, 3): the quadratic models of the points, in world axes."""
@@ -159,12 +183,13 @@ class _State:
 
 
 class _Solver:
-    def __init__(self, rig: Rig, bundle: Bundle, config: BundleConfig) -> None:
+    def __init__(self, rigs: Sequence[Rig], bundle: Bundle, config: BundleConfig) -> None:
         self.config = config
-        self._weighs_disparities = config.disparity_sigmas > 0 and rig.stereo and not rig.depth
+        two_cameras = any(rig.second_camera is not None for rig in rigs)
+        self._weighs_disparities = config.disparity_sigmas > 0 and two_cameras
         moves = ~bundle.fixed[bundle.obs_kf]
-        self.table = _Table(rig, bundle, config, np.flatnonzero(moves))
-        self.fixed = _Table(rig, bundle, config, np.flatnonzero(~moves))
+        self.table = _Table(rigs, bundle, config, np.flatnonzero(moves))
+        self.fixed = _Table(rigs, bundle, config, np.flatnonzero(~moves))
         self.free = np.where(bundle.fixed, -1, np.cumsum(~bundle.fixed) - 1).astype(np.int64)
         self.moving = np.flatnonzero(~bundle.fixed)
         self.level = bundle.level
@@ -367,8 +392,10 @@ def _disparity_weights(total: F64, information: F64, sigmas: float) -> F64:
     return weight
 
 
-def bundle_adjust(rig: Rig, bundle: Bundle, config: BundleConfig | None = None) -> BundleResult:
+def bundle_adjust(rig: Rig | Sequence[Rig], bundle: Bundle, config: BundleConfig | None = None) -> BundleResult:
     """Poses and points that minimise the robust reprojection error.
+
+    Args: rig, that took the keyframes; several with `Bundle.kf_rig`.
 
     A point without inliers stays where it is; one on a single ray moves onto it and constrains no pose.
 
@@ -377,7 +404,7 @@ def bundle_adjust(rig: Rig, bundle: Bundle, config: BundleConfig | None = None) 
     """
     config = config or BundleConfig()
     _check(bundle)
-    solver = _Solver(rig, bundle, config)
+    solver = _Solver([rig] if isinstance(rig, Rig) else rig, bundle, config)
     state = _State(
         np.ascontiguousarray(bundle.world_T_kf[:, :3, :3], float),
         np.ascontiguousarray(bundle.world_T_kf[:, :3, 3], float),

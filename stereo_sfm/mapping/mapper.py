@@ -49,7 +49,7 @@ from stereo_sfm.mapping.correction import apply_loop, fuse_sides, loop_is_known,
 from stereo_sfm.mapping.insertion import insert_keyframe
 from stereo_sfm.mapping.level import down_of
 from stereo_sfm.mapping.map import Map, MapSnapshot
-from stereo_sfm.mapping.recalibration import recalibrate
+from stereo_sfm.mapping.recalibration import calibration_update, recalibrate
 from stereo_sfm.mapping.row_errors import RowMonitor
 from stereo_sfm.mapping.self_calibration import Revision, SelfCalibration
 from stereo_sfm.mapping.sensor_calibration import SensorCalibration
@@ -113,6 +113,7 @@ class Mapper:
         """
         self._config, self._rig, self._spans = config, rig, spans or NoSpans()
         self._source_rig, self._calibration = rig, calibration
+        self._terms: F64 = np.zeros(RIG_TERMS)  # corrections so far
         self._revised: CalibrationUpdate | None = None  # for the next update
         self._sensors = sensors
         self._sensor_update: SensorUpdate | None = None  # of this step
@@ -247,6 +248,11 @@ class Mapper:
         """The rig of the map, with the corrections estimated so far."""
         return self._rig
 
+    @property
+    def calibration(self) -> tuple[Rig, F64]:
+        """The rig as the run began, and the terms (8,) that make it that of the map."""
+        return self._source_rig, self._terms
+
     def _calibrate_sensors(self, keyframe: Keyframe) -> None:
         """Compare IMU and wheels with the poses by the images, where that is asked for."""
         if self._sensors is not None:
@@ -260,11 +266,9 @@ class Mapper:
         assert self._calibration is not None
         row, applied = len(self.map.keyframes) - 1, self._calibration.applies
         kf_id, stamp_ns = int(self.map.keyframes.kf_id[row]), int(self.map.keyframes.stamp_ns[row])
-        self._revised = CalibrationUpdate(
-            self._version, kf_id, stamp_ns, revision.terms, revision.covariance, revision.since_kf_id, applied,
-            revision.why, revision.text,
-        )  # fmt: skip
+        self._revised = calibration_update(revision, self._version, kf_id, stamp_ns, applied)
         if applied:
+            self._terms = revision.terms
             changes = [*revision.on_the_way, (revision.since_kf_id, revision.terms)]
             rigs = [(self.map.kf_row(since), with_terms(self._source_rig, terms)) for since, terms in changes]
             recalibrate(self.map, [(0, self._rig), *rigs])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Protocol
 
-from stereo_sfm.types import Keyframe, LoopResult, MapUpdate
+from stereo_sfm.types import F64, Keyframe, LoopResult, MapUpdate
 
 if TYPE_CHECKING:
     from stereo_sfm.calib.rig import Rig
@@ -39,6 +39,11 @@ class AnyMapper(Protocol):
     @property
     def rig(self) -> Rig:
         """The rig that the map is true of."""
+        ...
+
+    @property
+    def calibration(self) -> tuple[Rig, F64]:
+        """The rig as the run began, and the terms (8,) of its correction."""
         ...
 
     # -- what is kept ------------------------------------------------------------------------------------------------

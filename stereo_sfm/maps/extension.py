@@ -11,6 +11,8 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import LoopConfig, MapperConfig
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.mapper import Mapper
+from stereo_sfm.mapping.self_calibration import SelfCalibration
+from stereo_sfm.mapping.sensor_calibration import SensorCalibration
 from stereo_sfm.maps.localizer import Localizer
 from stereo_sfm.maps.relocalization import Location
 from stereo_sfm.timing import NoSpans
@@ -21,15 +23,25 @@ class Extension(Mapper):
     """A mapper whose updates are in the frame of a saved map once a keyframe was relocalized in it.
 
     Until then they are in the session's own map frame, which begins at its first keyframe; the update of the first
-    relocalization contains all keyframes and points, transformed. The session's own map (`map`) keeps its frame:
+    relocalization contains all keyframes and points, transformed, and so does that of the first one after a correction
+    of the rig, which changes where the session's points are. The session's own map (`map`) keeps its frame:
     `maps.merge` joins the two when the run is saved.
     """
 
     def __init__(
-        self, config: MapperConfig, rig: Rig, spans: NoSpans | None, loop_config: LoopConfig, localizer: Localizer
+        self,
+        config: MapperConfig,
+        rig: Rig,
+        spans: NoSpans | None,
+        loop_config: LoopConfig,
+        localizer: Localizer,
+        calibration: SelfCalibration | None = None,
+        sensors: SensorCalibration | None = None,
     ) -> None:
-        super().__init__(config, rig, spans, loop_config)
+        """Args: localizer, in the saved map, without a self-calibration of its own; the others as the mapper's."""
+        super().__init__(config, rig, spans, loop_config, calibration, sensors)
         self._localizer = localizer
+        self._misplaced = True  # no keyframe was relocalized since the rig was corrected
         self._saved_T_session: F64 | None = None
         self._found: Location | None = None  # of the first relocalized keyframe
         self._found_kf: tuple[int, F64] = -1, np.eye(4)  # a living keyframe, and the relocalized one's pose in it
@@ -38,15 +50,17 @@ class Extension(Mapper):
         """As the mapper's, in the saved map's frame once it is known."""
         update = super().step(keyframe, loop)
         self._follow_found()
-        if self._saved_T_session is not None:
-            return self._in_saved_map(update, self._saved_T_session)
-        place = self._localizer.step(keyframe)
-        if not self._localizer.found:
+        self._misplaced |= update.calibration is not None and update.calibration.applied
+        if self._misplaced:
+            place = self._localizer.step(keyframe)
+            if self._localizer.last is not None and self._localizer.last.found:
+                self._found, self._found_kf = self._localizer.last, (keyframe.kf_id, np.eye(4))
+                self._saved_T_session = se3.orthonormalize(place.map_T_odom @ se3.inverse(update.map_T_odom))
+                self._misplaced = False
+                update = self._with_everything(update)
+        if self._saved_T_session is None:
             return update
-        assert self._localizer.last is not None
-        self._found, self._found_kf = self._localizer.last, (keyframe.kf_id, np.eye(4))
-        self._saved_T_session = se3.orthonormalize(place.map_T_odom @ se3.inverse(update.map_T_odom))
-        return self._in_saved_map(self._with_everything(update), self._saved_T_session)
+        return self._in_saved_map(update, self._saved_T_session)
 
     def finish(self, loops: Sequence[LoopResult]) -> MapUpdate | None:
         """As the mapper's."""
@@ -62,7 +76,7 @@ class Extension(Mapper):
         return self._saved_T_session is not None
 
     def place(self) -> LoopResult | None:
-        """The first relocalization, as a loop from a keyframe of the saved map to a live one of the session, or None.
+        """The relocalization, as a loop from a keyframe of the saved map to a live one of the session, or None.
 
         Ids are those of the respective map.
         """

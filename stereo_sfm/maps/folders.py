@@ -10,8 +10,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.errors import StereoSfmError
@@ -81,27 +79,32 @@ def make_mapper(config: Config, rig: Rig, spans: NoSpans, folders: MapFolders) -
     from stereo_sfm.mapping.self_calibration import SelfCalibration
     from stereo_sfm.mapping.sensor_calibration import SensorCalibration
 
+    wanted = SelfCalibration.wanted(config, rig) if config.mapper.enabled else None
+    sensors = SensorCalibration.wanted(config, rig)
     if folders.map_in is None:
-        calibrations = SelfCalibration.wanted(config, rig), SensorCalibration.wanted(config, rig)
-        return Mapper(config.mapper, rig, spans, config.loop, *calibrations)
+        return Mapper(config.mapper, rig, spans, config.loop, wanted, sensors)
     from stereo_sfm.maps.extension import Extension
     from stereo_sfm.maps.localizer import Localizer
     from stereo_sfm.maps.saved_map import load_map
 
     saved = load_map(folders.map_in, rig)
-    localizer = Localizer(saved.snapshot, rig, configured_vocabulary(config.loop), config.loop)
-    return localizer if folders.localize_only else Extension(config.mapper, rig, spans, config.loop, localizer)
+    vocabulary, own = configured_vocabulary(config.loop), saved.keyframe_rigs([rig])
+    if folders.localize_only:
+        return Localizer(saved.snapshot, rig, vocabulary, config.loop, own, wanted)
+    localizer = Localizer(saved.snapshot, rig, vocabulary, config.loop, own)
+    return Extension(config.mapper, rig, spans, config.loop, localizer, wanted, sensors)
 
 
 def saved_map_of(mapper: AnyMapper, config: Config) -> SavedMap | None:
     """The map of a run for saving; None if nothing was mapped."""
+    from stereo_sfm.maps.cameras import MapCamera
     from stereo_sfm.maps.saved_map import SavedMap
 
     snapshot = mapper.snapshot()
     if snapshot is None or not len(snapshot.kf_ids) or not len(snapshot.points):
         return None
     vocabulary = configured_vocabulary(config.loop)
-    return SavedMap(snapshot, mapper.rig, vocabulary.id, np.zeros(len(snapshot.kf_ids), np.int64))
+    return SavedMap.of_session(snapshot, MapCamera(*mapper.calibration), vocabulary.id)
 
 
 def save_result(mapper: AnyMapper, config: Config, folders: MapFolders) -> None:
@@ -143,7 +146,7 @@ def _merged(mapper: AnyMapper, session: SavedMap, map_in: Path, config: Config) 
     from stereo_sfm.maps.merge import merge
     from stereo_sfm.maps.saved_map import load_map
 
-    before = load_map(map_in, session.rig)
+    before = load_map(map_in)
     vocabulary = configured_vocabulary(config.loop)
     return merge([before, session], vocabulary, config.loop, config.mapper, mapper.place()).saved
 

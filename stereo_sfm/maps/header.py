@@ -9,8 +9,9 @@ from typing import Any
 
 from stereo_sfm.errors import StereoSfmError
 
-VERSION, READ = 4, (2, 3, 4)
-SIDES_SINCE, DOWN_SINCE = 3, 4  # 1 had no corners, 2 none in views that face the shelves, 3 no gravity
+VERSION, READ = 5, (2, 3, 4, 5)
+# 1 had no corners, 2 none in views that face the shelves, 3 no gravity, 4 one rig for all sessions
+SIDES_SINCE, DOWN_SINCE, CAMERAS_SINCE = 3, 4, 5
 KIND = "stereo_sfm_map"
 COUNTS = ("keyframes", "points", "observations", "sessions")
 

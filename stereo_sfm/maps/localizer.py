@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from stereo_sfm.calib.choice import with_terms
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import LoopConfig
 from stereo_sfm.geometry import se3
@@ -14,8 +15,10 @@ from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.mapping.level import mean_down
 from stereo_sfm.mapping.map import MapSnapshot
 from stereo_sfm.mapping.protocol import WithoutJobs
+from stereo_sfm.mapping.recalibration import calibration_update
+from stereo_sfm.mapping.self_calibration import SelfCalibration
 from stereo_sfm.maps.relocalization import Location, Relocalizer, not_found
-from stereo_sfm.types import F64, Keyframe, LoopResult, MapUpdate
+from stereo_sfm.types import F64, RIG_TERMS, CalibrationUpdate, Keyframe, LoopResult, MapUpdate
 
 LOST_AFTER = 5  # keyframes not found near the prediction before the whole map is searched
 
@@ -30,9 +33,25 @@ class Localizer(WithoutJobs):
     map once the camera is located in it; before, and in a map without, what the newest keyframe measured.
     """
 
-    def __init__(self, snapshot: MapSnapshot, rig: Rig, vocabulary: Vocabulary, config: LoopConfig) -> None:
+    def __init__(
+        self,
+        snapshot: MapSnapshot,
+        rig: Rig,
+        vocabulary: Vocabulary,
+        config: LoopConfig,
+        own: Sequence[Rig] = (),
+        calibration: SelfCalibration | None = None,
+    ) -> None:
+        """Begin before the first keyframe.
+
+        Args:
+            snapshot: the map. rig: of the camera. own: the rigs of the map's keyframes, where they have other ones.
+            calibration: estimates corrections of the rig; None: the rig stays.
+        """
         self.rig, self.saved = rig, snapshot
-        self._relocalizer = Relocalizer(snapshot, rig, vocabulary, config)
+        self._source_rig, self._calibration = rig, calibration
+        self._terms = self._tracked_terms = np.zeros(RIG_TERMS)  # of its correction: the newest, and the keyframes'
+        self._relocalizer = Relocalizer(snapshot, rig, vocabulary, config, own)
         self._saved_down = mean_down(snapshot.map_T_kf, snapshot.down, snapshot.down_sigma)
         self._config = config
         self._map_T_odom: F64 = np.eye(4)
@@ -47,6 +66,7 @@ class Localizer(WithoutJobs):
     def step(self, keyframe: Keyframe, loop: LoopResult | None = None) -> MapUpdate:
         """Localize a keyframe in the map; `loop` belongs to the mapper's signature and is unused."""
         self._version += 1
+        revised = self._revise(keyframe)
         if keyframe.submap_id != self._submap:
             self._submap, self._failures, self._waiting = keyframe.submap_id, LOST_AFTER, []
             self._unconfirmed = None
@@ -67,8 +87,27 @@ class Localizer(WithoutJobs):
             culled_point_ids=np.zeros(0, np.int64),
             fused_point_ids=np.zeros((0, 2), np.int64),
             map_T_odom=self._map_T_odom.copy(),
+            calibration=revised,
             down=self._down(keyframe),
         )
+
+    @property
+    def calibration(self) -> tuple[Rig, F64]:
+        """The rig as the run began, and the terms (8,) of its correction so far."""
+        return self._source_rig, self._terms
+
+    def _revise(self, keyframe: Keyframe) -> CalibrationUpdate | None:
+        """Correct the rig where the keyframes show that it is wrong."""
+        if not np.array_equal(keyframe.rig_terms, self._tracked_terms):  # the tracker's rig was corrected
+            self._tracked_terms = keyframe.rig_terms
+            self._relocalizer.use(with_terms(self._source_rig, self._tracked_terms))
+        revision = None if self._calibration is None else self._calibration.add(keyframe)
+        if self._calibration is None or revision is None:
+            return None
+        if self._calibration.applies:
+            self._terms, self.rig = revision.terms, with_terms(self._source_rig, revision.terms)
+        where = self._version, keyframe.kf_id, keyframe.stamp_ns
+        return calibration_update(revision, *where, self._calibration.applies)
 
     def finish(self, loops: Sequence[LoopResult]) -> MapUpdate | None:
         """No pending work."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,7 @@ from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import LoopConfig, MapperConfig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.loop.closer import LoopCloser
+from stereo_sfm.loop.other_camera import widest
 from stereo_sfm.loop.vocabulary import Vocabulary
 from stereo_sfm.mapping import window
 from stereo_sfm.mapping.bundle import bundle_adjust
@@ -53,11 +54,12 @@ def merge(
         place: a known loop from the first map to the second, in the ids of each.
 
     Raises:
-        StereoSfmError: different cameras, or a map that no loop joins to the others.
+        StereoSfmError: maps of one and of two cameras, or a map that no loop joins to the others.
     """
     side_by_side = joined(list(maps))
     map_ = restore_for_merging(side_by_side.snapshot, mapper)
-    closer = session_closer(config, side_by_side.rig, vocabulary)
+    rigs = side_by_side.keyframe_rigs()
+    closer = session_closer(config, rigs, vocabulary)
     sessions, stamps = side_by_side.sessions, side_by_side.snapshot.stamp_ns
     begins = {k: int(stamps[sessions == k].min()) for k in side_by_side.session_ids}  # sessions have unrelated clocks
     loops: list[LoopResult] = []
@@ -65,20 +67,20 @@ def merge(
     if place is not None:
         fused += close_loop(map_, in_joined_ids(place, maps[0]), loops, config, mapper)
     others_begin = int(_ends(maps, "kf_ids")[0])
-    for keyframe, k in zip(side_by_side.snapshot.keyframes(), sessions.tolist(), strict=True):
+    for keyframe, k, rig in zip(side_by_side.snapshot.keyframes(), sessions.tolist(), rigs, strict=True):
         keyframe = dataclasses.replace(keyframe, stamp_ns=keyframe.stamp_ns - begins[k])
         if keyframe.kf_id < others_begin:  # its own loops are in the map
-            closer.add(keyframe)
+            closer.add(keyframe, rig)
             continue
-        result = closer.step(keyframe)
+        result = closer.step(keyframe, rig)
         if result.candidate_kf_id >= 0:
             fused += close_loop(map_, result, loops, config, mapper)
     _check_joined(maps, loops)
-    full_adjustment(map_, side_by_side.rig, mapper)
+    full_adjustment(map_, dict(zip(side_by_side.snapshot.kf_ids.tolist(), rigs, strict=True)), mapper)
     snapshot = map_.snapshot()
     session_of = dict(zip(side_by_side.snapshot.kf_ids.tolist(), sessions.tolist(), strict=True))
     merged = np.array([session_of[k] for k in snapshot.kf_ids.tolist()], np.int64)
-    return Merge(SavedMap(snapshot, side_by_side.rig, vocabulary.id, merged), loops, fused)
+    return Merge(SavedMap(snapshot, side_by_side.cameras, vocabulary.id, merged), loops, fused)
 
 
 def close_loop(map_: Map, loop: LoopResult, loops: list[LoopResult], config: LoopConfig, mapper: MapperConfig) -> int:
@@ -113,9 +115,12 @@ def restore_for_merging(snapshot: MapSnapshot, mapper: MapperConfig) -> Map:
     return map_
 
 
-def session_closer(config: LoopConfig, rig: Rig, vocabulary: Vocabulary) -> LoopCloser:
-    """A loop closer that looks for every link between sessions."""
-    return LoopCloser(dataclasses.replace(config, pause=MERGE_PAUSE), rig, vocabulary)
+def session_closer(config: LoopConfig, rigs: Sequence[Rig], vocabulary: Vocabulary) -> LoopCloser:
+    """A loop closer that looks for every link between sessions, of keyframes that these rigs took; the last the newest.
+
+    Places are compared as the rig with the widest view sees them.
+    """
+    return LoopCloser(dataclasses.replace(config, pause=MERGE_PAUSE), widest(rigs[::-1]), vocabulary)
 
 
 def share_a_session(a: SavedMap, b: SavedMap) -> bool:
@@ -161,13 +166,19 @@ def _check_joined(maps: Sequence[SavedMap], loops: list[LoopResult]) -> None:
         )
 
 
-def full_adjustment(map_: Map, rig: Rig, config: MapperConfig) -> None:
+def full_adjustment(map_: Map, rigs: Mapping[int, Rig], config: MapperConfig) -> None:
     """Bundle adjustment of the whole map with the mapper's settings, the first keyframe fixed.
 
     Outlier observations are removed afterwards, and points that too few keyframes still observe.
+
+    Args: rigs, by the ids of the keyframes that they took.
     """
     part = window.whole_map(map_)
-    result = bundle_adjust(rig, part.bundle, window.bundle_config(config))
+    taken = [rigs[k] for k in map_.keyframes.kf_id[part.kf_rows].tolist()]
+    number = {rig: i for i, rig in enumerate(dict.fromkeys(taken))}
+    which = np.array([number[rig] for rig in taken], np.int64) if len(number) > 1 else None
+    bundle = dataclasses.replace(part.bundle, kf_rig=which)
+    result = bundle_adjust(list(number), bundle, window.bundle_config(config))
     window.write_back(map_, part, result)
     map_.cull_points(part.pt_rows[map_.points.obs_count[part.pt_rows] < config.min_observations])
     log.info("full bundle adjustment: cost %.1f to %.1f", result.initial_cost, result.cost)

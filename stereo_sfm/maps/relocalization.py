@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from stereo_sfm.geometry import se3
 from stereo_sfm.loop.absolute_pose import Matches, joined, refine_pose
 from stereo_sfm.loop.cloud import Cloud, gather
 from stereo_sfm.loop.database import PlaceDatabase
+from stereo_sfm.loop.other_camera import widest
 from stereo_sfm.loop.place_view import PlaceView, place_view_of
 from stereo_sfm.loop.sideways import (
     MIN_CORNERS,
@@ -78,8 +80,19 @@ def _distinct(a: Location, b: Location) -> bool:
 class Relocalizer:
     """Finds cameras in a map. Results depend on the map, the configuration and the view only."""
 
-    def __init__(self, snapshot: MapSnapshot, rig: Rig, vocabulary: Vocabulary, config: LoopConfig) -> None:
-        self._map, self._rig = snapshot, rig
+    def __init__(
+        self,
+        snapshot: MapSnapshot,
+        rig: Rig,
+        vocabulary: Vocabulary,
+        config: LoopConfig,
+        map_rigs: Sequence[Rig] = (),
+    ) -> None:
+        """Args:
+        rig: of the camera. map_rigs: of each keyframe of the map, the same object for equal ones; none: the camera's.
+        """
+        self._map, self._own, self._camera = snapshot, list(map_rigs) or [rig] * len(snapshot.kf_ids), rig
+        self._rig = widest([rig, *dict.fromkeys(self._own)])  # whose pixels are compared
         self._keyframes = snapshot.keyframes()
         self._described = np.flatnonzero([k.described for k in self._keyframes])
         self._undescribed = np.flatnonzero([not k.described for k in self._keyframes])
@@ -112,6 +125,12 @@ class Relocalizer:
         self._has_sides = any(len(k.sides) >= MIN_CORNERS for k in self._keyframes)
         for keyframe in self._keyframes:
             self._fronts.add(keyframe)
+
+    def use(self, camera: Rig) -> None:
+        """Use a corrected rig of the camera."""
+        self._camera = camera
+        self._rig = widest([camera, *dict.fromkeys(self._own)])
+        self._cloud.cache_clear()
 
     def locate(self, keyframe: Keyframe) -> Location:
         """Find the camera of a keyframe (its pose is ignored) in the map, if need be from another direction."""
@@ -260,7 +279,7 @@ class Relocalizer:
         return verify_near(kf_T_cam, view, self._cloud(row, sideways), self._rig, self._config_of(sideways))
 
     def _view(self, keyframe: Keyframe, sideways: bool) -> PlaceView:
-        return place_view_of(keyframe, self._rig, self._config.disparity_sigma_px, sideways)
+        return place_view_of(keyframe, self._rig, self._config.disparity_sigma_px, sideways, self._camera)
 
     def _config_of(self, sideways: bool) -> LoopConfig:
         return self._side_config if sideways else self._config
@@ -273,7 +292,8 @@ class Relocalizer:
         order = np.argsort(-shared, kind="stable")[: self._config.relocalize_keyframes]
         order = order[shared[order] > 0]
         centre, *others = (self._keyframes[k] for k in order.tolist())
-        cloud = gather(centre, others, self._rig, self._config.disparity_sigma_px, sideways)
+        own = [self._own[k] for k in order.tolist()]
+        cloud = gather(centre, others, self._rig, self._config.disparity_sigma_px, sideways, own)
         mapped = cloud.ids >= 0
         at = np.searchsorted(self._map.pt_ids, cloud.ids[mapped])
         sigmas = cloud.sigmas.copy()

@@ -1,4 +1,4 @@
-"""A saved map: a versioned folder of `map.json`, `rig.yaml` and four npz files, without images.
+"""A saved map: a versioned folder of `map.json`, `cameras.yaml`, `rig.yaml` and four npz files, without images.
 
 Equal maps give equal bytes. An invalid folder gives a one-line error.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,20 +18,26 @@ from stereo_sfm.arrays import read_arrays
 from stereo_sfm.calib.formats.native import read_native, write_native
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.geometry import se3
-from stereo_sfm.geometry.cameras import Camera
 from stereo_sfm.input_file import read_bytes
 from stereo_sfm.mapping.map import Map, MapSnapshot
+from stereo_sfm.maps.cameras import MapCamera, cameras_text, difference, read_cameras, unified
 from stereo_sfm.maps.columns import check_columns
-from stereo_sfm.maps.header import DOWN_SINCE, SIDES_SINCE, check_counts, checksum, damaged, read_header, write_header
+from stereo_sfm.maps.header import (
+    CAMERAS_SINCE,
+    DOWN_SINCE,
+    SIDES_SINCE,
+    check_counts,
+    checksum,
+    damaged,
+    read_header,
+    write_header,
+)
 from stereo_sfm.maps.replace_folder import replaced_folder
 from stereo_sfm.types import I64, MapUpdate, Trajectory
 
 log = logging.getLogger("stereo_sfm")
 
-# What self-calibration may change of a rig: radians, share of the baseline, share of the right focal length.
-SAME_TURN, SAME_SHIFT, SAME_FOCAL = 0.01, 0.02, 0.01
-
+RIG, CAMERAS = "rig.yaml", "cameras.yaml"
 _FILES: dict[str, tuple[str, ...]] = {
     "keyframes": ("kf_ids", "frame_ids", "stamp_ns", "submap_ids", "map_T_kf", "down", "down_sigma", "sessions"),
     "points": ("pt_ids", "points", "anchors", "seen", "expected"),
@@ -45,13 +51,30 @@ class SavedMap:
     """A map with everything needed to use it again."""
 
     snapshot: MapSnapshot  # keyframes, points and observations
-    rig: Rig  # calibration of the camera that mapped
+    cameras: Mapping[int, MapCamera]  # of each session, by its number
     vocabulary_id: str  # of the visual words that its keyframes are found by
     sessions: I64  # (K,) session of each keyframe: 0, 1, ...
+
+    @staticmethod
+    def of_session(snapshot: MapSnapshot, camera: MapCamera, vocabulary_id: str) -> SavedMap:
+        """The map of one session."""
+        return SavedMap(snapshot, {0: camera}, vocabulary_id, np.zeros(len(snapshot.kf_ids), np.int64))
 
     def __len__(self) -> int:
         """Number of keyframes."""
         return len(self.snapshot.kf_ids)
+
+    @property
+    def rig(self) -> Rig:
+        """The rig of the newest session."""
+        return self.cameras[int(self.sessions.max())].rig
+
+    def keyframe_rigs(self, first: Sequence[Rig] = ()) -> list[Rig]:
+        """The rig of each keyframe, one object for equal ones; of those equal to one of `first`, that object."""
+        used = self.session_ids
+        rigs = unified([*first, *(self.cameras[k].rig for k in used)])[len(first) :]
+        of = dict(zip(used, rigs, strict=True))
+        return [of[k] for k in self.sessions.tolist()]
 
     @property
     def session_ids(self) -> list[int]:
@@ -61,7 +84,7 @@ class SavedMap:
 
 def map_files() -> frozenset[str]:
     """The names of the files of a map."""
-    return frozenset({"map.json", "rig.yaml", *(f"{name}.npz" for name in _FILES)})
+    return frozenset({"map.json", RIG, CAMERAS, *(f"{name}.npz" for name in _FILES)})
 
 
 def save_map(saved: SavedMap, folder: Path | str, beside: Mapping[str, bytes] | None = None) -> None:
@@ -83,8 +106,9 @@ def save_map(saved: SavedMap, folder: Path | str, beside: Mapping[str, bytes] | 
             path = draft / f"{name}.npz"
             np.savez_compressed(path, **{c: _column(saved, c) for c in columns})
             checksums[name] = checksum(path.read_bytes())
-        write_native(saved.rig, draft / "rig.yaml")
-        checksums["rig"] = checksum((draft / "rig.yaml").read_bytes())
+        write_native(saved.rig, draft / RIG)
+        (draft / CAMERAS).write_text(cameras_text(saved.cameras, saved.session_ids), encoding="utf-8")
+        checksums |= {"rig": checksum((draft / RIG).read_bytes()), "cameras": checksum((draft / CAMERAS).read_bytes())}
         write_header(draft, _counts(saved), saved.vocabulary_id, checksums)
         for name, data in beside.items():
             (draft / name).write_bytes(data)
@@ -108,13 +132,15 @@ def load_map(folder: Path | str, rig: Rig | None = None) -> SavedMap:
 
     Args:
         folder: as written by `--map-out` and `save_map`.
-        rig: the camera to use the map with, checked against the map's own.
+        rig: the camera to use the map with. Another one than the map's is reported.
 
     Raises:
-        StereoSfmError: no map, another version, damaged, empty, or built with another camera.
+        StereoSfmError: no map, another version, damaged, empty, or built with two cameras where `rig` is one, or the
+            other way round.
     """
     folder = Path(folder).expanduser()
     head = read_header(folder, (*_FILES, "rig"))
+    sessions_with_cameras = head["version"] >= CAMERAS_SINCE
     checksums = head["sha256"]
     columns: dict[str, Any] = {}
     try:
@@ -128,9 +154,11 @@ def load_map(folder: Path | str, rig: Rig | None = None) -> SavedMap:
             if name == "keyframes" and head["version"] < DOWN_SINCE:
                 data["down"], data["down_sigma"] = np.zeros((len(data["kf_ids"]), 3)), np.zeros(len(data["kf_ids"]))
             columns.update({c: data[c] for c in wanted})
-        if checksum((folder / "rig.yaml").read_bytes()) != checksums["rig"]:
-            raise ValueError("rig")
-        own = read_native(folder / "rig.yaml")
+        for name, file in (("rig", RIG), ("cameras", CAMERAS))[: 1 + sessions_with_cameras]:
+            if checksum((folder / file).read_bytes()) != checksums[name]:
+                raise ValueError(name)
+        own = MapCamera(read_native(folder / RIG))
+        cameras = read_cameras(folder / CAMERAS) if sessions_with_cameras else {}
     except (OSError, KeyError, ValueError, StereoSfmError):
         raise damaged(folder, "a file is missing or was changed") from None
     try:
@@ -143,51 +171,33 @@ def load_map(folder: Path | str, rig: Rig | None = None) -> SavedMap:
     snapshot = MapSnapshot(**columns)
     if not len(snapshot.kf_ids) or not len(snapshot.points):
         raise StereoSfmError(f"the map {folder} is empty: it has no keyframes or no points")
-    if rig is not None and not same_rig(own, rig):
-        raise StereoSfmError(
-            f"the map {folder} was built with another camera ({describe_rig(own)}) than this one ({describe_rig(rig)})"
-        )
-    if rig is not None and abs(own.readout_s - rig.readout_s) > 1e-3:
+    saved = SavedMap(snapshot, cameras, head["vocabulary"], sessions)
+    if not sessions_with_cameras:
+        cameras.update(dict.fromkeys(saved.session_ids, own))
+    if not cameras.keys() >= set(saved.session_ids):
+        raise damaged(folder, f"{CAMERAS} lacks a session")
+    check_counts(folder, head, _counts(saved))
+    if rig is not None:
+        _check_camera(folder, saved.cameras[saved.session_ids[-1]], rig)
+    return saved
+
+
+def _check_camera(folder: Path, last: MapCamera, rig: Rig) -> None:
+    """Report what another camera differs by.
+
+    Raises:
+        StereoSfmError: distances are known to one of them only.
+    """
+    own = last.rig
+    if own.stereo != rig.stereo:
+        raise StereoSfmError(f"the map {folder} cannot be used with this camera: {difference(own, rig)}")
+    if min((difference(x, rig, corrected=True) for x in (own, last.calibrated)), key=len):
+        log.warning("the map %s was built with another camera: this one has %s", folder, difference(own, rig))
+    if abs(own.readout_s - rig.readout_s) > 1e-3:
         log.warning(
             "the map %s was built with %s, this camera has %s: check readout_s in rig.yaml",
             folder, own.shutter, rig.shutter,
         )  # fmt: skip
-    saved = SavedMap(snapshot, own, head["vocabulary"], sessions)
-    check_counts(folder, head, _counts(saved))
-    return saved
-
-
-def _same_parameters(a: Camera, b: Camera, focal: float) -> bool:
-    return np.allclose(a.params[:2], b.params[:2], rtol=focal, atol=0) and np.allclose(
-        a.params[2:], b.params[2:], rtol=1e-6, atol=1e-9
-    )
-
-
-def same_rig(a: Rig, b: Rig) -> bool:
-    """Whether two rigs have the same models, sizes, parameters and relative pose.
-
-    Small differences, as from self-calibration, are allowed in rotation, baseline direction and focal length of the
-    right camera. Readouts may differ: pixels of maps are corrected to the stamps.
-    """
-    turned = np.linalg.norm(se3.log(se3.inverse(a.left_T_right) @ b.left_T_right)[3:])
-    shifted = np.linalg.norm(a.left_T_right[:3, 3] - b.left_T_right[:3, 3])
-    if a.depth != b.depth or turned > SAME_TURN or shifted > SAME_SHIFT * max(a.baseline, 1e-6):
-        return False
-    for x, y, focal in ((a.left, b.left, 1e-6), (a.right, b.right, SAME_FOCAL)):
-        if (x is None) != (y is None):
-            return False
-        if (
-            x is not None
-            and y is not None
-            and (x.model != y.model or x.size != y.size or not _same_parameters(x, y, focal))
-        ):
-            return False
-    return True
-
-
-def describe_rig(rig: Rig) -> str:
-    """A short description of a rig."""
-    return f"{rig.left.model} {rig.left.width}x{rig.left.height} f={rig.left.fx:.1f} b={1000 * rig.baseline:.0f} mm"
 
 
 def restore_map(snapshot: MapSnapshot) -> Map:
@@ -223,21 +233,23 @@ def joined(maps: list[SavedMap]) -> SavedMap:
     """Concatenate maps: ids, submaps and sessions of later ones are offset to follow those of earlier ones.
 
     Raises:
-        StereoSfmError: they were built with different cameras.
+        StereoSfmError: one was built with one camera, another with two.
     """
     first = maps[0]
     parts: dict[str, list[Any]] = {f.name: [] for f in dataclasses.fields(MapSnapshot)}
     sessions: list[Any] = []
+    cameras: dict[int, MapCamera] = {}
     raised = {"kf_ids": 0, "pt_ids": 0, "submap_ids": 0, "anchors": 0, "obs_kf": 0, "obs_pt": 0, "corner_kf": 0}
     next_session = 0
     for saved in maps:
-        if not same_rig(saved.rig, first.rig):
-            raise StereoSfmError("maps of different cameras cannot be merged")
+        if saved.rig.stereo != first.rig.stereo:
+            raise StereoSfmError(f"these maps cannot be merged: {difference(first.rig, saved.rig)}")
         s = saved.snapshot
         for name, values in parts.items():
             column = getattr(s, name)
             values.append(column + raised[name] if name in raised else column)
         sessions.append(saved.sessions + next_session)
+        cameras |= {next_session + k: saved.cameras[k] for k in saved.session_ids}
         next_session += int(saved.sessions.max()) + 1
         for name in ("kf_ids", "pt_ids", "submap_ids"):
             raised[name] += int(getattr(s, name).max()) + 1
@@ -245,7 +257,7 @@ def joined(maps: list[SavedMap]) -> SavedMap:
             raised[name] += len(s.kf_ids)
         raised["obs_pt"] += len(s.pt_ids)
     snapshot = MapSnapshot(**{name: np.concatenate(values) for name, values in parts.items()})
-    return SavedMap(snapshot, first.rig, first.vocabulary_id, np.concatenate(sessions))
+    return SavedMap(snapshot, cameras, first.vocabulary_id, np.concatenate(sessions))
 
 
 def as_update(saved: SavedMap) -> MapUpdate:

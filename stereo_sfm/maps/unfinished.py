@@ -79,7 +79,7 @@ def publish(base: Path | None, session: Path, out: Path, config: Config) -> int:
     if place is None:
         raise StereoSfmError(f"the session was not found in the saved map {base} yet")
     vocabulary = configured_vocabulary(config.loop)
-    saved = update(load_map(base, part.rig), part, vocabulary, config.loop, config.mapper, place).saved
+    saved = update(load_map(base), part, vocabulary, config.loop, config.mapper, place).saved
     save_map(saved, out)
     return len(saved)
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import KDTree
 
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import LoopConfig, MapperConfig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
@@ -69,7 +70,7 @@ def update(
         place: a known loop from the map to the session, in the ids of each.
 
     Raises:
-        StereoSfmError: different cameras, a session that is in the map already, or that no loop joins to it.
+        StereoSfmError: one camera and two, a session that is in the map already, or that no loop joins to it.
     """
     if place is None and share_a_session(saved, walk):  # with a place it was driven just now
         raise StereoSfmError("this session is in the map already")
@@ -78,7 +79,8 @@ def update(
     first_new = len(saved)
     loops: list[LoopResult] = []
     fused = 0 if place is None else close_loop(map_, in_joined_ids(place, saved), loops, config, mapper)
-    fused += _close(map_, both, first_new, session_closer(config, both.rig, vocabulary), loops, config, mapper)
+    rigs = both.keyframe_rigs()
+    fused += _close(map_, both, first_new, rigs, session_closer(config, rigs, vocabulary), loops, config, mapper)
     boundary = int(both.snapshot.kf_ids[first_new])
     if not any(loop.candidate_kf_id < boundary <= loop.kf_id for loop in loops):
         raise StereoSfmError("the session was not found in the map: no loop joins them (are they of one store?)")
@@ -90,12 +92,12 @@ def update(
         obs = kept[together.obs_kf]
         points = np.bincount(together.obs_pt[obs], minlength=len(together.pt_ids)) > 0
         map_ = restore_for_merging(subset(together, kept, points, obs), mapper)
-    full_adjustment(map_, both.rig, mapper)
+    full_adjustment(map_, dict(zip(both.snapshot.kf_ids.tolist(), rigs, strict=True)), mapper)
     snapshot, kept_sessions = _snapshot(map_, session_of)
     back = _back(saved.snapshot, snapshot)
     new = _renumbered(_moved(snapshot, back))
     return Update(
-        SavedMap(new, saved.rig, vocabulary.id, kept_sessions),
+        SavedMap(new, both.cameras, vocabulary.id, kept_sessions),
         int(both.sessions[first_new]),
         loops,
         fused,
@@ -109,6 +111,7 @@ def _close(
     map_: Map,
     both: SavedMap,
     first_new: int,
+    rigs: list[Rig],
     closer: LoopCloser,
     loops: list[LoopResult],
     config: LoopConfig,
@@ -120,10 +123,10 @@ def _close(
     chains = int(both.snapshot.submap_ids[:first_new].max()) + 1
     for row, keyframe in enumerate(both.snapshot.keyframes()):
         if row < first_new:  # the map is one rigid piece
-            closer.add(dataclasses.replace(keyframe, submap_id=0, stamp_ns=0))
+            closer.add(dataclasses.replace(keyframe, submap_id=0, stamp_ns=0), rigs[row])
             continue
         chain = keyframe.submap_id - chains + 1
-        result = closer.step(dataclasses.replace(keyframe, submap_id=chain, stamp_ns=int(stamps[row])))
+        result = closer.step(dataclasses.replace(keyframe, submap_id=chain, stamp_ns=int(stamps[row])), rigs[row])
         if result.candidate_kf_id >= 0:
             fused += close_loop(map_, result, loops, config, mapper)
     return fused

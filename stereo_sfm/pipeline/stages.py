@@ -132,9 +132,10 @@ def make_tracker_with_places(
 def make_closer(
     config: Config, rig: Rig, spans: NoSpans | None = None, localize_only: bool = False
 ) -> AnyCloser | None:
-    """The loop closer, or None where there is none."""
+    """The loop closer, which goes on after errors, or None where there is none."""
     if not config.closes_loops(rig.stereo, localize_only):
         return None
     from stereo_sfm.loop.closer import LoopCloser
+    from stereo_sfm.pipeline.restarting_closer import RestartingCloser
 
-    return LoopCloser(config.loop, rig, spans=spans)
+    return RestartingCloser(lambda: LoopCloser(config.loop, rig, spans=spans))

@@ -16,6 +16,7 @@ from stereo_sfm.drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.export.colmap import export_colmap
 from stereo_sfm.export.keyframe_images import check_session, open_recording, session_of_recording, write_keyframe_images
+from stereo_sfm.maps.cameras import MapCamera
 from stereo_sfm.maps.saved_map import SavedMap, joined, save_map
 from stereo_sfm.types import StereoImage
 from tests.maps.maps import small_map
@@ -93,14 +94,14 @@ def test_an_ambiguous_recording_is_rejected(tmp_path: Path, saved: SavedMap) -> 
 @pytest.mark.parametrize(("how", "option"), [("none", "none"), ("pinhole", "pinhole"), ("epipolar", "wide")])
 def test_images_are_those_of_the_maps_camera(how: str, option: str) -> None:
     rig = rectified(open_source(SPEC), how).rig
-    source = open_recording(SPEC, rig)
+    source = open_recording(SPEC, [rig])
     assert isinstance(source, RectifiedSource) == (option != "none")
     assert np.array_equal(source.rig.left.params, rig.left.params)
 
 
 def test_images_of_another_camera_are_refused(saved: SavedMap) -> None:
-    with pytest.raises(StereoSfmError, match=r"150x140 .*is not the map's \(kannala_brandt 848x800"):
-        open_recording(SPEC, saved.rig)
+    with pytest.raises(StereoSfmError, match=r"is not the map's.*left image 150x140 instead of 848x800"):
+        open_recording(SPEC, [saved.rig])
 
 
 def test_export_of_a_rectified_run_writes_rectified_images(
@@ -113,7 +114,7 @@ def test_export_of_a_rectified_run_writes_rectified_images(
     ids, stamps = np.full(len(saved), frames[0].frame_id), np.full(len(saved), frames[0].stamp_ns)
     ids[-1], stamps[-1] = frames[2].frame_id, frames[2].stamp_ns
     rectified_map = dataclasses.replace(
-        saved, rig=seen.rig, snapshot=dataclasses.replace(s, frame_ids=ids, stamp_ns=stamps)
+        saved, cameras={0: MapCamera(seen.rig)}, snapshot=dataclasses.replace(s, frame_ids=ids, stamp_ns=stamps)
     )
     save_map(rectified_map, tmp_path / "m")
     export = ["export", str(tmp_path / "m"), "--format", "colmap", "-o", str(tmp_path / "c"), "--images", SPEC]

@@ -92,10 +92,11 @@ def make_sequence(
     flip: float = 0.06,
     noise_px: float = 0.4,
     max_points: int = 300,
+    rig: Rig | None = None,
 ) -> StoreSequence:
-    """Keyframes of a sequence through the aisles, in this order."""
+    """Keyframes of a sequence through the aisles, in this order; `rig`: that of `fisheye_rig` when omitted."""
     rng, corner_rng = np.random.default_rng(seed), np.random.default_rng([seed, 1])
-    rig = fisheye_rig()
+    rig = rig or fisheye_rig()
     points, descriptors = shelf_points(max(aisles) + 1, alike, rng)
     strength = corner_rng.random(len(points))
     world_T_kf = aisle_sequence(aisles)

@@ -58,6 +58,13 @@ def test_the_same_view_is_the_same_place_and_direction() -> None:
     assert graph.same_view(0) == [0, 1]
 
 
+def test_a_keyframe_has_its_own_view_even_where_its_pose_is_no_rotation() -> None:
+    graph, stretched = KeyframeGraph(), at(0.0)
+    stretched[:3, :3] *= 0.9  # as far from a rotation as after hundreds of products
+    graph.add(0, stretched, 0)
+    assert graph.same_view(0) == [0]
+
+
 def test_the_same_view_is_found_in_spite_of_drift_once_a_loop_is_known() -> None:
     graph = KeyframeGraph()
     graph.add(0, at(0.0), 0)

@@ -9,6 +9,7 @@ import numpy as np
 
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.map import Map
+from stereo_sfm.maps.cameras import MapCamera
 from stereo_sfm.maps.saved_map import SavedMap
 from tests.loop.store_sequence import StoreSequence, make_sequence
 
@@ -22,7 +23,7 @@ def map_of_sequence(sequence: StoreSequence, vocabulary_id: str = "") -> SavedMa
         map_.add_points(k.point_ids[new], se3.transform(pose, k.points_cam[new]), row)
         map_.observe(row, map_.point_rows(k.point_ids), k.uv_left, k.uv_right, k.descriptors)
     snapshot = map_.snapshot()
-    return SavedMap(snapshot, sequence.rig, vocabulary_id, np.zeros(len(snapshot.kf_ids), np.int64))
+    return SavedMap.of_session(snapshot, MapCamera(sequence.rig), vocabulary_id)
 
 
 def small_map(seed: int = 0, noise_px: float = 0.2) -> tuple[StoreSequence, SavedMap]:

@@ -8,12 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stereo_sfm.calib.rig import Rig
 from stereo_sfm.cli import main
 from stereo_sfm.config import Config, LoopConfig, MapperConfig
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.loop import vocabulary as voc
 from stereo_sfm.mapping.mapper import Mapper
+from stereo_sfm.maps.cameras import MapCamera
 from stereo_sfm.maps.folders import MapFolders, save_result
 from stereo_sfm.maps.merge import full_adjustment, merge, prune, share_a_session
 from stereo_sfm.maps.saved_map import SavedMap, joined, load_map, restore_map, save_map
@@ -83,7 +85,7 @@ def test_wrong_observations_leave_the_map_in_the_full_adjustment(
     uv_left[wrong] += [12.0, -9.0]
     map_ = restore_map(dataclasses.replace(s, uv_left=uv_left))
     map_.points.sigma[:] = map_.observations.sigma[:] = MapperConfig().sigma_px
-    full_adjustment(map_, maps[1].rig, MapperConfig())
+    full_adjustment(map_, dict.fromkeys(s.kf_ids.tolist(), maps[1].rig), MapperConfig())
     after = map_.snapshot()
     seen = set(zip(after.kf_ids[after.obs_kf].tolist(), after.pt_ids[after.obs_pt].tolist(), strict=True))
     for row in wrong:
@@ -103,9 +105,9 @@ def test_maps_without_common_points_are_not_merged(maps: list[SavedMap], vocabul
         merge([maps[1], stranger], vocabulary, LoopConfig())
 
 
-def test_maps_of_different_cameras_are_not_merged(maps: list[SavedMap]) -> None:
-    with pytest.raises(StereoSfmError, match="different cameras"):
-        joined([maps[0], dataclasses.replace(maps[1], rig=pinhole_rig())])
+def test_maps_of_one_and_of_two_cameras_are_not_merged(maps: list[SavedMap]) -> None:
+    with pytest.raises(StereoSfmError, match="cannot be merged: one camera instead of two cameras"):
+        joined([maps[0], dataclasses.replace(maps[1], cameras={0: MapCamera(Rig(pinhole_rig().left))})])
 
 
 def test_a_session_is_found_in_the_map(maps: list[SavedMap], merged: SavedMap) -> None:
