@@ -8,7 +8,9 @@ fits ends the check. If none does, the calibration is corrected (`calib.wrong_ri
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
@@ -16,18 +18,20 @@ from stereo_sfm.calib.matches import match_pair
 from stereo_sfm.calib.mistakes import MIN_DISPARITY_PX, mistake
 from stereo_sfm.calib.rectification import Rectification, rectify
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.calib.wrong_rig import correction
+from stereo_sfm.calib.wrong_rig import MAX_SHIFT, better_fit
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.types import U8, StereoImage
+from stereo_sfm.types import StereoImage, U8
 
-MAX_PAIRS = 3  # of a recording that are examined
-SPACING = 5  # frames from one to the next
-LOOKED_AT = SPACING * (MAX_PAIRS - 1) + 1  # frames
+CHOSEN = (0, 5, 10)  # the pairs that are examined, if the first one does not fit
+LOOKED_AT = CHOSEN[-1] + 1 + MAX_SHIFT  # images: some on either side of these, where pairs may be frames apart
 CORNERS = 100  # of the left image
 MIN_CORNERS = 25  # with fewer an image shows too little to judge a calibration
 MIN_MATCHES = 12  # with fewer a pair does not fit; as in a window of `check-calib`
 FITTING_SHARE = 0.5  # of the matches
 LIMIT_PX = 1.0  # of a row error: what the tracker accepts (tracker.max_epipolar_px)
+ADVICE = (
+    "'stereo-sfm check-calib SOURCE --correct rig.yaml' measures it with the whole recording, '--rig rig.yaml' uses that"
+)
 DARK_MEDIAN, BRIGHT_MEDIAN = 12.0, 243.0  # grey levels
 MIN_CONTRAST = 4.0  # grey levels between the 10th and the 90th percentile
 
@@ -38,49 +42,57 @@ class StartFinding:
 
     text: str = ""  # one line; "" if they fit
     rig: Rig | None = None  # the calibration that they fit; None: none is known but the given one
+    shift: int = 0  # left image k belongs to right image k + shift
     shown: bool = False  # by the images; False: only a guess, for a tracker that does not start
 
 
 def check_start(rig: Rig, images: Iterable[StereoImage]) -> StartFinding:
-    """Check a calibration by some of the first images; of one camera only the exposure is checked.
+    """Check a calibration by the first images; of one camera only the exposure is checked.
 
     Args:
         rig: the calibration.
-        images: `SPACING` frames from one to the next, at most `MAX_PAIRS`; read as far as needed.
+        images: successive ones; `LOOKED_AT` of them are read, but only one if it fits.
     """
     seen: list[StereoImage] = []
-    rectification: Rectification | None = None
-    for image in images:
+    cameras = _Cameras(rig)
+    for number, image in enumerate(islice(images, LOOKED_AT)):
         seen.append(image)
-        if image.right is None or rig.second_camera is None:
-            if not _exposure([image.left]):
-                return StartFinding()
-            continue
-        try:
-            rectification = rectification or rectify(rig, "epipolar")
-        except StereoSfmError:
-            continue
-        if _fits(rectification, image.left, image.right):
+        if number in CHOSEN and cameras.fit(image):
             return StartFinding()
-    light = _exposure([image.left for image in seen])
-    if light:
+    light = _exposure([seen[k].left for k in CHOSEN if k < len(seen)])
+    if light or not cameras.judged:
         return StartFinding(light)
-    pairs = [image for image in seen if image.right is not None]
-    return _what_is_wrong(rig, pairs, rectification is not None) if pairs and rig.second_camera else StartFinding()
-
-
-def _fits(rectification: Rectification, left: U8, right: U8) -> bool:
-    found = match_pair(rectification, *rectification.apply(left, right), CORNERS)
-    ahead = found.left[:, 0] - found.right[:, 0] > MIN_DISPARITY_PX
-    return len(found) >= MIN_MATCHES and float((ahead & (np.abs(found.row_error) < LIMIT_PX)).mean()) >= FITTING_SHARE
-
-
-def _what_is_wrong(rig: Rig, pairs: Sequence[StereoImage], valid: bool) -> StartFinding:
-    better = correction(rig, pairs) if valid else None
+    chosen = [k for k in CHOSEN if k < len(seen)]
+    better = better_fit(rig, seen, chosen) if cameras.rectification is not None else None
     if better is not None:
-        return StartFinding(better.text, better.rig, True)
-    text, shown = mistake(rig, [(image.left, image.right) for image in pairs if image.right is not None])
-    return StartFinding(text, None, shown)
+        return StartFinding(better.text, better.rig, better.shift, True)
+    text, shown = mistake(rig, [(seen[k].left, right) for k in chosen if (right := seen[k].right) is not None])
+    return StartFinding(text, shown=shown)
+
+
+class _Cameras:
+    """Whether pairs fit the calibration."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.rectification: Rectification | None = None
+        self.judged = False  # a pair that shows something was seen
+        self._stereo = rig.second_camera is not None
+        if self._stereo:
+            with suppress(StereoSfmError):  # no epipolar geometry: nothing fits
+                self.rectification = rectify(rig, "epipolar")
+
+    def fit(self, image: StereoImage) -> bool:
+        """Whether half of the matches are near their rows; an image of one camera fits if it shows something."""
+        if image.right is None or not self._stereo:
+            return not _exposure([image.left])
+        if self.rectification is None:
+            self.judged = True
+            return False
+        found = match_pair(self.rectification, *self.rectification.apply(image.left, image.right), CORNERS)
+        self.judged |= found.corners >= MIN_CORNERS
+        ahead = found.left[:, 0] - found.right[:, 0] > MIN_DISPARITY_PX
+        near = ahead & (np.abs(found.row_error) < LIMIT_PX)
+        return len(found) >= MIN_MATCHES and float(near.mean()) >= FITTING_SHARE
 
 
 def _exposure(images: Sequence[U8]) -> str:
