@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -81,25 +82,39 @@ class CameraStore:
 class CorrectionKeeper:
     """Keeps the corrections of one run for the next run of the same camera."""
 
-    def __init__(self, store: Path | None, start: Rig) -> None:
+    def __init__(self, store: Path | None, start: Rig, given: Rig | None = None) -> None:
         """Before the first correction.
 
         Args:
             store: the folder of a `CameraStore`; None: nothing is kept.
             start: the rig at the run's start.
+            given: the rig that the start check corrected to this one; the same where it did not.
 
         Raises:
             StereoSfmError: the rig has no serial number, or its files are damaged.
         """
         self._store = None if store is None else CameraStore(store)
         self._start = start
-        self._original = start if self._store is None else self._store.original(start)
+        given = start if given is None else given
+        self._original = given if self._store is None else self._store.original(given)
+        self._checked = given is not start  # and corrected
 
     def keep(self, correction: CalibrationUpdate) -> None:
         """Keep a correction that was applied, in place of the run's earlier one; a warning if that is not possible."""
-        if self._store is not None and correction.applied:
+        if correction.applied:
+            self._keep(with_terms(self._start, correction.terms))
+
+    def keep_last(self, corrections: Sequence[CalibrationUpdate]) -> None:
+        """At the end of a run: keep the last of its corrections, or that of its start."""
+        if corrections:
+            self.keep(corrections[-1])
+        elif self._checked:
+            self._keep(self._start)
+
+    def _keep(self, rig: Rig) -> None:
+        if self._store is not None:
             try:
-                self._store.keep(self._original, with_terms(self._start, correction.terms))
+                self._store.keep(self._original, rig)
             except StereoSfmError as error:
                 log.warning("%s", error)
 

@@ -28,7 +28,7 @@ ROLLING_SHUTTER_MIMICS = np.array(
     [False, True, False, True, True, False, True, True]
 )  # terms that motion with a rolling shutter can mimic
 SIGMAS = 4.0  # standard deviations from zero that make a term significant
-NONE = np.zeros(RIG_TERMS, bool)
+NONE, ALL = np.zeros(RIG_TERMS, bool), np.ones(RIG_TERMS, bool)
 MIN_SHARE_IN_HALVES = 0.5  # of a term's value that each half of the recording must show, with the same sign
 
 
@@ -142,6 +142,7 @@ def significant(
     rolling: bool = False,
     sigmas: float | F64 = SIGMAS,
     confirmed: Bool = NONE,
+    among: Bool = ALL,
 ) -> Bool:
     """(8,) terms that remain when the weakest insignificant one is dropped until there is none.
 
@@ -150,9 +151,10 @@ def significant(
         sigmas: standard deviations from zero that make a term significant; one number, or (8,).
         rolling: rolling shutter; terms that motion can mimic are not written.
         confirmed: (8,) terms that the halves need not confirm.
+        among: (8,) terms that may remain.
     """
     needed = np.broadcast_to(sigmas, RIG_TERMS)
-    kept = ~ROLLING_SHUTTER_MIMICS if rolling else np.ones(RIG_TERMS, bool)
+    kept = among & ~ROLLING_SHUTTER_MIMICS if rolling else among.copy()
     while kept.any():
         here = whole.without(kept)
         weakest = np.argmin(np.where(kept, here.strength, np.inf))

@@ -24,6 +24,7 @@ class Matches:
 
     left: F64  # (N, 2)
     right: F64  # (N, 2)
+    corners: int = 0  # of the left image that were searched in the right one
 
     def __len__(self) -> int:
         return len(self.left)
@@ -61,7 +62,7 @@ def match_pair(
     found = np.isfinite(guess[:, 0])
     start, guess = corners[found].astype(np.float32), guess[found].astype(np.float32)
     if not len(start):
-        return Matches(np.zeros((0, 2)), np.zeros((0, 2)))
+        return Matches(np.zeros((0, 2)), np.zeros((0, 2)), len(corners))
     a, b = flattened(left), flattened(right)
     end, good = lucas_kanade(a, b, start, guess)
     back, good_back = lucas_kanade(b, a, end, start)
@@ -72,7 +73,7 @@ def match_pair(
     returned = np.linalg.norm(back - start, axis=1) < 0.15
     near = np.linalg.norm(end - guess, axis=1) < 2.5
     kept = good & good_back & inside & returned & near
-    return Matches(start[kept].astype(float), end[kept].astype(float))
+    return Matches(start[kept].astype(float), end[kept].astype(float), len(corners))
 
 
 def spread_corners(image: U8, usable: Bool, count: int) -> F64:

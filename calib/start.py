@@ -1,78 +1,98 @@
-"""Diagnosis of a tracker that does not start: common calibration mistakes are undone one by one on a few pairs.
+"""The start check: whether a few of the first images fit the calibration, and what would make them fit.
 
-Stereo matches are searched with the given calibration and with each mistake undone (`calib.matches`); a mistake is
-reported if undoing it gives many times the matches. For identical parallel cameras, swapped images, upside-down images
-and an inverted transform are indistinguishable: then all that help are reported.
+A pair fits if half of its stereo matches lie within a pixel of their rows, as the trackers need it. The first pair that
+fits ends the check. If none does, the calibration is corrected (`calib.wrong_rig`) or a mistake is named
+(`calib.mistakes`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
 from stereo_sfm.calib.matches import match_pair
-from stereo_sfm.calib.rectification import rectify
+from stereo_sfm.calib.mistakes import MIN_DISPARITY_PX, mistake
+from stereo_sfm.calib.rectification import Rectification, rectify
 from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calib.wrong_rig import MAX_SHIFT, better_fit
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.geometry import se3
-from stereo_sfm.types import U8, StereoImage
+from stereo_sfm.types import StereoImage, U8
 
-MAX_PAIRS = 3  # of a recording that are examined
-SPACING = 5  # frames from one to the next
-CORNERS = 200  # searched in each pair
-MIN_DISPARITY_PX = -0.5  # points of smaller disparity lie behind the cameras
-MAX_ROW_ERROR_PX = 2.0
-MIN_MATCHES = 25  # in a pair, with which the calibration is plausible
-MIN_GAIN = 3.0  # ratio of matches with and without a mistake undone, for it to be reported
-MIN_SHARE_OF_BEST = 0.7  # of the best mistake's matches, for another one to be reported too
+CHOSEN = (0, 5, 10)  # the pairs that are examined, if the first one does not fit
+LOOKED_AT = CHOSEN[-1] + 1 + MAX_SHIFT  # images: some on either side of these, where pairs may be frames apart
+CORNERS = 100  # of the left image
+MIN_CORNERS = 25  # with fewer an image shows too little to judge a calibration
+MIN_MATCHES = 12  # with fewer a pair does not fit; as in a window of `check-calib`
+FITTING_SHARE = 0.5  # of the matches
+LIMIT_PX = 1.0  # of a row error: what the tracker accepts (tracker.max_epipolar_px)
+ADVICE = (
+    "'stereo-sfm check-calib SOURCE --correct rig.yaml' measures it with the whole recording, '--rig rig.yaml' uses that"
+)
 DARK_MEDIAN, BRIGHT_MEDIAN = 12.0, 243.0  # grey levels
 MIN_CONTRAST = 4.0  # grey levels between the 10th and the 90th percentile
 
-Pair = tuple[U8, U8]
+
+@dataclass(frozen=True, eq=False)
+class StartFinding:
+    """What the first images say about the calibration."""
+
+    text: str = ""  # one line; "" if they fit
+    rig: Rig | None = None  # the calibration that they fit; None: none is known but the given one
+    shift: int = 0  # left image k belongs to right image k + shift
+    shown: bool = False  # by the images; False: only a guess, for a tracker that does not start
 
 
-@dataclass(frozen=True)
-class Mistake:
-    """A common mistake between images and calibration, and how to undo it."""
-
-    name: str
-    rig: Callable[[Rig], Rig]
-    pair: Callable[[Pair], Pair]
-
-
-def _turned(image: U8) -> U8:
-    return np.ascontiguousarray(image[::-1, ::-1])
-
-
-def _inverted(rig: Rig) -> Rig:
-    return replace(rig, left_T_right=se3.inverse(rig.left_T_right))
-
-
-MISTAKES = (
-    Mistake("left and right are swapped", lambda rig: rig, lambda pair: (pair[1], pair[0])),
-    Mistake("left_T_right is inverted", _inverted, lambda pair: pair),
-    Mistake("both images are upside down", lambda rig: rig, lambda pair: (_turned(pair[0]), _turned(pair[1]))),
-    Mistake("the left image is upside down", lambda rig: rig, lambda pair: (_turned(pair[0]), pair[1])),
-    Mistake("the right image is upside down", lambda rig: rig, lambda pair: (pair[0], _turned(pair[1]))),
-)
-
-
-def why_no_start(rig: Rig, images: Sequence[StereoImage]) -> str:
-    """One line with the likely reason why tracking does not start on these images; "" if none is found.
+def check_start(rig: Rig, images: Iterable[StereoImage]) -> StartFinding:
+    """Check a calibration by the first images; of one camera only the exposure is checked.
 
     Args:
-        rig: the calibration of the run.
-        images: some of the first; without right images only their exposure is checked.
+        rig: the calibration.
+        images: successive ones; `LOOKED_AT` of them are read, but only one if it fits.
     """
-    light = _exposure([image.left for image in images])
-    if light:
-        return light
-    pairs = [(image.left, image.right) for image in images if image.right is not None][:MAX_PAIRS]
-    if rig.right is None or not pairs:
-        return ""
-    return _mistake(rig, pairs)
+    seen: list[StereoImage] = []
+    cameras = _Cameras(rig)
+    for number, image in enumerate(islice(images, LOOKED_AT)):
+        seen.append(image)
+        if number in CHOSEN and cameras.fit(image):
+            return StartFinding()
+    light = _exposure([seen[k].left for k in CHOSEN if k < len(seen)])
+    if light or not cameras.judged:
+        return StartFinding(light)
+    chosen = [k for k in CHOSEN if k < len(seen)]
+    better = better_fit(rig, seen, chosen) if cameras.rectification is not None else None
+    if better is not None:
+        return StartFinding(better.text, better.rig, better.shift, True)
+    text, shown = mistake(rig, [(seen[k].left, right) for k in chosen if (right := seen[k].right) is not None])
+    return StartFinding(text, shown=shown)
+
+
+class _Cameras:
+    """Whether pairs fit the calibration."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.rectification: Rectification | None = None
+        self.judged = False  # a pair that shows something was seen
+        self._stereo = rig.second_camera is not None
+        if self._stereo:
+            with suppress(StereoSfmError):  # no epipolar geometry: nothing fits
+                self.rectification = rectify(rig, "epipolar")
+
+    def fit(self, image: StereoImage) -> bool:
+        """Whether half of the matches are near their rows; an image of one camera fits if it shows something."""
+        if image.right is None or not self._stereo:
+            return not _exposure([image.left])
+        if self.rectification is None:
+            self.judged = True
+            return False
+        found = match_pair(self.rectification, *self.rectification.apply(image.left, image.right), CORNERS)
+        self.judged |= found.corners >= MIN_CORNERS
+        ahead = found.left[:, 0] - found.right[:, 0] > MIN_DISPARITY_PX
+        near = ahead & (np.abs(found.row_error) < LIMIT_PX)
+        return len(found) >= MIN_MATCHES and float(near.mean()) >= FITTING_SHARE
 
 
 def _exposure(images: Sequence[U8]) -> str:
@@ -87,29 +107,3 @@ def _exposure(images: Sequence[U8]) -> str:
     if spread < MIN_CONTRAST:
         return f"the images have no contrast (grey levels within {spread:.0f}): a covered lens, or a blank wall"
     return ""
-
-
-def _mistake(rig: Rig, pairs: Sequence[Pair]) -> str:
-    now = _matches(rig, pairs)
-    if now >= MIN_MATCHES:
-        return ""
-    undone = [(_matches(mistake.rig(rig), [mistake.pair(pair) for pair in pairs]), mistake) for mistake in MISTAKES]
-    best = max(count for count, _ in undone)
-    if best < max(MIN_MATCHES, MIN_GAIN * now):
-        return f"few stereo matches ({now:.0f} per pair): is this the calibration of these cameras?"
-    names = [mistake.name for count, mistake in undone if count >= MIN_SHARE_OF_BEST * best]
-    return f"{' or '.join(names)}: {now:.0f} stereo matches per pair, {best:.0f} with that undone"
-
-
-def _matches(rig: Rig, pairs: Sequence[Pair]) -> float:
-    """Mean number per pair of stereo matches with small row error and points in front of the cameras."""
-    try:
-        rectification = rectify(rig, "epipolar")
-    except StereoSfmError:
-        return 0.0
-    counts: list[int] = []
-    for left, right in pairs:
-        found = match_pair(rectification, *rectification.apply(left, right), CORNERS)
-        ahead = found.left[:, 0] - found.right[:, 0] > MIN_DISPARITY_PX
-        counts.append(int((ahead & (np.abs(found.row_error) < MAX_ROW_ERROR_PX)).sum()))
-    return float(np.mean(counts))

@@ -56,6 +56,14 @@ class _Tracking:
     fresh: int = 0  # frames since the last kept moment
 
 
+def still_window(rectification: Rectification, image: StereoImage, max_matches: int, search_rows: int) -> Window:
+    """A window of one moment: the matches of one pair. Arguments as those of `collect`."""
+    assert image.right is not None
+    rows = match_pair(rectification, *rectification.apply(image.left, image.right), max_matches, search_rows)
+    left, right = rectification.left.to_source(rows.left)[None], rectification.right.to_source(rows.right)[None]
+    return Window(left, right, np.full_like(right, np.nan), rows)
+
+
 def collect(
     images: Iterable[StereoImage],
     rectification: Rectification,

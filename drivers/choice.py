@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, Protocol
 
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from stereo_sfm.drivers.rig_option import RigOption
     from stereo_sfm.drivers.source import Source
     from stereo_sfm.log.provenance import Opening
+    from stereo_sfm.types import StartCheck
 
 P = ParamSpec("P")
 
@@ -96,6 +97,9 @@ class SourceChoice:
         speed: playback speed relative to the stamps; None: as fast as they are read.
         repeat: play it again and again.
         camera_store: folder of calibrations that earlier runs corrected, by serial number (`calib.camera_store`).
+        start: the first images are not compared with the calibration (unchecked), or they are (checked), and correct it
+            where they contradict it (corrected).
+        start_check: what an earlier run's first images said, which is not found out again.
     """
 
     spec: str
@@ -106,6 +110,8 @@ class SourceChoice:
     speed: float | None = None
     repeat: bool = False
     camera_store: Path | None = None
+    start: str = "unchecked"
+    start_check: StartCheck | None = None
 
     @staticmethod
     def of(
@@ -163,14 +169,32 @@ class SourceChoice:
         from stereo_sfm.drivers.rectified import rectified
         from stereo_sfm.drivers.repeated import RepeatedSource
         from stereo_sfm.drivers.select import SelectedFrames
+        from stereo_sfm.drivers.start_checked import StartCheckedSource
 
         source = open_source(self.spec, self.rig, **self.options)
         source = source if self.camera_store is None else CorrectedSource(source, self.camera_store)
         if self.selection != EVERYTHING:
             source = SelectedFrames(source, **vars(self.selection))
         source = rectified(source, RECTIFY[self.rectify])
+        if self.start != "unchecked" or self.start_check is not None:
+            source = StartCheckedSource(source, self.start == "corrected", self.start_check)
         source = RepeatedSource(source) if self.repeat else source
         return source if self.speed is None else PacedSource(source, self.speed)
+
+
+def with_start_check(opener: Opener, correct: bool) -> Opener:
+    """The opener of a run's source: its first images are compared with the calibration, and may correct it.
+
+    A replay has what its run found; a program's own source is taken as it is.
+    """
+    if not isinstance(opener, SourceChoice) or isinstance(opener, ReplayChoice):
+        return opener
+    return replace(opener, start="corrected" if correct else "checked")
+
+
+def with_known_start(opener: Opener, check: StartCheck) -> Opener:
+    """The opener of a source whose first images were looked at before."""
+    return replace(opener, start_check=check) if isinstance(opener, SourceChoice) else opener
 
 
 def _loaded(rig: RigOption) -> Rig | None:

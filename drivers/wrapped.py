@@ -8,7 +8,7 @@ from typing import Self
 
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.drivers.source import Source, Stamps, chosen_frames
-from stereo_sfm.types import StereoImage, Trajectory
+from stereo_sfm.types import StartCheck, StereoImage, Trajectory
 
 
 class WrappedSource:
@@ -40,6 +40,16 @@ class WrappedSource:
     @property
     def counters(self) -> Mapping[str, float]:
         return self.source.counters
+
+    @property
+    def start_check(self) -> StartCheck | None:
+        """What the first images said about the calibration, where they were compared with it and contradict it."""
+        return getattr(self.source, "start_check", None)
+
+    @property
+    def given_rig(self) -> Rig:
+        """The calibration before a start check corrected it."""
+        return getattr(self.source, "given_rig", self.source.rig)
 
     def stamps(self) -> Stamps | None:
         """The stamps of the frames passed on: unknown in advance, unless a subclass knows them."""

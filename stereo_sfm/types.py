@@ -321,6 +321,26 @@ class CalibrationUpdate(Message):
         super().__post_init__()
 
 
+@dataclass(frozen=True)
+class StartCheck:
+    """What the first images said about the calibration before the run began; there is none where they fit it."""
+
+    TOPIC: ClassVar[Topic] = Topic("/start_check", "before the first frame, where the images contradict the calibration")
+
+    frame_id: int  # the first image
+    stamp_ns: int
+    text: str  # what is wrong
+    remedy: str  # what is done about it, or can be; "" where the text says it
+    shown: bool  # by the images; False: only a guess, for a tracker that does not start
+    rig: str  # the two cameras that the run uses instead, as the text of a rig.yaml; "": the given ones
+    right_shift: int  # left image k is used with right image k + right_shift
+
+    @property
+    def line(self) -> str:
+        """One human-readable line."""
+        return f"{self.text}: {self.remedy}" if self.remedy else self.text
+
+
 @dataclass(frozen=True, eq=False)
 class SensorUpdate(Message):
     """The terms that the mapper found of the calibration of IMU and wheels; of a sensor without evidence they are 0."""

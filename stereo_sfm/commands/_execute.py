@@ -16,7 +16,6 @@ from stereo_sfm.errors import StereoSfmError, from_os_error
 if TYPE_CHECKING:
     from stereo_sfm.commands._step import Stepper
     from stereo_sfm.config import Config
-    from stereo_sfm.drivers.choice import SourceChoice
     from stereo_sfm.eval.record import RunRecord
     from stereo_sfm.log.recorded import RecordedRun
     from stereo_sfm.maps.folders import MapFolders
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
 
 TRACKING_FAILED = 4
 INLINE_END_S = 3.0  # a run in one process waits this long for its source to stop
-LOOK_S = 3.0  # after an interruption, for the full evaluation and the plots of the report
+LOOK_S = 3.0  # after an interruption, for the plots of the report
 
 
 @dataclass(frozen=True)
@@ -73,7 +72,6 @@ def execute(options: RunOptions) -> tuple[int, Path]:
     from stereo_sfm.drivers.choice import SourceChoice
     from stereo_sfm.eval.record import RunRecord
     from stereo_sfm.eval.run_results import write_results
-    from stereo_sfm.eval.start import why_not_started
     from stereo_sfm.eval.statistics import failure, summary
     from stereo_sfm.export.run_folder import link_latest
     from stereo_sfm.pipeline.session import Session
@@ -96,14 +94,11 @@ def execute(options: RunOptions) -> tuple[int, Path]:
             stop.finished()
         stop.then = None
         folder, info = session.folder, session.info
-        images = SourceChoice(str(folder / "run.mcap")) if info.live else o.source  # to look at once more
         stats, evaluations = write_results(
             folder, info.name, info.rig, o.config, record, wall_s, info.ground_truth, o.frame, o.source.numbering,
-            o.max_lost_percent, why_not_started(images, record) if stop.since_s < LOOK_S else "",
-            lambda: stop.since_s < LOOK_S,
+            o.max_lost_percent, lambda: stop.since_s < LOOK_S,
         )  # fmt: skip
-        if record.calibrations:
-            CorrectionKeeper(o.source.camera_store, info.rig).keep(record.calibrations[-1])
+        CorrectionKeeper(o.source.camera_store, info.rig, info.given_rig).keep_last(record.calibrations)
         link_latest(folder)
     if not o.quiet:
         print("\n".join([*summary(stats, evaluations), f"written to {folder} (start with {folder / 'report.md'})"]))

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 SHUTTER_FRAMES = 200  # looked at for a rolling shutter
 MISTAKE = "images"  # finding of swapped or upside-down images, or an inverted transform
 FIXED_SHARE = 0.003  # of an image, from which on the robot in view is worth a mask
+DEFAULT_SEARCH = 14  # rows
 SIDES = ("left", "right")
 
 
@@ -31,7 +32,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--windows", type=int, default=10, help="number of short segments of the recording to use")
     parser.add_argument("--max-frames", type=int, default=600, help="stop after N frames")
     parser.add_argument(
-        "--search", type=int, default=14, metavar="ROWS", help="search range for row errors, in rows above and below"
+        "--search", type=int, default=None, metavar="ROWS",
+        help="search range for row errors, in rows above and below (default: 14, or what the first images need)",
     )
     parser.add_argument("--correct", type=Path, default=None, metavar="FILE", help="write the corrected rig to FILE")
     parser.add_argument("--overwrite", action="store_true", help="replace the file of --correct")
@@ -46,7 +48,7 @@ class CheckOptions:
     rig: Path | None
     windows: int
     max_frames: int
-    search: int
+    search: int | None
     correct: Path | None
     overwrite: bool
     json: bool
@@ -59,36 +61,38 @@ def run(args: argparse.Namespace) -> int:
     import json
     from dataclasses import replace
 
-    from stereo_sfm.calib import load_rig, save_rig
+    from stereo_sfm.calib import save_rig
     from stereo_sfm.calib.check import Finding, check
     from stereo_sfm.calib.mask_search import MaskSearch
     from stereo_sfm.calib.rectification import rectify
-    from stereo_sfm.calib.start import why_no_start
     from stereo_sfm.calib.tracks import MAX_FRAMES, collect, corners_for
+    from stereo_sfm.calib.wrong_rig import search_rows
     from stereo_sfm.config import Config
     from stereo_sfm.drivers.source import open_source
+    from stereo_sfm.drivers.start_checked import StartCheckedSource
     from stereo_sfm.eval.sensor_motion import SensorMotion
     from stereo_sfm.tracking.flow.readout import ReadoutSearch
 
     _check(options)
-    with open_source(options.source) as source:
-        rig = source.rig if options.rig is None else load_rig(options.rig)
+    with StartCheckedSource(open_source(options.source, options.rig), correct=True) as source:
+        rig = source.given_rig
         rectification = rectify(rig, "epipolar")
+        images = itertools.islice(source, options.max_frames)
+        start = source.start_check
+        widely = search_rows(rectification) if start is not None and start.rig else DEFAULT_SEARCH
         total = min(source.frame_count or options.max_frames, options.max_frames)
         gap = 0 if source.live else max(0, total // options.windows - MAX_FRAMES)
         corners = corners_for(total, options.windows)
         shutter = ReadoutSearch(Config().tracker, rig)
         masks = MaskSearch()
         motion = SensorMotion(rig) if rig.imu is not None or rig.wheel is not None else None
-        first: list[StereoImage] = []
-        images = _first_kept(itertools.islice(source, options.max_frames), first)
         images = _searched(images, shutter, masks)
         images = images if motion is None else motion.watch(images)
-        windows = collect(images, rectification, options.windows, gap, corners, options.search)
+        windows = collect(images, rectification, options.windows, gap, corners, options.search or widely)
         readout = shutter.measured()
-        mistake = why_no_start(rig, first)
+        mistake = "" if start is None or start.rig else start.text
         report = _checked(lambda: check(rig, rectification, windows, rolling=readout.best_s != 0), mistake)
-        others = [Finding(MISTAKE, 2, mistake)] if mistake else []
+        others = [] if start is None else [Finding(MISTAKE if mistake else "first images", 2, start.text)]
         others += [_shutter(rig.shutter, readout), *_robot(masks, rig), *(motion.findings() if motion else [])]
         report = replace(report, findings=(*report.findings, *others))
     if options.correct is not None:
@@ -107,16 +111,6 @@ def _searched(images: Iterable[StereoImage], shutter: ReadoutSearch, masks: Mask
     for number, image in enumerate(images):
         if image.right is not None:
             masks.add_tracked(image, *shutter.add(image, number < SHUTTER_FRAMES))
-        yield image
-
-
-def _first_kept(images: Iterable[StereoImage], first: list[StereoImage]) -> Iterator[StereoImage]:
-    """Pass the images on, and keep some of the first."""
-    from stereo_sfm.calib.start import MAX_PAIRS, SPACING
-
-    for number, image in enumerate(images):
-        if number % SPACING == 0 and len(first) < MAX_PAIRS:
-            first.append(image)
         yield image
 
 
@@ -169,7 +163,9 @@ def _robot(masks: MaskSearch, rig: Rig) -> list[Finding]:
 def _check(options: CheckOptions) -> None:
     from stereo_sfm.errors import StereoSfmError
 
-    check_counts({"--windows": options.windows, "--max-frames": options.max_frames, "--search": options.search})
+    check_counts(
+        {"--windows": options.windows, "--max-frames": options.max_frames, "--search": options.search or DEFAULT_SEARCH}
+    )
     if options.correct is not None and options.correct.exists() and not options.overwrite:
         raise StereoSfmError(f"{options.correct} exists: choose another name or give --overwrite")
 

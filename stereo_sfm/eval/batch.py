@@ -54,7 +54,6 @@ def run_one(task: BatchTask) -> dict[str, Any]:
     from stereo_sfm.drivers.choice import SourceChoice
     from stereo_sfm.eval.record import RunRecord
     from stereo_sfm.eval.run_results import write_results
-    from stereo_sfm.eval.start import why_not_started
     from stereo_sfm.export.run_folder import prepare_folder
     from stereo_sfm.maps.folders import MapFolders
     from stereo_sfm.pipeline.session import Session, Wiring
@@ -72,10 +71,7 @@ def run_one(task: BatchTask) -> dict[str, Any]:
                     pass
             info = session.info
             wall_s = time.perf_counter() - begin
-            why = why_not_started(opener, record)
-            stats, _ = write_results(
-                folder, info.name, info.rig, task.config, record, wall_s, info.ground_truth, why_not_started=why
-            )
+            stats, _ = write_results(folder, info.name, info.rig, task.config, record, wall_s, info.ground_truth)
         result |= {"ok": True, "stats": stats}
     except StereoSfmError as error:
         result |= {"ok": False, "error": str(error)}

@@ -35,6 +35,12 @@ def calibration_stats(record: RunRecord) -> list[dict[str, Any]]:
     ]
 
 
+def start_check_stats(record: RunRecord) -> dict[str, Any] | None:
+    """What the first images said about the calibration; None where they fit it."""
+    found = record.start_check
+    return None if found is None else {"text": found.line, "shown": found.shown, "corrected": bool(found.rig)}
+
+
 def sensor_stats(record: RunRecord) -> list[dict[str, Any]] | None:
     """Every word about the calibration of IMU and wheels; terms in degrees, ms, per cent, mm; no sigma: unknown. None
     where it was not asked for."""
@@ -84,12 +90,13 @@ def row_error_stats(record: RunRecord) -> dict[str, Any] | None:
 
 
 def calibration_lines(stats: dict[str, Any]) -> list[str]:
-    """A line for each change of the calibration, and one about the row errors."""
-    rows = stats["row_errors"]
+    """A line about the start check, one for each change of the calibration, and one about the row errors."""
+    rows, checked = stats["row_errors"], stats["start_check"]
+    begun = [f"calibration at the start: {checked['text']}"] if checked and checked["shown"] else []
     off = [] if rows is None else [f"row error {rows['systematic_px']:.2f} px (worst {rows['worst_px']:.2f} px)"]
     if rows is not None and rows["warning"]:
         off[0] += ": the calibration does not fit (see check-calib)"
-    lines = off + [
+    lines = begun + off + [
         f"calibration {'corrected' if c['applied'] else 'doubtful'} at {c['seconds']:.1f} s ({c['why']}): {c['text']}"
         for c in stats["calibration"]
     ]

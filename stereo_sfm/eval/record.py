@@ -32,6 +32,7 @@ from stereo_sfm.types import (
     MapUpdate,
     RowErrors,
     SensorUpdate,
+    StartCheck,
     TrackState,
     Trajectory,
 )
@@ -100,6 +101,7 @@ class RunRecord:
     closed: list[Closure] = field(default_factory=list[Closure])  # accepted by the loop closer
     failed_kf_ids: list[int] = field(default_factory=list[int])  # at which the loop closer failed
     refused_kf_ids: set[int] = field(default_factory=set[int])  # of loops that the mapper rejected
+    start_check: StartCheck | None = None  # what the first images said about the calibration; None: they fit
     row_errors: RowErrors | None = None  # the last
     row_error_px: list[tuple[int, float]] = field(default_factory=list[tuple[int, float]])  # stamp_ns, systematic
     calibrations: list[CalibrationUpdate] = field(default_factory=list[CalibrationUpdate])  # changes of the rig
@@ -128,6 +130,10 @@ class RunRecord:
     @_take.register
     def _put_dropped(self, dropped: Dropped) -> None:
         self.drops[dropped.where] = self.drops.get(dropped.where, 0) + dropped.count
+
+    @_take.register
+    def _put_start_check(self, check: StartCheck) -> None:
+        self.start_check = check
 
     @_take.register
     def _put_log_ended(self, ended: LogEnded) -> None:

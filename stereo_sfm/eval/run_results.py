@@ -45,7 +45,6 @@ def write_results(
     frame: str = "cam0",
     step: int = 1,
     max_lost_percent: float = MAX_LOST_PERCENT,
-    why_not_started: str = "",
     go_on: Callable[[], bool] = lambda: True,
 ) -> tuple[dict[str, Any], dict[str, Evaluation]]:
     """Write trajectories, configuration, calibration, numbers and report.
@@ -59,7 +58,6 @@ def write_results(
         frame: "cam0" or "body", the frame whose poses the trajectory files hold. Errors are always those of cam0.
         step: every `step`-th frame of the source was processed.
         max_lost_percent: frames without a pose above which the run counts as failed.
-        why_not_started: reason for a run without any pose, see `eval.start`.
         go_on: whether there is time for another plot.
 
     Returns:
@@ -82,7 +80,7 @@ def write_results(
         write_corrected_rig(folder, rig, record)
         evaluations = _evaluate(estimates, reference, "sim3" if scale_free(config, rig) else "se3")
         stats = {"source": source_name, "frame": frame, **statistics(record, wall_s, evaluations)}
-        stats |= {"max_lost_percent": max_lost_percent, "why_not_started": why_not_started}
+        stats["max_lost_percent"] = max_lost_percent
         write_json(folder / "stats.json", stats)
         write_report(folder, source_name, record, stats, estimates, reference, evaluations, go_on)
     return stats, evaluations

@@ -9,7 +9,13 @@ from typing import Any
 import numpy as np
 
 from stereo_sfm.drivers.live.counters import LOSSES
-from stereo_sfm.eval.calibration_results import calibration_lines, calibration_stats, row_error_stats, sensor_stats
+from stereo_sfm.eval.calibration_results import (
+    calibration_lines,
+    calibration_stats,
+    row_error_stats,
+    sensor_stats,
+    start_check_stats,
+)
 from stereo_sfm.eval.evaluate import Evaluation, length
 from stereo_sfm.eval.record import RunRecord
 from stereo_sfm.messages import Health
@@ -76,6 +82,7 @@ def statistics(record: RunRecord, wall_s: float, evaluations: dict[str, Evaluati
         "ms": stage_times(record),
         "health": {stage: _health(report) for stage, report in sorted(record.health.items())},
         "camera": record.source_counts,
+        "start_check": start_check_stats(record),
         "calibration": calibration_stats(record),
         "sensor_calibration": sensor_stats(record),
         "row_errors": row_error_stats(record),
@@ -106,8 +113,8 @@ def _health(report: Health) -> dict[str, float]:
 def failure(stats: dict[str, Any]) -> str:
     """Why the run counts as failed (exit code 4), or ''."""
     if not stats["tracked"]:
-        why = stats.get("why_not_started", "")
-        return "tracking never initialised" + (f": {why}" if why else "")
+        checked = stats["start_check"]
+        return "tracking never initialised" + (f": {checked['text']}" if checked else "")
     if stats["lost_percent"] > stats["max_lost_percent"]:
         dropped = stats["dropped_by_capture"]
         why = f", {thousands(dropped)} of them dropped by capture: the stages are too slow" if dropped else ""

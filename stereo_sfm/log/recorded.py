@@ -15,7 +15,7 @@ from stereo_sfm.log import schema, topics
 from stereo_sfm.log.attached import attached_config, attached_rig
 from stereo_sfm.log.provenance import ENDED_EARLY, METADATA, SOURCE_RIG_FILE, Opening
 from stereo_sfm.log.reader import LogReader, Record
-from stereo_sfm.types import Applied, Dropped
+from stereo_sfm.types import Applied, Dropped, StartCheck
 
 TYPES: dict[str, type[Any]] = {topic.schema: message for message, topic in topics.OF.items()}
 
@@ -72,6 +72,7 @@ class RecordedRun:
     applied: list[Applied]
     dropped: list[Dropped]
     opening: Opening = field(default_factory=Opening)  # of the source
+    start_check: StartCheck | None = None  # that the run began with
 
 
 def read_run(reader: LogReader) -> RecordedRun:
@@ -86,7 +87,7 @@ def read_run(reader: LogReader) -> RecordedRun:
             f"{reader.path} is not the log of a run: it has no configuration (use 'stereo-sfm run' instead)"
         )
     about = reader.metadata(METADATA)
-    found: dict[str, list[Any]] = {topics.APPLIED: [], topics.DROPPED: []}
+    found: dict[str, list[Any]] = {topics.APPLIED: [], topics.DROPPED: [], topics.START_CHECK: []}
     for record, message in messages(reader, tuple(found)):
         found[record.topic].append(message)
     return RecordedRun(
@@ -97,6 +98,7 @@ def read_run(reader: LogReader) -> RecordedRun:
         found[topics.APPLIED],
         found[topics.DROPPED],
         read_opening(reader),
+        next(iter(found[topics.START_CHECK]), None),
     )
 
 

@@ -25,6 +25,7 @@ from stereo_sfm.types import (
     MapUpdate,
     RowErrors,
     SensorUpdate,
+    StartCheck,
 )
 
 SCHEMA_VERSION = "1"
@@ -52,6 +53,7 @@ FEATURES = "/cam0/features"
 KEYFRAME = Keyframe.TOPIC.name
 MAP_UPDATE = MapUpdate.TOPIC.name
 CALIBRATION = CalibrationUpdate.TOPIC.name
+START_CHECK = StartCheck.TOPIC.name
 ROW_ERRORS = RowErrors.TOPIC.name
 SENSORS = SensorUpdate.TOPIC.name
 LOOP = LoopResult.TOPIC.name
@@ -114,6 +116,7 @@ TABLE: tuple[Row, ...] = (
     _ours(ImuSample),
     _ours(WheelSample),
     _foxglove(GROUND_TRUTH, "PoseInFrame", "every pose of the source's ground truth, in its own frame"),
+    _ours(StartCheck),
     _ours(Dropped),
     _ours(Applied),
     _foxglove(TF, "FrameTransforms", "every frame: map to odom, odom to body; with an IMU level to map"),

@@ -13,12 +13,13 @@ from multiprocessing.connection import Connection, wait
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.drivers.checked_samples import checked_samples
 from stereo_sfm.drivers.source import Source
+from stereo_sfm.drivers.start_checked import RigChanged
 from stereo_sfm.pipeline.channels import End, Outbox, pickled
 from stereo_sfm.pipeline.health import HealthMeter
 from stereo_sfm.pipeline.images import ImageRing, SlotImage
-from stereo_sfm.pipeline.stages import sensor_drop, source_counters
+from stereo_sfm.pipeline.stages import sensor_drop, source_counters, start_check
 from stereo_sfm.pipeline.watchdog import HeartbeatThread
-from stereo_sfm.types import Dropped, StereoImage, Trajectory
+from stereo_sfm.types import Dropped, StartCheck, StereoImage, Trajectory
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +31,20 @@ class SourceInfo:
     ground_truth: Trajectory | None
     frame_count: int | None
     live: bool
+    given_rig: Rig  # before a start check corrected it
+
+    @staticmethod
+    def of(source: Source) -> SourceInfo:
+        """Of an open source."""
+        given = getattr(source, "given_rig", source.rig)
+        return SourceInfo(source.name, source.rig, source.ground_truth, source.frame_count, source.live, given)
+
+
+@dataclass(frozen=True)
+class OpenAgain:
+    """A live camera's first images contradict the calibration: the run begins again with what they fit."""
+
+    check: StartCheck
 
 
 TRACKER_SLOTS = 4  # of the ring, reserved from the log in real time
@@ -113,6 +128,8 @@ class CaptureStage:
         """Run until the source ends or a stop is requested."""
         try:
             self._read()
+        except RigChanged as found:
+            self.to_main.send(OpenAgain(found.check))
         finally:
             self._count(self._last)  # also when the source failed
             self.to_tracker.send(End("capture"))  # what was read so far is processed
@@ -142,7 +159,12 @@ class CaptureStage:
 
     def _images(self) -> Iterator[StereoImage]:
         """The images of the source; the watchdog measures how long each takes."""
+        self.pulse.begin()
         images = checked_samples(self.source)
+        self.pulse.end()
+        checked = start_check(self.source)
+        if checked is not None:
+            self.to_main.send(checked)
         while True:
             self.pulse.begin()
             image = next(images, None)

@@ -21,6 +21,7 @@ from stereo_sfm.pipeline.stages import (
     make_tracker_with_places,
     sensor_drop,
     source_counters,
+    start_check,
 )
 from stereo_sfm.pipeline.text import Listener
 from stereo_sfm.pipeline.threads import limited_threads
@@ -143,6 +144,9 @@ def run_inline(
     run = InlineRun(source, config, sinks, schedule, folders, jpeg)
     with Listener("main", run.add_line), limited_threads(config.pipeline.threads):
         images, failure = checked_samples(source), None
+        checked = start_check(source)
+        if checked is not None:
+            run.publish(checked)
         while True:
             try:
                 image = next(images)

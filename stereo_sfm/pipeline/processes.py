@@ -15,10 +15,11 @@ from typing import Self
 
 from stereo_sfm.config import Config
 from stereo_sfm.drivers.choice import Opener
+from stereo_sfm.drivers.start_checked import RigChanged
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.maps.folders import MapFolders
 from stereo_sfm.messages import Compiling, Localized, LogEnded, LogLine, MapSaved, Relocalize, SaveMap, Sink
-from stereo_sfm.pipeline.capture import SourceInfo
+from stereo_sfm.pipeline.capture import OpenAgain, SourceInfo
 from stereo_sfm.pipeline.channels import Arrivals, End, Failed
 from stereo_sfm.pipeline.child import UPSTREAM_LOST, Ready, Setup
 from stereo_sfm.pipeline.images import ImageLayout, ImageRing, SlotImage
@@ -189,6 +190,9 @@ class ProcessRun:
             self._end(connection, message.stage)
         elif isinstance(message, Ready):
             self._begin(message.stage)
+        elif isinstance(message, OpenAgain):
+            self._abandon()
+            raise RigChanged(message.check)
         else:
             if isinstance(message, LogLine):
                 emit(message)

@@ -12,7 +12,8 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from stereo_sfm.config import Config
-from stereo_sfm.drivers.choice import Opener
+from stereo_sfm.drivers.choice import Opener, with_known_start, with_start_check
+from stereo_sfm.drivers.start_checked import RigChanged, StartCheckedSource
 from stereo_sfm.errors import StereoSfmError, require
 from stereo_sfm.export.run_folder import KEPT_MAP, default_folder, discard_files, prepare_folder
 from stereo_sfm.folder_lock import FolderLock
@@ -24,7 +25,7 @@ from stereo_sfm.pipeline.logger import LogOptions
 from stereo_sfm.pipeline.processes import ProcessRun
 from stereo_sfm.pipeline.schedule import Recorded
 from stereo_sfm.pipeline.viewer import ViewerOptions
-from stereo_sfm.types import Dropped, Frame
+from stereo_sfm.types import Dropped, Frame, StartCheck
 from stereo_sfm.viz.server import LOOPBACK
 
 if TYPE_CHECKING:
@@ -67,7 +68,8 @@ class Session:
             raise StereoSfmError("--mode realtime needs processes: omit --inline")
         if wiring.viz != "none":
             require(("rerun",), "viewer", "the viewer")
-        self._opener, self._config, self._sinks, self._wiring = opener, config, list(sinks), wiring
+        self._opener = with_start_check(opener, config.self_calibration.mode == "auto")
+        self._config, self._sinks, self._wiring = config, list(sinks), wiring
         self._folders, self._overwrite, self._replayed = folders, overwrite, replayed
         self._stack = ExitStack()
         self._stopped = False
@@ -119,11 +121,23 @@ class Session:
         self.close()
 
     def __iter__(self) -> Iterator[Frame]:
-        for frame in self._frames:
-            self._began = True
-            yield frame
-            if self._stopped and self._run is None:
-                return
+        try:
+            for frame in self._frames:
+                self._began = True
+                yield frame
+                if self._stopped and self._run is None:
+                    return
+        except RigChanged as found:
+            self._open_again(found.check)
+            yield from self
+
+    def _open_again(self, check: StartCheck) -> None:
+        """Start the processes anew, with the calibration that a live camera's first images fit."""
+        self._opener = with_known_start(self._opener, check)
+        self._stack.close()
+        with ExitStack() as stack:
+            self._frames = self._enter_processes(stack)
+            self._stack = stack.pop_all()
 
     def stop(self) -> None:
         """Finish what is in flight and end."""
@@ -177,7 +191,9 @@ class Session:
 
         self._compilation = stack.enter_context(listening(self._compiling))
         source = stack.enter_context(self._opener())
-        self.info = SourceInfo(source.name, source.rig, source.ground_truth, source.frame_count, source.live)
+        if isinstance(source, StartCheckedSource):
+            source.look()  # a camera's images as well: nothing in this process makes them wait
+        self.info = SourceInfo.of(source)
         folder = self._name_folder(source.name)
         self._prepare()
         options = self._log_options(self._opener.device, folder)
@@ -230,7 +246,7 @@ class Session:
             log=self._log_options(self._opener.device, self.folder),
             folders=self._folders,
             viewer=viewer,
-            opened=self._prepare,
+            opened=self._prepare if self._lock is None else None,
         )
         stack.enter_context(self._run)
         self.info = self._run.info

@@ -18,7 +18,7 @@ from stereo_sfm.messages import SourceCounters
 from stereo_sfm.pipeline.schedule import Schedule
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.tracking.factory import AnyTracker, make_tracker
-from stereo_sfm.types import Applied, Dropped, Frame, Keyframe, LoopResult, MapUpdate, StereoImage, Trajectory
+from stereo_sfm.types import Applied, Dropped, Frame, Keyframe, LoopResult, MapUpdate, StartCheck, StereoImage, Trajectory
 
 T_co = TypeVar("T_co", covariant=True)
 
@@ -56,6 +56,11 @@ def sensor_drop(image: StereoImage) -> Dropped | None:
 def source_counters(source: Source, frame_id: int) -> SourceCounters | None:
     """Counters of a live source so far; None for files, which have none."""
     return SourceCounters(frame_id, dict(source.counters)) if source.counters else None
+
+
+def start_check(source: Source) -> StartCheck | None:
+    """What the source's first images said about its calibration; None for one that was not asked, or that fits."""
+    return getattr(source, "start_check", None)
 
 
 class AnyCloser(Protocol):

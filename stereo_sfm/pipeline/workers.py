@@ -31,7 +31,7 @@ def run_capture(
     from stereo_sfm.pipeline.images import ImageLayout, ImageRing
 
     with opener() as source:
-        to_main.send(SourceInfo(source.name, source.rig, source.ground_truth, source.frame_count, source.live))
+        to_main.send(SourceInfo.of(source))
         jpeg: bool
         setup, jpeg = Inbox[tuple[Setup, bool]](control).take()
         delay = prepare("capture", setup)

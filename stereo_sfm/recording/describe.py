@@ -13,6 +13,7 @@ import numpy as np
 
 from stereo_sfm.calib.lens_doubts import doubts
 from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calib.start import ADVICE, check_start
 from stereo_sfm.drivers.folder_source import FolderSource
 from stereo_sfm.drivers.source import Source
 from stereo_sfm.errors import StereoSfmError
@@ -230,7 +231,7 @@ def _describe_source(out: Description, spec: str | Path, rig: Path | None) -> No
         if out.kind != "mcap":
             out.metadata["source"] = source.name
             out.seconds = float(stamps[-1] - stamps[0]) / 1e9 if len(stamps) else 0.0
-        out.problems += _unlit(source, len(stamps))
+        out.problems += _unlit(source, len(stamps)) or _against_calibration(source)
     out.problems += _problems(out)
 
 
@@ -246,6 +247,17 @@ def _unlit(source: Source, count: int) -> list[str]:
     of, least = f"of {len(unlit)} sampled frames", 1 if spread else max(len(unlit), 1)
     counts = ((unlit.count(what), what) for what in (NO_LIGHT, NO_CONTRAST))
     return [f"{n} {of} have {what}" for n, what in counts if n >= least]
+
+
+def _against_calibration(source: Source) -> list[str]:
+    """What the first images say against the calibration, as at the start of a run."""
+    try:
+        found = check_start(source.rig, source)
+    except StereoSfmError as error:
+        return [str(error)]
+    if not found.text:
+        return []
+    return [found.text if found.rig is None else f"{found.text}: a run corrects it at its start; {ADVICE}"]
 
 
 def _shows_nothing(image: StereoImage) -> str:

@@ -7,7 +7,8 @@ import threading
 import time
 
 from stereo_sfm.config import Config
-from stereo_sfm.drivers.choice import Opener, SourceChoice
+from stereo_sfm.drivers.choice import Opener, SourceChoice, with_known_start
+from stereo_sfm.drivers.start_checked import RigChanged
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.pipeline.processes import StageDied
 from stereo_sfm.service.camera import same_camera
@@ -124,6 +125,9 @@ class Pipelines:
             session.run()
             self._failures = 0
             return True
+        except RigChanged as found:
+            self._opener = with_known_start(self._opener, found.check)
+            return False
         except StageDied as error:
             self._health.restarts += 1
             self._failures = 0 if session.tracking_s > STABLE_S else self._failures + 1

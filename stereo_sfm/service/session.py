@@ -10,7 +10,7 @@ from typing import Any
 
 from stereo_sfm.calib.camera_store import CorrectionKeeper
 from stereo_sfm.config import Config
-from stereo_sfm.drivers.choice import Opener
+from stereo_sfm.drivers.choice import Opener, with_start_check
 from stereo_sfm.maps.folders import MapFolders
 from stereo_sfm.messages import Compiling, Localized, LogLine, MapSaved
 from stereo_sfm.pipeline.images import SlotImage
@@ -45,6 +45,7 @@ class Session:
         recorder: Recorder,
         map_saved: Callable[[MapSaved], None],
     ) -> None:
+        opener = with_start_check(opener, config.self_calibration.mode == "auto")
         self.number, self._opener, self._config, self._folders = number, opener, config, folders
         self._hub, self._facts, self._health, self._map_saved = hub, facts, health, map_saved
         self._recorder = recorder
@@ -103,7 +104,7 @@ class Session:
                 info = run.info
                 self.serial = info.rig.serial
                 self._poses = PoseConverter(info.rig, self.number, self._clock)
-                self._corrections = CorrectionKeeper(self._opener.camera_store, info.rig)
+                self._corrections = CorrectionKeeper(self._opener.camera_store, info.rig, info.given_rig)
                 opening = self._folders.opening(self._opener.opening(info.rig))
                 self._recorder.begin(run, self._config, self._opener.spec or info.name, opening)
                 self._hub.publish(Started(self.number, info.name, info.rig, info.live))

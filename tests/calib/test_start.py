@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import stereo_sfm as s
-from stereo_sfm.calib.start import why_no_start
+from stereo_sfm.calib.start import check_start
 from stereo_sfm.geometry import se3
 
 Change = Callable[[s.StereoImage], s.StereoImage]
@@ -40,21 +40,21 @@ CHANGES: dict[str, tuple[Change, str]] = {
 def test_a_mistake_in_the_images_is_reported(images: tuple[s.Rig, list[s.StereoImage]], name: str) -> None:
     rig, good = images
     change, message = CHANGES[name]
-    why = why_no_start(rig, [change(image) for image in good])
+    why = check_start(rig, [change(image) for image in good])
     assert message in why and "\n" not in why
 
 
 def test_an_inverted_transform_is_reported(images: tuple[s.Rig, list[s.StereoImage]]) -> None:
     rig, good = images
     inverted = replace(rig, left_T_right=se3.inverse(rig.left_T_right))
-    assert why_no_start(inverted, good).startswith("left_T_right is inverted: 0 stereo matches")
+    assert check_start(inverted, good).startswith("left_T_right is inverted: 0 stereo matches")
 
 
 def test_the_calibration_of_other_cameras_is_suspected(images: tuple[s.Rig, list[s.StereoImage]]) -> None:
     rig, good = images
     bent = rig.left_T_right @ se3.exp(np.array([0, 0, 0, 0.3, 0.2, 0.1]))
-    assert "is this the calibration of these cameras?" in why_no_start(replace(rig, left_T_right=bent), good)
+    assert "is this the calibration of these cameras?" in check_start(replace(rig, left_T_right=bent), good)
 
 
 def test_good_images_give_no_diagnosis(images: tuple[s.Rig, list[s.StereoImage]]) -> None:
-    assert why_no_start(*images) == ""
+    assert check_start(*images) == ""
