@@ -158,13 +158,14 @@ class SourceChoice:
             raise StereoSfmError(f"{output} is the source, or contains it: choose another -o")
 
     def __call__(self) -> Source:
+        from stereo_sfm.drivers.ascending import AscendingSource
         from stereo_sfm.drivers.corrected import CorrectedSource
         from stereo_sfm.drivers.paced import PacedSource
         from stereo_sfm.drivers.rectified import rectified
         from stereo_sfm.drivers.repeated import RepeatedSource
         from stereo_sfm.drivers.select import SelectedFrames
 
-        source = open_source(self.spec, self.rig, **self.options)
+        source: Source = AscendingSource(open_source(self.spec, self.rig, **self.options))
         source = source if self.camera_store is None else CorrectedSource(source, self.camera_store)
         if self.selection != EVERYTHING:
             source = SelectedFrames(source, **vars(self.selection))

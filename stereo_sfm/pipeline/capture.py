@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 
 from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.ascending import ascending
 from stereo_sfm.drivers.checked_samples import checked_samples
 from stereo_sfm.drivers.source import Source
 from stereo_sfm.pipeline.channels import End, Outbox, pickled
@@ -142,7 +143,7 @@ class CaptureStage:
 
     def _images(self) -> Iterator[StereoImage]:
         """The images of the source; the watchdog measures how long each takes."""
-        images = checked_samples(self.source)
+        images = checked_samples(ascending(self.source, self.source.name))
         while True:
             self.pulse.begin()
             image = next(images, None)

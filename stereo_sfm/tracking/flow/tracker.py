@@ -495,9 +495,10 @@ class Tracker:
         bridge = self._bridge(image.stamp_ns)
         seen = bridge is None or image.left.max() >= DARK
         if seen:
+            unseen = (image.stamp_ns - self._stamp_ns) * 1e-9 if self._lost == 1 else 0.0  # without any image
             seconds = (image.stamp_ns - self._lost_ns) * 1e-9 if self._lost > 1 else 0.0
             self._free_s = self._free_s + seconds if self._recovery.free else 0.0
-            self._covered_s += 0.0 if self._recovery.free else seconds
+            self._covered_s += unseen if self._recovery.free else seconds + unseen
         self._lost_ns = image.stamp_ns
         if max(self._free_s, COVERED_SHARE * self._covered_s) > self._config.lost_s:
             self._pose = expected.odom_T_cam
