@@ -11,6 +11,7 @@ from stereo_sfm.eval import plots
 from stereo_sfm.eval.calibration_results import calibration_table
 from stereo_sfm.eval.evaluate import Evaluation, table
 from stereo_sfm.eval.record import RunRecord
+from stereo_sfm.eval.sensor_results import sensor_lines
 from stereo_sfm.eval.statistics import failure, summary, thousands
 from stereo_sfm.types import Trajectory
 
@@ -193,6 +194,7 @@ def verdicts(stats: dict[str, Any], evaluations: dict[str, Evaluation]) -> list[
             "was recognised in another; drive again through a place that was seen before tracking was lost"
         )
     out += _drops(stats)
+    out += [f"**WARN**: {line}" for line in sensor_lines(stats)]
     if stats["tracked"] and stats["inliers_median"] < FEW_INLIERS:
         out.append(
             f"**WARN**: only {stats['inliers_median']:.0f} points per frame: check texture, exposure and calibration"

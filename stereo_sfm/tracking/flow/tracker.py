@@ -183,7 +183,7 @@ class Tracker:
             if keyframe is not None or self._solver.crowded(self._static_count()):
                 self._sparse = images
         state = TrackState.RECOVERED if recovered else TrackState.OK
-        stats |= {} if self._sensors is None else self._sensors.level(self._pose)
+        stats |= {} if self._sensors is None else self._sensors.level(self._pose) | self._sensors.use_of_each()
         reason = "" if self._sensors is None else self._sensors.news()
         return self._frame(image, self._pose, solution.covariance, state, reason, inlier, keyframe, stats), keyframe
 
