@@ -20,6 +20,7 @@ S = TypeVar("S", ImuSamples, WheelSamples)
 MAX_GYRO, MAX_ACCEL = 50.0, 500.0  # rad/s, m/s^2: above what sensors on robots measure
 MAX_SPEED, MAX_WHEEL = 50.0, 1000.0  # m/s, rad/s
 JUDGED = 100  # samples until units are judged
+CLOCK_S = 10.0  # from the first samples to their image: more is another clock
 GAP_S = 1.0  # without samples, between images that come: worth a line
 
 
@@ -108,13 +109,21 @@ class _Sensor(Generic[S]):
                 self.say("doubled", "samples that are doubled or come too late are skipped")
         return keep
 
-    def note_gap(self, image: StereoImage, count: int) -> None:
-        """A line when the sensor falls silent."""
-        if self.left_out:
+    def note_gap(self, image: StereoImage, samples: S | None) -> None:
+        """A line when the sensor falls silent, or has another clock."""
+        if self.left_out or (samples is None and self.newest_ns is None):
             return
-        if count:
-            self.newest_ns = image.stamp_ns
-        elif self.newest_ns is not None and (image.stamp_ns - self.newest_ns) * 1e-9 > GAP_S:
+        came, first = samples is not None and len(samples) > 0, self.newest_ns is None
+        if samples is not None and came:
+            self.newest_ns = int(samples.stamp_ns[-1])
+        elif self.newest_ns is None:
+            self.newest_ns = image.stamp_ns  # none came yet
+        away_s = abs(image.stamp_ns - (self.newest_ns or 0)) * 1e-9
+        if came and first and away_s > CLOCK_S:
+            self.say(
+                "clock", f"their stamps are {away_s:.3g} s away from the images': another clock, they are not used"
+            )
+        elif away_s > GAP_S:
             self.say("gap", f"no samples for more than {GAP_S:g} s: the run goes on without them")
 
 
@@ -143,8 +152,8 @@ class SampleChecker:
     def checked(self, image: StereoImage) -> StereoImage:
         """The image with samples that the stages can use: the same object where nothing is wrong."""
         imu, wheel = self._imu.checked(image.imu), self._wheel.checked(image.wheel)
-        self._imu.note_gap(image, 0 if imu is None else len(imu))
-        self._wheel.note_gap(image, 0 if wheel is None else len(wheel))
+        self._imu.note_gap(image, imu)
+        self._wheel.note_gap(image, wheel)
         same = imu is image.imu and wheel is image.wheel
         return image if same else replace(image, imu=imu, wheel=wheel)
 

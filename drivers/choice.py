@@ -164,6 +164,7 @@ class SourceChoice:
             raise StereoSfmError(f"{output} is the source, or contains it: choose another -o")
 
     def __call__(self) -> Source:
+        from stereo_sfm.drivers.ascending import AscendingSource
         from stereo_sfm.drivers.corrected import CorrectedSource
         from stereo_sfm.drivers.paced import PacedSource
         from stereo_sfm.drivers.rectified import rectified
@@ -171,7 +172,7 @@ class SourceChoice:
         from stereo_sfm.drivers.select import SelectedFrames
         from stereo_sfm.drivers.start_checked import StartCheckedSource
 
-        source = open_source(self.spec, self.rig, **self.options)
+        source: Source = AscendingSource(open_source(self.spec, self.rig, **self.options))
         source = source if self.camera_store is None else CorrectedSource(source, self.camera_store)
         if self.selection != EVERYTHING:
             source = SelectedFrames(source, **vars(self.selection))

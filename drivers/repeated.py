@@ -33,13 +33,14 @@ class RepeatedSource(WrappedSource):
                 if first is None:
                     first = image.stamp_ns
                 before, last = last, image.stamp_ns
-                yield _shifted(image, next(ids), shift_ns)
+                yield shifted(image, next(ids), shift_ns)
             if first is None or before is None or last is None:
                 return  # fewer than two images: no interval
             shift_ns += last - first + (last - before)
 
 
-def _shifted(image: StereoImage, frame_id: int, shift_ns: int) -> StereoImage:
+def shifted(image: StereoImage, frame_id: int, shift_ns: int) -> StereoImage:
+    """The image with another number, and with its samples at later times."""
     imu, wheel = image.imu, image.wheel
     return replace(
         image,

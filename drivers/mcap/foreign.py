@@ -16,7 +16,9 @@ from stereo_sfm.calib.formats.camera_info import CameraInfo
 from stereo_sfm.calib.imu import Imu
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.calib.wheel import Wheel
+from stereo_sfm.drivers.image_lists import MAX_SKEW_NS
 from stereo_sfm.drivers.mcap import McapOptions
+from stereo_sfm.drivers.mcap.clock import Clock, clock_of
 from stereo_sfm.drivers.mcap.messages import (
     BAD_MESSAGE,
     CAMERAS,
@@ -30,12 +32,14 @@ from stereo_sfm.drivers.mcap.messages import (
     ImuReading,
     Transform,
     WheelReading,
+    half_of,
     schema_name,
 )
 from stereo_sfm.drivers.mcap.recording import Recording
 from stereo_sfm.drivers.mcap.rig import camera_of, chain, stereo_rig
-from stereo_sfm.drivers.mcap.topics import camera_topic, choose_topics, is_rectified
+from stereo_sfm.drivers.mcap.topics import ChosenTopics, camera_topic, choose_topics, is_rectified
 from stereo_sfm.drivers.rig_option import chosen_rig
+from stereo_sfm.drivers.side_names import words_of
 from stereo_sfm.drivers.source import BaseSource, Stamps
 from stereo_sfm.drivers.tum_rgbd.source import with_virtual_camera
 from stereo_sfm.drivers.used_bits import used_bits
@@ -48,9 +52,9 @@ log = logging.getLogger("stereo_sfm")
 
 Reading = TypeVar("Reading", ImuReading, WheelReading)
 
-_STATIC_NS = 10_000_000_000  # the fixed transforms must come within the first ten seconds
+_STATIC_NS = 10_000_000_000  # fixed transforms among moving ones must come within the first ten seconds
 _STEP_BACK_NS = 200_000_000  # messages of several threads may be out of order by less
-_WAITING = 30  # maximum number of images of one camera that wait for the other
+_WAITING_BYTES = 1 << 28  # of images of one camera that wait for the other: logs may be written in bursts
 
 
 @dataclass
@@ -75,22 +79,44 @@ class ForeignSource(BaseSource):
         self.name = str(reader.path)
         self.topics = choose_topics(reader, options.left, options.right, options.depth, options.wheel)
         self._joints = [name for name in options.joints.split(",") if name]
+        self._read_forward()
+        self._clock = self._found_clock()
         self.rig = self._with_wheel(self._with_imu(chosen_rig(options.rig, self._recorded_rig)))
         if self.topics.depth:
             self.rig = with_virtual_camera(self.rig)
         self.ground_truth = self._read_truth()
         counts = {t.topic: t.count for t in reader.topics}
         self.frame_count = min(counts[t] for t in (self.topics.left, self._other()) if t)
-        self._tolerance_ns = self._period_ns() * 2 // 5
         self._bits = used_bits(self.name, self._sample)
         self._check_first()
-        back_ns = reader.step_back_ns(self.topics.left)
+
+    def _read_forward(self) -> None:
+        """In the order of the file, where the clock by which messages were logged was set back."""
+        back_ns = self.reader.step_back_ns(self.topics.left)
         if back_ns > _STEP_BACK_NS:
+            self.reader.by_time = False
             log.warning(
-                "%s: the clock goes back by %.1f s in it: images from before and after are merged by their stamps",
+                "%s: the clock goes back by %.1f s in it: its messages are read in the order of the file",
                 self.name,
                 back_ns / 1e9,
             )
+
+    def _found_clock(self) -> Clock:
+        def stamps(topic: str) -> Iterator[tuple[int, int]]:
+            records = self.reader.messages([topic])
+            return ((message.stamp_ns, r.log_time) for r in records if (message := self._message_of(r)) is not None)
+
+        clock, warning = clock_of(self.name, [t for t in (self.topics.left, self._other()) if t], stamps)
+        if warning:
+            log.warning("%s: %s", self.name, warning)
+        if clock.skew_ns > MAX_SKEW_NS:
+            log.warning(
+                "%s: the stamps of left and right images differ by %.1f ms: in motion they see different scenes. "
+                "Trigger both cameras together",
+                self.name,
+                clock.skew_ns / 1e6,
+            )
+        return clock
 
     def close(self) -> None:
         self.reader.close()
@@ -164,12 +190,12 @@ class ForeignSource(BaseSource):
         others: deque[_StampedImage] = deque()
         for record in self.reader.messages([*names, *samples], start_ns, until_ns):
             if record.topic in self.topics.imu:
-                reading = _imu_reading(record)
-                imu += [reading] if reading is not None else []
+                reading = _imu_reading(record, self.topics)
+                imu += [self._on_clock(reading, record)] if reading is not None else []
                 continue
             if record.topic == self.topics.wheel:
                 turned = _wheel_reading(record)
-                wheel += [turned] if turned is not None else []
+                wheel += [self._on_clock(turned, record)] if turned is not None else []
                 continue
             image = self._image_of(record)
             if image is None:
@@ -177,27 +203,40 @@ class ForeignSource(BaseSource):
             if len(names) == 1:
                 yield image, None
                 continue
+            for waiting in (lefts, others):  # from before the clock was set back
+                while waiting and waiting[0].stamp_ns - image.stamp_ns > _STEP_BACK_NS:
+                    waiting.popleft()
             (lefts if record.topic == names[0] else others).append(image)
             while lefts and others:
                 skew = others[0].stamp_ns - lefts[0].stamp_ns
-                if skew < -self._tolerance_ns:
+                if skew < -self._clock.tolerance_ns:
                     others.popleft()
-                elif skew > self._tolerance_ns:
+                elif skew > self._clock.tolerance_ns:
                     yield lefts.popleft(), None
                 else:
                     yield lefts.popleft(), others.popleft()
-            if len(lefts) > _WAITING:
+            if sum(len(x.message.data) for x in lefts) > _WAITING_BYTES:
                 yield lefts.popleft(), None
-            if len(others) > _WAITING:
+            if sum(len(x.message.data) for x in others) > _WAITING_BYTES:
                 others.popleft()
 
-    def _image_of(self, record: Record) -> _StampedImage | None:
+    def _on_clock(self, reading: Reading, record: Record) -> Reading:
+        """A sample with its stamp on the clock of the images."""
+        stamp_ns = self._clock.stamp(reading.stamp_ns, record.log_time)
+        return reading if stamp_ns == reading.stamp_ns else replace(reading, stamp_ns=stamp_ns)
+
+    def _message_of(self, record: Record) -> ImageMessage | None:
         try:
-            message = IMAGES[schema_name(record)](record.data)
+            return IMAGES[schema_name(record)](record.data)
         except BAD_MESSAGE as error:
             log.warning("%s: a message of %s cannot be read: %s", self.name, record.topic, error)
             return None
-        return _StampedImage(message.stamp_ns or record.log_time, message)
+
+    def _image_of(self, record: Record) -> _StampedImage | None:
+        message = self._message_of(record)
+        if message is None:
+            return None
+        return _StampedImage(self._clock.stamp(message.stamp_ns, record.log_time), message)
 
     def _recorded_rig(self) -> Rig:
         names = tuple(camera_topic(t, self.topics.cameras) for t in (self.topics.left, self.topics.right) if t)
@@ -226,7 +265,8 @@ class ForeignSource(BaseSource):
         """The rig with the pose of the IMU, where the recording has one and its transforms say where it is."""
         if rig.imu is not None or not self.topics.imu:
             return rig
-        reading = next((r for m in self.reader.messages(self.topics.imu) if (r := _imu_reading(m)) is not None), None)
+        records = self.reader.messages(self.topics.imu[:1])
+        reading = next((r for m in records if (r := _imu_reading(m, self.topics)) is not None), None)
         left_T_imu = chain(self._fixed_transforms(), self._left_frame(), reading.frame) if reading else None
         if left_T_imu is None:
             log.info("%s: no transform from the left camera to the IMU: its samples are not used", self.name)
@@ -247,7 +287,10 @@ class ForeignSource(BaseSource):
     def _fixed_transforms(self) -> list[Transform]:
         out: list[Transform] = []
         start, _ = self.reader.time_range
-        for record in self.reader.messages(self.topics.transforms, None, start + _STATIC_NS):
+        fixed = [t for t in self.topics.transforms if "static" in words_of(t)]  # few: the clock may be set after them
+        others = [t for t in self.topics.transforms if t not in fixed]
+        first = self.reader.messages(others, None, start + _STATIC_NS)
+        for record in itertools.chain(self.reader.messages(fixed), first):
             try:
                 out += TRANSFORMS[schema_name(record)](record.data)
             except BAD_MESSAGE as error:
@@ -262,7 +305,8 @@ class ForeignSource(BaseSource):
                 pose = POSES[schema_name(record)](record.data)
             except BAD_MESSAGE:
                 continue
-            rows.append(Transform(pose.stamp_ns or record.log_time, pose.parent, pose.child, pose.matrix))
+            stamp_ns = self._clock.stamp(pose.stamp_ns, record.log_time)
+            rows.append(Transform(stamp_ns, pose.parent, pose.child, pose.matrix))
         if not rows:
             return None
         rows.sort(key=lambda row: row.stamp_ns)
@@ -273,10 +317,6 @@ class ForeignSource(BaseSource):
     def _left_frame(self) -> str:
         first = next((self._image_of(r) for r in self.reader.messages([self.topics.left])), None)
         return first.message.frame if first else ""
-
-    def _period_ns(self) -> int:
-        stamps = [r.log_time for r in itertools.islice(self.reader.messages([self.topics.left]), 20)]
-        return int(np.median(np.diff(stamps))) if len(stamps) > 1 else 100_000_000
 
     def _sample(self, count: int) -> Iterator[Any]:
         """Readable images of both cameras at evenly spaced times."""
@@ -304,9 +344,11 @@ class ForeignSource(BaseSource):
             )
 
 
-def _imu_reading(record: Record) -> ImuReading | None:
+def _imu_reading(record: Record, topics: ChosenTopics) -> ImuReading | None:
+    """What a message measures: of two topics the first one is the gyroscope's, the other one the accelerometer's."""
     with suppress(*BAD_MESSAGE):
-        return IMUS[schema_name(record)](record.data)
+        reading = IMUS[schema_name(record)](record.data)
+        return reading if len(topics.imu) == 1 else half_of(reading, record.topic == topics.imu[0])
     return None
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,7 @@ from stereo_sfm.log.reader import Record
 from stereo_sfm.pixels import decode_gray
 from stereo_sfm.types import F32, F64, U8, U16
 
+NOTHING = (float("nan"),) * 3  # what is not measured
 # Exceptions of damaged or unexpected messages.
 BAD_MESSAGE = (ValueError, DecodeError, struct.error, IndexError)
 
@@ -204,14 +205,24 @@ def _odometry_ros(data: bytes) -> Transform:
 
 
 def _imu_ros(data: bytes) -> ImuReading:
-    """A covariance of -1 stands for a quantity that is not measured (sensor_msgs/Imu)."""
+    """A covariance of -1 stands for a quantity that is not measured (sensor_msgs/Imu).
+
+    So does a force of exactly zero, beside which a sensor that measures both would have to fall freely.
+    """
     cdr = _Cdr(data)
     stamp_ns, frame = cdr.header()
     cdr.take("d", 13)
     gyro, gyro_known = cdr.take("d", 3), cdr.take("d", 9)[0] != -1
     accel, accel_known = cdr.take("d", 3), cdr.take("d", 9)[0] != -1
-    nothing = (float("nan"),) * 3
-    return ImuReading(stamp_ns, frame, [*(gyro if gyro_known else nothing), *(accel if accel_known else nothing)])
+    accel_known = accel_known and any(accel)
+    return ImuReading(stamp_ns, frame, [*(gyro if gyro_known else NOTHING), *(accel if accel_known else NOTHING)])
+
+
+def half_of(reading: ImuReading, gyro: bool) -> ImuReading:
+    """The gyroscope's half of a message, or the accelerometer's: drivers with a topic for each fill the other half
+    with zeros."""
+    values = [*reading.values[:3], *NOTHING] if gyro else [*NOTHING, *reading.values[3:]]
+    return replace(reading, values=values)
 
 
 def _odometry_velocity_ros(data: bytes) -> WheelReading:

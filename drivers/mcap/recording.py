@@ -13,6 +13,7 @@ class Recording(Protocol):
     """Messages by topic and time: an MCAP file (`stereo_sfm.log.reader.LogReader`) or a ROS bag."""
 
     path: Path
+    by_time: bool  # messages come in the order of their log time, else in that of the file, if the kind of file can
 
     @property
     def topics(self) -> list[TopicInfo]:
@@ -27,7 +28,7 @@ class Recording(Protocol):
     def messages(
         self, topics: Collection[str] | None = None, start: int | None = None, until: int | None = None
     ) -> Iterator[Record]:
-        """Messages of some topics (None: all) in the order of their log time, both ends inclusive."""
+        """Messages of some topics (None: all) in the order that `by_time` says, both ends inclusive."""
         ...
 
     def step_back_ns(self, topic: str) -> int:

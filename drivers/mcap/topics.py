@@ -17,26 +17,14 @@ from stereo_sfm.drivers.mcap.messages import (
     VELOCITIES,
 )
 from stereo_sfm.drivers.mcap.recording import Recording
+from stereo_sfm.drivers.side_names import side_pairs, words_of
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log.reader import TopicInfo
 
 log = logging.getLogger("stereo_sfm")
 
-# Parts of names of left and right cameras, most specific first.
-_SIDES = (
-    ("left", "right"),
-    ("cam0", "cam1"),
-    ("cam_0", "cam_1"),
-    ("camera0", "camera1"),
-    ("camera_0", "camera_1"),
-    ("fisheye1", "fisheye2"),
-    ("infra1", "infra2"),
-    ("rect0", "rect1"),
-    ("image0", "image1"),
-    ("image_0", "image_1"),
-    ("cam1", "cam2"),
-)
-_DEPTH = ("depth", "disparity")
+_DEPTH = {"depth", "depthmap", "disparity"}  # words of names
+_GYRO, _ACCEL = ("gyro", "gyroscope"), ("accel", "acc", "accelerometer")
 _TRUTH = ("ground_truth", "groundtruth", "mocap", "vicon")
 
 
@@ -91,12 +79,17 @@ def choose_topics(reader: Recording, left: str = "", right: str = "", depth: str
 
 
 def _imu_topics(topics: list[str]) -> tuple[str, ...]:
-    """The first IMU; both topics of one whose gyroscope and accelerometer are separate."""
+    """The first IMU; both topics of one whose gyroscope and accelerometer are separate, the gyroscope's first."""
+    both = [t for t in topics if not {*_GYRO, *_ACCEL} & {*words_of(t)}]
     for gyro in topics:
-        accel = gyro.replace("gyro", "accel")
-        if accel != gyro and accel in topics:
-            return gyro, accel
-    return tuple(topics[:1])
+        around = [word for word in words_of(gyro) if word not in _GYRO]
+        if len(around) == len(words_of(gyro)):
+            continue
+        for accel in topics:
+            words = words_of(accel)
+            if accel != gyro and [w for w in words if w not in _ACCEL] == around and {*_ACCEL} & {*words}:
+                return gyro, accel
+    return tuple((both or topics)[:1])
 
 
 def _wheel_topic(name: str, rows: list[TopicInfo], chosen: str) -> str:
@@ -107,7 +100,7 @@ def _wheel_topic(name: str, rows: list[TopicInfo], chosen: str) -> str:
             raise StereoSfmError(f"{name} has no wheel odometry {chosen} (there is: {', '.join(known) or 'none'})")
         return chosen
     names = [t.topic for t in rows if t.schema in VELOCITIES]
-    return next((t for t in names if "wheel" in t.lower() or t.endswith("/odom")), "")
+    return next((t for t in names if any(w.startswith("wheel") for w in words_of(t)) or t.endswith("/odom")), "")
 
 
 def camera_topic(image: str, cameras: tuple[str, ...]) -> str:
@@ -118,7 +111,7 @@ def camera_topic(image: str, cameras: tuple[str, ...]) -> str:
 
 def is_rectified(topic: str) -> bool:
     """Whether an image topic has rectified images, by its name."""
-    return "rect" in topic.lower() and "unrect" not in topic.lower()
+    return any(word == "rect" or word.startswith("rectif") for word in words_of(topic))
 
 
 def _content(topics: list[TopicInfo]) -> str:
@@ -131,7 +124,7 @@ def _content(topics: list[TopicInfo]) -> str:
 
 
 def _is_depth(topic: str) -> bool:
-    return any(word in topic.lower() for word in _DEPTH)
+    return not _DEPTH.isdisjoint(words_of(topic))
 
 
 def _shared(a: str, b: str) -> int:
@@ -145,12 +138,7 @@ def _shared(a: str, b: str) -> int:
 
 
 def _pair(name: str, candidates: list[str], cameras: tuple[str, ...]) -> tuple[str, str]:
-    pairs = [
-        (topic, topic.replace(one, other))
-        for one, other in _SIDES
-        for topic in candidates
-        if one in topic and topic.replace(one, other) in candidates
-    ]
+    pairs = side_pairs(candidates)
     if pairs:
         order = {pair: i for i, pair in reversed(list(enumerate(pairs)))}
         return min(order, key=lambda p: (not camera_topic(p[0], cameras), is_rectified(p[0]), len(p[0]), order[p]))

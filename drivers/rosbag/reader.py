@@ -70,6 +70,7 @@ class BagReader:
         from rosbags.typesys import Stores, get_typestore
 
         self.path = path
+        self.by_time = True  # always
         self._ros_1 = path.suffix == _SUFFIX_ROS_1
         self._types = get_typestore(Stores.LATEST)
         self._reader: Any = self._opened()

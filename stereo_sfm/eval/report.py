@@ -11,6 +11,7 @@ from stereo_sfm.eval import plots
 from stereo_sfm.eval.calibration_results import calibration_table
 from stereo_sfm.eval.evaluate import Evaluation, table
 from stereo_sfm.eval.record import RunRecord
+from stereo_sfm.eval.sensor_results import sensor_lines
 from stereo_sfm.eval.statistics import failure, loop_errors, summary, thousands
 from stereo_sfm.types import Trajectory
 
@@ -195,6 +196,7 @@ def verdicts(stats: dict[str, Any], evaluations: dict[str, Evaluation]) -> list[
     if stats["loop_errors_at"]:
         out.append(f"**WARN**: {loop_errors(stats)}")
     out += _drops(stats)
+    out += [f"**WARN**: {line}" for line in sensor_lines(stats)]
     if stats["tracked"] and stats["inliers_median"] < FEW_INLIERS:
         out.append(
             f"**WARN**: only {stats['inliers_median']:.0f} points per frame: check texture, exposure and calibration"

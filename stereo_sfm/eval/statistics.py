@@ -18,6 +18,7 @@ from stereo_sfm.eval.calibration_results import (
 )
 from stereo_sfm.eval.evaluate import Evaluation, length
 from stereo_sfm.eval.record import RunRecord
+from stereo_sfm.eval.sensor_results import sensor_lines, sensor_use_stats
 from stereo_sfm.messages import Health
 from stereo_sfm.tracking.inertial.inertial_motion import roll_pitch_deg
 from stereo_sfm.types import F64, TrackState
@@ -85,6 +86,7 @@ def statistics(record: RunRecord, wall_s: float, evaluations: dict[str, Evaluati
         "start_check": start_check_stats(record),
         "calibration": calibration_stats(record),
         "sensor_calibration": sensor_stats(record),
+        "sensors": sensor_use_stats(record),
         "row_errors": row_error_stats(record),
         "fingerprint": record.fingerprint(),
         "evaluation": {name: result.to_dict() for name, result in (evaluations or {}).items()},
@@ -149,6 +151,7 @@ def summary(stats: dict[str, Any], evaluations: dict[str, Evaluation] | None = N
         lines.append(loop_errors(stats))
     if stats["gravity"]:
         lines.append(_gravity(stats["gravity"]))
+    lines += sensor_lines(stats)
     if stats["camera"]:
         lines.append(_camera(stats["camera"]))
     lines += _log(stats)

@@ -96,6 +96,7 @@ def in_order(
     wanted: Collection[int],
     start: int | None,
     until: int | None,
+    by_time: bool = True,
 ) -> Iterator[Message]:
     """Messages of many chunks in the order of their log time, equal times in the order of the file.
 
@@ -105,10 +106,11 @@ def in_order(
         wanted: channels.
         start: first log time, inclusive.
         until: last log time, inclusive.
+        by_time: False: all in the order of the file.
     """
     least, most = -1 if start is None else start, (1 << 64) if until is None else until
     queue: list[tuple[int, int, int, ChunkIndex | Message]] = [
-        (c.message_start_time, c.chunk_start_offset, -1, c)
+        (c.message_start_time * by_time, c.chunk_start_offset, -1, c)
         for c in chunks
         if c.message_end_time >= least and c.message_start_time <= most
         and (not c.message_index_offsets or not c.message_index_offsets.keys().isdisjoint(wanted))
@@ -121,4 +123,4 @@ def in_order(
             continue
         for at, record in records(read(item)):
             if isinstance(record, Message) and record.channel_id in wanted and least <= record.log_time <= most:
-                heapq.heappush(queue, (record.log_time, offset, at, record))
+                heapq.heappush(queue, (record.log_time * by_time, offset, at, record))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import logging
 import struct
 import zlib
@@ -90,6 +91,7 @@ class LogReader:
         except OSError as error:
             raise StereoSfmError(f"cannot read {path}: {error.strerror}") from None
         self.truncated = ""
+        self.by_time = True  # False: messages come in the order of the file, for one whose clock was set back
         self._times: dict[int, I64] | None = None
         try:
             scan.check_magic(self._stream, path)
@@ -157,7 +159,7 @@ class LogReader:
     def messages(
         self, topics: Collection[str] | None = None, start: int | None = None, until: int | None = None
     ) -> Iterator[Record]:
-        """Messages in the order of their log time, equal times in file order.
+        """Messages in the order of their log time, equal times in file order; all in file order unless `by_time`.
 
         Args:
             topics: names, None for all.
@@ -178,12 +180,12 @@ class LogReader:
 
     def _found(self, wanted: Collection[int], start: int | None, until: int | None) -> Iterator[Message]:
         if self.summary.chunk_indexes:
-            return chunks.in_order(self.summary.chunk_indexes, self._chunk, wanted, start, until)
+            return chunks.in_order(self.summary.chunk_indexes, self._chunk, wanted, start, until, self.by_time)
         inside = [m for m in scan.loose(self._stream) if m.channel_id in wanted]
         inside = [
             m for m in inside if (start is None or m.log_time >= start) and (until is None or m.log_time <= until)
         ]
-        return iter(sorted(inside, key=lambda m: m.log_time))
+        return iter(sorted(inside, key=lambda m: m.log_time) if self.by_time else inside)
 
     def _chunk(self, index: ChunkIndex) -> Chunk:
         raw = self._read(index.chunk_start_offset, index.chunk_length)
@@ -212,6 +214,12 @@ class LogReader:
         if indexed is None:
             return np.array([r.log_time for r in self.messages([topic])], np.int64)
         return np.sort(np.concatenate([np.zeros(0, np.int64), *indexed]))
+
+    @property
+    def set_back(self) -> bool:
+        """Whether the clock goes back from one part of the file to the next, by the index alone."""
+        chunks = sorted(self.summary.chunk_indexes, key=lambda c: c.chunk_start_offset)
+        return any(b.message_end_time < a.message_end_time for a, b in itertools.pairwise(chunks))
 
     def step_back_ns(self, topic: str) -> int:
         """How far the log time goes back at most from one message of a topic to the next; 0 without an index."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 
 from stereo_sfm.calib.rig import Rig
+from stereo_sfm.drivers.ascending import ascending
 from stereo_sfm.drivers.checked_samples import checked_samples
 from stereo_sfm.drivers.source import Source
 from stereo_sfm.drivers.start_checked import RigChanged
@@ -160,7 +161,7 @@ class CaptureStage:
     def _images(self) -> Iterator[StereoImage]:
         """The images of the source; the watchdog measures how long each takes."""
         self.pulse.begin()
-        images = checked_samples(self.source)
+        images = checked_samples(ascending(self.source, self.source.name))
         self.pulse.end()
         checked = start_check(self.source)
         if checked is not None:

@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Generator, Sequence
 
 from stereo_sfm.config import Config
+from stereo_sfm.drivers.ascending import ascending
 from stereo_sfm.drivers.checked_samples import checked_samples
 from stereo_sfm.drivers.source import Source
 from stereo_sfm.errors import StereoSfmError
@@ -143,7 +144,7 @@ def run_inline(
     """
     run = InlineRun(source, config, sinks, schedule, folders, jpeg)
     with Listener("main", run.add_line), limited_threads(config.pipeline.threads):
-        images, failure = checked_samples(source), None
+        images, failure = checked_samples(ascending(source, source.name)), None
         checked = start_check(source)
         if checked is not None:
             run.publish(checked)

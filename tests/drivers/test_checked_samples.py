@@ -116,6 +116,19 @@ def test_a_sensor_that_falls_silent(caplog: pytest.LogCaptureFixture) -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda i: replace(i, imu=imu_of(i).shifted(-(10**15))), "another clock"),
+        (lambda i: replace(i, imu=imu_of(i).part(slice(0))), "no samples for more than"),
+    ],
+)
+def test_samples_of_another_clock_or_none_at_all(change: Change, says: str, caplog: pytest.LogCaptureFixture) -> None:
+    assert len(list(checked_samples(images(change)))) == FRAMES
+    (record,) = caplog.records
+    assert says in record.getMessage() and "inertial" in record.getMessage()
+
+
 @pytest.mark.parametrize("change", [doubled, not_numbers, disordered])
 def test_a_run_goes_on(change: Change, caplog: pytest.LogCaptureFixture) -> None:
     with open_source("sim:loop?size=212x200&frames=12&rate=15&start=60&imu=t265&wheel=differential") as source:

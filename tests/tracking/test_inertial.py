@@ -160,9 +160,9 @@ def test_in_the_dark_the_error_stays_small_and_is_known(seed: int) -> None:
 
 def test_before_velocity_is_known_only_the_rotation_is_predicted() -> None:
     session = Session()
-    motion = follow(session, 0.5)
     expected = se3.from_rotation_translation(np.eye(3), np.array([1.0, 2.0, 3.0]))
-    stamp = 550_000_000
+    np.testing.assert_array_equal(follow(session, 0.3).predict(350_000_000, expected), expected)  # nothing shown yet
+    motion, stamp = follow(session, 1.0), 1_050_000_000
     predicted = motion.predict(stamp, expected)
     np.testing.assert_array_equal(predicted[:3, 3], expected[:3, 3])
     turned = predicted[:3, :3].T @ session.pose(stamp * 1e-9)[:3, :3]
@@ -203,7 +203,11 @@ def test_a_bias_that_was_found_in_turns_is_remembered() -> None:
     for k in range(40 * 20):  # y is down
         turning = 0.6 * np.sin(0.5 * k / 20) if k < 20 * 20 else 0.0
         stamps = k * FRAME_NS + np.arange(RATE_NS, FRAME_NS + 1, RATE_NS)
+        rate = np.pi / 2  # rad/s, in which it is moved up and down, too
+        lifted = np.cos(1e-9 * rate * stamps) if k < 20 * 20 else np.ones(len(stamps))
+        position[1] = 0.1 * (1 - lifted[-1])
         accel = np.tile(np.array([0.0, -GRAVITY, 0.0]) + bias, (len(stamps), 1))
+        accel[:, 1] += 0.1 * rate**2 * lifted if k < 20 * 20 else 0.0
         gyro = np.tile([0.0, turning, 0.0], (len(stamps), 1))
         noise = rng.normal(0, 1, (len(stamps), 6)) * np.repeat([2e-3, 3e-2], 3)
         motion.feed(ImuSamples(stamps, gyro + noise[:, :3], accel + noise[:, 3:]))

@@ -142,13 +142,14 @@ def test_wheels_that_are_stuck_reversed_or_in_other_units_are_left_out_and_that_
         return replace(samples, speeds=samples.speeds * factor) if 8 < seconds < 16 else samples
 
     drive = Drive({"wheel": "differential"}, wrong).until(14.0)
-    assert drive.said == ["wheels_contradict_images"]
+    assert {text.partition(":")[0] for text in drive.said} == {"wheels_contradict_images"}
+    assert len(drive.said) <= 2 and ("nothing" in drive.said[-1]) == (factor == 0.0)
     stamp = drive.source.stamp_ns(drive.next)
     assert drive.sensors.bridge(stamp) is None
     step = np.array([0.01, 0, 0.03, 0, 0, 0])
     np.testing.assert_array_equal(drive.sensors.predict(stamp, np.eye(4), step), se3.exp(step))
     assert drive.until(DARK_S).sensors.bridge(drive.source.stamp_ns(drive.next)) is not None, "they are right again"
-    assert len(drive.said) == 1
+    assert len(drive.said) <= 2
 
 
 def test_a_step_is_predicted_by_the_change_of_the_wheels() -> None:

@@ -184,7 +184,7 @@ class Tracker:
             if keyframe is not None or self._solver.crowded(self._static_count()):
                 self._sparse = images
         state = TrackState.RECOVERED if recovered else TrackState.OK
-        stats |= {} if self._sensors is None else self._sensors.level(self._pose)
+        stats |= {} if self._sensors is None else self._sensors.level(self._pose) | self._sensors.use_of_each()
         reason = "" if self._sensors is None else self._sensors.news()
         return self._frame(image, self._pose, solution.covariance, state, reason, inlier, keyframe, stats), keyframe
 
@@ -501,9 +501,10 @@ class Tracker:
         bridge = self._bridge(image.stamp_ns)
         seen = bridge is None or image.left.max() >= DARK
         if seen:
+            unseen = (image.stamp_ns - self._stamp_ns) * 1e-9 if self._lost == 1 else 0.0  # without any image
             seconds = (image.stamp_ns - self._lost_ns) * 1e-9 if self._lost > 1 else 0.0
             self._free_s = self._free_s + seconds if self._recovery.free else 0.0
-            self._covered_s += 0.0 if self._recovery.free else seconds
+            self._covered_s += unseen if self._recovery.free else seconds + unseen
         self._lost_ns = image.stamp_ns
         begun = self._stamp_ns == self._begun_ns  # one image is nothing to wait for
         if begun or max(self._free_s, COVERED_SHARE * self._covered_s) > self._config.lost_s:

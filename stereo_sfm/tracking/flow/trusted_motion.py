@@ -112,7 +112,7 @@ class TrustedMotion:
         seconds = max((stamp_ns - last_ns) * 1e-9, 0.0)
         fade = _faded(seconds, FADE_S)
         forward = self.velocity() * ([1.0] * 3 + [0.0] * 3) * fade
-        turns = np.arange(TURN_STEP, MAX_TURN_RATE * seconds + 0.5 * TURN_STEP, TURN_STEP)
+        turns = np.arange(TURN_STEP, min(MAX_TURN_RATE * seconds, math.pi) + 0.5 * TURN_STEP, TURN_STEP)
         arcs = [(1.0, side * turn) for turn in turns.tolist() for side in (1.0, -1.0)]
         motions = [(1.0, 0.0), *((speed, 0.0) for speed in SLOWER), *arcs]
         return [last @ se3.exp(speed * forward + [0, 0, 0, 0, turn, 0]) for speed, turn in motions]

@@ -136,6 +136,11 @@ class InertialFilter:
         """(3,) rad/s: what makes the integrated rotations those of the poses."""
         return self._bias
 
+    @property
+    def gyro_bias_sigma(self) -> float:
+        """rad/s, standard deviation of that."""
+        return float(np.sqrt(np.trace(self._bias_p) / 3))
+
     def estimate(self) -> InertialState | None:
         """None before enough is seen."""
         if self._seconds < MIN_S:

@@ -11,6 +11,7 @@ from stereo_sfm.calib.imu import TURN_SHARE, Imu
 from stereo_sfm.calib.wheel import Wheel
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.preintegration import GRAVITY, Preintegrated, preintegrate
+from stereo_sfm.tracking.inertial.agreement import ForceAgreement, RateAgreement, SensorUse
 from stereo_sfm.tracking.inertial.dead_reckoning import DeadReckoning
 from stereo_sfm.tracking.inertial.inertial_filter import WRONG_CHI2, InertialFilter, InertialState
 from stereo_sfm.tracking.inertial.rest import STILL_NS
@@ -21,6 +22,8 @@ from stereo_sfm.types import F64, I64, ImuSamples, InertialLink
 NODE_NS = 200_000_000  # between the poses of the filter
 MAX_TURN_ERROR = 0.1  # rad/s between gyroscope and images, root mean square: more is another sensor's data
 JUDGED = 20  # intervals for the comparison with the images
+MISSING_S = 10.0  # between a pose and the newest sample: more is another clock
+LOOKED_AGAIN = 60  # intervals after which what is wrong is known better
 MAX_GRAVITY_ERROR = 1.0  # m/s^2 of its size
 STILL = np.array([0.005, 0.05])  # rad/s, m/s^2: spread of a sensor at rest ...
 STILL_NOISE = 3.0  # ... and its own noise so many times
@@ -50,14 +53,44 @@ class InertialMotion:
         self._gyro_bias: F64 = np.zeros(3)
         self._begun = False
         self._integrated: dict[tuple[int, int], Preintegrated | None] = {}  # by interval, since the last samples
+        self._rates, self._forces = RateAgreement(imu.gyro_bias_sigma), ForceAgreement(imu.accel_bias_sigma)
+        self._agreed = SensorUse.UNKNOWN  # what the images have shown to be right
+        self._node: _Node | None = None  # the motion that led to the newest pose of the filter
+        self._silent = 0  # successive poses without samples around
         self._turn_errors: list[float] = []  # squared, rad/s
         self._moves_wrong: deque[bool] = deque(maxlen=JUDGED)
         self.left_out = ""  # why the sensor is not used
+        self._why = ""  # in more words
+        self._out = 0  # poses for which it has been left out
 
     @property
     def state(self) -> InertialState | None:
         """Velocity, gravity and biases at the newest pose of the filter; None while they are not known."""
         return self._state
+
+    @property
+    def use(self) -> SensorUse:
+        """How far it counts."""
+        if self.left_out:
+            return SensorUse.CONTRADICTS
+        if self._silent >= JUDGED:
+            return SensorUse.MISSING
+        return SensorUse.USED if self._state is not None else min(self._agreed, SensorUse.ROTATION)
+
+    @property
+    def news(self) -> str:
+        """Why the sensor does not count, beginning with a word for each reason; "" if it does, or may yet."""
+        if self.left_out:
+            return f"{self.left_out}: {self._why}"
+        return f"imu_missing: {self._missing}" if self.use == SensorUse.MISSING else ""
+
+    @property
+    def _missing(self) -> str:
+        newest_ns = self._buffer.newest_ns
+        if newest_ns is None:
+            return "no samples came"
+        away_s = abs(self._last_ns - newest_ns) * 1e-9
+        return "its stamps have another clock than the images'" if away_s > MISSING_S else "samples are missing"
 
     @property
     def left_R_imu(self) -> F64:
@@ -81,19 +114,21 @@ class InertialMotion:
     def begin(self, stamp_ns: int, odom_T_cam: F64) -> None:
         """The odometry begins anew here: poses from before do not go with those to come."""
         self._begun, self._state = True, None
+        self._rates.begin()
         self._restart(stamp_ns, odom_T_cam @ self._imu.left_T_imu)
 
     def _restart(self, stamp_ns: int, odom_T_imu: F64) -> None:
         self._filter.begin(odom_T_imu)
         self._rotation.restart()
+        self._node = None
         self._node_ns = self._last_ns = stamp_ns
         self._odom_T_node = self._odom_T_last = odom_T_imu
 
     def predict(self, stamp_ns: int, expected: F64) -> F64:
-        """(4, 4) odom_T_cam at a time after the last pose: the rotation by the gyroscope, the translation too once
-        velocity and gravity are known; `expected` (4, 4) where the samples do not reach."""
+        """(4, 4) odom_T_cam at a time after the last pose: the rotation by the gyroscope once that agrees with the
+        images, the translation too once velocity and gravity are known; `expected` (4, 4) otherwise."""
         motion = self.motion(self._last_ns, stamp_ns)
-        if motion is None or self.left_out:
+        if motion is None or self.use < SensorUse.ROTATION:
             return expected
         odom_R_imu = self._odom_T_last[:3, :3] @ motion.rotation
         if self._state is None:
@@ -108,14 +143,15 @@ class InertialMotion:
     def fused(self, stamp_ns: int, seen: F64, covariance: F64) -> F64:
         """The pose (4, 4) that an image gave, with its covariance (6, 6), corrected by the rotation since the last."""
         motion = self.motion(self._last_ns, stamp_ns)
-        if self._state is None or motion is None or self.left_out:
+        if motion is None or self.use < SensorUse.ROTATION:
             self._rotation.restart()
             return seen
         cam_R_imu = self._imu.left_T_imu[:3, :3]
         predicted = self._odom_T_last[:3, :3] @ motion.rotation @ cam_R_imu.T
         turn = cam_R_imu @ motion.rotation @ cam_R_imu.T
         share = TURN_SHARE * float(np.linalg.norm(se3.so3_log(turn)))
-        common = (self._state.gyro_bias_sigma * motion.seconds) ** 2 + share**2
+        bias_sigma = self._filter.gyro_bias_sigma if self._state is None else self._state.gyro_bias_sigma
+        common = (bias_sigma * motion.seconds) ** 2 + share**2
         noise = cam_R_imu @ motion.covariance[:3, :3] @ cam_R_imu.T + common * np.eye(3)
         return self._rotation.fused(predicted, turn, noise, seen, covariance)
 
@@ -135,9 +171,12 @@ class InertialMotion:
             self._restart(stamp_ns, odom_T_imu)
             return
         self._moves_wrong.append(self._filter.add(motion, odom_T_imu) > WRONG_CHI2)
-        self._node_ns, self._odom_T_node = stamp_ns, odom_T_imu
+        node = _Node.of(motion, self._odom_T_node, odom_T_imu)
+        if self._node is not None:
+            self._forces.add(*node.since(self._node))
+        self._node_ns, self._odom_T_node, self._node = stamp_ns, odom_T_imu, node
         self._buffer.forget(stamp_ns)
-        self._state = None if self.left_out else self._filter.estimate()
+        self._state = self._filter.estimate() if self._agreed == SensorUse.USED else None
         self._gyro_bias = self._filter.gyro_bias() if self._state is None else self._state.gyro_bias
         self._integrated.clear()
 
@@ -175,15 +214,15 @@ class InertialMotion:
 
     def turning(self, begin_ns: int, end_ns: int) -> Turning | None:
         """The gyroscope between two times; None where samples are missing."""
-        found = self._buffer.between(begin_ns, end_ns)
+        found = self._buffer.between(begin_ns, end_ns) if self.use >= SensorUse.ROTATION else None
         return None if found is None else Turning(found.edges_ns, found.gyro - self._gyro_bias)
 
     def link(self, begin_ns: int, stamp_ns: int) -> InertialLink | None:
-        """From the stamp of the keyframe before to that of a keyframe; None where the IMU is left out.
+        """From the stamp of the keyframe before to that of a keyframe; None where the IMU does not count.
 
         The state is that of the newest pose, and not given where the keyframe has another.
         """
-        if self.left_out:
+        if self._agreed != SensorUse.USED:
             return None
         found = self._buffer.between(begin_ns, stamp_ns) if stamp_ns > begin_ns else None
         edges, gyro, accel = np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3))
@@ -231,21 +270,73 @@ class InertialMotion:
         return self._state.velocity + self._state.gravity * motion.seconds + turned
 
     def _compare(self, stamp_ns: int, odom_T_imu: F64) -> None:
-        """Compare with what the images showed: a sensor that contradicts them for long is left out."""
+        """Compare with what the images showed: a sensor counts once it agrees, and no longer where it contradicts."""
         motion = self.motion(self._last_ns, stamp_ns)
+        self._silent = 0 if motion is not None else self._silent + 1
         if motion is None:
+            self._rates.begin()
             return
         seen = self._odom_T_last[:3, :3].T @ odom_T_imu[:3, :3]
         off = se3.so3_log(motion.rotation.T @ seen)
         self._turn_errors = [*self._turn_errors[1 - JUDGED :], float(off @ off) / motion.seconds**2]
-        wrong = len(self._turn_errors) >= JUDGED and sum(self._turn_errors) > JUDGED * MAX_TURN_ERROR**2
+        t = motion.seconds
+        self._rates.add(se3.so3_log(motion.rotation) / t + motion.gyro_bias, se3.so3_log(seen) / t, t)
+        rates, forces = self._rates.verdict(), self._forces.verdict()
+        enough = len(self._turn_errors) >= JUDGED
         size = 0.0 if self._state is None else abs(self._filter.force - GRAVITY)
-        if wrong:
+        before = self.left_out
+        if rates is False or (enough and sum(self._turn_errors) > JUDGED * MAX_TURN_ERROR**2):
             self.left_out = "gyro_contradicts_images"
-        elif size > MAX_GRAVITY_ERROR or sum(self._moves_wrong) > JUDGED // 2:
+        elif forces is False or size > MAX_GRAVITY_ERROR or sum(self._moves_wrong) > JUDGED // 2:
             self.left_out = "accelerometer_contradicts_images"
-        elif self.left_out and len(self._turn_errors) >= JUDGED:
+        elif self.left_out and enough:
             self.left_out = ""
+        if self.left_out:
+            self._agreed, self._state = SensorUse.UNKNOWN, None
+            self._out = 0 if self.left_out != before else self._out + 1
+            if self._out in (0, LOOKED_AGAIN):
+                self._why = self._explained(forces)
+        elif rates or self._agreed >= SensorUse.ROTATION:
+            both = forces or self._agreed == SensorUse.USED
+            self._agreed = SensorUse.USED if both else SensorUse.ROTATION
+
+    def _explained(self, forces: bool | None) -> str:
+        """What is wrong, and what to do."""
+        if self.left_out.startswith("gyro"):
+            wrong = self._rates.why()
+        elif forces is False:
+            wrong = self._forces.why()
+        else:
+            wrong = "its mean force is not that of gravity, or not in its direction"
+        return f"{wrong} ('stereo-sfm calibrate SOURCE --imu' finds rotation and time offset)"
+
+
+@dataclass(frozen=True, eq=False)
+class _Node:
+    """The motion between two poses of the filter as the comparison of forces needs it, odometry frame."""
+
+    seconds: float
+    velocity: F64  # (3,) m/s, mean by the images
+    pushed: F64  # (3,) m/s, by the measured forces
+    moved: F64  # (3,) m/s, mean by the measured forces
+    by_bias: tuple[F64, F64]  # (3, 3) of both, by the accelerometer's bias
+
+    @staticmethod
+    def of(m: Preintegrated, begin: F64, end: F64) -> _Node:
+        """From pose (4, 4) to pose (4, 4)."""
+        r, t = begin[:3, :3], m.seconds
+        return _Node(
+            t, (end[:3, 3] - begin[:3, 3]) / t, r @ m.velocity, r @ m.position / t,
+            (r @ m.velocity_by_accel, r @ m.position_by_accel / t),
+        )  # fmt: skip
+
+    def since(self, before: _Node) -> tuple[F64, F64, F64, float]:
+        """The arguments of `ForceAgreement.add`: by the mean velocities of two successive motions the accelerations are
+        known without the velocities themselves (Qin and Shen 2017)."""
+        t = 0.5 * (before.seconds + self.seconds)
+        measured = (before.pushed - before.moved + self.moved) / t
+        by_bias = (before.by_bias[0] - before.by_bias[1] + self.by_bias[1]) / t
+        return measured, (self.velocity - before.velocity) / t, by_bias, t
 
 
 def roll_pitch_deg(down: F64) -> tuple[float, float]:

@@ -180,10 +180,14 @@ class MotionSensors:
         self._collected = CollectedSamples()
         return collected.joined()
 
+    def use_of_each(self) -> dict[str, float]:
+        """How far each sensor counts, a `SensorUse` by its name."""
+        sensors = {"imu": self._inertial, "wheels": self._wheels}
+        return {name: float(sensor.use) for name, sensor in sensors.items() if sensor is not None}
+
     def news(self) -> str:
-        """Why a sensor is left out, once; "" otherwise."""
-        reasons = ["" if self._inertial is None else self._inertial.left_out]
-        reasons += ["wheels_contradict_images"] if self._wheels is not None and self._wheels.left_out else []
+        """Why a sensor is left out, when that is new; "" otherwise."""
+        reasons = [sensor.news for sensor in (self._inertial, self._wheels) if sensor is not None]
         new = [r for r in reasons if r and r not in self._said]
-        self._said.update(new)
+        self._said.update(new[:1])
         return new[0] if new else ""

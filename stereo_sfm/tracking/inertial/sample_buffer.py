@@ -36,6 +36,11 @@ class SampleBuffer:
         self._accel_stamp_ns: I64 = np.zeros(0, np.int64)  # of the accelerometer alone, the last ones
         self._accel_alone: F64 = np.zeros((0, 3))
 
+    @property
+    def newest_ns(self) -> int | None:
+        """The stamp of the newest sample on the camera's clock; None without any."""
+        return int(self._series.stamp_ns[-1]) if len(self._series.stamp_ns) else None
+
     def add(self, samples: ImuSamples) -> None:
         """The next samples; accelerations are interpolated at the times of the gyroscope."""
         stamps = samples.stamp_ns - round(self._imu.offset_s * 1e9)

@@ -9,6 +9,7 @@ import numpy as np
 from stereo_sfm.calib.wheel import Wheel
 from stereo_sfm.geometry import se3
 from stereo_sfm.geometry.twist_integration import TwistMotion, integrate_twists
+from stereo_sfm.tracking.inertial.agreement import SensorUse
 from stereo_sfm.tracking.inertial.dead_reckoning import WheelStep
 from stereo_sfm.tracking.inertial.inertial_motion import Turning
 from stereo_sfm.tracking.inertial.rest import STILL_NS
@@ -35,7 +36,7 @@ class WheelMotion:
         self._odom_T_link: F64 = np.eye(4)
         self._last_step: tuple[float, F64] | None = None  # seconds and tangent (6,), camera axes
         self._raw_of: tuple[int, int, F64 | None] = (0, 0, None)  # an interval, and the motion in it
-        self._begun = False
+        self._begun = self._fed = False
         self._slips = 0.0  # share of the way that is in doubt in a turn
 
     @property
@@ -54,11 +55,30 @@ class WheelMotion:
         """Whether they contradict the images."""
         return self._window.left_out
 
+    @property
+    def news(self) -> str:
+        """Why they do not count, beginning with a word for each reason; "" if they do, or may yet."""
+        if not self.left_out:
+            return ""
+        return (
+            "wheels_contradict_images: they measure nothing where the camera moves"
+            if self._window.silent
+            else "wheels_contradict_images: another motion ('stereo-sfm calibrate SOURCE --wheel' finds radii and pose)"
+        )
+
+    @property
+    def use(self) -> SensorUse:
+        """Whether they count: the images have shown that they measure the robot's motion."""
+        if self.left_out:
+            return SensorUse.CONTRADICTS
+        return SensorUse.USED if self._window.agreed else SensorUse.UNKNOWN if self._fed else SensorUse.MISSING
+
     def feed(self, samples: WheelSamples | None) -> None:
         """Samples up to the image that is tracked next."""
         self._raw_of = 0, 0, None
         if samples is None or not len(samples):
             return
+        self._fed = True
         stamps = samples.stamp_ns - round(self._wheel.offset_s * 1e9)
         values = np.hstack(self._wheel.velocities(samples))
         if not np.isfinite(values).all():
@@ -101,7 +121,7 @@ class WheelMotion:
 
     def changed(self, stamp_ns: int, step: F64) -> F64:
         """The expected step (6,) since the last pose, camera axes, with the wheels' change of speed added."""
-        motion = None if self.left_out else self._raw(self._last_ns, stamp_ns)
+        motion = self._raw(self._last_ns, stamp_ns) if self._window.agreed else None
         if motion is None or self._last_step is None:
             return step
         seconds = (stamp_ns - self._last_ns) * 1e-9
@@ -122,7 +142,7 @@ class WheelMotion:
         Where the wheels turn otherwise than the gyroscope they slip, and their way is in doubt.
         """
         edges, c = gyro.edges_ns, self._correction
-        if self.left_out or self._series.edges(int(edges[0]), int(edges[-1])) is None:
+        if not self._window.agreed or self._series.edges(int(edges[0]), int(edges[-1])) is None:
             return None
         seconds, values = np.diff(edges) * 1e-9, self._series.means(edges)
         rates = gyro.rates @ (self._wheel.left_T_wheel[:3, :3].T @ left_R_imu).T
@@ -135,7 +155,7 @@ class WheelMotion:
     def predict(self, stamp_ns: int) -> tuple[F64, F64] | None:
         """Pose (4, 4) odom_T_cam at a time after the last one, and its covariance (6, 6) as that of a `Frame`.
 
-        None where samples are missing, or the wheels contradict the images.
+        None where samples are missing, or the wheels do not count.
         """
         link = self.link(self._last_ns, stamp_ns) if self._begun else None
         if link is None:
@@ -144,9 +164,8 @@ class WheelMotion:
         return self._odom_T_last @ se3.inverse(left_T_wheel) @ link.last_T_cam, link.covariance
 
     def link(self, begin_ns: int, stamp_ns: int) -> MotionLink | None:
-        """The motion of the camera from one time to another; None where samples are missing, or the wheels contradict
-        the images."""
-        motion = None if self.left_out else self._by_wheels(begin_ns, stamp_ns)
+        """The camera's motion from one time to another; None where samples are missing, or the wheels do not count."""
+        motion = self._by_wheels(begin_ns, stamp_ns) if self._window.agreed else None
         if motion is None:
             return None
         moved = se3.from_rotation_translation(motion.rotation, motion.position)

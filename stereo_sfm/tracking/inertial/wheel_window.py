@@ -20,7 +20,7 @@ TURN_SIGMA = {"skid_steer": 0.3}  # expected of the scale of turns, where that i
 STRAIGHT = 0.05  # rad/s of a robot that does not turn
 TURN_FREE = 0.03, 0.1  # rad and share by which turns differ without slip
 MIN_SIGMA_M, MIN_SIGMA_RAD = 0.003, 0.003  # standard deviation of a link's difference, at least
-JUDGED = 6  # links for the comparison with the images
+SHOWN, JUDGED = 2, 6  # links for the comparison with the images: before they count, and before they are left out
 WRONG, RIGHT = 0.5, 0.25  # of the way: more is another motion, less is the same again
 NOTICED_M = 0.1  # of way, before anything is judged
 
@@ -57,7 +57,13 @@ class WheelWindow:
         self._slip, self._turn_sigma = slip, TURN_SIGMA.get(model, slip)
         self._rigid = model != "skid_steer"
         self._links: deque[_Link] = deque(maxlen=LINKS)
-        self.left_out = False
+        self.left_out = False  # they contradict the images
+        self.agreed = False  # they have agreed with the images since
+
+    @property
+    def silent(self) -> bool:
+        """Whether they have measured nothing at all of late."""
+        return not any(k.way.any() or k.turn for k in list(self._links)[1 - JUDGED :])
 
     def begin(self) -> None:
         """What was before does not go with what comes."""
@@ -73,8 +79,13 @@ class WheelWindow:
         recent = list(self._links)[-JUDGED:]
         off = sum(float(((k.way - k.seen) ** 2).sum()) for k in recent)
         way = sum(max(float((k.way**2).sum()), float((k.seen**2).sum())) for k in recent)
-        if len(recent) == JUDGED and way > NOTICED_M**2:
+        if way <= NOTICED_M**2:
+            return
+        if len(recent) == JUDGED:
             self.left_out = off > ((RIGHT if self.left_out else WRONG) ** 2) * way
+        if len(recent) >= SHOWN and off <= RIGHT**2 * way:
+            self.agreed = True
+        self.agreed &= not self.left_out
 
     def correction(self) -> WheelCorrection:
         """What the window says; what is expected of a calibration while it is short."""
