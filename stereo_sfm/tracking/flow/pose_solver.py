@@ -251,11 +251,11 @@ def optimise_pose(
             break
         exp_into(xi, 1.0, move)
         compose_into(pose.copy(), move, pose)
-        rectify_rotation(pose)
         _move_distances(rho, prior, variance, elimination, xi, row_s)
         for i in range(n - 6):
             moved[i] += xi[i]
             velocity[i] += xi[6 + i]
+    rectify_rotation(pose)
     for i in range(n):
         normal[i, i] += 1e-9
     inverse = np.full((n, n), np.inf)
