@@ -47,6 +47,7 @@ class Estimate:
 
     value: F64  # (8,) radians; the focal length's is a ratio
     covariance: F64  # (8, 8)
+    freedom: float = np.inf  # degrees of freedom of the covariance's scale
 
     @functools.cached_property
     def information(self) -> tuple[F64, F64]:
@@ -63,11 +64,17 @@ class Estimate:
         inside = np.linalg.inv(matrix[at][:, at])
         value, covariance = np.zeros(RIG_TERMS), np.zeros((RIG_TERMS, RIG_TERMS))
         value[at], covariance[at[:, None], at] = inside @ vector[at], inside
-        return Estimate(value, covariance)
+        return Estimate(value, covariance, self.freedom)
 
     def by(self, basis: F64) -> Estimate:
         """The estimate of `basis` (8, 8) times the terms."""
-        return Estimate(basis @ self.value, basis @ self.covariance @ basis.T)
+        return Estimate(basis @ self.value, basis @ self.covariance @ basis.T, self.freedom)
+
+    def ignoring(self, terms: Bool) -> Estimate:
+        """The estimate with `terms` (8,) unknown, whatever is held: the marginal Gaussian of the others."""
+        known = np.diag(np.where(terms, 0.0, 1.0))
+        unknown = np.diag(np.where(terms, np.diag(self.covariance), 0.0))
+        return Estimate(known @ self.value, known @ self.covariance @ known + unknown, self.freedom)
 
     @property
     def sigma(self) -> F64:
@@ -76,8 +83,8 @@ class Estimate:
 
     @functools.cached_property
     def strength(self) -> F64:
-        """(8,) values in standard deviations."""
-        return np.abs(self.value) / np.maximum(self.sigma, 1e-12)
+        """(8,) values in standard deviations of a Gaussian that are as unlikely: the covariance may be known badly."""
+        return self._gaussian(np.abs(self.value) / np.maximum(self.sigma, 1e-12))
 
     @property
     def reach(self) -> float:
@@ -85,7 +92,15 @@ class Estimate:
 
         The covariance must be definite.
         """
-        return float(np.sqrt(self.value @ np.linalg.solve(self.covariance, self.value))) if self.value.any() else 0.0
+        if not self.value.any():
+            return 0.0
+        return float(self._gaussian(np.sqrt(self.value @ np.linalg.solve(self.covariance, self.value))))
+
+    def _gaussian(self, deviations: F64) -> F64:
+        """Of Student's distribution as deviations of a Gaussian of the same probability (Wallace, Biometrika 46, 1959)."""
+        if np.isinf(self.freedom):
+            return deviations
+        return np.sqrt(self.freedom * np.log1p(deviations**2 / self.freedom))
 
 
 @dataclass(frozen=True)

@@ -30,15 +30,11 @@ MIN_POINTS = 20
 MAX_POINTS = 160
 STEPS = 4  # of Gauss-Newton
 DERIVATIVE = 1e-5  # radians or ratio: step of numerical derivatives
-# Factor on the deviation of the matches' errors, which are correlated: 2, less what Cauchy's weights overstate it by.
-INFLATION = 1.9
 NOISE_PX = 0.05, 5.0  # limits of the estimated noise of one coordinate
 LENGTHENING = 1, 5, 6, 7  # terms that trade lengths with one another: rotation about y, those of lenses
 # Prior standard deviations of the terms: radians, radians, ratio, radians.
 PRIOR = np.array([0.01, 0.01, 0.01, 0.005, 0.005, 0.005, 0.01, 0.01])
 
-# Apparent change of the terms by errors of the lens model, in radians and ratio per radian that the camera turns.
-LENS_ERROR_PER_RADIAN = np.array([0.0, 0.003, 0.0, 0.0, 0.0, 0.0015, 0.0, 0.0])
 # Prior standard deviations of `_shapes`, px at the image's border.
 LENS_PRIOR = np.array([6.0, 2.0, 2.0, 2.0, *[0.5] * 6])
 SHARED_PRIOR = np.concatenate([PRIOR, LENS_PRIOR]) ** -2  # information
@@ -51,18 +47,10 @@ class RigInformation:
     matrix: F64  # (8, 8)
     vector: F64  # (8,) matrix @ (the terms that fit best)
 
-    @staticmethod
-    def summed(parts: Sequence[RigInformation]) -> RigInformation:
-        """That of all parts together."""
-        return RigInformation(np.sum([p.matrix for p in parts], axis=0), np.sum([p.vector for p in parts], axis=0))
-
-    def with_lens_error(self, angle: float) -> RigInformation:
-        """Less information, for errors of the lens model while the camera turns by `angle` radians."""
-        affected = LENS_ERROR_PER_RADIAN > 0
-        sigma = LENS_ERROR_PER_RADIAN[affected] * max(angle, 1e-3)
-        columns = self.matrix[:, affected]
-        lost = columns @ np.linalg.inv(columns[affected] + np.diag(sigma**-2))
-        return RigInformation(self.matrix - lost @ columns.T, self.vector - lost @ self.vector[affected])
+    def gain(self, terms: F64, change: F64) -> float:
+        """By how much a change (8,) of terms (8,) lowers the cost of rows and reprojections, in standard deviations."""
+        size = change @ self.matrix @ change
+        return float((2 * (self.vector - self.matrix @ terms) @ change - size) / np.sqrt(max(size, 1e-12)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +63,9 @@ class RigWindow:
     information: RigInformation
     noise_px: float
     length: F64  # (8,) relative change of lengths by each of the LENGTHENING terms, per radian or ratio; others zero
+    turn: (
+        F64  # (3,) radians from the first to the last keyframe, zero where the same lenses saw what it is measured with
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,11 +132,10 @@ def solve_window(
         corrected = with_terms(rig, terms)
     system = _System.of(corrected, problem.seen_by(corrected, before), sigma, hard=True)
     information = system.information(problem, terms)
-    if before is None:
-        information = information.with_lens_error(_turned(keyframes))
     last = keyframes[-1]
     length = _length_by_terms(rig, problem.uv_left[0], problem.uv_right[0])
-    return RigWindow(keyframes[0].kf_id, last.kf_id, last.stamp_ns, information, system.noise_px, length)
+    turn = se3.log(se3.inverse(keyframes[0].odom_T_cam) @ last.odom_T_cam)[3:] if before is None else np.zeros(3)
+    return RigWindow(keyframes[0].kf_id, last.kf_id, last.stamp_ns, information, system.noise_px, length, turn)
 
 
 def _length_by_terms(rig: Rig, uv_left: F64, uv_right: F64) -> F64:
@@ -193,12 +183,6 @@ def _problem(rig: Rig, keyframes: Sequence[SeenPoints], known: int) -> _Problem 
     return _Problem(uv[0], uv[1], of_known, bearing[good], rho[good], frames, shapes, np.zeros(len(LENS_PRIOR)))
 
 
-def _turned(keyframes: Sequence[SeenPoints]) -> float:
-    """Sum of the rotations from keyframe to keyframe in radians."""
-    poses = np.array([k.odom_T_cam for k in keyframes])
-    return float(np.linalg.norm(se3.log(se3.inverse(poses[:-1]) @ poses[1:])[:, 3:], axis=1).sum())
-
-
 def _shapes(camera: Camera, uv: F64) -> F64:
     """(..., 2, L) displacements of pixels by errors that both lenses may share, one pixel at the image's border.
 
@@ -243,8 +227,8 @@ class _System:
             np.ascontiguousarray(problem.frame_T_first[:, :3, 3]), problem.shapes, problem.lens,
             (rig.left.model_id, rig.left.params, rig.right.model_id, rig.right.params),
             np.ascontiguousarray(rotation.T), rig.left_T_right[:3, 3].copy(),
-            np.ascontiguousarray(-rig.baseline * (rotation.T @ rect_R_left[1:].T)), sigma, hard, INFLATION,
-            problem.known, h, g, gain, gradient, squares, rows,
+            np.ascontiguousarray(-rig.baseline * (rotation.T @ rect_R_left[1:].T)), sigma, hard, problem.known,
+             h, g, gain, gradient, squares, rows,
         )  # fmt: skip
         own = h[shared:, shared:] + 1e-6 * np.eye(size - shared)
         pose_gain = np.asarray(np.linalg.solve(own, h[shared:, :shared]), float)

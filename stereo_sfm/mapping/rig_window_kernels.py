@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 
-from stereo_sfm.geometry.kernels import inlined, inner, njit, project_one
+from stereo_sfm.geometry.kernels import PINHOLE, RADTAN, inlined, inner, njit, project_one
 from stereo_sfm.types import RIG_TERMS
 
 
@@ -51,7 +51,7 @@ def _lens_rows(shape, lens, j_rig, residual, at):
 @njit
 def accumulate(
     uv_left, uv_right, bearing, tangent, rho, rot, pos, shapes, lens, cams, right_r, baseline, by_direction, sigma,
-    hard, inflation, known, h, g, gain, gradient, size, rows,
+    hard, known, h, g, gain, gradient, size, rows,
 ):  # fmt: skip
     """Fills the reduced normal equations and what gives the points' own steps.
 
@@ -62,7 +62,7 @@ def accumulate(
         cams: models and parameters of both cameras.
         right_r: (3, 3) rotation of right_T_left. baseline: (3,) right camera in the left one.
         by_direction: (3, 2) derivative of rho-scaled right coordinates by the baseline's direction.
-        sigma: px. hard: drop what is beyond six sigmas. inflation: of the deviations.
+        sigma: px. hard: drop what is beyond six sigmas.
         known: (F,) moments whose right pixels say nothing of the terms: they were seen by a known rig.
         h: (R, R), g: (R,), R = 8 + L + 6 (F - 1), overwritten. gain: (N, 3, R), gradient: (N, 3), overwritten.
         size: (N,) sum of squared residuals. rows: (N,) how many.
@@ -132,7 +132,7 @@ def accumulate(
                                 j0 * by_direction[0, c] + j1 * by_direction[1, c] + j2 * by_direction[2, c]
                             )
                         j_rig[2 + k, 5] = out[k] - params_r[2 + k]
-                    if model_r == 0 or model_r == 1:
+                    if model_l == PINHOLE and model_r <= RADTAN:  # a distorted lens was calibrated with its decentering
                         a, b = q[0] / q[2], q[1] / q[2]
                         j_rig[2, 6], j_rig[3, 6] = -params_r[0] * b * b, params_r[1] * a * b
                         j_rig[2, 7], j_rig[3, 7] = -params_r[0] * a * b, params_r[1] * a * a
@@ -149,7 +149,7 @@ def accumulate(
                 size[n] += residual[i] * residual[i]
             rows[n] += used
             ratio = worst / sigma  # Cauchy's scale: tracks' errors have long tails, and lean to one side there
-            w = 0.0 if hard and ratio > 6.0 else 1.0 / ((1.0 + ratio * ratio) * (inflation * sigma) ** 2)
+            w = 0.0 if hard and ratio > 6.0 else 1.0 / ((1.0 + ratio * ratio) * sigma * sigma)
             if w == 0.0:
                 continue
             o = shared + 6 * (f - 1)

@@ -1,20 +1,21 @@
 """Self-calibration: corrections of the rig estimated from the keyframes during mapping.
 
-Every few keyframes with motion form a window (`mapping.rig_window`); the information of the windows about the terms
-is summed. Terms are corrected that differ from the current ones by several standard deviations, that both halves of
-the windows (even and odd ones) confirm, and that exceed the systematic error of matching (`calib.choice`). Once one is,
-others follow that are worth their variance. The rows show terms of lenses, which change lengths by what the lens model
-says of disparities: lengths stay unless there is evidence about them. A corrected term is refined as long as windows
-come, first whenever their number has doubled. Points are tracked where a wrong rig expects them, and agree with it a
-little: a first error that is so large that two keyframes show it is corrected at once, and once there are enough
-windows since a large correction, those before it are discarded. Where the windows show drift (temperature), the rig is
-known to be wrong: the terms at the newest window are used from it on, and the windows since the last revision are on
-the way there.
+Every few keyframes with motion form a window (`mapping.rig_window`). The terms of the rig are estimated from all
+windows with the deviations that the windows' scatter shows (`mapping.rig_course`). Terms are corrected that differ from
+the current ones by several of these, that both halves of the windows (even and odd ones) confirm, and whose correction
+by one half makes rows and reprojections of the other half better. Once one is, others follow that are likely wrong.
+The rows show terms of lenses, which change lengths by what the lens model says of disparities: lengths stay unless
+there is evidence about them. A corrected term is refined as long as windows come, first whenever their number has
+doubled; one that moves by more than its deviation allowed, and then is not significant any more, is taken back for
+good. Points are tracked where a wrong rig expects them, and agree with it a little: once there are enough windows since
+a large correction, those before it are discarded. Where the windows show drift (temperature), the rig is known to be
+wrong: the terms at the newest window are used from it on, and the windows since the last revision are on the way there.
 
 After a sudden change of the rig (a knock) earlier windows are discarded, and the correction applies from the first
 keyframe on that was seen by the changed rig. What the rig before it measured of the points that are seen before and
 after it is what the changed rig is measured with, besides the windows since. The tracker notices a rotation at once
-(`tracking.flow.knock`); other changes, and small ones, show where the newest windows contradict all earlier ones.
+(`tracking.flow.knock`); other changes, and small ones, show where the newest windows contradict all earlier ones by
+more than these contradict each other, and by more than turning explains.
 """
 
 from __future__ import annotations
@@ -25,12 +26,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stereo_sfm.calib.choice import NAMES, NONE, SCALES, UNITS, Estimate, choose, significant, with_terms
+from stereo_sfm.calib.choice import NAMES, SCALES, UNITS, Choice, Estimate, choose, significant, with_terms
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.config import Config
 from stereo_sfm.mapping.rig_change import SeenPoints, first_changed
-from stereo_sfm.mapping.rig_drift import steady_change
-from stereo_sfm.mapping.rig_window import PRIOR, EarlierRig, RigInformation, RigWindow, solve_window
+from stereo_sfm.mapping.rig_course import Scatter, constant, steady, with_step
+from stereo_sfm.mapping.rig_window import EarlierRig, RigWindow, solve_window
 from stereo_sfm.types import F64, RIG_TERMS, Bool, Keyframe
 
 OF_LENSES = slice(5, 8)  # focal ratio and decentering
@@ -39,24 +40,30 @@ MIN_KEYFRAMES = 3  # of the last window
 MIN_MOTION = 0.02  # of the image's width: median motion of common points from one keyframe of a window to the next
 MAX_COMMON = 0.6  # share of common points below which a keyframe has moved in any case
 MIN_WINDOWS = 2  # before the first correction
-FIRST_KEYFRAMES = 2  # from which a first error is corrected that both halves of their points show ...
-FIRST_SIGMAS = 20.0  # ... with this significance: errors of lenses and of tracking may look like smaller ones
-ENOUGH_WINDOWS = 4  # with fewer, a correction must be more significant: errors of a window's keyframes are alike
+FIRST_KEYFRAMES = 2  # from which a first error is corrected that both halves of their points show
+INTRODUCED = np.array([1, 1, 1, 2, 2, 2, 4, 4])  # windows that each term needs: in the order in which cameras err
+ENOUGH_WINDOWS = 4  # for halves of two windows each
 MAX_BETWEEN = 4  # windows from one revision to the next: as many as there are, but no more
 MAX_WINDOWS = 80  # used, the newest
-AFTER_STEP = range(2, 7)  # newest windows that must contradict all others to indicate a step
-STRADDLING_SIGMAS = 2.0  # by which a window during which the rig changed differs from those afterwards
+AFTER_STEP = range(4, 9)  # newest windows that must contradict all others to indicate a step
 BEFORE_STEP = 4  # earlier windows needed to detect a step
 STEP_REACH = 2  # windows before and after the likeliest pair of windows in which it may have happened
 RECENT_KEYFRAMES = 64  # among which the first after a step is looked for
 ACROSS_STEP = 6, 4  # keyframes before and after it from which the changed rig is measured
 KNOCK_KEYFRAMES = 2  # after a rotation that the tracker noticed, from which the changed rig is first measured
 DRIFT_WINDOWS = 8  # needed to detect drift
-SIGMAS = 5.0  # significance of the first term that is corrected
-FURTHER_SIGMAS = np.sqrt(2.0)  # of others, once the calibration is known to be wrong (Akaike's criterion)
+SIGMAS = 4.0  # significance of the first term that is corrected, and of drift
+STEP_SIGMAS = 5.0  # of a step, which is looked for between all windows
+# Of others, once the calibration is known to be wrong: Akaike's criterion, but for those by which cameras err least.
+FURTHER_SIGMAS = np.where(np.isin(np.arange(RIG_TERMS), [3, 4, 6, 7]), SIGMAS, np.sqrt(2.0))
 REFINED_SIGMAS = 0.3  # its refinement: below, a change is not worth the bundle adjustment
-MISLED_SHARE = 0.1  # of a rig's error that remains in what is estimated from points tracked with it
-MATCHING_PX = 0.02  # systematic error of matching
+HUNTING_SIGMAS = 3.0  # by which a refinement moves a term that is taken back unless it is still significant
+HELPING_SIGMAS = 2.0  # by which a correction makes windows better that it was not estimated from
+MISLED_SHARE = 0.05  # of a rig's error that remains in what is estimated from points tracked with it
+MATCHING_PX = 0.02  # systematic error of matching, of all windows
+# Bias of the terms of lenses, px at the border over the noise of a pixel: distances are a nonlinear function of pixels.
+BIAS_SHARE = 0.5
+WINDOW_PX = 0.05  # that of one window, before windows show theirs: of ten real recordings 0.02 to 0.1 in the median
 DIRECTION = np.deg2rad(0.15)  # systematic error of the baseline's direction: matching errors that depend on distance
 
 
@@ -87,16 +94,18 @@ class SelfCalibration:
         self._until_due = MIN_WINDOWS  # windows until the next revision
         self._misled_kf_id = -1  # last keyframe tracked with a rig that a large correction has shown to be wrong
         self._stepped = False  # a step was detected and is not yet corrected
-        self._straddling = False  # it may have happened during the first window
         self._step_between = 0, 0  # keyframes between which it happened
         self._recent: deque[SeenPoints] = deque(maxlen=RECENT_KEYFRAMES)
         self._turn: F64 = np.zeros(3)  # that the tracker noticed
         self._turned_kf_id = -1  # first keyframe since; -1: the rig has been measured
         half_width = 0.5 * rig.left.width
-        turn = MATCHING_PX / rig.left.fx
-        roll = ratio = MATCHING_PX / (0.5 * half_width)
+        turn, roll = 1 / rig.left.fx, 2 / half_width
         decentering = roll * rig.left.fx / half_width
-        self._floor = np.array([turn, turn, roll, DIRECTION, DIRECTION, ratio, decentering, decentering])
+        of_pixel = np.array([turn, turn, roll, np.inf, np.inf, roll, decentering, decentering])
+        self._of_pixel = of_pixel
+        self._expected = Scatter(np.diag(np.minimum(WINDOW_PX * of_pixel, DIRECTION) ** 2))
+        self._taken_back = np.zeros(RIG_TERMS, bool)
+        self._sigma = np.zeros(RIG_TERMS)  # of the corrections, those of the basis
 
     def add(self, keyframe: Keyframe) -> Revision | None:
         """Add a keyframe; returns a revision when one becomes significant."""
@@ -116,8 +125,7 @@ class SelfCalibration:
             return None
         if self._until_due > 0 and not self._stepped:
             return None
-        known = self._stepped or len(self.windows) >= ENOUGH_WINDOWS
-        return self._revise(SIGMAS if known else SIGMAS * np.sqrt(ENOUGH_WINDOWS / len(self.windows)))
+        return self._revise()
 
     @staticmethod
     def wanted(config: Config, rig: Rig) -> SelfCalibration | None:
@@ -131,18 +139,22 @@ class SelfCalibration:
         """After the last keyframe: a last revision from all windows."""
         if len(self._keyframes) >= MIN_KEYFRAMES:
             self._close_window()
-        return self._revise(SIGMAS, refined_sigmas=0.0) if len(self.windows) >= MIN_WINDOWS else None
+        return self._revise(refined_sigmas=0.0) if len(self.windows) >= MIN_WINDOWS else None
 
     def estimate(self, windows: Sequence[RigWindow]) -> Estimate:
         """Change of the current terms estimated from windows; its covariance includes systematic matching errors."""
-        total = self._information(windows)
-        covariance = np.asarray(np.linalg.inv(total.matrix), float)
-        return Estimate(covariance @ total.vector - self.terms, covariance + np.diag(self._floor**2))
+        return self._beyond(self.terms, constant(windows, self._expected).at([1.0]))
 
-    def _information(self, windows: Sequence[RigWindow]) -> RigInformation:
-        """That of windows, and of the prior around the current terms."""
-        none = RigInformation(np.diag(1 / PRIOR**2), self.terms / PRIOR**2)
-        return RigInformation.summed([none, *(w.information for w in windows)])
+    @property
+    def _floor(self) -> F64:
+        """(8,) standard deviations of what all windows share."""
+        px = np.full(RIG_TERMS, MATCHING_PX)
+        px[OF_LENSES] += BIAS_SHARE * np.mean([w.noise_px for w in self.windows] or [0.0])
+        return np.minimum(px * self._of_pixel, DIRECTION)
+
+    def _beyond(self, terms: F64, found: Estimate) -> Estimate:
+        """The change from `terms`, with errors that all windows share."""
+        return Estimate(found.value - terms, found.covariance + np.diag(self._floor**2), found.freedom)
 
     def _close_window(self) -> bool:
         """Add a window of the collected keyframes; False if they do not determine one."""
@@ -155,7 +167,6 @@ class SelfCalibration:
             self._until_due -= 1
             self._drop_misled()
             self._detect_step()
-            self._drop_straddling()
         return window is not None
 
     def _drop_misled(self) -> None:
@@ -164,30 +175,30 @@ class SelfCalibration:
         if ENOUGH_WINDOWS <= len(later) < len(self.windows):
             self.windows = deque(later, maxlen=MAX_WINDOWS)
 
-    def _revise(self, first_sigmas: float, refined_sigmas: float = REFINED_SIGMAS) -> Revision | None:
-        """`first_sigmas`, `refined_sigmas`: significance of the first correction of a term, and of further ones."""
+    def _revise(self, refined_sigmas: float = REFINED_SIGMAS) -> Revision | None:
+        """`refined_sigmas`: significance of further corrections of a term."""
         windows = list(self.windows)
         drift = self._drift(windows)
         enough = self._corrected.any() or len(windows) >= ENOUGH_WINDOWS
         self._until_due = min(len(windows), MAX_BETWEEN) if enough else 1
-        found = self._change(windows, first_sigmas, drift, refined_sigmas)
+        found = self._change(windows, drift, refined_sigmas)
         if found is None:
             return None
         if self._stepped:
             self._since, self._stepped = self._first_after_step(self.terms + found.value), False
-            return self._revision(self._measured_across(self._since, found, first_sigmas), "step", self._since)
+            return self._revision(self._measured_across(self._since, found), "step", self._since)
         if drift is not None:
             return self._revision(found, "drift", windows[-1].first_kf_id, self._on_the_way(found.value))
         why = "refined" if self._corrected[found.written].all() else "significant"
-        if (MISLED_SHARE * np.abs(found.value) > self._floor).any():
+        if (MISLED_SHARE * np.abs(found.value) > found.sigma).any():
             self._misled_kf_id = windows[-1].last_kf_id
         return self._revision(found, why, self._since)
 
     def _at_first_sight(self) -> Revision | None:
         """A correction of an error that is so large that each half of the points of two keyframes shows it."""
-        halves = [[k.every(2, first) for k in self._keyframes] for first in (0, 1)]
-        windows = [w for half in halves if (w := solve_window(self._rig, half, self.terms)) is not None]
-        found = self._change(windows, FIRST_SIGMAS) if len(windows) == len(halves) else None
+        parts = [self._keyframes, *([k.every(2, first) for k in self._keyframes] for first in (0, 1))]
+        windows = [w for part in parts if (w := solve_window(self._rig, part, self.terms)) is not None]
+        found = self._change(windows[:1], halves=(windows[1:2], windows[2:])) if len(windows) == len(parts) else None
         if found is None:
             return None
         self._misled_kf_id = self._keyframes[-1].kf_id
@@ -202,25 +213,61 @@ class SelfCalibration:
     def _change(
         self,
         windows: Sequence[RigWindow],
-        first_sigmas: float,
         drift: _Drift | None = None,
         refined_sigmas: float = REFINED_SIGMAS,
+        halves: tuple[Sequence[RigWindow], Sequence[RigWindow]] | None = None,
     ) -> _Change | None:
-        """What windows show to be wrong; None if nothing is."""
-        whole = self.estimate(windows) if drift is None else drift.at_the_end[0]
-        drifting = NONE if drift is None else drift.terms
-        further = FURTHER_SIGMAS if self._corrected.any() else np.where(drifting, FURTHER_SIGMAS, first_sigmas)
-        sigmas = np.where(self._corrected, refined_sigmas, further)
-        if whole.reach < sigmas.min():
+        """What windows show to be wrong; None if nothing is.
+
+        Args:
+            refined_sigmas: significance of further corrections of a term.
+            halves: of the windows; None: even and odd ones.
+        """
+        halves = halves or (windows[::2], windows[1::2] or windows)  # one window: what a step has left
+        basis = self._basis(windows)
+        kept = np.linalg.solve(basis, np.where(self._taken_back, 0.0, basis @ self.terms))
+        courses = [] if drift else [constant(part, self._expected).at([1.0]) for part in (windows, *halves)]
+        ignored = self._taken_back | (len(windows) < INTRODUCED)
+        found = drift.at_the_end if drift else courses
+        whole, *parts = [self._beyond(kept, f).by(basis).ignoring(ignored) for f in found]
+        wrong = drift.terms if drift and not self._corrected.any() else self._corrected.any()
+        new = np.where(ignored, np.inf, np.where(wrong, FURTHER_SIGMAS, SIGMAS))
+        sigmas, back = np.where(self._corrected, refined_sigmas, new), kept - self.terms
+        choice = self._choose(whole, parts, sigmas)
+        if not (drift or self._helps(halves, [p.without(choice.written).value for p in parts], basis, back)):
+            choice = self._choose(whole, parts, np.where(self._corrected, refined_sigmas, np.inf))
+        hunting = self._corrected & (np.abs(choice.value) > HUNTING_SIGMAS * self._sigma)
+        hunting &= np.abs(choice.value + basis @ kept) < SIGMAS * choice.sigma
+        if hunting.any() and not drift:
+            self._taken_back, self._corrected = self._taken_back | hunting, self._corrected & ~hunting
+            return self._change(windows, drift, refined_sigmas, halves)
+        value = np.asarray(np.linalg.solve(basis, choice.value), float) + back
+        covariance = whole.by(np.linalg.inv(basis)).covariance
+        return _Change(value, choice.sigma, covariance, choice.written) if value.any() else None
+
+    def _choose(self, whole: Estimate, parts: Sequence[Estimate], sigmas: F64) -> Choice:
+        return choose(whole, parts, self._rig.readout_s > 0, sigmas, self._corrected)
+
+    def _helps(self, halves: Sequence[Sequence[RigWindow]], values: Sequence[F64], basis: F64, back: F64) -> bool:
+        """Whether what one half says makes rows and reprojections of the other half's windows better.
+
+        A window's gain is over its standard deviation: windows know unequally much.
+        """
+        changes = [np.linalg.solve(basis, value) + back for value in values]
+        gains = np.array([
+            w.information.gain(self.terms, change)
+            for change, other in zip(changes, halves[::-1], strict=True)
+            for w in other
+        ])  # fmt: skip
+        return bool(gains.mean() > HELPING_SIGMAS * gains.std() / np.sqrt(len(gains) - 1))
+
+    def _turned(self, across: RigWindow | None) -> _Change | None:
+        """A change of the current terms by a knock, which a window across it shows; None: it shows none."""
+        if across is None:
             return None
-        parts = windows[::2], windows[1::2] or windows  # one window: what a step has left
-        halves = [self.estimate(part) for part in parts] if drift is None else drift.at_the_end[1:]
-        basis, rolling = self._basis(windows), self._rig.readout_s > 0
-        choice = choose(whole.by(basis), [h.by(basis) for h in halves], rolling, sigmas, self._corrected)
-        if not choice.written.any():
-            return None
-        value = np.asarray(np.linalg.solve(basis, choice.value), float)
-        return _Change(value, choice.sigma, whole.covariance, choice.written)
+        whole = self._beyond(self.terms, constant([across], self._expected).at([1.0]))
+        choice = choose(whole, [whole], self._rig.readout_s > 0, SIGMAS)
+        return _Change(choice.value, choice.sigma, whole.covariance, choice.written) if choice.written.any() else None
 
     def _knock(self, keyframe: Keyframe) -> Revision | None:
         """The revision of a rotation that the tracker noticed, once a few keyframes confirm it."""
@@ -231,10 +278,11 @@ class SelfCalibration:
         after = sum(k.kf_id >= self._turned_kf_id for k in self._recent)
         if not turn.any() or self._turned_kf_id < 0 or not KNOCK_KEYFRAMES <= after <= ACROSS_STEP[1]:
             return None
+        self._before_change()
         initial = self.terms.copy()
         initial[:3] += turn
         across = self._across(len(self._recent) - after, initial)
-        found = None if across is None else self._change([across], SIGMAS)
+        found = self._turned(across)
         if across is None or found is None:
             return None
         self._since, self._step_between = self._turned_kf_id, (self._turned_kf_id - STEP_REACH, keyframe.kf_id)
@@ -243,10 +291,10 @@ class SelfCalibration:
             self._since, after = first, sum(k.kf_id >= first for k in self._recent)
             again = self._across(len(self._recent) - after, self.terms + found.value)
             across = across if again is None else again
-            found = self._change([across], SIGMAS) or found
+            found = self._turned(across) or found
         self.windows = deque([across], maxlen=MAX_WINDOWS)
         self._keyframes = list(self._recent)[-after:]
-        self._stepped = self._straddling = False
+        self._stepped = False
         self._turned_kf_id, self._until_due = -1, MIN_WINDOWS
         return self._revision(found, "step", self._since)
 
@@ -255,6 +303,7 @@ class SelfCalibration:
     ) -> Revision:
         self.terms = self.terms + change.value
         self._corrected |= change.written
+        self._sigma = change.sigma
         self._revised_ns = self._recent[-1].stamp_ns
         text = _text(change.value, change.sigma)
         return Revision(self.terms.copy(), change.covariance, since_kf_id, why, text, on_the_way)
@@ -271,15 +320,14 @@ class SelfCalibration:
         earlier = EarlierRig(with_terms(self._rig, self.terms), len(before))
         return solve_window(self._rig, [*before[::-1], *after], terms, earlier)
 
-    def _measured_across(self, since_kf_id: int, found: _Change, first_sigmas: float) -> _Change:
+    def _measured_across(self, since_kf_id: int, found: _Change) -> _Change:
         """A step's change, measured with what the rig before it knew of the points."""
         at = next((i for i, k in enumerate(self._recent) if k.kf_id == since_kf_id), 0)
         across = self._across(at, self.terms + found.value)
         if across is None:
             return found
         self.windows.appendleft(across)
-        self._straddling = False
-        return self._change(list(self.windows), first_sigmas) or found
+        return self._change(list(self.windows)) or found
 
     def _basis(self, windows: Sequence[RigWindow]) -> F64:
         """(8, 8) from the terms to those that are chosen: instead of the rotation about y, the one that changes lengths
@@ -296,37 +344,45 @@ class SelfCalibration:
         """What windows show of terms that change steadily; None if none does."""
         if len(windows) < DRIFT_WINDOWS:
             return None
-        whole = steady_change(windows, windows, self.terms, self._floor)
-        if whole.estimate.reach < SIGMAS:
+        whole = steady(windows, windows, self._expected)
+        if whole.at([0.0, 1.0]).reach < SIGMAS:
             return None
-        halves = [steady_change(part, windows, self.terms, self._floor) for part in (windows[::2], windows[1::2])]
-        terms = significant(whole.estimate, [h.estimate for h in halves], self._rig.readout_s > 0, SIGMAS)
-        return _Drift(terms, [fit.at_the_end(terms) for fit in (whole, *halves)]) if terms.any() else None
+        courses = [whole, *(steady(part, windows, self._expected) for part in (windows[::2], windows[1::2]))]
+        change, *halves = [c.at([0.0, 1.0]) for c in courses]
+        terms = significant(change, halves, self._rig.readout_s > 0, SIGMAS)
+        return _Drift(terms, [c.with_zero(1, ~terms).at([1.0, 0.0]) for c in courses]) if terms.any() else None
 
     def _detect_step(self) -> None:
+        """Whether the newest windows contradict all earlier ones; during the one before them it may have happened."""
         windows = list(self.windows)
-        splits = range(len(windows) - AFTER_STEP.start, max(BEFORE_STEP, len(windows) - AFTER_STEP.stop + 1) - 1, -1)
-        if not any(self._differ(windows[:k], windows[k:]) for k in splits):
+        splits = range(len(windows) - AFTER_STEP.start, max(BEFORE_STEP, len(windows) - AFTER_STEP.stop), -1)
+        gives = self._taken_back[:3].any()  # the mount: it changes back, too
+        if gives or not any(self._step(windows[: k - 1], windows[k:]) for k in splits):
             return
-        split = max(splits, key=lambda k: self._fit(windows[:k]) + self._fit(windows[k:]))
-        first = windows[split]
+        near = range(splits[-1], len(windows) - 1)
+        split = max(near, key=lambda k: self._across_windows(windows[: k - 1], windows[k:]).reach)
+        self._before_change(windows[: split - 1])
         self.windows = deque(windows[split:], maxlen=MAX_WINDOWS)
-        self._since, self._stepped, self._straddling = first.first_kf_id, True, True
+        self._since, self._stepped = windows[split].first_kf_id, True
         self._step_between = windows[split - STEP_REACH].first_kf_id, windows[split:][:STEP_REACH][-1].last_kf_id
 
-    def _differ(self, before: Sequence[RigWindow], after: Sequence[RigWindow]) -> bool:
-        """Whether the newest windows contradict all earlier ones."""
-        base = self.estimate(before)
-        change = _difference(self.estimate(after), base)
-        if change.reach < SIGMAS:
-            return False
-        halves = [_difference(self.estimate(part), base) for part in (after[::2], after[1::2])]
-        return bool(significant(change, halves, self._rig.readout_s > 0, SIGMAS).any())
+    def _across_windows(self, before: Sequence[RigWindow], after: Sequence[RigWindow]) -> Estimate:
+        """The change of the terms from some windows to others."""
+        return with_step(before, after, self._expected).at([0.0, 1.0])
 
-    def _fit(self, windows: Sequence[RigWindow]) -> float:
-        """How well one rig explains windows: their log-likelihood but for a constant of each window."""
-        total = self._information(windows)
-        return 0.5 * float(total.vector @ np.linalg.solve(total.matrix, total.vector))
+    def _step(self, before: Sequence[RigWindow], after: Sequence[RigWindow]) -> bool:
+        """Whether there is a significant change that each half of the windows after it shows."""
+        change = self._across_windows(before, after)
+        if change.reach < STEP_SIGMAS:
+            return False
+        halves = [self._across_windows(before, part) for part in (after[::2], after[1::2])]
+        return bool(significant(change, halves, self._rig.readout_s > 0, STEP_SIGMAS).any())
+
+    def _before_change(self, windows: Sequence[RigWindow] = ()) -> None:
+        """Expect of the windows after a change the scatter of those (all by default) before it, and any change."""
+        self._sigma = np.full(RIG_TERMS, np.inf)
+        if windows or self.windows:
+            self._expected = constant(windows or list(self.windows), self._expected).scatter
 
     def _first_after_step(self, terms: F64) -> int:
         """Id of the first keyframe that the rig with these terms saw, else of the first window after the step."""
@@ -335,23 +391,13 @@ class SelfCalibration:
         found = first_changed(seen, with_terms(self._rig, self.terms), with_terms(self._rig, terms))
         return self._since if found is None else found
 
-    def _drop_straddling(self) -> None:
-        """After a step, discard the first window if it contradicts the others: the rig changed during it."""
-        first, *others = self.windows
-        if not self._straddling or not others:
-            return
-        change = _difference(self.estimate(others), self.estimate([first]))
-        if significant(change, [change], self._rig.readout_s > 0, STRADDLING_SIGMAS).any():
-            self.windows.popleft()
-            self._straddling = False
-
 
 @dataclass(frozen=True, eq=False)
 class _Drift:
     """Of terms that change steadily."""
 
     terms: Bool  # (8,) those that do
-    at_the_end: list[Estimate]  # change of the current terms, from all windows and from both halves
+    at_the_end: list[Estimate]  # the terms, from all windows and from both halves
 
 
 @dataclass(frozen=True, eq=False)
@@ -362,10 +408,6 @@ class _Change:
     sigma: F64  # (8,) of those of the basis
     covariance: F64  # (8, 8)
     written: Bool  # (8,)
-
-
-def _difference(after: Estimate, before: Estimate) -> Estimate:
-    return Estimate(after.value - before.value, after.covariance + before.covariance)
 
 
 def _moved(a: SeenPoints, b: SeenPoints, min_px: float) -> bool:
