@@ -12,7 +12,10 @@ from _real_sequences import Sequence as RealSequence
 from stereo_sfm.types import F64
 
 Run = dict[str, Any]
-CLEARLY, SIGMAS = 0.05, 2.0  # a switch beats default by more than this share and so many standard errors
+CLEARLY, SIGMAS = (
+    0.05,
+    2.0,
+)  # a switch beats default by more than this share and so many standard errors (of two starts or more)
 CLEARLY_LOST = 0.01  # the same of lost frames, as a share of all
 STEPS_FOUND = 0.9  # share that must be
 BETTER = "BETTER THAN DEFAULT"
@@ -206,7 +209,7 @@ def comparison(default: list[Run], other: list[Run]) -> str:
 def _errors_paired(pairs: F64) -> str:
     """(N, 2) errors of the first and the second."""
     mean, difference, error = float(pairs[:, 0].mean()), *_difference(pairs)
-    better = difference > CLEARLY * mean and not difference <= SIGMAS * error
+    better = difference > CLEARLY * mean and difference > SIGMAS * error
     text = f"error {100 * difference / max(mean, 1e-12):+.0f} ± {100 * error / max(mean, 1e-12):.0f} %"
     return f"**{text}: {BETTER}**" if better else text
 
@@ -214,7 +217,7 @@ def _errors_paired(pairs: F64) -> str:
 def _lost_paired(pairs: F64, frames: float) -> str:
     """(N, 2) lost frames of the first and the second."""
     difference, error = _difference(pairs)
-    better = difference > CLEARLY_LOST * frames and not difference <= SIGMAS * error
+    better = difference > CLEARLY_LOST * frames and difference > SIGMAS * error
     text = f"lost {difference:+.1f} ± {error:.1f} frames"
     return f"**{text}: {BETTER}**" if better else text
 

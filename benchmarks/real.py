@@ -49,6 +49,7 @@ PACKAGES, SIMULATOR = ("stereo_sfm", "drivers", "calib"), "drivers/sim"
 DECIDING = (*PACKAGES, f":!{SIMULATOR}")  # files that decide the results of real sequences
 RUNNER = Path(__file__).with_name("_real_run.py")
 LONGEST_S = 3600.0  # of a run: then it hangs
+STOPPED = (130, -2, -15)  # exit codes of a run that somebody stopped: it is run again
 STEREO_ONLY = ("self-calibration", "steps", "side views")
 
 
@@ -172,6 +173,8 @@ def perform(job: Job, store: Path, real: Path | None) -> dict[str, Any]:
         return json.loads(path.read_text("utf-8"))
     assert place is not None
     result = result_of(job, place.resolve(), place.parent / job.sequence.rig if job.sequence.rig else None)
+    if result["exit"] in STOPPED:
+        return result
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_suffix(f".{os.getpid()}.part")
     part.write_text(json.dumps(result, indent=1), encoding="utf-8")
