@@ -37,7 +37,7 @@ CAUCHY_SCALES = np.array([20.0, 10.0, 6.0, 4.0, 2.0, 1.0, 1.0])
 REAPPEARED_NOISE = 1.0  # over config.sigma_px, at least: windows that changed much are found less exactly
 BLURRED_NOISE = 2.0  # the same of windows in a blurred image
 MEDIAN_ERROR = 0.8  # of unit noise in the four rows of a point
-NOISE_RANGE = (0.3, 4.0)  # over config.sigma_px
+NOISE_RANGE = (0.3, 10.0)  # over config.sigma_px: the noise of the best images, and what still is a match
 # Differences from the prediction that are possible for any robot: metres and m/s^2, radians and rad/s^2.
 MIN_LIMITS = (0.01, 4.0), (0.01, 6.0)
 # Standard deviations of a robot's differences, and root mean squares of the recent ones, if that is more. What moves
@@ -60,8 +60,7 @@ MOST_FREEDOMS = 1.0  # of the six of a pose that may rest on one point ...
 KNOWN_M = 0.005  # ... that is new, if the others have the position with this standard deviation
 NEAR = 2.0  # times the largest error of an inlier, at the predicted pose
 LIMIT_SIGMAS = 5.0  # root mean squares of the recent differences, if that is more
-MEMORY_S = 5.0  # time constant of their average ...
-FIRST_IMAGES = 15  # ... and what a robot's usual ones count for at the start: stamps may be wrong by any factor
+MEMORY_S = 5.0  # time constant of their average
 MIN_DEPTH_SIGMA = 1e-3  # relative
 
 
@@ -142,7 +141,6 @@ class FramePoseSolver:
         self._alert_s = 0.0  # seconds for which other motions are still searched for
         self.open_view = 0.0  # inliers of an unobstructed view
         self._difference = np.zeros(2)  # mean square of metres/s^2 and radians/s^2 between expected and found poses
-        self._differences = FIRST_IMAGES  # images that it is the mean of
 
     def use(self, cameras: StereoCameras) -> None:
         """Use other cameras."""
@@ -406,9 +404,7 @@ class FramePoseSolver:
         self.open_view += share * (solution.inliers - self.open_view)
         if seconds > 0:
             off = np.array(se3.extent(se3.inverse(expected.pose) @ solution.pose)) / seconds**2
-            self._differences += 1
-            share = max(1.0 / self._differences, 1.0 - math.exp(-seconds / MEMORY_S))
-            self._difference += share * (off**2 - self._difference)
+            self._difference += (1.0 - math.exp(-seconds / MEMORY_S)) * (off**2 - self._difference)
 
     def _learn_noise(self, tracks: Tracks, solution: PoseSolution, seconds: float) -> None:
         """From the points that have been static for long, outliers or not: what they show is noise.
