@@ -93,11 +93,14 @@ def course(windows: Sequence[RigWindow], columns: F64, prior: F64, expected: Sca
 
 
 def _alike(error: F64, scatter: F64) -> float:
-    """Correlation of the errors (N, 8) of neighbouring windows, from 0 to MOST_ALIKE."""
-    scaled = error @ np.linalg.inv(np.linalg.cholesky(scatter)).T
-    squares, products = (scaled**2).sum(), (scaled[1:] * scaled[:-1]).sum()
-    usual = PRIOR_WINDOWS * squares / len(error)
-    return float(np.clip((products + ALIKE * usual) / max(squares + usual, 1e-12), 0.0, MOST_ALIKE))
+    """Correlation of the errors (N, 8) of neighbouring windows, from 0 to MOST_ALIKE.
+
+    That of N errors around their mean is too small by (1 + 4 r) / N (Kendall, Biometrika 41, 1954).
+    """
+    count, scaled = len(error), error / np.sqrt(np.diag(scatter))
+    shown = (scaled[1:] * scaled[:-1]).sum() / max((scaled**2).sum(), 1e-12)
+    shown += (1 + 4 * shown) / count
+    return float(np.clip((PRIOR_WINDOWS * ALIKE + count * shown) / (PRIOR_WINDOWS + count), 0.0, MOST_ALIKE))
 
 
 def constant(windows: Sequence[RigWindow], expected: Scatter) -> Course:

@@ -134,7 +134,7 @@ def solve_window(
     information = system.information(problem, terms)
     last = keyframes[-1]
     length = _length_by_terms(rig, problem.uv_left[0], problem.uv_right[0])
-    turn = se3.log(se3.inverse(keyframes[0].odom_T_cam) @ last.odom_T_cam)[3:] if before is None else np.zeros(3)
+    turn = se3.log(se3.inverse(keyframes[0].odom_T_cam) @ last.odom_T_cam)[3:]
     return RigWindow(keyframes[0].kf_id, last.kf_id, last.stamp_ns, information, system.noise_px, length, turn)
 
 

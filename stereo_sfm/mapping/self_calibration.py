@@ -356,8 +356,7 @@ class SelfCalibration:
         """Whether the newest windows contradict all earlier ones; during the one before them it may have happened."""
         windows = list(self.windows)
         splits = range(len(windows) - AFTER_STEP.start, max(BEFORE_STEP, len(windows) - AFTER_STEP.stop), -1)
-        gives = self._taken_back[:3].any()  # the mount: it changes back, too
-        if gives or not any(self._step(windows[: k - 1], windows[k:]) for k in splits):
+        if not any(self._step(windows[: k - 1], windows[k:]) for k in splits):
             return
         near = range(splits[-1], len(windows) - 1)
         split = max(near, key=lambda k: self._across_windows(windows[: k - 1], windows[k:]).reach)
@@ -367,8 +366,12 @@ class SelfCalibration:
         self._step_between = windows[split - STEP_REACH].first_kf_id, windows[split:][:STEP_REACH][-1].last_kf_id
 
     def _across_windows(self, before: Sequence[RigWindow], after: Sequence[RigWindow]) -> Estimate:
-        """The change of the terms from some windows to others."""
-        return with_step(before, after, self._expected).at([0.0, 1.0])
+        """The change of the terms from some windows to others, which may all share one window's error: of a mount that
+        gives until the next turn.
+        """
+        course = with_step(before, after, self._expected)
+        change = course.at([0.0, 1.0])
+        return Estimate(change.value, change.covariance + course.scatter.covariance, change.freedom)
 
     def _step(self, before: Sequence[RigWindow], after: Sequence[RigWindow]) -> bool:
         """Whether there is a significant change that each half of the windows after it shows."""
@@ -376,7 +379,8 @@ class SelfCalibration:
         if change.reach < STEP_SIGMAS:
             return False
         halves = [self._across_windows(before, part) for part in (after[::2], after[1::2])]
-        return bool(significant(change, halves, self._rig.readout_s > 0, STEP_SIGMAS).any())
+        sigmas = np.where(self._taken_back, np.inf, STEP_SIGMAS)
+        return bool(significant(change, halves, self._rig.readout_s > 0, sigmas).any())
 
     def _before_change(self, windows: Sequence[RigWindow] = ()) -> None:
         """Expect of the windows after a change the scatter of those (all by default) before it, and any change."""

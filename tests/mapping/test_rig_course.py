@@ -40,7 +40,7 @@ def test_stated_deviations_are_those_of_the_scatter(scatter: float, alike: float
     """Whatever windows state, and where neighbours share errors."""
     true = 4e-4 * np.arange(RIG_TERMS)
     seen = [windows(np.tile(true, (24, 1)), scatter, seed, alike) for seed in range(30)]
-    assert 0.5 < deviations([constant(w, EXPECTED) for w in seen], [1.0], true) < 1.3
+    assert 0.5 < deviations([constant(w, EXPECTED) for w in seen], [1.0], true) < 1.6  # without scatter: 5 and more
 
 
 @pytest.mark.parametrize("scatter", [STATED, 5 * STATED])
@@ -57,7 +57,7 @@ def test_a_step_is_as_significant_as_the_windows_agree() -> None:
     terms[10:, 1] = 2e-3
     calm, shaken = (windows(terms, scatter, 0) for scatter in (STATED, 2e-3))
     assert with_step(calm[:10], calm[10:], EXPECTED).at([0.0, 1.0]).strength[1] > 6
-    assert with_step(shaken[:10], shaken[10:], EXPECTED).at([0.0, 1.0]).reach < 4
+    assert with_step(shaken[:10], shaken[10:], EXPECTED).at([0.0, 1.0]).reach < 5
 
 
 def test_a_term_that_does_not_change_has_its_mean_at_the_end() -> None:
