@@ -17,8 +17,8 @@ POINTS = np.random.default_rng(0).uniform([-1, -1, 1], [1, 1, 4], (50, 3))
 def keyframe(k: int) -> Keyframe:
     """With corners that the right rig saw, at the distances that the wrong one measured."""
     uv_left, uv_right = RIGHT.left.project(POINTS), RIGHT.project_right(POINTS)
-    seen = [a.astype(np.float32) for a in (uv_left, uv_right, 1.1 * POINTS)]
-    corners = Corners(*seen, np.zeros((50, 32), np.uint8))
+    left, right, points = (a.astype(np.float32) for a in (uv_left, uv_right, 1.1 * POINTS))
+    corners = Corners(left, right, points, np.zeros((50, 32), np.uint8))
     none, uv = np.zeros(0, np.int64), np.zeros((0, 2))
     return Keyframe(
         k, k, k, np.eye(4), none, uv, uv.copy(), np.zeros((0, 3)), np.zeros((0, 32), np.uint8), corners=corners
