@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
 
 from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calib.scene_model import inverse_distances
 from stereo_sfm.geometry import se3
 from stereo_sfm.mapping.map import Map
 from stereo_sfm.mapping.self_calibration import Revision
 from stereo_sfm.mapping.triangulate import triangulate
-from stereo_sfm.types import I64, CalibrationUpdate
+from stereo_sfm.types import I64, CalibrationUpdate, Corners
 
 
 def calibration_update(revision: Revision, version: int, kf_id: int, stamp_ns: int, applied: bool) -> CalibrationUpdate:
@@ -24,7 +26,8 @@ def calibration_update(revision: Revision, version: int, kf_id: int, stamp_ns: i
 
 
 def recalibrate(map_: Map, rigs: Sequence[tuple[int, Rig]]) -> None:
-    """Move points to their positions with the last rig; poses stay for the bundle adjustment that must follow.
+    """Move points and corners to their positions with the last rig; poses stay for the bundle adjustment that must
+    follow.
 
     Args:
         map_: changed in place.
@@ -34,12 +37,28 @@ def recalibrate(map_: Map, rigs: Sequence[tuple[int, Rig]]) -> None:
     after = rigs[-1][1]
     for (first, before), (until, _) in pairwise(rigs):
         _rewrite(map_, before, after, first, until)
+    firsts = [first for first, _ in rigs]
+    for row, seen in map_.corners.items():
+        before = rigs[max(bisect_right(firsts, row) - 1, 0)][1]
+        map_.corners[row] = _placed(seen[0], before, after), _placed(seen[1], before, after)
     rows = map_.living_points()
     rows = rows[map_.points.obs_count[rows] > 0]
     old = map_.points.xyz[rows].copy()
     new = triangulate(map_, after, rows)
     good = np.asarray(np.isfinite(new).all(1))
     map_.move_points(rows[good], np.where(good[:, None], new, old)[good])
+
+
+def _placed(corners: Corners, before: Rig, after: Rig) -> Corners:
+    """Corners that the rig `before` saw as the other one would have seen them; without a match they stay."""
+    left, right, points = (np.asarray(a, np.float64) for a in (corners.uv_left, corners.uv_right, corners.points_cam))
+    moved = right + (after.project_right(points) - before.project_right(points))
+    rho = inverse_distances(after, left, moved)
+    good = np.isfinite(rho) & (rho > 0)
+    now = after.left.unproject(left[good]) / rho[good, None]
+    uv_right, points_cam = corners.uv_right.copy(), corners.points_cam.copy()
+    uv_right[good], points_cam[good] = moved[good], now
+    return Corners(corners.uv_left, uv_right, points_cam, corners.descriptors)
 
 
 def _rewrite(map_: Map, before: Rig, after: Rig, first: int, until: int) -> None:
