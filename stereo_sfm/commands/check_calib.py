@@ -32,7 +32,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--windows", type=int, default=10, help="number of short segments of the recording to use")
     parser.add_argument("--max-frames", type=int, default=600, help="stop after N frames")
     parser.add_argument(
-        "--search", type=int, default=None, metavar="ROWS",
+        "--search",
+        type=int,
+        default=None,
+        metavar="ROWS",
         help="search range for row errors, in rows above and below (default: 14, or what the first images need)",
     )
     parser.add_argument("--correct", type=Path, default=None, metavar="FILE", help="write the corrected rig to FILE")

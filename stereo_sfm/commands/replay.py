@@ -134,7 +134,11 @@ def _run_again(options: ReplayOptions, wiring: Wiring) -> RunOptions:
     frame_ids = tuple(f.frame_id for f in frames if _within(f, frames[0], options.until))
     return RunOptions(
         ReplayChoice(
-            spec, rig, rectify=rectify, start_check=before.start_check, frame_ids=frame_ids,
+            spec,
+            rig,
+            rectify=rectify,
+            start_check=before.start_check,
+            frame_ids=frame_ids,
             recorded_skip=before.opening.frame_skip,
         ),
         _changed(before.config, options.set),

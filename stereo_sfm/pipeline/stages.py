@@ -18,7 +18,17 @@ from stereo_sfm.messages import SourceCounters
 from stereo_sfm.pipeline.schedule import Schedule
 from stereo_sfm.timing import NoSpans
 from stereo_sfm.tracking.factory import AnyTracker, make_tracker
-from stereo_sfm.types import Applied, Dropped, Frame, Keyframe, LoopResult, MapUpdate, StartCheck, StereoImage, Trajectory
+from stereo_sfm.types import (
+    Applied,
+    Dropped,
+    Frame,
+    Keyframe,
+    LoopResult,
+    MapUpdate,
+    StartCheck,
+    StereoImage,
+    Trajectory,
+)
 
 T_co = TypeVar("T_co", covariant=True)
 
