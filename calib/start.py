@@ -28,7 +28,7 @@ CORNERS = 100  # of the left image
 MIN_CORNERS = 25  # with fewer an image shows too little to judge a calibration
 MIN_MATCHES = 12  # with fewer a pair does not fit; as in a window of `check-calib`
 FITTING_SHARE = 0.5  # of the matches
-ADVICE = "'stereo-sfm check-calib SOURCE --correct rig.yaml' measures it with all images, '--rig rig.yaml' uses what it found"
+ADVICE = "'stereo-sfm check-calib SOURCE --correct rig.yaml' measures it with all images; then use '--rig rig.yaml'"
 DARK_MEDIAN, BRIGHT_MEDIAN = 12.0, 243.0  # grey levels
 MIN_CONTRAST = 4.0  # grey levels between the 10th and the 90th percentile
 
