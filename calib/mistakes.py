@@ -15,12 +15,12 @@ import numpy as np
 from stereo_sfm.calib.matches import match_pair
 from stereo_sfm.calib.rectification import rectify
 from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calib.wrong_rig import MIN_DISPARITY_PX
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
 from stereo_sfm.types import U8
 
 CORNERS = 200  # searched in each pair
-MIN_DISPARITY_PX = -0.5  # points of smaller disparity lie behind the cameras
 MAX_ROW_ERROR_PX = 2.0
 MIN_MATCHES = 25  # in a pair, with which the calibration is plausible
 MIN_GAIN = 3.0  # ratio of matches with and without a mistake undone, for it to be reported

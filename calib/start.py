@@ -9,18 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
 
 from stereo_sfm.calib.matches import match_pair
-from stereo_sfm.calib.mistakes import MIN_DISPARITY_PX, mistake
+from stereo_sfm.calib.mistakes import mistake
 from stereo_sfm.calib.rectification import Rectification, rectify
 from stereo_sfm.calib.rig import Rig
-from stereo_sfm.calib.wrong_rig import MAX_SHIFT, better_fit
+from stereo_sfm.calib.wrong_rig import LIMIT_PX, MAX_SHIFT, MIN_DISPARITY_PX, Fit, better_fit
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.types import StereoImage, U8
+from stereo_sfm.types import U8, StereoImage
 
 CHOSEN = (0, 5, 10)  # the pairs that are examined, if the first one does not fit
 LOOKED_AT = CHOSEN[-1] + 1 + MAX_SHIFT  # images: some on either side of these, where pairs may be frames apart
@@ -28,10 +28,7 @@ CORNERS = 100  # of the left image
 MIN_CORNERS = 25  # with fewer an image shows too little to judge a calibration
 MIN_MATCHES = 12  # with fewer a pair does not fit; as in a window of `check-calib`
 FITTING_SHARE = 0.5  # of the matches
-LIMIT_PX = 1.0  # of a row error: what the tracker accepts (tracker.max_epipolar_px)
-ADVICE = (
-    "'stereo-sfm check-calib SOURCE --correct rig.yaml' measures it with the whole recording, '--rig rig.yaml' uses that"
-)
+ADVICE = "'stereo-sfm check-calib SOURCE --correct rig.yaml' measures it with all images; then use '--rig rig.yaml'"
 DARK_MEDIAN, BRIGHT_MEDIAN = 12.0, 243.0  # grey levels
 MIN_CONTRAST = 4.0  # grey levels between the 10th and the 90th percentile
 
@@ -64,10 +61,17 @@ def check_start(rig: Rig, images: Iterable[StereoImage]) -> StartFinding:
         return StartFinding(light)
     chosen = [k for k in CHOSEN if k < len(seen)]
     better = better_fit(rig, seen, chosen) if cameras.rectification is not None else None
-    if better is not None:
+    if better is not None and _confirmed(better, seen, chosen):
         return StartFinding(better.text, better.rig, better.shift, True)
     text, shown = mistake(rig, [(seen[k].left, right) for k in chosen if (right := seen[k].right) is not None])
     return StartFinding(text, shown=shown)
+
+
+def _confirmed(better: Fit, images: Sequence[StereoImage], chosen: Sequence[int]) -> bool:
+    """Whether most pairs fit, once they are rectified and searched anew."""
+    cameras, at = _Cameras(better.rig), [k for k in chosen if 0 <= k + better.shift < len(images)]
+    fits = [cameras.fit(replace(images[k], right=images[k + better.shift].right)) for k in at]
+    return 2 * sum(fits) > len(fits)
 
 
 class _Cameras:

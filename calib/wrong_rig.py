@@ -2,8 +2,8 @@
 
 Corners are searched in so many rows that a right camera turned by two degrees is found. The turn comes from the small
 bundle adjustment of `check-calib`; rows that a cropped or shifted image sets apart are the other candidate. Each half
-of the matches is corrected by what the other half says: a correction counts only if these rows fit then. If no
-calibration fits all pairs alike, the right images may belong to other left ones.
+of the matches is corrected by what the other half says: a correction counts only if these rows fit then. The
+right images may belong to other left ones, too.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from stereo_sfm.calib.choice import significant, with_terms
 from stereo_sfm.calib.consistency import estimate
 from stereo_sfm.calib.rectification import Rectification, rectify
 from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calib.scene_model import inverse_distances
 from stereo_sfm.calib.tracks import MIN_POINTS, Window, still_window
 from stereo_sfm.geometry.stereo import epipolar_angle
 from stereo_sfm.types import F64, RIG_TERMS, StereoImage
@@ -25,6 +26,8 @@ MAX_TURN = np.deg2rad(2.2)  # of a right camera that is found: two degrees about
 CORNERS = 200  # searched in each pair
 MIN_MATCHES = 40  # in all pairs, as `check-calib` needs
 MIN_GAIN = 2.0  # ratio of the row errors without and with a correction, for it to count
+MIN_DISPARITY_PX = -0.5  # points of smaller disparity lie behind the cameras
+LIMIT_PX = 1.0  # of a row error: what the tracker accepts (tracker.max_epipolar_px)
 MAX_SHIFT = 2  # frames between the images of a pair
 SEEN_IN_ROWS = np.array([k in (0, 2) for k in range(RIG_TERMS)])  # of the terms: the turns about x and z
 
@@ -42,11 +45,6 @@ class Fit:
     def worst_px(self) -> float:
         """Of the pair that fits least."""
         return float(self.error_px.max())
-
-    @property
-    def alike(self) -> bool:
-        """Whether all pairs fit equally well, as those of one calibration do."""
-        return self.worst_px <= MIN_GAIN * float(self.error_px.min())
 
 
 def row_errors(rig: Rig, window: Window) -> F64:
@@ -74,14 +72,14 @@ def better_fit(rig: Rig, images: Sequence[StereoImage], chosen: Iterable[int]) -
     """
     rectification, at = rectify(rig, "epipolar"), list(chosen)
     best = _best(rig, _windows(rectification, images, at, 0))
-    if best is None or best.alike:
-        return best if best is not None and best.text else None
+    if best is None:
+        return None
     for shift in sorted(range(-MAX_SHIFT, MAX_SHIFT + 1), key=abs)[1:]:
         other = _best(rig, _windows(rectification, images, at, shift))
         if other is not None and len(other.error_px) > 1 and MIN_GAIN * other.worst_px < best.worst_px:
             text = " and ".join(part for part in (_apart(shift), other.text) if part)
             best = replace(other, text=text, shift=shift)
-    return best if best.text else None
+    return best if best.text and best.worst_px < LIMIT_PX else None
 
 
 def _apart(shift: int) -> str:
@@ -146,9 +144,7 @@ def _halves(windows: list[Window]) -> tuple[list[Window], list[Window]]:
     if len(windows) > 1:
         return windows[0::2], windows[1::2]
     (one,) = windows
-    even, odd = (
-        Window(one.left[:, k::2], one.right[:, k::2], one.right_velocity[:, k::2], one.rows) for k in (0, 1)
-    )
+    even, odd = (Window(one.left[:, k::2], one.right[:, k::2], one.right_velocity[:, k::2], one.rows) for k in (0, 1))
     return [even], [odd]
 
 
@@ -156,4 +152,10 @@ def _medians(windows: list[Window], first: Rig, second: Rig) -> F64:
     """(F,) median absolute row errors: of the first half's windows with the rig of the second, and the reverse."""
     even, odd = _halves(windows)
     halves = [(second, window) for window in even] + [(first, window) for window in odd]
-    return np.array([np.nanmedian(np.abs(row_errors(rig, window))) for rig, window in halves])
+    return np.array([np.nanmedian(_misfit(rig, window)) for rig, window in halves])
+
+
+def _misfit(rig: Rig, window: Window) -> F64:
+    """(N,) absolute row errors; infinite for points behind the cameras, which no calibration explains."""
+    disparity = rig.left.fx * rig.baseline * inverse_distances(rig, window.left[0], window.right[0])
+    return np.where(disparity < MIN_DISPARITY_PX, np.inf, np.abs(row_errors(rig, window)))

@@ -30,8 +30,9 @@ class RigChanged(StereoSfmError):
 class StartCheckedSource(WrappedSource):
     """Wraps a source and is entered with it: its images, and the calibration that the first of them fit.
 
-    The images that were looked at are passed on with the others. A live camera's do not wait for a run to be ready: they
-    are looked at when the run wants them, and another calibration is a reason to open the source again (`RigChanged`).
+    The images that were looked at are passed on with the others. A live camera's do not wait for a run to be ready:
+    they are looked at when the run wants them, and if they contradict the calibration, the source must be opened again
+    (`RigChanged`).
     """
 
     def __init__(self, source: Source, correct: bool, known: StartCheck | None = None) -> None:

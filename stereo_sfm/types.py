@@ -325,9 +325,7 @@ class CalibrationUpdate(Message):
 class StartCheck:
     """What the first images said about the calibration before the run began; there is none where they fit it."""
 
-    TOPIC: ClassVar[Topic] = Topic(
-        "/start_check", "before the first frame, where the images contradict the calibration"
-    )
+    TOPIC: ClassVar[Topic] = Topic("/start_check", "before the first frame, if the images contradict the calibration")
 
     frame_id: int  # the first image
     stamp_ns: int

@@ -16,6 +16,7 @@ from stereo_sfm.errors import StereoSfmError, from_os_error
 if TYPE_CHECKING:
     from stereo_sfm.commands._step import Stepper
     from stereo_sfm.config import Config
+    from stereo_sfm.drivers.choice import SourceChoice
     from stereo_sfm.eval.record import RunRecord
     from stereo_sfm.log.recorded import RecordedRun
     from stereo_sfm.maps.folders import MapFolders
@@ -69,7 +70,6 @@ def execute(options: RunOptions) -> tuple[int, Path]:
 
         start_context(options.config.pipeline.threads)  # loads code while this process does
     from stereo_sfm.calib.camera_store import CorrectionKeeper
-    from stereo_sfm.drivers.choice import SourceChoice
     from stereo_sfm.eval.record import RunRecord
     from stereo_sfm.eval.run_results import write_results
     from stereo_sfm.eval.statistics import failure, summary

@@ -96,14 +96,11 @@ def calibration_lines(stats: dict[str, Any]) -> list[str]:
     off = [] if rows is None else [f"row error {rows['systematic_px']:.2f} px (worst {rows['worst_px']:.2f} px)"]
     if rows is not None and rows["warning"]:
         off[0] += ": the calibration does not fit (see check-calib)"
-    lines = (
-        begun
-        + off
-        + [
-            f"calibration {'corrected' if c['applied'] else 'doubtful'} at {c['seconds']:.1f} s ({c['why']}): {c['text']}"
-            for c in stats["calibration"]
-        ]
-    )
+    changes = [
+        f"calibration {'corrected' if c['applied'] else 'doubtful'} at {c['seconds']:.1f} s ({c['why']}): {c['text']}"
+        for c in stats["calibration"]
+    ]
+    lines = [*begun, *off, *changes]
     compared = stats["sensor_calibration"]
     if compared is None:
         return lines

@@ -17,7 +17,9 @@ from stereo_sfm.types import F64, Keyframe, RowErrors
 GRID = (3, 4)  # rows and columns of regions
 FAST_SHARE, SLOW_SHARE = 0.2, 0.04  # weight of the newest keyframe in the averages
 MIN_MATCHES = 5  # of a region
-WARN_PX = 0.5  # of the systematic part; from 1 px on matches are lost
+# Of the systematic part, the larger one of the two: matches are lost from 1 px on, and the same small turn of a camera
+# is many pixels of a long lens. Half a pixel is 0.05 degrees at a focal length of 573 px.
+WARN_PX, WARN_DEG = 0.5, 0.05
 
 
 class RowMonitor:
@@ -40,7 +42,7 @@ class RowMonitor:
         systematic, before = _size(self._fast), _size(self._slow)
         return RowErrors(
             keyframe.kf_id, keyframe.stamp_ns, self._fast.ravel().copy(), systematic, systematic - before,
-            systematic > WARN_PX,
+            systematic > max(WARN_PX, self._rig.left.fx * np.deg2rad(WARN_DEG)),
         )  # fmt: skip
 
     def _regions(self, keyframe: Keyframe) -> F64:

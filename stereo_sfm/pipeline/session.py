@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from stereo_sfm.log.recorded import RecordedRun
 
 log = logging.getLogger("stereo_sfm")
+LOG = "run.mcap"  # in the run's folder
 
 
 @dataclass(frozen=True)
@@ -128,13 +129,15 @@ class Session:
                 if self._stopped and self._run is None:
                     return
         except RigChanged as found:
-            self._open_again(found.check)
-            yield from self
+            if not self._stopped:
+                self._open_again(found.check)
+                yield from self
 
     def _open_again(self, check: StartCheck) -> None:
         """Start the processes anew, with the calibration that a live camera's first images fit."""
         self._opener = with_known_start(self._opener, check)
         self._stack.close()
+        (self.folder / LOG).unlink(missing_ok=True)  # it holds no image
         with ExitStack() as stack:
             self._frames = self._enter_processes(stack)
             self._stack = stack.pop_all()
@@ -175,7 +178,7 @@ class Session:
         if kind == "none":
             return None
         pixels = self._wiring.image_format or ("raw" if live else "png")
-        return LogOptions(folder / "run.mcap", pixels if kind == "full" else "none")
+        return LogOptions(folder / LOG, pixels if kind == "full" else "none")
 
     def _ring_drops(self) -> list[Dropped]:
         """Images that the run to be repeated dropped because it was too slow."""

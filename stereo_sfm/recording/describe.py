@@ -255,7 +255,7 @@ def _against_calibration(source: Source) -> list[str]:
         found = check_start(source.rig, source)
     except StereoSfmError as error:
         return [str(error)]
-    if not found.text:
+    if not found.shown:
         return []
     return [found.text if found.rig is None else f"{found.text}: a run corrects it at its start; {ADVICE}"]
 
