@@ -569,9 +569,17 @@ def test_an_encoding_that_cannot_be_read_is_refused_once(tmp_path: Path, capsys:
     assert "'yuv_of_the_future' is not supported" in _error(_write(tmp_path / "a.mcap", image=image), capsys)
 
 
+def test_compressed_images_that_are_video_are_refused_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def image(i: int, side: int, frame: str) -> CompressedImage:
+        return CompressedImage(frame_id=frame, data=b"\0\0\0\1", format="h264")
+
+    assert "'h264' images are video" in _error(_write(tmp_path / "a.mcap", image=image), capsys)
+
+
 @pytest.mark.parametrize(("encoding", "height", "depth"), [("nv12", 3 * H // 2, 1), ("bayer_rggb16", H, 2)])
 def test_brightness_of_video_and_deep_bayer_images(encoding: str, height: int, depth: int, tmp_path: Path) -> None:
     """Of 16 bits these images use 14, which are scaled to eight."""
+
     def image(i: int, side: int, frame: str) -> RawImage:
         even = np.full((height, W), 60 * 256 ** (depth - 1) + i, np.uint8 if depth == 1 else "<u2")
         return RawImage(frame_id=frame, width=W, height=H, encoding=encoding, step=W * depth, data=even.tobytes())
