@@ -123,7 +123,7 @@ class _Sensor(Generic[S]):
             self.say(
                 "clock", f"their stamps are {away_s:.3g} s away from the images': another clock, they are not used"
             )
-        elif away_s > GAP_S:
+        elif away_s > GAP_S and "clock" not in self.said:
             self.say("gap", f"no samples for more than {GAP_S:g} s: the run goes on without them")
 
 

@@ -1,27 +1,30 @@
 """Two folders of images (or one with left*/right* files) with a rig file: the simplest dataset format.
 
-Stamps come from times.txt (seconds, one line per frame), else from file names in nanoseconds or seconds, else from the
-given frame rate and the numbers in the file names.
+Stamps come from times.txt (a line for each frame, `drivers.times_file`), else from file names in nanoseconds or
+seconds, else from the given frame rate and the numbers in the file names.
 """
 
 from __future__ import annotations
 
+import itertools
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calib.side_names import LEFT_RIGHT, side_pairs, words_of
 from stereo_sfm.drivers.folder_source import FolderSource, FrameFiles, folder_of
 from stereo_sfm.drivers.ground_truth import read_trajectory
 from stereo_sfm.drivers.image_lists import (
     frame_numbers,
     lines_of,
     list_images,
+    natural_key,
     pair_files,
-    stamp_from_text,
     stamps_of,
 )
 from stereo_sfm.drivers.rig_option import chosen_rig
-from stereo_sfm.drivers.text_file import read_text
+from stereo_sfm.drivers.times_file import read_times
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.pixels import SUFFIXES
 
@@ -29,8 +32,9 @@ if TYPE_CHECKING:
     from stereo_sfm.drivers.images import ImagesOptions
 
 ASSUMED_FPS = 30.0
-# folder names of the two cameras; the first two are also file name prefixes in one folder
-PAIRS = (("left", "right"), ("cam0", "cam1"), ("image_0", "image_1"), ("image_2", "image_3"), ("infra1", "infra2"))
+# Words beside which numbers tell cameras apart (`calib.side_names`), and not recordings.
+CAMERAS = {"cam", "camera", "image", "img", "infra", "ir", "fisheye", "view", "rect"}
+TIMES = ("times.txt", "timestamps.txt", "times.csv", "timestamps.csv")
 RIG_NAMES = ("rig", "calibration", "calib", "camchain", "stereo", "intrinsics")
 RIG_SUFFIXES = (".yaml", ".yml", ".json", ".txt")
 TRUTH_NAMES = ("groundtruth.txt", "groundtruth.tum", "poses.tum", "poses.txt")
@@ -46,10 +50,12 @@ def open_images(path: str, options: ImagesOptions) -> FolderSource:
     """
     folder = folder_of("images", path)
     name = f"images:{folder.resolve().name}"
-    found = find_pair(folder)
+    found = find_pair(folder, options.left, options.right)
     if found is None:
+        there = ", ".join(sorted(p.name for p in folder.iterdir())[:8])
         raise StereoSfmError(
-            f"{folder} contains no image pair (left/ and right/, cam0/ and cam1/, or left*, right* files)"
+            f"{folder} contains no image pair (left/ and right/, cam0/ and cam1/, or left*, right* files) but {there}: "
+            f"name them as in 'images:{path}?left=FOLDER&right=FOLDER'"
         )
     stamps = _stamps(name, folder, found[0], options.fps)
     pairs = [pair for pair in pair_files(name, *found) if pair[0] in stamps]
@@ -72,24 +78,70 @@ def open_images(path: str, options: ImagesOptions) -> FolderSource:
 
 def _stamped(folder: Path, files: list[Path]) -> bool:
     """Whether something tells when the images were taken."""
-    return (folder / "times.txt").is_file() or stamps_of(files) is not None
+    return _times_file(folder) is not None or stamps_of(files) is not None
 
 
-def find_pair(folder: Path) -> tuple[list[Path], list[Path]] | None:
-    """The left and the right image files of a folder, in order; None if there is no such pair."""
-    for names in PAIRS:
-        sides = [next((p for p in (folder / n, folder / n / "data") if _has_images(p)), None) for n in names]
-        if sides[0] is not None and sides[1] is not None:
-            return list_images(sides[0]), list_images(sides[1])
+def find_pair(folder: Path, left: str = "", right: str = "") -> tuple[list[Path], list[Path]] | None:
+    """The left and the right image files of a folder, in order; None if there is no such pair.
+
+    Args:
+        folder: with a folder for each camera, or with the files of both.
+        left, right: a folder or a pattern of files ("left*.png") each, where the names do not tell.
+    """
+    if left or right:
+        return _chosen(folder, left), _chosen(folder, right)
+    inside = {
+        p.name: place for p in sorted(folder.iterdir()) if p.is_dir() for place in (p, p / "data") if _has_images(place)
+    }
+    for names in _of_cameras(list(inside)):
+        return list_images(inside[names[0]]), list_images(inside[names[1]])
     if not _has_images(folder):
         return None
-    files = list_images(folder)
-    left, right = ([p for p in files if _is_numbered(p.stem, prefix)] for prefix in PAIRS[0])
-    return (left, right) if left and right else None
+    sides = _by_side(list_images(folder))
+    for names in _of_cameras(list(sides)):
+        return sides[names[0]], sides[names[1]]
+    return None
 
 
-def _is_numbered(stem: str, prefix: str) -> bool:
-    return stem.startswith(prefix) and stem[len(prefix) :].strip("_-").isdigit()
+def _of_cameras(names: list[str]) -> list[tuple[str, str]]:
+    """Pairs of names, those of numbers beside a word for a camera only."""
+    sides = {side for pair in LEFT_RIGHT for side in pair}
+    return [
+        pair for pair in side_pairs(names)
+        if any(w in sides | CAMERAS or w.startswith("left") or w.endswith("left") for w in words_of(pair[0]))
+    ]  # fmt: skip
+
+
+def _chosen(folder: Path, text: str) -> list[Path]:
+    """The files of one camera that the user names.
+
+    Raises:
+        StereoSfmError: there are none.
+    """
+    if text and (folder / text).is_dir():
+        return list_images(folder / text)
+    files = [p for p in folder.glob(text) if p.suffix.lower() in SUFFIXES] if text else []
+    if not files:
+        raise StereoSfmError(
+            f"{folder}: '{text}' is no folder and no pattern of image files: give both left= and right="
+        )
+    return sorted(files, key=natural_key)
+
+
+def _by_side(files: list[Path]) -> dict[str, list[Path]]:
+    """Files of one folder by their names without the frame's number, the digits that differ most."""
+    alike: dict[tuple[str, ...], list[tuple[Path, list[str]]]] = {}
+    for path in files:
+        parts = re.split(r"([0-9]+)", path.stem)
+        alike.setdefault(tuple(parts[::2]), []).append((path, parts[1::2]))
+    out: dict[str, list[Path]] = {}
+    for words, rows in alike.items():
+        counts = [len({digits[k] for _, digits in rows}) for k in range(len(words) - 1)]
+        frame = max(range(len(counts)), key=lambda k, counts=counts: (counts[k], k), default=-1)
+        for path, digits in rows:
+            kept = [text if k != frame else "_" for k, text in enumerate(digits)]
+            out.setdefault("".join(itertools.chain(*zip(words, [*kept, ""], strict=True))), []).append(path)
+    return out
 
 
 def _has_images(folder: Path) -> bool:
@@ -108,18 +160,23 @@ def _own_rig(folder: Path) -> Rig:
 
 def _stamps(name: str, folder: Path, files: list[Path], fps: float | None) -> dict[Path, int]:
     """Nanoseconds of the left images."""
-    times = folder / "times.txt"
-    if times.is_file():
-        stamps = [stamp_from_text(line) for line in read_text(times).split()]
-        if None in stamps:
-            raise StereoSfmError(f"{times} must have one time in seconds for each of the {len(files)} frames")
-        lines = lines_of(name, files, len(stamps), times.name)
-        return {file: stamps[line] or 0 for file, line in lines.items()}
-    named = stamps_of(files)
-    if named is not None:
-        return dict(zip(files, named, strict=True))
+    path = _times_file(folder)
+    if path is not None:
+        times = read_times(path)
+        named = dict(zip(times.names, times.stamp_ns, strict=False))
+        if all(file.stem in named for file in files):
+            return {file: named[file.stem] for file in files}
+        lines = lines_of(name, files, len(times.stamp_ns), path.name)
+        return {file: times.stamp_ns[line] for file, line in lines.items()}
+    stamps = stamps_of(files)
+    if stamps is not None:
+        return dict(zip(files, stamps, strict=True))
     period = 1e9 / (fps or ASSUMED_FPS)
     return {p: round(i * period) for p, i in zip(files, frame_numbers(files), strict=True)}
+
+
+def _times_file(folder: Path) -> Path | None:
+    return next((folder / name for name in TIMES if (folder / name).is_file()), None)
 
 
 def _skews(pairs: list[tuple[Path, Path]]) -> list[int | None]:

@@ -15,7 +15,9 @@ import numpy as np
 from stereo_sfm.calib.formats.camera_info import CameraInfo
 from stereo_sfm.calib.imu import Imu
 from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calib.side_names import words_of
 from stereo_sfm.calib.wheel import Wheel
+from stereo_sfm.drivers.folder_source import SHOWN_WARNINGS
 from stereo_sfm.drivers.image_lists import MAX_SKEW_NS
 from stereo_sfm.drivers.mcap import McapOptions
 from stereo_sfm.drivers.mcap.clock import Clock, clock_of
@@ -39,11 +41,11 @@ from stereo_sfm.drivers.mcap.recording import Recording
 from stereo_sfm.drivers.mcap.rig import camera_of, chain, stereo_rig
 from stereo_sfm.drivers.mcap.topics import ChosenTopics, camera_topic, choose_topics, is_rectified
 from stereo_sfm.drivers.rig_option import chosen_rig
-from stereo_sfm.drivers.side_names import words_of
 from stereo_sfm.drivers.source import BaseSource, Stamps
 from stereo_sfm.drivers.tum_rgbd.source import with_virtual_camera
 from stereo_sfm.drivers.used_bits import used_bits
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.log.images import UnknownEncoding
 from stereo_sfm.log.reader import Record
 from stereo_sfm.pixels import eight_bits
 from stereo_sfm.types import ImuSamples, StereoImage, Trajectory, WheelSamples
@@ -79,6 +81,7 @@ class ForeignSource(BaseSource):
         self.name = str(reader.path)
         self.topics = choose_topics(reader, options.left, options.right, options.depth, options.wheel)
         self._joints = [name for name in options.joints.split(",") if name]
+        self._unreadable = 0  # images of the last reading
         self._read_forward()
         self._clock = self._found_clock()
         self.rig = self._with_wheel(self._with_imu(chosen_rig(options.rig, self._recorded_rig)))
@@ -144,7 +147,7 @@ class ForeignSource(BaseSource):
         Raises:
             StereoSfmError: images that do not fit the calibration.
         """
-        dropped = 0
+        dropped = self._unreadable = 0
         imu: list[ImuReading] = []
         wheel: list[WheelReading] = []
         for frame_id, (left, other) in enumerate(self._pairs(start_ns, until_ns, imu, wheel)):
@@ -156,6 +159,8 @@ class ForeignSource(BaseSource):
                     imu=take_imu(imu, left.stamp_ns) if self.topics.imu else None,
                     wheel=take_wheel(wheel, left.stamp_ns, self._joints) if self.topics.wheel else None,
                 )
+        if self._unreadable > SHOWN_WARNINGS:
+            log.warning("%s: %d images could not be read", self.name, self._unreadable)
 
     def _other(self) -> str:
         return self.topics.right or self.topics.depth
@@ -167,8 +172,12 @@ class ForeignSource(BaseSource):
             pixels = eight_bits(left.message.gray(), self._bits)
             right = eight_bits(other.message.gray(), self._bits) if other and self.topics.right else None
             depth = other.message.depth() if other and self.topics.depth else None
+        except UnknownEncoding as error:
+            raise StereoSfmError(f"{self.name}: {error}: record or convert them in one of these") from None
         except BAD_MESSAGE as error:
-            log.warning("%s: image at %d ns is skipped: %s", self.name, left.stamp_ns, error)
+            self._unreadable += 1
+            if self._unreadable <= SHOWN_WARNINGS:
+                log.warning("%s: image at %d ns is skipped: %s", self.name, left.stamp_ns, error)
             return None
         self._check_size("left", pixels.shape, self.rig.left.size)
         if right is not None and self.rig.right is not None:
@@ -269,7 +278,7 @@ class ForeignSource(BaseSource):
         reading = next((r for m in records if (r := _imu_reading(m, self.topics)) is not None), None)
         left_T_imu = chain(self._fixed_transforms(), self._left_frame(), reading.frame) if reading else None
         if left_T_imu is None:
-            log.info("%s: no transform from the left camera to the IMU: its samples are not used", self.name)
+            log.warning("%s: no transform from the left camera to the IMU: its samples are not used", self.name)
             return rig
         return replace(rig, imu=Imu(left_T_imu))
 
@@ -280,7 +289,8 @@ class ForeignSource(BaseSource):
         reading = next((r for m in self.reader.messages([self.topics.wheel]) if (r := _wheel_reading(m))), None)
         left_T_wheel = chain(self._fixed_transforms(), self._left_frame(), reading.frame) if reading else None
         if left_T_wheel is None or reading is None or reading.joints:
-            log.info("%s: %s needs the wheels' calibration (--rig FILE): it is not used", self.name, self.topics.wheel)
+            text = "%s: %s needs the wheels' calibration (--rig FILE): it is not used"
+            log.warning(text, self.name, self.topics.wheel)
             return rig
         return replace(rig, wheel=Wheel(left_T_wheel))
 

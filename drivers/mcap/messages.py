@@ -21,12 +21,14 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
 
 from stereo_sfm.calib.formats.camera_info import CameraInfo, info_from_rows
+from stereo_sfm.calib.side_names import words_of
 from stereo_sfm.geometry import se3
 from stereo_sfm.log import foxglove, images
 from stereo_sfm.log.reader import Record
 from stereo_sfm.pixels import decode_gray
 from stereo_sfm.types import F32, F64, U8, U16
 
+VIDEO = {"h", "hevc", "av", "vp"}  # words of "h264", "H265", "hevc", "av1", "vp9"
 NOTHING = (float("nan"),) * 3  # what is not measured
 # Exceptions of damaged or unexpected messages.
 BAD_MESSAGE = (ValueError, DecodeError, struct.error, IndexError)
@@ -47,7 +49,14 @@ class ImageMessage:
     big_endian: bool = False
 
     def gray(self) -> U8 | U16:
-        """(H, W) with the depth of the message."""
+        """(H, W) with the depth of the message.
+
+        Raises:
+            UnknownEncoding: no image of the topic can be read.
+            ValueError: this one cannot.
+        """
+        if self.compressed and not VIDEO.isdisjoint(words_of(self.encoding)):
+            raise images.UnknownEncoding(f"'{self.encoding}' images are video, which is not supported")
         if self.compressed:
             return decode_gray(self.data)
         return images.decode_raw(self.data, self.width, self.height, self.step, self.encoding, self.big_endian)
@@ -138,7 +147,7 @@ def _image_foxglove_raw(data: bytes) -> ImageMessage:
 
 def _image_foxglove_compressed(data: bytes) -> ImageMessage:
     m = CompressedImage.FromString(data)
-    return ImageMessage(foxglove.stamp_of(m), m.frame_id, True, m.data)
+    return ImageMessage(foxglove.stamp_of(m), m.frame_id, True, m.data, encoding=m.format)
 
 
 def _image_ros_raw(data: bytes) -> ImageMessage:
@@ -156,7 +165,7 @@ def _image_ros_compressed(data: bytes) -> ImageMessage:
     blob = cdr.blob()
     if "compressedDepth" in encoding:  # the depth transport has a header before the PNG
         blob = blob[blob.find(b"\x89PNG") :]
-    return ImageMessage(stamp_ns, frame, True, blob)
+    return ImageMessage(stamp_ns, frame, True, blob, encoding=encoding)
 
 
 def _camera_foxglove(data: bytes) -> CameraInfo:

@@ -6,6 +6,7 @@ import logging
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 
+from stereo_sfm.calib.side_names import side_pairs, words_of
 from stereo_sfm.drivers.mcap.messages import (
     CAMERAS,
     ENCODINGS,
@@ -17,7 +18,6 @@ from stereo_sfm.drivers.mcap.messages import (
     VELOCITIES,
 )
 from stereo_sfm.drivers.mcap.recording import Recording
-from stereo_sfm.drivers.side_names import side_pairs, words_of
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.log.reader import TopicInfo
 

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import importlib
+import logging
 import os
 from dataclasses import dataclass
 from typing import Any
 
 from stereo_sfm.drivers.live.errors import Busy, DeviceError, DeviceFault, DeviceLost, NoPermission, NotFound
 
+log = logging.getLogger("stereo_sfm")
+
+AUTO_CALIBRATION = "DEPTHAI_AUTOCALIBRATION"
 # Read by depthai when it is imported. Since 3.7 it reports every import and pipeline to its vendor unless disabled,
 # and uploads crash dumps of the camera. Variables set by the user are kept.
 ENVIRONMENT = {
@@ -20,6 +24,7 @@ ENVIRONMENT = {
     "DEPTHAI_LEVEL": "off",  # it logs to standard output
     "DEPTHAI_SEARCH_TIMEOUT": "2000",
     "DEPTHAI_RECONNECT_TIMEOUT": "0",  # we handle reconnection ourselves, with a new segment
+    AUTO_CALIBRATION: "OFF",  # since 3.6 it may measure the pair again at start, and write that to the camera
 }
 
 # Lower-case parts of depthai's messages -> error and message; the first match is used.
@@ -48,6 +53,11 @@ def load() -> Any:
     """
     for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
+    if os.environ[AUTO_CALIBRATION].upper() != ENVIRONMENT[AUTO_CALIBRATION]:
+        log.warning(
+            "%s=%s: depthai may change the camera's calibration at start, and write it to the camera",
+            AUTO_CALIBRATION, os.environ[AUTO_CALIBRATION],
+        )  # fmt: skip
     try:
         return importlib.import_module("depthai")
     except ImportError as error:

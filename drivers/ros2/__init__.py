@@ -19,7 +19,7 @@ class Ros2Options(SourceOptions):
 
     left: str = option("", "topic of the left images, raw or compressed")
     right: str = option("", "topic of the right images; without it there is one camera")
-    imu: str = option("", "topic of sensor_msgs/Imu")
+    imu: str = option("", "topic of sensor_msgs/Imu, or those of gyroscope and accelerometer: GYRO,ACCEL")
     odom: str = option(
         "", "topic of nav_msgs/Odometry or geometry_msgs/TwistStamped: its velocities are the wheel odometry"
     )

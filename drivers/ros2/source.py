@@ -36,12 +36,14 @@ from stereo_sfm.drivers.mcap.messages import (
     ImageMessage,
     ImuReading,
     Transform,
+    half_of,
 )
 from stereo_sfm.drivers.mcap.rig import camera_of, chain, stereo_rig
 from stereo_sfm.drivers.mcap.topics import camera_topic, is_rectified
 from stereo_sfm.drivers.rig_option import chosen_rig
 from stereo_sfm.drivers.source import BaseSource
 from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.log.images import UnknownEncoding
 from stereo_sfm.pixels import eight_bits
 from stereo_sfm.types import StereoImage
 
@@ -158,7 +160,10 @@ class Ros2Source(BaseSource):
         for side, topic in enumerate(self._topics):
             self._subscribe(topic, IMAGES, lambda p, side=side: self._pairs.put(side, p), qos_profile_sensor_data)
         if self._options.imu:
-            self._subscribe(self._options.imu, IMUS, self._take_imu, qos_profile_sensor_data)
+            topics = self._options.imu.split(",")
+            for k, topic in enumerate(topics[:2]):
+                take = self._take_imu if len(topics) == 1 else lambda r, k=k: self._take_imu(half_of(r, k == 0))
+                self._subscribe(topic, IMUS, take, qos_profile_sensor_data)
         if self._options.odom:
             take = lambda r: self._wheel.add(r.stamp_ns, r.linear, r.angular)  # noqa: E731
             self._subscribe(self._options.odom, VELOCITIES, take, qos_profile_sensor_data)
@@ -291,7 +296,7 @@ class Ros2Source(BaseSource):
             del self._imu[:-MAX_READINGS]
 
     def __iter__(self) -> Iterator[StereoImage]:
-        frame_id, last_ns, dropped = 0, -1, 0
+        frame_id, dropped = 0, 0
         while self._pairs.ready.get(0) is not None:
             pass  # what came before somebody wanted images
         while True:
@@ -301,13 +306,13 @@ class Ros2Source(BaseSource):
             (left, right), lost = got
             self._counters.add("dropped_by_host", lost)
             self._counters.add("dropped", lost)
-            image = self._image(frame_id, left, right, dropped + lost) if left.stamp_ns > last_ns else None
+            image = self._image(frame_id, left, right, dropped + lost)
             if image is None:
                 dropped += 1 + lost
                 self._counters.add("implausible")
                 continue
             self._counters.add("pairs")
-            frame_id, last_ns, dropped = frame_id + 1, left.stamp_ns, 0
+            frame_id, dropped = frame_id + 1, 0
             yield image
 
     def _image(self, frame_id: int, left: ImageMessage, right: ImageMessage | None, dropped: int) -> StereoImage | None:
@@ -318,6 +323,8 @@ class Ros2Source(BaseSource):
         """
         try:
             pixels = [eight_bits(p.gray()) for p in (left, right) if p is not None]
+        except UnknownEncoding as error:
+            raise StereoSfmError(f"{self.name}: {error}") from None
         except BAD_MESSAGE as error:
             log.warning("%s: the image at %d ns is skipped: %s", self.name, left.stamp_ns, error)
             return None

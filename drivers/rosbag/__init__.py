@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stereo_sfm.drivers.driver import Certainty, Driver
-from stereo_sfm.drivers.mcap import McapOptions
+from stereo_sfm.drivers.mcap import RECORDING, McapOptions
+from stereo_sfm.errors import StereoSfmError
 
 if TYPE_CHECKING:
     from stereo_sfm.drivers.source import Source
@@ -18,7 +19,22 @@ _MARK_BYTES = 4096
 def _open(place: str, options: McapOptions) -> Source:
     from stereo_sfm.drivers.rosbag.reader import open_bag
 
-    return open_bag(place, options)
+    folder = Path(place).expanduser()
+    files = _files(folder) if place and folder.is_dir() and not (folder / "metadata.yaml").is_file() else []
+    if len(files) > 1:
+        raise StereoSfmError(
+            f"{place} has {len(files)} files and no metadata.yaml: 'ros2 bag reindex {place}' makes one, or run a file"
+        )
+    if files and files[0].suffix == ".mcap":
+        from stereo_sfm.drivers.mcap.source import open_mcap
+
+        return open_mcap(str(files[0]), options)
+    return open_bag(str(files[0]) if files else place, options)
+
+
+def _files(folder: Path) -> list[Path]:
+    """The files of a rosbag2 folder."""
+    return sorted(p for p in folder.iterdir() if p.suffix in (".db3", ".mcap"))
 
 
 def _recognise(path: Path) -> Certainty:
@@ -26,7 +42,8 @@ def _recognise(path: Path) -> Certainty:
         return Certainty.MARKED if path.suffix in (".bag", ".db3") else Certainty.NO
     about = path / "metadata.yaml"
     if not about.is_file():
-        return Certainty.NO
+        ours = (path / RECORDING).is_file()
+        return Certainty.NO if ours or not _files(path) else Certainty.LAYOUT
     with about.open("rb") as file:
         return Certainty.MARKED if _MARK.encode() in file.read(_MARK_BYTES) else Certainty.NO
 

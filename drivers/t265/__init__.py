@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from stereo_sfm.drivers.driver import Attached, Cameras, Driver, UsbId
 from stereo_sfm.drivers.options import SourceOptions, option
 from stereo_sfm.drivers.t265 import messages as m
-from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.errors import StereoSfmError, require
 
 if TYPE_CHECKING:
     from stereo_sfm.drivers.source import Source
@@ -50,6 +50,7 @@ _OF_THE_SIMULATED = ("images", "frames", "faults", "paced", "seed")
 
 
 def _open(place: str, options: T265Options) -> Source:
+    require(("usb",), "t265", "the T265, also the simulated one,")
     if place == SIMULATED:
         from stereo_sfm.drivers.t265.simulated.source import open_simulated
 

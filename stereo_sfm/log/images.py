@@ -104,19 +104,29 @@ _ENCODINGS: dict[str, tuple[int, int, int | None]] = {
     "yuv422_yuy2": (1, 2, cv2.COLOR_YUV2GRAY_YUYV),
     "uyvy": (1, 2, cv2.COLOR_YUV2GRAY_UYVY),
     "yuv422": (1, 2, cv2.COLOR_YUV2GRAY_UYVY),
-    **{f"bayer_{p}8": (1, 1, getattr(cv2, f"COLOR_BAYER_{c}2GRAY")) for p, c in _BAYER.items()},
+    "rgb16": (2, 3, cv2.COLOR_RGB2GRAY),
+    "bgr16": (2, 3, cv2.COLOR_BGR2GRAY),
+    "rgba16": (2, 4, cv2.COLOR_RGBA2GRAY),
+    "bgra16": (2, 4, cv2.COLOR_BGRA2GRAY),
+    **{f"bayer_{p}{8 * n}": (n, 1, getattr(cv2, f"COLOR_BAYER_{c}2GRAY")) for p, c in _BAYER.items() for n in (1, 2)},
+    **dict.fromkeys(("nv12", "nv21", "nv24", "i420", "yuv420p"), (1, 1, None)),  # brightness first, then the colours
 }
+
+
+class UnknownEncoding(ValueError):
+    """An encoding that is not supported: so are all images of the topic."""
 
 
 def decode_raw(data: bytes, width: int, height: int, step: int, encoding: str, big_endian: bool = False) -> U8 | U16:
     """Pixels of a RawImage in any common encoding -> (H, W) grey with the encoding's depth of eight or sixteen bits.
 
     Raises:
-        ValueError: unknown encoding, impossible size, or too few bytes.
+        UnknownEncoding: not a known one.
+        ValueError: impossible size, or too few bytes.
     """
     layout = _ENCODINGS.get(encoding.lower())
     if layout is None:
-        raise ValueError(f"image encoding '{encoding}' is not supported (known: {', '.join(_ENCODINGS)})")
+        raise UnknownEncoding(f"image encoding '{encoding}' is not supported (known: {', '.join(_ENCODINGS)})")
     depth, channels, conversion = layout
     row = width * channels * depth
     step = step or row
@@ -127,9 +137,10 @@ def decode_raw(data: bytes, width: int, height: int, step: int, encoding: str, b
     rows = np.frombuffer(data[: step * height].ljust(step * height, b"\0"), np.uint8).reshape(height, step)[:, :row]
     dtype = np.dtype(f"{'>' if big_endian else '<'}u{depth}")
     pixels = np.ascontiguousarray(rows).view(dtype).reshape(height, width, channels)
+    pixels = pixels.astype(dtype.newbyteorder("="), copy=conversion is None)
     if conversion is None:
-        return pixels[..., 0].astype(dtype.newbyteorder("="))
-    return cv2.cvtColor(pixels if channels > 1 else pixels[..., 0], conversion).astype(np.uint8, copy=False)
+        return pixels[..., 0]
+    return cv2.cvtColor(pixels if channels > 1 else pixels[..., 0], conversion).astype(pixels.dtype, copy=False)
 
 
 def decode_depth(data: bytes, width: int, height: int, step: int, encoding: str) -> F32:
@@ -141,7 +152,7 @@ def decode_depth(data: bytes, width: int, height: int, step: int, encoding: str)
     dtypes = {"32fc1": np.dtype("<f4"), "16uc1": np.dtype("<u2"), "mono16": np.dtype("<u2")}
     dtype = dtypes.get(encoding.lower())
     if dtype is None:
-        raise ValueError(f"depth encoding '{encoding}' is not supported (32FC1 or 16UC1)")
+        raise UnknownEncoding(f"depth encoding '{encoding}' is not supported (32FC1 or 16UC1)")
     step = step or dtype.itemsize * width
     if step < dtype.itemsize * width or len(data) < step * height:
         raise ValueError(f"a depth image of {width}x{height} {encoding} has only {len(data)} bytes")

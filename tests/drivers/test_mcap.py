@@ -22,6 +22,7 @@ from mcap_protobuf.writer import Writer as ProtobufWriter
 from stereo_sfm.calib.rig import Rig
 from stereo_sfm.cli import main
 from stereo_sfm.drivers import open_source
+from stereo_sfm.drivers.choice import SourceChoice
 from stereo_sfm.drivers.mcap.topics import choose_topics
 from stereo_sfm.drivers.memory import MemorySource
 from stereo_sfm.errors import StereoSfmError
@@ -59,8 +60,12 @@ def _write(
     skew_ns: int = 0,
     skip: Sequence[tuple[int, int]] = (),
     extra: Callable[[ProtobufWriter], None] = lambda writer: None,
+    clocks: Callable[[int, int], tuple[int, int]] | None = None,
 ) -> Path:
-    """A stereo recording as by another program."""
+    """A stereo recording as by another program.
+
+    `clocks`: header stamp and log time of an image and side.
+    """
     with path.open("wb") as stream, ProtobufWriter(stream) as writer:
         for side, topic in enumerate(calibrations):
             message = foxglove.calibration(cameras[side], frames[side], 10**9)
@@ -74,8 +79,8 @@ def _write(
                 if (i, side) in skip:
                     continue
                 stamp = 10**9 + i * PERIOD_NS + side * skew_ns
-                message = foxglove.stamp(image(i, side, frames[side]), stamp)
-                writer.write_message(topic, message, stamp + 7_000_000, stamp)  # logged later than taken
+                stamp, logged = (stamp, stamp + 7_000_000) if clocks is None else clocks(i, side)  # logged later
+                writer.write_message(topic, foxglove.stamp(image(i, side, frames[side]), stamp), logged, stamp)
         extra(writer)
     return path
 
@@ -496,6 +501,92 @@ def test_a_clock_that_runs_backwards_is_reported(tmp_path: Path, caplog: pytest.
     with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(_write(tmp_path / "b.mcap", count=10)):
         pass
     assert "clock" not in caplog.text
+
+
+def _taken(i: int) -> int:
+    return 10**9 + i * PERIOD_NS
+
+
+@pytest.mark.parametrize(
+    "logged",
+    [
+        lambda i, side: 10**9,
+        lambda i, side: 0,
+        lambda i, side: 10**9 + 12_000 * (2 * i + side),  # bursts
+        lambda i, side: 10**9 + 12_000 * i + side * 10**8,  # all of one camera, then all of the other
+    ],
+)
+def test_log_times_say_nothing_where_headers_do(logged: Callable[[int, int], int], tmp_path: Path) -> None:
+    path = _write(tmp_path / "a.mcap", count=40, clocks=lambda i, side: (_taken(i) + 300_000 * side, logged(i, side)))
+    with open_source(path) as source:
+        images = list(source)
+    assert [image.stamp_ns for image in images] == [_taken(i) for i in range(40)]
+
+
+def test_one_clock_where_a_camera_has_no_header_stamps(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """The other camera's stamps are of another clock than the times of logging, two frames away."""
+    late = 2 * PERIOD_NS
+
+    def clocks(i: int, side: int) -> tuple[int, int]:
+        return (0 if side else _taken(i)), _taken(i) + late + 1_000_000 * side
+
+    with (
+        caplog.at_level(logging.WARNING, "stereo_sfm"),
+        open_source(_write(tmp_path / "a.mcap", clocks=clocks)) as source,
+    ):
+        images = list(source)
+    assert "/stereo/right/image_raw are all the same" in caplog.text
+    for i, image in enumerate(images):
+        assert image.right is not None and image.stamp_ns == _taken(i) + late
+        np.testing.assert_array_equal(image.right, _pixels(i, 1))  # of the same moment
+
+
+def test_no_clock_at_all(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "nothing tells when" in _error(_write(tmp_path / "a.mcap", clocks=lambda i, side: (0, 10**9)), capsys)
+
+
+def test_cameras_that_are_not_triggered_together_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING, "stereo_sfm"), open_source(_write(tmp_path / "a.mcap", skew_ns=18_000_000)):
+        pass
+    assert "stamps of left and right images differ by 18.0 ms" in caplog.text
+
+
+def test_headers_that_are_set_back_keep_their_pairs(tmp_path: Path) -> None:
+    def clocks(i: int, side: int) -> tuple[int, int]:
+        return _taken(i) - (i >= 5) * 2 * 10**9 + 10**10, _taken(i) + 1_000 * side
+
+    with SourceChoice(str(_write(tmp_path / "a.mcap", count=12, clocks=clocks)))() as source:
+        images = list(source)
+    assert [image.stamp_ns for image in images] == [_taken(i) + 10**10 for i in range(12)]
+
+
+def test_an_encoding_that_cannot_be_read_is_refused_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def image(i: int, side: int, frame: str) -> RawImage:
+        message = _raw(i, side, frame)
+        message.encoding = "yuv_of_the_future"
+        return message
+
+    assert "'yuv_of_the_future' is not supported" in _error(_write(tmp_path / "a.mcap", image=image), capsys)
+
+
+def test_compressed_images_that_are_video_are_refused_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def image(i: int, side: int, frame: str) -> CompressedImage:
+        return CompressedImage(frame_id=frame, data=b"\0\0\0\1", format="h264")
+
+    assert "'h264' images are video" in _error(_write(tmp_path / "a.mcap", image=image), capsys)
+
+
+@pytest.mark.parametrize(("encoding", "height", "depth"), [("nv12", 3 * H // 2, 1), ("bayer_rggb16", H, 2)])
+def test_brightness_of_video_and_deep_bayer_images(encoding: str, height: int, depth: int, tmp_path: Path) -> None:
+    """Of 16 bits these images use 14, which are scaled to eight."""
+
+    def image(i: int, side: int, frame: str) -> RawImage:
+        even = np.full((height, W), 60 * 256 ** (depth - 1) + i, np.uint8 if depth == 1 else "<u2")
+        return RawImage(frame_id=frame, width=W, height=H, encoding=encoding, step=W * depth, data=even.tobytes())
+
+    with open_source(_write(tmp_path / "a.mcap", image=image)) as source:
+        first = next(iter(source)).left
+    assert first.shape == (H, W) and np.abs(first.astype(int) - 60 * 4 ** (depth - 1)).max() <= 1
 
 
 def test_a_pipe_is_not_a_recording(tmp_path: Path) -> None:

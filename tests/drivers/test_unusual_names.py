@@ -1,0 +1,128 @@
+"""Folders, files, topics and lists of times that are named otherwise than ours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from stereo_sfm.calib import save_rig
+from stereo_sfm.calib.rig import Rig
+from stereo_sfm.calib.side_names import side_pairs
+from stereo_sfm.drivers import open_source
+from stereo_sfm.drivers.images.source import find_pair
+from stereo_sfm.drivers.mcap.topics import is_rectified
+from stereo_sfm.drivers.times_file import read_times
+from stereo_sfm.errors import StereoSfmError
+from stereo_sfm.geometry import se3
+from stereo_sfm.geometry.cameras import Pinhole
+
+NS = 1403636579763555584
+
+
+def write(folder: Path, names: Sequence[str], level: int) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    pixels = (np.random.default_rng(level).integers(0, 40, (30, 40)) + level).astype(np.uint8)
+    for name in names:
+        cv2.imwrite(str(folder / name), pixels)
+
+
+def stereo_rig() -> Rig:
+    camera = Pinhole(40, 30, 30.0, 30.0, 20.0, 15.0)
+    return Rig(camera, camera, se3.from_rotation_translation(np.eye(3), np.array([0.1, 0, 0])))
+
+
+@pytest.mark.parametrize(
+    "names",
+    ["left right", "Left Right", "cam_left cam_right", "leftcam rightcam", "L R", "cam1 cam2", "fisheye1 fisheye2",
+     "infra1 infra2", "image_2 image_3", "image_left/data image_right/data"],
+)  # fmt: skip
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+def test_folders_of_two_cameras(names: str, suffix: str, tmp_path: Path) -> None:
+    for level, name in zip((50, 150), names.split(), strict=True):
+        write(tmp_path / name, [f"{k:06d}.{suffix}" for k in range(3)], level)
+    save_rig(stereo_rig(), tmp_path / "rig.yaml")
+    with open_source(tmp_path) as source:
+        images = list(source)
+    assert [image.left.mean() < 100 < image.right.mean() for image in images if image.right is not None] == [True] * 3
+
+
+@pytest.mark.parametrize(
+    ("left", "right"),
+    [
+        ("left{}", "right{}"),
+        ("cam0_{}", "cam1_{}"),
+        ("{}_left", "{}_right"),
+        ("{}_cam0", "{}_cam1"),
+        ("img_L_{}", "img_R_{}"),
+    ],
+)
+def test_files_of_both_cameras_in_one_folder(left: str, right: str, tmp_path: Path) -> None:
+    numbers = [NS + 50_000_000 * k for k in range(3)]
+    write(tmp_path, [f"{left.format(n)}.png" for n in numbers], 50)
+    write(tmp_path, [f"{right.format(n)}.png" for n in numbers], 150)
+    found = find_pair(tmp_path)
+    assert found is not None
+    assert [p.stem for p in found[0]] == [left.format(n) for n in numbers]
+    assert [p.stem for p in found[1]] == [right.format(n) for n in numbers]
+
+
+def test_names_that_tell_nothing_are_chosen(tmp_path: Path) -> None:
+    for level, name in ((50, "west"), (150, "east")):
+        write(tmp_path / name, ["0.png", "1.png"], level)
+    save_rig(stereo_rig(), tmp_path / "rig.yaml")
+    assert find_pair(tmp_path) is None
+    with pytest.raises(StereoSfmError, match=r"east, rig.yaml, west: name them as in .*left=FOLDER&right=FOLDER"):
+        open_source(f"images:{tmp_path}")
+    with open_source(f"images:{tmp_path}?left=west&right=east") as source:
+        assert source.frame_count == 2
+    with pytest.raises(StereoSfmError, match="give both"):
+        open_source(f"images:{tmp_path}?left=west")
+
+
+def test_recordings_side_by_side_are_no_pair(tmp_path: Path) -> None:
+    for name in ("run1", "run2", "2024", "2025"):
+        write(tmp_path / name, ["0.png"], 50)
+    assert find_pair(tmp_path) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "stamps", "names"),
+    [
+        ("1.5\n2.5\n", [1_500_000_000, 2_500_000_000], []),
+        ("# times\n\n1.5\r\n2.5", [1_500_000_000, 2_500_000_000], []),
+        ("timestamp\n1.5\n2.5", [1_500_000_000, 2_500_000_000], []),
+        ("1.403636579763555584e+18\n1.403636579813555456e+18\n", [NS, 1403636579813555456], []),
+        (f"#timestamp [ns],filename\n{NS},a.png\n{NS + 1},b.png", [NS, NS + 1], ["a", "b"]),
+        ("0 1.5\n1 2.5\n", [1_500_000_000, 2_500_000_000], []),
+        ("left/a.png;1.5\nleft/b.png;2.5\n", [1_500_000_000, 2_500_000_000], ["a", "b"]),
+        ("1 2 3.5", [1_000_000_000, 2_000_000_000, 3_500_000_000], []),
+        ("0\n1\n2\n", [0, 1_000_000_000, 2_000_000_000], []),
+    ],
+)  # fmt: skip
+def test_lists_of_times(text: str, stamps: list[int], names: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "times.txt"
+    path.write_text(text)
+    times = read_times(path)
+    assert times.stamp_ns == stamps and times.names == names
+
+
+def test_a_list_without_times(tmp_path: Path) -> None:
+    path = tmp_path / "times.txt"
+    path.write_text("one\ntwo\n")
+    with pytest.raises(StereoSfmError, match="one time in seconds or nanoseconds"):
+        read_times(path)
+
+
+def test_words_not_letters_tell_rectified_images() -> None:
+    assert is_rectified("/camera/left/image_rect") and is_rectified("/cam/image_rect_raw") and is_rectified("/leftRect")
+    assert not any(map(is_rectified, ("/direct/left/image_raw", "/camera/unrectified", "/rectangle/image")))
+
+
+def test_pairs_of_topics() -> None:
+    assert side_pairs(["/cleft/image", "/cright/image", "/x/cam0", "/x/cam1"])[0] == ("/cleft/image", "/cright/image")
+    assert side_pairs(["/cam1/image", "/cam2/image", "/cam0/image"])[0] == ("/cam0/image", "/cam1/image")
+    assert not side_pairs(["/left/image", "/right/mask"])
