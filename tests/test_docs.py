@@ -53,6 +53,16 @@ def test_no_local_paths(page: Path) -> None:
     assert not re.search(r"/work/|/home/|/root/|localhost|https?://[0-9]", page.read_text())
 
 
+def test_each_row_of_the_inputs_is_a_test() -> None:
+    page = (ROOT / "docs" / "reference" / "inputs.md").read_text()
+    rows = [line for line in page.splitlines() if line.startswith("|") and "`test_" in line]
+    known = "".join(p.read_text() for p in (ROOT / "tests").rglob("test_*.py"))
+    assert len(rows) > 20
+    for row in rows:
+        for name in re.findall(r"`(test_\w+)`", row):
+            assert f"def {name}(" in known, f"no test {name} for the row: {row}"
+
+
 def test_links_between_pages_lead_somewhere() -> None:
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#]+?)(?:#[^)]*)?\)", page.read_text()):

@@ -165,7 +165,8 @@ def stereo_only(right: Camera | None, file_format: str) -> Camera:
 def unsupported(camera: Camera, file_format: str) -> StereoSfmError:
     """The error for a lens model that a format cannot express."""
     return StereoSfmError(
-        f"{file_format} has no lens model for '{camera.model}': rectify to pinhole first, or use the format 'rig'"
+        f"{file_format} has no lens model for '{camera.model}': rectify to pinhole first (in a run, --rectify pinhole) "
+        "or use the format 'rig'"
     )
 
 

@@ -19,7 +19,18 @@ from stereo_sfm.calib.formats.kitti import read_kitti
 from stereo_sfm.calib.formats.opencv import read_opencv
 from stereo_sfm.errors import StereoSfmError
 from stereo_sfm.geometry import se3
-from stereo_sfm.geometry.cameras import Camera, Epipolar, KannalaBrandt, Pinhole, RadTan
+from stereo_sfm.geometry.cameras import (
+    Camera,
+    DoubleSphere,
+    Epipolar,
+    Eucm,
+    Fov,
+    KannalaBrandt,
+    Mei,
+    Pinhole,
+    RadTan,
+    Tilted,
+)
 from tests.synthetic import fisheye_rig
 
 NEARLY = se3.exp(np.array([0.0639, 3e-4, -2e-4, 0.004, -0.011, 0.002]))  # left_T_right
@@ -48,10 +59,23 @@ IDEAL = Rig(
     Pinhole(1241, 376, 718.856, 718.856, 607.1928, 185.2157),
     se3.from_rotation_translation(np.eye(3), np.array([0.537165718864418, 0, 0])),
 )
-RIGS = {"fisheye": FISHEYE, "radtan": RADTAN, "rational": RATIONAL, "ideal": IDEAL}
+OAK = (0.32, -0.06, -3.7e-05, 7.6e-05, -0.0023, 0.654, -0.034, -0.009, 0.0011, -0.0004, 0.0007, 0.0002, 0.003, -0.001)
+FEW = {  # lenses that few formats know, and those
+    "tilted": (Tilted, OAK, ("rig", "ros", "opencv", "foxglove", "depthai")),
+    "fov": (Fov, (0.93,), ("rig", "kalibr", "colmap", "kapture")),
+    "mei": (Mei, (1.9, -0.01, 0.02, 0.001, -0.002), ("rig", "kalibr")),
+    "double_sphere": (DoubleSphere, (-0.17, 0.59), ("rig", "kalibr", "basalt")),
+    "eucm": (Eucm, (0.63, 1.04), ("rig", "kalibr", "basalt")),
+}
+OTHERS = {
+    name: Rig(lens(1280, 800, 577.8, 577.9, 627.2, 410.3, d), lens(1280, 800, 578.8, 577.1, 630.2, 407.3, d), NEARLY)
+    for name, (lens, d, _) in FEW.items()
+}
+RIGS = {"fisheye": FISHEYE, "radtan": RADTAN, "rational": RATIONAL, "ideal": IDEAL} | OTHERS
 FILES = {"rig": "rig.yaml", "kalibr": "camchain.yaml", "opencv": "stereo.yml", "kitti": "calib.txt"}
 NO_BODY = ("depthai", "ros", "opencv", "kitti", "colmap", "foxglove")  # dialects that have no place for body_T_left
 CANNOT = {("kitti", r) for r in ("fisheye", "radtan", "rational")} | {("kalibr", "rational"), ("euroc", "rational")}
+CANNOT |= {(f, name) for name, (_, _, known) in FEW.items() for f in FORMATS if f not in known}
 
 
 def target(folder: Path, name: str) -> Path:

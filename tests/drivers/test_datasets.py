@@ -232,6 +232,20 @@ def test_a_rig_that_cannot_state_a_readout_keeps_the_data_sets(tmp_path: Path) -
     assert open_source(folder, rig=tmp_path / "rig.yaml").rig.readout_s == 0.0
 
 
+def test_depth_images_in_other_units(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    folder = make_tum_rgbd(tmp_path)  # 7500 units everywhere
+    for scale, metres in ((1000, 7.5), (5000, 1.5)):
+        with open_source(f"{folder}?depth_scale={scale}") as source:
+            depth = next(iter(source)).depth
+        assert depth is not None and depth[5, 5] == pytest.approx(metres)
+    assert "depth_scale" not in caplog.text
+    for file in sorted((folder / "depth").glob("*.png")):
+        cv2.imwrite(str(file), np.full((480, 640), 700, np.uint16))  # 0.7 m in millimetres
+    with open_source(folder):
+        assert "depths from 0.14 m on are nearer than depth cameras see" in caplog.text
+        assert "?depth_scale=1000" in caplog.text
+
+
 def test_tum_rgbd_of_an_unknown_camera_needs_a_rig(tmp_path: Path) -> None:
     folder = make_tum_rgbd(tmp_path).rename(tmp_path / "my_kinect")
     with pytest.raises(StereoSfmError, match="--rig FILE"):

@@ -11,6 +11,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -31,7 +32,7 @@ from stereo_sfm.drivers.oak.source import OakSource
 from stereo_sfm.drivers.oak.stream import OakStream
 from stereo_sfm.drivers.source import open_source
 from stereo_sfm.errors import StereoSfmError
-from stereo_sfm.geometry.cameras import KannalaBrandt, RadTan
+from stereo_sfm.geometry.cameras import KannalaBrandt, RadTan, Tilted
 from stereo_sfm.types import StereoImage
 from tests.drivers.oak_rig import FIXTURES, PERIOD_S, SIZE, FakeOak, calibration, dai, frame, motion
 
@@ -166,6 +167,17 @@ def test_wide_lenses_are_fisheyes_and_boards_may_not_know_their_imu() -> None:
     assert isinstance(found.left, KannalaBrandt)
     assert found.left.distortion == pytest.approx((0.0312, -0.0124, 0.0041, -0.0011))
     assert found.imu is None
+
+
+def test_tilted_lenses_of_newer_cameras() -> None:
+    data = json.loads((FIXTURES / "oak_d.json").read_text())
+    d = [0.32, -0.06, -4e-05, 8e-05, -0.0023, 0.654, -0.034, -0.009, 0.0011, -4e-4, 7e-4, 2e-4, 0.003, -0.001]
+    dict(data["cameraData"])[1]["distortionCoeff"] = d
+    found = read_calibration(dai, dai.CalibrationHandler.fromJson(data), (640, 400), "OAK-D", "1").left
+    assert isinstance(found, Tilted) and found.distortion == pytest.approx(d, rel=1e-6)
+    points = np.array([[0.5, -0.3, 1.0], [-0.7, 0.2, 1.2]])
+    theirs, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), found.matrix, np.array(found.distortion))
+    np.testing.assert_allclose(found.project(points), theirs[:, 0], rtol=0, atol=1e-9)
 
 
 def changed(**extrinsics: float) -> Any:
