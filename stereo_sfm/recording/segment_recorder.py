@@ -239,7 +239,8 @@ class SegmentRecorder:
         self._used = used_bytes(p.root)
         disk = self._disk(p.root)
         if disk.free < p.quota.min_free:
-            self._no_room = f"disk full: {disk.free / 1e6:.0f} MB free, images need {p.quota.min_free / 1e6:.0f} MB"
+            least = f"{p.quota.min_free / 1e6:.0f} MB (recording.min_free_gb)"
+            self._no_room = f"disk full: {disk.free / 1e6:.0f} MB free, images need {least}"
         elif excess > (0 if current is None else current.bytes):
             self._no_room = "recordings that you marked fill the quota: delete some of them; images are not recorded"
         else:
